@@ -1,0 +1,325 @@
+"""Tetrahedral meshes: linear (4 nodes) and quadratic (10 nodes), their surface and points embedded in them.
+
+Nodes of an element are ordered as in VTK: corners 0 1 2 3, then the middles of the edges 01 12 02 03 13 23.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.spatial import cKDTree
+
+from femsense.arrays import FloatArray, IntArray, as_points, freeze
+from femsense.errors import InputError
+
+EDGES = np.array([[0, 1], [1, 2], [0, 2], [0, 3], [1, 3], [2, 3]])
+FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])  # outward where the volume is positive
+FACE_EDGES = np.array([[1, 5, 4], [3, 5, 2], [0, 4, 3], [2, 1, 0]])  # middle of each side of a face: (ab, bc, ca)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class TetMesh:
+    """A tetrahedral mesh at rest."""
+
+    nodes: FloatArray
+    """Node positions [m], shape (n, 3): those of the linear mesh first, then the mid-edge nodes."""
+    tets: IntArray
+    """Node indices, shape (m, 4) or (m, 10)."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "nodes", freeze(as_points(self.nodes, "nodes")))
+        object.__setattr__(self, "tets", freeze(self.tets, np.int64))
+        if self.tets.ndim != 2 or self.tets.shape[1] not in (4, 10):
+            raise InputError("tets has the wrong shape", where="tets", found=self.tets.shape, expected="(m, 4) or (m, 10)")
+        if self.tets.size and (self.tets.min() < 0 or self.tets.max() >= len(self.nodes)):
+            raise InputError("tets names a node that does not exist", where="tets", found=int(self.tets.max()), expected=f"0 … {len(self.nodes) - 1}")
+
+    @property
+    def is_quadratic(self) -> bool:
+        return self.tets.shape[1] == 10
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Embedding:
+    """Points carried by a mesh: point = Σ weights · nodes."""
+
+    nodes: IntArray
+    """Node indices, shape (p, k)."""
+    weights: FloatArray
+    """Weights, shape (p, k); each row sums to 1."""
+    element: IntArray
+    """The element that carries each point, shape (p,)."""
+    outside: FloatArray
+    """How far outside of the mesh each point is at rest [m], shape (p,); 0 inside."""
+
+    def __len__(self) -> int:
+        return len(self.nodes)
+
+    def positions(self, node_positions: FloatArray) -> FloatArray:
+        """Return the positions of the points [m], shape (p, 3), for node positions [m], shape (n, 3)."""
+        return np.einsum("pk,pkc->pc", self.weights, node_positions[self.nodes])
+
+    def matrix(self, node_count: int) -> sp.csr_matrix:
+        """Return the interpolation as a sparse matrix, shape (p, n)."""
+        p, k = self.nodes.shape
+        rows = np.repeat(np.arange(p), k)
+        return sp.csr_matrix((self.weights.ravel(), (rows, self.nodes.ravel())), shape=(p, node_count))
+
+    def spread(self, forces: FloatArray, node_count: int) -> FloatArray:
+        """Return nodal forces [N], shape (n, 3), that are equivalent to forces [N], shape (p, 3), at the points."""
+        return np.asarray(self.matrix(node_count).T @ forces)
+
+    def __getitem__(self, index: object) -> Embedding:
+        return Embedding(*(np.atleast_1d(getattr(self, f)[index]) if f in ("element", "outside") else np.atleast_2d(getattr(self, f)[index])
+                           for f in ("nodes", "weights", "element", "outside")))  # fmt: skip
+
+
+def element_volumes(mesh: TetMesh) -> FloatArray:
+    """Return the signed volumes of the corner tetrahedra [m³], shape (m,)."""
+    corners = mesh.nodes[mesh.tets[:, :4]]
+    return np.asarray(np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6.0)
+
+
+def to_quadratic(mesh: TetMesh) -> TetMesh:
+    """Return the mesh with nodes in the middle of all edges (unchanged where it has them)."""
+    if mesh.is_quadratic:
+        return mesh
+    edges = np.sort(mesh.tets[:, EDGES].reshape(-1, 2), axis=1)
+    unique, inverse = np.unique(edges, axis=0, return_inverse=True)
+    middles = mesh.nodes[unique].mean(axis=1)
+    tets = np.hstack([mesh.tets, len(mesh.nodes) + inverse.reshape(-1, 6)])
+    return TetMesh(np.vstack([mesh.nodes, middles]), tets)
+
+
+def to_linear(mesh: TetMesh) -> TetMesh:
+    """Return the mesh of the corner nodes (their numbers stay where they stand first)."""
+    if not mesh.is_quadratic:
+        return mesh
+    used = np.unique(mesh.tets[:, :4])
+    number = np.full(len(mesh.nodes), -1)
+    number[used] = np.arange(len(used))
+    return TetMesh(mesh.nodes[used], number[mesh.tets[:, :4]])
+
+
+def refined(mesh: TetMesh) -> TetMesh:
+    """Return the mesh with every tetrahedron split into eight (Bey's rule, shortest inner diagonal)."""
+    fine = to_quadratic(to_linear(mesh))
+    a, b, c, d, ab, bc, ac, ad, bd, cd = fine.tets.T
+    corner = [(a, ab, ac, ad), (ab, b, bc, bd), (ac, bc, c, cd), (ad, bd, cd, d)]
+    x = fine.nodes
+    diagonals = [((ab, cd), (ac, ad, bd, bc)), ((ac, bd), (ab, bc, cd, ad)), ((ad, bc), (ab, ac, cd, bd))]
+    lengths = np.stack([np.linalg.norm(x[p] - x[q], axis=1) for (p, q), _ in diagonals])
+    choice = lengths.argmin(axis=0)
+    blocks = [np.stack(t, axis=1) for t in corner]
+    for k, ((p, q), ring) in enumerate(diagonals):
+        pick = choice == k
+        blocks += [np.stack([p, q, ring[i], ring[(i + 1) % 4]], axis=1)[pick] for i in range(4)]
+    return oriented(TetMesh(x, np.vstack(blocks)))
+
+
+def oriented(mesh: TetMesh) -> TetMesh:
+    """Return the mesh with the node order of inverted tetrahedra mended (all volumes positive)."""
+    flip = element_volumes(mesh) < 0
+    if not flip.any():
+        return mesh
+    tets = mesh.tets.copy()
+    swap = [0, 2, 1, 3] if tets.shape[1] == 4 else [0, 2, 1, 3, 6, 5, 4, 7, 9, 8]
+    # swapping corners 1 and 2 turns the edges 01 12 02 03 13 23 into 02 12 01 03 23 13
+    if tets.shape[1] == 10:
+        swap = [0, 2, 1, 3, 6, 5, 4, 7, 9, 8]
+    tets[flip] = tets[flip][:, swap]
+    return TetMesh(mesh.nodes, tets)
+
+
+def body_parts(mesh: TetMesh) -> IntArray:
+    """Return the number of the connected part that each node belongs to, shape (n,); −1 for unused nodes."""
+    n = len(mesh.nodes)
+    first = np.repeat(mesh.tets[:, 0], mesh.tets.shape[1] - 1)
+    graph = sp.coo_matrix((np.ones(len(first)), (first, mesh.tets[:, 1:].ravel())), shape=(n, n))
+    labels = np.asarray(sp.csgraph.connected_components(graph, directed=False)[1], dtype=np.int64)
+    used = np.zeros(n, dtype=bool)
+    used[mesh.tets] = True
+    labels[~used] = -1
+    _, labels[used] = np.unique(labels[used], return_inverse=True)
+    return labels
+
+
+def check_mesh(mesh: TetMesh, where: str) -> None:
+    """Refuse what cannot be computed: no elements, flat or inverted ones, unused nodes, loose parts. Raises InputError."""
+    if not len(mesh.tets):
+        raise InputError("the mesh has no tetrahedra", where=where, expected="tetrahedra (tetra or tetra10 cells)")
+    volumes = element_volumes(mesh)
+    size = np.median(np.abs(volumes))
+    flat = np.flatnonzero(np.abs(volumes) < 1e-9 * size)
+    if len(flat):
+        raise InputError("tetrahedra without volume", where=where, found=f"{len(flat)}, the first is number {flat[0]}",
+                         expected="positive volumes", hint="femsense mesh SURFACE -o ROBOT makes a sound mesh")  # fmt: skip
+    inverted = np.flatnonzero(volumes < 0)
+    if len(inverted):
+        raise InputError("inverted tetrahedra", where=where, found=f"{len(inverted)} of {len(volumes)}, the first is number {inverted[0]}",
+                         expected="node order with positive volume", hint="swap two nodes of each inverted tetrahedron")  # fmt: skip
+    parts = body_parts(mesh)
+    if (parts < 0).any():
+        raise InputError("nodes that belong to no tetrahedron", where=where, found=f"{int((parts < 0).sum())}, the first is number {int(np.flatnonzero(parts < 0)[0])}",
+                         expected="every node in an element", hint="remove the unused nodes")  # fmt: skip
+    if parts.max() > 0:
+        raise InputError("the mesh falls into separate parts", where=where, found=f"{parts.max() + 1} parts of {np.bincount(parts).tolist()} nodes",
+                         expected="one connected body", hint="merge duplicate nodes, or keep one part")  # fmt: skip
+
+
+def surface_triangles(mesh: TetMesh) -> IntArray:
+    """Return the triangles of the boundary, outward, shape (t, 3); a face of a quadratic element gives four."""
+    faces = mesh.tets[:, FACES].reshape(-1, 3)
+    _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
+    outer = np.sort(first[count == 1])
+    corners = faces[outer]
+    if not mesh.is_quadratic:
+        return corners
+    ab, bc, ca = mesh.tets[:, 4:][:, FACE_EDGES].reshape(-1, 3)[outer].T
+    a, b, c = corners.T
+    return np.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], axis=1).reshape(-1, 3)
+
+
+def triangle_normals(positions: FloatArray, triangles: IntArray) -> FloatArray:
+    """Return area vectors (normal × area) of triangles [m²], shape (t, 3)."""
+    a, b, c = (positions[triangles[:, i]] for i in range(3))
+    return np.cross(b - a, c - a) / 2.0
+
+
+def vertex_normals(positions: FloatArray, triangles: IntArray) -> FloatArray:
+    """Return unit normals at all nodes, area weighted, shape (n, 3); zero where a node is in no triangle."""
+    area = triangle_normals(positions, triangles)
+    normals = np.zeros_like(positions)
+    for i in range(3):
+        np.add.at(normals, triangles[:, i], area)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
+
+
+def barycentric(mesh: TetMesh, elements: IntArray, points: FloatArray) -> FloatArray:
+    """Return barycentric coordinates of points in the given elements at rest, shape (p, 4)."""
+    corners = mesh.nodes[mesh.tets[elements, :4]]
+    edge = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
+    inner = np.linalg.solve(edge, (points - corners[:, 0])[..., None])[..., 0]
+    return np.concatenate([1.0 - inner.sum(axis=1, keepdims=True), inner], axis=1)
+
+
+def shape_values(barycentric_coordinates: FloatArray, *, quadratic: bool) -> FloatArray:
+    """Return the shape functions at barycentric coordinates (p, 4), shape (p, 4) or (p, 10)."""
+    L = barycentric_coordinates
+    if not quadratic:
+        return L
+    return np.concatenate([L * (2.0 * L - 1.0), 4.0 * L[:, EDGES[:, 0]] * L[:, EDGES[:, 1]]], axis=1)
+
+
+def shape_slopes(barycentric_coordinates: FloatArray, *, quadratic: bool) -> FloatArray:
+    """Return dN/dL at barycentric coordinates (p, 4), shape (p, 4 or 10, 4)."""
+    L = barycentric_coordinates
+    p = len(L)
+    if not quadratic:
+        return np.broadcast_to(np.eye(4), (p, 4, 4)).copy()
+    slopes = np.zeros((p, 10, 4))
+    for i in range(4):
+        slopes[:, i, i] = 4.0 * L[:, i] - 1.0
+    for e, (i, j) in enumerate(EDGES):
+        slopes[:, 4 + e, i] = 4.0 * L[:, j]
+        slopes[:, 4 + e, j] = 4.0 * L[:, i]
+    return slopes
+
+
+def closest_in_tet(corners: FloatArray, points: FloatArray) -> FloatArray:
+    """Return barycentric coordinates (p, 4) of the point of each tetrahedron (p, 4, 3) that is closest to points (p, 3)."""
+    edge = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
+    inner = np.linalg.solve(edge, (points - corners[:, 0])[..., None])[..., 0]
+    best = np.concatenate([1.0 - inner.sum(axis=1, keepdims=True), inner], axis=1)
+    distance = np.where((best >= 0).all(axis=1), 0.0, np.inf)
+    for face in FACES:
+        weights = closest_in_triangle(corners[:, face], points)
+        d = np.linalg.norm(np.einsum("pi,pic->pc", weights, corners[:, face]) - points, axis=1)
+        closer = d < distance
+        best[closer] = 0.0
+        best[np.ix_(closer, face)] = weights[closer]
+        distance = np.minimum(d, distance)
+    return best
+
+
+def closest_in_triangle(corners: FloatArray, points: FloatArray) -> FloatArray:
+    """Return barycentric coordinates (p, 3) of the point of each triangle (p, 3, 3) that is closest to points (p, 3).
+
+    The plane's foot where it is inside, else the best of the three sides (Ericson, Real-Time Collision Detection, 5.1).
+    """
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    ab, ac, ap = b - a, c - a, points - a
+    d00, d01, d11 = (np.einsum("pc,pc->p", u, v) for u, v in ((ab, ab), (ab, ac), (ac, ac)))
+    d20, d21 = np.einsum("pc,pc->p", ap, ab), np.einsum("pc,pc->p", ap, ac)
+    det = d00 * d11 - d01 * d01
+    safe = np.where(det > 0, det, 1.0)
+    v, w = (d11 * d20 - d01 * d21) / safe, (d00 * d21 - d01 * d20) / safe
+    best = np.stack([1.0 - v - w, v, w], axis=1)
+    inside = (det > 0) & (best >= 0).all(axis=1)
+    distance = np.where(inside, 0.0, np.inf)  # the foot beats every side
+    for i, j in ((0, 1), (1, 2), (2, 0)):
+        p, q = corners[:, i], corners[:, j]
+        along = q - p
+        length = np.einsum("pc,pc->p", along, along)
+        t = np.clip(np.einsum("pc,pc->p", points - p, along) / np.where(length > 0, length, 1.0), 0.0, 1.0)
+        d = np.linalg.norm(p + t[:, None] * along - points, axis=1)
+        closer = d < distance
+        best[closer] = 0.0
+        best[closer, i] = 1.0 - t[closer]
+        best[closer, j] = t[closer]
+        distance = np.where(closer, d, distance)
+    return best
+
+
+def embed_points(mesh: TetMesh, points: FloatArray, *, outside_rule: str = "nearest_element") -> Embedding:
+    """Tie points to the elements that hold them at rest.
+
+    A point outside goes with one element through the first-order expansion of that element's shape functions at the
+    closest point of the element (for tet4 this is the element's affine map).
+
+    Arguments:
+        mesh: the mesh at rest.
+        points: positions at rest [m], shape (p, 3).
+        outside_rule: which element carries a point outside: "nearest_element" (by distance to the element; markers)
+            or "nearest_centre" (by distance to its centre, SOFA's rule; cables).
+
+    Returns:
+        the embedding, with the distance outside.
+    """
+    points = as_points(points)
+    corners = mesh.nodes[mesh.tets[:, :4]]
+    centres = corners.mean(axis=1)
+    reach = np.linalg.norm(corners - centres[:, None], axis=2).max()
+    near = cKDTree(centres).query(points, k=1)
+    element = np.asarray(near[1], dtype=np.int64).reshape(len(points))
+    outside = np.zeros(len(points))
+    tree = cKDTree(centres)
+    for i, point in enumerate(points):
+        candidates = np.asarray(tree.query_ball_point(point, reach * (1 + 1e-9)), dtype=np.int64)
+        if len(candidates):
+            inner = barycentric(mesh, candidates, np.broadcast_to(point, (len(candidates), 3)))
+            holder = inner.min(axis=1)
+            if holder.max() >= -1e-9:
+                element[i] = candidates[holder.argmax()]
+                continue
+        element[i], outside[i] = _carrier_of_outsider(mesh, corners, centres, tree, point, near[0][i], reach, outside_rule, element[i])
+    at = closest_in_tet(corners[element], points)
+    slopes = shape_slopes(at, quadratic=mesh.is_quadratic)
+    beyond = barycentric(mesh, element, points) - at
+    weights = shape_values(at, quadratic=mesh.is_quadratic) + np.einsum("pkl,pl->pk", slopes, beyond)
+    return Embedding(mesh.tets[element], weights, element, outside)
+
+
+def _carrier_of_outsider(
+    mesh: TetMesh, corners: FloatArray, centres: FloatArray, tree: cKDTree, point: FloatArray,
+    centre_distance: float, reach: float, rule: str, nearest_centre: int,
+) -> tuple[int, float]:  # fmt: skip
+    """Return the element that carries a point outside of the mesh, and the distance to the mesh [m]."""
+    candidates = np.asarray(tree.query_ball_point(point, centre_distance + reach), dtype=np.int64)
+    nearest = closest_in_tet(corners[candidates], np.broadcast_to(point, (len(candidates), 3)))
+    distance = np.linalg.norm(np.einsum("pi,pic->pc", nearest, corners[candidates]) - point, axis=1)
+    element = nearest_centre if rule == "nearest_centre" else int(candidates[distance.argmin()])
+    return element, float(distance.min())
