@@ -44,5 +44,7 @@ def as_indices(values: npt.ArrayLike, count: int, name: str = "indices") -> IntA
     if indices.size and not np.issubdtype(indices.dtype, np.integer):
         raise InputError(f"{name} must be integers", where=name, found=indices.dtype, expected="integers")
     if indices.size and (indices.min() < 0 or indices.max() >= count):
-        raise InputError(f"{name} out of range", where=name, found=(int(indices.min()), int(indices.max())), expected=f"0 … {count - 1}")
+        raise InputError(
+            f"{name} out of range", where=name, found=(int(indices.min()), int(indices.max())), expected=f"0 … {count - 1}"
+        )
     return indices.astype(np.int64)

@@ -34,7 +34,12 @@ class TetMesh:
         if self.tets.ndim != 2 or self.tets.shape[1] not in (4, 10):
             raise InputError("tets has the wrong shape", where="tets", found=self.tets.shape, expected="(m, 4) or (m, 10)")
         if self.tets.size and (self.tets.min() < 0 or self.tets.max() >= len(self.nodes)):
-            raise InputError("tets names a node that does not exist", where="tets", found=int(self.tets.max()), expected=f"0 … {len(self.nodes) - 1}")
+            raise InputError(
+                "tets names a node that does not exist",
+                where="tets",
+                found=int(self.tets.max()),
+                expected=f"0 … {len(self.nodes) - 1}",
+            )
 
     @property
     def is_quadratic(self) -> bool:
@@ -305,7 +310,9 @@ def embed_points(mesh: TetMesh, points: FloatArray, *, outside_rule: str = "near
             if holder.max() >= -1e-9:
                 element[i] = candidates[holder.argmax()]
                 continue
-        element[i], outside[i] = _carrier_of_outsider(mesh, corners, centres, tree, point, near[0][i], reach, outside_rule, element[i])
+        element[i], outside[i] = _carrier_of_outsider(
+            mesh, corners, centres, tree, point, near[0][i], reach, outside_rule, element[i]
+        )
     at = closest_in_tet(corners[element], points)
     slopes = shape_slopes(at, quadratic=mesh.is_quadratic)
     beyond = barycentric(mesh, element, points) - at

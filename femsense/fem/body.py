@@ -1,0 +1,199 @@
+"""What the solver knows of a body: mesh, material, clamp, cables and dead loads."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from femsense.arrays import BoolArray, FloatArray, IntArray, as_indices, as_points, freeze
+from femsense.errors import InputError
+from femsense.fem.mesh import Embedding, TetMesh, element_volumes, embed_points
+from femsense.fem.stencil import FreeMap, Stencil, make_free_map, make_stencil
+
+LAWS = ("corotational", "neo_hookean", "gent")
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Material:
+    """An isotropic material, one modulus and Poisson ratio for each element."""
+
+    young_modulus: FloatArray
+    """[Pa], shape (m,)."""
+    poisson_ratio: FloatArray
+    """[1], shape (m,), in (−1, 0.5)."""
+    density: float
+    """[kg/m³]."""
+    law: str = "corotational"
+    """One of LAWS."""
+    stretch_limit: float = np.inf
+    """Gent's limit of I₁ − 3 [1]."""
+
+    def lame(self) -> tuple[FloatArray, FloatArray]:
+        """Return μ and λ [Pa], shapes (m,)."""
+        E, nu = self.young_modulus, self.poisson_ratio
+        return E / (2.0 * (1.0 + nu)), E * nu / ((1.0 + nu) * (1.0 - 2.0 * nu))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Cable:
+    """A cable through points of the body to a pull point that is fixed in space."""
+
+    name: str
+    path: Embedding
+    """Points of the body, far end first."""
+    pull_point: FloatArray
+    """[m], shape (3,)."""
+    exit_direction: FloatArray | None = None
+    """Unit vector in which the cable leaves the pull point, shape (3,); only friction feels it."""
+    min_tension: float = 0.0
+    """[N]."""
+    max_tension: float = np.inf
+    """[N]."""
+    friction: float = 0.0
+    """Capstan coefficient μ at every bend [1]."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class BodyModel:
+    """A body with its clamp, cables and dead loads. A change makes a new object (`with_…`)."""
+
+    mesh: TetMesh
+    material: Material
+    clamped: IntArray
+    """Clamped nodes, shape (k,)."""
+    clamp_stiffness: float
+    """A spring in each direction at every clamped node of the declared mesh instead of the clamp [N/m]; inf: clamped."""
+    clamp_nodes: IntArray
+    """The clamped nodes that the declared mesh has (no added mid-edge nodes); these get the springs, shape (s,)."""
+    cables: tuple[Cable, ...]
+    gravity: FloatArray
+    """[m/s²], shape (3,)."""
+    dead_forces: FloatArray
+    """Nodal forces beside the weight, constant in space [N], shape (n, 3)."""
+    stencil: Stencil
+    free_map: FreeMap
+
+    @property
+    def cable_names(self) -> tuple[str, ...]:
+        return tuple(cable.name for cable in self.cables)
+
+    def weight(self) -> FloatArray:
+        """Return the nodal forces of gravity [N], shape (n, 3) (consistent: ρ ∫ N dV g)."""
+        return self.material.density * self.stencil.node_volume[:, None] * self.gravity
+
+    def dead_load(self) -> FloatArray:
+        """Return weight plus other dead forces [N], shape (n, 3)."""
+        return self.weight() + self.dead_forces
+
+    def with_gravity(self, vector: npt.ArrayLike) -> BodyModel:
+        """Return the body under another gravity [m/s²], shape (3,)."""
+        return replace(self, gravity=freeze(vector))
+
+    def with_dead_forces(self, forces: npt.ArrayLike) -> BodyModel:
+        """Return the body with other dead forces beside its weight [N], shape (n, 3)."""
+        return replace(self, dead_forces=freeze(forces))
+
+    def with_material(self, material: Material) -> BodyModel:
+        """Return the body made of another material."""
+        return replace(self, material=material)
+
+    def with_stiffness_scale(self, scale: npt.ArrayLike) -> BodyModel:
+        """Return the body with its modulus scaled, by one number or one an element (m,)."""
+        return replace(
+            self, material=replace(self.material, young_modulus=freeze(self.material.young_modulus * np.asarray(scale)))
+        )
+
+    def with_cables(self, cables: tuple[Cable, ...]) -> BodyModel:
+        """Return the body with other cables."""
+        return replace(self, cables=cables)
+
+    def with_clamp_stiffness(self, stiffness: float) -> BodyModel:
+        """Return the body on springs instead of the clamp [N/m a node and direction]; inf gives the clamp back."""
+        fixed = self.clamped if np.isinf(stiffness) else np.zeros(0, dtype=np.int64)
+        return replace(self, clamp_stiffness=float(stiffness), free_map=make_free_map(self.stencil, self.mesh, fixed))
+
+
+def make_body(
+    mesh: TetMesh,
+    *,
+    young_modulus: float | FloatArray,
+    poisson_ratio: float | FloatArray,
+    density: float = 0.0,
+    law: str = "corotational",
+    clamped: npt.ArrayLike | BoolArray = (),
+    clamp_nodes: npt.ArrayLike | None = None,
+    cables: tuple[Cable, ...] = (),
+    gravity: npt.ArrayLike = (0.0, 0.0, 0.0),
+) -> BodyModel:
+    """Build a body.
+
+    Arguments:
+        mesh: tet4 or tet10 mesh.
+        young_modulus: [Pa], one or one an element.
+        poisson_ratio: [1], one or one an element.
+        density: [kg/m³].
+        law: "corotational", "neo_hookean" or "gent".
+        clamped: indices of the clamped nodes, or a mask (n,).
+        clamp_nodes: those of them that springs replace where the clamp gives; by default all.
+        cables: see `tie_cable`.
+        gravity: [m/s²], shape (3,).
+
+    Raises:
+        InputError: where a value is out of its range.
+    """
+    n, m = len(mesh.nodes), len(mesh.tets)
+    E, nu = (np.broadcast_to(np.asarray(v, dtype=float), (m,)) for v in (young_modulus, poisson_ratio))
+    if not (np.isfinite(E).all() and (E > 0).all()):
+        raise InputError("must be positive", where="young_modulus", found=float(E.min()), expected="> 0 Pa")
+    if not ((nu > -1).all() and (nu < 0.5).all()):
+        raise InputError(
+            "out of range", where="poisson_ratio", found=float(nu.max()), expected="−1 < ν < 0.5", hint="0.49 for silicone"
+        )
+    if law not in LAWS:
+        raise InputError("unknown law", where="law", found=law, expected=" | ".join(LAWS))
+    mask = np.asarray(clamped)
+    indices = (
+        np.flatnonzero(mask)
+        if mask.dtype == np.bool_
+        else as_indices(clamped, n, "clamped")
+        if mask.size
+        else np.zeros(0, np.int64)
+    )
+    springs = indices if clamp_nodes is None else as_indices(clamp_nodes, n, "clamp_nodes")
+    if (element_volumes(mesh) <= 0).any():
+        raise InputError(
+            "inverted or flat tetrahedra", where="mesh", expected="positive volumes", hint="see femsense.fem.mesh.check_mesh"
+        )
+    stencil = make_stencil(mesh)
+    material = Material(freeze(E), freeze(nu), float(density), law)
+    return BodyModel(mesh, material, freeze(np.unique(indices), np.int64), np.inf, freeze(springs, np.int64), cables,
+                     freeze(gravity), freeze(np.zeros((n, 3))), stencil, make_free_map(stencil, mesh, indices))  # fmt: skip
+
+
+def tie_cable(
+    mesh: TetMesh,
+    name: str,
+    path: npt.ArrayLike,
+    pull_point: npt.ArrayLike,
+    *,
+    exit_direction: npt.ArrayLike | None = None,
+    min_tension: float = 0.0,
+    max_tension: float = np.inf,
+    friction: float = 0.0,
+) -> Cable:
+    """Tie a cable to the body: each point of its path [m], shape (p, 3), far end first, goes with an element (see `embed_points`)."""
+    embedding = embed_points(mesh, as_points(path, f"path of cable {name}"), outside_rule="nearest_centre")
+    direction = None
+    if exit_direction is not None:
+        vector = as_points(exit_direction, f"exit_direction of cable {name}")[0]
+        length = np.linalg.norm(vector)
+        if length == 0:
+            raise InputError(
+                "has no length", where=f"exit_direction of cable {name}", found=vector.tolist(), expected="a direction"
+            )
+        direction = freeze(vector / length)
+    return Cable(
+        name, embedding, freeze(as_points(pull_point)[0]), direction, float(min_tension), float(max_tension), float(friction)
+    )

@@ -1,0 +1,148 @@
+"""What depends on the mesh alone: gradients at the quadrature points and the fixed sparsity pattern of the stiffness."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+
+from femsense.arrays import FloatArray, IntArray, freeze
+from femsense.fem.mesh import TetMesh, shape_slopes, shape_values
+
+_A, _B = 0.5854101966249685, 0.1381966011250105
+QUADRATURE = np.array([[_A, _B, _B, _B], [_B, _A, _B, _B], [_B, _B, _A, _B], [_B, _B, _B, _A]])
+"""Four points of degree 2 (barycentric coordinates), equal weights (Keast 1986, rule 2)."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Stencil:
+    """Gradients, volumes and block pattern of a mesh."""
+
+    gradients: FloatArray
+    """Shape function gradients [1/m], shape (m, q, a, 3): element, quadrature point, node, direction."""
+    volumes: FloatArray
+    """Volume of each quadrature point [m³], shape (m, q)."""
+    node_volume: FloatArray
+    """∫ N dV [m³], shape (n,)."""
+    slots: IntArray
+    """Where the 3×3 block of nodes (a, b) of an element goes, shape (m, a, a)."""
+    block_rows: IntArray
+    """Block pattern in CSR: indptr, shape (n + 1,)."""
+    block_columns: IntArray
+    """Block pattern in CSR: indices, shape (nb,)."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class FreeMap:
+    """The free unknowns in the order in which they are factorised, and where their stiffness entries stand."""
+
+    dofs: IntArray
+    """Unknowns 3·node + direction, in factor order, shape (f,)."""
+    indptr: IntArray
+    """CSC pattern of the reduced matrix."""
+    indices: IntArray
+    source: IntArray
+    """For each entry of the CSC matrix, its place in the flat block array, shape (nnz,)."""
+
+
+def make_stencil(mesh: TetMesh) -> Stencil:
+    """Return gradients, volumes and pattern of a mesh."""
+    quadratic = mesh.is_quadratic
+    points = QUADRATURE if quadratic else np.full((1, 4), 0.25)
+    slopes = shape_slopes(points, quadratic=quadratic)  # (q, a, 4)
+    local = slopes[:, :, 1:] - slopes[:, :, :1]  # dN/dξ for ξ = L1..L3
+    x = mesh.nodes[mesh.tets]
+    jacobian = np.einsum("mac,qai->mqci", x, local)
+    inverse = np.linalg.inv(jacobian)
+    gradients = np.einsum("qai,mqic->mqac", local, inverse)
+    volumes = np.linalg.det(jacobian) / (6.0 * len(points))
+    node_volume = np.zeros(len(mesh.nodes))
+    values = _moments(mesh, volumes)
+    np.add.at(node_volume, mesh.tets, values)
+    rows, columns, slots = _block_pattern(mesh)
+    return Stencil(
+        freeze(gradients),
+        freeze(volumes),
+        freeze(node_volume),
+        freeze(slots, np.int64),
+        freeze(rows, np.int64),
+        freeze(columns, np.int64),
+    )
+
+
+def _moments(mesh: TetMesh, volumes: FloatArray) -> FloatArray:
+    """Return ∫ N dV of each node of each element [m³], shape (m, a); exact where edges are straight."""
+    if not mesh.is_quadratic:
+        return np.repeat(volumes / 4.0, 4, axis=1)
+    return np.asarray(np.einsum("mq,qa->ma", volumes, shape_values(QUADRATURE, quadratic=True)))
+
+
+def _block_pattern(mesh: TetMesh) -> tuple[IntArray, IntArray, IntArray]:
+    """Return indptr and indices of the node graph, and the slot of every element block."""
+    n, a = len(mesh.nodes), mesh.tets.shape[1]
+    rows = np.repeat(mesh.tets, a, axis=1).ravel()
+    columns = np.tile(mesh.tets, (1, a)).ravel()
+    keys, slots = np.unique(rows * n + columns, return_inverse=True)
+    indptr = np.searchsorted(keys, np.arange(n + 1) * n)
+    return indptr, keys % n, slots.reshape(len(mesh.tets), a, a)
+
+
+def make_free_map(stencil: Stencil, mesh: TetMesh, fixed: IntArray) -> FreeMap:
+    """Return the map from blocks to the matrix of the unknowns that are not fixed, ordered for little fill."""
+    n = len(mesh.nodes)
+    free_node = np.ones(n, dtype=bool)
+    free_node[fixed] = False
+    free_node[np.diff(stencil.block_rows) == 0] = False
+    order = dissection_order(mesh.nodes, stencil, np.flatnonzero(free_node))
+    place = np.full(n, -1)
+    place[order] = np.arange(len(order))
+    rows = np.repeat(np.arange(n), np.diff(stencil.block_rows))
+    keep = (place[rows] >= 0) & (place[stencil.block_columns] >= 0)
+    block = np.flatnonzero(keep)
+    i, j = place[rows[keep]], place[stencil.block_columns[keep]]
+    ci, cj = np.divmod(np.arange(9), 3)
+    matrix = sp.coo_matrix(
+        ((block[:, None] * 9 + np.arange(9)).ravel() + 1, ((3 * i[:, None] + ci).ravel(), (3 * j[:, None] + cj).ravel())),
+        shape=(3 * len(order), 3 * len(order)),
+    ).tocsc()
+    matrix.sort_indices()
+    dofs = (3 * order[:, None] + np.arange(3)).ravel()
+    return FreeMap(
+        freeze(dofs, np.int64),
+        freeze(matrix.indptr, np.int32),
+        freeze(matrix.indices, np.int32),
+        freeze(matrix.data - 1, np.int64),
+    )
+
+
+def dissection_order(nodes: FloatArray, stencil: Stencil, free: IntArray, *, leaf: int = 40) -> IntArray:
+    """Return free nodes in nested-dissection order: both halves first, then the nodes that separate them.
+
+    The cut is a plane at the median along the longest side of each part (George 1973, with coordinates in place of a grid).
+    """
+    side = np.zeros(len(nodes), dtype=np.int8)
+    result: list[IntArray] = []
+
+    def dissect(part: IntArray) -> None:
+        if len(part) <= leaf:
+            result.append(part)
+            return
+        x = nodes[part]
+        along = x[:, np.argmax(np.ptp(x, axis=0))]
+        low = part[along <= np.median(along)]
+        high = part[along > np.median(along)]
+        if not len(low) or not len(high):
+            result.append(part)
+            return
+        side[high] = 1
+        touching = np.array(
+            [side[stencil.block_columns[stencil.block_rows[v] : stencil.block_rows[v + 1]]].any() for v in low], dtype=bool
+        )
+        side[high] = 0
+        dissect(low[~touching])
+        dissect(high)
+        result.append(low[touching])
+
+    dissect(free)
+    return np.concatenate(result) if result else free

@@ -1,0 +1,98 @@
+"""A robot as the program sees it: a body, what is measured on it, and how commands become inputs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from femsense.arrays import FloatArray, IntArray, freeze
+from femsense.fem.body import BodyModel
+from femsense.fem.mesh import Embedding, embed_points, surface_triangles
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Actuation:
+    """From recorded cable inputs to true ones, one value a cable, in the order of the body's cables."""
+
+    gain: FloatArray
+    """true = gain × recorded [1], shape (a,)."""
+    tension_offset: FloatArray
+    """true = max(0, recorded + offset) [N], shape (a,); at rest too."""
+    displacement_offset: FloatArray
+    """true = recorded + offset [m], shape (a,)."""
+    slack: FloatArray
+    """Play that is taken up before a cable pulls [m], shape (a,)."""
+    stretch_stiffness: FloatArray
+    """Cable stiffness [N/m], shape (a,); inf: does not stretch."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Observation:
+    """What stands between the body and the measured points."""
+
+    depth_scale: float = 1.0
+    """measured distance along the ray = scale × true distance + offset [1]."""
+    depth_offset: float = 0.0
+    """[m]."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Robot:
+    """A robot: a body with markers, features and the effects that its model holds."""
+
+    name: str
+    body: BodyModel
+    marker_names: tuple[str, ...]
+    marker_points: FloatArray
+    """Markers at rest [m], shape (k, 3)."""
+    markers: Embedding
+    """The markers' ties to the body."""
+    features: IntArray
+    """Surface nodes that serve as feature points, spread evenly over the free surface, shape (e,)."""
+    color_rgb: FloatArray | None
+    """What the segmentation looks for, each in [0, 1], shape (3,)."""
+    actuation: Actuation
+    observation: Observation
+    creep: tuple[tuple[float, float], ...] = ()
+    """Terms (fraction [1], time [s]) of the creep compliance."""
+    document: dict[str, Any] | None = None
+    """The declared robot.toml (before effects), as plain tables; None where the robot was made in Python."""
+    folder: Path | None = None
+    """Where robot.toml and the mesh stand."""
+
+    def with_body(self, body: BodyModel) -> Robot:
+        """Return the robot with another body on the same mesh."""
+        return replace(self, body=body)
+
+    def with_marker_points(self, points: FloatArray) -> Robot:
+        """Return the robot with its markers elsewhere at rest [m], shape (k, 3)."""
+        return replace(self, marker_points=freeze(points), markers=embed_points(self.body.mesh, points))
+
+
+def plain_actuation(cable_count: int) -> Actuation:
+    """Return the actuation of cables that do exactly what was recorded."""
+    one, zero = np.ones(cable_count), np.zeros(cable_count)
+    return Actuation(freeze(one), freeze(zero), freeze(zero), freeze(zero), freeze(one * np.inf))
+
+
+def spread_features(body: BodyModel, count: int) -> IntArray:
+    """Return surface nodes spread evenly over the free surface (farthest-point sampling), shape (≤ count,).
+
+    Nodes of the clamp do not count; the first is the free surface node that is farthest from the clamp, so that the
+    result is the same whatever the numbering.
+    """
+    surface = np.unique(surface_triangles(body.mesh))
+    free = np.setdiff1d(surface, body.clamped)
+    if not len(free) or count <= 0:
+        return np.zeros(0, dtype=np.int64)
+    x = body.mesh.nodes[free]
+    anchor = body.mesh.nodes[body.clamped].mean(axis=0) if len(body.clamped) else x.mean(axis=0)
+    chosen = [int(np.argmax(np.linalg.norm(x - anchor, axis=1)))]
+    distance = np.linalg.norm(x - x[chosen[0]], axis=1)
+    while len(chosen) < min(count, len(free)):
+        chosen.append(int(np.argmax(distance)))
+        distance = np.minimum(distance, np.linalg.norm(x - x[chosen[-1]], axis=1))
+    return freeze(free[chosen], np.int64)
