@@ -1,0 +1,396 @@
+# mypy: allow-untyped-decorators
+"""Which points are robot, which are something else: by colour, by the model, by planes and clusters.
+
+Source: "Calibration and force sensing with an RGB-D camera", section V.A.2. The idea of growing regions by colour and then
+merging them is that of the Point Cloud Library (Zhan, Liang and Xiao 2009); here it is a union of neighbours in a grid.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from femsense.arrays import BoolArray, FloatArray, IntArray, as_points, freeze
+from femsense.errors import DataError, InputError
+from femsense.pointcloud.cloud import PointCloud
+from femsense.pointcloud.grid import adjacent_labels, build_grid, by_size, connected_labels, count_neighbors, find_root, positive
+
+_DARK = 0.08  # brightness below which a colour says nothing: a few steps of 8-bit noise turn its hue
+
+
+# --- colour -----------------------------------------------------------------------------------------------------------
+
+
+def shading_features(colors: npt.ArrayLike, *, brightness_weight: float = 0.3) -> FloatArray:
+    """Return colours as chromaticity and weakly weighted brightness, shape (n, 3).
+
+        (r − g, (r + g)/2 − b) / (r + g + b + 0.1)   and   brightness_weight · (r + g + b)/3
+
+    A shadow scales r, g and b together, so it moves the last number only; 0.1 keeps dark noise small.
+
+    Arguments:
+        colors: red, green, blue in [0, 1], shape (n, 3).
+        brightness_weight: 0 ignores brightness, 1 lets black and white lie 1 apart.
+    """
+    rgb = as_points(colors, "colors")
+    total = rgb.sum(axis=1)
+    red_green = (rgb[:, 0] - rgb[:, 1]) / (total + 0.1)
+    yellow_blue = (0.5 * (rgb[:, 0] + rgb[:, 1]) - rgb[:, 2]) / (total + 0.1)
+    return np.column_stack([red_green, yellow_blue, brightness_weight * total / 3.0])
+
+
+def region_growing(
+    cloud: PointCloud,
+    *,
+    radius_m: float,
+    color_threshold: float = 0.03,
+    merge_threshold: float = 0.05,
+    min_size: int = 100,
+    brightness_weight: float = 0.3,
+) -> IntArray:
+    """Return the region of each point, shape (n,): 0 is the largest, −1 a small region that touches no other.
+
+    1. Neighbours within radius_m whose colours differ by at most color_threshold belong together.
+    2. Regions that touch are merged while their mean colours differ by at most merge_threshold, the most alike first.
+    3. A region below min_size joins the neighbour whose mean colour is closest.
+
+    Arguments:
+        cloud: with colours.
+        radius_m: neighbourhood [m], about three times the spacing of the points.
+        color_threshold, merge_threshold: distances of `shading_features`, no unit.
+        min_size: points of the smallest region that stands alone.
+        brightness_weight: see `shading_features`.
+    Raises:
+        InputError: a cloud without colours, a radius that is not positive.
+    """
+    features = shading_features(_need_colors(cloud), brightness_weight=brightness_weight)
+    radius = positive(radius_m, "radius_m")
+    grid = build_grid(cloud.points, radius)
+    labels = by_size(connected_labels(grid, radius, features, float(color_threshold)), 1)
+    if len(labels) == 0:
+        return labels
+    pairs = adjacent_labels(grid, radius, labels)
+    sizes = np.bincount(labels)
+    sums = np.stack([np.bincount(labels, weights=column) for column in features.T], axis=1)
+    return by_size(_merge_regions(pairs, sizes, sums, float(merge_threshold), int(min_size))[labels], int(min_size))
+
+
+def color_mask(
+    colors: npt.ArrayLike,
+    color_rgb: npt.ArrayLike,
+    *,
+    tolerance_deg: float = 10.0,
+    shade: tuple[float, float] = (0.15, 2.0),
+) -> BoolArray:
+    """Return which colours are color_rgb in some light, shape (n,).
+
+    The angle between two colours as vectors (r, g, b) does not change when light or shadow scales one of them.
+
+    Arguments:
+        colors: red, green, blue in [0, 1], shape (n, 3).
+        color_rgb: the colour looked for, shape (3,).
+        tolerance_deg: largest angle [deg]; 10 tells saturated colours apart, a grey robot needs less.
+        shade: smallest and largest brightness as a multiple of that of color_rgb.
+    Raises:
+        InputError: color_rgb is not a colour in [0, 1], or too dark to have a hue.
+    """
+    rgb = as_points(colors, "colors")
+    wanted = np.asarray(color_rgb, dtype=np.float64).ravel()
+    if wanted.shape != (3,) or not np.isfinite(wanted).all() or wanted.min() < 0.0 or wanted.max() > 1.0:
+        raise InputError("not a colour", where="color_rgb", found=color_rgb, expected="three numbers in 0 … 1")
+    length = float(np.linalg.norm(wanted))
+    if length < _DARK:
+        raise InputError("too dark to be told from shadow", where="color_rgb", found=color_rgb, expected=f"a length above {_DARK}")
+    lengths = np.linalg.norm(rgb, axis=1)
+    cosine = rgb @ (wanted / length) / np.maximum(lengths, 1e-12)
+    in_light = (lengths >= max(shade[0] * length, _DARK)) & (lengths <= shade[1] * length)
+    return np.asarray(in_light & (cosine >= np.cos(np.deg2rad(tolerance_deg))))
+
+
+def segment_robot(
+    cloud: PointCloud,
+    color_rgb: npt.ArrayLike,
+    *,
+    tolerance_deg: float = 10.0,
+    shade: tuple[float, float] = (0.15, 2.0),
+    vote_radius_m: float | None = None,
+) -> tuple[PointCloud, PointCloud]:
+    """Return (robot, surroundings) by the robot's colour.
+
+    Arguments:
+        cloud: with colours.
+        color_rgb: the robot's colour in [0, 1], shape (3,).
+        tolerance_deg, shade: see `color_mask`.
+        vote_radius_m: where given, each point takes the side of the majority within this radius [m], itself included; that removes
+            speckle, dark points and glints. Keep it below the size of the smallest object that may touch the robot.
+    Raises:
+        InputError: a cloud without colours, or a colour that cannot be used.
+    """
+    mask = color_mask(_need_colors(cloud), color_rgb, tolerance_deg=tolerance_deg, shade=shade)
+    if vote_radius_m is not None:
+        mask = _majority(cloud.points, mask, positive(vote_radius_m, "vote_radius_m"))
+    return cloud.select(mask), cloud.select(~mask)
+
+
+# --- model ------------------------------------------------------------------------------------------------------------
+
+
+def segment_by_model(
+    cloud: PointCloud,
+    surface_points: npt.ArrayLike,
+    surface_normals: npt.ArrayLike,
+    distance_m: float,
+    *,
+    color_rgb: npt.ArrayLike | None = None,
+    tolerance_deg: float = 10.0,
+    learn_colors: bool = True,
+) -> tuple[PointCloud, PointCloud]:
+    """Return (robot, surroundings) by the predicted surface: points near it are robot.
+
+    The distance is taken to the tangent plane of the nearest surface point; sideways the spacing of the surface points counts
+    as well, so that a coarse surface has no holes. Colour helps where there is some: near points whose colour is not
+    color_rgb, or, without it, is more like the far points than like the near ones, are surroundings. Without colours,
+    objects closer than distance_m count as robot: search contacts with a radius above distance_m.
+
+    Arguments:
+        surface_points: predicted surface [m], shape (s, 3).
+        surface_normals: outward normals, shape (s, 3).
+        distance_m: largest distance from the surface [m]; above the expected error of the prediction.
+        color_rgb, tolerance_deg: see `color_mask`; optional.
+        learn_colors: without color_rgb, learn both sides' colours from this cloud.
+    Raises:
+        InputError: wrong shapes, no surface, a distance that is not positive.
+    """
+    from scipy.spatial import cKDTree
+
+    surface, normals = surface_pair(surface_points, surface_normals, "surface_points", "surface_normals")
+    distance = positive(distance_m, "distance_m")
+    if len(surface) == 0:
+        raise InputError("no surface", where="surface_points", found="0 points", expected="at least one")
+    tree = cKDTree(surface)
+    _, nearest = tree.query(cloud.points)
+    offset, sideways = along_and_across(cloud.points - surface[nearest], normals[nearest])
+    near: BoolArray = (np.abs(offset) <= distance) & (sideways <= distance + _spacing(tree))
+    if cloud.colors is not None and color_rgb is not None:
+        near &= color_mask(cloud.colors, color_rgb, tolerance_deg=tolerance_deg)
+    elif cloud.colors is not None and learn_colors:
+        near = _like_the_near(shading_features(cloud.colors, brightness_weight=0.3), near, np.abs(offset) <= 0.5 * distance)
+    return cloud.select(near), cloud.select(~near)
+
+
+# --- planes and clusters ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Plane:
+    """The points p with normal · p = offset; the normal points to the side of the frame's origin (the camera)."""
+
+    normal: FloatArray
+    """Unit normal, shape [3]."""
+    offset: float
+    """Signed distance of the plane from the origin along the normal [m], ≤ 0."""
+
+    def distance(self, points: FloatArray) -> FloatArray:
+        """Return the signed distance of points (n, 3) from the plane [m], > 0 on the camera's side, shape (n,)."""
+        return np.asarray(points @ self.normal - self.offset)
+
+
+def find_plane(
+    points: npt.ArrayLike, distance_m: float, *, trials: int = 300, rng: np.random.Generator | None = None
+) -> Plane:
+    """Return the plane with the most points within distance_m [m] (RANSAC, then least squares over its points).
+
+    Arguments:
+        points: [m], shape (n, 3).
+        distance_m: half the thickness of the plane [m], about two standard deviations of the depth.
+        trials: planes through three random points; 300 miss a plane that holds 30 % of the points with probability 3e-4.
+        rng: source of randomness; a fixed seed where it is not given.
+    Raises:
+        DataError: fewer than three points, or all of them on a line.
+    """
+    positions = as_points(points)
+    distance = positive(distance_m, "distance_m")
+    generator = np.random.default_rng(0) if rng is None else rng
+    if len(positions) < 3:
+        raise DataError(f"no plane in {len(positions)} points: at least 3 are needed")
+    sample = positions[np.sort(generator.permutation(len(positions))[:3000])]
+    corners = sample[generator.integers(len(sample), size=(int(trials), 3))]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    lengths = np.linalg.norm(normals, axis=1)
+    usable = lengths > 1e-9 * max(float(np.ptp(positions, axis=0).max()) ** 2, 1e-300)
+    if not usable.any():
+        raise DataError("no plane: the points lie on a line or in one place")
+    normals = normals[usable] / lengths[usable, None]
+    offsets = np.einsum("ij,ij->i", normals, corners[usable, 0])
+    score = (np.abs(sample @ normals.T - offsets) <= distance).sum(axis=0)
+    best = int(np.argmax(score))
+    plane = _facing_origin(normals[best], float(offsets[best]))
+    for _ in range(5):
+        plane = _fit_plane(positions[np.abs(plane.distance(positions)) <= distance], plane)
+    return plane
+
+
+def remove_plane(
+    cloud: PointCloud,
+    distance_m: float,
+    *,
+    keep_behind: bool = False,
+    trials: int = 300,
+    rng: np.random.Generator | None = None,
+) -> tuple[PointCloud, Plane]:
+    """Return the points on the camera's side of the largest plane, and that plane.
+
+    Arguments:
+        distance_m: points closer to the plane than this are removed [m].
+        keep_behind: keep the points behind the plane too (under the table).
+        trials, rng: see `find_plane`.
+    Raises:
+        DataError: fewer than three points, or all of them on a line.
+    """
+    plane = find_plane(cloud.points, distance_m, trials=trials, rng=rng)
+    height = plane.distance(cloud.points)
+    return cloud.select((height > distance_m) | (keep_behind & (height < -distance_m))), plane
+
+
+def euclidean_clusters(points: npt.ArrayLike, distance_m: float, min_size: int = 1) -> IntArray:
+    """Return the cluster of each point, shape (n,): 0 is the largest, −1 a cluster below min_size.
+
+    Points closer than distance_m [m] to each other belong together. points [m], shape (n, 3). Raises InputError.
+    """
+    positions = as_points(points)
+    distance = positive(distance_m, "distance_m")
+    colorless = np.zeros((len(positions), 1))
+    return by_size(connected_labels(build_grid(positions, distance), distance, colorless, 1.0), int(min_size))
+
+
+# --- helpers ----------------------------------------------------------------------------------------------------------
+
+
+def surface_pair(points: npt.ArrayLike, normals: npt.ArrayLike, points_name: str, normals_name: str) -> tuple[FloatArray, FloatArray]:
+    """Return points (n, 3) and unit normals (n, 3) after checking that they belong together. Raises InputError."""
+    positions, directions = as_points(points, points_name), as_points(normals, normals_name)
+    if len(positions) != len(directions):
+        raise InputError(f"one normal per row of {points_name}", where=normals_name, found=len(directions), expected=len(positions))
+    lengths = np.linalg.norm(directions, axis=1)
+    if (lengths <= 0.0).any():
+        row = int(np.flatnonzero(lengths <= 0.0)[0])
+        raise InputError("a normal of length zero", where=f"{normals_name}[{row}]", found=directions[row].tolist(), expected="a direction")
+    return positions, directions / lengths[:, None]
+
+
+def along_and_across(differences: FloatArray, normals: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the parts of differences (n, 3) along unit normals (signed) and across them (≥ 0), shape (n,) each."""
+    along = np.einsum("ij,ij->i", differences, normals)
+    return along, np.linalg.norm(differences - along[:, None] * normals, axis=1)
+
+
+def _need_colors(cloud: PointCloud) -> FloatArray:
+    if cloud.colors is None:
+        raise InputError("the cloud has no colours", where="cloud", expected="colours", hint="segment_by_model works without")
+    return cloud.colors
+
+
+def _majority(points: FloatArray, mask: BoolArray, radius: float) -> BoolArray:
+    from femsense.pointcloud.grid import count_within
+
+    voters = count_neighbors(build_grid(points, radius), radius) + 1
+    for_robot = count_within(build_grid(points[mask], radius), points, radius)
+    return np.where(2 * for_robot == voters, mask, 2 * for_robot > voters)
+
+
+def _spacing(tree: object) -> float:
+    """Return the largest distance from a surface point to its third neighbour [m]: the holes between the points."""
+    data = np.asarray(tree.data)  # type: ignore[attr-defined]
+    if len(data) < 4:
+        return 0.0
+    distances, _ = tree.query(data, k=4)  # type: ignore[attr-defined]
+    return float(np.quantile(distances[:, -1], 0.95))
+
+
+def _like_the_near(features: FloatArray, near: BoolArray, sure: BoolArray) -> BoolArray:
+    """Return the near points whose colour is more likely that of the surely near points than that of the far ones.
+
+    Both are normal distributions; where they overlap too much (or one has under 30 points) colour decides nothing.
+    """
+    inner, outer = features[near & sure], features[~near]
+    if min(len(inner), len(outer)) < 30:
+        return near
+    inner_center, outer_center = np.median(inner, axis=0), np.median(outer, axis=0)
+    inner_spread, outer_spread = _spread(inner, inner_center), _spread(outer, outer_center)
+    apart = np.abs(inner_center - outer_center) / (inner_spread + outer_spread)
+    if apart.max() < 2.0:
+        return near
+    inner_cost = (((features - inner_center) / inner_spread) ** 2).sum(axis=1) + 2.0 * np.log(inner_spread).sum()
+    outer_cost = (((features - outer_center) / outer_spread) ** 2).sum(axis=1) + 2.0 * np.log(outer_spread).sum()
+    return near & (inner_cost <= outer_cost)
+
+
+def _spread(values: FloatArray, center: FloatArray) -> FloatArray:
+    """Return the standard deviation of each column from its median deviation, at least one step of an 8-bit colour."""
+    return np.asarray(np.maximum(1.4826 * np.median(np.abs(values - center), axis=0), 1.0 / 255.0))
+
+
+def _facing_origin(normal: FloatArray, offset: float) -> Plane:
+    sign = -1.0 if offset > 0.0 else 1.0
+    return Plane(freeze(sign * normal), sign * offset)
+
+
+def _fit_plane(points: FloatArray, start: Plane) -> Plane:
+    if len(points) < 3:
+        return start
+    center = points.mean(axis=0)
+    _, vectors = np.linalg.eigh((points - center).T @ (points - center))
+    return _facing_origin(vectors[:, 0], float(vectors[:, 0] @ center))
+
+
+@njit(cache=True)
+def _merge_regions(pairs: IntArray, sizes: IntArray, sums: FloatArray, threshold: float, min_size: int) -> IntArray:
+    """Return the root of each region (k,); sizes (k,) and sums (k, 3) are those of the regions, pairs (m, 2) touch."""
+    parent = np.arange(len(sizes))
+    merged = True
+    while merged:
+        merged = False
+        for e in np.argsort(_differences(pairs, parent, sizes, sums), kind="mergesort"):
+            a, b = find_root(parent, pairs[e, 0]), find_root(parent, pairs[e, 1])
+            if a != b and _mean_distance(a, b, sizes, sums) <= threshold:
+                _join(parent, sizes, sums, a, b)
+                merged = True
+    merged = True
+    while merged:
+        merged = False
+        for e in np.argsort(_differences(pairs, parent, sizes, sums), kind="mergesort"):
+            a, b = find_root(parent, pairs[e, 0]), find_root(parent, pairs[e, 1])
+            if a != b and min(sizes[a], sizes[b]) < min_size:
+                _join(parent, sizes, sums, a, b)
+                merged = True
+    for i in range(len(parent)):
+        parent[i] = find_root(parent, i)
+    return parent
+
+
+@njit(cache=True)
+def _mean_distance(a: int, b: int, sizes: IntArray, sums: FloatArray) -> float:
+    total = 0.0
+    for k in range(sums.shape[1]):
+        total += (sums[a, k] / sizes[a] - sums[b, k] / sizes[b]) ** 2
+    return float(np.sqrt(total))
+
+
+@njit(cache=True)
+def _differences(pairs: IntArray, parent: IntArray, sizes: IntArray, sums: FloatArray) -> FloatArray:
+    result = np.zeros(len(pairs))
+    for e in range(len(pairs)):
+        result[e] = _mean_distance(find_root(parent, pairs[e, 0]), find_root(parent, pairs[e, 1]), sizes, sums)
+    return result
+
+
+@njit(cache=True)
+def _join(parent: IntArray, sizes: IntArray, sums: FloatArray, a: int, b: int) -> None:
+    low, high = min(a, b), max(a, b)
+    parent[high] = low
+    sizes[low] += sizes[high]
+    for k in range(sums.shape[1]):
+        sums[low, k] += sums[high, k]
