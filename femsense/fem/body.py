@@ -53,6 +53,18 @@ class Cable:
     """[N]."""
     friction: float = 0.0
     """Capstan coefficient μ at every bend [1]."""
+    stretch_stiffness: float = np.inf
+    """Stiffness of the cable itself [N/m]; inf: it does not stretch."""
+
+
+def segment_ties(path: Embedding) -> tuple[IntArray, FloatArray]:
+    """Return the nodes that move each segment of a cable and their weights in the difference of its ends, shapes (s, 2k).
+
+    The last segment ends at the pull point, which no node moves: its second half has weight 0.
+    """
+    ahead = np.vstack([path.nodes[1:], path.nodes[-1:]])
+    weight = np.vstack([path.weights[1:], np.zeros((1, path.weights.shape[1]))])
+    return np.hstack([path.nodes, ahead]), np.hstack([-path.weights, weight])
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -73,6 +85,8 @@ class BodyModel:
     dead_forces: FloatArray
     """Nodal forces beside the weight, constant in space [N], shape (n, 3)."""
     stencil: Stencil
+    cable_slots: tuple[IntArray, ...]
+    """Where the geometric stiffness of each segment of each cable goes, one array (s, 2k, 2k) a cable."""
     free_map: FreeMap
 
     @property
@@ -106,7 +120,9 @@ class BodyModel:
         )
 
     def with_cables(self, cables: tuple[Cable, ...]) -> BodyModel:
-        """Return the body with other cables."""
+        """Return the body with changed cables; their paths must stay, since the sparsity pattern holds them."""
+        if [c.path for c in cables] != [c.path for c in self.cables]:
+            raise InputError("the paths of the cables must stay", where="cables", hint="make_body builds a body with other paths")
         return replace(self, cables=cables)
 
     def with_clamp_stiffness(self, stiffness: float) -> BodyModel:
@@ -166,10 +182,11 @@ def make_body(
         raise InputError(
             "inverted or flat tetrahedra", where="mesh", expected="positive volumes", hint="see femsense.fem.mesh.check_mesh"
         )
-    stencil = make_stencil(mesh)
+    ties = [segment_ties(cable.path) for cable in cables]
+    stencil, cable_slots = make_stencil(mesh, [nodes for nodes, _ in ties])
     material = Material(freeze(E), freeze(nu), float(density), law)
     return BodyModel(mesh, material, freeze(np.unique(indices), np.int64), np.inf, freeze(springs, np.int64), cables,
-                     freeze(gravity), freeze(np.zeros((n, 3))), stencil, make_free_map(stencil, mesh, indices))  # fmt: skip
+                     freeze(gravity), freeze(np.zeros((n, 3))), stencil, cable_slots, make_free_map(stencil, mesh, indices))  # fmt: skip
 
 
 def tie_cable(

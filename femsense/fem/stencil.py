@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
+from scipy.sparse.linalg import splu
 
 from femsense.arrays import FloatArray, IntArray, freeze
 from femsense.fem.mesh import TetMesh, shape_slopes, shape_values
@@ -46,8 +47,16 @@ class FreeMap:
     """For each entry of the CSC matrix, its place in the flat block array, shape (nnz,)."""
 
 
-def make_stencil(mesh: TetMesh) -> Stencil:
-    """Return gradients, volumes and pattern of a mesh."""
+def make_stencil(mesh: TetMesh, cliques: list[IntArray] | None = None) -> tuple[Stencil, tuple[IntArray, ...]]:
+    """Return gradients, volumes and pattern of a mesh.
+
+    Arguments:
+        mesh: the mesh at rest.
+        cliques: sets of nodes that are coupled beside the elements (segments of cables), arrays (s, k) of node indices.
+
+    Returns:
+        the stencil, and for each clique array the slots of its node pairs, shape (s, k, k).
+    """
     quadratic = mesh.is_quadratic
     points = QUADRATURE if quadratic else np.full((1, 4), 0.25)
     slopes = shape_slopes(points, quadratic=quadratic)  # (q, a, 4)
@@ -60,15 +69,9 @@ def make_stencil(mesh: TetMesh) -> Stencil:
     node_volume = np.zeros(len(mesh.nodes))
     values = _moments(mesh, volumes)
     np.add.at(node_volume, mesh.tets, values)
-    rows, columns, slots = _block_pattern(mesh)
-    return Stencil(
-        freeze(gradients),
-        freeze(volumes),
-        freeze(node_volume),
-        freeze(slots, np.int64),
-        freeze(rows, np.int64),
-        freeze(columns, np.int64),
-    )
+    rows, columns, slots = _block_pattern(len(mesh.nodes), [mesh.tets, *(cliques or [])])
+    stencil = Stencil(freeze(gradients), freeze(volumes), freeze(node_volume), slots[0], freeze(rows, np.int64), freeze(columns, np.int64))
+    return stencil, slots[1:]
 
 
 def _moments(mesh: TetMesh, volumes: FloatArray) -> FloatArray:
@@ -78,14 +81,14 @@ def _moments(mesh: TetMesh, volumes: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("mq,qa->ma", volumes, shape_values(QUADRATURE, quadratic=True)))
 
 
-def _block_pattern(mesh: TetMesh) -> tuple[IntArray, IntArray, IntArray]:
-    """Return indptr and indices of the node graph, and the slot of every element block."""
-    n, a = len(mesh.nodes), mesh.tets.shape[1]
-    rows = np.repeat(mesh.tets, a, axis=1).ravel()
-    columns = np.tile(mesh.tets, (1, a)).ravel()
-    keys, slots = np.unique(rows * n + columns, return_inverse=True)
+def _block_pattern(n: int, groups: list[IntArray]) -> tuple[IntArray, IntArray, tuple[IntArray, ...]]:
+    """Return indptr and indices of the graph of n nodes that groups (g, k) of nodes couple, and the slots of their pairs."""
+    pairs = [(group[:, :, None] * n + group[:, None, :]) for group in groups]
+    keys, place = np.unique(np.concatenate([p.ravel() for p in pairs]), return_inverse=True)
     indptr = np.searchsorted(keys, np.arange(n + 1) * n)
-    return indptr, keys % n, slots.reshape(len(mesh.tets), a, a)
+    ends = np.cumsum([p.size for p in pairs])[:-1]
+    slots = tuple(freeze(part.reshape(p.shape), np.int64) for part, p in zip(np.split(place.ravel(), ends), pairs))
+    return indptr, keys % n, slots
 
 
 def make_free_map(stencil: Stencil, mesh: TetMesh, fixed: IntArray) -> FreeMap:
@@ -94,7 +97,7 @@ def make_free_map(stencil: Stencil, mesh: TetMesh, fixed: IntArray) -> FreeMap:
     free_node = np.ones(n, dtype=bool)
     free_node[fixed] = False
     free_node[np.diff(stencil.block_rows) == 0] = False
-    order = dissection_order(mesh.nodes, stencil, np.flatnonzero(free_node))
+    order = fill_reducing_order(stencil, np.flatnonzero(free_node))
     place = np.full(n, -1)
     place[order] = np.arange(len(order))
     rows = np.repeat(np.arange(n), np.diff(stencil.block_rows))
@@ -116,33 +119,11 @@ def make_free_map(stencil: Stencil, mesh: TetMesh, fixed: IntArray) -> FreeMap:
     )
 
 
-def dissection_order(nodes: FloatArray, stencil: Stencil, free: IntArray, *, leaf: int = 40) -> IntArray:
-    """Return free nodes in nested-dissection order: both halves first, then the nodes that separate them.
-
-    The cut is a plane at the median along the longest side of each part (George 1973, with coordinates in place of a grid).
-    """
-    side = np.zeros(len(nodes), dtype=np.int8)
-    result: list[IntArray] = []
-
-    def dissect(part: IntArray) -> None:
-        if len(part) <= leaf:
-            result.append(part)
-            return
-        x = nodes[part]
-        along = x[:, np.argmax(np.ptp(x, axis=0))]
-        low = part[along <= np.median(along)]
-        high = part[along > np.median(along)]
-        if not len(low) or not len(high):
-            result.append(part)
-            return
-        side[high] = 1
-        touching = np.array(
-            [side[stencil.block_columns[stencil.block_rows[v] : stencil.block_rows[v + 1]]].any() for v in low], dtype=bool
-        )
-        side[high] = 0
-        dissect(low[~touching])
-        dissect(high)
-        result.append(low[touching])
-
-    dissect(free)
-    return np.concatenate(result) if result else free
+def fill_reducing_order(stencil: Stencil, free: IntArray) -> IntArray:
+    """Return the free nodes in an order of little fill (multiple minimum degree on the node graph, by SuperLU)."""
+    n = len(stencil.block_rows) - 1
+    graph = sp.csr_matrix((np.ones(len(stencil.block_columns)), stencil.block_columns, stencil.block_rows), shape=(n, n))
+    part = graph[free][:, free]
+    dominant = (part + sp.diags_array(np.asarray(part.sum(axis=1)).ravel() + 1.0)).tocsc()
+    lu = splu(dominant, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    return free[np.argsort(lu.perm_c)]

@@ -1,0 +1,69 @@
+"""Internal energy, forces and stiffness of a body, and the reduced sparse matrix of its free unknowns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+
+from femsense.arrays import FloatArray
+from femsense.fem.body import BodyModel
+from femsense.fem.corotational import corotational_kernel
+from femsense.fem.hyperelastic import hyperelastic_kernel
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Internal:
+    """Internal energy and its derivatives at one configuration."""
+
+    energy: float
+    """[J]; inf where an element is inverted (hyperelastic laws)."""
+    forces: FloatArray
+    """dW/dx [N], shape (n, 3)."""
+    blocks: FloatArray | None
+    """d²W/dx² [N/m], shape (nb, 9), in the stencil's pattern; None if not asked for."""
+
+
+def internal(body: BodyModel, positions: FloatArray, *, tangent: bool = True) -> Internal:
+    """Return internal energy, forces and (if asked) stiffness of the body at the given node positions [m], shape (n, 3).
+
+    The clamp's springs, where the body has them, belong to it.
+    """
+    stencil, material = body.stencil, body.material
+    mu, lam = material.lame()
+    forces = np.zeros_like(body.mesh.nodes)
+    blocks = np.zeros((len(stencil.block_columns) if tangent else 0, 9))
+    kernel = corotational_kernel if material.law == "corotational" else hyperelastic_kernel
+    limit = material.stretch_limit if material.law == "gent" else np.inf
+    energy = kernel(np.ascontiguousarray(positions), body.mesh.tets, stencil.gradients, stencil.volumes, mu, lam, limit, tangent, stencil.slots, forces, blocks)  # fmt: skip
+    if np.isfinite(body.clamp_stiffness):
+        energy += _add_clamp_springs(body, positions, forces, blocks if tangent else None)
+    return Internal(float(energy), forces, blocks if tangent else None)
+
+
+def _add_clamp_springs(body: BodyModel, positions: FloatArray, forces: FloatArray, blocks: FloatArray | None) -> float:
+    nodes, stiffness = body.clamp_nodes, body.clamp_stiffness
+    stretch = positions[nodes] - body.mesh.nodes[nodes]
+    forces[nodes] += stiffness * stretch
+    if blocks is not None:
+        blocks[np.ix_(diagonal_slots(body)[nodes], [0, 4, 8])] += stiffness
+    return 0.5 * stiffness * float((stretch**2).sum())
+
+
+def diagonal_slots(body: BodyModel) -> FloatArray:
+    """Return the slot of the diagonal block of every node, shape (n,)."""
+    stencil = body.stencil
+    rows = np.repeat(np.arange(len(stencil.block_rows) - 1), np.diff(stencil.block_rows))
+    slots = np.zeros(len(stencil.block_rows) - 1, dtype=np.int64)
+    on = np.flatnonzero(rows == stencil.block_columns)
+    slots[rows[on]] = on
+    return slots
+
+
+def reduced_matrix(body: BodyModel, blocks: FloatArray) -> sp.csc_matrix:
+    """Return the stiffness of the free unknowns [N/m], shape (f, f), in factor order."""
+    free = body.free_map
+    data = blocks.ravel()[free.source]
+    size = len(free.dofs)
+    return sp.csc_matrix((data, free.indices, free.indptr), shape=(size, size))

@@ -1,0 +1,105 @@
+"""Cable kinematics: length, its derivatives, the forces of tensions that may differ from segment to segment, and friction.
+
+Points of a path are numbered from the far end; segment j joins point j and j + 1, the last one ends at the pull point.
+A cable of length ℓ has shortened by δ = ℓ(rest) − ℓ(x). Tensions t_j along the segments load the nodes with
+−Σ_j t_j ∂ℓ_j/∂x; equal tensions T give T ∂δ/∂x, the row of H_a.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from femsense.arrays import FloatArray
+from femsense.fem.body import BodyModel, Cable, segment_ties
+
+
+def segments(cable: Cable, positions: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return unit vectors from far end to pull point, shape (s, 3), and lengths [m], shape (s,), of the segments."""
+    points = np.vstack([cable.path.positions(positions), cable.pull_point])
+    difference = np.diff(points, axis=0)
+    length = np.linalg.norm(difference, axis=1)
+    return difference / np.maximum(length, 1e-12)[:, None], length
+
+
+def cable_length(cable: Cable, positions: FloatArray) -> float:
+    """Return the length of a cable [m]."""
+    return float(segments(cable, positions)[1].sum())
+
+
+def shortening(body: BodyModel, positions: FloatArray) -> FloatArray:
+    """Return the shortening of each cable against rest [m], shape (a,)."""
+    rest = body.mesh.nodes
+    return np.array([cable_length(c, rest) - cable_length(c, positions) for c in body.cables])
+
+
+def point_forces(directions: FloatArray, tensions: FloatArray) -> FloatArray:
+    """Return the forces of segment tensions [N], shape (s,), on the points of the path [N], shape (s, 3)."""
+    pull = tensions[:, None] * directions
+    forces = pull.copy()
+    forces[1:] -= pull[:-1]
+    return forces
+
+
+def cable_forces(cable: Cable, positions: FloatArray, tensions: FloatArray, node_count: int) -> FloatArray:
+    """Return the nodal forces of a cable [N], shape (n, 3), for the tensions of its segments [N], shape (s,)."""
+    return cable.path.spread(point_forces(segments(cable, positions)[0], tensions), node_count)
+
+
+def pull_rows(body: BodyModel, positions: FloatArray, shares: list[FloatArray] | None = None) -> FloatArray:
+    """Return H_a: the nodal forces of unit tensions [1], shape (a, 3n); shares scale the segments of each cable (friction)."""
+    n = len(body.mesh.nodes)
+    rows = np.zeros((len(body.cables), 3 * n))
+    for i, cable in enumerate(body.cables):
+        share = np.ones(len(cable.path)) if shares is None else shares[i]
+        rows[i] = cable_forces(cable, positions, share, n).ravel()
+    return rows
+
+
+def add_cable_stiffness(body: BodyModel, positions: FloatArray, tensions: tuple[FloatArray, ...], blocks: FloatArray) -> None:
+    """Add the geometric stiffness of the cables to stiffness blocks [N/m], shape (nb, 9), for tensions [N] of their segments.
+
+    Each segment adds t (I − d dᵀ)/ℓ between its two ends: positive semi-definite for a pulling cable.
+    """
+    for cable, slots, tension in zip(body.cables, body.cable_slots, tensions):
+        if not tension.any():
+            continue
+        d, length = segments(cable, positions)
+        stiffness = (tension / np.maximum(length, 1e-12))[:, None, None] * (np.eye(3) - d[:, :, None] * d[:, None, :])
+        _, weights = segment_ties(cable.path)
+        values = np.einsum("sa,sb,sij->sabij", weights, weights, stiffness)
+        np.add.at(blocks, slots.ravel(), values.reshape(-1, 9))
+
+
+def bend_angles(cable: Cable, positions: FloatArray) -> FloatArray:
+    """Return the bend before each segment [rad], shape (s,), going outwards from the motor: entry j is the bend between
+    segment j + 1 and segment j; the last is the bend at the pull point (0 without an exit direction)."""
+    directions, _ = segments(cable, positions)
+    angles = np.zeros(len(directions))
+    angles[:-1] = _angle(directions[:-1], directions[1:])
+    if cable.exit_direction is not None:
+        angles[-1] = _angle(directions[-1:], cable.exit_direction[None])[0]
+    return angles
+
+
+def _angle(u: FloatArray, v: FloatArray) -> FloatArray:
+    return np.asarray(np.arctan2(np.linalg.norm(np.cross(u, v), axis=1), np.einsum("ij,ij->i", u, v)))
+
+
+def rub(cable: Cable, angles: FloatArray, before: FloatArray, motor_tension: float) -> FloatArray:
+    """Return the tensions along a cable after a change of the motor's tension: capstan with stick.
+
+    Going outwards from the motor, the tension behind a bend of angle θ stays what it was unless it leaves
+    [T e^(−μθ), T e^(+μθ)] of the tension T before the bend; then it is moved to that end.
+
+    Arguments:
+        angles: the bends, as `bend_angles` gives them [rad], shape (s,).
+        before: the tensions of the segments until now [N], shape (s,).
+        motor_tension: [N].
+    """
+    tensions = np.empty_like(before)
+    inner = motor_tension
+    for j in range(len(before) - 1, -1, -1):
+        span = np.exp(cable.friction * angles[j])
+        tensions[j] = min(max(before[j], inner / span), inner * span)
+        inner = tensions[j]
+    return tensions

@@ -1,0 +1,119 @@
+"""Compliance W = H K⁻¹ Hᵀ between directions at points of the body and cables, from one factorisation.
+
+K is the exact tangent at the equilibrium (geometric stiffness of the cables included). Cables that are pulled with a given
+tension are free to move; taut held cables keep their length, so that W then holds K⁻¹ − K⁻¹Hᵀ(HK⁻¹Hᵀ + 1/k)⁻¹HK⁻¹ (Zhang et al.
+2019, equations 3–5, with the constraint eliminated).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from femsense.arrays import FloatArray, as_points
+from femsense.errors import FemsenseError, InputError
+from femsense.fem.assembly import internal, reduced_matrix
+from femsense.fem.body import BodyModel
+from femsense.fem.cables import add_cable_stiffness, cable_forces, pull_rows
+from femsense.fem.equilibrium import Equilibrium
+from femsense.fem.linear import Factorization, factorize
+from femsense.fem.mesh import Embedding, embed_points
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Tangent:
+    """The linearised body at an equilibrium: how it answers to small forces and inputs."""
+
+    factor: Factorization
+    dofs: npt.NDArray[np.int64]
+    """Free unknowns in factor order, shape (f,)."""
+    held_rows: FloatArray
+    """dδ/dx of the taut held cables over the free unknowns, shape (h, f)."""
+    held_columns: FloatArray
+    """K⁻¹ times the force columns of those cables, shape (f, h)."""
+    held_compliance: FloatArray
+    """Their compliance, cable stretch included [m/N], shape (h, h)."""
+    node_count: int
+
+    def respond(self, forces: FloatArray) -> FloatArray:
+        """Return node displacements [m], shape (k, n, 3), under small nodal forces [N], shape (k, n, 3); held cables keep their length."""
+        right = forces.reshape(len(forces), -1)[:, self.dofs].T
+        answer = self.factor.solve(right)
+        if self.held_rows.size:
+            answer = answer - self.held_columns @ np.linalg.solve(self.held_compliance, self.held_rows @ answer)
+        return self._spread(answer)
+
+    def respond_to_held(self) -> FloatArray:
+        """Return node displacements for a shortening of each held cable by one metre [1], shape (h, n, 3)."""
+        return self._spread(self.held_columns @ np.linalg.inv(self.held_compliance))
+
+    def _spread(self, answer: FloatArray) -> FloatArray:
+        full = np.zeros((answer.shape[1], 3 * self.node_count))
+        full[:, self.dofs] = answer.T
+        return full.reshape(len(full), self.node_count, 3)
+
+
+def tangent_at(body: BodyModel, equilibrium: Equilibrium) -> Tangent:
+    """Return the exact linearisation of a body at an equilibrium. Raises FemsenseError where it is unstable there."""
+    blocks = internal(body, equilibrium.positions).blocks
+    assert blocks is not None
+    add_cable_stiffness(body, equilibrium.positions, equilibrium.segment_tensions, blocks)
+    factor = factorize(reduced_matrix(body, blocks))
+    if factor is None:
+        raise FemsenseError("the stiffness is singular: nothing holds the body (clamp more nodes)")
+    dofs = body.free_map.dofs
+    held = np.flatnonzero(equilibrium.held)
+    rows = pull_rows(body, equilibrium.positions)[held][:, dofs]
+    shares = [t / T if T > 0 else np.ones_like(t) for t, T in zip(equilibrium.segment_tensions, equilibrium.tension.values())]
+    forces = pull_rows(body, equilibrium.positions, shares)[held][:, dofs]
+    columns = factor.solve(forces.T) if len(held) else np.zeros((len(dofs), 0))
+    stretch = np.array([1.0 / body.cables[i].stretch_stiffness for i in held])
+    return Tangent(factor, dofs, rows, columns, rows @ columns + np.diag(stretch), len(body.mesh.nodes))
+
+
+def compliance(
+    body: BodyModel,
+    equilibrium: Equilibrium,
+    *,
+    points: npt.ArrayLike = (),
+    directions: npt.ArrayLike = (),
+    tangent: Tangent | None = None,
+) -> FloatArray:
+    """Return the compliance between directions at points of the body, then cables.
+
+    Arguments:
+        body: the body.
+        equilibrium: the state at which it is linearised.
+        points: points of the body at rest [m], shape (k, 3).
+        directions: a direction at each point [1], shape (k, 3); used as they are, so unit vectors give m/N.
+        tangent: the linearisation, where it is known already.
+
+    Returns:
+        W [m/N], shape (k + a, k + a): displacement of row i along its direction (for a cable: its shortening) under a unit
+        force of column j. Rows and columns of held cables are those of the free cable (their tension as the input).
+
+    Raises:
+        InputError: points and directions do not fit; FemsenseError: nothing holds the body.
+    """
+    P, D = as_points(points, "points"), as_points(directions, "directions")
+    if P.shape != D.shape:
+        raise InputError("points and directions differ in shape", where="directions", found=D.shape, expected=P.shape)
+    at = tangent_at(body, equilibrium) if tangent is None else tangent
+    point_rows = direction_rows(embed_points(body.mesh, P), D, len(body.mesh.nodes)) if len(P) else np.zeros((0, 3 * at.node_count))
+    rows = np.vstack([point_rows, pull_rows(body, equilibrium.positions)])[:, at.dofs]
+    W = rows @ at.factor.solve(rows.T)
+    return np.asarray((W + W.T) / 2.0)
+
+
+def direction_rows(embedding: Embedding, directions: FloatArray, node_count: int) -> FloatArray:
+    """Return the rows of H that map node displacements to displacements of points along directions, shape (k, 3n)."""
+    k = len(embedding)
+    rows = np.zeros((k, node_count, 3))
+    values = embedding.weights[:, :, None] * directions[:, None, :]
+    np.add.at(rows, (np.arange(k)[:, None], embedding.nodes), values)
+    return rows.reshape(k, -1)
+
+
+__all__ = ["Tangent", "cable_forces", "compliance", "direction_rows", "tangent_at"]

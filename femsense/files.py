@@ -1,0 +1,148 @@
+"""Writing results so that nothing half-written ever stands at the final name, and hashing what was read."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+import math
+import os
+import secrets
+import shutil
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+PART_PREFIX = ".part-"
+"""Names of unfinished files and folders start so."""
+
+
+@contextmanager
+def write_beside(path: str | Path) -> Iterator[Path]:
+    """Yield a free path beside `path`; what the block writes there (a file or a folder) gets the final name at its end.
+
+    The temporary name keeps the ending of the final one. If the block raises, nothing is left behind and what stood at
+    `path` before is untouched. A folder replaces the whole folder that stood there.
+
+    Raises:
+        FileNotFoundError: where the block wrote nothing.
+    """
+    final = Path(path).absolute()
+    final.parent.mkdir(parents=True, exist_ok=True)
+    part = final.with_name(f"{PART_PREFIX}{secrets.token_hex(4)}-{final.name}")
+    try:
+        yield part
+        _replace(part, final)
+    finally:
+        _remove(part)
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """Write text as UTF-8 with plain line feeds."""
+    with write_beside(path) as part:
+        part.write_text(text, encoding="utf-8", newline="\n")
+
+
+def write_json(path: str | Path, data: Any) -> None:
+    """Write JSON. Arrays become lists, paths strings, numbers that are not finite null (JSON has no other word)."""
+    write_text(path, json_text(data) + "\n")
+
+
+def json_text(data: Any, *, indent: int | None = 2) -> str:
+    """Return data as strict JSON text; see `write_json`."""
+    return json.dumps(plain(data), indent=indent, ensure_ascii=False, allow_nan=False)
+
+
+def write_toml(path: str | Path, document: Mapping[str, Any]) -> None:
+    """Write a TOML document. Arrays become lists; numbers are written so that they read back the same."""
+    import tomli_w
+
+    write_text(path, tomli_w.dumps(plain(document, nonfinite=True)))
+
+
+def write_csv(path: str | Path, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+    """Write a CSV file with a header. Numbers read back the same; None and NaN become empty cells."""
+    with write_beside(path) as part, part.open("w", encoding="utf-8", newline="") as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(columns)
+        writer.writerows([_cell(value) for value in row] for row in rows)
+
+
+def file_hash(path: str | Path) -> str:
+    """Return the SHA-256 of a file's content, 64 hexadecimal digits."""
+    with Path(path).open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def folder_hash(folder: str | Path) -> str:
+    """Return a SHA-256 of the names and contents of all files in a folder and below (unfinished ones do not count)."""
+    root = Path(folder)
+    digest = hashlib.sha256()
+    files = {file.relative_to(root).as_posix(): file for file in root.rglob("*") if file.is_file()}
+    for name, file in sorted(files.items()):
+        if PART_PREFIX not in name:
+            digest.update(f"{name}\0{file_hash(file)}\n".encode())
+    return digest.hexdigest()
+
+
+def plain(value: Any, *, nonfinite: bool = False) -> Any:
+    """Return the value made of dict, list, str, int, float, bool and None only.
+
+    Arguments:
+        value: may hold arrays, numpy numbers, tuples, paths.
+        nonfinite: keep inf and nan (TOML has them); else they become None.
+    """
+    if isinstance(value, Mapping):
+        return {str(key): plain(item, nonfinite=nonfinite) for key, item in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return plain(value.tolist(), nonfinite=nonfinite)
+    if isinstance(value, list | tuple | set | frozenset):
+        return [plain(item, nonfinite=nonfinite) for item in value]
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, float) and not math.isfinite(value) and not nonfinite:
+        return None
+    return value
+
+
+def _cell(value: object) -> object:
+    if isinstance(value, np.generic):
+        value = value.item()
+    if value is None or (isinstance(value, float) and math.isnan(value)):
+        return ""
+    return int(value) if isinstance(value, bool) else value
+
+
+def _replace(part: Path, final: Path) -> None:
+    """Give the finished file or folder its final name."""
+    if not part.is_dir():
+        _flush(part)
+        os.replace(part, final)
+        return
+    if not final.exists():
+        os.replace(part, final)
+        return
+    old = final.with_name(f"{PART_PREFIX}{secrets.token_hex(4)}-old-{final.name}")
+    os.replace(final, old)
+    try:
+        os.replace(part, final)
+    except OSError:
+        os.replace(old, final)
+        raise
+    _remove(old)
+
+
+def _flush(path: Path) -> None:
+    """Have the content on the disk before the name: a crash leaves the old file or the new one."""
+    with path.open("rb") as stream:
+        os.fsync(stream.fileno())
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)

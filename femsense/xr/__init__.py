@@ -1,0 +1,1 @@
+"""Skinned meshes, animation files and the page that shows them."""
