@@ -115,10 +115,10 @@ def _keys_at(schema: type[Schema], location: Sequence[int | str]) -> Iterable[st
 
 def _description_at(schema: type[Schema], location: Sequence[int | str]) -> str | None:
     """Return what the schema says of the innermost described key of a place."""
-    description, table = None, schema
+    description: str | None = None
     for i, part in enumerate(location):
         table = _annotation_at(schema, location[:i])
-        field = table.model_fields.get(part) if isinstance(table, type) and issubclass(table, BaseModel) else None
+        field = table.model_fields.get(str(part)) if isinstance(table, type) and issubclass(table, BaseModel) else None
         description = field.description or description if field else description
     return description
 

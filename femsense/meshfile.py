@@ -1,0 +1,262 @@
+"""Mesh files: tetrahedra in any format that meshio reads, closed surfaces through fTetWild (cached), and element quality."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import importlib.util
+import io
+import os
+import sys
+import types
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from femsense.arrays import FloatArray, IntArray
+from femsense.errors import InputError, MissingDependency
+from femsense.fem.mesh import EDGES, TetMesh, element_volumes, oriented
+from femsense.files import write_beside
+from femsense.tables import near
+
+SURFACE_ENDINGS = (".ply", ".stl", ".obj", ".off")
+SOLID_KINDS = ("hexahedron", "wedge", "pyramid", "hexahedron20", "hexahedron27", "wedge15", "pyramid13")
+EDGE_FRACTION = 0.05
+"""Edge length of a mesh made from a surface, over the diagonal of its bounding box."""
+
+
+def read_tets(path: Path, *, where: str | None = None) -> TetMesh:
+    """Return the tetrahedra of a mesh file, in the file's unit, corner nodes first.
+
+    A closed surface is tetrahedralised on first use; the result is kept in the cache folder. Nodes that no tetrahedron uses
+    are dropped with a warning. A mesh whose elements are all inverted has another order of nodes and is turned.
+
+    Arguments:
+        path: the file.
+        where: what a message names; by default the file.
+
+    Raises:
+        InputError: no such file, not readable, no tetrahedra, other solid elements, an open surface.
+    """
+    where = where or str(path)
+    _check_exists(path, where)
+    if path.suffix.lower() in SURFACE_ENDINGS:
+        return _tets_of_surface(*read_surface(path, where=where), where)
+    points, cells = _read_cells(path, where)
+    kinds = [kind for kind in ("tetra", "tetra10") if kind in cells]
+    others = sorted(set(cells) & set(SOLID_KINDS))
+    if others or len(kinds) > 1:
+        raise InputError("elements that femsense does not compute with", where=where, found=", ".join(sorted(cells)),
+                         expected="tetrahedra of one kind (tetra or tetra10)", hint="split them into tetrahedra where the mesh is made")  # fmt: skip
+    if kinds:
+        return _ordered(points, cells[kinds[0]], where)
+    if "triangle" in cells:
+        return _tets_of_surface(*_closed(points, cells["triangle"], where), where)
+    raise InputError("the mesh has no tetrahedra", where=where, found=", ".join(sorted(cells)) or "no cells", expected="tetra or tetra10 cells, or a closed surface of triangles")  # fmt: skip
+
+
+def read_surface(path: Path, *, where: str | None = None) -> tuple[FloatArray, IntArray]:
+    """Return points, shape (n, 3), in the file's unit, and triangles, shape (t, 3), of a closed surface. Raises InputError."""
+    where = where or str(path)
+    _check_exists(path, where)
+    points, triangles = read_triangles(path, where=where)
+    return _closed(points, triangles, where)
+
+
+def read_triangles(path: Path, *, where: str | None = None) -> tuple[FloatArray, IntArray]:
+    """Return points, shape (n, 3), and triangles, shape (t, 3), of a surface file, equal points merged. Raises InputError."""
+    import trimesh
+
+    where = where or str(path)
+    try:
+        surface: Any = trimesh.load_mesh(str(path))
+        points, triangles = np.array(surface.vertices, dtype=np.float64), np.array(surface.faces, dtype=np.int64)
+    except Exception as error:
+        raise InputError("not readable as a surface", where=where, found=_reason(error), expected="triangles (ply, stl, obj, off)") from None  # fmt: skip
+    if not len(triangles):
+        raise InputError("the surface has no triangles", where=where, found=f"{len(points)} points", expected="triangles")
+    return points, triangles
+
+
+def tetrahedralise(
+    points: FloatArray, triangles: IntArray, *, edge_fraction: float = EDGE_FRACTION, where: str = "surface"
+) -> TetMesh:
+    """Return tetrahedra that fill a closed surface (fTetWild, one thread, so that the same surface gives the same mesh).
+
+    Arguments:
+        points: shape (n, 3), any unit.
+        triangles: shape (t, 3), outward; a cavity's surface points into the cavity.
+        edge_fraction: wanted edge length over the diagonal of the bounding box [1].
+        where: what a message names.
+
+    Raises:
+        InputError: where nothing came out. MissingDependency: without pytetwild.
+    """
+    make = _pytetwild().tetrahedralize
+    nodes, tets = make(
+        points, triangles.astype(np.int32), edge_length_fac=edge_fraction, num_threads=1, vtk_ordering=True, quiet=True
+    )
+    if not len(tets):
+        raise InputError("no tetrahedra came out of this surface", where=where, found=f"{len(triangles)} triangles", expected="a closed surface around a volume")  # fmt: skip
+    mesh = _compact(np.asarray(nodes, dtype=np.float64), np.asarray(tets, dtype=np.int64))
+    return oriented(mesh)
+
+
+def write_mesh(mesh: TetMesh, path: Path) -> None:
+    """Write a mesh in metres, in the format that the ending names (.vtu keeps all digits)."""
+    import meshio
+
+    kind = "tetra10" if mesh.is_quadratic else "tetra"
+    with write_beside(path) as part:
+        meshio.Mesh(np.asarray(mesh.nodes), [(kind, np.asarray(mesh.tets))]).write(part)
+
+
+def radius_ratio(mesh: TetMesh) -> FloatArray:
+    """Return 3 × inradius / circumradius of each corner tetrahedron [1], shape (m,): 1 regular, 0 flat."""
+    corners = mesh.nodes[mesh.tets[:, :4]]
+    a, b, c = (corners[:, i] - corners[:, 0] for i in (1, 2, 3))
+    volume = np.abs(element_volumes(mesh))
+    faces = [np.cross(a, b), np.cross(b, c), np.cross(c, a), np.cross(b - a, c - a)]
+    area = sum(np.linalg.norm(face, axis=1) for face in faces) / 2.0
+    opposite = [np.linalg.norm(p, axis=1) * np.linalg.norm(q - r, axis=1) for p, q, r in ((a, b, c), (b, a, c), (c, a, b))]
+    s = sum(opposite) / 2.0
+    product = s * np.prod([s - side for side in opposite], axis=0)  # 6 V R = √(s (s−p) (s−q) (s−r))
+    circumradius_volume = np.sqrt(np.maximum(product, 0.0)) / 6.0
+    return np.asarray(
+        np.divide(9.0 * volume**2, area * circumradius_volume, out=np.zeros_like(volume), where=circumradius_volume > 0)
+    )
+
+
+def cache_folder() -> Path:
+    """Return where meshes made from surfaces are kept: $FEMSENSE_CACHE, else femsense in the user's cache folder."""
+    if chosen := os.environ.get("FEMSENSE_CACHE"):
+        return Path(chosen)
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "femsense"
+
+
+def file_format(path: Path) -> str | None:
+    """Return meshio's name of a mesh file's format from its content; None where only the ending says it."""
+    with path.open("rb") as stream:
+        head = stream.read(512).lstrip()
+    starts = ((b"# vtk DataFile", "vtk"), (b"$MeshFormat", "gmsh"), (b"MeshVersionFormatted", "medit"), (b"<Xdmf", "xdmf"))
+    if b"<VTKFile" in head:
+        return "vtu"
+    return next((name for start, name in starts if head.startswith(start)), None)
+
+
+def _check_exists(path: Path, where: str) -> None:
+    if path.is_file():
+        return
+    names = [file.name for file in path.parent.iterdir() if file.is_file()] if path.parent.is_dir() else []
+    raise InputError("no such mesh file", where=where, found=str(path), expected="a file", hint=near(path.name, names))
+
+
+def _read_cells(path: Path, where: str) -> tuple[FloatArray, dict[str, IntArray]]:
+    """Return points and the cells of each kind through meshio, which may print and exit."""
+    import meshio
+
+    try:
+        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+            mesh = meshio.read(path, file_format=file_format(path))
+        points = np.asarray(mesh.points, dtype=np.float64)
+        cells = {kind: np.asarray(data, dtype=np.int64) for kind, data in mesh.cells_dict.items()}
+    except (Exception, SystemExit) as error:
+        raise InputError("not readable as a mesh", where=where, found=_reason(error), expected="tetrahedra in a format that meshio reads (vtu, vtk, msh, …)") from None  # fmt: skip
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise InputError("not a mesh in space", where=where, found=f"points of shape {points.shape}", expected="three coordinates a point")  # fmt: skip
+    if not np.isfinite(points).all():
+        bad = int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])
+        raise InputError("a node is not finite", where=where, found=f"node {bad}: {points[bad].tolist()}", expected="finite coordinates")  # fmt: skip
+    return points, cells
+
+
+def _ordered(points: FloatArray, tets: IntArray, where: str) -> TetMesh:
+    """Return the mesh with its corner nodes first, all elements turned where all are inverted."""
+    if tets.size and (tets.min() < 0 or tets.max() >= len(points)):
+        raise InputError("an element names a node that does not exist", where=where, found=int(tets.max()), expected=f"0 … {len(points) - 1}")  # fmt: skip
+    unused = len(points) - len(np.unique(tets))
+    if unused:
+        warnings.warn(f"{where}: {unused} nodes that belong to no tetrahedron were dropped", stacklevel=4)
+    mesh = _compact(points, tets)
+    if mesh.is_quadratic:
+        _check_middles(mesh, where)
+    volumes = element_volumes(mesh)
+    return oriented(mesh) if len(volumes) and (volumes < 0).all() else mesh
+
+
+def _compact(points: FloatArray, tets: IntArray) -> TetMesh:
+    """Return the mesh of the used nodes: corners in their order, then the nodes that are only middles of edges."""
+    corners = np.unique(tets[:, :4])
+    order = np.concatenate([corners, np.setdiff1d(tets, corners)])
+    number = np.full(len(points), -1)
+    number[order] = np.arange(len(order))
+    return TetMesh(points[order], number[tets])
+
+
+def _check_middles(mesh: TetMesh, where: str) -> None:
+    ends = mesh.nodes[mesh.tets[:, EDGES]]
+    off = np.linalg.norm(mesh.nodes[mesh.tets[:, 4:]] - ends.mean(axis=2), axis=2)
+    length = np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=2)
+    bad = np.flatnonzero((off > 0.25 * length).any(axis=1))
+    if len(bad):
+        raise InputError("mid-edge nodes that are not in the middle of their edges", where=where, found=f"{len(bad)} of {len(mesh.tets)} elements, the first is number {bad[0]}",
+                         expected="the order of VTK: corners 0 1 2 3, then the edges 01 12 02 03 13 23")  # fmt: skip
+
+
+def _closed(points: FloatArray, triangles: IntArray, where: str) -> tuple[FloatArray, IntArray]:
+    """Return the surface, outward. Raises InputError where it is open."""
+    import trimesh
+
+    surface = trimesh.Trimesh(points, triangles, process=True)
+    if not surface.is_watertight:
+        edges = np.sort(np.asarray(surface.edges), axis=1)
+        count = np.unique(edges, axis=0, return_counts=True)[1]
+        raise InputError("the surface is not closed", where=where, found=f"{int((count == 1).sum())} edges with one triangle, {int((count > 2).sum())} with more than two",
+                         expected="every edge between two triangles", hint="close its holes in a mesh editor, or give tetrahedra")  # fmt: skip
+    if not surface.is_winding_consistent or surface.volume < 0:
+        trimesh.repair.fix_normals(surface)
+    return np.array(surface.vertices, dtype=np.float64), np.array(surface.faces, dtype=np.int64)
+
+
+def _tets_of_surface(points: FloatArray, triangles: IntArray, where: str) -> TetMesh:
+    """Return the tetrahedra of a surface from the cache, or made and kept there."""
+    key = hashlib.sha256(points.tobytes() + triangles.tobytes() + f"1 {EDGE_FRACTION}".encode()).hexdigest()
+    file = cache_folder() / "tetrahedra" / f"{key[:32]}.npz"
+    cached = _read_cache(file)
+    if cached is not None:
+        return cached
+    mesh = tetrahedralise(points, triangles, where=where)
+    with contextlib.suppress(OSError), write_beside(file) as part:  # a cache that cannot be written costs time only
+        np.savez_compressed(part, nodes=mesh.nodes, tets=mesh.tets)
+    return mesh
+
+
+def _read_cache(file: Path) -> TetMesh | None:
+    """Return a kept mesh; None where there is none or it cannot be read."""
+    try:
+        with np.load(file) as data:
+            return TetMesh(data["nodes"], data["tets"])
+    except Exception:
+        return None
+
+
+def _pytetwild() -> Any:
+    """Import pytetwild. Some versions want pyvista for an accessor that is not used here; they do without it."""
+    if importlib.util.find_spec("pytetwild") is None:
+        raise MissingDependency("a surface becomes tetrahedra through pytetwild: pip install pytetwild")
+    if importlib.util.find_spec("pyvista") is None:
+        sys.modules.setdefault("pytetwild._accessor", types.ModuleType("pytetwild._accessor"))
+    import pytetwild
+
+    return pytetwild
+
+
+def _reason(error: BaseException) -> str:
+    text = str(error).strip().splitlines()
+    return (
+        f"{type(error).__name__}: {text[0][:120]}"
+        if text and not isinstance(error, SystemExit)
+        else "another format, or a broken file"
+    )
