@@ -1,1 +1,46 @@
 """Effects: what a plain model may lack, by name. One tuple of them; robot.toml and loop.json use the same names."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
+from typing import Any
+
+from femsense.effects.cables import CABLE_FRICTION, CABLE_GAIN, CABLE_OFFSET, CABLE_SLACK, CABLE_STRETCH
+from femsense.effects.effect import Effect, Entry, Parameter, build_entry
+from femsense.effects.loads import GRAVITY, PAYLOAD
+from femsense.effects.material import CREEP, HYPERELASTIC, POISSON, SOFT_REGION, STIFFNESS
+from femsense.effects.observation import DEPTH_SCALE, MARKER_OFFSET
+from femsense.effects.support import BASE_COMPLIANCE
+from femsense.errors import InputError
+from femsense.model import Robot
+
+EFFECTS: tuple[Effect, ...] = (
+    GRAVITY, STIFFNESS, POISSON, SOFT_REGION, HYPERELASTIC, CREEP, PAYLOAD, BASE_COMPLIANCE, CABLE_FRICTION, CABLE_OFFSET,
+    CABLE_GAIN, CABLE_STRETCH, CABLE_SLACK, DEPTH_SCALE, MARKER_OFFSET,
+)  # fmt: skip
+
+
+def find_effect(name: str) -> Effect:
+    """Return the effect of a name. Raises InputError."""
+    for effect in EFFECTS:
+        if effect.name == name:
+            return effect
+    names = [effect.name for effect in EFFECTS]
+    near = get_close_matches(name, names, 1)
+    raise InputError("unknown effect", where="effects.name", found=name, expected=", ".join(names), hint=f"did you mean {near[0]}?" if near else None)
+
+
+def apply_effects(robot: Robot, entries: Sequence[Mapping[str, Any]]) -> Robot:
+    """Return the robot with the effects of `[[effects]]`, one after the other. Raises InputError."""
+    for entry in entries:
+        rest = {key: value for key, value in entry.items() if key != "name"}
+        effect = find_effect(str(entry.get("name")))
+        unknown = sorted(set(rest) - set(effect.keys))
+        if unknown:
+            raise InputError("unknown key", where=f"effects.{effect.name}", found=unknown[0], expected=", ".join(effect.keys))
+        robot = effect.apply(robot, rest)
+    return robot
+
+
+__all__ = ["EFFECTS", "Effect", "Entry", "Parameter", "apply_effects", "build_entry", "find_effect"]

@@ -91,6 +91,7 @@ class _State:
     taut: BoolArray  # held cables that carry load, (a,)
     shares: list[FloatArray]  # segment tension / motor tension
     factor: Factorization | None = None
+    borrowed: bool = False  # the factor belongs to another state; it serves as long as the residual falls fast
     iterations: int = 0
     residual: float = np.inf
 
@@ -190,8 +191,8 @@ def _initial_state(body: BodyModel, loads: _Loads, start: Equilibrium | None, re
         motor = start.tension[body.cable_names[i]]
         if motor > 0:
             shares[i] = tensions / motor
-    usable = reuse_factor and start.factor is not None
-    return _State(x, np.asarray(T, dtype=float), taut, shares, start.factor if usable else None)
+    usable = reuse_factor and start.factor is not None and start.factor.size == len(body.free_map.dofs)
+    return _State(x, np.asarray(T, dtype=float), taut, shares, start.factor if usable else None, usable)
 
 
 def _clamped(body: BodyModel) -> BoolArray:
@@ -271,8 +272,9 @@ def _newton(body: BodyModel, loads: _Loads, state: _State, max_iterations: int) 
             return CONVERGED
         if not np.isfinite(state.residual):
             return "stalled"
-        if state.factor is None or state.residual > 0.2 * last:
-            state.factor = _factor_here(body, here, state)
+        slow = state.residual > 0.2 * last if state.borrowed else state.residual > 1e3 * loads.tolerance
+        if state.factor is None or slow:
+            state.factor, state.borrowed = _factor_here(body, here, state), False
             if state.factor is None:
                 return "singular"
         last = state.residual
@@ -282,7 +284,6 @@ def _newton(body: BodyModel, loads: _Loads, state: _State, max_iterations: int) 
         if moved is None:
             return CONVERGED if state.residual <= 1e3 * loads.tolerance else "stalled"
         here = moved
-        last = last if state.residual <= 1e3 * loads.tolerance else 0.0  # far away: a new factor at every step
     return "iterations"
 
 
@@ -388,7 +389,7 @@ def _step_loads(body: BodyModel, loads: _Loads, iterations: int, max_iterations:
     spent = iterations
     while done < 1.0:
         part = min(1.0, done + step)
-        state = replace_state(good)
+        state = _copied(good)
         part_loads = loads.scaled(part)
         state.T = np.where(loads.controlled, good.T, part_loads.tension)
         status = _settle(body, part_loads, state, max_iterations)
@@ -405,9 +406,9 @@ def _step_loads(body: BodyModel, loads: _Loads, iterations: int, max_iterations:
     return good, CONVERGED
 
 
-def replace_state(state: _State) -> _State:
+def _copied(state: _State) -> _State:
     """Return a copy that can be moved on without harm to the original."""
-    return _State(state.x.copy(), state.T.copy(), state.taut.copy(), [s.copy() for s in state.shares], None, state.iterations, state.residual)
+    return _State(state.x.copy(), state.T.copy(), state.taut.copy(), [s.copy() for s in state.shares], None, False, state.iterations, state.residual)
 
 
 def _result(body: BodyModel, loads: _Loads, state: _State, status: str, nodal_forces: FloatArray) -> Equilibrium:

@@ -20,6 +20,11 @@ class Factorization:
     negative: int
     """Negative pivots: 0 where the matrix is positive definite (Sylvester's law of inertia)."""
 
+    @property
+    def size(self) -> int:
+        """Number of unknowns."""
+        return int(self.lu.shape[0])
+
     def solve(self, right: FloatArray) -> FloatArray:
         """Return K⁻¹ right, shape (f,) or (f, k)."""
         return np.asarray(self.lu.solve(np.ascontiguousarray(right)))

@@ -1,0 +1,1 @@
+"""Calibration: the camera's pose and the initial inputs of the cables."""

@@ -1,0 +1,118 @@
+"""Bounded Gauss–Newton with priors, a covariance, and a statement of what the data do not determine."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import lsq_linear
+
+from femsense.arrays import FloatArray, freeze
+
+Evaluate = Callable[[FloatArray, bool], tuple[FloatArray, FloatArray | None]]
+"""(θ, with derivative) → whitened residual (N,), Jacobian (N, p) or None. A θ that cannot be evaluated raises DataError."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class FitResult:
+    """A least-squares estimate."""
+
+    theta: FloatArray
+    """Shape (p,)."""
+    covariance: FloatArray
+    """Of θ for unit residual variance, shape (p, p); infinite variance where the data say nothing."""
+    residual: FloatArray
+    """Whitened residual, shape (N,)."""
+    jacobian: FloatArray
+    """Its derivative, shape (N, p)."""
+    cost: tuple[float, ...]
+    """Sum of squares after each iteration, the start first."""
+    status: str
+    """"converged" or "iterations"."""
+
+
+def gauss_newton(
+    evaluate: Evaluate,
+    theta: FloatArray,
+    *,
+    low: FloatArray | None = None,
+    high: FloatArray | None = None,
+    max_iterations: int = 30,
+    tolerance: float = 1e-10,
+) -> FitResult:
+    """Minimise ‖r(θ)‖² within bounds (Levenberg's damping where a plain step does not pay).
+
+    Arguments:
+        evaluate: residual and Jacobian; priors are rows of them.
+        theta: the start, shape (p,).
+        low, high: bounds, shape (p,).
+        max_iterations: Gauss–Newton steps.
+        tolerance: relative decrease at which it stops.
+    """
+    from femsense.errors import DataError
+
+    p = len(theta)
+    low = np.full(p, -np.inf) if low is None else low
+    high = np.full(p, np.inf) if high is None else high
+    theta = np.clip(theta, low, high)
+    residual, jacobian = evaluate(theta, True)
+    assert jacobian is not None
+    costs = [float(residual @ residual)]
+    damping, status = 0.0, "iterations"
+    for _ in range(max_iterations):
+        scale = np.linalg.norm(jacobian, axis=0)
+        scale[scale == 0] = 1.0
+        step = _bounded_step(jacobian, residual, scale, damping, low - theta, high - theta)
+        predicted = costs[-1] - float(np.sum((residual + jacobian @ step) ** 2))
+        if predicted <= tolerance * costs[-1] or np.abs(step * scale).max(initial=0.0) <= 1e-12 * (1.0 + np.sqrt(costs[-1])):
+            status = "converged"
+            break
+        try:
+            new_residual, _ = evaluate(theta + step, False)
+            cost = float(new_residual @ new_residual)
+        except DataError:
+            cost = np.inf
+        if cost > costs[-1] - 1e-4 * predicted:
+            damping = max(10.0 * damping, 1e-4)
+            if damping > 1e8:
+                status = "converged"
+                break
+            continue
+        damping = damping / 10.0 if damping > 1e-6 else 0.0
+        theta = theta + step
+        residual, jacobian = evaluate(theta, True)
+        assert jacobian is not None
+        costs.append(float(residual @ residual))
+    return FitResult(freeze(theta), freeze(covariance_of(jacobian)), freeze(residual), freeze(jacobian), tuple(costs), status)
+
+
+def _bounded_step(J: FloatArray, r: FloatArray, scale: FloatArray, damping: float, low: FloatArray, high: FloatArray) -> FloatArray:
+    """Return the step that minimises ‖r + J s‖² + damping ‖scale · s‖² within bounds."""
+    p = J.shape[1]
+    A = np.vstack([J / scale, np.sqrt(damping) * np.eye(p)]) if damping > 0 else J / scale
+    b = np.concatenate([-r, np.zeros(p)]) if damping > 0 else -r
+    step = np.linalg.lstsq(A, b, rcond=1e-12)[0] / scale
+    if (step >= low).all() and (step <= high).all():
+        return np.asarray(step)
+    open_low, open_high = np.minimum(low * scale, -1e-15), np.maximum(high * scale, 1e-15)
+    bounded = lsq_linear(A, b, bounds=(open_low, open_high), method="bvls", max_iter=10 * p + 50)
+    return np.clip(np.asarray(bounded.x) / scale, low, high)
+
+
+def covariance_of(jacobian: FloatArray) -> FloatArray:
+    """Return (JᵀJ)⁻¹, with infinite variance along parameters that J does not see."""
+    scale = np.linalg.norm(jacobian, axis=0)
+    seen = scale > 0
+    covariance = np.full((jacobian.shape[1],) * 2, 0.0)
+    covariance[~seen, ~seen] = np.inf
+    if not seen.any():
+        return covariance
+    _, s, Vt = np.linalg.svd(jacobian[:, seen] / scale[seen], full_matrices=False)
+    weak = s < 1e-9 * s.max()
+    inverse = np.where(weak, 0.0, 1.0 / np.where(weak, 1.0, s))
+    part = (Vt.T * inverse**2) @ Vt
+    blind = (Vt[weak] ** 2).sum(axis=0) > 1e-6 if weak.any() else np.zeros(len(part), dtype=bool)
+    part[blind, blind] = np.inf
+    covariance[np.ix_(seen, seen)] = part / np.outer(scale[seen], scale[seen])
+    return covariance

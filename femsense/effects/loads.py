@@ -1,0 +1,45 @@
+"""Effects that load the body: its own weight, and a payload that was not declared."""
+
+from __future__ import annotations
+
+from femsense.effects.effect import Effect, Entry, Parameter, vector
+from femsense.fem.mesh import embed_points
+from femsense.model import Robot, spread_features
+
+STANDARD_GRAVITY = 9.80665
+"""[m/s²]."""
+
+
+def _gravity_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
+    if robot.body.material.density <= 0:
+        return ()
+    now = robot.body.gravity
+    return tuple(Parameter("vector_m_s2", i, "m/s²", float(now[i]), -12.0, 12.0, 0.05) for i in range(3))
+
+
+def _apply_gravity(robot: Robot, entry: Entry) -> Robot:
+    return robot.with_body(robot.body.with_gravity(vector(entry, "vector_m_s2", "gravity")))
+
+
+def _payload_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
+    return tuple(Parameter("force_n", i, "N", 0.0, -20.0, 20.0, 1e-3) for i in range(3))
+
+
+def _payload_places(robot: Robot) -> tuple[Entry, ...]:
+    """A dozen places that are spread over the free surface, and the markers (whose own weight is a payload)."""
+    nodes = spread_features(robot.body, 12)
+    places = [*robot.body.mesh.nodes[nodes].tolist(), *robot.marker_points[:6].tolist()]
+    return tuple({"point_m": [float(v) for v in place]} for place in places)
+
+
+def _apply_payload(robot: Robot, entry: Entry) -> Robot:
+    point, force = vector(entry, "point_m", "payload"), vector(entry, "force_n", "payload")
+    mesh = robot.body.mesh
+    forces = embed_points(mesh, point[None]).spread(force[None], len(mesh.nodes))
+    return robot.with_body(robot.body.with_dead_forces(robot.body.dead_forces + forces))
+
+
+GRAVITY = Effect("gravity", "its own weight, or weight in another direction", _gravity_parameters, _apply_gravity, keys=("vector_m_s2",))
+PAYLOAD = Effect("payload", "a load that was not declared", _payload_parameters, _apply_payload, _payload_places, keys=("point_m", "force_n"))
+
+__all__ = ["GRAVITY", "PAYLOAD", "STANDARD_GRAVITY"]

@@ -1,0 +1,93 @@
+"""Effects of the material: its modulus, Poisson ratio, a softer part, another law, slow flow."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from femsense.arrays import freeze
+from femsense.effects.effect import Effect, Entry, Parameter, number, vector
+from femsense.errors import InputError
+from femsense.model import Robot, spread_features
+
+
+def _stiffness_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
+    return (Parameter("scale", None, "1", 0.0, float(np.log(0.1)), float(np.log(10.0)), 1e-3, "log"),)
+
+
+def _apply_stiffness(robot: Robot, entry: Entry) -> Robot:
+    return robot.with_body(robot.body.with_stiffness_scale(number(entry, "scale", "stiffness", low=1e-3, high=1e3)))
+
+
+def _poisson_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
+    declared = float(np.median(robot.body.material.poisson_ratio))
+    return (Parameter("poisson_ratio", None, "1", declared, 0.05, 0.4995, 1e-4),)
+
+
+def _apply_poisson(robot: Robot, entry: Entry) -> Robot:
+    nu = number(entry, "poisson_ratio", "poisson", low=-0.99, high=0.4999)
+    material = robot.body.material
+    return robot.with_body(robot.body.with_material(replace(material, poisson_ratio=freeze(np.full_like(material.poisson_ratio, nu)))))
+
+
+def _region_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
+    return (Parameter("scale", None, "1", 0.0, float(np.log(0.1)), float(np.log(5.0)), 1e-3, "log"),)
+
+
+def _region_places(robot: Robot) -> tuple[Entry, ...]:
+    """Spheres of two sizes around places that are spread over the body."""
+    nodes = robot.body.mesh.nodes
+    size = float(np.linalg.norm(np.ptp(nodes, axis=0)))
+    places = nodes[spread_features(robot.body, 8)]
+    return tuple({"center_m": [float(v) for v in p], "radius_m": r * size} for p in places for r in (0.12, 0.25))
+
+
+def _apply_region(robot: Robot, entry: Entry) -> Robot:
+    center, mesh = vector(entry, "center_m", "soft_region"), robot.body.mesh
+    radius = number(entry, "radius_m", "soft_region", low=0.0)
+    scale = number(entry, "scale", "soft_region", low=1e-3, high=1e3)
+    inside = np.linalg.norm(mesh.nodes[mesh.tets[:, :4]].mean(axis=1) - center, axis=1) <= radius
+    if not inside.any():
+        raise InputError("no element has its centroid in the region", where="soft_region", found=f"radius {radius:g} m around {center.tolist()}",
+                         expected="a region of the body", hint="enlarge radius_m")  # fmt: skip
+    return robot.with_body(robot.body.with_stiffness_scale(np.where(inside, scale, 1.0)))
+
+
+def _apply_law(robot: Robot, entry: Entry) -> Robot:
+    law = entry.get("law")
+    if law not in ("neo_hookean", "gent"):
+        raise InputError("unknown law", where="hyperelastic.law", found=law, expected="neo_hookean | gent")
+    limit = number(entry, "jm", "hyperelastic", low=1e-3) if law == "gent" else np.inf
+    return robot.with_body(robot.body.with_material(replace(robot.body.material, law=str(law), stretch_limit=limit)))
+
+
+def _law_seeds(robot: Robot) -> tuple[Entry, ...]:
+    return ({"law": "neo_hookean"}, {"law": "gent", "jm": 3.0})
+
+
+def _no_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
+    return ()
+
+
+def _creep_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
+    return (Parameter("fraction", None, "1", 0.0, 0.0, 1.0, 1e-3),) if control == "tension" else ()
+
+
+def _creep_seeds(robot: Robot) -> tuple[Entry, ...]:
+    return tuple({"time_s": t} for t in (1.0, 4.0, 16.0, 64.0))
+
+
+def _apply_creep(robot: Robot, entry: Entry) -> Robot:
+    fractions, times = np.atleast_1d(entry.get("fraction", [])), np.atleast_1d(entry.get("time_s", []))
+    if not len(fractions) or fractions.shape != times.shape:
+        raise InputError("fraction and time_s differ in number", where="creep", found=entry, expected="one or more terms, as many of each")
+    terms = tuple((number({"f": float(f)}, "f", "creep.fraction", low=0.0), number({"t": float(t)}, "t", "creep.time_s", low=1e-6)) for f, t in zip(fractions, times))
+    return replace(robot, creep=robot.creep + terms)
+
+
+STIFFNESS = Effect("stiffness", "the right modulus everywhere", _stiffness_parameters, _apply_stiffness, keys=("scale",))
+POISSON = Effect("poisson", "the right Poisson ratio", _poisson_parameters, _apply_poisson, keys=("poisson_ratio",))
+SOFT_REGION = Effect("soft_region", "a part of another stiffness", _region_parameters, _apply_region, _region_places, keys=("center_m", "radius_m", "scale"))
+HYPERELASTIC = Effect("hyperelastic", "stiffening or softening with stretch", _no_parameters, _apply_law, _law_seeds, keys=("law", "jm"))
+CREEP = Effect("creep", "slow flow under load", _creep_parameters, _apply_creep, _creep_seeds, keys=("fraction", "time_s"), history=True)

@@ -1,0 +1,212 @@
+"""The quasi-static walk along a recording: from recorded inputs to one equilibrium a frame.
+
+History (friction of cables, creep) is carried from frame to frame in the order of time. Without history, frames with the
+same inputs and loads share one solve.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from femsense.arrays import FloatArray, IntArray, freeze
+from femsense.errors import DataError
+from femsense.fem.equilibrium import Equilibrium, solve_equilibrium
+from femsense.fem.mesh import embed_points
+from femsense.model import Robot
+from femsense.recording import Recording
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Drive:
+    """What truly drives the robot in each frame: recorded inputs after offset, gain, play and creep."""
+
+    control: str
+    """"tension" or "displacement"."""
+    inputs: FloatArray
+    """[N] or [m], shape (F, a), in the order of the body's cables."""
+    gravity: FloatArray | None
+    """[m/s²], shape (F, 3); None: that of the body."""
+    load_frame: IntArray
+    """Frame index of each known load, shape (L,)."""
+    load_points: FloatArray
+    """Where it acts, at rest [m], shape (L, 3)."""
+    load_forces: FloatArray
+    """[N], shape (L, 3), creep included."""
+
+
+def drive_of(robot: Robot, recording: Recording, *, initial: FloatArray | None = None) -> Drive:
+    """Return what drives a robot in a recording.
+
+    Arguments:
+        robot: the robot with its effects.
+        recording: inputs, loads and gravity of each frame.
+        initial: initial inputs [N] or [m], shape (a,), added to the recorded ones (for `actuation_zero = "unknown"`).
+
+    Returns:
+        the drive.
+    """
+    names, act = robot.body.cable_names, robot.actuation
+    order = [recording.cable_names.index(name) for name in names] if recording.cable_names else []
+    recorded = recording.inputs[:, order] if order else np.zeros((len(recording.time_s), len(names)))
+    recorded = recorded + (0.0 if initial is None else initial)
+    if recording.actuation == "tension":
+        inputs = np.maximum(act.gain * recorded + act.tension_offset, 0.0)
+        inputs = _creep(inputs, recording.time_s, robot.creep)
+    else:
+        inputs = act.gain * recorded + act.displacement_offset - act.slack
+    forces = _creep_loads(recording, robot.creep)
+    return Drive(recording.actuation, freeze(inputs), recording.gravity, recording.load_frame, recording.load_points, forces)
+
+
+def _creep(values: FloatArray, time_s: FloatArray, terms: tuple[tuple[float, float], ...]) -> FloatArray:
+    """Return values (F, k) with J(t) = 1 + Σ f (1 − exp(−t/τ)) on every change; linear between frames, crept out before the first."""
+    result = values.copy()
+    for fraction, tau in terms:
+        flow = values[0].copy()
+        result[0] += fraction * flow
+        for k in range(1, len(values)):
+            dt = time_s[k] - time_s[k - 1]
+            decay = np.exp(-dt / tau)
+            slope = (values[k] - values[k - 1]) / dt
+            flow = values[k] - slope * tau * (1.0 - decay) + (flow - values[k - 1]) * decay
+            result[k] += fraction * flow
+    return result
+
+
+def _creep_loads(recording: Recording, terms: tuple[tuple[float, float], ...]) -> FloatArray:
+    if not terms or not len(recording.load_frame):
+        return recording.load_forces
+    places, number = np.unique(recording.load_points, axis=0, return_inverse=True)
+    table = np.zeros((len(recording.time_s), 3 * len(places)))
+    for load, place, frame in zip(recording.load_forces, number.ravel(), recording.load_frame):
+        table[frame, 3 * place : 3 * place + 3] += load
+    crept = _creep(table, recording.time_s, terms)
+    first: set[tuple[int, int]] = set()
+    forces = np.zeros_like(recording.load_forces)
+    for i, (place, frame) in enumerate(zip(number.ravel(), recording.load_frame)):
+        if (int(place), int(frame)) not in first:  # loads at one place and frame were added up
+            forces[i] = crept[frame, 3 * place : 3 * place + 3]
+            first.add((int(place), int(frame)))
+    return forces
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Walk:
+    """One way to walk: a robot and its drive."""
+
+    robot: Robot
+    drive: Drive
+
+
+def has_history(robot: Robot) -> bool:
+    """Return whether the state depends on what was before (friction along a cable)."""
+    return any(cable.friction > 0 for cable in robot.body.cables)
+
+
+def frame_loads(walk: Walk, frame: int) -> FloatArray | None:
+    """Return the nodal forces of the known loads of a frame [N], shape (n, 3); None where there are none."""
+    rows = np.flatnonzero(walk.drive.load_frame == frame)
+    if not len(rows):
+        return None
+    mesh = walk.robot.body.mesh
+    return embed_points(mesh, walk.drive.load_points[rows]).spread(walk.drive.load_forces[rows], len(mesh.nodes))
+
+
+def solve_frame(
+    walk: Walk, frame: int, *, start: Equilibrium | None = None, before: tuple[FloatArray, ...] | None = None, reuse_factor: bool = False,
+    nodal_forces: FloatArray | None = None,
+) -> Equilibrium:  # fmt: skip
+    """Return the equilibrium of one frame.
+
+    Arguments:
+        walk: robot and drive.
+        frame: index of the frame.
+        start: a state to start from.
+        before: tensions along the cables until now (friction); by default none.
+        reuse_factor: whether the start's factor serves.
+        nodal_forces: forces beside the known loads [N], shape (n, 3).
+    """
+    drive, body = walk.drive, walk.robot.body
+    if drive.gravity is not None:
+        body = body.with_gravity(drive.gravity[frame])
+    loads = frame_loads(walk, frame)
+    if nodal_forces is not None:
+        loads = nodal_forces if loads is None else loads + nodal_forces
+    values = {name: float(v) for name, v in zip(body.cable_names, drive.inputs[frame])}
+    if before is None:
+        before = tuple(np.zeros(len(c.path)) for c in body.cables)
+    tension, held = (values, None) if drive.control == "tension" else (None, values)
+    return solve_equilibrium(body, tension=tension, shortening=held, nodal_forces=loads, start=start, before=before, reuse_factor=reuse_factor)
+
+
+def walk_along(
+    walk: Walk, frames: Sequence[int], observe: Callable[[Robot, Equilibrium], FloatArray], variants: Sequence[Walk] = (),
+) -> Iterator[tuple[int, Equilibrium, FloatArray, FloatArray]]:  # fmt: skip
+    """Solve frames in order, and with each the same frame of variants that differ from it by little.
+
+    Variants start from the base state with its factor, so that a derivative by difference costs a few solves and no
+    factorisation.
+
+    Arguments:
+        walk: the base.
+        frames: indices, ascending; frames between them are solved too where the past matters.
+        observe: (robot, state) → what is kept of a state, shape (p, 3).
+        variants: other robots or drives.
+
+    Yields:
+        frame index, equilibrium, observation (p, 3), observations of the variants (v, p, 3).
+    """
+    wanted = set(int(f) for f in frames)
+    past = any(has_history(w.robot) for w in (walk, *variants))
+    todo = range(max(wanted) + 1) if past and wanted else sorted(wanted)
+    known: dict[bytes, tuple[Equilibrium, FloatArray, FloatArray]] = {}
+    base: Equilibrium | None = None
+    memory: list[tuple[FloatArray, ...] | None] = [None] * (1 + len(variants))
+    for k in todo:
+        key = _key(walk, variants, k)
+        if not past and key in known:
+            yield k, *known[key]
+            continue
+        base = _require(solve_frame(walk, k, start=base if base is not None and base.converged else None, before=memory[0]), k)
+        memory[0] = base.segment_tensions if past else None
+        seen = observe(walk.robot, base)
+        others = np.zeros((len(variants), *seen.shape))
+        for i, variant in enumerate(variants):
+            state = _require(solve_frame(variant, k, start=base, before=memory[1 + i], reuse_factor=True), k)
+            memory[1 + i] = state.segment_tensions if past else None
+            others[i] = observe(variant.robot, state)
+        kept = replace(base, factor=None)
+        if not past:
+            known[key] = (kept, seen, others)
+        if k in wanted:
+            yield k, kept, seen, others
+
+
+def _key(walk: Walk, variants: Sequence[Walk], frame: int) -> bytes:
+    parts = []
+    for w in (walk, *variants):
+        drive = w.drive
+        rows = drive.load_frame == frame
+        parts += [drive.inputs[frame], drive.load_points[rows].ravel(), drive.load_forces[rows].ravel()]
+        if drive.gravity is not None:
+            parts.append(drive.gravity[frame])
+    return np.concatenate([np.asarray(p, dtype=float) for p in parts]).tobytes()
+
+
+def _require(state: Equilibrium, frame: int) -> Equilibrium:
+    if not state.converged:
+        raise DataError(f"no equilibrium in frame {frame}: {state.status}: {state.advice} (unbalanced {state.residual_n:.2g} N)")
+    return state
+
+
+def marker_positions(robot: Robot, state: Equilibrium) -> FloatArray:
+    """Return the markers of a robot in a state [m], shape (k, 3), robot frame."""
+    return robot.markers.positions(state.positions)
+
+
+def rest_drive(robot: Robot) -> Equilibrium:
+    """Return the equilibrium of a robot whose cables are slack."""
+    return solve_equilibrium(robot.body)
