@@ -79,7 +79,9 @@ def _parse(header: dict[str, list[str]], file: Path) -> _Layout:
     letters = header.get("TYPE", [])
     if len(letters) != len(names) or any(size not in _SIZES.get(letter, ()) for letter, size in zip(letters, sizes)):
         found = f"TYPE {' '.join(letters)}, SIZE {' '.join(map(str, sizes))}"
-        raise InputError("unknown field types", where=file, found=found, expected=f"{len(names)} of F (4, 8), U or I (1, 2, 4, 8)")
+        raise InputError(
+            "unknown field types", where=file, found=found, expected=f"{len(names)} of F (4, 8), U or I (1, 2, 4, 8)"
+        )
     storage = " ".join(header["DATA"])
     if storage not in ("ascii", "binary", "binary_compressed"):
         raise InputError("unknown storage", where=file, found=f"DATA {storage}", expected="ascii, binary or binary_compressed")
@@ -90,7 +92,9 @@ def _parse(header: dict[str, list[str]], file: Path) -> _Layout:
 def _integers(header: dict[str, list[str]], key: str, length: int, file: Path) -> tuple[int, ...]:
     words = header.get(key, [])
     if len(words) != length or not all(word.isdigit() and int(word) > 0 for word in words):
-        raise InputError("a broken PCD header", where=file, found=f"{key} {' '.join(words)}", expected=f"{key} with {length} numbers > 0")
+        raise InputError(
+            "a broken PCD header", where=file, found=f"{key} {' '.join(words)}", expected=f"{key} with {length} numbers > 0"
+        )
     return tuple(int(word) for word in words)
 
 
@@ -101,7 +105,9 @@ def _point_count(header: dict[str, list[str]], file: Path) -> int:
     sides = header.get("WIDTH", []) + header.get("HEIGHT", [])
     if len(sides) == 2 and all(word.isdigit() for word in sides):
         return int(sides[0]) * int(sides[1])
-    raise InputError("the PCD header does not say how many points", where=file, found=f"POINTS {' '.join(words)}", expected="POINTS n")
+    raise InputError(
+        "the PCD header does not say how many points", where=file, found=f"POINTS {' '.join(words)}", expected="POINTS n"
+    )
 
 
 # --- data -------------------------------------------------------------------------------------------------------------

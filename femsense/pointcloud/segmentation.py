@@ -1,5 +1,5 @@
 # mypy: allow-untyped-decorators
-"""Which points are robot, which are something else: by colour, by the model, by planes and clusters.
+"""Which points are robot and which are something else: by colour, or by the model.
 
 Source: "Calibration and force sensing with an RGB-D camera", section V.A.2. The idea of growing regions by colour and then
 merging them is that of the Point Cloud Library (Zhan, Liang and Xiao 2009); here it is a union of neighbours in a grid.
@@ -7,16 +7,23 @@ merging them is that of the Point Cloud Library (Zhan, Liang and Xiao 2009); her
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from femsense.arrays import BoolArray, FloatArray, IntArray, as_points, freeze
-from femsense.errors import DataError, InputError
+from femsense.arrays import BoolArray, FloatArray, IntArray, as_points
+from femsense.errors import InputError
 from femsense.pointcloud.cloud import PointCloud
-from femsense.pointcloud.grid import adjacent_labels, build_grid, by_size, connected_labels, count_neighbors, find_root, positive
+from femsense.pointcloud.grid import (
+    adjacent_labels,
+    build_grid,
+    by_size,
+    connected_labels,
+    count_neighbors,
+    count_within,
+    find_root,
+    positive,
+)
 
 _DARK = 0.08  # brightness below which a colour says nothing: a few steps of 8-bit noise turn its hue
 
@@ -103,7 +110,9 @@ def color_mask(
         raise InputError("not a colour", where="color_rgb", found=color_rgb, expected="three numbers in 0 … 1")
     length = float(np.linalg.norm(wanted))
     if length < _DARK:
-        raise InputError("too dark to be told from shadow", where="color_rgb", found=color_rgb, expected=f"a length above {_DARK}")
+        raise InputError(
+            "too dark to be told from shadow", where="color_rgb", found=color_rgb, expected=f"a length above {_DARK}"
+        )
     lengths = np.linalg.norm(rgb, axis=1)
     cosine = rgb @ (wanted / length) / np.maximum(lengths, 1e-12)
     in_light = (lengths >= max(shade[0] * length, _DARK)) & (lengths <= shade[1] * length)
@@ -181,103 +190,24 @@ def segment_by_model(
     return cloud.select(near), cloud.select(~near)
 
 
-# --- planes and clusters ----------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Plane:
-    """The points p with normal · p = offset; the normal points to the side of the frame's origin (the camera)."""
-
-    normal: FloatArray
-    """Unit normal, shape [3]."""
-    offset: float
-    """Signed distance of the plane from the origin along the normal [m], ≤ 0."""
-
-    def distance(self, points: FloatArray) -> FloatArray:
-        """Return the signed distance of points (n, 3) from the plane [m], > 0 on the camera's side, shape (n,)."""
-        return np.asarray(points @ self.normal - self.offset)
-
-
-def find_plane(
-    points: npt.ArrayLike, distance_m: float, *, trials: int = 300, rng: np.random.Generator | None = None
-) -> Plane:
-    """Return the plane with the most points within distance_m [m] (RANSAC, then least squares over its points).
-
-    Arguments:
-        points: [m], shape (n, 3).
-        distance_m: half the thickness of the plane [m], about two standard deviations of the depth.
-        trials: planes through three random points; 300 miss a plane that holds 30 % of the points with probability 3e-4.
-        rng: source of randomness; a fixed seed where it is not given.
-    Raises:
-        DataError: fewer than three points, or all of them on a line.
-    """
-    positions = as_points(points)
-    distance = positive(distance_m, "distance_m")
-    generator = np.random.default_rng(0) if rng is None else rng
-    if len(positions) < 3:
-        raise DataError(f"no plane in {len(positions)} points: at least 3 are needed")
-    sample = positions[np.sort(generator.permutation(len(positions))[:3000])]
-    corners = sample[generator.integers(len(sample), size=(int(trials), 3))]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    lengths = np.linalg.norm(normals, axis=1)
-    usable = lengths > 1e-9 * max(float(np.ptp(positions, axis=0).max()) ** 2, 1e-300)
-    if not usable.any():
-        raise DataError("no plane: the points lie on a line or in one place")
-    normals = normals[usable] / lengths[usable, None]
-    offsets = np.einsum("ij,ij->i", normals, corners[usable, 0])
-    score = (np.abs(sample @ normals.T - offsets) <= distance).sum(axis=0)
-    best = int(np.argmax(score))
-    plane = _facing_origin(normals[best], float(offsets[best]))
-    for _ in range(5):
-        plane = _fit_plane(positions[np.abs(plane.distance(positions)) <= distance], plane)
-    return plane
-
-
-def remove_plane(
-    cloud: PointCloud,
-    distance_m: float,
-    *,
-    keep_behind: bool = False,
-    trials: int = 300,
-    rng: np.random.Generator | None = None,
-) -> tuple[PointCloud, Plane]:
-    """Return the points on the camera's side of the largest plane, and that plane.
-
-    Arguments:
-        distance_m: points closer to the plane than this are removed [m].
-        keep_behind: keep the points behind the plane too (under the table).
-        trials, rng: see `find_plane`.
-    Raises:
-        DataError: fewer than three points, or all of them on a line.
-    """
-    plane = find_plane(cloud.points, distance_m, trials=trials, rng=rng)
-    height = plane.distance(cloud.points)
-    return cloud.select((height > distance_m) | (keep_behind & (height < -distance_m))), plane
-
-
-def euclidean_clusters(points: npt.ArrayLike, distance_m: float, min_size: int = 1) -> IntArray:
-    """Return the cluster of each point, shape (n,): 0 is the largest, −1 a cluster below min_size.
-
-    Points closer than distance_m [m] to each other belong together. points [m], shape (n, 3). Raises InputError.
-    """
-    positions = as_points(points)
-    distance = positive(distance_m, "distance_m")
-    colorless = np.zeros((len(positions), 1))
-    return by_size(connected_labels(build_grid(positions, distance), distance, colorless, 1.0), int(min_size))
-
-
 # --- helpers ----------------------------------------------------------------------------------------------------------
 
 
-def surface_pair(points: npt.ArrayLike, normals: npt.ArrayLike, points_name: str, normals_name: str) -> tuple[FloatArray, FloatArray]:
+def surface_pair(
+    points: npt.ArrayLike, normals: npt.ArrayLike, points_name: str, normals_name: str
+) -> tuple[FloatArray, FloatArray]:
     """Return points (n, 3) and unit normals (n, 3) after checking that they belong together. Raises InputError."""
     positions, directions = as_points(points, points_name), as_points(normals, normals_name)
     if len(positions) != len(directions):
-        raise InputError(f"one normal per row of {points_name}", where=normals_name, found=len(directions), expected=len(positions))
+        raise InputError(
+            f"one normal per row of {points_name}", where=normals_name, found=len(directions), expected=len(positions)
+        )
     lengths = np.linalg.norm(directions, axis=1)
     if (lengths <= 0.0).any():
         row = int(np.flatnonzero(lengths <= 0.0)[0])
-        raise InputError("a normal of length zero", where=f"{normals_name}[{row}]", found=directions[row].tolist(), expected="a direction")
+        raise InputError(
+            "a normal of length zero", where=f"{normals_name}[{row}]", found=directions[row].tolist(), expected="a direction"
+        )
     return positions, directions / lengths[:, None]
 
 
@@ -294,11 +224,9 @@ def _need_colors(cloud: PointCloud) -> FloatArray:
 
 
 def _majority(points: FloatArray, mask: BoolArray, radius: float) -> BoolArray:
-    from femsense.pointcloud.grid import count_within
-
     voters = count_neighbors(build_grid(points, radius), radius) + 1
     for_robot = count_within(build_grid(points[mask], radius), points, radius)
-    return np.where(2 * for_robot == voters, mask, 2 * for_robot > voters)
+    return np.asarray(np.where(2 * for_robot == voters, mask, 2 * for_robot > voters))
 
 
 def _spacing(tree: object) -> float:
@@ -325,25 +253,12 @@ def _like_the_near(features: FloatArray, near: BoolArray, sure: BoolArray) -> Bo
         return near
     inner_cost = (((features - inner_center) / inner_spread) ** 2).sum(axis=1) + 2.0 * np.log(inner_spread).sum()
     outer_cost = (((features - outer_center) / outer_spread) ** 2).sum(axis=1) + 2.0 * np.log(outer_spread).sum()
-    return near & (inner_cost <= outer_cost)
+    return np.asarray(near & (inner_cost <= outer_cost))
 
 
 def _spread(values: FloatArray, center: FloatArray) -> FloatArray:
     """Return the standard deviation of each column from its median deviation, at least one step of an 8-bit colour."""
     return np.asarray(np.maximum(1.4826 * np.median(np.abs(values - center), axis=0), 1.0 / 255.0))
-
-
-def _facing_origin(normal: FloatArray, offset: float) -> Plane:
-    sign = -1.0 if offset > 0.0 else 1.0
-    return Plane(freeze(sign * normal), sign * offset)
-
-
-def _fit_plane(points: FloatArray, start: Plane) -> Plane:
-    if len(points) < 3:
-        return start
-    center = points.mean(axis=0)
-    _, vectors = np.linalg.eigh((points - center).T @ (points - center))
-    return _facing_origin(vectors[:, 0], float(vectors[:, 0] @ center))
 
 
 @njit(cache=True)

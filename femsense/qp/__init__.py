@@ -1,0 +1,20 @@
+"""The quadratic problem of force sensing: build it, solve it with a certificate, and say how far the forces can be trusted."""
+
+from femsense.qp.forces import ForceEstimate, estimate_forces
+from femsense.qp.problem import FrictionCone, Multipliers, Problem, Residuals, build_force_problem, kkt_residuals
+from femsense.qp.solve import SOLVERS, Solution, Status, solve
+
+__all__ = [
+    "SOLVERS",
+    "ForceEstimate",
+    "FrictionCone",
+    "Multipliers",
+    "Problem",
+    "Residuals",
+    "Solution",
+    "Status",
+    "build_force_problem",
+    "estimate_forces",
+    "kkt_residuals",
+    "solve",
+]

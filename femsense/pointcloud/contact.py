@@ -1,0 +1,97 @@
+"""Where something touches the robot.
+
+Source: "Calibration and force sensing with an RGB-D camera", section V.A.3–4, Algorithm 2.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from femsense.arrays import FloatArray, IntArray, as_points, freeze
+from femsense.errors import InputError
+from femsense.pointcloud.grid import build_grid, count_within, positive
+from femsense.pointcloud.objects import euclidean_clusters
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Contacts:
+    """Places of contact, the one with the most points first."""
+
+    positions: FloatArray
+    """Mean of each group of contact points [m], shape [k, 3]."""
+    counts: IntArray
+    """Surrounding points in each group, shape [k]."""
+    radius: FloatArray
+    """Root mean square distance of a group's points from their mean [m], shape [k]: the size of the patch."""
+
+    def __len__(self) -> int:
+        return len(self.counts)
+
+
+def detect_contacts(
+    surroundings: npt.ArrayLike,
+    robot: npt.ArrayLike,
+    *,
+    search_radius_m: float,
+    min_neighbors: int,
+    cluster_distance_m: float,
+    min_points: int = 1,
+) -> Contacts:
+    """Return the places where surrounding points come close to the robot (Algorithm 2).
+
+    A surrounding point is a contact point where at least min_neighbors robot points lie within search_radius_m; contact points closer
+    than cluster_distance_m to each other form a group; a group's mean is a place of contact.
+
+    Arguments:
+        surroundings: points of everything but the robot [m], shape (m, 3).
+        robot: points of the robot [m], shape (r, 3).
+        search_radius_m: [m]; above the spacing of the points and the noise.
+        min_neighbors: robot points that make a contact, at least 1.
+        cluster_distance_m: gap that parts two contacts [m].
+        min_points: contact points of the smallest group.
+    Returns:
+        Contacts, ordered by falling count, then by x, y, z; empty where nothing touches.
+    Raises:
+        InputError: wrong shapes, or numbers that are not positive.
+    """
+    others, body = as_points(surroundings, "surroundings"), as_points(robot, "robot")
+    radius = positive(search_radius_m, "search_radius_m")
+    enough = _at_least_one(min_neighbors, "min_neighbors")
+    touching = others[count_within(build_grid(body, radius), others, radius, enough=enough) >= enough]
+    groups = euclidean_clusters(touching, cluster_distance_m, _at_least_one(min_points, "min_points"))
+    return _contacts(touching[groups >= 0], groups[groups >= 0])
+
+
+def map_to_features(positions: npt.ArrayLike, feature_points: npt.ArrayLike) -> IntArray:
+    """Return the index of the feature point that is closest to each position, shape (k,).
+
+    Arguments:
+        positions: places of contact [m], shape (k, 3).
+        feature_points: [m], shape (e, 3); of two at the same distance the first is taken.
+    Raises:
+        InputError: wrong shapes, or no feature points.
+    """
+    places, features = as_points(positions, "positions"), as_points(feature_points, "feature_points")
+    if len(features) == 0:
+        raise InputError("no feature points", where="feature_points", found="0 points", expected="at least one")
+    squared = ((places[:, None, :] - features[None, :, :]) ** 2).sum(axis=2)
+    return np.asarray(squared.argmin(axis=1), dtype=np.int64)
+
+
+def _contacts(points: FloatArray, groups: IntArray) -> Contacts:
+    counts = np.bincount(groups)
+    if len(counts) == 0:
+        return Contacts(freeze(np.zeros((0, 3))), freeze([], np.int64), freeze([]))
+    means = np.stack([np.bincount(groups, weights=column) for column in points.T], axis=1) / counts[:, None]
+    spread = np.bincount(groups, weights=((points - means[groups]) ** 2).sum(axis=1)) / counts
+    order = np.lexsort((means[:, 2], means[:, 1], means[:, 0], -counts))
+    return Contacts(freeze(means[order]), freeze(counts[order], np.int64), freeze(np.sqrt(spread[order])))
+
+
+def _at_least_one(value: int, name: str) -> int:
+    if int(value) < 1:
+        raise InputError(f"{name} must be at least 1", where=name, found=value, expected="≥ 1")
+    return int(value)
