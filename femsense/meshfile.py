@@ -44,16 +44,16 @@ def read_tets(path: Path, *, where: str | None = None) -> TetMesh:
     _check_exists(path, where)
     if path.suffix.lower() in SURFACE_ENDINGS:
         return _tets_of_surface(*read_surface(path, where=where), where)
-    points, cells = _read_cells(path, where)
+    points, cells = read_cells(path, where)
     kinds = [kind for kind in ("tetra", "tetra10") if kind in cells]
     others = sorted(set(cells) & set(SOLID_KINDS))
     if others or len(kinds) > 1:
         raise InputError("elements that femsense does not compute with", where=where, found=", ".join(sorted(cells)),
                          expected="tetrahedra of one kind (tetra or tetra10)", hint="split them into tetrahedra where the mesh is made")  # fmt: skip
     if kinds:
-        return _ordered(points, cells[kinds[0]], where)
+        return ordered_tets(points, cells[kinds[0]], where)
     if "triangle" in cells:
-        return _tets_of_surface(*_closed(points, cells["triangle"], where), where)
+        return _tets_of_surface(*closed_surface(points, cells["triangle"], where), where)
     raise InputError("the mesh has no tetrahedra", where=where, found=", ".join(sorted(cells)) or "no cells", expected="tetra or tetra10 cells, or a closed surface of triangles")  # fmt: skip
 
 
@@ -62,7 +62,7 @@ def read_surface(path: Path, *, where: str | None = None) -> tuple[FloatArray, I
     where = where or str(path)
     _check_exists(path, where)
     points, triangles = read_triangles(path, where=where)
-    return _closed(points, triangles, where)
+    return closed_surface(points, triangles, where)
 
 
 def read_triangles(path: Path, *, where: str | None = None) -> tuple[FloatArray, IntArray]:
@@ -153,7 +153,7 @@ def _check_exists(path: Path, where: str) -> None:
     raise InputError("no such mesh file", where=where, found=str(path), expected="a file", hint=near(path.name, names))
 
 
-def _read_cells(path: Path, where: str) -> tuple[FloatArray, dict[str, IntArray]]:
+def read_cells(path: Path, where: str) -> tuple[FloatArray, dict[str, IntArray]]:
     """Return points and the cells of each kind through meshio, which may print and exit."""
     import meshio
 
@@ -172,7 +172,7 @@ def _read_cells(path: Path, where: str) -> tuple[FloatArray, dict[str, IntArray]
     return points, cells
 
 
-def _ordered(points: FloatArray, tets: IntArray, where: str) -> TetMesh:
+def ordered_tets(points: FloatArray, tets: IntArray, where: str) -> TetMesh:
     """Return the mesh with its corner nodes first, all elements turned where all are inverted."""
     if tets.size and (tets.min() < 0 or tets.max() >= len(points)):
         raise InputError("an element names a node that does not exist", where=where, found=int(tets.max()), expected=f"0 … {len(points) - 1}")  # fmt: skip
@@ -205,7 +205,7 @@ def _check_middles(mesh: TetMesh, where: str) -> None:
                          expected="the order of VTK: corners 0 1 2 3, then the edges 01 12 02 03 13 23")  # fmt: skip
 
 
-def _closed(points: FloatArray, triangles: IntArray, where: str) -> tuple[FloatArray, IntArray]:
+def closed_surface(points: FloatArray, triangles: IntArray, where: str) -> tuple[FloatArray, IntArray]:
     """Return the surface, outward. Raises InputError where it is open."""
     import trimesh
 

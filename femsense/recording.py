@@ -604,15 +604,15 @@ def _find_clouds(folder: Path, views: tuple[str, ...], numbers: IntArray) -> tup
     """Return the cloud (or depth) files and the colour files of each frame and view."""
     clouds, colors = [], []
     for name in views:
-        found = _numbered(folder / "clouds" / name, (".ply", ".pcd"))
-        depth = _numbered(folder / "depth" / name, (".png",))
-        color = _numbered(folder / "color" / name, (".png",))
+        found = numbered_files(folder / "clouds" / name, (".ply", ".pcd"))
+        depth = numbered_files(folder / "depth" / name, (".png",))
+        color = numbered_files(folder / "color" / name, (".png",))
         clouds.append([found.get(n) or depth.get(n) for n in numbers.tolist()])
         colors.append([color.get(n) if n not in found and n in depth else None for n in numbers.tolist()])
     return tuple(zip(*clouds)), tuple(zip(*colors))
 
 
-def _numbered(folder: Path, endings: tuple[str, ...]) -> dict[int, Path]:
+def numbered_files(folder: Path, endings: tuple[str, ...]) -> dict[int, Path]:
     """Return the files of a folder by the number that is their name."""
     files: dict[int, Path] = {}
     for file in sorted(folder.iterdir()) if folder.is_dir() else []:
