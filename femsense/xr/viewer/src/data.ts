@@ -1,0 +1,63 @@
+// What the page is served next to the mesh: the frames of the run and the contacts of each.
+
+export type Vector = [number, number, number];
+
+export interface Contact {
+  contact: number;
+  point_m: Vector | null;
+  force_vector_n: Vector | null;
+  force_n: number | null;
+  std_n: number | null;
+  source: string;
+}
+
+export interface Frame {
+  time_s: number; // from the first frame, as in the animation
+  frame: number | null; // number in the recording
+  status: string | null;
+  rms_after_m: number | null;
+  contacts: Contact[];
+}
+
+export interface Run {
+  name: string;
+  frames: Frame[];
+}
+
+/** Returns the run, or null where none is served: the mesh alone can be shown too. */
+export async function loadRun(url: string): Promise<Run | null> {
+  const answer = await fetch(url);
+  if (answer.status === 404) return null;
+  if (!answer.ok) throw new Error(`${url} could not be loaded (${answer.status}).`);
+  const run = (await answer.json()) as Run & { format?: string };
+  if (run.format !== "femsense-contacts-1") throw new Error(`${url} is not a list of contacts that this page knows.`);
+  return run;
+}
+
+/** Returns the index of the frame whose time is nearest. */
+export function frameAt(frames: Frame[], time: number): number {
+  let low = 0;
+  let high = frames.length - 1;
+  while (high - low > 1) {
+    const middle = (low + high) >> 1;
+    if (frames[middle]!.time_s <= time) low = middle;
+    else high = middle;
+  }
+  return high >= 0 && Math.abs(frames[high]!.time_s - time) < Math.abs(frames[low]!.time_s - time) ? high : low;
+}
+
+export function totalForce(frame: Frame): number {
+  return frame.contacts.reduce((sum, c) => sum + (c.force_n ?? 0), 0);
+}
+
+/** Standard deviation of the sum, taken as independent. */
+export function totalStd(frame: Frame): number | null {
+  const known = frame.contacts.filter((c) => c.std_n !== null);
+  return known.length ? Math.hypot(...known.map((c) => c.std_n!)) : null;
+}
+
+export function newtons(force: number | null, std: number | null): string {
+  if (force === null) return "–";
+  const digits = Math.abs(force) >= 10 ? 1 : 2;
+  return std === null ? `${force.toFixed(digits)} N` : `${force.toFixed(digits)} ± ${std.toFixed(digits)} N`;
+}
