@@ -116,9 +116,9 @@ def write_cloud(path: str | Path, cloud: PointCloud) -> None:
         raise InputError("no such folder", where=file.parent, expected="a folder that exists")
     import open3d as o3d
 
-    data = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud.points))
+    data = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud.points.copy()))
     if cloud.colors is not None:
-        data.colors = o3d.utility.Vector3dVector(cloud.colors)
+        data.colors = o3d.utility.Vector3dVector(cloud.colors.copy())
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         written = o3d.io.write_point_cloud(str(file), data)
     if not written:

@@ -150,7 +150,7 @@ def _matches(raw: tuple[FloatArray, IntArray], grid: Grid, visible: BoolArray, a
     dof = fitted - terms
     variance = _pooled_variance(squares, dof)
     used = np.full(len(found), average)
-    std = np.sqrt(np.where(used, variance * leverage, variance + (slope * line) ** 2) + floor**2)
+    std = np.sqrt(np.where(used, variance * np.where(found, leverage, 1.0), variance + (slope * line) ** 2) + floor**2)
     return Matches(
         found=freeze(found, np.bool_),
         distance=freeze(np.where(found, np.where(used, value, offset), np.nan)),

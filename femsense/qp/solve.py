@@ -109,6 +109,8 @@ def solve(problem: Problem, *, solver: str = "daqp", tolerance: float = 1e-7, fa
     """
     if solver not in SOLVERS:
         raise InputError("unknown solver", where="solver", found=solver, expected=", ".join(SOLVERS))
+    if (problem.parts()[6] > problem.parts()[7]).any():
+        return _without_answer(Status.INFEASIBLE)
     scaling = _scaling(problem)
     scaled = _scaled(problem, scaling)
     if _most_negative(scaled.P) < -1e-9:
@@ -220,7 +222,7 @@ def _call(problem: Problem, solver: str) -> tuple[FloatArray | None, Multipliers
         warnings.simplefilter("ignore")
         try:
             answer = qpsolvers.solve_problem(quadratic, solver=solver, **_OPTIONS[solver])
-        except (qpsolvers.QPError, ValueError, ArithmeticError):
+        except Exception:  # a solver's own ways to fail; the certificate decides
             return None, None
     if not answer.found or answer.x is None:
         return None, None
@@ -234,14 +236,20 @@ def _writable(part: FloatArray | None) -> FloatArray | None:
 def _cleaned(problem: Problem, z: FloatArray | None, y: FloatArray | None, z_box: FloatArray | None) -> Multipliers:
     """Return multipliers with absent parts as zeros, and none on bounds that are not there."""
     _, q, _, h, _, b, lb, ub = problem.parts()
-    box = np.zeros(len(q)) if z_box is None or len(z_box) == 0 else np.array(z_box, dtype=np.float64)
+    box = _first(z_box, len(q))
     box[(box < 0.0) & ~np.isfinite(lb)] = 0.0
     box[(box > 0.0) & ~np.isfinite(ub)] = 0.0
     return Multipliers(
-        z=np.zeros(len(h)) if z is None or len(z) == 0 else np.asarray(z, dtype=np.float64),
-        y=np.zeros(len(b)) if y is None or len(y) == 0 else np.asarray(y, dtype=np.float64),
+        z=_first(z, len(h)),
+        y=_first(y, len(b)),
         z_box=box,
     )
+
+
+def _first(values: FloatArray | None, length: int) -> FloatArray:
+    """Return the first entries as a new array, zeros where there are too few (solvers differ in what they give for absent parts)."""
+    given = np.zeros(0) if values is None else np.asarray(values, dtype=np.float64)
+    return np.array(given[:length]) if len(given) >= length else np.zeros(length)
 
 
 def _largest(residuals: Residuals) -> float:
@@ -258,7 +266,7 @@ def _most_negative(P: FloatArray) -> float:
 def _diagnosis(scaled: Problem) -> Status:
     """Return why no solver had an answer: two linear programmes tell infeasible and unbounded from inaccurate."""
     P, q, G, h, A, b, lb, ub = scaled.parts()
-    if (lb > ub).any() or _linear(np.zeros(len(q)), G, h, A, b, lb, ub)[0] == 2:
+    if _linear(np.zeros(len(q)), G, h, A, b, lb, ub)[0] == 2:
         return Status.INFEASIBLE
     down, up = np.where(np.isfinite(lb), 0.0, -1.0), np.where(np.isfinite(ub), 0.0, 1.0)
     flat = np.vstack([A, P])
