@@ -7,6 +7,7 @@ import hashlib
 import importlib.util
 import io
 import os
+import secrets
 import sys
 import types
 import warnings
@@ -18,7 +19,7 @@ import numpy as np
 from femsense.arrays import FloatArray, IntArray
 from femsense.errors import InputError, MissingDependency
 from femsense.fem.mesh import EDGES, TetMesh, element_volumes, oriented
-from femsense.files import write_beside
+from femsense.files import PART_PREFIX, write_beside
 from femsense.tables import near
 
 SURFACE_ENDINGS = (".ply", ".stl", ".obj", ".off")
@@ -30,7 +31,7 @@ EDGE_FRACTION = 0.05
 def read_tets(path: Path, *, where: str | None = None) -> TetMesh:
     """Return the tetrahedra of a mesh file, in the file's unit, corner nodes first.
 
-    A closed surface is tetrahedralised on first use; the result is kept in the cache folder. Nodes that no tetrahedron uses
+    A closed surface is tetrahedralised on first use; the result is kept beside it (or in the cache folder). Nodes that no tetrahedron uses
     are dropped with a warning. A mesh whose elements are all inverted has another order of nodes and is turned.
 
     Arguments:
@@ -43,7 +44,7 @@ def read_tets(path: Path, *, where: str | None = None) -> TetMesh:
     where = where or str(path)
     _check_exists(path, where)
     if path.suffix.lower() in SURFACE_ENDINGS:
-        return _tets_of_surface(*read_surface(path, where=where), where)
+        return _tets_of_surface(path, *read_surface(path, where=where), where)
     points, cells = read_cells(path, where)
     kinds = [kind for kind in ("tetra", "tetra10") if kind in cells]
     others = sorted(set(cells) & set(SOLID_KINDS))
@@ -53,7 +54,7 @@ def read_tets(path: Path, *, where: str | None = None) -> TetMesh:
     if kinds:
         return ordered_tets(points, cells[kinds[0]], where)
     if "triangle" in cells:
-        return _tets_of_surface(*closed_surface(points, cells["triangle"], where), where)
+        return _tets_of_surface(path, *closed_surface(points, cells["triangle"], where), where)
     raise InputError("the mesh has no tetrahedra", where=where, found=", ".join(sorted(cells)) or "no cells", expected="tetra or tetra10 cells, or a closed surface of triangles")  # fmt: skip
 
 
@@ -83,7 +84,7 @@ def read_triangles(path: Path, *, where: str | None = None) -> tuple[FloatArray,
 def tetrahedralise(
     points: FloatArray, triangles: IntArray, *, edge_fraction: float = EDGE_FRACTION, where: str = "surface"
 ) -> TetMesh:
-    """Return tetrahedra that fill a closed surface (fTetWild, one thread, so that the same surface gives the same mesh).
+    """Return tetrahedra that fill a closed surface (fTetWild; another mesh each time, see `_tets_of_surface`).
 
     Arguments:
         points: shape (n, 3), any unit.
@@ -100,8 +101,15 @@ def tetrahedralise(
     )
     if not len(tets):
         raise InputError("no tetrahedra came out of this surface", where=where, found=f"{len(triangles)} triangles", expected="a closed surface around a volume")  # fmt: skip
-    mesh = _compact(np.asarray(nodes, dtype=np.float64), np.asarray(tets, dtype=np.int64))
-    return oriented(mesh)
+    mesh = oriented(_compact(np.asarray(nodes, dtype=np.float64), np.asarray(tets, dtype=np.int64)))
+    corners = points[triangles]
+    inside = float(np.linalg.det(corners).sum() / 6.0)  # Σ a · (b × c) / 6 over outward triangles
+    filled = float(element_volumes(mesh).sum()) / inside if inside else np.nan
+    if not 0.95 < filled < 1.05:
+        warnings.warn(
+            f"{where}: the tetrahedra fill {100 * filled:.3g} % of the surface's volume; are its walls thin?", stacklevel=4
+        )
+    return mesh
 
 
 def write_mesh(mesh: TetMesh, path: Path) -> None:
@@ -111,6 +119,16 @@ def write_mesh(mesh: TetMesh, path: Path) -> None:
     kind = "tetra10" if mesh.is_quadratic else "tetra"
     with write_beside(path) as part:
         meshio.Mesh(np.asarray(mesh.nodes), [(kind, np.asarray(mesh.tets))]).write(part)
+
+
+def mesh_companions(path: Path) -> list[Path]:
+    """Return the files that a mesh needs to load back the same: itself, the other files of its format, kept tetrahedra."""
+    pairs = {".node": (".ele",), ".ele": (".node",), ".xdmf": (".h5",), ".xmf": (".h5",)}
+    files = [path, *(path.with_suffix(ending) for ending in pairs.get(path.suffix.lower(), ()))]
+    if path.suffix.lower() in SURFACE_ENDINGS:
+        places = kept_tets(path, *read_surface(path))
+        files += [next((place for place in places if place.is_file()), path)]
+    return [file for file in dict.fromkeys(files) if file.is_file()]
 
 
 def radius_ratio(mesh: TetMesh) -> FloatArray:
@@ -220,23 +238,55 @@ def closed_surface(points: FloatArray, triangles: IntArray, where: str) -> tuple
     return np.array(surface.vertices, dtype=np.float64), np.array(surface.faces, dtype=np.int64)
 
 
-def _tets_of_surface(points: FloatArray, triangles: IntArray, where: str) -> TetMesh:
-    """Return the tetrahedra of a surface from the cache, or made and kept there."""
-    key = hashlib.sha256(points.tobytes() + triangles.tobytes() + f"1 {EDGE_FRACTION}".encode()).hexdigest()
-    file = cache_folder() / "tetrahedra" / f"{key[:32]}.npz"
-    cached = _read_cache(file)
-    if cached is not None:
-        return cached
+def kept_tets(surface: Path, points: FloatArray, triangles: IntArray) -> tuple[Path, Path]:
+    """Return where the tetrahedra of a surface file are kept: beside it, or in the cache where that cannot be written."""
+    content = points.tobytes() + triangles.tobytes() + f"1 {EDGE_FRACTION}".encode()
+    name = f"{surface.stem}-{hashlib.sha256(content).hexdigest()[:16]}.tets.npz"
+    return surface.with_name(name), cache_folder() / "tetrahedra" / name
+
+
+def _tets_of_surface(file: Path, points: FloatArray, triangles: IntArray, where: str) -> TetMesh:
+    """Return the tetrahedra of a surface as they are kept, or made and kept.
+
+    fTetWild shuffles with a seed of its own, so that only the kept mesh makes two runs equal: the first one written counts.
+    """
+    places = kept_tets(file, points, triangles)
+    for place in places:
+        kept = _read_kept(place)
+        if kept is not None:
+            return kept
     mesh = tetrahedralise(points, triangles, where=where)
-    with contextlib.suppress(OSError), write_beside(file) as part:  # a cache that cannot be written costs time only
-        np.savez_compressed(part, nodes=mesh.nodes, tets=mesh.tets)
+    for place in places:
+        if _keep(mesh, place):
+            return _read_kept(place) or mesh
+    warnings.warn(
+        f"{where}: the tetrahedra cannot be kept, so that each run makes another mesh; femsense mesh writes one", stacklevel=4
+    )
     return mesh
 
 
-def _read_cache(file: Path) -> TetMesh | None:
+def _keep(mesh: TetMesh, place: Path) -> bool:
+    """Write the mesh where none stands yet (two processes may come here at once); False where that is not possible."""
+    part = place.with_name(f"{PART_PREFIX}{secrets.token_hex(4)}-{place.name}")
+    try:
+        place.parent.mkdir(parents=True, exist_ok=True)
+        np.savez_compressed(part, nodes=mesh.nodes, tets=mesh.tets)
+        if _read_kept(place) is None:
+            place.unlink(missing_ok=True)
+        with contextlib.suppress(FileExistsError):
+            os.link(part, place)
+    except OSError:
+        return False
+    finally:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
+    return True
+
+
+def _read_kept(place: Path) -> TetMesh | None:
     """Return a kept mesh; None where there is none or it cannot be read."""
     try:
-        with np.load(file) as data:
+        with np.load(place) as data:
             return TetMesh(data["nodes"], data["tets"])
     except Exception:
         return None

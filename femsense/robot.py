@@ -18,7 +18,7 @@ from femsense.errors import InputError
 from femsense.fem.body import BodyModel, Cable, make_body, tie_cable
 from femsense.fem.mesh import TetMesh, check_mesh, embed_points, to_linear, to_quadratic
 from femsense.files import plain, write_beside, write_toml
-from femsense.meshfile import read_tets, write_mesh
+from femsense.meshfile import mesh_companions, read_tets, write_mesh
 from femsense.model import Observation, Robot, plain_actuation, spread_features
 from femsense.pose import check_pose, transform_points
 from femsense.tables import Schema, key_path, near, read_toml, schema_problems, short, validated
@@ -492,7 +492,7 @@ def _check_plain(robot: Robot) -> None:
         "dead forces": body.dead_forces.any(),
         "cable friction": any(cable.friction for cable in body.cables),
         "actuation that is not plain": not same_inputs,
-        "observation that is not plain": robot.observation != Observation(),
+        "observation that is not plain": (robot.observation.depth_scale, robot.observation.depth_offset) != (1.0, 0.0),
         "creep": robot.creep,
     }
     found = [name for name, holds in beyond.items() if holds]
@@ -531,11 +531,9 @@ def _copy_mesh(source: Path, folder: Path) -> str:
     """Copy a mesh file (with the files that belong to it) and return its name."""
     if not source.is_file():
         raise InputError("the robot's mesh file is gone", where=source, expected="the file that it was loaded from")
-    companions = {".node": (".node", ".ele"), ".ele": (".node", ".ele"), ".xdmf": (".xdmf", ".h5"), ".xmf": (".xmf", ".h5")}
-    for ending in companions.get(source.suffix.lower(), (source.suffix,)):
-        file = source.with_suffix(ending)
+    for file in mesh_companions(source):
         target = folder / file.name
-        if file.is_file() and not (target.exists() and target.samefile(file)):
+        if not (target.exists() and target.samefile(file)):
             with write_beside(target) as part:
                 shutil.copyfile(file, part)
     return source.name

@@ -70,9 +70,10 @@ def schema_problems(schema: type[Schema], document: dict[str, Any], path: Path) 
 
 def near(word: str, known: Iterable[str]) -> str | None:
     """Return a hint that names the known words closest to a word; None where none is close."""
-    close = difflib.get_close_matches(word.lower(), {name.lower(): name for name in known}, n=3, cutoff=0.6)
-    names = [name for name in known if name.lower() in close]
-    return "did you mean " + " or ".join(repr(name) for name in names) + "?" if names else None
+    likeness = {name: difflib.SequenceMatcher(None, word.lower(), name.lower()).ratio() for name in known}
+    best = max(likeness.values(), default=0.0)
+    names = [name for name, value in likeness.items() if value >= max(0.6, best - 0.05)]
+    return "did you mean " + " or ".join(repr(name) for name in names[:3]) + "?" if names else None
 
 
 def short(value: object, width: int = 90) -> str:

@@ -88,10 +88,10 @@ def changed(document: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[s
     return result
 
 
-def write_block_robot(folder: Path, *, cells: Sequence[int] = (4, 2, 2), mesh: TetMesh | None = None, **overrides: Any) -> Path:
+def write_block_robot(folder: Path, *, cells: Sequence[int] = (4, 2, 2), block: TetMesh | None = None, **overrides: Any) -> Path:
     """Write a block robot (see `block_document`) into a folder and return the folder. The mesh file is in millimetres."""
     folder.mkdir(parents=True, exist_ok=True)
-    body = mesh or block_mesh(cells)
+    body = block or block_mesh(cells)
     kind = "tetra10" if body.is_quadratic else "tetra"
     meshio.Mesh(np.asarray(body.nodes) * 1e3, [(kind, np.asarray(body.tets))]).write(folder / "block.vtu")
     (folder / "robot.toml").write_text(tomli_w.dumps(block_document(**overrides)), encoding="utf-8")
