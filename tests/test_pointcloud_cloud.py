@@ -122,8 +122,30 @@ def test_a_shortened_ply_is_an_error(tmp_path: Path) -> None:
     path = tmp_path / "cloud.ply"
     write_cloud(path, some_cloud(100))
     path.write_bytes(path.read_bytes()[:-200])
-    with pytest.raises(InputError, match=r"(?s)broken or shortened PLY.*100 vertices"):
+    with pytest.raises(InputError, match=r"(?s)broken or shortened PLY.*92 whole vertices.*100 vertices"):
         read_cloud(path)
+
+
+PLY = "ply\nformat ascii 1.0\ncomment by hand\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\n"
+COLORED = PLY + "property uchar red\nproperty uchar green\nproperty uchar blue\n"
+FACES = "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+
+
+def test_an_ascii_ply_with_faces_behind_its_vertices(tmp_path: Path) -> None:
+    path = tmp_path / "cloud.ply"
+    path.write_text(COLORED + FACES + "0 1 2 255 0 51\nnan 4 5 0 0 0\n3 0 1 1\n")
+    cloud = read_cloud(path)
+    assert cloud.points.tolist() == [[0.0, 1.0, 2.0]]
+    np.testing.assert_allclose(cloud.colors, [[1.0, 0.0, 0.2]])
+
+
+def test_a_big_endian_ply_with_float_colours(tmp_path: Path) -> None:
+    path = tmp_path / "cloud.ply"
+    head = COLORED.replace("ascii", "binary_big_endian").replace("uchar", "float") + "end_header\n"
+    path.write_bytes(head.encode() + np.arange(12, dtype=">f4").__truediv__(12).astype(">f4").tobytes())
+    cloud = read_cloud(path)
+    np.testing.assert_allclose(cloud.points[1], np.arange(6, 9) / 12, rtol=1e-6)
+    np.testing.assert_allclose(cloud.colors[0], np.arange(3, 6) / 12, rtol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -131,6 +153,24 @@ def test_a_shortened_ply_is_an_error(tmp_path: Path) -> None:
     [
         ("a.ply", "no header", "not a PLY file"),
         ("a.ply", "ply\nformat ascii 1.0\nend_header\n", "names no vertices"),
+        ("a.ply", "ply\nformat zip 1.0\nend_header\n", r"(?s)unknown storage.*format zip"),
+        ("a.ply", "ply\nformat ascii 1.0\nelement vertex some\nend_header\n", r"(?s)says nothing.*element vertex some"),
+        ("a.ply", "ply\nformat ascii 1.0\nelement vertex 1\nproperty list uchar int x\nend_header\n", "lists in or before"),
+        (
+            "a.ply",
+            "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n3\n",
+            r"(?s)fields are missing.*x, y, z",
+        ),
+        (
+            "a.ply",
+            "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\nx\n",
+            r"(?s)broken or shortened PLY.*numbers",
+        ),
+        (
+            "a.ply",
+            "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nend_header\n1\n",
+            r"(?s)1 vertices.*2 vertices of 1",
+        ),
         ("a.xyz", "", r"not a format of point clouds"),
     ],
 )

@@ -171,8 +171,8 @@ def test_friction_keeps_the_force_in_its_cone() -> None:
         assert tangential <= -mu * estimate.forces[2] + 1e-9
         if force is inside:
             np.testing.assert_allclose(estimate.forces, force, atol=1e-7)
-        else:  # on a side of the pyramid: one direction is lost
-            assert np.linalg.matrix_rank(estimate.covariance, tol=1e-6 * np.trace(estimate.covariance)) == 2
+        else:  # on a side or an edge of the pyramid: one or two directions are lost
+            assert np.linalg.matrix_rank(estimate.covariance, tol=1e-6 * np.trace(estimate.covariance)) in (1, 2)
 
 
 def test_an_infeasible_problem_is_a_status() -> None:

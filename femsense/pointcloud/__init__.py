@@ -7,6 +7,7 @@ from femsense.pointcloud.matching import Matches, match_along_normals
 from femsense.pointcloud.normals import estimate_normals
 from femsense.pointcloud.objects import Plane, euclidean_clusters, find_plane, objects_on_plane, remove_plane
 from femsense.pointcloud.pcd import read_pcd_fields
+from femsense.pointcloud.ply import read_ply_vertices
 from femsense.pointcloud.segmentation import color_mask, region_growing, segment_by_model, segment_robot, shading_features
 
 __all__ = [
@@ -26,6 +27,7 @@ __all__ = [
     "pass_through",
     "read_cloud",
     "read_pcd_fields",
+    "read_ply_vertices",
     "region_growing",
     "remove_plane",
     "remove_radius_outliers",

@@ -12,6 +12,7 @@ from femsense.arrays import FloatArray, as_points, freeze
 from femsense.errors import InputError
 from femsense.pointcloud.grid import positive
 from femsense.pointcloud.pcd import read_pcd_fields
+from femsense.pointcloud.ply import read_ply_vertices
 
 _SUFFIXES = (".ply", ".pcd")
 
@@ -99,9 +100,8 @@ def read_cloud(path: str | Path) -> PointCloud:
     if not file.is_file():
         raise InputError("no such file", where=file, expected="a PLY or PCD file")
     _check_suffix(file)
-    if file.suffix.lower() == ".pcd":
-        return _cloud_of_fields(read_pcd_fields(file), file)
-    return _read_ply(file)
+    fields = read_pcd_fields(file) if file.suffix.lower() == ".pcd" else read_ply_vertices(file)
+    return _cloud_of_fields(fields, file)
 
 
 def write_cloud(path: str | Path, cloud: PointCloud) -> None:
@@ -159,51 +159,29 @@ def _pixel_colors(color: npt.ArrayLike, shape: tuple[int, ...]) -> FloatArray:
     return image / 255.0 if image.dtype == np.uint8 else image.astype(np.float64)
 
 
-def _finite_cloud(points: FloatArray, colors: FloatArray | None) -> PointCloud:
-    finite = np.isfinite(points).all(axis=1)
-    return PointCloud(points[finite], None if colors is None else colors[finite])
-
-
 def _cloud_of_fields(fields: dict[str, npt.NDArray[np.generic]], file: Path) -> PointCloud:
     missing = [name for name in "xyz" if name not in fields]
     if missing:
         raise InputError("fields are missing", where=file, found=", ".join(fields), expected="x, y, z")
     points = np.stack([fields[name].astype(np.float64) for name in "xyz"], axis=1)
+    finite = np.isfinite(points).all(axis=1)
+    colors = _field_colors(fields)
+    return PointCloud(points[finite], None if colors is None else colors[finite])
+
+
+def _field_colors(fields: dict[str, npt.NDArray[np.generic]]) -> FloatArray | None:
+    """Return colours (n, 3) in 0 … 1: packed as in PCD, or three numbers as in PLY (whole ones count up to their type's largest)."""
     packed = fields.get("rgba", fields.get("rgb"))
-    return _finite_cloud(points, None if packed is None else _unpacked(packed))
+    if packed is not None:
+        return _unpacked(packed)
+    if not all(name in fields for name in ("red", "green", "blue")):
+        return None
+    columns = np.stack([fields[name] for name in ("red", "green", "blue")], axis=1)
+    whole = np.issubdtype(columns.dtype, np.integer)
+    return columns / float(np.iinfo(columns.dtype).max) if whole else columns.astype(np.float64)
 
 
 def _unpacked(packed: npt.NDArray[np.generic]) -> FloatArray:
     """Return colours (n, 3) from 0x..RRGGBB, kept as an integer or in the bits of a float."""
     bits = packed.view(np.uint32) if packed.dtype == np.float32 else packed.astype(np.uint32)
     return np.stack([(bits >> shift) & 255 for shift in (16, 8, 0)], axis=1) / 255.0
-
-
-def _read_ply(file: Path) -> PointCloud:
-    expected = _ply_vertex_count(file)
-    import open3d as o3d
-
-    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        data = o3d.io.read_point_cloud(str(file), format="ply")
-    points = np.asarray(data.points)
-    if len(points) != expected:
-        raise InputError(
-            "a broken or shortened PLY file",
-            where=file,
-            found=f"{len(points)} readable vertices",
-            expected=f"{expected} vertices with x, y, z, as the header says",
-        )
-    return _finite_cloud(points, np.asarray(data.colors) if data.has_colors() else None)
-
-
-def _ply_vertex_count(file: Path) -> int:
-    """Return the number of vertices that the header promises."""
-    head = file.read_bytes()[:65536].split(b"end_header", 1)
-    lines = head[0].decode("ascii", "replace").split("\n")
-    if lines[0].strip() != "ply" or len(head) == 1:
-        raise InputError("not a PLY file", where=file, found=repr(lines[0][:40]), expected="a header from `ply` to `end_header`")
-    for line in lines:
-        words = line.split()
-        if words[:2] == ["element", "vertex"] and len(words) == 3 and words[2].isdigit():
-            return int(words[2])
-    raise InputError("the PLY header names no vertices", where=file, found="no such line", expected="element vertex N")
