@@ -211,18 +211,18 @@ def rms(difference: FloatArray) -> float:
 
 
 def _choose_bones(rest: FloatArray, frames: FloatArray) -> int:
-    """Return the number of bones that serves held-out frames best (the smaller one where two are within 2 %)."""
+    """Return the number of bones that serves held-out frames best (the smaller one where two are within 2 % or a millionth of the body)."""
     if len(frames) < FEWEST_FRAMES_TO_CHOOSE:
         return min(DEFAULT_BONES, len(rest))
     spread = frames[np.sort(farthest_points(frames.reshape(len(frames), -1), FIT_FRAMES))]
     held_out = np.arange(len(spread)) % 3 == 1
-    best, best_rms = 1, np.inf
+    best, best_rms = min(BONE_COUNTS[0], len(rest)), np.inf
     for count in (c for c in BONE_COUNTS if c <= max(1, len(rest) // 4)):
         origins, poses = _find_bones(rest, spread[~held_out], count)
         joints, weights, _ = _refine(rest, spread[~held_out], origins, poses)
         skin = _finished(rest, origins, joints, weights)
         unseen = skin_rms(skin, fit_poses(skin, spread[held_out]), spread[held_out])
-        if unseen < 0.98 * best_rms:
+        if unseen < 0.98 * best_rms - NOISE * _size(rest):
             best, best_rms = count, unseen
         elif unseen > 1.5 * best_rms:
             break

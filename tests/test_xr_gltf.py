@@ -1,0 +1,281 @@
+"""The GLB file: what it means (read by a reader of its own), what Khronos' validator says, refusals."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import struct
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+from test_xr_bar import bar_mesh, bar_states, bar_surface
+
+from femsense.errors import InputError
+from femsense.fem.mesh import surface_triangles, to_quadratic, triangle_normals
+from femsense.xr.gltf import ExportReport, export_states, quaternions, write_glb
+from femsense.xr.skinning import fit_poses, fit_skin
+
+ROOT = Path(__file__).parents[1]
+VALIDATOR = "gltf-validator@2.0.0-dev.3.10"
+
+
+# ---- a reader that shares nothing with the writer ------------------------------------------------------------------------
+
+
+class Glb:
+    """Just enough of glTF 2.0 to put the skinned vertices of a time where a viewer would."""
+
+    TYPES = {5121: "u1", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+    WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+
+    def __init__(self, path: Path) -> None:
+        data = path.read_bytes()
+        magic, version, length = struct.unpack_from("<III", data)
+        assert (magic, version, length) == (0x46546C67, 2, len(data))
+        size, kind = struct.unpack_from("<II", data, 12)
+        assert kind == 0x4E4F534A
+        self.json: dict[str, Any] = json.loads(data[20 : 20 + size])
+        self.binary = data[20 + size + 8 :]
+
+    def array(self, index: int) -> np.ndarray:
+        accessor = self.json["accessors"][index]
+        view = self.json["bufferViews"][accessor["bufferView"]]
+        width = self.WIDTHS[accessor["type"]]
+        flat = np.frombuffer(self.binary, self.TYPES[accessor["componentType"]], accessor["count"] * width, view["byteOffset"])
+        return flat.reshape(accessor["count"], width) if width > 1 else flat
+
+    def attribute(self, name: str) -> np.ndarray:
+        return self.array(self.json["meshes"][0]["primitives"][0]["attributes"][name])
+
+    @property
+    def times(self) -> np.ndarray:
+        return self.array(self.json["animations"][0]["samplers"][0]["input"])
+
+    def vertices(self, key: int | None) -> np.ndarray:
+        """Positions in glTF's frame at a key of the animation, or at rest."""
+        joints = self.json["skins"][0]["joints"]
+        bind = self.array(self.json["skins"][0]["inverseBindMatrices"]).reshape(-1, 4, 4).transpose(0, 2, 1).astype(float)
+        matrices = np.array([self.world(node, key) @ bind[j] for j, node in enumerate(joints)])
+        points = np.c_[self.attribute("POSITION"), np.ones(len(self.attribute("POSITION")))]
+        weights, indices = self.attribute("WEIGHTS_0").astype(float), self.attribute("JOINTS_0")
+        return np.einsum("vk,vkij,vj->vi", weights, matrices[indices], points)[:, :3]
+
+    def world(self, node: int, key: int | None) -> np.ndarray:
+        parent = next((i for i, n in enumerate(self.json["nodes"]) if node in n.get("children", [])), None)
+        local = self.local(node, key)
+        return local if parent is None else self.world(parent, key) @ local
+
+    def local(self, node: int, key: int | None) -> np.ndarray:
+        part = {"translation": [0.0, 0, 0], "rotation": [0.0, 0, 0, 1]} | self.json["nodes"][node]
+        animation = self.json["animations"][0]
+        for channel in animation["channels"] if key is not None else []:
+            if channel["target"]["node"] == node:
+                part[channel["target"]["path"]] = self.array(animation["samplers"][channel["sampler"]]["output"])[key]
+        x, y, z, w = (float(v) for v in part["rotation"])
+        T = np.eye(4)  # the quaternion's matrix, written out
+        T[:3, :3] = [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+        T[:3, 3] = part["translation"]
+        return T
+
+
+def in_gltf(points: np.ndarray) -> np.ndarray:
+    """Robot frame (Z up) to glTF (Y up), written out: what was up is y, what was y points at the viewer's back."""
+    return np.stack([points[..., 0], points[..., 2], -points[..., 1]], axis=-1)
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> tuple[Glb, ExportReport, np.ndarray]:
+    mesh = bar_mesh()
+    times, states = bar_states(mesh.nodes)
+    path = tmp_path_factory.mktemp("glb") / "bar.glb"
+    report = export_states(mesh.nodes, mesh.tets, times, states.astype(np.float32), path, bones=10)
+    return Glb(path), report, states[:, np.unique(surface_triangles(mesh))]
+
+
+# ---- what the file means ---------------------------------------------------------------------------------------------------
+
+
+def test_skinned_vertices_are_where_the_surface_is(exported: tuple[Glb, ExportReport, np.ndarray]) -> None:
+    glb, report, surface = exported
+    off = np.array([glb.vertices(f) for f in range(len(surface))]) - in_gltf(surface)
+    rms = float(np.sqrt((off**2).sum(axis=-1).mean()))
+    assert rms == pytest.approx(report.rms_m, rel=1e-3)
+    assert np.sqrt((off**2).sum(axis=-1)).max() == pytest.approx(report.max_m, rel=1e-2)
+    motion = np.sqrt(((surface - surface[0]) ** 2).sum(axis=-1).mean())
+    assert report.rms_m < 0.01 * motion  # the report itself cannot hide a mesh in the wrong place
+    assert (report.frames, report.vertices, report.bones) == (len(surface), surface.shape[1], 10)
+
+
+def test_bind_pose_is_the_rest_shape_upright(exported: tuple[Glb, ExportReport, np.ndarray]) -> None:
+    glb, _, surface = exported
+    np.testing.assert_allclose(glb.vertices(None), glb.attribute("POSITION"), atol=1e-7)
+    np.testing.assert_allclose(glb.attribute("POSITION"), in_gltf(surface[0]), atol=1e-7)
+    assert np.ptp(glb.attribute("POSITION")[:, 1]) == pytest.approx(0.2, rel=1e-5)  # 0.2 m tall, y up
+
+
+def test_normals_point_outward(exported: tuple[Glb, ExportReport, np.ndarray]) -> None:
+    glb, _, _ = exported
+    primitive = glb.json["meshes"][0]["primitives"][0]
+    triangles = glb.array(primitive["indices"]).reshape(-1, 3).astype(int)
+    points, normals = glb.attribute("POSITION").astype(float), glb.attribute("NORMAL").astype(float)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-6)
+    face = triangle_normals(points, triangles)
+    assert ((face * normals[triangles].mean(axis=1)).sum(axis=1) > 0).all()
+    volume = np.einsum("ti,ti->", face, points[triangles].mean(axis=1)) / 3.0
+    assert volume == pytest.approx(0.03 * 0.03 * 0.2, rel=1e-5)
+
+
+def test_keys_start_at_zero_and_do_not_jump(exported: tuple[Glb, ExportReport, np.ndarray]) -> None:
+    glb, _, _ = exported
+    assert glb.times[0] == 0.0 and glb.times[-1] == pytest.approx(2.0) and (np.diff(glb.times) > 0).all()
+    animation = glb.json["animations"][0]
+    for channel in animation["channels"]:
+        sampler = animation["samplers"][channel["sampler"]]
+        assert sampler["interpolation"] == "LINEAR"
+        if channel["target"]["path"] == "rotation":
+            q = glb.array(sampler["output"]).astype(float)
+            np.testing.assert_allclose(np.linalg.norm(q, axis=1), 1.0, atol=1e-6)
+            assert ((q[1:] * q[:-1]).sum(axis=1) > 0).all()
+
+
+def test_quaternions_pass_half_a_turn_without_a_jump() -> None:
+    from scipy.spatial.transform import Rotation
+
+    angle = np.linspace(0.0, 6.0 * np.pi, 61)
+    turns = Rotation.from_rotvec(angle[:, None] * [0.0, 0.0, 1.0]).as_matrix()[:, None]
+    q = quaternions(turns)[:, 0]
+    assert ((q[1:] * q[:-1]).sum(axis=1) > 0.9).all()
+    np.testing.assert_allclose(Rotation.from_quat(q).as_matrix(), turns[:, 0], atol=1e-12)
+
+
+def test_joints_and_weights_follow_the_rules(exported: tuple[Glb, ExportReport, np.ndarray]) -> None:
+    glb, report, _ = exported
+    joints, weights = glb.attribute("JOINTS_0"), glb.attribute("WEIGHTS_0")
+    assert joints.dtype == np.uint8 and joints.shape[1] == 4 and joints.max() < report.bones
+    np.testing.assert_allclose(weights.astype(float).sum(axis=1), 1.0, atol=1e-7)
+    assert (joints[weights == 0] == 0).all()
+    skin = glb.json["skins"][0]
+    assert glb.json["nodes"][skin["skeleton"]]["children"] == skin["joints"]
+    assert "rotation" not in glb.json["nodes"][0] and glb.json["scenes"][0]["nodes"] == [0, 1]
+
+
+def test_single_frame_and_quadratic_mesh(tmp_path: Path) -> None:
+    mesh = to_quadratic(bar_mesh((1, 1, 6)))
+    _, states = bar_states(mesh.nodes, 9)
+    report = export_states(None, mesh.tets, [7.5], states[4:5], tmp_path / "one.glb")
+    glb = Glb(tmp_path / "one.glb")
+    assert list(glb.times) == [0.0]
+    used = np.unique(surface_triangles(mesh))
+    np.testing.assert_allclose(glb.vertices(0), in_gltf(states[4, used]), atol=1e-6)
+    assert report.rms_m < 1e-9
+
+
+def test_colours(tmp_path: Path) -> None:
+    rest, states, triangles = bar_surface(3, (1, 1, 4))
+    skin = fit_skin(rest, states, bones=2)
+    poses = fit_poses(skin, states)
+    write_glb(tmp_path / "a.glb", rest, triangles, skin, poses, [0, 1, 2], color_rgb=(1.0, 0.5, 0.0))
+    factor = Glb(tmp_path / "a.glb").json["materials"][0]["pbrMetallicRoughness"]["baseColorFactor"]
+    assert factor == pytest.approx([1.0, 0.2140, 0.0, 1.0], abs=1e-4)  # sRGB 0.5 is 0.214 in linear light
+    each = np.linspace(0.0, 1.0, rest.size).reshape(rest.shape)
+    write_glb(tmp_path / "b.glb", rest, triangles, skin, poses, [0, 1, 2], color_rgb=each)
+    assert Glb(tmp_path / "b.glb").attribute("COLOR_0").shape == rest.shape
+
+
+def test_times_far_from_zero_keep_their_steps(tmp_path: Path) -> None:
+    rest, states, triangles = bar_surface(3, (1, 1, 4))
+    skin = fit_skin(rest, states, bones=2)
+    start = 1.7e9  # seconds since 1970: too coarse for single precision unless the first is taken off
+    path = write_glb(tmp_path / "t.glb", rest, triangles, skin, fit_poses(skin, states), start + np.array([0.0, 0.033, 0.066]))
+    np.testing.assert_allclose(Glb(path).times, [0.0, 0.033, 0.066], atol=1e-6)
+
+
+# ---- refusals ----------------------------------------------------------------------------------------------------------------
+
+
+def test_refusals_leave_nothing_behind(tmp_path: Path) -> None:
+    mesh = bar_mesh((1, 1, 4))
+    times, states = bar_states(mesh.nodes, 4)
+    broken = states.copy()
+    broken[2, 0] = np.inf
+    target = tmp_path / "robot.glb"
+    for arguments, text in [
+        ((mesh.nodes, mesh.tets, times, broken), r"states\[2\].*must be finite"),
+        ((mesh.nodes, mesh.tets, times[[0, 2, 1, 3]], states), r"time_s\[2\].*must increase"),
+        ((mesh.nodes, mesh.tets, times[[0, 1, 1, 2]], states), r"time_s\[2\].*must increase"),
+        ((mesh.nodes, mesh.tets, times[:3], states), "one finite time a frame"),
+        ((mesh.nodes, mesh.tets, times, states[:0]), "wrong shape"),
+        ((mesh.nodes[:-1], mesh.tets, times, states), "tets names a node"),
+    ]:
+        with pytest.raises(InputError, match=text):
+            export_states(*arguments, target, bones=2)
+    with pytest.raises(InputError, match="not a colour"):
+        export_states(mesh.nodes, mesh.tets, times, states, target, bones=2, color_rgb=(20, 110, 200))
+    with pytest.raises(InputError, match="folder does not exist"):
+        export_states(mesh.nodes, mesh.tets, times, states, tmp_path / "no" / "robot.glb", bones=2)
+    assert list(tmp_path.iterdir()) == []
+
+
+# ---- Khronos' validator --------------------------------------------------------------------------------------------------------
+
+SCRIPT = """
+const { validateBytes } = require('gltf-validator');
+const data = new Uint8Array(require('fs').readFileSync(process.argv[2]));
+validateBytes(data).then((r) => console.log(JSON.stringify(r.issues)), (e) => { console.error(e); process.exit(1); });
+"""
+
+
+def build_hook() -> ModuleType:
+    """The module that finds Node and npm for the wheel; it does so for the tests too."""
+    pytest.importorskip("hatchling")
+    spec = importlib.util.spec_from_file_location("hatch_build", ROOT / "hatch_build.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["hatch_build"] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def npm_folder(cache: Path, *packages: str) -> Path:
+    """A folder with these npm packages; kept between runs. Skips where npm cannot be had."""
+    hook = build_hook()
+    done = cache / "installed.json"
+    if done.is_file() and json.loads(done.read_text()) == list(packages):
+        return cache
+    try:
+        command = hook.npm_command(("install", "--ignore-scripts", "--no-audit", "--no-fund", "--no-save", *packages))
+        subprocess.run(command, cwd=cache, check=True, capture_output=True, timeout=180)
+    except (RuntimeError, subprocess.SubprocessError) as error:
+        pytest.skip(f"npm cannot be reached: {error}")
+    done.write_text(json.dumps(packages))
+    return cache
+
+
+def test_khronos_validator_finds_nothing(request: pytest.FixtureRequest, tmp_path: Path) -> None:
+    folder = npm_folder(request.config.cache.mkdir("gltf-validator"), VALIDATOR)
+    script = folder / "validate.cjs"
+    script.write_text(SCRIPT, encoding="utf-8")
+    mesh = bar_mesh((1, 1, 6))
+    times, states = bar_states(mesh.nodes, 9)
+    export_states(mesh.nodes, mesh.tets, times, states, tmp_path / "many.glb", bones=5)
+    export_states(None, mesh.tets, [0.0], states[:1], tmp_path / "one.glb")
+    rest, surface, triangles = bar_surface(3, (1, 1, 4))
+    skin = fit_skin(rest, surface, bones=2)
+    write_glb(
+        tmp_path / "colours.glb", rest, triangles, skin, fit_poses(skin, surface), [0, 1, 2], color_rgb=0.5 * np.ones_like(rest)
+    )
+    for name in ("many", "one", "colours"):
+        command = [*build_hook().node_command(), str(script), str(tmp_path / f"{name}.glb")]
+        said = subprocess.run(command, check=True, capture_output=True, text=True, timeout=60).stdout
+        issues = json.loads(said)
+        assert issues["messages"] == [], name
+        assert issues["numErrors"] == issues["numWarnings"] == issues["numInfos"] == 0
