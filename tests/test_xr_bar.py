@@ -74,7 +74,23 @@ def write_run(folder: Path, *, contacts: bool = True, frames: int = 24) -> Path:
     if not contacts:
         return folder
     touched = int(((mesh.nodes - [0.015, 0.0, 0.15]) ** 2).sum(axis=1).argmin())
-    columns = "frame,time_s,contact,x_m,y_m,z_m,nx,ny,nz,fx_n,fy_n,fz_n,force_n,std_n,source".split(",")
+    columns = [
+        "frame",
+        "time_s",
+        "contact",
+        "x_m",
+        "y_m",
+        "z_m",
+        "nx",
+        "ny",
+        "nz",
+        "fx_n",
+        "fy_n",
+        "fz_n",
+        "force_n",
+        "std_n",
+        "source",
+    ]
     with (folder / "contacts.csv").open("w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)
         table.writerow(columns)

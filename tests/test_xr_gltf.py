@@ -9,7 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -30,8 +30,8 @@ VALIDATOR = "gltf-validator@2.0.0-dev.3.10"
 class Glb:
     """Just enough of glTF 2.0 to put the skinned vertices of a time where a viewer would."""
 
-    TYPES = {5121: "u1", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-    WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+    TYPES: ClassVar = {5121: "u1", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+    WIDTHS: ClassVar = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 
     def __init__(self, path: Path) -> None:
         data = path.read_bytes()

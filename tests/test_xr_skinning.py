@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from scipy.optimize import minimize
@@ -32,6 +34,22 @@ def random_poses(rng: np.random.Generator, frames: int) -> np.ndarray:
 
 def moved(poses: np.ndarray, points: np.ndarray) -> np.ndarray:
     return np.einsum("fij,vj->fvi", poses[:, :3, :3], points) + poses[:, None, :3, 3]
+
+
+def general_simplex(G: np.ndarray, g: np.ndarray) -> np.ndarray:
+    """The same problem for a general solver."""
+    k = len(g)
+    total = {"type": "eq", "fun": lambda x: x.sum() - 1.0}
+    found = minimize(
+        lambda x: 0.5 * x @ G @ x - g @ x,
+        np.full(k, 1 / k),
+        jac=lambda x: G @ x - g,
+        method="SLSQP",
+        bounds=[(0, 1)] * k,
+        constraints=total,
+        options={"ftol": 1e-14},
+    )
+    return np.asarray(found.x)
 
 
 # ---- laws -----------------------------------------------------------------------------------------------------------
@@ -96,7 +114,7 @@ def test_sweeps_never_make_the_fit_worse(bar: tuple[np.ndarray, np.ndarray], ski
     fit = prepare_poses(skin)
     for frame in bar[1][3:9]:
         errors = [skin_rms(skin, fit(frame, sweeps=n)[None], frame[None]) for n in (0, 1, 2, 4, 8, 16)]
-        assert all(later <= before * (1 + 1e-9) for before, later in zip(errors, errors[1:]))
+        assert all(later <= before * (1 + 1e-9) for before, later in pairwise(errors))
 
 
 def test_a_frame_far_from_the_one_before_does_not_depend_on_it(bar: tuple[np.ndarray, np.ndarray], skin: Skin) -> None:
@@ -138,9 +156,7 @@ def test_weights_against_a_general_solver() -> None:
         G, g = D.T @ D, rng.normal(size=k)
         w = simplex_least_squares(G, g)
         assert (w >= 0).all() and np.isclose(w.sum(), 1.0)
-        other = minimize(lambda x: 0.5 * x @ G @ x - g @ x, np.full(k, 1 / k), jac=lambda x: G @ x - g, method="SLSQP",
-                         bounds=[(0, 1)] * k, constraints={"type": "eq", "fun": lambda x: x.sum() - 1}, options={"ftol": 1e-14})  # fmt: skip
-        np.testing.assert_allclose(w, other.x, atol=1e-6)
+        np.testing.assert_allclose(w, general_simplex(G, g), atol=1e-6)
 
 
 def test_rotation_against_scipy_also_for_mirrored_clouds() -> None:
