@@ -8,8 +8,9 @@ import importlib.util
 import io
 import os
 import secrets
+import subprocess
 import sys
-import types
+import tempfile
 import warnings
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,18 @@ from femsense.tables import near
 
 SURFACE_ENDINGS = (".ply", ".stl", ".obj", ".off")
 SOLID_KINDS = ("hexahedron", "wedge", "pyramid", "hexahedron20", "hexahedron27", "wedge15", "pyramid13")
+FTETWILD = """
+import importlib.util, sys, types
+import numpy as np
+if importlib.util.find_spec("pyvista") is None:  # some versions import it for an accessor that is not used here
+    sys.modules["pytetwild._accessor"] = types.ModuleType("pytetwild._accessor")
+import pytetwild
+data = np.load("surface.npz")
+nodes, tets = pytetwild.tetrahedralize(
+    data["points"], data["triangles"], edge_length_fac=float(data["edge"]), vtk_ordering=True, quiet=True
+)
+np.savez("tets.npz", nodes=nodes, tets=tets)
+"""
 EDGE_FRACTION = 0.05
 """Edge length of a mesh made from a surface, over the diagonal of its bounding box."""
 
@@ -95,13 +108,10 @@ def tetrahedralise(
     Raises:
         InputError: where nothing came out. MissingDependency: without pytetwild.
     """
-    make = _pytetwild().tetrahedralize
-    nodes, tets = make(
-        points, triangles.astype(np.int32), edge_length_fac=edge_fraction, num_threads=1, vtk_ordering=True, quiet=True
-    )
+    nodes, tets = _run_ftetwild(points, triangles, edge_fraction, where)
     if not len(tets):
         raise InputError("no tetrahedra came out of this surface", where=where, found=f"{len(triangles)} triangles", expected="a closed surface around a volume")  # fmt: skip
-    mesh = oriented(_compact(np.asarray(nodes, dtype=np.float64), np.asarray(tets, dtype=np.int64)))
+    mesh = oriented(_compact(nodes, tets))
     corners = points[triangles]
     inside = float(np.linalg.det(corners).sum() / 6.0)  # Σ a · (b × c) / 6 over outward triangles
     filled = float(element_volumes(mesh).sum()) / inside if inside else np.nan
@@ -292,15 +302,20 @@ def _read_kept(place: Path) -> TetMesh | None:
         return None
 
 
-def _pytetwild() -> Any:
-    """Import pytetwild. Some versions want pyvista for an accessor that is not used here; they do without it."""
+def _run_ftetwild(points: FloatArray, triangles: IntArray, edge_fraction: float, where: str) -> tuple[FloatArray, IntArray]:
+    """Return nodes and tetrahedra from a process of its own: fTetWild writes files where it runs, and it may crash."""
     if importlib.util.find_spec("pytetwild") is None:
         raise MissingDependency("a surface becomes tetrahedra through pytetwild: pip install pytetwild")
-    if importlib.util.find_spec("pyvista") is None:
-        sys.modules.setdefault("pytetwild._accessor", types.ModuleType("pytetwild._accessor"))
-    import pytetwild
-
-    return pytetwild
+    with tempfile.TemporaryDirectory(prefix="femsense-") as folder:
+        np.savez(Path(folder) / "surface.npz", points=points, triangles=triangles.astype(np.int32), edge=edge_fraction)
+        result = subprocess.run([sys.executable, "-c", FTETWILD], cwd=folder, capture_output=True, text=True, errors="replace")
+        made = Path(folder) / "tets.npz"
+        if result.returncode or not made.is_file():
+            last = (result.stderr.strip().splitlines() or [f"exit status {result.returncode}"])[-1]
+            raise InputError("fTetWild failed on this surface", where=where, found=last[:200], expected="tetrahedra",
+                             hint="mend the surface (self-intersections, thin walls), or give tetrahedra")  # fmt: skip
+        with np.load(made) as data:
+            return np.asarray(data["nodes"], dtype=np.float64), np.asarray(data["tets"], dtype=np.int64)
 
 
 def _reason(error: BaseException) -> str:

@@ -325,8 +325,11 @@ def surface_robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-def test_a_closed_surface_is_tetrahedralised_once(surface_robot: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_closed_surface_is_tetrahedralised_once(surface_robot: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
     first = load_robot(surface_robot)
+    assert not list(Path.cwd().iterdir())
     np.testing.assert_allclose(element_volumes(first.body.mesh).sum(), 9e-5, rtol=0.02)
     assert len(list(surface_robot.glob("*.tets.npz"))) == 1 and not list(surface_robot.glob(".part-*"))
     monkeypatch.setattr("femsense.meshfile.tetrahedralise", lambda *a, **k: pytest.fail("made again"))
@@ -341,6 +344,13 @@ def test_a_kept_mesh_that_is_broken_is_made_again(surface_robot: Path) -> None:
     kept.write_bytes(kept.read_bytes()[:100])
     robot = load_robot(surface_robot)
     same_robot(robot, load_robot(surface_robot))
+
+
+def test_a_crash_of_the_mesher_is_a_clear_error(surface_robot: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("femsense.meshfile.FTETWILD", "import os; os.abort()")
+    with pytest.raises(InputError, match="fTetWild failed on this surface") as error:
+        load_robot(surface_robot)
+    assert "exit status -6" in str(error.value) and not list(surface_robot.glob("*.npz"))
 
 
 def test_another_surface_is_another_mesh(surface_robot: Path) -> None:
@@ -455,7 +465,9 @@ def bad_mesh(kind: str) -> TetMesh:
         tets[3] = tets[3][[1, 0, 2, 3]]
         return TetMesh(mesh.nodes, tets)
     if kind == "two parts":
-        return TetMesh(np.vstack([mesh.nodes, mesh.nodes + np.array([0.2, 0, 0])]), np.vstack([mesh.tets, mesh.tets + len(mesh.nodes)]))
+        return TetMesh(
+            np.vstack([mesh.nodes, mesh.nodes + np.array([0.2, 0, 0])]), np.vstack([mesh.tets, mesh.tets + len(mesh.nodes)])
+        )
     if kind == "flat":
         return TetMesh(
             np.vstack([mesh.nodes, mesh.nodes[mesh.tets[0, :3]].mean(axis=0)]),
