@@ -137,7 +137,7 @@ def _replace(part: Path, final: Path) -> None:
 
 def _flush(path: Path) -> None:
     """Have the content on the disk before the name: a crash leaves the old file or the new one."""
-    with path.open("rb") as stream:
+    with path.open("r+b") as stream:
         os.fsync(stream.fileno())
 
 

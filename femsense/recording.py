@@ -313,6 +313,9 @@ def table_problems(table: RecordingTable, path: Path) -> list[InputError]:
         problems.append(InputError("one pose for several cameras", where=f"{path}: T_robot_camera", expected="T_robot_camera in each [cameras.NAME]"))  # fmt: skip
     if table.T_robot_camera is not None and table.camera is not None and table.camera.T_robot_camera is not None:
         problems.append(InputError("the pose stands twice", where=f"{path}: camera.T_robot_camera", expected="T_robot_camera above [camera]"))  # fmt: skip
+    for name in table.cameras or {}:
+        if not re.fullmatch(r'[^/\\,;"\s.][^/\\,;"\s]*', name):
+            problems.append(InputError("not a name for a camera, which is also the name of its folder", where=f"{path}: cameras", found=repr(name), expected="a name without blanks, slashes, commas and a point at its start"))  # fmt: skip
     for location, pose in _declared_poses(table):
         try:
             check_pose(pose, f"{path}: {key_path(location)}")

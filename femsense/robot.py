@@ -150,7 +150,7 @@ def load_robot(path_or_name: str | Path, *, effects: bool = True) -> Robot:
         raise problem
     robot = build_robot(table, document, path)
     entries = [dict(entry) for entry in table.effects]
-    return _with_effects(robot, entries) if entries and effects else robot
+    return _with_effects(robot, entries, path) if entries and effects else robot
 
 
 def find_robot(path_or_name: str | Path) -> Path:
@@ -404,11 +404,16 @@ def _warn_of_units(table: RobotTable, path: Path) -> None:
         warnings.warn(f"{_at(path, 'gravity', 'vector_m_s2')}: {table.gravity.vector_m_s2} is more than ten times gravity; is it in mm/s²?", stacklevel=4)  # fmt: skip
 
 
-def _with_effects(robot: Robot, entries: list[dict[str, Any]]) -> Robot:
+def _with_effects(robot: Robot, entries: list[dict[str, Any]], path: Path) -> Robot:
     from femsense.effects import apply_effects
 
-    result: Robot = apply_effects(robot, entries)
-    return result
+    for i, entry in enumerate(entries):
+        try:
+            robot = apply_effects(robot, [entry])
+        except InputError as error:
+            name = entry["name"]
+            raise InputError(f"effect {name!r}: {error.what}", where=_at(path, "effects", i), found=error.found, expected=error.expected, hint=error.hint) from None  # fmt: skip
+    return robot
 
 
 # Saving

@@ -471,6 +471,7 @@ BAD: list[tuple[dict[str, str | None], str, list[str]]] = [
     ({"recording_toml": POSE_TOML.replace("1.0", "2.0") + TOML}, "recording.toml: T_robot_camera", ["not a rigid transform"]),
     ({"recording_toml": POSE_TOML + TOML + "[cameras.a]\n"}, "recording.toml: T_robot_camera", ["one pose for several cameras"]),
     ({"recording_toml": POSE_TOML + TOML + CAMERA + POSE_TOML}, "recording.toml: camera.T_robot_camera", ["the pose stands twice"]),
+    ({"recording_toml": TOML + '[cameras."../a"]\n'}, "recording.toml: cameras", ["not a name for a camera", "'../a'"]),
     ({"recording_toml": TOML + "x = = 1\n"}, "recording.toml", ["not valid TOML", "line 4"]),
     ({"frames_csv": FRAMES}, "frames.csv", ["no frames"]),
     ({"frames_csv": ""}, "frames.csv", ["the file is empty", "frame,time_s"]),

@@ -202,6 +202,17 @@ def test_effects_go_to_the_effects_and_can_be_left_out(tmp_path: Path, monkeypat
     assert load_robot(folder, effects=False).name == "block"
 
 
+def test_a_wrong_parameter_of_an_effect_names_the_file(tmp_path: Path) -> None:
+    folder = write_block_robot(tmp_path, effects=[{"name": "stiffness", "scale": 2.0}, {"name": "stiffness", "scal": 2.0}])
+    with pytest.raises(InputError) as error:
+        load_robot(folder)
+    assert f"{folder / 'robot.toml'}: effects[1]: effect 'stiffness': unknown key" in str(error.value) and "scal" in str(
+        error.value
+    )
+    write_block_robot(tmp_path, effects=[{"name": "stiffness", "scale": 2.0}])
+    np.testing.assert_allclose(load_robot(folder).body.material.young_modulus, 300e3)
+
+
 def test_names_of_the_project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_block_robot(tmp_path / "meshes" / "block")
     write_block_robot(tmp_path / "meshes" / "blob")
