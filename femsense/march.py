@@ -19,6 +19,10 @@ from femsense.model import Robot
 from femsense.recording import Recording
 
 
+FACTOR_MEMORY = 2e9
+"""Factors of several frames are kept up to this total [bytes]."""
+
+
 @dataclass(frozen=True, eq=False, slots=True)
 class Drive:
     """What truly drives the robot in each frame: recorded inputs after offset, gain, play and creep."""
@@ -144,6 +148,7 @@ def solve_frame(
 
 def walk_along(
     walk: Walk, frames: Sequence[int], observe: Callable[[Robot, Equilibrium], FloatArray], variants: Sequence[Walk] = (),
+    *, starts: dict[int, Equilibrium] | None = None,
 ) -> Iterator[tuple[int, Equilibrium, FloatArray, FloatArray]]:  # fmt: skip
     """Solve frames in order, and with each the same frame of variants that differ from it by little.
 
@@ -155,6 +160,8 @@ def walk_along(
         frames: indices, ascending; frames between them are solved too where the past matters.
         observe: (robot, state) → what is kept of a state, shape (p, 3).
         variants: other robots or drives.
+        starts: frame → a state near by, such as that of an earlier walk; brought up to date as frames are solved. Their
+            factors are kept as long as they fit into FACTOR_MEMORY.
 
     Yields:
         frame index, equilibrium, observation (p, 3), observations of the variants (v, p, 3).
@@ -170,19 +177,30 @@ def walk_along(
         if not past and key in known:
             yield k, *known[key]
             continue
-        base = _require(solve_frame(walk, k, start=base if base is not None and base.converged else None, before=memory[0]), k)
+        near = base if starts is None else starts.get(k, base)
+        base = _require(solve_frame(walk, k, start=near, before=memory[0], reuse_factor=near is not base), k)
         memory[0] = base.segment_tensions if past else None
         seen = observe(walk.robot, base)
         others = np.zeros((len(variants), *seen.shape))
         for i, variant in enumerate(variants):
+            if _same_mechanics(walk, variant):
+                others[i] = observe(variant.robot, base)
+                continue
             state = _require(solve_frame(variant, k, start=base, before=memory[1 + i], reuse_factor=True), k)
             memory[1 + i] = state.segment_tensions if past else None
             others[i] = observe(variant.robot, state)
         kept = replace(base, factor=None)
+        if starts is not None:
+            starts[k] = base if base.factor is not None and len(todo) * base.factor.bytes < FACTOR_MEMORY else kept
         if not past:
             known[key] = (kept, seen, others)
         if k in wanted:
             yield k, kept, seen, others
+
+
+def _same_mechanics(walk: Walk, variant: Walk) -> bool:
+    a, b = walk.drive, variant.drive
+    return variant.robot.body is walk.robot.body and np.array_equal(a.inputs, b.inputs) and np.array_equal(a.load_forces, b.load_forces)
 
 
 def _key(walk: Walk, variants: Sequence[Walk], frame: int) -> bytes:
@@ -205,8 +223,3 @@ def _require(state: Equilibrium, frame: int) -> Equilibrium:
 def marker_positions(robot: Robot, state: Equilibrium) -> FloatArray:
     """Return the markers of a robot in a state [m], shape (k, 3), robot frame."""
     return robot.markers.positions(state.positions)
-
-
-def rest_drive(robot: Robot) -> Equilibrium:
-    """Return the equilibrium of a robot whose cables are slack."""
-    return solve_equilibrium(robot.body)

@@ -51,7 +51,7 @@ def rotation_from_vector(rotation_vector: npt.ArrayLike) -> FloatArray:
     """Return the rotation matrix (3, 3) of a rotation vector [rad], shape (3,) (Rodrigues)."""
     from scipy.spatial.transform import Rotation
 
-    return np.asarray(Rotation.from_rotvec(np.asarray(rotation_vector, dtype=np.float64)).as_matrix())
+    return np.asarray(Rotation.from_rotvec(np.array(rotation_vector, dtype=np.float64)).as_matrix())
 
 
 def move_pose(T_a_b: FloatArray, step: npt.ArrayLike, *, pivot_a: npt.ArrayLike = (0.0, 0.0, 0.0)) -> FloatArray:

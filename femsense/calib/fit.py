@@ -14,6 +14,10 @@ Evaluate = Callable[[FloatArray, bool], tuple[FloatArray, FloatArray | None]]
 """(θ, with derivative) → whitened residual (N,), Jacobian (N, p) or None. A θ that cannot be evaluated raises DataError."""
 
 
+STILL = 1e-3
+"""A step that changes the whitened residual by less than this is none."""
+
+
 @dataclass(frozen=True, eq=False, slots=True)
 class FitResult:
     """A least-squares estimate."""
@@ -65,7 +69,7 @@ def gauss_newton(
         scale[scale == 0] = 1.0
         step = _bounded_step(jacobian, residual, scale, damping, low - theta, high - theta)
         predicted = costs[-1] - float(np.sum((residual + jacobian @ step) ** 2))
-        if predicted <= tolerance * costs[-1] or np.abs(step * scale).max(initial=0.0) <= 1e-12 * (1.0 + np.sqrt(costs[-1])):
+        if predicted <= tolerance * costs[-1] or np.linalg.norm(jacobian @ step) <= STILL:
             status = "converged"
             break
         try:

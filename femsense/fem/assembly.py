@@ -61,9 +61,12 @@ def diagonal_slots(body: BodyModel) -> FloatArray:
     return slots
 
 
+def reduced_values(body: BodyModel, blocks: FloatArray) -> FloatArray:
+    """Return the stiffness entries of the free unknowns [N/m], shape (nnz,), in the order of the free map's pattern."""
+    return blocks.ravel()[body.free_map.source]
+
+
 def reduced_matrix(body: BodyModel, blocks: FloatArray) -> sp.csc_matrix:
     """Return the stiffness of the free unknowns [N/m], shape (f, f), in factor order."""
-    free = body.free_map
-    data = blocks.ravel()[free.source]
-    size = len(free.dofs)
-    return sp.csc_matrix((data, free.indices, free.indptr), shape=(size, size))
+    pattern = body.free_map.pattern
+    return sp.csc_matrix((reduced_values(body, blocks), pattern.indices, pattern.indptr), shape=(pattern.size,) * 2)

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from femsense.arrays import FloatArray, as_points
 from femsense.errors import FemsenseError, InputError
-from femsense.fem.assembly import internal, reduced_matrix
+from femsense.fem.assembly import internal, reduced_values
 from femsense.fem.body import BodyModel
 from femsense.fem.cables import add_cable_stiffness, cable_forces, pull_rows
 from femsense.fem.equilibrium import Equilibrium
@@ -60,7 +60,7 @@ def tangent_at(body: BodyModel, equilibrium: Equilibrium) -> Tangent:
     blocks = internal(body, equilibrium.positions).blocks
     assert blocks is not None
     add_cable_stiffness(body, equilibrium.positions, equilibrium.segment_tensions, blocks)
-    factor = factorize(reduced_matrix(body, blocks))
+    factor = factorize(body.free_map.pattern, reduced_values(body, blocks))
     if factor is None:
         raise FemsenseError("the stiffness is singular: nothing holds the body (clamp more nodes)")
     dofs = body.free_map.dofs

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from femsense.arrays import BoolArray, FloatArray, as_points, freeze
 from femsense.errors import InputError
-from femsense.fem.assembly import Internal, internal, reduced_matrix
+from femsense.fem.assembly import Internal, internal, reduced_values
 from femsense.fem.body import BodyModel
 from femsense.fem.cables import add_cable_stiffness, bend_angles, cable_forces, cable_length, rub, shortening
 from femsense.fem.linear import Factorization, factorize_definite
@@ -291,7 +291,7 @@ def _factor_here(body: BodyModel, here: Internal, state: _State) -> Factorizatio
     assert here.blocks is not None
     blocks = here.blocks.copy()
     add_cable_stiffness(body, state.x, tuple(np.maximum(T, 0.0) * s for T, s in zip(state.T, state.shares)), blocks)
-    return factorize_definite(reduced_matrix(body, blocks))[0]
+    return factorize_definite(body.free_map.pattern, reduced_values(body, blocks))[0]
 
 
 def _rows(body: BodyModel, state: _State) -> FloatArray:

@@ -1,65 +1,206 @@
-"""Factor once, solve many: the sparse symmetric systems of the body."""
+"""Factor once, solve many: the sparse symmetric systems of the body.
+
+PARDISO of the MKL (through pypardiso) where it is installed, with its analysis kept for a sparsity pattern; SuperLU of
+SciPy elsewhere. Set FEMSENSE_SOLVER=superlu to choose the latter.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+import ctypes
+import functools
+import os
+import weakref
+from dataclasses import dataclass, field
+from typing import Any, Protocol
 
 import numpy as np
+import numpy.typing as npt
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
-from femsense.arrays import FloatArray
+from femsense.arrays import FloatArray, IntArray
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Factorization:
-    """A factorised stiffness of the free unknowns."""
+class Pattern:
+    """The sparsity pattern of a symmetric matrix in CSC (which is CSR too)."""
 
-    lu: Any
-    negative: int
-    """Negative pivots: 0 where the matrix is positive definite (Sylvester's law of inertia)."""
+    indptr: IntArray
+    """shape (f + 1,)."""
+    indices: IntArray
+    """shape (nnz,)."""
+    upper: IntArray
+    """Entries on and above the diagonal, in CSR, shape (nnz_upper,)."""
+    upper_indptr: npt.NDArray[np.int32]
+    upper_indices: npt.NDArray[np.int32]
+    idle: list[Any] = field(default_factory=list)
+    """Solvers that hold the analysis of this pattern and no factor that is still needed."""
 
     @property
     def size(self) -> int:
-        """Number of unknowns."""
-        return int(self.lu.shape[0])
+        return len(self.indptr) - 1
+
+
+def make_pattern(indptr: IntArray, indices: IntArray) -> Pattern:
+    """Return the pattern of a symmetric CSC matrix with sorted indices."""
+    size = len(indptr) - 1
+    rows = np.repeat(np.arange(size), np.diff(indptr))
+    upper = np.flatnonzero(indices >= rows)
+    counts = np.bincount(rows[upper], minlength=size)
+    return Pattern(indptr, indices, upper, np.concatenate([[0], np.cumsum(counts)]).astype(np.int32), indices[upper].astype(np.int32))
+
+
+class Factorization(Protocol):
+    """A factorised stiffness of the free unknowns."""
+
+    negative: int
+    """Negative pivots: 0 where the matrix is positive definite (Sylvester's law of inertia)."""
+    size: int
+    """Number of unknowns."""
+    bytes: int
+    """Rough size in memory."""
 
     def solve(self, right: FloatArray) -> FloatArray:
         """Return K⁻¹ right, shape (f,) or (f, k)."""
-        return np.asarray(self.lu.solve(np.ascontiguousarray(right)))
+        ...
 
 
-def factorize(matrix: sp.csc_matrix) -> Factorization | None:
-    """Factorise a symmetric matrix that is ordered already; None where it is singular or not finite."""
-    if not np.isfinite(matrix.data).all():
+def factorize(pattern: Pattern, values: FloatArray) -> Factorization | None:
+    """Factorise a symmetric matrix; None where it is singular or not finite.
+
+    Arguments:
+        pattern: its sparsity pattern.
+        values: its entries in CSC order [N/m], shape (nnz,).
+    """
+    if not np.isfinite(values).all():
         return None
+    if pardiso_library() is not None:
+        return _factorize_pardiso(pattern, values)
+    matrix = sp.csc_matrix((values, pattern.indices, pattern.indptr), shape=(pattern.size,) * 2)
     try:
-        lu = splu(matrix, permc_spec="NATURAL", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+        return _SuperLU(splu(matrix, permc_spec="NATURAL", diag_pivot_thresh=0.0, options={"SymmetricMode": True}))
     except RuntimeError:  # exactly singular
         return None
-    kept_order = bool((lu.perm_r == np.arange(len(lu.perm_r))).all())
-    pivots = lu.U.diagonal()
-    return Factorization(lu, int((pivots <= 0).sum()) if kept_order else len(pivots))
 
 
-def factorize_definite(matrix: sp.csc_matrix, *, tries: int = 30) -> tuple[Factorization | None, float]:
+def factorize_definite(pattern: Pattern, values: FloatArray, *, tries: int = 30) -> tuple[Factorization | None, float]:
     """Factorise matrix + shift·I with the smallest tried shift that makes it positive definite.
 
     Returns:
         the factorisation (None where nothing helped) and the shift [N/m], 0 where none was needed.
     """
-    factor = factorize(matrix)
+    factor = factorize(pattern, values)
     if factor is not None and factor.negative == 0:
         return factor, 0.0
-    diagonal = np.abs(matrix.diagonal())
-    if not np.isfinite(diagonal).all() or diagonal.max(initial=0.0) == 0.0:
+    columns = np.repeat(np.arange(pattern.size), np.diff(pattern.indptr))
+    diagonal = np.flatnonzero(pattern.indices == columns)
+    size = np.abs(values[diagonal])
+    if not np.isfinite(size).all() or size.max(initial=0.0) == 0.0:
         return None, 0.0
-    shift = 1e-6 * float(np.median(diagonal))
-    eye = sp.eye_array(matrix.shape[0], format="csc")
+    shift = 1e-6 * float(np.median(size))
     for _ in range(tries):
-        factor = factorize(sp.csc_matrix(matrix + shift * eye))
+        shifted = values.copy()
+        shifted[diagonal] += shift
+        factor = factorize(pattern, shifted)
         if factor is not None and factor.negative == 0:
             return factor, shift
         shift *= 4.0
     return None, shift
+
+
+class _SuperLU:
+    def __init__(self, lu: Any) -> None:
+        kept_order = bool((lu.perm_r == np.arange(len(lu.perm_r))).all())
+        pivots = lu.U.diagonal()
+        self.negative = int((pivots <= 0).sum()) if kept_order else len(pivots)
+        self.size = len(pivots)
+        self.bytes = 12 * int(lu.nnz)
+        self._lu = lu
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        return np.asarray(self._lu.solve(np.ascontiguousarray(right)))
+
+
+@functools.cache
+def pardiso_library() -> Any:
+    """Return MKL's PARDISO as a C function, or None where it is not installed or not wanted."""
+    if os.environ.get("FEMSENSE_SOLVER", "").lower() == "superlu":
+        return None
+    try:
+        from pypardiso.pardiso_wrapper import PyPardisoSolver
+
+        solver = PyPardisoSolver()
+    except (ImportError, OSError):
+        return None
+    threads = int(os.environ.get("FEMSENSE_THREADS", "1"))
+    solver.libmkl.MKL_Set_Num_Threads(threads)
+    return solver.libmkl.pardiso
+
+
+class _PardisoHandle:
+    """PARDISO's memory for one pattern: its analysis, and one factor at a time."""
+
+    def __init__(self, pattern: Pattern) -> None:
+        self.indptr, self.indices, self.size = pattern.upper_indptr, pattern.upper_indices, pattern.size
+        self.pt = np.zeros(64, dtype=np.int64)
+        self.iparm = np.zeros(64, dtype=np.int32)
+        # own settings, METIS, pivot floor 1e-8, count the factor's entries, Bunch–Kaufman, indices from 0
+        self.iparm[[0, 1, 9, 17, 20, 34]] = 1, 2, 8, -1, 1, 1
+        self.values = np.zeros(len(self.indices))
+        self.call(11)
+        self.entries = int(self.iparm[17])
+        weakref.finalize(self, _release, self.pt, self.iparm, self.size)
+
+    def call(self, phase: int, right: FloatArray | None = None, answer: FloatArray | None = None) -> int:
+        count = 1 if right is None or right.ndim == 1 else right.shape[1]
+        return _pardiso(self.pt, phase, self.size, self.values, self.indptr, self.indices, count, self.iparm, right, answer)
+
+
+def _pardiso(
+    pt: Any, phase: int, size: int, values: Any, indptr: Any, indices: Any, count: int, iparm: Any, right: Any, answer: Any
+) -> int:
+    def integer(value: int) -> Any:
+        return ctypes.byref(ctypes.c_int32(value))
+
+    def at(array: Any, kind: Any) -> Any:
+        return array.ctypes.data_as(ctypes.POINTER(kind)) if array is not None else None
+
+    error = ctypes.c_int32(0)
+    pardiso_library()(
+        at(pt, ctypes.c_int64), integer(1), integer(1), integer(-2), integer(phase), integer(size),
+        at(values, ctypes.c_double), at(indptr, ctypes.c_int32), at(indices, ctypes.c_int32), at(np.zeros(1, np.int32), ctypes.c_int32),
+        integer(count), at(iparm, ctypes.c_int32), integer(0), at(right, ctypes.c_double), at(answer, ctypes.c_double), ctypes.byref(error),
+    )  # fmt: skip
+    return int(error.value)
+
+
+def _release(pt: Any, iparm: Any, size: int) -> None:
+    _pardiso(pt, -1, size, None, np.zeros(1, np.int32), np.zeros(1, np.int32), 1, iparm, None, None)
+
+
+class _Pardiso:
+    def __init__(self, handle: _PardisoHandle, pattern: Pattern) -> None:
+        self.negative = int(handle.iparm[22]) + int(handle.iparm[13])  # negative eigenvalues and perturbed pivots
+        self.size = handle.size
+        self.bytes = 8 * handle.entries
+        self._handle = handle
+        weakref.finalize(self, pattern.idle.append, handle)
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        b = np.asfortranarray(right, dtype=np.float64)
+        if b.size == 0:
+            return np.zeros_like(b)
+        x = np.empty_like(b, order="F")
+        error = self._handle.call(33, b, x)
+        if error:
+            raise RuntimeError(f"PARDISO could not solve (error {error})")
+        return x
+
+
+def _factorize_pardiso(pattern: Pattern, values: FloatArray) -> Factorization | None:
+    handle = pattern.idle.pop() if pattern.idle else _PardisoHandle(pattern)
+    handle.values = values[pattern.upper]
+    if handle.call(22):
+        pattern.idle.append(handle)
+        return None
+    return _Pardiso(handle, pattern)

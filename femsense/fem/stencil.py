@@ -9,6 +9,7 @@ import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
 from femsense.arrays import FloatArray, IntArray, freeze
+from femsense.fem.linear import Pattern, make_pattern
 from femsense.fem.mesh import TetMesh, shape_slopes, shape_values
 
 _A, _B = 0.5854101966249685, 0.1381966011250105
@@ -40,11 +41,10 @@ class FreeMap:
 
     dofs: IntArray
     """Unknowns 3·node + direction, in factor order, shape (f,)."""
-    indptr: IntArray
-    """CSC pattern of the reduced matrix."""
-    indices: IntArray
+    pattern: Pattern
+    """Pattern of the reduced matrix."""
     source: IntArray
-    """For each entry of the CSC matrix, its place in the flat block array, shape (nnz,)."""
+    """For each entry of the reduced matrix, its place in the flat block array, shape (nnz,)."""
 
 
 def make_stencil(mesh: TetMesh, cliques: list[IntArray] | None = None) -> tuple[Stencil, tuple[IntArray, ...]]:
@@ -111,12 +111,8 @@ def make_free_map(stencil: Stencil, mesh: TetMesh, fixed: IntArray) -> FreeMap:
     ).tocsc()
     matrix.sort_indices()
     dofs = (3 * order[:, None] + np.arange(3)).ravel()
-    return FreeMap(
-        freeze(dofs, np.int64),
-        freeze(matrix.indptr, np.int32),
-        freeze(matrix.indices, np.int32),
-        freeze(matrix.data - 1, np.int64),
-    )
+    pattern = make_pattern(freeze(matrix.indptr, np.int32), freeze(matrix.indices, np.int32))
+    return FreeMap(freeze(dofs, np.int64), pattern, freeze(matrix.data - 1, np.int64))
 
 
 def fill_reducing_order(stencil: Stencil, free: IntArray) -> IntArray:

@@ -1,0 +1,350 @@
+"""Calibration of camera pose and initial cable inputs from markers.
+
+Algorithm 1 of Zhang et al. 2019 gives the start: a rigid fit by SVD, then the inputs by a bounded QP on the compliance, then a
+new equilibrium, in turns. Its fixed point is not the joint optimum where the pose can imitate the inputs, so a bounded
+Gauss–Newton over pose and inputs together finishes, and its normal matrix gives the standard deviations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from femsense.arrays import FloatArray, IntArray
+from femsense.calib.calibration import Calibration
+from femsense.calib.fit import FitResult, covariance_of, gauss_newton
+from femsense.calib.forward import Hypothesis, Scene, SceneJet, evaluate_scene, in_robot_frame, make_scene
+from femsense.calib.rigid import fit_rigid, fit_rigid_robust
+from femsense.errors import DataError
+from femsense.fem.equilibrium import Equilibrium
+from femsense.march import Walk, drive_of, solve_frame
+from femsense.model import Robot
+from femsense.pose import move_pose
+from femsense.recording import Recording, check_against
+
+MAX_FRAMES = 40
+"""More frames than this are thinned out evenly; they would add time and hardly any accuracy."""
+NOISE_FLOOR = 1e-7
+"""No camera measures better than this [m]."""
+SEAT_STD_FLOOR = 1e-4
+"""Markers are not glued better than this [m]."""
+
+
+def usable_frames(recording: Recording) -> IntArray:
+    """Return the frames in which every load is known: free ones, and those with declared loads; all where nothing is said."""
+    every = np.arange(len(recording.time_s))
+    if recording.free is None:
+        return every
+    known = recording.free.copy()
+    known[recording.load_frame] = True
+    return every[known]
+
+
+def calibrate(robot: Robot, recording: Recording, *, frames: Sequence[int] | None = None) -> Calibration:
+    """Find the pose of each camera and, where their zero is unknown, the initial inputs of the cables.
+
+    Arguments:
+        robot: the robot.
+        recording: markers (or a known pose) and inputs.
+        frames: indices of the frames to use; by default those without undeclared contact, thinned out to MAX_FRAMES.
+
+    Raises:
+        DataError: no markers and no pose, too few markers, or no equilibrium.
+    """
+    recording = check_against(robot, recording)
+    chosen = usable_frames(recording) if frames is None else np.asarray(frames, dtype=np.int64)
+    if not len(chosen):
+        raise DataError("no frame is free of undeclared contact: mark free frames with 1 in the column free of frames.csv, or declare loads.csv")
+    if not len(recording.marker_frame):
+        return _declared(robot, recording, chosen)
+    seen = chosen[np.isin(chosen, recording.marker_frame)]
+    if len(seen) > MAX_FRAMES:
+        seen = seen[np.unique(np.linspace(0, len(seen) - 1, MAX_FRAMES).round().astype(int))]
+    scene = make_scene(robot, recording, seen)
+    poses = first_poses(robot, scene)
+    initial = _first_inputs(robot, recording)
+    history: list[float] = []
+    if recording.actuation_zero == "unknown" and robot.body.cables:
+        poses, initial = _alternate(robot, scene, poses, initial, history)
+    fit, poses, initial, jet = fit_joint(robot, scene, poses, initial, history)
+    return _result(robot, scene, fit, poses, initial, jet, history)
+
+
+def _first_inputs(robot: Robot, recording: Recording) -> FloatArray | None:
+    if recording.actuation_zero == "absolute":
+        return None
+    lowest = recording.inputs.min(axis=0) if recording.inputs.size else np.zeros(len(robot.body.cables))
+    return np.maximum(0.0, -lowest) if recording.actuation == "tension" else np.zeros(len(robot.body.cables))
+
+
+def first_poses(robot: Robot, scene: Scene) -> list[FloatArray]:
+    """Return a start for the pose of each camera: declared, from the markers at rest, or from those of the first frame.
+
+    Raises:
+        DataError: a camera sees fewer than three markers.
+    """
+    poses: list[FloatArray] = []
+    for v, name in enumerate(scene.recording.camera_names):
+        declared = scene.recording.T_robot_camera[v]
+        resting = scene.rest_view == v
+        if declared is not None:
+            poses.append(declared)
+        elif resting.sum() >= 3:
+            poses.append(fit_rigid_robust(robot.marker_points[scene.rest_marker[resting]], scene.rest_points[resting])[0])
+        else:
+            poses.append(_pose_from_frame(robot, scene, v, name))
+    return poses
+
+
+def _pose_from_frame(robot: Robot, scene: Scene, view: int, name: str) -> FloatArray:
+    """Fit the first frame in which a camera sees enough markers to the model of that frame."""
+    walk = Walk(robot, drive_of(robot, scene.recording, initial=_first_inputs(robot, scene.recording)))
+    most = 0
+    for k in scene.frames:
+        rows = (scene.frame == k) & (scene.view == view)
+        most = max(most, int(rows.sum()))
+        if rows.sum() >= 3:
+            state = solve_frame(walk, int(k))
+            shape = state.positions if state.converged else robot.body.mesh.nodes
+            return fit_rigid(robot.markers.positions(shape)[scene.marker[rows]], scene.points[rows])
+    raise DataError(f"camera {name or '(only one)'} needs a frame with three markers for its pose; the most in one frame is {most}. Give T_robot_camera, or show more markers")
+
+
+def _alternate(robot: Robot, scene: Scene, poses: list[FloatArray], initial: FloatArray | None, history: list[float], *, rounds: int = 6) -> tuple[list[FloatArray], FloatArray]:
+    """Algorithm 1: rigid pose and bounded inputs in turns."""
+    from scipy.optimize import lsq_linear
+
+    assert initial is not None
+    low, high = _input_bounds(robot, scene.recording)
+    plain, starts = Hypothesis(robot), dict[int, Equilibrium]()
+    empty, pivot = np.zeros(0), robot.marker_points.mean(axis=0)
+    for _ in range(rounds):
+        jet = evaluate_scene(plain, scene, empty, poses, initial, derivative=True, vary_initial=True, pivot=pivot, starts=starts)
+        history.append(_rms(jet.residual))
+        W_ea = -jet.by_initial.reshape(-1, len(initial))  # residual = measured − modelled
+        step = lsq_linear(W_ea, jet.residual.ravel(), bounds=(low - initial - 1e-12, high - initial + 1e-12)).x
+        initial = np.clip(initial + step, low, high)
+        jet = evaluate_scene(plain, scene, empty, poses, initial, derivative=False, vary_initial=False, pivot=pivot, starts=starts)
+        if not any(T is not None for T in scene.recording.T_robot_camera) and not len(scene.rest_marker):
+            poses = _rigid_again(robot, scene, jet)
+        if np.abs(step).max() < 1e-6 * max(np.abs(initial).max(), 1e-6):
+            break
+    return poses, initial
+
+
+def _rigid_again(robot: Robot, scene: Scene, jet: SceneJet) -> list[FloatArray]:
+    model = {k: robot.markers.positions(s.positions) for k, s in jet.states.items()}
+    predicted = np.array([model[int(f)][m] for f, m in zip(scene.frame, scene.marker)])
+    return [fit_rigid(predicted[scene.view == v], scene.points[scene.view == v]) for v in range(len(scene.recording.camera_names))]
+
+
+def _input_bounds(robot: Robot, recording: Recording) -> tuple[FloatArray, FloatArray]:
+    """Return bounds of the initial inputs, so that no frame leaves the limits of its cable."""
+    cables = robot.body.cables
+    if recording.actuation == "displacement":
+        reach = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
+        return np.full(len(cables), -reach), np.full(len(cables), reach)
+    order = [recording.cable_names.index(c.name) for c in cables]
+    lowest = recording.inputs[:, order].min(axis=0) if recording.inputs.size else np.zeros(len(cables))
+    low = np.array([max(c.min_tension, 0.0) for c in cables]) - np.minimum(lowest, 0.0)
+    return np.maximum(low, 0.0), np.maximum(np.array([c.max_tension for c in cables]), low + 1e-9)
+
+
+def fit_joint(
+    robot: Robot, scene: Scene, poses: list[FloatArray], initial: FloatArray | None, history: list[float], *, free_inputs: bool = True,
+) -> tuple[FitResult, list[FloatArray], FloatArray | None, SceneJet]:  # fmt: skip
+    """Finish over poses and initial inputs together; the noise is estimated from the residual, twice.
+
+    Poses that the recording declares stay as they are.
+    """
+    plain, empty = Hypothesis(robot), np.zeros(0)
+    pivot = robot.marker_points.mean(axis=0)
+    moving = [v for v, T in enumerate(scene.recording.T_robot_camera) if T is None]
+    a = len(initial) if initial is not None and free_inputs else 0
+    base_poses, sigma = list(poses), 5e-4
+    seat_std = SEAT_STD_FLOOR
+    weights = np.ones(len(scene.points))
+    jet: SceneJet | None = None
+    starts: dict[int, Equilibrium] = {}
+
+    def place(theta: FloatArray) -> tuple[list[FloatArray], FloatArray | None]:
+        moved = list(base_poses)
+        for i, v in enumerate(moving):
+            moved[v] = move_pose(base_poses[v], theta[6 * i : 6 * i + 6], pivot_a=pivot)
+        return moved, theta[6 * len(moving) :] if a else initial
+
+    def evaluate(theta: FloatArray, derivative: bool) -> tuple[FloatArray, FloatArray | None]:
+        nonlocal jet
+        moved, inputs = place(theta)
+        jet = evaluate_scene(plain, scene, empty, moved, inputs, derivative=derivative, vary_initial=bool(a), pivot=pivot, starts=starts)
+        row = (weights / sigma)[:, None]
+        residual = np.concatenate([(row * jet.residual).ravel(), jet.rest.ravel() / seat_std])
+        if not derivative:
+            return residual, None
+        columns = [c for v in moving for c in range(6 * v, 6 * v + 6)]
+        J_pose = np.vstack([(row[:, :, None] * jet.by_pose[:, :, columns]).reshape(jet.residual.size, len(columns)),
+                            jet.rest_by_pose[:, :, columns].reshape(jet.rest.size, len(columns)) / seat_std])  # fmt: skip
+        J_in = np.vstack([(row[:, :, None] * jet.by_initial).reshape(jet.residual.size, a), np.zeros((jet.rest.size, a))])
+        return residual, np.hstack([J_pose, J_in])
+
+    low, high = _input_bounds(robot, scene.recording) if a else (np.zeros(0), np.zeros(0))
+    free = np.full(6 * len(moving), np.inf)
+    bounds = np.concatenate([-free, low]), np.concatenate([free, high])
+    theta = np.concatenate([np.zeros(6 * len(moving)), initial if a and initial is not None else np.zeros(0)])
+    for last in (False, False, True):
+        fit = gauss_newton(evaluate, theta, low=bounds[0], high=bounds[1])
+        theta = fit.theta
+        evaluate(theta, True)
+        assert jet is not None
+        history.append(_rms(jet.residual))
+        if last:
+            break
+        weights = _huber_weights(jet.residual, sigma)
+        sigma = _spread(jet.residual * weights[:, None], len(theta))
+        seat_std = max(SEAT_STD_FLOOR, float(np.sqrt((jet.rest**2).mean()))) if len(jet.rest) else seat_std
+    moved, inputs = place(theta)
+    fit = _with_bound_inputs(fit, theta, bounds)
+    return fit, moved, inputs, jet
+
+
+def _with_bound_inputs(fit: FitResult, theta: FloatArray, bounds: tuple[FloatArray, FloatArray]) -> FitResult:
+    """A parameter at its bound stays there: it takes no part in the covariance of the others."""
+    at = (theta <= bounds[0]) | (theta >= bounds[1])
+    if not at.any():
+        return fit
+    covariance = np.zeros_like(fit.covariance)
+    covariance[np.ix_(~at, ~at)] = covariance_of(fit.jacobian[:, ~at])
+    own = np.linalg.norm(fit.jacobian[:, at], axis=0)
+    covariance[at, at] = np.where(own > 0, 1.0 / np.where(own > 0, own, 1.0) ** 2, np.inf)
+    return FitResult(fit.theta, covariance, fit.residual, fit.jacobian, fit.cost, fit.status)
+
+
+def _huber_weights(residual: FloatArray, sigma: float) -> FloatArray:
+    """Return square-root weights of Huber's loss for 3-D residuals, scaled by their median."""
+    distance = np.linalg.norm(residual, axis=1)
+    if len(distance) < 8:
+        return np.ones(len(distance))
+    scale = max(float(np.median(distance)) / 1.538, 1e-12)  # median of a chi distribution with 3 degrees
+    return np.sqrt(np.minimum(1.0, 3.5 * scale / np.maximum(distance, 1e-300)))
+
+
+def _spread(residual: FloatArray, parameters: int) -> float:
+    freedom = max(residual.size - parameters, 1)
+    return max(float(np.sqrt((residual**2).sum() / freedom)), NOISE_FLOOR)
+
+
+def _rms(residual: FloatArray) -> float:
+    return float(np.sqrt((residual**2).sum(axis=1).mean()))
+
+
+def _initial_state(robot: Robot, recording: Recording, initial: FloatArray | None) -> Equilibrium:
+    """Return the state under the initial inputs alone (where they are unknown), else under those of the first frame."""
+    if initial is not None:
+        recording = replace(recording, inputs=np.zeros_like(recording.inputs))
+    return solve_frame(Walk(robot, drive_of(robot, recording, initial=initial)), 0)
+
+
+def _result(
+    robot: Robot, scene: Scene, fit: FitResult, poses: list[FloatArray], initial: FloatArray | None, jet: SceneJet, history: list[float],
+) -> Calibration:  # fmt: skip
+    recording, names = scene.recording, robot.body.cable_names
+    state = _initial_state(robot, recording, initial)
+    moving = [v for v, T in enumerate(recording.T_robot_camera) if T is None]
+    pose_std = np.zeros((4, 4))
+    if 0 in moving:
+        pose_std = _pose_std(poses[0], fit.covariance[:6, :6], robot.marker_points.mean(axis=0))
+    a = len(names) if initial is not None else 0
+    input_covariance = fit.covariance[6 * len(moving) :, 6 * len(moving) :] if a else np.zeros((0, 0))
+    own, other = _input_std(robot, recording, state, input_covariance)
+    per_marker = {
+        name: _rms(jet.residual[scene.marker == i]) for i, name in enumerate(robot.marker_names) if (scene.marker == i).any()
+    }
+    places = in_robot_frame(scene.rest_points, scene.rest_view, poses, robot.observation)
+    tension, displacement = (own, other) if recording.actuation == "tension" else (other, own)
+    return Calibration(
+        T_robot_camera=poses[0],
+        poses=tuple(poses),
+        camera_names=recording.camera_names,
+        cable_tension_n=dict(state.tension),
+        cable_displacement_m=_initial_displacement(state, recording, names, initial),
+        rms_m=_rms(jet.residual),
+        marker_rms_m=per_marker,
+        history=tuple({"iteration": i, "rms_m": r} for i, r in enumerate(history)),
+        pose_std=pose_std,
+        tension_std_n=tension,
+        displacement_std_m=displacement,
+        status=_status(fit, robot, own, recording),
+        seats_m={robot.marker_names[m]: p.tolist() for m, p in zip(scene.rest_marker, places)},
+        frames=tuple(int(recording.frame_numbers[k]) for k in scene.frames),
+    )
+
+
+def _initial_displacement(state: Equilibrium, recording: Recording, names: tuple[str, ...], initial: FloatArray | None) -> dict[str, float]:
+    if recording.actuation == "displacement" and initial is not None:
+        return {name: float(v) for name, v in zip(names, initial)}
+    return dict(state.shortening)
+
+
+def _pose_std(T: FloatArray, covariance: FloatArray, pivot: FloatArray) -> FloatArray:
+    """Return one standard deviation of the entries of T from the covariance of (rotation about the pivot, shift)."""
+    std = np.zeros((4, 4))
+    J = np.zeros((3, 4, 6))
+    for j in range(6):
+        step = np.zeros(6)
+        step[j] = 1e-6
+        J[:, :, j] = (move_pose(T, step, pivot_a=pivot) - T)[:3] / 1e-6
+    std[:3] = np.sqrt(np.maximum(np.einsum("abi,ij,abj->ab", J, covariance, J), 0.0))
+    return std
+
+
+def _input_std(
+    robot: Robot, recording: Recording, state: Equilibrium, covariance: FloatArray
+) -> tuple[dict[str, float | None], dict[str, float | None]]:
+    """Return the standard deviations of the fitted inputs and of the others (tension ↔ shortening, through W_aa)."""
+    from femsense.fem.compliance import compliance
+
+    names = robot.body.cable_names
+    if not covariance.size:
+        return {n: 0.0 for n in names}, {n: 0.0 for n in names}
+    W = compliance(robot.body, state)
+    J = W if recording.actuation == "tension" else np.linalg.pinv(W)
+    finite = np.isfinite(np.diag(covariance)).all()
+    derived = np.sqrt(np.maximum(np.diag(J @ covariance @ J.T), 0.0)) if finite else np.full(len(names), np.inf)
+    own = np.sqrt(np.diag(covariance))
+
+    def table(values: FloatArray) -> dict[str, float | None]:
+        return {n: float(v) if np.isfinite(v) else None for n, v in zip(names, values)}
+
+    return table(own), table(derived)
+
+
+def _status(fit: FitResult, robot: Robot, own: dict[str, float | None], recording: Recording) -> str:
+    if fit.status != "converged":
+        return "not settled after the last iteration: look at the history of the residual"
+    if recording.actuation_zero == "absolute":
+        return "converged"
+    scale = 0.25 if recording.actuation == "tension" else 0.005
+    unit = "N" if recording.actuation == "tension" else "m"
+    weak = [f"{n} (± {'∞' if v is None else format(v, '.2g')} {unit})" for n, v in own.items() if v is None or v > scale]
+    if weak:
+        return "converged, but these data hardly determine the initial input of " + ", ".join(weak)
+    return "converged"
+
+
+def _declared(robot: Robot, recording: Recording, frames: IntArray) -> Calibration:
+    """Return the calibration of a recording without markers whose poses are declared."""
+    missing = [name or "(only one)" for name, T in zip(recording.camera_names, recording.T_robot_camera) if T is None]
+    if missing:
+        raise DataError(f"no markers and no T_robot_camera: the pose of camera {', '.join(missing)} is not known. Record markers, or write T_robot_camera in recording.toml")
+    if recording.actuation_zero == "unknown" and robot.body.cables:
+        raise DataError("initial inputs cannot be found without markers: record markers, or absolute inputs")
+    poses = tuple(T for T in recording.T_robot_camera if T is not None)
+    state = _initial_state(robot, recording, None)
+    none: dict[str, float | None] = {n: 0.0 for n in robot.body.cable_names}
+    return Calibration(poses[0], poses, recording.camera_names, dict(state.tension), dict(state.shortening), float("nan"), {}, (),
+                       np.zeros((4, 4)), none, dict(none), "as declared: there are no markers to fit", frames=tuple(int(recording.frame_numbers[k]) for k in frames))  # fmt: skip
+
+
+__all__ = ["calibrate", "first_poses", "fit_joint", "usable_frames"]

@@ -1,0 +1,38 @@
+"""What a calibration is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from femsense.arrays import FloatArray
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Calibration:
+    """Poses of the cameras and initial inputs of the cables, with their uncertainty."""
+
+    T_robot_camera: FloatArray
+    """Pose of the first camera, shape (4, 4)."""
+    poses: tuple[FloatArray, ...]
+    """Poses of all cameras, each (4, 4)."""
+    camera_names: tuple[str, ...]
+    cable_tension_n: dict[str, float]
+    """Initial tension of each cable [N]."""
+    cable_displacement_m: dict[str, float]
+    """Initial shortening of each cable [m]."""
+    rms_m: float
+    """Root mean square distance between measured and modelled markers [m]; nan where there are none."""
+    marker_rms_m: dict[str, float]
+    history: tuple[dict[str, float], ...]
+    """{iteration, rms_m} of each iteration."""
+    pose_std: FloatArray
+    """One standard deviation of the entries of T_robot_camera, shape (4, 4)."""
+    tension_std_n: dict[str, float | None]
+    """[N]; None where the data say nothing."""
+    displacement_std_m: dict[str, float | None]
+    status: str
+    """"converged", or what the data leave open, in words."""
+    seats_m: dict[str, list[float]] = field(default_factory=dict)
+    """Where rest.csv shows the markers to sit [m], robot frame."""
+    frames: tuple[int, ...] = ()
+    """Numbers of the frames that were used."""

@@ -1,0 +1,257 @@
+"""From parameters to marker residuals: poses of the cameras, initial inputs and effects, over one or several recordings.
+
+The residual of a marker is  T_robot_camera · y − p(x),  y the measured point (after the camera's depth law) and p its
+place on the body in the state x. Where `rest.csv` measures the markers on the unloaded body, it says where they really
+sit: seat = T_robot_camera · y_rest, and how far seats lie from their declared places ties the pose down.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from femsense.arrays import FloatArray, IntArray
+from femsense.effects import Effect, Entry, Parameter, build_entry
+from femsense.errors import DataError
+from femsense.fem.equilibrium import Equilibrium
+from femsense.fem.mesh import embed_points
+from femsense.march import Walk, drive_of, walk_along
+from femsense.model import Observation, Robot
+from femsense.pose import move_pose, transform_points
+from femsense.recording import Recording
+
+POSE_STEP = np.array([1e-5, 1e-5, 1e-5, 1e-6, 1e-6, 1e-6])
+"""Steps for derivatives by a pose [rad, m]."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Scene:
+    """The markers of one recording that a fit uses."""
+
+    recording: Recording
+    frames: IntArray
+    """Indices of the frames that are used, ascending, shape (f,)."""
+    frame: IntArray
+    """Frame index of each measured marker, shape (k,)."""
+    marker: IntArray
+    """Its index among the robot's markers, shape (k,)."""
+    view: IntArray
+    """The camera that saw it, shape (k,)."""
+    points: FloatArray
+    """Where it was measured [m], camera frame, shape (k, 3)."""
+    rest_marker: IntArray
+    """Markers that rest.csv has, as indices of the robot's markers, shape (r,)."""
+    rest_view: IntArray
+    """shape (r,)."""
+    rest_points: FloatArray
+    """[m], camera frame, shape (r, 3)."""
+
+    def pick(self, frames: IntArray) -> Scene:
+        """Return the scene of some of its frames."""
+        rows = np.isin(self.frame, frames)
+        return replace(self, frames=np.intersect1d(self.frames, frames), frame=self.frame[rows], marker=self.marker[rows],
+                       view=self.view[rows], points=self.points[rows])  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Hypothesis:
+    """Effects whose parameters are fitted, on top of a robot."""
+
+    robot: Robot
+    terms: tuple[tuple[Effect, Entry, tuple[Parameter, ...]], ...] = ()
+    """(effect, what is fixed of its entry, parameters that are fitted)."""
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        return tuple(p for _, _, parameters in self.terms for p in parameters)
+
+    def entries(self, coordinates: FloatArray) -> list[Entry]:
+        """Return the effects' tables, name included, for coordinates of the fit, shape (p,)."""
+        result, at = [], 0
+        for effect, seed, parameters in self.terms:
+            entry = build_entry(parameters, list(coordinates[at : at + len(parameters)]), seed)
+            result.append({"name": effect.name, **entry})
+            at += len(parameters)
+        return result
+
+    def robot_at(self, coordinates: FloatArray) -> Robot:
+        """Return the robot with the effects at coordinates, shape (p,)."""
+        robot = self.robot
+        for (effect, _, parameters), entry in zip(self.terms, self.entries(coordinates)):
+            if parameters and all(p.coordinate(p.value(c)) == p.null for p, c in zip(parameters, self._part(effect, coordinates))):
+                continue
+            robot = effect.apply(robot, {k: v for k, v in entry.items() if k != "name"})
+        return robot
+
+    def _part(self, wanted: Effect, coordinates: FloatArray) -> FloatArray:
+        at = 0
+        for effect, _, parameters in self.terms:
+            if effect is wanted:
+                return coordinates[at : at + len(parameters)]
+            at += len(parameters)
+        return coordinates[:0]
+
+
+def make_scene(robot: Robot, recording: Recording, frames: IntArray) -> Scene:
+    """Return the markers of some frames of a recording. Raises DataError where there are none."""
+    known = {name: i for i, name in enumerate(robot.marker_names)}
+    number = np.array([known.get(name, -1) for name in recording.marker_names], dtype=np.int64)
+    marker = number[recording.marker_index] if len(recording.marker_index) else np.zeros(0, np.int64)
+    rows = np.isin(recording.marker_frame, frames) & (marker >= 0)
+    if not rows.any():
+        raise DataError("the recording has no markers that the robot knows in the frames that can be used")
+    rest_marker, rest_view, rest_points = np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3))
+    if recording.rest is not None:
+        rest = recording.rest
+        rest_all = np.array([known.get(name, -1) for name in rest.names], dtype=np.int64)
+        rest_marker, rest_view, rest_points = rest_all[rest_all >= 0], rest.view[rest_all >= 0], rest.positions[rest_all >= 0]
+    used = np.intersect1d(frames, recording.marker_frame[rows])
+    return Scene(recording, used, recording.marker_frame[rows], marker[rows], recording.marker_view[rows], recording.marker_xyz[rows],
+                 rest_marker, rest_view, rest_points)  # fmt: skip
+
+
+def undo_depth(points: FloatArray, seen: Observation) -> FloatArray:
+    """Return true camera points [m] from measured ones: measured distance = scale × true distance + offset."""
+    if seen.depth_scale == 1.0 and seen.depth_offset == 0.0:
+        return points
+    distance = np.linalg.norm(points, axis=1, keepdims=True)
+    return np.asarray(points * (distance - seen.depth_offset) / seen.depth_scale / distance)
+
+
+def in_robot_frame(points: FloatArray, view: IntArray, poses: Sequence[FloatArray], seen: Observation) -> FloatArray:
+    """Return measured points in the robot frame [m], each through the pose of its camera."""
+    corrected = undo_depth(points, seen)
+    result = np.empty_like(corrected)
+    for v, T in enumerate(poses):
+        result[view == v] = transform_points(T, corrected[view == v])
+    return result
+
+
+def seats(robot: Robot, scene: Scene, poses: Sequence[FloatArray]) -> FloatArray:
+    """Return where the markers sit at rest [m], shape (m, 3): measured by rest.csv, or as declared."""
+    places = robot.marker_points.copy()
+    if len(scene.rest_marker):
+        places[scene.rest_marker] = in_robot_frame(scene.rest_points, scene.rest_view, poses, robot.observation)
+    return places
+
+
+def marker_residual(robot: Robot, scene: Scene, poses: Sequence[FloatArray], model: Mapping[int, FloatArray]) -> FloatArray:
+    """Return measured minus modelled markers [m], shape (k, 3), robot frame; model: frame → markers (m, 3)."""
+    measured = in_robot_frame(scene.points, scene.view, poses, robot.observation)
+    predicted = np.array([model[int(f)][m] for f, m in zip(scene.frame, scene.marker)])
+    return measured - predicted.reshape(-1, 3)
+
+
+def rest_residual(robot: Robot, scene: Scene, poses: Sequence[FloatArray]) -> FloatArray:
+    """Return how far the measured seats lie from the declared places [m], shape (r, 3)."""
+    return (seats(robot, scene, poses) - robot.marker_points)[scene.rest_marker]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class SceneJet:
+    """Marker residuals of a scene with their derivatives."""
+
+    residual: FloatArray
+    """[m], shape (k, 3)."""
+    rest: FloatArray
+    """Seat residual [m], shape (r, 3)."""
+    by_pose: FloatArray
+    """d residual / d pose step (rotation about the pivot, shift), shape (k, 3, 6 v)."""
+    rest_by_pose: FloatArray
+    """shape (r, 3, 6 v)."""
+    by_initial: FloatArray
+    """d residual / d initial input, shape (k, 3, a or 0)."""
+    by_effect: FloatArray
+    """d residual / d coordinate of the hypothesis, shape (k, 3, p)."""
+    states: dict[int, Equilibrium]
+    """The equilibrium of each frame."""
+
+
+def evaluate_scene(
+    hypothesis: Hypothesis, scene: Scene, coordinates: FloatArray, poses: Sequence[FloatArray], initial: FloatArray | None,
+    *, derivative: bool, vary_initial: bool, pivot: FloatArray, starts: dict[int, Equilibrium] | None = None,
+) -> SceneJet:  # fmt: skip
+    """Evaluate marker residuals of a scene at a point of parameter space, and their derivatives by differences.
+
+    `starts` holds states of earlier evaluations near by and is brought up to date.
+
+    Raises:
+        DataError: a frame has no equilibrium.
+    """
+    robot = hypothesis.robot_at(coordinates)
+    base = Walk(robot, drive_of(robot, scene.recording, initial=initial))
+    steps, variants = _variants(hypothesis, scene, coordinates, initial, base) if derivative else ([], [])
+    if not vary_initial:
+        keep = len(hypothesis.parameters)
+        steps, variants = steps[:keep], variants[:keep]
+    place = embed_points(robot.body.mesh, seats(robot, scene, poses))
+    offset_place = {
+        id(v.robot): embed_points(v.robot.body.mesh, seats(v.robot, scene, poses)) for v in variants if v.robot is not robot
+    }
+
+    def observe(r: Robot, state: Equilibrium) -> FloatArray:
+        return offset_place.get(id(r), place).positions(state.positions)
+
+    states: dict[int, Equilibrium] = {}
+    model: dict[int, FloatArray] = {}
+    shifted: list[dict[int, FloatArray]] = [{} for _ in variants]
+    for k, state, seen, others in walk_along(base, scene.frames.tolist(), observe, variants, starts=starts):
+        states[k], model[k] = state, seen
+        for i in range(len(variants)):
+            shifted[i][k] = others[i]
+    residual = marker_residual(robot, scene, poses, model)
+    columns = [(marker_residual(v.robot, scene, poses, m) - residual) / h for v, m, h in zip(variants, shifted, steps)]
+    split = len(hypothesis.parameters) if derivative else 0
+    by_pose, rest_by_pose = _pose_derivative(robot, scene, poses, states, residual, pivot) if derivative else (np.zeros((len(residual), 3, 0)),) * 2
+    return SceneJet(residual, rest_residual(robot, scene, poses), by_pose, rest_by_pose, _stack(columns[split:], residual), _stack(columns[:split], residual), states)  # fmt: skip
+
+
+def _stack(columns: list[FloatArray], residual: FloatArray) -> FloatArray:
+    return np.stack(columns, axis=2) if columns else np.zeros((*residual.shape, 0))
+
+
+def _variants(
+    hypothesis: Hypothesis, scene: Scene, coordinates: FloatArray, initial: FloatArray | None, base: Walk
+) -> tuple[list[float], list[Walk]]:
+    """Return steps and walks: first one for each coordinate, then one for each initial input."""
+    steps, walks = [], []
+    for j, parameter in enumerate(hypothesis.parameters):
+        h = parameter.step if coordinates[j] + parameter.step <= parameter.high else -parameter.step
+        moved = coordinates.copy()
+        moved[j] += h
+        robot = hypothesis.robot_at(moved)
+        steps.append(h)
+        walks.append(Walk(robot, drive_of(robot, scene.recording, initial=initial)))
+    names = base.robot.body.cable_names
+    start = np.zeros(len(names)) if initial is None else initial
+    for i in range(len(names)):
+        h = 1e-4 if scene.recording.actuation == "tension" else 1e-6
+        moved = start.copy()
+        moved[i] += h
+        steps.append(h)
+        walks.append(Walk(base.robot, drive_of(base.robot, scene.recording, initial=moved)))
+    return steps, walks
+
+
+def _pose_derivative(
+    robot: Robot, scene: Scene, poses: Sequence[FloatArray], states: Mapping[int, Equilibrium], residual: FloatArray, pivot: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the derivatives of marker and seat residuals by each pose; only seats that move need the states again."""
+    columns, rest_columns = [], []
+    rest = rest_residual(robot, scene, poses)
+    still = {k: robot.markers.positions(s.positions) for k, s in states.items()} if not len(scene.rest_marker) else None
+    for v in range(len(poses)):
+        for j in range(6):
+            step = np.zeros(6)
+            step[j] = POSE_STEP[j]
+            moved = list(poses)
+            moved[v] = move_pose(poses[v], step, pivot_a=pivot)
+            model = still
+            if model is None:
+                place = embed_points(robot.body.mesh, seats(robot, scene, moved))
+                model = {k: place.positions(s.positions) for k, s in states.items()}
+            columns.append((marker_residual(robot, scene, moved, model) - residual) / step[j])
+            rest_columns.append((rest_residual(robot, scene, moved) - rest) / step[j])
+    return np.stack(columns, axis=2), np.stack(rest_columns, axis=2)
