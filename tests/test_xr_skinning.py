@@ -165,7 +165,9 @@ def test_rotation_against_scipy_also_for_mirrored_clouds() -> None:
         p = rng.normal(size=(20, 3))
         q = p @ Rotation.random(rng=rng).as_matrix().T * [1.0, 1.0, mirror]
         expected, _ = Rotation.align_vectors(q, p)
-        np.testing.assert_allclose(rotation_of(p.T @ q), expected.as_matrix(), atol=1e-9)
+        R = np.empty((3, 3))
+        rotation_of(p.T @ q, R)
+        np.testing.assert_allclose(R, expected.as_matrix(), atol=1e-9)
 
 
 # ---- borders ----------------------------------------------------------------------------------------------------------

@@ -1,4 +1,7 @@
-"""Inner loops of the skinning fit, compiled: rigid sweeps over the bones of a frame, weights of single vertices."""
+"""Inner loops of the skinning fit, compiled: rigid sweeps over the bones of a frame, weights of single vertices.
+
+Plain loops over small arrays, which compile in a moment and need no linear-algebra library.
+"""
 
 # mypy: disable-error-code="untyped-decorator"
 
@@ -18,41 +21,112 @@ CANDIDATES = 10
 
 
 @njit(cache=True)
-def rotation_of(covariance: FloatArray) -> FloatArray:
-    """Return the rotation R (3, 3) with the largest trace(R C), for C = Σ w p qᵀ (Kabsch 1976, det R = +1)."""
-    U, _, Vt = np.linalg.svd(covariance)
-    V = Vt.T
-    R = V @ U.T
-    if np.linalg.det(R) < 0.0:
-        V = V.copy()
-        V[:, 2] = -V[:, 2]
-        return np.asarray(V @ U.T)
-    return np.asarray(R)
+def rotation_of(covariance: FloatArray, R: FloatArray) -> None:
+    """Write the rotation R (3, 3) with the largest trace(R C), for C = Σ w p qᵀ: it turns p to q.
+
+    Horn 1987: its quaternion is the eigenvector of the largest eigenvalue of a symmetric 4 × 4 matrix, found by Jacobi
+    rotations. Always proper, also for flat and mirrored clouds.
+    """
+    C = covariance
+    K, V = np.zeros((4, 4)), np.eye(4)
+    K[0, 0] = C[0, 0] + C[1, 1] + C[2, 2]
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        K[0, i + 1] = K[i + 1, 0] = C[j, k] - C[k, j]
+        K[i + 1, i + 1] = C[i, i] - C[j, j] - C[k, k]
+        K[j + 1, k + 1] = K[k + 1, j + 1] = C[j, k] + C[k, j]
+    diagonalise(K, V)
+    best = 0
+    for i in range(1, 4):
+        if K[i, i] > K[best, best]:
+            best = i
+    w, x, y, z = V[0, best], V[1, best], V[2, best], V[3, best]
+    n = w * w + x * x + y * y + z * z
+    R[0, 0], R[0, 1], R[0, 2] = 1.0 - 2.0 * (y * y + z * z) / n, 2.0 * (x * y - z * w) / n, 2.0 * (x * z + y * w) / n
+    R[1, 0], R[1, 1], R[1, 2] = 2.0 * (x * y + z * w) / n, 1.0 - 2.0 * (x * x + z * z) / n, 2.0 * (y * z - x * w) / n
+    R[2, 0], R[2, 1], R[2, 2] = 2.0 * (x * z - y * w) / n, 2.0 * (y * z + x * w) / n, 1.0 - 2.0 * (x * x + y * y) / n
+
+
+@njit(cache=True)
+def diagonalise(K: FloatArray, V: FloatArray) -> None:
+    """Turn a symmetric 4 × 4 matrix into its eigenvalues on the diagonal, V (identity before) into its eigenvectors.
+
+    Cyclic Jacobi rotations (Golub and Van Loan, Matrix Computations, 8.5).
+    """
+    for _ in range(20):
+        off, size = 0.0, 0.0
+        for i in range(4):
+            size += K[i, i] * K[i, i]
+            for j in range(i):
+                off += K[i, j] * K[i, j]
+        if off <= 1e-32 * size or off == 0.0:
+            return
+        for p in range(3):
+            for q in range(p + 1, 4):
+                if K[p, q] != 0.0:
+                    jacobi_rotation(K, V, p, q)
+
+
+@njit(cache=True)
+def jacobi_rotation(K: FloatArray, V: FloatArray, p: int, q: int) -> None:
+    """Turn K in the plane p, q so that K[p, q] vanishes, and V along."""
+    ratio = (K[q, q] - K[p, p]) / (2.0 * K[p, q])
+    t = 1.0 / (abs(ratio) + np.sqrt(1.0 + ratio * ratio))
+    if ratio < 0.0:
+        t = -t
+    c = 1.0 / np.sqrt(1.0 + t * t)
+    s = t * c
+    for i in range(4):
+        a, b = K[i, p], K[i, q]
+        K[i, p], K[i, q] = c * a - s * b, s * a + c * b
+    for i in range(4):
+        a, b = K[p, i], K[q, i]
+        K[p, i], K[q, i] = c * a - s * b, s * a + c * b
+    for i in range(4):
+        a, b = V[i, p], V[i, q]
+        V[i, p], V[i, q] = c * a - s * b, s * a + c * b
 
 
 @njit(cache=True)
 def misfit(N: FloatArray, Y: FloatArray, M: FloatArray) -> float:
     """Return Σ |A M − x|² − Σ |x|² of a frame, for stacked transposed transforms M, shape (B, 4, 3)."""
-    size = 4 * len(M)
-    flat = M.reshape(size, 3)
-    return float(np.sum(flat * (N.reshape(size, size) @ flat)) - 2.0 * np.sum(flat * Y.reshape(size, 3)))
+    total = 0.0
+    for b in range(len(M)):
+        for i in range(4):
+            for k in range(3):
+                product = -2.0 * Y[b, i, k]
+                for c in range(len(M)):
+                    for j in range(4):
+                        product += N[b, i, c, j] * M[c, j, k]
+                total += M[b, i, k] * product
+    return total
 
 
 @njit(cache=True)
-def separate_fits(N: FloatArray, Y: FloatArray, share: FloatArray) -> FloatArray:
-    """Return [Rᵀ; tᵀ] of each bone (B, 4, 3), fitted to its vertices with its weights, without regard to the others."""
-    M = np.zeros((len(N), 4, 3))
-    for b in range(len(N)):
-        # Σ_i w p over all bones' weights is what the last column of the sums over bones holds: weights sum to 1 at a vertex
-        moment = np.zeros(3)
-        for c in range(len(N)):
-            moment += N[b, :3, c, 3]
-        scale = max(share[b], 1e-300)
-        middle, target = moment / scale, Y[b, 3] / scale
-        R = rotation_of(Y[b, :3] - np.outer(moment, target))
-        M[b, :3] = R.T
-        M[b, 3] = target - R @ middle
-    return M
+def set_bone(M: FloatArray, b: int, sums: FloatArray, moment: FloatArray, weight: float, prior: float, R: FloatArray) -> None:
+    """Write the rigid fit of one bone into M[b] = [Rᵀ; tᵀ].
+
+    Arguments:
+        M: transposed transforms of all bones, shape (B, 4, 3).
+        b: the bone.
+        sums: Σ w p qᵀ over Σ w qᵀ, shape (4, 3).
+        moment: Σ w p, shape (3,).
+        weight: Σ w.
+        prior: weight of the present rotation, which decides what the vertices leave open.
+        R: work, shape (3, 3).
+    """
+    if weight <= 1e-300:
+        return
+    covariance = np.empty((3, 3))
+    for i in range(3):
+        for k in range(3):
+            covariance[i, k] = sums[i, k] - moment[i] * sums[3, k] / weight + prior * M[b, i, k]
+    rotation_of(covariance, R)
+    for k in range(3):
+        M[b, 3, k] = sums[3, k] / weight
+        for i in range(3):
+            M[b, i, k] = R[k, i]
+            M[b, 3, k] -= R[k, i] * moment[i] / weight
 
 
 @njit(cache=True)
@@ -67,36 +141,60 @@ def sweep_poses(N: FloatArray, Y: FloatArray, share: FloatArray, start: FloatArr
         sweeps: how many.
     """
     bones = len(N)
+    R, sums, moment = np.empty((3, 3)), np.empty((4, 3)), np.empty(3)
     M = separate_fits(N, Y, share)
     if len(start) == bones:
         before = np.empty((bones, 4, 3))
         for b in range(bones):
-            before[b, :3] = start[b, :3, :3].T
-            before[b, 3] = start[b, :3, 3]
+            for k in range(3):
+                before[b, 3, k] = start[b, k, 3]
+                for i in range(3):
+                    before[b, i, k] = start[b, k, i]
         if misfit(N, Y, before) <= misfit(N, Y, M):
             M = before
-    flat = M.reshape(4 * bones, 3)
     for _ in range(sweeps):
         for b in range(bones):
-            own = np.ascontiguousarray(N[b, :, b, :])
-            left = Y[b] - N[b].reshape(4, 4 * bones) @ flat + own @ M[b]
-            weight = own[3, 3]
-            if weight <= 1e-300:
-                continue
-            moment, target = own[:3, 3] / weight, left[3] / weight
-            covariance = left[:3] - np.outer(moment, left[3])
-            # a trace of the present rotation decides what the vertices leave open
-            spread = own[0, 0] + own[1, 1] + own[2, 2]
-            covariance += 1e-9 * spread * M[b, :3]
-            R = rotation_of(covariance)
-            M[b, :3] = R.T
-            M[b, 3] = target - R @ moment
+            left_by_others(N, Y, M, b, sums)
+            for i in range(3):
+                moment[i] = N[b, i, b, 3]
+            spread = N[b, 0, b, 0] + N[b, 1, b, 1] + N[b, 2, b, 2]
+            set_bone(M, b, sums, moment, N[b, 3, b, 3], 1e-9 * spread, R)
     poses = np.zeros((bones, 4, 4))
     for b in range(bones):
-        poses[b, :3, :3] = M[b, :3].T
-        poses[b, :3, 3] = M[b, 3]
         poses[b, 3, 3] = 1.0
+        for k in range(3):
+            poses[b, k, 3] = M[b, 3, k]
+            for i in range(3):
+                poses[b, k, i] = M[b, i, k]
     return poses
+
+
+@njit(cache=True)
+def separate_fits(N: FloatArray, Y: FloatArray, share: FloatArray) -> FloatArray:
+    """Return [Rᵀ; tᵀ] of each bone (B, 4, 3), fitted to its vertices with its weights, without regard to the others."""
+    M = np.zeros((len(N), 4, 3))
+    R, moment = np.empty((3, 3)), np.empty(3)
+    for b in range(len(N)):
+        for i in range(3):
+            M[b, i, i] = 1.0
+            moment[i] = 0.0
+            for c in range(len(N)):  # weights sum to 1 at each vertex: Σ_c Σ w_b w_c p = Σ w_b p
+                moment[i] += N[b, i, c, 3]
+        set_bone(M, b, Y[b], moment, share[b], 0.0, R)
+    return M
+
+
+@njit(cache=True)
+def left_by_others(N: FloatArray, Y: FloatArray, M: FloatArray, b: int, sums: FloatArray) -> None:
+    """Write what bone b has to explain: its sums of the frame less what the other bones do, shape (4, 3)."""
+    for i in range(4):
+        for k in range(3):
+            rest = Y[b, i, k]
+            for c in range(len(M)):
+                if c != b:
+                    for j in range(4):
+                        rest -= N[b, i, c, j] * M[c, j, k]
+            sums[i, k] = rest
 
 
 # ---- weights ----------------------------------------------------------------------------------------------------------
@@ -121,41 +219,89 @@ def weights_of_vertices(
     """
     vertices, frames, bones = len(rest), len(poses), len(origins)
     count = min(CANDIDATES, bones)
+    few = min(INFLUENCES, bones)
     joints = np.zeros((vertices, INFLUENCES), dtype=np.int64)
     weights = np.zeros((vertices, INFLUENCES))
     D = np.empty((bones, 3 * frames))
-    error = np.empty(bones)
+    rank = np.empty(bones)
+    G, g = np.empty((count, count)), np.empty(count)
+    G4, g4 = np.empty((few, few)), np.empty(few)
     for v in range(vertices):
+        least, mean = misses_of_bones(rest[v], states[v], origins, poses, D, rank)
+        size = tiny + pull * least
         for b in range(bones):
-            p = rest[v] - origins[b]
-            total = 0.0
-            for f in range(frames):
-                T = poses[f, b]
-                for i in range(3):
-                    d = T[i, 0] * p[0] + T[i, 1] * p[1] + T[i, 2] * p[2] + T[i, 3] - states[v, f, i]
-                    D[b, 3 * f + i] = d
-                    total += d * d
-            error[b] = total / frames
-        size = tiny + pull * error.min()
-        chosen = np.argsort(error - (error.mean() * 1e-3 + tiny) * smooth[v])[:count]
-        G = np.empty((count, count))
-        g = np.empty(count)
+            rank[b] -= (1e-3 * mean + tiny) * smooth[v, b]
+        chosen = smallest(rank, count)
         for i in range(count):
             for j in range(i + 1):
-                G[i, j] = G[j, i] = np.dot(D[chosen[i]], D[chosen[j]]) / frames
-        for i in range(count):
+                G[i, j] = G[j, i] = dot(D[chosen[i]], D[chosen[j]]) / frames
             G[i, i] += size
             g[i] = size * smooth[v, chosen[i]]
-        w = simplex_least_squares(G, g)
-        kept = np.argsort(-w)[:INFLUENCES]
-        w4 = simplex_least_squares(np.ascontiguousarray(G[kept][:, kept]), g[kept])
-        order = np.argsort(-w4)
-        for k in range(len(order)):
-            if w4[order[k]] > 1e-6:
+        kept = smallest(-simplex_least_squares(G, g), few)
+        for i in range(few):
+            g4[i] = g[kept[i]]
+            for j in range(few):
+                G4[i, j] = G[kept[i], kept[j]]
+        w = simplex_least_squares(G4, g4)
+        order = smallest(-w, few)
+        total = 0.0
+        for k in range(few):
+            if w[order[k]] > 1e-6:
                 joints[v, k] = chosen[kept[order[k]]]
-                weights[v, k] = w4[order[k]]
-        weights[v] /= weights[v].sum()
+                weights[v, k] = w[order[k]]
+                total += w[order[k]]
+        for k in range(few):
+            weights[v, k] /= total
     return joints, weights
+
+
+@njit(cache=True)
+def misses_of_bones(
+    rest: FloatArray, states: FloatArray, origins: FloatArray, poses: FloatArray, D: FloatArray, error: FloatArray
+) -> tuple[float, float]:
+    """Write how far each bone alone misses a vertex, (B, 3 F), and its mean square (B,); return the least and the mean of these."""
+    frames = len(poses)
+    p = np.empty(3)
+    least, mean = np.inf, 0.0
+    for b in range(len(origins)):
+        for i in range(3):
+            p[i] = rest[i] - origins[b, i]
+        total = 0.0
+        for f in range(frames):
+            for i in range(3):
+                d = poses[f, b, i, 3] - states[f, i]
+                for j in range(3):
+                    d += poses[f, b, i, j] * p[j]
+                D[b, 3 * f + i] = d
+                total += d * d
+        error[b] = total / frames
+        mean += error[b] / len(origins)
+        least = min(least, error[b])
+    return least, mean
+
+
+@njit(cache=True, fastmath=True)
+def dot(a: FloatArray, b: FloatArray) -> float:
+    """Return a · b."""
+    total = 0.0
+    for i in range(len(a)):
+        total += a[i] * b[i]
+    return total
+
+
+@njit(cache=True)
+def smallest(values: FloatArray, count: int) -> IntArray:
+    """Return the indices of the smallest values in their order, shape (count,); the first of equal ones first."""
+    taken = np.zeros(len(values), dtype=np.bool_)
+    result = np.empty(count, dtype=np.int64)
+    for k in range(count):
+        best = -1
+        for i in range(len(values)):
+            if not taken[i] and (best < 0 or values[i] < values[best]):
+                best = i
+        taken[best] = True
+        result[k] = best
+    return result
 
 
 @njit(cache=True)
@@ -166,51 +312,83 @@ def simplex_least_squares(G: FloatArray, g: FloatArray) -> FloatArray:
     step back to the border where an entry would turn negative.
     """
     k = len(g)
-    single = np.empty(k)
-    for i in range(k):
-        single[i] = 0.5 * G[i, i] - g[i]
-    w = np.zeros(k)
-    first = int(np.argmin(single))
-    w[first] = 1.0
-    free = np.zeros(k, dtype=np.bool_)
-    free[first] = True
+    first = 0
+    for i in range(1, k):
+        if 0.5 * G[i, i] - g[i] < 0.5 * G[first, first] - g[first]:
+            first = i
+    w, free, gradient = np.zeros(k), np.zeros(k, dtype=np.bool_), np.empty(k)
+    w[first], free[first] = 1.0, True
     for _ in range(3 * k):
-        gradient = G @ w - g
-        level = np.dot(w, gradient)
-        gain = np.where(free, np.inf, gradient - level)
-        entering = int(np.argmin(gain))
-        if gain[entering] >= -1e-10 * G[first, first]:
+        level = 0.0
+        for i in range(k):
+            gradient[i] = -g[i]
+            for j in range(k):
+                gradient[i] += G[i, j] * w[j]
+            level += w[i] * gradient[i]
+        entering = -1
+        for i in range(k):
+            if not free[i] and (entering < 0 or gradient[i] < gradient[entering]):
+                entering = i
+        if entering < 0 or gradient[entering] - level >= -1e-10 * G[first, first]:
             break
         free[entering] = True
-        for _ in range(k):
-            target = equality_least_squares(G, g, free)
-            step = 1.0
-            for i in range(k):
-                if free[i] and target[i] < 0.0:
-                    step = min(step, w[i] / (w[i] - target[i]))
-            w = w + step * (target - w)
-            if step >= 1.0:
-                break
-            for i in range(k):
-                if free[i] and target[i] < 0.0 and w[i] <= 1e-12:
-                    free[i] = False
-                    w[i] = 0.0
+        settle(G, g, free, w)
     return w
 
 
 @njit(cache=True)
+def settle(G: FloatArray, g: FloatArray, free: BoolArray, w: FloatArray) -> None:
+    """Move w to the minimum over the free entries; entries that would turn negative stop at zero and are free no more."""
+    for _ in range(len(g)):
+        target = equality_least_squares(G, g, free)
+        step = 1.0
+        for i in range(len(g)):
+            if free[i] and target[i] < 0.0:
+                step = min(step, w[i] / (w[i] - target[i]))
+        for i in range(len(g)):
+            w[i] += step * (target[i] - w[i])
+        if step >= 1.0:
+            return
+        for i in range(len(g)):
+            if free[i] and target[i] < 0.0 and w[i] <= 1e-12:
+                free[i] = False
+                w[i] = 0.0
+
+
+@njit(cache=True)
 def equality_least_squares(G: FloatArray, g: FloatArray, free: BoolArray) -> FloatArray:
-    """Return the minimiser of wᵀ G w / 2 − g w with Σ w = 1 over the free entries, zero elsewhere, shape (k,)."""
-    index = np.flatnonzero(free)
-    inner = np.empty((len(index), len(index)))
-    right = np.ones((len(index), 2))
-    for a in range(len(index)):
-        right[a, 0] = g[index[a]]
-        for b in range(len(index)):
-            inner[a, b] = G[index[a], index[b]]
-    both = np.linalg.solve(inner, right)
-    multiplier = (1.0 - both[:, 0].sum()) / both[:, 1].sum()
-    w = np.zeros(len(g))
-    for a in range(len(index)):
-        w[index[a]] = both[a, 0] + multiplier * both[a, 1]
+    """Return the minimiser of wᵀ G w / 2 − g w with Σ w = 1 over the free entries, zero elsewhere, shape (k,).
+
+    Gauss elimination of the free part with right-hand sides g and 1; the second carries the constraint's multiplier.
+    """
+    k = len(g)
+    index = np.empty(k, dtype=np.int64)
+    n = 0
+    for i in range(k):
+        if free[i]:
+            index[n] = i
+            n += 1
+    A = np.empty((n, n + 2))
+    for a in range(n):
+        for b in range(n):
+            A[a, b] = G[index[a], index[b]]
+        A[a, n] = g[index[a]]
+        A[a, n + 1] = 1.0
+    for a in range(n):  # positive definite: no pivoting needed
+        for b in range(a + 1, n):
+            factor = A[b, a] / A[a, a]
+            for c in range(a, n + 2):
+                A[b, c] -= factor * A[a, c]
+    plain, ones = 0.0, 0.0
+    for back in range(n):
+        a = n - 1 - back
+        for right in (n, n + 1):
+            for c in range(a + 1, n):
+                A[a, right] -= A[a, c] * A[c, right]
+            A[a, right] /= A[a, a]
+        plain += A[a, n]
+        ones += A[a, n + 1]
+    w = np.zeros(k)
+    for a in range(n):
+        w[index[a]] = A[a, n] + (1.0 - plain) / ones * A[a, n + 1]
     return w
