@@ -71,7 +71,7 @@ def cell_keys(points: FloatArray, cell: float, origin: FloatArray) -> tuple[IntA
 def build_grid(points: FloatArray, cell: float) -> Grid:
     """Return the points sorted into cells of the given edge [m]; points [m], shape (n, 3). Raises InputError."""
     if len(points) == 0:
-        return Grid(points, np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(3), np.zeros(3, np.int64), cell)
+        return Grid(np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(3), np.zeros(3, np.int64), cell)
     low = points.min(axis=0)
     keys, dims = cell_keys(points, cell, low)
     order = np.argsort(keys, kind="stable")
@@ -82,7 +82,8 @@ def count_within(grid: Grid, queries: FloatArray, radius: float, *, enough: int 
     """Return how many of the grid's points lie within radius [m] of each query (n, 3); counting may end at `enough`."""
     if len(grid.keys) == 0 or len(queries) == 0:
         return np.zeros(len(queries), dtype=np.int64)
-    counts: IntArray = _count_within(queries, grid.points, grid.keys, grid.origin, grid.dims, grid.cell, radius**2, enough)
+    own = np.array(queries)  # one kind of array for the kernels: each kind compiles anew
+    counts: IntArray = _count_within(own, grid.points, grid.keys, grid.origin, grid.dims, grid.cell, radius**2, enough)
     return counts
 
 

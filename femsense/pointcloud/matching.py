@@ -101,7 +101,7 @@ def match_along_normals(
     facing = _facing(cloud, robot_normals)
     visible = _visible(places, directions, camera_position, view_direction, float(min_facing))
     grid = build_grid(cloud, float(np.hypot(across, along)))
-    raw = _match(*_sorted(grid, facing), places, directions, visible, across, along, order)
+    raw = _match(*_sorted(grid, facing), np.array(places), directions, visible, across, along, order)
     return _matches(raw, grid, visible, average, float(std_floor_m))
 
 
@@ -138,7 +138,7 @@ def _visible(
 
 
 def _sorted(grid: Grid, facing: FloatArray) -> tuple[FloatArray, FloatArray, IntArray, FloatArray, IntArray, float]:
-    return grid.points, facing[grid.order] if len(facing) else facing, grid.keys, grid.origin, grid.dims, grid.cell
+    return grid.points, facing[grid.order] if len(facing) else np.zeros((0, 3)), grid.keys, grid.origin, grid.dims, grid.cell
 
 
 def _matches(raw: tuple[FloatArray, IntArray], grid: Grid, visible: BoolArray, average: bool, floor: float) -> Matches:
