@@ -265,7 +265,7 @@ def _tets_of_surface(file: Path, points: FloatArray, triangles: IntArray, where:
         kept = _read_kept(place)
         if kept is not None:
             return kept
-    mesh = tetrahedralise(points, triangles, where=where)
+    mesh = tetrahedralise(points, triangles, edge_fraction=EDGE_FRACTION, where=where)
     for place in places:
         if _keep(mesh, place):
             return _read_kept(place) or mesh

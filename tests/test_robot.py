@@ -330,6 +330,7 @@ def test_any_declared_robot_round_trips(tmp_path_factory: pytest.TempPathFactory
 def surface_robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     pytest.importorskip("trimesh")
     monkeypatch.setenv("FEMSENSE_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr("femsense.meshfile.EDGE_FRACTION", 0.2)
     folder = write_block_robot(tmp_path / "robot", mesh__file="block.stl", cables=None)
     points, triangles = block_surface((100.0, 30.0, 30.0))
     meshio.Mesh(points, [("triangle", triangles)]).write(folder / "block.stl")
