@@ -64,6 +64,18 @@ def test_covariance_is_that_of_weighted_least_squares() -> None:
     np.testing.assert_allclose(estimate.std, np.sqrt(np.diag(estimate.covariance)), rtol=1e-12)
 
 
+def test_cables_that_are_measured_leave_their_directions() -> None:
+    """(13) takes the columns of the cables out; (14) makes the tensions follow the forces: λ_a = W_aa⁻¹ (… − W_af λ_f)."""
+    W, W_c, free, std = body()
+    fixed = estimate_forces(W, W_c, free, free, std=std, cable_inputs=[0.0, 0.0])
+    np.testing.assert_allclose(fixed.covariance, estimate_forces(W, None, free, free, std=std).covariance, rtol=1e-8)
+    W_aa, W_af = 1e-3 * np.array([[2.0, 0.5], [0.5, 1.0]]), 1e-3 * np.random.default_rng(7).normal(size=(2, 3))
+    parts = {"W_aa": W_aa, "W_af": W_af, "delta_a_free": np.zeros(2)}
+    moved = estimate_forces(W, W_c, free, free, std=std, cable_displacements=[0.0, 0.0], **parts)
+    stiffer = W - W_c @ np.linalg.solve(W_aa, W_af)
+    np.testing.assert_allclose(moved.covariance, estimate_forces(stiffer, None, free, free, std=std).covariance, rtol=1e-7)
+
+
 def test_unknown_tensions_and_nuisance_are_marginalised() -> None:
     """By the other road: a nuisance of deviation τ is noise of covariance B τ² Bᵀ; a free one takes its direction away."""
     W, W_c, free, std = body()

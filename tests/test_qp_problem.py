@@ -72,6 +72,21 @@ def test_the_pyramid_lies_inside_the_cone_and_touches_it(sides: int) -> None:
     assert not (G @ unit <= 0).all(), "a pull is not allowed"
 
 
+def test_without_friction_only_a_push_along_the_normal_is_left() -> None:
+    G = build_force_problem(**random_parts(), friction_cone=FrictionCone([[0, 0, 1.0]], 0.0)).G[:, 2:]
+    assert (G @ [0, 0, -1.0] <= 1e-15).all()
+    for force in ([0, 0, 1.0], [0.1, 0, -1.0], [0, -0.1, -1.0]):
+        assert (G @ force > 1e-3).any()
+
+
+def test_every_kind_of_violation_counts() -> None:
+    problem = Problem(np.eye(1), [0.0], G=[[2.0]], h=[6.0], A=[[1.0]], b=[2.0], lb=[1.0], ub=[2.5])
+    for x, violation in ((2.0, 0.0), (0.0, 2.0), (-1.0, 3.0), (4.0, 2.0), (8.0, 10.0)):
+        assert kkt_residuals(problem, np.array([x]), nobody(1, 1, 1)).primal == violation
+    boxed = Problem(np.eye(1), [0.0], lb=[1.0], ub=[2.5])
+    assert [kkt_residuals(boxed, np.array([x]), nobody(1)).primal for x in (0.5, 2.0, 4.0)] == [0.5, 0.0, 1.5]
+
+
 def test_a_certificate_of_an_optimal_point_vanishes_and_of_another_does_not() -> None:
     # min (x − 2)² + (y − 1)²,  x ≤ 1, x + y = 1.5  →  (1, 0.5), by hand: z_box = 1, y = 1
     problem = Problem(2 * np.eye(2), [-4.0, -2.0], A=[[1.0, 1.0]], b=[1.5], ub=[1.0, np.inf])

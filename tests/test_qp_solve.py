@@ -193,6 +193,7 @@ def test_a_failing_solver_hands_over(monkeypatch: pytest.MonkeyPatch) -> None:
     assert called[0] == "daqp" and len(called) > 1 and solution.solver != "daqp" and solution.solved
     alone = solve(problem, fallback=False)
     assert alone.status is Status.INACCURATE and alone.certificate > 0.01 and alone.solver == "daqp"
+    assert solve(KNOWN["free"].problem, fallback=False).status is Status.INACCURATE, "bounded by its curvature"
 
 
 def test_unknown_solvers_are_refused() -> None:

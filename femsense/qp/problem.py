@@ -350,4 +350,4 @@ def _pyramid(cone: FrictionCone, a: int, f: int, k: int) -> FloatArray:
 def _bound_work(bounds: FloatArray, multipliers: FloatArray) -> float:
     """Return Σ bound · multiplier, where an absent bound with multiplier zero counts as zero and any other as inf."""
     acting = multipliers != 0.0
-    return float(bounds[acting] @ multipliers[acting]) if np.isfinite(bounds[acting]).all() else np.inf
+    return float(bounds[acting] @ multipliers[acting])
