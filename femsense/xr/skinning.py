@@ -32,7 +32,7 @@ DEFAULT_BONES = 12
 ROUNDS = 12
 """Rounds of weights and poses."""
 FIT_SWEEPS = 12
-ONLINE_SWEEPS = 2
+ONLINE_SWEEPS = 4
 NOISE = 1e-6
 """Motion below this share of the body's size says nothing about weights."""
 PULL = 1e-3
@@ -118,7 +118,7 @@ def fit_poses(skin: Skin, states: npt.ArrayLike, *, sweeps: int = FIT_SWEEPS) ->
     Arguments:
         skin: the surface and its weights.
         states: vertices of each frame, robot frame [m], shape (F, V, 3).
-        sweeps: passes over the bones in each frame; two serve a live view (`prepare_poses` gives the step alone).
+        sweeps: passes over the bones in each frame; a live view needs fewer (`prepare_poses` gives the step alone).
 
     Returns:
         T_robot_bone of each frame, shape (F, B, 4, 4).

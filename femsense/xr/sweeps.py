@@ -142,23 +142,23 @@ def sweep_poses(N: FloatArray, Y: FloatArray, share: FloatArray, start: FloatArr
     """
     bones = len(N)
     R, sums, moment = np.empty((3, 3)), np.empty((4, 3)), np.empty(3)
-    M = separate_fits(N, Y, share)
-    if len(start) == bones:
-        before = np.empty((bones, 4, 3))
-        for b in range(bones):
-            for k in range(3):
-                before[b, 3, k] = start[b, k, 3]
-                for i in range(3):
+    before = np.zeros((bones, 4, 3))
+    for b in range(bones):
+        for i in range(3):
+            before[b, i, i] = 1.0
+            if len(start) == bones:
+                before[b, 3, i] = start[b, i, 3]
+                for k in range(3):
                     before[b, i, k] = start[b, k, i]
-        if misfit(N, Y, before) <= misfit(N, Y, M):
-            M = before
+    M = separate_fits(N, Y, share, before)
+    if len(start) == bones and misfit(N, Y, before) <= misfit(N, Y, M):
+        M = before
     for _ in range(sweeps):
         for b in range(bones):
             left_by_others(N, Y, M, b, sums)
             for i in range(3):
                 moment[i] = N[b, i, b, 3]
-            spread = N[b, 0, b, 0] + N[b, 1, b, 1] + N[b, 2, b, 2]
-            set_bone(M, b, sums, moment, N[b, 3, b, 3], 1e-9 * spread, R)
+            set_bone(M, b, sums, moment, N[b, 3, b, 3], prior_of(N, b), R)
     poses = np.zeros((bones, 4, 4))
     for b in range(bones):
         poses[b, 3, 3] = 1.0
@@ -170,18 +170,23 @@ def sweep_poses(N: FloatArray, Y: FloatArray, share: FloatArray, start: FloatArr
 
 
 @njit(cache=True)
-def separate_fits(N: FloatArray, Y: FloatArray, share: FloatArray) -> FloatArray:
+def separate_fits(N: FloatArray, Y: FloatArray, share: FloatArray, before: FloatArray) -> FloatArray:
     """Return [Rᵀ; tᵀ] of each bone (B, 4, 3), fitted to its vertices with its weights, without regard to the others."""
-    M = np.zeros((len(N), 4, 3))
+    M = before.copy()
     R, moment = np.empty((3, 3)), np.empty(3)
     for b in range(len(N)):
         for i in range(3):
-            M[b, i, i] = 1.0
             moment[i] = 0.0
             for c in range(len(N)):  # weights sum to 1 at each vertex: Σ_c Σ w_b w_c p = Σ w_b p
                 moment[i] += N[b, i, c, 3]
-        set_bone(M, b, Y[b], moment, share[b], 0.0, R)
+        set_bone(M, b, Y[b], moment, share[b], prior_of(N, b), R)
     return M
+
+
+@njit(cache=True)
+def prior_of(N: FloatArray, b: int) -> float:
+    """Return the small weight of a bone's present rotation, which decides what its vertices leave open."""
+    return 1e-9 * float(N[b, 0, b, 0] + N[b, 1, b, 1] + N[b, 2, b, 2])
 
 
 @njit(cache=True)

@@ -22,11 +22,13 @@ import {
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import { RoomEnvironment } from "three/addons/environments/RoomEnvironment.js";
 
-const TABLE = new Vector3(0, 0.9, -0.6); // where the robot's ground stands in front of a person [m]
+const TABLE = new Vector3(0, 1.1, -0.6); // where the robot's ground stands in front of a person [m]
+
+const FIELD_OF_VIEW = 38; // on a screen [deg]
 
 export class Stage {
   readonly scene = new Scene();
-  readonly camera = new PerspectiveCamera(38, 1, 0.001, 100);
+  readonly camera = new PerspectiveCamera(FIELD_OF_VIEW, 1, 0.001, 100);
   readonly renderer: WebGLRenderer;
   readonly controls: OrbitControls;
   /** Everything that belongs to the robot; moves as one onto the table of a headset's room. */
@@ -53,6 +55,7 @@ export class Stage {
     this.sun.shadow.bias = -0.0004;
     this.robot.add(this.sun, this.sun.target, this.ground);
     this.scene.add(this.robot, new HemisphereLight(0xbfd8ff, 0x1a1f28, 0.7));
+    this.renderer.xr.addEventListener("sessionend", () => this.leave());
     this.controls = new OrbitControls(this.camera, canvas);
     this.controls.enableDamping = true;
     this.controls.dampingFactor = 0.12;
@@ -124,7 +127,6 @@ export class Stage {
     const xr = navigator.xr;
     if (!xr) return;
     const session = await xr.requestSession(mode, { optionalFeatures: ["local-floor", "hand-tracking"] });
-    session.addEventListener("end", () => this.leave());
     this.renderer.xr.setReferenceSpaceType(session.enabledFeatures?.includes("local-floor") === false ? "local" : "local-floor");
     const middle = this.box.getCenter(new Vector3());
     this.robot.position.copy(TABLE).sub(new Vector3(middle.x, this.box.min.y, middle.z));
@@ -139,6 +141,8 @@ export class Stage {
 
   private leave(): void {
     this.robot.position.set(0, 0, 0);
+    this.camera.fov = FIELD_OF_VIEW; // the session left the headset's
+    this.camera.zoom = 1;
     this.resize();
     this.fit(this.box);
   }
