@@ -93,6 +93,13 @@ def test_a_slanted_surface_is_met_on_the_line_and_not_beside_it() -> None:
         np.testing.assert_allclose(matches.distance, 0.002, atol=1e-12)
 
 
+def test_a_single_point_beside_the_line_of_a_slanted_surface_is_that_uncertain() -> None:
+    flat = np.random.default_rng(0).uniform(-0.01, 0.01, size=(60, 2))
+    points = np.column_stack([flat, 0.8 * flat[:, 0]])
+    matches = match_along_normals([[0, 0, 0]], [[0, 0, 1]], points, d_m=0.006, d_l=0.02)
+    np.testing.assert_allclose(matches.std, 0.8 * matches.line_distance, rtol=1e-9)
+
+
 def test_second_order_follows_curvature_and_first_order_is_off_as_stated() -> None:
     features, normals = front(60)
     points = cap(np.random.default_rng(0), 40000)
