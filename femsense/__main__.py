@@ -1,0 +1,7 @@
+"""`python -m femsense` is the command `femsense`."""
+
+from __future__ import annotations
+
+from femsense.cli import main
+
+main()

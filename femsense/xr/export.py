@@ -1,0 +1,62 @@
+"""From a run to a skinned, animated mesh in one call."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from femsense.arrays import FloatArray, IntArray
+from femsense.model import Robot
+from femsense.xr.gltf import ExportReport, export_states
+from femsense.xr.view import export_run
+
+
+class _States(Protocol):
+    @property
+    def time_s(self) -> FloatArray: ...
+    @property
+    def nodes_m(self) -> npt.NDArray[np.float32]: ...
+    @property
+    def tets(self) -> IntArray: ...
+    @property
+    def rest_nodes_m(self) -> FloatArray: ...
+
+
+class RunLike(Protocol):
+    """A run, as far as an export looks at it."""
+
+    @property
+    def states(self) -> _States: ...
+    @property
+    def robot(self) -> Robot: ...
+
+
+def export_glb(
+    run: RunLike | str | Path, path: str | Path, *, bones: int | None = None, color_rgb: npt.ArrayLike | None = None
+) -> ExportReport:
+    """Write a run as a skinned, animated mesh (binary glTF 2.0).
+
+    Arguments:
+        run: of `estimate`, or a folder that it was written to.
+        path: the `.glb` file; its folder is made where it is missing.
+        bones: how many; chosen on held-out frames if None.
+        color_rgb: colour of the body, sRGB in 0 … 1, shape (3,); by default the robot's where the run knows it.
+
+    Returns:
+        what was written, with the distance to the finite-element surface.
+
+    Raises:
+        InputError: a folder without states, or times that do not increase.
+    """
+    target = Path(path).expanduser()
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if isinstance(run, str | Path):
+        return export_run(run, target, bones=bones, color_rgb=color_rgb)
+    states, robot = run.states, run.robot
+    color = robot.color_rgb if color_rgb is None else color_rgb
+    return export_states(
+        states.rest_nodes_m, states.tets, states.time_s, states.nodes_m, target, bones=bones, color_rgb=color, name=robot.name
+    )
