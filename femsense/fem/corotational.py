@@ -71,7 +71,7 @@ def closest_rotation(F: FloatArray, R: FloatArray, work: FloatArray) -> None:
 def inverse_symmetric(A: FloatArray, out: FloatArray) -> None:
     """Write the inverse of a symmetric 3 × 3 matrix; one that is singular gets a small shift."""
     det = determinant(A)
-    size = abs(A[0, 0]) + abs(A[1, 1]) + abs(A[2, 2]) + 1e-300
+    size = abs(A[0, 0]) + abs(A[1, 1]) + abs(A[2, 2]) + 1e-12  # all nodes in one point give A = 0
     if abs(det) < 1e-9 * size**3:
         for i in range(3):
             A[i, i] += 1e-3 * size
