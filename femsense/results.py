@@ -198,22 +198,23 @@ def write_run(
     seconds: float | None = None,
     calibration: Calibration | None = None,
 ) -> Path:
-    """Write contacts.csv, frames.csv, states.npz and at last run.json.
+    """Write contacts.csv, frames.csv, states.npz, the calibration and at last run.json.
 
     Arguments:
         run: of `estimate`.
         folder: made where it is missing; its other files stay.
         inputs: of `run_inputs`.
         seconds: how long the estimate took [s].
-        calibration: written beside them where the run made it itself.
+        calibration: what it was made with; stands beside it as calibration.json.
 
     Returns:
         the folder.
 
     Raises:
-        InputError: where the folder is a robot or a recording, which the results would overwrite.
+        InputError: see `check_run_folder`.
     """
-    with _results_folder(folder, "run.json", not_beside=("robot.toml", "recording.toml", "loop.json")) as part:
+    check_run_folder(folder)
+    with _results_folder(folder, "run.json") as part:
         if calibration is not None:
             write_calibration(calibration, part / "calibration.json")
         write_csv(part / "contacts.csv", CONTACT_COLUMNS, [_contact_row(contact) for contact in run.contacts])
@@ -223,6 +224,11 @@ def write_run(
         _write_states(run.states, part / "states.npz")
         write_json(part / "run.json", _run_document(run, inputs, seconds))
     return Path(folder)
+
+
+def check_run_folder(folder: str | Path) -> None:
+    """Raise InputError where a run cannot be written: in a robot, a recording or a loop, or where a file stands."""
+    _check_folder(Path(folder).expanduser(), ("robot.toml", "recording.toml", "loop.json"))
 
 
 def read_run(folder: str | Path, *, robot: Robot | None = None) -> Run:
@@ -359,18 +365,23 @@ def write_loop(loop: LoopResult, folder: str | Path, *, inputs: Mapping[str, Any
     """Write the improved robot and at last loop.json; return the folder.
 
     Raises:
-        InputError: where the folder is a recording, a run, or a robot that no loop has written.
+        InputError: see `check_loop_folder`.
     """
     from femsense.robot import save_robot
 
-    root = Path(folder)
-    if (root / "robot.toml").is_file() and not (root / "loop.json").is_file():
-        raise InputError("a robot stands there, which would be overwritten", where=root, expected="a new folder, or one that femsense improve wrote", hint="another -o OUT")  # fmt: skip
-    with _results_folder(root, "loop.json", not_beside=("recording.toml", "run.json")) as part:
+    check_loop_folder(folder)
+    with _results_folder(folder, "loop.json") as part:
         save_robot(loop.robot, part)
         document = {"format": LOOP_FORMAT, **loop.document()}
         write_json(part / "loop.json", {**document, "inputs": inputs or {}, "versions": versions()})
-    return root
+    return Path(folder)
+
+
+def check_loop_folder(folder: str | Path) -> None:
+    """Raise InputError where a loop cannot be written: in a recording, a run or a robot that no loop wrote, or at a file."""
+    root = Path(folder).expanduser()
+    own = (root / "loop.json").is_file()
+    _check_folder(root, ("recording.toml", "run.json") if own else ("recording.toml", "run.json", "robot.toml"))
 
 
 def read_loop(path: str | Path) -> dict[str, Any]:
@@ -383,18 +394,13 @@ def read_loop(path: str | Path) -> dict[str, Any]:
 
 
 @contextmanager
-def _results_folder(folder: str | Path, marker: str, *, not_beside: Sequence[str]) -> Iterator[Path]:
+def _results_folder(folder: str | Path, marker: str) -> Iterator[Path]:
     """Yield an empty folder; what the block writes there moves into `folder` at its end, `marker` last.
 
     A new folder appears in one step. In one that is there, the old marker goes first, so that a folder with a marker is always
     complete; its other files stay.
     """
     root = Path(folder).expanduser().absolute()
-    foreign = [name for name in not_beside if (root / name).is_file()]
-    if foreign:
-        raise InputError("these results would overwrite or mix with what stands there", where=root, found=foreign[0], expected="a folder of their own", hint="another -o")  # fmt: skip
-    if root.exists() and not root.is_dir():
-        raise InputError("a file stands where the folder should be written", where=root, expected="a folder", hint="another -o")
     if not root.exists():
         with write_beside(root) as part:
             part.mkdir(parents=True)
@@ -405,6 +411,14 @@ def _results_folder(folder: str | Path, marker: str, *, not_beside: Sequence[str
         (root / marker).unlink(missing_ok=True)
         for file in sorted(Path(scratch).iterdir(), key=lambda file: file.name == marker):
             os.replace(file, root / file.name)
+
+
+def _check_folder(root: Path, not_beside: Sequence[str]) -> None:
+    foreign = next((name for name in not_beside if (root / name).is_file()), None)
+    if foreign is not None:
+        raise InputError("the results would mix with what stands there", where=root, found=foreign, expected="a folder of their own", hint="another -o")  # fmt: skip
+    if root.exists() and not root.is_dir():
+        raise InputError("a file stands where the folder should be written", where=root, expected="a folder", hint="another -o")
 
 
 def _read_document(file: Path, expected: str) -> dict[str, Any]:

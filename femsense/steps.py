@@ -1,0 +1,105 @@
+"""From files to files: what the commands do between reading their arguments and saying the result, with resuming."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from femsense import results
+from femsense.recording import load_recording
+from femsense.robot import load_robot
+
+if TYPE_CHECKING:
+    from femsense.sensing import Run
+
+Progress = Callable[..., None]
+Say = Callable[[str], None]
+
+
+def estimate_into(
+    folder: str | Path,
+    robot: str | Path,
+    recording: str | Path,
+    *,
+    say: Say,
+    calibration: str | Path | None = None,
+    at: Sequence[Sequence[float]] | None = None,
+    again: bool = False,
+    progress: Progress | None = None,
+) -> Run:
+    """Estimate a recording into a folder, or return what stands there if it was made from the same input.
+
+    Arguments:
+        folder: of the run.
+        robot, recording: folders (or the name of a robot).
+        say: told in one line what happens beside the estimate.
+        calibration: calibration.json; None calibrates first.
+        at: places of contact at rest [m], shape (k, 3).
+        again: compute even where the result is there.
+        progress: called with (frames done, frames in all).
+
+    Raises:
+        FemsenseError: bad input, a folder that holds something else, or data that allow no result.
+    """
+    from femsense.calib.calibrate import calibrate
+    from femsense.sensing import estimate
+
+    results.check_run_folder(folder)
+    body, frames = load_robot(robot), load_recording(recording)
+    given = None if calibration is None else results.read_calibration(calibration)
+    inputs = results.run_inputs(body, frames, given, at=at)
+    if not again and results.finished(folder, inputs):
+        say(f"{folder} holds this result already (--again computes it anew)")
+        return results.read_run(folder, robot=body)
+    if given is None:
+        say(f"no calibration given: calibrating first, into {Path(folder) / 'calibration.json'}")
+    used = calibrate(body, frames) if given is None else given
+    began = time.perf_counter()
+    run = estimate(body, frames, used, at=at, progress=progress)
+    results.write_run(run, folder, inputs=inputs, seconds=time.perf_counter() - began, calibration=used)
+    return run
+
+
+def improve_into(
+    folder: str | Path,
+    robot: str | Path,
+    recordings: Sequence[str | Path],
+    *,
+    say: Say,
+    validation: Sequence[str | Path] = (),
+    effects: Sequence[str] | None = None,
+    without: Sequence[str] | None = None,
+    again: bool = False,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Close the loop into a folder, or return what stands there if it was made from the same input.
+
+    Arguments:
+        folder: gets loop.json, robot.toml and the mesh.
+        robot: a folder, or the name of a robot.
+        recordings: what effects are found on; validation: what they are tested on.
+        say: told in one line what happens beside the loop.
+        effects, without: names of effects to try, or not to try.
+        again: compute even where the result is there.
+        progress: as of `improve`.
+
+    Returns:
+        the content of loop.json.
+
+    Raises:
+        FemsenseError: bad input, a folder that holds something else, or data that allow no result.
+    """
+    from femsense.loop import improve
+
+    results.check_loop_folder(folder)
+    body = load_robot(robot)
+    train, test = [load_recording(path) for path in recordings], [load_recording(path) for path in validation]
+    inputs = results.loop_inputs(body, train, test, effects=effects, without=without)
+    if not again and results.finished(folder, inputs):
+        say(f"{folder} holds this result already (--again computes it anew)")
+        return results.read_loop(folder)
+    loop = improve(body, train, validation=test, effects=effects, without=without, progress=progress)
+    results.write_loop(loop, folder, inputs=inputs)
+    return results.read_loop(folder)

@@ -1,0 +1,186 @@
+"""Results in a few lines of text for people, and in a few numbers for programs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from femsense.calib.calibration import Calibration
+
+if TYPE_CHECKING:
+    from femsense.sensing import ContactForce, Run
+
+VERDICTS = {
+    "effects": "the data name what the model lacks",
+    "none": "the model explains the data to their noise",
+    "unexplained": "a residual is left that no effect explains",
+}
+
+
+def columns(rows: Iterable[Sequence[str]], *, indent: int = 2) -> str:
+    """Return rows of text as aligned columns; a row may end early."""
+    table = [list(row) for row in rows]
+    count = max((len(row) for row in table), default=0)
+    widths = [max((len(row[j]) for row in table if j < len(row) - 1), default=0) for j in range(count)]
+    return "\n".join((" " * indent + "  ".join(cell.ljust(width) for cell, width in zip(row, widths))).rstrip() for row in table)
+
+
+def calibration_text(calibration: Calibration) -> str:
+    """Return a calibration in a few lines."""
+    c = calibration
+    rows: list[list[str]] = [["status", c.status]]
+    for name, T in zip(c.camera_names, c.poses):
+        rows.append(
+            [
+                f"camera {name}".strip(),
+                f"at {_millimetres(T[:3, 3])} in the robot frame" + (_pose_std(c) if T is c.poses[0] else ""),
+            ]
+        )
+    if np.isfinite(c.rms_m):
+        rows.append(["residual", f"{1e3 * c.rms_m:.3f} mm rms over {len(c.marker_rms_m)} markers in {len(c.frames)} frames"])
+        worst = max(c.marker_rms_m, key=lambda name: c.marker_rms_m[name], default=None)
+        rows += [] if worst is None else [["worst marker", f"{worst}, {1e3 * c.marker_rms_m[worst]:.3f} mm rms"]]
+    for name, tension in c.cable_tension_n.items():
+        rows.append([f"cable {name}", f"{tension:.3f} N{_std(c.tension_std_n.get(name), 1.0, 'N')}, "
+                     f"{1e3 * c.cable_displacement_m.get(name, float('nan')):.2f} mm{_std(c.displacement_std_m.get(name), 1e3, 'mm')} at the start"])  # fmt: skip
+    return "calibration\n" + columns(rows)
+
+
+def run_document(run: Run) -> dict[str, Any]:
+    """Return a run in numbers."""
+    good = [frame for frame in run.frames if frame.status == "ok"]
+    strongest = _strongest(run)
+    return {
+        "robot": run.robot.name,
+        "frames": len(run.frames),
+        "frames_ok": len(good),
+        "contacts": len(run.contacts),
+        "frames_with_contact": len({contact.frame for contact in run.contacts}),
+        "largest_force_n": None if strongest is None else strongest.force_n,
+        "rms_before_m": _median([frame.rms_before_m for frame in good]),
+        "rms_after_m": _median([frame.rms_after_m for frame in good]),
+        "ms_per_frame": _median([frame.ms for frame in good]),
+        "known_loads": run.known_loads,
+        "failed": [{"frame": frame.frame, "status": frame.status} for frame in run.frames if frame.status != "ok"],
+    }
+
+
+def run_text(run: Run) -> str:
+    """Return a run in a few lines."""
+    facts, strongest = run_document(run), _strongest(run)
+    rows = [["frames", f"{facts['frames_ok']} of {facts['frames']}"]]
+    rows.append(["contacts", f"{facts['contacts']} in {facts['frames_with_contact']} frames"])
+    if facts["rms_after_m"] is not None:
+        rows.append(
+            [
+                "residual",
+                f"{1e3 * facts['rms_before_m']:.3f} → {1e3 * facts['rms_after_m']:.3f} mm rms with contact forces, median of the frames",
+            ]
+        )
+    if strongest is not None:
+        rows.append(
+            [
+                "largest force",
+                f"{strongest.force_n:.3f} ± {strongest.std_n:.3f} N in frame {strongest.frame}, at {_millimetres(strongest.position_m)}",
+            ]
+        )
+    for load in run.known_loads:
+        rows.append(
+            [
+                f"known load, frame {load['frame']}",
+                f"{load['declared_n']:.3f} N declared, {load['sensed_n']:.3f} N sensed ({load['error_percent']:+.1f} %)",
+            ]
+        )
+    for frame in facts["failed"][:5]:
+        rows.append([f"no result, frame {frame['frame']}", frame["status"]])
+    if len(facts["failed"]) > 5:
+        rows.append(["no result", f"in {len(facts['failed']) - 5} frames more: see frames.csv"])
+    return f"run of {run.robot.name}\n{columns(rows)}"
+
+
+def loop_text(document: Mapping[str, Any]) -> str:
+    """Return loop.json in a few lines."""
+    verdict = str(document.get("verdict"))
+    lines = [f"verdict: {verdict}" + (f" ({VERDICTS[verdict]})" if verdict in VERDICTS else "")]
+    lines.append(columns(_loop_rows(document)))
+    for effect in document.get("effects") or []:
+        lines += ["", effect_text(effect)]
+    for title, key in (
+        ("cannot be told apart", "confounded"),
+        ("not testable", "not_testable"),
+        ("next experiment", "next_experiment"),
+        ("what is left", "left"),
+    ):
+        value = document.get(key)
+        if value:
+            lines += ["", f"{title}: {_words(value)}"]
+    return "\n".join(lines)
+
+
+def effect_text(effect: Mapping[str, Any]) -> str:
+    """Return one entry of `effects` in loop.json: its name, parameters with one standard deviation, and what it changed."""
+    rows = [[key, _parameter(value)] for key, value in (effect.get("parameters") or {}).items()]
+    before, after = effect.get("validation_rms_before_m"), effect.get("validation_rms_after_m")
+    if before is not None and after is not None:
+        rows.append(["residual on held-out data", f"{1e3 * before:.3f} → {1e3 * after:.3f} mm rms"])
+    return f"{effect.get('name')}\n{columns(rows)}"
+
+
+def _loop_rows(document: Mapping[str, Any]) -> list[list[str]]:
+    rows = []
+    before, after = document.get("before") or {}, document.get("after") or {}
+    for key, name in (("train_rms_m", "residual"), ("validation_rms_m", "residual, held out")):
+        if before.get(key) is not None and after.get(key) is not None:
+            rows.append([name, f"{1e3 * before[key]:.3f} → {1e3 * after[key]:.3f} mm rms"])
+    if document.get("noise_m") is not None:
+        rows.append(["noise", f"{1e3 * document['noise_m']:.3f} mm"])
+    return rows
+
+
+def _parameter(value: Any) -> str:
+    if not isinstance(value, Mapping):
+        return _words(value)
+    found, std, unit = value.get("value"), value.get("std"), value.get("unit") or ""
+    if isinstance(found, Mapping):
+        stds = std if isinstance(std, Mapping) else {}
+        return ", ".join(f"{name} {_parameter({'value': v, 'std': stds.get(name), 'unit': unit})}" for name, v in found.items())
+    unit = "" if unit == "1" else f" {unit}"
+    return f"{_words(found)}{'' if std is None else f' ± {_words(std)}'}{unit}"
+
+
+def _words(value: Any) -> str:
+    """Return a value of JSON as a short text."""
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, Mapping):
+        return ", ".join(f"{str(key).replace('_', ' ')} {_words(item)}" for key, item in value.items() if item is not None)
+    if isinstance(value, list | tuple):
+        simple = all(isinstance(item, int | float) for item in value)
+        return f"[{', '.join(map(_words, value))}]" if simple else "; ".join(map(_words, value))
+    return "–" if value is None else str(value)
+
+
+def _strongest(run: Run) -> ContactForce | None:
+    return max(run.contacts, key=lambda contact: contact.force_n, default=None)
+
+
+def _median(values: Sequence[float]) -> float | None:
+    known = [value for value in values if np.isfinite(value)]
+    return float(np.median(known)) if known else None
+
+
+def _millimetres(point: Any) -> str:
+    return "[" + ", ".join(f"{1e3 * value:.1f}" for value in point) + "] mm"
+
+
+def _std(value: float | None, scale: float, unit: str) -> str:
+    if value is None:
+        return " (the data say nothing of it)"
+    return f" ± {scale * value:.2g} {unit}" if value > 0 else ""
+
+
+def _pose_std(calibration: Calibration) -> str:
+    largest = float(np.max(calibration.pose_std[:3, 3], initial=0.0))
+    return f", ± {1e3 * largest:.2g} mm" if largest > 0 else ""
