@@ -15,7 +15,7 @@ import numpy as np
 from femsense.arrays import FloatArray, IntArray
 from femsense.calib.calibration import Calibration
 from femsense.calib.fit import FitResult, covariance_of, gauss_newton
-from femsense.calib.forward import Hypothesis, Scene, SceneJet, evaluate_scene, in_robot_frame, make_scene
+from femsense.calib.forward import Hypothesis, Scene, SceneJet, evaluate_scene, in_robot_frame, make_scene, rest_residual
 from femsense.calib.rigid import fit_rigid, fit_rigid_robust
 from femsense.errors import DataError
 from femsense.fem.equilibrium import Equilibrium
@@ -55,6 +55,8 @@ def calibrate(robot: Robot, recording: Recording, *, frames: Sequence[int] | Non
     """
     recording = check_against(robot, recording)
     chosen = usable_frames(recording) if frames is None else np.asarray(frames, dtype=np.int64)
+    if recording.rest is not None and not np.isin(recording.marker_frame, chosen).any():
+        return _from_rest(robot, recording)
     if not len(chosen):
         raise DataError("no frame is free of undeclared contact: mark free frames with 1 in the column free of frames.csv, or declare loads.csv")
     if not len(recording.marker_frame):
@@ -165,7 +167,8 @@ def fit_joint(
     a = len(initial) if initial is not None and free_inputs else 0
     base_poses, sigma = list(poses), 5e-4
     seat_std = SEAT_STD_FLOOR
-    weights = np.ones(len(scene.points))
+    repeats = _repeats(scene)
+    weights = repeats
     jet: SceneJet | None = None
     starts: dict[int, Equilibrium] = {}
 
@@ -201,8 +204,8 @@ def fit_joint(
         history.append(_rms(jet.residual))
         if last:
             break
-        weights = _huber_weights(jet.residual, sigma)
-        sigma = _spread(jet.residual * weights[:, None], len(theta))
+        weights = repeats * _huber_weights(jet.residual)
+        sigma = _spread(jet.residual * weights[:, None], float(3 * (repeats**2).sum()), len(theta))
         seat_std = max(SEAT_STD_FLOOR, float(np.sqrt((jet.rest**2).mean()))) if len(jet.rest) else seat_std
     moved, inputs = place(theta)
     fit = _with_bound_inputs(fit, theta, bounds)
@@ -221,7 +224,25 @@ def _with_bound_inputs(fit: FitResult, theta: FloatArray, bounds: tuple[FloatArr
     return FitResult(fit.theta, covariance, fit.residual, fit.jacobian, fit.cost, fit.status)
 
 
-def _huber_weights(residual: FloatArray, sigma: float) -> FloatArray:
+def _repeats(scene: Scene) -> FloatArray:
+    """Return square-root weights by which frames under the same inputs and loads count once together, shape (k,).
+
+    Such frames repeat the same error of the model; taking them for independent would make every standard deviation too small.
+    """
+    recording = scene.recording
+    keys = []
+    for f in scene.frame:
+        rows = recording.load_frame == f
+        parts = [recording.inputs[f], recording.load_points[rows].ravel(), recording.load_forces[rows].ravel()]
+        parts.append(recording.gravity[f] if recording.gravity is not None else np.zeros(0))
+        keys.append(np.concatenate(parts).tobytes())
+    count: dict[tuple[bytes, int], int] = {}
+    for key, marker in zip(keys, scene.marker):
+        count[key, int(marker)] = count.get((key, int(marker)), 0) + 1
+    return np.array([count[key, int(marker)] ** -0.5 for key, marker in zip(keys, scene.marker)])
+
+
+def _huber_weights(residual: FloatArray) -> FloatArray:
     """Return square-root weights of Huber's loss for 3-D residuals, scaled by their median."""
     distance = np.linalg.norm(residual, axis=1)
     if len(distance) < 8:
@@ -230,9 +251,9 @@ def _huber_weights(residual: FloatArray, sigma: float) -> FloatArray:
     return np.sqrt(np.minimum(1.0, 3.5 * scale / np.maximum(distance, 1e-300)))
 
 
-def _spread(residual: FloatArray, parameters: int) -> float:
-    freedom = max(residual.size - parameters, 1)
-    return max(float(np.sqrt((residual**2).sum() / freedom)), NOISE_FLOOR)
+def _spread(weighted: FloatArray, rows: float, parameters: int) -> float:
+    freedom = max(rows - parameters, 1.0)
+    return max(float(np.sqrt((weighted**2).sum() / freedom)), NOISE_FLOOR)
 
 
 def _rms(residual: FloatArray) -> float:
@@ -252,9 +273,8 @@ def _result(
     recording, names = scene.recording, robot.body.cable_names
     state = _initial_state(robot, recording, initial)
     moving = [v for v, T in enumerate(recording.T_robot_camera) if T is None]
-    pose_std = np.zeros((4, 4))
-    if 0 in moving:
-        pose_std = _pose_std(poses[0], fit.covariance[:6, :6], robot.marker_points.mean(axis=0))
+    pose_covariance = fit.covariance[:6, :6] if 0 in moving else np.zeros((6, 6))
+    pose_std = _pose_std(poses[0], pose_covariance, robot.marker_points.mean(axis=0))
     a = len(names) if initial is not None else 0
     input_covariance = fit.covariance[6 * len(moving) :, 6 * len(moving) :] if a else np.zeros((0, 0))
     own, other = _input_std(robot, recording, state, input_covariance)
@@ -273,6 +293,7 @@ def _result(
         marker_rms_m=per_marker,
         history=tuple({"iteration": i, "rms_m": r} for i, r in enumerate(history)),
         pose_std=pose_std,
+        pose_covariance=pose_covariance,
         tension_std_n=tension,
         displacement_std_m=displacement,
         status=_status(fit, robot, own, recording),
@@ -333,6 +354,36 @@ def _status(fit: FitResult, robot: Robot, own: dict[str, float | None], recordin
     return "converged"
 
 
+def _from_rest(robot: Robot, recording: Recording) -> Calibration:
+    """Return the calibration of a recording none of whose frames can be used: poses from the markers at rest alone."""
+    if recording.actuation_zero == "unknown" and robot.body.cables:
+        raise DataError("initial inputs need a frame that is free of undeclared contact (column free of frames.csv)")
+    number = {name: i for i, name in enumerate(robot.marker_names)}
+    rest = recording.rest
+    assert rest is not None
+    marker = np.array([number.get(name, -1) for name in rest.names], dtype=np.int64)
+    known = marker >= 0
+    scene = Scene(recording, *(np.zeros(0, np.int64),) * 4, np.zeros((0, 3)), marker[known], rest.view[known], rest.positions[known])
+    poses = first_poses(robot, scene)
+    left = rest_residual(robot, scene, poses)
+    sigma = max(float(np.sqrt((left**2).sum() / max(left.size - 6 * len(poses), 1))), SEAT_STD_FLOOR)
+    arm = robot.marker_points[scene.rest_marker] - robot.marker_points.mean(axis=0)
+    J = np.concatenate([np.hstack([-_cross(a), np.eye(3)]) for a in arm])
+    covariance = covariance_of(J / sigma)
+    state = _initial_state(robot, recording, None)
+    none: dict[str, float | None] = {n: 0.0 for n in robot.body.cable_names}
+    per_marker = {robot.marker_names[m]: float(np.linalg.norm(r)) for m, r in zip(scene.rest_marker, left)}
+    places = in_robot_frame(scene.rest_points, scene.rest_view, poses, robot.observation)
+    seats_m = {robot.marker_names[m]: p.tolist() for m, p in zip(scene.rest_marker, places)}
+    return Calibration(poses[0], tuple(poses), recording.camera_names, dict(state.tension), dict(state.shortening), _rms(left), per_marker, (),
+                       _pose_std(poses[0], covariance, robot.marker_points.mean(axis=0)), covariance, none, dict(none),
+                       "converged (from rest.csv alone: no frame is free)", seats_m)  # fmt: skip
+
+
+def _cross(v: FloatArray) -> FloatArray:
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+
+
 def _declared(robot: Robot, recording: Recording, frames: IntArray) -> Calibration:
     """Return the calibration of a recording without markers whose poses are declared."""
     missing = [name or "(only one)" for name, T in zip(recording.camera_names, recording.T_robot_camera) if T is None]
@@ -344,7 +395,7 @@ def _declared(robot: Robot, recording: Recording, frames: IntArray) -> Calibrati
     state = _initial_state(robot, recording, None)
     none: dict[str, float | None] = {n: 0.0 for n in robot.body.cable_names}
     return Calibration(poses[0], poses, recording.camera_names, dict(state.tension), dict(state.shortening), float("nan"), {}, (),
-                       np.zeros((4, 4)), none, dict(none), "as declared: there are no markers to fit", frames=tuple(int(recording.frame_numbers[k]) for k in frames))  # fmt: skip
+                       np.zeros((4, 4)), np.zeros((6, 6)), none, dict(none), "as declared: there are no markers to fit", frames=tuple(int(recording.frame_numbers[k]) for k in frames))  # fmt: skip
 
 
 __all__ = ["calibrate", "first_poses", "fit_joint", "usable_frames"]

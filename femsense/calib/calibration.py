@@ -27,6 +27,8 @@ class Calibration:
     """{iteration, rms_m} of each iteration."""
     pose_std: FloatArray
     """One standard deviation of the entries of T_robot_camera, shape (4, 4)."""
+    pose_covariance: FloatArray
+    """Of (rotation about the markers' mean [rad], shift [m]) of the first camera, shape (6, 6)."""
     tension_std_n: dict[str, float | None]
     """[N]; None where the data say nothing."""
     displacement_std_m: dict[str, float | None]
