@@ -1,0 +1,265 @@
+"""A depth camera that looks at triangles: rays, shading, and the noise of active stereo.
+
+Depth z [m] of a pixel comes from a disparity, so that its standard deviation grows as z² · subpixel / (f · baseline)
+(Intel, "Best-known methods for tuning RealSense D400"); a part of it is common to neighbouring pixels, since disparities
+are matched over windows. Surfaces seen too obliquely, and many pixels at depth edges, give no depth or one in between.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from femsense.arrays import BoolArray, FloatArray, IntArray, freeze
+from femsense.errors import InputError
+from femsense.frames import Camera
+from femsense.model import Observation
+from femsense.pointcloud.cloud import PointCloud
+from femsense.pose import check_pose, invert_pose, make_pose, rotation_from_vector, transform_points
+from femsense.rig.script import NoiseTable, ViewTable
+
+AMBIENT = 0.35
+"""Share of the light that comes from everywhere."""
+EDGE = 0.01
+"""Neighbouring depths that differ by more than this are an edge [m]."""
+COLOR_NOISE = 0.012
+"""Standard deviation of a colour channel [1]."""
+HIDDEN = 2e-3
+"""A marker is hidden where the ray towards it ends more than this before it [m]."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Shape:
+    """Triangles of one colour."""
+
+    points: FloatArray
+    """[m], shape (n, 3), robot frame."""
+    triangles: IntArray
+    """Shape (t, 3), outward."""
+    color: FloatArray
+    """Red, green, blue in [0, 1], shape (3,)."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class DepthImage:
+    """What a camera saw."""
+
+    depth: FloatArray
+    """Along the optical axis [m], shape (H, W); 0 where nothing was measured."""
+    color: npt.NDArray[np.uint8]
+    """Red, green, blue, shape (H, W, 3)."""
+    shape: IntArray
+    """Index of the shape in each pixel, shape (H, W); −1 where there is none."""
+
+
+def camera_of(view: ViewTable) -> Camera:
+    """Return the lens of a view."""
+    fy = view.fx if view.fy is None else view.fy
+    cx = (view.width - 1) / 2 if view.cx is None else view.cx
+    cy = (view.height - 1) / 2 if view.cy is None else view.cy
+    return Camera("", view.width, view.height, view.fx, fy, cx, cy, freeze(np.zeros(5)), view.depth_unit_m)
+
+
+def pose_of(view: ViewTable) -> FloatArray:
+    """Return T_robot_camera, shape (4, 4). Raises InputError."""
+    if view.T_robot_camera is not None:
+        return check_pose(view.T_robot_camera, "camera.T_robot_camera")
+    return look_at(view.eye_m or (), view.target_m or (), roll=np.radians(view.roll_deg))
+
+
+def look_at(eye: Sequence[float], target: Sequence[float], *, roll: float = 0.0) -> FloatArray:
+    """Return T_robot_camera of a camera at `eye` [m] that looks at `target` [m], upright (z up), then turned by `roll` [rad].
+
+    Raises:
+        InputError: where eye and target are one.
+    """
+    forward = np.asarray(target, dtype=float) - np.asarray(eye, dtype=float)
+    distance = np.linalg.norm(forward)
+    if distance < 1e-9:
+        raise InputError("a camera cannot look at where it stands", where="camera.target_m", found=list(target), expected="another place than eye_m")
+    z = forward / distance
+    up = np.array([0.0, 0.0, 1.0]) if abs(z[2]) < 0.999 else np.array([0.0, 1.0, 0.0])
+    x = np.cross(z, up)
+    x /= np.linalg.norm(x)
+    upright = np.stack([x, np.cross(z, x), z], axis=1)
+    return make_pose(upright @ rotation_from_vector([0.0, 0.0, roll]), np.asarray(eye, dtype=float))
+
+
+def pixel_rays(camera: Camera) -> FloatArray:
+    """Return the ray of each pixel with z = 1, camera frame, shape (H, W, 3)."""
+    u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    return np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
+
+
+def render(
+    camera: Camera, T_robot_camera: FloatArray, shapes: Sequence[Shape], *,
+    noise: NoiseTable | None = None, observation: Observation = Observation(), rng: np.random.Generator | None = None,  # noqa: B008
+) -> DepthImage:  # fmt: skip
+    """Return what a camera sees.
+
+    Arguments:
+        camera: the lens.
+        T_robot_camera: where it stands, shape (4, 4).
+        shapes: what there is, robot frame.
+        noise: of the depth; without it depth is exact and without gaps.
+        observation: measured distance along the ray = depth_scale × true distance + depth_offset.
+        rng: source of the noise; needed where `noise` is given.
+    """
+    rays = pixel_rays(camera)
+    depth, shape, facing = _cast(rays, T_robot_camera, shapes)
+    color = _shade(shapes, shape, facing, rng)
+    seen = shape >= 0
+    measured = np.where(seen, depth, 0.0)
+    if noise is not None and rng is not None:
+        measured = _disturbed(measured, facing, noise, camera, rng)
+    stretch = observation.depth_scale + observation.depth_offset / np.where(seen, depth * np.linalg.norm(rays, axis=-1), 1.0)
+    return DepthImage(freeze(measured * stretch), color, shape)
+
+
+def cloud_of(image: DepthImage, camera: Camera, which: npt.ArrayLike | None = None) -> PointCloud:
+    """Return the measured points of an image with their colours, camera frame; `which` is a mask (H, W) of pixels to keep."""
+    keep = image.depth > 0
+    if which is not None:
+        keep &= np.asarray(which)
+    points = pixel_rays(camera)[keep] * image.depth[keep][:, None]
+    return PointCloud(points, image.color[keep] / 255.0)
+
+
+def thinned(cloud: PointCloud, size: float) -> PointCloud:
+    """Return one point of each cube of a size [m]: the one that comes first."""
+    cubes = np.floor(cloud.points / size).astype(np.int64)
+    _, first = np.unique(cubes, axis=0, return_index=True)
+    return cloud.select(np.sort(first))
+
+
+def write_ply(path: Path, cloud: PointCloud) -> None:
+    """Write a cloud as binary PLY in single precision with byte colours (15 bytes a point, the same bytes every time)."""
+    colors = np.zeros((len(cloud), 3)) if cloud.colors is None else cloud.colors
+    rows = np.zeros(len(cloud), dtype=[("xyz", "<f4", 3), ("rgb", "u1", 3)])
+    rows["xyz"], rows["rgb"] = cloud.points, np.rint(255.0 * colors)
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(cloud)}"]
+    lines += [f"property float {axis}" for axis in "xyz"] + [f"property uchar {name}" for name in ("red", "green", "blue")]
+    path.write_bytes(("\n".join([*lines, "end_header"]) + "\n").encode() + rows.tobytes())
+
+
+def write_images(depth_file: Path, color_file: Path, image: DepthImage, camera: Camera) -> None:
+    """Write depth as 16-bit and colour as 8-bit PNG. Raises InputError where a depth does not fit into 16 bits."""
+    import cv2
+
+    units = np.rint(image.depth / camera.depth_unit)
+    if units.max(initial=0.0) > np.iinfo(np.uint16).max:
+        raise InputError("depths beyond 16 bits", where="camera.depth_unit_m", found=f"{image.depth.max():.3g} m in units of {camera.depth_unit:g} m", expected=f"depth_unit_m ≥ {image.depth.max() / 65535:.2g}")  # fmt: skip
+    for file, pixels in ((depth_file, units.astype(np.uint16)), (color_file, image.color[..., ::-1])):
+        file.write_bytes(cv2.imencode(".png", pixels)[1].tobytes())
+
+
+def visible_points(camera: Camera, T_robot_camera: FloatArray, shapes: Sequence[Shape], points: FloatArray) -> BoolArray:
+    """Return which points (p, 3) [m], robot frame, are inside the image and not behind anything."""
+    local = transform_points(invert_pose(T_robot_camera), points)
+    ahead = local[:, 2] > 1e-6
+    safe = np.where(ahead, local[:, 2], 1.0)
+    u, v = camera.fx * local[:, 0] / safe + camera.cx, camera.fy * local[:, 1] / safe + camera.cy
+    inside = ahead & (u >= -0.5) & (u <= camera.width - 0.5) & (v >= -0.5) & (v <= camera.height - 0.5)
+    rays = local / np.where(ahead, local[:, 2], 1.0)[:, None]
+    hit, shape, _ = _cast(rays, T_robot_camera, shapes)
+    gap = (local[:, 2] - hit) * np.linalg.norm(rays, axis=1)
+    return np.asarray(inside & ((shape < 0) | (gap < HIDDEN)))
+
+
+def measured_points(T_robot_camera: FloatArray, points: FloatArray, observation: Observation) -> FloatArray:
+    """Return points (p, 3) [m] of the robot frame as the camera measures them without noise, camera frame."""
+    local = transform_points(invert_pose(T_robot_camera), points)
+    distance = np.linalg.norm(local, axis=1, keepdims=True)
+    return np.asarray(local * (observation.depth_scale + observation.depth_offset / distance))
+
+
+# Rays and light
+
+
+def _cast(rays: FloatArray, T_robot_camera: FloatArray, shapes: Sequence[Shape]) -> tuple[FloatArray, IntArray, FloatArray]:
+    """Return depth [m] (inf: nothing), index of the shape (−1: nothing) and cosine to the normal of each ray, shape (…,)."""
+    import open3d as o3d
+
+    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
+    for shape in shapes:
+        scene.add_triangles(
+            o3d.core.Tensor(np.ascontiguousarray(shape.points, dtype=np.float32)),
+            o3d.core.Tensor(np.ascontiguousarray(shape.triangles, dtype=np.uint32)),
+        )
+    directions = rays @ T_robot_camera[:3, :3].T
+    start = np.broadcast_to(T_robot_camera[:3, 3], directions.shape)
+    answer: dict[str, Any] = scene.cast_rays(o3d.core.Tensor(np.concatenate([start, directions], axis=-1).astype(np.float32)), nthreads=1)
+    number = answer["geometry_ids"].numpy().astype(np.int64)
+    missed = number == int(scene.INVALID_ID)
+    normals = answer["primitive_normals"].numpy().astype(np.float64)
+    facing = np.abs(np.einsum("...c,...c->...", normals, directions)) / np.linalg.norm(directions, axis=-1)
+    depth = np.full(number.shape, np.inf)
+    for i, shape in enumerate(shapes):
+        mine = number == i
+        depth[mine] = _exact_depth(shape, answer["primitive_ids"].numpy()[mine], start[mine], directions[mine])
+    return depth, np.where(missed, -1, number), np.where(missed, 0.0, facing)
+
+
+def _exact_depth(shape: Shape, triangle: npt.NDArray[Any], start: FloatArray, direction: FloatArray) -> FloatArray:
+    """Return where rays (k, 3) meet the planes of their triangles, in double precision, as a multiple of the direction."""
+    a, b, c = (shape.points[shape.triangles[triangle.astype(np.int64), i]] for i in range(3))
+    normal = np.cross(b - a, c - a)
+    return np.asarray(np.einsum("kc,kc->k", a - start, normal) / np.einsum("kc,kc->k", direction, normal))
+
+
+def _shade(shapes: Sequence[Shape], shape: IntArray, facing: FloatArray, rng: np.random.Generator | None) -> npt.NDArray[np.uint8]:
+    """Return the colours with a lamp at the camera, shape (H, W, 3)."""
+    palette = np.vstack([np.zeros((1, 3)), *(s.color[None] for s in shapes)])
+    color = palette[shape + 1] * (AMBIENT + (1.0 - AMBIENT) * facing)[..., None]
+    if rng is not None:
+        color = color + COLOR_NOISE * rng.standard_normal(color.shape)
+    return np.asarray(np.rint(255.0 * np.clip(color, 0.0, 1.0)), dtype=np.uint8)
+
+
+# Noise
+
+
+def depth_std(depth: FloatArray, noise: NoiseTable, camera: Camera) -> FloatArray:
+    """Return one standard deviation of depths [m]: z² · subpixel / (f · baseline)."""
+    focal = camera.fx if noise.focal_px is None else noise.focal_px
+    return np.asarray(depth**2 * noise.subpixel_px / (focal * noise.baseline_m))
+
+
+def _disturbed(depth: FloatArray, facing: FloatArray, noise: NoiseTable, camera: Camera, rng: np.random.Generator) -> FloatArray:
+    """Return depths with noise, steps and gaps."""
+    common = _smooth_noise(depth.shape, noise.correlation_px, rng)
+    own = rng.standard_normal(depth.shape)
+    share = noise.correlated_share
+    result = depth + depth_std(depth, noise, camera) * (np.sqrt(share) * common + np.sqrt(1.0 - share) * own)
+    edge, front, back = _edges(depth)
+    chance, between = rng.random(depth.shape), rng.random(depth.shape)
+    flying = edge & (chance < noise.flying_share) & (front > 0)
+    result[flying] = (front + between * (back - front))[flying]
+    step = noise.quantum_m or camera.depth_unit
+    result = np.rint(result / step) * step
+    gone = edge & ~flying & (chance < noise.flying_share + noise.edge_dropout)
+    gone |= facing < np.cos(np.radians(noise.grazing_deg))
+    return np.asarray(np.where(gone | (depth <= 0), 0.0, result))
+
+
+def _smooth_noise(shape: tuple[int, ...], width: float, rng: np.random.Generator) -> FloatArray:
+    """Return noise of unit variance that neighbours share, shape (H, W)."""
+    from scipy.ndimage import gaussian_filter
+
+    impulse = np.zeros((8 * int(np.ceil(width)) + 1,) * 2)
+    impulse[impulse.shape[0] // 2, impulse.shape[1] // 2] = 1.0
+    gain = np.sqrt((gaussian_filter(impulse, width, mode="wrap") ** 2).sum())
+    return np.asarray(gaussian_filter(rng.standard_normal(shape), width, mode="wrap") / gain)
+
+
+def _edges(depth: FloatArray) -> tuple[BoolArray, FloatArray, FloatArray]:
+    """Return where depth jumps, and the nearest and farthest depth of each pixel and its neighbours, shape (H, W)."""
+    from scipy.ndimage import maximum_filter, minimum_filter
+
+    front, back = minimum_filter(depth, 3), maximum_filter(depth, 3)
+    return back - front > EDGE, front, back

@@ -1,0 +1,71 @@
+"""What stands before the camera in a frame: the deformed body, the probes that touch it, the floor."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from femsense.arrays import FloatArray
+from femsense.fem.mesh import surface_triangles
+from femsense.model import Robot
+from femsense.rig.camera import Shape
+from femsense.rig.script import Plan, SceneTable
+from femsense.rig.truth import TrueContact, TrueFrame
+
+PLAIN_RGB = (0.6, 0.6, 0.6)
+FLOOR_HALF = 1.0
+"""Half the side of the floor [m]."""
+ROD_LENGTH = 0.12
+"""Length of what holds a probe [m]."""
+
+
+def frame_shapes(robot: Robot, frame: TrueFrame, plan: Plan, scene: SceneTable) -> list[Shape]:
+    """Return what the camera sees in a frame: the body first, then the probes, then the floor.
+
+    Arguments:
+        robot: the true robot.
+        frame: its state and contacts.
+        plan: for the probes.
+        scene: colours and floor.
+    """
+    shapes = [body_shape(robot, frame.state.positions, scene)]
+    for contact in frame.contacts:
+        table = plan.contacts[contact.contact].table
+        shapes.append(probe_shape(contact, table.probe, table.probe_radius_m, np.array(scene.probe_rgb)))
+    if scene.floor_z_m is not None:
+        shapes.append(floor_shape(scene.floor_z_m, np.array(scene.floor_rgb)))
+    return shapes
+
+
+def body_shape(robot: Robot, positions: FloatArray, scene: SceneTable) -> Shape:
+    """Return the deformed surface of a body; positions [m], shape (n, 3)."""
+    color = scene.robot_rgb if scene.robot_rgb is not None else robot.color_rgb if robot.color_rgb is not None else PLAIN_RGB
+    return Shape(positions, surface_triangles(robot.body.mesh), np.asarray(color, dtype=float))
+
+
+def probe_shape(contact: TrueContact, kind: str, radius: float, color: FloatArray) -> Shape:
+    """Return a probe [m] that touches the body from outside along the force: a ball or a blunt rod, on a thin rod."""
+    import trimesh
+
+    axis = -contact.force / np.linalg.norm(contact.force)
+    tip = contact.place
+    rod = _rod(tip + 0.5 * radius * axis, tip + (ROD_LENGTH + radius) * axis, 0.45 * radius)
+    if kind == "sphere":
+        head = trimesh.creation.icosphere(subdivisions=3, radius=radius)
+        head.apply_translation(tip + radius * contact.normal)
+    else:
+        head = _rod(tip, tip + 3.0 * radius * axis, radius)
+    both = trimesh.util.concatenate([head, rod])
+    return Shape(np.array(both.vertices, dtype=float), np.array(both.faces, dtype=np.int64), color)
+
+
+def floor_shape(height: float, color: FloatArray) -> Shape:
+    """Return a level square at a height [m]."""
+    h = FLOOR_HALF
+    corners = np.array([[-h, -h, height], [h, -h, height], [h, h, height], [-h, h, height]])
+    return Shape(corners, np.array([[0, 1, 2], [0, 2, 3]]), color)
+
+
+def _rod(start: FloatArray, end: FloatArray, radius: float):  # type: ignore[no-untyped-def]
+    import trimesh
+
+    return trimesh.creation.cylinder(radius=radius, segment=np.stack([start, end]), sections=32)

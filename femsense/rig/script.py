@@ -1,0 +1,349 @@
+"""The script of a virtual experiment (`femsense-script-1`): what is pulled when, what touches, what the truth has, what is seen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from femsense.arrays import BoolArray, FloatArray, IntArray, freeze
+from femsense.errors import InputError
+from femsense.model import Robot
+from femsense.robot import Matrix, Share, Vector
+from femsense.tables import Schema, key_path, near, read_toml, validated
+
+FORMAT = "femsense-script-1"
+COLOR = "three numbers from 0 to 1: [red, green, blue]"
+PLACE = "three numbers in metres [x, y, z], on the surface at rest, robot frame"
+Color = Annotated[list[Share], Field(min_length=3, max_length=3)]
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+Count = Annotated[int, Field(ge=0)]
+
+
+class SweepTable(Schema):
+    """One excursion from rest and back."""
+
+    label: Annotated[str, Field(min_length=1, description="a label, each sweep its own")]
+    cables: dict[str, float | list[float]] = Field(
+        {}, description="cable → its value at the height of the sweep [N or m], or a list with one value a frame"
+    )
+    rest: Count = Field(0, description="frames at rest before the sweep, ≥ 0")
+    up: Count = Field(3, description="frames on the way up, the height included, ≥ 0")
+    hold: Count = Field(0, description="frames at the height, ≥ 0")
+    down: Count = Field(3, description="frames on the way down, rest included, ≥ 0")
+    levels: list[float] | None = Field(None, description="one factor a frame, in place of rest, up, hold and down")
+    dt_s: Positive | None = Field(None, description="time from frame to frame [s], > 0")
+    free: bool | None = Field(None, description="true: nothing undeclared touches; by default false where a contact acts")
+    gravity_m_s2: Vector | None = Field(None, description="gravity in the robot frame during this sweep [m/s²]")
+
+    def profile(self) -> list[float]:
+        """Return the factor of each frame."""
+        if self.levels is not None:
+            return list(self.levels)
+        rise = [(i + 1) / self.up for i in range(self.up)]
+        fall = [1.0 - (i + 1) / self.down for i in range(self.down)]
+        return [0.0] * self.rest + rise + [1.0] * self.hold + fall
+
+
+class ContactTable(Schema):
+    """Something that presses on the body and is not declared in the recording."""
+
+    sweep: str = Field(description="label of the sweep in which it acts")
+    point_m: Vector = Field(description=PLACE)
+    force_n: NotNegative | list[NotNegative] = Field(description="newton, one number or one a frame of the sweep, ≥ 0; at 0 it does not touch")
+    direction: Vector | None = Field(None, description="direction of the force; by default into the surface, as it turns")
+    radius_m: Positive = Field(0.006, description="the force is spread over the surface within this distance [m], > 0")
+    probe: Literal["sphere", "cylinder"] = Field("sphere", description='what the camera sees: "sphere" or "cylinder"')
+    probe_radius_m: Positive = Field(0.006, description="[m], > 0")
+
+
+class LoadTable(Schema):
+    """A known load: it stands in loads.csv."""
+
+    sweep: str = Field(description="label of the sweep in which it acts")
+    point_m: Vector = Field(description=PLACE)
+    force_n: Vector | list[Vector] = Field(description="newton [x, y, z], or one such vector a frame of the sweep")
+
+
+class TruthTable(Schema):
+    """How the truth differs from the estimator's model beside the effects."""
+
+    refinements: Annotated[int, Field(ge=0, le=3)] = Field(1, description="how often every tetrahedron is split into eight, 0 … 3")
+    element: Literal["tet4", "tet10"] = Field("tet10", description='"tet4" or "tet10"')
+    law: Literal["corotational", "neo_hookean", "gent"] = Field("neo_hookean", description='"neo_hookean", "gent" or "corotational"')
+    stretch_limit: Positive | None = Field(None, description="Gent's limit jm of I₁ − 3, > 0")
+    substeps: Annotated[int, Field(ge=1)] = Field(3, description="steps from frame to frame, ≥ 1")
+
+    @model_validator(mode="after")
+    def _gent_needs_its_limit(self) -> TruthTable:
+        if (self.law == "gent") != (self.stretch_limit is not None):
+            raise ValueError('law = "gent" and stretch_limit go together')
+        return self
+
+
+class NoiseTable(Schema):
+    """Noise of a depth image, after active stereo cameras."""
+
+    subpixel_px: NotNegative = Field(0.08, description="error of the disparity [px], ≥ 0")
+    baseline_m: Positive = Field(0.055, description="distance of the two imagers [m], > 0")
+    focal_px: Positive | None = Field(None, description="focal length of the imagers [px]; by default fx")
+    correlated_share: Share = Field(0.5, description="share of the variance that neighbouring pixels have in common, 0 … 1")
+    correlation_px: Positive = Field(2.0, description="width of that common part [px], > 0")
+    grazing_deg: Annotated[float, Field(gt=0, le=90)] = Field(82.0, description="surfaces seen more obliquely than this give no depth [°]")
+    edge_dropout: Share = Field(0.5, description="share of the pixels at depth edges that give no depth, 0 … 1")
+    flying_share: Share = Field(0.05, description="share of the pixels at depth edges that fall between front and back, 0 … 1")
+    quantum_m: NotNegative = Field(0.0, description="step of the depth values [m]; 0: the camera's depth_unit_m")
+
+
+class ViewTable(Schema):
+    """A pinhole camera and where it stands."""
+
+    width: Annotated[int, Field(gt=0)] = Field(424, description="pixels, > 0")
+    height: Annotated[int, Field(gt=0)] = Field(240, description="pixels, > 0")
+    fx: Positive = Field(306.0, description="focal length in pixels, > 0")
+    fy: Positive | None = Field(None, description="focal length in pixels, > 0; by default fx")
+    cx: float | None = Field(None, description="pixels; by default the middle")
+    cy: float | None = Field(None, description="pixels; by default the middle")
+    depth_unit_m: Positive = Field(1e-4, description="metres in one unit of a depth image, > 0")
+    T_robot_camera: Matrix | None = Field(None, description="4 rows of 4 numbers, in place of eye_m and target_m")
+    eye_m: Vector | None = Field(None, description="where the camera stands, robot frame [m]")
+    target_m: Vector | None = Field(None, description="what it looks at, robot frame [m]")
+    roll_deg: float = Field(0.0, description="turn about the line of sight [°]")
+    declare_pose: bool = Field(False, description="true: the recording says where the camera stands")
+    noise: NoiseTable | None = Field(None, description="a table [camera.noise]; without it depth is exact")
+
+    @model_validator(mode="after")
+    def _one_pose(self) -> ViewTable:
+        looks = self.eye_m is not None and self.target_m is not None
+        if looks == (self.T_robot_camera is not None):
+            raise ValueError("a camera stands either by eye_m and target_m or by T_robot_camera")
+        return self
+
+
+class MarkersTable(Schema):
+    """How well markers are seen."""
+
+    names: list[str] | None = Field(None, description="the markers that there are; by default all of the robot")
+    std_m: NotNegative = Field(0.0, description="noise of each coordinate of each marker in each frame [m], ≥ 0")
+    frame_std_m: NotNegative = Field(0.0, description="noise of each coordinate that all markers of a frame have in common [m], ≥ 0")
+    placement_std_m: NotNegative = Field(0.0, description="how far from its place each marker is glued, each coordinate [m], ≥ 0")
+    occlusion: bool = Field(True, description="true: markers that the camera cannot see have no row")
+    rest_file: bool = Field(False, description="true: rest.csv holds the markers of the unloaded body")
+
+
+class CloudsTable(Schema):
+    """Which frames get clouds, and in which form."""
+
+    kind: Literal["none", "ply", "depth"] = Field("none", description='"none", "ply" (clouds/) or "depth" (depth/ and color/)')
+    frames: Literal["all", "contact"] = Field("all", description='"all" or "contact"')
+    extra_frames: list[Count] = Field([], description="further frames, counted from 0")
+    voxel_m: NotNegative = Field(0.0, description="PLY only: one point a cube of this size [m]; 0: all points")
+    crop_m: Annotated[list[Vector], Field(min_length=2, max_length=2)] | None = Field(
+        None, description="PLY only: two corners of a box in the robot frame [m]"
+    )
+
+
+class SceneTable(Schema):
+    """What else is in the picture."""
+
+    floor_z_m: float | None = Field(0.0, description="height of the floor [m]")
+    floor_rgb: Color = Field([0.55, 0.53, 0.50], description=COLOR)
+    probe_rgb: Color = Field([0.85, 0.30, 0.12], description=COLOR)
+    robot_rgb: Color | None = Field(None, description=COLOR + "; by default the robot's appearance")
+
+
+class ScriptTable(Schema):
+    """A script, version femsense-script-1."""
+
+    format: Literal["femsense-script-1"] = Field(description=f'format = "{FORMAT}"')
+    seed: Count = Field(0, description="a whole number ≥ 0")
+    actuation: Literal["tension", "displacement"] = Field("tension", description='"tension" [N] or "displacement" [m]')
+    actuation_zero: Literal["absolute", "unknown"] = Field("absolute", description='"absolute" or "unknown"')
+    initial: dict[str, float] = Field({}, description="cable → its true input before the first sweep [N or m]")
+    input_std: NotNegative = Field(0.0, description="noise of the recorded inputs [N or m], ≥ 0")
+    dt_s: Positive = Field(0.5, description="time from frame to frame [s], > 0")
+    sweeps: Annotated[list[SweepTable], Field(min_length=1)] = Field(description="at least one [[sweeps]] with label and cables")
+    contacts: list[ContactTable] = Field([], description="tables [[contacts]]")
+    loads: list[LoadTable] = Field([], description="tables [[loads]]")
+    truth: TruthTable = Field(default_factory=lambda: TruthTable.model_validate({}), description="a table [truth]")
+    effects: list[dict[str, Any]] = Field([], description="tables [[effects]] that only the truth has")
+    camera: ViewTable = Field(description="a table [camera] with eye_m and target_m, or T_robot_camera")
+    markers: MarkersTable = Field(default_factory=lambda: MarkersTable.model_validate({}), description="a table [markers]")
+    clouds: CloudsTable = Field(default_factory=lambda: CloudsTable.model_validate({}), description="a table [clouds]")
+    scene: SceneTable = Field(default_factory=lambda: SceneTable.model_validate({}), description="a table [scene]")
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class PlannedContact:
+    """A contact along the frames."""
+
+    table: ContactTable
+    force: FloatArray
+    """[N], shape (F,); 0 where it does not touch."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Plan:
+    """A script frame by frame, for the cables of one robot."""
+
+    control: str
+    """"tension" or "displacement"."""
+    time_s: FloatArray
+    """[s], shape (F,)."""
+    sweep: tuple[str, ...]
+    free: BoolArray
+    """Shape (F,)."""
+    commanded: FloatArray
+    """Inputs counted from the initial ones [N] or [m], shape (F, a), in the order of the body's cables."""
+    initial: FloatArray
+    """True inputs before the first sweep [N] or [m], shape (a,)."""
+    gravity: FloatArray | None
+    """[m/s²], shape (F, 3); None: that of the body."""
+    load_frame: IntArray
+    """Frame index of each known load, shape (L,)."""
+    load_points: FloatArray
+    """[m], shape (L, 3)."""
+    load_forces: FloatArray
+    """[N], shape (L, 3)."""
+    contacts: tuple[PlannedContact, ...]
+
+
+def read_script(path: str | Path) -> ScriptTable:
+    """Return a script after checking it. Raises InputError with file, key, what was found and what was expected."""
+    file = Path(path)
+    if not file.is_file():
+        raise InputError("no such script", where=file, expected=f'a TOML file with format = "{FORMAT}"')
+    return check_script(read_toml(file), file)
+
+
+def check_script(document: dict[str, Any], where: Path = Path("script")) -> ScriptTable:
+    """Return the checked script of plain tables; `where` is what messages name. Raises InputError."""
+    script = validated(ScriptTable, document, where)
+    labels = [sweep.label for sweep in script.sweeps]
+    for i, label in enumerate(labels):
+        if label in labels[:i]:
+            raise _problem("a label stands twice", where, ("sweeps", i, "label"), repr(label), "each sweep its own label")
+    for kind, tables in (("contacts", script.contacts), ("loads", script.loads)):
+        for i, table in enumerate(tables):
+            if table.sweep not in labels:
+                raise _problem("no such sweep", where, (kind, i, "sweep"), repr(table.sweep), ", ".join(labels), near(table.sweep, labels))
+    for i, sweep in enumerate(script.sweeps):
+        _check_sweep(sweep, i, where)
+    return script
+
+
+def plan_script(script: ScriptTable, robot: Robot, where: Path = Path("script")) -> Plan:
+    """Return a script frame by frame.
+
+    Arguments:
+        script: the script.
+        robot: whose cables and markers it names.
+        where: what messages name.
+
+    Raises:
+        InputError: unknown cables or markers, negative tensions, lists of another length than their sweep, frames that are not there.
+    """
+    names = robot.body.cable_names
+    _check_names(script, robot, where)
+    counts = [len(sweep.profile()) for sweep in script.sweeps]
+    first = dict(zip((s.label for s in script.sweeps), np.r_[0, np.cumsum(counts)[:-1]].tolist()))
+    count = dict(zip(first, counts))
+    steps = np.concatenate([np.full(n, s.dt_s or script.dt_s) for s, n in zip(script.sweeps, counts)])
+    contacts = tuple(_planned_contact(script, i, first, count, int(steps.size), where) for i in range(len(script.contacts)))
+    touched = {c.table.sweep for c in contacts if c.force.any()}
+    initial = np.array([script.initial.get(name, 0.0) for name in names])
+    commanded = np.vstack([_sweep_inputs(sweep, names) for sweep in script.sweeps])
+    if script.actuation == "tension" and (commanded + initial < -1e-12).any():
+        raise InputError("a tension below zero", where=f"{where}: sweeps", found=f"{(commanded + initial).min():g} N", expected="initial + sweep ≥ 0 N")
+    _check_cloud_frames(script, int(steps.size), where)
+    frames, points, forces = _planned_loads(script, first, count, where)
+    return Plan(
+        control=script.actuation,
+        time_s=freeze(np.cumsum(steps) - steps[0]),
+        sweep=tuple(s.label for s, n in zip(script.sweeps, counts) for _ in range(n)),
+        free=freeze(np.concatenate([np.full(n, s.label not in touched if s.free is None else s.free) for s, n in zip(script.sweeps, counts)]), bool),
+        commanded=freeze(commanded),
+        initial=freeze(initial),
+        gravity=_planned_gravity(script, robot, counts),
+        load_frame=freeze(frames, np.int64),
+        load_points=freeze(points),
+        load_forces=freeze(forces),
+        contacts=contacts,
+    )  # fmt: skip
+
+
+def _check_sweep(sweep: SweepTable, i: int, where: Path) -> None:
+    count = len(sweep.profile())
+    if not count:
+        raise _problem("a sweep without frames", where, ("sweeps", i), repr(sweep.label), "rest, up, hold, down or levels")
+    for name, values in sweep.cables.items():
+        if isinstance(values, list) and len(values) != count:
+            raise _problem("another number of values than frames", where, ("sweeps", i, "cables", name), f"{len(values)} values", f"{count} values, or one number")
+
+
+def _check_names(script: ScriptTable, robot: Robot, where: Path) -> None:
+    cables = robot.body.cable_names
+    used: list[tuple[str, tuple[int | str, ...]]] = [(name, ("initial", name)) for name in script.initial]
+    used += [(name, ("sweeps", i, "cables", name)) for i, sweep in enumerate(script.sweeps) for name in sweep.cables]
+    for name, place in used:
+        if name not in cables:
+            raise _problem("unknown cable", where, place, repr(name), ", ".join(cables) or "a robot with cables", near(name, cables))
+    for i, name in enumerate(script.markers.names or ()):
+        if name not in robot.marker_names:
+            raise _problem("unknown marker", where, ("markers", "names", i), repr(name), ", ".join(robot.marker_names), near(name, robot.marker_names))
+
+
+def _check_cloud_frames(script: ScriptTable, count: int, where: Path) -> None:
+    for i, frame in enumerate(script.clouds.extra_frames):
+        if frame >= count:
+            raise _problem("no such frame", where, ("clouds", "extra_frames", i), frame, f"0 … {count - 1}")
+
+
+def _sweep_inputs(sweep: SweepTable, names: Sequence[str]) -> FloatArray:
+    """Return the inputs of a sweep, shape (frames, a)."""
+    profile = np.array(sweep.profile())
+    table = np.zeros((len(profile), len(names)))
+    for name, value in sweep.cables.items():
+        table[:, names.index(name)] = np.asarray(value) if isinstance(value, list) else value * profile
+    return table
+
+
+def _planned_contact(script: ScriptTable, i: int, first: dict[str, int], count: dict[str, int], total: int, where: Path) -> PlannedContact:  # fmt: skip
+    table = script.contacts[i]
+    n, start = count[table.sweep], first[table.sweep]
+    values = np.full(n, table.force_n) if isinstance(table.force_n, float | int) else np.array(table.force_n, dtype=float)
+    if len(values) != n:
+        raise _problem("another number of values than frames", where, ("contacts", i, "force_n"), f"{len(values)} values", f"{n} values, or one number")
+    force = np.zeros(total)
+    force[start : start + n] = values
+    return PlannedContact(table, freeze(force))
+
+
+def _planned_loads(script: ScriptTable, first: dict[str, int], count: dict[str, int], where: Path) -> tuple[IntArray, FloatArray, FloatArray]:  # fmt: skip
+    frames, points, forces = [], [], []
+    for i, table in enumerate(script.loads):
+        n = count[table.sweep]
+        values = np.asarray(table.force_n, dtype=float)
+        values = np.tile(values, (n, 1)) if values.ndim == 1 else values
+        if len(values) != n:
+            raise _problem("another number of vectors than frames", where, ("loads", i, "force_n"), f"{len(values)} vectors", f"{n} vectors, or one")
+        frames += [first[table.sweep] + k for k in range(n)]
+        points += [table.point_m] * n
+        forces += values.tolist()
+    return np.array(frames, dtype=np.int64), np.array(points).reshape(-1, 3), np.array(forces).reshape(-1, 3)
+
+
+def _planned_gravity(script: ScriptTable, robot: Robot, counts: Sequence[int]) -> FloatArray | None:
+    if all(sweep.gravity_m_s2 is None for sweep in script.sweeps):
+        return None
+    rows = [robot.body.gravity if s.gravity_m_s2 is None else np.array(s.gravity_m_s2) for s in script.sweeps]
+    return freeze(np.repeat(rows, counts, axis=0))
+
+
+def _problem(what: str, where: Path, location: Sequence[int | str], found: object, expected: str, hint: str | None = None) -> InputError:
+    return InputError(what, where=f"{where}: {key_path(location)}", found=found, expected=expected, hint=hint)

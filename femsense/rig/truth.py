@@ -1,0 +1,345 @@
+"""The true body: another mesh and law than the estimator's, its own friction and creep, walked along a plan in small steps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from femsense.arrays import FloatArray, freeze
+from femsense.effects import apply_effects
+from femsense.errors import DataError, InputError
+from femsense.fem.body import BodyModel, Cable, make_body, tie_cable
+from femsense.fem.cables import bend_angles
+from femsense.fem.equilibrium import Equilibrium, solve_equilibrium
+from femsense.fem.mesh import TetMesh, embed_points, refined, surface_triangles, to_linear, to_quadratic, triangle_normals
+from femsense.model import Robot
+from femsense.rig.friction import Grip, new_grip, pull
+from femsense.rig.script import Plan, PlannedContact, TruthTable
+
+SETTLED = 1e-8
+"""Tensions along the cables and contact forces rest when a pass moves them by less than this [N]."""
+PASSES = 60
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Patch:
+    """A part of the surface that a probe presses on."""
+
+    triangles: FloatArray
+    """Node indices, shape (t, 3)."""
+    share: FloatArray
+    """Part of the force that each triangle carries [1], shape (t,)."""
+
+    def place(self, positions: FloatArray) -> FloatArray:
+        """Return the centre of the patch [m], shape (3,)."""
+        return np.asarray(self.share @ positions[self.triangles].mean(axis=1))
+
+    def normal(self, positions: FloatArray) -> FloatArray:
+        """Return the outward unit normal of the patch, shape (3,)."""
+        area = self.share @ triangle_normals(positions, self.triangles)  # type: ignore[arg-type]
+        return np.asarray(area / np.linalg.norm(area))
+
+    def spread(self, force: FloatArray, node_count: int) -> FloatArray:
+        """Return the nodal forces of a force [N], shape (n, 3)."""
+        forces = np.zeros((node_count, 3))
+        for corner in range(3):
+            np.add.at(forces, self.triangles[:, corner], self.share[:, None] * force / 3.0)
+        return forces
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class TrueContact:
+    """A contact in one frame."""
+
+    contact: int
+    """Which of the script's contacts."""
+    place: FloatArray
+    """Centre of the patch on the deformed body [m], shape (3,)."""
+    normal: FloatArray
+    """Outward unit normal there, shape (3,)."""
+    force: FloatArray
+    """On the body [N], shape (3,)."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class TrueFrame:
+    """The truth in one frame."""
+
+    state: Equilibrium
+    motor: FloatArray
+    """Inputs at the motors after all effects [N] or [m], shape (a,)."""
+    contacts: tuple[TrueContact, ...]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Load:
+    """What drives the body at one moment."""
+
+    inputs: FloatArray  # (a,)
+    forces: FloatArray  # known loads, (n, 3) N
+    contact: FloatArray  # (c,) N
+    gravity: FloatArray  # (3,)
+
+    def towards(self, other: _Load, part: float) -> _Load:
+        pairs = ((getattr(self, f), getattr(other, f)) for f in ("inputs", "forces", "contact", "gravity"))
+        return _Load(*(a + part * (b - a) for a, b in pairs))
+
+
+# The body
+
+
+def true_robot(robot: Robot, table: TruthTable, effects: Sequence[Mapping[str, Any]]) -> Robot:
+    """Return the robot as it truly is.
+
+    Arguments:
+        robot: as it is declared.
+        table: mesh and law of the truth.
+        effects: entries as in `[[effects]]`, applied to the truth only.
+
+    Raises:
+        InputError: where an effect does not fit.
+    """
+    mesh = true_mesh(robot.body.mesh, table)
+    body = _on_mesh(robot.body, mesh)
+    limit = np.inf if table.stretch_limit is None else table.stretch_limit
+    body = body.with_material(replace(body.material, law=table.law, stretch_limit=limit))
+    moved = replace(robot, body=body, markers=embed_points(mesh, robot.marker_points), features=np.zeros(0, np.int64))
+    for i, entry in enumerate(effects):
+        try:
+            moved = apply_effects(moved, [entry])
+        except InputError as error:
+            raise InputError(error.what, where=f"effects[{i}]: {error.where}", found=error.found, expected=error.expected, hint=error.hint) from None
+    return moved
+
+
+def true_mesh(mesh: TetMesh, table: TruthTable) -> TetMesh:
+    """Return the mesh of the truth; the robot's own where nothing is refined and the element is the same."""
+    if not table.refinements and mesh.is_quadratic == (table.element == "tet10"):
+        return mesh
+    fine = to_linear(mesh)
+    for _ in range(table.refinements):
+        fine = refined(fine)
+    return to_quadratic(fine) if table.element == "tet10" else fine
+
+
+def _on_mesh(body: BodyModel, mesh: TetMesh) -> BodyModel:
+    """Return the body on another mesh of the same shape: what moved with clamped nodes only is clamped."""
+    if mesh is body.mesh:
+        return body
+    ties = embed_points(body.mesh, mesh.nodes)
+    is_clamped = np.zeros(len(body.mesh.nodes), dtype=bool)
+    is_clamped[body.clamped] = True
+    held = np.abs(np.where(is_clamped[ties.nodes], 0.0, ties.weights)).max(axis=1) < 1e-6
+    parent = embed_points(body.mesh, mesh.nodes[mesh.tets[:, :4]].mean(axis=1)).element
+    springs = cKDTree(mesh.nodes).query(body.mesh.nodes[body.clamp_nodes])[1] if len(body.clamp_nodes) else np.zeros(0, np.int64)
+    made = make_body(
+        mesh,
+        young_modulus=body.material.young_modulus[parent],
+        poisson_ratio=body.material.poisson_ratio[parent],
+        density=body.material.density,
+        clamped=np.flatnonzero(held),
+        clamp_nodes=springs,
+        cables=tuple(_on_mesh_cable(cable, body.mesh, mesh) for cable in body.cables),
+        gravity=body.gravity,
+    )
+    if np.isfinite(body.clamp_stiffness):
+        made = made.with_clamp_stiffness(body.clamp_stiffness)
+    loaded = np.flatnonzero(body.dead_forces.any(axis=1))
+    if len(loaded):
+        made = made.with_dead_forces(embed_points(mesh, body.mesh.nodes[loaded]).spread(body.dead_forces[loaded], len(mesh.nodes)))
+    return made
+
+
+def _on_mesh_cable(cable: Cable, old: TetMesh, new: TetMesh) -> Cable:
+    path = cable.path.positions(old.nodes)
+    tied = tie_cable(new, cable.name, path, cable.pull_point, exit_direction=cable.exit_direction)
+    return replace(cable, path=tied.path)
+
+
+def contact_patch(mesh: TetMesh, point: Sequence[float], radius: float) -> Patch:
+    """Return the surface triangles around a place at rest; the pressure falls to nothing at the radius.
+
+    Arguments:
+        mesh: of the truth.
+        point: on the surface at rest [m], shape (3,).
+        radius: [m]; where no triangle's centre is so near, the nearest one carries all.
+    """
+    triangles = surface_triangles(mesh)
+    distance = np.linalg.norm(mesh.nodes[triangles].mean(axis=1) - np.asarray(point), axis=1)
+    area = np.linalg.norm(triangle_normals(mesh.nodes, triangles), axis=1)
+    near = np.flatnonzero(distance < radius)
+    if not len(near):
+        near = np.array([int(distance.argmin())])
+    normals = triangle_normals(mesh.nodes, triangles[near])
+    near = near[normals @ normals[distance[near].argmin()] > 0]  # not the far side of a thin part
+    share = area[near] * np.maximum(1.0 - (distance[near] / radius) ** 2, 1e-3)
+    return Patch(triangles[near], share / share.sum())  # type: ignore[arg-type]
+
+
+# The inputs
+
+
+def true_inputs(robot: Robot, plan: Plan) -> FloatArray:
+    """Return what the motors truly do in each frame [N] or [m], shape (F, a): gain, zero, play and creep of the truth."""
+    act = robot.actuation
+    inputs = act.gain * (plan.commanded + plan.initial)
+    if plan.control == "displacement":
+        return np.asarray(inputs + act.displacement_offset - act.slack)
+    pulled = np.where(inputs + act.tension_offset > 0, inputs + act.tension_offset, 0.0)
+    return creep_matrix(plan.time_s, robot.creep) @ pulled
+
+
+def creep_matrix(time_s: FloatArray, terms: Sequence[tuple[float, float]]) -> FloatArray:
+    """Return C, shape (F, F), with crept = C @ values.
+
+    The convolution of J(t) = 1 + Σ f (1 − exp(−t/τ)) with the rate of values that go straight from frame to frame; what was
+    there before the first frame has crept to its end. Each row is summed in full, from the closed form of each piece.
+    """
+    F = len(time_s)
+    rate = np.zeros((F, F))
+    rate[:, 0] = 1.0 + sum(fraction for fraction, _ in terms)
+    for k in range(1, F):
+        dt = time_s[k] - time_s[k - 1]
+        since, until = time_s[k:] - time_s[k - 1], time_s[k:] - time_s[k]
+        rate[k:, k] = 1.0
+        for fraction, tau in terms:
+            rate[k:, k] += fraction * (1.0 - tau / dt * (np.exp(-until / tau) - np.exp(-since / tau)))
+    change = np.eye(F) - np.eye(F, k=-1)
+    return np.asarray(rate @ change)
+
+
+# The walk
+
+
+def walk_truth(robot: Robot, plan: Plan, *, substeps: int = 3) -> list[TrueFrame]:
+    """Return the truth of every frame.
+
+    Arguments:
+        robot: see `true_robot`.
+        plan: what happens.
+        substeps: steps from frame to frame; the path between them is straight in the inputs and loads.
+
+    Raises:
+        DataError: where there is no equilibrium.
+    """
+    inputs = true_inputs(robot, plan)
+    walker = _Walker(robot, plan)
+    frames, last = [], walker.nothing()
+    loads = walker.frame_loads(inputs)
+    for k, load in enumerate(loads):
+        for step in range(1, substeps + 1):
+            walker.go(last.towards(load, step / substeps), k)
+        frames.append(TrueFrame(replace(walker.state, factor=None), freeze(inputs[k]), walker.contacts_now(load)))
+        last = load
+    return frames
+
+
+class _Walker:
+    """The state of the truth, moved on step by step; bodies without friction carry given tensions along their cables."""
+
+    def __init__(self, robot: Robot, plan: Plan) -> None:
+        self.control = plan.control
+        self.plan = plan
+        self.friction = [cable.friction for cable in robot.body.cables]
+        self.creep = robot.creep
+        self.body = robot.body.with_cables(tuple(replace(cable, friction=0.0) for cable in robot.body.cables))
+        self.patches = [contact_patch(robot.body.mesh, c.table.point_m, c.table.radius_m) for c in plan.contacts]
+        self.grips = [new_grip(len(cable.path)) for cable in robot.body.cables]
+        self.state = solve_equilibrium(self.body)
+
+    def nothing(self) -> _Load:
+        """Return the load of the body at rest: its own weight."""
+        n = len(self.body.mesh.nodes)
+        gravity = self.body.gravity if self.plan.gravity is None else self.plan.gravity[0]
+        return _Load(np.zeros(len(self.friction)), np.zeros((n, 3)), np.zeros(len(self.patches)), np.asarray(gravity))
+
+    def frame_loads(self, inputs: FloatArray) -> list[_Load]:
+        """Return what drives the body in each frame."""
+        plan, n, F = self.plan, len(self.body.mesh.nodes), len(inputs)
+        known = _known_loads(self.body.mesh, plan, creep_matrix(plan.time_s, self.creep))
+        gravity = np.tile(self.body.gravity, (F, 1)) if plan.gravity is None else plan.gravity
+        contact = np.stack([c.force for c in plan.contacts], axis=1) if plan.contacts else np.zeros((F, 0))
+        return [_Load(inputs[k], known.get(k, np.zeros((n, 3))), contact[k], gravity[k]) for k in range(F)]
+
+    def go(self, load: _Load, frame: int) -> None:
+        """Move on to a load: the state, the tensions along the cables and the contact forces agree at the end."""
+        body = self.body if self.plan.gravity is None else self.body.with_gravity(load.gravity)
+        for _ in range(PASSES):
+            along, grips = self._along(load)
+            forces = load.forces + self._contact_forces(load)
+            self.state = self._solve(body, load, along, forces, frame)
+            if self._settled(load, along, forces):
+                self.grips = grips
+                return
+        raise DataError(f"the truth of frame {frame} does not settle: friction and contact keep moving; use more substeps")
+
+    def contacts_now(self, load: _Load) -> tuple[TrueContact, ...]:
+        """Return the contacts that press."""
+        x = self.state.positions
+        return tuple(
+            TrueContact(i, freeze(patch.place(x)), freeze(patch.normal(x)), freeze(force * self._direction(i)))
+            for i, (patch, force) in enumerate(zip(self.patches, load.contact))
+            if force > 0
+        )
+
+    def _along(self, load: _Load) -> tuple[list[FloatArray], list[Grip]]:
+        """Return the tensions along each cable [N], far end first, and what the bends would remember."""
+        motors = load.inputs if self.control == "tension" else np.array(list(self.state.tension.values()))
+        tensions, grips = [], []
+        for cable, grip, friction, motor in zip(self.body.cables, self.grips, self.friction, motors):
+            bends = bend_angles(cable, self.state.positions)[::-1]
+            behind, now = pull(grip, max(float(motor), 0.0), bends, friction)
+            tensions.append(behind[::-1])
+            grips.append(now)
+        return tensions, grips
+
+    def _solve(self, body: BodyModel, load: _Load, along: list[FloatArray], forces: FloatArray, frame: int) -> Equilibrium:
+        names = body.cable_names
+        values = {name: float(v) for name, v in zip(names, load.inputs)}
+        motor = values if self.control == "tension" else dict(self.state.tension)
+        start = replace(self.state, tension=motor, segment_tensions=tuple(along))
+        tension, held = (values, None) if self.control == "tension" else (None, values)
+        state = solve_equilibrium(body, tension=tension, shortening=held, nodal_forces=forces, start=start, reuse_factor=True)
+        if not state.converged:
+            raise DataError(f"the truth has no equilibrium in frame {frame}: {state.status}: {state.advice}")
+        return state
+
+    def _settled(self, load: _Load, along: list[FloatArray], forces: FloatArray) -> bool:
+        """Return whether what was solved with is what its result asks for."""
+        wanted, _ = self._along(load)
+        used = self.state.segment_tensions
+        moved = [np.abs(w - u).max(initial=0.0) for w, u in zip(wanted, used)]
+        pressed = np.abs(load.forces + self._contact_forces(load) - forces).max(initial=0.0)
+        return max([float(pressed), *moved]) < SETTLED * max(1.0, float(np.abs(load.inputs).max(initial=0.0)))
+
+    def _direction(self, i: int) -> FloatArray:
+        given = self.plan.contacts[i].table.direction
+        if given is None:
+            return -self.patches[i].normal(self.state.positions)
+        return np.asarray(given) / np.linalg.norm(given)
+
+    def _contact_forces(self, load: _Load) -> FloatArray:
+        n = len(self.body.mesh.nodes)
+        total = np.zeros((n, 3))
+        for i, (patch, force) in enumerate(zip(self.patches, load.contact)):
+            total += patch.spread(force * self._direction(i), n)
+        return total
+
+
+def _known_loads(mesh: TetMesh, plan: Plan, creep: FloatArray) -> dict[int, FloatArray]:
+    """Return the nodal forces of the known loads, creep included: frame → (n, 3)."""
+    if not len(plan.load_frame):
+        return {}
+    places, number = np.unique(plan.load_points, axis=0, return_inverse=True)
+    table = np.zeros((len(plan.time_s), len(places), 3))
+    np.add.at(table, (plan.load_frame, number.ravel()), plan.load_forces)
+    crept = np.einsum("fg,gpc->fpc", creep, table)
+    ties = embed_points(mesh, places)
+    return {k: ties.spread(crept[k], len(mesh.nodes)) for k in range(len(crept))}
+
+
+__all__ = ["Patch", "PlannedContact", "TrueContact", "TrueFrame", "contact_patch", "creep_matrix", "true_inputs", "true_mesh", "true_robot", "walk_truth"]
