@@ -109,10 +109,9 @@ def simulate(
     json: Json = False,
 ) -> Answer:
     """Record on the virtual rig, with the truth beside it."""
-    from femsense.rig.simulate import simulate as simulate_rig
-    from femsense.robot import load_robot
+    from femsense.steps import simulate_into
 
-    simulate_rig(load_robot(robot), script, output)
+    simulate_into(output, robot, script)
     return Answer({"recording": str(output)}, f"recording: {output}\nlook at it: femsense inspect {output}")
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from femsense import results
+from femsense.errors import InputError
 from femsense.recording import load_recording
 from femsense.robot import load_robot
 
@@ -103,3 +104,17 @@ def improve_into(
     loop = improve(body, train, validation=test, effects=effects, without=without, progress=progress)
     results.write_loop(loop, folder, inputs=inputs)
     return results.read_loop(folder)
+
+
+def simulate_into(folder: str | Path, robot: str | Path, script: str | Path) -> Path:
+    """Write the recording of a script; return its folder.
+
+    Raises:
+        InputError: where the folder holds anything but a recording, which would be replaced. FemsenseError: as `simulate`.
+    """
+    from femsense.rig.simulate import simulate
+
+    target = Path(folder).expanduser()
+    if target.exists() and not (target / "recording.toml").is_file() and not (target.is_dir() and not any(target.iterdir())):
+        raise InputError("something else than a recording stands there, which would be replaced", where=target, expected="a new folder", hint="another -o")  # fmt: skip
+    return simulate(load_robot(robot), script, target)
