@@ -86,7 +86,7 @@ def energy_density(F: np.ndarray, law: str, mu: float, lam: float, limit: float)
     inverse = np.linalg.inv(F).T
     if law == "neo_hookean":
         return mu / 2 * (I1 - 3) + volume, mu * F + (lam * np.log(J) - mu) * inverse
-    if I1 - 3 >= limit:
+    if limit <= I1 - 3:
         return np.inf, np.full((3, 3), np.nan)
     return -mu * limit / 2 * np.log(1 - (I1 - 3) / limit) + volume, mu / (1 - (I1 - 3) / limit) * F + (
         lam * np.log(J) - mu

@@ -101,6 +101,14 @@ class BodyModel:
         """Return weight plus other dead forces [N], shape (n, 3)."""
         return self.weight() + self.dead_forces
 
+    def is_held(self) -> bool:
+        """Return whether clamp or springs stop every rigid motion: three of their nodes are not on a line."""
+        nodes = self.mesh.nodes[self.clamped if np.isinf(self.clamp_stiffness) else self.clamp_nodes]
+        if len(nodes) < 3:
+            return False
+        spread = np.linalg.svd(nodes - nodes.mean(axis=0), compute_uv=False)
+        return bool(spread[1] > 1e-9 * spread[0])
+
     def with_gravity(self, vector: npt.ArrayLike) -> BodyModel:
         """Return the body under another gravity [m/s²], shape (3,)."""
         return replace(self, gravity=freeze(vector))

@@ -61,7 +61,7 @@ def tangent_at(body: BodyModel, equilibrium: Equilibrium) -> Tangent:
     assert blocks is not None
     add_cable_stiffness(body, equilibrium.positions, equilibrium.segment_tensions, blocks)
     factor = factorize(body.free_map.pattern, reduced_values(body, blocks))
-    if factor is None:
+    if factor is None or (factor.negative > 0 and not body.is_held()):
         raise FemsenseError("the stiffness is singular: nothing holds the body (clamp more nodes)")
     dofs = body.free_map.dofs
     held = np.flatnonzero(equilibrium.held)

@@ -132,6 +132,8 @@ def solve_equilibrium(
     loads = _collect_loads(body, tension, shortening, nodal_forces, start, before, bilateral, relative_tolerance)
     state = _initial_state(body, loads, start, reuse_factor)
     status = _settle(body, loads, state, max_iterations)
+    if status != CONVERGED and not body.is_held():
+        status = "singular"
     if status not in (CONVERGED, "singular"):
         state, status = _step_loads(body, loads, state.iterations, max_iterations)
     extra = np.zeros_like(body.mesh.nodes) if nodal_forces is None else np.asarray(nodal_forces, dtype=np.float64)
@@ -258,7 +260,7 @@ def _newton(body: BodyModel, loads: _Loads, state: _State, max_iterations: int) 
     free = body.free_map.dofs
     held = np.flatnonzero(state.taut)
     stretch = np.array([1.0 / body.cables[i].stretch_stiffness for i in held])
-    here = internal(body, state.x)
+    here = internal(body, state.x, tangent=not state.borrowed)
     last = np.inf
     for _ in range(max_iterations):
         rows = _rows(body, state)
@@ -288,8 +290,8 @@ def _newton(body: BodyModel, loads: _Loads, state: _State, max_iterations: int) 
 
 
 def _factor_here(body: BodyModel, here: Internal, state: _State) -> Factorization | None:
-    assert here.blocks is not None
-    blocks = here.blocks.copy()
+    blocks = internal(body, state.x).blocks if here.blocks is None else here.blocks.copy()
+    assert blocks is not None
     add_cable_stiffness(body, state.x, tuple(np.maximum(T, 0.0) * s for T, s in zip(state.T, state.shares)), blocks)
     return factorize_definite(body.free_map.pattern, reduced_values(body, blocks))[0]
 
@@ -334,8 +336,10 @@ def _line_search(
     step[free] = du
     step = step.reshape(-1, 3)
     penalty = 2.0 * np.abs(T0[held] + dT) + 1e-3 if len(held) else np.zeros(0)
-    base = _merit(body, loads, state, held, here, penalty)
-    slope = _slope(body, loads, state, held, here, step) - float(penalty @ np.abs(gap))
+    lost = np.zeros(len(T0))  # a held cable with friction is no pure constraint: what its bends take away is a given force
+    lost[held] = [T if body.cables[i].friction > 0 else 0.0 for i, T in zip(held, T0[held] + dT)]
+    base = _merit(body, loads, state, held, here, penalty, lost)
+    slope = _slope(body, loads, state, held, here, step, lost) - float(penalty @ np.abs(gap))
     noise = 1e-12 * (abs(here.energy) + abs(float((loads.forces * x0).sum())) + float(np.abs(T0).sum()) * 1e-2 + 1e-12)
     length = 1.0
     limit = 0.5 * np.ptp(body.mesh.nodes, axis=0).max() / max(np.abs(step).max(), 1e-300)
@@ -344,21 +348,25 @@ def _line_search(
         state.x = x0 + length * step
         state.T = T0.copy()
         state.T[held] = T0[held] + length * dT
-        there = internal(body, state.x, tangent=trial == 0)
+        there = internal(body, state.x, tangent=trial == 0 and not state.borrowed)
         if np.isfinite(there.energy):
-            merit = _merit(body, loads, state, held, there, penalty)
+            merit = _merit(body, loads, state, held, there, penalty, lost)
             if merit <= base + 1e-4 * length * slope + noise:
-                return there if there.blocks is not None else internal(body, state.x)
+                return there
         length *= 0.5
     state.x, state.T = x0, T0
     return None
 
 
-def _merit(body: BodyModel, loads: _Loads, state: _State, held: npt.NDArray[np.intp], here: Internal, penalty: FloatArray) -> float:
+def _merit(
+    body: BodyModel, loads: _Loads, state: _State, held: npt.NDArray[np.intp], here: Internal, penalty: FloatArray, lost: FloatArray
+) -> float:
     value = here.energy - float((loads.forces * (state.x - body.mesh.nodes)).sum())
     for i, cable in enumerate(body.cables):
         if not state.taut[i] and state.T[i] != 0.0:
             value += state.T[i] * _weighted_length(cable, state.x, state.shares[i])
+        if lost[i] != 0.0:
+            value += lost[i] * _weighted_length(cable, state.x, state.shares[i] - 1.0)
     if len(held):
         stretch = np.array([1.0 / body.cables[i].stretch_stiffness for i in held])
         gap = loads.target[held] - shortening(body, state.x)[held] - stretch * state.T[held]
@@ -372,13 +380,16 @@ def _weighted_length(cable: object, x: FloatArray, share: FloatArray) -> float:
     return float(share @ segments(cable, x)[1])  # type: ignore[arg-type]
 
 
-def _slope(body: BodyModel, loads: _Loads, state: _State, held: npt.NDArray[np.intp], here: Internal, step: FloatArray) -> float:
-    """Return the derivative of the potential (without held cables) along a step."""
+def _slope(body: BodyModel, loads: _Loads, state: _State, held: npt.NDArray[np.intp], here: Internal, step: FloatArray, lost: FloatArray) -> float:
+    """Return the derivative of the potential (of held cables only what friction takes away) along a step."""
     gradient = here.forces - loads.forces
     rows = _rows(body, state)
     loose = state.T.copy()
     loose[held] = 0.0
-    return float((gradient * step).sum() - (loose @ rows) @ step.ravel()) if len(rows) else float((gradient * step).sum())
+    if not len(rows):
+        return float((gradient * step).sum())
+    pull = loose @ rows + lost @ (rows - _kinematic_rows(body, state, rows))
+    return float((gradient * step).sum() - pull @ step.ravel())
 
 
 def _step_loads(body: BodyModel, loads: _Loads, iterations: int, max_iterations: int) -> tuple[_State, str]:

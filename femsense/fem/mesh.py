@@ -157,7 +157,7 @@ def check_mesh(mesh: TetMesh, where: str) -> None:
         raise InputError("the mesh has no tetrahedra", where=where, expected="tetrahedra (tetra or tetra10 cells)")
     volumes = element_volumes(mesh)
     size = np.median(np.abs(volumes))
-    flat = np.flatnonzero(np.abs(volumes) < 1e-9 * size)
+    flat = np.flatnonzero(np.abs(volumes) <= 1e-9 * size)
     if len(flat):
         raise InputError("tetrahedra without volume", where=where, found=f"{len(flat)}, the first is number {flat[0]}",
                          expected="positive volumes", hint="femsense mesh SURFACE -o ROBOT makes a sound mesh")  # fmt: skip
