@@ -29,6 +29,7 @@ EDGE = 0.01
 """Neighbouring depths that differ by more than this are an edge [m]."""
 COLOR_NOISE = 0.012
 """Standard deviation of a colour channel [1]."""
+TRUE_DEPTH = Observation()
 HIDDEN = 2e-3
 """A marker is hidden where the ray towards it ends more than this before it [m]."""
 
@@ -81,7 +82,12 @@ def look_at(eye: Sequence[float], target: Sequence[float], *, roll: float = 0.0)
     forward = np.asarray(target, dtype=float) - np.asarray(eye, dtype=float)
     distance = np.linalg.norm(forward)
     if distance < 1e-9:
-        raise InputError("a camera cannot look at where it stands", where="camera.target_m", found=list(target), expected="another place than eye_m")
+        raise InputError(
+            "a camera cannot look at where it stands",
+            where="camera.target_m",
+            found=list(target),
+            expected="another place than eye_m",
+        )
     z = forward / distance
     up = np.array([0.0, 0.0, 1.0]) if abs(z[2]) < 0.999 else np.array([0.0, 1.0, 0.0])
     x = np.cross(z, up)
@@ -98,7 +104,7 @@ def pixel_rays(camera: Camera) -> FloatArray:
 
 def render(
     camera: Camera, T_robot_camera: FloatArray, shapes: Sequence[Shape], *,
-    noise: NoiseTable | None = None, observation: Observation = Observation(), rng: np.random.Generator | None = None,  # noqa: B008
+    noise: NoiseTable | None = None, observation: Observation = TRUE_DEPTH, rng: np.random.Generator | None = None,
 ) -> DepthImage:  # fmt: skip
     """Return what a camera sees.
 
@@ -193,7 +199,9 @@ def _cast(rays: FloatArray, T_robot_camera: FloatArray, shapes: Sequence[Shape])
         )
     directions = rays @ T_robot_camera[:3, :3].T
     start = np.broadcast_to(T_robot_camera[:3, 3], directions.shape)
-    answer: dict[str, Any] = scene.cast_rays(o3d.core.Tensor(np.concatenate([start, directions], axis=-1).astype(np.float32)), nthreads=1)
+    answer: dict[str, Any] = scene.cast_rays(
+        o3d.core.Tensor(np.concatenate([start, directions], axis=-1).astype(np.float32)), nthreads=1
+    )
     number = answer["geometry_ids"].numpy().astype(np.int64)
     missed = number == int(scene.INVALID_ID)
     normals = answer["primitive_normals"].numpy().astype(np.float64)
@@ -212,7 +220,9 @@ def _exact_depth(shape: Shape, triangle: npt.NDArray[Any], start: FloatArray, di
     return np.asarray(np.einsum("kc,kc->k", a - start, normal) / np.einsum("kc,kc->k", direction, normal))
 
 
-def _shade(shapes: Sequence[Shape], shape: IntArray, facing: FloatArray, rng: np.random.Generator | None) -> npt.NDArray[np.uint8]:
+def _shade(
+    shapes: Sequence[Shape], shape: IntArray, facing: FloatArray, rng: np.random.Generator | None
+) -> npt.NDArray[np.uint8]:
     """Return the colours with a lamp at the camera, shape (H, W, 3)."""
     palette = np.vstack([np.zeros((1, 3)), *(s.color[None] for s in shapes)])
     color = palette[shape + 1] * (AMBIENT + (1.0 - AMBIENT) * facing)[..., None]

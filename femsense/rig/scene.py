@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from femsense.arrays import FloatArray
@@ -65,7 +67,7 @@ def floor_shape(height: float, color: FloatArray) -> Shape:
     return Shape(corners, np.array([[0, 1, 2], [0, 2, 3]]), color)
 
 
-def _rod(start: FloatArray, end: FloatArray, radius: float):  # type: ignore[no-untyped-def]
+def _rod(start: FloatArray, end: FloatArray, radius: float) -> Any:
     import trimesh
 
     return trimesh.creation.cylinder(radius=radius, segment=np.stack([start, end]), sections=32)

@@ -55,7 +55,9 @@ class ContactTable(Schema):
 
     sweep: str = Field(description="label of the sweep in which it acts")
     point_m: Vector = Field(description=PLACE)
-    force_n: NotNegative | list[NotNegative] = Field(description="newton, one number or one a frame of the sweep, ≥ 0; at 0 it does not touch")
+    force_n: NotNegative | list[NotNegative] = Field(
+        description="newton, one number or one a frame of the sweep, ≥ 0; at 0 it does not touch"
+    )
     direction: Vector | None = Field(None, description="direction of the force; by default into the surface, as it turns")
     radius_m: Positive = Field(0.006, description="the force is spread over the surface within this distance [m], > 0")
     probe: Literal["sphere", "cylinder"] = Field("sphere", description='what the camera sees: "sphere" or "cylinder"')
@@ -73,9 +75,13 @@ class LoadTable(Schema):
 class TruthTable(Schema):
     """How the truth differs from the estimator's model beside the effects."""
 
-    refinements: Annotated[int, Field(ge=0, le=3)] = Field(1, description="how often every tetrahedron is split into eight, 0 … 3")
+    refinements: Annotated[int, Field(ge=0, le=3)] = Field(
+        1, description="how often every tetrahedron is split into eight, 0 … 3"
+    )
     element: Literal["tet4", "tet10"] = Field("tet10", description='"tet4" or "tet10"')
-    law: Literal["corotational", "neo_hookean", "gent"] = Field("neo_hookean", description='"neo_hookean", "gent" or "corotational"')
+    law: Literal["corotational", "neo_hookean", "gent"] = Field(
+        "neo_hookean", description='"neo_hookean", "gent" or "corotational"'
+    )
     stretch_limit: Positive | None = Field(None, description="Gent's limit jm of I₁ − 3, > 0")
     substeps: Annotated[int, Field(ge=1)] = Field(3, description="steps from frame to frame, ≥ 1")
 
@@ -94,7 +100,9 @@ class NoiseTable(Schema):
     focal_px: Positive | None = Field(None, description="focal length of the imagers [px]; by default fx")
     correlated_share: Share = Field(0.5, description="share of the variance that neighbouring pixels have in common, 0 … 1")
     correlation_px: Positive = Field(2.0, description="width of that common part [px], > 0")
-    grazing_deg: Annotated[float, Field(gt=0, le=90)] = Field(82.0, description="surfaces seen more obliquely than this give no depth [°]")
+    grazing_deg: Annotated[float, Field(gt=0, le=90)] = Field(
+        82.0, description="surfaces seen more obliquely than this give no depth [°]"
+    )
     edge_dropout: Share = Field(0.5, description="share of the pixels at depth edges that give no depth, 0 … 1")
     flying_share: Share = Field(0.05, description="share of the pixels at depth edges that fall between front and back, 0 … 1")
     quantum_m: NotNegative = Field(0.0, description="step of the depth values [m]; 0: the camera's depth_unit_m")
@@ -130,7 +138,9 @@ class MarkersTable(Schema):
 
     names: list[str] | None = Field(None, description="the markers that there are; by default all of the robot")
     std_m: NotNegative = Field(0.0, description="noise of each coordinate of each marker in each frame [m], ≥ 0")
-    frame_std_m: NotNegative = Field(0.0, description="noise of each coordinate that all markers of a frame have in common [m], ≥ 0")
+    frame_std_m: NotNegative = Field(
+        0.0, description="noise of each coordinate that all markers of a frame have in common [m], ≥ 0"
+    )
     placement_std_m: NotNegative = Field(0.0, description="how far from its place each marker is glued, each coordinate [m], ≥ 0")
     occlusion: bool = Field(True, description="true: markers that the camera cannot see have no row")
     rest_file: bool = Field(False, description="true: rest.csv holds the markers of the unloaded body")
@@ -228,10 +238,11 @@ def check_script(document: dict[str, Any], where: Path = Path("script")) -> Scri
     for i, label in enumerate(labels):
         if label in labels[:i]:
             raise _problem("a label stands twice", where, ("sweeps", i, "label"), repr(label), "each sweep its own label")
-    for kind, tables in (("contacts", script.contacts), ("loads", script.loads)):
-        for i, table in enumerate(tables):
-            if table.sweep not in labels:
-                raise _problem("no such sweep", where, (kind, i, "sweep"), repr(table.sweep), ", ".join(labels), near(table.sweep, labels))
+    named = [("contacts", i, table.sweep) for i, table in enumerate(script.contacts)]
+    named += [("loads", i, table.sweep) for i, table in enumerate(script.loads)]
+    for kind, i, label in named:
+        if label not in labels:
+            raise _problem("no such sweep", where, (kind, i, "sweep"), repr(label), ", ".join(labels), near(label, labels))
     for i, sweep in enumerate(script.sweeps):
         _check_sweep(sweep, i, where)
     return script
@@ -259,7 +270,12 @@ def plan_script(script: ScriptTable, robot: Robot, where: Path = Path("script"))
     initial = np.array([script.initial.get(name, 0.0) for name in names])
     commanded = np.vstack([_sweep_inputs(sweep, names) for sweep in script.sweeps])
     if script.actuation == "tension" and (commanded + initial < -1e-12).any():
-        raise InputError("a tension below zero", where=f"{where}: sweeps", found=f"{(commanded + initial).min():g} N", expected="initial + sweep ≥ 0 N")
+        raise InputError(
+            "a tension below zero",
+            where=f"{where}: sweeps",
+            found=f"{(commanded + initial).min():g} N",
+            expected="initial + sweep ≥ 0 N",
+        )
     _check_cloud_frames(script, int(steps.size), where)
     frames, points, forces = _planned_loads(script, first, count, where)
     return Plan(
@@ -283,7 +299,13 @@ def _check_sweep(sweep: SweepTable, i: int, where: Path) -> None:
         raise _problem("a sweep without frames", where, ("sweeps", i), repr(sweep.label), "rest, up, hold, down or levels")
     for name, values in sweep.cables.items():
         if isinstance(values, list) and len(values) != count:
-            raise _problem("another number of values than frames", where, ("sweeps", i, "cables", name), f"{len(values)} values", f"{count} values, or one number")
+            raise _problem(
+                "another number of values than frames",
+                where,
+                ("sweeps", i, "cables", name),
+                f"{len(values)} values",
+                f"{count} values, or one number",
+            )
 
 
 def _check_names(script: ScriptTable, robot: Robot, where: Path) -> None:
@@ -292,10 +314,19 @@ def _check_names(script: ScriptTable, robot: Robot, where: Path) -> None:
     used += [(name, ("sweeps", i, "cables", name)) for i, sweep in enumerate(script.sweeps) for name in sweep.cables]
     for name, place in used:
         if name not in cables:
-            raise _problem("unknown cable", where, place, repr(name), ", ".join(cables) or "a robot with cables", near(name, cables))
+            raise _problem(
+                "unknown cable", where, place, repr(name), ", ".join(cables) or "a robot with cables", near(name, cables)
+            )
     for i, name in enumerate(script.markers.names or ()):
         if name not in robot.marker_names:
-            raise _problem("unknown marker", where, ("markers", "names", i), repr(name), ", ".join(robot.marker_names), near(name, robot.marker_names))
+            raise _problem(
+                "unknown marker",
+                where,
+                ("markers", "names", i),
+                repr(name),
+                ", ".join(robot.marker_names),
+                near(name, robot.marker_names),
+            )
 
 
 def _check_cloud_frames(script: ScriptTable, count: int, where: Path) -> None:
@@ -318,7 +349,13 @@ def _planned_contact(script: ScriptTable, i: int, first: dict[str, int], count: 
     n, start = count[table.sweep], first[table.sweep]
     values = np.full(n, table.force_n) if isinstance(table.force_n, float | int) else np.array(table.force_n, dtype=float)
     if len(values) != n:
-        raise _problem("another number of values than frames", where, ("contacts", i, "force_n"), f"{len(values)} values", f"{n} values, or one number")
+        raise _problem(
+            "another number of values than frames",
+            where,
+            ("contacts", i, "force_n"),
+            f"{len(values)} values",
+            f"{n} values, or one number",
+        )
     force = np.zeros(total)
     force[start : start + n] = values
     return PlannedContact(table, freeze(force))
@@ -331,7 +368,13 @@ def _planned_loads(script: ScriptTable, first: dict[str, int], count: dict[str, 
         values = np.asarray(table.force_n, dtype=float)
         values = np.tile(values, (n, 1)) if values.ndim == 1 else values
         if len(values) != n:
-            raise _problem("another number of vectors than frames", where, ("loads", i, "force_n"), f"{len(values)} vectors", f"{n} vectors, or one")
+            raise _problem(
+                "another number of vectors than frames",
+                where,
+                ("loads", i, "force_n"),
+                f"{len(values)} vectors",
+                f"{n} vectors, or one",
+            )
         frames += [first[table.sweep] + k for k in range(n)]
         points += [table.point_m] * n
         forces += values.tolist()
@@ -345,5 +388,7 @@ def _planned_gravity(script: ScriptTable, robot: Robot, counts: Sequence[int]) -
     return freeze(np.repeat(rows, counts, axis=0))
 
 
-def _problem(what: str, where: Path, location: Sequence[int | str], found: object, expected: str, hint: str | None = None) -> InputError:
+def _problem(
+    what: str, where: Path, location: Sequence[int | str], found: object, expected: str, hint: str | None = None
+) -> InputError:
     return InputError(what, where=f"{where}: {key_path(location)}", found=found, expected=expected, hint=hint)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,9 +14,21 @@ from femsense.fem.mesh import embed_points, to_linear
 from femsense.files import write_csv, write_json
 from femsense.frames import Camera, Recording, RestMarkers, make_recording
 from femsense.model import Robot
-from femsense.pose import invert_pose, transform_points
+from femsense.pose import transform_points
 from femsense.recording import save_recording
-from femsense.rig.camera import Shape, camera_of, cloud_of, measured_points, pose_of, render, thinned, visible_points, write_images, write_ply
+from femsense.rig.camera import (
+    DepthImage,
+    Shape,
+    camera_of,
+    cloud_of,
+    measured_points,
+    pose_of,
+    render,
+    thinned,
+    visible_points,
+    write_images,
+    write_ply,
+)
 from femsense.rig.scene import frame_shapes
 from femsense.rig.script import Plan, ScriptTable, check_script, plan_script, read_script
 from femsense.rig.truth import TrueFrame, true_robot, walk_truth
@@ -213,7 +225,7 @@ def _write_images(experiment: Experiment, shapes: list[Shape], k: int, folder: P
     write_images(folder / "depth" / f"{k:06d}.png", folder / "color" / f"{k:06d}.png", image, experiment.camera)
 
 
-def _image(experiment: Experiment, shapes: list[Shape], k: int):  # type: ignore[no-untyped-def]
+def _image(experiment: Experiment, shapes: list[Shape], k: int) -> DepthImage:
     script = experiment.script
     return render(experiment.camera, experiment.T_robot_camera, shapes, noise=script.camera.noise,
                   observation=experiment.robot.observation, rng=_rng(script, "clouds", k))  # fmt: skip
@@ -231,7 +243,9 @@ def _write_truth(experiment: Experiment, folder: Path) -> None:
     corners = to_linear(experiment.declared.body.mesh)
     ties = embed_points(experiment.robot.body.mesh, corners.nodes)
     nodes = np.array([ties.positions(frame.state.positions) for frame in experiment.frames])
-    np.savez_compressed(folder / "states.npz", time_s=experiment.plan.time_s, nodes_m=np.round(nodes, 6).astype(np.float32), tets=corners.tets)
+    np.savez_compressed(
+        folder / "states.npz", time_s=experiment.plan.time_s, nodes_m=np.round(nodes, 6).astype(np.float32), tets=corners.tets
+    )
 
 
 def truth_document(experiment: Experiment) -> dict[str, Any]:
@@ -263,7 +277,9 @@ def _contact_rows(experiment: Experiment) -> list[list[object]]:
         for contact in frame.contacts:
             rest = experiment.plan.contacts[contact.contact].table.point_m
             numbers = np.concatenate([contact.place, contact.normal, contact.force, [np.linalg.norm(contact.force)], rest])
-            rows.append([k, round(float(experiment.plan.time_s[k]), DIGITS), contact.contact, *np.round(numbers, DIGITS).tolist()])
+            rows.append(
+                [k, round(float(experiment.plan.time_s[k]), DIGITS), contact.contact, *np.round(numbers, DIGITS).tolist()]
+            )
     return rows
 
 
@@ -275,8 +291,3 @@ def _marker_rows(experiment: Experiment) -> list[list[object]]:
         for name, place, keep in zip(experiment.robot.marker_names, places, chosen)
         if keep
     ]
-
-
-Writer = Callable[[Experiment, list[Shape], int, Path], None]
-
-__all__ = ["Experiment", "cloud_frames", "invert_pose", "recording_of", "run_experiment", "simulate", "truth_document", "write_experiment"]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from femsense.arrays import FloatArray, freeze
+from femsense.arrays import FloatArray, IntArray, freeze
 from femsense.effects import apply_effects
 from femsense.errors import DataError, InputError
 from femsense.fem.body import BodyModel, Cable, make_body, tie_cable
@@ -18,7 +18,7 @@ from femsense.fem.equilibrium import Equilibrium, solve_equilibrium
 from femsense.fem.mesh import TetMesh, embed_points, refined, surface_triangles, to_linear, to_quadratic, triangle_normals
 from femsense.model import Robot
 from femsense.rig.friction import Grip, new_grip, pull
-from femsense.rig.script import Plan, PlannedContact, TruthTable
+from femsense.rig.script import Plan, TruthTable
 
 SETTLED = 1e-8
 """Tensions along the cables and contact forces rest when a pass moves them by less than this [N]."""
@@ -29,7 +29,7 @@ PASSES = 60
 class Patch:
     """A part of the surface that a probe presses on."""
 
-    triangles: FloatArray
+    triangles: IntArray
     """Node indices, shape (t, 3)."""
     share: FloatArray
     """Part of the force that each triangle carries [1], shape (t,)."""
@@ -40,7 +40,7 @@ class Patch:
 
     def normal(self, positions: FloatArray) -> FloatArray:
         """Return the outward unit normal of the patch, shape (3,)."""
-        area = self.share @ triangle_normals(positions, self.triangles)  # type: ignore[arg-type]
+        area = self.share @ triangle_normals(positions, self.triangles)
         return np.asarray(area / np.linalg.norm(area))
 
     def spread(self, force: FloatArray, node_count: int) -> FloatArray:
@@ -112,7 +112,9 @@ def true_robot(robot: Robot, table: TruthTable, effects: Sequence[Mapping[str, A
         try:
             moved = apply_effects(moved, [entry])
         except InputError as error:
-            raise InputError(error.what, where=f"effects[{i}]: {error.where}", found=error.found, expected=error.expected, hint=error.hint) from None
+            raise InputError(
+                error.what, where=f"effects[{i}]: {error.where}", found=error.found, expected=error.expected, hint=error.hint
+            ) from None
     return moved
 
 
@@ -150,7 +152,9 @@ def _on_mesh(body: BodyModel, mesh: TetMesh) -> BodyModel:
         made = made.with_clamp_stiffness(body.clamp_stiffness)
     loaded = np.flatnonzero(body.dead_forces.any(axis=1))
     if len(loaded):
-        made = made.with_dead_forces(embed_points(mesh, body.mesh.nodes[loaded]).spread(body.dead_forces[loaded], len(mesh.nodes)))
+        made = made.with_dead_forces(
+            embed_points(mesh, body.mesh.nodes[loaded]).spread(body.dead_forces[loaded], len(mesh.nodes))
+        )
     return made
 
 
@@ -177,7 +181,7 @@ def contact_patch(mesh: TetMesh, point: Sequence[float], radius: float) -> Patch
     normals = triangle_normals(mesh.nodes, triangles[near])
     near = near[normals @ normals[distance[near].argmin()] > 0]  # not the far side of a thin part
     share = area[near] * np.maximum(1.0 - (distance[near] / radius) ** 2, 1e-3)
-    return Patch(triangles[near], share / share.sum())  # type: ignore[arg-type]
+    return Patch(triangles[near], share / share.sum())
 
 
 # The inputs
@@ -314,13 +318,13 @@ class _Walker:
         used = self.state.segment_tensions
         moved = [np.abs(w - u).max(initial=0.0) for w, u in zip(wanted, used)]
         pressed = np.abs(load.forces + self._contact_forces(load) - forces).max(initial=0.0)
-        return max([float(pressed), *moved]) < SETTLED * max(1.0, float(np.abs(load.inputs).max(initial=0.0)))
+        return bool(max([float(pressed), *moved]) < SETTLED * max(1.0, float(np.abs(load.inputs).max(initial=0.0))))
 
     def _direction(self, i: int) -> FloatArray:
         given = self.plan.contacts[i].table.direction
         if given is None:
             return -self.patches[i].normal(self.state.positions)
-        return np.asarray(given) / np.linalg.norm(given)
+        return np.asarray(np.array(given) / np.linalg.norm(given))
 
     def _contact_forces(self, load: _Load) -> FloatArray:
         n = len(self.body.mesh.nodes)
@@ -340,6 +344,3 @@ def _known_loads(mesh: TetMesh, plan: Plan, creep: FloatArray) -> dict[int, Floa
     crept = np.einsum("fg,gpc->fpc", creep, table)
     ties = embed_points(mesh, places)
     return {k: ties.spread(crept[k], len(mesh.nodes)) for k in range(len(crept))}
-
-
-__all__ = ["Patch", "PlannedContact", "TrueContact", "TrueFrame", "contact_patch", "creep_matrix", "true_inputs", "true_mesh", "true_robot", "walk_truth"]

@@ -127,7 +127,9 @@ def leg_nodes(points: list[FloatArray], start: IntArray, turns: int) -> IntArray
         layer = []
         for cell in GRID:
             a, b = rounded(cell, roundness) * [width / 2, thickness / 2]
-            layer.append(add(points, (r + b * outward[0]) * radial + a * across + (z + b * outward[1]) * np.array([0.0, 0.0, 1.0])))
+            layer.append(
+                add(points, (r + b * outward[0]) * radial + a * across + (z + b * outward[1]) * np.array([0.0, 0.0, 1.0]))
+            )
         layers.append(np.array(layer).reshape(3, 3))
     return np.stack(layers)
 
@@ -162,7 +164,9 @@ def robot_document(mesh: TetMesh, stations: dict[str, IntArray]) -> dict[str, ob
         "material": {"young_modulus_pa": 320e3, "poisson_ratio": 0.46, "density_kg_m3": 1070.0},
         "gravity": {"vector_m_s2": [0.0, 0.0, -9.81]},
         "fixed": [{"box_m": foot_box(x[nodes[-2:]])} for nodes in stations.values()],
-        "cables": [cable_table(name, x[nodes]) for name, nodes in sorted(stations.items(), key=lambda item: "nwse".index(item[0][0]))],
+        "cables": [
+            cable_table(name, x[nodes]) for name, nodes in sorted(stations.items(), key=lambda item: "nwse".index(item[0][0]))
+        ],
         "markers": marker_tables(mesh, stations),
         "features": {"count": 51},
         "appearance": {"color_rgb": [0.16, 0.48, 0.78]},
@@ -172,7 +176,10 @@ def robot_document(mesh: TetMesh, stations: dict[str, IntArray]) -> dict[str, ob
 def foot_box(layers: FloatArray) -> list[list[float]]:
     """Return the box around the lowest two cross-sections of a leg."""
     points = layers.reshape(-1, 3)
-    return [[float(v) for v in np.floor(points.min(axis=0) * 1e3 - 0.5) / 1e3], [float(v) for v in np.ceil(points.max(axis=0) * 1e3 + 0.5) / 1e3]]
+    return [
+        [float(v) for v in np.floor(points.min(axis=0) * 1e3 - 0.5) / 1e3],
+        [float(v) for v in np.ceil(points.max(axis=0) * 1e3 + 0.5) / 1e3],
+    ]
 
 
 def cable_table(name: str, leg: FloatArray) -> dict[str, object]:
