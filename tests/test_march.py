@@ -1,0 +1,238 @@
+"""The walk along a recording: from recorded to true inputs, sharing of equal frames, history, derivatives by variants."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from analytic import bar_body
+from helpers import block_mesh
+
+from femsense import march
+from femsense.effects import apply_effects
+from femsense.errors import DataError
+from femsense.fem.equilibrium import solve_equilibrium
+from femsense.fem.mesh import embed_points
+from femsense.march import Walk, drive_of, has_history, marker_positions, solve_frame, walk_along
+from femsense.model import Observation, Robot, plain_actuation
+from femsense.recording import Recording, make_recording
+
+MARKERS = np.array([[0.1, 0.015, 0.03], [0.06, 0.0, 0.0], [0.1, 0.03, 0.015]])
+
+
+def robot(
+    effects: Sequence[Mapping[str, Any]] = (), *, gravity: tuple[float, ...] = (0.0, 0.0, -9.81), friction: float = 0.0
+) -> Robot:
+    body = bar_body(block_mesh((4, 1, 1)), gravity=gravity, friction=friction)
+    plain = Robot(name="bar", body=body, marker_names=("a", "b", "c"), marker_points=MARKERS, markers=embed_points(body.mesh, MARKERS),
+                  features=np.zeros(0, np.int64), color_rgb=None, actuation=plain_actuation(2), observation=Observation())  # fmt: skip
+    return apply_effects(plain, effects)
+
+
+def recording(inputs: Sequence[Sequence[float]], **parts: Any) -> Recording:
+    return make_recording(
+        **{"time_s": np.arange(len(inputs), dtype=float), "cable_names": ("top", "side"), "inputs": inputs, **parts}
+    )
+
+
+def walked(r: Robot, rec: Recording, frames: Sequence[int] | None = None, **options: Any) -> dict[int, np.ndarray]:
+    frames = range(rec.frame_count) if frames is None else frames
+    return {k: seen for k, _, seen, _ in walk_along(Walk(r, drive_of(r, rec)), frames, marker_positions, **options)}
+
+
+# What truly drives
+
+
+def test_true_tension_is_gain_times_recorded_plus_offset_and_never_negative() -> None:
+    r = robot([{"name": "cable_gain", "scale": {"top": 0.8}}, {"name": "cable_offset", "tension_n": {"top": 0.3, "side": -0.5}}])
+    drive = drive_of(r, recording([[1.0, 2.0], [0.0, 0.1]]))
+    np.testing.assert_allclose(drive.inputs, [[1.1, 1.5], [0.3, 0.0]])
+
+
+def test_true_displacement_is_gain_times_recorded_plus_offset_less_slack() -> None:
+    r = robot([{"name": "cable_gain", "scale": 2.0}, {"name": "cable_offset", "displacement_m": 0.001}, {"name": "cable_slack", "displacement_m": {"side": 0.004}}])  # fmt: skip
+    drive = drive_of(r, recording([[0.01, 0.02]], actuation="displacement"))
+    np.testing.assert_allclose(drive.inputs, [[0.021, 0.037]])
+
+
+def test_slack_lets_a_held_cable_do_nothing_until_it_is_taken_up() -> None:
+    r = robot([{"name": "cable_slack", "displacement_m": {"top": 0.005}}], gravity=(0, 0, 0))
+    seen = walked(r, recording([[0.0, 0], [0.004, 0], [0.008, 0]], actuation="displacement"))
+    np.testing.assert_allclose(seen[1], seen[0], atol=1e-10)
+    np.testing.assert_allclose(
+        seen[2], walked(robot(gravity=(0, 0, 0)), recording([[0.003, 0]], actuation="displacement"))[0], atol=1e-9
+    )
+
+
+def test_initial_inputs_are_added_before_gain() -> None:
+    r = robot([{"name": "cable_gain", "scale": 0.5}])
+    drive = drive_of(r, recording([[1.0, 2.0]], actuation_zero="unknown"), initial=np.array([0.2, 0.4]))
+    np.testing.assert_allclose(drive.inputs, [[0.6, 1.2]])
+
+
+def test_columns_are_taken_by_name() -> None:
+    rec = make_recording(time_s=[0.0], cable_names=("side", "top"), inputs=[[1.0, 2.0]])
+    np.testing.assert_array_equal(drive_of(robot(), rec).inputs, [[2.0, 1.0]])
+
+
+# Creep
+
+
+def crept(values: Sequence[float], times: Sequence[float], fraction: float, tau: float) -> np.ndarray:
+    r = robot([{"name": "creep", "fraction": fraction, "time_s": tau}])
+    rec = recording([[v, 0.0] for v in values], time_s=times)
+    return np.asarray(drive_of(r, rec).inputs[:, 0])
+
+
+def test_creep_of_a_steep_step_follows_its_compliance() -> None:
+    t = np.array([0.0, 1e-9, 0.5, 1.0, 3.0, 20.0])
+    found = crept([0, 1, 1, 1, 1, 1], t, 0.3, 2.0)
+    np.testing.assert_allclose(found, np.concatenate([[0], 1 + 0.3 * (1 - np.exp(-t[1:] / 2.0))]), atol=1e-7)
+
+
+def test_creep_of_a_ramp_is_the_integral_of_its_steps() -> None:
+    t = np.array([0.0, 0.7, 1.0, 2.5, 4.0])
+    f, tau = 0.4, 1.3
+    np.testing.assert_allclose(crept(2 * t, t, f, tau), 2 * t + 2 * f * (t - tau * (1 - np.exp(-t / tau))), rtol=1e-10)
+
+
+def test_creep_does_not_depend_on_how_finely_time_is_cut() -> None:
+    coarse = crept([0, 2, 2, 1], [0, 1, 3, 4], 0.5, 0.8)
+    t = np.linspace(0, 4, 81)
+    fine = crept(np.interp(t, [0, 1, 3, 4], [0, 2, 2, 1]).tolist(), t.tolist(), 0.5, 0.8)
+    np.testing.assert_allclose(fine[[0, 20, 60, 80]], coarse, rtol=1e-9)
+
+
+def test_what_was_there_before_the_first_frame_has_crept_out() -> None:
+    np.testing.assert_allclose(crept([2, 2, 2], [0, 1, 5], 0.25, 3.0), 2.5)
+
+
+def test_creep_terms_add_up() -> None:
+    r = robot([{"name": "creep", "fraction": [0.2, 0.1], "time_s": [1.0, 5.0]}])
+    t = np.array([0.0, 1.0, 2.0, 6.0])
+    found = drive_of(r, recording([[v, 0] for v in (0, 1, 1, 0)], time_s=t)).inputs[:, 0]
+    one, two = crept([0, 1, 1, 0], t.tolist(), 0.2, 1.0), crept([0, 1, 1, 0], t.tolist(), 0.1, 5.0)
+    np.testing.assert_allclose(found, np.maximum(one + two - [0, 1, 1, 0], 0))
+
+
+def test_known_loads_creep_too_and_two_at_one_place_are_one() -> None:
+    r = robot([{"name": "creep", "fraction": 0.5, "time_s": 1.0}])
+    place, t = [0.1, 0.015, 0.015], [0.0, 1.0, 2.0, 3.0]
+    once = recording([[0, 0]] * 4, time_s=t, load_frame=[1, 2, 3], load_points=[place] * 3, load_forces=[[0, 0, -1.0]] * 3)
+    halves = recording(
+        [[0, 0]] * 4, time_s=t, load_frame=[1, 1, 2, 2, 3, 3], load_points=[place] * 6, load_forces=[[0, 0, -0.5]] * 6
+    )
+    drive = drive_of(r, once)
+    ramp = 0.5 * (1 - (1 - np.exp(-1.0)))  # after the ramp over the first second
+    flow = np.array([ramp, 0.5 - (0.5 - ramp) * np.exp(-1), 0.5 - (0.5 - ramp) * np.exp(-2)])
+    np.testing.assert_allclose(-drive.load_forces[:, 2], 1 + flow, rtol=1e-9)
+    other = drive_of(r, halves)
+    for k in (1, 2, 3):
+        np.testing.assert_allclose(other.load_forces[other.load_frame == k].sum(axis=0), drive.load_forces[k - 1], atol=1e-12)
+
+
+# Walking
+
+
+def test_equal_frames_share_one_solve_and_come_out_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    rec = recording([[1.0, 0], [0.5, 0.2], [1.0, 0], [1.0, 0], [0.5, 0.2]])
+    calls: list[int] = []
+    plain = march.solve_frame
+    monkeypatch.setattr(march, "solve_frame", lambda *a, **k: calls.append(a[1]) or plain(*a, **k))
+    seen = walked(robot(), rec)
+    assert calls == [0, 1]
+    for k in range(5):
+        alone = solve_frame(Walk(robot(), drive_of(robot(), rec)), k)
+        np.testing.assert_allclose(seen[k], marker_positions(robot(), alone), atol=1e-9)
+
+
+def test_frames_with_other_loads_or_gravity_are_not_the_same() -> None:
+    rec = recording([[1.0, 0]] * 4, load_frame=[1, 2], load_points=[[0.1, 0.015, 0.03]] * 2, load_forces=[[0, 0, -0.1], [0, 0, 0.1]],
+                    gravity=[[0, 0, -9.81], [0, 0, -9.81], [0, 0, -9.81], [0, 9.81, 0]])  # fmt: skip
+    seen = walked(robot(), rec)
+    for a in range(4):
+        for b in range(a):
+            assert np.abs(seen[a] - seen[b]).max() > 1e-5
+
+
+def test_a_known_load_acts_where_it_stands() -> None:
+    rec = recording([[0, 0]], load_frame=[0], load_points=[MARKERS[0]], load_forces=[[0, 0.2, 0]])
+    body = robot().body
+    forces = embed_points(body.mesh, MARKERS[:1]).spread(np.array([[0, 0.2, 0]]), len(body.mesh.nodes))
+    np.testing.assert_allclose(
+        walked(robot(), rec)[0], robot().markers.positions(solve_equilibrium(body, nodal_forces=forces).positions), atol=1e-9
+    )
+
+
+def test_gravity_of_a_frame_replaces_that_of_the_body() -> None:
+    rec = recording([[0, 0]], gravity=[[0.0, 3.0, 1.0]])
+    np.testing.assert_allclose(
+        walked(robot(), rec)[0], walked(robot(gravity=(0.0, 3.0, 1.0)), recording([[0, 0]]))[0], atol=1e-12
+    )
+
+
+def test_with_friction_the_past_matters_and_unwanted_frames_are_walked_too() -> None:
+    up_down = recording([[0.5, 0], [1.5, 0], [0.5, 0]])
+    r = robot(friction=0.5)
+    assert has_history(r) and not has_history(robot())
+    seen = walked(r, up_down)
+    assert np.abs(seen[2] - seen[0]).max() > 1e-5
+    np.testing.assert_allclose(walked(r, up_down, [2])[2], seen[2], atol=1e-9)
+    plain = walked(robot(), up_down)
+    np.testing.assert_array_equal(plain[2], plain[0])
+
+
+def test_variants_give_the_derivative_of_frames_solved_anew() -> None:
+    rec, h = recording([[1.0, 0.3], [1.5, 0.1]]), 1e-4
+    base = robot()
+    variants = [robot([{"name": "stiffness", "scale": 1 + h}]), robot([{"name": "poisson", "poisson_ratio": 0.4 + h}]), robot([{"name": "payload", "point_m": MARKERS[1].tolist(), "force_n": [0, 0, h]}])]  # fmt: skip
+    behind = [robot([{"name": "stiffness", "scale": 1 - h}]), robot([{"name": "poisson", "poisson_ratio": 0.4 - h}]), robot([{"name": "payload", "point_m": MARKERS[1].tolist(), "force_n": [0, 0, -h]}])]  # fmt: skip
+    for k, _, seen, others in walk_along(
+        Walk(base, drive_of(base, rec)), [0, 1], marker_positions, [Walk(v, drive_of(v, rec)) for v in variants]
+    ):
+        for forward, ahead, back in zip(others, variants, behind):
+            alone = [marker_positions(r, solve_equilibrium(r.body, tension=dict(zip(("top", "side"), rec.inputs[k])), relative_tolerance=1e-12)) for r in (ahead, back)]  # fmt: skip
+            central = (alone[0] - alone[1]) / (2 * h)
+            assert np.abs((forward - seen) / h - central).max() < 1e-3 * np.abs(central).max()  # one-sided: h of curvature
+            np.testing.assert_allclose(forward, alone[0], atol=1e-4 * h * np.abs(central).max() + 1e-11)
+
+
+def test_a_variant_in_observation_alone_costs_no_solve(monkeypatch: pytest.MonkeyPatch) -> None:
+    base = robot()
+    moved = base.with_marker_points(MARKERS + 0.001)
+    rec = recording([[1.0, 0.3]])
+    calls: list[int] = []
+    plain = march.solve_frame
+    monkeypatch.setattr(march, "solve_frame", lambda *a, **k: calls.append(a[1]) or plain(*a, **k))
+    drive = drive_of(base, rec)
+    _, _, seen, others = next(iter(walk_along(Walk(base, drive), [0], marker_positions, [Walk(moved, drive)])))
+    assert calls == [0] and 5e-4 < np.abs(others[0] - seen).max() < 2e-3
+
+
+def test_a_variant_in_gravity_is_solved() -> None:
+    base, rec = robot(), recording([[1.0, 0.3]])
+    tilted = replace(base, body=base.body.with_gravity([1.0, 0, -9.81]))
+    _, _, seen, others = next(
+        iter(walk_along(Walk(base, drive_of(base, rec)), [0], marker_positions, [Walk(tilted, drive_of(tilted, rec))]))
+    )
+    assert np.abs(others[0] - seen).max() > 1e-6
+
+
+def test_earlier_states_are_starts_and_are_brought_up_to_date() -> None:
+    base, starts = robot(), {}
+    cold = walked(base, recording([[1.0, 0.3], [2.0, 0.3]]), starts=starts)
+    assert set(starts) == {0, 1}
+    warm = walked(base, recording([[1.001, 0.3], [2.0, 0.3]]), starts=starts)
+    assert np.abs(warm[0] - cold[0]).max() > 1e-9
+    np.testing.assert_allclose(warm[0], walked(base, recording([[1.001, 0.3]]))[0], atol=1e-9)
+    np.testing.assert_allclose(warm[1], cold[1], atol=1e-9)
+
+
+def test_a_frame_without_equilibrium_names_itself() -> None:
+    base = robot()
+    loose = replace(base, body=bar_body(block_mesh((4, 1, 1)), clamped=False, gravity=(0, 0, -9.81)))
+    with pytest.raises(DataError, match="no equilibrium in frame 0: singular: nothing holds the body"):
+        walked(loose, recording([[0.0, 0]]))
