@@ -81,16 +81,17 @@ def _arrow(axes: Any, tip: FloatArray, force: FloatArray, color: str, width: flo
 
 def _equal_axes(axes: Any, points: FloatArray) -> None:
     middle, half = (points.max(axis=0) + points.min(axis=0)) / 2, 0.55 * float(np.ptp(points, axis=0).max())
-    axes.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half), zlim=(middle[2] - half, middle[2] + half),
+    low = float(points[:, 2].min())
+    axes.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half), zlim=(low, low + 1.4 * half),
              xlabel="x [mm]", ylabel="y [mm]", zlabel="z [mm]")  # fmt: skip
-    axes.set_box_aspect((1, 1, 1), zoom=1.1)
+    axes.set_box_aspect((1, 1, 0.7), zoom=1.15)
     axes.view_init(elev=22, azim=-62)
     axes.computed_zorder = False
 
 
 def _draw_forces(axes: Any, before: Run, after: Run, truth: Sequence[TrueContact]) -> None:
     """Draw the sum of the sensed forces of each frame next to the truth."""
-    frames = sorted({c.frame for c in (*before.contacts, *after.contacts, *truth)})
+    frames = sorted({c.frame for c in before.contacts} | {c.frame for c in after.contacts} | {c.frame for c in truth})
     for run, color, label, shift in ((before, DECLARED, "declared robot", -0.12), (after, IMPROVED, "improved robot", 0.12)):
         size = [_total([c.force_n_xyz for c in run.contacts if c.frame == k]) for k in frames]
         std = [float(np.sqrt(sum(c.std_n**2 for c in run.contacts if c.frame == k))) for k in frames]
@@ -118,7 +119,15 @@ def _draw_forces(axes: Any, before: Run, after: Run, truth: Sequence[TrueContact
     axes.set(xlabel="frame", ylabel="contact force [N]", title="force over the frames")
     axes.xaxis.get_major_locator().set_params(integer=True)
     axes.spines[["top", "right"]].set_visible(False)
-    axes.set_ylim(bottom=0)
+    largest = max(
+        (
+            _total([c.force_n_xyz for c in group if c.frame == k])
+            for group in (before.contacts, after.contacts, truth)
+            for k in frames
+        ),
+        default=1.0,
+    )
+    axes.set_ylim(0, 1.4 * max(largest, 1e-3))
     if frames:
         axes.legend(frameon=False, fontsize=8)
 
@@ -141,12 +150,12 @@ def _draw_residuals(axes: Any, document: Mapping[str, Any]) -> None:
             )
             axes.text(value, i + shift, f" {value:.2f} mm", va="center", fontsize=9)
     axes.set_yticks(range(len(keys)), [name for _, name in keys])
-    axes.margins(x=0.18)
+    axes.margins(x=0.45)
     axes.set(xlabel="rms distance of markers from the model [mm]", title=_found(loop))
     axes.spines[["top", "right"]].set_visible(False)
     if loop.get("noise_m") is not None:
-        axes.axvline(1e3 * loop["noise_m"], color=TRUE, lw=1, ls=":", label="noise")
-    axes.legend(frameon=False, fontsize=8)
+        axes.axvline(1e3 * loop["noise_m"], color=TRUE, lw=1, ls=":", label="noise of a marker")
+    axes.legend(frameon=False, fontsize=8, loc="center right")
 
 
 def _both(loop: Mapping[str, Any], key: str) -> bool:
@@ -159,9 +168,12 @@ def _found(loop: Mapping[str, Any]) -> str:
 
 
 def _strongest_frame(run: Run, truth: Sequence[TrueContact]) -> int:
-    known = truth or run.contacts
-    best = max(known, key=lambda c: float(np.linalg.norm(c.force_n_xyz)), default=None)
-    return run.frames[0].frame if best is None else best.frame
+    """Return the frame of the largest true force that was sensed, else of the largest sensed force."""
+    sensed = {c.frame for c in run.contacts}
+    sizes = [(float(np.linalg.norm(c.force_n_xyz)), c.frame) for c in truth if c.frame in sensed] or [
+        (c.force_n, c.frame) for c in run.contacts
+    ]
+    return max(sizes)[1] if sizes else run.frames[0].frame
 
 
 def _total(forces: Sequence[FloatArray]) -> float:

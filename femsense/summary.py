@@ -12,6 +12,8 @@ from femsense.calib.calibration import Calibration
 if TYPE_CHECKING:
     from femsense.sensing import ContactForce, Run
 
+LISTED = 6
+"""So many frames are listed one by one."""
 VERDICTS = {
     "effects": "the data name what the model lacks",
     "none": "the model explains the data to their noise",
@@ -51,6 +53,7 @@ def calibration_text(calibration: Calibration) -> str:
 def run_document(run: Run) -> dict[str, Any]:
     """Return a run in numbers."""
     good = [frame for frame in run.frames if frame.status == "ok"]
+    touched = [frame for frame in good if frame.contacts] or good
     strongest = _strongest(run)
     return {
         "robot": run.robot.name,
@@ -59,8 +62,8 @@ def run_document(run: Run) -> dict[str, Any]:
         "contacts": len(run.contacts),
         "frames_with_contact": len({contact.frame for contact in run.contacts}),
         "largest_force_n": None if strongest is None else strongest.force_n,
-        "rms_before_m": _median([frame.rms_before_m for frame in good]),
-        "rms_after_m": _median([frame.rms_after_m for frame in good]),
+        "rms_before_m": _median([frame.rms_before_m for frame in touched]),
+        "rms_after_m": _median([frame.rms_after_m for frame in touched]),
         "ms_per_frame": _median([frame.ms for frame in good]),
         "known_loads": run.known_loads,
         "failed": [{"frame": frame.frame, "status": frame.status} for frame in run.frames if frame.status != "ok"],
@@ -76,7 +79,7 @@ def run_text(run: Run) -> str:
         rows.append(
             [
                 "residual",
-                f"{1e3 * facts['rms_before_m']:.3f} → {1e3 * facts['rms_after_m']:.3f} mm rms with contact forces, median of the frames",
+                f"{1e3 * facts['rms_before_m']:.3f} → {1e3 * facts['rms_after_m']:.3f} mm rms with the forces, median of the frames with contact",
             ]
         )
     if strongest is not None:
@@ -93,10 +96,12 @@ def run_text(run: Run) -> str:
                 f"{load['declared_n']:.3f} N declared, {load['sensed_n']:.3f} N sensed ({load['error_percent']:+.1f} %)",
             ]
         )
-    for frame in facts["failed"][:5]:
+    if len(run.known_loads) > LISTED:
+        rows.append(["known loads", f"{len(run.known_loads) - LISTED} frames more: see run.json"])
+    for frame in facts["failed"][:LISTED]:
         rows.append([f"no result, frame {frame['frame']}", frame["status"]])
-    if len(facts["failed"]) > 5:
-        rows.append(["no result", f"in {len(facts['failed']) - 5} frames more: see frames.csv"])
+    if len(facts["failed"]) > LISTED:
+        rows.append(["no result", f"in {len(facts['failed']) - LISTED} frames more: see frames.csv"])
     return f"run of {run.robot.name}\n{columns(rows)}"
 
 

@@ -1,0 +1,55 @@
+# make demo   the whole chain on the recording that comes along, into femsense-demo/
+# make test   lint, types and all tests
+# make lint   ruff and mypy
+# make clean  what the targets above have made
+#
+# Each sets up what it needs first: a virtual environment in .venv with femsense and what it depends on. PYTHON=… chooses the
+# Python (3.11 or 3.12); DEMO=… the folder of the demo's results; JOBS=… how many tests run at a time.
+
+VENV := .venv
+DEMO ?= femsense-demo
+JOBS ?= 2
+RUN := $(VENV)/bin
+SOURCES := pyproject.toml hatch_build.py $(shell find femsense/xr/viewer -type f -not -path '*/dist/*' -not -path '*/node_modules/*' 2>/dev/null)
+export OMP_NUM_THREADS ?= 1
+export OPENBLAS_NUM_THREADS ?= 1
+export MKL_NUM_THREADS ?= 1
+
+.PHONY: demo test lint clean
+.DEFAULT_GOAL := demo
+
+demo: $(VENV)/.installed
+	$(RUN)/femsense demo -o $(DEMO)
+
+test: lint
+	$(RUN)/python -m pytest -n $(JOBS)
+
+lint: $(VENV)/.installed-dev
+	$(RUN)/ruff check .
+	$(RUN)/ruff format --check .
+	$(RUN)/mypy
+
+clean:
+	rm -rf $(VENV) build dist femsense-demo .pytest_cache .mypy_cache .ruff_cache .hypothesis femsense/xr/viewer/dist
+	find . -name __pycache__ -type d -not -path './.git/*' -prune -exec rm -rf {} +
+
+$(VENV)/.installed: $(VENV)/.python $(SOURCES)
+	$(RUN)/python -m pip install --disable-pip-version-check --quiet --editable .
+	touch $@
+
+$(VENV)/.installed-dev: $(VENV)/.python $(SOURCES)
+	$(RUN)/python -m pip install --disable-pip-version-check --quiet --editable '.[dev]'
+	touch $(VENV)/.installed $@
+
+# The first of these that runs and has the right version makes the environment.
+$(VENV)/.python:
+	@for candidate in $(PYTHON) python3.12 python3.11 python3 python; do \
+		if $$candidate -c 'import sys, venv, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 12))' >/dev/null 2>&1; then \
+			echo "setting up $(VENV) with $$candidate: a few minutes, once"; \
+			$$candidate -m venv --clear $(VENV) && touch $@ && exit 0; \
+			exit 1; \
+		fi; \
+	done; \
+	echo "femsense needs Python 3.11 or 3.12 with venv, and neither was found." >&2; \
+	echo "On Debian or Ubuntu: apt-get install python3-venv; elsewhere name it: make PYTHON=/path/to/python3.12 $(MAKECMDGOALS)" >&2; \
+	exit 1
