@@ -119,7 +119,7 @@ def _alternate(robot: Robot, scene: Scene, poses: list[FloatArray], initial: Flo
     from scipy.optimize import lsq_linear
 
     assert initial is not None
-    low, high = _input_bounds(robot, scene.recording)
+    low, high = input_bounds(robot, scene.recording)
     plain, starts = Hypothesis(robot), dict[int, Equilibrium]()
     empty, pivot = np.zeros(0), robot.marker_points.mean(axis=0)
     for _ in range(rounds):
@@ -142,7 +142,7 @@ def _rigid_again(robot: Robot, scene: Scene, jet: SceneJet) -> list[FloatArray]:
     return [fit_rigid(predicted[scene.view == v], scene.points[scene.view == v]) for v in range(len(scene.recording.camera_names))]
 
 
-def _input_bounds(robot: Robot, recording: Recording) -> tuple[FloatArray, FloatArray]:
+def input_bounds(robot: Robot, recording: Recording) -> tuple[FloatArray, FloatArray]:
     """Return bounds of the initial inputs, so that no frame leaves the limits of its cable."""
     cables = robot.body.cables
     if recording.actuation == "displacement":
@@ -192,7 +192,7 @@ def fit_joint(
         J_in = np.vstack([(row[:, :, None] * jet.by_initial).reshape(jet.residual.size, a), np.zeros((jet.rest.size, a))])
         return residual, np.hstack([J_pose, J_in])
 
-    low, high = _input_bounds(robot, scene.recording) if a else (np.zeros(0), np.zeros(0))
+    low, high = input_bounds(robot, scene.recording) if a else (np.zeros(0), np.zeros(0))
     free = np.full(6 * len(moving), np.inf)
     bounds = np.concatenate([-free, low]), np.concatenate([free, high])
     theta = np.concatenate([np.zeros(6 * len(moving)), initial if a and initial is not None else np.zeros(0)])

@@ -78,20 +78,14 @@ class Hypothesis:
 
     def robot_at(self, coordinates: FloatArray) -> Robot:
         """Return the robot with the effects at coordinates, shape (p,)."""
-        robot = self.robot
+        robot, at = self.robot, 0
         for (effect, _, parameters), entry in zip(self.terms, self.entries(coordinates)):
-            if parameters and all(p.coordinate(p.value(c)) == p.null for p, c in zip(parameters, self._part(effect, coordinates))):
+            own = coordinates[at : at + len(parameters)]
+            at += len(parameters)
+            if parameters and all(c == p.null for p, c in zip(parameters, own)):
                 continue
             robot = effect.apply(robot, {k: v for k, v in entry.items() if k != "name"})
         return robot
-
-    def _part(self, wanted: Effect, coordinates: FloatArray) -> FloatArray:
-        at = 0
-        for effect, _, parameters in self.terms:
-            if effect is wanted:
-                return coordinates[at : at + len(parameters)]
-            at += len(parameters)
-        return coordinates[:0]
 
 
 def make_scene(robot: Robot, recording: Recording, frames: IntArray) -> Scene:

@@ -1,0 +1,223 @@
+"""The joint fit of poses, initial inputs, modulus, cable zeros and effects over several recordings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from femsense.arrays import BoolArray, FloatArray
+from femsense.calib.fit import FitResult, gauss_newton
+from femsense.calib.forward import Hypothesis, Scene, SceneJet, evaluate_scene, rest_residual
+from femsense.effects.loads import STANDARD_GRAVITY
+from femsense.fem.equilibrium import Equilibrium
+from femsense.loop.noise import Groups, Noise, whiten
+from femsense.pose import move_pose
+
+DECLARED_POSE_STD = np.array([2e-3] * 3 + [3e-4] * 3)
+"""How far a declared pose is trusted [rad, m]."""
+GRAVITY_STD = 0.1
+"""How far the size of gravity is known to be 9.80665 m/s² on an unknown site [m/s²]."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Trial:
+    """One recording as the fit sees it."""
+
+    scene: Scene
+    groups: Groups
+    poses: tuple[FloatArray, ...]
+    """Where the fit starts; pose steps are counted from here."""
+    initial: FloatArray | None
+    """Start of the initial inputs; None where they are known."""
+    input_low: FloatArray
+    input_high: FloatArray
+    starts: dict[int, Equilibrium]
+    """States of earlier evaluations."""
+
+    @property
+    def size(self) -> int:
+        """Number of the trial's own parameters."""
+        return 6 * len(self.poses) + (0 if self.initial is None else len(self.initial))
+
+    def place(self, own: FloatArray, pivot: FloatArray) -> tuple[list[FloatArray], FloatArray | None]:
+        """Return poses and initial inputs for the trial's own parameters."""
+        poses = [move_pose(T, own[6 * v : 6 * v + 6], pivot_a=pivot) for v, T in enumerate(self.poses)]
+        return poses, None if self.initial is None else own[6 * len(self.poses) :]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Prior:
+    """Independent Gaussian priors on the coordinates of a hypothesis."""
+
+    mean: FloatArray
+    std: FloatArray
+    """inf: none."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Jets:
+    """Unwhitened residuals and derivatives of all trials at one point."""
+
+    jets: list[SceneJet]
+    theta: FloatArray
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class JointFit:
+    """The outcome of a joint fit."""
+
+    hypothesis: Hypothesis
+    prior: Prior
+    fit: FitResult
+    own: int
+    """Number of parameters that belong to recordings; those of the hypothesis follow."""
+    chi2: float
+    """Whitened sum of squares of markers and priors."""
+    jets: list[SceneJet]
+
+    @property
+    def coordinates(self) -> FloatArray:
+        """Coordinates of the hypothesis, shape (p,)."""
+        return self.fit.theta[self.own :]
+
+    @property
+    def std(self) -> FloatArray:
+        """Standard deviations of the coordinates, shape (p,)."""
+        return np.sqrt(np.maximum(np.diag(self.fit.covariance)[self.own :], 0.0))
+
+    @property
+    def rms(self) -> float:
+        """Root mean square 3-D residual of the markers [m]."""
+        return rms_of([jet.residual for jet in self.jets])
+
+
+def rms_of(residuals: list[FloatArray]) -> float:
+    """Return the root mean square 3-D length of residuals (k, 3) [m]."""
+    return float(np.sqrt(np.mean(np.concatenate([(r**2).sum(axis=1) for r in residuals]))))
+
+
+@dataclass(eq=False, slots=True)
+class JointProblem:
+    """Whitened residual and Jacobian over trials; remembers the last jets."""
+
+    hypothesis: Hypothesis
+    prior: Prior
+    trials: list[Trial]
+    factors: list[FloatArray]
+    seat_std: float
+    last: Jets | None = None
+
+    @property
+    def own(self) -> int:
+        return sum(t.size for t in self.trials)
+
+    def start(self, coordinates: FloatArray) -> FloatArray:
+        """Return θ at the trials' starts."""
+        parts = [np.concatenate([np.zeros(6 * len(t.poses)), t.initial if t.initial is not None else np.zeros(0)]) for t in self.trials]
+        return np.concatenate([*parts, coordinates])
+
+    def bounds(self) -> tuple[FloatArray, FloatArray]:
+        """Return bounds of θ."""
+        low, high = [], []
+        for t in self.trials:
+            free = np.full(6 * len(t.poses), np.inf)
+            low += [-free, t.input_low if t.initial is not None else np.zeros(0)]
+            high += [free, t.input_high if t.initial is not None else np.zeros(0)]
+        parameters = self.hypothesis.parameters
+        return np.concatenate([*low, [p.low for p in parameters]]), np.concatenate([*high, [p.high for p in parameters]])
+
+    def evaluate(self, theta: FloatArray, derivative: bool) -> tuple[FloatArray, FloatArray | None]:
+        """Return whitened residual (N,) and Jacobian (N, p): markers, seats, declared poses, priors."""
+        coordinates = theta[self.own :]
+        rows, blocks, jets, at = [], [], [], 0
+        for trial, factor in zip(self.trials, self.factors):
+            own = theta[at : at + trial.size]
+            jet = self.jet(trial, own, coordinates, derivative)
+            jets.append(jet)
+            r, J = self._scene_rows(trial, factor, jet, own, at, len(theta), derivative)
+            rows.append(r)
+            blocks.append(J)
+            at += trial.size
+        r, J = self._prior_rows(coordinates, len(theta))
+        rows.append(r)
+        blocks.append(J)
+        self.last = Jets(jets, theta)
+        return np.concatenate(rows), np.vstack(blocks) if derivative else None
+
+    def jet(self, trial: Trial, own: FloatArray, coordinates: FloatArray, derivative: bool) -> SceneJet:
+        """Return the residuals and derivatives of one trial."""
+        pivot = self.hypothesis.robot.marker_points.mean(axis=0)
+        poses, initial = trial.place(own, pivot)
+        return evaluate_scene(self.hypothesis, trial.scene, coordinates, poses, initial, derivative=derivative,
+                              vary_initial=trial.initial is not None, pivot=pivot, starts=trial.starts)  # fmt: skip
+
+    def _scene_rows(
+        self, trial: Trial, factor: FloatArray, jet: SceneJet, own: FloatArray, at: int, width: int, derivative: bool
+    ) -> tuple[FloatArray, FloatArray]:
+        poses = 6 * len(trial.poses)
+        declared = np.array([T is not None for T in trial.scene.recording.T_robot_camera]).repeat(6)
+        trust = np.where(declared, 1.0 / np.tile(DECLARED_POSE_STD, len(trial.poses)), 0.0)
+        r = np.concatenate([whiten(factor, jet.residual), jet.rest.ravel() / self.seat_std, trust * own[:poses]])
+        J = np.zeros((len(r), width if derivative else 0))
+        if not derivative:
+            return r, J
+        k, s = jet.residual.size, jet.rest.size
+        J[:k, at : at + poses] = whiten(factor, jet.by_pose)
+        J[:k, at + poses : at + trial.size] = whiten(factor, jet.by_initial)
+        J[:k, self.own :] = whiten(factor, jet.by_effect)
+        J[k : k + s, at : at + poses] = jet.rest_by_pose.reshape(s, -1) / self.seat_std
+        J[k + s :, at : at + poses] = np.diag(trust)
+        return r, J
+
+    def _prior_rows(self, coordinates: FloatArray, width: int) -> tuple[FloatArray, FloatArray]:
+        known = np.isfinite(self.prior.std)
+        r = (coordinates - self.prior.mean)[known] / self.prior.std[known]
+        J = np.zeros((len(r), width))
+        J[np.arange(len(r)), self.own + np.flatnonzero(known)] = 1.0 / self.prior.std[known]
+        gravity = self.gravity_at()
+        if gravity is None or np.linalg.norm(coordinates[gravity]) < 1e-3:
+            return r, J
+        vector = coordinates[gravity]
+        size = float(np.linalg.norm(vector))
+        row = np.zeros((1, width))
+        row[0, self.own + np.flatnonzero(gravity)] = vector / size / GRAVITY_STD
+        return np.append(r, (size - STANDARD_GRAVITY) / GRAVITY_STD), np.vstack([J, row])
+
+    def gravity_at(self) -> BoolArray | None:
+        """Return which coordinates are the components of gravity, or None."""
+        mask = np.array([p.key == "vector_m_s2" for p in self.hypothesis.parameters], dtype=bool)
+        return mask if mask.any() else None
+
+
+def fit_jointly(
+    hypothesis: Hypothesis, prior: Prior, trials: list[Trial], noise: Noise, seat_std: float, coordinates: FloatArray,
+    *, own: FloatArray | None = None, max_iterations: int = 12,
+) -> JointFit:  # fmt: skip
+    """Fit poses, initial inputs and the coordinates of a hypothesis together, in full nonlinearity.
+
+    Arguments:
+        hypothesis, prior: what is fitted, and what is known of it beforehand.
+        trials: the recordings.
+        noise: weights of the residuals.
+        seat_std: of seats measured by rest.csv against their declared places [m].
+        coordinates: start of the hypothesis, shape (p,).
+        own: start of the recordings' own parameters; by default where the trials start.
+        max_iterations: Gauss–Newton steps.
+
+    Raises:
+        DataError: no equilibrium at the start.
+    """
+    problem = JointProblem(hypothesis, prior, trials, [noise.whitener(t.groups) for t in trials], seat_std)
+    theta = problem.start(coordinates)
+    if own is not None:
+        theta[: problem.own] = own
+    low, high = problem.bounds()
+    fit = gauss_newton(problem.evaluate, theta, low=low, high=high, max_iterations=max_iterations, tolerance=1e-6)
+    if problem.last is None or not np.array_equal(problem.last.theta, fit.theta) or not problem.last.jets[0].by_pose.size:
+        problem.evaluate(fit.theta, True)
+    assert problem.last is not None
+    return JointFit(hypothesis, prior, fit, problem.own, float(fit.residual @ fit.residual), problem.last.jets)
+
+
+__all__ = ["JointFit", "JointProblem", "Prior", "Trial", "fit_jointly", "rest_residual", "rms_of"]

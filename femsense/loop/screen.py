@@ -1,0 +1,167 @@
+"""Screening: how much of the residual each effect explains beyond what calibration can imitate.
+
+With z the whitened nuisance columns (poses, initial inputs, modulus, zeros, and the effects that are in the model already) and P the
+projector on their orthogonal complement, an effect's field s is judged by P s alone (Frisch–Waugh–Lovell): it is as if every nuisance were
+refitted with it. ρ = |P s| / |s| is the share that calibration leaves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import lsq_linear
+
+from femsense.arrays import FloatArray
+from femsense.calib.forward import Hypothesis
+from femsense.effects import EFFECTS, Effect, Entry, Parameter
+from femsense.errors import FemsenseError
+from femsense.loop.joint import JointFit, JointProblem
+from femsense.loop.noise import whiten
+
+NUISANCE = ("stiffness", "cable_offset")
+"""Effects that are always fitted along."""
+TESTABLE = 0.1
+"""An effect of which calibration imitates more than 90 % cannot be tested."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Candidate:
+    """An effect with a seed, as a column block at the current model."""
+
+    effect: Effect
+    seed: Entry
+    parameters: tuple[Parameter, ...]
+    raw: list[FloatArray]
+    """Columns in metres, one array (k, 3, q) a trial."""
+    columns: FloatArray
+    """Whitened, nuisance projected out, shape (N, q)."""
+    retained: float
+    """ρ."""
+    step: FloatArray
+    """Best linear step from the null, shape (q,)."""
+    gain: float
+    """Decrease of χ² by that step."""
+    score: float
+    """dBIC: gain − q log n − 2 log m."""
+    smallest: FloatArray
+    """Size of each parameter (in its coordinate) that would just have been seen, shape (q,)."""
+
+
+def candidates_for(base: JointFit, control: str, *, names: Sequence[str], has_seats: bool) -> list[tuple[Effect, Entry, tuple[Parameter, ...]]]:
+    """Return the effects and seeds to try on top of a fitted model."""
+    present = {effect.name for effect, _, _ in base.hypothesis.terms}
+    robot = base.hypothesis.robot_at(base.coordinates)
+    result = []
+    for effect in EFFECTS:
+        if effect.name not in names or effect.name in present or (effect.name == "marker_offset" and has_seats):
+            continue
+        for seed in effect.seeds(robot):
+            parameters = effect.parameters(robot, control)
+            if parameters:
+                result.append((effect, seed, parameters))
+    return result
+
+
+def screen(
+    base: JointFit, problem: JointProblem, todo: list[tuple[Effect, Entry, tuple[Parameter, ...]]], n_effective: float
+) -> list[Candidate]:
+    """Return all candidates with their linear scores, the best first.
+
+    Arguments:
+        base: the current fit.
+        problem: its problem (trials and noise).
+        todo: effects to try.
+        n_effective: number of independent observations, for BIC.
+    """
+    usable, raw = _columns(base, problem, todo)
+    nuisance = np.asarray(base.fit.jacobian)
+    Q = _orthonormal(nuisance)
+    residual = base.fit.residual - Q @ (Q.T @ base.fit.residual)
+    spans = np.cumsum([0, *(len(p) for _, _, p in usable)])
+    effects = max(len({e.name for e, _, _ in usable}), 1)
+    result = []
+    for i, (effect, seed, parameters) in enumerate(usable):
+        own = [block[:, :, spans[i] : spans[i + 1]] for block in raw]
+        whole = _whitened(base, problem, own)
+        if not np.isfinite(whole).all() or np.linalg.norm(whole) == 0:
+            continue
+        left = whole - Q @ (Q.T @ whole)
+        step, gain = _best_step(left, residual, parameters)
+        q = len(parameters)
+        score = gain - q * np.log(n_effective) - 2.0 * np.log(effects)
+        retained = float(np.linalg.norm(left) / np.linalg.norm(whole))
+        result.append(Candidate(effect, seed, parameters, own, left, retained, step, gain, float(score), _smallest(left, q, n_effective)))
+    return sorted(result, key=lambda c: -c.score)
+
+
+def _columns(
+    base: JointFit, problem: JointProblem, todo: list[tuple[Effect, Entry, tuple[Parameter, ...]]]
+) -> tuple[list[tuple[Effect, Entry, tuple[Parameter, ...]]], list[FloatArray]]:
+    """Return the effects that can be evaluated, and their columns [m], one array (k, 3, Σq) a trial."""
+    fixed = base.hypothesis.robot_at(base.coordinates)
+    usable = []
+    for effect, seed, parameters in todo:
+        try:
+            probe = Hypothesis(fixed, ((effect, seed, parameters),))
+            moved = np.array([p.null + p.step for p in parameters])
+            probe.robot_at(moved)
+            usable.append((effect, seed, parameters))
+        except FemsenseError:
+            continue
+    every = Hypothesis(fixed, tuple(usable))
+    null = np.array([p.null for p in every.parameters])
+    probe_problem = JointProblem(every, problem.prior, problem.trials, problem.factors, problem.seat_std)
+    columns, at = [], 0
+    for trial in problem.trials:
+        jet = probe_problem.jet(trial, base.fit.theta[at : at + trial.size], null, True)
+        columns.append(jet.by_effect)
+        at += trial.size
+    return usable, columns
+
+
+def _whitened(base: JointFit, problem: JointProblem, own: list[FloatArray]) -> FloatArray:
+    """Return columns whitened and padded with zeros to the rows of the fit (seats, declared poses and priors see nothing)."""
+    q = own[0].shape[2]
+    result = np.zeros((len(base.fit.residual), q))
+    at = 0
+    for trial, factor, block, jet in zip(problem.trials, problem.factors, own, base.jets):
+        result[at : at + block.shape[0] * 3] = whiten(factor, block)
+        at += block.shape[0] * 3 + jet.rest.size + 6 * len(trial.poses)
+    return result
+
+
+def _orthonormal(columns: FloatArray) -> FloatArray:
+    norm = np.linalg.norm(columns, axis=0)
+    if not (norm > 0).any():
+        return np.zeros((len(columns), 0))
+    U, s, _ = np.linalg.svd(columns[:, norm > 0] / norm[norm > 0], full_matrices=False)
+    return np.asarray(U[:, s > 1e-9 * s[0]])
+
+
+def _best_step(columns: FloatArray, residual: FloatArray, parameters: Sequence[Parameter]) -> tuple[FloatArray, float]:
+    """Return the bounded step that explains most, and the decrease of χ²."""
+    null = np.array([p.null for p in parameters])
+    low, high = np.array([p.low for p in parameters]) - null, np.array([p.high for p in parameters]) - null
+    scale = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    low, high = np.minimum(low * scale, -1e-12), np.maximum(high * scale, 1e-12)
+    answer = lsq_linear(columns / scale, -residual, bounds=(low, high))
+    gain = float(residual @ residual) - float(np.sum((residual + columns / scale @ answer.x) ** 2))
+    return np.asarray(answer.x / scale), gain
+
+
+def _smallest(columns: FloatArray, q: int, n_effective: float) -> FloatArray:
+    """Return the size of each parameter at which the expected dBIC reaches 10."""
+    needed = np.sqrt(10.0 + q * np.log(n_effective))
+    norm = np.linalg.norm(columns, axis=0)
+    return np.asarray(np.where(norm > 0, needed / np.maximum(norm, 1e-300), np.inf))
+
+
+def confounding(a: Candidate, b: Candidate) -> float:
+    """Return how much of a's field b can imitate once nuisance is projected out (the largest canonical correlation)."""
+    A, B = _orthonormal(a.columns), _orthonormal(b.columns)
+    if not A.size or not B.size:
+        return 0.0
+    direction = a.columns @ a.step if np.linalg.norm(a.columns @ a.step) > 0 else a.columns[:, 0]
+    return float(np.linalg.norm(B.T @ direction) / max(np.linalg.norm(direction), 1e-300))

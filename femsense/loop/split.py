@@ -1,0 +1,62 @@
+"""Which frames are fitted and which are held out: whole sweeps, chosen before any fit."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from femsense.arrays import IntArray
+from femsense.recording import Recording
+
+
+def sweeps_of(recording: Recording, frames: IntArray) -> IntArray:
+    """Return the number of the sweep that each frame belongs to, shape (f,).
+
+    A sweep is what the column `sweep` says; without it an excursion of the inputs from their lowest level and back; where
+    the inputs do not move, a run of frames under the same loads.
+    """
+    if recording.sweep is not None:
+        labels = [recording.sweep[k] for k in frames]
+        return np.unique(labels, return_inverse=True)[1] if len(set(labels)) > 1 else _runs(recording, frames)
+    moving = np.ptp(recording.inputs, axis=0).max(initial=0.0) > 0 if recording.inputs.size else False
+    return _excursions(recording, frames) if moving else _runs(recording, frames)
+
+
+def _excursions(recording: Recording, frames: IntArray) -> IntArray:
+    inputs = recording.inputs
+    height = np.abs(inputs - inputs.min(axis=0)).max(axis=1)
+    resting = height <= 0.05 * height.max()
+    starts = resting & ~np.concatenate([[False], resting[:-1]])
+    number = np.maximum(np.cumsum(starts) - 1, 0)
+    return np.unique(number[frames], return_inverse=True)[1]
+
+
+def _runs(recording: Recording, frames: IntArray) -> IntArray:
+    keys = [state_key(recording, int(k)) for k in frames]
+    change = np.array([i > 0 and keys[i] != keys[i - 1] for i in range(len(keys))], dtype=bool)
+    return np.cumsum(change)
+
+
+def state_key(recording: Recording, frame: int) -> bytes:
+    """Return what tells apart frames under different inputs, loads or gravity."""
+    rows = recording.load_frame == frame
+    parts = [recording.inputs[frame], recording.load_points[rows].ravel(), recording.load_forces[rows].ravel()]
+    if recording.gravity is not None:
+        parts.append(recording.gravity[frame])
+    return np.concatenate([np.asarray(p, dtype=float).ravel() for p in parts]).tobytes()
+
+
+def hold_out(recording: Recording, frames: IntArray) -> tuple[IntArray, IntArray, str]:
+    """Return frames to fit, frames to hold out, and how they were chosen in words.
+
+    A quarter of the sweeps, evenly spread and the last among them; of two or three sweeps the last one; of a single sweep
+    its last quarter.
+    """
+    number = sweeps_of(recording, frames)
+    count = int(number.max()) + 1
+    if count >= 2:
+        wanted = max(1, round(count / 4))
+        held = np.unique(np.round(np.linspace(count - 1, 0, wanted + 1)[:-1]).astype(int))
+        mask = np.isin(number, held)
+        return frames[~mask], frames[mask], f"{len(held)} of {count} sweeps"
+    split = max(1, round(0.75 * len(frames)))
+    return frames[:split], frames[split:], "the last quarter of the frames (one sweep only)"
