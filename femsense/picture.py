@@ -13,8 +13,8 @@ from femsense.fem.mesh import TetMesh, surface_triangles
 from femsense.files import write_beside
 
 if TYPE_CHECKING:
-    from femsense.demo import TrueContact
     from femsense.sensing import Run
+    from femsense.truth import TrueContact
 
 BODY = np.array([0.62, 0.72, 0.86])
 TRUE, DECLARED, IMPROVED = "#222222", "#d9822b", "#1f6f5c"
