@@ -36,11 +36,13 @@ def _region_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
 
 
 def _region_places(robot: Robot) -> tuple[Entry, ...]:
-    """Spheres of two sizes around places that are spread over the body."""
+    """Spheres of two sizes around places that are spread over the body, those that hold the centroid of an element."""
     nodes = robot.body.mesh.nodes
     size = float(np.linalg.norm(np.ptp(nodes, axis=0)))
     places = nodes[spread_features(robot.body, 8)]
-    return tuple({"center_m": [float(v) for v in p], "radius_m": r * size} for p in places for r in (0.12, 0.25))
+    centroids = nodes[robot.body.mesh.tets[:, :4]].mean(axis=1)
+    spheres = [(p, r * size) for p in places for r in (0.12, 0.25)]
+    return tuple({"center_m": [float(v) for v in p], "radius_m": r} for p, r in spheres if (np.linalg.norm(centroids - p, axis=1) <= r).any())
 
 
 def _apply_region(robot: Robot, entry: Entry) -> Robot:
