@@ -1,0 +1,169 @@
+"""Rigid fit and bounded Gauss–Newton: exact answers, optimality, covariance, degenerate data."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from analytic import central_gradient, random_rotation
+from scipy.optimize import least_squares
+
+from femsense.calib.fit import covariance_of, gauss_newton
+from femsense.calib.rigid import fit_rigid, fit_rigid_robust
+from femsense.errors import DataError, InputError
+from femsense.pose import invert_pose, make_pose, move_pose, transform_points
+
+
+def pairs(seed: int, *, count: int = 8, noise: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return T_a_b and corresponding points a, b."""
+    rng = np.random.default_rng(seed)
+    T, b = make_pose(random_rotation(rng), rng.normal(0, 1, 3)), rng.normal(0, 0.1, (count, 3))
+    return T, transform_points(T, b) + rng.normal(0, noise, (count, 3)), b
+
+
+def misfit(T: np.ndarray, a: np.ndarray, b: np.ndarray, w: np.ndarray | float = 1.0) -> float:
+    return float((np.asarray(w) * ((transform_points(T, b) - a) ** 2).sum(axis=1)).sum())
+
+
+# Rigid
+
+
+@pytest.mark.parametrize("count", [3, 4, 20])
+@pytest.mark.parametrize("seed", range(3))
+def test_exact_pairs_give_their_pose(seed: int, count: int) -> None:
+    T, a, b = pairs(seed, count=count)
+    np.testing.assert_allclose(fit_rigid(a, b), T, atol=1e-12)
+    np.testing.assert_allclose(fit_rigid(b, a), invert_pose(T), atol=1e-12)
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_no_pose_nearby_fits_noisy_pairs_better(weighted: bool) -> None:
+    _, a, b = pairs(5, noise=0.02)
+    w = np.random.default_rng(0).uniform(0.1, 5, len(a)) if weighted else None
+    T = fit_rigid(a, b, weights=w)
+    slope = central_gradient(lambda step: misfit(move_pose(T, step), a, b, 1.0 if w is None else w), np.zeros(6), 1e-5)
+    assert np.abs(slope).max() < 1e-8 and np.linalg.det(T[:3, :3]) == pytest.approx(1.0)
+
+
+def test_noise_averages_out() -> None:
+    errors = [
+        np.linalg.norm(fit_rigid(*pairs(s, count=n, noise=0.01)[1:])[:3, 3] - pairs(s, count=n)[0][:3, 3])
+        for n in (10, 1000)
+        for s in range(20)
+    ]
+    assert np.mean(errors[20:]) < 0.2 * np.mean(errors[:20])
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_flat_and_noisy_points_never_give_a_mirror(seed: int) -> None:
+    _, a, b = pairs(seed, noise=0.05)
+    b[:, 2] *= 1e-3
+    R = fit_rigid(a, b)[:3, :3]
+    assert np.linalg.det(R) == pytest.approx(1.0) and np.allclose(R @ R.T, np.eye(3))
+
+
+def test_mirrored_points_give_the_best_rotation() -> None:
+    _, a, b = pairs(1)
+    T = fit_rigid(a, b * [1, 1, -1])
+    assert np.linalg.det(T[:3, :3]) == pytest.approx(1.0)
+    rng = np.random.default_rng(0)
+    others = [make_pose(R := random_rotation(rng), a.mean(axis=0) - R @ (b * [1, 1, -1]).mean(axis=0)) for _ in range(200)]
+    assert misfit(T, a, b * [1, 1, -1]) <= min(misfit(other, a, b * [1, 1, -1]) for other in others)
+
+
+def test_points_without_weight_do_not_count() -> None:
+    T, a, b = pairs(2)
+    a[0] += 5.0
+    np.testing.assert_allclose(fit_rigid(a, b, weights=np.array([0.0] + [1.0] * 7)), T, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "error", "text"),
+    [
+        (np.zeros((2, 3)), np.zeros((2, 3)), DataError, "needs three points that are seen; found 2"),
+        (np.outer(range(5), [1.0, 2, 3]), np.outer(range(5), [3.0, 2, 1]), DataError, "not on a line"),
+        (np.zeros((4, 3)), np.zeros((4, 3)), DataError, "not on a line"),
+        (np.zeros((4, 3)), np.zeros((5, 3)), InputError, "do not correspond"),
+    ],
+)
+def test_pairs_that_give_no_pose(a: np.ndarray, b: np.ndarray, error: type[Exception], text: str) -> None:
+    with pytest.raises(error, match=text):
+        fit_rigid(a, b)
+
+
+def test_a_robust_fit_sets_outliers_aside() -> None:
+    T, a, b = pairs(3, count=12, noise=1e-4)
+    a[4] += [0.05, 0.02, 0.0]
+    plain = fit_rigid(a, b)
+    robust, weights = fit_rigid_robust(a, b)
+    assert weights.argmin() == 4 and weights[4] < 1e-3
+    assert np.abs(robust - T).max() < 0.1 * np.abs(plain - T).max()
+
+
+def test_four_points_cannot_say_who_is_wrong() -> None:
+    _, a, b = pairs(3, count=4, noise=0.01)
+    T, weights = fit_rigid_robust(a, b)
+    np.testing.assert_array_equal(weights, 1.0)
+    np.testing.assert_array_equal(T, fit_rigid(a, b))
+
+
+# Gauss–Newton
+
+
+def curve(theta: np.ndarray, derivative: bool) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return residuals of a · exp(−b t) + c at known data."""
+    t = np.linspace(0, 4, 25)
+    data = 2.0 * np.exp(-0.7 * t) + 0.3 + 0.01 * np.sin(37 * t)
+    a, b, c = theta
+    model = np.exp(-b * t)
+    J = np.column_stack([model, -a * t * model, np.ones_like(t)]) / 0.01
+    return (a * model + c - data) / 0.01, J if derivative else None
+
+
+def test_it_finds_the_least_squares_of_scipy() -> None:
+    fit = gauss_newton(curve, np.array([1.0, 0.3, 0.0]))
+    wanted = least_squares(lambda x: curve(x, False)[0], [1.0, 0.3, 0.0], xtol=1e-14, ftol=1e-14)
+    std = np.sqrt(np.diag(fit.covariance))
+    assert fit.status == "converged" and (np.diff(fit.cost) < 0).all()
+    assert (np.abs(fit.theta - wanted.x) < 1e-2 * std).all()
+    np.testing.assert_allclose(fit.covariance, np.linalg.inv(wanted.jac.T @ wanted.jac), rtol=1e-3)
+
+
+@pytest.mark.parametrize(("low", "high"), [([-9, 0.9, -9], [9, 9, 9]), ([-9, -9, -9], [1.8, 9, 9]), ([-9, -9, 0.4], [9, 0.6, 9])])
+def test_it_stays_within_bounds_and_is_the_best_there(low: list[float], high: list[float]) -> None:
+    fit = gauss_newton(curve, np.array([1.0, 0.5, 0.5]), low=np.array(low, dtype=float), high=np.array(high, dtype=float))
+    wanted = least_squares(lambda x: curve(x, False)[0], np.clip([1.0, 0.5, 0.5], np.add(low, 1e-6), np.subtract(high, 1e-6)), bounds=(low, high), xtol=1e-14, ftol=1e-14)  # fmt: skip
+    assert (fit.theta >= low).all() and (fit.theta <= high).all()
+    assert fit.cost[-1] <= 2 * wanted.cost * (1 + 1e-5)
+
+
+def test_a_linear_problem_takes_one_step() -> None:
+    rng = np.random.default_rng(0)
+    A, b = rng.normal(0, 1, (30, 4)), rng.normal(0, 1, 30)
+    fit = gauss_newton(lambda x, d: (A @ x - b, A if d else None), np.zeros(4))
+    np.testing.assert_allclose(fit.theta, np.linalg.lstsq(A, b, rcond=None)[0], atol=1e-10)
+    np.testing.assert_allclose(fit.covariance, np.linalg.inv(A.T @ A), rtol=1e-9)
+    assert len(fit.cost) == 2
+
+
+def test_a_bad_first_step_is_damped() -> None:
+    evaluate = lambda x, d: (1e3 * np.arctan(x - 1.0), 1e3 * np.diag(1 / (1 + (x - 1.0) ** 2)) if d else None)  # noqa: E731
+    fit = gauss_newton(evaluate, np.array([8.0]))  # plain Gauss–Newton diverges from here
+    assert fit.theta[0] == pytest.approx(1.0, abs=1e-5)
+
+
+def test_where_it_cannot_be_evaluated_it_steps_back() -> None:
+    def evaluate(x: np.ndarray, derivative: bool) -> tuple[np.ndarray, np.ndarray | None]:
+        if x[0] <= 0:
+            raise DataError("no equilibrium")
+        return 100 * np.array([np.log(x[0]) + 2.0]), np.array([[100 / x[0]]]) if derivative else None
+
+    assert gauss_newton(evaluate, np.array([3.0])).theta[0] == pytest.approx(np.exp(-2.0), rel=1e-4)
+
+
+def test_what_the_data_do_not_see_has_no_bound_on_its_spread() -> None:
+    covariance = covariance_of(np.array([[1.0, 0, 1], [2.0, 0, 2], [0.0, 0, 0]]))
+    assert np.isinf(np.diag(covariance)).all()
+    J = np.random.default_rng(0).normal(0, 1, (9, 3)) * [1, 1e4, 1e-4]
+    np.testing.assert_allclose(covariance_of(J), np.linalg.inv(J.T @ J), rtol=1e-7)
+    mixed = covariance_of(np.column_stack([J[:, 0], np.zeros(9), J[:, 1], J[:, 1]]))
+    assert np.isfinite(mixed[0, 0]) and np.isinf(mixed[1, 1]) and np.isinf(mixed[2, 2]) and np.isinf(mixed[3, 3])
