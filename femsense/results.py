@@ -271,7 +271,7 @@ def read_states(path: str | Path) -> States:
     except Exception as error:  # whatever the archive reader meets in a broken file
         raise InputError("not readable", where=file, found=error, expected="arrays time_s, nodes_m, tets, rest_nodes_m") from None
     return States(
-        time_s=freeze(arrays["time_s"]), nodes_m=freeze(arrays["nodes_m"]), tets=freeze(arrays["tets"], np.int64), rest_nodes_m=freeze(arrays["rest_nodes_m"])
+        time_s=freeze(arrays["time_s"]), nodes_m=freeze(arrays["nodes_m"], np.float32), tets=freeze(arrays["tets"], np.int64), rest_nodes_m=freeze(arrays["rest_nodes_m"])
     )  # fmt: skip
 
 
@@ -297,7 +297,7 @@ def _write_states(states: States, path: Path) -> None:
 
 
 def _run_document(run: Run, inputs: Mapping[str, Any], seconds: float | None) -> dict[str, Any]:
-    times = np.array([frame.ms for frame in run.frames], dtype=np.float64)
+    times = np.array([frame.ms for frame in run.frames if frame.status == "ok"], dtype=np.float64)
     good = [frame.status for frame in run.frames].count("ok")
     return {
         "format": RUN_FORMAT,
@@ -371,9 +371,9 @@ def write_loop(loop: LoopResult, folder: str | Path, *, inputs: Mapping[str, Any
 
     check_loop_folder(folder)
     with _results_folder(folder, "loop.json") as part:
-        save_robot(loop.robot, part)
-        document = {"format": LOOP_FORMAT, **loop.document()}
-        write_json(part / "loop.json", {**document, "inputs": inputs or {}, "versions": versions()})
+        declared = (loop.declared.document or {}).get("effects", [])
+        save_robot(loop.declared, part, effects=[*declared, *loop.entries])
+        write_json(part / "loop.json", {**loop.document(), "inputs": inputs or {}, "versions": versions()})
     return Path(folder)
 
 

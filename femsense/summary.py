@@ -108,7 +108,8 @@ def run_text(run: Run) -> str:
 def loop_text(document: Mapping[str, Any]) -> str:
     """Return loop.json in a few lines."""
     verdict = str(document.get("verdict"))
-    lines = [f"verdict: {verdict}" + (f" ({VERDICTS[verdict]})" if verdict in VERDICTS else "")]
+    words = document.get("sentence") or VERDICTS.get(verdict)
+    lines = [f"verdict: {verdict}" + (f" ({words})" if words else "")]
     lines.append(columns(_loop_rows(document)))
     for effect in document.get("effects") or []:
         lines += ["", effect_text(effect)]
