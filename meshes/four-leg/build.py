@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from femsense.arrays import FloatArray, IntArray
-from femsense.fem.mesh import TetMesh, check_mesh, oriented, surface_triangles, vertex_normals
+from femsense.fem.mesh import TetMesh, check_mesh, oriented
 from femsense.files import write_toml
 from femsense.meshfile import write_mesh
 
@@ -30,15 +30,18 @@ LEGS = {"east": 0, "north": 1, "west": 2, "south": 3}
 LEG_POINTS = np.array([[13.0, 80.0], [36.0, 84.0], [62.0, 76.0], [78.0, 54.0], [79.0, 30.0], [72.0, 7.0], [70.0, 0.0]])
 LEG_WIDTH = np.array([26.0, 22.0, 19.0, 18.0, 18.0, 22.0, 24.0])
 LEG_THICKNESS = np.array([18.0, 15.0, 13.0, 13.0, 13.0, 17.0, 20.0])
-STATIONS = 8
+STATIONS = 15
 """Hexahedra along a leg, the foot pad not counted."""
+KNEE = 9
+"""Cross-section that the cable is tied to."""
 ROUND = 0.86
 """Corners of a cross-section, over those of its rectangle."""
 STEM = ((94.0, 0.78, 0.9), (110.0, 0.62, 0.85))
 """Levels of the stem: height [mm], size over the hub's, roundness."""
 VIEW = np.array([-0.35, -0.6, 0.72])
 """Towards a camera in front; the feet's markers sit where it sees them."""
-GRID = np.array([[i, j] for i in (-1.0, 0.0, 1.0) for j in (-1.0, 0.0, 1.0)])
+ACROSS, OUTWARD = (-1.0, 0.0, 1.0), (-1.0, 1.0)
+"""Nodes of a leg's cross-section: two cells wide, one thick."""
 FACE_LOOPS = ((0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5))
 """Faces of a hexahedron with corners 4 i + 2 j + k, each around its border."""
 
@@ -59,25 +62,24 @@ def main() -> None:
 
 
 def build_mesh() -> tuple[TetMesh, dict[str, IntArray]]:
-    """Return the tetrahedra [m] and, for each leg, the nodes of its cross-sections, shape (stations, 3, 3).
+    """Return the tetrahedra [m] and, for each leg, the nodes of its cross-sections, shape (stations, 3, 2).
 
     Cross-sections go from the hub to the foot; their second index runs across the leg, their third outwards (up at the hub).
     """
     points: list[FloatArray] = []
-    hub = np.array([[add(points, hub_point(i, j, k)) for k in (-1, 0, 1)] for i in (-1, 0, 1) for j in (-1, 0, 1)])
-    hub = hub.reshape(3, 3, 3)
+    hub = np.array([[[add(points, hub_point(i, j, k)) for k in OUTWARD] for j in ACROSS] for i in ACROSS])
     blocks = [hub]
-    stem = [hub[:, :, 2]]
+    stem = [hub[:, :, -1]]
     for height, size, roundness in STEM:
-        layer = [add(points, np.append(size * rounded(g, roundness) * LEG_POINTS[0, 0], height)) for g in GRID]
-        stem.append(np.array(layer).reshape(3, 3))
+        cells = [size * rounded(np.array([i, j]), roundness) * LEG_POINTS[0, 0] for i in ACROSS for j in ACROSS]
+        stem.append(np.array([add(points, np.append(cell, height)) for cell in cells]).reshape(3, 3))
     blocks.append(np.stack(stem, axis=2))
     stations = {}
     for name, turns in LEGS.items():
         stations[name] = leg_nodes(points, hub_face(hub, turns), turns)
         blocks.append(stations[name])
-    cells = np.vstack([hexahedra(block) for block in blocks])
-    tets = np.vstack([six_tets(cell) for cell in cells])
+    hexes = np.vstack([hexahedra(block) for block in blocks])
+    tets = np.vstack([six_tets(cell) for cell in hexes])
     return oriented(TetMesh(np.array(points) * 1e-3, tets)), stations
 
 
@@ -87,7 +89,7 @@ def add(points: list[FloatArray], point: npt.ArrayLike) -> int:
     return len(points) - 1
 
 
-def hub_point(i: int, j: int, k: int) -> FloatArray:
+def hub_point(i: float, j: float, k: float) -> FloatArray:
     """Return a node of the hub [mm]."""
     half, middle, thick = LEG_POINTS[0, 0], LEG_POINTS[0, 1], LEG_THICKNESS[0]
     return np.array([half * i, half * j, middle + thick / 2 * k])
@@ -99,7 +101,7 @@ def rounded(cell: FloatArray, roundness: float) -> FloatArray:
 
 
 def hub_face(hub: IntArray, turns: int) -> IntArray:
-    """Return the hub's nodes where a leg begins, shape (3, 3): across, upwards."""
+    """Return the hub's nodes where a leg begins, shape (3, 2): across, upwards."""
     if turns == 0:
         return hub[2, :, :]
     if turns == 1:
@@ -108,7 +110,7 @@ def hub_face(hub: IntArray, turns: int) -> IntArray:
 
 
 def leg_nodes(points: list[FloatArray], start: IntArray, turns: int) -> IntArray:
-    """Append the nodes of a leg and return all of them with those of the hub, shape (stations, 3, 3)."""
+    """Append the nodes of a leg and return all of them with those of the hub, shape (stations, 3, 2)."""
     from scipy.interpolate import CubicSpline
 
     chord = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(LEG_POINTS, axis=0), axis=1))]
@@ -120,17 +122,17 @@ def leg_nodes(points: list[FloatArray], start: IntArray, turns: int) -> IntArray
     for s, place in enumerate(places[1:], start=1):
         (r, z), slope = curve(place), curve(place, 1)
         outward = np.array([-slope[1], slope[0]]) / np.linalg.norm(slope)
-        if s == len(places) - 1:
-            outward = np.array([1.0, 0.0])  # the sole is level
+        if s >= len(places) - 2:
+            outward = np.array([1.0, 0.0])  # the foot pad is level, so that its clamp is the same on every mesh
         width, thickness = np.interp(place, chord, LEG_WIDTH), np.interp(place, chord, LEG_THICKNESS)
         roundness = 1.0 + (ROUND - 1.0) * min(s / 2, 1.0)
         layer = []
-        for cell in GRID:
-            a, b = rounded(cell, roundness) * [width / 2, thickness / 2]
+        for cell in ((a, b) for a in ACROSS for b in OUTWARD):
+            a, b = rounded(np.array(cell), roundness) * [width / 2, thickness / 2]
             layer.append(
                 add(points, (r + b * outward[0]) * radial + a * across + (z + b * outward[1]) * np.array([0.0, 0.0, 1.0]))
             )
-        layers.append(np.array(layer).reshape(3, 3))
+        layers.append(np.array(layer).reshape(len(ACROSS), len(OUTWARD)))
     return np.stack(layers)
 
 
@@ -184,7 +186,7 @@ def foot_box(layers: FloatArray) -> list[list[float]]:
 
 def cable_table(name: str, leg: FloatArray) -> dict[str, object]:
     """Return a cable from the inside of a knee to a pull point near the axis, where it turns down."""
-    knee = leg[5, 1, 1] * 0.7 + leg[5, 1, 0] * 0.3
+    knee = 0.35 * leg[KNEE, 1, 1] + 0.65 * leg[KNEE, 1, 0]
     radial = np.array([knee[0], knee[1], 0.0]) / np.hypot(knee[0], knee[1])
     return {
         "name": name,
@@ -198,19 +200,21 @@ def cable_table(name: str, leg: FloatArray) -> dict[str, object]:
 def marker_tables(mesh: TetMesh, stations: dict[str, IntArray]) -> list[dict[str, object]]:
     """Return markers on the surface: the tip, three along each leg, and one above each foot."""
     x = mesh.nodes
-    normals = vertex_normals(x, surface_triangles(mesh))
     top = x[:, 2].max()
     tip = int(np.argmin(np.linalg.norm(x - [0.0, 0.0, top], axis=1)))
     places = {"tip": x[tip]}
     for name, nodes in stations.items():
-        for label, station in (("inner", 1), ("arch", 3), ("knee", 5)):
-            places[f"{name}-{label}"] = x[nodes[station, 1, 2]]
-        ring = nodes[-2].ravel()
-        sight = normals[ring] @ VIEW / np.linalg.norm(VIEW)
-        middle = [1, 3, 5, 7]  # the middles of the four sides
-        side = middle[int(np.argmax(sight[middle]))]
-        places[f"{name}-foot"] = 0.7 * x[ring[side]] + 0.3 * x[nodes[-3].ravel()[side]]
+        for label, station in (("inner", 2), ("arch", 5), ("knee", 8)):
+            places[f"{name}-{label}"] = x[nodes[station, 1, 1]]
+        low, high = side_middles(x[nodes[-2]]), side_middles(x[nodes[-3]])
+        side = int(np.argmax((low - low.mean(axis=0)) @ VIEW))
+        places[f"{name}-foot"] = 0.7 * low[side] + 0.3 * high[side]
     return [{"name": name, "position_m": [round(float(v), 6) for v in place]} for name, place in places.items()]
+
+
+def side_middles(section: FloatArray) -> FloatArray:
+    """Return the middles of the four sides of a cross-section (3, 2, 3), shape (4, 3)."""
+    return np.stack([section[0].mean(axis=0), section[2].mean(axis=0), section[1, 0], section[1, 1]])
 
 
 if __name__ == "__main__":
