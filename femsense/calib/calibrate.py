@@ -24,8 +24,10 @@ from femsense.model import Robot
 from femsense.pose import move_pose
 from femsense.recording import Recording, check_against
 
-MAX_FRAMES = 40
+MAX_FRAMES = 24
 """More frames than this are thinned out evenly; they would add time and hardly any accuracy."""
+START_FRAMES = 5
+"""Frames that Algorithm 1 uses for the start."""
 NOISE_FLOOR = 1e-7
 """No camera measures better than this [m]."""
 SEAT_STD_FLOOR = 1e-4
@@ -69,7 +71,8 @@ def calibrate(robot: Robot, recording: Recording, *, frames: Sequence[int] | Non
     initial = _first_inputs(robot, recording)
     history: list[float] = []
     if recording.actuation_zero == "unknown" and robot.body.cables:
-        poses, initial = _alternate(robot, scene, poses, initial, history)
+        few = seen[np.unique(np.linspace(0, len(seen) - 1, START_FRAMES).round().astype(int))]
+        poses, initial = _alternate(robot, make_scene(robot, recording, few), poses, initial, history)
     fit, poses, initial, jet = fit_joint(robot, scene, poses, initial, history)
     return _result(robot, scene, fit, poses, initial, jet, history)
 
@@ -114,7 +117,7 @@ def _pose_from_frame(robot: Robot, scene: Scene, view: int, name: str) -> FloatA
     raise DataError(f"camera {name or '(only one)'} needs a frame with three markers for its pose; the most in one frame is {most}. Give T_robot_camera, or show more markers")
 
 
-def _alternate(robot: Robot, scene: Scene, poses: list[FloatArray], initial: FloatArray | None, history: list[float], *, rounds: int = 6) -> tuple[list[FloatArray], FloatArray]:
+def _alternate(robot: Robot, scene: Scene, poses: list[FloatArray], initial: FloatArray | None, history: list[float], *, rounds: int = 3) -> tuple[list[FloatArray], FloatArray]:
     """Algorithm 1: rigid pose and bounded inputs in turns."""
     from scipy.optimize import lsq_linear
 
@@ -196,7 +199,7 @@ def fit_joint(
     free = np.full(6 * len(moving), np.inf)
     bounds = np.concatenate([-free, low]), np.concatenate([free, high])
     theta = np.concatenate([np.zeros(6 * len(moving)), initial if a and initial is not None else np.zeros(0)])
-    for last in (False, False, True):
+    for last in (False, True):
         fit = gauss_newton(evaluate, theta, low=bounds[0], high=bounds[1])
         theta = fit.theta
         evaluate(theta, True)

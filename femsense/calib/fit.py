@@ -14,7 +14,7 @@ Evaluate = Callable[[FloatArray, bool], tuple[FloatArray, FloatArray | None]]
 """(θ, with derivative) → whitened residual (N,), Jacobian (N, p) or None. A θ that cannot be evaluated raises DataError."""
 
 
-STILL = 1e-3
+STILL = 1e-2
 """A step that changes the whitened residual by less than this is none."""
 
 

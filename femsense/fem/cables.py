@@ -15,9 +15,11 @@ from femsense.fem.body import BodyModel, Cable, segment_ties
 
 def segments(cable: Cable, positions: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return unit vectors from far end to pull point, shape (s, 3), and lengths [m], shape (s,), of the segments."""
-    points = np.vstack([cable.path.positions(positions), cable.pull_point])
-    difference = np.diff(points, axis=0)
-    length = np.linalg.norm(difference, axis=1)
+    points = np.empty((len(cable.path) + 1, 3))
+    points[:-1] = cable.path.positions(positions)
+    points[-1] = cable.pull_point
+    difference = points[1:] - points[:-1]
+    length = np.sqrt(np.einsum("sc,sc->s", difference, difference))
     return difference / np.maximum(length, 1e-12)[:, None], length
 
 
@@ -42,7 +44,10 @@ def point_forces(directions: FloatArray, tensions: FloatArray) -> FloatArray:
 
 def cable_forces(cable: Cable, positions: FloatArray, tensions: FloatArray, node_count: int) -> FloatArray:
     """Return the nodal forces of a cable [N], shape (n, 3), for the tensions of its segments [N], shape (s,)."""
-    return cable.path.spread(point_forces(segments(cable, positions)[0], tensions), node_count)
+    at_points = point_forces(segments(cable, positions)[0], tensions)
+    forces = np.zeros((node_count, 3))
+    np.add.at(forces, cable.path.nodes, cable.path.weights[:, :, None] * at_points[:, None, :])
+    return forces
 
 
 def pull_rows(body: BodyModel, positions: FloatArray, shares: list[FloatArray] | None = None) -> FloatArray:

@@ -220,6 +220,7 @@ def _settle(body: BodyModel, loads: _Loads, state: _State, max_iterations: int) 
             continue
         if not frictional or _update_friction(body, loads, state):
             return CONVERGED
+        state.borrowed = True  # the tensions move by little: the factor at hand serves
     return "iterations"
 
 
@@ -261,7 +262,7 @@ def _newton(body: BodyModel, loads: _Loads, state: _State, max_iterations: int) 
     held = np.flatnonzero(state.taut)
     stretch = np.array([1.0 / body.cables[i].stretch_stiffness for i in held])
     here = internal(body, state.x, tangent=not state.borrowed)
-    last = np.inf
+    last, saved = np.inf, (state.x, state.T)
     for _ in range(max_iterations):
         rows = _rows(body, state)
         H = _kinematic_rows(body, state, rows)[held][:, free] if len(held) else np.zeros((0, len(free)))
@@ -274,14 +275,21 @@ def _newton(body: BodyModel, loads: _Loads, state: _State, max_iterations: int) 
             return CONVERGED
         if not np.isfinite(state.residual):
             return "stalled"
-        slow = state.residual > 0.2 * last if state.borrowed else state.residual > 1e3 * loads.tolerance
-        if state.factor is None or slow:
-            state.factor, state.borrowed = _factor_here(body, here, state), False
+        if state.borrowed and state.residual > 0.2 * last:  # the borrowed factor does not serve: back, and a factor of its own
+            state.x, state.T = saved
+            state.factor, state.borrowed, last = None, False, np.inf
+            here = internal(body, state.x)
+            continue
+        if state.factor is None or (not state.borrowed and state.residual > 1e3 * loads.tolerance):
+            state.factor = _factor_here(body, here, state)
             if state.factor is None:
                 return "singular"
-        last = state.residual
+        last, saved = state.residual, (state.x, state.T)
         du, dT = _bordered_step(state.factor, force, gap, H, C, stretch)
         state.iterations += 1
+        if state.borrowed:
+            here = _full_step(body, state, held, du, dT)
+            continue
         moved = _line_search(body, loads, state, held, here, du, dT, gap)
         if moved is None:
             return CONVERGED if state.residual <= 1e3 * loads.tolerance else "stalled"
@@ -321,6 +329,14 @@ def _bordered_step(factor: Factorization, force: FloatArray, gap: FloatArray, H:
     free, compliance = columns[:, 0], columns[:, 1:]
     dT = np.linalg.lstsq(H @ compliance + np.diag(stretch), gap - H @ free, rcond=None)[0]
     return free + compliance @ dT, dT
+
+
+def _full_step(body: BodyModel, state: _State, held: npt.NDArray[np.intp], du: FloatArray, dT: FloatArray) -> Internal:
+    x = state.x.ravel().copy()
+    x[body.free_map.dofs] += du
+    state.x, state.T = x.reshape(-1, 3), state.T.copy()
+    state.T[held] += dT
+    return internal(body, state.x, tangent=False)
 
 
 def _line_search(

@@ -107,10 +107,13 @@ def improve(
     base = _stage(data, hypothesis, prior, noise, base.fit.coordinates, own=_own(base))
     history, first, refits = [base], None, list[dict[str, Any]]()
     table: list[Candidate] = []
+    growing = _fresh(data)
     while len(history) <= MAX_EFFECTS:
         say(f"screening effects ({len(history) - 1} found so far)")
         table = _screen(data, history[-1].fit, noise, names, n_effective)
         first = first or table
+        if not growing:
+            break
         winner, tried = _best_refit(data, history[-1], table, noise, n_effective, say)
         refits += tried
         if winner is None:
@@ -119,7 +122,11 @@ def improve(
         noise, n_effective = _noise(data, winner, names)
         history[-1] = _stage(data, winner.fit.hypothesis, winner.fit.prior, noise, winner.fit.coordinates, own=_own(winner))
     say("testing what is left")
-    return _conclude(data, before, history, noise, n_effective, table, first or [], refits, rng)
+    result = _conclude(data, before, history, noise, n_effective, table, first or [], refits, rng)
+    if growing:
+        return result
+    only = "record another state (other inputs, load or direction of gravity): these data repeat one state, which cannot tell effects apart"
+    return replace(result, next_experiment="; ".join(t for t in (only, result.next_experiment) if t))
 
 
 def _names(effects: Sequence[str] | None, without: Sequence[str] | None) -> list[str]:
@@ -318,7 +325,7 @@ def _best_refit(
             record["verdict"] = f"no equilibrium: {error}"
             continue
         q = len(candidate.parameters)
-        gain = stage.fit.chi2 - trial.fit.chi2
+        gain = _evidence(stage.fit, trial.fit, n_effective)
         score = gain - q * np.log(n_effective) - 2.0 * np.log(library)
         record |= {"dchi2": gain, "dbic": score, "validation_rms_m": trial.held_rms}
         reason = _objection(stage, trial, candidate, score)
@@ -328,6 +335,18 @@ def _best_refit(
     if best is not None:
         best[2]["verdict"] = "named"
     return (None if best is None else best[1]), records
+
+
+def _evidence(before: JointFit, after: JointFit, n_effective: float) -> float:
+    """Return the decrease of χ², or that of n log χ² where it is smaller (the noise level is itself an estimate from few data)."""
+    freedom = max(n_effective - len(after.fit.theta), 1.0)
+    return min(before.chi2 - after.chi2, freedom * float(np.log(before.chi2 / max(after.chi2, 1e-12))))
+
+
+def _fresh(data: Data) -> bool:
+    """Return whether anything is held out that is not a repetition of a fitted state."""
+    fitted = {state_key(t.scene.recording, int(k)) for t in data.train for k in t.scene.frames}
+    return any(state_key(t.scene.recording, int(k)) not in fitted for t in data.held for k in t.scene.frames)
 
 
 def _refit(data: Data, stage: Stage, candidate: Candidate, noise: Noise) -> Stage:
