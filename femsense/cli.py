@@ -170,7 +170,7 @@ def improve(
     again: Annotated[bool, typer.Option("--again", help="Compute even where OUT holds this result already.")] = False,
     json: Json = False,
 ) -> Answer:  # fmt: skip
-    """Find the effect that the model lacks; write the better robot."""
+    """Find what the model lacks and write the better robot."""
     from femsense.steps import improve_into
     from femsense.summary import loop_text
 
@@ -226,7 +226,7 @@ def report(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="A folder of results.", show_default=False)],
     json: Json = False,
 ) -> Answer:
-    """Write the figures of a folder of results as one HTML file."""
+    """Write the figures of results as one HTML file."""
     from femsense.report import write_report
 
     page = write_report(folder)
