@@ -122,7 +122,7 @@ def calibrate(
     output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="The file to write.")] = Path("calibration.json"),
     json: Json = False,
 ) -> Answer:
-    """Find the pose of the camera and the initial inputs of the cables."""
+    """Find the camera's pose and the cables' initial inputs."""
     from femsense.calib.calibrate import calibrate as calibrate_recording
     from femsense.recording import load_recording
     from femsense.results import calibration_document, write_calibration

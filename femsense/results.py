@@ -153,10 +153,10 @@ def robot_input(robot: Robot) -> dict[str, Any]:
 
 
 def recording_input(recording: Recording) -> dict[str, Any]:
-    """Return folder and SHA-256 of a recording: of the files that results depend on."""
+    """Return folder and SHA-256 of a recording: of its frames' numbers and the files that results depend on."""
     if recording.folder is None:
         return {"path": None, "sha256": None}
-    digest = hashlib.sha256()
+    digest = hashlib.sha256(np.ascontiguousarray(recording.frame_numbers).tobytes())
     for part in RECORDING_PARTS:
         place = recording.folder / part
         for file in sorted(place.rglob("*")) if place.is_dir() else [place]:

@@ -18,7 +18,7 @@ from femsense.errors import InputError
 from femsense.files import PART_PREFIX
 from femsense.loop import LoopResult
 from femsense.model import Robot
-from femsense.recording import Recording, load_recording
+from femsense.recording import Recording, load_recording, select_frames
 from femsense.robot import load_robot
 from femsense.sensing import ContactForce, FrameReport, Run, States
 
@@ -282,6 +282,7 @@ def test_finished_sees_every_change_of_the_input(tmp_path: Path, robot: Robot, r
     others = [
         results.run_inputs(robot, recording, calibration),
         results.run_inputs(robot, recording, None, at=[0.1, 0, 0]),
+        results.run_inputs(robot, select_frames(recording, [0, 1]), calibration, at=[0.1, 0, 0]),
         results.run_inputs(robot, recording, make_calibration(rms_m=1e-3), at=[0.1, 0, 0]),
         results.run_inputs(
             load_robot(write_block_robot(tmp_path / "r", material__young_modulus_pa=1e5)), recording, calibration, at=[0.1, 0, 0]
