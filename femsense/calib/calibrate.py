@@ -28,6 +28,8 @@ MAX_FRAMES = 24
 """More frames than this are thinned out evenly; they would add time and hardly any accuracy."""
 START_FRAMES = 5
 """Frames that Algorithm 1 uses for the start."""
+MAX_REWEIGHTINGS = 10
+"""Fits until the outliers are set aside; without any it takes two."""
 NOISE_FLOOR = 1e-7
 """No camera measures better than this [m]."""
 SEAT_STD_FLOOR = 1e-4
@@ -199,16 +201,19 @@ def fit_joint(
     free = np.full(6 * len(moving), np.inf)
     bounds = np.concatenate([-free, low]), np.concatenate([free, high])
     theta = np.concatenate([np.zeros(6 * len(moving)), initial if a and initial is not None else np.zeros(0)])
-    for last in (False, True):
+    huber = np.ones(len(scene.points))
+    for again in range(MAX_REWEIGHTINGS):
         fit = gauss_newton(evaluate, theta, low=bounds[0], high=bounds[1])
         theta = fit.theta
         evaluate(theta, True)
         assert jet is not None
         history.append(_rms(jet.residual))
-        if last:
+        before, huber = huber, _huber_weights(jet.residual)
+        if again and np.abs(huber - before).max() < 0.1:
             break
-        weights = repeats * _huber_weights(jet.residual)
-        sigma = _spread(jet.residual * weights[:, None], float(3 * (repeats**2).sum()), len(theta))
+        weights = repeats * huber
+        winsorised = jet.residual * (repeats * huber**2)[:, None]  # an outlier counts as the largest residual that is none
+        sigma = _spread(winsorised, float(3 * (repeats**2).sum()), len(theta))
         seat_std = max(SEAT_STD_FLOOR, float(np.sqrt((jet.rest**2).mean()))) if len(jet.rest) else seat_std
     moved, inputs = place(theta)
     fit = _with_bound_inputs(fit, theta, bounds)

@@ -1,0 +1,208 @@
+"""Break key lines one at a time (a sign, a transpose, millimetres for metres, a factor) and demand that named tests turn red.
+
+    python scripts/sabotage.py [WORD …] [--list]
+
+With words only those entries run whose file or tests contain one of them. The work is done in a copy of the repository;
+the tests must be green there first. Exit status 0: every sabotage was noticed; 1: one survived, or a line is no longer there.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+PARTS = ("femsense", "tests", "meshes", "examples", "scripts", "pyproject.toml")
+
+
+@dataclass(frozen=True)
+class Sabotage:
+    """One line to break and the tests (pytest node ids, in tests/) that must notice."""
+
+    file: str
+    line: str
+    broken: str
+    tests: str
+
+
+def S(file: str, line: str, broken: str, tests: str) -> Sabotage:
+    return Sabotage(f"femsense/{file}", line, broken, tests)
+
+
+SABOTAGES = (
+    # the elements
+    S("fem/corotational.py", "+ lam[e] * trace * R[i, j])", "- lam[e] * trace * R[i, j])", "test_fem_elements.py::test_force_is_the_slope_of_the_energy"),
+    S("fem/corotational.py", "G[a, 0, j] = -c * (", "G[a, 0, j] = c * (", "test_fem_elements.py::test_tangent_is_the_slope_of_the_force"),
+    S("fem/corotational.py", "la = lame * h[a, i]", "la = mu2 * h[a, i]", "test_fem_elements.py::test_stiffness_of_the_corner_tetrahedron"),
+    S("fem/corotational.py", "R[i, j] = U[i, 0] * Vt[0, j]", "R[i, j] = U[0, i] * Vt[0, j]", "test_fem_elements.py::test_inverted_corotational_elements_are_finite_and_right"),
+    S("fem/corotational.py", "+ abs(A[2, 2]) + 1e-12", "+ abs(A[2, 2]) + 1e-300", "test_fem_elements.py::test_inverted_corotational_elements_are_finite_and_right"),
+    S("fem/hyperelastic.py", "- across * g_inv[b, i] * g_inv[a, j]", "- across * g_inv[a, i] * g_inv[b, j]", "test_fem_elements.py::test_tangent_is_the_slope_of_the_force"),
+    S("fem/hyperelastic.py", "if J <= 0.0 or stretch >= limit:", "if J == 0.0 or stretch >= limit:", "test_fem_elements.py::test_inverted_hyperelastic_elements_have_infinite_energy"),
+    S("fem/hyperelastic.py", "scale = limit / (limit - stretch)", "scale = limit / (limit + stretch)", "test_fem_elements.py::test_force_is_the_slope_of_the_energy"),
+    S("fem/body.py", "E * nu / ((1.0 + nu) * (1.0 - 2.0 * nu))", "E * nu / ((1.0 + nu) * (1.0 - nu))", "test_fem_elements.py::test_a_pulled_bar_stretches_by_p_over_e_and_thins_by_nu"),
+    S("fem/assembly.py", "energy += _add_clamp_springs(", "energy -= _add_clamp_springs(", "test_fem_elements.py::test_clamp_springs_have_their_own_energy_force_and_tangent"),
+    S("fem/stencil.py", "_A, _B = 0.5854101966249685, 0.1381966011250105", "_A, _B = 0.55, 0.15", "test_fem_elements.py::test_displacement_converges_at_the_order_of_the_element test_fem_elements.py::test_energy_and_forces_are_those_of_the_slow_implementation"),
+    # the mesh
+    S("fem/stencil.py", "volumes = np.linalg.det(jacobian) / (6.0 * len(points))", "volumes = np.linalg.det(jacobian) / 6.0", "test_fem_mesh.py::test_node_volumes_sum_to_the_volume_and_carry_its_centre"),
+    S("fem/stencil.py", 'np.einsum("mq,qa->ma", volumes, shape_values(QUADRATURE, quadratic=True))', "np.repeat(volumes.sum(axis=1, keepdims=True) / 10, 10, axis=1)", "test_fem_mesh.py::test_node_volumes_of_a_quadratic_element_are_those_of_the_books"),
+    S("fem/mesh.py", "[0, 2, 1, 3] if tets.shape[1] == 4 else", "[0, 2, 1, 3, 4, 5, 6, 7, 8, 9] if tets.shape[1] == 10 else", "test_fem_mesh.py::test_orienting_mends_inverted_elements_and_keeps_mid_nodes_on_their_edges"),
+    S("fem/mesh.py", "FACES = np.array([[1, 2, 3],", "FACES = np.array([[1, 3, 2],", "test_fem_mesh.py::test_the_surface_is_closed_and_looks_outwards"),
+    S("fem/mesh.py", "beyond = barycentric(mesh, element, points) - at", "beyond = at - barycentric(mesh, element, points)", "test_fem_mesh.py::test_embedded_points_follow_linear_fields_inside_and_outside"),
+    S("fem/mesh.py", "slopes[:, 4 + e, i] = 4.0 * L[:, j]", "slopes[:, 4 + e, i] = 4.0 * L[:, i]", "test_fem_mesh.py::test_shape_slopes_are_differences_of_the_shape_functions"),
+    S("fem/mesh.py", "t = np.clip(np.einsum(", "t = np.abs(np.einsum(", "test_fem_mesh.py::test_closest_in_a_triangle_beats_every_sample_and_is_in_it"),
+    # factorisation
+    S("fem/linear.py", "weakref.finalize(self, pattern.idle.append, handle)", "pattern.idle.append(handle)", "test_fem_linear.py::test_factors_alive_at_once_keep_their_own_values"),
+    S("fem/linear.py", "self.negative = int(handle.iparm[22])", "self.negative = int(handle.iparm[21])", "test_fem_linear.py::test_an_indefinite_matrix_is_seen_as_such"),
+    S("fem/linear.py", "pivots <= 0", "pivots >= 0", "test_fem_linear.py::test_solutions_are_those_of_the_dense_matrix"),
+    S("fem/linear.py", "shift *= 4.0", "shift *= 1.0", "test_fem_linear.py::test_the_shift_makes_an_indefinite_matrix_definite"),
+    # cables
+    S("fem/cables.py", "(np.eye(3) - d[:, :, None] * d[:, None, :])", "(np.eye(3) + d[:, :, None] * d[:, None, :])", "test_fem_cables.py::test_geometric_stiffness_is_the_slope_of_the_cable_forces"),
+    S("fem/cables.py", "forces[1:] -= pull[:-1]", "forces[1:] += pull[:-1]", "test_fem_cables.py::test_pull_rows_are_the_slope_of_the_shortening"),
+    S("fem/cables.py", "cable_length(c, rest) - cable_length(c, positions)", "cable_length(c, positions) - cable_length(c, rest)", "test_fem_cables.py::test_pull_rows_are_the_slope_of_the_shortening"),
+    S("fem/cables.py", "inner = tensions[j]", "inner = motor_tension", "test_fem_cables.py::test_rubbing_is_that_of_the_definition"),
+    S("fem/cables.py", "span = np.exp(cable.friction * angles[j])", "span = np.exp(cable.friction * np.degrees(angles[j]))", "test_fem_cables.py::test_pulling_loses_sticking_keeps_letting_go_gains"),
+    S("fem/cables.py", "_angle(directions[:-1], directions[1:])", "_angle(directions[:-1], -directions[1:])", "test_fem_cables.py::test_bends_of_a_known_path"),
+    S("fem/body.py", "np.hstack([-path.weights, weight])", "np.hstack([path.weights, weight])", "test_fem_cables.py::test_geometric_stiffness_is_the_slope_of_the_cable_forces"),
+    # equilibrium and compliance
+    S("fem/equilibrium.py", "T if body.cables[i].friction > 0 else 0.0", "0.0 * T", "test_fem_cables.py::test_a_held_cable_with_friction_keeps_its_length"),
+    S("fem/equilibrium.py", "gap = shortening(body, state.x) - loads.target", "gap = loads.target - shortening(body, state.x)", "test_fem_equilibrium.py::test_a_slack_cable_becomes_taut_again_from_a_slack_start test_fem_equilibrium.py::test_a_command_below_the_geometry_leaves_the_cable_slack"),
+    S("fem/equilibrium.py", "push = state.taut & (state.T < -1e-12)", "push = state.taut & (state.T < -1e12)", "test_fem_equilibrium.py::test_a_held_cable_is_taut_at_its_length_or_slack_and_shorter"),
+    S("fem/equilibrium.py", "if status != CONVERGED and not body.is_held():", "if False:", "test_fem_equilibrium.py::test_nothing_clamped_is_singular_and_says_what_to_do"),
+    S("fem/body.py", "return self.weight() + self.dead_forces", "return self.weight() - self.dead_forces", "test_fem_equilibrium.py::test_gravity_and_its_nodal_forces_are_the_same"),
+    S("fem/compliance.py", "(W + W.T) / 2.0", "W + W.T", "test_fem_compliance.py::test_compliance_is_the_derivative_of_equilibria_solved_anew"),
+    S("fem/compliance.py", "answer = answer - self.held_columns", "answer = answer + self.held_columns", "test_fem_compliance.py::test_held_cables_keep_their_length_in_the_response"),
+    S("fem/compliance.py", "rows @ columns + np.diag(stretch)", "rows @ columns - np.diag(stretch)", "test_fem_compliance.py::test_the_response_to_a_held_cable_is_the_derivative_of_equilibria_solved_anew"),
+    S("fem/compliance.py", "    add_cable_stiffness(body, equilibrium.positions", "    0 and add_cable_stiffness(body, equilibrium.positions", "test_fem_compliance.py::test_compliance_is_the_derivative_of_equilibria_solved_anew"),
+    # the walk and the effects
+    S("march.py", "result[0] += fraction * flow", "result[0] += 0 * flow", "test_march.py::test_what_was_there_before_the_first_frame_has_crept_out"),
+    S("march.py", "flow = values[k] - slope * tau", "flow = values[k] + slope * tau", "test_march.py::test_creep_of_a_ramp_is_the_integral_of_its_steps"),
+    S("march.py", "act.gain * recorded + act.displacement_offset - act.slack", "act.gain * recorded + act.displacement_offset + act.slack", "test_march.py::test_true_displacement_is_gain_times_recorded_plus_offset_less_slack"),
+    S("march.py", "drive.load_points[rows].ravel(), drive.load_forces[rows].ravel()]", "drive.load_points[rows].ravel()]", "test_march.py::test_frames_with_other_loads_or_gravity_are_not_the_same"),
+    S("march.py", "memory[0] = base.segment_tensions if past else None", "memory[0] = None", "test_march.py::test_with_friction_the_past_matters_and_unwanted_frames_are_walked_too"),
+    S("effects/observation.py", "seen.depth_offset * scale + offset", "seen.depth_offset + offset", "test_effects.py::test_depth_is_undone_as_it_was_made"),
+    S("effects/cables.py", "gain=freeze(act.gain * per_cable(", "gain=freeze(act.gain / per_cable(", "test_effects.py::test_gains_multiply_and_offsets_add_when_they_come_twice"),
+    S("effects/effect.py", "return float(std / coordinate**2)", "return float(std / coordinate)", "test_effects.py::test_parameters_are_well_posed"),
+    S("effects/material.py", "np.where(inside, scale, 1.0)", "np.where(inside, 1.0, scale)", "test_effects.py::test_a_soft_region_scales_elements_whose_centroid_is_inside"),
+    S("effects/loads.py", "robot.body.dead_forces + forces", "forces", "test_effects.py::test_a_payload_is_a_force_at_its_point_beside_others"),
+    # poses and calibration
+    S("pose.py", "return make_pose(R, -R @ T_a_b[:3, 3])", "return make_pose(R, -T_a_b[:3, 3])", "test_pose.py::test_inverse_undoes_and_products_compose"),
+    S("pose.py", "pivot - R @ pivot + delta[3:]", "pivot - R.T @ pivot + delta[3:]", "test_pose.py::test_moving_a_pose_turns_about_the_pivot_and_then_shifts"),
+    S("calib/rigid.py", "np.sign(np.linalg.det(U @ Vt))", "1.0", "test_calib_fit.py::test_flat_and_noisy_points_never_give_a_mirror test_calib_fit.py::test_mirrored_points_give_the_best_rotation"),
+    S("calib/rigid.py", "mean_a - R @ mean_b", "mean_a - R.T @ mean_b", "test_calib_fit.py::test_exact_pairs_give_their_pose"),
+    S("calib/fit.py", "part = (Vt.T * inverse**2) @ Vt", "part = (Vt.T * inverse) @ Vt", "test_calib_fit.py::test_a_linear_problem_takes_one_step"),
+    S("calib/fit.py", "np.concatenate([-r, np.zeros(p)]) if damping > 0 else -r", "np.concatenate([r, np.zeros(p)]) if damping > 0 else r", "test_calib_fit.py::test_it_finds_the_least_squares_of_scipy"),
+    S("calib/forward.py", "points * (distance - seen.depth_offset)", "points * (distance + seen.depth_offset)", "test_effects.py::test_depth_is_undone_as_it_was_made"),
+    S("calib/forward.py", "return measured - predicted.reshape(-1, 3)", "return measured - 1e3 * predicted.reshape(-1, 3)", "test_calib_calibrate.py::test_exact_markers_give_pose_and_inputs_back"),
+    S("calib/forward.py", "columns.append((marker_residual(robot, scene, moved, model) - residual) / step[j])", "columns.append((marker_residual(robot, scene, moved, model) - residual) / step[0])", "test_calib_calibrate.py::test_derivatives_of_residuals_are_differences"),
+    S("calib/calibrate.py", "freedom = max(rows - parameters, 1.0)", "freedom = max(4.0 * rows, 1.0)", "test_calib_calibrate.py::test_errors_reach_the_cramer_rao_bound_and_are_as_large_as_stated"),
+    S("calib/calibrate.py", "return np.sqrt(np.minimum(1.0, 3.5 * scale / np.maximum(distance, 1e-300)))", "return np.ones(len(distance))", "test_calib_calibrate.py::test_an_outlier_does_little_and_hardly_widens_what_is_stated"),
+    # clouds
+    S("pointcloud/filters.py", "np.add.reduceat(values[order], starts, axis=0) / counts[:, None]", "np.add.reduceat(values[order], starts, axis=0)", "test_pointcloud_filters.py::test_voxels_hold_the_means_of_their_points"),
+    S("pointcloud/filters.py", "return cloud.select(counts >= min_neighbors)", "return cloud.select(counts > min_neighbors)", "test_pointcloud_filters.py::test_lone_points_are_those_with_few_others_near"),
+    S("pointcloud/contact.py", "radius, enough=enough) >= enough]", "radius, enough=enough) > enough]", "test_pointcloud_contact.py::test_contacts_are_those_of_the_paper"),
+    S("pointcloud/contact.py", "squared.argmin(axis=1)", "squared.argmax(axis=1)", "test_pointcloud_contact.py::test_the_nearest_feature_is_taken"),
+    S("pointcloud/matching.py", "offset = x * normal[0] + y * normal[1] + z * normal[2]", "offset = -(x * normal[0] + y * normal[1] + z * normal[2])", "test_pointcloud_matching.py::test_distance_is_positive_outwards"),
+    S("pointcloud/matching.py", "variance + (slope * line) ** 2) + floor**2", "variance + (slope * line) ** 2)", "test_pointcloud_matching.py::test_the_floor_adds_in_squares"),
+    S("pointcloud/matching.py", "return np.asarray((cosine >= min_facing).any(axis=1))", "return np.asarray((cosine <= min_facing).any(axis=1))", "test_pointcloud_matching.py::test_features_that_face_away_are_hidden"),
+    S("pointcloud/segmentation.py", "cosine >= np.cos(np.deg2rad(tolerance_deg))", "cosine >= np.cos(tolerance_deg)", "test_pointcloud_segmentation.py::test_shadow_does_not_change_which_points_are_robot test_pointcloud_segmentation.py::test_shade_bounds_tell_white_from_dark_grey test_pointcloud_segmentation.py::test_light_moves_brightness_and_hardly_chromaticity"),
+    S("pointcloud/segmentation.py", "return cloud.select(near), cloud.select(~near)", "return cloud.select(~near), cloud.select(near)", "test_pointcloud_segmentation.py::test_model_without_colours_takes_what_is_near"),
+    # forces
+    S("qp/problem.py", 'misfit = _sized(free, rows, "free") - _sized(target, rows, "target")', 'misfit = _sized(target, rows, "target") - _sized(free, rows, "free")', "test_qp_forces.py::test_exact_data_give_the_exact_forces"),
+    S("qp/problem.py", '- _sized(delta_a_free, a, "delta_a_free")', '+ _sized(delta_a_free, a, "delta_a_free")', "test_qp_forces.py::test_measured_displacements_give_forces_and_tensions test_qp_problem.py::test_actuator_constraints_are_equations_13_and_14"),
+    S("qp/problem.py", "return np.asarray(1.0 / values**2)", "return np.asarray(1.0 / values)", "test_qp_forces.py::test_unknown_tensions_and_nuisance_are_marginalised test_qp_problem.py::test_objective_is_the_weighted_misfit_with_its_priors"),
+    S("qp/problem.py", "cone.mu * np.cos(np.pi / cone.sides) * normal", "cone.mu * normal", "test_qp_problem.py::test_the_pyramid_lies_inside_the_cone_and_touches_it"),
+    S("qp/problem.py", "gradient = P @ x + q + G.T @ z", "gradient = P @ x + q - G.T @ z", "test_qp_solve.py::test_known_answers_prove_themselves"),
+    S("qp/forces.py", "np.asarray(1.0 / np.broadcast_to(values.ravel() if values.ndim else values, (rows,)) ** 2)", "np.asarray(1.0 / np.broadcast_to(values.ravel() if values.ndim else values, (rows,)))", "test_qp_forces.py::test_covariance_is_that_of_weighted_least_squares"),
+    # units of files
+    S("robot.py", '"mm": 0.001}', '"mm": 1.0}', "test_robot.py::test_units_and_pose_of_the_mesh"),
+    S("recording.py", "TOO_FAR = 50.0", "TOO_FAR = 50000.0", "test_recording.py::test_one_clear_error"),
+    S("recording.py", "TOO_LONG = 5.0", "TOO_LONG = 5000.0", "test_recording.py::test_one_clear_error"),
+    S("recording.py", "table.depth_unit_m or 0.001)", "0.0001)", "test_recording.py::test_depth_and_colour_become_a_cloud test_recording.py::test_round_trip_with_everything"),
+    S("frame_clouds.py", "image[:, :, 2::-1]", "image[:, :, :3]", "test_recording.py::test_depth_and_colour_become_a_cloud"),
+    S("recording.py", '"load_forces": table.numbers(FORCE_COLUMNS)', '"load_forces": table.numbers(PLACE_COLUMNS)', "test_recording.py::test_optional_columns_and_files test_recording.py::test_round_trip_with_everything"),
+)  # fmt: skip
+
+
+def copy_repository(folder: Path) -> Path:
+    """Copy what the tests need into a folder; data that stand beside the repository are linked."""
+    copy = folder / ROOT.name
+    for part in PARTS:
+        source = ROOT / part
+        if source.is_dir():
+            shutil.copytree(source, copy / part, symlinks=True)
+        elif source.is_file():
+            copy.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(source, copy / part)
+    beside = ROOT.parent / "shared"
+    if beside.exists():
+        (folder / "shared").symlink_to(beside)
+    return copy
+
+
+def red(copy: Path, tests: str, *, seconds: float = 600.0) -> tuple[bool, str]:
+    """Run tests in the copy; return whether any fails, and the last line of the report."""
+    environment = {**os.environ, "PYTHONPATH": str(copy), "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "--no-header", "--tb=no", *(f"tests/{test}" for test in tests.split())]
+    try:
+        done = subprocess.run(command, cwd=copy, env=environment, capture_output=True, text=True, timeout=seconds, check=False)
+    except subprocess.TimeoutExpired:
+        return True, "took too long"
+    lines = (done.stdout + done.stderr).strip().splitlines() or ["no report"]
+    if done.returncode not in (0, 1) or ("error" in lines[-1] and "failed" not in lines[-1]):
+        return False, f"the tests did not run: {lines[-1]}"  # a name that no test has is no red
+    return done.returncode == 1, lines[-1]
+
+
+def try_one(copy: Path, sabotage: Sabotage) -> tuple[str, str]:
+    """Break one line, run its tests, mend it; return "red", "SURVIVED" or "STALE", and a remark."""
+    path = copy / sabotage.file
+    original = path.read_text(encoding="utf-8")
+    if original.count(sabotage.line) != 1:
+        return "STALE", f"the line stands {original.count(sabotage.line)} times in the file"
+    status = path.stat()
+    path.write_text(original.replace(sabotage.line, sabotage.broken), encoding="utf-8")
+    try:
+        noticed, remark = red(copy, sabotage.tests)
+    finally:
+        path.write_text(original, encoding="utf-8")
+        os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))  # compiled files of the whole line serve again
+    return ("red" if noticed else "SURVIVED"), remark
+
+
+def shown(sabotage: Sabotage) -> str:
+    return f"{sabotage.file:34}  {sabotage.line[:44]:44}  →  {sabotage.broken[:44]:44}"
+
+
+def main(arguments: list[str]) -> int:
+    words = [word for word in arguments if not word.startswith("--")]
+    chosen = [s for s in SABOTAGES if not words or any(word in s.file or word in s.tests for word in words)]
+    if "--list" in arguments:
+        print(*map(shown, chosen), sep="\n")
+        return 0
+    with tempfile.TemporaryDirectory(prefix="sabotage") as folder:
+        copy = copy_repository(Path(folder))
+        tests = " ".join(dict.fromkeys(test for s in chosen for test in s.tests.split()))
+        broken_already, remark = red(copy, tests)
+        if broken_already or "passed" not in remark:
+            print(f"the tests are not green to begin with: {remark}")
+            return 1
+        results = []
+        for sabotage in chosen:
+            began = time.monotonic()
+            result, remark = try_one(copy, sabotage)
+            results.append(result)
+            print(f"{result:8}  {shown(sabotage)}  {time.monotonic() - began:5.1f} s  {remark}", flush=True)
+    print(
+        f"{results.count('red')} of {len(results)} noticed, {results.count('SURVIVED')} survived, {results.count('STALE')} stale"
+    )
+    return 0 if all(result == "red" for result in results) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
