@@ -384,17 +384,19 @@ def _progress(title: str) -> Iterator[Callable[..., None] | None]:
         yield None
         return
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[count]}"), TimeElapsedColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(title, total=None)
+        task = bar.add_task(title, total=None, count="")
 
-        def advance(done: int | str, total: int | None = None, text: str | None = None) -> None:
-            if isinstance(done, str):
-                bar.update(task, description=done)
-            else:
-                bar.update(task, completed=done, total=total, description=text)
+        def advance(done: int | str, total: int | None = None) -> None:
+            nonlocal task
+            if isinstance(done, int):
+                bar.update(task, completed=done, total=total, description=title, count=f"{done}/{total}")
+                return
+            bar.remove_task(task)  # an update cannot take a total away
+            task = bar.add_task(done, total=None, count="")
 
         yield advance
 
