@@ -1,0 +1,202 @@
+"""Figures: one look for all of them, the body seen along an axis, and SVG that is the same each time."""
+
+from __future__ import annotations
+
+import io
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from femsense.arrays import FloatArray, IntArray
+from femsense.fem.mesh import TetMesh, surface_triangles
+from femsense.report.page import Html, image
+
+BEFORE, AFTER = "#c8641b", "#1f6f5c"
+INK, SOFT, LINE, PALE = "#1f252c", "#5b6673", "#dfe3e8", "#9aa4af"
+SERIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#8a6d00", "#56b4e9", "#4b3b8f", "#666666")
+WIDTH, HEIGHT = 4.5, 3.0
+"""Of a panel [inch]: readable at the width of a phone."""
+SIZE = 9.5
+MANY = 1500
+"""So many points are drawn as pixels."""
+BODY = np.array([0.80, 0.84, 0.89])
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class View:
+    """A direction to look along, given by what points right and up."""
+
+    right: FloatArray
+    up: FloatArray
+    axes: tuple[str, str]
+
+    @property
+    def towards(self) -> FloatArray:
+        """Unit vector from the body to the eye, shape (3,)."""
+        return np.cross(self.right, self.up)
+
+    def flat(self, points: FloatArray) -> FloatArray:
+        """Return points or vectors (…, 3) as seen, (…, 2)."""
+        return np.asarray(points) @ np.stack([self.right, self.up], axis=1)
+
+
+X, Y, Z = np.eye(3)
+VIEWS = (View(X, Z, ("x", "z")), View(Y, Z, ("y", "z")), View(X, Y, ("x", "y")))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Surface:
+    """The skin of a body."""
+
+    nodes: FloatArray
+    """[m], shape (n, 3)."""
+    triangles: IntArray
+    """shape (t, 3)."""
+
+
+def skin(nodes: FloatArray, tets: IntArray) -> Surface:
+    """Return the skin of a body; mid-edge nodes are left out."""
+    return Surface(np.asarray(nodes, dtype=np.float64), surface_triangles(TetMesh(nodes, tets[:, :4])))
+
+
+def best_view(points: FloatArray, vectors: FloatArray) -> View:
+    """Return the view along an axis that shows most of the vectors (k, 3), and of the points (n, 3) they stand on."""
+
+    def shown(view: View) -> float:
+        whole = float((vectors**2).sum())
+        share = float((view.flat(vectors) ** 2).sum()) / whole if whole > 0 else 1.0
+        return share * math.sqrt(float(np.prod(np.ptp(view.flat(points), axis=0))))
+
+    return max(VIEWS, key=shown)
+
+
+def nice(value: float) -> float:
+    """Return the largest of 1, 2, 5 × 10ⁿ that is not above a value."""
+    base = 10.0 ** math.floor(math.log10(max(value, 1e-300)))
+    return next(step * base for step in (5.0, 2.0, 1.0) if step * base <= value * (1 + 1e-9))
+
+
+def new_axes(*, width: float = WIDTH, height: float = HEIGHT) -> tuple[Any, Any]:
+    """Return a figure of its own with axes of the report's look."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout="constrained", facecolor="white")
+    axes = figure.add_subplot()
+    axes.set_facecolor("white")
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.spines[["left", "bottom"]].set_color(PALE)
+    axes.tick_params(colors=SOFT, labelsize=SIZE - 0.5, length=3, width=0.8)
+    axes.grid(True, color=LINE, linewidth=0.7)
+    axes.set_axisbelow(True)
+    return figure, axes
+
+
+def name_axes(axes: Any, x: str, y: str) -> None:
+    """Name both axes."""
+    axes.set_xlabel(x, fontsize=SIZE, color=INK)
+    axes.set_ylabel(y, fontsize=SIZE, color=INK)
+
+
+def add_legend(axes: Any, **options: Any) -> None:
+    """Explain the colours above the axes, where nothing is covered."""
+    handles, _ = axes.get_legend_handles_labels()
+    columns = options.pop("columns", min(len(handles), 3))
+    if handles:
+        axes.legend(
+            loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns, frameon=False, fontsize=SIZE - 0.5,
+            labelcolor=INK, borderaxespad=0.2, handlelength=1.4, columnspacing=1.3, handletextpad=0.5, **options,
+        )  # fmt: skip
+
+
+def whole_numbers(axes: Any) -> None:
+    """Have only whole numbers on the x axis."""
+    from matplotlib.ticker import MaxNLocator
+
+    axes.xaxis.set_major_locator(MaxNLocator(nbins=7, integer=True))
+
+
+def draw_body(axes: Any, surface: Surface, view: View) -> None:
+    """Draw the skin of a body [mm], shaded, as pixels."""
+    from matplotlib.collections import PolyCollection
+
+    corners = 1e3 * surface.nodes[surface.triangles]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    facing = normals @ view.towards
+    front = np.flatnonzero(facing > 0)
+    order = front[np.argsort((corners[front] @ view.towards).mean(axis=1), kind="stable")]
+    light = 0.6 * view.towards + 0.5 * view.up - 0.3 * view.right
+    shade = 0.74 + 0.30 * np.clip(normals[order] @ light / np.linalg.norm(light), 0.0, 1.0)
+    colors = np.clip(BODY * shade[:, None], 0.0, 1.0)
+    axes.add_collection(
+        PolyCollection(list(view.flat(corners[order])), facecolors=colors, edgecolors=colors, linewidths=0.3, rasterized=True)
+    )
+
+
+def frame_body(axes: Any, view: View, low: FloatArray, high: FloatArray) -> None:
+    """Show a rectangle [mm] with equal scales, without axes, and with a cross of the directions and a scale bar below it."""
+    size = high - low
+    margin = 0.04 * float(size.max())
+    bar = nice(0.3 * float(size.max()))
+    y = low[1] - 1.4 * margin
+    axes.plot([low[0], low[0] + bar], [y, y], color=INK, linewidth=2, solid_capstyle="butt")
+    axes.text(low[0] + bar / 2, y - 0.6 * margin, f"{bar:g} mm", ha="center", va="top", fontsize=SIZE - 0.5, color=INK)
+    axes.set(xlim=(low[0] - margin, high[0] + margin), ylim=(y - 4.0 * margin, high[1] + margin))
+    axes.set_aspect("equal")
+    axes.axis("off")
+    _cross(axes, view, np.array([high[0] - 3.0 * margin, y - 2.6 * margin]), 2.2 * margin)
+
+
+def _cross(axes: Any, view: View, at: FloatArray, size: float) -> None:
+    """Draw which way the axes of the robot frame point."""
+    for name, (dx, dy) in zip(view.axes, ((1.0, 0.0), (0.0, 1.0))):
+        tip = at + size * np.array([dx, dy])
+        axes.annotate(
+            "",
+            xy=tuple(tip),
+            xytext=tuple(at),
+            arrowprops={"arrowstyle": "->", "color": SOFT, "linewidth": 0.9, "shrinkA": 0, "shrinkB": 0},
+        )
+        axes.text(*(at + 1.35 * size * np.array([dx, dy])), name, ha="center", va="center", fontsize=SIZE - 1, color=SOFT)
+
+
+def draw_bars(names: Sequence[str], values_mm: Sequence[float], unit: str, *, color: str = AFTER) -> Any:
+    """Return a figure of horizontal bars, the first on top."""
+    figure, axes = new_axes(height=max(1.5, 0.55 + 0.26 * len(names)))
+    places = np.arange(len(names))
+    axes.barh(places, values_mm, height=0.62, color=color)
+    for place, value in zip(places, values_mm):
+        axes.text(value, place, f" {value:.2f}", va="center", fontsize=SIZE - 1, color=INK)
+    axes.set_yticks(places, [clipped(name) for name in names])
+    axes.invert_yaxis()
+    axes.margins(x=0.14)
+    axes.grid(False, axis="y")
+    name_axes(axes, unit, "")
+    return figure
+
+
+def clipped(name: str, width: int = 22) -> str:
+    """Return a name that fits beside an axis, without what matplotlib takes for mathematics."""
+    text = name if len(name) <= width else name[: width - 1] + "…"
+    return text.replace("$", r"\$")
+
+
+def as_image(figure: Any, *, alt: str, caption: object = "") -> Html:
+    """Return a figure as part of the page."""
+    stream = io.StringIO()
+    figure.savefig(stream, format="svg", dpi=170, metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
+    return image(_stable(stream.getvalue()).encode(), "svg+xml", alt=alt, caption=caption)
+
+
+def _stable(svg: str) -> str:
+    """Return an SVG of matplotlib with its random names numbered in the order in which they appear."""
+    names: dict[str, str] = {}
+
+    def numbered(match: re.Match[str]) -> str:
+        return names.setdefault(match.group(0), f"n{len(names)}")
+
+    return re.sub(r'(?<=[#"])(?:[A-Za-z]\w*?)?[0-9a-f]{10}(?=[)"])', numbered, svg)

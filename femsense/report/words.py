@@ -1,0 +1,118 @@
+"""Numbers and names as people read them: mm, N or mN, so many digits as the uncertainty allows, "–" where nothing is known."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+NOTHING = "–"
+SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+UNITS = {"m": (1e3, "mm"), "Pa": (1e-3, "kPa"), "rad": (180.0 / math.pi, "°"), "1": (1.0, "")}
+"""What is shown instead of the units of files: factor and name."""
+MILLI = 0.1
+"""Forces below this [N] are shown in mN."""
+
+
+def known(value: Any) -> bool:
+    """Return whether a value is a finite number."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def number(value: Any, digits: int = 3) -> str:
+    """Return a number with so many digits, "–" for None and NaN."""
+    if not known(value):
+        return NOTHING
+    if value == 0:
+        return "0"
+    exponent = math.floor(math.log10(abs(value)))
+    if not -4 <= exponent < 6:
+        mantissa, power = f"{value:.{digits - 1}e}".split("e")
+        return _minus(f"{mantissa} × 10{str(int(power)).translate(SUPERSCRIPT)}")
+    return _minus(f"{value:.{max(0, digits - 1 - exponent)}f}")
+
+
+def quantity(value: Any, unit: str | None, digits: int = 3) -> str:
+    """Return a number of SI with the unit that it is shown in."""
+    factor, name = UNITS.get(unit or "1", (1.0, unit or ""))
+    return joined(number(factor * value, digits), name) if known(value) else NOTHING
+
+
+def length(value_m: Any, digits: int = 3) -> str:
+    """Return a length in mm."""
+    return quantity(value_m, "m", digits)
+
+
+def percent(share: Any, digits: int = 0) -> str:
+    """Return a share in percent."""
+    return _minus(f"{100 * share:.{digits}f} %") if known(share) else NOTHING
+
+
+def force_unit(largest_n: float) -> tuple[float, str]:
+    """Return factor and name of the unit for forces up to a size [N]."""
+    return (1e3, "mN") if 0 < largest_n < MILLI else (1.0, "N")
+
+
+def with_std(value: Any, std: Any, unit: str | None = None) -> str:
+    """Return value ± standard deviation with its unit; two digits of the deviation decide how many are shown."""
+    if isinstance(value, str | bool):
+        return str(value)
+    factor, name = UNITS.get(unit or "1", (1.0, unit or ""))
+    if not known(value) or not known(std) or std <= 0:
+        return quantity(value, unit)
+    value, std = factor * value, factor * std
+    decimals = 1 - math.floor(math.log10(std))
+    if decimals > 6:
+        return joined(f"{number(value)} ± {number(std, 2)}", name)
+    shown = max(0, decimals)
+    return joined(_minus(f"{value:.{shown}f} ± {std:.{shown}f}"), name)
+
+
+def interval(ends_m: Sequence[Any] | None) -> str:
+    """Return an interval of lengths in mm."""
+    if not ends_m or len(ends_m) != 2 or not all(map(known, ends_m)):
+        return NOTHING
+    return f"{number(1e3 * ends_m[0])} … {number(1e3 * ends_m[1])} mm"
+
+
+def entries(value: Any, std: Any) -> list[tuple[str, Any, Any]]:
+    """Return the named parts of a value with their deviations: those of a table, else the value itself with an empty name."""
+    if not isinstance(value, Mapping):
+        return [("", value, std)]
+    deviations = std if isinstance(std, Mapping) else {}
+    return [(str(name), part, deviations.get(name)) for name, part in value.items()]
+
+
+def parameter(value: Any, std: Any, unit: str | None) -> str:
+    """Return a number or a vector ± standard deviation."""
+    if not isinstance(value, list | tuple):
+        return with_std(value, std, unit)
+    deviations = std if isinstance(std, list | tuple) and len(std) == len(value) else [None] * len(value)
+    name = UNITS.get(unit or "1", (1.0, unit or ""))[1]
+    parts = [with_std(v, s, unit).removesuffix(name).strip() if name else with_std(v, s, unit) for v, s in zip(value, deviations)]
+    return joined(f"({', '.join(parts)})", name)
+
+
+def frame_list(frames: Sequence[int]) -> str:
+    """Return numbers of frames with runs drawn together: 0–3, 7."""
+    runs: list[list[int]] = []
+    for frame in sorted(set(frames)):
+        if runs and frame == runs[-1][1] + 1:
+            runs[-1][1] = frame
+        else:
+            runs.append([frame, frame])
+    return ", ".join(str(a) if a == b else f"{a}–{b}" for a, b in runs) or "none"
+
+
+def joined(text: str, unit: str) -> str:
+    """Return a number and its unit with a space between them that does not break."""
+    return f"{text}\u00a0{unit}" if unit and text != NOTHING else text
+
+
+def counted(count: int, noun: str) -> str:
+    """Return a count with its noun: 1 frame, 2 frames."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
+def _minus(text: str) -> str:
+    return text.replace("-", "−")

@@ -1,0 +1,60 @@
+"""From a folder of results to one HTML file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from femsense.errors import InputError
+from femsense.files import write_text
+from femsense.report.calibration import calibration_chapter
+from femsense.report.found import Found, find_results
+from femsense.report.loop import loop_chapter
+from femsense.report.page import Chapter, page
+from femsense.report.run import run_chapter
+
+CHAPTERS: dict[str, Callable[[Path, str], Chapter]] = {
+    "loop": loop_chapter,
+    "run": run_chapter,
+    "calibration": calibration_chapter,
+}
+NAMES = {"loop": "What the model lacks", "run": "Forces", "calibration": "Calibration"}
+
+
+def write_report(folder: str | Path, path: str | Path | None = None) -> Path:
+    """Write the figures and tables of a folder of results as one HTML file that needs nothing else.
+
+    Arguments:
+        folder: of femsense improve, estimate or calibrate, or one that holds such folders.
+        path: the file; report.html in the folder if not given.
+
+    Returns:
+        the file.
+
+    Raises:
+        InputError: no such folder, no results in it, a broken file among them, or a folder where the file should be written.
+    """
+    root = Path(folder).expanduser()
+    target = root / "report.html" if path is None else Path(path).expanduser()
+    if target.is_dir():
+        raise InputError("a folder stands where the file should be written", where=target, expected="the name of a file", hint=str(target / "report.html"))  # fmt: skip
+    write_text(target, report_html(root))
+    return target
+
+
+def report_html(folder: str | Path) -> str:
+    """Return the report of a folder as HTML. Raises InputError; see `write_report`."""
+    root = Path(folder).expanduser()
+    found = find_results(root)
+    chapters = [CHAPTERS[item.kind](item.file, _title(item, root, found)) for item in found]
+    subject = next((chapter.subject for chapter in chapters if chapter.subject), "") or root.resolve().name
+    return page(subject, "femsense report", chapters)
+
+
+def _title(item: Found, root: Path, found: Sequence[Found]) -> str:
+    """Return the title of a chapter: its kind, and where it stands if others are of the same kind or it is not of this folder."""
+    place = item.folder.relative_to(root).as_posix()
+    alike = [other for other in found if other.kind == item.kind and other.folder == item.folder]
+    if len(alike) > 1:
+        place = item.file.relative_to(root).as_posix()
+    return NAMES[item.kind] if place == "." else f"{NAMES[item.kind]} ({place})"
