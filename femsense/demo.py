@@ -100,18 +100,20 @@ def demo_text(document: Mapping[str, Any]) -> str:
     for title, key in (("residual of the markers", "train_rms_m"), ("  on held-out sweeps", "validation_rms_m")):
         rows.append([title, *(_figure((loop.get(when) or {}).get(key), 1e3, "mm") for when in ("before", "after"))])
     rows.append(["time a frame", *(_figure(run["ms_per_frame"], 1.0, "ms") for run in (a, b))])
-    lines = [columns(rows, indent=0), "", f"the model lacked (verdict: {loop['verdict']}):"]
+    lines = [columns(rows, indent=0), "", f"what the declared model lacks (verdict: {loop['verdict']}):"]
     lines += ["  " + line for effect in loop.get("effects") or [] for line in effect_text(effect).splitlines()] or [
         "  nothing that these data show"
     ]
-    true = [
-        ", ".join(f"{key} {value}" for key, value in effect.items() if key != "name") for effect in document["truth"]["effects"]
-    ]
-    lines += [f"  truth: {effect['name']} {text}" for effect, text in zip(document["truth"]["effects"], true)]
+    true = [[effect["name"], _entry(effect)] for effect in document["truth"]["effects"]]
+    lines += ["", "what it lacks in truth:", columns(true)] if true else []
     places = [["see it", f"femsense view {out / 'run'}"], ["mesh", str(out / "robot.glb")], ["picture", str(out / "picture.png")]]
     if document.get("report"):
         places.append(["report", str(document["report"])])
     return "\n".join([*lines, "", columns(places, indent=0)])
+
+
+def _entry(effect: Mapping[str, Any]) -> str:
+    return ", ".join(f"{key} {value}" for key, value in effect.items() if key != "name")
 
 
 def _report(folder: Path, say: Callable[[str], None]) -> str | None:
