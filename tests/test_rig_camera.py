@@ -108,6 +108,9 @@ def test_edges_and_oblique_surfaces_lose_depth() -> None:
     assert 0.05 < (image.depth[ball] == 0).mean() < 0.5
     center = tuple(np.argwhere(ball).mean(axis=0).round().astype(int))
     assert image.depth[center] > 0
+    oblique = NoiseTable.model_validate({"edge_dropout": 0.0, "flying_share": 0.0, "grazing_deg": 45.0})
+    lost = (render(CAMERA, POSE, shapes, noise=oblique, rng=np.random.default_rng(1)).depth == 0) & ball
+    assert 0.3 < lost.sum() / ball.sum() < 0.6  # a ball turns by 45° at 0.7 of its radius
     flying = NoiseTable.model_validate({"edge_dropout": 0.0, "flying_share": 1.0, "subpixel_px": 0.0})
     between = render(CAMERA, POSE, shapes, noise=flying, rng=np.random.default_rng(1)).depth
     assert ((between > 0.32) & (between < 0.58)).sum() > 50
