@@ -157,7 +157,8 @@ def test_json_is_alone_on_standard_output_whatever_libraries_print(tmp_path: Pat
         "    return real(path)\n"
         f"i.inspect_path = noisy\nsys.exit(cli.run(['inspect', {str(write_block_robot(tmp_path))!r}, '--json']))"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=False)
+    buffered = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=False, env=buffered)
     assert done.returncode == 0 and json.loads(done.stdout)["kind"] == "robot"
     assert all(word in done.stderr for word in ("python says", "C says", "the system says"))
 
