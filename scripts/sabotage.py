@@ -148,15 +148,25 @@ def copy_repository(folder: Path) -> Path:
 def red(copy: Path, tests: str, *, seconds: float = 600.0) -> tuple[bool, str]:
     """Run tests in the copy; return whether any fails, and the last line of the report."""
     environment = {**os.environ, "PYTHONPATH": str(copy), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "--no-header", "--tb=no", *(f"tests/{test}" for test in tests.split())]
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-x",
+        "--no-header",
+        "--tb=no",
+        "--disable-warnings",
+        *(f"tests/{test}" for test in tests.split()),
+    ]
     try:
         done = subprocess.run(command, cwd=copy, env=environment, capture_output=True, text=True, timeout=seconds, check=False)
     except subprocess.TimeoutExpired:
         return True, "took too long"
     lines = (done.stdout + done.stderr).strip().splitlines() or ["no report"]
-    if done.returncode not in (0, 1) or ("error" in lines[-1] and "failed" not in lines[-1]):
-        return False, f"the tests did not run: {lines[-1]}"  # a name that no test has is no red
-    return done.returncode == 1, lines[-1]
+    summary = next((line for line in reversed(lines) if " passed" in line or " failed" in line), lines[-1])
+    if done.returncode not in (0, 1) or (done.returncode == 1 and " failed" not in summary):
+        return False, f"the tests did not run: {summary}"  # a name that no test has is no red
+    return done.returncode == 1, summary
 
 
 def try_one(copy: Path, sabotage: Sabotage) -> tuple[str, str]:
