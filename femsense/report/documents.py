@@ -198,6 +198,22 @@ class RunFacts(Document):
     versions: dict[str, str] = Field(default_factory=dict)
 
 
+class DemoRun(Document):
+    force_error_n: Number = None
+    force_error_share: Number = None
+    place_error_m: Number = None
+    contacts_found: int | None = None
+    contacts_true: int | None = None
+    contacts_false: int | None = None
+
+
+class Demo(Document):
+    """demo.json."""
+
+    declared: DemoRun = DemoRun()
+    improved: DemoRun = DemoRun()
+
+
 def read_document(file: Path, schema: type[DocumentType], expected: str) -> DocumentType:
     """Return a checked JSON document of a format.
 
@@ -209,14 +225,20 @@ def read_document(file: Path, schema: type[DocumentType], expected: str) -> Docu
     Raises:
         InputError: not readable, not JSON, another format, or a key of the wrong type; with the key and what was found.
     """
-    try:
-        document = json.loads(read_text(file))
-    except ValueError as error:
-        raise InputError("not valid JSON", where=file, found=error, expected=f"a file of format {expected}") from None
-    if not isinstance(document, dict):
-        raise InputError("another kind of file", where=file, found=short(document), expected=f"a file of format {expected}")
+    document = read_json(file, f"a file of format {expected}")
     if document.get("format") != expected:
         raise InputError(
             "another kind of file", where=f"{file}: format", found=short(document.get("format")), expected=repr(expected)
         )
     return validated(schema, document, file)
+
+
+def read_json(file: Path, expected: str) -> dict[str, Any]:
+    """Return a JSON object; `expected` says what the file should be. Raises InputError."""
+    try:
+        document = json.loads(read_text(file))
+    except ValueError as error:
+        raise InputError("not valid JSON", where=file, found=error, expected=expected) from None
+    if not isinstance(document, dict):
+        raise InputError("another kind of file", where=file, found=short(document), expected=expected)
+    return document

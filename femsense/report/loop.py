@@ -164,7 +164,7 @@ def _residual_on_robot(residuals: Residuals, folder: Path) -> Html | None:
     ]
     shown = float((view.flat(mean[0]) ** 2).sum() / max((mean[0] ** 2).sum(), 1e-300))
     text = paragraph(
-        f"Arrows point from the model to the measurement: the mean of each marker over the held-out frames, drawn {factor:g} times as long, "
+        f"Arrows point from the model to the measurement: the mean of each marker over the held-out frames, {'at true length' if factor == 1 else f'drawn {factor:g} times as long'}, "
         f"with the same scale in both pictures. Small dots are single frames. The body is at rest, seen so that its {view.axes[0]}–{view.axes[1]} plane "
         f"lies in the page, which shows {words.percent(shown)} of the squared mean residual before."
     )
@@ -408,8 +408,10 @@ def _refits(candidates: Sequence[Candidate]) -> Html | None:
 
 
 def _open_questions(rivals: Sequence[Rivals], untestable: Sequence[Untestable], experiment: str) -> Html | None:
-    pairs = [together(code(r.pair[0]), Html(" and "), code(r.pair[1]), Html(f": {_why_alike(r)}")) for r in rivals]
-    hidden = [together(code(u.name), Html(f": calibration imitates {words.percent(u.absorbed_share)} of it")) for u in untestable]
+    pairs = [element("span", code(r.pair[0]), " and ", code(r.pair[1]), f": {_why_alike(r)}") for r in rivals]
+    hidden = [
+        element("span", code(u.name), f": calibration imitates {words.percent(u.absorbed_share)} of it") for u in untestable
+    ]
     advice = paragraph(element("strong", "Next experiment: "), experiment, class_="next") if experiment else None
     return together(
         section("Cannot be told apart", bullets(pairs), level=4), section("Not testable with these data", bullets(hidden), level=4), advice
@@ -520,7 +522,7 @@ def _card(card: Card, versions: Mapping[str, str]) -> Html | None:
     )
     rows += [["Uncertainty of marker seats", words.length(card.seat_std_m, 2)]] if words.known(card.seat_std_m) else []
     for name, parameters in card.nuisance_after.items():
-        rows.append([together(Html("Fitted along: "), code(name)), together(*_nuisance_lines(parameters))])
+        rows.append([element("span", "Fitted along: ", code(name)), together(*_nuisance_lines(parameters))])
     rows += [["Seed", str(card.seed)]] if card.seed is not None else []
     rows += [["Versions", ", ".join(f"{name} {version}" for name, version in versions.items())]] if versions else []
     return table(("Item", "Value"), rows, caption="What the result rests on; loop.json beside this file holds all of it.")

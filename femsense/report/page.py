@@ -37,6 +37,7 @@ code { font: 0.92em ui-monospace, SFMono-Regular, Menlo, Consolas, monospace; }
 .tile dd.note { font-size: 13px; font-weight: 400; color: var(--soft); }
 .panels { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 400px), 1fr)); gap: 8px 24px; margin: 10px 0; }
 figure { margin: 6px 0; break-inside: avoid; max-width: 560px; }
+figure.wide { max-width: none; }
 figure img { display: block; width: 100%; height: auto; }
 figcaption { font-size: 14px; color: var(--soft); }
 .scroll { overflow-x: auto; margin: 10px 0 14px; }
@@ -64,6 +65,9 @@ footer { margin-top: 52px; padding-top: 12px; padding-bottom: 40px; color: var(-
   h2, h3, h4 { break-after: avoid; } nav { display: none; }
 }
 """
+BLOCKS = {"p", "div", "dl", "dt", "dd", "li", "th", "td", "tr", "caption", "figcaption", "h1", "h2", "h3", "h4", "title"}
+"""Elements that end a line of the file."""
+NEWLINE = "\n"
 LONG = 150
 """A sentence of more letters is set smaller."""
 
@@ -102,7 +106,7 @@ def escape(value: object) -> Html:
 def element(tag: str, *contents: object, **attributes: str) -> Html:
     """Return an element; `class_` gives its class."""
     names = "".join(f' {name.rstrip("_").replace("_", "-")}="{escape(value)}"' for name, value in attributes.items())
-    return Html(f"<{tag}{names}>{''.join(map(escape, contents))}</{tag}>")
+    return Html(f"<{tag}{names}>{''.join(map(escape, contents))}</{tag}>{NEWLINE if tag in BLOCKS else ''}")
 
 
 def together(*parts: Html | None) -> Html:
@@ -164,7 +168,7 @@ def table(
         element("tr", *_row(row, numeric), class_="strong") if i in strong else element("tr", *_row(row, numeric))
         for i, row in enumerate(rows)
     ]
-    whole = element("table", element("caption", caption), element("thead", head), element("tbody", *lines))
+    whole = element("table", element("caption", caption), element("thead", head), element("tbody", together(*lines)))
     return element("div", whole, class_="scroll", tabindex="0", role="region", aria_label=caption)
 
 
@@ -183,7 +187,7 @@ def _cell(tag: str, content: object, numeric: bool, **attributes: str) -> Html:
     return element(tag, content, **({"class_": "n"} if numeric else {}), **attributes)
 
 
-def image(data: bytes, kind: str, *, alt: str, caption: object = "") -> Html:
+def image(data: bytes, kind: str, *, alt: str, caption: object = "", wide: bool = False) -> Html:
     """Return a figure with the picture inside the page.
 
     Arguments:
@@ -191,10 +195,13 @@ def image(data: bytes, kind: str, *, alt: str, caption: object = "") -> Html:
         kind: "svg+xml" or "png".
         alt: what it shows, for those who do not see it.
         caption: stands below it.
+        wide: over the whole width of the page.
     """
     source = f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"
     picture = Html(f'<img src="{source}" alt="{escape(alt)}">')
-    return element("figure", picture, *([element("figcaption", caption)] if caption else []))
+    return element(
+        "figure", picture, *([element("figcaption", caption)] if caption else []), **({"class_": "wide"} if wide else {})
+    )
 
 
 def panels(*figures: Html | None) -> Html | None:

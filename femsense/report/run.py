@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from femsense.arrays import FloatArray, IntArray
 from femsense.report import words
+from femsense.report.compare import load_error
 from femsense.report.documents import KnownLoad, RunFacts, read_document
 from femsense.report.drawing import (
     AFTER,
@@ -295,16 +296,11 @@ def _force_on_body(contacts: ContactTable, frames: FrameTable | None, folder: Pa
 
 def _known_loads(loads: Sequence[KnownLoad]) -> Html | None:
     rows = [
-        [str(load.frame), words.number(load.declared_n), words.number(load.sensed_n), _signed(load.error_percent)] for load in loads[:ROWS]
-    ]  # fmt: skip
-    errors = [abs(load.error_percent) for load in loads if load.error_percent is not None and words.known(load.error_percent)]
-    text = (
-        paragraph(
-            f"The median error is {words.number(float(np.median(errors)), 2)} %, the largest {words.number(max(errors), 2)} %."
-        )
-        if errors
-        else None
-    )
+        [str(load.frame), words.number(load.declared_n), words.number(load.sensed_n), _signed(load.error_percent)]
+        for load in loads[:ROWS]
+    ]
+    error = load_error(loads)
+    text = paragraph(f"The median size of the error is {error}.") if error != words.NOTHING else None
     caption = "Declared loads at the given places next to the forces that were sensed there." + _cut(len(loads), ROWS, "run.json")
     return (
         together(text, table(("Frame", "Declared [N]", "Sensed [N]", "Error [%]"), rows, caption=caption, numeric=(1, 2, 3)))

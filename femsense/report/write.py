@@ -8,6 +8,7 @@ from pathlib import Path
 from femsense.errors import InputError
 from femsense.files import write_text
 from femsense.report.calibration import calibration_chapter
+from femsense.report.compare import comparison_chapter
 from femsense.report.found import Found, find_results
 from femsense.report.loop import loop_chapter
 from femsense.report.page import Chapter, page
@@ -47,6 +48,11 @@ def report_html(folder: str | Path) -> str:
     root = Path(folder).expanduser()
     found = find_results(root)
     chapters = [CHAPTERS[item.kind](item.file, _title(item, root, found)) for item in found]
+    loops = sum(item.kind == "loop" for item in found)
+    compared = comparison_chapter(
+        root, [item.file for item in found if item.kind == "run"], "What it changes" if loops else "Comparison"
+    )
+    chapters[loops:loops] = [compared] if compared else []
     subject = next((chapter.subject for chapter in chapters if chapter.subject), "") or root.resolve().name
     return page(subject, "femsense report", chapters)
 
