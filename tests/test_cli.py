@@ -397,7 +397,9 @@ def test_stopping_leaves_nothing_half_written(tmp_path: Path, robot: Path, recor
     code = (
         "import femsense.calib.calibrate as c, sys, time\nfrom femsense.results import _write_states\nimport femsense.results as r\n"
         "def slow(*arguments):\n    _write_states(*arguments)\n    print('writing', file=sys.stderr, flush=True)\n    time.sleep(60)\n"
-        "r._write_states = slow\nfrom femsense.cli import main\nmain()"
+        "r._write_states = slow\nimport signal\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background inherits that it is ignored\n"
+        "from femsense.cli import main\nmain()"
     )
     words: Sequence[str] = ["estimate", str(robot), str(recording), "-o", str(tmp_path / "run"), "--at", "0.1,0.015,0.015"]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
