@@ -18,9 +18,10 @@ from femsense.files import folder_hash
 from femsense.march import Walk, drive_of, marker_positions, walk_along
 from femsense.model import Robot
 from femsense.recording import load_recording
+from femsense.rig.scene import probe_shape
 from femsense.rig.script import TruthTable, check_script, plan_script
 from femsense.rig.simulate import recording_of, run_experiment, simulate
-from femsense.rig.truth import contact_patch, creep_matrix, true_robot, walk_truth
+from femsense.rig.truth import TrueContact, contact_patch, creep_matrix, true_robot, walk_truth
 from femsense.robot import load_robot
 
 LOAD = {"sweep": "b", "point_m": [0.1, 0.015, 0.015], "force_n": [0.0, 0.0, -0.05]}
@@ -235,3 +236,13 @@ def test_nothing_half_written_is_left(robot: Robot, tmp_path: Path, monkeypatch:
     with pytest.raises(OSError, match="no space"):
         simulate(robot, SEEN, tmp_path / "out")
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("kind", ["sphere", "cylinder"])
+def test_a_probe_touches_from_outside(kind: str) -> None:
+    place, normal = np.array([0.01, 0.02, 0.03]), np.array([0.0, 0.0, 1.0])
+    probe = probe_shape(TrueContact(0, place, normal, np.array([0.0, 0.0, -0.5])), kind, 0.006, np.ones(3))
+    local = probe.points - place
+    assert local[:, 2].min() == pytest.approx(0.0, abs=1e-5)
+    assert np.hypot(local[:, 0], local[:, 1]).max() == pytest.approx(0.006, rel=0.02)
+    assert local[:, 2].max() > 0.1
