@@ -109,7 +109,7 @@ def write_run_folder(
         touched = [] if lost else [0] if k < 8 else [0, 1] if k < 20 or k == 25 else []
         for c in touched:
             contacts.append(
-                f"{k},{0.1 * k},{c},{0.09 - 0.04 * c},0.015,0.03,0,0,1,0.02,0,{-force / (c + 1)},{force / (c + 1)},{'' if k == 12 else 0.05 * scale},cloud"
+                f"{k},{0.1 * k},{c},{0.09 - 0.04 * c},0.015,0.03,0,0,1,0.02,0,{-force / (c + 1)},{force / (c + 1)},{'' if k in (12, 25) else 0.05 * scale},cloud"
             )
         lines.append(
             f'{k},{0.1 * k},"{reason if lost else "ok"}",{len(touched)},{0 if lost else 12},'
@@ -220,7 +220,7 @@ def check_picture(source: str) -> None:
         assert data.startswith(b"\x89PNG")
         return
     svg = data.decode()
-    assert svg.rstrip().endswith("</svg>") and "nan" not in re.sub(r'"data:[^"]*"', "", svg)
+    assert svg.startswith("<svg") and svg.rstrip().endswith("</svg>") and "nan" not in re.sub(r'"data:[^"]*"', "", svg)
     assert all(target.startswith(("#", "data:image/png")) for target in re.findall(r'href="([^"]*)"', svg))
 
 
@@ -239,7 +239,7 @@ def test_a_loop_shows_its_sentence_its_numbers_and_all_sections(tmp_path: Path) 
         "leave the same trace (agreement 97.2 %)", "poisson: calibration imitates 97 % of it", "Next experiment: turn the base by 90°",
         "poisson_ratio 0.031", "scale a change of 22 %", "softer than 10000 N/m", "0.10 mm … 0.30 mm (9 parameters)", "stiffness_n_m cannot be seen",
         "most at marker tip, mean (0.0100, −0.0200, 0.0600) mm", "most in frame 17, 0.290 mm", "none seen between neighbouring states (correlation 0.050, p = 0.31)",
-        "unloading −0.41 0.030", "Split, recording 1 (first) 2 of 6 sweeps", "0–3, 7 (5)", "each measurement by itself 0.0800 mm",
+        "unloading −0.41 0.030", "Split, recording 1 (first) 2 of 6 sweeps", "0–3, 7 (5)", "each measurement by itself 0.080 mm",
         "restricted maximum likelihood, with repeats", "Fitted along: stiffness scale 1.113 ± 0.012", "femsense 0.1.0, numpy 2.0",
     )  # fmt: skip
     assert len(page.all("img")) == 5
@@ -266,6 +266,13 @@ def test_nothing_known_is_a_dash(tmp_path: Path) -> None:
     assert "Held-out error, before – 95 % interval –" in page.text
     assert "coefficient – " in page.text and "m/s² – 0.310 mm" in page.text
     assert "Recovered" not in page.text
+
+
+def test_residuals_that_are_not_known_do_not_count(tmp_path: Path) -> None:
+    page = report(
+        write_loop_folder(tmp_path, residuals__before_m__0=[None, 0.0, 0.0], residuals__after_m__1=[0.0, float("nan"), 0.0])
+    )
+    assert "70 measurements of 3 markers" in page.text and len(page.all("img")) == 5
 
 
 def test_without_the_robot_there_is_no_picture_of_it(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Annotated, Any, Self, TypeVar
 
@@ -13,7 +14,7 @@ from femsense.tables import Schema, read_text, short, validated
 
 Number = float | None
 Pair = Annotated[list[str], Field(min_length=2, max_length=2)]
-Triple = Annotated[list[float], Field(min_length=3, max_length=3)]
+Triple = Annotated[list[Number], Field(min_length=3, max_length=3)]
 
 
 class Document(Schema):
@@ -137,6 +138,12 @@ class Residuals(Document):
             raise ValueError("the columns differ in length")
         return self
 
+    def known(self) -> Self:
+        """Return the rows that are finite before and after."""
+        keep = [i for i, values in enumerate(zip(self.before_m, self.after_m)) if all(map(_finite, [*values[0], *values[1]]))]
+        columns = {name: [column[i] for i in keep] if (column := getattr(self, name)) else [] for name in type(self).model_fields}
+        return self.model_copy(update=columns)
+
 
 class Input(Document):
     name: str | None = None
@@ -212,6 +219,10 @@ class Demo(Document):
 
     declared: DemoRun = DemoRun()
     improved: DemoRun = DemoRun()
+
+
+def _finite(value: Number) -> bool:
+    return value is not None and math.isfinite(value)
 
 
 def read_document(file: Path, schema: type[DocumentType], expected: str) -> DocumentType:

@@ -133,7 +133,7 @@ def draw_body(axes: Any, surface: Surface, view: View) -> None:
     shade = 0.74 + 0.30 * np.clip(normals[order] @ light / np.linalg.norm(light), 0.0, 1.0)
     colors = np.clip(BODY * shade[:, None], 0.0, 1.0)
     axes.add_collection(
-        PolyCollection(list(view.flat(corners[order])), facecolors=colors, edgecolors=colors, linewidths=0.3, rasterized=True)
+        PolyCollection(list(view.flat(corners[order])), facecolors=colors, edgecolors=colors, linewidths=0.7, rasterized=True)
     )
 
 
@@ -189,7 +189,8 @@ def as_image(figure: Any, *, alt: str, caption: object = "") -> Html:
     """Return a figure as part of the page."""
     stream = io.StringIO()
     figure.savefig(stream, format="svg", dpi=170, metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
-    return image(_stable(stream.getvalue()).encode(), "svg+xml", alt=alt, caption=caption)
+    svg = stream.getvalue()
+    return image(_stable(svg[svg.index("<svg") :]).encode(), "svg+xml", alt=alt, caption=caption)
 
 
 def _stable(svg: str) -> str:

@@ -83,10 +83,11 @@ def loop_chapter(file: Path, title: str) -> Chapter:
         InputError: either is broken.
     """
     loop = read_document(file, Loop, LOOP_FORMAT)
+    residuals = loop.residuals.known()
     body = together(
         _summary(loop),
-        section("Residual on the robot", _residual_on_robot(loop.residuals, file.parent)),
-        section("Error on held-out data", _held_out(loop.residuals, loop.noise_m)),
+        section("Residual on the robot", _residual_on_robot(residuals, file.parent)),
+        section("Error on held-out data", _held_out(residuals, loop.noise_m)),
         section("Effects found", _effects(loop.effects)),
         section("All effects that were tried", _candidates(loop.candidates)),
         section("What these data cannot say", _open_questions(loop.confounded, loop.not_testable, loop.next_experiment)),
@@ -174,7 +175,7 @@ def _residual_on_robot(residuals: Residuals, folder: Path) -> Html | None:
 def _per_marker(names: Sequence[str], values: FloatArray) -> FloatArray:
     """Return the mean of the rows of each marker, in the order of their names."""
     labels = np.array(names)
-    return np.array([np.nanmean(values[labels == name], axis=0) for name in sorted(set(names))])
+    return np.array([np.mean(values[labels == name], axis=0) for name in sorted(set(names))])
 
 
 def _exaggeration(surface: Surface, means: Sequence[FloatArray]) -> float:
@@ -245,7 +246,7 @@ def _held_out(residuals: Residuals, noise_m: float | None) -> Html | None:
     if not residuals.frame:
         return None
     before, after = (np.linalg.norm(np.asarray(values, float), axis=1) for values in (residuals.before_m, residuals.after_m))
-    median = [words.length(float(np.nanmedian(values))) for values in (before, after)]
+    median = [words.length(float(np.median(values))) for values in (before, after)]
     shares = as_image(
         _distribution(before, after, noise_m),
         alt=f"Share of held-out measurements with an error below a size, before and after; medians {median[0]} and {median[1]}.",
@@ -265,7 +266,7 @@ def _distribution(before: FloatArray, after: FloatArray, noise_m: float | None) 
     """Draw the shares of errors below a size, with what noise alone would give."""
     figure, axes = new_axes()
     for values, color, name in ((before, BEFORE, "before"), (after, AFTER, "after")):
-        sizes = 1e3 * np.sort(values[np.isfinite(values)])
+        sizes = 1e3 * np.sort(values)
         shares = np.arange(1, len(sizes) + 1) / max(len(sizes), 1)
         axes.step(
             np.concatenate([[0.0], sizes]),
@@ -275,7 +276,7 @@ def _distribution(before: FloatArray, after: FloatArray, noise_m: float | None) 
             linewidth=1.9,
             label=name,
         )
-    top = 1e3 * float(np.nanquantile(np.concatenate([before, after]), 0.995)) * 1.08
+    top = 1e3 * float(np.quantile(np.concatenate([before, after]), 0.995)) * 1.08
     if noise_m is not None and words.known(noise_m) and noise_m > 0:
         top = max(top, 2.2e3 * noise_m)
         x = np.linspace(0.0, top, 200)
@@ -326,7 +327,7 @@ def _frame_dots(frames: Sequence[tuple[int, int, float, float]], noise_m: float 
     several = len({f[0] for f in frames}) > 1
     labels = [f"{f[1]}\nR{f[0] + 1}" if several else str(f[1]) for f in frames]
     axes.set_xticks(places[::step], labels[::step])
-    axes.set_ylim(0.0, 1.08 * float(np.nanmax([*before, *after, 1e-9])))
+    axes.set_ylim(0.0, 1.08 * float(np.max([*before, *after, 1e-9])))
     axes.grid(False, axis="x")
     name_axes(axes, "frame" + (" (R: recording)" if several else ""), "rms error [mm]")
     add_legend(axes)

@@ -31,7 +31,7 @@ code { font: 0.92em ui-monospace, SFMono-Regular, Menlo, Consolas, monospace; }
 .soft { color: var(--soft); }
 .next { border-left: 4px solid var(--accent); padding: 2px 0 2px 14px; }
 .tiles { display: grid; grid-template-columns: repeat(auto-fit, minmax(170px, 1fr)); gap: 12px; margin: 14px 0 8px; }
-.tile { background: var(--pale); border-radius: 8px; padding: 11px 14px 12px; break-inside: avoid; }
+.tile { margin: 0; background: var(--pale); border-radius: 8px; padding: 11px 14px 12px; break-inside: avoid; }
 .tile dt { margin: 0; font-size: 13px; color: var(--soft); }
 .tile dd { margin: 0; font-size: 24px; font-weight: 600; line-height: 1.25; }
 .tile dd.note { font-size: 13px; font-weight: 400; color: var(--soft); }
@@ -43,6 +43,8 @@ figcaption { font-size: 14px; color: var(--soft); }
 .scroll { overflow-x: auto; margin: 10px 0 14px; }
 table { border-collapse: collapse; font-size: 14.5px; font-variant-numeric: tabular-nums; }
 caption { text-align: left; color: var(--soft); font-size: 14px; padding-bottom: 4px; }
+.cap { display: inline-block; position: sticky; left: 0; max-width: calc(100vw - 34px); }
+tbody th .soft { min-width: 150px; font-weight: 400; } td:last-child:not(.n) { min-width: 130px; }
 th, td { text-align: left; vertical-align: top; padding: 5px 18px 5px 0; border-bottom: 1px solid var(--line); }
 thead th { border-bottom: 1.5px solid var(--ink); font-weight: 600; vertical-align: bottom; }
 tbody th { font-weight: 500; }
@@ -59,7 +61,7 @@ footer { margin-top: 52px; padding-top: 12px; padding-bottom: 40px; color: var(-
   @page { margin: 16mm 14mm; }
   body { font-size: 10.5pt; } main, header, footer { max-width: none; padding: 0; }
   .verdict { font-size: 17pt; } .verdict.long { font-size: 14pt; }
-  .tile { border: 1px solid var(--line); } .tile dd { font-size: 15pt; }
+  .tiles { grid-template-columns: repeat(4, 1fr); } .tile { border: 1px solid var(--line); } .tile dd { font-size: 15pt; }
   .panels { grid-template-columns: 1fr 1fr; } .scroll { overflow: visible; } table { font-size: 9pt; }
   th, td { padding-right: 9pt; } thead { display: table-header-group; } tr { break-inside: avoid; }
   h2, h3, h4 { break-after: avoid; } nav { display: none; }
@@ -168,7 +170,12 @@ def table(
         element("tr", *_row(row, numeric), class_="strong") if i in strong else element("tr", *_row(row, numeric))
         for i, row in enumerate(rows)
     ]
-    whole = element("table", element("caption", caption), element("thead", head), element("tbody", together(*lines)))
+    whole = element(
+        "table",
+        element("caption", element("span", caption, class_="cap")),
+        element("thead", head),
+        element("tbody", together(*lines)),
+    )
     return element("div", whole, class_="scroll", tabindex="0", role="region", aria_label=caption)
 
 

@@ -219,7 +219,7 @@ def _force_figure(contacts: ContactTable, frames: FrameTable | None, numbers: Se
     size, std = factor * contacts.size_n, factor * np.nan_to_num(contacts.std_n)
     top = min(float(np.nanmax(size + 2 * std)), 2.5 * float(np.nanmax(size)))
     margin = 0.03 * (span[1] - span[0]) or 1.0
-    axes.set(ylim=(0.0, 1.06 * max(top, 1e-12)), xlim=(span[0] - margin, span[1] + margin))
+    axes.set(ylim=(0.0, 1.06 * max(top, 1e-3)), xlim=(span[0] - margin, span[1] + margin))
     name_axes(axes, "time [s]", f"force [{unit}]")
     add_legend(axes)
     return figure

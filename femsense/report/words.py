@@ -39,13 +39,13 @@ def quantity(value: Any, unit: str | None, digits: int = 3) -> str:
 
 
 def length(value_m: Any, digits: int = 3) -> str:
-    """Return a length in mm."""
-    return quantity(value_m, "m", digits)
+    """Return a length in mm; below 0.1 mm two digits are enough."""
+    return quantity(value_m, "m", min(digits, 2) if known(value_m) and abs(value_m) < 1e-4 else digits)
 
 
 def percent(share: Any, digits: int = 0) -> str:
     """Return a share in percent."""
-    return _minus(f"{100 * share:.{digits}f} %") if known(share) else NOTHING
+    return joined(_minus(f"{100 * share:.{digits}f}"), "%") if known(share) else NOTHING
 
 
 def force_unit(largest_n: float) -> tuple[float, str]:
