@@ -345,6 +345,14 @@ def test_a_run_without_contacts(tmp_path: Path) -> None:
     assert "Contact forces" not in page.text and "Known loads" not in page.text
 
 
+@pytest.mark.parametrize(("force", "pictures"), [("0,0,0,0,", 4), (",,,,", 3)], ids=["zero", "unknown"])
+def test_a_force_that_is_nothing(tmp_path: Path, force: str, pictures: int) -> None:
+    (write_run_folder(tmp_path, frames=2) / "contacts.csv").write_text(
+        f"{CONTACT_HEADER}\n0,0,0,0,0,0,0,0,1,{force},given\n", encoding="utf-8"
+    )
+    assert len(report(tmp_path).all("img")) == pictures
+
+
 def test_a_run_in_which_every_frame_failed(tmp_path: Path) -> None:
     write_run_folder(tmp_path, contacts=0, frames=2, frames_ok=0)
     (tmp_path / "contacts.csv").write_text(CONTACT_HEADER + "\n", encoding="utf-8")

@@ -250,7 +250,7 @@ def _force_on_body(contacts: ContactTable, frames: FrameTable | None, folder: Pa
     rows = np.flatnonzero(
         (contacts.frame == number) & np.isfinite(contacts.force_n).all(axis=1) & np.isfinite(contacts.place_m).all(axis=1)
     )
-    if not len(rows):
+    if not len(rows) or not contacts.size_n[rows].max() > 0:
         return None
     view = best_view(surface.nodes, contacts.force_n[rows])
     largest = float(contacts.size_n[rows].max())
