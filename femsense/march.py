@@ -13,11 +13,13 @@ import numpy as np
 
 from femsense.arrays import FloatArray, IntArray, freeze
 from femsense.errors import DataError
+from femsense.fem.assembly import internal
+from femsense.fem.cables import bend_angles, cable_forces, rub
+from femsense.fem.compliance import tangent_at
 from femsense.fem.equilibrium import Equilibrium, solve_equilibrium
 from femsense.fem.mesh import embed_points
 from femsense.model import Robot
 from femsense.recording import Recording
-
 
 FACTOR_MEMORY = 2e9
 """Factors of several frames are kept up to this total [bytes]."""
@@ -143,7 +145,9 @@ def solve_frame(
     if before is None:
         before = tuple(np.zeros(len(c.path)) for c in body.cables)
     tension, held = (values, None) if drive.control == "tension" else (None, values)
-    return solve_equilibrium(body, tension=tension, shortening=held, nodal_forces=loads, start=start, before=before, reuse_factor=reuse_factor)
+    return solve_equilibrium(
+        body, tension=tension, shortening=held, nodal_forces=loads, start=start, before=before, reuse_factor=reuse_factor
+    )
 
 
 def walk_along(
@@ -152,8 +156,9 @@ def walk_along(
 ) -> Iterator[tuple[int, Equilibrium, FloatArray, FloatArray]]:  # fmt: skip
     """Solve frames in order, and with each the same frame of variants that differ from it by little.
 
-    Variants start from the base state with its factor, so that a derivative by difference costs a few solves and no
-    factorisation.
+    A variant's state is the linear response of the base state to the forces that the variant adds there, so that all of them
+    together cost one factorisation and one solve with many right-hand sides; they must differ by little. A variant whose
+    clamp is another one is solved for itself.
 
     Arguments:
         walk: the base.
@@ -181,14 +186,7 @@ def walk_along(
         base = _require(solve_frame(walk, k, start=near, before=memory[0], reuse_factor=near is not base), k)
         memory[0] = base.segment_tensions if past else None
         seen = observe(walk.robot, base)
-        others = np.zeros((len(variants), *seen.shape))
-        for i, variant in enumerate(variants):
-            if _same_mechanics(walk, variant):
-                others[i] = observe(variant.robot, base)
-                continue
-            state = _require(solve_frame(variant, k, start=base, before=memory[1 + i], reuse_factor=True), k)
-            memory[1 + i] = state.segment_tensions if past else None
-            others[i] = observe(variant.robot, state)
+        others = _observe_variants(walk, variants, k, base, seen, observe, memory)
         kept = replace(base, factor=None)
         if starts is not None:
             starts[k] = base if base.factor is not None and len(todo) * base.factor.bytes < FACTOR_MEMORY else kept
@@ -198,9 +196,84 @@ def walk_along(
             yield k, kept, seen, others
 
 
+def _observe_variants(
+    walk: Walk, variants: Sequence[Walk], k: int, base: Equilibrium, seen: FloatArray, observe: Callable[[Robot, Equilibrium], FloatArray],
+    memory: list[tuple[FloatArray, ...] | None],
+) -> FloatArray:  # fmt: skip
+    """Return what is observed of each variant in frame k, shape (v, p, 3); `memory` keeps the tensions along their cables."""
+    others = np.zeros((len(variants), *seen.shape))
+    linear = []
+    for i, variant in enumerate(variants):
+        if _same_mechanics(walk, variant):
+            others[i] = observe(variant.robot, base)
+        elif variant.robot.body.free_map is not walk.robot.body.free_map:
+            state = _require(solve_frame(variant, k, start=base, before=memory[1 + i]), k)
+            memory[1 + i] = state.segment_tensions
+            others[i] = observe(variant.robot, state)
+        else:
+            linear.append(i)
+    if not linear:
+        return others
+    tangent = tangent_at(walk.robot.body, base)
+    inner = internal(walk.robot.body, base.positions, tangent=False).forces
+    moves = np.zeros((len(linear), *base.positions.shape))
+    rubbing = any(has_history(variants[i].robot) for i in linear)
+    for _ in range(2 if rubbing else 1):  # the second time with the bends as the first response leaves them
+        answers = [
+            _out_of_balance(walk, variants[i], k, base, inner, memory[1 + i], base.positions + move)
+            for i, move in zip(linear, moves)
+        ]
+        moves = tangent.respond(np.array([force for force, _, _ in answers]))
+        if base.held.any():
+            moves += np.tensordot(np.array([pulled[base.held] for _, pulled, _ in answers]), tangent.respond_to_held(), axes=1)
+    for i, move, (_, _, tensions) in zip(linear, moves, answers):
+        memory[1 + i] = tensions
+        others[i] = observe(variants[i].robot, replace(base, positions=base.positions + move))
+    return others
+
+
+def _out_of_balance(
+    walk: Walk, variant: Walk, k: int, base: Equilibrium, inner: FloatArray, before: tuple[FloatArray, ...] | None, bent: FloatArray,
+) -> tuple[FloatArray, FloatArray, tuple[FloatArray, ...]]:  # fmt: skip
+    """Return the nodal forces that a variant adds at the base state [N], (n, 3); the shortening that it adds to held cables
+    [m], (a,); and the tensions along its cables [N]. `bent` is where its cables bend [m], (n, 3)."""
+    body, x = variant.robot.body, base.positions
+    n = len(x)
+    if variant.drive.gravity is not None:
+        body = body.with_gravity(variant.drive.gravity[k])
+    loads = frame_loads(variant, k)
+    force = body.dead_load() + (0.0 if loads is None else loads)
+    same = body.material is walk.robot.body.material and body.clamp_stiffness == walk.robot.body.clamp_stiffness
+    force = force - (inner if same else internal(body, x, tangent=False).forces)
+    tensions = []
+    for i, cable in enumerate(body.cables):
+        held = variant.drive.control == "displacement"
+        motor = base.tension[cable.name] if held else float(variant.drive.inputs[k, i])
+        start = np.zeros(len(cable.path)) if before is None else before[i]
+        along = rub(cable, bend_angles(cable, bent), start, motor) if cable.friction > 0 else np.full(len(cable.path), motor)
+        tensions.append(along)
+        force = force + cable_forces(cable, x, along, n)
+    stretch = np.array(
+        [
+            base.tension[c.name] * (1.0 / b.stretch_stiffness - 1.0 / c.stretch_stiffness)
+            for b, c in zip(walk.robot.body.cables, body.cables)
+        ]
+    )
+    pulled = (
+        variant.drive.inputs[k] - walk.drive.inputs[k] + stretch
+        if variant.drive.control == "displacement"
+        else np.zeros(len(body.cables))
+    )
+    return force, pulled, tuple(tensions)
+
+
 def _same_mechanics(walk: Walk, variant: Walk) -> bool:
     a, b = walk.drive, variant.drive
-    return variant.robot.body is walk.robot.body and np.array_equal(a.inputs, b.inputs) and np.array_equal(a.load_forces, b.load_forces)
+    return (
+        variant.robot.body is walk.robot.body
+        and np.array_equal(a.inputs, b.inputs)
+        and np.array_equal(a.load_forces, b.load_forces)
+    )
 
 
 def _key(walk: Walk, variants: Sequence[Walk], frame: int) -> bytes:

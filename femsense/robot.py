@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
+import numpy.typing as npt
 from pydantic import Field, StringConstraints
 
 import femsense
@@ -25,6 +26,8 @@ from femsense.tables import Schema, key_path, near, read_toml, schema_problems, 
 
 FORMAT = "femsense-robot-1"
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+PER_METRE = {"m": 1.0, "cm": 100.0, "mm": 1000.0}
+"""Dividing by these rounds once: 35 mm become the same number as 0.035."""
 EFFECT_NAMES = (
     "gravity", "stiffness", "poisson", "soft_region", "discretisation", "hyperelastic", "creep", "payload",
     "base_compliance", "cable_friction", "cable_offset", "cable_gain", "cable_stretch", "cable_slack", "geometry",
@@ -36,8 +39,8 @@ FAR_MARKER = 1.0
 """The same for a marker, which may stand on a stalk."""
 FAR_PULL_POINT = 20.0
 """The same for a pull point."""
-INSIDE = 1e-9
-"""A node counts as inside a box up to this distance [m]."""
+INSIDE = 2
+"""A node counts as inside a box up to so many units in the last place of the bound (which is where rounding of units ends)."""
 
 # The tables of robot.toml
 
@@ -280,7 +283,7 @@ def read_declared_mesh(table: MeshTable, path: Path) -> TetMesh:
     file = path.parent / table.file
     where = f"{path}: mesh.file {table.file}"
     raw = read_tets(file, where=where)
-    nodes = raw.nodes * UNITS[table.unit]
+    nodes = raw.nodes / PER_METRE[table.unit]
     _check_size(nodes, table.unit, path)
     if table.T_robot_mesh is not None:
         nodes = transform_points(check_pose(table.T_robot_mesh, _at(path, "mesh", "T_robot_mesh")), nodes)
@@ -299,13 +302,18 @@ def clamped_nodes(mesh: TetMesh, boxes: Sequence[FixedTable], path: Path) -> Int
     inside = np.zeros(len(mesh.nodes), dtype=bool)
     for i, box in enumerate(boxes):
         low, high = np.asarray(box.box_m)
-        hits = ((mesh.nodes >= low - INSIDE) & (mesh.nodes <= high + INSIDE)).all(axis=1)
+        hits = _within(mesh.nodes, low, high)
         if not hits.any():
             raise _empty_box(mesh, low, high, _at(path, "fixed", i, "box_m"))
         inside |= hits
     if inside.all():
         raise InputError("the boxes hold every node", where=_at(path, "fixed"), found=f"{len(inside)} nodes clamped", expected="some that can move", hint="boxes are in metres")  # fmt: skip
     return np.flatnonzero(inside)
+
+
+def _within(nodes: FloatArray, low: FloatArray, high: FloatArray) -> npt.NDArray[np.bool_]:
+    slack_low, slack_high = INSIDE * np.spacing(np.abs(low)), INSIDE * np.spacing(np.abs(high))
+    return np.asarray(((nodes >= low - slack_low) & (nodes <= high + slack_high)).all(axis=1))
 
 
 def mesh_diagonal(nodes: FloatArray) -> float:
@@ -512,7 +520,7 @@ def _clamp_boxes(body: BodyModel) -> list[list[list[float]]]:
     if not len(clamped):
         raise InputError("the body has no clamp", where="robot", expected="clamped nodes")
     low, high = clamped.min(axis=0), clamped.max(axis=0)
-    hits = ((nodes >= low - INSIDE) & (nodes <= high + INSIDE)).all(axis=1)
+    hits = _within(nodes, low, high)
     if hits.sum() == len(clamped):
         return [[low.tolist(), high.tolist()]]
     return [[point.tolist(), point.tolist()] for point in clamped]

@@ -1,8 +1,8 @@
 """Contacts and forces of a recording, frame by frame.
 
-    cloud ─ pose ─ filter ─ segment ─► robot points, surroundings ─ detect ─► places
-    equilibrium under the inputs ─ match along normals (or markers) ─► rows ─ compliance ─ QP ─► forces ─┐ repeat until still
-                                   ▲─────────────────────────────────────────────────────────────────────┘
+cloud ─ pose ─ filter ─ segment ─► robot points, surroundings ─ detect ─► places
+equilibrium under the inputs ─ match along normals (or markers) ─► rows ─ compliance ─ QP ─► forces ─┐ repeat until still
+                               ▲─────────────────────────────────────────────────────────────────────┘
 """
 
 from __future__ import annotations
@@ -54,11 +54,13 @@ class SensingOptions:
     """Coulomb coefficient of a contact: forces within its cone. None: along the inward normal only."""
     modulus_std: float = 0.03
     """What is not known of the modulus, relative; it enters the standard deviation of every force."""
+    model_std: float = 0.015
+    """What is not known of the modelled motion of a point, relative to its way from rest (mesh, law, boundary)."""
     cloud_std_m: float = 1e-4
     """What averaging cannot remove from a cloud [m]."""
     marker_std_m: float | None = None
     """Noise of a marker along each axis [m]; None: from the residual of the calibration."""
-    iterations: int = 8
+    iterations: int = 15
     """Linearisations a frame at most."""
 
 
@@ -256,7 +258,17 @@ def make_sensor(
     drive = drive_of(robot, recording, initial=initial)
     sensed_here = _near_places(recording, places, size)
     drive = replace(drive, load_frame=drive.load_frame[~sensed_here], load_points=drive.load_points[~sensed_here], load_forces=drive.load_forces[~sensed_here])  # fmt: skip
-    return Sensor(robot, recording, calibration, Walk(robot, drive), surface, options or SensingOptions(), places, _root(calibration.pose_covariance), size)
+    return Sensor(
+        robot,
+        recording,
+        calibration,
+        Walk(robot, drive),
+        surface,
+        options or SensingOptions(),
+        places,
+        _root(calibration.pose_covariance),
+        size,
+    )
 
 
 def sense_frame(sensor: Sensor, k: int, previous: SensedFrame | None) -> SensedFrame:
@@ -280,14 +292,26 @@ def sense_frame(sensor: Sensor, k: int, previous: SensedFrame | None) -> SensedF
         forces = estimate.forces
         contacts = _contacts(sensor, k, patches, estimate, state, source)
     number, stamp = int(sensor.recording.frame_numbers[k]), float(sensor.recording.time_s[k])
-    report = FrameReport(number, stamp, "ok", len(contacts), at_end.count, rows.rms, at_end.rms, 1e3 * (time.perf_counter() - began), dict(state.tension))
+    report = FrameReport(
+        number,
+        stamp,
+        "ok",
+        len(contacts),
+        at_end.count,
+        rows.rms,
+        at_end.rms,
+        1e3 * (time.perf_counter() - began),
+        dict(state.tension),
+    )
     return SensedFrame(state, free_state, forces, report, contacts)
 
 
 # --- places ------------------------------------------------------------------------------------------------------------
 
 
-def _find_contacts(sensor: Sensor, k: int, clouds: tuple[FloatArray, FloatArray] | None, state: Equilibrium) -> tuple[list[Patch], str]:
+def _find_contacts(
+    sensor: Sensor, k: int, clouds: tuple[FloatArray, FloatArray] | None, state: Equilibrium
+) -> tuple[list[Patch], str]:
     """Return where forces may act: the given places, else where surroundings touch the robot (Algorithm 2)."""
     mesh, clamped, radius = sensor.robot.body.mesh, sensor.robot.body.clamped, 1.5 * sensor.surface.edge
     if len(sensor.places):
@@ -355,7 +379,12 @@ def _robot_and_surroundings(sensor: Sensor, k: int, state: Equilibrium) -> tuple
     for view in range(len(sensor.recording.camera_names)):
         cloud = read_frame_cloud(sensor.recording, k, view=view)
         if cloud is not None:
-            points = in_robot_frame(cloud.points, np.zeros(len(cloud.points), dtype=np.int64), [sensor.calibration.poses[view]], sensor.robot.observation)
+            points = in_robot_frame(
+                cloud.points,
+                np.zeros(len(cloud.points), dtype=np.int64),
+                [sensor.calibration.poses[view]],
+                sensor.robot.observation,
+            )
             parts.append(PointCloud(points, cloud.colors))
     if not parts:
         return None
@@ -367,7 +396,9 @@ def _robot_and_surroundings(sensor: Sensor, k: int, state: Equilibrium) -> tuple
     cloud = remove_radius_outliers(voxel_grid(pass_through(cloud, box), voxel), 3.0 * voxel, 4)
     robot, others = _segment(sensor, cloud, state)
     if len(robot.points) < 10:
-        raise DataError(f"only {len(robot.points)} points of the robot in view: check the pose, appearance.color_rgb, and what the camera sees")
+        raise DataError(
+            f"only {len(robot.points)} points of the robot in view: check the pose, appearance.color_rgb, and what the camera sees"
+        )
     return robot.points, others.points
 
 
@@ -403,12 +434,23 @@ def _cloud_rows(sensor: Sensor, points: FloatArray, state: Equilibrium) -> Rows:
     )  # fmt: skip
     use = matches.found & np.isfinite(matches.std)
     if use.sum() < 3:
-        raise DataError(f"only {int(use.sum())} of {len(features)} feature points were found in the cloud: check the pose and the view")
+        raise DataError(
+            f"only {int(use.sum())} of {len(features)} feature points were found in the cloud: check the pose and the view"
+        )
     at, n = features[use], normals[use]
     seen = matches.positions(state.positions[features], normals)[use]
     by_pose = np.einsum("rc,rcj->rj", n, _pose_columns(sensor, seen))
     distance = matches.distance[use]
-    return Rows(lambda u: np.einsum("krc,rc->rk", u[:, at], n), distance, matches.std[use], by_pose, int(use.sum()), float(np.sqrt((distance**2).mean())))
+    way = np.linalg.norm(state.positions[at] - sensor.robot.body.mesh.nodes[at], axis=1)
+    std = np.hypot(matches.std[use], options.model_std * way)
+    return Rows(
+        lambda u: np.einsum("krc,rc->rk", u[:, at], n),
+        distance,
+        std,
+        by_pose,
+        int(use.sum()),
+        float(np.sqrt((distance**2).mean())),
+    )
 
 
 def _marker_rows(sensor: Sensor, k: int, state: Equilibrium) -> Rows:
@@ -420,10 +462,14 @@ def _marker_rows(sensor: Sensor, k: int, state: Equilibrium) -> Rows:
     rows, marker = rows[marker >= 0], marker[marker >= 0]
     if not len(rows):
         raise DataError("no marker is seen in this frame")
-    measured = in_robot_frame(recording.marker_xyz[rows], recording.marker_view[rows], sensor.calibration.poses, robot.observation)
+    measured = in_robot_frame(
+        recording.marker_xyz[rows], recording.marker_view[rows], sensor.calibration.poses, robot.observation
+    )
     place = robot.markers[marker]
     residual = measured - place.positions(state.positions)
-    std = np.full(residual.size, sensor.options.marker_std_m or _marker_std(sensor.calibration))
+    way = np.linalg.norm(place.positions(state.positions) - robot.marker_points[marker], axis=1)
+    noise = sensor.options.marker_std_m or _marker_std(sensor.calibration)
+    std = np.repeat(np.hypot(noise, sensor.options.model_std * way), 3)
     seated = np.array([robot.marker_names[m] in sensor.calibration.seats_m for m in marker])
     # a seat that rest.csv measured moves with the pose: only the marker's motion since then is left to turn
     by_pose = _pose_columns(sensor, measured) - seated[:, None, None] * _pose_columns(sensor, robot.marker_points[marker])
@@ -479,14 +525,23 @@ def _fit_forces(
         directions = _directions(sensor, patches, state, source)
         tangent = tangent_at(sensor.robot.body, state)
         W = rows.functional(tangent.respond(basis)) @ directions
-        estimate, size = _solve_qp(sensor, rows, W, directions, forces, state, tangent, patches, source, size)
-        new = directions @ estimate.forces
-        change = float(np.abs(new - forces).max())
-        forces = new
-        state = _solve(sensor, k, np.tensordot(forces, basis, axes=1), state, before)
-        rows = _measure(sensor, k, clouds, state)
-        if change < 2e-3 * max(float(np.abs(forces).max()), 1e-3):
+        nuisance = _nuisance(sensor, rows, state, tangent)
+        estimate, size = _solve_qp(sensor, rows, W, nuisance, directions, forces, state, patches, source, size)
+        step = directions @ estimate.forces - forces
+        if float(np.abs(step).max()) < 2e-3 * max(float(np.abs(forces + step).max()), 1e-3):
             break
+        cost = _cost(rows, nuisance, forces, size)
+        for share in (1.0, 0.5, 0.25, 0.125, 0.06):  # large deflections: a full step may lead too far
+            try:
+                there = _solve(sensor, k, np.tensordot(forces + share * step, basis, axes=1), state, before)
+                seen = _measure(sensor, k, clouds, there)
+            except DataError:
+                continue
+            if _cost(seen, nuisance, forces + share * step, size) < cost or share < 0.1:
+                break
+        else:
+            raise DataError("no equilibrium near the forces that the data ask for")
+        forces, state, rows = forces + share * step, there, seen
     assert estimate is not None
     covariance = directions @ estimate.covariance @ directions.T
     return state, replace(estimate, forces=freeze(forces), covariance=freeze(covariance)), rows
@@ -507,8 +562,25 @@ def _normal(sensor: Sensor, patch: Patch, state: Equilibrium) -> FloatArray:
     return mean / max(float(np.linalg.norm(mean)), 1e-12)
 
 
+def _nuisance(sensor: Sensor, rows: Rows, state: Equilibrium, tangent: Tangent) -> FloatArray:
+    """Return how the model moves with modulus and pose, in units of their standard deviations [m], shape (r, j)."""
+    load = internal(sensor.robot.body, state.positions, tangent=False).forces
+    by_modulus = -sensor.options.modulus_std * rows.functional(tangent.respond(load[None]))
+    return np.hstack([by_modulus, -rows.by_pose])
+
+
+def _cost(rows: Rows, nuisance: FloatArray, forces: FloatArray, size: float) -> float:
+    """Return the mean square of the whitened residual with nuisance fitted, and of the forces against their prior."""
+    if len(nuisance) != len(rows.residual):  # other features are found than before
+        return float(np.mean((rows.residual / rows.std) ** 2))
+    A = np.vstack([nuisance / rows.std[:, None], np.eye(nuisance.shape[1])])
+    b = np.concatenate([rows.residual / rows.std, np.zeros(nuisance.shape[1])])
+    left = b - A @ np.linalg.lstsq(A, b, rcond=None)[0]
+    return float((left @ left + (0.0 if np.isinf(size) else forces @ forces / size**2)) / len(rows.residual))
+
+
 def _solve_qp(
-    sensor: Sensor, rows: Rows, W: FloatArray, directions: FloatArray, forces: FloatArray, state: Equilibrium, tangent: Tangent,
+    sensor: Sensor, rows: Rows, W: FloatArray, nuisance: FloatArray, directions: FloatArray, forces: FloatArray, state: Equilibrium,
     patches: Sequence[Patch], source: str, size: float,
 ) -> tuple[ForceEstimate, float]:  # fmt: skip
     """The QP in the total forces: modelled = W (f − f₀) at the linearisation f₀; pose and modulus are nuisance with priors.
@@ -520,9 +592,6 @@ def _solve_qp(
         the estimate, and the size of that prior [N] (inf where each force has one component).
     """
     now = np.linalg.lstsq(directions, forces, rcond=None)[0]
-    load = internal(sensor.robot.body, state.positions, tangent=False).forces
-    by_modulus = -sensor.options.modulus_std * rows.functional(tangent.respond(load[None]))
-    nuisance = np.hstack([by_modulus, -rows.by_pose])
     pushing = source == "cloud" and sensor.options.friction is None
     cone = None
     if source == "cloud" and sensor.options.friction is not None:
@@ -554,7 +623,9 @@ def _solve_qp(
     return estimate, size
 
 
-def _solve(sensor: Sensor, k: int, nodal_forces: FloatArray | None, start: Equilibrium | None, before: tuple[FloatArray, ...] | None) -> Equilibrium:
+def _solve(
+    sensor: Sensor, k: int, nodal_forces: FloatArray | None, start: Equilibrium | None, before: tuple[FloatArray, ...] | None
+) -> Equilibrium:
     state = solve_frame(sensor.walk, k, start=start, before=before, nodal_forces=nodal_forces)
     if not state.converged:
         raise DataError(f"no equilibrium: {state.status}: {state.advice}")
@@ -564,7 +635,9 @@ def _solve(sensor: Sensor, k: int, nodal_forces: FloatArray | None, start: Equil
 # --- results -------------------------------------------------------------------------------------------------------------
 
 
-def _contacts(sensor: Sensor, k: int, patches: Sequence[Patch], estimate: ForceEstimate | None, state: Equilibrium, source: str) -> tuple[ContactForce, ...]:
+def _contacts(
+    sensor: Sensor, k: int, patches: Sequence[Patch], estimate: ForceEstimate | None, state: Equilibrium, source: str
+) -> tuple[ContactForce, ...]:
     if estimate is None:
         return ()
     number, stamp = int(sensor.recording.frame_numbers[k]), float(sensor.recording.time_s[k])
@@ -582,10 +655,14 @@ def _contacts(sensor: Sensor, k: int, patches: Sequence[Patch], estimate: ForceE
 def _failed(sensor: Sensor, k: int, error: FemsenseError) -> FrameReport:
     number, stamp = int(sensor.recording.frame_numbers[k]), float(sensor.recording.time_s[k])
     nan = float("nan")
-    return FrameReport(number, stamp, " ".join(str(error).split()), 0, 0, nan, nan, nan, dict.fromkeys(sensor.robot.body.cable_names, nan))
+    return FrameReport(
+        number, stamp, " ".join(str(error).split()), 0, 0, nan, nan, nan, dict.fromkeys(sensor.robot.body.cable_names, nan)
+    )
 
 
-def _compare_loads(recording: Recording, places: FloatArray, contacts: Sequence[ContactForce], size: float) -> tuple[dict[str, float], ...]:
+def _compare_loads(
+    recording: Recording, places: FloatArray, contacts: Sequence[ContactForce], size: float
+) -> tuple[dict[str, float], ...]:
     """Return declared next to sensed resultants of the frames whose loads act at the given places."""
     near = _near_places(recording, places, size)
     result = []
@@ -595,8 +672,25 @@ def _compare_loads(recording: Recording, places: FloatArray, contacts: Sequence[
         if rows.any() and sensed:
             declared = np.linalg.norm(recording.load_forces[rows].sum(axis=0))
             found = np.linalg.norm(np.sum(sensed, axis=0))
-            result.append({"frame": int(number), "declared_n": float(declared), "sensed_n": float(found), "error_percent": float(100 * (found / declared - 1))})
+            result.append(
+                {
+                    "frame": int(number),
+                    "declared_n": float(declared),
+                    "sensed_n": float(found),
+                    "error_percent": float(100 * (found / declared - 1)),
+                }
+            )
     return tuple(result)
 
 
-__all__ = ["ContactForce", "FrameReport", "Run", "SensedFrame", "SensingOptions", "States", "estimate", "make_sensor", "sense_frame"]
+__all__ = [
+    "ContactForce",
+    "FrameReport",
+    "Run",
+    "SensedFrame",
+    "SensingOptions",
+    "States",
+    "estimate",
+    "make_sensor",
+    "sense_frame",
+]

@@ -62,7 +62,9 @@ def calibrate(robot: Robot, recording: Recording, *, frames: Sequence[int] | Non
     if recording.rest is not None and not np.isin(recording.marker_frame, chosen).any():
         return _from_rest(robot, recording)
     if not len(chosen):
-        raise DataError("no frame is free of undeclared contact: mark free frames with 1 in the column free of frames.csv, or declare loads.csv")
+        raise DataError(
+            "no frame is free of undeclared contact: mark free frames with 1 in the column free of frames.csv, or declare loads.csv"
+        )
     if not len(recording.marker_frame):
         return _declared(robot, recording, chosen)
     seen = chosen[np.isin(chosen, recording.marker_frame)]
@@ -116,10 +118,14 @@ def _pose_from_frame(robot: Robot, scene: Scene, view: int, name: str) -> FloatA
             state = solve_frame(walk, int(k))
             shape = state.positions if state.converged else robot.body.mesh.nodes
             return fit_rigid(robot.markers.positions(shape)[scene.marker[rows]], scene.points[rows])
-    raise DataError(f"camera {name or '(only one)'} needs a frame with three markers for its pose; the most in one frame is {most}. Give T_robot_camera, or show more markers")
+    raise DataError(
+        f"camera {name or '(only one)'} needs a frame with three markers for its pose; the most in one frame is {most}. Give T_robot_camera, or show more markers"
+    )
 
 
-def _alternate(robot: Robot, scene: Scene, poses: list[FloatArray], initial: FloatArray | None, history: list[float], *, rounds: int = 3) -> tuple[list[FloatArray], FloatArray]:
+def _alternate(
+    robot: Robot, scene: Scene, poses: list[FloatArray], initial: FloatArray | None, history: list[float], *, rounds: int = 3
+) -> tuple[list[FloatArray], FloatArray]:
     """Algorithm 1: rigid pose and bounded inputs in turns."""
     from scipy.optimize import lsq_linear
 
@@ -133,7 +139,9 @@ def _alternate(robot: Robot, scene: Scene, poses: list[FloatArray], initial: Flo
         W_ea = -jet.by_initial.reshape(-1, len(initial))  # residual = measured − modelled
         step = lsq_linear(W_ea, jet.residual.ravel(), bounds=(low - initial - 1e-12, high - initial + 1e-12)).x
         initial = np.clip(initial + step, low, high)
-        jet = evaluate_scene(plain, scene, empty, poses, initial, derivative=False, vary_initial=False, pivot=pivot, starts=starts)
+        jet = evaluate_scene(
+            plain, scene, empty, poses, initial, derivative=False, vary_initial=False, pivot=pivot, starts=starts
+        )
         if not any(T is not None for T in scene.recording.T_robot_camera) and not len(scene.rest_marker):
             poses = _rigid_again(robot, scene, jet)
         if np.abs(step).max() < 1e-6 * max(np.abs(initial).max(), 1e-6):
@@ -144,7 +152,9 @@ def _alternate(robot: Robot, scene: Scene, poses: list[FloatArray], initial: Flo
 def _rigid_again(robot: Robot, scene: Scene, jet: SceneJet) -> list[FloatArray]:
     model = {k: robot.markers.positions(s.positions) for k, s in jet.states.items()}
     predicted = np.array([model[int(f)][m] for f, m in zip(scene.frame, scene.marker)])
-    return [fit_rigid(predicted[scene.view == v], scene.points[scene.view == v]) for v in range(len(scene.recording.camera_names))]
+    return [
+        fit_rigid(predicted[scene.view == v], scene.points[scene.view == v]) for v in range(len(scene.recording.camera_names))
+    ]
 
 
 def input_bounds(robot: Robot, recording: Recording) -> tuple[FloatArray, FloatArray]:
@@ -186,7 +196,9 @@ def fit_joint(
     def evaluate(theta: FloatArray, derivative: bool) -> tuple[FloatArray, FloatArray | None]:
         nonlocal jet
         moved, inputs = place(theta)
-        jet = evaluate_scene(plain, scene, empty, moved, inputs, derivative=derivative, vary_initial=bool(a), pivot=pivot, starts=starts)
+        jet = evaluate_scene(
+            plain, scene, empty, moved, inputs, derivative=derivative, vary_initial=bool(a), pivot=pivot, starts=starts
+        )
         row = (weights / sigma)[:, None]
         residual = np.concatenate([(row * jet.residual).ravel(), jet.rest.ravel() / seat_std])
         if not derivative:
@@ -310,7 +322,9 @@ def _result(
     )
 
 
-def _initial_displacement(state: Equilibrium, recording: Recording, names: tuple[str, ...], initial: FloatArray | None) -> dict[str, float]:
+def _initial_displacement(
+    state: Equilibrium, recording: Recording, names: tuple[str, ...], initial: FloatArray | None
+) -> dict[str, float]:
     if recording.actuation == "displacement" and initial is not None:
         return {name: float(v) for name, v in zip(names, initial)}
     return dict(state.shortening)
@@ -371,7 +385,9 @@ def _from_rest(robot: Robot, recording: Recording) -> Calibration:
     assert rest is not None
     marker = np.array([number.get(name, -1) for name in rest.names], dtype=np.int64)
     known = marker >= 0
-    scene = Scene(recording, *(np.zeros(0, np.int64),) * 4, np.zeros((0, 3)), marker[known], rest.view[known], rest.positions[known])
+    scene = Scene(
+        recording, *(np.zeros(0, np.int64),) * 4, np.zeros((0, 3)), marker[known], rest.view[known], rest.positions[known]
+    )
     poses = first_poses(robot, scene)
     left = rest_residual(robot, scene, poses)
     sigma = max(float(np.sqrt((left**2).sum() / max(left.size - 6 * len(poses), 1))), SEAT_STD_FLOOR)
@@ -396,7 +412,9 @@ def _declared(robot: Robot, recording: Recording, frames: IntArray) -> Calibrati
     """Return the calibration of a recording without markers whose poses are declared."""
     missing = [name or "(only one)" for name, T in zip(recording.camera_names, recording.T_robot_camera) if T is None]
     if missing:
-        raise DataError(f"no markers and no T_robot_camera: the pose of camera {', '.join(missing)} is not known. Record markers, or write T_robot_camera in recording.toml")
+        raise DataError(
+            f"no markers and no T_robot_camera: the pose of camera {', '.join(missing)} is not known. Record markers, or write T_robot_camera in recording.toml"
+        )
     if recording.actuation_zero == "unknown" and robot.body.cables:
         raise DataError("initial inputs cannot be found without markers: record markers, or absolute inputs")
     poses = tuple(T for T in recording.T_robot_camera if T is not None)

@@ -44,6 +44,7 @@ def gauss_newton(
     high: FloatArray | None = None,
     max_iterations: int = 30,
     tolerance: float = 1e-10,
+    still: float = STILL,
 ) -> FitResult:
     """Minimise ‖r(θ)‖² within bounds (Levenberg's damping where a plain step does not pay).
 
@@ -53,6 +54,7 @@ def gauss_newton(
         low, high: bounds, shape (p,).
         max_iterations: Gauss–Newton steps.
         tolerance: relative decrease at which it stops.
+        still: length of a step in whitened residual at which it stops.
     """
     from femsense.errors import DataError
 
@@ -69,7 +71,7 @@ def gauss_newton(
         scale[scale == 0] = 1.0
         step = _bounded_step(jacobian, residual, scale, damping, low - theta, high - theta)
         predicted = costs[-1] - float(np.sum((residual + jacobian @ step) ** 2))
-        if predicted <= tolerance * costs[-1] or np.linalg.norm(jacobian @ step) <= STILL:
+        if predicted <= tolerance * costs[-1] or np.linalg.norm(jacobian @ step) <= still:
             status = "converged"
             break
         try:
@@ -91,7 +93,9 @@ def gauss_newton(
     return FitResult(freeze(theta), freeze(covariance_of(jacobian)), freeze(residual), freeze(jacobian), tuple(costs), status)
 
 
-def _bounded_step(J: FloatArray, r: FloatArray, scale: FloatArray, damping: float, low: FloatArray, high: FloatArray) -> FloatArray:
+def _bounded_step(
+    J: FloatArray, r: FloatArray, scale: FloatArray, damping: float, low: FloatArray, high: FloatArray
+) -> FloatArray:
     """Return the step that minimises ‖r + J s‖² + damping ‖scale · s‖² within bounds."""
     p = J.shape[1]
     A = np.vstack([J / scale, np.sqrt(damping) * np.eye(p)]) if damping > 0 else J / scale

@@ -198,7 +198,9 @@ def evaluate_scene(
     residual = marker_residual(robot, scene, poses, model)
     columns = [(marker_residual(v.robot, scene, poses, m) - residual) / h for v, m, h in zip(variants, shifted, steps)]
     split = len(hypothesis.parameters) if derivative else 0
-    by_pose, rest_by_pose = _pose_derivative(robot, scene, poses, states, residual, pivot) if derivative else (np.zeros((len(residual), 3, 0)),) * 2
+    by_pose, rest_by_pose = (
+        _pose_derivative(robot, scene, poses, states, residual, pivot) if derivative else (np.zeros((len(residual), 3, 0)),) * 2
+    )
     return SceneJet(residual, rest_residual(robot, scene, poses), by_pose, rest_by_pose, _stack(columns[split:], residual), _stack(columns[:split], residual), states)  # fmt: skip
 
 
@@ -230,7 +232,12 @@ def _variants(
 
 
 def _pose_derivative(
-    robot: Robot, scene: Scene, poses: Sequence[FloatArray], states: Mapping[int, Equilibrium], residual: FloatArray, pivot: FloatArray
+    robot: Robot,
+    scene: Scene,
+    poses: Sequence[FloatArray],
+    states: Mapping[int, Equilibrium],
+    residual: FloatArray,
+    pivot: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
     """Return the derivatives of marker and seat residuals by each pose; only seats that move need the states again."""
     columns, rest_columns = [], []

@@ -27,7 +27,7 @@ def fit_rigid(points_a: FloatArray, points_b: FloatArray, *, weights: FloatArray
         raise DataError(f"a pose needs three points that are seen; found {int((w > 0).sum())}")
     w = w / w.sum()
     mean_a, mean_b = w @ a, w @ b
-    U, s, Vt = np.linalg.svd((w[:, None] * (a - mean_a)).T @ (b - mean_b))
+    U, _, Vt = np.linalg.svd((w[:, None] * (a - mean_a)).T @ (b - mean_b))
     spread = np.linalg.svd(np.sqrt(w)[:, None] * (b - mean_b), compute_uv=False)
     if spread[1] < 1e-6 * max(spread[0], 1e-300):
         raise DataError("a pose needs three points that are not on a line")

@@ -28,7 +28,13 @@ def find_effect(name: str) -> Effect:
             return effect
     names = [effect.name for effect in EFFECTS]
     near = get_close_matches(name, names, 1)
-    raise InputError("unknown effect", where="effects.name", found=name, expected=", ".join(names), hint=f"did you mean {near[0]}?" if near else None)
+    raise InputError(
+        "unknown effect",
+        where="effects.name",
+        found=name,
+        expected=", ".join(names),
+        hint=f"did you mean {near[0]}?" if near else None,
+    )
 
 
 def apply_effects(robot: Robot, entries: Sequence[Mapping[str, Any]]) -> Robot:

@@ -23,9 +23,18 @@ def _friction_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
 def _apply_friction(robot: Robot, entry: Entry) -> Robot:
     values = per_cable(entry, "coefficient", "cable_friction", robot, 0.0)
     if (values < 0).any():
-        raise InputError("a coefficient of friction is not negative", where="cable_friction.coefficient", found=float(values.min()), expected="≥ 0")
+        raise InputError(
+            "a coefficient of friction is not negative",
+            where="cable_friction.coefficient",
+            found=float(values.min()),
+            expected="≥ 0",
+        )
     if (values > 0).any() and not _has_bends(robot):
-        raise InputError("no cable of this robot bends", where="cable_friction", hint="give [[cables]] an exit_direction, or inner points of the path")
+        raise InputError(
+            "no cable of this robot bends",
+            where="cable_friction",
+            hint="give [[cables]] an exit_direction, or inner points of the path",
+        )
     cables = tuple(replace(c, friction=float(v)) for c, v in zip(robot.body.cables, values))
     return robot.with_body(robot.body.with_cables(cables))
 
@@ -45,7 +54,9 @@ def _apply_offset(robot: Robot, entry: Entry) -> Robot:
 
 
 def _gain_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
-    return tuple(Parameter("scale", name, "1", 0.0, float(np.log(0.3)), float(np.log(3.0)), 1e-3, "log") for name in robot.body.cable_names)
+    return tuple(
+        Parameter("scale", name, "1", 0.0, float(np.log(0.3)), float(np.log(3.0)), 1e-3, "log") for name in robot.body.cable_names
+    )
 
 
 def _apply_gain(robot: Robot, entry: Entry) -> Robot:
@@ -64,7 +75,9 @@ def _apply_stretch(robot: Robot, entry: Entry) -> Robot:
         return robot
     values: FloatArray = per_cable(entry, "stiffness_n_m", "cable_stretch", robot, float("nan"))
     if not (values > 0).all():
-        raise InputError("a stiffness is positive", where="cable_stretch.stiffness_n_m", found=float(values.min()), expected="> 0 N/m")
+        raise InputError(
+            "a stiffness is positive", where="cable_stretch.stiffness_n_m", found=float(values.min()), expected="> 0 N/m"
+        )
     cables = tuple(replace(c, stretch_stiffness=float(v)) for c, v in zip(robot.body.cables, values))
     return robot.with_body(robot.body.with_cables(cables))
 
@@ -77,12 +90,20 @@ def _slack_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
 
 def _apply_slack(robot: Robot, entry: Entry) -> Robot:
     act = robot.actuation
-    return replace(robot, actuation=replace(act, slack=freeze(act.slack + per_cable(entry, "displacement_m", "cable_slack", robot, 0.0))))
+    return replace(
+        robot, actuation=replace(act, slack=freeze(act.slack + per_cable(entry, "displacement_m", "cable_slack", robot, 0.0)))
+    )
 
 
 CABLE_FRICTION = Effect("cable_friction", "loss where a cable bends or rubs; depends on the direction of motion",
                         _friction_parameters, _apply_friction, keys=("coefficient",), history=True)  # fmt: skip
-CABLE_OFFSET = Effect("cable_offset", "a wrong zero of tension or displacement", _offset_parameters, _apply_offset, keys=("tension_n", "displacement_m"))
+CABLE_OFFSET = Effect(
+    "cable_offset",
+    "a wrong zero of tension or displacement",
+    _offset_parameters,
+    _apply_offset,
+    keys=("tension_n", "displacement_m"),
+)
 CABLE_GAIN = Effect("cable_gain", "a wrong scale of the tension or displacement", _gain_parameters, _apply_gain, keys=("scale",))
 CABLE_STRETCH = Effect("cable_stretch", "a cable that is a spring", _stretch_parameters, _apply_stretch, keys=("stiffness_n_m",))
 CABLE_SLACK = Effect("cable_slack", "play before a cable pulls", _slack_parameters, _apply_slack, keys=("displacement_m",))

@@ -101,7 +101,9 @@ def build_entry(parameters: Sequence[Parameter], coordinates: Sequence[float], s
     return entry
 
 
-def number(entry: Entry, key: str, where: str, *, low: float = -np.inf, high: float = np.inf, default: float | None = None) -> float:
+def number(
+    entry: Entry, key: str, where: str, *, low: float = -np.inf, high: float = np.inf, default: float | None = None
+) -> float:
     """Return a number of an entry after checking its range. Raises InputError."""
     value = entry.get(key, default)
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value) or not low <= value <= high:

@@ -26,9 +26,8 @@ def _payload_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
 
 
 def _payload_places(robot: Robot) -> tuple[Entry, ...]:
-    """A dozen places that are spread over the free surface, and the markers (whose own weight is a payload)."""
-    nodes = spread_features(robot.body, 12)
-    places = [*robot.body.mesh.nodes[nodes].tolist(), *robot.marker_points[:6].tolist()]
+    """Places that are spread over the free surface."""
+    places = robot.body.mesh.nodes[spread_features(robot.body, 10)]
     return tuple({"point_m": [float(v) for v in place]} for place in places)
 
 
@@ -39,7 +38,11 @@ def _apply_payload(robot: Robot, entry: Entry) -> Robot:
     return robot.with_body(robot.body.with_dead_forces(robot.body.dead_forces + forces))
 
 
-GRAVITY = Effect("gravity", "its own weight, or weight in another direction", _gravity_parameters, _apply_gravity, keys=("vector_m_s2",))
-PAYLOAD = Effect("payload", "a load that was not declared", _payload_parameters, _apply_payload, _payload_places, keys=("point_m", "force_n"))
+GRAVITY = Effect(
+    "gravity", "its own weight, or weight in another direction", _gravity_parameters, _apply_gravity, keys=("vector_m_s2",)
+)
+PAYLOAD = Effect(
+    "payload", "a load that was not declared", _payload_parameters, _apply_payload, _payload_places, keys=("point_m", "force_n")
+)
 
 __all__ = ["GRAVITY", "PAYLOAD", "STANDARD_GRAVITY"]

@@ -28,7 +28,9 @@ def _poisson_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
 def _apply_poisson(robot: Robot, entry: Entry) -> Robot:
     nu = number(entry, "poisson_ratio", "poisson", low=-0.99, high=0.4999)
     material = robot.body.material
-    return robot.with_body(robot.body.with_material(replace(material, poisson_ratio=freeze(np.full_like(material.poisson_ratio, nu)))))
+    return robot.with_body(
+        robot.body.with_material(replace(material, poisson_ratio=freeze(np.full_like(material.poisson_ratio, nu))))
+    )
 
 
 def _region_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
@@ -36,13 +38,17 @@ def _region_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
 
 
 def _region_places(robot: Robot) -> tuple[Entry, ...]:
-    """Spheres of two sizes around places that are spread over the body, those that hold the centroid of an element."""
+    """Spheres around places that are spread over the body, those that hold the centroid of an element."""
     nodes = robot.body.mesh.nodes
     size = float(np.linalg.norm(np.ptp(nodes, axis=0)))
     places = nodes[spread_features(robot.body, 8)]
     centroids = nodes[robot.body.mesh.tets[:, :4]].mean(axis=1)
     spheres = [(p, r * size) for p in places for r in (0.12, 0.25)]
-    return tuple({"center_m": [float(v) for v in p], "radius_m": r} for p, r in spheres if (np.linalg.norm(centroids - p, axis=1) <= r).any())
+    return tuple(
+        {"center_m": [float(v) for v in p], "radius_m": r}
+        for p, r in spheres
+        if (np.linalg.norm(centroids - p, axis=1) <= r).any()
+    )
 
 
 def _apply_region(robot: Robot, entry: Entry) -> Robot:
@@ -83,13 +89,29 @@ def _creep_seeds(robot: Robot) -> tuple[Entry, ...]:
 def _apply_creep(robot: Robot, entry: Entry) -> Robot:
     fractions, times = np.atleast_1d(entry.get("fraction", [])), np.atleast_1d(entry.get("time_s", []))
     if not len(fractions) or fractions.shape != times.shape:
-        raise InputError("fraction and time_s differ in number", where="creep", found=entry, expected="one or more terms, as many of each")
-    terms = tuple((number({"f": float(f)}, "f", "creep.fraction", low=0.0), number({"t": float(t)}, "t", "creep.time_s", low=1e-6)) for f, t in zip(fractions, times))
+        raise InputError(
+            "fraction and time_s differ in number", where="creep", found=entry, expected="one or more terms, as many of each"
+        )
+    terms = tuple(
+        (number({"f": float(f)}, "f", "creep.fraction", low=0.0), number({"t": float(t)}, "t", "creep.time_s", low=1e-6))
+        for f, t in zip(fractions, times)
+    )
     return replace(robot, creep=robot.creep + terms)
 
 
 STIFFNESS = Effect("stiffness", "the right modulus everywhere", _stiffness_parameters, _apply_stiffness, keys=("scale",))
 POISSON = Effect("poisson", "the right Poisson ratio", _poisson_parameters, _apply_poisson, keys=("poisson_ratio",))
-SOFT_REGION = Effect("soft_region", "a part of another stiffness", _region_parameters, _apply_region, _region_places, keys=("center_m", "radius_m", "scale"))
-HYPERELASTIC = Effect("hyperelastic", "stiffening or softening with stretch", _no_parameters, _apply_law, _law_seeds, keys=("law", "jm"))
-CREEP = Effect("creep", "slow flow under load", _creep_parameters, _apply_creep, _creep_seeds, keys=("fraction", "time_s"), history=True)
+SOFT_REGION = Effect(
+    "soft_region",
+    "a part of another stiffness",
+    _region_parameters,
+    _apply_region,
+    _region_places,
+    keys=("center_m", "radius_m", "scale"),
+)
+HYPERELASTIC = Effect(
+    "hyperelastic", "stiffening or softening with stretch", _no_parameters, _apply_law, _law_seeds, keys=("law", "jm")
+)
+CREEP = Effect(
+    "creep", "slow flow under load", _creep_parameters, _apply_creep, _creep_seeds, keys=("fraction", "time_s"), history=True
+)

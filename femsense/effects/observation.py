@@ -23,7 +23,9 @@ def _apply_depth(robot: Robot, entry: Entry) -> Robot:
     scale = number(entry, "scale", "depth_scale", low=0.5, high=2.0, default=1.0)
     offset = number(entry, "offset_m", "depth_scale", low=-1.0, high=1.0, default=0.0)
     seen = robot.observation
-    return replace(robot, observation=replace(seen, depth_scale=seen.depth_scale * scale, depth_offset=seen.depth_offset * scale + offset))
+    return replace(
+        robot, observation=replace(seen, depth_scale=seen.depth_scale * scale, depth_offset=seen.depth_offset * scale + offset)
+    )
 
 
 def _marker_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
@@ -42,5 +44,9 @@ def _apply_marker(robot: Robot, entry: Entry) -> Robot:
     return robot.with_marker_points(points)
 
 
-DEPTH_SCALE = Effect("depth_scale", "a camera whose distances are off", _depth_parameters, _apply_depth, keys=("scale", "offset_m"))
-MARKER_OFFSET = Effect("marker_offset", "markers that sit elsewhere than declared", _marker_parameters, _apply_marker, keys=("offset_m",))
+DEPTH_SCALE = Effect(
+    "depth_scale", "a camera whose distances are off", _depth_parameters, _apply_depth, keys=("scale", "offset_m")
+)
+MARKER_OFFSET = Effect(
+    "marker_offset", "markers that sit elsewhere than declared", _marker_parameters, _apply_marker, keys=("offset_m",)
+)

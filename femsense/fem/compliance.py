@@ -101,7 +101,9 @@ def compliance(
     if P.shape != D.shape:
         raise InputError("points and directions differ in shape", where="directions", found=D.shape, expected=P.shape)
     at = tangent_at(body, equilibrium) if tangent is None else tangent
-    point_rows = direction_rows(embed_points(body.mesh, P), D, len(body.mesh.nodes)) if len(P) else np.zeros((0, 3 * at.node_count))
+    point_rows = (
+        direction_rows(embed_points(body.mesh, P), D, len(body.mesh.nodes)) if len(P) else np.zeros((0, 3 * at.node_count))
+    )
     rows = np.vstack([point_rows, pull_rows(body, equilibrium.positions)])[:, at.dofs]
     W = rows @ at.factor.solve(rows.T)
     return np.asarray((W + W.T) / 2.0)

@@ -173,7 +173,11 @@ def _collect_loads(
     stiffness = float(np.median(body.material.young_modulus)) * reach
     scale = np.linalg.norm(forces, axis=1).sum() + np.abs(T).sum() + np.abs(d).sum() * stiffness * 1e-2
     tolerance = relative_tolerance * max(scale, 1e-6 * stiffness * reach * 1e-2) + 1e-13 * stiffness * reach
-    return _Loads(forces, T, d, controlled, bilateral, before, float(tolerance)) if a else _Loads(forces, T, d, controlled, bilateral, (), float(tolerance))
+    return (
+        _Loads(forces, T, d, controlled, bilateral, before, float(tolerance))
+        if a
+        else _Loads(forces, T, d, controlled, bilateral, (), float(tolerance))
+    )
 
 
 def _initial_state(body: BodyModel, loads: _Loads, start: Equilibrium | None, reuse_factor: bool) -> _State:
@@ -250,7 +254,7 @@ def _update_friction(body: BodyModel, loads: _Loads, state: _State) -> bool:
         T = max(state.T[i], 0.0)
         tensions = rub(cable, bend_angles(cable, state.x), loads.before[i], T)
         share = tensions / T if T > 0 else np.zeros_like(tensions)
-        if np.abs(share - state.shares[i]).max() * T > 1e-10 * max(1.0, T):
+        if np.abs(share - state.shares[i]).max() * T > 1e-8 * max(1.0, T):
             still = False
         state.shares[i] = share
     return still
@@ -321,7 +325,9 @@ def _kinematic_rows(body: BodyModel, state: _State, rows: FloatArray) -> FloatAr
     return result
 
 
-def _bordered_step(factor: Factorization, force: FloatArray, gap: FloatArray, H: FloatArray, C: FloatArray, stretch: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _bordered_step(
+    factor: Factorization, force: FloatArray, gap: FloatArray, H: FloatArray, C: FloatArray, stretch: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Solve K du − Cᵀ dT = force, H du + stretch dT = gap."""
     if not len(gap):
         return factor.solve(force), gap
@@ -375,7 +381,13 @@ def _line_search(
 
 
 def _merit(
-    body: BodyModel, loads: _Loads, state: _State, held: npt.NDArray[np.intp], here: Internal, penalty: FloatArray, lost: FloatArray
+    body: BodyModel,
+    loads: _Loads,
+    state: _State,
+    held: npt.NDArray[np.intp],
+    here: Internal,
+    penalty: FloatArray,
+    lost: FloatArray,
 ) -> float:
     value = here.energy - float((loads.forces * (state.x - body.mesh.nodes)).sum())
     for i, cable in enumerate(body.cables):
@@ -396,7 +408,9 @@ def _weighted_length(cable: object, x: FloatArray, share: FloatArray) -> float:
     return float(share @ segments(cable, x)[1])  # type: ignore[arg-type]
 
 
-def _slope(body: BodyModel, loads: _Loads, state: _State, held: npt.NDArray[np.intp], here: Internal, step: FloatArray, lost: FloatArray) -> float:
+def _slope(
+    body: BodyModel, loads: _Loads, state: _State, held: npt.NDArray[np.intp], here: Internal, step: FloatArray, lost: FloatArray
+) -> float:
     """Return the derivative of the potential (of held cables only what friction takes away) along a step."""
     gradient = here.forces - loads.forces
     rows = _rows(body, state)
@@ -435,7 +449,16 @@ def _step_loads(body: BodyModel, loads: _Loads, iterations: int, max_iterations:
 
 def _copied(state: _State) -> _State:
     """Return a copy that can be moved on without harm to the original."""
-    return _State(state.x.copy(), state.T.copy(), state.taut.copy(), [s.copy() for s in state.shares], None, False, state.iterations, state.residual)
+    return _State(
+        state.x.copy(),
+        state.T.copy(),
+        state.taut.copy(),
+        [s.copy() for s in state.shares],
+        None,
+        False,
+        state.iterations,
+        state.residual,
+    )
 
 
 def _result(body: BodyModel, loads: _Loads, state: _State, status: str, nodal_forces: FloatArray) -> Equilibrium:

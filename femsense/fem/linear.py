@@ -47,7 +47,9 @@ def make_pattern(indptr: IntArray, indices: IntArray) -> Pattern:
     rows = np.repeat(np.arange(size), np.diff(indptr))
     upper = np.flatnonzero(indices >= rows)
     counts = np.bincount(rows[upper], minlength=size)
-    return Pattern(indptr, indices, upper, np.concatenate([[0], np.cumsum(counts)]).astype(np.int32), indices[upper].astype(np.int32))
+    return Pattern(
+        indptr, indices, upper, np.concatenate([[0], np.cumsum(counts)]).astype(np.int32), indices[upper].astype(np.int32)
+    )
 
 
 class Factorization(Protocol):

@@ -70,7 +70,9 @@ def make_stencil(mesh: TetMesh, cliques: list[IntArray] | None = None) -> tuple[
     values = _moments(mesh, volumes)
     np.add.at(node_volume, mesh.tets, values)
     rows, columns, slots = _block_pattern(len(mesh.nodes), [mesh.tets, *(cliques or [])])
-    stencil = Stencil(freeze(gradients), freeze(volumes), freeze(node_volume), slots[0], freeze(rows, np.int64), freeze(columns, np.int64))
+    stencil = Stencil(
+        freeze(gradients), freeze(volumes), freeze(node_volume), slots[0], freeze(rows, np.int64), freeze(columns, np.int64)
+    )
     return stencil, slots[1:]
 
 

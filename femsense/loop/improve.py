@@ -147,21 +147,35 @@ def prepare(robot: Robot, recordings: Sequence[Recording], validation: Sequence[
     validation = [check_against(robot, r) for r in validation]
     control = recordings[0].actuation
     if any(r.actuation != control for r in [*recordings, *validation]):
-        raise InputError("recordings differ in actuation", where="recordings", found=[r.actuation for r in [*recordings, *validation]], expected="all tension or all displacement")
+        raise InputError(
+            "recordings differ in actuation",
+            where="recordings",
+            found=[r.actuation for r in [*recordings, *validation]],
+            expected="all tension or all displacement",
+        )
     train: list[Trial] = []
     held: list[Trial] = []
     held_of: list[int | None] = []
     words: list[str] = []
     for i, recording in enumerate(recordings):
         frames = _marked_frames(recording)
-        fitted, kept, how = (frames, frames[:0], "all frames fitted; held out: other recordings") if validation else hold_out(recording, frames)
+        fitted, kept, how = (
+            (frames, frames[:0], "all frames fitted; held out: other recordings") if validation else hold_out(recording, frames)
+        )
         if not len(kept) and not validation:
             raise DataError("one frame is too few to hold anything out: record more frames, or give --validation")
         trial = _trial(robot, recording, fitted)
         train.append(trial)
         words.append(how)
         if len(kept):
-            held.append(replace(trial, scene=make_scene(robot, recording, kept), groups=_groups(recording, make_scene(robot, recording, kept)), starts={}))
+            held.append(
+                replace(
+                    trial,
+                    scene=make_scene(robot, recording, kept),
+                    groups=_groups(recording, make_scene(robot, recording, kept)),
+                    starts={},
+                )
+            )
             held_of.append(i)
     for recording in validation:
         held.append(_trial(robot, recording, _marked_frames(recording), first_only=True))
@@ -176,7 +190,9 @@ def _marked_frames(recording: Recording) -> IntArray:
     frames = usable_frames(recording)
     frames = frames[np.isin(frames, recording.marker_frame)]
     if not len(frames):
-        raise DataError("no frame with markers is free of undeclared contact: the loop needs markers in free frames (or declared loads)")
+        raise DataError(
+            "no frame with markers is free of undeclared contact: the loop needs markers in free frames (or declared loads)"
+        )
     rows = int(np.isin(recording.marker_frame, frames).sum())
     return frames[:: max(1, int(np.ceil(rows / MAX_ROWS)))]
 
@@ -233,7 +249,14 @@ def _with_nuisance(data: Data) -> tuple[Hypothesis, Prior]:
 
 
 def _stage(
-    data: Data, hypothesis: Hypothesis, prior: Prior, noise: Noise, coordinates: FloatArray, *, own: FloatArray | None = None, max_iterations: int = 12
+    data: Data,
+    hypothesis: Hypothesis,
+    prior: Prior,
+    noise: Noise,
+    coordinates: FloatArray,
+    *,
+    own: FloatArray | None = None,
+    max_iterations: int = 12,
 ) -> Stage:
     fit = fit_jointly(hypothesis, prior, data.train, noise, data.seat_std, coordinates, own=own, max_iterations=max_iterations)
     residuals = _held_residuals(data, fit, noise)
@@ -255,12 +278,24 @@ def _held_residuals(data: Data, fit: JointFit, noise: Noise) -> list[FloatArray]
             poses, initial = data.train[of].place(fit.fit.theta[spans[of] : spans[of + 1]], pivot)
         else:
             poses, initial = _pose_on_first_frames(robot, trial, noise, data.seat_std, pivot)
-        jet = evaluate_scene(plain, trial.scene, np.zeros(0), poses, initial, derivative=False, vary_initial=False, pivot=pivot, starts=trial.starts)
+        jet = evaluate_scene(
+            plain,
+            trial.scene,
+            np.zeros(0),
+            poses,
+            initial,
+            derivative=False,
+            vary_initial=False,
+            pivot=pivot,
+            starts=trial.starts,
+        )
         result.append(jet.residual)
     return result
 
 
-def _pose_on_first_frames(robot: Robot, trial: Trial, noise: Noise, seat_std: float, pivot: FloatArray) -> tuple[list[FloatArray], FloatArray | None]:
+def _pose_on_first_frames(
+    robot: Robot, trial: Trial, noise: Noise, seat_std: float, pivot: FloatArray
+) -> tuple[list[FloatArray], FloatArray | None]:
     frames = trial.scene.frames
     scene = trial.scene.pick(frames[: max(1, round(0.2 * len(frames)))])
     first = replace(trial, scene=scene, groups=_groups(scene.recording, scene), starts={})
@@ -271,23 +306,26 @@ def _pose_on_first_frames(robot: Robot, trial: Trial, noise: Noise, seat_std: fl
 def _noise(data: Data, stage: Stage, names: Sequence[str]) -> tuple[Noise, float]:
     """Estimate the noise from what the richest linear model leaves; return it with the effective number of observations."""
     unit = Noise({"white": 5e-4}, "")
-    problem = JointProblem(stage.fit.hypothesis, stage.fit.prior, data.train, [unit.whitener(t.groups) for t in data.train], data.seat_std)
+    problem = JointProblem(
+        stage.fit.hypothesis, stage.fit.prior, data.train, [unit.whitener(t.groups) for t in data.train], data.seat_std
+    )
     todo = _todo(data, stage.fit, names)
     table = screen(stage.fit, problem, todo, 100.0) if todo else []
     own = sum(t.size for t in data.train)
     best: dict[str, Candidate] = {}
     for candidate in table:
         best.setdefault(candidate.effect.name, candidate)
-    columns, at = [], 0
+    columns, extra, at = [], [], 0
     for i, (trial, jet) in enumerate(zip(data.train, stage.fit.jets)):
         k = len(jet.residual)
         block = np.zeros((k, 3, own))
         block[:, :, at : at + 6 * len(trial.poses)] = jet.by_pose
         block[:, :, at + 6 * len(trial.poses) : at + trial.size] = jet.by_initial
         at += trial.size
-        parts = [block, jet.by_effect, *(c.raw[i] for c in best.values() if c.effect.name != "marker_offset")]
-        columns.append(np.concatenate(parts, axis=2))
-    noise = estimate_noise([j.residual for j in stage.fit.jets], columns, [t.groups for t in data.train])
+        columns.append(np.concatenate([block, jet.by_effect], axis=2))
+        others = [c.raw[i] for c in best.values() if c.effect.name != "marker_offset"]
+        extra.append(np.concatenate([np.zeros((k, 3, 0)), *others], axis=2))
+    noise = estimate_noise([j.residual for j in stage.fit.jets], columns, extra, [t.groups for t in data.train])
     return noise, float(sum(3 * (t.groups.state.max() + 1) for t in data.train))
 
 
@@ -315,7 +353,10 @@ def _best_refit(
             chosen.setdefault(candidate.effect.name, candidate)
     best, records = None, []
     library = max(len({c.effect.name for c in table}), 1)
-    for candidate in list(chosen.values())[:REFITS]:
+    refits = REFITS if len(stage.fit.hypothesis.terms) <= len(NUISANCE) else REFITS // 2
+    for candidate in list(chosen.values())[:refits]:
+        if best is not None and candidate.score < 0.7 * best[0] - EVIDENCE:
+            break  # far behind: a joint refit seldom gains that much on its linear score
         say(f"refitting with {candidate.effect.name}")
         record: dict[str, Any] = {"name": candidate.effect.name, "seed": candidate.seed}
         records.append(record)
@@ -353,13 +394,26 @@ def _refit(data: Data, stage: Stage, candidate: Candidate, noise: Noise) -> Stag
     """Joint fit with one more effect, started from its linear step."""
     hypothesis = Hypothesis(data.robot, (*stage.fit.hypothesis.terms, (candidate.effect, candidate.seed, candidate.parameters)))
     null = np.array([p.null for p in candidate.parameters])
+    low, high = np.array([p.low for p in candidate.parameters]), np.array([p.high for p in candidate.parameters])
+    prior = Prior(np.concatenate([stage.fit.prior.mean, null]), np.concatenate([stage.fit.prior.std, np.full(len(null), np.inf)]))
+    start = np.clip(_first_guess(candidate, null), low, high)
+    for share in (1.0, 0.3, 0.0):  # a linear step may lead too far
+        coordinates = np.concatenate([stage.fit.coordinates, null + share * (start - null)])
+        try:
+            trial = _stage(data, hypothesis, prior, noise, coordinates, own=_own(stage), max_iterations=10)
+        except DataError:
+            continue
+        if trial.fit.chi2 <= stage.fit.chi2 + 1.0:
+            return trial
+    raise DataError("no start from which the fit improves")
+
+
+def _first_guess(candidate: Candidate, null: FloatArray) -> FloatArray:
+    """Return the linear step; for gravity its direction with the size that is known."""
     start = null + candidate.step
     if candidate.effect.name == "gravity":
         start = start / max(float(np.linalg.norm(start)), 1e-9) * STANDARD_GRAVITY
-    low, high = np.array([p.low for p in candidate.parameters]), np.array([p.high for p in candidate.parameters])
-    prior = Prior(np.concatenate([stage.fit.prior.mean, null]), np.concatenate([stage.fit.prior.std, np.full(len(null), np.inf)]))
-    coordinates = np.concatenate([stage.fit.coordinates, np.clip(start, low, high)])
-    return _stage(data, hypothesis, prior, noise, coordinates, own=_own(stage), max_iterations=25)
+    return np.asarray(start)
 
 
 def _objection(stage: Stage, trial: Stage, candidate: Candidate, score: float) -> str | None:
@@ -397,7 +451,8 @@ def _conclude(
     rivals = _confounded(table, first, refits, history)
     not_testable = [
         {"name": c.effect.name, "absorbed_share": float(np.sqrt(max(0.0, 1.0 - c.retained**2))), "retained_share": c.retained}
-        for c in _one_each(first) if c.retained < TESTABLE
+        for c in _one_each(first)
+        if c.retained < TESTABLE
     ]
     robot = apply_effects(data.robot, entries) if entries else data.robot
     if data.robot.document is not None and entries:
@@ -438,19 +493,39 @@ def _promoted(data: Data, final: Stage) -> list[str]:
     return result
 
 
-def _chain(data: Data, before: Stage, history: list[Stage], promoted: list[str], noise: Noise) -> tuple[list[dict[str, Any]], list[Entry]]:
+def _chain(
+    data: Data, before: Stage, history: list[Stage], promoted: list[str], noise: Noise
+) -> tuple[list[dict[str, Any]], list[Entry]]:
     """Return the effects in the order in which they were added, each with the held-out error before and after it."""
     final = history[-1]
     tables = {e["name"]: e for e in final.fit.hypothesis.entries(final.fit.coordinates)}
     rows, entries, error = [], [], before.held_rms
     for name in promoted:
-        after = _stage_with(data, [n for n in promoted[: promoted.index(name) + 1]], noise).held_rms if name != promoted[-1] else history[0].held_rms
-        rows.append({"name": name, "parameters": _parameters(final, name), "validation_rms_before_m": error, "validation_rms_after_m": after})
+        after = (
+            _stage_with(data, [n for n in promoted[: promoted.index(name) + 1]], noise).held_rms
+            if name != promoted[-1]
+            else history[0].held_rms
+        )
+        rows.append(
+            {
+                "name": name,
+                "parameters": _parameters(final, name),
+                "validation_rms_before_m": error,
+                "validation_rms_after_m": after,
+            }
+        )
         entries.append(_rounded(tables[name]))
         error = after
     for stage in history[1:]:
         name = stage.fit.hypothesis.terms[-1][0].name
-        rows.append({"name": name, "parameters": _parameters(final, name), "validation_rms_before_m": error, "validation_rms_after_m": stage.held_rms})
+        rows.append(
+            {
+                "name": name,
+                "parameters": _parameters(final, name),
+                "validation_rms_before_m": error,
+                "validation_rms_after_m": stage.held_rms,
+            }
+        )
         entries.append(_rounded(tables[name]))
         error = stage.held_rms
     return rows, entries
@@ -488,7 +563,10 @@ def _parameters(stage: Stage, name: str) -> dict[str, Any]:
             for field, number in (("value", value), ("std", deviation)):
                 slot[field] = _placed(slot[field], p.part, float(number) if np.isfinite(number) else None)
         if effect.name == name:
-            result |= {k: {"value": v, "std": None, "unit": "m" if k.endswith("_m") else "s" if k.endswith("_s") else "1"} for k, v in seed.items()}
+            result |= {
+                k: {"value": v, "std": None, "unit": "m" if k.endswith("_m") else "s" if k.endswith("_s") else "1"}
+                for k, v in seed.items()
+            }
         at += len(parameters)
     return result
 
@@ -549,14 +627,20 @@ def _why_not(c: Candidate) -> str:
     return f"too little evidence (dBIC {c.score:.1f})"
 
 
-def _confounded(table: list[Candidate], first: list[Candidate], refits: list[dict[str, Any]], history: list[Stage]) -> list[dict[str, Any]]:
+def _confounded(
+    table: list[Candidate], first: list[Candidate], refits: list[dict[str, Any]], history: list[Stage]
+) -> list[dict[str, Any]]:
     """Return pairs that these data cannot tell apart: fields that agree, or refits whose evidence is within 10 of the named one."""
     pairs = []
     named = [s.fit.hypothesis.terms[-1][0].name for s in history[1:]]
     best = {r["name"]: r["dbic"] for r in refits if r.get("verdict") == "named"}
     for name in named:
         for r in refits:
-            if r["name"] not in named and r.get("verdict") == "passes" and r.get("dbic", -np.inf) > best.get(name, np.inf) - EVIDENCE:
+            if (
+                r["name"] not in named
+                and r.get("verdict") == "passes"
+                and r.get("dbic", -np.inf) > best.get(name, np.inf) - EVIDENCE
+            ):
                 pairs.append({"pair": [name, r["name"]], "dbic_gap": float(best[name] - r["dbic"])})
     ones = _one_each(first)
     for i, a in enumerate(ones):
@@ -584,11 +668,22 @@ def _next_experiment(data: Data, rivals: list[dict[str, Any]], not_testable: lis
     names = {n for r in rivals for n in r["pair"]} | {r["name"] for r in not_testable}
     advice = []
     recordings = [t.scene.recording for t in data.train]
-    unloading = any(len(r.inputs) > 1 and (np.diff(r.inputs, axis=0).max(initial=0.0) > 0) and (np.diff(r.inputs, axis=0).min(initial=0.0) < 0) for r in recordings)
+    unloading = any(
+        len(r.inputs) > 1
+        and (np.diff(r.inputs, axis=0).max(initial=0.0) > 0)
+        and (np.diff(r.inputs, axis=0).min(initial=0.0) < 0)
+        for r in recordings
+    )
     if names & {"gravity", "payload"}:
-        advice.append("turn the base by 90° between frames, camera fixed (gravity_*_m_s2 in frames.csv): weight then changes direction and the pose does not")
+        advice.append(
+            "turn the base by 90° between frames, camera fixed (gravity_*_m_s2 in frames.csv): weight then changes direction and the pose does not"
+        )
     if names & {"cable_friction", "creep", "cable_slack"}:
-        advice.append("go up and down at several levels, and hold for a minute" if not unloading else "hold for a minute at two levels, and repeat a sweep at another speed")
+        advice.append(
+            "go up and down at several levels, and hold for a minute"
+            if not unloading
+            else "hold for a minute at two levels, and repeat a sweep at another speed"
+        )
     if names & {"cable_gain", "cable_offset", "stiffness", "cable_stretch"}:
         advice.append("hang a known weight on the robot in some frames (loads.csv)")
     if names & {"poisson", "soft_region", "base_compliance", "hyperelastic"}:
@@ -617,11 +712,16 @@ def _short(parameters: dict[str, Any]) -> str:
             return "[" + ", ".join(show(v) for v in value) + "]"
         return ", ".join(f"{k} {show(v)}" for k, v in value.items()) if isinstance(value, dict) else str(value)
 
-    return ", ".join(f"{k} {show(p['value'])} {p['unit']}".replace(" 1", "") if p["unit"] == "1" else f"{k} {show(p['value'])} {p['unit']}" for k, p in parameters.items())
+    return ", ".join(
+        f"{k} {show(p['value'])} {p['unit']}".replace(" 1", "") if p["unit"] == "1" else f"{k} {show(p['value'])} {p['unit']}"
+        for k, p in parameters.items()
+    )
 
 
 def _card(data: Data, before: Stage, final: Stage, noise: Noise, n_effective: float) -> dict[str, Any]:
-    nuisance = {name: _parameters(final, name) for name in NUISANCE if any(e.name == name for e, _, _ in final.fit.hypothesis.terms)}
+    nuisance = {
+        name: _parameters(final, name) for name in NUISANCE if any(e.name == name for e, _, _ in final.fit.hypothesis.terms)
+    }
     return {
         "recordings": [str(t.scene.recording.folder) for t in data.train],
         "split": data.split,

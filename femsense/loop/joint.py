@@ -114,7 +114,9 @@ class JointProblem:
 
     def start(self, coordinates: FloatArray) -> FloatArray:
         """Return θ at the trials' starts."""
-        parts = [np.concatenate([np.zeros(6 * len(t.poses)), t.initial if t.initial is not None else np.zeros(0)]) for t in self.trials]
+        parts = [
+            np.concatenate([np.zeros(6 * len(t.poses)), t.initial if t.initial is not None else np.zeros(0)]) for t in self.trials
+        ]
         return np.concatenate([*parts, coordinates])
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
@@ -213,7 +215,7 @@ def fit_jointly(
     if own is not None:
         theta[: problem.own] = own
     low, high = problem.bounds()
-    fit = gauss_newton(problem.evaluate, theta, low=low, high=high, max_iterations=max_iterations, tolerance=1e-6)
+    fit = gauss_newton(problem.evaluate, theta, low=low, high=high, max_iterations=max_iterations, tolerance=1e-6, still=0.15)
     if problem.last is None or not np.array_equal(problem.last.theta, fit.theta) or not problem.last.jets[0].by_pose.size:
         problem.evaluate(fit.theta, True)
     assert problem.last is not None

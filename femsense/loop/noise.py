@@ -10,6 +10,7 @@ that is measured five times repeats its error five times, and the term h² says 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.linalg import cho_solve, cholesky, solve_triangular
@@ -78,30 +79,78 @@ def whiten(factor: FloatArray, values: FloatArray) -> FloatArray:
     return np.asarray(flat.reshape(3 * k, *values.shape[2:]))
 
 
-def estimate_noise(residuals: list[FloatArray], columns: list[FloatArray], groups: list[Groups]) -> Noise:
+MAX_REML_ROWS = 600
+"""Rows that the estimate of the noise uses at most; more are thinned out by whole frames."""
+
+
+def estimate_noise(
+    residuals: list[FloatArray], nuisance: list[FloatArray], extra: list[FloatArray], groups: list[Groups]
+) -> Noise:
     """Return the components of the noise by restricted maximum likelihood.
 
     Arguments:
         residuals: of each recording [m], shape (k, 3).
-        columns: what the richest model can explain, shape (k, 3, p), the same p everywhere.
+        nuisance: columns of what is fitted, shape (k, 3, p), the same p everywhere.
+        extra: columns of what might be in the data besides, shape (k, 3, q); their leading directions count as explained.
         groups: of each recording.
     """
+    residuals, nuisance, extra, groups = _thinned(residuals, nuisance, extra, groups)
     names = ["white", *sorted({n for g in groups for n in g.members()})]
-    basis = _compact(columns)
+    distinct = sum(3 * (int(g.state.max()) + 1) for g in groups)
+    basis = _richest(nuisance, extra, distinct)
     scale = float(np.sqrt(np.mean(np.concatenate([r.ravel() for r in residuals]) ** 2))) + FLOOR
 
     def negative_log_likelihood(log_std: FloatArray) -> float:
-        std = dict(zip(names, np.exp(log_std)))
-        std["white"] = max(std["white"], FLOOR)
-        return _reml(Noise(std, ""), residuals, basis, groups)
+        if np.abs(log_std - start).max() > 12.0:
+            return 1e30
+        return _reml(Noise(dict(zip(names, np.maximum(np.exp(log_std), FLOOR))), ""), residuals, basis, groups)
 
-    start = np.log(np.full(len(names), 0.3 * scale))
-    bounds = [(np.log(FLOOR), np.log(30 * scale))] + [(np.log(1e-3 * scale), np.log(30 * scale))] * (len(names) - 1)
-    best = minimize(negative_log_likelihood, start, method="L-BFGS-B", bounds=bounds, options={"maxiter": 60, "eps": 1e-3})
+    first = np.array(
+        [max(_jitter(residuals, groups), FLOOR) if n == "white" and "state" in names else 0.3 * scale for n in names]
+    )
+    start = np.log(first)
+    simplex = np.vstack([start, start + np.diag(np.full(len(names), -1.0))])
+    best = minimize(
+        negative_log_likelihood,
+        start,
+        method="Nelder-Mead",
+        options={"maxfev": 60 * len(names), "xatol": 0.02, "fatol": 0.02, "initial_simplex": simplex},
+    )
     std = {name: float(v) for name, v in zip(names, np.exp(best.x))}
-    std = {name: v if name == "white" or v > 2e-3 * scale else 0.0 for name, v in std.items()}
+    std = {name: max(v, FLOOR) if name == "white" else v if v > 2e-2 * scale else 0.0 for name, v in std.items()}
     repeats = "state" in names
-    return Noise(std, "restricted maximum likelihood, with repeats" if repeats else "restricted maximum likelihood; no repeated state: assumed from the residual")
+    return Noise(
+        std,
+        "restricted maximum likelihood, with repeats"
+        if repeats
+        else "restricted maximum likelihood; no repeated state: assumed from the residual",
+    )
+
+
+def _jitter(residuals: list[FloatArray], groups: list[Groups]) -> float:
+    """Return the scatter of repeated rows about their mean [m]."""
+    above, below = 0.0, 0
+    for r, g in zip(residuals, groups):
+        count = np.bincount(g.state)
+        mean = np.stack([np.bincount(g.state, r[:, c]) for c in range(3)], axis=1) / count[:, None]
+        above += float(((r - mean[g.state]) ** 2).sum())
+        below += 3 * int((count - 1).sum())
+    return float(np.sqrt(above / below)) if below else 0.0
+
+
+def _thinned(
+    residuals: list[FloatArray], nuisance: list[FloatArray], extra: list[FloatArray], groups: list[Groups]
+) -> tuple[list[FloatArray], list[FloatArray], list[FloatArray], list[Groups]]:
+    step = int(np.ceil(sum(len(r) for r in residuals) / MAX_REML_ROWS))
+    if step <= 1:
+        return residuals, nuisance, extra, groups
+    keep = [g.frame % step == 0 for g in groups]
+    thin = [
+        Groups(*(np.unique(getattr(g, n)[k], return_inverse=True)[1] for n in ("marker", "frame", "sweep", "state")))
+        for g, k in zip(groups, keep)
+    ]
+    pick = [[a[k] for a, k in zip(arrays, keep)] for arrays in (residuals, nuisance, extra)]
+    return pick[0], pick[1], pick[2], thin
 
 
 def _reml(noise: Noise, residuals: list[FloatArray], basis: list[FloatArray], groups: list[Groups]) -> float:
@@ -122,15 +171,26 @@ def _reml(noise: Noise, residuals: list[FloatArray], basis: list[FloatArray], gr
     return 0.5 * (log_det + 2 * float(np.log(np.diag(factor)).sum()) + rr - fit)
 
 
-def _compact(columns: list[FloatArray]) -> list[FloatArray]:
-    """Return an orthonormal basis of the columns, so that near duplicates cost no degrees of freedom; at most a third of the rows."""
-    stacked = np.vstack([c.reshape(-1, c.shape[2]) for c in columns])
-    norm = np.linalg.norm(stacked, axis=0)
-    U, s, _ = np.linalg.svd(stacked[:, norm > 0] / norm[norm > 0], full_matrices=False)
-    keep = min(int((s > 0.03 * s[0]).sum()), len(stacked) // 3)
-    U = U[:, : max(keep, 1)]
-    parts, at = [], 0
-    for c in columns:
-        parts.append(U[at : at + c.shape[0] * 3].reshape(c.shape[0], 3, -1))
-        at += c.shape[0] * 3
-    return parts
+def _richest(nuisance: list[FloatArray], extra: list[FloatArray], distinct: int) -> list[FloatArray]:
+    """Return an orthonormal basis of the nuisance and of the leading directions of what might be there besides.
+
+    The latter take at most a third of the degrees of freedom that the nuisance leaves, so that some are left for the noise.
+    """
+    Z = _stacked(nuisance)
+    U, s, _ = np.linalg.svd(Z, full_matrices=False)
+    Q = U[:, s > 1e-9 * max(s.max(initial=0.0), 1e-300)]
+    X = _stacked(extra)
+    X = X - Q @ (Q.T @ X)
+    U, s, _ = np.linalg.svd(X, full_matrices=False)
+    spare = max((distinct - Q.shape[1]) // 3, 0)
+    keep = min(int((s > 0.05 * max(s.max(initial=0.0), 1e-300)).sum()), spare)
+    Q = np.hstack([Q, U[:, :keep]])
+    spans = np.cumsum([0, *(c.shape[0] * 3 for c in nuisance)])
+    return [Q[a:b].reshape((b - a) // 3, 3, -1) for a, b in pairwise(spans)]
+
+
+def _stacked(columns: list[FloatArray]) -> FloatArray:
+    """Return columns of all recordings below each other with unit length, shape (3 Σk, p)."""
+    flat = np.vstack([c.reshape(-1, c.shape[2]) for c in columns])
+    norm = np.linalg.norm(flat, axis=0)
+    return np.asarray(flat[:, norm > 0] / norm[norm > 0])

@@ -49,7 +49,9 @@ class Candidate:
     """Size of each parameter (in its coordinate) that would just have been seen, shape (q,)."""
 
 
-def candidates_for(base: JointFit, control: str, *, names: Sequence[str], has_seats: bool) -> list[tuple[Effect, Entry, tuple[Parameter, ...]]]:
+def candidates_for(
+    base: JointFit, control: str, *, names: Sequence[str], has_seats: bool
+) -> list[tuple[Effect, Entry, tuple[Parameter, ...]]]:
     """Return the effects and seeds to try on top of a fitted model."""
     present = {effect.name for effect, _, _ in base.hypothesis.terms}
     robot = base.hypothesis.robot_at(base.coordinates)
@@ -92,7 +94,9 @@ def screen(
         q = len(parameters)
         score = gain - q * np.log(n_effective) - 2.0 * np.log(effects)
         retained = float(np.linalg.norm(left) / np.linalg.norm(whole))
-        result.append(Candidate(effect, seed, parameters, own, left, retained, step, gain, float(score), _smallest(left, q, n_effective)))
+        result.append(
+            Candidate(effect, seed, parameters, own, left, retained, step, gain, float(score), _smallest(left, q, n_effective))
+        )
     return sorted(result, key=lambda c: -c.score)
 
 

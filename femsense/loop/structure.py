@@ -64,7 +64,9 @@ def _lag_one(fields: list[tuple[FloatArray, FloatArray]], rng: np.random.Generat
     return above / below if below > 0 and pairs >= 4 else float("nan")
 
 
-def describe_left(robot: Robot, trials: list[Trial], residuals: list[FloatArray], statistic: float, p_value: float) -> dict[str, Any]:
+def describe_left(
+    robot: Robot, trials: list[Trial], residuals: list[FloatArray], statistic: float, p_value: float
+) -> dict[str, Any]:
     """Return what the remaining residual looks like: size, where, and what it goes with."""
     marker = np.concatenate([t.scene.marker for t in trials])
     size = np.concatenate([np.linalg.norm(r, axis=1) for r in residuals])
@@ -77,7 +79,11 @@ def describe_left(robot: Robot, trials: list[Trial], residuals: list[FloatArray]
     return {
         "rms_m": float(np.sqrt((size**2).mean())),
         "marker_rms_m": per_marker,
-        "where": {"marker": worst, "position_m": robot.marker_points[robot.marker_names.index(worst)].tolist(), "mean_residual_m": mean.tolist()},
+        "where": {
+            "marker": worst,
+            "position_m": robot.marker_points[robot.marker_names.index(worst)].tolist(),
+            "mean_residual_m": mean.tolist(),
+        },
         "worst_frame": {"frame": int(frames[top]), "rms_m": float(frame_rms[top])},
         "goes_with": goes_with,
         "structure": {"lag_one": float(statistic), "p_value": float(p_value)},
@@ -93,7 +99,15 @@ def _per_frame(trials: list[Trial], residuals: list[FloatArray]) -> tuple[FloatA
             numbers.append(recording.frame_numbers[k])
             change = recording.inputs[k] - recording.inputs[k - 1] if k > 0 else np.zeros(recording.inputs.shape[1])
             load = np.linalg.norm(recording.load_forces[recording.load_frame == k].sum(axis=0))
-            rows.append([recording.time_s[k], np.abs(recording.inputs[k]).sum(), float(change.sum() < 0), float(load), float(np.linalg.norm(trial.scene.points[trial.scene.frame == k].mean(axis=0)))])
+            rows.append(
+                [
+                    recording.time_s[k],
+                    np.abs(recording.inputs[k]).sum(),
+                    float(change.sum() < 0),
+                    float(load),
+                    float(np.linalg.norm(trial.scene.points[trial.scene.frame == k].mean(axis=0))),
+                ]
+            )
     table = np.array(rows, dtype=float)
     names = ("time", "actuation", "unloading", "known load", "distance from the camera")
     return np.array(rms), {n: table[:, i] for i, n in enumerate(names)}, np.array(numbers)

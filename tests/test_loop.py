@@ -1,0 +1,107 @@
+"""The loop on data of another mesh and law than the estimator's: what is undeclared is found, and nothing else is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from arm import arm, record, sweeps
+
+from femsense.errors import DataError, InputError
+from femsense.loop import improve
+from femsense.loop.noise import Groups, Noise, estimate_noise, whiten
+from femsense.loop.split import hold_out, sweeps_of
+from femsense.recording import make_recording
+
+
+def found(loop, name):
+    return next(e for e in loop.effects if e["name"] == name)
+
+
+def test_friction_is_named_with_its_coefficient_and_the_held_out_error_falls():
+    inputs, labels = sweeps()
+    recording, _ = record(inputs, effects=[{"name": "cable_friction", "coefficient": 0.25}], labels=labels)
+    loop = improve(arm(), [recording])
+    assert loop.verdict == "effects"
+    effect = found(loop, "cable_friction")
+    assert effect["parameters"]["coefficient"]["value"] == pytest.approx(0.25, rel=0.15)
+    assert loop.after["validation_rms_m"] < 0.5 * loop.before["validation_rms_m"]
+    assert {e["name"] for e in loop.effects} <= {"cable_friction", "stiffness", "cable_offset"}
+
+
+def test_a_wrong_modulus_is_named_stiffness_and_nothing_else():
+    inputs, labels = sweeps()
+    recording, _ = record(inputs, effects=[{"name": "stiffness", "scale": 1.25}], labels=labels)
+    loop = improve(arm(), [recording])
+    assert [e["name"] for e in loop.effects] == ["stiffness"]
+    assert found(loop, "stiffness")["parameters"]["scale"]["value"] == pytest.approx(1.25, rel=0.06)
+    assert loop.robot.body.material.young_modulus[0] == pytest.approx(1.25 * 300e3, rel=0.06)
+
+
+def test_a_model_that_lacks_nothing_is_told_so():
+    inputs, labels = sweeps()
+    recording, _ = record(inputs, labels=labels, truth=arm(), noise=2e-4)
+    loop = improve(arm(), [recording])
+    assert loop.verdict == "none"
+    assert not loop.effects
+    assert loop.noise_m == pytest.approx(2e-4 * np.sqrt(3), rel=0.15)
+    assert loop.detectable["cable_friction"]["smallest"]["coefficient"] < 0.2
+
+
+def test_a_second_round_on_the_improved_robot_finds_nothing():
+    inputs, labels = sweeps()
+    recording, _ = record(inputs, effects=[{"name": "stiffness", "scale": 0.8}], labels=labels, truth=arm(), noise=2e-4)
+    first = improve(arm(), [recording])
+    assert improve(first.robot, [recording]).verdict == "none"
+
+
+def test_names_that_do_not_exist_are_refused():
+    with pytest.raises(InputError, match="cable_friction"):
+        improve(arm(), [record(sweeps()[0][:2])[0]], effects=["cable_frictoin"])
+
+
+def test_data_without_free_markers_say_so():
+    inputs, _ = sweeps()
+    recording, _ = record(inputs[:4], free=False)
+    with pytest.raises(DataError, match="free of undeclared contact"):
+        improve(arm(), [recording])
+
+
+def test_whole_sweeps_are_held_out_and_the_last_is_among_them():
+    inputs, labels = sweeps()
+    recording = make_recording(time_s=np.arange(len(inputs)), cable_names=list("abcd"), inputs=inputs, sweep=labels)
+    fit, held, _ = hold_out(recording, np.arange(len(inputs)))
+    assert not {labels[k] for k in fit} & {labels[k] for k in held}
+    assert labels[-1] in {labels[k] for k in held}
+
+
+def test_without_labels_a_sweep_is_an_excursion_from_rest():
+    inputs = np.array([[0.0], [1.0], [0.0], [2.0], [1.0], [0.0], [1.0]])
+    recording = make_recording(time_s=np.arange(7), cable_names=["a"], inputs=inputs)
+    assert sweeps_of(recording, np.arange(7)).tolist() == [0, 0, 1, 1, 1, 2, 2]
+
+
+def test_the_components_of_the_noise_are_told_apart():
+    rng = np.random.default_rng(3)
+    frames, markers = 40, 12
+    frame, marker = np.repeat(np.arange(frames), markers), np.tile(np.arange(markers), frames)
+    groups = Groups(marker, frame, frame // 8, np.arange(frames * markers))
+    residual = (
+        1e-4 * rng.normal(size=(frames * markers, 3))
+        + 3e-4 * rng.normal(size=(markers, 3))[marker]
+        + 2e-4 * rng.normal(size=(frames, 3))[frame]
+    )
+    none = np.zeros((frames * markers, 3, 0))
+    noise = estimate_noise([residual], [np.ones((frames * markers, 3, 1)) * 1e-6], [none], [groups])
+    assert noise.std["white"] == pytest.approx(1e-4, rel=0.1)
+    assert noise.std["marker"] == pytest.approx(3e-4, rel=0.4)
+    assert noise.std["frame"] == pytest.approx(2e-4, rel=0.3)
+    white = whiten(noise.whitener(groups), residual)
+    assert white.std() == pytest.approx(1.0, rel=0.1)
+
+
+def test_whitening_inverts_the_covariance():
+    groups = Groups(np.array([0, 1, 0, 1]), np.array([0, 0, 1, 1]), np.zeros(4, int), np.array([0, 1, 0, 1]))
+    noise = Noise({"white": 0.5, "frame": 0.3, "state": 0.2}, "")
+    rows = whiten(noise.whitener(groups), np.repeat(np.eye(4)[:, None, :], 3, axis=1))  # (12, 4): one block an axis
+    one_axis = rows.reshape(4, 3, 4)[:, 0]
+    np.testing.assert_allclose(one_axis.T @ one_axis, np.linalg.inv(noise.covariance(groups)), rtol=1e-10)
