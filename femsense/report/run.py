@@ -326,7 +326,7 @@ def _contact_rows(contacts: ContactTable | None) -> Html | None:
             words.with_std(factor * float(contacts.size_n[i]), factor * float(contacts.std_n[i])),
             _vector(factor * contacts.force_n[i]), _vector(1e3 * contacts.place_m[i], 1), contacts.source[i] or words.NOTHING,
         ]
-        for i in range(len(contacts))
+        for i in range(min(len(contacts), ROWS))
     ]  # fmt: skip
     headers = ("Frame", "Time [s]", "Contact", f"Force [{unit}]", f"Components x, y, z [{unit}]", "Place x, y, z [mm]", "Source")
     caption = "Force on the body and its place on the deformed body, robot frame." + _cut(len(contacts), ROWS, "contacts.csv")
