@@ -320,7 +320,7 @@ def test_a_run_shows_forces_contacts_frames_and_known_loads(tmp_path: Path) -> N
         page,
         "32 contacts in 30 frames, 2 of them without a result; largest force 0.697 ± 0.050 N in frame 5.",
         "28 of 30", "in 19 frames", "0.455 mm 2.11 mm without them", "16.0 ms",
-        "12 1.20 0 0.298 0.020, 0, −0.30 90.0, 15.0, 30.0 cloud", "Which with a result 28 0–2, 5–29 none: no equilibrium: stuck 2 3–4", 
+        "12 1.20 0 0.298 0.020, 0, −0.30 90.0, 15.0, 30.0 cloud", "Which with a result 28 0–2, 5–29 none: no equilibrium: stuck 2 3–4",
         "7 0.500 0.480 −4.0", "9 1.00 1.02 +2.0", "The median size of the error is 20 mN (3.0 %).",
         "Computing time of each frame; median 16.0 ms, 15.0 to 17.0 ms.", "Recording pushes", "Frame 5, with the strongest force: contact 0 0.697 ± 0.050 N.",
     )  # fmt: skip
