@@ -87,7 +87,9 @@ def bend_angles(cable: Cable, positions: FloatArray) -> FloatArray:
 
 
 def _angle(u: FloatArray, v: FloatArray) -> FloatArray:
-    return np.asarray(np.arctan2(np.linalg.norm(np.cross(u, v), axis=1), np.einsum("ij,ij->i", u, v)))
+    """Return the angle between unit vectors [rad], shape (s,) (Kahan: accurate for small and for large angles)."""
+    apart, along = u - v, u + v
+    return np.asarray(2.0 * np.arctan2(np.sqrt(np.einsum("ij,ij->i", apart, apart)), np.sqrt(np.einsum("ij,ij->i", along, along))))
 
 
 def rub(cable: Cable, angles: FloatArray, before: FloatArray, motor_tension: float) -> FloatArray:

@@ -22,6 +22,8 @@ from femsense.fem.cables import add_cable_stiffness, bend_angles, cable_forces, 
 from femsense.fem.linear import Factorization, factorize_definite
 
 CONVERGED = "converged"
+FOLLOW_FRICTION = 25
+"""Newton steps at most in which the tensions along the cables follow the bends; then they stand still until Newton rests."""
 ADVICE = {
     CONVERGED: "the unbalanced force is below its tolerance",
     "singular": "nothing holds the body: clamp more nodes (three that are not on a line at least)",
@@ -267,7 +269,10 @@ def _newton(body: BodyModel, loads: _Loads, state: _State, max_iterations: int) 
     stretch = np.array([1.0 / body.cables[i].stretch_stiffness for i in held])
     here = internal(body, state.x, tangent=not state.borrowed)
     last, saved = np.inf, (state.x, state.T)
-    for _ in range(max_iterations):
+    frictional = any(c.friction > 0 for c in body.cables)
+    for iteration in range(max_iterations):
+        if frictional and 0 < iteration < FOLLOW_FRICTION:
+            _update_friction(body, loads, state)
         rows = _rows(body, state)
         H = _kinematic_rows(body, state, rows)[held][:, free] if len(held) else np.zeros((0, len(free)))
         C = rows[held][:, free] if len(held) else H
@@ -279,7 +284,7 @@ def _newton(body: BodyModel, loads: _Loads, state: _State, max_iterations: int) 
             return CONVERGED
         if not np.isfinite(state.residual):
             return "stalled"
-        if state.borrowed and state.residual > 0.2 * last:  # the borrowed factor does not serve: back, and a factor of its own
+        if state.borrowed and state.residual > 0.5 * last:  # the borrowed factor does not serve: back, and a factor of its own
             state.x, state.T = saved
             state.factor, state.borrowed, last = None, False, np.inf
             here = internal(body, state.x)

@@ -79,7 +79,7 @@ def whiten(factor: FloatArray, values: FloatArray) -> FloatArray:
     return np.asarray(flat.reshape(3 * k, *values.shape[2:]))
 
 
-MAX_REML_ROWS = 600
+MAX_REML_ROWS = 400
 """Rows that the estimate of the noise uses at most; more are thinned out by whole frames."""
 
 
@@ -114,7 +114,7 @@ def estimate_noise(
         negative_log_likelihood,
         start,
         method="Nelder-Mead",
-        options={"maxfev": 60 * len(names), "xatol": 0.02, "fatol": 0.02, "initial_simplex": simplex},
+        options={"maxfev": 40 * len(names), "xatol": 0.02, "fatol": 0.02, "initial_simplex": simplex},
     )
     std = {name: float(v) for name, v in zip(names, np.exp(best.x))}
     std = {name: max(v, FLOOR) if name == "white" else v if v > 2e-2 * scale else 0.0 for name, v in std.items()}
