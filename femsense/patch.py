@@ -49,7 +49,8 @@ def make_surface(mesh: TetMesh) -> Surface:
     triangles = surface_triangles(mesh)
     nodes = np.unique(triangles)
     share = np.linalg.norm(triangle_normals(mesh.nodes, triangles), axis=1) / 3.0
-    area = np.bincount(triangles.ravel(), np.repeat(share, 3), minlength=len(mesh.nodes))[nodes]
+    per_node = np.bincount(triangles.ravel(), np.repeat(share, 3), minlength=len(mesh.nodes))
+    area = np.asarray(per_node[nodes], dtype=np.float64)
     corners = mesh.nodes[triangles]
     edge = float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean())
     return Surface(triangles, nodes, area, edge)

@@ -207,7 +207,9 @@ def estimate(
         InputError: no clouds and no places; DataError: not one frame gave a result.
     """
     sensor = make_sensor(robot, recording, calibration, at=at, options=options)
-    reports, contacts, states = [], [], []
+    reports: list[FrameReport] = []
+    contacts: list[ContactForce] = []
+    states: list[FloatArray] = []
     sensed: SensedFrame | None = None
     count = len(recording.time_s)
     for k in range(count):
@@ -647,7 +649,7 @@ def _contacts(
         size = float(np.linalg.norm(force))
         normal = _normal(sensor, patch, state)
         along = force / size if size > 0 else -normal
-        std = float(np.sqrt(max(along @ estimate.covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] @ along, 0.0)))
+        std = float(np.sqrt(max(float(along @ estimate.covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] @ along), 0.0)))
         result.append(ContactForce(number, stamp, i, patch.mean(state.positions), normal, force, size, std, source))
     return tuple(result)
 

@@ -227,6 +227,7 @@ def fit_joint(
         winsorised = jet.residual * (repeats * huber**2)[:, None]  # an outlier counts as the largest residual that is none
         sigma = _spread(winsorised, float(3 * (repeats**2).sum()), len(theta))
         seat_std = max(SEAT_STD_FLOOR, float(np.sqrt((jet.rest**2).mean()))) if len(jet.rest) else seat_std
+    assert jet is not None
     moved, inputs = place(theta)
     fit = _with_bound_inputs(fit, theta, bounds)
     return fit, moved, inputs, jet
@@ -268,7 +269,7 @@ def _huber_weights(residual: FloatArray) -> FloatArray:
     if len(distance) < 8:
         return np.ones(len(distance))
     scale = max(float(np.median(distance)) / 1.538, 1e-12)  # median of a chi distribution with 3 degrees
-    return np.sqrt(np.minimum(1.0, 3.5 * scale / np.maximum(distance, 1e-300)))
+    return np.asarray(np.sqrt(np.minimum(1.0, 3.5 * scale / np.maximum(distance, 1e-300))))
 
 
 def _spread(weighted: FloatArray, rows: float, parameters: int) -> float:

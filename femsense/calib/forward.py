@@ -135,7 +135,7 @@ def marker_residual(robot: Robot, scene: Scene, poses: Sequence[FloatArray], mod
     """Return measured minus modelled markers [m], shape (k, 3), robot frame; model: frame → markers (m, 3)."""
     measured = in_robot_frame(scene.points, scene.view, poses, robot.observation)
     predicted = np.array([model[int(f)][m] for f, m in zip(scene.frame, scene.marker)])
-    return measured - predicted.reshape(-1, 3)
+    return np.asarray(measured - predicted.reshape(-1, 3))
 
 
 def rest_residual(robot: Robot, scene: Scene, poses: Sequence[FloatArray]) -> FloatArray:

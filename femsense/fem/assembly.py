@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 
-from femsense.arrays import FloatArray
+from femsense.arrays import FloatArray, IntArray
 from femsense.fem.body import BodyModel
 from femsense.fem.corotational import corotational_kernel
 from femsense.fem.hyperelastic import hyperelastic_kernel
@@ -47,11 +47,11 @@ def _add_clamp_springs(body: BodyModel, positions: FloatArray, forces: FloatArra
     stretch = positions[nodes] - body.mesh.nodes[nodes]
     forces[nodes] += stiffness * stretch
     if blocks is not None:
-        blocks[np.ix_(diagonal_slots(body)[nodes], [0, 4, 8])] += stiffness
+        blocks[np.ix_(diagonal_slots(body)[nodes], np.array([0, 4, 8]))] += stiffness
     return 0.5 * stiffness * float((stretch**2).sum())
 
 
-def diagonal_slots(body: BodyModel) -> FloatArray:
+def diagonal_slots(body: BodyModel) -> IntArray:
     """Return the slot of the diagonal block of every node, shape (n,)."""
     stencil = body.stencil
     rows = np.repeat(np.arange(len(stencil.block_rows) - 1), np.diff(stencil.block_rows))

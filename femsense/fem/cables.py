@@ -89,7 +89,9 @@ def bend_angles(cable: Cable, positions: FloatArray) -> FloatArray:
 def _angle(u: FloatArray, v: FloatArray) -> FloatArray:
     """Return the angle between unit vectors [rad], shape (s,) (Kahan: accurate for small and for large angles)."""
     apart, along = u - v, u + v
-    return np.asarray(2.0 * np.arctan2(np.sqrt(np.einsum("ij,ij->i", apart, apart)), np.sqrt(np.einsum("ij,ij->i", along, along))))
+    return np.asarray(
+        2.0 * np.arctan2(np.sqrt(np.einsum("ij,ij->i", apart, apart)), np.sqrt(np.einsum("ij,ij->i", along, along)))
+    )
 
 
 def rub(cable: Cable, angles: FloatArray, before: FloatArray, motor_tension: float) -> FloatArray:

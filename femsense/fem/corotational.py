@@ -1,3 +1,4 @@
+# mypy: allow-untyped-decorators
 """The corotational element: linear elasticity in the frame that the polar decomposition F = V R turns along.
 
 Energy density  w = μ ‖F − R‖² + λ/2 (tr(Rᵀ F) − 3)², R the closest rotation to F. With h_a = R ∇N_a, V = F Rᵀ and
@@ -21,7 +22,7 @@ from femsense.arrays import FloatArray, IntArray
 @njit(cache=True)
 def determinant(A: FloatArray) -> float:
     """Return det A of a 3 × 3 matrix."""
-    return (
+    return float(
         A[0, 0] * (A[1, 1] * A[2, 2] - A[1, 2] * A[2, 1])
         - A[0, 1] * (A[1, 0] * A[2, 2] - A[1, 2] * A[2, 0])
         + A[0, 2] * (A[1, 0] * A[2, 1] - A[1, 1] * A[2, 0])

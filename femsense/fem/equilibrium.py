@@ -17,8 +17,8 @@ import numpy.typing as npt
 from femsense.arrays import BoolArray, FloatArray, as_points, freeze
 from femsense.errors import InputError
 from femsense.fem.assembly import Internal, internal, reduced_values
-from femsense.fem.body import BodyModel
-from femsense.fem.cables import add_cable_stiffness, bend_angles, cable_forces, cable_length, rub, shortening
+from femsense.fem.body import BodyModel, Cable
+from femsense.fem.cables import add_cable_stiffness, bend_angles, cable_forces, cable_length, rub, segments, shortening
 from femsense.fem.linear import Factorization, factorize_definite
 
 CONVERGED = "converged"
@@ -339,7 +339,7 @@ def _bordered_step(
     columns = factor.solve(np.column_stack([force, C.T]))
     free, compliance = columns[:, 0], columns[:, 1:]
     dT = np.linalg.lstsq(H @ compliance + np.diag(stretch), gap - H @ free, rcond=None)[0]
-    return free + compliance @ dT, dT
+    return free + compliance @ dT, np.asarray(dT, dtype=np.float64)
 
 
 def _full_step(body: BodyModel, state: _State, held: npt.NDArray[np.intp], du: FloatArray, dT: FloatArray) -> Internal:
@@ -359,9 +359,8 @@ def _line_search(
     """
     free = body.free_map.dofs
     x0, T0 = state.x, state.T
-    step = np.zeros(x0.size)
-    step[free] = du
-    step = step.reshape(-1, 3)
+    step = np.zeros(x0.shape)
+    step.reshape(-1)[free] = du
     penalty = 2.0 * np.abs(T0[held] + dT) + 1e-3 if len(held) else np.zeros(0)
     lost = np.zeros(len(T0))  # a held cable with friction is no pure constraint: what its bends take away is a given force
     lost[held] = [T if body.cables[i].friction > 0 else 0.0 for i, T in zip(held, T0[held] + dT)]
@@ -407,10 +406,8 @@ def _merit(
     return value
 
 
-def _weighted_length(cable: object, x: FloatArray, share: FloatArray) -> float:
-    from femsense.fem.cables import segments
-
-    return float(share @ segments(cable, x)[1])  # type: ignore[arg-type]
+def _weighted_length(cable: Cable, x: FloatArray, share: FloatArray) -> float:
+    return float(share @ segments(cable, x)[1])
 
 
 def _slope(

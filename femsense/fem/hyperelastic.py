@@ -1,3 +1,4 @@
+# mypy: allow-untyped-decorators
 """Hyperelastic laws with the interface of the corotational element: neo-Hookean and Gent.
 
     neo-Hookean  W = μ/2 (I₁ − 3) − μ ln J + λ/2 (ln J)²

@@ -43,7 +43,7 @@ class TetMesh:
 
     @property
     def is_quadratic(self) -> bool:
-        return self.tets.shape[1] == 10
+        return bool(self.tets.shape[1] == 10)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -64,7 +64,7 @@ class Embedding:
 
     def positions(self, node_positions: FloatArray) -> FloatArray:
         """Return the positions of the points [m], shape (p, 3), for node positions [m], shape (n, 3)."""
-        return np.einsum("pk,pkc->pc", self.weights, node_positions[self.nodes])
+        return np.asarray(np.einsum("pk,pkc->pc", self.weights, node_positions[self.nodes]))
 
     def matrix(self, node_count: int) -> sp.csr_matrix:
         """Return the interpolation as a sparse matrix, shape (p, n)."""
@@ -132,8 +132,6 @@ def oriented(mesh: TetMesh) -> TetMesh:
     tets = mesh.tets.copy()
     swap = [0, 2, 1, 3] if tets.shape[1] == 4 else [0, 2, 1, 3, 6, 5, 4, 7, 9, 8]
     # swapping corners 1 and 2 turns the edges 01 12 02 03 13 23 into 02 12 01 03 23 13
-    if tets.shape[1] == 10:
-        swap = [0, 2, 1, 3, 6, 5, 4, 7, 9, 8]
     tets[flip] = tets[flip][:, swap]
     return TetMesh(mesh.nodes, tets)
 
@@ -181,7 +179,7 @@ def surface_triangles(mesh: TetMesh) -> IntArray:
     outer = np.sort(first[count == 1])
     corners = faces[outer]
     if not mesh.is_quadratic:
-        return corners
+        return np.asarray(corners)
     ab, bc, ca = mesh.tets[:, 4:][:, FACE_EDGES].reshape(-1, 3)[outer].T
     a, b, c = corners.T
     return np.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], axis=1).reshape(-1, 3)
@@ -200,7 +198,7 @@ def vertex_normals(positions: FloatArray, triangles: IntArray) -> FloatArray:
     for i in range(3):
         np.add.at(normals, triangles[:, i], area)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
-    return np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
+    return np.asarray(np.divide(normals, length, out=np.zeros_like(normals), where=length > 0))
 
 
 def barycentric(mesh: TetMesh, elements: IntArray, points: FloatArray) -> FloatArray:
@@ -299,6 +297,7 @@ def embed_points(mesh: TetMesh, points: FloatArray, *, outside_rule: str = "near
     centres = corners.mean(axis=1)
     reach = np.linalg.norm(corners - centres[:, None], axis=2).max()
     near = cKDTree(centres).query(points, k=1)
+    centre_distance = np.asarray(near[0], dtype=np.float64).reshape(len(points))
     element = np.asarray(near[1], dtype=np.int64).reshape(len(points))
     outside = np.zeros(len(points))
     tree = cKDTree(centres)
@@ -311,7 +310,7 @@ def embed_points(mesh: TetMesh, points: FloatArray, *, outside_rule: str = "near
                 element[i] = candidates[holder.argmax()]
                 continue
         element[i], outside[i] = _carrier_of_outsider(
-            mesh, corners, centres, tree, point, near[0][i], reach, outside_rule, element[i]
+            mesh, corners, centres, tree, point, centre_distance[i], reach, outside_rule, element[i]
         )
     at = closest_in_tet(corners[element], points)
     slopes = shape_slopes(at, quadratic=mesh.is_quadratic)

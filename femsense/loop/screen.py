@@ -168,4 +168,4 @@ def confounding(a: Candidate, b: Candidate) -> float:
     if not A.size or not B.size:
         return 0.0
     direction = a.columns @ a.step if np.linalg.norm(a.columns @ a.step) > 0 else a.columns[:, 0]
-    return float(np.linalg.norm(B.T @ direction) / max(np.linalg.norm(direction), 1e-300))
+    return float(np.linalg.norm(B.T @ direction) / max(float(np.linalg.norm(direction)), 1e-300))

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from femsense.arrays import FloatArray
+from femsense.arrays import FloatArray, IntArray
 from femsense.loop.joint import Trial
 from femsense.model import Robot
 
@@ -27,7 +27,7 @@ def structure_test(trials: list[Trial], residuals: list[FloatArray], *, rng: np.
     return observed, float((1 + (shuffled >= observed - 1e-12).sum()) / (1 + PERMUTATIONS))
 
 
-def _field(trial: Trial, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _field(trial: Trial, residual: FloatArray) -> tuple[FloatArray, IntArray]:
     """Return residuals as (distinct states, markers, 3) with means removed, and the sweep of each state."""
     frames = np.unique(trial.scene.frame)
     count = int(trial.groups.marker.max()) + 1
@@ -46,7 +46,7 @@ def _field(trial: Trial, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
     return merged, sweep[first]
 
 
-def _lag_one(fields: list[tuple[FloatArray, FloatArray]], rng: np.random.Generator | None) -> float:
+def _lag_one(fields: list[tuple[FloatArray, IntArray]], rng: np.random.Generator | None) -> float:
     above, below = 0.0, 0.0
     for values, sweep in fields:
         order = np.arange(len(values))
@@ -90,7 +90,7 @@ def describe_left(
     }
 
 
-def _per_frame(trials: list[Trial], residuals: list[FloatArray]) -> tuple[FloatArray, dict[str, FloatArray], FloatArray]:
+def _per_frame(trials: list[Trial], residuals: list[FloatArray]) -> tuple[FloatArray, dict[str, FloatArray], IntArray]:
     rms, rows, numbers = [], [], []
     for trial, residual in zip(trials, residuals):
         recording = trial.scene.recording
@@ -117,7 +117,7 @@ def _rank(values: FloatArray, covariates: dict[str, FloatArray]) -> list[dict[st
     """Return the covariates by the strength of their rank correlation with the residual of a frame."""
     from scipy.stats import spearmanr
 
-    result = []
+    result: list[dict[str, Any]] = []
     for name, covariate in covariates.items():
         if len(values) >= 5 and np.ptp(covariate) > 0 and np.ptp(values) > 0:
             answer = spearmanr(values, covariate)
