@@ -51,8 +51,9 @@ def run_demo(folder: str | Path, *, say: Callable[[str], None], progress: Callab
     document = demo_document(out, before, loop, after, truth, true_effects(recording))
     export_glb(after, out / "robot.glb")
     draw_demo(before, after, truth, document, out / "picture.png")
-    document["report"] = _report(out / "loop", say)
+    document["report"] = str(out / "report.html")
     write_json(out / "demo.json", document)
+    document["report"] = _report(out, say)
     return document
 
 

@@ -56,7 +56,15 @@ def make_surface(mesh: TetMesh) -> Surface:
     return Surface(triangles, nodes, area, edge)
 
 
-def patch_at(surface: Surface, positions: FloatArray, place: FloatArray, radius: float, clamped: IntArray) -> Patch:
+def patch_at(
+    surface: Surface,
+    positions: FloatArray,
+    place: FloatArray,
+    radius: float,
+    clamped: IntArray,
+    *,
+    facing: FloatArray | None = None,
+) -> Patch:
     """Return the patch around the point of the surface that is closest to a place.
 
     The weights fall off as a cone of the given radius, times the area of each node; clamped nodes carry nothing.
@@ -67,8 +75,9 @@ def patch_at(surface: Surface, positions: FloatArray, place: FloatArray, radius:
         place: [m], shape (3,).
         radius: [m].
         clamped: nodes that cannot move.
+        facing: the outward normal that was seen there, shape (3,): faces that look elsewhere do not count.
     """
-    centre = closest_surface_point(surface, positions, place)
+    centre = closest_surface_point(surface, positions, place, facing=facing)
     distance = np.linalg.norm(positions[surface.nodes] - centre, axis=1)
     reach = max(radius, 1.01 * float(np.sort(distance)[min(3, len(distance) - 1)]))
     weight = surface.area * np.maximum(1.0 - distance / reach, 0.0)
@@ -81,9 +90,16 @@ def patch_at(surface: Surface, positions: FloatArray, place: FloatArray, radius:
     return Patch(surface.nodes[keep], weight[keep] / weight.sum())
 
 
-def closest_surface_point(surface: Surface, positions: FloatArray, place: FloatArray) -> FloatArray:
-    """Return the point of the surface that is closest to a place [m], shape (3,)."""
-    corners = positions[surface.triangles]
+def closest_surface_point(
+    surface: Surface, positions: FloatArray, place: FloatArray, *, facing: FloatArray | None = None
+) -> FloatArray:
+    """Return the point of the surface that is closest to a place [m], shape (3,); only faces within 70° of `facing`, if given."""
+    triangles = surface.triangles
+    if facing is not None:
+        normals = triangle_normals(positions, triangles)
+        looks = normals @ facing > 0.35 * np.linalg.norm(normals, axis=1) * np.linalg.norm(facing)
+        triangles = triangles[looks] if looks.any() else triangles
+    corners = positions[triangles]
     weights = closest_in_triangle(corners, np.broadcast_to(place, (len(corners), 3)))
     points = np.einsum("ti,tic->tc", weights, corners)
     return np.asarray(points[np.argmin(np.linalg.norm(points - place, axis=1))])

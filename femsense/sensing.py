@@ -24,12 +24,13 @@ from femsense.fem.compliance import Tangent, tangent_at
 from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.mesh import vertex_normals
 from femsense.march import Walk, drive_of, has_history, solve_frame
-from femsense.model import Robot
+from femsense.model import Robot, spread_features
 from femsense.patch import Patch, Surface, make_surface, patch_at
 from femsense.pointcloud.cloud import PointCloud
 from femsense.pointcloud.contact import detect_contacts
 from femsense.pointcloud.filters import pass_through, remove_radius_outliers, voxel_grid
 from femsense.pointcloud.matching import Matches, match_along_normals
+from femsense.pointcloud.normals import estimate_normals
 from femsense.pointcloud.segmentation import segment_by_model, segment_robot
 from femsense.qp.forces import ForceEstimate, estimate_forces
 from femsense.qp.problem import FrictionCone
@@ -52,15 +53,19 @@ class SensingOptions:
     """Robot points that make a contact."""
     friction: float | None = None
     """Coulomb coefficient of a contact: forces within its cone. None: along the inward normal only."""
+    match_points: int = 200
+    """Points of the surface that are matched, the robot's features first among them."""
     modulus_std: float = 0.03
     """What is not known of the modulus, relative; it enters the standard deviation of every force."""
     model_std: float = 0.015
     """What is not known of the modelled motion of a point, relative to its way from rest (mesh, law, boundary)."""
+    correlation_m: float | None = None
+    """Length over which errors of model and depth go together [m]; None: 12 % of the diagonal. Matches within it count once."""
     cloud_std_m: float = 1e-4
     """What averaging cannot remove from a cloud [m]."""
     marker_std_m: float | None = None
     """Noise of a marker along each axis [m]; None: from the residual of the calibration."""
-    iterations: int = 15
+    iterations: int = 10
     """Linearisations a frame at most."""
 
 
@@ -146,6 +151,18 @@ class SensedFrame:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
+class Seen:
+    """What the cameras see in one frame, robot frame."""
+
+    robot: FloatArray
+    """Points of the robot [m], shape (r, 3)."""
+    normals: FloatArray | None
+    """Their normals towards the camera, shape (r, 3); None with several cameras."""
+    others: FloatArray
+    """Points of everything else [m], shape (o, 3)."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
 class Rows:
     """Linearised measurements: `functional` maps node displacements to them."""
 
@@ -161,6 +178,8 @@ class Rows:
     """Features or markers."""
     rms: float
     """[m]."""
+    crowding: float = 1.0
+    """By how much errors that neighbours share widen standard deviations [1]."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -175,6 +194,8 @@ class Sensor:
     options: SensingOptions
     places: FloatArray
     """Given places of contact at rest [m], shape (g, 3)."""
+    probes: npt.NDArray[np.int64]
+    """Surface nodes that are matched with clouds, shape (e,)."""
     pose_root: FloatArray
     """Square root of the pose covariance (rotation about the pivot, shift), shape (6, ≤ 6)."""
     size: float = field(default=0.0)
@@ -268,6 +289,7 @@ def make_sensor(
         surface,
         options or SensingOptions(),
         places,
+        spread_features(robot.body, max(len(robot.features), (options or SensingOptions()).match_points)),
         _root(calibration.pose_covariance),
         size,
     )
@@ -286,11 +308,17 @@ def sense_frame(sensor: Sensor, k: int, previous: SensedFrame | None) -> SensedF
     clouds = _robot_and_surroundings(sensor, k, expected) if _has_clouds(sensor.recording) else None
     patches, source = _find_contacts(sensor, k, clouds, expected)
     rows = _measure(sensor, k, clouds, free_state)
+    rows = rows if clouds is None else _measure(sensor, k, clouds, free_state, _reach(sensor, rows))
     state, forces, at_end = free_state, np.zeros(0), rows
     contacts: tuple[ContactForce, ...] = ()
     if patches:
-        start = previous if previous is not None and source == "given" else None
+        start = previous if previous is not None and (source == "given" or _same_places(previous, patches, expected)) else None
         state, estimate, at_end = _fit_forces(sensor, k, clouds, patches, source, free_state, start, before)
+        if source == "cloud":  # where it touches is clearer once the model has come near
+            again, _ = _find_contacts(sensor, k, clouds, state)
+            if len(again) == len(patches) and _wandered(patches, again, state) > 0.5 * sensor.surface.edge:
+                patches = again
+                state, estimate, at_end = _fit_forces(sensor, k, clouds, patches, source, free_state, None, before)
         forces = estimate.forces
         contacts = _contacts(sensor, k, patches, estimate, state, source)
     number, stamp = int(sensor.recording.frame_numbers[k]), float(sensor.recording.time_s[k])
@@ -308,12 +336,23 @@ def sense_frame(sensor: Sensor, k: int, previous: SensedFrame | None) -> SensedF
     return SensedFrame(state, free_state, forces, report, contacts)
 
 
+def _wandered(patches: Sequence[Patch], again: Sequence[Patch], state: Equilibrium) -> float:
+    """Return how far the farthest patch has moved [m]."""
+    return max(float(np.linalg.norm(a.mean(state.positions) - b.mean(state.positions))) for a, b in zip(patches, again))
+
+
+def _same_places(previous: SensedFrame, patches: Sequence[Patch], state: Equilibrium) -> bool:
+    """Return whether the contacts are those of the frame before, so that its forces are a start."""
+    if len(previous.contacts) != len(patches):
+        return False
+    moved = [np.linalg.norm(p.mean(state.positions) - c.position_m) for p, c in zip(patches, previous.contacts)]
+    return bool(max(moved) < 0.05 * np.linalg.norm(np.ptp(state.positions, axis=0)))
+
+
 # --- places ------------------------------------------------------------------------------------------------------------
 
 
-def _find_contacts(
-    sensor: Sensor, k: int, clouds: tuple[FloatArray, FloatArray] | None, state: Equilibrium
-) -> tuple[list[Patch], str]:
+def _find_contacts(sensor: Sensor, k: int, clouds: Seen | None, state: Equilibrium) -> tuple[list[Patch], str]:
     """Return where forces may act: the given places, else where surroundings touch the robot (Algorithm 2)."""
     mesh, clamped, radius = sensor.robot.body.mesh, sensor.robot.body.clamped, 1.5 * sensor.surface.edge
     if len(sensor.places):
@@ -323,15 +362,25 @@ def _find_contacts(
         return [], "cloud"
     voxel = _voxel(sensor)
     reach = sensor.options.contact_radius_m or 3.0 * voxel
-    found = detect_contacts(clouds[1], clouds[0], search_radius_m=reach, min_neighbors=sensor.options.contact_neighbors,
+    found = detect_contacts(clouds.others, clouds.robot, search_radius_m=reach, min_neighbors=sensor.options.contact_neighbors,
                             cluster_distance_m=4.0 * voxel, min_points=3)  # fmt: skip
     near_clamp = _clamp_mask(sensor, found.positions, reach)
     patches = [
-        patch_at(sensor.surface, state.positions, p, max(radius, r), clamped)
+        patch_at(sensor.surface, state.positions, p, max(radius, r), clamped, facing=_seen_normal(clouds, p, 2.0 * reach))
         for p, r, skip in zip(found.positions, found.radius, near_clamp)
         if not skip
     ]
     return patches, "cloud"
+
+
+def _seen_normal(clouds: Seen, place: FloatArray, radius: float) -> FloatArray | None:
+    """Return the mean outward normal of the robot as it is seen around a place, shape (3,); None where it is not known."""
+    if clouds.normals is None:
+        return None
+    near = np.linalg.norm(clouds.robot - place, axis=1) < radius
+    mean = clouds.normals[near].sum(axis=0)
+    length = float(np.linalg.norm(mean))
+    return mean / length if length > 0.3 * max(int(near.sum()), 1) else None
 
 
 def _clamp_mask(sensor: Sensor, places: FloatArray, reach: float) -> npt.NDArray[np.bool_]:
@@ -375,7 +424,7 @@ def _voxel(sensor: Sensor) -> float:
     return sensor.options.voxel_m or 0.01 * sensor.size
 
 
-def _robot_and_surroundings(sensor: Sensor, k: int, state: Equilibrium) -> tuple[FloatArray, FloatArray] | None:
+def _robot_and_surroundings(sensor: Sensor, k: int, state: Equilibrium) -> Seen | None:
     """Return robot points and surrounding points of all cameras [m], robot frame; None where the frame has no cloud."""
     parts: list[PointCloud] = []
     for view in range(len(sensor.recording.camera_names)):
@@ -401,7 +450,10 @@ def _robot_and_surroundings(sensor: Sensor, k: int, state: Equilibrium) -> tuple
         raise DataError(
             f"only {len(robot.points)} points of the robot in view: check the pose, appearance.color_rgb, and what the camera sees"
         )
-    return robot.points, others.points
+    normals = None
+    if len(sensor.calibration.poses) == 1:
+        normals = estimate_normals(robot.points, 2.5 * voxel, camera_position=sensor.calibration.poses[0][:3, 3])[0]
+    return Seen(robot.points, normals, others.points)
 
 
 def _segment(sensor: Sensor, cloud: PointCloud, state: Equilibrium) -> tuple[PointCloud, PointCloud]:
@@ -419,21 +471,28 @@ def _segment(sensor: Sensor, cloud: PointCloud, state: Equilibrium) -> tuple[Poi
 # --- measurements --------------------------------------------------------------------------------------------------------
 
 
-def _measure(sensor: Sensor, k: int, clouds: tuple[FloatArray, FloatArray] | None, state: Equilibrium) -> Rows:
+def _measure(sensor: Sensor, k: int, clouds: Seen | None, state: Equilibrium, reach: float = np.inf) -> Rows:
     if clouds is not None:
-        return _cloud_rows(sensor, clouds[0], state)
+        return _cloud_rows(sensor, clouds, state, reach)
     return _marker_rows(sensor, k, state)
 
 
-def _cloud_rows(sensor: Sensor, points: FloatArray, state: Equilibrium) -> Rows:
-    """Feature points matched along their normals (Algorithm 3)."""
-    options, features = sensor.options, sensor.robot.features
+def _cloud_rows(sensor: Sensor, seen_now: Seen, state: Equilibrium, reach: float) -> Rows:
+    """Feature points matched along their normals (Algorithm 3), no farther than `reach` [m]."""
+    options, features = sensor.options, sensor.probes
     normals = vertex_normals(state.positions, sensor.surface.triangles)[features]
     cameras = np.array([T[:3, 3] for T in sensor.calibration.poses])
     matches: Matches = match_along_normals(
-        state.positions[features], normals, points, d_m=options.match_line_m or 3.0 * _voxel(sensor), d_l=options.match_reach_m or 0.12 * sensor.size,
-        average=True, camera_position=cameras, std_floor_m=options.cloud_std_m,
-    )  # fmt: skip
+        state.positions[features],
+        normals,
+        seen_now.robot,
+        d_m=options.match_line_m or 3.0 * _voxel(sensor),
+        d_l=min(options.match_reach_m or 0.2 * sensor.size, reach),
+        average=True,
+        camera_position=cameras,
+        robot_normals=seen_now.normals,
+        std_floor_m=options.cloud_std_m,
+    )
     use = matches.found & np.isfinite(matches.std)
     if use.sum() < 3:
         raise DataError(
@@ -452,7 +511,14 @@ def _cloud_rows(sensor: Sensor, points: FloatArray, state: Equilibrium) -> Rows:
         by_pose,
         int(use.sum()),
         float(np.sqrt((distance**2).mean())),
+        _crowding(seen, options.correlation_m or 0.12 * sensor.size),
     )
+
+
+def _crowding(points: FloatArray, length: float) -> float:
+    """Return the factor by which neighbours' common errors widen standard deviations: √(points / cells of that length they fill)."""
+    cells = len(np.unique(np.floor(points / length).astype(np.int64), axis=0))
+    return float(np.sqrt(len(points) / cells))
 
 
 def _marker_rows(sensor: Sensor, k: int, state: Equilibrium) -> Rows:
@@ -510,7 +576,7 @@ def _root(covariance: FloatArray) -> FloatArray:
 
 
 def _fit_forces(
-    sensor: Sensor, k: int, clouds: tuple[FloatArray, FloatArray] | None, patches: Sequence[Patch], source: str, free_state: Equilibrium,
+    sensor: Sensor, k: int, clouds: Seen | None, patches: Sequence[Patch], source: str, free_state: Equilibrium,
     previous: SensedFrame | None, before: tuple[FloatArray, ...] | None,
 ) -> tuple[Equilibrium, ForceEstimate, Rows]:  # fmt: skip
     """Equilibrium → compliance → QP, until the forces stop changing."""
@@ -523,20 +589,25 @@ def _fit_forces(
     rows = _measure(sensor, k, clouds, state)
     estimate: ForceEstimate | None = None
     size = np.inf
-    for _ in range(sensor.options.iterations):
+    for iteration in range(sensor.options.iterations):
+        rows = rows if clouds is None or iteration == 0 else _measure(sensor, k, clouds, state, _reach(sensor, rows))
+        rows = rows if iteration == 0 else _robust(rows)
         directions = _directions(sensor, patches, state, source)
         tangent = tangent_at(sensor.robot.body, state)
         W = rows.functional(tangent.respond(basis)) @ directions
         nuisance = _nuisance(sensor, rows, state, tangent)
         estimate, size = _solve_qp(sensor, rows, W, nuisance, directions, forces, state, patches, source, size)
         step = directions @ estimate.forces - forces
-        if float(np.abs(step).max()) < 2e-3 * max(float(np.abs(forces + step).max()), 1e-3):
+        still = np.maximum(
+            2e-3 * max(float(np.abs(forces + step).max()), 1e-3), 0.05 * np.linalg.norm(directions * estimate.std, axis=1)
+        )
+        if (np.abs(step) < still).all():
             break
         cost = _cost(rows, nuisance, forces, size)
         for share in (1.0, 0.5, 0.25, 0.125, 0.06):  # large deflections: a full step may lead too far
             try:
                 there = _solve(sensor, k, np.tensordot(forces + share * step, basis, axes=1), state, before)
-                seen = _measure(sensor, k, clouds, there)
+                seen = _measure(sensor, k, clouds, there, np.inf if iteration == 0 else _reach(sensor, rows))
             except DataError:
                 continue
             if _cost(seen, nuisance, forces + share * step, size) < cost or share < 0.1:
@@ -545,8 +616,20 @@ def _fit_forces(
             raise DataError("no equilibrium near the forces that the data ask for")
         forces, state, rows = forces + share * step, there, seen
     assert estimate is not None
-    covariance = directions @ estimate.covariance @ directions.T
+    covariance = rows.crowding**2 * (directions @ estimate.covariance @ directions.T)
     return state, replace(estimate, forces=freeze(forces), covariance=freeze(covariance)), rows
+
+
+def _reach(sensor: Sensor, rows: Rows) -> float:
+    """Return how far along the normal a match may still lie [m]: what lies farther than the rest belongs to something else."""
+    return max(6.0 * float(np.median(np.abs(rows.residual))), 1.5 * _voxel(sensor))
+
+
+def _robust(rows: Rows) -> Rows:
+    """Return the rows with larger standard deviations where residuals stand out (Huber, 2.5 times the median scale)."""
+    size = np.abs(rows.residual / rows.std)
+    scale = max(1.483 * float(np.median(size)), 1.0)
+    return replace(rows, std=rows.std * np.sqrt(np.maximum(size / (2.5 * scale), 1.0)))
 
 
 def _directions(sensor: Sensor, patches: Sequence[Patch], state: Equilibrium, source: str) -> FloatArray:

@@ -20,7 +20,7 @@ from femsense.recording import Recording, make_recording
 LENGTH, WIDTH = 0.1, 0.02
 NAMES = ("up", "down", "left", "right")
 SIDES = np.array([[0, 0, 1], [0, 0, -1], [0, 1, 0], [0, -1, 0]], dtype=float)
-T_ROBOT_CAMERA = make_pose(rotation_from_vector([0.3, -2.0, 0.4]), [0.1, 0.4, 0.2])
+T_ROBOT_CAMERA = make_pose(rotation_from_vector([2.4, 0.0, 0.0]), [0.05, 0.25, 0.28])
 
 
 def arm(
@@ -68,10 +68,10 @@ def arm(
     )
 
 
-def sweeps(height: float = 2.0, *, each: int = 3) -> tuple[np.ndarray, list[str]]:
+def sweeps(height: float = 2.0, *, each: int = 2) -> tuple[np.ndarray, list[str]]:
     """Return inputs (F, 4) that pull one cable, then pairs, up and down, and the label of the sweep of each frame."""
     rows, labels = [], []
-    for label, cables in (("up", [0]), ("left", [2]), ("down", [1]), ("right", [3]), ("up-left", [0, 2]), ("down-right", [1, 3])):
+    for label, cables in (("up", [0]), ("left", [2]), ("down", [1]), ("right", [3]), ("up-left", [0, 2])):
         levels = [*np.linspace(0, height, each + 1), *np.linspace(height, 0, each + 1)[1:]]
         for level in levels:
             row = np.zeros(4)

@@ -712,10 +712,7 @@ def _short(parameters: dict[str, Any]) -> str:
             return "[" + ", ".join(show(v) for v in value) + "]"
         return ", ".join(f"{k} {show(v)}" for k, v in value.items()) if isinstance(value, dict) else str(value)
 
-    return ", ".join(
-        f"{k} {show(p['value'])} {p['unit']}".replace(" 1", "") if p["unit"] == "1" else f"{k} {show(p['value'])} {p['unit']}"
-        for k, p in parameters.items()
-    )
+    return ", ".join(f"{k} {show(p['value'])}" + ("" if p["unit"] == "1" else f" {p['unit']}") for k, p in parameters.items())
 
 
 def _card(data: Data, before: Stage, final: Stage, noise: Noise, n_effective: float) -> dict[str, Any]:

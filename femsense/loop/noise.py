@@ -191,6 +191,6 @@ def _richest(nuisance: list[FloatArray], extra: list[FloatArray], distinct: int)
 
 def _stacked(columns: list[FloatArray]) -> FloatArray:
     """Return columns of all recordings below each other with unit length, shape (3 Σk, p)."""
-    flat = np.vstack([c.reshape(-1, c.shape[2]) for c in columns])
+    flat = np.vstack([c.reshape(3 * len(c), c.shape[2]) for c in columns])
     norm = np.linalg.norm(flat, axis=0)
     return np.asarray(flat[:, norm > 0] / norm[norm > 0])
