@@ -262,6 +262,15 @@ def with_marker_table(
     )
 
 
+def state_key(recording: Recording, frame: int) -> bytes:
+    """Return what tells apart frames under different inputs, loads or gravity."""
+    rows = recording.load_frame == frame
+    parts = [recording.inputs[frame], recording.load_points[rows].ravel(), recording.load_forces[rows].ravel()]
+    if recording.gravity is not None:
+        parts.append(recording.gravity[frame])
+    return np.concatenate([np.asarray(p, dtype=float).ravel() for p in parts]).tobytes()
+
+
 def marker_grid(recording: Recording, *, view: int = 0) -> FloatArray:
     """Return the markers as one camera saw them [m], camera frame, shape (F, markers, 3); NaN where hidden."""
     grid = np.full((recording.frame_count, len(recording.marker_names), 3), np.nan)

@@ -63,8 +63,8 @@ def drive_of(robot: Robot, recording: Recording, *, initial: FloatArray | None =
         inputs = _creep(inputs, recording.time_s, robot.creep)
     else:
         inputs = act.gain * recorded + act.displacement_offset - act.slack
-    forces = _creep_loads(recording, robot.creep)
-    return Drive(recording.actuation, freeze(inputs), recording.gravity, recording.load_frame, recording.load_points, forces)
+    frame, points, forces = _creep_loads(recording, robot.creep)
+    return Drive(recording.actuation, freeze(inputs), recording.gravity, frame, points, forces)
 
 
 def _creep(values: FloatArray, time_s: FloatArray, terms: tuple[tuple[float, float], ...]) -> FloatArray:
@@ -82,21 +82,16 @@ def _creep(values: FloatArray, time_s: FloatArray, terms: tuple[tuple[float, flo
     return result
 
 
-def _creep_loads(recording: Recording, terms: tuple[tuple[float, float], ...]) -> FloatArray:
+def _creep_loads(recording: Recording, terms: tuple[tuple[float, float], ...]) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Return frame, place and force of the known loads with creep; a load that is taken off goes on acting while it creeps back."""
     if not terms or not len(recording.load_frame):
-        return recording.load_forces
+        return recording.load_frame, recording.load_points, recording.load_forces
     places, number = np.unique(recording.load_points, axis=0, return_inverse=True)
-    table = np.zeros((len(recording.time_s), 3 * len(places)))
-    for load, place, frame in zip(recording.load_forces, number.ravel(), recording.load_frame):
-        table[frame, 3 * place : 3 * place + 3] += load
-    crept = _creep(table, recording.time_s, terms)
-    first: set[tuple[int, int]] = set()
-    forces = np.zeros_like(recording.load_forces)
-    for i, (place, frame) in enumerate(zip(number.ravel(), recording.load_frame)):
-        if (int(place), int(frame)) not in first:  # loads at one place and frame were added up
-            forces[i] = crept[frame, 3 * place : 3 * place + 3]
-            first.add((int(place), int(frame)))
-    return forces
+    table = np.zeros((len(recording.time_s), len(places), 3))
+    np.add.at(table, (recording.load_frame, number.ravel()), recording.load_forces)
+    crept = _creep(table.reshape(len(table), -1), recording.time_s, terms).reshape(table.shape)
+    frame, place = np.nonzero(np.abs(crept).max(axis=2) > 0)
+    return frame, places[place], crept[frame, place]
 
 
 @dataclass(frozen=True, eq=False, slots=True)

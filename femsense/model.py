@@ -78,13 +78,13 @@ def plain_actuation(cable_count: int) -> Actuation:
     return Actuation(freeze(one), freeze(zero), freeze(zero), freeze(zero), freeze(one * np.inf))
 
 
-def spread_features(body: BodyModel, count: int) -> IntArray:
+def spread_features(body: BodyModel, count: int, *, among: IntArray | None = None) -> IntArray:
     """Return surface nodes spread evenly over the free surface (farthest-point sampling), shape (≤ count,).
 
-    Nodes of the clamp do not count; the first is the free surface node that is farthest from the clamp, so that the
+    Only nodes `among` the given ones are taken, if given. Nodes of the clamp do not count; the first is the free surface node that is farthest from the clamp, so that the
     result is the same whatever the numbering.
     """
-    surface = np.unique(surface_triangles(body.mesh))
+    surface = np.unique(surface_triangles(body.mesh)) if among is None else among
     free = np.setdiff1d(surface, body.clamped)
     if not len(free) or count <= 0:
         return np.zeros(0, dtype=np.int64)

@@ -56,6 +56,17 @@ def make_surface(mesh: TetMesh) -> Surface:
     return Surface(triangles, nodes, area, edge)
 
 
+def flat_nodes(surface: Surface, positions: FloatArray) -> IntArray:
+    """Return surface nodes around which the surface is nearly flat, shape (k,): along a sharp edge a normal means little."""
+    area = triangle_normals(positions, surface.triangles)
+    total, together = np.zeros(len(positions)), np.zeros_like(positions)
+    for corner in range(3):
+        np.add.at(total, surface.triangles[:, corner], np.linalg.norm(area, axis=1))
+        np.add.at(together, surface.triangles[:, corner], area)
+    flatness = np.linalg.norm(together, axis=1)[surface.nodes] / total[surface.nodes]
+    return surface.nodes[flatness > 0.93]
+
+
 def patch_at(
     surface: Surface,
     positions: FloatArray,

@@ -23,6 +23,7 @@ from femsense.frames import (
     make_recording,
     marker_grid,
     select_frames,
+    state_key,
     with_marker_table,
 )
 from femsense.pose import check_pose
@@ -43,6 +44,7 @@ __all__ = [
     "recording_document",
     "save_recording",
     "select_frames",
+    "state_key",
     "with_marker_table",
 ]
 

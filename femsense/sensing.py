@@ -25,7 +25,7 @@ from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.mesh import vertex_normals
 from femsense.march import Walk, drive_of, has_history, solve_frame
 from femsense.model import Robot, spread_features
-from femsense.patch import Patch, Surface, make_surface, patch_at
+from femsense.patch import Patch, Surface, flat_nodes, make_surface, patch_at
 from femsense.pointcloud.cloud import PointCloud
 from femsense.pointcloud.contact import detect_contacts
 from femsense.pointcloud.filters import pass_through, remove_radius_outliers, voxel_grid
@@ -35,6 +35,9 @@ from femsense.pointcloud.segmentation import segment_by_model, segment_robot
 from femsense.qp.forces import ForceEstimate, estimate_forces
 from femsense.qp.problem import FrictionCone
 from femsense.recording import Recording, check_against, read_frame_cloud
+
+PLACE_STD = 0.5
+"""How well the place of a contact is known, in search radii."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,14 +57,16 @@ class SensingOptions:
     friction: float | None = None
     """Coulomb coefficient of a contact: forces within its cone. None: along the inward normal only."""
     match_points: int = 200
-    """Points of the surface that are matched, the robot's features first among them."""
+    """Points of the surface that are matched, spread evenly off sharp edges; at least as many as the robot has features."""
     modulus_std: float = 0.03
     """What is not known of the modulus, relative; it enters the standard deviation of every force."""
     model_std: float = 0.015
     """What is not known of the modelled motion of a point, relative to its way from rest (mesh, law, boundary)."""
+    cloud_force_std: float = 0.15
+    """Relative error of a force from clouds beside noise, pose, modulus and place: occlusion, edges, one view (see docs/forces.md)."""
     correlation_m: float | None = None
     """Length over which errors of model and depth go together [m]; None: 12 % of the diagonal. Matches within it count once."""
-    cloud_std_m: float = 1e-4
+    cloud_std_m: float = 5e-4
     """What averaging cannot remove from a cloud [m]."""
     marker_std_m: float | None = None
     """Noise of a marker along each axis [m]; None: from the residual of the calibration."""
@@ -213,7 +218,7 @@ def estimate(
 ) -> Run:
     """Find contacts and forces in every frame: from clouds, or from markers where there are none.
 
-    Known loads (loads.csv) act on the model, except those within a tenth of the body's size of a given place: these are what
+    Known loads (loads.csv) act on the model, except those within a fifth of the body's size of a given place: these are what
     is to be sensed, and `known_loads` compares.
 
     Arguments:
@@ -279,7 +284,7 @@ def make_sensor(
         table = calibration.cable_tension_n if recording.actuation == "tension" else calibration.cable_displacement_m
         initial = np.array([table[name] for name in robot.body.cable_names])
     drive = drive_of(robot, recording, initial=initial)
-    sensed_here = _near_places(recording, places, size)
+    sensed_here = _near_places(drive.load_points, places, size)
     drive = replace(drive, load_frame=drive.load_frame[~sensed_here], load_points=drive.load_points[~sensed_here], load_forces=drive.load_forces[~sensed_here])  # fmt: skip
     return Sensor(
         robot,
@@ -289,10 +294,17 @@ def make_sensor(
         surface,
         options or SensingOptions(),
         places,
-        spread_features(robot.body, max(len(robot.features), (options or SensingOptions()).match_points)),
+        _probes(robot, surface, options or SensingOptions()),
         _root(calibration.pose_covariance),
         size,
     )
+
+
+def _probes(robot: Robot, surface: Surface, options: SensingOptions) -> npt.NDArray[np.int64]:
+    """Return the surface nodes that are matched with clouds: as many as the robot's features at least, off sharp edges where it has enough others."""
+    count = max(len(robot.features), options.match_points)
+    flat = spread_features(robot.body, count, among=flat_nodes(surface, robot.body.mesh.nodes))
+    return flat if len(flat) >= min(50, count) else spread_features(robot.body, count)
 
 
 def sense_frame(sensor: Sensor, k: int, previous: SensedFrame | None) -> SensedFrame:
@@ -405,11 +417,11 @@ def _check_places(places: FloatArray, surface: Surface, robot: Robot, size: floa
                              hint="coordinates are metres in the robot frame")  # fmt: skip
 
 
-def _near_places(recording: Recording, places: FloatArray, size: float) -> npt.NDArray[np.bool_]:
-    """Return the known loads that act near a given place."""
-    if not len(places) or not len(recording.load_points):
-        return np.zeros(len(recording.load_points), dtype=bool)
-    distance = np.linalg.norm(recording.load_points[:, None] - places[None], axis=2).min(axis=1)
+def _near_places(points: FloatArray, places: FloatArray, size: float) -> npt.NDArray[np.bool_]:
+    """Return which known loads act near a given place."""
+    if not len(places) or not len(points):
+        return np.zeros(len(points), dtype=bool)
+    distance = np.linalg.norm(points[:, None] - places[None], axis=2).min(axis=1)
     return np.asarray(distance < 0.2 * size)
 
 
@@ -617,7 +629,41 @@ def _fit_forces(
         forces, state, rows = forces + share * step, there, seen
     assert estimate is not None
     covariance = rows.crowding**2 * (directions @ estimate.covariance @ directions.T)
+    if source == "cloud":
+        covariance = covariance + _place_covariance(sensor, patches, state, tangent, rows, forces)
     return state, replace(estimate, forces=freeze(forces), covariance=freeze(covariance)), rows
+
+
+def _place_covariance(
+    sensor: Sensor, patches: Sequence[Patch], state: Equilibrium, tangent: Tangent, rows: Rows, forces: FloatArray
+) -> FloatArray:
+    """Return what not knowing the place of contact exactly adds to the covariance of the forces [N²], shape (3k, 3k).
+
+    The camera sees the rim of what touches, not the contact itself. Each force is fitted again at places shifted along the surface
+    by PLACE_STD of the search radius, so that it moves the rows as before.
+    """
+    n, count = len(state.positions), 3 * len(patches)
+    covariance = np.zeros((count, count))
+    shift = PLACE_STD * (sensor.options.contact_radius_m or 3.0 * _voxel(sensor))
+    for i, patch in enumerate(patches):
+        force = forces[3 * i : 3 * i + 3]
+        size, normal = float(np.linalg.norm(force)), _normal(sensor, patch, state)
+        if size == 0:
+            continue
+        across = np.linalg.svd(normal[None])[2][1:]
+        places = [patch.mean(state.positions) + shift * t for t in across]
+        moved = [
+            patch_at(sensor.surface, state.positions, p, 1.5 * sensor.surface.edge, sensor.robot.body.clamped, facing=normal)
+            for p in places
+        ]
+        moves = (
+            rows.functional(tangent.respond(np.array([q.spread(force / size, n) for q in [patch, *moved]]))) / rows.std[:, None]
+        )
+        again = size * (moves[:, 1:].T @ moves[:, 0]) / np.maximum((moves[:, 1:] ** 2).sum(axis=0), 1e-300)
+        spread = float(((again - size) ** 2).sum())
+        relative = spread / size**2 + sensor.options.cloud_force_std**2
+        covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = relative * np.outer(force, force)
+    return covariance
 
 
 def _reach(sensor: Sensor, rows: Rows) -> float:
@@ -749,7 +795,7 @@ def _compare_loads(
     recording: Recording, places: FloatArray, contacts: Sequence[ContactForce], size: float
 ) -> tuple[dict[str, float], ...]:
     """Return declared next to sensed resultants of the frames whose loads act at the given places."""
-    near = _near_places(recording, places, size)
+    near = _near_places(recording.load_points, places, size)
     result = []
     for k, number in enumerate(recording.frame_numbers):
         rows = near & (recording.load_frame == k)

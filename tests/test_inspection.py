@@ -274,7 +274,7 @@ real = pytest.mark.skipif(not DATA.is_dir(), reason="no real data beside the rep
 
 REAL: dict[str, tuple[str, dict[str, Any]]] = {
     "diamond": ("robot", {"name": "diamond", "clamped_nodes": 58, "features": 51}),
-    "finger": ("robot", {"name": "finger", "clamped_nodes": 22}),
+    "finger": ("robot", {"name": "finger", "clamped_nodes": 20}),
     "beam/robot": ("robot", {"name": "silicone-beam", "clamped_nodes": 169, "gravity_m_s2": [0, 0, 0]}),
     "beam/robot_gravity": ("robot", {"gravity_m_s2": [0, 0, -9.80709]}),
     "hammer/robot": ("robot", {"name": "hammer-moldstar", "color_rgb": [0.05, 0.45, 0.65]}),

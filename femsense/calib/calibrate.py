@@ -22,7 +22,7 @@ from femsense.fem.equilibrium import Equilibrium
 from femsense.march import Walk, drive_of, solve_frame
 from femsense.model import Robot
 from femsense.pose import move_pose
-from femsense.recording import Recording, check_against
+from femsense.recording import Recording, check_against, state_key
 
 MAX_FRAMES = 24
 """More frames than this are thinned out evenly; they would add time and hardly any accuracy."""
@@ -250,13 +250,7 @@ def _repeats(scene: Scene) -> FloatArray:
 
     Such frames repeat the same error of the model; taking them for independent would make every standard deviation too small.
     """
-    recording = scene.recording
-    keys = []
-    for f in scene.frame:
-        rows = recording.load_frame == f
-        parts = [recording.inputs[f], recording.load_points[rows].ravel(), recording.load_forces[rows].ravel()]
-        parts.append(recording.gravity[f] if recording.gravity is not None else np.zeros(0))
-        keys.append(np.concatenate(parts).tobytes())
+    keys = [state_key(scene.recording, int(f)) for f in scene.frame]
     count: dict[tuple[bytes, int], int] = {}
     for key, marker in zip(keys, scene.marker):
         count[key, int(marker)] = count.get((key, int(marker)), 0) + 1

@@ -271,7 +271,7 @@ def _newton(body: BodyModel, loads: _Loads, state: _State, max_iterations: int) 
     last, saved = np.inf, (state.x, state.T)
     frictional = any(c.friction > 0 for c in body.cables)
     for iteration in range(max_iterations):
-        if frictional and 0 < iteration < FOLLOW_FRICTION:
+        if frictional and not len(held) and 0 < iteration < FOLLOW_FRICTION:
             _update_friction(body, loads, state)
         rows = _rows(body, state)
         H = _kinematic_rows(body, state, rows)[held][:, free] if len(held) else np.zeros((0, len(free)))

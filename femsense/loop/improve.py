@@ -23,10 +23,10 @@ from femsense.loop.joint import JointFit, JointProblem, Prior, Trial, fit_jointl
 from femsense.loop.noise import Groups, Noise, estimate_noise
 from femsense.loop.result import LoopResult
 from femsense.loop.screen import NUISANCE, TESTABLE, Candidate, candidates_for, confounding, screen
-from femsense.loop.split import hold_out, state_key, sweeps_of
+from femsense.loop.split import hold_out, sweeps_of
 from femsense.loop.structure import describe_left, structure_test
 from femsense.model import Robot
-from femsense.recording import Recording, check_against
+from femsense.recording import Recording, check_against, state_key
 
 MAX_EFFECTS = 3
 MAX_ROWS = 3000

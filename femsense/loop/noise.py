@@ -91,7 +91,7 @@ def estimate_noise(
     Arguments:
         residuals: of each recording [m], shape (k, 3).
         nuisance: columns of what is fitted, shape (k, 3, p), the same p everywhere.
-        extra: columns of what might be in the data besides, shape (k, 3, q); their leading directions count as explained.
+        extra: columns of what might be in the data besides, shape (k, 3, q), the likeliest first; these count as explained.
         groups: of each recording.
     """
     residuals, nuisance, extra, groups = _thinned(residuals, nuisance, extra, groups)
@@ -172,19 +172,23 @@ def _reml(noise: Noise, residuals: list[FloatArray], basis: list[FloatArray], gr
 
 
 def _richest(nuisance: list[FloatArray], extra: list[FloatArray], distinct: int) -> list[FloatArray]:
-    """Return an orthonormal basis of the nuisance and of the leading directions of what might be there besides.
+    """Return an orthonormal basis of the nuisance and of what might be there besides, the first columns of `extra` first.
 
     The latter take at most a third of the degrees of freedom that the nuisance leaves, so that some are left for the noise.
     """
     Z = _stacked(nuisance)
     U, s, _ = np.linalg.svd(Z, full_matrices=False)
-    Q = U[:, s > 1e-9 * max(s.max(initial=0.0), 1e-300)]
-    X = _stacked(extra)
-    X = X - Q @ (Q.T @ X)
-    U, s, _ = np.linalg.svd(X, full_matrices=False)
-    spare = max((distinct - Q.shape[1]) // 3, 0)
-    keep = min(int((s > 0.05 * max(s.max(initial=0.0), 1e-300)).sum()), spare)
-    Q = np.hstack([Q, U[:, :keep]])
+    basis = list(U[:, s > 1e-9 * max(s.max(initial=0.0), 1e-300)].T)
+    spare = max((distinct - len(basis)) // 3, 0)
+    for column in _stacked(extra).T:
+        if spare == 0:
+            break
+        left = column - np.transpose(basis) @ (np.array(basis) @ column)
+        size = float(np.linalg.norm(left))
+        if size > 0.02:  # not just what is there already
+            basis.append(left / size)
+            spare -= 1
+    Q = np.transpose(basis)
     spans = np.cumsum([0, *(c.shape[0] * 3 for c in nuisance)])
     return [Q[a:b].reshape((b - a) // 3, 3, -1) for a, b in pairwise(spans)]
 

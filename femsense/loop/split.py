@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from femsense.arrays import IntArray
-from femsense.recording import Recording
+from femsense.recording import Recording, state_key
 
 
 def sweeps_of(recording: Recording, frames: IntArray) -> IntArray:
@@ -34,15 +34,6 @@ def _runs(recording: Recording, frames: IntArray) -> IntArray:
     keys = [state_key(recording, int(k)) for k in frames]
     change = np.array([i > 0 and keys[i] != keys[i - 1] for i in range(len(keys))], dtype=bool)
     return np.cumsum(change)
-
-
-def state_key(recording: Recording, frame: int) -> bytes:
-    """Return what tells apart frames under different inputs, loads or gravity."""
-    rows = recording.load_frame == frame
-    parts = [recording.inputs[frame], recording.load_points[rows].ravel(), recording.load_forces[rows].ravel()]
-    if recording.gravity is not None:
-        parts.append(recording.gravity[frame])
-    return np.concatenate([np.asarray(p, dtype=float).ravel() for p in parts]).tobytes()
 
 
 def hold_out(recording: Recording, frames: IntArray) -> tuple[IntArray, IntArray, str]:

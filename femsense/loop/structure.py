@@ -9,6 +9,7 @@ import numpy as np
 from femsense.arrays import FloatArray, IntArray
 from femsense.loop.joint import Trial
 from femsense.model import Robot
+from femsense.recording import state_key
 
 PERMUTATIONS = 499
 
@@ -36,8 +37,6 @@ def _field(trial: Trial, residual: FloatArray) -> tuple[FloatArray, IntArray]:
     grid[place, trial.groups.marker] = residual
     sweep = np.zeros(len(frames), dtype=np.int64)
     sweep[place] = trial.groups.sweep
-    from femsense.loop.split import state_key
-
     keys = [state_key(trial.scene.recording, int(f)) for f in frames]
     first = [i for i in range(len(frames)) if i == 0 or keys[i] != keys[i - 1]]
     merged = np.array([np.nanmean(grid[a:b], axis=0) for a, b in zip(first, [*first[1:], len(frames)])])
