@@ -70,7 +70,7 @@ class SensingOptions:
     """What averaging cannot remove from a cloud [m]."""
     marker_std_m: float | None = None
     """Noise of a marker along each axis [m]; None: from the residual of the calibration."""
-    iterations: int = 10
+    iterations: int = 8
     """Linearisations a frame at most."""
 
 
@@ -616,7 +616,7 @@ def _fit_forces(
         if (np.abs(step) < still).all():
             break
         cost = _cost(rows, nuisance, forces, size)
-        for share in (1.0, 0.5, 0.25, 0.125, 0.06):  # large deflections: a full step may lead too far
+        for share in (1.0, 0.5, 0.2, 0.06):  # large deflections: a full step may lead too far
             try:
                 there = _solve(sensor, k, np.tensordot(forces + share * step, basis, axes=1), state, before)
                 seen = _measure(sensor, k, clouds, there, np.inf if iteration == 0 else _reach(sensor, rows))
@@ -757,7 +757,7 @@ def _solve_qp(
 def _solve(
     sensor: Sensor, k: int, nodal_forces: FloatArray | None, start: Equilibrium | None, before: tuple[FloatArray, ...] | None
 ) -> Equilibrium:
-    state = solve_frame(sensor.walk, k, start=start, before=before, nodal_forces=nodal_forces)
+    state = solve_frame(sensor.walk, k, start=start, before=before, nodal_forces=nodal_forces, reuse_factor=start is not None)
     if not state.converged:
         raise DataError(f"no equilibrium: {state.status}: {state.advice}")
     return state

@@ -366,7 +366,7 @@ def _best_refit(
             record["verdict"] = f"no equilibrium: {error}"
             continue
         q = len(candidate.parameters)
-        gain = _evidence(stage.fit, trial.fit, n_effective)
+        gain = _evidence(stage.fit, trial.fit)
         score = gain - q * np.log(n_effective) - 2.0 * np.log(library)
         record |= {"dchi2": gain, "dbic": score, "validation_rms_m": trial.held_rms}
         reason = _objection(stage, trial, candidate, score)
@@ -378,9 +378,9 @@ def _best_refit(
     return (None if best is None else best[1]), records
 
 
-def _evidence(before: JointFit, after: JointFit, n_effective: float) -> float:
-    """Return the decrease of χ², or that of n log χ² where it is smaller (the noise level is itself an estimate from few data)."""
-    freedom = max(n_effective - len(after.fit.theta), 1.0)
+def _evidence(before: JointFit, after: JointFit) -> float:
+    """Return the decrease of χ², or that of (rows − parameters) log χ² where it is smaller: the scale of the noise is an estimate too."""
+    freedom = max(len(after.fit.residual) - len(after.fit.theta), 1)
     return min(before.chi2 - after.chi2, freedom * float(np.log(before.chi2 / max(after.chi2, 1e-12))))
 
 
