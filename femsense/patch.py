@@ -64,7 +64,7 @@ def flat_nodes(surface: Surface, positions: FloatArray) -> IntArray:
         np.add.at(total, surface.triangles[:, corner], np.linalg.norm(area, axis=1))
         np.add.at(together, surface.triangles[:, corner], area)
     flatness = np.linalg.norm(together, axis=1)[surface.nodes] / total[surface.nodes]
-    return surface.nodes[flatness > 0.93]
+    return np.asarray(surface.nodes[flatness > 0.93])
 
 
 def patch_at(
