@@ -349,7 +349,7 @@ def _best_refit(
     """Refit the best candidates in full nonlinearity; return the one that passes, if any, and what became of each."""
     chosen: dict[str, Candidate] = {}
     for candidate in table:
-        if candidate.score > 0 and candidate.retained > 1e-3:
+        if candidate.score > 0 and candidate.retained >= TESTABLE:
             chosen.setdefault(candidate.effect.name, candidate)
     best, records = None, []
     library = max(len({c.effect.name for c in table}), 1)
