@@ -70,7 +70,7 @@ class SensingOptions:
     """What averaging cannot remove from a cloud [m]."""
     marker_std_m: float | None = None
     """Noise of a marker along each axis [m]; None: from the residual of the calibration."""
-    iterations: int = 8
+    iterations: int = 6
     """Linearisations a frame at most."""
 
 

@@ -24,7 +24,7 @@ from femsense.model import Robot
 from femsense.pose import move_pose
 from femsense.recording import Recording, check_against, state_key
 
-MAX_FRAMES = 24
+MAX_FRAMES = 16
 """More frames than this are thinned out evenly; they would add time and hardly any accuracy."""
 START_FRAMES = 5
 """Frames that Algorithm 1 uses for the start."""
