@@ -7,6 +7,7 @@ import hashlib
 import json
 import math
 import os
+import re
 import secrets
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -18,6 +19,8 @@ import numpy as np
 
 PART_PREFIX = ".part-"
 """Names of unfinished files and folders start so."""
+LONGEST_ARRAY = 100
+"""A list of points that is longer than this gets a line for each of them in TOML."""
 
 
 @contextmanager
@@ -57,10 +60,10 @@ def json_text(data: Any, *, indent: int | None = 2) -> str:
 
 
 def write_toml(path: str | Path, document: Mapping[str, Any]) -> None:
-    """Write a TOML document. Arrays become lists; numbers are written so that they read back the same."""
+    """Write a TOML document. Arrays become lists; numbers are written so that they read back the same; points stay on one line."""
     import tomli_w
 
-    write_text(path, tomli_w.dumps(plain(document, nonfinite=True)))
+    write_text(path, _on_one_line(tomli_w.dumps(plain(document, nonfinite=True))))
 
 
 def write_csv(path: str | Path, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
@@ -106,6 +109,17 @@ def plain(value: Any, *, nonfinite: bool = False) -> Any:
     if isinstance(value, float) and not math.isfinite(value) and not nonfinite:
         return None
     return value
+
+
+def _on_one_line(toml: str) -> str:
+    """Return TOML with its arrays of numbers, and short arrays of those, on one line each (a string never holds a line feed)."""
+    rows = re.sub(r"\[((?:\n +[-+\w.]+,)+)\n *\]", lambda found: f"[{', '.join(found[1].replace(',', ' ').split())}]", toml)
+    return re.sub(r"\[((?:\n +\[[^\[\]\n]*\],)+)\n *\]", _joined, rows)
+
+
+def _joined(found: re.Match[str]) -> str:
+    joined = f"[{', '.join(line.strip().rstrip(',') for line in found[1].strip().splitlines())}]"
+    return joined if len(joined) <= LONGEST_ARRAY else found[0]
 
 
 def _cell(value: object) -> object:

@@ -1,0 +1,64 @@
+"""Tetrahedra of bodies that are built of blocks: a grid of cells, some of them left out, placed in space by a function."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from femsense.arrays import BoolArray, FloatArray
+from femsense.errors import InputError
+from femsense.fem.mesh import TetMesh, oriented
+
+KUHN = np.array([[0, 1, 3, 7], [0, 3, 2, 7], [0, 2, 6, 7], [0, 6, 4, 7], [0, 4, 5, 7], [0, 5, 1, 7]])
+"""Six tetrahedra of a cube whose corner (i, j, k) has the number 4 i + 2 j + k."""
+
+
+def block_mesh(
+    levels: Sequence[npt.ArrayLike],
+    *,
+    keep: Callable[[FloatArray], BoolArray] | None = None,
+    place: Callable[[FloatArray], FloatArray] | None = None,
+) -> TetMesh:
+    """Return the tetrahedra of a grid of blocks, six a cell, always the same ones.
+
+    Cells are split by Kuhn's rule, mirrored from each cell to the next, so that neighbours fit together and a grid with an even
+    number of cells along an axis is its own mirror image across it (a symmetric body bends symmetrically).
+
+    Arguments:
+        levels: where the cells begin and end along each of the three axes, rising, any unit.
+        keep: centres of the cells (c, 3) → which of them belong to the body, shape (c,); by default all.
+        place: grid points (n, 3) → where they are [m], (n, 3); by default as they are.
+
+    Raises:
+        InputError: levels that do not rise, or no cell left.
+    """
+    axes = [np.asarray(level, dtype=np.float64) for level in levels]
+    for name, axis in zip("xyz", axes):
+        if len(axis) < 2 or not (np.diff(axis) > 0).all():
+            raise InputError("must rise, two values at least", where=f"levels along {name}", found=axis.tolist())
+    counts = [len(axis) - 1 for axis in axes]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    cells = np.stack(np.meshgrid(*[np.arange(count) for count in counts], indexing="ij"), axis=-1).reshape(-1, 3)
+    if keep is not None:
+        centres = np.stack([(axis[:-1] + axis[1:])[cells[:, i]] / 2.0 for i, axis in enumerate(axes)], axis=1)
+        cells = cells[np.asarray(keep(centres), dtype=bool)]
+    if not len(cells):
+        raise InputError("no cell is left", where="keep", found=f"0 of {np.prod(counts)}", expected="some cells of the grid")
+    corner = np.array([(i, j, k) for i in (0, 1) for j in (0, 1) for k in (0, 1)])
+    at = cells[:, None] + np.where(cells[:, None] % 2 == 0, corner, 1 - corner)  # odd cells are mirrored
+    numbers = np.ravel_multi_index(tuple(np.moveaxis(at, -1, 0)), [count + 1 for count in counts])
+    used, tets = np.unique(numbers[:, KUHN].reshape(-1, 4), return_inverse=True)
+    nodes = points[used]
+    return oriented(TetMesh(nodes if place is None else place(nodes), tets.reshape(-1, 4)))
+
+
+def rounded_square(points: FloatArray, *, roundness: float) -> FloatArray:
+    """Return points (n, 2) of the square [−1, 1]² moved towards the disc of the same half width.
+
+    `roundness` 0 leaves the square, 1 gives the disc (x √(1 − y²/2), y √(1 − x²/2)), whose four corner cells are flat.
+    """
+    x, y = points[:, 0], points[:, 1]
+    disc = np.stack([x * np.sqrt(1.0 - y**2 / 2.0), y * np.sqrt(1.0 - x**2 / 2.0)], axis=1)
+    return (1.0 - roundness) * points + roundness * disc
