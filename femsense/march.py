@@ -14,7 +14,8 @@ import numpy as np
 from femsense.arrays import FloatArray, IntArray, freeze
 from femsense.errors import DataError
 from femsense.fem.assembly import internal
-from femsense.fem.cables import bend_angles, cable_forces, rub
+from femsense.fem.cables import bend_angles, cable_forces, rub, shortening
+from femsense.fem.clamp import first_give
 from femsense.fem.compliance import tangent_at
 from femsense.fem.equilibrium import Equilibrium, solve_equilibrium
 from femsense.fem.mesh import embed_points
@@ -152,8 +153,8 @@ def walk_along(
     """Solve frames in order, and with each the same frame of variants that differ from it by little.
 
     A variant's state is the linear response of the base state to the forces that the variant adds there, so that all of them
-    together cost one factorisation and one solve with many right-hand sides; they must differ by little. A variant whose
-    clamp is another one is solved for itself.
+    together cost one factorisation and one solve with many right-hand sides; they must differ by little. A variant on another
+    mesh, or with a rigid clamp where that of the base gives, is solved for itself.
 
     Arguments:
         walk: the base.
@@ -201,7 +202,7 @@ def _observe_variants(
     for i, variant in enumerate(variants):
         if _same_mechanics(walk, variant):
             others[i] = observe(variant.robot, base)
-        elif variant.robot.body.free_map is not walk.robot.body.free_map:
+        elif not _linear(walk, variant):
             state = _require(solve_frame(variant, k, start=base, before=memory[1 + i]), k)
             memory[1 + i] = state.segment_tensions
             others[i] = observe(variant.robot, state)
@@ -211,34 +212,65 @@ def _observe_variants(
         return others
     tangent = tangent_at(walk.robot.body, base)
     inner = internal(walk.robot.body, base.positions, tangent=False).forces
+    starts = [_carried(walk, variants[i], k, base, inner) for i in linear]
     moves = np.zeros((len(linear), *base.positions.shape))
     rubbing = any(has_history(variants[i].robot) for i in linear)
     for _ in range(2 if rubbing else 1):  # the second time with the bends as the first response leaves them
         answers = [
-            _out_of_balance(walk, variants[i], k, base, inner, memory[1 + i], base.positions + move)
-            for i, move in zip(linear, moves)
+            _out_of_balance(walk, variants[i], k, base, inner, memory[1 + i], start, start + move)
+            for i, start, move in zip(linear, starts, moves)
         ]
         moves = tangent.respond(np.array([force for force, _, _ in answers]))
         if base.held.any():
             moves += np.tensordot(np.array([pulled[base.held] for _, pulled, _ in answers]), tangent.respond_to_held(), axes=1)
-    for i, move, (_, _, tensions) in zip(linear, moves, answers):
+    for i, start, move, (_, _, tensions) in zip(linear, starts, moves, answers):
         memory[1 + i] = tensions
-        others[i] = observe(variants[i].robot, replace(base, positions=base.positions + move))
+        others[i] = observe(variants[i].robot, replace(base, positions=start + move))
     return others
 
 
+def _linear(walk: Walk, variant: Walk) -> bool:
+    """Return whether the linear response gives a variant: the same elements, and a clamp that moves by little."""
+    base, other = walk.robot.body, variant.robot.body
+    return base.mesh.tets is other.mesh.tets and (base.clamp_is_rigid or not other.clamp_is_rigid)
+
+
+def _carried(walk: Walk, variant: Walk, k: int, base: Equilibrium, inner: FloatArray) -> FloatArray:
+    """Return where the variant's response starts [m], (n, 3): the base state, grown as its body is and with its clamp given way."""
+    body, other, x = walk.robot.body, variant.robot.body, base.positions
+    if other.mesh is not body.mesh:
+        x = x + (other.mesh.nodes - body.mesh.nodes)
+    if body.clamp_is_rigid and not other.clamp_is_rigid:
+        return x + first_give(other, _pulls_at(walk, k, base) - inner)
+    return x
+
+
+def _pulls_at(walk: Walk, k: int, base: Equilibrium) -> FloatArray:
+    """Return the nodal forces of dead loads and cables in the base state [N], (n, 3)."""
+    body = walk.robot.body
+    if walk.drive.gravity is not None:
+        body = body.with_gravity(walk.drive.gravity[k])
+    force = body.dead_load() + base.nodal_forces
+    for cable, along in zip(body.cables, base.segment_tensions):
+        force = force + cable_forces(cable, base.positions, along, len(force))
+    return np.asarray(force)
+
+
 def _out_of_balance(
-    walk: Walk, variant: Walk, k: int, base: Equilibrium, inner: FloatArray, before: tuple[FloatArray, ...] | None, bent: FloatArray,
+    walk: Walk, variant: Walk, k: int, base: Equilibrium, inner: FloatArray, before: tuple[FloatArray, ...] | None, x: FloatArray,
+    bent: FloatArray,
 ) -> tuple[FloatArray, FloatArray, tuple[FloatArray, ...]]:  # fmt: skip
-    """Return the nodal forces that a variant adds at the base state [N], (n, 3); the shortening that it adds to held cables
-    [m], (a,); and the tensions along its cables [N]. `bent` is where its cables bend [m], (n, 3)."""
-    body, x = variant.robot.body, base.positions
+    """Return the nodal forces that a variant adds at positions x near the base state [N], (n, 3); the shortening that it adds to
+    held cables [m], (a,); and the tensions along its cables [N]. `bent` is where its cables bend [m], (n, 3)."""
+    body = variant.robot.body
     n = len(x)
     if variant.drive.gravity is not None:
         body = body.with_gravity(variant.drive.gravity[k])
     loads = frame_loads(variant, k)
     force = body.dead_load() + (0.0 if loads is None else loads)
-    same = body.material is walk.robot.body.material and body.clamp_stiffness == walk.robot.body.clamp_stiffness
+    still = x is base.positions
+    springs = [(b.clamp_stiffness, b.clamp_turn_stiffness) for b in (body, walk.robot.body)]
+    same = still and body.material is walk.robot.body.material and (springs[0] == springs[1])
     force = force - (inner if same else internal(body, x, tangent=False).forces)
     tensions = []
     for i, cable in enumerate(body.cables):
@@ -259,6 +291,8 @@ def _out_of_balance(
         if variant.drive.control == "displacement"
         else np.zeros(len(body.cables))
     )
+    if not still and variant.drive.control == "displacement":
+        pulled = pulled - shortening(body, x) + shortening(walk.robot.body, base.positions)
     return force, pulled, tuple(tensions)
 
 

@@ -14,14 +14,14 @@ from analytic import bar_body
 from helpers import block_mesh, write_block_robot
 
 from femsense.calib.forward import undo_depth
-from femsense.effects import EFFECTS, Effect, Entry, Parameter, apply_effects, build_entry, find_effect
+from femsense.effects import EFFECTS, FORMS, Effect, Entry, Parameter, apply_effects, build_entry, find_effect
 from femsense.errors import InputError
 from femsense.fem.equilibrium import solve_equilibrium
 from femsense.fem.mesh import embed_points
 from femsense.march import Walk, drive_of, solve_frame
 from femsense.model import Observation, Robot, plain_actuation
 from femsense.recording import make_recording
-from femsense.robot import load_robot
+from femsense.robot import EFFECT_NAMES, load_robot
 
 MARKERS = np.array([[0.1, 0.015, 0.03], [0.06, 0.0, 0.0], [0.1, 0.03, 0.015]])
 CENTER = [0.05, 0.015, 0.015]
@@ -53,12 +53,15 @@ def measured(r: Robot, control: str) -> np.ndarray:
 def examples() -> list[tuple[Effect, str, Entry, tuple[Parameter, ...]]]:
     r = robot()
     return [
-        (e, control, dict(e.seeds(r)[0]), e.parameters(r, control)) for e in EFFECTS for control in ("tension", "displacement")
+        (e, control, dict(e.seeds(r)[0]), e.parameters(r, control))
+        for e in FORMS
+        if not e.discrete
+        for control in ("tension", "displacement")
     ]
 
 
 def title(case: tuple[Effect, str, Entry, tuple[Parameter, ...]]) -> str:
-    return f"{case[0].name}-{case[1]}"
+    return f"{case[0].name}-{case[1]}-{len(case[3])}"
 
 
 ACTING = [case for case in examples() if case[3]]
@@ -70,8 +73,9 @@ ACTING = [case for case in examples() if case[3]]
 def test_the_names_are_those_of_the_format() -> None:
     names = {e.name for e in EFFECTS}
     assert len(names) == len(EFFECTS)
+    assert names == set(EFFECT_NAMES) == {form.name for form in FORMS}
     assert names == {
-        "gravity", "stiffness", "poisson", "soft_region", "hyperelastic", "creep", "payload", "base_compliance", "cable_friction",
+        "discretisation", "geometry", "gravity", "stiffness", "poisson", "soft_region", "hyperelastic", "creep", "payload", "base_compliance", "cable_friction",
         "cable_offset", "cable_gain", "cable_stretch", "cable_slack", "depth_scale", "marker_offset",
     }  # fmt: skip
     assert all(e.lacks and e.keys for e in EFFECTS)
@@ -246,7 +250,12 @@ def test_effects_that_cannot_act_here_have_no_parameters() -> None:
         ({"name": "cable_friction", "coefficient": -0.1}, ["not negative"]),
         ({"name": "cable_stretch", "stiffness_n_m": 0.0}, ["a stiffness is positive"]),
         ({"name": "cable_stretch", "stiffness_n_m": {"top": 5.0}}, ["cable_stretch.stiffness_n_m"]),
-        ({"name": "base_compliance", "rotation_stiffness_nm_rad": 1.0}, ["not modelled", "stiffness_n_m"]),
+        ({"name": "base_compliance"}, ["neither spring is given", "stiffness_n_m or rotation_stiffness_nm_rad"]),
+        ({"name": "base_compliance", "rotation_stiffness_nm_rad": 0.0}, ["base_compliance.rotation_stiffness_nm_rad"]),
+        ({"name": "hyperelastic", "law": "neo_hookean", "jm": 2.0}, ["jm belongs to gent"]),
+        ({"name": "geometry", "scale": 0.0}, ["geometry.scale", "0.2 … 5"]),
+        ({"name": "geometry"}, ["geometry.scale"]),
+        ({"name": "discretisation"}, ["neither element nor refinements"]),
         ({"name": "base_compliance", "stiffness_n_m": -5.0}, ["base_compliance.stiffness_n_m"]),
         ({"name": "marker_offset", "offset_m": {"z": [0, 0, 0]}}, ["unknown marker", "z", "a, b, c"]),
         ({"name": "marker_offset", "offset_m": [0, 0, 0]}, ["not a table"]),
@@ -269,13 +278,14 @@ def test_friction_without_a_bend_is_refused() -> None:
         apply_effects(r, [{"name": "cable_friction", "coefficient": 0.1}])
 
 
-@pytest.mark.parametrize("name", ["soft_region", "payload", "creep", "hyperelastic"])
-def test_every_starting_point_can_be_applied(name: str) -> None:
-    effect, r = find_effect(name), robot()
-    seeds = effect.seeds(r)
-    assert len(seeds) > 1
-    for seed in seeds:
-        parameters = effect.parameters(r, "tension")
+@pytest.mark.parametrize(
+    "effect", [f for f in FORMS if len(f.seeds(robot())[0])], ids=lambda f: f"{f.name}-{f.seeds(robot())[0]}"
+)
+def test_every_starting_point_can_be_applied(effect: Effect) -> None:
+    r = robot()
+    for seed in effect.seeds(r):
+        parameters = (*effect.parameters(r, "tension"), *effect.polish(r, "tension", seed))
+        assert effect.discrete or len(parameters)
         effect.apply(r, build_entry(parameters, [p.null for p in parameters], seed))
 
 

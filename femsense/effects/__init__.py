@@ -6,19 +6,23 @@ from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from typing import Any
 
-from femsense.effects.cables import CABLE_FRICTION, CABLE_GAIN, CABLE_OFFSET, CABLE_SLACK, CABLE_STRETCH
+from femsense.effects.cables import CABLE_FRICTION, CABLE_FRICTIONS, CABLE_GAIN, CABLE_OFFSET, CABLE_SLACK, CABLE_STRETCH
 from femsense.effects.effect import Effect, Entry, Parameter, build_entry
 from femsense.effects.loads import GRAVITY, PAYLOAD
-from femsense.effects.material import CREEP, HYPERELASTIC, POISSON, SOFT_REGION, STIFFNESS
+from femsense.effects.material import CREEP, CREEP_TWICE, GENT, HYPERELASTIC, POISSON, SOFT_REGION, STIFFNESS
 from femsense.effects.observation import DEPTH_SCALE, MARKER_OFFSET
-from femsense.effects.support import BASE_COMPLIANCE
+from femsense.effects.shape import DISCRETISATION, GEOMETRY
+from femsense.effects.support import BASE_COMPLIANCE, BASE_ROTATION
 from femsense.errors import InputError
 from femsense.model import Robot
 
 EFFECTS: tuple[Effect, ...] = (
-    GRAVITY, STIFFNESS, POISSON, SOFT_REGION, HYPERELASTIC, CREEP, PAYLOAD, BASE_COMPLIANCE, CABLE_FRICTION, CABLE_OFFSET,
-    CABLE_GAIN, CABLE_STRETCH, CABLE_SLACK, DEPTH_SCALE, MARKER_OFFSET,
+    GRAVITY, STIFFNESS, POISSON, SOFT_REGION, DISCRETISATION, HYPERELASTIC, CREEP, PAYLOAD, BASE_COMPLIANCE, CABLE_FRICTION,
+    CABLE_OFFSET, CABLE_GAIN, CABLE_STRETCH, CABLE_SLACK, GEOMETRY, DEPTH_SCALE, MARKER_OFFSET,
 )  # fmt: skip
+"""Each name once."""
+FORMS: tuple[Effect, ...] = (*EFFECTS, GENT, CREEP_TWICE, BASE_ROTATION, CABLE_FRICTIONS)
+"""Every way in which an effect can be fitted: some have further parameters, under the same name."""
 
 
 def find_effect(name: str) -> Effect:
@@ -49,4 +53,4 @@ def apply_effects(robot: Robot, entries: Sequence[Mapping[str, Any]]) -> Robot:
     return robot
 
 
-__all__ = ["EFFECTS", "Effect", "Entry", "Parameter", "apply_effects", "build_entry", "find_effect"]
+__all__ = ["EFFECTS", "FORMS", "Effect", "Entry", "Parameter", "apply_effects", "build_entry", "find_effect"]

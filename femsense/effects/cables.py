@@ -16,8 +16,22 @@ def _has_bends(robot: Robot) -> bool:
     return any(len(c.path) > 1 or c.exit_direction is not None for c in robot.body.cables)
 
 
+def _rubbing(robot: Robot, control: str) -> list[str]:
+    """Return the cables whose friction moves the body: a bend where it leaves matters only if its tension at the motor does."""
+    return [
+        c.name
+        for c in robot.body.cables
+        if len(c.path) > 1 or (c.exit_direction is not None and (control == "tension" or np.isfinite(c.stretch_stiffness)))
+    ]
+
+
 def _friction_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
-    return (Parameter("coefficient", None, "1", 0.0, 0.0, 1.5, 2e-3),) if _has_bends(robot) else ()
+    return (Parameter("coefficient", None, "1", 0.0, 0.0, 1.5, 2e-3),) if _rubbing(robot, control) else ()
+
+
+def _friction_parameters_each(robot: Robot, control: str) -> tuple[Parameter, ...]:
+    names = _rubbing(robot, control)
+    return tuple(Parameter("coefficient", name, "1", 0.0, 0.0, 1.5, 2e-3) for name in names) if len(names) > 1 else ()
 
 
 def _apply_friction(robot: Robot, entry: Entry) -> Robot:
@@ -97,6 +111,8 @@ def _apply_slack(robot: Robot, entry: Entry) -> Robot:
 
 CABLE_FRICTION = Effect("cable_friction", "loss where a cable bends or rubs; depends on the direction of motion",
                         _friction_parameters, _apply_friction, keys=("coefficient",), history=True)  # fmt: skip
+CABLE_FRICTIONS = Effect("cable_friction", "loss where a cable bends or rubs; depends on the direction of motion",
+                         _friction_parameters_each, _apply_friction, keys=("coefficient",), history=True)  # fmt: skip
 CABLE_OFFSET = Effect(
     "cable_offset",
     "a wrong zero of tension or displacement",

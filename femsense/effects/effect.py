@@ -83,11 +83,20 @@ class Effect:
     """All keys that an entry may have."""
     history: bool = False
     """Whether the state depends on what was before."""
+    discrete: bool = False
+    """Whether a seed changes the model by itself, by no small amount: it is then tried as a whole. Its parameters, if it has any,
+    start at their `null`, which is a plausible value and leaves no plain model."""
+    polish: Callable[[Robot, str, Entry], tuple[Parameter, ...]] = lambda robot, control, seed: ()
+    """(robot, control, seed) → what the seed holds still while effects are compared and a joint fit may move after that; `null`
+    is the seed's own value."""
+    nearby: Callable[[Robot, Entry], Sequence[Entry]] = lambda robot, seed: ()
+    """(robot, seed) → seeds between this one and its neighbours; tried once this one is known to be the best."""
 
 
 def build_entry(parameters: Sequence[Parameter], coordinates: Sequence[float], seed: Mapping[str, Any]) -> Entry:
     """Return the table of `[[effects]]` for coordinates of the fit."""
-    entry: Entry = dict(seed)
+    fitted = {p.key for p in parameters}
+    entry: Entry = {key: value for key, value in seed.items() if key not in fitted}
     for parameter, coordinate in zip(parameters, coordinates):
         value = parameter.value(float(coordinate))
         if parameter.part is None:

@@ -66,12 +66,23 @@ def _apply_law(robot: Robot, entry: Entry) -> Robot:
     law = entry.get("law")
     if law not in ("neo_hookean", "gent"):
         raise InputError("unknown law", where="hyperelastic.law", found=law, expected="neo_hookean | gent")
+    if law == "neo_hookean" and "jm" in entry:
+        raise InputError("jm belongs to gent", where="hyperelastic.jm", found=entry["jm"], expected='law = "gent"')
     limit = number(entry, "jm", "hyperelastic", low=1e-3) if law == "gent" else np.inf
     return robot.with_body(robot.body.with_material(replace(robot.body.material, law=str(law), stretch_limit=limit)))
 
 
 def _law_seeds(robot: Robot) -> tuple[Entry, ...]:
-    return ({"law": "neo_hookean"}, {"law": "gent", "jm": 3.0})
+    return () if robot.body.material.law == "neo_hookean" else ({"law": "neo_hookean"},)
+
+
+def _gent_seeds(robot: Robot) -> tuple[Entry, ...]:
+    return ({"law": "gent"},)
+
+
+def _gent_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
+    """The coordinate is 1/jm: 0 is the neo-Hookean law."""
+    return (Parameter("jm", None, "1", 0.3, 0.0, 10.0, 1e-4, "reciprocal"),)
 
 
 def _no_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
@@ -83,17 +94,35 @@ def _creep_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
 
 
 def _creep_seeds(robot: Robot) -> tuple[Entry, ...]:
-    return tuple({"time_s": t} for t in (1.0, 4.0, 16.0, 64.0))
+    return tuple({"time_s": t} for t in (0.5, 2.0, 8.0, 32.0, 128.0))
+
+
+def _creep_polish(robot: Robot, control: str, seed: Entry) -> tuple[Parameter, ...]:
+    start = float(np.log(seed["time_s"]))
+    return (Parameter("time_s", None, "s", start, float(np.log(0.05)), float(np.log(2000.0)), 1e-3, "log"),)
+
+
+def _creep_twice_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
+    return tuple(Parameter("fraction", i, "1", 0.0, 0.0, 1.0, 1e-3) for i in range(2)) if control == "tension" else ()
+
+
+def _creep_twice_seeds(robot: Robot) -> tuple[Entry, ...]:
+    return tuple({"time_s": list(times)} for times in ((0.5, 8.0), (2.0, 32.0), (8.0, 128.0)))
+
+
+def _creep_twice_polish(robot: Robot, control: str, seed: Entry) -> tuple[Parameter, ...]:
+    low, high = float(np.log(0.05)), float(np.log(2000.0))
+    return tuple(Parameter("time_s", i, "s", float(np.log(t)), low, high, 1e-3, "log") for i, t in enumerate(seed["time_s"]))
 
 
 def _apply_creep(robot: Robot, entry: Entry) -> Robot:
-    fractions, times = np.atleast_1d(entry.get("fraction", [])), np.atleast_1d(entry.get("time_s", []))
-    if not len(fractions) or fractions.shape != times.shape:
+    fractions, times = (v if isinstance(v, list) else [v] for v in (entry.get("fraction", []), entry.get("time_s", [])))
+    if not len(fractions) or len(fractions) != len(times):
         raise InputError(
             "fraction and time_s differ in number", where="creep", found=entry, expected="one or more terms, as many of each"
         )
     terms = tuple(
-        (number({"f": float(f)}, "f", "creep.fraction", low=0.0), number({"t": float(t)}, "t", "creep.time_s", low=1e-6))
+        (number({"f": f}, "f", "creep.fraction", low=0.0), number({"t": t}, "t", "creep.time_s", low=1e-6))
         for f, t in zip(fractions, times)
     )
     return replace(robot, creep=robot.creep + terms)
@@ -110,8 +139,24 @@ SOFT_REGION = Effect(
     keys=("center_m", "radius_m", "scale"),
 )
 HYPERELASTIC = Effect(
-    "hyperelastic", "stiffening or softening with stretch", _no_parameters, _apply_law, _law_seeds, keys=("law", "jm")
+    "hyperelastic",
+    "stiffening or softening with stretch",
+    _no_parameters,
+    _apply_law,
+    _law_seeds,
+    keys=("law", "jm"),
+    discrete=True,
 )
-CREEP = Effect(
-    "creep", "slow flow under load", _creep_parameters, _apply_creep, _creep_seeds, keys=("fraction", "time_s"), history=True
+GENT = Effect(
+    "hyperelastic",
+    "stiffening or softening with stretch",
+    _gent_parameters,
+    _apply_law,
+    _gent_seeds,
+    keys=("law", "jm"),
+    discrete=True,
 )
+CREEP = Effect("creep", "slow flow under load", _creep_parameters, _apply_creep, _creep_seeds,
+               keys=("fraction", "time_s"), history=True, polish=_creep_polish)  # fmt: skip
+CREEP_TWICE = Effect("creep", "slow flow under load", _creep_twice_parameters, _apply_creep, _creep_twice_seeds,
+                     keys=("fraction", "time_s"), history=True, polish=_creep_twice_polish)  # fmt: skip

@@ -2,30 +2,48 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from femsense.effects.effect import Effect, Entry, Parameter, number
 from femsense.errors import InputError
 from femsense.model import Robot
 
+KEYS = ("stiffness_n_m", "rotation_stiffness_nm_rad")
 
-def _clamp_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
+
+def _spring_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
     """The coordinate is the compliance of a node's spring [m/N], which is 0 for the clamp."""
     count = len(robot.body.clamp_nodes)
     if not count:
         return ()
-    reach = float((robot.body.mesh.nodes.max(axis=0) - robot.body.mesh.nodes.min(axis=0)).max())
-    body_compliance = count / (float(robot.body.material.young_modulus.mean()) * reach)
-    return (Parameter("stiffness_n_m", None, "N/m", 0.0, 0.0, 10.0 * body_compliance, 1e-3 * body_compliance, "reciprocal"),)
+    compliance = count / (float(robot.body.material.young_modulus.mean()) * robot.body.reach)
+    return (Parameter(KEYS[0], None, "N/m", 0.0, 0.0, 10.0 * compliance, 1e-4 * compliance, "reciprocal"),)
+
+
+def _plate_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
+    """The coordinate is the compliance of the plate [rad/(N m)], which is 0 for the clamp."""
+    nodes = robot.body.mesh.nodes[robot.body.clamp_nodes]
+    if len(nodes) < 3:
+        return ()
+    width = float(
+        np.sort(np.ptp(nodes, axis=0))[-2]
+    )  # of the clamped face; a bar of that width bends by reach/(E w⁴/12) a moment
+    bending = 12.0 * robot.body.reach / (float(robot.body.material.young_modulus.mean()) * max(width, 1e-3) ** 4)
+    return (Parameter(KEYS[1], None, "N m/rad", 0.0, 0.0, 2.0 * bending, 1e-5 * bending, "reciprocal"),)
 
 
 def _apply_clamp(robot: Robot, entry: Entry) -> Robot:
-    if "rotation_stiffness_nm_rad" in entry:
-        raise InputError("a clamp that turns as a whole is not modelled", where="base_compliance.rotation_stiffness_nm_rad",
-                         expected="stiffness_n_m", hint="give the spring of each node, stiffness_n_m")  # fmt: skip
-    value = entry.get("stiffness_n_m")
-    stiffness = float("inf") if value == float("inf") else number(entry, "stiffness_n_m", "base_compliance", low=1e-6)
-    return robot.with_body(robot.body.with_clamp_stiffness(stiffness))
+    if not any(key in entry for key in KEYS):
+        raise InputError("neither spring is given", where="base_compliance", expected=" or ".join(KEYS))
+    if not len(robot.body.clamp_nodes):
+        raise InputError("nothing of this body is clamped", where="base_compliance", expected="[[fixed]]")
+    spring, plate = (
+        float("inf") if entry.get(key, np.inf) == float("inf") else number(entry, key, "base_compliance", low=1e-9)
+        for key in KEYS
+    )
+    return robot.with_body(robot.body.with_clamp_stiffness(spring, turn=plate))
 
 
-BASE_COMPLIANCE = Effect(
-    "base_compliance", "a clamp that gives", _clamp_parameters, _apply_clamp, keys=("stiffness_n_m", "rotation_stiffness_nm_rad")
-)
+BASE_COMPLIANCE = Effect("base_compliance", "a clamp that gives", _spring_parameters, _apply_clamp, keys=KEYS)
+BASE_ROTATION = Effect("base_compliance", "a clamp that gives", _plate_parameters, _apply_clamp, keys=KEYS)
+"""The same effect with the other key: the loop tries both."""

@@ -9,6 +9,7 @@ import scipy.sparse as sp
 
 from femsense.arrays import FloatArray, IntArray
 from femsense.fem.body import BodyModel
+from femsense.fem.clamp import clamp_energy_and_forces, ties_of
 from femsense.fem.corotational import corotational_kernel
 from femsense.fem.hyperelastic import hyperelastic_kernel
 
@@ -28,7 +29,8 @@ class Internal:
 def internal(body: BodyModel, positions: FloatArray, *, tangent: bool = True) -> Internal:
     """Return internal energy, forces and (if asked) stiffness of the body at the given node positions [m], shape (n, 3).
 
-    The clamp's springs, where the body has them, belong to it.
+    The clamp's springs, where the body has them, belong to it; of a plate that turns, the blocks hold the sparse part only
+    (see `clamp.with_turning_plate`).
     """
     stencil, material = body.stencil, body.material
     mu, lam = material.lame()
@@ -37,18 +39,14 @@ def internal(body: BodyModel, positions: FloatArray, *, tangent: bool = True) ->
     kernel = corotational_kernel if material.law == "corotational" else hyperelastic_kernel
     limit = material.stretch_limit if material.law == "gent" else np.inf
     energy = kernel(np.ascontiguousarray(positions), body.mesh.tets, stencil.gradients, stencil.volumes, mu, lam, limit, tangent, stencil.slots, forces, blocks)  # fmt: skip
-    if np.isfinite(body.clamp_stiffness):
-        energy += _add_clamp_springs(body, positions, forces, blocks if tangent else None)
+    ties = ties_of(body)
+    if ties is not None:
+        extra, slopes = clamp_energy_and_forces(body, ties, positions)
+        energy += extra
+        forces[ties.nodes] += slopes
+        if tangent:
+            blocks[np.ix_(diagonal_slots(body)[ties.nodes], np.array([0, 4, 8]))] += ties.stiffness
     return Internal(float(energy), forces, blocks if tangent else None)
-
-
-def _add_clamp_springs(body: BodyModel, positions: FloatArray, forces: FloatArray, blocks: FloatArray | None) -> float:
-    nodes, stiffness = body.clamp_nodes, body.clamp_stiffness
-    stretch = positions[nodes] - body.mesh.nodes[nodes]
-    forces[nodes] += stiffness * stretch
-    if blocks is not None:
-        blocks[np.ix_(diagonal_slots(body)[nodes], np.array([0, 4, 8]))] += stiffness
-    return 0.5 * stiffness * float((stretch**2).sum())
 
 
 def diagonal_slots(body: BodyModel) -> IntArray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -88,6 +88,26 @@ class BodyModel:
     cable_slots: tuple[IntArray, ...]
     """Where the geometric stiffness of each segment of each cable goes, one array (s, 2k, 2k) a cable."""
     free_map: FreeMap
+    clamp_turn_stiffness: float = np.inf
+    """The clamp as a rigid plate turns about `clamp_center` against this spring [N m/rad]; inf: it does not turn."""
+    released: list[FreeMap] = field(default_factory=list)
+    """The free map without the clamp, once it has been needed; bodies of one mesh share it."""
+
+    @property
+    def clamp_is_rigid(self) -> bool:
+        """Whether clamped nodes stay where they are."""
+        return bool(np.isinf(self.clamp_stiffness) and np.isinf(self.clamp_turn_stiffness))
+
+    @property
+    def clamp_center(self) -> FloatArray:
+        """Centroid of the clamped nodes of the declared mesh at rest [m], shape (3,); of all nodes where none is clamped."""
+        nodes = self.mesh.nodes
+        return np.asarray((nodes[self.clamp_nodes] if len(self.clamp_nodes) else nodes).mean(axis=0))
+
+    @property
+    def reach(self) -> float:
+        """Longest side of the box around the body at rest [m]."""
+        return float(np.ptp(self.mesh.nodes, axis=0).max())
 
     @property
     def cable_names(self) -> tuple[str, ...]:
@@ -103,7 +123,7 @@ class BodyModel:
 
     def is_held(self) -> bool:
         """Return whether clamp or springs stop every rigid motion: three of their nodes are not on a line."""
-        nodes = self.mesh.nodes[self.clamped if np.isinf(self.clamp_stiffness) else self.clamp_nodes]
+        nodes = self.mesh.nodes[self.clamped if np.isinf(self.clamp_stiffness) else self.clamp_nodes]  # a plate holds all of them
         if len(nodes) < 3:
             return False
         spread = np.linalg.svd(nodes - nodes.mean(axis=0), compute_uv=False)
@@ -133,10 +153,35 @@ class BodyModel:
             raise InputError("the paths of the cables must stay", where="cables", hint="make_body builds a body with other paths")
         return replace(self, cables=cables)
 
-    def with_clamp_stiffness(self, stiffness: float) -> BodyModel:
-        """Return the body on springs instead of the clamp [N/m a node and direction]; inf gives the clamp back."""
-        fixed = self.clamped if np.isinf(stiffness) else np.zeros(0, dtype=np.int64)
-        return replace(self, clamp_stiffness=float(stiffness), free_map=make_free_map(self.stencil, self.mesh, fixed))
+    def with_clamp_stiffness(self, stiffness: float = np.inf, *, turn: float = np.inf) -> BodyModel:
+        """Return the body on a clamp that gives (see `femsense.fem.clamp`).
+
+        Arguments:
+            stiffness: of a spring in each direction at every node of `clamp_nodes` [N/m]; inf: none gives.
+            turn: of the plate about `clamp_center` [N m/rad]; inf: it does not turn. Both inf give the clamp back.
+        """
+        if np.isinf(stiffness) and np.isinf(turn):
+            free_map = make_free_map(self.stencil, self.mesh, self.clamped)
+        else:
+            if not self.released:
+                self.released.append(make_free_map(self.stencil, self.mesh, np.zeros(0, dtype=np.int64)))
+            free_map = self.released[0]
+        return replace(self, clamp_stiffness=float(stiffness), clamp_turn_stiffness=float(turn), free_map=free_map)
+
+    def scaled(self, scale: float) -> BodyModel:
+        """Return the body made larger about `clamp_center`: its nodes at rest, and with them what is tied to it.
+
+        Pull points stay in space. Gradients go with 1/scale and volumes with scale³; patterns and ties stay.
+        """
+        center, stencil = self.clamp_center, self.stencil
+        mesh = TetMesh(center + scale * (self.mesh.nodes - center), self.mesh.tets)
+        grown = replace(
+            stencil,
+            gradients=freeze(stencil.gradients / scale),
+            volumes=freeze(stencil.volumes * scale**3),
+            node_volume=freeze(stencil.node_volume * scale**3),
+        )
+        return replace(self, mesh=mesh, stencil=grown)
 
 
 def make_body(

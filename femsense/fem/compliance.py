@@ -17,6 +17,7 @@ from femsense.errors import FemsenseError, InputError
 from femsense.fem.assembly import internal, reduced_values
 from femsense.fem.body import BodyModel
 from femsense.fem.cables import add_cable_stiffness, cable_forces, pull_rows
+from femsense.fem.clamp import with_turning_plate
 from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.linear import Factorization, factorize
 from femsense.fem.mesh import Embedding, embed_points
@@ -60,7 +61,7 @@ def tangent_at(body: BodyModel, equilibrium: Equilibrium) -> Tangent:
     blocks = internal(body, equilibrium.positions).blocks
     assert blocks is not None
     add_cable_stiffness(body, equilibrium.positions, equilibrium.segment_tensions, blocks)
-    factor = factorize(body.free_map.pattern, reduced_values(body, blocks))
+    factor = with_turning_plate(body, equilibrium.positions, factorize(body.free_map.pattern, reduced_values(body, blocks)))
     if factor is None or (factor.negative > 0 and not body.is_held()):
         raise FemsenseError("the stiffness is singular: nothing holds the body (clamp more nodes)")
     dofs = body.free_map.dofs

@@ -19,6 +19,7 @@ from femsense.errors import InputError
 from femsense.fem.assembly import Internal, internal, reduced_values
 from femsense.fem.body import BodyModel, Cable
 from femsense.fem.cables import add_cable_stiffness, bend_angles, cable_forces, cable_length, rub, segments, shortening
+from femsense.fem.clamp import with_turning_plate
 from femsense.fem.linear import Factorization, factorize_definite
 
 CONVERGED = "converged"
@@ -310,7 +311,9 @@ def _factor_here(body: BodyModel, here: Internal, state: _State) -> Factorizatio
     blocks = internal(body, state.x).blocks if here.blocks is None else here.blocks.copy()
     assert blocks is not None
     add_cable_stiffness(body, state.x, tuple(np.maximum(T, 0.0) * s for T, s in zip(state.T, state.shares)), blocks)
-    return factorize_definite(body.free_map.pattern, reduced_values(body, blocks))[0]
+    plain = factorize_definite(body.free_map.pattern, reduced_values(body, blocks))[0]
+    whole = with_turning_plate(body, state.x, plain)
+    return whole if whole is None or whole.negative == 0 else plain  # the plate only ever softens, so that plain leads downhill
 
 
 def _rows(body: BodyModel, state: _State) -> FloatArray:

@@ -1,0 +1,155 @@
+"""Effects of the shape: a mesh that is not fine enough, and a body made or swollen to another size."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from femsense.arrays import FloatArray, IntArray, freeze
+from femsense.effects.effect import Effect, Entry, Parameter, number
+from femsense.errors import InputError
+from femsense.fem.body import BodyModel, make_body, tie_cable
+from femsense.fem.mesh import TetMesh, embed_points, refined, to_linear, to_quadratic
+from femsense.model import Robot
+
+MOST_REFINEMENTS = 3
+"""Each refinement makes eight elements of one."""
+MOST_TETS = 60000
+"""A finer mesh than this is not tried by itself."""
+
+
+def _size_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
+    return (Parameter("scale", None, "1", 0.0, float(np.log(0.8)), float(np.log(1.25)), 1e-4, "log"),)
+
+
+def _apply_size(robot: Robot, entry: Entry) -> Robot:
+    scale = number(entry, "scale", "geometry", low=0.2, high=5.0)
+    body = robot.body.scaled(scale)
+    center = robot.body.clamp_center
+    ties = replace(robot.markers, outside=freeze(scale * robot.markers.outside))
+    return replace(robot, body=body, marker_points=freeze(center + scale * (robot.marker_points - center)), markers=ties)
+
+
+def _mesh_seeds(robot: Robot) -> tuple[Entry, ...]:
+    """Quadratic elements and a finer mesh, where the mesh is linear and what comes of it can be computed."""
+    mesh = robot.body.mesh
+    if mesh.is_quadratic:
+        return ()
+    finer: tuple[Entry, ...] = ({"refinements": 1},) if 8 * len(mesh.tets) <= MOST_TETS else ()
+    return ({"element": "tet10"}, *finer)
+
+
+def _no_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
+    return ()
+
+
+def _apply_mesh(robot: Robot, entry: Entry) -> Robot:
+    element, refinements = entry.get("element"), entry.get("refinements", 0)
+    if element is None and "refinements" not in entry:
+        raise InputError(
+            "neither element nor refinements", where="discretisation", expected='element = "tet10", or refinements = 1'
+        )
+    if element not in (None, "tet4", "tet10"):
+        raise InputError("unknown element", where="discretisation.element", found=element, expected="tet4 | tet10")
+    if isinstance(refinements, bool) or not isinstance(refinements, int) or not 0 <= refinements <= MOST_REFINEMENTS:
+        raise InputError(
+            "not a whole number in range",
+            where="discretisation.refinements",
+            found=refinements,
+            expected=f"0 … {MOST_REFINEMENTS}",
+        )
+    mesh = finer_mesh(robot.body.mesh, element, refinements)
+    return robot if mesh is robot.body.mesh else robot_on_mesh(robot, mesh)
+
+
+def finer_mesh(mesh: TetMesh, element: str | None, refinements: int) -> TetMesh:
+    """Return a mesh of another element (None: the same), each element split into eight so many times."""
+    quadratic = mesh.is_quadratic if element is None else element == "tet10"
+    if not refinements and quadratic == mesh.is_quadratic:
+        return mesh
+    fine = to_linear(mesh)
+    for _ in range(refinements):
+        fine = refined(fine)
+    return to_quadratic(fine) if quadratic else fine
+
+
+def robot_on_mesh(robot: Robot, mesh: TetMesh) -> Robot:
+    """Return the robot with its body on another mesh of the same shape; markers, features and cables stay where they are."""
+    old = robot.body.mesh
+    boxes = declared_boxes(robot)
+    clamped = None if boxes is None else np.flatnonzero(_inside(mesh.nodes, boxes))
+    features = cKDTree(mesh.nodes).query(old.nodes[robot.features])[1] if len(robot.features) else robot.features
+    return replace(
+        robot,
+        body=body_on_mesh(robot.body, mesh, clamped=clamped),
+        markers=embed_points(mesh, robot.marker_points),
+        features=freeze(features, np.int64),
+    )
+
+
+def declared_boxes(robot: Robot) -> FloatArray | None:
+    """Return the boxes of [[fixed]] [m], shape (b, 2, 3), if they clamp just the nodes that are clamped; else None."""
+    document = robot.document
+    tables = document.get("fixed", []) if isinstance(document, Mapping) else []
+    boxes = np.array([t["box_m"] for t in tables], dtype=float).reshape(-1, 2, 3)
+    hold = np.array_equal(np.flatnonzero(_inside(robot.body.mesh.nodes, boxes)), robot.body.clamped)
+    return boxes if len(boxes) and hold else None
+
+
+def _inside(points: FloatArray, boxes: FloatArray) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    slack = 2 * np.spacing(np.abs(boxes))
+    low, high = boxes[:, 0] - slack[:, 0], boxes[:, 1] + slack[:, 1]
+    return np.asarray(((points[:, None] >= low) & (points[:, None] <= high)).all(axis=2).any(axis=1))
+
+
+def body_on_mesh(body: BodyModel, mesh: TetMesh, *, clamped: IntArray | None = None) -> BodyModel:
+    """Return a body on another mesh of the same shape.
+
+    Arguments:
+        body: the body.
+        mesh: elements take the material of the element that holds their centre; springs of the clamp and dead loads stay where they are.
+        clamped: nodes of the new mesh; by default those that moved with clamped nodes alone.
+    """
+    if clamped is None:
+        ties = embed_points(body.mesh, mesh.nodes)
+        is_clamped = np.zeros(len(body.mesh.nodes), dtype=bool)
+        is_clamped[body.clamped] = True
+        clamped = np.flatnonzero(np.abs(np.where(is_clamped[ties.nodes], 0.0, ties.weights)).max(axis=1) < 1e-6)
+    parent = embed_points(body.mesh, mesh.nodes[mesh.tets[:, :4]].mean(axis=1)).element
+    springs = cKDTree(mesh.nodes).query(body.mesh.nodes[body.clamp_nodes])[1] if len(body.clamp_nodes) else np.zeros(0, np.int64)
+    made = make_body(
+        mesh,
+        young_modulus=body.material.young_modulus[parent],
+        poisson_ratio=body.material.poisson_ratio[parent],
+        density=body.material.density,
+        clamped=clamped,
+        clamp_nodes=springs,
+        cables=tuple(
+            replace(c, path=tie_cable(mesh, c.name, c.path.positions(body.mesh.nodes), c.pull_point).path) for c in body.cables
+        ),
+        gravity=body.gravity,
+    )
+    made = made.with_material(replace(made.material, law=body.material.law, stretch_limit=body.material.stretch_limit))
+    if not body.clamp_is_rigid:
+        made = made.with_clamp_stiffness(body.clamp_stiffness, turn=body.clamp_turn_stiffness)
+    loaded = np.flatnonzero(body.dead_forces.any(axis=1))
+    if not len(loaded):
+        return made
+    return made.with_dead_forces(embed_points(mesh, body.mesh.nodes[loaded]).spread(body.dead_forces[loaded], len(mesh.nodes)))
+
+
+DISCRETISATION = Effect(
+    "discretisation",
+    "a mesh fine enough",
+    _no_parameters,
+    _apply_mesh,
+    _mesh_seeds,
+    keys=("element", "refinements"),
+    discrete=True,
+)
+GEOMETRY = Effect("geometry", "a body made or swollen to another size", _size_parameters, _apply_size, keys=("scale",))
+
+__all__ = ["DISCRETISATION", "GEOMETRY", "body_on_mesh", "finer_mesh", "robot_on_mesh"]

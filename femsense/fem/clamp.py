@@ -1,0 +1,198 @@
+"""A clamp that gives: springs at its nodes, and a rigid plate that turns about its centre against a spring.
+
+The plate turns by R = exp[φ]× about the centroid c of the clamped nodes of the declared mesh. Each tied node i, at rest X_i, has its
+anchor at c + b_i, b_i = R (X_i − c), and with y_i = x_i − c the clamp's energy is
+
+    E(x) = min over φ of  ½ Σ k |y_i − b_i|² + ½ κ |φ|².
+
+At the minimum κ φ = Σ k b_i × y_i; the force on a node is k (b_i − y_i), and d²E/dx² = k I − P J⁻¹ Pᵀ with P_i = k [b_i]× and
+J = κ J_l⁻¹(φ) + Σ k ((b·y) I − b yᵀ), J_l the left Jacobian of the rotation. The part P J⁻¹ Pᵀ has rank three and goes beside the
+sparse stiffness (Woodbury).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from femsense.arrays import FloatArray, IntArray
+from femsense.fem.body import BodyModel
+from femsense.fem.linear import Factorization
+from femsense.pose import rotation_from_vector
+
+TIE = 1e4
+"""Where the plate alone gives, its nodes are tied to it with springs that are together so many times as stiff as Young's modulus × reach."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Ties:
+    """The nodes that springs hold, and their springs."""
+
+    nodes: IntArray
+    """shape (k,)."""
+    stiffness: float
+    """Of each spring [N/m]."""
+    center: FloatArray
+    """The plate's centre of rotation [m], shape (3,)."""
+    turn_stiffness: float
+    """Of the plate [N m/rad]; inf: it does not turn."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Plate:
+    """Where the plate rests for given node positions."""
+
+    turn: FloatArray
+    """Rotation vector φ [rad], shape (3,)."""
+    arms: FloatArray
+    """b_i, from the centre to the anchors [m], shape (k, 3)."""
+    jacobian: FloatArray
+    """J [N m/rad], shape (3, 3)."""
+
+
+def ties_of(body: BodyModel) -> Ties | None:
+    """Return the springs of a body's clamp; None where it is rigid."""
+    if body.clamp_is_rigid:
+        return None
+    nodes, stiffness = body.clamp_nodes, body.clamp_stiffness
+    if np.isinf(stiffness):
+        nodes = body.clamped
+        stiffness = TIE * float(np.median(body.material.young_modulus)) * body.reach / len(nodes)
+    return Ties(nodes, stiffness, body.clamp_center, body.clamp_turn_stiffness)
+
+
+def plate_at(body: BodyModel, ties: Ties, positions: FloatArray) -> Plate:
+    """Return where the plate rests for node positions [m], shape (n, 3). A plate that does not turn has J = inf."""
+    rest, y = body.mesh.nodes[ties.nodes] - ties.center, positions[ties.nodes] - ties.center
+    turn = np.zeros(3)
+    if np.isinf(ties.turn_stiffness):
+        return Plate(turn, rest, np.full((3, 3), np.inf))
+    k, kappa = ties.stiffness, ties.turn_stiffness
+    for _ in range(50):
+        arms = rest @ rotation_from_vector(turn).T
+        jacobian = kappa * _left_jacobian_inverse(turn) + k * (float((arms * y).sum()) * np.eye(3) - arms.T @ y)
+        moment = k * np.cross(arms, y).sum(axis=0) - kappa * turn
+        step = np.linalg.solve(jacobian, moment)
+        if np.abs(step).max() < 1e-14:
+            break
+        turn = _vector_of(rotation_from_vector(step) @ rotation_from_vector(turn))
+    return Plate(turn, arms, jacobian)
+
+
+def clamp_energy_and_forces(body: BodyModel, ties: Ties, positions: FloatArray) -> tuple[float, FloatArray]:
+    """Return the energy of the springs [J] and its slope dE/dx at the tied nodes [N], shape (k, 3)."""
+    plate = plate_at(body, ties, positions)
+    stretch = positions[ties.nodes] - ties.center - plate.arms
+    energy = 0.5 * ties.stiffness * float((stretch**2).sum())
+    if np.isfinite(ties.turn_stiffness):
+        energy += 0.5 * ties.turn_stiffness * float(plate.turn @ plate.turn)
+    return energy, ties.stiffness * stretch
+
+
+def clamp_turn(body: BodyModel, positions: FloatArray) -> FloatArray:
+    """Return by how much the clamp has turned about its centre [rad], a rotation vector of shape (3,)."""
+    ties = ties_of(body)
+    return np.zeros(3) if ties is None else plate_at(body, ties, positions).turn
+
+
+class TurningFactor:
+    """A factorised stiffness with the rank-three part of a turning plate: K⁻¹ of K = K₀ − P J⁻¹ Pᵀ."""
+
+    def __init__(self, plain: Factorization, columns: FloatArray, jacobian: FloatArray) -> None:
+        self._plain, self._columns = plain, columns
+        self._answers = plain.solve(columns)
+        inner = jacobian - columns.T @ self._answers
+        self._inner = (inner + inner.T) / 2.0
+        self.negative = plain.negative + int((np.linalg.eigvalsh(self._inner) <= 0).sum())
+        self.size, self.bytes = plain.size, plain.bytes + self._answers.nbytes
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        """Return K⁻¹ right, shape (f,) or (f, k)."""
+        answer = self._plain.solve(right)
+        return np.asarray(answer + self._answers @ np.linalg.solve(self._inner, self._columns.T @ answer))
+
+
+def with_turning_plate(body: BodyModel, positions: FloatArray, factor: Factorization | None) -> Factorization | None:
+    """Return the factor of the whole stiffness, plate included, from that of its sparse part."""
+    ties = ties_of(body)
+    if factor is None or ties is None or np.isinf(ties.turn_stiffness):
+        return factor
+    plate = plate_at(body, ties, positions)
+    full = np.zeros((len(positions), 3, 3))
+    full[ties.nodes] = ties.stiffness * _cross_matrices(plate.arms)
+    columns = full.reshape(-1, 3)[body.free_map.dofs]
+    return TurningFactor(factor, columns, plate.jacobian)
+
+
+def first_give(body: BodyModel, forces: FloatArray) -> FloatArray:
+    """Return how the nodes of a rigid clamp would move [m], shape (n, 3), to first order in the compliance that `body` has.
+
+    Arguments:
+        body: with springs that are stiff.
+        forces: that the rigid clamp takes up at its nodes [N], shape (n, 3). A clamped node that has no spring (in the middle of an
+            edge) follows its neighbours: it gives its force to the nearest nodes with springs, and moves as they do.
+    """
+    ties = ties_of(body)
+    moves = np.zeros_like(forces)
+    if ties is None:
+        return moves
+    rest = body.mesh.nodes
+    if np.isfinite(body.clamp_stiffness):
+        share = _shares(rest[body.clamped], rest[ties.nodes])
+        moves[body.clamped] = share @ (share.T @ forces[body.clamped]) / ties.stiffness
+    if np.isfinite(ties.turn_stiffness):
+        arms = rest[body.clamped] - ties.center
+        turn = np.cross(arms, forces[body.clamped]).sum(axis=0) / ties.turn_stiffness
+        moves[body.clamped] += np.cross(turn, arms)
+    return moves
+
+
+def _shares(points: FloatArray, nodes: FloatArray) -> FloatArray:
+    """Return how much of each point (p, 3) goes with each node (k, 3): all with a node that it is, half with both ends of its edge."""
+    distance = np.linalg.norm(points[:, None] - nodes[None], axis=2)
+    near = np.argsort(distance, axis=1)[:, :2]
+    share = np.zeros(distance.shape)
+    rows = np.arange(len(points))
+    single = distance[rows, near[:, 0]] < 1e-9
+    share[rows, near[:, 0]] = np.where(single, 1.0, 0.5)
+    share[rows[~single], near[~single, 1]] = 0.5
+    return share
+
+
+def _cross_matrices(vectors: FloatArray) -> FloatArray:
+    """Return [v]× of vectors (k, 3), shape (k, 3, 3)."""
+    result = np.zeros((len(vectors), 3, 3))
+    x, y, z = vectors.T
+    result[:, 0, 1], result[:, 0, 2], result[:, 1, 2] = -z, y, -x
+    result[:, 1, 0], result[:, 2, 0], result[:, 2, 1] = z, -y, x
+    return result
+
+
+def _left_jacobian_inverse(turn: FloatArray) -> FloatArray:
+    """Return dφ/dδ for exp[δ]× exp[φ]× (Solà et al. 2018, equation 146)."""
+    angle = float(np.linalg.norm(turn))
+    cross = _cross_matrices(turn[None])[0]
+    if angle < 1e-6:
+        return np.asarray(np.eye(3) - cross / 2.0 + cross @ cross / 12.0)
+    factor = 1.0 / angle**2 - (1.0 + np.cos(angle)) / (2.0 * angle * np.sin(angle))
+    return np.asarray(np.eye(3) - cross / 2.0 + factor * cross @ cross)
+
+
+def _vector_of(rotation: FloatArray) -> FloatArray:
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_matrix(rotation).as_rotvec())
+
+
+__all__ = [
+    "TIE",
+    "Plate",
+    "Ties",
+    "clamp_energy_and_forces",
+    "clamp_turn",
+    "first_give",
+    "plate_at",
+    "ties_of",
+    "with_turning_plate",
+]
