@@ -265,7 +265,12 @@ def with_marker_table(
 def state_key(recording: Recording, frame: int) -> bytes:
     """Return what tells apart frames under different inputs, loads or gravity."""
     rows = recording.load_frame == frame
-    parts = [recording.inputs[frame], recording.load_points[rows].ravel(), recording.load_forces[rows].ravel()]
+    parts = [
+        recording.inputs[frame],
+        recording.pressures[frame],
+        recording.load_points[rows].ravel(),
+        recording.load_forces[rows].ravel(),
+    ]
     if recording.gravity is not None:
         parts.append(recording.gravity[frame])
     return np.concatenate([np.asarray(p, dtype=float).ravel() for p in parts]).tobytes()
@@ -326,14 +331,14 @@ def _check_parts(recording: Recording) -> None:
 
 
 def check_against(robot: Robot, recording: Recording) -> Recording:
-    """Return the recording as this robot needs it: cables in the robot's order, without markers that the robot lacks.
+    """Return the recording as this robot needs it: cables and chambers in the robot's order, without markers that the robot lacks.
 
-    Warns of markers that are dropped and of inputs beyond the cables' limits.
+    Warns of markers that are dropped and of inputs beyond the limits of cables and chambers.
 
     Raises:
-        InputError: other cables than the robot's, no marker in common, a known load far from the body.
+        InputError: other cables or chambers than the robot's, no marker in common, a known load far from the body.
     """
-    fitted = _without_strangers(robot, _with_cable_order(robot, recording))
+    fitted = _without_strangers(robot, _with_chamber_order(robot, _with_cable_order(robot, recording)))
     _check_loads(robot, fitted)
     _warn_of_inputs(robot, fitted)
     return fitted
@@ -345,20 +350,32 @@ def _place(recording: Recording, file: str) -> str:
 
 def _with_cable_order(robot: Robot, recording: Recording) -> Recording:
     wanted = robot.body.cable_names
-    if set(wanted) != set(recording.cable_names):
-        lacking = [name for name in wanted if name not in recording.cable_names]
-        extra = [name for name in recording.cable_names if name not in wanted]
+    order = _drive_order(robot, recording, "cable", wanted, recording.cable_names)
+    return replace(recording, cable_names=wanted, inputs=freeze(recording.inputs[:, order]))
+
+
+def _with_chamber_order(robot: Robot, recording: Recording) -> Recording:
+    wanted = robot.body.chamber_names
+    order = _drive_order(robot, recording, "chamber", wanted, recording.chamber_names)
+    return replace(recording, chamber_names=wanted, pressures=freeze(recording.pressures[:, order]))
+
+
+def _drive_order(robot: Robot, recording: Recording, kind: str, wanted: tuple[str, ...], given: tuple[str, ...]) -> list[int]:
+    """Return where the robot's cables or chambers stand among the columns."""
+    if set(wanted) != set(given):
+        lacking = [name for name in wanted if name not in given]
+        extra = [name for name in given if name not in wanted]
         parts = [f"lacks {', '.join(lacking)}"] if lacking else []
         parts += [f"has {', '.join(extra)} that the robot has not"] if extra else []
+        idle = "a cable that was slack" if kind == "cable" else "a chamber without pressure"
         raise InputError(
-            f"other cables than those of the robot {robot.name!r}: the recording {' and '.join(parts)}",
+            f"other {kind}s than those of the robot {robot.name!r}: the recording {' and '.join(parts)}",
             where=_place(recording, "frames.csv"),
-            found=", ".join(f"cable_{name}" for name in recording.cable_names) or "no cable columns",
-            expected=", ".join(f"cable_{name}" for name in wanted) or "no cable columns",
-            hint=near(extra[0], wanted) if extra else "a cable that was slack has a column of zeros",
+            found=", ".join(f"{kind}_{name}" for name in given) or f"no {kind} columns",
+            expected=", ".join(f"{kind}_{name}" for name in wanted) or f"no {kind} columns",
+            hint=near(extra[0], wanted) if extra else f"{idle} has a column of zeros",
         )
-    order = [recording.cable_names.index(name) for name in wanted]
-    return replace(recording, cable_names=wanted, inputs=freeze(recording.inputs[:, order]))
+    return [given.index(name) for name in wanted]
 
 
 def _without_strangers(robot: Robot, recording: Recording) -> Recording:
@@ -410,7 +427,11 @@ def _check_loads(robot: Robot, recording: Recording) -> None:
 
 
 def _warn_of_inputs(robot: Robot, recording: Recording) -> None:
-    """Warn of tensions beyond what the cables are declared for."""
+    """Warn of pressures and tensions beyond what chambers and cables are declared for."""
+    for j, chamber in enumerate(robot.body.chambers):
+        highest = recording.pressures[:, j].max(initial=-np.inf)
+        if highest > chamber.max_pressure * (1 + 1e-9):
+            warnings.warn(f"{_place(recording, 'frames.csv')}: chamber {chamber.name!r} reaches {highest:.4g} Pa, more than its max_pressure_pa of {chamber.max_pressure:.4g} Pa", stacklevel=3)  # fmt: skip
     if recording.actuation != "tension" or recording.actuation_zero != "absolute":
         return
     for j, cable in enumerate(robot.body.cables):

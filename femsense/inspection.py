@@ -16,8 +16,9 @@ import numpy as np
 from femsense import meshfile, recording, robot
 from femsense.arrays import FloatArray
 from femsense.errors import FemsenseError, InputError
-from femsense.fem.body import Cable
-from femsense.fem.mesh import TetMesh, check_mesh, element_volumes, surface_triangles
+from femsense.fem.body import Cable, Chamber
+from femsense.fem.chambers import chamber_volume
+from femsense.fem.mesh import TetMesh, check_mesh, element_volumes, surface_triangles, triangle_normals
 from femsense.files import plain
 from femsense.model import Robot
 from femsense.pose import check_pose
@@ -230,7 +231,7 @@ def _robot_report(loaded: Robot, document: Mapping[str, Any]) -> Report:
         "gravity_m_s2": body.gravity,
         "clamped_nodes": len(body.clamped),
         "cables": [_cable_report(cable, body.mesh) for cable in body.cables],
-        "chambers": [item["name"] for item in document.get("chambers", [])],
+        "chambers": [_chamber_report(chamber, body.mesh) for chamber in body.chambers],
         "markers": [
             {"name": name, "position_mm": 1e3 * point, "outside_mm": 1e3 * float(outside)}
             for name, point, outside in zip(loaded.marker_names, loaded.marker_points, loaded.markers.outside)
@@ -256,6 +257,16 @@ def _cable_report(cable: Cable, mesh: TetMesh) -> Report:
         "bends_deg": float(np.degrees(angles.sum())),
         "outside_mm": 1e3 * float(cable.path.outside.max()),
         "max_tension_n": cable.max_tension,
+    }
+
+
+def _chamber_report(chamber: Chamber, mesh: TetMesh) -> Report:
+    area = np.linalg.norm(triangle_normals(mesh.nodes, chamber.faces[:, :3]), axis=1)
+    return {
+        "name": chamber.name,
+        "volume_cm3": 1e6 * chamber_volume(chamber, mesh.nodes),
+        "area_cm2": 1e4 * float(area.sum()),
+        "max_pressure_kpa": 1e-3 * chamber.max_pressure,
     }
 
 

@@ -15,6 +15,7 @@ from femsense.arrays import FloatArray, IntArray, freeze
 from femsense.errors import DataError
 from femsense.fem.assembly import internal
 from femsense.fem.cables import bend_angles, cable_forces, rub, shortening
+from femsense.fem.chambers import volume_gradient
 from femsense.fem.clamp import first_give
 from femsense.fem.compliance import tangent_at
 from femsense.fem.equilibrium import Equilibrium, solve_equilibrium
@@ -42,6 +43,8 @@ class Drive:
     """Where it acts, at rest [m], shape (L, 3)."""
     load_forces: FloatArray
     """[N], shape (L, 3), creep included."""
+    pressures: FloatArray
+    """[Pa], shape (F, c), in the order of the body's chambers, creep included."""
 
 
 def drive_of(robot: Robot, recording: Recording, *, initial: FloatArray | None = None) -> Drive:
@@ -65,7 +68,10 @@ def drive_of(robot: Robot, recording: Recording, *, initial: FloatArray | None =
     else:
         inputs = act.gain * recorded + act.displacement_offset - act.slack
     frame, points, forces = _creep_loads(recording, robot.creep)
-    return Drive(recording.actuation, freeze(inputs), recording.gravity, frame, points, forces)
+    order = [recording.chamber_names.index(name) for name in robot.body.chamber_names] if recording.chamber_names else []
+    pressures = recording.pressures[:, order] if order else np.zeros((len(recording.time_s), len(robot.body.chambers)))
+    pressures = _creep(pressures, recording.time_s, robot.creep)
+    return Drive(recording.actuation, freeze(inputs), recording.gravity, frame, points, forces, freeze(pressures))
 
 
 def _creep(values: FloatArray, time_s: FloatArray, terms: tuple[tuple[float, float], ...]) -> FloatArray:
@@ -142,8 +148,9 @@ def solve_frame(
         before = tuple(np.zeros(len(c.path)) for c in body.cables)
     tension, held = (values, None) if drive.control == "tension" else (None, values)
     return solve_equilibrium(
-        body, tension=tension, shortening=held, nodal_forces=loads, start=start, before=before, reuse_factor=reuse_factor
-    )
+        body, tension=tension, shortening=held, pressure=dict(zip(body.chamber_names, drive.pressures[frame].tolist())),
+        nodal_forces=loads, start=start, before=before, reuse_factor=reuse_factor,
+    )  # fmt: skip
 
 
 def walk_along(
@@ -221,8 +228,9 @@ def _observe_variants(
             for i, start, move in zip(linear, starts, moves)
         ]
         moves = tangent.respond(np.array([force for force, _, _ in answers]))
-        if base.held.any():
-            moves += np.tensordot(np.array([pulled[base.held] for _, pulled, _ in answers]), tangent.respond_to_held(), axes=1)
+        if base.held.any():  # cables: pressures are never held here
+            held = base.held[: len(walk.robot.body.cables)]
+            moves += np.tensordot(np.array([pulled[held] for _, pulled, _ in answers]), tangent.respond_to_held(), axes=1)
     for i, start, move, (_, _, tensions) in zip(linear, starts, moves, answers):
         memory[1 + i] = tensions
         others[i] = observe(variants[i].robot, replace(base, positions=start + move))
@@ -246,13 +254,15 @@ def _carried(walk: Walk, variant: Walk, k: int, base: Equilibrium, inner: FloatA
 
 
 def _pulls_at(walk: Walk, k: int, base: Equilibrium) -> FloatArray:
-    """Return the nodal forces of dead loads and cables in the base state [N], (n, 3)."""
+    """Return the nodal forces of dead loads, cables and pressures in the base state [N], (n, 3)."""
     body = walk.robot.body
     if walk.drive.gravity is not None:
         body = body.with_gravity(walk.drive.gravity[k])
     force = body.dead_load() + base.nodal_forces
     for cable, along in zip(body.cables, base.segment_tensions):
         force = force + cable_forces(cable, base.positions, along, len(force))
+    for chamber in body.chambers:
+        force = force + base.pressure[chamber.name] * volume_gradient(chamber, base.positions)
     return np.asarray(force)
 
 
@@ -280,6 +290,8 @@ def _out_of_balance(
         along = rub(cable, bend_angles(cable, bent), start, motor) if cable.friction > 0 else np.full(len(cable.path), motor)
         tensions.append(along)
         force = force + cable_forces(cable, x, along, n)
+    for chamber, pressure in zip(body.chambers, variant.drive.pressures[k]):
+        force = force + pressure * volume_gradient(chamber, x)
     stretch = np.array(
         [
             base.tension[c.name] * (1.0 / b.stretch_stiffness - 1.0 / c.stretch_stiffness)
@@ -301,6 +313,7 @@ def _same_mechanics(walk: Walk, variant: Walk) -> bool:
     return (
         variant.robot.body is walk.robot.body
         and np.array_equal(a.inputs, b.inputs)
+        and np.array_equal(a.pressures, b.pressures)
         and np.array_equal(a.load_forces, b.load_forces)
     )
 
@@ -310,7 +323,7 @@ def _key(walk: Walk, variants: Sequence[Walk], frame: int) -> bytes:
     for w in (walk, *variants):
         drive = w.drive
         rows = drive.load_frame == frame
-        parts += [drive.inputs[frame], drive.load_points[rows].ravel(), drive.load_forces[rows].ravel()]
+        parts += [drive.inputs[frame], drive.pressures[frame], drive.load_points[rows].ravel(), drive.load_forces[rows].ravel()]
         if drive.gravity is not None:
             parts.append(drive.gravity[frame])
     return np.concatenate([np.asarray(p, dtype=float) for p in parts]).tobytes()

@@ -218,9 +218,9 @@ def write_run(
         if calibration is not None:
             write_calibration(calibration, part / "calibration.json")
         write_csv(part / "contacts.csv", CONTACT_COLUMNS, [_contact_row(contact) for contact in run.contacts])
-        cables = list(run.robot.body.cable_names)
-        columns = [*FRAME_COLUMNS, *(f"tension_{name}_n" for name in cables)]
-        write_csv(part / "frames.csv", columns, [_frame_row(frame, cables) for frame in run.frames])
+        cables, chambers = run.robot.body.cable_names, run.robot.body.chamber_names
+        columns = [*FRAME_COLUMNS, *(f"tension_{name}_n" for name in cables), *(f"pressure_{name}_pa" for name in chambers)]
+        write_csv(part / "frames.csv", columns, [_frame_row(frame, cables, chambers) for frame in run.frames])
         _write_states(run.states, part / "states.npz")
         write_json(part / "run.json", _run_document(run, inputs, seconds))
     return Path(folder)
@@ -280,9 +280,9 @@ def _contact_row(contact: ContactForce) -> list[object]:
     return [c.frame, c.time_s, c.contact, *c.position_m, *c.normal, *c.force_n_xyz, c.force_n, c.std_n, c.source]
 
 
-def _frame_row(frame: FrameReport, cables: Sequence[str]) -> list[object]:
-    tensions = [frame.tension_n.get(name) for name in cables]
-    return [*(getattr(frame, name) for name in FRAME_COLUMNS), *tensions]
+def _frame_row(frame: FrameReport, cables: Sequence[str], chambers: Sequence[str]) -> list[object]:
+    drives = [*(frame.tension_n.get(name) for name in cables), *(frame.pressure_pa.get(name) for name in chambers)]
+    return [*(getattr(frame, name) for name in FRAME_COLUMNS), *drives]
 
 
 def _write_states(states: States, path: Path) -> None:
@@ -339,20 +339,20 @@ def _read_contacts(file: Path) -> tuple[ContactForce, ...]:
 def _read_frames(file: Path) -> tuple[FrameReport, ...]:
     from femsense.sensing import FrameReport
 
-    table = read_csv(file, required=FRAME_COLUMNS, prefixes=("tension_",))
-    cables = [
-        c.removeprefix("tension_").removesuffix("_n") for c in table.columns if c.startswith("tension_") and c.endswith("_n")
-    ]
+    table = read_csv(file, required=FRAME_COLUMNS, prefixes=("tension_", "pressure_"))
+    tensions = [c for c in table.columns if c.startswith("tension_") and c.endswith("_n")]
+    pressures = [c for c in table.columns if c.startswith("pressure_") and c.endswith("_pa")]
+    cables = [c.removeprefix("tension_").removesuffix("_n") for c in tensions]
+    chambers = [c.removeprefix("pressure_").removesuffix("_pa") for c in pressures]
     counts = {name: table.integers(name) for name in ("frame", "contacts", "matched")}
-    values = table.numbers(
-        ("time_s", "rms_before_m", "rms_after_m", "ms", *(f"tension_{c}_n" for c in cables)), empty_is_nan=True
-    )
+    values = table.numbers(("time_s", "rms_before_m", "rms_after_m", "ms", *tensions, *pressures), empty_is_nan=True)
     status = table.text("status")
     return tuple(
         FrameReport(
             frame=int(counts["frame"][i]), time_s=float(row[0]), status=status[i], contacts=int(counts["contacts"][i]),
             matched=int(counts["matched"][i]), rms_before_m=float(row[1]), rms_after_m=float(row[2]), ms=float(row[3]),
             tension_n={name: float(value) for name, value in zip(cables, row[4:])},
+            pressure_pa={name: float(value) for name, value in zip(chambers, row[4 + len(cables) :])},
         )
         for i, row in enumerate(values)
     )  # fmt: skip

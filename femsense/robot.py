@@ -16,7 +16,8 @@ from pydantic import Field, StringConstraints
 import femsense
 from femsense.arrays import FloatArray, IntArray, freeze
 from femsense.errors import InputError
-from femsense.fem.body import BodyModel, Cable, make_body, tie_cable
+from femsense.fem.body import BodyModel, Cable, Chamber, make_body, tie_cable
+from femsense.fem.chambers import check_chambers, find_chamber
 from femsense.fem.mesh import TetMesh, check_mesh, embed_points, to_linear, to_quadratic
 from femsense.files import plain, write_beside, write_toml
 from femsense.meshfile import mesh_companions, read_tets, write_mesh
@@ -256,6 +257,7 @@ def build_robot(table: RobotTable, document: dict[str, Any], path: Path) -> Robo
         clamped=clamped,
         clamp_nodes=clamped[clamped < len(declared.nodes)],
         cables=tuple(_make_cable(mesh, cable, i, path) for i, cable in enumerate(table.cables)),
+        chambers=_make_chambers(mesh, table.chambers, path),
         gravity=table.gravity.vector_m_s2 if table.gravity else (0.0, 0.0, 0.0),
     )
     if (body.stencil.volumes <= 0).any():
@@ -375,6 +377,15 @@ def _make_cable(mesh: TetMesh, table: CableTable, i: int, path: Path) -> Cable:
     return cable
 
 
+def _make_chambers(mesh: TetMesh, tables: Sequence[ChamberTable], path: Path) -> tuple[Chamber, ...]:
+    chambers = tuple(
+        find_chamber(mesh, t.name, t.seed_m, max_pressure=t.max_pressure_pa, where=_at(path, "chambers", i, "seed_m"))
+        for i, t in enumerate(tables)
+    )
+    check_chambers(chambers, where=f"{path}: chambers")
+    return chambers
+
+
 def _marker_points(mesh: TetMesh, markers: Sequence[MarkerTable], path: Path) -> FloatArray:
     points = freeze(np.array([marker.position_m for marker in markers], dtype=np.float64).reshape(-1, 3))
     outside = embed_points(mesh, points).outside
@@ -404,8 +415,6 @@ def _far(what: str, where: str, point: Sequence[float], distance: float, limit: 
 
 def _warn_of_units(table: RobotTable, path: Path) -> None:
     """Warn of what can be computed but is hardly meant."""
-    if table.chambers:
-        warnings.warn(f"{path}: pressures in chambers are not simulated yet; the chambers are kept in the file", stacklevel=4)
     if table.material.young_modulus_pa < 1e3:
         warnings.warn(f"{_at(path, 'material', 'young_modulus_pa')}: {table.material.young_modulus_pa:g} Pa is softer than any silicone; is it in kPa or MPa?", stacklevel=4)  # fmt: skip
     if table.gravity and np.linalg.norm(table.gravity.vector_m_s2) > 100.0:
@@ -484,6 +493,7 @@ def _declared(robot: Robot) -> dict[str, Any]:
         document["gravity"] = {"vector_m_s2": body.gravity.tolist()}
     document["fixed"] = [{"box_m": box} for box in _clamp_boxes(body)]
     document["cables"] = [_cable_document(cable, body.mesh) for cable in body.cables]
+    document["chambers"] = [{"name": c.name, "seed_m": c.seed.tolist(), "max_pressure_pa": c.max_pressure} for c in body.chambers]
     document["markers"] = [{"name": n, "position_m": p.tolist()} for n, p in zip(robot.marker_names, robot.marker_points)]
     document["features"] = {"count": max(len(robot.features), 1)}
     if robot.color_rgb is not None:

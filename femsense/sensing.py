@@ -113,6 +113,7 @@ class FrameReport:
     rms_after_m: float
     ms: float
     tension_n: dict[str, float]
+    pressure_pa: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -344,6 +345,7 @@ def sense_frame(sensor: Sensor, k: int, previous: SensedFrame | None) -> SensedF
         at_end.rms,
         1e3 * (time.perf_counter() - began),
         dict(state.tension),
+        dict(state.pressure),
     )
     return SensedFrame(state, free_state, forces, report, contacts)
 
@@ -786,9 +788,11 @@ def _contacts(
 def _failed(sensor: Sensor, k: int, error: FemsenseError) -> FrameReport:
     number, stamp = int(sensor.recording.frame_numbers[k]), float(sensor.recording.time_s[k])
     nan = float("nan")
+    body = sensor.robot.body
     return FrameReport(
-        number, stamp, " ".join(str(error).split()), 0, 0, nan, nan, nan, dict.fromkeys(sensor.robot.body.cable_names, nan)
-    )
+        number, stamp, " ".join(str(error).split()), 0, 0, nan, nan, nan,
+        dict.fromkeys(body.cable_names, nan), dict.fromkeys(body.chamber_names, nan),
+    )  # fmt: skip
 
 
 def _compare_loads(

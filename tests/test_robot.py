@@ -174,13 +174,6 @@ def test_cable_points_slightly_outside_warn_with_distance_and_rule(tmp_path: Pat
     np.testing.assert_allclose(path.positions(robot.body.mesh.nodes), [[0.1, 0.015, 0.0325]], atol=1e-12)
 
 
-def test_chambers_are_kept_with_a_warning(tmp_path: Path) -> None:
-    chambers = [{"name": "bellow", "seed_m": [0.0, 0.02, 0.03], "max_pressure_pa": 40e3}]
-    with pytest.warns(UserWarning, match="pressures in chambers are not simulated yet"):
-        robot = load_robot(write_block_robot(tmp_path, chambers=chambers))
-    assert robot_document(robot)["chambers"] == chambers
-
-
 def test_a_modulus_in_kpa_warns(tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match=r"material\.young_modulus_pa: 150 Pa is softer than any silicone"):
         load_robot(write_block_robot(tmp_path, material__young_modulus_pa=150.0))

@@ -278,7 +278,7 @@ def _rms(residual: FloatArray) -> float:
 def _initial_state(robot: Robot, recording: Recording, initial: FloatArray | None) -> Equilibrium:
     """Return the state under the initial inputs alone (where they are unknown), else under those of the first frame."""
     if initial is not None:
-        recording = replace(recording, inputs=np.zeros_like(recording.inputs))
+        recording = replace(recording, inputs=np.zeros_like(recording.inputs), pressures=np.zeros_like(recording.pressures))
     return solve_frame(Walk(robot, drive_of(robot, recording, initial=initial)), 0)
 
 
@@ -346,7 +346,7 @@ def _input_std(
     names = robot.body.cable_names
     if not covariance.size:
         return {n: 0.0 for n in names}, {n: 0.0 for n in names}
-    W = compliance(robot.body, state)
+    W = compliance(robot.body, state)[: len(names), : len(names)]
     J = W if recording.actuation == "tension" else np.linalg.pinv(W)
     finite = np.isfinite(np.diag(covariance)).all()
     derived = np.sqrt(np.maximum(np.diag(J @ covariance @ J.T), 0.0)) if finite else np.full(len(names), np.inf)

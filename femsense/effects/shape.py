@@ -12,6 +12,7 @@ from femsense.arrays import FloatArray, IntArray, freeze
 from femsense.effects.effect import Effect, Entry, Parameter, number
 from femsense.errors import InputError
 from femsense.fem.body import BodyModel, make_body, tie_cable
+from femsense.fem.chambers import find_chamber
 from femsense.fem.mesh import TetMesh, embed_points, refined, to_linear, to_quadratic
 from femsense.model import Robot
 
@@ -130,6 +131,7 @@ def body_on_mesh(body: BodyModel, mesh: TetMesh, *, clamped: IntArray | None = N
         cables=tuple(
             replace(c, path=tie_cable(mesh, c.name, c.path.positions(body.mesh.nodes), c.pull_point).path) for c in body.cables
         ),
+        chambers=tuple(find_chamber(mesh, c.name, c.seed, max_pressure=c.max_pressure) for c in body.chambers),
         gravity=body.gravity,
     )
     made = made.with_material(replace(made.material, law=body.material.law, stretch_limit=body.material.stretch_limit))

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
+import scipy.sparse as sp
 
 from femsense.arrays import BoolArray, FloatArray, IntArray, as_indices, as_points, freeze
 from femsense.errors import InputError
@@ -55,6 +56,19 @@ class Cable:
     """Capstan coefficient μ at every bend [1]."""
     stretch_stiffness: float = np.inf
     """Stiffness of the cable itself [N/m]; inf: it does not stretch."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Chamber:
+    """A closed cavity of the body under pressure (see `chambers.find_chamber`)."""
+
+    name: str
+    faces: IntArray
+    """Nodes of its surface, looking into the material, shape (t, 3), or (t, 6): corners, then the middles of ab, bc, ca."""
+    seed: FloatArray
+    """A point inside at rest [m], shape (3,)."""
+    max_pressure: float = np.inf
+    """[Pa]."""
 
 
 def segment_ties(path: Embedding) -> tuple[IntArray, FloatArray]:
@@ -109,9 +123,17 @@ class BodyModel:
         """Longest side of the box around the body at rest [m]."""
         return float(np.ptp(self.mesh.nodes, axis=0).max())
 
+    chambers: tuple[Chamber, ...] = ()
+    chamber_curvature: tuple[sp.csr_matrix, ...] = ()
+    """Second derivatives of the volume of each chamber (see `chambers.curvature_map`), each (nb, n)."""
+
     @property
     def cable_names(self) -> tuple[str, ...]:
         return tuple(cable.name for cable in self.cables)
+
+    @property
+    def chamber_names(self) -> tuple[str, ...]:
+        return tuple(chamber.name for chamber in self.chambers)
 
     def weight(self) -> FloatArray:
         """Return the nodal forces of gravity [N], shape (n, 3) (consistent: ρ ∫ N dV g)."""
@@ -181,7 +203,8 @@ class BodyModel:
             volumes=freeze(stencil.volumes * scale**3),
             node_volume=freeze(stencil.node_volume * scale**3),
         )
-        return replace(self, mesh=mesh, stencil=grown)
+        chambers = tuple(replace(c, seed=freeze(center + scale * (c.seed - center))) for c in self.chambers)
+        return replace(self, mesh=mesh, stencil=grown, chambers=chambers)
 
 
 def make_body(
@@ -194,6 +217,7 @@ def make_body(
     clamped: npt.ArrayLike | BoolArray = (),
     clamp_nodes: npt.ArrayLike | None = None,
     cables: tuple[Cable, ...] = (),
+    chambers: tuple[Chamber, ...] = (),
     gravity: npt.ArrayLike = (0.0, 0.0, 0.0),
 ) -> BodyModel:
     """Build a body.
@@ -207,6 +231,7 @@ def make_body(
         clamped: indices of the clamped nodes, or a mask (n,).
         clamp_nodes: those of them that springs replace where the clamp gives; by default all.
         cables: see `tie_cable`.
+        chambers: see `chambers.find_chamber`.
         gravity: [m/s²], shape (3,).
 
     Raises:
@@ -222,6 +247,8 @@ def make_body(
         )
     if law not in LAWS:
         raise InputError("unknown law", where="law", found=law, expected=" | ".join(LAWS))
+    from femsense.fem.chambers import check_chambers, curvature_map
+
     mask = np.asarray(clamped)
     indices = (
         np.flatnonzero(mask)
@@ -235,11 +262,15 @@ def make_body(
         raise InputError(
             "inverted or flat tetrahedra", where="mesh", expected="positive volumes", hint="see femsense.fem.mesh.check_mesh"
         )
-    ties = [segment_ties(cable.path) for cable in cables]
-    stencil, cable_slots = make_stencil(mesh, [nodes for nodes, _ in ties])
+    check_chambers(chambers)
+    ties = [segment_ties(cable.path)[0] for cable in cables]
+    stencil, slots = make_stencil(mesh, [*ties, *(chamber.faces for chamber in chambers)])
+    cable_slots = slots[: len(cables)]
+    curvature = tuple(curvature_map(c, s, len(stencil.block_columns), n) for c, s in zip(chambers, slots[len(cables) :]))
     material = Material(freeze(E), freeze(nu), float(density), law)
     return BodyModel(mesh, material, freeze(np.unique(indices), np.int64), np.inf, freeze(springs, np.int64), cables,
-                     freeze(gravity), freeze(np.zeros((n, 3))), stencil, cable_slots, make_free_map(stencil, mesh, indices))  # fmt: skip
+                     freeze(gravity), freeze(np.zeros((n, 3))), stencil, cable_slots, make_free_map(stencil, mesh, indices),
+                     chambers=chambers, chamber_curvature=curvature)  # fmt: skip
 
 
 def tie_cable(

@@ -1,7 +1,7 @@
-"""Compliance W = H K⁻¹ Hᵀ between directions at points of the body and cables, from one factorisation.
+"""Compliance W = H K⁻¹ Hᵀ between directions at points of the body, cables and chambers, from one factorisation.
 
-K is the exact tangent at the equilibrium (geometric stiffness of the cables included). Cables that are pulled with a given
-tension are free to move; taut held cables keep their length, so that W then holds K⁻¹ − K⁻¹Hᵀ(HK⁻¹Hᵀ + 1/k)⁻¹HK⁻¹ (Zhang et al.
+K is the exact tangent at the equilibrium (geometric stiffness of cables and pressures included). Cables that are pulled with a
+given tension are free to move, chambers under a given pressure too; taut held cables keep their length and held chambers their volume, so that W then holds K⁻¹ − K⁻¹Hᵀ(HK⁻¹Hᵀ + 1/k)⁻¹HK⁻¹ (Zhang et al.
 2019, equations 3–5, with the constraint eliminated).
 """
 
@@ -17,6 +17,7 @@ from femsense.errors import FemsenseError, InputError
 from femsense.fem.assembly import internal, reduced_values
 from femsense.fem.body import BodyModel
 from femsense.fem.cables import add_cable_stiffness, cable_forces, pull_rows
+from femsense.fem.chambers import add_pressure_stiffness, volume_gradient
 from femsense.fem.clamp import with_turning_plate
 from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.linear import Factorization, factorize
@@ -31,11 +32,11 @@ class Tangent:
     dofs: npt.NDArray[np.int64]
     """Free unknowns in factor order, shape (f,)."""
     held_rows: FloatArray
-    """dδ/dx of the taut held cables over the free unknowns, shape (h, f)."""
+    """dδ/dx of the taut held cables and dV/dx of the held chambers over the free unknowns, shape (h, f)."""
     held_columns: FloatArray
-    """K⁻¹ times the force columns of those cables, shape (f, h)."""
+    """K⁻¹ times their force columns, shape (f, h)."""
     held_compliance: FloatArray
-    """Their compliance, cable stretch included [m/N], shape (h, h)."""
+    """Their compliance, cable stretch included [m/N] (of chambers [m³/Pa]), shape (h, h)."""
     node_count: int
 
     def respond(self, forces: FloatArray) -> FloatArray:
@@ -61,16 +62,17 @@ def tangent_at(body: BodyModel, equilibrium: Equilibrium) -> Tangent:
     blocks = internal(body, equilibrium.positions).blocks
     assert blocks is not None
     add_cable_stiffness(body, equilibrium.positions, equilibrium.segment_tensions, blocks)
+    add_pressure_stiffness(body, equilibrium.positions, np.array(list(equilibrium.pressure.values())), blocks)
     factor = with_turning_plate(body, equilibrium.positions, factorize(body.free_map.pattern, reduced_values(body, blocks)))
     if factor is None or (factor.negative > 0 and not body.is_held()):
         raise FemsenseError("the stiffness is singular: nothing holds the body (clamp more nodes)")
     dofs = body.free_map.dofs
     held = np.flatnonzero(equilibrium.held)
-    rows = pull_rows(body, equilibrium.positions)[held][:, dofs]
+    rows = drive_rows(body, equilibrium.positions)[held][:, dofs]
     shares = [t / T if T > 0 else np.ones_like(t) for t, T in zip(equilibrium.segment_tensions, equilibrium.tension.values())]
-    forces = pull_rows(body, equilibrium.positions, shares)[held][:, dofs]
+    forces = drive_rows(body, equilibrium.positions, shares)[held][:, dofs]
     columns = factor.solve(forces.T) if len(held) else np.zeros((len(dofs), 0))
-    stretch = np.array([1.0 / body.cables[i].stretch_stiffness for i in held])
+    stretch = np.array([1.0 / c.stretch_stiffness for c in body.cables] + [0.0] * len(body.chambers))[held]
     return Tangent(factor, dofs, rows, columns, rows @ columns + np.diag(stretch), len(body.mesh.nodes))
 
 
@@ -82,7 +84,7 @@ def compliance(
     directions: npt.ArrayLike = (),
     tangent: Tangent | None = None,
 ) -> FloatArray:
-    """Return the compliance between directions at points of the body, then cables.
+    """Return the compliance between directions at points of the body, then cables, then chambers.
 
     Arguments:
         body: the body.
@@ -92,8 +94,9 @@ def compliance(
         tangent: the linearisation, where it is known already.
 
     Returns:
-        W [m/N], shape (k + a, k + a): displacement of row i along its direction (for a cable: its shortening) under a unit
-        force of column j. Rows and columns of held cables are those of the free cable (their tension as the input).
+        W [m/N], shape (k + a + c, k + a + c): displacement of row i along its direction (for a cable: its shortening, for a
+        chamber: its growth [m³]) under a unit force of column j (for a chamber: one pascal). Rows and columns of what is held are
+        those of the free cable or chamber (its tension or pressure as the input).
 
     Raises:
         InputError: points and directions do not fit; FemsenseError: nothing holds the body.
@@ -105,9 +108,18 @@ def compliance(
     point_rows = (
         direction_rows(embed_points(body.mesh, P), D, len(body.mesh.nodes)) if len(P) else np.zeros((0, 3 * at.node_count))
     )
-    rows = np.vstack([point_rows, pull_rows(body, equilibrium.positions)])[:, at.dofs]
+    rows = np.vstack([point_rows, drive_rows(body, equilibrium.positions)])[:, at.dofs]
     W = rows @ at.factor.solve(rows.T)
     return np.asarray((W + W.T) / 2.0)
+
+
+def drive_rows(body: BodyModel, positions: FloatArray, shares: list[FloatArray] | None = None) -> FloatArray:
+    """Return H_a: the nodal forces of unit tensions of the cables and of unit pressures of the chambers, shape (a + c, 3n).
+
+    `shares` scale the segments of each cable (friction).
+    """
+    chambers = [volume_gradient(c, positions).reshape(1, -1) for c in body.chambers]
+    return np.vstack([pull_rows(body, positions, shares), *chambers])
 
 
 def direction_rows(embedding: Embedding, directions: FloatArray, node_count: int) -> FloatArray:
@@ -119,4 +131,4 @@ def direction_rows(embedding: Embedding, directions: FloatArray, node_count: int
     return rows.reshape(k, -1)
 
 
-__all__ = ["Tangent", "cable_forces", "compliance", "direction_rows", "tangent_at"]
+__all__ = ["Tangent", "cable_forces", "compliance", "direction_rows", "drive_rows", "tangent_at"]

@@ -1,8 +1,9 @@
-"""Static equilibrium under dead loads and cables: Newton with the exact tangent, a line search, and load steps when needed.
+"""Static equilibrium under dead loads, cables and pressures: Newton with the exact tangent, a line search, and load steps when needed.
 
-The state minimises  Π(x) = W(x) − f·x + Σ t ℓ(x)  over the free nodes, where cables pull with given tensions t; a held
-cable adds the constraint  δ(x) + T/k = d  with its tension T as multiplier. A held cable never pushes (unless asked): it
-goes slack where T would be negative, and taut again where its shortening would fall below d (complementarity).
+The state minimises  Π(x) = W(x) − f·x + Σ t ℓ(x) − Σ p V(x)  over the free nodes, where cables pull with given tensions t and
+chambers press with given pressures p; a held cable adds the constraint  δ(x) + T/k = d  with its tension T as multiplier, a held
+chamber  V(x) − V(rest) = ΔV  with its pressure. A held cable never pushes (unless asked): it goes slack where T would be
+negative, and taut again where its shortening would fall below d (complementarity). A held chamber may pull: it is full of liquid.
 Friction moves the tensions along a cable (see `cables.rub`); they are updated between Newton solves until they rest.
 """
 
@@ -19,6 +20,7 @@ from femsense.errors import InputError
 from femsense.fem.assembly import Internal, internal, reduced_values
 from femsense.fem.body import BodyModel, Cable
 from femsense.fem.cables import add_cable_stiffness, bend_angles, cable_forces, cable_length, rub, segments, shortening
+from femsense.fem.chambers import add_pressure_stiffness, chamber_volume, volume_changes, volume_gradient
 from femsense.fem.clamp import with_turning_plate
 from femsense.fem.linear import Factorization, factorize_definite
 
@@ -45,6 +47,10 @@ class Equilibrium:
     """Tension of each cable at its motor [N]."""
     shortening: dict[str, float]
     """Shortening of each cable against rest [m]."""
+    pressure: dict[str, float]
+    """Pressure in each chamber above the surroundings [Pa]."""
+    volume: dict[str, float]
+    """How much each chamber has grown since rest [m³]."""
     residual_n: float
     """Largest unbalanced nodal force [N]."""
     status: str
@@ -53,7 +59,7 @@ class Equilibrium:
     segment_tensions: tuple[FloatArray, ...]
     """Tension along each cable, far end first [N], one array (s,) a cable."""
     held: BoolArray
-    """Cables that are held at a displacement and taut, shape (a,)."""
+    """Cables that are held at a displacement and taut, then chambers that are held at a volume, shape (a + c,)."""
     nodal_forces: FloatArray
     """Nodal forces beside the body's own dead load [N], shape (n, 3)."""
     factor: Factorization | None
@@ -71,18 +77,19 @@ class Equilibrium:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Loads:
-    """What drives the body; `scaled` gives a part of it for load steps."""
+    """What drives the body (cables, then chambers: a + c drives); `scaled` gives a part of it for load steps."""
 
     forces: FloatArray  # dead nodal forces [N], (n, 3)
-    tension: FloatArray  # of cables that are not held [N], (a,)
-    target: FloatArray  # shortening of held cables [m], (a,)
-    controlled: BoolArray  # cables that are held at a shortening, (a,)
+    effort: FloatArray  # tensions [N] and pressures [Pa] that are given, (a + c,)
+    target: FloatArray  # shortening [m] or growth [m³] of what is held, (a + c,)
+    controlled: BoolArray  # what is held, (a + c,)
+    lever: FloatArray  # effort × lever is a force, travel / lever a length: 1, or the surface of a chamber [m²], (a + c,)
     bilateral: bool
     before: tuple[FloatArray, ...]  # tensions along the cables until now [N]
     tolerance: float  # of the residual [N]
 
     def scaled(self, part: float) -> _Loads:
-        return replace(self, forces=part * self.forces, tension=part * self.tension, target=part * self.target)
+        return replace(self, forces=part * self.forces, effort=part * self.effort, target=part * self.target)
 
 
 @dataclass(eq=False, slots=True)
@@ -90,8 +97,8 @@ class _State:
     """Where the iteration stands."""
 
     x: FloatArray  # (n, 3)
-    T: FloatArray  # motor tensions, (a,)
-    taut: BoolArray  # held cables that carry load, (a,)
+    T: FloatArray  # motor tensions [N], then pressures [Pa], (a + c,)
+    taut: BoolArray  # held cables that carry load, and held chambers, (a + c,)
     shares: list[FloatArray]  # segment tension / motor tension
     factor: Factorization | None = None
     borrowed: bool = False  # the factor belongs to another state; it serves as long as the residual falls fast
@@ -104,6 +111,8 @@ def solve_equilibrium(
     *,
     tension: Mapping[str, float] | None = None,
     shortening: Mapping[str, float] | None = None,
+    pressure: Mapping[str, float] | None = None,
+    volume: Mapping[str, float] | None = None,
     nodal_forces: npt.ArrayLike | None = None,
     start: Equilibrium | None = None,
     before: tuple[FloatArray, ...] | None = None,
@@ -118,6 +127,8 @@ def solve_equilibrium(
         body: the body with its weight and dead forces.
         tension: name → tension at the motor [N]; cables that are not named anywhere are slack.
         shortening: name → shortening that a cable is held at [m]; such a cable never pushes unless `bilateral`.
+        pressure: name → pressure in a chamber above the surroundings [Pa]; chambers that are not named anywhere have none.
+        volume: name → growth of a chamber since rest [m³] that it is held at, as a pump of liquid does; it may suck.
         nodal_forces: further nodal forces [N], shape (n, 3).
         start: an equilibrium to start from (its positions, tensions and factor).
         before: tensions along the cables until now [N], for friction; by default those of `start`, else none.
@@ -130,9 +141,10 @@ def solve_equilibrium(
         the state; `status` says whether it is an equilibrium, `advice` what to do if not.
 
     Raises:
-        InputError: unknown cable, a cable named twice, wrong shapes or values.
+        InputError: unknown cable or chamber, one named twice, wrong shapes or values.
     """
-    loads = _collect_loads(body, tension, shortening, nodal_forces, start, before, bilateral, relative_tolerance)
+    given = {"tension": tension, "shortening": shortening, "pressure": pressure, "volume": volume}
+    loads = _collect_loads(body, given, nodal_forces, start, before, bilateral, relative_tolerance)
     state = _initial_state(body, loads, start, reuse_factor)
     status = _settle(body, loads, state, max_iterations)
     if status != CONVERGED and not body.is_held():
@@ -144,57 +156,75 @@ def solve_equilibrium(
 
 
 def _collect_loads(
-    body: BodyModel, tension: Mapping[str, float] | None, held: Mapping[str, float] | None, nodal_forces: npt.ArrayLike | None,
-    start: Equilibrium | None, before: tuple[FloatArray, ...] | None, bilateral: bool, relative_tolerance: float,
+    body: BodyModel, given: Mapping[str, Mapping[str, float] | None], nodal_forces: npt.ArrayLike | None, start: Equilibrium | None,
+    before: tuple[FloatArray, ...] | None, bilateral: bool, relative_tolerance: float,
 ) -> _Loads:  # fmt: skip
-    names = body.cable_names
-    a, n = len(names), len(body.mesh.nodes)
-    tension, held = dict(tension or {}), dict(held or {})
-    for where, values in (("tension", tension), ("shortening", held)):
-        for name, value in values.items():
-            if name not in names:
-                raise InputError("unknown cable", where=where, found=name, expected=", ".join(names) or "a body with cables")
-            if not np.isfinite(value):
-                raise InputError("must be finite", where=f"{where}[{name}]", found=value)
-            if where == "tension" and value < 0 and not bilateral:
-                raise InputError("a cable cannot push", where=f"tension[{name}]", found=f"{value:g} N", expected="≥ 0")
-    twice = set(tension) & set(held)
-    if twice:
-        raise InputError("a cable is either pulled or held", where="shortening", found=f"{sorted(twice)} in tension too")
+    n = len(body.mesh.nodes)
+    T, d, pulled = _drive_values(body.cable_names, "a cable", "tension", "shortening", given)
+    p, grown, filled = _drive_values(body.chamber_names, "a chamber", "pressure", "volume", given)
+    pushes = np.flatnonzero(T < 0)
+    if len(pushes) and not bilateral:
+        name = body.cable_names[pushes[0]]
+        raise InputError("a cable cannot push", where=f"tension[{name}]", found=f"{T[pushes[0]]:g} N", expected="≥ 0")
     forces = body.dead_load()
     if nodal_forces is not None:
         extra = as_points(nodal_forces, "nodal_forces")
         if extra.shape != (n, 3):
             raise InputError("wrong shape", where="nodal_forces", found=extra.shape, expected=(n, 3))
         forces = forces + extra
-    T = np.array([tension.get(name, 0.0) for name in names])
-    d = np.array([held.get(name, 0.0) for name in names])
-    controlled = np.array([name in held for name in names], dtype=bool)
     if before is None:
         before = start.segment_tensions if start is not None else tuple(np.zeros(len(c.path)) for c in body.cables)
+    areas = [np.linalg.norm(volume_gradient(c, body.mesh.nodes), axis=1).sum() for c in body.chambers]
+    lever = np.concatenate([np.ones(len(T)), areas])
+    effort, target = np.concatenate([T, p]), np.concatenate([d, grown])
     reach = np.ptp(body.mesh.nodes, axis=0).max()
     stiffness = float(np.median(body.material.young_modulus)) * reach
-    scale = np.linalg.norm(forces, axis=1).sum() + np.abs(T).sum() + np.abs(d).sum() * stiffness * 1e-2
+    scale = np.linalg.norm(forces, axis=1).sum() + np.abs(effort) @ lever + (np.abs(target) / lever).sum() * stiffness * 1e-2
     tolerance = relative_tolerance * max(scale, 1e-6 * stiffness * reach * 1e-2) + 1e-13 * stiffness * reach
-    return (
-        _Loads(forces, T, d, controlled, bilateral, before, float(tolerance))
-        if a
-        else _Loads(forces, T, d, controlled, bilateral, (), float(tolerance))
-    )
+    return _Loads(forces, effort, target, np.concatenate([pulled, filled]), lever, bilateral, before, float(tolerance))
+
+
+def _drive_values(
+    names: tuple[str, ...], kind: str, effort: str, travel: str, given: Mapping[str, Mapping[str, float] | None]
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Return what cables or chambers are given: efforts, travels, and which are held at their travel."""
+    tables = {where: dict(given[where] or {}) for where in (effort, travel)}
+    for where, values in tables.items():
+        for name, value in values.items():
+            if name not in names:
+                raise InputError(
+                    f"unknown {kind.split()[1]}",
+                    where=where,
+                    found=name,
+                    expected=", ".join(names) or f"a body with {kind.split()[1]}s",
+                )
+            if not np.isfinite(value):
+                raise InputError("must be finite", where=f"{where}[{name}]", found=value)
+    twice = set(tables[effort]) & set(tables[travel])
+    if twice:
+        what = "pulled or held" if effort == "tension" else "under pressure or held"
+        raise InputError(f"{kind} is either {what}", where=travel, found=f"{sorted(twice)} in {effort} too")
+    return (np.array([tables[effort].get(name, 0.0) for name in names], dtype=float),
+            np.array([tables[travel].get(name, 0.0) for name in names], dtype=float),
+            np.array([name in tables[travel] for name in names], dtype=bool))  # fmt: skip
 
 
 def _initial_state(body: BodyModel, loads: _Loads, start: Equilibrium | None, reuse_factor: bool) -> _State:
     shares = [np.ones(len(c.path)) for c in body.cables]
     if start is None:
-        return _State(body.mesh.nodes.copy(), loads.tension.copy(), loads.controlled.copy(), shares)
+        return _State(body.mesh.nodes.copy(), loads.effort.copy(), loads.controlled.copy(), shares)
     if start.positions.shape != body.mesh.nodes.shape:
         raise InputError("belongs to another mesh", where="start", found=start.positions.shape, expected=body.mesh.nodes.shape)
     x = start.positions.copy()
     clamped = _clamped(body)
     x[clamped] = body.mesh.nodes[clamped]
-    T = np.where(loads.controlled, [start.tension.get(name, 0.0) for name in body.cable_names], loads.tension)
-    taut = loads.controlled & (start.held | (T > 0)) if loads.controlled.any() else loads.controlled.copy()
-    if loads.controlled.any() and not start.held.any():
+    last = [start.tension.get(name, 0.0) for name in body.cable_names] + [
+        start.pressure.get(name, 0.0) for name in body.chamber_names
+    ]
+    T = np.where(loads.controlled, last, loads.effort)
+    cable = np.arange(len(T)) < len(body.cables)
+    taut = loads.controlled & (start.held | (T > 0) | ~cable)
+    if not start.held.any():
         taut = loads.controlled.copy()
     for i, tensions in enumerate(start.segment_tensions):
         motor = start.tension[body.cable_names[i]]
@@ -235,13 +265,14 @@ def _update_slack(body: BodyModel, loads: _Loads, state: _State) -> bool:
     """Let go what would push and tighten what became too long; return whether anything changed."""
     if loads.bilateral or not loads.controlled.any():
         return False
-    push = state.taut & (state.T < -1e-12)
+    cable = np.arange(len(state.T)) < len(body.cables)
+    push = state.taut & cable & (state.T < -1e-12)
     if push.any():
         worst = np.flatnonzero(push)[np.argmin(state.T[push])]
         state.taut[worst], state.T[worst] = False, 0.0
         return True
-    gap = shortening(body, state.x) - loads.target
-    loose = loads.controlled & ~state.taut & (gap < -1e-9)
+    gap = _travel(body, state.x) - loads.target
+    loose = loads.controlled & cable & ~state.taut & (gap < -1e-9)
     if loose.any():
         state.taut[np.flatnonzero(loose)[np.argmin(gap[loose])]] = True
         return True
@@ -267,7 +298,7 @@ def _newton(body: BodyModel, loads: _Loads, state: _State, max_iterations: int) 
     """Newton at fixed shares and a fixed set of taut cables."""
     free = body.free_map.dofs
     held = np.flatnonzero(state.taut)
-    stretch = np.array([1.0 / body.cables[i].stretch_stiffness for i in held])
+    stretch = _stretch(body)[held]
     here = internal(body, state.x, tangent=not state.borrowed)
     last, saved = np.inf, (state.x, state.T)
     frictional = any(c.friction > 0 for c in body.cables)
@@ -279,9 +310,9 @@ def _newton(body: BodyModel, loads: _Loads, state: _State, max_iterations: int) 
         C = rows[held][:, free] if len(held) else H
         pull = state.T @ rows if len(rows) else 0.0
         force = (loads.forces.ravel() - here.forces.ravel() + pull)[free]
-        gap = loads.target[held] - shortening(body, state.x)[held] - stretch * state.T[held] if len(held) else np.zeros(0)
+        gap = loads.target[held] - _travel(body, state.x)[held] - stretch * state.T[held] if len(held) else np.zeros(0)
         state.residual = float(np.linalg.norm(force.reshape(-1, 3), axis=1).max(initial=0.0))
-        if state.residual <= loads.tolerance and np.abs(gap).max(initial=0.0) <= 1e-12:
+        if state.residual <= loads.tolerance and (np.abs(gap) / loads.lever[held]).max(initial=0.0) <= 1e-12:
             return CONVERGED
         if not np.isfinite(state.residual):
             return "stalled"
@@ -295,7 +326,7 @@ def _newton(body: BodyModel, loads: _Loads, state: _State, max_iterations: int) 
             if state.factor is None:
                 return "singular"
         last, saved = state.residual, (state.x, state.T)
-        du, dT = _bordered_step(state.factor, force, gap, H, C, stretch)
+        du, dT = _bordered_step(state.factor, force, gap, H, C, stretch, loads.lever[held])
         state.iterations += 1
         if state.borrowed:
             here = _full_step(body, state, held, du, dT)
@@ -311,20 +342,22 @@ def _factor_here(body: BodyModel, here: Internal, state: _State) -> Factorizatio
     blocks = internal(body, state.x).blocks if here.blocks is None else here.blocks.copy()
     assert blocks is not None
     add_cable_stiffness(body, state.x, tuple(np.maximum(T, 0.0) * s for T, s in zip(state.T, state.shares)), blocks)
+    add_pressure_stiffness(body, state.x, state.T[len(body.cables) :], blocks)
     plain = factorize_definite(body.free_map.pattern, reduced_values(body, blocks))[0]
     whole = with_turning_plate(body, state.x, plain)
     return whole if whole is None or whole.negative == 0 else plain  # the plate only ever softens, so that plain leads downhill
 
 
 def _rows(body: BodyModel, state: _State) -> FloatArray:
-    """Return the nodal forces of unit motor tensions, shape (a, 3n), with the loss along each cable."""
+    """Return the nodal forces of unit motor tensions, with the loss along each cable, and of unit pressures, shape (a + c, 3n)."""
     n = len(body.mesh.nodes)
     rows = [cable_forces(c, state.x, s, n).ravel() for c, s in zip(body.cables, state.shares)]
+    rows += [volume_gradient(c, state.x).ravel() for c in body.chambers]
     return np.array(rows) if rows else np.zeros((0, 3 * n))
 
 
 def _kinematic_rows(body: BodyModel, state: _State, rows: FloatArray) -> FloatArray:
-    """Return dδ/dx, shape (a, 3n): the rows without the loss along the cables."""
+    """Return dδ/dx and dV/dx, shape (a + c, 3n): the rows without the loss along the cables."""
     n = len(body.mesh.nodes)
     result = rows.copy()
     for i, cable in enumerate(body.cables):
@@ -333,15 +366,32 @@ def _kinematic_rows(body: BodyModel, state: _State, rows: FloatArray) -> FloatAr
     return result
 
 
+def _travel(body: BodyModel, positions: FloatArray) -> FloatArray:
+    """Return the shortening of each cable [m] and the growth of each chamber [m³] since rest, shape (a + c,)."""
+    return np.concatenate([shortening(body, positions), volume_changes(body, positions)])
+
+
+def _stretch(body: BodyModel) -> FloatArray:
+    """Return the compliance of each cable itself [m/N], and 0 for each chamber, shape (a + c,)."""
+    return np.array([1.0 / c.stretch_stiffness for c in body.cables] + [0.0] * len(body.chambers))
+
+
 def _bordered_step(
-    factor: Factorization, force: FloatArray, gap: FloatArray, H: FloatArray, C: FloatArray, stretch: FloatArray
+    factor: Factorization,
+    force: FloatArray,
+    gap: FloatArray,
+    H: FloatArray,
+    C: FloatArray,
+    stretch: FloatArray,
+    lever: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
     """Solve K du − Cᵀ dT = force, H du + stretch dT = gap."""
     if not len(gap):
         return factor.solve(force), gap
     columns = factor.solve(np.column_stack([force, C.T]))
     free, compliance = columns[:, 0], columns[:, 1:]
-    dT = np.linalg.lstsq(H @ compliance + np.diag(stretch), gap - H @ free, rcond=None)[0]
+    matrix = (H @ compliance + np.diag(stretch)) / np.outer(lever, lever)  # all in m/N
+    dT = np.linalg.lstsq(matrix, (gap - H @ free) / lever, rcond=None)[0] / lever
     return free + compliance @ dT, np.asarray(dT, dtype=np.float64)
 
 
@@ -364,12 +414,13 @@ def _line_search(
     x0, T0 = state.x, state.T
     step = np.zeros(x0.shape)
     step.reshape(-1)[free] = du
-    penalty = 2.0 * np.abs(T0[held] + dT) + 1e-3 if len(held) else np.zeros(0)
+    penalty = 2.0 * np.abs(T0[held] + dT) + 1e-3 / loads.lever[held]
     lost = np.zeros(len(T0))  # a held cable with friction is no pure constraint: what its bends take away is a given force
-    lost[held] = [T if body.cables[i].friction > 0 else 0.0 for i, T in zip(held, T0[held] + dT)]
+    rubs = np.array([c.friction > 0 for c in body.cables] + [False] * len(body.chambers), dtype=bool)
+    lost[held] = np.where(rubs[held], T0[held] + dT, 0.0)
     base = _merit(body, loads, state, held, here, penalty, lost)
     slope = _slope(body, loads, state, held, here, step, lost) - float(penalty @ np.abs(gap))
-    noise = 1e-12 * (abs(here.energy) + abs(float((loads.forces * x0).sum())) + float(np.abs(T0).sum()) * 1e-2 + 1e-12)
+    noise = 1e-12 * (abs(here.energy) + abs(float((loads.forces * x0).sum())) + float(np.abs(T0) @ loads.lever) * 1e-2 + 1e-12)
     length = 1.0
     limit = 0.5 * np.ptp(body.mesh.nodes, axis=0).max() / max(np.abs(step).max(), 1e-300)
     length = min(1.0, limit)
@@ -402,9 +453,12 @@ def _merit(
             value += state.T[i] * _weighted_length(cable, state.x, state.shares[i])
         if lost[i] != 0.0:
             value += lost[i] * _weighted_length(cable, state.x, state.shares[i] - 1.0)
+    for i, chamber in enumerate(body.chambers, len(body.cables)):
+        if not state.taut[i] and state.T[i] != 0.0:
+            value -= state.T[i] * (chamber_volume(chamber, state.x) - chamber_volume(chamber, body.mesh.nodes))
     if len(held):
-        stretch = np.array([1.0 / body.cables[i].stretch_stiffness for i in held])
-        gap = loads.target[held] - shortening(body, state.x)[held] - stretch * state.T[held]
+        stretch = _stretch(body)[held]
+        gap = loads.target[held] - _travel(body, state.x)[held] - stretch * state.T[held]
         value += float(penalty @ np.abs(gap)) + 0.5 * float(stretch @ state.T[held] ** 2)
     return value
 
@@ -437,7 +491,7 @@ def _step_loads(body: BodyModel, loads: _Loads, iterations: int, max_iterations:
         part = min(1.0, done + step)
         state = _copied(good)
         part_loads = loads.scaled(part)
-        state.T = np.where(loads.controlled, good.T, part_loads.tension)
+        state.T = np.where(loads.controlled, good.T, part_loads.effort)
         status = _settle(body, part_loads, state, max_iterations)
         spent += state.iterations - good.iterations
         if status == CONVERGED:
@@ -467,12 +521,14 @@ def _copied(state: _State) -> _State:
 
 
 def _result(body: BodyModel, loads: _Loads, state: _State, status: str, nodal_forces: FloatArray) -> Equilibrium:
-    names = body.cable_names
-    short = shortening(body, state.x)
+    names, a = body.cable_names, len(body.cables)
+    travel = _travel(body, state.x)
     return Equilibrium(
         positions=freeze(state.x),
         tension={name: float(T) for name, T in zip(names, state.T)},
-        shortening={name: float(d) for name, d in zip(names, short)},
+        shortening={name: float(d) for name, d in zip(names, travel)},
+        pressure={name: float(p) for name, p in zip(body.chamber_names, state.T[a:])},
+        volume={name: float(v) for name, v in zip(body.chamber_names, travel[a:])},
         residual_n=state.residual,
         status=status,
         iterations=state.iterations,

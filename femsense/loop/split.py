@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from femsense.arrays import IntArray
+from femsense.arrays import FloatArray, IntArray
 from femsense.recording import Recording, state_key
 
 
@@ -17,12 +17,19 @@ def sweeps_of(recording: Recording, frames: IntArray) -> IntArray:
     if recording.sweep is not None:
         labels = [recording.sweep[k] for k in frames]
         return np.unique(labels, return_inverse=True)[1] if len(set(labels)) > 1 else _runs(recording, frames)
-    moving = np.ptp(recording.inputs, axis=0).max(initial=0.0) > 0 if recording.inputs.size else False
-    return _excursions(recording, frames) if moving else _runs(recording, frames)
+    inputs = _drives(recording)
+    moving = np.ptp(inputs, axis=0).max(initial=0.0) > 0
+    return _excursions(inputs, frames) if moving else _runs(recording, frames)
 
 
-def _excursions(recording: Recording, frames: IntArray) -> IntArray:
-    inputs = recording.inputs
+def _drives(recording: Recording) -> FloatArray:
+    """Return inputs and pressures in one unit, shape (F, a + c): the widest range of a pressure is that of an input."""
+    width = [float(np.ptp(table, axis=0).max(initial=0.0)) for table in (recording.inputs, recording.pressures)]
+    scale = width[0] / width[1] if min(width) > 0 else 1.0
+    return np.hstack([recording.inputs, scale * recording.pressures])
+
+
+def _excursions(inputs: FloatArray, frames: IntArray) -> IntArray:
     height = np.abs(inputs - inputs.min(axis=0)).max(axis=1)
     resting = height <= 0.05 * height.max()
     starts = resting & ~np.concatenate([[False], resting[:-1]])

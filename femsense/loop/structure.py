@@ -102,13 +102,14 @@ def _per_frame(trials: list[Trial], residuals: list[FloatArray]) -> tuple[FloatA
                 [
                     recording.time_s[k],
                     np.abs(recording.inputs[k]).sum(),
+                    np.abs(recording.pressures[k]).sum(),
                     float(change.sum() < 0),
                     float(load),
                     float(np.linalg.norm(trial.scene.points[trial.scene.frame == k].mean(axis=0))),
                 ]
             )
     table = np.array(rows, dtype=float)
-    names = ("time", "actuation", "unloading", "known load", "distance from the camera")
+    names = ("time", "actuation", "pressure", "unloading", "known load", "distance from the camera")
     return np.array(rms), {n: table[:, i] for i, n in enumerate(names)}, np.array(numbers)
 
 

@@ -78,6 +78,7 @@ class FrameTable:
     after_m: FloatArray
     ms: FloatArray
     tension_n: dict[str, FloatArray]
+    pressure_pa: dict[str, FloatArray]
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -122,13 +123,15 @@ def _contacts(file: Path) -> ContactTable:
 
 
 def _frames(file: Path) -> FrameTable:
-    table_ = read_csv(file, required=FRAME_COLUMNS, prefixes=("tension_",))
+    table_ = read_csv(file, required=FRAME_COLUMNS, prefixes=("tension_", "pressure_"))
     cables = [c for c in table_.columns if c.startswith("tension_")]
-    values = table_.numbers(("time_s", "rms_before_m", "rms_after_m", "ms", *cables), empty_is_nan=True)
+    chambers = [c for c in table_.columns if c.startswith("pressure_")]
+    values = table_.numbers(("time_s", "rms_before_m", "rms_after_m", "ms", *cables, *chambers), empty_is_nan=True)
     tension = {c.removeprefix("tension_").removesuffix("_n"): values[:, 4 + j] for j, c in enumerate(cables)}
+    pressure = {c.removeprefix("pressure_").removesuffix("_pa"): values[:, 4 + len(cables) + j] for j, c in enumerate(chambers)}
     return FrameTable(
         table_.integers("frame"), values[:, 0], table_.text("status"), table_.integers("contacts"), table_.integers("matched"), values[:, 1],
-        values[:, 2], values[:, 3], tension,
+        values[:, 2], values[:, 3], tension, pressure,
     )  # fmt: skip
 
 
@@ -359,7 +362,7 @@ def _statuses(frames: FrameTable | None) -> Html | None:
 def _frame_panels(frames: FrameTable | None) -> Html | None:
     if frames is None or not frames.good.any():
         return None
-    return panels(_residual_panel(frames), _time_panel(frames), _tension_panel(frames))
+    return panels(_residual_panel(frames), _time_panel(frames), _tension_panel(frames), _pressure_panel(frames))
 
 
 def _residual_panel(frames: FrameTable) -> Html | None:
@@ -404,20 +407,24 @@ def _time_panel(frames: FrameTable) -> Html | None:
 
 
 def _tension_panel(frames: FrameTable) -> Html | None:
-    cables = [(name, values) for name, values in frames.tension_n.items() if np.isfinite(values).any()][:SHOWN]
-    if not cables:
+    return _drive_panel(frames, frames.tension_n, "tension [N]", "Tension of the cables")
+
+
+def _pressure_panel(frames: FrameTable) -> Html | None:
+    return _drive_panel(frames, frames.pressure_pa, "pressure [Pa]", "Pressure in the chambers")
+
+
+def _drive_panel(frames: FrameTable, drives: dict[str, FloatArray], label: str, title: str) -> Html | None:
+    shown = [(name, values) for name, values in drives.items() if np.isfinite(values).any()][:SHOWN]
+    if not shown:
         return None
     figure, axes = new_axes()
-    for color, (name, values) in zip(SERIES, cables):
+    for color, (name, values) in zip(SERIES, shown):
         axes.plot(frames.frame, values, color=color, linewidth=1.5, label=clipped(name, 14), rasterized=len(frames) > MANY)
     whole_numbers(axes)
-    name_axes(axes, "frame", "tension [N]")
-    add_legend(axes, columns=min(len(cables), 4))
-    return as_image(
-        figure,
-        alt=f"Tension of the cables {', '.join(name for name, _ in cables)} over the frames.",
-        caption="Tension of the cables.",
-    )
+    name_axes(axes, "frame", label)
+    add_legend(axes, columns=min(len(shown), 4))
+    return as_image(figure, alt=f"{title} {', '.join(name for name, _ in shown)} over the frames.", caption=f"{title}.")
 
 
 def _origin(facts: RunFacts) -> Html | None:

@@ -32,6 +32,9 @@ class SweepTable(Schema):
     cables: dict[str, float | list[float]] = Field(
         {}, description="cable → its value at the height of the sweep [N or m], or a list with one value a frame"
     )
+    chambers: dict[str, float | list[float]] = Field(
+        {}, description="chamber → its pressure at the height of the sweep [Pa], or a list with one value a frame"
+    )
     rest: Count = Field(0, description="frames at rest before the sweep, ≥ 0")
     up: Count = Field(3, description="frames on the way up, the height included, ≥ 0")
     hold: Count = Field(0, description="frames at the height, ≥ 0")
@@ -212,6 +215,8 @@ class Plan:
     """Inputs counted from the initial ones [N] or [m], shape (F, a), in the order of the body's cables."""
     initial: FloatArray
     """True inputs before the first sweep [N] or [m], shape (a,)."""
+    pressures: FloatArray
+    """[Pa], shape (F, c), in the order of the body's chambers."""
     gravity: FloatArray | None
     """[m/s²], shape (F, 3); None: that of the body."""
     load_frame: IntArray
@@ -259,7 +264,7 @@ def plan_script(script: ScriptTable, robot: Robot, where: Path = Path("script"))
     Raises:
         InputError: unknown cables or markers, negative tensions, lists of another length than their sweep, frames that are not there.
     """
-    names = robot.body.cable_names
+    names, chambers = robot.body.cable_names, robot.body.chamber_names
     _check_names(script, robot, where)
     counts = [len(sweep.profile()) for sweep in script.sweeps]
     first = dict(zip((s.label for s in script.sweeps), np.r_[0, np.cumsum(counts)[:-1]].tolist()))
@@ -268,7 +273,9 @@ def plan_script(script: ScriptTable, robot: Robot, where: Path = Path("script"))
     contacts = tuple(_planned_contact(script, i, first, count, int(steps.size), where) for i in range(len(script.contacts)))
     touched = {c.table.sweep for c in contacts if c.force.any()}
     initial = np.array([script.initial.get(name, 0.0) for name in names])
-    commanded = np.vstack([_sweep_inputs(sweep, names) for sweep in script.sweeps])
+    commanded = np.vstack([_sweep_inputs(sweep, sweep.cables, names) for sweep in script.sweeps])
+    pressures = np.vstack([_sweep_inputs(sweep, sweep.chambers, chambers) for sweep in script.sweeps])
+    _check_pressures(pressures, robot, where)
     if script.actuation == "tension" and (commanded + initial < -1e-12).any():
         raise InputError(
             "a tension below zero",
@@ -285,6 +292,7 @@ def plan_script(script: ScriptTable, robot: Robot, where: Path = Path("script"))
         free=freeze(np.concatenate([np.full(n, s.label not in touched if s.free is None else s.free) for s, n in zip(script.sweeps, counts)]), bool),
         commanded=freeze(commanded),
         initial=freeze(initial),
+        pressures=freeze(pressures),
         gravity=_planned_gravity(script, robot, counts),
         load_frame=freeze(frames, np.int64),
         load_points=freeze(points),
@@ -297,26 +305,35 @@ def _check_sweep(sweep: SweepTable, i: int, where: Path) -> None:
     count = len(sweep.profile())
     if not count:
         raise _problem("a sweep without frames", where, ("sweeps", i), repr(sweep.label), "rest, up, hold, down or levels")
-    for name, values in sweep.cables.items():
-        if isinstance(values, list) and len(values) != count:
-            raise _problem(
-                "another number of values than frames",
-                where,
-                ("sweeps", i, "cables", name),
-                f"{len(values)} values",
-                f"{count} values, or one number",
+    for kind, table in (("cables", sweep.cables), ("chambers", sweep.chambers)):
+        for name, values in table.items():
+            if isinstance(values, list) and len(values) != count:
+                found, expected = f"{len(values)} values", f"{count} values, or one number"
+                raise _problem("another number of values than frames", where, ("sweeps", i, kind, name), found, expected)
+
+
+def _check_pressures(pressures: FloatArray, robot: Robot, where: Path) -> None:
+    for chamber, column in zip(robot.body.chambers, pressures.T):
+        if column.max() > chamber.max_pressure * (1 + 1e-9):
+            found, limit = f"{column.max():g} Pa", f"at most max_pressure_pa = {chamber.max_pressure:g} Pa"
+            raise InputError(
+                "more pressure than the chamber bears",
+                where=f"{where}: sweeps, chamber {chamber.name}",
+                found=found,
+                expected=limit,
             )
 
 
 def _check_names(script: ScriptTable, robot: Robot, where: Path) -> None:
-    cables = robot.body.cable_names
-    used: list[tuple[str, tuple[int | str, ...]]] = [(name, ("initial", name)) for name in script.initial]
-    used += [(name, ("sweeps", i, "cables", name)) for i, sweep in enumerate(script.sweeps) for name in sweep.cables]
-    for name, place in used:
-        if name not in cables:
-            raise _problem(
-                "unknown cable", where, place, repr(name), ", ".join(cables) or "a robot with cables", near(name, cables)
-            )
+    used: list[tuple[str, str, tuple[int | str, ...]]] = [("cable", name, ("initial", name)) for name in script.initial]
+    for i, sweep in enumerate(script.sweeps):
+        used += [("cable", name, ("sweeps", i, "cables", name)) for name in sweep.cables]
+        used += [("chamber", name, ("sweeps", i, "chambers", name)) for name in sweep.chambers]
+    for kind, name, place in used:
+        known = robot.body.cable_names if kind == "cable" else robot.body.chamber_names
+        if name not in known:
+            expected = ", ".join(known) or f"a robot with {kind}s"
+            raise _problem(f"unknown {kind}", where, place, repr(name), expected, near(name, known))
     for i, name in enumerate(script.markers.names or ()):
         if name not in robot.marker_names:
             raise _problem(
@@ -335,11 +352,11 @@ def _check_cloud_frames(script: ScriptTable, count: int, where: Path) -> None:
             raise _problem("no such frame", where, ("clouds", "extra_frames", i), frame, f"0 … {count - 1}")
 
 
-def _sweep_inputs(sweep: SweepTable, names: Sequence[str]) -> FloatArray:
-    """Return the inputs of a sweep, shape (frames, a)."""
+def _sweep_inputs(sweep: SweepTable, values: dict[str, float | list[float]], names: Sequence[str]) -> FloatArray:
+    """Return the inputs of cables or chambers in a sweep, shape (frames, names)."""
     profile = np.array(sweep.profile())
     table = np.zeros((len(profile), len(names)))
-    for name, value in sweep.cables.items():
+    for name, value in values.items():
         table[:, names.index(name)] = np.asarray(value) if isinstance(value, list) else value * profile
     return table
 

@@ -119,6 +119,8 @@ def recording_of(experiment: Experiment) -> Recording:
         T_robot_camera=[experiment.T_robot_camera] if script.camera.declare_pose else None,
         cable_names=experiment.declared.body.cable_names,
         inputs=np.round(recorded, DIGITS),
+        chamber_names=experiment.declared.body.chamber_names,
+        pressures=plan.pressures,
         free=plan.free,
         sweep=plan.sweep,
         gravity=plan.gravity,

@@ -14,6 +14,7 @@ from femsense.effects import apply_effects
 from femsense.errors import DataError, InputError
 from femsense.fem.body import BodyModel, Cable, make_body, tie_cable
 from femsense.fem.cables import bend_angles
+from femsense.fem.chambers import find_chamber
 from femsense.fem.equilibrium import Equilibrium, solve_equilibrium
 from femsense.fem.mesh import TetMesh, embed_points, refined, surface_triangles, to_linear, to_quadratic, triangle_normals
 from femsense.model import Robot
@@ -83,9 +84,10 @@ class _Load:
     forces: FloatArray  # known loads, (n, 3) N
     contact: FloatArray  # (c,) N
     gravity: FloatArray  # (3,)
+    pressures: FloatArray  # (p,) Pa
 
     def towards(self, other: _Load, part: float) -> _Load:
-        pairs = ((getattr(self, f), getattr(other, f)) for f in ("inputs", "forces", "contact", "gravity"))
+        pairs = ((getattr(self, f), getattr(other, f)) for f in ("inputs", "forces", "contact", "gravity", "pressures"))
         return _Load(*(a + part * (b - a) for a, b in pairs))
 
 
@@ -146,6 +148,7 @@ def _on_mesh(body: BodyModel, mesh: TetMesh) -> BodyModel:
         clamped=np.flatnonzero(held),
         clamp_nodes=springs,
         cables=tuple(_on_mesh_cable(cable, body.mesh, mesh) for cable in body.cables),
+        chambers=tuple(find_chamber(mesh, c.name, c.seed, max_pressure=c.max_pressure) for c in body.chambers),
         gravity=body.gravity,
     )
     if np.isfinite(body.clamp_stiffness):
@@ -259,15 +262,23 @@ class _Walker:
         """Return the load of the body at rest: its own weight."""
         n = len(self.body.mesh.nodes)
         gravity = self.body.gravity if self.plan.gravity is None else self.plan.gravity[0]
-        return _Load(np.zeros(len(self.friction)), np.zeros((n, 3)), np.zeros(len(self.patches)), np.asarray(gravity))
+        return _Load(
+            np.zeros(len(self.friction)),
+            np.zeros((n, 3)),
+            np.zeros(len(self.patches)),
+            np.asarray(gravity),
+            np.zeros(len(self.body.chambers)),
+        )
 
     def frame_loads(self, inputs: FloatArray) -> list[_Load]:
         """Return what drives the body in each frame."""
         plan, n, F = self.plan, len(self.body.mesh.nodes), len(inputs)
-        known = _known_loads(self.body.mesh, plan, creep_matrix(plan.time_s, self.creep))
+        creep = creep_matrix(plan.time_s, self.creep)
+        known = _known_loads(self.body.mesh, plan, creep)
         gravity = np.tile(self.body.gravity, (F, 1)) if plan.gravity is None else plan.gravity
         contact = np.stack([c.force for c in plan.contacts], axis=1) if plan.contacts else np.zeros((F, 0))
-        return [_Load(inputs[k], known.get(k, np.zeros((n, 3))), contact[k], gravity[k]) for k in range(F)]
+        pressures = creep @ plan.pressures
+        return [_Load(inputs[k], known.get(k, np.zeros((n, 3))), contact[k], gravity[k], pressures[k]) for k in range(F)]
 
     def go(self, load: _Load, frame: int) -> None:
         """Move on to a load: the state, the tensions along the cables and the contact forces agree at the end."""
@@ -307,7 +318,8 @@ class _Walker:
         motor = values if self.control == "tension" else dict(self.state.tension)
         start = replace(self.state, tension=motor, segment_tensions=tuple(along))
         tension, held = (values, None) if self.control == "tension" else (None, values)
-        state = solve_equilibrium(body, tension=tension, shortening=held, nodal_forces=forces, start=start, reuse_factor=True)
+        pressure = dict(zip(body.chamber_names, load.pressures.tolist()))
+        state = solve_equilibrium(body, tension=tension, shortening=held, pressure=pressure, nodal_forces=forces, start=start, reuse_factor=True)  # fmt: skip
         if not state.converged:
             raise DataError(f"the truth has no equilibrium in frame {frame}: {state.status}: {state.advice}")
         return state
