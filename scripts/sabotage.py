@@ -73,7 +73,6 @@ SABOTAGES = (
     S("fem/chambers.py", "inner[:, [0, 2, 1]] if inner.shape[1] == 3", "inner[:, [0, 1, 2]] if inner.shape[1] == 3", "test_fem_chambers.py::test_volume_of_a_box_and_of_its_image_under_a_linear_map"),
     S("fem/chambers.py", "[0, 2, 1, 5, 4, 3]", "[0, 2, 1, 3, 4, 5]", "test_fem_chambers.py::test_a_quadratic_surface_follows_the_sphere"),
     S("fem/chambers.py", "if abs(turns) > 0.01:", "if abs(turns) > 2.0:", "test_fem_chambers.py::test_seeds_that_are_not_in_a_cavity"),
-    S("fem/equilibrium.py", "add_pressure_stiffness(body, state.x, state.T[len(body.cables) :], blocks)", "pass", "test_fem_equilibrium.py::test_newton_is_quadratic_near_the_solution"),
     S("fem/compliance.py", "add_pressure_stiffness(body, equilibrium.positions, np.array(list(equilibrium.pressure.values())), blocks)", "pass", "test_fem_chambers.py::test_pressure_and_cable_are_reciprocal"),
     S("march.py", "force = force + pressure * volume_gradient(chamber, x)", "pass", "test_pneumatic.py::test_simulate_calibrate_estimate_improve"),
     S("frames.py", "recording.inputs[frame], recording.pressures[frame],", "recording.inputs[frame],", "test_pneumatic.py::test_columns_are_matched_by_name_and_pressures_beyond_the_limit_warn"),
