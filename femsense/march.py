@@ -14,12 +14,13 @@ import numpy as np
 from femsense.arrays import FloatArray, IntArray, freeze
 from femsense.errors import DataError
 from femsense.fem.assembly import internal
+from femsense.fem.body import BodyModel
 from femsense.fem.cables import bend_angles, cable_forces, rub, shortening
 from femsense.fem.chambers import volume_gradient
 from femsense.fem.clamp import first_give
 from femsense.fem.compliance import tangent_at
 from femsense.fem.equilibrium import Equilibrium, solve_equilibrium
-from femsense.fem.mesh import embed_points
+from femsense.fem.mesh import Embedding, TetMesh, embed_points
 from femsense.model import Robot
 from femsense.recording import Recording
 
@@ -45,6 +46,8 @@ class Drive:
     """[N], shape (L, 3), creep included."""
     pressures: FloatArray
     """[Pa], shape (F, c), in the order of the body's chambers, creep included."""
+    load_ties: Embedding
+    """Where the mesh carries each known load."""
 
 
 def drive_of(robot: Robot, recording: Recording, *, initial: FloatArray | None = None) -> Drive:
@@ -71,7 +74,14 @@ def drive_of(robot: Robot, recording: Recording, *, initial: FloatArray | None =
     order = [recording.chamber_names.index(name) for name in robot.body.chamber_names] if recording.chamber_names else []
     pressures = recording.pressures[:, order] if order else np.zeros((len(recording.time_s), len(robot.body.chambers)))
     pressures = _creep(pressures, recording.time_s, robot.creep)
-    return Drive(recording.actuation, freeze(inputs), recording.gravity, frame, points, forces, freeze(pressures))
+    ties = _load_ties(robot.body.mesh, points)
+    return Drive(recording.actuation, freeze(inputs), recording.gravity, frame, points, forces, freeze(pressures), ties)
+
+
+def _load_ties(mesh: TetMesh, points: FloatArray) -> Embedding:
+    """Return the ties of loads, each place looked up once."""
+    places, number = np.unique(points, axis=0, return_inverse=True)
+    return embed_points(mesh, places)[number.ravel()]
 
 
 def _creep(values: FloatArray, time_s: FloatArray, terms: tuple[tuple[float, float], ...]) -> FloatArray:
@@ -119,8 +129,7 @@ def frame_loads(walk: Walk, frame: int) -> FloatArray | None:
     rows = np.flatnonzero(walk.drive.load_frame == frame)
     if not len(rows):
         return None
-    mesh = walk.robot.body.mesh
-    return embed_points(mesh, walk.drive.load_points[rows]).spread(walk.drive.load_forces[rows], len(mesh.nodes))
+    return walk.drive.load_ties[rows].spread(walk.drive.load_forces[rows], len(walk.robot.body.mesh.nodes))
 
 
 def solve_frame(
@@ -218,14 +227,13 @@ def _observe_variants(
     if not linear:
         return others
     tangent = tangent_at(walk.robot.body, base)
-    inner = internal(walk.robot.body, base.positions, tangent=False).forces
-    starts = [_carried(walk, variants[i], k, base, inner) for i in linear]
+    balance = _Balance(walk, k, base)
+    starts = [balance.carried(variants[i]) for i in linear]
     moves = np.zeros((len(linear), *base.positions.shape))
     rubbing = any(has_history(variants[i].robot) for i in linear)
     for _ in range(2 if rubbing else 1):  # the second time with the bends as the first response leaves them
         answers = [
-            _out_of_balance(walk, variants[i], k, base, inner, memory[1 + i], start, start + move)
-            for i, start, move in zip(linear, starts, moves)
+            balance.upset_by(variants[i], memory[1 + i], start, start + move) for i, start, move in zip(linear, starts, moves)
         ]
         moves = tangent.respond(np.array([force for force, _, _ in answers]))
         if base.held.any():  # cables: pressures are never held here
@@ -243,69 +251,106 @@ def _linear(walk: Walk, variant: Walk) -> bool:
     return base.mesh.tets is other.mesh.tets and (base.clamp_is_rigid or not other.clamp_is_rigid)
 
 
-def _carried(walk: Walk, variant: Walk, k: int, base: Equilibrium, inner: FloatArray) -> FloatArray:
-    """Return where the variant's response starts [m], (n, 3): the base state, grown as its body is and with its clamp given way."""
-    body, other, x = walk.robot.body, variant.robot.body, base.positions
-    if other.mesh is not body.mesh:
-        x = x + (other.mesh.nodes - body.mesh.nodes)
-    if body.clamp_is_rigid and not other.clamp_is_rigid:
-        return x + first_give(other, _pulls_at(walk, k, base) - inner)
-    return x
+class _Balance:
+    """The forces that balance in the base state of a frame, and by how much a variant upsets them."""
 
+    def __init__(self, walk: Walk, frame: int, base: Equilibrium) -> None:
+        self.walk, self.frame, self.base = walk, frame, base
+        self.body = self._body(walk)
+        self.inner = internal(self.body, base.positions, tangent=False).forces
+        self.dead = self.body.dead_load()
 
-def _pulls_at(walk: Walk, k: int, base: Equilibrium) -> FloatArray:
-    """Return the nodal forces of dead loads, cables and pressures in the base state [N], (n, 3)."""
-    body = walk.robot.body
-    if walk.drive.gravity is not None:
-        body = body.with_gravity(walk.drive.gravity[k])
-    force = body.dead_load() + base.nodal_forces
-    for cable, along in zip(body.cables, base.segment_tensions):
-        force = force + cable_forces(cable, base.positions, along, len(force))
-    for chamber in body.chambers:
-        force = force + base.pressure[chamber.name] * volume_gradient(chamber, base.positions)
-    return np.asarray(force)
+    def _body(self, walk: Walk) -> BodyModel:
+        body, gravity = walk.robot.body, walk.drive.gravity
+        return body if gravity is None else body.with_gravity(gravity[self.frame])
 
+    def _loads(self, walk: Walk) -> FloatArray:
+        loads = frame_loads(walk, self.frame)
+        return np.zeros_like(self.inner) if loads is None else loads
 
-def _out_of_balance(
-    walk: Walk, variant: Walk, k: int, base: Equilibrium, inner: FloatArray, before: tuple[FloatArray, ...] | None, x: FloatArray,
-    bent: FloatArray,
-) -> tuple[FloatArray, FloatArray, tuple[FloatArray, ...]]:  # fmt: skip
-    """Return the nodal forces that a variant adds at positions x near the base state [N], (n, 3); the shortening that it adds to
-    held cables [m], (a,); and the tensions along its cables [N]. `bent` is where its cables bend [m], (n, 3)."""
-    body = variant.robot.body
-    n = len(x)
-    if variant.drive.gravity is not None:
-        body = body.with_gravity(variant.drive.gravity[k])
-    loads = frame_loads(variant, k)
-    force = body.dead_load() + (0.0 if loads is None else loads)
-    still = x is base.positions
-    springs = [(b.clamp_stiffness, b.clamp_turn_stiffness) for b in (body, walk.robot.body)]
-    same = still and body.material is walk.robot.body.material and (springs[0] == springs[1])
-    force = force - (inner if same else internal(body, x, tangent=False).forces)
-    tensions = []
-    for i, cable in enumerate(body.cables):
-        held = variant.drive.control == "displacement"
-        motor = base.tension[cable.name] if held else float(variant.drive.inputs[k, i])
-        start = np.zeros(len(cable.path)) if before is None else before[i]
-        along = rub(cable, bend_angles(cable, bent), start, motor) if cable.friction > 0 else np.full(len(cable.path), motor)
-        tensions.append(along)
-        force = force + cable_forces(cable, x, along, n)
-    for chamber, pressure in zip(body.chambers, variant.drive.pressures[k]):
-        force = force + pressure * volume_gradient(chamber, x)
-    stretch = np.array(
-        [
-            base.tension[c.name] * (1.0 / b.stretch_stiffness - 1.0 / c.stretch_stiffness)
-            for b, c in zip(walk.robot.body.cables, body.cables)
+    def carried(self, variant: Walk) -> FloatArray:
+        """Return where the variant's response starts [m], (n, 3): the base state, grown as its body is and with its clamp given way."""
+        body, other, x = self.body, variant.robot.body, self.base.positions
+        if other.mesh is not body.mesh:
+            x = x + (other.mesh.nodes - body.mesh.nodes)
+        if body.clamp_is_rigid and not other.clamp_is_rigid:
+            return x + first_give(other, self._pulls() - self.inner)
+        return x
+
+    def _pulls(self) -> FloatArray:
+        """Return the nodal forces of loads, cables and pressures in the base state [N], (n, 3)."""
+        x = self.base.positions
+        force = self.dead + self.base.nodal_forces
+        for cable, along in zip(self.body.cables, self.base.segment_tensions):
+            force = force + cable_forces(cable, x, along, len(x))
+        for chamber in self.body.chambers:
+            force = force + self.base.pressure[chamber.name] * volume_gradient(chamber, x)
+        return np.asarray(force)
+
+    def upset_by(
+        self, variant: Walk, before: tuple[FloatArray, ...] | None, x: FloatArray, bent: FloatArray
+    ) -> tuple[FloatArray, FloatArray, tuple[FloatArray, ...]]:
+        """Return the nodal forces that a variant adds at positions x near the base state [N], (n, 3); the shortening that it adds
+        to held cables [m], (a,); and the tensions along its cables [N]. `bent` is where its cables bend [m], (n, 3)."""
+        body = self._body(variant)
+        tensions = self._tensions(variant, body, before, bent)
+        still = x is self.base.positions
+        force = self._change(variant, body, tensions) if still else self._whole(variant, body, tensions, x)
+        return force, self._pulled(variant, body, None if still else x), tensions
+
+    def _whole(self, variant: Walk, body: BodyModel, tensions: tuple[FloatArray, ...], x: FloatArray) -> FloatArray:
+        """Return all forces on a variant's body at x."""
+        force = body.dead_load() + self._loads(variant) - internal(body, x, tangent=False).forces
+        for cable, along in zip(body.cables, tensions):
+            force = force + cable_forces(cable, x, along, len(x))
+        for chamber, pressure in zip(body.chambers, variant.drive.pressures[self.frame]):
+            force = force + pressure * volume_gradient(chamber, x)
+        return np.asarray(force)
+
+    def _change(self, variant: Walk, body: BodyModel, tensions: tuple[FloatArray, ...]) -> FloatArray:
+        """Return what a variant changes of the forces in the base state, where they sum to nothing."""
+        x, own, drive = self.base.positions, self.body, variant.drive
+        force = np.zeros_like(x)
+        if body is not own:
+            force += body.dead_load() - self.dead
+            springs = [(b.clamp_stiffness, b.clamp_turn_stiffness) for b in (body, own)]
+            if body.material is not own.material or springs[0] != springs[1]:
+                force += self.inner - internal(body, x, tangent=False).forces
+        if drive.load_forces is not self.walk.drive.load_forces:
+            force += self._loads(variant) - self._loads(self.walk)
+        for cable, along, along_here in zip(body.cables, tensions, self.base.segment_tensions):
+            if not np.array_equal(along, along_here):
+                force += cable_forces(cable, x, along - along_here, len(x))
+        for i, chamber in enumerate(body.chambers):
+            more = drive.pressures[self.frame, i] - self.walk.drive.pressures[self.frame, i]
+            if more != 0.0:
+                force += more * volume_gradient(chamber, x)
+        return force
+
+    def _tensions(
+        self, variant: Walk, body: BodyModel, before: tuple[FloatArray, ...] | None, bent: FloatArray
+    ) -> tuple[FloatArray, ...]:
+        result = []
+        for i, cable in enumerate(body.cables):
+            held = variant.drive.control == "displacement"
+            motor = self.base.tension[cable.name] if held else float(variant.drive.inputs[self.frame, i])
+            start = np.zeros(len(cable.path)) if before is None else before[i]
+            rubs = cable.friction > 0
+            result.append(rub(cable, bend_angles(cable, bent), start, motor) if rubs else np.full(len(cable.path), motor))
+        return tuple(result)
+
+    def _pulled(self, variant: Walk, body: BodyModel, x: FloatArray | None) -> FloatArray:
+        cables = self.body.cables
+        if variant.drive.control != "displacement":
+            return np.zeros(len(cables))
+        stretch = [
+            self.base.tension[c.name] * (1.0 / b.stretch_stiffness - 1.0 / c.stretch_stiffness)
+            for b, c in zip(cables, body.cables)
         ]
-    )
-    pulled = (
-        variant.drive.inputs[k] - walk.drive.inputs[k] + stretch
-        if variant.drive.control == "displacement"
-        else np.zeros(len(body.cables))
-    )
-    if not still and variant.drive.control == "displacement":
-        pulled = pulled - shortening(body, x) + shortening(walk.robot.body, base.positions)
-    return force, pulled, tuple(tensions)
+        pulled = variant.drive.inputs[self.frame] - self.walk.drive.inputs[self.frame] + np.array(stretch)
+        if x is not None:
+            pulled = pulled - shortening(body, x) + shortening(self.body, self.base.positions)
+        return np.asarray(pulled)
 
 
 def _same_mechanics(walk: Walk, variant: Walk) -> bool:

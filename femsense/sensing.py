@@ -286,7 +286,8 @@ def make_sensor(
         initial = np.array([table[name] for name in robot.body.cable_names])
     drive = drive_of(robot, recording, initial=initial)
     sensed_here = _near_places(drive.load_points, places, size)
-    drive = replace(drive, load_frame=drive.load_frame[~sensed_here], load_points=drive.load_points[~sensed_here], load_forces=drive.load_forces[~sensed_here])  # fmt: skip
+    drive = replace(drive, load_frame=drive.load_frame[~sensed_here], load_points=drive.load_points[~sensed_here], load_forces=drive.load_forces[~sensed_here],
+                    load_ties=drive.load_ties[~sensed_here])  # fmt: skip
     return Sensor(
         robot,
         recording,
