@@ -19,7 +19,7 @@ from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.mesh import embed_points
 from femsense.march import Walk, drive_of, walk_along
 from femsense.model import Observation, Robot
-from femsense.pose import move_pose, transform_points
+from femsense.pose import invert_pose, move_pose, transform_points
 from femsense.recording import Recording
 
 POSE_STEP = np.array([1e-5, 1e-5, 1e-5, 1e-6, 1e-6, 1e-6])
@@ -196,12 +196,24 @@ def evaluate_scene(
         for i in range(len(variants)):
             shifted[i][k] = others[i]
     residual = marker_residual(robot, scene, poses, model)
-    columns = [(marker_residual(v.robot, scene, poses, m) - residual) / h for v, m, h in zip(variants, shifted, steps)]
+    clean = _as_predicted(robot, scene, poses, model)  # a column made of measured points would hold their noise
+    columns = [marker_residual(v.robot, clean, poses, m) / h for v, m, h in zip(variants, shifted, steps)]
     split = len(hypothesis.parameters) if derivative else 0
     by_pose, rest_by_pose = (
         _pose_derivative(robot, scene, poses, states, residual, pivot) if derivative else (np.zeros((len(residual), 3, 0)),) * 2
     )
     return SceneJet(residual, rest_residual(robot, scene, poses), by_pose, rest_by_pose, _stack(columns[split:], residual), _stack(columns[:split], residual), states)  # fmt: skip
+
+
+def _as_predicted(robot: Robot, scene: Scene, poses: Sequence[FloatArray], model: Mapping[int, FloatArray]) -> Scene:
+    """Return the scene with every marker where the model would have the camera measure it."""
+    places = np.array([model[int(f)][m] for f, m in zip(scene.frame, scene.marker)]).reshape(-1, 3)
+    points = np.empty_like(places)
+    for v, T in enumerate(poses):
+        points[scene.view == v] = transform_points(invert_pose(T), places[scene.view == v])
+    distance = np.linalg.norm(points, axis=1, keepdims=True)
+    seen = robot.observation
+    return replace(scene, points=points * (seen.depth_scale * distance + seen.depth_offset) / distance)
 
 
 def _stack(columns: list[FloatArray], residual: FloatArray) -> FloatArray:

@@ -22,7 +22,7 @@ from femsense.errors import DataError, FemsenseError, InputError
 from femsense.loop.joint import JointFit, JointProblem, Prior, Trial, fit_jointly, rms_of
 from femsense.loop.noise import Groups, Noise, estimate_noise
 from femsense.loop.result import LoopResult
-from femsense.loop.screen import NUISANCE, TESTABLE, Candidate, candidates_for, confounding, screen
+from femsense.loop.screen import NUISANCE, TESTABLE, Candidate, Fields, candidates_for, confounding, effect_fields, screen
 from femsense.loop.split import hold_out, sweeps_of
 from femsense.loop.structure import describe_left, structure_test
 from femsense.model import Robot
@@ -103,26 +103,26 @@ def improve(
     hypothesis, prior = _with_nuisance(data)
     say("fitting what calibration may move")
     base = _stage(data, hypothesis, prior, noise, np.zeros(len(prior.mean)))
-    noise, n_effective = _noise(data, base, names)
-    base = _stage(data, hypothesis, prior, noise, base.fit.coordinates, own=_own(base))
-    history, first, refits = [base], None, list[dict[str, Any]]()
-    table: list[Candidate] = []
+    history = [base]
+    table, first, refits = list[Candidate](), list[Candidate](), list[dict[str, Any]]()
     growing = _fresh(data)
-    while len(history) <= MAX_EFFECTS:
+    while True:
         say(f"screening effects ({len(history) - 1} found so far)")
-        table = _screen(data, history[-1].fit, noise, names, n_effective)
+        fields = _fields(data, history[-1], names)
+        noise, n_effective = _noise(data, history[-1], fields)
+        here = history[-1].fit
+        history[-1] = _stage(data, here.hypothesis, here.prior, noise, here.coordinates, own=_own(history[-1]))
+        table = _screen(data, history[-1].fit, noise, fields, n_effective)
         first = first or table
-        if not growing:
+        if not growing or len(history) > MAX_EFFECTS:
             break
         winner, tried = _best_refit(data, history[-1], table, noise, n_effective, say)
         refits += tried
         if winner is None:
             break
         history.append(winner)
-        noise, n_effective = _noise(data, winner, names)
-        history[-1] = _stage(data, winner.fit.hypothesis, winner.fit.prior, noise, winner.fit.coordinates, own=_own(winner))
     say("testing what is left")
-    result = _conclude(data, before, history, noise, n_effective, table, first or [], refits, rng)
+    result = _conclude(data, before, history, noise, n_effective, table, first, refits, rng)
     if growing:
         return result
     only = "record another state (other inputs, load or direction of gravity): these data repeat one state, which cannot tell effects apart"
@@ -303,18 +303,21 @@ def _pose_on_first_frames(
     return first.place(fit.fit.theta, pivot)
 
 
-def _noise(data: Data, stage: Stage, names: Sequence[str]) -> tuple[Noise, float]:
+def _fields(data: Data, stage: Stage, names: Sequence[str]) -> Fields:
+    """Return what each effect that is not in the model yet would do to the markers."""
+    seated = any(len(t.scene.rest_marker) for t in data.train)
+    todo = candidates_for(stage.fit, data.control, names=[n for n in names if n not in NUISANCE], has_seats=seated)
+    return effect_fields(stage.fit, data.train, todo)
+
+
+def _problem(data: Data, fit: JointFit, noise: Noise) -> JointProblem:
+    return JointProblem(fit.hypothesis, fit.prior, data.train, [noise.whitener(t.groups) for t in data.train], data.seat_std)
+
+
+def _noise(data: Data, stage: Stage, fields: Fields) -> tuple[Noise, float]:
     """Estimate the noise from what the richest linear model leaves; return it with the effective number of observations."""
-    unit = Noise({"white": 5e-4}, "")
-    problem = JointProblem(
-        stage.fit.hypothesis, stage.fit.prior, data.train, [unit.whitener(t.groups) for t in data.train], data.seat_std
-    )
-    todo = _todo(data, stage.fit, names)
-    table = screen(stage.fit, problem, todo, 100.0) if todo else []
+    table = screen(stage.fit, _problem(data, stage.fit, Noise({"white": 5e-4}, "")), fields, 100.0)
     own = sum(t.size for t in data.train)
-    best: dict[str, Candidate] = {}
-    for candidate in table:
-        best.setdefault(candidate.effect.name, candidate)
     columns, extra, at = [], [], 0
     for i, (trial, jet) in enumerate(zip(data.train, stage.fit.jets)):
         k = len(jet.residual)
@@ -323,21 +326,14 @@ def _noise(data: Data, stage: Stage, names: Sequence[str]) -> tuple[Noise, float
         block[:, :, at + 6 * len(trial.poses) : at + trial.size] = jet.by_initial
         at += trial.size
         columns.append(np.concatenate([block, jet.by_effect], axis=2))
-        others = [c.raw[i] for c in best.values() if c.effect.name != "marker_offset"]
+        others = [c.raw[i] for c in _one_each(table) if c.effect.name != "marker_offset"]
         extra.append(np.concatenate([np.zeros((k, 3, 0)), *others], axis=2))
     noise = estimate_noise([j.residual for j in stage.fit.jets], columns, extra, [t.groups for t in data.train])
     return noise, float(sum(3 * (t.groups.state.max() + 1) for t in data.train))
 
 
-def _todo(data: Data, fit: JointFit, names: Sequence[str]) -> list[tuple[Effect, Entry, tuple[Parameter, ...]]]:
-    seated = any(len(t.scene.rest_marker) for t in data.train)
-    return candidates_for(fit, data.control, names=[n for n in names if n not in NUISANCE], has_seats=seated)
-
-
-def _screen(data: Data, fit: JointFit, noise: Noise, names: Sequence[str], n_effective: float) -> list[Candidate]:
-    problem = JointProblem(fit.hypothesis, fit.prior, data.train, [noise.whitener(t.groups) for t in data.train], data.seat_std)
-    todo = _todo(data, fit, names)
-    return screen(fit, problem, todo, n_effective) if todo else []
+def _screen(data: Data, fit: JointFit, noise: Noise, fields: Fields, n_effective: float) -> list[Candidate]:
+    return screen(fit, _problem(data, fit, noise), fields, n_effective)
 
 
 # --- growth --------------------------------------------------------------------------------------------------------------

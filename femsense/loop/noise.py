@@ -79,7 +79,7 @@ def whiten(factor: FloatArray, values: FloatArray) -> FloatArray:
     return np.asarray(flat.reshape(3 * k, *values.shape[2:]))
 
 
-MAX_REML_ROWS = 400
+MAX_REML_ROWS = 700
 """Rows that the estimate of the noise uses at most; more are thinned out by whole frames."""
 
 
@@ -99,32 +99,69 @@ def estimate_noise(
     distinct = sum(3 * (int(g.state.max()) + 1) for g in groups)
     basis = _richest(nuisance, extra, distinct)
     scale = float(np.sqrt(np.mean(np.concatenate([r.ravel() for r in residuals]) ** 2))) + FLOOR
-
-    def negative_log_likelihood(log_std: FloatArray) -> float:
-        if np.abs(log_std - start).max() > 12.0:
-            return 1e30
-        return _reml(Noise(dict(zip(names, np.maximum(np.exp(log_std), FLOOR))), ""), residuals, basis, groups)
-
-    first = np.array(
-        [max(_jitter(residuals, groups), FLOOR) if n == "white" and "state" in names else 0.3 * scale for n in names]
-    )
-    start = np.log(first)
-    simplex = np.vstack([start, start + np.diag(np.full(len(names), -1.0))])
-    best = minimize(
-        negative_log_likelihood,
-        start,
-        method="Nelder-Mead",
-        options={"maxfev": 40 * len(names), "xatol": 0.02, "fatol": 0.02, "initial_simplex": simplex},
-    )
+    jitter = _jitter(residuals, groups) if "state" in names else 0.0
+    lowest, highest = np.log(np.maximum(1e-3 * scale, FLOOR)), np.log(3.0 * scale)
+    likelihood = _Likelihood(names, residuals, basis, groups)
+    best = None
+    for white in {max(jitter, FLOOR), 0.3 * scale, 0.7 * scale}:
+        start = np.clip(np.log([white if n == "white" else 0.3 * scale for n in names]), lowest, highest)
+        answer = minimize(likelihood, start, jac=True, method="L-BFGS-B", bounds=[(lowest, highest)] * len(names))
+        best = answer if best is None or answer.fun < best.fun else best
+    assert best is not None
     std = {name: float(v) for name, v in zip(names, np.exp(best.x))}
     std = {name: max(v, FLOOR) if name == "white" else v if v > 2e-2 * scale else 0.0 for name, v in std.items()}
-    repeats = "state" in names
-    return Noise(
-        std,
-        "restricted maximum likelihood, with repeats"
-        if repeats
-        else "restricted maximum likelihood; no repeated state: assumed from the residual",
-    )
+    how = "with repeats" if "state" in names else "no repeated state: assumed from the residual"
+    return Noise(std, f"restricted maximum likelihood, {how}")
+
+
+class _Likelihood:
+    """Minus the restricted log-likelihood of log standard deviations, with its gradient.
+
+    2 L = log|V| + log|XᵀV⁻¹X| + rᵀPr,  ∂(2 L)/∂v_i = tr(P V_i) − rᵀP V_i P r,  P = V⁻¹ − V⁻¹X(XᵀV⁻¹X)⁻¹XᵀV⁻¹,  V = Σ v_i V_i, the
+    same for each axis and block-diagonal over recordings.
+    """
+
+    def __init__(self, names: list[str], residuals: list[FloatArray], basis: list[FloatArray], groups: list[Groups]) -> None:
+        self.names, self.residuals, self.basis = names, residuals, basis
+        self.parts = [[_pattern(g, name) for name in names] for g in groups]
+
+    def __call__(self, log_std: FloatArray) -> tuple[float, FloatArray]:
+        variance = np.exp(2.0 * log_std)
+        p = self.basis[0].shape[2]
+        normal, right, log_det, own = np.zeros((p, p)), np.zeros(p), 0.0, 0.0
+        pieces = []
+        for r, X, parts in zip(self.residuals, self.basis, self.parts):
+            inverse, log_size = _inverse(sum(v * part for v, part in zip(variance, parts)))
+            ViX, Vir = np.einsum("kl,lcp->kcp", inverse, X, optimize=True), inverse @ r
+            normal += np.einsum("kcp,kcq->pq", X, ViX, optimize=True)
+            right += np.einsum("kcp,kc->p", X, Vir)
+            log_det += 3.0 * log_size
+            own += float((r * Vir).sum())
+            pieces.append((inverse, ViX, Vir, parts))
+        factor = cholesky(normal + 1e-12 * np.trace(normal) / max(p, 1) * np.eye(p), lower=True)
+        fitted = cho_solve((factor, True), right)
+        value = log_det + 2.0 * float(np.log(np.diag(factor)).sum()) + own - float(right @ fitted)
+        gradient = np.zeros(len(variance))
+        for inverse, ViX, Vir, parts in pieces:
+            Pr = Vir - ViX @ fitted
+            half = cho_solve((factor, True), ViX.reshape(-1, p).T).T.reshape(ViX.shape)
+            inner = np.einsum("kcp,lcp->kl", ViX, half, optimize=True)
+            outer = np.einsum("kc,lc->kl", Pr, Pr)
+            kernel = 3.0 * inverse - inner - outer
+            gradient += [float((kernel * part).sum()) for part in parts]
+        return 0.5 * value, np.asarray(gradient * variance)
+
+
+def _pattern(groups: Groups, name: str) -> FloatArray:
+    """Return which rows share a component, shape (k, k)."""
+    labels = np.arange(len(groups.marker)) if name == "white" else getattr(groups, name)
+    return np.asarray(labels[:, None] == labels[None, :], dtype=float)
+
+
+def _inverse(matrix: FloatArray) -> tuple[FloatArray, float]:
+    """Return the inverse of a positive definite matrix and the logarithm of its determinant."""
+    L = cholesky(matrix, lower=True)
+    return np.asarray(cho_solve((L, True), np.eye(len(L)))), 2.0 * float(np.log(np.diag(L)).sum())
 
 
 def _jitter(residuals: list[FloatArray], groups: list[Groups]) -> float:
@@ -151,24 +188,6 @@ def _thinned(
     ]
     pick = [[a[k] for a, k in zip(arrays, keep)] for arrays in (residuals, nuisance, extra)]
     return pick[0], pick[1], pick[2], thin
-
-
-def _reml(noise: Noise, residuals: list[FloatArray], basis: list[FloatArray], groups: list[Groups]) -> float:
-    p = basis[0].shape[2]
-    log_det, XX, Xr, rr = 0.0, np.zeros((p, p)), np.zeros(p), 0.0
-    for r, X, g in zip(residuals, basis, groups):
-        try:
-            L = noise.whitener(g)
-        except np.linalg.LinAlgError:
-            return 1e30
-        log_det += 3 * 2 * float(np.log(np.diag(L)).sum())
-        wr, WX = whiten(L, r), whiten(L, X)
-        XX += WX.T @ WX
-        Xr += WX.T @ wr
-        rr += float(wr @ wr)
-    factor = cholesky(XX + 1e-12 * np.trace(XX) / p * np.eye(p), lower=True)
-    fit = float(Xr @ cho_solve((factor, True), Xr))
-    return 0.5 * (log_det + 2 * float(np.log(np.diag(factor)).sum()) + rr - fit)
 
 
 def _richest(nuisance: list[FloatArray], extra: list[FloatArray], distinct: int) -> list[FloatArray]:

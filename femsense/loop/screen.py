@@ -17,7 +17,7 @@ from femsense.arrays import FloatArray
 from femsense.calib.forward import Hypothesis
 from femsense.effects import EFFECTS, Effect, Entry, Parameter
 from femsense.errors import FemsenseError
-from femsense.loop.joint import JointFit, JointProblem
+from femsense.loop.joint import JointFit, JointProblem, Prior, Trial
 from femsense.loop.noise import whiten
 
 NUISANCE = ("stiffness", "cable_offset")
@@ -66,26 +66,37 @@ def candidates_for(
     return result
 
 
-def screen(
-    base: JointFit, problem: JointProblem, todo: list[tuple[Effect, Entry, tuple[Parameter, ...]]], n_effective: float
-) -> list[Candidate]:
+@dataclass(frozen=True, eq=False, slots=True)
+class Fields:
+    """What effects do to the markers at a fitted model, to first order."""
+
+    todo: list[tuple[Effect, Entry, tuple[Parameter, ...]]]
+    """The effects and seeds that can be evaluated."""
+    raw: list[FloatArray]
+    """Columns [m], one array (k, 3, Σq) a trial."""
+
+    def of(self, i: int) -> list[FloatArray]:
+        """Return the columns of one effect, one array (k, 3, q) a trial."""
+        spans = np.cumsum([0, *(len(p) for _, _, p in self.todo)])
+        return [block[:, :, spans[i] : spans[i + 1]] for block in self.raw]
+
+
+def screen(base: JointFit, problem: JointProblem, fields: Fields, n_effective: float) -> list[Candidate]:
     """Return all candidates with their linear scores, the best first.
 
     Arguments:
         base: the current fit.
         problem: its problem (trials and noise).
-        todo: effects to try.
+        fields: of the effects to try, at this fit or very near to it.
         n_effective: number of independent observations, for BIC.
     """
-    usable, raw = _columns(base, problem, todo)
     nuisance = np.asarray(base.fit.jacobian)
     Q = _orthonormal(nuisance)
     residual = base.fit.residual - Q @ (Q.T @ base.fit.residual)
-    spans = np.cumsum([0, *(len(p) for _, _, p in usable)])
-    effects = max(len({e.name for e, _, _ in usable}), 1)
+    effects = max(len({e.name for e, _, _ in fields.todo}), 1)
     result = []
-    for i, (effect, seed, parameters) in enumerate(usable):
-        own = [block[:, :, spans[i] : spans[i + 1]] for block in raw]
+    for i, (effect, seed, parameters) in enumerate(fields.todo):
+        own = fields.of(i)
         whole = _whitened(base, problem, own)
         if not np.isfinite(whole).all() or np.linalg.norm(whole) == 0:
             continue
@@ -100,29 +111,28 @@ def screen(
     return sorted(result, key=lambda c: -c.score)
 
 
-def _columns(
-    base: JointFit, problem: JointProblem, todo: list[tuple[Effect, Entry, tuple[Parameter, ...]]]
-) -> tuple[list[tuple[Effect, Entry, tuple[Parameter, ...]]], list[FloatArray]]:
-    """Return the effects that can be evaluated, and their columns [m], one array (k, 3, Σq) a trial."""
+def effect_fields(
+    base: JointFit, trials: list[Trial], todo: list[tuple[Effect, Entry, tuple[Parameter, ...]]]
+) -> Fields:
+    """Return what each effect does to the markers, all of them with one factorisation a frame."""
     fixed = base.hypothesis.robot_at(base.coordinates)
     usable = []
     for effect, seed, parameters in todo:
         try:
-            probe = Hypothesis(fixed, ((effect, seed, parameters),))
             moved = np.array([p.null + p.step for p in parameters])
-            probe.robot_at(moved)
+            Hypothesis(fixed, ((effect, seed, parameters),)).robot_at(moved)
             usable.append((effect, seed, parameters))
         except FemsenseError:
             continue
     every = Hypothesis(fixed, tuple(usable))
     null = np.array([p.null for p in every.parameters])
-    probe_problem = JointProblem(every, problem.prior, problem.trials, problem.factors, problem.seat_std)
-    columns, at = [], 0
-    for trial in problem.trials:
-        jet = probe_problem.jet(trial, base.fit.theta[at : at + trial.size], null, True)
-        columns.append(jet.by_effect)
+    probe = JointProblem(every, Prior(np.zeros(0), np.zeros(0)), trials, [], 1.0)
+    raw, at = [], 0
+    for trial in trials:
+        jet = probe.jet(trial, base.fit.theta[at : at + trial.size], null, True)
+        raw.append(jet.by_effect)
         at += trial.size
-    return usable, columns
+    return Fields(usable, raw)
 
 
 def _whitened(base: JointFit, problem: JointProblem, own: list[FloatArray]) -> FloatArray:
