@@ -37,9 +37,7 @@ def bar_mesh(cells: Sequence[int], shape: Callable[[FloatArray], FloatArray]) ->
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     number = np.arange(len(nodes)).reshape(np.asarray(cells) + 1)
     corner = [(i, j, k) for i in (0, 1) for j in (0, 1) for k in (0, 1)]
-    cubes = np.stack(
-        [number[i : i + cells[0], j : j + cells[1], k : k + cells[2]].ravel() for i, j, k in corner], axis=1
-    )
+    cubes = np.stack([number[i : i + cells[0], j : j + cells[1], k : k + cells[2]].ravel() for i, j, k in corner], axis=1)
     nodes = shape(nodes)
     tets = cubes[:, CUBE_TETS].reshape(-1, 4)
     x = nodes[tets]
@@ -68,11 +66,25 @@ class Design:
         """Return the robot on its coarse (declared) or fine (true) mesh."""
         mesh = bar_mesh(self.fine if fine else self.coarse, self.shape)
         cables = tuple(
-            tie_cable(mesh, name, path, pull, exit_direction=[-0.5, *(np.asarray(pull[1:]) / max(np.linalg.norm(pull[1:]), 1e-9))], max_tension=20.0)
+            tie_cable(
+                mesh,
+                name,
+                path,
+                pull,
+                exit_direction=[-0.5, *(np.asarray(pull[1:]) / max(np.linalg.norm(pull[1:]), 1e-9))],
+                max_tension=20.0,
+            )
             for name, (path, pull) in self.cables.items()
         )
         body = make_body(
-            mesh, young_modulus=modulus, poisson_ratio=0.45, density=1070.0, law=law, clamped=mesh.nodes[:, 0] < 1e-9, cables=cables, gravity=gravity
+            mesh,
+            young_modulus=modulus,
+            poisson_ratio=0.45,
+            density=1070.0,
+            law=law,
+            clamped=mesh.nodes[:, 0] < 1e-9,
+            cables=cables,
+            gravity=gravity,
         )
         corners = [self.shape(np.array([[s, *c]]))[0] for s in self.marker_stations for c in ((0, 1), (0, -1), (1, 0), (-1, 0))]
         points = np.array(corners)
@@ -205,7 +217,9 @@ def _case(number: int, kind: str, i: int, rng: np.random.Generator) -> Case:
     hidden: tuple[dict[str, Any], ...] = ()
     outside = ""
     if kind == "single":
-        hidden = (hidden_effect(names[(i // 3 * 2 + i % 3 if control == "tension" else i // 3) % len(names)], design, control, rng),)
+        hidden = (
+            hidden_effect(names[(i // 3 * 2 + i % 3 if control == "tension" else i // 3) % len(names)], design, control, rng),
+        )
     if kind == "two":
         pair = rng.choice([n for n in names if n not in ("marker_offset", "gravity")], 2, replace=False)
         hidden = tuple(hidden_effect(str(n), design, control, rng) for n in pair)
@@ -248,7 +262,10 @@ def make_data(case: Case, seed: int) -> Made:
     law_hidden = any(e["name"] == "hyperelastic" for e in case.hidden)
     scale = float(rng.uniform(0.8, 1.2))
     declared = design.robot(
-        fine=False, law="corotational" if law_hidden else law, gravity=EARTH if case.declared_gravity else (0, 0, 0), modulus=design.modulus
+        fine=False,
+        law="corotational" if law_hidden else law,
+        gravity=EARTH if case.declared_gravity else (0, 0, 0),
+        modulus=design.modulus,
     )
     if law == "corotational" and any(e["name"] == "hyperelastic" for e in case.hidden):
         raise ValueError("the hidden law needs a hyperelastic truth")

@@ -111,9 +111,7 @@ def screen(base: JointFit, problem: JointProblem, fields: Fields, n_effective: f
     return sorted(result, key=lambda c: -c.score)
 
 
-def effect_fields(
-    base: JointFit, trials: list[Trial], todo: list[tuple[Effect, Entry, tuple[Parameter, ...]]]
-) -> Fields:
+def effect_fields(base: JointFit, trials: list[Trial], todo: list[tuple[Effect, Entry, tuple[Parameter, ...]]]) -> Fields:
     """Return what each effect does to the markers, all of them with one factorisation a frame."""
     fixed = base.hypothesis.robot_at(base.coordinates)
     usable = []
