@@ -100,6 +100,31 @@ def inspect(
 
 
 @app.command()
+def mesh(
+    surface: Annotated[Path, typer.Argument(metavar="SURFACE", help="STL, OBJ, PLY or OFF: triangles around the body.", show_default=False)],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="ROBOT", help="The robot's folder; its robot.toml is kept where there is one.", show_default=False)],
+    unit: Annotated[str | None, typer.Option("--unit", metavar="m|cm|mm", help="Unit of the surface file; required.", show_default=False)] = None,
+    size: Annotated[float | None, typer.Option("--size", metavar="MM", help="Wanted edge length.", show_default=False)] = None,
+    most: Annotated[int, typer.Option("--max-tets", metavar="N", min=6, help="Not more tetrahedra than this.")] = 2000,
+    tolerance: Annotated[float | None, typer.Option("--tolerance", metavar="MM", help="How far the mesh may leave the surface.", show_default=False)] = None,
+    element: Annotated[str, typer.Option("--element", metavar="tet4|tet10", help="For a new robot.toml.")] = "tet10",
+    close_holes: Annotated[bool, typer.Option("--close-holes", help="Close large holes too, by flat caps.")] = False,
+    fill_cavities: Annotated[bool, typer.Option("--fill-cavities", help="Take inner shells as solid, not as chambers.")] = False,
+    part: Annotated[int | None, typer.Option("--part", metavar="N", min=1, help="Which of several bodies; 1 is the largest.", show_default=False)] = None,
+    again: Annotated[bool, typer.Option("--again", help="Fill even where ROBOT holds this mesh already.")] = False,
+    json: Json = False,
+) -> Answer:  # fmt: skip
+    """Fill a surface with tetrahedra; start a robot."""
+    from femsense.meshing import MeshOptions, mesh_into, mesh_text
+
+    options = MeshOptions(unit, size, most, tolerance, element, close_holes, fill_cavities, part)
+    with _progress("mesh") as progress:
+        document = mesh_into(output, surface, options, say=_say, again=again, progress=progress)
+    text = f"{mesh_text(document)}\n\nwritten: {output}\nlook at it: femsense inspect {output}"
+    return Answer(document, text)
+
+
+@app.command()
 def simulate(
     robot: RobotPath,
     script: Annotated[Path, typer.Argument(metavar="SCRIPT", help="What the virtual rig does (TOML).", show_default=False)],

@@ -7,6 +7,7 @@ import hashlib
 import importlib.util
 import io
 import os
+import re
 import secrets
 import subprocess
 import sys
@@ -21,6 +22,7 @@ from femsense.arrays import FloatArray, IntArray
 from femsense.errors import InputError, MissingDependency
 from femsense.fem.mesh import EDGES, TetMesh, element_volumes, oriented
 from femsense.files import PART_PREFIX, write_beside
+from femsense.surface import repaired
 from femsense.tables import near
 
 SURFACE_ENDINGS = (".ply", ".stl", ".obj", ".off")
@@ -33,12 +35,15 @@ if importlib.util.find_spec("pyvista") is None:  # some versions import it for a
 import pytetwild
 data = np.load("surface.npz")
 nodes, tets = pytetwild.tetrahedralize(
-    data["points"], data["triangles"], edge_length_fac=float(data["edge"]), vtk_ordering=True, quiet=True
+    data["points"], data["triangles"], edge_length_fac=float(data["edge"]), epsilon=float(data["envelope"]), vtk_ordering=True,
+    quiet=True,
 )
 np.savez("tets.npz", nodes=nodes, tets=tets)
 """
 EDGE_FRACTION = 0.05
 """Edge length of a mesh made from a surface, over the diagonal of its bounding box."""
+ENVELOPE = 1e-3
+"""How far a mesh made from a surface may leave it, over the diagonal of its bounding box."""
 
 
 def read_tets(path: Path, *, where: str | None = None) -> TetMesh:
@@ -90,12 +95,29 @@ def read_triangles(path: Path, *, where: str | None = None) -> tuple[FloatArray,
     except Exception as error:
         raise InputError("not readable as a surface", where=where, found=_reason(error), expected="triangles (ply, stl, obj, off)") from None  # fmt: skip
     if not len(triangles):
-        raise InputError("the surface has no triangles", where=where, found=f"{len(points)} points", expected="triangles")
+        raise _no_triangles(path, where)
     return points, triangles
 
 
+def _no_triangles(path: Path, where: str) -> InputError:
+    """Return what to say of a file without triangles: points alone are a cloud; else it is something else than its ending says."""
+    with path.open("rb") as stream:
+        head = stream.read(1_000_000)
+    declared = re.search(rb"^element vertex (\d+)", head, re.MULTILINE)
+    count = int(declared[1]) if declared else len(re.findall(rb"^v\s", head, re.MULTILINE))
+    if count:
+        return InputError("the surface has no triangles", where=where, found=f"a cloud of {count} points", expected="triangles", hint="reconstruct a closed surface first (MeshLab, Open3D: Poisson reconstruction)")  # fmt: skip
+    return InputError("the surface has no triangles", where=where, found="no points either", expected="triangles", hint="is this file what its ending says?")  # fmt: skip
+
+
 def tetrahedralise(
-    points: FloatArray, triangles: IntArray, *, edge_fraction: float = EDGE_FRACTION, where: str = "surface"
+    points: FloatArray,
+    triangles: IntArray,
+    *,
+    edge_fraction: float = EDGE_FRACTION,
+    envelope: float = ENVELOPE,
+    where: str = "surface",
+    check_volume: bool = True,
 ) -> TetMesh:
     """Return tetrahedra that fill a closed surface (fTetWild; another mesh each time, see `_tets_of_surface`).
 
@@ -103,19 +125,21 @@ def tetrahedralise(
         points: shape (n, 3), any unit.
         triangles: shape (t, 3), outward; a cavity's surface points into the cavity.
         edge_fraction: wanted edge length over the diagonal of the bounding box [1].
+        envelope: how far the mesh may leave the surface, over that diagonal [1].
         where: what a message names.
+        check_volume: warn where the tetrahedra hold more or less than the surface (which may where shells cross).
 
     Raises:
         InputError: where nothing came out. MissingDependency: without pytetwild.
     """
-    nodes, tets = _run_ftetwild(points, triangles, edge_fraction, where)
+    nodes, tets = _run_ftetwild(points, triangles, edge_fraction, envelope, where)
     if not len(tets):
         raise InputError("no tetrahedra came out of this surface", where=where, found=f"{len(triangles)} triangles", expected="a closed surface around a volume")  # fmt: skip
     mesh = oriented(_compact(nodes, tets))
     corners = points[triangles]
     inside = float(np.linalg.det(corners).sum() / 6.0)  # Σ a · (b × c) / 6 over outward triangles
     filled = float(element_volumes(mesh).sum()) / inside if inside else np.nan
-    if not 0.95 < filled < 1.05:
+    if check_volume and not 0.95 < filled < 1.05:
         warnings.warn(
             f"{where}: the tetrahedra fill {100 * filled:.3g} % of the surface's volume; are its walls thin?", stacklevel=4
         )
@@ -234,18 +258,16 @@ def _check_middles(mesh: TetMesh, where: str) -> None:
 
 
 def closed_surface(points: FloatArray, triangles: IntArray, where: str) -> tuple[FloatArray, IntArray]:
-    """Return the surface, outward. Raises InputError where it is open."""
-    import trimesh
-
-    surface = trimesh.Trimesh(points, triangles, process=True)
-    if not surface.is_watertight:
-        edges = np.sort(np.asarray(surface.edges), axis=1)
-        count = np.unique(edges, axis=0, return_counts=True)[1]
+    """Return the surface, outward, inner shells as cavities, as it is otherwise. Raises InputError where it is open or in parts."""
+    points, same = np.unique(points, axis=0, return_inverse=True)
+    triangles = same.reshape(-1)[triangles]
+    edges = np.sort(np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
+    count = np.unique(edges, axis=0, return_counts=True)[1]
+    if (count != 2).any():
         raise InputError("the surface is not closed", where=where, found=f"{int((count == 1).sum())} edges with one triangle, {int((count > 2).sum())} with more than two",
-                         expected="every edge between two triangles", hint="close its holes in a mesh editor, or give tetrahedra")  # fmt: skip
-    if not surface.is_winding_consistent or surface.volume < 0:
-        trimesh.repair.fix_normals(surface)
-    return np.array(surface.vertices, dtype=np.float64), np.array(surface.faces, dtype=np.int64)
+                         expected="every edge between two triangles", hint="femsense mesh SURFACE -o ROBOT closes holes and mends what it can")  # fmt: skip
+    made = repaired(points, triangles, where=where)
+    return np.array(made.points), np.array(made.triangles)
 
 
 def kept_tets(surface: Path, points: FloatArray, triangles: IntArray) -> tuple[Path, Path]:
@@ -302,12 +324,14 @@ def _read_kept(place: Path) -> TetMesh | None:
         return None
 
 
-def _run_ftetwild(points: FloatArray, triangles: IntArray, edge_fraction: float, where: str) -> tuple[FloatArray, IntArray]:
+def _run_ftetwild(
+    points: FloatArray, triangles: IntArray, edge_fraction: float, envelope: float, where: str
+) -> tuple[FloatArray, IntArray]:
     """Return nodes and tetrahedra from a process of its own: fTetWild writes files where it runs, and it may crash."""
     if importlib.util.find_spec("pytetwild") is None:
         raise MissingDependency("a surface becomes tetrahedra through pytetwild: pip install pytetwild")
     with tempfile.TemporaryDirectory(prefix="femsense-") as folder:
-        np.savez(Path(folder) / "surface.npz", points=points, triangles=triangles.astype(np.int32), edge=edge_fraction)
+        np.savez(Path(folder) / "surface.npz", points=points, triangles=triangles.astype(np.int32), edge=edge_fraction, envelope=envelope)  # fmt: skip
         result = subprocess.run([sys.executable, "-c", FTETWILD], cwd=folder, capture_output=True, text=True, errors="replace")
         made = Path(folder) / "tets.npz"
         if result.returncode or not made.is_file():

@@ -34,6 +34,8 @@ EFFECT_NAMES = (
     "base_compliance", "cable_friction", "cable_offset", "cable_gain", "cable_stretch", "cable_slack", "geometry",
     "depth_scale", "marker_offset",
 )  # fmt: skip
+SMALLEST_BODY, LARGEST_BODY = 1e-3, 20.0
+"""A body that is smaller or larger across than this [m] has another unit than declared."""
 FAR_CABLE = 0.25
 """A cable point farther outside than this times the mesh's diagonal is an error."""
 FAR_MARKER = 1.0
@@ -343,11 +345,10 @@ def _empty_box(mesh: TetMesh, low: FloatArray, high: FloatArray, where: str) -> 
 
 def _check_size(nodes: FloatArray, unit: str, path: Path) -> None:
     size = float(np.ptp(nodes, axis=0).max())
-    if 1e-3 <= size <= 20.0:
+    if SMALLEST_BODY <= size <= LARGEST_BODY:
         return
     raw = size / UNITS[unit]
-    fits = [name for name, scale in UNITS.items() if name != unit and 1e-3 <= raw * scale <= 20.0]
-    best = min(fits, key=lambda name: abs(np.log(raw * UNITS[name] / 0.2)), default=None)
+    best = likely_unit(raw)
     raise InputError(
         "the body has an unlikely size",
         where=_at(path, "mesh", "unit"),
@@ -355,6 +356,12 @@ def _check_size(nodes: FloatArray, unit: str, path: Path) -> None:
         expected="between 1 mm and 20 m",
         hint=f"unit = {best!r} gives {raw * UNITS[best]:.3g} m" if best else "scale the mesh file",
     )
+
+
+def likely_unit(size: float) -> str | None:
+    """Return the unit that makes a body of this size, in the unit of its file, most like a robot; None where none does."""
+    fits = [name for name, scale in UNITS.items() if SMALLEST_BODY <= size * scale <= LARGEST_BODY]
+    return min(fits, key=lambda name: abs(np.log(size * UNITS[name] / 0.2)), default=None)
 
 
 def _make_cable(mesh: TetMesh, table: CableTable, i: int, path: Path) -> Cable:

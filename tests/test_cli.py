@@ -23,7 +23,7 @@ from femsense import cli
 from femsense.errors import DataError, InputError
 from femsense.files import PART_PREFIX
 
-COMMANDS = ("demo", "inspect", "simulate", "calibrate", "estimate", "improve", "export", "view", "report", "doctor")
+COMMANDS = ("demo", "inspect", "mesh", "simulate", "calibrate", "estimate", "improve", "export", "view", "report", "doctor")
 ROOT = Path(femsense.__file__).parents[1]
 
 
