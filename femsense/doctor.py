@@ -152,13 +152,17 @@ def _libraries() -> Check:
 
 
 def _solver() -> Check:
+    chosen = os.environ.get("FEMSENSE_SOLVER", "").lower()
+    if chosen in ("", "cholesky"):
+        return Check("linear solver", "ok", "Cholesky of femsense, with the BLAS of SciPy")
+    if chosen not in ("pardiso", "superlu"):
+        return Check("linear solver", "error", f"FEMSENSE_SOLVER={chosen} is not known", "cholesky, pardiso or superlu")
     from femsense.fem.linear import pardiso_library
 
-    if pardiso_library() is not None:
-        return Check("linear solver", "ok", f"PARDISO (pypardiso {_version('pypardiso')})")
-    chosen = os.environ.get("FEMSENSE_SOLVER", "").lower() == "superlu"
-    hint = "FEMSENSE_SOLVER=superlu asks for it" if chosen else "pip install pypardiso makes it several times faster on x86-64"
-    return Check("linear solver", "warning", "SuperLU of SciPy", hint)
+    name = f"PARDISO (pypardiso {_version('pypardiso')})" if pardiso_library() is not None else "SuperLU of SciPy"
+    return Check(
+        "linear solver", "warning", name, f"FEMSENSE_SOLVER={chosen} asks for it: slower than the solver that comes along"
+    )
 
 
 def _viewer() -> Check:

@@ -57,6 +57,10 @@ SABOTAGES = (
     S("fem/mesh.py", "slopes[:, 4 + e, i] = 4.0 * L[:, j]", "slopes[:, 4 + e, i] = 4.0 * L[:, i]", "test_fem_mesh.py::test_shape_slopes_are_differences_of_the_shape_functions"),
     S("fem/mesh.py", "t = np.clip(np.einsum(", "t = np.abs(np.einsum(", "test_fem_mesh.py::test_closest_in_a_triangle_beats_every_sample_and_is_in_it"),
     # factorisation
+    S("fem/cholesky.py", "other[i] -= scale * known[i]", "other[i] += scale * known[i]", "test_fem_linear.py::test_a_random_pattern_is_factorised_as_the_dense_matrix"),
+    S("fem/cholesky.py", "X[to + a, seen[r]] -= work[line + r]", "X[to + a, seen[r]] += work[line + r]", "test_fem_linear.py::test_the_gram_matrix_of_sparse_columns_is_that_of_dense_ones"),
+    S("fem/cholesky.py", "weakref.finalize(self, analysis.idle.append, L)", "analysis.idle.append(L)", "test_fem_linear.py::test_factors_alive_at_once_keep_their_own_values"),
+    S("fem/cholesky.py", "head[parent[s]] = s", "head[parent[s]] = s if follow[s] == -1 else follow[s]", "test_fem_linear.py::test_a_random_pattern_is_factorised_as_the_dense_matrix"),
     S("fem/linear.py", "weakref.finalize(self, pattern.idle.append, handle)", "pattern.idle.append(handle)", "test_fem_linear.py::test_factors_alive_at_once_keep_their_own_values"),
     S("fem/linear.py", "self.negative = int(handle.iparm[22])", "self.negative = int(handle.iparm[21])", "test_fem_linear.py::test_an_indefinite_matrix_is_seen_as_such"),
     S("fem/linear.py", "pivots <= 0", "pivots >= 0", "test_fem_linear.py::test_solutions_are_those_of_the_dense_matrix"),

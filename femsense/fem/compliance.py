@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+import scipy.sparse as sp
 
 from femsense.arrays import FloatArray, as_points
 from femsense.errors import FemsenseError, InputError
@@ -109,7 +110,7 @@ def compliance(
         direction_rows(embed_points(body.mesh, P), D, len(body.mesh.nodes)) if len(P) else np.zeros((0, 3 * at.node_count))
     )
     rows = np.vstack([point_rows, drive_rows(body, equilibrium.positions)])[:, at.dofs]
-    W = rows @ at.factor.solve(rows.T)
+    W = at.factor.gram(sp.csc_matrix(rows.T))
     return np.asarray((W + W.T) / 2.0)
 
 

@@ -1,7 +1,8 @@
 """Factor once, solve many: the sparse symmetric systems of the body.
 
-PARDISO of the MKL (through pypardiso) where it is installed, with its analysis kept for a sparsity pattern; SuperLU of
-SciPy elsewhere. Set FEMSENSE_SOLVER=superlu to choose the latter.
+A stiffness that is positive definite goes to `femsense.fem.cholesky`, with its analysis kept for a sparsity pattern. One that
+is not goes to PARDISO of the MKL (through pypardiso) where it is installed, and to SuperLU of SciPy elsewhere.
+Set FEMSENSE_SOLVER to `pardiso` or `superlu` to send all of them there.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
 from femsense.arrays import FloatArray, IntArray
+from femsense.fem.cholesky import Analysis, analyse, cholesky
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -34,11 +36,19 @@ class Pattern:
     upper_indptr: npt.NDArray[np.int32]
     upper_indices: npt.NDArray[np.int32]
     idle: list[Any] = field(default_factory=list)
-    """Solvers that hold the analysis of this pattern and no factor that is still needed."""
+    """PARDISO solvers that hold the analysis of this pattern and no factor that is still needed."""
+    analyses: list[Analysis] = field(default_factory=list)
+    """The analysis for Cholesky, once it was needed."""
 
     @property
     def size(self) -> int:
         return len(self.indptr) - 1
+
+    def analysis(self) -> Analysis:
+        """Return the analysis for Cholesky, made when it is first asked for."""
+        if not self.analyses:
+            self.analyses.append(analyse(self.indptr, self.indices))
+        return self.analyses[0]
 
 
 def make_pattern(indptr: IntArray, indices: IntArray) -> Pattern:
@@ -66,6 +76,10 @@ class Factorization(Protocol):
         """Return K⁻¹ right, shape (f,) or (f, k)."""
         ...
 
+    def gram(self, columns: sp.csc_matrix) -> FloatArray:
+        """Return BᵀK⁻¹B, shape (k, k), for sparse columns B, shape (f, k)."""
+        ...
+
 
 def factorize(pattern: Pattern, values: FloatArray) -> Factorization | None:
     """Factorise a symmetric matrix; None where it is singular or not finite.
@@ -76,13 +90,7 @@ def factorize(pattern: Pattern, values: FloatArray) -> Factorization | None:
     """
     if not np.isfinite(values).all():
         return None
-    if pardiso_library() is not None:
-        return _factorize_pardiso(pattern, values)
-    matrix = sp.csc_matrix((values, pattern.indices, pattern.indptr), shape=(pattern.size,) * 2)
-    try:
-        return _SuperLU(splu(matrix, permc_spec="NATURAL", diag_pivot_thresh=0.0, options={"SymmetricMode": True}))
-    except RuntimeError:  # exactly singular
-        return None
+    return (_cholesky(pattern, values) if _wanted() == "cholesky" else None) or _factorize_any(pattern, values)
 
 
 def factorize_definite(pattern: Pattern, values: FloatArray, *, tries: int = 30) -> tuple[Factorization | None, float]:
@@ -91,8 +99,8 @@ def factorize_definite(pattern: Pattern, values: FloatArray, *, tries: int = 30)
     Returns:
         the factorisation (None where nothing helped) and the shift [N/m], 0 where none was needed.
     """
-    factor = factorize(pattern, values)
-    if factor is not None and factor.negative == 0:
+    factor = _definite(pattern, values)
+    if factor is not None:
         return factor, 0.0
     columns = np.repeat(np.arange(pattern.size), np.diff(pattern.indptr))
     diagonal = np.flatnonzero(pattern.indices == columns)
@@ -103,11 +111,38 @@ def factorize_definite(pattern: Pattern, values: FloatArray, *, tries: int = 30)
     for _ in range(tries):
         shifted = values.copy()
         shifted[diagonal] += shift
-        factor = factorize(pattern, shifted)
-        if factor is not None and factor.negative == 0:
+        factor = _definite(pattern, shifted)
+        if factor is not None:
             return factor, shift
         shift *= 4.0
     return None, shift
+
+
+def _wanted() -> str:
+    return os.environ.get("FEMSENSE_SOLVER", "").lower() or "cholesky"
+
+
+def _cholesky(pattern: Pattern, values: FloatArray) -> Factorization | None:
+    return cholesky(pattern.analysis(), values)
+
+
+def _definite(pattern: Pattern, values: FloatArray) -> Factorization | None:
+    """Return the factor of a matrix that is positive definite, None where it is not."""
+    if _wanted() == "cholesky":
+        return _cholesky(pattern, values)
+    factor = factorize(pattern, values)
+    return factor if factor is not None and factor.negative == 0 else None
+
+
+def _factorize_any(pattern: Pattern, values: FloatArray) -> Factorization | None:
+    """Factorise a matrix that may be indefinite."""
+    if pardiso_library() is not None:
+        return _factorize_pardiso(pattern, values)
+    matrix = sp.csc_matrix((values, pattern.indices, pattern.indptr), shape=(pattern.size,) * 2)
+    try:
+        return _SuperLU(splu(matrix, permc_spec="NATURAL", diag_pivot_thresh=0.0, options={"SymmetricMode": True}))
+    except RuntimeError:  # exactly singular
+        return None
 
 
 class _SuperLU:
@@ -122,11 +157,14 @@ class _SuperLU:
     def solve(self, right: FloatArray) -> FloatArray:
         return np.asarray(self._lu.solve(np.ascontiguousarray(right)))
 
+    def gram(self, columns: sp.csc_matrix) -> FloatArray:
+        return np.asarray(columns.T @ self.solve(columns.toarray()))
+
 
 @functools.cache
 def pardiso_library() -> Any:
     """Return MKL's PARDISO as a C function, or None where it is not installed or not wanted."""
-    if os.environ.get("FEMSENSE_SOLVER", "").lower() == "superlu":
+    if _wanted() == "superlu":
         return None
     try:
         from pypardiso.pardiso_wrapper import PyPardisoSolver
@@ -197,6 +235,9 @@ class _Pardiso:
         if error:
             raise RuntimeError(f"PARDISO could not solve (error {error})")
         return x
+
+    def gram(self, columns: sp.csc_matrix) -> FloatArray:
+        return np.asarray(columns.T @ self.solve(columns.toarray()))
 
 
 def _factorize_pardiso(pattern: Pattern, values: FloatArray) -> Factorization | None:

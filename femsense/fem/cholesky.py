@@ -1,0 +1,699 @@
+# mypy: allow-untyped-decorators
+"""Sparse Cholesky of stiffness matrices: multifrontal, supernodal, in single or double precision.
+
+The analysis (elimination tree, supernodes, where every entry goes) depends on the sparsity pattern alone and is kept. Dense
+work goes to the BLAS that SciPy brings. Right-hand sides with few entries, as points and cables have, only visit the part of
+the tree above them: that is what makes `gram` (B'K⁻¹B without K⁻¹B) cheap. References: Liu 1992 (multifrontal method),
+Ashcraft & Grimes 1989 (relaxed supernodes), Gilbert 1994 (the reach of a sparse right-hand side).
+"""
+
+from __future__ import annotations
+
+import weakref
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import scipy.sparse as sp
+from llvmlite import ir
+from numba import njit, types
+from numba.extending import get_cython_function_address, intrinsic
+
+from femsense.arrays import FloatArray, IntArray
+
+FEW = 4
+"""Right-hand sides that are solved one by one; more go through BLAS together."""
+SMALL = 16
+"""Columns that plain loops factorise at a time; the rest of a panel follows through BLAS."""
+
+
+@intrinsic
+def _call(typing_context: Any, address: Any, arguments: Any) -> Any:
+    """Call a Fortran routine at an address; all its arguments are pointers, given as a tuple of integers."""
+    del typing_context
+
+    def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        integer = ir.IntType(64)
+        kind = ir.FunctionType(ir.VoidType(), [integer] * len(arguments))
+        pointers = [builder.extract_value(values[1], i) for i in range(len(arguments))]
+        builder.call(builder.inttoptr(values[0], kind.as_pointer()), pointers)
+        return context.get_dummy_value()
+
+    return types.void(address, arguments), build
+
+
+# --- analysis ------------------------------------------------------------------------------------------------------------
+
+
+@njit(cache=True)
+def _elimination_tree(indptr: IntArray, indices: IntArray) -> IntArray:
+    n = len(indptr) - 1
+    parent, ancestor = np.full(n, -1, np.int64), np.full(n, -1, np.int64)
+    for j in range(n):
+        for p in range(indptr[j], indptr[j + 1]):
+            i = indices[p]
+            while i != -1 and i < j:
+                above = ancestor[i]
+                ancestor[i] = j
+                if above == -1:
+                    parent[i] = j
+                i = above
+    return parent
+
+
+@njit(cache=True)
+def _postorder(parent: IntArray, weight: IntArray) -> IntArray:
+    """Return the nodes of a forest, children before parents, the heaviest child last."""
+    n = len(parent)
+    head, follow = np.full(n, -1, np.int64), np.full(n, -1, np.int64)
+    for j in np.argsort(weight):  # lists are filled from the front: the heaviest comes first in a list, last in the order
+        if parent[j] != -1:
+            follow[j] = head[parent[j]]
+            head[parent[j]] = j
+    order, stack, count = np.empty(n, np.int64), np.empty(n, np.int64), n
+    for root in range(n - 1, -1, -1):
+        if parent[root] != -1:
+            continue
+        top = 0
+        stack[0] = root
+        while top >= 0:
+            j = stack[top]
+            top -= 1
+            count -= 1
+            order[count] = j
+            light = np.int64(head[j])
+            first = top + 1
+            while light != -1:
+                top += 1
+                stack[top] = light
+                light = follow[light]
+            stack[first : top + 1] = stack[first : top + 1][::-1].copy()
+    return order
+
+
+@njit(cache=True)
+def _structures(indptr: IntArray, indices: IntArray, parent: IntArray) -> tuple[IntArray, IntArray]:
+    """Return the rows below the diagonal of each column of the factor, as indptr and indices (sorted)."""
+    n = len(parent)
+    start = np.zeros(n + 1, np.int64)
+    rows = np.empty(8 * len(indices) + 64, np.int64)
+    mark = np.full(n, -1, np.int64)
+    head, follow = np.full(n, -1, np.int64), np.full(n, -1, np.int64)
+    end = 0
+    for j in range(n):
+        if end + n - j > len(rows):
+            more = np.empty(2 * len(rows) + n, np.int64)
+            more[:end] = rows[:end]
+            rows = more
+        first = end
+        mark[j] = j
+        for p in range(indptr[j], indptr[j + 1]):
+            i = indices[p]
+            if i > j and mark[i] != j:
+                mark[i] = j
+                rows[end] = i
+                end += 1
+        child = np.int64(head[j])
+        while child != -1:
+            for p in range(start[child], start[child + 1]):
+                i = rows[p]
+                if mark[i] != j:
+                    mark[i] = j
+                    rows[end] = i
+                    end += 1
+            child = follow[child]
+        rows[first:end].sort()
+        start[j + 1] = end
+        if parent[j] != -1:
+            follow[j] = head[parent[j]]
+            head[parent[j]] = j
+    return start, rows[:end].copy()
+
+
+@njit(cache=True)
+def _supernodes(count: IntArray, parent: IntArray, unit: int) -> IntArray:
+    """Return the first column of each supernode and the end; small ones are merged with their parents where few zeros result."""
+    n = len(parent)
+    firsts = np.empty(n + 1, np.int64)
+    zeros = np.zeros(n + 1, np.float64)
+    k = 0
+    for j in range(n):
+        if k > 0 and parent[j - 1] == j and count[j - 1] == count[j] + 1:
+            continue
+        firsts[k] = j
+        k += 1
+    firsts[k] = n
+    # merge from the left: a stack of supernodes, the top is tried with what follows
+    kept = np.empty(n + 1, np.int64)
+    top = 0
+    for s in range(k):
+        first, last = firsts[s], firsts[s + 1] - 1
+        empty = 0.0
+        while top > 0:
+            below = kept[top - 1]
+            if parent[first - 1] == -1 or parent[first - 1] > last:
+                break
+            wide, own = first - below, last + 1 - first
+            height = own + count[last]
+            fill = 0.0
+            for c in range(below, first):
+                fill += (first - c) + height - (count[c] + 1)
+            total = 0.5 * (wide + own) * (wide + own + 1) + (wide + own) * count[last]
+            share = (fill + empty) / total
+            columns = unit * (wide + own)
+            if not (columns <= 12 or (columns <= 36 and share < 0.2) or (columns <= 96 and share < 0.08) or share < 0.02):
+                break
+            empty = fill + empty
+            first = below
+            top -= 1
+        kept[top] = first
+        zeros[top] = empty
+        top += 1
+    kept[top] = n
+    return kept[: top + 1].copy()
+
+
+@njit(cache=True)
+def _relations(firsts: IntArray, start: IntArray, rows: IntArray) -> tuple[IntArray, IntArray, IntArray, IntArray]:
+    """Return parent of each supernode, its rows (indptr, indices), and where these stand in the front of the parent."""
+    count = len(firsts) - 1
+    n = firsts[count]
+    owner = np.empty(n, np.int64)
+    for s in range(count):
+        owner[firsts[s] : firsts[s + 1]] = s
+    begin = np.zeros(count + 1, np.int64)
+    for s in range(count):
+        last = firsts[s + 1] - 1
+        begin[s + 1] = begin[s] + start[last + 1] - start[last]
+    below = np.empty(begin[count], np.int64)
+    place = np.empty(begin[count], np.int64)
+    parent = np.full(count, -1, np.int64)
+    for s in range(count):
+        last = firsts[s + 1] - 1
+        below[begin[s] : begin[s + 1]] = rows[start[last] : start[last + 1]]
+        if begin[s + 1] > begin[s]:
+            parent[s] = owner[below[begin[s]]]
+    where = np.empty(n, np.int64)
+    for s in range(count):
+        p = parent[s]
+        if p == -1:
+            continue
+        own = firsts[p + 1] - firsts[p]
+        for q in range(begin[p], begin[p + 1]):
+            where[below[q]] = own + q - begin[p]
+        for q in range(begin[s], begin[s + 1]):
+            i = below[q]
+            place[q] = i - firsts[p] if i < firsts[p + 1] else where[i]
+    return parent, begin, below, place
+
+
+@njit(cache=True)
+def _targets(
+    indptr: IntArray, indices: IntArray, order: IntArray, inverse: IntArray, firsts: IntArray, begin: IntArray, below: IntArray,
+    offset: IntArray, unit: int,
+) -> tuple[IntArray, IntArray]:  # fmt: skip
+    """Return where the entries of a matrix (in its scalar CSC) go in the factor: source, target."""
+    source = np.empty(len(indices), np.int64)
+    target = np.empty(len(indices), np.int64)
+    where = np.empty(len(order), np.int64)
+    k = 0
+    for s in range(len(firsts) - 1):
+        own = firsts[s + 1] - firsts[s]
+        height = unit * (own + begin[s + 1] - begin[s])
+        for q in range(begin[s], begin[s + 1]):
+            where[below[q]] = own + q - begin[s]
+        for j in range(firsts[s], firsts[s + 1]):
+            for b in range(unit):
+                column = unit * order[j] + b
+                at = offset[s] + (unit * (j - firsts[s]) + b) * height
+                for p in range(indptr[column], indptr[column + 1]):
+                    node, a = divmod(indices[p], unit)
+                    i = inverse[node]
+                    if i < j or (i == j and a < b):
+                        continue
+                    line = i - firsts[s] if i < firsts[s + 1] else where[i]
+                    source[k] = p
+                    target[k] = at + unit * line + a
+                    k += 1
+    return source[:k].copy(), target[:k].copy()
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Analysis:
+    """What the factorisation of every matrix of one pattern shares. Nodes are `unit` unknowns each."""
+
+    unit: int
+    order: IntArray
+    """Unknowns in the order of elimination, shape (f,)."""
+    firsts: IntArray
+    """First node of each supernode, and the end, shape (s + 1,)."""
+    parent: IntArray
+    """Supernode above, −1 at a root, shape (s,)."""
+    begin: IntArray
+    """Where the nodes below each supernode begin in `below`, shape (s + 1,)."""
+    below: IntArray
+    place: IntArray
+    """Where each of `below` stands in the front of the parent."""
+    offset: IntArray
+    """Where the panel of each supernode begins in the factor, shape (s + 1,)."""
+    source: IntArray
+    target: IntArray
+    stack: int
+    """Entries of the largest stack of update matrices."""
+    rank: IntArray
+    """Place of each unknown in the order of elimination, shape (f,)."""
+    owner: IntArray
+    """Supernode of each unknown in the order of elimination, shape (f,)."""
+    idle: list[npt.NDArray[Any]]
+    """Memory of factors that are gone, taken again by new ones."""
+
+    @property
+    def size(self) -> int:
+        return len(self.order)
+
+    def take(self, kind: str) -> npt.NDArray[Any]:
+        """Return memory for a factor."""
+        for i in range(len(self.idle)):
+            if self.idle[i].dtype.char == kind:
+                array: npt.NDArray[Any] = self.idle.pop(i)
+                return array
+        fresh: npt.NDArray[Any] = np.empty(self.offset[-1], kind)
+        return fresh
+
+
+@njit(cache=True)
+def _stack_size(parent: IntArray, begin: IntArray, unit: int) -> int:
+    count = len(parent)
+    waiting = np.zeros(count + 1, np.int64)
+    now, most = 0, 0
+    for s in range(count):
+        own = (unit * (begin[s + 1] - begin[s])) ** 2
+        most = max(most, now + own)
+        now += own - waiting[s]
+        if parent[s] != -1:
+            waiting[parent[s]] += own
+    return most
+
+
+def analyse(indptr: IntArray, indices: IntArray) -> Analysis:
+    """Analyse the pattern of a symmetric matrix in CSC with sorted indices; its order is taken as one of little fill."""
+    unit = 3 if _has_blocks(indptr, indices) else 1
+    heads, entries = np.asarray(indptr, np.int64), np.asarray(indices, np.int64)
+    counts = np.diff(heads)[::unit] // unit
+    rows = np.concatenate([[0], np.cumsum(counts)])
+    columns = entries[_ranges(heads[:-1:unit], counts, unit)] // unit
+    parent = _elimination_tree(rows, columns)
+    order = _postorder(parent, np.diff(_structures(rows, columns, parent)[0]))
+    inverse = np.empty_like(order)
+    inverse[order] = np.arange(len(order))
+    columns = inverse[columns[_ranges(rows[:-1][order], counts[order], 1)]]
+    rows = np.concatenate([[0], np.cumsum(counts[order])])
+    parent = np.where(parent[order] >= 0, inverse[parent[order]], -1)
+    start, structure = _structures(rows, columns, parent)
+    firsts = _supernodes(np.diff(start), parent, unit)
+    above, begin, below, place = _relations(firsts, start, structure)
+    width = unit * np.diff(firsts)
+    offset = np.concatenate([[0], np.cumsum(width * (width + unit * np.diff(begin)))])
+    source, target = _targets(heads, entries, order, inverse, firsts, begin, below, offset, unit)
+    unknowns = (unit * order[:, None] + np.arange(unit)).ravel()
+    rank = np.empty_like(unknowns)
+    rank[unknowns] = np.arange(len(unknowns))
+    owner = np.repeat(np.arange(len(above)), width)
+    return Analysis(
+        unit, unknowns, firsts, above, begin, below, place, offset, source, target, int(_stack_size(above, begin, unit)), rank, owner, []
+    )  # fmt: skip
+
+
+def _ranges(starts: IntArray, counts: IntArray, step: int) -> IntArray:
+    """Return starts[0], starts[0] + step, … counts[0] times, then the same of starts[1], and so on."""
+    ends = np.cumsum(counts)
+    inner = np.arange(int(counts.sum()), dtype=np.int64) - np.repeat(ends - counts, counts)
+    return np.asarray(np.repeat(starts, counts) + step * inner)
+
+
+def _has_blocks(indptr: IntArray, indices: IntArray) -> bool:
+    """Return whether a pattern consists of full 3 × 3 blocks."""
+    if (len(indptr) - 1) % 3 or len(indices) % 9:
+        return False
+    counts = np.diff(indptr).reshape(-1, 3)
+    if (counts != counts[:, :1]).any() or (counts % 3).any():
+        return False
+    triples = np.asarray(indices).reshape(-1, 3)
+    return bool((triples[:, 0] % 3 == 0).all() and (np.diff(triples, axis=1) == 1).all())
+
+
+# --- numbers -------------------------------------------------------------------------------------------------------------
+
+
+@njit(cache=True)
+def _factor_columns(panel: FloatArray, height: int, first: int, last: int) -> bool:
+    """Factorise columns first … last of a panel (stored by columns) in place; False where a pivot is not positive."""
+    for j in range(first, last):
+        line = panel[j * height + j : (j + 1) * height]
+        pivot = line[0]
+        if not pivot > 0.0:
+            return False
+        inverse = 1.0 / np.sqrt(pivot)
+        for i in range(len(line)):
+            line[i] *= inverse
+        for k in range(j + 1, last):
+            known, other = line[k - j :], panel[k * height + k : (k + 1) * height]
+            scale = known[0]
+            for i in range(len(other)):
+                other[i] -= scale * known[i]
+    return True
+
+
+@njit(cache=True)
+def _extend_add(
+    child: FloatArray, place: IntArray, unit: int, own: int, panel: FloatArray, height: int, update: FloatArray
+) -> None:
+    """Add the update matrix of a child to the front of its parent: the panel, and the update matrix below it."""
+    rows = len(place)
+    size, rest = unit * rows, height - unit * own
+    for j in range(rows):
+        column = place[j]
+        for b in range(unit):
+            line = child[(unit * j + b) * size : (unit * j + b + 1) * size]
+            if column < own:
+                to = panel[(unit * column + b) * height : (unit * column + b + 1) * height]
+                shift = np.uint64(0)
+            else:
+                to = update[(unit * (column - own) + b) * rest : (unit * (column - own) + b + 1) * rest]
+                shift = np.uint64(unit * own)
+            for i in range(j, rows):
+                at = np.uint64(unit * place[i]) - shift
+                frm = np.uint64(unit * i)
+                for a in range(unit):
+                    to[at + np.uint64(a)] += line[frm + np.uint64(a)]
+
+
+@njit(cache=True)
+def _factorise(
+    values: FloatArray, source: IntArray, target: IntArray, unit: int, firsts: IntArray, parent: IntArray, begin: IntArray,
+    place: IntArray, offset: IntArray, blas: IntArray, L: FloatArray, stack: FloatArray, head: IntArray, follow: IntArray,
+    letters: npt.NDArray[np.uint8], numbers: npt.NDArray[np.int32], scalars: FloatArray,
+) -> bool:  # fmt: skip
+    """Write the factor; False where the matrix is not positive definite."""
+    L[:] = 0.0
+    for k in range(len(source)):
+        L[target[k]] = values[source[k]]
+    width = L.itemsize
+    lower, no, yes = letters.ctypes.data, letters.ctypes.data + 1, letters.ctypes.data + 2
+    at = numbers.ctypes.data
+    minus, one, zero = scalars.ctypes.data, scalars.ctypes.data + width, scalars.ctypes.data + 2 * width
+    head[:] = -1
+    top = 0
+    base, pile = L.ctypes.data, stack.ctypes.data
+    for s in range(len(parent)):
+        own = firsts[s + 1] - firsts[s]
+        rows = begin[s + 1] - begin[s]
+        columns, rest = unit * own, unit * rows
+        height = columns + rest
+        panel = L[offset[s] : offset[s + 1]]
+        floor = top
+        update = stack[top : top + rest * rest]
+        child = head[s]
+        if child != -1:
+            for j in range(rest):
+                update[j * rest + j : (j + 1) * rest] = 0.0
+        while child != -1:  # the last child lies on top of the stack
+            size = unit * (begin[child + 1] - begin[child])
+            floor -= size * size
+            _extend_add(
+                stack[floor : floor + size * size], place[begin[child] : begin[child + 1]], unit, own, panel, height, update
+            )
+            child = follow[child]
+        for j in range(0, columns, SMALL):
+            last = min(j + SMALL, columns)
+            if not _factor_columns(panel, height, j, last):
+                return False
+            if last < columns:  # the rest of the panel: A[last:, last:columns] −= X[last:, j:last] X[last:columns, j:last]ᵀ
+                numbers[0], numbers[1], numbers[2], numbers[3] = height - last, columns - last, last - j, height
+                x = base + width * (offset[s] + j * height + last)
+                y = base + width * (offset[s] + last * height + last)
+                _call(blas[0], (no, yes, at, at + 4, at + 8, minus, x, at + 12, x, at + 12, one, y, at + 12))
+        if rest > 0:
+            numbers[0], numbers[1], numbers[2], numbers[3] = rest, columns, height, rest
+            x = base + width * (offset[s] + columns)
+            beta = one if head[s] != -1 else zero
+            _call(blas[1], (lower, no, at, at + 4, minus, x, at + 8, beta, pile + width * top, at + 12))
+            if floor < top:
+                stack[floor : floor + rest * rest] = update
+            if parent[s] != -1:
+                follow[s] = head[parent[s]]
+                head[parent[s]] = s
+        top = floor + rest * rest
+    return True
+
+
+@njit(cache=True, fastmath={"reassoc", "contract"})
+def _solve_one(
+    unit: int,
+    firsts: IntArray,
+    begin: IntArray,
+    below: IntArray,
+    offset: IntArray,
+    L: FloatArray,
+    x: FloatArray,
+    half: FloatArray,
+) -> None:
+    """Solve in place for one right-hand side in the order of elimination."""
+    count = len(firsts) - 1
+    for s in range(count):
+        c0, columns = unit * firsts[s], unit * (firsts[s + 1] - firsts[s])
+        rest = unit * (begin[s + 1] - begin[s])
+        height = columns + rest
+        total = half[:height]
+        total[:columns] = x[c0 : c0 + columns]
+        total[columns:] = 0.0
+        for j in range(columns):
+            line, left = L[offset[s] + j * height + j : offset[s] + (j + 1) * height], total[j:]
+            value = left[0] / line[0]
+            for i in range(len(line)):
+                left[i] -= line[i] * value
+            left[0] = value
+        x[c0 : c0 + columns] = total[:columns]
+        for q in range(begin[s + 1] - begin[s]):
+            to = unit * below[begin[s] + q]
+            for a in range(unit):
+                x[to + a] += total[columns + unit * q + a]
+    for s in range(count - 1, -1, -1):
+        c0, columns = unit * firsts[s], unit * (firsts[s + 1] - firsts[s])
+        rest = unit * (begin[s + 1] - begin[s])
+        height = columns + rest
+        total = half[:height]
+        total[:columns] = x[c0 : c0 + columns]
+        for q in range(begin[s + 1] - begin[s]):
+            to = unit * below[begin[s] + q]
+            for a in range(unit):
+                total[columns + unit * q + a] = x[to + a]
+        for j in range(columns - 1, -1, -1):
+            line, left = L[offset[s] + j * height + j + 1 : offset[s] + (j + 1) * height], total[j + 1 :]
+            known = L[0] * 0
+            for i in range(len(line)):
+                known += line[i] * left[i]
+            total[j] = (total[j] - known) / L[offset[s] + j * height + j]
+        x[c0 : c0 + columns] = total[:columns]
+
+
+@njit(cache=True)
+def _solve_many(
+    unit: int, firsts: IntArray, begin: IntArray, below: IntArray, offset: IntArray, blas: IntArray, L: FloatArray, X: FloatArray,
+    work: FloatArray, letters: npt.NDArray[np.uint8], numbers: npt.NDArray[np.int32], scalars: FloatArray,
+) -> None:  # fmt: skip
+    """Solve in place for the columns of X (f, k) in the order of elimination; work holds k times the tallest front."""
+    width, k = L.itemsize, X.shape[1]
+    lower, no, yes, right = letters.ctypes.data, letters.ctypes.data + 1, letters.ctypes.data + 2, letters.ctypes.data + 3
+    at = numbers.ctypes.data
+    minus, one, zero = scalars.ctypes.data, scalars.ctypes.data + width, scalars.ctypes.data + 2 * width
+    numbers[0] = k
+    for s in range(len(firsts) - 1):
+        c0, columns, rows = unit * firsts[s], unit * (firsts[s + 1] - firsts[s]), begin[s + 1] - begin[s]
+        numbers[1], numbers[2], numbers[3] = columns, unit * rows, columns + unit * rows
+        panel, here = L.ctypes.data + width * offset[s], X.ctypes.data + width * c0 * k
+        _call(blas[2], (right, lower, yes, no, at, at + 4, one, panel, at + 12, here, at))
+        if rows > 0:
+            _call(
+                blas[0],
+                (no, yes, at, at + 8, at + 4, one, here, at, panel + width * columns, at + 12, zero, work.ctypes.data, at),
+            )
+        for q in range(rows):
+            for a in range(unit):
+                line, part = X[unit * below[begin[s] + q] + a], work[(unit * q + a) * k : (unit * q + a + 1) * k]
+                for r in range(k):
+                    line[r] -= part[r]
+    for s in range(len(firsts) - 2, -1, -1):
+        c0, columns, rows = unit * firsts[s], unit * (firsts[s + 1] - firsts[s]), begin[s + 1] - begin[s]
+        numbers[1], numbers[2], numbers[3] = columns, unit * rows, columns + unit * rows
+        panel, here = L.ctypes.data + width * offset[s], X.ctypes.data + width * c0 * k
+        for q in range(rows):
+            for a in range(unit):
+                work[(unit * q + a) * k : (unit * q + a + 1) * k] = X[unit * below[begin[s] + q] + a]
+        if rows > 0:
+            _call(
+                blas[0],
+                (no, no, at, at + 4, at + 8, minus, work.ctypes.data, at, panel + width * columns, at + 12, one, here, at),
+            )
+        _call(blas[2], (right, lower, no, no, at, at + 4, one, panel, at + 12, here, at))
+
+
+@njit(cache=True)
+def _reach(parent: IntArray, owner: IntArray, indptr: IntArray, rows: IntArray) -> tuple[IntArray, IntArray]:
+    """Return which right-hand sides (columns of B, rows in the order of elimination) each supernode sees: indptr, columns."""
+    count, columns = len(parent), len(indptr) - 1
+    mark = np.full(count, -1, np.int64)
+    size = np.zeros(count + 1, np.int64)
+    for fill in range(2):
+        mark[:] = -1
+        if fill == 1:
+            start = np.zeros(count + 1, np.int64)
+            start[1:] = np.cumsum(size[:count])
+            active = np.empty(start[count], np.int64)
+            size[:] = 0
+        for r in range(columns):
+            for p in range(indptr[r], indptr[r + 1]):
+                s = owner[rows[p]]
+                while s != -1 and mark[s] != r:
+                    mark[s] = r
+                    if fill == 1:
+                        active[start[s] + size[s]] = r
+                    size[s] += 1
+                    s = parent[s]
+    return start, active
+
+
+@njit(cache=True)
+def _gram(
+    unit: int, firsts: IntArray, begin: IntArray, below: IntArray, offset: IntArray, start: IntArray, active: IntArray, blas: IntArray,
+    L: FloatArray, X: FloatArray, work: FloatArray, W: FloatArray,
+    letters: npt.NDArray[np.uint8], numbers: npt.NDArray[np.int32], scalars: FloatArray,
+) -> None:  # fmt: skip
+    """Add XᵀK⁻¹X to W (lower half in the order of `active`); X (f, k), in the order of elimination, is overwritten."""
+    width = L.itemsize
+    lower, no, yes, right = letters.ctypes.data, letters.ctypes.data + 1, letters.ctypes.data + 2, letters.ctypes.data + 3
+    at = numbers.ctypes.data
+    one, zero = scalars.ctypes.data + width, scalars.ctypes.data + 2 * width
+    for s in range(len(firsts) - 1):
+        seen = active[start[s] : start[s + 1]]
+        k = len(seen)
+        if k == 0:
+            continue
+        c0, columns = unit * firsts[s], unit * (firsts[s + 1] - firsts[s])
+        rest = unit * (begin[s + 1] - begin[s])
+        height = columns + rest
+        for i in range(columns):
+            for r in range(k):
+                work[i * k + r] = X[c0 + i, seen[r]]
+        numbers[0], numbers[1], numbers[2], numbers[3] = k, columns, rest, height
+        here = work.ctypes.data
+        after = here + width * columns * k
+        _call(blas[2], (right, lower, yes, no, at, at + 4, one, L.ctypes.data + width * offset[s], at + 12, here, at))
+        if rest > 0:
+            below_panel = L.ctypes.data + width * (offset[s] + columns)
+            _call(blas[0], (no, yes, at, at + 8, at + 4, one, here, at, below_panel, at + 12, zero, after, at))
+            for q in range(begin[s + 1] - begin[s]):
+                to = unit * below[begin[s] + q]
+                for a in range(unit):
+                    line = (columns + unit * q + a) * k
+                    for r in range(k):
+                        X[to + a, seen[r]] -= work[line + r]
+        _call(blas[1], (lower, no, at, at + 4, one, here, at, zero, after, at))
+        for c in range(k):
+            for r in range(c, k):
+                W[seen[r], seen[c]] += work[(columns + c) * k + r]
+
+
+class Cholesky:
+    """A factor K = LLᵀ of a positive definite matrix."""
+
+    def __init__(self, analysis: Analysis, L: npt.NDArray[Any]) -> None:
+        self.negative = 0
+        self.size = analysis.size
+        self.bytes = L.nbytes
+        self._analysis, self._L = analysis, L
+        weakref.finalize(self, analysis.idle.append, L)
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        """Return K⁻¹ right, shape (f,) or (f, k)."""
+        a, kind = self._analysis, self._L.dtype
+        right = np.asarray(right)
+        columns = right.reshape(a.size, -1)
+        if columns.shape[1] < FEW:
+            x = np.ascontiguousarray(columns[a.order].T, dtype=kind)
+            work = np.empty(a.size, kind)
+            for one in x:
+                _solve_one(a.unit, a.firsts, a.begin, a.below, a.offset, self._L, one, work)
+            ordered = x.T
+        else:
+            ordered = np.ascontiguousarray(columns[a.order], dtype=kind)
+            work = np.empty(a.unit * int(np.diff(a.begin).max(initial=0)) * ordered.shape[1], kind)
+            _solve_many(
+                a.unit, a.firsts, a.begin, a.below, a.offset, _BLAS[kind.char], self._L, ordered, work, *_constants(kind.char)
+            )
+        return ordered[a.rank].astype(np.float64, copy=False).reshape(right.shape)
+
+    def gram(self, columns: sp.csc_matrix) -> FloatArray:
+        """Return BᵀK⁻¹B = (L⁻¹B)ᵀ(L⁻¹B), shape (k, k), for sparse columns B, shape (f, k)."""
+        a, k, kind = self._analysis, columns.shape[1], self._L.dtype
+        rows = a.rank[columns.indices]
+        indptr = columns.indptr.astype(np.int64)
+        start, active = _reach(a.parent, a.owner, indptr, rows)
+        X = np.zeros((a.size, k), kind)
+        X[rows, np.repeat(np.arange(k), np.diff(indptr))] = columns.data
+        W = np.zeros((k, k))
+        tallest = int((np.diff(a.firsts) + np.maximum(np.diff(a.begin), k)).max(initial=0))
+        work = np.empty(a.unit * tallest * k, kind)
+        _gram(
+            a.unit,
+            a.firsts,
+            a.begin,
+            a.below,
+            a.offset,
+            start,
+            active,
+            _BLAS[kind.char],
+            self._L,
+            X,
+            work,
+            W,
+            *_constants(kind.char),
+        )
+        return np.asarray(W + np.tril(W, -1).T)
+
+
+def cholesky(analysis: Analysis, values: FloatArray, *, single: bool = False) -> Cholesky | None:
+    """Factorise a symmetric matrix of an analysed pattern; None where it is not positive definite.
+
+    Arguments:
+        analysis: from `analyse`.
+        values: its entries in CSC order, shape (nnz,).
+        single: work in single precision (errors of 1e-7 times the condition of the matrix: a preconditioner).
+    """
+    a, kind = analysis, "f" if single else "d"
+    L = a.take(kind)
+    stack, head, follow = np.empty(a.stack, kind), np.empty(len(a.parent), np.int64), np.empty(len(a.parent), np.int64)
+    definite = _factorise(
+        values, a.source, a.target, a.unit, a.firsts, a.parent, a.begin, a.place, a.offset, _BLAS[kind], L, stack, head, follow,
+        *_constants(kind),
+    )  # fmt: skip
+    if definite:
+        return Cholesky(a, L)
+    a.idle.append(L)
+    return None
+
+
+def _addresses(kind: str) -> IntArray:
+    return np.array(
+        [get_cython_function_address("scipy.linalg.cython_blas", kind + name) for name in ("gemm", "syrk", "trsm")],
+        dtype=np.int64,
+    )
+
+
+def _constants(kind: str) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.int32], npt.NDArray[Any]]:
+    """Return what BLAS is pointed at: letters L N T R, room for integers, and −1, 1, 0."""
+    return np.frombuffer(b"LNTR", np.uint8), np.zeros(4, np.int32), np.array([-1.0, 1.0, 0.0], kind)
+
+
+_BLAS = {"d": _addresses("d"), "f": _addresses("s")}
