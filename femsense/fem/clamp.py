@@ -15,6 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.sparse as sp
 
 from femsense.arrays import FloatArray, IntArray
 from femsense.fem.body import BodyModel
@@ -111,6 +112,11 @@ class TurningFactor:
         """Return K⁻¹ right, shape (f,) or (f, k)."""
         answer = self._plain.solve(right)
         return np.asarray(answer + self._answers @ np.linalg.solve(self._inner, self._columns.T @ answer))
+
+    def gram(self, columns: sp.csc_matrix) -> FloatArray:
+        """Return BᵀK⁻¹B, shape (k, k), for sparse columns B, shape (f, k)."""
+        seen = columns.T @ self._answers
+        return np.asarray(self._plain.gram(columns) + seen @ np.linalg.solve(self._inner, seen.T))
 
 
 def with_turning_plate(body: BodyModel, positions: FloatArray, factor: Factorization | None) -> Factorization | None:
