@@ -67,34 +67,42 @@ def monomial_gradients(x: np.ndarray, quadratic: bool) -> np.ndarray:
     return np.array(linear + (more if quadratic else []), dtype=float)
 
 
-def energy_density(F: np.ndarray, law: str, mu: float, lam: float, limit: float) -> tuple[float, np.ndarray]:
-    """Return W [J/m³] and dW/dF [Pa] as in textbooks."""
+def local_part(F: np.ndarray, law: str, mu: float, limit: float) -> tuple[float, np.ndarray]:
+    """Return W [J/m³] without its λ term, and dW/dF [Pa], as in textbooks."""
     if law == "corotational":
-        R, _ = scipy.linalg.polar(F)
-        if np.linalg.det(R) < 0:
-            U, _, Vt = np.linalg.svd(F)
-            R = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
+        R = polar_rotation(F)
         strain = R.T @ F - np.eye(3)  # symmetric where R is the polar rotation
         strain = (strain + strain.T) / 2
-        return mu * float((strain**2).sum()) + lam / 2 * np.trace(strain) ** 2, R @ (
-            2 * mu * strain + lam * np.trace(strain) * np.eye(3)
-        )
+        return mu * float((strain**2).sum()), R @ (2 * mu * strain)
     J, I1 = np.linalg.det(F), float((F**2).sum())
-    if J <= 0:
+    if J <= 0 or limit <= I1 - 3:
         return np.inf, np.full((3, 3), np.nan)
-    volume = -mu * np.log(J) + lam / 2 * np.log(J) ** 2
     inverse = np.linalg.inv(F).T
     if law == "neo_hookean":
-        return mu / 2 * (I1 - 3) + volume, mu * F + (lam * np.log(J) - mu) * inverse
-    if limit <= I1 - 3:
-        return np.inf, np.full((3, 3), np.nan)
-    return -mu * limit / 2 * np.log(1 - (I1 - 3) / limit) + volume, mu / (1 - (I1 - 3) / limit) * F + (
-        lam * np.log(J) - mu
-    ) * inverse
+        return mu / 2 * (I1 - 3) - mu * np.log(J), mu * F - mu * inverse
+    return -mu * limit / 2 * np.log(1 - (I1 - 3) / limit) - mu * np.log(J), mu / (1 - (I1 - 3) / limit) * F - mu * inverse
+
+
+def polar_rotation(F: np.ndarray) -> np.ndarray:
+    """Return the rotation closest to F."""
+    R = np.asarray(scipy.linalg.polar(F)[0])
+    if np.linalg.det(R) < 0:
+        U, _, Vt = np.linalg.svd(F)
+        R = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
+    return R
+
+
+def dilatation(F: np.ndarray, law: str) -> tuple[float, np.ndarray]:
+    """Return what the λ term measures, tr(RᵀF) − 3 or J, and its derivative by F."""
+    if law == "corotational":
+        R = polar_rotation(F)
+        return float(np.trace(R.T @ F)) - 3, R
+    J = float(np.linalg.det(F))
+    return J, J * np.linalg.inv(F).T
 
 
 def slow_internal(body: BodyModel, positions: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return internal energy [J] and dW/dx [N], shape (n, 3), element by element."""
+    """Return internal energy [J] and dW/dx [N], shape (n, 3), element by element; one mean dilatation an element."""
     mesh, law, limit = body.mesh, body.material.law, body.material.stretch_limit
     quadratic = mesh.tets.shape[1] == 10
     a = (5 + 3 * np.sqrt(5)) / 20
@@ -107,13 +115,22 @@ def slow_internal(body: BodyModel, positions: np.ndarray) -> tuple[float, np.nda
         volume = abs(np.dot(X[1] - X[0], np.cross(X[2] - X[0], X[3] - X[0]))) / 6
         origin, size = X[0], np.ptp(X, axis=0).max()  # well scaled monomials
         inverse = np.linalg.inv(np.array([monomials((p - origin) / size, quadratic) for p in X]))
+        mean, mean_slope = 0.0, np.zeros((len(tet), 3))
         for place in places:
             at = (np.array(place) @ X[:4] - origin) / size
             gradients = inverse.T @ monomial_gradients(at, quadratic) / size
-            W, P = energy_density(positions[tet].T @ gradients, law, mu, lam, limit)
+            F = positions[tet].T @ gradients
+            W, P = local_part(F, law, mu, limit)
+            theta, slope = dilatation(F, law)
             energy += volume / len(places) * W
-            for node, g in zip(tet, gradients):
-                forces[node] += volume / len(places) * (P @ g)
+            forces[tet] += volume / len(places) * gradients @ P.T
+            mean += theta / len(places)
+            mean_slope += gradients @ slope.T / len(places)
+        if law == "corotational":
+            energy, factor = energy + lam / 2 * volume * mean**2, lam * mean
+        else:
+            energy, factor = energy + lam / 2 * volume * np.log(mean) ** 2, lam * np.log(mean) / mean
+        forces[tet] += volume * factor * mean_slope
     return energy, forces
 
 

@@ -1,3 +1,4 @@
+# mypy: allow-untyped-decorators
 """Internal energy, forces and stiffness of a body, and the reduced sparse matrix of its free unknowns."""
 
 from __future__ import annotations
@@ -6,12 +7,20 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
+from numba import njit
 
 from femsense.arrays import FloatArray, IntArray
 from femsense.fem.body import BodyModel
 from femsense.fem.clamp import clamp_energy_and_forces, ties_of
 from femsense.fem.corotational import corotational_kernel
 from femsense.fem.hyperelastic import hyperelastic_kernel
+from femsense.fem.stencil import block_row_numbers
+
+KERNELS = {
+    (name, count): kernel(count, quad)
+    for name, kernel in (("corotational", corotational_kernel), ("hyperelastic", hyperelastic_kernel))
+    for count, quad in ((4, 1), (10, 4))
+}
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -23,7 +32,7 @@ class Internal:
     forces: FloatArray
     """dW/dx [N], shape (n, 3)."""
     blocks: FloatArray | None
-    """d²W/dx² [N/m], shape (nb, 9), in the stencil's pattern; None if not asked for."""
+    """d²W/dx² [N/m], shape (nb, 9), in the stencil's pattern (one half of it); None if not asked for."""
 
 
 def internal(body: BodyModel, positions: FloatArray, *, tangent: bool = True) -> Internal:
@@ -36,9 +45,9 @@ def internal(body: BodyModel, positions: FloatArray, *, tangent: bool = True) ->
     mu, lam = material.lame()
     forces = np.zeros_like(body.mesh.nodes)
     blocks = np.zeros((len(stencil.block_columns) if tangent else 0, 9))
-    kernel = corotational_kernel if material.law == "corotational" else hyperelastic_kernel
+    kernel = KERNELS["corotational" if material.law == "corotational" else "hyperelastic", body.mesh.tets.shape[1]]
     limit = material.stretch_limit if material.law == "gent" else np.inf
-    energy = kernel(np.ascontiguousarray(positions), body.mesh.tets, stencil.gradients, stencil.volumes, mu, lam, limit, tangent, stencil.slots, forces, blocks)  # fmt: skip
+    energy = kernel(np.ascontiguousarray(positions), stencil.tets, stencil.gradients, stencil.volumes, mu, lam, limit, tangent, stencil.slots, forces, blocks)  # fmt: skip
     ties = ties_of(body)
     if ties is not None:
         extra, slopes = clamp_energy_and_forces(body, ties, positions)
@@ -51,17 +60,24 @@ def internal(body: BodyModel, positions: FloatArray, *, tangent: bool = True) ->
 
 def diagonal_slots(body: BodyModel) -> IntArray:
     """Return the slot of the diagonal block of every node, shape (n,)."""
-    stencil = body.stencil
-    rows = np.repeat(np.arange(len(stencil.block_rows) - 1), np.diff(stencil.block_rows))
-    slots = np.zeros(len(stencil.block_rows) - 1, dtype=np.int64)
-    on = np.flatnonzero(rows == stencil.block_columns)
+    rows = block_row_numbers(body.stencil)
+    slots = np.zeros(len(body.mesh.nodes), dtype=np.int64)
+    on = np.flatnonzero(rows == body.stencil.block_columns[:-1])
     slots[rows[on]] = on
     return slots
 
 
 def reduced_values(body: BodyModel, blocks: FloatArray) -> FloatArray:
     """Return the stiffness entries of the free unknowns [N/m], shape (nnz,), in the order of the free map's pattern."""
-    return blocks.ravel()[body.free_map.source]
+    return np.asarray(_gather(blocks.ravel(), body.free_map.source))
+
+
+@njit(cache=True)
+def _gather(values: FloatArray, source: IntArray) -> FloatArray:
+    result = np.empty(len(source))
+    for k in range(len(source)):
+        result[k] = values[source[k]]
+    return result
 
 
 def reduced_matrix(body: BodyModel, blocks: FloatArray) -> sp.csc_matrix:

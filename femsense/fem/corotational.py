@@ -1,151 +1,222 @@
 # mypy: allow-untyped-decorators
 """The corotational element: linear elasticity in the frame that the polar decomposition F = V R turns along.
 
-Energy density  w = μ ‖F − R‖² + λ/2 (tr(Rᵀ F) − 3)², R the closest rotation to F. With h_a = R ∇N_a, V = F Rᵀ and
-D = tr(V) I − V:
+Energy of an element with quadrature points q of volume w_q and V = Σ w_q:
 
-    force      f_a  = (2μ (F − R) + λ tr(V − I) R) ∇N_a
-    tangent    K_ab = 2μ (h_a·h_b) I + λ h_a h_bᵀ − c [h_a]ₓ D⁻¹ [h_b]ₓ,   c = λ tr(V − I) − 2μ
+    W = μ Σ w_q ‖F_q − R_q‖² + λ/2 V θ²,    θ = Σ w_q (tr(R_qᵀ F_q) − 3) / V,    R_q the closest rotation to F_q.
 
-which is the full second derivative, rotation included. References: Müller & Gross 2004 (warped stiffness),
-Chao et al. 2010 (the energy), McAdams et al. 2011 (its exact second derivative).
+θ is one number an element, the mean dilatation: the λ term of a tetrahedron with ten nodes then asks for one thing, not four,
+and the element does not lock where ν is close to ½. With one point (four nodes) it is the textbook element.
+With h_qa = R_q ∇N_a, h_a = Σ w_q h_qa / V, V_q = F_q R_qᵀ and D_q = tr(V_q) I − V_q:
+
+    force      f_a  = Σ w_q (2μ (F_q − R_q) + λ θ R_q) ∇N_a
+    tangent    K_ab = V λ h_a h_bᵀ + Σ w_q (2μ (h_qa·h_qb) I − (λ θ − 2μ) [h_qa]ₓ D_q⁻¹ [h_qb]ₓ)
+
+which is the full second derivative, rotation included. References: Müller & Gross 2004 (warped stiffness), Chao et al. 2010
+(the energy), McAdams et al. 2011 (its exact second derivative), Nagtegaal, Parks & Rice 1974 (mean dilatation).
 """
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numba import njit
 
-from femsense.arrays import FloatArray, IntArray
+from femsense.arrays import FloatArray
+
+FAST = {"contract", "reassoc", "nsz", "arcp"}
+"""Rounding may differ; infinities and NaN are kept."""
+LANES = 8
+"""Rows of node values are padded to a multiple of this, so that processors can take them in whole registers."""
 
 
-@njit(cache=True)
-def determinant(A: FloatArray) -> float:
-    """Return det A of a 3 × 3 matrix."""
+@njit(cache=True, fastmath=FAST)
+def determinant(F: FloatArray, q: int) -> float:
+    """Return det F_q, the matrix of a point being a column of F, row by row, shape (9, quad)."""
     return float(
-        A[0, 0] * (A[1, 1] * A[2, 2] - A[1, 2] * A[2, 1])
-        - A[0, 1] * (A[1, 0] * A[2, 2] - A[1, 2] * A[2, 0])
-        + A[0, 2] * (A[1, 0] * A[2, 1] - A[1, 1] * A[2, 0])
+        F[0, q] * (F[4, q] * F[8, q] - F[5, q] * F[7, q])
+        - F[1, q] * (F[3, q] * F[8, q] - F[5, q] * F[6, q])
+        + F[2, q] * (F[3, q] * F[7, q] - F[4, q] * F[6, q])
     )
 
 
-@njit(cache=True)
-def cofactor(A: FloatArray, out: FloatArray) -> None:
-    """Write the cofactor matrix (det A · A⁻ᵀ) of a 3 × 3 matrix."""
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        out[i, 0] = A[j, 1] * A[k, 2] - A[j, 2] * A[k, 1]
-        out[i, 1] = A[j, 2] * A[k, 0] - A[j, 0] * A[k, 2]
-        out[i, 2] = A[j, 0] * A[k, 1] - A[j, 1] * A[k, 0]
+@njit(cache=True, fastmath=FAST)
+def closest_rotation(F: FloatArray, R: FloatArray, q: int) -> None:
+    """Write the rotation (det +1) that is closest to F_q (Newton of Higham 1986; the SVD where F_q is flat or inverted).
 
-
-@njit(cache=True)
-def closest_rotation(F: FloatArray, R: FloatArray, work: FloatArray) -> None:
-    """Write the rotation (det +1) that is closest to F (Newton of Higham 1986; the SVD where F is flat or inverted)."""
+    Matrices are columns, row by row, shape (9, quad).
+    """
     size = 0.0
-    for i in range(3):
-        for j in range(3):
-            size += F[i, j] * F[i, j]
-            R[i, j] = F[i, j]
-    if determinant(F) > 0.02 * (size / 3.0) ** 1.5:
-        for _ in range(30):
-            det = determinant(R)
-            cofactor(R, work)
-            change = 0.0
-            for i in range(3):
-                for j in range(3):
-                    new = 0.5 * (R[i, j] + work[i, j] / det)
-                    change = max(change, abs(new - R[i, j]))
-                    R[i, j] = new
-            if change < 1e-9:  # quadratic: the next change is below 1e-17
-                return
-    U, _, Vt = np.linalg.svd(F)
-    if determinant(U) * determinant(Vt) < 0.0:
-        for i in range(3):
-            U[i, 2] = -U[i, 2]
-    for i in range(3):
-        for j in range(3):
-            R[i, j] = U[i, 0] * Vt[0, j] + U[i, 1] * Vt[1, j] + U[i, 2] * Vt[2, j]
+    for k in range(9):
+        size += F[k, q] * F[k, q]
+    if not determinant(F, q) > 0.02 * (size / 3.0) ** 1.5:
+        closest_rotation_by_svd(F, R, q)
+        return
+    a, b, c, d, e, f, g, h, i = F[0, q], F[1, q], F[2, q], F[3, q], F[4, q], F[5, q], F[6, q], F[7, q], F[8, q]
+    for _ in range(30):
+        u, v, w = e * i - f * h, f * g - d * i, d * h - e * g
+        s = 0.5 / (a * u + b * v + c * w)
+        A, B, C = 0.5 * a + s * u, 0.5 * b + s * v, 0.5 * c + s * w
+        D, E, H = 0.5 * d + s * (c * h - b * i), 0.5 * e + s * (a * i - c * g), 0.5 * f + s * (b * g - a * h)
+        J, K, L = 0.5 * g + s * (b * f - c * e), 0.5 * h + s * (c * d - a * f), 0.5 * i + s * (a * e - b * d)
+        change = (A - a) ** 2 + (B - b) ** 2 + (C - c) ** 2 + (D - d) ** 2 + (E - e) ** 2
+        change += (H - f) ** 2 + (J - g) ** 2 + (K - h) ** 2 + (L - i) ** 2
+        a, b, c, d, e, f, g, h, i = A, B, C, D, E, H, J, K, L
+        if change < 1e-17:  # quadratic: the next change is below 1e-16
+            break
+    else:
+        closest_rotation_by_svd(F, R, q)
+        return
+    R[0, q], R[1, q], R[2, q], R[3, q], R[4, q], R[5, q], R[6, q], R[7, q], R[8, q] = a, b, c, d, e, f, g, h, i
 
 
 @njit(cache=True)
-def inverse_symmetric(A: FloatArray, out: FloatArray) -> None:
-    """Write the inverse of a symmetric 3 × 3 matrix; one that is singular gets a small shift."""
-    det = determinant(A)
-    size = abs(A[0, 0]) + abs(A[1, 1]) + abs(A[2, 2]) + 1e-12  # all nodes in one point give A = 0
-    if abs(det) < 1e-9 * size**3:
-        for i in range(3):
-            A[i, i] += 1e-3 * size
-        det = determinant(A)
-    cofactor(A, out)
-    for i in range(3):
-        for j in range(3):
-            out[i, j] /= det
+def closest_rotation_by_svd(F: FloatArray, R: FloatArray, q: int) -> None:
+    """Write the rotation that is closest to F_q, flat or inverted as it may be."""
+    U, _, Vt = np.linalg.svd(np.ascontiguousarray(F[:, q]).reshape(3, 3))
+    if np.linalg.det(U) * np.linalg.det(Vt) < 0.0:
+        U[:, 2] *= -1.0
+    R[:, q] = (U @ Vt).ravel()
 
 
-@njit(cache=True)
-def corotational_kernel(
-    x: FloatArray, tets: IntArray, gradients: FloatArray, volumes: FloatArray, mu: FloatArray, lam: FloatArray,
-    limit: float, tangent: bool, slots: IntArray, forces: FloatArray, blocks: FloatArray,
-) -> float:  # fmt: skip
-    """Add internal forces [N] and, if asked, stiffness blocks [N/m]; return the energy [J]. `limit` is not used."""
-    m, quad, count = gradients.shape[0], gradients.shape[1], gradients.shape[2]
-    F, R, V, D = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    Dinv, work, P = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    h = np.empty((count, 3))
-    G = np.empty((count, 3, 3))
-    energy = 0.0
-    for e in range(m):
+@njit(cache=True, fastmath=FAST)
+def turning_compliance(F: FloatArray, R: FloatArray, q: int, out: FloatArray) -> None:
+    """Write the six entries 00 01 02 11 12 22 of D_q⁻¹; a singular D_q (a body shrunk to a point) gets a small shift."""
+    a = F[3, q] * R[3, q] + F[4, q] * R[4, q] + F[5, q] * R[5, q]
+    b = F[6, q] * R[6, q] + F[7, q] * R[7, q] + F[8, q] * R[8, q]
+    c = F[0, q] * R[0, q] + F[1, q] * R[1, q] + F[2, q] * R[2, q]
+    d00, d11, d22 = a + b, b + c, c + a
+    d01 = -(F[0, q] * R[3, q] + F[1, q] * R[4, q] + F[2, q] * R[5, q])
+    d02 = -(F[0, q] * R[6, q] + F[1, q] * R[7, q] + F[2, q] * R[8, q])
+    d12 = -(F[3, q] * R[6, q] + F[4, q] * R[7, q] + F[5, q] * R[8, q])
+    size = abs(d00) + abs(d11) + abs(d22) + 1e-12
+    for _ in range(2):
+        c00, c01, c02 = d11 * d22 - d12 * d12, d02 * d12 - d01 * d22, d01 * d12 - d02 * d11
+        det = d00 * c00 + d01 * c01 + d02 * c02
+        if abs(det) >= 1e-9 * size**3:
+            break
+        d00, d11, d22 = d00 + 1e-3 * size, d11 + 1e-3 * size, d22 + 1e-3 * size
+    out[0], out[1], out[2] = c00 / det, c01 / det, c02 / det
+    out[3], out[4], out[5] = (d00 * d22 - d02 * d02) / det, (d01 * d02 - d00 * d12) / det, (d00 * d11 - d01 * d01) / det
+
+
+def padded(count: int) -> int:
+    """Return the length of a padded row of node values."""
+    return count if count <= 4 else -(-count // LANES) * LANES
+
+
+def corotational_kernel(count: int, quad: int) -> Any:
+    """Return the compiled kernel for elements with `count` nodes and `quad` quadrature points.
+
+    It adds internal forces [N] and, if asked, the stiffness blocks on and above the diagonal [N/m], and returns the energy [J]:
+    kernel(x, tets, gradients, volumes, mu, lam, limit, tangent, slots, forces, blocks), arrays as in `Stencil`. `limit` is not used.
+    """
+    row = padded(count)
+    add_blocks = block_adder(count)
+
+    @njit(inline="always")
+    def stiffness(e, w, mu, pull, lam, F, R, H, mean, Dinv, Z, K):  # type: ignore[no-untyped-def]
+        """Write the stiffness of an element, K[a, i, j, b]."""
+        volume = 0.0
         for q in range(quad):
-            vol = volumes[e, q]
-            g = gradients[e, q]
+            volume += w[e, q]
+            turning_compliance(F, R, q, Dinv)
+            s = w[e, q] * (2.0 * mu - pull)
+            d00, d01, d02, d11, d12, d22 = s * Dinv[0], s * Dinv[1], s * Dinv[2], s * Dinv[3], s * Dinv[4], s * Dinv[5]
+            for a in range(count):  # Z = (2μ − λθ) w [h]ₓ D⁻¹
+                x, y, z = H[q, 0, a], H[q, 1, a], H[q, 2, a]
+                Z[a, 0, 3 * q], Z[a, 0, 3 * q + 1], Z[a, 0, 3 * q + 2] = y * d02 - z * d01, y * d12 - z * d11, y * d22 - z * d12
+                Z[a, 1, 3 * q], Z[a, 1, 3 * q + 1], Z[a, 1, 3 * q + 2] = z * d00 - x * d02, z * d01 - x * d12, z * d02 - x * d22
+                Z[a, 2, 3 * q], Z[a, 2, 3 * q + 1], Z[a, 2, 3 * q + 2] = x * d01 - y * d00, x * d11 - y * d01, x * d12 - y * d02
+        for a in range(count):
             for i in range(3):
-                for j in range(3):
-                    s = 0.0
+                side = lam / volume * mean[i, a]
+                for b in range(a & -LANES, row):
+                    s0, s1, s2 = side * mean[0, b], side * mean[1, b], side * mean[2, b]
+                    for q in range(quad):
+                        z0, z1, z2 = Z[a, i, 3 * q], Z[a, i, 3 * q + 1], Z[a, i, 3 * q + 2]
+                        s0 += z1 * H[q, 2, b] - z2 * H[q, 1, b]
+                        s1 += z2 * H[q, 0, b] - z0 * H[q, 2, b]
+                        s2 += z0 * H[q, 1, b] - z1 * H[q, 0, b]
+                    K[a, i, 0, b], K[a, i, 1, b], K[a, i, 2, b] = s0, s1, s2
+        for q in range(quad):
+            s = 2.0 * mu * w[e, q]
+            for a in range(count):
+                x, y, z = s * H[q, 0, a], s * H[q, 1, a], s * H[q, 2, a]
+                for b in range(a & -LANES, row):
+                    dot = x * H[q, 0, b] + y * H[q, 1, b] + z * H[q, 2, b]
+                    K[a, 0, 0, b] += dot
+                    K[a, 1, 1, b] += dot
+                    K[a, 2, 2, b] += dot
+
+    @njit(cache=True, fastmath=FAST)
+    def kernel(x, tets, gradients, volumes, mu, lam, limit, tangent, slots, forces, blocks):  # type: ignore[no-untyped-def]
+        F, R, X, f = np.empty((9, quad)), np.empty((9, quad)), np.empty((3, count)), np.empty((3, count))
+        H, mean = np.zeros((quad, 3, row)), np.zeros((3, row))
+        Dinv, Z, K = np.empty(6), np.empty((count, 3, 3 * quad)), np.empty((count, 3, 3, row))
+        energy = 0.0
+        for e in range(len(tets)):
+            for a in range(count):
+                for i in range(3):
+                    X[i, a] = x[tets[e, a], i]
+                    f[i, a] = mean[i, a] = 0.0
+            theta = volume = 0.0
+            for q in range(quad):
+                for i in range(3):
+                    for j in range(3):
+                        s = 0.0
+                        for a in range(count):
+                            s += X[i, a] * gradients[e, q, j, a]
+                        F[3 * i + j, q] = s
+                closest_rotation(F, R, q)
+                trace = -3.0
+                for k in range(9):
+                    trace += F[k, q] * R[k, q]
+                theta += volumes[e, q] * trace
+                volume += volumes[e, q]
+            theta /= volume
+            energy += 0.5 * lam[e] * volume * theta * theta
+            pull = lam[e] * theta
+            for q in range(quad):
+                w = volumes[e, q]
+                norm = 0.0
+                for i in range(3):
+                    r0, r1, r2 = R[3 * i, q], R[3 * i + 1, q], R[3 * i + 2, q]
+                    u0, u1, u2 = F[3 * i, q] - r0, F[3 * i + 1, q] - r1, F[3 * i + 2, q] - r2
+                    norm += u0 * u0 + u1 * u1 + u2 * u2
+                    m2, p = 2.0 * w * mu[e], w * pull
+                    p0, p1, p2 = m2 * u0 + p * r0, m2 * u1 + p * r1, m2 * u2 + p * r2
                     for a in range(count):
-                        s += x[tets[e, a], i] * g[a, j]
-                    F[i, j] = s
-            closest_rotation(F, R, work)
-            trace, norm = -3.0, 0.0
-            for i in range(3):
-                for j in range(3):
-                    trace += F[i, j] * R[i, j]
-                    norm += (F[i, j] - R[i, j]) ** 2
-            energy += vol * (mu[e] * norm + 0.5 * lam[e] * trace * trace)
-            for i in range(3):
-                for j in range(3):
-                    P[i, j] = vol * (2.0 * mu[e] * (F[i, j] - R[i, j]) + lam[e] * trace * R[i, j])
+                        g0, g1, g2 = gradients[e, q, 0, a], gradients[e, q, 1, a], gradients[e, q, 2, a]
+                        f[i, a] += p0 * g0 + p1 * g1 + p2 * g2
+                        h = r0 * g0 + r1 * g1 + r2 * g2
+                        H[q, i, a] = h
+                        mean[i, a] += w * h
+                energy += w * mu[e] * norm
             for a in range(count):
                 for i in range(3):
-                    forces[tets[e, a], i] += P[i, 0] * g[a, 0] + P[i, 1] * g[a, 1] + P[i, 2] * g[a, 2]
-            if not tangent:
-                continue
-            for i in range(3):
-                for j in range(3):
-                    V[i, j] = F[i, 0] * R[j, 0] + F[i, 1] * R[j, 1] + F[i, 2] * R[j, 2]
-            total = V[0, 0] + V[1, 1] + V[2, 2]
-            for i in range(3):
-                for j in range(3):
-                    D[i, j] = (total if i == j else 0.0) - 0.5 * (V[i, j] + V[j, i])
-            inverse_symmetric(D, Dinv)
-            c = vol * (lam[e] * trace - 2.0 * mu[e])
-            for a in range(count):
+                    forces[tets[e, a], i] += f[i, a]
+            if tangent:
+                stiffness(e, volumes, mu[e], pull, lam[e], F, R, H, mean, Dinv, Z, K)
+                add_blocks(K, slots, e, blocks)
+        return energy
+
+    return kernel
+
+
+def block_adder(count: int) -> Any:
+    """Return the function that adds the blocks a ≤ b of K[a, i, j, b] where they belong."""
+
+    @njit(inline="always")
+    def add_blocks(K, slots, e, blocks):  # type: ignore[no-untyped-def]
+        pair = 0
+        for a in range(count):
+            for b in range(a, count):
+                slot = slots[e, pair]
+                pair += 1
                 for i in range(3):
-                    h[a, i] = R[i, 0] * g[a, 0] + R[i, 1] * g[a, 1] + R[i, 2] * g[a, 2]
-            for a in range(count):  # G_a = −c [h_a]ₓ D⁻¹
-                for j in range(3):
-                    G[a, 0, j] = -c * (h[a, 1] * Dinv[2, j] - h[a, 2] * Dinv[1, j])
-                    G[a, 1, j] = -c * (h[a, 2] * Dinv[0, j] - h[a, 0] * Dinv[2, j])
-                    G[a, 2, j] = -c * (h[a, 0] * Dinv[1, j] - h[a, 1] * Dinv[0, j])
-            mu2, lame = 2.0 * mu[e] * vol, lam[e] * vol
-            for a in range(count):
-                for b in range(count):
-                    block = blocks[slots[e, a, b]]
-                    dot = mu2 * (h[a, 0] * h[b, 0] + h[a, 1] * h[b, 1] + h[a, 2] * h[b, 2])
-                    for i in range(3):
-                        la = lame * h[a, i]
-                        block[3 * i] += la * h[b, 0] + G[a, i, 1] * h[b, 2] - G[a, i, 2] * h[b, 1]
-                        block[3 * i + 1] += la * h[b, 1] + G[a, i, 2] * h[b, 0] - G[a, i, 0] * h[b, 2]
-                        block[3 * i + 2] += la * h[b, 2] + G[a, i, 0] * h[b, 1] - G[a, i, 1] * h[b, 0]
-                        block[4 * i] += dot
-    return energy
+                    for j in range(3):
+                        blocks[slot, 3 * i + j] += K[a, i, j, b]
+
+    return add_blocks

@@ -4,71 +4,122 @@
     neo-Hookean  W = μ/2 (I₁ − 3) − μ ln J + λ/2 (ln J)²
     Gent         the first term becomes −μ jm/2 ln(1 − (I₁ − 3)/jm)
 
-With g_a = F⁻ᵀ ∇N_a, s = 1 (neo-Hookean) or jm/(jm − I₁ + 3) (Gent), f_a = μ s F ∇N_a + (λ ln J − μ) g_a and
-K_ab = μ s (∇N_a·∇N_b) I + 2 μ s²/jm (F∇N_a)(F∇N_b)ᵀ + λ g_a g_bᵀ + (μ − λ ln J) g_b g_aᵀ (Bonet & Wood 2008, ch. 6; Gent 1996).
-An inverted or over-stretched element has infinite energy, which the line search steps back from.
+The λ term of an element takes one J: the mean J̄ = Σ w_q J_q / V over its quadrature points (its volume against rest; Simo,
+Taylor & Pister 1985), so that ten nodes do not lock where ν is close to ½. With g_qa = F_q⁻ᵀ ∇N_a, m_a = Σ w_q J_q g_qa / V,
+p = λ ln J̄ / J̄ and s = 1 (neo-Hookean) or jm/(jm − I₁ + 3) (Gent):
+
+    force      f_a  = Σ w_q (μ s F_q ∇N_a + (p J_q − μ) g_qa)
+    tangent    K_ab = V λ (1 − ln J̄)/J̄² m_a m_bᵀ + Σ w_q (μ s (∇N_a·∇N_b) I + 2 μ s²/jm (F_q∇N_a)(F_q∇N_b)ᵀ
+                      + p J_q g_qa g_qbᵀ + (μ − p J_q) g_qb g_qaᵀ)
+
+(Bonet & Wood 2008, ch. 6; Gent 1996). An inverted or over-stretched element has infinite energy, which the line search steps
+back from.
 """
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numba import njit
 
-from femsense.arrays import FloatArray, IntArray
-from femsense.fem.corotational import cofactor, determinant
+from femsense.fem.corotational import FAST, LANES, block_adder, determinant, padded
 
 
-@njit(cache=True)
-def hyperelastic_kernel(
-    x: FloatArray, tets: IntArray, gradients: FloatArray, volumes: FloatArray, mu: FloatArray, lam: FloatArray,
-    limit: float, tangent: bool, slots: IntArray, forces: FloatArray, blocks: FloatArray,
-) -> float:  # fmt: skip
-    """Add internal forces [N] and, if asked, stiffness blocks [N/m]; return the energy [J]. `limit`: Gent's jm, inf for neo-Hookean."""
-    m, quad, count = gradients.shape[0], gradients.shape[1], gradients.shape[2]
-    F, work = np.empty((3, 3)), np.empty((3, 3))
-    Fg, g_inv = np.empty((count, 3)), np.empty((count, 3))
-    energy = 0.0
-    for e in range(m):
-        for q in range(quad):
-            vol = volumes[e, q]
-            g = gradients[e, q]
-            stretch = -3.0
+def hyperelastic_kernel(count: int, quad: int) -> Any:
+    """Return the compiled kernel for elements with `count` nodes and `quad` quadrature points.
+
+    It adds internal forces [N] and, if asked, the stiffness blocks on and above the diagonal [N/m], and returns the energy [J]:
+    kernel(x, tets, gradients, volumes, mu, lam, limit, tangent, slots, forces, blocks), arrays as in `Stencil`.
+    `limit`: Gent's jm, inf for neo-Hookean.
+    """
+    row = padded(count)
+    add_blocks = block_adder(count)
+
+    @njit(inline="always")
+    def stiffness(e, gradients, along, bulk, pressure, shear, second, inverse, forward, mean, K):  # type: ignore[no-untyped-def]
+        """Write the stiffness of an element, K[a, i, j, b]."""
+        for a in range(count):
             for i in range(3):
-                for j in range(3):
-                    s = 0.0
-                    for a in range(count):
-                        s += x[tets[e, a], i] * g[a, j]
-                    F[i, j] = s
-                    stretch += s * s
-            J = determinant(F)
-            if J <= 0.0 or stretch >= limit:
-                return np.inf
-            log_J = np.log(J)
-            first, second, scale = 0.5 * mu[e] * stretch, 0.0, 1.0
-            if limit < np.inf:
-                first = -0.5 * mu[e] * limit * np.log(1.0 - stretch / limit)
-                scale = limit / (limit - stretch)
-                second = 2.0 * vol * mu[e] * scale * scale / limit
-            energy += vol * (first - mu[e] * log_J + 0.5 * lam[e] * log_J * log_J)
-            cofactor(F, work)
-            along, across = vol * mu[e] * scale, vol * (lam[e] * log_J - mu[e])
+                side = bulk * mean[i, a]
+                for b in range(a & -LANES, row):
+                    s0, s1, s2 = side * mean[0, b], side * mean[1, b], side * mean[2, b]
+                    for q in range(quad):
+                        left, right = pressure[q] * inverse[q, i, a], shear[q] * inverse[q, i, b]
+                        stretch = second[q] * forward[q, i, a]
+                        s0 += left * inverse[q, 0, b] + right * inverse[q, 0, a] + stretch * forward[q, 0, b]
+                        s1 += left * inverse[q, 1, b] + right * inverse[q, 1, a] + stretch * forward[q, 1, b]
+                        s2 += left * inverse[q, 2, b] + right * inverse[q, 2, a] + stretch * forward[q, 2, b]
+                    K[a, i, 0, b], K[a, i, 1, b], K[a, i, 2, b] = s0, s1, s2
+        for q in range(quad):
+            for a in range(count):
+                x, y, z = (along[q] * gradients[e, q, 0, a], along[q] * gradients[e, q, 1, a], along[q] * gradients[e, q, 2, a])
+                for b in range(a, count):
+                    dot = x * gradients[e, q, 0, b] + y * gradients[e, q, 1, b] + z * gradients[e, q, 2, b]
+                    K[a, 0, 0, b] += dot
+                    K[a, 1, 1, b] += dot
+                    K[a, 2, 2, b] += dot
+
+    @njit(cache=True, fastmath=FAST)
+    def kernel(x, tets, gradients, volumes, mu, lam, limit, tangent, slots, forces, blocks):  # type: ignore[no-untyped-def]
+        F, X, f = np.empty((9, quad)), np.empty((3, count)), np.empty((3, count))
+        forward, inverse, mean = np.zeros((quad, 3, row)), np.zeros((quad, 3, row)), np.zeros((3, row))
+        J, along, pressure, shear, second = np.empty(quad), np.empty(quad), np.empty(quad), np.empty(quad), np.zeros(quad)
+        K = np.empty((count, 3, 3, row))
+        energy = 0.0
+        for e in range(len(tets)):
             for a in range(count):
                 for i in range(3):
-                    Fg[a, i] = F[i, 0] * g[a, 0] + F[i, 1] * g[a, 1] + F[i, 2] * g[a, 2]
-                    g_inv[a, i] = (work[i, 0] * g[a, 0] + work[i, 1] * g[a, 1] + work[i, 2] * g[a, 2]) / J
-                    forces[tets[e, a], i] += along * Fg[a, i] + across * g_inv[a, i]
-            if not tangent:
-                continue
+                    X[i, a] = x[tets[e, a], i]
+                    f[i, a] = mean[i, a] = 0.0
+            volume = now = 0.0
+            for q in range(quad):
+                stretch = -3.0
+                for i in range(3):
+                    for j in range(3):
+                        s = 0.0
+                        for a in range(count):
+                            s += X[i, a] * gradients[e, q, j, a]
+                        F[3 * i + j, q] = s
+                        stretch += s * s
+                J[q] = determinant(F, q)
+                if J[q] <= 0.0 or stretch >= limit:
+                    return np.inf
+                volume += volumes[e, q]
+                now += volumes[e, q] * J[q]
+                first, scale = 0.5 * mu[e] * stretch, 1.0
+                if limit < np.inf:
+                    first = -0.5 * mu[e] * limit * np.log(1.0 - stretch / limit)
+                    scale = limit / (limit - stretch)
+                    second[q] = 2.0 * volumes[e, q] * mu[e] * scale * scale / limit
+                along[q] = volumes[e, q] * mu[e] * scale
+                energy += volumes[e, q] * (first - mu[e] * np.log(J[q]))
+            ratio = now / volume
+            log_ratio = np.log(ratio)
+            energy += 0.5 * lam[e] * volume * log_ratio * log_ratio
+            for q in range(quad):
+                pressure[q] = volumes[e, q] * J[q] * lam[e] * log_ratio / ratio
+                shear[q] = volumes[e, q] * mu[e] - pressure[q]
+                w = volumes[e, q] * J[q]
+                for i in range(3):
+                    j, k = 3 * ((i + 1) % 3), 3 * ((i + 2) % 3)
+                    c0 = (F[j + 1, q] * F[k + 2, q] - F[j + 2, q] * F[k + 1, q]) / J[q]
+                    c1 = (F[j + 2, q] * F[k, q] - F[j, q] * F[k + 2, q]) / J[q]
+                    c2 = (F[j, q] * F[k + 1, q] - F[j + 1, q] * F[k, q]) / J[q]
+                    f0, f1, f2 = F[3 * i, q], F[3 * i + 1, q], F[3 * i + 2, q]
+                    for a in range(count):
+                        g0, g1, g2 = gradients[e, q, 0, a], gradients[e, q, 1, a], gradients[e, q, 2, a]
+                        forward[q, i, a] = f0 * g0 + f1 * g1 + f2 * g2
+                        inverse[q, i, a] = c0 * g0 + c1 * g1 + c2 * g2
+                        mean[i, a] += w * inverse[q, i, a]
+                        f[i, a] += along[q] * forward[q, i, a] - shear[q] * inverse[q, i, a]
             for a in range(count):
-                for b in range(count):
-                    block = blocks[slots[e, a, b]]
-                    dot = along * (g[a, 0] * g[b, 0] + g[a, 1] * g[b, 1] + g[a, 2] * g[b, 2])
-                    for i in range(3):
-                        for j in range(3):
-                            block[3 * i + j] += (
-                                vol * lam[e] * g_inv[a, i] * g_inv[b, j]
-                                - across * g_inv[b, i] * g_inv[a, j]
-                                + second * Fg[a, i] * Fg[b, j]
-                            )
-                        block[4 * i] += dot
-    return energy
+                for i in range(3):
+                    forces[tets[e, a], i] += f[i, a]
+            if tangent:
+                bulk = lam[e] * (1.0 - log_ratio) / (ratio * ratio * volume)
+                stiffness(e, gradients, along, bulk, pressure, shear, second, inverse, forward, mean, K)
+                add_blocks(K, slots, e, blocks)
+        return energy
+
+    return kernel

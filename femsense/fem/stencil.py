@@ -8,7 +8,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
-from femsense.arrays import FloatArray, IntArray, freeze
+from femsense.arrays import BoolArray, FloatArray, IntArray, freeze
 from femsense.fem.linear import Pattern, make_pattern
 from femsense.fem.mesh import TetMesh, shape_slopes, shape_values
 
@@ -19,20 +19,26 @@ QUADRATURE = np.array([[_A, _B, _B, _B], [_B, _A, _B, _B], [_B, _B, _A, _B], [_B
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Stencil:
-    """Gradients, volumes and block pattern of a mesh."""
+    """Gradients, volumes and block pattern of a mesh.
 
+    The stiffness is symmetric: only its 3×3 blocks of nodes i ≤ j are kept. A block array has one row more than there are
+    such pairs, the last one; there goes what is added to the other half, and nobody reads it.
+    """
+
+    tets: IntArray
+    """Nodes of each element in rising order, shape (m, a)."""
     gradients: FloatArray
-    """Shape function gradients [1/m], shape (m, q, a, 3): element, quadrature point, node, direction."""
+    """Gradients of the shape functions of `tets` [1/m], shape (m, q, 3, a): element, quadrature point, direction, node."""
     volumes: FloatArray
     """Volume of each quadrature point [m³], shape (m, q)."""
     node_volume: FloatArray
     """∫ N dV [m³], shape (n,)."""
     slots: IntArray
-    """Where the 3×3 block of nodes (a, b) of an element goes, shape (m, a, a)."""
+    """Where the blocks of the node pairs (a ≤ b) of an element go, shape (m, a (a + 1) / 2)."""
     block_rows: IntArray
     """Block pattern in CSR: indptr, shape (n + 1,)."""
     block_columns: IntArray
-    """Block pattern in CSR: indices, shape (nb,)."""
+    """Block pattern in CSR: indices ≥ their row, shape (nb,); the last entry is −1 for the row that nobody reads."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -64,15 +70,19 @@ def make_stencil(mesh: TetMesh, cliques: list[IntArray] | None = None) -> tuple[
     x = mesh.nodes[mesh.tets]
     jacobian = np.einsum("mac,qai->mqci", x, local)
     inverse = np.linalg.inv(jacobian)
-    gradients = np.einsum("qai,mqic->mqac", local, inverse)
+    order = np.argsort(mesh.tets, axis=1)
+    gradients = np.take_along_axis(np.einsum("qai,mqic->mqca", local, inverse), order[:, None, None, :], axis=3)
+    tets = np.take_along_axis(mesh.tets, order, axis=1)
     volumes = np.linalg.det(jacobian) / (6.0 * len(points))
     node_volume = np.zeros(len(mesh.nodes))
     values = _moments(mesh, volumes)
     np.add.at(node_volume, mesh.tets, values)
-    rows, columns, slots = _block_pattern(len(mesh.nodes), [mesh.tets, *(cliques or [])])
+    rows, columns, slots = _block_pattern(len(mesh.nodes), [tets, *(cliques or [])])
+    first, second = np.triu_indices(tets.shape[1])
     stencil = Stencil(
-        freeze(gradients), freeze(volumes), freeze(node_volume), slots[0], freeze(rows, np.int64), freeze(columns, np.int64)
-    )
+        freeze(tets, np.int32), freeze(gradients), freeze(volumes), freeze(node_volume),
+        freeze(slots[0][:, first, second], np.int32), freeze(rows, np.int64), freeze(columns, np.int64),
+    )  # fmt: skip
     return stencil, slots[1:]
 
 
@@ -84,44 +94,66 @@ def _moments(mesh: TetMesh, volumes: FloatArray) -> FloatArray:
 
 
 def _block_pattern(n: int, groups: list[IntArray]) -> tuple[IntArray, IntArray, tuple[IntArray, ...]]:
-    """Return indptr and indices of the graph of n nodes that groups (g, k) of nodes couple, and the slots of their pairs."""
+    """Return indptr and indices of the pairs i ≤ j of n nodes that groups (g, k) of nodes couple, and the slots of their pairs."""
     pairs = [(group[:, :, None] * n + group[:, None, :]) for group in groups]
-    keys, place = np.unique(np.concatenate([p.ravel() for p in pairs]), return_inverse=True)
+    below = np.concatenate([(group[:, :, None] > group[:, None, :]).ravel() for group in groups])
+    flat = np.concatenate([p.ravel() for p in pairs])
+    keys = np.unique(flat[~below])
+    place = np.where(below, len(keys), np.searchsorted(keys, flat))
     indptr = np.searchsorted(keys, np.arange(n + 1) * n)
     ends = np.cumsum([p.size for p in pairs])[:-1]
-    slots = tuple(freeze(part.reshape(p.shape), np.int64) for part, p in zip(np.split(place.ravel(), ends), pairs))
-    return indptr, keys % n, slots
+    slots = tuple(freeze(part.reshape(p.shape), np.int64) for part, p in zip(np.split(place, ends), pairs))
+    return indptr, np.append(keys % n, -1), slots
 
 
 def make_free_map(stencil: Stencil, mesh: TetMesh, fixed: IntArray) -> FreeMap:
     """Return the map from blocks to the matrix of the unknowns that are not fixed, ordered for little fill."""
     n = len(mesh.nodes)
-    free_node = np.ones(n, dtype=bool)
+    rows = block_row_numbers(stencil)
+    columns = stencil.block_columns[:-1]
+    free_node = np.zeros(n, dtype=bool)
+    free_node[rows], free_node[columns] = True, True
     free_node[fixed] = False
-    free_node[np.diff(stencil.block_rows) == 0] = False
-    order = fill_reducing_order(stencil, np.flatnonzero(free_node))
+    order = fill_reducing_order(rows, columns, free_node)
     place = np.full(n, -1)
     place[order] = np.arange(len(order))
-    rows = np.repeat(np.arange(n), np.diff(stencil.block_rows))
-    keep = (place[rows] >= 0) & (place[stencil.block_columns] >= 0)
-    block = np.flatnonzero(keep)
-    i, j = place[rows[keep]], place[stencil.block_columns[keep]]
-    ci, cj = np.divmod(np.arange(9), 3)
-    matrix = sp.coo_matrix(
-        ((block[:, None] * 9 + np.arange(9)).ravel() + 1, ((3 * i[:, None] + ci).ravel(), (3 * j[:, None] + cj).ravel())),
-        shape=(3 * len(order), 3 * len(order)),
-    ).tocsc()
-    matrix.sort_indices()
+    slot = np.flatnonzero((place[rows] >= 0) & (place[columns] >= 0))
+    other = slot[rows[slot] != columns[slot]]  # the same blocks seen from the other half
+    i = np.concatenate([place[rows[slot]], place[columns[other]]])
+    j = np.concatenate([place[columns[slot]], place[rows[other]]])
+    where = np.concatenate([9 * slot, 9 * other])
+    turned = np.arange(len(where)) >= len(slot)
+    sort = np.lexsort((i, j))
+    pattern, source = _entries(i[sort], j[sort], where[sort], turned[sort], len(order))
     dofs = (3 * order[:, None] + np.arange(3)).ravel()
-    pattern = make_pattern(freeze(matrix.indptr, np.int32), freeze(matrix.indices, np.int32))
-    return FreeMap(freeze(dofs, np.int64), pattern, freeze(matrix.data - 1, np.int64))
+    return FreeMap(freeze(dofs, np.int64), pattern, source)
 
 
-def fill_reducing_order(stencil: Stencil, free: IntArray) -> IntArray:
-    """Return the free nodes in an order of little fill (multiple minimum degree on the node graph, by SuperLU)."""
-    n = len(stencil.block_rows) - 1
-    graph = sp.csr_matrix((np.ones(len(stencil.block_columns)), stencil.block_columns, stencil.block_rows), shape=(n, n))
-    part = graph[free][:, free]
+def _entries(i: IntArray, j: IntArray, where: IntArray, turned: BoolArray, size: int) -> tuple[Pattern, IntArray]:
+    """Return pattern and sources of the matrix of the 3×3 blocks (i, j), sorted by column, that begin at `where`."""
+    count = np.bincount(j, minlength=size)
+    first = np.concatenate([[0], np.cumsum(count)])
+    rank = np.arange(len(j)) - first[j]
+    r, c = np.arange(3)[:, None], np.arange(3)
+    to = (9 * first[j] + 3 * rank)[:, None, None] + 3 * count[j][:, None, None] * c + r
+    indices, source = np.empty(9 * len(j), dtype=np.int32), np.empty(9 * len(j), dtype=np.int32)
+    indices[to] = 3 * i[:, None, None] + r + 0 * c
+    source[to] = where[:, None, None] + np.where(turned[:, None, None], 3 * c + r, 3 * r + c)
+    indptr = np.concatenate([[0], np.cumsum(np.repeat(3 * count, 3))])
+    return make_pattern(freeze(indptr, np.int32), freeze(indices, np.int32)), freeze(source, np.int32)
+
+
+def block_row_numbers(stencil: Stencil) -> IntArray:
+    """Return the row of each kept block, shape (nb − 1,)."""
+    return np.repeat(np.arange(len(stencil.block_rows) - 1), np.diff(stencil.block_rows))
+
+
+def fill_reducing_order(rows: IntArray, columns: IntArray, free: BoolArray) -> IntArray:
+    """Return the free nodes in an order of little fill (multiple minimum degree, by SuperLU) for the couplings rows–columns."""
+    n = len(free)
+    upper = sp.csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(n, n))
+    nodes = np.flatnonzero(free)
+    part = (upper + upper.T)[nodes][:, nodes]
     dominant = (part + sp.diags_array(np.asarray(part.sum(axis=1)).ravel() + 1.0)).tocsc()
     lu = splu(dominant, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    return free[np.argsort(lu.perm_c)]
+    return nodes[np.argsort(lu.perm_c)]
