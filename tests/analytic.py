@@ -101,8 +101,18 @@ def dilatation(F: np.ndarray, law: str) -> tuple[float, np.ndarray]:
     return J, J * np.linalg.inv(F).T
 
 
+def volumetric(theta: float, law: str, lam: float) -> tuple[float, float]:
+    """Return the λ term [J/m³] for a dilatation (see `dilatation`) and its derivative [Pa]."""
+    if law == "corotational":
+        return lam / 2 * theta**2, lam * theta
+    return lam / 2 * np.log(theta) ** 2, lam * np.log(theta) / theta
+
+
 def slow_internal(body: BodyModel, positions: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return internal energy [J] and dW/dx [N], shape (n, 3), element by element; one mean dilatation an element."""
+    """Return internal energy [J] and dW/dx [N], shape (n, 3), element by element.
+
+    λ up to ¾ μ acts on the dilatation of the points, the rest on the mean over the element.
+    """
     mesh, law, limit = body.mesh, body.material.law, body.material.stretch_limit
     quadratic = mesh.tets.shape[1] == 10
     a = (5 + 3 * np.sqrt(5)) / 20
@@ -122,14 +132,13 @@ def slow_internal(body: BodyModel, positions: np.ndarray) -> tuple[float, np.nda
             F = positions[tet].T @ gradients
             W, P = local_part(F, law, mu, limit)
             theta, slope = dilatation(F, law)
-            energy += volume / len(places) * W
-            forces[tet] += volume / len(places) * gradients @ P.T
+            W_local, factor = volumetric(theta, law, min(lam, 0.75 * mu))
+            energy += volume / len(places) * (W + W_local)
+            forces[tet] += volume / len(places) * gradients @ (P + factor * slope).T
             mean += theta / len(places)
             mean_slope += gradients @ slope.T / len(places)
-        if law == "corotational":
-            energy, factor = energy + lam / 2 * volume * mean**2, lam * mean
-        else:
-            energy, factor = energy + lam / 2 * volume * np.log(mean) ** 2, lam * np.log(mean) / mean
+        W_mean, factor = volumetric(mean, law, lam - min(lam, 0.75 * mu))
+        energy += volume * W_mean
         forces[tet] += volume * factor * mean_slope
     return energy, forces
 

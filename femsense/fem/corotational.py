@@ -3,14 +3,15 @@
 
 Energy of an element with quadrature points q of volume w_q and V = Σ w_q:
 
-    W = μ Σ w_q ‖F_q − R_q‖² + λ/2 V θ²,    θ = Σ w_q (tr(R_qᵀ F_q) − 3) / V,    R_q the closest rotation to F_q.
+    W = Σ w_q (μ ‖F_q − R_q‖² + λ'/2 θ_q²) + V (λ − λ')/2 θ²,    θ_q = tr(R_qᵀ F_q) − 3,    θ = Σ w_q θ_q / V,
 
-θ is one number an element, the mean dilatation: the λ term of a tetrahedron with ten nodes then asks for one thing, not four,
-and the element does not lock where ν is close to ½. With one point (four nodes) it is the textbook element.
-With h_qa = R_q ∇N_a, h_a = Σ w_q h_qa / V, V_q = F_q R_qᵀ and D_q = tr(V_q) I − V_q:
+R_q the closest rotation to F_q, λ' = min(λ, ¾ μ). What λ exceeds λ' by acts on θ, one number an element, the mean
+dilatation: that part of a tetrahedron with ten nodes asks for one thing, not four, and the element does not lock where ν is
+close to ½. Why ¾ stands in docs/elements.md. With one point (four nodes) it is the textbook element, whatever λ'.
+With h_qa = R_q ∇N_a, h_a = Σ w_q h_qa / V, V_q = F_q R_qᵀ, D_q = tr(V_q) I − V_q and p_q = λ' θ_q + (λ − λ') θ:
 
-    force      f_a  = Σ w_q (2μ (F_q − R_q) + λ θ R_q) ∇N_a
-    tangent    K_ab = V λ h_a h_bᵀ + Σ w_q (2μ (h_qa·h_qb) I − (λ θ − 2μ) [h_qa]ₓ D_q⁻¹ [h_qb]ₓ)
+    force      f_a  = Σ w_q (2μ (F_q − R_q) + p_q R_q) ∇N_a
+    tangent    K_ab = V (λ − λ') h_a h_bᵀ + Σ w_q (2μ (h_qa·h_qb) I + λ' h_qa h_qbᵀ − (p_q − 2μ) [h_qa]ₓ D_q⁻¹ [h_qb]ₓ)
 
 which is the full second derivative, rotation included. References: Müller & Gross 2004 (warped stiffness), Chao et al. 2010
 (the energy), McAdams et al. 2011 (its exact second derivative), Nagtegaal, Parks & Rice 1974 (mean dilatation).
@@ -101,6 +102,10 @@ def turning_compliance(F: FloatArray, R: FloatArray, q: int, out: FloatArray) ->
     out[3], out[4], out[5] = (d00 * d22 - d02 * d02) / det, (d01 * d02 - d00 * d12) / det, (d00 * d11 - d01 * d01) / det
 
 
+LOCAL = 0.75
+"""λ up to this share of μ acts at each quadrature point, the rest on the mean dilatation of an element."""
+
+
 def padded(count: int) -> int:
     """Return the length of a padded row of node values."""
     return count if count <= 4 else -(-count // LANES) * LANES
@@ -116,13 +121,13 @@ def corotational_kernel(count: int, quad: int) -> Any:
     add_blocks = block_adder(count)
 
     @njit(inline="always")
-    def stiffness(e, w, mu, pull, lam, F, R, H, mean, Dinv, Z, K):  # type: ignore[no-untyped-def]
+    def stiffness(e, w, mu, pull, local, lam, F, R, H, mean, Dinv, Z, K):  # type: ignore[no-untyped-def]
         """Write the stiffness of an element, K[a, i, j, b]."""
         volume = 0.0
         for q in range(quad):
             volume += w[e, q]
             turning_compliance(F, R, q, Dinv)
-            s = w[e, q] * (2.0 * mu - pull)
+            s = w[e, q] * (2.0 * mu - pull[q])
             d00, d01, d02, d11, d12, d22 = s * Dinv[0], s * Dinv[1], s * Dinv[2], s * Dinv[3], s * Dinv[4], s * Dinv[5]
             for a in range(count):  # Z = (2μ − λθ) w [h]ₓ D⁻¹
                 x, y, z = H[q, 0, a], H[q, 1, a], H[q, 2, a]
@@ -131,14 +136,15 @@ def corotational_kernel(count: int, quad: int) -> Any:
                 Z[a, 2, 3 * q], Z[a, 2, 3 * q + 1], Z[a, 2, 3 * q + 2] = x * d01 - y * d00, x * d11 - y * d01, x * d12 - y * d02
         for a in range(count):
             for i in range(3):
-                side = lam / volume * mean[i, a]
+                side = (lam - local) / volume * mean[i, a]
                 for b in range(a & -LANES, row):
                     s0, s1, s2 = side * mean[0, b], side * mean[1, b], side * mean[2, b]
                     for q in range(quad):
                         z0, z1, z2 = Z[a, i, 3 * q], Z[a, i, 3 * q + 1], Z[a, i, 3 * q + 2]
-                        s0 += z1 * H[q, 2, b] - z2 * H[q, 1, b]
-                        s1 += z2 * H[q, 0, b] - z0 * H[q, 2, b]
-                        s2 += z0 * H[q, 1, b] - z1 * H[q, 0, b]
+                        z = local * w[e, q] * H[q, i, a]
+                        s0 += z1 * H[q, 2, b] - z2 * H[q, 1, b] + z * H[q, 0, b]
+                        s1 += z2 * H[q, 0, b] - z0 * H[q, 2, b] + z * H[q, 1, b]
+                        s2 += z0 * H[q, 1, b] - z1 * H[q, 0, b] + z * H[q, 2, b]
                     K[a, i, 0, b], K[a, i, 1, b], K[a, i, 2, b] = s0, s1, s2
         for q in range(quad):
             s = 2.0 * mu * w[e, q]
@@ -154,7 +160,7 @@ def corotational_kernel(count: int, quad: int) -> Any:
     def kernel(x, tets, gradients, volumes, mu, lam, limit, tangent, slots, forces, blocks):  # type: ignore[no-untyped-def]
         F, R, X, f = np.empty((9, quad)), np.empty((9, quad)), np.empty((3, count)), np.empty((3, count))
         H, mean = np.zeros((quad, 3, row)), np.zeros((3, row))
-        Dinv, Z, K = np.empty(6), np.empty((count, 3, 3 * quad)), np.empty((count, 3, 3, row))
+        pull, Dinv, Z, K = np.empty(quad), np.empty(6), np.empty((count, 3, 3 * quad)), np.empty((count, 3, 3, row))
         energy = 0.0
         for e in range(len(tets)):
             for a in range(count):
@@ -162,6 +168,7 @@ def corotational_kernel(count: int, quad: int) -> Any:
                     X[i, a] = x[tets[e, a], i]
                     f[i, a] = mean[i, a] = 0.0
             theta = volume = 0.0
+            local = min(lam[e], LOCAL * mu[e])
             for q in range(quad):
                 for i in range(3):
                     for j in range(3):
@@ -173,19 +180,21 @@ def corotational_kernel(count: int, quad: int) -> Any:
                 trace = -3.0
                 for k in range(9):
                     trace += F[k, q] * R[k, q]
+                pull[q] = local * trace
+                energy += 0.5 * volumes[e, q] * local * trace * trace
                 theta += volumes[e, q] * trace
                 volume += volumes[e, q]
             theta /= volume
-            energy += 0.5 * lam[e] * volume * theta * theta
-            pull = lam[e] * theta
+            energy += 0.5 * (lam[e] - local) * volume * theta * theta
             for q in range(quad):
+                pull[q] += (lam[e] - local) * theta
                 w = volumes[e, q]
                 norm = 0.0
                 for i in range(3):
                     r0, r1, r2 = R[3 * i, q], R[3 * i + 1, q], R[3 * i + 2, q]
                     u0, u1, u2 = F[3 * i, q] - r0, F[3 * i + 1, q] - r1, F[3 * i + 2, q] - r2
                     norm += u0 * u0 + u1 * u1 + u2 * u2
-                    m2, p = 2.0 * w * mu[e], w * pull
+                    m2, p = 2.0 * w * mu[e], w * pull[q]
                     p0, p1, p2 = m2 * u0 + p * r0, m2 * u1 + p * r1, m2 * u2 + p * r2
                     for a in range(count):
                         g0, g1, g2 = gradients[e, q, 0, a], gradients[e, q, 1, a], gradients[e, q, 2, a]
@@ -198,7 +207,7 @@ def corotational_kernel(count: int, quad: int) -> Any:
                 for i in range(3):
                     forces[tets[e, a], i] += f[i, a]
             if tangent:
-                stiffness(e, volumes, mu[e], pull, lam[e], F, R, H, mean, Dinv, Z, K)
+                stiffness(e, volumes, mu[e], pull, local, lam[e], F, R, H, mean, Dinv, Z, K)
                 add_blocks(K, slots, e, blocks)
         return energy
 

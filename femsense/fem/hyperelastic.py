@@ -4,13 +4,13 @@
     neo-Hookean  W = μ/2 (I₁ − 3) − μ ln J + λ/2 (ln J)²
     Gent         the first term becomes −μ jm/2 ln(1 − (I₁ − 3)/jm)
 
-The λ term of an element takes one J: the mean J̄ = Σ w_q J_q / V over its quadrature points (its volume against rest; Simo,
-Taylor & Pister 1985), so that ten nodes do not lock where ν is close to ½. With g_qa = F_q⁻ᵀ ∇N_a, m_a = Σ w_q J_q g_qa / V,
-p = λ ln J̄ / J̄ and s = 1 (neo-Hookean) or jm/(jm − I₁ + 3) (Gent):
+Of λ, λ' = min(λ, ¾ μ) acts on the J_q of each quadrature point and the rest on one J̄ = Σ w_q J_q / V, the volume of the element
+against rest (Simo, Taylor & Pister 1985), so that ten nodes do not lock where ν is close to ½. With g_qa = F_q⁻ᵀ ∇N_a,
+m_a = Σ w_q J_q g_qa / V, p = (λ − λ') ln J̄ / J̄, p_q = p J_q + λ' ln J_q and s = 1 (neo-Hookean) or jm/(jm − I₁ + 3) (Gent):
 
-    force      f_a  = Σ w_q (μ s F_q ∇N_a + (p J_q − μ) g_qa)
-    tangent    K_ab = V λ (1 − ln J̄)/J̄² m_a m_bᵀ + Σ w_q (μ s (∇N_a·∇N_b) I + 2 μ s²/jm (F_q∇N_a)(F_q∇N_b)ᵀ
-                      + p J_q g_qa g_qbᵀ + (μ − p J_q) g_qb g_qaᵀ)
+    force      f_a  = Σ w_q (μ s F_q ∇N_a + (p_q − μ) g_qa)
+    tangent    K_ab = V (λ − λ') (1 − ln J̄)/J̄² m_a m_bᵀ + Σ w_q (μ s (∇N_a·∇N_b) I + 2 μ s²/jm (F_q∇N_a)(F_q∇N_b)ᵀ
+                      + (p J_q + λ') g_qa g_qbᵀ + (μ − p_q) g_qb g_qaᵀ)
 
 (Bonet & Wood 2008, ch. 6; Gent 1996). An inverted or over-stretched element has infinite energy, which the line search steps
 back from.
@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from femsense.fem.corotational import FAST, LANES, block_adder, determinant, padded
+from femsense.fem.corotational import FAST, LANES, LOCAL, block_adder, determinant, padded
 
 
 def hyperelastic_kernel(count: int, quad: int) -> Any:
@@ -64,7 +64,14 @@ def hyperelastic_kernel(count: int, quad: int) -> Any:
     def kernel(x, tets, gradients, volumes, mu, lam, limit, tangent, slots, forces, blocks):  # type: ignore[no-untyped-def]
         F, X, f = np.empty((9, quad)), np.empty((3, count)), np.empty((3, count))
         forward, inverse, mean = np.zeros((quad, 3, row)), np.zeros((quad, 3, row)), np.zeros((3, row))
-        J, along, pressure, shear, second = np.empty(quad), np.empty(quad), np.empty(quad), np.empty(quad), np.zeros(quad)
+        J, log_J, along, pressure, shear, second = (
+            np.empty(quad),
+            np.empty(quad),
+            np.empty(quad),
+            np.empty(quad),
+            np.empty(quad),
+            np.zeros(quad),
+        )
         K = np.empty((count, 3, 3, row))
         energy = 0.0
         for e in range(len(tets)):
@@ -73,6 +80,7 @@ def hyperelastic_kernel(count: int, quad: int) -> Any:
                     X[i, a] = x[tets[e, a], i]
                     f[i, a] = mean[i, a] = 0.0
             volume = now = 0.0
+            local = min(lam[e], LOCAL * mu[e])
             for q in range(quad):
                 stretch = -3.0
                 for i in range(3):
@@ -93,14 +101,16 @@ def hyperelastic_kernel(count: int, quad: int) -> Any:
                     scale = limit / (limit - stretch)
                     second[q] = 2.0 * volumes[e, q] * mu[e] * scale * scale / limit
                 along[q] = volumes[e, q] * mu[e] * scale
-                energy += volumes[e, q] * (first - mu[e] * np.log(J[q]))
+                log_J[q] = np.log(J[q])
+                energy += volumes[e, q] * (first - mu[e] * log_J[q] + 0.5 * local * log_J[q] * log_J[q])
             ratio = now / volume
             log_ratio = np.log(ratio)
-            energy += 0.5 * lam[e] * volume * log_ratio * log_ratio
+            energy += 0.5 * (lam[e] - local) * volume * log_ratio * log_ratio
             for q in range(quad):
-                pressure[q] = volumes[e, q] * J[q] * lam[e] * log_ratio / ratio
-                shear[q] = volumes[e, q] * mu[e] - pressure[q]
                 w = volumes[e, q] * J[q]
+                shared = w * (lam[e] - local) * log_ratio / ratio
+                pressure[q] = shared + volumes[e, q] * local
+                shear[q] = volumes[e, q] * (mu[e] - local * log_J[q]) - shared
                 for i in range(3):
                     j, k = 3 * ((i + 1) % 3), 3 * ((i + 2) % 3)
                     c0 = (F[j + 1, q] * F[k + 2, q] - F[j + 2, q] * F[k + 1, q]) / J[q]
@@ -117,7 +127,7 @@ def hyperelastic_kernel(count: int, quad: int) -> Any:
                 for i in range(3):
                     forces[tets[e, a], i] += f[i, a]
             if tangent:
-                bulk = lam[e] * (1.0 - log_ratio) / (ratio * ratio * volume)
+                bulk = (lam[e] - local) * (1.0 - log_ratio) / (ratio * ratio * volume)
                 stiffness(e, gradients, along, bulk, pressure, shear, second, inverse, forward, mean, K)
                 add_blocks(K, slots, e, blocks)
         return energy

@@ -1,0 +1,290 @@
+"""Elements that lock and elements that do not: error against milliseconds on a block and on the diamond robot.
+
+Prints the tables of docs/elements.md. Small displacements, written with scipy beside the package's own elements, so that elements
+which the package does not have stand in the same table; its default is compared with its own row of them. The diamond is the
+one of the data folder beside the project (or the argument); without it only the block is done. `--fine N` sets how often the
+meshes of the converged values are refined (1: three minutes).
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import scipy.sparse as sp
+
+from femsense.arrays import FloatArray
+from femsense.fem.assembly import internal, reduced_matrix, reduced_values
+from femsense.fem.body import BodyModel, make_body
+from femsense.fem.linear import factorize
+from femsense.fem.mesh import EDGES, TetMesh, oriented, refined, surface_triangles, to_quadratic
+from femsense.fem.stencil import QUADRATURE
+from femsense.robot import load_robot
+
+POISSON = (0.30, 0.45, 0.49, 0.499)
+SHARED = Path(__file__).parents[1].parent / "shared" / "data" / "diamond"
+KUHN = np.array([[0, 1, 3, 7], [0, 3, 2, 7], [0, 2, 6, 7], [0, 6, 4, 7], [0, 4, 5, 7], [0, 5, 1, 7]])
+ELEMENTS = {
+    "tet4": (False, "points"),
+    "tet4, dilatation averaged at nodes": (False, "nodes"),
+    "tet10, four points": (True, "points"),
+    "tet10, dilatation averaged at corners": (True, "nodes"),
+    "tet10, mean dilatation of all strain": (True, "all"),
+    "tet10, mean dilatation": (True, "mean"),
+    "tet10, mean dilatation for λ − ½ μ": (True, 0.5),
+    "tet10, mean dilatation for λ − ¾ μ (the default)": (True, 0.75),
+    "tet10, mean dilatation for λ − μ": (True, 1.0),
+}
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Case:
+    """A body at rest with clamped nodes and one load."""
+
+    name: str
+    body: BodyModel
+    load: FloatArray
+    """[N], shape (n, 3)."""
+    pushed: FloatArray
+    """Displacement of the clamped nodes [m], shape (n, 3)."""
+
+
+def block(cells: tuple[int, int, int], size: tuple[float, float, float]) -> TetMesh:
+    """Return a box of cells × 6 tetrahedra."""
+    axes = [np.linspace(0.0, length, count + 1) for length, count in zip(size, cells)]
+    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    number = np.arange(len(nodes)).reshape(np.array(cells) + 1)
+    corners = [(i, j, k) for i in (0, 1) for j in (0, 1) for k in (0, 1)]
+    cubes = np.stack([number[i : i + cells[0], j : j + cells[1], k : k + cells[2]].ravel() for i, j, k in corners], axis=1)
+    return oriented(TetMesh(nodes, cubes[:, KUHN].reshape(-1, 4)))
+
+
+def traction(mesh: TetMesh, on: Callable[[FloatArray], FloatArray], field: Callable[[FloatArray], FloatArray]) -> FloatArray:
+    """Return nodal forces [N] of a traction field [Pa] on the boundary faces that lie on a plane."""
+    corners = surface_triangles(TetMesh(mesh.nodes, mesh.tets[:, :4]))
+    x = mesh.nodes[corners]
+    keep = on(x.reshape(-1, 3)).reshape(-1, 3).all(axis=1)
+    corners, x = corners[keep], x[keep]
+    area = np.linalg.norm(np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]), axis=1) / 2.0
+    forces = np.zeros_like(mesh.nodes)
+    middle = {}
+    if mesh.is_quadratic:
+        pairs = np.sort(mesh.tets[:, EDGES], axis=-1).reshape(-1, 2)
+        middle = dict(zip(map(tuple, pairs.tolist()), mesh.tets[:, 4:].ravel().tolist()))
+    for a, b in ((0, 1), (1, 2), (2, 0)):
+        value = area[:, None] / 3.0 * field((x[:, a] + x[:, b]) / 2.0)
+        if mesh.is_quadratic:
+            nodes = [middle[pair] for pair in map(tuple, np.sort(corners[:, [a, b]], axis=1).tolist())]
+            np.add.at(forces, nodes, value)
+            continue
+        for corner in (a, b):
+            np.add.at(forces, corners[:, corner], value / 2.0)
+    return forces
+
+
+def stiffness(body: BodyModel, kind: str | float) -> sp.csr_matrix:
+    """Return the small-displacement stiffness of all nodes [N/m], shape (3n, 3n).
+
+    2μ ε:ε at the points, and λ times the square of the dilatation: at the points, averaged over elements ("mean"), over the
+    patches of the corner nodes ("nodes"), over elements with the μ part of the dilatation ("all"), or over elements for what λ
+    exceeds a share of μ (a number).
+    """
+    stencil, n = body.stencil, len(body.mesh.nodes)
+    g, w, tets = stencil.gradients, stencil.volumes, stencil.tets.astype(np.int64)
+    mu, lam = body.material.lame()
+    volume = w.sum(axis=1)
+    dot = np.einsum("mqia,mqib,mq->mab", g, g, w * mu[:, None])
+    K = np.einsum("mab,ij->maibj", dot, np.eye(3)) + np.einsum("mqja,mqib,mq->maibj", g, g, w * mu[:, None])
+    local = (
+        np.minimum(lam, kind * mu) if isinstance(kind, float) else {"points": lam, "all": -2.0 / 3.0 * mu}.get(kind, 0.0 * lam)
+    )
+    K += np.einsum("mqia,mqjb,mq->maibj", g, g, w * local[:, None])
+    if kind not in ("points", "nodes"):
+        mean = np.einsum("mqia,mq->mai", g, w)
+        K += np.einsum("mai,mbj,m->maibj", mean, mean, (lam - local) / volume)
+    dofs = (3 * tets[:, :, None] + np.arange(3)).reshape(len(tets), -1)
+    k = dofs.shape[1]
+    matrix = sp.coo_matrix((K.ravel(), (np.repeat(dofs, k, axis=1).ravel(), np.tile(dofs, (1, k)).ravel())), shape=(3 * n,) * 2)
+    if kind != "nodes":
+        return matrix.tocsr()
+    points = QUADRATURE if body.mesh.is_quadratic else np.full((1, 4), 0.25)
+    corners = body.mesh.tets[:, :4]
+    D = np.einsum("mqia,mq,qk->mkai", g, w, points).reshape(len(tets), 4, -1)
+    patch = np.bincount(corners.ravel(), weights=np.repeat(volume / 4.0, 4), minlength=n)
+    rows = np.repeat(corners, k, axis=1).ravel()
+    divergence = sp.csr_matrix((D.ravel(), (rows, np.repeat(dofs[:, None], 4, axis=1).ravel())), shape=(n, 3 * n))
+    weight = np.divide(lam[0], patch, out=np.zeros(n), where=patch > 0)
+    return (matrix + divergence.T @ sp.diags_array(weight) @ divergence).tocsr()
+
+
+def responses(cases: list[Case], kind: str | float) -> list[float]:
+    """Return the work of each load on its displacement [J] or, of a given displacement, the reciprocal of its work [1/J]."""
+    import pypardiso
+
+    result: list[float] = []
+    body, K, solver = None, None, pypardiso.PyPardisoSolver(mtype=2)
+    for case in cases:
+        if case.body is not body:
+            body, K = case.body, stiffness(case.body, kind)
+            free = body.free_map.dofs
+            inner = sp.triu(K[free][:, free], format="csr")
+            solver.factorize(inner)
+        u = case.pushed.ravel().copy()
+        u[free] = solver.solve(inner, (case.load.ravel() - K @ u)[free])
+        result.append(float(case.load.ravel() @ u) if case.load.any() else 1.0 / float(u @ (K @ u)))
+    solver.free_memory(everything=True)
+    return result
+
+
+def block_cases(level: float, quadratic: bool, nu: float) -> list[Case]:
+    """Return sag, bending, torsion of a bar (100 × 30 × 30 mm) and the squeeze of a pad (30 × 30 × 15 mm) between sticky plates."""
+    wide, long = round(3 * level), round(8 * level)
+    bar, pad = block((long, wide, wide), (0.1, 0.03, 0.03)), block((round(4 * level),) * 2 + (wide,), (0.03, 0.03, 0.015))
+    if quadratic:
+        bar, pad = to_quadratic(bar), to_quadratic(pad)
+    body = make_body(
+        bar, young_modulus=1e5, poisson_ratio=nu, density=1000.0, gravity=[0, 0, -9.81], clamped=bar.nodes[:, 0] < 1e-9
+    )
+    still = np.zeros_like(bar.nodes)
+
+    def at_end(x: FloatArray) -> FloatArray:
+        return np.asarray(x[:, 0] > 0.1 - 1e-9)
+
+    down = traction(bar, at_end, lambda x: np.tile([0.0, 0.0, -1.0], (len(x), 1)))
+    twist = traction(bar, at_end, lambda x: np.cross([1.0, 0.0, 0.0], x - [0.0, 0.015, 0.015]))
+    low, high = pad.nodes[:, 2] < 1e-9, pad.nodes[:, 2] > 0.015 - 1e-9
+    squeezed = make_body(pad, young_modulus=1e5, poisson_ratio=nu, clamped=low | high)
+    pushed = np.zeros_like(pad.nodes)
+    pushed[high, 2] = -1.0
+    bars = [Case(name, body, load, still) for name, load in (("sag", body.weight()), ("bending", down), ("torsion", twist))]
+    return [*bars, Case("squeeze", squeezed, np.zeros_like(pad.nodes), pushed)]
+
+
+def diamond_case(folder: Path, refinements: int, quadratic: bool, nu: float) -> Case:
+    """Return the diamond under its own weight; its response is the work of the weight (twice the energy)."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        mesh = load_robot(folder).body.mesh
+    for _ in range(refinements):
+        mesh = refined(mesh)
+    mesh = to_quadratic(mesh) if quadratic else mesh
+    box = np.array([[-0.015, -0.015, -0.04], [0.015, 0.015, 0.01]])
+    held = ((mesh.nodes >= box[0] - 1e-9) & (mesh.nodes <= box[1] + 1e-9)).all(axis=1)
+    body = make_body(mesh, young_modulus=450e3, poisson_ratio=nu, density=1070.0, gravity=[0, 0, -9.81], clamped=held)
+    return Case("diamond", body, body.weight(), np.zeros_like(mesh.nodes))
+
+
+def converged(f: float, p: float, F: float, P: float) -> float:
+    """Return the value that two elements tend to at one and the same rate, from f and p on a mesh and F and P on a finer one."""
+    return (p * F - f * P) / (p + F - P - f)
+
+
+def references(make: Callable[[int], list[Case]]) -> list[tuple[float, float]]:
+    """Return the converged response of each case, and how far the two finest values lie apart, relative."""
+    (f, p), (F, P) = ([responses(cases, kind) for kind in ("points", "mean")] for cases in (make(0), make(1)))
+    return [(converged(*four), abs(four[3] / four[2] - 1.0)) for four in zip(f, p, F, P)]
+
+
+def table(title: str, make: Callable[[int, bool, float], list[Case]], fine: Callable[[int, bool, float], list[Case]]) -> None:
+    """Print the errors of all elements, in percent of the converged response, + too soft."""
+    names = [case.name for case in make(0, False, 0.3)]
+    print(f"\n{title}: error of the displacement, %, at ν = {', '.join(map(str, POISSON))}")
+    truth = {nu: references(lambda k, nu=nu: fine(k, True, nu)) for nu in POISSON}  # type: ignore[misc]
+    for i, name in enumerate(names):
+        print(f"  {name}: the finest meshes disagree by {', '.join(f'{100 * truth[nu][i][1]:.2f}' for nu in POISSON)} %")
+    print("| element | " + " | ".join(names) + " |\n|---|" + "---|" * len(names))
+    for label, (quadratic, kind) in ELEMENTS.items():
+        found = [responses(make(0, quadratic, nu), kind) for nu in POISSON]
+        errors = [[100.0 * (found[k][i] / truth[nu][i][0] - 1.0) for k, nu in enumerate(POISSON)] for i in range(len(names))]
+        print(f"| {label} | " + " | ".join(", ".join(f"{e:+.1f}" for e in row) for row in errors) + " |", flush=True)
+
+
+def agreement(case: Case) -> float:
+    """Return how far the package's stiffness at rest is from the one written here, relative."""
+    free = case.body.free_map.dofs
+    blocks = internal(case.body, np.array(case.body.mesh.nodes)).blocks
+    assert blocks is not None
+    K = stiffness(case.body, 0.75)[free][:, free]
+    return float(abs(reduced_matrix(case.body, blocks) - K).max() / abs(K).max())
+
+
+def median_ms(run: Callable[[], object], times: int = 15) -> str:
+    """Return median wall and process time of a call [ms]."""
+    run()
+    wall, used = [], []
+    for _ in range(times):
+        a, b = time.perf_counter(), time.process_time()
+        run()
+        wall.append(time.perf_counter() - a)
+        used.append(time.process_time() - b)
+    return f"{1e3 * np.median(wall):.2f} / {1e3 * np.median(used):.2f}"
+
+
+def timing(body: BodyModel, label: str) -> None:
+    """Print one row of the table of times."""
+    rng = np.random.default_rng(0)
+    x = body.mesh.nodes + rng.normal(0.0, 1e-6, body.mesh.nodes.shape)
+    blocks = internal(body, x).blocks
+    assert blocks is not None
+    values = reduced_values(body, blocks)
+    factor = factorize(body.free_map.pattern, values)
+    assert factor is not None
+    right = rng.normal(size=len(body.free_map.dofs))
+    runs: list[Callable[[], object]] = [
+        lambda: internal(body, x, tangent=False),
+        lambda: internal(body, x),
+        lambda: reduced_values(body, blocks),
+        lambda: factorize(body.free_map.pattern, values),
+        lambda: factor.solve(right),
+    ]
+    print(f"| {label} | {len(right)} | " + " | ".join(median_ms(run) for run in runs) + " |", flush=True)
+
+
+def main() -> None:
+    """Print errors on block and diamond, then times."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("diamond", nargs="?", type=Path, default=SHARED)
+    parser.add_argument("--fine", type=int, default=1)
+    parser.add_argument("--only", choices=("errors", "times"))
+    arguments = parser.parse_args()
+    folder: Path = arguments.diamond
+    if arguments.only != "times":
+        worst = max(agreement(case) for quadratic in (False, True) for case in block_cases(0.5, quadratic, 0.49))
+        print(f"the package's elements against the ones written here, at rest: {worst:.1e}")
+        table(
+            "Block, 8 × 3 × 3 and 4 × 4 × 3 cells",
+            lambda k, q, nu: block_cases(1.0, q, nu),
+            lambda k, q, nu: block_cases(2.0 * 2**k * arguments.fine, q, nu),
+        )
+        if folder.exists():
+            table(
+                "Diamond, own weight",
+                lambda k, q, nu: [diamond_case(folder, 0, q, nu)],
+                lambda k, q, nu: [diamond_case(folder, k + arguments.fine - 1, q, nu)],
+            )
+    if arguments.only != "errors":
+        print(
+            "\n| ms, wall / process | free unknowns | force | force and tangent | into the matrix | factor | one solve |\n|---|---|---|---|---|---|---|"
+        )
+        for quadratic in (False, True):
+            for law in ("corotational", "neo_hookean"):
+                body = (
+                    diamond_case(folder, 0, quadratic, 0.45).body
+                    if folder.exists()
+                    else block_cases(3.0, quadratic, 0.45)[0].body
+                )
+                chosen = (
+                    body
+                    if law == "corotational"
+                    else make_body(body.mesh, young_modulus=450e3, poisson_ratio=0.45, law=law, clamped=body.clamped)
+                )
+                timing(chosen, f"{'tet10' if quadratic else 'tet4'}, {law.replace('_', '-')}")
+
+
+if __name__ == "__main__":
+    main()
