@@ -248,7 +248,7 @@ def _observe_variants(
 def _linear(walk: Walk, variant: Walk) -> bool:
     """Return whether the linear response gives a variant: the same elements, and a clamp that moves by little."""
     base, other = walk.robot.body, variant.robot.body
-    return base.mesh.tets is other.mesh.tets and (base.clamp_is_rigid or not other.clamp_is_rigid)
+    return base.stencil.slots is other.stencil.slots and (base.clamp_is_rigid or not other.clamp_is_rigid)
 
 
 class _Balance:
@@ -274,18 +274,18 @@ class _Balance:
         if other.mesh is not body.mesh:
             x = x + (other.mesh.nodes - body.mesh.nodes)
         if body.clamp_is_rigid and not other.clamp_is_rigid:
-            return x + first_give(other, self._pulls() - self.inner)
+            return x + first_give(other, self._left())
         return x
 
-    def _pulls(self) -> FloatArray:
-        """Return the nodal forces of loads, cables and pressures in the base state [N], (n, 3)."""
+    def _left(self) -> FloatArray:
+        """Return all forces in the base state [N], (n, 3): at the clamp what it takes up, elsewhere what Newton left."""
         x = self.base.positions
         force = self.dead + self.base.nodal_forces
         for cable, along in zip(self.body.cables, self.base.segment_tensions):
             force = force + cable_forces(cable, x, along, len(x))
         for chamber in self.body.chambers:
             force = force + self.base.pressure[chamber.name] * volume_gradient(chamber, x)
-        return np.asarray(force)
+        return np.asarray(force - self.inner)
 
     def upset_by(
         self, variant: Walk, before: tuple[FloatArray, ...] | None, x: FloatArray, bent: FloatArray
@@ -299,13 +299,13 @@ class _Balance:
         return force, self._pulled(variant, body, None if still else x), tensions
 
     def _whole(self, variant: Walk, body: BodyModel, tensions: tuple[FloatArray, ...], x: FloatArray) -> FloatArray:
-        """Return all forces on a variant's body at x."""
+        """Return all forces on a variant's body at x, less what the base state leaves."""
         force = body.dead_load() + self._loads(variant) - internal(body, x, tangent=False).forces
         for cable, along in zip(body.cables, tensions):
             force = force + cable_forces(cable, x, along, len(x))
         for chamber, pressure in zip(body.chambers, variant.drive.pressures[self.frame]):
             force = force + pressure * volume_gradient(chamber, x)
-        return np.asarray(force)
+        return np.asarray(force - self._left())
 
     def _change(self, variant: Walk, body: BodyModel, tensions: tuple[FloatArray, ...]) -> FloatArray:
         """Return what a variant changes of the forces in the base state, where they sum to nothing."""

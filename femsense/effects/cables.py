@@ -26,12 +26,12 @@ def _rubbing(robot: Robot, control: str) -> list[str]:
 
 
 def _friction_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
-    return (Parameter("coefficient", None, "1", 0.0, 0.0, 1.5, 2e-3),) if _rubbing(robot, control) else ()
+    return (Parameter("coefficient", None, "1", 0.0, 0.0, 1.5, 2e-5),) if _rubbing(robot, control) else ()
 
 
 def _friction_parameters_each(robot: Robot, control: str) -> tuple[Parameter, ...]:
     names = _rubbing(robot, control)
-    return tuple(Parameter("coefficient", name, "1", 0.0, 0.0, 1.5, 2e-3) for name in names) if len(names) > 1 else ()
+    return tuple(Parameter("coefficient", name, "1", 0.0, 0.0, 1.5, 2e-5) for name in names) if len(names) > 1 else ()
 
 
 def _apply_friction(robot: Robot, entry: Entry) -> Robot:
@@ -69,7 +69,7 @@ def _apply_offset(robot: Robot, entry: Entry) -> Robot:
 
 def _gain_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
     return tuple(
-        Parameter("scale", name, "1", 0.0, float(np.log(0.3)), float(np.log(3.0)), 1e-3, "log") for name in robot.body.cable_names
+        Parameter("scale", name, "1", 0.0, float(np.log(0.3)), float(np.log(3.0)), 1e-5, "log") for name in robot.body.cable_names
     )
 
 

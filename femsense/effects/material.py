@@ -13,7 +13,7 @@ from femsense.model import Robot, spread_features
 
 
 def _stiffness_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
-    return (Parameter("scale", None, "1", 0.0, float(np.log(0.1)), float(np.log(10.0)), 1e-3, "log"),)
+    return (Parameter("scale", None, "1", 0.0, float(np.log(0.1)), float(np.log(10.0)), 1e-5, "log"),)
 
 
 def _apply_stiffness(robot: Robot, entry: Entry) -> Robot:
@@ -22,7 +22,7 @@ def _apply_stiffness(robot: Robot, entry: Entry) -> Robot:
 
 def _poisson_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
     declared = float(np.median(robot.body.material.poisson_ratio))
-    return (Parameter("poisson_ratio", None, "1", declared, 0.05, 0.4995, 1e-4),)
+    return (Parameter("poisson_ratio", None, "1", declared, 0.05, 0.4995, 1e-6),)
 
 
 def _apply_poisson(robot: Robot, entry: Entry) -> Robot:
@@ -34,7 +34,7 @@ def _apply_poisson(robot: Robot, entry: Entry) -> Robot:
 
 
 def _region_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
-    return (Parameter("scale", None, "1", 0.0, float(np.log(0.1)), float(np.log(5.0)), 1e-3, "log"),)
+    return (Parameter("scale", None, "1", 0.0, float(np.log(0.1)), float(np.log(5.0)), 1e-5, "log"),)
 
 
 def _region_places(robot: Robot) -> tuple[Entry, ...]:
@@ -99,7 +99,7 @@ def _creep_seeds(robot: Robot) -> tuple[Entry, ...]:
 
 def _creep_polish(robot: Robot, control: str, seed: Entry) -> tuple[Parameter, ...]:
     start = float(np.log(seed["time_s"]))
-    return (Parameter("time_s", None, "s", start, float(np.log(0.05)), float(np.log(2000.0)), 1e-3, "log"),)
+    return (Parameter("time_s", None, "s", start, float(np.log(0.05)), float(np.log(2000.0)), 1e-5, "log"),)
 
 
 def _creep_twice_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
@@ -112,7 +112,7 @@ def _creep_twice_seeds(robot: Robot) -> tuple[Entry, ...]:
 
 def _creep_twice_polish(robot: Robot, control: str, seed: Entry) -> tuple[Parameter, ...]:
     low, high = float(np.log(0.05)), float(np.log(2000.0))
-    return tuple(Parameter("time_s", i, "s", float(np.log(t)), low, high, 1e-3, "log") for i, t in enumerate(seed["time_s"]))
+    return tuple(Parameter("time_s", i, "s", float(np.log(t)), low, high, 1e-5, "log") for i, t in enumerate(seed["time_s"]))
 
 
 def _apply_creep(robot: Robot, entry: Entry) -> Robot:

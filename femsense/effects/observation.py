@@ -14,7 +14,7 @@ from femsense.model import Robot
 
 def _depth_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
     return (
-        Parameter("scale", None, "1", 0.0, float(np.log(0.9)), float(np.log(1.1)), 1e-4, "log"),
+        Parameter("scale", None, "1", 0.0, float(np.log(0.9)), float(np.log(1.1)), 1e-6, "log"),
         Parameter("offset_m", None, "m", 0.0, -0.03, 0.03, 1e-5),
     )
 
@@ -29,7 +29,7 @@ def _apply_depth(robot: Robot, entry: Entry) -> Robot:
 
 
 def _marker_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
-    return tuple(Parameter("offset_m", (name, i), "m", 0.0, -0.02, 0.02, 1e-5) for name in robot.marker_names for i in range(3))
+    return tuple(Parameter("offset_m", (name, i), "m", 0.0, -0.02, 0.02, 1e-6) for name in robot.marker_names for i in range(3))
 
 
 def _apply_marker(robot: Robot, entry: Entry) -> Robot:

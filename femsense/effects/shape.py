@@ -23,7 +23,7 @@ MOST_TETS = 60000
 
 
 def _size_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
-    return (Parameter("scale", None, "1", 0.0, float(np.log(0.8)), float(np.log(1.25)), 1e-4, "log"),)
+    return (Parameter("scale", None, "1", 0.0, float(np.log(0.8)), float(np.log(1.25)), 1e-6, "log"),)
 
 
 def _apply_size(robot: Robot, entry: Entry) -> Robot:

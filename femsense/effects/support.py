@@ -17,7 +17,7 @@ def _spring_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
     if not count:
         return ()
     compliance = count / (float(robot.body.material.young_modulus.mean()) * robot.body.reach)
-    return (Parameter(KEYS[0], None, "N/m", 0.0, 0.0, 10.0 * compliance, 1e-4 * compliance, "reciprocal"),)
+    return (Parameter(KEYS[0], None, "N/m", 0.0, 0.0, 10.0 * compliance, 1e-6 * compliance, "reciprocal"),)
 
 
 def _plate_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
@@ -29,7 +29,7 @@ def _plate_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
         np.sort(np.ptp(nodes, axis=0))[-2]
     )  # of the clamped face; a bar of that width bends by reach/(E w⁴/12) a moment
     bending = 12.0 * robot.body.reach / (float(robot.body.material.young_modulus.mean()) * max(width, 1e-3) ** 4)
-    return (Parameter(KEYS[1], None, "N m/rad", 0.0, 0.0, 2.0 * bending, 1e-5 * bending, "reciprocal"),)
+    return (Parameter(KEYS[1], None, "N m/rad", 0.0, 0.0, 2.0 * bending, 1e-6 * bending, "reciprocal"),)
 
 
 def _apply_clamp(robot: Robot, entry: Entry) -> Robot:
