@@ -1,0 +1,124 @@
+"""The sensitivity of the markers to every effect, as the loop uses it, against marches that are solved anew."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from arm import NAMES, T_ROBOT_CAMERA, arm
+
+from femsense.calib.forward import Hypothesis, evaluate_scene, in_robot_frame, make_scene
+from femsense.effects import FORMS, find_effect
+from femsense.march import Walk, drive_of, walk_along
+from femsense.pose import invert_pose, transform_points
+from femsense.recording import make_recording
+
+INPUTS = {"tension": [[0.3, 0.2], [1.5, 0.4], [0.9, 1.2]], "displacement": [[1.0, 1.0], [5.0, 1.5], [3.0, 4.0]]}
+"""Of two neighbouring cables [N] or [mm]; the others are slack."""
+
+
+def scene_of(control):
+    """Return an arm, and a scene in which the camera sees it exactly where the model has it."""
+    robot = arm((3, 1, 1), gravity=(0.0, 0.0, -4.0))
+    frames = range(len(INPUTS[control]))
+    inputs = np.full((len(frames), 4), 0.0 if control == "tension" else -0.05)
+    inputs[:, [0, 2]] = np.array(INPUTS[control]) * (1.0 if control == "tension" else 1e-3)
+    options = {"time_s": np.arange(len(frames)) * 1.7, "cable_names": NAMES, "inputs": inputs, "actuation": control}
+    walk = Walk(robot, drive_of(robot, make_recording(**options)))
+    seen = [points for *_, points, _ in walk_along(walk, frames, lambda r, s: r.markers.positions(s.positions))]
+    markers = transform_points(invert_pose(T_ROBOT_CAMERA), np.vstack(seen))
+    count = len(robot.marker_names)
+    recording = make_recording(**options, marker_names=robot.marker_names, marker_frame=np.repeat(np.arange(len(frames)), count),
+                               marker_index=np.tile(np.arange(count), len(frames)), marker_xyz=markers)  # fmt: skip
+    return robot, make_scene(robot, recording, np.arange(len(frames)))
+
+
+SCENES = {control: scene_of(control) for control in INPUTS}
+CASES = [
+    (form, control, at)
+    for form in FORMS
+    for control, (robot, _) in SCENES.items()
+    for at in ("null", "away")
+    if (p := form.parameters(robot, control)) and (at == "away" or p[0].null <= p[0].low)
+]
+"""Where an effect is bounded by its null, there too."""
+
+
+def title(case):
+    form, control, at = case
+    return f"{form.name}{FORMS.index(form)}-{control}-{at}"
+
+
+def jet(hypothesis, scene, coordinates, starts, *, derivative=False):
+    return evaluate_scene(hypothesis, scene, coordinates, [T_ROBOT_CAMERA], None, derivative=derivative, vary_initial=derivative,
+                          pivot=np.array([0.05, 0.0, 0.0]), starts=starts)  # fmt: skip
+
+
+def as_seen(hypothesis, scene, coordinates, starts):
+    """Return the scene with the points where the model at the coordinates has the camera measure them."""
+    seen = hypothesis.robot_at(coordinates).observation
+    where = (
+        in_robot_frame(scene.points, scene.view, [T_ROBOT_CAMERA], seen) - jet(hypothesis, scene, coordinates, starts).residual
+    )
+    points = transform_points(invert_pose(T_ROBOT_CAMERA), where)
+    distance = np.linalg.norm(points, axis=1, keepdims=True)
+    return replace(scene, points=points * (seen.depth_scale * distance + seen.depth_offset) / distance)
+
+
+def slope(residual, p, here, at):
+    """Return d residual / d coordinate [m] by differences of fourth order, one-sided where the coordinate cannot go lower."""
+    h = (4e-4 if at == "null" else 1e-3) * (p.high - p.low)
+    if at == "null" or p.key == "tension_n":
+        weights = {0: -25 / 12, 1: 4, 2: -3, 3: 4 / 3, 4: -1 / 4}
+        if p.key == "rotation_stiffness_nm_rad":  # there the plate's ties are missing
+            weights = {1: -77 / 12, 2: 107 / 6, 3: -39 / 2, 4: 61 / 6, 5: -25 / 12}
+    else:
+        weights = {-2: 1 / 12, -1: -2 / 3, 1: 2 / 3, 2: -1 / 12}
+    return sum(w * residual(i * h) for i, w in weights.items()) / h
+
+
+@pytest.mark.parametrize("case", CASES, ids=title)
+def test_the_sensitivity_to_an_effect_is_that_of_marches_solved_anew(case):
+    form, control, at = case
+    robot, scene = SCENES[control]
+    seed, starts = dict(form.seeds(robot)[0]), dict(STARTS[control])
+    parameters = (*form.parameters(robot, control), *(form.polish(robot, control, seed) if at == "away" else ()))
+    hypothesis = Hypothesis(robot, ((form, seed, parameters),))
+    away = [0.05 * (p.high - p.null) if at == "away" else 0.0 for p in parameters]
+    coordinates = np.array([p.null for p in parameters]) + away
+    scene = as_seen(hypothesis, scene, coordinates, starts)
+    here = jet(hypothesis, scene, coordinates, starts, derivative=True)
+    nuisance = NUISANCE[control]
+    for key in dict.fromkeys(p.key for p in parameters):
+        j, parameter = next((j, p) for j, p in enumerate(parameters) if p.key == key)
+
+        def residual(step, j=j):
+            moved = coordinates.copy()
+            moved[j] += step
+            return jet(hypothesis, scene, moved, dict(starts) if at == "away" else {}).residual
+
+        exact = slope(residual, parameter, coordinates[j], at)
+        error = here.by_effect[:, :, j] - exact
+        size = max(np.linalg.norm(here.by_effect[:, :, i]) for i, p in enumerate(parameters) if p.key == key)
+        assert np.linalg.norm(error) < (1e-2 if form.name == "cable_friction" else 1e-4) * size, parameter.label
+        left = np.linalg.norm(
+            nuisance(exact)
+        )  # of what calibration leaves, where that is more than the noise of these differences
+        assert np.linalg.norm(nuisance(error)) < 0.05 * left or left < 1e-4 * size, parameter.label
+
+
+def projector(scene, robot, starts):
+    """Return the map that takes out what pose, inputs and modulus can imitate."""
+    stiffness = find_effect("stiffness")
+    here = jet(
+        Hypothesis(robot, ((stiffness, {}, stiffness.parameters(robot, "")),)), scene, np.zeros(1), starts, derivative=True
+    )
+    columns = np.concatenate([here.by_pose, here.by_initial, here.by_effect], axis=2).reshape(-1, 6 + 4 + 1)
+    columns = columns[:, np.linalg.norm(columns, axis=0) > 0]
+    Q = np.linalg.qr(columns / np.linalg.norm(columns, axis=0))[0]
+    return lambda field: field.ravel() - Q @ (Q.T @ field.ravel())
+
+
+STARTS = {control: {} for control in SCENES}
+NUISANCE = {control: projector(scene, robot, STARTS[control]) for control, (robot, scene) in SCENES.items()}
