@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -37,6 +38,8 @@ class Observation:
     """measured distance along the ray = scale × true distance + offset [1]."""
     depth_offset: float = 0.0
     """[m]."""
+    corrections: tuple[Callable[[FloatArray], FloatArray], ...] = ()
+    """What a user's effects do after that: measured points [m], (k, 3), camera frame → truer ones."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

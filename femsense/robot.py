@@ -238,7 +238,7 @@ def _effect_problems(entry: Mapping[str, Any], i: int, path: Path) -> list[Input
     expected = " | ".join(EFFECT_NAMES)
     if "name" not in entry:
         return [InputError("a required key is missing", where=where, found="nothing", expected=expected)]
-    if entry["name"] not in EFFECT_NAMES:
+    if entry["name"] not in EFFECT_NAMES and "file" not in entry:
         return [InputError("unknown effect", where=where, found=short(entry["name"]), expected=expected, hint=near(str(entry["name"]), EFFECT_NAMES))]  # fmt: skip
     return []
 
@@ -461,6 +461,9 @@ def save_robot(robot: Robot, folder: str | Path, *, effects: Sequence[Mapping[st
     """
     target = Path(folder)
     document = robot_document(robot, effects=effects)
+    for entry in document.get("effects", []):
+        if "file" in entry:
+            entry["file"] = _copy_effect(entry, robot, target)
     if robot.document is not None and robot.folder is not None:
         document["mesh"]["file"] = _copy_mesh(robot.folder / document["mesh"]["file"], target)
     else:
@@ -555,6 +558,20 @@ def _cable_document(cable: Cable, mesh: TetMesh) -> dict[str, Any]:
     if np.isfinite(cable.max_tension):
         table["max_tension_n"] = cable.max_tension
     return table
+
+
+def _copy_effect(entry: Mapping[str, Any], robot: Robot, folder: Path) -> str:
+    """Copy the Python file of a user's effect and return its name."""
+    from femsense.effects.own import find_own_file
+
+    source = find_own_file(entry, robot)
+    if not source.is_file():
+        raise InputError("the file of an effect is gone", where=source, expected=f"the Python file of {entry.get('name')}")
+    target = folder / source.name
+    if not (target.exists() and target.samefile(source)):
+        with write_beside(target) as part:
+            shutil.copyfile(source, part)
+    return source.name
 
 
 def _copy_mesh(source: Path, folder: Path) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import femsense as fs
+from femsense.effects import build_entry, load_own_effect
 from femsense.robot import robot_names
 
 EXAMPLES = Path(fs.__file__).parents[1] / "examples"
@@ -47,6 +48,16 @@ def test_forces(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = fs.read_run(tmp_path / "out")
     assert [frame.frame for frame in run.frames] == list(example.FRAMES) and {frame.status for frame in run.frames} == {"ok"}
     assert run.contacts and (tmp_path / "out" / "robot.glb").read_bytes()[:4] == b"glTF"
+
+
+def test_magnet() -> None:
+    effect = load_own_effect(EXAMPLES / "magnet.py")
+    robot = fs.load_robot("four-leg")
+    seed = effect.seeds(robot)[0]
+    entry = build_entry(effect.parameters(robot, "tension"), [0.0, 0.1, -0.2], seed)
+    pulled = effect.apply(robot, entry)
+    np.testing.assert_allclose((pulled.body.dead_forces - robot.body.dead_forces).sum(axis=0), [0.0, 0.1, -0.2], atol=1e-12)
+    assert effect.lacks == "a magnet beside the tip" and len(effect.seeds(robot)) == 2
 
 
 def test_every_example_is_tested() -> None:

@@ -108,10 +108,22 @@ def make_scene(robot: Robot, recording: Recording, frames: IntArray) -> Scene:
 
 def undo_depth(points: FloatArray, seen: Observation) -> FloatArray:
     """Return true camera points [m] from measured ones: measured distance = scale × true distance + offset."""
-    if seen.depth_scale == 1.0 and seen.depth_offset == 0.0:
-        return points
+    if seen.depth_scale != 1.0 or seen.depth_offset != 0.0:
+        distance = np.linalg.norm(points, axis=1, keepdims=True)
+        points = np.asarray(points * (distance - seen.depth_offset) / seen.depth_scale / distance)
+    for correct in seen.corrections:
+        points = correct(points)
+    return points
+
+
+def redo_depth(points: FloatArray, seen: Observation) -> FloatArray:
+    """Return what the camera measures of true camera points [m]; the inverse of `undo_depth` (corrections by fixed point)."""
+    for correct in reversed(seen.corrections):
+        target = points
+        for _ in range(20):
+            points = points + (target - correct(points))
     distance = np.linalg.norm(points, axis=1, keepdims=True)
-    return np.asarray(points * (distance - seen.depth_offset) / seen.depth_scale / distance)
+    return np.asarray(points * (seen.depth_scale * distance + seen.depth_offset) / distance)
 
 
 def in_robot_frame(points: FloatArray, view: IntArray, poses: Sequence[FloatArray], seen: Observation) -> FloatArray:
@@ -211,9 +223,7 @@ def _as_predicted(robot: Robot, scene: Scene, poses: Sequence[FloatArray], model
     points = np.empty_like(places)
     for v, T in enumerate(poses):
         points[scene.view == v] = transform_points(invert_pose(T), places[scene.view == v])
-    distance = np.linalg.norm(points, axis=1, keepdims=True)
-    seen = robot.observation
-    return replace(scene, points=points * (seen.depth_scale * distance + seen.depth_offset) / distance)
+    return replace(scene, points=redo_depth(points, robot.observation))
 
 
 def _stack(columns: list[FloatArray], residual: FloatArray) -> FloatArray:

@@ -11,6 +11,7 @@ from femsense.effects.effect import Effect, Entry, Parameter, build_entry
 from femsense.effects.loads import GRAVITY, PAYLOAD
 from femsense.effects.material import CREEP, CREEP_TWICE, GENT, HYPERELASTIC, POISSON, SOFT_REGION, STIFFNESS
 from femsense.effects.observation import DEPTH_SCALE, MARKER_OFFSET
+from femsense.effects.own import find_own_file, load_own_effect
 from femsense.effects.shape import DISCRETISATION, GEOMETRY
 from femsense.effects.support import BASE_COMPLIANCE, BASE_ROTATION
 from femsense.errors import InputError
@@ -45,7 +46,7 @@ def apply_effects(robot: Robot, entries: Sequence[Mapping[str, Any]]) -> Robot:
     """Return the robot with the effects of `[[effects]]`, one after the other. Raises InputError."""
     for entry in entries:
         rest = {key: value for key, value in entry.items() if key != "name"}
-        effect = find_effect(str(entry.get("name")))
+        effect = find_effect(str(entry.get("name"))) if "file" not in entry else _own(entry, robot)
         unknown = sorted(set(rest) - set(effect.keys))
         if unknown:
             raise InputError("unknown key", where=f"effects.{effect.name}", found=unknown[0], expected=", ".join(effect.keys))
@@ -53,4 +54,13 @@ def apply_effects(robot: Robot, entries: Sequence[Mapping[str, Any]]) -> Robot:
     return robot
 
 
-__all__ = ["EFFECTS", "FORMS", "Effect", "Entry", "Parameter", "apply_effects", "build_entry", "find_effect"]
+def _own(entry: Mapping[str, Any], robot: Robot) -> Effect:
+    """Return the effect of an entry with `file`. Raises InputError."""
+    file = find_own_file(entry, robot)
+    effect = load_own_effect(file)
+    if effect.name != entry.get("name"):
+        raise InputError("the file holds another effect", where=f"{file}: name", found=effect.name, expected=entry.get("name"))
+    return effect
+
+
+__all__ = ["EFFECTS", "FORMS", "Effect", "Entry", "Parameter", "apply_effects", "build_entry", "find_effect", "load_own_effect"]
