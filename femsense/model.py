@@ -93,9 +93,17 @@ def spread_features(body: BodyModel, count: int, *, among: IntArray | None = Non
         return np.zeros(0, dtype=np.int64)
     x = body.mesh.nodes[free]
     anchor = body.mesh.nodes[body.clamped].mean(axis=0) if len(body.clamped) else x.mean(axis=0)
-    chosen = [int(np.argmax(np.linalg.norm(x - anchor, axis=1)))]
-    distance = np.linalg.norm(x - x[chosen[0]], axis=1)
-    while len(chosen) < min(count, len(free)):
+    first = int(np.argmax(np.linalg.norm(x - anchor, axis=1)))
+    return freeze(free[spread_points(x, count, first=first)], np.int64)
+
+
+def spread_points(points: FloatArray, count: int, *, first: int = 0) -> IntArray:
+    """Return which of some points (p, 3) are spread evenly among them (farthest-point sampling), shape (≤ count,)."""
+    if not len(points) or count <= 0:
+        return np.zeros(0, dtype=np.int64)
+    chosen = [first]
+    distance = np.linalg.norm(points - points[first], axis=1)
+    while len(chosen) < min(count, len(points)):
         chosen.append(int(np.argmax(distance)))
-        distance = np.minimum(distance, np.linalg.norm(x - x[chosen[-1]], axis=1))
-    return freeze(free[chosen], np.int64)
+        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
+    return np.array(chosen, dtype=np.int64)

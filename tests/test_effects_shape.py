@@ -11,7 +11,7 @@ from analytic import bar_body, central_gradient, dense_stiffness
 from arm import WIDTH, arm
 from helpers import block_mesh, write_block_robot
 
-from femsense.effects import apply_effects
+from femsense.effects import apply_effects, build_entry, find_effect
 from femsense.effects.shape import body_on_mesh, finer_mesh, robot_on_mesh
 from femsense.errors import InputError
 from femsense.fem.assembly import internal
@@ -203,3 +203,17 @@ def test_errors_of_discretisation(keys, texts):
 def test_quadratic_meshes_need_no_other_elements():
     body = bar_body(to_quadratic(block_mesh((2, 1, 1))))
     assert body_on_mesh(body, body.mesh).mesh is body.mesh
+
+
+@pytest.mark.parametrize(
+    ("name", "true", "key"), [("soft_region", [0.06, 0.0, 0.0], "center_m"), ("payload", [0.07, 0.0, 0.01], "point_m")]
+)
+def test_seeds_near_by_come_closer_to_a_place(name, true, key):
+    robot = arm((7, 2, 2))
+    effect = find_effect(name)
+    far = [float(np.linalg.norm(np.array(seed[key]) - true)) for seed in effect.seeds(robot)]
+    nearby = effect.nearby(robot, effect.seeds(robot)[int(np.argmin(far))])
+    assert min(float(np.linalg.norm(np.array(seed[key]) - true)) for seed in nearby) < 0.7 * min(far)
+    for seed in nearby:
+        parameters = effect.parameters(robot, "tension")
+        effect.apply(robot, build_entry(parameters, [p.null for p in parameters], seed))

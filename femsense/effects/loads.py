@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from femsense.effects.effect import Effect, Entry, Parameter, vector
-from femsense.fem.mesh import embed_points
-from femsense.model import Robot, spread_features
+from femsense.fem.mesh import embed_points, surface_triangles
+from femsense.model import Robot, spread_features, spread_points
 
 STANDARD_GRAVITY = 9.80665
 """[m/s²]."""
@@ -31,6 +33,15 @@ def _payload_places(robot: Robot) -> tuple[Entry, ...]:
     return tuple({"point_m": [float(v) for v in place]} for place in places)
 
 
+def _places_nearby(robot: Robot, seed: Entry) -> tuple[Entry, ...]:
+    """Places of the surface around one."""
+    nodes, center = robot.body.mesh.nodes, np.asarray(seed["point_m"])
+    surface = nodes[np.setdiff1d(np.unique(surface_triangles(robot.body.mesh)), robot.body.clamped)]
+    near = surface[np.linalg.norm(surface - center, axis=1) <= 0.3 * robot.body.reach]
+    first = int(np.linalg.norm(near - center, axis=1).argmin()) if len(near) else 0
+    return (dict(seed), *({"point_m": [float(v) for v in near[i]]} for i in spread_points(near, 20, first=first)))
+
+
 def _apply_payload(robot: Robot, entry: Entry) -> Robot:
     point, force = vector(entry, "point_m", "payload"), vector(entry, "force_n", "payload")
     mesh = robot.body.mesh
@@ -42,7 +53,13 @@ GRAVITY = Effect(
     "gravity", "its own weight, or weight in another direction", _gravity_parameters, _apply_gravity, keys=("vector_m_s2",)
 )
 PAYLOAD = Effect(
-    "payload", "a load that was not declared", _payload_parameters, _apply_payload, _payload_places, keys=("point_m", "force_n")
+    "payload",
+    "a load that was not declared",
+    _payload_parameters,
+    _apply_payload,
+    _payload_places,
+    keys=("point_m", "force_n"),
+    nearby=_places_nearby,
 )
 
 __all__ = ["GRAVITY", "PAYLOAD", "STANDARD_GRAVITY"]

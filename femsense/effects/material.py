@@ -9,7 +9,7 @@ import numpy as np
 from femsense.arrays import freeze
 from femsense.effects.effect import Effect, Entry, Parameter, number, vector
 from femsense.errors import InputError
-from femsense.model import Robot, spread_features
+from femsense.model import Robot, spread_features, spread_points
 
 
 def _stiffness_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
@@ -48,6 +48,21 @@ def _region_places(robot: Robot) -> tuple[Entry, ...]:
         {"center_m": [float(v) for v in p], "radius_m": r}
         for p, r in spheres
         if (np.linalg.norm(centroids - p, axis=1) <= r).any()
+    )
+
+
+def _regions_nearby(robot: Robot, seed: Entry) -> tuple[Entry, ...]:
+    """Spheres of several sizes around places near by, those that hold the centroid of an element."""
+    mesh, center, radius = robot.body.mesh, np.asarray(seed["center_m"]), float(seed["radius_m"])
+    centroids = mesh.nodes[mesh.tets[:, :4]].mean(axis=1)
+    near = centroids[np.linalg.norm(centroids - center, axis=1) <= 1.5 * radius]
+    first = int(np.linalg.norm(near - center, axis=1).argmin()) if len(near) else 0
+    places = [center, *near[spread_points(near, 10, first=first)]]
+    return tuple(
+        {"center_m": [float(v) for v in place], "radius_m": factor * radius}
+        for place in places
+        for factor in (0.6, 0.8, 1.0, 1.3)
+        if (np.linalg.norm(centroids - place, axis=1) <= factor * radius).any()
     )
 
 
@@ -137,6 +152,7 @@ SOFT_REGION = Effect(
     _apply_region,
     _region_places,
     keys=("center_m", "radius_m", "scale"),
+    nearby=_regions_nearby,
 )
 HYPERELASTIC = Effect(
     "hyperelastic",
