@@ -235,7 +235,9 @@ def _observe_variants(
         answers = [
             balance.upset_by(variants[i], memory[1 + i], start, start + move) for i, start, move in zip(linear, starts, moves)
         ]
-        moves = tangent.respond(np.array([force for force, _, _ in answers]))
+        moved = [start is not base.positions for start in starts]
+        forces = [force - balance.left() if m else force for m, (force, _, _) in zip(moved, answers)]
+        moves = tangent.respond(np.array(forces))
         if base.held.any():  # cables: pressures are never held here
             held = base.held[: len(walk.robot.body.cables)]
             moves += np.tensordot(np.array([pulled[held] for _, pulled, _ in answers]), tangent.respond_to_held(), axes=1)
@@ -274,10 +276,10 @@ class _Balance:
         if other.mesh is not body.mesh:
             x = x + (other.mesh.nodes - body.mesh.nodes)
         if body.clamp_is_rigid and not other.clamp_is_rigid:
-            return x + first_give(other, self._left())
+            return x + first_give(other, self.left())
         return x
 
-    def _left(self) -> FloatArray:
+    def left(self) -> FloatArray:
         """Return all forces in the base state [N], (n, 3): at the clamp what it takes up, elsewhere what Newton left."""
         x = self.base.positions
         force = self.dead + self.base.nodal_forces
@@ -299,13 +301,13 @@ class _Balance:
         return force, self._pulled(variant, body, None if still else x), tensions
 
     def _whole(self, variant: Walk, body: BodyModel, tensions: tuple[FloatArray, ...], x: FloatArray) -> FloatArray:
-        """Return all forces on a variant's body at x, less what the base state leaves."""
+        """Return all forces on a variant's body at x."""
         force = body.dead_load() + self._loads(variant) - internal(body, x, tangent=False).forces
         for cable, along in zip(body.cables, tensions):
             force = force + cable_forces(cable, x, along, len(x))
         for chamber, pressure in zip(body.chambers, variant.drive.pressures[self.frame]):
             force = force + pressure * volume_gradient(chamber, x)
-        return np.asarray(force - self._left())
+        return np.asarray(force)
 
     def _change(self, variant: Walk, body: BodyModel, tensions: tuple[FloatArray, ...]) -> FloatArray:
         """Return what a variant changes of the forces in the base state, where they sum to nothing."""

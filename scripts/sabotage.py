@@ -104,7 +104,7 @@ SABOTAGES = (
     S("fem/clamp.py", "np.cross(arms, y).sum(axis=0) - kappa * turn", "np.cross(arms, y).sum(axis=0) - 2 * kappa * turn", "test_effects_shape.py::test_the_plate_turns_by_the_moment_of_all_loads"),
     S("fem/body.py", "stencil.volumes * scale**3", "stencil.volumes * scale**2", "test_effects_shape.py::test_a_body_of_another_size_is_that_of_a_mesh_of_that_size"),
     S("effects/shape.py", "body.material.young_modulus[parent]", "body.material.young_modulus[parent[::-1]]", "test_effects_shape.py::test_a_finer_mesh_keeps_what_the_robot_has"),
-    S("march.py", "return x + first_give(other, self._left())", "return x", "test_effects_derivatives.py"),
+    S("march.py", "return x + first_give(other, self.left())", "return x", "test_effects_derivatives.py"),
     S("march.py", "x = x + (other.mesh.nodes - body.mesh.nodes)", "x = x + 0.0", "test_effects_derivatives.py"),
     S("effects/observation.py", "seen.depth_offset * scale + offset", "seen.depth_offset + offset", "test_effects.py::test_depth_is_undone_as_it_was_made"),
     S("effects/cables.py", "gain=freeze(act.gain * per_cable(", "gain=freeze(act.gain / per_cable(", "test_effects.py::test_gains_multiply_and_offsets_add_when_they_come_twice"),
