@@ -60,7 +60,9 @@ def recover(number: int, control: str, entry: dict[str, Any]) -> tuple[LoopResul
     made = make_data(case, 7)
     declared = made.declared
     if law_hidden:
-        declared = declared.with_body(declared.body.with_material(replace(declared.body.material, law="corotational", stretch_limit=np.inf)))
+        declared = declared.with_body(
+            declared.body.with_material(replace(declared.body.material, law="corotational", stretch_limit=np.inf))
+        )
     if mesh_hidden:
         declared = robot_on_mesh(declared, to_linear(declared.body.mesh))
     began = time.process_time()
@@ -82,7 +84,9 @@ def row(loop: LoopResult, truth: dict[str, Any]) -> tuple[str, str]:
         seen = "in set" if name in rivals else "not testable" if untestable else "MISSED"
         return seen, f"{loop.verdict}: " + ", ".join(others)
     outcome = "named" + (f" with {', '.join(others)}" if others else "")
-    return outcome, "; ".join(_compared(key, effect["parameters"].get(key), value) for key, value in truth.items() if key != "name")
+    return outcome, "; ".join(
+        _compared(key, effect["parameters"].get(key), value) for key, value in truth.items() if key != "name"
+    )
 
 
 def _compared(key: str, found: dict[str, Any] | None, truth: Any) -> str:
@@ -92,7 +96,9 @@ def _compared(key: str, found: dict[str, Any] | None, truth: Any) -> str:
         value, std = found["value"], found["std"]
         if not isinstance(value, dict):
             value, std = {k: value for k in truth}, {k: std for k in truth}
-        return ", ".join(_compared(f"{key}[{k}]", {"value": value.get(k), "std": (std or {}).get(k)}, v) for k, v in truth.items())
+        return ", ".join(
+            _compared(f"{key}[{k}]", {"value": value.get(k), "std": (std or {}).get(k)}, v) for k, v in truth.items()
+        )
     if isinstance(truth, str) or found["value"] is None or found["std"] is None:
         return f"{key} {_text(found['value'])} (true {_text(truth)})"
     value, std, true = (np.atleast_1d(np.asarray(v, dtype=float)) for v in (found["value"], found["std"], truth))
