@@ -1,3 +1,4 @@
+# mypy: allow-untyped-decorators
 """Cable kinematics: length, its derivatives, the forces of tensions that may differ from segment to segment, and friction.
 
 Points of a path are numbered from the far end; segment j joins point j and j + 1, the last one ends at the pull point.
@@ -8,19 +9,31 @@ A cable of length ℓ has shortened by δ = ℓ(rest) − ℓ(x). Tensions t_j a
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 
-from femsense.arrays import FloatArray
+from femsense.arrays import FloatArray, IntArray
 from femsense.fem.body import BodyModel, Cable, segment_ties
 
 
 def segments(cable: Cable, positions: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return unit vectors from far end to pull point, shape (s, 3), and lengths [m], shape (s,), of the segments."""
-    points = np.empty((len(cable.path) + 1, 3))
-    points[:-1] = cable.path.positions(positions)
-    points[-1] = cable.pull_point
-    difference = points[1:] - points[:-1]
-    length = np.sqrt(np.einsum("sc,sc->s", difference, difference))
-    return difference / np.maximum(length, 1e-12)[:, None], length
+    return _segments(cable.path.nodes, cable.path.weights, cable.pull_point, np.ascontiguousarray(positions))
+
+
+@njit(cache=True)
+def _segments(nodes: IntArray, weights: FloatArray, end: FloatArray, positions: FloatArray) -> tuple[FloatArray, FloatArray]:
+    count, k = nodes.shape
+    points = np.zeros((count + 1, 3))
+    points[count] = end
+    for s in range(count):
+        for a in range(k):
+            for c in range(3):
+                points[s, c] += weights[s, a] * positions[nodes[s, a], c]
+    directions, lengths = points[1:] - points[:-1], np.empty(count)
+    for s in range(count):
+        lengths[s] = np.sqrt(directions[s, 0] ** 2 + directions[s, 1] ** 2 + directions[s, 2] ** 2)
+        directions[s] /= max(lengths[s], 1e-12)
+    return directions, lengths
 
 
 def cable_length(cable: Cable, positions: FloatArray) -> float:
@@ -45,8 +58,16 @@ def point_forces(directions: FloatArray, tensions: FloatArray) -> FloatArray:
 def cable_forces(cable: Cable, positions: FloatArray, tensions: FloatArray, node_count: int) -> FloatArray:
     """Return the nodal forces of a cable [N], shape (n, 3), for the tensions of its segments [N], shape (s,)."""
     at_points = point_forces(segments(cable, positions)[0], tensions)
+    return _spread(cable.path.nodes, cable.path.weights, at_points, node_count)
+
+
+@njit(cache=True)
+def _spread(nodes: IntArray, weights: FloatArray, at_points: FloatArray, node_count: int) -> FloatArray:
     forces = np.zeros((node_count, 3))
-    np.add.at(forces, cable.path.nodes, cable.path.weights[:, :, None] * at_points[:, None, :])
+    for s in range(nodes.shape[0]):
+        for a in range(nodes.shape[1]):
+            for c in range(3):
+                forces[nodes[s, a], c] += weights[s, a] * at_points[s, c]
     return forces
 
 
