@@ -134,7 +134,7 @@ def frame_loads(walk: Walk, frame: int) -> FloatArray | None:
 
 def solve_frame(
     walk: Walk, frame: int, *, start: Equilibrium | None = None, before: tuple[FloatArray, ...] | None = None, reuse_factor: bool = False,
-    nodal_forces: FloatArray | None = None,
+    nodal_forces: FloatArray | None = None, relative_tolerance: float = 1e-9,
 ) -> Equilibrium:  # fmt: skip
     """Return the equilibrium of one frame.
 
@@ -145,6 +145,7 @@ def solve_frame(
         before: tensions along the cables until now (friction); by default none.
         reuse_factor: whether the start's factor serves.
         nodal_forces: forces beside the known loads [N], shape (n, 3).
+        relative_tolerance: of the unbalanced force against the sum of all loads.
     """
     drive, body = walk.drive, walk.robot.body
     if drive.gravity is not None:
@@ -158,7 +159,7 @@ def solve_frame(
     tension, held = (values, None) if drive.control == "tension" else (None, values)
     return solve_equilibrium(
         body, tension=tension, shortening=held, pressure=dict(zip(body.chamber_names, drive.pressures[frame].tolist())),
-        nodal_forces=loads, start=start, before=before, reuse_factor=reuse_factor,
+        nodal_forces=loads, start=start, before=before, reuse_factor=reuse_factor, relative_tolerance=relative_tolerance,
     )  # fmt: skip
 
 

@@ -36,6 +36,8 @@ from femsense.qp.forces import ForceEstimate, estimate_forces
 from femsense.qp.problem import FrictionCone
 from femsense.recording import Recording, check_against, read_frame_cloud
 
+ROUGH = 1e-6
+"""Unbalanced force, relative to all loads, of the states on the way to the forces; the last one is exact."""
 PLACE_STD = 0.5
 """How well the place of a contact is known, in search radii."""
 
@@ -184,6 +186,8 @@ class Rows:
     """Features or markers."""
     rms: float
     """[m]."""
+    sharp: FloatArray
+    """The same before residuals that stand out got more [m], shape (r,)."""
     crowding: float = 1.0
     """By how much errors that neighbours share widen standard deviations [1]."""
 
@@ -326,13 +330,15 @@ def sense_frame(sensor: Sensor, k: int, previous: SensedFrame | None) -> SensedF
     state, forces, at_end = free_state, np.zeros(0), rows
     contacts: tuple[ContactForce, ...] = ()
     if patches:
-        start = previous if previous is not None and (source == "given" or _same_places(previous, patches, expected)) else None
+        same = previous is not None and (source == "given" or _same_places(previous, patches, expected))
+        start = (previous.state, previous.forces) if previous is not None and same else None
         state, estimate, at_end = _fit_forces(sensor, k, clouds, patches, source, free_state, start, before)
         if source == "cloud":  # where it touches is clearer once the model has come near
             again, _ = _find_contacts(sensor, k, clouds, state)
             if len(again) == len(patches) and _wandered(patches, again, state) > 0.5 * sensor.surface.edge:
                 patches = again
-                state, estimate, at_end = _fit_forces(sensor, k, clouds, patches, source, free_state, None, before)
+                near = (state, estimate.forces)
+                state, estimate, at_end = _fit_forces(sensor, k, clouds, patches, source, free_state, near, before)
         forces = estimate.forces
         contacts = _contacts(sensor, k, patches, estimate, state, source)
     number, stamp = int(sensor.recording.frame_numbers[k]), float(sensor.recording.time_s[k])
@@ -526,6 +532,7 @@ def _cloud_rows(sensor: Sensor, seen_now: Seen, state: Equilibrium, reach: float
         by_pose,
         int(use.sum()),
         float(np.sqrt((distance**2).mean())),
+        std,
         _crowding(seen, options.correlation_m or 0.12 * sensor.size),
     )
 
@@ -561,7 +568,7 @@ def _marker_rows(sensor: Sensor, k: int, state: Equilibrium) -> Rows:
     def functional(u: FloatArray) -> FloatArray:
         return np.array([place.positions(v).ravel() for v in u]).reshape(len(u), -1).T
 
-    return Rows(functional, residual.ravel(), std, by_pose, len(rows), float(np.sqrt((residual**2).sum(axis=1).mean())))
+    return Rows(functional, residual.ravel(), std, by_pose, len(rows), float(np.sqrt((residual**2).sum(axis=1).mean())), std)
 
 
 def _marker_std(calibration: Calibration) -> float:
@@ -592,25 +599,32 @@ def _root(covariance: FloatArray) -> FloatArray:
 
 def _fit_forces(
     sensor: Sensor, k: int, clouds: Seen | None, patches: Sequence[Patch], source: str, free_state: Equilibrium,
-    previous: SensedFrame | None, before: tuple[FloatArray, ...] | None,
+    start: tuple[Equilibrium, FloatArray] | None, before: tuple[FloatArray, ...] | None,
 ) -> tuple[Equilibrium, ForceEstimate, Rows]:  # fmt: skip
-    """Equilibrium → compliance → QP, until the forces stop changing."""
+    """Equilibrium → compliance → QP, until the forces stop changing or no step makes the fit better.
+
+    `start` is a state near by and the forces in it.
+    """
     n = len(sensor.robot.body.mesh.nodes)
     basis = np.array([patch.spread(axis, n) for patch in patches for axis in np.eye(3)])
     state, forces = free_state, np.zeros(len(basis))
-    if previous is not None and len(previous.forces) == len(basis):
-        forces = previous.forces
-        state = _solve(sensor, k, np.tensordot(forces, basis, axes=1), previous.state, before)
+    if start is not None and len(start[1]) == len(basis):
+        forces = start[1]
+        state = _solve(sensor, k, np.tensordot(forces, basis, axes=1), start[0], before, ROUGH)
     rows = _measure(sensor, k, clouds, state)
     estimate: ForceEstimate | None = None
     size = np.inf
     for iteration in range(sensor.options.iterations):
         rows = rows if clouds is None or iteration == 0 else _measure(sensor, k, clouds, state, _reach(sensor, rows))
-        rows = rows if iteration == 0 else _robust(rows)
+        outlying = _outlying(rows)
+        rows = _robust(rows, outlying)
         directions = _directions(sensor, patches, state, source)
         tangent = tangent_at(sensor.robot.body, state)
-        W = rows.functional(tangent.respond(basis)) @ directions
-        nuisance = _nuisance(sensor, rows, state, tangent)
+        load = internal(sensor.robot.body, state.positions, tangent=False).forces
+        moves = tangent.respond(np.concatenate([basis, load[None]]))
+        moves, sag = moves[:-1], moves[-1:]
+        W = rows.functional(moves) @ directions
+        nuisance = _nuisance(sensor, rows, sag)
         estimate, size = _solve_qp(sensor, rows, W, nuisance, directions, forces, state, patches, source, size)
         step = directions @ estimate.forces - forces
         still = np.maximum(
@@ -618,23 +632,37 @@ def _fit_forces(
         )
         if (np.abs(step) < still).all():
             break
-        cost = _cost(rows, nuisance, forces, size)
-        for share in (1.0, 0.5, 0.2, 0.06):  # large deflections: a full step may lead too far
+        cost = _cost(rows, nuisance, forces, size, outlying)
+        better = None
+        for share in (1.0, 0.4, 0.1):  # large deflections: a full step may lead too far
             try:
-                there = _solve(sensor, k, np.tensordot(forces + share * step, basis, axes=1), state, before)
+                there = _predicted(state, tangent, np.tensordot(share * step, moves, axes=1))
+                there = _solve(sensor, k, np.tensordot(forces + share * step, basis, axes=1), there, before, ROUGH)
                 seen = _measure(sensor, k, clouds, there, np.inf if iteration == 0 else _reach(sensor, rows))
             except DataError:
                 continue
-            if _cost(seen, nuisance, forces + share * step, size) < cost or share < 0.1:
+            seen = _robust(seen, outlying)
+            gain = cost - _cost(seen, _nuisance(sensor, seen, sag), forces + share * step, size, outlying)
+            if gain > 0:
+                better = (forces + share * step, there, seen)
                 break
-        else:
-            raise DataError("no equilibrium near the forces that the data ask for")
-        forces, state, rows = forces + share * step, there, seen
+        if better is None:
+            break
+        forces, state, rows = better
+        if gain < 1e-3 * cost:
+            break
+    state = _solve(sensor, k, np.tensordot(forces, basis, axes=1), state, before)
     assert estimate is not None
     covariance = rows.crowding**2 * (directions @ estimate.covariance @ directions.T)
     if source == "cloud":
         covariance = covariance + _place_covariance(sensor, patches, state, tangent, rows, forces)
     return state, replace(estimate, forces=freeze(forces), covariance=freeze(covariance)), rows
+
+
+def _predicted(state: Equilibrium, tangent: Tangent, move: FloatArray) -> Equilibrium:
+    """Return a start near the state that follows when nodes move by `move` [m], shape (n, 3), with the factor that said so."""
+    factor = tangent.factor if tangent.factor.negative == 0 else None
+    return replace(state, positions=state.positions + move, factor=factor)
 
 
 def _place_covariance(
@@ -674,11 +702,14 @@ def _reach(sensor: Sensor, rows: Rows) -> float:
     return max(6.0 * float(np.median(np.abs(rows.residual))), 1.5 * _voxel(sensor))
 
 
-def _robust(rows: Rows) -> Rows:
-    """Return the rows with larger standard deviations where residuals stand out (Huber, 2.5 times the median scale)."""
-    size = np.abs(rows.residual / rows.std)
-    scale = max(1.483 * float(np.median(size)), 1.0)
-    return replace(rows, std=rows.std * np.sqrt(np.maximum(size / (2.5 * scale), 1.0)))
+def _outlying(rows: Rows) -> float:
+    """Return from which size on a whitened residual stands out [1]: 2.5 times the median scale (Huber)."""
+    return 2.5 * max(1.483 * float(np.median(np.abs(rows.residual / rows.sharp))), 1.0)
+
+
+def _robust(rows: Rows, outlying: float) -> Rows:
+    """Return the rows with larger standard deviations where residuals stand out."""
+    return replace(rows, std=rows.sharp * np.sqrt(np.maximum(np.abs(rows.residual / rows.sharp) / outlying, 1.0)))
 
 
 def _directions(sensor: Sensor, patches: Sequence[Patch], state: Equilibrium, source: str) -> FloatArray:
@@ -696,21 +727,22 @@ def _normal(sensor: Sensor, patch: Patch, state: Equilibrium) -> FloatArray:
     return mean / max(float(np.linalg.norm(mean)), 1e-12)
 
 
-def _nuisance(sensor: Sensor, rows: Rows, state: Equilibrium, tangent: Tangent) -> FloatArray:
-    """Return how the model moves with modulus and pose, in units of their standard deviations [m], shape (r, j)."""
-    load = internal(sensor.robot.body, state.positions, tangent=False).forces
-    by_modulus = -sensor.options.modulus_std * rows.functional(tangent.respond(load[None]))
-    return np.hstack([by_modulus, -rows.by_pose])
+def _nuisance(sensor: Sensor, rows: Rows, sag: FloatArray) -> FloatArray:
+    """Return how the model moves with modulus and pose, in units of their standard deviations [m], shape (r, j).
+
+    `sag` is the response of the nodes to the internal forces [m], shape (1, n, 3): a body so much softer moves on by so much.
+    """
+    return np.hstack([-sensor.options.modulus_std * rows.functional(sag), -rows.by_pose])
 
 
-def _cost(rows: Rows, nuisance: FloatArray, forces: FloatArray, size: float) -> float:
-    """Return the mean square of the whitened residual with nuisance fitted, and of the forces against their prior."""
-    if len(nuisance) != len(rows.residual):  # other features are found than before
-        return float(np.mean((rows.residual / rows.std) ** 2))
+def _cost(rows: Rows, nuisance: FloatArray, forces: FloatArray, size: float, outlying: float) -> float:
+    """Return the mean of Huber's function of the whitened residual with nuisance fitted, and of the forces against their prior."""
     A = np.vstack([nuisance / rows.std[:, None], np.eye(nuisance.shape[1])])
     b = np.concatenate([rows.residual / rows.std, np.zeros(nuisance.shape[1])])
-    left = b - A @ np.linalg.lstsq(A, b, rcond=None)[0]
-    return float((left @ left + (0.0 if np.isinf(size) else forces @ forces / size**2)) / len(rows.residual))
+    fitted = np.linalg.lstsq(A, b, rcond=None)[0]
+    z = np.abs(rows.residual - nuisance @ fitted) / rows.sharp
+    loss = np.where(z <= outlying, z**2, outlying * (2.0 * z - outlying)).sum() + fitted @ fitted
+    return float((loss + (0.0 if np.isinf(size) else forces @ forces / size**2)) / len(rows.residual))
 
 
 def _solve_qp(
@@ -758,9 +790,12 @@ def _solve_qp(
 
 
 def _solve(
-    sensor: Sensor, k: int, nodal_forces: FloatArray | None, start: Equilibrium | None, before: tuple[FloatArray, ...] | None
-) -> Equilibrium:
-    state = solve_frame(sensor.walk, k, start=start, before=before, nodal_forces=nodal_forces, reuse_factor=start is not None)
+    sensor: Sensor, k: int, nodal_forces: FloatArray | None, start: Equilibrium | None, before: tuple[FloatArray, ...] | None,
+    tolerance: float = 1e-9,
+) -> Equilibrium:  # fmt: skip
+    state = solve_frame(
+        sensor.walk, k, start=start, before=before, nodal_forces=nodal_forces, reuse_factor=start is not None, relative_tolerance=tolerance
+    )  # fmt: skip
     if not state.converged:
         raise DataError(f"no equilibrium: {state.status}: {state.advice}")
     return state

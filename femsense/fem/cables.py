@@ -17,7 +17,8 @@ from femsense.fem.body import BodyModel, Cable, segment_ties
 
 def segments(cable: Cable, positions: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return unit vectors from far end to pull point, shape (s, 3), and lengths [m], shape (s,), of the segments."""
-    return _segments(cable.path.nodes, cable.path.weights, cable.pull_point, np.ascontiguousarray(positions))
+    directions, lengths = _segments(cable.path.nodes, cable.path.weights, cable.pull_point, np.ascontiguousarray(positions))
+    return directions, lengths
 
 
 @njit(cache=True)
@@ -58,7 +59,7 @@ def point_forces(directions: FloatArray, tensions: FloatArray) -> FloatArray:
 def cable_forces(cable: Cable, positions: FloatArray, tensions: FloatArray, node_count: int) -> FloatArray:
     """Return the nodal forces of a cable [N], shape (n, 3), for the tensions of its segments [N], shape (s,)."""
     at_points = point_forces(segments(cable, positions)[0], tensions)
-    return _spread(cable.path.nodes, cable.path.weights, at_points, node_count)
+    return np.asarray(_spread(cable.path.nodes, cable.path.weights, at_points, node_count))
 
 
 @njit(cache=True)

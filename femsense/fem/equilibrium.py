@@ -321,7 +321,7 @@ def _newton(body: BodyModel, loads: _Loads, state: _State, max_iterations: int) 
             state.factor, state.borrowed, last = None, False, np.inf
             here = internal(body, state.x)
             continue
-        if state.factor is None or (not state.borrowed and state.residual > 1e3 * loads.tolerance):
+        if state.factor is None or (not state.borrowed and state.residual > max(loads.tolerance, 1e-2 * last)):
             state.factor = _factor_here(body, here, state)
             if state.factor is None:
                 return "singular"
