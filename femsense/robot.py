@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import Field, StringConstraints
+from pydantic import Field, StringConstraints, model_validator
 
 import femsense
 from femsense.arrays import FloatArray, IntArray, freeze
@@ -20,9 +20,11 @@ from femsense.fem.body import BodyModel, Cable, Chamber, make_body, tie_cable
 from femsense.fem.chambers import check_chambers, find_chamber
 from femsense.fem.mesh import TetMesh, check_mesh, embed_points, to_linear, to_quadratic
 from femsense.files import plain, write_beside, write_toml
+from femsense.materials import POISSON_RATIO, silicone
 from femsense.meshfile import mesh_companions, read_tets, write_mesh
 from femsense.model import Observation, Robot, plain_actuation, spread_features
 from femsense.pose import check_pose, transform_points
+from femsense.regions import RegionTable, regional
 from femsense.tables import Schema, key_path, near, read_toml, schema_problems, short, validated
 
 FORMAT = "femsense-robot-1"
@@ -62,9 +64,27 @@ class MeshTable(Schema):
 
 
 class MaterialTable(Schema):
+    name: str | None = Field(None, description="a silicone of femsense.materials; what the other keys say goes before it")
     young_modulus_pa: float = Field(gt=0, description="Young's modulus in pascal, > 0, such as 150e3 for soft silicone")
     poisson_ratio: float = Field(gt=-1, lt=0.5, description="Poisson's ratio, −1 < ν < 0.5, such as 0.45 or 0.49 for silicone")
     density_kg_m3: float = Field(gt=0, description="density in kg/m³, > 0, such as 1070 for silicone")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _named(cls, table: Any) -> Any:
+        """Take what a named silicone says for the keys that the table leaves out."""
+        if not isinstance(table, dict) or not isinstance(table.get("name"), str):
+            return table
+        try:
+            material = silicone(table["name"])
+        except InputError as error:
+            raise ValueError(f"unknown material {table['name']!r}; known are {error.expected}") from None
+        known = {
+            "young_modulus_pa": material.young_modulus_pa,
+            "poisson_ratio": POISSON_RATIO,
+            "density_kg_m3": material.density_kg_m3,
+        }
+        return {**{key: value for key, value in known.items() if value is not None}, **table}
 
 
 class GravityTable(Schema):
@@ -125,6 +145,7 @@ class RobotTable(Schema):
     )
     cables: list[CableTable] = Field([], description="tables [[cables]]")
     chambers: list[ChamberTable] = Field([], description="tables [[chambers]]")
+    regions: list[RegionTable] = Field([], description="tables [[regions]] with a place and young_modulus_pa or poisson_ratio")
     markers: list[MarkerTable] = Field([], description="tables [[markers]]")
     features: FeaturesTable = Field(default_factory=lambda: FeaturesTable(count=51), description="a table [features] with count")
     appearance: AppearanceTable = Field(
@@ -251,10 +272,12 @@ def build_robot(table: RobotTable, document: dict[str, Any], path: Path) -> Robo
     declared = read_declared_mesh(table.mesh, path)
     mesh = with_element(declared, table.mesh.element)
     clamped = clamped_nodes(mesh, table.fixed, path)
+    file, material = path.parent / table.mesh.file, table.material
+    moduli, ratios = regional(mesh, table.regions, file, path, material.young_modulus_pa, material.poisson_ratio)
     body = make_body(
         mesh,
-        young_modulus=table.material.young_modulus_pa,
-        poisson_ratio=table.material.poisson_ratio,
+        young_modulus=moduli,
+        poisson_ratio=ratios,
         density=table.material.density_kg_m3,
         clamped=clamped,
         clamp_nodes=clamped[clamped < len(declared.nodes)],
