@@ -12,14 +12,15 @@ from numba import njit
 from femsense.arrays import FloatArray, IntArray
 from femsense.fem.body import BodyModel
 from femsense.fem.clamp import clamp_energy_and_forces, ties_of
-from femsense.fem.corotational import corotational_kernel
-from femsense.fem.hyperelastic import hyperelastic_kernel
+from femsense.fem.corotational import corotational_tet4, corotational_tet10
+from femsense.fem.hyperelastic import hyperelastic_tet4, hyperelastic_tet10
 from femsense.fem.stencil import block_row_numbers
 
 KERNELS = {
-    (name, count): kernel(count, quad)
-    for name, kernel in (("corotational", corotational_kernel), ("hyperelastic", hyperelastic_kernel))
-    for count, quad in ((4, 1), (10, 4))
+    ("corotational", 4): corotational_tet4,
+    ("corotational", 10): corotational_tet10,
+    ("hyperelastic", 4): hyperelastic_tet4,
+    ("hyperelastic", 10): hyperelastic_tet10,
 }
 
 
@@ -47,7 +48,9 @@ def internal(body: BodyModel, positions: FloatArray, *, tangent: bool = True) ->
     blocks = np.zeros((len(stencil.block_columns) if tangent else 0, 9))
     kernel = KERNELS["corotational" if material.law == "corotational" else "hyperelastic", body.mesh.tets.shape[1]]
     limit = material.stretch_limit if material.law == "gent" else np.inf
-    energy = kernel(np.ascontiguousarray(positions), stencil.tets, stencil.gradients, stencil.volumes, mu, lam, limit, tangent, stencil.slots, forces, blocks)  # fmt: skip
+    x = np.ascontiguousarray(positions).view()
+    x.flags.writeable = False  # one compiled kernel, whether the caller's array can be written to or not
+    energy = kernel(x, stencil.tets, stencil.gradients, stencil.volumes, mu, lam, limit, tangent, stencil.slots, forces, blocks)  # fmt: skip
     ties = ties_of(body)
     if ties is not None:
         extra, slopes = clamp_energy_and_forces(body, ties, positions)

@@ -19,8 +19,6 @@ which is the full second derivative, rotation included. References: Müller & Gr
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numba import njit
 
@@ -29,7 +27,7 @@ from femsense.arrays import FloatArray
 FAST = {"contract", "reassoc", "nsz", "arcp"}
 """Rounding may differ; infinities and NaN are kept."""
 LANES = 8
-"""Rows of node values are padded to a multiple of this, so that processors can take them in whole registers."""
+"""Rows of ten node values are padded to a multiple of this, so that processors can take them in whole registers."""
 
 
 @njit(cache=True, fastmath=FAST)
@@ -106,126 +104,122 @@ LOCAL = 0.75
 """λ up to this share of μ acts at each quadrature point, the rest on the mean dilatation of an element."""
 
 
-def padded(count: int) -> int:
-    """Return the length of a padded row of node values."""
-    return count if count <= 4 else -(-count // LANES) * LANES
+@njit(inline="always")
+def add_blocks(count, K, slots, e, blocks):  # type: ignore[no-untyped-def]
+    """Add the blocks a ≤ b of K[a, i, j, b] where they belong."""
+    pair = 0
+    for a in range(count):
+        for b in range(a, count):
+            slot = slots[e, pair]
+            pair += 1
+            for i in range(3):
+                for j in range(3):
+                    blocks[slot, 3 * i + j] += K[a, i, j, b]
 
 
-def corotational_kernel(count: int, quad: int) -> Any:
-    """Return the compiled kernel for elements with `count` nodes and `quad` quadrature points.
+@njit(inline="always")
+def _stiffness(count, quad, row, e, w, mu, pull, local, lam, F, R, H, mean, Dinv, Z, K):  # type: ignore[no-untyped-def]
+    """Write the stiffness of an element, K[a, i, j, b]."""
+    volume = 0.0
+    for q in range(quad):
+        volume += w[e, q]
+        turning_compliance(F, R, q, Dinv)
+        s = w[e, q] * (2.0 * mu - pull[q])
+        d00, d01, d02, d11, d12, d22 = s * Dinv[0], s * Dinv[1], s * Dinv[2], s * Dinv[3], s * Dinv[4], s * Dinv[5]
+        for a in range(count):  # Z = (2μ − λθ) w [h]ₓ D⁻¹
+            x, y, z = H[q, 0, a], H[q, 1, a], H[q, 2, a]
+            Z[a, 0, 3 * q], Z[a, 0, 3 * q + 1], Z[a, 0, 3 * q + 2] = y * d02 - z * d01, y * d12 - z * d11, y * d22 - z * d12
+            Z[a, 1, 3 * q], Z[a, 1, 3 * q + 1], Z[a, 1, 3 * q + 2] = z * d00 - x * d02, z * d01 - x * d12, z * d02 - x * d22
+            Z[a, 2, 3 * q], Z[a, 2, 3 * q + 1], Z[a, 2, 3 * q + 2] = x * d01 - y * d00, x * d11 - y * d01, x * d12 - y * d02
+    for a in range(count):
+        for i in range(3):
+            side = (lam - local) / volume * mean[i, a]
+            for b in range(a & -LANES, row):
+                s0, s1, s2 = side * mean[0, b], side * mean[1, b], side * mean[2, b]
+                for q in range(quad):
+                    z0, z1, z2 = Z[a, i, 3 * q], Z[a, i, 3 * q + 1], Z[a, i, 3 * q + 2]
+                    z = local * w[e, q] * H[q, i, a]
+                    s0 += z1 * H[q, 2, b] - z2 * H[q, 1, b] + z * H[q, 0, b]
+                    s1 += z2 * H[q, 0, b] - z0 * H[q, 2, b] + z * H[q, 1, b]
+                    s2 += z0 * H[q, 1, b] - z1 * H[q, 0, b] + z * H[q, 2, b]
+                K[a, i, 0, b], K[a, i, 1, b], K[a, i, 2, b] = s0, s1, s2
+    for q in range(quad):
+        s = 2.0 * mu * w[e, q]
+        for a in range(count):
+            x, y, z = s * H[q, 0, a], s * H[q, 1, a], s * H[q, 2, a]
+            for b in range(a & -LANES, row):
+                dot = x * H[q, 0, b] + y * H[q, 1, b] + z * H[q, 2, b]
+                K[a, 0, 0, b] += dot
+                K[a, 1, 1, b] += dot
+                K[a, 2, 2, b] += dot
 
-    It adds internal forces [N] and, if asked, the stiffness blocks on and above the diagonal [N/m], and returns the energy [J]:
-    kernel(x, tets, gradients, volumes, mu, lam, limit, tangent, slots, forces, blocks), arrays as in `Stencil`. `limit` is not used.
-    """
-    row = padded(count)
-    add_blocks = block_adder(count)
 
-    @njit(inline="always")
-    def stiffness(e, w, mu, pull, local, lam, F, R, H, mean, Dinv, Z, K):  # type: ignore[no-untyped-def]
-        """Write the stiffness of an element, K[a, i, j, b]."""
-        volume = 0.0
-        for q in range(quad):
-            volume += w[e, q]
-            turning_compliance(F, R, q, Dinv)
-            s = w[e, q] * (2.0 * mu - pull[q])
-            d00, d01, d02, d11, d12, d22 = s * Dinv[0], s * Dinv[1], s * Dinv[2], s * Dinv[3], s * Dinv[4], s * Dinv[5]
-            for a in range(count):  # Z = (2μ − λθ) w [h]ₓ D⁻¹
-                x, y, z = H[q, 0, a], H[q, 1, a], H[q, 2, a]
-                Z[a, 0, 3 * q], Z[a, 0, 3 * q + 1], Z[a, 0, 3 * q + 2] = y * d02 - z * d01, y * d12 - z * d11, y * d22 - z * d12
-                Z[a, 1, 3 * q], Z[a, 1, 3 * q + 1], Z[a, 1, 3 * q + 2] = z * d00 - x * d02, z * d01 - x * d12, z * d02 - x * d22
-                Z[a, 2, 3 * q], Z[a, 2, 3 * q + 1], Z[a, 2, 3 * q + 2] = x * d01 - y * d00, x * d11 - y * d01, x * d12 - y * d02
+@njit(inline="always")
+def _kernel(count, quad, row, x, tets, gradients, volumes, mu, lam, limit, tangent, slots, forces, blocks):  # type: ignore[no-untyped-def]
+    F, R, X, f = np.empty((9, quad)), np.empty((9, quad)), np.empty((3, count)), np.empty((3, count))
+    H, mean = np.zeros((quad, 3, row)), np.zeros((3, row))
+    pull, Dinv, Z, K = np.empty(quad), np.empty(6), np.empty((count, 3, 3 * quad)), np.empty((count, 3, 3, row))
+    energy = 0.0
+    for e in range(len(tets)):
         for a in range(count):
             for i in range(3):
-                side = (lam - local) / volume * mean[i, a]
-                for b in range(a & -LANES, row):
-                    s0, s1, s2 = side * mean[0, b], side * mean[1, b], side * mean[2, b]
-                    for q in range(quad):
-                        z0, z1, z2 = Z[a, i, 3 * q], Z[a, i, 3 * q + 1], Z[a, i, 3 * q + 2]
-                        z = local * w[e, q] * H[q, i, a]
-                        s0 += z1 * H[q, 2, b] - z2 * H[q, 1, b] + z * H[q, 0, b]
-                        s1 += z2 * H[q, 0, b] - z0 * H[q, 2, b] + z * H[q, 1, b]
-                        s2 += z0 * H[q, 1, b] - z1 * H[q, 0, b] + z * H[q, 2, b]
-                    K[a, i, 0, b], K[a, i, 1, b], K[a, i, 2, b] = s0, s1, s2
+                X[i, a] = x[tets[e, a], i]
+                f[i, a] = mean[i, a] = 0.0
+        theta = volume = 0.0
+        local = min(lam[e], LOCAL * mu[e])
         for q in range(quad):
-            s = 2.0 * mu * w[e, q]
-            for a in range(count):
-                x, y, z = s * H[q, 0, a], s * H[q, 1, a], s * H[q, 2, a]
-                for b in range(a & -LANES, row):
-                    dot = x * H[q, 0, b] + y * H[q, 1, b] + z * H[q, 2, b]
-                    K[a, 0, 0, b] += dot
-                    K[a, 1, 1, b] += dot
-                    K[a, 2, 2, b] += dot
-
-    @njit(cache=True, fastmath=FAST)
-    def kernel(x, tets, gradients, volumes, mu, lam, limit, tangent, slots, forces, blocks):  # type: ignore[no-untyped-def]
-        F, R, X, f = np.empty((9, quad)), np.empty((9, quad)), np.empty((3, count)), np.empty((3, count))
-        H, mean = np.zeros((quad, 3, row)), np.zeros((3, row))
-        pull, Dinv, Z, K = np.empty(quad), np.empty(6), np.empty((count, 3, 3 * quad)), np.empty((count, 3, 3, row))
-        energy = 0.0
-        for e in range(len(tets)):
-            for a in range(count):
-                for i in range(3):
-                    X[i, a] = x[tets[e, a], i]
-                    f[i, a] = mean[i, a] = 0.0
-            theta = volume = 0.0
-            local = min(lam[e], LOCAL * mu[e])
-            for q in range(quad):
-                for i in range(3):
-                    for j in range(3):
-                        s = 0.0
-                        for a in range(count):
-                            s += X[i, a] * gradients[e, q, j, a]
-                        F[3 * i + j, q] = s
-                closest_rotation(F, R, q)
-                trace = -3.0
-                for k in range(9):
-                    trace += F[k, q] * R[k, q]
-                pull[q] = local * trace
-                energy += 0.5 * volumes[e, q] * local * trace * trace
-                theta += volumes[e, q] * trace
-                volume += volumes[e, q]
-            theta /= volume
-            energy += 0.5 * (lam[e] - local) * volume * theta * theta
-            for q in range(quad):
-                pull[q] += (lam[e] - local) * theta
-                w = volumes[e, q]
-                norm = 0.0
-                for i in range(3):
-                    r0, r1, r2 = R[3 * i, q], R[3 * i + 1, q], R[3 * i + 2, q]
-                    u0, u1, u2 = F[3 * i, q] - r0, F[3 * i + 1, q] - r1, F[3 * i + 2, q] - r2
-                    norm += u0 * u0 + u1 * u1 + u2 * u2
-                    m2, p = 2.0 * w * mu[e], w * pull[q]
-                    p0, p1, p2 = m2 * u0 + p * r0, m2 * u1 + p * r1, m2 * u2 + p * r2
+            for i in range(3):
+                for j in range(3):
+                    s = 0.0
                     for a in range(count):
-                        g0, g1, g2 = gradients[e, q, 0, a], gradients[e, q, 1, a], gradients[e, q, 2, a]
-                        f[i, a] += p0 * g0 + p1 * g1 + p2 * g2
-                        h = r0 * g0 + r1 * g1 + r2 * g2
-                        H[q, i, a] = h
-                        mean[i, a] += w * h
-                energy += w * mu[e] * norm
-            for a in range(count):
-                for i in range(3):
-                    forces[tets[e, a], i] += f[i, a]
-            if tangent:
-                stiffness(e, volumes, mu[e], pull, local, lam[e], F, R, H, mean, Dinv, Z, K)
-                add_blocks(K, slots, e, blocks)
-        return energy
-
-    return kernel
-
-
-def block_adder(count: int) -> Any:
-    """Return the function that adds the blocks a ≤ b of K[a, i, j, b] where they belong."""
-
-    @njit(inline="always")
-    def add_blocks(K, slots, e, blocks):  # type: ignore[no-untyped-def]
-        pair = 0
+                        s += X[i, a] * gradients[e, q, j, a]
+                    F[3 * i + j, q] = s
+            closest_rotation(F, R, q)
+            trace = -3.0
+            for k in range(9):
+                trace += F[k, q] * R[k, q]
+            pull[q] = local * trace
+            energy += 0.5 * volumes[e, q] * local * trace * trace
+            theta += volumes[e, q] * trace
+            volume += volumes[e, q]
+        theta /= volume
+        energy += 0.5 * (lam[e] - local) * volume * theta * theta
+        for q in range(quad):
+            pull[q] += (lam[e] - local) * theta
+            w = volumes[e, q]
+            norm = 0.0
+            for i in range(3):
+                r0, r1, r2 = R[3 * i, q], R[3 * i + 1, q], R[3 * i + 2, q]
+                u0, u1, u2 = F[3 * i, q] - r0, F[3 * i + 1, q] - r1, F[3 * i + 2, q] - r2
+                norm += u0 * u0 + u1 * u1 + u2 * u2
+                m2, p = 2.0 * w * mu[e], w * pull[q]
+                p0, p1, p2 = m2 * u0 + p * r0, m2 * u1 + p * r1, m2 * u2 + p * r2
+                for a in range(count):
+                    g0, g1, g2 = gradients[e, q, 0, a], gradients[e, q, 1, a], gradients[e, q, 2, a]
+                    f[i, a] += p0 * g0 + p1 * g1 + p2 * g2
+                    h = r0 * g0 + r1 * g1 + r2 * g2
+                    H[q, i, a] = h
+                    mean[i, a] += w * h
+            energy += w * mu[e] * norm
         for a in range(count):
-            for b in range(a, count):
-                slot = slots[e, pair]
-                pair += 1
-                for i in range(3):
-                    for j in range(3):
-                        blocks[slot, 3 * i + j] += K[a, i, j, b]
+            for i in range(3):
+                forces[tets[e, a], i] += f[i, a]
+        if tangent:
+            _stiffness(count, quad, row, e, volumes, mu[e], pull, local, lam[e], F, R, H, mean, Dinv, Z, K)
+            add_blocks(count, K, slots, e, blocks)
+    return energy
 
-    return add_blocks
+
+@njit(cache=True, fastmath=FAST)
+def corotational_tet4(x, tets, gradients, volumes, mu, lam, limit, tangent, slots, forces, blocks):  # type: ignore[no-untyped-def]
+    """Add internal forces [N] and, if asked, the stiffness blocks on and above the diagonal [N/m]; return the energy [J].
+
+    Arrays are those of `Stencil`; `limit` is not used. The same for ten nodes is `corotational_tet10`.
+    """
+    return _kernel(4, 1, 4, x, tets, gradients, volumes, mu, lam, limit, tangent, slots, forces, blocks)
+
+
+@njit(cache=True, fastmath=FAST)
+def corotational_tet10(x, tets, gradients, volumes, mu, lam, limit, tangent, slots, forces, blocks):  # type: ignore[no-untyped-def]
+    """See `corotational_tet4`."""
+    return _kernel(10, 4, 16, x, tets, gradients, volumes, mu, lam, limit, tangent, slots, forces, blocks)
