@@ -90,12 +90,17 @@ def demo(
 @app.command()
 def inspect(
     path: Annotated[str, typer.Argument(metavar="PATH", help="A file, a folder, or the name of a robot.", show_default=False)],
+    accuracy: Annotated[bool, typer.Option("--accuracy", help="Of a robot: what its mesh costs in motion and in force.")] = False,
     json: Json = False,
 ) -> Answer:
     """Say what a file or folder is and what is wrong with it."""
-    from femsense.inspection import describe, inspect_path
+    from femsense.inspection import describe, inspect_accuracy, inspect_path
 
-    report = inspect_path(path)
+    if accuracy:
+        with _progress("accuracy") as progress:
+            report = inspect_accuracy(path, progress=progress)
+    else:
+        report = inspect_path(path)
     return Answer(report, describe(report), exit_status=2 if report["problems"] else 0)
 
 

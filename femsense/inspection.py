@@ -73,9 +73,29 @@ def inspect_path(path: str | Path) -> Report:
     return checked
 
 
+def inspect_accuracy(path: str | Path, *, progress: Callable[..., None] | None = None) -> Report:
+    """Return a report of a robot with what its mesh costs, under `accuracy` (see `assess_accuracy`); without where it has problems.
+
+    Raises:
+        InputError: where the path is no robot. DataError: where its model has no equilibrium.
+    """
+    from femsense.accuracy import assess_accuracy
+
+    report = inspect_path(path)
+    if report["kind"] != "robot":
+        raise InputError("--accuracy is about robots", where=path, found=TITLES.get(report["kind"], report["kind"]), expected="a folder with robot.toml, or the name of a robot")  # fmt: skip
+    if not report["problems"]:
+        report["accuracy"] = plain(assess_accuracy(robot.load_robot(_existing(path)), progress=progress))
+    return report
+
+
 def describe(report: Mapping[str, Any]) -> str:
     """Return a report of `inspect_path` as aligned plain text."""
     lines = [f"{report['path']}: {TITLES.get(report['kind'], report['kind'])}", ""]
+    if "accuracy" in report:
+        from femsense.accuracy import accuracy_text
+
+        return "\n".join([*lines, accuracy_text(report["accuracy"])])
     lines += _section({key: value for key, value in report.items() if key not in ("path", "kind", "problems", "warnings")}, 2)
     for title in ("problems", "warnings"):
         texts = report.get(title, [])

@@ -24,6 +24,7 @@ LAYERS = (
     ("march", "patch", "meshing"),
     ("calib", "xr", "rig"),
     ("sensing", "loop", "importers", "learn", "stream"),
+    ("accuracy",),
     ("results", "inspection", "report", "doctor", "summary", "truth", "picture"),
     ("steps", "demo"),
     ("cli",),
