@@ -22,8 +22,7 @@ from femsense.arrays import FloatArray
 from femsense.effects.shape import body_on_mesh, finer_mesh
 from femsense.errors import DataError
 from femsense.fem.body import BodyModel
-from femsense.fem.cables import pull_rows
-from femsense.fem.compliance import tangent_at
+from femsense.fem.compliance import drive_rows, tangent_at
 from femsense.fem.equilibrium import Equilibrium, solve_equilibrium
 from femsense.fem.mesh import Embedding, TetMesh, embed_points, triangle_normals
 from femsense.model import Robot
@@ -42,7 +41,9 @@ FORCE_POINTS = 6
 PART_OF_LARGEST = 0.5
 """Inputs act with this part of their largest value."""
 USUAL_MOTION = 0.1
-"""A cable without a limit is pulled until the body moves by about this share of its diagonal."""
+"""No input moves the body by more than about this share of its diagonal."""
+MOST_PILOT_UNKNOWNS = 40_000
+"""Inputs are sized on quadratic elements if these have no more unknowns; linear ones move too little."""
 PATCH = 0.06
 """Radius of the patch that carries a contact force, over the diagonal; one and a half edges of the surface at least."""
 GOOD_MOTION, GOOD_FORCE = 0.03, 0.05
@@ -116,7 +117,7 @@ def assess_accuracy(robot: Robot, *, progress: Progress | None = None) -> dict[s
     tell("the declared mesh")
     places = _observed(robot)
     coarse = "tet10" if robot.body.mesh.is_quadratic else "tet4"
-    loads, solved = _feasible_loads(robot.body)
+    loads, solved = _feasible(robot.body)
     chosen = [space for space in SPACES if space == (coarse, 0) or _affordable(robot.body, space, len(loads))]
     meshes = {space: finer_mesh(robot.body.mesh, space[0], space[1]) for space in chosen}
     finest = max(meshes.values(), key=lambda mesh: len(mesh.nodes))
@@ -129,7 +130,7 @@ def assess_accuracy(robot: Robot, *, progress: Progress | None = None) -> dict[s
         if answer is not None and states is not None:
             answers.append(answer)
             solved = states
-    return _report(robot, coarse, loads, answers, len(SPACES) - len(chosen))
+    return _report(robot, coarse, loads, answers, len(SPACES) - len(answers))
 
 
 def _on(body: BodyModel, mesh: TetMesh) -> BodyModel:
@@ -155,35 +156,56 @@ def _observed(robot: Robot) -> FloatArray:
 # Loads
 
 
-def _feasible_loads(body: BodyModel) -> tuple[list[Load], _Solved]:
-    """Return the loads under which the declared model converges, each small enough, and its states."""
+def _rest(body: BodyModel) -> Equilibrium:
+    """Return the state under the weight alone. Raises DataError where there is none."""
     rest = solve_equilibrium(body)
     if not rest.converged:
         raise DataError(f"the declared model has no equilibrium under its own weight: {rest.status}: {rest.advice}")
-    loads, states = ([Load("gravity", "own weight", 1.0, "")] if body.gravity.any() else []), [rest]
-    for load in _inputs(body, rest):
-        for share in (1.0, 0.5, 0.25, 0.125):
-            smaller = replace(load, size=share * load.size)
-            state = solve_equilibrium(body, **_drive(smaller), start=rest)
-            if state.converged:
-                loads.append(smaller)
-                states.append(state)
-                break
-    return loads, _Solved(body.mesh, tuple(states))
+    return rest
 
 
-def _inputs(body: BodyModel, rest: Equilibrium) -> list[Load]:
+def _feasible(body: BodyModel) -> tuple[list[Load], _Solved]:
+    """Return loads under which the declared model converges, and its states. Raises DataError where there are none."""
+    loads, start = _loads(body), _Solved(body.mesh, (_rest(body),))
+    for _ in range(4):
+        states = _states(body, loads, start)
+        if states is not None:
+            return loads, _Solved(body.mesh, states)
+        loads = [load if load.kind == "gravity" else replace(load, size=0.5 * load.size) for load in loads]
+    raise DataError("the declared model does not converge under its cables and chambers, even by an eighth of their usual inputs")
+
+
+def _loads(body: BodyModel) -> list[Load]:
+    """Return the weight and the inputs, each a part of its largest value but no larger than moves the body a good deal.
+
+    How far an input moves the body is taken from the stiffness at rest of quadratic elements.
+    """
+    chosen = _inputs(body)
+    weight = [Load("gravity", "own weight", 1.0, "")] if body.gravity.any() else []
+    if not chosen:
+        return weight
+    quadratic = finer_mesh(body.mesh, "tet10", 0)
+    pilot = _on(body, quadratic) if 3 * len(quadratic.nodes) <= MOST_PILOT_UNKNOWNS else body
+    rest = _rest(pilot)
+    pulls = drive_rows(pilot, rest.positions)[[_row(pilot, load) for load in chosen]]
+    moves = np.linalg.norm(tangent_at(pilot, rest).respond(pulls.reshape(len(chosen), -1, 3)), axis=2).max(axis=1)
+    diagonal = float(np.linalg.norm(np.ptp(body.mesh.nodes, axis=0)))
+    limits = [float(f"{USUAL_MOTION * diagonal / max(move, 1e-300):.2g}") for move in moves]
+    loads = [replace(load, size=min(load.size, limit)) for load, limit in zip(chosen, limits)]
+    return weight + loads
+
+
+def _row(body: BodyModel, load: Load) -> int:
+    """Return the number of an input: cables first, then chambers."""
+    if load.kind == "cable":
+        return body.cable_names.index(load.name)
+    return len(body.cables) + body.chamber_names.index(load.name)
+
+
+def _inputs(body: BodyModel) -> list[Load]:
     cables = [Load("cable", cable.name, PART_OF_LARGEST * cable.max_tension, "N") for cable in body.cables]
     chambers = [Load("chamber", chamber.name, PART_OF_LARGEST * chamber.max_pressure, "Pa") for chamber in body.chambers]
-    chosen = [(cables + chambers)[i] for i in _spread(len(cables) + len(chambers), MOST_INPUTS)]
-    unlimited = [i for i, load in enumerate(chosen) if not np.isfinite(load.size)]
-    if unlimited:
-        pulls = pull_rows(body, rest.positions)[[body.cable_names.index(chosen[i].name) for i in unlimited]]
-        moves = np.abs(tangent_at(body, rest).respond(pulls.reshape(len(unlimited), -1, 3))).max(axis=(1, 2))
-        diagonal = float(np.linalg.norm(np.ptp(body.mesh.nodes, axis=0)))
-        for i, move in zip(unlimited, moves):
-            chosen[i] = replace(chosen[i], size=float(f"{USUAL_MOTION * diagonal / max(move, 1e-12):.2g}"))
-    return chosen
+    return [(cables + chambers)[i] for i in _spread(len(cables) + len(chambers), MOST_INPUTS)]
 
 
 def _spread(count: int, most: int) -> list[int]:
@@ -252,22 +274,19 @@ def _answer(
 
 
 def _states(body: BodyModel, loads: Sequence[Load], before: _Solved) -> tuple[Equilibrium, ...] | None:
-    if body.mesh is before.mesh:
-        return before.states
-    ties = embed_points(before.mesh, body.mesh.nodes)
-    inputs = [load for load in loads if load.kind != "gravity"]
-    states = []
-    for drive, known in zip([{}, *map(_drive, inputs)], before.states):
-        state = solve_equilibrium(body, **drive, start=_carried(known, ties, body))
-        if not state.converged:
-            state = solve_equilibrium(body, **drive)
-        if not state.converged:
+    ties = None if body.mesh is before.mesh else embed_points(before.mesh, body.mesh.nodes)
+    drives = [{}, *(_drive(load) for load in loads if load.kind != "gravity")]
+    states: list[Equilibrium] = []
+    for i, drive in enumerate(drives):
+        known = before.states[i] if i < len(before.states) else states[0]
+        start = known if ties is None or i >= len(before.states) else _carried(known, ties)
+        states.append(solve_equilibrium(body, **drive, start=start))
+        if not states[-1].converged:
             return None
-        states.append(state)
     return tuple(states)
 
 
-def _carried(known: Equilibrium, ties: Embedding, body: BodyModel) -> Equilibrium:
+def _carried(known: Equilibrium, ties: Embedding) -> Equilibrium:
     """Return a state of one space as a start in another one."""
     positions = ties.positions(known.positions)
     return replace(known, positions=positions, nodal_forces=np.zeros_like(positions), factor=None)
