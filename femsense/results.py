@@ -23,6 +23,7 @@ import numpy.typing as npt
 import femsense
 from femsense.arrays import FloatArray, freeze
 from femsense.calib.calibration import Calibration
+from femsense.effects.own import find_own_file
 from femsense.errors import InputError
 from femsense.files import PART_PREFIX, file_hash, json_text, plain, write_beside, write_csv, write_json
 from femsense.pose import check_pose
@@ -149,6 +150,9 @@ def robot_input(robot: Robot) -> dict[str, Any]:
     mesh = robot.body.mesh
     digest = hashlib.sha256(json_text(robot.document).encode())
     digest.update(np.ascontiguousarray(mesh.nodes).tobytes() + np.ascontiguousarray(mesh.tets).tobytes())
+    for entry in (robot.document or {}).get("effects", []):
+        if "file" in entry:
+            digest.update(file_hash(find_own_file(entry, robot)).encode())
     return {"name": robot.name, "path": None if robot.folder is None else str(robot.folder), "sha256": digest.hexdigest()}
 
 
