@@ -21,9 +21,12 @@ import scipy.sparse as sp
 from femsense.arrays import FloatArray
 from femsense.fem.assembly import internal, reduced_matrix, reduced_values
 from femsense.fem.body import BodyModel, make_body
+from femsense.fem.equilibrium import solve_equilibrium
 from femsense.fem.linear import factorize
 from femsense.fem.mesh import EDGES, TetMesh, oriented, refined, surface_triangles, to_quadratic
 from femsense.fem.stencil import QUADRATURE
+from femsense.rig.script import TruthTable
+from femsense.rig.truth import true_robot
 from femsense.robot import load_robot
 
 POISSON = (0.30, 0.45, 0.49, 0.499)
@@ -245,15 +248,32 @@ def timing(body: BodyModel, label: str) -> None:
     print(f"| {label} | {len(right)} | " + " | ".join(median_ms(run) for run in runs) + " |", flush=True)
 
 
+def large_displacements() -> None:
+    """Print the sag of four-leg and how far 2 N of one cable move its tip, on its mesh and on one refined once."""
+    table = "| four-leg | tetrahedra | sag, mm | tip under 2 N, mm |\n|---|---|---|---|"
+    print(f"\n{table}")
+    robot = load_robot("four-leg")
+    for refinements in (0, 1):
+        for element in ("tet4", "tet10"):
+            truth = TruthTable.model_validate({"refinements": refinements, "element": element, "law": "corotational"})
+            body = true_robot(robot, truth, []).body
+            top = int(np.argmax(body.mesh.nodes[:, 2]))
+            rest = solve_equilibrium(body)
+            pulled = solve_equilibrium(body, tension={"north": 2.0}, start=rest)
+            sag = body.mesh.nodes[top, 2] - rest.positions[top, 2]
+            moved = np.linalg.norm(pulled.positions[top] - rest.positions[top])
+            print(f"| {element} | {len(body.mesh.tets)} | {1e3 * sag:.2f} | {1e3 * moved:.2f} |", flush=True)
+
+
 def main() -> None:
-    """Print errors on block and diamond, then times."""
+    """Print errors on block and diamond, large displacements, then times."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("diamond", nargs="?", type=Path, default=SHARED)
     parser.add_argument("--fine", type=int, default=1)
-    parser.add_argument("--only", choices=("errors", "times"))
+    parser.add_argument("--only", choices=("errors", "large", "times"))
     arguments = parser.parse_args()
     folder: Path = arguments.diamond
-    if arguments.only != "times":
+    if arguments.only in (None, "errors"):
         worst = max(agreement(case) for quadratic in (False, True) for case in block_cases(0.5, quadratic, 0.49))
         print(f"the package's elements against the ones written here, at rest: {worst:.1e}")
         table(
@@ -267,7 +287,9 @@ def main() -> None:
                 lambda k, q, nu: [diamond_case(folder, 0, q, nu)],
                 lambda k, q, nu: [diamond_case(folder, k + arguments.fine - 1, q, nu)],
             )
-    if arguments.only != "errors":
+    if arguments.only in (None, "large"):
+        large_displacements()
+    if arguments.only in (None, "times"):
         print(
             "\n| ms, wall / process | free unknowns | force | force and tangent | into the matrix | factor | one solve |\n|---|---|---|---|---|---|---|"
         )

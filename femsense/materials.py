@@ -22,9 +22,9 @@ PSI = 6894.757
 POISSON_RATIO = 0.49
 """Of a named silicone where the robot declares none: as incompressible as the elements like it (real ones are above 0.499)."""
 
-TENSILE = "Maréchal et al. 2021 (doi 10.1089/soro.2019.0115), tensile data of the Soft Robotics Materials Database, 450 mm/min"
-SMOOTH_ON = "Smooth-On technical bulletin as quoted with its values in public design notes (7 days at 23 °C)"
-WACKER = "Wacker data sheet as quoted in a public design note (24 h at 23 °C)"
+TENSILE = "tensile test at 450 mm/min, Soft Robotics Materials Database (Maréchal et al., Soft Robotics 2021)"
+SMOOTH_ON = "Smooth-On technical bulletin of the series (7 days at 23 °C), as quoted in public design notes"
+WACKER = "Wacker data sheet (24 h at 23 °C), as quoted in a public design note"
 GENT = "Shore A by Gent 1958"
 
 
@@ -106,8 +106,8 @@ SILICONES = (
         "44–54 A",
         None,
         (
-            Modulus(1.32e6, "fitted, 10:1, cured at 25 °C", "Johnston et al. 2014 (doi 10.1088/0960-1317/24/3/035017)"),
-            Modulus(2.97e6, "fitted, 10:1, cured at 200 °C", "Johnston et al. 2014 (doi 10.1088/0960-1317/24/3/035017)"),
+            Modulus(1.32e6, "fitted, 10:1, cured at 25 °C", "Johnston et al., J. Micromech. Microeng. 2014"),
+            Modulus(2.97e6, "fitted, 10:1, cured at 200 °C", "Johnston et al., J. Micromech. Microeng. 2014"),
         ),
         "Johnston et al. 2014, by temperature of cure",
     ),
