@@ -122,3 +122,21 @@ def projector(scene, robot, starts):
 
 STARTS = {control: {} for control in SCENES}
 NUISANCE = {control: projector(scene, robot, STARTS[control]) for control, (robot, scene) in SCENES.items()}
+
+
+@pytest.mark.parametrize("name", ["geometry", "depth_scale"])
+def test_measured_seats_know_of_size_and_depth(name):
+    robot, scene = SCENES["tension"]
+    rest = transform_points(invert_pose(T_ROBOT_CAMERA), robot.marker_points)
+    count = len(rest)
+    scene = replace(scene, rest_marker=np.arange(count), rest_view=np.zeros(count, dtype=int), rest_points=rest)
+    effect = find_effect(name)
+    parameters = effect.parameters(robot, "tension")
+    hypothesis = Hypothesis(robot, ((effect, {}, parameters),))
+    here = jet(hypothesis, scene, np.zeros(len(parameters)), {}, derivative=True)
+    assert here.rest_by_effect.shape == (count, 3, len(parameters))
+    for j in range(len(parameters)):
+        step = 1e-5 * np.eye(len(parameters))[j]
+        ahead, behind = (jet(hypothesis, scene, sign * step, {}).rest for sign in (1.0, -1.0))
+        np.testing.assert_allclose(here.rest_by_effect[:, :, j], (ahead - behind) / 2e-5, atol=1e-6)
+        assert np.abs(here.rest_by_effect[:, :, j]).max() > 0.01

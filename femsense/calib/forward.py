@@ -167,6 +167,8 @@ class SceneJet:
     """d residual / d pose step (rotation about the pivot, shift), shape (k, 3, 6 v)."""
     rest_by_pose: FloatArray
     """shape (r, 3, 6 v)."""
+    rest_by_effect: FloatArray
+    """d seat residual / d coordinate of the hypothesis, shape (r, 3, p)."""
     by_initial: FloatArray
     """d residual / d initial input, shape (k, 3, a or 0)."""
     by_effect: FloatArray
@@ -214,7 +216,9 @@ def evaluate_scene(
     by_pose, rest_by_pose = (
         _pose_derivative(robot, scene, poses, states, residual, pivot) if derivative else (np.zeros((len(residual), 3, 0)),) * 2
     )
-    return SceneJet(residual, rest_residual(robot, scene, poses), by_pose, rest_by_pose, _stack(columns[split:], residual), _stack(columns[:split], residual), states)  # fmt: skip
+    rest = rest_residual(robot, scene, poses)
+    rest_columns = [(rest_residual(v.robot, scene, poses) - rest) / h for v, h in zip(variants[:split], steps)]
+    return SceneJet(residual, rest, by_pose, rest_by_pose, _stack(rest_columns, rest), _stack(columns[split:], residual), _stack(columns[:split], residual), states)  # fmt: skip
 
 
 def _as_predicted(robot: Robot, scene: Scene, poses: Sequence[FloatArray], model: Mapping[int, FloatArray]) -> Scene:
