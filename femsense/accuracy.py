@@ -309,7 +309,7 @@ def _report(robot: Robot, coarse: str, loads: Sequence[Load], answers: Sequence[
         "forces": _force_table(own, robot),
         "spaces": spaces,
     }
-    report["advice"] = _advice(report, best, left_out)
+    report["advice"] = _advice(report, best)
     return report
 
 
@@ -417,20 +417,25 @@ def _force_table(error: _Errors, robot: Robot) -> dict[str, Any]:
     }
 
 
-def _advice(report: Mapping[str, Any], best: Mapping[str, Any] | None, left_out: int) -> str:
+def _advice(report: Mapping[str, Any], best: Mapping[str, Any] | None) -> str:
     declared = next(space for space in report["spaces"] if space["declared"])
     if declared["motion_percent"] is None:
         return "the declared space is the finest that is affordable here: nothing to compare it with; a coarser mesh of the same body would show its error"  # fmt: skip
     if declared["good_enough"]:
         return "the declared mesh is fine enough"
-    if best is None:
-        return "no space that was tried is fine enough: refine the mesh where it is thin (femsense mesh --size), then ask again"
-    change = f'element = "{best["element"]}"' if best["element"] != declared["element"] else ""
-    if best["refinements"]:
-        change = " and ".join(
-            filter(None, [change, f"a mesh of about {best['tetrahedra']} tetrahedra (femsense mesh --max-tets)"])
-        )
-    return f"{change}: {best['unknowns']} unknowns instead of {declared['unknowns']}, {best['step_ms']:.0f} ms a Newton step instead of {declared['step_ms']:.0f} ms"  # fmt: skip
+    if best is not None:
+        return f"better: {_change(best, declared)}"
+    finest = max(
+        report["spaces"], key=lambda space: (space["motion_percent"] is None, space["element"] == "tet10", space["unknowns"])
+    )
+    return f"no space that was tried is known to be fine enough; the nearest is {_change(finest, declared)}"
+
+
+def _change(space: Mapping[str, Any], declared: Mapping[str, Any]) -> str:
+    changes = [f'element = "{space["element"]}"'] if space["element"] != declared["element"] else []
+    if space["refinements"]:
+        changes.append(f"a mesh of about {space['tetrahedra']} tetrahedra (femsense mesh --max-tets)")
+    return f"{' and '.join(changes)}: {space['unknowns']} unknowns instead of {declared['unknowns']}, {space['step_ms']:.0f} ms a Newton step instead of {declared['step_ms']:.0f} ms"  # fmt: skip
 
 
 def accuracy_text(report: Mapping[str, Any]) -> str:

@@ -38,15 +38,15 @@ class Portrait:
     eye_m: Sequence[float]
     target_m: Sequence[float]
     pulls: Sequence[Mapping[str, float]]
-    """Cable → tension [N], a panel each; the empty one shows the robot under its own weight."""
+    """Cable → tension [N], or chamber → pressure [Pa], a panel each; the empty one shows the robot under its own weight."""
     fx: float = 1500.0
     size_px: tuple[int, int] = (760, 640)
 
 
 def build(folder: Path, mesh: Callable[[], TetMesh], document: Callable[[], dict[str, Any]], portrait: Portrait) -> None:
-    """Write the mesh and robot.toml of a robot, and with --picture its picture NAME.png."""
+    """Write the mesh and robot.toml of a robot, and with --picture its picture."""
     parser = argparse.ArgumentParser(description=f"Build the robot {folder.name}.")
-    parser.add_argument("--picture", action="store_true", help=f"render {folder.name}.png too")
+    parser.add_argument("--picture", action="store_true", help="render its picture too")
     wanted = parser.parse_args()
     made, tables = mesh(), document()
     check_mesh(made, folder.name)
@@ -73,12 +73,16 @@ def draw(folder: Path, portrait: Portrait, *, name: str | None = None) -> None:
     width, height = portrait.size_px
     figure, axes = plt.subplots(1, count, figsize=(4.2 * count, 4.2 * height / width + 0.4), dpi=110, squeeze=False)
     for axis, pulls in zip(axes[0], portrait.pulls):
-        state = solve_equilibrium(robot.body, tension=pulls)
+        blown = {name: value for name, value in pulls.items() if name in robot.body.chamber_names}
+        pulled = {name: value for name, value in pulls.items() if name not in blown}
+        state = solve_equilibrium(robot.body, tension=pulled, pressure=blown)
         _panel(axis, robot, np.asarray(state.positions), portrait)
-        named = ", ".join(f"{cable} {force:g} N" for cable, force in pulls.items()) or "own weight only"
+        texts = [f"{name} {force:g} N" for name, force in pulled.items()]
+        texts += [f"{name} {pressure / 1e3:g} kPa" for name, pressure in blown.items()]
+        named = ", ".join(texts) or "own weight only"
         axis.set_title(named, fontsize=11, pad=8)
     figure.tight_layout()
-    figure.savefig(folder / f"{name or folder.name}.png", metadata={"Software": None})
+    figure.savefig(folder / f"{(name or folder.name).replace('-', '_')}.png", metadata={"Software": None})
     plt.close(figure)
 
 

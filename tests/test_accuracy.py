@@ -69,7 +69,7 @@ def test_linear_elements_are_far_worse_and_a_finer_mesh_is_better(reports: Any) 
         assert unknowns == sorted(unknowns) and all(s["step_ms"] > 0 for s in report["spaces"])
     worst = [abs(report["forces"]["worst_percent"]) for _, report in reports.values()]
     assert worst[0] > 3 * worst[1] and min(reports["tet4"][1]["forces"]["error_percent"]) > 0  # too stiff: forces too large
-    assert 'element = "tet10"' in reports["tet4"][1]["advice"] or "no space" in reports["tet4"][1]["advice"]
+    assert 'element = "tet10"' in reports["tet4"][1]["advice"] and "a mesh of about 144" in reports["tet10"][1]["advice"]
 
 
 def test_a_model_that_moves_half_as_far_senses_twice_the_force() -> None:
@@ -109,6 +109,7 @@ def test_what_is_too_large_is_left_out_and_said(tmp_path: Path, monkeypatch: pyt
     assert [s["motion_percent"] is None for s in report["spaces"]] == [False, True, False] and not np.isfinite(
         report["loads"][0]["doubt_mm"]
     )
+    assert report["advice"].startswith('no space that was tried is known to be fine enough; the nearest is element = "tet10": ')
     monkeypatch.setattr(accuracy, "MOST_UNKNOWNS", 1)
     alone = assess_accuracy(robot)
     assert "nothing to compare it with" in alone["advice"] and alone["loads"][0]["error_mm"] is None
@@ -127,7 +128,7 @@ def test_the_advice_takes_the_cheapest_that_serves(reports: Any, monkeypatch: py
         monkeypatch.setattr(accuracy, "GOOD_MOTION", 1.001 * limit)
         monkeypatch.setattr(accuracy, "GOOD_FORCE", 1.001 * limit)
         best = accuracy._best(spaces)
-        assert text in accuracy._advice(report | {"spaces": spaces}, best, 0)
+        assert text in accuracy._advice(report | {"spaces": spaces}, best)
 
 
 def test_inputs_move_the_body_neither_too_far_nor_beyond_their_limit(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from femsense.model import Robot
 from femsense.robot import load_robot, robot_names
 
 ROBOTS = sorted(name for name in robot_names() if name != "four-leg")
-LENGTH = {"arm": 0.180, "finger": 0.092}
+LENGTH = {"arm": 0.180, "finger": 0.092, "gripper": 0.092, "pneu-finger": 0.0745}
 """From the clamp to the far end [m]."""
 
 
@@ -70,12 +70,15 @@ def test_its_weight_bends_it_a_little(robot: Robot, rest: Equilibrium) -> None:
     assert 1e-3 < largest_move(rest.positions, robot.body.mesh.nodes) / LENGTH[robot.name] < 0.12
 
 
-def test_each_cable_moves_it_from_a_cold_start(robot: Robot, rest: Equilibrium) -> None:
-    for cable in robot.body.cables:
-        pulled = solve_equilibrium(robot.body, tension={cable.name: cable.max_tension})
-        assert pulled.converged, cable.name
-        assert 0.1 < largest_move(pulled.positions, rest.positions) / LENGTH[robot.name] < 0.45
-        assert pulled.shortening[cable.name] > 0
+def test_each_cable_and_chamber_moves_it_from_a_cold_start(robot: Robot, rest: Equilibrium) -> None:
+    inputs = [("tension", cable.name, cable.max_tension) for cable in robot.body.cables]
+    inputs += [("pressure", chamber.name, chamber.max_pressure) for chamber in robot.body.chambers]
+    assert inputs
+    for kind, name, largest in inputs:
+        moved = solve_equilibrium(robot.body, **{kind: {name: largest}})
+        assert moved.converged, name
+        assert 0.1 < largest_move(moved.positions, rest.positions) / LENGTH[robot.name] < 0.42
+        assert kind == "pressure" or moved.shortening[name] > 0
 
 
 def largest_move(after: np.ndarray, before: np.ndarray) -> float:
@@ -114,7 +117,7 @@ def test_a_name_serves_as_a_robot_in_the_chain(tmp_path: Path, capfd: pytest.Cap
     script = tmp_path / "script.toml"
     script.write_text(
         'format = "femsense-script-1"\nseed = 1\n[truth]\nrefinements = 0\nsubsteps = 1\n[markers]\nstd_m = 1e-4\n'
-        '[camera]\neye_m = [0.05, -0.25, 0.25]\ntarget_m = [0.05, 0.0, 0.01]\n[[sweeps]]\nlabel = "up"\ncables = { flexor = 0.8 }\nrest = 1\nup = 2\ndown = 1\n',
+        '[camera]\neye_m = [0.05, -0.25, 0.25]\ntarget_m = [0.05, 0.0, 0.01]\n[[sweeps]]\nlabel = "up"\ncables = { flexor = 0.8 }\nrest = 1\nup = 1\ndown = 0\n',
         encoding="utf-8",
     )
     recording, calibration, run = (str(tmp_path / name) for name in ("recording", "calibration.json", "run"))
