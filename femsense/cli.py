@@ -197,6 +197,7 @@ def improve(
     validation: Annotated[list[Path] | None, typer.Option("--validation", metavar="RECORDING …", help="What they are tested on.", show_default=False)] = None,
     effects: Annotated[list[str] | None, typer.Option("--effects", metavar="NAME,…", help="Try these effects only.", show_default=False)] = None,
     without: Annotated[list[str] | None, typer.Option("--without", metavar="NAME,…", help="Do not try these effects.", show_default=False)] = None,
+    user_effect: Annotated[list[Path] | None, typer.Option("--user-effect", metavar="FILE", help="Try an effect of your own (docs/effects/own.md).", show_default=False)] = None,
     again: Annotated[bool, typer.Option("--again", help="Compute even where OUT holds this result already.")] = False,
     json: Json = False,
 ) -> Answer:  # fmt: skip
@@ -207,6 +208,7 @@ def improve(
     with _progress("improve") as progress:
         document = improve_into(
             output, robot, recordings, validation=validation or [], effects=_names(effects), without=_names(without),
+            user_effects=user_effect or [],
             again=again, say=_say, progress=progress,
         )  # fmt: skip
     return Answer({"folder": str(output), **document}, f"{loop_text(document)}\n\nwritten: {output}")

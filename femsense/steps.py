@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from femsense import results
 from femsense.errors import InputError
+from femsense.files import file_hash
 from femsense.recording import load_recording
 from femsense.robot import load_robot
 
@@ -72,6 +73,7 @@ def improve_into(
     validation: Sequence[str | Path] = (),
     effects: Sequence[str] | None = None,
     without: Sequence[str] | None = None,
+    user_effects: Sequence[str | Path] = (),
     again: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
@@ -83,6 +85,7 @@ def improve_into(
         recordings: what effects are found on; validation: what they are tested on.
         say: told in one line what happens beside the loop.
         effects, without: names of effects to try, or not to try.
+        user_effects: Python files of effects that are tried too.
         again: compute even where the result is there.
         progress: as of `improve`.
 
@@ -97,11 +100,12 @@ def improve_into(
     results.check_loop_folder(folder)
     body = load_robot(robot)
     train, test = [load_recording(path) for path in recordings], [load_recording(path) for path in validation]
-    inputs = results.loop_inputs(body, train, test, effects=effects, without=without)
+    own = {str(file): file_hash(Path(file)) for file in user_effects if Path(file).is_file()}
+    inputs = results.loop_inputs(body, train, test, effects=effects, without=without, user_effects=own)
     if not again and results.finished(folder, inputs):
         say(f"{folder} holds this result already (--again computes it anew)")
         return results.read_loop(folder)
-    loop = improve(body, train, validation=test, effects=effects, without=without, progress=progress)
+    loop = improve(body, train, validation=test, effects=effects, without=without, user_effects=user_effects, progress=progress)
     results.write_loop(loop, folder, inputs=inputs)
     return results.read_loop(folder)
 

@@ -337,6 +337,11 @@ def test_unknown_effects_are_refused_with_a_hint(run: Any, robot: Path, recordin
     assert said.status == 2 and "unknown effect" in said.err and not (tmp_path / "out").exists()
 
 
+def test_an_effect_of_ones_own_that_is_not_there_is_said(run: Any, robot: Path, recording: Path, tmp_path: Path) -> None:
+    said = run("improve", robot, recording, "-o", tmp_path / "out", "--user-effect", tmp_path / "magnet.py")
+    assert said.status == 2 and "magnet.py: no such file" in said.err and not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize(("names", "parsed"), [(None, None), (["a,b"], ["a", "b"]), (["a", " b ,"], ["a", "b"]), ([""], None)])
 def test_names(names: list[str] | None, parsed: list[str] | None) -> None:
     assert cli._names(names) == parsed

@@ -7,14 +7,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from femsense.arrays import FloatArray, IntArray, freeze
 from femsense.effects import apply_effects
+from femsense.effects.shape import body_on_mesh
 from femsense.errors import DataError, InputError
-from femsense.fem.body import BodyModel, Cable, make_body, tie_cable
+from femsense.fem.body import BodyModel
 from femsense.fem.cables import bend_angles
-from femsense.fem.chambers import find_chamber
 from femsense.fem.equilibrium import Equilibrium, solve_equilibrium
 from femsense.fem.mesh import TetMesh, embed_points, refined, surface_triangles, to_linear, to_quadratic, triangle_normals
 from femsense.model import Robot
@@ -106,7 +105,7 @@ def true_robot(robot: Robot, table: TruthTable, effects: Sequence[Mapping[str, A
         InputError: where an effect does not fit.
     """
     mesh = true_mesh(robot.body.mesh, table)
-    body = _on_mesh(robot.body, mesh)
+    body = robot.body if mesh is robot.body.mesh else body_on_mesh(robot.body, mesh)
     limit = np.inf if table.stretch_limit is None else table.stretch_limit
     body = body.with_material(replace(body.material, law=table.law, stretch_limit=limit))
     moved = replace(robot, body=body, markers=embed_points(mesh, robot.marker_points), features=np.zeros(0, np.int64))
@@ -128,43 +127,6 @@ def true_mesh(mesh: TetMesh, table: TruthTable) -> TetMesh:
     for _ in range(table.refinements):
         fine = refined(fine)
     return to_quadratic(fine) if table.element == "tet10" else fine
-
-
-def _on_mesh(body: BodyModel, mesh: TetMesh) -> BodyModel:
-    """Return the body on another mesh of the same shape: what moved with clamped nodes only is clamped."""
-    if mesh is body.mesh:
-        return body
-    ties = embed_points(body.mesh, mesh.nodes)
-    is_clamped = np.zeros(len(body.mesh.nodes), dtype=bool)
-    is_clamped[body.clamped] = True
-    held = np.abs(np.where(is_clamped[ties.nodes], 0.0, ties.weights)).max(axis=1) < 1e-6
-    parent = embed_points(body.mesh, mesh.nodes[mesh.tets[:, :4]].mean(axis=1)).element
-    springs = cKDTree(mesh.nodes).query(body.mesh.nodes[body.clamp_nodes])[1] if len(body.clamp_nodes) else np.zeros(0, np.int64)
-    made = make_body(
-        mesh,
-        young_modulus=body.material.young_modulus[parent],
-        poisson_ratio=body.material.poisson_ratio[parent],
-        density=body.material.density,
-        clamped=np.flatnonzero(held),
-        clamp_nodes=springs,
-        cables=tuple(_on_mesh_cable(cable, body.mesh, mesh) for cable in body.cables),
-        chambers=tuple(find_chamber(mesh, c.name, c.seed, max_pressure=c.max_pressure) for c in body.chambers),
-        gravity=body.gravity,
-    )
-    if np.isfinite(body.clamp_stiffness):
-        made = made.with_clamp_stiffness(body.clamp_stiffness)
-    loaded = np.flatnonzero(body.dead_forces.any(axis=1))
-    if len(loaded):
-        made = made.with_dead_forces(
-            embed_points(mesh, body.mesh.nodes[loaded]).spread(body.dead_forces[loaded], len(mesh.nodes))
-        )
-    return made
-
-
-def _on_mesh_cable(cable: Cable, old: TetMesh, new: TetMesh) -> Cable:
-    path = cable.path.positions(old.nodes)
-    tied = tie_cable(new, cable.name, path, cable.pull_point, exit_direction=cable.exit_direction)
-    return replace(cable, path=tied.path)
 
 
 def contact_patch(mesh: TetMesh, point: Sequence[float], radius: float) -> Patch:
