@@ -6,14 +6,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from arm import arm
+from arm import arm, record, sweeps
 from helpers import write_block_robot
 
 from femsense.calib.forward import redo_depth, undo_depth
 from femsense.effects import apply_effects, build_entry, load_own_effect
 from femsense.errors import InputError
+from femsense.loop import improve
 from femsense.robot import load_robot, save_robot
 
+MAGNET = Path(__file__).resolve().parents[1] / "examples" / "magnet.py"
 OUTSIDE = "ignore:.*outside the mesh.*:UserWarning"
 DRAUGHT = '''
 """A draught from the side."""
@@ -161,3 +163,17 @@ def test_entries_are_checked(tmp_path):
     ]:
         with pytest.raises(InputError, match=text):
             apply_effects(robot, [entry])
+
+
+def test_an_effect_of_ones_own_competes_and_the_better_robot_can_be_written(tmp_path):
+    inputs, labels = sweeps(each=1)
+    hidden = {"name": "magnet", "file": str(MAGNET), "center_m": [0.1, 0.0, 0.0], "force_n": [0.0, 0.16, 0.1]}
+    recording, _ = record(inputs[:9], effects=[hidden], labels=labels[:9], truth=arm((3, 1, 1)))
+    loop = improve(arm((3, 1, 1)), [recording], effects=["magnet", "cable_friction"], user_effects=[MAGNET])
+    tried = next(row for row in loop.candidates if row["name"] == "magnet")
+    assert tried["dchi2"] > 100.0 and tried["seed"]["file"] == str(MAGNET)
+    save_robot(arm((3, 1, 1)), tmp_path, effects=[hidden])
+    assert (tmp_path / "magnet.py").is_file()
+    np.testing.assert_allclose(load_robot(tmp_path).body.dead_forces.sum(axis=0), hidden["force_n"], atol=1e-9)
+    with pytest.raises(InputError, match="unknown effect"):
+        improve(arm((2, 1, 1)), [recording], effects=["magnet"])

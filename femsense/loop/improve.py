@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ import numpy as np
 from femsense.arrays import FloatArray, IntArray
 from femsense.calib.calibrate import calibrate, input_bounds, usable_frames
 from femsense.calib.forward import Hypothesis, Scene, evaluate_scene, make_scene
-from femsense.effects import EFFECTS, Effect, Entry, Parameter, apply_effects, find_effect
+from femsense.effects import EFFECTS, FORMS, Effect, Entry, Parameter, apply_effects, find_effect, load_own_effect
 from femsense.effects.loads import STANDARD_GRAVITY
 from femsense.errors import DataError, FemsenseError, InputError
 from femsense.loop.joint import JointFit, JointProblem, Prior, Trial, fit_jointly, rms_of
@@ -58,6 +59,8 @@ class Data:
     seat_std: float
     input_scale: FloatArray
     """Typical range of each cable's input [N] or [m], shape (a,)."""
+    forms: tuple[Effect, ...] = FORMS
+    """What may be tried, a user's effects among it."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -76,6 +79,7 @@ def improve(
     validation: Sequence[Recording] = (),
     effects: Sequence[str] | None = None,
     without: Sequence[str] | None = None,
+    user_effects: Sequence[str | Path] = (),
     progress: Progress | None = None,
     seed: int = 0,
 ) -> LoopResult:
@@ -87,6 +91,7 @@ def improve(
         validation: data to judge on; by default whole sweeps of the recordings are held out.
         effects: names to try; by default all.
         without: names to leave out.
+        user_effects: Python files of effects that are tried too (docs/effects/own.md); they belong to "all".
         progress: told what is going on.
         seed: of the permutation test and the bootstrap.
 
@@ -94,10 +99,11 @@ def improve(
         InputError: unknown names, no recording; DataError: the data do not allow a fit.
     """
     say = progress or (lambda text: None)
-    names = _names(effects, without)
+    own = tuple(load_own_effect(file) for file in user_effects)
+    names = _names(effects, without, own)
     rng = np.random.default_rng(seed)
     say("reading and calibrating")
-    data = prepare(robot, recordings, validation)
+    data = replace(prepare(robot, recordings, validation), forms=(*FORMS, *own))
     noise = Noise({"white": 5e-4}, "start")
     before = _stage(data, Hypothesis(robot), Prior(np.zeros(0), np.zeros(0)), noise, np.zeros(0))
     hypothesis, prior = _with_nuisance(data)
@@ -129,10 +135,12 @@ def improve(
     return replace(result, next_experiment="; ".join(t for t in (only, result.next_experiment) if t))
 
 
-def _names(effects: Sequence[str] | None, without: Sequence[str] | None) -> list[str]:
+def _names(effects: Sequence[str] | None, without: Sequence[str] | None, own: Sequence[Effect]) -> list[str]:
+    mine = [effect.name for effect in own]
     for name in [*(effects or []), *(without or [])]:
-        find_effect(name)
-    chosen = [e.name for e in EFFECTS] if effects is None else list(effects)
+        if name not in mine:
+            find_effect(name)
+    chosen = [*(e.name for e in EFFECTS), *mine] if effects is None else list(effects)
     return [name for name in chosen if name not in (without or [])]
 
 
@@ -306,7 +314,9 @@ def _pose_on_first_frames(
 def _fields(data: Data, stage: Stage, names: Sequence[str]) -> Fields:
     """Return what each effect that is not in the model yet would do to the markers."""
     seated = any(len(t.scene.rest_marker) for t in data.train)
-    todo = candidates_for(stage.fit, data.control, names=[n for n in names if n not in NUISANCE], has_seats=seated)
+    todo = candidates_for(
+        stage.fit, data.control, forms=data.forms, names=[n for n in names if n not in NUISANCE], has_seats=seated
+    )
     return effect_fields(stage.fit, data.train, todo)
 
 

@@ -169,7 +169,7 @@ class JointProblem:
         J[:k, at + poses : at + trial.size] = whiten(factor, jet.by_initial)
         J[:k, self.own :] = whiten(factor, jet.by_effect)
         J[k : k + s, at : at + poses] = jet.rest_by_pose.reshape(s, poses) / self.seat_std
-        J[k : k + s, self.own :] = jet.rest_by_effect.reshape(s, -1) / self.seat_std
+        J[k : k + s, self.own :] = jet.rest_by_effect.reshape(s, jet.rest_by_effect.shape[2]) / self.seat_std
         J[k + s :, at : at + poses] = np.diag(trust)
         return r, J
 

@@ -15,7 +15,7 @@ from scipy.optimize import lsq_linear
 
 from femsense.arrays import FloatArray
 from femsense.calib.forward import Hypothesis
-from femsense.effects import EFFECTS, Effect, Entry, Parameter
+from femsense.effects import Effect, Entry, Parameter
 from femsense.errors import FemsenseError
 from femsense.loop.joint import JointFit, JointProblem, Prior, Trial
 from femsense.loop.noise import whiten
@@ -50,14 +50,19 @@ class Candidate:
 
 
 def candidates_for(
-    base: JointFit, control: str, *, names: Sequence[str], has_seats: bool
+    base: JointFit, control: str, *, forms: Sequence[Effect], names: Sequence[str], has_seats: bool
 ) -> list[tuple[Effect, Entry, tuple[Parameter, ...]]]:
     """Return the effects and seeds to try on top of a fitted model."""
     present = {effect.name for effect, _, _ in base.hypothesis.terms}
     robot = base.hypothesis.robot_at(base.coordinates)
     result = []
-    for effect in EFFECTS:
-        if effect.name not in names or effect.name in present or (effect.name == "marker_offset" and has_seats):
+    for effect in forms:
+        if (
+            effect.discrete
+            or effect.name not in names
+            or effect.name in present
+            or (effect.name == "marker_offset" and has_seats)
+        ):
             continue
         for seed in effect.seeds(robot):
             parameters = effect.parameters(robot, control)
