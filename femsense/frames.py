@@ -432,10 +432,15 @@ def _warn_of_inputs(robot: Robot, recording: Recording) -> None:
         highest = recording.pressures[:, j].max(initial=-np.inf)
         if highest > chamber.max_pressure * (1 + 1e-9):
             warnings.warn(f"{_place(recording, 'frames.csv')}: chamber {chamber.name!r} reaches {highest:.4g} Pa, more than its max_pressure_pa of {chamber.max_pressure:.4g} Pa", stacklevel=3)  # fmt: skip
-    if recording.actuation != "tension" or recording.actuation_zero != "absolute":
+    if recording.actuation != "tension":
         return
     for j, cable in enumerate(robot.body.cables):
         tension = recording.inputs[:, j]
+        if recording.actuation_zero != "absolute":
+            span = max(float(tension.max(initial=0.0)), 0.0) - min(float(tension.min(initial=0.0)), 0.0)
+            if span > (cable.max_tension - cable.min_tension) * (1 + 1e-9):
+                warnings.warn(f"{_place(recording, 'frames.csv')}: the tensions of cable {cable.name!r} span {span:.4g} N, more than from its min_tension_n to its max_tension_n", stacklevel=3)  # fmt: skip
+            continue
         if tension.max(initial=-np.inf) > cable.max_tension * (1 + 1e-9):
             warnings.warn(f"{_place(recording, 'frames.csv')}: cable {cable.name!r} reaches {tension.max():.4g} N, more than its max_tension_n of {cable.max_tension:.4g} N", stacklevel=3)  # fmt: skip
         if tension.min(initial=np.inf) < 0:

@@ -158,15 +158,20 @@ def _rigid_again(robot: Robot, scene: Scene, jet: SceneJet) -> list[FloatArray]:
 
 
 def input_bounds(robot: Robot, recording: Recording) -> tuple[FloatArray, FloatArray]:
-    """Return bounds of the initial inputs, so that no frame leaves the limits of its cable."""
+    """Return bounds of the initial inputs, so that no frame leaves the limits of its cable: initial + recorded stays within them.
+
+    A cable whose recorded tensions alone span more than its limits (`check_against` warns of it) keeps max_tension_n as its bound.
+    """
     cables = robot.body.cables
     if recording.actuation == "displacement":
         reach = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
         return np.full(len(cables), -reach), np.full(len(cables), reach)
     order = [recording.cable_names.index(c.name) for c in cables]
-    lowest = recording.inputs[:, order].min(axis=0) if recording.inputs.size else np.zeros(len(cables))
-    low = np.array([max(c.min_tension, 0.0) for c in cables]) - np.minimum(lowest, 0.0)
-    return np.maximum(low, 0.0), np.maximum(np.array([c.max_tension for c in cables]), low + 1e-9)
+    recorded = recording.inputs[:, order] if recording.inputs.size else np.zeros((1, len(cables)))
+    low = np.array([max(c.min_tension, 0.0) for c in cables]) - np.minimum(recorded.min(axis=0), 0.0)
+    limit = np.array([c.max_tension for c in cables])
+    high = limit - np.maximum(recorded.max(axis=0), 0.0)
+    return low, np.maximum(np.where(high > low, high, limit), low + 1e-9)
 
 
 def fit_joint(

@@ -10,9 +10,11 @@ import scipy.sparse as sp
 
 from femsense.arrays import BoolArray, FloatArray, IntArray, as_indices, as_points, freeze
 from femsense.errors import InputError
-from femsense.fem.mesh import Embedding, TetMesh, element_volumes, embed_points
+from femsense.fem.mesh import Embedding, TetMesh, body_parts, element_volumes, embed_points
 from femsense.fem.stencil import FreeMap, Stencil, make_free_map, make_stencil
 
+FLAT = 1e-12
+"""Tetrahedra smaller than this times the median one are flat but for rounding."""
 LAWS = ("corotational", "neo_hookean", "gent")
 
 
@@ -123,6 +125,8 @@ class BodyModel:
         """Longest side of the box around the body at rest [m]."""
         return float(np.ptp(self.mesh.nodes, axis=0).max())
 
+    parts: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    """The connected part that each node belongs to, shape (n,); a robot has one (see `mesh.check_mesh`)."""
     chambers: tuple[Chamber, ...] = ()
     chamber_curvature: tuple[sp.csr_matrix, ...] = ()
     """Second derivatives of the volume of each chamber (see `chambers.curvature_map`), each (nb, n)."""
@@ -144,20 +148,20 @@ class BodyModel:
         return self.weight() + self.dead_forces
 
     def is_held(self) -> bool:
-        """Return whether clamp or springs stop every rigid motion: three of their nodes are not on a line."""
-        nodes = self.mesh.nodes[self.clamped if np.isinf(self.clamp_stiffness) else self.clamp_nodes]  # a plate holds all of them
-        if len(nodes) < 3:
-            return False
-        spread = np.linalg.svd(nodes - nodes.mean(axis=0), compute_uv=False)
-        return bool(spread[1] > 1e-9 * spread[0])
+        """Return whether clamp or springs stop every rigid motion of every part: three of its nodes there are not on a line."""
+        held = self.clamped if np.isinf(self.clamp_stiffness) else self.clamp_nodes  # a plate holds all of them
+        return all(_spread_out(self.mesh.nodes[held[self.parts[held] == part]]) for part in range(int(self.parts.max()) + 1))
 
     def with_gravity(self, vector: npt.ArrayLike) -> BodyModel:
         """Return the body under another gravity [m/s²], shape (3,)."""
-        return replace(self, gravity=freeze(vector))
+        return replace(self, gravity=_finite_vector(vector, "gravity"))
 
     def with_dead_forces(self, forces: npt.ArrayLike) -> BodyModel:
-        """Return the body with other dead forces beside its weight [N], shape (n, 3)."""
-        return replace(self, dead_forces=freeze(forces))
+        """Return the body with other dead forces beside its weight [N], shape (n, 3). Raises InputError."""
+        wanted = as_points(forces, "dead_forces")
+        if wanted.shape != self.mesh.nodes.shape:
+            raise InputError("wrong shape", where="dead_forces", found=wanted.shape, expected=self.mesh.nodes.shape)
+        return replace(self, dead_forces=freeze(wanted))
 
     def with_material(self, material: Material) -> BodyModel:
         """Return the body made of another material."""
@@ -258,7 +262,10 @@ def make_body(
         else np.zeros(0, np.int64)
     )
     springs = indices if clamp_nodes is None else as_indices(clamp_nodes, n, "clamp_nodes")
-    if (element_volumes(mesh) <= 0).any():
+    if not (np.isfinite(density) and density >= 0):
+        raise InputError("out of range", where="density", found=density, expected="≥ 0 kg/m³")
+    volumes = element_volumes(mesh)
+    if (volumes <= FLAT * np.median(np.abs(volumes))).any():
         raise InputError(
             "inverted or flat tetrahedra", where="mesh", expected="positive volumes", hint="see femsense.fem.mesh.check_mesh"
         )
@@ -269,8 +276,23 @@ def make_body(
     curvature = tuple(curvature_map(c, s, len(stencil.block_columns), n) for c, s in zip(chambers, slots[len(cables) :]))
     material = Material(freeze(E), freeze(nu), float(density), law)
     return BodyModel(mesh, material, freeze(np.unique(indices), np.int64), np.inf, freeze(springs, np.int64), cables,
-                     freeze(gravity), freeze(np.zeros((n, 3))), stencil, cable_slots, make_free_map(stencil, mesh, indices),
-                     chambers=chambers, chamber_curvature=curvature)  # fmt: skip
+                     _finite_vector(gravity, "gravity"), freeze(np.zeros((n, 3))), stencil, cable_slots, make_free_map(stencil, mesh, indices),
+                     parts=freeze(body_parts(mesh), np.int64), chambers=chambers, chamber_curvature=curvature)  # fmt: skip
+
+
+def _spread_out(points: FloatArray) -> bool:
+    """Return whether three of the points (k, 3) are not on a line."""
+    if len(points) < 3:
+        return False
+    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return bool(spread[1] > 1e-9 * spread[0])
+
+
+def _finite_vector(vector: npt.ArrayLike, where: str) -> FloatArray:
+    values = as_points(vector, where)
+    if values.shape != (1, 3):
+        raise InputError("wrong shape", where=where, found=np.shape(vector), expected="(3,)")
+    return freeze(values[0])
 
 
 def tie_cable(
@@ -285,6 +307,8 @@ def tie_cable(
     friction: float = 0.0,
 ) -> Cable:
     """Tie a cable to the body: each point of its path [m], shape (p, 3), far end first, goes with an element (see `embed_points`)."""
+    if not (np.isfinite(friction) and friction >= 0):
+        raise InputError("out of range", where=f"friction of cable {name}", found=friction, expected="≥ 0")
     embedding = embed_points(mesh, as_points(path, f"path of cable {name}"), outside_rule="nearest_centre")
     direction = None
     if exit_direction is not None:

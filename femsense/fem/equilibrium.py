@@ -22,18 +22,27 @@ from femsense.fem.body import BodyModel, Cable
 from femsense.fem.cables import add_cable_stiffness, bend_angles, cable_forces, cable_length, rub, segments, shortening
 from femsense.fem.chambers import add_pressure_stiffness, chamber_volume, volume_changes, volume_gradient
 from femsense.fem.clamp import with_turning_plate
-from femsense.fem.linear import Factorization, factorize_definite
+from femsense.fem.linear import Factorization, factorize, factorize_definite
 
 CONVERGED = "converged"
+MOST_STEPS = 1500
+"""Newton steps in all, load steps included."""
+SMALLEST_PART = 2e-3
+"""Load steps smaller than this share of the load are given up."""
+CLOSED = 1e-12
+"""How far a held cable may miss its length [m]."""
+FALL_ITERATIONS = 30
+"""Inverse iterations towards the softest motion of a state that may be unstable."""
 FOLLOW_FRICTION = 25
 """Newton steps at most in which the tensions along the cables follow the bends; then they stand still until Newton rests."""
 ADVICE = {
     CONVERGED: "the unbalanced force is below its tolerance",
+    "unstable": "the forces balance, but the slightest disturbance makes the body buckle: (a) add a small force to the side to which it should go; (b) reduce the load",
     "singular": "nothing holds the body: clamp more nodes (three that are not on a line at least)",
     "stalled": "no step lowers the energy any further: (a) the load may be beyond buckling; (b) elements may be inverted; try smaller loads or a better mesh",
     "iterations": "Newton did not settle in its iterations: try smaller steps of the inputs, or start from a nearby equilibrium",
-    "cables": "the held cables could not agree on which of them are slack: try other displacements",
-    "overload": "load steps became too small: the body collapses or buckles under this load; reduce it",
+    "cables": "the held cables and chambers contradict each other, or could not agree on which cables are slack: try other displacements",
+    "overload": "load steps became too small: (a) the body collapses or buckles under this load; (b) a cable has drawn its point to the next one; reduce the load",
 }
 
 
@@ -52,10 +61,15 @@ class Equilibrium:
     volume: dict[str, float]
     """How much each chamber has grown since rest [m³]."""
     residual_n: float
-    """Largest unbalanced nodal force [N]."""
+    """Largest unbalanced nodal force under the whole load [N]."""
     status: str
     """"converged" or what happened (a key of ADVICE)."""
     iterations: int
+    reached: float
+    """Share of the load at which the positions stand [1]: 1, or where load steps had to stop."""
+    indefinite_steps: int
+    """Newton steps at which the stiffness was not positive definite: above 0 the body may have buckled or snapped through on the
+    way, and there may be other equilibria."""
     segment_tensions: tuple[FloatArray, ...]
     """Tension along each cable, far end first [N], one array (s,) a cable."""
     held: BoolArray
@@ -77,7 +91,7 @@ class Equilibrium:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Loads:
-    """What drives the body (cables, then chambers: a + c drives); `scaled` gives a part of it for load steps."""
+    """What drives the body (cables, then chambers: a + c drives)."""
 
     forces: FloatArray  # dead nodal forces [N], (n, 3)
     effort: FloatArray  # tensions [N] and pressures [Pa] that are given, (a + c,)
@@ -88,8 +102,12 @@ class _Loads:
     before: tuple[FloatArray, ...]  # tensions along the cables until now [N]
     tolerance: float  # of the residual [N]
 
-    def scaled(self, part: float) -> _Loads:
-        return replace(self, forces=part * self.forces, effort=part * self.effort, target=part * self.target)
+    def part_way(self, first: _Loads, part: float) -> _Loads:
+        """Return the loads on the straight way from the first ones (part 0) to these (part 1)."""
+        mixed = {
+            name: (1.0 - part) * getattr(first, name) + part * getattr(self, name) for name in ("forces", "effort", "target")
+        }
+        return replace(self, **mixed)
 
 
 @dataclass(eq=False, slots=True)
@@ -104,6 +122,9 @@ class _State:
     borrowed: bool = False  # the factor belongs to another state; it serves as long as the residual falls fast
     iterations: int = 0
     residual: float = np.inf
+    shifted: bool = False  # the stiffness was not positive definite where it was last factorised
+    shift: float = 0.0  # what made the stiffness positive definite there [N/m]
+    indefinite_steps: int = 0
 
 
 def solve_equilibrium(
@@ -144,15 +165,30 @@ def solve_equilibrium(
         InputError: unknown cable or chamber, one named twice, wrong shapes or values.
     """
     given = {"tension": tension, "shortening": shortening, "pressure": pressure, "volume": volume}
+    if not (max_iterations >= 1 and 0 < relative_tolerance < 1):
+        found = f"{max_iterations}, {relative_tolerance:g}"
+        raise InputError("out of range", where="max_iterations, relative_tolerance", found=found, expected="≥ 1, between 0 and 1")
     loads = _collect_loads(body, given, nodal_forces, start, before, bilateral, relative_tolerance)
     state = _initial_state(body, loads, start, reuse_factor)
-    status = _settle(body, loads, state, max_iterations)
-    if status != CONVERGED and not body.is_held():
+    shares = [s.copy() for s in state.shares]
+    status, reached = _settle(body, loads, state, max_iterations), 1.0
+    if status not in (CONVERGED, "singular") and start is not None and start.converged and body.is_held():
+        first = _loads_of(body, start, loads)
+        state, status, reached = _step_loads(body, first, loads, _initial_state(body, first, start, False), state, max_iterations)
+    if status not in (CONVERGED, "singular") and body.is_held():
+        nothing = replace(loads, forces=0.0 * loads.forces, effort=0.0 * loads.effort, target=0.0 * loads.target)
+        rest = _State(body.mesh.nodes.copy(), nothing.effort.copy(), _first_taut(body, loads), shares)
+        state, status, reached = _step_loads(body, nothing, loads, rest, state, max_iterations)
+    if status != CONVERGED or any(c.friction > 0 for c in body.cables):  # friction has moved since Newton looked
+        state.residual = _residual(body, loads, state)
+    if status != CONVERGED:
+        status = status if body.is_held() else "singular"
+    elif not body.is_held() and not _holds_itself(body, state):
         status = "singular"
-    if status not in (CONVERGED, "singular"):
-        state, status = _step_loads(body, loads, state.iterations, max_iterations)
+    elif state.shifted and _can_fall(body, loads, state):
+        status = "unstable"
     extra = np.zeros_like(body.mesh.nodes) if nodal_forces is None else np.asarray(nodal_forces, dtype=np.float64)
-    return _result(body, loads, state, status, extra)
+    return _result(body, state, status, reached, extra)
 
 
 def _collect_loads(
@@ -174,6 +210,9 @@ def _collect_loads(
         forces = forces + extra
     if before is None:
         before = start.segment_tensions if start is not None else tuple(np.zeros(len(c.path)) for c in body.cables)
+    if [len(b) for b in before] != [len(c.path) for c in body.cables] or not all(np.isfinite(b).all() for b in before):
+        raise InputError("not the tensions along these cables", where="before", found=[len(b) for b in before],
+                         expected=f"finite, segments {[len(c.path) for c in body.cables]}")  # fmt: skip
     areas = [np.linalg.norm(volume_gradient(c, body.mesh.nodes), axis=1).sum() for c in body.chambers]
     lever = np.concatenate([np.ones(len(T)), areas])
     effort, target = np.concatenate([T, p]), np.concatenate([d, grown])
@@ -209,23 +248,40 @@ def _drive_values(
             np.array([name in tables[travel] for name in names], dtype=bool))  # fmt: skip
 
 
+def _loads_of(body: BodyModel, start: Equilibrium, loads: _Loads) -> _Loads:
+    """Return the loads under which a start was in equilibrium, for drives that are held where these are."""
+    effort = np.array([*start.tension.values(), *start.pressure.values()])
+    travel = _travel(body, start.positions) + _stretch(body) * effort
+    free = ~loads.controlled
+    return replace(loads, forces=body.dead_load() + start.nodal_forces, effort=np.where(free, np.maximum(effort, 0.0) if not loads.bilateral else effort, 0.0),
+                   target=np.where(free, 0.0, travel))  # fmt: skip
+
+
+def _first_taut(body: BodyModel, loads: _Loads) -> BoolArray:
+    """Return which drives are held at first where nothing is known: cables that are paid out are slack at rest."""
+    cable = np.arange(len(loads.effort)) < len(body.cables)
+    return loads.controlled & (~cable | (loads.target >= 0.0) | loads.bilateral)
+
+
 def _initial_state(body: BodyModel, loads: _Loads, start: Equilibrium | None, reuse_factor: bool) -> _State:
     shares = [np.ones(len(c.path)) for c in body.cables]
     if start is None:
-        return _State(body.mesh.nodes.copy(), loads.effort.copy(), loads.controlled.copy(), shares)
+        return _State(body.mesh.nodes.copy(), loads.effort.copy(), _first_taut(body, loads), shares)
     if start.positions.shape != body.mesh.nodes.shape:
         raise InputError("belongs to another mesh", where="start", found=start.positions.shape, expected=body.mesh.nodes.shape)
+    if set(start.tension) != set(body.cable_names) or set(start.pressure) != set(body.chamber_names):
+        raise InputError("belongs to a body with other cables or chambers", where="start", found=[*start.tension, *start.pressure],
+                         expected=[*body.cable_names, *body.chamber_names])  # fmt: skip
     x = start.positions.copy()
     clamped = _clamped(body)
     x[clamped] = body.mesh.nodes[clamped]
-    last = [start.tension.get(name, 0.0) for name in body.cable_names] + [
-        start.pressure.get(name, 0.0) for name in body.chamber_names
-    ]
+    last = [start.tension[name] for name in body.cable_names] + [start.pressure[name] for name in body.chamber_names]
     T = np.where(loads.controlled, last, loads.effort)
     cable = np.arange(len(T)) < len(body.cables)
     taut = loads.controlled & (start.held | (T > 0) | ~cable)
-    if not start.held.any():
-        taut = loads.controlled.copy()
+    if loads.bilateral or not start.held.any():
+        taut = _first_taut(body, loads)
+    T[loads.controlled & ~taut] = 0.0
     for i, tensions in enumerate(start.segment_tensions):
         motor = start.tension[body.cable_names[i]]
         if motor > 0:
@@ -246,8 +302,11 @@ def _settle(body: BodyModel, loads: _Loads, state: _State, max_iterations: int) 
     seen: set[bytes] = set()
     for _ in range(60):
         status = _newton(body, loads, state, max_iterations)
-        if status != CONVERGED:
-            return status
+        if status == "cables" and _let_go(body, loads, state) and state.taut.tobytes() not in seen:
+            seen.add(state.taut.tobytes())
+            continue
+        if status != CONVERGED or state.iterations > MOST_STEPS:
+            return status if status != CONVERGED else "iterations"
         changed = _update_slack(body, loads, state)
         if changed:
             key = state.taut.tobytes()
@@ -259,6 +318,18 @@ def _settle(body: BodyModel, loads: _Loads, state: _State, max_iterations: int) 
             return CONVERGED
         state.borrowed = True  # the tensions move by little: the factor at hand serves
     return "iterations"
+
+
+def _let_go(body: BodyModel, loads: _Loads, state: _State) -> bool:
+    """Let go the held cable that is shortest against its command, where held cables contradict each other; False where none may go."""
+    cable = np.arange(len(state.T)) < len(body.cables)
+    candidates = np.flatnonzero(state.taut & cable)
+    if loads.bilateral or not len(candidates):
+        return False
+    over = (_travel(body, state.x) - loads.target)[candidates]
+    worst = candidates[np.argmax(over)]
+    state.taut[worst], state.T[state.taut | (np.arange(len(state.T)) == worst)] = False, 0.0
+    return True
 
 
 def _update_slack(body: BodyModel, loads: _Loads, state: _State) -> bool:
@@ -308,44 +379,125 @@ def _newton(body: BodyModel, loads: _Loads, state: _State, max_iterations: int) 
         rows = _rows(body, state)
         H = _kinematic_rows(body, state, rows)[held][:, free] if len(held) else np.zeros((0, len(free)))
         C = rows[held][:, free] if len(held) else H
-        pull = state.T @ rows if len(rows) else 0.0
-        force = (loads.forces.ravel() - here.forces.ravel() + pull)[free]
+        force = _unbalanced(loads, state, here, rows)[free]
         gap = loads.target[held] - _travel(body, state.x)[held] - stretch * state.T[held] if len(held) else np.zeros(0)
         state.residual = float(np.linalg.norm(force.reshape(-1, 3), axis=1).max(initial=0.0))
-        if state.residual <= loads.tolerance and (np.abs(gap) / loads.lever[held]).max(initial=0.0) <= 1e-12:
+        sound = bool(np.isfinite(state.residual) and np.isfinite(here.energy))
+        closed = bool((np.abs(gap) / loads.lever[held]).max(initial=0.0) <= CLOSED)
+        if sound and closed and state.residual <= loads.tolerance:
             return CONVERGED
-        if not np.isfinite(state.residual):
-            return "stalled"
-        if state.borrowed and state.residual > 0.5 * last:  # the borrowed factor does not serve: back, and a factor of its own
+        if state.borrowed and not (
+            sound and state.residual <= 0.5 * last
+        ):  # the borrowed factor does not serve: back, and its own
             state.x, state.T = saved
             state.factor, state.borrowed, last = None, False, np.inf
             here = internal(body, state.x)
             continue
+        if not sound:
+            return "stalled"
         if state.factor is None or (not state.borrowed and state.residual > max(loads.tolerance, 1e-2 * last)):
-            state.factor = _factor_here(body, here, state)
+            state.factor = _factor_here(body, here, state, H, C, stretch, loads.lever[held])
             if state.factor is None:
                 return "singular"
         last, saved = state.residual, (state.x, state.T)
         du, dT = _bordered_step(state.factor, force, gap, H, C, stretch, loads.lever[held])
+        if not closed and _contradicts(H @ du + stretch * dT, gap, loads.lever[held]):
+            return "cables"
+        if not (np.isfinite(du).all() and np.isfinite(dT).all()):
+            return "stalled"
         state.iterations += 1
         if state.borrowed:
             here = _full_step(body, state, held, du, dT)
             continue
         moved = _line_search(body, loads, state, held, here, du, dT, gap)
         if moved is None:
-            return CONVERGED if state.residual <= 1e3 * loads.tolerance else "stalled"
+            return CONVERGED if closed and state.residual <= 1e3 * loads.tolerance else "stalled"
         here = moved
     return "iterations"
 
 
-def _factor_here(body: BodyModel, here: Internal, state: _State) -> Factorization | None:
+def _unbalanced(loads: _Loads, state: _State, here: Internal, rows: FloatArray) -> FloatArray:
+    """Return the unbalanced force of every unknown [N], shape (3n,)."""
+    pull = state.T @ rows if len(rows) else 0.0
+    return np.asarray(loads.forces.ravel() - here.forces.ravel() + pull)
+
+
+def _residual(body: BodyModel, loads: _Loads, state: _State) -> float:
+    """Return the largest unbalanced nodal force [N]; inf where an element is turned inside out."""
+    here = internal(body, state.x, tangent=False)
+    force = _unbalanced(loads, state, here, _rows(body, state))[body.free_map.dofs]
+    size = float(np.linalg.norm(force.reshape(-1, 3), axis=1).max(initial=0.0))
+    return size if np.isfinite(here.energy) and np.isfinite(size) else np.inf
+
+
+def _factor_here(
+    body: BodyModel, here: Internal, state: _State, H: FloatArray, C: FloatArray, stretch: FloatArray, lever: FloatArray
+) -> Factorization | None:
+    """Factorise the stiffness, made positive definite where it is not: then steps lead downhill. Held cables and chambers hold too:
+    a stiffness that is indefinite only where they do not let the body go stays as it is."""
+    values = reduced_values(body, _stiffness_blocks(body, here, state))
+    plain, state.shift = factorize_definite(body.free_map.pattern, values, first=state.shift / 4.0)
+    whole = with_turning_plate(body, state.x, plain)
+    state.shifted = state.shift > 0.0 or whole is None or whole.negative > 0
+    if state.shifted and len(H):
+        exact = with_turning_plate(body, state.x, factorize(body.free_map.pattern, values))
+        state.shifted = exact is None or not _held_definite(exact, H, C, stretch, lever)
+        whole = whole if state.shifted else exact
+    state.indefinite_steps += state.shifted
+    # the plate only ever softens, so that the factor without it leads downhill
+    return plain if state.shifted and whole is not None and whole.negative > 0 else whole
+
+
+def _stiffness_blocks(body: BodyModel, here: Internal, state: _State) -> FloatArray:
     blocks = internal(body, state.x).blocks if here.blocks is None else here.blocks.copy()
     assert blocks is not None
-    add_cable_stiffness(body, state.x, tuple(np.maximum(T, 0.0) * s for T, s in zip(state.T, state.shares)), blocks)
-    add_pressure_stiffness(body, state.x, state.T[len(body.cables) :], blocks)
-    plain = factorize_definite(body.free_map.pattern, reduced_values(body, blocks))[0]
-    whole = with_turning_plate(body, state.x, plain)
-    return whole if whole is None or whole.negative == 0 else plain  # the plate only ever softens, so that plain leads downhill
+    a = len(body.cables)
+    add_cable_stiffness(body, state.x, tuple(T * s for T, s in zip(state.T[:a], state.shares)), blocks)
+    add_pressure_stiffness(body, state.x, state.T[a:], blocks)
+    return blocks
+
+
+def _held_definite(factor: Factorization, H: FloatArray, C: FloatArray, stretch: FloatArray, lever: FloatArray) -> bool:
+    """Return whether a stiffness is positive definite on all motions that held cables and chambers allow.
+
+    Inertia is additive (Haynsworth 1968): it is so where S = H K⁻¹ Cᵀ + 1/k has as many negative eigenvalues as K.
+    """
+    S = (H @ factor.solve(C.T) + np.diag(stretch)) / np.outer(lever, lever)
+    if not np.isfinite(S).all():
+        return False
+    return int((np.linalg.eigvalsh((S + S.T) / 2.0) < 0).sum()) == factor.negative
+
+
+def _holds_itself(body: BodyModel, state: _State) -> bool:
+    """Return whether a balanced body whose clamp does not hold it stands all the same (cables may hold it)."""
+    blocks = _stiffness_blocks(body, internal(body, state.x), state)
+    factor = with_turning_plate(body, state.x, factorize(body.free_map.pattern, reduced_values(body, blocks)))
+    return factor is not None and factor.negative == 0
+
+
+def _can_fall(body: BodyModel, loads: _Loads, state: _State) -> bool:
+    """Return whether a balanced state has a motion along which its energy falls: the softest one, by inverse iteration.
+
+    The curvature along it is a difference of forces, so that a false alarm needs more than a factor's perturbed pivot.
+    """
+    held = np.flatnonzero(state.taut)
+    rows, free = _rows(body, state), body.free_map.dofs
+    H, stretch, lever = rows[held][:, free], _stretch(body)[held], loads.lever[held]
+    if state.factor is None:
+        return False
+    motion = np.random.default_rng(0).standard_normal(len(free))
+    for _ in range(FALL_ITERATIONS):
+        motion, _ = _bordered_step(state.factor, motion, np.zeros(len(held)), H, H, stretch, lever)
+        motion /= np.abs(motion).max()
+    step = np.zeros(state.x.size)
+    step[free] = 1e-6 * np.ptp(body.mesh.nodes, axis=0).max() * motion
+    forces = []
+    for sign in (1.0, -1.0):
+        there = replace(state, x=state.x + sign * step.reshape(-1, 3))
+        forces.append(_unbalanced(loads, there, internal(body, there.x, tangent=False), _rows(body, there)))
+    curvature = float((forces[1] - forces[0]) @ step)
+    scale = float(np.abs((forces[1] - forces[0]) * step).sum())
+    return curvature < -1e-6 * scale
 
 
 def _rows(body: BodyModel, state: _State) -> FloatArray:
@@ -361,7 +513,7 @@ def _kinematic_rows(body: BodyModel, state: _State, rows: FloatArray) -> FloatAr
     n = len(body.mesh.nodes)
     result = rows.copy()
     for i, cable in enumerate(body.cables):
-        if cable.friction > 0:
+        if (state.shares[i] != 1.0).any():
             result[i] = cable_forces(cable, state.x, np.ones(len(cable.path)), n).ravel()
     return result
 
@@ -395,6 +547,11 @@ def _bordered_step(
     return free + compliance @ dT, np.asarray(dT, dtype=np.float64)
 
 
+def _contradicts(reached: FloatArray, gap: FloatArray, lever: FloatArray) -> bool:
+    """Return whether a step cannot close the gaps of what is held: their rows depend on each other."""
+    return bool((np.abs(reached - gap) / lever).max() > 1e-3 * (np.abs(gap) / lever).max() + CLOSED)
+
+
 def _full_step(body: BodyModel, state: _State, held: npt.NDArray[np.intp], du: FloatArray, dT: FloatArray) -> Internal:
     x = state.x.ravel().copy()
     x[body.free_map.dofs] += du
@@ -416,7 +573,7 @@ def _line_search(
     step.reshape(-1)[free] = du
     penalty = 2.0 * np.abs(T0[held] + dT) + 1e-3 / loads.lever[held]
     lost = np.zeros(len(T0))  # a held cable with friction is no pure constraint: what its bends take away is a given force
-    rubs = np.array([c.friction > 0 for c in body.cables] + [False] * len(body.chambers), dtype=bool)
+    rubs = np.array([(s != 1.0).any() for s in state.shares] + [False] * len(body.chambers), dtype=bool)
     lost[held] = np.where(rubs[held], T0[held] + dT, 0.0)
     base = _merit(body, loads, state, held, here, penalty, lost)
     slope = _slope(body, loads, state, held, here, step, lost) - float(penalty @ np.abs(gap))
@@ -481,46 +638,40 @@ def _slope(
     return float((gradient * step).sum() - pull @ step.ravel())
 
 
-def _step_loads(body: BodyModel, loads: _Loads, iterations: int, max_iterations: int) -> tuple[_State, str]:
-    """Apply the loads bit by bit from rest; the steps shrink where Newton fails and grow where it succeeds."""
-    state = _initial_state(body, loads, None, False)
-    good = state
+def _step_loads(
+    body: BodyModel, first: _Loads, loads: _Loads, good: _State, failed: _State, max_iterations: int
+) -> tuple[_State, str, float]:
+    """Go from the first loads to the wanted ones bit by bit; the steps shrink where Newton fails and grow where it succeeds.
+
+    Returns:
+        the last equilibrium on the way, its status, and which share of the way it is.
+    """
     done, step = 0.0, 0.25
-    spent = iterations
-    while done < 1.0:
+    spent, good.indefinite_steps = failed.iterations, failed.indefinite_steps
+    status = _settle(body, first, good, max_iterations)
+    while status == CONVERGED and done < 1.0:
         part = min(1.0, done + step)
-        state = _copied(good)
-        part_loads = loads.scaled(part)
-        state.T = np.where(loads.controlled, good.T, part_loads.effort)
-        status = _settle(body, part_loads, state, max_iterations)
+        there, state = loads.part_way(first, part), _copied(good)
+        state.T = np.where(loads.controlled, good.T, there.effort)
+        status = _settle(body, there, state, max_iterations)
         spent += state.iterations - good.iterations
         if status == CONVERGED:
             good, done, step = state, part, 1.5 * step
-            continue
-        step *= 0.4
-        if step < 2e-3 or spent > 600:
-            good.iterations = spent
-            good.residual = state.residual
-            return good, status if status == "singular" else "overload"
+        elif 0.4 * step >= SMALLEST_PART and spent < MOST_STEPS:
+            status, step = CONVERGED, 0.4 * step
+        else:
+            status = status if status in ("singular", "cables") else "overload"
     good.iterations = spent
-    return good, CONVERGED
+    return good, status, done
 
 
 def _copied(state: _State) -> _State:
-    """Return a copy that can be moved on without harm to the original."""
-    return _State(
-        state.x.copy(),
-        state.T.copy(),
-        state.taut.copy(),
-        [s.copy() for s in state.shares],
-        None,
-        False,
-        state.iterations,
-        state.residual,
-    )
+    """Return a copy that can be moved on without harm to the original, with a factor to come."""
+    shares = [s.copy() for s in state.shares]
+    return replace(state, x=state.x.copy(), T=state.T.copy(), taut=state.taut.copy(), shares=shares, factor=None, borrowed=False)
 
 
-def _result(body: BodyModel, loads: _Loads, state: _State, status: str, nodal_forces: FloatArray) -> Equilibrium:
+def _result(body: BodyModel, state: _State, status: str, reached: float, nodal_forces: FloatArray) -> Equilibrium:
     names, a = body.cable_names, len(body.cables)
     travel = _travel(body, state.x)
     return Equilibrium(
@@ -532,6 +683,8 @@ def _result(body: BodyModel, loads: _Loads, state: _State, status: str, nodal_fo
         residual_n=state.residual,
         status=status,
         iterations=state.iterations,
+        reached=reached,
+        indefinite_steps=state.indefinite_steps,
         segment_tensions=tuple(freeze(T * s) for T, s in zip(state.T, state.shares)),
         held=freeze(state.taut, bool),
         nodal_forces=freeze(nodal_forces),

@@ -93,8 +93,13 @@ def factorize(pattern: Pattern, values: FloatArray) -> Factorization | None:
     return (_cholesky(pattern, values) if _wanted() == "cholesky" else None) or _factorize_any(pattern, values)
 
 
-def factorize_definite(pattern: Pattern, values: FloatArray, *, tries: int = 30) -> tuple[Factorization | None, float]:
+def factorize_definite(
+    pattern: Pattern, values: FloatArray, *, first: float = 0.0, tries: int = 30
+) -> tuple[Factorization | None, float]:
     """Factorise matrix + shift·I with the smallest tried shift that makes it positive definite.
+
+    Arguments:
+        first: the shift to try first where one is needed [N/m], such as a quarter of that which served near by.
 
     Returns:
         the factorisation (None where nothing helped) and the shift [N/m], 0 where none was needed.
@@ -107,7 +112,7 @@ def factorize_definite(pattern: Pattern, values: FloatArray, *, tries: int = 30)
     size = np.abs(values[diagonal])
     if not np.isfinite(size).all() or size.max(initial=0.0) == 0.0:
         return None, 0.0
-    shift = 1e-6 * float(np.median(size))
+    shift = max(first, 1e-6 * float(np.median(size)))
     for _ in range(tries):
         shifted = values.copy()
         shifted[diagonal] += shift

@@ -202,10 +202,13 @@ def vertex_normals(positions: FloatArray, triangles: IntArray) -> FloatArray:
 
 
 def barycentric(mesh: TetMesh, elements: IntArray, points: FloatArray) -> FloatArray:
-    """Return barycentric coordinates of points in the given elements at rest, shape (p, 4)."""
+    """Return barycentric coordinates of points in the given elements at rest, shape (p, 4). Raises InputError where one is flat."""
     corners = mesh.nodes[mesh.tets[elements, :4]]
     edge = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
-    inner = np.linalg.solve(edge, (points - corners[:, 0])[..., None])[..., 0]
+    try:
+        inner = np.linalg.solve(edge, (points - corners[:, 0])[..., None])[..., 0]
+    except np.linalg.LinAlgError:
+        raise InputError("tetrahedra without volume", where="mesh", expected="positive volumes") from None
     return np.concatenate([1.0 - inner.sum(axis=1, keepdims=True), inner], axis=1)
 
 
