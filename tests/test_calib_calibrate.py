@@ -10,7 +10,7 @@ import pytest
 from analytic import bar_body, random_rotation
 from helpers import DATA, block_mesh
 
-from femsense.calib.calibrate import calibrate, usable_frames
+from femsense.calib.calibrate import calibrate, input_bounds, usable_frames
 from femsense.calib.forward import Hypothesis, evaluate_scene, make_scene
 from femsense.effects import apply_effects, find_effect
 from femsense.errors import DataError, InputError
@@ -19,7 +19,7 @@ from femsense.fem.mesh import embed_points
 from femsense.march import Walk, drive_of, solve_frame
 from femsense.model import Observation, Robot, plain_actuation
 from femsense.pose import invert_pose, make_pose, move_pose, transform_points
-from femsense.recording import Recording, RestMarkers, make_recording
+from femsense.recording import Recording, RestMarkers, check_against, make_recording
 from femsense.robot import load_robot
 
 NAMES = ("a", "b", "c", "d", "e", "f")
@@ -246,6 +246,20 @@ def test_an_input_stays_within_the_limits_of_its_cable() -> None:
     assert found.cable_tension_n["top"] == pytest.approx(1.0) and found.cable_tension_n["side"] >= 0.3
     found = calibrate(robot.with_body(body), seen_by_camera(robot, [[0.0, 0.0]], initial=np.array([0.8, 0.1])))
     assert found.cable_tension_n["side"] == pytest.approx(0.3) and found.cable_tension_n["top"] <= 1.0
+
+
+def test_no_frame_leaves_the_limits_of_its_cable() -> None:
+    """With a zero that is not known, initial + recorded stays below max_tension_n, not the initial input alone."""
+    robot = bar_robot()
+    body = robot.body.with_cables(tuple(replace(c, max_tension=2.0, min_tension=0.1) for c in robot.body.cables))
+    rec = seen_by_camera(robot, [[0.0, 0.0], [1.5, 0.2], [0.5, -0.1]])
+    low, high = input_bounds(robot.with_body(body), rec)
+    np.testing.assert_allclose(low, [0.1, 0.2])
+    np.testing.assert_allclose(high, [0.5, 1.8])
+    wide = replace(rec, inputs=2.0 * rec.inputs)
+    with pytest.warns(UserWarning, match="cable 'top' span 3 N, more than from its min_tension_n to its max_tension_n"):
+        check_against(robot.with_body(body), wide)
+    assert input_bounds(robot.with_body(body), wide)[1][0] == 2.0
 
 
 # Seats

@@ -137,7 +137,11 @@ def _alternate(
         jet = evaluate_scene(plain, scene, empty, poses, initial, derivative=True, vary_initial=True, pivot=pivot, starts=starts)
         history.append(_rms(jet.residual))
         W_ea = -jet.by_initial.reshape(-1, len(initial))  # residual = measured − modelled
-        step = lsq_linear(W_ea, jet.residual.ravel(), bounds=(low - initial - 1e-12, high - initial + 1e-12)).x
+        ridge = (
+            SEAT_STD_FLOOR / _largest_input(robot, scene.recording.actuation) * np.eye(len(initial))
+        )  # what no marker feels stays
+        right = np.concatenate([jet.residual.ravel(), np.zeros(len(initial))])
+        step = lsq_linear(np.vstack([W_ea, ridge]), right, bounds=(low - initial - 1e-12, high - initial + 1e-12)).x
         initial = np.clip(initial + step, low, high)
         jet = evaluate_scene(
             plain, scene, empty, poses, initial, derivative=False, vary_initial=False, pivot=pivot, starts=starts
@@ -147,6 +151,12 @@ def _alternate(
         if np.abs(step).max() < 1e-6 * max(np.abs(initial).max(), 1e-6):
             break
     return poses, initial
+
+
+def _largest_input(robot: Robot, actuation: str) -> float:
+    """Return the size of an input that would crush the body: a tenth of E × reach² [N], or of its reach [m]."""
+    body = robot.body
+    return 0.1 * body.reach * (float(np.median(body.material.young_modulus)) * body.reach if actuation == "tension" else 1.0)
 
 
 def _rigid_again(robot: Robot, scene: Scene, jet: SceneJet) -> list[FloatArray]:
@@ -424,4 +434,4 @@ def _declared(robot: Robot, recording: Recording, frames: IntArray) -> Calibrati
                        np.zeros((4, 4)), np.zeros((6, 6)), none, dict(none), "as declared: there are no markers to fit", frames=tuple(int(recording.frame_numbers[k]) for k in frames))  # fmt: skip
 
 
-__all__ = ["calibrate", "first_poses", "fit_joint", "usable_frames"]
+__all__ = ["calibrate", "first_poses", "fit_joint", "input_bounds", "usable_frames"]

@@ -29,6 +29,8 @@ MOST_STEPS = 1500
 """Newton steps in all, load steps included."""
 SMALLEST_PART = 2e-3
 """Load steps smaller than this share of the load are given up."""
+FAR = 1e6
+"""A stiffness factorised where the residual was more than this times its tolerance says nothing of the stability of the end."""
 CLOSED = 1e-12
 """How far a held cable may miss its length [m]."""
 FALL_ITERATIONS = 30
@@ -125,6 +127,7 @@ class _State:
     shifted: bool = False  # the stiffness was not positive definite where it was last factorised
     shift: float = 0.0  # what made the stiffness positive definite there [N/m]
     indefinite_steps: int = 0
+    factored_at: float = 0.0  # residual where the stiffness was last factorised [N]
 
 
 def solve_equilibrium(
@@ -168,6 +171,8 @@ def solve_equilibrium(
     if not (max_iterations >= 1 and 0 < relative_tolerance < 1):
         found = f"{max_iterations}, {relative_tolerance:g}"
         raise InputError("out of range", where="max_iterations, relative_tolerance", found=found, expected="≥ 1, between 0 and 1")
+    if start is not None:
+        _check_start(body, start)
     loads = _collect_loads(body, given, nodal_forces, start, before, bilateral, relative_tolerance)
     state = _initial_state(body, loads, start, reuse_factor)
     shares = [s.copy() for s in state.shares]
@@ -185,7 +190,7 @@ def solve_equilibrium(
         status = status if body.is_held() else "singular"
     elif not body.is_held() and not _holds_itself(body, state):
         status = "singular"
-    elif state.shifted and _can_fall(body, loads, state):
+    elif (state.shifted or state.factored_at > FAR * loads.tolerance) and _can_fall(body, loads, state):
         status = "unstable"
     extra = np.zeros_like(body.mesh.nodes) if nodal_forces is None else np.asarray(nodal_forces, dtype=np.float64)
     return _result(body, state, status, reached, extra)
@@ -248,6 +253,14 @@ def _drive_values(
             np.array([name in tables[travel] for name in names], dtype=bool))  # fmt: skip
 
 
+def _check_start(body: BodyModel, start: Equilibrium) -> None:
+    if start.positions.shape != body.mesh.nodes.shape:
+        raise InputError("belongs to another mesh", where="start", found=start.positions.shape, expected=body.mesh.nodes.shape)
+    if set(start.tension) != set(body.cable_names) or set(start.pressure) != set(body.chamber_names):
+        raise InputError("belongs to a body with other cables or chambers", where="start", found=[*start.tension, *start.pressure],
+                         expected=[*body.cable_names, *body.chamber_names])  # fmt: skip
+
+
 def _loads_of(body: BodyModel, start: Equilibrium, loads: _Loads) -> _Loads:
     """Return the loads under which a start was in equilibrium, for drives that are held where these are."""
     effort = np.array([*start.tension.values(), *start.pressure.values()])
@@ -267,11 +280,6 @@ def _initial_state(body: BodyModel, loads: _Loads, start: Equilibrium | None, re
     shares = [np.ones(len(c.path)) for c in body.cables]
     if start is None:
         return _State(body.mesh.nodes.copy(), loads.effort.copy(), _first_taut(body, loads), shares)
-    if start.positions.shape != body.mesh.nodes.shape:
-        raise InputError("belongs to another mesh", where="start", found=start.positions.shape, expected=body.mesh.nodes.shape)
-    if set(start.tension) != set(body.cable_names) or set(start.pressure) != set(body.chamber_names):
-        raise InputError("belongs to a body with other cables or chambers", where="start", found=[*start.tension, *start.pressure],
-                         expected=[*body.cable_names, *body.chamber_names])  # fmt: skip
     x = start.positions.copy()
     clamped = _clamped(body)
     x[clamped] = body.mesh.nodes[clamped]
@@ -286,8 +294,9 @@ def _initial_state(body: BodyModel, loads: _Loads, start: Equilibrium | None, re
         motor = start.tension[body.cable_names[i]]
         if motor > 0:
             shares[i] = tensions / motor
+    far = np.inf if start.status == "unstable" else 0.0  # where nothing moves, stability is looked at all the same
     usable = reuse_factor and start.factor is not None and start.factor.size == len(body.free_map.dofs)
-    return _State(x, np.asarray(T, dtype=float), taut, shares, start.factor if usable else None, usable)
+    return _State(x, np.asarray(T, dtype=float), taut, shares, start.factor if usable else None, usable, factored_at=far)
 
 
 def _clamped(body: BodyModel) -> BoolArray:
@@ -399,6 +408,7 @@ def _newton(body: BodyModel, loads: _Loads, state: _State, max_iterations: int) 
             state.factor = _factor_here(body, here, state, H, C, stretch, loads.lever[held])
             if state.factor is None:
                 return "singular"
+            state.factored_at = state.residual
         last, saved = state.residual, (state.x, state.T)
         du, dT = _bordered_step(state.factor, force, gap, H, C, stretch, loads.lever[held])
         if not closed and _contradicts(H @ du + stretch * dT, gap, loads.lever[held]):
@@ -483,11 +493,12 @@ def _can_fall(body: BodyModel, loads: _Loads, state: _State) -> bool:
     held = np.flatnonzero(state.taut)
     rows, free = _rows(body, state), body.free_map.dofs
     H, stretch, lever = rows[held][:, free], _stretch(body)[held], loads.lever[held]
-    if state.factor is None:
+    factor = _factor_here(body, internal(body, state.x), state, H, H, stretch, lever)
+    if factor is None or not state.shifted:
         return False
     motion = np.random.default_rng(0).standard_normal(len(free))
     for _ in range(FALL_ITERATIONS):
-        motion, _ = _bordered_step(state.factor, motion, np.zeros(len(held)), H, H, stretch, lever)
+        motion, _ = _bordered_step(factor, motion, np.zeros(len(held)), H, H, stretch, lever)
         motion /= np.abs(motion).max()
     step = np.zeros(state.x.size)
     step[free] = 1e-6 * np.ptp(body.mesh.nodes, axis=0).max() * motion
