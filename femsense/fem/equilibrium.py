@@ -29,6 +29,8 @@ MOST_STEPS = 1500
 """Newton steps in all, load steps included."""
 SMALLEST_PART = 2e-3
 """Load steps smaller than this share of the load are given up."""
+CHORD = 1e-2
+"""A stiffness serves for another step where the last one left less than this share of the residual."""
 FAR = 1e6
 """A stiffness factorised where the residual was more than this times its tolerance says nothing of the stability of the end."""
 CLOSED = 1e-12
@@ -190,7 +192,7 @@ def solve_equilibrium(
         status = status if body.is_held() else "singular"
     elif not body.is_held() and not _holds_itself(body, state):
         status = "singular"
-    elif (state.shifted or state.factored_at > FAR * loads.tolerance) and _can_fall(body, loads, state):
+    elif _is_doubtful(loads, state, start) and _can_fall(body, loads, state):
         status = "unstable"
     extra = np.zeros_like(body.mesh.nodes) if nodal_forces is None else np.asarray(nodal_forces, dtype=np.float64)
     return _result(body, state, status, reached, extra)
@@ -404,7 +406,7 @@ def _newton(body: BodyModel, loads: _Loads, state: _State, max_iterations: int) 
             continue
         if not sound:
             return "stalled"
-        if state.factor is None or (not state.borrowed and state.residual > max(loads.tolerance, 1e-2 * last)):
+        if state.factor is None or (not state.borrowed and state.residual > max(loads.tolerance, CHORD * last)):
             state.factor = _factor_here(body, here, state, H, C, stretch, loads.lever[held])
             if state.factor is None:
                 return "singular"
@@ -483,6 +485,16 @@ def _holds_itself(body: BodyModel, state: _State) -> bool:
     blocks = _stiffness_blocks(body, internal(body, state.x), state)
     factor = with_turning_plate(body, state.x, factorize(body.free_map.pattern, reduced_values(body, blocks)))
     return factor is not None and factor.negative == 0
+
+
+def _is_doubtful(loads: _Loads, state: _State, start: Equilibrium | None) -> bool:
+    """Return whether the stiffness at hand leaves open if a balanced state is stable.
+
+    It does where it was not positive definite, and where it was factorised far from the end. A walk from one state to the next is
+    spared the latter: the next step, which starts with the stiffness of this state, sees it.
+    """
+    walks = start is not None and start.converged
+    return state.shifted or (not walks and state.factored_at > FAR * loads.tolerance)
 
 
 def _can_fall(body: BodyModel, loads: _Loads, state: _State) -> bool:
