@@ -155,6 +155,15 @@ SABOTAGES = (
     S("recording.py", "table.depth_unit_m or 0.001)", "0.0001)", "test_recording.py::test_depth_and_colour_become_a_cloud test_recording.py::test_round_trip_with_everything"),
     S("frame_clouds.py", "image[:, :, 2::-1]", "image[:, :, :3]", "test_recording.py::test_depth_and_colour_become_a_cloud"),
     S("recording.py", '"load_forces": table.numbers(FORCE_COLUMNS)', '"load_forces": table.numbers(PLACE_COLUMNS)', "test_recording.py::test_optional_columns_and_files test_recording.py::test_round_trip_with_everything"),
+    # surfaces, meshing, what a mesh costs
+    S("fem/blocks.py", "np.where(cells[:, None] % 2 == 0, corner, 1 - corner)", "corner + 0 * cells[:, None]", "test_fem_blocks.py::test_an_even_grid_is_its_own_mirror_image"),
+    S("surface.py", "wrong = (shells.volume < 0) != inner", "wrong = shells.volume < 0", "test_surface.py::test_an_inner_shell_is_a_cavity_whichever_way_it_faces"),
+    S("surface.py", "alike = edges[pair[:, 0], 0] == edges[pair[:, 1], 1]", "alike = edges[pair[:, 0], 0] == edges[pair[:, 1], 0]", "test_surface.py::test_what_is_mended"),
+    S("surface.py", "real = ~shares & (t > 1e-3)", "real = (t > 1e-3)", "test_surface.py::test_crossing_triangles_are_found"),
+    S("meshing.py", "scaled = TetMesh(mesh.nodes * PER_METRE[unit], mesh.tets)", "scaled = TetMesh(mesh.nodes / PER_METRE[unit], mesh.tets)", "test_meshing.py::test_a_robot_that_is_there_keeps_its_table"),
+    S("quality.py", "np.cbrt(3.0 *", "np.cbrt(2.0 *", "test_quality.py::test_a_regular_tetrahedron_is_perfect"),
+    S("accuracy.py", "step = 1.0 / (2.0**ORDER - 1.0)", "step = 1.0 / 2.0**ORDER", "test_accuracy.py::test_a_model_that_moves_half_as_far_senses_twice_the_force"),
+    S("accuracy.py", "/ (own**2).sum(axis=(1, 2)) - 1.0", "/ (true**2).sum(axis=(1, 2)) - 1.0", "test_accuracy.py::test_a_model_that_moves_half_as_far_senses_twice_the_force"),
 )  # fmt: skip
 
 

@@ -121,7 +121,7 @@ def test_the_examples_in_the_new_robot_work_once_they_are_uncommented(tmp_path: 
     robot = load_robot(tmp_path / "robot")
     assert robot.body.cable_names == ("cable-1",) and robot.marker_names == ("top",) and robot.color_rgb is not None
     assert robot.body.cables[0].path.outside.max() == 0.0 and robot.markers.outside.max() < 1e-6
-    assert solve_equilibrium(robot.body, tension={"cable-1": 1.0}).converged
+    assert solve_equilibrium(robot.body, tension={"cable-1": 0.05}).converged
 
 
 def test_the_lowest_slab_holds_a_body_that_stands_on_a_tip() -> None:
