@@ -1,0 +1,238 @@
+"""How fast the body is: cold equilibria beside SOFA's, parts, real time, growth with the mesh. Prints the tables of docs/speed.md.
+
+    OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 python benchmarks/body.py [cold|parts|frames|growth …] [--data FOLDER]
+
+Medians of CPU time of one thread; SOFA's figures are those of `reference/cases.json`, measured on a like machine.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import subprocess
+import sys
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from femsense.fem.assembly import internal, reduced_values
+from femsense.fem.body import BodyModel, make_body, tie_cable
+from femsense.fem.cables import pull_rows
+from femsense.fem.cholesky import cholesky
+from femsense.fem.compliance import compliance, direction_rows
+from femsense.fem.equilibrium import solve_equilibrium
+from femsense.fem.linear import factorize, pardiso_library
+from femsense.fem.mesh import embed_points, refined, surface_triangles, to_quadratic, vertex_normals
+from femsense.fem.tracker import Tracker
+from femsense.robot import load_robot
+
+DATA = Path(__file__).resolve().parents[1].parent / "shared" / "data"
+
+
+def median_ms(call: Callable[[], Any], count: int = 9) -> float:
+    """Return the median CPU time of a call [ms]."""
+    call()
+    times = []
+    for _ in range(count):
+        began = time.process_time()
+        call()
+        times.append(time.process_time() - began)
+    return 1e3 * float(np.median(times))
+
+
+def verdict(value: float, target: float, *, most: bool = True) -> str:
+    reached = value <= target if most else value >= target
+    return f"to reach {'≤' if most else '≥'} {target:g}: {'yes' if reached else 'NO'}"
+
+
+def cold(data: Path) -> None:
+    """Cold equilibria of the reference cases beside SOFA."""
+    body = load_robot(data / "diamond").body.with_gravity([0, 0, 0])
+    cases = json.loads((data / "reference" / "cases.json").read_text(encoding="utf-8"))
+    for kind in ("corotational_polar", "neo_hookean"):
+        law = "neo_hookean" if kind == "neo_hookean" else "corotational"
+        lawful = body.with_material(replace(body.material, law=law))
+        for case, document in cases[kind].items():
+            if "newton_steps" not in document:
+                continue
+            forces = np.tile(0.5 / len(body.mesh.nodes) * np.array(document["gravity_m_s2"]), (len(body.mesh.nodes), 1))
+            for node, force in document["nodal_force_n"]:
+                forces[node] += force
+            held = document["held_cables"]
+            tension = {name: value for name, value in document["tension_n"].items() if name not in held}
+
+            def solve(lawful: BodyModel = lawful, tension: Any = tension, held: Any = held, forces: Any = forces) -> Any:
+                return solve_equilibrium(lawful, tension=tension, shortening=held, nodal_forces=forces)
+
+            ms, sofa = median_ms(solve), document["newton_steps"] * document["ms_per_step"]
+            state = solve()
+            print(
+                f"{law:13} {case:13} {state.iterations:3d} steps {ms:7.1f} ms   SOFA {document['newton_steps']:3d} × {document['ms_per_step']:5.2f} = {sofa:6.1f} ms"
+                f"   ratio {ms / sofa:.3f}   {verdict(ms / sofa, 0.15)}"
+            )
+
+
+def diamond(data: Path, quadratic: bool) -> tuple[BodyModel, np.ndarray]:
+    """Return the diamond, quadratic with a modulus of its own, and its feature points at rest."""
+    robot = load_robot(data / "diamond")
+    body, features = robot.body, robot.body.mesh.nodes[robot.features]
+    if quadratic:
+        mesh = to_quadratic(body.mesh)
+        path = {c.name: c.path.positions(body.mesh.nodes) for c in body.cables}
+        cables = tuple(tie_cable(mesh, c.name, path[c.name], c.pull_point) for c in body.cables)
+        inside = in_boxes(mesh.nodes)
+        body = make_body(
+            mesh,
+            young_modulus=450e3,
+            poisson_ratio=0.45,
+            density=1070.0,
+            clamped=inside,
+            cables=cables,
+            gravity=[0, 0, -9.81],
+        )
+    return body, features
+
+
+def in_boxes(nodes: np.ndarray) -> np.ndarray:
+    return np.asarray(((nodes >= [-0.015, -0.015, -0.04]) & (nodes <= [0.015, 0.015, 0.01])).all(axis=1))
+
+
+def parts(data: Path) -> None:
+    """Assembly, factor, solves."""
+    for quadratic in (False, True):
+        body, features = diamond(data, quadratic)
+        state = solve_equilibrium(body, tension=dict.fromkeys(body.cable_names, 1.0))
+        print(f"\n{'tet10' if quadratic else 'tet4'}, {body.free_map.pattern.size} free unknowns")
+        parts_at(body, features, np.array(state.positions))
+
+
+def parts_at(body: BodyModel, features: np.ndarray, x: np.ndarray) -> None:
+    pattern = body.free_map.pattern
+    whole, forces = median_ms(lambda: internal(body, x)), median_ms(lambda: internal(body, x, tangent=False))
+    print(f"  assembly {whole:.2f} ms, forces alone {forces:.2f} ms")
+    blocks = internal(body, x).blocks
+    assert blocks is not None
+    values = reduced_values(body, blocks)
+    normals = np.tile([0.0, 0.0, 1.0], (len(features), 1))
+    rows = np.vstack([direction_rows(embed_points(body.mesh, features), normals, len(x)), pull_rows(body, x)])
+    columns = sp.csc_matrix(rows[:, body.free_map.dofs].T)
+    solver_line("Cholesky, double", partial(cholesky, pattern.analysis(), values), columns)
+    solver_line("Cholesky, single", partial(cholesky, pattern.analysis(), values, single=True), columns)
+    for name in ("pardiso", "superlu"):
+        os.environ["FEMSENSE_SOLVER"] = name
+        pardiso_library.cache_clear()
+        if name == "superlu" or pardiso_library() is not None:
+            solver_line(name, partial(factorize, pattern, values), columns)
+        del os.environ["FEMSENSE_SOLVER"]
+        pardiso_library.cache_clear()
+
+
+def solver_line(name: str, make: Callable[[], Any], columns: sp.csc_matrix) -> None:
+    factor, right = make(), np.random.default_rng(0).normal(size=columns.shape[0])
+    one, gram = median_ms(lambda: factor.solve(right)), median_ms(lambda: factor.gram(columns), 3)
+    print(
+        f"  {name:17} factor {median_ms(make, 3):7.2f} ms, one solve {one:6.2f} ms, W of {columns.shape[1]} rows {gram:7.2f} ms"
+    )
+
+
+def frames(data: Path) -> None:
+    """A sensing frame: tensions move on, about 1 mm of motion, then W of 51 feature normals and the cables."""
+    for quadratic in (False, True):
+        body, features = diamond(data, quadratic)
+        triangles = surface_triangles(body.mesh)
+        nearest = np.array([np.argmin(np.linalg.norm(body.mesh.nodes - p, axis=1)) for p in features])
+        for jitter in (0.0, 0.01):
+            noise = np.random.default_rng(1).normal(0, jitter, (40, len(body.cables)))
+            tracker, spent, shares, errors = Tracker(body), [], [], []
+            for k in range(28):
+                tension = {
+                    name: 2.0 + np.sin(0.023 * k + i * np.pi / 2) + 0.6 * np.sin(1.7 * 0.023 * k + i) + noise[k, i]
+                    for i, name in enumerate(body.cable_names)
+                }
+                began = time.process_time()
+                frame = tracker.step(tension=tension)
+                normals = vertex_normals(frame.positions, triangles)[nearest]
+                W = tracker.compliance(points=features, directions=normals)
+                spent.append(1e3 * (time.process_time() - began))
+                shares.append(frame.error_m / frame.motion_m)
+                if k in (8, 16, 24):
+                    full = solve_equilibrium(body, tension=tension)
+                    exact = compliance(body, full, points=features, directions=normals)
+                    off = np.abs(full.positions - frame.positions).max()
+                    errors.append((off / frame.motion_m, np.linalg.norm(W - exact) / np.linalg.norm(exact), frame.motion_m))
+            ms, worst = float(np.median(spent[4:])), np.max(errors, axis=0)
+            rate = 1e3 / ms
+            print(
+                f"{'tet10' if quadratic else 'tet4 '} input jitter {jitter:g} N: {ms:6.1f} ms a frame (slowest {max(spent[4:]):.1f}), {rate:5.1f} Hz   {verdict(rate, 20.0 if quadratic else 100.0, most=False)}"
+                f"   motion ≤ {1e3 * worst[2]:.2f} mm, error {worst[0]:.1e} of it (reported ≤ {max(shares[4:]):.1e}), W {worst[1]:.1e}"
+            )
+            if quadratic:
+                print(f"      at tet10 accuracy by a reduction: {rate:.1f} Hz   {verdict(rate, 40.0, most=False)}")
+
+
+def growth(data: Path, levels: int) -> None:
+    """Uniform refinement: each mesh in a process of its own."""
+    rows = []
+    for level in range(levels):
+        text = subprocess.run([sys.executable, __file__, "one", "--level", str(level), "--data", str(data)], capture_output=True, text=True, check=False).stdout  # fmt: skip
+        print(text.strip() or f"level {level}: did not finish")
+        if text.strip():
+            rows.append([float(v) for v in text.split("|")[1].split()])
+    if len(rows) > 1:
+        table = np.log(np.array(rows))
+        slopes = (table[-1, 1:] - table[0, 1:]) / (table[-1, 0] - table[0, 0])
+        print("exponents in unknowns: assembly {:.2f}, factor {:.2f}, solve {:.2f}, memory of the factor {:.2f}".format(*slopes))
+
+
+def one_level(data: Path, level: int) -> None:
+    """Assembly, factor and solve on the diamond refined so many times."""
+    mesh = load_robot(data / "diamond").body.mesh
+    for _ in range(level):
+        mesh = refined(mesh)
+    body = make_body(mesh, young_modulus=180e3, poisson_ratio=0.45, density=1070.0, clamped=in_boxes(mesh.nodes))
+    pattern = body.free_map.pattern
+    began = time.process_time()
+    analysis = pattern.analysis()
+    analysed = time.process_time() - began
+    x = np.array(mesh.nodes)
+    blocks = internal(body, x).blocks
+    assert blocks is not None
+    values = reduced_values(body, blocks)
+    factor = cholesky(analysis, values)
+    assert factor is not None
+    right = body.weight().ravel()[body.free_map.dofs]
+    times = (
+        median_ms(lambda: internal(body, x), 3),
+        median_ms(lambda: cholesky(analysis, values), 3),
+        median_ms(lambda: factor.solve(right), 3),
+    )
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(
+        f"{len(mesh.tets):7d} tetrahedra, {pattern.size} unknowns: analysis {analysed:.2f} s, assembly {times[0]:.1f} ms, factor {times[1]:.1f} ms,"
+        f" solve {times[2]:.2f} ms, factor {factor.bytes / 2**20:.0f} MB, peak of the process {peak:.0f} MB | {pattern.size} {times[0]} {times[1]} {times[2]} {factor.bytes}"
+    )
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser()
+    parser.add_argument("what", nargs="*", default=["cold", "parts", "frames", "growth"])
+    parser.add_argument("--data", type=Path, default=DATA)
+    parser.add_argument("--level", type=int, default=0)
+    parser.add_argument("--levels", type=int, default=3)
+    given = parser.parse_args()
+    warnings.simplefilter("ignore")
+    for what in given.what:
+        if what == "one":
+            one_level(given.data, given.level)
+            continue
+        print(f"\n== {what}", flush=True)
+        {"cold": lambda: cold(given.data), "parts": lambda: parts(given.data), "frames": lambda: frames(given.data), "growth": lambda: growth(given.data, given.levels)}[what]()  # fmt: skip

@@ -1,0 +1,87 @@
+"""The tracker: near the full solver along a path, with an error estimate that holds, and the full solver where it must."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from analytic import bar_body
+from helpers import block_mesh
+
+from femsense.errors import FemsenseError, InputError
+from femsense.fem.body import BodyModel
+from femsense.fem.compliance import compliance
+from femsense.fem.equilibrium import solve_equilibrium
+from femsense.fem.tracker import Tracker
+
+MESH = block_mesh((6, 2, 2))
+POINTS = np.array([[0.1, 0.015, 0.03], [0.07, 0.0, 0.01]])
+DIRECTIONS = np.array([[0.0, 0, 1], [0, 1, 0]])
+
+
+def body_of(quadratic: bool) -> BodyModel:
+    return bar_body(MESH, quadratic=quadratic, gravity=(0, 0, -9.81))
+
+
+def tensions(t: float) -> dict[str, float]:
+    return {"top": max(0.0, 1.0 + 0.9 * np.sin(t)), "side": max(0.0, 0.6 * np.sin(1.3 * t))}  # slack now and then
+
+
+@pytest.mark.parametrize("quadratic", [False, True])
+@pytest.mark.parametrize("single", [False, True])
+@pytest.mark.parametrize("speed", [0.1, 0.7])
+def test_every_frame_is_near_the_full_solution_and_within_its_error(quadratic: bool, single: bool, speed: float) -> None:
+    body, load = body_of(quadratic), np.zeros_like(MESH.nodes if not quadratic else body_of(True).mesh.nodes)
+    tracker = Tracker(body, single=single)
+    load[np.argmax(body.mesh.nodes[:, 0])] = [0.0, 0.02, 0.0]
+    for k in range(10):
+        force = load * np.sin(k * speed)
+        frame = tracker.step(tension=tensions(k * speed), nodal_forces=force)
+        full = solve_equilibrium(body, tension=tensions(k * speed), nodal_forces=force)
+        error = np.abs(frame.positions - full.positions).max()
+        assert error <= frame.error_m
+        assert frame.error_m <= max(0.01 * frame.motion_m, 1e-7)
+        assert frame.fell_back == (k == 0) or speed > 0.5
+
+
+def test_the_compliance_is_that_of_the_full_solution() -> None:
+    body = body_of(False)
+    tracker = Tracker(body)
+    for k in range(4):
+        tracker.step(tension=tensions(0.1 * k))
+    full = solve_equilibrium(body, tension=tensions(0.3))
+    wanted = compliance(body, full, points=POINTS, directions=DIRECTIONS)
+    for _ in range(2):  # the second time with what is kept of the points
+        got = tracker.compliance(points=POINTS, directions=DIRECTIONS)
+        np.testing.assert_allclose(got, wanted, atol=2e-3 * np.abs(wanted).max())
+
+
+def test_a_leap_falls_back_to_the_full_solver() -> None:
+    body = body_of(False)
+    tracker = Tracker(body)
+    tracker.step(tension={"top": 0.1})
+    frame = tracker.step(tension={"top": 6.0, "side": 4.0})
+    full = solve_equilibrium(body, tension={"top": 6.0, "side": 4.0})
+    assert frame.fell_back
+    np.testing.assert_allclose(frame.positions, full.positions, atol=1e-8)
+    assert not tracker.step(tension={"top": 6.0, "side": 4.01}).fell_back
+
+
+def test_a_smooth_path_takes_one_factorisation_a_frame() -> None:
+    tracker = Tracker(body_of(True))
+    counts = [tracker.step(tension=tensions(0.02 * k)).factorisations for k in range(12)]
+    assert counts[4:] == [1] * 8
+
+
+def test_what_a_tracker_does_not_know_is_said() -> None:
+    with pytest.raises(InputError, match="cannot be tracked"):
+        Tracker(bar_body(MESH, friction=0.2))
+    tracker = Tracker(body_of(False))
+    with pytest.raises(FemsenseError, match="call step first"):
+        tracker.compliance()
+    with pytest.raises(InputError, match="unknown cable"):
+        tracker.step(tension={"bottom": 1.0})
+    with pytest.raises(InputError, match="cannot push"):
+        tracker.step(tension={"top": -1.0})
+    tracker.step(tension={"top": 1.0})
+    with pytest.raises(InputError, match="differ in shape"):
+        tracker.compliance(points=POINTS, directions=DIRECTIONS[:1])
