@@ -269,7 +269,7 @@ class _Balance:
 
     def _loads(self, walk: Walk) -> FloatArray:
         loads = frame_loads(walk, self.frame)
-        return np.zeros_like(self.inner) if loads is None else loads
+        return np.zeros((len(walk.robot.body.mesh.nodes), 3)) if loads is None else loads
 
     def carried(self, variant: Walk) -> FloatArray:
         """Return where the variant's response starts [m], (n, 3): the base state, grown as its body is and with its clamp given way."""
@@ -354,6 +354,27 @@ class _Balance:
         if x is not None:
             pulled = pulled - shortening(body, x) + shortening(self.body, self.base.positions)
         return np.asarray(pulled)
+
+
+def one_step_finer(walk: Walk, fine: Walk, frame: int, base: Equilibrium, ties: Embedding) -> FloatArray:
+    """Return where the nodes of a finer mesh come to rest [m], shape (n, 3), after one Newton step from a state of a coarser one.
+
+    Arguments:
+        walk: the coarse robot and its drive.
+        fine: the same on the finer mesh.
+        frame: index of the frame.
+        base: the coarse state of that frame.
+        ties: of the fine nodes to the coarse mesh.
+    """
+    x = ties.positions(base.positions)
+    body = fine.robot.body
+    start = replace(base, positions=x, factor=None)
+    tangent = tangent_at(body, start)
+    force, pulled, _ = _Balance(walk, frame, base).upset_by(fine, base.segment_tensions, x, x)
+    move = tangent.respond(force[None])[0]
+    if base.held.any():
+        move = move + np.tensordot(pulled[base.held[: len(body.cables)]], tangent.respond_to_held(), axes=1)
+    return np.asarray(x + move)
 
 
 def _same_mechanics(walk: Walk, variant: Walk) -> bool:

@@ -62,13 +62,20 @@ class Hypothesis:
     robot: Robot
     terms: tuple[tuple[Effect, Entry, tuple[Parameter, ...]], ...] = ()
     """(effect, what is fixed of its entry, parameters that are fitted)."""
+    settled: tuple[tuple[Effect, Entry], ...] = ()
+    """Effects without parameters, which the robot has already."""
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         return tuple(p for _, _, parameters in self.terms for p in parameters)
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the effects, those without parameters first."""
+        return tuple(effect.name for effect, _ in self.settled) + tuple(effect.name for effect, _, _ in self.terms)
+
     def entries(self, coordinates: FloatArray) -> list[Entry]:
-        """Return the effects' tables, name included, for coordinates of the fit, shape (p,)."""
+        """Return the tables of the terms, name included, for coordinates of the fit, shape (p,)."""
         result, at = [], 0
         for effect, seed, parameters in self.terms:
             entry = build_entry(parameters, list(coordinates[at : at + len(parameters)]), seed)
@@ -82,7 +89,7 @@ class Hypothesis:
         for (effect, _, parameters), entry in zip(self.terms, self.entries(coordinates)):
             own = coordinates[at : at + len(parameters)]
             at += len(parameters)
-            if parameters and all(c == p.null for p, c in zip(parameters, own)):
+            if parameters and not effect.discrete and all(c == p.null for p, c in zip(parameters, own)):
                 continue
             robot = effect.apply(robot, {k: v for k, v in entry.items() if k != "name"})
         return robot

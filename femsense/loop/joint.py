@@ -11,7 +11,8 @@ from femsense.calib.fit import FitResult, gauss_newton
 from femsense.calib.forward import Hypothesis, Scene, SceneJet, evaluate_scene, rest_residual
 from femsense.effects.loads import STANDARD_GRAVITY
 from femsense.fem.equilibrium import Equilibrium
-from femsense.loop.noise import Groups, Noise, whiten
+from femsense.fem.mesh import TetMesh
+from femsense.loop.noise import Groups, Noise, Whitener, whiten
 from femsense.pose import move_pose
 
 DECLARED_POSE_STD = np.array([2e-3] * 3 + [3e-4] * 3)
@@ -32,13 +33,19 @@ class Trial:
     """Start of the initial inputs; None where they are known."""
     input_low: FloatArray
     input_high: FloatArray
-    starts: dict[int, Equilibrium]
-    """States of earlier evaluations."""
+    starts: dict[int, tuple[TetMesh, dict[int, Equilibrium]]]
+    """States of earlier evaluations, frame by frame, for each mesh."""
+    mesh_error: FloatArray | None = None
+    """How far a finer mesh would move the markers [m], shape (k, 3); counts as noise of that size."""
 
     @property
     def size(self) -> int:
         """Number of the trial's own parameters."""
         return 6 * len(self.poses) + (0 if self.initial is None else len(self.initial))
+
+    def starts_on(self, mesh: TetMesh) -> dict[int, Equilibrium]:
+        """Return the states of earlier evaluations on a mesh (bodies of another size share its elements)."""
+        return self.starts.setdefault(id(mesh.tets), (mesh, {}))[1]
 
     def place(self, own: FloatArray, pivot: FloatArray) -> tuple[list[FloatArray], FloatArray | None]:
         """Return poses and initial inputs for the trial's own parameters."""
@@ -104,7 +111,7 @@ class JointProblem:
     hypothesis: Hypothesis
     prior: Prior
     trials: list[Trial]
-    factors: list[FloatArray]
+    factors: list[Whitener]
     seat_std: float
     last: Jets | None = None
 
@@ -152,10 +159,10 @@ class JointProblem:
         pivot = self.hypothesis.robot.marker_points.mean(axis=0)
         poses, initial = trial.place(own, pivot)
         return evaluate_scene(self.hypothesis, trial.scene, coordinates, poses, initial, derivative=derivative,
-                              vary_initial=trial.initial is not None, pivot=pivot, starts=trial.starts)  # fmt: skip
+                              vary_initial=trial.initial is not None, pivot=pivot, starts=trial.starts_on(self.hypothesis.robot.body.mesh))  # fmt: skip
 
     def _scene_rows(
-        self, trial: Trial, factor: FloatArray, jet: SceneJet, own: FloatArray, at: int, width: int, derivative: bool
+        self, trial: Trial, factor: Whitener, jet: SceneJet, own: FloatArray, at: int, width: int, derivative: bool
     ) -> tuple[FloatArray, FloatArray]:
         poses = 6 * len(trial.poses)
         declared = np.array([T is not None for T in trial.scene.recording.T_robot_camera]).repeat(6)
@@ -211,7 +218,7 @@ def fit_jointly(
     Raises:
         DataError: no equilibrium at the start.
     """
-    problem = JointProblem(hypothesis, prior, trials, [noise.whitener(t.groups) for t in trials], seat_std)
+    problem = JointProblem(hypothesis, prior, trials, [noise.whitener(t.groups, t.mesh_error) for t in trials], seat_std)
     theta = problem.start(coordinates)
     if own is not None:
         theta[: problem.own] = own

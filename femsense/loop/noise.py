@@ -62,9 +62,17 @@ class Noise:
                 sigma += self.std[name] ** 2 * (labels[:, None] == labels[None, :])
         return sigma
 
-    def whitener(self, groups: Groups) -> FloatArray:
-        """Return the lower Cholesky factor L of the covariance, shape (k, k); L⁻¹ whitens."""
-        return np.asarray(cholesky(self.covariance(groups), lower=True))
+    def whitener(self, groups: Groups, error: FloatArray | None = None) -> Whitener:
+        """Return what whitens rows with these groups.
+
+        `error` (k, 3) is a field [m] that the residual may hold by chance, with a standard deviation of once its size.
+        """
+        lower = np.asarray(cholesky(self.covariance(groups), lower=True))
+        if error is None:
+            return Whitener(lower, np.zeros(0), 0.0)
+        field = whiten(Whitener(lower, np.zeros(0), 0.0), error)
+        size = float(np.linalg.norm(field))
+        return Whitener(lower, field / max(size, 1e-300), 1.0 - 1.0 / np.sqrt(1.0 + size**2))
 
     @property
     def total(self) -> float:
@@ -72,11 +80,25 @@ class Noise:
         return float(np.sqrt(3.0 * sum(v**2 for v in self.std.values())))
 
 
-def whiten(factor: FloatArray, values: FloatArray) -> FloatArray:
-    """Return L⁻¹ values for rows (k, 3, …), axis by axis, flattened to (3k, …)."""
+@dataclass(frozen=True, eq=False, slots=True)
+class Whitener:
+    """A square root of the inverse covariance Σ ⊗ 1₃ + e eᵀ:  w ↦ (1 − shrink · d dᵀ) L⁻¹ w."""
+
+    lower: FloatArray
+    """Cholesky factor L of Σ, shape (k, k)."""
+    direction: FloatArray
+    """L⁻¹ e as a unit vector d, shape (3k,); empty without e."""
+    shrink: float
+
+
+def whiten(whitener: Whitener, values: FloatArray) -> FloatArray:
+    """Return rows (k, 3, …) whitened, flattened to (3k, …)."""
     k = len(values)
-    flat = solve_triangular(factor, values.reshape(k, -1), lower=True)
-    return np.asarray(flat.reshape(3 * k, *values.shape[2:]))
+    flat = solve_triangular(whitener.lower, values.reshape(k, -1), lower=True)
+    rows = np.asarray(flat.reshape(3 * k, *values.shape[2:]))
+    if not whitener.direction.size:
+        return rows
+    return np.asarray(rows - np.multiply.outer(whitener.direction, whitener.shrink * (whitener.direction @ rows)))
 
 
 MAX_REML_ROWS = 700

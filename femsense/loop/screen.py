@@ -19,6 +19,7 @@ from femsense.effects import Effect, Entry, Parameter
 from femsense.errors import FemsenseError
 from femsense.loop.joint import JointFit, JointProblem, Prior, Trial
 from femsense.loop.noise import whiten
+from femsense.model import Robot
 
 NUISANCE = ("stiffness", "cable_offset")
 """Effects that are always fitted along."""
@@ -53,20 +54,15 @@ def candidates_for(
     base: JointFit, control: str, *, forms: Sequence[Effect], names: Sequence[str], has_seats: bool
 ) -> list[tuple[Effect, Entry, tuple[Parameter, ...]]]:
     """Return the effects and seeds to try on top of a fitted model."""
-    present = {effect.name for effect, _, _ in base.hypothesis.terms}
+    present = set(base.hypothesis.names)
     robot = base.hypothesis.robot_at(base.coordinates)
     result = []
     for effect in forms:
-        if (
-            effect.discrete
-            or effect.name not in names
-            or effect.name in present
-            or (effect.name == "marker_offset" and has_seats)
-        ):
+        if effect.name not in names or effect.name in present or (effect.name == "marker_offset" and has_seats):
             continue
         for seed in effect.seeds(robot):
             parameters = effect.parameters(robot, control)
-            if parameters:
+            if parameters or effect.discrete:
                 result.append((effect, seed, parameters))
     return result
 
@@ -78,11 +74,11 @@ class Fields:
     todo: list[tuple[Effect, Entry, tuple[Parameter, ...]]]
     """The effects and seeds that can be evaluated."""
     raw: list[FloatArray]
-    """Columns [m], one array (k, 3, Σq) a trial."""
+    """Columns [m], one array (k, 3, Σq) a trial; a discrete alternative has one column, its whole change."""
 
     def of(self, i: int) -> list[FloatArray]:
         """Return the columns of one effect, one array (k, 3, q) a trial."""
-        spans = np.cumsum([0, *(len(p) for _, _, p in self.todo)])
+        spans = np.cumsum([0, *(1 if e.discrete else len(p) for e, _, p in self.todo)])
         return [block[:, :, spans[i] : spans[i + 1]] for block in self.raw]
 
 
@@ -106,7 +102,7 @@ def screen(base: JointFit, problem: JointProblem, fields: Fields, n_effective: f
         if not np.isfinite(whole).all() or np.linalg.norm(whole) == 0:
             continue
         left = whole - Q @ (Q.T @ whole)
-        step, gain = _best_step(left, residual, parameters)
+        step, gain = _whole_step(left, residual) if effect.discrete else _best_step(left, residual, parameters)
         q = len(parameters)
         score = gain - q * np.log(n_effective) - 2.0 * np.log(effects)
         retained = float(np.linalg.norm(left) / np.linalg.norm(whole))
@@ -117,25 +113,51 @@ def screen(base: JointFit, problem: JointProblem, fields: Fields, n_effective: f
 
 
 def effect_fields(base: JointFit, trials: list[Trial], todo: list[tuple[Effect, Entry, tuple[Parameter, ...]]]) -> Fields:
-    """Return what each effect does to the markers, all of them with one factorisation a frame."""
+    """Return what each effect does to the markers: those with parameters to first order, all of them with one factorisation a frame;
+    discrete alternatives as a whole, each with a walk of its own."""
     fixed = base.hypothesis.robot_at(base.coordinates)
-    usable = []
-    for effect, seed, parameters in todo:
-        try:
-            moved = np.array([p.null + p.step for p in parameters])
-            Hypothesis(fixed, ((effect, seed, parameters),)).robot_at(moved)
-            usable.append((effect, seed, parameters))
-        except FemsenseError:
-            continue
-    every = Hypothesis(fixed, tuple(usable))
+    smooth = [t for t in todo if not t[0].discrete and _can_act(fixed, t)]
+    every = Hypothesis(fixed, tuple(smooth))
     null = np.array([p.null for p in every.parameters])
     probe = JointProblem(every, Prior(np.zeros(0), np.zeros(0)), trials, [], 1.0)
     raw, at = [], 0
     for trial in trials:
-        jet = probe.jet(trial, base.fit.theta[at : at + trial.size], null, True)
-        raw.append(jet.by_effect)
+        raw.append(probe.jet(trial, base.fit.theta[at : at + trial.size], null, True).by_effect)
         at += trial.size
+    usable = smooth
+    for one in (t for t in todo if t[0].discrete and _can_act(fixed, t)):
+        changes = _whole_change(base, trials, fixed, one)
+        if changes is not None:
+            usable = [*usable, one]
+            raw = [np.concatenate([block, change[:, :, None]], axis=2) for block, change in zip(raw, changes)]
     return Fields(usable, raw)
+
+
+def _can_act(robot: Robot, one: tuple[Effect, Entry, tuple[Parameter, ...]]) -> bool:
+    parameters = one[2]
+    try:
+        Hypothesis(robot, (one,)).robot_at(np.array([p.null + p.step for p in parameters]))
+    except FemsenseError:
+        return False
+    return True
+
+
+def _whole_change(
+    base: JointFit, trials: list[Trial], fixed: Robot, one: tuple[Effect, Entry, tuple[Parameter, ...]]
+) -> list[FloatArray] | None:
+    """Return by how much a discrete alternative changes the residual of each trial [m], (k, 3); None where it has no equilibrium."""
+    parameters = one[2]
+    robot = Hypothesis(fixed, (one,)).robot_at(np.array([p.null for p in parameters]))
+    probe = JointProblem(Hypothesis(robot), Prior(np.zeros(0), np.zeros(0)), trials, [], 1.0)
+    changes, at = [], 0
+    try:
+        for trial, jet in zip(trials, base.jets):
+            moved = probe.jet(trial, base.fit.theta[at : at + trial.size], np.zeros(0), False)
+            changes.append(moved.residual - jet.residual)
+            at += trial.size
+    except FemsenseError:
+        return None
+    return changes
 
 
 def _whitened(base: JointFit, problem: JointProblem, own: list[FloatArray]) -> FloatArray:
@@ -173,6 +195,19 @@ def _smallest(columns: FloatArray, q: int, n_effective: float) -> FloatArray:
     needed = np.sqrt(10.0 + q * np.log(n_effective))
     norm = np.linalg.norm(columns, axis=0)
     return np.asarray(np.where(norm > 0, needed / np.maximum(norm, 1e-300), np.inf))
+
+
+def _whole_step(columns: FloatArray, residual: FloatArray) -> tuple[FloatArray, float]:
+    """Return the step to a discrete alternative, which is taken as a whole, and the decrease of χ²."""
+    return np.ones(1), float(residual @ residual) - float(np.sum((residual + columns[:, 0]) ** 2))
+
+
+def one_each(table: list[Candidate]) -> list[Candidate]:
+    """Return the best candidate of each name."""
+    seen: dict[str, Candidate] = {}
+    for candidate in table:
+        seen.setdefault(candidate.effect.name, candidate)
+    return list(seen.values())
 
 
 def confounding(a: Candidate, b: Candidate) -> float:

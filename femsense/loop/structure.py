@@ -2,30 +2,95 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from femsense.arrays import FloatArray, IntArray
 from femsense.loop.joint import Trial
+from femsense.loop.noise import Noise, whiten
 from femsense.model import Robot
 from femsense.recording import state_key
 
 PERMUTATIONS = 499
+LEVEL = 0.01
+"""Probability, over all tests together (Holm 1979), of calling mere noise structure."""
 
 
-def structure_test(trials: list[Trial], residuals: list[FloatArray], *, rng: np.random.Generator) -> tuple[float, float]:
-    """Return a statistic of structure in time and its permutation p-value.
+@dataclass(frozen=True, eq=False, slots=True)
+class StructureTests:
+    """Tests for structure in a residual; p-values as they are, not adjusted."""
 
-    Marker means and frame means are removed; T = Σ r_k·r_{k+1} / Σ |r_k|² over neighbouring frames of a sweep, against shuffles
-    of the frames within sweeps. It knows no scale, so that a wrong noise level cannot trip it.
+    lag_one: float
+    p: dict[str, float]
+    """Test → p-value: neighbouring states alike, one pattern in many states, one sweep apart, one marker apart."""
+
+    @property
+    def significant(self) -> bool:
+        """Whether any test stands after Holm's adjustment."""
+        return min(self.p.values(), default=1.0) * len(self.p) <= LEVEL
+
+    def document(self) -> dict[str, Any]:
+        """Return the tests as plain tables."""
+        return {
+            "lag_one": self.lag_one,
+            "p_value": min(self.p.values(), default=1.0),
+            "tests": dict(self.p),
+            "significant": self.significant,
+        }
+
+
+def structure_tests(trials: list[Trial], residuals: list[FloatArray], *, rng: np.random.Generator) -> StructureTests:
+    """Return tests for structure in residuals [m], (k, 3) a trial.
+
+    * `neighbours`: marker means and frame means removed; T = Σ r_k·r_{k+1} / Σ |r_k|² over neighbouring states of a sweep, against
+      shuffles of the states within sweeps. It knows no scale, so that a wrong noise level cannot trip it.
+    * `pattern`: the largest singular value of states × markers, against shuffles of each marker's states among themselves (Horn 1965).
+    * `sweep`, `marker`: the sweep or marker with the largest mean square, against the same shuffles.
     """
     fields = [_field(t, r) for t, r in zip(trials, residuals)]
     observed = _lag_one(fields, None)
-    if not np.isfinite(observed):
-        return 0.0, 1.0
-    shuffled = np.array([_lag_one(fields, rng) for _ in range(PERMUTATIONS)])
-    return observed, float((1 + (shuffled >= observed - 1e-12).sum()) / (1 + PERMUTATIONS))
+    p: dict[str, float] = {}
+    if np.isfinite(observed):
+        shuffled = np.array([_lag_one(fields, rng) for _ in range(PERMUTATIONS)])
+        p["neighbours"] = _share(shuffled, observed)
+    seen = np.array([_largest(fields, None)])
+    null = np.array([_largest(fields, rng) for _ in range(PERMUTATIONS)])
+    p |= {name: _share(null[:, i], float(seen[0, i])) for i, name in enumerate(("pattern", "sweep"))}
+    return StructureTests(observed if np.isfinite(observed) else 0.0, p)
+
+
+def _share(null: FloatArray, observed: float) -> float:
+    return float((1 + (null >= observed - 1e-12).sum()) / (1 + len(null)))
+
+
+def _largest(fields: list[tuple[FloatArray, IntArray]], rng: np.random.Generator | None) -> tuple[float, float]:
+    """Return the largest singular value, and the largest mean square of a sweep, relative to all; with `rng` after shuffling."""
+    singular, apart = 0.0, 0.0
+    for values, sweep in fields:
+        flat = values.reshape(len(values), -1)
+        if rng is not None:
+            markers = values.shape[1]
+            order = np.argsort(rng.random((len(values), markers)), axis=0)
+            flat = values[order, np.arange(markers)[None, :]].reshape(len(values), -1)
+        total = float((flat**2).sum())
+        if total <= 0 or len(flat) < 3:
+            continue
+        singular = max(singular, float(np.linalg.svd(flat, compute_uv=False)[0] ** 2 / total))
+        power = (flat**2).sum(axis=1)
+        means = [power[sweep == s].mean() for s in np.unique(sweep)]
+        apart = max(apart, float(np.max(means) / power.mean()))
+    return singular, apart
+
+
+def without_mesh_error(trial: Trial, residual: FloatArray, noise: Noise) -> FloatArray:
+    """Return the residual [m], (k, 3), less what of it is likeliest to be the mesh's own error."""
+    if trial.mesh_error is None:
+        return residual
+    plain = noise.whitener(trial.groups)
+    g, r = whiten(plain, trial.mesh_error), whiten(plain, residual)
+    return np.asarray(residual - float(g @ r) / (1.0 + float(g @ g)) * trial.mesh_error)
 
 
 def _field(trial: Trial, residual: FloatArray) -> tuple[FloatArray, IntArray]:
@@ -63,9 +128,7 @@ def _lag_one(fields: list[tuple[FloatArray, IntArray]], rng: np.random.Generator
     return above / below if below > 0 and pairs >= 4 else float("nan")
 
 
-def describe_left(
-    robot: Robot, trials: list[Trial], residuals: list[FloatArray], statistic: float, p_value: float
-) -> dict[str, Any]:
+def describe_left(robot: Robot, trials: list[Trial], residuals: list[FloatArray]) -> dict[str, Any]:
     """Return what the remaining residual looks like: size, where, and what it goes with."""
     marker = np.concatenate([t.scene.marker for t in trials])
     size = np.concatenate([np.linalg.norm(r, axis=1) for r in residuals])
@@ -85,7 +148,6 @@ def describe_left(
         },
         "worst_frame": {"frame": int(frames[top]), "rms_m": float(frame_rms[top])},
         "goes_with": goes_with,
-        "structure": {"lag_one": float(statistic), "p_value": float(p_value)},
     }
 
 

@@ -1,0 +1,420 @@
+"""The conclusion: which effects are named, what is left, what these data cannot say, and the robot that is handed back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from femsense.arrays import FloatArray
+from femsense.effects import Entry, apply_effects
+from femsense.loop.data import Data
+from femsense.loop.grow import EVIDENCE, evidence
+from femsense.loop.joint import Prior
+from femsense.loop.noise import Noise
+from femsense.loop.result import LoopResult
+from femsense.loop.screen import NUISANCE, TESTABLE, Candidate, confounding, one_each
+from femsense.loop.stages import Stage, make_stage, own_of
+from femsense.loop.structure import describe_left, structure_tests, without_mesh_error
+
+SIGNIFICANT = 3.0
+RELEVANT = 0.02
+"""A nuisance that moved by more than three standard deviations and 2 % is named as an effect."""
+MIN_SWEEPS = 4
+"""With fewer held-out sweeps the interval of the held-out error resamples frames."""
+DRAWS = 2000
+EXPLAINED = 0.8
+"""Share of the excess over the noise that effects must take away where structure is left."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Search:
+    """What the search went through."""
+
+    before: Stage
+    """The declared model, calibrated."""
+    history: list[tuple[str, Stage]]
+    """("", the model with what calibration may move), then each effect with the stage that added it."""
+    final: Stage
+    noise: Noise
+    n_effective: float
+    first: list[Candidate]
+    """The first screening."""
+    last: list[Candidate]
+    """The last one."""
+    refits: list[dict[str, Any]]
+
+
+def conclude(data: Data, search: Search, rng: np.random.Generator) -> LoopResult:
+    """Return the verdict with all that the report shows."""
+    before, final, noise = search.before, search.final, search.noise
+    promoted = _promoted(data, search)
+    names = [*promoted, *(n for n, _ in search.history[1:] if n in final.fit.hypothesis.names)]
+    back = _handed_back(data, final, promoted, noise) if names else before
+    entries = _entries(back, names)
+    effects = _chain(data, search, promoted, names, back)
+    residuals = [without_mesh_error(t, jet.residual, noise) for t, jet in zip(data.train, final.fit.jets)]
+    tests = structure_tests(data.train, residuals, rng=rng)
+    excess = _excess(before, final, noise)
+    unexplained = tests.significant and excess.left > excess.tolerated and excess.explained < EXPLAINED
+    verdict = "unexplained" if unexplained else "effects" if effects else "none"
+    rivals = _confounded(search, names)
+    not_testable = [
+        {"name": c.effect.name, "absorbed_share": float(np.sqrt(max(0.0, 1.0 - c.retained**2))), "retained_share": c.retained}
+        for c in one_each(search.first)
+        if c.retained < TESTABLE and c.effect.name not in names
+    ]
+    robot = apply_effects(data.robot, entries) if entries else data.robot
+    if data.robot.document is not None and entries:
+        robot = replace(robot, document={**data.robot.document, "effects": [*data.robot.document.get("effects", []), *entries]})
+    return LoopResult(
+        verdict=verdict,
+        sentence=_sentence(verdict, effects, before, back, noise),
+        noise_m=noise.total,
+        before=_errors(data, before, rng),
+        after=_errors(data, back, rng),
+        effects=tuple(effects),
+        entries=tuple(entries),
+        candidates=tuple(_candidate_rows(search.first, search.last, search.refits)),
+        confounded=tuple(rivals),
+        next_experiment=_next_experiment(data, rivals, not_testable),
+        not_testable=tuple(not_testable),
+        detectable=_detectable(search.last, {e["name"] for e in effects}),
+        left={
+            **describe_left(data.robot, data.train, residuals),
+            "structure": tests.document(),
+            "explained_share": excess.explained,
+        },
+        robot=robot,
+        declared=data.robot,
+        data=_card(data, before, final, noise, search.n_effective),
+        residuals=_residual_table(data, before, back),
+    )
+
+
+def _promoted(data: Data, search: Search) -> list[str]:
+    """Return the nuisances that the data moved significantly away from what is declared, with evidence for each as a whole."""
+    final = search.final.fit
+    result, at = [], 0
+    for effect, _, parameters in final.hypothesis.terms:
+        part = slice(at, at + len(parameters))
+        at += len(parameters)
+        if effect.name not in NUISANCE:
+            continue
+        values, std = final.coordinates[part], final.std[part]
+        size = np.abs(values) / (1.0 if effect.name == "stiffness" else np.maximum(data.input_scale, 1e-12))
+        moved = (np.abs(values) > SIGNIFICANT * std) & (size > RELEVANT)
+        if moved.any() and (len(parameters) == 1 or _is_evident(data, search, effect.name, len(parameters))):
+            result.append(effect.name)
+    return result
+
+
+def _is_evident(data: Data, search: Search, name: str, count: int) -> bool:
+    """Return whether a nuisance of several parameters, taken out of the fit as a whole, is missed (dBIC)."""
+    final = search.final
+    without = _refitted(data, final, [n for n in final.fit.hypothesis.names if n != name], search.noise)
+    missed = evidence(without.fit, final.fit) - count * np.log(search.n_effective) > EVIDENCE
+    return bool(missed and final.held_rms < without.held_rms)
+
+
+def _handed_back(data: Data, final: Stage, promoted: list[str], noise: Noise) -> Stage:
+    """Return the fit of just what is handed back: nuisances that stay as declared are taken out."""
+    keep = [n for n in final.fit.hypothesis.names if n not in NUISANCE or n in promoted]
+    if len(keep) == len(final.fit.hypothesis.names):
+        return final
+    return _refitted(data, final, keep, noise)
+
+
+def _refitted(data: Data, stage: Stage, keep: list[str], noise: Noise) -> Stage:
+    """Return a stage with some of its terms only, fitted again."""
+    terms = stage.fit.hypothesis.terms
+    mask = np.concatenate([np.full(len(p), e.name in keep) for e, _, p in terms]) if terms else np.zeros(0, dtype=bool)
+    hypothesis = replace(stage.fit.hypothesis, terms=tuple(t for t in terms if t[0].name in keep))
+    prior = Prior(stage.fit.prior.mean[mask], stage.fit.prior.std[mask])
+    return make_stage(data, hypothesis, prior, noise, stage.fit.coordinates[mask], own=own_of(stage))
+
+
+def _entries(stage: Stage, names: list[str]) -> list[Entry]:
+    """Return the tables of `[[effects]]`: those that change the mesh or the law first, then in the order in which they were found."""
+    settled = [{"name": effect.name, **seed} for effect, seed in stage.fit.hypothesis.settled]
+    tables = {e["name"]: e for e in stage.fit.hypothesis.entries(stage.fit.coordinates)}
+    return [_rounded(e) for e in settled] + [_rounded(tables[name]) for name in names if name in tables]
+
+
+def _chain(data: Data, search: Search, promoted: list[str], names: list[str], back: Stage) -> list[dict[str, Any]]:
+    """Return the effects in the order in which they were added, each with the held-out error before and after it."""
+    stages = dict(search.history)
+    errors = []
+    for i in range(len(promoted)):
+        alone = promoted[: i + 1] != [n for n in stages[""].fit.hypothesis.names]
+        stage = _refitted(data, stages[""], promoted[: i + 1], search.noise) if alone else stages[""]
+        errors.append(stage.held_rms)
+    errors += [stages[name].held_rms for name in names[len(promoted) :]]
+    if errors:
+        errors[-1] = back.held_rms
+    return [
+        {
+            "name": name,
+            "parameters": _parameters(search.final, back, name),
+            "validation_rms_before_m": b,
+            "validation_rms_after_m": a,
+        }
+        for name, b, a in zip(names, [search.before.held_rms, *errors], errors)
+    ]
+
+
+@dataclass(frozen=True, slots=True)
+class Excess:
+    """Root mean squares [m] over what is measured again and again alike."""
+
+    left: float
+    """What the final model leaves beyond the noise of repetition."""
+    tolerated: float
+    explained: float
+    """Share of the mean square beyond the noise that the effects took away."""
+
+
+def _excess(before: Stage, final: Stage, noise: Noise) -> Excess:
+    floor = np.sqrt(3.0 * sum(v**2 for k, v in noise.std.items() if k != "state"))
+    left = float(np.sqrt(max(final.fit.rms**2 - floor**2, 0.0)))
+    first = max(before.fit.rms**2 - floor**2, 1e-18)
+    return Excess(left, 0.25 * float(floor), float((before.fit.rms**2 - final.fit.rms**2) / first))
+
+
+def _rounded(entry: Entry) -> Entry:
+    def tidy(value: Any) -> Any:
+        if isinstance(value, float):
+            return float(f"{value:.9g}")
+        if isinstance(value, list):
+            return [tidy(v) for v in value]
+        return {k: tidy(v) for k, v in value.items()} if isinstance(value, dict) else value
+
+    return {k: tidy(v) for k, v in entry.items()}
+
+
+def _parameters(full: Stage, back: Stage, name: str) -> dict[str, Any]:
+    """Return {key: {value, std, unit}} of one effect; vectors and tables keep their shape. What was not fitted has std None.
+
+    Values are those that are handed back; standard deviations are those of the full fit, in which nothing was held still.
+    """
+    result = dict[str, Any]()
+    for effect, seed in back.fit.hypothesis.settled:
+        if effect.name == name:
+            result |= {k: {"value": v, "std": None, "unit": _unit(k)} for k, v in seed.items()}
+    spread = _coordinate_std(full, name)
+    at = 0
+    for effect, seed, parameters in back.fit.hypothesis.terms:
+        values = back.fit.coordinates[at : at + len(parameters)]
+        std = back.fit.std[at : at + len(parameters)]
+        at += len(parameters)
+        if effect.name != name:
+            continue
+        if spread is not None and len(spread) == len(std):
+            std = np.maximum(std, spread)
+        for p, value, deviation in zip(parameters, values, std):
+            slot = result.setdefault(p.key, {"value": None, "std": None, "unit": p.unit})
+            for field, number in (("value", p.value(value)), ("std", p.value_std(value, deviation))):
+                slot[field] = _placed(slot[field], p.part, float(number) if np.isfinite(number) else None)
+        result |= {k: {"value": v, "std": None, "unit": _unit(k)} for k, v in seed.items() if k not in result}
+    return result
+
+
+def _coordinate_std(stage: Stage, name: str) -> FloatArray | None:
+    at = 0
+    for effect, _, parameters in stage.fit.hypothesis.terms:
+        if effect.name == name:
+            return stage.fit.std[at : at + len(parameters)]
+        at += len(parameters)
+    return None
+
+
+def _unit(key: str) -> str:
+    return "m" if key.endswith("_m") else "s" if key.endswith("_s") else "1"
+
+
+def _placed(slot: Any, part: Any, number: float | None) -> Any:
+    if part is None:
+        return number
+    if isinstance(part, int):
+        return [*(slot or []), number]
+    if isinstance(part, tuple):
+        table = dict(slot or {})
+        table[part[0]] = [*table.get(part[0], []), number]
+        return table
+    return {**(slot or {}), part: number}
+
+
+def _errors(data: Data, stage: Stage, rng: np.random.Generator) -> dict[str, Any]:
+    squares = [(r**2).sum(axis=1) for r in stage.held_residuals]
+    labels = [np.unique(t.groups.sweep).size for t in data.held]
+    by_sweep = sum(labels) >= MIN_SWEEPS
+    blocks = [
+        s[group == g]
+        for s, t in zip(squares, data.held)
+        for group in [t.groups.sweep if by_sweep else t.groups.frame]
+        for g in np.unique(group)
+    ]
+    sums, counts = np.array([b.sum() for b in blocks]), np.array([len(b) for b in blocks])
+    drawn = rng.integers(0, len(blocks), size=(DRAWS, len(blocks)))
+    draws = np.sqrt(sums[drawn].sum(axis=1) / counts[drawn].sum(axis=1))
+    return {
+        "train_rms_m": stage.fit.rms,
+        "validation_rms_m": stage.held_rms,
+        "validation_ci_m": [float(np.quantile(draws, 0.025)), float(np.quantile(draws, 0.975))],
+        "validation_ci_by": "sweeps" if by_sweep else "frames",
+    }
+
+
+def _candidate_rows(first: list[Candidate], table: list[Candidate], refits: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return every effect that was tried with its scores: linear at the start, linear at the end, and the joint refits."""
+    last = {c.effect.name: c for c in one_each(table)}
+    rows = []
+    for c in one_each(first):
+        joint = [r for r in refits if r["name"] == c.effect.name]
+        end = last.get(c.effect.name)
+        rows.append({
+            "name": c.effect.name, "seed": c.seed, "dchi2": c.gain, "dbic": c.score, "retained_share": c.retained,
+            "dbic_at_end": None if end is None else end.score, "refits": joint, "verdict": joint[-1]["verdict"] if joint else _why_not(c),
+        })  # fmt: skip
+    return rows
+
+
+def _why_not(c: Candidate) -> str:
+    if c.retained < TESTABLE:
+        return f"not testable: calibration imitates {100 * np.sqrt(max(0.0, 1 - c.retained**2)):.0f} % of it"
+    return f"too little evidence (dBIC {c.score:.1f})"
+
+
+def _confounded(search: Search, names: list[str]) -> list[dict[str, Any]]:
+    """Return pairs that these data cannot tell apart: fields that agree, or refits whose evidence is within 10 of the named one."""
+    pairs = []
+    first = search.first
+    best = {r["name"]: r["dbic"] for r in search.refits if r.get("verdict") == "named"}
+    rivals = [r for r in search.refits if r["name"] not in names and r.get("verdict") == "passes"]
+    for name in (n for n in names if n in best):
+        pairs += [
+            {"pair": [name, r["name"]], "dbic_gap": float(best[name] - r["dbic"])}
+            for r in rivals
+            if r["step"] == _step_of(search, name) and r["dbic"] > best[name] - EVIDENCE
+        ]
+    ones = one_each(first)
+    for i, a in enumerate(ones):
+        for b in ones[i + 1 :]:
+            if a.retained < TESTABLE or b.retained < TESTABLE or len(b.parameters) > 6 or len(a.parameters) > 6:
+                continue
+            share = min(confounding(a, b), confounding(b, a))
+            if share > 0.95:
+                pairs.append({"pair": [a.effect.name, b.effect.name], "cosine": share})
+    return pairs
+
+
+def _step_of(search: Search, name: str) -> int:
+    return next(int(r["step"]) for r in search.refits if r["name"] == name and r.get("verdict") == "named")
+
+
+def _detectable(table: list[Candidate], found: set[str]) -> dict[str, Any]:
+    result: dict[str, Any] = {}
+    for c in one_each(table):
+        if c.effect.name in found:
+            continue
+        if c.effect.discrete:
+            seen = c.smallest[0] < 1.0 if len(c.smallest) else False
+            result[c.effect.name] = {"smallest": {}, "would_be_seen": bool(seen), "share_seen": float(c.smallest[0])}
+            continue
+        sizes = {p.label: float(s) if np.isfinite(s) else None for p, s in zip(c.parameters, c.smallest)}
+        result[c.effect.name] = {"smallest": sizes, "coordinate": c.parameters[0].scale, "unit": c.parameters[0].unit}
+    return result
+
+
+def _next_experiment(data: Data, rivals: list[dict[str, Any]], not_testable: list[dict[str, Any]]) -> str:
+    """Return in words what to record to tell apart what these data cannot."""
+    names = {n for r in rivals for n in r["pair"]} | {r["name"] for r in not_testable}
+    advice = []
+    recordings = [t.scene.recording for t in data.train]
+    unloading = any(
+        len(r.inputs) > 1
+        and (np.diff(r.inputs, axis=0).max(initial=0.0) > 0)
+        and (np.diff(r.inputs, axis=0).min(initial=0.0) < 0)
+        for r in recordings
+    )
+    if names & {"gravity", "payload"}:
+        advice.append(
+            "turn the base by 90° between frames, camera fixed (gravity_*_m_s2 in frames.csv): weight then changes direction and the pose does not"
+        )
+    if names & {"cable_friction", "creep", "cable_slack"}:
+        advice.append(
+            "go up and down at several levels, and hold for a minute"
+            if not unloading
+            else "hold for a minute at two levels, and repeat a sweep at another speed"
+        )
+    if names & {"cable_gain", "cable_offset", "stiffness", "cable_stretch"}:
+        advice.append("hang a known weight on the robot in some frames (loads.csv)")
+    if names & {"poisson", "soft_region", "base_compliance", "hyperelastic"}:
+        advice.append("add markers on opposite faces and close to the clamp, and pull opposite cables together")
+    if names & {"depth_scale", "marker_offset"}:
+        advice.append("record rest.csv: the unloaded body, and move the camera in depth")
+    return "; ".join(advice)
+
+
+def _sentence(verdict: str, effects: list[dict[str, Any]], before: Stage, after: Stage, noise: Noise) -> str:
+    error = f"held-out error {1e3 * before.held_rms:.2f} mm"
+    if verdict == "none":
+        return f"The model explains the data to their noise ({1e3 * noise.total:.2f} mm): {error}."
+    if verdict == "unexplained" and not effects:
+        return f"A residual is left that no effect of the list explains: {error}, noise {1e3 * noise.total:.2f} mm."
+    what = ", ".join(f"{e['name']} ({_short(e['parameters'])})" for e in effects)
+    tail = "" if verdict == "effects" else " A structured residual is left that no effect explains."
+    return f"The model lacks {what}; held-out error {1e3 * before.held_rms:.2f} mm before, {1e3 * after.held_rms:.2f} mm after.{tail}"
+
+
+def _short(parameters: dict[str, Any]) -> str:
+    def show(value: Any) -> str:
+        if isinstance(value, float):
+            return f"{value:.3g}"
+        if isinstance(value, list):
+            return "[" + ", ".join(show(v) for v in value) + "]"
+        return ", ".join(f"{k} {show(v)}" for k, v in value.items()) if isinstance(value, dict) else str(value)
+
+    return ", ".join(f"{k} {show(p['value'])}" + ("" if p["unit"] == "1" else f" {p['unit']}") for k, p in parameters.items())
+
+
+def _card(data: Data, before: Stage, final: Stage, noise: Noise, n_effective: float) -> dict[str, Any]:
+    nuisance = {
+        name: _parameters(final, final, name)
+        for name in NUISANCE
+        if any(e.name == name for e, _, _ in final.fit.hypothesis.terms)
+    }
+    return {
+        "recordings": [str(t.scene.recording.folder) for t in data.train],
+        "split": data.split,
+        "frames_fitted": [[int(t.scene.recording.frame_numbers[k]) for k in t.scene.frames] for t in data.train],
+        "frames_held_out": [[int(t.scene.recording.frame_numbers[k]) for k in t.scene.frames] for t in data.held],
+        "noise_components_m": noise.std,
+        "noise_source": noise.source,
+        "mesh_error_m": _mesh_error(data),
+        "effective_observations": n_effective,
+        "nuisance_after": nuisance,
+        "seat_std_m": data.seat_std,
+    }
+
+
+def _mesh_error(data: Data) -> float | None:
+    """Return how far a finer mesh would move the markers, root mean square [m]; None where it was not computed."""
+    errors = [(t.mesh_error**2).sum(axis=1) for t in data.train if t.mesh_error is not None]
+    return float(np.sqrt(np.mean(np.concatenate(errors)))) if errors else None
+
+
+def _residual_table(data: Data, before: Stage, after: Stage) -> dict[str, Any]:
+    rows: dict[str, list[Any]] = {"recording": [], "frame": [], "marker": [], "before_m": [], "after_m": []}
+    for i, (trial, a, b) in enumerate(zip(data.held, before.held_residuals, after.held_residuals)):
+        numbers = trial.scene.recording.frame_numbers[trial.scene.frame]
+        rows["recording"] += [i] * len(a)
+        rows["frame"] += [int(n) for n in numbers]
+        rows["marker"] += [data.robot.marker_names[m] for m in trial.scene.marker]
+        rows["before_m"] += a.tolist()
+        rows["after_m"] += b.tolist()
+    return rows
+
+
+__all__ = ["Search", "conclude"]

@@ -1,0 +1,258 @@
+"""Growth: refit the best candidates in full nonlinearity, accept one, polish it, and drop what is no longer needed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from femsense.arrays import FloatArray
+from femsense.calib.forward import Hypothesis
+from femsense.effects import Effect, Entry, Parameter
+from femsense.effects.loads import STANDARD_GRAVITY
+from femsense.errors import DataError, FemsenseError
+from femsense.loop.data import Data
+from femsense.loop.joint import JointFit, Prior
+from femsense.loop.noise import Noise
+from femsense.loop.predict import sweeps_predicted
+from femsense.loop.screen import Candidate, effect_fields, screen
+from femsense.loop.stages import Stage, make_stage, own_of, problem_of
+
+REFITS = 5
+"""Candidates that are refitted in full nonlinearity at the first step; half as many later."""
+REFITTABLE = 0.04
+"""A candidate of which calibration leaves less than this is not refitted."""
+EVIDENCE = 10.0
+"""dBIC that a named effect needs."""
+WORTH = 0.03
+"""Share of the held-out error that an effect must take away to be worth naming."""
+POLISHED = 2.0
+"""Decrease of χ² that each further parameter of a polished effect must bring."""
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Refit:
+    """A candidate after its joint fit."""
+
+    candidate: Candidate
+    stage: Stage
+    score: float
+    """dBIC of the nonlinear fit."""
+    record: dict[str, Any]
+    """What the report says of it."""
+
+
+def grow(
+    data: Data, stage: Stage, table: list[Candidate], noise: Noise, n_effective: float, say: Progress
+) -> tuple[Stage | None, list[dict[str, Any]]]:
+    """Return the stage with one more effect, or None where nothing passes, and what became of each candidate that was refitted."""
+    refits: list[Refit] = []
+    records: list[dict[str, Any]] = []
+    library = max(len({c.effect.name for c in table}), 1)
+    for candidate in _shortlist(table, first=not _added(stage)):
+        best = max((r.score for r in refits if r.record["verdict"] == "passes"), default=-np.inf)
+        if candidate.score < 0.5 * best - EVIDENCE:
+            break  # far behind: a joint refit seldom gains that much on its linear score
+        say(f"refitting with {candidate.effect.name}")
+        record: dict[str, Any] = {"name": candidate.effect.name, "seed": candidate.seed}
+        records.append(record)
+        try:
+            made = refit(data, stage, candidate, noise)
+        except FemsenseError as error:
+            record["verdict"] = f"no equilibrium: {error}"
+            continue
+        refits.append(_judged(data, stage, candidate, made, record, n_effective, library))
+    passing = [r for r in refits if r.record["verdict"] == "passes"]
+    if not passing:
+        return None, records
+    winner = max(passing, key=lambda r: r.score)
+    for rival in sorted(passing, key=lambda r: -r.score):
+        if rival.score > winner.score - EVIDENCE or rival is winner:
+            polished = _polish(data, stage, rival, noise, say)
+            rival.record["dbic"] += rival.stage.fit.chi2 - polished.fit.chi2 if polished is not rival.stage else 0.0
+            rival.record["validation_rms_m"] = polished.held_rms
+            refits[refits.index(rival)] = replace(rival, stage=polished, score=rival.record["dbic"])
+    passing = [r for r in refits if r.record["verdict"] == "passes"]
+    winner = max(passing, key=lambda r: r.score)
+    winner.record["verdict"] = "named"
+    return winner.stage, records
+
+
+def _added(stage: Stage) -> list[str]:
+    """Return the effects that growth has added."""
+    from femsense.loop.screen import NUISANCE
+
+    return [name for name in stage.fit.hypothesis.names if name not in NUISANCE]
+
+
+def _shortlist(table: list[Candidate], *, first: bool) -> list[Candidate]:
+    """Return the best candidate of each name (of each form, where forms are close), the best first."""
+    chosen: list[Candidate] = []
+    for candidate in table:
+        if candidate.score <= 0 or candidate.retained < REFITTABLE:
+            continue
+        same = [c for c in chosen if c.effect.name == candidate.effect.name]
+        if any(c.effect is candidate.effect for c in same) or (same and candidate.score < same[0].score - EVIDENCE):
+            continue
+        chosen.append(candidate)
+    return chosen[: REFITS if first else (REFITS + 1) // 2]
+
+
+def _judged(
+    data: Data, stage: Stage, candidate: Candidate, made: Stage, record: dict[str, Any], n_effective: float, library: int
+) -> Refit:
+    q = len(candidate.parameters)
+    gain = evidence(stage.fit, made.fit)
+    score = gain - q * np.log(n_effective) - 2.0 * np.log(library)
+    better, spread = sweeps_predicted(data.train, stage.fit, made.fit)
+    record |= {"dchi2": gain, "dbic": score, "validation_rms_m": made.held_rms, "cv_gain": better, "cv_spread": spread}
+    record["verdict"] = _objection(stage, made, candidate, score, better, spread) or "passes"
+    return Refit(candidate, made, score, record)
+
+
+def evidence(before: JointFit, after: JointFit) -> float:
+    """Return the decrease of χ², or that of (rows − parameters) log χ² where it is smaller: the scale of the noise is an estimate too."""
+    freedom = max(len(after.fit.residual) - len(after.fit.theta), 1)
+    return min(before.chi2 - after.chi2, freedom * float(np.log(before.chi2 / max(after.chi2, 1e-12))))
+
+
+def refit(data: Data, stage: Stage, candidate: Candidate, noise: Noise) -> Stage:
+    """Joint fit with one more effect, started from its linear step. Raises DataError where no start helps."""
+    null = np.array([p.null for p in candidate.parameters])
+    low, high = np.array([p.low for p in candidate.parameters]), np.array([p.high for p in candidate.parameters])
+    start = null if candidate.effect.discrete else np.clip(_first_guess(candidate, null), low, high)
+    hypothesis, prior = with_term(stage.fit, candidate.effect, candidate.seed, candidate.parameters)
+    shares = (1.0,) if candidate.effect.discrete else (1.0, 0.3, 0.0)  # a linear step may lead too far
+    for share in shares:
+        coordinates = np.concatenate([stage.fit.coordinates, null + share * (start - null)])
+        try:
+            made = make_stage(data, hypothesis, prior, noise, coordinates, own=own_of(stage), max_iterations=10)
+        except DataError:
+            continue
+        if made.fit.chi2 <= stage.fit.chi2 + 1.0:
+            return made
+    raise DataError("no start from which the fit improves")
+
+
+def with_term(fit: JointFit, effect: Effect, seed: Entry, parameters: tuple[Parameter, ...]) -> tuple[Hypothesis, Prior]:
+    """Return the hypothesis of a fit with one more effect, and its prior (flat in the effect)."""
+    old = fit.hypothesis
+    if not parameters:
+        settled = (*old.settled, (effect, seed))
+        return replace(old, robot=effect.apply(old.robot, seed), settled=settled), fit.prior
+    null = np.array([p.null for p in parameters])
+    prior = Prior(np.concatenate([fit.prior.mean, null]), np.concatenate([fit.prior.std, np.full(len(null), np.inf)]))
+    return replace(old, terms=(*old.terms, (effect, seed, parameters))), prior
+
+
+def _first_guess(candidate: Candidate, null: FloatArray) -> FloatArray:
+    """Return the linear step; for gravity its direction with the size that is known."""
+    start = null + candidate.step
+    if candidate.effect.name == "gravity":
+        start = start / max(float(np.linalg.norm(start)), 1e-9) * STANDARD_GRAVITY
+    return np.asarray(start)
+
+
+def _objection(stage: Stage, made: Stage, candidate: Candidate, score: float, better: float, spread: float) -> str | None:
+    """Return why an effect is not accepted, or None."""
+    q = len(candidate.parameters)
+    values, std = made.fit.coordinates[len(made.fit.coordinates) - q :], made.fit.std[len(made.fit.std) - q :]
+    if score <= EVIDENCE:
+        return f"too little evidence (dBIC {score:.1f})"
+    if not np.isfinite(std).all():
+        return "not identifiable: the data leave a parameter open"
+    low, high = np.array([p.low for p in candidate.parameters]), np.array([p.high for p in candidate.parameters])
+    at_bound = (values <= low + 1e-9) & (low > -np.inf) | (values >= high - 1e-9)
+    if at_bound.any() and not (candidate.effect.discrete and (values[at_bound] <= low[at_bound] + 1e-9).all()):
+        return "acts like it, but its value lies at the edge of what is plausible"
+    if np.isfinite(spread) and better <= spread:
+        return f"sweeps that are left out do not speak for it ({better:+.1f} ± {spread:.1f})"
+    if made.held_rms > (1.0 - WORTH) * stage.held_rms:
+        return f"held-out error does not fall enough ({1e3 * stage.held_rms:.3f} to {1e3 * made.held_rms:.3f} mm)"
+    return None
+
+
+# --- polishing -------------------------------------------------------------------------------------------------------------
+
+
+def _polish(data: Data, stage: Stage, winner: Refit, noise: Noise, say: Progress) -> Stage:
+    """Return the winner with its seed (place, radius, time) improved: first seeds near by, then fitted along."""
+    best = winner.stage
+    effect, seed = winner.candidate.effect, winner.candidate.seed
+    nearby = effect.nearby(data.robot, seed)
+    if nearby:
+        say(f"looking near by for {effect.name}")
+        candidate = _best_nearby(data, stage, effect, nearby, noise)
+        made = _tried(data, stage, candidate, noise) if candidate is not None else None
+        if made is not None and made.fit.chi2 < best.fit.chi2:
+            best, seed = made, candidate.seed  # type: ignore[union-attr]
+    more = effect.polish(data.robot, data.control, seed)
+    if not more:
+        return best
+    say(f"polishing {effect.name}")
+    *others, (_, _, parameters) = best.fit.hypothesis.terms
+    hypothesis = replace(best.fit.hypothesis, terms=(*others, (effect, seed, (*parameters, *more))))
+    null = np.array([p.null for p in more])
+    prior = Prior(np.concatenate([best.fit.prior.mean, null]), np.concatenate([best.fit.prior.std, np.full(len(null), np.inf)]))
+    try:
+        made = make_stage(data, hypothesis, prior, noise, np.concatenate([best.fit.coordinates, null]), own=own_of(best))
+    except FemsenseError:
+        return best
+    inside = all(p.low < v < p.high for p, v in zip(more, made.fit.coordinates[-len(more) :]))
+    return made if made.fit.chi2 < best.fit.chi2 - POLISHED * len(more) and inside else best
+
+
+def _best_nearby(data: Data, stage: Stage, effect: Effect, seeds: Any, noise: Noise) -> Candidate | None:
+    robot = stage.fit.hypothesis.robot_at(stage.fit.coordinates)
+    todo = [(effect, seed, effect.parameters(robot, data.control)) for seed in seeds]
+    fields = effect_fields(stage.fit, data.train, todo)
+    table = screen(stage.fit, problem_of(data, stage.fit, noise), fields, 100.0)
+    return max(table, key=lambda c: c.gain, default=None)
+
+
+def _tried(data: Data, stage: Stage, candidate: Candidate, noise: Noise) -> Stage | None:
+    try:
+        return refit(data, stage, candidate, noise)
+    except FemsenseError:
+        return None
+
+
+# --- pruning ---------------------------------------------------------------------------------------------------------------
+
+
+def prune(data: Data, stage: Stage, noise: Noise, n_effective: float, say: Progress) -> Stage:
+    """Return the stage without effects that those added later have made needless (dBIC for keeping them not above 0)."""
+    added = _added(stage)
+    for name in added[:-1]:
+        terms = stage.fit.hypothesis.terms
+        index = next((i for i, t in enumerate(terms) if t[0].name == name), None)
+        if index is None:
+            continue
+        say(f"asking whether {name} is still needed")
+        without = _without(data, stage, index, noise)
+        if without is None:
+            continue
+        q = len(terms[index][2])
+        if evidence(without.fit, stage.fit) - q * np.log(n_effective) <= 0.0:
+            stage = without
+    return stage
+
+
+def _without(data: Data, stage: Stage, index: int, noise: Noise) -> Stage | None:
+    terms = stage.fit.hypothesis.terms
+    spans = np.cumsum([0, *(len(p) for _, _, p in terms)])
+    keep = np.ones(spans[-1], dtype=bool)
+    keep[spans[index] : spans[index + 1]] = False
+    prior = Prior(stage.fit.prior.mean[keep], stage.fit.prior.std[keep])
+    hypothesis = replace(stage.fit.hypothesis, terms=terms[:index] + terms[index + 1 :])
+    try:
+        return make_stage(data, hypothesis, prior, noise, stage.fit.coordinates[keep], own=own_of(stage), max_iterations=10)
+    except FemsenseError:
+        return None
+
+
+__all__ = ["EVIDENCE", "Progress", "evidence", "grow", "prune", "refit", "with_term"]

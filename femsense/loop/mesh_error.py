@@ -1,0 +1,91 @@
+"""What the mesh itself costs: how far a mesh of half the size would move the markers, in every state.
+
+A residual of that shape says nothing of the robot. It counts as noise, once its size as standard deviation, so that no effect is named
+for what a finer mesh would explain. One Newton step from the state on the declared mesh, which the finer one holds exactly,
+gives it (a hierarchical estimate: Bank & Smith 1993).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from femsense.arrays import FloatArray
+from femsense.calib.forward import seats
+from femsense.effects.shape import finer_mesh, robot_on_mesh
+from femsense.errors import FemsenseError
+from femsense.fem.equilibrium import Equilibrium
+from femsense.fem.mesh import embed_points
+from femsense.loop.joint import JointFit, Trial
+from femsense.march import Walk, drive_of, one_step_finer
+from femsense.model import Robot
+
+MOST_TETS = 24000
+"""A finer mesh than this takes too long in every state."""
+MOST_WORK = 300_000
+"""Tetrahedra × states; beyond it the nearest state that was computed stands for others."""
+
+
+def with_mesh_errors(trials: list[Trial], fit: JointFit) -> list[Trial]:
+    """Return the trials with the error of a quadratic mesh at a fit; unchanged where the mesh is linear (it is an effect then) or huge."""
+    robot = fit.hypothesis.robot_at(fit.coordinates)
+    mesh = robot.body.mesh
+    if not mesh.is_quadratic or 8 * len(mesh.tets) > MOST_TETS:
+        return [replace(t, mesh_error=None) for t in trials]
+    try:
+        fine = robot_on_mesh(robot, finer_mesh(mesh, None, 1))
+    except FemsenseError:
+        return [replace(t, mesh_error=None) for t in trials]
+    at, result, pivot = 0, [], fit.hypothesis.robot.marker_points.mean(axis=0)
+    for trial, jet in zip(trials, fit.jets):
+        poses, initial = trial.place(fit.fit.theta[at : at + trial.size], pivot)
+        at += trial.size
+        moves = _moves(robot, fine, trial, seats(robot, trial.scene, poses), initial, jet.states)
+        error = np.array([moves[int(f)][m] for f, m in zip(trial.scene.frame, trial.scene.marker)])
+        result.append(replace(trial, mesh_error=error))
+    return result
+
+
+def _moves(
+    robot: Robot, fine: Robot, trial: Trial, places: FloatArray, initial: FloatArray | None, states: dict[int, Equilibrium]
+) -> dict[int, FloatArray]:
+    """Return by how much the finer mesh moves the markers in each frame [m], (m, 3)."""
+    coarse_walk = Walk(robot, drive_of(robot, trial.scene.recording, initial=initial))
+    fine_walk = Walk(fine, drive_of(fine, trial.scene.recording, initial=initial))
+    ties = embed_points(robot.body.mesh, fine.body.mesh.nodes)
+    here, there = embed_points(robot.body.mesh, places), embed_points(fine.body.mesh, places)
+    frames = sorted(states)
+    vectors = _state_vectors(trial, frames)
+    chosen = _representatives(vectors, max(8, MOST_WORK // len(fine.body.mesh.tets)))
+    known = []
+    for i in chosen:
+        base = states[frames[i]]
+        finer = one_step_finer(coarse_walk, fine_walk, frames[i], base, ties)
+        known.append(there.positions(finer) - here.positions(base.positions))
+    nearest = np.asarray(cKDTree(vectors[chosen]).query(vectors)[1])
+    return {k: known[j] for k, j in zip(frames, nearest)}
+
+
+def _state_vectors(trial: Trial, frames: list[int]) -> FloatArray:
+    """Return inputs, pressures, gravity and total load of each frame, each in units of its range, shape (f, q)."""
+    recording = trial.scene.recording
+    load = np.zeros((len(recording.time_s), 3))
+    np.add.at(load, recording.load_frame, recording.load_forces)
+    gravity = np.zeros((len(load), 0)) if recording.gravity is None else recording.gravity
+    table = np.hstack([recording.inputs, recording.pressures, gravity, load])[frames]
+    return np.asarray(table / np.maximum(np.ptp(table, axis=0), 1e-12))
+
+
+def _representatives(vectors: FloatArray, most: int) -> list[int]:
+    """Return indices of distinct states, at most so many, spread widely (farthest-point sampling)."""
+    chosen = [0]
+    distance = np.linalg.norm(vectors - vectors[0], axis=1)
+    while len(chosen) < most and distance.max() > 1e-9:
+        chosen.append(int(distance.argmax()))
+        distance = np.minimum(distance, np.linalg.norm(vectors - vectors[chosen[-1]], axis=1))
+    return chosen
+
+
+__all__ = ["with_mesh_errors"]

@@ -1,0 +1,133 @@
+"""Stages: a model, fitted jointly, with its error on held-out data, its noise and the fields of what it may lack."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from femsense.arrays import FloatArray
+from femsense.calib.forward import Hypothesis, evaluate_scene
+from femsense.effects import Effect, Entry, Parameter, find_effect
+from femsense.loop.data import Data, groups_of
+from femsense.loop.joint import JointFit, JointProblem, Prior, Trial, fit_jointly, rms_of
+from femsense.loop.noise import Noise, estimate_noise
+from femsense.loop.screen import NUISANCE, Candidate, Fields, candidates_for, effect_fields, one_each, screen
+from femsense.model import Robot
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Stage:
+    """A model with its fit and its error on held-out data."""
+
+    fit: JointFit
+    held_residuals: list[FloatArray]
+    held_rms: float
+
+
+def with_nuisance(data: Data) -> tuple[Hypothesis, Prior]:
+    """Return the declared model with what is always fitted along: the modulus and, where inputs are absolute, the cables' zeros."""
+    terms: list[tuple[Effect, Entry, tuple[Parameter, ...]]] = []
+    std: list[float] = []
+    for name in NUISANCE:
+        effect = find_effect(name)
+        parameters = effect.parameters(data.robot, data.control)
+        unknown_zero = any(t.initial is not None for t in data.train)
+        if not parameters or (name == "cable_offset" and unknown_zero):
+            continue
+        terms.append((effect, {}, parameters))
+        std += [0.7] if name == "stiffness" else [max(0.25 * float(s), 1e-9) for s in data.input_scale]
+    return Hypothesis(data.robot, tuple(terms)), Prior(np.zeros(len(std)), np.array(std))
+
+
+def make_stage(
+    data: Data,
+    hypothesis: Hypothesis,
+    prior: Prior,
+    noise: Noise,
+    coordinates: FloatArray,
+    *,
+    own: FloatArray | None = None,
+    max_iterations: int = 12,
+) -> Stage:
+    fit = fit_jointly(hypothesis, prior, data.train, noise, data.seat_std, coordinates, own=own, max_iterations=max_iterations)
+    residuals = held_out_residuals(data, fit, noise)
+    return Stage(fit, residuals, rms_of(residuals))
+
+
+def own_of(stage: Stage) -> FloatArray:
+    return np.array(stage.fit.fit.theta[: stage.fit.own])
+
+
+def held_out_residuals(data: Data, fit: JointFit, noise: Noise) -> list[FloatArray]:
+    """Return the residuals of the held-out data (k, 3); a recording of its own gets its own pose from its first frames."""
+    robot = fit.hypothesis.robot_at(fit.coordinates)
+    plain, pivot = Hypothesis(robot), data.robot.marker_points.mean(axis=0)
+    spans = np.cumsum([0, *(t.size for t in data.train)])
+    result = []
+    for trial, of in zip(data.held, data.held_of):
+        if of is not None:
+            poses, initial = data.train[of].place(fit.fit.theta[spans[of] : spans[of + 1]], pivot)
+        else:
+            poses, initial = _pose_on_first_frames(robot, trial, noise, data.seat_std, pivot)
+        jet = evaluate_scene(
+            plain,
+            trial.scene,
+            np.zeros(0),
+            poses,
+            initial,
+            derivative=False,
+            vary_initial=False,
+            pivot=pivot,
+            starts=trial.starts_on(robot.body.mesh),
+        )
+        result.append(jet.residual)
+    return result
+
+
+def _pose_on_first_frames(
+    robot: Robot, trial: Trial, noise: Noise, seat_std: float, pivot: FloatArray
+) -> tuple[list[FloatArray], FloatArray | None]:
+    frames = trial.scene.frames
+    scene = trial.scene.pick(frames[: max(1, round(0.2 * len(frames)))])
+    first = replace(trial, scene=scene, groups=groups_of(scene), starts={}, mesh_error=None)
+    fit = fit_jointly(Hypothesis(robot), Prior(np.zeros(0), np.zeros(0)), [first], noise, seat_std, np.zeros(0))
+    return first.place(fit.fit.theta, pivot)
+
+
+def fields_of(data: Data, stage: Stage, names: Sequence[str]) -> Fields:
+    """Return what each effect that is not in the model yet would do to the markers."""
+    seated = any(len(t.scene.rest_marker) for t in data.train)
+    todo = candidates_for(stage.fit, data.control, forms=data.forms, names=[n for n in names if n not in NUISANCE], has_seats=seated)
+    return effect_fields(stage.fit, data.train, todo)
+
+
+def problem_of(data: Data, fit: JointFit, noise: Noise) -> JointProblem:
+    return JointProblem(
+        fit.hypothesis, fit.prior, data.train, [noise.whitener(t.groups, t.mesh_error) for t in data.train], data.seat_std
+    )
+
+
+def noise_of(data: Data, stage: Stage, fields: Fields) -> tuple[Noise, float]:
+    """Estimate the noise from what the richest linear model leaves; return it with the effective number of observations."""
+    table = screen(stage.fit, problem_of(data, stage.fit, Noise({"white": 5e-4}, "")), fields, 100.0)
+    own = sum(t.size for t in data.train)
+    columns, extra, at = [], [], 0
+    for i, (trial, jet) in enumerate(zip(data.train, stage.fit.jets)):
+        k = len(jet.residual)
+        block = np.zeros((k, 3, own + (trial.mesh_error is not None)))
+        block[:, :, at : at + 6 * len(trial.poses)] = jet.by_pose
+        block[:, :, at + 6 * len(trial.poses) : at + trial.size] = jet.by_initial
+        if trial.mesh_error is not None:
+            block[:, :, -1] = trial.mesh_error
+        at += trial.size
+        columns.append(np.concatenate([block, jet.by_effect], axis=2))
+        others = [c.raw[i] for c in one_each(table) if c.effect.name != "marker_offset"]
+        extra.append(np.concatenate([np.zeros((k, 3, 0)), *others], axis=2))
+    noise = estimate_noise([j.residual for j in stage.fit.jets], columns, extra, [t.groups for t in data.train])
+    return noise, float(sum(3 * (t.groups.state.max() + 1) for t in data.train))
+
+
+def screen_stage(data: Data, fit: JointFit, noise: Noise, fields: Fields, n_effective: float) -> list[Candidate]:
+    return screen(fit, problem_of(data, fit, noise), fields, n_effective)
