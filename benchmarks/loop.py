@@ -2,7 +2,7 @@
 
     python benchmarks/loop.py tune                    # the seeds that thresholds may be tuned on
     python benchmarks/loop.py report                  # the sealed ones: figures of README and docs come from these
-    python benchmarks/loop.py report --cases 20       # some of each kind
+    python benchmarks/loop.py tune --every 6          # some of each kind
 
 Results stand in a file beside the script's working directory (one line a case) and are not computed again; `--table` prints from it.
 """
@@ -15,6 +15,7 @@ import multiprocessing
 import time
 import warnings
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -98,7 +99,11 @@ def detection_index(made: Made) -> dict[str, float]:
     left = s - Q @ (Q.T @ s)
     q = len(find_effect(hidden["name"]).parameters(robot, case.control)) or 1
     needed = np.sqrt(4.0 * (10.0 + q * np.log(3 * F * k)))
-    return {"d": float(np.linalg.norm(left)), "needed": float(needed), "retained": float(np.linalg.norm(left) / np.linalg.norm(s))}
+    return {
+        "d": float(np.linalg.norm(left)),
+        "needed": float(needed),
+        "retained": float(np.linalg.norm(left) / np.linalg.norm(s)),
+    }
 
 
 def _markers(robot: Robot, made: Made) -> FloatArray:
@@ -143,13 +148,29 @@ def parameter_errors(record: dict[str, Any]) -> list[tuple[float, bool | None]]:
     truth = record["hidden"][0]
     found = next(e for e in record["effects"] if e["name"] == truth["name"])["parameters"]
     result: list[tuple[float, bool | None]] = []
-    for key in ("scale", "poisson_ratio", "fraction", "coefficient", "stiffness_n_m", "tension_n", "displacement_m", "force_n", "vector_m_s2", "offset_m"):
+    for key in (
+        "scale",
+        "poisson_ratio",
+        "fraction",
+        "coefficient",
+        "stiffness_n_m",
+        "tension_n",
+        "displacement_m",
+        "force_n",
+        "vector_m_s2",
+        "offset_m",
+    ):
         if key not in truth or key not in found or (truth["name"] == "depth_scale" and key == "offset_m"):
             continue
         null = 0.45 if key == "poisson_ratio" else 1.0 if key == "scale" else 0.0
         for t, v, s in _matched(truth[key], found[key]["value"], found[key]["std"], null):
             size = np.linalg.norm(np.atleast_1d(t) - null)
-            result.append((float(np.linalg.norm(np.atleast_1d(v) - np.atleast_1d(t)) / size), None if s is None else bool(np.all(np.abs(np.atleast_1d(v) - np.atleast_1d(t)) <= 1.96 * np.atleast_1d(s)))))
+            result.append(
+                (
+                    float(np.linalg.norm(np.atleast_1d(v) - np.atleast_1d(t)) / size),
+                    None if s is None else bool(np.all(np.abs(np.atleast_1d(v) - np.atleast_1d(t)) <= 1.96 * np.atleast_1d(s))),
+                )
+            )
     return result
 
 
@@ -183,12 +204,20 @@ def table(records: Sequence[dict[str, Any]]) -> None:
     errors = [e for r in first for e in parameter_errors(r)]
     if errors:
         sizes = np.array([e for e, _ in errors])
-        row("error of the parameter, median / 90 %", f"{100 * np.median(sizes):.1f} % / {100 * np.quantile(sizes, 0.9):.1f} %", "10 / 25 % | 5 / 15 %")
+        row(
+            "error of the parameter, median / 90 %",
+            f"{100 * np.median(sizes):.1f} % / {100 * np.quantile(sizes, 0.9):.1f} %",
+            "10 / 25 % | 5 / 15 %",
+        )
         held = [c for _, c in errors if c is not None]
         row("95 % interval holds the truth", wilson(sum(held), len(held)), "85-99 % | 92-98 %")
     shares = [_recovered(r) for r in first]
     if shares:
-        row("recovered share of held-out error, median / 10 %", f"{np.median(shares):.2f} / {np.quantile(shares, 0.1):.2f}", ">= 0.90 | >= 0.97 / 0.90")
+        row(
+            "recovered share of held-out error, median / 10 %",
+            f"{np.median(shares):.2f} / {np.quantile(shares, 0.1):.2f}",
+            ">= 0.90 | >= 0.97 / 0.90",
+        )
         ratio = [r["after_m"] / r["before_m"] for r in first if r["d_prime"]["d"] > 10]
         row("held-out error after / before, d' > 10, median", f"{np.median(ratio):.2f} (noise included)", "<= 0.5 | <= 0.25")
     outside = [r for r in done if r["kind"] == "outside"]
@@ -196,13 +225,25 @@ def table(records: Sequence[dict[str, Any]]) -> None:
         part = [r for r in outside if r["white_m"] == s]
         right = [r for r in part if r["verdict"] == "unexplained" or not named(r)]
         row(f"outside the list: no confident name, noise {1e3 * s:.1f} mm", wilson(len(right), len(part)), ">= 70 % | >= 90 %")
-        row(f"  of them called unexplained, noise {1e3 * s:.1f} mm", wilson(sum(r["verdict"] == "unexplained" for r in part), len(part)), "")
+        row(
+            f"  of them called unexplained, noise {1e3 * s:.1f} mm",
+            wilson(sum(r["verdict"] == "unexplained" for r in part), len(part)),
+            "",
+        )
     two = [r for r in done if r["kind"] == "two"]
     hidden = [{e["name"] for e in r["hidden"]} for r in two]
     row("two hidden: both found", wilson(sum(h <= answer_set(r) for r, h in zip(two, hidden)), len(two)), ">= 50 % | >= 75 %")
-    row("two hidden: at least one, and no false one", wilson(sum(bool(h & answer_set(r)) and set(named(r)) <= h | {"cable_offset"} for r, h in zip(two, hidden)), len(two)), ">= 90 % | >= 97 %")
+    row(
+        "two hidden: at least one, and no false one",
+        wilson(sum(bool(h & answer_set(r)) and set(named(r)) <= h | {"cable_offset"} for r, h in zip(two, hidden)), len(two)),
+        ">= 90 % | >= 97 %",
+    )
     poor = [r for r in done if r["kind"] == "poor"]
-    row("what the recording cannot show is not named", wilson(sum(r["label"] not in named(r) or bool(r["not_testable"]) for r in poor), len(poor)), ">= 90 % | 100 %")
+    row(
+        "what the recording cannot show is not named",
+        wilson(sum(r["label"] not in named(r) or bool(r["not_testable"]) for r in poor), len(poor)),
+        ">= 90 % | 100 %",
+    )
     times = [r["cpu_s"] for r in done]
     row("time of improve, CPU, median / longest", f"{np.median(times):.0f} s / {np.max(times):.0f} s", "")
     power_curve(single)
@@ -222,13 +263,15 @@ def power_curve(single: Sequence[dict[str, Any]]) -> None:
     """Print how often the hidden effect is named, by its detection index."""
     print("\nd'/needed      cases  named  in the set  silent  another name")
     edges = [0.0, 0.25, 0.5, 1.0, 2.0, 4.0, np.inf]
-    for low, high in zip(edges, edges[1:]):
+    for low, high in pairwise(edges):
         part = [r for r in single if low <= r["d_prime"]["d"] / r["d_prime"]["needed"] < high]
         if part:
             right = sum(r["label"] in named(r) for r in part)
             inset = sum(r["label"] in answer_set(r) for r in part)
             silent = sum(not named(r) for r in part)
-            print(f"{low:4.2f} … {high:4.2f}   {len(part):5d}  {right:5d}  {inset:10d}  {silent:6d}  {sum(bool(named(r)) and r['label'] not in answer_set(r) for r in part):12d}")
+            print(
+                f"{low:4.2f} … {high:4.2f}   {len(part):5d}  {right:5d}  {inset:10d}  {silent:6d}  {sum(bool(named(r)) and r['label'] not in answer_set(r) for r in part):12d}"
+            )
 
 
 def failures(records: Sequence[dict[str, Any]]) -> None:
@@ -242,15 +285,21 @@ def failures(records: Sequence[dict[str, Any]]) -> None:
         missed = r["kind"] == "single" and detectable(r) and r["label"] not in named(r)
         if wrong or missed or (r["kind"] == "null" and r["verdict"] == "unexplained"):
             names = [(e["name"], {k: v["value"] for k, v in e["parameters"].items()}) for e in r["effects"]]
-            d = f"d'/needed {r['d_prime']['d'] / r['d_prime']['needed']:.1f} retained {r['d_prime']['retained']:.2f}" if "d_prime" in r else ""
-            print(f"  {r['number']:3d} {r['kind']:7s} {r['robot']:6s} {r['control']:12s} {1e3 * r['white_m']:.1f} mm {r['hidden'] or r['label']} {d} -> {r['verdict']}: {names}; {1e3 * r['before_m']:.2f} -> {1e3 * r['after_m']:.2f} mm (noise {1e3 * r['floor_m']:.2f})")
+            d = (
+                f"d'/needed {r['d_prime']['d'] / r['d_prime']['needed']:.1f} retained {r['d_prime']['retained']:.2f}"
+                if "d_prime" in r
+                else ""
+            )
+            print(
+                f"  {r['number']:3d} {r['kind']:7s} {r['robot']:6s} {r['control']:12s} {1e3 * r['white_m']:.1f} mm {r['hidden'] or r['label']} {d} -> {r['verdict']}: {names}; {1e3 * r['before_m']:.2f} -> {1e3 * r['after_m']:.2f} mm (noise {1e3 * r['floor_m']:.2f})"
+            )
 
 
 def main() -> None:
     """Run the cases that are not yet in the file, then print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("which", choices=sorted(SEEDS))
-    parser.add_argument("--cases", type=int, default=0, help="of each kind at most so many")
+    parser.add_argument("--every", type=int, default=1, help="take every so many-th case of each kind")
     parser.add_argument("--out", type=Path, default=None)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--table", action="store_true", help="print from the file, run nothing")
@@ -262,7 +311,7 @@ def main() -> None:
     jobs = []
     for case in make_cases(SEEDS[options.which], COUNTS):
         counted[case.kind] = counted.get(case.kind, 0) + 1
-        if case.number not in known and not (options.cases and counted[case.kind] > options.cases):
+        if case.number not in known and (counted[case.kind] - 1) % options.every == 0:
             jobs.append((options.which, case))
     if not options.table:
         with multiprocessing.get_context("spawn").Pool(options.workers) as pool:
@@ -270,10 +319,12 @@ def main() -> None:
                 records.append(record)
                 with out.open("a") as file:
                     file.write(json.dumps(record, default=float) + "\n")
-                print(f"{len(records)} {record['kind']} {record['label']} {record.get('verdict', record.get('failed'))} {[e['name'] for e in record.get('effects', [])]}", flush=True)
+                print(
+                    f"{len(records)} {record['kind']} {record['label']} {record.get('verdict', record.get('failed'))} {[e['name'] for e in record.get('effects', [])]}",
+                    flush=True,
+                )
     table(records)
     failures(records)
-
 
 
 if __name__ == "__main__":

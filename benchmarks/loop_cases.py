@@ -270,11 +270,15 @@ def make_data(case: Case, seed: int) -> Made:
     if law == "corotational" and any(e["name"] == "hyperelastic" for e in case.hidden):
         raise ValueError("the hidden law needs a hyperelastic truth")
     true = design.robot(fine=True, law=law, gravity=EARTH if case.declared_gravity else (0, 0, 0), modulus=scale * design.modulus)
-    true = apply_effects(true, [e for e in case.hidden if e["name"] != "hyperelastic"])
+    true = apply_effects(true, [_on_fine_clamp(e, declared, true) for e in case.hidden if e["name"] != "hyperelastic"])
     recorded, labels, time_s = excursions(design, case.control, rng, poor=case.poor)
     loads = _known_loads(design, labels, rng) if not case.poor else (np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
-    plan = Plan(case.control, freeze(time_s), tuple(labels), freeze(np.ones(len(labels)), bool), freeze(_driven(case, recorded, time_s)), freeze(np.zeros(recorded.shape[1])),
-                None, freeze(loads[0], np.int64), freeze(loads[1]), freeze(loads[2]), _contacts(case, labels, rng))  # fmt: skip
+    F, a = recorded.shape
+    plan = Plan(
+        control=case.control, time_s=freeze(time_s), sweep=tuple(labels), free=freeze(np.ones(F), bool), commanded=freeze(_driven(case, recorded, time_s)),
+        initial=freeze(np.zeros(a)), pressures=freeze(np.zeros((F, 0))), gravity=None, load_frame=freeze(loads[0], np.int64), load_points=freeze(loads[1]), load_forces=freeze(loads[2]),
+        contacts=_contacts(case, labels, rng),
+    )  # fmt: skip
     if case.outside == "draught":
         true = replace(true, body=true.body.with_gravity(true.body.gravity + 1.2 * case.size * np.array([0.3, 1.0, 0.2])))
         plan = replace(plan, gravity=freeze(_gusts(declared, true, labels)))
@@ -282,6 +286,13 @@ def make_data(case: Case, seed: int) -> Made:
     markers = np.array([true.markers.positions(f.state.positions) for f in frames])
     recording, T, noise = _measure(case, declared, true, plan, recorded, markers, rng)
     return Made(case, declared, recording, markers, T, scale, noise)
+
+
+def _on_fine_clamp(entry: dict[str, Any], declared: Robot, true: Robot) -> dict[str, Any]:
+    """Return an entry whose springs, one a node of the declared mesh, are spread over the nodes of the true one."""
+    if entry["name"] != "base_compliance":
+        return entry
+    return {**entry, "stiffness_n_m": entry["stiffness_n_m"] * len(declared.body.clamp_nodes) / len(true.body.clamp_nodes)}
 
 
 def excursions(design: Design, control: str, rng: np.random.Generator, *, poor: bool) -> tuple[FloatArray, list[str], FloatArray]:

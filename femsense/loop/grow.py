@@ -69,17 +69,41 @@ def grow(
     passing = [r for r in refits if r.record["verdict"] == "passes"]
     if not passing:
         return None, records
-    winner = max(passing, key=lambda r: r.score)
-    for rival in sorted(passing, key=lambda r: -r.score):
-        if rival.score > winner.score - EVIDENCE or rival is winner:
-            polished = _polish(data, stage, rival, noise, say)
-            rival.record["dbic"] += rival.stage.fit.chi2 - polished.fit.chi2 if polished is not rival.stage else 0.0
-            rival.record["validation_rms_m"] = polished.held_rms
-            refits[refits.index(rival)] = replace(rival, stage=polished, score=rival.record["dbic"])
-    passing = [r for r in refits if r.record["verdict"] == "passes"]
-    winner = max(passing, key=lambda r: r.score)
+    leaders = [r for r in passing if r.score > max(p.score for p in passing) - EVIDENCE]
+    leaders = [_polished(data, stage, r, noise, say) for r in leaders]
+    winner = max(leaders, key=lambda r: r.score)
+    winner = _enriched(data, stage, winner, table, noise, n_effective, library, say)
     winner.record["verdict"] = "named"
     return winner.stage, records
+
+
+def _polished(data: Data, stage: Stage, refitted: Refit, noise: Noise, say: Progress) -> Refit:
+    polished = _polish(data, stage, refitted, noise, say)
+    if polished is refitted.stage:
+        return refitted
+    score = refitted.score + refitted.stage.fit.chi2 - polished.fit.chi2
+    refitted.record.update({"dbic": score, "validation_rms_m": polished.held_rms})
+    return replace(refitted, stage=polished, score=score)
+
+
+def _enriched(
+    data: Data, stage: Stage, winner: Refit, table: list[Candidate], noise: Noise, n_effective: float, library: int, say: Progress
+) -> Refit:
+    """Return the winner in a form with more parameters where that has EVIDENCE over the simple one."""
+    for form in _forms(table, winner.candidate.effect.name):
+        if len(form.parameters) <= len(winner.candidate.parameters):
+            continue
+        say(f"trying {form.effect.name} with {len(form.parameters)} parameters")
+        made = _tried(data, stage, form, noise)
+        if made is None:
+            continue
+        rich = _judged(data, stage, form, made, dict(winner.record), n_effective, library)
+        if rich.record["verdict"] == "passes":
+            rich = _polished(data, stage, rich, noise, say)
+        if rich.record["verdict"] == "passes" and rich.score > winner.score + EVIDENCE:
+            winner.record.update(rich.record | {"seed": form.seed})
+            winner = replace(rich, record=winner.record)
+    return winner
 
 
 def _added(stage: Stage) -> list[str]:
@@ -90,16 +114,23 @@ def _added(stage: Stage) -> list[str]:
 
 
 def _shortlist(table: list[Candidate], *, first: bool) -> list[Candidate]:
-    """Return the best candidate of each name (of each form, where forms are close), the best first."""
+    """Return the best candidate of each name, in its simplest form (or forms, if several are equally simple), the best first."""
+    names = list(dict.fromkeys(c.effect.name for c in table if c.score > 0 and c.retained >= REFITTABLE))
     chosen: list[Candidate] = []
+    for name in names[: REFITS if first else (REFITS + 1) // 2]:
+        forms = _forms(table, name)
+        simple = min(len(c.parameters) for c in forms)
+        chosen += [c for c in forms if len(c.parameters) == simple]
+    return chosen
+
+
+def _forms(table: list[Candidate], name: str) -> list[Candidate]:
+    """Return the best candidate of each form of an effect."""
+    best: dict[int, Candidate] = {}
     for candidate in table:
-        if candidate.score <= 0 or candidate.retained < REFITTABLE:
-            continue
-        same = [c for c in chosen if c.effect.name == candidate.effect.name]
-        if any(c.effect is candidate.effect for c in same) or (same and candidate.score < same[0].score - EVIDENCE):
-            continue
-        chosen.append(candidate)
-    return chosen[: REFITS if first else (REFITS + 1) // 2]
+        if candidate.effect.name == name and candidate.retained >= REFITTABLE:
+            best.setdefault(id(candidate.effect), candidate)
+    return list(best.values())
 
 
 def _judged(
@@ -107,7 +138,7 @@ def _judged(
 ) -> Refit:
     q = len(candidate.parameters)
     gain = evidence(stage.fit, made.fit)
-    score = gain - q * np.log(n_effective) - 2.0 * np.log(library)
+    score = gain - q * np.log(n_effective) - 2.0 * np.log(library * candidate.seeds)
     better, spread = sweeps_predicted(data.train, stage.fit, made.fit)
     record |= {"dchi2": gain, "dbic": score, "validation_rms_m": made.held_rms, "cv_gain": better, "cv_spread": spread}
     record["verdict"] = _objection(stage, made, candidate, score, better, spread) or "passes"

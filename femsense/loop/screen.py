@@ -45,7 +45,9 @@ class Candidate:
     gain: float
     """Decrease of χ² by that step."""
     score: float
-    """dBIC: gain − q log n − 2 log m."""
+    """dBIC: gain − q log n − 2 log m, m the number of effects times that of the form's seeds."""
+    seeds: int
+    """How many seeds of this form were tried."""
     smallest: FloatArray
     """Size of each parameter (in its coordinate) that would just have been seen, shape (q,)."""
 
@@ -104,10 +106,13 @@ def screen(base: JointFit, problem: JointProblem, fields: Fields, n_effective: f
         left = whole - Q @ (Q.T @ whole)
         step, gain = _whole_step(left, residual) if effect.discrete else _best_step(left, residual, parameters)
         q = len(parameters)
-        score = gain - q * np.log(n_effective) - 2.0 * np.log(effects)
+        seeds = sum(e is effect for e, _, _ in fields.todo)
+        score = gain - q * np.log(n_effective) - 2.0 * np.log(effects * seeds)
         retained = float(np.linalg.norm(left) / np.linalg.norm(whole))
         result.append(
-            Candidate(effect, seed, parameters, own, left, retained, step, gain, float(score), _smallest(left, q, n_effective))
+            Candidate(
+                effect, seed, parameters, own, left, retained, step, gain, float(score), seeds, _smallest(left, q, n_effective)
+            )
         )
     return sorted(result, key=lambda c: -c.score)
 
