@@ -401,7 +401,7 @@ def _card(data: Data, before: Stage, final: Stage, noise: Noise, n_effective: fl
 
 def _mesh_error(data: Data) -> float | None:
     """Return how far a finer mesh would move the markers, root mean square [m]; None where it was not computed."""
-    errors = [(t.mesh_error**2).sum(axis=1) for t in data.train if t.mesh_error is not None]
+    errors = [(t.mesh_error**2).sum(axis=(1, 2)) for t in data.train if t.mesh_error is not None]
     return float(np.sqrt(np.mean(np.concatenate(errors)))) if errors else None
 
 

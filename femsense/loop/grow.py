@@ -14,11 +14,11 @@ from femsense.effects import Effect, Entry, Parameter
 from femsense.effects.loads import STANDARD_GRAVITY
 from femsense.errors import DataError, FemsenseError
 from femsense.loop.data import Data
-from femsense.loop.joint import JointFit, Prior
+from femsense.loop.joint import JointFit, Prior, rms_of
 from femsense.loop.noise import Noise
 from femsense.loop.predict import sweeps_predicted
 from femsense.loop.screen import Candidate, effect_fields, screen
-from femsense.loop.stages import Stage, make_stage, own_of, problem_of
+from femsense.loop.stages import Stage, held_chi2, make_stage, own_of, problem_of
 
 REFITS = 5
 """Candidates that are refitted in full nonlinearity at the first step; half as many later."""
@@ -26,8 +26,10 @@ REFITTABLE = 0.04
 """A candidate of which calibration leaves less than this is not refitted."""
 EVIDENCE = 10.0
 """dBIC that a named effect needs."""
-WORTH = 0.03
-"""Share of the held-out error that an effect must take away to be worth naming."""
+PREDICTS = 0.2
+"""Share of the decrease of χ², a row, that must show on held-out rows too."""
+ABOVE_MESH = 0.5
+"""An effect must move the markers by this much of what the mesh itself costs (beyond what calibration absorbs)."""
 POLISHED = 2.0
 """Decrease of χ² that each further parameter of a polished effect must bring."""
 
@@ -65,7 +67,7 @@ def grow(
         except FemsenseError as error:
             record["verdict"] = f"no equilibrium: {error}"
             continue
-        refits.append(_judged(data, stage, candidate, made, record, n_effective, library))
+        refits.append(_judged(data, stage, candidate, made, record, noise, n_effective, library))
     passing = [r for r in refits if r.record["verdict"] == "passes"]
     if not passing:
         return None, records
@@ -97,7 +99,7 @@ def _enriched(
         made = _tried(data, stage, form, noise)
         if made is None:
             continue
-        rich = _judged(data, stage, form, made, dict(winner.record), n_effective, library)
+        rich = _judged(data, stage, form, made, dict(winner.record), noise, n_effective, library)
         if rich.record["verdict"] == "passes":
             rich = _polished(data, stage, rich, noise, say)
         if rich.record["verdict"] == "passes" and rich.score > winner.score + EVIDENCE:
@@ -125,23 +127,40 @@ def _shortlist(table: list[Candidate], *, first: bool) -> list[Candidate]:
 
 
 def _forms(table: list[Candidate], name: str) -> list[Candidate]:
-    """Return the best candidate of each form of an effect."""
-    best: dict[int, Candidate] = {}
+    """Return the best candidate of each form of an effect (one cable or marker alone is a form of its own)."""
+    best: dict[tuple[int, int], Candidate] = {}
     for candidate in table:
         if candidate.effect.name == name and candidate.retained >= REFITTABLE:
-            best.setdefault(id(candidate.effect), candidate)
+            best.setdefault((id(candidate.effect), len(candidate.parameters)), candidate)
     return list(best.values())
 
 
 def _judged(
-    data: Data, stage: Stage, candidate: Candidate, made: Stage, record: dict[str, Any], n_effective: float, library: int
+    data: Data,
+    stage: Stage,
+    candidate: Candidate,
+    made: Stage,
+    record: dict[str, Any],
+    noise: Noise,
+    n_effective: float,
+    library: int,
 ) -> Refit:
     q = len(candidate.parameters)
     gain = evidence(stage.fit, made.fit)
     score = gain - q * np.log(n_effective) - 2.0 * np.log(library * candidate.seeds)
     better, spread = sweeps_predicted(data.train, stage.fit, made.fit)
     record |= {"dchi2": gain, "dbic": score, "validation_rms_m": made.held_rms, "cv_gain": better, "cv_spread": spread}
-    record["verdict"] = _objection(stage, made, candidate, score, better, spread) or "passes"
+    held = held_chi2(data, stage, noise) - held_chi2(data, made, noise)
+    moved, mesh = _moved(stage, made), mesh_cost(data, stage)
+    record |= {"held_dchi2": held, "moved_m": moved, "mesh_cost_m": mesh}
+    fit_objection = _objection(made, candidate, score)
+    if fit_objection is None and np.isfinite(spread) and better <= spread:
+        fit_objection = f"sweeps that are left out do not speak for it ({better:+.1f} ± {spread:.1f})"
+    if fit_objection is None and held < PREDICTS * gain * _held_share(data):
+        fit_objection = f"it does not predict the held-out data (χ² falls by {held:.1f}, by {gain:.1f} where fitted)"
+    if fit_objection is None and moved < ABOVE_MESH * mesh:
+        fit_objection = f"it moves the markers by {1e3 * moved:.3f} mm, the mesh itself by {1e3 * mesh:.3f} mm"
+    record["verdict"] = fit_objection or "passes"
     return Refit(candidate, made, score, record)
 
 
@@ -188,7 +207,32 @@ def _first_guess(candidate: Candidate, null: FloatArray) -> FloatArray:
     return np.asarray(start)
 
 
-def _objection(stage: Stage, made: Stage, candidate: Candidate, score: float, better: float, spread: float) -> str | None:
+def _held_share(data: Data) -> float:
+    """Return held-out rows for each fitted one."""
+    return sum(len(t.scene.frame) for t in data.held) / max(sum(len(t.scene.frame) for t in data.train), 1)
+
+
+def _moved(before: Stage, after: Stage) -> float:
+    """Return by how much an effect moves the markers beyond what calibration does [m], root mean square."""
+    return rms_of([b.residual - a.residual for a, b in zip(after.fit.jets, before.fit.jets)])
+
+
+def mesh_cost(data: Data, stage: Stage) -> float:
+    """Return what the mesh costs beyond what calibration absorbs [m], root mean square of the markers; 0 where it is not known."""
+    if any(t.mesh_error is None for t in data.train):
+        return 0.0
+    errors = [t.mesh_error.sum(axis=2).ravel() for t in data.train if t.mesh_error is not None]
+    J = [np.concatenate([j.by_pose, j.by_effect], axis=2).reshape(e.size, -1) for j, e in zip(stage.fit.jets, errors)]
+    return float(np.sqrt(3.0 * np.mean(np.concatenate([_rest(j, e) for j, e in zip(J, errors)]) ** 2)))
+
+
+def _rest(columns: FloatArray, values: FloatArray) -> FloatArray:
+    scale = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    fitted = np.linalg.lstsq(columns / scale, values, rcond=1e-9)[0]
+    return np.asarray(values - columns / scale @ fitted)
+
+
+def _objection(made: Stage, candidate: Candidate, score: float) -> str | None:
     """Return why an effect is not accepted, or None."""
     q = len(candidate.parameters)
     values, std = made.fit.coordinates[len(made.fit.coordinates) - q :], made.fit.std[len(made.fit.std) - q :]
@@ -200,10 +244,6 @@ def _objection(stage: Stage, made: Stage, candidate: Candidate, score: float, be
     at_bound = (values <= low + 1e-9) & (low > -np.inf) | (values >= high - 1e-9)
     if at_bound.any() and not (candidate.effect.discrete and (values[at_bound] <= low[at_bound] + 1e-9).all()):
         return "acts like it, but its value lies at the edge of what is plausible"
-    if np.isfinite(spread) and better <= spread:
-        return f"sweeps that are left out do not speak for it ({better:+.1f} ± {spread:.1f})"
-    if made.held_rms > (1.0 - WORTH) * stage.held_rms:
-        return f"held-out error does not fall enough ({1e3 * stage.held_rms:.3f} to {1e3 * made.held_rms:.3f} mm)"
     return None
 
 

@@ -70,7 +70,7 @@ def improve(
     say("fitting what calibration may move")
     base = make_stage(data, hypothesis, prior, noise, np.zeros(len(prior.mean)))
     say("asking what the mesh costs")
-    data = replace(data, train=with_mesh_errors(data.train, base.fit))
+    data = with_mesh_errors(data, base)
     history: list[tuple[str, Stage]] = [("", base)]
     stage, first, refits = base, list[Candidate](), list[dict[str, Any]]()
     growing = _fresh(data)

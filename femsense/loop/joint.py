@@ -36,7 +36,7 @@ class Trial:
     starts: dict[int, tuple[TetMesh, dict[int, Equilibrium]]]
     """States of earlier evaluations, frame by frame, for each mesh."""
     mesh_error: FloatArray | None = None
-    """How far a finer mesh would move the markers [m], shape (k, 3); counts as noise of that size."""
+    """How far a finer mesh would move the markers [m], one field a sweep, shape (k, 3, sweeps); counts as noise of that size."""
 
     @property
     def size(self) -> int:

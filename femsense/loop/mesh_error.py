@@ -7,18 +7,21 @@ gives it (a hierarchical estimate: Bank & Smith 1993).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from femsense.arrays import FloatArray
-from femsense.calib.forward import seats
+from femsense.calib.forward import Hypothesis, evaluate_scene, seats
 from femsense.effects.shape import finer_mesh, robot_on_mesh
 from femsense.errors import FemsenseError
 from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.mesh import embed_points
-from femsense.loop.joint import JointFit, Trial
+from femsense.loop.data import Data
+from femsense.loop.joint import Trial
+from femsense.loop.stages import Stage, placed
 from femsense.march import Walk, drive_of, one_step_finer
 from femsense.model import Robot
 
@@ -28,24 +31,38 @@ MOST_WORK = 300_000
 """Tetrahedra × states; beyond it the nearest state that was computed stands for others."""
 
 
-def with_mesh_errors(trials: list[Trial], fit: JointFit) -> list[Trial]:
-    """Return the trials with the error of a quadratic mesh at a fit; unchanged where the mesh is linear (it is an effect then) or huge."""
-    robot = fit.hypothesis.robot_at(fit.coordinates)
+def with_mesh_errors(data: Data, stage: Stage) -> Data:
+    """Return the data with the error of a quadratic mesh at a stage; without it where the mesh is linear (it is an effect then) or huge."""
+    robot = stage.fit.hypothesis.robot_at(stage.fit.coordinates)
     mesh = robot.body.mesh
     if not mesh.is_quadratic or 8 * len(mesh.tets) > MOST_TETS:
-        return [replace(t, mesh_error=None) for t in trials]
+        return data
     try:
         fine = robot_on_mesh(robot, finer_mesh(mesh, None, 1))
+        train = [_with_error(robot, fine, t, *p) for t, p in zip(data.train, placed(data, stage.fit))]
+        own = [placed(data, stage.fit)[of] if of is not None else (t.poses, t.initial) for t, of in zip(data.held, data.held_of)]
+        held = [_with_error(robot, fine, t, *p) for t, p in zip(data.held, own)]
     except FemsenseError:
-        return [replace(t, mesh_error=None) for t in trials]
-    at, result, pivot = 0, [], fit.hypothesis.robot.marker_points.mean(axis=0)
-    for trial, jet in zip(trials, fit.jets):
-        poses, initial = trial.place(fit.fit.theta[at : at + trial.size], pivot)
-        at += trial.size
-        moves = _moves(robot, fine, trial, seats(robot, trial.scene, poses), initial, jet.states)
-        error = np.array([moves[int(f)][m] for f, m in zip(trial.scene.frame, trial.scene.marker)])
-        result.append(replace(trial, mesh_error=error))
-    return result
+        return data
+    return replace(data, train=train, held=held)
+
+
+def _with_error(robot: Robot, fine: Robot, trial: Trial, poses: Sequence[FloatArray], initial: FloatArray | None) -> Trial:
+    places = seats(robot, trial.scene, poses)
+    states = evaluate_scene(
+        Hypothesis(robot), trial.scene, np.zeros(0), poses, initial, derivative=False, vary_initial=False,
+        pivot=robot.marker_points.mean(axis=0), starts=trial.starts_on(robot.body.mesh),
+    ).states  # fmt: skip
+    return replace(trial, mesh_error=_by_sweep(trial, _moves(robot, fine, trial, places, initial, states)))
+
+
+def _by_sweep(trial: Trial, moves: dict[int, FloatArray]) -> FloatArray:
+    """Return the error as one field a sweep [m], (k, 3, sweeps): each sweep loads the mesh in its own way."""
+    error = np.array([moves[int(f)][m] for f, m in zip(trial.scene.frame, trial.scene.marker)])
+    number = np.unique(trial.groups.sweep, return_inverse=True)[1]
+    fields = np.zeros((*error.shape, int(number.max()) + 1))
+    fields[np.arange(len(error)), :, number] = error
+    return fields
 
 
 def _moves(

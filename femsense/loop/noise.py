@@ -65,14 +65,14 @@ class Noise:
     def whitener(self, groups: Groups, error: FloatArray | None = None) -> Whitener:
         """Return what whitens rows with these groups.
 
-        `error` (k, 3) is a field [m] that the residual may hold by chance, with a standard deviation of once its size.
+        `error` (k, 3, b) are fields [m] that the residual may hold by chance, each with a standard deviation of once its size.
         """
         lower = np.asarray(cholesky(self.covariance(groups), lower=True))
+        plain = Whitener(lower, np.zeros((3 * len(lower), 0)), np.zeros(0))
         if error is None:
-            return Whitener(lower, np.zeros(0), 0.0)
-        field = whiten(Whitener(lower, np.zeros(0), 0.0), error)
-        size = float(np.linalg.norm(field))
-        return Whitener(lower, field / max(size, 1e-300), 1.0 - 1.0 / np.sqrt(1.0 + size**2))
+            return plain
+        directions, size, _ = np.linalg.svd(whiten(plain, error), full_matrices=False)
+        return Whitener(lower, directions, 1.0 - 1.0 / np.sqrt(1.0 + size**2))
 
     @property
     def total(self) -> float:
@@ -82,13 +82,14 @@ class Noise:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Whitener:
-    """A square root of the inverse covariance Σ ⊗ 1₃ + e eᵀ:  w ↦ (1 − shrink · d dᵀ) L⁻¹ w."""
+    """A square root of the inverse covariance Σ ⊗ 1₃ + E Eᵀ:  w ↦ (1 − D diag(shrink) Dᵀ) L⁻¹ w."""
 
     lower: FloatArray
     """Cholesky factor L of Σ, shape (k, k)."""
-    direction: FloatArray
-    """L⁻¹ e as a unit vector d, shape (3k,); empty without e."""
-    shrink: float
+    directions: FloatArray
+    """Left singular vectors D of L⁻¹ E, shape (3k, b)."""
+    shrink: FloatArray
+    """shape (b,)."""
 
 
 def whiten(whitener: Whitener, values: FloatArray) -> FloatArray:
@@ -96,9 +97,10 @@ def whiten(whitener: Whitener, values: FloatArray) -> FloatArray:
     k = len(values)
     flat = solve_triangular(whitener.lower, values.reshape(k, -1), lower=True)
     rows = np.asarray(flat.reshape(3 * k, *values.shape[2:]))
-    if not whitener.direction.size:
+    if not whitener.shrink.size:
         return rows
-    return np.asarray(rows - np.multiply.outer(whitener.direction, whitener.shrink * (whitener.direction @ rows)))
+    along = np.tensordot(whitener.directions.T, rows, axes=1)
+    return np.asarray(rows - np.tensordot(whitener.directions * whitener.shrink, along, axes=1))
 
 
 MAX_REML_ROWS = 700

@@ -66,7 +66,20 @@ def candidates_for(
             parameters = effect.parameters(robot, control)
             if parameters or effect.discrete:
                 result.append((effect, seed, parameters))
+            parts = _parts(parameters)
+            if len(parts) > 1:
+                result += [(effect, seed, part) for part in parts]
     return result
+
+
+def _parts(parameters: tuple[Parameter, ...]) -> list[tuple[Parameter, ...]]:
+    """Return the parameters of each cable or marker by itself: an effect may be that of one of them alone."""
+    parts: dict[str, list[Parameter]] = {}
+    for p in parameters:
+        owner = p.part[0] if isinstance(p.part, tuple) else p.part
+        if isinstance(owner, str):
+            parts.setdefault(owner, []).append(p)
+    return [tuple(part) for part in parts.values()]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -106,7 +119,7 @@ def screen(base: JointFit, problem: JointProblem, fields: Fields, n_effective: f
         left = whole - Q @ (Q.T @ whole)
         step, gain = _whole_step(left, residual) if effect.discrete else _best_step(left, residual, parameters)
         q = len(parameters)
-        seeds = sum(e is effect for e, _, _ in fields.todo)
+        seeds = sum(e is effect and len(p) == len(parameters) for e, _, p in fields.todo)
         score = gain - q * np.log(n_effective) - 2.0 * np.log(effects * seeds)
         retained = float(np.linalg.norm(left) / np.linalg.norm(whole))
         result.append(

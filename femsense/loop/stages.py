@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from femsense.calib.forward import Hypothesis, evaluate_scene
 from femsense.effects import Effect, Entry, Parameter, find_effect
 from femsense.loop.data import Data, groups_of
 from femsense.loop.joint import JointFit, JointProblem, Prior, Trial, fit_jointly, rms_of
-from femsense.loop.noise import Noise, estimate_noise
+from femsense.loop.noise import Noise, estimate_noise, whiten
 from femsense.loop.screen import NUISANCE, Candidate, Fields, candidates_for, effect_fields, one_each, screen
 from femsense.model import Robot
 
@@ -103,6 +104,20 @@ def fields_of(data: Data, stage: Stage, names: Sequence[str]) -> Fields:
     return effect_fields(stage.fit, data.train, todo)
 
 
+def placed(data: Data, fit: JointFit) -> list[tuple[list[FloatArray], FloatArray | None]]:
+    """Return poses and initial inputs of each training trial at a fit."""
+    pivot = data.robot.marker_points.mean(axis=0)
+    spans = np.cumsum([0, *(t.size for t in data.train)])
+    return [t.place(fit.fit.theta[a:b], pivot) for t, (a, b) in zip(data.train, pairwise(spans))]
+
+
+def held_chi2(data: Data, stage: Stage, noise: Noise) -> float:
+    """Return the whitened sum of squares of the held-out residuals."""
+    return float(
+        sum((whiten(noise.whitener(t.groups, t.mesh_error), r) ** 2).sum() for t, r in zip(data.held, stage.held_residuals))
+    )
+
+
 def problem_of(data: Data, fit: JointFit, noise: Noise) -> JointProblem:
     return JointProblem(
         fit.hypothesis, fit.prior, data.train, [noise.whitener(t.groups, t.mesh_error) for t in data.train], data.seat_std
@@ -113,14 +128,15 @@ def noise_of(data: Data, stage: Stage, fields: Fields) -> tuple[Noise, float]:
     """Estimate the noise from what the richest linear model leaves; return it with the effective number of observations."""
     table = screen(stage.fit, problem_of(data, stage.fit, Noise({"white": 5e-4}, "")), fields, 100.0)
     own = sum(t.size for t in data.train)
+    widest = max(0 if t.mesh_error is None else t.mesh_error.shape[2] for t in data.train)
     columns, extra, at = [], [], 0
     for i, (trial, jet) in enumerate(zip(data.train, stage.fit.jets)):
         k = len(jet.residual)
-        block = np.zeros((k, 3, own + (trial.mesh_error is not None)))
+        block = np.zeros((k, 3, own + widest))
         block[:, :, at : at + 6 * len(trial.poses)] = jet.by_pose
         block[:, :, at + 6 * len(trial.poses) : at + trial.size] = jet.by_initial
         if trial.mesh_error is not None:
-            block[:, :, -1] = trial.mesh_error
+            block[:, :, own : own + trial.mesh_error.shape[2]] = trial.mesh_error
         at += trial.size
         columns.append(np.concatenate([block, jet.by_effect], axis=2))
         others = [c.raw[i] for c in one_each(table) if c.effect.name != "marker_offset"]

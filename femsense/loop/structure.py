@@ -89,8 +89,9 @@ def without_mesh_error(trial: Trial, residual: FloatArray, noise: Noise) -> Floa
     if trial.mesh_error is None:
         return residual
     plain = noise.whitener(trial.groups)
-    g, r = whiten(plain, trial.mesh_error), whiten(plain, residual)
-    return np.asarray(residual - float(g @ r) / (1.0 + float(g @ g)) * trial.mesh_error)
+    G, r = whiten(plain, trial.mesh_error), whiten(plain, residual)
+    share = np.linalg.solve(np.eye(G.shape[1]) + G.T @ G, G.T @ r)
+    return np.asarray(residual - trial.mesh_error @ share)
 
 
 def _field(trial: Trial, residual: FloatArray) -> tuple[FloatArray, IntArray]:
