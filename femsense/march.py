@@ -356,8 +356,16 @@ class _Balance:
         return np.asarray(pulled)
 
 
-def one_step_finer(walk: Walk, fine: Walk, frame: int, base: Equilibrium, ties: Embedding) -> FloatArray:
-    """Return where the nodes of a finer mesh come to rest [m], shape (n, 3), after one Newton step from a state of a coarser one.
+FINER_STEPS = 5
+FINER_ENOUGH = 0.2
+"""Newton steps on the finer mesh end when the unbalanced force has fallen to this share."""
+
+
+def finer_state(walk: Walk, fine: Walk, frame: int, base: Equilibrium, ties: Embedding) -> FloatArray | None:
+    """Return where the nodes of a finer mesh come to rest [m], shape (n, 3), nearly: Newton steps from a state of a coarser one.
+
+    One step is most often enough, since the finer mesh holds the coarse state exactly and its error is small. None where the steps
+    do not settle.
 
     Arguments:
         walk: the coarse robot and its drive.
@@ -366,15 +374,20 @@ def one_step_finer(walk: Walk, fine: Walk, frame: int, base: Equilibrium, ties: 
         base: the coarse state of that frame.
         ties: of the fine nodes to the coarse mesh.
     """
-    x = ties.positions(base.positions)
-    body = fine.robot.body
-    start = replace(base, positions=x, factor=None)
-    tangent = tangent_at(body, start)
-    force, pulled, _ = _Balance(walk, frame, base).upset_by(fine, base.segment_tensions, x, x)
-    move = tangent.respond(force[None])[0]
-    if base.held.any():
-        move = move + np.tensordot(pulled[base.held[: len(body.cables)]], tangent.respond_to_held(), axes=1)
-    return np.asarray(x + move)
+    body, balance = fine.robot.body, _Balance(walk, frame, base)
+    x, first = ties.positions(base.positions), np.inf
+    for step in range(FINER_STEPS):
+        force, pulled, _ = balance.upset_by(fine, base.segment_tensions, x, x)
+        size = float(np.linalg.norm(force.ravel()[body.free_map.dofs]))
+        first = size if step == 0 else first
+        if step and size < FINER_ENOUGH * first:
+            return x
+        tangent = tangent_at(body, replace(base, positions=x, factor=None))
+        move = tangent.respond(force[None])[0]
+        if base.held.any():
+            move = move + np.tensordot(pulled[base.held[: len(body.cables)]], tangent.respond_to_held(), axes=1)
+        x = np.asarray(x + move)
+    return None
 
 
 def _same_mechanics(walk: Walk, variant: Walk) -> bool:

@@ -298,6 +298,12 @@ def _confounded(search: Search, names: list[str]) -> list[dict[str, Any]]:
             for r in rivals
             if r["step"] == _step_of(search, name) and r["dbic"] > best[name] - EVIDENCE
         ]
+    for name in (n for n in names if n in NUISANCE):
+        pairs += [
+            {"pair": [name, r["name"]], "dbic_gap": 0.0}
+            for r in search.refits
+            if name in r.get("takes_over", []) and r["name"] not in names and r["dbic"] > EVIDENCE
+        ]
     ones = one_each(first)
     for i, a in enumerate(ones):
         for b in ones[i + 1 :]:

@@ -17,7 +17,7 @@ from femsense.loop.data import Data
 from femsense.loop.joint import JointFit, Prior, rms_of
 from femsense.loop.noise import Noise
 from femsense.loop.predict import sweeps_predicted
-from femsense.loop.screen import Candidate, effect_fields, screen
+from femsense.loop.screen import NUISANCE, Candidate, effect_fields, screen
 from femsense.loop.stages import Stage, held_chi2, make_stage, own_of, problem_of
 
 REFITS = 5
@@ -26,7 +26,9 @@ REFITTABLE = 0.04
 """A candidate of which calibration leaves less than this is not refitted."""
 EVIDENCE = 10.0
 """dBIC that a named effect needs."""
-PREDICTS = 0.2
+ENOUGH_SPREAD = 0.5
+"""Standard errors by which the prediction of left-out sweeps must get better."""
+PREDICTS = 0.05
 """Share of the decrease of χ², a row, that must show on held-out rows too."""
 ABOVE_MESH = 0.5
 """An effect must move the markers by this much of what the mesh itself costs (beyond what calibration absorbs)."""
@@ -110,8 +112,6 @@ def _enriched(
 
 def _added(stage: Stage) -> list[str]:
     """Return the effects that growth has added."""
-    from femsense.loop.screen import NUISANCE
-
     return [name for name in stage.fit.hypothesis.names if name not in NUISANCE]
 
 
@@ -152,9 +152,9 @@ def _judged(
     record |= {"dchi2": gain, "dbic": score, "validation_rms_m": made.held_rms, "cv_gain": better, "cv_spread": spread}
     held = held_chi2(data, stage, noise) - held_chi2(data, made, noise)
     moved, mesh = _moved(stage, made), mesh_cost(data, stage)
-    record |= {"held_dchi2": held, "moved_m": moved, "mesh_cost_m": mesh}
+    record |= {"held_dchi2": held, "moved_m": moved, "mesh_cost_m": mesh, "takes_over": _taken_over(stage, made)}
     fit_objection = _objection(made, candidate, score)
-    if fit_objection is None and np.isfinite(spread) and better <= spread:
+    if fit_objection is None and np.isfinite(spread) and better <= ENOUGH_SPREAD * spread:
         fit_objection = f"sweeps that are left out do not speak for it ({better:+.1f} ± {spread:.1f})"
     if fit_objection is None and held < PREDICTS * gain * _held_share(data):
         fit_objection = f"it does not predict the held-out data (χ² falls by {held:.1f}, by {gain:.1f} where fitted)"
@@ -205,6 +205,22 @@ def _first_guess(candidate: Candidate, null: FloatArray) -> FloatArray:
     if candidate.effect.name == "gravity":
         start = start / max(float(np.linalg.norm(start)), 1e-9) * STANDARD_GRAVITY
     return np.asarray(start)
+
+
+def _taken_over(before: Stage, after: Stage) -> list[str]:
+    """Return the nuisances that are significant before an effect is added, and not after."""
+    return [n for n in NUISANCE if _z(before, n) > 3.0 and _z(after, n) < 3.0]
+
+
+def _z(stage: Stage, name: str) -> float:
+    """Return by how many standard deviations the values of a nuisance differ from none, at most."""
+    at = 0
+    for effect, _, parameters in stage.fit.hypothesis.terms:
+        part = slice(at, at + len(parameters))
+        at += len(parameters)
+        if effect.name == name:
+            return float(np.max(np.abs(stage.fit.coordinates[part]) / np.maximum(stage.fit.std[part], 1e-300)))
+    return 0.0
 
 
 def _held_share(data: Data) -> float:

@@ -1,8 +1,8 @@
 """What the mesh itself costs: how far a mesh of half the size would move the markers, in every state.
 
 A residual of that shape says nothing of the robot. It counts as noise, once its size as standard deviation, so that no effect is named
-for what a finer mesh would explain. One Newton step from the state on the declared mesh, which the finer one holds exactly,
-gives it (a hierarchical estimate: Bank & Smith 1993).
+for what a finer mesh would explain. A Newton step or two from the state on the declared mesh, which the finer one holds exactly,
+give it (a hierarchical estimate: Bank & Smith 1993).
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from scipy.spatial import cKDTree
 from femsense.arrays import FloatArray
 from femsense.calib.forward import Hypothesis, evaluate_scene, seats
 from femsense.effects.shape import finer_mesh, robot_on_mesh
-from femsense.errors import FemsenseError
+from femsense.errors import DataError, FemsenseError
 from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.mesh import embed_points
 from femsense.loop.data import Data
 from femsense.loop.joint import Trial
 from femsense.loop.stages import Stage, placed
-from femsense.march import Walk, drive_of, one_step_finer
+from femsense.march import Walk, drive_of, finer_state
 from femsense.model import Robot
 
 MOST_TETS = 24000
@@ -76,12 +76,16 @@ def _moves(
     frames = sorted(states)
     vectors = _state_vectors(trial, frames)
     chosen = _representatives(vectors, max(8, MOST_WORK // len(fine.body.mesh.tets)))
-    known = []
+    known, settled = [], []
     for i in chosen:
         base = states[frames[i]]
-        finer = one_step_finer(coarse_walk, fine_walk, frames[i], base, ties)
-        known.append(there.positions(finer) - here.positions(base.positions))
-    nearest = np.asarray(cKDTree(vectors[chosen]).query(vectors)[1])
+        finer = finer_state(coarse_walk, fine_walk, frames[i], base, ties)
+        if finer is not None:
+            settled.append(i)
+            known.append(there.positions(finer) - here.positions(base.positions))
+    if not known:
+        raise DataError("no state settles on the finer mesh")
+    nearest = np.asarray(cKDTree(vectors[settled]).query(vectors)[1])
     return {k: known[j] for k, j in zip(frames, nearest)}
 
 
