@@ -196,6 +196,7 @@ def walk_along(
             yield k, *known[key]
             continue
         near = base if starts is None else starts.get(k, base)
+        near = near if near is None or _clamp_fits(walk.robot.body, near) else None
         base = _require(solve_frame(walk, k, start=near, before=memory[0], reuse_factor=near is not base), k)
         memory[0] = base.segment_tensions if past else None
         seen = observe(walk.robot, base)
@@ -207,6 +208,12 @@ def walk_along(
             known[key] = (kept, seen, others)
         if k in wanted:
             yield k, kept, seen, others
+
+
+def _clamp_fits(body: BodyModel, state: Equilibrium) -> bool:
+    """Return whether a state can serve as a start: a clamp that gave way elsewhere would be torn back."""
+    held = body.clamped if body.clamp_is_rigid else body.clamped[:0]
+    return bool(np.abs(state.positions[held] - body.mesh.nodes[held]).max(initial=0.0) < 1e-9)
 
 
 def _observe_variants(

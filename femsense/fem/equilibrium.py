@@ -144,6 +144,7 @@ def solve_equilibrium(
     before: tuple[FloatArray, ...] | None = None,
     bilateral: bool = False,
     reuse_factor: bool = False,
+    along: tuple[FloatArray, ...] | None = None,
     max_iterations: int = 60,
     relative_tolerance: float = 1e-9,
 ) -> Equilibrium:
@@ -160,6 +161,8 @@ def solve_equilibrium(
         before: tensions along the cables until now [N], for friction; by default those of `start`, else none.
         bilateral: held cables may push.
         reuse_factor: begin with the factor of `start` (for changes so small that its stiffness still serves).
+        along: tension of each segment of each cable for a tension of 1 at its motor [1], held still: for laws of friction of one's
+            own; cables with friction of theirs move on from it. By default 1 without friction, and with it as `start` left it.
         max_iterations: Newton steps at each load level.
         relative_tolerance: of the unbalanced force against the sum of all loads.
 
@@ -176,12 +179,14 @@ def solve_equilibrium(
     if start is not None:
         _check_start(body, start)
     loads = _collect_loads(body, given, nodal_forces, start, before, bilateral, relative_tolerance)
-    state = _initial_state(body, loads, start, reuse_factor)
+    state = _initial_state(body, loads, start, reuse_factor, along)
     shares = [s.copy() for s in state.shares]
     status, reached = _settle(body, loads, state, max_iterations), 1.0
     if status not in (CONVERGED, "singular") and start is not None and start.converged and body.is_held():
         first = _loads_of(body, start, loads)
-        state, status, reached = _step_loads(body, first, loads, _initial_state(body, first, start, False), state, max_iterations)
+        state, status, reached = _step_loads(
+            body, first, loads, _initial_state(body, first, start, False, along), state, max_iterations
+        )
     if status not in (CONVERGED, "singular") and body.is_held():
         nothing = replace(loads, forces=0.0 * loads.forces, effort=0.0 * loads.effort, target=0.0 * loads.target)
         rest = _State(body.mesh.nodes.copy(), nothing.effort.copy(), _first_taut(body, loads), shares)
@@ -278,8 +283,10 @@ def _first_taut(body: BodyModel, loads: _Loads) -> BoolArray:
     return loads.controlled & (~cable | (loads.target >= 0.0) | loads.bilateral)
 
 
-def _initial_state(body: BodyModel, loads: _Loads, start: Equilibrium | None, reuse_factor: bool) -> _State:
-    shares = [np.ones(len(c.path)) for c in body.cables]
+def _initial_state(
+    body: BodyModel, loads: _Loads, start: Equilibrium | None, reuse_factor: bool, along: tuple[FloatArray, ...] | None
+) -> _State:
+    shares = [np.ones(len(c.path)) for c in body.cables] if along is None else [np.array(share) for share in along]
     if start is None:
         return _State(body.mesh.nodes.copy(), loads.effort.copy(), _first_taut(body, loads), shares)
     x = start.positions.copy()
@@ -294,7 +301,7 @@ def _initial_state(body: BodyModel, loads: _Loads, start: Equilibrium | None, re
     T[loads.controlled & ~taut] = 0.0
     for i, tensions in enumerate(start.segment_tensions):
         motor = start.tension[body.cable_names[i]]
-        if motor > 0:
+        if motor > 0 and body.cables[i].friction > 0 and along is None:
             shares[i] = tensions / motor
     far = np.inf if start.status == "unstable" else 0.0  # where nothing moves, stability is looked at all the same
     usable = reuse_factor and start.factor is not None and start.factor.size == len(body.free_map.dofs)

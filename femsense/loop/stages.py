@@ -100,7 +100,9 @@ def _pose_on_first_frames(
 def fields_of(data: Data, stage: Stage, names: Sequence[str]) -> Fields:
     """Return what each effect that is not in the model yet would do to the markers."""
     seated = any(len(t.scene.rest_marker) for t in data.train)
-    todo = candidates_for(stage.fit, data.control, forms=data.forms, names=[n for n in names if n not in NUISANCE], has_seats=seated)
+    todo = candidates_for(
+        stage.fit, data.control, forms=data.forms, names=[n for n in names if n not in NUISANCE], has_seats=seated
+    )
     return effect_fields(stage.fit, data.train, todo)
 
 

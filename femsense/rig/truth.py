@@ -278,10 +278,11 @@ class _Walker:
         names = body.cable_names
         values = {name: float(v) for name, v in zip(names, load.inputs)}
         motor = values if self.control == "tension" else dict(self.state.tension)
-        start = replace(self.state, tension=motor, segment_tensions=tuple(along))
+        start = replace(self.state, tension=motor)
+        shares = tuple(t / motor[n] if motor[n] > 0 else np.ones_like(t) for n, t in zip(names, along))
         tension, held = (values, None) if self.control == "tension" else (None, values)
         pressure = dict(zip(body.chamber_names, load.pressures.tolist()))
-        state = solve_equilibrium(body, tension=tension, shortening=held, pressure=pressure, nodal_forces=forces, start=start, reuse_factor=True)  # fmt: skip
+        state = solve_equilibrium(body, tension=tension, shortening=held, pressure=pressure, nodal_forces=forces, start=start, along=shares, reuse_factor=True)  # fmt: skip
         if not state.converged:
             raise DataError(f"the truth has no equilibrium in frame {frame}: {state.status}: {state.advice}")
         return state
