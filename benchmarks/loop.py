@@ -313,6 +313,7 @@ def main() -> None:
         counted[case.kind] = counted.get(case.kind, 0) + 1
         if case.number not in known and (counted[case.kind] - 1) % options.every == 0:
             jobs.append((options.which, case))
+    np.random.default_rng(0).shuffle(jobs)  # so that a part of the cases is a fair sample
     if not options.table:
         with multiprocessing.get_context("spawn").Pool(options.workers) as pool:
             for record in pool.imap_unordered(run_case, jobs):

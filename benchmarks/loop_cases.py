@@ -290,7 +290,7 @@ def make_data(case: Case, seed: int) -> Made:
 
 def _on_fine_clamp(entry: dict[str, Any], declared: Robot, true: Robot) -> dict[str, Any]:
     """Return an entry whose springs, one a node of the declared mesh, are spread over the nodes of the true one."""
-    if entry["name"] != "base_compliance":
+    if entry["name"] != "base_compliance" or "stiffness_n_m" not in entry:
         return entry
     return {**entry, "stiffness_n_m": entry["stiffness_n_m"] * len(declared.body.clamp_nodes) / len(true.body.clamp_nodes)}
 

@@ -304,6 +304,8 @@ def _confounded(search: Search, names: list[str]) -> list[dict[str, Any]]:
             for r in search.refits
             if name in r.get("takes_over", []) and r["name"] not in names and r["dbic"] > EVIDENCE
         ]
+    if "cable_offset" in names and any(c.effect.name == "cable_slack" for c in first):
+        pairs.append({"pair": ["cable_offset", "cable_slack"], "cosine": 1.0})  # play is a negative zero of the displacement
     ones = one_each(first)
     for i, a in enumerate(ones):
         for b in ones[i + 1 :]:

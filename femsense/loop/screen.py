@@ -90,11 +90,14 @@ class Fields:
     """The effects and seeds that can be evaluated."""
     raw: list[FloatArray]
     """Columns [m], one array (k, 3, Σq) a trial; a discrete alternative has one column, its whole change."""
+    rest: list[FloatArray]
+    """The same of the seats that rest.csv measures [m], (r, 3, Σq) a trial."""
 
-    def of(self, i: int) -> list[FloatArray]:
-        """Return the columns of one effect, one array (k, 3, q) a trial."""
+    def of(self, i: int) -> tuple[list[FloatArray], list[FloatArray]]:
+        """Return the columns of one effect in markers and seats, one array (k, 3, q) and (r, 3, q) a trial."""
         spans = np.cumsum([0, *(1 if e.discrete else len(p) for e, _, p in self.todo)])
-        return [block[:, :, spans[i] : spans[i + 1]] for block in self.raw]
+        part = slice(spans[i], spans[i + 1])
+        return [block[:, :, part] for block in self.raw], [block[:, :, part] for block in self.rest]
 
 
 def screen(base: JointFit, problem: JointProblem, fields: Fields, n_effective: float) -> list[Candidate]:
@@ -112,8 +115,8 @@ def screen(base: JointFit, problem: JointProblem, fields: Fields, n_effective: f
     effects = max(len({e.name for e, _, _ in fields.todo}), 1)
     result = []
     for i, (effect, seed, parameters) in enumerate(fields.todo):
-        own = fields.of(i)
-        whole = _whitened(base, problem, own)
+        own, rest = fields.of(i)
+        whole = _whitened(base, problem, own, rest)
         if not np.isfinite(whole).all() or np.linalg.norm(whole) == 0:
             continue
         left = whole - Q @ (Q.T @ whole)
@@ -138,9 +141,13 @@ def effect_fields(base: JointFit, trials: list[Trial], todo: list[tuple[Effect, 
     every = Hypothesis(fixed, tuple(smooth))
     null = np.array([p.null for p in every.parameters])
     probe = JointProblem(every, Prior(np.zeros(0), np.zeros(0)), trials, [], 1.0)
-    raw, at = [], 0
+    raw, rest, at = [], [], 0
     for trial in trials:
-        raw.append(probe.jet(trial, base.fit.theta[at : at + trial.size], null, True).by_effect)
+        jet = probe.jet(trial, base.fit.theta[at : at + trial.size], null, True)
+        raw.append(jet.by_effect)
+        rest.append(
+            jet.rest_by_effect.reshape(*jet.rest.shape, -1) if jet.rest.size else np.zeros((0, 3, jet.by_effect.shape[2]))
+        )
         at += trial.size
     usable = smooth
     for one in (t for t in todo if t[0].discrete and _can_act(fixed, t)):
@@ -148,7 +155,8 @@ def effect_fields(base: JointFit, trials: list[Trial], todo: list[tuple[Effect, 
         if changes is not None:
             usable = [*usable, one]
             raw = [np.concatenate([block, change[:, :, None]], axis=2) for block, change in zip(raw, changes)]
-    return Fields(usable, raw)
+            rest = [np.concatenate([block, np.zeros((*block.shape[:2], 1))], axis=2) for block in rest]
+    return Fields(usable, raw, rest)
 
 
 def _can_act(robot: Robot, one: tuple[Effect, Entry, tuple[Parameter, ...]]) -> bool:
@@ -178,14 +186,16 @@ def _whole_change(
     return changes
 
 
-def _whitened(base: JointFit, problem: JointProblem, own: list[FloatArray]) -> FloatArray:
-    """Return columns whitened and padded with zeros to the rows of the fit (seats, declared poses and priors see nothing)."""
+def _whitened(base: JointFit, problem: JointProblem, own: list[FloatArray], rest: list[FloatArray]) -> FloatArray:
+    """Return columns of markers and seats, whitened, with zeros for the other rows of the fit (declared poses and priors)."""
     q = own[0].shape[2]
     result = np.zeros((len(base.fit.residual), q))
     at = 0
-    for trial, factor, block, jet in zip(problem.trials, problem.factors, own, base.jets):
-        result[at : at + block.shape[0] * 3] = whiten(factor, block)
-        at += block.shape[0] * 3 + jet.rest.size + 6 * len(trial.poses)
+    for trial, factor, block, seats in zip(problem.trials, problem.factors, own, rest):
+        k, s = 3 * len(block), 3 * len(seats)
+        result[at : at + k] = whiten(factor, block)
+        result[at + k : at + k + s] = seats.reshape(s, q) / problem.seat_std
+        at += k + s + 6 * len(trial.poses)
     return result
 
 
