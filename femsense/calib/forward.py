@@ -186,11 +186,12 @@ class SceneJet:
 
 def evaluate_scene(
     hypothesis: Hypothesis, scene: Scene, coordinates: FloatArray, poses: Sequence[FloatArray], initial: FloatArray | None,
-    *, derivative: bool, vary_initial: bool, pivot: FloatArray, starts: dict[int, Equilibrium] | None = None,
+    *, derivative: bool, vary_initial: bool, pivot: FloatArray, starts: dict[int, Equilibrium] | None = None, noiseless: bool = False,
 ) -> SceneJet:  # fmt: skip
     """Evaluate marker residuals of a scene at a point of parameter space, and their derivatives by differences.
 
-    `starts` holds states of earlier evaluations near by and is brought up to date.
+    `starts` holds states of earlier evaluations near by and is brought up to date. With `noiseless` the columns of effects are
+    those at points where the model would have them measured: a column made of measured points holds their noise.
 
     Raises:
         DataError: a frame has no equilibrium.
@@ -217,8 +218,9 @@ def evaluate_scene(
         for i in range(len(variants)):
             shifted[i][k] = others[i]
     residual = marker_residual(robot, scene, poses, model)
-    clean = _as_predicted(robot, scene, poses, model)  # a column made of measured points would hold their noise
-    columns = [marker_residual(v.robot, clean, poses, m) / h for v, m, h in zip(variants, shifted, steps)]
+    seen_at = _as_predicted(robot, scene, poses, model) if noiseless else scene
+    here = marker_residual(robot, seen_at, poses, model)
+    columns = [(marker_residual(v.robot, seen_at, poses, m) - here) / h for v, m, h in zip(variants, shifted, steps)]
     split = len(hypothesis.parameters) if derivative else 0
     by_pose, rest_by_pose = (
         _pose_derivative(robot, scene, poses, states, residual, pivot) if derivative else (np.zeros((len(residual), 3, 0)),) * 2
