@@ -30,7 +30,7 @@ def test_friction_is_named_with_its_coefficient_and_the_held_out_error_falls():
 
 def test_a_wrong_modulus_is_named_stiffness_and_nothing_else():
     inputs, labels = sweeps()
-    recording, _ = record(inputs, effects=[{"name": "stiffness", "scale": 1.25}], labels=labels)
+    recording, _ = record(inputs, effects=[{"name": "stiffness", "scale": 1.25}], labels=labels, truth=arm((8, 3, 3)))
     loop = improve(arm(), [recording])
     assert [e["name"] for e in loop.effects] == ["stiffness"]
     assert found(loop, "stiffness")["parameters"]["scale"]["value"] == pytest.approx(1.25, rel=0.06)

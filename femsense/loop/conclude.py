@@ -10,7 +10,7 @@ import numpy as np
 from femsense.arrays import FloatArray
 from femsense.effects import Entry, apply_effects
 from femsense.loop.data import Data
-from femsense.loop.grow import EVIDENCE, evidence
+from femsense.loop.grow import ABOVE_MESH, EVIDENCE, evidence, mesh_cost, moved_by
 from femsense.loop.joint import Prior
 from femsense.loop.noise import Noise
 from femsense.loop.result import LoopResult
@@ -115,7 +115,7 @@ def _is_evident(data: Data, search: Search, name: str, count: int) -> bool:
     final = search.final
     without = _refitted(data, final, [n for n in final.fit.hypothesis.names if n != name], search.noise)
     missed = evidence(without.fit, final.fit) - count * np.log(search.n_effective) > EVIDENCE
-    return bool(missed and final.held_rms < without.held_rms)
+    return bool(missed and final.held_rms < without.held_rms and moved_by(without, final) > ABOVE_MESH * mesh_cost(data, without))
 
 
 def _handed_back(data: Data, final: Stage, promoted: list[str], noise: Noise) -> Stage:

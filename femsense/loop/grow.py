@@ -51,12 +51,11 @@ class Refit:
 
 
 def grow(
-    data: Data, stage: Stage, table: list[Candidate], noise: Noise, n_effective: float, say: Progress
+    data: Data, stage: Stage, table: list[Candidate], noise: Noise, say: Progress
 ) -> tuple[Stage | None, list[dict[str, Any]]]:
     """Return the stage with one more effect, or None where nothing passes, and what became of each candidate that was refitted."""
     refits: list[Refit] = []
     records: list[dict[str, Any]] = []
-    library = max(len({c.effect.name for c in table}), 1)
     for candidate in _shortlist(table, first=not _added(stage)):
         best = max((r.score for r in refits if r.record["verdict"] == "passes"), default=-np.inf)
         if candidate.score < 0.5 * best - EVIDENCE:
@@ -69,14 +68,14 @@ def grow(
         except FemsenseError as error:
             record["verdict"] = f"no equilibrium: {error}"
             continue
-        refits.append(_judged(data, stage, candidate, made, record, noise, n_effective, library))
+        refits.append(_judged(data, stage, candidate, made, record, noise))
     passing = [r for r in refits if r.record["verdict"] == "passes"]
     if not passing:
         return None, records
     leaders = [r for r in passing if r.score > max(p.score for p in passing) - EVIDENCE]
     leaders = [_polished(data, stage, r, noise, say) for r in leaders]
     winner = max(leaders, key=lambda r: r.score)
-    winner = _enriched(data, stage, winner, table, noise, n_effective, library, say)
+    winner = _enriched(data, stage, winner, table, noise, say)
     winner.record["verdict"] = "named"
     return winner.stage, records
 
@@ -90,9 +89,7 @@ def _polished(data: Data, stage: Stage, refitted: Refit, noise: Noise, say: Prog
     return replace(refitted, stage=polished, score=score)
 
 
-def _enriched(
-    data: Data, stage: Stage, winner: Refit, table: list[Candidate], noise: Noise, n_effective: float, library: int, say: Progress
-) -> Refit:
+def _enriched(data: Data, stage: Stage, winner: Refit, table: list[Candidate], noise: Noise, say: Progress) -> Refit:
     """Return the winner in a form with more parameters where that has EVIDENCE over the simple one."""
     for form in _forms(table, winner.candidate.effect.name):
         if len(form.parameters) <= len(winner.candidate.parameters):
@@ -101,7 +98,7 @@ def _enriched(
         made = _tried(data, stage, form, noise)
         if made is None:
             continue
-        rich = _judged(data, stage, form, made, dict(winner.record), noise, n_effective, library)
+        rich = _judged(data, stage, form, made, dict(winner.record), noise)
         if rich.record["verdict"] == "passes":
             rich = _polished(data, stage, rich, noise, say)
         if rich.record["verdict"] == "passes" and rich.score > winner.score + EVIDENCE:
@@ -142,16 +139,13 @@ def _judged(
     made: Stage,
     record: dict[str, Any],
     noise: Noise,
-    n_effective: float,
-    library: int,
 ) -> Refit:
-    q = len(candidate.parameters)
     gain = evidence(stage.fit, made.fit)
-    score = gain - q * np.log(n_effective) - 2.0 * np.log(library * candidate.seeds)
+    score = gain - candidate.cost
     better, spread = sweeps_predicted(data.train, stage.fit, made.fit)
     record |= {"dchi2": gain, "dbic": score, "validation_rms_m": made.held_rms, "cv_gain": better, "cv_spread": spread}
     held = held_chi2(data, stage, noise) - held_chi2(data, made, noise)
-    moved, mesh = _moved(stage, made), mesh_cost(data, stage)
+    moved, mesh = moved_by(stage, made), mesh_cost(data, stage)
     record |= {"held_dchi2": held, "moved_m": moved, "mesh_cost_m": mesh, "takes_over": _taken_over(stage, made)}
     fit_objection = _objection(made, candidate, score)
     if fit_objection is None and np.isfinite(spread) and better <= ENOUGH_SPREAD * spread:
@@ -228,7 +222,7 @@ def _held_share(data: Data) -> float:
     return sum(len(t.scene.frame) for t in data.held) / max(sum(len(t.scene.frame) for t in data.train), 1)
 
 
-def _moved(before: Stage, after: Stage) -> float:
+def moved_by(before: Stage, after: Stage) -> float:
     """Return by how much an effect moves the markers beyond what calibration does [m], root mean square."""
     return rms_of([b.residual - a.residual for a, b in zip(after.fit.jets, before.fit.jets)])
 
@@ -342,4 +336,4 @@ def _without(data: Data, stage: Stage, index: int, noise: Noise) -> Stage | None
         return None
 
 
-__all__ = ["EVIDENCE", "Progress", "evidence", "grow", "prune", "refit", "with_term"]
+__all__ = ["ABOVE_MESH", "EVIDENCE", "Progress", "evidence", "grow", "mesh_cost", "moved_by", "prune", "refit", "with_term"]

@@ -85,7 +85,7 @@ def improve(
         first = first or table
         if not growing or found >= MAX_EFFECTS:
             break
-        winner, tried = grow(data, stage, table, noise, n_effective, say)
+        winner, tried = grow(data, stage, table, noise, say)
         refits += [{**record, "step": found + 1} for record in tried]
         if winner is None:
             break

@@ -45,11 +45,21 @@ class Candidate:
     gain: float
     """Decrease of χ² by that step."""
     score: float
-    """dBIC: gain − q log n − 2 log m, m the number of effects times that of the form's seeds."""
-    seeds: int
-    """How many seeds of this form were tried."""
+    """dBIC: gain − cost."""
+    cost: float
+    """What the evidence must bring for the candidate's freedom."""
     smallest: FloatArray
     """Size of each parameter (in its coordinate) that would just have been seen, shape (q,)."""
+
+
+def penalty(count: int, seed: Entry, alone: int, effects: int, n_effective: float) -> float:
+    """Return what a candidate's freedom costs: (q + s) log n + 2 log (m a).
+
+    q parameters are fitted; the s numbers of its seed (a place, a radius, a time) are chosen from many, so they count as parameters
+    too; m effects are looked at, and a is the number of cables or markers that it might be alone.
+    """
+    chosen = sum(int(np.size(v)) for v in seed.values() if not isinstance(v, str | bool))
+    return float((count + chosen) * np.log(n_effective) + 2.0 * np.log(max(effects * alone, 1)))
 
 
 def candidates_for(
@@ -122,12 +132,13 @@ def screen(base: JointFit, problem: JointProblem, fields: Fields, n_effective: f
         left = whole - Q @ (Q.T @ whole)
         step, gain = _whole_step(left, residual) if effect.discrete else _best_step(left, residual, parameters)
         q = len(parameters)
-        seeds = sum(e is effect and len(p) == len(parameters) for e, _, p in fields.todo)
-        score = gain - q * np.log(n_effective) - 2.0 * np.log(effects * seeds)
+        alone = sum(e is effect and len(p) == len(parameters) and s == seed for e, s, p in fields.todo)
+        cost = penalty(q, seed, alone, effects, n_effective)
+        score = gain - cost
         retained = float(np.linalg.norm(left) / np.linalg.norm(whole))
         result.append(
             Candidate(
-                effect, seed, parameters, own, left, retained, step, gain, float(score), seeds, _smallest(left, q, n_effective)
+                effect, seed, parameters, own, left, retained, step, gain, float(score), cost, _smallest(left, q, n_effective)
             )
         )
     return sorted(result, key=lambda c: -c.score)
