@@ -83,12 +83,11 @@ def candidates_for(
 
 
 def _parts(parameters: tuple[Parameter, ...]) -> list[tuple[Parameter, ...]]:
-    """Return the parameters of each cable or marker by itself: an effect may be that of one of them alone."""
+    """Return the parameters of each cable or marker, or of each key, by itself: an effect may be that of one of them alone."""
     parts: dict[str, list[Parameter]] = {}
     for p in parameters:
         owner = p.part[0] if isinstance(p.part, tuple) else p.part
-        if isinstance(owner, str):
-            parts.setdefault(owner, []).append(p)
+        parts.setdefault(owner if isinstance(owner, str) else p.key, []).append(p)
     return [tuple(part) for part in parts.values()]
 
 
