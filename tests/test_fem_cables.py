@@ -185,6 +185,18 @@ def test_a_held_cable_with_friction_keeps_its_length() -> None:
     )
 
 
+def test_a_body_without_friction_forgets_the_losses_of_its_start() -> None:
+    rubbing = solve_equilibrium(cable_body(False, friction=0.3), tension={"bent": 2.0})
+    assert np.ptp(rubbing.segment_tensions[0]) > 0.05
+    cold = solve_equilibrium(cable_body(False), tension={"bent": 2.0})
+    warm = solve_equilibrium(cable_body(False), tension={"bent": 2.0}, start=rubbing)
+    np.testing.assert_allclose(warm.positions, cold.positions, atol=1e-9)
+    held_still = solve_equilibrium(
+        cable_body(False), tension={"bent": 2.0}, along=tuple(t / 2.0 for t in rubbing.segment_tensions)
+    )
+    np.testing.assert_allclose(held_still.segment_tensions[0], rubbing.segment_tensions[0], rtol=1e-9)
+
+
 # A cable that is a spring
 
 

@@ -178,11 +178,11 @@ def test_a_load_that_cannot_be_borne_is_reported_with_the_share_that_was() -> No
 
 
 def test_load_steps_keep_the_given_losses_along_a_cable(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A cable without friction of its own carries the tensions of its start in their proportions, also where load steps are needed."""
+    """A cable without friction of its own carries the shares that are given along it, also where load steps are needed."""
     body = bar_body(block_mesh((4, 1, 1)))
     start = solve_equilibrium(body, tension={"side": 1.0})
-    start = replace(start, segment_tensions=(start.segment_tensions[0], np.array([0.4, 1.0])))
-    wanted = solve_equilibrium(body, tension={"side": 4.0}, start=start)
+    along = (np.ones_like(start.segment_tensions[0]), np.array([0.4, 1.0]))
+    wanted = solve_equilibrium(body, tension={"side": 4.0}, start=start, along=along)
     assert wanted.segment_tensions[1].tolist() == [1.6, 4.0]
     plain, calls = equilibrium._settle, []
 
@@ -191,7 +191,7 @@ def test_load_steps_keep_the_given_losses_along_a_cable(monkeypatch: pytest.Monk
         return "stalled" if len(calls) in (1, 4) else plain(*arguments)
 
     monkeypatch.setattr(equilibrium, "_settle", fails_at_first)
-    stepped = solve_equilibrium(body, tension={"side": 4.0}, start=start)
+    stepped = solve_equilibrium(body, tension={"side": 4.0}, start=start, along=along)
     assert len(calls) > 4 and stepped.converged
     np.testing.assert_allclose(stepped.segment_tensions[1], [1.6, 4.0])
     np.testing.assert_allclose(stepped.positions, wanted.positions, atol=1e-8)

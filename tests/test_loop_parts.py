@@ -1,0 +1,169 @@
+"""Parts of the loop against closed forms and slow second ways: likelihood, whitening, left-out sweeps, the mesh's error, structure."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from arm import arm, record, sweeps
+
+from femsense.calib.forward import Hypothesis, evaluate_scene, make_scene
+from femsense.effects import find_effect
+from femsense.effects.shape import finer_mesh, robot_on_mesh
+from femsense.fem.equilibrium import solve_equilibrium
+from femsense.loop import improve
+from femsense.loop.data import prepare
+from femsense.loop.mesh_error import with_mesh_errors
+from femsense.loop.noise import Groups, Noise, _Likelihood, whiten
+from femsense.loop.predict import sweeps_predicted
+from femsense.loop.screen import _parts, penalty
+from femsense.loop.stages import make_stage, with_nuisance
+from femsense.loop.structure import structure_tests
+
+RNG = np.random.default_rng(11)
+
+
+def some_groups(frames: int = 12, markers: int = 5) -> Groups:
+    frame, marker = np.repeat(np.arange(frames), markers), np.tile(np.arange(markers), frames)
+    return Groups(marker, frame, frame // 4, np.arange(frames * markers))
+
+
+def test_the_gradient_of_the_likelihood_is_its_difference():
+    groups = some_groups()
+    k = len(groups.marker)
+    likelihood = _Likelihood(
+        ["white", "frame", "marker", "sweep"], [RNG.normal(size=(k, 3))], [RNG.normal(size=(k, 3, 4))], [groups]
+    )
+    at = np.log([1.0, 0.6, 0.4, 0.3])
+    gradient = likelihood(at)[1]
+    for i, step in enumerate(1e-5 * np.eye(4)):
+        assert gradient[i] == pytest.approx((likelihood(at + step)[0] - likelihood(at - step)[0]) / 2e-5, rel=1e-5)
+
+
+def test_whitening_takes_fields_that_count_as_noise():
+    groups = some_groups(4, 3)
+    noise = Noise({"white": 0.5, "frame": 0.3}, "")
+    fields = RNG.normal(size=(12, 3, 2))
+    W = whiten(noise.whitener(groups, fields), np.eye(36).reshape(12, 3, 36))
+    E = fields.reshape(36, 2)
+    sigma = np.kron(noise.covariance(groups), np.eye(3)) + E @ E.T
+    np.testing.assert_allclose(W.T @ W, np.linalg.inv(sigma), rtol=1e-9, atol=1e-9)
+
+
+def linear_fit(J: np.ndarray, r: np.ndarray, rest: int = 0) -> SimpleNamespace:
+    """Return what `sweeps_predicted` asks of a fit, at the optimum of a linear problem."""
+    at_optimum = r - J @ np.linalg.lstsq(J, r, rcond=None)[0]
+    return SimpleNamespace(fit=SimpleNamespace(jacobian=J, residual=at_optimum), jets=[SimpleNamespace(rest=np.zeros((rest, 3)))])
+
+
+def test_left_out_sweeps_are_predicted_as_by_fits_without_them():
+    groups = some_groups()
+    n = 3 * len(groups.marker)
+    trial = SimpleNamespace(groups=groups, poses=())
+    J, r = RNG.normal(size=(n, 6)), RNG.normal(size=n)
+    small, large = linear_fit(J[:, :3], r), linear_fit(J, r)
+    got, spread = sweeps_predicted([trial], small, large)
+
+    def density(columns: np.ndarray, rows: np.ndarray) -> float:
+        others = np.setdiff1d(np.arange(n), rows)
+        theta = np.linalg.lstsq(columns[others], r[others], rcond=None)[0]
+        cov = np.eye(len(rows)) + columns[rows] @ np.linalg.inv(columns[others].T @ columns[others]) @ columns[rows].T
+        error = r[rows] - columns[rows] @ theta
+        return float(-error @ np.linalg.solve(cov, error) - np.linalg.slogdet(cov)[1])
+
+    sweep = np.repeat(groups.sweep, 3)
+    gains = [density(J, np.flatnonzero(sweep == s)) - density(J[:, :3], np.flatnonzero(sweep == s)) for s in range(3)]
+    assert got == pytest.approx(sum(gains), rel=1e-8)
+    assert spread == pytest.approx(np.sqrt(3) * np.std(gains, ddof=1), rel=1e-8)
+
+
+def test_the_error_of_the_mesh_is_what_the_finer_mesh_adds():
+    inputs, labels = sweeps(each=1)
+    robot = arm((4, 2, 2))
+    recording, _ = record(inputs, labels=labels, truth=robot)
+    data = prepare(robot, [recording], [])
+    hypothesis, prior = with_nuisance(data)
+    stage = make_stage(data, hypothesis, prior, Noise({"white": 1e-4}, ""), np.zeros(len(prior.mean)))
+    trial = with_mesh_errors(data, stage).train[0]
+    error = trial.mesh_error.sum(axis=2)
+    fitted = stage.fit.hypothesis.robot_at(stage.fit.coordinates)
+    fine = robot_on_mesh(fitted, finer_mesh(fitted.body.mesh, None, 1))
+    k = int(trial.scene.frames[2])
+    tension = dict(zip(fitted.body.cable_names, recording.inputs[k] + fitted.actuation.tension_offset))
+    tension = {name: max(t, 0.0) for name, t in tension.items()}
+    places = [r.markers.positions(solve_equilibrium(r.body, tension=tension).positions) for r in (fitted, fine)]
+    wanted = (places[1] - places[0])[trial.scene.marker[trial.scene.frame == k]]
+    np.testing.assert_allclose(error[trial.scene.frame == k], wanted, atol=0.15 * np.abs(wanted).max())
+    assert np.abs(wanted).max() > 1e-4
+    used = (trial.mesh_error != 0).any(axis=1).sum(axis=1)
+    assert used.max() == 1  # each row has the field of its own sweep
+
+
+def structure_of(values: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> dict[str, float]:
+    """Return the p-values for residuals (frames, markers, 3) over four sweeps of different inputs."""
+    frames, markers, _ = values.shape
+    inputs = RNG.uniform(0.1, 1.0, size=(frames, 4))
+    labels = [f"s{i // (frames // 4)}" for i in range(frames)]
+    frame, marker = np.repeat(np.arange(frames), markers), np.tile(np.arange(markers), frames)
+    fake = SimpleNamespace(time_s=np.arange(frames) * 1.0, inputs=inputs)
+    trial = SimpleNamespace(
+        scene=SimpleNamespace(frame=frame, recording=fake),
+        groups=Groups(marker, frame, np.unique(labels, return_inverse=True)[1][frame], frame),
+    )
+    monkeypatch.setattr("femsense.loop.structure.state_key", lambda recording, k: inputs[k].tobytes())
+    return structure_tests([trial], [values.reshape(-1, 3)], rng=np.random.default_rng(0)).p
+
+
+def test_noise_alone_has_no_structure_and_a_pattern_has(monkeypatch: pytest.MonkeyPatch):
+    noise = RNG.normal(size=(24, 6, 3))
+    assert min(structure_of(noise, monkeypatch).values()) > 0.003
+    pattern = np.zeros_like(noise)
+    pattern[6:12] = 3.0 * RNG.normal(size=(6, 3))
+    p = structure_of(noise + pattern, monkeypatch)
+    assert p["pattern"] <= 0.002
+    assert p["sweep"] <= 0.002
+
+
+def test_columns_for_screening_do_not_hold_the_noise_of_measured_points():
+    inputs, labels = sweeps(each=1)
+    robot = arm((4, 2, 2))
+    effect = find_effect("depth_scale")
+    columns = {}
+    for noise in (0.0, 3e-3):
+        recording, _ = record(inputs, labels=labels, truth=robot, noise=noise, seed=1)
+        scene = make_scene(robot, recording, np.arange(3))
+        poses = [prepare(robot, [record(inputs, labels=labels, truth=robot, noise=0.0)[0]], []).train[0].poses[0]]
+        hypothesis = Hypothesis(robot, ((effect, {}, effect.parameters(robot, "tension")),))
+        for noiseless in (True, False):
+            jet = evaluate_scene(hypothesis, scene, np.zeros(2), poses, None, derivative=True, vary_initial=False,
+                                 pivot=robot.marker_points.mean(axis=0), noiseless=noiseless)  # fmt: skip
+            columns[noise, noiseless] = jet.by_effect
+    np.testing.assert_allclose(columns[0.0, True], columns[3e-3, True], atol=1e-6)
+    assert np.abs(columns[0.0, False] - columns[3e-3, False]).max() > 1e-3
+
+
+def test_one_marker_that_sits_elsewhere_is_named_alone():
+    inputs, labels = sweeps(1.5, each=1)
+    robot = arm((4, 2, 2))
+    recording, _ = record(
+        inputs, labels=labels, truth=robot, noise=1e-4, effects=[{"name": "marker_offset", "offset_m": {"m5": [2e-3, 0.0, 1e-3]}}]
+    )
+    loop = improve(robot, [recording], effects=["marker_offset", "cable_gain", "payload"])
+    effect = next(e for e in loop.effects if e["name"] == "marker_offset")
+    assert list(effect["parameters"]["offset_m"]["value"]) == ["m5"]
+    np.testing.assert_allclose(effect["parameters"]["offset_m"]["value"]["m5"], [2e-3, 0.0, 1e-3], atol=2.5e-4)
+
+
+def test_parts_are_cables_markers_and_keys():
+    robot = arm()
+    assert [len(p) for p in _parts(find_effect("cable_gain").parameters(robot, "tension"))] == [1] * 4
+    assert [len(p) for p in _parts(find_effect("marker_offset").parameters(robot, "tension"))] == [3] * 12
+    assert [len(p) for p in _parts(find_effect("depth_scale").parameters(robot, "tension"))] == [1, 1]
+    assert len(_parts(find_effect("payload").parameters(robot, "tension"))) == 1
+
+
+def test_the_numbers_of_a_seed_cost_as_much_as_parameters():
+    place = {"center_m": [0.0, 0.0, 0.0], "radius_m": 0.1}
+    assert penalty(1, place, 1, 10, 1000.0) == pytest.approx(5 * np.log(1000.0) + 2 * np.log(10))
+    assert penalty(0, {"law": "neo_hookean"}, 1, 10, 1000.0) == pytest.approx(2 * np.log(10))
