@@ -10,7 +10,7 @@ import numpy as np
 from femsense.arrays import FloatArray
 from femsense.effects import Entry, apply_effects
 from femsense.loop.data import Data
-from femsense.loop.grow import ABOVE_MESH, EVIDENCE, evidence, mesh_cost, moved_by
+from femsense.loop.grow import ABOVE_MESH, EVIDENCE, at_edge, evidence, mesh_cost, moved_by
 from femsense.loop.joint import Prior
 from femsense.loop.noise import Noise
 from femsense.loop.result import LoopResult
@@ -24,6 +24,8 @@ RELEVANT = 0.02
 MIN_SWEEPS = 4
 """With fewer held-out sweeps the interval of the held-out error resamples frames."""
 DRAWS = 2000
+NOT_WORSE = 1.02
+"""What is handed back may not have a larger held-out error than the declared model, but for this factor."""
 EXPLAINED = 0.8
 """Share of the excess over the noise that effects must take away where structure is left."""
 
@@ -51,7 +53,8 @@ def conclude(data: Data, search: Search, rng: np.random.Generator) -> LoopResult
     before, final, noise = search.before, search.final, search.noise
     promoted = _promoted(data, search)
     names = [*promoted, *(n for n, _ in search.history[1:] if n in final.fit.hypothesis.names)]
-    back = _handed_back(data, final, promoted, noise) if names else before
+    names, back = _worth_handing_back(data, search, promoted, names)
+    promoted = [n for n in promoted if n in names]
     entries = _entries(back, names)
     effects = _chain(data, search, promoted, names, back)
     residuals = [without_mesh_error(t, jet.residual, noise) for t, jet in zip(data.train, final.fit.jets)]
@@ -118,12 +121,22 @@ def _is_evident(data: Data, search: Search, name: str, count: int) -> bool:
     return bool(missed and final.held_rms < without.held_rms and moved_by(without, final) > ABOVE_MESH * mesh_cost(data, without))
 
 
-def _handed_back(data: Data, final: Stage, promoted: list[str], noise: Noise) -> Stage:
-    """Return the fit of just what is handed back: nuisances that stay as declared are taken out."""
-    keep = [n for n in final.fit.hypothesis.names if n not in NUISANCE or n in promoted]
-    if len(keep) == len(final.fit.hypothesis.names):
+def _worth_handing_back(data: Data, search: Search, promoted: list[str], names: list[str]) -> tuple[list[str], Stage]:
+    """Return the names that are handed back with the fit of just these: nuisances that stay as declared are taken out, and so is,
+    from the last one on, what would make the error on held-out data larger than it was, or goes to the edge of what is plausible."""
+    while names:
+        back = _handed_back(data, search.final, names, search.noise)
+        if back.held_rms <= NOT_WORSE * search.before.held_rms and not at_edge(back.fit):
+            return names, back
+        names = names[:-1]
+    return [], search.before
+
+
+def _handed_back(data: Data, final: Stage, names: list[str], noise: Noise) -> Stage:
+    settled = [effect.name for effect, _ in final.fit.hypothesis.settled]
+    if set(final.fit.hypothesis.names) <= {*names, *settled}:
         return final
-    return _refitted(data, final, keep, noise)
+    return _refitted(data, final, names, noise)
 
 
 def _refitted(data: Data, stage: Stage, keep: list[str], noise: Noise) -> Stage:

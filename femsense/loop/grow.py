@@ -245,16 +245,30 @@ def _rest(columns: FloatArray, values: FloatArray) -> FloatArray:
 def _objection(made: Stage, candidate: Candidate, score: float) -> str | None:
     """Return why an effect is not accepted, or None."""
     q = len(candidate.parameters)
-    values, std = made.fit.coordinates[len(made.fit.coordinates) - q :], made.fit.std[len(made.fit.std) - q :]
+    std = made.fit.std[len(made.fit.std) - q :]
     if score <= EVIDENCE:
         return f"too little evidence (dBIC {score:.1f})"
     if not np.isfinite(std).all():
         return "not identifiable: the data leave a parameter open"
-    low, high = np.array([p.low for p in candidate.parameters]), np.array([p.high for p in candidate.parameters])
-    at_bound = (values <= low + 1e-9) & (low > -np.inf) | (values >= high - 1e-9)
-    if at_bound.any() and not (candidate.effect.discrete and (values[at_bound] <= low[at_bound] + 1e-9).all()):
+    edge = at_edge(made.fit)
+    if candidate.effect.name in edge:
         return "acts like it, but its value lies at the edge of what is plausible"
+    if edge:
+        return f"with it {edge[0]} goes to the edge of what is plausible"
     return None
+
+
+def at_edge(fit: JointFit) -> list[str]:
+    """Return the effects beside the nuisances with a value at the edge of what is plausible (a law's limit may be none at all)."""
+    names, at = [], 0
+    for effect, _, parameters in fit.hypothesis.terms:
+        values = fit.coordinates[at : at + len(parameters)]
+        at += len(parameters)
+        low, high = np.array([p.low for p in parameters]), np.array([p.high for p in parameters])
+        beyond = (values >= high - 1e-9) | ((values <= low + 1e-9) & (low > -np.inf) & (not effect.discrete))
+        if beyond.any() and effect.name not in NUISANCE:
+            names.append(effect.name)
+    return names
 
 
 # --- polishing -------------------------------------------------------------------------------------------------------------
@@ -336,4 +350,16 @@ def _without(data: Data, stage: Stage, index: int, noise: Noise) -> Stage | None
         return None
 
 
-__all__ = ["ABOVE_MESH", "EVIDENCE", "Progress", "evidence", "grow", "mesh_cost", "moved_by", "prune", "refit", "with_term"]
+__all__ = [
+    "ABOVE_MESH",
+    "EVIDENCE",
+    "Progress",
+    "at_edge",
+    "evidence",
+    "grow",
+    "mesh_cost",
+    "moved_by",
+    "prune",
+    "refit",
+    "with_term",
+]
