@@ -16,7 +16,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any, NoReturn, TypeVar
 
 import typer
 from typer.exceptions import TyperException
@@ -24,6 +24,7 @@ from typer.exceptions import TyperException
 import femsense
 from femsense.errors import FemsenseError
 
+T = TypeVar("T")
 STOPPED = 130
 """Exit status after Ctrl-C, as shells have it."""
 SEVERAL = ("--at", "--validation", "--effects", "--without")
@@ -133,14 +134,17 @@ def mesh(
 def simulate(
     robot: RobotPath,
     script: Annotated[Path, typer.Argument(metavar="SCRIPT", help="What the virtual rig does (TOML).", show_default=False)],
-    output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="RECORDING", help="The recording to write.", show_default=False)
-    ],
+    output: Annotated[Path | None, typer.Option("-o", "--output", metavar="RECORDING", help="The recording to write.", show_default=False)] = None,
+    plan: Annotated[bool, typer.Option("--plan", help="Say what this experiment could show; record nothing.")] = False,
+    noise: Annotated[float, typer.Option("--noise", metavar="MM", min=0.0, help="With --plan: noise of each coordinate of a marker.")] = 0.2,
     json: Json = False,
-) -> Answer:
+) -> Answer:  # fmt: skip
     """Record on the virtual rig, with the truth beside it."""
-    from femsense.steps import simulate_into
+    from femsense.steps import script_outlook, simulate_into
 
+    if plan:
+        return Answer(*script_outlook(robot, script, noise=1e-3 * noise))
+    output = _required(output, "'-o' / '--output'", "option")
     simulate_into(output, robot, script)
     return Answer({"recording": str(output)}, f"recording: {output}\nlook at it: femsense inspect {output}")
 
@@ -192,19 +196,31 @@ def estimate(
 @app.command()
 def improve(
     robot: RobotPath,
-    recordings: Annotated[list[Path], typer.Argument(metavar="RECORDING", help="What the effects are found on.", show_default=False)],
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="The folder to write.", show_default=False)],
+    recordings: Annotated[list[Path] | None, typer.Argument(metavar="RECORDING", help="What the effects are found on.", show_default=False)] = None,
+    output: Annotated[Path | None, typer.Option("-o", "--output", metavar="OUT", help="The folder to write; with --plan a script (TOML).", show_default=False)] = None,
     validation: Annotated[list[Path] | None, typer.Option("--validation", metavar="RECORDING …", help="What they are tested on.", show_default=False)] = None,
     effects: Annotated[list[str] | None, typer.Option("--effects", metavar="NAME,…", help="Try these effects only.", show_default=False)] = None,
     without: Annotated[list[str] | None, typer.Option("--without", metavar="NAME,…", help="Do not try these effects.", show_default=False)] = None,
     user_effect: Annotated[list[Path] | None, typer.Option("--user-effect", metavar="FILE", help="Try an effect of your own (docs/effects/own.md).", show_default=False)] = None,
     again: Annotated[bool, typer.Option("--again", help="Compute even where OUT holds this result already.")] = False,
+    plan: Annotated[bool, typer.Option("--plan", help="Propose what to record, so that effects can be told apart; needs no RECORDING.")] = False,
+    given: Annotated[Path | None, typer.Option("--given", metavar="RECORDING", help="With --plan: what is recorded already.", show_default=False)] = None,
+    noise: Annotated[float, typer.Option("--noise", metavar="MM", min=0.0, help="With --plan: noise of each coordinate of a marker.")] = 0.2,
+    frames: Annotated[int, typer.Option("--frames", metavar="N", min=1, help="With --plan: not more new frames than this.")] = 60,
+    actuation: Annotated[str, typer.Option("--actuation", metavar="tension|displacement", help="With --plan: what drives the cables.")] = "tension",
     json: Json = False,
 ) -> Answer:  # fmt: skip
     """Find what the model lacks and write the better robot."""
-    from femsense.steps import improve_into
+    from femsense.steps import improve_into, plan_into
     from femsense.summary import loop_text
 
+    if plan:
+        with _progress("plan") as progress:
+            return Answer(
+                *plan_into(output, robot, given=given, noise=1e-3 * noise, frames=frames, control=actuation, progress=progress)
+            )
+    recordings = _required(recordings, "'RECORDING...'", "argument")
+    output = _required(output, "'-o' / '--output'", "option")
     with _progress("improve") as progress:
         document = improve_into(
             output, robot, recordings, validation=validation or [], effects=_names(effects), without=_names(without),
@@ -455,6 +471,13 @@ def _spread(words: list[str]) -> list[str]:
         option, count = (word, 0) if word in SEVERAL else (None, 0)
         result.append(word)
     return result
+
+
+def _required(value: T | None, name: str, kind: str) -> T:
+    """Return what only --plan can do without."""
+    if value is None:
+        raise TyperException(f"Missing {kind} {name}.")
+    return value
 
 
 def _places(texts: Sequence[str]) -> list[list[float]] | None:

@@ -122,3 +122,59 @@ def simulate_into(folder: str | Path, robot: str | Path, script: str | Path) -> 
     if target.exists() and not (target / "recording.toml").is_file() and not (target.is_dir() and not any(target.iterdir())):
         raise InputError("something else than a recording stands there, which would be replaced", where=target, expected="a new folder", hint="another -o")  # fmt: skip
     return simulate(load_robot(robot), script, target)
+
+
+def script_outlook(robot: str | Path, script: str | Path, *, noise: float) -> tuple[dict[str, Any], str]:
+    """Return what the experiment of a script could show, as plain tables and as text; `noise` is of a marker's coordinate [m]."""
+    from femsense.loop.advice import outlook_text
+    from femsense.loop.plan import outlook_document, outlook_of_script
+    from femsense.rig.script import read_script
+
+    outlook = outlook_of_script(load_robot(robot), read_script(script), Path(script), noise=noise)
+    return outlook_document(outlook), outlook_text(outlook)
+
+
+def plan_into(
+    file: str | Path | None,
+    robot: str | Path,
+    *,
+    given: str | Path | None,
+    noise: float,
+    frames: int,
+    control: str,
+    progress: Progress | None = None,
+) -> tuple[dict[str, Any], str]:
+    """Propose an experiment; write it as a script where a file is named. Return it as plain tables and as text.
+
+    Arguments:
+        file: script to write; one with `-far` in its name is written beside it for a second distance of the camera.
+        robot: a folder, or the name of a robot.
+        given: a recording that exists; None starts from nothing.
+        noise: of a marker's coordinate [m].
+        frames: budget.
+        control: "tension" or "displacement"; a given recording says it itself.
+        progress: called with (items done, items in all).
+
+    Raises:
+        FemsenseError: bad input, or a robot without an equilibrium.
+    """
+    from femsense.files import write_toml
+    from femsense.loop.advice import proposal_text
+    from femsense.loop.plan import plan_experiment, proposal_document
+
+    if control not in ("tension", "displacement"):
+        raise InputError("unknown actuation", where="--actuation", found=control, expected="tension | displacement")
+    if file is not None and Path(file).suffix != ".toml":
+        raise InputError("not the name of a script", where="-o", found=str(file), expected="a file that ends in .toml")
+    recording = None if given is None else load_recording(given)
+    proposal = plan_experiment(load_robot(robot), control=control, noise=noise, frames=frames, given=recording, progress=progress)
+    files = []
+    for name, script in proposal.scripts().items() if file is not None else ():
+        target = Path(str(file))
+        target = target.with_stem(target.stem + name)
+        write_toml(target, script)
+        files.append(str(target))
+    text = proposal_text(proposal) + "".join(
+        f"\n\nwritten: {f} (femsense simulate ROBOT {f} -o RECORDING tries it)" for f in files
+    )
+    return {**proposal_document(proposal), "scripts": files}, text

@@ -9,6 +9,7 @@ import numpy as np
 
 from femsense.arrays import FloatArray
 from femsense.effects import Entry, apply_effects
+from femsense.loop.advice import next_element
 from femsense.loop.data import Data
 from femsense.loop.grow import ABOVE_MESH, EVIDENCE, at_edge, evidence, mesh_cost, moved_by
 from femsense.loop.joint import Prior
@@ -81,7 +82,7 @@ def conclude(data: Data, search: Search, rng: np.random.Generator) -> LoopResult
         entries=tuple(entries),
         candidates=tuple(_candidate_rows(search.first, search.last, search.refits)),
         confounded=tuple(rivals),
-        next_experiment=_next_experiment(data, rivals, not_testable),
+        next_experiment=_next_experiment(data, final, noise, rivals, not_testable),
         not_testable=tuple(not_testable),
         detectable=_detectable(search.last, {e["name"] for e in effects}),
         left={
@@ -348,8 +349,14 @@ def _detectable(table: list[Candidate], found: set[str]) -> dict[str, Any]:
     return result
 
 
-def _next_experiment(data: Data, rivals: list[dict[str, Any]], not_testable: list[dict[str, Any]]) -> str:
-    """Return in words what to record to tell apart what these data cannot."""
+def _next_experiment(
+    data: Data, final: Stage, noise: Noise, rivals: list[dict[str, Any]], not_testable: list[dict[str, Any]]
+) -> str:
+    """Return in words what to record to tell apart what these data cannot: as predicted where that is cheap, else by rule."""
+    pairs = [(r["pair"][0], r["pair"][1]) for r in rivals]
+    predicted = next_element(data, final.fit, noise.total / np.sqrt(3.0), pairs, [r["name"] for r in not_testable])
+    if predicted:
+        return "; or ".join(f"{words} (expected evidence {before:.0f} → {after:.0f})" for words, before, after in predicted[:2])
     names = {n for r in rivals for n in r["pair"]} | {r["name"] for r in not_testable}
     advice = []
     recordings = [t.scene.recording for t in data.train]

@@ -59,7 +59,7 @@ def prepare(robot: Robot, recordings: Sequence[Recording], validation: Sequence[
     held_of: list[int | None] = []
     words: list[str] = []
     for i, recording in enumerate(recordings):
-        frames = _marked_frames(recording)
+        frames = marked_frames(recording)
         fitted, kept, how = (
             (frames, frames[:0], "all frames fitted; held out: other recordings") if validation else hold_out(recording, frames)
         )
@@ -73,7 +73,7 @@ def prepare(robot: Robot, recordings: Sequence[Recording], validation: Sequence[
             held.append(replace(trial, scene=scene, groups=groups_of(scene), starts={}))
             held_of.append(i)
     for recording in validation:
-        held.append(_trial(robot, recording, _marked_frames(recording), first_only=True))
+        held.append(_trial(robot, recording, marked_frames(recording), first_only=True))
         held_of.append(None)
         words.append("validation recording")
     rest = [r for t in train for r in [_rest_spread(robot, t)] if r is not None]
@@ -81,7 +81,7 @@ def prepare(robot: Robot, recordings: Sequence[Recording], validation: Sequence[
     return Data(robot, control, train, held, held_of, words, float(np.sqrt(np.mean(np.square(rest)))) if rest else 1e-3, scale)
 
 
-def _marked_frames(recording: Recording) -> IntArray:
+def marked_frames(recording: Recording) -> IntArray:
     frames = usable_frames(recording)
     frames = frames[np.isin(frames, recording.marker_frame)]
     if not len(frames):

@@ -1,0 +1,195 @@
+"""A plan in words: tables for people, and the next experiment that a finished loop asks for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from femsense.arrays import FloatArray
+from femsense.errors import FemsenseError
+from femsense.loop.data import Data, groups_of
+from femsense.loop.joint import JointFit, Trial
+from femsense.loop.menu import menu, setup_for
+from femsense.loop.outlook import EVIDENCE, Block, Form, Judge, Outlook, Row, forms_of, make_block, turns_of
+from femsense.loop.plan import Proposal, element_block
+from femsense.loop.screen import NUISANCE
+from femsense.march import has_history
+from femsense.model import Robot
+
+MOST_WORK = 30_000
+"""Tetrahedra × frames that advice after a loop may cost; a few seconds."""
+MOST_LOOKED_AT = 6
+"""Frames of each recording that are looked at then."""
+
+
+# Tables
+
+
+def outlook_text(outlook: Outlook, before: Outlook | None = None) -> str:
+    """Return what an experiment could show as a table; with what came before beside it."""
+    first = {r.label: r for r in before.rows} if before is not None else {}
+    wide = max(len(r.label) for r in outlook.rows) + 2
+    head = f"{'effect':{wide}}{'left by calibration':>22}{'smallest seen':>32}{'dBIC at plausible size':>26}"
+    lines = [head, "-" * len(head)]
+    for r in outlook.rows:
+        old = first.get(r.label)
+        cells = [_arrow(None if old is None else old.retained, r.retained, "{:.1%}"), _both(old, r)]
+        cells.append(_arrow(None if old is None else old.dbic, r.dbic, "{:.0f}"))
+        lines.append(f"{r.label:{wide}}{cells[0]:>22}{cells[1]:>32}{cells[2]:>26}  {_verdict(r)}")
+    for label in (k for k in first if k not in {r.label for r in outlook.rows}):
+        lines.append(f"{label:{wide}}measured by rest.csv, no longer in question")
+    return "\n".join([*lines, "", *_summary(outlook, before)])
+
+
+def _arrow(old: float | None, new: float, form: str) -> str:
+    return form.format(new) if old is None else f"{form.format(old)} → {form.format(new)}"
+
+
+def _both(old: Row | None, new: Row) -> str:
+    if new.form.effect.discrete:
+        return "as a whole"
+    after = _smallest(new)
+    return after if old is None else f"{_smallest(old, bare=True)} → {after}"
+
+
+def _smallest(r: Row, *, bare: bool = False) -> str:
+    """Return the smallest size of the effect's middle parameter in its own unit."""
+    of = [i for i, p in enumerate(r.form.parameters) if p.key == r.form.parameters[0].key]
+    size = float(np.sort(r.smallest[of])[(len(of) - 1) // 2])
+    p = r.form.parameters[0]
+    if not np.isfinite(size) or not r.testable:
+        return "–"
+    value, unit = size, "" if p.unit == "1" else f" {p.unit}"
+    if p.scale == "log":
+        value, unit = 100 * float(np.expm1(min(size, 7.0))), " %"
+    elif p.scale == "reciprocal":
+        value = 1.0 / size
+    elif p.unit == "m":
+        value, unit = 1e3 * size, " mm"
+    return f"{value:.3g}" + ("" if bare else unit)
+
+
+def _verdict(r: Row) -> str:
+    return "" if r.seen else "too small to be seen" if r.testable else "not testable"
+
+
+def _summary(outlook: Outlook, before: Outlook | None) -> list[str]:
+    def count(what: str) -> str:
+        new = len(getattr(outlook, what)()) if what == "confused" else len(getattr(outlook, what))
+        if before is None:
+            return str(new)
+        old = len(before.confused()) if what == "confused" else len(getattr(before, what))
+        return f"{old} → {new}"
+
+    lines = [
+        f"not testable: {count('untestable')}; too small to be seen: {count('unseen')}; pairs that look alike: {count('confused')}"
+    ]
+    for i, j, share, gap in sorted(outlook.confused(), key=lambda p: p[3])[:12]:
+        names = f"{outlook.rows[i].label} / {outlook.rows[j].label}"
+        lines.append(f"  {names}: one imitates {100 * share:.0f} % of the other, dBIC gap {gap:.0f}")
+    return lines
+
+
+def proposal_text(proposal: Proposal) -> str:
+    """Return a proposal in words and its table."""
+    brings = {s.element.key: s.better for s in proposal.steps}
+    frames, seconds = sum(e.frames for e in proposal.elements), sum(e.seconds for e in proposal.elements)
+    lines = [f"What to record ({frames} frames, {seconds / 60:.1f} minutes of motion; every item starts and ends at rest):", ""]
+    for i, e in enumerate(proposal.elements):
+        how = f" ({e.frames} frame{'s' if e.frames > 1 else ''}, {e.seconds:.0f} s)" if e.frames else ""
+        lines.append(f"{i + 1:3d}. {e.words}{how}")
+        lines += [f"       {text}" for text in brings.get(e.key, ())[:4]]
+    if not proposal.steps:
+        lines.append("nothing on the menu helps within these frames")
+    lines += [f"left out: {text}" for text in proposal.left_out]
+    title = f"Predicted, before → after, {1e3 * proposal.noise:g} mm noise a coordinate, on the declared robot:"
+    note = (
+        "Validation needs frames beyond these: one more sweep of a kind that is not in the list (femsense improve --validation)."
+    )
+    return "\n".join([*lines, "", note, "", title, "", outlook_text(proposal.after, proposal.before)])
+
+
+# What a finished loop asks for
+
+
+def next_element(
+    data: Data, fit: JointFit, noise: float, confounded: Sequence[tuple[str, str]], not_testable: Sequence[str]
+) -> list[tuple[str, float, float]]:
+    """Return which item of the menu would help most with what the data leave open, and by how much.
+
+    Arguments:
+        data: of the loop; few of its frames are looked at.
+        fit: the model.
+        noise: of a marker's coordinate [m].
+        confounded: pairs of effects that the data cannot tell apart.
+        not_testable: effects that they cannot show.
+
+    Returns:
+        (what to do, the smallest expected dBIC gap of the open questions before, the same after), the best first; empty where nothing
+        helps or where it would take too long.
+    """
+    robot = fit.hypothesis.robot_at(fit.coordinates)
+    names = {n for pair in confounded for n in pair} | set(not_testable)
+    trials = [_few(t) for t in data.train]
+    tets = len(robot.body.mesh.tets)
+    if not names or tets * sum(_cost(t, robot) for t in trials) > 2 * MOST_WORK:
+        return []
+    try:
+        zero = "unknown" if any(t.initial is not None for t in trials) else "absolute"
+        setup = setup_for(robot, data.control, zero, most=data.input_scale)
+        forms = _open_forms(robot, data, names)
+        have = [_trial_block(t, robot, forms, noise, str(i)) for i, t in enumerate(trials)]
+    except FemsenseError:
+        return []
+    judge, work = Judge(forms, data.input_scale), 0
+    now = _open(judge.judge(have), confounded, not_testable)
+    found = []
+    for element in menu(setup):
+        work += tets * (element.frames + 1)
+        if not element.sweeps or work > MOST_WORK:
+            continue
+        try:
+            block = element_block(setup, forms, element, noise, with_rest=False)
+        except FemsenseError:
+            continue
+        then = _open(judge.judge([*have, block]), confounded, not_testable)
+        if sum(np.minimum(then, EVIDENCE)) > sum(np.minimum(now, EVIDENCE)) + 1.0:
+            found.append((element.words, float(min(now)), float(min(then)), float(sum(np.minimum(then, EVIDENCE)))))
+    return [(words, before, after) for words, before, after, _ in sorted(found, key=lambda f: -f[3])]
+
+
+def _few(trial: Trial) -> Trial:
+    frames = trial.scene.frames
+    every = np.unique(np.linspace(0, len(frames) - 1, min(MOST_LOOKED_AT, len(frames))).round().astype(int))
+    scene = trial.scene.pick(frames[every])
+    return replace(trial, scene=scene, groups=groups_of(scene), starts={}, mesh_error=None)
+
+
+def _cost(trial: Trial, robot: Robot) -> int:
+    return int(trial.scene.frames.max()) + 1 if has_history(robot) else len(trial.scene.frames)
+
+
+def _open_forms(robot: Robot, data: Data, names: set[str]) -> list[Form]:
+    unknown = any(t.initial is not None for t in data.train)
+    wanted = (names | set(NUISANCE)) - ({"cable_offset"} if unknown else set())
+    return forms_of(robot, data.control, data.input_scale, names=sorted(wanted))
+
+
+def _trial_block(trial: Trial, robot: Robot, forms: list[Form], noise: float, key: str) -> Block:
+    turns = turns_of(trial.scene.recording.gravity, robot.body.gravity)
+    return make_block(trial, robot, forms, recording=key, noise=noise, turns=turns, measured=True)
+
+
+def _open(outlook: Outlook, pairs: Sequence[tuple[str, str]], not_testable: Sequence[str]) -> FloatArray:
+    """Return the expected evidence on each open question: the gap of a pair, or of an effect over no effect."""
+    of = {frozenset({outlook.rows[i].name, outlook.rows[j].name}): gap for i, j, _, gap in reversed(outlook.pairs())}
+    alone = {r.name: r.dbic for r in reversed(outlook.rows)}
+    answers: list[Any] = [of.get(frozenset(p), EVIDENCE) for p in pairs]
+    answers += [alone.get(n, EVIDENCE) for n in not_testable]
+    return np.array(answers or [EVIDENCE])
+
+
+__all__ = ["next_element", "outlook_text", "proposal_text"]
