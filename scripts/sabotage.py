@@ -173,6 +173,12 @@ SABOTAGES = (
     S("quality.py", "np.cbrt(3.0 *", "np.cbrt(2.0 *", "test_quality.py::test_a_regular_tetrahedron_is_perfect"),
     S("accuracy.py", "step = 1.0 / (2.0**ORDER - 1.0)", "step = 1.0 / 2.0**ORDER", "test_accuracy.py::test_a_model_that_moves_half_as_far_senses_twice_the_force"),
     S("accuracy.py", "/ (own**2).sum(axis=(1, 2)) - 1.0", "/ (true**2).sum(axis=(1, 2)) - 1.0", "test_accuracy.py::test_a_model_that_moves_half_as_far_senses_twice_the_force"),
+    # the experiment advisor
+    S("loop/outlook.py", "left + shared - cross.T @ _inverse(own) @ cross", "left + shared + 0 * cross.T @ _inverse(own) @ cross", "test_plan.py::test_gram_matrices_say_what_projections_of_the_columns_say"),
+    S("loop/outlook.py", "gain - float(self.explained[i, j]) + self._price", "gain + self._price", "test_plan.py::test_gram_matrices_say_what_projections_of_the_columns_say"),
+    S("loop/outlook.py", "mine = [b for b in blocks if b.recording == key]", "mine = list(blocks)", "test_plan.py::test_two_recordings_have_two_poses_and_one_has_one"),
+    S("loop/outlook.py", 'np.einsum("kci,kij->kcj", own, turns[trial.scene.frame])', "own", "test_plan.py::test_turning_the_base_makes_gravity_testable"),
+    S("loop/outlook.py", "np.arctan2(size, float(a @ b))", "np.arctan2(float(a @ b), size)", "test_plan.py::test_turns_take_gravity_as_declared_to_that_of_the_frame"),
 )  # fmt: skip
 
 

@@ -51,7 +51,11 @@ def row(outlook, label):
 def form(name, at, count, size=1.0):
     effect = find_effect(name)
     parameters = effect.parameters(tiny(), "tension")[:1] * count
-    return Form(name, name, effect, {}, parameters, np.full(count, size), 1, at)
+    return Form(name, name, effect, {}, parameters, np.full(count, size), at)
+
+
+def nothing(own, shared):
+    return Gram(np.zeros((own, own)), np.zeros((own, shared)), np.zeros((shared, shared)))
 
 
 def test_gram_matrices_say_what_projections_of_the_columns_say():
@@ -60,7 +64,7 @@ def test_gram_matrices_say_what_projections_of_the_columns_say():
     shared[:, 4] = shared[:, 1] + 0.3 * shared[:, 4]
     forms = [form("stiffness", 0, 1), form("poisson", 1, 1), form("gravity", 2, 2), form("geometry", 4, 1)]
     gram = Gram(own.T @ own, own.T @ shared, shared.T @ shared)
-    outlook = Judge(forms, np.ones(4)).judge([Block("a", gram, None, np.zeros((3, 3)), 40, 40)])
+    outlook = Judge(forms, np.ones(4)).judge([Block("a", gram, None, nothing(3, 5), 40, 40)])
     prior = np.zeros((1, 4))
     prior[0, 3] = 1 / 0.7
     N = np.vstack([np.hstack([own, shared[:, :1]]), prior])
@@ -89,7 +93,7 @@ def test_two_recordings_have_two_poses_and_one_has_one():
     halves = [(own[s], shared[s]) for s in (slice(0, 15), slice(15, 30))]
 
     def judged(keys):
-        blocks = [Block(k, Gram(o.T @ o, o.T @ s, s.T @ s), None, np.zeros((3, 3)), 15, 15) for k, (o, s) in zip(keys, halves)]
+        blocks = [Block(k, Gram(o.T @ o, o.T @ s, s.T @ s), None, nothing(3, 1), 15, 15) for k, (o, s) in zip(keys, halves)]
         return Judge(forms, np.ones(4)).judge(blocks).rows[0].retained
 
     assert judged("aa") > 0.5

@@ -25,7 +25,7 @@ from femsense.effects.effect import number, vector
 from femsense.effects.loads import STANDARD_GRAVITY
 from femsense.effects.support import BASE_ROTATION
 from femsense.loop.joint import JointFit, JointProblem, Prior, Trial
-from femsense.loop.screen import NUISANCE, TESTABLE, effect_fields
+from femsense.loop.screen import NUISANCE, TESTABLE, effect_fields, penalty
 from femsense.model import Robot
 from femsense.pose import rotation_from_vector
 from femsense.rig.camera import measured_points, visible_points
@@ -101,8 +101,6 @@ class Form:
     parameters: tuple[Parameter, ...]
     size: FloatArray
     """Plausible size of each column, in coordinates."""
-    seeds: int
-    """How many seeds `improve` tries of it."""
     at: int
     """Where its columns start."""
 
@@ -123,13 +121,13 @@ def forms_of(robot: Robot, control: str, ranges: FloatArray, *, names: Sequence[
     result: list[Form] = []
     at = 0
     for effect, label in _kinds(robot):
-        seeds = list(effect.seeds(robot))
-        for seed in seeds[:MOST_SEEDS] if names is None or effect.name in names else []:
+        seeds = effect.seeds(robot)[:MOST_SEEDS]
+        for seed in seeds if names is None or effect.name in names else []:
             parameters = effect.parameters(robot, control)
             if not parameters and not effect.discrete:
                 continue
             size = np.ones(1) if effect.discrete else np.array([_plausible(effect, p, robot, ranges) for p in parameters])
-            result.append(Form(label, effect.name, effect, seed, parameters, size, len(seeds), at))
+            result.append(Form(label, effect.name, effect, seed, parameters, size, at))
             at += len(size)
     return result
 
@@ -185,8 +183,8 @@ class Block:
     gram: Gram
     rested: Gram | None
     """The same with rest.csv; None where it was not asked for."""
-    seats: FloatArray
-    """What rest.csv says of the pose, shape (w, w)."""
+    seats: Gram
+    """What rest.csv says, once a recording."""
     states: int
     """Distinct states of markers."""
     rows: int
@@ -223,23 +221,23 @@ def make_block(
     trial = trial if measured else _as_expected(trial, robot)
     jet = _jet(trial, robot)
     rows = _seen(trial, robot, jet) if see else np.ones(len(jet.residual), dtype=bool)
-    columns = _columns(trial, robot, jet, forms, turns)
-    own = np.concatenate([jet.by_pose, jet.by_initial], axis=2)
+    columns, rest_columns = _columns(trial, robot, jet, forms, turns, width=max((f.columns.stop for f in forms), default=0))
     states = len(np.unique(trial.groups.state[rows]))
-    seats = _seats(jet, own.shape[2], noise)
-    gram = _gram(own[rows], columns[rows], noise)
-    rested = None
-    if with_rest:
-        placed = _with_rest(trial, robot)
-        jet = _jet(placed, robot)
-        changed = [f for f in forms if f.name in ("geometry", "depth_scale")]
-        columns = columns.copy()
-        fresh = _columns(placed, robot, jet, changed, turns)
-        for f in changed:
-            columns[:, :, f.columns] = fresh[:, :, f.columns]
-        own = np.concatenate([jet.by_pose, jet.by_initial], axis=2)
-        rested, seats = _gram(own[rows], columns[rows], noise), _seats(jet, own.shape[2], noise)
-    return Block(recording, gram, rested, seats, states, int(rows.sum()))
+    gram, seats = _gram(_own(jet)[rows], columns[rows], noise), _seats(jet, rest_columns, noise)
+    if not with_rest:
+        return Block(recording, gram, None, seats, states, int(rows.sum()))
+    placed = _with_rest(trial, robot)
+    jet = _jet(placed, robot)
+    moved = [f for f in forms if f.name in ("geometry", "depth_scale")]  # the others leave the measured seats where they are
+    fresh, rest_columns = _columns(placed, robot, jet, moved, turns, width=columns.shape[2])
+    for f in moved:
+        columns[:, :, f.columns] = fresh[:, :, f.columns]
+    rested = _gram(_own(jet)[rows], columns[rows], noise)
+    return Block(recording, gram, rested, _seats(jet, rest_columns, noise), states, int(rows.sum()))
+
+
+def _own(jet: SceneJet) -> FloatArray:
+    return np.concatenate([jet.by_pose, jet.by_initial], axis=2)
 
 
 def _jet(trial: Trial, robot: Robot) -> SceneJet:
@@ -278,12 +276,14 @@ def _seen(trial: Trial, robot: Robot, jet: SceneJet) -> BoolArray:
     return np.array([visible[int(f)][m] for f, m in zip(scene.frame, scene.marker)], dtype=bool)
 
 
-def _columns(trial: Trial, robot: Robot, jet: SceneJet, forms: Sequence[Form], turns: FloatArray | None) -> FloatArray:
-    """Return the columns of forms at their places [m], shape (k, 3, e); zero where one cannot act or finds no equilibrium."""
-    width = max((f.columns.stop for f in forms), default=0)
-    result = np.zeros((len(jet.residual), 3, width))
+def _columns(
+    trial: Trial, robot: Robot, jet: SceneJet, forms: Sequence[Form], turns: FloatArray | None, *, width: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return the columns of forms at their places [m], of markers (k, 3, e) and of measured seats (r, 3, e); zero where a form cannot
+    act or finds no equilibrium."""
+    result, rest = np.zeros((len(jet.residual), 3, width)), np.zeros((len(jet.rest), 3, width))
     if not forms:
-        return result
+        return result, rest
     theta = _start(trial)
     fit = FitResult(theta, np.zeros((0, 0)), np.zeros(0), np.zeros((0, 0)), (), "")
     base = JointFit(Hypothesis(robot), Prior(np.zeros(0), np.zeros(0)), fit, len(theta), 0.0, [jet])
@@ -291,11 +291,11 @@ def _columns(trial: Trial, robot: Robot, jet: SceneJet, forms: Sequence[Form], t
     where = {(id(f.effect), id(f.seed)): f for f in forms}
     for i, (effect, seed, _) in enumerate(fields.todo):
         form = where[id(effect), id(seed)]
-        own = fields.of(i)[0]
+        (own,), (seats,) = fields.of(i)
         if form.effect is WEIGHT and turns is not None:
             own = np.einsum("kci,kij->kcj", own, turns[trial.scene.frame])
-        result[:, :, form.columns] = own
-    return result
+        result[:, :, form.columns], rest[:, :, form.columns] = own, seats
+    return result, rest
 
 
 def _gram(own: FloatArray, shared: FloatArray, noise: float) -> Gram:
@@ -303,12 +303,13 @@ def _gram(own: FloatArray, shared: FloatArray, noise: float) -> Gram:
     return Gram(A.T @ A, A.T @ B, B.T @ B)
 
 
-def _seats(jet: SceneJet, width: int, noise: float) -> FloatArray:
-    """Return what measured seats say of the pose; they are trusted as markers are, but not better than 0.1 mm."""
-    result = np.zeros((width, width))
-    A = jet.rest_by_pose.reshape(-1, jet.rest_by_pose.shape[2]) / max(noise, 1e-4)
-    result[: A.shape[1], : A.shape[1]] = A.T @ A
-    return result
+def _seats(jet: SceneJet, shared: FloatArray, noise: float) -> Gram:
+    """Return what measured seats say; they are trusted as markers are, but not better than 0.1 mm."""
+    r = len(jet.rest)
+    own = np.concatenate(
+        [jet.rest_by_pose.reshape(r, 3, jet.by_pose.shape[2]), np.zeros((r, 3, jet.by_initial.shape[2]))], axis=2
+    )
+    return _gram(own, shared, max(noise, 1e-4))
 
 
 def turns_of(gravity: FloatArray | None, declared: FloatArray) -> FloatArray | None:
@@ -424,7 +425,7 @@ class Judge:
         labels = [label for label in self._by_label if not (rest and label == "marker_offset")]
         names = len({f.name for f in self.forms if f.name not in self.calibrated})
         scale = np.sqrt(np.maximum(np.diag(whole), 1e-300))
-        free = {drop: _Left(self, seen, scale, self._kept(drop), float(np.log(count)), names) for drop in self._drops(labels)}
+        free = {drop: _Left(self, seen, scale, self._kept(drop), count, names) for drop in self._drops(labels)}
         rows = [self._row(label, free[self._dropped(label)], whole, count) for label in labels]
         confounding, gap = np.zeros((len(rows), len(rows))), np.full((len(rows), len(rows)), np.inf)
         for i, a in enumerate(rows):
@@ -450,9 +451,8 @@ class Judge:
         for key in dict.fromkeys(b.recording for b in blocks):
             mine = [b for b in blocks if b.recording == key]
             grams = [b.rested if rest and b.rested is not None else b.gram for b in mine]
+            grams += [mine[0].seats] if rest or mine[0].rested is None else []
             own, cross, shared = (np.sum([getattr(g, n) for g in grams], axis=0) for n in ("own", "cross", "shared"))
-            if rest or mine[0].rested is None:
-                own = own + mine[0].seats
             left, whole = left + shared - cross.T @ _inverse(own) @ cross, whole + shared
         return np.asarray(left), np.asarray(whole)
 
@@ -471,8 +471,8 @@ class Judge:
 class _Left:
     """What some calibration leaves of every form, and how much of one another explains."""
 
-    def __init__(self, judge: Judge, shared: FloatArray, scale: FloatArray, kept: list[Form], log_n: float, names: int) -> None:
-        self.forms, self.log_n, self.names = judge.forms, log_n, names
+    def __init__(self, judge: Judge, shared: FloatArray, scale: FloatArray, kept: list[Form], count: float, names: int) -> None:
+        self.forms, self.count, self.names = judge.forms, count, names
         N = np.concatenate([np.arange(f.at, f.at + len(f.size)) for f in kept]) if kept else np.zeros(0, dtype=np.int64)
         prior = np.concatenate([_prior(f, judge.ranges) for f in kept]) if kept else np.zeros(0)
         G = shared[np.ix_(N, N)] + np.diag(1.0 / prior**2)
@@ -499,7 +499,7 @@ class _Left:
         return share, min(gaps)
 
     def _price(self, f: Form) -> float:
-        return float(len(f.parameters) * self.log_n + 2.0 * np.log(self.names * f.seeds))
+        return penalty(len(f.parameters), f.seed, 1, self.names, self.count)
 
 
 def _prior(f: Form, ranges: FloatArray) -> FloatArray:
