@@ -1,6 +1,6 @@
 """What the experiment advisor proposes for the robots that come along, and what that costs.
 
-    python benchmarks/plan.py [ROBOT …]
+python benchmarks/plan.py [ROBOT …]
 """
 
 from __future__ import annotations

@@ -132,6 +132,7 @@ def mesh(
 
 @app.command()
 def simulate(
+    context: typer.Context,
     robot: RobotPath,
     script: Annotated[Path, typer.Argument(metavar="SCRIPT", help="What the virtual rig does (TOML).", show_default=False)],
     output: Annotated[Path | None, typer.Option("-o", "--output", metavar="RECORDING", help="The recording to write.", show_default=False)] = None,
@@ -144,7 +145,7 @@ def simulate(
 
     if plan:
         return Answer(*script_outlook(robot, script, noise=1e-3 * noise))
-    output = _required(output, "'-o' / '--output'", "option")
+    output = _required(context, output, "'-o' / '--output'", "option")
     simulate_into(output, robot, script)
     return Answer({"recording": str(output)}, f"recording: {output}\nlook at it: femsense inspect {output}")
 
@@ -195,6 +196,7 @@ def estimate(
 
 @app.command()
 def improve(
+    context: typer.Context,
     robot: RobotPath,
     recordings: Annotated[list[Path] | None, typer.Argument(metavar="RECORDING", help="What the effects are found on.", show_default=False)] = None,
     output: Annotated[Path | None, typer.Option("-o", "--output", metavar="OUT", help="The folder to write; with --plan a script (TOML).", show_default=False)] = None,
@@ -219,8 +221,8 @@ def improve(
             return Answer(
                 *plan_into(output, robot, given=given, noise=1e-3 * noise, frames=frames, control=actuation, progress=progress)
             )
-    recordings = _required(recordings, "'RECORDING...'", "argument")
-    output = _required(output, "'-o' / '--output'", "option")
+    recordings = _required(context, recordings, "'RECORDING...'", "argument")
+    output = _required(context, output, "'-o' / '--output'", "option")
     with _progress("improve") as progress:
         document = improve_into(
             output, robot, recordings, validation=validation or [], effects=_names(effects), without=_names(without),
@@ -473,10 +475,12 @@ def _spread(words: list[str]) -> list[str]:
     return result
 
 
-def _required(value: T | None, name: str, kind: str) -> T:
+def _required(context: typer.Context, value: T | None, name: str, kind: str) -> T:
     """Return what only --plan can do without."""
     if value is None:
-        raise TyperException(f"Missing {kind} {name}.")
+        error = TyperException(f"Missing {kind} {name}.")
+        error.ctx = context  # type: ignore[attr-defined]
+        raise error
     return value
 
 

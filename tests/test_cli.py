@@ -126,8 +126,6 @@ def test_version(run: Any) -> None:
         (["improve", "robot"], "Missing argument 'RECORDING...'. See: femsense improve --help"),
         (["improve", "robot", "a"], "Missing option '-o' / '--output'. See: femsense improve --help"),
         (["simulate", "robot", "a"], "Missing option '-o' / '--output'. See: femsense simulate --help"),
-        (["improve", "robot", "--plan", "-o", "plan"], "expected a file that ends in .toml"),
-        (["improve", "robot", "--plan", "--actuation", "force"], "expected tension | displacement"),
         (["inspect", "--nonsense", "x"], "No such option: --nonsense"),
         (["estimate", "a", "b", "-o", "c", "--at", "1,2"], "'1,2' is not a place: three numbers in metres are"),
         (["estimate", "a", "b", "-o", "c", "--at", "x,y,z"], "'x,y,z' is not a place"),
@@ -138,6 +136,11 @@ def test_wrong_usage_is_one_clear_line(run: Any, arguments: list[str], message: 
     said = run(*arguments)
     assert said.status == 2 and said.out == ""
     assert message in said.err and said.err.count("\n") == 1 and said.err.startswith("femsense: ")
+
+
+def test_a_plan_refuses_what_it_cannot_do(run: Any, robot: Path) -> None:
+    assert "expected: a file that ends in .toml" in run("improve", robot, "--plan", "-o", "plan").err
+    assert "expected: tension | displacement" in run("improve", robot, "--plan", "--actuation", "force").err
 
 
 @pytest.mark.parametrize(
