@@ -12,15 +12,15 @@ from femsense.arrays import FloatArray
 from femsense.errors import FemsenseError
 from femsense.loop.data import Data, groups_of
 from femsense.loop.joint import JointFit, Trial
-from femsense.loop.menu import menu, setup_for
+from femsense.loop.menu import Element, menu, setup_for
 from femsense.loop.outlook import EVIDENCE, Block, Form, Judge, Outlook, Row, forms_of, make_block, turns_of
 from femsense.loop.plan import Proposal, element_block
 from femsense.loop.screen import NUISANCE
 from femsense.march import has_history
 from femsense.model import Robot
 
-MOST_WORK = 30_000
-"""Tetrahedra × frames that advice after a loop may cost; a few seconds."""
+MOST_WORK, MOST_FRAMES = 30_000, 40
+"""Tetrahedra × frames, and frames, that items may cost as advice after a loop; the recordings may cost twice that. A few seconds."""
 MOST_LOOKED_AT = 6
 """Frames of each recording that are looked at then."""
 
@@ -135,22 +135,25 @@ def next_element(
     names = {n for pair in confounded for n in pair} | set(not_testable)
     trials = [_few(t) for t in data.train]
     tets = len(robot.body.mesh.tets)
-    if not names or tets * sum(_cost(t, robot) for t in trials) > 2 * MOST_WORK:
+    past = has_history(robot) or "cable_friction" in names
+    cost = sum(int(t.scene.frames.max()) + 1 if past else len(t.scene.frames) for t in trials)
+    if not names or cost > 2 * min(MOST_WORK // tets, MOST_FRAMES):
         return []
     try:
         zero = "unknown" if any(t.initial is not None for t in trials) else "absolute"
         setup = setup_for(robot, data.control, zero, most=data.input_scale)
         forms = _open_forms(robot, data, names)
-        have = [_trial_block(t, robot, forms, noise, str(i)) for i, t in enumerate(trials)]
+        shares = [len(few.scene.frames) / len(t.scene.frames) for few, t in zip(trials, data.train)]
+        have = [_trial_block(t, robot, forms, noise * np.sqrt(share), str(i)) for i, (t, share) in enumerate(zip(trials, shares))]
     except FemsenseError:
         return []
-    judge, work = Judge(forms, data.input_scale), 0
+    judge, left = Judge(forms, data.input_scale), min(MOST_WORK // tets, MOST_FRAMES)
     now = _open(judge.judge(have), confounded, not_testable)
     found = []
-    for element in menu(setup):
-        work += tets * (element.frames + 1)
-        if not element.sweeps or work > MOST_WORK:
+    for element in _one_of_each_first(menu(setup)):
+        if not element.sweeps or element.frames >= left:
             continue
+        left -= element.frames + 1
         try:
             block = element_block(setup, forms, element, noise, with_rest=False)
         except FemsenseError:
@@ -161,15 +164,16 @@ def next_element(
     return [(words, before, after) for words, before, after, _ in sorted(found, key=lambda f: -f[3])]
 
 
+def _one_of_each_first(elements: Sequence[Element]) -> list[Element]:
+    kinds = [e.key.split(":")[0] for e in elements]
+    return [e for _, _, e in sorted(((kinds[:i].count(kinds[i]), i, e) for i, e in enumerate(elements)), key=lambda t: t[:2])]
+
+
 def _few(trial: Trial) -> Trial:
     frames = trial.scene.frames
     every = np.unique(np.linspace(0, len(frames) - 1, min(MOST_LOOKED_AT, len(frames))).round().astype(int))
     scene = trial.scene.pick(frames[every])
     return replace(trial, scene=scene, groups=groups_of(scene), starts={}, mesh_error=None)
-
-
-def _cost(trial: Trial, robot: Robot) -> int:
-    return int(trial.scene.frames.max()) + 1 if has_history(robot) else len(trial.scene.frames)
 
 
 def _open_forms(robot: Robot, data: Data, names: set[str]) -> list[Form]:
