@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from femsense.errors import DataError, FemsenseError, InputError, MissingDependency
     from femsense.fem.compliance import compliance
     from femsense.fem.equilibrium import Equilibrium, solve_equilibrium
-    from femsense.loop import LoopResult, improve
+    from femsense.loop.improve import improve
+    from femsense.loop.result import LoopResult
     from femsense.model import Robot
     from femsense.recording import Recording, load_recording
     from femsense.results import read_calibration, read_loop, read_run, write_calibration, write_loop, write_run
