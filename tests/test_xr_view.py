@@ -174,8 +174,8 @@ const args = ['--no-sandbox', '--use-gl=angle', '--use-angle=swiftshader', '--en
   page.on('console', (m) => { if (m.type() === 'error') problems.push(m.text()); });
   page.on('pageerror', (e) => problems.push(e.message));
   page.on('request', (r) => { if (r.url().startsWith('http')) hosts.add(new URL(r.url()).host); });
-  await page.goto(url + '?time=0.97&play=0');
-  await page.waitForFunction(() => document.documentElement.dataset.state, null, { timeout: 60000 });
+  await page.goto(url + '?time=0.97&play=0', { timeout: 120000 });
+  await page.waitForFunction(() => document.documentElement.dataset.state, null, { timeout: 120000 });
   const state = await page.evaluate(() => document.documentElement.dataset.state);
   const text = () => page.evaluate(() => document.body.innerText);
   const result = { state, problems, hosts: [...hosts], text: await text() };
@@ -228,7 +228,7 @@ def look(request: pytest.FixtureRequest, url: str, folder: Path) -> dict[str, ob
     script = packages / "look.cjs"
     script.write_text(LOOK, encoding="utf-8")
     command = [*build_hook().node_command(), str(script), str(CHROMIUM), url, str(folder / "desk.png"), str(folder / "phone.png")]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=150, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr
     found: dict[str, object] = json.loads(done.stdout)
     return found
