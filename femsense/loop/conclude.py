@@ -11,6 +11,7 @@ from femsense.arrays import FloatArray
 from femsense.effects import Entry, apply_effects
 from femsense.loop.advice import next_element
 from femsense.loop.data import Data
+from femsense.loop.evidence import gather
 from femsense.loop.grow import ABOVE_MESH, EVIDENCE, at_edge, evidence, mesh_cost, moved_by
 from femsense.loop.joint import Prior
 from femsense.loop.noise import Noise
@@ -94,6 +95,9 @@ def conclude(data: Data, search: Search, rng: np.random.Generator) -> LoopResult
         declared=data.robot,
         data=_card(data, before, final, noise, search.n_effective),
         residuals=_residual_table(data, before, back),
+        evidence=gather(
+            data, before, search.history[0][1], final, back, noise, search.n_effective, search.first, search.last, tests, rng
+        ),
     )
 
 

@@ -94,6 +94,7 @@ def improve(
         history.append((name, stage))
     say("testing what is left")
     result = conclude(data, Search(before, history, stage, noise, n_effective, first, table, refits), rng)
+    result = replace(result, data={**result.data, "seed": seed})
     if growing:
         return result
     only = "record another state (other inputs, load or direction of gravity): these data repeat one state, which cannot tell effects apart"

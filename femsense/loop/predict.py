@@ -18,14 +18,14 @@ def sweeps_predicted(trials: list[Trial], before: JointFit, after: JointFit) -> 
 
     The standard error is infinite for fewer than three sweeps.
     """
-    rows = _sweep_rows(trials, before)
+    rows = sweep_rows(trials, before)
     gains = np.array([_density(after, r) - _density(before, r) for r in rows])
     if len(gains) < 3:
         return float(gains.sum()), float("inf")
     return float(gains.sum()), float(np.sqrt(len(gains)) * gains.std(ddof=1))
 
 
-def _sweep_rows(trials: list[Trial], fit: JointFit) -> list[IntArray]:
+def sweep_rows(trials: list[Trial], fit: JointFit) -> list[IntArray]:
     """Return the rows of the whitened residual that belong to each sweep of each trial."""
     result, at = [], 0
     for trial, jet in zip(trials, fit.jets):
@@ -55,4 +55,4 @@ def _half_inverse(J: FloatArray) -> FloatArray:
     return np.asarray(Vt[keep].T / s[keep] / scale[:, None])
 
 
-__all__ = ["sweeps_predicted"]
+__all__ = ["sweep_rows", "sweeps_predicted"]

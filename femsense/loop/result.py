@@ -41,6 +41,9 @@ class LoopResult:
     residuals: dict[str, Any] = field(default_factory=dict)
     """Held-out residuals before and after, for figures: {frame, marker, before_m, after_m, position_m}."""
 
+    evidence: dict[str, Any] = field(default_factory=dict)
+    """What the report draws and tabulates besides; see `femsense.loop.evidence`."""
+
     def document(self) -> dict[str, Any]:
         """Return the content of loop.json."""
         return {
@@ -59,4 +62,5 @@ class LoopResult:
             "left": self.left,
             "data": self.data,
             "residuals": self.residuals,
+            "evidence": self.evidence,
         }

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 
 from femsense.arrays import FloatArray
-from femsense.calib.forward import Hypothesis, evaluate_scene
+from femsense.calib.forward import Hypothesis, SceneJet, evaluate_scene
 from femsense.effects import Effect, Entry, Parameter, find_effect
 from femsense.loop.data import Data, groups_of
 from femsense.loop.joint import JointFit, JointProblem, Prior, Trial, fit_jointly, rms_of
@@ -19,12 +19,26 @@ from femsense.model import Robot
 
 
 @dataclass(frozen=True, eq=False, slots=True)
+class HeldOut:
+    """What a model makes of a held-out trial."""
+
+    jet: SceneJet
+    """Residuals and states, no derivatives."""
+    poses: list[FloatArray]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
 class Stage:
     """A model with its fit and its error on held-out data."""
 
     fit: JointFit
-    held_residuals: list[FloatArray]
+    held: list[HeldOut]
     held_rms: float
+
+    @property
+    def held_residuals(self) -> list[FloatArray]:
+        """Residuals of the held-out data [m], (k, 3) a trial."""
+        return [h.jet.residual for h in self.held]
 
 
 def with_nuisance(data: Data) -> tuple[Hypothesis, Prior]:
@@ -53,16 +67,16 @@ def make_stage(
     max_iterations: int = 12,
 ) -> Stage:
     fit = fit_jointly(hypothesis, prior, data.train, noise, data.seat_std, coordinates, own=own, max_iterations=max_iterations)
-    residuals = held_out_residuals(data, fit, noise)
-    return Stage(fit, residuals, rms_of(residuals))
+    held = held_out(data, fit, noise)
+    return Stage(fit, held, rms_of([h.jet.residual for h in held]))
 
 
 def own_of(stage: Stage) -> FloatArray:
     return np.array(stage.fit.fit.theta[: stage.fit.own])
 
 
-def held_out_residuals(data: Data, fit: JointFit, noise: Noise) -> list[FloatArray]:
-    """Return the residuals of the held-out data (k, 3); a recording of its own gets its own pose from its first frames."""
+def held_out(data: Data, fit: JointFit, noise: Noise) -> list[HeldOut]:
+    """Return what a fit makes of each held-out trial; a recording of its own gets its own pose from its first frames."""
     robot = fit.hypothesis.robot_at(fit.coordinates)
     plain, pivot = Hypothesis(robot), data.robot.marker_points.mean(axis=0)
     spans = np.cumsum([0, *(t.size for t in data.train)])
@@ -83,7 +97,7 @@ def held_out_residuals(data: Data, fit: JointFit, noise: Noise) -> list[FloatArr
             pivot=pivot,
             starts=trial.starts_on(robot.body.mesh),
         )
-        result.append(jet.residual)
+        result.append(HeldOut(jet, list(poses)))
     return result
 
 

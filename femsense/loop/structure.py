@@ -8,12 +8,16 @@ from typing import Any
 import numpy as np
 
 from femsense.arrays import FloatArray, IntArray
+from femsense.loop.covariates import covariates_of, rank_with, stacked
 from femsense.loop.joint import Trial
 from femsense.loop.noise import Noise, whiten
 from femsense.model import Robot
 from femsense.recording import state_key
 
 PERMUTATIONS = 499
+WORST_FRAMES = 5
+GOES_WITH = 8
+"""So many frames and covariates are listed."""
 LEVEL = 0.01
 """Probability, over all tests together (Holm 1979), of calling mere noise structure."""
 
@@ -130,59 +134,60 @@ def _lag_one(fields: list[tuple[FloatArray, IntArray]], rng: np.random.Generator
 
 
 def describe_left(robot: Robot, trials: list[Trial], residuals: list[FloatArray]) -> dict[str, Any]:
-    """Return what the remaining residual looks like: size, where, and what it goes with."""
+    """Return what the remaining residual looks like: how large, where on the body, in which frames, which way, and what it goes with.
+
+    The direction is the one that holds most of the mean square of the worst marker (its sign: that of the mean); `share` says how much.
+    """
     marker = np.concatenate([t.scene.marker for t in trials])
-    size = np.concatenate([np.linalg.norm(r, axis=1) for r in residuals])
+    field = np.concatenate(residuals)
+    size = np.linalg.norm(field, axis=1)
     per_marker = {robot.marker_names[m]: float(np.sqrt((size[marker == m] ** 2).mean())) for m in np.unique(marker)}
     worst = max(per_marker, key=lambda name: per_marker[name])
-    mean = np.mean(np.concatenate(residuals)[marker == robot.marker_names.index(worst)], axis=0)
-    frame_rms, covariates, frames = _per_frame(trials, residuals)
-    goes_with = _rank(frame_rms, covariates)
-    top = int(np.argmax(frame_rms))
+    own = field[marker == robot.marker_names.index(worst)]
+    rms, numbers, recordings = _frame_sizes(trials, residuals)
+    order = np.argsort(-rms, kind="stable")
+    direction, share = _direction(own)
     return {
         "rms_m": float(np.sqrt((size**2).mean())),
         "marker_rms_m": per_marker,
         "where": {
             "marker": worst,
             "position_m": robot.marker_points[robot.marker_names.index(worst)].tolist(),
-            "mean_residual_m": mean.tolist(),
+            "mean_residual_m": own.mean(axis=0).tolist(),
+            "direction": direction.tolist(),
+            "direction_share": share,
         },
-        "worst_frame": {"frame": int(frames[top]), "rms_m": float(frame_rms[top])},
-        "goes_with": goes_with,
+        "worst_frame": {"recording": int(recordings[order[0]]), "frame": int(numbers[order[0]]), "rms_m": float(rms[order[0]])},
+        "worst_frames": [
+            {"recording": int(recordings[i]), "frame": int(numbers[i]), "rms_m": float(rms[i])} for i in order[:WORST_FRAMES]
+        ],
+        "half_in_frames": _share_of_half(rms[order]),
+        "goes_with": rank_with(rms, stacked([covariates_of(t.scene) for t in trials]))[:GOES_WITH],
     }
 
 
-def _per_frame(trials: list[Trial], residuals: list[FloatArray]) -> tuple[FloatArray, dict[str, FloatArray], IntArray]:
-    rms, rows, numbers = [], [], []
-    for trial, residual in zip(trials, residuals):
-        recording = trial.scene.recording
-        for k in np.unique(trial.scene.frame):
-            rms.append(np.sqrt((residual[trial.scene.frame == k] ** 2).sum(axis=1).mean()))
-            numbers.append(recording.frame_numbers[k])
-            change = recording.inputs[k] - recording.inputs[k - 1] if k > 0 else np.zeros(recording.inputs.shape[1])
-            load = np.linalg.norm(recording.load_forces[recording.load_frame == k].sum(axis=0))
-            rows.append(
-                [
-                    recording.time_s[k],
-                    np.abs(recording.inputs[k]).sum(),
-                    np.abs(recording.pressures[k]).sum(),
-                    float(change.sum() < 0),
-                    float(load),
-                    float(np.linalg.norm(trial.scene.points[trial.scene.frame == k].mean(axis=0))),
-                ]
-            )
-    table = np.array(rows, dtype=float)
-    names = ("time", "actuation", "pressure", "unloading", "known load", "distance from the camera")
-    return np.array(rms), {n: table[:, i] for i, n in enumerate(names)}, np.array(numbers)
+def _frame_sizes(trials: list[Trial], residuals: list[FloatArray]) -> tuple[FloatArray, IntArray, IntArray]:
+    """Return root mean square [m], number and recording of each frame, in order."""
+    sizes = [frame_rms(t, r) for t, r in zip(trials, residuals)]
+    numbers = [t.scene.recording.frame_numbers[t.scene.frames] for t in trials]
+    return np.concatenate(sizes), np.concatenate(numbers), np.repeat(np.arange(len(trials)), [len(s) for s in sizes])
 
 
-def _rank(values: FloatArray, covariates: dict[str, FloatArray]) -> list[dict[str, Any]]:
-    """Return the covariates by the strength of their rank correlation with the residual of a frame."""
-    from scipy.stats import spearmanr
+def frame_rms(trial: Trial, residual: FloatArray) -> FloatArray:
+    """Return the root mean square of a residual (k, 3) in each frame of a trial [m], shape (f,)."""
+    place = np.searchsorted(trial.scene.frames, trial.scene.frame)
+    count = np.bincount(place, minlength=len(trial.scene.frames))
+    return np.sqrt(np.bincount(place, (residual**2).sum(axis=1), minlength=len(count)) / np.maximum(count, 1))
 
-    result: list[dict[str, Any]] = []
-    for name, covariate in covariates.items():
-        if len(values) >= 5 and np.ptp(covariate) > 0 and np.ptp(values) > 0:
-            answer = spearmanr(values, covariate)
-            result.append({"covariate": name, "rank_correlation": float(answer.statistic), "p_value": float(answer.pvalue)})
-    return sorted(result, key=lambda r: -abs(r["rank_correlation"]))[:3]
+
+def _direction(vectors: FloatArray) -> tuple[FloatArray, float]:
+    """Return the unit vector that holds most of the mean square of vectors (k, 3), and the share it holds."""
+    _, s, Vt = np.linalg.svd(vectors, full_matrices=False)
+    sign = -1.0 if float(vectors.mean(axis=0) @ Vt[0]) < 0 else 1.0
+    return sign * Vt[0], float(s[0] ** 2 / max(float((s**2).sum()), 1e-300))
+
+
+def _share_of_half(rms_falling: FloatArray) -> float:
+    """Return the share of the frames, the worst first, that hold half of the mean square."""
+    held = np.cumsum(rms_falling**2)
+    return float((np.searchsorted(held, 0.5 * held[-1]) + 1) / len(held))

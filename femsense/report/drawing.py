@@ -95,6 +95,40 @@ def new_axes(*, width: float = WIDTH, height: float = HEIGHT) -> tuple[Any, Any]
     return figure, axes
 
 
+def new_panels(rows: int, columns: int, *, width: float, height: float) -> tuple[Any, list[list[Any]]]:
+    """Return a figure of its own with a grid of axes without a frame, for bodies."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout="constrained", facecolor="white")
+    grid = figure.subplots(rows, columns, squeeze=False)
+    return figure, [list(line) for line in grid]
+
+
+def arrow_options(width: float = 0.0075) -> dict[str, Any]:
+    """Return how arrows in units of the axes are drawn."""
+    return {
+        "angles": "xy", "scale_units": "xy", "scale": 1.0, "width": width, "headwidth": 3.6, "headlength": 4.2, "headaxislength": 3.8,
+        "minlength": 0.2, "zorder": 5,
+    }  # fmt: skip
+
+
+def draw_camera(axes: Any, view: View, directions: Sequence[FloatArray], low: FloatArray, high: FloatArray) -> None:
+    """Draw which way the cameras look, in the upper right corner [mm]; across the page as a ring with a dot (to the eye) or a cross."""
+    size = 0.09 * float((high - low).max())
+    for i, direction in enumerate(directions[:3]):
+        at = np.array([high[0] - 0.6 * size, high[1] - (0.5 + 1.9 * i) * size])
+        flat = view.flat(direction)
+        if float(np.linalg.norm(flat)) > 0.35:
+            tip, tail = at + 0.5 * size * flat, at - 0.5 * size * flat
+            axes.annotate("", xy=tuple(tip), xytext=tuple(tail), arrowprops={"arrowstyle": "-|>", "color": INK, "linewidth": 1.1, "shrinkA": 0, "shrinkB": 0})  # fmt: skip
+        else:
+            inner = "." if float(direction @ view.towards) > 0 else "x"
+            axes.plot([at[0]], [at[1]], "o", color="white", markeredgecolor=INK, markersize=8)
+            axes.plot([at[0]], [at[1]], inner, color=INK, markersize=4)
+        name = "camera looks" if len(directions) == 1 else f"camera {i + 1} looks"
+        axes.text(at[0] - 0.75 * size, at[1], name, ha="right", va="center", fontsize=SIZE - 1.5, color=SOFT)
+
+
 def name_axes(axes: Any, x: str, y: str) -> None:
     """Name both axes."""
     axes.set_xlabel(x, fontsize=SIZE, color=INK)
@@ -137,7 +171,7 @@ def draw_body(axes: Any, surface: Surface, view: View) -> None:
     )
 
 
-def frame_body(axes: Any, view: View, low: FloatArray, high: FloatArray) -> None:
+def frame_body(axes: Any, view: View, low: FloatArray, high: FloatArray, *, corner: bool = True) -> None:
     """Show a rectangle [mm] with equal scales, without axes, and with a cross of the directions and a scale bar below it."""
     size = high - low
     margin = 0.04 * float(size.max())
@@ -148,7 +182,8 @@ def frame_body(axes: Any, view: View, low: FloatArray, high: FloatArray) -> None
     axes.set(xlim=(low[0] - margin, high[0] + margin), ylim=(y - 4.0 * margin, high[1] + margin))
     axes.set_aspect("equal")
     axes.axis("off")
-    _cross(axes, view, np.array([high[0] - 3.0 * margin, y - 2.6 * margin]), 2.2 * margin)
+    if corner:
+        _cross(axes, view, np.array([high[0] - 3.0 * margin, y - 2.6 * margin]), 2.2 * margin)
 
 
 def _cross(axes: Any, view: View, at: FloatArray, size: float) -> None:
@@ -185,12 +220,12 @@ def clipped(name: str, width: int = 22) -> str:
     return text.replace("$", r"\$")
 
 
-def as_image(figure: Any, *, alt: str, caption: object = "") -> Html:
+def as_image(figure: Any, *, alt: str, caption: object = "", wide: bool = False) -> Html:
     """Return a figure as part of the page."""
     stream = io.StringIO()
     figure.savefig(stream, format="svg", dpi=170, metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
     svg = stream.getvalue()
-    return image(_stable(svg[svg.index("<svg") :]).encode(), "svg+xml", alt=alt, caption=caption)
+    return image(_stable(svg[svg.index("<svg") :]).encode(), "svg+xml", alt=alt, caption=caption, wide=wide)
 
 
 def _stable(svg: str) -> str:

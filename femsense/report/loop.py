@@ -10,20 +10,9 @@ from typing import Any
 import numpy as np
 
 from femsense.arrays import FloatArray
-from femsense.effects import EFFECTS
+from femsense.model import Robot
 from femsense.report import words
-from femsense.report.documents import (
-    Candidate,
-    Card,
-    Detectable,
-    Effect,
-    Left,
-    Loop,
-    Residuals,
-    Rivals,
-    Untestable,
-    read_document,
-)
+from femsense.report.documents import Evidence, Frames, Left, Loop, Residuals, Rivals, Structure, read_document
 from femsense.report.drawing import (
     AFTER,
     BEFORE,
@@ -35,17 +24,31 @@ from femsense.report.drawing import (
     Surface,
     View,
     add_legend,
+    arrow_options,
     as_image,
     best_view,
     draw_bars,
     draw_body,
+    draw_camera,
     frame_body,
     name_axes,
     new_axes,
     nice,
     skin,
 )
-from femsense.report.page import Cell, Chapter, Html, bullets, code, element, panels, paragraph, section, table, tiles, together
+from femsense.report.loop_figures import confounding_map, force_field, residual_against, residual_in_frames, sweep_dots
+from femsense.report.loop_tables import (
+    calibration_table,
+    covariate_table,
+    data_card,
+    effects_table,
+    forces_part,
+    power_table,
+    ranking_table,
+    refits_table,
+    tests_table,
+)
+from femsense.report.page import Chapter, Html, bullets, code, element, panels, paragraph, section, table, tiles, together
 from femsense.results import LOOP_FORMAT
 from femsense.robot import load_robot
 
@@ -54,22 +57,14 @@ VERDICTS = {
     "none": "The model explains the data to their noise.",
     "unexplained": "A residual is left that no effect explains.",
 }
-OUTCOMES = {
-    "named": "named: part of the improved model",
-    "passes": "passes all tests too, with less evidence than the one that was named",
-}
+OLDER = (
+    "This loop.json holds no figures of the residual, of calibration, of confounding and of forces: it was written by an earlier femsense. "
+    "Run femsense improve again for the whole report."
+)
 ARROW_SHARE = 0.2
 """The longest arrow, in sizes of the body."""
 SPOTS = 600
-LISTED = 6
 MARKERS = 30
-COMPONENTS = {
-    "white": "each measurement by itself",
-    "state": "a marker in a repeated state",
-    "marker": "a marker in all frames",
-    "frame": "all markers of a frame",
-    "sweep": "all frames of a sweep",
-}
 
 
 def loop_chapter(file: Path, title: str) -> Chapter:
@@ -84,18 +79,30 @@ def loop_chapter(file: Path, title: str) -> Chapter:
     """
     loop = read_document(file, Loop, LOOP_FORMAT)
     residuals = loop.residuals.known()
+    evidence = loop.evidence or Evidence()
+    robot = load_robot(file.parent, effects=False) if (file.parent / "robot.toml").is_file() else None
+    rest = None if robot is None else skin(robot.body.mesh.nodes, robot.body.mesh.tets)
+    cameras = [np.asarray(c.axis, float) for c in evidence.pictures.cameras if all(map(words.known, c.axis))]
     body = together(
         _summary(loop),
-        section("Residual on the robot", _residual_on_robot(residuals, file.parent)),
-        section("Error on held-out data", _held_out(residuals, loop.noise_m)),
-        section("Effects found", _effects(loop.effects)),
-        section("All effects that were tried", _candidates(loop.candidates)),
-        section("What these data cannot say", _open_questions(loop.confounded, loop.not_testable, loop.next_experiment)),
-        section("Smallest effects that would have been seen", _detectable(loop.detectable)),
-        section("What is left", _left(loop.left)),
-        section("Data", _card(loop.data, loop.versions)),
-    )
+        None if loop.evidence or not _is_old(loop) else paragraph(OLDER, class_="next"),
+        section("1. Residual on the robot", _mean_residual(residuals, robot, rest, cameras), residual_in_frames(evidence.pictures, rest)),
+        section("2. What the residual goes with", residual_against(evidence.frames, evidence.score, evidence.tip), covariate_table(evidence.score)),
+        section("3. Error on held-out data", _held_out(residuals, evidence.frames, loop.noise_m)),
+        section("4. Effects", effects_table(loop.effects), ranking_table(loop.candidates, evidence.ranking, loop.effects), refits_table(loop.candidates)),
+        section("5. What these data cannot say", _open_questions(loop, evidence)),
+        section("6. What calibration had taken up", calibration_table(evidence.calibration)),
+        section("7. Tests, and what is left", tests_table(evidence.tests), _left(loop, evidence, rest)),
+        section("8. Smallest effects that would have been seen", power_table(loop.detectable, evidence.power)),
+        section("9. Data", data_card(loop)),
+        section("10. What it means for forces", forces_part(evidence.forces)),
+    )  # fmt: skip
     return Chapter(title, body, loop.sentence or VERDICTS.get(loop.verdict, ""), loop.inputs.robot.name or "")
+
+
+def _is_old(loop: Loop) -> bool:
+    """Return whether more than a verdict is there, so that the figures are missed."""
+    return bool(loop.residuals.frame or loop.candidates)
 
 
 # On top
@@ -136,11 +143,12 @@ def recovered(before_m: float | None, after_m: float | None, noise_m: float | No
 # Residuals
 
 
-def _residual_on_robot(residuals: Residuals, folder: Path) -> Html | None:
+def _mean_residual(
+    residuals: Residuals, robot: Robot | None, surface: Surface | None, cameras: Sequence[FloatArray]
+) -> Html | None:
     """Draw the mean residual of each marker before and after on the robot of the loop."""
-    if not residuals.marker or not (folder / "robot.toml").is_file():
+    if not residuals.marker or robot is None or surface is None:
         return None
-    robot = load_robot(folder, effects=False)
     seat = {name: point for name, point in zip(robot.marker_names, robot.marker_points)}
     rows = np.array([i for i, name in enumerate(residuals.marker) if name in seat], dtype=np.int64)
     if not len(rows):
@@ -148,7 +156,6 @@ def _residual_on_robot(residuals: Residuals, folder: Path) -> Html | None:
     names = [residuals.marker[i] for i in rows]
     points = np.array([seat[name] for name in names])
     before, after = np.asarray(residuals.before_m, float)[rows], np.asarray(residuals.after_m, float)[rows]
-    surface = skin(robot.body.mesh.nodes, robot.body.mesh.tets)
     mean = [_per_marker(names, values) for values in (before, after)]
     seats = _per_marker(names, points)
     view = best_view(np.vstack([surface.nodes, seats]), mean[0])
@@ -157,7 +164,7 @@ def _residual_on_robot(residuals: Residuals, folder: Path) -> Html | None:
     reach = _reach(surface, view, points, factor, (before, after))
     figures = [
         as_image(
-            _quiver(surface, view, (seats, m), (points, values), factor, key, reach, color, title),
+            _quiver(surface, view, (seats, m), (points, values), factor, key, reach, color, title, cameras),
             alt=f"Mean residual of {words.counted(len(seats), 'marker')} {title}: {_sizes(m)}.",
             caption=f"{title.capitalize()}: mean over the held-out frames {_sizes(m)}.",
         )
@@ -202,7 +209,7 @@ def _reach(
 
 def _quiver(
     surface: Surface, view: View, mean: tuple[FloatArray, FloatArray], single: tuple[FloatArray, FloatArray], factor: float, key: float,
-    reach: tuple[FloatArray, FloatArray], color: str, title: str,
+    reach: tuple[FloatArray, FloatArray], color: str, title: str, cameras: Sequence[FloatArray],
 ) -> Any:  # fmt: skip
     low, high = reach
     height = float(np.clip(4.2 * (high[1] - low[1]) / (high[0] - low[0]) + 0.9, 1.9, 4.4))
@@ -213,28 +220,16 @@ def _quiver(
     axes.plot(*tips.T, ".", color=color, alpha=0.35, markersize=3, markeredgewidth=0, rasterized=len(tips) > MANY)
     seats = 1e3 * view.flat(mean[0])
     axes.plot(*seats.T, "o", color="white", markeredgecolor=INK, markeredgewidth=0.8, markersize=3.5)
-    axes.quiver(*seats.T, *(1e3 * factor * view.flat(mean[1])).T, color=color, **_arrows())
+    axes.quiver(*seats.T, *(1e3 * factor * view.flat(mean[1])).T, color=color, **arrow_options())
     frame_body(axes, view, low, high)
+    if title == "before":
+        draw_camera(axes, view, cameras, low, high)
     bottom, margin = low[1], 0.04 * float((high - low).max())
     start = low[0] + 0.42 * (high[0] - low[0])
-    axes.quiver([start], [bottom - 1.4 * margin], [1e3 * factor * key], [0.0], color=color, **_arrows())
+    axes.quiver([start], [bottom - 1.4 * margin], [1e3 * factor * key], [0.0], color=color, **arrow_options())
     axes.text(start, bottom - 2.0 * margin, f"{1e3 * key:g} mm residual", ha="left", va="top", fontsize=SIZE - 0.5, color=INK)
     axes.set_title(title, fontsize=SIZE + 1, color=color, loc="left", fontweight="bold")
     return figure
-
-
-def _arrows() -> dict[str, Any]:
-    return {
-        "angles": "xy",
-        "scale_units": "xy",
-        "scale": 1.0,
-        "width": 0.0075,
-        "headwidth": 3.6,
-        "headlength": 4.2,
-        "headaxislength": 3.8,
-        "minlength": 0.2,
-        "zorder": 5,
-    }
 
 
 def _sizes(mean: FloatArray) -> str:
@@ -242,9 +237,9 @@ def _sizes(mean: FloatArray) -> str:
     return f"{words.length(float(np.sqrt((sizes**2).mean())))} rms, {words.length(float(sizes.max()))} at most"
 
 
-def _held_out(residuals: Residuals, noise_m: float | None) -> Html | None:
+def _held_out(residuals: Residuals, table: Frames, noise_m: float | None) -> Html | None:
     if not residuals.frame:
-        return None
+        return sweep_dots(table, noise_m)
     before, after = (np.linalg.norm(np.asarray(values, float), axis=1) for values in (residuals.before_m, residuals.after_m))
     median = [words.length(float(np.median(values))) for values in (before, after)]
     shares = as_image(
@@ -259,7 +254,7 @@ def _held_out(residuals: Residuals, noise_m: float | None) -> Html | None:
         alt=f"Root mean square error of each held-out frame before and after; it fell in {fell} of {len(frames)} frames.",
         caption=f"The error fell in {fell} of {words.counted(len(frames), 'held-out frame')}.",
     )
-    return panels(shares, dots)
+    return panels(shares, dots, sweep_dots(table, noise_m))
 
 
 def _distribution(before: FloatArray, after: FloatArray, noise_m: float | None) -> Any:
@@ -334,88 +329,22 @@ def _frame_dots(frames: Sequence[tuple[int, int, float, float]], noise_m: float 
     return figure
 
 
-# Effects
+# What these data cannot say
 
 
-def _lacks(name: str) -> str:
-    return next((effect.lacks for effect in EFFECTS if effect.name == name), "")
-
-
-def _effects(effects: Sequence[Effect]) -> Html | None:
-    rows: list[list[object]] = []
-    for effect in effects:
-        parts = [
-            (f"{key} {name}".strip(), words.parameter(value, std, parameter.unit))
-            for key, parameter in effect.parameters.items()
-            for name, value, std in words.entries(parameter.value, parameter.std)
-        ] or [("", words.NOTHING)]
-        label = together(code(effect.name), _soft_line(_lacks(effect.name)))
-        errors = [Cell(words.length(e), len(parts)) for e in (effect.validation_rms_before_m, effect.validation_rms_after_m)]
-        first, *more = parts
-        rows.append([Cell(label, len(parts)), code(first[0]) if first[0] else "", first[1], *errors])
-        rows += [[None, code(name), value, None, None] for name, value in more]
-    headers = ("Effect", "Parameter", "Value ± std", "Held-out error before", "after")
-    return table(
-        headers,
-        rows,
-        caption="Effects in the order in which they were added, with the parameters of the final fit.",
-        numeric=(3, 4),
-    )
-
-
-def _soft_line(text: str) -> Html | None:
-    return element("div", text, class_="soft") if text else None
-
-
-def _candidates(candidates: Sequence[Candidate]) -> Html | None:
-    rows = [
-        [
-            together(code(c.name), _soft_line(_lacks(c.name))), words.number(c.dchi2), words.number(c.dbic), words.percent(c.retained_share),
-            words.number(c.dbic_at_end), OUTCOMES.get(c.verdict, c.verdict) or words.NOTHING,
-        ]
-        for c in candidates
-    ]  # fmt: skip
-    headers = ("Effect", "Δχ²", "ΔBIC", "Retained", "ΔBIC at the end", "Verdict")
-    ranking = table(
-        headers, rows, caption="Screening with the model before any effect was added, the best first.", numeric=(1, 2, 3, 4),
-        strong=[i for i, c in enumerate(candidates) if c.verdict == "named"],
-    )  # fmt: skip
-    text = paragraph(
-        "Δχ² is what the effect explains of the residual beyond all that calibration can imitate; ΔBIC takes off a price for each parameter and each effect tried, "
-        "and a named effect needs 10. “Retained” is the share of its trace that calibration leaves.",
-        class_="soft",
-    )
-    return together(text, ranking, _refits(candidates)) if ranking else None
-
-
-def _refits(candidates: Sequence[Candidate]) -> Html | None:
-    rows = [
-        [
-            code(c.name),
-            words.number(r.dchi2),
-            words.number(r.dbic),
-            words.length(r.validation_rms_m),
-            OUTCOMES.get(r.verdict, r.verdict) or words.NOTHING,
-        ]
-        for c in candidates
-        for r in c.refits
-    ]
-    return table(
-        ("Effect", "Δχ²", "ΔBIC", "Held-out error", "Outcome"),
-        rows,
-        caption="The best of them, fitted together with calibration in full.",
-        numeric=(1, 2, 3),
-    )
-
-
-def _open_questions(rivals: Sequence[Rivals], untestable: Sequence[Untestable], experiment: str) -> Html | None:
-    pairs = [element("span", code(r.pair[0]), " and ", code(r.pair[1]), f": {_why_alike(r)}") for r in rivals]
+def _open_questions(loop: Loop, evidence: Evidence) -> Html | None:
+    pairs = [element("span", code(r.pair[0]), " and ", code(r.pair[1]), f": {_why_alike(r)}") for r in loop.confounded]
     hidden = [
-        element("span", code(u.name), f": calibration imitates {words.percent(u.absorbed_share)} of it") for u in untestable
+        element("span", code(u.name), f": calibration imitates {words.percent(u.absorbed_share)} of it")
+        for u in loop.not_testable
     ]
+    experiment = loop.next_experiment
     advice = paragraph(element("strong", "Next experiment: "), experiment, class_="next") if experiment else None
     return together(
-        section("Cannot be told apart", bullets(pairs), level=4), section("Not testable with these data", bullets(hidden), level=4), advice
+        section("Cannot be told apart", bullets(pairs), level=4),
+        section("Not testable with these data", bullets(hidden), level=4),
+        advice,
+        confounding_map(evidence.confounding),
     ) or None  # fmt: skip
 
 
@@ -427,66 +356,50 @@ def _why_alike(rivals: Rivals) -> str:
     return "these data do not tell which it is"
 
 
-def _detectable(detectable: Mapping[str, Detectable]) -> Html | None:
+# What is left
+
+
+def _left(loop: Loop, evidence: Evidence, surface: Surface | None) -> Html | None:
+    left = loop.left
     rows = [
-        [together(code(name), _soft_line(_lacks(name))), _smallest(entry)] for name, entry in detectable.items() if entry.smallest
+        [c.covariate, words.number(c.rank_correlation, 2), words.number(c.p_value, 2), words.number(c.p_holm, 2)]
+        for c in left.goes_with
     ]
-    caption = "For each effect that was not found: the size at which the data would have named it (expected ΔBIC of 10)."
-    return table(("Effect", "Smallest size"), rows, caption=caption)
+    headers = ("Goes with", "Rank correlation", "p", "p (Holm)")
+    goes = table(headers, rows, caption="What the size of the residual of a frame goes with.", numeric=(1, 2, 3))
+    structured = loop.verdict == "unexplained" or left.structure.significant
+    field = force_field(evidence.equivalent_forces, surface) if structured else None
+    return together(bullets(_left_facts(left)), panels(goes, _marker_bars(left.marker_rms_m), field)) or None
 
 
-def _smallest(entry: Detectable) -> Html:
-    sizes = [(label, value) for label, value in entry.smallest.items()]
-    if len(sizes) > LISTED:
-        seen = [value for _, value in sizes if value is not None and words.known(value)]
-        if not seen:
-            return Html("cannot be seen")
-        span = " … ".join(size_words(v, entry.coordinate, entry.unit) for v in (min(seen), max(seen)))
-        return Html(f"{span} ({len(sizes)} parameters)")
-    return together(
-        *(element("div", code(label), f" {size_words(value, entry.coordinate, entry.unit)}") for label, value in sizes)
-    )
-
-
-def size_words(size: float | None, coordinate: str, unit: str) -> str:
-    """Return the smallest visible size of a parameter, given in the coordinate of the fit, in words."""
-    if size is None or not words.known(size) or size <= 0:
-        return "cannot be seen"
-    if coordinate == "log":
-        return (
-            f"a change of {words.number(100 * math.expm1(size), 2)} %"
-            if size < math.log(2.0)
-            else f"a factor of {words.number(math.exp(min(size, 50.0)), 2)}"
-        )
-    if coordinate == "reciprocal":
-        return f"softer than {words.quantity(1.0 / size, unit, 2)}"
-    return words.quantity(size, unit, 2)
-
-
-# What is left, and the data
-
-
-def _left(left: Left) -> Html | None:
+def _left_facts(left: Left) -> list[str]:
     facts = []
     if words.known(left.rms_m):
         facts.append(f"Size: {words.length(left.rms_m)} rms on the fitted data.")
-    if left.where.marker:
-        mean = left.where.mean_residual_m or []
-        facts.append(
-            f"Where: most at marker {left.where.marker}" + (f", mean {words.parameter(list(mean), None, 'm')}." if mean else ".")
-        )
+    where = left.where
+    if where.marker:
+        mean = f", mean {words.parameter(list(where.mean_residual_m), None, 'm')}" if where.mean_residual_m else ""
+        facts.append(f"Where: most at marker {where.marker}{mean}.")
+    if where.direction and all(map(words.known, where.direction)):
+        along = ", ".join(words.number(v, 2) for v in where.direction)
+        facts.append(f"Which way: {words.percent(where.direction_share)} of it there lies along ({along}).")
     if left.worst_frame.frame is not None:
-        facts.append(f"When: most in frame {left.worst_frame.frame}, {words.length(left.worst_frame.rms_m)} rms.")
+        others = [f"{w.frame}" for w in left.worst_frames[1:] if w.frame is not None]
+        more = f", then in {', '.join(others)}" if others else ""
+        facts.append(f"When: most in frame {left.worst_frame.frame}, {words.length(left.worst_frame.rms_m)} rms{more}.")
+    if words.known(left.half_in_frames):
+        facts.append(f"How spread: {words.percent(left.half_in_frames)} of the frames hold half of the squared residual.")
+    if words.known(left.explained_share):
+        facts.append(f"The effects took away {words.percent(left.explained_share)} of the squared residual beyond the noise.")
     if words.known(left.structure.p_value):
-        facts.append(f"Structure: {_structure_words(left.structure.lag_one, left.structure.p_value)}.")
-    rows = [[c.covariate, words.number(c.rank_correlation, 2), words.number(c.p_value, 2)] for c in left.goes_with]
-    goes = table(("Goes with", "Rank correlation", "p"), rows, caption="What the residual of a frame goes with.", numeric=(1, 2))
-    return together(bullets(facts), panels(goes, _marker_bars(left.marker_rms_m))) or None
+        facts.append(f"Structure: {_structure_words(left.structure)}.")
+    return facts
 
 
-def _structure_words(lag: float | None, p_value: float | None) -> str:
-    state = "neighbouring states resemble each other" if (p_value or 0.0) <= 0.01 else "none seen between neighbouring states"
-    return f"{state} (correlation {words.number(lag, 2)}, p = {words.number(p_value, 2)})"
+def _structure_words(structure: Structure) -> str:
+    found = structure.significant if structure.significant is not None else (structure.p_value or 0.0) <= 0.01
+    state = "the residual is not mere noise" if found else "none seen beyond noise"
+    return f"{state} (correlation of neighbouring states {words.number(structure.lag_one, 2)}, smallest p = {words.number(structure.p_value, 2)})"
 
 
 def _marker_bars(per_marker: Mapping[str, float | None]) -> Html | None:
@@ -501,37 +414,3 @@ def _marker_bars(per_marker: Mapping[str, float | None]) -> Html | None:
         alt=f"Residual of each marker after: the largest {shown[0][0]:.2f} mm at {shown[0][1]}.",
         caption=f"Residual of each marker after.{more}",
     )
-
-
-def _card(card: Card, versions: Mapping[str, str]) -> Html | None:
-    rows: list[list[object]] = []
-    for i, how in enumerate(card.split):
-        name = Path(card.recordings[i] or "").name if i < len(card.recordings) else ""
-        rows.append([f"Split, recording {i + 1}" + (f" ({name})" if name else ""), how])
-    for title, groups in (("Frames fitted", card.frames_fitted), ("Frames held out", card.frames_held_out)):
-        rows += [
-            [f"{title}{f', {i + 1}' if len(groups) > 1 else ''}", f"{words.frame_list(g)} ({len(g)})"]
-            for i, g in enumerate(groups)
-        ]
-    noise = [f"{COMPONENTS.get(name, name)} {words.length(std)}" for name, std in card.noise_components_m.items()]
-    rows += [["Noise, each axis", "; ".join(noise)]] if noise else []
-    rows += [["Source of the noise level", card.noise_source]] if card.noise_source else []
-    rows += (
-        [["Independent observations", words.number(card.effective_observations)]]
-        if words.known(card.effective_observations)
-        else []
-    )
-    rows += [["Uncertainty of marker seats", words.length(card.seat_std_m, 2)]] if words.known(card.seat_std_m) else []
-    for name, parameters in card.nuisance_after.items():
-        rows.append([element("span", "Fitted along: ", code(name)), together(*_nuisance_lines(parameters))])
-    rows += [["Seed", str(card.seed)]] if card.seed is not None else []
-    rows += [["Versions", ", ".join(f"{name} {version}" for name, version in versions.items())]] if versions else []
-    return table(("Item", "Value"), rows, caption="What the result rests on; loop.json beside this file holds all of it.")
-
-
-def _nuisance_lines(parameters: Mapping[str, Any]) -> list[Html]:
-    return [
-        element("div", code(f"{key} {name}".strip()), f" {words.parameter(value, std, p.unit)}")
-        for key, p in parameters.items()
-        for name, value, std in words.entries(p.value, p.std)
-    ]

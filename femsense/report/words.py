@@ -48,6 +48,12 @@ def percent(share: Any, digits: int = 0) -> str:
     return joined(_minus(f"{100 * share:.{digits}f}"), "%") if known(share) else NOTHING
 
 
+def signed(value: Any, digits: int = 2) -> str:
+    """Return a number with its sign, also where it is positive."""
+    text = number(value, digits)
+    return f"+{text}" if known(value) and value > 0 else text
+
+
 def force_unit(largest_n: float) -> tuple[float, str]:
     """Return factor and name of the unit for forces up to a size [N]."""
     return (1e3, "mN") if 0 < largest_n < MILLI else (1.0, "N")

@@ -1,0 +1,467 @@
+"""Tables of a closed loop: ranking, calibration before and after, tests, forces, the data card."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from femsense.effects import EFFECTS
+from femsense.report import words
+from femsense.report.documents import (
+    CalibrationShift,
+    Candidate,
+    Card,
+    Compliance,
+    Detectable,
+    Effect,
+    Estimate,
+    Evidence,
+    Forces,
+    LackOfFit,
+    LoadRow,
+    Loop,
+    LoopInputs,
+    Ranked,
+    Score,
+    Size,
+    Structure,
+    Tested,
+    Tests,
+    Triple,
+)
+from femsense.report.page import Cell, Html, code, element, paragraph, table, together
+
+OUTCOMES = {
+    "named": "named: part of the improved model",
+    "passes": "rival: passes all tests too, with less evidence than the one that was named",
+}
+LISTED = 6
+COMPONENTS = {
+    "white": "each measurement by itself",
+    "state": "a marker in a repeated state",
+    "marker": "a marker in all frames",
+    "frame": "all markers of a frame",
+    "sweep": "all frames of a sweep",
+}
+TESTS = {
+    "neighbours": "neighbouring states are alike",
+    "pattern": "one pattern in many states",
+    "sweep": "one sweep stands apart",
+    "marker": "one marker stands apart",
+}
+STAGES = ("before", "nuisance", "after")
+
+
+def lacks(name: str) -> str:
+    """Return what the plain model lacks where an effect acts."""
+    return next((effect.lacks for effect in EFFECTS if effect.name == name), "")
+
+
+def soft_line(text: str) -> Html | None:
+    """Return a line in small grey type; None for no text."""
+    return element("div", text, class_="soft") if text else None
+
+
+def effect_name(name: str) -> Html:
+    """Return the name of an effect with what it means below it."""
+    return together(code(name), soft_line(lacks(name)))
+
+
+# Effects and candidates
+
+
+def effects_table(effects: Sequence[Effect]) -> Html | None:
+    """Return the effects that were found, with their parameters and the held-out error around each."""
+    rows: list[list[object]] = []
+    for effect in effects:
+        parts = [
+            (f"{key} {name}".strip(), words.parameter(value, std, parameter.unit))
+            for key, parameter in effect.parameters.items()
+            for name, value, std in words.entries(parameter.value, parameter.std)
+        ] or [("", words.NOTHING)]
+        errors = [Cell(words.length(e), len(parts)) for e in (effect.validation_rms_before_m, effect.validation_rms_after_m)]
+        first, *more = parts
+        rows.append([Cell(effect_name(effect.name), len(parts)), code(first[0]) if first[0] else "", first[1], *errors])
+        rows += [[None, code(name), value, None, None] for name, value in more]
+    headers = ("Effect", "Parameter", "Value ± std", "Held-out error before", "after")
+    return table(
+        headers,
+        rows,
+        caption="Effects in the order in which they were added, with the parameters of the final fit.",
+        numeric=(3, 4),
+    )
+
+
+def ranking_table(candidates: Sequence[Candidate], ranked: Mapping[str, Ranked], effects: Sequence[Effect]) -> Html | None:
+    """Return all effects that were tried, the best first."""
+    final = {effect.name: effect for effect in effects}
+    rows = [
+        [
+            together(effect_name(c.name), *_values(final.get(c.name), ranked.get(c.name, Ranked()))), words.number(c.dchi2), words.number(c.dbic),
+            _left_out(c), words.percent(c.retained_share), words.percent(ranked.get(c.name, Ranked()).first_share), words.number(c.dbic_at_end), _verdict(c),
+        ]
+        for c in candidates
+    ]  # fmt: skip
+    ranking = table(
+        ("Effect, value, plausible range", "Δχ²", "ΔBIC", "Left-out sweeps", "Retained", "First", "ΔBIC at the end", "Verdict"), rows,
+        caption="Every effect that was tried, by what the first screening says of it.", numeric=(1, 2, 3, 4, 5, 6),
+        strong=[i for i, c in enumerate(candidates) if c.verdict == "named"],
+    )  # fmt: skip
+    text = paragraph(
+        "Δχ² is what the effect explains of the residual beyond all that calibration can imitate; ΔBIC takes off a price for each parameter and each effect tried, "
+        "and a named effect needs 10. Left-out sweeps: by how much twice the log-likelihood of sweeps that are not fitted rises, ± its standard error. “Retained” is the share of its trace "
+        "that calibration leaves. “First” is how often the effect comes first when whole sweeps are drawn anew. Values: of the final fit where named, else of the linear screening.",
+        class_="soft",
+    )
+    return together(text, ranking) if ranking else None
+
+
+def _left_out(c: Candidate) -> str:
+    known = [r for r in c.refits if words.known(r.cv_gain)]
+    if not known:
+        return words.NOTHING
+    return words.with_std(known[-1].cv_gain, known[-1].cv_spread)
+
+
+def _verdict(c: Candidate) -> str:
+    text = c.verdict
+    if text in OUTCOMES or not text or text.startswith("not testable"):
+        return OUTCOMES.get(text, text) or words.NOTHING
+    return f"excluded: {text}"
+
+
+def _values(effect: Effect | None, ranked: Ranked) -> list[Html]:
+    """Return the values of an effect with their plausible range, a line each; a span where there are many."""
+    if effect is not None and effect.parameters:
+        ranges = {p.label.partition("[")[0]: p for p in ranked.parameters}
+        parts = [(key, words.parameter(v, s, p.unit), ranges.get(key)) for key, p in effect.parameters.items() for _, v, s in words.entries(p.value, p.std)]  # fmt: skip
+        return [_value_line(label, text, estimate) for label, text, estimate in parts[:LISTED]]
+    shown = [p for p in ranked.parameters if words.known(p.value) or p.ends]
+    if len(shown) > LISTED:
+        seen = [p.value for p in shown if words.known(p.value) and p.value is not None]
+        text = f"{words.quantity(min(seen), shown[0].unit, 2)} … {words.quantity(max(seen), shown[0].unit, 2)}" if seen else ""
+        return [_value_line(f"{len(shown)} parameters", text, shown[0])]
+    return [_value_line(p.label, words.with_std(p.value, p.std, p.unit) if words.known(p.value) else "", p) for p in shown]
+
+
+def _value_line(label: str, text: str, estimate: Estimate | None) -> Html:
+    ends = estimate.ends if estimate else []
+    factor, unit = words.UNITS.get(estimate.unit, (1.0, estimate.unit)) if estimate else (1.0, "")
+    span = ""
+    if len(ends) == 2 and words.known(ends[0]):
+        top = words.number(factor * (ends[1] or 0.0), 2) if words.known(ends[1]) else "∞"
+        span = f" in [{words.number(factor * (ends[0] or 0.0), 2)}, {top}]" + (f" {unit}" if unit else "")
+    return element("div", code(label), f" {text}{span}", class_="soft value")
+
+
+def refits_table(candidates: Sequence[Candidate]) -> Html | None:
+    """Return what became of the candidates that were fitted together with calibration."""
+    rows = [
+        [
+            code(c.name),
+            words.number(r.dchi2),
+            words.number(r.dbic),
+            words.length(r.validation_rms_m),
+            OUTCOMES.get(r.verdict, r.verdict) or words.NOTHING,
+        ]
+        for c in candidates
+        for r in c.refits
+    ]
+    return table(
+        ("Effect", "Δχ²", "ΔBIC", "Held-out error", "Outcome"), rows,
+        caption="The best of them, fitted together with calibration in full.", numeric=(1, 2, 3),
+    )  # fmt: skip
+
+
+# What would have been seen
+
+
+def power_table(detectable: Mapping[str, Detectable], power: Mapping[str, Sequence[Size]]) -> Html | None:
+    """Return the smallest size of every effect that was not found."""
+    rows = [
+        [effect_name(name), _sizes(power.get(name, ()), entry)]
+        for name, entry in detectable.items()
+        if entry.smallest or power.get(name)
+    ]
+    return table(
+        ("Effect", "Smallest size"), rows,
+        caption="For each effect that was not found: the size at which the data would have named it (expected ΔBIC of 10).",
+    )  # fmt: skip
+
+
+def _sizes(own: Sequence[Size], entry: Detectable) -> Html:
+    lines = [(s.label, smallest_words(s.size, s.kind, s.unit)) for s in own]
+    lines = lines or [(label, size_words(value, entry.coordinate, entry.unit)) for label, value in entry.smallest.items()]
+    if len(lines) <= LISTED:
+        return together(*(element("div", code(label) if label else "", f" {text}" if label else text) for label, text in lines))
+    if own:
+        best = sorted((s for s in own if words.known(s.size)), key=lambda s: s.size or 0.0)
+        ends = [smallest_words(s.size, s.kind, s.unit) for s in (best[0], best[-1])] if best else []
+    else:
+        seen = sorted(v for v in entry.smallest.values() if v is not None and words.known(v))
+        ends = [size_words(v, entry.coordinate, entry.unit) for v in (seen[0], seen[-1])] if seen else []
+    return Html(f"{' … '.join(ends)} ({len(lines)} parameters)" if ends else "cannot be seen")
+
+
+def smallest_words(size: float | None, kind: str, unit: str) -> str:
+    """Return the smallest visible size of a parameter in its own unit, in words."""
+    if size is None or not words.known(size) or size <= 0:
+        return "cannot be seen"
+    if kind == "whole":
+        return (
+            "would have been seen"
+            if size < 1.0
+            else f"cannot be seen: its whole change would have to be {words.number(size, 2)} times as large"
+        )
+    if kind == "factor":
+        return f"a change of {words.number(100.0 * (size - 1.0), 2)} %" if size < 2.0 else f"a factor of {words.number(size, 2)}"
+    if kind == "softer_than":
+        return f"softer than {words.quantity(size, unit, 2)}"
+    return words.quantity(size, unit, 2)
+
+
+def size_words(size: float | None, coordinate: str, unit: str) -> str:
+    """Return the smallest visible size of a parameter, given in the coordinate of the fit, in words."""
+    if size is None or not words.known(size) or size <= 0:
+        return "cannot be seen"
+    kinds = {"log": ("factor", math.exp(min(size, 50.0))), "reciprocal": ("softer_than", 1.0 / size)}
+    kind, own = kinds.get(coordinate, ("change", size))
+    return smallest_words(own, kind, unit)
+
+
+# Covariates, calibration, tests
+
+
+def covariate_table(score: Score) -> Html | None:
+    """Return what the leading pattern of the residual goes with, before and after."""
+    after = {c.covariate: c for c in score.goes_with_after}
+    rows = [
+        [
+            c.covariate,
+            words.number(c.rank_correlation, 2),
+            words.number(c.p_holm, 2),
+            words.number(after[c.covariate].rank_correlation, 2) if c.covariate in after else words.NOTHING,
+        ]
+        for c in score.goes_with_before
+    ]
+    return table(
+        ("Goes with", "Rank correlation before", "p (Holm)", "after"), rows,
+        caption="The leading pattern of the residual and what it goes with (Spearman; neighbouring frames are not independent, so p is optimistic).", numeric=(1, 2, 3),
+    )  # fmt: skip
+
+
+def calibration_table(shift: CalibrationShift) -> Html | None:
+    """Return where calibration stood before, with all that it may move, and with the effects."""
+    several = len({p.recording for p in shift.poses}) > 1 or len({p.camera for p in shift.poses}) > 1
+    rows: list[list[object]] = []
+    for pose in shift.poses:
+        where = f", recording {pose.recording + 1}" + (f", camera {pose.camera + 1}" if pose.camera else "") if several else ""
+        for title, moved, spread, unit in (
+            ("Camera turned", pose.turn_rad, pose.turn_std_rad, "rad"),
+            ("Camera shifted", pose.shift_m, pose.shift_std_m, "m"),
+        ):
+            cells = [_vector(moved.get(name), spread.get(name), unit) for name in STAGES[1:]]
+            rows.append([f"{title}{where}", words.NOTHING, "0", *cells])
+    for given in shift.initial_inputs:
+        where = f", recording {given.recording + 1}" if len({g.recording for g in shift.initial_inputs}) > 1 else ""
+        rows.append([f"Initial input of {given.cable}{where}", words.NOTHING, *_three(given.values, given.unit)])
+    for term in shift.parameters:
+        rows.append(
+            [element("span", code(term.label)), words.quantity(term.declared, term.unit), *_three(term.values, term.unit)]
+        )
+    return table(
+        ("Quantity", "Declared", "Calibrated (before)", "With all that calibration may move", "With the effects"), rows,
+        caption="Camera: against where the calibration of the declared model put it (± one standard deviation). What moves back when effects are added is where they had been hiding.",
+    )  # fmt: skip
+
+
+def _vector(value: Triple | None, std: Triple | None, unit: str) -> str:
+    return words.NOTHING if value is None else words.parameter(list(value), list(std) if std else None, unit)
+
+
+def _three(values: Mapping[str, Sequence[Any]], unit: str) -> list[str]:
+    found = [values.get(name) for name in STAGES]
+    return [words.with_std(v[0], v[1] if len(v) > 1 else None, unit) if v else words.NOTHING for v in found]
+
+
+def tests_table(tests: Tests) -> Html | None:
+    """Return the tests of structure and of lack of fit, before and after."""
+    pair = (tests.before, tests.after)
+    names = [
+        n
+        for n in (*TESTS, *tests.before.structure.tests)
+        if n in tests.before.structure.tests or n in tests.after.structure.tests
+    ]
+    rows: list[list[object]] = [["Size of the residual, fitted data", *(words.length(t.train_rms_m) for t in pair)]]
+    rows += [[f"Structure: {TESTS.get(n, n)}", *(_p(t.structure.tests.get(n)) for t in pair)] for n in dict.fromkeys(names)]
+    rows.append(["Correlation of neighbouring states", *(words.number(t.structure.lag_one, 2) for t in pair)])
+    rows.append(["Any structure (1 %, Holm)", *(_yes(t.structure) for t in pair)])
+    rows.append(["Lack of fit against repeats (F)", *(_lack(t.lack_of_fit) for t in pair)])
+    if pair == (Tested(), Tested()):
+        return None
+    return table(
+        ("Test", "Before", "After"), rows, caption="Tests of the residual of the fitted data, the mesh's own error taken off."
+    )
+
+
+def _p(value: float | None) -> str:
+    return f"p = {words.number(value, 2)}" if words.known(value) else words.NOTHING
+
+
+def _yes(structure: Structure) -> str:
+    return words.NOTHING if structure.significant is None else "yes" if structure.significant else "no"
+
+
+def _lack(fit: LackOfFit | None) -> str:
+    if fit is None:
+        return "not testable: too little is repeated"
+    return f"F = {words.number(fit.f, 2)}, {_p(fit.p_value)} ({fit.df_lack}, {fit.df_pure} degrees of freedom; repeats differ by {words.length(fit.pure_error_m)})"
+
+
+# Forces
+
+
+def forces_part(forces: Forces) -> Html | None:
+    """Return what the effects mean for sensed forces."""
+    return _loads(forces.loads) if forces.loads else _softer(forces.compliance)
+
+
+def _loads(loads: Sequence[LoadRow]) -> Html | None:
+    several = len({row.recording for row in loads}) > 1
+    rows = [
+        [
+            f"{row.recording + 1}: {row.frame}" if several else str(row.frame),
+            words.quantity(row.declared_n, "N"),
+            *_sensed(row.before_n, row.before_std_n, row.declared_n),
+            *_sensed(row.after_n, row.after_std_n, row.declared_n),
+        ]
+        for row in loads
+    ]
+    held = all(row.held_out for row in loads)
+    medians = [_median_error(loads, name) for name in ("before_n", "after_n")]
+    text = paragraph(
+        f"Sensed along the declared load, from the markers, to first order about the declared load, in {'held-out' if held else 'fitted'} frames. "
+        f"Median size of the error: {medians[0]} with the declared robot, calibrated; {medians[1]} with the improved one."
+    )
+    numbers = table(
+        ("Recording: frame" if several else "Frame", "Declared load", "Declared robot", "error", "Improved robot", "error"), rows,
+        caption="Forces at declared loads, ± one standard deviation from the noise of the markers.", numeric=(1, 2, 3, 4, 5),
+    )  # fmt: skip
+    return together(text, numbers)
+
+
+def _sensed(value: float | None, std: float | None, declared: float | None) -> list[str]:
+    if not words.known(value) or not words.known(declared) or not declared:
+        return [words.with_std(value, std, "N"), words.NOTHING]
+    assert value is not None
+    return [words.with_std(value, std, "N"), words.joined(words.signed(100 * (value - declared) / declared), "%")]
+
+
+def _median_error(loads: Sequence[LoadRow], name: str) -> str:
+    import statistics
+
+    gaps = [(abs(value - row.declared_n), abs(value - row.declared_n) / row.declared_n) for row in loads if words.known(value := getattr(row, name)) and words.known(row.declared_n) and row.declared_n]  # fmt: skip
+    if not gaps:
+        return words.NOTHING
+    size, share = (statistics.median(g[i] for g in gaps) for i in (0, 1))
+    return f"{words.quantity(size, 'N', 2)} ({words.percent(share, 1)})"
+
+
+def _softer(compliance: Compliance) -> Html | None:
+    ratios = [r for frame in compliance.frames for r in frame.ratio if words.known(r) and r is not None]
+    if not ratios:
+        return None
+    import statistics
+
+    middle = statistics.median(ratios)
+    text = paragraph(
+        f"No load is declared in these frames. The same dent of the surface is sensed as {words.number(middle)} times the force that the declared robot senses "
+        f"(median over places and frames; {words.number(min(ratios))} to {words.number(max(ratios))}): compliance before over compliance after."
+    )
+    rows = [
+        [
+            f"{frame.title} ({frame.frame})",
+            _span(frame.ratio),
+            words.quantity(frame.phantom_before_n, "N", 2),
+            words.quantity(frame.phantom_after_n, "N", 2),
+        ]
+        for frame in compliance.frames
+    ]
+    numbers = table(
+        ("Frame", "Force, improved over declared", "False force before", "after"), rows,
+        caption="False force: what would have been sensed at the free end, where nothing touches, from the residual alone.", numeric=(1, 2, 3),
+    )  # fmt: skip
+    return together(text, numbers)
+
+
+def _span(ratio: Sequence[float | None]) -> str:
+    seen = sorted(r for r in ratio if words.known(r) and r is not None)
+    return f"{words.number(seen[0])} … {words.number(seen[-1])}" if seen else words.NOTHING
+
+
+# The data
+
+
+def data_card(loop: Loop) -> Html | None:
+    """Return what the result rests on."""
+    card, evidence = loop.data, loop.evidence or Evidence()
+    rows: list[list[object]] = []
+    for i, how in enumerate(card.split):
+        name = Path(card.recordings[i] or "").name if i < len(card.recordings) else ""
+        rows.append([f"Split, recording {i + 1}" + (f" ({name})" if name and name != "None" else ""), how])
+    for title, groups in (("Frames fitted", card.frames_fitted), ("Frames held out", card.frames_held_out)):
+        rows += [
+            [f"{title}{f', {i + 1}' if len(groups) > 1 else ''}", f"{words.frame_list(g)} ({len(g)})"]
+            for i, g in enumerate(groups)
+        ]
+    for i, reasons in enumerate(evidence.excluded):
+        lines = [element("div", f"{why}: {words.frame_list(g)} ({len(g)})") for why, g in reasons.items() if g]
+        rows.append(
+            [f"Frames left out{f', {i + 1}' if len(evidence.excluded) > 1 else ''}", together(*lines) if lines else "none"]
+        )
+    rows += [["Repeats (a state reached again the same way)", str(evidence.repeats)]] if evidence.repeats is not None else []
+    rows += _noise_rows(card)
+    for name, parameters in card.nuisance_after.items():
+        rows.append([element("span", "Fitted along: ", code(name)), together(*_nuisance_lines(parameters))])
+    rows += [["Seed", str(card.seed)]] if card.seed is not None else []
+    rows += [["Versions", ", ".join(f"{name} {version}" for name, version in loop.versions.items())]] if loop.versions else []
+    rows += _hash_rows(loop.inputs)
+    return table(("Item", "Value"), rows, caption="What the result rests on; loop.json beside this file holds all of it.")
+
+
+def _noise_rows(card: Card) -> list[list[object]]:
+    noise = [f"{COMPONENTS.get(name, name)} {words.length(std)}" for name, std in card.noise_components_m.items()]
+    rows: list[list[object]] = [["Noise, each axis", "; ".join(noise)]] if noise else []
+    rows += [["Source of the noise level", card.noise_source]] if card.noise_source else []
+    rows += (
+        [["Independent observations", words.number(card.effective_observations)]]
+        if words.known(card.effective_observations)
+        else []
+    )
+    rows += [["Uncertainty of marker seats", words.length(card.seat_std_m, 2)]] if words.known(card.seat_std_m) else []
+    rows += [["Error of the mesh, at the markers", words.length(card.mesh_error_m, 2)]] if words.known(card.mesh_error_m) else []
+    return rows
+
+
+def _nuisance_lines(parameters: Mapping[str, Any]) -> list[Html]:
+    return [
+        element("div", code(f"{key} {name}".strip()), f" {words.parameter(value, std, p.unit)}")
+        for key, p in parameters.items()
+        for name, value, std in words.entries(p.value, p.std)
+    ]
+
+
+def _hash_rows(inputs: LoopInputs) -> list[list[object]]:
+    named = [
+        ("Robot", inputs.robot),
+        *((f"Recording {i + 1}", r) for i, r in enumerate(inputs.recordings)),
+        *((f"Validation {i + 1}", r) for i, r in enumerate(inputs.validation)),
+    ]
+    lines = [
+        element("div", f"{title} {Path(item.path).name if item.path else ''} ", code(item.sha256[:16]))
+        for title, item in named
+        if item.sha256
+    ]
+    return [["SHA-256 of the inputs (first digits)", together(*lines)]] if lines else []
