@@ -113,20 +113,20 @@ def arrow_options(width: float = 0.0075) -> dict[str, Any]:
 
 
 def draw_camera(axes: Any, view: View, directions: Sequence[FloatArray], low: FloatArray, high: FloatArray) -> None:
-    """Draw which way the cameras look, in the upper right corner [mm]; across the page as a ring with a dot (to the eye) or a cross."""
-    size = 0.09 * float((high - low).max())
-    for i, direction in enumerate(directions[:3]):
-        at = np.array([high[0] - 0.6 * size, high[1] - (0.5 + 1.9 * i) * size])
+    """Draw which way the cameras look, below the body where `frame_body` leaves room [mm]; across the page as a ring with a dot
+    (to the eye) or a cross."""
+    margin = 0.04 * float((high - low).max())
+    for i, direction in enumerate(directions[:2]):
+        at = np.array([high[0] - (0.8 + 5.0 * i) * margin, low[1] - 1.4 * margin])
         flat = view.flat(direction)
         if float(np.linalg.norm(flat)) > 0.35:
-            tip, tail = at + 0.5 * size * flat, at - 0.5 * size * flat
+            tip, tail = at + 1.3 * margin * flat, at - 1.3 * margin * flat
             axes.annotate("", xy=tuple(tip), xytext=tuple(tail), arrowprops={"arrowstyle": "-|>", "color": INK, "linewidth": 1.1, "shrinkA": 0, "shrinkB": 0})  # fmt: skip
         else:
-            inner = "." if float(direction @ view.towards) > 0 else "x"
             axes.plot([at[0]], [at[1]], "o", color="white", markeredgecolor=INK, markersize=8)
-            axes.plot([at[0]], [at[1]], inner, color=INK, markersize=4)
-        name = "camera looks" if len(directions) == 1 else f"camera {i + 1} looks"
-        axes.text(at[0] - 0.75 * size, at[1], name, ha="right", va="center", fontsize=SIZE - 1.5, color=SOFT)
+            axes.plot([at[0]], [at[1]], "." if float(direction @ view.towards) > 0 else "x", color=INK, markersize=4)
+        name = "camera" if len(directions) == 1 else f"camera {i + 1}"
+        axes.text(at[0] + 0.8 * margin, at[1] - 1.6 * margin, name, ha="right", va="top", fontsize=SIZE - 0.5, color=INK)
 
 
 def name_axes(axes: Any, x: str, y: str) -> None:

@@ -173,7 +173,7 @@ def _mean_residual(
     shown = float((view.flat(mean[0]) ** 2).sum() / max((mean[0] ** 2).sum(), 1e-300))
     text = paragraph(
         f"Arrows point from the model to the measurement: the mean of each marker over the held-out frames, {'at true length' if factor == 1 else f'drawn {factor:g} times as long'}, "
-        f"with the same scale in both pictures. Small dots are single frames. The body is at rest, seen so that its {view.axes[0]}–{view.axes[1]} plane "
+        f"with the same scale in both pictures{'; the black one says which way the camera looks' if cameras else ''}. Small dots are single frames. The body is at rest, seen so that its {view.axes[0]}–{view.axes[1]} plane "
         f"lies in the page, which shows {words.percent(shown)} of the squared mean residual before."
     )
     return together(text, panels(*figures))
@@ -221,8 +221,9 @@ def _quiver(
     seats = 1e3 * view.flat(mean[0])
     axes.plot(*seats.T, "o", color="white", markeredgecolor=INK, markeredgewidth=0.8, markersize=3.5)
     axes.quiver(*seats.T, *(1e3 * factor * view.flat(mean[1])).T, color=color, **arrow_options())
-    frame_body(axes, view, low, high)
-    if title == "before":
+    with_camera = title == "before" and len(cameras) > 0
+    frame_body(axes, view, low, high, corner=not with_camera)
+    if with_camera:
         draw_camera(axes, view, cameras, low, high)
     bottom, margin = low[1], 0.04 * float((high - low).max())
     start = low[0] + 0.42 * (high[0] - low[0])
@@ -242,19 +243,19 @@ def _held_out(residuals: Residuals, table: Frames, noise_m: float | None) -> Htm
         return sweep_dots(table, noise_m)
     before, after = (np.linalg.norm(np.asarray(values, float), axis=1) for values in (residuals.before_m, residuals.after_m))
     median = [words.length(float(np.median(values))) for values in (before, after)]
+    frames = _per_frame(residuals, before, after)
+    fell = f"the error fell in {sum(b > a for _, _, b, a in frames)} of {words.counted(len(frames), 'held-out frame')}"
     shares = as_image(
         _distribution(before, after, noise_m),
         alt=f"Share of held-out measurements with an error below a size, before and after; medians {median[0]} and {median[1]}.",
-        caption=f"{words.counted(len(before), 'measurement')} of {words.counted(len(set(residuals.marker)), 'marker')}; median {median[0]} before, {median[1]} after.",
+        caption=f"{words.counted(len(before), 'measurement')} of {words.counted(len(set(residuals.marker)), 'marker')}; median {median[0]} before, {median[1]} after; {fell}.",
     )
-    frames = _per_frame(residuals, before, after)
-    fell = int(sum(b > a for _, _, b, a in frames))
-    dots = as_image(
+    dots = sweep_dots(table, noise_m) or as_image(
         _frame_dots(frames, noise_m),
-        alt=f"Root mean square error of each held-out frame before and after; it fell in {fell} of {len(frames)} frames.",
-        caption=f"The error fell in {fell} of {words.counted(len(frames), 'held-out frame')}.",
+        alt=f"Root mean square error of each held-out frame before and after; {fell}.",
+        caption="Error of each held-out frame.",
     )
-    return panels(shares, dots, sweep_dots(table, noise_m))
+    return panels(shares, dots)
 
 
 def _distribution(before: FloatArray, after: FloatArray, noise_m: float | None) -> Any:

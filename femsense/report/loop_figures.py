@@ -36,7 +36,7 @@ from femsense.report.drawing import (
 )
 from femsense.report.page import Html, panels, paragraph, together
 
-ARROW_SHARE = 0.16
+ARROW_SHARE = 0.2
 """The longest arrow, in sizes of the body."""
 FIELD_SHARE = 0.25
 SWEEPS = len(SERIES)
@@ -75,7 +75,7 @@ def residual_in_frames(pictures: Pictures, rest: Surface | None) -> Html | None:
             foot = 1e3 * view.flat(places - r)
             axes.plot(*foot.T, "o", color="white", markeredgecolor=INK, markeredgewidth=0.7, markersize=2.8)
             axes.quiver(*foot.T, *(1e3 * factor * view.flat(r)).T, color=color, **arrow_options(0.009))
-            frame_body(axes, view, low, high, corner=row == 1 and column == 0)
+            frame_body(axes, view, low, high, corner=column == 0 and (row == 1 or not pictures.cameras))
             _arrow_key(axes, low, high, factor, nice(largest), color)
             title = f"{name}, {snapshot.title} (frame {snapshot.frame}): {1e3 * float(np.sqrt((r**2).sum(axis=1).mean())):.2f} mm"
             axes.set_title(title, fontsize=SIZE, color=color, loc="left", fontweight="bold")
@@ -292,7 +292,7 @@ def sweep_dots(frames: Frames, noise_m: float | None) -> Html | None:
             values = squares[kind][rows]
             ends[kind] = float(np.sqrt(np.nanmean(values))) if np.isfinite(values).any() else math.nan
             axes.plot(
-                np.full(rows.sum(), i + side), np.sqrt(values), "o", color=color, alpha=0.35, markersize=2.4, markeredgewidth=0
+                np.full(rows.sum(), i + side), np.sqrt(values), "o", color=color, alpha=0.5, markersize=3.2, markeredgewidth=0
             )
             axes.plot(
                 [i + side], [ends[kind]], "o", color=color, markersize=6.0, markeredgewidth=0, label=kind if i == 0 else None
@@ -331,7 +331,8 @@ def confounding_map(confounding: Confounding) -> Html | None:
         return None
     share = np.array([[np.nan if v is None else v for v in row] for row in confounding.share], float)
     np.fill_diagonal(share, np.nan)
-    figure, axes = new_axes(width=6.4, height=max(2.6, 1.4 + 0.30 * n))
+    wide = n > 6
+    figure, axes = new_axes(width=7.6 if wide else 4.5, height=1.3 + 0.34 * n)
     from matplotlib.colors import LinearSegmentedColormap
 
     colors = LinearSegmentedColormap.from_list("map", ["#ffffff", "#f3d9c4", BEFORE, "#6e2f06"])
@@ -370,7 +371,7 @@ def confounding_map(confounding: Confounding) -> Html | None:
         figure,
         alt=f"Map of {n} effects: how much of the trace of one another one imitates; the most {top[0]:.0%} of {top[1]} by {top[2]}.",
         caption="How much of the trace of the effect on the left the effect below imitates [%], with all that calibration can imitate taken off. Above 95 (bold) these data cannot tell the two apart.",
-        wide=False,
+        wide=wide,
     )  # fmt: skip
 
 

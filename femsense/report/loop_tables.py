@@ -99,20 +99,20 @@ def ranking_table(candidates: Sequence[Candidate], ranked: Mapping[str, Ranked],
     final = {effect.name: effect for effect in effects}
     rows = [
         [
-            together(effect_name(c.name), *_values(final.get(c.name), ranked.get(c.name, Ranked()))), words.number(c.dchi2), words.number(c.dbic),
-            _left_out(c), words.percent(c.retained_share), words.percent(ranked.get(c.name, Ranked()).first_share), words.number(c.dbic_at_end), _verdict(c),
+            effect_name(c.name), together(*_values(final.get(c.name), ranked.get(c.name, Ranked()))), words.number(c.dchi2), words.number(c.dbic),
+            _left_out(c), words.percent(c.retained_share), words.percent(ranked.get(c.name, Ranked()).first_share), _verdict(c),
         ]
         for c in candidates
     ]  # fmt: skip
     ranking = table(
-        ("Effect, value, plausible range", "Δχ²", "ΔBIC", "Left-out sweeps", "Retained", "First", "ΔBIC at the end", "Verdict"), rows,
-        caption="Every effect that was tried, by what the first screening says of it.", numeric=(1, 2, 3, 4, 5, 6),
+        ("Effect", "Value, plausible range", "Δχ²", "ΔBIC", "Left-out sweeps", "Retained", "First", "Verdict"), rows,
+        caption="Every effect that was tried, by what the first screening says of it.", numeric=(2, 3, 4, 5, 6),
         strong=[i for i, c in enumerate(candidates) if c.verdict == "named"],
     )  # fmt: skip
     text = paragraph(
         "Δχ² is what the effect explains of the residual beyond all that calibration can imitate; ΔBIC takes off a price for each parameter and each effect tried, "
         "and a named effect needs 10. Left-out sweeps: by how much twice the log-likelihood of sweeps that are not fitted rises, ± its standard error. “Retained” is the share of its trace "
-        "that calibration leaves. “First” is how often the effect comes first when whole sweeps are drawn anew. Values: of the final fit where named, else of the linear screening.",
+        "that calibration leaves. “First” is how often the effect comes first when whole sweeps are drawn anew. Values: of the final fit where named, else of the linear screening. The modulus and the zeros of the cables are not among them: they are always fitted along.",
         class_="soft",
     )
     return together(text, ranking) if ranking else None
@@ -153,7 +153,7 @@ def _value_line(label: str, text: str, estimate: Estimate | None) -> Html:
     if len(ends) == 2 and words.known(ends[0]):
         top = words.number(factor * (ends[1] or 0.0), 2) if words.known(ends[1]) else "∞"
         span = f" in [{words.number(factor * (ends[0] or 0.0), 2)}, {top}]" + (f" {unit}" if unit else "")
-    return element("div", code(label), f" {text}{span}", class_="soft value")
+    return element("div", code(label), f" {text}", element("span", span, class_="soft") if span else "", class_="value")
 
 
 def refits_table(candidates: Sequence[Candidate]) -> Html | None:

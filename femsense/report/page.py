@@ -29,6 +29,7 @@ nav ul { padding: 0; list-style: none; display: flex; flex-wrap: wrap; gap: 4px 
 a { color: var(--accent); }
 code { font: 0.92em ui-monospace, SFMono-Regular, Menlo, Consolas, monospace; }
 .soft { color: var(--soft); }
+.value { min-width: 190px; }
 .next { border-left: 4px solid var(--accent); padding: 2px 0 2px 14px; }
 .tiles { display: grid; grid-template-columns: repeat(auto-fit, minmax(170px, 1fr)); gap: 12px; margin: 14px 0 8px; }
 .tile { margin: 0; background: var(--pale); border-radius: 8px; padding: 11px 14px 12px; break-inside: avoid; }
@@ -64,7 +65,7 @@ footer { margin-top: 52px; padding-top: 12px; padding-bottom: 40px; color: var(-
   .tiles { grid-template-columns: repeat(4, 1fr); } .tile { border: 1px solid var(--line); } .tile dd { font-size: 15pt; }
   .panels { grid-template-columns: 1fr 1fr; } .scroll { overflow: visible; } table { font-size: 9pt; }
   th, td { padding-right: 9pt; } thead { display: table-header-group; } tr { break-inside: avoid; }
-  h2, h3, h4 { break-after: avoid; } nav { display: none; }
+  h2, h3, h4 { break-after: avoid; } .value { min-width: 34mm; } nav { display: none; }
 }
 """
 BLOCKS = {"p", "div", "dl", "dt", "dd", "li", "th", "td", "tr", "caption", "figcaption", "h1", "h2", "h3", "h4", "title"}
