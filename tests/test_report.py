@@ -18,7 +18,8 @@ from femsense.report import words, write_report
 from femsense.report.compare import load_error
 from femsense.report.documents import KnownLoad
 from femsense.report.drawing import VIEWS, best_view, nice, skin
-from femsense.report.loop import recovered, size_words
+from femsense.report.loop import recovered
+from femsense.report.loop_tables import size_words
 
 MARKERS = {"tip": [0.1, 0.015, 0.03], "middle": [0.05, 0.015, 0.03], "stalk": [0.1, 0.015, 0.05]}
 SENTENCE = "The model lacks gravity (vector_m_s2 [0.1, 0.02, -9.7] m/s²); held-out error 2.04 mm before, 0.17 mm after."
@@ -46,7 +47,7 @@ def loop_document(**overrides: Any) -> dict[str, Any]:
             {"name": "cable_gain", "parameters": {"scale": {"value": {"top": 1.031, "side": 0.985}, "std": {"top": 0.004, "side": None}, "unit": "1"}}},
         ],
         "candidates": [
-            {"name": "gravity", "seed": {}, "dchi2": 5321.4, "dbic": 5290.1, "retained_share": 0.83, "dbic_at_end": None, "refits": [{"name": "gravity", "dchi2": 5390.0, "dbic": 5360.0, "validation_rms_m": 3.1e-4, "verdict": "named"}], "verdict": "named"},
+            {"name": "gravity", "seed": {}, "dchi2": 5321.4, "dbic": 5290.1, "retained_share": 0.83, "dbic_at_end": None, "refits": [{"name": "gravity", "dchi2": 5390.0, "dbic": 5360.0, "validation_rms_m": 3.1e-4, "cv_gain": 42.0, "cv_spread": 8.0, "verdict": "named"}], "verdict": "named"},
             {"name": "payload", "seed": {"point_m": [0.1, 0, 0]}, "dchi2": 4100.0, "dbic": 4070.2, "retained_share": 0.4, "dbic_at_end": 1.0, "refits": [], "verdict": "passes"},
             {"name": "poisson", "seed": {}, "dchi2": 1.5e-5, "dbic": -7.4, "retained_share": 0.05, "dbic_at_end": -8.0, "refits": [], "verdict": "not testable: calibration imitates 97 % of it"},
         ],
@@ -64,7 +65,7 @@ def loop_document(**overrides: Any) -> dict[str, Any]:
             "rms_m": 1.7e-4, "marker_rms_m": {"tip": 2.1e-4, "middle": 1.2e-4, "stalk": None},
             "where": {"marker": "tip", "position_m": MARKERS["tip"], "mean_residual_m": [1e-5, -2e-5, 6e-5]},
             "worst_frame": {"frame": 17, "rms_m": 2.9e-4},
-            "goes_with": [{"covariate": "unloading", "rank_correlation": -0.41, "p_value": 0.03}],
+            "goes_with": [{"covariate": "unloading", "rank_correlation": -0.41, "p_value": 0.03, "p_holm": 0.15}],
             "structure": {"lag_one": 0.05, "p_value": 0.31},
         },
         "data": {
@@ -72,15 +73,93 @@ def loop_document(**overrides: Any) -> dict[str, Any]:
             "frames_fitted": [[0, 1, 2, 3, 7], [0, 1]], "frames_held_out": [list(range(8, 20)), list(range(8, 20))],
             "noise_components_m": {"white": 8e-5, "marker": 6e-5}, "noise_source": "restricted maximum likelihood, with repeats",
             "effective_observations": 252.0, "nuisance_after": {"stiffness": {"scale": {"value": 1.113, "std": 0.012, "unit": "1"}}},
-            "seat_std_m": 3e-4, "seed": 0,
+            "seat_std_m": 3e-4, "mesh_error_m": 5e-5, "seed": 0,
         },
         "residuals": {
             "recording": [row[0] for row in rows], "frame": [row[1] for row in rows], "marker": [row[2] for row in rows],
             "before_m": (sag + noise).tolist(), "after_m": noise.tolist(),
         },
-        "inputs": {"robot": {"name": "block", "path": "somewhere/block", "sha256": "0"}}, "versions": {"femsense": "0.1.0", "numpy": "2.0"},
+        "inputs": {"robot": {"name": "block", "path": "somewhere/block", "sha256": "0"}, "recordings": [{"path": "somewhere/first", "sha256": "abcd" * 16}]}, "versions": {"femsense": "0.1.0", "numpy": "2.0"},
     }  # fmt: skip
+    document["detectable"] |= {
+        "hyperelastic": {"smallest": {}, "would_be_seen": True},
+        "discretisation": {"smallest": {}, "would_be_seen": False},
+    }
+    document["evidence"] = evidence_document()
     return changed(document, overrides)
+
+
+def evidence_document() -> dict[str, Any]:
+    """Return plausible figures in numbers for a loop.json."""
+    rng = np.random.default_rng(11)
+    count = 24
+    push = np.concatenate([np.linspace(0, 2, 4), np.linspace(2, 0, 4)] * 3)
+    way = np.array([0, 0, 0, 0, 1, 1, 1, 1] * 3, dtype=bool)
+    score = 1e-3 * push * np.where(way, -0.5, 1.0) + 1e-5 * rng.normal(size=count)
+    mesh = block_mesh((4, 2, 2))
+    surface = skin(mesh.nodes, mesh.tets)
+    corners, triangles = np.unique(surface.triangles, return_inverse=True)
+    seats = np.array(list(MARKERS.values()))
+    residual = np.outer([1.0, 0.5, 1.0], [0.0, 0.0, -2e-3])
+    shots = [
+        {"title": title, "recording": 0, "frame": i, "marker": list(MARKERS), "measured_m": (seats + residual).tolist(), "before_m": residual.tolist(),
+         "after_m": (0.1 * residual).tolist(), "nodes_m": mesh.nodes[corners].tolist()}
+        for i, title in enumerate(("rest", "mid", "max"))
+    ]  # fmt: skip
+    tip = 0.01 * push
+    covariate = {"covariate": "unloading", "rank_correlation": -0.82, "p_value": 1e-6, "p_holm": 9e-6}
+    tests = {"neighbours": 0.002, "pattern": 0.004, "sweep": 0.5}
+    triple = [1e-3, 2e-3, -1e-3]
+    moved = {"nuisance": triple, "after": [1e-4, 0.0, 0.0]}
+    spread = {"before": [1e-5] * 3, "nuisance": [2e-5] * 3, "after": [2e-5] * 3}
+    return {
+        "frames": {
+            "recording": [0] * 16 + [1] * 8, "frame": list(range(16)) + list(range(8)), "time_s": [0.5 * i for i in range(count)], "sweep": ["one"] * 8 + ["two"] * 8 + ["three"] * 8,
+            "held_out": [False] * 8 + [True] * 16, "actuation": push.tolist(), "unloading": way.tolist(), "load_n": [0.0] * count,
+            "before_rms_m": (2e-3 + np.abs(score)).tolist(), "after_rms_m": [2e-4] * 23 + [None], "score_before_m": score.tolist(), "score_after_m": (0.1 * score).tolist(),
+        },
+        "score": {"share": 0.81, "pattern": {}, "goes_with_before": [covariate, {**covariate, "covariate": "time", "rank_correlation": 0.11}], "goes_with_after": [{**covariate, "rank_correlation": -0.2}],
+                  "covariate": "unloading", "covariate_values": way.astype(float).tolist()},
+        "tip": {"marker": "tip", "direction": [0.0, 0.0, 1.0], "recording": [0] * 16 + [1] * 8, "frame": list(range(16)) + list(range(8)),
+                "measured_m": tip.tolist(), "before_m": (tip + 2e-3).tolist(), "after_m": (tip + 1e-4).tolist()},
+        "pictures": {"triangles": triangles.reshape(-1, 3).tolist(), "frames": shots, "cameras": [{"axis": [0.0, 0.6, -0.8], "position_m": [0.05, -0.3, 0.4]}]},
+        "ranking": {
+            "gravity": {"parameters": [{"label": f"vector_m_s2[{i}]", "value": 0.0, "std": 0.1, "ends": [-12.0, 12.0], "unit": "m/s²"} for i in range(3)], "first_share": 0.97},
+            "payload": {"parameters": [{"label": "force_n[0]", "value": 0.12, "std": 0.01, "ends": [-20.0, 20.0], "unit": "N"}], "first_share": 0.03},
+            "poisson": {"parameters": [{"label": "poisson_ratio", "value": None, "std": None, "ends": [0.05, 0.499], "unit": "1"}], "first_share": None},
+        },
+        "confounding": {"names": ["gravity", "payload", "cable_gain"], "share": [[1.0, 0.97, 0.2], [0.9, 1.0, 0.1], [0.2, None, 1.0]]},
+        "calibration": {
+            "poses": [{"recording": r, "camera": 0, "turn_rad": moved, "shift_m": moved, "turn_std_rad": spread, "shift_std_m": spread} for r in (0, 1)],
+            "initial_inputs": [{"recording": 0, "cable": "top", "unit": "N", "values": {"before": [0.31, 0.02], "nuisance": [0.4, 0.03], "after": [0.3, None]}}],
+            "parameters": [{"label": "stiffness: scale", "unit": "1", "declared": 1.0, "values": {"nuisance": [0.8, 0.01], "after": [1.01, 0.012]}}],
+        },
+        "tests": {
+            "before": {"structure": {"lag_one": 0.7, "p_value": 0.002, "tests": tests, "significant": True}, "lack_of_fit": {"f": 31.2, "p_value": 1e-9, "df_lack": 40, "df_pure": 12, "pure_error_m": 2e-4}, "train_rms_m": 1.9e-3},
+            "after": {"structure": {"lag_one": 0.05, "p_value": 0.31, "tests": {"neighbours": 0.31}, "significant": False}, "lack_of_fit": None, "train_rms_m": 1.7e-4},
+        },
+        "power": {
+            "poisson": [{"label": "poisson_ratio", "kind": "change", "size": 0.031, "unit": "1"}],
+            "soft_region": [{"label": "scale", "kind": "factor", "size": 1.221, "unit": "1"}, {"label": "radius_m", "kind": "change", "size": 2e-3, "unit": "m"}],
+            "cable_stretch": [{"label": "stiffness_n_m", "kind": "softer_than", "size": 1e4, "unit": "N/m"}],
+            "base_compliance": [{"label": "stiffness_n_m", "kind": "softer_than", "size": None, "unit": "N/m"}],
+            "hyperelastic": [{"label": "", "kind": "whole", "size": 0.2, "unit": "1"}],
+            "discretisation": [{"label": "", "kind": "whole", "size": 3.0, "unit": "1"}],
+        },
+        "excluded": [{"touched, load not declared": [4, 5, 6], "no markers": [9]}, {}], "repeats": 2,
+        "forces": {"loads": [
+            {"recording": 0, "frame": 9, "held_out": True, "declared_n": 0.5, "before_n": 0.41, "before_std_n": 0.01, "after_n": 0.49, "after_std_n": 0.01},
+            {"recording": 0, "frame": 11, "held_out": True, "declared_n": 1.0, "before_n": 0.80, "before_std_n": 0.02, "after_n": 1.01, "after_std_n": 0.02},
+        ]},
+        "equivalent_forces": {"recording": 0, "frame": 7, "points_m": seats.tolist(), "forces_n": (20 * residual).tolist(), "total_n": [0.0, 0.0, -0.1], "explained_share": 0.93},
+    }  # fmt: skip
+
+
+COMPLIANCE = {
+    "compliance": {
+        "frames": [{"title": "rest", "frame": 0, "ratio": [0.9, 0.92, None], "phantom_before_n": 0.031, "phantom_after_n": 0.002}]
+    }
+}
 
 
 def write_loop_folder(folder: Path, *, robot: bool = True, **overrides: Any) -> Path:
@@ -227,23 +306,67 @@ def check_picture(source: str) -> None:
 # Loops
 
 
-def test_a_loop_shows_its_sentence_its_numbers_and_all_sections(tmp_path: Path) -> None:
+def test_a_loop_shows_its_sentence_and_its_ten_items_with_their_numbers(tmp_path: Path) -> None:
     page = report(write_loop_folder(tmp_path / "out"))
     assert page.text.startswith("block femsense report block " + SENTENCE)
     expect(
         page,
         "2.04 mm 95 % interval 1.85 … 2.21 mm", "0.173 mm 95 % interval 0.160 … 0.185 mm", "Recovered 100 %", "1.90 mm before, 0.170 mm after",
-        "vector_m_s2 (0.10 ± 0.30, 0.02 ± 0.25, −9.70 ± 0.12) m/s² 2.04 mm 0.310 mm", "coefficient 0.210 ± 0.015 0.310 mm 0.173 mm",
-        "law capstan", "scale top 1.0310 ± 0.0040 – –", "scale side 0.985", "5321 5290 83 % –",
-        "named: part of the improved model", "1.50 × 10⁻⁵ −7.40 5 %", "gravity and payload: their evidence differs by a ΔBIC of 3.2 only",
-        "leave the same trace (agreement 97.2 %)", "poisson: calibration imitates 97 % of it", "Next experiment: turn the base by 90°",
-        "poisson_ratio 0.031", "scale a change of 22 %", "softer than 10000 N/m", "0.10 mm … 0.30 mm (9 parameters)", "stiffness_n_m cannot be seen",
-        "most at marker tip, mean (0.0100, −0.0200, 0.0600) mm", "most in frame 17, 0.290 mm", "none seen between neighbouring states (correlation 0.050, p = 0.31)",
-        "unloading −0.41 0.030", "Split, recording 1 (first) 2 of 6 sweeps", "0–3, 7 (5)", "each measurement by itself 0.080 mm",
-        "restricted maximum likelihood, with repeats", "Fitted along: stiffness scale 1.113 ± 0.012", "femsense 0.1.0, numpy 2.0",
+        "1. Residual on the robot", "the black one says which way the camera looks", "Single frames of the fitted data",
+        "2. What the residual goes with", "The pattern holds 81 % of the squared residual before", "goes best with: unloading (rank correlation −0.82)", "by sweep (3 sweeps)",
+        "Marker tip along (0, 0, 1.0); the model misses it there by 2.00 mm rms before and 0.100 mm after", "unloading −0.82 9.0 × 10⁻⁶ −0.20", "time 0.11 9.0 × 10⁻⁶ –",
+        "3. Error on held-out data", "72 measurements of 3 markers", "the error fell in 24 of 24 held-out frames", "The error fell in 2 of 2 held-out sweeps",
+        "4. Effects", "vector_m_s2 (0.10 ± 0.30, 0.02 ± 0.25, −9.70 ± 0.12) m/s² 2.04 mm 0.310 mm", "coefficient 0.210 ± 0.015 0.310 mm 0.173 mm",
+        "law capstan", "scale top 1.0310 ± 0.0040 – –", "scale side 0.985", "−9.70 ± 0.12) m/s² in [−12, 12] m/s² 5321 5290 42.0 ± 8.0 83 % 97 % named: part of the improved model",
+        "force_n[0] 0.120 ± 0.010 N in [−20, 20] N 4100 4070 – 40 % 3 % rival: passes all tests too", "poisson_ratio in [0.050, 0.50] 1.50 × 10⁻⁵ −7.40 – 5 % – not testable: calibration imitates 97 % of it",
+        "5. What these data cannot say", "gravity and payload: their evidence differs by a ΔBIC of 3.2 only", "leave the same trace (agreement 97.2 %)", "poisson: calibration imitates 97 % of it",
+        "Next experiment: turn the base by 90°", "How much of the trace of the effect on the left the effect below imitates",
+        "6. What calibration had taken up", "Camera turned, recording 2 – 0 (0.0573 ± 0.0011, 0.1146 ± 0.0011, −0.0573 ± 0.0011) °", "Camera shifted, recording 1 – 0 (1.000 ± 0.020,",
+        "Initial input of top – 0.310 ± 0.020 N 0.400 ± 0.030 N 0.300 N", "stiffness: scale 1.00 – 0.800 ± 0.010 1.010 ± 0.012",
+        "7. Tests, and what is left", "neighbouring states are alike p = 0.0020 p = 0.31", "Any structure (1 %, Holm) yes no", "F = 31, p = 1.0 × 10⁻⁹ (40, 12 degrees of freedom; repeats differ by 0.200 mm) not testable",
+        "most at marker tip, mean (0.0100, −0.0200, 0.0600) mm", "most in frame 17, 0.290 mm", "none seen beyond noise (correlation of neighbouring states 0.050, smallest p = 0.31)", "unloading −0.41 0.030 0.15",
+        "8. Smallest effects that would have been seen", "poisson_ratio 0.031", "scale a change of 22 %", "radius_m 2.0 mm", "softer than 10000 N/m", "0.10 mm … 0.30 mm (9 parameters)",
+        "stiffness_n_m cannot be seen", "or softening with stretch would have been seen", "would have to be 3.0 times as large",
+        "9. Data", "Split, recording 1 (first) 2 of 6 sweeps", "0–3, 7 (5)", "touched, load not declared: 4–6 (3)", "no markers: 9 (1)", "Frames left out, 2 none", "reached again the same way) 2",
+        "each measurement by itself 0.080 mm", "restricted maximum likelihood, with repeats", "Error of the mesh, at the markers 0.050 mm", "Fitted along: stiffness scale 1.113 ± 0.012", "Seed 0", "femsense 0.1.0, numpy 2.0", "Recording 1 first abcdabcdabcdabcd",
+        "10. What it means for forces", "in held-out frames", "0.14 N (19.0 %) with the declared robot, calibrated; 10 mN (1.5 %) with the improved one".replace("10 mN", "0.010 N"),
+        "9 0.500 N 0.410 ± 0.010 N −18 % 0.490 ± 0.010 N −2.0 %", "11 1.00 N 0.800 ± 0.020 N −20 % 1.010 ± 0.020 N +1.0 %",
     )  # fmt: skip
-    assert len(page.all("img")) == 5
-    assert "72 measurements of 3 markers" in page.text and "The error fell in 24 of 24 held-out frames" in page.text
+    assert len(page.all("img")) == 10
+
+
+def test_without_loads_the_compliance_says_what_forces_do(tmp_path: Path) -> None:
+    page = report(write_loop_folder(tmp_path, evidence__forces=COMPLIANCE))
+    expect(page, "sensed as 0.910 times the force that the declared robot senses (median over places and frames; 0.900 to 0.920)", "rest (0) 0.900 … 0.920 0.031 N 0.0020 N")  # fmt: skip
+
+
+def test_what_no_effect_explains_is_shown_where_it_acts(tmp_path: Path) -> None:
+    left = {
+        "rms_m": 9e-4, "where": {"marker": "tip", "mean_residual_m": [0.0, 0.0, 1e-3], "direction": [0.0, 0.6, 0.8], "direction_share": 0.91},
+        "worst_frame": {"frame": 17, "rms_m": 2e-3}, "worst_frames": [{"frame": 17, "rms_m": 2e-3}, {"frame": 18, "rms_m": 1e-3}], "half_in_frames": 0.08, "explained_share": 0.32,
+        "goes_with": [{"covariate": "known load", "rank_correlation": 0.7, "p_value": 1e-4, "p_holm": 1e-3}], "structure": {"lag_one": 0.6, "p_value": 0.002, "significant": True},
+    }  # fmt: skip
+    page = report(write_loop_folder(tmp_path, verdict="unexplained", effects=[], left=left))
+    expect(
+        page, "91 % of it there lies along (0, 0.60, 0.80)", "most in frame 17, 2.00 mm rms, then in 18.", "8 % of the frames hold half", "took away 32 %",
+        "the residual is not mere noise", "known load 0.70 0.00010 0.0010", "Not evidence: the smallest forces on the surface", "they explain 93 % of it", "Together they make (0, 0, −0.10) N",
+    )  # fmt: skip
+    assert len(page.all("img")) == 10
+    calm = report(write_loop_folder(tmp_path / "calm", verdict="none", effects=[]))
+    assert "Not evidence" not in calm.text
+
+
+def test_a_loop_of_an_earlier_version_says_what_it_lacks(tmp_path: Path) -> None:
+    page = report(write_loop_folder(tmp_path, evidence=None))
+    expect(page, "Run femsense improve again for the whole report.", "1. Residual on the robot", "4. Effects", "9. Data")
+    assert "earlier femsense" not in report(write_loop_folder(tmp_path / "new")).text
+
+
+@pytest.mark.parametrize("part", list(evidence_document()))
+def test_each_part_of_the_evidence_may_be_missing_or_empty(tmp_path: Path, part: str) -> None:
+    empty: dict[str, Any] = {"excluded": [], "repeats": None}
+    report(write_loop_folder(tmp_path / "empty", **{f"evidence__{part}": empty.get(part, {})}))
+    report(write_loop_folder(tmp_path / "missing", **{f"evidence__{part}": None}))
 
 
 def test_the_same_folder_gives_the_same_page(tmp_path: Path) -> None:
@@ -272,23 +395,23 @@ def test_residuals_that_are_not_known_do_not_count(tmp_path: Path) -> None:
     page = report(
         write_loop_folder(tmp_path, residuals__before_m__0=[None, 0.0, 0.0], residuals__after_m__1=[0.0, float("nan"), 0.0])
     )
-    assert "70 measurements of 3 markers" in page.text and len(page.all("img")) == 5
+    assert "70 measurements of 3 markers" in page.text and len(page.all("img")) == 10
 
 
 def test_without_the_robot_there_is_no_picture_of_it(tmp_path: Path) -> None:
     page = report(write_loop_folder(tmp_path, robot=False))
-    assert "Residual on the robot" not in page.text and len(page.all("img")) == 3
+    assert "Small dots are single frames" not in page.text and len(page.all("img")) == 8
 
 
 @pytest.mark.parametrize("missing", ["effects", "candidates", "confounded", "not_testable", "detectable", "left", "data", "residuals", "noise_m", "before", "next_experiment", "versions", "inputs"])  # fmt: skip
 def test_each_missing_part_is_left_out(tmp_path: Path, missing: str) -> None:
     page = report(write_loop_folder(tmp_path / "loop", robot=False, **{missing: None}))
     titles = {
-        "effects": "Effects found",
-        "candidates": "All effects",
+        "effects": "Effects in the order",
+        "candidates": "Every effect that was tried",
         "detectable": "Smallest effects",
-        "left": "What is left",
-        "residuals": "Error on held-out",
+        "left": "What the size of the residual",
+        "residuals": "measurements of 3 markers",
     }
     assert SENTENCE in page.text
     assert titles.get(missing, "nowhere") not in page.text
@@ -458,6 +581,10 @@ def test_a_path_that_is_no_folder_and_a_file_that_is_one(tmp_path: Path) -> None
         ({"residuals__before_m__0": [1.0, 2.0]}, "residuals.before_m[0]"),
         ({"residuals__marker": ["tip"]}, "residuals"),
         ({"confounded__0__pair": ["gravity"]}, "confounded[0].pair"),
+        ({"evidence": 5}, "evidence"),
+        ({"evidence__frames__sweep": ["one"]}, "evidence.frames"),
+        ({"evidence__forces__loads__0__frame": "nine"}, "evidence.forces.loads[0].frame"),
+        ({"evidence__pictures__frames__0__before_m__0": [1.0]}, "evidence.pictures.frames[0].before_m[0]"),
         ({"format": "femsense-loop-9"}, "format"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
