@@ -95,9 +95,7 @@ def conclude(data: Data, search: Search, rng: np.random.Generator) -> LoopResult
         declared=data.robot,
         data=_card(data, before, final, noise, search.n_effective),
         residuals=_residual_table(data, before, back),
-        evidence=gather(
-            data, before, search.history[0][1], final, back, noise, search.n_effective, search.first, search.last, tests, rng
-        ),
+        evidence=gather(data, before, search.history[0][1], final, back, noise, search.first, search.last, tests, rng),
     )
 
 

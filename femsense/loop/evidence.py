@@ -38,7 +38,7 @@ REPEATS = 6
 
 
 def gather(
-    data: Data, before: Stage, base: Stage, final: Stage, back: Stage, noise: Noise, n_effective: float,
+    data: Data, before: Stage, base: Stage, final: Stage, back: Stage, noise: Noise,
     first: list[Candidate], last: list[Candidate], after_tests: StructureTests, rng: np.random.Generator,
 ) -> dict[str, Any]:  # fmt: skip
     """Return the content of `evidence` in loop.json.
@@ -48,7 +48,7 @@ def gather(
         before: the declared model, calibrated.
         base: with all that calibration may move.
         final: with the effects, everything free; `back`: what is handed back.
-        noise, n_effective: at the end.
+        noise: at the end.
         first, last: the first and the last screening.
         after_tests: tests of structure at the end.
         rng: of the bootstrap and the permutations.
@@ -61,7 +61,7 @@ def gather(
         "score": pattern,
         "tip": _tip(data, old, new),
         "pictures": _pictures(data, old, new),
-        "ranking": _ranking(data, base.fit, first, n_effective, rng),
+        "ranking": _ranking(data, base.fit, first, rng),
         "confounding": _confounding(first),
         "calibration": _calibration(data, {"before": before, "nuisance": base, "after": final}),
         "tests": {
@@ -213,12 +213,10 @@ def _pictures(data: Data, old: list[View], new: list[View]) -> dict[str, Any]:
 # Candidates
 
 
-def _ranking(
-    data: Data, fit: JointFit, first: list[Candidate], n_effective: float, rng: np.random.Generator
-) -> dict[str, dict[str, Any]]:
+def _ranking(data: Data, fit: JointFit, first: list[Candidate], rng: np.random.Generator) -> dict[str, dict[str, Any]]:
     """Return for each effect the linear estimate of its parameters with their plausible range, and how often it comes first."""
     ones = one_each(first)
-    often = _first_share(data, fit, ones, n_effective, rng)
+    often = _first_share(data, fit, ones, rng)
     return {
         c.effect.name: {"parameters": _estimates(c), "first_share": None if often is None else often[i]}
         for i, c in enumerate(ones)
@@ -244,9 +242,7 @@ def _ends(a: float, b: float) -> list[float]:
     return [min(a, b), max(a, b)]
 
 
-def _first_share(
-    data: Data, fit: JointFit, ones: list[Candidate], n_effective: float, rng: np.random.Generator
-) -> list[float] | None:
+def _first_share(data: Data, fit: JointFit, ones: list[Candidate], rng: np.random.Generator) -> list[float] | None:
     """Return how often each effect has the best linear score when whole sweeps are drawn with replacement; None for few sweeps.
 
     Nuisance is projected out anew in each draw. Rows that belong to no sweep (seats, declared poses, priors) stay.
@@ -266,12 +262,11 @@ def _first_share(
         grams.append(whole[rows].T @ whole[rows])
     rest = whole[~inside].T @ whole[~inside]
     spans = list(pairwise(np.cumsum([J.shape[1], *(c.columns.shape[1] for c in ones)])))
-    price = [len(c.parameters) * np.log(n_effective) + 2.0 * np.log(len(ones) * c.seeds) for c in ones]
     wins = np.zeros(len(ones))
     for _ in range(DRAWS):
         counts = np.bincount(rng.integers(0, len(groups), len(groups)), minlength=len(groups))
         G = _without(rest + np.tensordot(counts, np.array(grams), axes=1), J.shape[1])
-        gains = [_gain(G, a - J.shape[1], b - J.shape[1], c, size[a:b]) - cost for (a, b), c, cost in zip(spans, ones, price)]
+        gains = [_gain(G, a - J.shape[1], b - J.shape[1], c, size[a:b]) - c.cost for (a, b), c in zip(spans, ones)]
         wins[int(np.argmax(gains))] += max(gains) > 0
     return [float(w) / DRAWS for w in wins]
 
