@@ -62,7 +62,7 @@ def residual_in_frames(pictures: Pictures, rest: Surface | None) -> Html | None:
     everything = np.vstack([*measured, *(s.nodes for s in shapes if s is not None)])
     view = best_view(everything, np.vstack(fields["before"]))
     tips = np.vstack([m + (factor - 1.0) * r for part in fields.values() for m, r in zip(measured, part)])
-    corners = 1e3 * np.vstack([view.flat(everything), np.quantile(view.flat(tips), [0.01, 0.99], axis=0)])
+    corners = 1e3 * np.vstack([view.flat(everything), view.flat(tips)])
     low, high = corners.min(axis=0), corners.max(axis=0)
     span = high - low
     height = float(np.clip(2 * (3.1 * span[1] / span[0] + 0.75), 3.2, 8.0))

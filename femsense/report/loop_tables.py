@@ -347,7 +347,7 @@ def _loads(loads: Sequence[LoadRow]) -> Html | None:
     )
     numbers = table(
         ("Recording: frame" if several else "Frame", "Declared load", "Declared robot", "error", "Improved robot", "error"), rows,
-        caption="Forces at declared loads, ± one standard deviation from the noise of the markers.", numeric=(1, 2, 3, 4, 5),
+        caption="Forces at declared loads, ± one standard deviation from the noise of the markers, taken as independent.", numeric=(1, 2, 3, 4, 5),
     )  # fmt: skip
     return together(text, numbers)
 
