@@ -65,7 +65,7 @@ footer { margin-top: 52px; padding-top: 12px; padding-bottom: 40px; color: var(-
   .tiles { grid-template-columns: repeat(4, 1fr); } .tile { border: 1px solid var(--line); } .tile dd { font-size: 15pt; }
   .panels { grid-template-columns: 1fr 1fr; } .scroll { overflow: visible; } table { font-size: 9pt; }
   th, td { padding-right: 9pt; } thead { display: table-header-group; } tr { break-inside: avoid; }
-  h2, h3, h4 { break-after: avoid; } .value { min-width: 34mm; } nav { display: none; }
+  h2, h3, h4, caption { break-after: avoid; } .value { min-width: 34mm; } nav { display: none; }
 }
 """
 BLOCKS = {"p", "div", "dl", "dt", "dd", "li", "th", "td", "tr", "caption", "figcaption", "h1", "h2", "h3", "h4", "title"}
