@@ -43,12 +43,13 @@ def read_truth(recording: Path) -> tuple[TrueContact, ...]:
 
 
 def true_effects(recording: Path) -> list[dict[str, Any]]:
-    """Return the effects that the truth has, as entries of `[[effects]]`; none where nothing is known of it."""
+    """Return the effects that the truth has, a law other than the plain one among them, as entries of `[[effects]]`; none where nothing is known of it."""
     try:
         known = json.loads((recording / "truth" / "truth.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return []
-    return list(known.get("effects", []))
+    law = known.get("model", {}).get("law", "corotational")
+    return [*known.get("effects", []), *([{"name": "hyperelastic", "law": law}] if law != "corotational" else [])]
 
 
 def force_errors(run: Run, truth: Sequence[TrueContact]) -> dict[str, Any]:
