@@ -117,12 +117,26 @@ def loop_text(document: Mapping[str, Any]) -> str:
         ("cannot be told apart", "confounded"),
         ("not testable", "not_testable"),
         ("next experiment", "next_experiment"),
-        ("what is left", "left"),
     ):
         value = document.get(key)
         if value:
             lines += ["", f"{title}: {_words(value)}"]
-    return "\n".join(lines)
+    left = _left(document.get("left") or {})
+    return "\n".join([*lines, "", f"what is left: {left}"] if left else lines)
+
+
+def _left(left: Mapping[str, Any]) -> str:
+    """Return in one line how large the remaining residual is, where, and whether it has structure."""
+    if left.get("rms_m") is None:
+        return ""
+    words = [f"{1e3 * left['rms_m']:.3g} mm rms"]
+    marker = (left.get("where") or {}).get("marker")
+    if marker:
+        words.append(f"most at marker {marker}")
+    tests = left.get("structure") or {}
+    if "significant" in tests:
+        words.append("with structure" if tests["significant"] else "without structure")
+    return ", ".join(words)
 
 
 def effect_text(effect: Mapping[str, Any]) -> str:

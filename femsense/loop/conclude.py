@@ -291,14 +291,24 @@ def _candidate_rows(first: list[Candidate], table: list[Candidate], refits: list
         end = last.get(c.effect.name)
         rows.append({
             "name": c.effect.name, "seed": c.seed, "dchi2": c.gain, "dbic": c.score, "retained_share": c.retained,
-            "dbic_at_end": None if end is None else end.score, "refits": joint, "verdict": joint[-1]["verdict"] if joint else _why_not(c),
+            "dbic_at_end": None if end is None else end.score, "refits": joint, "verdict": _verdict_of(joint) if joint else _why_not(c, end),
         })  # fmt: skip
     return rows
 
 
-def _why_not(c: Candidate) -> str:
+def _verdict_of(joint: list[dict[str, Any]]) -> str:
+    """Return what became of an effect in all its joint refits: the best that was said of any."""
+    said = [str(r["verdict"]) for r in joint]
+    return next((v for v in ("named", "passes") if v in said), said[-1])
+
+
+def _why_not(c: Candidate, end: Candidate | None) -> str:
     if c.retained < TESTABLE:
         return f"not testable: calibration imitates {100 * np.sqrt(max(0.0, 1 - c.retained**2)):.0f} % of it"
+    if c.score > EVIDENCE and end is not None and end.score <= EVIDENCE:
+        return f"nothing is left for it once what is named is in the model (dBIC {c.score:.0f}, then {end.score:.1f})"
+    if c.score > EVIDENCE:
+        return f"not refitted: far behind the best (dBIC {c.score:.0f})"
     return f"too little evidence (dBIC {c.score:.1f})"
 
 
