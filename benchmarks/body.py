@@ -1,6 +1,6 @@
 """How fast the body is: cold equilibria beside SOFA's, parts, real time, growth with the mesh. Prints the tables of docs/speed.md.
 
-    OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 python benchmarks/body.py [cold|parts|frames|growth …] [--data FOLDER]
+    OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 python benchmarks/body.py [cold|parts|frames|growth|iterative …] [--data FOLDER]
 
 Medians of CPU time of one thread; SOFA's figures are those of `reference/cases.json`, measured on a like machine.
 """
@@ -222,17 +222,63 @@ def one_level(data: Path, level: int) -> None:
     )
 
 
+def iterative_growth(data: Path, levels: int) -> None:
+    """The iterative solver beside the direct one, each mesh, element and solver in a process of its own."""
+    print(
+        "  element tetrahedra unknowns    solver | prepared, anew, a solve (iterations) | equilibrium under weight | memory of the factor, of the process"
+    )
+    for element, counts in (("tet4", levels), ("tet10", levels - 1)):
+        for level in range(counts):
+            for solver in ("direct", "iterative"):
+                arguments = [sys.executable, __file__, "side", "--level", str(level), "--element", element, "--data", str(data)]
+                done = subprocess.run(arguments, capture_output=True, text=True, check=False, env={**os.environ, "FEMSENSE_SOLVER": solver})  # fmt: skip
+                print(done.stdout.rstrip() or f"{element}, level {level}, {solver}: did not finish", flush=True)
+
+
+def one_side(data: Path, level: int, element: str) -> None:
+    """Set-up, solve and a cold equilibrium under weight with the solver that FEMSENSE_SOLVER names."""
+    mesh = load_robot(data / "diamond").body.mesh
+    for _ in range(level):
+        mesh = refined(mesh)
+    mesh = to_quadratic(mesh) if element == "tet10" else mesh
+    body = make_body(mesh, young_modulus=180e3, poisson_ratio=0.45, density=1070.0, clamped=in_boxes(mesh.nodes), gravity=[0, 0, -9.81])  # fmt: skip
+    pattern, blocks = body.free_map.pattern, internal(body, np.array(mesh.nodes)).blocks
+    assert blocks is not None
+    values, right = reduced_values(body, blocks), body.weight().ravel()[body.free_map.dofs]
+    began = time.process_time()
+    analysed = pattern.levels() if os.environ["FEMSENSE_SOLVER"] == "iterative" else pattern.analysis()
+    first = time.process_time() - began
+    assert analysed is not None
+    small = load_robot(data / "diamond").body
+    solve_equilibrium(small, tension={small.cable_names[0]: 0.1})  # compiled code is loaded
+    factor = factorize(pattern, values)
+    assert factor is not None
+    again, solve = median_ms(lambda: factorize(pattern, values), 1), median_ms(lambda: factor.solve(right), 1)
+    began = time.process_time()
+    state = solve_equilibrium(body)
+    cold_s = time.process_time() - began
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(
+        f"  {element:5} {len(mesh.tets):9d} {pattern.size:9d} {os.environ['FEMSENSE_SOLVER']:>9} | analysis {first:.2f} s, then {again:.0f} ms, {solve:.1f} ms ({getattr(factor, 'iterations', 0)})"
+        f" | {cold_s:.2f} s, {state.status} in {state.iterations} steps | {factor.bytes / 2**20:.0f} MB, {peak:.0f} MB"
+    )
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser()
-    parser.add_argument("what", nargs="*", default=["cold", "parts", "frames", "growth"])
+    parser.add_argument("what", nargs="*", default=["cold", "parts", "frames", "growth", "iterative"])
     parser.add_argument("--data", type=Path, default=DATA)
     parser.add_argument("--level", type=int, default=0)
     parser.add_argument("--levels", type=int, default=3)
+    parser.add_argument("--element", choices=["tet4", "tet10"], default="tet4")
     given = parser.parse_args()
     warnings.simplefilter("ignore")
     for what in given.what:
         if what == "one":
             one_level(given.data, given.level)
             continue
+        if what == "side":
+            one_side(given.data, given.level, given.element)
+            continue
         print(f"\n== {what}", flush=True)
-        {"cold": lambda: cold(given.data), "parts": lambda: parts(given.data), "frames": lambda: frames(given.data), "growth": lambda: growth(given.data, given.levels)}[what]()  # fmt: skip
+        {"cold": lambda: cold(given.data), "parts": lambda: parts(given.data), "frames": lambda: frames(given.data), "growth": lambda: growth(given.data, given.levels), "iterative": lambda: iterative_growth(given.data, given.levels)}[what]()  # fmt: skip

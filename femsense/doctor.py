@@ -153,10 +153,17 @@ def _libraries() -> Check:
 
 def _solver() -> Check:
     chosen = os.environ.get("FEMSENSE_SOLVER", "").lower()
-    if chosen in ("", "cholesky"):
+    if chosen in ("", "cholesky", "direct"):
         return Check("linear solver", "ok", "Cholesky of femsense, with the BLAS of SciPy")
+    if chosen == "iterative":
+        return Check(
+            "linear solver",
+            "warning",
+            "conjugate gradients",
+            "FEMSENSE_SOLVER=iterative asks for them: they save memory, not time",
+        )
     if chosen not in ("pardiso", "superlu"):
-        return Check("linear solver", "error", f"FEMSENSE_SOLVER={chosen} is not known", "cholesky, pardiso or superlu")
+        return Check("linear solver", "error", f"FEMSENSE_SOLVER={chosen} is not known", "direct, iterative, pardiso or superlu")
     from femsense.fem.linear import pardiso_library
 
     name = f"PARDISO (pypardiso {_version('pypardiso')})" if pardiso_library() is not None else "SuperLU of SciPy"

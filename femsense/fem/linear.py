@@ -1,8 +1,9 @@
 """Factor once, solve many: the sparse symmetric systems of the body.
 
 A stiffness that is positive definite goes to `femsense.fem.cholesky`, with its analysis kept for a sparsity pattern. One that
-is not goes to PARDISO of the MKL (through pypardiso) where it is installed, and to SuperLU of SciPy elsewhere.
-Set FEMSENSE_SOLVER to `pardiso` or `superlu` to send all of them there.
+is not goes to PARDISO of the MKL (through pypardiso) where it is installed, and to SuperLU of SciPy elsewhere. Where the factor
+would not fit into memory, conjugate gradients take its place (see `femsense.fem.iterative`).
+FEMSENSE_SOLVER chooses by hand: `direct` or `iterative`; `pardiso` or `superlu` send all of them there.
 """
 
 from __future__ import annotations
@@ -20,7 +21,15 @@ import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
 from femsense.arrays import FloatArray, IntArray
+from femsense.errors import FemsenseError
 from femsense.fem.cholesky import Analysis, analyse, cholesky
+from femsense.fem.iterative import Grid, Levels, UnsettledError, iterative, make_levels
+
+ITERATIVE_FROM = 100_000
+"""Unknowns from which on the memory of a direct factor is looked at. Within memory the direct factor was faster at every measured size,
+linear and quadratic (`python benchmarks/body.py iterative`), so that memory alone switches."""
+MEMORY_SHARE = 0.6
+"""A direct factor may take this share of the memory that is free."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -39,6 +48,12 @@ class Pattern:
     """PARDISO solvers that hold the analysis of this pattern and no factor that is still needed."""
     analyses: list[Analysis] = field(default_factory=list)
     """The analysis for Cholesky, once it was needed."""
+    grid: Grid | None = None
+    """The nodes behind the unknowns, for the iterative solver; None: unknown."""
+    levels_made: list[Levels] = field(default_factory=list)
+    """The levels of the iterative solver, once they were needed."""
+    fits: list[bool] = field(default_factory=list)
+    """Whether a direct factor fits into memory, once that was asked."""
 
     @property
     def size(self) -> int:
@@ -49,6 +64,13 @@ class Pattern:
         if not self.analyses:
             self.analyses.append(analyse(self.indptr, self.indices))
         return self.analyses[0]
+
+    def levels(self) -> Levels:
+        """Return the levels of the iterative solver, made when they are first asked for."""
+        if not self.levels_made:
+            assert self.grid is not None
+            self.levels_made.append(make_levels(self.indptr, self.indices, self.grid))
+        return self.levels_made[0]
 
 
 def make_pattern(indptr: IntArray, indices: IntArray) -> Pattern:
@@ -90,6 +112,11 @@ def factorize(pattern: Pattern, values: FloatArray) -> Factorization | None:
     """
     if not np.isfinite(values).all():
         return None
+    if _iterates(pattern):
+        found = _iterate(pattern, values)
+        if found is not None:
+            return found
+        _require_memory(pattern)
     return (_cholesky(pattern, values) if _wanted() == "cholesky" else None) or _factorize_any(pattern, values)
 
 
@@ -124,7 +151,58 @@ def factorize_definite(
 
 
 def _wanted() -> str:
-    return os.environ.get("FEMSENSE_SOLVER", "").lower() or "cholesky"
+    """Return which direct solver is wanted."""
+    chosen = os.environ.get("FEMSENSE_SOLVER", "").lower()
+    return "cholesky" if chosen in ("", "direct", "iterative") else chosen
+
+
+def _iterates(pattern: Pattern) -> bool:
+    """Return whether a pattern is one for conjugate gradients: by choice, or because its factor does not fit into memory."""
+    chosen = os.environ.get("FEMSENSE_SOLVER", "").lower()
+    if chosen or pattern.grid is None:
+        return chosen == "iterative" and pattern.grid is not None
+    if pattern.size < ITERATIVE_FROM:
+        return False
+    if not pattern.fits:  # decided once: the memory of a factor that is made is no longer free, but it is used again
+        pattern.fits.append(direct_bytes(pattern) <= MEMORY_SHARE * available_memory())
+    return not pattern.fits[0]
+
+
+def _iterate(pattern: Pattern, values: FloatArray) -> Factorization | None:
+    """Return a stiffness solved by conjugate gradients, None where it is not definite or they take too long."""
+    try:
+        return iterative(pattern.levels(), values)
+    except UnsettledError:
+        return None
+
+
+def _require_memory(pattern: Pattern) -> None:
+    """Raise FemsenseError where a direct factor is needed and does not fit into memory."""
+    needed, free = direct_bytes(pattern), MEMORY_SHARE * available_memory()
+    if needed > free:
+        raise FemsenseError(
+            f"conjugate gradients cannot solve this stiffness (not definite, or too ill-conditioned), and its factor needs {needed / 1e9:.1f} GB where {free / 1e9:.1f} GB may be used: "
+            "(a) smaller loads, (b) a coarser mesh, (c) more memory"
+        )
+
+
+def direct_bytes(pattern: Pattern) -> int:
+    """Return the memory that the direct factor takes while it is made [bytes]."""
+    analysis = pattern.analysis()
+    return 8 * (int(analysis.offset[-1]) + analysis.stack)
+
+
+def available_memory() -> float:
+    """Return the free memory of the machine [bytes]; inf where it is unknown."""
+    try:
+        with open("/proc/meminfo", encoding="ascii") as lines:
+            return next(1024.0 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable"))
+    except (OSError, StopIteration):
+        pass
+    try:
+        return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    except (AttributeError, ValueError, OSError):
+        return float("inf")
 
 
 def _cholesky(pattern: Pattern, values: FloatArray) -> Factorization | None:
@@ -133,6 +211,11 @@ def _cholesky(pattern: Pattern, values: FloatArray) -> Factorization | None:
 
 def _definite(pattern: Pattern, values: FloatArray) -> Factorization | None:
     """Return the factor of a matrix that is positive definite, None where it is not."""
+    if _iterates(pattern):
+        try:
+            return iterative(pattern.levels(), values)
+        except UnsettledError:
+            _require_memory(pattern)
     if _wanted() == "cholesky":
         return _cholesky(pattern, values)
     factor = factorize(pattern, values)

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.sparse as sp
-from scipy.sparse.linalg import splu
 
 from femsense.arrays import BoolArray, FloatArray, IntArray, freeze
+from femsense.fem.cholesky import fill_reducing_order
+from femsense.fem.iterative import Grid
 from femsense.fem.linear import Pattern, make_pattern
-from femsense.fem.mesh import TetMesh, shape_slopes, shape_values
+from femsense.fem.mesh import EDGES, TetMesh, shape_slopes, shape_values
 
 _A, _B = 0.5854101966249685, 0.1381966011250105
 QUADRATURE = np.array([[_A, _B, _B, _B], [_B, _A, _B, _B], [_B, _B, _A, _B], [_B, _B, _B, _A]])
@@ -126,7 +126,16 @@ def make_free_map(stencil: Stencil, mesh: TetMesh, fixed: IntArray) -> FreeMap:
     sort = np.lexsort((i, j))
     pattern, source = _entries(i[sort], j[sort], where[sort], turned[sort], len(order))
     dofs = (3 * order[:, None] + np.arange(3)).ravel()
-    return FreeMap(freeze(dofs, np.int64), pattern, source)
+    grid = Grid(freeze(mesh.nodes[order]), freeze(_edge_ends(mesh, place)[order], np.int64))
+    return FreeMap(freeze(dofs, np.int64), replace(pattern, grid=grid), source)
+
+
+def _edge_ends(mesh: TetMesh, place: IntArray) -> IntArray:
+    """Return the places of the ends of the edge that each node is in the middle of, twice its own for a corner, shape (n, 2)."""
+    ends = np.column_stack([place, place])
+    if mesh.is_quadratic:
+        ends[mesh.tets[:, 4:]] = place[mesh.tets[:, EDGES]]
+    return ends
 
 
 def _entries(i: IntArray, j: IntArray, where: IntArray, turned: BoolArray, size: int) -> tuple[Pattern, IntArray]:
@@ -146,14 +155,3 @@ def _entries(i: IntArray, j: IntArray, where: IntArray, turned: BoolArray, size:
 def block_row_numbers(stencil: Stencil) -> IntArray:
     """Return the row of each kept block, shape (nb − 1,)."""
     return np.repeat(np.arange(len(stencil.block_rows) - 1), np.diff(stencil.block_rows))
-
-
-def fill_reducing_order(rows: IntArray, columns: IntArray, free: BoolArray) -> IntArray:
-    """Return the free nodes in an order of little fill (multiple minimum degree, by SuperLU) for the couplings rows–columns."""
-    n = len(free)
-    upper = sp.csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(n, n))
-    nodes = np.flatnonzero(free)
-    part = (upper + upper.T)[nodes][:, nodes]
-    dominant = (part + sp.diags_array(np.asarray(part.sum(axis=1)).ravel() + 1.0)).tocsc()
-    lu = splu(dominant, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    return nodes[np.argsort(lu.perm_c)]
