@@ -87,7 +87,8 @@ def make_levels(indptr: IntArray, indices: IntArray, grid: Grid) -> Levels:
     graph = sp.csr_matrix((np.ones(len(columns), np.float32), columns, rows), shape=(p, p))
     follows, weights = _corners(grid) if grid.is_quadratic else _aggregates(grid, rows, columns)
     coarse = sp.csr_matrix(abs(follows).T @ graph @ abs(follows))
-    order = fill_reducing_order(*coarse.nonzero(), np.ones(coarse.shape[0], dtype=bool))
+    first, second = (np.asarray(index, np.int64) for index in coarse.nonzero())
+    order = fill_reducing_order(first, second, np.ones(coarse.shape[0], dtype=bool))
     place = np.empty_like(order)
     place[order] = np.arange(len(order))
     follows.indices = place[follows.indices].astype(follows.indices.dtype)
@@ -97,11 +98,11 @@ def make_levels(indptr: IntArray, indices: IntArray, grid: Grid) -> Levels:
     numbers = sp.csr_matrix((np.arange(len(weights)), follows.indices, follows.indptr), shape=follows.shape)
     prolong = sp.bsr_matrix((weights.astype(np.float32), follows.indices, follows.indptr), shape=(3 * p, u * len(order))).tocsr()
     prolong.eliminate_zeros()
-    expanded = _expanded(coarse.indptr, coarse.indices, u)
+    coarse_rows, coarse_columns = np.asarray(coarse.indptr, np.int64), np.asarray(coarse.indices, np.int64)
     children = numbers.T.tocsr()
     return Levels(
         rows, columns, prolong, prolong.T.tocsr(), numbers, children, weights,
-        np.asarray(coarse.indptr, np.int64), np.asarray(coarse.indices, np.int64), analyse(*expanded),
+        coarse_rows, coarse_columns, analyse(*_expanded(coarse_rows, coarse_columns, u)),
     )  # fmt: skip
 
 
@@ -156,13 +157,7 @@ def _grouped(rows: ShortArray, columns: ShortArray) -> IntArray:
         for j in columns[rows[i] : rows[i + 1]]:
             if group[j] != -1:
                 joined[i] = group[j]
-    for i in range(count):
-        if joined[i] != -1:
-            continue
-        for j in columns[rows[i] : rows[i + 1]]:
-            if joined[j] == -1:
-                joined[j] = number
-        number += 1
+    joined[joined == -1] = 0  # far from the rest: any aggregate will do
     return joined
 
 

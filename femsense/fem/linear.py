@@ -26,8 +26,10 @@ from femsense.fem.cholesky import Analysis, analyse, cholesky
 from femsense.fem.iterative import Grid, Levels, UnsettledError, iterative, make_levels
 
 ITERATIVE_FROM = 100_000
-"""Unknowns from which on the memory of a direct factor is looked at. Within memory the direct factor was faster at every measured size,
-linear and quadratic (`python benchmarks/body.py iterative`), so that memory alone switches."""
+"""Unknowns from which on the memory of a direct factor is looked at. Up to 165 321 unknowns the direct factor was several times faster,
+linear and quadratic (docs/speed.md, `python benchmarks/body.py iterative`), so that memory alone switches."""
+ITERATIVE_LEAST = 60
+"""Bodies with fewer unknowns always have a direct factor: they may be too small for aggregates with rigid motions."""
 MEMORY_SHARE = 0.6
 """A direct factor may take this share of the memory that is free."""
 
@@ -159,8 +161,10 @@ def _wanted() -> str:
 def _iterates(pattern: Pattern) -> bool:
     """Return whether a pattern is one for conjugate gradients: by choice, or because its factor does not fit into memory."""
     chosen = os.environ.get("FEMSENSE_SOLVER", "").lower()
-    if chosen or pattern.grid is None:
-        return chosen == "iterative" and pattern.grid is not None
+    if pattern.grid is None or pattern.size < ITERATIVE_LEAST:
+        return False
+    if chosen:
+        return chosen == "iterative"
     if pattern.size < ITERATIVE_FROM:
         return False
     if not pattern.fits:  # decided once: the memory of a factor that is made is no longer free, but it is used again
