@@ -16,7 +16,6 @@ from femsense.fem.cables import (
     bend_angles,
     cable_forces,
     cable_length,
-    point_forces,
     pull_rows,
     rub,
     segments,
@@ -101,7 +100,11 @@ def test_forces_of_a_cable_balance_the_pull_at_its_end() -> None:
     directions, _ = segments(cable, x)
     forces = cable_forces(cable, x, np.full(4, 3.0), len(x))
     np.testing.assert_allclose(forces.sum(axis=0), 3.0 * directions[-1], atol=1e-12)
-    np.testing.assert_allclose(point_forces(directions, np.array([1.0, 2, 3, 4]))[0], directions[0])
+    unequal = np.array([1.0, 2, 3, 4])[:, None] * directions
+    at_points = unequal - np.vstack([np.zeros(3), unequal[:-1]])
+    wanted = np.zeros_like(x)
+    np.add.at(wanted, cable.path.nodes, cable.path.weights[:, :, None] * at_points[:, None, :])
+    np.testing.assert_allclose(cable_forces(cable, x, np.array([1.0, 2, 3, 4]), len(x)), wanted, atol=1e-12)
 
 
 def test_shares_scale_the_segments() -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 
 from femsense.arrays import FloatArray, IntArray
-from femsense.fem.body import BodyModel, Cable, segment_ties
+from femsense.fem.body import BodyModel, Cable
 
 
 def segments(cable: Cable, positions: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -48,27 +48,23 @@ def shortening(body: BodyModel, positions: FloatArray) -> FloatArray:
     return np.array([cable_length(c, rest) - cable_length(c, positions) for c in body.cables])
 
 
-def point_forces(directions: FloatArray, tensions: FloatArray) -> FloatArray:
-    """Return the forces of segment tensions [N], shape (s,), on the points of the path [N], shape (s, 3)."""
-    pull = tensions[:, None] * directions
-    forces = pull.copy()
-    forces[1:] -= pull[:-1]
-    return forces
-
-
 def cable_forces(cable: Cable, positions: FloatArray, tensions: FloatArray, node_count: int) -> FloatArray:
     """Return the nodal forces of a cable [N], shape (n, 3), for the tensions of its segments [N], shape (s,)."""
-    at_points = point_forces(segments(cable, positions)[0], tensions)
-    return np.asarray(_spread(cable.path.nodes, cable.path.weights, at_points, node_count))
+    x = np.ascontiguousarray(positions)
+    return np.asarray(_pull(cable.path.nodes, cable.path.weights, cable.pull_point, x, tensions, node_count))
 
 
 @njit(cache=True)
-def _spread(nodes: IntArray, weights: FloatArray, at_points: FloatArray, node_count: int) -> FloatArray:
+def _pull(
+    nodes: IntArray, weights: FloatArray, end: FloatArray, positions: FloatArray, tensions: FloatArray, node_count: int
+) -> FloatArray:
+    directions, _ = _segments(nodes, weights, end, positions)
     forces = np.zeros((node_count, 3))
     for s in range(nodes.shape[0]):
-        for a in range(nodes.shape[1]):
-            for c in range(3):
-                forces[nodes[s, a], c] += weights[s, a] * at_points[s, c]
+        for c in range(3):
+            at_point = tensions[s] * directions[s, c] - (tensions[s - 1] * directions[s - 1, c] if s > 0 else 0.0)
+            for a in range(nodes.shape[1]):
+                forces[nodes[s, a], c] += weights[s, a] * at_point
     return forces
 
 
@@ -88,13 +84,25 @@ def add_cable_stiffness(body: BodyModel, positions: FloatArray, tensions: tuple[
     Each segment adds t (I − d dᵀ)/ℓ between its two ends: positive semi-definite for a pulling cable.
     """
     for cable, slots, tension in zip(body.cables, body.cable_slots, tensions):
-        if not tension.any():
-            continue
-        d, length = segments(cable, positions)
-        stiffness = (tension / np.maximum(length, 1e-12))[:, None, None] * (np.eye(3) - d[:, :, None] * d[:, None, :])
-        _, weights = segment_ties(cable.path)
-        values = np.einsum("sa,sb,sij->sabij", weights, weights, stiffness)
-        np.add.at(blocks, slots.ravel(), values.reshape(-1, 9))
+        if tension.any():
+            d, length = segments(cable, positions)
+            _add_segments(cable.path.weights, d, tension / np.maximum(length, 1e-12), slots, blocks)
+
+
+@njit(cache=True)
+def _add_segments(weights: FloatArray, d: FloatArray, stiffness: FloatArray, slots: IntArray, blocks: FloatArray) -> None:
+    count, k = weights.shape
+    ends = np.empty(2 * k)  # weights of the nodes in the difference of the ends of a segment, as in `segment_ties`
+    for s in range(count):
+        for a in range(k):
+            ends[a] = -weights[s, a]
+            ends[k + a] = weights[s + 1, a] if s + 1 < count else 0.0
+        for a in range(2 * k):
+            for b in range(2 * k):
+                share = ends[a] * ends[b] * stiffness[s]
+                for i in range(3):
+                    for j in range(3):
+                        blocks[slots[s, a, b], 3 * i + j] += share * ((1.0 if i == j else 0.0) - d[s, i] * d[s, j])
 
 
 def bend_angles(cable: Cable, positions: FloatArray) -> FloatArray:

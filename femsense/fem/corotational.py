@@ -210,16 +210,79 @@ def _kernel(count, quad, row, x, tets, gradients, volumes, mu, lam, limit, tange
     return energy
 
 
+@njit(inline="always")
+def _linear_forces(tet, G, R, P, H, forces):  # type: ignore[no-untyped-def]
+    """Add the forces P ∇N of four nodes to those of the body, and write H = R ∇N, shape (4, 3)."""
+    for a in range(4):
+        g0, g1, g2, n = G[0, a], G[1, a], G[2, a], tet[a]
+        forces[n, 0] += P[0] * g0 + P[1] * g1 + P[2] * g2
+        forces[n, 1] += P[3] * g0 + P[4] * g1 + P[5] * g2
+        forces[n, 2] += P[6] * g0 + P[7] * g1 + P[8] * g2
+        H[a, 0] = R[0, 0] * g0 + R[1, 0] * g1 + R[2, 0] * g2
+        H[a, 1] = R[3, 0] * g0 + R[4, 0] * g1 + R[5, 0] * g2
+        H[a, 2] = R[6, 0] * g0 + R[7, 0] * g1 + R[8, 0] * g2
+
+
+@njit(inline="always")
+def _linear_stiffness(H, D, shear, bulk, turn, slots, blocks):  # type: ignore[no-untyped-def]
+    """Add shear (h_a·h_b) I + bulk h_a h_bᵀ + turn [h_a]ₓ D⁻¹ [h_b]ₓ of the pairs a ≤ b of four nodes."""
+    d00, d01, d02, d11, d12, d22 = turn * D[0], turn * D[1], turn * D[2], turn * D[3], turn * D[4], turn * D[5]
+    pair = 0
+    for a in range(4):
+        x, y, z = H[a, 0], H[a, 1], H[a, 2]
+        z00, z01, z02 = y * d02 - z * d01, y * d12 - z * d11, y * d22 - z * d12
+        z10, z11, z12 = z * d00 - x * d02, z * d01 - x * d12, z * d02 - x * d22
+        z20, z21, z22 = x * d01 - y * d00, x * d11 - y * d01, x * d12 - y * d02
+        bx, by, bz = bulk * x, bulk * y, bulk * z
+        for b in range(a, 4):
+            u, v, w = H[b, 0], H[b, 1], H[b, 2]
+            dot = shear * (x * u + y * v + z * w)
+            to = blocks[slots[pair]]
+            pair += 1
+            to[0] += z01 * w - z02 * v + bx * u + dot
+            to[1] += z02 * u - z00 * w + bx * v
+            to[2] += z00 * v - z01 * u + bx * w
+            to[3] += z11 * w - z12 * v + by * u
+            to[4] += z12 * u - z10 * w + by * v + dot
+            to[5] += z10 * v - z11 * u + by * w
+            to[6] += z21 * w - z22 * v + bz * u
+            to[7] += z22 * u - z20 * w + bz * v
+            to[8] += z20 * v - z21 * u + bz * w + dot
+
+
 @njit(cache=True, fastmath=FAST)
 def corotational_tet4(x, tets, gradients, volumes, mu, lam, limit, tangent, slots, forces, blocks):  # type: ignore[no-untyped-def]
     """Add internal forces [N] and, if asked, the stiffness blocks on and above the diagonal [N/m]; return the energy [J].
 
-    Arrays are those of `Stencil`; `limit` is not used. The same for ten nodes is `corotational_tet10`.
+    Arrays are those of `Stencil`; `limit` is not used. With one point λ' does not matter, and nothing is kept from point to point:
+    twice as fast as the kernel of ten nodes would be. For these see `corotational_tet10`.
     """
-    return _kernel(4, 1, 4, x, tets, gradients, volumes, mu, lam, limit, tangent, slots, forces, blocks)
+    F, R, P, H, D = np.empty((9, 1)), np.empty((9, 1)), np.empty(9), np.empty((4, 3)), np.empty(6)
+    energy = 0.0
+    for e in range(len(tets)):
+        n0, n1, n2, n3, G = tets[e, 0], tets[e, 1], tets[e, 2], tets[e, 3], gradients[e, 0]
+        for i in range(3):
+            x0, x1, x2, x3 = x[n0, i], x[n1, i], x[n2, i], x[n3, i]
+            for j in range(3):
+                F[3 * i + j, 0] = x0 * G[j, 0] + x1 * G[j, 1] + x2 * G[j, 2] + x3 * G[j, 3]
+        closest_rotation(F, R, 0)
+        trace = -3.0
+        for k in range(9):
+            trace += F[k, 0] * R[k, 0]
+        shear, bulk = 2.0 * volumes[e, 0] * mu[e], volumes[e, 0] * lam[e]
+        turn, norm = shear - bulk * trace, 0.0
+        for k in range(9):
+            norm += (F[k, 0] - R[k, 0]) ** 2
+            P[k] = shear * F[k, 0] - turn * R[k, 0]
+        energy += 0.5 * (shear * norm + bulk * trace * trace)
+        _linear_forces(tets[e], G, R, P, H, forces)
+        if tangent:
+            turning_compliance(F, R, 0, D)
+            _linear_stiffness(H, D, shear, bulk, turn, slots[e], blocks)
+    return energy
 
 
 @njit(cache=True, fastmath=FAST)
 def corotational_tet10(x, tets, gradients, volumes, mu, lam, limit, tangent, slots, forces, blocks):  # type: ignore[no-untyped-def]
-    """See `corotational_tet4`."""
+    """The same for ten nodes and four points, see `corotational_tet4`."""
     return _kernel(10, 4, 16, x, tets, gradients, volumes, mu, lam, limit, tangent, slots, forces, blocks)

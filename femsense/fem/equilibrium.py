@@ -428,7 +428,7 @@ def _newton(body: BodyModel, loads: _Loads, state: _State, max_iterations: int) 
         if state.borrowed:
             here = _full_step(body, state, held, du, dT)
             continue
-        moved = _line_search(body, loads, state, held, here, du, dT, gap)
+        moved = _line_search(body, loads, state, held, here, du, dT, gap, force)
         if moved is None:
             return CONVERGED if closed and state.residual <= 1e3 * loads.tolerance else "stalled"
         here = moved
@@ -592,6 +592,7 @@ def _full_step(body: BodyModel, state: _State, held: npt.NDArray[np.intp], du: F
 
 def _line_search(
     body: BodyModel, loads: _Loads, state: _State, held: npt.NDArray[np.intp], here: Internal, du: FloatArray, dT: FloatArray, gap: FloatArray,
+    force: FloatArray,
 ) -> Internal | None:  # fmt: skip
     """Go along a Newton step as far as the potential allows (Armijo); return the internal state there, None if nowhere.
 
@@ -606,7 +607,9 @@ def _line_search(
     rubs = np.array([(s != 1.0).any() for s in state.shares] + [False] * len(body.chambers), dtype=bool)
     lost[held] = np.where(rubs[held], T0[held] + dT, 0.0)
     base = _merit(body, loads, state, held, here, penalty, lost)
-    slope = _slope(body, loads, state, held, here, step, lost) - float(penalty @ np.abs(gap))
+    slope = -float(force @ du)
+    if len(held):
+        slope = _slope(body, loads, state, held, here, step, lost) - float(penalty @ np.abs(gap))
     noise = 1e-12 * (abs(here.energy) + abs(float((loads.forces * x0).sum())) + float(np.abs(T0) @ loads.lever) * 1e-2 + 1e-12)
     length = 1.0
     limit = 0.5 * np.ptp(body.mesh.nodes, axis=0).max() / max(np.abs(step).max(), 1e-300)
