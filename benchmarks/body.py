@@ -1,6 +1,6 @@
 """How fast the body is: cold equilibria beside SOFA's, parts, real time, growth with the mesh. Prints the tables of docs/speed.md.
 
-    OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 python benchmarks/body.py [cold|parts|frames|growth|iterative …] [--data FOLDER]
+    OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 python benchmarks/body.py [cold|parts|frames|kept|growth|iterative …] [--data FOLDER]
 
 Medians of CPU time of one thread; SOFA's figures are those of `reference/cases.json`, measured on a like machine.
 """
@@ -24,15 +24,17 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
+from femsense.fem import equilibrium
 from femsense.fem.assembly import internal, reduced_values
 from femsense.fem.body import BodyModel, make_body, tie_cable
 from femsense.fem.cables import pull_rows
 from femsense.fem.cholesky import cholesky
-from femsense.fem.compliance import compliance, direction_rows
+from femsense.fem.compliance import compliance, direction_rows, tangent_at
 from femsense.fem.equilibrium import solve_equilibrium
 from femsense.fem.linear import factorize, pardiso_library
 from femsense.fem.mesh import embed_points, refined, surface_triangles, to_quadratic, vertex_normals
 from femsense.fem.tracker import Tracker
+from femsense.fem.turning import turned_step
 from femsense.robot import load_robot
 
 DATA = Path(__file__).resolve().parents[1].parent / "shared" / "data"
@@ -74,11 +76,18 @@ def cold(data: Path) -> None:
                 return solve_equilibrium(lawful, tension=tension, shortening=held, nodal_forces=forces)
 
             ms, sofa = median_ms(solve), document["newton_steps"] * document["ms_per_step"]
-            state = solve()
             print(
-                f"{law:13} {case:13} {state.iterations:3d} steps {ms:7.1f} ms   SOFA {document['newton_steps']:3d} × {document['ms_per_step']:5.2f} = {sofa:6.1f} ms"
+                f"{law:13} {case:13} {solve().iterations:3d} steps ({straight_steps(solve):2d} straight) {ms:6.1f} ms   SOFA {document['newton_steps']:3d} × {document['ms_per_step']:5.2f} = {sofa:6.1f} ms"
                 f"   ratio {ms / sofa:.3f}   {verdict(ms / sofa, 0.15)}"
             )
+
+
+def straight_steps(solve: Callable[[], Any]) -> int:
+    """Return how many Newton steps a solve takes where no step lets the elements turn."""
+    curved, equilibrium.CURVED = equilibrium.CURVED, np.inf
+    count = int(solve().iterations)
+    equilibrium.CURVED = curved
+    return count
 
 
 def diamond(data: Path, quadratic: bool) -> tuple[BodyModel, np.ndarray]:
@@ -179,6 +188,31 @@ def frames(data: Path) -> None:
                 print(f"      at tet10 accuracy by a reduction: {rate:.1f} Hz   {verdict(rate, 40.0, most=False)}")
 
 
+def kept(data: Path) -> None:
+    """Corrections with the factor of an earlier frame, straight and with elements that turn: what they leave, as a share of the motion."""
+    for quadratic in (False, True):
+        body, _ = diamond(data, quadratic)
+        inputs = [2.0 + np.sin(0.023 * k + np.arange(4) * np.pi / 2) + 0.6 * np.sin(1.7 * 0.023 * k + np.arange(4)) for k in range(4)]
+        states = [solve_equilibrium(body, tension=dict(zip(body.cable_names, inputs[0])))]
+        for T in inputs[1:]:
+            states.append(solve_equilibrium(body, tension=dict(zip(body.cable_names, T)), start=states[-1]))
+        factor = tangent_at(body, states[0]).factor
+        for lag in (1, 2, 3):
+            motion = np.abs(states[lag].positions - states[lag - 1].positions).max()
+            for turns in (False, True):
+                x, left = np.array(states[lag - 1].positions), []
+                for _ in range(4):
+                    pull = (inputs[lag] @ pull_rows(body, x)).reshape(-1, 3)
+                    force = body.dead_load() - internal(body, x, tangent=False).forces + pull
+                    step = np.zeros(x.size)
+                    step[body.free_map.dofs] = factor.solve(force.ravel()[body.free_map.dofs])
+                    turned = turned_step(body, x, step.reshape(-1, 3)) if turns else None
+                    x = x + step.reshape(-1, 3) if turned is None else turned
+                    left.append(np.abs(x - states[lag].positions).max() / motion)
+                name = "turned" if turns else "straight"
+                print(f"{'tet10' if quadratic else 'tet4 '} {lag} frames old, {name:8}", *(f"{100 * v:10.2g} %" for v in left))
+
+
 def growth(data: Path, levels: int) -> None:
     """Uniform refinement: each mesh in a process of its own."""
     rows = []
@@ -266,7 +300,7 @@ def one_side(data: Path, level: int, element: str) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser()
-    parser.add_argument("what", nargs="*", default=["cold", "parts", "frames", "growth", "iterative"])
+    parser.add_argument("what", nargs="*", default=["cold", "parts", "frames", "kept", "growth", "iterative"])
     parser.add_argument("--data", type=Path, default=DATA)
     parser.add_argument("--level", type=int, default=0)
     parser.add_argument("--levels", type=int, default=3)
@@ -281,4 +315,4 @@ if __name__ == "__main__":
             one_side(given.data, given.level, given.element)
             continue
         print(f"\n== {what}", flush=True)
-        {"cold": lambda: cold(given.data), "parts": lambda: parts(given.data), "frames": lambda: frames(given.data), "growth": lambda: growth(given.data, given.levels), "iterative": lambda: iterative_growth(given.data, given.levels)}[what]()  # fmt: skip
+        {"cold": lambda: cold(given.data), "parts": lambda: parts(given.data), "frames": lambda: frames(given.data), "kept": lambda: kept(given.data), "growth": lambda: growth(given.data, given.levels), "iterative": lambda: iterative_growth(given.data, given.levels)}[what]()  # fmt: skip

@@ -23,6 +23,7 @@ from femsense.fem.cables import add_cable_stiffness, bend_angles, cable_forces, 
 from femsense.fem.chambers import add_pressure_stiffness, chamber_volume, volume_changes, volume_gradient
 from femsense.fem.clamp import with_turning_plate
 from femsense.fem.linear import Factorization, factorize, factorize_definite
+from femsense.fem.turning import turned_step
 
 CONVERGED = "converged"
 MOST_STEPS = 1500
@@ -37,6 +38,8 @@ CLOSED = 1e-12
 """How far a held cable may miss its length [m]."""
 FALL_ITERATIONS = 30
 """Inverse iterations towards the softest motion of a state that may be unstable."""
+CURVED = 1e-3
+"""Steps longer than this share of the body are tried with elements that turn before they are tried straight."""
 FOLLOW_FRICTION = 25
 """Newton steps at most in which the tensions along the cables follow the bends; then they stand still until Newton rests."""
 ADVICE = {
@@ -611,11 +614,11 @@ def _line_search(
     if len(held):
         slope = _slope(body, loads, state, held, here, step, lost) - float(penalty @ np.abs(gap))
     noise = 1e-12 * (abs(here.energy) + abs(float((loads.forces * x0).sum())) + float(np.abs(T0) @ loads.lever) * 1e-2 + 1e-12)
-    length = 1.0
-    limit = 0.5 * np.ptp(body.mesh.nodes, axis=0).max() / max(np.abs(step).max(), 1e-300)
-    length = min(1.0, limit)
+    reach, longest = body.reach, float(np.abs(step).max(initial=1e-300))
+    length = min(1.0, 0.5 * reach / longest)
+    turned = turned_step(body, x0, length * step) if longest > CURVED * reach else None
     for trial in range(25):
-        state.x = x0 + length * step
+        state.x = x0 + length * step if turned is None else turned
         state.T = T0.copy()
         state.T[held] = T0[held] + length * dT
         there = internal(body, state.x, tangent=trial == 0 and not state.borrowed)
@@ -623,7 +626,7 @@ def _line_search(
             merit = _merit(body, loads, state, held, there, penalty, lost)
             if merit <= base + 1e-4 * length * slope + noise:
                 return there
-        length *= 0.5
+        length, turned = (0.5 * length if turned is None else length), None
     state.x, state.T = x0, T0
     return None
 

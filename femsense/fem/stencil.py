@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -51,6 +52,8 @@ class FreeMap:
     """Pattern of the reduced matrix."""
     source: IntArray
     """For each entry of the reduced matrix, its place in the flat block array, shape (nnz,)."""
+    laplacian: list[Any] = field(default_factory=list)
+    """The factor that `turning.turned_step` needs, once it was needed (None where there is none)."""
 
 
 def make_stencil(mesh: TetMesh, cliques: list[IntArray] | None = None) -> tuple[Stencil, tuple[IntArray, ...]]:
