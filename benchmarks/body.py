@@ -192,7 +192,9 @@ def kept(data: Path) -> None:
     """Corrections with the factor of an earlier frame, straight and with elements that turn: what they leave, as a share of the motion."""
     for quadratic in (False, True):
         body, _ = diamond(data, quadratic)
-        inputs = [2.0 + np.sin(0.023 * k + np.arange(4) * np.pi / 2) + 0.6 * np.sin(1.7 * 0.023 * k + np.arange(4)) for k in range(4)]
+        inputs = [
+            2.0 + np.sin(0.023 * k + np.arange(4) * np.pi / 2) + 0.6 * np.sin(1.7 * 0.023 * k + np.arange(4)) for k in range(4)
+        ]
         states = [solve_equilibrium(body, tension=dict(zip(body.cable_names, inputs[0])))]
         for T in inputs[1:]:
             states.append(solve_equilibrium(body, tension=dict(zip(body.cable_names, T)), start=states[-1]))
