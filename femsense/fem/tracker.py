@@ -1,8 +1,8 @@
 """Follow a body from frame to frame while its inputs move: an equilibrium with a checked error, and its compliance, at camera rate.
 
 A frame starts from the better of two predictions: the linear response of the frame before to the change of the loads, by the
-factor at hand, or the last three frames carried on as a parabola (which follows rotations, and is free of the stretch that a
-tangent step adds). Then a fresh factor and two corrections with it, until what they leave is a small share of the motion: where
+factor at hand along which elements turn, or the last three frames carried on as a parabola (both free of the stretch that a
+straight tangent step adds, and whose force would make it look worse than it is). Then a fresh factor and two corrections with it, until what they leave is a small share of the motion: where
 the second is q times the first, the ones to come sum up to q/(1−q) of the second (Deuflhard 2011, section 2.1), and SAFETY times
 that is the error that is reported. Where Newton does not get there, `solve_equilibrium` takes over.
 """
@@ -25,6 +25,7 @@ from femsense.fem.cholesky import Cholesky, cholesky
 from femsense.fem.compliance import direction_rows
 from femsense.fem.equilibrium import solve_equilibrium
 from femsense.fem.mesh import embed_points
+from femsense.fem.turning import turned_step
 
 SAFETY = 3.0
 """The reported error is so many times what the corrections make one expect."""
@@ -153,7 +154,9 @@ class Tracker:
             force = self._unbalanced(carried, T, loads)
             if _largest(self._factor.solve(force)) <= NEAR * _largest(carried - last):
                 return carried, force
-        x = _moved(last, free, self._factor.solve(self._unbalanced(last, T, loads)))
+        step = _moved(np.zeros_like(last), free, self._factor.solve(self._unbalanced(last, T, loads)))
+        turned = turned_step(self.body, last, step)
+        x = last + step if turned is None else turned
         other = self._unbalanced(x, T, loads)
         return (x, other) if not len(force) or float(other @ other) < float(force @ force) else (carried, force)
 

@@ -58,7 +58,7 @@ def _factorised_laplacian(body: BodyModel) -> Cholesky | None:
     whole = sp.csr_matrix((values.ravel(), (rows.ravel(), columns.ravel())), shape=(n, n))
     part = sp.csc_matrix(whole[nodes][:, nodes])
     part.sort_indices()
-    return cholesky(analyse(part.indptr, part.indices), part.data)
+    return cholesky(analyse(part.indptr.astype(np.int64), part.indices.astype(np.int64)), part.data)
 
 
 @njit(cache=True, fastmath=FAST)
