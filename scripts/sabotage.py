@@ -62,10 +62,10 @@ SABOTAGES = (
     S("fem/mesh.py", "slopes[:, 4 + e, i] = 4.0 * L[:, j]", "slopes[:, 4 + e, i] = 4.0 * L[:, i]", "test_fem_mesh.py::test_shape_slopes_are_differences_of_the_shape_functions"),
     S("fem/mesh.py", "t = np.clip(np.einsum(", "t = np.abs(np.einsum(", "test_fem_mesh.py::test_closest_in_a_triangle_beats_every_sample_and_is_in_it"),
     # factorisation
-    S("fem/cholesky.py", "other[i] -= scale * known[i]", "other[i] += scale * known[i]", "test_fem_linear.py::test_a_random_pattern_is_factorised_as_the_dense_matrix"),
+    S("fem/cholesky.py", "+ i] -= scale * corner[i * WIDE + j]", "+ i] += scale * corner[i * WIDE + j]", "test_fem_linear.py::test_a_random_pattern_is_factorised_as_the_dense_matrix"),
     S("fem/cholesky.py", "X[to + a, seen[r]] -= work[line + r]", "X[to + a, seen[r]] += work[line + r]", "test_fem_linear.py::test_the_gram_matrix_of_sparse_columns_is_that_of_dense_ones"),
     S("fem/cholesky.py", "weakref.finalize(self, analysis.idle.append, L)", "analysis.idle.append(L)", "test_fem_linear.py::test_factors_alive_at_once_keep_their_own_values"),
-    S("fem/cholesky.py", "head[parent[s]] = s", "head[parent[s]] = s if follow[s] == -1 else follow[s]", "test_fem_linear.py::test_a_random_pattern_is_factorised_as_the_dense_matrix"),
+    S("fem/cholesky.py", "if room[other] - end >= size:", "if room[other] - end >= 0:", "test_fem_linear.py::test_a_random_pattern_is_factorised_as_the_dense_matrix"),
     S("fem/turning.py", "A[i, j] -= W[i, 0] * V[0, j]", "A[i, j] += W[i, 0] * V[0, j]", "test_fem_turning.py::test_a_turn_about_a_hinge_is_a_rotation_without_stretch"),
     S("fem/turning.py", "np.sin(angle) / angle - 1.0, (1.0", "np.sin(angle) / angle, (1.0", "test_fem_turning.py::test_a_small_step_is_the_straight_one_to_first_order"),
     S("fem/cables.py", "tensions[s - 1] * directions[s - 1, c]", "tensions[s] * directions[s - 1, c]", "test_fem_cables.py::test_forces_of_a_cable_balance_the_pull_at_its_end"),

@@ -22,11 +22,12 @@ from numba.extending import get_cython_function_address, intrinsic
 from scipy.sparse.linalg import splu
 
 from femsense.arrays import BoolArray, FloatArray, IntArray
+from femsense.fem.tiles import PADDING, WIDE, add_run, subtract_and_solve, subtract_product
 
 FEW = 4
 """Right-hand sides that are solved one by one; more go through BLAS together."""
-SMALL = 16
-"""Columns that plain loops factorise at a time; the rest of a panel follows through BLAS."""
+LARGE = 120
+"""Columns of a front from which on BLAS does better than tiles in registers, and that tiles factorise at a time."""
 
 
 @intrinsic
@@ -212,12 +213,13 @@ def _relations(firsts: IntArray, start: IntArray, rows: IntArray) -> tuple[IntAr
 @njit(cache=True)
 def _targets(
     indptr: IntArray, indices: IntArray, order: IntArray, inverse: IntArray, firsts: IntArray, begin: IntArray, below: IntArray,
-    offset: IntArray, unit: int,
-) -> tuple[IntArray, IntArray]:  # fmt: skip
-    """Return where the entries of a matrix (in its scalar CSC) go in the factor: source, target."""
-    source = np.empty(len(indices), np.int64)
-    target = np.empty(len(indices), np.int64)
+    unit: int,
+) -> tuple[IntArray, npt.NDArray[np.int32], npt.NDArray[np.int32]]:  # fmt: skip
+    """Return where the entries of a matrix (in its scalar CSC) go: their begin for each supernode, source, place in its panel."""
+    source = np.empty(len(indices), np.int32)
+    target = np.empty(len(indices), np.int32)
     where = np.empty(len(order), np.int64)
+    entries = np.zeros(len(firsts), np.int64)
     k = 0
     for s in range(len(firsts) - 1):
         own = firsts[s + 1] - firsts[s]
@@ -227,7 +229,7 @@ def _targets(
         for j in range(firsts[s], firsts[s + 1]):
             for b in range(unit):
                 column = unit * order[j] + b
-                at = offset[s] + (unit * (j - firsts[s]) + b) * height
+                at = (unit * (j - firsts[s]) + b) * height
                 for p in range(indptr[column], indptr[column + 1]):
                     node, a = divmod(indices[p], unit)
                     i = inverse[node]
@@ -237,7 +239,54 @@ def _targets(
                     source[k] = p
                     target[k] = at + unit * line + a
                     k += 1
-    return source[:k].copy(), target[:k].copy()
+        entries[s + 1] = k
+    return entries, source[:k].copy(), target[:k].copy()
+
+
+@njit(cache=True)
+def _runs(begin: IntArray, place: IntArray) -> tuple[IntArray, IntArray]:
+    """Return the begin of each supernode's runs of rows that follow each other in the parent's front too, and where each run begins."""
+    heads = np.zeros(len(begin), np.int64)
+    runs = np.empty(len(place), np.int64)
+    k = 0
+    for s in range(len(begin) - 1):
+        for q in range(begin[s], begin[s + 1]):
+            if q == begin[s] or place[q] != place[q - 1] + 1:
+                runs[k] = q - begin[s]
+                k += 1
+        heads[s + 1] = k
+    return heads, runs[:k].copy()
+
+
+@njit(cache=True)
+def _rooms(parent: IntArray, begin: IntArray, unit: int) -> tuple[IntArray, int]:
+    """Return where the update matrix of each supernode lives until its parent has taken it, and how much room all of them need.
+
+    Each takes the first gap that is large enough.
+    """
+    count = len(parent)
+    room, alive, kept, most = np.zeros(count, np.int64), np.empty(count, np.int64), 0, 0
+    for s in range(count):
+        size = (unit * (begin[s + 1] - begin[s])) ** 2
+        at, end = 0, 0
+        while at < kept:
+            other = alive[at]
+            if room[other] - end >= size:
+                break
+            end = room[other] + (unit * (begin[other + 1] - begin[other])) ** 2
+            at += 1
+        room[s] = end
+        most = max(most, end + size)
+        alive[at + 1 : kept + 1] = alive[at:kept].copy()
+        alive[at] = s
+        kept += 1
+        left = 0
+        for k in range(kept):
+            if parent[alive[k]] != s and (alive[k] != s or size > 0):
+                alive[left] = alive[k]
+                left += 1
+        kept = left
+    return room, most
 
 
 def fill_reducing_order(rows: IntArray, columns: IntArray, free: BoolArray) -> IntArray:
@@ -269,10 +318,19 @@ class Analysis:
     """Where each of `below` stands in the front of the parent."""
     offset: IntArray
     """Where the panel of each supernode begins in the factor, shape (s + 1,)."""
-    source: IntArray
-    target: IntArray
+    entries: IntArray
+    """Where the entries of the matrix that go into each panel begin in `source` and `target`, shape (s + 1,)."""
+    source: npt.NDArray[np.int32]
+    target: npt.NDArray[np.int32]
+    """Their places in the matrix and in the panel."""
+    heads: IntArray
+    """Where the runs of each supernode begin in `runs`, shape (s + 1,)."""
+    runs: IntArray
+    """First row of each run of rows below that follow each other in the front of the parent as well."""
+    room: IntArray
+    """Where the update matrix of each supernode lives, shape (s,)."""
     stack: int
-    """Entries of the largest stack of update matrices."""
+    """Entries of the room of all update matrices."""
     rank: IntArray
     """Place of each unknown in the order of elimination, shape (f,)."""
     owner: IntArray
@@ -290,22 +348,8 @@ class Analysis:
             if self.idle[i].dtype.char == kind:
                 array: npt.NDArray[Any] = self.idle.pop(i)
                 return array
-        fresh: npt.NDArray[Any] = np.empty(self.offset[-1], kind)
+        fresh: npt.NDArray[Any] = np.empty(self.offset[-1] + PADDING, kind)
         return fresh
-
-
-@njit(cache=True)
-def _stack_size(parent: IntArray, begin: IntArray, unit: int) -> int:
-    count = len(parent)
-    waiting = np.zeros(count + 1, np.int64)
-    now, most = 0, 0
-    for s in range(count):
-        own = (unit * (begin[s + 1] - begin[s])) ** 2
-        most = max(most, now + own)
-        now += own - waiting[s]
-        if parent[s] != -1:
-            waiting[parent[s]] += own
-    return most
 
 
 def analyse(indptr: IntArray, indices: IntArray) -> Analysis:
@@ -327,13 +371,16 @@ def analyse(indptr: IntArray, indices: IntArray) -> Analysis:
     above, begin, below, place = _relations(firsts, start, structure)
     width = unit * np.diff(firsts)
     offset = np.concatenate([[0], np.cumsum(width * (width + unit * np.diff(begin)))])
-    source, target = _targets(heads, entries, order, inverse, firsts, begin, below, offset, unit)
+    starts, source, target = _targets(heads, entries, order, inverse, firsts, begin, below, unit)
+    room, stack = _rooms(above, begin, unit)
+    run_heads, runs = _runs(begin, place)
     unknowns = (unit * order[:, None] + np.arange(unit)).ravel()
     rank = np.empty_like(unknowns)
     rank[unknowns] = np.arange(len(unknowns))
     owner = np.repeat(np.arange(len(above)), width)
     return Analysis(
-        unit, unknowns, firsts, above, begin, below, place, offset, source, target, int(_stack_size(above, begin, unit)), rank, owner, []
+        unit=unit, order=unknowns, firsts=firsts, parent=above, begin=begin, below=below, place=place, offset=offset, entries=starts,
+        source=source, target=target, heads=run_heads, runs=runs, room=room, stack=int(stack), rank=rank, owner=owner, idle=[],
     )  # fmt: skip
 
 
@@ -359,104 +406,108 @@ def _has_blocks(indptr: IntArray, indices: IntArray) -> bool:
 
 
 @njit(cache=True)
-def _factor_columns(panel: FloatArray, height: int, first: int, last: int) -> bool:
-    """Factorise columns first … last of a panel (stored by columns) in place; False where a pivot is not positive."""
-    for j in range(first, last):
-        line = panel[j * height + j : (j + 1) * height]
-        pivot = line[0]
+def _factor_corner(L: FloatArray, at: int, height: int, columns: int, corner: FloatArray) -> bool:
+    """Factorise the first columns ≤ 6 and rows of a panel that begins at `at`; write them to `corner` too, with reciprocal diagonal."""
+    for j in range(columns):
+        pivot = L[at + j * height + j]
         if not pivot > 0.0:
             return False
         inverse = 1.0 / np.sqrt(pivot)
-        for i in range(len(line)):
-            line[i] *= inverse
-        for k in range(j + 1, last):
-            known, other = line[k - j :], panel[k * height + k : (k + 1) * height]
-            scale = known[0]
-            for i in range(len(other)):
-                other[i] -= scale * known[i]
+        corner[j * WIDE + j] = inverse
+        L[at + j * height + j] = pivot * inverse
+        for i in range(j + 1, columns):
+            value = L[at + j * height + i] * inverse
+            L[at + j * height + i] = value
+            corner[i * WIDE + j] = value
+        for k in range(j + 1, columns):
+            scale = corner[k * WIDE + j]
+            for i in range(k, columns):
+                L[at + k * height + i] -= scale * corner[i * WIDE + j]
+    return True
+
+
+@njit(cache=True)
+def _factor_panel(L: FloatArray, start: int, height: int, first: int, last: int, corner: FloatArray) -> bool:
+    """Factorise columns first … last of a panel, those before being done with; False where a pivot is not positive."""
+    width = L.itemsize
+    for j in range(first, last, WIDE):
+        columns, depth = min(WIDE, last - j), j - first
+        at = start + j * height + j
+        left, here = L.ctypes.data + width * (start + first * height + j), L.ctypes.data + width * at
+        subtract_product(L, left, left, height, here, height, columns, columns, depth)
+        if not _factor_corner(L, at, height, columns, corner):
+            return False
+        step, rows = width * columns, height - j - columns
+        subtract_and_solve(L, left + step, left, height, here + step, height, rows, columns, depth, corner.ctypes.data)
     return True
 
 
 @njit(cache=True)
 def _extend_add(
-    child: FloatArray, place: IntArray, unit: int, own: int, panel: FloatArray, height: int, update: FloatArray
-) -> None:
-    """Add the update matrix of a child to the front of its parent: the panel, and the update matrix below it."""
-    rows = len(place)
-    size, rest = unit * rows, height - unit * own
-    for j in range(rows):
-        column = place[j]
-        for b in range(unit):
-            line = child[(unit * j + b) * size : (unit * j + b + 1) * size]
-            if column < own:
-                to = panel[(unit * column + b) * height : (unit * column + b + 1) * height]
-                shift = np.uint64(0)
-            else:
-                to = update[(unit * (column - own) + b) * rest : (unit * (column - own) + b + 1) * rest]
-                shift = np.uint64(unit * own)
-            for i in range(j, rows):
-                at = np.uint64(unit * place[i]) - shift
-                frm = np.uint64(unit * i)
-                for a in range(unit):
-                    to[at + np.uint64(a)] += line[frm + np.uint64(a)]
+    child: int, size: int, begins: IntArray, place: IntArray, unit: int, own: int, panel: int, height: int, update: int, L: FloatArray
+) -> None:  # fmt: skip
+    """Add the update matrix of a child (`size` rows, at an address like all of them) to the front of its parent, run by run."""
+    width, rest, count = L.itemsize, height - unit * own, len(begins)
+    for c in range(count):
+        last = begins[c + 1] if c + 1 < count else len(place)
+        for j in range(begins[c], last):
+            for b in range(unit):
+                column = unit * place[j] + b
+                inside = place[j] < own
+                to = panel + width * column * height if inside else update + width * ((column - unit * own) * rest - unit * own)
+                line = child + width * (unit * j + b) * size
+                add_run(L, to + width * unit * place[j], line + width * unit * j, unit * (last - j))
+                for r in range(c + 1, count):
+                    i, end = begins[r], begins[r + 1] if r + 1 < count else len(place)
+                    add_run(L, to + width * unit * place[i], line + width * unit * i, unit * (end - i))
 
 
 @njit(cache=True)
 def _factorise(
-    values: FloatArray, source: IntArray, target: IntArray, unit: int, firsts: IntArray, parent: IntArray, begin: IntArray,
-    place: IntArray, offset: IntArray, blas: IntArray, L: FloatArray, stack: FloatArray, head: IntArray, follow: IntArray,
-    letters: npt.NDArray[np.uint8], numbers: npt.NDArray[np.int32], scalars: FloatArray,
+    values: FloatArray, entries: IntArray, source: IntArray, target: IntArray, unit: int, firsts: IntArray, parent: IntArray,
+    begin: IntArray, place: IntArray, offset: IntArray, heads: IntArray, runs: IntArray, room: IntArray, blas: IntArray, L: FloatArray,
+    stack: FloatArray, head: IntArray, follow: IntArray, letters: npt.NDArray[np.uint8], numbers: npt.NDArray[np.int32], scalars: FloatArray,
 ) -> bool:  # fmt: skip
     """Write the factor; False where the matrix is not positive definite."""
-    L[:] = 0.0
-    for k in range(len(source)):
-        L[target[k]] = values[source[k]]
-    width = L.itemsize
+    width, corner = L.itemsize, np.empty(WIDE * WIDE, L.dtype)
     lower, no, yes = letters.ctypes.data, letters.ctypes.data + 1, letters.ctypes.data + 2
-    at = numbers.ctypes.data
-    minus, one, zero = scalars.ctypes.data, scalars.ctypes.data + width, scalars.ctypes.data + 2 * width
-    head[:] = -1
-    top = 0
+    at, minus, one = numbers.ctypes.data, scalars.ctypes.data, scalars.ctypes.data + width
     base, pile = L.ctypes.data, stack.ctypes.data
+    head[:] = -1
     for s in range(len(parent)):
         own = firsts[s + 1] - firsts[s]
-        rows = begin[s + 1] - begin[s]
-        columns, rest = unit * own, unit * rows
-        height = columns + rest
-        panel = L[offset[s] : offset[s + 1]]
-        floor = top
-        update = stack[top : top + rest * rest]
+        columns, rest = unit * own, unit * (begin[s + 1] - begin[s])
+        height, start, update = columns + rest, offset[s], pile + width * room[s]
+        L[start : offset[s + 1]] = 0.0
+        for k in range(entries[s], entries[s + 1]):
+            L[start + target[k]] = values[source[k]]
+        stack[room[s] : room[s] + rest * rest] = 0.0
         child = head[s]
-        if child != -1:
-            for j in range(rest):
-                update[j * rest + j : (j + 1) * rest] = 0.0
-        while child != -1:  # the last child lies on top of the stack
-            size = unit * (begin[child + 1] - begin[child])
-            floor -= size * size
-            _extend_add(
-                stack[floor : floor + size * size], place[begin[child] : begin[child + 1]], unit, own, panel, height, update
-            )
+        while child != -1:
+            rows, taken = place[begin[child] : begin[child + 1]], pile + width * room[child]
+            begins = runs[heads[child] : heads[child + 1]]
+            _extend_add(taken, unit * len(rows), begins, rows, unit, own, base + width * start, height, update, L)
             child = follow[child]
-        for j in range(0, columns, SMALL):
-            last = min(j + SMALL, columns)
-            if not _factor_columns(panel, height, j, last):
+        for j in range(0, columns, LARGE):
+            last = min(j + LARGE, columns)
+            if not _factor_panel(L, start, height, j, last, corner):
                 return False
             if last < columns:  # the rest of the panel: A[last:, last:columns] −= X[last:, j:last] X[last:columns, j:last]ᵀ
                 numbers[0], numbers[1], numbers[2], numbers[3] = height - last, columns - last, last - j, height
-                x = base + width * (offset[s] + j * height + last)
-                y = base + width * (offset[s] + last * height + last)
+                x, y = base + width * (start + j * height + last), base + width * (start + last * height + last)
                 _call(blas[0], (no, yes, at, at + 4, at + 8, minus, x, at + 12, x, at + 12, one, y, at + 12))
-        if rest > 0:
+        x = base + width * (start + columns)
+        if columns > LARGE and rest > 0:
             numbers[0], numbers[1], numbers[2], numbers[3] = rest, columns, height, rest
-            x = base + width * (offset[s] + columns)
-            beta = one if head[s] != -1 else zero
-            _call(blas[1], (lower, no, at, at + 4, minus, x, at + 8, beta, pile + width * top, at + 12))
-            if floor < top:
-                stack[floor : floor + rest * rest] = update
-            if parent[s] != -1:
-                follow[s] = head[parent[s]]
-                head[parent[s]] = s
-        top = floor + rest * rest
+            _call(blas[1], (lower, no, at, at + 4, minus, x, at + 8, one, update, at + 12))
+        else:
+            for j in range(0, rest, WIDE):
+                here = x + width * j
+                to = update + width * (j * rest + j)
+                subtract_product(L, here, here, height, to, rest, rest - j, min(WIDE, rest - j), columns)
+        if parent[s] != -1:
+            follow[s] = head[parent[s]]
+            head[parent[s]] = s
     return True
 
 
@@ -623,7 +674,7 @@ class Cholesky:
     def __init__(self, analysis: Analysis, L: npt.NDArray[Any]) -> None:
         self.negative = 0
         self.size = analysis.size
-        self.bytes = L.nbytes
+        self.bytes = int(analysis.offset[-1]) * L.itemsize
         self._analysis, self._L = analysis, L
         weakref.finalize(self, analysis.idle.append, L)
 
@@ -687,8 +738,8 @@ def cholesky(analysis: Analysis, values: FloatArray, *, single: bool = False) ->
     L = a.take(kind)
     stack, head, follow = np.empty(a.stack, kind), np.empty(len(a.parent), np.int64), np.empty(len(a.parent), np.int64)
     definite = _factorise(
-        values, a.source, a.target, a.unit, a.firsts, a.parent, a.begin, a.place, a.offset, _BLAS[kind], L, stack, head, follow,
-        *_constants(kind),
+        values, a.entries, a.source, a.target, a.unit, a.firsts, a.parent, a.begin, a.place, a.offset, a.heads, a.runs, a.room,
+        _BLAS[kind], L, stack, head, follow, *_constants(kind),
     )  # fmt: skip
     if definite:
         return Cholesky(a, L)

@@ -1,0 +1,272 @@
+# mypy: allow-untyped-decorators, allow-untyped-calls
+"""Dense work on fronts too small for a BLAS to pay: tiles that stay in the vector registers, written as LLVM code for the processor at hand.
+
+A tile is up to three registers of rows times six columns. Reading beyond the last row or column of a matrix is harmless (what is
+read there reaches no result), so that only what is written is masked; the memory must reach PADDING entries beyond its end.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import llvmlite.binding as llvm
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
+
+WIDE = 6
+"""Columns of a tile: two nodes."""
+BYTES = 64 if llvm.get_host_cpu_features().get("avx512f", False) else 32
+"""Size of a register; a processor with smaller ones takes two."""
+REGISTERS = 3 if BYTES == 64 else 2
+"""Registers of rows in a tile."""
+PADDING = 4 * BYTES
+"""Entries that may be read beyond the end of a matrix."""
+INTEGER = ir.IntType(64)
+
+
+@intrinsic
+def subtract_product(
+    context: Any, like: Any, a: Any, b: Any, step: Any, c: Any, step_c: Any, rows: Any, columns: Any, depth: Any
+) -> Any:
+    """C (rows, columns ≤ 6) −= A (rows, depth) B (columns, depth)ᵀ; matrices by columns, A and B with `step`, C with `step_c` between them.
+
+    `like` is an array of the numbers in question, matrices are given by their addresses.
+    """
+    del context
+    return types.void(like, *[types.int64] * 8), _builder("subtract", like, solves=False)
+
+
+@intrinsic
+def subtract_and_solve(
+    context: Any, like: Any, a: Any, b: Any, step: Any, c: Any, step_c: Any, rows: Any, columns: Any, depth: Any, L: Any
+) -> Any:
+    """The same, then C ← C L⁻ᵀ for a lower L (columns, columns) by rows, WIDE apart, with the reciprocals of its diagonal on it."""
+    del context
+    return types.void(like, *[types.int64] * 9), _builder("solve", like, solves=True)
+
+
+@intrinsic
+def add_run(context: Any, like: Any, to: Any, source: Any, count: Any) -> Any:
+    """Add `count` numbers at the address `source` to those at `to`."""
+    del context
+
+    def build(target: Any, builder: Any, signature: Any, values: Any) -> Any:
+        builder.call(_run_function(builder.module, like), values[1:])
+        return target.get_dummy_value()
+
+    return types.void(like, types.int64, types.int64, types.int64), build
+
+
+def _builder(name: str, like: Any, *, solves: bool) -> Any:
+    def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        builder.call(_tile_rows(builder.module, name, like, solves), values[1:])
+        return context.get_dummy_value()
+
+    return build
+
+
+def _kind(like: Any) -> tuple[str, Any, int]:
+    """Return a letter, the LLVM type of the numbers of an array, and how many a register holds."""
+    return ("f", ir.FloatType(), BYTES // 4) if like.dtype.bitwidth == 32 else ("d", ir.DoubleType(), BYTES // 8)
+
+
+def _function(module: Any, name: str, count: int) -> tuple[Any, bool]:
+    """Return the function of a name with so many integers as arguments, and whether it is there already."""
+    if name in module.globals:
+        return module.globals[name], True
+    function = ir.Function(module, ir.FunctionType(ir.VoidType(), [INTEGER] * count), name)
+    function.linkage = "internal"
+    return function, False
+
+
+def _declared(module: Any, name: str, result: Any, arguments: list[Any]) -> Any:
+    """Return a function of LLVM's own."""
+    return module.globals[name] if name in module.globals else ir.Function(module, ir.FunctionType(result, arguments), name)
+
+
+def _number(value: int) -> Any:
+    return ir.Constant(INTEGER, value)
+
+
+def _at(builder: Any, address: Any, offset: Any, kind: Any) -> Any:
+    """Return a pointer to what begins `offset` bytes after an address."""
+    return builder.inttoptr(builder.add(address, offset), kind.as_pointer())
+
+
+def _mask(builder: Any, count: Any, first: int, lanes: int) -> Any:
+    """Return which of `lanes` entries from `first` on are below count."""
+    vector = ir.VectorType(INTEGER, lanes)
+    places = ir.Constant(vector, [first + lane for lane in range(lanes)])
+    return builder.icmp_signed("<", places, _spread(builder, count, lanes))
+
+
+def _spread(builder: Any, value: Any, lanes: int) -> Any:
+    vector = ir.VectorType(value.type, lanes)
+    one = builder.insert_element(ir.Constant(vector, ir.Undefined), value, ir.Constant(ir.IntType(32), 0))
+    return builder.shuffle_vector(
+        one, ir.Constant(vector, ir.Undefined), ir.Constant(ir.VectorType(ir.IntType(32), lanes), [0] * lanes)
+    )
+
+
+def _masked(builder: Any, kind: Any, lanes: int) -> tuple[Any, Any]:
+    """Return LLVM's masked load and store of a register."""
+    vector = ir.VectorType(kind, lanes)
+    bits, pointer = ir.VectorType(ir.IntType(1), lanes), vector.as_pointer()
+    ending = f"v{lanes}f{64 if isinstance(kind, ir.DoubleType) else 32}.p0"
+    load = _declared(builder.module, f"llvm.masked.load.{ending}", vector, [pointer, ir.IntType(32), bits, vector])
+    store = _declared(builder.module, f"llvm.masked.store.{ending}", ir.VoidType(), [vector, pointer, ir.IntType(32), bits])
+    return load, store
+
+
+def _tile_rows(module: Any, name: str, like: Any, solves: bool) -> Any:
+    """Return the function that goes through the rows of a product, as many registers at a time as are needed."""
+    letter, _, lanes = _kind(like)
+    arguments = 9 if solves else 8
+    function, known = _function(module, f"femsense_{name}_{letter}", arguments)
+    if known:
+        return function
+    builder = ir.IRBuilder(function.append_basic_block("entry"))
+    a, b, step, c, step_c, rows, columns, depth, *rest = function.args
+    loop, end = function.append_basic_block("loop"), function.append_basic_block("end")
+    entry = builder.block
+    builder.cbranch(builder.icmp_signed(">", rows, _number(0)), loop, end)
+    builder.position_at_end(loop)
+    row = builder.phi(INTEGER)
+    row.add_incoming(_number(0), entry)
+    left = builder.sub(rows, row)
+    offset = builder.mul(row, _number(BYTES // lanes))
+    given = [builder.add(a, offset), b, step, builder.add(c, offset), step_c, left, columns, depth, *rest]
+    after = function.append_basic_block("after")
+    for registers in range(1, REGISTERS + 1):
+        here, other = function.append_basic_block(), function.append_basic_block()
+        if registers < REGISTERS:
+            builder.cbranch(builder.icmp_signed("<=", left, _number(registers * lanes)), here, other)
+        else:
+            builder.branch(here)
+        builder.position_at_end(here)
+        builder.call(_tile(module, name, like, registers, solves), given)
+        builder.branch(after)
+        builder.position_at_end(other)
+    builder.unreachable()
+    builder.position_at_end(after)
+    following = builder.add(row, _number(REGISTERS * lanes))
+    row.add_incoming(following, after)
+    builder.cbranch(builder.icmp_signed("<", following, rows), loop, end)
+    builder.position_at_end(end)
+    builder.ret_void()
+    return function
+
+
+def _tile(module: Any, name: str, like: Any, registers: int, solves: bool) -> Any:
+    """Return the function of one tile with so many registers of rows."""
+    letter, kind, lanes = _kind(like)
+    function, known = _function(module, f"femsense_{name}_{letter}{registers}", 9 if solves else 8)
+    if known:
+        return function
+    size, vector = BYTES // lanes, ir.VectorType(kind, lanes)
+    builder = ir.IRBuilder(function.append_basic_block("entry"))
+    a, b, step, c, step_c, rows, columns, depth, *rest = function.args
+    multiply_add = _declared(module, f"llvm.fmuladd.v{lanes}{'f64' if letter == 'd' else 'f32'}", vector, [vector] * 3)
+    bytes_a, bytes_c = builder.mul(step, _number(size)), builder.mul(step_c, _number(size))
+    sums, end = _products(builder, (a, b, bytes_a, depth), (kind, lanes, registers), multiply_add)
+    load, store = _masked(builder, kind, lanes)
+    align, nothing = ir.Constant(ir.IntType(32), size), ir.Constant(vector, [0.0] * lanes)
+    masks = [_mask(builder, rows, v * lanes, lanes) for v in range(registers)]
+    done: list[list[Any]] = []
+    for n in range(WIDE):
+        here = function.append_basic_block()
+        builder.cbranch(builder.icmp_signed(">", columns, _number(n)), here, end)
+        builder.position_at_end(here)
+        column = builder.add(c, builder.mul(bytes_c, _number(n)))
+        done.append([])
+        for v in range(registers):
+            pointer = _at(builder, column, _number(v * BYTES), vector)
+            value = builder.fsub(builder.call(load, [pointer, align, masks[v], nothing]), sums[n][v])
+            if solves:
+                value = _eliminated(builder, value, [d[v] for d in done[:n]], rest[0], (n, size, kind, lanes))
+            done[n].append(value)
+            builder.call(store, [value, pointer, align, masks[v]])
+    builder.branch(end)
+    builder.position_at_end(end)
+    builder.ret_void()
+    return function
+
+
+def _products(
+    builder: Any, given: tuple[Any, ...], shape: tuple[Any, int, int], multiply_add: Any
+) -> tuple[list[list[Any]], Any]:
+    """Write the loop over the depth; return A Bᵀ by columns, in registers, and the block where the function ends."""
+    a, b, bytes_a, depth = given
+    kind, lanes, registers = shape
+    vector, size, function, entry = ir.VectorType(kind, lanes), BYTES // lanes, builder.function, builder.block
+    loop, after, end = (function.append_basic_block(name) for name in ("depth", "after", "end"))
+    nothing = ir.Constant(vector, [0.0] * lanes)
+    builder.cbranch(builder.icmp_signed(">", depth, _number(0)), loop, after)
+    builder.position_at_end(loop)
+    k, at = builder.phi(INTEGER), builder.phi(INTEGER)
+    k.add_incoming(_number(0), entry)
+    at.add_incoming(_number(0), entry)
+    sums = [[builder.phi(vector) for _ in range(registers)] for _ in range(WIDE)]
+    column, row = builder.add(a, at), builder.add(b, at)
+    left = [builder.load(_at(builder, column, _number(v * BYTES), vector), align=size) for v in range(registers)]
+    following = []
+    for n in range(WIDE):
+        one = _spread(builder, builder.load(_at(builder, row, _number(n * size), kind)), lanes)
+        following.append([builder.call(multiply_add, [left[v], one, sums[n][v]]) for v in range(registers)])
+    k_next, at_next = builder.add(k, _number(1)), builder.add(at, bytes_a)
+    k.add_incoming(k_next, loop)
+    at.add_incoming(at_next, loop)
+    for n in range(WIDE):
+        for v in range(registers):
+            sums[n][v].add_incoming(nothing, entry)
+            sums[n][v].add_incoming(following[n][v], loop)
+    builder.cbranch(builder.icmp_signed("<", k_next, depth), loop, after)
+    builder.position_at_end(after)
+    result = [[builder.phi(vector) for _ in range(registers)] for _ in range(WIDE)]
+    for n in range(WIDE):
+        for v in range(registers):
+            result[n][v].add_incoming(nothing, entry)
+            result[n][v].add_incoming(following[n][v], loop)
+    return result, end
+
+
+def _eliminated(builder: Any, value: Any, known: list[Any], L: Any, shape: tuple[int, int, Any, int]) -> Any:
+    """Return (value − Σ known L[n, m]) / L[n, n]."""
+    n, size, kind, lanes = shape
+    for m, other in enumerate(known):
+        factor = _spread(builder, builder.load(_at(builder, L, _number((n * WIDE + m) * size), kind)), lanes)
+        value = builder.fsub(value, builder.fmul(other, factor, flags=("contract",)), flags=("contract",))
+    inverse = _spread(builder, builder.load(_at(builder, L, _number((n * WIDE + n) * size), kind)), lanes)
+    return builder.fmul(value, inverse)
+
+
+def _run_function(module: Any, like: Any) -> Any:
+    """Return the function that adds a run of numbers, a register at a time."""
+    letter, kind, lanes = _kind(like)
+    function, known = _function(module, f"femsense_add_{letter}", 3)
+    if known:
+        return function
+    vector, size = ir.VectorType(kind, lanes), BYTES // lanes
+    builder = ir.IRBuilder(function.append_basic_block("entry"))
+    to, source, count = function.args
+    entry, loop, end = builder.block, function.append_basic_block("loop"), function.append_basic_block("end")
+    load, store = _masked(builder, kind, lanes)
+    align, nothing = ir.Constant(ir.IntType(32), size), ir.Constant(vector, [0.0] * lanes)
+    builder.branch(loop)
+    builder.position_at_end(loop)
+    left, at = builder.phi(INTEGER), builder.phi(INTEGER)
+    left.add_incoming(count, entry)
+    at.add_incoming(_number(0), entry)
+    mask = _mask(builder, left, 0, lanes)
+    pointer = _at(builder, to, at, vector)
+    there = builder.call(load, [pointer, align, mask, nothing])
+    more = builder.call(load, [_at(builder, source, at, vector), align, mask, nothing])
+    builder.call(store, [builder.fadd(there, more), pointer, align, mask])
+    left_next, at_next = builder.sub(left, _number(lanes)), builder.add(at, _number(BYTES))
+    left.add_incoming(left_next, loop)
+    at.add_incoming(at_next, loop)
+    builder.cbranch(builder.icmp_signed(">", left_next, _number(0)), loop, end)
+    builder.position_at_end(end)
+    builder.ret_void()
+    return function
