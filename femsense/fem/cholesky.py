@@ -531,7 +531,18 @@ def _solve_one(
         total = half[:height]
         total[:columns] = x[c0 : c0 + columns]
         total[columns:] = 0.0
-        for j in range(columns):
+        triples = columns - columns % 3
+        for j in range(0, triples, 3):
+            at = offset[s] + j * height + j
+            u = total[j] / L[at]
+            v = (total[j + 1] - L[at + 1] * u) / L[at + height + 1]
+            w = (total[j + 2] - L[at + 2] * u - L[at + height + 2] * v) / L[at + 2 * height + 2]
+            total[j], total[j + 1], total[j + 2] = u, v, w
+            left, size = total[j + 3 : height], height - j - 3
+            first, second, third = L[at + 3 : at + 3 + size], L[at + height + 3 :][:size], L[at + 2 * height + 3 :][:size]
+            for i in range(size):
+                left[i] -= first[i] * u + second[i] * v + third[i] * w
+        for j in range(triples, columns):
             line, left = L[offset[s] + j * height + j : offset[s] + (j + 1) * height], total[j:]
             value = left[0] / line[0]
             for i in range(len(line)):
@@ -552,12 +563,24 @@ def _solve_one(
             to = unit * below[begin[s] + q]
             for a in range(unit):
                 total[columns + unit * q + a] = x[to + a]
-        for j in range(columns - 1, -1, -1):
+        triples = columns - columns % 3
+        for j in range(columns - 1, triples - 1, -1):
             line, left = L[offset[s] + j * height + j + 1 : offset[s] + (j + 1) * height], total[j + 1 :]
             known = L[0] * 0
             for i in range(len(line)):
                 known += line[i] * left[i]
             total[j] = (total[j] - known) / L[offset[s] + j * height + j]
+        for j in range(triples - 3, -1, -3):
+            at, left, size = offset[s] + j * height + j, total[j + 3 : height], height - j - 3
+            first, second, third = L[at + 3 : at + 3 + size], L[at + height + 3 :][:size], L[at + 2 * height + 3 :][:size]
+            u, v, w = total[j], total[j + 1], total[j + 2]
+            for i in range(size):
+                u -= first[i] * left[i]
+                v -= second[i] * left[i]
+                w -= third[i] * left[i]
+            w /= L[at + 2 * height + 2]
+            v = (v - L[at + height + 2] * w) / L[at + height + 1]
+            total[j], total[j + 1], total[j + 2] = (u - L[at + 1] * v - L[at + 2] * w) / L[at], v, w
         x[c0 : c0 + columns] = total[:columns]
 
 
