@@ -65,6 +65,8 @@ class Robot:
     """The declared robot.toml (before effects), as plain tables; None where the robot was made in Python."""
     folder: Path | None = None
     """Where robot.toml and the mesh stand."""
+    marker_share: FloatArray | None = None
+    """By which share each marker follows the body, shape (k,): 1 sits on it, 0 sits on what holds it; None: all sit on it."""
 
     def with_body(self, body: BodyModel) -> Robot:
         """Return the robot with another body on the same mesh."""
@@ -72,7 +74,12 @@ class Robot:
 
     def with_marker_points(self, points: FloatArray) -> Robot:
         """Return the robot with its markers elsewhere at rest [m], shape (k, 3)."""
-        return replace(self, marker_points=freeze(points), markers=embed_points(self.body.mesh, points))
+        return replace(self, marker_points=freeze(points), markers=self.tie_markers(points))
+
+    def tie_markers(self, places: FloatArray) -> Embedding:
+        """Return the ties of all markers when they sit at places [m], shape (k, 3)."""
+        ties = embed_points(self.body.mesh, places)
+        return ties if self.marker_share is None else ties.following(places, self.marker_share)
 
 
 def plain_actuation(cable_count: int) -> Actuation:

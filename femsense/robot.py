@@ -34,7 +34,7 @@ PER_METRE = {"m": 1.0, "cm": 100.0, "mm": 1000.0}
 EFFECT_NAMES = (
     "gravity", "stiffness", "poisson", "soft_region", "discretisation", "hyperelastic", "creep", "payload",
     "base_compliance", "cable_friction", "cable_offset", "cable_gain", "cable_stretch", "cable_slack", "geometry",
-    "depth_scale", "marker_offset",
+    "depth_scale", "marker_offset", "clamped_marker",
 )  # fmt: skip
 SMALLEST_BODY, LARGEST_BODY = 1e-3, 20.0
 """A body that is smaller or larger across than this [m] has another unit than declared."""

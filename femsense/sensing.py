@@ -566,7 +566,7 @@ def _marker_rows(sensor: Sensor, k: int, state: Equilibrium) -> Rows:
     by_pose = by_pose.reshape(residual.size, -1)
 
     def functional(u: FloatArray) -> FloatArray:
-        return np.array([place.positions(v).ravel() for v in u]).reshape(len(u), -1).T
+        return np.array([place.moves(v).ravel() for v in u]).reshape(len(u), -1).T
 
     return Rows(functional, residual.ravel(), std, by_pose, len(rows), float(np.sqrt((residual**2).sum(axis=1).mean())), std)
 

@@ -76,7 +76,7 @@ def test_the_names_are_those_of_the_format() -> None:
     assert names == set(EFFECT_NAMES) == {form.name for form in FORMS}
     assert names == {
         "discretisation", "geometry", "gravity", "stiffness", "poisson", "soft_region", "hyperelastic", "creep", "payload", "base_compliance", "cable_friction",
-        "cable_offset", "cable_gain", "cable_stretch", "cable_slack", "depth_scale", "marker_offset",
+        "cable_offset", "cable_gain", "cable_stretch", "cable_slack", "depth_scale", "marker_offset", "clamped_marker",
     }  # fmt: skip
     assert all(e.lacks and e.keys for e in EFFECTS)
 

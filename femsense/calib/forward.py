@@ -16,7 +16,6 @@ from femsense.arrays import FloatArray, IntArray
 from femsense.effects import Effect, Entry, Parameter, build_entry
 from femsense.errors import DataError
 from femsense.fem.equilibrium import Equilibrium
-from femsense.fem.mesh import embed_points
 from femsense.march import Walk, drive_of, walk_along
 from femsense.model import Observation, Robot
 from femsense.pose import invert_pose, move_pose, transform_points
@@ -202,10 +201,8 @@ def evaluate_scene(
     if not vary_initial:
         keep = len(hypothesis.parameters)
         steps, variants = steps[:keep], variants[:keep]
-    place = embed_points(robot.body.mesh, seats(robot, scene, poses))
-    offset_place = {
-        id(v.robot): embed_points(v.robot.body.mesh, seats(v.robot, scene, poses)) for v in variants if v.robot is not robot
-    }
+    place = robot.tie_markers(seats(robot, scene, poses))
+    offset_place = {id(v.robot): v.robot.tie_markers(seats(v.robot, scene, poses)) for v in variants if v.robot is not robot}
 
     def observe(r: Robot, state: Equilibrium) -> FloatArray:
         return offset_place.get(id(r), place).positions(state.positions)
@@ -286,7 +283,7 @@ def _pose_derivative(
             moved[v] = move_pose(poses[v], step, pivot_a=pivot)
             model = still
             if model is None:
-                place = embed_points(robot.body.mesh, seats(robot, scene, moved))
+                place = robot.tie_markers(seats(robot, scene, moved))
                 model = {k: place.positions(s.positions) for k, s in states.items()}
             columns.append((marker_residual(robot, scene, moved, model) - residual) / step[j])
             rest_columns.append((rest_residual(robot, scene, moved) - rest) / step[j])

@@ -10,7 +10,7 @@ from femsense.effects.cables import CABLE_FRICTION, CABLE_FRICTIONS, CABLE_GAIN,
 from femsense.effects.effect import Effect, Entry, Parameter, build_entry
 from femsense.effects.loads import GRAVITY, PAYLOAD
 from femsense.effects.material import CREEP, CREEP_TWICE, GENT, HYPERELASTIC, POISSON, SOFT_REGION, STIFFNESS
-from femsense.effects.observation import DEPTH_SCALE, MARKER_OFFSET
+from femsense.effects.observation import CLAMPED_MARKER, DEPTH_SCALE, MARKER_OFFSET
 from femsense.effects.own import find_own_file, load_own_effect
 from femsense.effects.shape import DISCRETISATION, GEOMETRY
 from femsense.effects.support import BASE_COMPLIANCE, BASE_ROTATION
@@ -19,7 +19,7 @@ from femsense.model import Robot
 
 EFFECTS: tuple[Effect, ...] = (
     GRAVITY, STIFFNESS, POISSON, SOFT_REGION, DISCRETISATION, HYPERELASTIC, CREEP, PAYLOAD, BASE_COMPLIANCE, CABLE_FRICTION,
-    CABLE_OFFSET, CABLE_GAIN, CABLE_STRETCH, CABLE_SLACK, GEOMETRY, DEPTH_SCALE, MARKER_OFFSET,
+    CABLE_OFFSET, CABLE_GAIN, CABLE_STRETCH, CABLE_SLACK, GEOMETRY, DEPTH_SCALE, MARKER_OFFSET, CLAMPED_MARKER,
 )  # fmt: skip
 """Each name once."""
 FORMS: tuple[Effect, ...] = (*EFFECTS, GENT, CREEP_TWICE, BASE_ROTATION, CABLE_FRICTIONS)

@@ -30,8 +30,7 @@ def _apply_size(robot: Robot, entry: Entry) -> Robot:
     scale = number(entry, "scale", "geometry", low=0.2, high=5.0)
     body = robot.body.scaled(scale)
     center = robot.body.clamp_center
-    ties = replace(robot.markers, outside=freeze(scale * robot.markers.outside))
-    return replace(robot, body=body, marker_points=freeze(center + scale * (robot.marker_points - center)), markers=ties)
+    return robot.with_body(body).with_marker_points(center + scale * (robot.marker_points - center))
 
 
 def _mesh_seeds(robot: Robot) -> tuple[Entry, ...]:
@@ -83,12 +82,8 @@ def robot_on_mesh(robot: Robot, mesh: TetMesh) -> Robot:
     boxes = declared_boxes(robot)
     clamped = None if boxes is None else np.flatnonzero(_inside(mesh.nodes, boxes))
     features = cKDTree(mesh.nodes).query(old.nodes[robot.features])[1] if len(robot.features) else robot.features
-    return replace(
-        robot,
-        body=body_on_mesh(robot.body, mesh, clamped=clamped),
-        markers=embed_points(mesh, robot.marker_points),
-        features=freeze(features, np.int64),
-    )
+    moved = robot.with_body(body_on_mesh(robot.body, mesh, clamped=clamped))
+    return replace(moved.with_marker_points(robot.marker_points), features=freeze(features, np.int64))
 
 
 def declared_boxes(robot: Robot) -> FloatArray | None:

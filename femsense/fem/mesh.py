@@ -5,7 +5,8 @@ Nodes of an element are ordered as in VTK: corners 0 1 2 3, then the middles of 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -53,18 +54,29 @@ class Embedding:
     nodes: IntArray
     """Node indices, shape (p, k)."""
     weights: FloatArray
-    """Weights, shape (p, k); each row sums to 1."""
+    """Weights, shape (p, k); each row sums to 1, or to the share by which a point follows."""
     element: IntArray
     """The element that carries each point, shape (p,)."""
     outside: FloatArray
     """How far outside of the mesh each point is at rest [m], shape (p,); 0 inside."""
+    still: FloatArray | None = None
+    """The part of each point that stays where it is [m], shape (p, 3); None: points go with the mesh wholly. See `following`."""
 
     def __len__(self) -> int:
         return len(self.nodes)
 
     def positions(self, node_positions: FloatArray) -> FloatArray:
         """Return the positions of the points [m], shape (p, 3), for node positions [m], shape (n, 3)."""
-        return np.asarray(np.einsum("pk,pkc->pc", self.weights, node_positions[self.nodes]))
+        moved = self.moves(node_positions)
+        return moved if self.still is None else moved + self.still
+
+    def moves(self, field: FloatArray) -> FloatArray:
+        """Return how a displacement of the nodes (n, 3) moves the points, shape (p, 3)."""
+        return np.asarray(np.einsum("pk,pkc->pc", self.weights, field[self.nodes]))
+
+    def following(self, points: FloatArray, share: FloatArray) -> Embedding:
+        """Return ties of points [m], shape (p, 3), that follow the mesh by a share only, shape (p,): 1 wholly, 0 not at all."""
+        return replace(self, weights=freeze(share[:, None] * self.weights), still=freeze((1.0 - share[:, None]) * points))
 
     def matrix(self, node_count: int) -> sp.csr_matrix:
         """Return the interpolation as a sparse matrix, shape (p, n)."""
@@ -76,9 +88,10 @@ class Embedding:
         """Return nodal forces [N], shape (n, 3), that are equivalent to forces [N], shape (p, 3), at the points."""
         return np.asarray(self.matrix(node_count).T @ forces)
 
-    def __getitem__(self, index: object) -> Embedding:
-        return Embedding(*(np.atleast_1d(getattr(self, f)[index]) if f in ("element", "outside") else np.atleast_2d(getattr(self, f)[index])
-                           for f in ("nodes", "weights", "element", "outside")))  # fmt: skip
+    def __getitem__(self, index: Any) -> Embedding:
+        still = None if self.still is None else np.atleast_2d(self.still[index])
+        return Embedding(np.atleast_2d(self.nodes[index]), np.atleast_2d(self.weights[index]),
+                         np.atleast_1d(self.element[index]), np.atleast_1d(self.outside[index]), still)  # fmt: skip
 
 
 def element_volumes(mesh: TetMesh) -> FloatArray:

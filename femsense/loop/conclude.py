@@ -17,6 +17,7 @@ from femsense.loop.joint import Prior
 from femsense.loop.noise import Noise
 from femsense.loop.result import LoopResult
 from femsense.loop.screen import NUISANCE, TESTABLE, Candidate, confounding, one_each
+from femsense.loop.spread import coordinate_std
 from femsense.loop.stages import Stage, make_stage, own_of
 from femsense.loop.structure import describe_left, structure_tests, without_mesh_error
 
@@ -172,7 +173,7 @@ def _chain(data: Data, search: Search, promoted: list[str], names: list[str], ba
     return [
         {
             "name": name,
-            "parameters": _parameters(search.final, back, name),
+            "parameters": _parameters(data, search.noise, search.final, back, name),
             "validation_rms_before_m": b,
             "validation_rms_after_m": a,
         }
@@ -209,7 +210,7 @@ def _rounded(entry: Entry) -> Entry:
     return {k: tidy(v) for k, v in entry.items()}
 
 
-def _parameters(full: Stage, back: Stage, name: str) -> dict[str, Any]:
+def _parameters(data: Data, noise: Noise, full: Stage, back: Stage, name: str) -> dict[str, Any]:
     """Return {key: {value, std, unit}} of one effect; vectors and tables keep their shape. What was not fitted has std None.
 
     Values are those that are handed back; standard deviations are those of the full fit, in which nothing was held still.
@@ -218,7 +219,7 @@ def _parameters(full: Stage, back: Stage, name: str) -> dict[str, Any]:
     for effect, seed in back.fit.hypothesis.settled:
         if effect.name == name:
             result |= {k: {"value": v, "std": None, "unit": _unit(k)} for k, v in seed.items()}
-    spread = _coordinate_std(full, name)
+    spread = _coordinate_std(data, noise, full, name)
     at = 0
     for effect, seed, parameters in back.fit.hypothesis.terms:
         values = back.fit.coordinates[at : at + len(parameters)]
@@ -236,11 +237,11 @@ def _parameters(full: Stage, back: Stage, name: str) -> dict[str, Any]:
     return result
 
 
-def _coordinate_std(stage: Stage, name: str) -> FloatArray | None:
-    at = 0
+def _coordinate_std(data: Data, noise: Noise, stage: Stage, name: str) -> FloatArray | None:
+    std, at = coordinate_std(stage.fit, data.train, noise), 0
     for effect, _, parameters in stage.fit.hypothesis.terms:
         if effect.name == name:
-            return stage.fit.std[at : at + len(parameters)]
+            return std[at : at + len(parameters)]
         at += len(parameters)
     return None
 
@@ -421,7 +422,7 @@ def _short(parameters: dict[str, Any]) -> str:
 
 def _card(data: Data, before: Stage, final: Stage, noise: Noise, n_effective: float) -> dict[str, Any]:
     nuisance = {
-        name: _parameters(final, final, name)
+        name: _parameters(data, noise, final, final, name)
         for name in NUISANCE
         if any(e.name == name for e, _, _ in final.fit.hypothesis.terms)
     }

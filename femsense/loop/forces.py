@@ -63,8 +63,8 @@ class View:
         mesh = self.robot.body.mesh
         ties = embed_points(mesh, places)
         units = [ties.spread(np.eye(3 * len(places))[j].reshape(-1, 3), len(mesh.nodes)) for j in range(3 * len(places))]
-        marks = embed_points(mesh, seats(self.robot, self.trial.scene, self.poses)[self.trial.scene.marker[self.rows(frame)]])
-        return np.stack([marks.positions(move).ravel() for move in tangent.respond(np.array(units))], axis=1)
+        marks = self.robot.tie_markers(seats(self.robot, self.trial.scene, self.poses))[self.trial.scene.marker[self.rows(frame)]]
+        return np.stack([marks.moves(move).ravel() for move in tangent.respond(np.array(units))], axis=1)
 
 
 def views_of(data: Data, stage: Stage) -> list[View]:

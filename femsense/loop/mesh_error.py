@@ -72,7 +72,7 @@ def _moves(
     coarse_walk = Walk(robot, drive_of(robot, trial.scene.recording, initial=initial))
     fine_walk = Walk(fine, drive_of(fine, trial.scene.recording, initial=initial))
     ties = embed_points(robot.body.mesh, fine.body.mesh.nodes)
-    here, there = embed_points(robot.body.mesh, places), embed_points(fine.body.mesh, places)
+    here, there = robot.tie_markers(places), fine.tie_markers(places)
     frames = sorted(states)
     vectors = _state_vectors(trial, frames)
     chosen = _representatives(vectors, max(8, MOST_WORK // len(fine.body.mesh.tets)))

@@ -49,6 +49,7 @@ PLAUSIBLE = {
     ("creep", "fraction"): 0.15, ("payload", "force_n"): 0.05, ("cable_friction", "coefficient"): 0.15, ("cable_gain", "scale"): 0.05,
     ("cable_stretch", "stiffness_n_m"): 5e-5, ("cable_slack", "displacement_m"): 5e-4, ("geometry", "scale"): 0.02,
     ("depth_scale", "scale"): 0.01, ("depth_scale", "offset_m"): 2e-3, ("marker_offset", "offset_m"): 5e-4,
+    ("clamped_marker", "share"): 1.0,
 }  # fmt: skip
 """Sizes in the coordinates of the fit (logarithms, compliances): usual for cast silicone, hand-laid cables and depth cameras."""
 CLAMP_SHARE = {"stiffness_n_m": 0.01, "rotation_stiffness_nm_rad": 0.02}

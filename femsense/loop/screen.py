@@ -58,7 +58,7 @@ def penalty(count: int, seed: Entry, alone: int, effects: int, n_effective: floa
     q parameters are fitted; the s numbers of its seed (a place, a radius, a time) are chosen from many, so they count as parameters
     too; m effects are looked at, and a is the number of cables or markers that it might be alone.
     """
-    chosen = sum(int(np.size(v)) for v in seed.values() if not isinstance(v, str | bool))
+    chosen = sum(int(np.size(v)) for v in seed.values() if not isinstance(v, bool) and np.asarray(v).dtype.kind in "iuf")
     return float((count + chosen) * np.log(n_effective) + 2.0 * np.log(max(effects * alone, 1)))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -167,7 +167,7 @@ def _with_placement(robot: Robot, script: ScriptTable) -> Robot:
         return robot
     error = std * _rng(script, "placement").standard_normal(robot.marker_points.shape)
     points = robot.marker_points + error
-    return replace(robot, marker_points=freeze(points), markers=embed_points(robot.body.mesh, points))
+    return robot.with_marker_points(points)
 
 
 def _chosen_markers(robot: Robot, script: ScriptTable) -> BoolArray:

@@ -108,7 +108,7 @@ def true_robot(robot: Robot, table: TruthTable, effects: Sequence[Mapping[str, A
     body = robot.body if mesh is robot.body.mesh else body_on_mesh(robot.body, mesh)
     limit = np.inf if table.stretch_limit is None else table.stretch_limit
     body = body.with_material(replace(body.material, law=table.law, stretch_limit=limit))
-    moved = replace(robot, body=body, markers=embed_points(mesh, robot.marker_points), features=np.zeros(0, np.int64))
+    moved = replace(robot.with_body(body).with_marker_points(robot.marker_points), features=np.zeros(0, np.int64))
     for i, entry in enumerate(effects):
         try:
             moved = apply_effects(moved, [entry])

@@ -1,0 +1,95 @@
+"""How far the values of a fit may be off, where (JᵀJ)⁻¹ says too little.
+
+Two things are put right. A model that leaves more than the noise was fitted with weights that are too large: all variances grow by the
+factor by which it does (Birge 1932). And the size of gravity is known, so that its direction lives on a sphere: where the data see one
+component only, the tangent to the sphere bounds the others, although a whole circle is
+as likely. Second moments about the estimate over the sphere, weighted by the likelihood, say so.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from femsense.arrays import FloatArray, IntArray
+from femsense.effects.loads import STANDARD_GRAVITY
+from femsense.loop.joint import GRAVITY_STD, JointFit, Trial
+from femsense.loop.noise import Noise
+
+RINGS, SPOKES = 160, 48
+"""Directions that are looked at: rings about the estimate, close to each other near it, and places on each ring."""
+
+
+def coordinate_std(fit: JointFit, trials: list[Trial], noise: Noise) -> FloatArray:
+    """Return standard deviations of the coordinates of a hypothesis about their estimates, shape (p,)."""
+    growth = misfit(fit, trials, noise)
+    std = growth * fit.std
+    mask = np.array([p.key == "vector_m_s2" for p in fit.hypothesis.parameters], dtype=bool)
+    if mask.sum() != 3 or np.linalg.norm(fit.coordinates[mask]) < 1e-3:
+        return std
+    sphere = _over_the_sphere(fit, np.flatnonzero(mask), growth)
+    return np.where(mask, sphere, np.maximum(std, sphere))
+
+
+def misfit(fit: JointFit, trials: list[Trial], noise: Noise) -> float:
+    """Return by which factor the residual exceeds the noise, at least 1.
+
+    States that repeat count once: with n state means of markers in three axes and p parameters it is √(Σ|r̄|² / (n − p) / σ²).
+    """
+    square, count, expected = 0.0, 0, 0.0
+    for trial, jet in zip(trials, fit.jets):
+        state = trial.groups.state
+        size = np.bincount(state)
+        means = np.stack([np.bincount(state, jet.residual[:, c]) for c in range(3)], axis=1) / size[:, None]
+        square, count = square + float((means**2).sum()), count + means.size
+        if trial.mesh_error is not None:
+            expected += float((trial.mesh_error**2).sum()) / len(state) * len(size)
+        expected += 3.0 * float((_variance(noise) + noise.std["white"] ** 2 / size).sum())
+    freedom = count - len(fit.fit.theta)
+    if freedom < 1 or expected <= 0.0:
+        return 1.0
+    return max(1.0, float(np.sqrt(square / expected * count / freedom)))
+
+
+def _variance(noise: Noise) -> float:
+    return sum(v**2 for name, v in noise.std.items() if name != "white")
+
+
+def _over_the_sphere(fit: JointFit, at: IntArray, growth: float) -> FloatArray:
+    """Return root mean squares about the estimate when gravity roams the sphere and all else follows, shape (p,)."""
+    rows = np.asarray(fit.fit.jacobian)[:-1] / growth  # the last row is what is known of gravity's size
+    residual = np.asarray(fit.fit.residual)[:-1] / growth
+    normal, slope = rows.T @ rows, rows.T @ residual
+    own = np.asarray(at) + fit.own
+    rest = np.setdiff1d(np.arange(len(normal)), own)
+    inverse = np.linalg.pinv(normal[np.ix_(rest, rest)], rcond=1e-12, hermitian=True)
+    gain = inverse @ normal[np.ix_(rest, own)]
+    inner = normal[np.ix_(own, own)] - normal[np.ix_(own, rest)] @ gain
+    pull = slope[own] - gain.T @ slope[rest]
+    towards, area = _directions(np.asarray(fit.coordinates)[at])
+    moves = STANDARD_GRAVITY * towards - np.asarray(fit.coordinates)[at]
+    # along each direction the size is Gaussian: curvature, slope, and χ² at its best
+    curve = np.einsum("ki,ij,kj->k", towards, inner, towards) + 1.0 / GRAVITY_STD**2
+    rise = np.einsum("ki,ki->k", towards, moves @ inner + pull)
+    chi2 = np.einsum("ki,ki->k", moves @ inner + 2.0 * pull, moves) - rise**2 / curve
+    weight = area * np.exp(-0.5 * (chi2 - chi2.min())) / np.sqrt(curve)
+    weight /= weight.sum()
+    moves = moves - (rise / curve)[:, None] * towards
+    square = np.zeros(len(normal))
+    square[own] = weight @ (moves**2 + towards**2 / curve[:, None])
+    followers = -(moves @ gain.T) - inverse @ slope[rest]
+    square[rest] = np.diag(inverse) + weight @ (followers**2 + (towards @ gain.T) ** 2 / curve[:, None])
+    return np.sqrt(square)[fit.own :]
+
+
+def _directions(estimate: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return unit vectors all over the sphere (k, 3), dense about an estimate, with their areas (k,)."""
+    axis = estimate / np.linalg.norm(estimate)
+    side = np.linalg.svd(axis[None])[2][1:]
+    edge = np.pi * np.linspace(0.0, 1.0, RINGS + 1) ** 3
+    ring, turn = 0.5 * (edge[1:] + edge[:-1]), 2.0 * np.pi * np.arange(SPOKES) / SPOKES
+    around = np.cos(turn)[:, None] * side[0] + np.sin(turn)[:, None] * side[1]
+    directions = np.cos(ring)[:, None, None] * axis + np.sin(ring)[:, None, None] * around
+    return directions.reshape(-1, 3), np.repeat(np.sin(ring) * np.diff(edge), SPOKES)
+
+
+__all__ = ["coordinate_std", "misfit"]
