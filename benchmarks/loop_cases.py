@@ -151,6 +151,8 @@ class Case:
     declared_gravity: bool = True
     tetrahedra: str = "tet10"
     names: tuple[str, ...] = field(default=())
+    modulus_scale: float | None = None
+    """True over declared modulus; None draws it."""
 
     @property
     def label(self) -> str:
@@ -260,7 +262,8 @@ def make_data(case: Case, seed: int) -> Made:
     design = case.design
     law = "neo_hookean" if case.hyperelastic else "corotational"
     law_hidden = any(e["name"] == "hyperelastic" for e in case.hidden)
-    scale = float(rng.uniform(0.8, 1.2))
+    drawn = float(rng.uniform(0.8, 1.2))
+    scale = drawn if case.modulus_scale is None else case.modulus_scale
     declared = design.robot(
         fine=False,
         law="corotational" if law_hidden else law,
