@@ -27,7 +27,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 from arm import arm, record, sweeps  # noqa: E402 (the tests hold the arm and the ways to tell)
-from changed import in_unit, log_permuted, markers_reordered, renumbered, sweeps_shuffled, turned_world  # noqa: E402
+from changed import in_unit, log_permuted, renumbered, reordered, sweeps_shuffled, turned_world  # noqa: E402
 
 from femsense.errors import FemsenseError  # noqa: E402
 from femsense.loop import improve  # noqa: E402
@@ -43,7 +43,7 @@ HIDDEN: dict[str, list[dict[str, Any]]] = {
     "cable_friction": [{"name": "cable_friction", "coefficient": 0.25}],
     "creep": [{"name": "creep", "fraction": 0.2, "time_s": 4.0}],
 }
-WAYS = ("as it is", "sweeps shuffled", "mesh in mm", "mesh in cm", "world turned", "mesh renumbered", "markers reordered")
+WAYS = ("as it is", "sweeps shuffled", "mesh in mm", "mesh in cm", "world turned", "mesh renumbered", "reordered")
 CONTROL = ("nothing", "cable_gain", "cable_friction")
 
 
@@ -71,7 +71,7 @@ def told(hidden: str, way: str, folder: Path) -> tuple[Robot, Recording]:
         return turned_world(robot, recording, WORLD)
     if way == "mesh renumbered":
         return renumbered(robot, rng), recording
-    return markers_reordered(robot, recording, rng) if way == "markers reordered" else (robot, recording)
+    return reordered(robot, recording, rng) if way == "reordered" else (robot, recording)
 
 
 def closed(robot: Robot, recording: Recording) -> dict[str, Any]:

@@ -113,16 +113,20 @@ def loop_text(document: Mapping[str, Any]) -> str:
     lines.append(columns(_loop_rows(document)))
     for effect in document.get("effects") or []:
         lines += ["", effect_text(effect)]
-    for title, key in (
-        ("cannot be told apart", "confounded"),
-        ("not testable", "not_testable"),
-        ("next experiment", "next_experiment"),
+    for title, said in (
+        ("cannot be told apart", ", ".join(" / ".join(p["pair"]) for p in document.get("confounded") or ())),
+        ("not testable", ", ".join(map(_untestable, document.get("not_testable") or ()))),
+        ("next experiment", document.get("next_experiment")),
     ):
-        value = document.get(key)
-        if value:
-            lines += ["", f"{title}: {_words(value)}"]
+        if said:
+            lines += ["", f"{title}: {said}"]
     left = _left(document.get("left") or {})
     return "\n".join([*lines, "", f"what is left: {left}"] if left else lines)
+
+
+def _untestable(effect: Mapping[str, Any]) -> str:
+    share = effect.get("absorbed_share")
+    return str(effect["name"]) + ("" if share is None else f" (calibration imitates {100 * share:.1f} % of it)")
 
 
 def _left(left: Mapping[str, Any]) -> str:

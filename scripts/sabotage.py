@@ -145,6 +145,10 @@ SABOTAGES = (
     S("loop/predict.py", "inner = np.eye(B.shape[1]) - B.T @ B", "inner = np.eye(B.shape[1]) + B.T @ B", "test_loop_parts.py::test_left_out_sweeps_are_predicted_as_by_fits_without_them"),
     S("march.py", "x = np.asarray(x + move)", "x = np.asarray(x - move)", "test_loop_parts.py::test_the_error_of_the_mesh_is_what_the_finer_mesh_adds"),
     S("calib/forward.py", "seen_at = _as_predicted(robot, scene, poses, model) if noiseless else scene", "seen_at = scene", "test_loop_parts.py::test_columns_for_screening_do_not_hold_the_noise_of_measured_points"),
+    S("loop/rivals.py", "ahead = mine - (", "ahead = mine + (", "test_loop_rivals.py::test_weight_on_one_mount_does_as_well_as_zeros_that_moved"),
+    S("loop/rivals.py", "if ahead < EVIDENCE:", "if True:", "test_loop_rivals.py::test_a_zero_that_is_wrong_has_no_rival"),
+    S("calib/forward.py", "known.get(name, -1) for name in recording.marker_names", "i for i, name in enumerate(recording.marker_names)", "test_loop_invariance.py::test_the_verdict_is_the_same_however_it_is_told[markers and cables reordered]"),
+    S("frames.py", "return [given.index(name) for name in wanted]", "return list(range(len(wanted)))", "test_loop_invariance.py::test_the_verdict_is_the_same_however_it_is_told[markers and cables reordered]"),
     S("loop/screen.py", "return [tuple(part) for part in parts.values()]", "return []", "test_loop_parts.py::test_parts_are_cables_markers_and_keys"),
     S("fem/equilibrium.py", "if motor > 0 and body.cables[i].friction > 0 and along is None:", "if motor > 0 and along is None:", "test_fem_cables.py::test_a_body_without_friction_forgets_the_losses_of_its_start"),
     # clouds

@@ -64,8 +64,8 @@ def log_permuted(recording: Recording, rng: np.random.Generator) -> Recording:
     return replace(recording, inputs=freeze(recording.inputs[order]), pressures=freeze(recording.pressures[order]))
 
 
-def markers_reordered(robot: Robot, recording: Recording, rng: np.random.Generator) -> tuple[Robot, Recording]:
-    """Return robot and recording with their markers in other orders, each in its own; the rows of a frame too."""
+def reordered(robot: Robot, recording: Recording, rng: np.random.Generator) -> tuple[Robot, Recording]:
+    """Return robot and recording with their markers in other orders, each in its own; the rows of a frame and the columns of cables too."""
     r, order = recording, rng.permutation(len(robot.marker_names))
     other = replace(robot, marker_names=tuple(robot.marker_names[i] for i in order), marker_points=freeze(robot.marker_points[order]), markers=robot.markers[order])  # fmt: skip
     turn = rng.permutation(len(r.marker_names))
@@ -73,6 +73,8 @@ def markers_reordered(robot: Robot, recording: Recording, rng: np.random.Generat
     rows = np.lexsort((rng.random(len(r.marker_frame)), r.marker_frame))
     seen = replace(r, marker_names=tuple(r.marker_names[i] for i in turn), marker_index=freeze(new[r.marker_index][rows], np.int64),
                    marker_frame=freeze(r.marker_frame[rows], np.int64), marker_xyz=freeze(r.marker_xyz[rows]), marker_view=freeze(r.marker_view[rows], np.int64))  # fmt: skip
+    columns = rng.permutation(len(r.cable_names))
+    seen = replace(seen, cable_names=tuple(r.cable_names[i] for i in columns), inputs=freeze(r.inputs[:, columns]))
     return other, seen
 
 
@@ -146,4 +148,4 @@ def in_unit(robot: Robot, unit: str, folder: Path) -> Robot:
     return load_robot(folder)
 
 
-__all__ = ["in_order", "in_unit", "log_permuted", "markers_reordered", "renumbered", "sweeps_shuffled", "turned_world"]
+__all__ = ["in_order", "in_unit", "log_permuted", "renumbered", "reordered", "sweeps_shuffled", "turned_world"]

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from arm import arm, record, sweeps
-from changed import in_unit, log_permuted, markers_reordered, renumbered, sweeps_shuffled, turned_world
+from changed import in_unit, log_permuted, renumbered, reordered, sweeps_shuffled, turned_world
 
 from femsense.loop import LoopResult, improve
 from femsense.model import Robot
@@ -64,7 +64,7 @@ TOLD: dict[str, Told] = {
     "mesh in millimetres": lambda robot, r, folder: (in_unit(robot, "mm", folder), r),
     "world turned": lambda robot, r, folder: turned_world(robot, r, WORLD),
     "mesh renumbered": lambda robot, r, folder: (renumbered(robot, np.random.default_rng(5)), r),
-    "markers reordered": lambda robot, r, folder: markers_reordered(robot, r, np.random.default_rng(6)),
+    "markers and cables reordered": lambda robot, r, folder: reordered(robot, r, np.random.default_rng(6)),
 }
 
 

@@ -117,7 +117,7 @@ def proposal_text(proposal: Proposal) -> str:
 
 def next_element(
     data: Data, fit: JointFit, noise: float, confounded: Sequence[tuple[str, str]], not_testable: Sequence[str]
-) -> list[tuple[str, float, float]]:
+) -> list[tuple[str, str, float, float]]:
     """Return which item of the menu would help most with what the data leave open, and by how much.
 
     Arguments:
@@ -128,8 +128,9 @@ def next_element(
         not_testable: effects that they cannot show.
 
     Returns:
-        (what to do, the smallest expected dBIC gap of the open questions before, the same after), the best first; empty where nothing
-        helps or where it would take too long.
+        (what to do, the open question that gains most by it, the expected evidence on it before and after), the best first; empty where nothing
+        brings any question towards an answer or where it would take too long. What an item is worth is the evidence between 0 and
+        `EVIDENCE` that it adds to each question: below 0 the wrong answer is expected, and less wrong is no better.
     """
     robot = fit.hypothesis.robot_at(fit.coordinates)
     names = {n for pair in confounded for n in pair} | set(not_testable)
@@ -149,6 +150,7 @@ def next_element(
         return []
     judge, left = Judge(forms, data.input_scale), min(MOST_WORK // tets, MOST_FRAMES)
     now = _open(judge.judge(have), confounded, not_testable)
+    questions = [*(f"{a} or {b}" for a, b in confounded), *not_testable]
     found = []
     for element in _one_of_each_first(menu(setup)):
         if not element.sweeps or element.frames >= left:
@@ -159,9 +161,11 @@ def next_element(
         except FemsenseError:
             continue
         then = _open(judge.judge([*have, block]), confounded, not_testable)
-        if sum(np.minimum(then, EVIDENCE)) > sum(np.minimum(now, EVIDENCE)) + 1.0:
-            found.append((element.words, float(min(now)), float(min(then)), float(sum(np.minimum(then, EVIDENCE)))))
-    return [(words, before, after) for words, before, after, _ in sorted(found, key=lambda f: -f[3])]
+        gain = np.clip(then, 0.0, EVIDENCE) - np.clip(now, 0.0, EVIDENCE)
+        if gain.sum() > 1.0:
+            most = int(np.argmax(gain))
+            found.append((float(gain.sum()), (element.words, questions[most], float(now[most]), float(then[most]))))
+    return [item for _, item in sorted(found, key=lambda f: -f[0])]
 
 
 def _one_of_each_first(elements: Sequence[Element]) -> list[Element]:

@@ -16,6 +16,7 @@ from femsense.loop.grow import ABOVE_MESH, EVIDENCE, at_edge, evidence, mesh_cos
 from femsense.loop.joint import Prior
 from femsense.loop.noise import Noise
 from femsense.loop.result import LoopResult
+from femsense.loop.rivals import in_place_of
 from femsense.loop.screen import NUISANCE, TESTABLE, Candidate, confounding, one_each
 from femsense.loop.spread import coordinate_std
 from femsense.loop.stages import Stage, make_stage, own_of
@@ -65,7 +66,7 @@ def conclude(data: Data, search: Search, rng: np.random.Generator) -> LoopResult
     excess = _excess(before, final, noise)
     unexplained = tests.significant and excess.left > excess.tolerated and excess.explained < EXPLAINED
     verdict = "unexplained" if unexplained else "effects" if effects else "none"
-    rivals = _confounded(search, names)
+    rivals = [*_confounded(search, names), *_in_place_of_zeros(data, search, promoted)]
     not_testable = [
         {"name": c.effect.name, "absorbed_share": float(np.sqrt(max(0.0, 1.0 - c.retained**2))), "retained_share": c.retained}
         for c in one_each(search.first)
@@ -344,6 +345,16 @@ def _confounded(search: Search, names: list[str]) -> list[dict[str, Any]]:
     return pairs
 
 
+def _in_place_of_zeros(data: Data, search: Search, promoted: list[str]) -> list[dict[str, Any]]:
+    """Return pairs of `cable_offset`, where it is named, with effects that explain the data as well with the zeros as declared."""
+    if "cable_offset" not in promoted:
+        return []
+    final = search.final
+    without = _refitted(data, final, [n for n in final.fit.hypothesis.names if n != "cable_offset"], search.noise)
+    tried = list(dict.fromkeys(c.effect.name for c in search.first))
+    return in_place_of(data, "cable_offset", final, without, search.noise, search.n_effective, tried)
+
+
 def _step_of(search: Search, name: str) -> int:
     return next(int(r["step"]) for r in search.refits if r["name"] == name and r.get("verdict") == "named")
 
@@ -369,7 +380,9 @@ def _next_experiment(
     pairs = [(r["pair"][0], r["pair"][1]) for r in rivals]
     predicted = next_element(data, final.fit, noise.total / np.sqrt(3.0), pairs, [r["name"] for r in not_testable])
     if predicted:
-        return "; or ".join(f"{words} (expected evidence {before:.0f} → {after:.0f})" for words, before, after in predicted[:2])
+        return "; or ".join(
+            f"{words} ({what}: expected dBIC {before:.0f} → {after:.0f})" for words, what, before, after in predicted[:2]
+        )
     names = {n for r in rivals for n in r["pair"]} | {r["name"] for r in not_testable}
     advice = []
     recordings = [t.scene.recording for t in data.train]
