@@ -20,6 +20,8 @@ from femsense.fem.chambers import volume_gradient
 from femsense.fem.clamp import first_give
 from femsense.fem.compliance import tangent_at
 from femsense.fem.equilibrium import Equilibrium, solve_equilibrium
+from femsense.fem.iterative import UnsettledError, iterative
+from femsense.fem.linear import Factorization, Pattern, factorize
 from femsense.fem.mesh import Embedding, TetMesh, embed_points
 from femsense.model import Robot
 from femsense.recording import Recording
@@ -366,6 +368,20 @@ class _Balance:
 FINER_STEPS = 5
 FINER_ENOUGH = 0.2
 """Newton steps on the finer mesh end when the unbalanced force has fallen to this share."""
+ROUGH = 1e-2
+"""Share of a step on the finer mesh that may be missing, in energy: it says how large an error is, no more."""
+ROUGH_FROM = 9000
+"""Unknowns from which on such a step takes conjugate gradients instead of a factor."""
+
+
+def roughly(pattern: Pattern, values: FloatArray) -> Factorization | None:
+    """Return a stiffness that is solved to ROUGH, by conjugate gradients where these are faster than a factor."""
+    if pattern.size < ROUGH_FROM or pattern.grid is None or not np.isfinite(values).all():
+        return factorize(pattern, values)
+    try:
+        return iterative(pattern.levels(), values, tolerance=ROUGH) or factorize(pattern, values)
+    except UnsettledError:
+        return factorize(pattern, values)
 
 
 def finer_state(walk: Walk, fine: Walk, frame: int, base: Equilibrium, ties: Embedding) -> FloatArray | None:
@@ -389,7 +405,7 @@ def finer_state(walk: Walk, fine: Walk, frame: int, base: Equilibrium, ties: Emb
         first = size if step == 0 else first
         if step and size < FINER_ENOUGH * first:
             return x
-        tangent = tangent_at(body, replace(base, positions=x, factor=None))
+        tangent = tangent_at(body, replace(base, positions=x, factor=None), roughly)
         move = tangent.respond(force[None])[0]
         if base.held.any():
             move = move + np.tensordot(pulled[base.held[: len(body.cables)]], tangent.respond_to_held(), axes=1)

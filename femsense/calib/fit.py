@@ -45,8 +45,14 @@ def gauss_newton(
     max_iterations: int = 30,
     tolerance: float = 1e-10,
     still: float = STILL,
+    known: tuple[FloatArray, FloatArray | None] | None = None,
+    borrowed: FloatArray | None = None,
+    serves: float = 0.0,
 ) -> FitResult:
     """Minimise ‖r(θ)‖² within bounds (Levenberg's damping where a plain step does not pay).
+
+    A Jacobian that predicted the last step well serves for the next one too; the fit ends only where the Jacobian at θ itself says that
+    there is nothing left to gain.
 
     Arguments:
         evaluate: residual and Jacobian; priors are rows of them.
@@ -55,42 +61,73 @@ def gauss_newton(
         max_iterations: Gauss–Newton steps.
         tolerance: relative decrease at which it stops.
         still: length of a step in whitened residual at which it stops.
+        known: residual and Jacobian at the start, where they are known.
+        borrowed: a Jacobian from near the start to begin with.
+        serves: a Jacobian serves for another step where it missed the change of the residual by less than this share of it.
     """
     from femsense.errors import DataError
 
     p = len(theta)
     low = np.full(p, -np.inf) if low is None else low
     high = np.full(p, np.inf) if high is None else high
-    theta = np.clip(theta, low, high)
-    residual, jacobian = evaluate(theta, True)
-    assert jacobian is not None
+    clipped = np.clip(theta, low, high)
+    known = known if np.array_equal(clipped, theta) else None
+    theta = clipped
+    residual, jacobian, own = _first(evaluate, theta, known, borrowed)
     costs = [float(residual @ residual)]
-    damping, status = 0.0, "iterations"
-    for _ in range(max_iterations):
+    damping, status, steps = 0.0, "iterations", 0
+    while steps < max_iterations or not own:
         scale = np.linalg.norm(jacobian, axis=0)
         scale[scale == 0] = 1.0
         step = _bounded_step(jacobian, residual, scale, damping, low - theta, high - theta)
-        predicted = costs[-1] - float(np.sum((residual + jacobian @ step) ** 2))
-        if predicted <= tolerance * costs[-1] or np.linalg.norm(jacobian @ step) <= still:
+        change = jacobian @ step
+        predicted = costs[-1] - float(np.sum((residual + change) ** 2))
+        small = predicted <= tolerance * costs[-1] or np.linalg.norm(change) <= still
+        if not own and (small or steps >= max_iterations):
+            residual, jacobian, own = *_both(evaluate, theta), True
+            continue
+        if small:
             status = "converged"
             break
+        steps += 1
         try:
             new_residual, _ = evaluate(theta + step, False)
             cost = float(new_residual @ new_residual)
         except DataError:
             cost = np.inf
-        if cost > costs[-1] - 1e-4 * predicted:
+        if not cost <= costs[-1] - 1e-4 * predicted:
+            if not own:
+                residual, jacobian, own = *_both(evaluate, theta), True
+                continue
             damping = max(10.0 * damping, 1e-4)
             if damping > 1e8:
                 status = "converged"
                 break
             continue
         damping = damping / 10.0 if damping > 1e-6 else 0.0
-        theta = theta + step
-        residual, jacobian = evaluate(theta, True)
-        assert jacobian is not None
+        missed = float(np.linalg.norm(new_residual - residual - change))
+        theta, residual, own = theta + step, new_residual, False
+        if missed > serves * float(np.linalg.norm(change)):
+            residual, jacobian, own = *_both(evaluate, theta), True
         costs.append(float(residual @ residual))
     return FitResult(freeze(theta), freeze(covariance_of(jacobian)), freeze(residual), freeze(jacobian), tuple(costs), status)
+
+
+def _first(
+    evaluate: Evaluate, theta: FloatArray, known: tuple[FloatArray, FloatArray | None] | None, borrowed: FloatArray | None
+) -> tuple[FloatArray, FloatArray, bool]:
+    """Return residual and Jacobian to begin with, and whether the Jacobian is that at θ."""
+    if known is not None and known[1] is not None:
+        return known[0], known[1], True
+    if borrowed is not None:
+        return evaluate(theta, False)[0], borrowed, False
+    return *_both(evaluate, theta), True
+
+
+def _both(evaluate: Evaluate, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+    residual, jacobian = evaluate(theta, True)
+    assert jacobian is not None
+    return residual, jacobian
 
 
 def _bounded_step(

@@ -7,6 +7,7 @@ given tension are free to move, chambers under a given pressure too; taut held c
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,8 +22,11 @@ from femsense.fem.cables import add_cable_stiffness, cable_forces, pull_rows
 from femsense.fem.chambers import add_pressure_stiffness, volume_gradient
 from femsense.fem.clamp import with_turning_plate
 from femsense.fem.equilibrium import Equilibrium
-from femsense.fem.linear import Factorization, factorize
+from femsense.fem.linear import Factorization, Pattern, factorize
 from femsense.fem.mesh import Embedding, embed_points
+
+Solver = Callable[[Pattern, FloatArray], Factorization | None]
+"""(pattern, entries in CSC order) → the stiffness factorised, as `factorize` does."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -58,13 +62,14 @@ class Tangent:
         return full.reshape(len(full), self.node_count, 3)
 
 
-def tangent_at(body: BodyModel, equilibrium: Equilibrium) -> Tangent:
-    """Return the exact linearisation of a body at an equilibrium. Raises FemsenseError where it is unstable there."""
+def tangent_at(body: BodyModel, equilibrium: Equilibrium, solver: Solver = factorize) -> Tangent:
+    """Return the exact linearisation of a body at an equilibrium, its stiffness solved by `solver`. Raises FemsenseError where it is
+    unstable there."""
     blocks = internal(body, equilibrium.positions).blocks
     assert blocks is not None
     add_cable_stiffness(body, equilibrium.positions, equilibrium.segment_tensions, blocks)
     add_pressure_stiffness(body, equilibrium.positions, np.array(list(equilibrium.pressure.values())), blocks)
-    factor = with_turning_plate(body, equilibrium.positions, factorize(body.free_map.pattern, reduced_values(body, blocks)))
+    factor = with_turning_plate(body, equilibrium.positions, solver(body.free_map.pattern, reduced_values(body, blocks)))
     if factor is None or (factor.negative > 0 and not body.is_held()):
         raise FemsenseError("the stiffness is singular: nothing holds the body (clamp more nodes)")
     dofs = body.free_map.dofs

@@ -301,13 +301,16 @@ def _galerkin(
 class Iterative:
     """A positive definite stiffness that is solved by conjugate gradients, behind the face of a factor."""
 
-    def __init__(self, levels: Levels, values: FloatArray, inverse: SingleArray, coarse: Cholesky) -> None:
+    def __init__(
+        self, levels: Levels, values: FloatArray, inverse: SingleArray, coarse: Cholesky, tolerance: float = TOLERANCE
+    ) -> None:
         self.negative = 0
         self.size = len(levels.rows) * 3 - 3
         self.bytes = values.nbytes + values.nbytes // 2 + inverse.nbytes + coarse.bytes
         self.iterations = 0
         """Of the last right-hand side."""
         self._levels, self._values, self._inverse, self._coarse = levels, values, inverse, coarse
+        self._tolerance = tolerance
         self._single = values.astype(np.float32)
 
     def solve(self, right: FloatArray) -> FloatArray:
@@ -334,7 +337,7 @@ class Iterative:
         return answer is not None
 
     def _solve_one(self, b: FloatArray) -> FloatArray:
-        x, left, wanted, total = np.zeros(self.size), b, TOLERANCE, 0
+        x, left, wanted, total = np.zeros(self.size), b, self._tolerance, 0
         product = np.empty(self.size)
         for _ in range(RESTARTS):
             part, share = self._conjugate(left, wanted, MOST)
@@ -382,12 +385,14 @@ class Iterative:
         return x.astype(np.float64) * size
 
 
-def iterative(levels: Levels, values: FloatArray) -> Iterative | None:
+def iterative(levels: Levels, values: FloatArray, *, tolerance: float = TOLERANCE) -> Iterative | None:
     """Prepare conjugate gradients for a symmetric matrix; None where it is not positive definite.
 
     Arguments:
         levels: of its pattern, from `make_levels`.
         values: its entries in CSC order, shape (nnz,); kept, not copied.
+        tolerance: share of √(rᵀM⁻¹r) that a solution may leave. With more than that of the test for being definite, the matrix is
+            taken to be so until curvature says otherwise.
 
     Raises:
         UnsettledError: conjugate gradients take too long.
@@ -398,8 +403,8 @@ def iterative(levels: Levels, values: FloatArray) -> Iterative | None:
     coarse = coarse_factor(levels, values)
     if coarse is None:
         return None
-    made = Iterative(levels, values, inverse, coarse)
-    return made if made.is_definite() else None
+    made = Iterative(levels, values, inverse, coarse, tolerance)
+    return made if tolerance > PROBE or made.is_definite() else None
 
 
 def coarse_factor(levels: Levels, values: FloatArray) -> Cholesky | None:

@@ -312,22 +312,17 @@ def embed_points(mesh: TetMesh, points: FloatArray, *, outside_rule: str = "near
     corners = mesh.nodes[mesh.tets[:, :4]]
     centres = corners.mean(axis=1)
     reach = np.linalg.norm(corners - centres[:, None], axis=2).max()
-    near = cKDTree(centres).query(points, k=1)
+    tree = cKDTree(centres)
+    near = tree.query(points, k=1)
     centre_distance = np.asarray(near[0], dtype=np.float64).reshape(len(points))
     element = np.asarray(near[1], dtype=np.int64).reshape(len(points))
     outside = np.zeros(len(points))
-    tree = cKDTree(centres)
-    for i, point in enumerate(points):
-        candidates = np.asarray(tree.query_ball_point(point, reach * (1 + 1e-9)), dtype=np.int64)
-        if len(candidates):
-            inner = barycentric(mesh, candidates, np.broadcast_to(point, (len(candidates), 3)))
-            holder = inner.min(axis=1)
-            if holder.max() >= -1e-9:
-                element[i] = candidates[holder.argmax()]
-                continue
-        element[i], outside[i] = _carrier_of_outsider(
-            mesh, corners, centres, tree, point, centre_distance[i], reach, outside_rule, element[i]
-        )
+    for first in range(0, len(points), AT_ONCE):
+        part = slice(first, first + AT_ONCE)
+        free = first + _find_holders(mesh, tree, points[part], reach, element[part])
+        if len(free):
+            carrier, outside[free] = _carriers_of_outsiders(corners, tree, points[free], centre_distance[free] + reach)
+            element[free] = carrier if outside_rule == "nearest_element" else element[free]
     at = closest_in_tet(corners[element], points)
     slopes = shape_slopes(at, quadratic=mesh.is_quadratic)
     beyond = barycentric(mesh, element, points) - at
@@ -335,13 +330,47 @@ def embed_points(mesh: TetMesh, points: FloatArray, *, outside_rule: str = "near
     return Embedding(mesh.tets[element], weights, element, outside)
 
 
-def _carrier_of_outsider(
-    mesh: TetMesh, corners: FloatArray, centres: FloatArray, tree: cKDTree, point: FloatArray,
-    centre_distance: float, reach: float, rule: str, nearest_centre: int,
-) -> tuple[int, float]:  # fmt: skip
-    """Return the element that carries a point outside of the mesh, and the distance to the mesh [m]."""
-    candidates = np.asarray(tree.query_ball_point(point, centre_distance + reach), dtype=np.int64)
-    nearest = closest_in_tet(corners[candidates], np.broadcast_to(point, (len(candidates), 3)))
-    distance = np.linalg.norm(np.einsum("pi,pic->pc", nearest, corners[candidates]) - point, axis=1)
-    element = nearest_centre if rule == "nearest_centre" else int(candidates[distance.argmin()])
-    return element, float(distance.min())
+AT_ONCE = 4096
+"""Points that are looked for together."""
+
+
+def _find_holders(mesh: TetMesh, tree: cKDTree, points: FloatArray, reach: float, element: IntArray) -> IntArray:
+    """Write the element that holds each point; return the points that none holds."""
+    point, candidate, start = _pairs(tree.query_ball_point(points, reach * (1 + 1e-9), return_sorted=False))
+    if not len(point):
+        return np.arange(len(points))
+    depth = barycentric(mesh, candidate, points[point]).min(axis=1)
+    best, which = _first_largest(depth, start)
+    held = best >= -1e-9
+    element[held] = candidate[which[held]]
+    return np.flatnonzero(~held)
+
+
+def _carriers_of_outsiders(
+    corners: FloatArray, tree: cKDTree, points: FloatArray, radius: FloatArray
+) -> tuple[IntArray, FloatArray]:
+    """Return the element nearest to each point outside of the mesh, and the distance to it [m]."""
+    point, candidate, start = _pairs(tree.query_ball_point(points, radius, return_sorted=False))
+    nearest = closest_in_tet(corners[candidate], points[point])
+    distance = np.linalg.norm(np.einsum("pi,pic->pc", nearest, corners[candidate]) - points[point], axis=1)
+    best, which = _first_largest(-distance, start)
+    return candidate[which], -best
+
+
+def _pairs(found: Any) -> tuple[IntArray, IntArray, IntArray]:
+    """Return pairs (point, candidate) of lists of candidates, one a point, and where those of each point begin, with the end."""
+    count = np.array([len(one) for one in found], dtype=np.int64)
+    candidate = np.array([c for one in found for c in one], dtype=np.int64)
+    return np.repeat(np.arange(len(count)), count), candidate, np.concatenate([[0], np.cumsum(count)])
+
+
+def _first_largest(values: FloatArray, start: IntArray) -> tuple[FloatArray, IntArray]:
+    """Return the largest of each group of values, and where it first stands; −inf where a group is empty."""
+    count = np.diff(start)
+    full = np.flatnonzero(count)
+    best, which = np.full(len(count), -np.inf), np.zeros(len(count), dtype=np.int64)
+    best[full] = np.maximum.reduceat(values, start[full])
+    hits = np.flatnonzero(values == np.repeat(best, count))
+    group, first = np.unique(np.repeat(np.arange(len(count)), count)[hits], return_index=True)
+    which[group] = hits[first]
+    return best, which

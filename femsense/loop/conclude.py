@@ -19,7 +19,7 @@ from femsense.loop.result import LoopResult
 from femsense.loop.rivals import in_place_of
 from femsense.loop.screen import NUISANCE, TESTABLE, Candidate, confounding, one_each
 from femsense.loop.spread import coordinate_std
-from femsense.loop.stages import Stage, make_stage, own_of
+from femsense.loop.stages import Stage, jets_without, make_stage, own_of
 from femsense.loop.structure import describe_left, structure_tests, without_mesh_error
 
 SIGNIFICANT = 3.0
@@ -150,7 +150,9 @@ def _refitted(data: Data, stage: Stage, keep: list[str], noise: Noise) -> Stage:
     mask = np.concatenate([np.full(len(p), e.name in keep) for e, _, p in terms]) if terms else np.zeros(0, dtype=bool)
     hypothesis = replace(stage.fit.hypothesis, terms=tuple(t for t in terms if t[0].name in keep))
     prior = Prior(stage.fit.prior.mean[mask], stage.fit.prior.std[mask])
-    return make_stage(data, hypothesis, prior, noise, stage.fit.coordinates[mask], own=own_of(stage))
+    return make_stage(
+        data, hypothesis, prior, noise, stage.fit.coordinates[mask], own=own_of(stage), near=jets_without(stage, mask)
+    )
 
 
 def _entries(stage: Stage, names: list[str]) -> list[Entry]:

@@ -18,7 +18,7 @@ from femsense.loop.joint import JointFit, Prior, rms_of
 from femsense.loop.noise import Noise
 from femsense.loop.predict import sweeps_predicted
 from femsense.loop.screen import NUISANCE, Candidate, effect_fields, screen
-from femsense.loop.stages import Stage, held_chi2, make_stage, own_of, problem_of
+from femsense.loop.stages import Stage, held_chi2, jets_with, jets_without, make_stage, own_of, problem_of
 
 REFITS = 5
 """Candidates that are refitted in full nonlinearity at the first step; half as many later."""
@@ -30,6 +30,8 @@ ENOUGH_SPREAD = 0.5
 """Standard errors by which the prediction of left-out sweeps must get better."""
 PREDICTS = 0.05
 """Share of the decrease of χ², a row, that must show on held-out rows too."""
+PROMISED = 0.3
+"""A fit from the null that brings less than this share of the linear gain is tried from other starts too."""
 ABOVE_MESH = 0.5
 """An effect must move the markers by this much of what the mesh itself costs (beyond what calibration absorbs)."""
 POLISHED = 2.0
@@ -170,15 +172,25 @@ def refit(data: Data, stage: Stage, candidate: Candidate, noise: Noise) -> Stage
     low, high = np.array([p.low for p in candidate.parameters]), np.array([p.high for p in candidate.parameters])
     start = null if candidate.effect.discrete else np.clip(_first_guess(candidate, null), low, high)
     hypothesis, prior = with_term(stage.fit, candidate.effect, candidate.seed, candidate.parameters)
-    shares = (1.0,) if candidate.effect.discrete else (1.0, 0.3, 0.0)  # a linear step may lead too far
+    free = not candidate.effect.discrete and candidate.effect.name != "gravity"  # for these the null is no start
+    shares = (1.0,) if candidate.effect.discrete else (0.0, 1.0, 0.3) if free else (1.0, 0.3, 0.0)  # a linear step may go too far
+    best: Stage | None = None
     for share in shares:
         coordinates = np.concatenate([stage.fit.coordinates, null + share * (start - null)])
+        known = jets_with(stage, candidate) if free and share == 0.0 else None
+        near = stage.fit.jets if not candidate.parameters else None
         try:
-            made = make_stage(data, hypothesis, prior, noise, coordinates, own=own_of(stage), max_iterations=10)
+            made = make_stage(
+                data, hypothesis, prior, noise, coordinates, own=own_of(stage), max_iterations=10, known=known, near=near
+            )
         except DataError:
             continue
-        if made.fit.chi2 <= stage.fit.chi2 + 1.0:
-            return made
+        if made.fit.chi2 <= (stage.fit.chi2 + 1.0 if best is None else best.fit.chi2):
+            best = made
+        if best is not None and (known is None or stage.fit.chi2 - best.fit.chi2 > PROMISED * candidate.gain):
+            return best
+    if best is not None:
+        return best
     raise DataError("no start from which the fit improves")
 
 
@@ -345,7 +357,16 @@ def _without(data: Data, stage: Stage, index: int, noise: Noise) -> Stage | None
     prior = Prior(stage.fit.prior.mean[keep], stage.fit.prior.std[keep])
     hypothesis = replace(stage.fit.hypothesis, terms=terms[:index] + terms[index + 1 :])
     try:
-        return make_stage(data, hypothesis, prior, noise, stage.fit.coordinates[keep], own=own_of(stage), max_iterations=10)
+        return make_stage(
+            data,
+            hypothesis,
+            prior,
+            noise,
+            stage.fit.coordinates[keep],
+            own=own_of(stage),
+            max_iterations=10,
+            near=jets_without(stage, keep),
+        )
     except FemsenseError:
         return None
 

@@ -79,7 +79,9 @@ def improve(
         say(f"screening effects ({found} found so far)")
         fields = fields_of(data, stage, names)
         noise, n_effective = noise_of(data, stage, fields)
-        stage = make_stage(data, stage.fit.hypothesis, stage.fit.prior, noise, stage.fit.coordinates, own=own_of(stage))
+        stage = make_stage(
+            data, stage.fit.hypothesis, stage.fit.prior, noise, stage.fit.coordinates, own=own_of(stage), known=stage.fit.jets
+        )
         history[-1] = (history[-1][0], stage)
         table = screen_stage(data, stage.fit, noise, fields, n_effective)
         first = first or table

@@ -116,6 +116,7 @@ class JointProblem:
     noiseless: bool = False
     """Whether columns of effects are free of the noise of measured points (for screening; a fit wants its own Jacobian)."""
     last: Jets | None = None
+    """With derivatives."""
 
     @property
     def own(self) -> int:
@@ -140,20 +141,26 @@ class JointProblem:
 
     def evaluate(self, theta: FloatArray, derivative: bool) -> tuple[FloatArray, FloatArray | None]:
         """Return whitened residual (N,) and Jacobian (N, p): markers, seats, declared poses, priors."""
-        coordinates = theta[self.own :]
-        rows, blocks, jets, at = [], [], [], 0
-        for trial, factor in zip(self.trials, self.factors):
+        jets, at = [], 0
+        for trial in self.trials:
+            jets.append(self.jet(trial, theta[at : at + trial.size], theta[self.own :], derivative))
+            at += trial.size
+        if derivative:
+            self.last = Jets(jets, np.array(theta))
+        return self.rows_of(jets, theta, derivative)
+
+    def rows_of(self, jets: list[SceneJet], theta: FloatArray, derivative: bool) -> tuple[FloatArray, FloatArray | None]:
+        """Return what `evaluate` makes of the jets of all trials at θ."""
+        rows, blocks, at = [], [], 0
+        for trial, factor, jet in zip(self.trials, self.factors, jets):
             own = theta[at : at + trial.size]
-            jet = self.jet(trial, own, coordinates, derivative)
-            jets.append(jet)
             r, J = self._scene_rows(trial, factor, jet, own, at, len(theta), derivative)
             rows.append(r)
             blocks.append(J)
             at += trial.size
-        r, J = self._prior_rows(coordinates, len(theta))
+        r, J = self._prior_rows(theta[self.own :], len(theta))
         rows.append(r)
         blocks.append(J)
-        self.last = Jets(jets, theta)
         return np.concatenate(rows), np.vstack(blocks) if derivative else None
 
     def jet(self, trial: Trial, own: FloatArray, coordinates: FloatArray, derivative: bool) -> SceneJet:
@@ -202,9 +209,13 @@ class JointProblem:
         return mask if mask.any() else None
 
 
+SERVES = 0.25
+"""Derivatives serve for another step of a fit where they missed the change of the residual by less than this share of it."""
+
+
 def fit_jointly(
     hypothesis: Hypothesis, prior: Prior, trials: list[Trial], noise: Noise, seat_std: float, coordinates: FloatArray,
-    *, own: FloatArray | None = None, max_iterations: int = 12,
+    *, own: FloatArray | None = None, max_iterations: int = 12, known: list[SceneJet] | None = None, near: list[SceneJet] | None = None,
 ) -> JointFit:  # fmt: skip
     """Fit poses, initial inputs and the coordinates of a hypothesis together, in full nonlinearity.
 
@@ -216,6 +227,8 @@ def fit_jointly(
         coordinates: start of the hypothesis, shape (p,).
         own: start of the recordings' own parameters; by default where the trials start.
         max_iterations: Gauss–Newton steps.
+        known: residuals and derivatives at the start, one jet a trial, where they are known.
+        near: derivatives from near the start, to begin with.
 
     Raises:
         DataError: no equilibrium at the start.
@@ -225,8 +238,13 @@ def fit_jointly(
     if own is not None:
         theta[: problem.own] = own
     low, high = problem.bounds()
-    fit = gauss_newton(problem.evaluate, theta, low=low, high=high, max_iterations=max_iterations, tolerance=1e-6, still=0.15)
-    if problem.last is None or not np.array_equal(problem.last.theta, fit.theta) or not problem.last.jets[0].by_pose.size:
+    begin = None if known is None else problem.rows_of(known, theta, True)
+    problem.last = None if known is None else Jets(known, np.array(theta))
+    fit = gauss_newton(
+        problem.evaluate, theta, low=low, high=high, max_iterations=max_iterations, tolerance=1e-6, still=0.15,
+        known=begin, borrowed=None if near is None else problem.rows_of(near, theta, True)[1], serves=SERVES,
+    )  # fmt: skip
+    if problem.last is None or not np.array_equal(problem.last.theta, fit.theta):
         problem.evaluate(fit.theta, True)
     assert problem.last is not None
     return JointFit(hypothesis, prior, fit, problem.own, float(fit.residual @ fit.residual), problem.last.jets)

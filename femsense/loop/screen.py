@@ -36,6 +36,8 @@ class Candidate:
     parameters: tuple[Parameter, ...]
     raw: list[FloatArray]
     """Columns in metres, one array (k, 3, q) a trial."""
+    seats: list[FloatArray]
+    """The same of the seats that rest.csv measures [m], (r, 3, q) a trial."""
     columns: FloatArray
     """Whitened, nuisance projected out, shape (N, q)."""
     retained: float
@@ -137,7 +139,18 @@ def screen(base: JointFit, problem: JointProblem, fields: Fields, n_effective: f
         retained = float(np.linalg.norm(left) / np.linalg.norm(whole))
         result.append(
             Candidate(
-                effect, seed, parameters, own, left, retained, step, gain, float(score), cost, _smallest(left, q, n_effective)
+                effect,
+                seed,
+                parameters,
+                own,
+                rest,
+                left,
+                retained,
+                step,
+                gain,
+                float(score),
+                cost,
+                _smallest(left, q, n_effective),
             )
         )
     return sorted(result, key=lambda c: -c.score)

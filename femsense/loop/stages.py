@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from femsense.arrays import FloatArray
+from femsense.arrays import BoolArray, FloatArray
 from femsense.calib.forward import Hypothesis, SceneJet, evaluate_scene
 from femsense.effects import Effect, Entry, Parameter, find_effect
 from femsense.loop.data import Data, groups_of
@@ -65,10 +65,33 @@ def make_stage(
     *,
     own: FloatArray | None = None,
     max_iterations: int = 12,
+    known: list[SceneJet] | None = None,
+    near: list[SceneJet] | None = None,
 ) -> Stage:
-    fit = fit_jointly(hypothesis, prior, data.train, noise, data.seat_std, coordinates, own=own, max_iterations=max_iterations)
+    """Return the fit of a hypothesis and what it makes of the held-out data; arguments as of `fit_jointly`."""
+    fit = fit_jointly(
+        hypothesis, prior, data.train, noise, data.seat_std, coordinates,
+        own=own, max_iterations=max_iterations, known=known, near=near,
+    )  # fmt: skip
     held = held_out(data, fit, noise)
     return Stage(fit, held, rms_of([h.jet.residual for h in held]))
+
+
+def jets_with(stage: Stage, candidate: Candidate) -> list[SceneJet]:
+    """Return the jets of a stage with the columns of a candidate behind the others."""
+    return [
+        replace(
+            jet,
+            by_effect=np.concatenate([jet.by_effect, own], axis=2),
+            rest_by_effect=np.concatenate([jet.rest_by_effect, seats], axis=2),
+        )
+        for jet, own, seats in zip(stage.fit.jets, candidate.raw, candidate.seats)
+    ]
+
+
+def jets_without(stage: Stage, keep: BoolArray) -> list[SceneJet]:
+    """Return the jets of a stage with the columns of some coordinates only."""
+    return [replace(j, by_effect=j.by_effect[:, :, keep], rest_by_effect=j.rest_by_effect[:, :, keep]) for j in stage.fit.jets]
 
 
 def own_of(stage: Stage) -> FloatArray:

@@ -1,0 +1,243 @@
+"""How long `femsense improve` takes: 100 frames, 20 effects, 1536 tetrahedra.
+
+    python benchmarks/improve.py                        # tet10 and tet4, something hidden and nothing, three runs each
+    python benchmarks/improve.py --case tet10/friction --runs 1
+
+A bar of 120 × 24 × 24 mm with four cables (16 × 4 × 4 cells, six tetrahedra each) goes through ten sweeps of ten frames: up, held, down. Truth
+has a mesh of its own (14 × 5 × 5 cells, ten nodes each), the rig's integrators of friction, a modulus that is off, an unknown camera
+pose, and noise of markers, frames, sweeps and places. All 17 effects of the list in all their forms are tried, and three of a user's own. Each run is a
+process of its own, from starting Python to loop.json and the page of `femsense report`; BLAS has one thread.
+
+The recordings are kept (--data), so that running it again only times.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+import warnings
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from loop_cases import EARTH, Case, Design, _around, _measure
+
+from femsense.arrays import FloatArray, freeze
+from femsense.effects import apply_effects
+from femsense.files import write_text
+from femsense.recording import save_recording
+from femsense.rig.script import Plan
+from femsense.rig.truth import walk_truth
+from femsense.robot import save_robot
+
+STAGES = (
+    ("reading", "start, reading, calibrating"),
+    ("fitting", "fit of what calibration may move"),
+    ("asking what", "error of the mesh"),
+    ("screening", "screening and noise"),
+    ("refitting", "joint refits"),
+    ("looking", "seeds near by"),
+    ("polishing", "polishing"),
+    ("trying", "richer forms"),
+    ("asking whether", "pruning"),
+    ("testing", "verdict and evidence"),
+    ("report", "report"),
+)
+HIDDEN: dict[str, tuple[dict[str, Any], ...]] = {
+    "nothing": (),
+    "clamp": ({"name": "base_compliance", "stiffness_n_m": 60.0},),
+    "friction": ({"name": "cable_friction", "coefficient": 0.15},),
+    "two": ({"name": "cable_friction", "coefficient": 0.15}, {"name": "creep", "fraction": 0.12, "time_s": 8.0}),
+}
+OWN = {
+    "magnet": '''"""A magnet beside the tip."""
+import numpy as np
+
+name = "magnet"
+parameters = {"force_n": {"unit": "N", "low": -0.5, "high": 0.5, "size": 3}}
+seeds = [{"center_m": [0.115, 0.0, 0.0]}, {"center_m": [0.06, 0.0, 0.0]}]
+
+
+def forces(nodes_m, force_n, center_m):
+    weight = np.exp(-(((nodes_m - center_m) / 0.02) ** 2).sum(axis=1))
+    return np.outer(weight / weight.sum(), force_n)
+''',
+    "taper": '''"""A modulus that grows from the clamp to the tip."""
+
+name = "taper"
+parameters = {"slope": {"low": -0.8, "high": 0.8}}
+
+
+def change(robot, slope):
+    body = robot.body
+    along = body.mesh.nodes[body.mesh.tets[:, :4]].mean(axis=1)[:, 0]
+    return robot.with_body(body.with_stiffness_scale(1.0 + slope * (along / 0.12 - 0.5)))
+''',
+    "lens": '''"""A lens with radial distortion."""
+
+name = "lens"
+parameters = {"k1": {"low": -0.2, "high": 0.2}}
+
+
+def correct(points_m, k1):
+    slope = points_m[:, :2] / points_m[:, 2:]
+    bent = points_m.copy()
+    bent[:, :2] *= 1.0 + k1 * (slope**2).sum(axis=1, keepdims=True)
+    return bent
+''',
+}
+
+
+def _bar(p: FloatArray) -> FloatArray:
+    return np.column_stack([0.12 * p[:, 0], 0.012 * p[:, 1:]])
+
+
+BAR = Design(
+    "bar", (16, 4, 4), (14, 5, 5), _bar,
+    {n: ([[0.115, *_around(0.008, a)], [0.075, *_around(0.008, a)], [0.035, *_around(0.008, a)]], [-0.012, *_around(0.012, a)])
+     for n, a in (("a", 0.1), ("b", np.pi / 2), ("c", np.pi), ("d", -np.pi / 2))},
+    (0.02, 0.27, 0.5, 0.74, 0.98), 300e3, 3.0,
+)  # fmt: skip
+
+
+def make(hidden: str, folder: Path) -> None:
+    """Write robot, recording and a user's own effects into a folder."""
+    case = Case(1, "single", BAR, "tension", 1e-4, HIDDEN[hidden], seats=True, hyperelastic=False)
+    declared = BAR.robot(fine=False, law="corotational", gravity=EARTH, modulus=BAR.modulus)
+    true = BAR.robot(fine=True, law="corotational", gravity=EARTH, modulus=0.9 * BAR.modulus)
+    true = apply_effects(true, [_on_clamp(e, len(declared.body.clamped), len(true.body.clamped)) for e in case.hidden])
+    mixes = np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1], [0.7, 0.7, 0, 0], [0, 0.7, 0.6, 0], [0, 0, 0.8, 0.5], [0.5, 0, 0, 0.8],
+                      [0.5, 0.5, 0.5, 0.5], [1, 0, 0.4, 0]])  # fmt: skip
+    order = np.random.default_rng(3).permutation(len(mixes))
+    levels = np.array([0.0, 0.35, 0.7, 1.0, 1.0, 1.0, 0.8, 0.5, 0.2, 0.0])
+    pace = np.array([1.0, 1.0, 1.0, 1.0, 4.0, 8.0, 1.0, 1.0, 1.0, 1.0])
+    recorded = BAR.tension * np.concatenate([np.outer(levels, mixes[m]) for m in order])
+    labels = tuple(f"s{i}" for i in range(len(mixes)) for _ in levels)
+    time_s = np.cumsum(np.tile(pace, len(mixes))) - 1.0
+    F, loaded = len(recorded), np.flatnonzero([label == "s1" for label in labels])
+    plan = Plan(
+        control="tension", time_s=freeze(time_s), sweep=labels, free=freeze(np.ones(F), bool), commanded=freeze(recorded), initial=freeze(np.zeros(4)),
+        pressures=freeze(np.zeros((F, 0))), gravity=None, load_frame=freeze(loaded, np.int64), load_points=freeze(np.tile([0.117, 0.0, 0.012], (len(loaded), 1))),
+        load_forces=freeze(np.tile([0.0, 0.0, -0.08], (len(loaded), 1))), contacts=(),
+    )  # fmt: skip
+    frames = walk_truth(true, plan, substeps=2)
+    markers = np.array([true.markers.positions(f.state.positions) for f in frames])
+    recording = _measure(case, declared, true, plan, recorded, markers, np.random.default_rng(7))[0]
+    for kind in ("tet10", "tet4"):
+        save_robot(declared, folder / f"robot-{kind}")
+        file = folder / f"robot-{kind}" / "robot.toml"
+        write_text(file, file.read_text(encoding="utf-8").replace('"tet10"', f'"{kind}"'))
+    for name, text in OWN.items():
+        write_text(folder / f"{name}.py", text)
+    save_recording(recording, folder / "recording")
+
+
+def _on_clamp(entry: dict[str, Any], declared: int, true: int) -> dict[str, Any]:
+    """Return an entry whose springs, one a node of the declared mesh, are spread over the nodes of the true one."""
+    return {**entry, "stiffness_n_m": entry["stiffness_n_m"] * declared / true} if "stiffness_n_m" in entry else entry
+
+
+def one_run(folder: Path, element: str) -> None:
+    """Close the loop as the command does, and print what each stage took."""
+    from femsense.report import write_report
+    from femsense.steps import improve_into
+
+    warnings.simplefilter("ignore")
+    marks = [("reading", float(os.environ["FEMSENSE_BEGAN"]), 0.0)]
+
+    def mark(text: str) -> None:
+        own = resource.getrusage(resource.RUSAGE_SELF)
+        marks.append((text, time.time(), own.ru_utime + own.ru_stime))
+
+    with tempfile.TemporaryDirectory() as out:
+        document = improve_into(
+            Path(out) / "loop", folder / f"robot-{element}", [folder / "recording"], user_effects=[folder / f"{n}.py" for n in OWN],
+            say=lambda text: None, progress=mark,
+        )  # fmt: skip
+        mark("report")
+        write_report(Path(out) / "loop")
+        mark("end")
+    spent: dict[str, list[float]] = {}
+    for (text, wall, cpu), (_, then, cpu_then) in pairwise(marks):
+        name = next(long for short, long in STAGES if text.startswith(short))
+        entry = spent.setdefault(name, [0.0, 0.0])
+        entry[0] += then - wall
+        entry[1] += cpu_then - cpu
+    print(
+        json.dumps(
+            {"stages": spent, "verdict": document["verdict"], "sentence": document["sentence"], "steps": [m[0] for m in marks]}
+        )
+    )
+
+
+def timed(folder: Path, element: str) -> dict[str, Any]:
+    """Run the loop once in a process of its own; return its stages with wall and CPU seconds."""
+    environment = {
+        **os.environ,
+        "FEMSENSE_BEGAN": repr(time.time()),
+        **{f"{n}_NUM_THREADS": "1" for n in ("OMP", "MKL", "OPENBLAS")},
+    }
+    before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+    answer = subprocess.run(
+        [sys.executable, __file__, "--one", str(folder), "--element", element],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    wall, after = time.perf_counter() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
+    if answer.returncode:
+        raise SystemExit(answer.stderr)
+    cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return {**json.loads(answer.stdout.splitlines()[-1]), "wall_s": wall, "cpu_s": cpu}
+
+
+def show(name: str, runs: list[dict[str, Any]]) -> None:
+    """Print the medians of one case by stage."""
+    print(f"\n{name}: {runs[0]['sentence']}")
+    print(f"  {'stage':36s}{'wall s':>8s}{'CPU s':>8s}")
+    for _, stage in STAGES:
+        rows = [r["stages"].get(stage, [0.0, 0.0]) for r in runs]
+        if any(row[0] > 0 for row in rows):
+            print(f"  {stage:36s}{np.median([r[0] for r in rows]):8.1f}{np.median([r[1] for r in rows]):8.1f}")
+    print(f"  {'all':36s}{np.median([r['wall_s'] for r in runs]):8.1f}{np.median([r['cpu_s'] for r in runs]):8.1f}", flush=True)
+
+
+def main() -> None:
+    """Time the cases and print their tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument(
+        "--case",
+        action="append",
+        help="ELEMENT/HIDDEN, of tet10 | tet4 and nothing | clamp | friction | two; several by repeating",
+    )
+    parser.add_argument("--runs", type=int, default=3)
+    parser.add_argument("--data", type=Path, default=Path(tempfile.gettempdir()) / "femsense-improve")
+    parser.add_argument("--steps", action="store_true", help="list what was done")
+    parser.add_argument("--one", type=Path, help=argparse.SUPPRESS)
+    parser.add_argument("--element", default="tet10", help=argparse.SUPPRESS)
+    given = parser.parse_args()
+    if given.one is not None:
+        one_run(given.one, given.element)
+        return
+    for name in given.case or ["tet10/nothing", "tet10/clamp", "tet10/friction", "tet4/nothing", "tet4/friction"]:
+        element, hidden = name.split("/")
+        folder = given.data / hidden
+        if not (folder / "recording" / "recording.toml").is_file():
+            print(f"making the recording of {hidden} …", flush=True)
+            make(hidden, folder)
+        runs = [timed(folder, element) for _ in range(given.runs)]
+        show(name, runs)
+        if given.steps:
+            print("  " + "; ".join(runs[0]["steps"]))
+
+
+if __name__ == "__main__":
+    main()
