@@ -34,6 +34,10 @@ MOST_UNKNOWNS = 200_000
 """A finer space with more unknowns is not solved …"""
 MOST_WORK = 400_000
 """… and neither is one whose unknowns times the number of loads is above this."""
+MOST_SECONDS = 400.0
+"""… nor one that would take this processor time, judged by the steps of the space before [s]."""
+STEPS = 8
+"""Factorisations that a state and its start take, about."""
 MOST_INPUTS = 4
 """So many cables and chambers are looked at, spread over their list."""
 FORCE_POINTS = 6
@@ -123,14 +127,34 @@ def assess_accuracy(robot: Robot, *, progress: Progress | None = None) -> dict[s
     finest = max(meshes.values(), key=lambda mesh: len(mesh.nodes))
     patches = _patches(robot, finest)
     answers: list[Answer] = []
+    left_out = [f"{_space_name(*space)} (too many unknowns)" for space in SPACES if space not in chosen]
     for element, refinements in chosen:
-        tell(f"{element}, {refinements} refinements" if refinements else element)
+        unknowns = 3 * len(meshes[element, refinements].nodes)
+        seconds = _expected_seconds(answers, unknowns, len(solved.states))
+        if seconds > MOST_SECONDS and (element, refinements) != (coarse, 0):
+            left_out.append(f"{_space_name(element, refinements)} ({unknowns} unknowns, about {seconds / 60:.0f} min)")
+            continue
+        tell(f"{_space_name(element, refinements)}: {unknowns} unknowns" + (f", about {seconds:.0f} s" if seconds >= 10 else ""))
         body = _on(robot.body, meshes[element, refinements])
         answer, states = _answer(body, (element, refinements), loads, places, patches, solved)
-        if answer is not None and states is not None:
-            answers.append(answer)
-            solved = states
-    return _report(robot, coarse, loads, answers, len(SPACES) - len(answers))
+        if answer is None or states is None:
+            left_out.append(f"{_space_name(element, refinements)} (does not converge)")
+            continue
+        answers.append(answer)
+        solved = states
+    return _report(robot, coarse, loads, answers, left_out)
+
+
+def _space_name(element: str, refinements: int) -> str:
+    return f"{element}, split into eight" if refinements else element
+
+
+def _expected_seconds(answers: Sequence[Answer], unknowns: int, states: int) -> float:
+    """Return the processor time that a space would take: direct factors of a solid grow with the square of the unknowns."""
+    if not answers:
+        return 0.0
+    largest = max(answers, key=lambda answer: answer.unknowns)
+    return STEPS * states * 1e-3 * largest.step_ms * (unknowns / largest.unknowns) ** 2
 
 
 def _on(body: BodyModel, mesh: TetMesh) -> BodyModel:
@@ -295,7 +319,9 @@ def _carried(known: Equilibrium, ties: Embedding) -> Equilibrium:
 # The report
 
 
-def _report(robot: Robot, coarse: str, loads: Sequence[Load], answers: Sequence[Answer], left_out: int) -> dict[str, Any]:
+def _report(
+    robot: Robot, coarse: str, loads: Sequence[Load], answers: Sequence[Answer], left_out: Sequence[str]
+) -> dict[str, Any]:
     declared = next(answer for answer in answers if answer.is_space(coarse, 0))
     reference = _reference(answers)
     errors = [_errors(answer, reference) for answer in answers]
@@ -304,7 +330,7 @@ def _report(robot: Robot, coarse: str, loads: Sequence[Load], answers: Sequence[
     own = errors[[answer is declared for answer in answers].index(True)]
     report = {
         "declared": {"element": coarse, "tetrahedra": declared.tetrahedra, "unknowns": declared.unknowns},
-        "reference": reference.description | {"spaces_left_out": left_out},
+        "reference": reference.description | {"spaces_left_out": len(left_out), "left_out": list(left_out)},
         "loads": [_load_row(load, own, i) for i, load in enumerate(loads)],
         "forces": _force_table(own, robot),
         "spaces": spaces,
@@ -452,9 +478,12 @@ def accuracy_text(report: Mapping[str, Any]) -> str:
         lines += ["", f"  a sensed force is off by {text} % at {len(forces)} places (+: sensed too large, the mesh is too stiff)"]
     lines += ["", f"  {'space':<24}{'tetrahedra':>10}{'unknowns':>10}{'ms a step':>11}{'motion':>9}{'force':>9}"]
     for space in report["spaces"]:
-        name = f"{space['element']}{', split into eight' if space['refinements'] else ''}{' *' if space['declared'] else ''}"
+        name = f"{_space_name(space['element'], space['refinements'])}{' *' if space['declared'] else ''}"
         lines.append(f"  {name:<24}{space['tetrahedra']:>10}{space['unknowns']:>10}{space['step_ms']:>11.0f}{_percent(space['motion_percent']):>9}{_percent(space['force_percent']):>9}")  # fmt: skip
-    lines += ["  * declared; errors are the worst of all loads", "", report["advice"]]
+    lines += ["  * declared; errors are the worst of all loads"]
+    if report["reference"]["left_out"]:
+        lines.append(f"  left out: {'; '.join(report['reference']['left_out'])}")
+    lines += ["", report["advice"]]
     return "\n".join(lines)
 
 

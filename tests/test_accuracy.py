@@ -116,6 +116,17 @@ def test_what_is_too_large_is_left_out_and_said(tmp_path: Path, monkeypatch: pyt
     assert "?" in accuracy_text(alone)
 
 
+def test_what_would_take_too_long_is_left_out_and_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    robot, told = block(tmp_path, "tet10"), list[str]()
+    monkeypatch.setattr(accuracy, "MOST_SECONDS", 0.0)
+    report = assess_accuracy(robot, progress=told.append)
+    assert [(s["element"], s["refinements"]) for s in report["spaces"]] == [("tet4", 0), ("tet10", 0)]
+    split = finer_mesh(robot.body.mesh, "tet10", 1)
+    assert report["reference"]["left_out"][-1].startswith(f"tet10, split into eight ({3 * len(split.nodes)} unknowns, about ")
+    assert "left out: tet4, split into eight (" in accuracy_text(report)
+    assert told == ["the declared mesh", *(f"{s['element']}: {3 * len(finer_mesh(robot.body.mesh, s['element'], 0).nodes)} unknowns" for s in report["spaces"])]  # fmt: skip
+
+
 def test_the_advice_takes_the_cheapest_that_serves(reports: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     _, report = reports["tet4"]
     worst = {(s["element"], s["refinements"]): max(s["motion_percent"], s["force_percent"]) / 100 for s in report["spaces"]}
