@@ -205,6 +205,7 @@ def improve(
     without: Annotated[list[str] | None, typer.Option("--without", metavar="NAME,…", help="Do not try these effects.", show_default=False)] = None,
     user_effect: Annotated[list[Path] | None, typer.Option("--user-effect", metavar="FILE", help="Try an effect of your own (docs/effects/own.md).", show_default=False)] = None,
     again: Annotated[bool, typer.Option("--again", help="Compute even where OUT holds this result already.")] = False,
+    workers: Annotated[int | None, typer.Option("--workers", metavar="N", min=1, help="Threads that work; by default one a core, four at most.", show_default=False)] = None,
     plan: Annotated[bool, typer.Option("--plan", help="Propose what to record, so that effects can be told apart; needs no RECORDING.")] = False,
     given: Annotated[Path | None, typer.Option("--given", metavar="RECORDING", help="With --plan: what is recorded already.", show_default=False)] = None,
     noise: Annotated[float, typer.Option("--noise", metavar="MM", min=0.0, help="With --plan: noise of each coordinate of a marker.")] = 0.2,
@@ -213,9 +214,11 @@ def improve(
     json: Json = False,
 ) -> Answer:  # fmt: skip
     """Find what the model lacks and write the better robot."""
+    from femsense.parallel import set_workers
     from femsense.steps import improve_into, plan_into
     from femsense.summary import loop_text
 
+    set_workers(workers)
     if plan:
         with _progress("plan") as progress:
             return Answer(

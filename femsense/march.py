@@ -18,16 +18,18 @@ from femsense.fem.body import BodyModel
 from femsense.fem.cables import bend_angles, cable_forces, rub, shortening
 from femsense.fem.chambers import volume_gradient
 from femsense.fem.clamp import first_give
-from femsense.fem.compliance import tangent_at
+from femsense.fem.compliance import Tangent, tangent_at
 from femsense.fem.equilibrium import Equilibrium, solve_equilibrium
 from femsense.fem.iterative import UnsettledError, iterative
-from femsense.fem.linear import Factorization, Pattern, factorize
+from femsense.fem.linear import Factorization, Pattern, available_memory, factorize
 from femsense.fem.mesh import Embedding, TetMesh, embed_points
 from femsense.model import Robot
+from femsense.parallel import each
 from femsense.recording import Recording
 
-FACTOR_MEMORY = 2e9
-"""Factors of several frames are kept up to this total [bytes]."""
+FACTOR_MEMORY = 3e9
+"""Factors of several frames are kept up to this total [bytes], and up to MEMORY_SHARE of the memory that is free."""
+MEMORY_SHARE = 0.25
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -188,28 +190,76 @@ def walk_along(
     """
     wanted = set(int(f) for f in frames)
     past = any(has_history(w.robot) for w in (walk, *variants))
-    todo = range(max(wanted) + 1) if past and wanted else sorted(wanted)
-    known: dict[bytes, tuple[Equilibrium, FloatArray, FloatArray]] = {}
-    base: Equilibrium | None = None
-    memory: list[tuple[FloatArray, ...] | None] = [None] * (1 + len(variants))
+    todo = list(range(max(wanted) + 1)) if past and wanted else sorted(wanted)
+    first: dict[bytes, int] = {}
+    alike = {k: k if past else first.setdefault(_key(walk, variants, k), k) for k in todo}
+    unique = [k for k in todo if alike[k] == k]
+    bases = dict(zip(unique, _base_states(walk, unique, starts, past)))
+    answers: dict[int, tuple[FloatArray, FloatArray]] = {}
+    room = _room(len(unique))
+    for k, seen, others, factor in _answers(walk, variants, bases, observe, past):
+        answers[k] = seen, others
+        if factor is not None and starts is not None and factor.bytes < room:
+            starts[k] = replace(starts[k], factor=factor)
     for k in todo:
-        key = _key(walk, variants, k)
-        if not past and key in known:
-            yield k, *known[key]
-            continue
-        near = base if starts is None else starts.get(k, base)
-        near = near if near is None or _clamp_fits(walk.robot.body, near) else None
-        base = _require(solve_frame(walk, k, start=near, before=memory[0], reuse_factor=near is not base), k)
-        memory[0] = base.segment_tensions if past else None
-        seen = observe(walk.robot, base)
-        others = _observe_variants(walk, variants, k, base, seen, observe, memory)
-        kept = replace(base, factor=None)
-        if starts is not None:
-            starts[k] = base if base.factor is not None and len(todo) * base.factor.bytes < FACTOR_MEMORY else kept
-        if not past:
-            known[key] = (kept, seen, others)
         if k in wanted:
-            yield k, kept, seen, others
+            yield k, bases[alike[k]], *answers[alike[k]]
+
+
+def _room(count: int) -> float:
+    """Return how much memory a factor may take where so many are kept [bytes]."""
+    return min(FACTOR_MEMORY, MEMORY_SHARE * available_memory()) / max(count, 1)
+
+
+def _base_states(walk: Walk, frames: list[int], starts: dict[int, Equilibrium] | None, past: bool) -> Iterator[Equilibrium]:
+    """Yield the states of frames, without their factors; `starts` gets them with these where they fit into memory."""
+    body, room = walk.robot.body, _room(len(frames))
+    near = {} if starts is None else {k: starts[k] for k in frames if k in starts and _clamp_fits(body, starts[k])}
+
+    def keep(k: int, state: Equilibrium) -> Equilibrium:
+        bare = replace(state, factor=None)
+        if starts is not None:
+            starts[k] = state if state.factor is not None and state.factor.bytes < room else bare
+        return bare
+
+    def again(k: int) -> Equilibrium:
+        return keep(k, _require(solve_frame(walk, k, start=near[k], reuse_factor=True), k))
+
+    if not past and len(near) == len(frames):
+        yield from each(again, frames)
+        return
+    last: Equilibrium | None = None
+    before: tuple[FloatArray, ...] | None = None
+    for k in frames:
+        start = near.get(k, last)
+        start = start if start is None or _clamp_fits(body, start) else None
+        last = _require(solve_frame(walk, k, start=start, before=before, reuse_factor=start is not last), k)
+        before = last.segment_tensions if past else None
+        yield keep(k, last)
+
+
+Answer = tuple[int, FloatArray, FloatArray, Factorization | None]
+"""Frame, observation (p, 3), observations of variants (v, p, 3), the factor that gave them."""
+
+
+def _answers(
+    walk: Walk, variants: Sequence[Walk], bases: dict[int, Equilibrium], observe: Callable[[Robot, Equilibrium], FloatArray], past: bool
+) -> Iterator[Answer]:  # fmt: skip
+    """Yield what is observed in each base state, and of the variants there."""
+    body, memory = walk.robot.body, list[tuple[FloatArray, ...] | None]([None] * (1 + len(variants)))
+
+    def at(k: int, tangent: Tangent | None, memory: list[tuple[FloatArray, ...] | None]) -> Answer:
+        seen = observe(walk.robot, bases[k])
+        return k, seen, *_observe_variants(walk, variants, k, bases[k], seen, observe, memory, tangent)
+
+    if not past:
+        yield from each(lambda k: at(k, None, list(memory)), bases)
+        return
+    if not any(_linear(walk, v) and not _same_mechanics(walk, v) for v in variants):
+        yield from (at(k, None, memory) for k in bases)
+        return
+    for k, tangent in zip(bases, each(lambda k: tangent_at(body, bases[k]), bases)):
+        yield at(k, tangent, memory)
 
 
 def _clamp_fits(body: BodyModel, state: Equilibrium) -> bool:
@@ -220,9 +270,12 @@ def _clamp_fits(body: BodyModel, state: Equilibrium) -> bool:
 
 def _observe_variants(
     walk: Walk, variants: Sequence[Walk], k: int, base: Equilibrium, seen: FloatArray, observe: Callable[[Robot, Equilibrium], FloatArray],
-    memory: list[tuple[FloatArray, ...] | None],
-) -> FloatArray:  # fmt: skip
-    """Return what is observed of each variant in frame k, shape (v, p, 3); `memory` keeps the tensions along their cables."""
+    memory: list[tuple[FloatArray, ...] | None], tangent: Tangent | None = None,
+) -> tuple[FloatArray, Factorization | None]:  # fmt: skip
+    """Return what is observed of each variant in frame k, shape (v, p, 3), and the factor of the stiffness where it took one.
+
+    `memory` keeps the tensions along the cables of the variants; `tangent` is that of the base state, where it is known.
+    """
     others = np.zeros((len(variants), *seen.shape))
     linear = []
     for i, variant in enumerate(variants):
@@ -235,8 +288,8 @@ def _observe_variants(
         else:
             linear.append(i)
     if not linear:
-        return others
-    tangent = tangent_at(walk.robot.body, base)
+        return others, None
+    tangent = tangent_at(walk.robot.body, base) if tangent is None else tangent
     balance = _Balance(walk, k, base)
     starts = [balance.carried(variants[i]) for i in linear]
     moves = np.zeros((len(linear), *base.positions.shape))
@@ -254,7 +307,7 @@ def _observe_variants(
     for i, start, move, (_, _, tensions) in zip(linear, starts, moves, answers):
         memory[1 + i] = tensions
         others[i] = observe(variants[i].robot, replace(base, positions=start + move))
-    return others
+    return others, tangent.factor
 
 
 def _linear(walk: Walk, variant: Walk) -> bool:

@@ -167,3 +167,53 @@ def test_what_the_data_do_not_see_has_no_bound_on_its_spread() -> None:
     np.testing.assert_allclose(covariance_of(J), np.linalg.inv(J.T @ J), rtol=1e-7)
     mixed = covariance_of(np.column_stack([J[:, 0], np.zeros(9), J[:, 1], J[:, 1]]))
     assert np.isfinite(mixed[0, 0]) and np.isinf(mixed[1, 1]) and np.isinf(mixed[2, 2]) and np.isinf(mixed[3, 3])
+
+
+def counted(power: float):
+    """Return an evaluation of a bent line with noise, and the list of the derivatives that it was asked for."""
+    x = np.linspace(0.1, 1.0, 30)
+    y = 0.7 * x**1.3 + 0.2 + 0.01 * np.sin(40 * x)
+    asked: list[bool] = []
+
+    def evaluate(theta: np.ndarray, derivative: bool) -> tuple[np.ndarray, np.ndarray | None]:
+        asked.append(derivative)
+        a, b, c = theta
+        r = a * x ** (1 + power * b) + c - y
+        J = np.column_stack([x ** (1 + power * b), a * power * np.log(x) * x ** (1 + power * b), np.ones_like(x)])
+        return r, J if derivative else None
+
+    return evaluate, asked
+
+
+def test_a_jacobian_that_serves_again_ends_at_the_same_place_with_fewer_of_them() -> None:
+    results, jacobians = [], []
+    for serves in (0.0, 0.3):
+        evaluate, asked = counted(1.0)
+        results.append(gauss_newton(evaluate, np.array([0.6, 0.2, 0.1]), serves=serves, still=1e-12, tolerance=1e-14))
+        jacobians.append(sum(asked))
+    np.testing.assert_allclose(results[1].theta, results[0].theta, atol=1e-7)
+    assert results[1].status == "converged" and jacobians[1] < jacobians[0]
+    evaluate, _ = counted(1.0)
+    np.testing.assert_array_equal(results[1].jacobian, evaluate(results[1].theta, True)[1])  # that at the end
+
+
+def test_what_is_known_at_the_start_is_not_evaluated_again() -> None:
+    evaluate, asked = counted(1.0)
+    start = np.array([0.6, 0.2, 0.1])
+    known = evaluate(start, True)
+    asked.clear()
+    fit = gauss_newton(evaluate, start, known=known)
+    assert asked[0] is False
+    plain = gauss_newton(counted(1.0)[0], start)
+    np.testing.assert_array_equal(fit.theta, plain.theta)
+    asked.clear()
+    assert gauss_newton(evaluate, plain.theta, known=evaluate(plain.theta, True)).status == "converged" and asked == [True]
+
+
+def test_a_borrowed_jacobian_never_decides_the_end() -> None:
+    evaluate, asked = counted(1.0)
+    start = np.array([0.6, 0.2, 0.1])
+    wrong = np.zeros((30, 3))  # says that nothing can be gained
+    fit = gauss_newton(evaluate, start, borrowed=wrong)
+    np.testing.assert_allclose(fit.theta, gauss_newton(counted(1.0)[0], start).theta, atol=1e-9)
+    assert asked[:2] == [False, True]

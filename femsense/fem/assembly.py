@@ -75,7 +75,7 @@ def reduced_values(body: BodyModel, blocks: FloatArray) -> FloatArray:
     return np.asarray(_gather(blocks.ravel(), body.free_map.source))
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _gather(values: FloatArray, source: IntArray) -> FloatArray:
     result = np.empty(len(source))
     for k in range(len(source)):

@@ -344,10 +344,17 @@ class Analysis:
 
     def take(self, kind: str) -> npt.NDArray[Any]:
         """Return memory for a factor."""
-        for i in range(len(self.idle)):
-            if self.idle[i].dtype.char == kind:
-                array: npt.NDArray[Any] = self.idle.pop(i)
-                return array
+        others = []
+        try:
+            while True:  # other threads may take from the list meanwhile
+                array: npt.NDArray[Any] = self.idle.pop()
+                if array.dtype.char == kind:
+                    return array
+                others.append(array)
+        except IndexError:
+            pass
+        finally:
+            self.idle.extend(others)
         fresh: npt.NDArray[Any] = np.empty(self.offset[-1] + PADDING, kind)
         return fresh
 
@@ -462,7 +469,7 @@ def _extend_add(
                     add_run(L, to + width * unit * place[i], line + width * unit * i, unit * (end - i))
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _factorise(
     values: FloatArray, entries: IntArray, source: IntArray, target: IntArray, unit: int, firsts: IntArray, parent: IntArray,
     begin: IntArray, place: IntArray, offset: IntArray, heads: IntArray, runs: IntArray, room: IntArray, blas: IntArray, L: FloatArray,
@@ -511,7 +518,7 @@ def _factorise(
     return True
 
 
-@njit(cache=True, fastmath={"reassoc", "contract"})
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
 def _solve_one(
     unit: int,
     firsts: IntArray,
@@ -584,7 +591,7 @@ def _solve_one(
         x[c0 : c0 + columns] = total[:columns]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _solve_many(
     unit: int, firsts: IntArray, begin: IntArray, below: IntArray, offset: IntArray, blas: IntArray, L: FloatArray, X: FloatArray,
     work: FloatArray, letters: npt.NDArray[np.uint8], numbers: npt.NDArray[np.int32], scalars: FloatArray,

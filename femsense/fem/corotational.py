@@ -250,7 +250,7 @@ def _linear_stiffness(H, D, shear, bulk, turn, slots, blocks):  # type: ignore[n
             to[8] += z20 * v - z21 * u + bz * w + dot
 
 
-@njit(cache=True, fastmath=FAST)
+@njit(cache=True, nogil=True, fastmath=FAST)
 def corotational_tet4(x, tets, gradients, volumes, mu, lam, limit, tangent, slots, forces, blocks):  # type: ignore[no-untyped-def]
     """Add internal forces [N] and, if asked, the stiffness blocks on and above the diagonal [N/m]; return the energy [J].
 
@@ -282,7 +282,7 @@ def corotational_tet4(x, tets, gradients, volumes, mu, lam, limit, tangent, slot
     return energy
 
 
-@njit(cache=True, fastmath=FAST)
+@njit(cache=True, nogil=True, fastmath=FAST)
 def corotational_tet10(x, tets, gradients, volumes, mu, lam, limit, tangent, slots, forces, blocks):  # type: ignore[no-untyped-def]
     """The same for ten nodes and four points, see `corotational_tet4`."""
     return _kernel(10, 4, 16, x, tets, gradients, volumes, mu, lam, limit, tangent, slots, forces, blocks)

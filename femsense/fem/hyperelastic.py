@@ -122,7 +122,7 @@ def _kernel(count, quad, row, x, tets, gradients, volumes, mu, lam, limit, tange
     return energy
 
 
-@njit(cache=True, fastmath=FAST)
+@njit(cache=True, nogil=True, fastmath=FAST)
 def hyperelastic_tet4(x, tets, gradients, volumes, mu, lam, limit, tangent, slots, forces, blocks):  # type: ignore[no-untyped-def]
     """Add internal forces [N] and, if asked, the stiffness blocks on and above the diagonal [N/m]; return the energy [J].
 
@@ -131,7 +131,7 @@ def hyperelastic_tet4(x, tets, gradients, volumes, mu, lam, limit, tangent, slot
     return _kernel(4, 1, 4, x, tets, gradients, volumes, mu, lam, limit, tangent, slots, forces, blocks)
 
 
-@njit(cache=True, fastmath=FAST)
+@njit(cache=True, nogil=True, fastmath=FAST)
 def hyperelastic_tet10(x, tets, gradients, volumes, mu, lam, limit, tangent, slots, forces, blocks):  # type: ignore[no-untyped-def]
     """See `hyperelastic_tet4`."""
     return _kernel(10, 4, 16, x, tets, gradients, volumes, mu, lam, limit, tangent, slots, forces, blocks)

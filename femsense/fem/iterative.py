@@ -173,7 +173,7 @@ def _expanded(rows: IntArray, columns: IntArray, unit: int) -> tuple[IntArray, I
 # with m blocks in the row ---
 
 
-@njit(cache=True, fastmath={"reassoc", "contract"})
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
 def _times(rows: ShortArray, columns: ShortArray, values: FloatArray, x: FloatArray, y: FloatArray) -> None:
     """Write y = K x."""
     for i in range(len(rows) - 1):
@@ -192,7 +192,7 @@ def _times(rows: ShortArray, columns: ShortArray, values: FloatArray, x: FloatAr
         y[3 * i], y[3 * i + 1], y[3 * i + 2] = s0, s1, s2
 
 
-@njit(cache=True, fastmath={"reassoc", "contract"})
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
 def _sweep_forward(
     rows: ShortArray, columns: ShortArray, values: SingleArray, inverse: SingleArray, r: SingleArray, x: SingleArray, left: SingleArray
 ) -> None:  # fmt: skip
@@ -222,7 +222,7 @@ def _sweep_forward(
                 left[3 * i], left[3 * i + 1], left[3 * i + 2] = -s0, -s1, -s2
 
 
-@njit(cache=True, fastmath={"reassoc", "contract"})
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
 def _sweep_backward(
     rows: ShortArray, columns: ShortArray, values: SingleArray, inverse: SingleArray, r: SingleArray, x: SingleArray
 ) -> None:
@@ -264,7 +264,7 @@ def _diagonal_inverses(rows: ShortArray, columns: ShortArray, values: FloatArray
     return True
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _galerkin(
     rows: ShortArray, columns: ShortArray, values: FloatArray, parent_rows: ShortArray, parents: ShortArray,
     child_rows: ShortArray, children: ShortArray, entry: IntArray, weights: FloatArray, coarse_rows: IntArray, coarse_columns: IntArray,

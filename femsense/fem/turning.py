@@ -61,7 +61,7 @@ def _factorised_laplacian(body: BodyModel) -> Cholesky | None:
     return cholesky(analyse(part.indptr.astype(np.int64), part.indices.astype(np.int64)), part.data)
 
 
-@njit(cache=True, fastmath=FAST)
+@njit(cache=True, nogil=True, fastmath=FAST)
 def _excess(x: FloatArray, step: FloatArray, tets: IntArray, gradients: FloatArray, volumes: FloatArray, out: FloatArray) -> None:
     """Add Σ w (F' − F − dF) ∇N_a to out, shape (n, 3)."""
     F, R, D, A, P = np.empty((9, 1)), np.empty((9, 1)), np.empty(6), np.empty((3, 3)), np.empty((3, 3))

@@ -24,6 +24,7 @@ from femsense.loop.joint import Trial
 from femsense.loop.stages import Stage, placed
 from femsense.march import Walk, drive_of, finer_state
 from femsense.model import Robot
+from femsense.parallel import each
 
 MOST_TETS = 24000
 """A finer mesh than this takes too long in every state."""
@@ -77,12 +78,12 @@ def _moves(
     vectors = _state_vectors(trial, frames)
     chosen = _representatives(vectors, max(8, MOST_WORK // len(fine.body.mesh.tets)))
     known, settled = [], []
-    for i in chosen:
-        base = states[frames[i]]
-        finer = finer_state(coarse_walk, fine_walk, frames[i], base, ties)
+    fine.body.free_map.pattern.analysis()  # before threads ask for it
+    finer_states = each(lambda i: finer_state(coarse_walk, fine_walk, frames[i], states[frames[i]], ties), chosen)
+    for i, finer in zip(chosen, finer_states):
         if finer is not None:
             settled.append(i)
-            known.append(there.positions(finer) - here.positions(base.positions))
+            known.append(there.positions(finer) - here.positions(states[frames[i]].positions))
     if not known:
         raise DataError("no state settles on the finer mesh")
     nearest = np.asarray(cKDTree(vectors[settled]).query(vectors)[1])
