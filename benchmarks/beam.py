@@ -131,7 +131,7 @@ def values(data: Data, stage: Stage) -> dict[str, list[tuple[float, float]]]:
 
 
 def shown(pairs: Sequence[tuple[float, float]]) -> str:
-    return ", ".join(f"{v:.3g} ± {s:.2g}" for v, s in pairs)
+    return ", ".join(f"{v:.3g} ± {s:.2g}" if np.isfinite(v) else "rigid" for v, s in pairs)
 
 
 def sensed(beam: Beam, robot: Robot) -> list[tuple[float, float]]:
@@ -440,7 +440,7 @@ def draw_forces(stages: dict[str, tuple[Stage, list[tuple[float, float]]]]) -> N
 def save(figure: Any, name: str) -> None:
     PICTURES.mkdir(exist_ok=True)
     figure.tight_layout()
-    figure.savefig(PICTURES / f"{name}.png", dpi=110)
+    figure.savefig(PICTURES / f"{name}.png", dpi=110, bbox_inches="tight")
     print(f"wrote docs/pictures/{name}.png", flush=True)
 
 

@@ -189,6 +189,12 @@ SABOTAGES = (
     S("accuracy.py", "step = 1.0 / (2.0**ORDER - 1.0)", "step = 1.0 / 2.0**ORDER", "test_accuracy.py::test_a_model_that_moves_half_as_far_senses_twice_the_force"),
     S("accuracy.py", "/ (own**2).sum(axis=(1, 2)) - 1.0", "/ (true**2).sum(axis=(1, 2)) - 1.0", "test_accuracy.py::test_a_model_that_moves_half_as_far_senses_twice_the_force"),
     # the experiment advisor
+    S("loop/spread.py", "moves = moves - (rise / curve)[:, None] * towards", "moves = moves + (rise / curve)[:, None] * towards", "test_loop_spread.py::test_gravity_seen_along_all_axes_has_the_usual_spread"),
+    S("loop/spread.py", "return np.where(mask, sphere, np.maximum(std, sphere))", "return std", "test_loop_spread.py::test_gravity_seen_along_one_axis_may_point_anywhere_on_a_circle"),
+    S("loop/spread.py", "square / expected * count / freedom", "square / expected", "test_loop_spread.py::test_parameters_leave_less_to_judge_the_noise_by"),
+    S("fem/mesh.py", "still=freeze((1.0 - share[:, None]) * points)", "still=freeze(share[:, None] * points)", "test_effects_clamped_marker.py::test_a_marker_follows_the_body_by_its_share"),
+    S("effects/shape.py", "moved.with_marker_points(robot.marker_points)", "moved", "test_effects_clamped_marker.py::test_a_share_stays_with_the_marker_when_it_moves_or_the_mesh_changes"),
+    S("accuracy.py", "if seconds > MOST_SECONDS and", "if False and", "test_accuracy.py::test_what_would_take_too_long_is_left_out_and_said"),
     S("loop/outlook.py", "left + shared - cross.T @ _inverse(own) @ cross", "left + shared + 0 * cross.T @ _inverse(own) @ cross", "test_plan.py::test_gram_matrices_say_what_projections_of_the_columns_say"),
     S("loop/outlook.py", "gain - float(self.explained[i, j]) + self._price", "gain + self._price", "test_plan.py::test_gram_matrices_say_what_projections_of_the_columns_say"),
     S("loop/outlook.py", "mine = [b for b in blocks if b.recording == key]", "mine = list(blocks)", "test_plan.py::test_two_recordings_have_two_poses_and_one_has_one"),
