@@ -15,7 +15,7 @@ import femsense
 
 PACKAGE = Path(femsense.__file__).parent
 LAYERS = (
-    ("errors", "arrays", "pose"),
+    ("errors", "arrays", "pose", "parallel"),
     ("fem", "pointcloud", "qp"),
     ("model",),
     ("effects",),
