@@ -84,8 +84,10 @@ def _summary(outlook: Outlook, before: Outlook | None) -> list[str]:
         old = len(before.confused()) if what == "confused" else len(getattr(before, what))
         return f"{old} → {new}"
 
+    apart = " → ".join("{} of {}".format(*o.told_apart()) for o in (before, outlook) if o is not None)
     lines = [
-        f"not testable: {count('untestable')}; too small to be seen: {count('unseen')}; pairs that look alike: {count('confused')}"
+        f"not testable: {count('untestable')}; too small to be seen: {count('unseen')}; pairs of effects that would be told apart: {apart}",
+        f"pairs that would both be seen and look alike: {count('confused')}",
     ]
     for i, j, share, gap in sorted(outlook.confused(), key=lambda p: p[3])[:12]:
         names = f"{outlook.rows[i].label} / {outlook.rows[j].label}"

@@ -409,7 +409,8 @@ def _next_experiment(
     if names & {"poisson", "soft_region", "base_compliance", "hyperelastic"}:
         advice.append("add markers on opposite faces and close to the clamp, and pull opposite cables together")
     if names & {"depth_scale", "marker_offset"}:
-        advice.append("record rest.csv: the unloaded body, and move the camera in depth")
+        rest = any(r.rest is not None for r in recordings)
+        advice.append("move the camera in depth" if rest else "record rest.csv: the unloaded body, and move the camera in depth")
     return "; ".join(advice)
 
 

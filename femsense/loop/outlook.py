@@ -380,6 +380,12 @@ class Outlook:
         seen = [r.seen for r in self.rows]
         return [p for p in self.pairs() if seen[p[0]] and seen[p[1]] and (p[2] > ALIKE or p[3] < EVIDENCE)]
 
+    def told_apart(self) -> tuple[int, int]:
+        """Return the number of pairs of effects that would both be seen and told apart, and of all pairs."""
+        pairs = self.pairs()
+        seen = sum(self.rows[i].seen and self.rows[j].seen for i, j, *_ in pairs)
+        return seen - len(self.confused()), len(pairs)
+
     @property
     def untestable(self) -> list[str]:
         return [r.label for r in self.rows if not r.testable]
