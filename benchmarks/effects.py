@@ -131,7 +131,7 @@ def use(robot: Path, recording: Path, folder: Path, control: str) -> list[str]:
     script = folder / "script.toml"
     top = SMALL_ARM.tension if control == "tension" else 4e-3
     write_toml(script, {
-        "format": "femsense-script-1", "actuation": control, 
+        "format": "femsense-script-1", "actuation": control,
         "sweeps": [{"label": label, "cables": {"a": top}, "rest": 1, "up": 1, "down": 1} for label in ("free", "s")],
         "truth": {"refinements": 0, "law": "corotational", "substeps": 1}, "camera": {"eye_m": [0.05, 0.25, 0.3], "target_m": [0.05, 0.0, 0.0]},
         "contacts": [{"sweep": "s", "point_m": [0.08, 0.0, 0.01], "force_n": 0.1}], "markers": {"std_m": 1e-4},

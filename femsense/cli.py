@@ -215,7 +215,7 @@ def improve(
 ) -> Answer:  # fmt: skip
     """Find what the model lacks and write the better robot."""
     from femsense.parallel import set_workers
-    from femsense.steps import improve_into, plan_into
+    from femsense.steps import improve_into, loop_page, plan_into
     from femsense.summary import loop_text
 
     set_workers(workers)
@@ -232,7 +232,9 @@ def improve(
             user_effects=user_effect or [],
             again=again, say=_say, progress=progress,
         )  # fmt: skip
-    return Answer({"folder": str(output), **document}, f"{loop_text(document)}\n\nwritten: {output}")
+    page = loop_page(output, say=_say)
+    text = f"{loop_text(document)}\n\nwritten: {output}" + (f"\nlook at it: {page}" if page is not None else "")
+    return Answer({"folder": str(output), **document}, text)
 
 
 @app.command()

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from femsense import results
-from femsense.errors import InputError
+from femsense.errors import FemsenseError, InputError
 from femsense.files import file_hash
 from femsense.recording import load_recording
 from femsense.robot import load_robot
@@ -108,6 +108,20 @@ def improve_into(
     loop = improve(body, train, validation=test, effects=effects, without=without, user_effects=user_effects, progress=progress)
     results.write_loop(loop, folder, inputs=inputs)
     return results.read_loop(folder)
+
+
+def loop_page(folder: str | Path, *, say: Say) -> Path | None:
+    """Return report.html of a folder with loop.json, written where it is missing or older; None where this installation cannot."""
+    page, loop = Path(folder) / "report.html", Path(folder) / "loop.json"
+    if page.is_file() and page.stat().st_mtime_ns >= loop.stat().st_mtime_ns:
+        return page
+    try:
+        from femsense.report import write_report
+
+        return write_report(folder)
+    except (ImportError, FemsenseError) as error:
+        say(f"no report: {' '.join(str(error).split())}")
+        return None
 
 
 def simulate_into(folder: str | Path, robot: str | Path, script: str | Path) -> Path:

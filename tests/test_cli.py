@@ -22,6 +22,7 @@ import femsense
 from femsense import cli
 from femsense.errors import DataError, InputError
 from femsense.files import PART_PREFIX
+from femsense.steps import loop_page
 
 COMMANDS = ("demo", "inspect", "mesh", "simulate", "calibrate", "estimate", "improve", "export", "view", "report", "doctor")
 ROOT = Path(femsense.__file__).parents[1]
@@ -437,3 +438,31 @@ def test_a_closed_pipe_is_no_error(robot: Path) -> None:
     line = f"{sys.executable} -m femsense inspect {robot} | head -c 1"
     done = subprocess.run(line, shell=True, capture_output=True, text=True, cwd=ROOT, check=False)
     assert done.stderr == ""
+
+
+def test_the_page_of_a_loop_is_written_once_and_again_when_the_loop_is_newer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    written: list[Path] = []
+
+    def write(folder):
+        written.append(Path(folder))
+        (Path(folder) / "report.html").write_text("page")
+        return Path(folder) / "report.html"
+
+    monkeypatch.setattr("femsense.report.write_report", write)
+    loop, page = tmp_path / "loop.json", tmp_path / "report.html"
+    loop.write_text("{}")
+    assert loop_page(tmp_path, say=print) == page
+    assert loop_page(tmp_path, say=print) == page
+    assert len(written) == 1
+    os.utime(loop, ns=(page.stat().st_mtime_ns + 10**9,) * 2)
+    assert loop_page(tmp_path, say=print) == page
+    assert len(written) == 2
+    page.unlink()
+
+    def refuse(folder):
+        raise InputError("nothing to show", where=folder)
+
+    monkeypatch.setattr("femsense.report.write_report", refuse)
+    said: list[str] = []
+    assert loop_page(tmp_path, say=said.append) is None
+    assert "nothing to show" in said[0]
