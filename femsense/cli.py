@@ -204,6 +204,7 @@ def improve(
     effects: Annotated[list[str] | None, typer.Option("--effects", metavar="NAME,…", help="Try these effects only.", show_default=False)] = None,
     without: Annotated[list[str] | None, typer.Option("--without", metavar="NAME,…", help="Do not try these effects.", show_default=False)] = None,
     user_effect: Annotated[list[Path] | None, typer.Option("--user-effect", metavar="FILE", help="Try an effect of your own (docs/effects/own.md).", show_default=False)] = None,
+    measured: Annotated[str, typer.Option("--from", metavar="both|markers|clouds", help="What is used of recordings that have markers and clouds.")] = "both",
     again: Annotated[bool, typer.Option("--again", help="Compute even where OUT holds this result already.")] = False,
     workers: Annotated[int | None, typer.Option("--workers", metavar="N", min=1, help="Threads that work; by default one a core, four at most.", show_default=False)] = None,
     plan: Annotated[bool, typer.Option("--plan", help="Propose what to record, so that effects can be told apart; needs no RECORDING.")] = False,
@@ -229,7 +230,7 @@ def improve(
     with _progress("improve") as progress:
         document = improve_into(
             output, robot, recordings, validation=validation or [], effects=_names(effects), without=_names(without),
-            user_effects=user_effect or [],
+            user_effects=user_effect or [], measured=measured,
             again=again, say=_say, progress=progress,
         )  # fmt: skip
     page = loop_page(output, say=_say)

@@ -67,10 +67,24 @@ class Robot:
     """Where robot.toml and the mesh stand."""
     marker_share: FloatArray | None = None
     """By which share each marker follows the body, shape (k,): 1 sits on it, 0 sits on what holds it; None: all sit on it."""
+    surface_points: int = 0
+    """So many of the markers, the last ones, are points of the surface that clouds are measured at; nobody glued them on."""
 
     def with_body(self, body: BodyModel) -> Robot:
         """Return the robot with another body on the same mesh."""
         return replace(self, body=body)
+
+    @property
+    def glued_names(self) -> tuple[str, ...]:
+        """Names of the markers proper."""
+        return self.marker_names[: len(self.marker_names) - self.surface_points]
+
+    def with_surface_points(self, points: FloatArray) -> Robot:
+        """Return the robot with points of its surface at rest [m], shape (p, 3), behind its markers."""
+        names = tuple(f"surface {i + 1}" for i in range(len(points)))
+        share = None if self.marker_share is None else np.concatenate([self.marker_share, np.ones(len(points))])
+        more = replace(self, marker_names=(*self.marker_names, *names), marker_share=share, surface_points=self.surface_points + len(points))
+        return more.with_marker_points(np.vstack([self.marker_points.reshape(-1, 3), points]))
 
     def with_marker_points(self, points: FloatArray) -> Robot:
         """Return the robot with its markers elsewhere at rest [m], shape (k, 3)."""

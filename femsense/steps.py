@@ -74,6 +74,7 @@ def improve_into(
     effects: Sequence[str] | None = None,
     without: Sequence[str] | None = None,
     user_effects: Sequence[str | Path] = (),
+    measured: str = "both",
     again: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
@@ -86,6 +87,7 @@ def improve_into(
         say: told in one line what happens beside the loop.
         effects, without: names of effects to try, or not to try.
         user_effects: Python files of effects that are tried too.
+        measured: "markers", "clouds" or "both": what is used of recordings that have both.
         again: compute even where the result is there.
         progress: as of `improve`.
 
@@ -101,11 +103,20 @@ def improve_into(
     body = load_robot(robot)
     train, test = [load_recording(path) for path in recordings], [load_recording(path) for path in validation]
     own = {str(file): file_hash(Path(file)) for file in user_effects if Path(file).is_file()}
-    inputs = results.loop_inputs(body, train, test, effects=effects, without=without, user_effects=own)
+    inputs = results.loop_inputs(body, train, test, effects=effects, without=without, user_effects=own, measured=measured)
     if not again and results.finished(folder, inputs):
         say(f"{folder} holds this result already (--again computes it anew)")
         return results.read_loop(folder)
-    loop = improve(body, train, validation=test, effects=effects, without=without, user_effects=user_effects, progress=progress)
+    loop = improve(
+        body,
+        train,
+        validation=test,
+        effects=effects,
+        without=without,
+        user_effects=user_effects,
+        measured=measured,
+        progress=progress,
+    )
     results.write_loop(loop, folder, inputs=inputs)
     return results.read_loop(folder)
 

@@ -136,7 +136,7 @@ def _left(left: Mapping[str, Any]) -> str:
     words = [f"{1e3 * left['rms_m']:.3g} mm rms"]
     marker = (left.get("where") or {}).get("marker")
     if marker:
-        words.append(f"most at marker {marker}")
+        words.append(f"most at {marker}" if str(marker).startswith("surface ") else f"most at marker {marker}")
     tests = left.get("structure") or {}
     if "significant" in tests:
         words.append("with structure" if tests["significant"] else "without structure")
@@ -155,7 +155,10 @@ def effect_text(effect: Mapping[str, Any]) -> str:
 def _loop_rows(document: Mapping[str, Any]) -> list[list[str]]:
     rows = []
     before, after = document.get("before") or {}, document.get("after") or {}
-    for key, name in (("train_rms_m", "residual"), ("validation_rms_m", "residual, held out")):
+    keys = [("train_rms_m", "residual"), ("validation_rms_m", "residual, held out")]
+    if before.get("validation_normal_rms_m") != before.get("validation_rms_m"):
+        keys.append(("validation_normal_rms_m", "clouds, along normals, held out"))
+    for key, name in keys:
         if before.get(key) is not None and after.get(key) is not None:
             rows.append([name, f"{1e3 * before[key]:.3f} → {1e3 * after[key]:.3f} mm rms"])
     if document.get("noise_m") is not None:

@@ -54,13 +54,16 @@ def test_whitening_takes_fields_that_count_as_noise():
 def linear_fit(J: np.ndarray, r: np.ndarray, rest: int = 0) -> SimpleNamespace:
     """Return what `sweeps_predicted` asks of a fit, at the optimum of a linear problem."""
     at_optimum = r - J @ np.linalg.lstsq(J, r, rcond=None)[0]
-    return SimpleNamespace(fit=SimpleNamespace(jacobian=J, residual=at_optimum), jets=[SimpleNamespace(rest=np.zeros((rest, 3)))])
+    return SimpleNamespace(
+        fit=SimpleNamespace(jacobian=J, residual=at_optimum),
+        jets=[SimpleNamespace(rest=np.zeros((rest, 3)), residual=np.zeros((0, 3)))],
+    )
 
 
 def test_left_out_sweeps_are_predicted_as_by_fits_without_them():
     groups = some_groups()
     n = 3 * len(groups.marker)
-    trial = SimpleNamespace(groups=groups, poses=())
+    trial = SimpleNamespace(groups=groups, poses=(), together=False)
     J, r = RNG.normal(size=(n, 6)), RNG.normal(size=n)
     small, large = linear_fit(J[:, :3], r), linear_fit(J, r)
     got, spread = sweeps_predicted([trial], small, large)
@@ -108,7 +111,7 @@ def structure_of(values: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> dict[st
     frame, marker = np.repeat(np.arange(frames), markers), np.tile(np.arange(markers), frames)
     fake = SimpleNamespace(time_s=np.arange(frames) * 1.0, inputs=inputs)
     trial = SimpleNamespace(
-        scene=SimpleNamespace(frame=frame, recording=fake),
+        scene=SimpleNamespace(frame=frame, recording=fake, patches=None),
         groups=Groups(marker, frame, np.unique(labels, return_inverse=True)[1][frame], frame),
     )
     monkeypatch.setattr("femsense.loop.structure.state_key", lambda recording, k: inputs[k].tobytes())

@@ -72,7 +72,7 @@ def calibrate(robot: Robot, recording: Recording, *, frames: Sequence[int] | Non
         seen = seen[np.unique(np.linspace(0, len(seen) - 1, MAX_FRAMES).round().astype(int))]
     scene = make_scene(robot, recording, seen)
     poses = first_poses(robot, scene)
-    initial = _first_inputs(robot, recording)
+    initial = first_inputs(robot, recording)
     history: list[float] = []
     if recording.actuation_zero == "unknown" and robot.body.cables:
         few = seen[np.unique(np.linspace(0, len(seen) - 1, START_FRAMES).round().astype(int))]
@@ -81,7 +81,8 @@ def calibrate(robot: Robot, recording: Recording, *, frames: Sequence[int] | Non
     return _result(robot, scene, fit, poses, initial, jet, history)
 
 
-def _first_inputs(robot: Robot, recording: Recording) -> FloatArray | None:
+def first_inputs(robot: Robot, recording: Recording) -> FloatArray | None:
+    """Return initial inputs to start from [N] or [m], shape (a,): the smallest that leave no cable pushing; None where they are known."""
     if recording.actuation_zero == "absolute":
         return None
     lowest = recording.inputs.min(axis=0) if recording.inputs.size else np.zeros(len(robot.body.cables))
@@ -109,7 +110,7 @@ def first_poses(robot: Robot, scene: Scene) -> list[FloatArray]:
 
 def _pose_from_frame(robot: Robot, scene: Scene, view: int, name: str) -> FloatArray:
     """Fit the first frame in which a camera sees enough markers to the model of that frame."""
-    walk = Walk(robot, drive_of(robot, scene.recording, initial=_first_inputs(robot, scene.recording)))
+    walk = Walk(robot, drive_of(robot, scene.recording, initial=first_inputs(robot, scene.recording)))
     most = 0
     for k in scene.frames:
         rows = (scene.frame == k) & (scene.view == view)
@@ -434,4 +435,4 @@ def _declared(robot: Robot, recording: Recording, frames: IntArray) -> Calibrati
                        np.zeros((4, 4)), np.zeros((6, 6)), none, dict(none), "as declared: there are no markers to fit", frames=tuple(int(recording.frame_numbers[k]) for k in frames))  # fmt: skip
 
 
-__all__ = ["calibrate", "first_poses", "fit_joint", "input_bounds", "usable_frames"]
+__all__ = ["calibrate", "first_inputs", "first_poses", "fit_joint", "input_bounds", "usable_frames"]

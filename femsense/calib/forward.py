@@ -16,8 +16,10 @@ from femsense.arrays import FloatArray, IntArray
 from femsense.effects import Effect, Entry, Parameter, build_entry
 from femsense.errors import DataError
 from femsense.fem.equilibrium import Equilibrium
+from femsense.fem.mesh import Embedding
 from femsense.march import Walk, drive_of, walk_along
 from femsense.model import Observation, Robot
+from femsense.pointcloud.patches import Patches
 from femsense.pose import invert_pose, move_pose, transform_points
 from femsense.recording import Recording
 
@@ -46,12 +48,14 @@ class Scene:
     """shape (r,)."""
     rest_points: FloatArray
     """[m], camera frame, shape (r, 3)."""
+    patches: Patches | None = None
+    """Measured surface at each row, camera frame; `points` are then where the model's normals cross it. None: points are markers."""
 
     def pick(self, frames: IntArray) -> Scene:
         """Return the scene of some of its frames."""
         rows = np.isin(self.frame, frames)
         return replace(self, frames=np.intersect1d(self.frames, frames), frame=self.frame[rows], marker=self.marker[rows],
-                       view=self.view[rows], points=self.points[rows])  # fmt: skip
+                       view=self.view[rows], points=self.points[rows], patches=None if self.patches is None else self.patches.pick(rows))  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -102,14 +106,21 @@ def make_scene(robot: Robot, recording: Recording, frames: IntArray) -> Scene:
     rows = np.isin(recording.marker_frame, frames) & (marker >= 0)
     if not rows.any():
         raise DataError("the recording has no markers that the robot knows in the frames that can be used")
-    rest_marker, rest_view, rest_points = np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3))
-    if recording.rest is not None:
-        rest = recording.rest
-        rest_all = np.array([known.get(name, -1) for name in rest.names], dtype=np.int64)
-        rest_marker, rest_view, rest_points = rest_all[rest_all >= 0], rest.view[rest_all >= 0], rest.positions[rest_all >= 0]
-    used = np.intersect1d(frames, recording.marker_frame[rows])
-    return Scene(recording, used, recording.marker_frame[rows], marker[rows], recording.marker_view[rows], recording.marker_xyz[rows],
-                 rest_marker, rest_view, rest_points)  # fmt: skip
+    used, none = np.intersect1d(frames, recording.marker_frame[rows]), np.zeros(0, np.int64)
+    scene = Scene(recording, used, recording.marker_frame[rows], marker[rows], recording.marker_view[rows], recording.marker_xyz[rows],
+                  none, none, np.zeros((0, 3)))  # fmt: skip
+    return with_rest_markers(robot, scene)
+
+
+def with_rest_markers(robot: Robot, scene: Scene) -> Scene:
+    """Return a scene with the markers that rest.csv measures on the unloaded body."""
+    rest = scene.recording.rest
+    if rest is None:
+        return scene
+    known = {name: i for i, name in enumerate(robot.marker_names)}
+    every = np.array([known.get(name, -1) for name in rest.names], dtype=np.int64)
+    own = every >= 0
+    return replace(scene, rest_marker=every[own], rest_view=rest.view[own], rest_points=rest.positions[own])
 
 
 def undo_depth(points: FloatArray, seen: Observation) -> FloatArray:
@@ -141,6 +152,14 @@ def in_robot_frame(points: FloatArray, view: IntArray, poses: Sequence[FloatArra
     return result
 
 
+def as_measured(points: FloatArray, view: IntArray, poses: Sequence[FloatArray], seen: Observation) -> FloatArray:
+    """Return where each camera measures points of the robot frame [m], camera frame; the inverse of `in_robot_frame`."""
+    result = np.empty_like(points)
+    for v, T in enumerate(poses):
+        result[view == v] = transform_points(invert_pose(T), points[view == v])
+    return redo_depth(result, seen)
+
+
 def seats(robot: Robot, scene: Scene, poses: Sequence[FloatArray]) -> FloatArray:
     """Return where the markers sit at rest [m], shape (m, 3): measured by rest.csv, or as declared."""
     places = robot.marker_points.copy()
@@ -149,11 +168,20 @@ def seats(robot: Robot, scene: Scene, poses: Sequence[FloatArray]) -> FloatArray
     return places
 
 
+def _ties(robot: Robot, scene: Scene, poses: Sequence[FloatArray]) -> Embedding:
+    """Return the ties of the markers to the body, at their seats."""
+    return robot.tie_markers(seats(robot, scene, poses)) if len(scene.rest_marker) else robot.markers
+
+
 def marker_residual(robot: Robot, scene: Scene, poses: Sequence[FloatArray], model: Mapping[int, FloatArray]) -> FloatArray:
-    """Return measured minus modelled markers [m], shape (k, 3), robot frame; model: frame → markers (m, 3)."""
-    measured = in_robot_frame(scene.points, scene.view, poses, robot.observation)
-    predicted = np.array([model[int(f)][m] for f, m in zip(scene.frame, scene.marker)])
-    return np.asarray(measured - predicted.reshape(-1, 3))
+    """Return measured minus modelled markers [m], shape (k, 3), robot frame; model: frame → markers (m, 3).
+
+    Of patches of a measured surface: how far it lies outside of the model's points, along its normal, shape (k, 1).
+    """
+    predicted = np.array([model[int(f)][m] for f, m in zip(scene.frame, scene.marker)]).reshape(-1, 3)
+    if scene.patches is not None:
+        return -scene.patches.distance(as_measured(predicted, scene.view, poses, robot.observation))[:, None]
+    return np.asarray(in_robot_frame(scene.points, scene.view, poses, robot.observation) - predicted)
 
 
 def rest_residual(robot: Robot, scene: Scene, poses: Sequence[FloatArray]) -> FloatArray:
@@ -166,7 +194,7 @@ class SceneJet:
     """Marker residuals of a scene with their derivatives."""
 
     residual: FloatArray
-    """[m], shape (k, 3)."""
+    """[m], shape (k, c): c = 3 for markers, 1 for patches of a surface; so in all that follows."""
     rest: FloatArray
     """Seat residual [m], shape (r, 3)."""
     by_pose: FloatArray
@@ -201,11 +229,10 @@ def evaluate_scene(
     if not vary_initial:
         keep = len(hypothesis.parameters)
         steps, variants = steps[:keep], variants[:keep]
-    place = robot.tie_markers(seats(robot, scene, poses))
-    offset_place = {id(v.robot): v.robot.tie_markers(seats(v.robot, scene, poses)) for v in variants if v.robot is not robot}
+    places = {id(r): _ties(r, scene, poses) for r in (robot, *(v.robot for v in variants))}
 
     def observe(r: Robot, state: Equilibrium) -> FloatArray:
-        return offset_place.get(id(r), place).positions(state.positions)
+        return places.get(id(r), places[id(robot)]).positions(state.positions)
 
     states: dict[int, Equilibrium] = {}
     model: dict[int, FloatArray] = {}
@@ -215,12 +242,14 @@ def evaluate_scene(
         for i in range(len(variants)):
             shifted[i][k] = others[i]
     residual = marker_residual(robot, scene, poses, model)
-    seen_at = _as_predicted(robot, scene, poses, model) if noiseless else scene
+    seen_at = _as_predicted(robot, scene, poses, model) if noiseless and scene.patches is None else scene
     here = marker_residual(robot, seen_at, poses, model)
     columns = [(marker_residual(v.robot, seen_at, poses, m) - here) / h for v, m, h in zip(variants, shifted, steps)]
     split = len(hypothesis.parameters) if derivative else 0
     by_pose, rest_by_pose = (
-        _pose_derivative(robot, scene, poses, states, residual, pivot) if derivative else (np.zeros((len(residual), 3, 0)),) * 2
+        _pose_derivative(robot, scene, poses, states, residual, pivot)
+        if derivative
+        else (np.zeros((*residual.shape, 0)), np.zeros((0, 3, 0)))
     )
     rest = rest_residual(robot, scene, poses)
     rest_columns = [(rest_residual(v.robot, scene, poses) - rest) / h for v, h in zip(variants[:split], steps)]
@@ -230,10 +259,7 @@ def evaluate_scene(
 def _as_predicted(robot: Robot, scene: Scene, poses: Sequence[FloatArray], model: Mapping[int, FloatArray]) -> Scene:
     """Return the scene with every marker where the model would have the camera measure it."""
     places = np.array([model[int(f)][m] for f, m in zip(scene.frame, scene.marker)]).reshape(-1, 3)
-    points = np.empty_like(places)
-    for v, T in enumerate(poses):
-        points[scene.view == v] = transform_points(invert_pose(T), places[scene.view == v])
-    return replace(scene, points=redo_depth(points, robot.observation))
+    return replace(scene, points=as_measured(places, scene.view, poses, robot.observation))
 
 
 def _stack(columns: list[FloatArray], residual: FloatArray) -> FloatArray:

@@ -33,7 +33,7 @@ def _apply_depth(robot: Robot, entry: Entry) -> Robot:
 
 
 def _marker_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
-    return tuple(Parameter("offset_m", (name, i), "m", 0.0, -0.02, 0.02, 1e-6) for name in robot.marker_names for i in range(3))
+    return tuple(Parameter("offset_m", (name, i), "m", 0.0, -0.02, 0.02, 1e-6) for name in robot.glued_names for i in range(3))
 
 
 def _apply_marker(robot: Robot, entry: Entry) -> Robot:

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from femsense.arrays import FloatArray
 from femsense.errors import FemsenseError
-from femsense.loop.data import Data, groups_of
+from femsense.loop.data import Data
 from femsense.loop.joint import JointFit, Trial
 from femsense.loop.menu import Element, menu, setup_for
+from femsense.loop.noise import Noise
 from femsense.loop.outlook import EVIDENCE, Block, Form, Judge, Outlook, Row, forms_of, make_block, turns_of
 from femsense.loop.plan import Proposal, element_block
 from femsense.loop.screen import NUISANCE
@@ -118,14 +118,14 @@ def proposal_text(proposal: Proposal) -> str:
 
 
 def next_element(
-    data: Data, fit: JointFit, noise: float, confounded: Sequence[tuple[str, str]], not_testable: Sequence[str]
+    data: Data, fit: JointFit, noise: Noise, confounded: Sequence[tuple[str, str]], not_testable: Sequence[str]
 ) -> list[tuple[str, str, float, float]]:
     """Return which item of the menu would help most with what the data leave open, and by how much.
 
     Arguments:
         data: of the loop; few of its frames are looked at.
         fit: the model.
-        noise: of a marker's coordinate [m].
+        noise: of the data.
         confounded: pairs of effects that the data cannot tell apart.
         not_testable: effects that they cannot show.
 
@@ -147,7 +147,10 @@ def next_element(
         setup = setup_for(robot, data.control, zero, most=data.input_scale)
         forms = _open_forms(robot, data, names)
         shares = [len(few.scene.frames) / len(t.scene.frames) for few, t in zip(trials, data.train)]
-        have = [_trial_block(t, robot, forms, noise * np.sqrt(share), str(i)) for i, (t, share) in enumerate(zip(trials, shares))]
+        have = [
+            _trial_block(t, robot, forms, noise.row_std(t.groups) * np.sqrt(share), str(i))
+            for i, (t, share) in enumerate(zip(trials, shares))
+        ]
     except FemsenseError:
         return []
     judge, left = Judge(forms, data.input_scale), min(MOST_WORK // tets, MOST_FRAMES)
@@ -159,7 +162,7 @@ def next_element(
             continue
         left -= element.frames + 1
         try:
-            block = element_block(setup, forms, element, noise, with_rest=False)
+            block = element_block(setup, forms, element, noise.row_std(data.train[0].groups), with_rest=False)
         except FemsenseError:
             continue
         then = _open(judge.judge([*have, block]), confounded, not_testable)
@@ -178,8 +181,7 @@ def _one_of_each_first(elements: Sequence[Element]) -> list[Element]:
 def _few(trial: Trial) -> Trial:
     frames = trial.scene.frames
     every = np.unique(np.linspace(0, len(frames) - 1, min(MOST_LOOKED_AT, len(frames))).round().astype(int))
-    scene = trial.scene.pick(frames[every])
-    return replace(trial, scene=scene, groups=groups_of(scene), starts={}, mesh_error=None)
+    return trial.part(frames[every])
 
 
 def _open_forms(robot: Robot, data: Data, names: set[str]) -> list[Form]:

@@ -13,7 +13,7 @@ from femsense.loop.advice import next_element
 from femsense.loop.data import Data
 from femsense.loop.evidence import gather
 from femsense.loop.grow import ABOVE_MESH, EVIDENCE, at_edge, evidence, mesh_cost, moved_by
-from femsense.loop.joint import Prior
+from femsense.loop.joint import Prior, Trial, heads_of, normal_rms_of, rms_of, vectors_of
 from femsense.loop.noise import Noise
 from femsense.loop.result import LoopResult
 from femsense.loop.rivals import in_place_of
@@ -72,9 +72,10 @@ def conclude(data: Data, search: Search, rng: np.random.Generator) -> LoopResult
         for c in one_each(search.first)
         if c.retained < TESTABLE and c.effect.name not in names
     ]
-    robot = apply_effects(data.robot, entries) if entries else data.robot
-    if data.robot.document is not None and entries:
-        robot = replace(robot, document={**data.robot.document, "effects": [*data.robot.document.get("effects", []), *entries]})
+    robot = apply_effects(data.declared, entries) if entries else data.declared
+    if data.declared.document is not None and entries:
+        written = [*data.declared.document.get("effects", []), *entries]
+        robot = replace(robot, document={**data.declared.document, "effects": written})
     return LoopResult(
         verdict=verdict,
         sentence=_sentence(verdict, effects, before, back, noise),
@@ -94,7 +95,7 @@ def conclude(data: Data, search: Search, rng: np.random.Generator) -> LoopResult
             "explained_share": excess.explained,
         },
         robot=robot,
-        declared=data.robot,
+        declared=data.declared,
         data=_card(data, before, final, noise, search.n_effective),
         residuals=_residual_table(data, before, back),
         evidence=gather(data, before, search.history[0][1], final, back, noise, search.first, search.last, tests, rng),
@@ -196,7 +197,8 @@ class Excess:
 
 
 def _excess(before: Stage, final: Stage, noise: Noise) -> Excess:
-    floor = np.sqrt(3.0 * sum(v**2 for k, v in noise.std.items() if k != "state"))
+    axes, std = (3.0, noise.std) if noise.std else (1.0, noise.surface)
+    floor = np.sqrt(axes * sum(v**2 for k, v in std.items() if k != "state"))
     left = float(np.sqrt(max(final.fit.rms**2 - floor**2, 0.0)))
     first = max(before.fit.rms**2 - floor**2, 1e-18)
     return Excess(left, 0.25 * float(floor), float((before.fit.rms**2 - final.fit.rms**2) / first))
@@ -266,24 +268,31 @@ def _placed(slot: Any, part: Any, number: float | None) -> Any:
 
 
 def _errors(data: Data, stage: Stage, rng: np.random.Generator) -> dict[str, Any]:
-    squares = [(r**2).sum(axis=1) for r in stage.held_residuals]
-    labels = [np.unique(t.groups.sweep).size for t in data.held]
-    by_sweep = sum(labels) >= MIN_SWEEPS
-    blocks = [
-        s[group == g]
-        for s, t in zip(squares, data.held)
-        for group in [t.groups.sweep if by_sweep else t.groups.frame]
-        for g in np.unique(group)
-    ]
+    """Return the errors of a stage: of the markers, of clouds along their normals beside them; where there are no markers, twice those."""
+    kind = max(r.shape[1] for r in stage.held_residuals)
+    interval, by = _interval(data, stage, kind, rng)
+    errors = {
+        "train_rms_m": stage.fit.rms,
+        "validation_rms_m": stage.held_rms,
+        "validation_ci_m": interval,
+        "validation_ci_by": by,
+    }
+    held = normal_rms_of(stage.held_residuals)
+    if held is not None:
+        own = interval if kind == 1 else _interval(data, stage, 1, rng)[0]
+        errors |= {"train_normal_rms_m": stage.fit.normal_rms, "validation_normal_rms_m": held, "validation_normal_ci_m": own}
+    return errors
+
+
+def _interval(data: Data, stage: Stage, kind: int, rng: np.random.Generator) -> tuple[list[float], str]:
+    """Return the 95 % interval of the held-out error of markers (kind 3) or clouds (1) [m], and what was drawn again."""
+    pairs = [((r**2).sum(axis=1), t.groups) for r, t in zip(stage.held_residuals, data.held) if r.shape[1] == kind]
+    by_sweep = sum(np.unique(g.sweep).size for _, g in pairs) >= MIN_SWEEPS
+    blocks = [s[labels == g] for s, own in pairs for labels in [own.sweep if by_sweep else own.frame] for g in np.unique(labels)]
     sums, counts = np.array([b.sum() for b in blocks]), np.array([len(b) for b in blocks])
     drawn = rng.integers(0, len(blocks), size=(DRAWS, len(blocks)))
     draws = np.sqrt(sums[drawn].sum(axis=1) / counts[drawn].sum(axis=1))
-    return {
-        "train_rms_m": stage.fit.rms,
-        "validation_rms_m": stage.held_rms,
-        "validation_ci_m": [float(np.quantile(draws, 0.025)), float(np.quantile(draws, 0.975))],
-        "validation_ci_by": "sweeps" if by_sweep else "frames",
-    }
+    return [float(np.quantile(draws, 0.025)), float(np.quantile(draws, 0.975))], "sweeps" if by_sweep else "frames"
 
 
 def _candidate_rows(first: list[Candidate], table: list[Candidate], refits: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -380,14 +389,14 @@ def _next_experiment(
 ) -> str:
     """Return in words what to record to tell apart what these data cannot: as predicted where that is cheap, else by rule."""
     pairs = [(r["pair"][0], r["pair"][1]) for r in rivals]
-    predicted = next_element(data, final.fit, noise.total / np.sqrt(3.0), pairs, [r["name"] for r in not_testable])
+    predicted = next_element(data, final.fit, noise, pairs, [r["name"] for r in not_testable])
     if predicted:
         return "; or ".join(
             f"{words} ({what}: expected dBIC {before:.0f} → {after:.0f})" for words, what, before, after in predicted[:2]
         )
     names = {n for r in rivals for n in r["pair"]} | {r["name"] for r in not_testable}
     advice = []
-    recordings = [t.scene.recording for t in data.train]
+    recordings = [data.train[i].scene.recording for i in heads_of(data.train)]
     unloading = any(
         len(r.inputs) > 1
         and (np.diff(r.inputs, axis=0).max(initial=0.0) > 0)
@@ -408,7 +417,7 @@ def _next_experiment(
         advice.append("hang a known weight on the robot in some frames (loads.csv)")
     if names & {"poisson", "soft_region", "base_compliance", "hyperelastic"}:
         advice.append("add markers on opposite faces and close to the clamp, and pull opposite cables together")
-    if names & {"depth_scale", "marker_offset"}:
+    if names & {"depth_scale", "marker_offset"} and len(data.declared.marker_points):
         rest = any(r.rest is not None for r in recordings)
         advice.append("move the camera in depth" if rest else "record rest.csv: the unloaded body, and move the camera in depth")
     return "; ".join(advice)
@@ -416,13 +425,16 @@ def _next_experiment(
 
 def _sentence(verdict: str, effects: list[dict[str, Any]], before: Stage, after: Stage, noise: Noise) -> str:
     error = f"held-out error {1e3 * before.held_rms:.2f} mm"
+    if not noise.std:
+        error += " along the normals of the surface"
     if verdict == "none":
         return f"The model explains the data to their noise ({1e3 * noise.total:.2f} mm): {error}."
     if verdict == "unexplained" and not effects:
         return f"A residual is left that no effect of the list explains: {error}, noise {1e3 * noise.total:.2f} mm."
     what = ", ".join(f"{e['name']} ({_short(e['parameters'])})" for e in effects)
     tail = "" if verdict == "effects" else " A structured residual is left that no effect explains."
-    return f"The model lacks {what}; held-out error {1e3 * before.held_rms:.2f} mm before, {1e3 * after.held_rms:.2f} mm after.{tail}"
+    where = "" if noise.std else " along the normals of the surface"
+    return f"The model lacks {what}; held-out error{where} {1e3 * before.held_rms:.2f} mm before, {1e3 * after.held_rms:.2f} mm after.{tail}"
 
 
 def _short(parameters: dict[str, Any]) -> str:
@@ -442,12 +454,18 @@ def _card(data: Data, before: Stage, final: Stage, noise: Noise, n_effective: fl
         for name in NUISANCE
         if any(e.name == name for e, _, _ in final.fit.hypothesis.terms)
     }
+
+    def frames(trials: list[Trial]) -> list[list[int]]:
+        return [[int(t.scene.recording.frame_numbers[k]) for k in t.scene.frames] for t in trials]
+
     return {
-        "recordings": [str(t.scene.recording.folder) for t in data.train],
+        "recordings": [str(data.train[i].scene.recording.folder) for i in heads_of(data.train)],
         "split": data.split,
-        "frames_fitted": [[int(t.scene.recording.frame_numbers[k]) for k in t.scene.frames] for t in data.train],
-        "frames_held_out": [[int(t.scene.recording.frame_numbers[k]) for k in t.scene.frames] for t in data.held],
-        "noise_components_m": noise.std,
+        "frames_fitted": frames([data.train[i] for i in heads_of(data.train)]),
+        "frames_held_out": frames([data.held[i] for i in heads_of(data.held)]),
+        "measured": list(data.measured),
+        "clouds": _cloud_card(data, noise),
+        "noise_components_m": noise.std or noise.surface,
         "noise_source": noise.source,
         "mesh_error_m": _mesh_error(data),
         "effective_observations": n_effective,
@@ -456,15 +474,35 @@ def _card(data: Data, before: Stage, final: Stage, noise: Noise, n_effective: fl
     }
 
 
+def _cloud_card(data: Data, noise: Noise) -> dict[str, Any] | None:
+    """Return what was used of clouds; None where they were not."""
+    own = [t for t in data.train if t.scene.patches is not None]
+    if not own:
+        return None
+    rows = [len(t.scene.frame) for t in own]
+    return {
+        "frames": [len(t.scene.frames) for t in own],
+        "rows": rows,
+        "points_m": {
+            data.robot.marker_names[i]: data.robot.marker_points[i].tolist()
+            for i in sorted({int(m) for t in own for m in t.scene.marker})
+        },
+        "noise_components_m": noise.surface,
+        "noise_m": noise.along_normals,
+    }
+
+
 def _mesh_error(data: Data) -> float | None:
     """Return how far a finer mesh would move the markers, root mean square [m]; None where it was not computed."""
-    errors = [(t.mesh_error**2).sum(axis=(1, 2)) for t in data.train if t.mesh_error is not None]
-    return float(np.sqrt(np.mean(np.concatenate(errors)))) if errors else None
+    errors = [t.mesh_error.sum(axis=2) for t in data.train if t.mesh_error is not None]
+    return rms_of(errors) if errors else None
 
 
 def _residual_table(data: Data, before: Stage, after: Stage) -> dict[str, Any]:
     rows: dict[str, list[Any]] = {"recording": [], "frame": [], "marker": [], "before_m": [], "after_m": []}
-    for i, (trial, a, b) in enumerate(zip(data.held, before.held_residuals, after.held_residuals)):
+    for i, at in enumerate(heads_of(data.held)):
+        trial = data.held[at]
+        a, b = (vectors_of(trial, s.held_residuals[at], s.held[at].poses) for s in (before, after))
         numbers = trial.scene.recording.frame_numbers[trial.scene.frame]
         rows["recording"] += [i] * len(a)
         rows["frame"] += [int(n) for n in numbers]

@@ -10,12 +10,12 @@ import numpy as np
 
 from femsense.arrays import FloatArray
 from femsense.calib.calibrate import usable_frames
-from femsense.calib.forward import in_robot_frame
 from femsense.fem.mesh import surface_triangles, to_linear
+from femsense.loop.clouds import cloud_frames
 from femsense.loop.covariates import actuation_of, covariates_of, load_of, rank_with, stacked, unloading
 from femsense.loop.data import Data
 from femsense.loop.forces import View, chosen_frames, equivalent_forces, force_consequence, views_of
-from femsense.loop.joint import JointFit, Trial
+from femsense.loop.joint import JointFit, Trial, heads_of
 from femsense.loop.noise import Noise
 from femsense.loop.predict import sweep_rows
 from femsense.loop.screen import NUISANCE, TESTABLE, Candidate, one_each
@@ -69,10 +69,10 @@ def gather(
             "after": _tests(data.train, [without_mesh_error(t, j.residual, noise) for t, j in zip(data.train, final.fit.jets)], final.fit, after_tests),
         },
         "power": _power(last),
-        "excluded": [_excluded(t.scene.recording, data) for t in data.train],
-        "repeats": sum(_repeats(t) for t in data.train),
+        "excluded": [_excluded(data.train[i].scene.recording, data) for i in heads_of(data.train)],
+        "repeats": sum(_repeats(data.train[i]) for i in heads_of(data.train)),
         "forces": force_consequence(old, new, noise),
-        "equivalent_forces": equivalent_forces(views_of(data, final)[: len(data.train)], noise),
+        "equivalent_forces": equivalent_forces([v for v in views_of(data, final) if not v.held_out], noise),
     })  # fmt: skip
     return found
 
@@ -131,6 +131,7 @@ def _pattern(data: Data, old: list[View], new: list[View]) -> tuple[list[tuple[F
     score is the residual's component along it over √markers, so that it compares with a root mean square.
     """
     count = len(data.robot.marker_names)
+    names = sorted({int(m) for v in old for m in v.trial.scene.marker})
     fields = [(_grid(a, count), _grid(b, count)) for a, b in zip(old, new)]
     _, s, Vt = np.linalg.svd(np.vstack([f for f, _ in fields]), full_matrices=False)
     shape = Vt[0] * (1.0 if Vt[0][np.abs(Vt[0]).argmax()] > 0 else -1.0)
@@ -140,7 +141,7 @@ def _pattern(data: Data, old: list[View], new: list[View]) -> tuple[list[tuple[F
     best = tables[0][0]["covariate"] if tables[0] else None
     return scores, {
         "share": float(s[0] ** 2 / max(float((s**2).sum()), 1e-300)),
-        "pattern": {name: shape.reshape(-1, 3)[i].tolist() for i, name in enumerate(data.robot.marker_names)},
+        "pattern": {data.robot.marker_names[i]: shape.reshape(-1, 3)[i].tolist() for i in names},
         "goes_with_before": tables[0][:6],
         "goes_with_after": tables[1][:6],
         "covariate": best,
@@ -152,7 +153,7 @@ def _grid(view: View, count: int) -> FloatArray:
     """Return the residual as frames × (markers · 3) with the mean of each marker taken off; 0 where a marker is hidden."""
     scene = view.trial.scene
     grid = np.full((len(scene.frames), count, 3), np.nan)
-    grid[np.searchsorted(scene.frames, scene.frame), scene.marker] = view.jet.residual
+    grid[np.searchsorted(scene.frames, scene.frame), scene.marker] = view.vectors
     seen = np.isfinite(grid)
     mean = np.where(seen, grid, 0.0).sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
     return np.where(seen, grid - mean, 0.0).reshape(len(grid), -1)
@@ -161,17 +162,18 @@ def _grid(view: View, count: int) -> FloatArray:
 def _tip(data: Data, old: list[View], new: list[View]) -> dict[str, Any]:
     """Return the way of the marker farthest from the clamp along its main direction of motion: measured, before and after.
 
-    Measured points are where the handed-back calibration puts them; a model stands at measured − residual.
+    Measured points are where the handed-back calibration puts them; a model stands at measured − residual. Clouds do not tell where a
+    point of the surface went: {}.
     """
+    if any(v.trial.scene.patches is not None for v in old):
+        return {}
     seen = set.intersection(*({int(m) for m in v.trial.scene.marker} for v in old))
     if not seen:
         return {}
     far = np.linalg.norm(data.robot.marker_points - data.robot.body.clamp_center, axis=1)
     tip = max(seen, key=lambda m: float(far[m]))
     parts = [(v, w, np.flatnonzero(v.trial.scene.marker == tip)) for v, w in zip(old, new)]
-    measured = [
-        in_robot_frame(w.trial.scene.points, w.trial.scene.view, w.poses, w.robot.observation)[rows] for _, w, rows in parts
-    ]
+    measured = [w.measured[rows] for _, w, rows in parts]
     middle = np.vstack(measured).mean(axis=0)
     axis = np.linalg.svd(np.vstack(measured) - middle, full_matrices=False)[2][0]
     axis = axis if axis[np.abs(axis).argmax()] > 0 else -axis
@@ -197,12 +199,9 @@ def _pictures(data: Data, old: list[View], new: list[View]) -> dict[str, Any]:
     for title, k in chosen_frames(view):
         rows, place = view.rows(k), view.trial.scene.marker[view.rows(k)]
         state = view.jet.states[k].positions
-        measured = in_robot_frame(
-            other.trial.scene.points[rows], other.trial.scene.view[rows], other.poses, other.robot.observation
-        )
         frames.append({
             "title": title, "recording": view.recording, "frame": view.number(k), "marker": [names[m] for m in place],
-            "measured_m": measured.tolist(), "before_m": view.jet.residual[rows].tolist(), "after_m": other.jet.residual[rows].tolist(),
+            "measured_m": other.measured[rows].tolist(), "before_m": view.vectors[rows].tolist(), "after_m": other.vectors[rows].tolist(),
             "nodes_m": np.round(state[corners], 6).tolist() if len(corners) <= MOST_NODES else None,
         })  # fmt: skip
     small = len(corners) <= MOST_NODES
@@ -334,7 +333,7 @@ def _calibration(data: Data, stages: dict[str, Stage]) -> dict[str, Any]:
     zero = stages["before"].fit.fit.theta
     poses, inputs, terms = [], [], []
     at = 0
-    for i, trial in enumerate(data.train):
+    for i, trial in enumerate(data.train[j] for j in heads_of(data.train)):
         for v in range(len(trial.poses)):
             part = slice(at + 6 * v, at + 6 * v + 6)
             moved = {name: (s.fit.fit.theta[part] - zero[part]).tolist() for name, s in stages.items() if name != "before"}
@@ -399,7 +398,7 @@ def lack_of_fit(trials: list[Trial], residuals: list[FloatArray], parameters: in
             mean = values.mean(axis=0)
             lack += len(values) * float(mean @ mean)
             pure += float(((values - mean) ** 2).sum())
-            cells, stays = cells + 3, stays + 3 * len(values)
+            cells, stays = cells + len(mean), stays + len(mean) * len(values)
     own, free = cells - parameters, stays - cells
     if free < REPEATS or own < 1 or pure <= 0:
         return None
@@ -426,7 +425,7 @@ def _stays(trial: Trial) -> dict[int, tuple[int, tuple[bytes, bytes]]]:
 
 
 def _cells(trial: Trial, residual: FloatArray) -> list[FloatArray]:
-    """Return for each state and marker the mean residuals of its stays [m], (n, 3)."""
+    """Return for each state and marker the mean residuals of its stays [m], (n, c)."""
     stays = _stays(trial)
     sums: dict[tuple[tuple[bytes, bytes], int], dict[int, list[FloatArray]]] = {}
     for k, m, r in zip(trial.scene.frame, trial.scene.marker, residual):
@@ -446,6 +445,8 @@ def _excluded(recording: Recording, data: Data) -> dict[str, list[int]]:
     """Return the frames of a recording that are neither fitted nor held out, by reason."""
     used = {int(k) for t in [*data.train, *data.held] if t.scene.recording is recording for k in t.scene.frames}
     usable, marked = set(usable_frames(recording).tolist()), set(recording.marker_frame.tolist())
+    if "clouds" in data.measured:
+        marked |= set(cloud_frames(recording).tolist())
     reasons: dict[str, list[int]] = {}
     for k in range(len(recording.time_s)):
         if k in used:

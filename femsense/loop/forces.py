@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 
 from femsense.arrays import FloatArray, IntArray
-from femsense.calib.forward import SceneJet, seats
+from femsense.calib.forward import SceneJet, in_robot_frame, seats
 from femsense.errors import FemsenseError
 from femsense.fem.compliance import Tangent, compliance, tangent_at
 from femsense.fem.mesh import embed_points, surface_triangles, vertex_normals
 from femsense.loop.covariates import actuation_of
 from femsense.loop.data import Data
-from femsense.loop.joint import Trial
+from femsense.loop.joint import Trial, heads_of, normals_of, numbers_of, vectors_of
 from femsense.loop.noise import Noise
 from femsense.loop.stages import Stage, placed
 from femsense.model import Robot, spread_features
@@ -60,23 +60,36 @@ class View:
 
     def answers(self, tangent: Tangent, frame: int, places: FloatArray) -> FloatArray:
         """Return how the markers of a frame answer to unit forces along x, y, z at places of the body at rest [m/N], (3k, 3p)."""
-        mesh = self.robot.body.mesh
+        mesh, rows = self.robot.body.mesh, self.rows(frame)
         ties = embed_points(mesh, places)
         units = [ties.spread(np.eye(3 * len(places))[j].reshape(-1, 3), len(mesh.nodes)) for j in range(3 * len(places))]
-        marks = self.robot.tie_markers(seats(self.robot, self.trial.scene, self.poses))[self.trial.scene.marker[self.rows(frame)]]
-        return np.stack([marks.moves(move).ravel() for move in tangent.respond(np.array(units))], axis=1)
+        marks = self.robot.tie_markers(seats(self.robot, self.trial.scene, self.poses))[self.trial.scene.marker[rows]]
+        moves = np.array([marks.moves(move) for move in tangent.respond(np.array(units))])
+        if self.trial.scene.patches is not None:
+            moves = np.einsum("jkc,kc->jk", moves, normals_of(self.trial.scene, self.poses)[rows])
+        return moves.reshape(len(moves), -1).T
+
+    @property
+    def vectors(self) -> FloatArray:
+        """Residuals as vectors of the robot frame [m], shape (k, 3): those of clouds along the normals."""
+        return vectors_of(self.trial, self.jet.residual, self.poses)
+
+    @property
+    def measured(self) -> FloatArray:
+        """Measured points [m], shape (k, 3), robot frame; of clouds where the normals cross the measured surface."""
+        scene = self.trial.scene
+        return in_robot_frame(scene.points, scene.view, self.poses, self.robot.observation)
 
 
 def views_of(data: Data, stage: Stage) -> list[View]:
-    """Return all trials as a stage has them: the fitted ones, then those that are held out."""
+    """Return one trial of each recording as a stage has it: the fitted ones, then those that are held out. Markers come before clouds."""
     robot = stage.fit.hypothesis.robot_at(stage.fit.coordinates)
-    fitted = [
-        View(robot, trial, jet, list(poses), i, False)
-        for i, (trial, jet, (poses, _)) in enumerate(zip(data.train, stage.fit.jets, placed(data, stage.fit)))
-    ]
-    held, extra = [], len(data.train)
-    for trial, of, own in zip(data.held, data.held_of, stage.held):
-        held.append(View(robot, trial, own.jet, own.poses, extra if of is None else of, True))
+    poses, numbers = placed(data, stage.fit), numbers_of(data.train)
+    fitted = [View(robot, data.train[i], stage.fit.jets[i], list(poses[i][0]), numbers[i], False) for i in heads_of(data.train)]
+    held, extra = [], len(fitted)
+    for i in heads_of(data.held):
+        of, own = data.held_of[i], stage.held[i]
+        held.append(View(robot, data.held[i], own.jet, own.poses, extra if of is None else numbers[of], True))
         extra += of is None
     return fitted + held
 
@@ -120,7 +133,7 @@ def _at_loads(before: View, after: View, frame: int, noise: Noise) -> dict[str, 
         if len(rows) < len(own):
             return None
         C = view.answers(view.tangent(frame), frame, places)
-        change, spread = _solved(C, view.jet.residual[rows].ravel(), noise.total / np.sqrt(3.0))
+        change, spread = _solved(C, view.jet.residual[rows].ravel(), noise.row_std(view.trial.groups))
         part = slice(3 * main, 3 * main + 3)
         row[f"{name}_n"] = float(size[main] + change[part] @ direction)
         row[f"{name}_std_n"] = float(np.sqrt(direction @ spread[part, part] @ direction))
@@ -185,7 +198,7 @@ def equivalent_forces(views: list[View], noise: Noise) -> dict[str, Any]:
     worst = max(((v, int(k)) for v in views for k in v.trial.scene.frames), key=lambda at: _mean_square(*at))
     view, frame = worst
     r = view.jet.residual[view.rows(frame)].ravel()
-    goal = len(r) * noise.total**2 / 3.0
+    goal = len(r) * noise.row_std(view.trial.groups) ** 2
     if float(r @ r) <= goal:
         return {}
     body = view.robot.body

@@ -240,12 +240,12 @@ def moved_by(before: Stage, after: Stage) -> float:
 
 
 def mesh_cost(data: Data, stage: Stage) -> float:
-    """Return what the mesh costs beyond what calibration absorbs [m], root mean square of the markers; 0 where it is not known."""
+    """Return what the mesh costs beyond what calibration absorbs [m], root mean square as `rms_of` has it; 0 where it is not known."""
     if any(t.mesh_error is None for t in data.train):
         return 0.0
-    errors = [t.mesh_error.sum(axis=2).ravel() for t in data.train if t.mesh_error is not None]
+    errors = [t.mesh_error.sum(axis=2) for t in data.train if t.mesh_error is not None]
     J = [np.concatenate([j.by_pose, j.by_effect], axis=2).reshape(e.size, -1) for j, e in zip(stage.fit.jets, errors)]
-    return float(np.sqrt(3.0 * np.mean(np.concatenate([_rest(j, e) for j, e in zip(J, errors)]) ** 2)))
+    return rms_of([_rest(j, e.ravel()).reshape(e.shape) for j, e in zip(J, errors)])
 
 
 def _rest(columns: FloatArray, values: FloatArray) -> FloatArray:

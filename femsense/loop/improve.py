@@ -25,7 +25,7 @@ from femsense.loop.mesh_error import with_mesh_errors
 from femsense.loop.noise import Noise
 from femsense.loop.result import LoopResult
 from femsense.loop.screen import Candidate
-from femsense.loop.stages import Stage, fields_of, make_stage, noise_of, own_of, screen_stage, with_nuisance
+from femsense.loop.stages import Stage, fields_of, make_stage, noise_of, own_of, rematched, screen_stage, with_nuisance
 from femsense.model import Robot
 from femsense.recording import Recording, state_key
 
@@ -40,6 +40,7 @@ def improve(
     effects: Sequence[str] | None = None,
     without: Sequence[str] | None = None,
     user_effects: Sequence[str | Path] = (),
+    measured: str = "both",
     progress: Progress | None = None,
     seed: int = 0,
 ) -> LoopResult:
@@ -47,11 +48,12 @@ def improve(
 
     Arguments:
         robot: the declared robot.
-        recordings: data to fit; their markers are used.
+        recordings: data to fit: markers, clouds or depth images.
         validation: data to judge on; by default whole sweeps of the recordings are held out.
         effects: names to try; by default all.
         without: names to leave out.
         user_effects: Python files of effects that are tried too (docs/effects/own.md); they belong to "all".
+        measured: "markers", "clouds" or "both": what is used of recordings that have both.
         progress: told what is going on.
         seed: of the permutation test and the bootstrap.
 
@@ -63,12 +65,18 @@ def improve(
     names = _names(effects, without, own)
     rng = np.random.default_rng(seed)
     say("reading and calibrating")
-    data = replace(prepare(robot, recordings, validation), forms=(*FORMS, *own))
+    data = replace(prepare(robot, recordings, validation, measured), forms=(*FORMS, *own))
     noise = Noise({"white": 5e-4}, "start")
-    before = make_stage(data, Hypothesis(robot), Prior(np.zeros(0), np.zeros(0)), noise, np.zeros(0))
+    nothing = Prior(np.zeros(0), np.zeros(0))
+    before = make_stage(data, Hypothesis(data.robot), nothing, noise, np.zeros(0))
     hypothesis, prior = with_nuisance(data)
     say("fitting what calibration may move")
     base = make_stage(data, hypothesis, prior, noise, np.zeros(len(prior.mean)))
+    if "clouds" in data.measured:
+        say("matching the clouds again")
+        data = rematched(data, base, noise, anew=True)
+        base = make_stage(data, hypothesis, prior, noise, base.fit.coordinates, own=own_of(base))
+        before = make_stage(data, Hypothesis(data.robot), nothing, noise, np.zeros(0), own=own_of(before))
     say("asking what the mesh costs")
     data = with_mesh_errors(data, base)
     history: list[tuple[str, Stage]] = [("", base)]
@@ -77,6 +85,9 @@ def improve(
     while True:
         found = len(history) - 1
         say(f"screening effects ({found} found so far)")
+        if found and "clouds" in data.measured:
+            data = rematched(data, stage, noise)
+            stage = make_stage(data, stage.fit.hypothesis, stage.fit.prior, noise, stage.fit.coordinates, own=own_of(stage))
         fields = fields_of(data, stage, names)
         noise, n_effective = noise_of(data, stage, fields)
         stage = make_stage(
@@ -94,6 +105,8 @@ def improve(
         name = next(n for n in winner.fit.hypothesis.names if n not in stage.fit.hypothesis.names)
         stage = prune(data, winner, noise, n_effective, say)
         history.append((name, stage))
+    if len(history) > 1 and "clouds" in data.measured:  # before and after on the same patches
+        before = make_stage(data, Hypothesis(data.robot), nothing, noise, np.zeros(0), own=own_of(before))
     say("testing what is left")
     result = conclude(data, Search(before, history, stage, noise, n_effective, first, table, refits), rng)
     result = replace(result, data={**result.data, "seed": seed})

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from femsense.arrays import BoolArray, FloatArray
+from femsense.arrays import BoolArray, FloatArray, IntArray
 from femsense.calib.fit import FitResult, gauss_newton
 from femsense.calib.forward import Hypothesis, Scene, SceneJet, evaluate_scene, rest_residual
 from femsense.effects.loads import STANDARD_GRAVITY
@@ -14,6 +16,9 @@ from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.mesh import TetMesh
 from femsense.loop.noise import Groups, Noise, Whitener, whiten
 from femsense.pose import move_pose
+
+if TYPE_CHECKING:
+    from femsense.loop.clouds import Sheets
 
 DECLARED_POSE_STD = np.array([2e-3] * 3 + [3e-4] * 3)
 """How far a declared pose is trusted [rad, m]."""
@@ -23,7 +28,7 @@ GRAVITY_STD = 0.1
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Trial:
-    """One recording as the fit sees it."""
+    """One recording as the fit sees it: its markers, or its clouds."""
 
     scene: Scene
     groups: Groups
@@ -36,12 +41,23 @@ class Trial:
     starts: dict[int, tuple[TetMesh, dict[int, Equilibrium]]]
     """States of earlier evaluations, frame by frame, for each mesh."""
     mesh_error: FloatArray | None = None
-    """How far a finer mesh would move the markers [m], one field a sweep, shape (k, 3, sweeps); counts as noise of that size."""
+    """How far a finer mesh would move the markers [m], one field a sweep, shape (k, c, sweeps); counts as noise of that size."""
+    together: bool = False
+    """Whether these are the clouds of the recording whose markers are the trial before: pose and initial inputs are shared."""
+    sheets: Sheets | None = None
+    """What the cameras measured of the robot; only of clouds."""
+    frames: IntArray | None = None
+    """All frames of the recording that are fitted (or held out) with these, markers and clouds; None: those of the scene."""
 
     @property
     def size(self) -> int:
-        """Number of the trial's own parameters."""
+        """Number of the parameters that belong to the recording."""
         return 6 * len(self.poses) + (0 if self.initial is None else len(self.initial))
+
+    def part(self, frames: IntArray) -> Trial:
+        """Return the trial with some of its frames only."""
+        rows = np.isin(self.scene.frame, frames)
+        return replace(self, scene=self.scene.pick(frames), groups=self.groups.of_rows(rows), starts={}, mesh_error=None)
 
     def starts_on(self, mesh: TetMesh) -> dict[int, Equilibrium]:
         """Return the states of earlier evaluations on a mesh (bodies of another size share its elements)."""
@@ -51,6 +67,43 @@ class Trial:
         """Return poses and initial inputs for the trial's own parameters."""
         poses = [move_pose(T, own[6 * v : 6 * v + 6], pivot_a=pivot) for v, T in enumerate(self.poses)]
         return poses, None if self.initial is None else own[6 * len(self.poses) :]
+
+
+def spans_of(trials: Sequence[Trial]) -> list[slice]:
+    """Return where the parameters of each trial's recording stand in θ."""
+    spans: list[slice] = []
+    at = 0
+    for trial in trials:
+        if not trial.together:
+            spans.append(slice(at, at + trial.size))
+            at += trial.size
+        else:
+            spans.append(spans[-1])
+    return spans
+
+
+def numbers_of(trials: Sequence[Trial]) -> list[int]:
+    """Return the number of the recording that each trial belongs to."""
+    return [int(n) - 1 for n in np.cumsum([not t.together for t in trials])]
+
+
+def heads_of(trials: Sequence[Trial]) -> list[int]:
+    """Return the index of the trial of each recording that speaks for it: its markers, where there are any, else its clouds."""
+    return [i for i, t in enumerate(trials) if not t.together]
+
+
+def vectors_of(trial: Trial, residual: FloatArray, poses: Sequence[FloatArray] | None = None) -> FloatArray:
+    """Return a residual (k, c) [m] as vectors of the robot frame, shape (k, 3): those of clouds along the measured normals."""
+    if trial.scene.patches is None:
+        return residual
+    return residual * normals_of(trial.scene, trial.poses if poses is None else poses)
+
+
+def normals_of(scene: Scene, poses: Sequence[FloatArray]) -> FloatArray:
+    """Return the measured outward normals of the rows of a cloud, robot frame, shape (k, 3)."""
+    assert scene.patches is not None
+    turn = np.array([T[:3, :3] for T in poses])[scene.view]
+    return np.asarray(np.einsum("kij,kj->ki", turn, scene.patches.normals))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -95,13 +148,25 @@ class JointFit:
 
     @property
     def rms(self) -> float:
-        """Root mean square 3-D residual of the markers [m]."""
+        """Root mean square residual [m]: 3-D of the markers, where there are none along the normals of the clouds."""
         return rms_of([jet.residual for jet in self.jets])
+
+    @property
+    def normal_rms(self) -> float | None:
+        """Root mean square residual of the clouds along their normals [m]; None without clouds."""
+        return normal_rms_of([jet.residual for jet in self.jets])
 
 
 def rms_of(residuals: list[FloatArray]) -> float:
-    """Return the root mean square 3-D length of residuals (k, 3) [m]."""
-    return float(np.sqrt(np.mean(np.concatenate([(r**2).sum(axis=1) for r in residuals]))))
+    """Return the root mean square 3-D length of the residuals of markers (k, 3) [m]; where there are none, of clouds (k, 1)."""
+    kind = max(r.shape[1] for r in residuals)
+    return float(np.sqrt(np.mean(np.concatenate([(r**2).sum(axis=1) for r in residuals if r.shape[1] == kind]))))
+
+
+def normal_rms_of(residuals: list[FloatArray]) -> float | None:
+    """Return the root mean square of the residuals of clouds (k, 1) [m]; None where there are none."""
+    own = [r.ravel() for r in residuals if r.shape[1] == 1]
+    return float(np.sqrt(np.mean(np.concatenate(own) ** 2))) if own else None
 
 
 @dataclass(eq=False, slots=True)
@@ -120,19 +185,21 @@ class JointProblem:
 
     @property
     def own(self) -> int:
-        return sum(t.size for t in self.trials)
+        return sum(t.size for t in self.trials if not t.together)
 
     def start(self, coordinates: FloatArray) -> FloatArray:
         """Return θ at the trials' starts."""
         parts = [
-            np.concatenate([np.zeros(6 * len(t.poses)), t.initial if t.initial is not None else np.zeros(0)]) for t in self.trials
+            np.concatenate([np.zeros(6 * len(t.poses)), t.initial if t.initial is not None else np.zeros(0)])
+            for t in self.trials
+            if not t.together
         ]
         return np.concatenate([*parts, coordinates])
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
         """Return bounds of θ."""
         low, high = [], []
-        for t in self.trials:
+        for t in (t for t in self.trials if not t.together):
             free = np.full(6 * len(t.poses), np.inf)
             low += [-free, t.input_low if t.initial is not None else np.zeros(0)]
             high += [free, t.input_high if t.initial is not None else np.zeros(0)]
@@ -141,23 +208,19 @@ class JointProblem:
 
     def evaluate(self, theta: FloatArray, derivative: bool) -> tuple[FloatArray, FloatArray | None]:
         """Return whitened residual (N,) and Jacobian (N, p): markers, seats, declared poses, priors."""
-        jets, at = [], 0
-        for trial in self.trials:
-            jets.append(self.jet(trial, theta[at : at + trial.size], theta[self.own :], derivative))
-            at += trial.size
+        spans = spans_of(self.trials)
+        jets = [self.jet(trial, theta[span], theta[self.own :], derivative) for trial, span in zip(self.trials, spans)]
         if derivative:
             self.last = Jets(jets, np.array(theta))
         return self.rows_of(jets, theta, derivative)
 
     def rows_of(self, jets: list[SceneJet], theta: FloatArray, derivative: bool) -> tuple[FloatArray, FloatArray | None]:
         """Return what `evaluate` makes of the jets of all trials at θ."""
-        rows, blocks, at = [], [], 0
-        for trial, factor, jet in zip(self.trials, self.factors, jets):
-            own = theta[at : at + trial.size]
-            r, J = self._scene_rows(trial, factor, jet, own, at, len(theta), derivative)
+        rows, blocks = [], []
+        for trial, factor, jet, span in zip(self.trials, self.factors, jets, spans_of(self.trials)):
+            r, J = self._scene_rows(trial, factor, jet, theta[span], span.start, len(theta), derivative)
             rows.append(r)
             blocks.append(J)
-            at += trial.size
         r, J = self._prior_rows(theta[self.own :], len(theta))
         rows.append(r)
         blocks.append(J)
@@ -174,7 +237,7 @@ class JointProblem:
         self, trial: Trial, factor: Whitener, jet: SceneJet, own: FloatArray, at: int, width: int, derivative: bool
     ) -> tuple[FloatArray, FloatArray]:
         poses = 6 * len(trial.poses)
-        declared = np.array([T is not None for T in trial.scene.recording.T_robot_camera]).repeat(6)
+        declared = np.array([T is not None and not trial.together for T in trial.scene.recording.T_robot_camera]).repeat(6)
         trust = np.where(declared, 1.0 / np.tile(DECLARED_POSE_STD, len(trial.poses)), 0.0)
         r = np.concatenate([whiten(factor, jet.residual), jet.rest.ravel() / self.seat_std, trust * own[:poses]])
         J = np.zeros((len(r), width if derivative else 0))
@@ -250,4 +313,18 @@ def fit_jointly(
     return JointFit(hypothesis, prior, fit, problem.own, float(fit.residual @ fit.residual), problem.last.jets)
 
 
-__all__ = ["JointFit", "JointProblem", "Prior", "Trial", "fit_jointly", "rest_residual", "rms_of"]
+__all__ = [
+    "JointFit",
+    "JointProblem",
+    "Prior",
+    "Trial",
+    "fit_jointly",
+    "heads_of",
+    "normal_rms_of",
+    "normals_of",
+    "numbers_of",
+    "rest_residual",
+    "rms_of",
+    "spans_of",
+    "vectors_of",
+]

@@ -20,7 +20,7 @@ from femsense.errors import DataError, FemsenseError
 from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.mesh import embed_points
 from femsense.loop.data import Data
-from femsense.loop.joint import Trial
+from femsense.loop.joint import Trial, normals_of
 from femsense.loop.stages import Stage, placed
 from femsense.march import Walk, drive_of, finer_state
 from femsense.model import Robot
@@ -41,7 +41,8 @@ def with_mesh_errors(data: Data, stage: Stage) -> Data:
     try:
         fine = robot_on_mesh(robot, finer_mesh(mesh, None, 1))
         train = [_with_error(robot, fine, t, *p) for t, p in zip(data.train, placed(data, stage.fit))]
-        own = [placed(data, stage.fit)[of] if of is not None else (t.poses, t.initial) for t, of in zip(data.held, data.held_of)]
+        fitted = placed(data, stage.fit)
+        own = [fitted[of] if of is not None else (t.poses, t.initial) for t, of in zip(data.held, data.held_of)]
         held = [_with_error(robot, fine, t, *p) for t, p in zip(data.held, own)]
     except FemsenseError:
         return data
@@ -54,12 +55,14 @@ def _with_error(robot: Robot, fine: Robot, trial: Trial, poses: Sequence[FloatAr
         Hypothesis(robot), trial.scene, np.zeros(0), poses, initial, derivative=False, vary_initial=False,
         pivot=robot.marker_points.mean(axis=0), starts=trial.starts_on(robot.body.mesh),
     ).states  # fmt: skip
-    return replace(trial, mesh_error=_by_sweep(trial, _moves(robot, fine, trial, places, initial, states)))
+    return replace(trial, mesh_error=_by_sweep(trial, _moves(robot, fine, trial, places, initial, states), poses))
 
 
-def _by_sweep(trial: Trial, moves: dict[int, FloatArray]) -> FloatArray:
-    """Return the error as one field a sweep [m], (k, 3, sweeps): each sweep loads the mesh in its own way."""
+def _by_sweep(trial: Trial, moves: dict[int, FloatArray], poses: Sequence[FloatArray]) -> FloatArray:
+    """Return the error as one field a sweep [m], (k, c, sweeps): each sweep loads the mesh in its own way."""
     error = np.array([moves[int(f)][m] for f, m in zip(trial.scene.frame, trial.scene.marker)])
+    if trial.scene.patches is not None:
+        error = np.einsum("kc,kc->k", error, normals_of(trial.scene, poses))[:, None]
     number = np.unique(trial.groups.sweep, return_inverse=True)[1]
     fields = np.zeros((*error.shape, int(number.max()) + 1))
     fields[np.arange(len(error)), :, number] = error

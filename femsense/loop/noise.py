@@ -2,25 +2,32 @@
 
     Σ = s² I + h² [same marker in the same state] + m² [same marker] + f² [same frame] + r² [same sweep]
 
-for each axis alike. The variances come by restricted maximum likelihood (Patterson & Thompson 1971) from the residual that the
+for each axis alike. Rows of a cloud are one number each, along the normal nᵢ at the point Xᵢ of the body at rest; what is common to
+two of them, whatever it is, shows in both as far as their normals agree, and errors of neighbouring points are alike:
+
+    Σᵢⱼ = s² δᵢⱼ + (nᵢ·nⱼ) { ρᵢⱼ (h² [same state] + m²) + f² [same frame] + r² [same sweep] },  ρᵢⱼ = exp(−|Xᵢ − Xⱼ|² / 2 ℓ²).
+
+The variances come by restricted maximum likelihood (Patterson & Thompson 1971) from the residual that the
 richest linear model leaves, so that no effect under test counts as noise. Jitter within a hold is not the noise: a state
 that is measured five times repeats its error five times, and the term h² says so.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
 from scipy.linalg import cho_solve, cholesky, solve_triangular
 from scipy.optimize import minimize
 
-from femsense.arrays import FloatArray, IntArray
+from femsense.arrays import BoolArray, FloatArray, IntArray
 
 COMPONENTS = ("white", "state", "marker", "frame", "sweep")
 FLOOR = 2e-6
 """No camera's markers are better than this [m]."""
+CLOUD_START = 5e-4
+"""Noise of clouds along the normal before it is estimated [m]."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -32,6 +39,31 @@ class Groups:
     sweep: IntArray
     state: IntArray
     """Marker within a state (same inputs and loads)."""
+    surface: Surface | None = None
+    """Where the rows lie if they are points of a surface; None: they are markers, three axes each."""
+
+    def shared(self, name: str) -> FloatArray:
+        """Return how much of a component each two rows have in common, shape (k, k)."""
+        if name == "white":
+            return np.eye(len(self.marker))
+        labels = getattr(self, name)
+        if self.surface is None:
+            return np.asarray(labels[:, None] == labels[None, :], dtype=float)
+        return self.surface.shared(name, labels)
+
+    def of_rows(self, rows: BoolArray | IntArray) -> Groups:
+        """Return the groups of some rows."""
+        marker, frame, sweep, state = (
+            np.unique(labels[rows], return_inverse=True)[1] for labels in (self.marker, self.frame, self.sweep, self.state)
+        )
+        return Groups(marker, frame, sweep, state, None if self.surface is None else self.surface.of_rows(rows))
+
+    @property
+    def observations(self) -> int:
+        """Number of independent observations, as BIC counts them: coordinates of markers, or patches of the surface, in distinct states."""
+        if self.surface is None:
+            return 3 * (int(self.state.max(initial=-1)) + 1)
+        return self.surface.cells()
 
     def members(self) -> dict[str, IntArray]:
         """Return the groupings that can be told apart here: each has groups of several rows, and several groups."""
@@ -39,9 +71,45 @@ class Groups:
         for name in COMPONENTS[1:]:
             labels = getattr(self, name)
             count = np.bincount(labels)
-            if (count > 1).any() and len(count) > 1:
+            always = name == "state" and self.surface is not None  # neighbours repeat each other's error
+            if always or ((count > 1).any() and len(count) > 1):
                 result[name] = labels
         return result
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Surface:
+    """Rows of a cloud: where they lie on the body, and along which normals they are measured."""
+
+    points: FloatArray
+    """At rest [m], shape (k, 3)."""
+    normals: FloatArray
+    """Shape (k, 3)."""
+    states: IntArray
+    """Which state (same inputs and loads) each row was measured in, shape (k,)."""
+    length: float
+    """ℓ: errors of the model, of the shape and of the camera go together over this distance [m]."""
+
+    def shared(self, name: str, labels: IntArray) -> FloatArray:
+        """Return how much of a component each two rows have in common, shape (k, k)."""
+        alike = self.normals @ self.normals.T
+        if name in ("state", "marker"):
+            square = (self.points**2).sum(axis=1)
+            apart = np.maximum(square[:, None] + square[None, :] - 2.0 * self.points @ self.points.T, 0.0)
+            alike *= np.exp(-0.5 * apart / self.length**2)
+        if name == "marker":
+            return alike
+        groups = self.states if name == "state" else labels
+        return np.asarray(alike * (groups[:, None] == groups[None, :]))
+
+    def of_rows(self, rows: BoolArray | IntArray) -> Surface:
+        """Return some of the rows."""
+        return Surface(self.points[rows], self.normals[rows], self.states[rows], self.length)
+
+    def cells(self) -> int:
+        """Return the number of cells of the size of ℓ that are seen, summed over states."""
+        cells = np.floor(self.points / self.length).astype(np.int64)
+        return len(np.unique(np.column_stack([cells, self.states]), axis=0))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -49,26 +117,41 @@ class Noise:
     """Standard deviations of the components of the noise [m]."""
 
     std: dict[str, float]
+    """Of markers, along each axis."""
     source: str
     """Where they come from, in words."""
+    surface: dict[str, float] = field(default_factory=lambda: {"white": CLOUD_START})
+    """Of clouds, along the normal."""
+
+    def components(self, groups: Groups) -> dict[str, float]:
+        """Return the standard deviations that hold for rows with these groups [m]."""
+        return self.std if groups.surface is None else self.surface
+
+    def joined(self, estimate: Noise, clouds: bool) -> Noise:
+        """Return this noise with what was estimated of markers, or of clouds."""
+        source = "; ".join(dict.fromkeys(s for s in (self.source, estimate.source) if s))
+        return Noise(self.std, source, estimate.std) if clouds else Noise(estimate.std, source, self.surface)
+
+    def row_std(self, groups: Groups) -> float:
+        """Return the standard deviation of a row with these groups [m]: of a coordinate of a marker, or of a cloud along the normal."""
+        return float(np.sqrt(sum(v**2 for v in self.components(groups).values())))
 
     def covariance(self, groups: Groups) -> FloatArray:
         """Return the covariance of the rows of one axis [m²], shape (k, k)."""
-        k = len(groups.marker)
-        sigma = np.eye(k) * self.std["white"] ** 2
+        std = self.components(groups)
+        sigma = np.eye(len(groups.marker)) * std["white"] ** 2
         for name in COMPONENTS[1:]:
-            if self.std.get(name, 0.0) > 0:
-                labels = getattr(groups, name)
-                sigma += self.std[name] ** 2 * (labels[:, None] == labels[None, :])
+            if std.get(name, 0.0) > 0:
+                sigma += std[name] ** 2 * groups.shared(name)
         return sigma
 
     def whitener(self, groups: Groups, error: FloatArray | None = None) -> Whitener:
         """Return what whitens rows with these groups.
 
-        `error` (k, 3, b) are fields [m] that the residual may hold by chance, each with a standard deviation of once its size.
+        `error` (k, c, b) are fields [m] that the residual may hold by chance, each with a standard deviation of once its size.
         """
         lower = np.asarray(cholesky(self.covariance(groups), lower=True))
-        plain = Whitener(lower, np.zeros((3 * len(lower), 0)), np.zeros(0))
+        plain = Whitener(lower, np.zeros((0, 0)), np.zeros(0))
         if error is None:
             return plain
         directions, size, _ = np.linalg.svd(whiten(plain, error), full_matrices=False)
@@ -76,8 +159,15 @@ class Noise:
 
     @property
     def total(self) -> float:
-        """Root mean square 3-D noise of a marker [m]."""
+        """Root mean square 3-D noise of a marker [m]; where there are only clouds, of a cloud along the normal."""
+        if not self.std:
+            return self.along_normals
         return float(np.sqrt(3.0 * sum(v**2 for v in self.std.values())))
+
+    @property
+    def along_normals(self) -> float:
+        """Root mean square noise of a cloud along the normal [m]."""
+        return float(np.sqrt(sum(v**2 for v in self.surface.values())))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -87,16 +177,16 @@ class Whitener:
     lower: FloatArray
     """Cholesky factor L of Σ, shape (k, k)."""
     directions: FloatArray
-    """Left singular vectors D of L⁻¹ E, shape (3k, b)."""
+    """Left singular vectors D of L⁻¹ E, shape (c k, b)."""
     shrink: FloatArray
     """shape (b,)."""
 
 
 def whiten(whitener: Whitener, values: FloatArray) -> FloatArray:
-    """Return rows (k, 3, …) whitened, flattened to (3k, …)."""
-    k = len(values)
+    """Return rows (k, c, …) whitened, flattened to (c k, …)."""
+    k, c = values.shape[:2]
     flat = solve_triangular(whitener.lower, values.reshape(k, -1), lower=True)
-    rows = np.asarray(flat.reshape(3 * k, *values.shape[2:]))
+    rows = np.asarray(flat.reshape(c * k, *values.shape[2:]))
     if not whitener.shrink.size:
         return rows
     along = np.tensordot(whitener.directions.T, rows, axes=1)
@@ -113,14 +203,14 @@ def estimate_noise(
     """Return the components of the noise by restricted maximum likelihood.
 
     Arguments:
-        residuals: of each recording [m], shape (k, 3).
-        nuisance: columns of what is fitted, shape (k, 3, p), the same p everywhere.
-        extra: columns of what might be in the data besides, shape (k, 3, q), the likeliest first; these count as explained.
+        residuals: of each recording [m], shape (k, c): of markers (c = 3), or of clouds (c = 1).
+        nuisance: columns of what is fitted, shape (k, c, p), the same p everywhere.
+        extra: columns of what might be in the data besides, shape (k, c, q), the likeliest first; these count as explained.
         groups: of each recording.
     """
     residuals, nuisance, extra, groups = _thinned(residuals, nuisance, extra, groups)
     names = ["white", *sorted({n for g in groups for n in g.members()})]
-    distinct = sum(3 * (int(g.state.max()) + 1) for g in groups)
+    distinct = sum(g.observations for g in groups)
     basis = _richest(nuisance, extra, distinct)
     scale = float(np.sqrt(np.mean(np.concatenate([r.ravel() for r in residuals]) ** 2))) + FLOOR
     jitter = _jitter(residuals, groups) if "state" in names else 0.0
@@ -147,7 +237,7 @@ class _Likelihood:
 
     def __init__(self, names: list[str], residuals: list[FloatArray], basis: list[FloatArray], groups: list[Groups]) -> None:
         self.names, self.residuals, self.basis = names, residuals, basis
-        self.parts = [[_pattern(g, name) for name in names] for g in groups]
+        self.parts = [[g.shared(name) for name in names] for g in groups]
 
     def __call__(self, log_std: FloatArray) -> tuple[float, FloatArray]:
         variance = np.exp(2.0 * log_std)
@@ -159,7 +249,7 @@ class _Likelihood:
             ViX, Vir = np.einsum("kl,lcp->kcp", inverse, X, optimize=True), inverse @ r
             normal += np.einsum("kcp,kcq->pq", X, ViX, optimize=True)
             right += np.einsum("kcp,kc->p", X, Vir)
-            log_det += 3.0 * log_size
+            log_det += r.shape[1] * log_size
             own += float((r * Vir).sum())
             pieces.append((inverse, ViX, Vir, parts))
         factor = cholesky(normal + 1e-12 * np.trace(normal) / max(p, 1) * np.eye(p), lower=True)
@@ -171,15 +261,9 @@ class _Likelihood:
             half = cho_solve((factor, True), ViX.reshape(-1, p).T).T.reshape(ViX.shape)
             inner = np.einsum("kcp,lcp->kl", ViX, half, optimize=True)
             outer = np.einsum("kc,lc->kl", Pr, Pr)
-            kernel = 3.0 * inverse - inner - outer
+            kernel = Pr.shape[1] * inverse - inner - outer
             gradient += [float((kernel * part).sum()) for part in parts]
         return 0.5 * value, np.asarray(gradient * variance)
-
-
-def _pattern(groups: Groups, name: str) -> FloatArray:
-    """Return which rows share a component, shape (k, k)."""
-    labels = np.arange(len(groups.marker)) if name == "white" else getattr(groups, name)
-    return np.asarray(labels[:, None] == labels[None, :], dtype=float)
 
 
 def _inverse(matrix: FloatArray) -> tuple[FloatArray, float]:
@@ -193,9 +277,9 @@ def _jitter(residuals: list[FloatArray], groups: list[Groups]) -> float:
     above, below = 0.0, 0
     for r, g in zip(residuals, groups):
         count = np.bincount(g.state)
-        mean = np.stack([np.bincount(g.state, r[:, c]) for c in range(3)], axis=1) / count[:, None]
+        mean = np.stack([np.bincount(g.state, column) for column in r.T], axis=1) / count[:, None]
         above += float(((r - mean[g.state]) ** 2).sum())
-        below += 3 * int((count - 1).sum())
+        below += r.shape[1] * int((count - 1).sum())
     return float(np.sqrt(above / below)) if below else 0.0
 
 
@@ -205,13 +289,18 @@ def _thinned(
     step = int(np.ceil(sum(len(r) for r in residuals) / MAX_REML_ROWS))
     if step <= 1:
         return residuals, nuisance, extra, groups
-    keep = [g.frame % step == 0 for g in groups]
-    thin = [
-        Groups(*(np.unique(getattr(g, n)[k], return_inverse=True)[1] for n in ("marker", "frame", "sweep", "state")))
-        for g, k in zip(groups, keep)
-    ]
+    keep = [_spread_rows(g, step) for g in groups]
+    thin = [g.of_rows(k) for g, k in zip(groups, keep)]
     pick = [[a[k] for a, k in zip(arrays, keep)] for arrays in (residuals, nuisance, extra)]
     return pick[0], pick[1], pick[2], thin
+
+
+def _spread_rows(groups: Groups, step: int) -> BoolArray:
+    """Return one in so many rows: whole frames, of clouds half as many whole frames of half as many points."""
+    if groups.surface is None or step < 4:
+        return np.asarray(groups.frame % step == 0)
+    points = int(np.ceil(np.sqrt(step)))
+    return np.asarray((groups.frame % int(np.ceil(step / points)) == 0) & (groups.marker % points == 0))
 
 
 def _richest(nuisance: list[FloatArray], extra: list[FloatArray], distinct: int) -> list[FloatArray]:
@@ -232,12 +321,12 @@ def _richest(nuisance: list[FloatArray], extra: list[FloatArray], distinct: int)
             basis.append(left / size)
             spare -= 1
     Q = np.transpose(basis)
-    spans = np.cumsum([0, *(c.shape[0] * 3 for c in nuisance)])
-    return [Q[a:b].reshape((b - a) // 3, 3, -1) for a, b in pairwise(spans)]
+    spans = np.cumsum([0, *(c.shape[0] * c.shape[1] for c in nuisance)])
+    return [Q[a:b].reshape(*block.shape[:2], -1) for block, (a, b) in zip(nuisance, pairwise(spans))]
 
 
 def _stacked(columns: list[FloatArray]) -> FloatArray:
-    """Return columns of all recordings below each other with unit length, shape (3 Σk, p)."""
-    flat = np.vstack([c.reshape(3 * len(c), c.shape[2]) for c in columns])
+    """Return columns of all recordings below each other with unit length, shape (c Σk, p)."""
+    flat = np.vstack([c.reshape(-1, c.shape[2]) for c in columns])
     norm = np.linalg.norm(flat, axis=0)
     return np.asarray(flat[:, norm > 0] / norm[norm > 0])

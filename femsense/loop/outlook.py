@@ -280,9 +280,9 @@ def _seen(trial: Trial, robot: Robot, jet: SceneJet) -> BoolArray:
 def _columns(
     trial: Trial, robot: Robot, jet: SceneJet, forms: Sequence[Form], turns: FloatArray | None, *, width: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the columns of forms at their places [m], of markers (k, 3, e) and of measured seats (r, 3, e); zero where a form cannot
+    """Return the columns of forms at their places [m], of markers (k, c, e) and of measured seats (r, 3, e); zero where a form cannot
     act or finds no equilibrium."""
-    result, rest = np.zeros((len(jet.residual), 3, width)), np.zeros((len(jet.rest), 3, width))
+    result, rest = np.zeros((*jet.residual.shape, width)), np.zeros((len(jet.rest), 3, width))
     if not forms:
         return result, rest
     theta = _start(trial)

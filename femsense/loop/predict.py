@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from femsense.arrays import FloatArray, IntArray
-from femsense.loop.joint import JointFit, Trial
+from femsense.loop.joint import JointFit, Trial, numbers_of
 
 
 def sweeps_predicted(trials: list[Trial], before: JointFit, after: JointFit) -> tuple[float, float]:
@@ -26,13 +26,15 @@ def sweeps_predicted(trials: list[Trial], before: JointFit, after: JointFit) -> 
 
 
 def sweep_rows(trials: list[Trial], fit: JointFit) -> list[IntArray]:
-    """Return the rows of the whitened residual that belong to each sweep of each trial."""
-    result, at = [], 0
-    for trial, jet in zip(trials, fit.jets):
-        sweep = np.repeat(trial.groups.sweep, 3)
-        result += [at + np.flatnonzero(sweep == s) for s in np.unique(sweep)]
+    """Return the rows of the whitened residual that belong to each sweep of each recording, markers and clouds together."""
+    found: dict[tuple[int, int], list[IntArray]] = {}
+    at = 0
+    for number, trial, jet in zip(numbers_of(trials), trials, fit.jets):
+        sweep = np.repeat(trial.groups.sweep, jet.residual.shape[1])
+        for s in np.unique(sweep):
+            found.setdefault((number, int(s)), []).append(at + np.flatnonzero(sweep == s))
         at += len(sweep) + jet.rest.size + 6 * len(trial.poses)
-    return result
+    return [np.concatenate(rows) for rows in found.values()]
 
 
 def _density(fit: JointFit, rows: IntArray) -> float:

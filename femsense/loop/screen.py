@@ -17,7 +17,7 @@ from femsense.arrays import FloatArray
 from femsense.calib.forward import Hypothesis
 from femsense.effects import Effect, Entry, Parameter
 from femsense.errors import FemsenseError
-from femsense.loop.joint import JointFit, JointProblem, Prior, Trial
+from femsense.loop.joint import JointFit, JointProblem, Prior, Trial, spans_of
 from femsense.loop.noise import whiten
 from femsense.model import Robot
 
@@ -35,7 +35,7 @@ class Candidate:
     seed: Entry
     parameters: tuple[Parameter, ...]
     raw: list[FloatArray]
-    """Columns in metres, one array (k, 3, q) a trial."""
+    """Columns in metres, one array (k, c, q) a trial."""
     seats: list[FloatArray]
     """The same of the seats that rest.csv measures [m], (r, 3, q) a trial."""
     columns: FloatArray
@@ -105,7 +105,7 @@ class Fields:
     """The same of the seats that rest.csv measures [m], (r, 3, Σq) a trial."""
 
     def of(self, i: int) -> tuple[list[FloatArray], list[FloatArray]]:
-        """Return the columns of one effect in markers and seats, one array (k, 3, q) and (r, 3, q) a trial."""
+        """Return the columns of one effect in markers and seats, one array (k, c, q) and (r, 3, q) a trial."""
         spans = np.cumsum([0, *(1 if e.discrete else len(p) for e, _, p in self.todo)])
         part = slice(spans[i], spans[i + 1])
         return [block[:, :, part] for block in self.raw], [block[:, :, part] for block in self.rest]
@@ -164,14 +164,13 @@ def effect_fields(base: JointFit, trials: list[Trial], todo: list[tuple[Effect, 
     every = Hypothesis(fixed, tuple(smooth))
     null = np.array([p.null for p in every.parameters])
     probe = JointProblem(every, Prior(np.zeros(0), np.zeros(0)), trials, [], 1.0, noiseless=True)
-    raw, rest, at = [], [], 0
-    for trial in trials:
-        jet = probe.jet(trial, base.fit.theta[at : at + trial.size], null, True)
+    raw, rest = [], []
+    for trial, span in zip(trials, spans_of(trials)):
+        jet = probe.jet(trial, base.fit.theta[span], null, True)
         raw.append(jet.by_effect)
         rest.append(
             jet.rest_by_effect.reshape(*jet.rest.shape, -1) if jet.rest.size else np.zeros((0, 3, jet.by_effect.shape[2]))
         )
-        at += trial.size
     usable = smooth
     for one in (t for t in todo if t[0].discrete and _can_act(fixed, t)):
         changes = _whole_change(base, trials, fixed, one)
@@ -194,16 +193,15 @@ def _can_act(robot: Robot, one: tuple[Effect, Entry, tuple[Parameter, ...]]) -> 
 def _whole_change(
     base: JointFit, trials: list[Trial], fixed: Robot, one: tuple[Effect, Entry, tuple[Parameter, ...]]
 ) -> list[FloatArray] | None:
-    """Return by how much a discrete alternative changes the residual of each trial [m], (k, 3); None where it has no equilibrium."""
+    """Return by how much a discrete alternative changes the residual of each trial [m], (k, c); None where it has no equilibrium."""
     parameters = one[2]
     robot = Hypothesis(fixed, (one,)).robot_at(np.array([p.null for p in parameters]))
     probe = JointProblem(Hypothesis(robot), Prior(np.zeros(0), np.zeros(0)), trials, [], 1.0)
-    changes, at = [], 0
+    changes = []
     try:
-        for trial, jet in zip(trials, base.jets):
-            moved = probe.jet(trial, base.fit.theta[at : at + trial.size], np.zeros(0), False)
+        for trial, jet, span in zip(trials, base.jets, spans_of(trials)):
+            moved = probe.jet(trial, base.fit.theta[span], np.zeros(0), False)
             changes.append(moved.residual - jet.residual)
-            at += trial.size
     except FemsenseError:
         return None
     return changes
@@ -215,7 +213,7 @@ def _whitened(base: JointFit, problem: JointProblem, own: list[FloatArray], rest
     result = np.zeros((len(base.fit.residual), q))
     at = 0
     for trial, factor, block, seats in zip(problem.trials, problem.factors, own, rest):
-        k, s = 3 * len(block), 3 * len(seats)
+        k, s = block.shape[0] * block.shape[1], 3 * len(seats)
         result[at : at + k] = whiten(factor, block)
         result[at + k : at + k + s] = seats.reshape(s, q) / problem.seat_std
         at += k + s + 6 * len(trial.poses)

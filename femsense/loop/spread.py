@@ -33,25 +33,26 @@ def coordinate_std(fit: JointFit, trials: list[Trial], noise: Noise) -> FloatArr
 def misfit(fit: JointFit, trials: list[Trial], noise: Noise) -> float:
     """Return by which factor the residual exceeds the noise, at least 1.
 
-    States that repeat count once: with n state means of markers in three axes and p parameters it is √(Σ|r̄|² / (n − p) / σ²).
+    States that repeat count once: with n state means of markers in three axes (of clouds along normals) and p parameters it is √(Σ|r̄|² / (n − p) / σ²).
     """
     square, count, expected = 0.0, 0, 0.0
     for trial, jet in zip(trials, fit.jets):
         state = trial.groups.state
         size = np.bincount(state)
-        means = np.stack([np.bincount(state, jet.residual[:, c]) for c in range(3)], axis=1) / size[:, None]
+        axes, std = jet.residual.shape[1], noise.components(trial.groups)
+        means = np.stack([np.bincount(state, column) for column in jet.residual.T], axis=1) / size[:, None]
         square, count = square + float((means**2).sum()), count + means.size
         if trial.mesh_error is not None:
             expected += float((trial.mesh_error**2).sum()) / len(state) * len(size)
-        expected += 3.0 * float((_variance(noise) + noise.std["white"] ** 2 / size).sum())
+        expected += axes * float((_variance(std) + std["white"] ** 2 / size).sum())
     freedom = count - len(fit.fit.theta)
     if freedom < 1 or expected <= 0.0:
         return 1.0
     return max(1.0, float(np.sqrt(square / expected * count / freedom)))
 
 
-def _variance(noise: Noise) -> float:
-    return sum(v**2 for name, v in noise.std.items() if name != "white")
+def _variance(std: dict[str, float]) -> float:
+    return sum(v**2 for name, v in std.items() if name != "white")
 
 
 def _over_the_sphere(fit: JointFit, at: IntArray, growth: float) -> FloatArray:

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 
 from femsense.arrays import BoolArray, FloatArray
 from femsense.calib.forward import Hypothesis, SceneJet, evaluate_scene
 from femsense.effects import Effect, Entry, Parameter, find_effect
-from femsense.loop.data import Data, groups_of
-from femsense.loop.joint import JointFit, JointProblem, Prior, Trial, fit_jointly, rms_of
+from femsense.loop.clouds import make_rows, renewed_rows, states_of
+from femsense.loop.data import Data, groups_of, surface_of
+from femsense.loop.joint import JointFit, JointProblem, Prior, Trial, fit_jointly, rms_of, spans_of
 from femsense.loop.noise import Noise, estimate_noise, whiten
 from femsense.loop.screen import NUISANCE, Candidate, Fields, candidates_for, effect_fields, one_each, screen
 from femsense.model import Robot
@@ -37,7 +37,7 @@ class Stage:
 
     @property
     def held_residuals(self) -> list[FloatArray]:
-        """Residuals of the held-out data [m], (k, 3) a trial."""
+        """Residuals of the held-out data [m], (k, c) a trial."""
         return [h.jet.residual for h in self.held]
 
 
@@ -102,13 +102,8 @@ def held_out(data: Data, fit: JointFit, noise: Noise) -> list[HeldOut]:
     """Return what a fit makes of each held-out trial; a recording of its own gets its own pose from its first frames."""
     robot = fit.hypothesis.robot_at(fit.coordinates)
     plain, pivot = Hypothesis(robot), data.robot.marker_points.mean(axis=0)
-    spans = np.cumsum([0, *(t.size for t in data.train)])
-    result = []
-    for trial, of in zip(data.held, data.held_of):
-        if of is not None:
-            poses, initial = data.train[of].place(fit.fit.theta[spans[of] : spans[of + 1]], pivot)
-        else:
-            poses, initial = _pose_on_first_frames(robot, trial, noise, data.seat_std, pivot)
+    result: list[HeldOut] = []
+    for trial, (poses, initial) in zip(data.held, placed_held(data, fit, noise)):
         jet = evaluate_scene(
             plain,
             trial.scene,
@@ -124,14 +119,32 @@ def held_out(data: Data, fit: JointFit, noise: Noise) -> list[HeldOut]:
     return result
 
 
-def _pose_on_first_frames(
-    robot: Robot, trial: Trial, noise: Noise, seat_std: float, pivot: FloatArray
-) -> tuple[list[FloatArray], FloatArray | None]:
-    frames = trial.scene.frames
-    scene = trial.scene.pick(frames[: max(1, round(0.2 * len(frames)))])
-    first = replace(trial, scene=scene, groups=groups_of(scene), starts={}, mesh_error=None)
-    fit = fit_jointly(Hypothesis(robot), Prior(np.zeros(0), np.zeros(0)), [first], noise, seat_std, np.zeros(0))
-    return first.place(fit.fit.theta, pivot)
+Placed = tuple[list[FloatArray], FloatArray | None]
+"""Poses of the cameras, and initial inputs where they are unknown."""
+
+
+def placed_held(data: Data, fit: JointFit, noise: Noise) -> list[Placed]:
+    """Return poses and initial inputs of each held-out trial: those of its recording, or its own from its first frames."""
+    train, result = placed(data, fit), list[Placed]()
+    robot = fit.hypothesis.robot_at(fit.coordinates)
+    for i, (trial, of) in enumerate(zip(data.held, data.held_of)):
+        if of is not None:
+            result.append(train[of])
+        elif trial.together:
+            result.append(result[-1])
+        else:
+            both = [trial, *(t for t in data.held[i + 1 : i + 2] if t.together)]
+            result.append(_pose_on_first_frames(robot, both, noise, data.seat_std, data.robot.marker_points.mean(axis=0)))
+    return result
+
+
+def _pose_on_first_frames(robot: Robot, trials: list[Trial], noise: Noise, seat_std: float, pivot: FloatArray) -> Placed:
+    frames = np.unique(np.concatenate([t.scene.frames for t in trials]))
+    few = frames[: max(1, round(0.2 * len(frames)))]
+    first = [t.part(few) for t in trials if np.isin(t.scene.frames, few).any()]
+    first = [replace(t, together=bool(i)) for i, t in enumerate(first)]
+    fit = fit_jointly(Hypothesis(robot), Prior(np.zeros(0), np.zeros(0)), first, noise, seat_std, np.zeros(0))
+    return first[0].place(fit.fit.theta, pivot)
 
 
 def fields_of(data: Data, stage: Stage, names: Sequence[str]) -> Fields:
@@ -143,11 +156,30 @@ def fields_of(data: Data, stage: Stage, names: Sequence[str]) -> Fields:
     return effect_fields(stage.fit, data.train, todo)
 
 
-def placed(data: Data, fit: JointFit) -> list[tuple[list[FloatArray], FloatArray | None]]:
+def placed(data: Data, fit: JointFit) -> list[Placed]:
     """Return poses and initial inputs of each training trial at a fit."""
     pivot = data.robot.marker_points.mean(axis=0)
-    spans = np.cumsum([0, *(t.size for t in data.train)])
-    return [t.place(fit.fit.theta[a:b], pivot) for t, (a, b) in zip(data.train, pairwise(spans))]
+    return [t.place(fit.fit.theta[span], pivot) for t, span in zip(data.train, spans_of(data.train))]
+
+
+def rematched(data: Data, stage: Stage, noise: Noise, *, anew: bool = False) -> Data:
+    """Return the data with the clouds' patches made anew where a stage has the surface; with `anew` it is asked again which rows there are."""
+    if "clouds" not in data.measured:
+        return data
+    robot = stage.fit.hypothesis.robot_at(stage.fit.coordinates)
+    train = [_rematched(robot, t, *own, anew) for t, own in zip(data.train, placed(data, stage.fit))]
+    held = [_rematched(robot, t, *own, anew) for t, own in zip(data.held, placed_held(data, stage.fit, noise))]
+    return replace(data, train=train, held=held)
+
+
+def _rematched(robot: Robot, trial: Trial, poses: list[FloatArray], initial: FloatArray | None, anew: bool) -> Trial:
+    if trial.sheets is None:
+        return trial
+    states = states_of(robot, trial.scene, poses, initial, trial.starts_on(robot.body.mesh))
+    if not anew:
+        return replace(trial, scene=renewed_rows(robot, trial.scene, trial.sheets, states, poses))
+    scene = make_rows(robot, trial.scene, trial.sheets, states, poses)
+    return replace(trial, scene=scene, groups=groups_of(scene, trial.frames, surface_of(robot, scene, poses)), mesh_error=None)
 
 
 def held_chi2(data: Data, stage: Stage, noise: Noise) -> float:
@@ -166,22 +198,26 @@ def problem_of(data: Data, fit: JointFit, noise: Noise) -> JointProblem:
 def noise_of(data: Data, stage: Stage, fields: Fields) -> tuple[Noise, float]:
     """Estimate the noise from what the richest linear model leaves; return it with the effective number of observations."""
     table = screen(stage.fit, problem_of(data, stage.fit, Noise({"white": 5e-4}, "")), fields, 100.0)
-    own = sum(t.size for t in data.train)
+    own = stage.fit.own
     widest = max(0 if t.mesh_error is None else t.mesh_error.shape[2] for t in data.train)
-    columns, extra, at = [], [], 0
-    for i, (trial, jet) in enumerate(zip(data.train, stage.fit.jets)):
-        k = len(jet.residual)
-        block = np.zeros((k, 3, own + widest))
-        block[:, :, at : at + 6 * len(trial.poses)] = jet.by_pose
-        block[:, :, at + 6 * len(trial.poses) : at + trial.size] = jet.by_initial
+    columns, extra = [], []
+    for i, (trial, jet, span) in enumerate(zip(data.train, stage.fit.jets, spans_of(data.train))):
+        shape = jet.residual.shape
+        block = np.zeros((*shape, own + widest))
+        block[:, :, span] = np.concatenate([jet.by_pose, jet.by_initial], axis=2)
         if trial.mesh_error is not None:
             block[:, :, own : own + trial.mesh_error.shape[2]] = trial.mesh_error
-        at += trial.size
         columns.append(np.concatenate([block, jet.by_effect], axis=2))
         others = [c.raw[i] for c in one_each(table) if c.effect.name != "marker_offset"]
-        extra.append(np.concatenate([np.zeros((k, 3, 0)), *others], axis=2))
-    noise = estimate_noise([j.residual for j in stage.fit.jets], columns, extra, [t.groups for t in data.train])
-    return noise, float(sum(3 * (t.groups.state.max() + 1) for t in data.train))
+        extra.append(np.concatenate([np.zeros((*shape, 0)), *others], axis=2))
+    groups = [t.groups for t in data.train]
+    noise = Noise({}, "")
+    for clouds in (False, True):
+        which = [i for i, t in enumerate(data.train) if (t.scene.patches is not None) == clouds]
+        if which:
+            picked = [[column[i] for i in which] for column in ([j.residual for j in stage.fit.jets], columns, extra, groups)]
+            noise = noise.joined(estimate_noise(*picked), clouds)  # type: ignore[arg-type]
+    return noise, float(sum(g.observations for g in groups))
 
 
 def screen_stage(data: Data, fit: JointFit, noise: Noise, fields: Fields, n_effective: float) -> list[Candidate]:

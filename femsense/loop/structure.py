@@ -9,7 +9,7 @@ import numpy as np
 
 from femsense.arrays import FloatArray, IntArray
 from femsense.loop.covariates import covariates_of, rank_with, stacked
-from femsense.loop.joint import Trial
+from femsense.loop.joint import Trial, heads_of, vectors_of
 from femsense.loop.noise import Noise, whiten
 from femsense.model import Robot
 from femsense.recording import state_key
@@ -46,13 +46,17 @@ class StructureTests:
 
 
 def structure_tests(trials: list[Trial], residuals: list[FloatArray], *, rng: np.random.Generator) -> StructureTests:
-    """Return tests for structure in residuals [m], (k, 3) a trial.
+    """Return tests for structure in residuals [m], (k, c) a trial.
 
     * `neighbours`: marker means and frame means removed; T = Σ r_k·r_{k+1} / Σ |r_k|² over neighbouring states of a sweep, against
       shuffles of the states within sweeps. It knows no scale, so that a wrong noise level cannot trip it.
     * `pattern`: the largest singular value of states × markers, against shuffles of each marker's states among themselves (Horn 1965).
     * `sweep`, `marker`: the sweep or marker with the largest mean square, against the same shuffles.
+
+    Errors of a cloud are alike where points are near to each other, so that its states are shuffled whole, and `pattern` is not asked.
     """
+    if any(t.scene.patches is not None for t in trials):
+        return _cloud_tests(trials, residuals, rng)
     fields = [_field(t, r) for t, r in zip(trials, residuals)]
     observed = _lag_one(fields, None)
     p: dict[str, float] = {}
@@ -63,6 +67,27 @@ def structure_tests(trials: list[Trial], residuals: list[FloatArray], *, rng: np
     null = np.array([_largest(fields, rng) for _ in range(PERMUTATIONS)])
     p |= {name: _share(null[:, i], float(seen[0, i])) for i, name in enumerate(("pattern", "sweep"))}
     return StructureTests(observed if np.isfinite(observed) else 0.0, p)
+
+
+def _cloud_tests(trials: list[Trial], residuals: list[FloatArray], rng: np.random.Generator) -> StructureTests:
+    """Return the tests of clouds, with those of the markers beside them where there are some."""
+    pairs = list(zip(trials, residuals))
+    marked = [(t, r) for t, r in pairs if t.scene.patches is None]
+    markers = structure_tests([t for t, _ in marked], [r for _, r in marked], rng=rng) if marked else None
+    fields = [_field(t, r) for t, r in pairs if t.scene.patches is not None]
+    p = {} if markers is None else dict(markers.p)
+    observed = _lag_one(fields, None)
+    if np.isfinite(observed):
+        p["cloud neighbours"] = _share(np.array([_lag_one(fields, rng) for _ in range(PERMUTATIONS)]), observed)
+    whole = [_largest(_shuffled(fields, rng), None)[1] for _ in range(PERMUTATIONS)]
+    p["cloud sweep"] = _share(np.array(whole), _largest(fields, None)[1])
+    lag = observed if np.isfinite(observed) else 0.0
+    return StructureTests(lag if markers is None else markers.lag_one, p)
+
+
+def _shuffled(fields: list[tuple[FloatArray, IntArray]], rng: np.random.Generator) -> list[tuple[FloatArray, IntArray]]:
+    """Return fields with their states in another order, each whole."""
+    return [(values[rng.permutation(len(values))], sweep) for values, sweep in fields]
 
 
 def _share(null: FloatArray, observed: float) -> float:
@@ -89,7 +114,7 @@ def _largest(fields: list[tuple[FloatArray, IntArray]], rng: np.random.Generator
 
 
 def without_mesh_error(trial: Trial, residual: FloatArray, noise: Noise) -> FloatArray:
-    """Return the residual [m], (k, 3), less what of it is likeliest to be the mesh's own error."""
+    """Return the residual [m], (k, c), less what of it is likeliest to be the mesh's own error."""
     if trial.mesh_error is None:
         return residual
     plain = noise.whitener(trial.groups)
@@ -99,20 +124,28 @@ def without_mesh_error(trial: Trial, residual: FloatArray, noise: Noise) -> Floa
 
 
 def _field(trial: Trial, residual: FloatArray) -> tuple[FloatArray, IntArray]:
-    """Return residuals as (distinct states, markers, 3) with means removed, and the sweep of each state."""
+    """Return residuals as (distinct states, markers, c) with means removed, and the sweep of each state."""
     frames = np.unique(trial.scene.frame)
     count = int(trial.groups.marker.max()) + 1
-    grid = np.full((len(frames), count, 3), np.nan)
+    grid = np.full((len(frames), count, residual.shape[1]), np.nan)
     place = np.searchsorted(frames, trial.scene.frame)
     grid[place, trial.groups.marker] = residual
     sweep = np.zeros(len(frames), dtype=np.int64)
     sweep[place] = trial.groups.sweep
     keys = [state_key(trial.scene.recording, int(f)) for f in frames]
     first = [i for i in range(len(frames)) if i == 0 or keys[i] != keys[i - 1]]
-    merged = np.array([np.nanmean(grid[a:b], axis=0) for a, b in zip(first, [*first[1:], len(frames)])])
-    merged = np.nan_to_num(merged - np.nanmean(merged, axis=0, keepdims=True))
+    merged = np.array([_mean_seen(grid[a:b]) for a, b in zip(first, [*first[1:], len(frames)])])
+    merged = np.nan_to_num(merged - _mean_seen(merged)[None])
     merged = merged - merged.mean(axis=1, keepdims=True)
     return merged, sweep[first]
+
+
+def _mean_seen(values: FloatArray) -> FloatArray:
+    """Return the mean over the first axis of what is not NaN; NaN where all is."""
+    seen = np.isfinite(values)
+    count = seen.sum(axis=0)
+    total = np.where(seen, values, 0.0).sum(axis=0)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
 def _lag_one(fields: list[tuple[FloatArray, IntArray]], rng: np.random.Generator | None) -> float:
@@ -138,8 +171,10 @@ def describe_left(robot: Robot, trials: list[Trial], residuals: list[FloatArray]
 
     The direction is the one that holds most of the mean square of the worst marker (its sign: that of the mean); `share` says how much.
     """
+    heads = heads_of(trials)
+    trials, residuals = [trials[i] for i in heads], [residuals[i] for i in heads]
     marker = np.concatenate([t.scene.marker for t in trials])
-    field = np.concatenate(residuals)
+    field = np.concatenate([vectors_of(t, r) for t, r in zip(trials, residuals)])
     size = np.linalg.norm(field, axis=1)
     per_marker = {robot.marker_names[m]: float(np.sqrt((size[marker == m] ** 2).mean())) for m in np.unique(marker)}
     worst = max(per_marker, key=lambda name: per_marker[name])
@@ -174,7 +209,7 @@ def _frame_sizes(trials: list[Trial], residuals: list[FloatArray]) -> tuple[Floa
 
 
 def frame_rms(trial: Trial, residual: FloatArray) -> FloatArray:
-    """Return the root mean square of a residual (k, 3) in each frame of a trial [m], shape (f,)."""
+    """Return the root mean square of a residual (k, c) in each frame of a trial [m], shape (f,)."""
     place = np.searchsorted(trial.scene.frames, trial.scene.frame)
     count = np.bincount(place, minlength=len(trial.scene.frames))
     return np.sqrt(np.bincount(place, (residual**2).sum(axis=1), minlength=len(count)) / np.maximum(count, 1))

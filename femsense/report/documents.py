@@ -30,6 +30,9 @@ class Errors(Document):
     train_rms_m: Number = None
     validation_rms_m: Number = None
     validation_ci_m: list[Number] | None = None
+    train_normal_rms_m: Number = None
+    validation_normal_rms_m: Number = None
+    validation_normal_ci_m: list[Number] | None = None
 
 
 class Parameter(Document):
@@ -122,7 +125,17 @@ class Left(Document):
     structure: Structure = Structure()
 
 
+class Clouds(Document):
+    frames: list[int] = Field(default_factory=list)
+    rows: list[int] = Field(default_factory=list)
+    noise_components_m: dict[str, Number] = Field(default_factory=dict)
+    noise_m: Number = None
+    points_m: dict[str, Triple] = Field(default_factory=dict)
+
+
 class Card(Document):
+    measured: list[str] = Field(default_factory=lambda: ["markers"])
+    clouds: Clouds | None = None
     recordings: list[str | None] = Field(default_factory=list)
     split: list[str] = Field(default_factory=list)
     frames_fitted: list[list[int]] = Field(default_factory=list)

@@ -61,6 +61,10 @@ OLDER = (
     "This loop.json holds no figures of the residual, of calibration, of confounding and of forces: it was written by an earlier femsense. "
     "Run femsense improve again for the whole report."
 )
+CLOUDS = (
+    "There were no markers: what was fitted are clouds. Each “surface …” is a point of the body's surface; its residual is how far the "
+    "measured surface lies from the model's there, along the normal, outwards positive. Errors are root mean squares of these distances."
+)
 ARROW_SHARE = 0.2
 """The longest arrow, in sizes of the body."""
 SPOTS = 600
@@ -86,7 +90,8 @@ def loop_chapter(file: Path, title: str) -> Chapter:
     body = together(
         _summary(loop),
         None if loop.evidence or not _is_old(loop) else paragraph(OLDER, class_="next"),
-        section("1. Residual on the robot", _mean_residual(residuals, robot, rest, cameras), residual_in_frames(evidence.pictures, rest)),
+        None if has_markers(loop) else paragraph(CLOUDS, class_="soft"),
+        section("1. Residual on the robot", _mean_residual(residuals, robot, rest, cameras, _points(loop)), residual_in_frames(evidence.pictures, rest)),
         section("2. What the residual goes with", residual_against(evidence.frames, evidence.score, evidence.tip), covariate_table(evidence.score)),
         section("3. Error on held-out data", _held_out(residuals, evidence.frames, loop.noise_m)),
         section("4. Effects", effects_table(loop.effects), ranking_table(loop.candidates, evidence.ranking, loop.effects), refits_table(loop.candidates)),
@@ -109,15 +114,21 @@ def _is_old(loop: Loop) -> bool:
 
 
 def _summary(loop: Loop) -> Html | None:
-    before, after = loop.before, loop.after
+    before, after, marked = loop.before, loop.after, has_markers(loop)
+    kind = "rms, 3-D" if marked else "rms along the normals"
     items = [
         (title, words.length(errors.validation_rms_m), note)
         for title, errors in (("Held-out error, before", before), ("Held-out error, after", after))
-        for note in [f"95 % interval {words.interval(errors.validation_ci_m)}" if errors.validation_ci_m else "rms, 3-D"]
+        for note in [f"95 % interval {words.interval(errors.validation_ci_m)}, {kind}" if errors.validation_ci_m else kind]
         if errors != type(errors)()
     ]
+    if marked and words.known(before.validation_normal_rms_m) and words.known(after.validation_normal_rms_m):
+        ends = f"{words.length(before.validation_normal_rms_m)} → {words.length(after.validation_normal_rms_m)}"
+        items.append(("Held-out error of the clouds", ends, "rms along the normals"))
     if words.known(loop.noise_m):
-        items.append(("Noise of a marker", words.length(loop.noise_m), "rms, 3-D, from the data"))
+        items.append(
+            ("Noise of a marker" if marked else "Noise of a cloud", words.length(loop.noise_m), f"{kind}, from the data")
+        )
     share = recovered(before.validation_rms_m, after.validation_rms_m, loop.noise_m)
     if share is not None:
         items.append(("Recovered", words.percent(share), "of the excess over the noise (squares)"))
@@ -127,6 +138,11 @@ def _summary(loop: Loop) -> Html | None:
     )
     known = words.known(before.train_rms_m) or words.known(after.train_rms_m)
     return together(tiles(items) if items else None, train if known else None)
+
+
+def has_markers(loop: Loop) -> bool:
+    """Return whether markers were used; else the rows are points of the surface, measured along its normals."""
+    return "markers" in loop.data.measured
 
 
 def recovered(before_m: float | None, after_m: float | None, noise_m: float | None) -> float | None:
@@ -144,12 +160,16 @@ def recovered(before_m: float | None, after_m: float | None, noise_m: float | No
 
 
 def _mean_residual(
-    residuals: Residuals, robot: Robot | None, surface: Surface | None, cameras: Sequence[FloatArray]
+    residuals: Residuals,
+    robot: Robot | None,
+    surface: Surface | None,
+    cameras: Sequence[FloatArray],
+    points_m: Mapping[str, FloatArray],
 ) -> Html | None:
-    """Draw the mean residual of each marker before and after on the robot of the loop."""
+    """Draw the mean residual of each marker, or point of the surface, before and after on the robot of the loop."""
     if not residuals.marker or robot is None or surface is None:
         return None
-    seat = {name: point for name, point in zip(robot.marker_names, robot.marker_points)}
+    seat = {name: point for name, point in zip(robot.marker_names, robot.marker_points)} | dict(points_m)
     rows = np.array([i for i, name in enumerate(residuals.marker) if name in seat], dtype=np.int64)
     if not len(rows):
         return None
@@ -177,6 +197,12 @@ def _mean_residual(
         f"lies in the page, which shows {words.percent(shown)} of the squared mean residual before."
     )
     return together(text, panels(*figures))
+
+
+def _points(loop: Loop) -> dict[str, FloatArray]:
+    """Return where the points of the surface lie at rest [m]."""
+    clouds = loop.data.clouds
+    return {} if clouds is None else {name: np.asarray(place, float) for name, place in clouds.points_m.items()}
 
 
 def _per_marker(names: Sequence[str], values: FloatArray) -> FloatArray:
@@ -380,7 +406,8 @@ def _left_facts(left: Left) -> list[str]:
     where = left.where
     if where.marker:
         mean = f", mean {words.parameter(list(where.mean_residual_m), None, 'm')}" if where.mean_residual_m else ""
-        facts.append(f"Where: most at marker {where.marker}{mean}.")
+        kind = "" if where.marker.startswith("surface ") else "marker "
+        facts.append(f"Where: most at {kind}{where.marker}{mean}.")
     if where.direction and all(map(words.known, where.direction)):
         along = ", ".join(words.number(v, 2) for v in where.direction)
         facts.append(f"Which way: {words.percent(where.direction_share)} of it there lies along ({along}).")

@@ -50,6 +50,8 @@ TESTS = {
     "pattern": "one pattern in many states",
     "sweep": "one sweep stands apart",
     "marker": "one marker stands apart",
+    "cloud neighbours": "neighbouring states of the clouds are alike",
+    "cloud sweep": "one sweep of the clouds stands apart",
 }
 STAGES = ("before", "nuisance", "after")
 
@@ -440,8 +442,18 @@ def _noise_rows(card: Card) -> list[list[object]]:
         if words.known(card.effective_observations)
         else []
     )
-    rows += [["Uncertainty of marker seats", words.length(card.seat_std_m, 2)]] if words.known(card.seat_std_m) else []
     rows += [["Error of the mesh, at the markers", words.length(card.mesh_error_m, 2)]] if words.known(card.mesh_error_m) else []
+    if card.clouds is not None:
+        clouds = card.clouds
+        rows.append(["Clouds", f"{sum(clouds.rows)} rows along normals in {sum(clouds.frames)} fitted frames"])
+        if "markers" in card.measured:
+            own = [f"{COMPONENTS.get(name, name)} {words.length(std)}" for name, std in clouds.noise_components_m.items()]
+            rows.append(["Noise of clouds, along the normal", "; ".join(own)])
+    if "markers" not in card.measured:
+        return [
+            [str(a).replace("each axis", "along the normal").replace("at the markers", "along the normals"), b] for a, b in rows
+        ]
+    rows += [["Uncertainty of marker seats", words.length(card.seat_std_m, 2)]] if words.known(card.seat_std_m) else []
     return rows
 
 
