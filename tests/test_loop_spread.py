@@ -51,7 +51,7 @@ def test_gravity_seen_along_all_axes_has_the_usual_spread(size: float) -> None:
 
 
 def trial(count: int) -> Any:
-    return SimpleNamespace(groups=SimpleNamespace(state=np.repeat(np.arange(count), 5)), mesh_error=None)
+    return SimpleNamespace(groups=SimpleNamespace(state=np.repeat(np.arange(count), 5), surface=None), mesh_error=None)
 
 
 @pytest.mark.parametrize("factor", [0.5, 3.0])

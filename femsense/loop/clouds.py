@@ -29,6 +29,8 @@ from femsense.recording import Recording, read_frame_cloud
 
 SURFACE_POINTS = 140
 """Points of the surface; a camera sees less than half of them at once."""
+FEWEST_POINTS = 12
+"""With fewer off sharp edges those on edges count too."""
 VOXEL = 0.01
 """Edge of the cells that measured points are averaged over, in diagonals of the body."""
 RADIUS = 3.0
@@ -71,7 +73,7 @@ def with_surface(robot: Robot) -> Robot:
     surface = make_surface(robot.body.mesh)
     nodes = robot.body.mesh.nodes
     flat = spread_features(robot.body, SURFACE_POINTS, among=flat_nodes(surface, nodes))
-    chosen = flat if len(flat) >= SURFACE_POINTS // 3 else spread_features(robot.body, SURFACE_POINTS)
+    chosen = flat if len(flat) >= FEWEST_POINTS else spread_features(robot.body, SURFACE_POINTS)
     return robot.with_surface_points(nodes[chosen])
 
 

@@ -195,6 +195,8 @@ def whiten(whitener: Whitener, values: FloatArray) -> FloatArray:
 
 MAX_REML_ROWS = 700
 """Rows that the estimate of the noise uses at most; more are thinned out by whole frames."""
+MAX_CLOUD_ROWS = 500
+"""The same of clouds, whose points are thinned out as well."""
 
 
 def estimate_noise(
@@ -286,7 +288,8 @@ def _jitter(residuals: list[FloatArray], groups: list[Groups]) -> float:
 def _thinned(
     residuals: list[FloatArray], nuisance: list[FloatArray], extra: list[FloatArray], groups: list[Groups]
 ) -> tuple[list[FloatArray], list[FloatArray], list[FloatArray], list[Groups]]:
-    step = int(np.ceil(sum(len(r) for r in residuals) / MAX_REML_ROWS))
+    most = MAX_REML_ROWS if all(g.surface is None for g in groups) else MAX_CLOUD_ROWS
+    step = int(np.ceil(sum(len(r) for r in residuals) / most))
     if step <= 1:
         return residuals, nuisance, extra, groups
     keep = [_spread_rows(g, step) for g in groups]
@@ -296,8 +299,8 @@ def _thinned(
 
 
 def _spread_rows(groups: Groups, step: int) -> BoolArray:
-    """Return one in so many rows: whole frames, of clouds half as many whole frames of half as many points."""
-    if groups.surface is None or step < 4:
+    """Return about one in so many rows: whole frames, of clouds points in the same way."""
+    if groups.surface is None:
         return np.asarray(groups.frame % step == 0)
     points = int(np.ceil(np.sqrt(step)))
     return np.asarray((groups.frame % int(np.ceil(step / points)) == 0) & (groups.marker % points == 0))
@@ -322,11 +325,11 @@ def _richest(nuisance: list[FloatArray], extra: list[FloatArray], distinct: int)
             spare -= 1
     Q = np.transpose(basis)
     spans = np.cumsum([0, *(c.shape[0] * c.shape[1] for c in nuisance)])
-    return [Q[a:b].reshape(*block.shape[:2], -1) for block, (a, b) in zip(nuisance, pairwise(spans))]
+    return [Q[a:b].reshape(*block.shape[:2], len(basis)) for block, (a, b) in zip(nuisance, pairwise(spans))]
 
 
 def _stacked(columns: list[FloatArray]) -> FloatArray:
     """Return columns of all recordings below each other with unit length, shape (c Σk, p)."""
-    flat = np.vstack([c.reshape(-1, c.shape[2]) for c in columns])
+    flat = np.vstack([c.reshape(c.shape[0] * c.shape[1], c.shape[2]) for c in columns])
     norm = np.linalg.norm(flat, axis=0)
     return np.asarray(flat[:, norm > 0] / norm[norm > 0])

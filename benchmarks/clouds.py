@@ -1,0 +1,120 @@
+"""Effects found from clouds: the loop on the four-leg robot in front of its depth camera, from markers, from clouds and from both.
+
+    python benchmarks/clouds.py [--cases friction,gain,gravity,null] [--from markers,clouds,both] [--folder DIR]
+
+The truth has a mesh of half the size, quadratic elements, a neo-Hookean law (in the null case those that are declared, refined) and the
+rig's own integrator of friction; the camera is that of `femsense demo`, with its noise. Poses are declared, 2 mm and 5 mrad off.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from femsense.loop import improve
+from femsense.model import Robot
+from femsense.pose import move_pose
+from femsense.recording import Recording, load_recording
+from femsense.rig.simulate import simulate
+from femsense.robot import load_robot
+
+CASES: dict[str, list[dict[str, Any]]] = {
+    "friction": [{"name": "cable_friction", "coefficient": 0.2}],
+    "gain": [{"name": "cable_gain", "scale": {"west": 0.8}}],
+    "gravity": [{"name": "gravity", "vector_m_s2": [0.0, 0.0, -9.81]}],
+    "null": [],
+}
+POSE_OFF = np.array([5e-3, -3e-3, 4e-3, 2e-3, -1e-3, 1.5e-3])
+"""By how much the declared pose is off: rotation [rad], shift [m]."""
+
+
+def script_of(robot: Robot, case: str) -> dict[str, Any]:
+    """Return the script of a case: the sweeps of the demo without the touch, and a depth image in every frame."""
+    assert robot.folder is not None
+    script = tomllib.loads((robot.folder / "demo_script.toml").read_text(encoding="utf-8"))
+    script["sweeps"] = [sweep for sweep in script["sweeps"] if sweep["label"] != "touch"]
+    script |= {"contacts": [], "effects": CASES[case], "actuation_zero": "absolute", "clouds": {"kind": "depth", "frames": "all"}}
+    script["truth"]["law"] = "corotational" if case == "null" else "neo_hookean"
+    script["camera"]["declare_pose"] = True
+    return script
+
+
+def declared_robot(case: str) -> Robot:
+    robot = load_robot("four-leg")
+    return robot.with_body(robot.body.with_gravity(np.zeros(3))) if case == "gravity" else robot
+
+
+def recording_of(folder: Path, case: str) -> Recording:
+    """Return the recording of a case, made if it is not there yet."""
+    place = folder / case
+    if not (place / "recording.toml").is_file():
+        simulate(declared_robot(case), script_of(load_robot("four-leg"), case), place)
+    recording = load_recording(place)
+    pose = recording.T_robot_camera[0]
+    assert pose is not None
+    return replace(recording, T_robot_camera=(move_pose(pose, POSE_OFF, pivot_a=np.zeros(3)),))
+
+
+def size_of(loop: Any, truth: dict[str, Any]) -> str:
+    """Return the value that was found beside the true one."""
+    key, true = next((k, v) for k, v in truth.items() if k != "name")
+    entry = next((e for e in loop.effects if e["name"] == truth["name"]), None)
+    if entry is None:
+        return "–"
+    value, std = entry["parameters"][key]["value"], entry["parameters"][key]["std"]
+    if isinstance(value, list):
+        return f"{np.linalg.norm(np.subtract(value, true)) / np.linalg.norm(true):.1%} off"
+    if isinstance(value, dict):
+        value, std = (float(np.mean([t[k] for k in (true if isinstance(true, dict) else value)])) for t in (value, std))
+    true = float(np.mean(list(true.values()))) if isinstance(true, dict) else true
+    return f"{value:.3g} ± {std:.1g} (true {true:g})"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--cases", default="friction,gain,gravity,null")
+    parser.add_argument("--from", dest="kinds", default="markers,clouds,both")
+    parser.add_argument("--folder", type=Path)
+    options = parser.parse_args()
+    folder = options.folder or Path(tempfile.mkdtemp(prefix="clouds-"))
+    print("| hidden | from | verdict | named | size | held out, markers [mm] | held out, clouds [mm] | noise [mm] | CPU [s] |")
+    print("|---|---|---|---|---|---|---|---|---|", flush=True)
+    for case in options.cases.split(","):
+        recording = recording_of(folder, case)
+        for kind in options.kinds.split(","):
+            began = time.process_time()
+            loop = improve(declared_robot(case), [recording], measured=kind)
+            print(row(case, kind, loop, time.process_time() - began), flush=True)
+
+
+def row(case: str, kind: str, loop: Any, seconds: float) -> str:
+    def fall(key: str) -> str:
+        ends = [part.get(key) for part in (loop.before, loop.after)]
+        return "–" if None in ends else f"{1e3 * ends[0]:.3f} → {1e3 * ends[1]:.3f}"
+
+    marked = "–" if kind == "clouds" else fall("validation_rms_m")
+    named = ", ".join(e["name"] for e in loop.effects) or "–"
+    size = size_of(loop, CASES[case][0]) if CASES[case] else "–"
+    cells = [
+        case,
+        kind,
+        loop.verdict,
+        named,
+        size,
+        marked,
+        fall("validation_normal_rms_m"),
+        f"{1e3 * loop.noise_m:.3f}",
+        f"{seconds:.0f}",
+    ]
+    return "| " + " | ".join(cells) + " |"
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,249 @@
+"""The loop on clouds: rows along normals, their derivatives, and effects found without any marker."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from arm import T_ROBOT_CAMERA, arm, record, sweeps
+
+from femsense.calib.forward import Hypothesis, evaluate_scene
+from femsense.effects import find_effect
+from femsense.errors import DataError, InputError
+from femsense.fem.mesh import surface_triangles
+from femsense.frames import Camera
+from femsense.loop import improve
+from femsense.loop.data import Data, prepare
+from femsense.loop.joint import normals_of, spans_of, vectors_of
+from femsense.loop.noise import Groups, Noise, Surface, whiten
+from femsense.pointcloud.patches import fit_patches
+from femsense.pose import move_pose
+from femsense.recording import Recording, load_recording, save_recording
+from femsense.rig.camera import Shape, cloud_of, render, write_ply
+from femsense.rig.script import NoiseTable
+
+LENS = Camera("", 240, 180, 600.0, 600.0, 119.5, 89.5, np.zeros(5), 1e-4)
+NOISE = NoiseTable.model_validate({"subpixel_px": 0.05, "focal_px": 600.0, "correlated_share": 0.3, "correlation_px": 1.0})
+TURNED = move_pose(T_ROBOT_CAMERA, np.array([3e-3, -2e-3, 2e-3, 3e-4, -3e-4, 4e-4]), pivot_a=np.array([0.05, 0.0, 0.0]))
+"""What the recording says of the camera: a little off."""
+FEW = ["cable_friction", "cable_gain", "creep"]
+COARSE, FINE = (6, 1, 1), (7, 2, 2)
+
+
+def film(folder: Path, *, markers: bool = True, pose: Any = TURNED, **options: Any) -> Recording:
+    """Return a recording with clouds of the true arm, which has another mesh, written to a folder and read again."""
+    truth = options.pop("truth", None) or arm(FINE)
+    inputs, labels = sweeps()
+    recording, states = record(inputs, labels=labels, truth=truth, **options)
+    if not markers:
+        none = {f"marker_{n}": getattr(recording, f"marker_{n}")[:0] for n in ("frame", "index", "view", "xyz")}
+        recording = replace(recording, marker_names=(), **none)
+    recording = replace(recording, T_robot_camera=(pose,))
+    skin, rng = surface_triangles(truth.body.mesh), np.random.default_rng(7)
+
+    def fill(place: Path) -> None:
+        (place / "clouds").mkdir()
+        for k, x in enumerate(states):
+            image = render(LENS, T_ROBOT_CAMERA, [Shape(x, skin, np.array([0.2, 0.4, 0.8]))], noise=NOISE, rng=rng)
+            write_ply(place / "clouds" / f"{k:06d}.ply", cloud_of(image, LENS))
+
+    return load_recording(save_recording(recording, folder, fill=fill))
+
+
+@pytest.fixture(scope="module")
+def rubbing(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    """Return a recording with markers and clouds of an arm whose cables rub."""
+    hidden = [{"name": "cable_friction", "coefficient": 0.25}]
+    return film(tmp_path_factory.mktemp("rubbing") / "r", effects=hidden)
+
+
+@pytest.fixture(scope="module")
+def both(rubbing: Recording) -> Data:
+    return prepare(arm(COARSE), [rubbing], [])
+
+
+# Patches
+
+
+def sphere(center: np.ndarray, radius: float, noise: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Return directions (k, 3) that face a camera at the origin, and measured points (r, 3) of a ball."""
+    rng = np.random.default_rng(3)
+    out = rng.normal(size=(9000, 3))
+    out /= np.linalg.norm(out, axis=1, keepdims=True)
+    out = out[out[:, 2] < -0.2]
+    return out[out[:, 2] < -0.5][:40], center + radius * out + noise * rng.normal(size=out.shape)
+
+
+def test_a_patch_measures_the_distance_from_a_curved_surface_wherever_the_point_goes():
+    center, radius = np.array([0.01, -0.02, 0.4]), 0.03
+    out, points = sphere(center, radius)
+    patches, own, _ = fit_patches(center + (radius + 1e-3) * out, out, points, radius=0.006, reach=0.01, min_facing=0.3)
+    assert len(own) > 25
+    np.testing.assert_allclose(np.linalg.norm(patches.feet - center, axis=1), radius, atol=3e-6)
+    np.testing.assert_allclose(np.einsum("kc,kc->k", patches.normals, out[own]), 1.0, atol=1e-5)
+    moved = center + (radius + 1e-3) * out[own] + 2e-3 * np.random.default_rng(0).normal(size=(len(own), 3))
+    exact = np.linalg.norm(moved - center, axis=1) - radius
+    np.testing.assert_allclose(patches.distance(moved), exact, atol=2e-5)  # of 1 … 8 mm
+
+
+def test_no_patch_where_nothing_was_measured_or_on_the_far_side():
+    center, radius = np.array([0.0, 0.0, 0.4]), 0.03
+    out, points = sphere(center, radius)
+    away = -out
+    assert not len(fit_patches(center + radius * away, away, points, radius=0.006, reach=0.01, min_facing=0.3)[1])
+    assert not len(fit_patches(center + (radius + 0.02) * out, out, points, radius=0.006, reach=0.01, min_facing=0.3)[1])
+    half = points[points[:, 0] < -0.002]  # the line of a point beside the edge crosses nothing
+    beside = out[(radius * out[:, 0] > 0.001)]
+    assert not len(fit_patches(center + radius * beside, beside, half, radius=0.006, reach=0.01, min_facing=0.3)[1])
+
+
+# Rows
+
+
+def test_rows_are_what_the_true_pose_says_and_markers_and_clouds_share_it(both: Data):
+    marked, cloudy = both.train
+    assert both.measured == ("markers", "clouds")
+    assert (marked.scene.patches is None, cloudy.together, both.held[1].together) == (True, True, True)
+    assert spans_of(both.train) == [slice(0, 6), slice(0, 6)]
+    assert set(cloudy.groups.sweep) == set(marked.groups.sweep)
+    first = cloudy.scene.frame == 0
+    assert first.sum() > 12
+    normals = normals_of(cloudy.scene, [T_ROBOT_CAMERA])[first]
+    rest = both.robot.marker_points[cloudy.scene.marker[first]]
+    side = rest[:, 1:] / 0.01  # the arm is 20 mm wide: its sides have the normals ± y and ± z
+    side = np.where(np.abs(side) > 0.999, side, 0.0)
+    away = np.einsum("kc,kc->k", normals[:, 1:], side)
+    assert (away > 0.97).all()
+    scene, pivot = cloudy.scene.pick(np.zeros(1, dtype=np.int64)), both.robot.marker_points.mean(axis=0)
+    jet = evaluate_scene(
+        Hypothesis(both.robot), scene, np.zeros(0), [T_ROBOT_CAMERA], None, derivative=False, vary_initial=False, pivot=pivot
+    )
+    assert np.sqrt((jet.residual**2).mean()) < 4e-4  # no cable pulls yet
+
+
+def test_derivatives_of_cloud_rows_are_those_of_finite_differences(both: Data):
+    trial, robot = both.train[1], both.robot
+    scene = trial.scene.pick(trial.scene.frames[[2, 5]])
+    terms = [
+        (find_effect(n), {}, find_effect(n).parameters(robot, "tension")) for n in ("stiffness", "depth_scale", "cable_gain")
+    ]
+    hypothesis, pivot = Hypothesis(robot, tuple(terms)), robot.marker_points.mean(axis=0)
+    zero, initial = np.zeros(len(hypothesis.parameters)), np.full(4, 0.1)
+
+    def residual(coordinates: np.ndarray, step: np.ndarray, inputs: np.ndarray) -> np.ndarray:
+        poses = [move_pose(trial.poses[0], step, pivot_a=pivot)]
+        return evaluate_scene(
+            hypothesis, scene, coordinates, poses, inputs, derivative=False, vary_initial=False, pivot=pivot
+        ).residual
+
+    jet = evaluate_scene(hypothesis, scene, zero, list(trial.poses), initial, derivative=True, vary_initial=True, pivot=pivot)
+    assert jet.residual.shape == (len(scene.frame), 1)
+    for j, h in ((0, 1e-3), (2, 1e-3), (4, 1e-4)):
+        step = h * np.eye(6)[j]
+        central = (residual(zero, step, initial) - residual(zero, -step, initial)) / (2 * h)
+        np.testing.assert_allclose(jet.by_pose[:, :, j], central, atol=2e-2 * np.abs(central).max())
+    for j in range(len(zero)):
+        h = 5e-4 * np.eye(len(zero))[j]
+        central = (residual(zero + h, np.zeros(6), initial) - residual(zero - h, np.zeros(6), initial)) / 1e-3
+        np.testing.assert_allclose(jet.by_effect[:, :, j], central, atol=2e-2 * np.abs(central).max())
+    h = 1e-3 * np.eye(4)[0]
+    central = (residual(zero, np.zeros(6), initial + h) - residual(zero, np.zeros(6), initial - h)) / 2e-3
+    np.testing.assert_allclose(jet.by_initial[:, :, 0], central, atol=2e-2 * np.abs(central).max())
+
+
+def test_a_row_is_positive_where_the_measured_surface_lies_outside(both: Data):
+    trial = both.train[1]
+    poses = [T.copy() for T in trial.poses]
+    frame = trial.scene.frames[:1]
+    scene, pivot = trial.scene.pick(frame), both.robot.marker_points.mean(axis=0)
+
+    def residual() -> np.ndarray:
+        return evaluate_scene(
+            Hypothesis(both.robot), scene, np.zeros(0), poses, None, derivative=False, vary_initial=False, pivot=pivot
+        ).residual
+
+    before = residual()
+    poses[0][:3, 3] += 1e-3 * T_ROBOT_CAMERA[:3, 2] * -1.0  # everything measured comes 1 mm nearer to the camera
+    change = vectors_of(trial.part(frame), residual() - before)
+    assert (change @ -T_ROBOT_CAMERA[:3, 2] > 0.0).all()
+    assert (residual() > before).all()
+
+
+def test_noise_of_clouds_is_shared_by_neighbours_along_their_normals():
+    marker = np.array([0, 1, 0, 1])
+    surface = Surface(
+        np.array([[0.0, 0, 0], [0.01, 0, 0]] * 2), np.array([[0.0, 0, 1], [0.6, 0, 0.8]] * 2), np.array([0, 0, 1, 1]), 0.01
+    )
+    groups = Groups(marker, np.array([0, 0, 1, 1]), np.zeros(4, int), np.arange(4), surface)
+    noise = Noise({}, "", {"white": 0.5, "marker": 0.3, "frame": 0.2, "state": 0.1})
+    sigma, near = noise.covariance(groups), np.exp(-0.5)
+    assert sigma[0, 0] == pytest.approx(0.25 + 0.09 + 0.04 + 0.01)
+    assert sigma[0, 1] == pytest.approx(0.8 * (near * (0.09 + 0.01) + 0.04))
+    assert sigma[0, 2] == pytest.approx(0.09)
+    assert sigma[0, 3] == pytest.approx(0.8 * near * 0.09)
+    W = whiten(noise.whitener(groups), np.eye(4)[:, None, :])
+    np.testing.assert_allclose(np.linalg.inv(W.T @ W), sigma, atol=1e-12)
+
+
+# The loop
+
+
+def check_friction(loop: Any) -> None:
+    assert loop.verdict == "effects"
+    effect = next(e for e in loop.effects if e["name"] == "cable_friction")
+    value = effect["parameters"]["coefficient"]["value"]
+    value = value if isinstance(value, float) else float(np.mean(list(value.values())))
+    assert value == pytest.approx(0.25, rel=0.2)
+    assert {e["name"] for e in loop.effects} <= {"cable_friction", "stiffness", "cable_offset"}
+    assert loop.after["validation_normal_rms_m"] < 0.6 * loop.before["validation_normal_rms_m"]
+
+
+def test_friction_is_found_from_clouds_alone(rubbing: Recording):
+    none = {f"marker_{n}": getattr(rubbing, f"marker_{n}")[:0] for n in ("frame", "index", "view", "xyz")}
+    loop = improve(arm(COARSE), [replace(rubbing, marker_names=(), **none)], effects=FEW)
+    check_friction(loop)
+    assert loop.data["measured"] == ["clouds"]
+    assert loop.after["validation_rms_m"] == loop.after["validation_normal_rms_m"]
+    assert loop.robot.marker_names == arm(COARSE).marker_names
+    assert "along the normals" in loop.sentence
+
+
+def test_friction_is_found_from_markers_and_clouds_together(rubbing: Recording):
+    loop = improve(arm(COARSE), [rubbing], effects=FEW)
+    check_friction(loop)
+    assert loop.after["validation_rms_m"] != loop.after["validation_normal_rms_m"]
+    assert loop.after["validation_rms_m"] < 0.6 * loop.before["validation_rms_m"]
+
+
+def test_a_model_that_lacks_nothing_is_told_so_from_clouds(tmp_path: Path):
+    loop = improve(arm(COARSE), [film(tmp_path / "r", markers=False, truth=arm(COARSE))], effects=FEW)
+    assert (loop.verdict, loop.effects) == ("none", ())
+
+
+# What is missing
+
+
+def test_clouds_without_a_pose_say_what_to_give(rubbing: Recording):
+    none = {f"marker_{n}": getattr(rubbing, f"marker_{n}")[:0] for n in ("frame", "index", "view", "xyz")}
+    with pytest.raises(InputError, match=r"T_robot_camera in recording\.toml"):
+        prepare(arm(COARSE), [replace(rubbing, marker_names=(), T_robot_camera=(None,), **none)], [])
+
+
+def test_a_recording_without_clouds_or_with_none_in_free_frames_says_so(rubbing: Recording):
+    with pytest.raises(DataError, match="the recording has no clouds"):
+        prepare(arm(COARSE), [record(sweeps()[0][:4])[0]], [], "clouds")
+    with pytest.raises(DataError, match="no frame with clouds is free"):
+        prepare(arm(COARSE), [replace(rubbing, free=np.zeros(len(rubbing.time_s), dtype=bool))], [], "clouds")
+    with pytest.raises(InputError, match="both, markers, clouds"):
+        prepare(arm(COARSE), [rubbing], [], "images")
+
+
+def test_a_camera_that_looks_past_the_robot_is_refused(rubbing: Recording):
+    away = TURNED.copy()
+    away[:3, 3] += 0.5
+    none = {f"marker_{n}": getattr(rubbing, f"marker_{n}")[:0] for n in ("frame", "index", "view", "xyz")}
+    with pytest.raises(DataError, match="no camera sees the robot"):
+        prepare(arm(COARSE), [replace(rubbing, marker_names=(), T_robot_camera=(away,), **none)], [])
