@@ -204,7 +204,7 @@ def improve(
     effects: Annotated[list[str] | None, typer.Option("--effects", metavar="NAME,…", help="Try these effects only.", show_default=False)] = None,
     without: Annotated[list[str] | None, typer.Option("--without", metavar="NAME,…", help="Do not try these effects.", show_default=False)] = None,
     user_effect: Annotated[list[Path] | None, typer.Option("--user-effect", metavar="FILE", help="Try an effect of your own (docs/effects/own.md).", show_default=False)] = None,
-    measured: Annotated[str, typer.Option("--from", metavar="both|markers|clouds", help="What is used of recordings that have markers and clouds.")] = "both",
+    measured: Annotated[str, typer.Option("--from", metavar="auto|markers|clouds|both", help="What is used of a recording; auto: its markers, or its clouds where it has none.")] = "auto",
     again: Annotated[bool, typer.Option("--again", help="Compute even where OUT holds this result already.")] = False,
     workers: Annotated[int | None, typer.Option("--workers", metavar="N", min=1, help="Threads that work; by default one a core, four at most.", show_default=False)] = None,
     plan: Annotated[bool, typer.Option("--plan", help="Propose what to record, so that effects can be told apart; needs no RECORDING.")] = False,

@@ -83,8 +83,17 @@ class Robot:
         """Return the robot with points of its surface at rest [m], shape (p, 3), behind its markers."""
         names = tuple(f"surface {i + 1}" for i in range(len(points)))
         share = None if self.marker_share is None else np.concatenate([self.marker_share, np.ones(len(points))])
-        more = replace(self, marker_names=(*self.marker_names, *names), marker_share=share, surface_points=self.surface_points + len(points))
+        more = replace(
+            self, marker_names=(*self.marker_names, *names), marker_share=share, surface_points=self.surface_points + len(points)
+        )
         return more.with_marker_points(np.vstack([self.marker_points.reshape(-1, 3), points]))
+
+    def without_surface_points(self) -> Robot:
+        """Return the robot with its markers proper only."""
+        k = len(self.glued_names)
+        share = None if self.marker_share is None else self.marker_share[:k]
+        return replace(self, marker_names=self.glued_names, marker_points=self.marker_points[:k], markers=self.markers[np.arange(k)],
+                       marker_share=share, surface_points=0)  # fmt: skip
 
     def with_marker_points(self, points: FloatArray) -> Robot:
         """Return the robot with its markers elsewhere at rest [m], shape (k, 3)."""

@@ -74,7 +74,7 @@ def improve_into(
     effects: Sequence[str] | None = None,
     without: Sequence[str] | None = None,
     user_effects: Sequence[str | Path] = (),
-    measured: str = "both",
+    measured: str = "auto",
     again: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
@@ -87,7 +87,7 @@ def improve_into(
         say: told in one line what happens beside the loop.
         effects, without: names of effects to try, or not to try.
         user_effects: Python files of effects that are tried too.
-        measured: "markers", "clouds" or "both": what is used of recordings that have both.
+        measured: "markers", "clouds" or "both": what is used of a recording; "auto": its markers, or its clouds where it has none.
         again: compute even where the result is there.
         progress: as of `improve`.
 

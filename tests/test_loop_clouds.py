@@ -62,7 +62,7 @@ def rubbing(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 
 @pytest.fixture(scope="module")
 def both(rubbing: Recording) -> Data:
-    return prepare(arm(COARSE), [rubbing], [])
+    return prepare(arm(COARSE), [rubbing], [], "both")
 
 
 # Patches
@@ -212,7 +212,7 @@ def test_friction_is_found_from_clouds_alone(rubbing: Recording):
 
 
 def test_friction_is_found_from_markers_and_clouds_together(rubbing: Recording):
-    loop = improve(arm(COARSE), [rubbing], effects=FEW)
+    loop = improve(arm(COARSE), [rubbing], effects=FEW, measured="both")
     check_friction(loop)
     assert loop.after["validation_rms_m"] != loop.after["validation_normal_rms_m"]
     assert loop.after["validation_rms_m"] < 0.6 * loop.before["validation_rms_m"]
@@ -237,7 +237,7 @@ def test_a_recording_without_clouds_or_with_none_in_free_frames_says_so(rubbing:
         prepare(arm(COARSE), [record(sweeps()[0][:4])[0]], [], "clouds")
     with pytest.raises(DataError, match="no frame with clouds is free"):
         prepare(arm(COARSE), [replace(rubbing, free=np.zeros(len(rubbing.time_s), dtype=bool))], [], "clouds")
-    with pytest.raises(InputError, match="both, markers, clouds"):
+    with pytest.raises(InputError, match="auto, markers, clouds, both"):
         prepare(arm(COARSE), [rubbing], [], "images")
 
 

@@ -144,7 +144,8 @@ def next_element(
         return []
     try:
         zero = "unknown" if any(t.initial is not None for t in trials) else "absolute"
-        setup = setup_for(robot, data.control, zero, most=data.input_scale)
+        marked = robot.without_surface_points() if robot.glued_names else robot  # what an experiment would have on it
+        setup = setup_for(marked, data.control, zero, most=data.input_scale)
         forms = _open_forms(robot, data, names)
         shares = [len(few.scene.frames) / len(t.scene.frames) for few, t in zip(trials, data.train)]
         have = [

@@ -25,7 +25,8 @@ ROWS_A_CLOUD = 60
 """Points of the surface that a camera sees in one frame, about."""
 FEWEST_CLOUDS = 4
 """Where there are markers, fewer frames with clouds than this are not looked at."""
-MEASURED = ("both", "markers", "clouds")
+MEASURED = ("auto", "markers", "clouds", "both")
+"""What may be used of a recording; auto: its markers, or its clouds where it has no markers."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -55,14 +56,14 @@ class Data:
         return tuple(sorted(kinds, reverse=True))
 
 
-def prepare(robot: Robot, recordings: Sequence[Recording], validation: Sequence[Recording], measured: str = "both") -> Data:
+def prepare(robot: Robot, recordings: Sequence[Recording], validation: Sequence[Recording], measured: str = "auto") -> Data:
     """Check the recordings, split them, and calibrate each for a start.
 
     Arguments:
         robot: as it is declared.
         recordings: to fit.
         validation: to judge on.
-        measured: "markers", "clouds" or "both": what is used of a recording that has them.
+        measured: "markers", "clouds" or "both": what is used of a recording; "auto": its markers, or its clouds where it has none.
 
     Raises:
         InputError: bad arguments; DataError: the data do not allow a fit.
@@ -119,7 +120,7 @@ def _frames_of(recording: Recording, measured: str) -> tuple[IntArray, IntArray]
     none = usable[:0]
     marked = none if measured == "clouds" else usable[np.isin(usable, recording.marker_frame)]
     cloudy = none if measured == "markers" else np.intersect1d(usable, cloud_frames(recording))
-    if len(marked) and len(cloudy) < FEWEST_CLOUDS:
+    if len(marked) and (measured == "auto" or len(cloudy) < FEWEST_CLOUDS):
         cloudy = none
     if not len(marked) and not len(cloudy):
         raise DataError(_nothing(recording, measured))
@@ -135,9 +136,9 @@ def _evenly(recording: Recording, frames: IntArray, most: int) -> IntArray:
 
 
 def _nothing(recording: Recording, measured: str) -> str:
-    wanted = "markers or clouds" if measured == "both" else measured
+    wanted = measured if measured in ("markers", "clouds") else "markers or clouds"
     has = {"markers": bool(len(recording.marker_frame)), "clouds": has_clouds(recording)}
-    if not any(has[kind] for kind in (("markers", "clouds") if measured == "both" else (measured,))):
+    if not any(has[kind] for kind in has if kind in wanted):
         return f"the recording has no {wanted}: the loop needs markers.csv, clouds/ or depth/ in frames that are free (or whose loads are declared)"
     return f"no frame with {wanted} is free of undeclared contact: the loop needs {wanted} in free frames (or declared loads)"
 

@@ -408,7 +408,7 @@ def lack_of_fit(trials: list[Trial], residuals: list[FloatArray], parameters: in
         "p_value": float(fisher.sf(ratio, own, free)),
         "df_lack": own,
         "df_pure": free,
-        "pure_error_m": float(np.sqrt(3.0 * pure / free)),
+        "pure_error_m": float(np.sqrt(max(r.shape[1] for r in residuals) * pure / free)),
     }
 
 

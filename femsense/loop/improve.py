@@ -40,7 +40,7 @@ def improve(
     effects: Sequence[str] | None = None,
     without: Sequence[str] | None = None,
     user_effects: Sequence[str | Path] = (),
-    measured: str = "both",
+    measured: str = "auto",
     progress: Progress | None = None,
     seed: int = 0,
 ) -> LoopResult:
@@ -53,7 +53,7 @@ def improve(
         effects: names to try; by default all.
         without: names to leave out.
         user_effects: Python files of effects that are tried too (docs/effects/own.md); they belong to "all".
-        measured: "markers", "clouds" or "both": what is used of recordings that have both.
+        measured: "markers", "clouds" or "both": what is used of a recording; "auto": its markers, or its clouds where it has none.
         progress: told what is going on.
         seed: of the permutation test and the bootstrap.
 
@@ -87,7 +87,9 @@ def improve(
         say(f"screening effects ({found} found so far)")
         if found and "clouds" in data.measured:
             data = rematched(data, stage, noise)
-            stage = make_stage(data, stage.fit.hypothesis, stage.fit.prior, noise, stage.fit.coordinates, own=own_of(stage))
+            stage = make_stage(
+                data, stage.fit.hypothesis, stage.fit.prior, noise, stage.fit.coordinates, own=own_of(stage), near=stage.fit.jets
+            )
         fields = fields_of(data, stage, names)
         noise, n_effective = noise_of(data, stage, fields)
         stage = make_stage(
