@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -65,8 +66,12 @@ def _apply_mesh(robot: Robot, entry: Entry) -> Robot:
     return robot if mesh is robot.body.mesh else robot_on_mesh(robot, mesh)
 
 
+@functools.lru_cache(maxsize=4)
 def finer_mesh(mesh: TetMesh, element: str | None, refinements: int) -> TetMesh:
-    """Return a mesh of another element (None: the same), each element split into eight so many times."""
+    """Return a mesh of another element (None: the same), each element split into eight so many times.
+
+    The last ones are kept: states that were solved on a mesh then serve wherever it is asked for again.
+    """
     quadratic = mesh.is_quadratic if element is None else element == "tet10"
     if not refinements and quadratic == mesh.is_quadratic:
         return mesh
@@ -76,8 +81,12 @@ def finer_mesh(mesh: TetMesh, element: str | None, refinements: int) -> TetMesh:
     return to_quadratic(fine) if quadratic else fine
 
 
+@functools.lru_cache(maxsize=2)
 def robot_on_mesh(robot: Robot, mesh: TetMesh) -> Robot:
-    """Return the robot with its body on another mesh of the same shape; markers, features and cables stay where they are."""
+    """Return the robot with its body on another mesh of the same shape; markers, features and cables stay where they are.
+
+    The last ones are kept: what the stiffness of a fine mesh needs beforehand takes as long as some states.
+    """
     old = robot.body.mesh
     boxes = declared_boxes(robot)
     clamped = None if boxes is None else np.flatnonzero(_inside(mesh.nodes, boxes))
