@@ -143,11 +143,11 @@ def detectable(record: dict[str, Any]) -> bool:
     return bool(record["d_prime"]["d"] > record["d_prime"]["needed"] and record["d_prime"]["retained"] >= 0.1)
 
 
-def parameter_errors(record: dict[str, Any]) -> list[tuple[float, bool | None]]:
-    """Return the relative error of the size of a named effect, and whether its 95 % interval holds the truth."""
+def parameter_errors(record: dict[str, Any]) -> list[tuple[float, list[bool]]]:
+    """Return the relative error of each value of a named effect, and whether the 95 % interval of each component holds the truth."""
     truth = record["hidden"][0]
     found = next(e for e in record["effects"] if e["name"] == truth["name"])["parameters"]
-    result: list[tuple[float, bool | None]] = []
+    result: list[tuple[float, list[bool]]] = []
     for key in (
         "scale",
         "poisson_ratio",
@@ -165,12 +165,9 @@ def parameter_errors(record: dict[str, Any]) -> list[tuple[float, bool | None]]:
         null = 0.45 if key == "poisson_ratio" else 1.0 if key == "scale" else 0.0
         for t, v, s in _matched(truth[key], found[key]["value"], found[key]["std"], null):
             size = np.linalg.norm(np.atleast_1d(t) - null)
-            result.append(
-                (
-                    float(np.linalg.norm(np.atleast_1d(v) - np.atleast_1d(t)) / size),
-                    None if s is None else bool(np.all(np.abs(np.atleast_1d(v) - np.atleast_1d(t)) <= 1.96 * np.atleast_1d(s))),
-                )
-            )
+            off = np.abs(np.atleast_1d(v) - np.atleast_1d(t))
+            inside = [] if s is None else [bool(d <= 1.96 * w) for d, w in zip(off, np.atleast_1d(s))]
+            result.append((float(np.linalg.norm(off) / size), inside))
     return result
 
 
@@ -209,7 +206,7 @@ def table(records: Sequence[dict[str, Any]]) -> None:
             f"{100 * np.median(sizes):.1f} % / {100 * np.quantile(sizes, 0.9):.1f} %",
             "10 / 25 % | 5 / 15 %",
         )
-        held = [c for _, c in errors if c is not None]
+        held = [c for _, inside in errors for c in inside]
         row("95 % interval holds the truth", wilson(sum(held), len(held)), "85-99 % | 92-98 %")
     shares = [_recovered(r) for r in first]
     if shares:

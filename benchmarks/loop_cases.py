@@ -292,10 +292,13 @@ def make_data(case: Case, seed: int) -> Made:
 
 
 def _on_fine_clamp(entry: dict[str, Any], declared: Robot, true: Robot) -> dict[str, Any]:
-    """Return an entry whose springs, one a node of the declared mesh, are spread over the nodes of the true one."""
+    """Return an entry whose springs, one a node of the declared mesh, are spread over the nodes of the true one and resist turning alike."""
     if entry["name"] != "base_compliance" or "stiffness_n_m" not in entry:
         return entry
-    return {**entry, "stiffness_n_m": entry["stiffness_n_m"] * len(declared.body.clamp_nodes) / len(true.body.clamp_nodes)}
+    second = [
+        float(np.sum(np.square(n - n.mean(axis=0)))) for n in (r.body.mesh.nodes[r.body.clamp_nodes] for r in (declared, true))
+    ]
+    return {**entry, "stiffness_n_m": entry["stiffness_n_m"] * second[0] / second[1]}
 
 
 def excursions(design: Design, control: str, rng: np.random.Generator, *, poor: bool) -> tuple[FloatArray, list[str], FloatArray]:

@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 from arm import arm, record
+from femsense.loop.rivals import in_place_of
 
 from femsense.loop.data import prepare
 from femsense.loop.joint import Prior
 from femsense.loop.noise import Noise
-from femsense.loop.rivals import in_place_of
 from femsense.loop.stages import make_stage, with_nuisance
 from femsense.model import Robot
 

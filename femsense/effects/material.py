@@ -9,7 +9,7 @@ import numpy as np
 from femsense.arrays import freeze
 from femsense.effects.effect import Effect, Entry, Parameter, number, vector
 from femsense.errors import InputError
-from femsense.model import Robot, spread_features, spread_points
+from femsense.model import Robot, spread_features
 
 
 def _stiffness_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
@@ -52,18 +52,18 @@ def _region_places(robot: Robot) -> tuple[Entry, ...]:
 
 
 def _regions_nearby(robot: Robot, seed: Entry) -> tuple[Entry, ...]:
-    """Spheres of several sizes around places near by, those that hold the centroid of an element."""
+    """Spheres of several sizes around this place and places beside it; of those that hold the same elements only the first."""
     mesh, center, radius = robot.body.mesh, np.asarray(seed["center_m"]), float(seed["radius_m"])
     centroids = mesh.nodes[mesh.tets[:, :4]].mean(axis=1)
-    near = centroids[np.linalg.norm(centroids - center, axis=1) <= 1.5 * radius]
-    first = int(np.linalg.norm(near - center, axis=1).argmin()) if len(near) else 0
-    places = [center, *near[spread_points(near, 10, first=first)]]
-    return tuple(
-        {"center_m": [float(v) for v in place], "radius_m": factor * radius}
-        for place in places
-        for factor in (0.6, 0.8, 1.0, 1.3)
-        if (np.linalg.norm(centroids - place, axis=1) <= factor * radius).any()
-    )
+    moves = np.vstack([np.zeros((1, 3)), *(h * radius * np.vstack([np.eye(3), -np.eye(3)]) for h in (0.35, 0.8))])
+    distinct: dict[bytes, Entry] = {}
+    for place in center + moves:
+        distance = np.linalg.norm(centroids - place, axis=1)
+        for factor in (1.0, 0.8, 1.25, 0.6):
+            inside = distance <= factor * radius
+            if inside.any():
+                distinct.setdefault(inside.tobytes(), {"center_m": [float(v) for v in place], "radius_m": factor * radius})
+    return tuple(distinct.values())
 
 
 def _apply_region(robot: Robot, entry: Entry) -> Robot:

@@ -12,19 +12,16 @@ from femsense.effects import Entry, apply_effects
 from femsense.loop.advice import next_element
 from femsense.loop.data import Data
 from femsense.loop.evidence import gather
-from femsense.loop.grow import ABOVE_MESH, EVIDENCE, at_edge, evidence, mesh_cost, moved_by
-from femsense.loop.joint import Prior, Trial, heads_of, normal_rms_of, rms_of, vectors_of
+from femsense.loop.grow import EVIDENCE, at_edge
+from femsense.loop.joint import Trial, heads_of, normal_rms_of, rms_of, vectors_of
 from femsense.loop.noise import Noise
 from femsense.loop.result import LoopResult
-from femsense.loop.rivals import in_place_of
 from femsense.loop.screen import NUISANCE, TESTABLE, Candidate, confounding, one_each
-from femsense.loop.spread import coordinate_std
-from femsense.loop.stages import Stage, jets_without, make_stage, own_of
+from femsense.loop.spread import spreads
+from femsense.loop.stages import Stage, keeping
 from femsense.loop.structure import describe_left, structure_tests, without_mesh_error
+from femsense.loop.zeros import InPlace, moved_nuisance, zeros_are_evident
 
-SIGNIFICANT = 3.0
-RELEVANT = 0.02
-"""A nuisance that moved by more than three standard deviations and 2 % is named as an effect."""
 MIN_SWEEPS = 4
 """With fewer held-out sweeps the interval of the held-out error resamples frames."""
 DRAWS = 2000
@@ -50,6 +47,8 @@ class Search:
     last: list[Candidate]
     """The last one."""
     refits: list[dict[str, Any]]
+    in_place: InPlace | None
+    """What might be in the place of the cable zeros."""
 
 
 def conclude(data: Data, search: Search, rng: np.random.Generator) -> LoopResult:
@@ -60,13 +59,14 @@ def conclude(data: Data, search: Search, rng: np.random.Generator) -> LoopResult
     names, back = _worth_handing_back(data, search, promoted, names)
     promoted = [n for n in promoted if n in names]
     entries = _entries(back, names)
-    effects = _chain(data, search, promoted, names, back)
+    spread = spreads(data, final, noise, _seed_spread(search))
+    effects = _chain(data, search, promoted, names, back, spread)
     residuals = [without_mesh_error(t, jet.residual, noise) for t, jet in zip(data.train, final.fit.jets)]
     tests = structure_tests(data.train, residuals, rng=rng)
     excess = _excess(before, final, noise)
     unexplained = tests.significant and excess.left > excess.tolerated and excess.explained < EXPLAINED
     verdict = "unexplained" if unexplained else "effects" if effects else "none"
-    rivals = [*_confounded(search, names), *_in_place_of_zeros(data, search, promoted)]
+    rivals = _confounded(search, names)
     not_testable = [
         {"name": c.effect.name, "absorbed_share": float(np.sqrt(max(0.0, 1.0 - c.retained**2))), "retained_share": c.retained}
         for c in one_each(search.first)
@@ -96,35 +96,16 @@ def conclude(data: Data, search: Search, rng: np.random.Generator) -> LoopResult
         },
         robot=robot,
         declared=data.declared,
-        data=_card(data, before, final, noise, search.n_effective),
+        data=_card(data, final, spread, noise, search.n_effective),
         residuals=_residual_table(data, before, back),
         evidence=gather(data, before, search.history[0][1], final, back, noise, search.first, search.last, tests, rng),
     )
 
 
 def _promoted(data: Data, search: Search) -> list[str]:
-    """Return the nuisances that the data moved significantly away from what is declared, with evidence for each as a whole."""
-    final = search.final.fit
-    result, at = [], 0
-    for effect, _, parameters in final.hypothesis.terms:
-        part = slice(at, at + len(parameters))
-        at += len(parameters)
-        if effect.name not in NUISANCE:
-            continue
-        values, std = final.coordinates[part], final.std[part]
-        size = np.abs(values) / (1.0 if effect.name == "stiffness" else np.maximum(data.input_scale, 1e-12))
-        moved = (np.abs(values) > SIGNIFICANT * std) & (size > RELEVANT)
-        if moved.any() and (len(parameters) == 1 or _is_evident(data, search, effect.name, len(parameters))):
-            result.append(effect.name)
-    return result
-
-
-def _is_evident(data: Data, search: Search, name: str, count: int) -> bool:
-    """Return whether a nuisance of several parameters, taken out of the fit as a whole, is missed (dBIC)."""
-    final = search.final
-    without = _refitted(data, final, [n for n in final.fit.hypothesis.names if n != name], search.noise)
-    missed = evidence(without.fit, final.fit) - count * np.log(search.n_effective) > EVIDENCE
-    return bool(missed and final.held_rms < without.held_rms and moved_by(without, final) > ABOVE_MESH * mesh_cost(data, without))
+    """Return the nuisances that the data moved significantly away from what is declared; of the zeros, those that are missed."""
+    names = [n for n in search.final.fit.hypothesis.names if n in NUISANCE and moved_nuisance(data, search.final, n)]
+    return [n for n in names if n == "stiffness" or zeros_are_evident(data, search.final, search.noise, search.n_effective)]
 
 
 def _worth_handing_back(data: Data, search: Search, promoted: list[str], names: list[str]) -> tuple[list[str], Stage]:
@@ -142,18 +123,7 @@ def _handed_back(data: Data, final: Stage, names: list[str], noise: Noise) -> St
     settled = [effect.name for effect, _ in final.fit.hypothesis.settled]
     if set(final.fit.hypothesis.names) <= {*names, *settled}:
         return final
-    return _refitted(data, final, names, noise)
-
-
-def _refitted(data: Data, stage: Stage, keep: list[str], noise: Noise) -> Stage:
-    """Return a stage with some of its terms only, fitted again."""
-    terms = stage.fit.hypothesis.terms
-    mask = np.concatenate([np.full(len(p), e.name in keep) for e, _, p in terms]) if terms else np.zeros(0, dtype=bool)
-    hypothesis = replace(stage.fit.hypothesis, terms=tuple(t for t in terms if t[0].name in keep))
-    prior = Prior(stage.fit.prior.mean[mask], stage.fit.prior.std[mask])
-    return make_stage(
-        data, hypothesis, prior, noise, stage.fit.coordinates[mask], own=own_of(stage), near=jets_without(stage, mask)
-    )
+    return keeping(data, final, names, noise)
 
 
 def _entries(stage: Stage, names: list[str]) -> list[Entry]:
@@ -163,13 +133,20 @@ def _entries(stage: Stage, names: list[str]) -> list[Entry]:
     return [_rounded(e) for e in settled] + [_rounded(tables[name]) for name in names if name in tables]
 
 
-def _chain(data: Data, search: Search, promoted: list[str], names: list[str], back: Stage) -> list[dict[str, Any]]:
+def _seed_spread(search: Search) -> dict[str, FloatArray]:
+    named = [r for r in search.refits if r.get("verdict") == "named" and "seed_spread" in r]
+    return {r["name"]: np.array(r["seed_spread"]) for r in named}
+
+
+def _chain(
+    data: Data, search: Search, promoted: list[str], names: list[str], back: Stage, spread: dict[str, FloatArray]
+) -> list[dict[str, Any]]:
     """Return the effects in the order in which they were added, each with the held-out error before and after it."""
     stages = dict(search.history)
     errors = []
     for i in range(len(promoted)):
         alone = promoted[: i + 1] != [n for n in stages[""].fit.hypothesis.names]
-        stage = _refitted(data, stages[""], promoted[: i + 1], search.noise) if alone else stages[""]
+        stage = keeping(data, stages[""], promoted[: i + 1], search.noise) if alone else stages[""]
         errors.append(stage.held_rms)
     errors += [stages[name].held_rms for name in names[len(promoted) :]]
     if errors:
@@ -177,7 +154,7 @@ def _chain(data: Data, search: Search, promoted: list[str], names: list[str], ba
     return [
         {
             "name": name,
-            "parameters": _parameters(data, search.noise, search.final, back, name),
+            "parameters": _parameters(spread, back, name),
             "validation_rms_before_m": b,
             "validation_rms_after_m": a,
         }
@@ -215,16 +192,16 @@ def _rounded(entry: Entry) -> Entry:
     return {k: tidy(v) for k, v in entry.items()}
 
 
-def _parameters(data: Data, noise: Noise, full: Stage, back: Stage, name: str) -> dict[str, Any]:
+def _parameters(spread: dict[str, FloatArray], back: Stage, name: str) -> dict[str, Any]:
     """Return {key: {value, std, unit}} of one effect; vectors and tables keep their shape. What was not fitted has std None.
 
-    Values are those that are handed back; standard deviations are those of the full fit, in which nothing was held still.
+    Values are those that are handed back; standard deviations are not smaller than those of the full fit, in which nothing was held still.
     """
     result = dict[str, Any]()
     for effect, seed in back.fit.hypothesis.settled:
         if effect.name == name:
             result |= {k: {"value": v, "std": None, "unit": _unit(k)} for k, v in seed.items()}
-    spread = _coordinate_std(data, noise, full, name)
+    full = spread.get(name)
     at = 0
     for effect, seed, parameters in back.fit.hypothesis.terms:
         values = back.fit.coordinates[at : at + len(parameters)]
@@ -232,23 +209,14 @@ def _parameters(data: Data, noise: Noise, full: Stage, back: Stage, name: str) -
         at += len(parameters)
         if effect.name != name:
             continue
-        if spread is not None and len(spread) == len(std):
-            std = np.maximum(std, spread)
+        if full is not None and len(full) == len(std):
+            std = np.maximum(std, full)
         for p, value, deviation in zip(parameters, values, std):
             slot = result.setdefault(p.key, {"value": None, "std": None, "unit": p.unit})
             for field, number in (("value", p.value(value)), ("std", p.value_std(value, deviation))):
                 slot[field] = _placed(slot[field], p.part, float(number) if np.isfinite(number) else None)
         result |= {k: {"value": v, "std": None, "unit": _unit(k)} for k, v in seed.items() if k not in result}
     return result
-
-
-def _coordinate_std(data: Data, noise: Noise, stage: Stage, name: str) -> FloatArray | None:
-    std, at = coordinate_std(stage.fit, data.train, noise), 0
-    for effect, _, parameters in stage.fit.hypothesis.terms:
-        if effect.name == name:
-            return std[at : at + len(parameters)]
-        at += len(parameters)
-    return None
 
 
 def _unit(key: str) -> str:
@@ -343,6 +311,11 @@ def _confounded(search: Search, names: list[str]) -> list[dict[str, Any]]:
             for r in search.refits
             if name in r.get("takes_over", []) and r["name"] not in names and r["dbic"] > EVIDENCE
         ]
+    if search.in_place is not None and abs(search.in_place.ahead) < EVIDENCE:
+        other = search.in_place.name
+        pairs += [
+            {"pair": pair, "dbic_gap": abs(search.in_place.ahead)} for pair in [["cable_offset", other]] if set(pair) & set(names)
+        ]
     if "cable_offset" in names and any(c.effect.name == "cable_slack" for c in first):
         pairs.append({"pair": ["cable_offset", "cable_slack"], "cosine": 1.0})  # play is a negative zero of the displacement
     ones = one_each(first)
@@ -354,16 +327,6 @@ def _confounded(search: Search, names: list[str]) -> list[dict[str, Any]]:
             if share > 0.95:
                 pairs.append({"pair": [a.effect.name, b.effect.name], "cosine": share})
     return pairs
-
-
-def _in_place_of_zeros(data: Data, search: Search, promoted: list[str]) -> list[dict[str, Any]]:
-    """Return pairs of `cable_offset`, where it is named, with effects that explain the data as well with the zeros as declared."""
-    if "cable_offset" not in promoted:
-        return []
-    final = search.final
-    without = _refitted(data, final, [n for n in final.fit.hypothesis.names if n != "cable_offset"], search.noise)
-    tried = list(dict.fromkeys(c.effect.name for c in search.first))
-    return in_place_of(data, "cable_offset", final, without, search.noise, search.n_effective, tried)
 
 
 def _step_of(search: Search, name: str) -> int:
@@ -448,9 +411,9 @@ def _short(parameters: dict[str, Any]) -> str:
     return ", ".join(f"{k} {show(p['value'])}" + ("" if p["unit"] == "1" else f" {p['unit']}") for k, p in parameters.items())
 
 
-def _card(data: Data, before: Stage, final: Stage, noise: Noise, n_effective: float) -> dict[str, Any]:
+def _card(data: Data, final: Stage, spread: dict[str, FloatArray], noise: Noise, n_effective: float) -> dict[str, Any]:
     nuisance = {
-        name: _parameters(data, noise, final, final, name)
+        name: _parameters(spread, final, name)
         for name in NUISANCE
         if any(e.name == name for e, _, _ in final.fit.hypothesis.terms)
     }

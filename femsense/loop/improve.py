@@ -19,13 +19,14 @@ from femsense.calib.forward import Hypothesis
 from femsense.effects import EFFECTS, FORMS, Effect, find_effect, load_own_effect
 from femsense.loop.conclude import Search, conclude
 from femsense.loop.data import Data, prepare
-from femsense.loop.grow import Progress, grow, prune
+from femsense.loop.grow import Progress, grow, mesh_cost, moved_by, prune
 from femsense.loop.joint import Prior
 from femsense.loop.mesh_error import with_mesh_errors
 from femsense.loop.noise import Noise
 from femsense.loop.result import LoopResult
 from femsense.loop.screen import Candidate
 from femsense.loop.stages import Stage, fields_of, make_stage, noise_of, own_of, rematched, screen_stage, with_nuisance
+from femsense.loop.zeros import in_place_of_zeros
 from femsense.model import Robot
 from femsense.recording import Recording, state_key
 
@@ -105,12 +106,21 @@ def improve(
         if winner is None:
             break
         name = next(n for n in winner.fit.hypothesis.names if n not in stage.fit.hypothesis.names)
+        far = moved_by(stage, winner) > mesh_cost(data, stage)
         stage = prune(data, winner, noise, n_effective, say)
         history.append((name, stage))
+        if far:  # the mesh errs in another way in these states
+            data = with_mesh_errors(data, stage)
+    swap = in_place_of_zeros(data, stage, names, noise, n_effective, say) if growing else None
+    if swap is not None:
+        refits += [{**record, "step": len(history)} for record in swap.records]
+        if swap.stage is not None:
+            stage = swap.stage
+            history.append((swap.name, stage))
     if len(history) > 1 and "clouds" in data.measured:  # before and after on the same patches
         before = make_stage(data, Hypothesis(data.robot), nothing, noise, np.zeros(0), own=own_of(before))
     say("testing what is left")
-    result = conclude(data, Search(before, history, stage, noise, n_effective, first, table, refits), rng)
+    result = conclude(data, Search(before, history, stage, noise, n_effective, first, table, refits, swap), rng)
     result = replace(result, data={**result.data, "seed": seed})
     if growing:
         return result

@@ -193,6 +193,8 @@ def whiten(whitener: Whitener, values: FloatArray) -> FloatArray:
     return np.asarray(rows - np.tensordot(whitener.directions * whitener.shrink, along, axes=1))
 
 
+JITTER = 0.4
+"""The white part of the noise is no less than this share of what repeats of a state scatter by."""
 MAX_REML_ROWS = 700
 """Rows that the estimate of the noise uses at most; more are thinned out by whole frames."""
 MAX_CLOUD_ROWS = 500
@@ -217,11 +219,12 @@ def estimate_noise(
     scale = float(np.sqrt(np.mean(np.concatenate([r.ravel() for r in residuals]) ** 2))) + FLOOR
     jitter = _jitter(residuals, groups) if "state" in names else 0.0
     lowest, highest = np.log(np.maximum(1e-3 * scale, FLOOR)), np.log(3.0 * scale)
+    bounds = [(float(np.log(max(JITTER * jitter, np.exp(lowest)))) if n == "white" else lowest, highest) for n in names]
     likelihood = _Likelihood(names, residuals, basis, groups)
     best = None
     for white in {max(jitter, FLOOR), 0.3 * scale, 0.7 * scale}:
         start = np.clip(np.log([white if n == "white" else 0.3 * scale for n in names]), lowest, highest)
-        answer = minimize(likelihood, start, jac=True, method="L-BFGS-B", bounds=[(lowest, highest)] * len(names))
+        answer = minimize(likelihood, start, jac=True, method="L-BFGS-B", bounds=bounds)
         best = answer if best is None or answer.fun < best.fun else best
     assert best is not None
     std = {name: float(v) for name, v in zip(names, np.exp(best.x))}

@@ -40,7 +40,7 @@ def sweep_rows(trials: list[Trial], fit: JointFit) -> list[IntArray]:
 def _density(fit: JointFit, rows: IntArray) -> float:
     """Return twice the log density of left-out rows, up to a constant."""
     J, r = np.asarray(fit.fit.jacobian), np.asarray(fit.fit.residual)
-    A = _half_inverse(J)
+    A = half_inverse(J)
     B = J[rows] @ A  # H_bb = B Bᵀ
     inner = np.eye(B.shape[1]) - B.T @ B
     values, vectors = np.linalg.eigh(inner)
@@ -49,7 +49,7 @@ def _density(fit: JointFit, rows: IntArray) -> float:
     return float(np.log(values).sum() - r[rows] @ r[rows] - (mixed**2 / values).sum())
 
 
-def _half_inverse(J: FloatArray) -> FloatArray:
+def half_inverse(J: FloatArray) -> FloatArray:
     """Return A with A Aᵀ = (JᵀJ)⁻¹ over the directions that J sees."""
     scale = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
     _, s, Vt = np.linalg.svd(J / scale, full_matrices=False)
@@ -57,4 +57,4 @@ def _half_inverse(J: FloatArray) -> FloatArray:
     return np.asarray(Vt[keep].T / s[keep] / scale[:, None])
 
 
-__all__ = ["sweep_rows", "sweeps_predicted"]
+__all__ = ["half_inverse", "sweep_rows", "sweeps_predicted"]

@@ -40,6 +40,8 @@ class Candidate:
     """The same of the seats that rest.csv measures [m], (r, 3, q) a trial."""
     columns: FloatArray
     """Whitened, nuisance projected out, shape (N, q)."""
+    response: FloatArray
+    """How the fitted parameters answer to a unit of each column, shape (p, q)."""
     retained: float
     """ρ."""
     step: FloatArray
@@ -120,8 +122,7 @@ def screen(base: JointFit, problem: JointProblem, fields: Fields, n_effective: f
         fields: of the effects to try, at this fit or very near to it.
         n_effective: number of independent observations, for BIC.
     """
-    nuisance = np.asarray(base.fit.jacobian)
-    Q = _orthonormal(nuisance)
+    Q, inverse = _factors(np.asarray(base.fit.jacobian))
     residual = base.fit.residual - Q @ (Q.T @ base.fit.residual)
     effects = max(len({e.name for e, _, _ in fields.todo}), 1)
     result = []
@@ -130,28 +131,18 @@ def screen(base: JointFit, problem: JointProblem, fields: Fields, n_effective: f
         whole = _whitened(base, problem, own, rest)
         if not np.isfinite(whole).all() or np.linalg.norm(whole) == 0:
             continue
-        left = whole - Q @ (Q.T @ whole)
+        absorbed = Q.T @ whole
+        left = whole - Q @ absorbed
         step, gain = _whole_step(left, residual) if effect.discrete else _best_step(left, residual, parameters)
         q = len(parameters)
         alone = sum(e is effect and len(p) == len(parameters) and s == seed for e, s, p in fields.todo)
         cost = penalty(q, seed, alone, effects, n_effective)
         score = gain - cost
         retained = float(np.linalg.norm(left) / np.linalg.norm(whole))
+        smallest = _smallest(left, q, n_effective)
+        response = -inverse @ absorbed
         result.append(
-            Candidate(
-                effect,
-                seed,
-                parameters,
-                own,
-                rest,
-                left,
-                retained,
-                step,
-                gain,
-                float(score),
-                cost,
-                _smallest(left, q, n_effective),
-            )
+            Candidate(effect, seed, parameters, own, rest, left, response, retained, step, gain, float(score), cost, smallest)
         )
     return sorted(result, key=lambda c: -c.score)
 
@@ -221,11 +212,21 @@ def _whitened(base: JointFit, problem: JointProblem, own: list[FloatArray], rest
 
 
 def _orthonormal(columns: FloatArray) -> FloatArray:
+    return _factors(columns)[0]
+
+
+def _factors(columns: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return Q, an orthonormal basis of columns J (N, p), and A with A Qᵀ = J⁺."""
     norm = np.linalg.norm(columns, axis=0)
-    if not (norm > 0).any():
-        return np.zeros((len(columns), 0))
-    U, s, _ = np.linalg.svd(columns[:, norm > 0] / norm[norm > 0], full_matrices=False)
-    return np.asarray(U[:, s > 1e-9 * s[0]])
+    seen = norm > 0
+    inverse = np.zeros((columns.shape[1], 0))
+    if not seen.any():
+        return np.zeros((len(columns), 0)), inverse
+    U, s, Vt = np.linalg.svd(columns[:, seen] / norm[seen], full_matrices=False)
+    kept = s > 1e-9 * s[0]
+    inverse = np.zeros((columns.shape[1], int(kept.sum())))
+    inverse[seen] = (Vt[kept].T / s[kept]) / norm[seen, None]
+    return np.asarray(U[:, kept]), inverse
 
 
 def _best_step(columns: FloatArray, residual: FloatArray, parameters: Sequence[Parameter]) -> tuple[FloatArray, float]:

@@ -1,22 +1,58 @@
 """How far the values of a fit may be off, where (JᵀJ)⁻¹ says too little.
 
-Two things are put right. A model that leaves more than the noise was fitted with weights that are too large: all variances grow by the
-factor by which it does (Birge 1932). And the size of gravity is known, so that its direction lives on a sphere: where the data see one
-component only, the tangent to the sphere bounds the others, although a whole circle is
-as likely. Second moments about the estimate over the sphere, weighted by the likelihood, say so.
+* A model that leaves more than the noise was fitted with weights that are too large: all variances grow by the factor by which it does
+  (Birge 1932).
+* Where sweeps disagree by more than their noise, each sweep's own pull on the parameters shows it (cluster-robust covariance with half
+  leverage: Bell & McCaffrey 2002).
+* A time or a place that was chosen from a few seeds and held still while the rest was fitted is not known exactly.
+* The size of gravity is known, so that its direction lives on a sphere: where the data see one component only, the tangent to the sphere
+  bounds the others, although a whole circle is as likely. Second moments about the estimate over the sphere, weighted by the likelihood, say so.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from femsense.arrays import FloatArray, IntArray
+from femsense.calib.fit import covariance_of
 from femsense.effects.loads import STANDARD_GRAVITY
-from femsense.loop.joint import GRAVITY_STD, JointFit, Trial
+from femsense.loop.data import Data
+from femsense.loop.joint import GRAVITY_STD, JointFit, JointProblem, Prior, Trial
 from femsense.loop.noise import Noise
+from femsense.loop.predict import half_inverse, sweep_rows
+from femsense.loop.stages import Stage
 
 RINGS, SPOKES = 160, 48
 """Directions that are looked at: rings about the estimate, close to each other near it, and places on each ring."""
+
+LEAST_SWEEPS = 3
+"""Fewer cannot disagree."""
+SEED_STD = 0.7
+"""How well a seed's own number is known beforehand, in its coordinate (the logarithm of a time: a factor of two)."""
+
+
+def spreads(data: Data, stage: Stage, noise: Noise, seed_spread: dict[str, FloatArray]) -> dict[str, FloatArray]:
+    """Return the standard deviations of the coordinates of each effect.
+
+    Arguments:
+        data, stage, noise: of the final fit.
+        seed_spread: effect → scatter of its coordinates over seeds that explain as much.
+    """
+    own = stage.fit.own
+    std = np.maximum.reduce(
+        [coordinate_std(stage.fit, data.train, noise), _by_sweeps(data, stage)[own:], _with_open_seeds(data, stage, noise)]
+    )
+    result, at = dict[str, FloatArray](), 0
+    for effect, _, parameters in stage.fit.hypothesis.terms:
+        part = std[at : at + len(parameters)]
+        at += len(parameters)
+        extra = np.zeros(len(part))
+        known = seed_spread.get(effect.name, extra)
+        extra[: len(known)] = known[: len(part)]
+        result[effect.name] = np.hypot(part, extra)
+    return result
 
 
 def coordinate_std(fit: JointFit, trials: list[Trial], noise: Noise) -> FloatArray:
@@ -93,4 +129,46 @@ def _directions(estimate: FloatArray) -> tuple[FloatArray, FloatArray]:
     return directions.reshape(-1, 3), np.repeat(np.sin(ring) * np.diff(edge), SPOKES)
 
 
-__all__ = ["coordinate_std", "misfit"]
+def _by_sweeps(data: Data, stage: Stage) -> FloatArray:
+    """Return the standard deviations of all parameters that the disagreement of sweeps shows, shape (p,)."""
+    J, r = np.asarray(stage.fit.fit.jacobian), np.asarray(stage.fit.fit.residual)
+    sweeps = sweep_rows(data.train, stage.fit)
+    if len(sweeps) < LEAST_SWEEPS:
+        return np.zeros(J.shape[1])
+    A = half_inverse(J)
+    pulls = []
+    for rows in sweeps:
+        U, s, _ = np.linalg.svd(J[rows] @ A, full_matrices=False)
+        along = U.T @ r[rows]
+        freed = r[rows] + U @ ((1.0 / np.sqrt(np.maximum(1.0 - s**2, 0.05)) - 1.0) * along)
+        pulls.append(A @ (A.T @ (J[rows].T @ freed)))
+    return np.asarray(np.sqrt(np.sum(np.square(pulls), axis=0)))
+
+
+def _with_open_seeds(data: Data, stage: Stage, noise: Noise) -> FloatArray:
+    """Return the standard deviations of the coordinates with the numbers that seeds held still fitted along, shape (p,)."""
+    hypothesis = stage.fit.hypothesis
+    terms, null, fitted = [], [], []
+    at = 0
+    for effect, seed, parameters in hypothesis.terms:
+        held = {p.key for p in parameters}
+        more = tuple(p for p in effect.polish(data.robot, data.control, seed) if p.key not in held)
+        terms.append((effect, seed, (*parameters, *more)))
+        null += [*stage.fit.coordinates[at : at + len(parameters)], *(p.null for p in more)]
+        fitted += [True] * len(parameters) + [False] * len(more)
+        at += len(parameters)
+    mask = np.array(fitted, dtype=bool)
+    if mask.all():
+        return np.zeros(len(stage.fit.coordinates))
+    mean, std = np.array(null), np.full(len(null), SEED_STD)
+    mean[mask], std[mask] = stage.fit.prior.mean, stage.fit.prior.std
+    factors = [noise.whitener(t.groups, t.mesh_error) for t in data.train]
+    problem = JointProblem(replace(hypothesis, terms=tuple(terms)), Prior(mean, std), data.train, factors, data.seat_std)
+    theta = np.concatenate([stage.fit.fit.theta[: stage.fit.own], null])
+    jacobian = problem.evaluate(theta, True)[1]
+    assert jacobian is not None
+    variance = np.diag(covariance_of(jacobian))[stage.fit.own :]
+    return np.asarray(np.sqrt(np.maximum(variance[mask], 0.0)))
+
+
+__all__ = ["coordinate_std", "misfit", "spreads"]

@@ -17,6 +17,9 @@ from femsense.loop.noise import Noise, estimate_noise, whiten
 from femsense.loop.screen import NUISANCE, Candidate, Fields, candidates_for, effect_fields, one_each, screen
 from femsense.model import Robot
 
+ZERO_STD = 0.1
+"""How well the zero of a cable is known beforehand, as a share of its range in the recording."""
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class HeldOut:
@@ -52,7 +55,7 @@ def with_nuisance(data: Data) -> tuple[Hypothesis, Prior]:
         if not parameters or (name == "cable_offset" and unknown_zero):
             continue
         terms.append((effect, {}, parameters))
-        std += [0.7] if name == "stiffness" else [max(0.25 * float(s), 1e-9) for s in data.input_scale]
+        std += [0.7] if name == "stiffness" else [max(ZERO_STD * float(s), 1e-9) for s in data.input_scale]
     return Hypothesis(data.robot, tuple(terms)), Prior(np.zeros(len(std)), np.array(std))
 
 
@@ -92,6 +95,17 @@ def jets_with(stage: Stage, candidate: Candidate) -> list[SceneJet]:
 def jets_without(stage: Stage, keep: BoolArray) -> list[SceneJet]:
     """Return the jets of a stage with the columns of some coordinates only."""
     return [replace(j, by_effect=j.by_effect[:, :, keep], rest_by_effect=j.rest_by_effect[:, :, keep]) for j in stage.fit.jets]
+
+
+def keeping(data: Data, stage: Stage, names: Sequence[str], noise: Noise) -> Stage:
+    """Return a stage with some of its terms only, fitted again. Raises DataError."""
+    terms = stage.fit.hypothesis.terms
+    mask = np.concatenate([np.full(len(p), e.name in names) for e, _, p in terms]) if terms else np.zeros(0, dtype=bool)
+    hypothesis = replace(stage.fit.hypothesis, terms=tuple(t for t in terms if t[0].name in names))
+    prior = Prior(stage.fit.prior.mean[mask], stage.fit.prior.std[mask])
+    return make_stage(
+        data, hypothesis, prior, noise, stage.fit.coordinates[mask], own=own_of(stage), near=jets_without(stage, mask)
+    )
 
 
 def own_of(stage: Stage) -> FloatArray:
@@ -186,6 +200,16 @@ def held_chi2(data: Data, stage: Stage, noise: Noise) -> float:
     """Return the whitened sum of squares of the held-out residuals."""
     return float(
         sum((whiten(noise.whitener(t.groups, t.mesh_error), r) ** 2).sum() for t, r in zip(data.held, stage.held_residuals))
+    )
+
+
+def held_shift(data: Data, before: Stage, after: Stage, noise: Noise) -> float:
+    """Return the whitened sum of squares of the difference between two models on held-out data."""
+    return float(
+        sum(
+            (whiten(noise.whitener(t.groups, t.mesh_error), b - a) ** 2).sum()
+            for t, b, a in zip(data.held, before.held_residuals, after.held_residuals)
+        )
     )
 
 

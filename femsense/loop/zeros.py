@@ -1,0 +1,121 @@
+"""Cable zeros that moved, and whether an effect says better what they took.
+
+The zeros are fitted along with everything, so that an effect competes with them only for what they leave. A camera whose distances
+are off, a load or a weight can look much like a wrong zero: the zeros then swallow it, and would be named. So the model is fitted
+without them, and every effect is asked what it would explain in their place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from femsense.errors import FemsenseError
+from femsense.loop.data import Data
+from femsense.loop.grow import (
+    ABOVE_MESH,
+    EVIDENCE,
+    Progress,
+    Refit,
+    evidence,
+    judged,
+    mesh_cost,
+    moved_by,
+    polished,
+    refit,
+    shortlist,
+)
+from femsense.loop.noise import Noise
+from femsense.loop.stages import Stage, fields_of, keeping, screen_stage
+
+ZEROS = "cable_offset"
+SIGNIFICANT = 3.0
+RELEVANT = 0.02
+"""A nuisance that moved by more than three standard deviations and 2 % is named as an effect."""
+BETTER = 2.0
+"""dBIC by which an effect must be better than the zeros to take their place."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class InPlace:
+    """What became of the question."""
+
+    stage: Stage | None
+    """A model with an effect in the place of the zeros, where that is better."""
+    name: str
+    """The effect that is best in their place; empty: none passes."""
+    ahead: float
+    """dBIC of that effect less that of the zeros."""
+    records: list[dict[str, Any]]
+
+
+def moved_nuisance(data: Data, stage: Stage, name: str) -> int:
+    """Return how many values of a nuisance the data moved significantly away from what is declared."""
+    at = 0
+    for effect, _, parameters in stage.fit.hypothesis.terms:
+        part = slice(at, at + len(parameters))
+        at += len(parameters)
+        if effect.name != name:
+            continue
+        values, std = stage.fit.coordinates[part], stage.fit.std[part]
+        size = np.abs(values) / (1.0 if name == "stiffness" else np.maximum(data.input_scale, 1e-12))
+        return int(((np.abs(values) > SIGNIFICANT * std) & (size > RELEVANT)).sum())
+    return 0
+
+
+def evidence_for_zeros(data: Data, stage: Stage, without: Stage, n_effective: float) -> float:
+    """Return the dBIC of the zeros that moved: the others, as good as declared, cost nothing."""
+    moved, count = moved_nuisance(data, stage, ZEROS), len(data.robot.body.cables)
+    return evidence(without.fit, stage.fit) - moved * float(np.log(n_effective)) - 2.0 * float(np.log(max(count, 1)))
+
+
+def zeros_are_evident(data: Data, stage: Stage, noise: Noise, n_effective: float) -> Stage | None:
+    """Return the model without the zeros if it misses them, else None."""
+    if not moved_nuisance(data, stage, ZEROS):
+        return None
+    try:
+        without = keeping(data, stage, [n for n in stage.fit.hypothesis.names if n != ZEROS], noise)
+    except FemsenseError:
+        return None
+    if evidence_for_zeros(data, stage, without, n_effective) <= EVIDENCE or stage.held_rms >= without.held_rms:
+        return None
+    return without if moved_by(without, stage) > ABOVE_MESH * mesh_cost(data, without) else None
+
+
+def in_place_of_zeros(
+    data: Data, stage: Stage, names: Sequence[str], noise: Noise, n_effective: float, say: Progress
+) -> InPlace | None:
+    """Ask which effect explains what the zeros of a model explain; None where they explain nothing."""
+    without = zeros_are_evident(data, stage, noise, n_effective)
+    if without is None:
+        return None
+    say("asking what else might be in the place of the cable zeros")
+    worth = evidence_for_zeros(data, stage, without, n_effective)
+    table = screen_stage(data, without.fit, noise, fields_of(data, without, names), n_effective)
+    best: Refit | None = None
+    records: list[dict[str, Any]] = []
+    for candidate in shortlist(table, first=False):
+        if candidate.score < 0.5 * worth - EVIDENCE:
+            continue
+        record: dict[str, Any] = {"name": candidate.effect.name, "seed": candidate.seed, "in_place_of": ZEROS}
+        try:
+            made = refit(data, without, candidate, noise)
+        except FemsenseError:
+            continue
+        tried = judged(data, without, candidate, made, record, noise)
+        records.append(record)
+        if record["verdict"] == "passes" and (best is None or tried.score > best.score):
+            best = tried
+    if best is None:
+        return InPlace(None, "", -np.inf, records)
+    best = polished(data, without, best, noise, say)
+    ahead = best.score - worth
+    if ahead > BETTER:
+        best.record["verdict"] = "named"
+    return InPlace(best.stage if ahead > BETTER else None, best.candidate.effect.name, ahead, records)
+
+
+__all__ = ["RELEVANT", "SIGNIFICANT", "InPlace", "in_place_of_zeros", "moved_nuisance", "zeros_are_evident"]
