@@ -25,7 +25,7 @@ from femsense.loop.mesh_error import with_mesh_errors
 from femsense.loop.noise import Noise
 from femsense.loop.result import LoopResult
 from femsense.loop.screen import Candidate
-from femsense.loop.stages import Stage, fields_of, make_stage, noise_of, own_of, rematched, screen_stage, with_nuisance
+from femsense.loop.stages import Stage, fields_of, keeping, make_stage, noise_of, own_of, rematched, screen_stage, with_nuisance
 from femsense.loop.zeros import in_place_of_zeros
 from femsense.model import Robot
 from femsense.recording import Recording, state_key
@@ -79,7 +79,7 @@ def improve(
         base = make_stage(data, hypothesis, prior, noise, base.fit.coordinates, own=own_of(base))
         before = make_stage(data, Hypothesis(data.robot), nothing, noise, np.zeros(0), own=own_of(before))
     say("asking what the mesh costs")
-    data = with_mesh_errors(data, base)
+    data = with_mesh_errors(data, keeping(data, base, ["stiffness"], noise))  # zeros may have gone far, for an effect's sake
     history: list[tuple[str, Stage]] = [("", base)]
     stage, first, refits = base, list[Candidate](), list[dict[str, Any]]()
     growing = _fresh(data)

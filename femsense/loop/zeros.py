@@ -35,6 +35,8 @@ ZEROS = "cable_offset"
 SIGNIFICANT = 3.0
 RELEVANT = 0.02
 """A nuisance that moved by more than three standard deviations and 2 % is named as an effect."""
+ABOVE_MESH = 0.75
+"""Zeros must move the markers by this much of what the mesh itself costs: that is what they imitate best."""
 BETTER = 2.0
 """dBIC by which an effect must be better than the zeros to take their place."""
 
