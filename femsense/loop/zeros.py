@@ -16,7 +16,6 @@ import numpy as np
 from femsense.errors import FemsenseError
 from femsense.loop.data import Data
 from femsense.loop.grow import (
-    ABOVE_MESH,
     EVIDENCE,
     Progress,
     Refit,
