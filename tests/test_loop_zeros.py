@@ -1,0 +1,41 @@
+"""A zero that moved is not yet an explanation: what does better in its place takes it, what does as well is said with it."""
+
+from __future__ import annotations
+
+import numpy as np
+from arm import arm, record
+
+from femsense.loop.data import prepare
+from femsense.loop.noise import Noise
+from femsense.loop.stages import make_stage, with_nuisance
+from femsense.loop.zeros import InPlace, in_place_of_zeros
+from femsense.model import Robot
+
+NOISE = Noise({"white": 3e-4}, "")
+
+
+def asked(robot: Robot, truth: Robot, cables: list[int], tried: list[str], **changes) -> InPlace | None:
+    """Return what may be in the place of zeros that moved; the cables are pulled one after another."""
+    inputs = np.zeros((4 * len(cables), 4))
+    for i, cable in enumerate(cables):
+        inputs[4 * i : 4 * i + 4, cable] = np.linspace(0.0, 1.5, 4)
+    data = prepare(robot, [record(inputs, truth=truth, noise=3e-4, **changes)[0]], [])
+    hypothesis, prior = with_nuisance(data)
+    full = make_stage(data, hypothesis, prior, NOISE, np.zeros(len(prior.mean)))
+    return in_place_of_zeros(data, full, tried, NOISE, 200.0, lambda text: None)
+
+
+def test_weight_on_one_mount_takes_the_place_of_zeros_that_moved():
+    found = asked(arm((4, 1, 1), gravity=(0, 0, 0)), arm((4, 1, 1)), [0], ["gravity", "cable_gain"])
+    assert found is not None and found.name == "gravity" and found.ahead > 0.0  # weight is what the arm truly has
+    assert found.stage is not None and "cable_offset" not in found.stage.fit.hypothesis.names
+
+
+def test_a_zero_that_is_wrong_keeps_its_place():
+    wrong = [{"name": "cable_offset", "tension_n": {"left": 0.4}}]
+    found = asked(arm((4, 1, 1)), arm((4, 1, 1)), [0, 2, 1, 3], ["gravity", "cable_gain"], effects=wrong)
+    assert found is not None and found.stage is None and found.ahead < -10.0
+
+
+def test_zeros_that_are_right_are_not_asked_about():
+    assert asked(arm((4, 1, 1)), arm((4, 1, 1)), [0, 2, 1, 3], ["gravity"]) is None
