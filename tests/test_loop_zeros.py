@@ -26,7 +26,7 @@ def asked(robot: Robot, truth: Robot, cables: list[int], tried: list[str], **cha
 
 
 def test_weight_on_one_mount_takes_the_place_of_zeros_that_moved():
-    found = asked(arm((4, 1, 1), gravity=(0, 0, 0)), arm((4, 1, 1)), [0], ["gravity", "cable_gain"])
+    found = asked(arm((4, 1, 1), gravity=(0, 0, 0)), arm((4, 1, 1)), [0, 0, 0, 0], ["gravity", "cable_gain"])
     assert found is not None and found.name == "gravity" and found.ahead > 0.0  # weight is what the arm truly has
     assert found.stage is not None and "cable_offset" not in found.stage.fit.hypothesis.names
 
