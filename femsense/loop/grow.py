@@ -37,7 +37,10 @@ ROUNDS = 4
 PROMISED = 0.3
 """A fit from the null that brings less than this share of the linear gain is tried from other starts too."""
 ABOVE_MESH = 0.5
-"""An effect must move the markers by this much of what the mesh itself costs (beyond what calibration absorbs)."""
+"""An effect must move the markers by this much of what the mesh itself costs (beyond what calibration absorbs) …"""
+ABOVE_MESH_IF_SURE = 0.25
+"""… or by this much, if left-out sweeps speak for it by SURE standard errors and held-out data gain as much as fitted ones, a row."""
+SURE = 2.5
 POLISHED = 2.0
 """Decrease of χ² that each further parameter of a polished effect must bring."""
 
@@ -163,7 +166,8 @@ def judged(
         fit_objection = f"sweeps that are left out do not speak for it ({better:+.1f} ± {spread:.1f})"
     if fit_objection is None and held < wanted:
         fit_objection = f"it does not predict the held-out data (χ² falls by {held:.1f}, by {gain:.1f} where fitted)"
-    if fit_objection is None and moved < ABOVE_MESH * mesh:
+    sure = better > SURE * spread and held > gain * _held_share(data)
+    if fit_objection is None and moved < (ABOVE_MESH_IF_SURE if sure else ABOVE_MESH) * mesh:
         fit_objection = f"it moves the markers by {1e3 * moved:.3f} mm, the mesh itself by {1e3 * mesh:.3f} mm"
     record["verdict"] = fit_objection or "passes"
     return Refit(candidate, made, score, record)

@@ -92,7 +92,7 @@ def improve(
                 data, stage.fit.hypothesis, stage.fit.prior, noise, stage.fit.coordinates, own=own_of(stage), near=stage.fit.jets
             )
         fields = fields_of(data, stage, names)
-        noise, n_effective = noise_of(data, stage, fields)
+        noise, n_effective = noise_of(data, stage, fields, noise if found else None)
         stage = make_stage(
             data, stage.fit.hypothesis, stage.fit.prior, noise, stage.fit.coordinates, own=own_of(stage), known=stage.fit.jets
         )

@@ -193,6 +193,7 @@ def whiten(whitener: Whitener, values: FloatArray) -> FloatArray:
     return np.asarray(rows - np.tensordot(whitener.directions * whitener.shrink, along, axes=1))
 
 
+NEAR_STD = float(np.log(2.0))
 JITTER = 0.4
 """The white part of the noise is no less than this share of what repeats of a state scatter by."""
 MAX_REML_ROWS = 700
@@ -202,7 +203,11 @@ MAX_CLOUD_ROWS = 500
 
 
 def estimate_noise(
-    residuals: list[FloatArray], nuisance: list[FloatArray], extra: list[FloatArray], groups: list[Groups]
+    residuals: list[FloatArray],
+    nuisance: list[FloatArray],
+    extra: list[FloatArray],
+    groups: list[Groups],
+    before: dict[str, float] | None = None,
 ) -> Noise:
     """Return the components of the noise by restricted maximum likelihood.
 
@@ -211,6 +216,7 @@ def estimate_noise(
         nuisance: columns of what is fitted, shape (k, c, p), the same p everywhere.
         extra: columns of what might be in the data besides, shape (k, c, q), the likeliest first; these count as explained.
         groups: of each recording.
+        before: components [m] of an earlier estimate with a poorer model; the new one stays near it (a factor of two, softly), where the data leave it open.
     """
     residuals, nuisance, extra, groups = _thinned(residuals, nuisance, extra, groups)
     names = ["white", *sorted({n for g in groups for n in g.members()})]
@@ -220,7 +226,8 @@ def estimate_noise(
     jitter = _jitter(residuals, groups) if "state" in names else 0.0
     lowest, highest = np.log(np.maximum(1e-3 * scale, FLOOR)), np.log(3.0 * scale)
     bounds = [(float(np.log(max(JITTER * jitter, np.exp(lowest)))) if n == "white" else lowest, highest) for n in names]
-    likelihood = _Likelihood(names, residuals, basis, groups)
+    near = None if before is None else np.log([max(before.get(n, 0.0), np.exp(lowest)) for n in names])
+    likelihood = _Likelihood(names, residuals, basis, groups, near)
     best = None
     for white in {max(jitter, FLOOR), 0.3 * scale, 0.7 * scale}:
         start = np.clip(np.log([white if n == "white" else 0.3 * scale for n in names]), lowest, highest)
@@ -240,8 +247,15 @@ class _Likelihood:
     same for each axis and block-diagonal over recordings.
     """
 
-    def __init__(self, names: list[str], residuals: list[FloatArray], basis: list[FloatArray], groups: list[Groups]) -> None:
-        self.names, self.residuals, self.basis = names, residuals, basis
+    def __init__(
+        self,
+        names: list[str],
+        residuals: list[FloatArray],
+        basis: list[FloatArray],
+        groups: list[Groups],
+        near: FloatArray | None = None,
+    ) -> None:
+        self.names, self.residuals, self.basis, self.near = names, residuals, basis, near
         self.parts = [[g.shared(name) for name in names] for g in groups]
 
     def __call__(self, log_std: FloatArray) -> tuple[float, FloatArray]:
@@ -268,7 +282,11 @@ class _Likelihood:
             outer = np.einsum("kc,lc->kl", Pr, Pr)
             kernel = Pr.shape[1] * inverse - inner - outer
             gradient += [float((kernel * part).sum()) for part in parts]
-        return 0.5 * value, np.asarray(gradient * variance)
+        gradient = np.asarray(gradient * variance)
+        if self.near is None:
+            return 0.5 * value, gradient
+        off = (log_std - self.near) / NEAR_STD
+        return 0.5 * value + 0.5 * float(off @ off), gradient + off / NEAR_STD
 
 
 def _inverse(matrix: FloatArray) -> tuple[FloatArray, float]:

@@ -219,7 +219,7 @@ def problem_of(data: Data, fit: JointFit, noise: Noise) -> JointProblem:
     )
 
 
-def noise_of(data: Data, stage: Stage, fields: Fields) -> tuple[Noise, float]:
+def noise_of(data: Data, stage: Stage, fields: Fields, before: Noise | None = None) -> tuple[Noise, float]:
     """Estimate the noise from what the richest linear model leaves; return it with the effective number of observations."""
     table = screen(stage.fit, problem_of(data, stage.fit, Noise({"white": 5e-4}, "")), fields, 100.0)
     own = stage.fit.own
@@ -240,7 +240,7 @@ def noise_of(data: Data, stage: Stage, fields: Fields) -> tuple[Noise, float]:
         which = [i for i, t in enumerate(data.train) if (t.scene.patches is not None) == clouds]
         if which:
             picked = [[column[i] for i in which] for column in ([j.residual for j in stage.fit.jets], columns, extra, groups)]
-            noise = noise.joined(estimate_noise(*picked), clouds)  # type: ignore[arg-type]
+            noise = noise.joined(estimate_noise(*picked, None if before is None else before.surface if clouds else before.std), clouds)  # type: ignore[arg-type]
     return noise, float(sum(g.observations for g in groups))
 
 
