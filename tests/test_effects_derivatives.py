@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from arm import NAMES, T_ROBOT_CAMERA, arm
 
-from femsense.calib.forward import Hypothesis, evaluate_scene, in_robot_frame, make_scene
+from femsense.calib.forward import Hypothesis, evaluate_scene, make_scene
 from femsense.effects import FORMS, find_effect
 from femsense.march import Walk, drive_of, walk_along
 from femsense.pose import invert_pose, transform_points
@@ -57,13 +57,8 @@ def jet(hypothesis, scene, coordinates, starts, *, derivative=False):
 
 def as_seen(hypothesis, scene, coordinates, starts):
     """Return the scene with the points where the model at the coordinates has the camera measure them."""
-    seen = hypothesis.robot_at(coordinates).observation
-    where = (
-        in_robot_frame(scene.points, scene.view, [T_ROBOT_CAMERA], seen) - jet(hypothesis, scene, coordinates, starts).residual
-    )
-    points = transform_points(invert_pose(T_ROBOT_CAMERA), where)
-    distance = np.linalg.norm(points, axis=1, keepdims=True)
-    return replace(scene, points=points * (seen.depth_scale * distance + seen.depth_offset) / distance)
+    residual = jet(hypothesis, scene, coordinates, starts).residual
+    return replace(scene, points=scene.points - residual @ T_ROBOT_CAMERA[:3, :3])
 
 
 def slope(residual, p, here, at):

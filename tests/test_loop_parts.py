@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from arm import arm, record, sweeps
+from arm import T_ROBOT_CAMERA, arm, record, sweeps
 
 from femsense.calib.forward import Hypothesis, evaluate_scene, make_scene
 from femsense.effects import find_effect
@@ -128,22 +129,21 @@ def test_noise_alone_has_no_structure_and_a_pattern_has(monkeypatch: pytest.Monk
     assert p["sweep"] <= 0.002
 
 
-def test_columns_for_screening_do_not_hold_the_noise_of_measured_points():
+def test_a_scale_of_depth_neither_shrinks_the_noise_nor_holds_it_in_its_columns():
     inputs, labels = sweeps(each=1)
     robot = arm((4, 2, 2))
     effect = find_effect("depth_scale")
-    columns = {}
-    for noise in (0.0, 3e-3):
-        recording, _ = record(inputs, labels=labels, truth=robot, noise=noise, seed=1)
-        scene = make_scene(robot, recording, np.arange(3))
-        poses = [prepare(robot, [record(inputs, labels=labels, truth=robot, noise=0.0)[0]], []).train[0].poses[0]]
-        hypothesis = Hypothesis(robot, ((effect, {}, effect.parameters(robot, "tension")),))
-        for noiseless in (True, False):
-            jet = evaluate_scene(hypothesis, scene, np.zeros(2), poses, None, derivative=True, vary_initial=False,
-                                 pivot=robot.marker_points.mean(axis=0), noiseless=noiseless)  # fmt: skip
-            columns[noise, noiseless] = jet.by_effect
-    np.testing.assert_allclose(columns[0.0, True], columns[3e-3, True], atol=1e-6)
-    assert np.abs(columns[0.0, False] - columns[3e-3, False]).max() > 1e-3
+    hypothesis = Hypothesis(robot, ((effect, {}, effect.parameters(robot, "tension")),))
+    scene = make_scene(robot, record(inputs, labels=labels, truth=robot, noise=0.0)[0], np.arange(3))
+    noise = 3e-3 * RNG.normal(size=scene.points.shape)
+    jets = [
+        evaluate_scene(hypothesis, replace(scene, points=1.1 * scene.points + n), np.array([np.log(1.1), 0.0]), [T_ROBOT_CAMERA], None,
+                       derivative=True, vary_initial=False, pivot=robot.marker_points.mean(axis=0))
+        for n in (0.0, noise)
+    ]  # fmt: skip
+    np.testing.assert_allclose(jets[0].residual, 0.0, atol=1e-7)
+    np.testing.assert_allclose(np.linalg.norm(jets[1].residual, axis=1), np.linalg.norm(noise, axis=1), rtol=1e-4)
+    np.testing.assert_allclose(jets[0].by_effect, jets[1].by_effect, atol=1e-6)
 
 
 def test_one_marker_that_sits_elsewhere_is_named_alone():

@@ -135,6 +135,8 @@ def undo_depth(points: FloatArray, seen: Observation) -> FloatArray:
 
 def redo_depth(points: FloatArray, seen: Observation) -> FloatArray:
     """Return what the camera measures of true camera points [m]; the inverse of `undo_depth` (corrections by fixed point)."""
+    if seen.depth_scale == 1.0 and seen.depth_offset == 0.0 and not seen.corrections:
+        return points
     for correct in reversed(seen.corrections):
         target = points
         for _ in range(20):
@@ -174,14 +176,18 @@ def _ties(robot: Robot, scene: Scene, poses: Sequence[FloatArray]) -> Embedding:
 
 
 def marker_residual(robot: Robot, scene: Scene, poses: Sequence[FloatArray], model: Mapping[int, FloatArray]) -> FloatArray:
-    """Return measured minus modelled markers [m], shape (k, 3), robot frame; model: frame → markers (m, 3).
+    """Return measured minus modelled markers [m], shape (k, 3), along the axes of the robot; model: frame → markers (m, 3).
 
-    Of patches of a measured surface: how far it lies outside of the model's points, along its normal, shape (k, 1).
+    They are compared as the camera measures them. Measured points put right by a scale of depth would shrink with it, noise and all,
+    and a fit would take that for a better model. Of patches of a measured surface: how far it lies outside of the model's points, along
+    its normal, shape (k, 1).
     """
     predicted = np.array([model[int(f)][m] for f, m in zip(scene.frame, scene.marker)]).reshape(-1, 3)
+    expected = as_measured(predicted, scene.view, poses, robot.observation)
     if scene.patches is not None:
-        return -scene.patches.distance(as_measured(predicted, scene.view, poses, robot.observation))[:, None]
-    return np.asarray(in_robot_frame(scene.points, scene.view, poses, robot.observation) - predicted)
+        return -scene.patches.distance(expected)[:, None]
+    turns = np.array([T[:3, :3] for T in poses])[scene.view]
+    return np.asarray(np.einsum("kij,kj->ki", turns, scene.points - expected))
 
 
 def rest_residual(robot: Robot, scene: Scene, poses: Sequence[FloatArray]) -> FloatArray:
@@ -213,12 +219,11 @@ class SceneJet:
 
 def evaluate_scene(
     hypothesis: Hypothesis, scene: Scene, coordinates: FloatArray, poses: Sequence[FloatArray], initial: FloatArray | None,
-    *, derivative: bool, vary_initial: bool, pivot: FloatArray, starts: dict[int, Equilibrium] | None = None, noiseless: bool = False,
+    *, derivative: bool, vary_initial: bool, pivot: FloatArray, starts: dict[int, Equilibrium] | None = None,
 ) -> SceneJet:  # fmt: skip
     """Evaluate marker residuals of a scene at a point of parameter space, and their derivatives by differences.
 
-    `starts` holds states of earlier evaluations near by and is brought up to date. With `noiseless` the columns of effects are
-    those at points where the model would have them measured: a column made of measured points holds their noise.
+    `starts` holds states of earlier evaluations near by and is brought up to date.
 
     Raises:
         DataError: a frame has no equilibrium.
@@ -242,9 +247,7 @@ def evaluate_scene(
         for i in range(len(variants)):
             shifted[i][k] = others[i]
     residual = marker_residual(robot, scene, poses, model)
-    seen_at = _as_predicted(robot, scene, poses, model) if noiseless and scene.patches is None else scene
-    here = marker_residual(robot, seen_at, poses, model)
-    columns = [(marker_residual(v.robot, seen_at, poses, m) - here) / h for v, m, h in zip(variants, shifted, steps)]
+    columns = [(marker_residual(v.robot, scene, poses, m) - residual) / h for v, m, h in zip(variants, shifted, steps)]
     split = len(hypothesis.parameters) if derivative else 0
     by_pose, rest_by_pose = (
         _pose_derivative(robot, scene, poses, states, residual, pivot)
@@ -254,12 +257,6 @@ def evaluate_scene(
     rest = rest_residual(robot, scene, poses)
     rest_columns = [(rest_residual(v.robot, scene, poses) - rest) / h for v, h in zip(variants[:split], steps)]
     return SceneJet(residual, rest, by_pose, rest_by_pose, _stack(rest_columns, rest), _stack(columns[split:], residual), _stack(columns[:split], residual), states)  # fmt: skip
-
-
-def _as_predicted(robot: Robot, scene: Scene, poses: Sequence[FloatArray], model: Mapping[int, FloatArray]) -> Scene:
-    """Return the scene with every marker where the model would have the camera measure it."""
-    places = np.array([model[int(f)][m] for f, m in zip(scene.frame, scene.marker)]).reshape(-1, 3)
-    return replace(scene, points=as_measured(places, scene.view, poses, robot.observation))
 
 
 def _stack(columns: list[FloatArray], residual: FloatArray) -> FloatArray:

@@ -178,8 +178,6 @@ class JointProblem:
     trials: list[Trial]
     factors: list[Whitener]
     seat_std: float
-    noiseless: bool = False
-    """Whether columns of effects are free of the noise of measured points (for screening; a fit wants its own Jacobian)."""
     last: Jets | None = None
     """With derivatives."""
 
@@ -231,7 +229,7 @@ class JointProblem:
         pivot = self.hypothesis.robot.marker_points.mean(axis=0)
         poses, initial = trial.place(own, pivot)
         return evaluate_scene(self.hypothesis, trial.scene, coordinates, poses, initial, derivative=derivative,
-                              vary_initial=trial.initial is not None, pivot=pivot, starts=trial.starts_on(self.hypothesis.robot.body.mesh), noiseless=self.noiseless)  # fmt: skip
+                              vary_initial=trial.initial is not None, pivot=pivot, starts=trial.starts_on(self.hypothesis.robot.body.mesh))  # fmt: skip
 
     def _scene_rows(
         self, trial: Trial, factor: Whitener, jet: SceneJet, own: FloatArray, at: int, width: int, derivative: bool

@@ -154,7 +154,7 @@ def effect_fields(base: JointFit, trials: list[Trial], todo: list[tuple[Effect, 
     smooth = [t for t in todo if not t[0].discrete and _can_act(fixed, t)]
     every = Hypothesis(fixed, tuple(smooth))
     null = np.array([p.null for p in every.parameters])
-    probe = JointProblem(every, Prior(np.zeros(0), np.zeros(0)), trials, [], 1.0, noiseless=True)
+    probe = JointProblem(every, Prior(np.zeros(0), np.zeros(0)), trials, [], 1.0)
     raw, rest = [], []
     for trial, span in zip(trials, spans_of(trials)):
         jet = probe.jet(trial, base.fit.theta[span], null, True)
