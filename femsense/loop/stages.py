@@ -240,7 +240,9 @@ def noise_of(data: Data, stage: Stage, fields: Fields, before: Noise | None = No
         which = [i for i, t in enumerate(data.train) if (t.scene.patches is not None) == clouds]
         if which:
             picked = [[column[i] for i in which] for column in ([j.residual for j in stage.fit.jets], columns, extra, groups)]
-            noise = noise.joined(estimate_noise(*picked, None if before is None else before.surface if clouds else before.std), clouds)  # type: ignore[arg-type]
+            noise = noise.joined(
+                estimate_noise(*picked, None if before is None else before.surface if clouds else before.std), clouds
+            )  # type: ignore[arg-type]
     return noise, float(sum(g.observations for g in groups))
 
 
