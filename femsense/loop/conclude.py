@@ -18,7 +18,7 @@ from femsense.loop.noise import Noise
 from femsense.loop.result import LoopResult
 from femsense.loop.screen import NUISANCE, TESTABLE, Candidate, confounding, one_each
 from femsense.loop.spread import spreads
-from femsense.loop.stages import Stage, keeping
+from femsense.loop.stages import Stage, held_chi2, keeping
 from femsense.loop.structure import describe_left, structure_tests, without_mesh_error
 from femsense.loop.zeros import InPlace, moved_nuisance, zeros_are_evident
 
@@ -26,7 +26,9 @@ MIN_SWEEPS = 4
 """With fewer held-out sweeps the interval of the held-out error resamples frames."""
 DRAWS = 2000
 NOT_WORSE = 1.02
-"""What is handed back may not have a larger held-out error than the declared model, but for this factor."""
+"""What is handed back may not have a larger held-out error than the declared model, but for this factor …"""
+NOISY = 1.15
+"""… or for this one, where χ² of the held-out data says that their noise hides a better model."""
 EXPLAINED = 0.8
 """Share of the excess over the noise that effects must take away where structure is left."""
 
@@ -113,10 +115,18 @@ def _worth_handing_back(data: Data, search: Search, promoted: list[str], names: 
     from the last one on, what would make the error on held-out data larger than it was, or goes to the edge of what is plausible."""
     while names:
         back = _handed_back(data, search.final, names, search.noise)
-        if back.held_rms <= NOT_WORSE * search.before.held_rms and not at_edge(back.fit):
+        if not at_edge(back.fit) and _holds_out(data, search, back):
             return names, back
         names = names[:-1]
     return [], search.before
+
+
+def _holds_out(data: Data, search: Search, back: Stage) -> bool:
+    """Return whether a model is no worse on held-out data: in millimetres, or, within reason, by the noise that these data have."""
+    worse = back.held_rms / search.before.held_rms
+    if worse <= NOT_WORSE:
+        return True
+    return worse <= NOISY and held_chi2(data, search.before, search.noise) - held_chi2(data, back, search.noise) > EVIDENCE
 
 
 def _handed_back(data: Data, final: Stage, names: list[str], noise: Noise) -> Stage:

@@ -28,7 +28,7 @@ EVIDENCE = 10.0
 """dBIC that a named effect needs."""
 ENOUGH_SPREAD = 0.5
 """Standard errors by which the prediction of left-out sweeps must get better."""
-PREDICTS = 0.05
+PREDICTS = 0.25
 """Share of the decrease of χ², a row, that must show on held-out rows too (unless the effect hardly acts there)."""
 NEARLY = 0.05
 """Seeds whose gain is less by this share are as good."""

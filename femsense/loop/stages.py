@@ -236,13 +236,18 @@ def noise_of(data: Data, stage: Stage, fields: Fields, before: Noise | None = No
         extra.append(np.concatenate([np.zeros((*shape, 0)), *others], axis=2))
     groups = [t.groups for t in data.train]
     noise = Noise({}, "")
+    residuals = [j.residual for j in stage.fit.jets]
     for clouds in (False, True):
         which = [i for i, t in enumerate(data.train) if (t.scene.patches is not None) == clouds]
         if which:
-            picked = [[column[i] for i in which] for column in ([j.residual for j in stage.fit.jets], columns, extra, groups)]
-            noise = noise.joined(
-                estimate_noise(*picked, None if before is None else before.surface if clouds else before.std), clouds
-            )  # type: ignore[arg-type]
+            known = None if before is None else before.surface if clouds else before.std
+            picked = (
+                [residuals[i] for i in which],
+                [columns[i] for i in which],
+                [extra[i] for i in which],
+                [groups[i] for i in which],
+            )
+            noise = noise.joined(estimate_noise(*picked, known), clouds)
     return noise, float(sum(g.observations for g in groups))
 
 
