@@ -2,7 +2,8 @@
 
     python benchmarks/invariance.py               # what is not done yet, then the tables
     python benchmarks/invariance.py --table       # the tables of what is done
-    options: --draws N   permuted logs of each kind (20); --file FILE   where results stand (invariance.jsonl)
+    python benchmarks/invariance.py control       # the permuted logs alone ("same": the ways to tell alone)
+    options: --draws N   permuted logs (20); --file FILE   where results stand (invariance.jsonl); --jobs N   not more this time
 
 A small arm of 24 quadratic tetrahedra with one effect hidden; every effect of the list is tried. The order of sweeps is shuffled in the
 recording where the past of a sweep does not matter (nothing, or friction and cables that end slack), and in the experiment where it does
@@ -151,15 +152,16 @@ def print_tables(done: dict[str, dict[str, Any]]) -> None:
 def main() -> None:
     """Run what is not done yet and print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("only", nargs="?", choices=("same", "control"))
     parser.add_argument("--draws", type=int, default=20)
+    parser.add_argument("--jobs", type=int, default=10**6)
     parser.add_argument("--file", type=Path, default=Path("invariance.jsonl"))
     parser.add_argument("--table", action="store_true")
     options = parser.parse_args()
     lines = options.file.read_text().splitlines() if options.file.is_file() else []
     done = {r["job"]: r for r in map(json.loads, lines)}
-    for job in jobs(options.draws):
-        if options.table or str(job) in done:
-            continue
+    todo = [j for j in jobs(options.draws) if str(j) not in done and options.only in (None, j[0])]
+    for job in todo[: 0 if options.table else options.jobs]:
         done[str(job)] = {"job": str(job), **run_job(job)}
         with options.file.open("a") as file:
             file.write(json.dumps(done[str(job)]) + "\n")
