@@ -7,12 +7,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+from arm import arm, record, sweeps
 
 from femsense.calib.fit import covariance_of
+from femsense.calib.forward import Hypothesis
+from femsense.effects import find_effect
 from femsense.effects.loads import STANDARD_GRAVITY
-from femsense.loop.joint import GRAVITY_STD
+from femsense.loop.data import prepare
+from femsense.loop.joint import GRAVITY_STD, Prior
 from femsense.loop.noise import Noise
-from femsense.loop.spread import coordinate_std, misfit
+from femsense.loop.spread import _by_sweeps, coordinate_std, misfit, spreads
+from femsense.loop.stages import make_stage
 
 
 def linear_fit(rows: np.ndarray, gravity: np.ndarray, residual: np.ndarray | None = None) -> Any:
@@ -67,3 +72,39 @@ def test_parameters_leave_less_to_judge_the_noise_by() -> None:
     noise = Noise({"white": 1e-6, "state": 1e-4}, "")
     fit = SimpleNamespace(jets=[SimpleNamespace(residual=np.full((10, 3), 1e-4))], fit=SimpleNamespace(theta=np.zeros(3)))
     assert misfit(fit, [trial(2)], noise) == pytest.approx(np.sqrt(2.0), rel=1e-3)
+
+
+def sweeps_fit(values: np.ndarray, rows: int) -> tuple[Any, Any]:
+    """Return data and a stage: one parameter, the mean of whitened rows; `values` are what each sweep has it be."""
+    residual = np.concatenate([np.full(3 * rows, v) for v in values - values.mean()])
+    jet = SimpleNamespace(residual=residual.reshape(-1, 3), rest=np.zeros((0, 3)))
+    J = np.ones((len(residual), 1))
+    fit = SimpleNamespace(own=0, jets=[jet], fit=SimpleNamespace(jacobian=J, residual=residual, theta=np.zeros(1)))
+    groups = SimpleNamespace(sweep=np.repeat(np.arange(len(values)), rows))
+    return SimpleNamespace(
+        train=[SimpleNamespace(groups=groups, poses=(), together=False, sheets=None, scene=SimpleNamespace(patches=None))]
+    ), SimpleNamespace(fit=fit)
+
+
+def test_sweeps_that_disagree_say_by_how_much() -> None:
+    values = np.array([0.3, -0.5, 0.9, 0.1, -0.8])
+    data, stage = sweeps_fit(values, 4)
+    # of equal sweeps: the variance of a mean of five; half leverage gives each its share back, 1 / (1 − 1/5)
+    expected = np.sqrt(np.sum((values - values.mean()) ** 2) / 5 / 4)
+    np.testing.assert_allclose(_by_sweeps(data, stage), expected, rtol=1e-6)
+    two, stage = sweeps_fit(values[:2], 4)
+    assert not _by_sweeps(two, stage).any()
+
+
+def test_a_time_that_a_seed_holds_still_leaves_the_fraction_open() -> None:
+    inputs, labels = sweeps(1.5, each=1)
+    robot = arm((4, 1, 1))
+    truth = [{"name": "creep", "fraction": 0.2, "time_s": 6.0}]
+    data = prepare(robot, [record(inputs, labels=labels, truth=robot, effects=truth, noise=1e-4)[0]], [])
+    noise, effect = Noise({"white": 1e-4}, ""), find_effect("creep")
+    hypothesis = Hypothesis(robot, ((effect, {"time_s": 8.0}, effect.parameters(robot, "tension")),))
+    stage = make_stage(data, hypothesis, Prior(np.zeros(1), np.full(1, np.inf)), noise, np.array([0.2]))
+    std = spreads(data, stage, noise, {})["creep"]
+    assert std[0] > 1.5 * stage.fit.std[0]
+    more = spreads(data, stage, noise, {"creep": np.array([0.3])})["creep"]
+    assert more[0] == pytest.approx(np.hypot(std[0], 0.3))
