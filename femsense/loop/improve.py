@@ -67,9 +67,22 @@ def improve(
     rng = np.random.default_rng(seed)
     say("reading and calibrating")
     data = replace(prepare(robot, recordings, validation, measured), forms=(*FORMS, *own))
+    data, before, base = _calibrated(data, say)
+    growing = _fresh(data)
+    data, search = _search(data, before, base, names, MAX_EFFECTS if growing else 0, say)
+    say("testing what is left")
+    result = conclude(data, search, rng)
+    result = replace(result, data={**result.data, "seed": seed})
+    if growing:
+        return result
+    only = "record another state (other inputs, load or direction of gravity): these data repeat one state, which cannot tell effects apart"
+    return replace(result, next_experiment="; ".join(t for t in (only, result.next_experiment) if t))
+
+
+def _calibrated(data: Data, say: Progress) -> tuple[Data, Stage, Stage]:
+    """Return the data with what the mesh costs, the declared model calibrated, and the model with all that calibration may move."""
     noise = Noise({"white": 5e-4}, "start")
-    nothing = Prior(np.zeros(0), np.zeros(0))
-    before = make_stage(data, Hypothesis(data.robot), nothing, noise, np.zeros(0))
+    before = _declared(data, noise, None)
     hypothesis, prior = with_nuisance(data)
     say("fitting what calibration may move")
     base = make_stage(data, hypothesis, prior, noise, np.zeros(len(prior.mean)))
@@ -77,29 +90,38 @@ def improve(
         say("matching the clouds again")
         data = rematched(data, base, noise, anew=True)
         base = make_stage(data, hypothesis, prior, noise, base.fit.coordinates, own=own_of(base))
-        before = make_stage(data, Hypothesis(data.robot), nothing, noise, np.zeros(0), own=own_of(before))
+        before = _declared(data, noise, before)
     say("asking what the mesh costs")
     data = with_mesh_errors(data, keeping(data, base, ["stiffness"], noise))  # zeros may have gone far, for an effect's sake
+    return data, before, base
+
+
+def _declared(data: Data, noise: Noise, start: Stage | None) -> Stage:
+    """Return the declared model with its camera calibrated."""
+    nothing = Prior(np.zeros(0), np.zeros(0))
+    own = None if start is None else own_of(start)
+    return make_stage(data, Hypothesis(data.robot), nothing, noise, np.zeros(0), own=own)
+
+
+def _search(data: Data, before: Stage, base: Stage, names: list[str], most: int, say: Progress) -> tuple[Data, Search]:
+    """Screen, refit and add effects, at most so many, until none passes; return the data as the last model has them, and the search."""
     history: list[tuple[str, Stage]] = [("", base)]
     stage, first, refits = base, list[Candidate](), list[dict[str, Any]]()
-    growing = _fresh(data)
+    noise: Noise | None = None
     while True:
         found = len(history) - 1
         say(f"screening effects ({found} found so far)")
         if found and "clouds" in data.measured:
+            assert noise is not None
             data = rematched(data, stage, noise)
-            stage = make_stage(
-                data, stage.fit.hypothesis, stage.fit.prior, noise, stage.fit.coordinates, own=own_of(stage), near=stage.fit.jets
-            )
+            stage = _again(data, stage, noise, own_derivatives=False)
         fields = fields_of(data, stage, names)
-        noise, n_effective = noise_of(data, stage, fields, noise if found else None)
-        stage = make_stage(
-            data, stage.fit.hypothesis, stage.fit.prior, noise, stage.fit.coordinates, own=own_of(stage), known=stage.fit.jets
-        )
+        noise, n_effective = noise_of(data, stage, fields, noise)
+        stage = _again(data, stage, noise)
         history[-1] = (history[-1][0], stage)
         table = screen_stage(data, stage.fit, noise, fields, n_effective)
         first = first or table
-        if not growing or found >= MAX_EFFECTS:
+        if found >= most:
             break
         winner, tried = grow(data, stage, table, noise, say)
         refits += [{**record, "step": found + 1} for record in tried]
@@ -111,21 +133,23 @@ def improve(
         history.append((name, stage))
         if far:  # the mesh errs in another way in these states
             data = with_mesh_errors(data, stage)
-    swap = in_place_of_zeros(data, stage, names, noise, n_effective, say) if growing else None
+    swap = in_place_of_zeros(data, stage, names, noise, n_effective, say) if most else None
     if swap is not None:
         refits += [{**record, "step": len(history)} for record in swap.records]
         if swap.stage is not None:
             stage = swap.stage
             history.append((swap.name, stage))
-    if len(history) > 1 and "clouds" in data.measured:  # before and after on the same patches
-        before = make_stage(data, Hypothesis(data.robot), nothing, noise, np.zeros(0), own=own_of(before))
-    say("testing what is left")
-    result = conclude(data, Search(before, history, stage, noise, n_effective, first, table, refits, swap), rng)
-    result = replace(result, data={**result.data, "seed": seed})
-    if growing:
-        return result
-    only = "record another state (other inputs, load or direction of gravity): these data repeat one state, which cannot tell effects apart"
-    return replace(result, next_experiment="; ".join(t for t in (only, result.next_experiment) if t))
+    if len(history) > 1 and "clouds" in data.measured:
+        before = _declared(data, noise, before)  # before and after on the same patches
+    return data, Search(before, history, stage, noise, n_effective, first, table, refits, swap)
+
+
+def _again(data: Data, stage: Stage, noise: Noise, *, own_derivatives: bool = True) -> Stage:
+    """Return a stage fitted to other weights or rows, from where it is; with its own derivatives where the rows are the same."""
+    known, near = (stage.fit.jets, None) if own_derivatives else (None, stage.fit.jets)
+    return make_stage(
+        data, stage.fit.hypothesis, stage.fit.prior, noise, stage.fit.coordinates, own=own_of(stage), known=known, near=near
+    )
 
 
 def _names(effects: Sequence[str] | None, without: Sequence[str] | None, own: Sequence[Effect]) -> list[str]:
