@@ -81,8 +81,11 @@ def _moves(
     vectors = _state_vectors(trial, frames)
     chosen = _representatives(vectors, max(8, MOST_WORK // len(fine.body.mesh.tets)))
     known, settled = [], []
-    fine.body.free_map.pattern.analysis()  # before threads ask for it
-    finer_states = each(lambda i: finer_state(coarse_walk, fine_walk, frames[i], states[frames[i]], ties), chosen)
+
+    def finer_at(i: int) -> FloatArray | None:
+        return finer_state(coarse_walk, fine_walk, frames[i], states[frames[i]], ties)
+
+    finer_states = [finer_at(chosen[0]), *each(finer_at, chosen[1:])]  # the first makes what all of them share
     for i, finer in zip(chosen, finer_states):
         if finer is not None:
             settled.append(i)
