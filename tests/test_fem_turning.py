@@ -44,7 +44,7 @@ def test_a_small_step_is_the_straight_one_to_first_order(quadratic: bool) -> Non
 @pytest.mark.parametrize("quadratic", [False, True])
 def test_a_turn_about_a_hinge_is_a_rotation_without_stretch(quadratic: bool) -> None:
     body = bar(quadratic, on_an_edge=True)
-    body.free_map.laplacian.append(turning._factorised_laplacian(body))  # a hinge holds no body, but a Laplacian
+    body.free_map.laplacian.append(turning._corners(body))  # a hinge holds no body, but a Laplacian
     hinge, turn = body.mesh.nodes[body.clamped][0], np.array([0.0, 0.0, 0.7])
     arms = body.mesh.nodes - hinge
     there = turned_step(body, body.mesh.nodes, np.cross(turn, arms))

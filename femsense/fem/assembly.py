@@ -12,7 +12,7 @@ from numba import njit
 from femsense.arrays import FloatArray, IntArray
 from femsense.fem.body import BodyModel
 from femsense.fem.clamp import clamp_energy_and_forces, ties_of
-from femsense.fem.corotational import corotational_tet4, corotational_tet10
+from femsense.fem.corotational import corotational_tet4, corotational_tet10, stretched_tet10
 from femsense.fem.hyperelastic import hyperelastic_tet4, hyperelastic_tet10
 from femsense.fem.stencil import block_row_numbers
 
@@ -36,21 +36,34 @@ class Internal:
     """d²W/dx² [N/m], shape (nb, 9), in the stencil's pattern (one half of it); None if not asked for."""
 
 
-def internal(body: BodyModel, positions: FloatArray, *, tangent: bool = True) -> Internal:
+def internal(
+    body: BodyModel,
+    positions: FloatArray,
+    *,
+    tangent: bool = True,
+    room: FloatArray | None = None,
+    stretch: FloatArray | None = None,
+) -> Internal:
     """Return internal energy, forces and (if asked) stiffness of the body at the given node positions [m], shape (n, 3).
 
     The clamp's springs, where the body has them, belong to it; of a plate that turns, the blocks hold the sparse part only
-    (see `clamp.with_turning_plate`).
+    (see `clamp.with_turning_plate`). `room`, an array (nb, 9), takes the blocks; it may be of single precision.
+    `stretch`, for corotational elements of ten nodes, keeps the stress of one state for the stiffness of another (`stretched_tet10`).
     """
     stencil, material = body.stencil, body.material
     mu, lam = material.lame()
     forces = np.zeros_like(body.mesh.nodes)
-    blocks = np.zeros((len(stencil.block_columns) if tangent else 0, 9))
+    blocks = np.zeros((len(stencil.block_columns) if tangent else 0, 9)) if room is None else room
+    blocks[:] = 0.0
     kernel = KERNELS["corotational" if material.law == "corotational" else "hyperelastic", body.mesh.tets.shape[1]]
     limit = material.stretch_limit if material.law == "gent" else np.inf
     x = np.ascontiguousarray(positions).view()
     x.flags.writeable = False  # one compiled kernel, whether the caller's array can be written to or not
-    energy = kernel(x, stencil.tets, stencil.gradients, stencil.volumes, mu, lam, limit, tangent, stencil.slots, forces, blocks)  # fmt: skip
+    mesh = x, stencil.tets, stencil.gradients, stencil.volumes, mu, lam
+    if stretch is None:
+        energy = kernel(*mesh, limit, tangent, stencil.slots, forces, blocks)
+    else:
+        energy = stretched_tet10(*mesh, tangent, stencil.slots, forces, blocks, stretch)
     ties = ties_of(body)
     if ties is not None:
         extra, slopes = clamp_energy_and_forces(body, ties, positions)

@@ -756,19 +756,22 @@ class Cholesky:
         return np.asarray(W + np.tril(W, -1).T)
 
 
-def cholesky(analysis: Analysis, values: FloatArray, *, single: bool = False) -> Cholesky | None:
+def cholesky(
+    analysis: Analysis, values: FloatArray, *, single: bool = False, source: npt.NDArray[np.int32] | None = None
+) -> Cholesky | None:
     """Factorise a symmetric matrix of an analysed pattern; None where it is not positive definite.
 
     Arguments:
         analysis: from `analyse`.
         values: its entries in CSC order, shape (nnz,).
         single: work in single precision (errors of 1e-7 times the condition of the matrix: a preconditioner).
+        source: where the entries that `Analysis.source` names are in `values`, where these are in another order.
     """
     a, kind = analysis, "f" if single else "d"
     L = a.take(kind)
     stack, head, follow = np.empty(a.stack, kind), np.empty(len(a.parent), np.int64), np.empty(len(a.parent), np.int64)
     definite = _factorise(
-        values, a.entries, a.source, a.target, a.unit, a.firsts, a.parent, a.begin, a.place, a.offset, a.heads, a.runs, a.room,
+        values, a.entries, a.source if source is None else source, a.target, a.unit, a.firsts, a.parent, a.begin, a.place, a.offset, a.heads, a.runs, a.room,
         _BLAS[kind], L, stack, head, follow, *_constants(kind),
     )  # fmt: skip
     if definite:

@@ -23,6 +23,7 @@ import numpy as np
 from numba import njit
 
 from femsense.arrays import FloatArray
+from femsense.fem.tiles import add_run, subtract_product
 
 FAST = {"contract", "reassoc", "nsz", "arcp"}
 """Rounding may differ; infinities and NaN are kept."""
@@ -117,64 +118,121 @@ def add_blocks(count, K, slots, e, blocks):  # type: ignore[no-untyped-def]
                     blocks[slot, 3 * i + j] += K[a, i, j, b]
 
 
+@njit(cache=True, fastmath=FAST)
+def _four_rotations(F: FloatArray, R: FloatArray, flat_F: FloatArray, flat_R: FloatArray, change: FloatArray) -> None:
+    """Write the rotations closest to the matrices of four points, see `closest_rotation`; `change` is room for four.
+
+    The flat views are what a compiler can see to be apart from each other, so that it takes the four at once.
+    """
+    for q in range(4):
+        size = 0.0
+        for k in range(9):
+            size += F[k, q] * F[k, q]
+        change[q] = determinant(F, q) - 0.02 * (size / 3.0) ** 1.5
+    if not min(change[0], change[1], change[2], change[3]) > 0.0:
+        for q in range(4):
+            closest_rotation(F, R, q)
+        return
+    r = flat_R
+    r[:] = flat_F
+    for _ in range(30):
+        for q in range(4):
+            a, b, c, d, e, f, g, h, i = r[q], r[4 + q], r[8 + q], r[12 + q], r[16 + q], r[20 + q], r[24 + q], r[28 + q], r[32 + q]
+            u, v, w = e * i - f * h, f * g - d * i, d * h - e * g
+            s = 0.5 / (a * u + b * v + c * w)
+            A, B, C = s * u - 0.5 * a, s * v - 0.5 * b, s * w - 0.5 * c
+            D, E, H = s * (c * h - b * i) - 0.5 * d, s * (a * i - c * g) - 0.5 * e, s * (b * g - a * h) - 0.5 * f
+            J, K, L = s * (b * f - c * e) - 0.5 * g, s * (c * d - a * f) - 0.5 * h, s * (a * e - b * d) - 0.5 * i
+            change[q] = A * A + B * B + C * C + D * D + E * E + H * H + J * J + K * K + L * L
+            r[q], r[4 + q], r[8 + q], r[12 + q], r[16 + q] = a + A, b + B, c + C, d + D, e + E
+            r[20 + q], r[24 + q], r[28 + q], r[32 + q] = f + H, g + J, h + K, i + L
+        if max(change[0], change[1], change[2], change[3]) < 1e-17:
+            return
+    for q in range(4):
+        closest_rotation_by_svd(F, R, q)
+
+
+STEP = 112
+"""Numbers from one column of the product below to the next: 90 of nine a node, and the ten of the other side from 96 on."""
+
+
 @njit(inline="always")
-def _stiffness(count, quad, row, e, w, mu, pull, local, lam, F, R, H, mean, Dinv, Z, K):  # type: ignore[no-untyped-def]
-    """Write the stiffness of an element, K[a, i, j, b]."""
+def _factors(e, w, mu, pull, local, lam, F, R, H, mean, Dinv, T):  # type: ignore[no-untyped-def]
+    """Write the two sides of the stiffness of ten nodes as a product, K_ab = Σ_k t_ak h_bk with k = point and direction, then the mean.
+
+    T[k, 9 a + 3 i + j] is −t, T[k, 96 + b] is h.
+    """
     volume = 0.0
-    for q in range(quad):
+    for q in range(4):
         volume += w[e, q]
         turning_compliance(F, R, q, Dinv)
         s = w[e, q] * (2.0 * mu - pull[q])
         d00, d01, d02, d11, d12, d22 = s * Dinv[0], s * Dinv[1], s * Dinv[2], s * Dinv[3], s * Dinv[4], s * Dinv[5]
-        for a in range(count):  # Z = (2μ − λθ) w [h]ₓ D⁻¹
+        c, m = -local * w[e, q], -2.0 * mu * w[e, q]
+        X, Y, Z = T[3 * q], T[3 * q + 1], T[3 * q + 2]
+        for a in range(10):
             x, y, z = H[q, 0, a], H[q, 1, a], H[q, 2, a]
-            Z[a, 0, 3 * q], Z[a, 0, 3 * q + 1], Z[a, 0, 3 * q + 2] = y * d02 - z * d01, y * d12 - z * d11, y * d22 - z * d12
-            Z[a, 1, 3 * q], Z[a, 1, 3 * q + 1], Z[a, 1, 3 * q + 2] = z * d00 - x * d02, z * d01 - x * d12, z * d02 - x * d22
-            Z[a, 2, 3 * q], Z[a, 2, 3 * q + 1], Z[a, 2, 3 * q + 2] = x * d01 - y * d00, x * d11 - y * d01, x * d12 - y * d02
-    for a in range(count):
-        for i in range(3):
+            z00, z01, z02 = y * d02 - z * d01, y * d12 - z * d11, y * d22 - z * d12  # z = (2μ − p) w [h]ₓ D⁻¹
+            z10, z11, z12 = z * d00 - x * d02, z * d01 - x * d12, z * d02 - x * d22
+            z20, z21, z22 = x * d01 - y * d00, x * d11 - y * d01, x * d12 - y * d02
+            r = 9 * a
+            X[r], X[r + 1], X[r + 2] = (c + m) * x, -z02, z01
+            X[r + 3], X[r + 4], X[r + 5] = c * y, m * x - z12, z11
+            X[r + 6], X[r + 7], X[r + 8] = c * z, -z22, m * x + z21
+            Y[r], Y[r + 1], Y[r + 2] = m * y + z02, c * x, -z00
+            Y[r + 3], Y[r + 4], Y[r + 5] = z12, (c + m) * y, -z10
+            Y[r + 6], Y[r + 7], Y[r + 8] = z22, c * z, m * y - z20
+            Z[r], Z[r + 1], Z[r + 2] = m * z - z01, z00, c * x
+            Z[r + 3], Z[r + 4], Z[r + 5] = -z11, m * z + z10, c * y
+            Z[r + 6], Z[r + 7], Z[r + 8] = -z21, z20, (c + m) * z
+            X[96 + a], Y[96 + a], Z[96 + a] = x, y, z
+    for i in range(3):
+        for a in range(10):
             side = (lam - local) / volume * mean[i, a]
-            for b in range(a & -LANES, row):
-                s0, s1, s2 = side * mean[0, b], side * mean[1, b], side * mean[2, b]
-                for q in range(quad):
-                    z0, z1, z2 = Z[a, i, 3 * q], Z[a, i, 3 * q + 1], Z[a, i, 3 * q + 2]
-                    z = local * w[e, q] * H[q, i, a]
-                    s0 += z1 * H[q, 2, b] - z2 * H[q, 1, b] + z * H[q, 0, b]
-                    s1 += z2 * H[q, 0, b] - z0 * H[q, 2, b] + z * H[q, 1, b]
-                    s2 += z0 * H[q, 1, b] - z1 * H[q, 0, b] + z * H[q, 2, b]
-                K[a, i, 0, b], K[a, i, 1, b], K[a, i, 2, b] = s0, s1, s2
-    for q in range(quad):
-        s = 2.0 * mu * w[e, q]
-        for a in range(count):
-            x, y, z = s * H[q, 0, a], s * H[q, 1, a], s * H[q, 2, a]
-            for b in range(a & -LANES, row):
-                dot = x * H[q, 0, b] + y * H[q, 1, b] + z * H[q, 2, b]
-                K[a, 0, 0, b] += dot
-                K[a, 1, 1, b] += dot
-                K[a, 2, 2, b] += dot
+            for j in range(3):
+                T[12 + j, 9 * a + 3 * i + j] = -side
+            T[12 + i, 96 + a] = mean[i, a]
 
 
 @njit(inline="always")
-def _kernel(count, quad, row, x, tets, gradients, volumes, mu, lam, limit, tangent, slots, forces, blocks):  # type: ignore[no-untyped-def]
-    F, R, X, f = np.empty((9, quad)), np.empty((9, quad)), np.empty((3, count)), np.empty((3, count))
-    H, mean = np.zeros((quad, 3, row)), np.zeros((3, row))
-    pull, Dinv, Z, K = np.empty(quad), np.empty(6), np.empty((count, 3, 3 * quad)), np.empty((count, 3, 3, row))
+def _add_product(T, K, slots, blocks):  # type: ignore[no-untyped-def]
+    """Add T's product to the blocks of the pairs a ≤ b; K is room for it."""
+    width = T.itemsize
+    K[:] = 0.0
+    for first, count in ((0, 6), (6, 4)):
+        subtract_product(
+            T, T.ctypes.data, T.ctypes.data + width * (96 + first), STEP, K.ctypes.data + width * first * STEP, STEP, 9 * (first + count), count, 15
+        )  # fmt: skip
+    pair, row = 0, blocks.ctypes.data
+    for a in range(10):
+        for b in range(a, 10):
+            add_run(blocks, row + 9 * width * slots[pair], K.ctypes.data + width * (b * STEP + 9 * a), 9)
+            pair += 1
+
+
+@njit(cache=True, fastmath=FAST)
+def _tet10(x, tets, gradients, volumes, mu, lam, tangent, slots, forces, blocks, stretch):  # type: ignore[no-untyped-def]
+    """The same for ten nodes and four points, see `corotational_tet4` and, for `stretch`, `stretched_tet10`."""
+    F, R, X, f = np.empty((9, 4)), np.empty((9, 4)), np.empty((3, 10)), np.empty((3, 10))
+    H, mean, room, flat_F, flat_R = np.empty((4, 3, 10)), np.empty((3, 10)), np.empty(4), F.reshape(36), R.reshape(36)
+    pull, Dinv, T, K = np.empty(4), np.empty(6), np.zeros((16, STEP), blocks.dtype), np.empty((10, STEP), blocks.dtype)
     energy = 0.0
     for e in range(len(tets)):
-        for a in range(count):
+        for a in range(10):
             for i in range(3):
                 X[i, a] = x[tets[e, a], i]
                 f[i, a] = mean[i, a] = 0.0
         theta = volume = 0.0
         local = min(lam[e], LOCAL * mu[e])
-        for q in range(quad):
+        for q in range(4):
             for i in range(3):
                 for j in range(3):
                     s = 0.0
-                    for a in range(count):
+                    for a in range(10):
                         s += X[i, a] * gradients[e, q, j, a]
                     F[3 * i + j, q] = s
-            closest_rotation(F, R, q)
+        _four_rotations(F, R, flat_F, flat_R, room)
+        for q in range(4):
             trace = -3.0
             for k in range(9):
                 trace += F[k, q] * R[k, q]
@@ -184,7 +242,7 @@ def _kernel(count, quad, row, x, tets, gradients, volumes, mu, lam, limit, tange
             volume += volumes[e, q]
         theta /= volume
         energy += 0.5 * (lam[e] - local) * volume * theta * theta
-        for q in range(quad):
+        for q in range(4):
             pull[q] += (lam[e] - local) * theta
             w = volumes[e, q]
             norm = 0.0
@@ -194,19 +252,39 @@ def _kernel(count, quad, row, x, tets, gradients, volumes, mu, lam, limit, tange
                 norm += u0 * u0 + u1 * u1 + u2 * u2
                 m2, p = 2.0 * w * mu[e], w * pull[q]
                 p0, p1, p2 = m2 * u0 + p * r0, m2 * u1 + p * r1, m2 * u2 + p * r2
-                for a in range(count):
+                for a in range(10):
                     g0, g1, g2 = gradients[e, q, 0, a], gradients[e, q, 1, a], gradients[e, q, 2, a]
                     f[i, a] += p0 * g0 + p1 * g1 + p2 * g2
                     h = r0 * g0 + r1 * g1 + r2 * g2
                     H[q, i, a] = h
                     mean[i, a] += w * h
             energy += w * mu[e] * norm
-        for a in range(count):
+        for a in range(10):
             for i in range(3):
                 forces[tets[e, a], i] += f[i, a]
+        if len(stretch) and not tangent:
+            for q in range(4):
+                for i in range(3):
+                    for j in range(3):
+                        stretch[e, q, 3 * i + j] = R[i, q] * F[j, q] + R[3 + i, q] * F[3 + j, q] + R[6 + i, q] * F[6 + j, q]
+        if len(stretch) and tangent:
+            theta = 0.0
+            for q in range(4):
+                trace = stretch[e, q, 0] + stretch[e, q, 4] + stretch[e, q, 8] - 3.0
+                pull[q] = local * trace
+                theta += volumes[e, q] / volume * trace
+                for i in range(3):
+                    for j in range(3):
+                        F[3 * i + j, q] = (
+                            R[3 * i, q] * stretch[e, q, j]
+                            + R[3 * i + 1, q] * stretch[e, q, 3 + j]
+                            + R[3 * i + 2, q] * stretch[e, q, 6 + j]
+                        )
+            for q in range(4):
+                pull[q] += (lam[e] - local) * theta
         if tangent:
-            _stiffness(count, quad, row, e, volumes, mu[e], pull, local, lam[e], F, R, H, mean, Dinv, Z, K)
-            add_blocks(count, K, slots, e, blocks)
+            _factors(e, volumes, mu[e], pull, local, lam[e], F, R, H, mean, Dinv, T)
+            _add_product(T, K, slots[e], blocks)
     return energy
 
 
@@ -285,4 +363,14 @@ def corotational_tet4(x, tets, gradients, volumes, mu, lam, limit, tangent, slot
 @njit(cache=True, nogil=True, fastmath=FAST)
 def corotational_tet10(x, tets, gradients, volumes, mu, lam, limit, tangent, slots, forces, blocks):  # type: ignore[no-untyped-def]
     """The same for ten nodes and four points, see `corotational_tet4`."""
-    return _kernel(10, 4, 16, x, tets, gradients, volumes, mu, lam, limit, tangent, slots, forces, blocks)
+    return _tet10(x, tets, gradients, volumes, mu, lam, tangent, slots, forces, blocks, np.empty((0, 4, 9)))
+
+
+@njit(cache=True, fastmath=FAST)
+def stretched_tet10(x, tets, gradients, volumes, mu, lam, tangent, slots, forces, blocks, stretch):  # type: ignore[no-untyped-def]
+    """The same with the stress of another state in its stiffness.
+
+    Without `tangent`, RᵀF is written to `stretch`, shape (m, 4, 9); with it, the stiffness is that of the rotations R at x and of the
+    stretches that stand there, as if F were R times these (forces and energy are those of x).
+    """
+    return _tet10(x, tets, gradients, volumes, mu, lam, tangent, slots, forces, blocks, stretch)
