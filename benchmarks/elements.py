@@ -248,6 +248,33 @@ def timing(body: BodyModel, label: str) -> None:
     print(f"| {label} | {len(right)} | " + " | ".join(median_ms(run) for run in runs) + " |", flush=True)
 
 
+def pad_case(cells: tuple[int, int, int], grading: float, nu: float) -> Case:
+    """Return the squeezed pad of `block_cases`, quadratic, with cells that are smaller towards its faces (grading 0: all alike)."""
+    mesh = block(cells, (1.0, 1.0, 1.0))
+    nodes = (mesh.nodes - grading * np.sin(2.0 * np.pi * mesh.nodes) / (2.0 * np.pi)) * [0.03, 0.03, 0.015]
+    mesh = to_quadratic(TetMesh(nodes, mesh.tets))
+    low, high = mesh.nodes[:, 2] < 1e-9, mesh.nodes[:, 2] > 0.015 - 1e-9
+    pushed = np.zeros_like(mesh.nodes)
+    pushed[high, 2] = -1.0
+    return Case(
+        "squeeze", make_body(mesh, young_modulus=1e5, poisson_ratio=nu, clamped=low | high), np.zeros_like(pushed), pushed
+    )
+
+
+def pads(nu: float = 0.499) -> None:
+    """Print the errors of the squeezed pad on finer and on graded meshes: the edges along which it sticks are what is missed."""
+    (f, p), (F, P) = (
+        [responses([pad_case(c, 0.0, nu)], kind)[0] for kind in ("points", "mean")] for c in ((8, 8, 6), (12, 12, 9))
+    )
+    print(f"\nSqueezed pad, ν = {nu}; the finest meshes disagree by {100.0 * abs(P / F - 1.0):.2f} %")
+    print("| cells | grading | default, % | mean dilatation, % | four points, % |\n|---|---|---|---|---|")
+    meshes = [((4, 4, 3), 0.0), ((4, 4, 3), 0.4), ((4, 4, 3), 0.7), ((5, 5, 4), 0.0), ((5, 5, 4), 0.5), ((6, 6, 4), 0.0)]
+    for cells, grading in meshes:
+        found = [responses([pad_case(cells, grading, nu)], kind)[0] for kind in (0.75, "mean", "points")]
+        errors = " | ".join(f"{100.0 * (value / converged(f, p, F, P) - 1.0):+.1f}" for value in found)
+        print(f"| {' × '.join(map(str, cells))} | {grading} | {errors} |", flush=True)
+
+
 def large_displacements() -> None:
     """Print the sag of four-leg and how far 2 N of one cable move its tip, on its mesh and on one refined once."""
     table = "| four-leg | tetrahedra | sag, mm | tip under 2 N, mm |\n|---|---|---|---|"
@@ -270,7 +297,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("diamond", nargs="?", type=Path, default=SHARED)
     parser.add_argument("--fine", type=int, default=1)
-    parser.add_argument("--only", choices=("errors", "large", "times"))
+    parser.add_argument("--only", choices=("errors", "pad", "large", "times"))
     arguments = parser.parse_args()
     folder: Path = arguments.diamond
     if arguments.only in (None, "errors"):
@@ -287,6 +314,8 @@ def main() -> None:
                 lambda k, q, nu: [diamond_case(folder, 0, q, nu)],
                 lambda k, q, nu: [diamond_case(folder, k + arguments.fine - 1, q, nu)],
             )
+    if arguments.only in (None, "pad"):
+        pads()
     if arguments.only in (None, "large"):
         large_displacements()
     if arguments.only in (None, "times"):
