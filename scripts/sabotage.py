@@ -69,6 +69,7 @@ SABOTAGES = (
     S("fem/turning.py", "A[i, j] -= W[i, 0] * V[0, j]", "A[i, j] += W[i, 0] * V[0, j]", "test_fem_turning.py::test_a_turn_about_a_hinge_is_a_rotation_without_stretch"),
     S("fem/turning.py", "np.sin(angle) / angle - 1.0, (1.0", "np.sin(angle) / angle, (1.0", "test_fem_turning.py::test_a_small_step_is_the_straight_one_to_first_order"),
     S("fem/cables.py", "tensions[s - 1] * directions[s - 1, c]", "tensions[s] * directions[s - 1, c]", "test_fem_cables.py::test_forces_of_a_cable_balance_the_pull_at_its_end"),
+    S("fem/corotational.py", "theta += volumes[e, q] / volume * trace", "theta += volumes[e, q] * trace", "test_fem_tracker.py::test_a_stiffness_of_the_stretches_of_its_own_state_is_the_tangent_and_those_of_another_change_it"),
     S("fem/tracker.py", "NEAR * motion, self._floor", "1e9 * motion, self._floor", "test_fem_tracker.py::test_every_frame_is_near_the_full_solution_and_within_its_error"),
     S("fem/tracker.py", "np.full(len(c.path), t)", "np.full(len(c.path), -t)", "test_fem_tracker.py::test_the_compliance_is_that_of_the_full_solution"),
     S("fem/linear.py", "weakref.finalize(self, pattern.idle.append, handle)", "pattern.idle.append(handle)", "test_fem_linear.py::test_factors_alive_at_once_keep_their_own_values"),

@@ -8,6 +8,7 @@ from analytic import bar_body
 from helpers import block_mesh
 
 from femsense.errors import FemsenseError, InputError
+from femsense.fem.assembly import internal
 from femsense.fem.body import BodyModel
 from femsense.fem.compliance import compliance
 from femsense.fem.equilibrium import solve_equilibrium
@@ -85,3 +86,25 @@ def test_what_a_tracker_does_not_know_is_said() -> None:
     tracker.step(tension={"top": 1.0})
     with pytest.raises(InputError, match="differ in shape"):
         tracker.compliance(points=POINTS, directions=DIRECTIONS[:1])
+
+
+def test_a_stiffness_of_the_stretches_of_its_own_state_is_the_tangent_and_those_of_another_change_it() -> None:
+    body = body_of(True)
+    rest = np.array(body.mesh.nodes)
+    x = rest + 2e-3 * np.sin(40.0 * rest[:, ::-1])
+    stretch = np.zeros((len(body.mesh.tets), 4, 9))
+    forces = internal(body, x, tangent=False, stretch=stretch).forces
+    plain, same = internal(body, x), internal(body, x, stretch=stretch)
+    assert plain.blocks is not None and same.blocks is not None
+    scale = np.abs(plain.blocks[:-1]).max()
+    np.testing.assert_allclose(same.blocks[:-1], plain.blocks[:-1], atol=1e-12 * scale)
+    np.testing.assert_allclose(same.forces, forces, atol=1e-12 * np.abs(forces).max())
+    turned = x @ np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    internal(body, turned, tangent=False, stretch=stretch)  # a turn stretches nothing
+    again = internal(body, x, stretch=stretch).blocks
+    assert again is not None
+    np.testing.assert_allclose(again[:-1], plain.blocks[:-1], atol=1e-10 * scale)
+    internal(body, rest, tangent=False, stretch=stretch)
+    other = internal(body, x, stretch=stretch).blocks
+    assert other is not None
+    assert np.abs(other[:-1] - plain.blocks[:-1]).max() > 1e-3 * scale
