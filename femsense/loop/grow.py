@@ -41,6 +41,7 @@ ABOVE_MESH = 0.5
 ABOVE_MESH_IF_SURE = 0.25
 """… or by this much, if left-out sweeps speak for it by SURE standard errors and held-out data gain as much as fitted ones, a row."""
 SURE = 2.5
+"""Standard errors of the gain on left-out sweeps beyond which held-out data need only not speak against an effect."""
 POLISHED = 2.0
 """Decrease of χ² that each further parameter of a polished effect must bring."""
 
@@ -158,16 +159,18 @@ def judged(
     acts = held_shift(
         data, stage, made, noise
     )  # what `held` is on average for the true effect, with a variance of four times that
-    wanted = min(PREDICTS * gain * _held_share(data), acts - 5.0 * float(np.sqrt(acts)))
+    wanted = min(PREDICTS * gain * held_share(data), acts - 5.0 * float(np.sqrt(acts)))
     moved, mesh = moved_by(stage, made), mesh_cost(data, stage)
     record |= {"held_dchi2": held, "moved_m": moved, "mesh_cost_m": mesh, "takes_over": _taken_over(stage, made)}
+    surely = better > SURE * spread
+    if surely:
+        wanted = min(wanted, 0.0)
     fit_objection = _objection(made, candidate, score)
     if fit_objection is None and np.isfinite(spread) and better <= ENOUGH_SPREAD * spread:
         fit_objection = f"sweeps that are left out do not speak for it ({better:+.1f} ± {spread:.1f})"
     if fit_objection is None and held < wanted:
         fit_objection = f"it does not predict the held-out data (χ² falls by {held:.1f}, by {gain:.1f} where fitted)"
-    sure = better > SURE * spread and held > gain * _held_share(data)
-    if fit_objection is None and moved < (ABOVE_MESH_IF_SURE if sure else ABOVE_MESH) * mesh:
+    if fit_objection is None and moved < (ABOVE_MESH_IF_SURE if surely and held > gain * held_share(data) else ABOVE_MESH) * mesh:
         fit_objection = f"it moves the markers by {1e3 * moved:.3f} mm, the mesh itself by {1e3 * mesh:.3f} mm"
     record["verdict"] = fit_objection or "passes"
     return Refit(candidate, made, score, record)
@@ -244,7 +247,7 @@ def _z(stage: Stage, name: str) -> float:
     return 0.0
 
 
-def _held_share(data: Data) -> float:
+def held_share(data: Data) -> float:
     """Return held-out rows for each fitted one."""
     return sum(len(t.scene.frame) for t in data.held) / max(sum(len(t.scene.frame) for t in data.train), 1)
 
@@ -384,6 +387,7 @@ __all__ = [
     "at_edge",
     "evidence",
     "grow",
+    "held_share",
     "judged",
     "mesh_cost",
     "moved_by",

@@ -16,10 +16,13 @@ import numpy as np
 from femsense.errors import FemsenseError
 from femsense.loop.data import Data
 from femsense.loop.grow import (
+    ABOVE_MESH_IF_SURE,
     EVIDENCE,
+    SURE,
     Progress,
     Refit,
     evidence,
+    held_share,
     judged,
     mesh_cost,
     moved_by,
@@ -28,14 +31,15 @@ from femsense.loop.grow import (
     shortlist,
 )
 from femsense.loop.noise import Noise
-from femsense.loop.stages import Stage, fields_of, keeping, screen_stage
+from femsense.loop.predict import sweeps_predicted
+from femsense.loop.stages import Stage, fields_of, held_chi2, keeping, screen_stage
 
 ZEROS = "cable_offset"
 SIGNIFICANT = 3.0
 RELEVANT = 0.02
 """A nuisance that moved by more than three standard deviations and 2 % is named as an effect."""
 ABOVE_MESH = 0.75
-"""Zeros must move the markers by this much of what the mesh itself costs: that is what they imitate best."""
+"""Zeros must move the markers by this much of what the mesh itself costs, which they imitate best (less where sweeps are sure, as of any effect)."""
 BETTER = 2.0
 """dBIC by which an effect must be better than the zeros to take their place."""
 
@@ -83,7 +87,10 @@ def zeros_are_evident(data: Data, stage: Stage, noise: Noise, n_effective: float
         return None
     if evidence_for_zeros(data, stage, without, n_effective) <= EVIDENCE or stage.held_rms >= without.held_rms:
         return None
-    return without if moved_by(without, stage) > ABOVE_MESH * mesh_cost(data, without) else None
+    better, spread = sweeps_predicted(data.train, without.fit, stage.fit)
+    held = held_chi2(data, without, noise) - held_chi2(data, stage, noise)
+    sure = better > SURE * spread and held > held_share(data) * evidence(without.fit, stage.fit)
+    return without if moved_by(without, stage) > (ABOVE_MESH_IF_SURE if sure else ABOVE_MESH) * mesh_cost(data, without) else None
 
 
 def in_place_of_zeros(
@@ -114,9 +121,11 @@ def in_place_of_zeros(
         return InPlace(None, "", -np.inf, records)
     best = polished(data, without, best, noise, say)
     ahead = best.score - worth
-    if ahead > BETTER:
+    predicts = best.record["cv_gain"] - sweeps_predicted(data.train, without.fit, stage.fit)[0]
+    takes = ahead > BETTER or (ahead > -EVIDENCE and ahead + predicts > BETTER)  # where evidence is close, what predicts better
+    if takes:
         best.record["verdict"] = "named"
-    return InPlace(best.stage if ahead > BETTER else None, best.candidate.effect.name, ahead, records)
+    return InPlace(best.stage if takes else None, best.candidate.effect.name, ahead, records)
 
 
 __all__ = ["RELEVANT", "SIGNIFICANT", "InPlace", "in_place_of_zeros", "moved_nuisance", "zeros_are_evident"]
