@@ -41,7 +41,7 @@ PROMISED = 0.3
 ABOVE_MESH = 0.5
 """An effect must move the markers by this much of what the mesh itself costs (beyond what calibration absorbs) …"""
 ABOVE_MESH_IF_SURE = 0.25
-"""… or by this much, if left-out sweeps speak for it by SURE standard errors and held-out data gain as much as fitted ones, a row."""
+"""… or by this much, if left-out sweeps speak for it by SURE standard errors and, the more of these the less, held-out data gain too."""
 SURE = 2.5
 """Standard errors of the gain on left-out sweeps beyond which held-out data need only not speak against an effect."""
 POLISHED = 2.0
@@ -172,10 +172,16 @@ def judged(
         fit_objection = f"sweeps that are left out do not speak for it ({better:+.1f} ± {spread:.1f})"
     if fit_objection is None and held < wanted:
         fit_objection = f"it does not predict the held-out data (χ² falls by {held:.1f}, by {gain:.1f} where fitted)"
-    if fit_objection is None and moved < (ABOVE_MESH_IF_SURE if surely and held > gain * held_share(data) else ABOVE_MESH) * mesh:
+    least = ABOVE_MESH_IF_SURE if sure_beyond_mesh(better, spread, held, gain * held_share(data)) else ABOVE_MESH
+    if fit_objection is None and moved < least * mesh:
         fit_objection = f"it moves the markers by {1e3 * moved:.3f} mm, the mesh itself by {1e3 * mesh:.3f} mm"
     record["verdict"] = fit_objection or "passes"
     return Refit(candidate, made, score, record)
+
+
+def sure_beyond_mesh(better: float, spread: float, held: float, expected: float) -> bool:
+    """Return whether left-out sweeps (gain ± spread) and held-out data (gain, against what is expected of them) are sure together."""
+    return better > SURE * spread and held * better > 2.0 * SURE * spread * expected
 
 
 def evidence(before: JointFit, after: JointFit) -> float:
@@ -404,5 +410,6 @@ __all__ = [
     "prune",
     "refit",
     "shortlist",
+    "sure_beyond_mesh",
     "with_term",
 ]

@@ -18,7 +18,6 @@ from femsense.loop.data import Data
 from femsense.loop.grow import (
     ABOVE_MESH_IF_SURE,
     EVIDENCE,
-    SURE,
     Progress,
     Refit,
     evidence,
@@ -29,6 +28,7 @@ from femsense.loop.grow import (
     polished,
     refit,
     shortlist,
+    sure_beyond_mesh,
 )
 from femsense.loop.noise import Noise
 from femsense.loop.predict import sweeps_predicted
@@ -89,7 +89,7 @@ def zeros_are_evident(data: Data, stage: Stage, noise: Noise, n_effective: float
         return None
     better, spread = sweeps_predicted(data.train, without.fit, stage.fit)
     held = held_chi2(data, without, noise) - held_chi2(data, stage, noise)
-    sure = better > SURE * spread and held > held_share(data) * evidence(without.fit, stage.fit)
+    sure = sure_beyond_mesh(better, spread, held, held_share(data) * evidence(without.fit, stage.fit))
     return without if moved_by(without, stage) > (ABOVE_MESH_IF_SURE if sure else ABOVE_MESH) * mesh_cost(data, without) else None
 
 
