@@ -22,7 +22,7 @@ from femsense.arrays import FloatArray, IntArray
 from femsense.errors import InputError, MissingDependency
 from femsense.fem.mesh import EDGES, TetMesh, element_volumes, oriented
 from femsense.files import PART_PREFIX, write_beside
-from femsense.surface import repaired
+from femsense.surface import check_finite, merged, repaired
 from femsense.tables import near
 
 SURFACE_ENDINGS = (".ply", ".stl", ".obj", ".off")
@@ -42,6 +42,8 @@ np.savez("tets.npz", nodes=nodes, tets=tets)
 """
 EDGE_FRACTION = 0.05
 """Edge length of a mesh made from a surface, over the diagonal of its bounding box."""
+FILL_SECONDS = 600.0
+"""fTetWild is given up after this time."""
 ENVELOPE = 1e-3
 """How far a mesh made from a surface may leave it, over the diagonal of its bounding box."""
 
@@ -90,19 +92,23 @@ def read_triangles(path: Path, *, where: str | None = None) -> tuple[FloatArray,
 
     where = where or str(path)
     try:
-        surface: Any = trimesh.load_mesh(str(path))
+        surface: Any = trimesh.load_mesh(str(path), process=False)  # else triangles that are not finite would leave holes
         points, triangles = np.array(surface.vertices, dtype=np.float64), np.array(surface.faces, dtype=np.int64)
     except Exception as error:
-        raise InputError("not readable as a surface", where=where, found=_reason(error), expected="triangles (ply, stl, obj, off)") from None  # fmt: skip
+        raise InputError("not readable as a surface", where=where, found=_reason(error), expected="triangles (ply, stl, obj, off)", hint="is the file whole, and what its ending says?") from None  # fmt: skip
     if not len(triangles):
         raise _no_triangles(path, where)
-    return points, triangles
+    check_finite(points, where)
+    return merged(points, triangles)
 
 
 def _no_triangles(path: Path, where: str) -> InputError:
     """Return what to say of a file without triangles: points alone are a cloud; else it is something else than its ending says."""
     with path.open("rb") as stream:
         head = stream.read(1_000_000)
+    announced, size = int.from_bytes(head[80:84], "little"), path.stat().st_size
+    if path.suffix.lower() == ".stl" and size >= 84 and not head.lstrip().startswith(b"solid") and announced:
+        return InputError("the file does not hold what it announces", where=where, found=f"{announced} triangles announced, room for {(size - 84) // 50}", expected="a whole binary STL file", hint="copy or export it again")  # fmt: skip
     declared = re.search(rb"^element vertex (\d+)", head, re.MULTILINE)
     count = int(declared[1]) if declared else len(re.findall(rb"^v\s", head, re.MULTILINE))
     if count:
@@ -118,6 +124,7 @@ def tetrahedralise(
     envelope: float = ENVELOPE,
     where: str = "surface",
     check_volume: bool = True,
+    seconds: float = FILL_SECONDS,
 ) -> TetMesh:
     """Return tetrahedra that fill a closed surface (fTetWild; another mesh each time, see `_tets_of_surface`).
 
@@ -128,11 +135,12 @@ def tetrahedralise(
         envelope: how far the mesh may leave the surface, over that diagonal [1].
         where: what a message names.
         check_volume: warn where the tetrahedra hold more or less than the surface (which may where shells cross).
+        seconds: it is given up after so long [s].
 
     Raises:
-        InputError: where nothing came out. MissingDependency: without pytetwild.
+        InputError: where nothing came out, or not in time. MissingDependency: without pytetwild.
     """
-    nodes, tets = _run_ftetwild(points, triangles, edge_fraction, envelope, where)
+    nodes, tets = _run_ftetwild(points, triangles, edge_fraction, envelope, where, seconds)
     if not len(tets):
         raise InputError("no tetrahedra came out of this surface", where=where, found=f"{len(triangles)} triangles", expected="a closed surface around a volume")  # fmt: skip
     mesh = oriented(_compact(nodes, tets))
@@ -259,8 +267,7 @@ def _check_middles(mesh: TetMesh, where: str) -> None:
 
 def closed_surface(points: FloatArray, triangles: IntArray, where: str) -> tuple[FloatArray, IntArray]:
     """Return the surface, outward, inner shells as cavities, as it is otherwise. Raises InputError where it is open or in parts."""
-    points, same = np.unique(points, axis=0, return_inverse=True)
-    triangles = same.reshape(-1)[triangles]
+    points, triangles = merged(points, triangles)
     edges = np.sort(np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
     count = np.unique(edges, axis=0, return_counts=True)[1]
     if (count != 2).any():
@@ -325,14 +332,18 @@ def _read_kept(place: Path) -> TetMesh | None:
 
 
 def _run_ftetwild(
-    points: FloatArray, triangles: IntArray, edge_fraction: float, envelope: float, where: str
+    points: FloatArray, triangles: IntArray, edge_fraction: float, envelope: float, where: str, seconds: float
 ) -> tuple[FloatArray, IntArray]:
     """Return nodes and tetrahedra from a process of its own: fTetWild writes files where it runs, and it may crash."""
     if importlib.util.find_spec("pytetwild") is None:
         raise MissingDependency("a surface becomes tetrahedra through pytetwild: pip install pytetwild")
     with tempfile.TemporaryDirectory(prefix="femsense-") as folder:
         np.savez(Path(folder) / "surface.npz", points=points, triangles=triangles.astype(np.int32), edge=edge_fraction, envelope=envelope)  # fmt: skip
-        result = subprocess.run([sys.executable, "-c", FTETWILD], cwd=folder, capture_output=True, text=True, errors="replace")
+        try:
+            result = subprocess.run([sys.executable, "-c", FTETWILD], cwd=folder, capture_output=True, text=True, errors="replace", timeout=seconds)  # fmt: skip
+        except subprocess.TimeoutExpired:
+            raise InputError("fTetWild did not come to an end", where=where, found=f"{len(triangles)} triangles, given up after {seconds:.0f} s", expected="tetrahedra",
+                             hint="femsense mesh with a larger --size or --tolerance; a surface with fewer triangles") from None  # fmt: skip
         made = Path(folder) / "tets.npz"
         if result.returncode or not made.is_file():
             last = (result.stderr.strip().splitlines() or [f"exit status {result.returncode}"])[-1]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import tempfile
+import time
 import tomllib
 import warnings
 from collections.abc import Callable
@@ -14,14 +15,14 @@ from typing import Any
 import numpy as np
 
 import femsense
-from femsense.arrays import FloatArray, IntArray
+from femsense.arrays import FloatArray, IntArray, freeze
 from femsense.errors import FemsenseError, InputError
-from femsense.fem.mesh import TetMesh, body_parts, check_mesh, element_volumes, surface_triangles
+from femsense.fem.mesh import TetMesh, check_mesh, element_volumes, hinged_parts, surface_triangles
 from femsense.files import file_hash, write_json, write_text
-from femsense.meshfile import SURFACE_ENDINGS, radius_ratio, read_cells, read_triangles, tetrahedralise, write_mesh
+from femsense.meshfile import FILL_SECONDS, SURFACE_ENDINGS, radius_ratio, read_cells, read_triangles, tetrahedralise, write_mesh
 from femsense.quality import quality_report, quality_text
 from femsense.robot import LARGEST_BODY, PER_METRE, SMALLEST_BODY, likely_unit, load_robot
-from femsense.surface import Surface, crossing_triangles, distance_to, repaired, thinned
+from femsense.surface import Surface, check_finite, crossing_triangles, distance_to, repaired, thinned
 
 MESH_FILE, REPORT_FILE = "mesh.vtu", "mesh.json"
 USUAL = (5e-3, 2.0)
@@ -31,7 +32,10 @@ ENVELOPE_OF_EDGE = 0.04
 """The mesh may leave the surface by this share of an edge, if nothing else is asked for …"""
 LARGEST_ENVELOPE = 0.01
 """… and by this share of the diagonal at most."""
+CAD_ENDINGS = (".step", ".stp", ".iges", ".igs", ".brep", ".x_t", ".x_b", ".sldprt", ".sldasm", ".ipt", ".f3d", ".fcstd", ".3dm")
 TRIES = 5
+MOST_SECONDS = 900.0
+"""All fillings together take no longer than this."""
 POOR = 0.05
 """A worst radius ratio below this has the surface filled anew (fTetWild shuffles)."""
 LOOSE = 1e-3
@@ -122,7 +126,10 @@ def read_any_surface(path: Path) -> tuple[FloatArray, IntArray]:
         raise InputError("the file is empty", where=path, found="0 bytes", expected="an STL, OBJ, PLY or OFF file")
     if path.suffix.lower() in SURFACE_ENDINGS:
         return read_triangles(path)
+    if path.suffix.lower() in CAD_ENDINGS:
+        raise InputError("a CAD file, not triangles", where=path, found=path.suffix, expected="an STL, OBJ, PLY or OFF file", hint="export it as STL from the CAD program, in mm")  # fmt: skip
     points, cells = read_cells(path, str(path))
+    check_finite(points, str(path))
     if "triangle" not in cells or any(kind.startswith("tetra") for kind in cells):
         raise InputError("not a surface", where=path, found=", ".join(sorted(cells)) or "no cells", expected="triangles", hint="a mesh of tetrahedra needs no meshing: name it in robot.toml")  # fmt: skip
     return points, cells["triangle"]
@@ -175,20 +182,24 @@ def fill(
     tell = progress or (lambda *_: None)
     tell("mending the surface")
     unit = options.unit or "m"
-    surface = repaired(points / PER_METRE[unit], triangles, where=where, close_holes=options.close_holes,
-                       fill_cavities=options.fill_cavities, part=options.part, unit="m")  # fmt: skip
+    surface = repaired(points, triangles, where=where, close_holes=options.close_holes, fill_cavities=options.fill_cavities, part=options.part, unit=unit)  # fmt: skip
+    surface = replace(surface, points=freeze(surface.points / PER_METRE[unit]))
     crossing = len(np.unique(crossing_triangles(surface.points, surface.triangles)))
     if crossing:
         note = f"{crossing} triangles cross others: what lies inside any of them was filled"
         surface = replace(surface, done=(*surface.done, note))
-    edge = _first_edge(surface, options)
+    edge, began = _first_edge(surface, options), time.monotonic()
     for attempt in range(TRIES):
+        left = MOST_SECONDS - (time.monotonic() - began)
         tell(f"filling, edges of {1e3 * edge:.2g} mm, try {attempt + 1}")
-        filled = _fill_once(surface, edge, options, where, crosses=crossing > 0)
+        filled = _fill_once(surface, edge, options, where, crosses=crossing > 0, seconds=min(left, FILL_SECONDS))
         count = len(filled.mesh.tets)
         poor = radius_ratio(filled.mesh).min() < POOR
-        if count <= options.most_tets and (not poor or attempt == TRIES - 1):
+        slow = time.monotonic() - began > 0.5 * MOST_SECONDS  # another try might not come to an end
+        if count <= options.most_tets and (not poor or slow or attempt == TRIES - 1):
             return filled
+        if slow:
+            break
         if count > options.most_tets:
             if options.size_mm is not None:
                 raise _too_many(count, options, where, f"--size {1e3 * edge * (count / options.most_tets) ** (1 / 3):.3g}, or --max-tets {count}")  # fmt: skip
@@ -207,14 +218,14 @@ def _first_edge(surface: Surface, options: MeshOptions) -> float:
     return float(np.cbrt(6.0 * np.sqrt(2.0) * surface.volume / (0.6 * options.most_tets)))
 
 
-def _fill_once(surface: Surface, edge: float, options: MeshOptions, where: str, *, crosses: bool) -> Filled:
+def _fill_once(surface: Surface, edge: float, options: MeshOptions, where: str, *, crosses: bool, seconds: float) -> Filled:
     diagonal = surface.diagonal
     given = options.tolerance_mm
     tolerance = 1e-3 * given if given is not None else min(ENVELOPE_OF_EDGE * edge, LARGEST_ENVELOPE * diagonal)
     thin, strayed = thinned(surface, tolerance=0.5 * tolerance)
     made = tetrahedralise(
         np.array(thin.points), np.array(thin.triangles), edge_fraction=edge / diagonal, envelope=(tolerance - strayed) / diagonal,
-        where=where, check_volume=not crosses,
+        where=where, check_volume=not crosses, seconds=seconds,
     )  # fmt: skip
     mesh, notes = _one_body(made, where)
     strays = _strays(mesh, surface, crosses)
@@ -232,7 +243,7 @@ def _strays(mesh: TetMesh, surface: Surface, crosses: bool) -> float:
 
 def _one_body(mesh: TetMesh, where: str) -> tuple[TetMesh, tuple[str, ...]]:
     """Return the mesh without loose crumbs. Raises InputError where larger parts hang loose."""
-    parts = body_parts(mesh)[mesh.tets[:, 0]]
+    parts = hinged_parts(mesh)
     volume = np.bincount(parts, element_volumes(mesh))
     if len(volume) == 1:
         check_mesh(mesh, where)
@@ -240,7 +251,7 @@ def _one_body(mesh: TetMesh, where: str) -> tuple[TetMesh, tuple[str, ...]]:
     main = int(volume.argmax())
     loose = 1.0 - volume[main] / volume.sum()
     if loose > LOOSE:
-        raise InputError("the tetrahedra fall into separate parts", where=where, found=f"{len(volume)} parts; all but the largest hold {100 * loose:.3g} % of the volume", expected="one connected body", hint="a larger --max-tets or a smaller --size keeps thin bridges")  # fmt: skip
+        raise InputError("the tetrahedra fall into parts that no face joins", where=where, found=f"{len(volume)} parts; all but the largest hold {100 * loose:.3g} % of the volume", expected="one connected body (an edge or a corner alone is a hinge)", hint="a larger --max-tets or a smaller --size keeps thin bridges; bodies that only touch: let them overlap in the CAD program")  # fmt: skip
     nodes, tets = np.unique(mesh.tets[parts == main], return_inverse=True)
     kept = TetMesh(mesh.nodes[nodes], tets.reshape(-1, mesh.tets.shape[1]))
     check_mesh(kept, where)

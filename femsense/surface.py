@@ -7,6 +7,7 @@ the filling takes what lies inside any of them.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -108,11 +109,8 @@ def repaired(
 
 def _tidied(points: FloatArray, triangles: IntArray, where: str, done: list[str]) -> tuple[FloatArray, IntArray]:
     """Weld points, drop triangles that repeat a point or another triangle."""
-    if not np.isfinite(points).all():
-        bad = int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])
-        raise InputError("a point of the surface is not finite", where=where, found=f"point {bad}: {points[bad].tolist()}", expected="finite coordinates")  # fmt: skip
-    points, same = np.unique(points, axis=0, return_inverse=True)
-    triangles = same.reshape(-1)[triangles]
+    check_finite(points, where)
+    points, triangles = merged(points, triangles)
     diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
     if len(_open_edges(triangles)):
         welded = _weld(points, triangles, WELD * diagonal)
@@ -130,6 +128,22 @@ def _tidied(points: FloatArray, triangles: IntArray, where: str, done: list[str]
     if len(triangles) < 4 or np.ptp(points, axis=0).min() <= 1e-9 * diagonal:
         raise InputError("the surface encloses nothing", where=where, found=f"{len(triangles)} triangles, extents {np.ptp(points, axis=0).tolist()}", expected="a closed surface around a volume")  # fmt: skip
     return points, triangles
+
+
+def merged(points: FloatArray, triangles: IntArray) -> tuple[FloatArray, IntArray]:
+    """Return points and triangles with equal points made one, in order of their coordinates."""
+    order = np.lexsort(points.T[::-1])
+    first = np.append(True, (np.diff(points[order], axis=0) != 0).any(axis=1))
+    numbers = np.empty(len(points), dtype=np.int64)
+    numbers[order] = np.cumsum(first) - 1
+    return points[order][first], numbers[triangles]
+
+
+def check_finite(points: FloatArray, where: str) -> None:
+    """Refuse points that are not finite. Raises InputError."""
+    bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
+    if len(bad):
+        raise InputError("a point of the surface is not finite", where=where, found=f"{len(bad)} points, the first is number {bad[0]}: {points[bad[0]].tolist()}", expected="finite coordinates", hint="export the surface again")  # fmt: skip
 
 
 def _weld(points: FloatArray, triangles: IntArray, distance: float) -> IntArray:
@@ -198,7 +212,10 @@ def _neighbours(triangles: IntArray) -> tuple[IntArray, IntArray, BoolArray]:
 
 def _closed(points: FloatArray, triangles: IntArray, where: str, everything: bool, unit: str, done: list[str]) -> tuple[FloatArray, IntArray]:  # fmt: skip
     """Close small holes, or all of them, by fans around their middles."""
-    holes = _holes(triangles)
+    holes, loose = _holes(triangles)
+    if len(loose):
+        triangles = _without_sheets(points, triangles, loose, where, done)
+        holes, _ = _holes(triangles)
     if not holes:
         return points, triangles
     length = [float(np.linalg.norm(points[hole] - points[np.roll(hole, 1)], axis=1).sum()) for hole in holes]
@@ -206,9 +223,9 @@ def _closed(points: FloatArray, triangles: IntArray, where: str, everything: boo
     large = [(size, hole) for size, hole in zip(length, holes) if size > limit]
     if large:
         size, hole = max(large, key=lambda item: item[0])
-        middle = ", ".join(f"{value:.4g}" for value in points[hole].mean(axis=0))
+        found = f"{len(large)} large hole{'s' * (len(large) > 1)} of {len(holes)}; the largest has a border of {size:.4g} {unit} around {_place(points, points[hole].mean(axis=0))}"
         raise InputError(
-            "the surface is open", where=where, found=f"{len(large)} large holes of {len(holes)}; the largest has a border of {size:.4g} {unit} around [{middle}]",
+            "the surface is open", where=where, found=found,
             expected="a closed surface", hint="--close-holes closes them by flat caps; or mend the surface where it was made",
         )  # fmt: skip
     new_points, new_triangles = [points], [triangles]
@@ -224,12 +241,37 @@ def _closed(points: FloatArray, triangles: IntArray, where: str, everything: boo
     return np.vstack(new_points), np.vstack(new_triangles)
 
 
-def _holes(triangles: IntArray) -> list[IntArray]:
-    """Return the borders of the holes, each as its points in the order in which a closing triangle goes round."""
+def _place(points: FloatArray, place: FloatArray) -> str:
+    """Return a place in words, to a millionth of the size of the surface."""
+    step = 1e-6 * float(np.ptp(points, axis=0).max())
+    return "[" + ", ".join(f"{round(value / step) * step + 0.0:.4g}" for value in place.tolist()) + "]"
+
+
+def _without_sheets(points: FloatArray, triangles: IntArray, loose: IntArray, where: str, done: list[str]) -> IntArray:
+    """Leave out sheets that hang on the rest: open edges that do not come round bound them. Raises InputError where that is the most."""
+    edges, labels = np.sort(_directed_edges(triangles), axis=1), _pieces(triangles)
+    bounds = (edges[:, None] == np.sort(loose, axis=1)[None]).all(axis=2).any(axis=1)
+    hangs = np.isin(labels, labels[np.flatnonzero(bounds) // 3])
+    area = np.linalg.norm(_area_vectors(points, triangles), axis=1)
+    if area[hangs].sum() > 0.5 * area.sum():
+        raise InputError("the surface is open", where=where, found=f"{len(loose)} edges of one triangle that go round no hole, the first at {_place(points, points[loose[0]].mean(axis=0))}", expected="a closed surface", hint="mend it in a mesh editor")  # fmt: skip
+    done.append(f"{len(np.unique(labels[hangs]))} sheets of {int(hangs.sum())} triangles that hang on the body were left out")
+    return triangles[~hangs]
+
+
+def _pieces(triangles: IntArray) -> IntArray:
+    """Return the number of the piece that each triangle belongs to, joined by sides of two triangles, shape (t,)."""
+    first, second, _ = _neighbours(triangles)
+    graph = sp.coo_matrix((np.ones(len(first)), (first, second)), shape=(len(triangles),) * 2)
+    return np.asarray(sp.csgraph.connected_components(graph, directed=False)[1], dtype=np.int64)
+
+
+def _holes(triangles: IntArray) -> tuple[list[IntArray], IntArray]:
+    """Return the borders of the holes, each as its points in the order in which a closing triangle goes round, and open edges of none."""
     after: dict[int, list[int]] = {}
     for a, b in _open_edges(triangles).tolist():
         after.setdefault(b, []).append(a)
-    holes = []
+    holes, loose = [], []
     while after:
         start = next(iter(after))
         border = [start]
@@ -242,19 +284,17 @@ def _holes(triangles: IntArray) -> list[IntArray]:
                 break
         if len(border) > 3 and border[-1] == start:
             holes.append(np.array(border[:-1]))
-    return holes
+        else:
+            loose += list(itertools.pairwise(border))
+    return holes, np.array(loose, dtype=np.int64).reshape(-1, 2)
 
 
 # Shells
 
 
 def _find_shells(points: FloatArray, triangles: IntArray) -> _Shells:
-    first, second, _ = _neighbours(triangles)
-    t = len(triangles)
-    graph = sp.coo_matrix((np.ones(len(first)), (first, second)), shape=(t, t))
-    count, labels = sp.csgraph.connected_components(graph, directed=False)
-    of: IntArray = labels.astype(np.int64)
-    volume = _shell_volumes(points, triangles, of)
+    of = _pieces(triangles)
+    volume, count = _shell_volumes(points, triangles, of), int(of.max()) + 1
     if count == 1:
         return _Shells(of, volume, np.zeros(1, dtype=np.int64), np.zeros(1, dtype=np.int64))
     inside, meets = np.zeros((count, count), dtype=bool), _meeting(points, triangles, of, count)
@@ -352,9 +392,7 @@ def _bodies_text(points: FloatArray, triangles: IntArray, shells: _Shells, unit:
     for body in range(min(int(shells.body.max()) + 1, 6)):
         own = points[triangles[(shells.body == body)[shells.of]]].reshape(-1, 3)
         size, middle = np.ptp(own, axis=0), (own.min(axis=0) + own.max(axis=0)) / 2.0
-        parts.append(
-            f"{body + 1}: {' × '.join(f'{v:.3g}' for v in size)} {unit} around [{', '.join(f'{v:.3g}' for v in middle)}]"
-        )
+        parts.append(f"{body + 1}: {' × '.join(f'{v:.3g}' for v in size)} {unit} around {_place(points, middle)}")
     more = int(shells.body.max()) + 1 - len(parts)
     return "; ".join(parts) + (f"; and {more} more" if more > 0 else "")
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import pytest
 from analytic import monomials, random_rotation
@@ -20,6 +22,7 @@ from femsense.fem.mesh import (
     closest_in_triangle,
     element_volumes,
     embed_points,
+    hinged_parts,
     oriented,
     refined,
     shape_slopes,
@@ -133,6 +136,20 @@ def test_parts_are_the_connected_pieces() -> None:
     both = TetMesh(np.vstack([a.nodes, b.nodes]), np.vstack([a.tets, b.tets + len(a.nodes)]))
     parts = body_parts(both)
     assert (parts == np.repeat([0, 1], len(a.nodes))).all() or (parts == np.repeat([1, 0], len(a.nodes))).all()
+
+
+@pytest.mark.parametrize(("at", "parts"), [((1.0, 0.0, 0.0), 1), ((1.0, 1.0, 0.0), 2), ((1.0, 1.0, 1.0), 2)])
+def test_parts_that_share_an_edge_or_a_corner_swing(at: tuple[float, float, float], parts: int) -> None:
+    a, b = block_mesh((2, 2, 2), (1, 1, 1)), block_mesh((2, 2, 2), (1, 1, 1), start=at)
+    nodes, same = np.unique(np.vstack([a.nodes, b.nodes]), axis=0, return_inverse=True)
+    both = TetMesh(nodes, same.reshape(-1)[np.vstack([a.tets, b.tets + len(a.nodes)])])
+    assert body_parts(both).max() == 0
+    for mesh in (both, to_quadratic(both)):
+        assert len(np.unique(hinged_parts(mesh))) == parts
+    with warnings.catch_warnings(record=True) as noted:
+        warnings.simplefilter("always")
+        check_mesh(both, "boxes")
+    assert [str(note.message) for note in noted] == ["boxes: 2 parts of [48, 48] tetrahedra hang together by an edge or a corner alone and swing about it"] * (parts - 1)  # fmt: skip
 
 
 @pytest.mark.parametrize(

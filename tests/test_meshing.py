@@ -13,7 +13,7 @@ import pytest
 import trimesh
 from helpers import block_mesh, write_block_robot
 
-from femsense import cli, meshing
+from femsense import cli, meshfile, meshing
 from femsense.errors import InputError
 from femsense.fem.equilibrium import solve_equilibrium
 from femsense.fem.mesh import TetMesh, element_volumes, surface_triangles, to_linear
@@ -21,6 +21,14 @@ from femsense.meshing import MeshOptions, fill, mesh_into, starter_text
 from femsense.robot import load_robot
 
 MM = MeshOptions(unit="mm", most_tets=1200)
+BOX = trimesh.creation.box((100, 30, 30))
+
+
+def stl_bytes(corners: np.ndarray) -> bytes:
+    """Return a binary STL file of triangles, shape (t, 3, 3)."""
+    record = np.zeros(len(corners), dtype=[("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("rest", "<u2")])
+    record["corners"] = corners
+    return bytes(80) + len(corners).to_bytes(4, "little") + record.tobytes()
 
 
 def write_box(path: Path, extents: tuple[float, float, float] = (100, 30, 30)) -> Path:
@@ -224,8 +232,25 @@ def test_crumbs_are_left_out_and_parts_are_refused(monkeypatch: pytest.MonkeyPat
             filled = fill(np.array(box.vertices), np.array(box.faces), MM)
             assert len(filled.mesh.tets) == len(body.tets) and filled.done == ("1 loose crumbs were left out",)
             continue
-        with pytest.raises(InputError, match="fall into separate parts"):
+        with pytest.raises(InputError, match="fall into parts that no face joins"):
             fill(np.array(box.vertices), np.array(box.faces), MM)
+
+
+def test_bodies_that_touch_along_an_edge_are_no_body(monkeypatch: pytest.MonkeyPatch) -> None:
+    one, other = (block_mesh((2, 2, 2), (0.03,) * 3, start=(x, x, 0.0)) for x in (0.0, 0.03))
+    points, same = np.unique(np.vstack([one.nodes, other.nodes]), axis=0, return_inverse=True)
+    both = TetMesh(points, same.reshape(-1)[np.vstack([one.tets, other.tets + len(one.nodes)])])
+    monkeypatch.setattr(meshing, "tetrahedralise", lambda *_, **__: both)
+    boxes = trimesh.util.concatenate([trimesh.creation.box((30, 30, 30), trimesh.transformations.translation_matrix((x, x, 0))) for x in (15, 45)])  # fmt: skip
+    with pytest.raises(InputError, match="no face joins") as error:
+        fill(np.array(boxes.vertices), np.array(boxes.faces), MM)
+    assert "let them overlap" in str(error.value)
+
+
+def test_what_takes_too_long_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(meshfile, "FTETWILD", "import time; time.sleep(60)")
+    with pytest.raises(InputError, match="did not come to an end"):
+        meshfile.tetrahedralise(np.array(BOX.vertices), np.array(BOX.faces), seconds=0.2)
 
 
 # What is refused
@@ -240,7 +265,10 @@ def test_crumbs_are_left_out_and_parts_are_refused(monkeypatch: pytest.MonkeyPat
         ("words.obj", b"these are words\n", "no points either"),
         ("cloud.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n", "a cloud of 3 points"),
         ("cloud.ply", b"ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\nend_header\n0 0 0\n1 0 0\n", "a cloud of 2 points"),
-        ("noise.stl", bytes(range(256)) * 10, "the surface has no triangles"),
+        ("noise.stl", bytes(range(256)) * 10, "the file does not hold what it announces"),
+        ("cut.stl", stl_bytes(BOX.triangles)[:300], "12 triangles announced, room for 4"),
+        ("nan.stl", stl_bytes(np.where(np.arange(108).reshape(12, 3, 3) == 40, np.nan, BOX.triangles)), "1 points, the first is number 13: [50"),
+        ("part.step", b"ISO-10303-21;", "a CAD file, not triangles"),
         ("other.xyz", b"1 2 3\n", "not readable as a mesh"),
     ],
 )  # fmt: skip

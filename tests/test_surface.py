@@ -69,6 +69,20 @@ def test_small_holes_are_closed_and_said() -> None:
     assert surface.done[0].startswith("2 holes were closed; the longest border is 7.6")
 
 
+def test_a_sheet_that_hangs_on_the_body_is_left_out() -> None:
+    """A fin along an edge: two triangles whose open sides do not come round."""
+    points, faces = np.array(BOX.vertices), np.array(BOX.faces)
+    a, b = np.flatnonzero((points[:, 1] > 0) & (points[:, 2] > 0))
+    fin = np.vstack([points, points[[a, b]] + [0, 0, 30]])
+    surface = repaired(fin, np.vstack([faces, [[a, b, 9], [a, 9, 8]]]))
+    assert surface.volume == pytest.approx(9e4) and surface.done == (
+        "1 sheets of 2 triangles that hang on the body were left out",
+    )
+    fin[8:] += [0, 0, 200]
+    with pytest.raises(InputError, match="3 edges of one triangle that go round no hole"):
+        repaired(fin, np.vstack([faces, [[a, b, 9], [a, 9, 8]]]))
+
+
 def test_an_open_tube_is_refused_until_it_may_be_closed() -> None:
     with pytest.raises(InputError, match="the surface is open") as error:
         repaired(*open_tube(), unit="mm")
