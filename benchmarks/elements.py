@@ -23,7 +23,7 @@ from femsense.fem.assembly import internal, reduced_matrix, reduced_values
 from femsense.fem.body import BodyModel, make_body
 from femsense.fem.equilibrium import solve_equilibrium
 from femsense.fem.linear import factorize
-from femsense.fem.mesh import EDGES, TetMesh, oriented, refined, surface_triangles, to_quadratic
+from femsense.fem.mesh import EDGES, TetMesh, oriented, refined, shape_values, surface_triangles, to_quadratic
 from femsense.fem.stencil import QUADRATURE
 from femsense.rig.script import TruthTable
 from femsense.rig.truth import true_robot
@@ -171,8 +171,29 @@ def block_cases(level: float, quadratic: bool, nu: float) -> list[Case]:
     return [*bars, Case("squeeze", squeezed, np.zeros_like(pad.nodes), pushed)]
 
 
-def diamond_case(folder: Path, refinements: int, quadratic: bool, nu: float) -> Case:
-    """Return the diamond under its own weight; its response is the work of the weight (twice the energy)."""
+def body_load(mesh: TetMesh, field: Callable[[FloatArray], FloatArray]) -> FloatArray:
+    """Return nodal forces [N], shape (n, 3), of a field of force [N/m³] that takes and gives (p, 3)."""
+    corners = mesh.nodes[mesh.tets[:, :4]]
+    places = np.einsum("qa,mac->mqc", QUADRATURE, corners)
+    values = (
+        field(places.reshape(-1, 3)).reshape(places.shape) * np.linalg.det(corners[:, 1:] - corners[:, :1])[:, None, None] / 24.0
+    )
+    forces = np.zeros_like(mesh.nodes)
+    np.add.at(forces, mesh.tets, np.einsum("qa,mqc->mac", shape_values(QUADRATURE, quadratic=mesh.is_quadratic), values))
+    return forces
+
+
+DIAMOND = {
+    "sag": lambda x: np.tile([0.0, 0.0, -1.0], (len(x), 1)),
+    "bending": lambda x: np.tile([1.0, 0.0, 0.0], (len(x), 1)),
+    "torsion": lambda x: np.cross([0.0, 0.0, 1.0], x),
+    "squeeze": lambda x: x * [-1.0, -1.0, 0.0],
+}
+"""Fields of force on the diamond: down, sideways, about its axis, towards its axis."""
+
+
+def diamond_body(folder: Path, refinements: int, quadratic: bool, nu: float) -> BodyModel:
+    """Return the diamond with its base held."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         mesh = load_robot(folder).body.mesh
@@ -181,8 +202,13 @@ def diamond_case(folder: Path, refinements: int, quadratic: bool, nu: float) -> 
     mesh = to_quadratic(mesh) if quadratic else mesh
     box = np.array([[-0.015, -0.015, -0.04], [0.015, 0.015, 0.01]])
     held = ((mesh.nodes >= box[0] - 1e-9) & (mesh.nodes <= box[1] + 1e-9)).all(axis=1)
-    body = make_body(mesh, young_modulus=450e3, poisson_ratio=nu, density=1070.0, gravity=[0, 0, -9.81], clamped=held)
-    return Case("diamond", body, body.weight(), np.zeros_like(mesh.nodes))
+    return make_body(mesh, young_modulus=450e3, poisson_ratio=nu, density=1070.0, gravity=[0, 0, -9.81], clamped=held)
+
+
+def diamond_cases(folder: Path, refinements: int, quadratic: bool, nu: float) -> list[Case]:
+    """Return the diamond under its own weight, the weight sideways, and fields that turn and squeeze it."""
+    body = diamond_body(folder, refinements, quadratic, nu)
+    return [Case(name, body, body_load(body.mesh, field), np.zeros_like(body.mesh.nodes)) for name, field in DIAMOND.items()]
 
 
 def converged(f: float, p: float, F: float, P: float) -> float:
@@ -300,7 +326,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("diamond", nargs="?", type=Path, default=SHARED)
     parser.add_argument("--fine", type=int, default=1)
-    parser.add_argument("--only", choices=("errors", "pad", "large", "times"))
+    parser.add_argument("--only", choices=("errors", "diamond", "pad", "large", "times"))
     arguments = parser.parse_args()
     folder: Path = arguments.diamond
     if arguments.only in (None, "errors"):
@@ -311,12 +337,12 @@ def main() -> None:
             lambda k, q, nu: block_cases(1.0, q, nu),
             lambda k, q, nu: block_cases(2.0 * 2**k * arguments.fine, q, nu),
         )
-        if folder.exists():
-            table(
-                "Diamond, own weight",
-                lambda k, q, nu: [diamond_case(folder, 0, q, nu)],
-                lambda k, q, nu: [diamond_case(folder, k + arguments.fine - 1, q, nu)],
-            )
+    if arguments.only in (None, "errors", "diamond") and folder.exists():
+        table(
+            "Diamond, fields of force",
+            lambda k, q, nu: diamond_cases(folder, 0, q, nu),
+            lambda k, q, nu: diamond_cases(folder, k + arguments.fine - 1, q, nu),
+        )
     if arguments.only in (None, "pad"):
         pads()
     if arguments.only in (None, "large"):
@@ -327,11 +353,7 @@ def main() -> None:
         )
         for quadratic in (False, True):
             for law in ("corotational", "neo_hookean"):
-                body = (
-                    diamond_case(folder, 0, quadratic, 0.45).body
-                    if folder.exists()
-                    else block_cases(3.0, quadratic, 0.45)[0].body
-                )
+                body = diamond_body(folder, 0, quadratic, 0.45) if folder.exists() else block_cases(3.0, quadratic, 0.45)[0].body
                 chosen = (
                     body
                     if law == "corotational"

@@ -98,6 +98,9 @@ def inspect(
     from femsense.inspection import describe, inspect_accuracy, inspect_path
 
     if accuracy:
+        from femsense.accuracy import promise
+
+        _say(promise())
         with _progress("accuracy") as progress:
             report = inspect_accuracy(path, progress=progress)
     else:

@@ -69,7 +69,10 @@ def test_linear_elements_are_far_worse_and_a_finer_mesh_is_better(reports: Any) 
         assert unknowns == sorted(unknowns) and all(s["step_ms"] > 0 for s in report["spaces"])
     worst = [abs(report["forces"]["worst_percent"]) for _, report in reports.values()]
     assert worst[0] > 3 * worst[1] and min(reports["tet4"][1]["forces"]["error_percent"]) > 0  # too stiff: forces too large
-    assert 'element = "tet10"' in reports["tet4"][1]["advice"] and "a mesh of about 144" in reports["tet10"][1]["advice"]
+    assert (
+        'element = "tet10"' in reports["tet4"][1]["advice"]
+        and "a mesh of about 140 tetrahedra (femsense mesh --max-tets 140)" in reports["tet10"][1]["advice"]
+    )
 
 
 def test_a_model_that_moves_half_as_far_senses_twice_the_force() -> None:
@@ -87,7 +90,7 @@ def test_a_model_that_moves_half_as_far_senses_twice_the_force() -> None:
 
 def test_contact_forces_are_one_newton_into_the_body_on_every_mesh(tmp_path: Path) -> None:
     robot = block(tmp_path, cells=(4, 2, 2))
-    patches = accuracy._patches(robot, finer_mesh(robot.body.mesh, "tet10", 1))
+    patches = accuracy._patches(robot, finer_mesh(robot.body.mesh, "tet10", 1), robot.features[:6])
     total = patches.forces.sum(axis=1)
     np.testing.assert_allclose(np.linalg.norm(total, axis=1), 1.0)
     inward = robot.body.mesh.nodes.mean(axis=0) - robot.body.mesh.nodes[robot.features[: len(total)]]
@@ -98,6 +101,22 @@ def test_contact_forces_are_one_newton_into_the_body_on_every_mesh(tmp_path: Pat
         assert carried.outside.max() < 1e-9
         nodal = carried.spread(patches.forces[0], len(mesh.nodes))
         np.testing.assert_allclose(np.cross(mesh.nodes, nodal).sum(axis=0), np.cross(patches.places, patches.forces[0]).sum(axis=0), atol=1e-12)  # fmt: skip
+
+
+def test_contact_forces_are_tried_where_they_are_felt(tmp_path: Path) -> None:
+    robot = block(tmp_path, cells=(8, 2, 2))
+    chosen = accuracy._felt(robot, solve_equilibrium(robot.body), accuracy._observed(robot))
+    x = robot.body.mesh.nodes[:, 0]
+    assert len(chosen) == 6 and x[robot.features].min() < 0.01 and x[chosen].min() > 0.02  # nothing is felt next to the clamp
+    assert list(chosen) == [node for node in robot.features if node in chosen]
+
+
+def test_a_robot_without_loads_is_judged_by_forces(tmp_path: Path) -> None:
+    report = assess_accuracy(block(tmp_path, "tet4", cables=None, gravity=None))
+    assert report["loads"] == [] and all(space["motion_percent"] is None for space in report["spaces"])
+    assert report["spaces"][0]["force_percent"] > 100 and report["advice"].startswith('better: element = "tet10"')
+    text = accuracy_text(report)
+    assert "none: the robot has neither weight nor cables nor chambers" in text and "mm/N" in text
 
 
 def test_what_is_too_large_is_left_out_and_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -132,7 +151,10 @@ def test_the_advice_takes_the_cheapest_that_serves(reports: Any, monkeypatch: py
     worst = {(s["element"], s["refinements"]): max(s["motion_percent"], s["force_percent"]) / 100 for s in report["spaces"]}
     for limit, text in (
         (worst["tet10", 0], 'element = "tet10": '),
-        (worst["tet10", 1], 'element = "tet10" and a mesh of about 144'),
+        (
+            worst["tet10", 1],
+            'element = "tet10" and a mesh of about 160 tetrahedra (femsense mesh --max-tets 160): about 1400 unknowns',
+        ),  # 18 · 8 · 1.1
         (10.0, "fine enough"),
     ):
         spaces = [dict(space) for space in report["spaces"]]

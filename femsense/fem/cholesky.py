@@ -294,10 +294,22 @@ def fill_reducing_order(rows: IntArray, columns: IntArray, free: BoolArray) -> I
     n = len(free)
     upper = sp.csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(n, n))
     nodes = np.flatnonzero(free)
-    part = (upper + upper.T)[nodes][:, nodes]
-    dominant = (part + sp.diags_array(np.asarray(part.sum(axis=1)).ravel() + 1.0)).tocsc()
+    return nodes[minimum_degree((upper + upper.T)[nodes][:, nodes])]
+
+
+def minimum_degree(graph: sp.csr_matrix) -> IntArray:
+    """Return the nodes of a symmetric graph by multiple minimum degree, shape (n,)."""
+    dominant = (graph + sp.diags_array(np.asarray(graph.sum(axis=1)).ravel() + 1.0)).tocsc()
     lu = splu(dominant, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    return nodes[np.argsort(lu.perm_c)]
+    return np.asarray(np.argsort(lu.perm_c))
+
+
+def elimination_work(graph: sp.csr_matrix, order: IntArray) -> float:
+    """Return the multiplications of a factor of some nodes of a symmetric graph in an order: Σ (entries of a column)²."""
+    part = graph[order][:, order].tocsc()
+    indptr, indices = part.indptr.astype(np.int64), part.indices.astype(np.int64)
+    start, _ = _structures(indptr, indices, _elimination_tree(indptr, indices))
+    return float((np.diff(start + np.arange(len(start))).astype(np.float64) ** 2).sum())
 
 
 @dataclass(frozen=True, eq=False, slots=True)
