@@ -63,10 +63,7 @@ SABOTAGES = (
     S("fem/mesh.py", "t = np.clip(np.einsum(", "t = np.abs(np.einsum(", "test_fem_mesh.py::test_closest_in_a_triangle_beats_every_sample_and_is_in_it"),
     # factorisation
     S("fem/mesh.py", "same = np.flatnonzero(keys[order][1:] == keys[order][:-1])", "same = np.flatnonzero(keys[order][1:] >= keys[order][:-1])", "test_fem_mesh.py::test_parts_that_share_an_edge_or_a_corner_swing"),
-    S("fem/dissection.py", "np.concatenate([low[~reached_low], high[reached_high]])", "np.concatenate([low[reached_low], high[~reached_high]])", "test_fem_dissection.py::test_a_separator_is_a_smallest_cover"),
-    S("fem/dissection.py", "return other if elimination_work(graph, other) < work else order", "return other", "test_fem_dissection.py::test_a_solid_is_dissected_and_a_thin_bar_is_not"),
-    S("fem/dissection.py", "return np.concatenate([*parts, between])", "return np.concatenate([between, *parts])", "test_fem_dissection.py::test_a_solid_is_dissected_and_a_thin_bar_is_not"),
-    S("fem/cholesky.py", "start + np.arange(len(start))", "start", "test_fem_dissection.py::test_work_is_that_of_a_dense_factor"),
+    S("fem/cholesky.py", "start + np.arange(len(start))", "start", "test_fem_order.py::test_the_work_of_an_order_is_that_of_a_dense_factor"),
     S("fem/cholesky.py", "+ i] -= scale * corner[i * WIDE + j]", "+ i] += scale * corner[i * WIDE + j]", "test_fem_linear.py::test_a_random_pattern_is_factorised_as_the_dense_matrix"),
     S("fem/cholesky.py", "X[to + a, seen[r]] -= work[line + r]", "X[to + a, seen[r]] += work[line + r]", "test_fem_linear.py::test_the_gram_matrix_of_sparse_columns_is_that_of_dense_ones"),
     S("fem/cholesky.py", "weakref.finalize(self, analysis.idle.append, L)", "analysis.idle.append(L)", "test_fem_linear.py::test_factors_alive_at_once_keep_their_own_values"),

@@ -18,6 +18,10 @@ STILL = 1e-2
 """A step that changes the whitened residual by less than this is none."""
 
 
+DAMPING = 1e-2
+"""First damping of a step to where nothing can be evaluated, in units of the largest response."""
+
+
 @dataclass(frozen=True, eq=False, slots=True)
 class FitResult:
     """A least-squares estimate."""
@@ -60,7 +64,7 @@ def gauss_newton(
         low, high: bounds, shape (p,).
         max_iterations: Gauss–Newton steps.
         tolerance: relative decrease at which it stops.
-        still: length of a step in whitened residual at which it stops.
+        still: length of a step in whitened residual at which it stops, in units of the misfit where that is more than noise.
         known: residual and Jacobian at the start, where they are known.
         borrowed: a Jacobian from near the start to begin with.
         serves: a Jacobian serves for another step where it missed the change of the residual by less than this share of it.
@@ -82,7 +86,8 @@ def gauss_newton(
         step = _bounded_step(jacobian, residual, scale, damping, low - theta, high - theta)
         change = jacobian @ step
         predicted = costs[-1] - float(np.sum((residual + change) ** 2))
-        small = predicted <= tolerance * costs[-1] or np.linalg.norm(change) <= still
+        error = max(1.0, costs[-1] / max(len(residual), 1)) ** 0.5  # what a standard error is worth where the model misfits
+        small = predicted <= tolerance * costs[-1] or np.linalg.norm(change) <= still * error
         if not own and (small or steps >= max_iterations):
             residual, jacobian, own = *_both(evaluate, theta), True
             continue
@@ -99,7 +104,7 @@ def gauss_newton(
             if not own:
                 residual, jacobian, own = *_both(evaluate, theta), True
                 continue
-            damping = max(10.0 * damping, 1e-4)
+            damping = max(10.0 * damping, 1e-4 if np.isfinite(cost) else DAMPING)
             if damping > 1e8:
                 status = "converged"
                 break

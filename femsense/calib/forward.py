@@ -215,15 +215,20 @@ class SceneJet:
     """d residual / d coordinate of the hypothesis, shape (k, 3, p)."""
     states: dict[int, Equilibrium]
     """The equilibrium of each frame."""
+    by_other: FloatArray | None = None
+    """Change of the residual where another robot takes the place of this one, to first order [m], shape (k, 3, o)."""
 
 
 def evaluate_scene(
     hypothesis: Hypothesis, scene: Scene, coordinates: FloatArray, poses: Sequence[FloatArray], initial: FloatArray | None,
-    *, derivative: bool, vary_initial: bool, pivot: FloatArray, starts: dict[int, Equilibrium] | None = None,
+    *, derivative: bool, vary_initial: bool, pivot: FloatArray, starts: dict[int, Equilibrium] | None = None, patient: bool = True,
+    others: Sequence[Robot] = (),
 ) -> SceneJet:  # fmt: skip
-    """Evaluate marker residuals of a scene at a point of parameter space, and their derivatives by differences.
+    """Evaluate marker residuals of a scene at a point of parameter space, their derivatives by differences, and what other robots
+    would change.
 
-    `starts` holds states of earlier evaluations near by and is brought up to date.
+    `starts` holds states of earlier evaluations near by and is brought up to date; if not `patient`, a frame that Newton does not reach
+    from there has no equilibrium.
 
     Raises:
         DataError: a frame has no equilibrium.
@@ -234,6 +239,8 @@ def evaluate_scene(
     if not vary_initial:
         keep = len(hypothesis.parameters)
         steps, variants = steps[:keep], variants[:keep]
+    steps = [*steps, *(1.0 for _ in others)]
+    variants = [*variants, *(Walk(r, drive_of(r, scene.recording, initial=initial)) for r in others)]
     places = {id(r): _ties(r, scene, poses) for r in (robot, *(v.robot for v in variants))}
 
     def observe(r: Robot, state: Equilibrium) -> FloatArray:
@@ -242,13 +249,14 @@ def evaluate_scene(
     states: dict[int, Equilibrium] = {}
     model: dict[int, FloatArray] = {}
     shifted: list[dict[int, FloatArray]] = [{} for _ in variants]
-    for k, state, seen, others in walk_along(base, scene.frames.tolist(), observe, variants, starts=starts):
+    for k, state, seen, varied in walk_along(base, scene.frames.tolist(), observe, variants, starts=starts, patient=patient):
         states[k], model[k] = state, seen
         for i in range(len(variants)):
-            shifted[i][k] = others[i]
+            shifted[i][k] = varied[i]
     residual = marker_residual(robot, scene, poses, model)
     columns = [(marker_residual(v.robot, scene, poses, m) - residual) / h for v, m, h in zip(variants, shifted, steps)]
     split = len(hypothesis.parameters) if derivative else 0
+    last = len(columns) - len(others)
     by_pose, rest_by_pose = (
         _pose_derivative(robot, scene, poses, states, residual, pivot)
         if derivative
@@ -256,7 +264,8 @@ def evaluate_scene(
     )
     rest = rest_residual(robot, scene, poses)
     rest_columns = [(rest_residual(v.robot, scene, poses) - rest) / h for v, h in zip(variants[:split], steps)]
-    return SceneJet(residual, rest, by_pose, rest_by_pose, _stack(rest_columns, rest), _stack(columns[split:], residual), _stack(columns[:split], residual), states)  # fmt: skip
+    return SceneJet(residual, rest, by_pose, rest_by_pose, _stack(rest_columns, rest), _stack(columns[split:last], residual), _stack(columns[:split], residual),
+                    states, _stack(columns[last:], residual))  # fmt: skip
 
 
 def _stack(columns: list[FloatArray], residual: FloatArray) -> FloatArray:

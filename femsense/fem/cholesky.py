@@ -289,12 +289,20 @@ def _rooms(parent: IntArray, begin: IntArray, unit: int) -> tuple[IntArray, int]
     return room, most
 
 
+WORTH_CUTTING = 500
+"""Nodes; below, either order takes a millisecond."""
+
+
 def fill_reducing_order(rows: IntArray, columns: IntArray, free: BoolArray) -> IntArray:
-    """Return the free nodes in an order of little fill (multiple minimum degree, by SuperLU) for the couplings rows–columns."""
+    """Return the free nodes in an order of little fill for the couplings rows–columns: of multiple minimum degree (by SuperLU) and
+    nested dissection (by METIS, where it is installed) the one that makes less work. Thick bodies are better cut than peeled."""
     n = len(free)
     upper = sp.csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(n, n))
     nodes = np.flatnonzero(free)
-    return nodes[minimum_degree((upper + upper.T)[nodes][:, nodes])]
+    graph = sp.csr_matrix((upper + upper.T)[nodes][:, nodes])
+    orders = [minimum_degree(graph), *_nested_dissection(graph)]
+    best = min(orders, key=lambda order: elimination_work(graph, order)) if len(orders) > 1 else orders[0]
+    return np.asarray(nodes[best])
 
 
 def minimum_degree(graph: sp.csr_matrix) -> IntArray:
@@ -304,9 +312,23 @@ def minimum_degree(graph: sp.csr_matrix) -> IntArray:
     return np.asarray(np.argsort(lu.perm_c))
 
 
+def _nested_dissection(graph: sp.csr_matrix) -> list[IntArray]:
+    """Return the order of METIS; none where there is little to cut (and where nodes stand alone, which METIS does not survive)."""
+    between = sp.csr_matrix(graph - sp.diags_array(graph.diagonal()))
+    between.eliminate_zeros()
+    if graph.shape[0] < WORTH_CUTTING or (np.diff(between.indptr) == 0).any():
+        return []
+    try:
+        import pymetis
+    except ImportError:
+        return []
+    return [np.asarray(pymetis.nested_dissection(xadj=between.indptr, adjncy=between.indices)[0], np.int64)]
+
+
 def elimination_work(graph: sp.csr_matrix, order: IntArray) -> float:
     """Return the multiplications of a factor of some nodes of a symmetric graph in an order: Σ (entries of a column)²."""
     part = graph[order][:, order].tocsc()
+    part.sort_indices()
     indptr, indices = part.indptr.astype(np.int64), part.indices.astype(np.int64)
     start, _ = _structures(indptr, indices, _elimination_tree(indptr, indices))
     return float((np.diff(start + np.arange(len(start))).astype(np.float64) ** 2).sum())

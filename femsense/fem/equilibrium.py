@@ -32,6 +32,8 @@ SMALLEST_PART = 2e-3
 """Load steps smaller than this share of the load are given up."""
 CHORD = 1e-2
 """A stiffness serves for another step where the last one left less than this share of the residual."""
+LENT = 0.1
+"""So does one that was lent by a state near by."""
 FAR = 1e6
 """A stiffness factorised where the residual was more than this times its tolerance says nothing of the stability of the end."""
 CLOSED = 1e-12
@@ -150,6 +152,7 @@ def solve_equilibrium(
     along: tuple[FloatArray, ...] | None = None,
     max_iterations: int = 60,
     relative_tolerance: float = 1e-9,
+    patient: bool = True,
 ) -> Equilibrium:
     """Find the static equilibrium of a body.
 
@@ -168,6 +171,7 @@ def solve_equilibrium(
             own; cables with friction of theirs move on from it. By default 1 without friction, and with it as `start` left it.
         max_iterations: Newton steps at each load level.
         relative_tolerance: of the unbalanced force against the sum of all loads.
+        patient: where Newton fails from `start`, go to the loads bit by bit.
 
     Returns:
         the state; `status` says whether it is an equilibrium, `advice` what to do if not.
@@ -185,12 +189,13 @@ def solve_equilibrium(
     state = _initial_state(body, loads, start, reuse_factor, along)
     shares = [s.copy() for s in state.shares]
     status, reached = _settle(body, loads, state, max_iterations), 1.0
-    if status not in (CONVERGED, "singular") and start is not None and start.converged and body.is_held():
+    patient = patient or start is None
+    if patient and status not in (CONVERGED, "singular") and start is not None and start.converged and body.is_held():
         first = _loads_of(body, start, loads)
         state, status, reached = _step_loads(
             body, first, loads, _initial_state(body, first, start, False, along), state, max_iterations
         )
-    if status not in (CONVERGED, "singular") and body.is_held():
+    if patient and status not in (CONVERGED, "singular") and body.is_held():
         nothing = replace(loads, forces=0.0 * loads.forces, effort=0.0 * loads.effort, target=0.0 * loads.target)
         rest = _State(body.mesh.nodes.copy(), nothing.effort.copy(), _first_taut(body, loads), shares)
         state, status, reached = _step_loads(body, nothing, loads, rest, state, max_iterations)
@@ -392,7 +397,7 @@ def _newton(body: BodyModel, loads: _Loads, state: _State, max_iterations: int) 
     held = np.flatnonzero(state.taut)
     stretch = _stretch(body)[held]
     here = internal(body, state.x, tangent=not state.borrowed)
-    last, saved = np.inf, (state.x, state.T)
+    last = np.inf
     frictional = any(c.friction > 0 for c in body.cables)
     for iteration in range(max_iterations):
         if frictional and not len(held) and 0 < iteration < FOLLOW_FRICTION:
@@ -407,31 +412,25 @@ def _newton(body: BodyModel, loads: _Loads, state: _State, max_iterations: int) 
         closed = bool((np.abs(gap) / loads.lever[held]).max(initial=0.0) <= CLOSED)
         if sound and closed and state.residual <= loads.tolerance:
             return CONVERGED
-        if state.borrowed and not (
-            sound and state.residual <= 0.5 * last
-        ):  # the borrowed factor does not serve: back, and its own
-            state.x, state.T = saved
-            state.factor, state.borrowed, last = None, False, np.inf
-            here = internal(body, state.x)
-            continue
         if not sound:
             return "stalled"
-        if state.factor is None or (not state.borrowed and state.residual > max(loads.tolerance, CHORD * last)):
-            state.factor = _factor_here(body, here, state, H, C, stretch, loads.lever[held])
+        serves = LENT if state.borrowed else CHORD
+        if state.factor is None or state.residual > max(loads.tolerance, serves * last):
+            state.factor, state.borrowed = _factor_here(body, here, state, H, C, stretch, loads.lever[held]), False
             if state.factor is None:
                 return "singular"
             state.factored_at = state.residual
-        last, saved = state.residual, (state.x, state.T)
+        last = state.residual
         du, dT = _bordered_step(state.factor, force, gap, H, C, stretch, loads.lever[held])
         if not closed and _contradicts(H @ du + stretch * dT, gap, loads.lever[held]):
             return "cables"
         if not (np.isfinite(du).all() and np.isfinite(dT).all()):
             return "stalled"
         state.iterations += 1
-        if state.borrowed:
-            here = _full_step(body, state, held, du, dT)
-            continue
         moved = _line_search(body, loads, state, held, here, du, dT, gap, force)
+        if moved is None and state.borrowed:
+            state.factor = None
+            continue
         if moved is None:
             return CONVERGED if closed and state.residual <= 1e3 * loads.tolerance else "stalled"
         here = moved
@@ -583,14 +582,6 @@ def _bordered_step(
 def _contradicts(reached: FloatArray, gap: FloatArray, lever: FloatArray) -> bool:
     """Return whether a step cannot close the gaps of what is held: their rows depend on each other."""
     return bool((np.abs(reached - gap) / lever).max() > 1e-3 * (np.abs(gap) / lever).max() + CLOSED)
-
-
-def _full_step(body: BodyModel, state: _State, held: npt.NDArray[np.intp], du: FloatArray, dT: FloatArray) -> Internal:
-    x = state.x.ravel().copy()
-    x[body.free_map.dofs] += du
-    state.x, state.T = x.reshape(-1, 3), state.T.copy()
-    state.T[held] += dT
-    return internal(body, state.x, tangent=False)
 
 
 def _line_search(

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from femsense.arrays import BoolArray, FloatArray, IntArray, freeze
-from femsense.fem.dissection import elimination_order
+from femsense.fem.cholesky import fill_reducing_order
 from femsense.fem.iterative import Grid
 from femsense.fem.linear import Pattern, make_pattern
 from femsense.fem.mesh import EDGES, TetMesh, shape_slopes, shape_values
@@ -117,7 +117,7 @@ def make_free_map(stencil: Stencil, mesh: TetMesh, fixed: IntArray) -> FreeMap:
     free_node = np.zeros(n, dtype=bool)
     free_node[rows], free_node[columns] = True, True
     free_node[fixed] = False
-    order = elimination_order(rows, columns, free_node, mesh.nodes)
+    order = fill_reducing_order(rows, columns, free_node)
     place = np.full(n, -1)
     place[order] = np.arange(len(order))
     slot = np.flatnonzero((place[rows] >= 0) & (place[columns] >= 0))

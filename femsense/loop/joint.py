@@ -15,6 +15,7 @@ from femsense.effects.loads import STANDARD_GRAVITY
 from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.mesh import TetMesh
 from femsense.loop.noise import Groups, Noise, Whitener, whiten
+from femsense.model import Robot
 from femsense.pose import move_pose
 
 if TYPE_CHECKING:
@@ -207,7 +208,8 @@ class JointProblem:
     def evaluate(self, theta: FloatArray, derivative: bool) -> tuple[FloatArray, FloatArray | None]:
         """Return whitened residual (N,) and Jacobian (N, p): markers, seats, declared poses, priors."""
         spans = spans_of(self.trials)
-        jets = [self.jet(trial, theta[span], theta[self.own :], derivative) for trial, span in zip(self.trials, spans)]
+        patient = derivative or self.last is None  # a step that is only tried is not worth the long way
+        jets = [self.jet(trial, theta[span], theta[self.own :], derivative, patient) for trial, span in zip(self.trials, spans)]
         if derivative:
             self.last = Jets(jets, np.array(theta))
         return self.rows_of(jets, theta, derivative)
@@ -224,12 +226,21 @@ class JointProblem:
         blocks.append(J)
         return np.concatenate(rows), np.vstack(blocks) if derivative else None
 
-    def jet(self, trial: Trial, own: FloatArray, coordinates: FloatArray, derivative: bool) -> SceneJet:
+    def jet(
+        self,
+        trial: Trial,
+        own: FloatArray,
+        coordinates: FloatArray,
+        derivative: bool,
+        patient: bool = True,
+        others: Sequence[Robot] = (),
+    ) -> SceneJet:
         """Return the residuals and derivatives of one trial."""
         pivot = self.hypothesis.robot.marker_points.mean(axis=0)
         poses, initial = trial.place(own, pivot)
         return evaluate_scene(self.hypothesis, trial.scene, coordinates, poses, initial, derivative=derivative,
-                              vary_initial=trial.initial is not None, pivot=pivot, starts=trial.starts_on(self.hypothesis.robot.body.mesh))  # fmt: skip
+                              vary_initial=trial.initial is not None, pivot=pivot, starts=trial.starts_on(self.hypothesis.robot.body.mesh),
+                              patient=patient, others=others)  # fmt: skip
 
     def _scene_rows(
         self, trial: Trial, factor: Whitener, jet: SceneJet, own: FloatArray, at: int, width: int, derivative: bool
