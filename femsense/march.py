@@ -27,7 +27,7 @@ from femsense.model import Robot
 from femsense.parallel import each
 from femsense.recording import Recording
 
-FACTOR_MEMORY = 3e9
+FACTOR_MEMORY = 2e9
 """Factors of several frames are kept up to this total [bytes], and up to MEMORY_SHARE of the memory that is free."""
 MEMORY_SHARE = 0.25
 TRIED = 1e-7
@@ -140,7 +140,7 @@ def frame_loads(walk: Walk, frame: int) -> FloatArray | None:
 
 def solve_frame(
     walk: Walk, frame: int, *, start: Equilibrium | None = None, before: tuple[FloatArray, ...] | None = None, reuse_factor: bool = False,
-    nodal_forces: FloatArray | None = None, relative_tolerance: float = 1e-9, patient: bool = True,
+    nodal_forces: FloatArray | None = None, relative_tolerance: float = 1e-9, rough: bool = False,
 ) -> Equilibrium:  # fmt: skip
     """Return the equilibrium of one frame.
 
@@ -152,7 +152,7 @@ def solve_frame(
         reuse_factor: whether the start's factor serves.
         nodal_forces: forces beside the known loads [N], shape (n, 3).
         relative_tolerance: of the unbalanced force against the sum of all loads.
-        patient: where Newton fails from `start`, go to the loads bit by bit.
+        rough: the state is only tried (see `solve_equilibrium`).
     """
     drive, body = walk.drive, walk.robot.body
     if drive.gravity is not None:
@@ -167,13 +167,13 @@ def solve_frame(
     return solve_equilibrium(
         body, tension=tension, shortening=held, pressure=dict(zip(body.chamber_names, drive.pressures[frame].tolist())),
         nodal_forces=loads, start=start, before=before, reuse_factor=reuse_factor, relative_tolerance=relative_tolerance,
-        patient=patient,
+        rough=rough,
     )  # fmt: skip
 
 
 def walk_along(
     walk: Walk, frames: Sequence[int], observe: Callable[[Robot, Equilibrium], FloatArray], variants: Sequence[Walk] = (),
-    *, starts: dict[int, Equilibrium] | None = None, patient: bool = True,
+    *, starts: dict[int, Equilibrium] | None = None, rough: bool = False,
 ) -> Iterator[tuple[int, Equilibrium, FloatArray, FloatArray]]:  # fmt: skip
     """Solve frames in order, and with each the same frame of variants that differ from it by little.
 
@@ -188,8 +188,7 @@ def walk_along(
         variants: other robots or drives.
         starts: frame → a state near by, such as that of an earlier walk; brought up to date as frames are solved. Their
             factors are kept as long as they fit into FACTOR_MEMORY.
-        patient: go to the loads bit by bit where Newton fails from a state near by, and solve to the last; else states are good enough
-            to be tried.
+        rough: states are only tried, where one near by is known.
 
     Yields:
         frame index, equilibrium, observation (p, 3), observations of the variants (v, p, 3).
@@ -200,7 +199,7 @@ def walk_along(
     first: dict[bytes, int] = {}
     alike = {k: k if past else first.setdefault(_key(walk, variants, k), k) for k in todo}
     unique = [k for k in todo if alike[k] == k]
-    bases = dict(zip(unique, _base_states(walk, unique, starts, past, patient)))
+    bases = dict(zip(unique, _base_states(walk, unique, starts, past, rough)))
     answers: dict[int, tuple[FloatArray, FloatArray]] = {}
     room = _room(len(unique))
     for k, seen, others, factor in _answers(walk, variants, bases, observe, past):
@@ -218,7 +217,7 @@ def _room(count: int) -> float:
 
 
 def _base_states(
-    walk: Walk, frames: list[int], starts: dict[int, Equilibrium] | None, past: bool, patient: bool
+    walk: Walk, frames: list[int], starts: dict[int, Equilibrium] | None, past: bool, rough: bool
 ) -> Iterator[Equilibrium]:
     """Yield the states of frames, without their factors; `starts` gets them with these where they fit into memory."""
     body, room = walk.robot.body, _room(len(frames))
@@ -231,9 +230,9 @@ def _base_states(
         return bare
 
     def again(k: int) -> Equilibrium:
-        tolerance = 1e-9 if patient else TRIED
+        tolerance = TRIED if rough else 1e-9
         return keep(
-            k, _require(solve_frame(walk, k, start=near[k], reuse_factor=True, relative_tolerance=tolerance, patient=patient), k)
+            k, _require(solve_frame(walk, k, start=near[k], reuse_factor=True, relative_tolerance=tolerance, rough=rough), k)
         )
 
     if not past and len(near) == len(frames):
@@ -245,7 +244,7 @@ def _base_states(
         start = near.get(k, last)
         start = start if start is None or _clamp_fits(body, start) else None
         last = _require(
-            solve_frame(walk, k, start=start, before=before, reuse_factor=start is not last, patient=patient or k not in near), k
+            solve_frame(walk, k, start=start, before=before, reuse_factor=start is not last, rough=rough and k in near), k
         )
         before = last.segment_tensions if past else None
         yield keep(k, last)

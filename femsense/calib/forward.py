@@ -221,14 +221,14 @@ class SceneJet:
 
 def evaluate_scene(
     hypothesis: Hypothesis, scene: Scene, coordinates: FloatArray, poses: Sequence[FloatArray], initial: FloatArray | None,
-    *, derivative: bool, vary_initial: bool, pivot: FloatArray, starts: dict[int, Equilibrium] | None = None, patient: bool = True,
+    *, derivative: bool, vary_initial: bool, pivot: FloatArray, starts: dict[int, Equilibrium] | None = None, rough: bool = False,
     others: Sequence[Robot] = (),
 ) -> SceneJet:  # fmt: skip
     """Evaluate marker residuals of a scene at a point of parameter space, their derivatives by differences, and what other robots
     would change.
 
-    `starts` holds states of earlier evaluations near by and is brought up to date; if not `patient`, a frame that Newton does not reach
-    from there has no equilibrium.
+    `starts` holds states of earlier evaluations near by and is brought up to date; states that are only tried may be
+    `rough`: a frame that Newton does not reach from there then has no equilibrium.
 
     Raises:
         DataError: a frame has no equilibrium.
@@ -249,7 +249,7 @@ def evaluate_scene(
     states: dict[int, Equilibrium] = {}
     model: dict[int, FloatArray] = {}
     shifted: list[dict[int, FloatArray]] = [{} for _ in variants]
-    for k, state, seen, varied in walk_along(base, scene.frames.tolist(), observe, variants, starts=starts, patient=patient):
+    for k, state, seen, varied in walk_along(base, scene.frames.tolist(), observe, variants, starts=starts, rough=rough):
         states[k], model[k] = state, seen
         for i in range(len(variants)):
             shifted[i][k] = varied[i]

@@ -133,6 +133,7 @@ class _State:
     residual: float = np.inf
     shifted: bool = False  # the stiffness was not positive definite where it was last factorised
     shift: float = 0.0  # what made the stiffness positive definite there [N/m]
+    single: bool = False  # factors in single precision
     indefinite_steps: int = 0
     factored_at: float = 0.0  # residual where the stiffness was last factorised [N]
 
@@ -152,7 +153,7 @@ def solve_equilibrium(
     along: tuple[FloatArray, ...] | None = None,
     max_iterations: int = 60,
     relative_tolerance: float = 1e-9,
-    patient: bool = True,
+    rough: bool = False,
 ) -> Equilibrium:
     """Find the static equilibrium of a body.
 
@@ -171,7 +172,7 @@ def solve_equilibrium(
             own; cables with friction of theirs move on from it. By default 1 without friction, and with it as `start` left it.
         max_iterations: Newton steps at each load level.
         relative_tolerance: of the unbalanced force against the sum of all loads.
-        patient: where Newton fails from `start`, go to the loads bit by bit.
+        rough: the state is only tried: factors in single precision, and no way to the loads bit by bit where Newton fails from `start`.
 
     Returns:
         the state; `status` says whether it is an equilibrium, `advice` what to do if not.
@@ -187,15 +188,16 @@ def solve_equilibrium(
         _check_start(body, start)
     loads = _collect_loads(body, given, nodal_forces, start, before, bilateral, relative_tolerance)
     state = _initial_state(body, loads, start, reuse_factor, along)
+    rough = rough and start is not None
+    state.single = rough
     shares = [s.copy() for s in state.shares]
     status, reached = _settle(body, loads, state, max_iterations), 1.0
-    patient = patient or start is None
-    if patient and status not in (CONVERGED, "singular") and start is not None and start.converged and body.is_held():
+    if not rough and status not in (CONVERGED, "singular") and start is not None and start.converged and body.is_held():
         first = _loads_of(body, start, loads)
         state, status, reached = _step_loads(
             body, first, loads, _initial_state(body, first, start, False, along), state, max_iterations
         )
-    if patient and status not in (CONVERGED, "singular") and body.is_held():
+    if not rough and status not in (CONVERGED, "singular") and body.is_held():
         nothing = replace(loads, forces=0.0 * loads.forces, effort=0.0 * loads.effort, target=0.0 * loads.target)
         rest = _State(body.mesh.nodes.copy(), nothing.effort.copy(), _first_taut(body, loads), shares)
         state, status, reached = _step_loads(body, nothing, loads, rest, state, max_iterations)
@@ -457,7 +459,7 @@ def _factor_here(
     """Factorise the stiffness, made positive definite where it is not: then steps lead downhill. Held cables and chambers hold too:
     a stiffness that is indefinite only where they do not let the body go stays as it is."""
     values = reduced_values(body, _stiffness_blocks(body, here, state))
-    plain, state.shift = factorize_definite(body.free_map.pattern, values, first=state.shift / 4.0)
+    plain, state.shift = factorize_definite(body.free_map.pattern, values, first=state.shift / 4.0, single=state.single)
     whole = with_turning_plate(body, state.x, plain)
     state.shifted = state.shift > 0.0 or whole is None or whole.negative > 0
     if state.shifted and len(H):

@@ -123,17 +123,18 @@ def factorize(pattern: Pattern, values: FloatArray) -> Factorization | None:
 
 
 def factorize_definite(
-    pattern: Pattern, values: FloatArray, *, first: float = 0.0, tries: int = 30
+    pattern: Pattern, values: FloatArray, *, first: float = 0.0, tries: int = 30, single: bool = False
 ) -> tuple[Factorization | None, float]:
     """Factorise matrix + shift·I with the smallest tried shift that makes it positive definite.
 
     Arguments:
         first: the shift to try first where one is needed [N/m], such as a quarter of that which served near by.
+        single: single precision is enough, as for a step that is corrected by others.
 
     Returns:
         the factorisation (None where nothing helped) and the shift [N/m], 0 where none was needed.
     """
-    factor = _definite(pattern, values)
+    factor = _definite(pattern, values, single)
     if factor is not None:
         return factor, 0.0
     columns = np.repeat(np.arange(pattern.size), np.diff(pattern.indptr))
@@ -145,7 +146,7 @@ def factorize_definite(
     for _ in range(tries):
         shifted = values.copy()
         shifted[diagonal] += shift
-        factor = _definite(pattern, shifted)
+        factor = _definite(pattern, shifted, single)
         if factor is not None:
             return factor, shift
         shift *= 4.0
@@ -209,11 +210,11 @@ def available_memory() -> float:
         return float("inf")
 
 
-def _cholesky(pattern: Pattern, values: FloatArray) -> Factorization | None:
-    return cholesky(pattern.analysis(), values)
+def _cholesky(pattern: Pattern, values: FloatArray, single: bool = False) -> Factorization | None:
+    return cholesky(pattern.analysis(), values, single=single)
 
 
-def _definite(pattern: Pattern, values: FloatArray) -> Factorization | None:
+def _definite(pattern: Pattern, values: FloatArray, single: bool = False) -> Factorization | None:
     """Return the factor of a matrix that is positive definite, None where it is not."""
     if _iterates(pattern):
         try:
@@ -221,7 +222,7 @@ def _definite(pattern: Pattern, values: FloatArray) -> Factorization | None:
         except UnsettledError:
             _require_memory(pattern)
     if _wanted() == "cholesky":
-        return _cholesky(pattern, values)
+        return _cholesky(pattern, values, single)
     factor = factorize(pattern, values)
     return factor if factor is not None and factor.negative == 0 else None
 

@@ -31,6 +31,8 @@ from femsense.model import Robot
 from femsense.recording import Recording, state_key
 
 MAX_EFFECTS = 3
+ROUGHLY = 3
+"""Steps of the fit at which what the mesh costs is asked."""
 
 
 def improve(
@@ -92,7 +94,8 @@ def _calibrated(data: Data, say: Progress) -> tuple[Data, Stage, Stage]:
         base = make_stage(data, hypothesis, prior, noise, base.fit.coordinates, own=own_of(base))
         before = _declared(data, noise, before)
     say("asking what the mesh costs")
-    data = with_mesh_errors(data, keeping(data, base, ["stiffness"], noise))  # zeros may have gone far, for an effect's sake
+    plain = keeping(data, base, ["stiffness"], noise, max_iterations=ROUGHLY)  # zeros may have gone far, for an effect's sake
+    data = with_mesh_errors(data, plain)
     return data, before, base
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,6 +27,10 @@ GRAVITY_STD = 0.1
 """How far the size of gravity is known to be 9.80665 m/s² on an unknown site [m/s²]."""
 
 
+States = dict[int, Equilibrium]
+"""Frame → the state that was solved last."""
+
+
 @dataclass(frozen=True, eq=False, slots=True)
 class Trial:
     """One recording as the fit sees it: its markers, or its clouds."""
@@ -39,7 +43,7 @@ class Trial:
     """Start of the initial inputs; None where they are known."""
     input_low: FloatArray
     input_high: FloatArray
-    starts: dict[int, tuple[TetMesh, dict[int, Equilibrium]]]
+    starts: dict[int, tuple[TetMesh, States]]
     """States of earlier evaluations, frame by frame, for each mesh."""
     mesh_error: FloatArray | None = None
     """How far a finer mesh would move the markers [m], one field a sweep, shape (k, c, sweeps); counts as noise of that size."""
@@ -60,7 +64,7 @@ class Trial:
         rows = np.isin(self.scene.frame, frames)
         return replace(self, scene=self.scene.pick(frames), groups=self.groups.of_rows(rows), starts={}, mesh_error=None)
 
-    def starts_on(self, mesh: TetMesh) -> dict[int, Equilibrium]:
+    def starts_on(self, mesh: TetMesh) -> States:
         """Return the states of earlier evaluations on a mesh (bodies of another size share its elements)."""
         return self.starts.setdefault(id(mesh.tets), (mesh, {}))[1]
 
@@ -181,6 +185,10 @@ class JointProblem:
     seat_std: float
     last: Jets | None = None
     """With derivatives."""
+    tried: tuple[FloatArray, list[States]] | None = None
+    """The step that was tried last, and its states."""
+    scale: FloatArray = field(default_factory=lambda: np.zeros(0))
+    """How much the residual answers to each parameter, shape (p,)."""
 
     @property
     def own(self) -> int:
@@ -206,13 +214,39 @@ class JointProblem:
         return np.concatenate([*low, [p.low for p in parameters]]), np.concatenate([*high, [p.high for p in parameters]])
 
     def evaluate(self, theta: FloatArray, derivative: bool) -> tuple[FloatArray, FloatArray | None]:
-        """Return whitened residual (N,) and Jacobian (N, p): markers, seats, declared poses, priors."""
+        """Return whitened residual (N,) and Jacobian (N, p): markers, seats, declared poses, priors.
+
+        What is asked without a derivative, once one is known, is a step that is tried: its states are solved roughly and kept only if
+        the fit goes there.
+        """
+        rough = not derivative and self.last is not None
+        starts = self._starts(theta, rough)
         spans = spans_of(self.trials)
-        patient = derivative or self.last is None  # a step that is only tried is not worth the long way
-        jets = [self.jet(trial, theta[span], theta[self.own :], derivative, patient) for trial, span in zip(self.trials, spans)]
+        jets = [
+            self.jet(t, theta[span], theta[self.own :], derivative, s, rough) for t, span, s in zip(self.trials, spans, starts)
+        ]
+        if rough:
+            self.tried = (np.array(theta), starts)
         if derivative:
             self.last = Jets(jets, np.array(theta))
-        return self.rows_of(jets, theta, derivative)
+        rows = self.rows_of(jets, theta, derivative)
+        self.scale = self.scale if rows[1] is None else np.linalg.norm(rows[1], axis=0)
+        return rows
+
+    def _starts(self, theta: FloatArray, rough: bool) -> list[States]:
+        """Return the states to start from, of each trial: those of the step that was tried last where it is nearer."""
+        kept = [t.starts_on(self.hypothesis.robot.body.mesh) for t in self.trials]
+        if not rough:
+            for own, tried in zip(kept, self.tried[1] if self.tried is not None and np.array_equal(self.tried[0], theta) else []):
+                own.update(tried)
+            return kept
+        nearer = (
+            self.tried is not None
+            and self.last is not None
+            and len(self.scale) == len(theta)
+            and np.linalg.norm(self.scale * (theta - self.tried[0])) < np.linalg.norm(self.scale * (theta - self.last.theta))
+        )
+        return [dict(s) for s in (self.tried[1] if nearer and self.tried is not None else kept)]
 
     def rows_of(self, jets: list[SceneJet], theta: FloatArray, derivative: bool) -> tuple[FloatArray, FloatArray | None]:
         """Return what `evaluate` makes of the jets of all trials at θ."""
@@ -227,20 +261,15 @@ class JointProblem:
         return np.concatenate(rows), np.vstack(blocks) if derivative else None
 
     def jet(
-        self,
-        trial: Trial,
-        own: FloatArray,
-        coordinates: FloatArray,
-        derivative: bool,
-        patient: bool = True,
+        self, trial: Trial, own: FloatArray, coordinates: FloatArray, derivative: bool, starts: States | None = None, rough: bool = False,
         others: Sequence[Robot] = (),
-    ) -> SceneJet:
-        """Return the residuals and derivatives of one trial."""
+    ) -> SceneJet:  # fmt: skip
+        """Return the residuals and derivatives of one trial, from its own states or others to start from."""
         pivot = self.hypothesis.robot.marker_points.mean(axis=0)
         poses, initial = trial.place(own, pivot)
+        starts = trial.starts_on(self.hypothesis.robot.body.mesh) if starts is None else starts
         return evaluate_scene(self.hypothesis, trial.scene, coordinates, poses, initial, derivative=derivative,
-                              vary_initial=trial.initial is not None, pivot=pivot, starts=trial.starts_on(self.hypothesis.robot.body.mesh),
-                              patient=patient, others=others)  # fmt: skip
+                              vary_initial=trial.initial is not None, pivot=pivot, starts=starts, rough=rough, others=others)  # fmt: skip
 
     def _scene_rows(
         self, trial: Trial, factor: Whitener, jet: SceneJet, own: FloatArray, at: int, width: int, derivative: bool

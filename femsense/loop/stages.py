@@ -97,14 +97,21 @@ def jets_without(stage: Stage, keep: BoolArray) -> list[SceneJet]:
     return [replace(j, by_effect=j.by_effect[:, :, keep], rest_by_effect=j.rest_by_effect[:, :, keep]) for j in stage.fit.jets]
 
 
-def keeping(data: Data, stage: Stage, names: Sequence[str], noise: Noise) -> Stage:
+def keeping(data: Data, stage: Stage, names: Sequence[str], noise: Noise, *, max_iterations: int = 12) -> Stage:
     """Return a stage with some of its terms only, fitted again. Raises DataError."""
     terms = stage.fit.hypothesis.terms
     mask = np.concatenate([np.full(len(p), e.name in names) for e, _, p in terms]) if terms else np.zeros(0, dtype=bool)
     hypothesis = replace(stage.fit.hypothesis, terms=tuple(t for t in terms if t[0].name in names))
     prior = Prior(stage.fit.prior.mean[mask], stage.fit.prior.std[mask])
     return make_stage(
-        data, hypothesis, prior, noise, stage.fit.coordinates[mask], own=own_of(stage), near=jets_without(stage, mask)
+        data,
+        hypothesis,
+        prior,
+        noise,
+        stage.fit.coordinates[mask],
+        own=own_of(stage),
+        max_iterations=max_iterations,
+        near=jets_without(stage, mask),
     )
 
 
