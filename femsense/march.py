@@ -30,8 +30,8 @@ from femsense.recording import Recording
 FACTOR_MEMORY = 2e9
 """Factors of several frames are kept up to this total [bytes], and up to MEMORY_SHARE of the memory that is free."""
 MEMORY_SHARE = 0.25
-TRIED = 1e-7
-"""Relative tolerance of states that are only tried: a thousandth of a millimetre, where derivatives want a hundred times less."""
+TRIED = 1e-8
+"""Relative tolerance of states that are only tried: below a thousandth of a millimetre, where derivatives want a tenth of it."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

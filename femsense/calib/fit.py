@@ -18,8 +18,7 @@ STILL = 1e-2
 """A step that changes the whitened residual by less than this is none."""
 
 
-DAMPING = 1e-2
-"""First damping of a step to where nothing can be evaluated, in units of the largest response."""
+MOST_DAMPING = 1e8
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -104,8 +103,8 @@ def gauss_newton(
             if not own:
                 residual, jacobian, own = *_both(evaluate, theta), True
                 continue
-            damping = max(10.0 * damping, 1e-4 if np.isfinite(cost) else DAMPING)
-            if damping > 1e8:
+            damping = _shorter(jacobian, residual, scale, damping, low - theta, high - theta, change)
+            if damping > MOST_DAMPING:
                 status = "converged"
                 break
             continue
@@ -116,6 +115,18 @@ def gauss_newton(
             residual, jacobian, own = *_both(evaluate, theta), True
         costs.append(float(residual @ residual))
     return FitResult(freeze(theta), freeze(covariance_of(jacobian)), freeze(residual), freeze(jacobian), tuple(costs), status)
+
+
+def _shorter(
+    J: FloatArray, r: FloatArray, scale: FloatArray, damping: float, low: FloatArray, high: FloatArray, change: FloatArray
+) -> float:
+    """Return the damping that makes a step change the residual by half as much as `change` or less."""
+    while damping <= MOST_DAMPING:
+        damping = max(10.0 * damping, 1e-4)
+        step = _bounded_step(J, r, scale, damping, low, high)
+        if np.linalg.norm(J @ step) <= 0.5 * np.linalg.norm(change):
+            break
+    return damping
 
 
 def _first(

@@ -342,7 +342,7 @@ def fit_jointly(
     begin = None if known is None else problem.rows_of(known, theta, True)
     problem.last = None if known is None else Jets(known, np.array(theta))
     fit = gauss_newton(
-        problem.evaluate, theta, low=low, high=high, max_iterations=max_iterations, tolerance=1e-6, still=0.15,
+        problem.evaluate, theta, low=low, high=high, max_iterations=max_iterations, tolerance=1e-6, still=0.2,
         known=begin, borrowed=None if near is None else problem.rows_of(near, theta, True)[1], serves=SERVES,
     )  # fmt: skip
     if problem.last is None or not np.array_equal(problem.last.theta, fit.theta):
