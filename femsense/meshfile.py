@@ -42,7 +42,7 @@ np.savez("tets.npz", nodes=nodes, tets=tets)
 """
 EDGE_FRACTION = 0.05
 """Edge length of a mesh made from a surface, over the diagonal of its bounding box."""
-FILL_SECONDS = 600.0
+FILL_SECONDS = 300.0
 """fTetWild is given up after this time."""
 ENVELOPE = 1e-3
 """How far a mesh made from a surface may leave it, over the diagonal of its bounding box."""
@@ -343,7 +343,7 @@ def _run_ftetwild(
             result = subprocess.run([sys.executable, "-c", FTETWILD], cwd=folder, capture_output=True, text=True, errors="replace", timeout=seconds)  # fmt: skip
         except subprocess.TimeoutExpired:
             raise InputError("fTetWild did not come to an end", where=where, found=f"{len(triangles)} triangles, given up after {seconds:.0f} s", expected="tetrahedra",
-                             hint="femsense mesh with a larger --size or --tolerance; a surface with fewer triangles") from None  # fmt: skip
+                             hint="surfaces that nearly coincide and walls thinner than the tolerance are what takes long: mend them, or femsense mesh with another --tolerance or a larger --size") from None  # fmt: skip
         made = Path(folder) / "tets.npz"
         if result.returncode or not made.is_file():
             last = (result.stderr.strip().splitlines() or [f"exit status {result.returncode}"])[-1]

@@ -22,7 +22,7 @@ from femsense.files import file_hash, write_json, write_text
 from femsense.meshfile import FILL_SECONDS, SURFACE_ENDINGS, radius_ratio, read_cells, read_triangles, tetrahedralise, write_mesh
 from femsense.quality import quality_report, quality_text
 from femsense.robot import LARGEST_BODY, PER_METRE, SMALLEST_BODY, likely_unit, load_robot
-from femsense.surface import Surface, check_finite, crossing_triangles, distance_to, repaired, thinned
+from femsense.surface import Surface, check_finite, crossing_triangles, distance_to, repaired, shared_edges, thinned
 
 MESH_FILE, REPORT_FILE = "mesh.vtu", "mesh.json"
 USUAL = (5e-3, 2.0)
@@ -34,7 +34,7 @@ LARGEST_ENVELOPE = 0.01
 """… and by this share of the diagonal at most."""
 CAD_ENDINGS = (".step", ".stp", ".iges", ".igs", ".brep", ".x_t", ".x_b", ".sldprt", ".sldasm", ".ipt", ".f3d", ".fcstd", ".3dm")
 TRIES = 5
-MOST_SECONDS = 900.0
+MOST_SECONDS = 600.0
 """All fillings together take no longer than this."""
 POOR = 0.05
 """A worst radius ratio below this has the surface filled anew (fTetWild shuffles)."""
@@ -188,11 +188,18 @@ def fill(
     if crossing:
         note = f"{crossing} triangles cross others: what lies inside any of them was filled"
         surface = replace(surface, done=(*surface.done, note))
+    walls = len(shared_edges(surface.triangles))
+    if walls:
+        note = (
+            f"{walls} edges have more than two triangles (walls inside, or bodies that touch there): what lies inside was filled"
+        )
+        surface = replace(surface, done=(*surface.done, note))
     edge, began = _first_edge(surface, options), time.monotonic()
     for attempt in range(TRIES):
         left = MOST_SECONDS - (time.monotonic() - began)
-        tell(f"filling, edges of {1e3 * edge:.2g} mm, try {attempt + 1}")
-        filled = _fill_once(surface, edge, options, where, crosses=crossing > 0, seconds=min(left, FILL_SECONDS))
+        seconds = min(left, FILL_SECONDS)
+        tell(f"filling, edges of {1e3 * edge:.2g} mm, try {attempt + 1}, {seconds / 60:.0f} min at most")
+        filled = _fill_once(surface, edge, options, where, crosses=crossing + walls > 0, seconds=seconds)
         count = len(filled.mesh.tets)
         poor = radius_ratio(filled.mesh).min() < POOR
         slow = time.monotonic() - began > 0.5 * MOST_SECONDS  # another try might not come to an end

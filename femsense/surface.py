@@ -171,6 +171,12 @@ def _open_edges(triangles: IntArray) -> IntArray:
     return np.asarray(edges[count[inverse.reshape(-1)] == 1])
 
 
+def shared_edges(triangles: IntArray) -> IntArray:
+    """Return the sides that more than two triangles have, shape (e, 2)."""
+    edges, count = np.unique(np.sort(_directed_edges(triangles), axis=1), axis=0, return_counts=True)
+    return np.asarray(edges[count > 2])
+
+
 def _turned_alike(points: FloatArray, triangles: IntArray, where: str, done: list[str]) -> IntArray:
     """Turn triangles so that neighbours go round the same way.
 

@@ -236,6 +236,18 @@ def test_crumbs_are_left_out_and_parts_are_refused(monkeypatch: pytest.MonkeyPat
             fill(np.array(box.vertices), np.array(box.faces), MM)
 
 
+def test_a_wall_inside_is_said_and_filled(quick: list[dict[str, Any]]) -> None:
+    """A box cut by a wall that shares its edges with it."""
+    left, right = (
+        trimesh.creation.box((size, 30, 30), trimesh.transformations.translation_matrix((x, 0, 0)))
+        for size, x in ((60, -30), (40, 20))
+    )
+    faces = np.vstack([left.triangles, right.triangles[(right.triangles[:, :, 0] > 1).any(axis=1)]])
+    filled = fill(faces.reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3), MM)
+    assert any(note.startswith("4 edges have more than two triangles (walls inside") for note in filled.done)
+    assert quick[0]["check_volume"] is False
+
+
 def test_bodies_that_touch_along_an_edge_are_no_body(monkeypatch: pytest.MonkeyPatch) -> None:
     one, other = (block_mesh((2, 2, 2), (0.03,) * 3, start=(x, x, 0.0)) for x in (0.0, 0.03))
     points, same = np.unique(np.vstack([one.nodes, other.nodes]), axis=0, return_inverse=True)
