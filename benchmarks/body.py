@@ -1,6 +1,6 @@
 """How fast the body is: cold equilibria beside SOFA's, parts, real time, growth with the mesh. Prints the tables of docs/speed.md.
 
-    OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 python benchmarks/body.py [cold|parts|frames|kept|growth|iterative …] [--data FOLDER]
+    OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 python benchmarks/body.py [cold|parts|orders|frames|kept|growth|iterative …] [--data FOLDER]
 
 CPU time of one thread: medians (cold, frames), the least of several runs (parts, growth, iterative); SOFA's figures are those of `reference/cases.json`, measured on a like machine.
 """
@@ -28,7 +28,7 @@ from femsense.fem import equilibrium
 from femsense.fem.assembly import internal, reduced_values
 from femsense.fem.body import BodyModel, make_body, tie_cable
 from femsense.fem.cables import pull_rows
-from femsense.fem.cholesky import cholesky
+from femsense.fem.cholesky import _nested_dissection, cholesky, elimination_work, minimum_degree
 from femsense.fem.compliance import compliance, direction_rows, tangent_at
 from femsense.fem.equilibrium import solve_equilibrium
 from femsense.fem.linear import factorize, pardiso_library
@@ -160,6 +160,24 @@ def solver_line(name: str, make: Callable[[], Any], columns: sp.csc_matrix) -> N
     factor, right = make(), np.random.default_rng(0).normal(size=columns.shape[0])
     one, gram = least_ms(lambda: factor.solve(right)), least_ms(lambda: factor.gram(columns), 5)
     print(f"  {name:17} factor {least_ms(make):7.2f} ms, one solve {one:6.2f} ms, W of {columns.shape[1]} rows {gram:7.2f} ms")
+
+
+def orders(data: Path) -> None:
+    """Work of a factor by minimum degree and by nested dissection: thin limbs (diamond), a solid bar (beam), both quadratic."""
+    for name, body in (("diamond", diamond(data, True)[0]), ("beam", load_robot(data / "beam" / "robot").body)):
+        free = np.zeros(len(body.mesh.nodes), dtype=bool)
+        free[body.free_map.dofs // 3] = True
+        pairs = body.mesh.tets[:, np.array(np.triu_indices(10, 1)).T].reshape(-1, 2)
+        graph = sp.coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(free), len(free))).tocsr()
+        graph = (graph + graph.T)[free][:, free]
+        work = [27e-9 * elimination_work(graph, order) for order in (minimum_degree(graph), *_nested_dissection(graph))]
+        x = np.array(body.mesh.nodes)
+        blocks = internal(body, x).blocks
+        assert blocks is not None
+        values, analysis = reduced_values(body, blocks), body.free_map.pattern.analysis()
+        factor = least_ms(partial(cholesky, analysis, values), 5)
+        text = ", ".join(f"{value:.2f} Gflop" for value in work)
+        print(f"  {name}, {analysis.size} unknowns: minimum degree, METIS {text}; factor as chosen {factor:.0f} ms")
 
 
 def frames(data: Path) -> None:
@@ -315,7 +333,7 @@ def one_side(data: Path, level: int, element: str) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser()
-    parser.add_argument("what", nargs="*", default=["cold", "parts", "frames", "kept", "growth", "iterative"])
+    parser.add_argument("what", nargs="*", default=["cold", "parts", "orders", "frames", "kept", "growth", "iterative"])
     parser.add_argument("--data", type=Path, default=DATA)
     parser.add_argument("--level", type=int, default=0)
     parser.add_argument("--levels", type=int, default=3)
@@ -330,4 +348,4 @@ if __name__ == "__main__":
             one_side(given.data, given.level, given.element)
             continue
         print(f"\n== {what}", flush=True)
-        {"cold": lambda: cold(given.data), "parts": lambda: parts(given.data), "frames": lambda: frames(given.data), "kept": lambda: kept(given.data), "growth": lambda: growth(given.data, given.levels), "iterative": lambda: iterative_growth(given.data, given.levels)}[what]()  # fmt: skip
+        {"cold": lambda: cold(given.data), "parts": lambda: parts(given.data), "orders": lambda: orders(given.data), "frames": lambda: frames(given.data), "kept": lambda: kept(given.data), "growth": lambda: growth(given.data, given.levels), "iterative": lambda: iterative_growth(given.data, given.levels)}[what]()  # fmt: skip

@@ -27,6 +27,8 @@ DUST = 1e-6
 """A shell that encloses less than this share of the whole is left out."""
 TOUCHING = 1e-4
 """Shells closer than this, over the diagonal, are one body."""
+MOST_SHELLS = 3000
+"""Surfaces in more pieces are refused: all of them would be compared with each other."""
 MANY_TRIANGLES = 6000
 """Surfaces with more triangles than this are thinned out before they are filled."""
 Progress = Callable[..., None]
@@ -96,8 +98,8 @@ def repaired(
     points, triangles = _tidied(points, triangles, where, done)
     triangles = _turned_alike(points, triangles, where, done)
     points, triangles = _closed(points, triangles, where, close_holes, unit, done)
-    shells = _find_shells(points, triangles)
-    triangles, shells = _without_dust(points, triangles, shells, where, done)
+    triangles = _without_dust(points, triangles, where, done)
+    shells = _find_shells(points, triangles, where)
     triangles, cavities = _faced(triangles, shells, fill_cavities, done)
     triangles, cavities = _chosen(points, triangles, shells, part, fill_cavities, cavities, where, unit, done)
     used, numbers = np.unique(triangles, return_inverse=True)
@@ -298,20 +300,24 @@ def _holes(triangles: IntArray) -> tuple[list[IntArray], IntArray]:
 # Shells
 
 
-def _find_shells(points: FloatArray, triangles: IntArray) -> _Shells:
+def _find_shells(points: FloatArray, triangles: IntArray, where: str) -> _Shells:
     of = _pieces(triangles)
     volume, count = _shell_volumes(points, triangles, of), int(of.max()) + 1
+    if count > MOST_SHELLS:
+        raise InputError("the surface falls into too many pieces", where=where, found=f"{count} pieces of {len(triangles) / count:.1f} triangles on average", expected=f"a closed surface, or at most {MOST_SHELLS} shells", hint="merge equal points and remove what is inside, in a mesh editor")  # fmt: skip
     if count == 1:
         return _Shells(of, volume, np.zeros(1, dtype=np.int64), np.zeros(1, dtype=np.int64))
-    inside, meets = np.zeros((count, count), dtype=bool), _meeting(points, triangles, of, count)
-    for i in range(count):
-        corners = points[np.unique(triangles[of == i])]
-        probes = corners[:: max(1, len(corners) // 4)]
-        for j in np.flatnonzero(~(meets[i] | meets[:, i])):
-            own = triangles[of == j]
-            low, high = points[own].min(axis=(0, 1)), points[own].max(axis=(0, 1))
-            if j != i and ((corners >= low) & (corners <= high)).all():
-                inside[i, j] = bool((np.abs(winding_number(points[own], probes)) > 0.5).all())
+    corners = [
+        points[np.unique(own)] for own in np.split(triangles[np.argsort(of, kind="stable")], np.cumsum(np.bincount(of))[:-1])
+    ]
+    low, high = np.array([own.min(axis=0) for own in corners]), np.array([own.max(axis=0) for own in corners])
+    meets = _meeting(points, triangles, of, corners, low, high)
+    inside = np.zeros((count, count), dtype=bool)
+    held = (low[:, None] >= low[None]).all(axis=2) & (high[:, None] <= high[None]).all(axis=2) & ~(meets | meets.T)
+    np.fill_diagonal(held, False)
+    for i, j in np.argwhere(held):
+        probes = corners[i][:: max(1, len(corners[i]) // 4)]
+        inside[i, j] = bool((np.abs(winding_number(points[triangles[of == j]], probes)) > 0.5).all())
     depth = inside.sum(axis=1)
     meets |= inside & (depth[:, None] % 2 == 1) & (depth[None] == depth[:, None] - 1)  # a cavity belongs to what holds it
     body = sp.csgraph.connected_components(sp.csr_matrix(meets.astype(float)), directed=False)[1]
@@ -320,17 +326,21 @@ def _find_shells(points: FloatArray, triangles: IntArray) -> _Shells:
     return _Shells(of, volume, depth, np.argsort(np.argsort(-size))[body])
 
 
-def _meeting(points: FloatArray, triangles: IntArray, of: IntArray, count: int) -> BoolArray:
-    """Return which shells cross or touch, shape (s, s)."""
-    meets = np.zeros((count, count), dtype=bool)
+def _meeting(
+    points: FloatArray, triangles: IntArray, of: IntArray, corners: list[FloatArray], low: FloatArray, high: FloatArray
+) -> BoolArray:
+    """Return which shells cross or touch, shape (s, s); corners, low and high are those of each shell."""
     crossing = crossing_triangles(points, triangles)
+    meets = np.zeros((len(corners),) * 2, dtype=bool)
     meets[of[crossing[:, 0]], of[crossing[:, 1]]] = True
     near = TOUCHING * float(np.linalg.norm(np.ptp(points, axis=0)))
-    for i in range(count):
-        corners = points[np.unique(triangles[of == i])]
-        for j in set(range(count)) - {i}:
-            if not meets[i, j]:
-                meets[i, j] = distance_to(points, triangles[of == j], corners).min() < near
+    close = (low[:, None] <= high[None] + near).all(axis=2) & (high[:, None] >= low[None] - near).all(axis=2) & ~meets
+    np.fill_diagonal(close, False)
+    for j in np.flatnonzero(close.any(axis=0)):
+        others = np.flatnonzero(close[:, j])
+        away = distance_to(points, triangles[of == j], np.vstack([corners[i] for i in others]))
+        ends = np.cumsum([len(corners[i]) for i in others])[:-1]
+        meets[others, j] = [part.min() < near for part in np.split(away, ends)]
     return meets
 
 
@@ -345,18 +355,16 @@ def _area_vectors(points: FloatArray, triangles: IntArray) -> FloatArray:
     return np.cross(b - a, c - a) / 2.0
 
 
-def _without_dust(
-    points: FloatArray, triangles: IntArray, shells: _Shells, where: str, done: list[str]
-) -> tuple[IntArray, _Shells]:
-    size = np.abs(shells.volume)
+def _without_dust(points: FloatArray, triangles: IntArray, where: str, done: list[str]) -> IntArray:
+    of = _pieces(triangles)
+    size = np.abs(_shell_volumes(points, triangles, of))
     if size.max() <= 1e-9 * float(np.linalg.norm(np.ptp(points, axis=0))) ** 3:
         raise InputError("the surface encloses nothing", where=where, found=f"a volume of {size.max():.3g} in the unit of the file", expected="a closed surface around a volume")  # fmt: skip
     dust = size < DUST * size.max()
     if not dust.any():
-        return triangles, shells
+        return triangles
     done.append(f"{int(dust.sum())} shells that enclose next to nothing were left out")
-    kept = triangles[~dust[shells.of]]
-    return kept, _find_shells(points, kept)
+    return np.asarray(triangles[~dust[of]])
 
 
 def _faced(triangles: IntArray, shells: _Shells, fill: bool, done: list[str]) -> tuple[IntArray, int]:

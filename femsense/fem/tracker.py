@@ -3,8 +3,8 @@
 A frame starts from one of two predictions: the last three frames carried on as a parabola, where that was near in the frame before,
 or else the linear response to the change of the loads, by the factor at hand and along which elements turn. Either stretches elements
 by a little too much, and it is the stress of this that spoils the stiffness there: with quadratic elements it is that of the rotations
-predicted and of the stress of the frame before (stress that lags behind is what Magisano, Leonetti & Garcea 2017 make Newton converge
-faster with), whose error is a tenth. Then a fresh factor and two corrections with it, until what they leave is a small share of the motion: where
+predicted and of the stress of the frame before (stress that lags behind is what Magisano, Leonetti & Garcea, CMAME 313, 2017, make
+Newton converge faster with), whose error is a tenth. Then a fresh factor and two corrections with it, until what they leave is a small share of the motion: where
 the second is q times the first, the ones to come sum up to q/(1−q) of the second (Deuflhard 2011, section 2.1), and SAFETY times
 that is the error that is reported. Where Newton does not get there, `solve_equilibrium` takes over.
 """
