@@ -20,7 +20,7 @@ from femsense.loop.predict import sweeps_predicted
 from femsense.loop.screen import NUISANCE, Candidate, effect_fields, screen
 from femsense.loop.stages import Stage, held_chi2, held_shift, jets_with, keeping, make_stage, own_of, problem_of
 
-REFITS = 5
+REFITS = 6
 """Candidates that are refitted in full nonlinearity at the first step; half as many later."""
 REFITTABLE = 0.04
 """A candidate of which calibration leaves less than this is not refitted."""
