@@ -215,17 +215,13 @@ class SceneJet:
     """d residual / d coordinate of the hypothesis, shape (k, 3, p)."""
     states: dict[int, Equilibrium]
     """The equilibrium of each frame."""
-    by_other: FloatArray | None = None
-    """Change of the residual where another robot takes the place of this one, to first order [m], shape (k, 3, o)."""
 
 
 def evaluate_scene(
     hypothesis: Hypothesis, scene: Scene, coordinates: FloatArray, poses: Sequence[FloatArray], initial: FloatArray | None,
     *, derivative: bool, vary_initial: bool, pivot: FloatArray, starts: dict[int, Equilibrium] | None = None, rough: bool = False,
-    others: Sequence[Robot] = (),
 ) -> SceneJet:  # fmt: skip
-    """Evaluate marker residuals of a scene at a point of parameter space, their derivatives by differences, and what other robots
-    would change.
+    """Evaluate marker residuals of a scene at a point of parameter space, and their derivatives by differences.
 
     `starts` holds states of earlier evaluations near by and is brought up to date; states that are only tried may be
     `rough`: a frame that Newton does not reach from there then has no equilibrium.
@@ -239,8 +235,6 @@ def evaluate_scene(
     if not vary_initial:
         keep = len(hypothesis.parameters)
         steps, variants = steps[:keep], variants[:keep]
-    steps = [*steps, *(1.0 for _ in others)]
-    variants = [*variants, *(Walk(r, drive_of(r, scene.recording, initial=initial)) for r in others)]
     places = {id(r): _ties(r, scene, poses) for r in (robot, *(v.robot for v in variants))}
 
     def observe(r: Robot, state: Equilibrium) -> FloatArray:
@@ -256,7 +250,6 @@ def evaluate_scene(
     residual = marker_residual(robot, scene, poses, model)
     columns = [(marker_residual(v.robot, scene, poses, m) - residual) / h for v, m, h in zip(variants, shifted, steps)]
     split = len(hypothesis.parameters) if derivative else 0
-    last = len(columns) - len(others)
     by_pose, rest_by_pose = (
         _pose_derivative(robot, scene, poses, states, residual, pivot)
         if derivative
@@ -264,8 +257,7 @@ def evaluate_scene(
     )
     rest = rest_residual(robot, scene, poses)
     rest_columns = [(rest_residual(v.robot, scene, poses) - rest) / h for v, h in zip(variants[:split], steps)]
-    return SceneJet(residual, rest, by_pose, rest_by_pose, _stack(rest_columns, rest), _stack(columns[split:last], residual), _stack(columns[:split], residual),
-                    states, _stack(columns[last:], residual))  # fmt: skip
+    return SceneJet(residual, rest, by_pose, rest_by_pose, _stack(rest_columns, rest), _stack(columns[split:], residual), _stack(columns[:split], residual), states)  # fmt: skip
 
 
 def _stack(columns: list[FloatArray], residual: FloatArray) -> FloatArray:

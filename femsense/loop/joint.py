@@ -15,7 +15,6 @@ from femsense.effects.loads import STANDARD_GRAVITY
 from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.mesh import TetMesh
 from femsense.loop.noise import Groups, Noise, Whitener, whiten
-from femsense.model import Robot
 from femsense.pose import move_pose
 
 if TYPE_CHECKING:
@@ -261,15 +260,20 @@ class JointProblem:
         return np.concatenate(rows), np.vstack(blocks) if derivative else None
 
     def jet(
-        self, trial: Trial, own: FloatArray, coordinates: FloatArray, derivative: bool, starts: States | None = None, rough: bool = False,
-        others: Sequence[Robot] = (),
-    ) -> SceneJet:  # fmt: skip
+        self,
+        trial: Trial,
+        own: FloatArray,
+        coordinates: FloatArray,
+        derivative: bool,
+        starts: States | None = None,
+        rough: bool = False,
+    ) -> SceneJet:
         """Return the residuals and derivatives of one trial, from its own states or others to start from."""
         pivot = self.hypothesis.robot.marker_points.mean(axis=0)
         poses, initial = trial.place(own, pivot)
         starts = trial.starts_on(self.hypothesis.robot.body.mesh) if starts is None else starts
         return evaluate_scene(self.hypothesis, trial.scene, coordinates, poses, initial, derivative=derivative,
-                              vary_initial=trial.initial is not None, pivot=pivot, starts=starts, rough=rough, others=others)  # fmt: skip
+                              vary_initial=trial.initial is not None, pivot=pivot, starts=starts, rough=rough)  # fmt: skip
 
     def _scene_rows(
         self, trial: Trial, factor: Whitener, jet: SceneJet, own: FloatArray, at: int, width: int, derivative: bool

@@ -8,17 +8,17 @@ refitted with it. ρ = |P s| / |s| is the share that calibration leaves.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import lsq_linear
 
 from femsense.arrays import FloatArray
-from femsense.calib.forward import Hypothesis, marker_residual, seats
+from femsense.calib.forward import Hypothesis
 from femsense.effects import Effect, Entry, Parameter
-from femsense.errors import FemsenseError
-from femsense.loop.finer import moves_on
-from femsense.loop.joint import JointFit, JointProblem, Prior, Trial, spans_of
+from femsense.errors import DataError, FemsenseError
+from femsense.fem.mesh import embed_points
+from femsense.loop.joint import JointFit, JointProblem, Prior, States, Trial, spans_of
 from femsense.loop.noise import whiten
 from femsense.model import Robot
 
@@ -149,35 +149,26 @@ def screen(base: JointFit, problem: JointProblem, fields: Fields, n_effective: f
 
 
 def effect_fields(base: JointFit, trials: list[Trial], todo: list[tuple[Effect, Entry, tuple[Parameter, ...]]]) -> Fields:
-    """Return what each effect does to the markers to first order, all of them with one factorisation a frame; discrete alternatives as
-    a whole, those on another mesh by a walk of their own."""
+    """Return what each effect does to the markers: those with parameters to first order, all of them with one factorisation a frame;
+    discrete alternatives as a whole, each with a walk of its own."""
     fixed = base.hypothesis.robot_at(base.coordinates)
-    possible = [t for t in todo if _can_act(fixed, t)]
-    smooth = [t for t in possible if not t[0].discrete]
-    other = [(t, _taken(fixed, t)) for t in possible if t[0].discrete]
-    laws = [(t, robot) for t, robot in other if robot.body.mesh is fixed.body.mesh]
+    smooth = [t for t in todo if not t[0].discrete and _can_act(fixed, t)]
     every = Hypothesis(fixed, tuple(smooth))
     null = np.array([p.null for p in every.parameters])
     probe = JointProblem(every, Prior(np.zeros(0), np.zeros(0)), trials, [], 1.0)
     raw, rest = [], []
     for trial, span in zip(trials, spans_of(trials)):
-        jet = probe.jet(trial, base.fit.theta[span], null, True, others=[robot for _, robot in laws])
-        assert jet.by_other is not None
-        raw.append(np.concatenate([jet.by_effect, jet.by_other], axis=2))
-        rest.append(np.concatenate([jet.rest_by_effect, np.zeros((*jet.rest.shape, len(laws)))], axis=2))
-    usable = [*smooth, *(t for t, _ in laws)]
-    for one, robot in other:
-        changes = None if robot.body.mesh is fixed.body.mesh else _change_on(base, trials, fixed, robot)
+        jet = probe.jet(trial, base.fit.theta[span], null, True)
+        raw.append(jet.by_effect)
+        rest.append(jet.rest_by_effect)
+    usable = smooth
+    for one in (t for t in todo if t[0].discrete and _can_act(fixed, t)):
+        changes = _whole_change(base, trials, fixed, one)
         if changes is not None:
-            usable.append(one)
+            usable = [*usable, one]
             raw = [np.concatenate([block, change[:, :, None]], axis=2) for block, change in zip(raw, changes)]
             rest = [np.concatenate([block, np.zeros((*block.shape[:2], 1))], axis=2) for block in rest]
     return Fields(usable, raw, rest)
-
-
-def _taken(robot: Robot, one: tuple[Effect, Entry, tuple[Parameter, ...]]) -> Robot:
-    """Return the robot with a discrete alternative."""
-    return Hypothesis(robot, (one,)).robot_at(np.array([p.null for p in one[2]]))
 
 
 def _can_act(robot: Robot, one: tuple[Effect, Entry, tuple[Parameter, ...]]) -> bool:
@@ -189,20 +180,39 @@ def _can_act(robot: Robot, one: tuple[Effect, Entry, tuple[Parameter, ...]]) -> 
     return True
 
 
-def _change_on(base: JointFit, trials: list[Trial], fixed: Robot, fine: Robot) -> list[FloatArray] | None:
-    """Return by how much another mesh changes the residual of each trial [m], (k, c); None where it has no equilibrium."""
-    pivot, changes = base.hypothesis.robot.marker_points.mean(axis=0), []
-    for trial, jet, span in zip(trials, base.jets, spans_of(trials)):
-        poses, initial = trial.place(base.fit.theta[span], pivot)
-        places = seats(fixed, trial.scene, poses)
-        try:
-            moves = moves_on(fixed, fine, trial, places, initial, jet.states)
-        except FemsenseError:
-            return None
-        ties = fixed.tie_markers(places)
-        model = {k: ties.positions(state.positions) + moves[k] for k, state in jet.states.items()}
-        changes.append(marker_residual(fixed, trial.scene, poses, model) - jet.residual)
+def _whole_change(
+    base: JointFit, trials: list[Trial], fixed: Robot, one: tuple[Effect, Entry, tuple[Parameter, ...]]
+) -> list[FloatArray] | None:
+    """Return by how much a discrete alternative changes the residual of each trial [m], (k, c); None where it has no equilibrium."""
+    parameters = one[2]
+    robot = Hypothesis(fixed, (one,)).robot_at(np.array([p.null for p in parameters]))
+    probe = JointProblem(Hypothesis(robot), Prior(np.zeros(0), np.zeros(0)), trials, [], 1.0)
+    changes = []
+    try:
+        for trial, jet, span in zip(trials, base.jets, spans_of(trials)):
+            own, starts = base.fit.theta[span], _starts_of(trial, fixed, robot, jet.states)
+            try:
+                moved = probe.jet(trial, own, np.zeros(0), False, starts, rough=True)
+            except DataError:
+                moved = probe.jet(trial, own, np.zeros(0), False, starts)
+            changes.append(moved.residual - jet.residual)
+    except FemsenseError:
+        return None
     return changes
+
+
+def _starts_of(trial: Trial, fixed: Robot, robot: Robot, states: States) -> States:
+    """Return starts for a robot with another law, or on another mesh of the same body, from states of it as it was."""
+    mesh = robot.body.mesh
+    if mesh is fixed.body.mesh:
+        return dict(states)
+    starts = trial.starts_on(mesh)
+    if starts.keys() != states.keys():
+        ties, still = embed_points(fixed.body.mesh, mesh.nodes), np.zeros_like(mesh.nodes)
+        starts.update(
+            {k: replace(s, positions=ties.positions(s.positions), nodal_forces=still, factor=None) for k, s in states.items()}
+        )
+    return starts
 
 
 def _whitened(base: JointFit, problem: JointProblem, own: list[FloatArray], rest: list[FloatArray]) -> FloatArray:

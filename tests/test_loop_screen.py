@@ -1,0 +1,91 @@
+"""Screening against whole walks: what another law or another mesh makes of the markers; and fits that leave no trace of steps not taken."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from arm import arm, record, sweeps
+
+from femsense.calib.forward import marker_residual, seats
+from femsense.effects import FORMS, find_effect
+from femsense.effects.shape import robot_on_mesh
+from femsense.errors import DataError
+from femsense.fem.equilibrium import solve_equilibrium
+from femsense.fem.mesh import to_linear
+from femsense.loop.data import Data, prepare
+from femsense.loop.joint import JointProblem
+from femsense.loop.noise import Noise
+from femsense.loop.screen import effect_fields
+from femsense.loop.stages import Stage, make_stage, with_nuisance
+from femsense.model import Robot
+
+NOISE = Noise({"white": 1e-4}, "")
+
+
+def staged(robot: Robot, height: float = 3.0) -> tuple[Data, Stage]:
+    inputs, labels = sweeps(height, each=1)
+    recording, _ = record(inputs, labels=labels)
+    data = prepare(robot, [recording], [])
+    hypothesis, prior = with_nuisance(data)
+    return data, make_stage(data, hypothesis, prior, NOISE, np.zeros(len(prior.mean)))
+
+
+def whole_change(data: Data, stage: Stage, other: Robot) -> np.ndarray:
+    """Return by how much another robot changes the residual, each state solved for itself."""
+    trial, jet = data.train[0], stage.fit.jets[0]
+    fixed = stage.fit.hypothesis.robot_at(stage.fit.coordinates)
+    poses, _ = trial.place(stage.fit.fit.theta[: stage.fit.own], data.robot.marker_points.mean(axis=0))
+    ties, model = other.tie_markers(seats(fixed, trial.scene, poses)), {}
+    for k in jet.states:
+        inputs = trial.scene.recording.inputs[k] + fixed.actuation.tension_offset
+        tension = dict(zip(other.body.cable_names, np.maximum(fixed.actuation.gain * inputs, 0.0)))
+        model[k] = ties.positions(solve_equilibrium(other.body, tension=tension).positions)
+    return np.asarray(marker_residual(other, trial.scene, poses, model) - jet.residual)
+
+
+@pytest.mark.parametrize("form", [f for f in FORMS if f.name == "hyperelastic"], ids=["neo_hookean", "gent"])
+def test_another_law_is_screened_by_what_it_would_do(form) -> None:
+    data, stage = staged(arm((5, 2, 2)))
+    robot = stage.fit.hypothesis.robot_at(stage.fit.coordinates)
+    (seed,) = form.seeds(robot)
+    parameters = form.parameters(robot, "tension")
+    fields = effect_fields(stage.fit, data.train, [(form, seed, parameters)])
+    entry = {**seed, "jm": 1 / 0.3} if parameters else seed
+    whole = whole_change(data, stage, form.apply(robot, entry))
+    assert np.linalg.norm(fields.raw[0][:, :, 0] - whole) < 1e-3 * np.linalg.norm(whole)
+    assert np.abs(whole).max() > 1e-4
+
+
+def test_another_mesh_is_screened_by_what_it_would_do() -> None:
+    declared = arm((5, 2, 2))
+    linear = to_linear(declared.body.mesh)
+    effect = find_effect("discretisation")
+    data, stage = staged(robot_on_mesh(declared, linear), 1.0)
+    robot = stage.fit.hypothesis.robot_at(stage.fit.coordinates)
+    seed = {"element": "tet10"}
+    fields = effect_fields(stage.fit, data.train, [(effect, seed, ())])
+    whole = whole_change(data, stage, effect.apply(robot, seed))
+    assert np.linalg.norm(fields.raw[0][:, :, 0] - whole) < 1e-3 * np.linalg.norm(whole)
+    assert np.abs(whole).max() > 1e-3
+
+
+def test_a_step_that_is_not_taken_leaves_no_state_behind() -> None:
+    data, stage = staged(arm((4, 2, 2)))
+    trial = replace(data.train[0], starts={})
+    problem = JointProblem(stage.fit.hypothesis, stage.fit.prior, [trial], [NOISE.whitener(trial.groups, None)], 1.0)
+    theta = np.array(stage.fit.fit.theta)
+    at = problem.evaluate(theta, True)[0]
+    kept = trial.starts_on(stage.fit.hypothesis.robot.body.mesh)
+    before = {k: s.positions for k, s in kept.items()}
+    far, soft = theta.copy(), theta.copy()
+    far[problem.own] += np.log(0.8)
+    soft[problem.own] = np.log(0.02)  # it collapses
+    there = problem.evaluate(far, False)[0]
+    with pytest.raises(DataError):
+        problem.evaluate(soft, False)
+    assert all(kept[k].positions is x for k, x in before.items())
+    np.testing.assert_allclose(problem.evaluate(far, True)[0], there, atol=0.05)  # taken after all: solved to the last
+    assert not any(kept[k].positions is x for k, x in before.items())
+    np.testing.assert_allclose(problem.evaluate(theta, True)[0], at, atol=1e-3)
