@@ -14,6 +14,8 @@ from femsense.effects.shape import robot_on_mesh
 from femsense.errors import DataError
 from femsense.fem.equilibrium import solve_equilibrium
 from femsense.fem.mesh import to_linear
+from femsense.loop import conclude
+from femsense.loop.conclude import Search
 from femsense.loop.data import Data, prepare
 from femsense.loop.joint import JointProblem
 from femsense.loop.noise import Noise
@@ -89,3 +91,15 @@ def test_a_step_that_is_not_taken_leaves_no_state_behind() -> None:
     np.testing.assert_allclose(problem.evaluate(far, True)[0], there, atol=0.05)  # taken after all: solved to the last
     assert not any(kept[k].positions is x for k, x in before.items())
     np.testing.assert_allclose(problem.evaluate(theta, True)[0], at, atol=1e-3)
+
+
+def test_a_model_without_equilibrium_is_not_handed_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    def collapses(*_: object, **__: object) -> Stage:
+        raise DataError("no equilibrium in frame 3")
+
+    data, stage = staged(arm((4, 2, 2)), 1.0)
+    search = Search(stage, [("", stage)], stage, NOISE, 10.0, [], [], [], None)
+    monkeypatch.setattr(conclude, "keeping", collapses)
+    assert conclude._worth_handing_back(data, search, ["stiffness"], ["stiffness"]) == ([], stage)
+    chain = conclude._chain(data, search, ["stiffness"], ["stiffness"], stage, {})
+    assert [c["validation_rms_after_m"] for c in chain] == [stage.held_rms]

@@ -9,6 +9,7 @@ import numpy as np
 
 from femsense.arrays import FloatArray
 from femsense.effects import Entry, apply_effects
+from femsense.errors import FemsenseError
 from femsense.loop.advice import next_element
 from femsense.loop.data import Data
 from femsense.loop.evidence import gather
@@ -115,7 +116,7 @@ def _worth_handing_back(data: Data, search: Search, promoted: list[str], names: 
     from the last one on, what would make the error on held-out data larger than it was, or goes to the edge of what is plausible."""
     while names:
         back = _handed_back(data, search.final, names, search.noise)
-        if not at_edge(back.fit) and _holds_out(data, search, back):
+        if back is not None and not at_edge(back.fit) and _holds_out(data, search, back):
             return names, back
         names = names[:-1]
     return [], search.before
@@ -129,11 +130,15 @@ def _holds_out(data: Data, search: Search, back: Stage) -> bool:
     return worse <= NOISY and held_chi2(data, search.before, search.noise) - held_chi2(data, back, search.noise) > EVIDENCE
 
 
-def _handed_back(data: Data, final: Stage, names: list[str], noise: Noise) -> Stage:
+def _handed_back(data: Data, final: Stage, names: list[str], noise: Noise) -> Stage | None:
+    """Return the fit of some names alone; None where it has no equilibrium in some state."""
     settled = [effect.name for effect, _ in final.fit.hypothesis.settled]
     if set(final.fit.hypothesis.names) <= {*names, *settled}:
         return final
-    return keeping(data, final, names, noise)
+    try:
+        return keeping(data, final, names, noise)
+    except FemsenseError:
+        return None
 
 
 def _entries(stage: Stage, names: list[str]) -> list[Entry]:
@@ -155,8 +160,7 @@ def _chain(
     stages = dict(search.history)
     errors = []
     for i in range(len(promoted)):
-        alone = promoted[: i + 1] != [n for n in stages[""].fit.hypothesis.names]
-        stage = keeping(data, stages[""], promoted[: i + 1], search.noise) if alone else stages[""]
+        stage = _handed_back(data, stages[""], promoted[: i + 1], search.noise) or stages[""]
         errors.append(stage.held_rms)
     errors += [stages[name].held_rms for name in names[len(promoted) :]]
     if errors:

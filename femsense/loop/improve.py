@@ -17,6 +17,7 @@ import numpy as np
 
 from femsense.calib.forward import Hypothesis
 from femsense.effects import EFFECTS, FORMS, Effect, find_effect, load_own_effect
+from femsense.errors import FemsenseError
 from femsense.loop.conclude import Search, conclude
 from femsense.loop.data import Data, prepare
 from femsense.loop.grow import Progress, grow, mesh_cost, moved_by, prune
@@ -94,9 +95,11 @@ def _calibrated(data: Data, say: Progress) -> tuple[Data, Stage, Stage]:
         base = make_stage(data, hypothesis, prior, noise, base.fit.coordinates, own=own_of(base))
         before = _declared(data, noise, before)
     say("asking what the mesh costs")
-    plain = keeping(data, base, ["stiffness"], noise, max_iterations=ROUGHLY)  # zeros may have gone far, for an effect's sake
-    data = with_mesh_errors(data, plain)
-    return data, before, base
+    try:  # zeros may have gone far, for an effect's sake
+        plain = keeping(data, base, ["stiffness"], noise, max_iterations=ROUGHLY)
+    except FemsenseError:
+        plain = base
+    return with_mesh_errors(data, plain), before, base
 
 
 def _declared(data: Data, noise: Noise, start: Stage | None) -> Stage:
