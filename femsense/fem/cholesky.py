@@ -22,7 +22,17 @@ from numba.extending import get_cython_function_address, intrinsic
 from scipy.sparse.linalg import splu
 
 from femsense.arrays import BoolArray, FloatArray, IntArray
-from femsense.fem.tiles import PADDING, WIDE, add_run, subtract_and_solve, subtract_product
+from femsense.fem.tiles import (
+    PADDING,
+    WIDE,
+    add_run,
+    subtract_and_solve,
+    subtract_product,
+    subtract_six_columns,
+    subtract_six_dots,
+    subtract_three_columns,
+    subtract_three_dots,
+)
 
 FEW = 4
 """Right-hand sides that are solved one by one; more go through BLAS together."""
@@ -564,65 +574,69 @@ def _solve_one(
     half: FloatArray,
 ) -> None:
     """Solve in place for one right-hand side in the order of elimination."""
-    count = len(firsts) - 1
-    for s in range(count):
+    width, base, y = L.itemsize, L.ctypes.data, half.ctypes.data
+    for s in range(len(firsts) - 1):
         c0, columns = unit * firsts[s], unit * (firsts[s + 1] - firsts[s])
-        rest = unit * (begin[s + 1] - begin[s])
-        height = columns + rest
-        total = half[:height]
-        total[:columns] = x[c0 : c0 + columns]
-        total[columns:] = 0.0
-        triples = columns - columns % 3
-        for j in range(0, triples, 3):
+        height = columns + unit * (begin[s + 1] - begin[s])
+        for i in range(columns):
+            half[i] = x[c0 + i]
+        for i in range(columns, height):
+            half[i] = 0.0
+        j = 0
+        while j < columns:
+            size = 6 if columns - j >= 6 else 3 if columns - j >= 3 else 1
+            at, after = offset[s] + j * height + j, j + size
+            for k in range(size):
+                value = half[j + k] / L[at + k * height + k]
+                half[j + k] = value
+                for i in range(k + 1, size):
+                    half[j + i] -= L[at + k * height + i] * value
+            column, to, left = base + width * (at + size), y + width * after, height - after
+            if size == 6:
+                subtract_six_columns(L, column, height, y + width * j, to, left)
+            elif size == 3:
+                subtract_three_columns(L, column, height, y + width * j, to, left)
+            else:
+                for i in range(after, height):
+                    half[i] -= L[at + i - j] * half[j]
+            j = after
+        for i in range(columns):
+            x[c0 + i] = half[i]
+        for q in range(begin[s + 1] - begin[s]):
+            to = unit * below[begin[s] + q]
+            for a in range(unit):
+                x[to + a] += half[columns + unit * q + a]
+    for s in range(len(firsts) - 2, -1, -1):
+        c0, columns = unit * firsts[s], unit * (firsts[s + 1] - firsts[s])
+        height = columns + unit * (begin[s + 1] - begin[s])
+        for i in range(columns):
+            half[i] = x[c0 + i]
+        for q in range(begin[s + 1] - begin[s]):
+            to = unit * below[begin[s] + q]
+            for a in range(unit):
+                half[columns + unit * q + a] = x[to + a]
+        after = columns
+        while after > 0:
+            size = 6 if after >= 6 else 3 if after >= 3 else 1
+            j = after - size
             at = offset[s] + j * height + j
-            u = total[j] / L[at]
-            v = (total[j + 1] - L[at + 1] * u) / L[at + height + 1]
-            w = (total[j + 2] - L[at + 2] * u - L[at + height + 2] * v) / L[at + 2 * height + 2]
-            total[j], total[j + 1], total[j + 2] = u, v, w
-            left, size = total[j + 3 : height], height - j - 3
-            first, second, third = L[at + 3 : at + 3 + size], L[at + height + 3 :][:size], L[at + 2 * height + 3 :][:size]
-            for i in range(size):
-                left[i] -= first[i] * u + second[i] * v + third[i] * w
-        for j in range(triples, columns):
-            line, left = L[offset[s] + j * height + j : offset[s] + (j + 1) * height], total[j:]
-            value = left[0] / line[0]
-            for i in range(len(line)):
-                left[i] -= line[i] * value
-            left[0] = value
-        x[c0 : c0 + columns] = total[:columns]
-        for q in range(begin[s + 1] - begin[s]):
-            to = unit * below[begin[s] + q]
-            for a in range(unit):
-                x[to + a] += total[columns + unit * q + a]
-    for s in range(count - 1, -1, -1):
-        c0, columns = unit * firsts[s], unit * (firsts[s + 1] - firsts[s])
-        rest = unit * (begin[s + 1] - begin[s])
-        height = columns + rest
-        total = half[:height]
-        total[:columns] = x[c0 : c0 + columns]
-        for q in range(begin[s + 1] - begin[s]):
-            to = unit * below[begin[s] + q]
-            for a in range(unit):
-                total[columns + unit * q + a] = x[to + a]
-        triples = columns - columns % 3
-        for j in range(columns - 1, triples - 1, -1):
-            line, left = L[offset[s] + j * height + j + 1 : offset[s] + (j + 1) * height], total[j + 1 :]
-            known = L[0] * 0
-            for i in range(len(line)):
-                known += line[i] * left[i]
-            total[j] = (total[j] - known) / L[offset[s] + j * height + j]
-        for j in range(triples - 3, -1, -3):
-            at, left, size = offset[s] + j * height + j, total[j + 3 : height], height - j - 3
-            first, second, third = L[at + 3 : at + 3 + size], L[at + height + 3 :][:size], L[at + 2 * height + 3 :][:size]
-            u, v, w = total[j], total[j + 1], total[j + 2]
-            for i in range(size):
-                u -= first[i] * left[i]
-                v -= second[i] * left[i]
-                w -= third[i] * left[i]
-            w /= L[at + 2 * height + 2]
-            v = (v - L[at + height + 2] * w) / L[at + height + 1]
-            total[j], total[j + 1], total[j + 2] = (u - L[at + 1] * v - L[at + 2] * w) / L[at], v, w
-        x[c0 : c0 + columns] = total[:columns]
+            column, to, left = base + width * (at + size), y + width * after, height - after
+            if size == 6:
+                subtract_six_dots(L, column, height, y + width * j, to, left)
+            elif size == 3:
+                subtract_three_dots(L, column, height, y + width * j, to, left)
+            else:
+                known = L[0] * 0
+                for i in range(after, height):
+                    known += L[at + i - j] * half[i]
+                half[j] -= known
+            for k in range(size - 1, -1, -1):
+                for i in range(k + 1, size):
+                    half[j + k] -= L[at + k * height + i] * half[j + i]
+                half[j + k] /= L[at + k * height + k]
+            after = j
+        for i in range(columns):
+            x[c0 + i] = half[i]
 
 
 @njit(cache=True, nogil=True)

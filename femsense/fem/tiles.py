@@ -23,6 +23,8 @@ REGISTERS = 3 if BYTES == 64 else 2
 PADDING = 4 * BYTES
 """Entries that may be read beyond the end of a matrix."""
 INTEGER = ir.IntType(64)
+LANES = 8
+"""Elements that `add_gradient` and `add_divergence` work on at once."""
 
 
 @intrinsic
@@ -268,5 +270,153 @@ def _run_function(module: Any, like: Any) -> Any:
     at.add_incoming(at_next, loop)
     builder.cbranch(builder.icmp_signed(">", left_next, _number(0)), loop, end)
     builder.position_at_end(end)
+    builder.ret_void()
+    return function
+
+
+@intrinsic
+def add_gradient(context: Any, like: Any, to: Any, x: Any, slopes: Any, count: Any) -> Any:
+    """Add Σ_a x_ai g_aj to nine rows (i, j) of eight numbers at the address `to`: x of three rows of eight a node, g too but in single precision."""
+    del context
+
+    def build(target: Any, builder: Any, signature: Any, values: Any) -> Any:
+        builder.call(_lane_function(builder.module, "gradient"), values[1:])
+        return target.get_dummy_value()
+
+    return types.void(like, *[types.int64] * 4), build
+
+
+@intrinsic
+def add_divergence(context: Any, like: Any, to: Any, stress: Any, slopes: Any, count: Any) -> Any:
+    """Add Σ_j p_ij g_aj to three rows (i) of eight numbers a node at `to`, p being nine rows (i, j)."""
+    del context
+
+    def build(target: Any, builder: Any, signature: Any, values: Any) -> Any:
+        builder.call(_lane_function(builder.module, "divergence"), values[1:])
+        return target.get_dummy_value()
+
+    return types.void(like, *[types.int64] * 4), build
+
+
+def _lane_function(module: Any, name: str) -> Any:
+    """Return the function of a loop over nodes: nine products each, eight elements at once."""
+    function, known = _function(module, f"femsense_{name}", 4)
+    if known:
+        return function
+    wide, narrow = ir.VectorType(ir.DoubleType(), 8), ir.VectorType(ir.FloatType(), 8)
+    multiply_add = _declared(module, "llvm.fmuladd.v8f64", wide, [wide] * 3)
+    builder = ir.IRBuilder(function.append_basic_block("entry"))
+    to, other, slopes, count = function.args
+    entry, loop, end = builder.block, function.append_basic_block("loop"), function.append_basic_block("end")
+    fixed = to if name == "gradient" else other
+    nine = [builder.load(_at(builder, fixed, _number(64 * k), wide), align=8) for k in range(9)]
+    builder.branch(loop)
+    builder.position_at_end(loop)
+    node = builder.phi(INTEGER)
+    node.add_incoming(_number(0), entry)
+    sums = []
+    if name == "gradient":
+        for value in nine:
+            sums.append(builder.phi(wide))
+            sums[-1].add_incoming(value, entry)
+    place, slope = builder.mul(node, _number(192)), builder.add(slopes, builder.mul(node, _number(96)))
+    g = [builder.fpext(builder.load(_at(builder, slope, _number(32 * j), narrow), align=4), wide) for j in range(3)]
+    row = builder.add(other if name == "gradient" else to, place)
+    results = []
+    for i in range(3):
+        pointer = _at(builder, row, _number(64 * i), wide)
+        value = builder.load(pointer, align=8)
+        if name == "gradient":
+            results += [builder.call(multiply_add, [value, g[j], sums[3 * i + j]]) for j in range(3)]
+            continue
+        for j in range(3):
+            value = builder.call(multiply_add, [nine[3 * i + j], g[j], value])
+        builder.store(value, pointer, align=8)
+    following = builder.add(node, _number(1))
+    node.add_incoming(following, loop)
+    for phi, value in zip(sums, results):
+        phi.add_incoming(value, loop)
+    builder.cbranch(builder.icmp_signed("<", following, count), loop, end)
+    builder.position_at_end(end)
+    for k, value in enumerate(results):
+        builder.store(value, _at(builder, to, _number(64 * k), wide), align=8)
+    builder.ret_void()
+    return function
+
+
+def _columns(name: str, count: int) -> Any:
+    """Return the intrinsic of `subtract_columns` or `subtract_dots` for so many columns."""
+
+    @intrinsic
+    def columns(context: Any, like: Any, a: Any, step: Any, x: Any, y: Any, rows: Any) -> Any:
+        del context
+
+        def build(target: Any, builder: Any, signature: Any, values: Any) -> Any:
+            builder.call(_column_function(builder.module, name, like, count), values[1:])
+            return target.get_dummy_value()
+
+        return types.void(like, *[types.int64] * 5), build
+
+    return columns
+
+
+subtract_three_columns, subtract_six_columns = _columns("columns", 3), _columns("columns", 6)
+"""(like, a, step, x, y, rows): y −= A x for a matrix of three or six columns, `step` apart."""
+subtract_three_dots, subtract_six_dots = _columns("dots", 3), _columns("dots", 6)
+"""(like, a, step, x, y, rows): x −= Aᵀ y."""
+
+
+def _column_function(module: Any, name: str, like: Any, count: int) -> Any:
+    """Return the function that goes down a few columns, a register at a time."""
+    letter, kind, lanes = _kind(like)
+    function, known = _function(module, f"femsense_{name}_{letter}{count}", 5)
+    if known:
+        return function
+    vector, size, width = ir.VectorType(kind, lanes), BYTES // lanes, ir.IntType(32)
+    builder = ir.IRBuilder(function.append_basic_block("entry"))
+    a, step, x, y, rows = function.args
+    multiply_add = _declared(module, f"llvm.fmuladd.v{lanes}{'f64' if letter == 'd' else 'f32'}", vector, [vector] * 3)
+    load, store = _masked(builder, kind, lanes)
+    align, nothing = ir.Constant(width, size), ir.Constant(vector, [0.0] * lanes)
+    columns = [builder.add(a, builder.mul(step, _number(size * k))) for k in range(count)]
+    factors = [builder.load(_at(builder, x, _number(size * k), kind), align=size) for k in range(count)]
+    spread = [_spread(builder, builder.fneg(factor), lanes) for factor in factors] if name == "columns" else []
+    entry, loop, end = builder.block, function.append_basic_block("loop"), function.append_basic_block("end")
+    builder.cbranch(builder.icmp_signed(">", rows, _number(0)), loop, end)
+    builder.position_at_end(loop)
+    left, offset = builder.phi(INTEGER), builder.phi(INTEGER)
+    left.add_incoming(rows, entry)
+    offset.add_incoming(_number(0), entry)
+    sums = [builder.phi(vector) for _ in range(count if name == "dots" else 0)]
+    mask, pointer = _mask(builder, left, 0, lanes), _at(builder, y, offset, vector)
+    value = builder.call(load, [pointer, align, mask, nothing])
+    results = []
+    for k in range(count):
+        part = builder.call(load, [_at(builder, columns[k], offset, vector), align, mask, nothing])
+        if name == "columns":
+            value = builder.call(multiply_add, [part, spread[k], value])
+        else:
+            results.append(builder.call(multiply_add, [part, value, sums[k]]))
+    if name == "columns":
+        builder.call(store, [value, pointer, align, mask])
+    left_next, offset_next = builder.sub(left, _number(lanes)), builder.add(offset, _number(BYTES))
+    left.add_incoming(left_next, loop)
+    offset.add_incoming(offset_next, loop)
+    for phi, result in zip(sums, results):
+        phi.add_incoming(nothing, entry)
+        phi.add_incoming(result, loop)
+    builder.cbranch(builder.icmp_signed(">", left_next, _number(0)), loop, end)
+    builder.position_at_end(end)
+    if name == "dots":
+        ending = f"v{lanes}f{64 if letter == 'd' else 32}"
+        add = _declared(module, f"llvm.vector.reduce.fadd.{ending}", kind, [kind, vector])
+        for k in range(count):
+            total = builder.phi(vector)
+            total.add_incoming(nothing, entry)
+            total.add_incoming(results[k], loop)
+            sums[k] = total
+        for k in range(count):
+            whole = builder.call(add, [ir.Constant(kind, -0.0), sums[k]], fastmath=("reassoc",))
+            builder.store(builder.fsub(factors[k], whole), _at(builder, x, _number(size * k), kind), align=size)
     builder.ret_void()
     return function

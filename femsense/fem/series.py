@@ -1,0 +1,427 @@
+# mypy: allow-untyped-decorators
+"""Equilibria along a path of loads as a power series: the nonlinear answer of a body, from one factor.
+
+Where the loads move on a straight line, from those that hold x₀ (s = 0) to others (s = 1), the state is x(s) = x₀ + s x₁ + s² x₂ + …,
+and each term follows from the ones before by one solve with the tangent K of x₀ (asymptotic numerical method; Cochelin, Damil &
+Potier-Ferry 1994):
+
+    K x_{N+1} = g_N,    g_N = Σ_{n ≤ N+1} of the coefficients of the unbalanced force, with x_{N+1} = 0.
+
+The sum over all orders hands what a solve in single precision has missed on to the next term. A correction with a kept factor takes the
+force of x₀ + x₁ as a whole instead: a slender body that turns by ω is stretched by |ω|²/2 there, and the force of that, which the second
+term takes back, has a part across the body that the factor reads as a large motion. Term by term this cancels.
+
+Coefficients of the corotational element: F = R₀ F̂ and R = R₀ A with A = I + s A₁ + …, A_n = [a_n]ₓ + M_n. AᵀA = I gives
+
+    M₂ = (a₁a₁ᵀ − |a₁|² I)/2,    M₃ = (a₁a₂ᵀ + a₂a₁ᵀ)/2 − a₁·a₂ I    (M₁ = 0),
+
+and that S = AᵀF̂ be symmetric, with S₀ = R₀ᵀF₀ and B = F̂_n + M_n S₀ + Σ_{0<k<n} A_kᵀ F̂_{n−k}:
+
+    (tr(S₀) I − S₀) a_n = axial(B − Bᵀ),    θ_n = tr B,    P_n = R₀ (2μ (F̂_n − A_n) + Σ_k p_k A_{n−k}),
+
+p as in `corotational`. Elements are worked on eight at a time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from femsense.arrays import FloatArray, IntArray
+from femsense.fem.assembly import internal
+from femsense.fem.body import BodyModel
+from femsense.fem.cables import add_cable_stiffness, pull_rows
+from femsense.fem.cholesky import Cholesky, cholesky
+from femsense.fem.corotational import FAST, LOCAL, closest_rotation
+from femsense.fem.tiles import LANES, add_divergence, add_gradient
+
+ROWS = 54
+"""Rows of LANES numbers that a point takes: 0–8 F₁, then F̂₁ + F̂₂, then a stress; 9–17 F₂; 18–26 a₁, a₂, a₃; 27–30 θ₀ … θ₃; 31–34 their means; 35–49 R₀
+and S₀; 50–53 volume, λ', λ − λ', 2μ. One array with fixed places for all of them lets a compiler
+see that they are apart, so that it takes the eight elements at once."""
+MEMORY = 3
+"""Equilibria whose stretches are kept."""
+RIDGE = 1e-4
+"""Share of the squared distance of states that is added where weights for them are looked for."""
+TERMS = 3
+"""Terms of a series at most."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Lanes:
+    """The elements of a mesh in groups of LANES, the element being the last axis; elements of no volume fill the last group up."""
+
+    nodes: IntArray
+    """shape (g, a, LANES)."""
+    gradients: FloatArray
+    """Single precision, shape (g, q, 3 a, LANES)."""
+    constants: FloatArray
+    """Volumes of the points, λ', λ − λ' and 2μ, shape (g, q + 3, LANES)."""
+    frames: FloatArray
+    """R₀ (nine rows) and S₀ (00 01 02 11 12 22) at the start of the series, shape (g, q, 15 LANES)."""
+
+
+class Expansion:
+    """A state of a body from which others follow as series: cables under given tensions, a rigid clamp.
+
+    Laws without a series of their own have two terms, the second being the correction with the factor of x₀.
+    """
+
+    def __init__(self, body: BodyModel, *, single: bool) -> None:
+        """Prepare for a body; `single` keeps the factor in single precision."""
+        self.body, self._single = body, single
+        self.is_series = body.material.law == "corotational"
+        self._lanes = _lanes(body) if self.is_series else None
+        self._blocks = np.zeros((len(body.stencil.block_columns), 9), np.float32 if single else np.float64)
+        self._source = np.asarray(body.free_map.source[body.free_map.pattern.analysis().source], dtype=np.int32)
+        self.positions = body.mesh.nodes
+        self.factor: Cholesky | None = None
+        self.unbalanced = np.zeros_like(self.positions)
+        """What the last term answered to [N], shape (n, 3)."""
+        self._tension, self._held = np.zeros(len(body.cables)), np.zeros_like(self.positions)
+        keeps = body.mesh.is_quadratic and self._lanes is not None
+        self._room = np.zeros((len(body.mesh.tets), 4, 9)) if keeps else None
+        self._stretches: list[tuple[FloatArray, FloatArray]] = []  # of the last equilibria that were learnt
+
+    def learn(self, x: FloatArray) -> None:
+        """Keep the stretches of an equilibrium x: their stress serves the stiffness of starts to come."""
+        if self._room is not None:
+            stretch = self._stretches.pop(0)[1] if len(self._stretches) == MEMORY else np.empty_like(self._room)
+            internal(self.body, x, tangent=False, stretch=stretch)
+            self._stretches.append((x, stretch))
+
+    def forget(self) -> None:
+        """Forget what was learnt, after a leap."""
+        self._stretches = []
+
+    def move(self, x: FloatArray, tension: FloatArray) -> bool:
+        """Start from node positions x [m] and tensions [N], shape (a,); return whether the stiffness is positive definite there."""
+        body, blocks = self.body, self._blocks
+        stretch = None
+        if self._room is not None and self._stretches:
+            weights = combination(x, [state for state, _ in self._stretches])
+            stretch = np.einsum("k,keqi->eqi", weights, np.array([s for _, s in self._stretches]), out=self._room)
+        here = internal(body, x, room=blocks, stretch=stretch)
+        add_cable_stiffness(body, x, tuple(np.full(len(c.path), t) for c, t in zip(body.cables, tension)), blocks)
+        self.factor = None  # its memory serves the next one
+        self.factor = cholesky(body.free_map.pattern.analysis(), blocks.ravel(), single=self._single, source=self._source)
+        self.positions, self._tension = x, tension.copy()
+        self._held = -here.forces
+        if len(tension):
+            self._held += (tension @ pull_rows(body, x)).reshape(-1, 3)
+        if self._lanes is not None:
+            _frames(_read_only(x), self._lanes.nodes, self._lanes.gradients, self._lanes.frames)
+        return self.factor is not None
+
+    def terms(self, tension: FloatArray, loads: FloatArray) -> Iterator[FloatArray]:
+        """Yield x₁, x₂ and x₃ [m], shape (n, 3), for tensions [N] and dead loads [N], shape (n, 3)."""
+        assert self.factor is not None
+        count, free = TERMS if self._lanes is not None else 2, self.body.free_map.dofs
+        terms = np.zeros((count, *self.positions.shape))
+        for n in range(count):
+            self.unbalanced.reshape(-1)[free] = self._forces(terms[:n], tension, loads).ravel()[free]
+            terms[n].reshape(-1)[free] = self.factor.solve(self.unbalanced.ravel()[free])
+            yield terms[n]
+
+    def _forces(self, terms: FloatArray, tension: FloatArray, loads: FloatArray) -> FloatArray:
+        """Return g_N [N], shape (n, 3)."""
+        x, lanes, force = _read_only(self.positions), self._lanes, np.zeros_like(self.positions)
+        if lanes is None and len(terms):
+            there = self.positions + terms[0]
+            pull = (tension @ pull_rows(self.body, there)).reshape(-1, 3) if len(tension) else 0.0
+            return np.asarray(loads + pull - internal(self.body, there, tangent=False).forces)
+        if lanes is not None and len(terms):
+            series_forces(terms, lanes.nodes, lanes.gradients, lanes.constants, lanes.frames, force)
+        force = loads + self._held - force
+        for cable, before, after in zip(self.body.cables, self._tension, tension):
+            cable_series(cable.path.nodes, cable.path.weights, cable.pull_point, x, terms, before, after - before, force)
+        return force
+
+
+def combination(x: FloatArray, states: list[FloatArray]) -> FloatArray:
+    """Return weights of sum 1 by which states [m] come nearest to x, shape (k,): what is smooth in the state is carried on by them.
+
+    Least squares from the last state on; RIDGE keeps weights small where the states lie almost in a line or a plane.
+    """
+    ways = np.array([(state - states[-1]).ravel() for state in states[:-1]]).reshape(len(states) - 1, x.size)
+    gram = ways @ ways.T
+    gram += RIDGE * np.eye(len(gram)) * np.trace(gram) / max(len(gram), 1)
+    weights = np.linalg.lstsq(gram, ways @ (x - states[-1]).ravel(), rcond=None)[0]
+    weights *= min(1.0, 4.0 / max(float(np.abs(weights).sum()), 1e-300))
+    return np.append(weights, 1.0 - weights.sum())
+
+
+def _read_only(x: FloatArray) -> FloatArray:
+    view = np.ascontiguousarray(x).view()
+    view.flags.writeable = False  # one compiled kernel, whether the caller's array can be written to or not
+    return view
+
+
+def _lanes(body: BodyModel) -> Lanes:
+    stencil, (mu, lam) = body.stencil, body.material.lame()
+    count, points = stencil.volumes.shape
+    groups, local = -(-count // LANES), np.minimum(lam, LOCAL * mu)
+    which = np.concatenate([np.arange(count), np.zeros(groups * LANES - count, dtype=np.int64)])
+
+    def grouped(values: Any) -> Any:
+        return np.ascontiguousarray(np.moveaxis(values[which].reshape(groups, LANES, *values.shape[1:]), 1, -1))
+
+    constants = grouped(np.column_stack([stencil.volumes, local, lam - local, 2.0 * mu]))
+    constants[-1, :points, LANES - (groups * LANES - count) :] = 1e-300
+    gradients = stencil.gradients.transpose(0, 1, 3, 2).reshape(count, points, -1).astype(np.float32)
+    return Lanes(grouped(stencil.tets), grouped(gradients), constants, np.zeros((groups, points, 15 * LANES)))
+
+
+@njit(cache=True, fastmath=FAST, error_model="numpy")
+def _frames(x, nodes, gradients, frames):  # type: ignore[no-untyped-def]
+    """Write rotations and stretches of all points."""
+    groups, points, count = gradients.shape[0], gradients.shape[1], gradients.shape[2] // 3
+    F, R, X = np.empty((9, LANES)), np.empty((9, LANES)), np.zeros((count, 3, LANES))
+    for e in range(groups):
+        for a in range(count):
+            for q in range(LANES):
+                for i in range(3):
+                    X[a, i, q] = x[nodes[e, a, q], i]
+        for p in range(points):
+            F[:] = 0.0
+            add_gradient(F, F.ctypes.data, X.ctypes.data, gradients.ctypes.data + 12 * (e * points + p) * count * LANES, count)
+            out = frames[e, p]
+            for q in range(LANES):
+                closest_rotation(F, R, q)
+                row = 9
+                for i in range(3):
+                    for j in range(3):
+                        out[(3 * i + j) * LANES + q] = R[3 * i + j, q]
+                    for j in range(i, 3):
+                        out[row * LANES + q] = R[i, q] * F[j, q] + R[3 + i, q] * F[3 + j, q] + R[6 + i, q] * F[6 + j, q]
+                        row += 1
+
+
+@njit(cache=True, fastmath=FAST, error_model="numpy")
+def _turn(w):  # type: ignore[no-untyped-def]
+    """Find how the points of LANES elements turn: F₁, F₂ → F̂₁ + F̂₂, a₁, a₂, a₃ and θ₀ … θ₃, in the rows that `ROWS` names."""
+    for q in range(LANES):
+        r0, r1, r2, r3, r4, r5, r6, r7, r8 = (
+            w[280 + q],
+            w[288 + q],
+            w[296 + q],
+            w[304 + q],
+            w[312 + q],
+            w[320 + q],
+            w[328 + q],
+            w[336 + q],
+            w[344 + q],
+        )
+        f0, f1, f2 = w[q], w[8 + q], w[16 + q]
+        f3, f4, f5 = w[24 + q], w[32 + q], w[40 + q]
+        f6, f7, f8 = w[48 + q], w[56 + q], w[64 + q]
+        u0, u1, u2 = r0 * f0 + r3 * f3 + r6 * f6, r0 * f1 + r3 * f4 + r6 * f7, r0 * f2 + r3 * f5 + r6 * f8
+        u3, u4, u5 = r1 * f0 + r4 * f3 + r7 * f6, r1 * f1 + r4 * f4 + r7 * f7, r1 * f2 + r4 * f5 + r7 * f8
+        u6, u7, u8 = r2 * f0 + r5 * f3 + r8 * f6, r2 * f1 + r5 * f4 + r8 * f7, r2 * f2 + r5 * f5 + r8 * f8
+        f0, f1, f2 = w[72 + q], w[80 + q], w[88 + q]
+        f3, f4, f5 = w[96 + q], w[104 + q], w[112 + q]
+        f6, f7, f8 = w[120 + q], w[128 + q], w[136 + q]
+        v0, v1, v2 = r0 * f0 + r3 * f3 + r6 * f6, r0 * f1 + r3 * f4 + r6 * f7, r0 * f2 + r3 * f5 + r6 * f8
+        v3, v4, v5 = r1 * f0 + r4 * f3 + r7 * f6, r1 * f1 + r4 * f4 + r7 * f7, r1 * f2 + r4 * f5 + r7 * f8
+        v6, v7, v8 = r2 * f0 + r5 * f3 + r8 * f6, r2 * f1 + r5 * f4 + r8 * f7, r2 * f2 + r5 * f5 + r8 * f8
+        s0, s1, s2, s4, s5, s8 = w[352 + q], w[360 + q], w[368 + q], w[376 + q], w[384 + q], w[392 + q]
+        trace = s0 + s4 + s8
+        d00, d11, d22 = s4 + s8, s0 + s8, s0 + s4
+        i0, i1, i2 = d11 * d22 - s5 * s5, s2 * s5 + s1 * d22, s1 * s5 + s2 * d11
+        det = 1.0 / (d00 * i0 - s1 * i1 - s2 * i2)
+        i0, i1, i2 = i0 * det, i1 * det, i2 * det
+        i3, i4, i5 = (d00 * d22 - s2 * s2) * det, (s1 * s2 + d00 * s5) * det, (d00 * d11 - s1 * s1) * det
+        x, y, z = u7 - u5, u2 - u6, u3 - u1  # first order
+        a, b, c = i0 * x + i1 * y + i2 * z, i1 * x + i3 * y + i4 * z, i2 * x + i4 * y + i5 * z
+        t1 = u0 + u4 + u8
+        sa, sb, sc = s0 * a + s1 * b + s2 * c, s1 * a + s4 * b + s5 * c, s2 * a + s5 * b + s8 * c
+        # second: B = F̂₂ + M₂ S₀ − [a₁] F̂₁, M₂ = (a₁a₁ᵀ − |a₁|² I) / 2
+        x2, y2, z2 = v7 - v5 - 0.5 * (b * sc - c * sb), v2 - v6 - 0.5 * (c * sa - a * sc), v3 - v1 - 0.5 * (a * sb - b * sa)
+        x2 -= t1 * a - (u0 * a + u1 * b + u2 * c)
+        y2 -= t1 * b - (u3 * a + u4 * b + u5 * c)
+        z2 -= t1 * c - (u6 * a + u7 * b + u8 * c)
+        d, e, o = i0 * x2 + i1 * y2 + i2 * z2, i1 * x2 + i3 * y2 + i4 * z2, i2 * x2 + i4 * y2 + i5 * z2
+        t2 = v0 + v4 + v8
+        square = a * a + b * b + c * c
+        w[216 + q] = trace - 3.0
+        w[224 + q] = t1
+        w[232 + q] = t2 + 0.5 * (a * sa + b * sb + c * sc - square * trace) + a * x + b * y + c * z
+        # third: B = M₃ S₀ − [a₁] F̂₂ − [a₂] F̂₁ + M₂ F̂₁, M₃ = (a₁a₂ᵀ + a₂a₁ᵀ) / 2 − (a₁·a₂) I
+        sd, se, sf = s0 * d + s1 * e + s2 * o, s1 * d + s4 * e + s5 * o, s2 * d + s5 * e + s8 * o
+        ua, ub, uc = u0 * a + u3 * b + u6 * c, u1 * a + u4 * b + u7 * c, u2 * a + u5 * b + u8 * c  # F̂₁ᵀ a₁
+        x3 = (
+            -0.5 * (b * sf - c * se + e * sc - o * sb)
+            - (t2 * a - (v0 * a + v1 * b + v2 * c))
+            - (t1 * d - (u0 * d + u1 * e + u2 * o))
+        )
+        y3 = (
+            -0.5 * (c * sd - a * sf + o * sa - d * sc)
+            - (t2 * b - (v3 * a + v4 * b + v5 * c))
+            - (t1 * e - (u3 * d + u4 * e + u5 * o))
+        )
+        z3 = (
+            -0.5 * (a * se - b * sd + d * sb - e * sa)
+            - (t2 * c - (v6 * a + v7 * b + v8 * c))
+            - (t1 * o - (u6 * d + u7 * e + u8 * o))
+        )
+        x3 -= 0.5 * (b * uc - c * ub + square * x)
+        y3 -= 0.5 * (c * ua - a * uc + square * y)
+        z3 -= 0.5 * (a * ub - b * ua + square * z)
+        w[144 + q], w[152 + q], w[160 + q] = a, b, c
+        w[168 + q], w[176 + q], w[184 + q] = d, e, o
+        w[192 + q] = i0 * x3 + i1 * y3 + i2 * z3
+        w[200 + q] = i1 * x3 + i3 * y3 + i4 * z3
+        w[208 + q] = i2 * x3 + i4 * y3 + i5 * z3
+        dot = a * d + b * e + c * o
+        w[240 + q] = (
+            (a * sd + b * se + c * sf) - dot * trace + a * (v7 - v5) + b * (v2 - v6) + c * (v3 - v1) + d * x + e * y + o * z
+        )
+        w[240 + q] += 0.5 * (a * ua + b * ub + c * uc - square * t1)
+        w[q], w[8 + q], w[16 + q], w[24 + q], w[32 + q], w[40 + q], w[48 + q], w[56 + q], w[64 + q] = (
+            u0 + v0, u1 + v1, u2 + v2, u3 + v3, u4 + v4, u5 + v5, u6 + v6, u7 + v7, u8 + v8
+        )  # fmt: skip
+
+
+@njit(cache=True, fastmath=FAST, error_model="numpy")
+def _stress(w, last):  # type: ignore[no-untyped-def]
+    """Turn F̂₁ + F̂₂ into R₀ Σ P_n of the orders 1 … last (2 or 3) times the volume, in the same rows."""
+    third = 1.0 if last == 3 else 0.0
+    for q in range(LANES):
+        a, b, c, d, e, o = w[144 + q], w[152 + q], w[160 + q], w[168 + q], w[176 + q], w[184 + q]
+        x, y, z = third * w[192 + q], third * w[200 + q], third * w[208 + q]
+        bulk, rest, m = w[408 + q], w[416 + q], w[424 + q]
+        p0, p1 = bulk * w[216 + q] + rest * w[248 + q], bulk * w[224 + q] + rest * w[256 + q]
+        p2, p3 = bulk * w[232 + q] + rest * w[264 + q], third * (bulk * w[240 + q] + rest * w[272 + q])
+        one, two, three = p0 + p1 - m, p0 + third * p1 - m, third * (p0 - m)
+        one += third * p2
+        k, g, h = one * a + two * d + three * x, one * b + two * e + three * y, one * c + two * o + three * z
+        # symmetric: two M₂ + three M₃
+        half, dot = 0.5 * two, a * d + b * e + c * o
+        spread = p1 + p2 + p3 - half * (a * a + b * b + c * c) - three * dot
+        m00, m11, m22 = (
+            half * a * a + three * a * d + spread,
+            half * b * b + three * b * e + spread,
+            half * c * c + three * c * o + spread,
+        )
+        m01 = half * a * b + 0.5 * three * (a * e + b * d)
+        m02 = half * a * c + 0.5 * three * (a * o + c * d)
+        m12 = half * b * c + 0.5 * three * (b * o + c * e)
+        v = w[400 + q]
+        P0, P1, P2 = v * (m * w[q] + m00), v * (m * w[8 + q] + m01 - h), v * (m * w[16 + q] + m02 + g)
+        P3, P4, P5 = v * (m * w[24 + q] + m01 + h), v * (m * w[32 + q] + m11), v * (m * w[40 + q] + m12 - k)
+        P6, P7, P8 = v * (m * w[48 + q] + m02 - g), v * (m * w[56 + q] + m12 + k), v * (m * w[64 + q] + m22)
+        r0, r1, r2, r3, r4, r5, r6, r7, r8 = (
+            w[280 + q],
+            w[288 + q],
+            w[296 + q],
+            w[304 + q],
+            w[312 + q],
+            w[320 + q],
+            w[328 + q],
+            w[336 + q],
+            w[344 + q],
+        )
+        w[q], w[8 + q], w[16 + q] = r0 * P0 + r1 * P3 + r2 * P6, r0 * P1 + r1 * P4 + r2 * P7, r0 * P2 + r1 * P5 + r2 * P8
+        w[24 + q], w[32 + q], w[40 + q] = r3 * P0 + r4 * P3 + r5 * P6, r3 * P1 + r4 * P4 + r5 * P7, r3 * P2 + r4 * P5 + r5 * P8
+        w[48 + q], w[56 + q], w[64 + q] = r6 * P0 + r7 * P3 + r8 * P6, r6 * P1 + r7 * P4 + r8 * P7, r6 * P2 + r7 * P5 + r8 * P8
+
+
+@njit(cache=True, fastmath=FAST, error_model="numpy")
+def series_forces(terms, nodes, gradients, constants, frames, forces):  # type: ignore[no-untyped-def]
+    """Add Σ_{n=1}^{N+1} of the coefficients of the internal forces [N] for x₁ … x_N (terms, shape (N, n, 3), N = 1 or 2) and x_{N+1} = 0."""
+    N, groups, points, count = len(terms), gradients.shape[0], gradients.shape[1], gradients.shape[2] // 3
+    X, wide, own = points * ROWS * LANES, 3 * count * LANES, (points + 3) * LANES
+    v, w, f, g = np.zeros(ROWS * LANES), np.zeros(X + 2 * wide), frames.reshape(-1), constants.reshape(-1)
+    room, base, first = v.ctypes.data, w.ctypes.data, gradients.ctypes.data
+    for e in range(groups):
+        for t in range(N):
+            for a in range(count):
+                to = X + t * wide + 3 * a * LANES
+                for q in range(LANES):
+                    n = nodes[e, a, q]
+                    w[to + q], w[to + LANES + q], w[to + 2 * LANES + q] = terms[t, n, 0], terms[t, n, 1], terms[t, n, 2]
+        for p in range(points):
+            for k in range(18 * LANES):
+                v[k] = 0.0
+            for t in range(N):
+                add_gradient(v, room + 72 * t * LANES, base + 8 * (X + t * wide), first + 4 * (e * points + p) * wide, count)
+            for k in range(15 * LANES):
+                v[35 * LANES + k] = f[(e * points + p) * 15 * LANES + k]
+            for q in range(LANES):
+                v[50 * LANES + q] = g[e * own + p * LANES + q]
+            for k in range(3 * LANES):
+                v[51 * LANES + k] = g[e * own + points * LANES + k]
+            _turn(v)
+            for k in range(ROWS * LANES):
+                w[p * ROWS * LANES + k] = v[k]
+        _means(w, points)
+        for k in range(X, X + wide):
+            w[k] = 0.0
+        for p in range(points):
+            for k in range(ROWS * LANES):
+                v[k] = w[p * ROWS * LANES + k]
+            _stress(v, N + 1)
+            add_divergence(v, base + 8 * X, room, first + 4 * (e * points + p) * wide, count)
+        for a in range(count):
+            to = X + 3 * a * LANES
+            for q in range(LANES):
+                n = nodes[e, a, q]
+                forces[n, 0] += w[to + q]
+                forces[n, 1] += w[to + LANES + q]
+                forces[n, 2] += w[to + 2 * LANES + q]
+
+
+@njit(cache=True, fastmath=FAST, error_model="numpy")
+def _means(w, points):  # type: ignore[no-untyped-def]
+    """Write the mean dilatations of LANES elements beside those of their points."""
+    for k in range(4):
+        for q in range(LANES):
+            dilatation, volume = 0.0, 0.0
+            for p in range(points):
+                dilatation += w[(ROWS * p + 50) * LANES + q] * w[(ROWS * p + 27 + k) * LANES + q]
+                volume += w[(ROWS * p + 50) * LANES + q]
+            for p in range(points):
+                w[(ROWS * p + 31 + k) * LANES + q] = dilatation / volume
+
+
+@njit(cache=True)
+def cable_series(nodes, weights, end, x, terms, tension, more, forces):  # type: ignore[no-untyped-def]
+    """Add Σ_{n=1}^{N+1} of the coefficients of a cable's nodal forces, its tension being tension + s more."""
+    N, count, width = len(terms), nodes.shape[0], nodes.shape[1]
+    v, d, length = np.zeros((N + 2, count + 1, 3)), np.zeros((N + 2, count + 1, 3)), np.zeros(N + 2)
+    v[0, count] = end
+    for s in range(count):
+        for a in range(width):
+            for c in range(3):
+                v[0, s, c] += weights[s, a] * x[nodes[s, a], c]
+                for n in range(N):
+                    v[n + 1, s, c] += weights[s, a] * terms[n, nodes[s, a], c]
+    pull = np.zeros((count, 3))
+    for s in range(count):
+        for n in range(N + 2):
+            square = 0.0
+            for c in range(3):
+                v[n, s, c] = v[n, s + 1, c] - v[n, s, c]
+            for k in range(n + 1):
+                for c in range(3):
+                    square += v[k, s, c] * v[n - k, s, c]
+            for k in range(1, n):
+                square -= length[k] * length[n - k]
+            length[n] = np.sqrt(square) if n == 0 else square / (2.0 * length[0])
+            for c in range(3):
+                known = v[n, s, c]
+                for k in range(1, n + 1):
+                    known -= length[k] * d[n - k, s, c]
+                d[n, s, c] = known / length[0]
+        for n in range(1, N + 2):
+            for c in range(3):
+                pull[s, c] += tension * d[n, s, c] + more * d[n - 1, s, c]
+    for s in range(count):
+        for c in range(3):
+            at_point = pull[s, c] - (pull[s - 1, c] if s > 0 else 0.0)
+            for a in range(width):
+                forces[nodes[s, a], c] += weights[s, a] * at_point
