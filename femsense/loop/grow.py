@@ -10,14 +10,14 @@ import numpy as np
 
 from femsense.arrays import FloatArray
 from femsense.calib.forward import Hypothesis
-from femsense.effects import Effect, Entry, Parameter
+from femsense.effects import Effect, Entry, Parameter, find_effect
 from femsense.effects.loads import STANDARD_GRAVITY
 from femsense.errors import DataError, FemsenseError
 from femsense.loop.data import Data
 from femsense.loop.joint import JointFit, Prior, rms_of
 from femsense.loop.noise import Noise
 from femsense.loop.predict import sweeps_predicted
-from femsense.loop.screen import NUISANCE, Candidate, effect_fields, screen
+from femsense.loop.screen import NUISANCE, Candidate, effect_fields, penalty, screen
 from femsense.loop.stages import Stage, held_chi2, held_shift, jets_with, keeping, make_stage, own_of, problem_of
 
 REFITS = 6
@@ -42,6 +42,8 @@ ABOVE_MESH = 0.5
 """An effect must move the markers by this much of what the mesh itself costs (beyond what calibration absorbs) …"""
 ABOVE_MESH_IF_SURE = 0.25
 """… or by this much, if left-out sweeps speak for it by SURE standard errors and, the more of these the less, held-out data gain too."""
+DECLARED = -1.0
+"""Start from what is declared, where a discrete alternative does not fit from where calibration has gone without it."""
 SURE = 2.5
 """Standard errors of the gain on left-out sweeps beyond which held-out data need only not speak against an effect."""
 POLISHED = 2.0
@@ -63,12 +65,15 @@ class Refit:
 
 
 def grow(
-    data: Data, stage: Stage, table: list[Candidate], noise: Noise, say: Progress
+    data: Data, stage: Stage, table: list[Candidate], noise: Noise, names: Sequence[str], n_effective: float, say: Progress
 ) -> tuple[Stage | None, list[dict[str, Any]]]:
     """Return the stage with one more effect, or None where nothing passes, and what became of each candidate that was refitted."""
     refits: list[Refit] = []
     records: list[dict[str, Any]] = []
-    for candidate in shortlist(table, first=not _added(stage)):
+    first = not _added(stage)
+    asked = _quadratic(data, stage, names, n_effective) if first else []
+    screened = [c for c in shortlist(table, first=first) if not any(c.effect is a.effect and c.seed == a.seed for a in asked)]
+    for candidate in [*asked, *screened]:
         best = max((r.score for r in refits if r.record["verdict"] == "passes"), default=-np.inf)
         if candidate.score < 0.5 * best - EVIDENCE:
             break  # far behind: a joint refit seldom gains that much on its linear score
@@ -118,6 +123,17 @@ def _enriched(data: Data, stage: Stage, winner: Refit, table: list[Candidate], n
             winner.record.update(rich.record | {"seed": form.seed})
             winner = replace(rich, record=winner.record)
     return winner
+
+
+def _quadratic(data: Data, stage: Stage, names: Sequence[str], n_effective: float) -> list[Candidate]:
+    """Return quadratic elements as a candidate where the mesh is linear: always asked, and not by screening, since the modulus and
+    whatever else has made up for what a linear mesh costs is far from where quadratic elements have it."""
+    effect, seed = find_effect("discretisation"), {"element": "tet10"}
+    if effect.name not in names or seed not in effect.seeds(stage.fit.hypothesis.robot):
+        return []
+    nothing = np.zeros(0)
+    cost = penalty(0, seed, 1, max(len(names), 1), n_effective)
+    return [Candidate(effect, seed, (), [], [], np.zeros((0, 0)), np.zeros((0, 0)), 1.0, nothing, np.inf, np.inf, cost, nothing)]
 
 
 def _added(stage: Stage) -> list[str]:
@@ -197,14 +213,16 @@ def refit(data: Data, stage: Stage, candidate: Candidate, noise: Noise) -> Stage
     start = null if candidate.effect.discrete else np.clip(_first_guess(candidate, null), low, high)
     hypothesis, prior = with_term(stage.fit, candidate.effect, candidate.seed, candidate.parameters)
     free = not candidate.effect.discrete and candidate.effect.name != "gravity"  # for these the null is no start
-    shares = (1.0,) if candidate.effect.discrete else (0.0, 1.0, 0.3) if free else (1.0, 0.3, 0.0)  # a linear step may go too far
+    shares = (
+        (1.0, DECLARED) if candidate.effect.discrete else (0.0, 1.0, 0.3) if free else (1.0, 0.3, 0.0)
+    )  # a linear step may go too far
     answer = 0.0 if candidate.effect.discrete else candidate.response @ (start - null)  # of what is fitted already
     best: Stage | None = None
     for share in shares:
-        theta = stage.fit.fit.theta + share * answer
+        theta = _declared(data, stage, hypothesis, noise) if share == DECLARED else stage.fit.fit.theta + share * answer
         coordinates = np.concatenate([theta[stage.fit.own :], null + share * (start - null)])
         known = jets_with(stage, candidate) if free and share == 0.0 else None
-        near = stage.fit.jets if not candidate.parameters else None
+        near = stage.fit.jets if not candidate.parameters and share != DECLARED else None
         try:
             made = make_stage(
                 data, hypothesis, prior, noise, coordinates, own=theta[: stage.fit.own], max_iterations=10, known=known, near=near
@@ -218,6 +236,17 @@ def refit(data: Data, stage: Stage, candidate: Candidate, noise: Noise) -> Stage
     if best is not None:
         return best
     raise DataError("no start from which the fit improves")
+
+
+def _declared(data: Data, stage: Stage, hypothesis: Hypothesis, noise: Noise) -> FloatArray:
+    """Return where a discrete alternative starts if what is fitted stays as declared: with its own poses and initial inputs."""
+    alone = replace(hypothesis, terms=())
+    for trial in data.train:
+        if hypothesis.robot.body.mesh is not stage.fit.hypothesis.robot.body.mesh:
+            trial.starts_on(hypothesis.robot.body.mesh).clear()  # states that were carried there from elsewhere may have folded
+    nothing = Prior(np.zeros(0), np.zeros(0))
+    placed = make_stage(data, alone, nothing, noise, np.zeros(0), own=own_of(stage))
+    return np.concatenate([own_of(placed), stage.fit.prior.mean])
 
 
 def with_term(fit: JointFit, effect: Effect, seed: Entry, parameters: tuple[Parameter, ...]) -> tuple[Hypothesis, Prior]:

@@ -129,7 +129,7 @@ def _search(data: Data, before: Stage, base: Stage, names: list[str], most: int,
         first = first or table
         if found >= most:
             break
-        winner, tried = grow(data, stage, table, noise, say)
+        winner, tried = grow(data, stage, table, noise, names, n_effective, say)
         refits += [{**record, "step": found + 1} for record in tried]
         if winner is None:
             break
