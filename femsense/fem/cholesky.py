@@ -332,7 +332,8 @@ def _nested_dissection(graph: sp.csr_matrix) -> list[IntArray]:
         import pymetis
     except ImportError:
         return []
-    return [np.asarray(pymetis.nested_dissection(xadj=between.indptr, adjncy=between.indices)[0], np.int64)]
+    neighbours = pymetis.CSRAdjacency(between.indptr, between.indices)
+    return [np.asarray(pymetis.nested_dissection(adjacency=neighbours)[0], np.int64)]
 
 
 def elimination_work(graph: sp.csr_matrix, order: IntArray) -> float:
