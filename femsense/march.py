@@ -433,8 +433,8 @@ class _Balance:
 FINER_STEPS = 5
 FINER_ENOUGH = 0.2
 """Newton steps on the finer mesh end when the unbalanced force has fallen to this share."""
-ROUGH = 1e-2
-"""Share of a step on the finer mesh that may be missing, in energy: it says how large an error is, no more."""
+ROUGH = 1e-3
+"""Share of a step on the finer mesh that may be missing, in energy. With ten times as much the order of the nodes moved a fit by two percent."""
 ROUGH_FROM = 9000
 """Unknowns from which on such a step takes conjugate gradients instead of a factor."""
 
