@@ -15,12 +15,13 @@ from femsense.effects.shape import finer_mesh, robot_on_mesh
 from femsense.fem.equilibrium import solve_equilibrium
 from femsense.loop import improve
 from femsense.loop.data import prepare
-from femsense.loop.mesh_error import with_mesh_errors
+from femsense.loop.grow import MOUNTED, _tilt_cost
+from femsense.loop.mesh_error import VARIES, with_mesh_errors
 from femsense.loop.noise import Groups, Noise, _Likelihood, whiten
 from femsense.loop.predict import sweeps_predicted
 from femsense.loop.screen import _parts, penalty
 from femsense.loop.stages import make_stage, with_nuisance
-from femsense.loop.structure import structure_tests
+from femsense.loop.structure import structure_tests, without_mesh_error
 
 RNG = np.random.default_rng(11)
 
@@ -90,7 +91,7 @@ def test_the_error_of_the_mesh_is_what_the_finer_mesh_adds():
     hypothesis, prior = with_nuisance(data)
     stage = make_stage(data, hypothesis, prior, Noise({"white": 1e-4}, ""), np.zeros(len(prior.mean)))
     trial = with_mesh_errors(data, stage).train[0]
-    error = trial.mesh_error.sum(axis=2)
+    error = trial.mesh_error[:, :, 0]
     fitted = stage.fit.hypothesis.robot_at(stage.fit.coordinates)
     fine = robot_on_mesh(fitted, finer_mesh(fitted.body.mesh, None, 1))
     k = int(trial.scene.frames[2])
@@ -100,8 +101,43 @@ def test_the_error_of_the_mesh_is_what_the_finer_mesh_adds():
     wanted = (places[1] - places[0])[trial.scene.marker[trial.scene.frame == k]]
     np.testing.assert_allclose(error[trial.scene.frame == k], wanted, atol=0.15 * np.abs(wanted).max())
     assert np.abs(wanted).max() > 1e-4
-    used = (trial.mesh_error != 0).any(axis=1).sum(axis=1)
+    np.testing.assert_allclose(trial.mesh_error[:, :, 1:].sum(axis=2), VARIES * error)
+    used = (trial.mesh_error[:, :, 1:] != 0).any(axis=1).sum(axis=1)
     assert used.max() == 1  # each row has the field of its own sweep
+
+
+def test_one_share_of_the_mesh_error_in_all_sweeps_is_likelier_than_another_in_each():
+    inputs, labels = sweeps(each=1)
+    robot = arm((4, 2, 2))
+    recording, _ = record(inputs, labels=labels, truth=robot)
+    data = prepare(robot, [recording], [])
+    hypothesis, prior = with_nuisance(data)
+    noise = Noise({"white": 1e-5}, "")
+    trial = with_mesh_errors(data, make_stage(data, hypothesis, prior, noise, np.zeros(len(prior.mean)))).train[0]
+    factor, error = noise.whitener(trial.groups, trial.mesh_error), trial.mesh_error[:, :, 0]
+    sign = np.where(trial.groups.sweep % 2, 1.0, -1.0)[:, None]
+    costs = [float((whiten(factor, r) ** 2).sum()) for r in (0.5 * error, 0.5 * sign * error)]
+    assert costs[0] < 0.25 + 1e-6  # half a standard deviation
+    assert costs[1] > 10 * costs[0]
+    alike = without_mesh_error(trial, 0.5 * error, noise)
+    assert np.linalg.norm(alike) < 0.05 * np.linalg.norm(0.5 * error)
+
+
+def test_a_declared_gravity_is_believed_to_a_few_degrees():
+    gravity, robot = find_effect("gravity"), arm((4, 2, 2))
+    terms = gravity.parameters(robot, "tension")
+    candidate = SimpleNamespace(effect=gravity)
+
+    def cost(declared: list[float], found: list[float]) -> float:
+        body = SimpleNamespace(body=SimpleNamespace(gravity=np.array(declared)))
+        fit = SimpleNamespace(hypothesis=SimpleNamespace(parameters=terms), coordinates=np.array(found))
+        return _tilt_cost(body, candidate, fit)
+
+    down = [0.0, 0.0, -9.81]
+    angles = np.radians([0.0, 5.0, 30.0, 180.0])
+    costs = [cost(down, [9.81 * np.sin(a), 0.0, -9.81 * np.cos(a)]) for a in angles]
+    np.testing.assert_allclose(costs, 5.0 * np.log1p((angles / MOUNTED) ** 2 / 4.0), atol=1e-9)
+    assert cost([0.0, 0.0, 0.0], down) == 0.0
 
 
 def structure_of(values: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> dict[str, float]:

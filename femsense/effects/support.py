@@ -17,7 +17,7 @@ def _spring_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
     if not count:
         return ()
     compliance = count / (float(robot.body.material.young_modulus.mean()) * robot.body.reach)
-    return (Parameter(KEYS[0], None, "N/m", 0.0, 0.0, 10.0 * compliance, 1e-6 * compliance, "reciprocal"),)
+    return (Parameter(KEYS[0], None, "N/m", 0.0, 0.0, 50.0 * compliance, 1e-6 * compliance, "reciprocal"),)
 
 
 def _plate_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:

@@ -471,7 +471,7 @@ def _cloud_card(data: Data, noise: Noise) -> dict[str, Any] | None:
 
 def _mesh_error(data: Data) -> float | None:
     """Return how far a finer mesh would move the markers, root mean square [m]; None where it was not computed."""
-    errors = [t.mesh_error.sum(axis=2) for t in data.train if t.mesh_error is not None]
+    errors = [t.mesh_error[:, :, 0] for t in data.train if t.mesh_error is not None]
     return rms_of(errors) if errors else None
 
 

@@ -19,6 +19,7 @@ from femsense.loop.noise import Noise
 from femsense.loop.predict import sweeps_predicted
 from femsense.loop.screen import NUISANCE, Candidate, effect_fields, penalty, screen
 from femsense.loop.stages import Stage, held_chi2, held_shift, jets_with, keeping, make_stage, own_of, problem_of
+from femsense.model import Robot
 
 REFITS = 6
 """Candidates that are refitted in full nonlinearity at the first step; half as many later."""
@@ -42,8 +43,18 @@ ABOVE_MESH = 0.5
 """An effect must move the markers by this much of what the mesh itself costs (beyond what calibration absorbs) …"""
 ABOVE_MESH_IF_SURE = 0.25
 """… or by this much, if left-out sweeps speak for it by SURE standard errors and, the more of these the less, held-out data gain too."""
+NOT_PLAINLY_WORSE = 1.15
+"""No effect may leave so many times the plain error where fitted: it would live on a larger share of what the mesh costs."""
+MOUNTED = np.radians(5.0)
+"""A base is mounted as it is declared to about this angle, and a declared gravity is believed as much [rad]."""
 DECLARED = -1.0
 """Start from what is declared, where a discrete alternative does not fit from where calibration has gone without it."""
+AFAR = -2.0
+"""Start from what is declared, with the value of one parameter that then leaves least, where calibration went astray."""
+ASTRAY = 0.025
+"""Calibration that leaves more than this share of the body's size went astray for want of the effect."""
+LADDER = (0.003, 0.03, 0.1, 0.3)
+"""Values that are tried then, as shares of the way to the end of the plausible range."""
 SURE = 2.5
 """Standard errors of the gain on left-out sweeps beyond which held-out data need only not speak against an effect."""
 POLISHED = 2.0
@@ -170,7 +181,7 @@ def judged(
     noise: Noise,
 ) -> Refit:
     gain = evidence(stage.fit, made.fit)
-    score = gain - candidate.cost
+    score = gain - candidate.cost - _tilt_cost(data.declared, candidate, made.fit)
     better, spread = sweeps_predicted(data.train, stage.fit, made.fit)
     record |= {"dchi2": gain, "dbic": score, "validation_rms_m": made.held_rms, "cv_gain": better, "cv_spread": spread}
     held = held_chi2(data, stage, noise) - held_chi2(data, made, noise)
@@ -191,8 +202,21 @@ def judged(
     least = ABOVE_MESH_IF_SURE if sure_beyond_mesh(better, spread, held, gain * held_share(data)) else ABOVE_MESH
     if fit_objection is None and moved < least * mesh:
         fit_objection = f"it moves the markers by {1e3 * moved:.3f} mm, the mesh itself by {1e3 * mesh:.3f} mm"
+    if fit_objection is None and made.fit.rms > NOT_PLAINLY_WORSE * stage.fit.rms:
+        fit_objection = f"the plain error grows where fitted ({1e3 * stage.fit.rms:.3f} mm, then {1e3 * made.fit.rms:.3f} mm)"
     record["verdict"] = fit_objection or "passes"
     return Refit(candidate, made, score, record)
+
+
+def _tilt_cost(declared: Robot, candidate: Candidate, fit: JointFit) -> float:
+    """Return −2 log of how likely it is that a declared gravity is off by the angle of the fitted one: a Student's t with four degrees."""
+    own = declared.body.gravity
+    mask = np.array([p.key == "vector_m_s2" for p in fit.hypothesis.parameters], dtype=bool)
+    if candidate.effect.name != "gravity" or not np.any(own) or mask.sum() != 3:
+        return 0.0
+    vector = fit.coordinates[mask]
+    angle = np.arctan2(np.linalg.norm(np.cross(own, vector)), own @ vector)
+    return float(5.0 * np.log1p((angle / MOUNTED) ** 2 / 4.0))
 
 
 def sure_beyond_mesh(better: float, spread: float, held: float, expected: float) -> bool:
@@ -216,11 +240,18 @@ def refit(data: Data, stage: Stage, candidate: Candidate, noise: Noise) -> Stage
     shares = (
         (1.0, DECLARED) if candidate.effect.discrete else (0.0, 1.0, 0.3) if free else (1.0, 0.3, 0.0)
     )  # a linear step may go too far
+    if len(candidate.parameters) == 1 and stage.fit.rms > ASTRAY * data.robot.body.reach:
+        shares = (AFAR, *shares)
     answer = 0.0 if candidate.effect.discrete else candidate.response @ (start - null)  # of what is fitted already
     best: Stage | None = None
     for share in shares:
-        theta = _declared(data, stage, hypothesis, noise) if share == DECLARED else stage.fit.fit.theta + share * answer
-        coordinates = np.concatenate([theta[stage.fit.own :], null + share * (start - null)])
+        value = null + max(share, 0.0) * (start - null)
+        theta = stage.fit.fit.theta + max(share, 0.0) * answer
+        if share == DECLARED:
+            theta = _declared(data, stage, hypothesis, noise)
+        if share == AFAR:
+            theta, value = _afar(data, stage, candidate, noise)
+        coordinates = np.concatenate([theta[stage.fit.own :], value])
         known = jets_with(stage, candidate) if free and share == 0.0 else None
         near = stage.fit.jets if not candidate.parameters and share != DECLARED else None
         try:
@@ -247,6 +278,22 @@ def _declared(data: Data, stage: Stage, hypothesis: Hypothesis, noise: Noise) ->
     nothing = Prior(np.zeros(0), np.zeros(0))
     placed = make_stage(data, alone, nothing, noise, np.zeros(0), own=own_of(stage))
     return np.concatenate([own_of(placed), stage.fit.prior.mean])
+
+
+def _afar(data: Data, stage: Stage, candidate: Candidate, noise: Noise) -> tuple[FloatArray, FloatArray]:
+    """Return a start with all else as declared, and the value of the effect's parameter that leaves least there, shape (1,)."""
+    parameter, robot = candidate.parameters[0], stage.fit.hypothesis.robot
+    ends = [end for end in (parameter.low, parameter.high) if np.isfinite(end) and end != parameter.null]
+    best = stage.fit.fit.theta, np.array([parameter.null]), np.inf
+    for value in (parameter.null + share * (end - parameter.null) for end in ends for share in LADDER):
+        changed = candidate.effect.apply(robot, {**candidate.seed, parameter.key: parameter.value(value)})
+        try:
+            placed = make_stage(data, Hypothesis(changed), Prior(np.zeros(0), np.zeros(0)), noise, np.zeros(0), own=own_of(stage))
+        except FemsenseError:
+            continue
+        if placed.fit.rms < best[2]:
+            best = np.concatenate([own_of(placed), stage.fit.prior.mean]), np.array([value]), placed.fit.rms
+    return best[0], best[1]
 
 
 def with_term(fit: JointFit, effect: Effect, seed: Entry, parameters: tuple[Parameter, ...]) -> tuple[Hypothesis, Prior]:
@@ -294,13 +341,20 @@ def moved_by(before: Stage, after: Stage) -> float:
     return rms_of([b.residual - a.residual for a, b in zip(after.fit.jets, before.fit.jets)])
 
 
-def mesh_cost(data: Data, stage: Stage) -> float:
-    """Return what the mesh costs beyond what calibration absorbs [m], root mean square as `rms_of` has it; 0 where it is not known."""
+def mesh_cost(data: Data, stage: Stage, *, whole: bool = False) -> float:
+    """Return what the mesh costs beyond what calibration absorbs [m], root mean square as `rms_of` has it; 0 where it is not known.
+
+    Not whole: beyond the share of it that all sweeps have in common, too, where there are several.
+    """
     if any(t.mesh_error is None for t in data.train):
         return 0.0
-    errors = [t.mesh_error.sum(axis=2) for t in data.train if t.mesh_error is not None]
-    J = [np.concatenate([j.by_pose, j.by_effect], axis=2).reshape(e.size, -1) for j, e in zip(stage.fit.jets, errors)]
-    return rms_of([_rest(j, e.ravel()).reshape(e.shape) for j, e in zip(J, errors)])
+    errors = [t.mesh_error for t in data.train if t.mesh_error is not None]
+    J = [np.concatenate([j.by_pose, j.by_effect], axis=2).reshape(e[:, :, 0].size, -1) for j, e in zip(stage.fit.jets, errors)]
+    if whole or any(e.shape[2] < 3 for e in errors):
+        return rms_of([_rest(j, e[:, :, 0].ravel()).reshape(e.shape[:2]) for j, e in zip(J, errors)])
+    flat = [e.reshape(-1, e.shape[2]) for e in errors]
+    left = [_rest(np.column_stack([j, e[:, 0]]), e[:, 1:]) for j, e in zip(J, flat)]
+    return rms_of([np.linalg.norm(own, axis=1).reshape(e.shape[:2]) for own, e in zip(left, errors)])
 
 
 def _rest(columns: FloatArray, values: FloatArray) -> FloatArray:

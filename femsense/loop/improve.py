@@ -134,7 +134,7 @@ def _search(data: Data, before: Stage, base: Stage, names: list[str], most: int,
         if winner is None:
             break
         name = next(n for n in winner.fit.hypothesis.names if n not in stage.fit.hypothesis.names)
-        far = moved_by(stage, winner) > mesh_cost(data, stage)
+        far = moved_by(stage, winner) > mesh_cost(data, stage, whole=True)
         stage = prune(data, winner, noise, n_effective, say)
         history.append((name, stage))
         if far:  # the mesh errs in another way in these states

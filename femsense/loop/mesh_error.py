@@ -1,8 +1,9 @@
 """What the mesh itself costs: how far a mesh of half the size would move the markers, in every state.
 
-A residual of that shape says nothing of the robot. It counts as noise, once its size as standard deviation, so that no effect is named
-for what a finer mesh would explain. A Newton step or two from the state on the declared mesh, which the finer one holds exactly,
-give it (a hierarchical estimate: Bank & Smith 1993).
+A residual of that shape says nothing of the robot, whatever its size: how much of it a body shows is not known (a cable that is tied to points
+sinks the deeper the finer the mesh is), but it is the same share in all sweeps. So it counts as noise, once its size as standard deviation for
+all sweeps together and `VARIES` times for each by itself, so that no effect is named for what a finer mesh would explain. A Newton step or two
+from the state on the declared mesh, which the finer one holds exactly, give it (a hierarchical estimate: Bank & Smith 1993).
 """
 
 from __future__ import annotations
@@ -30,6 +31,8 @@ MOST_TETS = 24000
 """A finer mesh than this takes too long in every state."""
 MOST_WORK = 300_000
 """Tetrahedra × states; beyond it the nearest state that was computed stands for others."""
+VARIES = 0.25
+"""The share of the error that a body shows differs by this between sweeps (standard deviation)."""
 
 
 def with_mesh_errors(data: Data, stage: Stage) -> Data:
@@ -59,13 +62,14 @@ def _with_error(robot: Robot, fine: Robot, trial: Trial, poses: Sequence[FloatAr
 
 
 def _by_sweep(trial: Trial, moves: dict[int, FloatArray], poses: Sequence[FloatArray]) -> FloatArray:
-    """Return the error as one field a sweep [m], (k, c, sweeps): each sweep loads the mesh in its own way."""
+    """Return the error of all sweeps together, then `VARIES` times that of each sweep [m], shape (k, c, 1 + sweeps)."""
     error = np.array([moves[int(f)][m] for f, m in zip(trial.scene.frame, trial.scene.marker)])
     if trial.scene.patches is not None:
         error = np.einsum("kc,kc->k", error, normals_of(trial.scene, poses))[:, None]
     number = np.unique(trial.groups.sweep, return_inverse=True)[1]
-    fields = np.zeros((*error.shape, int(number.max()) + 1))
-    fields[np.arange(len(error)), :, number] = error
+    fields = np.zeros((*error.shape, int(number.max()) + 2))
+    fields[:, :, 0] = error
+    fields[np.arange(len(error)), :, 1 + number] = VARIES * error
     return fields
 
 
