@@ -15,7 +15,7 @@ from femsense.effects.shape import finer_mesh, robot_on_mesh
 from femsense.fem.equilibrium import solve_equilibrium
 from femsense.loop import improve
 from femsense.loop.data import prepare
-from femsense.loop.grow import MOUNTED, _tilt_cost
+from femsense.loop.grow import MOUNTED, tilt_cost
 from femsense.loop.mesh_error import VARIES, with_mesh_errors
 from femsense.loop.noise import Groups, Noise, _Likelihood, whiten
 from femsense.loop.predict import sweeps_predicted
@@ -131,7 +131,7 @@ def test_a_declared_gravity_is_believed_to_a_few_degrees():
     def cost(declared: list[float], found: list[float]) -> float:
         body = SimpleNamespace(body=SimpleNamespace(gravity=np.array(declared)))
         fit = SimpleNamespace(hypothesis=SimpleNamespace(parameters=terms), coordinates=np.array(found))
-        return _tilt_cost(body, candidate, fit)
+        return tilt_cost(body, candidate, fit)
 
     down = [0.0, 0.0, -9.81]
     angles = np.radians([0.0, 5.0, 30.0, 180.0])

@@ -49,12 +49,6 @@ MOUNTED = np.radians(5.0)
 """A base is mounted as it is declared to about this angle, and a declared gravity is believed as much [rad]."""
 DECLARED = -1.0
 """Start from what is declared, where a discrete alternative does not fit from where calibration has gone without it."""
-AFAR = -2.0
-"""Start from what is declared, with the value of one parameter that then leaves least, where calibration went astray."""
-ASTRAY = 0.025
-"""Calibration that leaves more than this share of the body's size went astray for want of the effect."""
-LADDER = (0.003, 0.03, 0.1, 0.3)
-"""Values that are tried then, as shares of the way to the end of the plausible range."""
 SURE = 2.5
 """Standard errors of the gain on left-out sweeps beyond which held-out data need only not speak against an effect."""
 POLISHED = 2.0
@@ -181,7 +175,7 @@ def judged(
     noise: Noise,
 ) -> Refit:
     gain = evidence(stage.fit, made.fit)
-    score = gain - candidate.cost - _tilt_cost(data.declared, candidate, made.fit)
+    score = gain - candidate.cost - tilt_cost(data.declared, candidate, made.fit)
     better, spread = sweeps_predicted(data.train, stage.fit, made.fit)
     record |= {"dchi2": gain, "dbic": score, "validation_rms_m": made.held_rms, "cv_gain": better, "cv_spread": spread}
     held = held_chi2(data, stage, noise) - held_chi2(data, made, noise)
@@ -208,7 +202,7 @@ def judged(
     return Refit(candidate, made, score, record)
 
 
-def _tilt_cost(declared: Robot, candidate: Candidate, fit: JointFit) -> float:
+def tilt_cost(declared: Robot, candidate: Candidate, fit: JointFit) -> float:
     """Return −2 log of how likely it is that a declared gravity is off by the angle of the fitted one: a Student's t with four degrees."""
     own = declared.body.gravity
     mask = np.array([p.key == "vector_m_s2" for p in fit.hypothesis.parameters], dtype=bool)
@@ -240,18 +234,11 @@ def refit(data: Data, stage: Stage, candidate: Candidate, noise: Noise) -> Stage
     shares = (
         (1.0, DECLARED) if candidate.effect.discrete else (0.0, 1.0, 0.3) if free else (1.0, 0.3, 0.0)
     )  # a linear step may go too far
-    if len(candidate.parameters) == 1 and stage.fit.rms > ASTRAY * data.robot.body.reach:
-        shares = (AFAR, *shares)
     answer = 0.0 if candidate.effect.discrete else candidate.response @ (start - null)  # of what is fitted already
     best: Stage | None = None
     for share in shares:
-        value = null + max(share, 0.0) * (start - null)
-        theta = stage.fit.fit.theta + max(share, 0.0) * answer
-        if share == DECLARED:
-            theta = _declared(data, stage, hypothesis, noise)
-        if share == AFAR:
-            theta, value = _afar(data, stage, candidate, noise)
-        coordinates = np.concatenate([theta[stage.fit.own :], value])
+        theta = _declared(data, stage, hypothesis, noise) if share == DECLARED else stage.fit.fit.theta + share * answer
+        coordinates = np.concatenate([theta[stage.fit.own :], null + share * (start - null)])
         known = jets_with(stage, candidate) if free and share == 0.0 else None
         near = stage.fit.jets if not candidate.parameters and share != DECLARED else None
         try:
@@ -278,22 +265,6 @@ def _declared(data: Data, stage: Stage, hypothesis: Hypothesis, noise: Noise) ->
     nothing = Prior(np.zeros(0), np.zeros(0))
     placed = make_stage(data, alone, nothing, noise, np.zeros(0), own=own_of(stage))
     return np.concatenate([own_of(placed), stage.fit.prior.mean])
-
-
-def _afar(data: Data, stage: Stage, candidate: Candidate, noise: Noise) -> tuple[FloatArray, FloatArray]:
-    """Return a start with all else as declared, and the value of the effect's parameter that leaves least there, shape (1,)."""
-    parameter, robot = candidate.parameters[0], stage.fit.hypothesis.robot
-    ends = [end for end in (parameter.low, parameter.high) if np.isfinite(end) and end != parameter.null]
-    best = stage.fit.fit.theta, np.array([parameter.null]), np.inf
-    for value in (parameter.null + share * (end - parameter.null) for end in ends for share in LADDER):
-        changed = candidate.effect.apply(robot, {**candidate.seed, parameter.key: parameter.value(value)})
-        try:
-            placed = make_stage(data, Hypothesis(changed), Prior(np.zeros(0), np.zeros(0)), noise, np.zeros(0), own=own_of(stage))
-        except FemsenseError:
-            continue
-        if placed.fit.rms < best[2]:
-            best = np.concatenate([own_of(placed), stage.fit.prior.mean]), np.array([value]), placed.fit.rms
-    return best[0], best[1]
 
 
 def with_term(fit: JointFit, effect: Effect, seed: Entry, parameters: tuple[Parameter, ...]) -> tuple[Hypothesis, Prior]:
@@ -494,5 +465,6 @@ __all__ = [
     "refit",
     "shortlist",
     "sure_beyond_mesh",
+    "tilt_cost",
     "with_term",
 ]

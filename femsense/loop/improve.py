@@ -20,6 +20,7 @@ from femsense.effects import EFFECTS, FORMS, Effect, find_effect, load_own_effec
 from femsense.errors import FemsenseError
 from femsense.loop.conclude import Search, conclude
 from femsense.loop.data import Data, prepare
+from femsense.loop.exchange import exchanged
 from femsense.loop.grow import Progress, grow, mesh_cost, moved_by, prune
 from femsense.loop.joint import Prior
 from femsense.loop.mesh_error import with_mesh_errors
@@ -139,6 +140,8 @@ def _search(data: Data, before: Stage, base: Stage, names: list[str], most: int,
         history.append((name, stage))
         if far:  # the mesh errs in another way in these states
             data = with_mesh_errors(data, stage)
+        history, refits = exchanged(data, history, refits, noise, n_effective, say)
+        stage = history[-1][1]
     swap = in_place_of_zeros(data, stage, names, noise, n_effective, say) if most else None
     if swap is not None:
         refits += [{**record, "step": len(history)} for record in swap.records]
