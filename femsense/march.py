@@ -6,7 +6,7 @@ same inputs and loads share one solve.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -32,6 +32,10 @@ FACTOR_MEMORY = 2e9
 MEMORY_SHARE = 0.25
 TRIED = 1e-8
 """Relative tolerance of states that are only tried: below a thousandth of a millimetre, where derivatives want a tenth of it."""
+PARTS, SHORTEST_PART = 4, 6
+"""Parts at most that frames with a past are walked in side by side, and frames of a part at least."""
+PAST, PAST_TRIED = 1e-8, 1e-6
+"""Tensions along a cable that agree so well [N], and as shares of the largest, are the same past; the latter for states that are only tried."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -193,22 +197,35 @@ def walk_along(
     Yields:
         frame index, equilibrium, observation (p, 3), observations of the variants (v, p, 3).
     """
-    wanted = set(int(f) for f in frames)
-    past = any(has_history(w.robot) for w in (walk, *variants))
-    todo = list(range(max(wanted) + 1)) if past and wanted else sorted(wanted)
-    first: dict[bytes, int] = {}
-    alike = {k: k if past else first.setdefault(_key(walk, variants, k), k) for k in todo}
+    wanted = sorted(set(int(f) for f in frames))
+    past = has_history(walk.robot)
+    todo = list(range(max(wanted) + 1)) if wanted and any(has_history(w.robot) for w in (walk, *variants)) else wanted
+    alike = _alike(walk, todo, past)
     unique = [k for k in todo if alike[k] == k]
     bases = dict(zip(unique, _base_states(walk, unique, starts, past, rough)))
-    answers: dict[int, tuple[FloatArray, FloatArray]] = {}
+    seen = {k: observe(walk.robot, bases[k]) for k in {alike[k]: None for k in wanted}}
+    others = {k: np.zeros((len(variants), *seen[alike[k]].shape)) for k in wanted}
+    answers = _Variants(walk, variants, {k: bases[alike[k]] for k in todo}, alike, others, observe)
     room = _room(len(unique))
-    for k, seen, others, factor in _answers(walk, variants, bases, observe, past):
-        answers[k] = seen, others
-        if factor is not None and starts is not None and factor.bytes < room:
+    for k, factor in answers.write():
+        if starts is not None and factor.bytes < room:
             starts[k] = replace(starts[k], factor=factor)
-    for k in todo:
-        if k in wanted:
-            yield k, bases[alike[k]], *answers[alike[k]]
+    for k in wanted:
+        yield k, bases[alike[k]], seen[alike[k]], others[k]
+
+
+def _alike(walk: Walk, frames: list[int], past: bool) -> dict[int, int]:
+    """Return for each frame the first one with the same state: the same inputs and loads, with a past the frames just before."""
+    first: dict[bytes, int] = {}
+    result: dict[int, int] = {}
+    last = b""
+    for k in frames:
+        key = _key(walk, k)
+        if past and key != last:
+            first[key] = k
+        result[k] = first.setdefault(key, k)
+        last = key
+    return result
 
 
 def _room(count: int) -> float:
@@ -229,49 +246,93 @@ def _base_states(
             starts[k] = state if state.factor is not None and state.factor.bytes < room else bare
         return bare
 
-    def again(k: int) -> Equilibrium:
-        tolerance = TRIED if rough else 1e-9
-        return keep(
-            k, _require(solve_frame(walk, k, start=near[k], reuse_factor=True, relative_tolerance=tolerance, rough=rough), k)
+    known = set(near)
+    if near:
+        near.update(_nearest(walk, near, [k for k in frames if k not in near]))
+
+    def again(k: int, before: tuple[FloatArray, ...] | None = None, start: Equilibrium | None = None) -> Equilibrium:
+        start, tried = near[k] if start is None else start, rough and k in known
+        return _require(
+            solve_frame(
+                walk, k, start=start, before=before, reuse_factor=True, relative_tolerance=TRIED if tried else 1e-9, rough=tried
+            ),
+            k,
         )
 
-    if not past and len(near) == len(frames):
-        yield from each(again, frames)
+    if near:
+        states = _march(walk, frames, near, again, rough) if past else each(again, frames)
+        yield from (keep(k, state) for k, state in zip(frames, states))
         return
     last: Equilibrium | None = None
     before: tuple[FloatArray, ...] | None = None
     for k in frames:
-        start = near.get(k, last)
-        start = start if start is None or _clamp_fits(body, start) else None
-        last = _require(
-            solve_frame(walk, k, start=start, before=before, reuse_factor=start is not last, rough=rough and k in near), k
-        )
+        last = _require(solve_frame(walk, k, start=last, before=before), k)
         before = last.segment_tensions if past else None
         yield keep(k, last)
 
 
-Answer = tuple[int, FloatArray, FloatArray, Factorization | None]
-"""Frame, observation (p, 3), observations of variants (v, p, 3), the factor that gave them."""
+def _nearest(walk: Walk, near: dict[int, Equilibrium], frames: list[int]) -> dict[int, Equilibrium]:
+    """Return for other frames the states of those frames whose inputs and loads are most like theirs."""
+    drive = walk.drive
+    load = np.zeros((len(drive.inputs), 3))
+    np.add.at(load, drive.load_frame, drive.load_forces)
+    gravity = np.zeros((len(load), 0)) if drive.gravity is None else drive.gravity
+    table = np.hstack([drive.inputs, drive.pressures, gravity, load])
+    table = table / np.maximum(np.ptp(table, axis=0), 1e-12)
+    known = list(near)
+    return {k: near[known[int(np.linalg.norm(table[known] - table[k], axis=1).argmin())]] for k in frames}
 
 
-def _answers(
-    walk: Walk, variants: Sequence[Walk], bases: dict[int, Equilibrium], observe: Callable[[Robot, Equilibrium], FloatArray], past: bool
-) -> Iterator[Answer]:  # fmt: skip
-    """Yield what is observed in each base state, and of the variants there."""
-    body, memory = walk.robot.body, list[tuple[FloatArray, ...] | None]([None] * (1 + len(variants)))
+def _march(
+    walk: Walk, frames: list[int], near: dict[int, Equilibrium], again: Callable[..., Equilibrium], rough: bool
+) -> list[Equilibrium]:
+    """Return the states of frames with a past, from states near by.
 
-    def at(k: int, tangent: Tangent | None, memory: list[tuple[FloatArray, ...] | None]) -> Answer:
-        seen = observe(walk.robot, bases[k])
-        return k, seen, *_observe_variants(walk, variants, k, bases[k], seen, observe, memory, tangent)
+    The frames are cut into parts that are walked side by side, each from the tensions along the cables that the states near by let
+    expect there. Then, part after part, frames are solved again until these are what the part before left.
+    """
+    size = max(SHORTEST_PART, -(-len(frames) // PARTS))
+    parts = [frames[i : i + size] for i in range(0, len(frames), size)]
+    expected = _expected_tensions(walk, frames, near)
+    assumed = [None, *(expected[part[-1]] for part in parts[:-1])]
+    result: dict[int, Equilibrium] = {}
+    slack = PAST_TRIED if rough else PAST
 
-    if not past:
-        yield from each(lambda k: at(k, None, list(memory)), bases)
-        return
-    if not any(_linear(walk, v) and not _same_mechanics(walk, v) for v in variants):
-        yield from (at(k, None, memory) for k in bases)
-        return
-    for k, tangent in zip(bases, each(lambda k: tangent_at(body, bases[k]), bases)):
-        yield at(k, tangent, memory)
+    def along(i: int) -> list[Equilibrium]:
+        states, before = [], assumed[i]
+        for k in parts[i]:
+            states.append(again(k, before))
+            before = states[-1].segment_tensions
+        return states
+
+    for i, states in enumerate(each(along, range(len(parts)))):
+        before = result[parts[i - 1][-1]].segment_tensions if i else None
+        result.update(zip(parts[i], states))
+        last = assumed[i]
+        for k in parts[i]:
+            if before is None or last is None or _as_before(before, last, slack):
+                break
+            last, result[k] = result[k].segment_tensions, again(k, before, result[k])
+            before = result[k].segment_tensions
+    return [result[k] for k in frames]
+
+
+def _expected_tensions(walk: Walk, frames: list[int], near: dict[int, Equilibrium]) -> dict[int, tuple[FloatArray, ...]]:
+    """Return the tensions along the cables in each frame if they bend as in states near by."""
+    result: dict[int, tuple[FloatArray, ...]] = {}
+    held, cables = walk.drive.control == "displacement", walk.robot.body.cables
+    before = tuple(np.zeros(len(c.path)) for c in cables)
+    for k in frames:
+        state = near[k]
+        motors = [state.tension[c.name] if held else float(T) for c, T in zip(cables, walk.drive.inputs[k])]
+        before = tuple(rub(c, bend_angles(c, state.positions), b, max(T, 0.0)) for c, b, T in zip(cables, before, motors))
+        result[k] = before
+    return result
+
+
+def _as_before(now: tuple[FloatArray, ...], then: tuple[FloatArray, ...], slack: float) -> bool:
+    """Return whether the tensions along all cables are what they were."""
+    return all(np.abs(a - b).max(initial=0.0) <= slack * max(1.0, float(a.max(initial=0.0))) for a, b in zip(now, then))
 
 
 def _clamp_fits(body: BodyModel, state: Equilibrium) -> bool:
@@ -280,52 +341,161 @@ def _clamp_fits(body: BodyModel, state: Equilibrium) -> bool:
     return bool(np.abs(state.positions[held] - body.mesh.nodes[held]).max(initial=0.0) < 1e-9)
 
 
-def _observe_variants(
-    walk: Walk, variants: Sequence[Walk], k: int, base: Equilibrium, seen: FloatArray, observe: Callable[[Robot, Equilibrium], FloatArray],
-    memory: list[tuple[FloatArray, ...] | None], tangent: Tangent | None = None,
-) -> tuple[FloatArray, Factorization | None]:  # fmt: skip
-    """Return what is observed of each variant in frame k, shape (v, p, 3), and the factor of the stiffness where it took one.
+Tensions = tuple[FloatArray, ...]
+"""Tensions along the cables [N], one array (s,) a cable."""
+Job = tuple[int, int, list[int]]
+"""Variant, the frame it is computed in, and all frames that it is the same in."""
 
-    `memory` keeps the tensions along the cables of the variants; `tangent` is that of the base state, where it is known.
-    """
-    others = np.zeros((len(variants), *seen.shape))
-    linear = []
-    for i, variant in enumerate(variants):
-        if _same_mechanics(walk, variant):
-            others[i] = observe(variant.robot, base)
-        elif not _linear(walk, variant):
-            state = _require(solve_frame(variant, k, start=base, before=memory[1 + i]), k)
-            memory[1 + i] = state.segment_tensions
-            others[i] = observe(variant.robot, state)
-        else:
-            linear.append(i)
-    if not linear:
-        return others, None
-    tangent = tangent_at(walk.robot.body, base) if tangent is None else tangent
-    balance = _Balance(walk, k, base)
-    starts = [balance.carried(variants[i]) for i in linear]
-    moves = np.zeros((len(linear), *base.positions.shape))
-    rubbing = any(has_history(variants[i].robot) for i in linear)
-    for _ in range(2 if rubbing else 1):  # the second time with the bends as the first response leaves them
-        answers = [
-            balance.upset_by(variants[i], memory[1 + i], start, start + move) for i, start, move in zip(linear, starts, moves)
-        ]
-        moved = [start is not base.positions for start in starts]
-        forces = [force - balance.left() if m else force for m, (force, _, _) in zip(moved, answers)]
+
+class _Variants:
+    """What is observed of variants in the frames of a walk."""
+
+    def __init__(
+        self, walk: Walk, variants: Sequence[Walk], bases: dict[int, Equilibrium], alike: dict[int, int], others: dict[int, FloatArray],
+        observe: Callable[[Robot, Equilibrium], FloatArray],
+    ) -> None:  # fmt: skip
+        self.walk, self.variants, self.bases, self.alike, self.others, self.observe = (
+            walk,
+            variants,
+            bases,
+            alike,
+            others,
+            observe,
+        )
+        own = [not _same_mechanics(walk, v) for v in variants]
+        linear = [_linear(walk, v) for v in variants]
+        rubs = [has_history(v.robot) for v in variants]
+        every = range(len(variants))
+        self.still = [i for i in every if not own[i]]
+        self.alone = [i for i in every if own[i] and not linear[i]]
+        self.plain = [i for i in every if own[i] and linear[i] and not rubs[i]]
+        self.rubbing = [i for i in every if own[i] and linear[i] and rubs[i]]
+        self.along: dict[tuple[int, int], Tensions] = {}
+        """(variant, frame) → tensions along its cables, of those that rub."""
+        self.kept: dict[int, Tangent] = {}
+        self.room = _room(len(set(alike.values())))
+
+    def write(self) -> Iterator[tuple[int, Factorization]]:
+        """Write all observations; yield the factors that gave them, with their frames."""
+        for k, table in self.others.items():
+            for i in self.still:
+                table[i] = self.observe(self.variants[i].robot, self.bases[k])
+        for i in self.alone:
+            self._write_alone(i)
+        if not self.plain and not self.rubbing:
+            return
+        if self.rubbing:  # twice: the second time with the bends as the first response leaves them
+            bends = {(i, k): self._bends(i, self.bases[k].positions) for i in self.rubbing for k in self.bases}
+            self._rub(bends)
+            for k, factor, found in each(self._bent, self._groups(self.bases)):
+                bends.update(found)
+                yield k, factor
+            self._rub(bends)
+        yield from each(self._written, self._groups(self.others))
+
+    def _write_alone(self, i: int) -> None:
+        """Write what is observed of a variant that is solved for itself."""
+        variant = self.variants[i]
+        memory: Tensions | None = None
+        for k in self.bases if has_history(variant.robot) else self.others:
+            state = _require(solve_frame(variant, k, start=self.bases[k], before=memory), k)
+            memory = state.segment_tensions if has_history(variant.robot) else None
+            if k in self.others:
+                self.others[k][i] = self.observe(variant.robot, state)
+
+    def _groups(self, frames: Iterable[int]) -> list[list[int]]:
+        """Return the frames with one base state together."""
+        groups: dict[int, list[int]] = {}
+        for k in frames:
+            groups.setdefault(self.alike[k], []).append(k)
+        return list(groups.values())
+
+    def _rub(self, bends: dict[tuple[int, int], list[FloatArray]]) -> None:
+        """Move the tensions along the cables of all variants that rub from frame to frame, for given bends."""
+        for i in self.rubbing:
+            variant = self.variants[i]
+            cables = variant.robot.body.cables
+            before = tuple(np.zeros(len(c.path)) for c in cables)
+            for k, base in self.bases.items():
+                motors = _motor_tensions(variant, k, base)
+                before = tuple(rub(c, angle, b, T) for c, angle, b, T in zip(cables, bends[i, k], before, motors))
+                self.along[i, k] = before
+
+    def _bends(self, i: int, x: FloatArray) -> list[FloatArray]:
+        return [bend_angles(c, x) if c.friction > 0 else np.zeros(len(c.path)) for c in self.variants[i].robot.body.cables]
+
+    def _tangent(self, k: int) -> Tangent:
+        return self.kept.pop(k, None) or tangent_at(self.walk.robot.body, self.bases[k])
+
+    def _jobs(self, group: list[int], which: Sequence[int]) -> list[Job]:
+        """Return what is to be computed of some variants in frames with one base state."""
+        jobs: dict[tuple[int, bytes], Job] = {}
+        for i in which:
+            for k in group:
+                key = _key(self.variants[i], k) + b"".join(a.tobytes() for a in self.along.get((i, k), ()))
+                jobs.setdefault((i, key), (i, k, []))[2].append(k)
+        return list(jobs.values())
+
+    def _bent(self, group: list[int]) -> tuple[int, Factorization, dict[tuple[int, int], list[FloatArray]]]:
+        """Return the bends of the variants that rub, as the first response leaves them; keep the tangent where all fit into memory."""
+        first, tangent = self.alike[group[0]], self._tangent(self.alike[group[0]])
+        if tangent.factor.bytes < self.room:
+            self.kept[first] = tangent
+        jobs = self._jobs(group, self.rubbing)
+        moved = zip(jobs, self._respond(group[0], jobs, tangent))
+        return first, tangent.factor, {(i, k): self._bends(i, x) for (i, _, frames), x in moved for k in frames}
+
+    def _written(self, group: list[int]) -> tuple[int, Factorization]:
+        """Write what is observed of all variants in frames with one base state."""
+        first, tangent = self.alike[group[0]], self._tangent(self.alike[group[0]])
+        jobs = self._jobs(group, [*self.plain, *self.rubbing])
+        for (i, _, frames), x in zip(jobs, self._respond(group[0], jobs, tangent)):
+            seen = self.observe(self.variants[i].robot, replace(self.bases[first], positions=x))
+            for frame in frames:
+                self.others[frame][i] = seen
+        return first, tangent.factor
+
+    def _respond(self, frame: int, jobs: list[Job], tangent: Tangent) -> list[FloatArray]:
+        """Return the positions of variants [m], each (n, 3): to first order in what they add to the forces of the base state."""
+        base = self.bases[frame]
+        balances: dict[int, _Balance] = {}
+        forces, pulls, starts = [], [], []
+        for i, k, _ in jobs:
+            if k not in balances:
+                balances[k] = _Balance(self.walk, k, base)
+            balance = balances[k]
+            start = balance.carried(self.variants[i])
+            force, pulled = balance.upset_by(self.variants[i], self.along.get((i, k)), start)
+            forces.append(force - balance.left() if start is not base.positions else force)
+            pulls.append(pulled)
+            starts.append(start)
         moves = tangent.respond(np.array(forces))
         if base.held.any():  # cables: pressures are never held here
-            held = base.held[: len(walk.robot.body.cables)]
-            moves += np.tensordot(np.array([pulled[held] for _, pulled, _ in answers]), tangent.respond_to_held(), axes=1)
-    for i, start, move, (_, _, tensions) in zip(linear, starts, moves, answers):
-        memory[1 + i] = tensions
-        others[i] = observe(variants[i].robot, replace(base, positions=start + move))
-    return others, tangent.factor
+            held = base.held[: len(self.walk.robot.body.cables)]
+            moves += np.tensordot(np.array(pulls)[:, held], tangent.respond_to_held(), axes=1)
+        return [start + move for start, move in zip(starts, moves)]
+
+
+def _motor_tensions(variant: Walk, frame: int, base: Equilibrium) -> list[float]:
+    """Return the tension at the motor of each cable [N]: of held ones as in the base state."""
+    names = variant.robot.body.cable_names
+    held = variant.drive.control == "displacement"
+    return [base.tension[name] if held else float(T) for name, T in zip(names, variant.drive.inputs[frame])]
 
 
 def _linear(walk: Walk, variant: Walk) -> bool:
     """Return whether the linear response gives a variant: the same elements, and a clamp that moves by little."""
     base, other = walk.robot.body, variant.robot.body
     return base.stencil.slots is other.stencil.slots and (base.clamp_is_rigid or not other.clamp_is_rigid)
+
+
+def _rubbed(variant: Walk, frame: int, base: Equilibrium, x: FloatArray) -> Tensions:
+    """Return the tensions along the cables of a variant at positions x if those of the base state are what was before."""
+    motors = _motor_tensions(variant, frame, base)
+    return tuple(
+        rub(c, bend_angles(c, x), before, T) if c.friction > 0 else np.full(len(c.path), T)
+        for c, before, T in zip(variant.robot.body.cables, base.segment_tensions, motors)
+    )
 
 
 class _Balance:
@@ -364,16 +534,16 @@ class _Balance:
             force = force + self.base.pressure[chamber.name] * volume_gradient(chamber, x)
         return np.asarray(force - self.inner)
 
-    def upset_by(
-        self, variant: Walk, before: tuple[FloatArray, ...] | None, x: FloatArray, bent: FloatArray
-    ) -> tuple[FloatArray, FloatArray, tuple[FloatArray, ...]]:
-        """Return the nodal forces that a variant adds at positions x near the base state [N], (n, 3); the shortening that it adds
-        to held cables [m], (a,); and the tensions along its cables [N]. `bent` is where its cables bend [m], (n, 3)."""
+    def upset_by(self, variant: Walk, along: Tensions | None, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the nodal forces that a variant adds at positions x near the base state [N], (n, 3), and the shortening that it adds
+        to held cables [m], (a,). `along` are the tensions along its cables; None: they do not rub."""
         body = self._body(variant)
-        tensions = self._tensions(variant, body, before, bent)
+        if along is None:
+            motors = _motor_tensions(variant, self.frame, self.base)
+            along = tuple(np.full(len(c.path), T) for c, T in zip(body.cables, motors))
         still = x is self.base.positions
-        force = self._change(variant, body, tensions) if still else self._whole(variant, body, tensions, x)
-        return force, self._pulled(variant, body, None if still else x), tensions
+        force = self._change(variant, body, along) if still else self._whole(variant, body, along, x)
+        return force, self._pulled(variant, body, None if still else x)
 
     def _whole(self, variant: Walk, body: BodyModel, tensions: tuple[FloatArray, ...], x: FloatArray) -> FloatArray:
         """Return all forces on a variant's body at x."""
@@ -403,18 +573,6 @@ class _Balance:
             if more != 0.0:
                 force += more * volume_gradient(chamber, x)
         return force
-
-    def _tensions(
-        self, variant: Walk, body: BodyModel, before: tuple[FloatArray, ...] | None, bent: FloatArray
-    ) -> tuple[FloatArray, ...]:
-        result = []
-        for i, cable in enumerate(body.cables):
-            held = variant.drive.control == "displacement"
-            motor = self.base.tension[cable.name] if held else float(variant.drive.inputs[self.frame, i])
-            start = np.zeros(len(cable.path)) if before is None else before[i]
-            rubs = cable.friction > 0
-            result.append(rub(cable, bend_angles(cable, bent), start, motor) if rubs else np.full(len(cable.path), motor))
-        return tuple(result)
 
     def _pulled(self, variant: Walk, body: BodyModel, x: FloatArray | None) -> FloatArray:
         cables = self.body.cables
@@ -465,7 +623,7 @@ def finer_state(walk: Walk, fine: Walk, frame: int, base: Equilibrium, ties: Emb
     body, balance = fine.robot.body, _Balance(walk, frame, base)
     x, first = ties.positions(base.positions), np.inf
     for step in range(FINER_STEPS):
-        force, pulled, _ = balance.upset_by(fine, base.segment_tensions, x, x)
+        force, pulled = balance.upset_by(fine, _rubbed(fine, frame, base, x), x)
         size = float(np.linalg.norm(force.ravel()[body.free_map.dofs]))
         first = size if step == 0 else first
         if step and size < FINER_ENOUGH * first:
@@ -488,14 +646,13 @@ def _same_mechanics(walk: Walk, variant: Walk) -> bool:
     )
 
 
-def _key(walk: Walk, variants: Sequence[Walk], frame: int) -> bytes:
-    parts = []
-    for w in (walk, *variants):
-        drive = w.drive
-        rows = drive.load_frame == frame
-        parts += [drive.inputs[frame], drive.pressures[frame], drive.load_points[rows].ravel(), drive.load_forces[rows].ravel()]
-        if drive.gravity is not None:
-            parts.append(drive.gravity[frame])
+def _key(walk: Walk, frame: int) -> bytes:
+    """Return what tells the drive of two frames apart."""
+    drive = walk.drive
+    rows = drive.load_frame == frame
+    parts = [drive.inputs[frame], drive.pressures[frame], drive.load_points[rows].ravel(), drive.load_forces[rows].ravel()]
+    if drive.gravity is not None:
+        parts.append(drive.gravity[frame])
     return np.concatenate([np.asarray(p, dtype=float) for p in parts]).tobytes()
 
 

@@ -36,7 +36,7 @@ class FitResult:
     cost: tuple[float, ...]
     """Sum of squares after each iteration, the start first."""
     status: str
-    """"converged" or "iterations"."""
+    """"converged", "iterations", or "given up" (see `worth` of `gauss_newton`)."""
 
 
 def gauss_newton(
@@ -51,11 +51,12 @@ def gauss_newton(
     known: tuple[FloatArray, FloatArray | None] | None = None,
     borrowed: FloatArray | None = None,
     serves: float = 0.0,
+    worth: float = np.inf,
 ) -> FitResult:
     """Minimise ‖r(θ)‖² within bounds (Levenberg's damping where a plain step does not pay).
 
-    A Jacobian that predicted the last step well serves for the next one too; the fit ends only where the Jacobian at θ itself says that
-    there is nothing left to gain.
+    A Jacobian that predicted the last step well serves for the next one too, corrected along that step (Broyden 1965); the fit ends
+    only where the Jacobian at θ itself says that there is nothing left to gain.
 
     Arguments:
         evaluate: residual and Jacobian; priors are rows of them.
@@ -67,6 +68,7 @@ def gauss_newton(
         known: residual and Jacobian at the start, where they are known.
         borrowed: a Jacobian from near the start to begin with.
         serves: a Jacobian serves for another step where it missed the change of the residual by less than this share of it.
+        worth: a fit whose sum of squares stays above this is given up where a borrowed Jacobian says that nothing is left to gain.
     """
     from femsense.errors import DataError
 
@@ -87,6 +89,9 @@ def gauss_newton(
         predicted = costs[-1] - float(np.sum((residual + change) ** 2))
         error = max(1.0, costs[-1] / max(len(residual), 1)) ** 0.5  # what a standard error is worth where the model misfits
         small = predicted <= tolerance * costs[-1] or np.linalg.norm(change) <= still * error
+        if not own and costs[-1] > worth and (small or steps >= max_iterations or costs[-1] - 2.0 * predicted > worth):
+            status = "given up"
+            break
         if not own and (small or steps >= max_iterations):
             residual, jacobian, own = *_both(evaluate, theta), True
             continue
@@ -109,10 +114,13 @@ def gauss_newton(
                 break
             continue
         damping = damping / 10.0 if damping > 1e-6 else 0.0
-        missed = float(np.linalg.norm(new_residual - residual - change))
+        missed = new_residual - residual - change
         theta, residual, own = theta + step, new_residual, False
-        if missed > serves * float(np.linalg.norm(change)):
+        if np.linalg.norm(missed) > serves * float(np.linalg.norm(change)):
             residual, jacobian, own = *_both(evaluate, theta), True
+        else:
+            along = scale**2 * step
+            jacobian = jacobian + np.outer(missed, along / max(float(along @ step), 1e-300))
         costs.append(float(residual @ residual))
     return FitResult(freeze(theta), freeze(covariance_of(jacobian)), freeze(residual), freeze(jacobian), tuple(costs), status)
 

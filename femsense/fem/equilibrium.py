@@ -34,6 +34,8 @@ CHORD = 1e-2
 """A stiffness serves for another step where the last one left less than this share of the residual."""
 LENT = 0.1
 """So does one that was lent by a state near by."""
+RUBS = 0.3
+"""So does any where tensions along cables follow the bends, which converge no faster with a stiffness of their own."""
 FAR = 1e6
 """A stiffness factorised where the residual was more than this times its tolerance says nothing of the stability of the end."""
 CLOSED = 1e-12
@@ -402,7 +404,8 @@ def _newton(body: BodyModel, loads: _Loads, state: _State, max_iterations: int) 
     last = np.inf
     frictional = any(c.friction > 0 for c in body.cables)
     for iteration in range(max_iterations):
-        if frictional and not len(held) and 0 < iteration < FOLLOW_FRICTION:
+        follows = frictional and not len(held) and iteration < FOLLOW_FRICTION
+        if follows and (iteration or state.borrowed):  # from a state near by at once: its bends are nearly those of the end
             _update_friction(body, loads, state)
         rows = _rows(body, state)
         H = _kinematic_rows(body, state, rows)[held][:, free] if len(held) else np.zeros((0, len(free)))
@@ -416,7 +419,7 @@ def _newton(body: BodyModel, loads: _Loads, state: _State, max_iterations: int) 
             return CONVERGED
         if not sound:
             return "stalled"
-        serves = LENT if state.borrowed else CHORD
+        serves = RUBS if follows else LENT if state.borrowed else CHORD
         if state.factor is None or state.residual > max(loads.tolerance, serves * last):
             state.factor, state.borrowed = _factor_here(body, here, state, H, C, stretch, loads.lever[held]), False
             if state.factor is None:

@@ -12,8 +12,9 @@ from femsense.calib.calibrate import calibrate, first_inputs, first_poses, input
 from femsense.calib.forward import Scene, make_scene, rest_residual, with_rest_markers
 from femsense.effects import FORMS, Effect
 from femsense.errors import DataError, InputError
+from femsense.fem.mesh import TetMesh
 from femsense.loop.clouds import SMOOTH, cloud_frames, diagonal_of, has_clouds, make_rows, read_sheets, states_of, with_surface
-from femsense.loop.joint import Trial, normals_of
+from femsense.loop.joint import States, Trial, normals_of
 from femsense.loop.noise import Groups, Surface
 from femsense.loop.split import hold_out, sweeps_of
 from femsense.model import Robot
@@ -161,10 +162,11 @@ def _trials(
     poses, initial = _start(declared, recording, few)
     low, high = input_bounds(robot, recording)
     every = np.union1d(fitted, kept)
+    starts: dict[int, tuple[TetMesh, States]] = {}
 
     def trial(scene: Scene, frames: IntArray) -> Trial:
         return Trial(
-            scene, groups_of(scene, frames, surface_of(robot, scene, poses)), poses, initial, low, high, {}, frames=frames
+            scene, groups_of(scene, frames, surface_of(robot, scene, poses)), poses, initial, low, high, starts, frames=frames
         )
 
     result: list[tuple[Trial, Trial | None]] = []

@@ -54,6 +54,9 @@ SURE = 2.5
 POLISHED = 2.0
 """Decrease of χ² that each further parameter of a polished effect must bring."""
 
+FORGONE = 2.0, 1.25
+"""A refit whose gain in χ² is too little by this much and this factor is given up before it has derivatives of its own."""
+
 Progress = Callable[[str], None]
 
 
@@ -86,7 +89,7 @@ def grow(
         record: dict[str, Any] = {"name": candidate.effect.name, "seed": candidate.seed}
         records.append(record)
         try:
-            made = refit(data, stage, candidate, noise)
+            made = refit(data, stage, candidate, noise, wanted=max(EVIDENCE, best - 2.0 * EVIDENCE))
         except FemsenseError as error:
             record["verdict"] = f"no equilibrium: {error}"
             continue
@@ -118,7 +121,7 @@ def _enriched(data: Data, stage: Stage, winner: Refit, table: list[Candidate], n
         if len(form.parameters) <= len(winner.candidate.parameters):
             continue
         say(f"trying {form.effect.name} with {len(form.parameters)} parameters")
-        made = _tried(data, stage, form, noise)
+        made = _tried(data, stage, form, noise, winner.score + EVIDENCE)
         if made is None:
             continue
         rich = judged(data, stage, form, made, dict(winner.record), noise)
@@ -224,8 +227,11 @@ def evidence(before: JointFit, after: JointFit) -> float:
     return min(before.chi2 - after.chi2, freedom * float(np.log(before.chi2 / max(after.chi2, 1e-12))))
 
 
-def refit(data: Data, stage: Stage, candidate: Candidate, noise: Noise) -> Stage:
-    """Joint fit with one more effect, started from its linear step. Raises DataError where no start helps."""
+def refit(data: Data, stage: Stage, candidate: Candidate, noise: Noise, *, wanted: float = EVIDENCE) -> Stage:
+    """Joint fit with one more effect, started from its linear step. Raises DataError where no start helps.
+
+    Where the dBIC stays well below what is wanted, the fit ends without derivatives of its own.
+    """
     null = np.array([p.null for p in candidate.parameters])
     low, high = np.array([p.low for p in candidate.parameters]), np.array([p.high for p in candidate.parameters])
     start = null if candidate.effect.discrete else np.clip(_first_guess(candidate, null), low, high)
@@ -236,6 +242,7 @@ def refit(data: Data, stage: Stage, candidate: Candidate, noise: Noise) -> Stage
     )  # a linear step may go too far
     answer = 0.0 if candidate.effect.discrete else candidate.response @ (start - null)  # of what is fitted already
     best: Stage | None = None
+    worth = stage.fit.chi2 - (candidate.cost + wanted - FORGONE[0]) / FORGONE[1]
     for share in shares:
         theta = _declared(data, stage, hypothesis, noise) if share == DECLARED else stage.fit.fit.theta + share * answer
         coordinates = np.concatenate([theta[stage.fit.own :], null + share * (start - null)])
@@ -243,8 +250,9 @@ def refit(data: Data, stage: Stage, candidate: Candidate, noise: Noise) -> Stage
         near = stage.fit.jets if not candidate.parameters and share != DECLARED else None
         try:
             made = make_stage(
-                data, hypothesis, prior, noise, coordinates, own=theta[: stage.fit.own], max_iterations=10, known=known, near=near
-            )
+                data, hypothesis, prior, noise, coordinates,
+                own=theta[: stage.fit.own], max_iterations=10, known=known, near=near, worth=worth,
+            )  # fmt: skip
         except DataError:
             continue
         if made.fit.chi2 <= (stage.fit.chi2 + 1.0 if best is None else best.fit.chi2):
@@ -421,9 +429,9 @@ def _screen_seeds(data: Data, stage: Stage, start: Candidate, seeds: Sequence[En
     return screen(stage.fit, problem_of(data, stage.fit, noise), fields, 100.0)
 
 
-def _tried(data: Data, stage: Stage, candidate: Candidate, noise: Noise) -> Stage | None:
+def _tried(data: Data, stage: Stage, candidate: Candidate, noise: Noise, wanted: float = EVIDENCE) -> Stage | None:
     try:
-        return refit(data, stage, candidate, noise)
+        return refit(data, stage, candidate, noise, wanted=wanted)
     except FemsenseError:
         return None
 

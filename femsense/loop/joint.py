@@ -61,7 +61,7 @@ class Trial:
     def part(self, frames: IntArray) -> Trial:
         """Return the trial with some of its frames only."""
         rows = np.isin(self.scene.frame, frames)
-        return replace(self, scene=self.scene.pick(frames), groups=self.groups.of_rows(rows), starts={}, mesh_error=None)
+        return replace(self, scene=self.scene.pick(frames), groups=self.groups.of_rows(rows), mesh_error=None)
 
     def starts_on(self, mesh: TetMesh) -> States:
         """Return the states of earlier evaluations on a mesh (bodies of another size share its elements)."""
@@ -184,6 +184,8 @@ class JointProblem:
     seat_std: float
     last: Jets | None = None
     """With derivatives."""
+    seen: Jets | None = None
+    """Without derivatives."""
     tried: tuple[FloatArray, list[States]] | None = None
     """The step that was tried last, and its states."""
     scale: FloatArray = field(default_factory=lambda: np.zeros(0))
@@ -228,9 +230,18 @@ class JointProblem:
             self.tried = (np.array(theta), starts)
         if derivative:
             self.last = Jets(jets, np.array(theta))
+        else:
+            self.seen = Jets(jets, np.array(theta))
         rows = self.rows_of(jets, theta, derivative)
         self.scale = self.scale if rows[1] is None else np.linalg.norm(rows[1], axis=0)
         return rows
+
+    def settle_for(self, near: list[SceneJet] | None) -> list[SceneJet]:
+        """Return the residuals that were seen last, with the derivatives from before; their states serve as starts from now on."""
+        derivatives = near if self.last is None else self.last.jets
+        assert self.seen is not None and derivatives is not None
+        self._starts(self.seen.theta, False)
+        return [replace(d, residual=s.residual, rest=s.rest, states=s.states) for d, s in zip(derivatives, self.seen.jets)]
 
     def _starts(self, theta: FloatArray, rough: bool) -> list[States]:
         """Return the states to start from, of each trial: those of the step that was tried last where it is nearer."""
@@ -321,6 +332,7 @@ SERVES = 0.25
 def fit_jointly(
     hypothesis: Hypothesis, prior: Prior, trials: list[Trial], noise: Noise, seat_std: float, coordinates: FloatArray,
     *, own: FloatArray | None = None, max_iterations: int = 12, known: list[SceneJet] | None = None, near: list[SceneJet] | None = None,
+    worth: float = np.inf,
 ) -> JointFit:  # fmt: skip
     """Fit poses, initial inputs and the coordinates of a hypothesis together, in full nonlinearity.
 
@@ -334,6 +346,7 @@ def fit_jointly(
         max_iterations: Gauss–Newton steps.
         known: residuals and derivatives at the start, one jet a trial, where they are known.
         near: derivatives from near the start, to begin with.
+        worth: χ² above which the fit is not worth derivatives of its own at the end.
 
     Raises:
         DataError: no equilibrium at the start.
@@ -347,8 +360,11 @@ def fit_jointly(
     problem.last = None if known is None else Jets(known, np.array(theta))
     fit = gauss_newton(
         problem.evaluate, theta, low=low, high=high, max_iterations=max_iterations, tolerance=1e-6, still=0.2,
-        known=begin, borrowed=None if near is None else problem.rows_of(near, theta, True)[1], serves=SERVES,
+        known=begin, borrowed=None if near is None else problem.rows_of(near, theta, True)[1], serves=SERVES, worth=worth,
     )  # fmt: skip
+    if fit.status == "given up":
+        jets = problem.settle_for(near)
+        return JointFit(hypothesis, prior, fit, problem.own, float(fit.residual @ fit.residual), jets)
     if problem.last is None or not np.array_equal(problem.last.theta, fit.theta):
         problem.evaluate(fit.theta, True)
     assert problem.last is not None

@@ -207,7 +207,7 @@ def _starts_of(trial: Trial, fixed: Robot, robot: Robot, states: States) -> Stat
     if mesh is fixed.body.mesh:
         return dict(states)
     starts = trial.starts_on(mesh)
-    if starts.keys() != states.keys():
+    if not states.keys() <= starts.keys():
         ties, still = embed_points(fixed.body.mesh, mesh.nodes), np.zeros_like(mesh.nodes)
         starts.update(
             {k: replace(s, positions=ties.positions(s.positions), nodal_forces=still, factor=None) for k, s in states.items()}

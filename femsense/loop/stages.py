@@ -70,11 +70,12 @@ def make_stage(
     max_iterations: int = 12,
     known: list[SceneJet] | None = None,
     near: list[SceneJet] | None = None,
+    worth: float = np.inf,
 ) -> Stage:
     """Return the fit of a hypothesis and what it makes of the held-out data; arguments as of `fit_jointly`."""
     fit = fit_jointly(
         hypothesis, prior, data.train, noise, data.seat_std, coordinates,
-        own=own, max_iterations=max_iterations, known=known, near=near,
+        own=own, max_iterations=max_iterations, known=known, near=near, worth=worth,
     )  # fmt: skip
     held = held_out(data, fit, noise)
     return Stage(fit, held, rms_of([h.jet.residual for h in held]))
