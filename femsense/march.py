@@ -23,6 +23,7 @@ from femsense.fem.equilibrium import Equilibrium, solve_equilibrium
 from femsense.fem.iterative import UnsettledError, iterative
 from femsense.fem.linear import Factorization, Pattern, available_memory, factorize
 from femsense.fem.mesh import Embedding, TetMesh, embed_points
+from femsense.fem.turning import turned_step
 from femsense.model import Robot
 from femsense.parallel import each
 from femsense.recording import Recording
@@ -278,7 +279,7 @@ def _nearest(walk: Walk, near: dict[int, Equilibrium], frames: list[int]) -> dic
     np.add.at(load, drive.load_frame, drive.load_forces)
     gravity = np.zeros((len(load), 0)) if drive.gravity is None else drive.gravity
     table = np.hstack([drive.inputs, drive.pressures, gravity, load])
-    table = table / np.maximum(np.ptp(table, axis=0), 1e-12)
+    table = (table - table[0]) / np.maximum(np.ptp(table, axis=0), 1e-12)
     known = list(near)
     return {k: near[known[int(np.linalg.norm(table[known] - table[k], axis=1).argmin())]] for k in frames}
 
@@ -588,8 +589,8 @@ class _Balance:
         return np.asarray(pulled)
 
 
-FINER_STEPS = 5
-FINER_ENOUGH = 0.2
+FINER_STEPS = 8
+FINER_ENOUGH = 5e-3
 """Newton steps on the finer mesh end when the unbalanced force has fallen to this share."""
 ROUGH = 1e-3
 """Share of a step on the finer mesh that may be missing, in energy. With ten times as much the order of the nodes moved a fit by two percent."""
@@ -632,7 +633,8 @@ def finer_state(walk: Walk, fine: Walk, frame: int, base: Equilibrium, ties: Emb
         move = tangent.respond(force[None])[0]
         if base.held.any():
             move = move + np.tensordot(pulled[base.held[: len(body.cables)]], tangent.respond_to_held(), axes=1)
-        x = np.asarray(x + move)
+        turned = turned_step(body, x, move)
+        x = np.asarray(x + move) if turned is None else turned
     return None
 
 

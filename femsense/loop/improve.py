@@ -23,18 +23,28 @@ from femsense.loop.data import Data, prepare
 from femsense.loop.exchange import exchanged
 from femsense.loop.grow import Progress, grow, mesh_cost, moved_by, prune
 from femsense.loop.joint import Prior
-from femsense.loop.mesh_error import with_mesh_errors
+from femsense.loop.mesh_error import few_states, with_mesh_errors
 from femsense.loop.noise import Noise
 from femsense.loop.result import LoopResult
 from femsense.loop.screen import Candidate
-from femsense.loop.stages import Stage, fields_of, keeping, make_stage, noise_of, own_of, rematched, screen_stage, with_nuisance
+from femsense.loop.stages import (
+    Stage,
+    fields_of,
+    make_stage,
+    noise_of,
+    own_of,
+    rematched,
+    roughly_keeping,
+    screen_stage,
+    with_nuisance,
+)
 from femsense.loop.zeros import in_place_of_zeros
 from femsense.model import Robot
 from femsense.recording import Recording, state_key
 
 MAX_EFFECTS = 3
-ROUGHLY = 3
-"""Steps of the fit at which what the mesh costs is asked."""
+ROUGHLY = 4
+"""Steps of the fit whose residual tells the noise; with that it is fitted to the end."""
 
 
 def improve(
@@ -89,7 +99,7 @@ def _calibrated(data: Data, say: Progress) -> tuple[Data, Stage, Stage]:
     before = _declared(data, noise, None)
     hypothesis, prior = with_nuisance(data)
     say("fitting what calibration may move")
-    base = make_stage(data, hypothesis, prior, noise, np.zeros(len(prior.mean)))
+    base = make_stage(data, hypothesis, prior, noise, np.zeros(len(prior.mean)), own=own_of(before), max_iterations=ROUGHLY)
     if "clouds" in data.measured:
         say("matching the clouds again")
         data = rematched(data, base, noise, anew=True)
@@ -97,7 +107,8 @@ def _calibrated(data: Data, say: Progress) -> tuple[Data, Stage, Stage]:
         before = _declared(data, noise, before)
     say("asking what the mesh costs")
     try:  # zeros may have gone far, for an effect's sake
-        plain = keeping(data, base, ["stiffness"], noise, max_iterations=ROUGHLY)
+        frames = [few_states(t, len(base.fit.hypothesis.robot.body.mesh.tets)) for t in data.train]
+        plain = roughly_keeping(data, base, ["stiffness"], noise, frames)
     except FemsenseError:
         plain = base
     return with_mesh_errors(data, plain), before, base

@@ -12,25 +12,25 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.interpolate import RBFInterpolator
 
-from femsense.arrays import FloatArray
-from femsense.calib.forward import Hypothesis, evaluate_scene, seats
+from femsense.arrays import FloatArray, IntArray
+from femsense.calib.forward import seats
 from femsense.effects.shape import finer_mesh, robot_on_mesh
 from femsense.errors import DataError, FemsenseError
-from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.mesh import embed_points
 from femsense.loop.data import Data
 from femsense.loop.joint import Trial, normals_of
 from femsense.loop.stages import Stage, placed
-from femsense.march import Walk, drive_of, finer_state
+from femsense.march import Walk, drive_of, finer_state, walk_along
 from femsense.model import Robot
 from femsense.parallel import each
+from femsense.recording import Recording
 
 MOST_TETS = 24000
 """A finer mesh than this takes too long in every state."""
-MOST_WORK = 300_000
-"""Tetrahedra × states; beyond it the nearest state that was computed stands for others."""
+MOST_WORK = 150_000
+"""Tetrahedra × states of a recording; beyond it the errors of other states are interpolated between those that were computed."""
 VARIES = 0.25
 """The share of the error that a body shows differs by this between sweeps (standard deviation)."""
 
@@ -41,24 +41,27 @@ def with_mesh_errors(data: Data, stage: Stage) -> Data:
     mesh = robot.body.mesh
     if not mesh.is_quadratic or 8 * len(mesh.tets) > MOST_TETS:
         return data
+    train, held, fitted = list(data.train), list(data.held), placed(data, stage.fit)
     try:
         fine = robot_on_mesh(robot, finer_mesh(mesh, None, 1))
-        train = [_with_error(robot, fine, t, *p) for t, p in zip(data.train, placed(data, stage.fit))]
-        fitted = placed(data, stage.fit)
-        own = [fitted[of] if of is not None else (t.poses, t.initial) for t, of in zip(data.held, data.held_of)]
-        held = [_with_error(robot, fine, t, *p) for t, p in zip(data.held, own)]
+        for i, (trial, (poses, initial)) in enumerate(zip(data.train, fitted)):
+            own = [j for j, of in enumerate(data.held_of) if of == i]
+            train[i], *later = _with_errors(robot, fine, [trial, *(held[j] for j in own)], poses, initial)
+            for j, one in zip(own, later):
+                held[j] = one
+        for j in (j for j, of in enumerate(data.held_of) if of is None):
+            held[j] = _with_errors(robot, fine, [held[j]], held[j].poses, held[j].initial)[0]
     except FemsenseError:
         return data
     return replace(data, train=train, held=held)
 
 
-def _with_error(robot: Robot, fine: Robot, trial: Trial, poses: Sequence[FloatArray], initial: FloatArray | None) -> Trial:
-    places = seats(robot, trial.scene, poses)
-    states = evaluate_scene(
-        Hypothesis(robot), trial.scene, np.zeros(0), poses, initial, derivative=False, vary_initial=False,
-        pivot=robot.marker_points.mean(axis=0), starts=trial.starts_on(robot.body.mesh),
-    ).states  # fmt: skip
-    return replace(trial, mesh_error=_by_sweep(trial, _moves(robot, fine, trial, places, initial, states), poses))
+def _with_errors(
+    robot: Robot, fine: Robot, trials: Sequence[Trial], poses: Sequence[FloatArray], initial: FloatArray | None
+) -> list[Trial]:
+    """Return trials of one recording with the error of the mesh in their states."""
+    moves = _moves(robot, fine, trials, seats(robot, trials[0].scene, poses), initial)
+    return [replace(t, mesh_error=_by_sweep(t, moves, poses)) for t in trials]
 
 
 def _by_sweep(trial: Trial, moves: dict[int, FloatArray], poses: Sequence[FloatArray]) -> FloatArray:
@@ -73,41 +76,54 @@ def _by_sweep(trial: Trial, moves: dict[int, FloatArray], poses: Sequence[FloatA
     return fields
 
 
+def few_states(trial: Trial, tets: int) -> IntArray:
+    """Return the frames of a trial in which the error of a mesh of so many elements would be computed, ascending."""
+    frames = trial.scene.frames
+    return np.asarray(frames[np.sort(_chosen(_state_vectors(trial.scene.recording, frames), 8 * tets))])
+
+
 def _moves(
-    robot: Robot, fine: Robot, trial: Trial, places: FloatArray, initial: FloatArray | None, states: dict[int, Equilibrium]
+    robot: Robot, fine: Robot, trials: Sequence[Trial], places: FloatArray, initial: FloatArray | None
 ) -> dict[int, FloatArray]:
     """Return by how much the finer mesh moves the markers in each frame [m], (m, 3)."""
-    coarse_walk = Walk(robot, drive_of(robot, trial.scene.recording, initial=initial))
-    fine_walk = Walk(fine, drive_of(fine, trial.scene.recording, initial=initial))
+    recording, starts = trials[0].scene.recording, trials[0].starts_on(robot.body.mesh)
+    coarse_walk = Walk(robot, drive_of(robot, recording, initial=initial))
+    fine_walk = Walk(fine, drive_of(fine, recording, initial=initial))
     ties = embed_points(robot.body.mesh, fine.body.mesh.nodes)
     here, there = robot.tie_markers(places), fine.tie_markers(places)
-    frames = sorted(states)
-    vectors = _state_vectors(trial, frames)
-    chosen = _representatives(vectors, max(8, MOST_WORK // len(fine.body.mesh.tets)))
+    frames = np.unique(np.concatenate([t.scene.frames for t in trials]))
+    vectors = _state_vectors(recording, frames)
+    chosen = _chosen(vectors, len(fine.body.mesh.tets))
+    walked = walk_along(coarse_walk, frames[chosen].tolist(), lambda r, s: s.positions[:0], starts=starts)
+    states = {k: state for k, state, _, _ in walked}
     known, settled = [], []
 
     def finer_at(i: int) -> FloatArray | None:
-        return finer_state(coarse_walk, fine_walk, frames[i], states[frames[i]], ties)
+        return finer_state(coarse_walk, fine_walk, int(frames[i]), states[int(frames[i])], ties)
 
     finer_states = [finer_at(chosen[0]), *each(finer_at, chosen[1:])]  # the first makes what all of them share
     for i, finer in zip(chosen, finer_states):
         if finer is not None:
             settled.append(i)
-            known.append(there.positions(finer) - here.positions(states[frames[i]].positions))
+            known.append(there.positions(finer) - here.positions(states[int(frames[i])].positions))
     if not known:
         raise DataError("no state settles on the finer mesh")
-    nearest = np.asarray(cKDTree(vectors[settled]).query(vectors)[1])
-    return {k: known[j] for k, j in zip(frames, nearest)}
+    between = RBFInterpolator(vectors[settled], np.reshape(known, (len(known), -1)), kernel="linear", degree=0)(vectors)
+    return dict(zip(frames.tolist(), between.reshape(-1, *known[0].shape)))
 
 
-def _state_vectors(trial: Trial, frames: list[int]) -> FloatArray:
+def _state_vectors(recording: Recording, frames: IntArray) -> FloatArray:
     """Return inputs, pressures, gravity and total load of each frame, each in units of its range, shape (f, q)."""
-    recording = trial.scene.recording
     load = np.zeros((len(recording.time_s), 3))
     np.add.at(load, recording.load_frame, recording.load_forces)
     gravity = np.zeros((len(load), 0)) if recording.gravity is None else recording.gravity
     table = np.hstack([recording.inputs, recording.pressures, gravity, load])[frames]
-    return np.asarray(table / np.maximum(np.ptp(table, axis=0), 1e-12))
+    return np.asarray((table - table[0]) / np.maximum(np.ptp(table, axis=0), 1e-12))
+
+
+def _chosen(vectors: FloatArray, tets: int) -> list[int]:
+    """Return indices of the states in which a finer mesh of so many elements is asked."""
+    return _representatives(vectors, max(8, MOST_WORK // tets))
 
 
 def _representatives(vectors: FloatArray, most: int) -> list[int]:
@@ -120,4 +136,4 @@ def _representatives(vectors: FloatArray, most: int) -> list[int]:
     return chosen
 
 
-__all__ = ["with_mesh_errors"]
+__all__ = ["few_states", "with_mesh_errors"]

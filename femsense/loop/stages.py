@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from femsense.arrays import BoolArray, FloatArray
+from femsense.arrays import BoolArray, FloatArray, IntArray
 from femsense.calib.forward import Hypothesis, SceneJet, evaluate_scene
 from femsense.effects import Effect, Entry, Parameter, find_effect
 from femsense.loop.clouds import make_rows, renewed_rows, states_of
@@ -19,6 +19,10 @@ from femsense.model import Robot
 
 ZERO_STD = 0.1
 """How well the zero of a cable is known beforehand, as a share of its range in the recording."""
+
+
+ROUGHLY = 3
+"""Steps of a fit that only has to come near."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -100,10 +104,7 @@ def jets_without(stage: Stage, keep: BoolArray) -> list[SceneJet]:
 
 def keeping(data: Data, stage: Stage, names: Sequence[str], noise: Noise, *, max_iterations: int = 12) -> Stage:
     """Return a stage with some of its terms only, fitted again. Raises DataError."""
-    terms = stage.fit.hypothesis.terms
-    mask = np.concatenate([np.full(len(p), e.name in names) for e, _, p in terms]) if terms else np.zeros(0, dtype=bool)
-    hypothesis = replace(stage.fit.hypothesis, terms=tuple(t for t in terms if t[0].name in names))
-    prior = Prior(stage.fit.prior.mean[mask], stage.fit.prior.std[mask])
+    hypothesis, prior, mask = _some_terms(stage, names)
     return make_stage(
         data,
         hypothesis,
@@ -114,6 +115,24 @@ def keeping(data: Data, stage: Stage, names: Sequence[str], noise: Noise, *, max
         max_iterations=max_iterations,
         near=jets_without(stage, mask),
     )
+
+
+def _some_terms(stage: Stage, names: Sequence[str]) -> tuple[Hypothesis, Prior, BoolArray]:
+    """Return the hypothesis and prior of a stage with some of its terms only, and which coordinates these have."""
+    terms = stage.fit.hypothesis.terms
+    mask = np.concatenate([np.full(len(p), e.name in names) for e, _, p in terms]) if terms else np.zeros(0, dtype=bool)
+    hypothesis = replace(stage.fit.hypothesis, terms=tuple(t for t in terms if t[0].name in names))
+    return hypothesis, Prior(stage.fit.prior.mean[mask], stage.fit.prior.std[mask]), mask
+
+
+def roughly_keeping(data: Data, stage: Stage, names: Sequence[str], noise: Noise, frames: Sequence[IntArray]) -> Stage:
+    """Return a stage with some of its terms only, fitted in a few steps to some frames of each trial; nothing is held out. Raises DataError."""
+    hypothesis, prior, mask = _some_terms(stage, names)
+    trials = [t.part(f) for t, f in zip(data.train, frames)]
+    fit = fit_jointly(
+        hypothesis, prior, trials, noise, data.seat_std, stage.fit.coordinates[mask], own=own_of(stage), max_iterations=ROUGHLY
+    )
+    return Stage(fit, [], float("nan"))
 
 
 def own_of(stage: Stage) -> FloatArray:
