@@ -8,11 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from femsense.arrays import FloatArray, IntArray
-from femsense.calib.calibrate import calibrate, first_inputs, first_poses, input_bounds, usable_frames
+from femsense.calib.calibrate import calibrate_states, first_inputs, first_poses, input_bounds, usable_frames
 from femsense.calib.forward import Scene, make_scene, rest_residual, with_rest_markers
 from femsense.effects import FORMS, Effect
 from femsense.errors import DataError, InputError
-from femsense.fem.mesh import TetMesh
 from femsense.loop.clouds import SMOOTH, cloud_frames, diagonal_of, has_clouds, make_rows, read_sheets, states_of, with_surface
 from femsense.loop.joint import States, Trial, normals_of
 from femsense.loop.noise import Groups, Surface
@@ -159,10 +158,11 @@ def _trials(
     """
     marked, cloudy = kinds
     few = fitted[: max(1, round(0.2 * len(fitted)))] if first_only else fitted
-    poses, initial = _start(declared, recording, few)
+    poses, initial, states = _start(declared, recording, few)
     low, high = input_bounds(robot, recording)
     every = np.union1d(fitted, kept)
-    starts: dict[int, tuple[TetMesh, States]] = {}
+    mesh = declared.body.mesh
+    starts = {id(mesh.tets): (mesh, states)} if states else {}
 
     def trial(scene: Scene, frames: IntArray) -> Trial:
         return Trial(
@@ -189,20 +189,20 @@ def _trials(
     return result
 
 
-def _start(robot: Robot, recording: Recording, frames: IntArray) -> tuple[tuple[FloatArray, ...], FloatArray | None]:
-    """Return poses and initial inputs to start from: of the calibration where there are markers, else as declared.
+def _start(robot: Robot, recording: Recording, frames: IntArray) -> tuple[tuple[FloatArray, ...], FloatArray | None, States]:
+    """Return poses, initial inputs and states to start from: of the calibration where there are markers, else as declared.
 
     Raises:
         InputError: neither markers, nor a declared pose.
     """
     unknown = recording.actuation_zero == "unknown" and bool(robot.body.cables)
     if np.isin(recording.marker_frame, frames).any():
-        calibration = calibrate(robot, recording, frames=frames.tolist())
+        calibration, states = calibrate_states(robot, recording, frames=frames.tolist())
         table = calibration.cable_tension_n if recording.actuation == "tension" else calibration.cable_displacement_m
-        return calibration.poses, np.array([table[name] for name in robot.body.cable_names]) if unknown else None
+        return calibration.poses, np.array([table[name] for name in robot.body.cable_names]) if unknown else None, states
     initial = first_inputs(robot, recording)
     if recording.rest is not None:
-        return tuple(first_poses(robot, _bare_scene(robot, recording, frames, with_rest=True))), initial
+        return tuple(first_poses(robot, _bare_scene(robot, recording, frames, with_rest=True))), initial, {}
     missing = [name or "(only one)" for name, T in zip(recording.camera_names, recording.T_robot_camera) if T is None]
     if missing:
         raise InputError(
@@ -212,7 +212,7 @@ def _start(robot: Robot, recording: Recording, frames: IntArray) -> tuple[tuple[
             expected="T_robot_camera in recording.toml (maps camera coordinates to robot coordinates; a few millimetres and degrees off will do)",
             hint="or show three markers in one frame, or measure them at rest (rest.csv)",
         )
-    return tuple(T for T in recording.T_robot_camera if T is not None), initial
+    return tuple(T for T in recording.T_robot_camera if T is not None), initial, {}
 
 
 def _bare_scene(robot: Robot, recording: Recording, frames: IntArray, *, with_rest: bool) -> Scene:

@@ -18,7 +18,7 @@ from femsense.loop.joint import JointFit, Prior, rms_of
 from femsense.loop.noise import Noise
 from femsense.loop.predict import sweeps_predicted
 from femsense.loop.screen import NUISANCE, Candidate, effect_fields, penalty, screen
-from femsense.loop.stages import Stage, held_chi2, held_shift, jets_with, keeping, make_stage, own_of, problem_of
+from femsense.loop.stages import QUADRATIC, Stage, held_chi2, held_shift, jets_with, keeping, make_stage, own_of, problem_of
 from femsense.model import Robot
 
 REFITS = 6
@@ -136,7 +136,7 @@ def _enriched(data: Data, stage: Stage, winner: Refit, table: list[Candidate], n
 def _quadratic(data: Data, stage: Stage, names: Sequence[str], n_effective: float) -> list[Candidate]:
     """Return quadratic elements as a candidate where the mesh is linear: always asked, and not by screening, since the modulus and
     whatever else has made up for what a linear mesh costs is far from where quadratic elements have it."""
-    effect, seed = find_effect("discretisation"), {"element": "tet10"}
+    effect, seed = find_effect("discretisation"), QUADRATIC
     if effect.name not in names or seed not in effect.seeds(stage.fit.hypothesis.robot):
         return []
     nothing = np.zeros(0)
@@ -237,9 +237,8 @@ def refit(data: Data, stage: Stage, candidate: Candidate, noise: Noise, *, wante
     start = null if candidate.effect.discrete else np.clip(_first_guess(candidate, null), low, high)
     hypothesis, prior = with_term(stage.fit, candidate.effect, candidate.seed, candidate.parameters)
     free = not candidate.effect.discrete and candidate.effect.name != "gravity"  # for these the null is no start
-    shares = (
-        (1.0, DECLARED) if candidate.effect.discrete else (0.0, 1.0, 0.3) if free else (1.0, 0.3, 0.0)
-    )  # a linear step may go too far
+    shares: tuple[float, ...] = (1.0, DECLARED) if candidate.gain < np.inf else (DECLARED, 1.0)
+    shares = shares if candidate.effect.discrete else (0.0, 1.0, 0.3) if free else (1.0, 0.3, 0.0)  # a linear step may go too far
     answer = 0.0 if candidate.effect.discrete else candidate.response @ (start - null)  # of what is fitted already
     best: Stage | None = None
     worth = stage.fit.chi2 - (candidate.cost + wanted - FORGONE[0]) / FORGONE[1]

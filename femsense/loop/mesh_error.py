@@ -29,7 +29,7 @@ from femsense.recording import Recording
 
 MOST_TETS = 24000
 """A finer mesh than this takes too long in every state."""
-MOST_WORK = 150_000
+MOST_WORK = 125_000
 """Tetrahedra × states of a recording; beyond it the errors of other states are interpolated between those that were computed."""
 VARIES = 0.25
 """The share of the error that a body shows differs by this between sweeps (standard deviation)."""

@@ -204,9 +204,9 @@ def _whole_change(
 def _starts_of(trial: Trial, fixed: Robot, robot: Robot, states: States) -> States:
     """Return starts for a robot with another law, or on another mesh of the same body, from states of it as it was."""
     mesh = robot.body.mesh
-    if mesh is fixed.body.mesh:
-        return dict(states)
     starts = trial.starts_on(mesh)
+    if mesh is fixed.body.mesh:  # the factors of these states are lent
+        return {k: replace(s, factor=starts[k].factor if k in starts else None) for k, s in states.items()}
     if not states.keys() <= starts.keys():
         ties, still = embed_points(fixed.body.mesh, mesh.nodes), np.zeros_like(mesh.nodes)
         starts.update(

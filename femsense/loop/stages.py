@@ -21,6 +21,8 @@ ZERO_STD = 0.1
 """How well the zero of a cable is known beforehand, as a share of its range in the recording."""
 
 
+QUADRATIC: Entry = {"element": "tet10"}
+"""The seed of quadratic elements, which growth asks first where the mesh is linear."""
 ROUGHLY = 3
 """Steps of a fit that only has to come near."""
 
@@ -194,6 +196,9 @@ def fields_of(data: Data, stage: Stage, names: Sequence[str]) -> Fields:
     todo = candidates_for(
         stage.fit, data.control, forms=data.forms, names=[n for n in names if n not in NUISANCE], has_seats=seated
     )
+    finer = [seed for effect, seed, _ in todo if effect.name == "discretisation"]
+    if len(finer) > 1 and not [n for n in stage.fit.hypothesis.names if n not in NUISANCE]:
+        todo = [t for t in todo if t[1] != QUADRATIC]  # asked in any case
     return effect_fields(stage.fit, data.train, todo)
 
 
