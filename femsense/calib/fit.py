@@ -55,8 +55,8 @@ def gauss_newton(
 ) -> FitResult:
     """Minimise ‖r(θ)‖² within bounds (Levenberg's damping where a plain step does not pay).
 
-    A Jacobian that predicted the last step well serves for the next one too, corrected along that step (Broyden 1965); the fit ends
-    only where the Jacobian at θ itself says that there is nothing left to gain.
+    A Jacobian that predicted the last step well serves for the next one too; the fit ends only where the Jacobian at θ itself says that
+    there is nothing left to gain.
 
     Arguments:
         evaluate: residual and Jacobian; priors are rows of them.
@@ -114,13 +114,10 @@ def gauss_newton(
                 break
             continue
         damping = damping / 10.0 if damping > 1e-6 else 0.0
-        missed = new_residual - residual - change
+        missed = float(np.linalg.norm(new_residual - residual - change))
         theta, residual, own = theta + step, new_residual, False
-        if np.linalg.norm(missed) > serves * float(np.linalg.norm(change)):
+        if missed > serves * float(np.linalg.norm(change)):
             residual, jacobian, own = *_both(evaluate, theta), True
-        else:
-            along = scale**2 * step
-            jacobian = jacobian + np.outer(missed, along / max(float(along @ step), 1e-300))
         costs.append(float(residual @ residual))
     return FitResult(freeze(theta), freeze(covariance_of(jacobian)), freeze(residual), freeze(jacobian), tuple(costs), status)
 
