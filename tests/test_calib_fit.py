@@ -217,3 +217,19 @@ def test_a_borrowed_jacobian_never_decides_the_end() -> None:
     fit = gauss_newton(evaluate, start, borrowed=wrong)
     np.testing.assert_allclose(fit.theta, gauss_newton(counted(1.0)[0], start).theta, atol=1e-9)
     assert asked[:2] == [False, True]
+
+
+def test_a_fit_that_is_not_worth_it_is_given_up_before_its_own_jacobian() -> None:
+    asked: list[bool] = []
+    J = np.array([[1.0, 0.0], [0.0, 2.0], [0.0, 0.0]])
+
+    def evaluate(theta: np.ndarray, derivative: bool) -> tuple[np.ndarray, np.ndarray | None]:
+        asked.append(derivative)
+        return J @ theta + np.array([1.0, 1.0, 3.0]) + 1e-3 * np.sin(theta[0]), J if derivative else None
+
+    start = np.zeros(2)
+    for worth, status in ((8.0, "given up"), (10.0, "converged")):
+        asked.clear()
+        fit = gauss_newton(evaluate, start, borrowed=J, serves=0.25, worth=worth)
+        assert fit.status == status and any(asked) == (status == "converged")
+        assert fit.cost[-1] == pytest.approx(9.0, abs=0.01)

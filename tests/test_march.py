@@ -185,6 +185,38 @@ def test_with_friction_the_past_matters_and_unwanted_frames_are_walked_too() -> 
     np.testing.assert_array_equal(plain[2], plain[0])
 
 
+def test_parts_of_a_walk_with_a_past_join_to_the_walk_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    levels = np.array([0.4, 1.0, 1.6, 1.6, 1.0, 0.5])
+    rec = recording(np.vstack([np.outer(levels, mix) + 0.05 for mix in ([1, 0], [0, 1], [0.6, 0.6], [0.2, 0.8], [1, 0.3])]))
+    starts: dict[int, Any] = {}
+    walked(robot(friction=0.4), rec, starts=starts)
+    for friction in (0.4, 0.6):
+        joined = walked(robot(friction=friction), rec, starts=dict(starts))
+        in_order = walked(robot(friction=friction), rec)
+        for k, seen in in_order.items():
+            np.testing.assert_allclose(joined[k], seen, atol=1e-9)
+    monkeypatch.setattr(march, "_as_before", lambda now, then, slack: True)  # where the past is only guessed, it shows
+    guessed = walked(robot(friction=0.6), rec, starts=dict(starts))
+    assert max(np.abs(guessed[k] - in_order[k]).max() for k in guessed) > 1e-8
+
+
+def test_with_friction_a_hold_is_solved_once_and_a_return_is_not_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    solved, solve = [], march.solve_frame
+    monkeypatch.setattr(march, "solve_frame", lambda walk, k, **more: (solved.append(k), solve(walk, k, **more))[1])
+    seen = walked(robot(friction=0.5), recording([[0.5, 0], [1.5, 0], [1.5, 0], [0.5, 0]]))
+    assert solved == [0, 1, 3]
+    np.testing.assert_array_equal(seen[1], seen[2])
+    assert np.abs(seen[3] - seen[0]).max() > 1e-5
+
+
+def test_a_frame_starts_from_the_state_whose_inputs_are_most_like_its_own() -> None:
+    rec = recording([[0.0, 0], [1.0, 0], [0.1, 0], [0.9, 0]])
+    starts: dict[int, Any] = {}
+    walked(robot(), rec, [0, 1], starts=starts)
+    found = march._nearest(Walk(robot(), drive_of(robot(), rec)), starts, [2, 3])
+    assert found[2] is starts[0] and found[3] is starts[1]
+
+
 def test_variants_give_the_derivative_of_frames_solved_anew() -> None:
     rec, h = recording([[1.0, 0.3], [1.5, 0.1]]), 1e-4
     base = robot()
