@@ -611,8 +611,8 @@ def roughly(pattern: Pattern, values: FloatArray) -> Factorization | None:
 def finer_state(walk: Walk, fine: Walk, frame: int, base: Equilibrium, ties: Embedding) -> FloatArray | None:
     """Return where the nodes of a finer mesh come to rest [m], shape (n, 3), nearly: Newton steps from a state of a coarser one.
 
-    One step is most often enough, since the finer mesh holds the coarse state exactly and its error is small. None where the steps
-    do not settle.
+    The finer mesh holds the coarse state exactly, but what it softens are single elements, so that two to four steps are needed, with
+    elements that turn along each of them. None where the steps do not settle.
 
     Arguments:
         walk: the coarse robot and its drive.

@@ -2,7 +2,7 @@
 
 A residual of that shape says nothing of the robot, whatever its size: how much of it a body shows is not known (a cable that is tied to points
 sinks the deeper the finer the mesh is), but it is the same share in all sweeps. So it counts as noise, once its size as standard deviation for
-all sweeps together and `VARIES` times for each by itself, so that no effect is named for what a finer mesh would explain. A Newton step or two
+all sweeps together and `VARIES` times for each by itself, so that no effect is named for what a finer mesh would explain. A few Newton steps
 from the state on the declared mesh, which the finer one holds exactly, give it (a hierarchical estimate: Bank & Smith 1993).
 """
 
