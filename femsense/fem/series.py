@@ -43,10 +43,14 @@ ROWS = 54
 """Rows of LANES numbers that a point takes: 0–8 F₁, then F̂₁ + F̂₂, then a stress; 9–17 F₂; 18–26 a₁, a₂, a₃; 27–30 θ₀ … θ₃; 31–34 their means; 35–49 R₀
 and S₀; 50–53 volume, λ', λ − λ', 2μ. One array with fixed places for all of them lets a compiler
 see that they are apart, so that it takes the eight elements at once."""
-MEMORY = 3
+MEMORY = 8
 """Equilibria whose stretches are kept."""
-RIDGE = 1e-4
-"""Share of the squared distance of states that is added where weights for them are looked for."""
+SAMPLE = 300
+"""Nodes whose positions tell how far states are apart."""
+ALIKE = 0.06
+"""What is known at a state holds for others as far as this share of the body away (root of the mean square): ℓ in `combination`."""
+NOISE = 1e-5
+"""Variance of what is known at a state, as a share of that of states that lie far apart."""
 TERMS = 3
 """Terms of a series at most."""
 
@@ -82,17 +86,22 @@ class Expansion:
         self.factor: Cholesky | None = None
         self.unbalanced = np.zeros_like(self.positions)
         """What the last term answered to [N], shape (n, 3)."""
-        self._tension, self._held = np.zeros(len(body.cables)), np.zeros_like(self.positions)
+        self.tension, self._held = np.zeros(len(body.cables)), np.zeros_like(self.positions)
         keeps = body.mesh.is_quadratic and self._lanes is not None
         self._room = np.zeros((len(body.mesh.tets), 4, 9)) if keeps else None
         self._stretches: list[tuple[FloatArray, FloatArray]] = []  # of the last equilibria that were learnt
+        self.length = ALIKE * body.reach
 
     def learn(self, x: FloatArray) -> None:
         """Keep the stretches of an equilibrium x: their stress serves the stiffness of starts to come."""
         if self._room is not None:
             stretch = self._stretches.pop(0)[1] if len(self._stretches) == MEMORY else np.empty_like(self._room)
             internal(self.body, x, tangent=False, stretch=stretch)
-            self._stretches.append((x, stretch))
+            self._stretches.append((self.sample(x), stretch))
+
+    def sample(self, x: FloatArray) -> FloatArray:
+        """Return the positions [m] of some nodes, shape (k, 3): what `combination` compares states by."""
+        return np.asarray(x[:: max(1, len(x) // SAMPLE)]).copy()
 
     def forget(self) -> None:
         """Forget what was learnt, after a leap."""
@@ -103,13 +112,13 @@ class Expansion:
         body, blocks = self.body, self._blocks
         stretch = None
         if self._room is not None and self._stretches:
-            weights = combination(x, [state for state, _ in self._stretches])
+            weights, _ = combination(self.sample(x), [state for state, _ in self._stretches], self.length)
             stretch = np.einsum("k,keqi->eqi", weights, np.array([s for _, s in self._stretches]), out=self._room)
         here = internal(body, x, room=blocks, stretch=stretch)
         add_cable_stiffness(body, x, tuple(np.full(len(c.path), t) for c, t in zip(body.cables, tension)), blocks)
         self.factor = None  # its memory serves the next one
         self.factor = cholesky(body.free_map.pattern.analysis(), blocks.ravel(), single=self._single, source=self._source)
-        self.positions, self._tension = x, tension.copy()
+        self.positions, self.tension = x, tension.copy()
         self._held = -here.forces
         if len(tension):
             self._held += (tension @ pull_rows(body, x)).reshape(-1, 3)
@@ -137,22 +146,27 @@ class Expansion:
         if lanes is not None and len(terms):
             series_forces(terms, lanes.nodes, lanes.gradients, lanes.constants, lanes.frames, force)
         force = loads + self._held - force
-        for cable, before, after in zip(self.body.cables, self._tension, tension):
+        for cable, before, after in zip(self.body.cables, self.tension, tension):
             cable_series(cable.path.nodes, cable.path.weights, cable.pull_point, x, terms, before, after - before, force)
         return force
 
 
-def combination(x: FloatArray, states: list[FloatArray]) -> FloatArray:
-    """Return weights of sum 1 by which states [m] come nearest to x, shape (k,): what is smooth in the state is carried on by them.
+def combination(x: FloatArray, states: list[FloatArray], length: float) -> tuple[FloatArray, float]:
+    """Return weights of sum 1, shape (k,), by which what is known at some states carries over to the state x, and how uncertain that is.
 
-    Least squares from the last state on; RIDGE keeps weights small where the states lie almost in a line or a plane.
+    Ordinary kriging (Cressie 1993, 3.2) with the covariance exp(−d²/2ℓ²) of states at a distance d (root of the mean square [m]) and a
+    variance of NOISE of what is known; the uncertainty is the standard deviation, as a share of what states far from each other differ by.
     """
-    ways = np.array([(state - states[-1]).ravel() for state in states[:-1]]).reshape(len(states) - 1, x.size)
-    gram = ways @ ways.T
-    gram += RIDGE * np.eye(len(gram)) * np.trace(gram) / max(len(gram), 1)
-    weights = np.linalg.lstsq(gram, ways @ (x - states[-1]).ravel(), rcond=None)[0]
-    weights *= min(1.0, 4.0 / max(float(np.abs(weights).sum()), 1e-300))
-    return np.append(weights, 1.0 - weights.sum())
+    k, ways = len(states), (np.array([*states, x]) - x).reshape(len(states) + 1, -1)
+    products = ways @ ways.T / ways.shape[1]
+    squares = np.diag(products)
+    covariance = np.exp(-(0.5 * (squares[:, None] + squares) - products) / length**2)
+    matrix = np.ones((k + 1, k + 1))
+    matrix[:k, :k] = covariance[:k, :k] + NOISE * np.eye(k)
+    matrix[k, k] = 0.0
+    right = np.append(covariance[:k, k], 1.0)
+    solution = np.linalg.solve(matrix, right)
+    return solution[:k], float(np.sqrt(max(1.0 - solution @ right, 0.0)))
 
 
 def _read_only(x: FloatArray) -> FloatArray:
