@@ -76,7 +76,7 @@ SABOTAGES = (
     S("fem/series.py", "x3 -= 0.5 * (b * uc", "x3 += 0.5 * (b * uc", "test_fem_tracker.py::test_each_term_of_a_series_raises_the_order_of_its_error"),
     S("fem/series.py", "one += third * p2", "one -= third * p2", "test_fem_tracker.py::test_each_term_of_a_series_raises_the_order_of_its_error"),
     S("fem/series.py", "known -= length[k] * d[n - k, s, c]", "known += length[k] * d[n - k, s, c]", "test_fem_tracker.py::test_each_term_of_a_series_raises_the_order_of_its_error"),
-    S("fem/series.py", "w[(ROWS * p + 31 + k) * LANES + q] = dilatation / volume", "w[(ROWS * p + 31 + k) * LANES + q] = dilatation", "test_fem_tracker.py::test_each_term_of_a_series_raises_the_order_of_its_error"),
+    S("fem/series.py", "+ MEANS + k * LANES + q] = dilatation / volume", "+ MEANS + k * LANES + q] = dilatation", "test_fem_tracker.py::test_each_term_of_a_series_raises_the_order_of_its_error"),
     S("fem/series.py", "right = np.append(covariance[:k, k], 1.0)", "right = np.append(covariance[:k, k], 0.0)", "test_fem_tracker.py::test_weights_carry_on_what_is_smooth_in_the_state_and_know_their_doubt"),
     S("fem/series.py", "1.0 - solution @ right", "1.0 - solution[:k] @ solution[:k]", "test_fem_tracker.py::test_weights_carry_on_what_is_smooth_in_the_state_and_know_their_doubt"),
     S("fem/tracker.py", "doubt <= DRIFT", "doubt >= 0.0", "test_fem_tracker.py::test_the_compliance_is_carried_on_where_inputs_jitter"),

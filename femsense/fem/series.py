@@ -40,9 +40,16 @@ from femsense.fem.corotational import FAST, LOCAL, closest_rotation
 from femsense.fem.tiles import LANES, add_divergence, add_gradient
 
 ROWS = 54
-"""Rows of LANES numbers that a point takes: 0–8 F₁, then F̂₁ + F̂₂, then a stress; 9–17 F₂; 18–26 a₁, a₂, a₃; 27–30 θ₀ … θ₃; 31–34 their means; 35–49 R₀
-and S₀; 50–53 volume, λ', λ − λ', 2μ. One array with fixed places for all of them lets a compiler
-see that they are apart, so that it takes the eight elements at once."""
+"""Rows of LANES numbers that a point takes. One array with fixed places for all of them lets a compiler see that they are apart, so that it
+takes the eight elements at once."""
+FIRST, SECOND = 0, 9 * LANES
+"""Where F₁ (then F̂₁ + F̂₂, then a stress) and F₂ begin among them, nine rows each;"""
+TURNS, THETA, MEANS = 18 * LANES, 27 * LANES, 31 * LANES
+"""a₁, a₂ and a₃, three rows each; θ₀ … θ₃, a row each; and their means over the element;"""
+ROTATION, STRETCH = 35 * LANES, 44 * LANES
+"""R₀, nine rows, and S₀ (00 01 02 11 12 22);"""
+VOLUME, LOCAL_BULK, MEAN_BULK, SHEAR = 50 * LANES, 51 * LANES, 52 * LANES, 53 * LANES
+"""volume, λ', λ − λ' and 2μ, a row each."""
 MEMORY = 8
 """Equilibria whose stretches are kept."""
 SAMPLE = 300
@@ -215,34 +222,41 @@ def _frames(x, nodes, gradients, frames):  # type: ignore[no-untyped-def]
                         row += 1
 
 
+@njit(inline="always")
+def _three(w, at):  # type: ignore[no-untyped-def]
+    """Return one number of each of three rows."""
+    return w[at], w[at + LANES], w[at + 2 * LANES]
+
+
+@njit(inline="always")
+def _put_three(w, at, x, y, z):  # type: ignore[no-untyped-def]
+    """Write one number of each of three rows."""
+    w[at], w[at + LANES], w[at + 2 * LANES] = x, y, z
+
+
+@njit(inline="always")
+def _nine(w, at):  # type: ignore[no-untyped-def]
+    """Return one number of each of nine rows."""
+    return (
+        w[at], w[at + LANES], w[at + 2 * LANES], w[at + 3 * LANES], w[at + 4 * LANES],
+        w[at + 5 * LANES], w[at + 6 * LANES], w[at + 7 * LANES], w[at + 8 * LANES],
+    )  # fmt: skip
+
+
 @njit(cache=True, fastmath=FAST, error_model="numpy")
 def _turn(w):  # type: ignore[no-untyped-def]
     """Find how the points of LANES elements turn: F₁, F₂ → F̂₁ + F̂₂, a₁, a₂, a₃ and θ₀ … θ₃, in the rows that `ROWS` names."""
     for q in range(LANES):
-        r0, r1, r2, r3, r4, r5, r6, r7, r8 = (
-            w[280 + q],
-            w[288 + q],
-            w[296 + q],
-            w[304 + q],
-            w[312 + q],
-            w[320 + q],
-            w[328 + q],
-            w[336 + q],
-            w[344 + q],
-        )
-        f0, f1, f2 = w[q], w[8 + q], w[16 + q]
-        f3, f4, f5 = w[24 + q], w[32 + q], w[40 + q]
-        f6, f7, f8 = w[48 + q], w[56 + q], w[64 + q]
+        r0, r1, r2, r3, r4, r5, r6, r7, r8 = _nine(w, ROTATION + q)
+        f0, f1, f2, f3, f4, f5, f6, f7, f8 = _nine(w, FIRST + q)
         u0, u1, u2 = r0 * f0 + r3 * f3 + r6 * f6, r0 * f1 + r3 * f4 + r6 * f7, r0 * f2 + r3 * f5 + r6 * f8
         u3, u4, u5 = r1 * f0 + r4 * f3 + r7 * f6, r1 * f1 + r4 * f4 + r7 * f7, r1 * f2 + r4 * f5 + r7 * f8
         u6, u7, u8 = r2 * f0 + r5 * f3 + r8 * f6, r2 * f1 + r5 * f4 + r8 * f7, r2 * f2 + r5 * f5 + r8 * f8
-        f0, f1, f2 = w[72 + q], w[80 + q], w[88 + q]
-        f3, f4, f5 = w[96 + q], w[104 + q], w[112 + q]
-        f6, f7, f8 = w[120 + q], w[128 + q], w[136 + q]
+        f0, f1, f2, f3, f4, f5, f6, f7, f8 = _nine(w, SECOND + q)
         v0, v1, v2 = r0 * f0 + r3 * f3 + r6 * f6, r0 * f1 + r3 * f4 + r6 * f7, r0 * f2 + r3 * f5 + r6 * f8
         v3, v4, v5 = r1 * f0 + r4 * f3 + r7 * f6, r1 * f1 + r4 * f4 + r7 * f7, r1 * f2 + r4 * f5 + r7 * f8
         v6, v7, v8 = r2 * f0 + r5 * f3 + r8 * f6, r2 * f1 + r5 * f4 + r8 * f7, r2 * f2 + r5 * f5 + r8 * f8
-        s0, s1, s2, s4, s5, s8 = w[352 + q], w[360 + q], w[368 + q], w[376 + q], w[384 + q], w[392 + q]
+        (s0, s1, s2), (s4, s5, s8) = _three(w, STRETCH + q), _three(w, STRETCH + 3 * LANES + q)
         trace = s0 + s4 + s8
         d00, d11, d22 = s4 + s8, s0 + s8, s0 + s4
         i0, i1, i2 = d11 * d22 - s5 * s5, s2 * s5 + s1 * d22, s1 * s5 + s2 * d11
@@ -261,9 +275,9 @@ def _turn(w):  # type: ignore[no-untyped-def]
         d, e, o = i0 * x2 + i1 * y2 + i2 * z2, i1 * x2 + i3 * y2 + i4 * z2, i2 * x2 + i4 * y2 + i5 * z2
         t2 = v0 + v4 + v8
         square = a * a + b * b + c * c
-        w[216 + q] = trace - 3.0
-        w[224 + q] = t1
-        w[232 + q] = t2 + 0.5 * (a * sa + b * sb + c * sc - square * trace) + a * x + b * y + c * z
+        w[THETA + q] = trace - 3.0
+        w[THETA + LANES + q] = t1
+        w[THETA + 2 * LANES + q] = t2 + 0.5 * (a * sa + b * sb + c * sc - square * trace) + a * x + b * y + c * z
         # third: B = M₃ S₀ − [a₁] F̂₂ − [a₂] F̂₁ + M₂ F̂₁, M₃ = (a₁a₂ᵀ + a₂a₁ᵀ) / 2 − (a₁·a₂) I
         sd, se, sf = s0 * d + s1 * e + s2 * o, s1 * d + s4 * e + s5 * o, s2 * d + s5 * e + s8 * o
         ua, ub, uc = u0 * a + u3 * b + u6 * c, u1 * a + u4 * b + u7 * c, u2 * a + u5 * b + u8 * c  # F̂₁ᵀ a₁
@@ -285,19 +299,19 @@ def _turn(w):  # type: ignore[no-untyped-def]
         x3 -= 0.5 * (b * uc - c * ub + square * x)
         y3 -= 0.5 * (c * ua - a * uc + square * y)
         z3 -= 0.5 * (a * ub - b * ua + square * z)
-        w[144 + q], w[152 + q], w[160 + q] = a, b, c
-        w[168 + q], w[176 + q], w[184 + q] = d, e, o
-        w[192 + q] = i0 * x3 + i1 * y3 + i2 * z3
-        w[200 + q] = i1 * x3 + i3 * y3 + i4 * z3
-        w[208 + q] = i2 * x3 + i4 * y3 + i5 * z3
+        _put_three(w, TURNS + q, a, b, c)
+        _put_three(w, TURNS + 3 * LANES + q, d, e, o)
+        _put_three(
+            w, TURNS + 6 * LANES + q, i0 * x3 + i1 * y3 + i2 * z3, i1 * x3 + i3 * y3 + i4 * z3, i2 * x3 + i4 * y3 + i5 * z3
+        )
         dot = a * d + b * e + c * o
-        w[240 + q] = (
+        w[THETA + 3 * LANES + q] = (
             (a * sd + b * se + c * sf) - dot * trace + a * (v7 - v5) + b * (v2 - v6) + c * (v3 - v1) + d * x + e * y + o * z
         )
-        w[240 + q] += 0.5 * (a * ua + b * ub + c * uc - square * t1)
-        w[q], w[8 + q], w[16 + q], w[24 + q], w[32 + q], w[40 + q], w[48 + q], w[56 + q], w[64 + q] = (
-            u0 + v0, u1 + v1, u2 + v2, u3 + v3, u4 + v4, u5 + v5, u6 + v6, u7 + v7, u8 + v8
-        )  # fmt: skip
+        w[THETA + 3 * LANES + q] += 0.5 * (a * ua + b * ub + c * uc - square * t1)
+        _put_three(w, FIRST + q, u0 + v0, u1 + v1, u2 + v2)
+        _put_three(w, FIRST + 3 * LANES + q, u3 + v3, u4 + v4, u5 + v5)
+        _put_three(w, FIRST + 6 * LANES + q, u6 + v6, u7 + v7, u8 + v8)
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
@@ -305,11 +319,14 @@ def _stress(w, last):  # type: ignore[no-untyped-def]
     """Turn F̂₁ + F̂₂ into R₀ Σ P_n of the orders 1 … last (2 or 3) times the volume, in the same rows."""
     third = 1.0 if last == 3 else 0.0
     for q in range(LANES):
-        a, b, c, d, e, o = w[144 + q], w[152 + q], w[160 + q], w[168 + q], w[176 + q], w[184 + q]
-        x, y, z = third * w[192 + q], third * w[200 + q], third * w[208 + q]
-        bulk, rest, m = w[408 + q], w[416 + q], w[424 + q]
-        p0, p1 = bulk * w[216 + q] + rest * w[248 + q], bulk * w[224 + q] + rest * w[256 + q]
-        p2, p3 = bulk * w[232 + q] + rest * w[264 + q], third * (bulk * w[240 + q] + rest * w[272 + q])
+        a, b, c, d, e, o, x, y, z = _nine(w, TURNS + q)
+        x, y, z = third * x, third * y, third * z
+        bulk, rest, m = w[LOCAL_BULK + q], w[MEAN_BULK + q], w[SHEAR + q]
+        p0, p1 = bulk * w[THETA + q] + rest * w[MEANS + q], bulk * w[THETA + LANES + q] + rest * w[MEANS + LANES + q]
+        p2, p3 = (
+            bulk * w[THETA + 2 * LANES + q] + rest * w[MEANS + 2 * LANES + q],
+            third * (bulk * w[THETA + 3 * LANES + q] + rest * w[MEANS + 3 * LANES + q]),
+        )
         one, two, three = p0 + p1 - m, p0 + third * p1 - m, third * (p0 - m)
         one += third * p2
         k, g, h = one * a + two * d + three * x, one * b + two * e + three * y, one * c + two * o + three * z
@@ -324,24 +341,19 @@ def _stress(w, last):  # type: ignore[no-untyped-def]
         m01 = half * a * b + 0.5 * three * (a * e + b * d)
         m02 = half * a * c + 0.5 * three * (a * o + c * d)
         m12 = half * b * c + 0.5 * three * (b * o + c * e)
-        v = w[400 + q]
-        P0, P1, P2 = v * (m * w[q] + m00), v * (m * w[8 + q] + m01 - h), v * (m * w[16 + q] + m02 + g)
-        P3, P4, P5 = v * (m * w[24 + q] + m01 + h), v * (m * w[32 + q] + m11), v * (m * w[40 + q] + m12 - k)
-        P6, P7, P8 = v * (m * w[48 + q] + m02 - g), v * (m * w[56 + q] + m12 + k), v * (m * w[64 + q] + m22)
-        r0, r1, r2, r3, r4, r5, r6, r7, r8 = (
-            w[280 + q],
-            w[288 + q],
-            w[296 + q],
-            w[304 + q],
-            w[312 + q],
-            w[320 + q],
-            w[328 + q],
-            w[336 + q],
-            w[344 + q],
+        v = w[VOLUME + q]
+        f0, f1, f2, f3, f4, f5, f6, f7, f8 = _nine(w, FIRST + q)
+        P0, P1, P2 = v * (m * f0 + m00), v * (m * f1 + m01 - h), v * (m * f2 + m02 + g)
+        P3, P4, P5 = v * (m * f3 + m01 + h), v * (m * f4 + m11), v * (m * f5 + m12 - k)
+        P6, P7, P8 = v * (m * f6 + m02 - g), v * (m * f7 + m12 + k), v * (m * f8 + m22)
+        r0, r1, r2, r3, r4, r5, r6, r7, r8 = _nine(w, ROTATION + q)
+        _put_three(w, FIRST + q, r0 * P0 + r1 * P3 + r2 * P6, r0 * P1 + r1 * P4 + r2 * P7, r0 * P2 + r1 * P5 + r2 * P8)
+        _put_three(
+            w, FIRST + 3 * LANES + q, r3 * P0 + r4 * P3 + r5 * P6, r3 * P1 + r4 * P4 + r5 * P7, r3 * P2 + r4 * P5 + r5 * P8
         )
-        w[q], w[8 + q], w[16 + q] = r0 * P0 + r1 * P3 + r2 * P6, r0 * P1 + r1 * P4 + r2 * P7, r0 * P2 + r1 * P5 + r2 * P8
-        w[24 + q], w[32 + q], w[40 + q] = r3 * P0 + r4 * P3 + r5 * P6, r3 * P1 + r4 * P4 + r5 * P7, r3 * P2 + r4 * P5 + r5 * P8
-        w[48 + q], w[56 + q], w[64 + q] = r6 * P0 + r7 * P3 + r8 * P6, r6 * P1 + r7 * P4 + r8 * P7, r6 * P2 + r7 * P5 + r8 * P8
+        _put_three(
+            w, FIRST + 6 * LANES + q, r6 * P0 + r7 * P3 + r8 * P6, r6 * P1 + r7 * P4 + r8 * P7, r6 * P2 + r7 * P5 + r8 * P8
+        )
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
@@ -362,13 +374,13 @@ def series_forces(terms, nodes, gradients, constants, frames, forces):  # type: 
             for k in range(18 * LANES):
                 v[k] = 0.0
             for t in range(N):
-                add_gradient(v, room + 72 * t * LANES, base + 8 * (X + t * wide), first + 4 * (e * points + p) * wide, count)
+                add_gradient(v, room + 8 * t * SECOND, base + 8 * (X + t * wide), first + 4 * (e * points + p) * wide, count)
             for k in range(15 * LANES):
-                v[35 * LANES + k] = f[(e * points + p) * 15 * LANES + k]
+                v[ROTATION + k] = f[(e * points + p) * 15 * LANES + k]
             for q in range(LANES):
-                v[50 * LANES + q] = g[e * own + p * LANES + q]
+                v[VOLUME + q] = g[e * own + p * LANES + q]
             for k in range(3 * LANES):
-                v[51 * LANES + k] = g[e * own + points * LANES + k]
+                v[LOCAL_BULK + k] = g[e * own + points * LANES + k]
             _turn(v)
             for k in range(ROWS * LANES):
                 w[p * ROWS * LANES + k] = v[k]
@@ -396,10 +408,11 @@ def _means(w, points):  # type: ignore[no-untyped-def]
         for q in range(LANES):
             dilatation, volume = 0.0, 0.0
             for p in range(points):
-                dilatation += w[(ROWS * p + 50) * LANES + q] * w[(ROWS * p + 27 + k) * LANES + q]
-                volume += w[(ROWS * p + 50) * LANES + q]
+                at = p * ROWS * LANES + q
+                dilatation += w[at + VOLUME] * w[at + THETA + k * LANES]
+                volume += w[at + VOLUME]
             for p in range(points):
-                w[(ROWS * p + 31 + k) * LANES + q] = dilatation / volume
+                w[p * ROWS * LANES + MEANS + k * LANES + q] = dilatation / volume
 
 
 @njit(cache=True)
