@@ -1,6 +1,6 @@
 """How fast the body is: cold equilibria beside SOFA's, parts, real time, growth with the mesh. Prints the tables of docs/speed.md.
 
-    OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 python benchmarks/body.py [cold|parts|orders|frames|kept|growth|iterative …] [--data FOLDER]
+    OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 python benchmarks/body.py [cold|parts|orders|frames|terms|kept|growth|iterative …] [--data FOLDER]
 
 CPU time of one thread: medians (cold, frames), the least of several runs (parts, growth, iterative); SOFA's figures are those of `reference/cases.json`, measured on a like machine.
 """
@@ -194,10 +194,7 @@ def frames(data: Path) -> None:
             noise = np.random.default_rng(1).normal(0, jitter, (44, len(body.cables)))
             tracker, spent, counts, within, errors = Tracker(body), [], [], [], []
             for k in range(44):
-                tension = {
-                    name: 2.0 + np.sin(0.023 * k + i * np.pi / 2) + 0.6 * np.sin(1.7 * 0.023 * k + i) + noise[k, i]
-                    for i, name in enumerate(body.cable_names)
-                }
+                tension = dict(zip(body.cable_names, along_the_way(k, len(body.cables)) + noise[k]))
                 began = time.process_time()
                 frame = tracker.step(tension=tension)
                 normals = vertex_normals(frame.positions, triangles)[nearest]
@@ -230,6 +227,38 @@ def frames(data: Path) -> None:
             )
 
 
+def terms(data: Path) -> None:
+    """What series of one, two and three terms leave, frames after their start: medians over ten starts, as shares of the motion of a frame."""
+    body, _ = diamond(data, True)
+    start = Expansion(body, single=True)
+    for jitter in (0.0, 0.03):
+        noise, states, rows = np.random.default_rng(1).normal(0, jitter, (40, len(body.cables))), [], []
+        inputs = [along_the_way(k, len(body.cables)) + noise[k] for k in range(40)]
+        for T in inputs:
+            given = dict(zip(body.cable_names, T))
+            states.append(solve_equilibrium(body, tension=given, start=states[-1] if states else None, relative_tolerance=1e-10))
+        for k in range(6, 36, 3):
+            start.learn(states[k].positions)
+            start.move(states[k].positions, inputs[k])
+            for lag in range(1, 5):
+                there, before = states[k + lag].positions, states[k + lag - 1].positions
+                parts = list(start.terms(inputs[k + lag], body.dead_load()))
+                left = [np.abs(states[k].positions + sum(parts[:n]) - there).max() for n in (1, 2, 3)]
+                rows.append([lag, *np.array([*left, np.abs(parts[2]).max()]) / np.abs(there - before).max()])
+        table = np.array(rows)
+        for lag in range(1, 5):
+            shares = 100.0 * np.median(table[table[:, 0] == lag, 1:], axis=0)
+            print(
+                f"input jitter {jitter:g} N, {lag} frames old: one {shares[0]:.2g} %, two {shares[1]:.2g} %, three {shares[2]:.2g} %, third {shares[3]:.2g} %"
+            )
+
+
+def along_the_way(k: int, cables: int) -> np.ndarray:
+    """Return the tensions of frame k of the smooth path [N], shape (cables,)."""
+    i = np.arange(cables)
+    return np.asarray(2.0 + np.sin(0.023 * k + i * np.pi / 2) + 0.6 * np.sin(1.7 * 0.023 * k + i))
+
+
 def start_anew(start: Expansion, x: np.ndarray, tension: np.ndarray, columns: sp.csc_matrix) -> None:
     """What a frame takes at least where each has a factor of its own: assembly, factor, two corrections, W."""
     start.move(x, tension)
@@ -242,9 +271,7 @@ def kept(data: Path) -> None:
     """Corrections with the factor of an earlier frame, straight and with elements that turn: what they leave, as a share of the motion."""
     for quadratic in (False, True):
         body, _ = diamond(data, quadratic)
-        inputs = [
-            2.0 + np.sin(0.023 * k + np.arange(4) * np.pi / 2) + 0.6 * np.sin(1.7 * 0.023 * k + np.arange(4)) for k in range(4)
-        ]
+        inputs = [along_the_way(k, len(body.cables)) for k in range(4)]
         states = [solve_equilibrium(body, tension=dict(zip(body.cable_names, inputs[0])))]
         for T in inputs[1:]:
             states.append(solve_equilibrium(body, tension=dict(zip(body.cable_names, T)), start=states[-1]))
@@ -276,7 +303,14 @@ def growth(data: Path, levels: int) -> None:
     if len(rows) > 1:
         table = np.log(np.array(rows))
         slopes = (table[-1, 1:] - table[0, 1:]) / (table[-1, 0] - table[0, 0])
-        print("exponents in unknowns: assembly {:.2f}, factor {:.2f}, solve {:.2f}, memory of the factor {:.2f}".format(*slopes))
+        print(
+            "exponents in unknowns: assembly {:.2f}, factor {:.2f}, solve {:.2f}, memory of the factor {:.2f}, work of the factor {:.2f}".format(
+                *slopes
+            )
+        )
+    if len(rows) > 2:  # the smallest mesh stays in the cache
+        slopes = (table[-1, 1:] - table[1, 1:]) / (table[-1, 0] - table[1, 0])
+        print("the same without the smallest mesh: {:.2f}, {:.2f}, {:.2f}, {:.2f}, {:.2f}".format(*slopes))
 
 
 def one_level(data: Path, level: int) -> None:
@@ -305,10 +339,13 @@ def one_level(data: Path, level: int) -> None:
         least_ms(lambda: cholesky(analysis, values), count),
         least_ms(lambda: factor.solve(right), count),
     )
+    columns = analysis.unit * np.diff(analysis.firsts)
+    heights = columns + analysis.unit * np.diff(analysis.begin)
+    work = sum(float((np.arange(h, h - c, -1.0) ** 2).sum()) for c, h in zip(columns, heights))
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     print(
-        f"{len(mesh.tets):7d} tetrahedra, {pattern.size} unknowns: made and ordered {made:.2f} s, analysis {analysed:.2f} s, assembly {times[0]:.1f} ms, factor {times[1]:.1f} ms,"
-        f" solve {times[2]:.2f} ms, factor {factor.bytes / 2**20:.0f} MB, peak of the process {peak:.0f} MB | {pattern.size} {times[0]} {times[1]} {times[2]} {factor.bytes}"
+        f"{len(mesh.tets):7d} tetrahedra, {pattern.size} unknowns: made and ordered {made:.2f} s, analysis {analysed:.2f} s, assembly {times[0]:.1f} ms, factor {times[1]:.1f} ms ({1e-6 * work / times[1]:.1f} Gflop/s),"
+        f" solve {times[2]:.2f} ms, factor {factor.bytes / 2**20:.0f} MB, peak of the process {peak:.0f} MB | {pattern.size} {times[0]} {times[1]} {times[2]} {factor.bytes} {work}"
     )
 
 
@@ -358,7 +395,7 @@ def one_side(data: Path, level: int, element: str) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser()
-    parser.add_argument("what", nargs="*", default=["cold", "parts", "orders", "frames", "kept", "growth", "iterative"])
+    parser.add_argument("what", nargs="*", default=["cold", "parts", "orders", "frames", "terms", "kept", "growth", "iterative"])
     parser.add_argument("--data", type=Path, default=DATA)
     parser.add_argument("--level", type=int, default=0)
     parser.add_argument("--levels", type=int, default=3)
@@ -373,4 +410,4 @@ if __name__ == "__main__":
             one_side(given.data, given.level, given.element)
             continue
         print(f"\n== {what}", flush=True)
-        {"cold": lambda: cold(given.data), "parts": lambda: parts(given.data), "orders": lambda: orders(given.data), "frames": lambda: frames(given.data), "kept": lambda: kept(given.data), "growth": lambda: growth(given.data, given.levels), "iterative": lambda: iterative_growth(given.data, given.levels)}[what]()  # fmt: skip
+        {"cold": lambda: cold(given.data), "parts": lambda: parts(given.data), "orders": lambda: orders(given.data), "frames": lambda: frames(given.data), "terms": lambda: terms(given.data), "kept": lambda: kept(given.data), "growth": lambda: growth(given.data, given.levels), "iterative": lambda: iterative_growth(given.data, given.levels)}[what]()  # fmt: skip
