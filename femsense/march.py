@@ -18,7 +18,7 @@ from femsense.fem.body import BodyModel
 from femsense.fem.cables import bend_angles, cable_forces, rub, shortening
 from femsense.fem.chambers import volume_gradient
 from femsense.fem.clamp import first_give
-from femsense.fem.compliance import Tangent, tangent_at
+from femsense.fem.compliance import Tangent, drive_rows, tangent_at
 from femsense.fem.equilibrium import Equilibrium, solve_equilibrium
 from femsense.fem.iterative import UnsettledError, iterative
 from femsense.fem.linear import Factorization, Pattern, available_memory, factorize
@@ -625,7 +625,7 @@ def finer_state(walk: Walk, fine: Walk, frame: int, base: Equilibrium, ties: Emb
     x, first = ties.positions(base.positions), np.inf
     for step in range(FINER_STEPS):
         force, pulled = balance.upset_by(fine, _rubbed(fine, frame, base, x), x)
-        size = float(np.linalg.norm(force.ravel()[body.free_map.dofs]))
+        size = _unbalanced(body, base, x, force)
         first = size if step == 0 else first
         if step and size < FINER_ENOUGH * first:
             return x
@@ -636,6 +636,16 @@ def finer_state(walk: Walk, fine: Walk, frame: int, base: Equilibrium, ties: Emb
         turned = turned_step(body, x, move)
         x = np.asarray(x + move) if turned is None else turned
     return None
+
+
+def _unbalanced(body: BodyModel, base: Equilibrium, x: FloatArray, force: FloatArray) -> float:
+    """Return the size of a nodal force [N] but for what the tensions of held cables, which are free to change, balance."""
+    dofs = body.free_map.dofs
+    rest, held = force.ravel()[dofs], np.flatnonzero(base.held[: len(body.cables)])
+    if len(held):
+        pulls = drive_rows(body, x)[held][:, dofs].T
+        rest = rest - pulls @ np.linalg.lstsq(pulls, rest, rcond=None)[0]
+    return float(np.linalg.norm(rest))
 
 
 def _same_mechanics(walk: Walk, variant: Walk) -> bool:

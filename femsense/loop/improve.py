@@ -151,7 +151,10 @@ def _search(data: Data, before: Stage, base: Stage, names: list[str], most: int,
         history.append((name, stage))
         if far:  # the mesh errs in another way in these states
             data = with_mesh_errors(data, stage)
+        found_so = history
         history, refits = exchanged(data, history, refits, noise, n_effective, say)
+        if history is not found_so:
+            history[-1] = (history[-1][0], prune(data, history[-1][1], noise, n_effective, say))
         stage = history[-1][1]
     swap = in_place_of_zeros(data, stage, names, noise, n_effective, say) if most else None
     if swap is not None:

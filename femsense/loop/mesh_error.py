@@ -99,7 +99,10 @@ def _moves(
     known, settled = [], []
 
     def finer_at(i: int) -> FloatArray | None:
-        return finer_state(coarse_walk, fine_walk, int(frames[i]), states[int(frames[i])], ties)
+        try:
+            return finer_state(coarse_walk, fine_walk, int(frames[i]), states[int(frames[i])], ties)
+        except FemsenseError:  # it folds there
+            return None
 
     finer_states = [finer_at(chosen[0]), *each(finer_at, chosen[1:])]  # the first makes what all of them share
     for i, finer in zip(chosen, finer_states):

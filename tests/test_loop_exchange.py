@@ -1,0 +1,76 @@
+"""What is named while another effect is missing may be wrong: in the whole model a rival, or the effect at another place, takes its place."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from arm import arm, record, sweeps
+
+from femsense.loop.data import Data, prepare
+from femsense.loop.exchange import exchanged
+from femsense.loop.grow import judged, refit, shortlist
+from femsense.loop.noise import Noise
+from femsense.loop.stages import Stage, fields_of, make_stage, screen_stage, with_nuisance
+
+NOISE = Noise({"white": 1e-4}, "")
+COUNT = 300.0
+HIDDEN = [
+    {"name": "payload", "point_m": [0.05, 0.0, 0.01], "force_n": [0.06, 0.15, 0.12]},
+    {"name": "cable_gain", "scale": {"up": 1.15}},
+]
+
+
+def started() -> tuple[Data, Stage]:
+    robot = arm((4, 1, 1))
+    inputs, labels = sweeps(each=1)
+    recording, _ = record(inputs, labels=labels, truth=arm((4, 1, 1)), effects=HIDDEN)
+    data = prepare(robot, [recording], [])
+    hypothesis, prior = with_nuisance(data)
+    return data, make_stage(data, hypothesis, prior, NOISE, np.zeros(len(prior.mean)))
+
+
+def added(data: Data, stage: Stage, name: str, step: int) -> tuple[Stage, dict[str, Any]]:
+    """Return a stage with one more effect, rightly or not, and its record."""
+    table = screen_stage(data, stage.fit, NOISE, fields_of(data, stage, [name]), COUNT)
+    record: dict[str, Any] = {"name": name, "seed": {}, "step": step}
+    candidate = max(shortlist(table, first=True) or table, key=lambda c: c.score)
+    made = judged(data, stage, candidate, refit(data, stage, candidate, NOISE), record, NOISE)
+    return made.stage, {**record, "verdict": "named"}
+
+
+def test_a_rival_that_is_right_takes_the_place_of_what_was_named_first():
+    data, base = started()
+    first, wrong = added(data, base, "gravity", 1)
+    second, right = added(data, first, "cable_gain", 2)
+    rival = {**wrong, "name": "payload", "verdict": "passes"}
+    history, refits = exchanged(
+        data, [("", base), ("gravity", first), ("cable_gain", second)], [wrong, rival, right], NOISE, COUNT, lambda text: None
+    )
+    assert [name for name, _ in history] == ["", "cable_gain", "payload"]
+    assert history[-1][1].fit.chi2 < second.fit.chi2
+    assert set(history[1][1].fit.hypothesis.names) == {"stiffness", "cable_offset", "cable_gain"}
+    said = {(r["name"], r["step"]): r["verdict"] for r in refits}
+    assert said["gravity", 1] == "passes" and said["payload", 2] == "named"
+
+
+def test_what_is_right_keeps_its_place():
+    data, base = started()
+    first, right = added(data, base, "payload", 1)
+    second, other = added(data, first, "cable_gain", 2)
+    rival = {**right, "name": "gravity", "verdict": "passes"}
+    before = [("", base), ("payload", first), ("cable_gain", second)]
+    history, refits = exchanged(data, before, [right, rival, other], NOISE, COUNT, lambda text: None)
+    assert {name for name, _ in history} == {"", "payload", "cable_gain"}  # perhaps at a better place
+    assert history[-1][1].fit.chi2 <= second.fit.chi2
+    assert not any(r["verdict"] == "named" for r in refits if r["name"] == "gravity")
+
+
+def test_effects_without_near_rivals_are_not_asked_again():
+    data, base = started()
+    first, own = added(data, base, "gravity", 1)
+    second, other = added(data, first, "cable_gain", 2)
+    rival = {**own, "name": "payload", "verdict": "passes", "dbic": 0.1 * own["dbic"] - 20.0}
+    before = [("", base), ("gravity", first), ("cable_gain", second)]
+    history, refits = exchanged(data, before, [own, rival, other], NOISE, COUNT, lambda text: None)
+    assert history is before and len(refits) == 3
