@@ -60,6 +60,7 @@ def conclude(data: Data, search: Search, rng: np.random.Generator) -> LoopResult
     promoted = _promoted(data, search)
     names = [*promoted, *(n for n, _ in search.history[1:] if n in final.fit.hypothesis.names)]
     names, back = _worth_handing_back(data, search, promoted, names)
+    strayed = "stiffness" in promoted and "stiffness" not in names  # what a modulus beyond all bounds takes away is not explained
     promoted = [n for n in promoted if n in names]
     entries = _entries(back, names)
     spread = spreads(data, final, noise, _seed_spread(search))
@@ -67,7 +68,7 @@ def conclude(data: Data, search: Search, rng: np.random.Generator) -> LoopResult
     residuals = [without_mesh_error(t, jet.residual, noise) for t, jet in zip(data.train, final.fit.jets)]
     tests = structure_tests(data.train, residuals, rng=rng)
     excess = _excess(before, final, noise)
-    unexplained = tests.significant and excess.left > excess.tolerated and excess.explained < EXPLAINED
+    unexplained = tests.significant and excess.left > excess.tolerated and (strayed or excess.explained < EXPLAINED)
     verdict = "unexplained" if unexplained else "effects" if effects else "none"
     rivals = _confounded(search, names)
     not_testable = [
@@ -116,7 +117,8 @@ def _worth_handing_back(data: Data, search: Search, promoted: list[str], names: 
     from the last one on, what would make the error on held-out data larger than it was, or goes to the edge of what is plausible."""
     while names:
         back = _handed_back(data, search.final, names, search.noise)
-        if back is not None and not at_edge(back.fit) and _holds_out(data, search, back):
+        strayed = back is not None and "stiffness" in at_edge(back.fit, nuisance=True)
+        if back is not None and not strayed and not at_edge(back.fit) and _holds_out(data, search, back):
             return names, back
         names = names[:-1]
     return [], search.before

@@ -357,15 +357,15 @@ def _objection(made: Stage, candidate: Candidate, score: float) -> str | None:
     return None
 
 
-def at_edge(fit: JointFit) -> list[str]:
-    """Return the effects beside the nuisances with a value at the edge of what is plausible (a law's limit may be none at all)."""
+def at_edge(fit: JointFit, *, nuisance: bool = False) -> list[str]:
+    """Return the effects, or the nuisances, with a value at the edge of what is plausible (a law's limit may be none at all)."""
     names, at = [], 0
     for effect, _, parameters in fit.hypothesis.terms:
         values = fit.coordinates[at : at + len(parameters)]
         at += len(parameters)
         low, high = np.array([p.low for p in parameters]), np.array([p.high for p in parameters])
         beyond = (values >= high - 1e-9) | ((values <= low + 1e-9) & (low > -np.inf) & (not effect.discrete))
-        if beyond.any() and effect.name not in NUISANCE:
+        if beyond.any() and (effect.name in NUISANCE) == nuisance:
             names.append(effect.name)
     return names
 
