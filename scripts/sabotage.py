@@ -79,8 +79,6 @@ SABOTAGES = (
     S("fem/series.py", "+ MEANS + k * LANES + q] = dilatation / volume", "+ MEANS + k * LANES + q] = dilatation", "test_fem_tracker.py::test_each_term_of_a_series_raises_the_order_of_its_error"),
     S("fem/series.py", "right = np.append(covariance[:k, k], 1.0)", "right = np.append(covariance[:k, k], 0.0)", "test_fem_tracker.py::test_weights_carry_on_what_is_smooth_in_the_state_and_know_their_doubt"),
     S("fem/series.py", "1.0 - solution @ right", "1.0 - solution[:k] @ solution[:k]", "test_fem_tracker.py::test_weights_carry_on_what_is_smooth_in_the_state_and_know_their_doubt"),
-    S("fem/tracker.py", "doubt <= DRIFT", "doubt >= 0.0", "test_fem_tracker.py::test_the_compliance_is_carried_on_where_inputs_jitter"),
-    S("fem/tracker.py", "if self._learns and error <= self._sound:", "if self._learns and error > 1e9:", "test_fem_tracker.py::test_the_compliance_is_carried_on_where_inputs_jitter"),
     S("fem/series.py", "np.full(len(c.path), t)", "np.full(len(c.path), -t)", "test_fem_tracker.py::test_each_term_of_a_series_raises_the_order_of_its_error"),
     S("fem/tracker.py", "SAFETY * shrink / (1.0 - shrink)", "0.05 * shrink / (1.0 - shrink)", "test_fem_tracker.py::test_errors_are_reported_honestly_where_inputs_jitter test_fem_tracker.py::test_every_frame_is_near_the_full_solution_and_within_its_error"),
     S("fem/linear.py", "weakref.finalize(self, pattern.idle.append, handle)", "pattern.idle.append(handle)", "test_fem_linear.py::test_factors_alive_at_once_keep_their_own_values"),
