@@ -16,7 +16,7 @@ from femsense.fem.equilibrium import solve_equilibrium
 from femsense.loop import improve
 from femsense.loop.data import prepare
 from femsense.loop.grow import MOUNTED, tilt_cost
-from femsense.loop.mesh_error import VARIES, with_mesh_errors
+from femsense.loop.mesh_error import SHARE, VARIES, mesh_errors, with_mesh_errors
 from femsense.loop.noise import Groups, Noise, _Likelihood, whiten
 from femsense.loop.predict import sweeps_predicted
 from femsense.loop.screen import _parts, penalty
@@ -91,7 +91,7 @@ def test_the_error_of_the_mesh_is_what_the_finer_mesh_adds():
     hypothesis, prior = with_nuisance(data)
     stage = make_stage(data, hypothesis, prior, Noise({"white": 1e-4}, ""), np.zeros(len(prior.mean)))
     trial = with_mesh_errors(data, stage).train[0]
-    error = trial.mesh_error[:, :, 0]
+    error = mesh_errors(replace(data, train=[trial]))[0]
     fitted = stage.fit.hypothesis.robot_at(stage.fit.coordinates)
     fine = robot_on_mesh(fitted, finer_mesh(fitted.body.mesh, None, 1))
     k = int(trial.scene.frames[2])
@@ -114,11 +114,11 @@ def test_one_share_of_the_mesh_error_in_all_sweeps_is_likelier_than_another_in_e
     hypothesis, prior = with_nuisance(data)
     noise = Noise({"white": 1e-5}, "")
     trial = with_mesh_errors(data, make_stage(data, hypothesis, prior, noise, np.zeros(len(prior.mean)))).train[0]
-    factor, error = noise.whitener(trial.groups, trial.mesh_error), trial.mesh_error[:, :, 0]
+    factor, error = noise.whitener(trial.groups, trial.mesh_error), mesh_errors(replace(data, train=[trial]))[0]
     sign = np.where(trial.groups.sweep % 2, 1.0, -1.0)[:, None]
-    costs = [float((whiten(factor, r) ** 2).sum()) for r in (0.5 * error, 0.5 * sign * error)]
-    assert costs[0] < 0.25 + 1e-6  # half a standard deviation
-    assert costs[1] > 10 * costs[0]
+    costs = [float((whiten(factor, r) ** 2).sum()) for r in (SHARE * error, SHARE * sign * error)]
+    assert costs[0] < 1.0 + 1e-6  # one standard deviation
+    assert costs[1] > 5 * costs[0]
     alike = without_mesh_error(trial, 0.5 * error, noise)
     assert np.linalg.norm(alike) < 0.05 * np.linalg.norm(0.5 * error)
 

@@ -15,6 +15,7 @@ from femsense.loop.data import Data
 from femsense.loop.evidence import gather
 from femsense.loop.grow import EVIDENCE, at_edge
 from femsense.loop.joint import Trial, heads_of, normal_rms_of, rms_of, vectors_of
+from femsense.loop.mesh_error import mesh_errors
 from femsense.loop.noise import Noise
 from femsense.loop.result import LoopResult
 from femsense.loop.screen import NUISANCE, TESTABLE, Candidate, confounding, one_each
@@ -473,7 +474,7 @@ def _cloud_card(data: Data, noise: Noise) -> dict[str, Any] | None:
 
 def _mesh_error(data: Data) -> float | None:
     """Return how far a finer mesh would move the markers, root mean square [m]; None where it was not computed."""
-    errors = [t.mesh_error[:, :, 0] for t in data.train if t.mesh_error is not None]
+    errors = mesh_errors(data)
     return rms_of(errors) if errors else None
 
 

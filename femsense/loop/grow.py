@@ -15,6 +15,7 @@ from femsense.effects.loads import STANDARD_GRAVITY
 from femsense.errors import DataError, FemsenseError
 from femsense.loop.data import Data
 from femsense.loop.joint import JointFit, Prior, rms_of
+from femsense.loop.mesh_error import mesh_errors
 from femsense.loop.noise import Noise
 from femsense.loop.predict import sweeps_predicted
 from femsense.loop.screen import NUISANCE, Candidate, effect_fields, penalty, screen
@@ -43,7 +44,7 @@ ABOVE_MESH = 0.5
 """An effect must move the markers by this much of what the mesh itself costs (beyond what calibration absorbs) …"""
 ABOVE_MESH_IF_SURE = 0.25
 """… or by this much, if left-out sweeps speak for it by SURE standard errors and, the more of these the less, held-out data gain too."""
-NOT_PLAINLY_WORSE = 1.15
+NOT_PLAINLY_WORSE = 1.25
 """No effect may leave so many times the plain error where fitted: it would live on a larger share of what the mesh costs."""
 MOUNTED = np.radians(5.0)
 """A base is mounted as it is declared to about this angle, and a declared gravity is believed as much [rad]."""
@@ -324,15 +325,13 @@ def mesh_cost(data: Data, stage: Stage, *, whole: bool = False) -> float:
 
     Not whole: beyond the share of it that all sweeps have in common, too, where there are several.
     """
-    if any(t.mesh_error is None for t in data.train):
-        return 0.0
-    errors = [t.mesh_error for t in data.train if t.mesh_error is not None]
-    J = [np.concatenate([j.by_pose, j.by_effect], axis=2).reshape(e[:, :, 0].size, -1) for j, e in zip(stage.fit.jets, errors)]
-    if whole or any(e.shape[2] < 3 for e in errors):
-        return rms_of([_rest(j, e[:, :, 0].ravel()).reshape(e.shape[:2]) for j, e in zip(J, errors)])
-    flat = [e.reshape(-1, e.shape[2]) for e in errors]
-    left = [_rest(np.column_stack([j, e[:, 0]]), e[:, 1:]) for j, e in zip(J, flat)]
-    return rms_of([np.linalg.norm(own, axis=1).reshape(e.shape[:2]) for own, e in zip(left, errors)])
+    errors = mesh_errors(data)
+    J = [np.concatenate([j.by_pose, j.by_effect], axis=2).reshape(e.size, -1) for j, e in zip(stage.fit.jets, errors)]
+    fields = [t.mesh_error for t in data.train if t.mesh_error is not None]
+    if whole or any(f.shape[2] < 3 for f in fields):
+        return rms_of([_rest(j, e.ravel()).reshape(e.shape) for j, e in zip(J, errors)]) if errors else 0.0
+    left = [_rest(np.column_stack([j, e.ravel()]), f.reshape(e.size, -1)[:, 1:]) for j, e, f in zip(J, errors, fields)]
+    return rms_of([np.linalg.norm(own, axis=1).reshape(e.shape) for own, e in zip(left, errors)]) if errors else 0.0
 
 
 def _rest(columns: FloatArray, values: FloatArray) -> FloatArray:

@@ -31,8 +31,10 @@ MOST_TETS = 24000
 """A finer mesh than this takes too long in every state."""
 MOST_WORK = 125_000
 """Tetrahedra × states of a recording; beyond it the errors of other states are interpolated between those that were computed."""
+SHARE = 0.35
+"""Standard deviation of the share of the error that a body shows in all sweeps (anchors that are some millimetres wide sink less than points) …"""
 VARIES = 0.25
-"""The share of the error that a body shows differs by this between sweeps (standard deviation)."""
+"""… and of what each sweep adds to it."""
 
 
 def with_mesh_errors(data: Data, stage: Stage) -> Data:
@@ -65,15 +67,21 @@ def _with_errors(
 
 
 def _by_sweep(trial: Trial, moves: dict[int, FloatArray], poses: Sequence[FloatArray]) -> FloatArray:
-    """Return the error of all sweeps together, then `VARIES` times that of each sweep [m], shape (k, c, 1 + sweeps)."""
+    """Return `SHARE` times the error of all sweeps together, then `VARIES` times that of each sweep [m], shape (k, c, 1 + sweeps)."""
     error = np.array([moves[int(f)][m] for f, m in zip(trial.scene.frame, trial.scene.marker)])
     if trial.scene.patches is not None:
         error = np.einsum("kc,kc->k", error, normals_of(trial.scene, poses))[:, None]
     number = np.unique(trial.groups.sweep, return_inverse=True)[1]
     fields = np.zeros((*error.shape, int(number.max()) + 2))
-    fields[:, :, 0] = error
+    fields[:, :, 0] = SHARE * error
     fields[np.arange(len(error)), :, 1 + number] = VARIES * error
     return fields
+
+
+def mesh_errors(data: Data) -> list[FloatArray]:
+    """Return the error of the mesh in the rows of each fitted trial [m], (k, c); none where one is not known."""
+    known = [t.mesh_error[:, :, 0] / SHARE for t in data.train if t.mesh_error is not None]
+    return known if len(known) == len(data.train) else []
 
 
 def few_states(trial: Trial, tets: int) -> IntArray:
@@ -139,4 +147,4 @@ def _representatives(vectors: FloatArray, most: int) -> list[int]:
     return chosen
 
 
-__all__ = ["few_states", "with_mesh_errors"]
+__all__ = ["SHARE", "few_states", "mesh_errors", "with_mesh_errors"]
