@@ -1,0 +1,76 @@
+"""How much of what a finer mesh would change does a truth on another mesh show, and is it the same share in all sweeps?
+
+    python benchmarks/mesh_share.py
+
+Of blind cases in which nothing is hidden (seeds of `loop.py tune`), with pose and modulus as in the truth: D, how far the truth's markers
+lie from the declared robot's; E, how far a mesh of half the size moves them (`femsense.loop.mesh_error`); the share a of E that is
+nearest to D in all sweeps, and in the sweeps one by one; and what is left of D beside it.
+"""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+from loop import COUNTS, SEEDS
+from loop_cases import Case, make_cases, make_data
+
+from femsense.arrays import FloatArray
+from femsense.calib.forward import Hypothesis, evaluate_scene
+from femsense.effects import apply_effects
+from femsense.loop.data import Data, prepare
+from femsense.loop.joint import JointFit, Prior
+from femsense.loop.mesh_error import mesh_errors, with_mesh_errors
+from femsense.loop.noise import Noise
+from femsense.loop.stages import make_stage
+from femsense.model import Robot
+
+EACH = 6
+"""Cases of each way to drive."""
+
+
+def rms_mm(field: FloatArray) -> float:
+    return 1e3 * float(np.sqrt((field**2).sum(axis=1).mean()))
+
+
+def compared(case: Case) -> None:
+    """Print the line of one case."""
+    made = make_data(case, SEEDS["tune"])
+    robot = apply_effects(made.declared, [{"name": "stiffness", "scale": made.modulus_scale}])
+    data = prepare(robot, [made.recording], ())
+    stage = make_stage(data, Hypothesis(data.robot), Prior(np.zeros(0), np.zeros(0)), Noise({"white": 5e-4}, ""), np.zeros(0))
+    errors = mesh_errors(with_mesh_errors(data, stage))
+    if not errors:
+        print(f"{case.number:4d} {case.design.name:7s}{case.control:13s} no state settles on the finer mesh", flush=True)
+        return
+    E, trial = errors[0], data.train[0]
+    D = np.array([made.truth[f, m] for f, m in zip(trial.scene.frame, trial.scene.marker)]) - model(stage.fit, robot, data)
+    share = float((D * E).sum() / (E**2).sum())
+    sweep = trial.groups.sweep
+    own = [float((D[sweep == s] * E[sweep == s]).sum() / (E[sweep == s] ** 2).sum()) for s in np.unique(sweep)]
+    print(f"{case.number:4d} {case.design.name:7s}{case.control:13s} D {rms_mm(D):5.2f}  E {rms_mm(E):5.2f} mm  a {share:5.2f}  left {rms_mm(D - share * E):5.2f} mm"
+          f"  sweeps {'  '.join(f'{a:5.2f}' for a in own)}", flush=True)  # fmt: skip
+
+
+def model(fit: JointFit, robot: Robot, data: Data) -> FloatArray:
+    """Return the declared robot's markers in the rows of the first trial [m], robot frame, (k, 3)."""
+    trial = data.train[0]
+    poses, initial = trial.place(fit.fit.theta[: fit.own], data.robot.marker_points.mean(axis=0))
+    states = evaluate_scene(
+        Hypothesis(robot), trial.scene, np.zeros(0), poses, initial, derivative=False, vary_initial=False,
+        pivot=robot.marker_points.mean(axis=0),
+    ).states  # fmt: skip
+    return np.array([robot.markers.positions(states[int(f)].positions)[m] for f, m in zip(trial.scene.frame, trial.scene.marker)])
+
+
+def main() -> None:
+    """Print a line for each case."""
+    warnings.simplefilter("ignore")
+    cases = [case for case in make_cases(SEEDS["tune"], COUNTS) if case.kind == "null"]
+    for control in ("displacement", "tension"):
+        for case in [c for c in cases if c.control == control][:EACH]:
+            compared(case)
+
+
+if __name__ == "__main__":
+    main()
