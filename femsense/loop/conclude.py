@@ -30,7 +30,8 @@ DRAWS = 2000
 NOT_WORSE = 1.02
 """What is handed back may not have a larger held-out error than the declared model, but for this factor …"""
 NOISY = 1.15
-"""… or for this one, where χ² of the held-out data says that their noise hides a better model."""
+"""… or, where only what calibration may move is handed back, for this one, if χ² of the held-out data says that noise hides a better model.
+An effect that is right has never needed it in blind cases; three that were wrong have."""
 EXPLAINED = 0.8
 """Share of the excess over the noise that effects must take away where structure is left."""
 
@@ -128,8 +129,8 @@ def _worth_handing_back(data: Data, search: Search, promoted: list[str], names: 
 def _holds_out(data: Data, search: Search, back: Stage) -> bool:
     """Return whether a model is no worse on held-out data: in millimetres, or, within reason, by the noise that these data have."""
     worse = back.held_rms / search.before.held_rms
-    if worse <= NOT_WORSE:
-        return True
+    if worse <= NOT_WORSE or any(name not in NUISANCE for name in back.fit.hypothesis.names):
+        return worse <= NOT_WORSE
     return worse <= NOISY and held_chi2(data, search.before, search.noise) - held_chi2(data, back, search.noise) > EVIDENCE
 
 
