@@ -14,14 +14,15 @@ from femsense.effects import find_effect
 from femsense.effects.shape import finer_mesh, robot_on_mesh
 from femsense.fem.equilibrium import solve_equilibrium
 from femsense.loop import improve
-from femsense.loop.data import prepare
+from femsense.loop.data import Data, prepare
 from femsense.loop.grow import MOUNTED, tilt_cost
 from femsense.loop.mesh_error import SHARE, VARIES, mesh_errors, with_mesh_errors
 from femsense.loop.noise import Groups, Noise, _Likelihood, whiten
 from femsense.loop.predict import sweeps_predicted
 from femsense.loop.screen import _parts, penalty
-from femsense.loop.stages import make_stage, with_nuisance
+from femsense.loop.stages import Stage, make_stage, with_nuisance
 from femsense.loop.structure import structure_tests, without_mesh_error
+from femsense.recording import Recording
 
 RNG = np.random.default_rng(11)
 
@@ -83,15 +84,20 @@ def test_left_out_sweeps_are_predicted_as_by_fits_without_them():
     assert spread == pytest.approx(np.sqrt(3) * np.std(gains, ddof=1), rel=1e-8)
 
 
-def test_the_error_of_the_mesh_is_what_the_finer_mesh_adds():
+def with_error_of_the_mesh(noise: Noise) -> tuple[Recording, Stage, Data]:
+    """Return a recording of a small arm, its calibrated stage, and the data with what the mesh costs there."""
     inputs, labels = sweeps(each=1)
     robot = arm((4, 2, 2))
     recording, _ = record(inputs, labels=labels, truth=robot)
     data = prepare(robot, [recording], [])
     hypothesis, prior = with_nuisance(data)
-    stage = make_stage(data, hypothesis, prior, Noise({"white": 1e-4}, ""), np.zeros(len(prior.mean)))
-    trial = with_mesh_errors(data, stage).train[0]
-    error = mesh_errors(replace(data, train=[trial]))[0]
+    stage = make_stage(data, hypothesis, prior, noise, np.zeros(len(prior.mean)))
+    return recording, stage, with_mesh_errors(data, stage)
+
+
+def test_the_error_of_the_mesh_is_what_the_finer_mesh_adds():
+    recording, stage, data = with_error_of_the_mesh(Noise({"white": 1e-4}, ""))
+    trial, error = data.train[0], mesh_errors(data)[0]
     fitted = stage.fit.hypothesis.robot_at(stage.fit.coordinates)
     fine = robot_on_mesh(fitted, finer_mesh(fitted.body.mesh, None, 1))
     k = int(trial.scene.frames[2])
@@ -107,14 +113,10 @@ def test_the_error_of_the_mesh_is_what_the_finer_mesh_adds():
 
 
 def test_one_share_of_the_mesh_error_in_all_sweeps_is_likelier_than_another_in_each():
-    inputs, labels = sweeps(each=1)
-    robot = arm((4, 2, 2))
-    recording, _ = record(inputs, labels=labels, truth=robot)
-    data = prepare(robot, [recording], [])
-    hypothesis, prior = with_nuisance(data)
     noise = Noise({"white": 1e-5}, "")
-    trial = with_mesh_errors(data, make_stage(data, hypothesis, prior, noise, np.zeros(len(prior.mean)))).train[0]
-    factor, error = noise.whitener(trial.groups, trial.mesh_error), mesh_errors(replace(data, train=[trial]))[0]
+    data = with_error_of_the_mesh(noise)[2]
+    trial, error = data.train[0], mesh_errors(data)[0]
+    factor = noise.whitener(trial.groups, trial.mesh_error)
     sign = np.where(trial.groups.sweep % 2, 1.0, -1.0)[:, None]
     costs = [float((whiten(factor, r) ** 2).sum()) for r in (SHARE * error, SHARE * sign * error)]
     assert costs[0] < 1.0 + 1e-6  # one standard deviation

@@ -127,10 +127,13 @@ def _worth_handing_back(data: Data, search: Search, promoted: list[str], names: 
 
 
 def _holds_out(data: Data, search: Search, back: Stage) -> bool:
-    """Return whether a model is no worse on held-out data: in millimetres, or, within reason, by the noise that these data have."""
+    """Return whether a model is no worse on held-out data in millimetres; one that is calibrated only may be, within reason, if it is
+    better by the noise that these data have."""
     worse = back.held_rms / search.before.held_rms
-    if worse <= NOT_WORSE or any(name not in NUISANCE for name in back.fit.hypothesis.names):
-        return worse <= NOT_WORSE
+    if worse <= NOT_WORSE:
+        return True
+    if any(name not in NUISANCE for name in back.fit.hypothesis.names):
+        return False
     return worse <= NOISY and held_chi2(data, search.before, search.noise) - held_chi2(data, back, search.noise) > EVIDENCE
 
 
