@@ -88,7 +88,7 @@ def cold(data: Path) -> None:
             def solve(lawful: BodyModel = lawful, tension: Any = tension, held: Any = held, forces: Any = forces) -> Any:
                 return solve_equilibrium(lawful, tension=tension, shortening=held, nodal_forces=forces)
 
-            ms, sofa = median_ms(solve), document["newton_steps"] * document["ms_per_step"]
+            ms, sofa = median_ms(solve, 31), document["newton_steps"] * document["ms_per_step"]
             print(
                 f"{law:13} {case:13} {solve().iterations:3d} steps ({straight_steps(solve):2d} straight) {ms:6.1f} ms   SOFA {document['newton_steps']:3d} × {document['ms_per_step']:5.2f} = {sofa:6.1f} ms"
                 f"   ratio {ms / sofa:.3f}   {verdict(ms / sofa, 0.15)}"

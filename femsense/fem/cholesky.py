@@ -26,6 +26,7 @@ from femsense.fem.tiles import (
     PADDING,
     WIDE,
     add_run,
+    fetch_ahead,
     subtract_and_solve,
     subtract_product,
     subtract_six_columns,
@@ -575,10 +576,11 @@ def _solve_one(
     half: FloatArray,
 ) -> None:
     """Solve in place for one right-hand side in the order of elimination."""
-    width, base, y = L.itemsize, L.ctypes.data, half.ctypes.data
+    width, base, y, last = L.itemsize, L.ctypes.data, half.ctypes.data, len(firsts) - 1
     for s in range(len(firsts) - 1):
         c0, columns = unit * firsts[s], unit * (firsts[s + 1] - firsts[s])
         height = columns + unit * (begin[s + 1] - begin[s])
+        fetch_ahead(base + width * offset[s + 1], width * (offset[min(s + 2, last)] - offset[s + 1]))
         for i in range(columns):
             half[i] = x[c0 + i]
         for i in range(columns, height):
@@ -610,6 +612,8 @@ def _solve_one(
     for s in range(len(firsts) - 2, -1, -1):
         c0, columns = unit * firsts[s], unit * (firsts[s + 1] - firsts[s])
         height = columns + unit * (begin[s + 1] - begin[s])
+        before = max(s - 1, 0)
+        fetch_ahead(base + width * offset[before], width * (offset[s] - offset[before]))
         for i in range(columns):
             half[i] = x[c0 + i]
         for q in range(begin[s + 1] - begin[s]):

@@ -23,7 +23,7 @@ import numpy as np
 from numba import njit
 
 from femsense.arrays import FloatArray
-from femsense.fem.tiles import add_run, subtract_product
+from femsense.fem.tiles import add_run, fetch_ahead, subtract_product
 
 FAST = {"contract", "reassoc", "nsz", "arcp"}
 """Rounding may differ; infinities and NaN are kept."""
@@ -198,6 +198,8 @@ def _factors(e, w, mu, pull, local, lam, F, R, H, mean, Dinv, T):  # type: ignor
 def _add_product(T, K, slots, blocks):  # type: ignore[no-untyped-def]
     """Add T's product to the blocks of the pairs a ≤ b; K is room for it."""
     width = T.itemsize
+    for pair in range(55):  # while the product is made
+        fetch_ahead(blocks.ctypes.data + 9 * width * slots[pair], 9 * width)
     K[:] = 0.0
     for first, count in ((0, 6), (6, 4)):
         subtract_product(

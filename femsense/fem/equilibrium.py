@@ -31,7 +31,10 @@ MOST_STEPS = 1500
 SMALLEST_PART = 2e-3
 """Load steps smaller than this share of the load are given up."""
 CHORD = 1e-2
-"""A stiffness serves for another step where the last one left less than this share of the residual."""
+"""A stiffness serves for another step where the last one left less than this share of the residual, or where two more such steps are enough
+(unless it was factorised so far off that another one is needed at the end)."""
+SURE = 0.1
+"""Where a step left less than this share, the next one is likely to leave less than CHORD: no tangent is made for the state it leads to."""
 LENT = 0.1
 """So does one that was lent by a state near by."""
 RUBS = 0.3
@@ -138,6 +141,7 @@ class _State:
     single: bool = False  # factors in single precision
     indefinite_steps: int = 0
     factored_at: float = 0.0  # residual where the stiffness was last factorised [N]
+    serves: bool = False  # the factor is likely to serve for the step after this one
 
 
 def solve_equilibrium(
@@ -419,13 +423,16 @@ def _newton(body: BodyModel, loads: _Loads, state: _State, max_iterations: int) 
             return CONVERGED
         if not sound:
             return "stalled"
-        serves = RUBS if follows else LENT if state.borrowed else CHORD
-        if state.factor is None or state.residual > max(loads.tolerance, serves * last):
+        left = state.residual / last
+        enough = RUBS if follows else LENT if state.borrowed else CHORD
+        sound_to_the_end = state.factored_at <= FAR * loads.tolerance and state.residual * min(left, 1.0) ** 2 <= loads.tolerance
+        serves = left <= enough or sound_to_the_end
+        if state.factor is None or not serves:
             state.factor, state.borrowed = _factor_here(body, here, state, H, C, stretch, loads.lever[held]), False
             if state.factor is None:
                 return "singular"
             state.factored_at = state.residual
-        last = state.residual
+        last, state.serves = state.residual, state.borrowed or 0.0 < left <= SURE
         du, dT = _bordered_step(state.factor, force, gap, H, C, stretch, loads.lever[held])
         if not closed and _contradicts(H @ du + stretch * dT, gap, loads.lever[held]):
             return "cables"
@@ -617,7 +624,7 @@ def _line_search(
         state.x = x0 + length * step if turned is None else turned
         state.T = T0.copy()
         state.T[held] = T0[held] + length * dT
-        there = internal(body, state.x, tangent=trial == 0 and not state.borrowed)
+        there = internal(body, state.x, tangent=trial == 0 and not state.serves)
         if np.isfinite(there.energy):
             merit = _merit(body, loads, state, held, there, penalty, lost)
             if merit <= base + 1e-4 * length * slope + noise:

@@ -98,6 +98,8 @@ class Expansion:
         self._room = np.zeros((len(body.mesh.tets), 4, 9)) if keeps else None
         self._stretches: list[tuple[FloatArray, FloatArray]] = []  # of the last equilibria that were learnt
         self.length = ALIKE * body.reach
+        self._loads: FloatArray | None = None  # dead loads of the last series
+        self._answers: FloatArray | None = None  # to what is unbalanced at the start and to each cable, shape (a + 1, f)
 
     def learn(self, x: FloatArray) -> None:
         """Keep the stretches of an equilibrium x: their stress serves the stiffness of starts to come."""
@@ -125,7 +127,7 @@ class Expansion:
         add_cable_stiffness(body, x, tuple(np.full(len(c.path), t) for c, t in zip(body.cables, tension)), blocks)
         self.factor = None  # its memory serves the next one
         self.factor = cholesky(body.free_map.pattern.analysis(), blocks.ravel(), single=self._single, source=self._source)
-        self.positions, self.tension = x, tension.copy()
+        self.positions, self.tension, self._answers = x, tension.copy(), None
         self._held = -here.forces
         if len(tension):
             self._held += (tension @ pull_rows(body, x)).reshape(-1, 3)
@@ -140,8 +142,21 @@ class Expansion:
         terms = np.zeros((count, *self.positions.shape))
         for n in range(count):
             self.unbalanced.reshape(-1)[free] = self._forces(terms[:n], tension, loads).ravel()[free]
-            terms[n].reshape(-1)[free] = self.factor.solve(self.unbalanced.ravel()[free])
+            known = self._first_term(tension, loads) if n == 0 else None
+            terms[n].reshape(-1)[free] = self.factor.solve(self.unbalanced.ravel()[free]) if known is None else known
             yield terms[n]
+
+    def _first_term(self, tension: FloatArray, loads: FloatArray) -> FloatArray | None:
+        """Return x₁ of the free unknowns, shape (f,), where the dead loads stay: one block of solves a start, since it is linear in the tensions."""
+        assert self.factor is not None
+        stays, self._loads, free = np.array_equal(loads, self._loads), loads, self.body.free_map.dofs
+        if not stays:
+            self._answers = None
+            return None
+        if self._answers is None:
+            pulls = pull_rows(self.body, self.positions)[:, free]
+            self._answers = self.factor.solve(np.vstack([(loads + self._held).ravel()[free], pulls]).T).T
+        return np.asarray(self._answers[0] + (tension - self.tension) @ self._answers[1:])
 
     def _forces(self, terms: FloatArray, tension: FloatArray, loads: FloatArray) -> FloatArray:
         """Return g_N [N], shape (n, 3)."""

@@ -23,6 +23,8 @@ REGISTERS = 3 if BYTES == 64 else 2
 PADDING = 4 * BYTES
 """Entries that may be read beyond the end of a matrix."""
 INTEGER = ir.IntType(64)
+LINE = 64
+"""Bytes of a line of the cache."""
 LANES = 8
 """Elements that `add_gradient` and `add_divergence` work on at once."""
 
@@ -58,6 +60,41 @@ def add_run(context: Any, like: Any, to: Any, source: Any, count: Any) -> Any:
         return target.get_dummy_value()
 
     return types.void(like, types.int64, types.int64, types.int64), build
+
+
+@intrinsic
+def fetch_ahead(context: Any, address: Any, size: Any) -> Any:
+    """Ask for so many bytes at an address to be brought into the cache, line by line; what lies there does not matter."""
+    del context
+
+    def build(target: Any, builder: Any, signature: Any, values: Any) -> Any:
+        builder.call(_fetch_function(builder.module), values)
+        return target.get_dummy_value()
+
+    return types.void(types.int64, types.int64), build
+
+
+def _fetch_function(module: Any) -> Any:
+    function, known = _function(module, "femsense_fetch", 2)
+    if known:
+        return function
+    builder = ir.IRBuilder(function.append_basic_block("entry"))
+    address, size = function.args
+    pointer, word = ir.IntType(8).as_pointer(), ir.IntType(32)
+    fetch = _declared(module, "llvm.prefetch.p0", ir.VoidType(), [pointer, word, word, word])
+    loop, end = function.append_basic_block("loop"), function.append_basic_block("end")
+    entry = builder.block
+    builder.cbranch(builder.icmp_signed(">", size, _number(0)), loop, end)
+    builder.position_at_end(loop)
+    at = builder.phi(INTEGER)
+    at.add_incoming(_number(0), entry)
+    builder.call(fetch, [_at(builder, address, at, ir.IntType(8)), *(ir.Constant(word, value) for value in (0, 2, 1))])
+    further = builder.add(at, _number(LINE))
+    at.add_incoming(further, loop)
+    builder.cbranch(builder.icmp_signed("<", further, size), loop, end)
+    builder.position_at_end(end)
+    builder.ret_void()
+    return function
 
 
 def _builder(name: str, like: Any, *, solves: bool) -> Any:

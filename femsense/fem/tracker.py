@@ -29,7 +29,9 @@ from femsense.fem.mesh import embed_points
 from femsense.fem.series import Expansion, combination
 
 GUESS = 4.0
-"""Where the third term is only expected, from how it grew in the frame before, the reported error is so many times that."""
+"""Where the third term is only expected, from how it grew in frames before, the reported error is so many times that …"""
+FADES = 0.9
+"""… and how it grew counts by so much less with every third term that was seen since."""
 SHRINK = 0.5
 """A term that is more than this share of the one before settles nothing."""
 NEAR = 0.005
@@ -97,7 +99,7 @@ class Tracker:
         self._trust = 1.0
         self._loads = np.zeros_like(body.mesh.nodes)
         self._terms: list[FloatArray] = []  # of the last series
-        self._growth: float | None = None  # third term over second and first [1/m], from the start at hand
+        self._growth, self._grown = 0.0, False  # third term over second and first [1/m], the largest of late; whether one is known from the start at hand
         self._learns = False  # whether the next sound state is to be learnt
         self._columns: dict[bytes, sp.csc_matrix] = {}
         self._known = Known(self.expansion.length)
@@ -163,7 +165,7 @@ class Tracker:
                 start.learn(x)
                 if start.move(x, tension):
                     self._know()
-        self._growth = None
+        self._grown = False
         if not start.move(here, T):
             raise FemsenseError("the state is unstable: reduce the load")
 
@@ -205,7 +207,7 @@ class Tracker:
         return None
 
     def _begin(self, x: FloatArray, tension: FloatArray) -> bool:
-        self._learns, self._growth = True, None
+        self._learns, self._grown = True, False
         return self.expansion.move(x, tension)
 
     def _look_ahead(self, T: FloatArray, motion: float) -> bool:
@@ -236,10 +238,11 @@ class Tracker:
             if not np.isfinite(sizes[-1]) or (len(sizes) > 1 and sizes[-1] > SHRINK * sizes[-2]):
                 return x, sizes[0], np.inf
             x, error = x + term, sizes[-1]
-            if len(sizes) == 2 and self._growth is not None:
+            if len(sizes) == 2 and self._grown:
                 error *= min(1.0, GUESS * self._growth * sizes[0])
             if len(sizes) == 3:
-                self._growth = sizes[2] / max(sizes[1] * sizes[0], 1e-300)
+                growth = sizes[2] / max(sizes[1] * sizes[0], 1e-300)
+                self._growth, self._grown = max(growth, FADES * self._growth), True
             error = max(self._trust * error, self._floor)
             if error <= self._allowed(_largest(x - last)) and (not self._learns or error <= self._sound):
                 break
@@ -254,7 +257,7 @@ class Tracker:
         if not state.converged:
             raise FemsenseError(f"no equilibrium: {state.status}: {state.advice}")
         motion = _largest(state.positions - (self._past[-1] if self._past else self.body.mesh.nodes))
-        self._past, self._columns, self._smooth, self._learns, self._growth = self._past[-1:], {}, False, False, None
+        self._past, self._columns, self._smooth, self._learns, self._grown = self._past[-1:], {}, False, False, False
         self.expansion.forget()
         self.expansion.learn(state.positions)
         if not self.expansion.move(state.positions, np.array(list(state.tension.values()))):
