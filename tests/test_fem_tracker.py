@@ -107,6 +107,23 @@ def test_each_term_of_a_series_raises_the_order_of_its_error(quadratic: bool) ->
     np.testing.assert_allclose(orders, [2.0, 3.0, 4.0], atol=0.35)
 
 
+def test_where_loads_stay_the_first_term_comes_from_what_is_known_of_the_start() -> None:
+    body = body_of(True)
+    start, loads = Expansion(body, single=False), body.dead_load()
+    begin = solve_equilibrium(body, tension=tensions(0.4))
+    assert start.move(begin.positions, np.array(list(begin.tension.values())))
+    other, push = np.array([1.9, 0.1]), np.zeros_like(loads)
+    push[-1, 1] = 0.03
+    fresh = [np.array(term) for term in start.terms(other, loads)]  # loads not seen before: a solve
+    list(start.terms(np.array([1.0, 1.0]), loads))  # seen: solves for each cable
+    for tension, force, wanted in ((other, loads, fresh), (other, loads + push, None), (other, loads, fresh)):
+        got = list(start.terms(tension, force))
+        if wanted is not None:
+            np.testing.assert_allclose(got, wanted, rtol=0, atol=1e-12)
+        else:
+            assert np.abs(got[0] - fresh[0]).max() > 1e-5
+
+
 def test_a_series_in_single_precision_loses_nothing() -> None:
     body, sums = body_of(True), []
     for single in (False, True):

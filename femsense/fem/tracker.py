@@ -99,7 +99,8 @@ class Tracker:
         self._trust = 1.0
         self._loads = np.zeros_like(body.mesh.nodes)
         self._terms: list[FloatArray] = []  # of the last series
-        self._growth, self._grown = 0.0, False  # third term over second and first [1/m], the largest of late; whether one is known from the start at hand
+        self._growth = 0.0  # third term over second and first [1/m], the largest of late
+        self._grown = False  # whether one is known from the start at hand
         self._learns = False  # whether the next sound state is to be learnt
         self._columns: dict[bytes, sp.csc_matrix] = {}
         self._known = Known(self.expansion.length)
