@@ -149,8 +149,9 @@ class Expansion:
     def _first_term(self, tension: FloatArray, loads: FloatArray) -> FloatArray | None:
         """Return x₁ of the free unknowns, shape (f,), where the dead loads stay: one block of solves a start, since it is linear in the tensions."""
         assert self.factor is not None
-        stays, self._loads, free = np.array_equal(loads, self._loads), loads, self.body.free_map.dofs
-        if not stays:
+        free, before = self.body.free_map.dofs, self._loads
+        self._loads = loads
+        if before is None or not np.array_equal(loads, before):
             self._answers = None
             return None
         if self._answers is None:
