@@ -150,7 +150,7 @@ class Expansion:
         """Return x₁ of the free unknowns, shape (f,), where the dead loads stay: one block of solves a start, since it is linear in the tensions."""
         assert self.factor is not None
         free, before = self.body.free_map.dofs, self._loads
-        self._loads = loads
+        self._loads = loads.copy()
         if before is None or not np.array_equal(loads, before):
             self._answers = None
             return None
