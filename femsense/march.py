@@ -10,18 +10,20 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy.sparse as sp
 
 from femsense.arrays import FloatArray, IntArray, freeze
-from femsense.errors import DataError
+from femsense.errors import DataError, FemsenseError
 from femsense.fem.assembly import internal
 from femsense.fem.body import BodyModel
 from femsense.fem.cables import bend_angles, cable_forces, rub, shortening
 from femsense.fem.chambers import volume_gradient
+from femsense.fem.cholesky import Cholesky
 from femsense.fem.clamp import first_give
 from femsense.fem.compliance import Tangent, drive_rows, tangent_at
 from femsense.fem.equilibrium import Equilibrium, solve_equilibrium
 from femsense.fem.iterative import UnsettledError, iterative
-from femsense.fem.linear import Factorization, Pattern, available_memory, factorize
+from femsense.fem.linear import Factorization, Pattern, available_memory, factorize, factorize_definite
 from femsense.fem.mesh import Embedding, TetMesh, embed_points
 from femsense.fem.turning import turned_step
 from femsense.model import Robot
@@ -34,7 +36,7 @@ MEMORY_SHARE = 0.25
 TRIED = 1e-8
 """Relative tolerance of states that are only tried: below a thousandth of a millimetre, where derivatives want a tenth of it."""
 PARTS, SHORTEST_PART = 4, 6
-"""Parts at most that frames with a past are walked in side by side, and frames of a part at least."""
+"""Parts at most that frames are walked in side by side where each starts from the one before, and frames of a part at least."""
 PAST, PAST_TRIED = 1e-8, 1e-6
 """Tensions along a cable that agree so well [N], and as shares of the largest, are the same past; the latter for states that are only tried."""
 
@@ -145,7 +147,7 @@ def frame_loads(walk: Walk, frame: int) -> FloatArray | None:
 
 def solve_frame(
     walk: Walk, frame: int, *, start: Equilibrium | None = None, before: tuple[FloatArray, ...] | None = None, reuse_factor: bool = False,
-    nodal_forces: FloatArray | None = None, relative_tolerance: float = 1e-9, rough: bool = False,
+    nodal_forces: FloatArray | None = None, relative_tolerance: float = 1e-9, rough: bool = False, single: bool = False,
 ) -> Equilibrium:  # fmt: skip
     """Return the equilibrium of one frame.
 
@@ -158,6 +160,7 @@ def solve_frame(
         nodal_forces: forces beside the known loads [N], shape (n, 3).
         relative_tolerance: of the unbalanced force against the sum of all loads.
         rough: the state is only tried (see `solve_equilibrium`).
+        single: factors in single precision, which the true residual makes up for.
     """
     drive, body = walk.drive, walk.robot.body
     if drive.gravity is not None:
@@ -172,7 +175,7 @@ def solve_frame(
     return solve_equilibrium(
         body, tension=tension, shortening=held, pressure=dict(zip(body.chamber_names, drive.pressures[frame].tolist())),
         nodal_forces=loads, start=start, before=before, reuse_factor=reuse_factor, relative_tolerance=relative_tolerance,
-        rough=rough,
+        rough=rough, single=single,
     )  # fmt: skip
 
 
@@ -209,8 +212,9 @@ def walk_along(
     answers = _Variants(walk, variants, {k: bases[alike[k]] for k in todo}, alike, others, observe)
     room = _room(len(unique))
     for k, factor in answers.write():
-        if starts is not None and factor.bytes < room:
-            starts[k] = replace(starts[k], factor=factor)
+        lent = factor.plain if isinstance(factor, Refined) else factor
+        if starts is not None and lent.bytes < room:
+            starts[k] = replace(starts[k], factor=lent)
     for k in wanted:
         yield k, bases[alike[k]], seen[alike[k]], others[k]
 
@@ -239,7 +243,7 @@ def _base_states(
 ) -> Iterator[Equilibrium]:
     """Yield the states of frames, without their factors; `starts` gets them with these where they fit into memory."""
     body, room = walk.robot.body, _room(len(frames))
-    near = {} if starts is None else {k: starts[k] for k in frames if k in starts and _clamp_fits(body, starts[k])}
+    near = {k: state for k, state in sorted((starts or {}).items()) if _clamp_fits(body, state)}
 
     def keep(k: int, state: Equilibrium) -> Equilibrium:
         bare = replace(state, factor=None)
@@ -247,7 +251,7 @@ def _base_states(
             starts[k] = state if state.factor is not None and state.factor.bytes < room else bare
         return bare
 
-    known = set(near)
+    known = near.keys() & set(frames)
     if near:
         near.update(_nearest(walk, near, [k for k in frames if k not in near]))
 
@@ -255,7 +259,14 @@ def _base_states(
         start, tried = near[k] if start is None else start, rough and k in known
         return _require(
             solve_frame(
-                walk, k, start=start, before=before, reuse_factor=True, relative_tolerance=TRIED if tried else 1e-9, rough=tried
+                walk,
+                k,
+                start=start,
+                before=before,
+                reuse_factor=True,
+                relative_tolerance=TRIED if tried else 1e-9,
+                rough=tried,
+                single=True,
             ),
             k,
         )
@@ -264,12 +275,23 @@ def _base_states(
         states = _march(walk, frames, near, again, rough) if past else each(again, frames)
         yield from (keep(k, state) for k, state in zip(frames, states))
         return
-    last: Equilibrium | None = None
-    before: tuple[FloatArray, ...] | None = None
-    for k in frames:
-        last = _require(solve_frame(walk, k, start=last, before=before), k)
-        before = last.segment_tensions if past else None
-        yield keep(k, last)
+
+    def along(part: list[int]) -> list[Equilibrium]:
+        states: list[Equilibrium] = []
+        for k in part:
+            last = states[-1] if states else None
+            before = last.segment_tensions if past and last is not None else None
+            states.append(keep(k, _require(solve_frame(walk, k, start=last, before=before, single=True), k)))
+        return states
+
+    for states in each(along, [frames] if past else _parts(frames)):
+        yield from states
+
+
+def _parts(frames: list[int]) -> list[list[int]]:
+    """Return frames cut into parts that are walked side by side; as many wherever it runs."""
+    size = max(SHORTEST_PART, -(-len(frames) // PARTS))
+    return [frames[i : i + size] for i in range(0, len(frames), size)]
 
 
 def _nearest(walk: Walk, near: dict[int, Equilibrium], frames: list[int]) -> dict[int, Equilibrium]:
@@ -292,8 +314,7 @@ def _march(
     The frames are cut into parts that are walked side by side, each from the tensions along the cables that the states near by let
     expect there. Then, part after part, frames are solved again until these are what the part before left.
     """
-    size = max(SHORTEST_PART, -(-len(frames) // PARTS))
-    parts = [frames[i : i + size] for i in range(0, len(frames), size)]
+    parts = _parts(frames)
     expected = _expected_tensions(walk, frames, near)
     assumed = [None, *(expected[part[-1]] for part in parts[:-1])]
     result: dict[int, Equilibrium] = {}
@@ -426,7 +447,7 @@ class _Variants:
         return [bend_angles(c, x) if c.friction > 0 else np.zeros(len(c.path)) for c in self.variants[i].robot.body.cables]
 
     def _tangent(self, k: int) -> Tangent:
-        return self.kept.pop(k, None) or tangent_at(self.walk.robot.body, self.bases[k])
+        return self.kept.pop(k, None) or tangent_at(self.walk.robot.body, self.bases[k], refined)
 
     def _jobs(self, group: list[int], which: Sequence[int]) -> list[Job]:
         """Return what is to be computed of some variants in frames with one base state."""
@@ -562,7 +583,7 @@ class _Balance:
         if body is not own:
             force += body.dead_load() - self.dead
             springs = [(b.clamp_stiffness, b.clamp_turn_stiffness) for b in (body, own)]
-            if body.material is not own.material or springs[0] != springs[1]:
+            if not _same_elements(body, own) or springs[0] != springs[1]:
                 force += self.inner - internal(body, x, tangent=False).forces
         if drive.load_forces is not self.walk.drive.load_forces:
             force += self._loads(variant) - self._loads(self.walk)
@@ -594,16 +615,61 @@ FINER_ENOUGH = 5e-3
 """Newton steps on the finer mesh end when the unbalanced force has fallen to this share."""
 ROUGH = 1e-3
 """Share of a step on the finer mesh that may be missing, in energy. With ten times as much the order of the nodes moved a fit by two percent."""
+EARLY = 3e-2
 ROUGH_FROM = 9000
 """Unknowns from which on such a step takes conjugate gradients instead of a factor."""
 
 
-def roughly(pattern: Pattern, values: FloatArray) -> Factorization | None:
-    """Return a stiffness that is solved to ROUGH, by conjugate gradients where these are faster than a factor."""
+REFINED_FROM = 3000
+"""Unknowns from which on a factor in single precision, and a solve more, take less time than one in double precision."""
+REFINED, MOST_REFINED = 1e-3, 3
+"""A correction by less than this share squares to what may be left of an error; solves at most before the factor is made in double precision."""
+
+
+class Refined:
+    """A stiffness behind its factor in single precision: solutions are corrected from their true residual (Wilkinson 1963)."""
+
+    def __init__(self, pattern: Pattern, values: FloatArray, plain: Factorization) -> None:
+        self.negative, self.size, self.bytes = 0, pattern.size, plain.bytes + values.nbytes
+        self.plain = plain
+        self._pattern, self._values = pattern, values
+        self._matrix = sp.csr_matrix((values, pattern.indices, pattern.indptr), shape=(pattern.size,) * 2)
+        self._exact: Factorization | None = None
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        """Return K⁻¹ right, shape (f,) or (f, k)."""
+        if self._exact is not None:
+            return self._exact.solve(right)
+        answer = self.plain.solve(right)
+        for _ in range(MOST_REFINED):
+            more = self.plain.solve(right - self._matrix @ answer)
+            answer = answer + more
+            if (np.abs(more).max(axis=0) <= REFINED * np.abs(answer).max(axis=0)).all():
+                return np.asarray(answer)
+        self._exact = factorize(self._pattern, self._values)
+        if self._exact is None:
+            raise FemsenseError("the stiffness is singular")
+        return self._exact.solve(right)
+
+    def gram(self, columns: sp.csc_matrix) -> FloatArray:
+        """Return BᵀK⁻¹B, shape (k, k), for sparse columns B, shape (f, k)."""
+        return np.asarray(columns.T @ self.solve(columns.toarray()))
+
+
+def refined(pattern: Pattern, values: FloatArray) -> Factorization | None:
+    """Return a stiffness that is solved to 1e-6 or better, from a factor in single precision where that pays and is enough."""
+    if pattern.size < REFINED_FROM or not np.isfinite(values).all():
+        return factorize(pattern, values)
+    plain = factorize_definite(pattern, values, tries=0, single=True)[0]
+    return Refined(pattern, values, plain) if isinstance(plain, Cholesky) else plain or factorize(pattern, values)
+
+
+def roughly(pattern: Pattern, values: FloatArray, tolerance: float = ROUGH) -> Factorization | None:
+    """Return a stiffness that is solved to a tolerance, by conjugate gradients where these are faster than a factor."""
     if pattern.size < ROUGH_FROM or pattern.grid is None or not np.isfinite(values).all():
         return factorize(pattern, values)
     try:
-        return iterative(pattern.levels(), values, tolerance=ROUGH) or factorize(pattern, values)
+        return iterative(pattern.levels(), values, tolerance=tolerance) or factorize(pattern, values)
     except UnsettledError:
         return factorize(pattern, values)
 
@@ -629,7 +695,8 @@ def finer_state(walk: Walk, fine: Walk, frame: int, base: Equilibrium, ties: Emb
         first = size if step == 0 else first
         if step and size < FINER_ENOUGH * first:
             return x
-        tangent = tangent_at(body, replace(base, positions=x, factor=None), roughly)
+        enough = EARLY if step == 0 else min(EARLY, ROUGH * first / size)
+        tangent = tangent_at(body, replace(base, positions=x, factor=None), lambda p, v: roughly(p, v, enough))
         move = tangent.respond(force[None])[0]
         if base.held.any():
             move = move + np.tensordot(pulled[base.held[: len(body.cables)]], tangent.respond_to_held(), axes=1)
@@ -646,6 +713,15 @@ def _unbalanced(body: BodyModel, base: Equilibrium, x: FloatArray, force: FloatA
         pulls = drive_rows(body, x)[held][:, dofs].T
         rest = rest - pulls @ np.linalg.lstsq(pulls, rest, rcond=None)[0]
     return float(np.linalg.norm(rest))
+
+
+def _same_elements(body: BodyModel, other: BodyModel) -> bool:
+    """Return whether the elements of two bodies answer alike, where their meshes do not differ by what moves their nodes."""
+    a, b = body.material, other.material
+    if a is b or body.mesh is not other.mesh:
+        return a is b
+    alike = np.array_equal(a.young_modulus, b.young_modulus) and np.array_equal(a.poisson_ratio, b.poisson_ratio)
+    return alike and (a.law, a.stretch_limit) == (b.law, b.stretch_limit)
 
 
 def _same_mechanics(walk: Walk, variant: Walk) -> bool:

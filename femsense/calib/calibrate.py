@@ -219,8 +219,18 @@ def fit_joint(
     def evaluate(theta: FloatArray, derivative: bool) -> tuple[FloatArray, FloatArray | None]:
         nonlocal jet
         moved, inputs = place(theta)
+        known = None if a or jet is None else jet.states  # a pose does not move the body
         jet = evaluate_scene(
-            plain, scene, empty, moved, inputs, derivative=derivative, vary_initial=bool(a), pivot=pivot, starts=starts
+            plain,
+            scene,
+            empty,
+            moved,
+            inputs,
+            derivative=derivative,
+            vary_initial=bool(a),
+            pivot=pivot,
+            starts=starts,
+            known=known,
         )
         row = (weights / sigma)[:, None]
         residual = np.concatenate([(row * jet.residual).ravel(), jet.rest.ravel() / seat_std])

@@ -220,11 +220,13 @@ class SceneJet:
 def evaluate_scene(
     hypothesis: Hypothesis, scene: Scene, coordinates: FloatArray, poses: Sequence[FloatArray], initial: FloatArray | None,
     *, derivative: bool, vary_initial: bool, pivot: FloatArray, starts: dict[int, Equilibrium] | None = None, rough: bool = False,
+    known: dict[int, Equilibrium] | None = None,
 ) -> SceneJet:  # fmt: skip
     """Evaluate marker residuals of a scene at a point of parameter space, and their derivatives by differences.
 
     `starts` holds states of earlier evaluations near by and is brought up to date; states that are only tried may be
-    `rough`: a frame that Newton does not reach from there then has no equilibrium.
+    `rough`: a frame that Newton does not reach from there then has no equilibrium. `known` are the states at this very point, as far as it
+    moves the body; they serve where no derivative by what moves it is wanted.
 
     Raises:
         DataError: a frame has no equilibrium.
@@ -243,7 +245,10 @@ def evaluate_scene(
     states: dict[int, Equilibrium] = {}
     model: dict[int, FloatArray] = {}
     shifted: list[dict[int, FloatArray]] = [{} for _ in variants]
-    for k, state, seen, varied in walk_along(base, scene.frames.tolist(), observe, variants, starts=starts, rough=rough):
+    if known is not None and not variants:
+        states, model = known, {k: observe(robot, state) for k, state in known.items()}
+    frames = [] if model else scene.frames.tolist()
+    for k, state, seen, varied in walk_along(base, frames, observe, variants, starts=starts, rough=rough):
         states[k], model[k] = state, seen
         for i in range(len(variants)):
             shifted[i][k] = varied[i]

@@ -160,6 +160,7 @@ def solve_equilibrium(
     max_iterations: int = 60,
     relative_tolerance: float = 1e-9,
     rough: bool = False,
+    single: bool = False,
 ) -> Equilibrium:
     """Find the static equilibrium of a body.
 
@@ -179,6 +180,7 @@ def solve_equilibrium(
         max_iterations: Newton steps at each load level.
         relative_tolerance: of the unbalanced force against the sum of all loads.
         rough: the state is only tried: factors in single precision, and no way to the loads bit by bit where Newton fails from `start`.
+        single: factors in single precision wherever these are positive definite; the residual and its tolerance are as ever.
 
     Returns:
         the state; `status` says whether it is an equilibrium, `advice` what to do if not.
@@ -195,7 +197,7 @@ def solve_equilibrium(
     loads = _collect_loads(body, given, nodal_forces, start, before, bilateral, relative_tolerance)
     state = _initial_state(body, loads, start, reuse_factor, along)
     rough = rough and start is not None
-    state.single = rough
+    state.single = rough or single
     shares = [s.copy() for s in state.shares]
     status, reached = _settle(body, loads, state, max_iterations), 1.0
     if not rough and status not in (CONVERGED, "singular") and start is not None and start.converged and body.is_held():
@@ -469,7 +471,11 @@ def _factor_here(
     """Factorise the stiffness, made positive definite where it is not: then steps lead downhill. Held cables and chambers hold too:
     a stiffness that is indefinite only where they do not let the body go stays as it is."""
     values = reduced_values(body, _stiffness_blocks(body, here, state))
-    plain, state.shift = factorize_definite(body.free_map.pattern, values, first=state.shift / 4.0, single=state.single)
+    pattern, first = body.free_map.pattern, state.shift / 4.0
+    plain, state.shift = factorize_definite(pattern, values, single=True, tries=0) if state.single else (None, 0.0)
+    if plain is None:  # perhaps in single precision alone
+        state.single = False
+        plain, state.shift = factorize_definite(pattern, values, first=first)
     whole = with_turning_plate(body, state.x, plain)
     state.shifted = state.shift > 0.0 or whole is None or whole.negative > 0
     if state.shifted and len(H):

@@ -166,12 +166,10 @@ def _chain(
     """Return the effects in the order in which they were added, each with the held-out error before and after it."""
     stages = dict(search.history)
     errors = []
-    for i in range(len(promoted)):
+    for i in range(len(promoted) - (names == promoted)):  # the last one's is that of what is handed back
         stage = _handed_back(data, stages[""], promoted[: i + 1], search.noise) or stages[""]
         errors.append(stage.held_rms)
-    errors += [stages[name].held_rms for name in names[len(promoted) :]]
-    if errors:
-        errors[-1] = back.held_rms
+    errors += [stages[name].held_rms for name in names[len(promoted) : -1]] + [back.held_rms] * bool(names)
     return [
         {
             "name": name,

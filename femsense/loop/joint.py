@@ -12,6 +12,7 @@ from femsense.arrays import BoolArray, FloatArray, IntArray
 from femsense.calib.fit import FitResult, gauss_newton
 from femsense.calib.forward import Hypothesis, Scene, SceneJet, evaluate_scene, rest_residual
 from femsense.effects.loads import STANDARD_GRAVITY
+from femsense.errors import DataError
 from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.mesh import TetMesh
 from femsense.loop.noise import Groups, Noise, Whitener, whiten
@@ -188,6 +189,8 @@ class JointProblem:
     """Without derivatives."""
     tried: tuple[FloatArray, list[States]] | None = None
     """The step that was tried last, and its states."""
+    near: list[SceneJet] | None = None
+    """Derivatives from near the start, until there are own ones."""
     scale: FloatArray = field(default_factory=lambda: np.zeros(0))
     """How much the residual answers to each parameter, shape (p,)."""
 
@@ -214,18 +217,56 @@ class JointProblem:
         parameters = self.hypothesis.parameters
         return np.concatenate([*low, [p.low for p in parameters]]), np.concatenate([*high, [p.high for p in parameters]])
 
+    def knots(self) -> FloatArray:
+        """Return where the derivative by each parameter jumps, shape (p,): the zero of a cable at which it goes slack in all frames that
+        record no tension; nan elsewhere."""
+        result = np.full(self.own + len(self.hypothesis.parameters), np.nan)
+        for at, cable, loose in self._loose():
+            if any(rows.any() for rows in loose):
+                result[at] = -self.hypothesis.robot.actuation.tension_offset[cable]
+        return result
+
+    def _loose(self) -> list[tuple[int, int, list[BoolArray]]]:
+        """Return for the zero of each tension: its place in θ, its cable, and which rows of each trial record no tension there."""
+        names = self.hypothesis.robot.body.cable_names
+        result = []
+        for j, parameter in enumerate(self.hypothesis.parameters, self.own):
+            if parameter.key != "tension_n" or parameter.part not in names:
+                continue
+            rows = []
+            for trial in self.trials:
+                recording = trial.scene.recording
+                column = recording.cable_names.index(str(parameter.part))
+                rows.append(recording.inputs[trial.scene.frame, column] == 0.0)
+            result.append((j, names.index(str(parameter.part)), rows))
+        return result
+
+    def below_knots(self) -> FloatArray:
+        """Return the Jacobian below the knots, shape (N, p): frames that record no tension do not feel the zero of a slack cable."""
+        jets, at_theta = (self.near, self.seen) if self.last is None else (self.last.jets, self.last)
+        assert jets is not None and at_theta is not None
+        columns = [jet.by_effect.copy() for jet in jets]
+        for at, _, loose in self._loose():
+            for own, rows in zip(columns, loose):
+                own[rows, :, at - self.own] = 0.0
+        result = self.rows_of([replace(j, by_effect=c) for j, c in zip(jets, columns)], at_theta.theta, True)[1]
+        assert result is not None
+        return result
+
     def evaluate(self, theta: FloatArray, derivative: bool) -> tuple[FloatArray, FloatArray | None]:
         """Return whitened residual (N,) and Jacobian (N, p): markers, seats, declared poses, priors.
 
         What is asked without a derivative, once one is known, is a step that is tried: its states are solved roughly and kept only if
         the fit goes there.
         """
-        rough = not derivative and self.last is not None
-        starts = self._starts(theta, rough)
-        spans = spans_of(self.trials)
-        jets = [
-            self.jet(t, theta[span], theta[self.own :], derivative, s, rough) for t, span, s in zip(self.trials, spans, starts)
-        ]
+        rough = not derivative and (self.last is not None or self.near is not None)
+        try:
+            starts, jets = self._jets(theta, derivative, rough)
+        except DataError:
+            if self.last is not None or not rough:
+                raise
+            rough = False  # the start is far from the states that are known
+            starts, jets = self._jets(theta, derivative, rough)
         if rough:
             self.tried = (np.array(theta), starts)
         if derivative:
@@ -235,6 +276,16 @@ class JointProblem:
         rows = self.rows_of(jets, theta, derivative)
         self.scale = self.scale if rows[1] is None else np.linalg.norm(rows[1], axis=0)
         return rows
+
+    def _jets(self, theta: FloatArray, derivative: bool, rough: bool) -> tuple[list[States], list[SceneJet]]:
+        """Return the states and the jets of all trials at θ."""
+        starts, spans, before = self._starts(theta, rough), spans_of(self.trials), self.last or self.seen
+        jets = []
+        for i, (trial, span) in enumerate(zip(self.trials, spans)):
+            still = before is not None and not self.hypothesis.parameters and trial.initial is None
+            known = before.jets[i].states if still and before is not None else None
+            jets.append(self.jet(trial, theta[span], theta[self.own :], derivative, starts[i], rough, known))
+        return starts, jets
 
     def settle_for(self, near: list[SceneJet] | None) -> list[SceneJet]:
         """Return the residuals that were seen last, with the derivatives from before; their states serve as starts from now on."""
@@ -250,13 +301,14 @@ class JointProblem:
             for own, tried in zip(kept, self.tried[1] if self.tried is not None and np.array_equal(self.tried[0], theta) else []):
                 own.update(tried)
             return kept
-        nearer = (
-            self.tried is not None
-            and self.last is not None
-            and len(self.scale) == len(theta)
-            and np.linalg.norm(self.scale * (theta - self.tried[0])) < np.linalg.norm(self.scale * (theta - self.last.theta))
+        if self.tried is None:
+            return [dict(s) for s in kept]
+        at, states = self.tried
+        nearer = self.last is None or (
+            len(self.scale) == len(theta)
+            and np.linalg.norm(self.scale * (theta - at)) < np.linalg.norm(self.scale * (theta - self.last.theta))
         )
-        return [dict(s) for s in (self.tried[1] if nearer and self.tried is not None else kept)]
+        return [dict(s) for s in (states if nearer else kept)]
 
     def rows_of(self, jets: list[SceneJet], theta: FloatArray, derivative: bool) -> tuple[FloatArray, FloatArray | None]:
         """Return what `evaluate` makes of the jets of all trials at θ."""
@@ -278,13 +330,14 @@ class JointProblem:
         derivative: bool,
         starts: States | None = None,
         rough: bool = False,
+        known: States | None = None,
     ) -> SceneJet:
-        """Return the residuals and derivatives of one trial, from its own states or others to start from."""
+        """Return the residuals and derivatives of one trial, from its own states or others to start from, or at states that are `known`."""
         pivot = self.hypothesis.robot.marker_points.mean(axis=0)
         poses, initial = trial.place(own, pivot)
         starts = trial.starts_on(self.hypothesis.robot.body.mesh) if starts is None else starts
         return evaluate_scene(self.hypothesis, trial.scene, coordinates, poses, initial, derivative=derivative,
-                              vary_initial=trial.initial is not None, pivot=pivot, starts=starts, rough=rough)  # fmt: skip
+                              vary_initial=trial.initial is not None, pivot=pivot, starts=starts, rough=rough, known=known)  # fmt: skip
 
     def _scene_rows(
         self, trial: Trial, factor: Whitener, jet: SceneJet, own: FloatArray, at: int, width: int, derivative: bool
@@ -357,10 +410,13 @@ def fit_jointly(
         theta[: problem.own] = own
     low, high = problem.bounds()
     begin = None if known is None else problem.rows_of(known, theta, True)
+    problem.near = near
     problem.last = None if known is None else Jets(known, np.array(theta))
+    problem.scale = problem.scale if begin is None or begin[1] is None else np.linalg.norm(begin[1], axis=0)
     fit = gauss_newton(
         problem.evaluate, theta, low=low, high=high, max_iterations=max_iterations, tolerance=1e-6, still=0.2,
         known=begin, borrowed=None if near is None else problem.rows_of(near, theta, True)[1], serves=SERVES, worth=worth,
+        knots=problem.knots(), below=problem.below_knots,
     )  # fmt: skip
     if fit.status == "given up":
         jets = problem.settle_for(near)
