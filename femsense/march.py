@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import scipy.sparse as sp
@@ -696,7 +697,7 @@ def finer_state(walk: Walk, fine: Walk, frame: int, base: Equilibrium, ties: Emb
         if step and size < FINER_ENOUGH * first:
             return x
         enough = EARLY if step == 0 else min(EARLY, ROUGH * first / size)
-        tangent = tangent_at(body, replace(base, positions=x, factor=None), lambda p, v: roughly(p, v, enough))
+        tangent = tangent_at(body, replace(base, positions=x, factor=None), partial(roughly, tolerance=enough))
         move = tangent.respond(force[None])[0]
         if base.held.any():
             move = move + np.tensordot(pulled[base.held[: len(body.cables)]], tangent.respond_to_held(), axes=1)

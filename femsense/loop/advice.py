@@ -18,6 +18,7 @@ from femsense.loop.plan import Proposal, element_block
 from femsense.loop.screen import NUISANCE
 from femsense.march import has_history
 from femsense.model import Robot
+from femsense.parallel import each
 
 MOST_WORK, MOST_FRAMES = 30_000, 40
 """Tetrahedra × frames, and frames, that items may cost as advice after a loop; the recordings may cost twice that. A few seconds."""
@@ -157,14 +158,21 @@ def next_element(
     judge, left = Judge(forms, data.input_scale), min(MOST_WORK // tets, MOST_FRAMES)
     now = _open(judge.judge(have), confounded, not_testable)
     questions = [*(f"{a} or {b}" for a, b in confounded), *not_testable]
-    found = []
+    chosen = []
     for element in _one_of_each_first(menu(setup)):
-        if not element.sweeps or element.frames >= left:
-            continue
-        left -= element.frames + 1
+        if element.sweeps and element.frames < left:
+            left -= element.frames + 1
+            chosen.append(element)
+
+    def block_of(element: Element) -> Block | None:
         try:
-            block = element_block(setup, forms, element, noise.row_std(data.train[0].groups), with_rest=False)
+            return element_block(setup, forms, element, noise.row_std(data.train[0].groups), with_rest=False)
         except FemsenseError:
+            return None
+
+    found = []
+    for element, block in zip(chosen, each(block_of, chosen)):
+        if block is None:
             continue
         then = _open(judge.judge([*have, block]), confounded, not_testable)
         gain = np.clip(then, 0.0, EVIDENCE) - np.clip(now, 0.0, EVIDENCE)

@@ -301,6 +301,8 @@ class JointProblem:
             for own, tried in zip(kept, self.tried[1] if self.tried is not None and np.array_equal(self.tried[0], theta) else []):
                 own.update(tried)
             return kept
+        if self.tried is None and self.last is None and self.near is not None:
+            return [_as_near(own, jet.states) for own, jet in zip(kept, self.near)]
         if self.tried is None:
             return [dict(s) for s in kept]
         at, states = self.tried
@@ -376,6 +378,15 @@ class JointProblem:
         """Return which coordinates are the components of gravity, or None."""
         mask = np.array([p.key == "vector_m_s2" for p in self.hypothesis.parameters], dtype=bool)
         return mask if mask.any() else None
+
+
+def _as_near(kept: States, near: States) -> States:
+    """Return states to start from: those of a fit near by where they are on the same mesh, since others may have gone far since then."""
+    shape = next(iter(near.values())).positions.shape
+    if any(state.positions.shape != shape for state in kept.values()):
+        return dict(kept)
+    still = {k for k, state in near.items() if k in kept and kept[k].positions is state.positions}  # these have their factors
+    return {**kept, **{k: state for k, state in near.items() if k not in still}}
 
 
 SERVES = 0.25

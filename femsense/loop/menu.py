@@ -16,8 +16,10 @@ import numpy as np
 from femsense.arrays import FloatArray
 from femsense.effects.loads import STANDARD_GRAVITY
 from femsense.errors import DataError
+from femsense.fem.equilibrium import Equilibrium
 from femsense.march import Walk, drive_of, solve_frame
 from femsense.model import Robot, spread_features
+from femsense.parallel import each
 from femsense.recording import make_recording
 from femsense.rig.camera import camera_of, look_at, visible_points
 from femsense.rig.scene import body_shape
@@ -273,17 +275,20 @@ def setup_for(robot: Robot, control: str, zero: str = "absolute", *, most: Float
     small = np.array([_small_step(robot, control, kind, top) for kind, _, top in slots])
     moves, sag = _moves(robot, control, small, tip, gravity)
     units = {"cables": "N" if control == "tension" else "m", "chambers": "Pa"}
-    pulls = []
-    for i, (kind, name, top) in enumerate(slots):
+
+    def pull(i: int) -> Pull:
+        kind, name, top = slots[i]
         far = float(np.linalg.norm(moves[i]))
         height = min(BEND * body.reach / max(far, 1e-9) * small[i], BEARABLE * top)
         if most is not None and kind == "cables" and most[i] > 0:
             height = float(most[i])
         height = _bearable(robot, control, len(slots), i, float(f"{height:.2g}"))
-        pulls.append(Pull(kind, name, height, units[kind], moves[i] * height / small[i]))
+        return Pull(kind, name, height, units[kind], moves[i] * height / small[i])
+
+    pulls = tuple(each(pull, range(len(slots))))
     weight = float(f"{SAG * body.reach / max(sag, 1e-12):.2g}")
     view, distance = _camera(robot)
-    return Setup(robot, control, zero, tuple(pulls), tip, middle, weight, gravity, view, distance)
+    return Setup(robot, control, zero, pulls, tip, middle, weight, gravity, view, distance)
 
 
 def _small_step(robot: Robot, control: str, kind: str, top: float) -> float:
@@ -309,15 +314,16 @@ def _moves(robot: Robot, control: str, small: FloatArray, tip: FloatArray, gravi
     push = 1e-3 * gravity / np.linalg.norm(gravity)
     inputs = np.vstack([np.zeros(len(small)), np.diag(small), np.zeros(len(small))])
     loads = {"load_frame": [len(inputs) - 1], "load_points": tip[None], "load_forces": push[None]}
-    walk, places = _still(robot, control, inputs, loads), []
-    start = None
-    for k in range(len(inputs)):
-        state = solve_frame(walk, k, start=start)
+    walk = _still(robot, control, inputs, loads)
+
+    def place(k: int, start: Equilibrium | None) -> tuple[Equilibrium, FloatArray]:
+        state = solve_frame(walk, k, start=start, single=True)
         if not state.converged:
             raise DataError(f"the declared robot has no equilibrium near rest: {state.status}: {state.advice}")
-        start = start or state
-        places.append(robot.markers.positions(state.positions))
-    change = np.array(places[1:]) - places[0]
+        return state, robot.markers.positions(state.positions)
+
+    rest, places = place(0, None)
+    change = np.array([there for _, there in each(lambda k: place(k, rest), range(1, len(inputs)))]) - places
     most = np.linalg.norm(change, axis=2).argmax(axis=1)
     best = change[np.arange(len(change)), most]
     return best[:-1], float(np.linalg.norm(best[-1]) / 1e-3)
@@ -328,7 +334,7 @@ def _bearable(robot: Robot, control: str, count: int, i: int, height: float) -> 
     for _ in range(5):
         inputs = np.zeros((1, count))
         inputs[0, i] = height
-        if solve_frame(_still(robot, control, inputs), 0).converged:
+        if solve_frame(_still(robot, control, inputs), 0, single=True).converged:
             return height
         height = float(f"{0.6 * height:.2g}")
     raise DataError(f"no equilibrium at {height:g} of pull {i}: the declared robot is too soft for its cables")
