@@ -24,6 +24,7 @@ from scipy.sparse.linalg import splu
 from femsense.arrays import BoolArray, FloatArray, IntArray
 from femsense.fem.tiles import (
     PADDING,
+    SIDES,
     WIDE,
     add_run,
     fetch_ahead,
@@ -31,8 +32,12 @@ from femsense.fem.tiles import (
     subtract_product,
     subtract_six_columns,
     subtract_six_dots,
+    subtract_six_side_dots,
+    subtract_six_sides,
     subtract_three_columns,
     subtract_three_dots,
+    subtract_three_side_dots,
+    subtract_three_sides,
 )
 
 FEW = 4
@@ -383,10 +388,17 @@ class Analysis:
     """Supernode of each unknown in the order of elimination, shape (f,)."""
     idle: list[npt.NDArray[Any]]
     """Memory of factors that are gone, taken again by new ones."""
+    columns: dict[tuple[str, int], npt.NDArray[Any]]
+    """Zeros for the columns of `Cholesky.gram`, by kind and number: it leaves them as it finds them."""
 
     @property
     def size(self) -> int:
         return len(self.order)
+
+    @property
+    def tallest(self) -> int:
+        """Rows of the tallest front."""
+        return int(self.unit * (np.diff(self.firsts) + np.diff(self.begin)).max(initial=0))
 
     def take(self, kind: str) -> npt.NDArray[Any]:
         """Return memory for a factor."""
@@ -433,7 +445,7 @@ def analyse(indptr: IntArray, indices: IntArray) -> Analysis:
     owner = np.repeat(np.arange(len(above)), width)
     return Analysis(
         unit=unit, order=unknowns, firsts=firsts, parent=above, begin=begin, below=below, place=place, offset=offset, entries=starts,
-        source=source, target=target, heads=run_heads, runs=runs, room=room, stack=int(stack), rank=rank, owner=owner, idle=[],
+        source=source, target=target, heads=run_heads, runs=runs, room=room, stack=int(stack), rank=rank, owner=owner, idle=[], columns={},
     )  # fmt: skip
 
 
@@ -644,6 +656,78 @@ def _solve_one(
             x[c0 + i] = half[i]
 
 
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+def _solve_sides(
+    unit: int,
+    firsts: IntArray,
+    begin: IntArray,
+    below: IntArray,
+    offset: IntArray,
+    L: FloatArray,
+    x: FloatArray,
+    half: FloatArray,
+) -> None:
+    """Solve in place for SIDES right-hand sides, x (f · SIDES), in the order of elimination; unit is 3 here. half has room for the tallest front."""
+    width, base, y, last = L.itemsize, L.ctypes.data, half.ctypes.data, len(firsts) - 1
+    line, block = width * SIDES, SIDES * unit
+    for s in range(last):
+        c0, columns = unit * firsts[s], unit * (firsts[s + 1] - firsts[s])
+        height = columns + unit * (begin[s + 1] - begin[s])
+        fetch_ahead(base + width * offset[s + 1], width * (offset[min(s + 2, last)] - offset[s + 1]))
+        half[: SIDES * columns] = x[SIDES * c0 : SIDES * (c0 + columns)]
+        half[SIDES * columns : SIDES * height] = 0.0
+        j = 0
+        while j < columns:
+            size = 6 if columns - j >= 6 else 3
+            at = offset[s] + j * height + j
+            for k in range(size):
+                inverse = 1 / L[at + k * height + k]
+                for r in range(SIDES * (j + k), SIDES * (j + k + 1)):
+                    half[r] *= inverse
+                for i in range(k + 1, size):
+                    factor, more = L[at + k * height + i], SIDES * (i - k)
+                    for r in range(SIDES * (j + k), SIDES * (j + k + 1)):
+                        half[r + more] -= factor * half[r]
+            column, to, left = base + width * (at + size), y + line * (j + size), height - j - size
+            if size == 6:
+                subtract_six_sides(L, column, height, y + line * j, to, left)
+            else:
+                subtract_three_sides(L, column, height, y + line * j, to, left)
+            j += size
+        x[SIDES * c0 : SIDES * (c0 + columns)] = half[: SIDES * columns]
+        for q in range(begin[s + 1] - begin[s]):
+            add_run(L, x.ctypes.data + width * block * below[begin[s] + q], y + line * (columns + unit * q), block)
+    for s in range(last - 1, -1, -1):
+        c0, columns = unit * firsts[s], unit * (firsts[s + 1] - firsts[s])
+        height = columns + unit * (begin[s + 1] - begin[s])
+        before = max(s - 1, 0)
+        fetch_ahead(base + width * offset[before], width * (offset[s] - offset[before]))
+        half[: SIDES * columns] = x[SIDES * c0 : SIDES * (c0 + columns)]
+        for q in range(begin[s + 1] - begin[s]):
+            to, own = block * below[begin[s] + q], SIDES * (columns + unit * q)
+            half[own : own + block] = x[to : to + block]
+        after = columns
+        while after > 0:
+            size = 6 if after >= 6 else 3
+            j = after - size
+            at = offset[s] + j * height + j
+            column, to, left = base + width * (at + size), y + line * after, height - after
+            if size == 6:
+                subtract_six_side_dots(L, column, height, y + line * j, to, left)
+            else:
+                subtract_three_side_dots(L, column, height, y + line * j, to, left)
+            for k in range(size - 1, -1, -1):
+                for i in range(k + 1, size):
+                    factor, more = L[at + k * height + i], SIDES * (i - k)
+                    for r in range(SIDES * (j + k), SIDES * (j + k + 1)):
+                        half[r] -= factor * half[r + more]
+                inverse = 1 / L[at + k * height + k]
+                for r in range(SIDES * (j + k), SIDES * (j + k + 1)):
+                    half[r] *= inverse
+            after = j
+        x[SIDES * c0 : SIDES * (c0 + columns)] = half[: SIDES * columns]
+
+
 @njit(cache=True, nogil=True)
 def _solve_many(
     unit: int, firsts: IntArray, begin: IntArray, below: IntArray, offset: IntArray, blas: IntArray, L: FloatArray, X: FloatArray,
@@ -716,7 +800,7 @@ def _gram(
     L: FloatArray, X: FloatArray, work: FloatArray, W: FloatArray,
     letters: npt.NDArray[np.uint8], numbers: npt.NDArray[np.int32], scalars: FloatArray,
 ) -> None:  # fmt: skip
-    """Add XᵀK⁻¹X to W (lower half in the order of `active`); X (f, k), in the order of elimination, is overwritten."""
+    """Add XᵀK⁻¹X to W (lower half in the order of `active`); X (f, k), in the order of elimination, is zero after it."""
     width = L.itemsize
     lower, no, yes, right = letters.ctypes.data, letters.ctypes.data + 1, letters.ctypes.data + 2, letters.ctypes.data + 3
     at = numbers.ctypes.data
@@ -732,6 +816,7 @@ def _gram(
         for i in range(columns):
             for r in range(k):
                 work[i * k + r] = X[c0 + i, seen[r]]
+                X[c0 + i, seen[r]] = 0.0
         numbers[0], numbers[1], numbers[2], numbers[3] = k, columns, rest, height
         here = work.ctypes.data
         after = here + width * columns * k
@@ -766,7 +851,12 @@ class Cholesky:
         a, kind = self._analysis, self._L.dtype
         right = np.asarray(right)
         columns = right.reshape(a.size, -1)
-        if columns.shape[1] < FEW:
+        if 1 < columns.shape[1] <= SIDES and a.unit == 3:
+            x, half = np.zeros((a.size, SIDES), kind), np.empty(SIDES * a.tallest, kind)
+            x[:, : columns.shape[1]] = columns[a.order]
+            _solve_sides(a.unit, a.firsts, a.begin, a.below, a.offset, self._L, x.reshape(-1), half)
+            ordered = x[:, : columns.shape[1]]
+        elif columns.shape[1] < FEW:
             x = np.ascontiguousarray(columns[a.order].T, dtype=kind)
             work = np.empty(a.size, kind)
             for one in x:
@@ -786,7 +876,8 @@ class Cholesky:
         rows = a.rank[columns.indices]
         indptr = columns.indptr.astype(np.int64)
         start, active = _reach(a.parent, a.owner, indptr, rows)
-        X = np.zeros((a.size, k), kind)
+        X = a.columns.pop((kind.char, k), None)
+        X = np.zeros((a.size, k), kind) if X is None else X
         X[rows, np.repeat(np.arange(k), np.diff(indptr))] = columns.data
         W = np.zeros((k, k))
         tallest = int((np.diff(a.firsts) + np.maximum(np.diff(a.begin), k)).max(initial=0))
@@ -806,6 +897,7 @@ class Cholesky:
             W,
             *_constants(kind.char),
         )
+        a.columns[kind.char, k] = X
         return np.asarray(W + np.tril(W, -1).T)
 
 

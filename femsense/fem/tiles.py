@@ -25,6 +25,8 @@ PADDING = 4 * BYTES
 INTEGER = ir.IntType(64)
 LINE = 64
 """Bytes of a line of the cache."""
+SIDES = 8
+"""Right-hand sides that are solved at once."""
 LANES = 8
 """Elements that `add_gradient` and `add_divergence` work on at once."""
 
@@ -401,6 +403,76 @@ subtract_three_columns, subtract_six_columns = _columns("columns", 3), _columns(
 """(like, a, step, x, y, rows): y −= A x for a matrix of three or six columns, `step` apart."""
 subtract_three_dots, subtract_six_dots = _columns("dots", 3), _columns("dots", 6)
 """(like, a, step, x, y, rows): x −= Aᵀ y."""
+
+
+def _sides(name: str, count: int) -> Any:
+    """Return the intrinsic of the same for SIDES right-hand sides that lie beside each other."""
+
+    @intrinsic
+    def sides(context: Any, like: Any, a: Any, step: Any, x: Any, y: Any, rows: Any) -> Any:
+        del context
+
+        def build(target: Any, builder: Any, signature: Any, values: Any) -> Any:
+            builder.call(_side_function(builder.module, name, like, count), values[1:])
+            return target.get_dummy_value()
+
+        return types.void(like, *[types.int64] * 5), build
+
+    return sides
+
+
+subtract_three_sides, subtract_six_sides = _sides("columns", 3), _sides("columns", 6)
+"""(like, a, step, x, y, rows): Y −= A X for a matrix of three or six columns, `step` apart; each row of X and of Y is SIDES numbers."""
+subtract_three_side_dots, subtract_six_side_dots = _sides("dots", 3), _sides("dots", 6)
+"""(like, a, step, x, y, rows): X −= Aᵀ Y."""
+
+
+def _side_function(module: Any, name: str, like: Any, count: int) -> Any:
+    """Return the function that goes down a few columns row by row, all right-hand sides at once."""
+    letter, kind, _ = _kind(like)
+    function, known = _function(module, f"femsense_sides_{name}_{letter}{count}", 5)
+    if known:
+        return function
+    size = 8 if letter == "d" else 4
+    vector = ir.VectorType(kind, SIDES)
+    builder = ir.IRBuilder(function.append_basic_block("entry"))
+    a, step, x, y, rows = function.args
+    multiply_add = _declared(module, f"llvm.fmuladd.v{SIDES}{'f64' if letter == 'd' else 'f32'}", vector, [vector] * 3)
+    columns = [builder.add(a, builder.mul(step, _number(size * k))) for k in range(count)]
+    given = [builder.load(_at(builder, x, _number(size * SIDES * k), vector), align=size) for k in range(count)]
+    factors = [builder.fneg(value) for value in given]
+    entry, loop, end = builder.block, function.append_basic_block("loop"), function.append_basic_block("end")
+    builder.cbranch(builder.icmp_signed(">", rows, _number(0)), loop, end)
+    builder.position_at_end(loop)
+    row = builder.phi(INTEGER)
+    row.add_incoming(_number(0), entry)
+    sums = [builder.phi(vector) for _ in given] if name == "dots" else []
+    pointer = _at(builder, y, builder.mul(row, _number(size * SIDES)), vector)
+    value, place, results = builder.load(pointer, align=size), builder.mul(row, _number(size)), []
+    for k, column in enumerate(columns):
+        entry_of = _spread(builder, builder.load(_at(builder, column, place, kind), align=size), SIDES)
+        if name == "columns":
+            value = builder.call(multiply_add, [entry_of, factors[k], value])
+        else:
+            results.append(builder.call(multiply_add, [entry_of, builder.fneg(value), sums[k]]))
+    if name == "columns":
+        builder.store(value, pointer, align=size)
+    following = builder.add(row, _number(1))
+    row.add_incoming(following, loop)
+    for phi, first, result in zip(sums, given, results):
+        phi.add_incoming(first, entry)
+        phi.add_incoming(result, loop)
+    builder.cbranch(builder.icmp_signed("<", following, rows), loop, end)
+    builder.position_at_end(end)
+    last = []
+    for first, result in zip(given, results):
+        last.append(builder.phi(vector))
+        last[-1].add_incoming(first, entry)
+        last[-1].add_incoming(result, loop)
+    for k, result in enumerate(last):
+        builder.store(result, _at(builder, x, _number(size * SIDES * k), vector), align=size)
+    builder.ret_void()
+    return function
 
 
 def _column_function(module: Any, name: str, like: Any, count: int) -> Any:

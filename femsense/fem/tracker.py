@@ -40,7 +40,7 @@ CLOSE = 0.03
 """A start that is made for a frame is this share of the motion from its equilibrium at most."""
 LOOK, AHEAD = 0.25, 0.5
 """A new start is made where the series would fail this share of a motion farther on, and so much of one ahead on the way."""
-DRIFT = 0.0135
+DRIFT = 0.0165
 """Share by which the compliance may be off where it is carried on from other states."""
 LIBRARY = 16
 """States at most whose compliance is kept."""
