@@ -448,7 +448,8 @@ class _Variants:
         return [bend_angles(c, x) if c.friction > 0 else np.zeros(len(c.path)) for c in self.variants[i].robot.body.cables]
 
     def _tangent(self, k: int) -> Tangent:
-        return self.kept.pop(k, None) or tangent_at(self.walk.robot.body, self.bases[k], refined)
+        few = len(self.plain) + len(self.rubbing) <= FEW_COLUMNS
+        return self.kept.pop(k, None) or tangent_at(self.walk.robot.body, self.bases[k], refined if few else factorize)
 
     def _jobs(self, group: list[int], which: Sequence[int]) -> list[Job]:
         """Return what is to be computed of some variants in frames with one base state."""
@@ -623,6 +624,8 @@ ROUGH_FROM = 9000
 
 REFINED_FROM = 3000
 """Unknowns from which on a factor in single precision, and a solve more, take less time than one in double precision."""
+FEW_COLUMNS = 16
+"""With more right-hand sides the solves that correct them take longer than a factor in double precision."""
 REFINED, MOST_REFINED = 1e-3, 3
 """A correction by less than this share squares to what may be left of an error; solves at most before the factor is made in double precision."""
 
