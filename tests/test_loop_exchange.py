@@ -5,11 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import pytest
 from arm import arm, record, sweeps
 
+from femsense.loop import grow
 from femsense.loop.data import Data, prepare
 from femsense.loop.exchange import exchanged
-from femsense.loop.grow import judged, refit, shortlist
+from femsense.loop.grow import Refit, evidence, judged, polished, refit, shortlist
 from femsense.loop.noise import Noise
 from femsense.loop.stages import Stage, fields_of, make_stage, screen_stage, with_nuisance
 
@@ -64,6 +66,17 @@ def test_what_is_right_keeps_its_place():
     assert {name for name, _ in history} == {"", "payload", "cable_gain"}  # perhaps at a better place
     assert history[-1][1].fit.chi2 <= second.fit.chi2
     assert not any(r["verdict"] == "named" for r in refits if r["name"] == "gravity")
+
+
+def test_polishing_counts_as_the_evidence_that_it_brings_where_noise_is_larger_than_thought(monkeypatch: pytest.MonkeyPatch):
+    data, base = started()
+    first, _ = added(data, base, "payload", 1)
+    better, _ = added(data, first, "cable_gain", 2)
+    table = screen_stage(data, base.fit, NOISE, fields_of(data, base, ["payload"]), COUNT)
+    rough = Refit(shortlist(table, first=True)[0], first, 100.0, {})
+    monkeypatch.setattr(grow, "_polish", lambda *_: better)
+    gained = polished(data, base, rough, NOISE, lambda text: None).score - 100.0
+    assert gained == pytest.approx(evidence(first.fit, better.fit)) and gained < 0.9 * (first.fit.chi2 - better.fit.chi2)
 
 
 def test_effects_without_near_rivals_are_not_asked_again():

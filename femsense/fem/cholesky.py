@@ -305,6 +305,8 @@ def _rooms(parent: IntArray, begin: IntArray, unit: int) -> tuple[IntArray, int]
     return room, most
 
 
+WORTH_PEELING = 100_000
+"""Free nodes from which on minimum degree is not asked where there is METIS: SuperLU takes minutes to tell it, and thick or thin, cutting wins there."""
 WORTH_CUTTING = 500
 """Nodes; below, either order takes a millisecond."""
 
@@ -316,7 +318,9 @@ def fill_reducing_order(rows: IntArray, columns: IntArray, free: BoolArray) -> I
     upper = sp.csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(n, n))
     nodes = np.flatnonzero(free)
     graph = sp.csr_matrix((upper + upper.T)[nodes][:, nodes])
-    orders = [minimum_degree(graph), *_nested_dissection(graph)]
+    orders = _nested_dissection(graph)
+    if len(nodes) < WORTH_PEELING or not orders:
+        orders.insert(0, minimum_degree(graph))
     best = min(orders, key=lambda order: elimination_work(graph, order)) if len(orders) > 1 else orders[0]
     return np.asarray(nodes[best])
 

@@ -10,6 +10,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
 from femsense.errors import FemsenseError
 from femsense.loop.data import Data
 from femsense.loop.grow import EVIDENCE, Progress, Refit, evidence, judged, polished, refit, shortlist, tilt_cost
@@ -22,7 +24,7 @@ RIVALS = 2
 NEAR = 0.75
 """A rival had this share of the evidence of the effect at least when that was named."""
 BETTER = 2.0
-"""dBIC by which a rival must be better."""
+"""dBIC by which a rival must be better; it takes EVIDENCE in the place of gravity where none is declared, since every body has weight."""
 
 History = list[tuple[str, Stage]]
 Records = list[dict[str, Any]]
@@ -79,6 +81,7 @@ def _best(
         return None, []
     worth = evidence(without.fit, stage.fit) - own.cost - tilt_cost(data.declared, own, stage.fit)
     records: Records = [{"name": name, "seed": own.seed, "in_place_of": name, "dbic": worth, "verdict": "passes"}]
+    margin = EVIDENCE if name == "gravity" and not np.any(data.declared.body.gravity) else BETTER
     best: Refit | None = None
     for candidate in shortlist([c for c in table if c.effect.name in rivals], first=True):
         record: dict[str, Any] = {"name": candidate.effect.name, "seed": candidate.seed, "in_place_of": name}
@@ -90,7 +93,7 @@ def _best(
         if record["verdict"] == "passes":
             tried = polished(data, without, tried, noise, say)
             records.append(record)
-        if record["verdict"] == "passes" and tried.score > (worth + BETTER if best is None else best.score):
+        if record["verdict"] == "passes" and tried.score > (worth + margin if best is None else best.score):
             best = tried
     return best, records
 

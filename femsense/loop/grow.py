@@ -111,7 +111,7 @@ def polished(data: Data, stage: Stage, refitted: Refit, noise: Noise, say: Progr
     made = _polish(data, stage, refitted, noise, say)
     if made is refitted.stage:
         return refitted
-    score = refitted.score + refitted.stage.fit.chi2 - made.fit.chi2
+    score = refitted.score + evidence(refitted.stage.fit, made.fit)
     refitted.record.update({"dbic": score, "validation_rms_m": made.held_rms})
     return replace(refitted, stage=made, score=score)
 
