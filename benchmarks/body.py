@@ -2,7 +2,7 @@
 
     OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 python benchmarks/body.py [cold|parts|orders|frames|terms|kept|growth|iterative …] [--data FOLDER]
 
-CPU time of one thread: medians (cold, frames), the least of several runs (parts, growth, iterative); SOFA's figures are those of `reference/cases.json`, measured on a like machine.
+CPU time of one thread, the least of several runs (what others do on the machine only adds); SOFA's figures are those of `reference/cases.json`, measured on a like machine.
 """
 
 from __future__ import annotations
@@ -42,26 +42,20 @@ from femsense.robot import load_robot
 DATA = Path(__file__).resolve().parents[1].parent / "shared" / "data"
 
 
-def median_ms(call: Callable[[], Any], count: int = 9) -> float:
-    """Return the median CPU time of a call [ms]."""
+def least_and_median_ms(call: Callable[[], Any], count: int = 41) -> tuple[float, float]:
+    """Return the least and the median CPU time of a call [ms]."""
     call()
     times = []
     for _ in range(count):
         began = time.process_time()
         call()
-        times.append(time.process_time() - began)
-    return 1e3 * float(np.median(times))
+        times.append(1e3 * (time.process_time() - began))
+    return min(times), float(np.median(times))
 
 
 def least_ms(call: Callable[[], Any], count: int = 15) -> float:
     """Return the least CPU time of a call [ms]: what others do on the machine only adds to it."""
-    call()
-    times = []
-    for _ in range(count):
-        began = time.process_time()
-        call()
-        times.append(time.process_time() - began)
-    return 1e3 * min(times)
+    return least_and_median_ms(call, count)[0]
 
 
 def verdict(value: float, target: float, *, most: bool = True) -> str:
@@ -88,9 +82,9 @@ def cold(data: Path) -> None:
             def solve(lawful: BodyModel = lawful, tension: Any = tension, held: Any = held, forces: Any = forces) -> Any:
                 return solve_equilibrium(lawful, tension=tension, shortening=held, nodal_forces=forces)
 
-            ms, sofa = median_ms(solve, 31), document["newton_steps"] * document["ms_per_step"]
+            (ms, median), sofa = least_and_median_ms(solve), document["newton_steps"] * document["ms_per_step"]
             print(
-                f"{law:13} {case:13} {solve().iterations:3d} steps ({straight_steps(solve):2d} straight) {ms:6.1f} ms   SOFA {document['newton_steps']:3d} × {document['ms_per_step']:5.2f} = {sofa:6.1f} ms"
+                f"{law:13} {case:13} {solve().iterations:3d} steps ({straight_steps(solve):2d} straight) {ms:6.1f} ms (median {median:5.1f})   SOFA {document['newton_steps']:3d} × {document['ms_per_step']:5.2f} = {sofa:6.1f} ms"
                 f"   ratio {ms / sofa:.3f}   {verdict(ms / sofa, 0.15)}"
             )
 
