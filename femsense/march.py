@@ -618,6 +618,7 @@ FINER_ENOUGH = 5e-3
 ROUGH = 1e-3
 """Share of a step on the finer mesh that may be missing, in energy. With ten times as much the order of the nodes moved a fit by two percent."""
 EARLY = 3e-2
+"""The same of the first of these steps, which the next one mends."""
 ROUGH_FROM = 9000
 """Unknowns from which on such a step takes conjugate gradients instead of a factor."""
 
