@@ -233,30 +233,3 @@ def test_a_fit_that_is_not_worth_it_is_given_up_before_its_own_jacobian() -> Non
         fit = gauss_newton(evaluate, start, borrowed=J, serves=0.25, worth=worth)
         assert fit.status == status and any(asked) == (status == "converged")
         assert fit.cost[-1] == pytest.approx(9.0, abs=0.01)
-
-
-def kinked(a: float, k: float, c: float):
-    """Return r(x) = (x₀ − a, k (max(x₀, 0) + c), x₁ − 2 + x₀), as a cable that goes slack at x₀ = 0 has it, and what counts its calls."""
-    calls = []
-
-    def jacobian(loose: bool) -> np.ndarray:
-        return np.array([[1.0, 0.0], [0.0 if loose else k, 0.0], [1.0, 1.0]])
-
-    def evaluate(x, derivative):
-        calls.append(derivative)
-        return np.array([x[0] - a, k * (max(x[0], 0.0) + c), x[1] - 2.0 + x[0]]), jacobian(x[0] < 0.0) if derivative else None
-
-    return evaluate, lambda: jacobian(True), calls
-
-
-@pytest.mark.parametrize("start", [0.5, 0.0, -0.5])
-@pytest.mark.parametrize(
-    ("a", "k", "c", "best"),
-    [(0.1, 5.0, 0.02, 0.0), (-1.0, 5.0, 0.02, -1.0), (-1.0, 5.0, 0.1, -1.0), (1.0, 5.0, -0.2, (1.0 + 25.0 * 0.2) / 26.0)],
-)
-def test_a_fit_ends_on_a_knot_or_beyond_it(start, a, k, c, best):
-    evaluate, below, calls = kinked(a, k, c)
-    fit = gauss_newton(evaluate, np.array([start, 0.0]), knots=np.array([0.0, np.nan]), below=below)
-    assert fit.status == "converged"
-    assert np.allclose(fit.theta, [best, 2.0 - best], atol=1e-9)
-    assert len(calls) <= (4 if best <= 0.0 else 6)

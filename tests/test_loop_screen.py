@@ -93,24 +93,6 @@ def test_a_step_that_is_not_taken_leaves_no_state_behind() -> None:
     np.testing.assert_allclose(problem.evaluate(theta, True)[0], at, atol=1e-3)
 
 
-def test_below_its_knot_the_zero_of_a_cable_moves_no_frame_in_which_it_is_slack() -> None:
-    data, stage = staged(arm((4, 2, 2)))
-    trial = data.train[0]
-    problem = JointProblem(stage.fit.hypothesis, stage.fit.prior, [trial], [NOISE.whitener(trial.groups, None)], 1.0)
-    knots = problem.knots()
-    at = np.flatnonzero(np.isfinite(knots))
-    theta = np.where(np.isfinite(knots), knots, stage.fit.fit.theta)
-    assert [problem.hypothesis.parameters[j - problem.own].key for j in at] == ["tension_n"] * len(data.robot.body.cables)
-    above = problem.evaluate(theta, True)[1]
-    below = problem.below_knots()
-    np.testing.assert_array_equal(np.delete(below, at, axis=1), np.delete(above, at, axis=1))
-    problem.evaluate(theta - 3e-3 * np.isin(np.arange(len(theta)), at), True)
-    left = problem.rows_of(problem.last.jets, theta, True)[1]
-    size = np.linalg.norm(left[:, at], axis=0)
-    assert (np.linalg.norm((below - left)[:, at], axis=0) < 0.03 * size).all()
-    assert (np.linalg.norm((above - left)[:, at], axis=0) > 0.3 * size).all()
-
-
 def test_a_model_without_equilibrium_is_not_handed_back(monkeypatch: pytest.MonkeyPatch) -> None:
     def collapses(*_: object, **__: object) -> Stage:
         raise DataError("no equilibrium in frame 3")

@@ -19,8 +19,6 @@ STILL = 1e-2
 
 
 MOST_DAMPING = 1e8
-ON_KNOT = 1e-12
-"""Parameters that come so close to a knot stand on it."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -54,8 +52,6 @@ def gauss_newton(
     borrowed: FloatArray | None = None,
     serves: float = 0.0,
     worth: float = np.inf,
-    knots: FloatArray | None = None,
-    below: Callable[[], FloatArray] | None = None,
 ) -> FitResult:
     """Minimise ‖r(θ)‖² within bounds (Levenberg's damping where a plain step does not pay).
 
@@ -73,9 +69,6 @@ def gauss_newton(
         borrowed: a Jacobian from near the start to begin with.
         serves: a Jacobian serves for another step where it missed the change of the residual by less than this share of it.
         worth: a fit whose sum of squares stays above this is given up where a borrowed Jacobian says that nothing is left to gain.
-        knots: where the derivative by a parameter jumps (a cable goes slack), shape (p,); nan: nowhere. A step ends at a knot, where the
-            Jacobian holds towards larger values.
-        below: the Jacobian that holds from the knots towards smaller values, shape (N, p), near where the last one was evaluated.
     """
     from femsense.errors import DataError
 
@@ -88,13 +81,11 @@ def gauss_newton(
     residual, jacobian, own = _first(evaluate, theta, known, borrowed)
     costs = [float(residual @ residual)]
     damping, status, steps = 0.0, "iterations", 0
-    knots = np.full(p, np.nan) if knots is None else knots
     while steps < max_iterations or not own:
         scale = np.linalg.norm(jacobian, axis=0)
         scale[scale == 0] = 1.0
-        slope, near, far = _one_sided(jacobian, residual, scale, damping, theta, low, high, knots, below)
-        step = _bounded_step(slope, residual, scale, damping, near, far)
-        change = slope @ step
+        step = _bounded_step(jacobian, residual, scale, damping, low - theta, high - theta)
+        change = jacobian @ step
         predicted = costs[-1] - float(np.sum((residual + change) ** 2))
         error = max(1.0, costs[-1] / max(len(residual), 1)) ** 0.5  # what a standard error is worth where the model misfits
         small = predicted <= tolerance * costs[-1] or np.linalg.norm(change) <= still * error
@@ -109,8 +100,7 @@ def gauss_newton(
             break
         steps += 1
         try:
-            there = np.where(np.abs(theta + step - knots) <= ON_KNOT, knots, theta + step)
-            new_residual, _ = evaluate(there, False)
+            new_residual, _ = evaluate(theta + step, False)
             cost = float(new_residual @ new_residual)
         except DataError:
             cost = np.inf
@@ -118,55 +108,18 @@ def gauss_newton(
             if not own:
                 residual, jacobian, own = *_both(evaluate, theta), True
                 continue
-            damping = _shorter(slope, residual, scale, damping, near, far, change)
+            damping = _shorter(jacobian, residual, scale, damping, low - theta, high - theta, change)
             if damping > MOST_DAMPING:
                 status = "converged"
                 break
             continue
         damping = damping / 10.0 if damping > 1e-6 else 0.0
         missed = float(np.linalg.norm(new_residual - residual - change))
-        theta, residual, own = there, new_residual, False
+        theta, residual, own = theta + step, new_residual, False
         if missed > serves * float(np.linalg.norm(change)):
             residual, jacobian, own = *_both(evaluate, theta), True
         costs.append(float(residual @ residual))
     return FitResult(freeze(theta), freeze(covariance_of(jacobian)), freeze(residual), freeze(jacobian), tuple(costs), status)
-
-
-def _one_sided(
-    J: FloatArray, r: FloatArray, scale: FloatArray, damping: float, theta: FloatArray, low: FloatArray, high: FloatArray,
-    knots: FloatArray, below: Callable[[], FloatArray] | None,
-) -> tuple[FloatArray, FloatArray, FloatArray]:  # fmt: skip
-    """Return the Jacobian and the bounds of the step, as far as one piece of the residual between knots reaches.
-
-    Parameters that stand on a knot go to the side that is predicted to gain: first up, then each down that would rather stay.
-    """
-    near = np.where(theta >= knots, np.maximum(low, knots), low) - theta
-    far = np.where(theta < knots, np.minimum(high, knots), high) - theta
-    at = np.flatnonzero(theta == knots)
-    if below is None or not len(at):
-        return J, near, far
-    other = below()[:, at]
-    R = np.asarray(np.linalg.qr(np.column_stack([J, other, r]), mode="r"))  # the same sums of squares in few rows
-    up, down, rest = R[:, : len(theta)], R[:, len(theta) : -1], R[:, -1]
-
-    def tried(sides: FloatArray) -> tuple[float, FloatArray, FloatArray, FloatArray, FloatArray]:
-        slope, lo, hi = up.copy(), near.copy(), far.copy()
-        slope[:, at[sides]] = down[:, sides]
-        hi[at[sides]], lo[at[sides]] = 0.0, (low - theta)[at[sides]]
-        step = _bounded_step(slope, rest, scale, damping, lo, hi)
-        return float(np.sum((rest + slope @ step) ** 2) + damping * np.sum((scale * step) ** 2)), step, sides, lo, hi
-
-    best = tried(np.zeros(len(at), dtype=bool))
-    for i in range(len(at)):
-        if best[1][at[i]] <= 0.0:
-            flipped = best[2].copy()
-            flipped[i] = True
-            other_way = tried(flipped)
-            best = other_way if other_way[0] < best[0] else best
-    _, _, sides, near, far = best
-    slope = J.copy()
-    slope[:, at[sides]] = other[:, sides]
-    return slope, near, far
 
 
 def _shorter(

@@ -217,42 +217,6 @@ class JointProblem:
         parameters = self.hypothesis.parameters
         return np.concatenate([*low, [p.low for p in parameters]]), np.concatenate([*high, [p.high for p in parameters]])
 
-    def knots(self) -> FloatArray:
-        """Return where the derivative by each parameter jumps, shape (p,): the zero of a cable at which it goes slack in all frames that
-        record no tension; nan elsewhere."""
-        result = np.full(self.own + len(self.hypothesis.parameters), np.nan)
-        for at, cable, loose in self._loose():
-            if any(rows.any() for rows in loose):
-                result[at] = -self.hypothesis.robot.actuation.tension_offset[cable]
-        return result
-
-    def _loose(self) -> list[tuple[int, int, list[BoolArray]]]:
-        """Return for the zero of each tension: its place in θ, its cable, and which rows of each trial record no tension there."""
-        names = self.hypothesis.robot.body.cable_names
-        result = []
-        for j, parameter in enumerate(self.hypothesis.parameters, self.own):
-            if parameter.key != "tension_n" or parameter.part not in names:
-                continue
-            rows = []
-            for trial in self.trials:
-                recording = trial.scene.recording
-                column = recording.cable_names.index(str(parameter.part))
-                rows.append(recording.inputs[trial.scene.frame, column] == 0.0)
-            result.append((j, names.index(str(parameter.part)), rows))
-        return result
-
-    def below_knots(self) -> FloatArray:
-        """Return the Jacobian below the knots, shape (N, p): frames that record no tension do not feel the zero of a slack cable."""
-        jets, at_theta = (self.near, self.seen) if self.last is None else (self.last.jets, self.last)
-        assert jets is not None and at_theta is not None
-        columns = [jet.by_effect.copy() for jet in jets]
-        for at, _, loose in self._loose():
-            for own, rows in zip(columns, loose):
-                own[rows, :, at - self.own] = 0.0
-        result = self.rows_of([replace(j, by_effect=c) for j, c in zip(jets, columns)], at_theta.theta, True)[1]
-        assert result is not None
-        return result
-
     def evaluate(self, theta: FloatArray, derivative: bool) -> tuple[FloatArray, FloatArray | None]:
         """Return whitened residual (N,) and Jacobian (N, p): markers, seats, declared poses, priors.
 
@@ -427,7 +391,6 @@ def fit_jointly(
     fit = gauss_newton(
         problem.evaluate, theta, low=low, high=high, max_iterations=max_iterations, tolerance=1e-6, still=0.2,
         known=begin, borrowed=None if near is None else problem.rows_of(near, theta, True)[1], serves=SERVES, worth=worth,
-        knots=problem.knots(), below=problem.below_knots,
     )  # fmt: skip
     if fit.status == "given up":
         jets = problem.settle_for(near)
