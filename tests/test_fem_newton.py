@@ -290,3 +290,13 @@ def test_abuse_ends_with_a_certificate_or_a_reason(case: Any) -> None:
         return
     share = certify(outcome)
     assert outcome.status != "converged" or share < 1e-5
+
+
+@pytest.mark.parametrize("law", ["corotational", "neo_hookean"])
+def test_a_held_cable_moves_a_body_on_which_nothing_at_all_acts_at_rest(law: str) -> None:
+    mesh = block_mesh((4, 2, 2), size=(0.5, 0.25, 0.25))  # powers of two: the first residual is 0, not nearly 0
+    cable = tie_cable(mesh, "c", [[0.5, 0.125, 0.25]], [-0.5, 0.125, 0.25])
+    body = make_body(mesh, young_modulus=1e5, poisson_ratio=0.3, clamped=mesh.nodes[:, 0] < 1e-9, cables=(cable,), law=law)
+    assert not internal(body, np.array(mesh.nodes)).forces.any()
+    state = solve_equilibrium(body, shortening={"c": 0.01})
+    assert state.converged and state.tension["c"] > 1.0 and abs(state.shortening["c"] - 0.01) < 1e-9

@@ -425,7 +425,7 @@ def _newton(body: BodyModel, loads: _Loads, state: _State, max_iterations: int) 
             return CONVERGED
         if not sound:
             return "stalled"
-        left = state.residual / last
+        left = state.residual / last if last > 0.0 else np.inf
         enough = RUBS if follows else LENT if state.borrowed else CHORD
         sound_to_the_end = state.factored_at <= FAR * loads.tolerance and state.residual * min(left, 1.0) ** 2 <= loads.tolerance
         serves = left <= enough or sound_to_the_end
