@@ -306,7 +306,8 @@ def _rooms(parent: IntArray, begin: IntArray, unit: int) -> tuple[IntArray, int]
 
 
 WORTH_PEELING = 100_000
-"""Free nodes from which on minimum degree is not asked where there is METIS: SuperLU takes minutes to tell it, and thick or thin, cutting wins there."""
+"""Free nodes from which on minimum degree is not asked where there is METIS: SuperLU takes minutes to tell it, and cutting makes less
+work on thin limbs and on a solid bar from thousands of nodes on (docs/speed.md)."""
 WORTH_CUTTING = 500
 """Nodes; below, either order takes a millisecond."""
 
@@ -593,7 +594,7 @@ def _solve_one(
 ) -> None:
     """Solve in place for one right-hand side in the order of elimination."""
     width, base, y, last = L.itemsize, L.ctypes.data, half.ctypes.data, len(firsts) - 1
-    for s in range(len(firsts) - 1):
+    for s in range(last):
         c0, columns = unit * firsts[s], unit * (firsts[s + 1] - firsts[s])
         height = columns + unit * (begin[s + 1] - begin[s])
         fetch_ahead(base + width * offset[s + 1], width * (offset[min(s + 2, last)] - offset[s + 1]))
