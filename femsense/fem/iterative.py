@@ -61,6 +61,8 @@ class Levels:
     """Nodes coupled with each node, in CSR: indptr, shape (p + 1,)."""
     columns: ShortArray
     """Indices, rising in each row, shape (blocks,)."""
+    diagonal: ShortArray
+    """Where the block on the diagonal of each row is, shape (p,)."""
     prolong: sp.csr_matrix
     """P in single precision, shape (f, c)."""
     restrict: sp.csr_matrix
@@ -100,8 +102,9 @@ def make_levels(indptr: IntArray, indices: IntArray, grid: Grid) -> Levels:
     prolong.eliminate_zeros()
     coarse_rows, coarse_columns = np.asarray(coarse.indptr, np.int64), np.asarray(coarse.indices, np.int64)
     children = numbers.T.tocsr()
+    diagonal = np.flatnonzero(columns == np.repeat(np.arange(p), counts)).astype(np.int32)
     return Levels(
-        rows, columns, prolong, prolong.T.tocsr(), numbers, children, weights,
+        rows, columns, diagonal, prolong, prolong.T.tocsr(), numbers, children, weights,
         coarse_rows, coarse_columns, analyse(*_expanded(coarse_rows, coarse_columns, u)),
     )  # fmt: skip
 
@@ -173,47 +176,50 @@ def _expanded(rows: IntArray, columns: IntArray, unit: int) -> tuple[IntArray, I
 # with m blocks in the row ---
 
 
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"}, inline="always")
+def _gathered(columns: ShortArray, first: int, last: int, x: Any, near: Any) -> None:
+    """Write into `near` what x holds at some columns, so that a row multiplies numbers that lie side by side."""
+    for k in range(last - first):
+        j = 3 * np.int64(columns[first + k])
+        near[3 * k], near[3 * k + 1], near[3 * k + 2] = x[j], x[j + 1], x[j + 2]
+
+
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
 def _times(rows: ShortArray, columns: ShortArray, values: FloatArray, x: FloatArray, y: FloatArray) -> None:
     """Write y = K x."""
+    near = np.empty(3 * np.diff(rows).max(), x.dtype)
     for i in range(len(rows) - 1):
-        first, m = rows[i], rows[i + 1] - rows[i]
-        at, stride = 9 * np.int64(first), 3 * np.int64(m)
+        first, n = np.int64(rows[i]), 3 * np.int64(rows[i + 1] - rows[i])
+        _gathered(columns, first, np.int64(rows[i + 1]), x, near)
+        at = 9 * first
+        v0, v1, v2 = values[at : at + n], values[at + n : at + 2 * n], values[at + 2 * n : at + 3 * n]
         s0, s1, s2 = 0.0, 0.0, 0.0
-        for k in range(m):
-            j = 3 * np.int64(columns[first + k])
-            x0, x1, x2 = x[j], x[j + 1], x[j + 2]
-            p = at + 3 * k
-            s0 += values[p] * x0 + values[p + 1] * x1 + values[p + 2] * x2
-            p += stride
-            s1 += values[p] * x0 + values[p + 1] * x1 + values[p + 2] * x2
-            p += stride
-            s2 += values[p] * x0 + values[p + 1] * x1 + values[p + 2] * x2
+        for q in range(n):
+            s0 += v0[q] * near[q]
+            s1 += v1[q] * near[q]
+            s2 += v2[q] * near[q]
         y[3 * i], y[3 * i + 1], y[3 * i + 2] = s0, s1, s2
 
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
 def _sweep_forward(
-    rows: ShortArray, columns: ShortArray, values: SingleArray, inverse: SingleArray, r: SingleArray, x: SingleArray, left: SingleArray
+    rows: ShortArray, columns: ShortArray, diagonal: ShortArray, values: SingleArray, inverse: SingleArray, r: SingleArray, x: SingleArray,
+    left: SingleArray,
 ) -> None:  # fmt: skip
     """Write x after a forward sweep from zero for K x = r, and what is left of r: −U x, with U the part above the diagonal."""
-    count = len(rows) - 1
+    near = np.empty(3 * np.diff(rows).max(), np.float32)
     for upper in range(2):
-        for i in range(count):
-            first, m = rows[i], rows[i + 1] - rows[i]
-            at, stride = 9 * np.int64(first), 3 * np.int64(m)
+        for i in range(len(rows) - 1):
+            row, n = np.int64(rows[i]), 3 * np.int64(rows[i + 1] - rows[i])
+            first, last = (row, np.int64(diagonal[i])) if upper == 0 else (np.int64(diagonal[i]) + 1, np.int64(rows[i + 1]))
+            _gathered(columns, first, last, x, near)
+            at, count = 9 * row + 3 * (first - row), 3 * (last - first)
+            v0, v1, v2 = values[at : at + count], values[at + n : at + n + count], values[at + 2 * n : at + 2 * n + count]
             s0, s1, s2 = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-            k = 0 if upper == 0 else m - 1
-            while columns[first + k] != i:
-                j = 3 * np.int64(columns[first + k])
-                x0, x1, x2 = x[j], x[j + 1], x[j + 2]
-                p = at + 3 * k
-                s0 += values[p] * x0 + values[p + 1] * x1 + values[p + 2] * x2
-                p += stride
-                s1 += values[p] * x0 + values[p + 1] * x1 + values[p + 2] * x2
-                p += stride
-                s2 += values[p] * x0 + values[p + 1] * x1 + values[p + 2] * x2
-                k += 1 if upper == 0 else -1
+            for q in range(count):
+                s0 += v0[q] * near[q]
+                s1 += v1[q] * near[q]
+                s2 += v2[q] * near[q]
             if upper == 0:
                 s0, s1, s2 = r[3 * i] - s0, r[3 * i + 1] - s1, r[3 * i + 2] - s2
                 for a in range(3):
@@ -227,30 +233,28 @@ def _sweep_backward(
     rows: ShortArray, columns: ShortArray, values: SingleArray, inverse: SingleArray, r: SingleArray, x: SingleArray
 ) -> None:
     """Improve x for K x = r by a backward sweep."""
+    near = np.empty(3 * np.diff(rows).max(), np.float32)
     for i in range(len(rows) - 2, -1, -1):
-        first, m = rows[i], rows[i + 1] - rows[i]
-        at, stride = 9 * np.int64(first), 3 * np.int64(m)
-        s0, s1, s2 = r[3 * i], r[3 * i + 1], r[3 * i + 2]
-        for k in range(m):
-            j = 3 * np.int64(columns[first + k])
-            x0, x1, x2 = x[j], x[j + 1], x[j + 2]
-            p = at + 3 * k
-            s0 -= values[p] * x0 + values[p + 1] * x1 + values[p + 2] * x2
-            p += stride
-            s1 -= values[p] * x0 + values[p + 1] * x1 + values[p + 2] * x2
-            p += stride
-            s2 -= values[p] * x0 + values[p + 1] * x1 + values[p + 2] * x2
+        first, n = np.int64(rows[i]), 3 * np.int64(rows[i + 1] - rows[i])
+        _gathered(columns, first, np.int64(rows[i + 1]), x, near)
+        at = 9 * first
+        v0, v1, v2 = values[at : at + n], values[at + n : at + 2 * n], values[at + 2 * n : at + 3 * n]
+        s0, s1, s2 = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+        for q in range(n):
+            s0 += v0[q] * near[q]
+            s1 += v1[q] * near[q]
+            s2 += v2[q] * near[q]
+        s0, s1, s2 = r[3 * i] - s0, r[3 * i + 1] - s1, r[3 * i + 2] - s2
         for a in range(3):
             x[3 * i + a] += inverse[i, 3 * a] * s0 + inverse[i, 3 * a + 1] * s1 + inverse[i, 3 * a + 2] * s2
 
 
 @njit(cache=True)
-def _diagonal_inverses(rows: ShortArray, columns: ShortArray, values: FloatArray, inverse: SingleArray) -> bool:
+def _diagonal_inverses(rows: ShortArray, diagonal: ShortArray, values: FloatArray, inverse: SingleArray) -> bool:
     """Write the inverses of the diagonal blocks; False where one is not positive definite."""
     for i in range(len(rows) - 1):
         first, m = rows[i], rows[i + 1] - rows[i]
-        k = np.searchsorted(columns[first : first + m], i)
-        p = 9 * np.int64(first) + 3 * k
+        p = 9 * np.int64(first) + 3 * np.int64(diagonal[i] - first)
         q = p + 3 * np.int64(m)
         s = q + 3 * np.int64(m)
         a, b, c, d, e, f = values[p], values[p + 1], values[p + 2], values[q + 1], values[q + 2], values[s + 2]
@@ -295,6 +299,44 @@ def _galerkin(
                     for a in range(u):
                         for b in range(u):
                             line[u * width * a + slot + b] += part[a, 0] * v[0, b] + part[a, 1] * v[1, b] + part[a, 2] * v[2, b]
+    return result
+
+
+@njit(cache=True, nogil=True)
+def _galerkin_of_corners(
+    rows: ShortArray, columns: ShortArray, values: FloatArray, parent_rows: ShortArray, parents: ShortArray, share: FloatArray,
+    coarse_rows: IntArray, coarse_columns: IntArray,
+) -> FloatArray:  # fmt: skip
+    """Return the same where nodes follow theirs by a share alone: each row of K P is made once, for all that its node follows."""
+    count, most = len(coarse_rows) - 1, 2 * np.diff(rows).max()
+    result = np.zeros(9 * coarse_rows[count])
+    number = np.full(count, -1, np.int64)
+    met, sums = np.empty(most, np.int64), np.empty((most, 9))
+    for i in range(len(rows) - 1):
+        first, m, seen = np.int64(rows[i]), np.int64(rows[i + 1] - rows[i]), 0
+        for k in range(m):
+            at, j = 9 * first + 3 * k, columns[first + k]
+            for s in range(parent_rows[j], parent_rows[j + 1]):
+                c, w = parents[s], share[s]
+                if number[c] < 0:
+                    number[c], met[seen] = seen, c
+                    sums[seen] = 0.0
+                    seen += 1
+                line = sums[number[c]]
+                for a in range(3):
+                    for b in range(3):
+                        line[3 * a + b] += w * values[at + 3 * m * a + b]
+        for t in range(parent_rows[i], parent_rows[i + 1]):
+            c, w = parents[t], share[t]
+            begin, width = coarse_rows[c], coarse_rows[c + 1] - coarse_rows[c]
+            for k in range(width):
+                n = number[coarse_columns[begin + k]]
+                if n >= 0:
+                    for a in range(3):
+                        for b in range(3):
+                            result[9 * begin + 3 * width * a + 3 * k + b] += w * sums[n, 3 * a + b]
+        for n in range(seen):
+            number[met[n]] = -1
     return result
 
 
@@ -379,7 +421,7 @@ class Iterative:
         size = float(np.abs(right).max(initial=0.0)) or 1.0  # single precision has a small range
         r = (right / size).astype(np.float32)
         x, left = np.empty_like(r), np.empty_like(r)
-        _sweep_forward(levels.rows, levels.columns, self._single, self._inverse, r, x, left)
+        _sweep_forward(levels.rows, levels.columns, levels.diagonal, self._single, self._inverse, r, x, left)
         x += levels.prolong @ self._coarse.solve(levels.restrict @ left).astype(np.float32)
         _sweep_backward(levels.rows, levels.columns, self._single, self._inverse, r, x)
         return x.astype(np.float64) * size
@@ -398,7 +440,7 @@ def iterative(levels: Levels, values: FloatArray, *, tolerance: float = TOLERANC
         UnsettledError: conjugate gradients take too long.
     """
     inverse = np.empty((len(levels.rows) - 1, 9), np.float32)
-    if not _diagonal_inverses(levels.rows, levels.columns, values, inverse):
+    if not _diagonal_inverses(levels.rows, levels.diagonal, values, inverse):
         return None
     coarse = coarse_factor(levels, values)
     if coarse is None:
@@ -409,8 +451,11 @@ def iterative(levels: Levels, values: FloatArray, *, tolerance: float = TOLERANC
 
 def coarse_factor(levels: Levels, values: FloatArray) -> Cholesky | None:
     """Return the factor of PᵀKP; None where it is not positive definite, and K with it."""
-    shared: tuple[Any, ...] = (levels.parents.indptr, levels.parents.indices, levels.children.indptr, levels.children.indices)
-    small = _galerkin(
-        levels.rows, levels.columns, values, *shared, levels.children.data, levels.weights, levels.coarse_rows, levels.coarse_columns
-    )  # fmt: skip
+    fine: tuple[Any, ...] = (levels.rows, levels.columns, values, levels.parents.indptr, levels.parents.indices)
+    coarse = (levels.coarse_rows, levels.coarse_columns)
+    if levels.weights.shape[2] == 3:
+        small = _galerkin_of_corners(*fine, levels.weights[:, 0, 0].copy(), *coarse)
+    else:
+        of = levels.children
+        small = _galerkin(*fine, of.indptr, of.indices, of.data, levels.weights, *coarse)
     return cholesky(levels.analysis, small, single=True) or cholesky(levels.analysis, small)
