@@ -305,9 +305,9 @@ def _rooms(parent: IntArray, begin: IntArray, unit: int) -> tuple[IntArray, int]
     return room, most
 
 
-WORTH_PEELING = 100_000
-"""Free nodes from which on minimum degree is not asked where there is METIS: SuperLU takes minutes to tell it, and cutting makes less
-work on thin limbs and on a solid bar from thousands of nodes on (docs/speed.md)."""
+WORTH_PEELING = 10_000
+"""Free nodes from which on minimum degree is not asked where there is METIS: telling it takes SuperLU a second, and minutes on huge
+meshes. With 19 000 to 58 000 nodes cutting made half the work on a solid bar and on thin limbs alike (`body.py orders` has the latter)."""
 WORTH_CUTTING = 500
 """Nodes; below, either order takes a millisecond."""
 
