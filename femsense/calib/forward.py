@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from femsense.arrays import FloatArray, IntArray
+from femsense.arrays import BoolArray, FloatArray, IntArray, freeze
 from femsense.effects import Effect, Entry, Parameter, build_entry
 from femsense.errors import DataError
 from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.mesh import Embedding
-from femsense.march import Walk, drive_of, walk_along
+from femsense.march import Walk, drive_of, has_history, inputs_wanted, walk_along
 from femsense.model import Observation, Robot
 from femsense.pointcloud.patches import Patches
 from femsense.pose import invert_pose, move_pose, transform_points
@@ -25,6 +25,8 @@ from femsense.recording import Recording
 
 POSE_STEP = np.array([1e-5, 1e-5, 1e-5, 1e-6, 1e-6, 1e-6])
 """Steps for derivatives by a pose [rad, m]."""
+TENSION_STEP = 1e-4
+"""Step for derivatives by a tension [N]."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -215,28 +217,32 @@ class SceneJet:
     """d residual / d coordinate of the hypothesis, shape (k, 3, p)."""
     states: dict[int, Equilibrium]
     """The equilibrium of each frame."""
+    by_input: FloatArray
+    """d residual / d tension that pulls in its own frame, cut off at 0 or not, shape (k, c, a); (k, c, 0) where it was not asked."""
+    pulled: BoolArray
+    """Whether the derivatives count the tension of a frame as not cut off, shape (F, a)."""
 
 
 def evaluate_scene(
     hypothesis: Hypothesis, scene: Scene, coordinates: FloatArray, poses: Sequence[FloatArray], initial: FloatArray | None,
     *, derivative: bool, vary_initial: bool, pivot: FloatArray, starts: dict[int, Equilibrium] | None = None, rough: bool = False,
-    known: dict[int, Equilibrium] | None = None,
+    known: dict[int, Equilibrium] | None = None, vary_inputs: bool = False,
 ) -> SceneJet:  # fmt: skip
     """Evaluate marker residuals of a scene at a point of parameter space, and their derivatives by differences.
 
     `starts` holds states of earlier evaluations near by and is brought up to date; states that are only tried may be
     `rough`: a frame that Newton does not reach from there then has no equilibrium. `known` are the states at this very point, as far as it
-    moves the body; they serve where no derivative by what moves it is wanted.
+    moves the body; they serve where no derivative by what moves it is wanted. With `vary_inputs` come derivatives by the tension of
+    each frame, where the robot has no past.
 
     Raises:
         DataError: a frame has no equilibrium.
     """
     robot = hypothesis.robot_at(coordinates)
     base = Walk(robot, drive_of(robot, scene.recording, initial=initial))
-    steps, variants = _variants(hypothesis, scene, coordinates, initial, base) if derivative else ([], [])
-    if not vary_initial:
-        keep = len(hypothesis.parameters)
-        steps, variants = steps[:keep], variants[:keep]
+    steps, variants = _variants(hypothesis, scene, coordinates, initial, base, vary_initial) if derivative else ([], [])
+    split, last = len(hypothesis.parameters) if derivative else 0, len(variants)
+    pulling = _pulling(hypothesis, base, steps, variants) if derivative and vary_inputs else []
     places = {id(r): _ties(r, scene, poses) for r in (robot, *(v.robot for v in variants))}
 
     def observe(r: Robot, state: Equilibrium) -> FloatArray:
@@ -254,7 +260,6 @@ def evaluate_scene(
             shifted[i][k] = varied[i]
     residual = marker_residual(robot, scene, poses, model)
     columns = [(marker_residual(v.robot, scene, poses, m) - residual) / h for v, m, h in zip(variants, shifted, steps)]
-    split = len(hypothesis.parameters) if derivative else 0
     by_pose, rest_by_pose = (
         _pose_derivative(robot, scene, poses, states, residual, pivot)
         if derivative
@@ -262,7 +267,13 @@ def evaluate_scene(
     )
     rest = rest_residual(robot, scene, poses)
     rest_columns = [(rest_residual(v.robot, scene, poses) - rest) / h for v, h in zip(variants[:split], steps)]
-    return SceneJet(residual, rest, by_pose, rest_by_pose, _stack(rest_columns, rest), _stack(columns[split:], residual), _stack(columns[:split], residual), states)  # fmt: skip
+    pulled, by_input = inputs_wanted(robot, scene.recording, initial) >= 0.0, [columns[j] for j in pulling]
+    for i, j in enumerate(pulling):
+        columns[j] = columns[j] * pulled[scene.frame, i][:, None]
+    return SceneJet(
+        residual, rest, by_pose, rest_by_pose, _stack(rest_columns, rest), _stack(columns[split:last], residual), _stack(columns[:split], residual),
+        states, _stack(by_input, residual), pulled,
+    )  # fmt: skip
 
 
 def _stack(columns: list[FloatArray], residual: FloatArray) -> FloatArray:
@@ -270,9 +281,9 @@ def _stack(columns: list[FloatArray], residual: FloatArray) -> FloatArray:
 
 
 def _variants(
-    hypothesis: Hypothesis, scene: Scene, coordinates: FloatArray, initial: FloatArray | None, base: Walk
+    hypothesis: Hypothesis, scene: Scene, coordinates: FloatArray, initial: FloatArray | None, base: Walk, vary_initial: bool
 ) -> tuple[list[float], list[Walk]]:
-    """Return steps and walks: first one for each coordinate, then one for each initial input."""
+    """Return steps and walks: first one for each coordinate, then one for each initial input if they vary."""
     steps, walks = [], []
     for j, parameter in enumerate(hypothesis.parameters):
         h = parameter.step if coordinates[j] + parameter.step <= parameter.high else -parameter.step
@@ -281,15 +292,34 @@ def _variants(
         robot = hypothesis.robot_at(moved)
         steps.append(h)
         walks.append(Walk(robot, drive_of(robot, scene.recording, initial=initial)))
-    names = base.robot.body.cable_names
+    names = base.robot.body.cable_names if vary_initial else ()
     start = np.zeros(len(names)) if initial is None else initial
     for i in range(len(names)):
-        h = 1e-4 if scene.recording.actuation == "tension" else 1e-6
+        h = TENSION_STEP if scene.recording.actuation == "tension" else 1e-6
         moved = start.copy()
         moved[i] += h
         steps.append(h)
         walks.append(Walk(base.robot, drive_of(base.robot, scene.recording, initial=moved)))
     return steps, walks
+
+
+def _pulling(hypothesis: Hypothesis, base: Walk, steps: list[float], variants: list[Walk]) -> list[int]:
+    """Return which variants pull a little more at each cable in every frame; none where the robot has a past, or nothing moves tensions.
+
+    They are put in the place of those of the cables' zeros, whose derivative is theirs wherever a tension is not cut off, or added.
+    """
+    driving = "cable_offset" in hypothesis.names or len(variants) > len(hypothesis.parameters)
+    if base.drive.control != "tension" or not driving or any(has_history(w.robot) for w in (base, *variants)):
+        return []
+    zeros = {} if base.robot.creep else {p.part: j for j, p in enumerate(hypothesis.parameters) if p.key == "tension_n"}
+    chosen = []
+    for i, name in enumerate(base.robot.body.cable_names):
+        inputs = base.drive.inputs.copy()
+        inputs[:, i] += TENSION_STEP
+        walk, at = Walk(base.robot, replace(base.drive, inputs=freeze(inputs))), zeros.get(name, len(variants))
+        steps[at : at + 1], variants[at : at + 1] = [TENSION_STEP], [walk]
+        chosen.append(at)
+    return chosen
 
 
 def _pose_derivative(

@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from femsense.arrays import BoolArray, FloatArray, IntArray
-from femsense.calib.fit import FitResult, gauss_newton
+from femsense.calib.fit import FitResult, Kinks, gauss_newton
 from femsense.calib.forward import Hypothesis, Scene, SceneJet, evaluate_scene, rest_residual
 from femsense.effects.loads import STANDARD_GRAVITY
 from femsense.errors import DataError
 from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.mesh import TetMesh
+from femsense.loop.kinks import Part, joined, trial_kinks
 from femsense.loop.noise import Groups, Noise, Whitener, whiten
 from femsense.pose import move_pose
 
@@ -248,8 +249,22 @@ class JointProblem:
         for i, (trial, span) in enumerate(zip(self.trials, spans)):
             still = before is not None and not self.hypothesis.parameters and trial.initial is None
             known = before.jets[i].states if still and before is not None else None
-            jets.append(self.jet(trial, theta[span], theta[self.own :], derivative, starts[i], rough, known))
+            jets.append(self.jet(trial, theta[span], theta[self.own :], derivative, starts[i], rough, known, derivative))
         return starts, jets
+
+    def kinks(self, theta: FloatArray) -> Kinks | None:
+        """Return where tensions that end at 0 bend the residual near θ, as far as the derivatives that were computed last tell."""
+        jets = self.near if self.last is None else self.last.jets
+        if jets is None or not any(jet.by_input.shape[2] for jet in jets):
+            return None
+        at, parts = 0, list[Part]()
+        for trial, factor, jet, span in zip(self.trials, self.factors, jets, spans_of(self.trials)):
+            found = trial_kinks(self.hypothesis, trial, jet, factor, theta[span], theta[self.own :])
+            if found is not None:
+                parts.append((slice(at, at + jet.residual.size), np.r_[span, self.own : len(theta)], found))
+            at += jet.residual.size + jet.rest.size + 6 * len(trial.poses)
+        rows = at + len(self._prior_rows(theta[self.own :], len(theta))[0])
+        return joined(parts, rows, len(theta)) if parts else None
 
     def settle_for(self, near: list[SceneJet] | None) -> list[SceneJet]:
         """Return the residuals that were seen last, with the derivatives from before; their states serve as starts from now on."""
@@ -297,13 +312,15 @@ class JointProblem:
         starts: States | None = None,
         rough: bool = False,
         known: States | None = None,
+        vary_inputs: bool = False,
     ) -> SceneJet:
         """Return the residuals and derivatives of one trial, from its own states or others to start from, or at states that are `known`."""
         pivot = self.hypothesis.robot.marker_points.mean(axis=0)
         poses, initial = trial.place(own, pivot)
         starts = trial.starts_on(self.hypothesis.robot.body.mesh) if starts is None else starts
         return evaluate_scene(self.hypothesis, trial.scene, coordinates, poses, initial, derivative=derivative,
-                              vary_initial=trial.initial is not None, pivot=pivot, starts=starts, rough=rough, known=known)  # fmt: skip
+                              vary_initial=trial.initial is not None, pivot=pivot, starts=starts, rough=rough, known=known,
+                              vary_inputs=vary_inputs)  # fmt: skip
 
     def _scene_rows(
         self, trial: Trial, factor: Whitener, jet: SceneJet, own: FloatArray, at: int, width: int, derivative: bool
@@ -390,7 +407,7 @@ def fit_jointly(
     problem.scale = problem.scale if begin is None or begin[1] is None else np.linalg.norm(begin[1], axis=0)
     fit = gauss_newton(
         problem.evaluate, theta, low=low, high=high, max_iterations=max_iterations, tolerance=1e-6, still=0.2,
-        known=begin, borrowed=None if near is None else problem.rows_of(near, theta, True)[1], serves=SERVES, worth=worth,
+        known=begin, borrowed=None if near is None else problem.rows_of(near, theta, True)[1], serves=SERVES, worth=worth, kinks=problem.kinks,
     )  # fmt: skip
     if fit.status == "given up":
         jets = problem.settle_for(near)
