@@ -233,7 +233,7 @@ def evaluate_scene(
     `starts` holds states of earlier evaluations near by and is brought up to date; states that are only tried may be
     `rough`: a frame that Newton does not reach from there then has no equilibrium. `known` are the states at this very point, as far as it
     moves the body; they serve where no derivative by what moves it is wanted. With `vary_inputs` come derivatives by the tension of
-    each frame, where the robot has no past.
+    each frame (where the robot has a past, by that of all frames).
 
     Raises:
         DataError: a frame has no equilibrium.
@@ -268,7 +268,7 @@ def evaluate_scene(
     rest = rest_residual(robot, scene, poses)
     rest_columns = [(rest_residual(v.robot, scene, poses) - rest) / h for v, h in zip(variants[:split], steps)]
     pulled, by_input = inputs_wanted(robot, scene.recording, initial) >= 0.0, [columns[j] for j in pulling]
-    for i, j in enumerate(pulling):
+    for i, j in ((i, j) for i, j in enumerate(pulling) if j < split):
         columns[j] = columns[j] * pulled[scene.frame, i][:, None]
     return SceneJet(
         residual, rest, by_pose, rest_by_pose, _stack(rest_columns, rest), _stack(columns[split:last], residual), _stack(columns[:split], residual),
@@ -304,14 +304,16 @@ def _variants(
 
 
 def _pulling(hypothesis: Hypothesis, base: Walk, steps: list[float], variants: list[Walk]) -> list[int]:
-    """Return which variants pull a little more at each cable in every frame; none where the robot has a past, or nothing moves tensions.
+    """Return which variants pull a little more at each cable in every frame; none where nothing moves tensions.
 
-    They are put in the place of those of the cables' zeros, whose derivative is theirs wherever a tension is not cut off, or added.
+    They are added; where nothing depends on other frames, they are put in the place of those of the cables' zeros, whose derivative is
+    theirs wherever a tension is not cut off.
     """
     driving = "cable_offset" in hypothesis.names or len(variants) > len(hypothesis.parameters)
-    if base.drive.control != "tension" or not driving or any(has_history(w.robot) for w in (base, *variants)):
+    if base.drive.control != "tension" or not driving:
         return []
-    zeros = {} if base.robot.creep else {p.part: j for j, p in enumerate(hypothesis.parameters) if p.key == "tension_n"}
+    past = bool(base.robot.creep) or any(has_history(w.robot) for w in (base, *variants))
+    zeros = {} if past else {p.part: j for j, p in enumerate(hypothesis.parameters) if p.key == "tension_n"}
     chosen = []
     for i, name in enumerate(base.robot.body.cable_names):
         inputs = base.drive.inputs.copy()
