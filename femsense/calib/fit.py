@@ -23,6 +23,8 @@ WIDTHS = 0.3, 0.1, 0.03, 0.01, 1e-3, 1e-5
 """How far kinks are rounded, in shares of the way that a plain step goes past them; one after the other."""
 TURNS = 4
 """Gauss–Newton steps for each of these, of a problem that costs nothing to evaluate."""
+ON_KINK = 0.2
+"""A fit rests on a kink that is nearer than so many standard errors."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -53,7 +55,7 @@ class FitResult:
     residual: FloatArray
     """Whitened residual, shape (N,)."""
     jacobian: FloatArray
-    """Its derivative, shape (N, p)."""
+    """Its derivative, shape (N, p); on a kink the mean of both sides that leaves no gradient."""
     cost: tuple[float, ...]
     """Sum of squares after each iteration, the start first."""
     status: str
@@ -141,6 +143,8 @@ def gauss_newton(
         if missed > serves * float(np.linalg.norm(change)):
             residual, jacobian, own = *_both(evaluate, theta), True
         costs.append(float(residual @ residual))
+    bends = None if kinks is None or not own else kinks(theta)
+    jacobian = jacobian if bends is None else _on_kinks(jacobian, residual, bends)
     return FitResult(freeze(theta), freeze(covariance_of(jacobian)), freeze(residual), freeze(jacobian), tuple(costs), status)
 
 
@@ -218,6 +222,30 @@ class _Near:
 
     def _cost(self, s: FloatArray, damping: float) -> float:
         return float(np.sum(self._reduced(s, 0.0) ** 2) + damping * np.sum((self.scale * s) ** 2))
+
+
+def _on_kinks(J: FloatArray, r: FloatArray, kinks: Kinks) -> FloatArray:
+    """Return the derivative that stands for both sides of the kinks on which a fit came to rest: the mean of them that leaves no gradient.
+
+    Straight lines of one side alone would go on down where the other side goes up (Clarke's generalised Jacobian has 0 among its gradients).
+    """
+    spread = np.sqrt(np.maximum(np.einsum("gp,pq,gq->g", kinks.slope, _finite(covariance_of(J)), kinks.slope), 0.0))
+    here = np.abs(kinks.value) < ON_KINK * spread
+    if not here.any():
+        return J
+    scale = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
+    counted = kinks.counted.astype(float)
+    pull = (kinks.columns[:, here].T @ r)[:, None] * kinks.slope[here] / scale
+    gradient = J.T @ r / scale - counted[here] @ pull
+    stay = 1e-6 * float(np.linalg.norm(pull)) * np.eye(len(pull))
+    A, b = np.vstack([pull.T, stay]), np.concatenate([-gradient, stay @ counted[here]])
+    share = counted.copy()
+    share[here] = lsq_linear(A, b, bounds=(0.0, 1.0)).x
+    return np.asarray(J + (kinks.columns * (share - counted)) @ kinks.slope)
+
+
+def _finite(covariance: FloatArray) -> FloatArray:
+    return np.where(np.isfinite(covariance), covariance, 0.0)
 
 
 def _cut(value: FloatArray, width: float) -> tuple[FloatArray, FloatArray]:

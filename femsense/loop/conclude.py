@@ -69,7 +69,7 @@ def conclude(data: Data, search: Search, rng: np.random.Generator) -> LoopResult
     effects = _chain(data, search, promoted, names, back, spread)
     residuals = [without_mesh_error(t, jet.residual, noise) for t, jet in zip(data.train, final.fit.jets)]
     tests = structure_tests(data.train, residuals, rng=rng)
-    excess = _excess(before, final, noise)
+    excess = _excess(before, final, back, noise)
     unexplained = tests.significant and excess.left > excess.tolerated and (strayed or excess.explained < EXPLAINED)
     verdict = "unexplained" if unexplained else "effects" if effects else "none"
     rivals = _confounded(search, names)
@@ -189,15 +189,21 @@ class Excess:
     """What the final model leaves beyond the noise of repetition."""
     tolerated: float
     explained: float
-    """Share of the mean square beyond the noise that the effects took away."""
+    """Share of the mean square beyond the noise that the effects took away: where fitted by all that was found, on held-out data by what is
+    handed back; the smaller one."""
 
 
-def _excess(before: Stage, final: Stage, noise: Noise) -> Excess:
+def _excess(before: Stage, final: Stage, back: Stage, noise: Noise) -> Excess:
     axes, std = (3.0, noise.std) if noise.std else (1.0, noise.surface)
-    floor = np.sqrt(axes * sum(v**2 for k, v in std.items() if k != "state"))
+    floor = float(np.sqrt(axes * sum(v**2 for k, v in std.items() if k != "state")))
     left = float(np.sqrt(max(final.fit.rms**2 - floor**2, 0.0)))
-    first = max(before.fit.rms**2 - floor**2, 1e-18)
-    return Excess(left, 0.25 * float(floor), float((before.fit.rms**2 - final.fit.rms**2) / first))
+    fitted = _taken_away(before.fit.rms, final.fit.rms, floor)
+    return Excess(left, 0.25 * floor, min(fitted, _taken_away(before.held_rms, back.held_rms, floor)))
+
+
+def _taken_away(before: float, after: float, floor: float) -> float:
+    """Return the share of the mean square beyond the floor that is gone; all of it where nothing is left beyond."""
+    return 1.0 if after <= floor else float((before**2 - after**2) / max(before**2 - floor**2, 1e-18))
 
 
 def _rounded(entry: Entry) -> Entry:

@@ -13,6 +13,10 @@ from femsense.arrays import FloatArray, IntArray
 from femsense.loop.joint import JointFit, Trial, numbers_of
 
 
+OPEN = 1e-8
+"""Share of what is known of a direction that comes from the sweeps that are not left out; below it they leave it open."""
+
+
 def sweeps_predicted(trials: list[Trial], before: JointFit, after: JointFit) -> tuple[float, float]:
     """Return by how much twice the log predictive density of a left-out sweep rises, summed over sweeps, and the standard error of that sum.
 
@@ -44,8 +48,8 @@ def _density(fit: JointFit, rows: IntArray) -> float:
     B = J[rows] @ A  # H_bb = B Bᵀ
     inner = np.eye(B.shape[1]) - B.T @ B
     values, vectors = np.linalg.eigh(inner)
-    values = np.maximum(values, 1e-9)
-    mixed = vectors.T @ (B.T @ r[rows])
+    mixed = np.where(values > OPEN, vectors.T @ (B.T @ r[rows]), 0.0)  # the other sweeps say nothing of these directions: any value fits
+    values = np.maximum(values, OPEN)
     return float(np.log(values).sum() - r[rows] @ r[rows] - (mixed**2 / values).sum())
 
 
