@@ -169,7 +169,7 @@ class _Near:
         self.r, self.J = r, J
         if kinks is not None:  # of all rows, these are what sums of squares depend on
             p, g = len(self.scale), len(kinks.value)
-            R = np.linalg.qr(np.column_stack([self.plain, kinks.columns, r]), mode="r")
+            R = np.asarray(np.linalg.qr(np.column_stack([self.plain, kinks.columns, r]), mode="r"))
             self.J0, self.W, self.r0 = R[:, :p], R[:, p : p + g], R[:, -1]
             self.J = self.plain + (kinks.columns * (kinks.value >= 0)) @ kinks.slope
 

@@ -10,11 +10,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-
 from femsense.errors import FemsenseError
 from femsense.loop.data import Data
-from femsense.loop.grow import EVIDENCE, Progress, Refit, evidence, judged, polished, refit, shortlist, tilt_cost
+from femsense.loop.grow import EVIDENCE, Progress, Refit, evidence, judged, polished, refit, shortlist, tilt_cost, weighs
 from femsense.loop.noise import Noise
 from femsense.loop.screen import NUISANCE, Candidate
 from femsense.loop.stages import Stage, fields_of, keeping, screen_stage
@@ -81,7 +79,7 @@ def _best(
         return None, []
     worth = evidence(without.fit, stage.fit) - own.cost - tilt_cost(data.declared, own, stage.fit)
     records: Records = [{"name": name, "seed": own.seed, "in_place_of": name, "dbic": worth, "verdict": "passes"}]
-    margin = EVIDENCE if name == "gravity" and not np.any(data.declared.body.gravity) else BETTER
+    margin = max(BETTER, weighs(data, name))
     best: Refit | None = None
     for candidate in shortlist([c for c in table if c.effect.name in rivals], first=True):
         record: dict[str, Any] = {"name": candidate.effect.name, "seed": candidate.seed, "in_place_of": name}

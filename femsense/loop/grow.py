@@ -98,9 +98,10 @@ def grow(
     passing = [r for r in refits if r.record["verdict"] == "passes"]
     if not passing:
         return None, records
+    # where evidence is close, what predicts better
     leaders = [r for r in passing if r.score > max(p.score for p in passing) - EVIDENCE]
     leaders = [polished(data, stage, r, noise, say) for r in leaders]
-    winner = max(leaders, key=lambda r: r.score + r.record["cv_gain"])  # where evidence is close, what predicts better
+    winner = max(leaders, key=lambda r: r.score + r.record["cv_gain"] + weighs(data, r.candidate.effect.name))
     winner = _enriched(data, stage, winner, table, noise, say)
     winner.record["verdict"] = "named"
     return winner.stage, records
@@ -215,6 +216,11 @@ def tilt_cost(declared: Robot, candidate: Candidate, fit: JointFit) -> float:
     vector = fit.coordinates[mask]
     angle = np.arctan2(np.linalg.norm(np.cross(own, vector)), own @ vector)
     return float(5.0 * np.log1p((angle / MOUNTED) ** 2 / 4.0))
+
+
+def weighs(data: Data, name: str) -> float:
+    """Return by how much dBIC an effect is ahead of its rivals beforehand: every body has weight, though the robot does not declare it."""
+    return EVIDENCE if name == "gravity" and not np.any(data.declared.body.gravity) else 0.0
 
 
 def sure_beyond_mesh(better: float, spread: float, held: float, expected: float) -> bool:
@@ -472,5 +478,6 @@ __all__ = [
     "shortlist",
     "sure_beyond_mesh",
     "tilt_cost",
+    "weighs",
     "with_term",
 ]

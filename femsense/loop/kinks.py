@@ -41,14 +41,13 @@ def trial_kinks(
     if trial.scene.recording.actuation != "tension" or not jet.by_input.shape[2]:
         return None
     value, slope, response = _wanted(hypothesis, trial, own, coordinates)
-    F, a, p = slope.shape
     near = (value < NEAR_ZERO * value.max(axis=0).clip(1e-9)) & (np.abs(slope).max(axis=2) > 0)
     frame, cable = np.nonzero(near)
     if not len(frame):
         return None
     table = np.column_stack([cable, value[near], slope[near], jet.pulled[near]])
     _, first, group = np.unique(table.round(9), axis=0, return_index=True, return_inverse=True)
-    weight = np.zeros((F, len(first)))
+    weight = np.zeros((len(value), len(first)))
     np.add.at(weight.T, group.ravel(), response[:, frame].T)
     field = jet.by_input[:, :, cable[first]] * weight[trial.scene.frame][:, None, :]
     some = np.abs(field).max(axis=(0, 1)) > 0

@@ -12,7 +12,6 @@ import numpy as np
 from femsense.arrays import FloatArray, IntArray
 from femsense.loop.joint import JointFit, Trial, numbers_of
 
-
 OPEN = 1e-8
 """Share of what is known of a direction that comes from the sweeps that are not left out; below it they leave it open."""
 
@@ -48,7 +47,8 @@ def _density(fit: JointFit, rows: IntArray) -> float:
     B = J[rows] @ A  # H_bb = B Bᵀ
     inner = np.eye(B.shape[1]) - B.T @ B
     values, vectors = np.linalg.eigh(inner)
-    mixed = np.where(values > OPEN, vectors.T @ (B.T @ r[rows]), 0.0)  # the other sweeps say nothing of these directions: any value fits
+    mixed = vectors.T @ (B.T @ r[rows])
+    mixed[values < OPEN] = 0.0  # whatever the value, these rows fit it
     values = np.maximum(values, OPEN)
     return float(np.log(values).sum() - r[rows] @ r[rows] - (mixed**2 / values).sum())
 
