@@ -689,6 +689,16 @@ def roughly(pattern: Pattern, values: FloatArray, tolerance: float = ROUGH) -> F
         return factorize(pattern, values)
 
 
+def share_on_finer(body: BodyModel) -> None:
+    """Make what the steps of all states on a finer mesh share, whatever its material: it is kept with the body's free map."""
+    pattern = body.free_map.pattern
+    if pattern.size < ROUGH_FROM or pattern.grid is None:
+        pattern.analysis()
+    else:
+        pattern.levels()
+    turned_step(body, body.mesh.nodes, np.zeros_like(body.mesh.nodes))
+
+
 def finer_state(walk: Walk, fine: Walk, frame: int, base: Equilibrium, ties: Embedding) -> FloatArray | None:
     """Return where the nodes of a finer mesh come to rest [m], shape (n, 3), nearly: Newton steps from a state of a coarser one.
 

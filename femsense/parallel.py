@@ -11,6 +11,7 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from typing import TypeVar
 
 from femsense.errors import InputError
@@ -65,4 +66,17 @@ def each(function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[
                 future.cancel()
 
 
-__all__ = ["each", "set_workers", "workers"]
+@contextmanager
+def beside(function: Callable[[], None]) -> Iterator[Callable[[], None]]:
+    """Work on what will be needed later in a thread of its own, and give what waits for it and raises what it raised.
+
+    With one worker nothing is begun: who needs it makes it then. Leaving waits for the thread.
+    """
+    if workers() < 2:
+        yield lambda: None
+        return
+    with ThreadPoolExecutor(1) as pool:
+        yield pool.submit(function).result
+
+
+__all__ = ["beside", "each", "set_workers", "workers"]

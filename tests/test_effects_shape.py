@@ -217,3 +217,18 @@ def test_seeds_near_by_come_closer_to_a_place(name, true, key):
     for seed in nearby:
         parameters = effect.parameters(robot, "tension")
         effect.apply(robot, build_entry(parameters, [p.null for p in parameters], seed))
+
+
+def test_bodies_of_other_materials_share_what_the_finer_mesh_needs():
+    robot = arm((4, 2, 2))
+    softer = robot.with_body(
+        robot.body.with_stiffness_scale(np.linspace(0.5, 1.0, len(robot.body.mesh.tets))).with_gravity((0.0, 1.0, 2.0))
+    )
+    mesh = finer_mesh(robot.body.mesh, None, 1)
+    one, other = robot_on_mesh(robot, mesh).body, robot_on_mesh(softer, mesh).body
+    assert one.free_map is other.free_map and one.stencil is other.stencil
+    for body, of in ((one, robot.body), (other, softer.body)):
+        assert sorted(body.material.young_modulus) == pytest.approx(sorted(np.repeat(of.material.young_modulus, 8)))
+        assert body.material.density == of.material.density and body.material.law == of.material.law
+        assert body.material.poisson_ratio == pytest.approx(np.repeat(of.material.poisson_ratio, 8))
+        np.testing.assert_array_equal(body.gravity, of.gravity)

@@ -16,7 +16,7 @@ from femsense.fem.equilibrium import solve_equilibrium
 from femsense.loop import improve
 from femsense.loop.data import Data, prepare
 from femsense.loop.grow import MOUNTED, tilt_cost
-from femsense.loop.mesh_error import SHARE, VARIES, mesh_errors, with_mesh_errors
+from femsense.loop.mesh_error import SHARE, VARIES, make_finer, mesh_errors, with_mesh_errors
 from femsense.loop.noise import Groups, Noise, _Likelihood, whiten
 from femsense.loop.predict import sweeps_predicted
 from femsense.loop.screen import _parts, penalty
@@ -93,6 +93,15 @@ def with_error_of_the_mesh(noise: Noise) -> tuple[Recording, Stage, Data]:
     hypothesis, prior = with_nuisance(data)
     stage = make_stage(data, hypothesis, prior, noise, np.zeros(len(prior.mean)))
     return recording, stage, with_mesh_errors(data, stage)
+
+
+def test_what_is_made_of_the_finer_mesh_beforehand_serves_the_fitted_robot():
+    robot = arm((4, 2, 2))
+    make_finer(robot)
+    ready = robot_on_mesh(robot, finer_mesh(robot.body.mesh, None, 1)).body.free_map
+    assert ready.pattern.analyses and ready.laplacian
+    softer = robot.with_body(robot.body.with_stiffness_scale(0.9))
+    assert robot_on_mesh(softer, finer_mesh(robot.body.mesh, None, 1)).body.free_map is ready
 
 
 def test_the_error_of_the_mesh_is_what_the_finer_mesh_adds():

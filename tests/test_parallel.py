@@ -12,7 +12,7 @@ from test_march import recording, robot
 from femsense import parallel
 from femsense.errors import DataError, InputError
 from femsense.march import Walk, drive_of, marker_positions, walk_along
-from femsense.parallel import each, set_workers, workers
+from femsense.parallel import beside, each, set_workers, workers
 
 
 @pytest.fixture(autouse=True)
@@ -88,3 +88,36 @@ def test_a_walk_does_not_depend_on_how_many_work(friction):
         rows = [list(walk_along(walks[0], range(5), marker_positions, walks[1:], starts=starts)) for _ in range(2)]
         found.append([np.vstack([seen[None], others]) for again in rows for _, _, seen, others in again])
     np.testing.assert_array_equal(found[0], found[1])
+
+
+def test_work_beside_is_waited_for_and_its_errors_come_with_the_wait():
+    set_workers(2)
+    done: list[int] = []
+
+    def work() -> None:
+        time.sleep(0.05)
+        done.append(threading.get_ident())
+
+    with beside(work) as wait:
+        wait()
+        assert len(done) == 1 and done[0] != threading.get_ident()
+    with beside(work):
+        pass
+    assert len(done) == 2
+
+    def fail() -> None:
+        raise DataError("nothing there")
+
+    with pytest.raises(DataError, match="nothing there"), beside(fail) as wait:
+        wait()
+    with pytest.raises(InputError), beside(work):
+        raise InputError("ends early", where="here", found=1, expected="2")
+    assert len(done) == 3
+
+
+def test_one_worker_begins_nothing_beside():
+    set_workers(1)
+    done: list[int] = []
+    with beside(lambda: done.append(1)) as wait:
+        wait()
+    assert not done

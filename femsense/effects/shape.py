@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from femsense.arrays import FloatArray, IntArray, freeze
 from femsense.effects.effect import Effect, Entry, Parameter, number
 from femsense.errors import InputError
-from femsense.fem.body import BodyModel, make_body, tie_cable
+from femsense.fem.body import BodyModel, Cable, Chamber, make_body, tie_cable
 from femsense.fem.chambers import find_chamber
 from femsense.fem.mesh import TetMesh, embed_points, refined, to_linear, to_quadratic
 from femsense.model import Robot
@@ -123,28 +123,41 @@ def body_on_mesh(body: BodyModel, mesh: TetMesh, *, clamped: IntArray | None = N
         is_clamped = np.zeros(len(body.mesh.nodes), dtype=bool)
         is_clamped[body.clamped] = True
         clamped = np.flatnonzero(np.abs(np.where(is_clamped[ties.nodes], 0.0, ties.weights)).max(axis=1) < 1e-6)
-    parent = embed_points(body.mesh, mesh.nodes[mesh.tets[:, :4]].mean(axis=1)).element
-    springs = cKDTree(mesh.nodes).query(body.mesh.nodes[body.clamp_nodes])[1] if len(body.clamp_nodes) else np.zeros(0, np.int64)
-    made = make_body(
-        mesh,
-        young_modulus=body.material.young_modulus[parent],
-        poisson_ratio=body.material.poisson_ratio[parent],
-        density=body.material.density,
-        clamped=clamped,
-        clamp_nodes=springs,
-        cables=tuple(
-            replace(c, path=tie_cable(mesh, c.name, c.path.positions(body.mesh.nodes), c.pull_point).path) for c in body.cables
-        ),
-        chambers=tuple(find_chamber(mesh, c.name, c.seed, max_pressure=c.max_pressure) for c in body.chambers),
-        gravity=body.gravity,
-    )
-    made = made.with_material(replace(made.material, law=body.material.law, stretch_limit=body.material.stretch_limit))
+    nodes = clamped.astype(np.int64).tobytes(), body.clamp_nodes.astype(np.int64).tobytes()
+    made, parent = _plain_body(body.mesh, mesh, body.cables, body.chambers, *nodes)
+    material = body.material
+    young, poisson = material.young_modulus[parent], material.poisson_ratio[parent]
+    made = made.with_material(replace(material, young_modulus=freeze(young), poisson_ratio=freeze(poisson)))
+    made = made.with_gravity(body.gravity)
     if not body.clamp_is_rigid:
         made = made.with_clamp_stiffness(body.clamp_stiffness, turn=body.clamp_turn_stiffness)
     loaded = np.flatnonzero(body.dead_forces.any(axis=1))
     if not len(loaded):
         return made
     return made.with_dead_forces(embed_points(mesh, body.mesh.nodes[loaded]).spread(body.dead_forces[loaded], len(mesh.nodes)))
+
+
+@functools.lru_cache(maxsize=2)
+def _plain_body(
+    old: TetMesh, mesh: TetMesh, cables: tuple[Cable, ...], chambers: tuple[Chamber, ...], clamped: bytes, springs: bytes
+) -> tuple[BodyModel, IntArray]:
+    """Return a body of any one material on a mesh with the cables and chambers of an old one, and which old element each element lies in.
+
+    The last ones are kept: pattern, order and ties take as long as some states, and no material changes them. Nodes are bytes of int64:
+    those that are clamped on the new mesh, and those of the old one that carry springs where the clamp gives.
+    """
+    parent = embed_points(old, mesh.nodes[mesh.tets[:, :4]].mean(axis=1)).element
+    held = old.nodes[np.frombuffer(springs, np.int64)]
+    made = make_body(
+        mesh,
+        young_modulus=1.0,
+        poisson_ratio=0.3,
+        clamped=np.frombuffer(clamped, np.int64),
+        clamp_nodes=cKDTree(mesh.nodes).query(held)[1] if len(held) else np.zeros(0, np.int64),
+        cables=tuple(replace(c, path=tie_cable(mesh, c.name, c.path.positions(old.nodes), c.pull_point).path) for c in cables),
+        chambers=tuple(find_chamber(mesh, c.name, c.seed, max_pressure=c.max_pressure) for c in chambers),
+    )
+    return made, parent
 
 
 DISCRETISATION = Effect(

@@ -23,6 +23,7 @@ from femsense.loop.joint import Trial, heads_of, normals_of, numbers_of, vectors
 from femsense.loop.noise import Noise
 from femsense.loop.stages import Stage, placed
 from femsense.model import Robot, spread_features
+from femsense.parallel import each
 
 LOADED_FRAMES = 8
 """Frames with known loads at most."""
@@ -102,7 +103,7 @@ def force_consequence(before: list[View], after: list[View], noise: Noise) -> di
     try:
         if loaded:
             chosen = np.unique(np.linspace(0, len(loaded) - 1, LOADED_FRAMES).round().astype(int))
-            rows = [_at_loads(a, b, k, noise) for a, b, k in (loaded[i] for i in chosen)]
+            rows = each(lambda at: _at_loads(at[0], at[1], at[2], noise), [loaded[i] for i in chosen])
             return {"loads": [row for row in rows if row is not None]}
         return {"compliance": _compliances(*pairs[0])}
     except FemsenseError:

@@ -8,7 +8,7 @@ better model until nothing passes.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from femsense.loop.data import Data, prepare
 from femsense.loop.exchange import exchanged
 from femsense.loop.grow import Progress, grow, mesh_cost, moved_by, prune
 from femsense.loop.joint import Prior
-from femsense.loop.mesh_error import few_states, with_mesh_errors
+from femsense.loop.mesh_error import few_states, make_finer, with_mesh_errors
 from femsense.loop.noise import Noise
 from femsense.loop.result import LoopResult
 from femsense.loop.screen import Candidate
@@ -40,6 +40,7 @@ from femsense.loop.stages import (
 )
 from femsense.loop.zeros import in_place_of_zeros
 from femsense.model import Robot
+from femsense.parallel import beside
 from femsense.recording import Recording, state_key
 
 MAX_EFFECTS = 3
@@ -80,8 +81,9 @@ def improve(
     names = _names(effects, without, own)
     rng = np.random.default_rng(seed)
     say("reading and calibrating")
-    data = replace(prepare(robot, recordings, validation, measured), forms=(*FORMS, *own))
-    data, before, base = _calibrated(data, say)
+    with beside(lambda: make_finer(robot)) as finer_is_made:
+        data = replace(prepare(robot, recordings, validation, measured), forms=(*FORMS, *own))
+        data, before, base = _calibrated(data, say, finer_is_made)
     growing = _fresh(data)
     data, search = _search(data, before, base, names, MAX_EFFECTS if growing else 0, say)
     say("testing what is left")
@@ -93,7 +95,7 @@ def improve(
     return replace(result, next_experiment="; ".join(t for t in (only, result.next_experiment) if t))
 
 
-def _calibrated(data: Data, say: Progress) -> tuple[Data, Stage, Stage]:
+def _calibrated(data: Data, say: Progress, finer_is_made: Callable[[], None]) -> tuple[Data, Stage, Stage]:
     """Return the data with what the mesh costs, the declared model calibrated, and the model with all that calibration may move."""
     noise = Noise({"white": 5e-4}, "start")
     before = _declared(data, noise, None)
@@ -111,6 +113,7 @@ def _calibrated(data: Data, say: Progress) -> tuple[Data, Stage, Stage]:
         plain = roughly_keeping(data, base, ["stiffness"], noise, frames)
     except FemsenseError:
         plain = base
+    finer_is_made()
     return with_mesh_errors(data, plain), before, base
 
 

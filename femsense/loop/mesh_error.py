@@ -8,6 +8,7 @@ from the state on the declared mesh, which the finer one holds exactly, give it 
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -18,11 +19,11 @@ from femsense.arrays import FloatArray, IntArray
 from femsense.calib.forward import seats
 from femsense.effects.shape import finer_mesh, robot_on_mesh
 from femsense.errors import DataError, FemsenseError
-from femsense.fem.mesh import embed_points
+from femsense.fem.mesh import Embedding, TetMesh, embed_points
 from femsense.loop.data import Data
 from femsense.loop.joint import Trial, normals_of
 from femsense.loop.stages import Stage, placed
-from femsense.march import Walk, drive_of, finer_state, walk_along
+from femsense.march import Walk, drive_of, finer_state, share_on_finer, walk_along
 from femsense.model import Robot
 from femsense.parallel import each
 from femsense.recording import Recording
@@ -41,7 +42,7 @@ def with_mesh_errors(data: Data, stage: Stage) -> Data:
     """Return the data with the error of a quadratic mesh at a stage; without it where the mesh is linear (it is an effect then) or huge."""
     robot = stage.fit.hypothesis.robot_at(stage.fit.coordinates)
     mesh = robot.body.mesh
-    if not mesh.is_quadratic or 8 * len(mesh.tets) > MOST_TETS:
+    if not _is_asked(mesh):
         return data
     train, held, fitted = list(data.train), list(data.held), placed(data, stage.fit)
     try:
@@ -56,6 +57,32 @@ def with_mesh_errors(data: Data, stage: Stage) -> Data:
     except FemsenseError:
         return data
     return replace(data, train=train, held=held)
+
+
+def _is_asked(mesh: TetMesh) -> bool:
+    return mesh.is_quadratic and 8 * len(mesh.tets) <= MOST_TETS
+
+
+def make_finer(robot: Robot) -> None:
+    """Make what `with_mesh_errors` needs of the finer mesh whatever the material, beside other work: what is made is kept.
+
+    A mesh that cannot be had is none here; it is asked for again where it is needed.
+    """
+    mesh = robot.body.mesh
+    if not _is_asked(mesh):
+        return
+    try:
+        fine = robot_on_mesh(robot, finer_mesh(mesh, None, 1))
+        share_on_finer(fine.body)
+        _ties(mesh, fine.body.mesh)
+    except FemsenseError:
+        return
+
+
+@functools.lru_cache(maxsize=2)
+def _ties(mesh: TetMesh, fine: TetMesh) -> Embedding:
+    """Return how the nodes of a finer mesh go with a mesh."""
+    return embed_points(mesh, fine.nodes)
 
 
 def _with_errors(
@@ -97,7 +124,8 @@ def _moves(
     recording, starts = trials[0].scene.recording, trials[0].starts_on(robot.body.mesh)
     coarse_walk = Walk(robot, drive_of(robot, recording, initial=initial))
     fine_walk = Walk(fine, drive_of(fine, recording, initial=initial))
-    ties = embed_points(robot.body.mesh, fine.body.mesh.nodes)
+    ties = _ties(robot.body.mesh, fine.body.mesh)
+    share_on_finer(fine.body)
     here, there = robot.tie_markers(places), fine.tie_markers(places)
     frames = np.unique(np.concatenate([t.scene.frames for t in trials]))
     vectors = _state_vectors(recording, frames)
@@ -112,8 +140,7 @@ def _moves(
         except FemsenseError:  # it folds there
             return None
 
-    finer_states = [finer_at(chosen[0]), *each(finer_at, chosen[1:])]  # the first makes what all of them share
-    for i, finer in zip(chosen, finer_states):
+    for i, finer in zip(chosen, each(finer_at, chosen)):
         if finer is not None:
             settled.append(i)
             known.append(there.positions(finer) - here.positions(states[int(frames[i])].positions))
@@ -147,4 +174,4 @@ def _representatives(vectors: FloatArray, most: int) -> list[int]:
     return chosen
 
 
-__all__ = ["SHARE", "few_states", "mesh_errors", "with_mesh_errors"]
+__all__ = ["SHARE", "few_states", "make_finer", "mesh_errors", "with_mesh_errors"]

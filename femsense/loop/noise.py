@@ -16,12 +16,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
-from scipy.linalg import cho_solve, cholesky, solve_triangular
+from scipy.linalg import LinAlgError, cho_solve, cholesky, solve_triangular
+from scipy.linalg.lapack import dpotri
 from scipy.optimize import minimize
 
 from femsense.arrays import BoolArray, FloatArray, IntArray
+from femsense.parallel import each
 
 COMPONENTS = ("white", "state", "marker", "frame", "sweep")
 FLOOR = 2e-6
@@ -228,12 +231,12 @@ def estimate_noise(
     bounds = [(float(np.log(max(JITTER * jitter, np.exp(lowest)))) if n == "white" else lowest, highest) for n in names]
     near = None if before is None else np.log([max(before.get(n, 0.0), np.exp(lowest)) for n in names])
     likelihood = _Likelihood(names, residuals, basis, groups, near)
-    best = None
-    for white in {max(jitter, FLOOR), 0.3 * scale, 0.7 * scale}:
+
+    def from_start(white: float) -> Any:
         start = np.clip(np.log([white if n == "white" else 0.3 * scale for n in names]), lowest, highest)
-        answer = minimize(likelihood, start, jac=True, method="L-BFGS-B", bounds=bounds)
-        best = answer if best is None or answer.fun < best.fun else best
-    assert best is not None
+        return minimize(likelihood, start, jac=True, method="L-BFGS-B", bounds=bounds)
+
+    best = min(each(from_start, {max(jitter, FLOOR), 0.3 * scale, 0.7 * scale}), key=lambda answer: answer.fun)
     std = {name: float(v) for name, v in zip(names, np.exp(best.x))}
     std = {name: max(v, FLOOR) if name == "white" else v if v > 2e-2 * scale else 0.0 for name, v in std.items()}
     how = "with repeats" if "state" in names else "no repeated state: assumed from the residual"
@@ -292,7 +295,10 @@ class _Likelihood:
 def _inverse(matrix: FloatArray) -> tuple[FloatArray, float]:
     """Return the inverse of a positive definite matrix and the logarithm of its determinant."""
     L = cholesky(matrix, lower=True)
-    return np.asarray(cho_solve((L, True), np.eye(len(L)))), 2.0 * float(np.log(np.diag(L)).sum())
+    inverse, failed = dpotri(L, lower=1)
+    if failed:
+        raise LinAlgError("the covariance is singular")
+    return np.asarray(np.tril(inverse) + np.tril(inverse, -1).T), 2.0 * float(np.log(np.diag(L)).sum())
 
 
 def _jitter(residuals: list[FloatArray], groups: list[Groups]) -> float:
