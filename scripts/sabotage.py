@@ -133,7 +133,7 @@ SABOTAGES = (
     S("fem/clamp.py", "answer + self._answers @", "answer - self._answers @", "test_effects_shape.py::test_compliance_on_a_turning_clamp_is_the_derivative_of_equilibria_solved_anew"),
     S("fem/clamp.py", "np.cross(arms, y).sum(axis=0) - kappa * turn", "np.cross(arms, y).sum(axis=0) - 2 * kappa * turn", "test_effects_shape.py::test_the_plate_turns_by_the_moment_of_all_loads"),
     S("fem/body.py", "stencil.volumes * scale**3", "stencil.volumes * scale**2", "test_effects_shape.py::test_a_body_of_another_size_is_that_of_a_mesh_of_that_size"),
-    S("effects/shape.py", "material.young_modulus[parent]", "material.young_modulus[parent[::-1]]", "test_effects_shape.py::test_a_finer_mesh_keeps_what_the_robot_has"),
+    S("effects/shape.py", "material.young_modulus[parent]", "material.young_modulus[parent[::-1]]", "test_effects_shape.py::test_bodies_of_other_materials_share_what_the_finer_mesh_needs"),
     S("effects/shape.py", "made = made.with_gravity(body.gravity)", "made = made.with_gravity(-body.gravity)", "test_effects_shape.py::test_bodies_of_other_materials_share_what_the_finer_mesh_needs"),
     S("parallel.py", "yield pool.submit(function).result", "yield lambda: pool.submit(function) and None", "test_parallel.py::test_work_beside_is_waited_for_and_its_errors_come_with_the_wait"),
     S("rig/camera.py", "(u + v <= 1.0 + ON_EDGE)", "(u + v <= 2.0 + ON_EDGE)", "test_rig_camera.py::test_rays_met_one_by_one_end_where_the_tree_says"),
