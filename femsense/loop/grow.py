@@ -123,7 +123,7 @@ def _enriched(data: Data, stage: Stage, winner: Refit, table: list[Candidate], n
         if len(form.parameters) <= len(winner.candidate.parameters):
             continue
         say(f"trying {form.effect.name} with {len(form.parameters)} parameters")
-        made = _tried(data, stage, form, noise, winner.score + EVIDENCE)
+        made = _richer(data, stage, winner, form, noise)
         if made is None:
             continue
         rich = judged(data, stage, form, made, dict(winner.record), noise)
@@ -133,6 +133,23 @@ def _enriched(data: Data, stage: Stage, winner: Refit, table: list[Candidate], n
             winner.record.update(rich.record | {"seed": form.seed})
             winner = replace(rich, record=winner.record)
     return winner
+
+
+def _richer(data: Data, stage: Stage, winner: Refit, form: Candidate, noise: Noise) -> Stage | None:
+    """Return the fit of a richer form of the winner, started from the winner itself where its parameters are among those of the form."""
+    settled, terms = winner.stage.fit.hypothesis.settled, winner.stage.fit.hypothesis.terms
+    keys = {p.key for p in form.parameters}
+    if settled != stage.fit.hypothesis.settled or not {p.key for p in terms[-1][2]} <= keys:
+        return _tried(data, stage, form, noise, winner.score + EVIDENCE)
+    split = len(winner.stage.fit.coordinates) - len(terms[-1][2])
+    found = {(p.key, p.part): float(v) for p, v in zip(terms[-1][2], winner.stage.fit.coordinates[split:])}
+    own = [found.get((p.key, p.part), found.get((p.key, None), p.null)) for p in form.parameters]
+    hypothesis, prior = with_term(stage.fit, form.effect, form.seed, form.parameters)
+    try:
+        coordinates = np.concatenate([winner.stage.fit.coordinates[:split], own])
+        return make_stage(data, hypothesis, prior, noise, coordinates, own=own_of(winner.stage), max_iterations=10)
+    except FemsenseError:
+        return None
 
 
 def _quadratic(data: Data, stage: Stage, names: Sequence[str], n_effective: float) -> list[Candidate]:
@@ -232,6 +249,12 @@ def evidence(before: JointFit, after: JointFit) -> float:
     """Return the decrease of χ², or that of (rows − parameters) log χ² where it is smaller: the scale of the noise is an estimate too."""
     freedom = max(len(after.fit.residual) - len(after.fit.theta), 1)
     return min(before.chi2 - after.chi2, freedom * float(np.log(before.chi2 / max(after.chi2, 1e-12))))
+
+
+def _beyond(fit: JointFit, price: float) -> float:
+    """Return the χ² beyond which a model without something is worse than a fit by so much evidence."""
+    freedom = max(len(fit.fit.residual) - len(fit.fit.theta), 1)
+    return fit.chi2 * float(np.exp(price / freedom)) + price
 
 
 def refit(data: Data, stage: Stage, candidate: Candidate, noise: Noise, *, wanted: float = EVIDENCE) -> Stage:
@@ -452,11 +475,12 @@ def prune(data: Data, stage: Stage, noise: Noise, n_effective: float, say: Progr
         if not count:
             continue
         say(f"asking whether {name} is still needed")
+        price = count * float(np.log(n_effective))
         try:
-            without = keeping(data, stage, others, noise)
+            without = keeping(data, stage, others, noise, worth=_beyond(stage.fit, FORGONE[1] * price + FORGONE[0]))
         except FemsenseError:
             continue
-        if evidence(without.fit, stage.fit) - count * np.log(n_effective) <= 0.0:
+        if evidence(without.fit, stage.fit) <= price:
             stage = without
     return stage
 

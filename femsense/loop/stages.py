@@ -104,8 +104,10 @@ def jets_without(stage: Stage, keep: BoolArray) -> list[SceneJet]:
     return [replace(j, by_effect=j.by_effect[:, :, keep], rest_by_effect=j.rest_by_effect[:, :, keep]) for j in stage.fit.jets]
 
 
-def keeping(data: Data, stage: Stage, names: Sequence[str], noise: Noise, *, max_iterations: int = 12) -> Stage:
-    """Return a stage with some of its terms only, fitted again. Raises DataError."""
+def keeping(
+    data: Data, stage: Stage, names: Sequence[str], noise: Noise, *, max_iterations: int = 12, worth: float = np.inf
+) -> Stage:
+    """Return a stage with some of its terms only, fitted again (roughly where χ² stays above `worth`). Raises DataError."""
     hypothesis, prior, mask = _some_terms(stage, names)
     return make_stage(
         data,
@@ -116,6 +118,7 @@ def keeping(data: Data, stage: Stage, names: Sequence[str], noise: Noise, *, max
         own=own_of(stage),
         max_iterations=max_iterations,
         near=jets_without(stage, mask),
+        worth=worth,
     )
 
 
