@@ -16,7 +16,7 @@ from femsense.loop.evidence import gather
 from femsense.loop.grow import EVIDENCE, at_edge
 from femsense.loop.joint import Trial, heads_of, normal_rms_of, rms_of, vectors_of
 from femsense.loop.mesh_error import mesh_errors
-from femsense.loop.noise import Noise
+from femsense.loop.noise import Noise, whiten
 from femsense.loop.result import LoopResult
 from femsense.loop.screen import NUISANCE, TESTABLE, Candidate, confounding, one_each
 from femsense.loop.spread import spreads
@@ -34,6 +34,8 @@ NOISY = 1.15
 An effect that is right has never needed it in blind cases; three that were wrong have."""
 EXPLAINED = 0.8
 """Share of the excess over the noise that effects must take away where structure is left."""
+LACKS = 2.0
+"""A model that is handed back may leave so many times the mean square, in units of all noise, that calibration of all nuisances leaves."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -69,8 +71,9 @@ def conclude(data: Data, search: Search, rng: np.random.Generator) -> LoopResult
     effects = _chain(data, search, promoted, names, back, spread)
     residuals = [without_mesh_error(t, jet.residual, noise) for t, jet in zip(data.train, final.fit.jets)]
     tests = structure_tests(data.train, residuals, rng=rng)
-    excess = _excess(before, final, back, noise)
+    excess = _excess(data, before, final, back, noise)
     unexplained = tests.significant and excess.left > excess.tolerated and (strayed or excess.explained < EXPLAINED)
+    unexplained = unexplained or _lacks(data, back, final, noise)
     verdict = "unexplained" if unexplained else "effects" if effects else "none"
     rivals = _confounded(search, names)
     not_testable = [
@@ -183,7 +186,7 @@ def _chain(
 
 @dataclass(frozen=True, slots=True)
 class Excess:
-    """Root mean squares [m] over what is measured again and again alike."""
+    """Root mean squares [m] over what is measured again and again alike, less the likeliest share of the mesh's error."""
 
     left: float
     """What the final model leaves beyond the noise of repetition."""
@@ -193,12 +196,31 @@ class Excess:
     handed back; the smaller one."""
 
 
-def _excess(before: Stage, final: Stage, back: Stage, noise: Noise) -> Excess:
+def _excess(data: Data, before: Stage, final: Stage, back: Stage, noise: Noise) -> Excess:
     axes, std = (3.0, noise.std) if noise.std else (1.0, noise.surface)
     floor = float(np.sqrt(axes * sum(v**2 for k, v in std.items() if k != "state")))
-    left = float(np.sqrt(max(final.fit.rms**2 - floor**2, 0.0)))
-    fitted = _taken_away(before.fit.rms, final.fit.rms, floor)
-    return Excess(left, 0.25 * floor, min(fitted, _taken_away(before.held_rms, back.held_rms, floor)))
+    fitted = [_beyond_mesh(data.train, [j.residual for j in s.fit.jets], noise) for s in (before, final)]
+    held = [_beyond_mesh(data.held, s.held_residuals, noise) for s in (before, back)]
+    left = float(np.sqrt(max(fitted[1] ** 2 - floor**2, 0.0)))
+    return Excess(left, 0.25 * floor, min(_taken_away(*fitted, floor), _taken_away(*held, floor)))
+
+
+def _beyond_mesh(trials: list[Trial], residuals: list[FloatArray], noise: Noise) -> float:
+    """Return the root mean square [m] of residuals less what of them is likeliest to be the mesh's own error."""
+    return rms_of([without_mesh_error(t, r, noise) for t, r in zip(trials, residuals)])
+
+
+def _lacks(data: Data, back: Stage, final: Stage, noise: Noise) -> bool:
+    """Return whether what is handed back leaves much that the final model takes away with nuisances that are not named."""
+    train = [_mean_square(data.train, [j.residual for j in s.fit.jets], noise) for s in (back, final)]
+    held = [_mean_square(data.held, s.held_residuals, noise) for s in (back, final)]
+    return any(own > LACKS * max(full, 1.0) for own, full in (train, held))
+
+
+def _mean_square(trials: list[Trial], residuals: list[FloatArray], noise: Noise) -> float:
+    """Return the mean square of whitened residuals; 1 is noise."""
+    rows = [whiten(noise.whitener(t.groups, t.mesh_error), r) for t, r in zip(trials, residuals)]
+    return float(np.mean(np.concatenate(rows, axis=None) ** 2)) if rows else 0.0
 
 
 def _taken_away(before: float, after: float, floor: float) -> float:
