@@ -202,7 +202,7 @@ def _excess(data: Data, before: Stage, final: Stage, back: Stage, noise: Noise) 
     fitted = [_beyond_mesh(data.train, [j.residual for j in s.fit.jets], noise) for s in (before, final)]
     held = [_beyond_mesh(data.held, s.held_residuals, noise) for s in (before, back)]
     left = float(np.sqrt(max(fitted[1] ** 2 - floor**2, 0.0)))
-    return Excess(left, 0.25 * floor, min(_taken_away(*fitted, floor), _taken_away(*held, floor)))
+    return Excess(left, 0.25 * floor, min(_taken_away(fitted[0], fitted[1], floor), _taken_away(held[0], held[1], floor)))
 
 
 def _beyond_mesh(trials: list[Trial], residuals: list[FloatArray], noise: Noise) -> float:
