@@ -64,10 +64,11 @@ def test_what_a_step_changes_is_known_across_a_kink() -> None:
         assert np.linalg.norm(J @ step - near.change(step)) > 0.1
 
 
-@pytest.mark.parametrize("creep", [False, True])
-def test_zeros_on_both_sides_are_predicted(creep: bool) -> None:
+@pytest.mark.parametrize(("creep", "scatter"), [(False, 0.0), (True, 0.0), (False, 0.01)])
+def test_zeros_on_both_sides_are_predicted(creep: bool, scatter: float) -> None:
     robot = arm((4, 1, 1))
     inputs, labels = sweeps(each=1)
+    inputs = inputs + scatter * np.random.default_rng(4).random(inputs.shape)
     recording, _ = record(inputs, labels=labels, truth=robot)
     robot = apply_effects(robot, [{"name": "creep", "fraction": 0.3, "time_s": 4.0}]) if creep else robot
     data = prepare(robot, [recording], [])
@@ -79,7 +80,8 @@ def test_zeros_on_both_sides_are_predicted(creep: bool) -> None:
     r, J = problem.evaluate(at, True)
     kinks = problem.kinks(at)
     near = _Near(r, J, kinks, at - 1.0, at + 1.0)
-    np.testing.assert_allclose(near.J, J)
+    assert len(kinks.value) <= 12
+    np.testing.assert_allclose(near.J, J, atol=0.02 * np.abs(J).max())
     true = problem.evaluate(there, False)[0] - r
     missed = [np.linalg.norm(change - true) / np.linalg.norm(true) for change in (near.change(there - at), J @ (there - at))]
     assert missed[0] < 0.05 and missed[1] > 3 * missed[0]

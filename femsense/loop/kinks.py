@@ -25,6 +25,8 @@ DRIVING = ("cable_offset", "cable_gain", "creep")
 """Effects that change the tension that drives a frame, and leave the body as it is."""
 NEAR_ZERO = 0.25
 """Tensions below this share of the largest one may come to 0 in a step."""
+ALIKE = 0.01
+"""Tensions that differ by less than this share of the largest one count as one: logs are noisy where cables are idle."""
 
 
 Part = tuple[slice, IntArray, Kinks]
@@ -36,23 +38,26 @@ def trial_kinks(
 ) -> Kinks | None:
     """Return where the residual rows of a trial bend near a point; its slopes are by the trial's own parameters, then the coordinates.
 
-    Frames in which a cable is driven alike, and answers alike to all parameters, bend together.
+    Frames in which a cable is driven alike bend together.
     """
     if trial.scene.recording.actuation != "tension" or not jet.by_input.shape[2]:
         return None
     value, slope, response = _wanted(hypothesis, trial, own, coordinates)
-    near = (value < NEAR_ZERO * value.max(axis=0).clip(1e-9)) & (np.abs(slope).max(axis=2) > 0)
+    largest = value.max(axis=0).clip(1e-9)
+    near = (value < NEAR_ZERO * largest) & (np.abs(slope).max(axis=2) > 0)
     frame, cable = np.nonzero(near)
     if not len(frame):
         return None
-    table = np.column_stack([cable, value[near], slope[near], jet.pulled[near]])
-    _, first, group = np.unique(table.round(9), axis=0, return_index=True, return_inverse=True)
-    weight = np.zeros((len(value), len(first)))
-    np.add.at(weight.T, group.ravel(), response[:, frame].T)
+    table = np.column_stack([cable, np.rint((value / largest)[near] / ALIKE), jet.pulled[near]])
+    _, group, count = np.unique(table, axis=0, return_inverse=True, return_counts=True)
+    share = np.zeros((len(count), len(frame)))
+    share[group.ravel(), np.arange(len(frame))] = 1.0
+    weight = response[:, frame] @ share.T  # what drives each frame by what is wanted in all frames of a group
+    first = share.argmax(axis=1)
     field = jet.by_input[:, :, cable[first]] * weight[trial.scene.frame][:, None, :]
     some = np.abs(field).max(axis=(0, 1)) > 0
-    first = first[some]
-    return Kinks(whiten(factor, field[:, :, some]), value[near][first], slope[near][first], jet.pulled[near][first])
+    mean = (share / count[:, None])[some]
+    return Kinks(whiten(factor, field[:, :, some]), mean @ value[near], mean @ slope[near], jet.pulled[near][first][some])
 
 
 def joined(parts: Sequence[Part], rows: int, width: int) -> Kinks:
