@@ -136,8 +136,6 @@ SABOTAGES = (
     S("effects/shape.py", "material.young_modulus[parent]", "material.young_modulus[parent[::-1]]", "test_effects_shape.py::test_bodies_of_other_materials_share_what_the_finer_mesh_needs"),
     S("effects/shape.py", "made = made.with_gravity(body.gravity)", "made = made.with_gravity(-body.gravity)", "test_effects_shape.py::test_bodies_of_other_materials_share_what_the_finer_mesh_needs"),
     S("parallel.py", "yield pool.submit(function).result", "yield lambda: pool.submit(function) and None", "test_parallel.py::test_work_beside_is_waited_for_and_its_errors_come_with_the_wait"),
-    S("rig/camera.py", "(u + v <= 1.0 + ON_EDGE)", "(u + v <= 2.0 + ON_EDGE)", "test_rig_camera.py::test_rays_met_one_by_one_end_where_the_tree_says"),
-    S("rig/camera.py", "ON_EDGE = 1e-9", "ON_EDGE = -1e-9", "test_rig_camera.py::test_no_ray_slips_through_between_triangles"),
     S("march.py", "return x + first_give(other, self.left())", "return x", "test_effects_derivatives.py"),
     S("march.py", "x = x + (other.mesh.nodes - body.mesh.nodes)", "x = x + 0.0", "test_effects_derivatives.py"),
     S("effects/observation.py", "seen.depth_offset * scale + offset", "seen.depth_offset + offset", "test_effects.py::test_depth_is_undone_as_it_was_made"),

@@ -15,8 +15,6 @@ from femsense.pointcloud.cloud import cloud_from_depth, read_cloud
 from femsense.pose import invert_pose, make_pose, rotation_from_vector, transform_points
 from femsense.rig.camera import (
     Shape,
-    _cast,
-    _met,
     camera_of,
     cloud_of,
     depth_std,
@@ -189,28 +187,3 @@ def test_thinning_leaves_one_point_a_cube() -> None:
     cloud = thinned(cloud_of(image, CAMERA), 0.02)
     cubes = np.floor(cloud.points / 0.02).astype(int)
     assert len(np.unique(cubes, axis=0)) == len(cubes) > 50
-
-
-def test_rays_met_one_by_one_end_where_the_tree_says() -> None:
-    rng = np.random.default_rng(4)
-    shapes = [
-        _wall(0.7, 0.3),
-        Shape(rng.uniform([-0.2, -0.2, 0.3], [0.2, 0.2, 0.6], (60, 3)), np.arange(60).reshape(20, 3), np.ones(3)),
-    ]
-    rays = np.column_stack([rng.uniform(-0.5, 0.5, (400, 2)), np.ones(400)])
-    T = look_at([0.02, 0.01, -0.05], [0.0, 0.03, 0.5], roll=0.3)
-    depth, number = _met(rays, T, shapes)
-    wanted, of, _ = _cast(rays, T, shapes)
-    assert set(number.tolist()) == {-1, 0, 1}
-    assert number.tolist() == of.tolist()
-    np.testing.assert_allclose(depth, wanted, rtol=1e-9)
-
-
-def test_no_ray_slips_through_between_triangles() -> None:
-    square = Shape(np.array([[-1.0, -1.0, 1.0], [1.0, -1.0, 1.0], [1.0, 1.0, 1.0], [-1.0, 1.0, 1.0]]), np.array([[0, 1, 2], [0, 2, 3]]), np.ones(3))  # fmt: skip
-    along = np.linspace(-0.99, 0.99, 200)
-    rays = np.column_stack([along, along, np.ones(200)])
-    for angle in (0.0, 0.4, 1.1):
-        turn = np.array([[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]])
-        rotated = Shape(square.points @ turn.T, square.triangles, square.color)
-        np.testing.assert_allclose(_met(rays @ turn.T, np.eye(4), [rotated])[0], 1.0, rtol=1e-12)

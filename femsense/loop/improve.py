@@ -8,6 +8,7 @@ better model until nothing passes.
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -81,7 +82,7 @@ def improve(
     names = _names(effects, without, own)
     rng = np.random.default_rng(seed)
     say("reading and calibrating")
-    with beside(lambda: make_finer(robot)) as finer_is_made:
+    with beside(lambda: _get_ready(robot)) as finer_is_made:
         data = replace(prepare(robot, recordings, validation, measured), forms=(*FORMS, *own))
         data, before, base = _calibrated(data, say, finer_is_made)
     growing = _fresh(data)
@@ -93,6 +94,12 @@ def improve(
         return result
     only = "record another state (other inputs, load or direction of gravity): these data repeat one state, which cannot tell effects apart"
     return replace(result, next_experiment="; ".join(t for t in (only, result.next_experiment) if t))
+
+
+def _get_ready(robot: Robot) -> None:
+    """Begin what takes seconds and waits for nothing: the finer mesh, and loading Open3D, whose rays say what the next experiment's camera sees."""
+    make_finer(robot)
+    importlib.import_module("open3d")
 
 
 def _calibrated(data: Data, say: Progress, finer_is_made: Callable[[], None]) -> tuple[Data, Stage, Stage]:

@@ -30,10 +30,6 @@ EDGE = 0.01
 COLOR_NOISE = 0.012
 """Standard deviation of a colour channel [1]."""
 TRUE_DEPTH = Observation()
-ON_EDGE = 1e-9
-"""A ray this close beside a triangle, in barycentric coordinates, meets it: none slips through between two."""
-FEW = 2_000_000
-"""Rays times triangles that are met one with the other: as fast as a tree of boxes, and Open3D takes seconds to import."""
 HIDDEN = 2e-3
 """A marker is hidden where the ray towards it ends more than this before it [m]."""
 
@@ -176,8 +172,7 @@ def visible_points(camera: Camera, T_robot_camera: FloatArray, shapes: Sequence[
     u, v = camera.fx * local[:, 0] / safe + camera.cx, camera.fy * local[:, 1] / safe + camera.cy
     inside = ahead & (u >= -0.5) & (u <= camera.width - 0.5) & (v >= -0.5) & (v <= camera.height - 0.5)
     rays = local / np.where(ahead, local[:, 2], 1.0)[:, None]
-    few = len(rays) * sum(len(s.triangles) for s in shapes) <= FEW
-    hit, shape = _met(rays, T_robot_camera, shapes) if few else _cast(rays, T_robot_camera, shapes)[:2]
+    hit, shape, _ = _cast(rays, T_robot_camera, shapes)
     gap = (local[:, 2] - hit) * np.linalg.norm(rays, axis=1)
     return np.asarray(inside & ((shape < 0) | (gap < HIDDEN)))
 
@@ -216,24 +211,6 @@ def _cast(rays: FloatArray, T_robot_camera: FloatArray, shapes: Sequence[Shape])
         mine = number == i
         depth[mine] = _exact_depth(shape, answer["primitive_ids"].numpy()[mine], start[mine], directions[mine])
     return depth, np.where(missed, -1, number), np.where(missed, 0.0, facing)
-
-
-def _met(rays: FloatArray, T_robot_camera: FloatArray, shapes: Sequence[Shape]) -> tuple[FloatArray, IntArray]:
-    """Return depth [m] (inf: nothing) and index of the shape (−1: nothing) of each ray (k, 3), each triangle met by each ray (Möller & Trumbore 1997)."""
-    depth, number = np.full(len(rays), np.inf), np.full(len(rays), -1)
-    directions, start = rays @ T_robot_camera[:3, :3].T, T_robot_camera[:3, 3]
-    for i, shape in enumerate(shapes):
-        a, b, c = (shape.points[shape.triangles[:, k]] for k in range(3))
-        normal, arm = np.cross(b - a, c - a), start - a
-        across = -directions @ normal.T
-        turned = np.cross(arm[None], directions[:, None])  # (k, t, 3)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            u, v = np.einsum("tc,ktc->kt", c - a, turned) / across, -np.einsum("tc,ktc->kt", b - a, turned) / across
-            t = np.einsum("tc,tc->t", arm, normal) / across
-            t = np.where((u >= -ON_EDGE) & (v >= -ON_EDGE) & (u + v <= 1.0 + ON_EDGE) & (t > 0.0), t, np.inf)
-        nearest = t.min(axis=1, initial=np.inf)
-        number, depth = np.where(nearest < depth, i, number), np.minimum(nearest, depth)
-    return depth, number
 
 
 def _exact_depth(shape: Shape, triangle: npt.NDArray[Any], start: FloatArray, direction: FloatArray) -> FloatArray:
