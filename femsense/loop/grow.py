@@ -55,6 +55,8 @@ SURE = 2.5
 POLISHED = 2.0
 """Decrease of χ² that each further parameter of a polished effect must bring."""
 
+MORE_STEPS = 30
+"""Steps for a refit that could win and is still on its way after the first ones."""
 FORGONE = 2.0, 1.25
 """A refit whose gain in χ² is too little by this much and this factor is given up before it has derivatives of its own."""
 
@@ -95,6 +97,8 @@ def grow(
             record["verdict"] = f"no equilibrium: {error}"
             continue
         refits.append(judged(data, stage, candidate, made, record, noise))
+    best = max((r.score for r in refits if r.record["verdict"] == "passes"), default=np.inf)
+    refits = [_to_the_end(data, stage, r, noise) if r.score > 0.5 * best - EVIDENCE else r for r in refits]
     passing = [r for r in refits if r.record["verdict"] == "passes"]
     if not passing:
         return None, records
@@ -105,6 +109,24 @@ def grow(
     winner = _enriched(data, stage, winner, table, noise, say)
     winner.record["verdict"] = "named"
     return winner.stage, records
+
+
+def _to_the_end(data: Data, stage: Stage, refitted: Refit, noise: Noise) -> Refit:
+    """Return a refit that ran out of steps on its way down with more of them: rivals are compared where each of them ends."""
+    fit = refitted.stage.fit
+    if fit.fit.status != "iterations":
+        return refitted
+    made = make_stage(
+        data,
+        fit.hypothesis,
+        fit.prior,
+        noise,
+        fit.coordinates,
+        own=own_of(refitted.stage),
+        max_iterations=MORE_STEPS,
+        known=fit.jets,
+    )
+    return judged(data, stage, refitted.candidate, made, refitted.record, noise)
 
 
 def polished(data: Data, stage: Stage, refitted: Refit, noise: Noise, say: Progress) -> Refit:
