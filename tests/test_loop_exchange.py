@@ -13,7 +13,8 @@ from femsense.loop.data import Data, prepare
 from femsense.loop.exchange import exchanged
 from femsense.loop.grow import Refit, evidence, judged, polished, refit, shortlist
 from femsense.loop.noise import Noise
-from femsense.loop.stages import Stage, fields_of, make_stage, screen_stage, with_nuisance
+from femsense.loop.screen import Candidate
+from femsense.loop.stages import Stage, fields_of, make_stage, own_of, screen_stage, with_nuisance
 
 NOISE = Noise({"white": 1e-4}, "")
 COUNT = 300.0
@@ -86,3 +87,21 @@ def test_effects_without_near_rivals_are_not_asked_again():
     before = [("", base), ("gravity", first), ("cable_gain", second)]
     history, refits = exchanged(data, before, [own, rival, other], NOISE, COUNT, lambda text: None)
     assert history is before and len(refits) == 3
+
+
+def test_a_refit_that_could_win_goes_to_its_end(monkeypatch: pytest.MonkeyPatch):
+    data, base = started()
+    table = screen_stage(data, base.fit, NOISE, fields_of(data, base, ["payload"]), COUNT)
+    whole = refit(data, base, shortlist(table, first=True)[0], NOISE)
+
+    def cut_short(data: Data, stage: Stage, candidate: Candidate, noise: Noise, **_: float) -> Stage:
+        hypothesis, prior = grow.with_term(stage.fit, candidate.effect, candidate.seed, candidate.parameters)
+        start = np.concatenate([stage.fit.coordinates, [p.null for p in candidate.parameters]])
+        return make_stage(data, hypothesis, prior, noise, start, own=own_of(stage), max_iterations=2)
+
+    monkeypatch.setattr(grow, "refit", cut_short)
+    monkeypatch.setattr(grow, "_polish", lambda data, stage, winner, *_: winner.stage)
+    winner, records = grow.grow(data, base, table, NOISE, ["payload"], COUNT, lambda text: None)
+    assert winner is not None and winner.fit.fit.status == "converged"
+    assert winner.fit.chi2 == pytest.approx(whole.fit.chi2, rel=0.02)
+    assert records[0]["dchi2"] == pytest.approx(evidence(base.fit, winner.fit))

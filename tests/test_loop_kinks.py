@@ -64,6 +64,25 @@ def test_what_a_step_changes_is_known_across_a_kink() -> None:
         assert np.linalg.norm(J @ step - near.change(step)) > 0.1
 
 
+def test_on_a_kink_the_derivative_has_no_gradient_and_takes_a_part_of_both_sides() -> None:
+    up, down = np.array([3.0, 1.0]), np.array([1.0, 0.0])  # slopes below 0 and above it
+    W = np.array([[2.0], [1.0], [0.0]])
+    plain = np.array([[1.0], [0.0], [-0.25]])
+
+    def evaluate(x: np.ndarray, derivative: bool):
+        side = up if x[0] >= 0 else down
+        r = np.array([*(side * x[0] + 0.1), 1.0 - 0.25 * x[0]])
+        return r, (np.array([*side, -0.25])[:, None] if derivative else None)
+
+    def kinks(x: np.ndarray) -> Kinks:
+        return Kinks(W, np.array(x), np.eye(1), np.array([x[0] >= 0]))
+
+    fit = gauss_newton(evaluate, np.array([0.5]), kinks=kinks)
+    gradients = [float(((plain + share * W).T @ fit.residual)[0]) for share in (0.0, 1.0)]
+    assert abs(fit.theta[0]) < 1e-3 and gradients[0] < -0.1 and gradients[1] > 0.1
+    assert abs(float((fit.jacobian.T @ fit.residual)[0])) < 1e-6
+
+
 @pytest.mark.parametrize(("creep", "scatter"), [(False, 0.0), (True, 0.0), (False, 0.01)])
 def test_zeros_on_both_sides_are_predicted(creep: bool, scatter: float) -> None:
     robot = arm((4, 1, 1))

@@ -14,6 +14,7 @@ from femsense.effects import find_effect
 from femsense.effects.shape import finer_mesh, robot_on_mesh
 from femsense.fem.equilibrium import solve_equilibrium
 from femsense.loop import improve
+from femsense.loop.conclude import _excess, _lacks
 from femsense.loop.data import Data, prepare
 from femsense.loop.grow import MOUNTED, tilt_cost
 from femsense.loop.mesh_error import SHARE, VARIES, make_finer, mesh_errors, with_mesh_errors
@@ -82,6 +83,37 @@ def test_left_out_sweeps_are_predicted_as_by_fits_without_them():
     gains = [density(J, np.flatnonzero(sweep == s)) - density(J[:, :3], np.flatnonzero(sweep == s)) for s in range(3)]
     assert got == pytest.approx(sum(gains), rel=1e-8)
     assert spread == pytest.approx(np.sqrt(3) * np.std(gains, ddof=1), rel=1e-8)
+
+
+def test_a_direction_that_one_sweep_alone_decides_says_nothing_where_that_is_left_out():
+    groups = some_groups()
+    n = 3 * len(groups.marker)
+    trial = SimpleNamespace(groups=groups, poses=(), together=False)
+    J, r = RNG.normal(size=(n, 6)), RNG.normal(size=n)
+    only = np.where(np.repeat(groups.sweep, 3) == 1, RNG.normal(size=n), 0.0)
+    J = np.column_stack([only, J])
+    small, large = linear_fit(J[:, :4], r), linear_fit(J, r)
+    large.fit.residual = large.fit.residual + 1e-3 * only  # a fit ends near its optimum
+    assert abs(sweeps_predicted([trial], small, large)[0]) < 100.0
+
+
+def leaving(train: float, held: float) -> SimpleNamespace:
+    """Return what the verdict asks of a stage that leaves residuals of such sizes [m] at 5 markers in 12 frames."""
+    values = [size * np.sign(RNG.normal(size=(60, 3))) for size in (train, held)]
+    return SimpleNamespace(fit=SimpleNamespace(jets=[SimpleNamespace(residual=values[0])]), held_residuals=[values[1]])
+
+
+def test_a_verdict_asks_what_the_robot_that_is_handed_back_leaves():
+    noise = Noise({"white": 1e-4}, "")
+    trial = SimpleNamespace(groups=some_groups(), mesh_error=None)
+    data = SimpleNamespace(train=[trial], held=[trial])
+    before, right = leaving(1e-3, 1e-3), leaving(1.2e-4, 1.2e-4)
+    assert _excess(data, before, right, right, noise).explained > 0.99
+    assert _excess(data, before, right, leaving(1e-3, 7e-4), noise).explained == pytest.approx((1.0 - 0.49) / 0.99)
+    assert _excess(data, before, leaving(7e-4, 1e-4), right, noise).explained == pytest.approx((1.0 - 0.49) / 0.99)
+    assert not _lacks(data, right, right, noise)
+    assert not _lacks(data, before, before, noise)  # whatever calibration may move leaves as much
+    assert _lacks(data, leaving(1.2e-4, 3e-4), right, noise) and _lacks(data, leaving(3e-4, 1.2e-4), right, noise)
 
 
 def with_error_of_the_mesh(noise: Noise) -> tuple[Recording, Stage, Data]:
