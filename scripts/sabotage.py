@@ -80,7 +80,6 @@ SABOTAGES = (
     S("fem/series.py", "right = np.append(covariance[:k, k], 1.0)", "right = np.append(covariance[:k, k], 0.0)", "test_fem_tracker.py::test_weights_carry_on_what_is_smooth_in_the_state_and_know_their_doubt"),
     S("fem/series.py", "1.0 - solution @ right", "1.0 - solution[:k] @ solution[:k]", "test_fem_tracker.py::test_weights_carry_on_what_is_smooth_in_the_state_and_know_their_doubt"),
     S("fem/series.py", "np.full(len(c.path), t)", "np.full(len(c.path), -t)", "test_fem_tracker.py::test_each_term_of_a_series_raises_the_order_of_its_error"),
-    S("fem/tracker.py", "SAFETY * shrink / (1.0 - shrink)", "0.05 * shrink / (1.0 - shrink)", "test_fem_tracker.py::test_errors_are_reported_honestly_where_inputs_jitter test_fem_tracker.py::test_every_frame_is_near_the_full_solution_and_within_its_error"),
     S("fem/linear.py", "weakref.finalize(self, pattern.idle.append, handle)", "pattern.idle.append(handle)", "test_fem_linear.py::test_factors_alive_at_once_keep_their_own_values"),
     S("fem/linear.py", "self.negative = int(handle.iparm[22])", "self.negative = int(handle.iparm[21])", "test_fem_linear.py::test_an_indefinite_matrix_is_seen_as_such"),
     S("fem/linear.py", "pivots <= 0", "pivots >= 0", "test_fem_linear.py::test_solutions_are_those_of_the_dense_matrix"),
@@ -92,8 +91,6 @@ SABOTAGES = (
     S("fem/iterative.py", "weights[:, 0, 4], weights[:, 0, 5] = z, -y", "weights[:, 0, 4], weights[:, 0, 5] = z, y", "test_fem_iterative.py::test_the_coarse_space_holds_the_rigid_motions"),
     S("fem/linear.py", "<= MEMORY_SHARE * available_memory())", ">= MEMORY_SHARE * available_memory())", "test_fem_iterative.py::test_memory_chooses"),
     # cables
-    S("fem/cables.py", "(np.eye(3) - d[:, :, None] * d[:, None, :])", "(np.eye(3) + d[:, :, None] * d[:, None, :])", "test_fem_cables.py::test_geometric_stiffness_is_the_slope_of_the_cable_forces"),
-    S("fem/cables.py", "forces[1:] -= pull[:-1]", "forces[1:] += pull[:-1]", "test_fem_cables.py::test_pull_rows_are_the_slope_of_the_shortening"),
     S("fem/cables.py", "cable_length(c, rest) - cable_length(c, positions)", "cable_length(c, positions) - cable_length(c, rest)", "test_fem_cables.py::test_pull_rows_are_the_slope_of_the_shortening"),
     S("fem/cables.py", "inner = tensions[j]", "inner = motor_tension", "test_fem_cables.py::test_rubbing_is_that_of_the_definition"),
     S("fem/cables.py", "span = np.exp(cable.friction * angles[j])", "span = np.exp(cable.friction * np.degrees(angles[j]))", "test_fem_cables.py::test_pulling_loses_sticking_keeps_letting_go_gains"),
@@ -155,7 +152,7 @@ SABOTAGES = (
     S("calib/fit.py", "part = (Vt.T * inverse**2) @ Vt", "part = (Vt.T * inverse) @ Vt", "test_calib_fit.py::test_a_linear_problem_takes_one_step"),
     S("calib/fit.py", "np.concatenate([-r, np.zeros(p)]) if damping > 0 else -r", "np.concatenate([r, np.zeros(p)]) if damping > 0 else r", "test_calib_fit.py::test_it_finds_the_least_squares_of_scipy"),
     S("calib/forward.py", "points * (distance - seen.depth_offset)", "points * (distance + seen.depth_offset)", "test_effects.py::test_depth_is_undone_as_it_was_made"),
-    S("calib/forward.py", "return np.asarray(measured - predicted.reshape(-1, 3))", "return measured - 1e3 * predicted.reshape(-1, 3)", "test_calib_calibrate.py::test_exact_markers_give_pose_and_inputs_back"),
+    S("calib/forward.py", "scene.points - expected)", "scene.points - 1e3 * expected)", "test_calib_calibrate.py::test_exact_markers_give_pose_and_inputs_back"),
     S("calib/forward.py", "columns.append((marker_residual(robot, scene, moved, model) - residual) / step[j])", "columns.append((marker_residual(robot, scene, moved, model) - residual) / step[0])", "test_calib_calibrate.py::test_derivatives_of_residuals_are_differences"),
     S("calib/calibrate.py", "freedom = max(rows - parameters, 1.0)", "freedom = max(4.0 * rows, 1.0)", "test_calib_calibrate.py::test_errors_reach_the_cramer_rao_bound_and_are_as_large_as_stated"),
     S("calib/calibrate.py", "return np.asarray(np.sqrt(np.minimum(1.0, 3.5 * scale / np.maximum(distance, 1e-300))))", "return np.ones(len(distance))", "test_calib_calibrate.py::test_an_outlier_does_little_and_hardly_widens_what_is_stated"),
@@ -166,7 +163,7 @@ SABOTAGES = (
     S("loop/predict.py", "mixed[values < OPEN] = 0.0", "pass", "test_loop_parts.py::test_a_direction_that_one_sweep_alone_decides_says_nothing_where_that_is_left_out"),
     S("loop/conclude.py", "return any(own > LACKS * max(full, 1.0) for own, full in (train, held))", "return False", "test_loop_parts.py::test_a_verdict_asks_what_the_robot_that_is_handed_back_leaves"),
     S("loop/grow.py", "_to_the_end(data, stage, r, noise) if r.score", "r if r.score", "test_loop_exchange.py::test_a_refit_that_could_win_goes_to_its_end"),
-    S("loop/zeros.py", "if ahead > BETTER:", "if False:", "test_loop_zeros.py::test_weight_on_one_mount_takes_the_place_of_zeros_that_moved"),
+    S("loop/zeros.py", "takes = ahead > BETTER or", "takes = False and", "test_loop_zeros.py::test_weight_on_one_mount_takes_the_place_of_zeros_that_moved"),
     S("loop/zeros.py", "if not moved_nuisance(data, stage, ZEROS):", "if False:", "test_loop_zeros.py::test_zeros_that_are_right_are_not_asked_about"),
     S("loop/noise.py", "return np.asarray(rows - np.tensordot(whitener.directions * whitener.shrink, along, axes=1))", "return rows", "test_loop_parts.py::test_whitening_takes_fields_that_count_as_noise"),
     S("loop/noise.py", "kernel = Pr.shape[1] * inverse - inner - outer", "kernel = Pr.shape[1] * inverse - outer", "test_loop_parts.py::test_the_gradient_of_the_likelihood_is_its_difference"),
@@ -179,7 +176,6 @@ SABOTAGES = (
     S("loop/joint.py", "spans.append(spans[-1])", "spans.append(slice(at, at + trial.size))", "test_loop_clouds.py::test_rows_are_what_the_true_pose_says_and_markers_and_clouds_share_it"),
     S("loop/predict.py", "inner = np.eye(B.shape[1]) - B.T @ B", "inner = np.eye(B.shape[1]) + B.T @ B", "test_loop_parts.py::test_left_out_sweeps_are_predicted_as_by_fits_without_them"),
     S("march.py", "turned = turned_step(body, x, move)", "turned = turned_step(body, x, -move)", "test_loop_parts.py::test_the_error_of_the_mesh_is_what_the_finer_mesh_adds"),
-    S("calib/forward.py", "seen_at = _as_predicted(robot, scene, poses, model) if noiseless else scene", "seen_at = scene", "test_loop_parts.py::test_columns_for_screening_do_not_hold_the_noise_of_measured_points"),
     S("calib/forward.py", "known.get(name, -1) for name in recording.marker_names", "i for i, name in enumerate(recording.marker_names)", "test_loop_invariance.py::test_the_verdict_is_the_same_however_it_is_told[markers and cables reordered]"),
     S("frames.py", "return [given.index(name) for name in wanted]", "return list(range(len(wanted)))", "test_loop_invariance.py::test_the_verdict_is_the_same_however_it_is_told[markers and cables reordered]"),
     S("loop/screen.py", "return [tuple(part) for part in parts.values()]", "return []", "test_loop_parts.py::test_parts_are_cables_markers_and_keys"),
@@ -299,6 +295,9 @@ def shown(sabotage: Sabotage) -> str:
 def main(arguments: list[str]) -> int:
     words = [word for word in arguments if not word.startswith("--")]
     chosen = [s for s in SABOTAGES if not words or any(word in s.file or word in s.tests for word in words)]
+    if not chosen:
+        print(f"no file and no test of an entry contains {' or '.join(words)}")
+        return 1
     if "--list" in arguments:
         print(*map(shown, chosen), sep="\n")
         return 0
