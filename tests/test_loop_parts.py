@@ -17,11 +17,12 @@ from femsense.loop import improve
 from femsense.loop.conclude import _excess, _lacks
 from femsense.loop.data import Data, prepare
 from femsense.loop.grow import MOUNTED, tilt_cost
+from femsense.loop.joint import Prior
 from femsense.loop.mesh_error import SHARE, VARIES, make_finer, mesh_errors, with_mesh_errors
 from femsense.loop.noise import Groups, Noise, _Likelihood, whiten
 from femsense.loop.predict import sweeps_predicted
 from femsense.loop.screen import _parts, penalty
-from femsense.loop.stages import Stage, make_stage, with_nuisance
+from femsense.loop.stages import Stage, keeping, make_stage, with_nuisance, with_seeds_still
 from femsense.loop.structure import structure_tests, without_mesh_error
 from femsense.recording import Recording
 
@@ -249,3 +250,21 @@ def test_the_numbers_of_a_seed_cost_as_much_as_parameters():
     place = {"center_m": [0.0, 0.0, 0.0], "radius_m": 0.1}
     assert penalty(1, place, 1, 10, 1000.0) == pytest.approx(5 * np.log(1000.0) + 2 * np.log(10))
     assert penalty(0, {"law": "neo_hookean"}, 1, 10, 1000.0) == pytest.approx(2 * np.log(10))
+
+
+def test_times_that_are_held_still_stay_where_the_fit_had_them():
+    inputs, labels = sweeps(each=1)
+    robot, noise, creep, seed = arm((4, 1, 1)), Noise({"white": 1e-4}, ""), find_effect("creep"), {"time_s": 2.0}
+    hidden = [{"name": "creep", "fraction": 0.2, "time_s": 3.0}]
+    recording, _ = record(inputs, labels=labels, truth=robot, effects=hidden)
+    data = prepare(robot, [recording], [])
+    parameters = (*creep.parameters(robot, "tension"), *creep.polish(robot, "tension", seed))
+    start, flat = np.array([0.1, np.log(5.0)]), Prior(np.zeros(2), np.full(2, np.inf))
+    stage = make_stage(data, Hypothesis(robot, ((creep, seed, parameters),)), flat, noise, start, max_iterations=2)
+    still = with_seeds_still(data, stage)
+    assert [p.key for p in still.fit.hypothesis.parameters] == ["fraction"]
+    assert still.fit.hypothesis.entries(still.fit.coordinates) == stage.fit.hypothesis.entries(stage.fit.coordinates)
+    again = keeping(data, still, ["creep"], noise)
+    (_, held, _), time_s = again.fit.hypothesis.terms[0], stage.fit.hypothesis.entries(stage.fit.coordinates)[0]["time_s"]
+    assert held["time_s"] == time_s != 2.0
+    assert again.fit.std.shape == (1,) and again.fit.chi2 < 1.1 * stage.fit.chi2

@@ -20,7 +20,7 @@ from femsense.loop.noise import Noise, whiten
 from femsense.loop.result import LoopResult
 from femsense.loop.screen import NUISANCE, TESTABLE, Candidate, confounding, one_each
 from femsense.loop.spread import spreads
-from femsense.loop.stages import Stage, held_chi2, keeping
+from femsense.loop.stages import Stage, held_chi2, keeping, with_seeds_still
 from femsense.loop.structure import describe_left, structure_tests, without_mesh_error
 from femsense.loop.zeros import InPlace, moved_nuisance, zeros_are_evident
 
@@ -122,6 +122,8 @@ def _worth_handing_back(data: Data, search: Search, promoted: list[str], names: 
     from the last one on, what would make the error on held-out data larger than it was, or goes to the edge of what is plausible."""
     while names:
         back = _handed_back(data, search.final, names, search.noise)
+        if back is not None and at_edge(back.fit):
+            back = _handed_back(data, with_seeds_still(data, search.final), names, search.noise)
         strayed = back is not None and "stiffness" in at_edge(back.fit, nuisance=True)
         if back is not None and not strayed and not at_edge(back.fit) and _holds_out(data, search, back):
             return names, back

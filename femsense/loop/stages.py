@@ -122,6 +122,31 @@ def keeping(
     )
 
 
+def with_seeds_still(data: Data, stage: Stage) -> Stage:
+    """Return a stage whose places and times, which were fitted along at last, are part of the seeds, as they are there.
+
+    A time that data see the beginning of only runs off to the end of its range where the rest is fitted again.
+    """
+    fit, terms, keep = stage.fit, list[tuple[Effect, Entry, tuple[Parameter, ...]]](), list[bool]()
+    for (effect, seed, parameters), entry in zip(fit.hypothesis.terms, fit.hypothesis.entries(fit.coordinates)):
+        own = {p.key for p in effect.parameters(data.robot, data.control)}
+        mask = [p.key in own for p in parameters]
+        still = {p.key: entry[p.key] for p, kept in zip(parameters, mask) if not kept}
+        terms.append((effect, {**seed, **still}, tuple(p for p, kept in zip(parameters, mask) if kept)))
+        keep += mask
+    kept = np.array(keep, dtype=bool)
+    theta = np.concatenate([fit.fit.theta[: fit.own], fit.coordinates[kept]])
+    prior = Prior(fit.prior.mean[kept], fit.prior.std[kept])
+    less = replace(
+        fit,
+        hypothesis=replace(fit.hypothesis, terms=tuple(terms)),
+        prior=prior,
+        fit=replace(fit.fit, theta=theta),
+        jets=jets_without(stage, kept),
+    )
+    return replace(stage, fit=less)
+
+
 def _some_terms(stage: Stage, names: Sequence[str]) -> tuple[Hypothesis, Prior, BoolArray]:
     """Return the hypothesis and prior of a stage with some of its terms only, and which coordinates these have."""
     terms = stage.fit.hypothesis.terms
