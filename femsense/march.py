@@ -369,9 +369,10 @@ def _as_before(now: tuple[FloatArray, ...], then: tuple[FloatArray, ...], slack:
 
 
 def _clamp_fits(body: BodyModel, state: Equilibrium) -> bool:
-    """Return whether a state can serve as a start: a clamp that gave way elsewhere would be torn back."""
-    held = body.clamped if body.clamp_is_rigid else body.clamped[:0]
-    return bool(np.abs(state.positions[held] - body.mesh.nodes[held]).max(initial=0.0) < 1e-9)
+    """Return whether a state can serve as a start: a clamp that gave way elsewhere would be torn back, and one that has not yet would
+    let go of the whole load at once, which takes longer than the way from rest."""
+    given = np.abs(state.positions[body.clamped] - body.mesh.nodes[body.clamped]).max(initial=0.0)
+    return bool(given < 1e-9 if body.clamp_is_rigid else given > 0.0 or not len(body.clamped))
 
 
 Tensions = tuple[FloatArray, ...]

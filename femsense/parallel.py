@@ -12,7 +12,10 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import cache
 from typing import TypeVar
+
+from threadpoolctl import ThreadpoolController
 
 from femsense.errors import InputError
 
@@ -47,13 +50,16 @@ def workers() -> int:
 
 
 def each(function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
-    """Yield function(item) of each item in order; no more than two a thread are worked on ahead."""
+    """Yield function(item) of each item in order; no more than two a thread are worked on ahead.
+
+    Meanwhile BLAS takes one thread a call: with several, the threads would wait for those of each other's calls.
+    """
     count = workers()
     if count < 2:
         yield from map(function, items)
         return
     waiting: deque[Future[Result]] = deque()
-    with ThreadPoolExecutor(count) as pool:
+    with _blas().limit(limits=1, user_api="blas"), ThreadPoolExecutor(count) as pool:
         try:
             for item in items:
                 waiting.append(pool.submit(function, item))
@@ -64,6 +70,11 @@ def each(function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[
         finally:
             for future in waiting:
                 future.cancel()
+
+
+@cache
+def _blas() -> ThreadpoolController:
+    return ThreadpoolController()
 
 
 @contextmanager

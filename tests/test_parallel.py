@@ -7,6 +7,7 @@ import time
 
 import numpy as np
 import pytest
+import threadpoolctl
 from test_march import recording, robot
 
 from femsense import parallel
@@ -37,6 +38,22 @@ def test_results_come_in_order_and_little_is_worked_on_ahead():
 def test_one_worker_works_in_this_thread():
     set_workers(1)
     assert set(each(lambda _: threading.get_ident(), range(4))) == {threading.get_ident()}
+
+
+def test_blas_takes_one_thread_while_ours_work_and_has_its_own_back_afterwards():
+    set_workers(2)
+    blas = threadpoolctl.ThreadpoolController().select(user_api="blas")
+
+    def threads(_: int = 0) -> int:
+        return max(library["num_threads"] for library in blas.info())
+
+    with blas.limit(limits=2):
+        if threads() < 2:
+            pytest.skip("this BLAS has one thread")
+        assert set(each(threads, range(4))) == {1} and threads() == 2
+        with beside(lambda: list(each(threads, range(20)))):
+            list(each(threads, range(20)))
+        assert threads() == 2
 
 
 def test_the_first_error_arrives_and_the_rest_is_left():

@@ -240,10 +240,15 @@ def judged(
     least = ABOVE_MESH_IF_SURE if sure_beyond_mesh(better, spread, held, gain * held_share(data)) else ABOVE_MESH
     if fit_objection is None and moved < least * mesh:
         fit_objection = f"it moves the markers by {1e3 * moved:.3f} mm, the mesh itself by {1e3 * mesh:.3f} mm"
-    if fit_objection is None and made.fit.rms > NOT_PLAINLY_WORSE * stage.fit.rms:
+    if fit_objection is None and _plainly_worse(stage, made):
         fit_objection = f"the plain error grows where fitted ({1e3 * stage.fit.rms:.3f} mm, then {1e3 * made.fit.rms:.3f} mm)"
     record["verdict"] = fit_objection or "passes"
     return Refit(candidate, made, score, record)
+
+
+def _plainly_worse(before: Stage, after: Stage) -> bool:
+    """Return whether an effect makes the plain error larger where fitted, without a smaller one on held-out data."""
+    return after.fit.rms > NOT_PLAINLY_WORSE * before.fit.rms and after.held_rms > before.held_rms
 
 
 def tilt_cost(declared: Robot, candidate: Candidate, fit: JointFit) -> float:
