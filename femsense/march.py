@@ -38,6 +38,8 @@ TRIED = 1e-8
 """Relative tolerance of states that are only tried: below a thousandth of a millimetre, where derivatives want a tenth of it."""
 PARTS, SHORTEST_PART = 4, 6
 """Parts at most that frames are walked in side by side where each starts from the one before, and frames of a part at least."""
+GIVES = 1e-3
+"""A state with a rigid clamp is a start for one that gives by less than this share of the body at first."""
 PAST, PAST_TRIED = 1e-8, 1e-6
 """Tensions along a cable that agree so well [N], and as shares of the largest, are the same past; the latter for states that are only tried."""
 
@@ -253,8 +255,8 @@ def _base_states(
     walk: Walk, frames: list[int], starts: dict[int, Equilibrium] | None, past: bool, rough: bool
 ) -> Iterator[Equilibrium]:
     """Yield the states of frames, without their factors; `starts` gets them with these where they fit into memory."""
-    body, room = walk.robot.body, _room(len(frames))
-    near = {k: state for k, state in sorted((starts or {}).items()) if _clamp_fits(body, state)}
+    room = _room(len(frames))
+    near = {k: state for k, state in sorted((starts or {}).items()) if _clamp_fits(walk, k, state)}
 
     def keep(k: int, state: Equilibrium) -> Equilibrium:
         bare = replace(state, factor=None)
@@ -368,11 +370,14 @@ def _as_before(now: tuple[FloatArray, ...], then: tuple[FloatArray, ...], slack:
     return all(np.abs(a - b).max(initial=0.0) <= slack * max(1.0, float(a.max(initial=0.0))) for a, b in zip(now, then))
 
 
-def _clamp_fits(body: BodyModel, state: Equilibrium) -> bool:
-    """Return whether a state can serve as a start: a clamp that gave way elsewhere would be torn back, and one that has not yet would
-    let go of the whole load at once, which takes longer than the way from rest."""
-    given = np.abs(state.positions[body.clamped] - body.mesh.nodes[body.clamped]).max(initial=0.0)
-    return bool(given < 1e-9 if body.clamp_is_rigid else given > 0.0 or not len(body.clamped))
+def _clamp_fits(walk: Walk, frame: int, state: Equilibrium) -> bool:
+    """Return whether a state can serve as a start: a clamp that gave way elsewhere would be torn back, and one that gives by much, and
+    has not yet, would let go of the whole load at once, which takes longer than the way from rest."""
+    body, clamped = walk.robot.body, walk.robot.body.clamped
+    given = np.abs(state.positions[clamped] - body.mesh.nodes[clamped]).max(initial=0.0)
+    if body.clamp_is_rigid or given >= 1e-9:
+        return bool(given < 1e-9 or not body.clamp_is_rigid)
+    return bool(np.abs(first_give(body, _Balance(walk, frame, state).left())).max(initial=0.0) < GIVES * body.reach)
 
 
 Tensions = tuple[FloatArray, ...]

@@ -233,3 +233,18 @@ def test_a_fit_that_is_not_worth_it_is_given_up_before_its_own_jacobian() -> Non
         fit = gauss_newton(evaluate, start, borrowed=J, serves=0.25, worth=worth)
         assert fit.status == status and any(asked) == (status == "converged")
         assert fit.cost[-1] == pytest.approx(9.0, abs=0.01)
+
+
+def test_a_fit_whose_steps_promise_less_than_half_of_what_is_missing_is_given_up_with_its_own_jacobian_too() -> None:
+    asked: list[bool] = []
+    J = np.array([[1.0, 0.0], [0.0, 2.0], [0.0, 0.0]])
+
+    def evaluate(theta: np.ndarray, derivative: bool) -> tuple[np.ndarray, np.ndarray | None]:
+        asked.append(derivative)
+        return J @ theta + np.array([1.0, 1.0, 3.0]), J if derivative else None
+
+    start = np.zeros(2)  # 11, of which a step takes 2
+    fit = gauss_newton(evaluate, start, worth=6.9)
+    assert fit.status == "given up" and asked == [True] and fit.cost == (11.0,)
+    assert gauss_newton(evaluate, start, worth=7.1).status == "given up"  # tried, and no better than that
+    assert gauss_newton(evaluate, start, worth=9.1).cost[-1] == pytest.approx(9.0)

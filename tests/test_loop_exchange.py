@@ -73,7 +73,7 @@ def test_polishing_counts_as_the_evidence_that_it_brings_where_noise_is_larger_t
     data, base = started()
     better, _ = added(data, base, "payload", 1)
     table = screen_stage(data, base.fit, NOISE, fields_of(data, base, ["payload"]), COUNT)
-    rough = Refit(shortlist(table, first=True)[0], base, 100.0, {})
+    rough = Refit(shortlist(table, first=True)[0], base, 100.0, 100.0, {})
     monkeypatch.setattr(grow, "_polish", lambda *_: better)
     gained = polished(data, base, rough, NOISE, lambda text: None).score - 100.0
     assert gained == pytest.approx(evidence(base.fit, better.fit)) and gained < 0.9 * (base.fit.chi2 - better.fit.chi2)

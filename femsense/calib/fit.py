@@ -18,6 +18,7 @@ STILL = 1e-2
 """A step that changes the whitened residual by less than this is none."""
 
 
+GIVEN_UP = "given up"
 MOST_DAMPING = 1e8
 WIDTHS = 0.3, 0.1, 0.03, 0.01, 1e-3, 1e-5
 """How far kinks are rounded, in shares of the way that a plain step goes past them; one after the other."""
@@ -92,7 +93,8 @@ def gauss_newton(
         known: residual and Jacobian at the start, where they are known.
         borrowed: a Jacobian from near the start to begin with.
         serves: a Jacobian serves for another step where it missed the change of the residual by less than this share of it.
-        worth: a fit whose sum of squares stays above this is given up where a borrowed Jacobian says that nothing is left to gain.
+        worth: a fit whose sum of squares stays above this is given up: where a step promises less than half of what is missing, or a
+            borrowed Jacobian says that nothing is left to gain.
         kinks: θ → where the residual bends near by, for the Jacobian that was computed last.
     """
     from femsense.errors import DataError
@@ -109,12 +111,13 @@ def gauss_newton(
     while steps < max_iterations or not own:
         near = _Near(residual, jacobian, None if kinks is None else kinks(theta), low - theta, high - theta)
         step = near.step(damping)
-        change = near.change(step)
-        predicted = costs[-1] - float(np.sum((residual + change) ** 2))
+        change, predicted = near.change(step), near.promise(step)
         error = max(1.0, costs[-1] / max(len(residual), 1)) ** 0.5  # what a standard error is worth where the model misfits
         small = predicted <= tolerance * costs[-1] or np.linalg.norm(change) <= still * error
-        if not own and costs[-1] > worth and (small or steps >= max_iterations or costs[-1] - 2.0 * predicted > worth):
-            status = "given up"
+        plain = predicted if damping == 0.0 or costs[-1] <= worth else near.promise(near.step(0.0))
+        hopeless = costs[-1] - 2.0 * plain > worth
+        if costs[-1] > worth and (hopeless or (not own and (small or steps >= max_iterations))):
+            status = GIVEN_UP
             break
         if not own and (small or steps >= max_iterations):
             residual, jacobian, own = *_both(evaluate, theta), True
@@ -179,6 +182,10 @@ class _Near:
         if k is None:
             return np.asarray(self.J @ step)
         return np.asarray(self.plain @ step + k.columns @ (_cut(k.value + k.slope @ step, 0.0)[0] - _cut(k.value, 0.0)[0]))
+
+    def promise(self, step: FloatArray) -> float:
+        """Return by how much a step lowers the sum of squares."""
+        return float(np.sum(self.r**2) - np.sum((self.r + self.change(step)) ** 2))
 
     def step(self, damping: float) -> FloatArray:
         """Return the step that minimises the sum of squares + damping ‖scale · s‖² within bounds."""

@@ -20,7 +20,7 @@ from femsense.loop.noise import Noise, whiten
 from femsense.loop.result import LoopResult
 from femsense.loop.screen import NUISANCE, TESTABLE, Candidate, confounding, one_each
 from femsense.loop.spread import spreads
-from femsense.loop.stages import Stage, held_chi2, keeping, with_seeds_still
+from femsense.loop.stages import ROUGHLY, Stage, held_chi2, keeping, with_seeds_still
 from femsense.loop.structure import describe_left, structure_tests, without_mesh_error
 from femsense.loop.zeros import InPlace, moved_nuisance, zeros_are_evident
 
@@ -142,13 +142,13 @@ def _holds_out(data: Data, search: Search, back: Stage) -> bool:
     return worse <= NOISY and held_chi2(data, search.before, search.noise) - held_chi2(data, back, search.noise) > EVIDENCE
 
 
-def _handed_back(data: Data, final: Stage, names: list[str], noise: Noise) -> Stage | None:
+def _handed_back(data: Data, final: Stage, names: list[str], noise: Noise, most: int = 12) -> Stage | None:
     """Return the fit of some names alone; None where it has no equilibrium in some state."""
     settled = [effect.name for effect, _ in final.fit.hypothesis.settled]
     if set(final.fit.hypothesis.names) <= {*names, *settled}:
         return final
     try:
-        return keeping(data, final, names, noise)
+        return keeping(data, final, names, noise, max_iterations=most)
     except FemsenseError:
         return None
 
@@ -172,7 +172,7 @@ def _chain(
     stages = dict(search.history)
     errors = []
     for i in range(len(promoted) - (names == promoted)):  # the last one's is that of what is handed back
-        stage = _handed_back(data, stages[""], promoted[: i + 1], search.noise) or stages[""]
+        stage = _handed_back(data, stages[""], promoted[: i + 1], search.noise, ROUGHLY) or stages[""]
         errors.append(stage.held_rms)
     errors += [stages[name].held_rms for name in names[len(promoted) : -1]] + [back.held_rms] * bool(names)
     return [

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from femsense.arrays import FloatArray
+from femsense.calib.fit import GIVEN_UP
 from femsense.calib.forward import Hypothesis
 from femsense.effects import Effect, Entry, Parameter, find_effect
 from femsense.effects.loads import STANDARD_GRAVITY
@@ -28,6 +29,8 @@ REFITTABLE = 0.04
 """A candidate of which calibration leaves less than this is not refitted."""
 EVIDENCE = 10.0
 """dBIC that a named effect needs."""
+PROMISING = 2.5
+"""Linear dBIC that a candidate needs to be refitted: what is so small is nearly linear."""
 ENOUGH_SPREAD = 0.5
 """Standard errors by which the prediction of left-out sweeps must get better."""
 PREDICTS = 0.25
@@ -71,6 +74,8 @@ class Refit:
     stage: Stage
     score: float
     """dBIC of the nonlinear fit."""
+    gain: float
+    """Decrease of χ² less the cost: as linear scores are."""
     record: dict[str, Any]
     """What the report says of it."""
 
@@ -85,8 +90,9 @@ def grow(
     asked = _quadratic(data, stage, names, n_effective) if first else []
     screened = [c for c in shortlist(table, first=first) if not any(c.effect is a.effect and c.seed == a.seed for a in asked)]
     for candidate in [*asked, *screened]:
-        best = max((r.score for r in refits if r.record["verdict"] == "passes"), default=-np.inf)
-        if candidate.score < 0.5 * best - EVIDENCE:
+        ahead = [r for r in refits if r.record["verdict"] == "passes"]
+        best = max((r.score for r in ahead), default=-np.inf)
+        if candidate.score < max((0.5 * r.gain for r in ahead), default=-np.inf) - EVIDENCE:
             break  # far behind: a joint refit seldom gains that much on its linear score
         say(f"refitting with {candidate.effect.name}")
         record: dict[str, Any] = {"name": candidate.effect.name, "seed": candidate.seed}
@@ -169,7 +175,8 @@ def _richer(data: Data, stage: Stage, winner: Refit, form: Candidate, noise: Noi
     hypothesis, prior = with_term(stage.fit, form.effect, form.seed, form.parameters)
     try:
         coordinates = np.concatenate([winner.stage.fit.coordinates[:split], own])
-        return make_stage(data, hypothesis, prior, noise, coordinates, own=own_of(winner.stage), max_iterations=10)
+        worth = _within(winner.stage.fit, (form.cost - winner.candidate.cost + EVIDENCE - FORGONE[0]) / FORGONE[1])
+        return make_stage(data, hypothesis, prior, noise, coordinates, own=own_of(winner.stage), max_iterations=10, worth=worth)
     except FemsenseError:
         return None
 
@@ -192,7 +199,7 @@ def _added(stage: Stage) -> list[str]:
 
 def shortlist(table: list[Candidate], *, first: bool) -> list[Candidate]:
     """Return the best candidate of each name, in its simplest form (or forms, if several are equally simple), the best first."""
-    names = list(dict.fromkeys(c.effect.name for c in table if c.score > 0 and c.retained >= REFITTABLE))
+    names = list(dict.fromkeys(c.effect.name for c in table if c.score > PROMISING and c.retained >= REFITTABLE))
     chosen: list[Candidate] = []
     for name in names[: REFITS if first else (REFITS + 1) // 2]:
         forms = _forms(table, name)
@@ -243,7 +250,7 @@ def judged(
     if fit_objection is None and _plainly_worse(stage, made):
         fit_objection = f"the plain error grows where fitted ({1e3 * stage.fit.rms:.3f} mm, then {1e3 * made.fit.rms:.3f} mm)"
     record["verdict"] = fit_objection or "passes"
-    return Refit(candidate, made, score, record)
+    return Refit(candidate, made, score, stage.fit.chi2 - made.fit.chi2 - candidate.cost, record)
 
 
 def _plainly_worse(before: Stage, after: Stage) -> bool:
@@ -278,6 +285,12 @@ def evidence(before: JointFit, after: JointFit) -> float:
     return min(before.chi2 - after.chi2, freedom * float(np.log(before.chi2 / max(after.chi2, 1e-12))))
 
 
+def _within(fit: JointFit, price: float) -> float:
+    """Return the χ² below which a model with something more is better than a fit by so much evidence."""
+    freedom = max(len(fit.fit.residual) - len(fit.fit.theta), 1)
+    return min(fit.chi2 - price, fit.chi2 * float(np.exp(-price / freedom)))
+
+
 def _beyond(fit: JointFit, price: float) -> float:
     """Return the χ² beyond which a model without something is worse than a fit by so much evidence."""
     freedom = max(len(fit.fit.residual) - len(fit.fit.theta), 1)
@@ -298,7 +311,7 @@ def refit(data: Data, stage: Stage, candidate: Candidate, noise: Noise, *, wante
     shares = shares if candidate.effect.discrete else (0.0, 1.0, 0.3) if free else (1.0, 0.3, 0.0)  # a linear step may go too far
     answer = 0.0 if candidate.effect.discrete else candidate.response @ (start - null)  # of what is fitted already
     best: Stage | None = None
-    worth = stage.fit.chi2 - (candidate.cost + wanted - FORGONE[0]) / FORGONE[1]
+    worth = _within(stage.fit, (candidate.cost + wanted - FORGONE[0]) / FORGONE[1])
     for share in shares:
         theta = _declared(data, stage, hypothesis, noise) if share == DECLARED else stage.fit.fit.theta + share * answer
         coordinates = np.concatenate([theta[stage.fit.own :], null + share * (start - null)])
@@ -315,6 +328,8 @@ def refit(data: Data, stage: Stage, candidate: Candidate, noise: Noise, *, wante
             best = made
         if best is not None and (known is None or stage.fit.chi2 - best.fit.chi2 > PROMISED * candidate.gain):
             return best
+        if made.fit.fit.status == GIVEN_UP:
+            return made
     if best is not None:
         return best
     raise DataError("no start from which the fit improves")
@@ -400,6 +415,8 @@ def _objection(made: Stage, candidate: Candidate, score: float) -> str | None:
     """Return why an effect is not accepted, or None."""
     q = len(candidate.parameters)
     std = made.fit.std[len(made.fit.std) - q :]
+    if score <= EVIDENCE and made.fit.fit.status == GIVEN_UP:
+        return "given up: a step promised too little beside the best"
     if score <= EVIDENCE:
         return f"too little evidence (dBIC {score:.1f})"
     if not np.isfinite(std).all():
