@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+
 import numpy as np
 import pytest
 from arm import arm, record, sweeps
@@ -35,6 +37,16 @@ def test_a_wrong_modulus_is_named_stiffness_and_nothing_else():
     assert [e["name"] for e in loop.effects] == ["stiffness"]
     assert found(loop, "stiffness")["parameters"]["scale"]["value"] == pytest.approx(1.25, rel=0.06)
     assert loop.robot.body.material.young_modulus[0] == pytest.approx(1.25 * 300e3, rel=0.06)
+
+
+def test_what_is_taken_away_by_what_nobody_names_is_left(monkeypatch: pytest.MonkeyPatch):
+    inputs, labels = sweeps()
+    recording, _ = record(inputs, effects=[{"name": "stiffness", "scale": 1.25}], labels=labels, truth=arm())
+    monkeypatch.setattr(sys.modules["femsense.loop.conclude"], "_promoted", lambda data, search: [])
+    loop = improve(arm(), [recording])
+    assert loop.verdict == "unexplained" and not loop.effects
+    assert loop.left["rms_m"] > 0.8 * loop.before["train_rms_m"] > 5.0 * loop.noise_m  # but for the error of the mesh
+    assert loop.left["structure"]["significant"] and loop.evidence["tests"]["after"]["structure"]["significant"]
 
 
 def test_a_model_that_lacks_nothing_is_told_so():

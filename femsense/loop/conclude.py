@@ -69,11 +69,14 @@ def conclude(data: Data, search: Search, rng: np.random.Generator) -> LoopResult
     entries = _entries(back, names)
     spread = spreads(data, final, noise, _seed_spread(search))
     effects = _chain(data, search, promoted, names, back, spread)
-    residuals = [without_mesh_error(t, jet.residual, noise) for t, jet in zip(data.train, final.fit.jets)]
+    lacks = _lacks(data, back, final, noise)
+    shown = back if lacks else final  # what nuisances take away unnamed is left, too
+    residuals = [without_mesh_error(t, jet.residual, noise) for t, jet in zip(data.train, shown.fit.jets)]
     tests = structure_tests(data.train, residuals, rng=rng)
     excess = _excess(data, before, final, back, noise)
-    unexplained = tests.significant and excess.left > excess.tolerated and (strayed or excess.explained < EXPLAINED)
-    unexplained = unexplained or _lacks(data, back, final, noise)
+    unexplained = lacks or (
+        tests.significant and excess.left > excess.tolerated and (strayed or excess.explained < EXPLAINED)
+    )
     verdict = "unexplained" if unexplained else "effects" if effects else "none"
     rivals = _confounded(search, names)
     not_testable = [
@@ -107,7 +110,7 @@ def conclude(data: Data, search: Search, rng: np.random.Generator) -> LoopResult
         declared=data.declared,
         data=_card(data, final, spread, noise, search.n_effective),
         residuals=_residual_table(data, before, back),
-        evidence=gather(data, before, search.history[0][1], final, back, noise, search.first, search.last, tests, rng),
+        evidence=gather(data, before, search.history[0][1], final, back, shown, noise, search.first, search.last, tests, rng),
     )
 
 

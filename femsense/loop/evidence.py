@@ -38,7 +38,7 @@ REPEATS = 6
 
 
 def gather(
-    data: Data, before: Stage, base: Stage, final: Stage, back: Stage, noise: Noise,
+    data: Data, before: Stage, base: Stage, final: Stage, back: Stage, shown: Stage, noise: Noise,
     first: list[Candidate], last: list[Candidate], after_tests: StructureTests, rng: np.random.Generator,
 ) -> dict[str, Any]:  # fmt: skip
     """Return the content of `evidence` in loop.json.
@@ -47,7 +47,7 @@ def gather(
         data: the recordings, split.
         before: the declared model, calibrated.
         base: with all that calibration may move.
-        final: with the effects, everything free; `back`: what is handed back.
+        final: with the effects, everything free; `back`: what is handed back; `shown`: that of the two whose residual is what is left.
         noise: at the end.
         first, last: the first and the last screening.
         after_tests: tests of structure at the end.
@@ -66,13 +66,13 @@ def gather(
         "calibration": _calibration(data, {"before": before, "nuisance": base, "after": final}),
         "tests": {
             "before": _tests(data.train, cleaned, before.fit, structure_tests(data.train, cleaned, rng=rng)),
-            "after": _tests(data.train, [without_mesh_error(t, j.residual, noise) for t, j in zip(data.train, final.fit.jets)], final.fit, after_tests),
+            "after": _tests(data.train, [without_mesh_error(t, j.residual, noise) for t, j in zip(data.train, shown.fit.jets)], shown.fit, after_tests),
         },
         "power": _power(last),
         "excluded": [_excluded(data.train[i].scene.recording, data) for i in heads_of(data.train)],
         "repeats": sum(_repeats(data.train[i]) for i in heads_of(data.train)),
         "forces": force_consequence(old, new, noise),
-        "equivalent_forces": equivalent_forces([v for v in views_of(data, final) if not v.held_out], noise),
+        "equivalent_forces": equivalent_forces([v for v in views_of(data, shown) if not v.held_out], noise),
     })  # fmt: skip
     return found
 
