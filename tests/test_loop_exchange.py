@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +18,7 @@ from femsense.loop.noise import Noise
 from femsense.loop.screen import Candidate
 from femsense.loop.stages import Stage, fields_of, make_stage, own_of, screen_stage, with_nuisance
 
+beside_a_tie = sys.modules["femsense.loop.improve"]._beside_a_tie
 NOISE = Noise({"white": 1e-4}, "")
 COUNT = 300.0
 HIDDEN = [
@@ -101,7 +104,37 @@ def test_a_refit_that_could_win_goes_to_its_end(monkeypatch: pytest.MonkeyPatch)
 
     monkeypatch.setattr(grow, "refit", cut_short)
     monkeypatch.setattr(grow, "_polish", lambda data, stage, winner, *_: winner.stage)
-    winner, records = grow.grow(data, base, table, NOISE, ["payload"], COUNT, lambda text: None)
-    assert winner is not None and winner.fit.fit.status == "converged"
-    assert winner.fit.chi2 == pytest.approx(whole.fit.chi2, rel=0.02)
-    assert records[0]["dchi2"] == pytest.approx(evidence(base.fit, winner.fit))
+    winner, _, records = grow.grow(data, base, table, NOISE, ["payload"], COUNT, lambda text: None)
+    assert winner is not None and winner.stage.fit.fit.status == "converged"
+    assert winner.stage.fit.chi2 == pytest.approx(whole.fit.chi2, rel=0.02)
+    assert records[0]["dchi2"] == pytest.approx(evidence(base.fit, winner.stage.fit))
+
+
+def test_what_goes_with_an_effect_that_was_as_good_is_found_beside_it():
+    data, base = started()
+    wrong, _ = added(data, base, "gravity", 1)
+    table = screen_stage(data, base.fit, NOISE, fields_of(data, base, ["cable_gain"]), COUNT)
+    candidate = (shortlist(table, first=True) or table)[0]
+    tie = Refit(candidate, refit(data, base, candidate, NOISE), 0.0, 0.0, {})
+    instead, both, tried = beside_a_tie(data, wrong, tie, NOISE, ["payload"], COUNT, lambda text: None)
+    assert both is not None and both.candidate.effect.name == "payload" and tried[-1]["verdict"] == "named"
+    assert instead.fit.hypothesis.names[-1] == "cable_gain"
+    assert both.stage.fit.hypothesis.names[-2:] == ("cable_gain", "payload")
+    assert beside_a_tie(data, both.stage, tie, NOISE, ["payload"], COUNT, lambda text: None)[1] is None
+
+
+def test_a_place_is_improved_before_a_refit_is_turned_down_for_what_it_predicts(monkeypatch: pytest.MonkeyPatch):
+    data, base = started()
+    table = screen_stage(data, base.fit, NOISE, fields_of(data, base, ["payload"]), COUNT)
+    asked = list[str]()
+
+    def strict(data: Data, stage: Stage, candidate: Candidate, made: Stage, record: dict[str, Any], noise: Noise) -> Refit:
+        own = judged(data, stage, candidate, made, record, noise)
+        record["verdict"] = "passes" if asked else "it does not predict"
+        asked.append(candidate.effect.name)
+        return own
+
+    monkeypatch.setattr(grow, "judged", strict)
+    monkeypatch.setattr(grow, "_polish", lambda data, stage, winner, *_: replace(winner.stage))
+    winner, _, records = grow.grow(data, base, table, NOISE, ["payload"], COUNT, lambda text: None)
+    assert winner is not None and asked[:2] == ["payload", "payload"] and records[0]["verdict"] == "named"

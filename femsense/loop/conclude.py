@@ -74,9 +74,7 @@ def conclude(data: Data, search: Search, rng: np.random.Generator) -> LoopResult
     residuals = [without_mesh_error(t, jet.residual, noise) for t, jet in zip(data.train, shown.fit.jets)]
     tests = structure_tests(data.train, residuals, rng=rng)
     excess = _excess(data, before, final, back, noise)
-    unexplained = lacks or (
-        tests.significant and excess.left > excess.tolerated and (strayed or excess.explained < EXPLAINED)
-    )
+    unexplained = lacks or (tests.significant and excess.left > excess.tolerated and (strayed or excess.explained < EXPLAINED))
     verdict = "unexplained" if unexplained else "effects" if effects else "none"
     rivals = _confounded(search, names)
     not_testable = [

@@ -112,4 +112,4 @@ def _without(data: Data, history: History, without: Stage, name: str, noise: Noi
     return steps
 
 
-__all__ = ["exchanged"]
+__all__ = ["BETTER", "exchanged"]

@@ -82,8 +82,9 @@ class Refit:
 
 def grow(
     data: Data, stage: Stage, table: list[Candidate], noise: Noise, names: Sequence[str], n_effective: float, say: Progress
-) -> tuple[Stage | None, list[dict[str, Any]]]:
-    """Return the stage with one more effect, or None where nothing passes, and what became of each candidate that was refitted."""
+) -> tuple[Refit | None, list[Refit], list[dict[str, Any]]]:
+    """Return the effect that comes next, or None where nothing passes; others that are as good; and what became of each candidate that was
+    refitted."""
     refits: list[Refit] = []
     records: list[dict[str, Any]] = []
     first = not _added(stage)
@@ -105,16 +106,19 @@ def grow(
         refits.append(judged(data, stage, candidate, made, record, noise))
     best = max((r.score for r in refits if r.record["verdict"] == "passes"), default=np.inf)
     refits = [_to_the_end(data, stage, r, noise) if r.score > 0.5 * best - EVIDENCE else r for r in refits]
+    if not any(r.record["verdict"] == "passes" for r in refits):
+        refits = [_elsewhere(data, stage, r, noise, say) for r in refits]
     passing = [r for r in refits if r.record["verdict"] == "passes"]
     if not passing:
-        return None, records
+        return None, [], records
     # where evidence is close, what predicts better
     leaders = [r for r in passing if r.score > max(p.score for p in passing) - EVIDENCE]
     leaders = [polished(data, stage, r, noise, say) for r in leaders]
     winner = max(leaders, key=lambda r: r.score + r.record["cv_gain"] + weighs(data, r.candidate.effect.name))
     winner = _enriched(data, stage, winner, table, noise, say)
     winner.record["verdict"] = "named"
-    return winner.stage, records
+    ties = [r for r in leaders if r.candidate.effect.name != winner.candidate.effect.name]
+    return winner, sorted(ties, key=lambda r: -r.score), records
 
 
 def _to_the_end(data: Data, stage: Stage, refitted: Refit, noise: Noise) -> Refit:
@@ -133,6 +137,14 @@ def _to_the_end(data: Data, stage: Stage, refitted: Refit, noise: Noise) -> Refi
         known=fit.jets,
     )
     return judged(data, stage, refitted.candidate, made, refitted.record, noise)
+
+
+def _elsewhere(data: Data, stage: Stage, refitted: Refit, noise: Noise, say: Progress) -> Refit:
+    """Return a refit with evidence that does not predict as it should, judged again with its seed improved: its place may be to blame."""
+    if refitted.score <= EVIDENCE or not refitted.candidate.effect.nearby(data.robot, refitted.candidate.seed):
+        return refitted
+    better = polished(data, stage, refitted, noise, say)
+    return better if better is refitted else judged(data, stage, better.candidate, better.stage, better.record, noise)
 
 
 def polished(data: Data, stage: Stage, refitted: Refit, noise: Noise, say: Progress) -> Refit:
@@ -533,6 +545,7 @@ __all__ = [
     "ABOVE_MESH",
     "EVIDENCE",
     "Progress",
+    "Refit",
     "at_edge",
     "evidence",
     "grow",

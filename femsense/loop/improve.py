@@ -21,8 +21,8 @@ from femsense.effects import EFFECTS, FORMS, Effect, find_effect, load_own_effec
 from femsense.errors import FemsenseError
 from femsense.loop.conclude import Search, conclude
 from femsense.loop.data import Data, prepare
-from femsense.loop.exchange import exchanged
-from femsense.loop.grow import Progress, grow, mesh_cost, moved_by, prune
+from femsense.loop.exchange import BETTER, exchanged
+from femsense.loop.grow import Progress, Refit, evidence, grow, mesh_cost, moved_by, prune
 from femsense.loop.joint import Prior
 from femsense.loop.mesh_error import few_states, make_finer, with_mesh_errors
 from femsense.loop.noise import Noise
@@ -134,7 +134,7 @@ def _declared(data: Data, noise: Noise, start: Stage | None) -> Stage:
 def _search(data: Data, before: Stage, base: Stage, names: list[str], most: int, say: Progress) -> tuple[Data, Search]:
     """Screen, refit and add effects, at most so many, until none passes; return the data as the last model has them, and the search."""
     history: list[tuple[str, Stage]] = [("", base)]
-    stage, first, refits = base, list[Candidate](), list[dict[str, Any]]()
+    stage, first, refits, ties = base, list[Candidate](), list[dict[str, Any]](), list[Refit]()
     noise: Noise | None = None
     while True:
         found = len(history) - 1
@@ -151,11 +151,17 @@ def _search(data: Data, before: Stage, base: Stage, names: list[str], most: int,
         first = first or table
         if found >= most:
             break
-        winner, tried = grow(data, stage, table, noise, names, n_effective, say)
+        next_one, others, tried = grow(data, stage, table, noise, names, n_effective, say)
         refits += [{**record, "step": found + 1} for record in tried]
-        if winner is None:
+        if next_one is None and ties:
+            instead, next_one, tried = _beside_a_tie(data, stage, ties[0], noise, names, n_effective, say)
+            if next_one is not None:
+                history[-1] = (ties[0].candidate.effect.name, instead)
+                refits = [*_renamed(refits, found, history[-1][0]), *({**record, "step": found + 1} for record in tried)]
+                stage, others = instead, []
+        if next_one is None:
             break
-        name = next(n for n in winner.fit.hypothesis.names if n not in stage.fit.hypothesis.names)
+        name, winner, ties = next_one.candidate.effect.name, next_one.stage, others
         far = moved_by(stage, winner) > mesh_cost(data, stage, whole=True)
         stage = prune(data, winner, noise, n_effective, say)
         history.append((name, stage))
@@ -175,6 +181,28 @@ def _search(data: Data, before: Stage, base: Stage, names: list[str], most: int,
     if len(history) > 1 and "clouds" in data.measured:
         before = _declared(data, noise, before)  # before and after on the same patches
     return data, Search(before, history, stage, noise, n_effective, first, table, refits, swap)
+
+
+def _beside_a_tie(
+    data: Data, stage: Stage, tie: Refit, noise: Noise, names: Sequence[str], n_effective: float, say: Progress
+) -> tuple[Stage, Refit | None, list[dict[str, Any]]]:
+    """Return the model with what was as good as the last effect in its place, and what comes next there, or None: the two together must be
+    better than the stage. What hides behind a wrong one of two that look alike shows beside the right one."""
+    say(f"trying {tie.candidate.effect.name} in the place of the last one, and what goes with it")
+    instead = _again(data, tie.stage, noise)
+    table = screen_stage(data, instead.fit, noise, fields_of(data, instead, names), n_effective)
+    both, _, tried = grow(data, instead, table, noise, names, n_effective, say)
+    if both is None or evidence(stage.fit, both.stage.fit) - both.candidate.cost <= BETTER:
+        return instead, None, []
+    return instead, both, tried
+
+
+def _renamed(refits: list[dict[str, Any]], step: int, name: str) -> list[dict[str, Any]]:
+    """Return what became of candidates where another one is named at a step."""
+    said = {True: "named", False: "passes"}
+    return [
+        {**r, "verdict": said[r["name"] == name]} if r["step"] == step and r["verdict"] in said.values() else r for r in refits
+    ]
 
 
 def _again(data: Data, stage: Stage, noise: Noise, *, own_derivatives: bool = True) -> Stage:
