@@ -16,7 +16,7 @@ from femsense.fem.equilibrium import solve_equilibrium
 from femsense.loop import improve
 from femsense.loop.conclude import _excess, _lacks
 from femsense.loop.data import Data, prepare
-from femsense.loop.grow import MOUNTED, tilt_cost
+from femsense.loop.grow import MOUNTED, _plainly_worse, tilt_cost
 from femsense.loop.joint import Prior
 from femsense.loop.mesh_error import SHARE, VARIES, make_finer, mesh_errors, with_mesh_errors
 from femsense.loop.noise import Groups, Noise, _Likelihood, whiten
@@ -115,6 +115,15 @@ def test_a_verdict_asks_what_the_robot_that_is_handed_back_leaves():
     assert not _lacks(data, right, right, noise)
     assert not _lacks(data, before, before, noise)  # whatever calibration may move leaves as much
     assert _lacks(data, leaving(1.2e-4, 3e-4), right, noise) and _lacks(data, leaving(3e-4, 1.2e-4), right, noise)
+
+
+def test_the_plain_error_may_grow_where_fitted_if_that_on_held_out_data_falls():
+    def errors(train: float, held: float) -> SimpleNamespace:
+        return SimpleNamespace(fit=SimpleNamespace(rms=train), held_rms=held)
+
+    before = errors(1.0, 1.0)
+    assert _plainly_worse(before, errors(1.3, 1.1))
+    assert not _plainly_worse(before, errors(1.3, 0.9)) and not _plainly_worse(before, errors(1.2, 1.1))
 
 
 def with_error_of_the_mesh(noise: Noise) -> tuple[Recording, Stage, Data]:

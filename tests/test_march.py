@@ -268,3 +268,16 @@ def test_a_frame_without_equilibrium_names_itself() -> None:
     loose = replace(base, body=bar_body(block_mesh((4, 1, 1)), clamped=False, gravity=(0, 0, -9.81)))
     with pytest.raises(DataError, match="no equilibrium in frame 0: singular: nothing holds the body"):
         walked(loose, recording([[0.0, 0]]))
+
+
+def test_states_with_a_rigid_clamp_are_starts_for_one_that_gives_by_little_and_the_answer_does_not_depend_on_them() -> None:
+    rec = recording([[1.0, 0.0], [2.0, 0.5]])
+    rigid, starts = robot(), {}
+    walked(rigid, rec, starts=starts)
+    for stiffness, serves in ((1e6, True), (20.0, False)):
+        soft = robot([{"name": "base_compliance", "stiffness_n_m": stiffness}])
+        walk = Walk(soft, drive_of(soft, rec))
+        assert all(march._clamp_fits(walk, k, state) == serves for k, state in starts.items())
+        there = walked(soft, rec, starts=dict(starts))
+        for k, alone in walked(soft, rec).items():
+            np.testing.assert_allclose(there[k], alone, atol=1e-8)

@@ -428,7 +428,7 @@ def _objection(made: Stage, candidate: Candidate, score: float) -> str | None:
     q = len(candidate.parameters)
     std = made.fit.std[len(made.fit.std) - q :]
     if score <= EVIDENCE and made.fit.fit.status == GIVEN_UP:
-        return "given up: a step promised too little beside the best"
+        return "given up: a step promised too little"
     if score <= EVIDENCE:
         return f"too little evidence (dBIC {score:.1f})"
     if not np.isfinite(std).all():

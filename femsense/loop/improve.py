@@ -189,7 +189,7 @@ def _beside_a_tie(
     """Return the model with what was as good as the last effect in its place, and what comes next there, or None: the two together must be
     better than the stage. What hides behind a wrong one of two that look alike shows beside the right one."""
     say(f"trying {tie.candidate.effect.name} in the place of the last one, and what goes with it")
-    instead = _again(data, tie.stage, noise)
+    instead = _again(data, tie.stage, noise, own_derivatives="clouds" not in data.measured)
     table = screen_stage(data, instead.fit, noise, fields_of(data, instead, names), n_effective)
     both, _, tried = grow(data, instead, table, noise, names, n_effective, say)
     if both is None or evidence(stage.fit, both.stage.fit) - both.candidate.cost <= BETTER:
