@@ -709,7 +709,7 @@ def finer_state(walk: Walk, fine: Walk, frame: int, base: Equilibrium, ties: Emb
     """Return where the nodes of a finer mesh come to rest [m], shape (n, 3), nearly: Newton steps from a state of a coarser one.
 
     The finer mesh holds the coarse state exactly, but what it softens are single elements, so that two to four steps are needed, with
-    elements that turn along each of them. None where the steps do not settle.
+    elements that turn along each of them. None where the steps do not settle, or run away: far off, forces look small again.
 
     Tried on the bar of `benchmarks/improve.py`, without use: a preconditioner kept from the first step of a state takes as much time in
     further iterations as it saves, one of another state takes several times as long, and `FINER_ENOUGH` = 0.02 moves the error by a sixth.
@@ -722,7 +722,8 @@ def finer_state(walk: Walk, fine: Walk, frame: int, base: Equilibrium, ties: Emb
         ties: of the fine nodes to the coarse mesh.
     """
     body, balance = fine.robot.body, _Balance(walk, frame, base)
-    x, first = ties.positions(base.positions), np.inf
+    coarse, first = ties.positions(base.positions), np.inf
+    x = coarse
     for step in range(FINER_STEPS):
         force, pulled = balance.upset_by(fine, _rubbed(fine, frame, base, x), x)
         size = _unbalanced(body, base, x, force)
@@ -736,6 +737,8 @@ def finer_state(walk: Walk, fine: Walk, frame: int, base: Equilibrium, ties: Emb
             move = move + np.tensordot(pulled[base.held[: len(body.cables)]], tangent.respond_to_held(), axes=1)
         turned = turned_step(body, x, move)
         x = np.asarray(x + move) if turned is None else turned
+        if not np.abs(x - coarse).max() < body.reach:
+            return None
     return None
 
 
