@@ -182,6 +182,7 @@ SABOTAGES = (
     S("pointcloud/patches.py", "return np.asarray((w - height) / np.sqrt(1.0 + along_u**2 + along_v**2))", "return np.asarray(w - height)", "test_loop_clouds.py::test_a_patch_measures_the_distance_from_a_curved_surface_wherever_the_point_goes"),
     S("loop/joint.py", "spans.append(spans[-1])", "spans.append(slice(at, at + trial.size))", "test_loop_clouds.py::test_rows_are_what_the_true_pose_says_and_markers_and_clouds_share_it"),
     S("loop/predict.py", "inner = np.eye(B.shape[1]) - B.T @ B", "inner = np.eye(B.shape[1]) + B.T @ B", "test_loop_parts.py::test_left_out_sweeps_are_predicted_as_by_fits_without_them"),
+    S("march.py", "if not np.abs(x - coarse).max() < body.reach:", "if False:", "test_loop_parts.py::test_a_finer_state_that_runs_away_says_nothing_though_its_forces_look_small"),
     S("march.py", "turned = turned_step(body, x, move)", "turned = turned_step(body, x, -move)", "test_loop_parts.py::test_the_error_of_the_mesh_is_what_the_finer_mesh_adds"),
     S("calib/forward.py", "known.get(name, -1) for name in recording.marker_names", "i for i, name in enumerate(recording.marker_names)", "test_loop_invariance.py::test_the_verdict_is_the_same_however_it_is_told[markers and cables reordered]"),
     S("frames.py", "return [given.index(name) for name in wanted]", "return list(range(len(wanted)))", "test_loop_invariance.py::test_the_verdict_is_the_same_however_it_is_told[markers and cables reordered]"),

@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 from arm import T_ROBOT_CAMERA, arm, record, sweeps
 
+from femsense import march
 from femsense.calib.forward import Hypothesis, evaluate_scene, make_scene
 from femsense.effects import find_effect
 from femsense.effects.shape import finer_mesh, robot_on_mesh
 from femsense.fem.equilibrium import solve_equilibrium
+from femsense.fem.mesh import embed_points
 from femsense.loop import improve
 from femsense.loop.conclude import _excess, _lacks
 from femsense.loop.data import Data, prepare
@@ -24,6 +26,7 @@ from femsense.loop.predict import sweeps_predicted
 from femsense.loop.screen import _parts, penalty
 from femsense.loop.stages import Stage, keeping, make_stage, with_nuisance, with_seeds_still
 from femsense.loop.structure import structure_tests, without_mesh_error
+from femsense.march import Walk, drive_of, finer_state, solve_frame
 from femsense.recording import Recording
 
 RNG = np.random.default_rng(11)
@@ -161,6 +164,19 @@ def test_the_error_of_the_mesh_is_what_the_finer_mesh_adds():
     np.testing.assert_allclose(trial.mesh_error[:, :, 1:].sum(axis=2), VARIES * error)
     used = (trial.mesh_error[:, :, 1:] != 0).any(axis=1).sum(axis=1)
     assert used.max() == 1  # each row has the field of its own sweep
+
+
+def test_a_finer_state_that_runs_away_says_nothing_though_its_forces_look_small(monkeypatch: pytest.MonkeyPatch):
+    robot = arm((4, 2, 2))
+    fine = robot_on_mesh(robot, finer_mesh(robot.body.mesh, None, 1))
+    recording, _ = record(sweeps(each=1)[0][:2], truth=robot)
+    walk, fine_walk = (Walk(r, drive_of(r, recording)) for r in (robot, fine))
+    asked = walk, fine_walk, 1, solve_frame(walk, 1), embed_points(robot.body.mesh, fine.body.mesh.nodes)
+    assert finer_state(*asked) is not None
+    sizes = iter([1.0, 1e-6])
+    monkeypatch.setattr(march, "_unbalanced", lambda *_: next(sizes))
+    monkeypatch.setattr(march, "turned_step", lambda body, x, move: 1e3 * x)
+    assert finer_state(*asked) is None
 
 
 def test_one_share_of_the_mesh_error_in_all_sweeps_is_likelier_than_another_in_each():
