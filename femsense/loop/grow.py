@@ -61,7 +61,7 @@ POLISHED = 2.0
 MORE_STEPS = 30
 """Steps for a refit that could win and is still on its way after the first ones."""
 FORGONE = 2.0, 1.25
-"""A refit whose gain in χ² is too little by this much and this factor is given up before it has derivatives of its own."""
+"""A refit is given up where the evidence in sight is too little by this much and this factor."""
 
 Progress = Callable[[str], None]
 
@@ -312,7 +312,7 @@ def _beyond(fit: JointFit, price: float) -> float:
 def refit(data: Data, stage: Stage, candidate: Candidate, noise: Noise, *, wanted: float = EVIDENCE) -> Stage:
     """Joint fit with one more effect, started from its linear step. Raises DataError where no start helps.
 
-    Where the dBIC stays well below what is wanted, the fit ends without derivatives of its own.
+    Where the dBIC would stay well below what is wanted, the fit is given up on its way.
     """
     null = np.array([p.null for p in candidate.parameters])
     low, high = np.array([p.low for p in candidate.parameters]), np.array([p.high for p in candidate.parameters])
