@@ -386,6 +386,55 @@ Job = tuple[int, int, list[int]]
 """Variant, the frame it is computed in, and all frames that it is the same in."""
 
 
+class _Answers:
+    """The tangent of a base state, and what was solved with it."""
+
+    def __init__(self, tangent: Tangent, times: int) -> None:
+        self.tangent, self.times = tangent, times
+        """times: how often it is asked."""
+        self.own: dict[tuple[int, int], FloatArray | None] = {}
+        """(variant, frame) → its answer to the forces of the variant but for tensions [m], (n, 3); None: there are none."""
+        self.by_segment: dict[int, FloatArray] = {}
+        """Segment, of all cables → the answer to a unit tension along it [m/N], (n, 3)."""
+
+    @property
+    def bytes(self) -> int:
+        every = [*self.own.values(), *self.by_segment.values()]
+        return self.tangent.factor.bytes + sum(a.nbytes for a in every if a is not None)
+
+    def moves(
+        self, body: BodyModel, x: FloatArray, keys: list[tuple[int, int]], forces: dict[tuple[int, int], FloatArray], tensions: FloatArray
+    ) -> FloatArray:
+        """Return the answers [m], (v, n, 3), to forces [N], those of some variants and the others' as known, and tensions along the segments of all
+        cables [N], (v, s): sums of one answer for each segment where that takes fewer of them."""
+        asked = [key for key, force in forces.items() if force.any()]
+        pulling, used = np.flatnonzero(tensions.any(axis=1)), np.flatnonzero(tensions.any(axis=0)).tolist()
+        new = [s for s in used if s not in self.by_segment]
+        few = len(new) <= self.times * len(pulling)
+        pulls = _segment_forces(body, x, new if few else used)
+        columns = [*(forces[key] for key in asked), *(pulls if few else np.tensordot(tensions[pulling][:, used], pulls, axes=1))]
+        solved = self.tangent.respond(np.array(columns)) if columns else np.zeros((0, *x.shape))
+        self.own.update(dict.fromkeys(forces))
+        self.own.update(zip(asked, solved))
+        moves, rest = np.zeros((len(keys), *x.shape)), solved[len(asked) :]
+        if few:
+            self.by_segment.update(zip(new, rest))
+            rest = np.tensordot(tensions[pulling][:, used], np.array([self.by_segment[s] for s in used]), axes=1) if used else rest
+        moves[pulling] = rest
+        for move, key in zip(moves, keys):
+            own = self.own[key]
+            if own is not None:
+                move += own
+        return moves
+
+
+def _segment_forces(body: BodyModel, x: FloatArray, which: list[int]) -> FloatArray:
+    """Return the nodal forces of a unit tension along some segments of all cables [1], shape (s, n, 3)."""
+    units = [(cable, unit) for cable in body.cables for unit in np.eye(len(cable.path))]
+    forces = [cable_forces(units[s][0], x, units[s][1], len(x)) for s in which]
+    return np.array(forces) if forces else np.zeros((0, *x.shape))
+
+
 class _Variants:
     """What is observed of variants in the frames of a walk."""
 
@@ -411,7 +460,7 @@ class _Variants:
         self.rubbing = [i for i in every if own[i] and linear[i] and rubs[i]]
         self.along: dict[tuple[int, int], Tensions] = {}
         """(variant, frame) → tensions along its cables, of those that rub."""
-        self.kept: dict[int, Tangent] = {}
+        self.kept: dict[int, _Answers] = {}
         self.room = _room(len(set(alike.values())))
 
     def write(self) -> Iterator[tuple[int, Factorization]]:
@@ -463,9 +512,10 @@ class _Variants:
     def _bends(self, i: int, x: FloatArray) -> list[FloatArray]:
         return [bend_angles(c, x) if c.friction > 0 else np.zeros(len(c.path)) for c in self.variants[i].robot.body.cables]
 
-    def _tangent(self, k: int) -> Tangent:
+    def _answers(self, k: int) -> _Answers:
         few = len(self.plain) + len(self.rubbing) <= FEW_COLUMNS
-        return self.kept.pop(k, None) or tangent_at(self.walk.robot.body, self.bases[k], refined if few else factorize)
+        known = self.kept.pop(k, None)
+        return known or _Answers(tangent_at(self.walk.robot.body, self.bases[k], refined if few else factorize), 2 if self.rubbing else 1)
 
     def _jobs(self, group: list[int], which: Sequence[int]) -> list[Job]:
         """Return what is to be computed of some variants in frames with one base state."""
@@ -477,42 +527,46 @@ class _Variants:
         return list(jobs.values())
 
     def _bent(self, group: list[int]) -> tuple[int, Factorization, dict[tuple[int, int], list[FloatArray]]]:
-        """Return the bends of the variants that rub, as the first response leaves them; keep the tangent where all fit into memory."""
-        first, tangent = self.alike[group[0]], self._tangent(self.alike[group[0]])
-        if tangent.factor.bytes < self.room:
-            self.kept[first] = tangent
+        """Return the bends of the variants that rub, as the first response leaves them; keep what was solved where all fits into memory."""
+        first, answers = self.alike[group[0]], self._answers(self.alike[group[0]])
         jobs = self._jobs(group, self.rubbing)
-        moved = zip(jobs, self._respond(group[0], jobs, tangent))
-        return first, tangent.factor, {(i, k): self._bends(i, x) for (i, _, frames), x in moved for k in frames}
+        moved = zip(jobs, self._respond(group[0], jobs, answers))
+        if answers.bytes < self.room:
+            self.kept[first] = answers
+        return first, answers.tangent.factor, {(i, k): self._bends(i, x) for (i, _, frames), x in moved for k in frames}
 
     def _written(self, group: list[int]) -> tuple[int, Factorization]:
         """Write what is observed of all variants in frames with one base state."""
-        first, tangent = self.alike[group[0]], self._tangent(self.alike[group[0]])
+        first, answers = self.alike[group[0]], self._answers(self.alike[group[0]])
         jobs = self._jobs(group, [*self.plain, *self.rubbing])
-        for (i, _, frames), x in zip(jobs, self._respond(group[0], jobs, tangent)):
+        for (i, _, frames), x in zip(jobs, self._respond(group[0], jobs, answers)):
             seen = self.observe(self.variants[i].robot, replace(self.bases[first], positions=x))
             for frame in frames:
                 self.others[frame][i] = seen
-        return first, tangent.factor
+        return first, answers.tangent.factor
 
-    def _respond(self, frame: int, jobs: list[Job], tangent: Tangent) -> list[FloatArray]:
-        """Return the positions of variants [m], each (n, 3): to first order in what they add to the forces of the base state."""
-        base = self.bases[frame]
-        balances: dict[int, _Balance] = {}
-        forces, pulls, starts = [], [], []
-        for i, k, _ in jobs:
-            if k not in balances:
-                balances[k] = _Balance(self.walk, k, base)
-            balance = balances[k]
-            start = balance.carried(self.variants[i])
-            force, pulled = balance.upset_by(self.variants[i], self.along.get((i, k)), start)
-            forces.append(force - balance.left() if start is not base.positions else force)
-            pulls.append(pulled)
-            starts.append(start)
-        moves = tangent.respond(np.array(forces))
+    def _respond(self, frame: int, jobs: list[Job], answers: _Answers) -> list[FloatArray]:
+        """Return the positions of variants [m], each (n, 3): to first order in what they add to the forces of the base state.
+
+        Tensions along cables are all that many of them change: their answers are sums of one for each segment.
+        """
+        base, body = self.bases[frame], self.walk.robot.body
+        balances = {k: _Balance(self.walk, k, base) for k in {k for _, k, _ in jobs}}
+        starts = [balances[k].carried(self.variants[i]) for i, k, _ in jobs]
+        rows, pulls, forces = list[FloatArray](), list[FloatArray](), dict[tuple[int, int], FloatArray]()
+        for (i, k, _), start in zip(jobs, starts):
+            balance, variant, still = balances[k], self.variants[i], start is base.positions
+            along = balance.along(variant) if (i, k) not in self.along else self.along[i, k]
+            rows.append(balance.more_tension(along) * still)
+            pulls.append(balance.pulled(variant, None if still else start))
+            if not still:
+                forces[i, k] = balance.whole(variant, along, start) - balance.left()
+            elif (i, k) not in answers.own:
+                forces[i, k] = balance.change(variant)
+        moves = answers.moves(body, base.positions, [job[:2] for job in jobs], forces, np.array(rows))
         if base.held.any():  # cables: pressures are never held here
-            held = base.held[: len(self.walk.robot.body.cables)]
-            moves += np.tensordot(np.array(pulls)[:, held], tangent.respond_to_held(), axes=1)
+            held = base.held[: len(body.cables)]
+            moves += np.tensordot(np.array(pulls)[:, held], answers.tangent.respond_to_held(), axes=1)
         return [start + move for start, move in zip(starts, moves)]
 
 
@@ -574,19 +628,19 @@ class _Balance:
             force = force + self.base.pressure[chamber.name] * volume_gradient(chamber, x)
         return np.asarray(force - self.inner)
 
-    def upset_by(self, variant: Walk, along: Tensions | None, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the nodal forces that a variant adds at positions x near the base state [N], (n, 3), and the shortening that it adds
-        to held cables [m], (a,). `along` are the tensions along its cables; None: they do not rub."""
-        body = self._body(variant)
-        if along is None:
-            motors = _motor_tensions(variant, self.frame, self.base)
-            along = tuple(np.full(len(c.path), T) for c, T in zip(body.cables, motors))
-        still = x is self.base.positions
-        force = self._change(variant, body, along) if still else self._whole(variant, body, along, x)
-        return force, self._pulled(variant, body, None if still else x)
+    def along(self, variant: Walk) -> Tensions:
+        """Return the tensions along a variant's cables where these do not rub."""
+        motors = _motor_tensions(variant, self.frame, self.base)
+        return tuple(np.full(len(c.path), T) for c, T in zip(variant.robot.body.cables, motors))
 
-    def _whole(self, variant: Walk, body: BodyModel, tensions: tuple[FloatArray, ...], x: FloatArray) -> FloatArray:
-        """Return all forces on a variant's body at x."""
+    def more_tension(self, along: Tensions) -> FloatArray:
+        """Return by how much tensions along all cables differ from those of the base state [N], shape (s,)."""
+        differences = [a - b for a, b in zip(along, self.base.segment_tensions)]
+        return np.concatenate(differences) if differences else np.zeros(0)
+
+    def whole(self, variant: Walk, tensions: Tensions, x: FloatArray) -> FloatArray:
+        """Return all forces on a variant's body at x near the base state [N], (n, 3), for tensions along its cables."""
+        body = self._body(variant)
         force = body.dead_load() + self._loads(variant) - internal(body, x, tangent=False).forces
         for cable, along in zip(body.cables, tensions):
             force = force + cable_forces(cable, x, along, len(x))
@@ -594,8 +648,9 @@ class _Balance:
             force = force + pressure * volume_gradient(chamber, x)
         return np.asarray(force)
 
-    def _change(self, variant: Walk, body: BodyModel, tensions: tuple[FloatArray, ...]) -> FloatArray:
-        """Return what a variant changes of the forces in the base state, where they sum to nothing."""
+    def change(self, variant: Walk) -> FloatArray:
+        """Return what a variant changes of the forces in the base state, where they sum to nothing, but for tensions along cables [N], (n, 3)."""
+        body = self._body(variant)
         x, own, drive = self.base.positions, self.body, variant.drive
         force = np.zeros_like(x)
         if body is not own:
@@ -605,17 +660,15 @@ class _Balance:
                 force += self.inner - internal(body, x, tangent=False).forces
         if drive.load_forces is not self.walk.drive.load_forces:
             force += self._loads(variant) - self._loads(self.walk)
-        for cable, along, along_here in zip(body.cables, tensions, self.base.segment_tensions):
-            if not np.array_equal(along, along_here):
-                force += cable_forces(cable, x, along - along_here, len(x))
         for i, chamber in enumerate(body.chambers):
             more = drive.pressures[self.frame, i] - self.walk.drive.pressures[self.frame, i]
             if more != 0.0:
                 force += more * volume_gradient(chamber, x)
         return force
 
-    def _pulled(self, variant: Walk, body: BodyModel, x: FloatArray | None) -> FloatArray:
-        cables = self.body.cables
+    def pulled(self, variant: Walk, x: FloatArray | None) -> FloatArray:
+        """Return the shortening that a variant adds to held cables at x, by default in the base state [m], (a,)."""
+        body, cables = self._body(variant), self.body.cables
         if variant.drive.control != "displacement":
             return np.zeros(len(cables))
         stretch = [
@@ -725,7 +778,8 @@ def finer_state(walk: Walk, fine: Walk, frame: int, base: Equilibrium, ties: Emb
     coarse, first = ties.positions(base.positions), np.inf
     x = coarse
     for step in range(FINER_STEPS):
-        force, pulled = balance.upset_by(fine, _rubbed(fine, frame, base, x), x)
+        along = _rubbed(fine, frame, base, x)
+        force = balance.whole(fine, along, x)
         size = _unbalanced(body, base, x, force)
         first = size if step == 0 else first
         if step and size < FINER_ENOUGH * first:
@@ -734,7 +788,8 @@ def finer_state(walk: Walk, fine: Walk, frame: int, base: Equilibrium, ties: Emb
         tangent = tangent_at(body, replace(base, positions=x, factor=None), partial(roughly, tolerance=enough))
         move = tangent.respond(force[None])[0]
         if base.held.any():
-            move = move + np.tensordot(pulled[base.held[: len(body.cables)]], tangent.respond_to_held(), axes=1)
+            pulled = balance.pulled(fine, x)[base.held[: len(body.cables)]]
+            move = move + np.tensordot(pulled, tangent.respond_to_held(), axes=1)
         turned = turned_step(body, x, move)
         x = np.asarray(x + move) if turned is None else turned
         if not np.abs(x - coarse).max() < body.reach:
