@@ -33,13 +33,25 @@ def _payload_places(robot: Robot) -> tuple[Entry, ...]:
     return tuple({"point_m": [float(v) for v in place]} for place in places)
 
 
+NEARBY = ((0.3, 10), (0.1, 8), (0.04, 6))
+"""How far around a place others are tried, in shares of the body's reach, and how many of each."""
+LATTICE = np.array([(i, j, 4 - i - j) for i in range(5) for j in range(5 - i)]) / 4.0
+"""Points of a triangle (barycentric) that may be such a place."""
+
+
 def _places_nearby(robot: Robot, seed: Entry) -> tuple[Entry, ...]:
-    """Places of the surface around one."""
-    nodes, center = robot.body.mesh.nodes, np.asarray(seed["point_m"])
-    surface = nodes[np.setdiff1d(np.unique(surface_triangles(robot.body.mesh)), robot.body.clamped)]
-    near = surface[np.linalg.norm(surface - center, axis=1) <= 0.3 * robot.body.reach]
-    first = int(np.linalg.norm(near - center, axis=1).argmin()) if len(near) else 0
-    return (dict(seed), *({"point_m": [float(v) for v in near[i]]} for i in spread_points(near, 20, first=first)))
+    """Places of the surface around one, far and near, not only at nodes: the force that is found goes with its lever."""
+    body, center = robot.body, np.asarray(seed["point_m"])
+    triangles = surface_triangles(body.mesh)
+    free = triangles[~np.isin(triangles, body.clamped).all(axis=1)]
+    surface = (LATTICE @ body.mesh.nodes[free]).reshape(-1, 3)
+    distance = np.linalg.norm(surface - center, axis=1)
+    places = [dict(seed)]
+    for share, count in NEARBY:
+        near = surface[distance <= share * body.reach]
+        first = int(np.linalg.norm(near - center, axis=1).argmin()) if len(near) else 0
+        places += [{"point_m": [float(v) for v in near[i]]} for i in spread_points(near, count, first=first)]
+    return tuple(places)
 
 
 def _apply_payload(robot: Robot, entry: Entry) -> Robot:
