@@ -15,12 +15,12 @@ from femsense.loop.data import Data
 from femsense.loop.evidence import gather
 from femsense.loop.grow import EVIDENCE, at_edge
 from femsense.loop.joint import Trial, heads_of, normal_rms_of, rms_of, vectors_of
-from femsense.loop.mesh_error import mesh_errors
+from femsense.loop.mesh_error import few_states, mesh_errors
 from femsense.loop.noise import Noise, whiten
 from femsense.loop.result import LoopResult
 from femsense.loop.screen import NUISANCE, TESTABLE, Candidate, confounding, one_each
 from femsense.loop.spread import spreads
-from femsense.loop.stages import ROUGHLY, Stage, held_chi2, keeping, with_seeds_still
+from femsense.loop.stages import Stage, held_chi2, held_out, keeping, roughly_keeping, with_seeds_still
 from femsense.loop.structure import describe_left, structure_tests, without_mesh_error
 from femsense.loop.zeros import InPlace, moved_nuisance, zeros_are_evident
 
@@ -119,10 +119,14 @@ def _promoted(data: Data, search: Search) -> list[str]:
 
 
 def _worth_handing_back(data: Data, search: Search, promoted: list[str], names: list[str]) -> tuple[list[str], Stage]:
-    """Return the names that are handed back with the fit of just these: nuisances that stay as declared are taken out, and so is,
-    from the last one on, what would make the error on held-out data larger than it was, or goes to the edge of what is plausible."""
+    """Return the names that are handed back with the fit of just these: nuisances that stay as declared are taken out, too if they only
+    do so here, and so is, from the last one on, what would make the error on held-out data larger than it was, or goes to the edge of what is plausible."""
     while names:
         back = _handed_back(data, search.final, names, search.noise)
+        still = [n for n in promoted if n in names and back is not None and not moved_nuisance(data, back, n)]
+        if still:
+            names = [n for n in names if n not in still]
+            continue
         if back is not None and at_edge(back.fit):
             back = _handed_back(data, with_seeds_still(data, search.final), names, search.noise)
         strayed = back is not None and "stiffness" in at_edge(back.fit, nuisance=True)
@@ -143,13 +147,13 @@ def _holds_out(data: Data, search: Search, back: Stage) -> bool:
     return worse <= NOISY and held_chi2(data, search.before, search.noise) - held_chi2(data, back, search.noise) > EVIDENCE
 
 
-def _handed_back(data: Data, final: Stage, names: list[str], noise: Noise, most: int = 12) -> Stage | None:
+def _handed_back(data: Data, final: Stage, names: list[str], noise: Noise) -> Stage | None:
     """Return the fit of some names alone; None where it has no equilibrium in some state."""
     settled = [effect.name for effect, _ in final.fit.hypothesis.settled]
     if set(final.fit.hypothesis.names) <= {*names, *settled}:
         return final
     try:
-        return keeping(data, final, names, noise, max_iterations=most)
+        return keeping(data, final, names, noise)
     except FemsenseError:
         return None
 
@@ -173,8 +177,7 @@ def _chain(
     stages = dict(search.history)
     errors = []
     for i in range(len(promoted) - (names == promoted)):  # the last one's is that of what is handed back
-        stage = _handed_back(data, stages[""], promoted[: i + 1], search.noise, ROUGHLY) or stages[""]
-        errors.append(stage.held_rms)
+        errors.append(_rough_error(data, stages[""], promoted[: i + 1], search.noise))
     errors += [stages[name].held_rms for name in names[len(promoted) : -1]] + [back.held_rms] * bool(names)
     return [
         {
@@ -185,6 +188,18 @@ def _chain(
         }
         for name, b, a in zip(names, [search.before.held_rms, *errors], errors)
     ]
+
+
+def _rough_error(data: Data, stage: Stage, names: list[str], noise: Noise) -> float:
+    """Return the held-out error [m] of a stage with some of its terms only, fitted to some states; its own where they have no equilibrium."""
+    if set(stage.fit.hypothesis.names) <= set(names):
+        return stage.held_rms
+    try:
+        frames = [few_states(t, len(stage.fit.hypothesis.robot.body.mesh.tets)) for t in data.train]
+        rough = roughly_keeping(data, stage, names, noise, frames)
+        return rms_of([h.jet.residual for h in held_out(data, rough.fit, noise)])
+    except FemsenseError:
+        return stage.held_rms
 
 
 @dataclass(frozen=True, slots=True)
