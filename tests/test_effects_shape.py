@@ -206,7 +206,7 @@ def test_quadratic_meshes_need_no_other_elements():
 
 
 @pytest.mark.parametrize(
-    ("name", "true", "key"), [("soft_region", [0.06, 0.0, 0.0], "center_m"), ("payload", [0.07, 0.0, 0.01], "point_m")]
+    ("name", "true", "key"), [("soft_region", [0.06, 0.0, 0.0], "center_m"), ("payload", [0.072, 0.003, 0.01], "point_m")]
 )
 def test_seeds_near_by_come_closer_to_a_place(name, true, key):
     robot = arm((7, 2, 2))
@@ -214,6 +214,10 @@ def test_seeds_near_by_come_closer_to_a_place(name, true, key):
     far = [float(np.linalg.norm(np.array(seed[key]) - true)) for seed in effect.seeds(robot)]
     nearby = effect.nearby(robot, effect.seeds(robot)[int(np.argmin(far))])
     assert min(float(np.linalg.norm(np.array(seed[key]) - true)) for seed in nearby) < 0.8 * min(far)
+    if name == "payload":  # and these again, to a part of an element
+        close = min(nearby, key=lambda seed: float(np.linalg.norm(np.array(seed[key]) - true)))
+        closer = [np.linalg.norm(np.array(seed[key]) - true) for seed in effect.nearby(robot, close)]
+        assert min(closer) < 0.03 * robot.body.reach
     for seed in nearby:
         parameters = effect.parameters(robot, "tension")
         effect.apply(robot, build_entry(parameters, [p.null for p in parameters], seed))
