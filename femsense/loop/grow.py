@@ -20,7 +20,18 @@ from femsense.loop.mesh_error import mesh_errors
 from femsense.loop.noise import Noise
 from femsense.loop.predict import sweeps_predicted
 from femsense.loop.screen import NUISANCE, Candidate, effect_fields, penalty, screen
-from femsense.loop.stages import QUADRATIC, Stage, held_chi2, held_shift, jets_with, keeping, make_stage, own_of, problem_of
+from femsense.loop.stages import (
+    QUADRATIC,
+    Stage,
+    held_chi2,
+    held_shift,
+    jets_with,
+    jets_without,
+    keeping,
+    make_stage,
+    own_of,
+    problem_of,
+)
 from femsense.model import Robot
 
 REFITS = 6
@@ -464,8 +475,9 @@ def _polish(data: Data, stage: Stage, winner: Refit, noise: Noise, say: Progress
     candidate, winner.record["seed_spread"] = _climb(data, stage, winner.candidate, noise, say)
     if candidate is not winner.candidate:
         made = _tried(data, stage, candidate, noise)
-        if made is not None and made.fit.chi2 < best.fit.chi2:
-            best, seed = made, candidate.seed
+        best = made if made is not None and made.fit.chi2 < best.fit.chi2 else best
+    if effect.nearby(data.robot, seed):
+        best, winner.record["seed_spread"] = _closer(data, best, noise)
     more = effect.polish(data.robot, data.control, seed)
     if not more:
         return best
@@ -503,8 +515,52 @@ def _climb(data: Data, stage: Stage, start: Candidate, noise: Noise, say: Progre
                 break
             here = found
         best = max(best, here, key=lambda c: c.gain)
+    return best, _scatter(seen, best)
+
+
+def _scatter(seen: Sequence[Candidate], best: Candidate) -> list[float]:
     steps = [c.step for c in seen if c.gain >= best.gain - max(EVIDENCE, NEARLY * best.gain)]
-    return best, [float(v) for v in np.std(steps, axis=0)]
+    return [float(v) for v in np.std(steps, axis=0)]
+
+
+def _closer(data: Data, stage: Stage, noise: Noise) -> tuple[Stage, list[float]]:
+    """Return a stage whose last effect has moved to neighbours of its seed as long as these explain more where the body is as the effect
+    has bent it, and the scatter as `_climb` has it; what a seed does to the body before it is bent ranks neighbours of a large effect wrongly."""
+    while True:
+        *_, (effect, seed, parameters) = stage.fit.hypothesis.terms
+        fields = effect_fields(stage.fit, data.train, [(effect, s, parameters) for s in effect.nearby(data.robot, seed)])
+        around = screen(without_last(stage.fit), problem_of(data, stage.fit, noise), fields, 100.0)
+        best, here = max(around, key=lambda c: c.gain), next(c for c in around if c.seed == seed)
+        if best.gain < here.gain + POLISHED:
+            return stage, _scatter(around, best)
+        made = _moved(data, stage, best, noise)
+        if made is None or made.fit.chi2 > stage.fit.chi2 - POLISHED:
+            return stage, _scatter(around, best)
+        stage = made
+
+
+def without_last(fit: JointFit) -> JointFit:
+    """Return a fit as it would be without its last effect if all were linear about where it is."""
+    *terms, (_, _, parameters) = fit.hypothesis.terms
+    q, J = len(parameters), np.asarray(fit.fit.jacobian)
+    own = fit.coordinates[-q:] - np.array([p.null for p in parameters])
+    less = replace(fit.fit, theta=fit.fit.theta[:-q], residual=fit.fit.residual - J[:, -q:] @ own, jacobian=J[:, :-q])
+    return replace(fit, hypothesis=replace(fit.hypothesis, terms=tuple(terms)), fit=less)
+
+
+def _moved(data: Data, stage: Stage, candidate: Candidate, noise: Noise) -> Stage | None:
+    """Return a stage with the seed of its last effect exchanged for that of a candidate beside it, fitted again; None where that does not fit."""
+    fit, q = stage.fit, len(candidate.parameters)
+    *terms, _ = fit.hypothesis.terms
+    hypothesis = replace(fit.hypothesis, terms=(*terms, (candidate.effect, candidate.seed, candidate.parameters)))
+    start = np.array([p.null for p in candidate.parameters]) + candidate.step
+    keep = np.arange(len(fit.coordinates)) < len(fit.coordinates) - q
+    near = jets_with(replace(stage, fit=replace(fit, jets=jets_without(stage, keep))), candidate)
+    try:
+        coordinates = np.concatenate([fit.coordinates[:-q], start])
+        return make_stage(data, hypothesis, fit.prior, noise, coordinates, own=own_of(stage), near=near)
+    except FemsenseError:
+        return None
 
 
 def _screen_seeds(data: Data, stage: Stage, start: Candidate, seeds: Sequence[Entry], noise: Noise) -> list[Candidate]:
