@@ -403,7 +403,12 @@ class _Answers:
         return self.tangent.factor.bytes + sum(a.nbytes for a in every if a is not None)
 
     def moves(
-        self, body: BodyModel, x: FloatArray, keys: list[tuple[int, int]], forces: dict[tuple[int, int], FloatArray], tensions: FloatArray
+        self,
+        body: BodyModel,
+        x: FloatArray,
+        keys: list[tuple[int, int]],
+        forces: dict[tuple[int, int], FloatArray],
+        tensions: FloatArray,
     ) -> FloatArray:
         """Return the answers [m], (v, n, 3), to forces [N], those of some variants and the others' as known, and tensions along the segments of all
         cables [N], (v, s): sums of one answer for each segment where that takes fewer of them."""
@@ -419,7 +424,9 @@ class _Answers:
         moves, rest = np.zeros((len(keys), *x.shape)), solved[len(asked) :]
         if few:
             self.by_segment.update(zip(new, rest))
-            rest = np.tensordot(tensions[pulling][:, used], np.array([self.by_segment[s] for s in used]), axes=1) if used else rest
+            rest = (
+                np.tensordot(tensions[pulling][:, used], np.array([self.by_segment[s] for s in used]), axes=1) if used else rest
+            )
         moves[pulling] = rest
         for move, key in zip(moves, keys):
             own = self.own[key]
@@ -515,7 +522,9 @@ class _Variants:
     def _answers(self, k: int) -> _Answers:
         few = len(self.plain) + len(self.rubbing) <= FEW_COLUMNS
         known = self.kept.pop(k, None)
-        return known or _Answers(tangent_at(self.walk.robot.body, self.bases[k], refined if few else factorize), 2 if self.rubbing else 1)
+        return known or _Answers(
+            tangent_at(self.walk.robot.body, self.bases[k], refined if few else factorize), 2 if self.rubbing else 1
+        )
 
     def _jobs(self, group: list[int], which: Sequence[int]) -> list[Job]:
         """Return what is to be computed of some variants in frames with one base state."""

@@ -13,9 +13,10 @@ from arm import arm, record, sweeps
 from femsense.loop import grow
 from femsense.loop.data import Data, prepare
 from femsense.loop.exchange import exchanged
-from femsense.loop.grow import Refit, evidence, judged, polished, refit, shortlist
+from femsense.loop.grow import Refit, _closer, evidence, judged, polished, refit, shortlist, without_last
 from femsense.loop.noise import Noise
 from femsense.loop.screen import Candidate
+from femsense.loop.spread import spreads
 from femsense.loop.stages import Stage, fields_of, make_stage, own_of, screen_stage, with_nuisance
 
 beside_a_tie = sys.modules["femsense.loop.improve"]._beside_a_tie
@@ -138,3 +139,28 @@ def test_a_place_is_improved_before_a_refit_is_turned_down_for_what_it_predicts(
     monkeypatch.setattr(grow, "_polish", lambda data, stage, winner, *_: replace(winner.stage))
     winner, _, records = grow.grow(data, base, table, NOISE, ["payload"], COUNT, lambda text: None)
     assert winner is not None and asked[:2] == ["payload", "payload"] and records[0]["verdict"] == "named"
+
+
+def test_a_place_moves_on_where_the_body_is_as_the_load_has_bent_it():
+    inputs, labels = sweeps(each=1)
+    hidden = {"name": "payload", "point_m": [0.066, 0.004, 0.01], "force_n": [0.0, 0.3, -0.4]}
+    recording, _ = record(inputs, labels=labels, truth=arm((4, 1, 1)), effects=[hidden])
+    data = prepare(arm((4, 1, 1)), [recording], [])
+    hypothesis, prior = with_nuisance(data)
+    base = make_stage(data, hypothesis, prior, NOISE, np.zeros(len(prior.mean)))
+    table = screen_stage(data, base.fit, NOISE, fields_of(data, base, ["payload"]), COUNT)
+    candidate = next(
+        c for c in table if len(c.parameters) == 3 and np.linalg.norm(np.subtract(c.seed["point_m"], hidden["point_m"])) > 0.012
+    )
+    stage = refit(data, base, candidate, NOISE)
+    alone = without_last(stage.fit)
+    back = alone.fit.residual + np.asarray(stage.fit.fit.jacobian)[:, -3:] @ stage.fit.coordinates[-3:]
+    np.testing.assert_allclose(back, stage.fit.fit.residual, atol=1e-9)
+    closer, scatter = _closer(data, stage, NOISE)
+    assert np.linalg.norm(np.subtract(closer.fit.hypothesis.terms[-1][1]["point_m"], hidden["point_m"])) < 0.004
+    assert closer.fit.chi2 < 0.5 * stage.fit.chi2 and np.all(np.array(scatter) < 0.2)
+    whole = polished(data, base, Refit(candidate, stage, 0.0, 0.0, {}), NOISE, lambda text: None).stage
+    found, std = whole.fit.coordinates[-6:], spreads(data, whole, NOISE, {})["payload"]
+    assert whole.fit.hypothesis.entries(whole.fit.coordinates)[-1]["point_m"] == found[3:].tolist()
+    off = np.abs(found - [*hidden["force_n"], *hidden["point_m"]])
+    assert np.all(off[3:] < 0.001) and np.all(off < 4.0 * std)

@@ -107,7 +107,9 @@ def test_a_model_without_equilibrium_is_not_handed_back(monkeypatch: pytest.Monk
 
 def test_a_modulus_that_is_as_declared_once_zeros_stay_is_not_handed_back(monkeypatch: pytest.MonkeyPatch) -> None:
     data, softer = staged(arm((4, 2, 2), modulus=250e3))
-    as_declared = replace(softer.fit, fit=replace(softer.fit.fit, theta=np.append(softer.fit.fit.theta[: softer.fit.own], [0.0] * 5)))
+    as_declared = replace(
+        softer.fit, fit=replace(softer.fit.fit, theta=np.append(softer.fit.fit.theta[: softer.fit.own], [0.0] * 5))
+    )
     search = Search(softer, [("", softer)], softer, NOISE, 10.0, [], [], [], None)
     assert conclude._worth_handing_back(data, search, ["stiffness"], ["stiffness"])[0] == ["stiffness"]
     monkeypatch.setattr(conclude, "keeping", lambda *_, **__: replace(softer, fit=as_declared))

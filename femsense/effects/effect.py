@@ -34,6 +34,8 @@ class Parameter:
     """Step for derivatives; small against what matters."""
     scale: str = "linear"
     """How the coordinate u gives the value: "linear" (u), "log" (exp u) or "reciprocal" (1/u)."""
+    known: float = float("inf")
+    """Standard deviation to which the coordinate is known to be at `null` beforehand."""
 
     def value(self, coordinate: float) -> float:
         """Return the value in robot.toml's unit."""

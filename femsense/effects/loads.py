@@ -54,6 +54,20 @@ def _places_nearby(robot: Robot, seed: Entry) -> tuple[Entry, ...]:
     return tuple(places)
 
 
+PLACED = 0.05
+"""How well a place is known beforehand, in shares of the body's reach: a force acts the same all along its line."""
+
+
+def _place_polish(robot: Robot, control: str, seed: Entry) -> tuple[Parameter, ...]:
+    reach = robot.body.reach
+    return tuple(
+        Parameter(
+            "point_m", i, "m", float(v), float(v) - 0.25 * reach, float(v) + 0.25 * reach, 1e-4 * reach, known=PLACED * reach
+        )
+        for i, v in enumerate(seed["point_m"])
+    )
+
+
 def _apply_payload(robot: Robot, entry: Entry) -> Robot:
     point, force = vector(entry, "point_m", "payload"), vector(entry, "force_n", "payload")
     mesh = robot.body.mesh
@@ -71,6 +85,7 @@ PAYLOAD = Effect(
     _apply_payload,
     _payload_places,
     keys=("point_m", "force_n"),
+    polish=_place_polish,
     nearby=_places_nearby,
 )
 

@@ -98,8 +98,8 @@ def _best(
 
 def _same(table: Sequence[Candidate], stage: Stage, name: str) -> Candidate | None:
     """Return the candidate of the form that is named."""
-    count = sum(len(p) for effect, _, p in stage.fit.hypothesis.terms if effect.name == name)
-    return next((c for c in table if c.effect.name == name and len(c.parameters) == count), None)
+    fitted = {(p.key, p.part) for effect, _, parameters in stage.fit.hypothesis.terms if effect.name == name for p in parameters}
+    return next((c for c in table if c.effect.name == name and {(p.key, p.part) for p in c.parameters} <= fitted), None)
 
 
 def _without(data: Data, history: History, without: Stage, name: str, noise: Noise) -> History:

@@ -124,7 +124,7 @@ def grow(
         return None, [], records
     # where evidence is close, what predicts better
     leaders = [r for r in passing if r.score > max(p.score for p in passing) - EVIDENCE]
-    leaders = [polished(data, stage, r, noise, say) for r in leaders]
+    leaders = [r if "seed_spread" in r.record else polished(data, stage, r, noise, say) for r in leaders]
     winner = max(leaders, key=lambda r: r.score + r.record["cv_gain"] + weighs(data, r.candidate.effect.name))
     winner = _enriched(data, stage, winner, table, noise, say)
     winner.record["verdict"] = "named"
@@ -470,22 +470,24 @@ def at_edge(fit: JointFit, *, nuisance: bool = False) -> list[str]:
 
 def _polish(data: Data, stage: Stage, winner: Refit, noise: Noise, say: Progress) -> Stage:
     """Return the winner with its seed (place, radius, time) improved: first seeds near by, then fitted along."""
-    best = winner.stage
-    effect, seed = winner.candidate.effect, winner.candidate.seed
+    best, effect = winner.stage, winner.candidate.effect
     candidate, winner.record["seed_spread"] = _climb(data, stage, winner.candidate, noise, say)
     if candidate is not winner.candidate:
         made = _tried(data, stage, candidate, noise)
         best = made if made is not None and made.fit.chi2 < best.fit.chi2 else best
-    if effect.nearby(data.robot, seed):
+    if not winner.candidate.parameters:
+        return best
+    if effect.nearby(data.robot, winner.candidate.seed):
         best, winner.record["seed_spread"] = _closer(data, best, noise)
+    *others, (_, seed, parameters) = best.fit.hypothesis.terms
     more = effect.polish(data.robot, data.control, seed)
     if not more:
         return best
     say(f"polishing {effect.name}")
-    *others, (_, _, parameters) = best.fit.hypothesis.terms
+    winner.record["seed_spread"] = [0.0] * len(parameters)  # `spreads` asks what the seed's own numbers leave open
     hypothesis = replace(best.fit.hypothesis, terms=(*others, (effect, seed, (*parameters, *more))))
     null = np.array([p.null for p in more])
-    prior = Prior(np.concatenate([best.fit.prior.mean, null]), np.concatenate([best.fit.prior.std, np.full(len(null), np.inf)]))
+    prior = Prior(np.concatenate([best.fit.prior.mean, null]), np.concatenate([best.fit.prior.std, [p.known for p in more]]))
     try:
         made = make_stage(data, hypothesis, prior, noise, np.concatenate([best.fit.coordinates, null]), own=own_of(best))
     except FemsenseError:

@@ -148,7 +148,7 @@ def _by_sweeps(data: Data, stage: Stage) -> FloatArray:
 def _with_open_seeds(data: Data, stage: Stage, noise: Noise) -> FloatArray:
     """Return the standard deviations of the coordinates with the numbers that seeds held still fitted along, shape (p,)."""
     hypothesis = stage.fit.hypothesis
-    terms, null, fitted = [], [], []
+    terms, null, fitted, known = [], [], [], []
     at = 0
     for effect, seed, parameters in hypothesis.terms:
         held = {p.key for p in parameters}
@@ -156,11 +156,12 @@ def _with_open_seeds(data: Data, stage: Stage, noise: Noise) -> FloatArray:
         terms.append((effect, seed, (*parameters, *more)))
         null += [*stage.fit.coordinates[at : at + len(parameters)], *(p.null for p in more)]
         fitted += [True] * len(parameters) + [False] * len(more)
+        known += [min(p.known, SEED_STD) for p in (*parameters, *more)]
         at += len(parameters)
     mask = np.array(fitted, dtype=bool)
     if mask.all():
         return np.zeros(len(stage.fit.coordinates))
-    mean, std = np.array(null), np.full(len(null), SEED_STD)
+    mean, std = np.array(null), np.array(known)
     mean[mask], std[mask] = stage.fit.prior.mean, stage.fit.prior.std
     factors = [noise.whitener(t.groups, t.mesh_error) for t in data.train]
     problem = JointProblem(replace(hypothesis, terms=tuple(terms)), Prior(mean, std), data.train, factors, data.seat_std)
