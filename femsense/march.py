@@ -767,7 +767,9 @@ def share_on_finer(body: BodyModel) -> None:
     turned_step(body, body.mesh.nodes, np.zeros_like(body.mesh.nodes))
 
 
-def finer_state(walk: Walk, fine: Walk, frame: int, base: Equilibrium, ties: Embedding) -> FloatArray | None:
+def finer_state(
+    walk: Walk, fine: Walk, frame: int, base: Equilibrium, ties: Embedding, guess: FloatArray | None = None
+) -> FloatArray | None:
     """Return where the nodes of a finer mesh come to rest [m], shape (n, 3), nearly: Newton steps from a state of a coarser one.
 
     The finer mesh holds the coarse state exactly, but what it softens are single elements, so that two to four steps are needed, with
@@ -782,18 +784,24 @@ def finer_state(walk: Walk, fine: Walk, frame: int, base: Equilibrium, ties: Emb
         frame: index of the frame.
         base: the coarse state of that frame.
         ties: of the fine nodes to the coarse mesh.
+        guess: by how much the nodes of the finer mesh went beyond the coarse state in another model [m], shape (n, 3), to begin with.
     """
     body, balance = fine.robot.body, _Balance(walk, frame, base)
-    coarse, first = ties.positions(base.positions), np.inf
-    x = coarse
-    for step in range(FINER_STEPS):
-        along = _rubbed(fine, frame, base, x)
-        force = balance.whole(fine, along, x)
-        size = _unbalanced(body, base, x, force)
-        first = size if step == 0 else first
-        if step and size < FINER_ENOUGH * first:
+
+    def left(x: FloatArray) -> tuple[FloatArray, float]:
+        force = balance.whole(fine, _rubbed(fine, frame, base, x), x)
+        return force, _unbalanced(body, base, x, force)
+
+    x = coarse = ties.positions(base.positions)
+    force, first = left(x)
+    size = first
+    if guess is not None and guess.shape == coarse.shape:
+        other = left(coarse + guess)
+        x, (force, size) = (coarse + guess, other) if other[1] < first else (x, (force, size))
+    for _ in range(FINER_STEPS):
+        if size <= FINER_ENOUGH * first:
             return x
-        enough = EARLY if step == 0 else min(EARLY, ROUGH * first / size)
+        enough = min(EARLY, ROUGH * first / size) if size < first else EARLY
         tangent = tangent_at(body, replace(base, positions=x, factor=None), partial(roughly, tolerance=enough))
         move = tangent.respond(force[None])[0]
         if base.held.any():
@@ -803,7 +811,8 @@ def finer_state(walk: Walk, fine: Walk, frame: int, base: Equilibrium, ties: Emb
         x = np.asarray(x + move) if turned is None else turned
         if not np.abs(x - coarse).max() < body.reach:
             return None
-    return None
+        force, size = left(x)
+    return x if size <= FINER_ENOUGH * first else None
 
 
 def _unbalanced(body: BodyModel, base: Equilibrium, x: FloatArray, force: FloatArray) -> float:

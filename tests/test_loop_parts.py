@@ -179,6 +179,27 @@ def test_a_finer_state_that_runs_away_says_nothing_though_its_forces_look_small(
     assert finer_state(*asked) is None
 
 
+def test_a_finer_state_begins_where_that_of_another_model_lay(monkeypatch: pytest.MonkeyPatch):
+    recording, _ = record(sweeps(each=1)[0][:4], truth=arm((4, 2, 2)))
+    ties, counted = None, list[int]()
+    exact = march.tangent_at
+    monkeypatch.setattr(march, "tangent_at", lambda *given: counted.append(1) or exact(*given))
+    beyond, found, steps = None, list[np.ndarray](), list[int]()
+    for modulus, guess in ((300e3, False), (285e3, False), (285e3, True)):
+        robot = arm((4, 2, 2), modulus=modulus)
+        fine = robot_on_mesh(robot, finer_mesh(robot.body.mesh, None, 1))
+        walk, fine_walk = (Walk(r, drive_of(r, recording)) for r in (robot, fine))
+        state, ties = solve_frame(walk, 3), embed_points(robot.body.mesh, fine.body.mesh.nodes)
+        counted.clear()
+        x = finer_state(walk, fine_walk, 3, state, ties, beyond if guess else None)
+        assert x is not None
+        beyond = x - ties.positions(state.positions) if beyond is None else beyond
+        found.append(x - ties.positions(state.positions))
+        steps.append(len(counted))
+    assert steps[2] < steps[1]
+    np.testing.assert_allclose(found[2], found[1], atol=0.02 * np.abs(found[1]).max())
+
+
 def test_one_share_of_the_mesh_error_in_all_sweeps_is_likelier_than_another_in_each():
     noise = Noise({"white": 1e-5}, "")
     data = with_error_of_the_mesh(noise)[2]
