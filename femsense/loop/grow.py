@@ -484,7 +484,6 @@ def _polish(data: Data, stage: Stage, winner: Refit, noise: Noise, say: Progress
     if not more:
         return best
     say(f"polishing {effect.name}")
-    winner.record["seed_spread"] = [0.0] * len(parameters)  # `spreads` asks what the seed's own numbers leave open
     hypothesis = replace(best.fit.hypothesis, terms=(*others, (effect, seed, (*parameters, *more))))
     null = np.array([p.null for p in more])
     prior = Prior(np.concatenate([best.fit.prior.mean, null]), np.concatenate([best.fit.prior.std, [p.known for p in more]]))
