@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from femsense.arrays import freeze
+from femsense.arrays import FloatArray, freeze
 from femsense.effects.effect import Effect, Entry, Parameter, number, vector
 from femsense.errors import InputError
+from femsense.fem.mesh import element_volumes
 from femsense.model import Robot, spread_features
 
 
@@ -37,18 +38,36 @@ def _region_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
     return (Parameter("scale", None, "1", 0.0, float(np.log(0.1)), float(np.log(5.0)), 1e-5, "log"),)
 
 
+RADII = 0.12, 0.25
+"""Radii of the spheres that are tried first, in shares of the body's diagonal."""
+
+
 def _region_places(robot: Robot) -> tuple[Entry, ...]:
-    """Spheres around places that are spread over the body, those that hold the centroid of an element."""
-    nodes = robot.body.mesh.nodes
-    size = float(np.linalg.norm(np.ptp(nodes, axis=0)))
-    places = nodes[spread_features(robot.body, 8)]
-    centroids = nodes[robot.body.mesh.tets[:, :4]].mean(axis=1)
-    spheres = [(p, r * size) for p in places for r in (0.12, 0.25)]
+    """Spheres around places that are spread over the surface, and around the middles of the body's parts; those that hold the centroid of an element."""
+    mesh = robot.body.mesh
+    size = float(np.linalg.norm(np.ptp(mesh.nodes, axis=0)))
+    centroids = mesh.nodes[mesh.tets[:, :4]].mean(axis=1)
+    places = [*mesh.nodes[spread_features(robot.body, 8)], *_middles(centroids, np.abs(element_volumes(mesh)), 3)]
+    spheres = [(p, r * size) for p in places for r in RADII]
     return tuple(
         {"center_m": [float(v) for v in p], "radius_m": r}
         for p, r in spheres
         if (np.linalg.norm(centroids - p, axis=1) <= r).any()
     )
+
+
+def _middles(points: FloatArray, weights: FloatArray, halvings: int) -> list[FloatArray]:
+    """Return the centres of parts of some points (p, 3) that are halved across their longest axis again and again."""
+    middle = np.average(points, axis=0, weights=weights)
+    if halvings == 0 or len(points) < 2:
+        return [middle]
+    along = (points - middle) @ np.linalg.eigh(np.cov(points.T, aweights=weights))[1][:, -1]
+    order = np.argsort(along)
+    median = along[order[np.searchsorted(np.cumsum(weights[order]), 0.5 * weights.sum())]]
+    half = along > median + 1e-6 * np.ptp(along)
+    if not half.any() or half.all():
+        return [middle]
+    return [m for part in (~half, half) for m in _middles(points[part], weights[part], halvings - 1)]
 
 
 def _regions_nearby(robot: Robot, seed: Entry) -> tuple[Entry, ...]:
