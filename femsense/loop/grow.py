@@ -471,14 +471,13 @@ def at_edge(fit: JointFit, *, nuisance: bool = False) -> list[str]:
 def _polish(data: Data, stage: Stage, winner: Refit, noise: Noise, say: Progress) -> Stage:
     """Return the winner with its seed (place, radius, time) improved: first seeds near by, then fitted along."""
     best, effect = winner.stage, winner.candidate.effect
-    candidate, winner.record["seed_spread"] = _climb(data, stage, winner.candidate, noise, say)
-    if candidate is not winner.candidate:
-        made = _tried(data, stage, candidate, noise)
-        best = made if made is not None and made.fit.chi2 < best.fit.chi2 else best
+    if effect.nearby(data.robot, winner.candidate.seed):
+        say(f"looking near by for {effect.name}")
+        best, winner.record["seed_spread"] = _placed(data, stage, winner, noise)
+    else:
+        winner.record["seed_spread"] = [0.0] * len(winner.candidate.parameters)
     if not winner.candidate.parameters:
         return best
-    if effect.nearby(data.robot, winner.candidate.seed):
-        best, winner.record["seed_spread"] = _closer(data, best, noise)
     *others, (_, seed, parameters) = best.fit.hypothesis.terms
     more = effect.polish(data.robot, data.control, seed)
     if not more:
@@ -495,28 +494,35 @@ def _polish(data: Data, stage: Stage, winner: Refit, noise: Noise, say: Progress
     return made if made.fit.chi2 < best.fit.chi2 - POLISHED * len(more) and inside else best
 
 
-def _climb(data: Data, stage: Stage, start: Candidate, noise: Noise, say: Progress) -> tuple[Candidate, list[float]]:
-    """Return the candidate whose seed explains most, and by how much the step of each of its parameters scatters over the seeds that
-    explain as much but for NEARLY.
+def _placed(data: Data, stage: Stage, winner: Refit, noise: Noise) -> tuple[Stage, list[float]]:
+    """Return the best of the fits that begin where the climbs from several seeds end, its seed moved on, and the scatter of `_closer`."""
+    best, scatter = _closer(data, winner.stage, noise)
+    for candidate in _climbed(data, stage, winner.candidate, noise):
+        made = _tried(data, stage, candidate, noise)
+        if made is None or made.fit.fit.status == GIVEN_UP:
+            continue
+        made, own = _closer(data, made, noise)
+        best, scatter = (made, own) if made.fit.chi2 < best.fit.chi2 else (best, scatter)
+    return best, scatter
 
-    Each of the best STARTS seeds goes from neighbour to neighbour: a soft place here and a stiff one there look alike when the modulus is open.
-    """
-    if not start.effect.nearby(data.robot, start.seed):
-        return start, [0.0] * len(start.step)
-    say(f"looking near by for {start.effect.name}")
+
+def _climbed(data: Data, stage: Stage, start: Candidate, noise: Noise) -> list[Candidate]:
+    """Return where the best STARTS seeds come to when each goes from neighbour to neighbour, the best first: a soft place here and a stiff
+    one there look alike when the modulus is open."""
     others = _screen_seeds(data, stage, start, start.effect.seeds(data.robot), noise)
-    best, seen = start, [start]
+    ends = list[Candidate]()
     for begin in [start, *(c for c in others if c.seed != start.seed)][:STARTS]:
         here = begin
         for _ in range(ROUNDS):
             around = _screen_seeds(data, stage, start, start.effect.nearby(data.robot, here.seed), noise)
-            seen += [here, *around]
             found = max([here, *around], key=lambda c: c.gain)
             if found.gain < here.gain + POLISHED:
                 break
             here = found
-        best = max(best, here, key=lambda c: c.gain)
-    return best, _scatter(seen, best)
+        if here is not start and not any(here.seed == end.seed for end in ends):
+            ends.append(here)
+    most = max((end.gain for end in ends), default=0.0)
+    return sorted((end for end in ends if end.gain > 0.5 * most), key=lambda c: -c.gain)
 
 
 def _scatter(seen: Sequence[Candidate], best: Candidate) -> list[float]:
@@ -526,7 +532,8 @@ def _scatter(seen: Sequence[Candidate], best: Candidate) -> list[float]:
 
 def _closer(data: Data, stage: Stage, noise: Noise) -> tuple[Stage, list[float]]:
     """Return a stage whose last effect has moved to neighbours of its seed as long as these explain more where the body is as the effect
-    has bent it, and the scatter as `_climb` has it; what a seed does to the body before it is bent ranks neighbours of a large effect wrongly."""
+    has bent it (what a seed does to the body before that ranks neighbours of a large effect wrongly), and by how much the step of each of
+    its parameters scatters over the seeds that explain as much but for NEARLY."""
     while True:
         *_, (effect, seed, parameters) = stage.fit.hypothesis.terms
         fields = effect_fields(stage.fit, data.train, [(effect, s, parameters) for s in effect.nearby(data.robot, seed)])

@@ -17,6 +17,8 @@ from femsense.loop.noise import Noise, estimate_noise, whiten
 from femsense.loop.screen import NUISANCE, Candidate, Fields, candidates_for, effect_fields, one_each, screen
 from femsense.model import Robot
 
+MODULUS_STD = 0.35
+"""How well the modulus is known beforehand, in its logarithm: a soft region in a stiff body and a stiff one in a soft body act nearly alike."""
 ZERO_STD = 0.1
 """How well the zero of a cable is known beforehand, as a share of its range in the recording."""
 
@@ -61,7 +63,7 @@ def with_nuisance(data: Data) -> tuple[Hypothesis, Prior]:
         if not parameters or (name == "cable_offset" and unknown_zero):
             continue
         terms.append((effect, {}, parameters))
-        std += [0.7] if name == "stiffness" else [max(ZERO_STD * float(s), 1e-9) for s in data.input_scale]
+        std += [MODULUS_STD] if name == "stiffness" else [max(ZERO_STD * float(s), 1e-9) for s in data.input_scale]
     return Hypothesis(data.robot, tuple(terms)), Prior(np.zeros(len(std)), np.array(std))
 
 
