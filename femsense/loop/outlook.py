@@ -26,6 +26,7 @@ from femsense.effects.loads import STANDARD_GRAVITY
 from femsense.effects.support import BASE_ROTATION
 from femsense.loop.joint import JointFit, JointProblem, Prior, Trial
 from femsense.loop.screen import NUISANCE, TESTABLE, effect_fields, penalty
+from femsense.loop.stages import MODULUS_STD
 from femsense.model import Robot
 from femsense.pose import rotation_from_vector
 from femsense.rig.camera import measured_points, visible_points
@@ -40,9 +41,8 @@ ALIKE = 0.95
 """Effects that imitate each other by more than this share cannot be told apart."""
 ABSORBED = 1e-9
 """Share of its χ² below which a direction counts as imitated whole."""
-STIFFNESS_STD = 0.7
 OFFSET_SHARE = 0.25
-"""What calibration assumes of the modulus [log] and of the zeros (share of the range), as in the loop."""
+"""How well the zeros are known beforehand, as a share of a cable's range."""
 
 PLAUSIBLE = {
     ("gravity", "vector_m_s2"): 1.0, ("stiffness", "scale"): 0.2, ("poisson", "poisson_ratio"): 0.03, ("soft_region", "scale"): 0.4,
@@ -511,7 +511,7 @@ class _Left:
 
 def _prior(f: Form, ranges: FloatArray) -> FloatArray:
     if f.name == "stiffness":
-        return np.full(len(f.size), STIFFNESS_STD)
+        return np.full(len(f.size), MODULUS_STD)
     return np.maximum(OFFSET_SHARE * np.asarray(ranges, dtype=float), 1e-9)
 
 
