@@ -223,6 +223,13 @@ def test_seeds_near_by_come_closer_to_a_place(name, true, key):
         effect.apply(robot, build_entry(parameters, [p.null for p in parameters], seed))
 
 
+def test_soft_regions_are_tried_inside_the_body_too():
+    seeds = find_effect("soft_region").seeds(arm((8, 2, 2)))
+    inside = [seed["center_m"] for seed in seeds if np.abs(seed["center_m"][1:]).max() < 3e-3]
+    along = np.unique(np.round([place[0] for place in inside], 4))
+    np.testing.assert_allclose(along, np.arange(0.00625, 0.1, 0.0125), atol=3e-3)  # the middles of eight slices
+
+
 def test_bodies_of_other_materials_share_what_the_finer_mesh_needs():
     robot = arm((4, 2, 2))
     softer = robot.with_body(
