@@ -370,13 +370,13 @@ def _declared(data: Data, stage: Stage, hypothesis: Hypothesis, noise: Noise) ->
 
 
 def with_term(fit: JointFit, effect: Effect, seed: Entry, parameters: tuple[Parameter, ...]) -> tuple[Hypothesis, Prior]:
-    """Return the hypothesis of a fit with one more effect, and its prior (flat in the effect)."""
+    """Return the hypothesis of a fit with one more effect, and its prior."""
     old = fit.hypothesis
     if not parameters:
         settled = (*old.settled, (effect, seed))
         return replace(old, robot=effect.apply(old.robot, seed), settled=settled), fit.prior
     null = np.array([p.null for p in parameters])
-    prior = Prior(np.concatenate([fit.prior.mean, null]), np.concatenate([fit.prior.std, np.full(len(null), np.inf)]))
+    prior = Prior(np.concatenate([fit.prior.mean, null]), np.concatenate([fit.prior.std, [p.known for p in parameters]]))
     return replace(old, terms=(*old.terms, (effect, seed, parameters))), prior
 
 

@@ -17,7 +17,7 @@ from femsense.loop.noise import Noise, estimate_noise, whiten
 from femsense.loop.screen import NUISANCE, Candidate, Fields, candidates_for, effect_fields, one_each, screen
 from femsense.model import Robot
 
-MODULUS_STD = 0.35
+MODULUS_STD = 0.5
 """How well the modulus is known beforehand, in its logarithm: a soft region in a stiff body and a stiff one in a soft body act nearly alike."""
 ZERO_STD = 0.1
 """How well the zero of a cable is known beforehand, as a share of its range in the recording."""
