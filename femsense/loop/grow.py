@@ -526,6 +526,7 @@ def _climbed(data: Data, stage: Stage, start: Candidate, noise: Noise) -> list[C
 
 
 def _scatter(seen: Sequence[Candidate], best: Candidate) -> list[float]:
+    """Return by how much the steps of those that explain nearly as much as the best scatter."""
     steps = [c.step for c in seen if c.gain >= best.gain - max(EVIDENCE, NEARLY * best.gain)]
     return [float(v) for v in np.std(steps, axis=0)]
 
@@ -538,7 +539,10 @@ def _closer(data: Data, stage: Stage, noise: Noise) -> tuple[Stage, list[float]]
         *_, (effect, seed, parameters) = stage.fit.hypothesis.terms
         fields = effect_fields(stage.fit, data.train, [(effect, s, parameters) for s in effect.nearby(data.robot, seed)])
         around = screen(without_last(stage.fit), problem_of(data, stage.fit, noise), fields, 100.0)
-        best, here = max(around, key=lambda c: c.gain), next(c for c in around if c.seed == seed)
+        here = next((c for c in around if c.seed == seed), None)
+        if here is None:  # it does nothing to these markers
+            return stage, [0.0] * len(parameters)
+        best = max(around, key=lambda c: c.gain)
         if best.gain < here.gain + POLISHED:
             return stage, _scatter(around, best)
         made = _moved(data, stage, best, noise)
