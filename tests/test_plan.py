@@ -17,7 +17,7 @@ from femsense.loop.menu import menu, minimal, script_of, setup_for
 from femsense.loop.noise import Noise
 from femsense.loop.outlook import Block, Form, Gram, Judge, forms_of, turns_of
 from femsense.loop.plan import element_block, outlook_of_script, plan_experiment
-from femsense.loop.stages import fields_of, make_stage, screen_stage, with_nuisance
+from femsense.loop.stages import MODULUS_STD, fields_of, make_stage, screen_stage, with_nuisance
 from femsense.recording import load_recording
 from femsense.rig.script import check_script, plan_script
 from femsense.rig.simulate import simulate
@@ -66,7 +66,7 @@ def test_gram_matrices_say_what_projections_of_the_columns_say():
     gram = Gram(own.T @ own, own.T @ shared, shared.T @ shared)
     outlook = Judge(forms, np.ones(4)).judge([Block("a", gram, None, nothing(3, 5), 40, 40)])
     prior = np.zeros((1, 4))
-    prior[0, 3] = 1 / 0.7
+    prior[0, 3] = 1 / MODULUS_STD
     N = np.vstack([np.hstack([own, shared[:, :1]]), prior])
     Q = np.linalg.qr(N)[0]
     E = np.vstack([shared[:, 1:], np.zeros((1, 4))])
