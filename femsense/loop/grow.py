@@ -495,15 +495,16 @@ def _polish(data: Data, stage: Stage, winner: Refit, noise: Noise, say: Progress
 
 
 def _placed(data: Data, stage: Stage, winner: Refit, noise: Noise) -> tuple[Stage, list[float]]:
-    """Return the best of the fits that begin where the climbs from several seeds end, its seed moved on, and the scatter of `_closer`."""
-    best, scatter = _closer(data, winner.stage, noise)
+    """Return the best of the fits that begin where the climbs from several seeds end, its seed moved on, and the scatter of its parameters:
+    that of `_closer`, or that over the places that explain as much where this is larger."""
+    ends = [_closer(data, winner.stage, noise)]
     for candidate in _climbed(data, stage, winner.candidate, noise):
         made = _tried(data, stage, candidate, noise)
-        if made is None or made.fit.fit.status == GIVEN_UP:
-            continue
-        made, own = _closer(data, made, noise)
-        best, scatter = (made, own) if made.fit.chi2 < best.fit.chi2 else (best, scatter)
-    return best, scatter
+        if made is not None and made.fit.fit.status != GIVEN_UP:
+            ends.append(_closer(data, made, noise))
+    best, scatter = min(ends, key=lambda end: end[0].fit.chi2)
+    values = [s.fit.coordinates[-len(scatter) :] for s, _ in ends if s.fit.chi2 < best.fit.chi2 + EVIDENCE]
+    return best, np.maximum(scatter, np.std(values, axis=0)).tolist()
 
 
 def _climbed(data: Data, stage: Stage, start: Candidate, noise: Noise) -> list[Candidate]:
