@@ -177,7 +177,7 @@ def parameter_errors(record: dict[str, Any]) -> list[tuple[float, list[bool]]]:
         for t, v, s in _matched(truth[key], found[key]["value"], found[key]["std"], null):
             size = np.linalg.norm(np.atleast_1d(t) - null)
             off = np.abs(np.atleast_1d(v) - np.atleast_1d(t))
-            inside = [] if s is None else [bool(d <= 1.96 * w) for d, w in zip(off, np.atleast_1d(s))]
+            inside = [] if s is None else [bool(d <= 1.96 * w) for d, w in zip(off, np.atleast_1d(s)) if w is not None]
             result.append((float(np.linalg.norm(off) / size), inside))
     return result
 
