@@ -97,9 +97,10 @@ def _best(
 
 
 def _same(table: Sequence[Candidate], stage: Stage, name: str) -> Candidate | None:
-    """Return the candidate of the form that is named."""
+    """Return the candidate of the form that is named: the one with most of what is fitted, which may be its place or time, too."""
     fitted = {(p.key, p.part) for effect, _, parameters in stage.fit.hypothesis.terms if effect.name == name for p in parameters}
-    return next((c for c in table if c.effect.name == name and {(p.key, p.part) for p in c.parameters} <= fitted), None)
+    forms = [c for c in table if c.effect.name == name and {(p.key, p.part) for p in c.parameters} <= fitted]
+    return max(forms, key=lambda c: len(c.parameters), default=None)
 
 
 def _without(data: Data, history: History, without: Stage, name: str, noise: Noise) -> History:
