@@ -46,7 +46,7 @@ def with_mesh_errors(data: Data, stage: Stage) -> Data:
         return data
     train, held, fitted = list(data.train), list(data.held), placed(data, stage.fit)
     try:
-        fine = robot_on_mesh(robot, finer_mesh(mesh, None, 1))
+        fine = robot_on_mesh(_on_firm_clamp(robot), finer_mesh(mesh, None, 1))
         for i, (trial, (poses, initial)) in enumerate(zip(data.train, fitted)):
             own = [j for j, of in enumerate(data.held_of) if of == i]
             train[i], *later = _with_errors(robot, fine, [trial, *(held[j] for j in own)], poses, initial)
@@ -57,6 +57,16 @@ def with_mesh_errors(data: Data, stage: Stage) -> Data:
     except FemsenseError:
         return data
     return replace(data, train=train, held=held)
+
+
+def _on_firm_clamp(robot: Robot) -> Robot:
+    """Return the robot on a clamp that does not give: on the finer mesh it stays where the state on the declared one has it.
+
+    Springs at the nodes of the declared mesh sink into a finer body as if it ended in as many points. How much the clamp gives is fitted on the
+    declared mesh, its error included; what is asked is what the body's error is.
+    """
+    body = robot.body
+    return robot if body.clamp_is_rigid else robot.with_body(body.with_clamp_stiffness())
 
 
 def _is_asked(mesh: TetMesh) -> bool:
