@@ -163,7 +163,7 @@ def polished(data: Data, stage: Stage, refitted: Refit, noise: Noise, say: Progr
     made = _polish(data, stage, refitted, noise, say)
     if made is refitted.stage:
         return refitted
-    score = refitted.score + evidence(refitted.stage.fit, made.fit)
+    score = refitted.score - evidence(stage.fit, refitted.stage.fit) + evidence(stage.fit, made.fit)
     refitted.record.update({"dbic": score, "validation_rms_m": made.held_rms})
     return replace(refitted, stage=made, score=score)
 
@@ -180,7 +180,8 @@ def _enriched(data: Data, stage: Stage, winner: Refit, table: list[Candidate], n
         rich = judged(data, stage, form, made, dict(winner.record), noise)
         if rich.record["verdict"] == "passes":
             rich = polished(data, stage, rich, noise, say)
-        if rich.record["verdict"] == "passes" and rich.score > winner.score + EVIDENCE:
+        more = evidence(winner.stage.fit, rich.stage.fit) - (rich.candidate.cost - winner.candidate.cost)
+        if rich.record["verdict"] == "passes" and more > EVIDENCE:
             winner.record.update(rich.record | {"seed": form.seed})
             winner = replace(rich, record=winner.record)
     return winner
@@ -490,7 +491,7 @@ def _polish(data: Data, stage: Stage, winner: Refit, noise: Noise, say: Progress
         made = make_stage(data, hypothesis, prior, noise, np.concatenate([best.fit.coordinates, null]), own=own_of(best))
     except FemsenseError:
         return best
-    inside = all(p.low < v < p.high for p, v in zip(more, made.fit.coordinates[-len(more) :]))
+    inside = all(p.low + 1e-9 < v < p.high - 1e-9 for p, v in zip(more, made.fit.coordinates[-len(more) :]))
     return made if made.fit.chi2 < best.fit.chi2 - POLISHED * len(more) and inside else best
 
 
