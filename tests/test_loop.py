@@ -49,6 +49,34 @@ def test_what_is_taken_away_by_what_nobody_names_is_left(monkeypatch: pytest.Mon
     assert loop.left["structure"]["significant"] and loop.evidence["tests"]["after"]["structure"]["significant"]
 
 
+def test_what_has_evidence_and_makes_the_held_out_error_larger_is_said_and_not_handed_back(monkeypatch: pytest.MonkeyPatch):
+    inputs, labels = sweeps()
+    recording, _ = record(inputs, effects=[{"name": "cable_friction", "coefficient": 0.25}], labels=labels, truth=arm((4, 1, 1)))
+    monkeypatch.setattr(sys.modules["femsense.loop.conclude"], "_holds_out", lambda data, search, back: False)
+    loop = improve(arm((4, 1, 1)), [recording], effects=["cable_friction"])
+    assert not loop.effects and loop.robot is loop.declared
+    assert "evidence for cable_friction" in loop.sentence and "mesh itself costs" in loop.sentence
+
+
+def test_an_effect_whose_states_do_not_come_to_rest_again_is_taken_back(monkeypatch: pytest.MonkeyPatch):
+    inputs, labels = sweeps()
+    recording, _ = record(inputs, effects=[{"name": "cable_friction", "coefficient": 0.25}], labels=labels, truth=arm((4, 1, 1)))
+    module = sys.modules["femsense.loop.improve"]
+    screened, asked = module.fields_of, list[tuple[str, ...]]()
+
+    def folds(data, stage, names):
+        asked.append(stage.fit.hypothesis.names)
+        if "cable_friction" in asked[-1]:
+            raise DataError("no equilibrium in frame 3")
+        return screened(data, stage, names)
+
+    monkeypatch.setattr(module, "fields_of", folds)
+    loop = improve(arm((4, 1, 1)), [recording], effects=["cable_friction"])
+    assert "cable_friction" in asked[-1] and "cable_friction" not in {e["name"] for e in loop.effects}
+    refits = [q for c in loop.candidates if c["name"] == "cable_friction" for q in c["refits"]]
+    assert any("no equilibrium in frame 3" in q["verdict"] for q in refits)
+
+
 def test_a_model_that_lacks_nothing_is_told_so():
     inputs, labels = sweeps()
     recording, _ = record(inputs, labels=labels, truth=arm(), noise=2e-4)

@@ -83,6 +83,18 @@ def test_polishing_counts_as_the_evidence_that_it_brings_where_noise_is_larger_t
     assert gained == pytest.approx(evidence(base.fit, better.fit)) and gained < 0.9 * (base.fit.chi2 - better.fit.chi2)
 
 
+def test_a_polished_refit_is_weighed_against_the_model_without_it_as_its_rivals_are(monkeypatch: pytest.MonkeyPatch):
+    data, base = started()
+    better, _ = added(data, base, "payload", 1)
+    table = screen_stage(data, base.fit, NOISE, fields_of(data, base, ["payload"]), COUNT)
+    half = replace(base, fit=replace(base.fit, chi2=0.4 * base.fit.chi2))
+    ahead = evidence(base.fit, half.fit)
+    rough = Refit(shortlist(table, first=True)[0], half, ahead - 20.0, 100.0, {})
+    monkeypatch.setattr(grow, "_polish", lambda *_: better)
+    assert polished(data, base, rough, NOISE, lambda text: None).score == pytest.approx(evidence(base.fit, better.fit) - 20.0)
+    assert abs(evidence(base.fit, better.fit) - ahead - evidence(half.fit, better.fit)) > 1.0  # two steps are not one
+
+
 def test_effects_without_near_rivals_are_not_asked_again():
     data, base = started()
     first, own = added(data, base, "gravity", 1)

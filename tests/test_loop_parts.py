@@ -166,6 +166,20 @@ def test_the_error_of_the_mesh_is_what_the_finer_mesh_adds():
     assert used.max() == 1  # each row has the field of its own sweep
 
 
+def test_springs_of_a_clamp_do_not_sink_into_the_finer_mesh():
+    soft = arm((4, 2, 2))
+    soft = soft.with_body(soft.body.with_clamp_stiffness(40.0))
+    recording, _ = record(sweeps(each=1)[0], labels=sweeps(each=1)[1], truth=soft)
+    noise = Noise({"white": 1e-4}, "")
+    data = prepare(soft, [recording], [])
+    stage = make_stage(data, Hypothesis(data.robot), Prior(np.zeros(0), np.zeros(0)), noise, np.zeros(0))
+    trial, error = data.train[0], mesh_errors(with_mesh_errors(data, stage))[0]
+    _, _, firm = with_error_of_the_mesh(noise)
+    nearest = np.unique(trial.scene.marker)[:4]  # beside the clamp, where a finer body would sink onto its springs
+    by_clamp, by_firm = (np.abs(e[np.isin(trial.scene.marker, nearest)]).max() for e in (error, mesh_errors(firm)[0]))
+    assert by_clamp < 3.0 * by_firm
+
+
 def test_a_finer_state_that_runs_away_says_nothing_though_its_forces_look_small(monkeypatch: pytest.MonkeyPatch):
     robot = arm((4, 2, 2))
     fine = robot_on_mesh(robot, finer_mesh(robot.body.mesh, None, 1))

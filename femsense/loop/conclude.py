@@ -88,7 +88,7 @@ def conclude(data: Data, search: Search, rng: np.random.Generator) -> LoopResult
         robot = replace(robot, document={**data.declared.document, "effects": written})
     return LoopResult(
         verdict=verdict,
-        sentence=_sentence(verdict, effects, before, back, noise),
+        sentence=_sentence(verdict, effects, before, back, noise) + _held_back(data, search, names),
         noise_m=noise.total,
         before=_errors(data, before, rng),
         after=_errors(data, back, rng),
@@ -463,6 +463,18 @@ def _sentence(verdict: str, effects: list[dict[str, Any]], before: Stage, after:
     tail = "" if verdict == "effects" else " A structured residual is left that no effect explains."
     where = "" if noise.std else " along the normals of the surface"
     return f"The model lacks {what}; held-out error{where} {1e3 * before.held_rms:.2f} mm before, {1e3 * after.held_rms:.2f} mm after.{tail}"
+
+
+def _held_back(data: Data, search: Search, names: list[str]) -> str:
+    """Return a sentence on effects that were found and are not handed back; nothing where there are none."""
+    found = [n for n, _ in search.history[1:] if n not in names and n in search.final.fit.hypothesis.names]
+    if not found:
+        return ""
+    cost = rms_of(mesh_errors(data)) if mesh_errors(data) else 0.0
+    mesh = f"; the mesh itself costs {1e3 * cost:.2f} mm, and a finer one may tell" if cost else ""
+    return (
+        f" There is evidence for {', '.join(found)}, but the held-out error would grow with it or a value be implausible{mesh}."
+    )
 
 
 def _short(parameters: dict[str, Any]) -> str:

@@ -134,8 +134,9 @@ def _declared(data: Data, noise: Noise, start: Stage | None) -> Stage:
 def _search(data: Data, before: Stage, base: Stage, names: list[str], most: int, say: Progress) -> tuple[Data, Search]:
     """Screen, refit and add effects, at most so many, until none passes; return the data as the last model has them, and the search."""
     history: list[tuple[str, Stage]] = [("", base)]
-    stage, first, refits, ties = base, list[Candidate](), list[dict[str, Any]](), list[Refit]()
+    stage, first, table, refits, ties = base, list[Candidate](), list[Candidate](), list[dict[str, Any]](), list[Refit]()
     noise: Noise | None = None
+    n_effective, earlier = 0.0, data
     while True:
         found = len(history) - 1
         say(f"screening effects ({found} found so far)")
@@ -143,7 +144,15 @@ def _search(data: Data, before: Stage, base: Stage, names: list[str], most: int,
             assert noise is not None
             data = rematched(data, stage, noise)
             stage = _again(data, stage, noise, own_derivatives=False)
-        fields = fields_of(data, stage, names)
+        try:
+            fields = fields_of(data, stage, names)
+        except FemsenseError as error:
+            if noise is None:
+                raise
+            refits = _unsettled(refits, found, error)
+            data, history = earlier, history[:-1]
+            stage = history[-1][1]
+            break
         noise, n_effective = noise_of(data, stage, fields, noise)
         stage = _again(data, stage, noise)
         history[-1] = (history[-1][0], stage)
@@ -161,6 +170,7 @@ def _search(data: Data, before: Stage, base: Stage, names: list[str], most: int,
                 stage, others = instead, []
         if next_one is None:
             break
+        earlier = data
         name, winner, ties = next_one.candidate.effect.name, next_one.stage, others
         far = moved_by(stage, winner) > mesh_cost(data, stage, whole=True)
         stage = prune(data, winner, noise, n_effective, say)
@@ -172,6 +182,7 @@ def _search(data: Data, before: Stage, base: Stage, names: list[str], most: int,
         if history is not found_so:
             history[-1] = (history[-1][0], prune(data, history[-1][1], noise, n_effective, say))
         stage = history[-1][1]
+    assert noise is not None
     swap = in_place_of_zeros(data, stage, names, noise, n_effective, say) if most else None
     if swap is not None:
         refits += [{**record, "step": len(history)} for record in swap.records]
@@ -195,6 +206,12 @@ def _beside_a_tie(
     if both is None or evidence(stage.fit, both.stage.fit) - both.candidate.cost <= BETTER:
         return instead, None, []
     return instead, both, tried
+
+
+def _unsettled(refits: list[dict[str, Any]], step: int, error: FemsenseError) -> list[dict[str, Any]]:
+    """Return the records of refits with what was named in a step taken back, since its states do not come to rest when they are asked for again."""
+    back = {"verdict": f"no equilibrium: {error}"}
+    return [{**r, **back} if r["step"] == step and r["verdict"] == "named" else r for r in refits]
 
 
 def _renamed(refits: list[dict[str, Any]], step: int, name: str) -> list[dict[str, Any]]:
