@@ -105,6 +105,27 @@ def test_a_model_without_equilibrium_is_not_handed_back(monkeypatch: pytest.Monk
     assert [c["validation_rms_after_m"] for c in chain] == [stage.held_rms]
 
 
+def test_a_model_may_have_a_larger_error_on_held_out_data_where_that_is_the_mesh_s_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    data, stage = staged(arm((4, 2, 2)), 1.0)
+    before, base, back = (replace(stage, held_rms=v) for v in (1.0, 1.5, 1.4))
+    back = replace(
+        back, fit=replace(stage.fit, hypothesis=replace(stage.fit.hypothesis, settled=((find_effect("hyperelastic"), {}),)))
+    )
+    search = Search(before, [("", base)], back, NOISE, 10.0, [], [], [], None)
+
+    def holds(error: float, *, chi2: float = 50.0, beyond: float = 0.5) -> bool:
+        model = replace(back, held_rms=error)
+        monkeypatch.setattr(conclude, "held_chi2", lambda _, s, noise: chi2 if s is model else 100.0)
+        sizes = iter([0.8, beyond])
+        monkeypatch.setattr(conclude, "beyond_mesh", lambda *_: next(sizes))
+        return conclude._holds_out(data, search, model)
+
+    assert holds(1.4) and holds(1.0, chi2=200.0)
+    assert not holds(1.6)  # more than all that calibration may move
+    assert not holds(1.4, chi2=95.0)
+    assert not holds(1.4, beyond=0.9)
+
+
 def test_a_modulus_that_is_as_declared_once_zeros_stay_is_not_handed_back(monkeypatch: pytest.MonkeyPatch) -> None:
     data, softer = staged(arm((4, 2, 2), modulus=250e3))
     as_declared = replace(

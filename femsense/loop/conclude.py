@@ -21,7 +21,7 @@ from femsense.loop.result import LoopResult
 from femsense.loop.screen import NUISANCE, TESTABLE, Candidate, confounding, one_each
 from femsense.loop.spread import spreads
 from femsense.loop.stages import Stage, held_chi2, held_out, keeping, roughly_keeping, with_seeds_still
-from femsense.loop.structure import describe_left, structure_tests, without_mesh_error
+from femsense.loop.structure import beyond_mesh, describe_left, structure_tests, without_mesh_error
 from femsense.loop.zeros import InPlace, moved_nuisance, zeros_are_evident
 
 MIN_SWEEPS = 4
@@ -88,7 +88,9 @@ def conclude(data: Data, search: Search, rng: np.random.Generator) -> LoopResult
         robot = replace(robot, document={**data.declared.document, "effects": written})
     return LoopResult(
         verdict=verdict,
-        sentence=_sentence(verdict, effects, before, back, noise) + _held_back(data, search, names),
+        sentence=_sentence(verdict, effects, before, back, noise)
+        + _by_mesh(data, search, back)
+        + _held_back(data, search, names),
         noise_m=noise.total,
         before=_errors(data, before, rng),
         after=_errors(data, back, rng),
@@ -137,14 +139,18 @@ def _worth_handing_back(data: Data, search: Search, promoted: list[str], names: 
 
 
 def _holds_out(data: Data, search: Search, back: Stage) -> bool:
-    """Return whether a model is no worse on held-out data in millimetres; one that is calibrated only may be, within reason, if it is
-    better by the noise that these data have."""
+    """Return whether a model is no worse on held-out data in millimetres; or else better by the noise that these data have, where it is calibrated
+    only and within reason, or where the mesh's own error is all that is larger: then it must be better beyond that, and no worse in millimetres than
+    the model with all that calibration may move."""
     worse = back.held_rms / search.before.held_rms
     if worse <= NOT_WORSE:
         return True
-    if any(name not in NUISANCE for name in back.fit.hypothesis.names):
+    if held_chi2(data, search.before, search.noise) - held_chi2(data, back, search.noise) <= EVIDENCE:
         return False
-    return worse <= NOISY and held_chi2(data, search.before, search.noise) - held_chi2(data, back, search.noise) > EVIDENCE
+    if worse <= NOISY and all(name in NUISANCE for name in back.fit.hypothesis.names):
+        return True
+    before, after = (beyond_mesh(data.held, s.held_residuals, search.noise) for s in (search.before, back))
+    return after < before and back.held_rms <= NOT_WORSE * search.history[0][1].held_rms
 
 
 def _handed_back(data: Data, final: Stage, names: list[str], noise: Noise) -> Stage | None:
@@ -217,15 +223,10 @@ class Excess:
 def _excess(data: Data, before: Stage, final: Stage, back: Stage, noise: Noise) -> Excess:
     axes, std = (3.0, noise.std) if noise.std else (1.0, noise.surface)
     floor = float(np.sqrt(axes * sum(v**2 for k, v in std.items() if k != "state")))
-    fitted = [_beyond_mesh(data.train, [j.residual for j in s.fit.jets], noise) for s in (before, final)]
-    held = [_beyond_mesh(data.held, s.held_residuals, noise) for s in (before, back)]
+    fitted = [beyond_mesh(data.train, [j.residual for j in s.fit.jets], noise) for s in (before, final)]
+    held = [beyond_mesh(data.held, s.held_residuals, noise) for s in (before, back)]
     left = float(np.sqrt(max(fitted[1] ** 2 - floor**2, 0.0)))
     return Excess(left, 0.25 * floor, min(_taken_away(fitted[0], fitted[1], floor), _taken_away(held[0], held[1], floor)))
-
-
-def _beyond_mesh(trials: list[Trial], residuals: list[FloatArray], noise: Noise) -> float:
-    """Return the root mean square [m] of residuals less what of them is likeliest to be the mesh's own error."""
-    return rms_of([without_mesh_error(t, r, noise) for t, r in zip(trials, residuals)])
 
 
 def _lacks(data: Data, back: Stage, final: Stage, noise: Noise) -> bool:
@@ -463,6 +464,14 @@ def _sentence(verdict: str, effects: list[dict[str, Any]], before: Stage, after:
     tail = "" if verdict == "effects" else " A structured residual is left that no effect explains."
     where = "" if noise.std else " along the normals of the surface"
     return f"The model lacks {what}; held-out error{where} {1e3 * before.held_rms:.2f} mm before, {1e3 * after.held_rms:.2f} mm after.{tail}"
+
+
+def _by_mesh(data: Data, search: Search, back: Stage) -> str:
+    """Return a sentence on what the held-out error is beyond the mesh's own, where that is what makes it larger; nothing where it is not larger."""
+    if back.held_rms <= NOT_WORSE * search.before.held_rms or not mesh_errors(data):
+        return ""
+    before, after = (1e3 * beyond_mesh(data.held, s.held_residuals, search.noise) for s in (search.before, back))
+    return f" Less the likeliest share of what the mesh itself costs, that is {before:.2f} mm before, {after:.2f} mm after."
 
 
 def _held_back(data: Data, search: Search, names: list[str]) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 
 from femsense.arrays import FloatArray, IntArray
 from femsense.loop.covariates import covariates_of, rank_with, stacked
-from femsense.loop.joint import Trial, heads_of, vectors_of
+from femsense.loop.joint import Trial, heads_of, rms_of, vectors_of
 from femsense.loop.noise import Noise, whiten
 from femsense.model import Robot
 from femsense.recording import state_key
@@ -121,6 +121,11 @@ def without_mesh_error(trial: Trial, residual: FloatArray, noise: Noise) -> Floa
     G, r = whiten(plain, trial.mesh_error), whiten(plain, residual)
     share = np.linalg.solve(np.eye(G.shape[1]) + G.T @ G, G.T @ r)
     return np.asarray(residual - trial.mesh_error @ share)
+
+
+def beyond_mesh(trials: list[Trial], residuals: list[FloatArray], noise: Noise) -> float:
+    """Return the root mean square [m] of residuals less what of them is likeliest to be the mesh's own error."""
+    return rms_of([without_mesh_error(t, r, noise) for t, r in zip(trials, residuals)])
 
 
 def _field(trial: Trial, residual: FloatArray) -> tuple[FloatArray, IntArray]:

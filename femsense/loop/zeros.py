@@ -33,6 +33,7 @@ from femsense.loop.grow import (
 from femsense.loop.noise import Noise
 from femsense.loop.predict import sweeps_predicted
 from femsense.loop.stages import Stage, fields_of, held_chi2, keeping, screen_stage
+from femsense.loop.structure import beyond_mesh
 
 ZEROS = "cable_offset"
 SIGNIFICANT = 3.0
@@ -85,7 +86,10 @@ def zeros_are_evident(data: Data, stage: Stage, noise: Noise, n_effective: float
         without = keeping(data, stage, [n for n in stage.fit.hypothesis.names if n != ZEROS], noise)
     except FemsenseError:
         return None
-    if evidence_for_zeros(data, stage, without, n_effective) <= EVIDENCE or stage.held_rms >= without.held_rms:
+    if evidence_for_zeros(data, stage, without, n_effective) <= EVIDENCE:
+        return None
+    plain = [beyond_mesh(data.held, s.held_residuals, noise) for s in (stage, without)]
+    if plain[0] >= plain[1]:
         return None
     better, spread = sweeps_predicted(data.train, without.fit, stage.fit)
     held = held_chi2(data, without, noise) - held_chi2(data, stage, noise)
