@@ -122,10 +122,10 @@ def grow(
     passing = [r for r in refits if r.record["verdict"] == "passes"]
     if not passing:
         return None, [], records
-    # where evidence is close, what predicts better
+    # where evidence is close, what surely predicts better
     leaders = [r for r in passing if r.score > max(p.score for p in passing) - EVIDENCE]
     leaders = [r if "seed_spread" in r.record else polished(data, stage, r, noise, say) for r in leaders]
-    winner = max(leaders, key=lambda r: r.score + r.record["cv_gain"] + weighs(data, r.candidate.effect.name))
+    winner = max(leaders, key=lambda r: r.score + _predicts(r) + weighs(data, r.candidate.effect.name))
     winner = _enriched(data, stage, winner, table, noise, say)
     winner.record["verdict"] = "named"
     ties = [r for r in leaders if r.candidate.effect.name != winner.candidate.effect.name]
@@ -291,6 +291,12 @@ def tilt_cost(declared: Robot, candidate: Candidate, fit: JointFit) -> float:
     vector = fit.coordinates[mask]
     angle = np.arctan2(np.linalg.norm(np.cross(own, vector)), own @ vector)
     return float(5.0 * np.log1p((angle / MOUNTED) ** 2 / 4.0))
+
+
+def _predicts(refitted: Refit) -> float:
+    """Return the gain on left-out sweeps less its standard error, where that is known."""
+    spread = refitted.record["cv_spread"]
+    return float(refitted.record["cv_gain"] - (spread if np.isfinite(spread) else 0.0))
 
 
 def weighs(data: Data, name: str) -> float:
