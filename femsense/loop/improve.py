@@ -45,6 +45,8 @@ from femsense.parallel import beside
 from femsense.recording import Recording, state_key
 
 MAX_EFFECTS = 3
+STATES = 5
+"""So many different states can tell effects apart though what is held out only repeats them."""
 ROUGHLY = 4
 """Steps of the fit whose residual tells the noise; with that it is fitted to the end."""
 
@@ -85,14 +87,14 @@ def improve(
     with beside(lambda: _get_ready(robot)) as finer_is_made:
         data = replace(prepare(robot, recordings, validation, measured), forms=(*FORMS, *own))
         data, before, base = _calibrated(data, say, finer_is_made)
-    growing = _fresh(data)
+    growing = _tells_apart(data)
     data, search = _search(data, before, base, names, MAX_EFFECTS if growing else 0, say)
     say("testing what is left")
     result = conclude(data, search, rng)
     result = replace(result, data={**result.data, "seed": seed})
     if growing:
         return result
-    only = "record another state (other inputs, load or direction of gravity): these data repeat one state, which cannot tell effects apart"
+    only = "record another state (other inputs, load or direction of gravity): these data repeat too few states, which cannot tell effects apart"
     return replace(result, next_experiment="; ".join(t for t in (only, result.next_experiment) if t))
 
 
@@ -239,10 +241,11 @@ def _names(effects: Sequence[str] | None, without: Sequence[str] | None, own: Se
     return [name for name in chosen if name not in (without or [])]
 
 
-def _fresh(data: Data) -> bool:
-    """Return whether anything is held out that is not a repetition of a fitted state."""
+def _tells_apart(data: Data) -> bool:
+    """Return whether these data can tell effects apart: a state that is not fitted is held out, or STATES different ones are fitted."""
     fitted = {state_key(t.scene.recording, int(k)) for t in data.train for k in t.scene.frames}
-    return any(state_key(t.scene.recording, int(k)) not in fitted for t in data.held for k in t.scene.frames)
+    fresh = any(state_key(t.scene.recording, int(k)) not in fitted for t in data.held for k in t.scene.frames)
+    return fresh or len(fitted) >= STATES
 
 
 __all__ = ["improve"]

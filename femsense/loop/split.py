@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from femsense.arrays import FloatArray, IntArray
+from femsense.arrays import BoolArray, FloatArray, IntArray
 from femsense.recording import Recording, state_key
 
 
@@ -43,17 +43,27 @@ def _runs(recording: Recording, frames: IntArray) -> IntArray:
     return np.cumsum(change)
 
 
+def _fresh(recording: Recording, frames: IntArray, held: BoolArray) -> bool:
+    """Return whether frames that are held out have a state that none of the others has."""
+    keys = [state_key(recording, int(k)) for k in frames]
+    fitted = {key for key, out in zip(keys, held) if not out}
+    return any(key not in fitted for key, out in zip(keys, held) if out)
+
+
 def hold_out(recording: Recording, frames: IntArray) -> tuple[IntArray, IntArray, str]:
     """Return frames to fit, frames to hold out, and how they were chosen in words.
 
     A quarter of the sweeps, evenly spread and the last among them; of two or three sweeps the last one; of a single sweep
-    its last quarter.
+    its last quarter. Where these only repeat states that are fitted, the last sweep with a state of its own takes the place of the last.
     """
     number = sweeps_of(recording, frames)
     count = int(number.max()) + 1
     if count >= 2:
         wanted = max(1, round(count / 4))
         held = np.unique(np.round(np.linspace(count - 1, 0, wanted + 1)[:-1]).astype(int))
+        if not _fresh(recording, frames, np.isin(number, held)):
+            swaps = [np.append(held[:-1], s) for s in range(count - 1, -1, -1) if s not in held]
+            held = next((h for h in swaps if _fresh(recording, frames, np.isin(number, h))), held)
         mask = np.isin(number, held)
         return frames[~mask], frames[mask], f"{len(held)} of {count} sweeps"
     split = max(1, round(0.75 * len(frames)))
