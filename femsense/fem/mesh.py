@@ -349,9 +349,13 @@ def embed_points(mesh: TetMesh, points: FloatArray, *, outside_rule: str = "near
     slopes = shape_slopes(at, quadratic=mesh.is_quadratic)
     beyond = barycentric(mesh, element, points) - at
     weights = shape_values(at, quadratic=mesh.is_quadratic) + np.einsum("pkl,pl->pk", slopes, beyond)
+    weights[np.abs(weights) < ROUNDING] = 0.0
     return Embedding(mesh.tets[element], weights, element, outside)
 
 
+ROUNDING = 1e-12
+"""Weights below this are rounding. Their products, in the stiffness of cables, would be numbers so small that processors take many times as long
+for them: factors in single precision took twice the time."""
 AT_ONCE = 4096
 """Points that are looked for together."""
 
