@@ -15,7 +15,7 @@ import scipy.sparse as sp
 
 from femsense.arrays import FloatArray, IntArray, freeze
 from femsense.errors import DataError, FemsenseError
-from femsense.fem.assembly import internal
+from femsense.fem.assembly import add_elements, element_forces, internal
 from femsense.fem.body import BodyModel
 from femsense.fem.cables import bend_angles, cable_forces, rub, shortening
 from femsense.fem.chambers import volume_gradient
@@ -609,6 +609,8 @@ class _Balance:
         self.body = self._body(walk)
         self.inner = internal(self.body, base.positions, tangent=False).forces
         self.dead = self.body.dead_load()
+        self.by_element: FloatArray | None = None
+        """Inner forces of each element [N], (m, k, 3), once they were needed."""
 
     def _body(self, walk: Walk) -> BodyModel:
         body, gravity = walk.robot.body, walk.drive.gravity
@@ -664,9 +666,7 @@ class _Balance:
         force = np.zeros_like(x)
         if body is not own:
             force += body.dead_load() - self.dead
-            springs = [(b.clamp_stiffness, b.clamp_turn_stiffness) for b in (body, own)]
-            if not _same_elements(body, own) or springs[0] != springs[1]:
-                force += self.inner - internal(body, x, tangent=False).forces
+            self._add_inner(body, force)
         if drive.load_forces is not self.walk.drive.load_forces:
             force += self._loads(variant) - self._loads(self.walk)
         for i, chamber in enumerate(body.chambers):
@@ -674,6 +674,18 @@ class _Balance:
             if more != 0.0:
                 force += more * volume_gradient(chamber, x)
         return force
+
+    def _add_inner(self, body: BodyModel, force: FloatArray) -> None:
+        """Add by how much less another body resists to a force [N], (n, 3)."""
+        own, x = self.body, self.base.positions
+        springs = [(b.clamp_stiffness, b.clamp_turn_stiffness) for b in (body, own)]
+        if springs[0] != springs[1] or not _same_but_modulus(body, own):
+            force += self.inner - internal(body, x, tangent=False).forces
+        elif body.material is not own.material:
+            if self.by_element is None:
+                self.by_element = element_forces(own, x)
+            softer = 1.0 - body.material.young_modulus / own.material.young_modulus
+            add_elements(own.stencil.tets, self.by_element, softer, force)
 
     def pulled(self, variant: Walk, x: FloatArray | None) -> FloatArray:
         """Return the shortening that a variant adds to held cables at x, by default in the base state [m], (a,)."""
@@ -825,13 +837,12 @@ def _unbalanced(body: BodyModel, base: Equilibrium, x: FloatArray, force: FloatA
     return float(np.linalg.norm(rest))
 
 
-def _same_elements(body: BodyModel, other: BodyModel) -> bool:
-    """Return whether the elements of two bodies answer alike, where their meshes do not differ by what moves their nodes."""
+def _same_but_modulus(body: BodyModel, other: BodyModel) -> bool:
+    """Return whether the elements of two bodies answer alike, but for their modulus, where their meshes do not differ by what moves their nodes."""
     a, b = body.material, other.material
     if a is b or body.mesh is not other.mesh:
         return a is b
-    alike = np.array_equal(a.young_modulus, b.young_modulus) and np.array_equal(a.poisson_ratio, b.poisson_ratio)
-    return alike and (a.law, a.stretch_limit) == (b.law, b.stretch_limit)
+    return np.array_equal(a.poisson_ratio, b.poisson_ratio) and (a.law, a.stretch_limit) == (b.law, b.stretch_limit)
 
 
 def _same_mechanics(walk: Walk, variant: Walk) -> bool:

@@ -74,6 +74,31 @@ def internal(
     return Internal(float(energy), forces, blocks if tangent else None)
 
 
+def element_forces(body: BodyModel, positions: FloatArray) -> FloatArray:
+    """Return the internal forces of each element by itself [N], shape (m, k, 3); in every law they go with its modulus."""
+    stencil, material = body.stencil, body.material
+    mu, lam = material.lame()
+    x = np.ascontiguousarray(positions[stencil.tets].reshape(-1, 3)).view()
+    x.flags.writeable = False
+    apart = np.arange(stencil.tets.size).reshape(stencil.tets.shape)
+    forces = np.zeros_like(x)
+    kernel = KERNELS["corotational" if material.law == "corotational" else "hyperelastic", body.mesh.tets.shape[1]]
+    limit = material.stretch_limit if material.law == "gent" else np.inf
+    mesh = x, apart, stencil.gradients, stencil.volumes, mu, lam
+    kernel(*mesh, limit, False, stencil.slots, forces, np.zeros((0, 9)))
+    return forces.reshape(*apart.shape, 3)
+
+
+@njit(cache=True, nogil=True)
+def add_elements(tets: IntArray, forces: FloatArray, weights: FloatArray, total: FloatArray) -> None:
+    """Add the forces of elements (m, k, 3), each times its weight (m,), to nodal forces (n, 3)."""
+    for e in range(len(tets)):
+        if weights[e] != 0.0:
+            for a in range(tets.shape[1]):
+                for i in range(3):
+                    total[tets[e, a], i] += weights[e] * forces[e, a, i]
+
+
 def diagonal_slots(body: BodyModel) -> IntArray:
     """Return the slot of the diagonal block of every node, shape (n,)."""
     rows = block_row_numbers(body.stencil)
