@@ -161,9 +161,9 @@ def effect_fields(base: JointFit, trials: list[Trial], todo: list[tuple[Effect, 
         jet = probe.jet(trial, base.fit.theta[span], null, True)
         raw.append(jet.by_effect)
         rest.append(jet.rest_by_effect)
-    usable = smooth
+    usable, near = smooth, [jet.states for jet in base.jets]
     for one in (t for t in todo if t[0].discrete and _can_act(fixed, t)):
-        changes = _whole_change(base, trials, fixed, one)
+        changes = _whole_change(base, trials, fixed, one, near)
         if changes is not None:
             usable = [*usable, one]
             raw = [np.concatenate([block, change[:, :, None]], axis=2) for block, change in zip(raw, changes)]
@@ -181,21 +181,25 @@ def _can_act(robot: Robot, one: tuple[Effect, Entry, tuple[Parameter, ...]]) -> 
 
 
 def _whole_change(
-    base: JointFit, trials: list[Trial], fixed: Robot, one: tuple[Effect, Entry, tuple[Parameter, ...]]
+    base: JointFit, trials: list[Trial], fixed: Robot, one: tuple[Effect, Entry, tuple[Parameter, ...]], near: list[States]
 ) -> list[FloatArray] | None:
-    """Return by how much a discrete alternative changes the residual of each trial [m], (k, c); None where it has no equilibrium."""
+    """Return by how much a discrete alternative changes the residual of each trial [m], (k, c); None where it has no equilibrium.
+
+    It starts from states `near`, which those of another law take the place of: laws differ less from each other than from what is declared.
+    """
     parameters = one[2]
     robot = Hypothesis(fixed, (one,)).robot_at(np.array([p.null for p in parameters]))
     probe = JointProblem(Hypothesis(robot), Prior(np.zeros(0), np.zeros(0)), trials, [], 1.0)
     changes = []
     try:
-        for trial, jet, span in zip(trials, base.jets, spans_of(trials)):
-            own, starts = base.fit.theta[span], _starts_of(trial, fixed, robot, jet.states)
+        for i, (trial, jet, span) in enumerate(zip(trials, base.jets, spans_of(trials))):
+            own, starts = base.fit.theta[span], _starts_of(trial, fixed, robot, near[i])
             try:
                 moved = probe.jet(trial, own, np.zeros(0), False, starts, rough=True)
             except DataError:
                 moved = probe.jet(trial, own, np.zeros(0), False, starts)
             changes.append(moved.residual - jet.residual)
+            near[i] = starts if robot.body.mesh is fixed.body.mesh else near[i]
     except FemsenseError:
         return None
     return changes
@@ -206,7 +210,7 @@ def _starts_of(trial: Trial, fixed: Robot, robot: Robot, states: States) -> Stat
     mesh = robot.body.mesh
     starts = trial.starts_on(mesh)
     if mesh is fixed.body.mesh:  # the factors of these states are lent
-        return {k: replace(s, factor=starts[k].factor if k in starts else None) for k, s in states.items()}
+        return {k: replace(s, factor=starts[k].factor) if s.factor is None and k in starts else s for k, s in states.items()}
     if not states.keys() <= starts.keys():
         ties, still = embed_points(fixed.body.mesh, mesh.nodes), np.zeros_like(mesh.nodes)
         starts.update(
