@@ -18,6 +18,8 @@ STILL = 1e-2
 """A step that changes the whitened residual by less than this is none."""
 
 
+LEAST_SHRINKING = 0.25
+"""No step is foretold to be shorter than this share of the one before."""
 GIVEN_UP = "given up"
 MOST_DAMPING = 1e8
 WIDTHS = 0.3, 0.1, 0.03, 0.01, 1e-3, 1e-5
@@ -61,6 +63,8 @@ class FitResult:
     """Sum of squares after each iteration, the start first."""
     status: str
     """"converged", "iterations", or "given up" (see `worth` of `gauss_newton`)."""
+    own: bool = True
+    """Whether the Jacobian is that at θ; else that of a step before."""
 
 
 def gauss_newton(
@@ -81,7 +85,8 @@ def gauss_newton(
     """Minimise ‖r(θ)‖² within bounds (Levenberg's damping where a plain step does not pay).
 
     A Jacobian that predicted the last step well serves for the next one too; the fit ends only where the Jacobian at θ itself says that
-    there is nothing left to gain.
+    there is nothing left to gain, or where it would: steps of a Gauss–Newton fit, each with a Jacobian of its own, shrink like a geometric series,
+    so that two of them foretell the next.
 
     Arguments:
         evaluate: residual and Jacobian; priors are rows of them.
@@ -108,6 +113,7 @@ def gauss_newton(
     residual, jacobian, own = _first(evaluate, theta, known, borrowed)
     costs = [float(residual @ residual)]
     damping, status, steps = 0.0, "iterations", 0
+    length, next_length = np.inf, np.inf  # of the last step with a Jacobian of its own; of the next one, foretold
     while steps < max_iterations or not own:
         near = _Near(residual, jacobian, None if kinks is None else kinks(theta), low - theta, high - theta)
         step = near.step(damping)
@@ -118,6 +124,9 @@ def gauss_newton(
         hopeless = costs[-1] - 2.0 * plain > worth
         if costs[-1] > worth and (hopeless or (not own and (small or steps >= max_iterations))):
             status = GIVEN_UP
+            break
+        if not own and small and next_length <= still * error:
+            status = "converged"
             break
         if not own and (small or steps >= max_iterations):
             residual, jacobian, own = *_both(evaluate, theta), True
@@ -142,13 +151,16 @@ def gauss_newton(
             continue
         damping = damping / 10.0 if damping > 1e-6 else 0.0
         missed = float(np.linalg.norm(new_residual - residual - change))
+        if own:
+            before, length = length, float(np.linalg.norm(change))
+            next_length = length * max(length / before, LEAST_SHRINKING) if damping == 0.0 and length < before < np.inf else np.inf
         theta, residual, own = theta + step, new_residual, False
         if missed > serves * float(np.linalg.norm(change)):
             residual, jacobian, own = *_both(evaluate, theta), True
         costs.append(float(residual @ residual))
-    bends = None if kinks is None or not own else kinks(theta)
+    bends = None if kinks is None or status == GIVEN_UP else kinks(theta)
     jacobian = jacobian if bends is None else _on_kinks(jacobian, residual, bends)
-    return FitResult(freeze(theta), freeze(covariance_of(jacobian)), freeze(residual), freeze(jacobian), tuple(costs), status)
+    return FitResult(freeze(theta), freeze(covariance_of(jacobian)), freeze(residual), freeze(jacobian), tuple(costs), status, own)
 
 
 def _shorter(near: _Near, damping: float, change: FloatArray) -> float:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from femsense.arrays import BoolArray, FloatArray, IntArray
-from femsense.calib.fit import GIVEN_UP, FitResult, Kinks, gauss_newton
+from femsense.calib.fit import FitResult, Kinks, gauss_newton
 from femsense.calib.forward import Hypothesis, Scene, SceneJet, evaluate_scene, rest_residual
 from femsense.effects.loads import STANDARD_GRAVITY
 from femsense.errors import DataError
@@ -412,7 +412,7 @@ def fit_jointly(
         known=begin, borrowed=None if near is None else problem.rows_of(near, theta, True)[1], serves=SERVES, worth=worth, kinks=problem.kinks,
     )  # fmt: skip
     if problem.last is None or not np.array_equal(problem.last.theta, fit.theta):
-        if fit.status == GIVEN_UP:
+        if not fit.own:
             jets = problem.settle_for(near)
             return JointFit(hypothesis, prior, fit, problem.own, float(fit.residual @ fit.residual), jets)
         problem.evaluate(fit.theta, True)
