@@ -93,8 +93,8 @@ SABOTAGES = (
     # cables
     S("fem/cables.py", "cable_length(c, rest) - cable_length(c, positions)", "cable_length(c, positions) - cable_length(c, rest)", "test_fem_cables.py::test_pull_rows_are_the_slope_of_the_shortening"),
     S("fem/cables.py", "inner = tensions[j]", "inner = motor_tension", "test_fem_cables.py::test_rubbing_is_that_of_the_definition"),
-    S("fem/cables.py", "span = np.exp(cable.friction * angles[j])", "span = np.exp(cable.friction * np.degrees(angles[j]))", "test_fem_cables.py::test_pulling_loses_sticking_keeps_letting_go_gains"),
-    S("fem/cables.py", "_angle(directions[:-1], directions[1:])", "_angle(directions[:-1], -directions[1:])", "test_fem_cables.py::test_bends_of_a_known_path"),
+    S("fem/cables.py", "span = np.exp(friction * angles[j])", "span = np.exp(friction * np.degrees(angles[j]))", "test_fem_cables.py::test_pulling_loses_sticking_keeps_letting_go_gains"),
+    S("fem/cables.py", "ahead = directions[s + 1] if", "ahead = -directions[s + 1] if", "test_fem_cables.py::test_bends_of_a_known_path"),
     # chambers
     S("fem/chambers.py", "blocks[:, [5, 6, 1]] -= w", "blocks[:, [5, 6, 1]] += w", "test_fem_chambers.py::test_gradient_and_stiffness_are_slopes_of_the_volume"),
     S("fem/chambers.py", "inner[:, [0, 2, 1]] if inner.shape[1] == 3", "inner[:, [0, 1, 2]] if inner.shape[1] == 3", "test_fem_chambers.py::test_volume_of_a_box_and_of_its_image_under_a_linear_map"),

@@ -177,6 +177,12 @@ def _ties(robot: Robot, scene: Scene, poses: Sequence[FloatArray]) -> Embedding:
     return robot.tie_markers(seats(robot, scene, poses)) if len(scene.rest_marker) else robot.markers
 
 
+def _tied_alike(robot: Robot, other: Robot) -> bool:
+    """Return whether the markers of two robots are tied to the same nodes in the same way, as far as declared places and cameras say."""
+    same_seats = robot.marker_points is other.marker_points and robot.observation == other.observation
+    return same_seats and robot.body.mesh is other.body.mesh and robot.marker_share is other.marker_share
+
+
 def marker_residual(robot: Robot, scene: Scene, poses: Sequence[FloatArray], model: Mapping[int, FloatArray]) -> FloatArray:
     """Return measured minus modelled markers [m], shape (k, 3), along the axes of the robot; model: frame → markers (m, 3).
 
@@ -243,7 +249,10 @@ def evaluate_scene(
     steps, variants = _variants(hypothesis, scene, coordinates, initial, base, vary_initial) if derivative else ([], [])
     split, last = len(hypothesis.parameters) if derivative else 0, len(variants)
     pulling = _pulling(hypothesis, base, steps, variants) if derivative and vary_inputs else []
-    places = {id(r): _ties(r, scene, poses) for r in (robot, *(v.robot for v in variants))}
+    places = {id(robot): _ties(robot, scene, poses)}
+    for v in variants:
+        if id(v.robot) not in places:
+            places[id(v.robot)] = places[id(robot)] if _tied_alike(v.robot, robot) else _ties(v.robot, scene, poses)
 
     def observe(r: Robot, state: Equilibrium) -> FloatArray:
         return places.get(id(r), places[id(robot)]).positions(state.positions)

@@ -108,20 +108,26 @@ def _add_segments(weights: FloatArray, d: FloatArray, stiffness: FloatArray, slo
 def bend_angles(cable: Cable, positions: FloatArray) -> FloatArray:
     """Return the bend before each segment [rad], shape (s,), going outwards from the motor: entry j is the bend between
     segment j + 1 and segment j; the last is the bend at the pull point (0 without an exit direction)."""
-    directions, _ = segments(cable, positions)
+    leaves = np.zeros(3) if cable.exit_direction is None else cable.exit_direction
+    path = cable.path
+    return np.asarray(_bends(path.nodes, path.weights, cable.pull_point, leaves, np.ascontiguousarray(positions)))
+
+
+@njit(cache=True)
+def _bends(nodes: IntArray, weights: FloatArray, end: FloatArray, leaves: FloatArray, positions: FloatArray) -> FloatArray:
+    """Return the angles between unit vectors of segments, the last with what leaves, if anything does (Kahan: accurate for small and for large angles)."""
+    directions, _ = _segments(nodes, weights, end, positions)
     angles = np.zeros(len(directions))
-    angles[:-1] = _angle(directions[:-1], directions[1:])
-    if cable.exit_direction is not None:
-        angles[-1] = _angle(directions[-1:], cable.exit_direction[None])[0]
+    for s in range(len(directions)):
+        ahead = directions[s + 1] if s + 1 < len(directions) else leaves
+        apart = along = size = 0.0
+        for c in range(3):
+            apart += (directions[s, c] - ahead[c]) ** 2
+            along += (directions[s, c] + ahead[c]) ** 2
+            size += ahead[c] ** 2
+        if size > 0.0:
+            angles[s] = 2.0 * np.arctan2(np.sqrt(apart), np.sqrt(along))
     return angles
-
-
-def _angle(u: FloatArray, v: FloatArray) -> FloatArray:
-    """Return the angle between unit vectors [rad], shape (s,) (Kahan: accurate for small and for large angles)."""
-    apart, along = u - v, u + v
-    return np.asarray(
-        2.0 * np.arctan2(np.sqrt(np.einsum("ij,ij->i", apart, apart)), np.sqrt(np.einsum("ij,ij->i", along, along)))
-    )
 
 
 def rub(cable: Cable, angles: FloatArray, before: FloatArray, motor_tension: float) -> FloatArray:
@@ -135,10 +141,15 @@ def rub(cable: Cable, angles: FloatArray, before: FloatArray, motor_tension: flo
         before: the tensions of the segments until now [N], shape (s,).
         motor_tension: [N].
     """
+    return np.asarray(_rub(float(cable.friction), angles, before, float(motor_tension)))
+
+
+@njit(cache=True)
+def _rub(friction: float, angles: FloatArray, before: FloatArray, motor_tension: float) -> FloatArray:
     tensions = np.empty_like(before)
     inner = motor_tension
     for j in range(len(before) - 1, -1, -1):
-        span = np.exp(cable.friction * angles[j])
+        span = np.exp(friction * angles[j])
         tensions[j] = min(max(before[j], inner / span), inner * span)
         inner = tensions[j]
     return tensions

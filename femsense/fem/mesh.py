@@ -87,7 +87,9 @@ class Embedding:
 
     def spread(self, forces: FloatArray, node_count: int) -> FloatArray:
         """Return nodal forces [N], shape (n, 3), that are equivalent to forces [N], shape (p, 3), at the points."""
-        return np.asarray(self.matrix(node_count).T @ forces)
+        result = np.zeros((node_count, 3))
+        np.add.at(result, self.nodes, self.weights[:, :, None] * forces[:, None, :])
+        return result
 
     def __getitem__(self, index: Any) -> Embedding:
         still = None if self.still is None else np.atleast_2d(self.still[index])
