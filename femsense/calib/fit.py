@@ -153,14 +153,18 @@ def gauss_newton(
         missed = float(np.linalg.norm(new_residual - residual - change))
         if own:
             before, length = length, float(np.linalg.norm(change))
-            next_length = length * max(length / before, LEAST_SHRINKING) if damping == 0.0 and length < before < np.inf else np.inf
+            next_length = (
+                length * max(length / before, LEAST_SHRINKING) if damping == 0.0 and length < before < np.inf else np.inf
+            )
         theta, residual, own = theta + step, new_residual, False
         if missed > serves * float(np.linalg.norm(change)):
             residual, jacobian, own = *_both(evaluate, theta), True
         costs.append(float(residual @ residual))
     bends = None if kinks is None or status == GIVEN_UP else kinks(theta)
     jacobian = jacobian if bends is None else _on_kinks(jacobian, residual, bends)
-    return FitResult(freeze(theta), freeze(covariance_of(jacobian)), freeze(residual), freeze(jacobian), tuple(costs), status, own)
+    return FitResult(
+        freeze(theta), freeze(covariance_of(jacobian)), freeze(residual), freeze(jacobian), tuple(costs), status, own
+    )
 
 
 def _shorter(near: _Near, damping: float, change: FloatArray) -> float:
