@@ -7,6 +7,7 @@ import pytest
 from analytic import central_gradient, random_rotation
 from scipy.optimize import least_squares
 
+import femsense.calib.fit as fit_module
 from femsense.calib.fit import covariance_of, gauss_newton
 from femsense.calib.rigid import fit_rigid, fit_rigid_robust
 from femsense.errors import DataError, InputError
@@ -195,6 +196,18 @@ def test_a_jacobian_that_serves_again_ends_at_the_same_place_with_fewer_of_them(
     assert results[1].status == "converged" and jacobians[1] < jacobians[0]
     evaluate, _ = counted(1.0)
     np.testing.assert_array_equal(results[1].jacobian, evaluate(results[1].theta, True)[1])  # that at the end
+
+
+def test_steps_that_shrink_foretell_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    results, jacobians = [], []
+    for least in (fit_module.LEAST_SHRINKING, np.inf):  # inf: nothing is foretold
+        monkeypatch.setattr(fit_module, "LEAST_SHRINKING", least)
+        evaluate, asked = counted(1.0)
+        results.append(gauss_newton(evaluate, np.array([0.9, 1.0, 0.4]), serves=0.3, still=1e-2))
+        jacobians.append(sum(asked))
+    np.testing.assert_allclose(results[0].theta, results[1].theta, atol=1e-5)
+    assert jacobians[0] == jacobians[1] - 1 and results[0].status == "converged"
+    assert results[1].own and not results[0].own
 
 
 def test_what_is_known_at_the_start_is_not_evaluated_again() -> None:

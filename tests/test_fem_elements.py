@@ -22,7 +22,7 @@ from helpers import block_mesh
 from scipy.sparse.linalg import spsolve
 
 from femsense.errors import InputError
-from femsense.fem.assembly import diagonal_slots, internal, reduced_matrix
+from femsense.fem.assembly import add_elements, diagonal_slots, element_forces, internal, reduced_matrix
 from femsense.fem.body import BodyModel, Material, make_body
 from femsense.fem.equilibrium import solve_equilibrium
 from femsense.fem.mesh import TetMesh, shape_values, to_quadratic
@@ -61,6 +61,17 @@ def test_tangent_is_the_slope_of_the_force(law: str, quadratic: bool, seed: int)
     x = distorted(body.mesh, rng, noise=0.03)
     slope = central_gradient(lambda y: internal(body, y, tangent=False).forces.ravel(), x, 2e-7)
     assert relative_error(dense_stiffness(body, x), slope) < 1e-6
+
+
+@pytest.mark.parametrize(("law", "quadratic"), CASES)
+def test_forces_of_elements_add_up_with_their_moduli(law: str, quadratic: bool) -> None:
+    body, rng = small_body(law, quadratic, 5), np.random.default_rng(5)
+    x = distorted(body.mesh, rng, noise=0.03)
+    scale = rng.uniform(0.5, 2.0, len(body.mesh.tets)) * np.array([0.0, 1.0] * 3) + 1e-3
+    total = np.zeros_like(x)
+    add_elements(body.stencil.tets, element_forces(body, x), scale, total)
+    wanted = internal(body.with_stiffness_scale(scale), x, tangent=False).forces
+    np.testing.assert_allclose(total, wanted, rtol=1e-9, atol=1e-12 * np.abs(wanted).max())
 
 
 def test_tangent_of_an_inverted_corotational_element_is_still_the_slope() -> None:

@@ -218,6 +218,13 @@ def test_embedded_points_follow_linear_fields_inside_and_outside(quadratic: bool
     np.testing.assert_allclose(at.positions(mesh.nodes @ A.T + 0.3), points @ A.T + 0.3, atol=1e-12)
 
 
+def test_weights_that_are_rounding_are_none() -> None:
+    mesh = crooked(quadratic=True)
+    corners = mesh.nodes[mesh.tets[:, :4]]
+    weights = np.abs(embed_points(mesh, corners.reshape(-1, 3)).weights)
+    assert ((weights == 0.0) | (weights > 1e-12)).all() and (weights == 0.0).mean() > 0.5
+
+
 def test_embedded_points_follow_quadratic_fields_in_quadratic_elements() -> None:
     mesh, rng = crooked(quadratic=True), np.random.default_rng(3)
     points, C = inside_points(mesh), rng.normal(0, 1, (10, 3))

@@ -149,13 +149,11 @@ def gauss_newton(
                 status = "converged"
                 break
             continue
+        if own:
+            before, length = length, float(np.linalg.norm(change)) if damping == 0.0 else np.inf
+            next_length = _foretold(before, length)
         damping = damping / 10.0 if damping > 1e-6 else 0.0
         missed = float(np.linalg.norm(new_residual - residual - change))
-        if own:
-            before, length = length, float(np.linalg.norm(change))
-            next_length = (
-                length * max(length / before, LEAST_SHRINKING) if damping == 0.0 and length < before < np.inf else np.inf
-            )
         theta, residual, own = theta + step, new_residual, False
         if missed > serves * float(np.linalg.norm(change)):
             residual, jacobian, own = *_both(evaluate, theta), True
@@ -165,6 +163,11 @@ def gauss_newton(
     return FitResult(
         freeze(theta), freeze(covariance_of(jacobian)), freeze(residual), freeze(jacobian), tuple(costs), status, own
     )
+
+
+def _foretold(before: float, length: float) -> float:
+    """Return how long the step after two steps will be if they go on shrinking; inf where they do not."""
+    return length * max(length / before, LEAST_SHRINKING) if length < before < np.inf else np.inf
 
 
 def _shorter(near: _Near, damping: float, change: FloatArray) -> float:
