@@ -85,8 +85,8 @@ def gauss_newton(
     """Minimise ‖r(θ)‖² within bounds (Levenberg's damping where a plain step does not pay).
 
     A Jacobian that predicted the last step well serves for the next one too; the fit ends only where the Jacobian at θ itself says that
-    there is nothing left to gain, or where it would: steps of a Gauss–Newton fit, each with a Jacobian of its own, shrink like a geometric series,
-    so that two of them foretell the next.
+    there is nothing left to gain, or, where what is left is noise, where it would: steps of a Gauss–Newton fit, each with a Jacobian of its own,
+    shrink like a geometric series, so that two of them foretell the next.
 
     Arguments:
         evaluate: residual and Jacobian; priors are rows of them.
@@ -125,7 +125,7 @@ def gauss_newton(
         if costs[-1] > worth and (hopeless or (not own and (small or steps >= max_iterations))):
             status = GIVEN_UP
             break
-        if not own and small and next_length <= still * error:
+        if not own and small and error == 1.0 and next_length <= still:
             status = "converged"
             break
         if not own and (small or steps >= max_iterations):
