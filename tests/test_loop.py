@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -127,6 +128,23 @@ def test_a_sweep_that_is_a_repetition_is_not_held_out_where_another_is_new():
         time_s=np.arange(6), cable_names=["a"], inputs=np.array([[0.0], [1.0], [2.0]] * 2), sweep=list("aaabbb")
     )
     assert hold_out(only, np.arange(6))[1].tolist() == [3, 4, 5]  # all are repeated: the last one
+
+
+def test_repeated_sweeps_of_many_states_tell_effects_apart():
+    def data(levels: list[float]) -> SimpleNamespace:
+        inputs = np.array([[v] for v in levels * 2])
+        recording = make_recording(time_s=np.arange(len(inputs)), cable_names=["a"], inputs=inputs)
+        fitted, held = np.split(np.arange(len(inputs)), 2)
+        return SimpleNamespace(
+            **{
+                n: [SimpleNamespace(scene=SimpleNamespace(recording=recording, frames=f))]
+                for n, f in (("train", fitted), ("held", held))
+            }
+        )
+
+    tells_apart = sys.modules["femsense.loop.improve"]._tells_apart
+    assert tells_apart(data([0.0, 1.0, 2.0, 3.0, 4.0]))
+    assert not tells_apart(data([0.0, 1.0]))
 
 
 def test_without_labels_a_sweep_is_an_excursion_from_rest():

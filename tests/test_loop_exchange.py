@@ -95,6 +95,14 @@ def test_a_polished_refit_is_weighed_against_the_model_without_it_as_its_rivals_
     assert abs(evidence(base.fit, better.fit) - ahead - evidence(half.fit, better.fit)) > 1.0  # two steps are not one
 
 
+def test_what_predicts_surely_goes_before_what_may_predict():
+    def predicts(gain: float, spread: float) -> float:
+        return grow._predicts(Refit(None, None, 0.0, 0.0, {"cv_gain": gain, "cv_spread": spread}))
+
+    assert predicts(44.0, 14.0) > predicts(48.0, 45.0)
+    assert predicts(44.0, np.inf) == 44.0
+
+
 def test_effects_without_near_rivals_are_not_asked_again():
     data, base = started()
     first, own = added(data, base, "gravity", 1)
