@@ -115,19 +115,17 @@ def test_whole_sweeps_are_held_out_and_the_last_is_among_them():
     assert labels[-1] in {labels[k] for k in held}
 
 
-def test_a_sweep_that_is_a_repetition_is_not_held_out_where_another_is_new():
-    inputs, labels = sweeps()
-    twice = np.vstack([inputs, inputs[-5:]])
-    recording = make_recording(
-        time_s=np.arange(len(twice)), cable_names=list("abcd"), inputs=twice, sweep=[*labels, *["again"] * 5]
-    )
-    _, held, _ = hold_out(recording, np.arange(len(twice)))
-    names = [*labels, *["again"] * 5]
-    assert "again" not in {names[k] for k in held} and len({names[k] for k in held}) == 2
-    only = make_recording(
-        time_s=np.arange(6), cable_names=["a"], inputs=np.array([[0.0], [1.0], [2.0]] * 2), sweep=list("aaabbb")
-    )
-    assert hold_out(only, np.arange(6))[1].tolist() == [3, 4, 5]  # all are repeated: the last one
+def test_a_sweep_that_is_a_repetition_is_not_held_out_where_another_can_be_spared():
+    def held(*sweeps: list[list[float]]) -> set[int]:
+        names = [str(i) for i, rows in enumerate(sweeps) for _ in rows]
+        inputs = np.concatenate([np.asarray(rows) for rows in sweeps])
+        recording = make_recording(time_s=np.arange(len(inputs)), cable_names=["a", "b"], inputs=inputs, sweep=names)
+        return {int(names[k]) for k in hold_out(recording, np.arange(len(inputs)))[1]}
+
+    one, both, other = ([[0.0, 0.0], x, [0.0, 0.0]] for x in ([2.0, 0.0], [2.0, 2.0], [0.0, 2.0]))
+    assert held(one, both, other) == {2}
+    assert held(one, other, both, both) == {1}  # `both` drives as far
+    assert held(one, other, other) == {2}  # nothing drives the first one but `one`
 
 
 def test_repeated_sweeps_of_many_states_tell_effects_apart():

@@ -145,9 +145,11 @@ def _holds_out(data: Data, search: Search, back: Stage) -> bool:
     worse = back.held_rms / search.before.held_rms
     if worse <= NOT_WORSE:
         return True
-    if held_chi2(data, search.before, search.noise) - held_chi2(data, back, search.noise) <= EVIDENCE:
+    only_calibrated = all(name in NUISANCE for name in back.fit.hypothesis.names)
+    gain = held_chi2(data, search.before, search.noise) - held_chi2(data, back, search.noise)
+    if gain <= (EVIDENCE if only_calibrated else 0.0):  # effects have been judged by held-out data before
         return False
-    if worse <= NOISY and all(name in NUISANCE for name in back.fit.hypothesis.names):
+    if only_calibrated and worse <= NOISY:
         return True
     before, after = (beyond_mesh(data.held, s.held_residuals, search.noise) for s in (search.before, back))
     return after < before and back.held_rms <= NOT_WORSE * search.history[0][1].held_rms

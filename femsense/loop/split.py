@@ -50,11 +50,18 @@ def _fresh(recording: Recording, frames: IntArray, held: BoolArray) -> bool:
     return any(key not in fitted for key, out in zip(keys, held) if out)
 
 
+def _can_be_spared(recording: Recording, frames: IntArray, held: BoolArray) -> bool:
+    """Return whether frames that are held out have a state of their own, while the others drive every input as far."""
+    size = np.abs(_drives(recording)[frames])
+    return _fresh(recording, frames, held) and bool((size[~held].max(axis=0) >= 0.9 * size.max(axis=0)).all())
+
+
 def hold_out(recording: Recording, frames: IntArray) -> tuple[IntArray, IntArray, str]:
     """Return frames to fit, frames to hold out, and how they were chosen in words.
 
     A quarter of the sweeps, evenly spread and the last among them; of two or three sweeps the last one; of a single sweep
-    its last quarter. Where these only repeat states that are fitted, the last sweep with a state of its own takes the place of the last.
+    its last quarter. Where these only repeat states that are fitted, the last sweep with a state of its own that can be spared takes
+    the place of the last: the others drive every input as far.
     """
     number = sweeps_of(recording, frames)
     count = int(number.max()) + 1
@@ -63,7 +70,7 @@ def hold_out(recording: Recording, frames: IntArray) -> tuple[IntArray, IntArray
         held = np.unique(np.round(np.linspace(count - 1, 0, wanted + 1)[:-1]).astype(int))
         if not _fresh(recording, frames, np.isin(number, held)):
             swaps = [np.append(held[:-1], s) for s in range(count - 1, -1, -1) if s not in held]
-            held = next((h for h in swaps if _fresh(recording, frames, np.isin(number, h))), held)
+            held = next((h for h in swaps if _can_be_spared(recording, frames, np.isin(number, h))), held)
         mask = np.isin(number, held)
         return frames[~mask], frames[mask], f"{len(held)} of {count} sweeps"
     split = max(1, round(0.75 * len(frames)))
