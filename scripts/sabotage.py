@@ -186,6 +186,7 @@ SABOTAGES = (
     S("loop/mesh_error.py", "robot_on_mesh(_on_firm_clamp(robot),", "robot_on_mesh(robot,", "test_loop_parts.py::test_springs_of_a_clamp_do_not_sink_into_the_finer_mesh"),
     S("loop/grow.py", "refitted.score - evidence(stage.fit, refitted.stage.fit) + evidence(stage.fit, made.fit)", "refitted.score + evidence(refitted.stage.fit, made.fit)", "test_loop_exchange.py::test_a_polished_refit_is_weighed_against_the_model_without_it_as_its_rivals_are"),
     S("loop/grow.py", 'refitted.record["cv_gain"] - (spread', 'refitted.record["cv_gain"] + (spread', "test_loop_exchange.py::test_what_predicts_surely_goes_before_what_may_predict"),
+    S("loop/grow.py", "if behind and not weighs(data, candidate.effect.name):", "if behind:", "test_loop_exchange.py::test_weight_that_nobody_declared_is_refitted_however_far_behind_it_looks"),
     S("loop/split.py", "if not _fresh(recording, frames, np.isin(number, held)):", "if False:", "test_loop.py::test_a_sweep_that_is_a_repetition_is_not_held_out_where_another_can_be_spared"),
     S("loop/improve.py", "return fresh or len(fitted) >= STATES", "return fresh", "test_loop.py::test_repeated_sweeps_of_many_states_tell_effects_apart"),
     S("loop/grow.py", "_to_the_end(data, stage, r, noise) if r.score", "r if r.score", "test_loop_exchange.py::test_a_refit_that_could_win_goes_to_its_end"),

@@ -103,6 +103,20 @@ def test_what_predicts_surely_goes_before_what_may_predict():
     assert predicts(44.0, np.inf) == 44.0
 
 
+def test_weight_that_nobody_declared_is_refitted_however_far_behind_it_looks():
+    inputs, labels = sweeps(each=1)
+    recording, _ = record(inputs, labels=labels, truth=arm((4, 1, 1)))
+    data = prepare(arm((4, 1, 1), gravity=(0, 0, 0)), [recording], [])
+    hypothesis, prior = with_nuisance(data)
+    base = make_stage(data, hypothesis, prior, NOISE, np.zeros(len(prior.mean)))
+    table = screen_stage(data, base.fit, NOISE, fields_of(data, base, ["gravity", "payload"]), COUNT)
+    looks = [replace(c, score=3.0 if c.effect.name == "gravity" else c.score) for c in table]
+    table = sorted(looks, key=lambda c: -c.score)
+    winner, _, records = grow.grow(data, base, table, NOISE, ["gravity", "payload"], COUNT, lambda text: None)
+    assert {r["name"] for r in records} == {"gravity", "payload"}
+    assert winner is not None and winner.candidate.effect.name == "gravity"
+
+
 def test_effects_without_near_rivals_are_not_asked_again():
     data, base = started()
     first, own = added(data, base, "gravity", 1)

@@ -104,8 +104,9 @@ def grow(
     for candidate in [*asked, *screened]:
         ahead = [r for r in refits if r.record["verdict"] == "passes"]
         best = max((r.score for r in ahead), default=-np.inf)
-        if candidate.score < max((0.5 * r.gain for r in ahead), default=-np.inf) - EVIDENCE:
-            break  # far behind: a joint refit seldom gains that much on its linear score
+        behind = candidate.score < max((0.5 * r.gain for r in ahead), default=-np.inf) - EVIDENCE
+        if behind and not weighs(data, candidate.effect.name):
+            continue  # a joint refit seldom gains that much on its linear score, but for a weight that cables lift
         say(f"refitting with {candidate.effect.name}")
         record: dict[str, Any] = {"name": candidate.effect.name, "seed": candidate.seed}
         records.append(record)
