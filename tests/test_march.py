@@ -232,6 +232,21 @@ def test_variants_give_the_derivative_of_frames_solved_anew() -> None:
             np.testing.assert_allclose(forward, alone[0], atol=1e-4 * h * np.abs(central).max() + 1e-11)
 
 
+def test_another_modulus_of_some_elements_moves_a_frame_as_if_it_were_solved_anew() -> None:
+    rec, h, base = recording([[1.0, 0.3]]), 1e-4, robot()
+    for entry in (
+        {"name": "stiffness"},
+        {"name": "soft_region", "center_m": MARKERS[1].tolist(), "radius_m": 0.04},
+    ):
+        ahead, back = (apply_effects(base, [{**entry, "scale": 1 + s}]) for s in (h, -h))
+        [(_, _, seen, others)] = walk_along(
+            Walk(base, drive_of(base, rec)), [0], marker_positions, [Walk(ahead, drive_of(ahead, rec))]
+        )
+        alone = [marker_positions(r, solve_equilibrium(r.body, tension={"top": 1.0, "side": 0.3}, relative_tolerance=1e-12)) for r in (ahead, back)]  # fmt: skip
+        central = (alone[0] - alone[1]) / (2 * h)
+        assert np.abs((others[0] - seen) / h - central).max() < 1e-3 * np.abs(central).max()  # one-sided: h of curvature
+
+
 def test_a_variant_in_observation_alone_costs_no_solve(monkeypatch: pytest.MonkeyPatch) -> None:
     base = robot()
     moved = base.with_marker_points(MARKERS + 0.001)
