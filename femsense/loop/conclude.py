@@ -151,8 +151,14 @@ def _holds_out(data: Data, search: Search, back: Stage) -> bool:
         return False
     if only_calibrated and worse <= NOISY:
         return True
-    before, after = (beyond_mesh(data.held, s.held_residuals, search.noise) for s in (search.before, back))
+    before, after = _held_beyond_mesh(data, search, back)
     return after < before and back.held_rms <= NOT_WORSE * search.history[0][1].held_rms
+
+
+def _held_beyond_mesh(data: Data, search: Search, back: Stage) -> tuple[float, float]:
+    """Return the held-out errors before and after [m] less the likeliest share of what the mesh itself costs."""
+    before, after = (beyond_mesh(data.held, s.held_residuals, search.noise) for s in (search.before, back))
+    return before, after
 
 
 def _handed_back(data: Data, final: Stage, names: list[str], noise: Noise) -> Stage | None:
@@ -472,8 +478,8 @@ def _by_mesh(data: Data, search: Search, back: Stage) -> str:
     """Return a sentence on what the held-out error is beyond the mesh's own, where that is what makes it larger; nothing where it is not larger."""
     if back.held_rms <= NOT_WORSE * search.before.held_rms or not mesh_errors(data):
         return ""
-    before, after = (1e3 * beyond_mesh(data.held, s.held_residuals, search.noise) for s in (search.before, back))
-    return f" Less the likeliest share of what the mesh itself costs, that is {before:.2f} mm before, {after:.2f} mm after."
+    before, after = _held_beyond_mesh(data, search, back)
+    return f" Less the likeliest share of what the mesh itself costs, that is {1e3 * before:.2f} mm before, {1e3 * after:.2f} mm after."
 
 
 def _held_back(data: Data, search: Search, names: list[str]) -> str:
@@ -481,8 +487,8 @@ def _held_back(data: Data, search: Search, names: list[str]) -> str:
     found = [n for n, _ in search.history[1:] if n not in names and n in search.final.fit.hypothesis.names]
     if not found:
         return ""
-    cost = rms_of(mesh_errors(data)) if mesh_errors(data) else 0.0
-    mesh = f"; the mesh itself costs {1e3 * cost:.2f} mm, and a finer one may tell" if cost else ""
+    errors = mesh_errors(data)
+    mesh = f"; the mesh itself costs {1e3 * rms_of(errors):.2f} mm, and a finer one may tell" if errors else ""
     return (
         f" There is evidence for {', '.join(found)}, but the held-out error would grow with it or a value be implausible{mesh}."
     )

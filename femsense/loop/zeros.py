@@ -88,8 +88,8 @@ def zeros_are_evident(data: Data, stage: Stage, noise: Noise, n_effective: float
         return None
     if evidence_for_zeros(data, stage, without, n_effective) <= EVIDENCE:
         return None
-    plain = [beyond_mesh(data.held, s.held_residuals, noise) for s in (stage, without)]
-    if plain[0] >= plain[1]:
+    fitted, declared = (beyond_mesh(data.held, s.held_residuals, noise) for s in (stage, without))
+    if fitted >= declared:
         return None
     better, spread = sweeps_predicted(data.train, without.fit, stage.fit)
     held = held_chi2(data, without, noise) - held_chi2(data, stage, noise)
