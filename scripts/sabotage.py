@@ -105,7 +105,7 @@ SABOTAGES = (
     S("fem/chambers.py", "[0, 2, 1, 5, 4, 3]", "[0, 2, 1, 3, 4, 5]", "test_fem_chambers.py::test_a_quadratic_surface_follows_the_sphere"),
     S("fem/chambers.py", "if abs(turns) > 0.01:", "if abs(turns) > 2.0:", "test_fem_chambers.py::test_seeds_that_are_not_in_a_cavity"),
     S("fem/compliance.py", "add_pressure_stiffness(body, equilibrium.positions, np.array(list(equilibrium.pressure.values())), blocks)", "pass", "test_fem_chambers.py::test_pressure_and_cable_are_reciprocal"),
-    S("march.py", "force = force + pressure * volume_gradient(chamber, x)", "pass", "test_pneumatic.py::test_simulate_calibrate_estimate_improve"),
+    S("march.py", "force = force + pressure * volume_gradient(chamber, x)", "pass", "test_pneumatic.py::test_pressure_pushes_on_the_finer_mesh_too"),
     S("fem/body.py", "np.hstack([-path.weights, weight])", "np.hstack([path.weights, weight])", "test_fem_cables.py::test_geometric_stiffness_is_the_slope_of_the_cable_forces"),
     # equilibrium and compliance
     S("fem/equilibrium.py", "np.where(rubs[held], T0[held] + dT, 0.0)", "np.zeros(len(held))", "test_fem_cables.py::test_a_held_cable_with_friction_keeps_its_length"),

@@ -13,9 +13,12 @@ from helpers import block_mesh, changed, write_block_robot
 from hollow import without_box
 
 from femsense import cli
+from femsense.effects.shape import finer_mesh, robot_on_mesh
 from femsense.errors import InputError
+from femsense.fem.mesh import embed_points
 from femsense.frames import check_against, make_recording, state_key
 from femsense.loop.split import sweeps_of
+from femsense.march import Walk, drive_of, finer_state, solve_frame
 from femsense.recording import load_recording
 from femsense.results import read_run
 from femsense.rig.script import check_script, plan_script
@@ -104,6 +107,20 @@ def test_excursions_of_the_pressure_are_sweeps() -> None:
     pressures = np.array([[0, 1, 2, 0, 1, 2, 0]], dtype=float).T * 1e3
     recording = make_recording(time_s=np.arange(7.0), chamber_names=["core"], pressures=pressures)
     assert sweeps_of(recording, np.arange(7)).tolist() == [0, 0, 0, 1, 1, 1, 2]
+
+
+def test_pressure_pushes_on_the_finer_mesh_too(folder: Path) -> None:
+    """A few steps from the state of the declared mesh end where the finer mesh comes to rest when it is solved for itself."""
+    coarse = load_robot(folder)
+    fine = robot_on_mesh(coarse, finer_mesh(coarse.body.mesh, None, 1))
+    recording = make_recording(time_s=[0.0], chamber_names=["core"], pressures=[[10e3]])
+    walk, fine_walk = (Walk(r, drive_of(r, recording)) for r in (coarse, fine))
+    state, ties = solve_frame(walk, 0), embed_points(coarse.body.mesh, fine.body.mesh.nodes)
+    found, wanted = finer_state(walk, fine_walk, 0, state, ties), solve_frame(fine_walk, 0).positions
+    assert found is not None
+    gone = np.abs(wanted - fine.body.mesh.nodes).max()
+    assert gone > 1e-3
+    np.testing.assert_allclose(found, wanted, atol=0.01 * gone)
 
 
 def test_simulate_calibrate_estimate_improve(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
