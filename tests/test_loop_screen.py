@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from arm import arm, record, sweeps
 
-from femsense.calib.forward import marker_residual, seats
-from femsense.effects import FORMS, find_effect
+from femsense.calib.forward import Hypothesis, marker_residual, seats
+from femsense.effects import FORMS, apply_effects, find_effect
 from femsense.effects.shape import robot_on_mesh
 from femsense.errors import DataError
 from femsense.fem.equilibrium import solve_equilibrium
@@ -17,7 +17,8 @@ from femsense.fem.mesh import to_linear
 from femsense.loop import conclude, improve
 from femsense.loop.conclude import Search
 from femsense.loop.data import Data, prepare
-from femsense.loop.joint import JointProblem
+from femsense.loop.grow import with_term
+from femsense.loop.joint import JointProblem, Prior
 from femsense.loop.noise import Noise
 from femsense.loop.screen import effect_fields
 from femsense.loop.stages import Stage, make_stage, with_nuisance
@@ -135,6 +136,52 @@ def test_a_modulus_that_is_as_declared_once_zeros_stay_is_not_handed_back(monkey
     assert conclude._worth_handing_back(data, search, ["stiffness"], ["stiffness"])[0] == ["stiffness"]
     monkeypatch.setattr(conclude, "keeping", lambda *_, **__: replace(softer, fit=as_declared))
     assert conclude._worth_handing_back(data, search, ["stiffness"], ["stiffness"])[0] == []
+
+
+def with_gain(modulus: float) -> tuple[Data, Search]:
+    """Return the search that found a cable's gain in a body whose modulus is off, too."""
+    declared = arm((4, 2, 2))
+    truth = apply_effects(arm((4, 2, 2), modulus=modulus), [{"name": "cable_gain", "scale": {"left": 0.92}}])
+    inputs, labels = sweeps(3.0)
+    recording, _ = record(inputs, labels=labels, truth=truth, noise=5e-5)
+    data = prepare(declared, [recording], [])
+    noise = Noise({"white": 5e-5}, "")
+    hypothesis, prior = with_nuisance(data)
+    base = make_stage(data, hypothesis, prior, noise, np.zeros(len(prior.mean)))
+    before = make_stage(data, Hypothesis(declared), Prior(np.zeros(0), np.zeros(0)), noise, np.zeros(0))
+    gain = find_effect("cable_gain")
+    parameters = tuple(p for p in gain.parameters(declared, "tension") if p.part == "left")
+    final = make_stage(data, *with_term(base.fit, gain, {}, parameters), noise, np.append(base.fit.coordinates, 0.0))
+    return data, Search(before, [("", base), ("cable_gain", final)], final, noise, 100.0, [], [], [], None)
+
+
+def handed_back(data: Data, search: Search) -> tuple[list[str], float]:
+    """Return the names that are handed back, and the gain."""
+    names, back = conclude._worth_handing_back(data, search, [], ["cable_gain"])
+    (entry,) = [e for e in back.fit.hypothesis.entries(back.fit.coordinates) if e["name"] == "cable_gain"]
+    return names, entry["scale"]["left"]
+
+
+def test_a_modulus_that_is_off_by_little_goes_along_with_an_effect_that_would_make_up_for_it() -> None:
+    data, search = with_gain(300e3 * 0.982)
+    assert not conclude._promoted(data, search)
+    names, gain = handed_back(data, search)
+    assert names == ["stiffness", "cable_gain"]
+    alone = conclude.keeping(data, search.final, ["cable_gain"], search.noise)
+    by_itself = float(np.exp(alone.fit.coordinates[0]))
+    assert abs(gain - 0.92) < 0.4 * abs(by_itself - 0.92)
+
+
+def test_what_is_handed_back_keeps_the_size_that_it_has_beside_all_nuisances_unless_held_out_data_miss_those(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    data, search = with_gain(300e3)
+    beside = float(np.exp(search.final.fit.coordinates[-1]))
+    alone = float(np.exp(conclude.keeping(data, search.final, ["cable_gain"], search.noise).fit.coordinates[0]))
+    assert abs(alone - beside) > 1e-3
+    assert handed_back(data, search) == (["cable_gain"], pytest.approx(alone, abs=1e-6))
+    monkeypatch.setattr(conclude, "NOT_WORSE", 1.2)
+    assert handed_back(data, search) == (["cable_gain"], pytest.approx(beside, abs=1e-5))
 
 
 def test_a_linear_mesh_is_asked_for_quadratic_elements_whatever_else_makes_up_for_it() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,7 +21,7 @@ from femsense.loop.noise import Noise, whiten
 from femsense.loop.result import LoopResult
 from femsense.loop.screen import NUISANCE, TESTABLE, Candidate, confounding, one_each
 from femsense.loop.spread import spreads
-from femsense.loop.stages import Stage, held_chi2, held_out, keeping, roughly_keeping, with_seeds_still
+from femsense.loop.stages import Stage, held_chi2, held_out, keeping, roughly_keeping, with_seeds_still, with_sizes_still
 from femsense.loop.structure import beyond_mesh, describe_left, structure_tests, without_mesh_error
 from femsense.loop.zeros import InPlace, moved_nuisance, zeros_are_evident
 
@@ -65,7 +66,7 @@ def conclude(data: Data, search: Search, rng: np.random.Generator) -> LoopResult
     names = [*promoted, *(n for n, _ in search.history[1:] if n in final.fit.hypothesis.names)]
     names, back = _worth_handing_back(data, search, promoted, names)
     strayed = "stiffness" in promoted and "stiffness" not in names  # what a modulus beyond all bounds takes away is not explained
-    promoted = [n for n in promoted if n in names]
+    promoted = [n for n in names if n in NUISANCE]
     entries = _entries(back, names)
     spread = spreads(data, final, noise, _seed_spread(search))
     effects = _chain(data, search, promoted, names, back, spread)
@@ -121,21 +122,45 @@ def _promoted(data: Data, search: Search) -> list[str]:
 
 
 def _worth_handing_back(data: Data, search: Search, promoted: list[str], names: list[str]) -> tuple[list[str], Stage]:
-    """Return the names that are handed back with the fit of just these: nuisances that stay as declared are taken out, too if they only
-    do so here, and so is, from the last one on, what would make the error on held-out data larger than it was, or goes to the edge of what is plausible."""
+    """Return the names that are handed back with the model of just these: with the sizes that they have beside all nuisances where held-out data
+    do not miss those, else fitted again. Nuisances that stay as declared are taken out, too if they only do so here, and so is, from the last one
+    on, what would make the error on held-out data larger than it was, or goes to the edge of what is plausible."""
     while names:
-        back = _handed_back(data, search.final, names, search.noise)
-        still = [n for n in promoted if n in names and back is not None and not moved_nuisance(data, back, n)]
-        if still:
-            names = [n for n in names if n not in still]
+        kept, back = _with_modulus(data, search, names, sizes_still=True)
+        if back is not None and back.held_rms <= NOT_WORSE * search.final.held_rms and _may_be_handed_back(data, search, back):
+            return kept, back
+        kept, back = _with_modulus(data, search, names, sizes_still=False)
+        idle = [n for n in promoted if n in kept and back is not None and not moved_nuisance(data, back, n)]
+        if idle:
+            names = [n for n in names if n not in idle]
             continue
         if back is not None and at_edge(back.fit):
-            back = _handed_back(data, with_seeds_still(data, search.final), names, search.noise)
-        strayed = back is not None and "stiffness" in at_edge(back.fit, nuisance=True)
-        if back is not None and not strayed and not at_edge(back.fit) and _holds_out(data, search, back):
-            return names, back
+            back = _handed_back(data, with_seeds_still(data, search.final), kept, search.noise)
+        if back is not None and _may_be_handed_back(data, search, back):
+            return kept, back
         names = names[:-1]
     return [], search.before
+
+
+def _may_be_handed_back(data: Data, search: Search, back: Stage) -> bool:
+    return not at_edge(back.fit) and "stiffness" not in at_edge(back.fit, nuisance=True) and _holds_out(data, search, back)
+
+
+def _with_modulus(data: Data, search: Search, names: list[str], *, sizes_still: bool) -> tuple[list[str], Stage | None]:
+    """Return names with the model of just these; with the modulus beside effects if it moved significantly, by whatever share, and held-out data miss it."""
+    back = _handed_back(data, search.final, names, search.noise, sizes_still=sizes_still)
+    if back is None or "stiffness" in names or not _has_effects(names):
+        return names, back
+    if not moved_nuisance(data, search.final, "stiffness", relevant=0.0):
+        return names, back
+    along = _handed_back(data, search.final, ["stiffness", *names], search.noise, sizes_still=sizes_still)
+    if along is None or held_chi2(data, back, search.noise) - held_chi2(data, along, search.noise) <= EVIDENCE:
+        return names, back
+    return ["stiffness", *names], along
+
+
+def _has_effects(names: Iterable[str]) -> bool:
+    return any(name not in NUISANCE for name in names)
 
 
 def _holds_out(data: Data, search: Search, back: Stage) -> bool:
@@ -145,7 +170,7 @@ def _holds_out(data: Data, search: Search, back: Stage) -> bool:
     worse = back.held_rms / search.before.held_rms
     if worse <= NOT_WORSE:
         return True
-    only_calibrated = all(name in NUISANCE for name in back.fit.hypothesis.names)
+    only_calibrated = not _has_effects(back.fit.hypothesis.names)
     gain = held_chi2(data, search.before, search.noise) - held_chi2(data, back, search.noise)
     if gain <= (EVIDENCE if only_calibrated else 0.0):  # effects have been judged by held-out data before
         return False
@@ -161,13 +186,16 @@ def _held_beyond_mesh(data: Data, search: Search, back: Stage) -> tuple[float, f
     return before, after
 
 
-def _handed_back(data: Data, final: Stage, names: list[str], noise: Noise) -> Stage | None:
-    """Return the fit of some names alone; None where it has no equilibrium in some state."""
-    settled = [effect.name for effect, _ in final.fit.hypothesis.settled]
-    if set(final.fit.hypothesis.names) <= {*names, *settled}:
+def _handed_back(data: Data, final: Stage, names: list[str], noise: Noise, *, sizes_still: bool = False) -> Stage | None:
+    """Return the model of some names alone, fitted again, or with the sizes that they have beside all that calibration may move: whoever
+    calibrates what is handed back moves that too. None where it has no equilibrium, or where another effect that they were found beside is gone."""
+    present = {effect.name for effect, _, _ in final.fit.hypothesis.terms}
+    if present <= set(names):
         return final
+    if sizes_still and not (_has_effects(names) and present <= {*names, *NUISANCE}):
+        return None
     try:
-        return keeping(data, final, names, noise)
+        return (with_sizes_still if sizes_still else keeping)(data, final, names, noise)
     except FemsenseError:
         return None
 

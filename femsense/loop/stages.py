@@ -27,6 +27,8 @@ QUADRATIC: Entry = {"element": "tet10"}
 """The seed of quadratic elements, which growth asks first where the mesh is linear."""
 ROUGHLY = 3
 """Steps of a fit that only has to come near."""
+STILL = 1e-3
+"""Freedom of a size that is held still, as a share of its standard deviation."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -122,6 +124,14 @@ def keeping(
         near=jets_without(stage, mask),
         worth=worth,
     )
+
+
+def with_sizes_still(data: Data, stage: Stage, names: Sequence[str], noise: Noise) -> Stage:
+    """Return a stage with some of its terms only, which keep the sizes that they have beside all of them; poses are fitted again. Raises DataError."""
+    hypothesis, _, mask = _some_terms(stage, names)
+    sizes = stage.fit.coordinates[mask]
+    still = Prior(sizes, STILL * stage.fit.std[mask])
+    return make_stage(data, hypothesis, still, noise, sizes, own=own_of(stage), near=jets_without(stage, mask))
 
 
 def with_seeds_still(data: Data, stage: Stage) -> Stage:

@@ -58,8 +58,8 @@ class InPlace:
     records: list[dict[str, Any]]
 
 
-def moved_nuisance(data: Data, stage: Stage, name: str) -> int:
-    """Return how many values of a nuisance the data moved significantly away from what is declared."""
+def moved_nuisance(data: Data, stage: Stage, name: str, *, relevant: float = RELEVANT) -> int:
+    """Return how many values of a nuisance the data moved significantly away from what is declared, and by more than a share of it."""
     at = 0
     for effect, _, parameters in stage.fit.hypothesis.terms:
         part = slice(at, at + len(parameters))
@@ -68,7 +68,7 @@ def moved_nuisance(data: Data, stage: Stage, name: str) -> int:
             continue
         values, std = stage.fit.coordinates[part], stage.fit.std[part]
         size = np.abs(values) / (1.0 if name == "stiffness" else np.maximum(data.input_scale, 1e-12))
-        return int(((np.abs(values) > SIGNIFICANT * std) & (size > RELEVANT)).sum())
+        return int(((np.abs(values) > SIGNIFICANT * std) & (size > relevant)).sum())
     return 0
 
 
