@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 import scipy.sparse as sp
@@ -607,10 +607,21 @@ class _Balance:
     def __init__(self, walk: Walk, frame: int, base: Equilibrium) -> None:
         self.walk, self.frame, self.base = walk, frame, base
         self.body = self._body(walk)
-        self.inner = internal(self.body, base.positions, tangent=False).forces
-        self.dead = self.body.dead_load()
-        self.by_element: FloatArray | None = None
-        """Inner forces of each element [N], (m, k, 3), once they were needed."""
+
+    @cached_property
+    def dead(self) -> FloatArray:
+        """Weight and other dead forces [N], (n, 3)."""
+        return self.body.dead_load()
+
+    @cached_property
+    def inner(self) -> FloatArray:
+        """Inner forces [N], (n, 3)."""
+        return internal(self.body, self.base.positions, tangent=False).forces
+
+    @cached_property
+    def by_element(self) -> FloatArray:
+        """Inner forces of each element [N], (m, k, 3)."""
+        return element_forces(self.body, self.base.positions)
 
     def _body(self, walk: Walk) -> BodyModel:
         body, gravity = walk.robot.body, walk.drive.gravity
@@ -682,8 +693,6 @@ class _Balance:
         if springs[0] != springs[1] or not _same_but_modulus(body, own):
             force += self.inner - internal(body, x, tangent=False).forces
         elif body.material is not own.material:
-            if self.by_element is None:
-                self.by_element = element_forces(own, x)
             softer = 1.0 - body.material.young_modulus / own.material.young_modulus
             add_elements(own.stencil.tets, self.by_element, softer, force)
 
