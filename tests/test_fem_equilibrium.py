@@ -53,6 +53,14 @@ def test_forces_balance_and_the_clamp_holds(law: str, quadratic: bool) -> None:
     assert state.tension["top"] == 1.5 and state.shortening["side"] == pytest.approx(0.004, abs=1e-11)
 
 
+def test_with_friction_the_reported_residual_is_that_of_the_state() -> None:
+    body = bar_body(MESH, friction=0.4)
+    first = solve_equilibrium(body, tension={"side": 1.0})
+    for state in (first, solve_equilibrium(body, tension={"top": 0.5, "side": 1.5}, start=first, reuse_factor=True)):
+        assert state.residual_n < 1e-7
+        assert unbalanced(body, state) == pytest.approx(state.residual_n, abs=1e-12)
+
+
 @pytest.mark.parametrize("law", LAWS)
 def test_warm_and_cold_starts_meet(law: str) -> None:
     body = bar(law)

@@ -141,6 +141,7 @@ class _State:
     single: bool = False  # factors in single precision
     indefinite_steps: int = 0
     factored_at: float = 0.0  # residual where the stiffness was last factorised [N]
+    here: Internal | None = None  # what Newton saw last, at x
     serves: bool = False  # the factor is likely to serve for the step after this one
 
 
@@ -406,7 +407,7 @@ def _newton(body: BodyModel, loads: _Loads, state: _State, max_iterations: int) 
     free = body.free_map.dofs
     held = np.flatnonzero(state.taut)
     stretch = _stretch(body)[held]
-    here = internal(body, state.x, tangent=not state.borrowed)
+    here = state.here = internal(body, state.x, tangent=not state.borrowed)
     last = np.inf
     frictional = any(c.friction > 0 for c in body.cables)
     for iteration in range(max_iterations):
@@ -447,7 +448,7 @@ def _newton(body: BodyModel, loads: _Loads, state: _State, max_iterations: int) 
             continue
         if moved is None:
             return CONVERGED if closed and state.residual <= 1e3 * loads.tolerance else "stalled"
-        here = moved
+        here = state.here = moved
     return "iterations"
 
 
@@ -459,7 +460,7 @@ def _unbalanced(loads: _Loads, state: _State, here: Internal, rows: FloatArray) 
 
 def _residual(body: BodyModel, loads: _Loads, state: _State) -> float:
     """Return the largest unbalanced nodal force [N]; inf where an element is turned inside out."""
-    here = internal(body, state.x, tangent=False)
+    here = internal(body, state.x, tangent=False) if state.here is None else state.here
     force = _unbalanced(loads, state, here, _rows(body, state))[body.free_map.dofs]
     size = float(np.linalg.norm(force.reshape(-1, 3), axis=1).max(initial=0.0))
     return size if np.isfinite(here.energy) and np.isfinite(size) else np.inf
@@ -712,8 +713,8 @@ def _step_loads(
 
 def _copied(state: _State) -> _State:
     """Return a copy that can be moved on without harm to the original, with a factor to come."""
-    shares = [s.copy() for s in state.shares]
-    return replace(state, x=state.x.copy(), T=state.T.copy(), taut=state.taut.copy(), shares=shares, factor=None, borrowed=False)
+    shares, x = [s.copy() for s in state.shares], state.x.copy()
+    return replace(state, x=x, T=state.T.copy(), taut=state.taut.copy(), shares=shares, factor=None, borrowed=False, here=None)
 
 
 def _result(body: BodyModel, state: _State, status: str, reached: float, nodal_forces: FloatArray) -> Equilibrium:
