@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -333,10 +334,7 @@ def embed_points(mesh: TetMesh, points: FloatArray, *, outside_rule: str = "near
         the embedding, with the distance outside.
     """
     points = as_points(points)
-    corners = mesh.nodes[mesh.tets[:, :4]]
-    centres = corners.mean(axis=1)
-    reach = np.linalg.norm(corners - centres[:, None], axis=2).max()
-    tree = cKDTree(centres)
+    corners, reach, tree = _by_centre(mesh)
     near = tree.query(points, k=1)
     centre_distance = np.asarray(near[0], dtype=np.float64).reshape(len(points))
     element = np.asarray(near[1], dtype=np.int64).reshape(len(points))
@@ -360,6 +358,15 @@ ROUNDING = 1e-12
 for them: factors in single precision took twice the time."""
 AT_ONCE = 4096
 """Points that are looked for together."""
+
+
+@lru_cache(maxsize=4)
+def _by_centre(mesh: TetMesh) -> tuple[FloatArray, float, cKDTree]:
+    """Return the corners of the elements of a mesh [m], (m, 4, 3), how far the farthest is from its element's centre [m], and the centres
+    as a tree."""
+    corners = mesh.nodes[mesh.tets[:, :4]]
+    centres = corners.mean(axis=1)
+    return corners, float(np.linalg.norm(corners - centres[:, None], axis=2).max()), cKDTree(centres)
 
 
 def _find_holders(mesh: TetMesh, tree: cKDTree, points: FloatArray, reach: float, element: IntArray) -> IntArray:
