@@ -59,6 +59,15 @@ def test_whitening_takes_fields_that_count_as_noise():
     np.testing.assert_allclose(W.T @ W, np.linalg.inv(sigma), rtol=1e-9, atol=1e-9)
 
 
+def test_whitening_is_kept_for_the_same_noise_and_groups_alone():
+    groups, other = some_groups(4, 3), some_groups(3, 4)
+    noise, louder = Noise({"white": 0.5, "frame": 0.3}, ""), Noise({"white": 0.5, "frame": 0.6}, "")
+    for n, g in ((noise, groups), (louder, groups), (noise, other), (noise, groups)):
+        lower = n.whitener(g).lower
+        np.testing.assert_allclose(lower @ lower.T, n.covariance(g), atol=1e-12)
+        assert n.whitener(g).lower is lower and not lower.flags.writeable
+
+
 def linear_fit(J: np.ndarray, r: np.ndarray, rest: int = 0) -> SimpleNamespace:
     """Return what `sweeps_predicted` asks of a fit, at the optimum of a linear problem."""
     at_optimum = r - J @ np.linalg.lstsq(J, r, rcond=None)[0]

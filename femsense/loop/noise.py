@@ -15,6 +15,7 @@ that is measured five times repeats its error five times, and the term h² says 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import lru_cache
 from itertools import pairwise
 from typing import Any
 
@@ -153,7 +154,7 @@ class Noise:
 
         `error` (k, c, b) are fields [m] that the residual may hold by chance, each with a standard deviation of once its size.
         """
-        lower = np.asarray(cholesky(self.covariance(groups), lower=True))
+        lower = _lower(self, groups)
         plain = Whitener(lower, np.zeros((0, 0)), np.zeros(0))
         if error is None:
             return plain
@@ -171,6 +172,14 @@ class Noise:
     def along_normals(self) -> float:
         """Root mean square noise of a cloud along the normal [m]."""
         return float(np.sqrt(sum(v**2 for v in self.surface.values())))
+
+
+@lru_cache(maxsize=4)
+def _lower(noise: Noise, groups: Groups) -> FloatArray:
+    """Return the Cholesky factor of the covariance of the rows of one axis [m], shape (k, k); fit after fit asks for the same one."""
+    lower = np.asarray(cholesky(noise.covariance(groups), lower=True))
+    lower.flags.writeable = False
+    return lower
 
 
 @dataclass(frozen=True, eq=False, slots=True)
