@@ -54,8 +54,6 @@ class Trial:
     """What the cameras measured of the robot; only of clouds."""
     frames: IntArray | None = None
     """All frames of the recording that are fitted (or held out) with these, markers and clouds; None: those of the scene."""
-    finer: dict[int, FloatArray] = field(default_factory=dict)
-    """Frame → by how much the nodes of a finer mesh went beyond the last model that was asked [m], (n, 3)."""
 
     @property
     def size(self) -> int:

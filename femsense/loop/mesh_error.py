@@ -147,14 +147,13 @@ def _moves(
     def finer_at(i: int) -> FloatArray | None:
         k = int(frames[i])
         try:
-            return finer_state(coarse_walk, fine_walk, k, states[k], ties, trials[0].finer.get(k))
+            return finer_state(coarse_walk, fine_walk, k, states[k], ties)
         except FemsenseError:  # it folds there
             return None
 
     for i, finer in zip(chosen, each(finer_at, chosen)):
         if finer is not None:
             settled.append(i)
-            trials[0].finer[int(frames[i])] = finer - ties.positions(states[int(frames[i])].positions)
             known.append(there.positions(finer) - here.positions(states[int(frames[i])].positions))
     if not known:
         raise DataError("no state settles on the finer mesh")
