@@ -4,7 +4,8 @@
 
 Of blind cases in which nothing is hidden (seeds of `loop.py tune`), with pose and modulus as in the truth: D, how far the truth's markers
 lie from the declared robot's; E, how far a mesh of half the size moves them (`femsense.loop.mesh_error`); the share a of E that is
-nearest to D in all sweeps, and in the sweeps one by one; and what is left of D beside it.
+nearest to D in all sweeps, and in the sweeps one by one; what is left of D beside it; and what is left beyond what calibration may move (pose,
+modulus, zeros) of D alone, beside one share of E, and beside one matrix times E.
 """
 
 from __future__ import annotations
@@ -19,10 +20,10 @@ from femsense.arrays import FloatArray
 from femsense.calib.forward import Hypothesis, evaluate_scene
 from femsense.effects import apply_effects
 from femsense.loop.data import Data, prepare
-from femsense.loop.joint import JointFit, Prior
+from femsense.loop.joint import JointFit, JointProblem, Prior
 from femsense.loop.mesh_error import mesh_errors, with_mesh_errors
 from femsense.loop.noise import Noise
-from femsense.loop.stages import make_stage
+from femsense.loop.stages import make_stage, with_nuisance
 from femsense.model import Robot
 
 EACH = 6
@@ -49,7 +50,23 @@ def compared(case: Case) -> None:
     sweep = trial.groups.sweep
     own = [float((D[sweep == s] * E[sweep == s]).sum() / (E[sweep == s] ** 2).sum()) for s in np.unique(sweep)]
     print(f"{case.number:4d} {case.design.name:7s}{case.control:13s} D {rms_mm(D):5.2f}  E {rms_mm(E):5.2f} mm  a {share:5.2f}  left {rms_mm(D - share * E):5.2f} mm"
-          f"  sweeps {'  '.join(f'{a:5.2f}' for a in own)}", flush=True)  # fmt: skip
+          f"  beyond calibration {beyond(data, D, E)} mm  sweeps {'  '.join(f'{a:5.2f}' for a in own)}", flush=True)  # fmt: skip
+
+
+def beyond(data: Data, D: FloatArray, E: FloatArray) -> str:
+    """Return what is left of D [mm] beyond calibration: of all of it, beside a E, and beside A E with any 3 × 3 matrix A."""
+    hypothesis, prior = with_nuisance(data)
+    problem = JointProblem(hypothesis, prior, data.train, [], data.seat_std)
+    jet = problem.jet(data.train[0], np.zeros(data.train[0].size), np.zeros(len(prior.mean)), True)
+    J = np.concatenate([jet.by_pose, jet.by_initial, jet.by_effect], axis=2).reshape(D.size, -1)
+    J = J[:, np.linalg.norm(J, axis=0) > 0]
+    J = J / np.linalg.norm(J, axis=0)
+    turned = (np.eye(3)[None, :, :, None] * E[:, None, None, :]).reshape(D.size, 9)
+    left = []
+    for columns in (J, np.column_stack([J, E.ravel()]), np.column_stack([J, turned])):
+        share = np.linalg.lstsq(columns, D.ravel(), rcond=1e-9)[0]
+        left.append(rms_mm((D.ravel() - columns @ share).reshape(D.shape)))
+    return "  ".join(f"{mm:5.3f}" for mm in left)
 
 
 def model(fit: JointFit, robot: Robot, data: Data) -> FloatArray:

@@ -198,6 +198,20 @@ def test_a_jacobian_that_serves_again_ends_at_the_same_place_with_fewer_of_them(
     np.testing.assert_array_equal(results[1].jacobian, evaluate(results[1].theta, True)[1])  # that at the end
 
 
+def test_a_jacobian_that_serves_again_learns_from_the_steps_it_predicted(monkeypatch: pytest.MonkeyPatch) -> None:
+    J, step, missed = np.eye(4)[:, :3], np.array([1.0, 2.0, 0.0]), np.array([0.1, 0.0, -0.2, 0.3])
+    seen = fit_module._as_seen(J, step, np.array([1.0, 3.0, 1.0]), missed)
+    np.testing.assert_allclose((seen - J) @ step, missed)
+    results, costs = [], []
+    for learns in (fit_module._as_seen, lambda J, *_: J):
+        monkeypatch.setattr(fit_module, "_as_seen", learns)
+        evaluate, asked = counted(1.0)
+        results.append(gauss_newton(evaluate, np.array([0.6, 0.2, 0.1]), serves=0.5, still=1e-9, tolerance=1e-14))
+        costs.append((len(asked), sum(asked)))
+    np.testing.assert_allclose(results[0].theta, results[1].theta, atol=1e-6)
+    assert costs[0][0] < costs[1][0] and costs[0][1] <= costs[1][1]
+
+
 def test_steps_that_shrink_foretell_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
     results, jacobians = [], []
     for least in (fit_module.LEAST_SHRINKING, np.inf):  # inf: nothing is foretold

@@ -23,7 +23,7 @@ from femsense.loop.conclude import _excess, _lacks
 from femsense.loop.data import Data, prepare
 from femsense.loop.grow import MOUNTED, _plainly_worse, tilt_cost
 from femsense.loop.joint import Prior
-from femsense.loop.mesh_error import SHARE, VARIES, make_finer, mesh_errors, with_mesh_errors
+from femsense.loop.mesh_error import SHARE, TURNS, VARIES, make_finer, mesh_errors, with_mesh_errors
 from femsense.loop.noise import Groups, Noise, _Likelihood, whiten
 from femsense.loop.predict import sweeps_predicted
 from femsense.loop.screen import _parts, penalty
@@ -173,9 +173,11 @@ def test_the_error_of_the_mesh_is_what_the_finer_mesh_adds():
     wanted = (places[1] - places[0])[trial.scene.marker[trial.scene.frame == k]]
     np.testing.assert_allclose(error[trial.scene.frame == k], wanted, atol=0.15 * np.abs(wanted).max())
     assert np.abs(wanted).max() > 1e-4
-    np.testing.assert_allclose(trial.mesh_error[:, :, 1:].sum(axis=2), VARIES * error)
-    used = (trial.mesh_error[:, :, 1:] != 0).any(axis=1).sum(axis=1)
-    assert used.max() == 1  # each row has the field of its own sweep
+    by_sweep, turned = trial.mesh_error[:, :, 1:-9], trial.mesh_error[:, :, -9:]
+    np.testing.assert_allclose(by_sweep.sum(axis=2), VARIES * error)
+    assert (by_sweep != 0).any(axis=1).sum(axis=1).max() == 1  # each row has the field of its own sweep
+    matrix = np.random.default_rng(0).normal(0.0, 1.0, (3, 3))
+    np.testing.assert_allclose(turned @ matrix.ravel(), TURNS * error @ matrix.T, atol=1e-12)
 
 
 def test_springs_of_a_clamp_do_not_sink_into_the_finer_mesh():
@@ -254,6 +256,17 @@ def test_one_share_of_the_mesh_error_in_all_sweeps_is_likelier_than_another_in_e
     assert costs[1] > 5 * costs[0]
     alike = without_mesh_error(trial, 0.5 * error, noise)
     assert np.linalg.norm(alike) < 0.05 * np.linalg.norm(0.5 * error)
+
+
+def test_the_mesh_error_may_turn_a_little_in_all_sweeps_whatever_the_axes():
+    noise = Noise({"white": 1e-5}, "")
+    data = with_error_of_the_mesh(noise)[2]
+    trial, error = data.train[0], mesh_errors(data)[0]
+    factor = noise.whitener(trial.groups, trial.mesh_error)
+    for axis in np.vstack([np.eye(3), [0.6, 0.0, 0.8]]):
+        turned = np.cross(axis, error)  # by a radian, √2 entries of one
+        assert float((whiten(factor, TURNS * turned) ** 2).sum()) < 2.0 + 1e-6
+        assert np.linalg.norm(without_mesh_error(trial, 0.1 * turned, noise)) < 0.05 * np.linalg.norm(0.1 * turned)
 
 
 def test_a_declared_gravity_is_believed_to_a_few_degrees():

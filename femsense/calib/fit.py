@@ -153,16 +153,25 @@ def gauss_newton(
             before, length = length, float(np.linalg.norm(change)) if damping == 0.0 else np.inf
             next_length = _foretold(before, length)
         damping = damping / 10.0 if damping > 1e-6 else 0.0
-        missed = float(np.linalg.norm(new_residual - residual - change))
+        missed = new_residual - residual - change
         theta, residual, own = theta + step, new_residual, False
-        if missed > serves * float(np.linalg.norm(change)):
+        if np.linalg.norm(missed) > serves * np.linalg.norm(change):
             residual, jacobian, own = *_both(evaluate, theta), True
+        else:
+            jacobian = _as_seen(jacobian, step, near.scale, missed)
         costs.append(float(residual @ residual))
     bends = None if kinks is None or status == GIVEN_UP else kinks(theta)
     jacobian = jacobian if bends is None else _on_kinks(jacobian, residual, bends)
     return FitResult(
         freeze(theta), freeze(covariance_of(jacobian)), freeze(residual), freeze(jacobian), tuple(costs), status, own
     )
+
+
+def _as_seen(J: FloatArray, step: FloatArray, scale: FloatArray, missed: FloatArray) -> FloatArray:
+    """Return the Jacobian that is nearest to J and has what J missed along a step (Broyden 1965)."""
+    along = scale**2 * step
+    size = float(along @ step)
+    return J if size == 0.0 else J + np.outer(missed, along / size)
 
 
 def _foretold(before: float, length: float) -> float:

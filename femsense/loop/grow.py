@@ -425,12 +425,12 @@ def moved_by(before: Stage, after: Stage) -> float:
 def mesh_cost(data: Data, stage: Stage, *, whole: bool = False) -> float:
     """Return what the mesh costs beyond what calibration absorbs [m], root mean square as `rms_of` has it; 0 where it is not known.
 
-    Not whole: beyond the share of it that all sweeps have in common, too, where there are several.
+    Not whole: beyond the share of it that all sweeps have in common, too, where there are several: what it may turn by and what sweeps add.
     """
     errors = mesh_errors(data)
     J = [np.concatenate([j.by_pose, j.by_effect], axis=2).reshape(e.size, -1) for j, e in zip(stage.fit.jets, errors)]
     fields = [t.mesh_error for t in data.train if t.mesh_error is not None]
-    if whole or any(f.shape[2] < 3 for f in fields):
+    if whole or any(len(np.unique(t.groups.sweep)) < 2 for t in data.train):
         return rms_of([_rest(j, e.ravel()).reshape(e.shape) for j, e in zip(J, errors)]) if errors else 0.0
     left = [_rest(np.column_stack([j, e.ravel()]), f.reshape(e.size, -1)[:, 1:]) for j, e, f in zip(J, errors, fields)]
     return rms_of([np.linalg.norm(own, axis=1).reshape(e.shape) for own, e in zip(left, errors)]) if errors else 0.0

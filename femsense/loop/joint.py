@@ -47,7 +47,7 @@ class Trial:
     starts: dict[int, tuple[TetMesh, States]]
     """States of earlier evaluations, frame by frame, for each mesh."""
     mesh_error: FloatArray | None = None
-    """How far a finer mesh would move the markers [m], one field a sweep, shape (k, c, sweeps); counts as noise of that size."""
+    """Fields of what a finer mesh would move the markers by [m], shape (k, c, b); each counts as noise of its size (`loop.mesh_error`)."""
     together: bool = False
     """Whether these are the clouds of the recording whose markers are the trial before: pose and initial inputs are shared."""
     sheets: Sheets | None = None

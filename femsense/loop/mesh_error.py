@@ -1,9 +1,9 @@
 """What the mesh itself costs: how far a mesh of half the size would move the markers, in every state.
 
 A residual of that shape says nothing of the robot, whatever its size: how much of it a body shows is not known (a cable that is tied to points
-sinks the deeper the finer the mesh is), but it is the same share in all sweeps. So it counts as noise, once its size as standard deviation for
-all sweeps together and `VARIES` times for each by itself, so that no effect is named for what a finer mesh would explain. A few Newton steps
-from the state on the declared mesh, which the finer one holds exactly, give it (a hierarchical estimate: Bank & Smith 1993).
+sinks the deeper the finer the mesh is), but it is the same share in all sweeps, but for what directions and sweeps differ by. So it counts as
+noise, once for all sweeps together (`SHARE`), once for each by itself (`VARIES`) and turned (`TURNS`), so that no effect is named for what a
+finer mesh would explain. A few Newton steps from the state on the declared mesh, which the finer one holds exactly, give it (a hierarchical estimate: Bank & Smith 1993).
 """
 
 from __future__ import annotations
@@ -35,7 +35,9 @@ MOST_WORK = 125_000
 SHARE = 0.35
 """Standard deviation of the share of the error that a body shows in all sweeps (anchors that are some millimetres wide sink less than points) …"""
 VARIES = 0.25
-"""… and of what each sweep adds to it."""
+"""… of what each sweep adds to it …"""
+TURNS = 0.07
+"""… and of the nine entries of a matrix that turns and stretches it in all sweeps: another mesh is not as much finer along the body as across."""
 
 
 def with_mesh_errors(data: Data, stage: Stage) -> Data:
@@ -104,15 +106,20 @@ def _with_errors(
 
 
 def _by_sweep(trial: Trial, moves: dict[int, FloatArray], poses: Sequence[FloatArray]) -> FloatArray:
-    """Return `SHARE` times the error of all sweeps together, then `VARIES` times that of each sweep [m], shape (k, c, 1 + sweeps)."""
+    """Return the fields of the error [m], shape (k, c, 1 + sweeps + 9), each of one standard deviation.
+
+    `SHARE` times the error of all sweeps together, `VARIES` times that of each sweep, `TURNS` times each of its axes along each axis.
+    """
     error = np.array([moves[int(f)][m] for f, m in zip(trial.scene.frame, trial.scene.marker)])
+    along = np.broadcast_to(np.eye(3), (len(error), 3, 3))  # (k, c, axis)
     if trial.scene.patches is not None:
-        error = np.einsum("kc,kc->k", error, normals_of(trial.scene, poses))[:, None]
+        along = normals_of(trial.scene, poses)[:, None, :]
+    turned = TURNS * (along[:, :, :, None] * error[:, None, None, :]).reshape(len(error), -1, 9)
+    error = np.einsum("kca,ka->kc", along, error)
     number = np.unique(trial.groups.sweep, return_inverse=True)[1]
-    fields = np.zeros((*error.shape, int(number.max()) + 2))
-    fields[:, :, 0] = SHARE * error
-    fields[np.arange(len(error)), :, 1 + number] = VARIES * error
-    return fields
+    by_sweep = np.zeros((*error.shape, int(number.max()) + 1))
+    by_sweep[np.arange(len(error)), :, number] = VARIES * error
+    return np.concatenate([SHARE * error[:, :, None], by_sweep, turned], axis=2)
 
 
 def mesh_errors(data: Data) -> list[FloatArray]:
