@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import multiprocessing
+import os
 import time
 import warnings
 from collections.abc import Sequence
@@ -331,6 +332,8 @@ def main() -> None:
             jobs.append((options.which, case))
     np.random.default_rng(0).shuffle(jobs)  # so that a part of the cases is a fair sample
     if not options.table:
+        for threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):  # of each worker; more of them would wait for each other
+            os.environ.setdefault(threads, "1")
         with multiprocessing.get_context("spawn").Pool(options.workers) as pool:
             for record in pool.imap_unordered(run_case, jobs):
                 records.append(record)

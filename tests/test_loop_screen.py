@@ -172,6 +172,18 @@ def test_a_modulus_that_is_off_by_little_goes_along_with_an_effect_that_would_ma
     assert abs(gain - 0.92) < 0.4 * abs(by_itself - 0.92)
 
 
+def test_a_modulus_that_moved_too_little_to_be_named_by_itself_goes_along_where_held_out_data_miss_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def folds(*_: object) -> Stage:
+        raise DataError("no equilibrium in frame 3")
+
+    data, search = with_gain(300e3 * 0.982)
+    monkeypatch.setattr(conclude, "with_sizes_still", folds)
+    names, _ = conclude._worth_handing_back(data, search, ["stiffness"], ["stiffness", "cable_gain"])
+    assert names == ["stiffness", "cable_gain"]
+
+
 def test_what_is_handed_back_keeps_the_size_that_it_has_beside_all_nuisances_unless_held_out_data_miss_those(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

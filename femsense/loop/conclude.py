@@ -130,7 +130,7 @@ def _worth_handing_back(data: Data, search: Search, promoted: list[str], names: 
         if back is not None and back.held_rms <= NOT_WORSE * search.final.held_rms and _may_be_handed_back(data, search, back):
             return kept, back
         kept, back = _with_modulus(data, search, names, sizes_still=False)
-        idle = [n for n in promoted if n in kept and back is not None and not moved_nuisance(data, back, n)]
+        idle = [n for n in promoted if n in names and back is not None and not moved_nuisance(data, back, n)]
         if idle:
             names = [n for n in names if n not in idle]
             continue
