@@ -57,6 +57,7 @@ def test_what_has_evidence_and_makes_the_held_out_error_larger_is_said_and_not_h
     loop = improve(arm((4, 1, 1)), [recording], effects=["cable_friction"])
     assert not loop.effects and loop.robot is loop.declared
     assert "evidence for cable_friction" in loop.sentence and "mesh itself costs" in loop.sentence
+    assert loop.verdict == "unexplained" and "nothing that may be handed back explains" in loop.sentence
 
 
 def test_an_effect_whose_states_do_not_come_to_rest_again_is_taken_back(monkeypatch: pytest.MonkeyPatch):

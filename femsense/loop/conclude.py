@@ -32,7 +32,9 @@ NOT_WORSE = 1.02
 """What is handed back may not have a larger held-out error than the declared model, but for this factor …"""
 NOISY = 1.15
 """… or, where only what calibration may move is handed back, for this one, if χ² of the held-out data says that noise hides a better model.
-An effect that is right has never needed it in blind cases; three that were wrong have."""
+An effect that is right has never needed it in blind cases; three that were wrong have …"""
+FAR_BETTER = 100.0
+"""… or, where the mesh's own error is what is larger, if χ² of the held-out data falls by so much."""
 EXPLAINED = 0.8
 """Share of the excess over the noise that effects must take away where structure is left."""
 LACKS = 2.0
@@ -75,7 +77,12 @@ def conclude(data: Data, search: Search, rng: np.random.Generator) -> LoopResult
     residuals = [without_mesh_error(t, jet.residual, noise) for t, jet in zip(data.train, shown.fit.jets)]
     tests = structure_tests(data.train, residuals, rng=rng)
     excess = _excess(data, before, final, back, noise)
-    unexplained = lacks or (tests.significant and excess.left > excess.tolerated and (strayed or excess.explained < EXPLAINED))
+    found = _not_handed_back(search, names)
+    unexplained = (
+        lacks
+        or (found and not effects)
+        or (tests.significant and excess.left > excess.tolerated and (strayed or excess.explained < EXPLAINED))
+    )
     verdict = "unexplained" if unexplained else "effects" if effects else "none"
     rivals = _confounded(search, names)
     not_testable = [
@@ -89,9 +96,9 @@ def conclude(data: Data, search: Search, rng: np.random.Generator) -> LoopResult
         robot = replace(robot, document={**data.declared.document, "effects": written})
     return LoopResult(
         verdict=verdict,
-        sentence=_sentence(verdict, effects, before, back, noise)
+        sentence=_sentence(verdict, effects, found, before, back, noise)
         + _by_mesh(data, search, back)
-        + _held_back(data, search, names),
+        + _evidence_for(data, found),
         noise_m=noise.total,
         before=_errors(data, before, rng),
         after=_errors(data, back, rng),
@@ -166,7 +173,7 @@ def _has_effects(names: Iterable[str]) -> bool:
 def _holds_out(data: Data, search: Search, back: Stage) -> bool:
     """Return whether a model is no worse on held-out data in millimetres; or else better by the noise that these data have, where it is calibrated
     only and within reason, or where the mesh's own error is all that is larger: then it must be better beyond that, and no worse in millimetres than
-    the model with all that calibration may move."""
+    the model with all that calibration may move, unless it is far better by the noise."""
     worse = back.held_rms / search.before.held_rms
     if worse <= NOT_WORSE:
         return True
@@ -177,7 +184,9 @@ def _holds_out(data: Data, search: Search, back: Stage) -> bool:
     if only_calibrated and worse <= NOISY:
         return True
     before, after = _held_beyond_mesh(data, search, back)
-    return after < before and back.held_rms <= NOT_WORSE * search.history[0][1].held_rms
+    return after < before and (
+        back.held_rms <= NOT_WORSE * search.history[0][1].held_rms or (gain > FAR_BETTER and worse <= NOISY)
+    )
 
 
 def _held_beyond_mesh(data: Data, search: Search, back: Stage) -> tuple[float, float]:
@@ -488,14 +497,15 @@ def _next_experiment(
     return "; ".join(advice)
 
 
-def _sentence(verdict: str, effects: list[dict[str, Any]], before: Stage, after: Stage, noise: Noise) -> str:
+def _sentence(verdict: str, effects: list[dict[str, Any]], found: list[str], before: Stage, after: Stage, noise: Noise) -> str:
     error = f"held-out error {1e3 * before.held_rms:.2f} mm"
     if not noise.std:
         error += " along the normals of the surface"
     if verdict == "none":
         return f"The model explains the data to their noise ({1e3 * noise.total:.2f} mm): {error}."
     if verdict == "unexplained" and not effects:
-        return f"A residual is left that no effect of the list explains: {error}, noise {1e3 * noise.total:.2f} mm."
+        explains = "nothing that may be handed back" if found else "no effect of the list"
+        return f"A residual is left that {explains} explains: {error}, noise {1e3 * noise.total:.2f} mm."
     what = ", ".join(f"{e['name']} ({_short(e['parameters'])})" for e in effects)
     tail = "" if verdict == "effects" else " A structured residual is left that no effect explains."
     where = "" if noise.std else " along the normals of the surface"
@@ -510,9 +520,13 @@ def _by_mesh(data: Data, search: Search, back: Stage) -> str:
     return f" Less the likeliest share of what the mesh itself costs, that is {1e3 * before:.2f} mm before, {1e3 * after:.2f} mm after."
 
 
-def _held_back(data: Data, search: Search, names: list[str]) -> str:
+def _not_handed_back(search: Search, names: list[str]) -> list[str]:
+    """Return the effects that were found, but are not among the names that are handed back."""
+    return [n for n, _ in search.history[1:] if n not in names and n in search.final.fit.hypothesis.names]
+
+
+def _evidence_for(data: Data, found: list[str]) -> str:
     """Return a sentence on effects that were found and are not handed back; nothing where there are none."""
-    found = [n for n, _ in search.history[1:] if n not in names and n in search.final.fit.hypothesis.names]
     if not found:
         return ""
     errors = mesh_errors(data)
