@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
-import scipy.sparse as sp
 
 from femsense.arrays import FloatArray, IntArray, freeze
 from femsense.errors import DataError, FemsenseError
@@ -19,13 +18,12 @@ from femsense.fem.assembly import add_elements, element_forces, internal
 from femsense.fem.body import BodyModel
 from femsense.fem.cables import bend_angles, cable_forces, rub, shortening
 from femsense.fem.chambers import volume_gradient
-from femsense.fem.cholesky import Cholesky
 from femsense.fem.clamp import first_give
 from femsense.fem.compliance import Tangent, drive_rows, tangent_at
 from femsense.fem.equilibrium import Equilibrium, solve_equilibrium
-from femsense.fem.iterative import UnsettledError, iterative
-from femsense.fem.linear import Factorization, Pattern, available_memory, factorize, factorize_definite
+from femsense.fem.linear import Factorization, available_memory, factorize
 from femsense.fem.mesh import Embedding, TetMesh, embed_points
+from femsense.fem.solves import ROUGH, Refined, prepare_roughly, refined, roughly
 from femsense.fem.turning import turned_step
 from femsense.model import Robot
 from femsense.parallel import each
@@ -40,6 +38,8 @@ PARTS, SHORTEST_PART = 4, 6
 """Parts at most that frames are walked in side by side where each starts from the one before, and frames of a part at least."""
 GIVES = 1e-3
 """A state with a rigid clamp is a start for one that gives by less than this share of the body at first."""
+FEW_COLUMNS = 16
+"""With more right-hand sides of a state the solves that correct them take longer than a factor in double precision."""
 PAST, PAST_TRIED = 1e-8, 1e-6
 """Tensions along a cable that agree so well [N], and as shares of the largest, are the same past; the latter for states that are only tried."""
 
@@ -720,77 +720,13 @@ PACES = (1.0, 0.5)
 """Shares of the first steps that are gone, tried in turn: whole ones fold elements where a body is bent much …"""
 NEAR = 0.1
 """… until the unbalanced force has fallen to this share."""
-ROUGH = 1e-3
-"""Share of a step on the finer mesh that may be missing, in energy. With ten times as much the order of the nodes moved a fit by two percent."""
 EARLY = 3e-2
-"""The same of the first of these steps, which the next one mends."""
-ROUGH_FROM = 9000
-"""Unknowns from which on such a step takes conjugate gradients instead of a factor."""
-
-
-REFINED_FROM = 3000
-"""Unknowns from which on a factor in single precision, and a solve more, take less time than one in double precision."""
-FEW_COLUMNS = 16
-"""With more right-hand sides the solves that correct them take longer than a factor in double precision."""
-REFINED, MOST_REFINED = 1e-3, 3
-"""A correction by less than this share squares to what may be left of an error; solves at most before the factor is made in double precision."""
-
-
-class Refined:
-    """A stiffness behind its factor in single precision: solutions are corrected from their true residual (Wilkinson 1963)."""
-
-    def __init__(self, pattern: Pattern, values: FloatArray, plain: Factorization) -> None:
-        self.negative, self.size, self.bytes = 0, pattern.size, plain.bytes + values.nbytes
-        self.plain = plain
-        self._pattern, self._values = pattern, values
-        self._matrix = sp.csr_matrix((values, pattern.indices, pattern.indptr), shape=(pattern.size,) * 2)
-        self._exact: Factorization | None = None
-
-    def solve(self, right: FloatArray) -> FloatArray:
-        """Return K⁻¹ right, shape (f,) or (f, k)."""
-        if self._exact is not None:
-            return self._exact.solve(right)
-        answer = self.plain.solve(right)
-        for _ in range(MOST_REFINED):
-            more = self.plain.solve(right - self._matrix @ answer)
-            answer = answer + more
-            if (np.abs(more).max(axis=0) <= REFINED * np.abs(answer).max(axis=0)).all():
-                return np.asarray(answer)
-        self._exact = factorize(self._pattern, self._values)
-        if self._exact is None:
-            raise FemsenseError("the stiffness is singular")
-        return self._exact.solve(right)
-
-    def gram(self, columns: sp.csc_matrix) -> FloatArray:
-        """Return BᵀK⁻¹B, shape (k, k), for sparse columns B, shape (f, k)."""
-        return np.asarray(columns.T @ self.solve(columns.toarray()))
-
-
-def refined(pattern: Pattern, values: FloatArray) -> Factorization | None:
-    """Return a stiffness that is solved to 1e-6 or better, from a factor in single precision where that pays and is enough."""
-    if pattern.size < REFINED_FROM or not np.isfinite(values).all():
-        return factorize(pattern, values)
-    plain = factorize_definite(pattern, values, tries=0, single=True)[0]
-    return Refined(pattern, values, plain) if isinstance(plain, Cholesky) else plain or factorize(pattern, values)
-
-
-def roughly(pattern: Pattern, values: FloatArray, tolerance: float = ROUGH) -> Factorization | None:
-    """Return a stiffness that is solved to a tolerance, by conjugate gradients where these are faster than a factor."""
-    if pattern.size < ROUGH_FROM or pattern.grid is None or not np.isfinite(values).all():
-        return factorize(pattern, values)
-    try:
-        return iterative(pattern.levels(), values, tolerance=tolerance) or factorize(pattern, values)
-    except UnsettledError:
-        return factorize(pattern, values)
+"""Share of the first of these steps that may be missing, in energy, which the next one mends; of the last ones ROUGH."""
 
 
 def share_on_finer(body: BodyModel) -> None:
     """Make what the steps of all states on a finer mesh share, whatever its material: it is kept with the body's free map."""
-    pattern = body.free_map.pattern
-    if pattern.size < ROUGH_FROM or pattern.grid is None:
-        pattern.analysis()
-    else:
-        pattern.levels()
+    prepare_roughly(body.free_map.pattern)
     turned_step(body, body.mesh.nodes, np.zeros_like(body.mesh.nodes))
 
 

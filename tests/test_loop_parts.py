@@ -16,6 +16,7 @@ from femsense.calib.forward import Hypothesis, evaluate_scene, make_scene
 from femsense.effects import find_effect
 from femsense.effects.shape import finer_mesh, robot_on_mesh
 from femsense.errors import FemsenseError
+from femsense.fem import solves
 from femsense.fem.equilibrium import Equilibrium, solve_equilibrium
 from femsense.fem.mesh import Embedding, embed_points
 from femsense.loop import improve
@@ -240,7 +241,7 @@ def test_a_finer_state_that_is_bent_much_by_held_cables_settles_where_it_belongs
 ):
     asked = on_both_meshes([0.012, 0.0, 0.0, 0.0], "displacement")
     exact = beyond(asked, solve_frame(asked[1], 0).positions)
-    monkeypatch.setattr(march, "ROUGH_FROM", rough_from)
+    monkeypatch.setattr(solves, "ROUGH_FROM", rough_from)
     monkeypatch.setattr(march, "FINER_ENOUGH", 1e-3)  # what is solved roughly must not keep the steps from getting there
     np.testing.assert_allclose(beyond(asked, finer_state(*asked)), exact, atol=0.25 * np.abs(exact).max())
 
