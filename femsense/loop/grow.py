@@ -63,7 +63,11 @@ NOT_PLAINLY_WORSE = 1.25
 MOUNTED = np.radians(5.0)
 """A base is mounted as it is declared to about this angle, and a declared gravity is believed as much [rad]."""
 DECLARED = -1.0
-"""Start from what is declared, where a discrete alternative does not fit from where calibration has gone without it."""
+"""Start from what is declared, where a discrete alternative does not fit from where calibration has gone without it …"""
+STRAYED = 2.0
+"""… or where this has gone so many of the standard deviations known beforehand, for the sake of what is missing …"""
+EXPLAINS = 1.25
+"""… and an effect leaves more than this mean square from there, in units of the noise."""
 SURE = 2.5
 """Standard errors of the gain on left-out sweeps beyond which held-out data need only not speak against an effect."""
 POLISHED = 2.0
@@ -341,11 +345,17 @@ def refit(data: Data, stage: Stage, candidate: Candidate, noise: Noise, *, wante
     shares: tuple[float, ...] = (1.0, DECLARED) if candidate.gain < np.inf else (DECLARED, 1.0)
     shares = shares if candidate.effect.discrete else (0.0, 1.0, 0.3) if free else (1.0, 0.3, 0.0)  # a linear step may go too far
     answer = 0.0 if candidate.effect.discrete else candidate.response @ (start - null)  # of what is fitted already
+    strayed = not candidate.effect.discrete and _has_strayed(stage)
     best: Stage | None = None
+    given_up: Stage | None = None
+    done = False
     worth = _within(stage.fit, (candidate.cost + wanted - FORGONE[0]) / FORGONE[1])
-    for share in shares:
+    for share in (*shares, DECLARED) if strayed else shares:
+        if done and not (strayed and share == DECLARED and not _explains(best)):
+            continue
         theta = _declared(data, stage, hypothesis, noise) if share == DECLARED else stage.fit.fit.theta + share * answer
-        coordinates = np.concatenate([theta[stage.fit.own :], null + share * (start - null)])
+        part = share if share != DECLARED else 0.0 if free else 1.0
+        coordinates = np.concatenate([theta[stage.fit.own :], null + part * (start - null)])
         known = jets_with(stage, candidate) if free and share == 0.0 else None
         near = stage.fit.jets if not candidate.parameters and share != DECLARED else None
         try:
@@ -357,17 +367,30 @@ def refit(data: Data, stage: Stage, candidate: Candidate, noise: Noise, *, wante
             continue
         if made.fit.chi2 <= (stage.fit.chi2 + 1.0 if best is None else best.fit.chi2):
             best = made
-        if best is not None and (known is None or stage.fit.chi2 - best.fit.chi2 > PROMISED * candidate.gain):
-            return best
-        if made.fit.fit.status == GIVEN_UP:
-            return made
-    if best is not None:
-        return best
+        enough = best is not None and (known is None or stage.fit.chi2 - best.fit.chi2 > PROMISED * candidate.gain)
+        given_up = made if made.fit.fit.status == GIVEN_UP else given_up
+        done = done or enough or given_up is not None
+    found = best or given_up
+    if found is not None:
+        return found
     raise DataError("no start from which the fit improves")
 
 
+def _has_strayed(stage: Stage) -> bool:
+    """Return whether calibration alone has gone far beyond what is known of it beforehand."""
+    fit = stage.fit
+    known = np.isfinite(fit.prior.std)
+    far = np.abs(fit.coordinates - fit.prior.mean)[known] > STRAYED * fit.prior.std[known]
+    return bool(far.any()) and all(name in NUISANCE for name in fit.hypothesis.names)
+
+
+def _explains(stage: Stage | None) -> bool:
+    """Return whether a model leaves little more than the noise where it is fitted."""
+    return stage is not None and stage.fit.chi2 < EXPLAINS * max(len(stage.fit.fit.residual) - len(stage.fit.fit.theta), 1)
+
+
 def _declared(data: Data, stage: Stage, hypothesis: Hypothesis, noise: Noise) -> FloatArray:
-    """Return where a discrete alternative starts if what is fitted stays as declared: with its own poses and initial inputs."""
+    """Return where an effect starts if what is fitted stays as declared: with its own poses and initial inputs."""
     alone = replace(hypothesis, terms=())
     for trial in data.train:
         if hypothesis.robot.body.mesh is not stage.fit.hypothesis.robot.body.mesh:

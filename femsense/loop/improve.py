@@ -8,6 +8,7 @@ better model until nothing passes.
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -18,7 +19,7 @@ import numpy as np
 
 from femsense.calib.forward import Hypothesis
 from femsense.effects import EFFECTS, FORMS, Effect, find_effect, load_own_effect
-from femsense.errors import FemsenseError
+from femsense.errors import DataError, FemsenseError
 from femsense.loop.conclude import Search, conclude
 from femsense.loop.data import Data, prepare
 from femsense.loop.exchange import BETTER, exchanged
@@ -47,8 +48,8 @@ from femsense.recording import Recording, state_key
 MAX_EFFECTS = 3
 STATES = 5
 """So many different states can tell effects apart though what is held out only repeats them."""
-ROUGHLY = 4
-"""Steps of the fit whose residual tells the noise; with that it is fitted to the end."""
+ROUGHLY, STEPS = 4, 12
+"""Steps of the fit whose residual tells the noise; and at most with that, to the end."""
 
 
 def improve(
@@ -110,7 +111,10 @@ def _calibrated(data: Data, say: Progress, finer_is_made: Callable[[], None]) ->
     before = _declared(data, noise, None)
     hypothesis, prior = with_nuisance(data)
     say("fitting what calibration may move")
-    base = make_stage(data, hypothesis, prior, noise, np.zeros(len(prior.mean)), own=own_of(before), max_iterations=ROUGHLY)
+    nothing = np.zeros(len(prior.mean))
+    base = _as_far_as_held_out_states_rest(
+        lambda steps: make_stage(data, hypothesis, prior, noise, nothing, own=own_of(before), max_iterations=steps), ROUGHLY
+    )
     if "clouds" in data.measured:
         say("matching the clouds again")
         data = rematched(data, base, noise, anew=True)
@@ -124,6 +128,15 @@ def _calibrated(data: Data, say: Progress, finer_is_made: Callable[[], None]) ->
         plain = base
     finer_is_made()
     return with_mesh_errors(data, plain), before, base
+
+
+def _as_far_as_held_out_states_rest(fit: Callable[[int], Stage], steps: int) -> Stage:
+    """Return a fit of so many steps, or of fewer where a held-out state collapses beyond: what calibration may move is no reason to fail, since it
+    may go far for the sake of an effect that is not found yet. Raises DataError where the start has no equilibrium either."""
+    for most in (steps, 2, 1):
+        with contextlib.suppress(DataError):
+            return fit(most)
+    return fit(0)
 
 
 def _declared(data: Data, noise: Noise, start: Stage | None) -> Stage:
@@ -227,9 +240,14 @@ def _renamed(refits: list[dict[str, Any]], step: int, name: str) -> list[dict[st
 def _again(data: Data, stage: Stage, noise: Noise, *, own_derivatives: bool = True) -> Stage:
     """Return a stage fitted to other weights or rows, from where it is; with its own derivatives where the rows are the same."""
     known, near = (stage.fit.jets, None) if own_derivatives else (None, stage.fit.jets)
-    return make_stage(
-        data, stage.fit.hypothesis, stage.fit.prior, noise, stage.fit.coordinates, own=own_of(stage), known=known, near=near
-    )
+    fit, own = stage.fit, own_of(stage)
+
+    def fitted(steps: int) -> Stage:
+        return make_stage(
+            data, fit.hypothesis, fit.prior, noise, fit.coordinates, own=own, max_iterations=steps, known=known, near=near
+        )
+
+    return _as_far_as_held_out_states_rest(fitted, STEPS)
 
 
 def _names(effects: Sequence[str] | None, without: Sequence[str] | None, own: Sequence[Effect]) -> list[str]:
