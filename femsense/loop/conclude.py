@@ -33,7 +33,7 @@ NOT_WORSE = 1.02
 NOISY = 1.15
 """… or, where only what calibration may move is handed back, for this one, if χ² of the held-out data says that noise hides a better model.
 An effect that is right has never needed it in blind cases; three that were wrong have …"""
-FAR_BETTER = 100.0
+FAR_BETTER = 50.0
 """… or, where the mesh's own error is what is larger, if χ² of the held-out data falls by so much."""
 EXPLAINED = 0.8
 """Share of the excess over the noise that effects must take away where structure is left."""
@@ -184,7 +184,7 @@ def _holds_out(data: Data, search: Search, back: Stage) -> bool:
     if only_calibrated and worse <= NOISY:
         return True
     before, after = _held_beyond_mesh(data, search, back)
-    return after < before and (
+    return after <= NOT_WORSE * before and (
         back.held_rms <= NOT_WORSE * search.history[0][1].held_rms or (gain > FAR_BETTER and worse <= NOISY)
     )
 

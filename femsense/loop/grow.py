@@ -67,7 +67,7 @@ DECLARED = -1.0
 STRAYED = 2.0
 """… or where this has gone so many of the standard deviations known beforehand, for the sake of what is missing …"""
 EXPLAINS = 1.25
-"""… and an effect leaves more than this mean square from there, in units of the noise."""
+"""… and an effect leaves more than this mean square from there, in units of the noise. Until one leaves less, linear scores say little."""
 SURE = 2.5
 """Standard errors of the gain on left-out sweeps beyond which held-out data need only not speak against an effect."""
 POLISHED = 2.0
@@ -106,11 +106,11 @@ def grow(
     asked = _quadratic(data, stage, names, n_effective) if first else []
     screened = [c for c in shortlist(table, first=first) if not any(c.effect is a.effect and c.seed == a.seed for a in asked)]
     for candidate in [*asked, *screened]:
-        ahead = [r for r in refits if r.record["verdict"] == "passes"]
+        ahead = [r for r in refits if r.record["verdict"] == "passes" and _explains(r.stage)]
         best = max((r.score for r in ahead), default=-np.inf)
         behind = candidate.score < max((0.5 * r.gain for r in ahead), default=-np.inf) - EVIDENCE
         if behind and not weighs(data, candidate.effect.name):
-            continue  # a joint refit seldom gains that much on its linear score, but for a weight that cables lift
+            continue  # where little is left to explain, a refit seldom gains that much on its linear score, but for a weight that cables lift
         say(f"refitting with {candidate.effect.name}")
         record: dict[str, Any] = {"name": candidate.effect.name, "seed": candidate.seed}
         records.append(record)
