@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 from arm import arm, record, sweeps
 
+from femsense.calib.forward import Hypothesis
 from femsense.loop import grow
 from femsense.loop.data import Data, prepare
 from femsense.loop.exchange import exchanged
 from femsense.loop.grow import Refit, _closer, evidence, judged, polished, refit, shortlist, without_last
+from femsense.loop.joint import Prior
 from femsense.loop.noise import Noise
 from femsense.loop.screen import Candidate
 from femsense.loop.spread import spreads
@@ -110,6 +112,7 @@ def test_weight_that_nobody_declared_is_refitted_however_far_behind_it_looks(mon
         return own
 
     monkeypatch.setattr(grow, "judged", lenient)
+    monkeypatch.setattr(grow, "_explains", lambda stage: True)
     inputs, labels = sweeps(each=1)
     recording, _ = record(inputs, labels=labels, truth=arm((4, 1, 1)))
     data = prepare(arm((4, 1, 1), gravity=(0, 0, 0)), [recording], [])
@@ -121,6 +124,51 @@ def test_weight_that_nobody_declared_is_refitted_however_far_behind_it_looks(mon
     winner, _, records = grow.grow(data, base, table, NOISE, ["gravity", "payload"], COUNT, lambda text: None)
     assert {r["name"] for r in records} == {"gravity", "payload"}
     assert winner is not None and winner.candidate.effect.name == "gravity"
+
+
+@pytest.mark.parametrize("explains", [True, False])
+def test_until_an_effect_explains_the_data_rivals_are_refitted_to_the_end(monkeypatch: pytest.MonkeyPatch, explains: bool):
+    asked = []
+
+    def seen(data: Data, stage: Stage, candidate: Candidate, noise: Noise, *, wanted: float) -> Stage:
+        asked.append((candidate.effect.name, wanted))
+        return refit(data, stage, candidate, noise)
+
+    def lenient(*given: Any) -> Refit:
+        own = judged(*given)
+        own.record["verdict"] = "passes"
+        return own
+
+    data, base = started()
+    table = screen_stage(data, base.fit, NOISE, fields_of(data, base, ["payload", "cable_gain"]), COUNT)
+    looks = [replace(c, score=3.0 if c.effect.name == "cable_gain" else 1e3 + c.score) for c in table]
+    monkeypatch.setattr(grow, "refit", seen)
+    monkeypatch.setattr(grow, "judged", lenient)
+    monkeypatch.setattr(grow, "_polish", lambda data, stage, winner, *_: winner.stage)
+    monkeypatch.setattr(grow, "_explains", lambda stage: explains)
+    grow.grow(data, base, sorted(looks, key=lambda c: -c.score), NOISE, ["payload", "cable_gain"], COUNT, lambda text: None)
+    assert asked == [("payload", grow.EVIDENCE)] + [("cable_gain", grow.EVIDENCE)] * (not explains)
+
+
+@pytest.mark.parametrize("strayed, explains", [(False, False), (True, True), (True, False)])
+def test_where_calibration_has_strayed_a_refit_starts_from_what_is_declared_too(
+    monkeypatch: pytest.MonkeyPatch, strayed: bool, explains: bool
+):
+    data, base = started()
+    candidate = screen_stage(data, base.fit, NOISE, fields_of(data, base, ["payload"]), COUNT)[0]
+    tight = Prior(base.fit.prior.mean, base.fit.prior.std * (1e-3 if strayed else 1e3))
+    base = replace(base, fit=replace(base.fit, prior=tight))
+    starts = []
+
+    def seen(data: Data, hypothesis: Hypothesis, prior: Prior, noise: Noise, coordinates: np.ndarray, **given: Any) -> Stage:
+        starts.append(coordinates)
+        return make_stage(data, hypothesis, prior, noise, coordinates, **given)
+
+    monkeypatch.setattr(grow, "make_stage", seen)
+    monkeypatch.setattr(grow, "_explains", lambda stage: explains)
+    refit(data, base, candidate, NOISE)
+    declared = [c for c in starts if len(c) and not c.any()]
+    assert len(declared) == (strayed and not explains)
 
 
 def test_effects_without_near_rivals_are_not_asked_again():

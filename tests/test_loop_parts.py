@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import sys
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -15,7 +16,7 @@ from femsense import march
 from femsense.calib.forward import Hypothesis, evaluate_scene, make_scene
 from femsense.effects import find_effect
 from femsense.effects.shape import finer_mesh, robot_on_mesh
-from femsense.errors import FemsenseError
+from femsense.errors import DataError, FemsenseError
 from femsense.fem import solves
 from femsense.fem.equilibrium import Equilibrium, solve_equilibrium
 from femsense.fem.mesh import Embedding, embed_points
@@ -32,6 +33,8 @@ from femsense.loop.stages import Stage, keeping, make_stage, with_nuisance, with
 from femsense.loop.structure import structure_tests, without_mesh_error
 from femsense.march import Walk, drive_of, finer_state, solve_frame
 from femsense.recording import Recording, make_recording
+
+as_far_as_held_out_states_rest = sys.modules["femsense.loop.improve"]._as_far_as_held_out_states_rest
 
 RNG = np.random.default_rng(11)
 
@@ -268,6 +271,20 @@ def test_the_mesh_error_may_turn_a_little_in_all_sweeps_whatever_the_axes():
         turned = np.cross(axis, error)  # by a radian, √2 entries of one
         assert float((whiten(factor, TURNS * turned) ** 2).sum()) < 2.0 + 1e-6
         assert np.linalg.norm(without_mesh_error(trial, 0.1 * turned, noise)) < 0.05 * np.linalg.norm(0.1 * turned)
+
+
+def test_calibration_goes_as_far_as_held_out_states_come_to_rest():
+    def collapses_beyond(most: int):
+        def fit(steps: int) -> int:
+            if steps > most:
+                raise DataError("no equilibrium in frame 3")
+            return steps
+
+        return fit
+
+    assert [as_far_as_held_out_states_rest(collapses_beyond(most), 4) for most in (4, 3, 1, 0)] == [4, 2, 1, 0]
+    with pytest.raises(DataError):
+        as_far_as_held_out_states_rest(collapses_beyond(-1), 4)
 
 
 def test_a_declared_gravity_is_believed_to_a_few_degrees():
