@@ -187,6 +187,7 @@ SABOTAGES = (
     S("loop/conclude.py", "return after < before and back.held_rms", "return after < before or back.held_rms", "test_loop_screen.py::test_a_model_may_have_a_larger_error_on_held_out_data_where_that_is_the_mesh_s_own"),
     S("loop/mesh_error.py", "(along[:, :, :, None] * error[:, None, None, :])", "(along[:, :, None, :] * error[:, None, :, None])", "test_loop_parts.py::test_the_error_of_the_mesh_is_what_the_finer_mesh_adds"),
     S("loop/mesh_error.py", "by_sweep, turned], axis=2)", "by_sweep], axis=2)", "test_loop_parts.py::test_the_mesh_error_may_turn_a_little_in_all_sweeps_whatever_the_axes"),
+    S("loop/stages.py", "errors = [t.error_by_sweep for t in data.train]", "errors = [t.mesh_error for t in data.train]", "test_beam.py::test_the_weight_of_a_beam_is_found_in_motion_capture"),
     S("loop/mesh_error.py", "robot_on_mesh(_on_firm_clamp(robot),", "robot_on_mesh(robot,", "test_loop_parts.py::test_springs_of_a_clamp_do_not_sink_into_the_finer_mesh"),
     S("loop/grow.py", "refitted.score - evidence(stage.fit, refitted.stage.fit) + evidence(stage.fit, made.fit)", "refitted.score + evidence(refitted.stage.fit, made.fit)", "test_loop_exchange.py::test_a_polished_refit_is_weighed_against_the_model_without_it_as_its_rivals_are"),
     S("loop/grow.py", 'refitted.record["cv_gain"] - (spread', 'refitted.record["cv_gain"] + (spread', "test_loop_exchange.py::test_what_predicts_surely_goes_before_what_may_predict"),

@@ -178,6 +178,7 @@ def test_the_error_of_the_mesh_is_what_the_finer_mesh_adds():
     np.testing.assert_allclose(error[trial.scene.frame == k], wanted, atol=0.15 * np.abs(wanted).max())
     assert np.abs(wanted).max() > 1e-4
     by_sweep, turned = trial.mesh_error[:, :, 1:-9], trial.mesh_error[:, :, -9:]
+    np.testing.assert_array_equal(trial.error_by_sweep, trial.mesh_error[:, :, :-9])  # what the noise is estimated beside
     np.testing.assert_allclose(by_sweep.sum(axis=2), VARIES * error)
     assert (by_sweep != 0).any(axis=1).sum(axis=1).max() == 1  # each row has the field of its own sweep
     matrix = np.random.default_rng(0).normal(0.0, 1.0, (3, 3))

@@ -60,6 +60,12 @@ class Trial:
         """Number of the parameters that belong to the recording."""
         return 6 * len(self.poses) + (0 if self.initial is None else len(self.initial))
 
+    @property
+    def error_by_sweep(self) -> FloatArray | None:
+        """The fields of the mesh's error that are large: of all sweeps together and of each by itself. Small ones follow, which are not worth a
+        degree of freedom each where the noise is estimated from few states."""
+        return None if self.mesh_error is None else self.mesh_error[:, :, : 1 + len(np.unique(self.groups.sweep))]
+
     def part(self, frames: IntArray) -> Trial:
         """Return the trial with some of its frames only."""
         rows = np.isin(self.scene.frame, frames)

@@ -295,14 +295,15 @@ def noise_of(data: Data, stage: Stage, fields: Fields, before: Noise | None = No
     """Estimate the noise from what the richest linear model leaves; return it with the effective number of observations."""
     table = screen(stage.fit, problem_of(data, stage.fit, Noise({"white": 5e-4}, "")), fields, 100.0)
     own = stage.fit.own
-    widest = max(0 if t.mesh_error is None else t.mesh_error.shape[2] for t in data.train)
+    errors = [t.error_by_sweep for t in data.train]
+    widest = max(0 if e is None else e.shape[2] for e in errors)
     columns, extra = [], []
-    for i, (trial, jet, span) in enumerate(zip(data.train, stage.fit.jets, spans_of(data.train))):
+    for i, (error, jet, span) in enumerate(zip(errors, stage.fit.jets, spans_of(data.train))):
         shape = jet.residual.shape
         block = np.zeros((*shape, own + widest))
         block[:, :, span] = np.concatenate([jet.by_pose, jet.by_initial], axis=2)
-        if trial.mesh_error is not None:
-            block[:, :, own : own + trial.mesh_error.shape[2]] = trial.mesh_error
+        if error is not None:
+            block[:, :, own : own + error.shape[2]] = error
         columns.append(np.concatenate([block, jet.by_effect], axis=2))
         others = [c.raw[i] for c in one_each(table) if c.effect.name != "marker_offset"]
         extra.append(np.concatenate([np.zeros((*shape, 0)), *others], axis=2))
