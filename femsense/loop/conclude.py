@@ -32,7 +32,7 @@ NOT_WORSE = 1.02
 """What is handed back may not have a larger held-out error than the declared model, but for this factor …"""
 NOISY = 1.15
 """… or, where only what calibration may move is handed back, for this one, if χ² of the held-out data says that noise hides a better model.
-An effect that is right has never needed it in blind cases; three that were wrong have …"""
+Three effects that were wrong would have needed it in blind cases, so that they have to do more …"""
 FAR_BETTER = 50.0
 """… or, where the mesh's own error is what is larger, if χ² of the held-out data falls by so much."""
 EXPLAINED = 0.8
@@ -172,8 +172,8 @@ def _has_effects(names: Iterable[str]) -> bool:
 
 def _holds_out(data: Data, search: Search, back: Stage) -> bool:
     """Return whether a model is no worse on held-out data in millimetres; or else better by the noise that these data have, where it is calibrated
-    only and within reason, or where the mesh's own error is all that is larger: then it must be better beyond that, and no worse in millimetres than
-    the model with all that calibration may move, unless it is far better by the noise."""
+    only and within reason, or where the mesh's own error is all that is larger: then it must be no worse beyond that, nor in millimetres than
+    the model with all that calibration may move, unless it is far better by the noise and within reason."""
     worse = back.held_rms / search.before.held_rms
     if worse <= NOT_WORSE:
         return True
