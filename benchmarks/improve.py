@@ -2,6 +2,7 @@
 
     python benchmarks/improve.py                        # tet10 and tet4, something hidden and nothing, three runs each
     python benchmarks/improve.py --case tet10/friction --runs 1
+    python benchmarks/improve.py --case tet4/friction --without discretisation
 
 A bar of 120 × 24 × 24 mm with four cables (16 × 4 × 4 cells, six tetrahedra each) goes through ten sweeps of ten frames: up, held, down. Truth
 has a mesh of its own (14 × 5 × 5 cells, ten nodes each), the rig's integrators of friction, a modulus that is off, an unknown camera
@@ -144,7 +145,7 @@ def _on_clamp(entry: dict[str, Any], declared: int, true: int) -> dict[str, Any]
     return {**entry, "stiffness_n_m": entry["stiffness_n_m"] * declared / true} if "stiffness_n_m" in entry else entry
 
 
-def one_run(folder: Path, element: str) -> None:
+def one_run(folder: Path, element: str, without: list[str]) -> None:
     """Close the loop as the command does, and print what each stage took."""
     from femsense.report import write_report
     from femsense.steps import improve_into
@@ -159,7 +160,7 @@ def one_run(folder: Path, element: str) -> None:
     with tempfile.TemporaryDirectory() as out:
         document = improve_into(
             Path(out) / "loop", folder / f"robot-{element}", [folder / "recording"], user_effects=[folder / f"{n}.py" for n in OWN],
-            say=lambda text: None, progress=mark,
+            without=without or None, say=lambda text: None, progress=mark,
         )  # fmt: skip
         mark("report")
         write_report(Path(out) / "loop")
@@ -177,12 +178,12 @@ def one_run(folder: Path, element: str) -> None:
     )
 
 
-def timed(folder: Path, element: str) -> dict[str, Any]:
+def timed(folder: Path, element: str, without: list[str]) -> dict[str, Any]:
     """Run the loop once in a process of its own; return its stages with wall and CPU seconds."""
     environment = {**os.environ, "FEMSENSE_BEGAN": repr(time.time())}
     before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     answer = subprocess.run(
-        [sys.executable, __file__, "--one", str(folder), "--element", element],
+        [sys.executable, __file__, "--one", str(folder), "--element", element, *(f"--without={name}" for name in without)],
         env=environment,
         capture_output=True,
         text=True,
@@ -215,13 +216,14 @@ def main() -> None:
         help="ELEMENT/HIDDEN, of tet10 | tet4 and nothing | clamp | friction | two; several by repeating",
     )
     parser.add_argument("--runs", type=int, default=3)
+    parser.add_argument("--without", action="append", default=[], metavar="EFFECT", help="leave an effect out; several by repeating")
     parser.add_argument("--data", type=Path, default=Path(tempfile.gettempdir()) / "femsense-improve")
     parser.add_argument("--steps", action="store_true", help="list what was done")
     parser.add_argument("--one", type=Path, help=argparse.SUPPRESS)
     parser.add_argument("--element", default="tet10", help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.one is not None:
-        one_run(given.one, given.element)
+        one_run(given.one, given.element, given.without)
         return
     for name in given.case or ["tet10/nothing", "tet10/clamp", "tet10/friction", "tet4/nothing", "tet4/friction"]:
         element, hidden = name.split("/")
@@ -229,8 +231,8 @@ def main() -> None:
         if not (folder / "recording" / "recording.toml").is_file():
             print(f"making the recording of {hidden} …", flush=True)
             make(hidden, folder)
-        runs = [timed(folder, element) for _ in range(given.runs)]
-        show(name, runs)
+        runs = [timed(folder, element, given.without) for _ in range(given.runs)]
+        show(name + "".join(f" without {effect}" for effect in given.without), runs)
         if given.steps:
             print("  " + "; ".join(runs[0]["steps"]))
 

@@ -373,11 +373,15 @@ def _as_before(now: tuple[FloatArray, ...], then: tuple[FloatArray, ...], slack:
 def _clamp_fits(walk: Walk, frame: int, state: Equilibrium) -> bool:
     """Return whether a state can serve as a start: a clamp that gave way elsewhere would be torn back, and one that gives by much, and
     has not yet, would let go of the whole load at once, which takes longer than the way from rest."""
-    body, clamped = walk.robot.body, walk.robot.body.clamped
-    given = np.abs(state.positions[clamped] - body.mesh.nodes[clamped]).max(initial=0.0)
-    if body.clamp_is_rigid or given >= 1e-9:
-        return bool(given < 1e-9 or not body.clamp_is_rigid)
+    body = walk.robot.body
+    if body.clamp_is_rigid or has_given(body, state):
+        return not (body.clamp_is_rigid and has_given(body, state))
     return bool(np.abs(first_give(body, _Balance(walk, frame, state).left())).max(initial=0.0) < GIVES * body.reach)
+
+
+def has_given(body: BodyModel, state: Equilibrium) -> bool:
+    """Return whether the clamp has given way in a state."""
+    return bool(np.abs(state.positions[body.clamped] - body.mesh.nodes[body.clamped]).max(initial=0.0) >= 1e-9)
 
 
 Tensions = tuple[FloatArray, ...]

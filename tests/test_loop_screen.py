@@ -18,7 +18,7 @@ from femsense.loop import conclude, improve
 from femsense.loop.conclude import Search
 from femsense.loop.data import Data, prepare
 from femsense.loop.grow import with_term
-from femsense.loop.joint import JointProblem, Prior
+from femsense.loop.joint import Jets, JointProblem, Prior
 from femsense.loop.noise import Noise
 from femsense.loop.screen import effect_fields
 from femsense.loop.stages import Stage, make_stage, with_nuisance
@@ -94,6 +94,28 @@ def test_a_step_that_is_not_taken_leaves_no_state_behind() -> None:
     np.testing.assert_allclose(problem.evaluate(theta, True)[0], at, atol=1e-3)
 
 
+@pytest.mark.parametrize("clamp", ["base_compliance", None])
+def test_a_fit_begins_at_the_states_of_the_model_before_unless_their_clamp_is_another(clamp: str | None) -> None:
+    data, stage = staged(arm((4, 2, 2)))
+    hypothesis, prior = stage.fit.hypothesis, stage.fit.prior
+    theta = np.array(stage.fit.fit.theta)
+    theta[stage.fit.own] += np.log(0.9)  # a rival went elsewhere
+    if clamp is not None:
+        effect = find_effect(clamp)
+        parameters = effect.parameters(data.robot, "tension")
+        hypothesis, prior = with_term(stage.fit, effect, {}, parameters)
+        theta = np.append(theta, [0.2 * p.high for p in parameters])
+    trial = replace(data.train[0], starts={})
+    problem = JointProblem(hypothesis, prior, [trial], [NOISE.whitener(trial.groups, None)], 1.0)
+    problem.evaluate(theta, True)
+    kept = dict(trial.starts_on(data.robot.body.mesh))
+    begins = JointProblem(hypothesis, prior, [trial], problem.factors, 1.0)
+    begins.last = Jets(stage.fit.jets, theta)
+    wanted = kept if clamp else stage.fit.jets[0].states
+    (starts,) = begins._starts(theta, True)
+    assert wanted and all(starts[k].positions is state.positions for k, state in wanted.items())
+
+
 def test_a_model_without_equilibrium_is_not_handed_back(monkeypatch: pytest.MonkeyPatch) -> None:
     def collapses(*_: object, **__: object) -> Stage:
         raise DataError("no equilibrium in frame 3")
@@ -128,6 +150,30 @@ def test_a_model_may_have_a_larger_error_on_held_out_data_where_that_is_the_mesh
     search = replace(search, before=before)
     assert not holds(1.4, chi2=105.0) and holds(1.4, chi2=95.0)
     assert not holds(1.4, beyond=0.9)
+
+
+@pytest.mark.parametrize("names, held", [(["stiffness"], True), (["stiffness", "cable_offset"], False)])
+def test_a_larger_error_is_not_for_zeros_of_cables_which_much_else_looks_like(
+    monkeypatch: pytest.MonkeyPatch, names: list[str], held: bool
+) -> None:
+    data, stage = staged(arm((4, 2, 2)), 1.0)
+    terms = tuple(t for t in stage.fit.hypothesis.terms if t[0].name in names)
+    back = replace(stage, held_rms=1.4, fit=replace(stage.fit, hypothesis=replace(stage.fit.hypothesis, terms=terms)))
+    search = Search(replace(stage, held_rms=1.0), [("", back)], back, NOISE, 10.0, [], [], [], None)
+    monkeypatch.setattr(conclude, "held_chi2", lambda _, s, noise: 40.0 if s is back else 80.0)
+    monkeypatch.setattr(conclude, "beyond_mesh", lambda *_: 0.5)
+    assert conclude._holds_out(data, search, back) == held
+
+
+@pytest.mark.parametrize("error, mesh, expected", [(0.5, None, False), (0.5, 1.0, False), (0.9, None, False), (0.9, 1.0, True)])
+def test_where_the_data_are_explained_by_what_the_mesh_costs_the_sentence_says_so(
+    error: float, mesh: float | None, expected: bool
+) -> None:
+    _, stage = staged(arm((4, 2, 2)), 1.0)
+    stage = replace(stage, held_rms=1e-3 * error)
+    noise = Noise({"white": 0.5e-3 / np.sqrt(3.0)}, "")
+    sentence = conclude._sentence("none", [], [], stage, stage, noise, None if mesh is None else 1e-3 * mesh)
+    assert ("its mesh costs (1.00 mm" in sentence) == expected and "noise (0.50 mm)" in sentence
 
 
 def test_a_modulus_that_is_as_declared_once_zeros_stay_is_not_handed_back(monkeypatch: pytest.MonkeyPatch) -> None:

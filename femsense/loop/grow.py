@@ -341,39 +341,50 @@ def refit(data: Data, stage: Stage, candidate: Candidate, noise: Noise, *, wante
     low, high = np.array([p.low for p in candidate.parameters]), np.array([p.high for p in candidate.parameters])
     start = null if candidate.effect.discrete else np.clip(_first_guess(candidate, null), low, high)
     hypothesis, prior = with_term(stage.fit, candidate.effect, candidate.seed, candidate.parameters)
-    free = not candidate.effect.discrete and candidate.effect.name != "gravity"  # for these the null is no start
-    shares: tuple[float, ...] = (1.0, DECLARED) if candidate.gain < np.inf else (DECLARED, 1.0)
-    shares = shares if candidate.effect.discrete else (0.0, 1.0, 0.3) if free else (1.0, 0.3, 0.0)  # a linear step may go too far
+    gravity = candidate.effect.name == "gravity"
+    free = not candidate.effect.discrete and not gravity  # for these the null is no start
     answer = 0.0 if candidate.effect.discrete else candidate.response @ (start - null)  # of what is fitted already
-    strayed = not candidate.effect.discrete and _has_strayed(stage)
-    best: Stage | None = None
-    given_up: Stage | None = None
-    done = False
     worth = _within(stage.fit, (candidate.cost + wanted - FORGONE[0]) / FORGONE[1])
-    for share in (*shares, DECLARED) if strayed else shares:
-        if done and not (strayed and share == DECLARED and not _explains(best)):
-            continue
-        theta = _declared(data, stage, hypothesis, noise) if share == DECLARED else stage.fit.fit.theta + share * answer
+
+    def fitted(share: float) -> Stage | None:
         part = share if share != DECLARED else 0.0 if free else 1.0
-        coordinates = np.concatenate([theta[stage.fit.own :], null + part * (start - null)])
         known = jets_with(stage, candidate) if free and share == 0.0 else None
         near = stage.fit.jets if not candidate.parameters and share != DECLARED else None
         try:
-            made = make_stage(
+            theta = _declared(data, stage, hypothesis, noise) if share == DECLARED else stage.fit.fit.theta + share * answer
+            coordinates = np.concatenate([theta[stage.fit.own :], null + part * (start - null)])
+            return make_stage(
                 data, hypothesis, prior, noise, coordinates,
                 own=theta[: stage.fit.own], max_iterations=10, known=known, near=near, worth=worth,
             )  # fmt: skip
         except DataError:
-            continue
-        if made.fit.chi2 <= (stage.fit.chi2 + 1.0 if best is None else best.fit.chi2):
+            return None
+
+    best: Stage | None = None
+    given_up: Stage | None = None
+    for share in _shares(candidate, free):
+        made = fitted(share)
+        if made is not None and made.fit.chi2 <= (stage.fit.chi2 + 1.0 if best is None else best.fit.chi2):
             best = made
-        enough = best is not None and (known is None or stage.fit.chi2 - best.fit.chi2 > PROMISED * candidate.gain)
-        given_up = made if made.fit.fit.status == GIVEN_UP else given_up
-        done = done or enough or given_up is not None
+        if made is not None and made.fit.fit.status == GIVEN_UP:
+            given_up = made
+            break
+        if best is not None and not (free and share == 0.0 and stage.fit.chi2 - best.fit.chi2 <= PROMISED * candidate.gain):
+            break
+    if gravity and _has_strayed(stage) and not _explains(best):
+        made = fitted(DECLARED)
+        best = made if made is not None and (best is None or made.fit.chi2 <= best.fit.chi2) else best
     found = best or given_up
-    if found is not None:
-        return found
-    raise DataError("no start from which the fit improves")
+    if found is None:
+        raise DataError("no start from which the fit improves")
+    return found
+
+
+def _shares(candidate: Candidate, free: bool) -> tuple[float, ...]:
+    """Return the shares of the linear step from which a refit may start, in order: that step may go too far."""
+    if candidate.effect.discrete:
+        return (1.0, DECLARED) if candidate.gain < np.inf else (DECLARED, 1.0)
+    return (0.0, 1.0, 0.3) if free else (1.0, 0.3, 0.0)
 
 
 def _has_strayed(stage: Stage) -> bool:

@@ -13,10 +13,12 @@ from femsense.calib.fit import FitResult, Kinks, gauss_newton
 from femsense.calib.forward import Hypothesis, Scene, SceneJet, evaluate_scene, rest_residual
 from femsense.effects.loads import STANDARD_GRAVITY
 from femsense.errors import DataError
+from femsense.fem.body import BodyModel
 from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.mesh import TetMesh
 from femsense.loop.kinks import Part, joined, trial_kinks
 from femsense.loop.noise import Groups, Noise, Whitener, whiten
+from femsense.march import has_given
 from femsense.pose import move_pose
 
 if TYPE_CHECKING:
@@ -286,8 +288,10 @@ class JointProblem:
             for own, tried in zip(kept, self.tried[1] if self.tried is not None and np.array_equal(self.tried[0], theta) else []):
                 own.update(tried)
             return kept
-        if self.tried is None and self.last is None and self.near is not None:
-            return [_as_near(own, jet.states) for own, jet in zip(kept, self.near)]
+        begun = self.near if self.last is None else self.last.jets
+        if self.tried is None and begun is not None:
+            body = self.hypothesis.robot_at(theta[self.own :]).body
+            return [_as_near(own, jet.states, body) for own, jet in zip(kept, begun)]
         if self.tried is None:
             return [dict(s) for s in kept]
         at, states = self.tried
@@ -367,13 +371,19 @@ class JointProblem:
         return mask if mask.any() else None
 
 
-def _as_near(kept: States, near: States) -> States:
-    """Return states to start from: those of a fit near by where they are on the same mesh, since others may have gone far since then."""
+def _as_near(kept: States, near: States, body: BodyModel) -> States:
+    """Return states of a body to start from: those of a fit near by where they are on the same mesh, since others may have gone far since
+    then, unless it is those whose clamp has given way, or not, as this body's does."""
     shape = next(iter(near.values())).positions.shape
     if any(state.positions.shape != shape for state in kept.values()):
         return dict(kept)
-    still = {k for k, state in near.items() if k in kept and kept[k].positions is state.positions}  # these have their factors
-    return {**kept, **{k: state for k, state in near.items() if k not in still}}
+
+    def serves(k: int, state: Equilibrium) -> bool:
+        if k not in kept or kept[k].positions is state.positions:  # such states have their factors
+            return k not in kept
+        return has_given(body, state) != body.clamp_is_rigid or has_given(body, kept[k]) == body.clamp_is_rigid
+
+    return {**kept, **{k: state for k, state in near.items() if serves(k, state)}}
 
 
 SERVES = 0.25
