@@ -216,7 +216,9 @@ def main() -> None:
         help="ELEMENT/HIDDEN, of tet10 | tet4 and nothing | clamp | friction | two; several by repeating",
     )
     parser.add_argument("--runs", type=int, default=3)
-    parser.add_argument("--without", action="append", default=[], metavar="EFFECT", help="leave an effect out; several by repeating")
+    parser.add_argument(
+        "--without", action="append", default=[], metavar="EFFECT", help="leave an effect out; several by repeating"
+    )
     parser.add_argument("--data", type=Path, default=Path(tempfile.gettempdir()) / "femsense-improve")
     parser.add_argument("--steps", action="store_true", help="list what was done")
     parser.add_argument("--one", type=Path, help=argparse.SUPPRESS)
