@@ -40,7 +40,7 @@ def compared(case: Case) -> None:
     robot = apply_effects(made.declared, [{"name": "stiffness", "scale": made.modulus_scale}])
     data = prepare(robot, [made.recording], ())
     stage = make_stage(data, Hypothesis(data.robot), Prior(np.zeros(0), np.zeros(0)), Noise({"white": 5e-4}, ""), np.zeros(0))
-    errors = mesh_errors(with_mesh_errors(data, stage))
+    errors = mesh_errors(with_mesh_errors(data, stage, []))
     if not errors:
         print(f"{case.number:4d} {case.design.name:7s}{case.control:13s} no state settles on the finer mesh", flush=True)
         return

@@ -19,7 +19,7 @@ from femsense.effects.shape import finer_mesh, robot_on_mesh
 from femsense.errors import DataError, FemsenseError
 from femsense.fem import solves
 from femsense.fem.equilibrium import Equilibrium, solve_equilibrium
-from femsense.fem.mesh import Embedding, embed_points
+from femsense.fem.mesh import Embedding, embed_points, to_linear
 from femsense.loop import improve
 from femsense.loop.conclude import _excess, _lacks
 from femsense.loop.data import Data, prepare
@@ -145,31 +145,39 @@ def test_the_plain_error_may_grow_where_fitted_if_that_on_held_out_data_falls():
     assert not _plainly_worse(before, errors(1.3, 0.9)) and not _plainly_worse(before, errors(1.2, 1.1))
 
 
-def with_error_of_the_mesh(noise: Noise) -> tuple[Recording, Stage, Data]:
+def with_error_of_the_mesh(noise: Noise, *, linear: bool = False, tried: tuple[str, ...] = ()) -> tuple[Recording, Stage, Data]:
     """Return a recording of a small arm, its calibrated stage, and the data with what the mesh costs there."""
     inputs, labels = sweeps(each=1)
     robot = arm((4, 2, 2))
+    robot = robot_on_mesh(robot, to_linear(robot.body.mesh)) if linear else robot
     recording, _ = record(inputs, labels=labels, truth=robot)
     data = prepare(robot, [recording], [])
     hypothesis, prior = with_nuisance(data)
     stage = make_stage(data, hypothesis, prior, noise, np.zeros(len(prior.mean)))
-    return recording, stage, with_mesh_errors(data, stage)
+    return recording, stage, with_mesh_errors(data, stage, tried)
+
+
+def test_a_linear_mesh_has_no_error_where_it_is_asked_about_as_an_effect():
+    noise = Noise({"white": 1e-4}, "")
+    assert mesh_errors(with_error_of_the_mesh(noise, linear=True, tried=("cable_friction", "discretisation"))[2]) == []
+    assert mesh_errors(with_error_of_the_mesh(noise, linear=True, tried=("cable_friction",))[2])
 
 
 def test_what_is_made_of_the_finer_mesh_beforehand_serves_the_fitted_robot():
     robot = arm((4, 2, 2))
-    make_finer(robot)
+    make_finer(robot, [])
     ready = robot_on_mesh(robot, finer_mesh(robot.body.mesh, None, 1)).body.free_map
     assert ready.pattern.analyses and ready.laplacian
     softer = robot.with_body(robot.body.with_stiffness_scale(0.9))
     assert robot_on_mesh(softer, finer_mesh(robot.body.mesh, None, 1)).body.free_map is ready
 
 
-def test_the_error_of_the_mesh_is_what_the_finer_mesh_adds():
-    recording, stage, data = with_error_of_the_mesh(Noise({"white": 1e-4}, ""))
+@pytest.mark.parametrize("linear, finer", [(False, (None, 1)), (True, ("tet10", 0))], ids=["tet10", "tet4"])
+def test_the_error_of_the_mesh_is_what_the_finer_mesh_adds(linear: bool, finer: tuple[str | None, int]):
+    recording, stage, data = with_error_of_the_mesh(Noise({"white": 1e-4}, ""), linear=linear)
     trial, error = data.train[0], mesh_errors(data)[0]
     fitted = stage.fit.hypothesis.robot_at(stage.fit.coordinates)
-    fine = robot_on_mesh(fitted, finer_mesh(fitted.body.mesh, None, 1))
+    fine = robot_on_mesh(fitted, finer_mesh(fitted.body.mesh, *finer))
     k = int(trial.scene.frames[2])
     tension = dict(zip(fitted.body.cable_names, recording.inputs[k] + fitted.actuation.tension_offset))
     tension = {name: max(t, 0.0) for name, t in tension.items()}
@@ -192,7 +200,7 @@ def test_springs_of_a_clamp_do_not_sink_into_the_finer_mesh():
     noise = Noise({"white": 1e-4}, "")
     data = prepare(soft, [recording], [])
     stage = make_stage(data, Hypothesis(data.robot), Prior(np.zeros(0), np.zeros(0)), noise, np.zeros(0))
-    trial, error = data.train[0], mesh_errors(with_mesh_errors(data, stage))[0]
+    trial, error = data.train[0], mesh_errors(with_mesh_errors(data, stage, []))[0]
     _, _, firm = with_error_of_the_mesh(noise)
     nearest = np.unique(trial.scene.marker)[:4]  # beside the clamp, where a finer body would sink onto its springs
     by_clamp, by_firm = (np.abs(e[np.isin(trial.scene.marker, nearest)]).max() for e in (error, mesh_errors(firm)[0]))

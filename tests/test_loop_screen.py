@@ -176,6 +176,19 @@ def test_where_the_data_are_explained_by_what_the_mesh_costs_the_sentence_says_s
     assert ("its mesh costs (1.00 mm" in sentence) == expected and "noise (0.50 mm)" in sentence
 
 
+@pytest.mark.parametrize("linear, named", [(True, True), (False, True), (True, False)])
+def test_effects_that_are_named_on_linear_elements_may_stand_for_these(
+    monkeypatch: pytest.MonkeyPatch, linear: bool, named: bool
+) -> None:
+    robot = arm((4, 2, 2))
+    data, stage = staged(robot_on_mesh(robot, to_linear(robot.body.mesh)) if linear else robot, 1.0)
+    settled = ((find_effect("hyperelastic"), {}),) if named else ()
+    back = replace(stage, fit=replace(stage.fit, hypothesis=replace(stage.fit.hypothesis, settled=settled)))
+    search = Search(stage, [("", stage)], back, NOISE, 10.0, [], [], [], None)
+    monkeypatch.setattr(conclude, "_mesh_error", lambda data: 2e-3)
+    assert ("try discretisation" in conclude._by_mesh(data, search, back)) == (linear and named)
+
+
 def test_a_modulus_that_is_as_declared_once_zeros_stay_is_not_handed_back(monkeypatch: pytest.MonkeyPatch) -> None:
     data, softer = staged(arm((4, 2, 2), modulus=250e3))
     as_declared = replace(

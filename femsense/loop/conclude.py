@@ -521,7 +521,11 @@ def _sentence(
 
 
 def _by_mesh(data: Data, search: Search, back: Stage) -> str:
-    """Return a sentence on what the held-out error is beyond the mesh's own, where that is what makes it larger; nothing where it is not larger."""
+    """Return a sentence on what the held-out error is beyond the mesh's own, where that is what makes it larger, or on what effects that are
+    named on a linear mesh may stand for; nothing where there is neither."""
+    mesh = _mesh_error(data)
+    if mesh and not data.robot.body.mesh.is_quadratic and _has_effects(back.fit.hypothesis.names):
+        return f" Linear elements cost {1e3 * mesh:.2f} mm themselves, which other effects may stand for: try discretisation too."
     if back.held_rms <= NOT_WORSE * search.before.held_rms or not mesh_errors(data):
         return ""
     before, after = _held_beyond_mesh(data, search, back)

@@ -85,9 +85,9 @@ def improve(
     names = _names(effects, without, own)
     rng = np.random.default_rng(seed)
     say("reading and calibrating")
-    with beside(lambda: _get_ready(robot)) as finer_is_made:
+    with beside(lambda: _get_ready(robot, names)) as finer_is_made:
         data = replace(prepare(robot, recordings, validation, measured), forms=(*FORMS, *own))
-        data, before, base = _calibrated(data, say, finer_is_made)
+        data, before, base = _calibrated(data, names, say, finer_is_made)
     growing = _tells_apart(data)
     data, search = _search(data, before, base, names, MAX_EFFECTS if growing else 0, say)
     say("testing what is left")
@@ -99,13 +99,13 @@ def improve(
     return replace(result, next_experiment="; ".join(t for t in (only, result.next_experiment) if t))
 
 
-def _get_ready(robot: Robot) -> None:
+def _get_ready(robot: Robot, names: Sequence[str]) -> None:
     """Begin what takes seconds and waits for nothing: the finer mesh, and loading Open3D, whose rays say what the next experiment's camera sees."""
-    make_finer(robot)
+    make_finer(robot, names)
     importlib.import_module("open3d")
 
 
-def _calibrated(data: Data, say: Progress, finer_is_made: Callable[[], None]) -> tuple[Data, Stage, Stage]:
+def _calibrated(data: Data, names: Sequence[str], say: Progress, finer_is_made: Callable[[], None]) -> tuple[Data, Stage, Stage]:
     """Return the data with what the mesh costs, the declared model calibrated, and the model with all that calibration may move."""
     noise = Noise({"white": 5e-4}, "start")
     before = _declared(data, noise, None)
@@ -127,7 +127,7 @@ def _calibrated(data: Data, say: Progress, finer_is_made: Callable[[], None]) ->
     except FemsenseError:
         plain = base
     finer_is_made()
-    return with_mesh_errors(data, plain), before, base
+    return with_mesh_errors(data, plain, names), before, base
 
 
 def _as_far_as_held_out_states_rest(fit: Callable[[int], Stage], steps: int) -> Stage:
@@ -191,7 +191,7 @@ def _search(data: Data, before: Stage, base: Stage, names: list[str], most: int,
         stage = prune(data, winner, noise, n_effective, say)
         history.append((name, stage))
         if far:  # the mesh errs in another way in these states
-            data = with_mesh_errors(data, stage)
+            data = with_mesh_errors(data, stage, names)
         found_so = history
         history, refits = exchanged(data, history, refits, noise, n_effective, say)
         if history is not found_so:

@@ -1,4 +1,4 @@
-"""What the mesh itself costs: how far a mesh of half the size would move the markers, in every state.
+"""What the mesh itself costs: how far a mesh of half the size would move the markers, in every state; where it is linear, quadratic elements.
 
 A residual of that shape says nothing of the robot, whatever its size: how much of it a body shows is not known (a cable that is tied to points
 sinks the deeper the finer the mesh is), but it is the same share in all sweeps, but for what directions and sweeps differ by. So it counts as
@@ -8,6 +8,7 @@ finer mesh would explain. A few Newton steps from the state on the declared mesh
 
 from __future__ import annotations
 
+import contextlib
 import functools
 from collections.abc import Sequence
 from dataclasses import replace
@@ -40,15 +41,16 @@ TURNS = 0.07
 """… and of the nine entries of a matrix that turns and stretches it in all sweeps: another mesh is not as much finer along the body as across."""
 
 
-def with_mesh_errors(data: Data, stage: Stage) -> Data:
-    """Return the data with the error of a quadratic mesh at a stage; without it where the mesh is linear (it is an effect then) or huge."""
+def with_mesh_errors(data: Data, stage: Stage, tried: Sequence[str]) -> Data:
+    """Return the data with the error of the mesh at a stage; without it where the mesh is huge, or linear and `discretisation` among the
+    effects that are tried."""
     robot = stage.fit.hypothesis.robot_at(stage.fit.coordinates)
-    mesh = robot.body.mesh
-    if not _is_asked(mesh):
-        return data
     train, held, fitted = list(data.train), list(data.held), placed(data, stage.fit)
     try:
-        fine = robot_on_mesh(_on_firm_clamp(robot), finer_mesh(mesh, None, 1))
+        finer = _finer(robot.body.mesh, tried)
+        if finer is None:
+            return data
+        fine = robot_on_mesh(_on_firm_clamp(robot), finer)
         for i, (trial, (poses, initial)) in enumerate(zip(data.train, fitted)):
             own = [j for j, of in enumerate(data.held_of) if of == i]
             train[i], *later = _with_errors(robot, fine, [trial, *(held[j] for j in own)], poses, initial)
@@ -71,24 +73,24 @@ def _on_firm_clamp(robot: Robot) -> Robot:
     return robot if body.clamp_is_rigid else robot.with_body(body.with_clamp_stiffness())
 
 
-def _is_asked(mesh: TetMesh) -> bool:
-    return mesh.is_quadratic and 8 * len(mesh.tets) <= MOST_TETS
+def _finer(mesh: TetMesh, tried: Sequence[str]) -> TetMesh | None:
+    """Return the mesh that tells what a mesh costs: one of half the size, or of quadratic elements where it is linear. None where that takes
+    too long, or where a linear mesh is asked about as an effect."""
+    if mesh.is_quadratic:
+        return finer_mesh(mesh, None, 1) if 8 * len(mesh.tets) <= MOST_TETS else None
+    return finer_mesh(mesh, "tet10", 0) if "discretisation" not in tried and len(mesh.tets) <= MOST_TETS else None
 
 
-def make_finer(robot: Robot) -> None:
+def make_finer(robot: Robot, tried: Sequence[str]) -> None:
     """Make what `with_mesh_errors` needs of the finer mesh whatever the material, beside other work: what is made is kept.
 
     A mesh that cannot be had is none here; it is asked for again where it is needed.
     """
-    mesh = robot.body.mesh
-    if not _is_asked(mesh):
-        return
-    try:
-        fine = robot_on_mesh(robot, finer_mesh(mesh, None, 1))
-        share_on_finer(fine.body)
-        _ties(mesh, fine.body.mesh)
-    except FemsenseError:
-        return
+    with contextlib.suppress(FemsenseError):
+        finer = _finer(robot.body.mesh, tried)
+        if finer is not None:
+            share_on_finer(robot_on_mesh(robot, finer).body)
+            _ties(robot.body.mesh, finer)
 
 
 @functools.lru_cache(maxsize=2)
