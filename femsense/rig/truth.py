@@ -22,7 +22,15 @@ from femsense.rig.script import Plan, TruthTable
 
 SETTLED = 1e-8
 """Tensions along the cables and contact forces rest when a pass moves them by less than this [N]."""
-PASSES = 60
+SETTLED_HELD = 1e-6
+"""The same where cables are held: their lengths close to a billionth of a metre, their tensions to what that is worth [N]."""
+PASSES = 200
+SLOW = 0.9
+"""Share of the pass before from which on passes of a held cable are summed beforehand."""
+FAR, NEARER = float(np.log(2.0)), 0.7
+"""A sum may change the logarithm of a tension by so much at first, and then by a smaller and smaller share of it."""
+TINY = 1e-12
+"""Tensions below this are none [N]."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -245,13 +253,18 @@ class _Walker:
     def go(self, load: _Load, frame: int) -> None:
         """Move on to a load: the state, the tensions along the cables and the contact forces agree at the end."""
         body = self.body if self.plan.gravity is None else self.body.with_gravity(load.gravity)
+        passes, far = [self._motors(load)], FAR
         for _ in range(PASSES):
-            along, grips = self._along(load)
+            ahead = _ahead(passes, far)
+            motors = passes[-1] if ahead is None else ahead
+            passes, far = (passes, far) if ahead is None else ([], NEARER * far)
+            along, grips = self._along(motors)
             forces = load.forces + self._contact_forces(load)
-            self.state = self._solve(body, load, along, forces, frame)
+            self.state = self._solve(body, load, motors, along, forces, frame)
             if self._settled(load, along, forces):
                 self.grips = grips
                 return
+            passes.append(self._motors(load))
         raise DataError(f"the truth of frame {frame} does not settle: friction and contact keep moving; use more substeps")
 
     def contacts_now(self, load: _Load) -> tuple[TrueContact, ...]:
@@ -263,9 +276,12 @@ class _Walker:
             if force > 0
         )
 
-    def _along(self, load: _Load) -> tuple[list[FloatArray], list[Grip]]:
+    def _motors(self, load: _Load) -> FloatArray:
+        """Return the tensions at the motors [N], shape (a,): of held cables as they came out last."""
+        return load.inputs if self.control == "tension" else np.array(list(self.state.tension.values()))
+
+    def _along(self, motors: FloatArray) -> tuple[list[FloatArray], list[Grip]]:
         """Return the tensions along each cable [N], far end first, and what the bends would remember."""
-        motors = load.inputs if self.control == "tension" else np.array(list(self.state.tension.values()))
         tensions, grips = [], []
         for cable, grip, friction, motor in zip(self.body.cables, self.grips, self.friction, motors):
             bends = bend_angles(cable, self.state.positions)[::-1]
@@ -274,10 +290,12 @@ class _Walker:
             grips.append(now)
         return tensions, grips
 
-    def _solve(self, body: BodyModel, load: _Load, along: list[FloatArray], forces: FloatArray, frame: int) -> Equilibrium:
+    def _solve(
+        self, body: BodyModel, load: _Load, motors: FloatArray, along: list[FloatArray], forces: FloatArray, frame: int
+    ) -> Equilibrium:
         names = body.cable_names
         values = {name: float(v) for name, v in zip(names, load.inputs)}
-        motor = values if self.control == "tension" else dict(self.state.tension)
+        motor = {name: float(v) for name, v in zip(names, motors)}
         start = replace(self.state, tension=motor)
         shares = tuple(t / motor[n] if motor[n] > 0 else np.ones_like(t) for n, t in zip(names, along))
         tension, held = (values, None) if self.control == "tension" else (None, values)
@@ -289,11 +307,13 @@ class _Walker:
 
     def _settled(self, load: _Load, along: list[FloatArray], forces: FloatArray) -> bool:
         """Return whether what was solved with is what its result asks for."""
-        wanted, _ = self._along(load)
+        wanted, _ = self._along(self._motors(load))
         used = self.state.segment_tensions
         moved = [np.abs(w - u).max(initial=0.0) for w, u in zip(wanted, used)]
         pressed = np.abs(load.forces + self._contact_forces(load) - forces).max(initial=0.0)
-        return bool(max([float(pressed), *moved]) < SETTLED * max(1.0, float(np.abs(load.inputs).max(initial=0.0))))
+        if self.control == "tension":
+            return bool(max([float(pressed), *moved]) < SETTLED * max(1.0, float(np.abs(load.inputs).max(initial=0.0))))
+        return bool(max([float(pressed), *moved]) < SETTLED_HELD)
 
     def _direction(self, i: int) -> FloatArray:
         given = self.plan.contacts[i].table.direction
@@ -307,6 +327,23 @@ class _Walker:
         for i, (patch, force) in enumerate(zip(self.patches, load.contact)):
             total += patch.spread(force * self._direction(i), n)
         return total
+
+
+def _ahead(passes: list[FloatArray], far: float) -> FloatArray | None:
+    """Return the tensions at the motors that passes creep towards [N], (a,); None where they do not creep.
+
+    While the bends of a held cable hold, what is behind them stays, and the tension at the motor moves by nearly the same small share in every
+    pass, until they slide. So where the logarithms of three passes move like a geometric series, it is summed (Aitken 1926), up to `far` in
+    the logarithm.
+    """
+    if len(passes) < 3:
+        return None
+    first, second, last = np.log(np.maximum(passes[-3:], TINY))
+    before, step = second - first, last - second
+    ratio = np.divide(step, before, out=np.zeros_like(step), where=before != 0.0)
+    slow = (ratio > SLOW) & (ratio < 1.0 / SLOW)
+    whole = np.clip(step / np.maximum(1.0 - ratio, TINY), -far, far)
+    return passes[-1] * np.exp(np.where(slow, whole, 0.0)) if slow.any() else None
 
 
 def _known_loads(mesh: TetMesh, plan: Plan, creep: FloatArray) -> dict[int, FloatArray]:
