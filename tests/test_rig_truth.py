@@ -20,6 +20,7 @@ from femsense.files import folder_hash
 from femsense.march import Walk, drive_of, marker_positions, walk_along
 from femsense.model import Robot
 from femsense.recording import load_recording, make_recording
+from femsense.rig import truth
 from femsense.rig.scene import probe_shape
 from femsense.rig.script import Plan, TruthTable, check_script, plan_script
 from femsense.rig.simulate import recording_of, run_experiment, simulate
@@ -60,22 +61,23 @@ def test_held_cables_agree_with_the_estimator(robot: Robot) -> None:
     np.testing.assert_allclose(_true_markers(robot, held), _estimators_markers(robot, held), atol=1e-9)
 
 
-def test_held_cables_that_rub_come_to_rest_when_they_are_let_out() -> None:
+def test_held_cables_that_rub_come_to_rest_when_they_are_let_out(monkeypatch: pytest.MonkeyPatch) -> None:
     """Tensions at their motors then creep, pass by pass, as long as their bends hold."""
+    monkeypatch.setattr(truth, "PASSES", 40)
     rubbing = apply_effects(arm((5, 2, 2)), [{"name": "cable_friction", "coefficient": 0.5}])
-    inputs = np.array([[4.0, 1.0, 3.0, 0.0], [4.0, 0.5, 3.0, 0.0], [3.8, 0.5, 3.0, 0.0]]) * 1e-3
+    inputs = np.array([[4.0, 0.0, 3.0, 0.0], [3.6, 0.0, 2.8, 0.0]]) * 1e-3
     nothing = freeze(np.zeros((0, 3)))
     plan = Plan(
-        control="displacement", time_s=freeze(np.arange(3.0)), sweep=("s",) * 3, free=freeze(np.ones(3), bool), commanded=freeze(inputs), initial=freeze(np.zeros(4)),
-        pressures=freeze(np.zeros((3, 0))), gravity=None, load_frame=freeze(np.zeros(0), np.int64), load_points=nothing, load_forces=nothing, contacts=(),
+        control="displacement", time_s=freeze(np.arange(2.0)), sweep=("s",) * 2, free=freeze(np.ones(2), bool), commanded=freeze(inputs), initial=freeze(np.zeros(4)),
+        pressures=freeze(np.zeros((2, 0))), gravity=None, load_frame=freeze(np.zeros(0), np.int64), load_points=nothing, load_forces=nothing, contacts=(),
     )  # fmt: skip
     recording = make_recording(time_s=plan.time_s, cable_names=NAMES, inputs=inputs, actuation="displacement")
 
     def markers(declared: Robot) -> np.ndarray:
         walk = Walk(declared, drive_of(declared, recording))
-        return np.array([seen for _, _, seen, _ in walk_along(walk, range(3), marker_positions)])
+        return np.array([seen for _, _, seen, _ in walk_along(walk, range(2), marker_positions)])
 
-    true = np.array([rubbing.markers.positions(f.state.positions) for f in walk_truth(rubbing, plan, substeps=6)])
+    true = np.array([rubbing.markers.positions(f.state.positions) for f in walk_truth(rubbing, plan, substeps=2)])
     expected = markers(rubbing)
     matters = np.abs(expected - markers(arm((5, 2, 2)))).max()
     np.testing.assert_allclose(true, expected, atol=5e-2 * matters)
