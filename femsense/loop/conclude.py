@@ -136,7 +136,7 @@ def _worth_handing_back(data: Data, search: Search, promoted: list[str], names: 
     on, what would make the error on held-out data larger than it was, or goes to the edge of what is plausible."""
     while names:
         kept, back = _with_modulus(data, search, names, sizes_still=True)
-        if back is not None and back.held_rms <= NOT_WORSE * search.final.held_rms and _may_be_handed_back(data, search, back):
+        if back is not None and not _misses(data, search, back) and _may_be_handed_back(data, search, back):
             return kept, back
         kept, back = _with_modulus(data, search, names, sizes_still=False)
         idle = [n for n in promoted if n in names and back is not None and not moved_nuisance(data, back, n)]
@@ -149,6 +149,12 @@ def _worth_handing_back(data: Data, search: Search, promoted: list[str], names: 
             return kept, back
         names = names[:-1]
     return [], search.before
+
+
+def _misses(data: Data, search: Search, back: Stage) -> bool:
+    """Return whether held-out data miss what the final model moves and this one does not."""
+    more = held_chi2(data, back, search.noise) - held_chi2(data, search.final, search.noise)
+    return back.held_rms > NOT_WORSE * search.final.held_rms or more > EVIDENCE
 
 
 def _may_be_handed_back(data: Data, search: Search, back: Stage) -> bool:
