@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -243,6 +244,18 @@ def test_a_point_outside_follows_the_first_order_field_of_its_element(quadratic:
     slope = barycentric(mesh, at.element, point) - foot
     gradient = np.einsum("pkl,pl,pkc->pc", shape_slopes(foot, quadratic=quadratic), slope, x[mesh.tets[at.element]])
     np.testing.assert_allclose(at.positions(x), tie.positions(x) + gradient, atol=1e-14)
+
+
+def test_of_elements_that_are_as_near_rounding_does_not_choose() -> None:
+    """A body that grows by nothing to speak of carries a load beside it with the same element: derivatives by its size hold on to that."""
+    length, half = 0.1, 0.01
+    mesh = block_mesh((7, 2, 2), (length, 2 * half, 2 * half), start=(0.0, -half, -half))
+    beside = np.array(
+        [[0.75 * length, 0.0, 1.03 * half], [3 / 7 * length, 0.0, 1.03 * half], [3 / 7 * length, -1.03 * half, 1.03 * half]]
+    )
+    scales = 1.0 + 1e-7 * np.arange(-20, 21)
+    carriers = {tuple(embed_points(replace(mesh, nodes=mesh.nodes * s), beside).element) for s in scales}
+    assert len(carriers) == 1
 
 
 def test_distance_outside_is_that_to_the_box() -> None:
