@@ -200,7 +200,7 @@ SABOTAGES = (
     S("loop/conclude.py", "if mesh and not data.robot.body.mesh.is_quadratic and", "if mesh and", "test_loop_screen.py::test_effects_that_are_named_on_linear_elements_may_stand_for_these"),
     S("rig/truth.py", "motors = passes[-1] if ahead is None else ahead", "motors = self._motors(load)", "test_rig_truth.py::test_held_cables_that_rub_come_to_rest_when_they_are_let_out"),
     S("loop/conclude.py", "> NOT_WORSE * search.final.held_rms or more > EVIDENCE", "> NOT_WORSE * search.final.held_rms", "test_loop_screen.py::test_what_is_handed_back_keeps_the_size_that_it_has_beside_all_nuisances_unless_held_out_data_miss_those"),
-    S("fem/mesh.py", "+ ALIKE * np.ptp(corners, axis=(0, 1)).max()", "", "test_fem_mesh.py::test_of_elements_that_are_as_near_rounding_does_not_choose"),
+    S("fem/mesh.py", "+ ALIKE_CENTRES * size", "", "test_fem_mesh.py::test_of_elements_that_are_as_near_rounding_does_not_choose"),
     S("loop/grow.py", "if gravity and _has_strayed(stage) and not _explains(best):", "if False:", "test_loop_exchange.py::test_where_calibration_has_strayed_gravity_starts_from_what_is_declared_too"),
     S("loop/improve.py", "for most in (steps, 2, 1):", "for most in (steps,):", "test_loop_parts.py::test_calibration_goes_as_far_as_held_out_states_come_to_rest"),
     S("loop/conclude.py", "or (found and not effects)", "or False", "test_loop.py::test_what_has_evidence_and_makes_the_held_out_error_larger_is_said_and_not_handed_back"),

@@ -356,8 +356,9 @@ def embed_points(mesh: TetMesh, points: FloatArray, *, outside_rule: str = "near
 ROUNDING = 1e-12
 """Weights below this are rounding. Their products, in the stiffness of cables, would be numbers so small that processors take many times as long
 for them: factors in single precision took twice the time."""
-ALIKE = 1e-9
-"""Elements whose distances to a point differ by less, in units of the mesh, are as near: the first of them carries it, so that rounding does not choose."""
+ALIKE, ALIKE_CENTRES = 1e-9, 1e-4
+"""Elements whose distances to a point differ by less, in units of the mesh, are as near, and so are centres of elements: the first of them carries
+it, so that neither rounding nor a step of a derivative by the body's size chooses."""
 AT_ONCE = 4096
 """Points that are looked for together."""
 
@@ -386,13 +387,16 @@ def _find_holders(mesh: TetMesh, tree: cKDTree, points: FloatArray, reach: float
 def _carriers_of_outsiders(
     corners: FloatArray, tree: cKDTree, points: FloatArray, radius: FloatArray
 ) -> tuple[IntArray, FloatArray]:
-    """Return the element nearest to each point outside of the mesh, the first of those that are as near, and the distance to it [m]."""
+    """Return the element nearest to each point outside of the mesh, of those that are as near the one with the nearest centre, and the distance to it [m]."""
     point, candidate, start = _pairs(tree.query_ball_point(points, radius, return_sorted=False))
     nearest = closest_in_tet(corners[candidate], points[point])
     distance = np.linalg.norm(np.einsum("pi,pic->pc", nearest, corners[candidate]) - points[point], axis=1)
-    best, _ = _first_largest(-distance, start)
-    alike = distance <= np.repeat(-best, np.diff(start)) + ALIKE * np.ptp(corners, axis=(0, 1)).max()
-    return np.minimum.reduceat(np.where(alike, candidate, len(corners)), start[:-1]), -best
+    size = np.ptp(corners, axis=(0, 1)).max()
+    best = np.minimum.reduceat(distance, start[:-1])
+    alike = distance <= np.repeat(best, np.diff(start)) + ALIKE * size
+    off = np.where(alike, np.linalg.norm(corners[candidate].mean(axis=1) - points[point], axis=1), np.inf)
+    alike = off <= np.repeat(np.minimum.reduceat(off, start[:-1]), np.diff(start)) + ALIKE_CENTRES * size
+    return np.minimum.reduceat(np.where(alike, candidate, len(corners)), start[:-1]), best
 
 
 def _pairs(found: Any) -> tuple[IntArray, IntArray, IntArray]:
