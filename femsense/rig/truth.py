@@ -23,7 +23,7 @@ from femsense.rig.script import Plan, TruthTable
 SETTLED = 1e-8
 """Tensions along the cables and contact forces rest when a pass moves them by less than this [N]."""
 SETTLED_HELD = 1e-6
-"""The same where cables are held: their lengths close to a billionth of a metre, their tensions to what that is worth [N]."""
+"""The same where cables are held: their tensions come from the balance of the body, to its tolerance [N]."""
 PASSES = 200
 SLOW = 0.9
 """Share of the pass before from which on passes of a held cable are summed beforehand."""
