@@ -184,9 +184,8 @@ def test_effects_that_are_named_on_linear_elements_may_stand_for_these(
     data, stage = staged(robot_on_mesh(robot, to_linear(robot.body.mesh)) if linear else robot, 1.0)
     settled = ((find_effect("hyperelastic"), {}),) if named else ()
     back = replace(stage, fit=replace(stage.fit, hypothesis=replace(stage.fit.hypothesis, settled=settled)))
-    search = Search(stage, [("", stage)], back, NOISE, 10.0, [], [], [], None)
     monkeypatch.setattr(conclude, "_mesh_error", lambda data: 2e-3)
-    assert ("try discretisation" in conclude._by_mesh(data, search, back)) == (linear and named)
+    assert ("try discretisation" in conclude._on_linear(data, back)) == (linear and named)
 
 
 def test_a_modulus_that_is_as_declared_once_zeros_stay_is_not_handed_back(monkeypatch: pytest.MonkeyPatch) -> None:

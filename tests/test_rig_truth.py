@@ -61,9 +61,8 @@ def test_held_cables_agree_with_the_estimator(robot: Robot) -> None:
     np.testing.assert_allclose(_true_markers(robot, held), _estimators_markers(robot, held), atol=1e-9)
 
 
-def test_held_cables_that_rub_come_to_rest_when_they_are_let_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Tensions at their motors then creep, pass by pass, as long as their bends hold."""
-    monkeypatch.setattr(truth, "PASSES", 40)
+def let_out() -> tuple[Robot, Plan, np.ndarray]:
+    """Return an arm whose cables rub, and how they are pulled and let out [m]."""
     rubbing = apply_effects(arm((5, 2, 2)), [{"name": "cable_friction", "coefficient": 0.5}])
     inputs = np.array([[4.0, 0.0, 3.0, 0.0], [3.6, 0.0, 2.8, 0.0]]) * 1e-3
     nothing = freeze(np.zeros((0, 3)))
@@ -71,6 +70,23 @@ def test_held_cables_that_rub_come_to_rest_when_they_are_let_out(monkeypatch: py
         control="displacement", time_s=freeze(np.arange(2.0)), sweep=("s",) * 2, free=freeze(np.ones(2), bool), commanded=freeze(inputs), initial=freeze(np.zeros(4)),
         pressures=freeze(np.zeros((2, 0))), gravity=None, load_frame=freeze(np.zeros(0), np.int64), load_points=nothing, load_forces=nothing, contacts=(),
     )  # fmt: skip
+    return rubbing, plan, inputs
+
+
+def test_bends_remember_the_tensions_at_which_a_held_cable_came_to_rest() -> None:
+    rubbing, plan, inputs = let_out()
+    walker = truth._Walker(rubbing, plan)
+    for k, load in enumerate(walker.frame_loads(inputs)):
+        walker.go(load, k)
+        pulled = list(walker.state.tension.values())
+        np.testing.assert_allclose([grip.inner[0] for grip in walker.grips], pulled, atol=1e-9)
+        assert max(pulled) > 0.5
+
+
+def test_held_cables_that_rub_come_to_rest_when_they_are_let_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tensions at their motors then creep, pass by pass, as long as their bends hold."""
+    monkeypatch.setattr(truth, "PASSES", 40)
+    rubbing, plan, inputs = let_out()
     recording = make_recording(time_s=plan.time_s, cable_names=NAMES, inputs=inputs, actuation="displacement")
 
     def markers(declared: Robot) -> np.ndarray:

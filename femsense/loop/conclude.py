@@ -100,6 +100,7 @@ def conclude(data: Data, search: Search, rng: np.random.Generator) -> LoopResult
         verdict=verdict,
         sentence=_sentence(verdict, effects, found, before, back, noise, _mesh_error(data))
         + _by_mesh(data, search, back)
+        + _on_linear(data, back)
         + _evidence_for(data, found),
         noise_m=noise.total,
         before=_errors(data, before, rng),
@@ -527,15 +528,19 @@ def _sentence(
 
 
 def _by_mesh(data: Data, search: Search, back: Stage) -> str:
-    """Return a sentence on what the held-out error is beyond the mesh's own, where that is what makes it larger, or on what effects that are
-    named on a linear mesh may stand for; nothing where there is neither."""
-    mesh = _mesh_error(data)
-    if mesh and not data.robot.body.mesh.is_quadratic and _has_effects(back.fit.hypothesis.names):
-        return f" Linear elements cost {1e3 * mesh:.2f} mm themselves, which other effects may stand for: try discretisation too."
+    """Return a sentence on what the held-out error is beyond the mesh's own, where that is what makes it larger; nothing where it is not larger."""
     if back.held_rms <= NOT_WORSE * search.before.held_rms or not mesh_errors(data):
         return ""
     before, after = _held_beyond_mesh(data, search, back)
     return f" Less the likeliest share of what the mesh itself costs, that is {1e3 * before:.2f} mm before, {1e3 * after:.2f} mm after."
+
+
+def _on_linear(data: Data, back: Stage) -> str:
+    """Return a sentence on what effects that are named on a linear mesh may stand for; nothing elsewhere, or where that is an effect itself."""
+    mesh = _mesh_error(data)
+    if not mesh or data.robot.body.mesh.is_quadratic or not _has_effects(back.fit.hypothesis.names):
+        return ""
+    return f" Linear elements cost {1e3 * mesh:.2f} mm themselves, which other effects may stand for: try discretisation too."
 
 
 def _not_handed_back(search: Search, names: list[str]) -> list[str]:

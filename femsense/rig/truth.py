@@ -258,11 +258,12 @@ class _Walker:
             ahead = _ahead(passes, far)
             motors = passes[-1] if ahead is None else ahead
             passes, far = (passes, far) if ahead is None else ([], NEARER * far)
-            along, grips = self._along(motors)
+            along, _ = self._along(motors)
             forces = load.forces + self._contact_forces(load)
             self.state = self._solve(body, load, motors, along, forces, frame)
             if self._settled(load, along, forces):
-                self.grips = grips
+                # of where it came to rest: while bends slide, any tension at the motor gives the same shares
+                self.grips = self._along(self._motors(load))[1]
                 return
             passes.append(self._motors(load))
         raise DataError(f"the truth of frame {frame} does not settle: friction and contact keep moving; use more substeps")
