@@ -6,6 +6,7 @@ same inputs and loads share one solve.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -226,7 +227,7 @@ def walk_along(
     room = _room(len(unique))
     for k, factor in answers.write():
         lent = factor.plain if isinstance(factor, Refined) else factor
-        if starts is not None and lent.bytes < room:
+        if starts is not None and lent.bytes < _most_lent(starts[k], room):
             starts[k] = replace(starts[k], factor=lent)
     for k in wanted:
         yield k, bases[alike[k]], seen[alike[k]], others[k]
@@ -249,6 +250,11 @@ def _alike(walk: Walk, frames: list[int], past: bool) -> dict[int, int]:
 def _room(count: int) -> float:
     """Return how much memory a factor may take where so many are kept [bytes]."""
     return min(FACTOR_MEMORY, MEMORY_SHARE * available_memory()) / max(count, 1)
+
+
+def _most_lent(state: Equilibrium, room: float) -> float:
+    """Return how many bytes a factor may take to be kept with a state: no more than the one it takes the place of, which is near enough."""
+    return room if state.factor is None else min(room, state.factor.bytes + 1)
 
 
 def _base_states(
@@ -393,8 +399,8 @@ Job = tuple[int, int, list[int]]
 class _Answers:
     """The tangent of a base state, and what was solved with it."""
 
-    def __init__(self, tangent: Tangent, times: int) -> None:
-        self.tangent, self.times = tangent, times
+    def __init__(self, make: Callable[[], Tangent], times: int) -> None:
+        self.make, self.times = make, times
         """times: how often it is asked."""
         self.own: dict[tuple[int, int], FloatArray | None] = {}
         """(variant, frame) → its answer to the forces of the variant but for tensions [m], (n, 3); None: there are none."""
@@ -403,8 +409,23 @@ class _Answers:
 
     @property
     def bytes(self) -> int:
+        """What the answers take, without the factor."""
         every = [*self.own.values(), *self.by_segment.values()]
-        return self.tangent.factor.bytes + sum(a.nbytes for a in every if a is not None)
+        return sum(a.nbytes for a in every if a is not None)
+
+    @cached_property
+    def tangent(self) -> Tangent:
+        return self.make()
+
+    @cached_property
+    def by_held(self) -> FloatArray:
+        """Held cable → the answer to a shortening by one metre [1], (h, n, 3)."""
+        return self.tangent.respond_to_held()
+
+    def keep(self, keys: Iterable[tuple[int, int]]) -> None:
+        """Let go of the answers of other variants, and of the factor, which is made again where it is needed after all."""
+        self.__dict__.pop("tangent", None)
+        self.own = {key: self.own[key] for key in keys if key in self.own}
 
     def moves(
         self,
@@ -490,7 +511,9 @@ class _Variants:
                 bends.update(found)
                 yield k, factor
             self._rub(bends)
-        yield from each(self._written, self._groups(self.others))
+            deque(each(self._write_rubbing, self._groups(self.others)), maxlen=0)
+        else:
+            yield from each(self._written, self._groups(self.others))
 
     def _write_alone(self, i: int) -> None:
         """Write what is observed of a variant that is solved for itself."""
@@ -525,10 +548,8 @@ class _Variants:
 
     def _answers(self, k: int) -> _Answers:
         few = len(self.plain) + len(self.rubbing) <= FEW_COLUMNS
-        known = self.kept.pop(k, None)
-        return known or _Answers(
-            tangent_at(self.walk.robot.body, self.bases[k], refined if few else factorize), 2 if self.rubbing else 1
-        )
+        solver = refined if few else factorize
+        return _Answers(lambda: tangent_at(self.walk.robot.body, self.bases[k], solver), 2 if self.rubbing else 1)
 
     def _jobs(self, group: list[int], which: Sequence[int]) -> list[Job]:
         """Return what is to be computed of some variants in frames with one base state."""
@@ -540,23 +561,37 @@ class _Variants:
         return list(jobs.values())
 
     def _bent(self, group: list[int]) -> tuple[int, Factorization, dict[tuple[int, int], list[FloatArray]]]:
-        """Return the bends of the variants that rub, as the first response leaves them; keep what was solved where all fits into memory."""
-        first, answers = self.alike[group[0]], self._answers(self.alike[group[0]])
-        jobs = self._jobs(group, self.rubbing)
-        moved = zip(jobs, self._respond(group[0], jobs, answers))
+        """Return the bends of the variants that rub, as the first response leaves them, and keep what the second one takes, where that fits into
+        memory; write what is observed of the other variants."""
+        first = self.alike[group[0]]
+        answers, jobs = self._answers(first), self._jobs(group, self.rubbing)
+        factor, moved = answers.tangent.factor, list(zip(jobs, self._respond(group[0], jobs, answers)))
+        self._write(group, self.plain, answers)
+        answers.keep(job[:2] for job in jobs)
         if answers.bytes < self.room:
             self.kept[first] = answers
-        return first, answers.tangent.factor, {(i, k): self._bends(i, x) for (i, _, frames), x in moved for k in frames}
+        return first, factor, {(i, k): self._bends(i, x) for (i, _, frames), x in moved for k in frames}
+
+    def _write_rubbing(self, group: list[int]) -> None:
+        """Write what is observed of the variants that rub in frames with one base state."""
+        first = self.alike[group[0]]
+        self._write(group, self.rubbing, self.kept.pop(first) if first in self.kept else self._answers(first))
 
     def _written(self, group: list[int]) -> tuple[int, Factorization]:
-        """Write what is observed of all variants in frames with one base state."""
-        first, answers = self.alike[group[0]], self._answers(self.alike[group[0]])
-        jobs = self._jobs(group, [*self.plain, *self.rubbing])
-        for (i, _, frames), x in zip(jobs, self._respond(group[0], jobs, answers)):
-            seen = self.observe(self.variants[i].robot, replace(self.bases[first], positions=x))
-            for frame in frames:
-                self.others[frame][i] = seen
+        """Write what is observed of the variants, none of which rubs, in frames with one base state."""
+        first = self.alike[group[0]]
+        answers = self._answers(first)
+        self._write(group, self.plain, answers)
         return first, answers.tangent.factor
+
+    def _write(self, group: list[int], which: Sequence[int], answers: _Answers) -> None:
+        """Write what is observed of some variants in frames with one base state, as far as that is asked."""
+        first, frames = self.alike[group[0]], [k for k in group if k in self.others]
+        jobs = self._jobs(frames, which)
+        for (i, _, alike), x in zip(jobs, self._respond(group[0], jobs, answers)) if jobs else ():
+            seen = self.observe(self.variants[i].robot, replace(self.bases[first], positions=x))
+            for frame in alike:
+                self.others[frame][i] = seen
 
     def _respond(self, frame: int, jobs: list[Job], answers: _Answers) -> list[FloatArray]:
         """Return the positions of variants [m], each (n, 3): to first order in what they add to the forces of the base state.
@@ -579,7 +614,7 @@ class _Variants:
         moves = answers.moves(body, base.positions, [job[:2] for job in jobs], forces, np.array(rows))
         if base.held.any():  # cables: pressures are never held here
             held = base.held[: len(body.cables)]
-            moves += np.tensordot(np.array(pulls)[:, held], answers.tangent.respond_to_held(), axes=1)
+            moves += np.tensordot(np.array(pulls)[:, held], answers.by_held, axes=1)
         return [start + move for start, move in zip(starts, moves)]
 
 

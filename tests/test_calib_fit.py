@@ -224,6 +224,17 @@ def test_steps_that_shrink_foretell_the_end(monkeypatch: pytest.MonkeyPatch) -> 
     assert results[1].own and not results[0].own
 
 
+def test_where_the_end_is_foretold_a_step_that_was_missed_asks_for_no_jacobian(monkeypatch: pytest.MonkeyPatch) -> None:
+    results, jacobians = [], []
+    for least in (fit_module.LEAST_SHRINKING, np.inf):
+        monkeypatch.setattr(fit_module, "LEAST_SHRINKING", least)
+        evaluate, asked = counted(1.0)
+        results.append(gauss_newton(evaluate, np.array([0.9, 1.0, 0.4]), still=1e-2))  # every step is missed
+        jacobians.append(sum(asked))
+    np.testing.assert_allclose(results[0].theta, results[1].theta, atol=1e-4)
+    assert jacobians[0] < jacobians[1] and not results[0].own
+
+
 def test_what_is_known_at_the_start_is_not_evaluated_again() -> None:
     evaluate, asked = counted(1.0)
     start = np.array([0.6, 0.2, 0.1])

@@ -64,15 +64,15 @@ def test_an_effect_whose_states_do_not_come_to_rest_again_is_taken_back(monkeypa
     inputs, labels = sweeps()
     recording, _ = record(inputs, effects=[{"name": "cable_friction", "coefficient": 0.25}], labels=labels, truth=arm((4, 1, 1)))
     module = sys.modules["femsense.loop.improve"]
-    screened, asked = module.fields_of, list[tuple[str, ...]]()
+    again, asked = module._again, list[tuple[str, ...]]()
 
-    def folds(data, stage, names):
+    def folds(data, stage, noise, **given):
         asked.append(stage.fit.hypothesis.names)
         if "cable_friction" in asked[-1]:
             raise DataError("no equilibrium in frame 3")
-        return screened(data, stage, names)
+        return again(data, stage, noise, **given)
 
-    monkeypatch.setattr(module, "fields_of", folds)
+    monkeypatch.setattr(module, "_again", folds)
     loop = improve(arm((4, 1, 1)), [recording], effects=["cable_friction"])
     assert "cable_friction" in asked[-1] and "cable_friction" not in {e["name"] for e in loop.effects}
     refits = [q for c in loop.candidates if c["name"] == "cable_friction" for q in c["refits"]]

@@ -11,17 +11,19 @@ import pytest
 from arm import arm, record, sweeps
 
 from femsense.calib.forward import Hypothesis
+from femsense.effects import find_effect
 from femsense.loop import grow
 from femsense.loop.data import Data, prepare
 from femsense.loop.exchange import exchanged
 from femsense.loop.grow import Refit, _closer, evidence, judged, polished, refit, shortlist, without_last
 from femsense.loop.joint import Prior
-from femsense.loop.noise import Noise
-from femsense.loop.screen import Candidate
+from femsense.loop.noise import Noise, whiten
+from femsense.loop.screen import Candidate, linear_gain
 from femsense.loop.spread import spreads
 from femsense.loop.stages import Stage, fields_of, make_stage, own_of, screen_stage, with_nuisance
 
-beside_a_tie = sys.modules["femsense.loop.improve"]._beside_a_tie
+improving = sys.modules["femsense.loop.improve"]
+beside_a_tie = improving._beside_a_tie
 NOISE = Noise({"white": 1e-4}, "")
 COUNT = 300.0
 HIDDEN = [
@@ -119,7 +121,7 @@ def test_weight_that_nobody_declared_is_refitted_however_far_behind_it_looks(mon
     hypothesis, prior = with_nuisance(data)
     base = make_stage(data, hypothesis, prior, NOISE, np.zeros(len(prior.mean)))
     table = screen_stage(data, base.fit, NOISE, fields_of(data, base, ["gravity", "payload"]), COUNT)
-    looks = [replace(c, score=3.0 if c.effect.name == "gravity" else c.score) for c in table]
+    looks = [replace(c, score=6.0 if c.effect.name == "gravity" else c.score) for c in table]
     table = sorted(looks, key=lambda c: -c.score)
     winner, _, records = grow.grow(data, base, table, NOISE, ["gravity", "payload"], COUNT, lambda text: None)
     assert {r["name"] for r in records} == {"gravity", "payload"}
@@ -141,7 +143,7 @@ def test_until_an_effect_explains_the_data_rivals_are_refitted_to_the_end(monkey
 
     data, base = started()
     table = screen_stage(data, base.fit, NOISE, fields_of(data, base, ["payload", "cable_gain"]), COUNT)
-    looks = [replace(c, score=3.0 if c.effect.name == "cable_gain" else 1e3 + c.score) for c in table]
+    looks = [replace(c, score=6.0 if c.effect.name == "cable_gain" else 1e3 + c.score) for c in table]
     monkeypatch.setattr(grow, "refit", seen)
     monkeypatch.setattr(grow, "judged", lenient)
     monkeypatch.setattr(grow, "_polish", lambda data, stage, winner, *_: winner.stage)
@@ -209,11 +211,73 @@ def test_what_goes_with_an_effect_that_was_as_good_is_found_beside_it():
     table = screen_stage(data, base.fit, NOISE, fields_of(data, base, ["cable_gain"]), COUNT)
     candidate = (shortlist(table, first=True) or table)[0]
     tie = Refit(candidate, refit(data, base, candidate, NOISE), 0.0, 0.0, {})
-    instead, both, tried = beside_a_tie(data, wrong, tie, NOISE, ["payload"], COUNT, lambda text: None)
+    instead, both, tried = beside_a_tie(data, wrong, tie, None, NOISE, ["payload"], COUNT, lambda text: None)
     assert both is not None and both.candidate.effect.name == "payload" and tried[-1]["verdict"] == "named"
     assert instead.fit.hypothesis.names[-1] == "cable_gain"
     assert both.stage.fit.hypothesis.names[-2:] == ("cable_gain", "payload")
-    assert beside_a_tie(data, both.stage, tie, NOISE, ["payload"], COUNT, lambda text: None)[1] is None
+    assert beside_a_tie(data, both.stage, tie, None, NOISE, ["payload"], COUNT, lambda text: None)[1] is None
+
+
+def test_what_fields_of_the_model_before_promise_is_what_its_own_do():
+    data, base = started()
+    names = ["cable_gain", "payload", "gravity"]
+    before = fields_of(data, base, names)
+    stage, _ = added(data, base, "cable_gain", 1)
+    hints = before.beside(stage.fit)
+    assert hints is not None and {e.name for e, _, _ in hints.todo} == {"payload", "gravity"}
+    tables = [screen_stage(data, stage.fit, NOISE, f, COUNT) for f in (hints, fields_of(data, stage, names))]
+    best = [{n: max(c.score for c in table if c.effect.name == n) for n in ("payload", "gravity")} for table in tables]
+    assert best[1]["payload"] > 100.0
+    assert all(best[0][n] == pytest.approx(best[1][n], rel=0.25) for n in best[0])
+    rival, _ = added(data, base, "payload", 1)
+    assert fields_of(data, stage, names).beside(rival.fit) is None  # a gain may be missing again
+    other = replace(stage.fit, hypothesis=replace(stage.fit.hypothesis, settled=((find_effect("hyperelastic"), {}),)))
+    assert before.beside(other) is None
+
+
+@pytest.mark.parametrize("promises", [True, False])
+def test_fields_are_computed_anew_where_those_of_the_model_before_promise_something(
+    monkeypatch: pytest.MonkeyPatch, promises: bool
+):
+    data, base = started()
+    stage, _ = added(data, base, "cable_gain" if promises else "payload", 1)
+    hints = fields_of(data, base, ["payload", "poisson"]).beside(stage.fit)
+    asked = list[str]()
+    monkeypatch.setattr(improving, "fields_of", lambda *given: asked.append("anew") or fields_of(*given))
+    if not promises:
+        monkeypatch.setattr(grow, "PROMISING", 1e3)
+    fields, table = improving._scored(data, stage, hints, NOISE, ["payload", "poisson"], COUNT)
+    assert asked == ["anew"] * promises and (fields is hints) != promises
+    assert {c.effect.name for c in table} <= {"payload", "poisson"}
+
+
+def test_a_richer_form_is_tried_only_where_fields_promise_something(monkeypatch: pytest.MonkeyPatch):
+    data, base = started()
+    fields = fields_of(data, base, ["cable_gain"])
+    table = screen_stage(data, base.fit, NOISE, fields, COUNT)
+    forms = sorted(grow._forms(table, "cable_gain"), key=lambda c: len(c.parameters))
+    one, all_of_them = forms[0], forms[-1]
+    made = refit(data, base, one, NOISE)
+    winner = Refit(one, made, evidence(base.fit, made.fit) - one.cost, 0.0, {})
+    J, r = np.asarray(made.fit.fit.jacobian), made.fit.fit.residual
+    problem = grow.problem_of(data, made.fit, NOISE)
+    promised = linear_gain(made.fit, problem, all_of_them.raw, all_of_them.seats)
+    whole = np.vstack(
+        [
+            whiten(problem.factors[0], all_of_them.raw[0]),
+            np.zeros((len(r) - all_of_them.raw[0][:, :, 0].size, len(all_of_them.parameters))),
+        ]
+    )
+    best = np.linalg.lstsq(np.column_stack([J, whole]), -r, rcond=1e-10)[0]
+    alone = np.linalg.lstsq(J, -r, rcond=1e-10)[0]
+    expected = np.sum((r + J @ alone) ** 2) - np.sum((r + np.column_stack([J, whole]) @ best) ** 2)
+    assert promised == pytest.approx(expected, rel=1e-3, abs=1e-6)
+    tried = list[bool]()
+    monkeypatch.setattr(grow, "make_stage", lambda *given, **more: tried.append(True) or make_stage(*given, **more))
+    for share in (0.0, 1e9):
+        monkeypatch.setattr(grow, "HINTED", share)
+        grow._richer(data, base, winner, all_of_them, NOISE)
+    assert tried == [True]
 
 
 def test_a_place_is_improved_before_a_refit_is_turned_down_for_what_it_predicts(monkeypatch: pytest.MonkeyPatch):

@@ -94,6 +94,26 @@ def test_a_step_that_is_not_taken_leaves_no_state_behind() -> None:
     np.testing.assert_allclose(problem.evaluate(theta, True)[0], at, atol=1e-3)
 
 
+def test_a_step_that_goes_too_far_is_refused_and_not_solved_by_all_means(monkeypatch: pytest.MonkeyPatch) -> None:
+    data, stage = staged(arm((4, 2, 2)))
+    problem = JointProblem(stage.fit.hypothesis, stage.fit.prior, data.train, [NOISE.whitener(data.train[0].groups, None)], 1.0)
+    problem.near = stage.fit.jets
+    rough_only, plain = list[bool](), JointProblem._jets
+
+    def too_far(self: JointProblem, theta: np.ndarray, derivative: bool, rough: bool) -> object:
+        rough_only.append(rough)
+        if rough:
+            raise DataError("no equilibrium")
+        return plain(self, theta, derivative, rough)
+
+    monkeypatch.setattr(JointProblem, "_jets", too_far)
+    theta = np.array(stage.fit.fit.theta)
+    problem.evaluate(theta, False)  # the start is solved by all means
+    with pytest.raises(DataError):
+        problem.evaluate(theta + 0.01, False)
+    assert rough_only == [True, False, True]
+
+
 @pytest.mark.parametrize("clamp", ["base_compliance", None])
 def test_a_fit_begins_at_the_states_of_the_model_before_unless_their_clamp_is_another(clamp: str | None) -> None:
     data, stage = staged(arm((4, 2, 2)))

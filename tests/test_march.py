@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -14,7 +15,7 @@ from helpers import block_mesh
 from femsense import march
 from femsense.effects import apply_effects
 from femsense.errors import DataError
-from femsense.fem.equilibrium import solve_equilibrium
+from femsense.fem.equilibrium import Equilibrium, solve_equilibrium
 from femsense.fem.mesh import embed_points
 from femsense.march import Walk, drive_of, has_history, marker_positions, solve_frame, walk_along
 from femsense.model import Observation, Robot, plain_actuation
@@ -41,6 +42,12 @@ def recording(inputs: Sequence[Sequence[float]], **parts: Any) -> Recording:
 def walked(r: Robot, rec: Recording, frames: Sequence[int] | None = None, **options: Any) -> dict[int, np.ndarray]:
     frames = range(rec.frame_count) if frames is None else frames
     return {k: seen for k, _, seen, _ in walk_along(Walk(r, drive_of(r, rec)), frames, marker_positions, **options)}
+
+
+def walk_states(r: Robot, rec: Recording) -> list[Equilibrium]:
+    starts: dict[int, Equilibrium] = {}
+    deque(walk_along(Walk(r, drive_of(r, rec)), range(rec.frame_count), marker_positions, starts=starts), maxlen=0)
+    return list(starts.values())
 
 
 # What truly drives
@@ -257,6 +264,31 @@ def test_a_variant_in_observation_alone_costs_no_solve(monkeypatch: pytest.Monke
     drive = drive_of(base, rec)
     _, _, seen, others = next(iter(walk_along(Walk(base, drive), [0], marker_positions, [Walk(moved, drive)])))
     assert calls == [0] and 5e-4 < np.abs(others[0] - seen).max() < 2e-3
+
+
+def test_variants_that_rub_are_answered_twice_with_one_factor_a_state(monkeypatch: pytest.MonkeyPatch) -> None:
+    base, rec = robot(), recording([[0.5, 0.0], [1.0, 0.2], [0.5, 0.0], [1.0, 0.2]])
+    rubs = [apply_effects(base, [{"name": "cable_friction", "coefficient": c}]) for c in (0.1, 0.2)]
+    others = [apply_effects(base, [{"name": "stiffness", "scale": scale}]) for scale in (0.9, 1.1)]
+    made, plain = list[Any](), march.tangent_at
+    monkeypatch.setattr(march, "tangent_at", lambda *given: made.append(given) or plain(*given))
+    walks = [Walk(r, drive_of(r, rec)) for r in (*rubs, *others)]
+    seen = list(walk_along(Walk(base, drive_of(base, rec)), range(4), marker_positions, walks))
+    assert len(made) == 2  # frames of two states
+    monkeypatch.setattr(march, "FACTOR_MEMORY", 0.0)
+    for (_, _, _, kept), (_, _, _, again) in zip(
+        seen, walk_along(Walk(base, drive_of(base, rec)), range(4), marker_positions, walks)
+    ):
+        np.testing.assert_allclose(kept, again, atol=1e-12)
+    assert len(made) == 6
+
+
+def test_a_factor_takes_the_place_of_no_smaller_one() -> None:
+    state = walk_states(robot(), recording([[0.5, 0.0]]))[0]
+    bare = replace(state, factor=None)
+    size = state.factor.bytes
+    assert march._most_lent(bare, 1e9) == 1e9 and size < march._most_lent(state, 1e9) < 2 * size
+    assert march._most_lent(state, 0.0) == 0.0
 
 
 def test_a_variant_in_gravity_is_solved() -> None:

@@ -125,7 +125,7 @@ def gauss_newton(
         if costs[-1] > worth and (hopeless or (not own and (small or steps >= max_iterations))):
             status = GIVEN_UP
             break
-        if not own and small and error == 1.0 and next_length <= still:
+        if not own and error == 1.0 and next_length <= still:
             status = "converged"
             break
         if not own and (small or steps >= max_iterations):
@@ -155,7 +155,7 @@ def gauss_newton(
         damping = damping / 10.0 if damping > 1e-6 else 0.0
         missed = new_residual - residual - change
         theta, residual, own = theta + step, new_residual, False
-        if np.linalg.norm(missed) > serves * np.linalg.norm(change):
+        if np.linalg.norm(missed) > serves * np.linalg.norm(change) and not (error == 1.0 and next_length <= still):
             residual, jacobian, own = *_both(evaluate, theta), True
         else:
             jacobian = _as_seen(jacobian, step, near.scale, missed)

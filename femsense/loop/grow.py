@@ -19,7 +19,7 @@ from femsense.loop.joint import JointFit, Prior, rms_of
 from femsense.loop.mesh_error import mesh_errors
 from femsense.loop.noise import Noise
 from femsense.loop.predict import sweeps_predicted
-from femsense.loop.screen import NUISANCE, Candidate, effect_fields, penalty, screen
+from femsense.loop.screen import NUISANCE, Candidate, effect_fields, linear_gain, penalty, screen
 from femsense.loop.stages import (
     QUADRATIC,
     Stage,
@@ -40,8 +40,10 @@ REFITTABLE = 0.04
 """A candidate of which calibration leaves less than this is not refitted."""
 EVIDENCE = 10.0
 """dBIC that a named effect needs."""
-PROMISING = 2.5
-"""Linear dBIC that a candidate needs to be refitted: what is so small is nearly linear."""
+PROMISING = 5.0
+"""Linear dBIC that a candidate needs to be refitted: what is small is nearly linear, so that a refit finds about as much."""
+HINTED = 0.5
+"""A richer form is tried where fields of the model without the effect promise this share of what it needs."""
 ENOUGH_SPREAD = 0.5
 """Standard errors by which the prediction of left-out sweeps must get better."""
 PREDICTS = 0.25
@@ -204,7 +206,10 @@ def _richer(data: Data, stage: Stage, winner: Refit, form: Candidate, noise: Noi
     hypothesis, prior = with_term(stage.fit, form.effect, form.seed, form.parameters)
     try:
         coordinates = np.concatenate([winner.stage.fit.coordinates[:split], own])
-        worth = _within(winner.stage.fit, (form.cost - winner.candidate.cost + EVIDENCE - FORGONE[0]) / FORGONE[1])
+        price = (form.cost - winner.candidate.cost + EVIDENCE - FORGONE[0]) / FORGONE[1]
+        if linear_gain(winner.stage.fit, problem_of(data, winner.stage.fit, noise), form.raw, form.seats) < HINTED * price:
+            return None
+        worth = _within(winner.stage.fit, price)
         return make_stage(data, hypothesis, prior, noise, coordinates, own=own_of(winner.stage), max_iterations=10, worth=worth)
     except FemsenseError:
         return None

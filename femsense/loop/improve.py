@@ -23,12 +23,12 @@ from femsense.errors import DataError, FemsenseError
 from femsense.loop.conclude import Search, conclude
 from femsense.loop.data import Data, prepare
 from femsense.loop.exchange import BETTER, exchanged
-from femsense.loop.grow import Progress, Refit, evidence, grow, mesh_cost, moved_by, prune
+from femsense.loop.grow import Progress, Refit, evidence, grow, mesh_cost, moved_by, prune, shortlist
 from femsense.loop.joint import Prior
 from femsense.loop.mesh_error import few_states, make_finer, with_mesh_errors
 from femsense.loop.noise import Noise
 from femsense.loop.result import LoopResult
-from femsense.loop.screen import Candidate
+from femsense.loop.screen import Candidate, Fields
 from femsense.loop.stages import (
     Stage,
     fields_of,
@@ -152,33 +152,31 @@ def _search(data: Data, before: Stage, base: Stage, names: list[str], most: int,
     stage, first, table, refits, ties = base, list[Candidate](), list[Candidate](), list[dict[str, Any]](), list[Refit]()
     noise: Noise | None = None
     n_effective, earlier = 0.0, data
+    fields: Fields | None = None
     while True:
         found = len(history) - 1
         say(f"screening effects ({found} found so far)")
         if found and "clouds" in data.measured:
             assert noise is not None
-            data = rematched(data, stage, noise)
+            data, fields = rematched(data, stage, noise), None
             stage = _again(data, stage, noise, own_derivatives=False)
         try:
-            fields = fields_of(data, stage, names)
+            stage, noise, n_effective, fields, table = _screened(data, stage, fields, noise, names)
         except FemsenseError as error:
-            if noise is None:
+            if not found:
                 raise
             refits = _unsettled(refits, found, error)
             data, history = earlier, history[:-1]
             stage = history[-1][1]
             break
-        noise, n_effective = noise_of(data, stage, fields, noise)
-        stage = _again(data, stage, noise)
         history[-1] = (history[-1][0], stage)
-        table = screen_stage(data, stage.fit, noise, fields, n_effective)
         first = first or table
         if found >= most:
             break
         next_one, others, tried = grow(data, stage, table, noise, names, n_effective, say)
         refits += [{**record, "step": found + 1} for record in tried]
         if next_one is None and ties:
-            instead, next_one, tried = _beside_a_tie(data, stage, ties[0], noise, names, n_effective, say)
+            instead, next_one, tried = _beside_a_tie(data, stage, ties[0], fields, noise, names, n_effective, say)
             if next_one is not None:
                 history[-1] = (ties[0].candidate.effect.name, instead)
                 refits = [*_renamed(refits, found, history[-1][0]), *({**record, "step": found + 1} for record in tried)]
@@ -209,14 +207,42 @@ def _search(data: Data, before: Stage, base: Stage, names: list[str], most: int,
     return data, Search(before, history, stage, noise, n_effective, first, table, refits, swap)
 
 
+def _screened(
+    data: Data, stage: Stage, before: Fields | None, noise: Noise | None, names: Sequence[str]
+) -> tuple[Stage, Noise, float, Fields, list[Candidate]]:
+    """Return a stage fitted with the noise that its residual tells, that noise, the effective number of observations, and the fields and scores
+    of what may come next: by the fields of the model before, as long as these promise nothing."""
+    fields = _fields(data, stage, before, names)
+    noise, n_effective = noise_of(data, stage, fields, noise)
+    stage = _again(data, stage, noise)
+    return stage, noise, n_effective, *_scored(data, stage, fields, noise, names, n_effective)
+
+
+def _fields(data: Data, stage: Stage, before: Fields | None, names: Sequence[str]) -> Fields:
+    """Return the fields of the model before where they tell what may come next, else those of the stage itself."""
+    hints = None if before is None else before.beside(stage.fit)
+    return fields_of(data, stage, names) if hints is None else hints
+
+
+def _scored(
+    data: Data, stage: Stage, fields: Fields, noise: Noise, names: Sequence[str], n_effective: float
+) -> tuple[Fields, list[Candidate]]:
+    """Return fields and the scores by them: those of the stage itself where others promise something."""
+    table = screen_stage(data, stage.fit, noise, fields, n_effective)
+    if fields.model is stage.fit.hypothesis or not shortlist(table, first=False):
+        return fields, table
+    fields = fields_of(data, stage, names)
+    return fields, screen_stage(data, stage.fit, noise, fields, n_effective)
+
+
 def _beside_a_tie(
-    data: Data, stage: Stage, tie: Refit, noise: Noise, names: Sequence[str], n_effective: float, say: Progress
+    data: Data, stage: Stage, tie: Refit, fields: Fields, noise: Noise, names: Sequence[str], n_effective: float, say: Progress
 ) -> tuple[Stage, Refit | None, list[dict[str, Any]]]:
     """Return the model with what was as good as the last effect in its place, and what comes next there, or None: the two together must be
     better than the stage. What hides behind a wrong one of two that look alike shows beside the right one."""
     say(f"trying {tie.candidate.effect.name} in the place of the last one, and what goes with it")
     instead = _again(data, tie.stage, noise, own_derivatives="clouds" not in data.measured)
-    table = screen_stage(data, instead.fit, noise, fields_of(data, instead, names), n_effective)
+    _, table = _scored(data, instead, _fields(data, instead, fields, names), noise, names, n_effective)
     both, _, tried = grow(data, instead, table, noise, names, n_effective, say)
     if both is None or evidence(stage.fit, both.stage.fit) - both.candidate.cost <= BETTER:
         return instead, None, []

@@ -236,7 +236,7 @@ class JointProblem:
         try:
             starts, jets = self._jets(theta, derivative, rough)
         except DataError:
-            if self.last is not None or not rough:
+            if self.last is not None or self.seen is not None or not rough:
                 raise
             rough = False  # the start is far from the states that are known
             starts, jets = self._jets(theta, derivative, rough)

@@ -106,6 +106,24 @@ class Fields:
     """Columns [m], one array (k, 3, Σq) a trial; a discrete alternative has one column, its whole change."""
     rest: list[FloatArray]
     """The same of the seats that rest.csv measures [m], (r, 3, Σq) a trial."""
+    model: Hypothesis
+    """The fitted model."""
+
+    def beside(self, fit: JointFit) -> Fields | None:
+        """Return the fields of what a model with more effects does not have yet, or None where they say little of it: it lies on another mesh,
+        has another law, or lacks an effect of this one.
+
+        What an effect does to the markers changes little with what else the body has: scores of `screen` by less than 6 in 52 models
+        of 215 blind cases, where an effect needs 10.
+        """
+        new = fit.hypothesis
+        if new.settled != self.model.settled or not set(self.model.names) <= set(new.names):
+            return None
+        spans = np.cumsum([0, *(1 if e.discrete else len(p) for e, _, p in self.todo)])
+        keep = [i for i, (effect, _, _) in enumerate(self.todo) if effect.name not in new.names]
+        columns = np.concatenate([np.arange(0), *(np.arange(spans[i], spans[i + 1]) for i in keep)])
+        raw, rest = [b[:, :, columns] for b in self.raw], [b[:, :, columns] for b in self.rest]
+        return Fields([self.todo[i] for i in keep], raw, rest, self.model)
 
     def of(self, i: int) -> tuple[list[FloatArray], list[FloatArray]]:
         """Return the columns of one effect in markers and seats, one array (k, c, q) and (r, 3, q) a trial."""
@@ -148,6 +166,14 @@ def screen(base: JointFit, problem: JointProblem, fields: Fields, n_effective: f
     return sorted(result, key=lambda c: -c.score)
 
 
+def linear_gain(base: JointFit, problem: JointProblem, raw: list[FloatArray], seats: list[FloatArray]) -> float:
+    """Return the decrease of χ² that columns of markers and seats (see `Candidate`) promise beside a fit, without bounds."""
+    Q = _orthonormal(np.asarray(base.fit.jacobian))
+    whole = _whitened(base, problem, raw, seats)
+    more = _orthonormal(whole - Q @ (Q.T @ whole))
+    return float(np.sum((more.T @ base.fit.residual) ** 2))
+
+
 def effect_fields(base: JointFit, trials: list[Trial], todo: list[tuple[Effect, Entry, tuple[Parameter, ...]]]) -> Fields:
     """Return what each effect does to the markers: those with parameters to first order, all of them with one factorisation a frame;
     discrete alternatives as a whole, each with a walk of its own."""
@@ -168,7 +194,7 @@ def effect_fields(base: JointFit, trials: list[Trial], todo: list[tuple[Effect, 
             usable = [*usable, one]
             raw = [np.concatenate([block, change[:, :, None]], axis=2) for block, change in zip(raw, changes)]
             rest = [np.concatenate([block, np.zeros((*block.shape[:2], 1))], axis=2) for block in rest]
-    return Fields(usable, raw, rest)
+    return Fields(usable, raw, rest, base.hypothesis)
 
 
 def _can_act(robot: Robot, one: tuple[Effect, Entry, tuple[Parameter, ...]]) -> bool:
