@@ -409,9 +409,9 @@ class _Answers:
 
     @property
     def bytes(self) -> int:
-        """What the answers take, without the factor."""
         every = [*self.own.values(), *self.by_segment.values()]
-        return sum(a.nbytes for a in every if a is not None)
+        factor = self.tangent.factor.bytes if "tangent" in self.__dict__ else 0
+        return factor + sum(a.nbytes for a in every if a is not None)
 
     @cached_property
     def tangent(self) -> Tangent:
@@ -423,9 +423,11 @@ class _Answers:
         return self.tangent.respond_to_held()
 
     def keep(self, keys: Iterable[tuple[int, int]]) -> None:
-        """Let go of the answers of other variants, and of the factor, which is made again where it is needed after all."""
-        self.__dict__.pop("tangent", None)
+        """Let go of the answers of other variants, and of the factor if further tensions are sums of the answers of segments: it is made again
+        where it is needed after all."""
         self.own = {key: self.own[key] for key in keys if key in self.own}
+        if self.by_segment:
+            self.__dict__.pop("tangent", None)
 
     def moves(
         self,
