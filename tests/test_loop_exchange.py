@@ -152,6 +152,31 @@ def test_until_an_effect_explains_the_data_rivals_are_refitted_to_the_end(monkey
     assert asked == [("payload", grow.EVIDENCE)] + [("cable_gain", grow.EVIDENCE)] * (not explains)
 
 
+@pytest.mark.parametrize("form", [True, False])
+def test_another_form_of_what_leads_is_held_against_what_that_one_promised(monkeypatch: pytest.MonkeyPatch, form: bool):
+    data, base = started()
+    table = screen_stage(data, base.fit, NOISE, fields_of(data, base, ["payload", "cable_gain"]), COUNT)
+    payload, gain = (next(c for c in table if c.effect.name == name) for name in ("payload", "cable_gain"))
+    rival = replace(payload, effect=replace(payload.effect)) if form else gain
+    asked = list[str]()
+
+    def lenient(data: Data, stage: Stage, candidate: Candidate, made: Stage, record: dict[str, Any], noise: Noise) -> Refit:
+        asked.append(candidate.effect.name)
+        return replace(
+            judged(data, stage, candidate, made, record | {"verdict": "passes"}, noise),
+            record={**record, "verdict": "passes"},
+            gain=800.0,
+        )
+
+    monkeypatch.setattr(grow, "judged", lenient)
+    monkeypatch.setattr(grow, "polished", lambda data, stage, refitted, *_: refitted)
+    monkeypatch.setattr(grow, "_explains", lambda stage: True)
+    monkeypatch.setattr(grow, "_predicts", lambda refitted: 0.0)
+    forms = [replace(payload, score=100.0), replace(rival, score=60.0)]
+    grow.grow(data, base, forms, NOISE, ["payload", "cable_gain"], COUNT, lambda text: None)
+    assert asked == ["payload", "payload"] if form else asked == ["payload"]
+
+
 @pytest.mark.parametrize(
     "name, strayed, explains, expected",
     [("gravity", False, False, 0), ("gravity", True, True, 0), ("gravity", True, False, 1), ("payload", True, False, 0)],

@@ -253,6 +253,17 @@ def test_a_modulus_that_is_off_by_little_goes_along_with_an_effect_that_would_ma
     assert abs(gain - 0.92) < 0.4 * abs(by_itself - 0.92)
 
 
+def test_a_modulus_that_zeros_hide_goes_along_where_it_is_plain_without_them() -> None:
+    data, search = with_gain(300e3 * 0.982)
+    fit, covariance = search.final.fit, np.array(search.final.fit.fit.covariance)
+    covariance[fit.own, fit.own] *= 1e4
+    vague = replace(search.final, fit=replace(fit, fit=replace(fit.fit, covariance=covariance)))
+    search = replace(search, final=vague, history=[search.history[0], ("cable_gain", vague)])
+    assert not conclude.moved_nuisance(data, vague, "stiffness", relevant=0.0)
+    names, gain = handed_back(data, search)
+    assert names == ["stiffness", "cable_gain"] and abs(gain - 0.92) < 2e-3
+
+
 def test_a_modulus_that_moved_too_little_to_be_named_by_itself_goes_along_where_held_out_data_miss_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -163,16 +163,18 @@ def _may_be_handed_back(data: Data, search: Search, back: Stage) -> bool:
 
 
 def _with_modulus(data: Data, search: Search, names: list[str], *, sizes_still: bool) -> tuple[list[str], Stage | None]:
-    """Return names with the model of just these; with the modulus beside effects if it moved significantly, by whatever share, and held-out data miss it."""
+    """Return names with the model of just these; with the modulus beside effects if it moved significantly there, by whatever share (zeros that are
+    not named may have moved in its place), and held-out data miss it."""
     back = _handed_back(data, search.final, names, search.noise, sizes_still=sizes_still)
     if back is None or "stiffness" in names or not _has_effects(names):
         return names, back
-    if not moved_nuisance(data, search.final, "stiffness", relevant=0.0):
+    if sizes_still and not moved_nuisance(data, search.final, "stiffness", relevant=0.0):
         return names, back
     along = _handed_back(data, search.final, ["stiffness", *names], search.noise, sizes_still=sizes_still)
-    if along is None or held_chi2(data, back, search.noise) - held_chi2(data, along, search.noise) <= EVIDENCE:
+    if along is None or not moved_nuisance(data, search.final if sizes_still else along, "stiffness", relevant=0.0):
         return names, back
-    return ["stiffness", *names], along
+    missed = held_chi2(data, back, search.noise) - held_chi2(data, along, search.noise) > EVIDENCE
+    return (["stiffness", *names], along) if missed else (names, back)
 
 
 def _has_effects(names: Iterable[str]) -> bool:

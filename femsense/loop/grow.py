@@ -110,7 +110,7 @@ def grow(
     for candidate in [*asked, *screened]:
         ahead = [r for r in refits if r.record["verdict"] == "passes" and _explains(r.stage)]
         best = max((r.score for r in ahead), default=-np.inf)
-        behind = candidate.score < max((0.5 * r.gain for r in ahead), default=-np.inf) - EVIDENCE
+        behind = candidate.score < max((0.5 * _bar(r, candidate) for r in ahead), default=-np.inf) - EVIDENCE
         if behind and not weighs(data, candidate.effect.name):
             continue  # where little is left to explain, a refit seldom gains that much on its linear score, but for a weight that cables lift
         say(f"refitting with {candidate.effect.name}")
@@ -137,6 +137,12 @@ def grow(
     winner.record["verdict"] = "named"
     ties = [r for r in leaders if r.candidate.effect.name != winner.candidate.effect.name]
     return winner, sorted(ties, key=lambda r: -r.score), records
+
+
+def _bar(ahead: Refit, candidate: Candidate) -> float:
+    """Return the gain of a refit that the linear one of a candidate is held against: of another form of the same effect it is the linear one too,
+    where that is smaller, since what bends one of them bends both."""
+    return min(ahead.gain, ahead.candidate.score) if candidate.effect.name == ahead.candidate.effect.name else ahead.gain
 
 
 def _to_the_end(data: Data, stage: Stage, refitted: Refit, noise: Noise) -> Refit:
