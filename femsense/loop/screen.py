@@ -113,8 +113,7 @@ class Fields:
         """Return the fields of what a model with more effects does not have yet, or None where they say little of it: it lies on another mesh,
         has another law, or lacks an effect of this one.
 
-        What an effect does to the markers changes little with what else the body has: scores of `screen` by less than 6 in 52 models
-        of 215 blind cases, where an effect needs 10.
+        What an effect does to the markers changes little with what else the body has (`benchmarks/hints.py`).
         """
         new = fit.hypothesis
         if new.settled != self.model.settled or not set(self.model.names) <= set(new.names):
