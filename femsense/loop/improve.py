@@ -236,7 +236,14 @@ def _scored(
 
 
 def _beside_a_tie(
-    data: Data, stage: Stage, tie: Refit, fields: Fields, noise: Noise, names: Sequence[str], n_effective: float, say: Progress
+    data: Data,
+    stage: Stage,
+    tie: Refit,
+    fields: Fields | None,
+    noise: Noise,
+    names: Sequence[str],
+    n_effective: float,
+    say: Progress,
 ) -> tuple[Stage, Refit | None, list[dict[str, Any]]]:
     """Return the model with what was as good as the last effect in its place, and what comes next there, or None: the two together must be
     better than the stage. What hides behind a wrong one of two that look alike shows beside the right one."""

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import lsq_linear
 
-from femsense.arrays import FloatArray
+from femsense.arrays import FloatArray, IntArray
 from femsense.calib.forward import Hypothesis
 from femsense.effects import Effect, Entry, Parameter
 from femsense.errors import DataError, FemsenseError
@@ -118,7 +118,7 @@ class Fields:
         new = fit.hypothesis
         if new.settled != self.model.settled or not set(self.model.names) <= set(new.names):
             return None
-        spans = np.cumsum([0, *(1 if e.discrete else len(p) for e, _, p in self.todo)])
+        spans = self._spans()
         keep = [i for i, (effect, _, _) in enumerate(self.todo) if effect.name not in new.names]
         columns = np.concatenate([np.arange(0), *(np.arange(spans[i], spans[i + 1]) for i in keep)])
         raw, rest = [b[:, :, columns] for b in self.raw], [b[:, :, columns] for b in self.rest]
@@ -126,9 +126,13 @@ class Fields:
 
     def of(self, i: int) -> tuple[list[FloatArray], list[FloatArray]]:
         """Return the columns of one effect in markers and seats, one array (k, c, q) and (r, 3, q) a trial."""
-        spans = np.cumsum([0, *(1 if e.discrete else len(p) for e, _, p in self.todo)])
+        spans = self._spans()
         part = slice(spans[i], spans[i + 1])
         return [block[:, :, part] for block in self.raw], [block[:, :, part] for block in self.rest]
+
+    def _spans(self) -> IntArray:
+        """Return where the columns of each effect begin, and where the last end."""
+        return np.cumsum([0, *(1 if e.discrete else len(p) for e, _, p in self.todo)])
 
 
 def screen(base: JointFit, problem: JointProblem, fields: Fields, n_effective: float) -> list[Candidate]:
