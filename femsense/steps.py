@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import importlib
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -10,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from femsense import results
 from femsense.errors import FemsenseError, InputError
 from femsense.files import file_hash
+from femsense.parallel import beside
 from femsense.recording import load_recording
 from femsense.robot import load_robot
 
@@ -107,18 +110,26 @@ def improve_into(
     if not again and results.finished(folder, inputs):
         say(f"{folder} holds this result already (--again computes it anew)")
         return results.read_loop(folder)
-    loop = improve(
-        body,
-        train,
-        validation=test,
-        effects=effects,
-        without=without,
-        user_effects=user_effects,
-        measured=measured,
-        progress=progress,
-    )
+    with beside(_load_pages):
+        loop = improve(
+            body,
+            train,
+            validation=test,
+            effects=effects,
+            without=without,
+            user_effects=user_effects,
+            measured=measured,
+            progress=progress,
+        )
     results.write_loop(loop, folder, inputs=inputs)
     return results.read_loop(folder)
+
+
+def _load_pages() -> None:
+    """Load what draws pages, which takes a second; an installation without it has no pages."""
+    with contextlib.suppress(ImportError):
+        for name in ("femsense.report", "matplotlib.figure", "matplotlib.backends.backend_svg"):
+            importlib.import_module(name)
 
 
 def loop_page(folder: str | Path, *, say: Say) -> Path | None:

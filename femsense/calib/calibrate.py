@@ -57,35 +57,42 @@ def calibrate(robot: Robot, recording: Recording, *, frames: Sequence[int] | Non
     Raises:
         DataError: no markers and no pose, too few markers, or no equilibrium.
     """
-    return calibrate_states(robot, recording, frames=frames)[0]
-
-
-def calibrate_states(
-    robot: Robot, recording: Recording, *, frames: Sequence[int] | None = None
-) -> tuple[Calibration, dict[int, Equilibrium]]:
-    """Return the calibration (see `calibrate`), and the state of each frame that it used."""
     recording = check_against(robot, recording)
     chosen = usable_frames(recording) if frames is None else np.asarray(frames, dtype=np.int64)
     if recording.rest is not None and not np.isin(recording.marker_frame, chosen).any():
-        return _from_rest(robot, recording), {}
+        return _from_rest(robot, recording)
     if not len(chosen):
         raise DataError(
             "no frame is free of undeclared contact: mark free frames with 1 in the column free of frames.csv, or declare loads.csv"
         )
     if not len(recording.marker_frame):
-        return _declared(robot, recording, chosen), {}
+        return _declared(robot, recording, chosen)
+    history: list[float] = []
+    return _result(robot, *_fitted(robot, recording, chosen, history), history)
+
+
+def calibrated_start(
+    robot: Robot, recording: Recording, frames: IntArray
+) -> tuple[tuple[FloatArray, ...], FloatArray | None, dict[int, Equilibrium]]:
+    """Return poses, initial inputs (None where they are known) and states of frames by which further fits begin; frames need markers."""
+    _, _, poses, initial, jet = _fitted(robot, recording, frames, [])
+    return tuple(poses), initial, jet.states
+
+
+def _fitted(
+    robot: Robot, recording: Recording, chosen: IntArray, history: list[float]
+) -> tuple[Scene, FitResult, list[FloatArray], FloatArray | None, SceneJet]:
+    """Return the scene of the frames that are used, and the fit to it."""
     seen = chosen[np.isin(chosen, recording.marker_frame)]
     if len(seen) > MAX_FRAMES:
         seen = seen[np.unique(np.linspace(0, len(seen) - 1, MAX_FRAMES).round().astype(int))]
     scene = make_scene(robot, recording, seen)
     poses = first_poses(robot, scene)
     initial = first_inputs(robot, recording)
-    history: list[float] = []
     if recording.actuation_zero == "unknown" and robot.body.cables:
         few = seen[np.unique(np.linspace(0, len(seen) - 1, START_FRAMES).round().astype(int))]
         poses, initial = _alternate(robot, make_scene(robot, recording, few), poses, initial, history)
-    fit, poses, initial, jet = fit_joint(robot, scene, poses, initial, history)
-    return _result(robot, scene, fit, poses, initial, jet, history), jet.states
+    return scene, *fit_joint(robot, scene, poses, initial, history)
 
 
 def first_inputs(robot: Robot, recording: Recording) -> FloatArray | None:
@@ -123,7 +130,7 @@ def _pose_from_frame(robot: Robot, scene: Scene, view: int, name: str) -> FloatA
         rows = (scene.frame == k) & (scene.view == view)
         most = max(most, int(rows.sum()))
         if rows.sum() >= 3:
-            state = solve_frame(walk, int(k))
+            state = solve_frame(walk, int(k), single=True)
             shape = state.positions if state.converged else robot.body.mesh.nodes
             return fit_rigid(robot.markers.positions(shape)[scene.marker[rows]], scene.points[rows])
     raise DataError(
@@ -452,4 +459,4 @@ def _declared(robot: Robot, recording: Recording, frames: IntArray) -> Calibrati
                        np.zeros((4, 4)), np.zeros((6, 6)), none, dict(none), "as declared: there are no markers to fit", frames=tuple(int(recording.frame_numbers[k]) for k in frames))  # fmt: skip
 
 
-__all__ = ["calibrate", "calibrate_states", "first_inputs", "first_poses", "fit_joint", "input_bounds", "usable_frames"]
+__all__ = ["calibrate", "calibrated_start", "first_inputs", "first_poses", "fit_joint", "input_bounds", "usable_frames"]

@@ -18,6 +18,8 @@ STILL = 1e-2
 """A step that changes the whitened residual by less than this is none."""
 
 
+NEARLY = 4.0
+"""A step is idle that promised less than so many times what counts as a gain, and gained less than that."""
 LEAST_SHRINKING = 0.25
 """No step is foretold to be shorter than this share of the one before."""
 GIVEN_UP = "given up"
@@ -80,13 +82,16 @@ def gauss_newton(
     borrowed: FloatArray | None = None,
     serves: float = 0.0,
     worth: float = np.inf,
+    trusted: float = 0.0,
+    enough: float = 0.0,
     kinks: Callable[[FloatArray], Kinks | None] | None = None,
 ) -> FitResult:
     """Minimise ‖r(θ)‖² within bounds (Levenberg's damping where a plain step does not pay).
 
     A Jacobian that predicted the last step well serves for the next one too; the fit ends only where the Jacobian at θ itself says that
     there is nothing left to gain, or, where what is left is noise, where it would: steps of a Gauss–Newton fit, each with a Jacobian of its own,
-    shrink like a geometric series, so that two of them foretell the next.
+    shrink like a geometric series, so that two of them foretell the next. It ends as well where two steps in turn were idle, as on kinks that
+    hold a fit up.
 
     Arguments:
         evaluate: residual and Jacobian; priors are rows of them.
@@ -100,6 +105,8 @@ def gauss_newton(
         serves: a Jacobian serves for another step where it missed the change of the residual by less than this share of it.
         worth: a fit whose sum of squares stays above this is given up: where a step promises less than half of what is missing, or a
             borrowed Jacobian says that nothing is left to gain.
+        trusted: a Jacobian that missed less than this share of every step since it was made is believed, too, that nothing is left to gain.
+        enough: what counts as a gain in the sum of squares, in units of the misfit where that is more than noise; 0: all that `tolerance` says.
         kinks: θ → where the residual bends near by, for the Jacobian that was computed last.
     """
     from femsense.errors import DataError
@@ -114,6 +121,8 @@ def gauss_newton(
     costs = [float(residual @ residual)]
     damping, status, steps = 0.0, "iterations", 0
     length, next_length = np.inf, np.inf  # of the last step with a Jacobian of its own; of the next one, foretold
+    sure: bool | None = own or None  # whether the Jacobian foretold all steps since it was made; None: not known
+    idle = 0  # idle steps in turn
     while steps < max_iterations or not own:
         near = _Near(residual, jacobian, None if kinks is None else kinks(theta), low - theta, high - theta)
         step = near.step(damping)
@@ -125,24 +134,24 @@ def gauss_newton(
         if costs[-1] > worth and (hopeless or (not own and (small or steps >= max_iterations))):
             status = GIVEN_UP
             break
-        if not own and error == 1.0 and next_length <= still:
+        foretold = not own and error == 1.0 and next_length <= still
+        if foretold or idle > 1 or (small and (own or sure or idle)):
             status = "converged"
             break
         if not own and (small or steps >= max_iterations):
-            residual, jacobian, own = *_both(evaluate, theta), True
+            residual, jacobian, own, sure = *_both(evaluate, theta), True, True
             continue
-        if small:
-            status = "converged"
-            break
         steps += 1
         try:
             new_residual, _ = evaluate(theta + step, False)
             cost = float(new_residual @ new_residual)
         except DataError:
             cost = np.inf
+        gain = enough * error**2
+        idle = idle + 1 if predicted < NEARLY * gain and not costs[-1] - cost >= gain else 0
         if not cost <= costs[-1] - 1e-4 * predicted:
-            if not own:
-                residual, jacobian, own = *_both(evaluate, theta), True
+            if not own and idle < 2:
+                residual, jacobian, own, sure = *_both(evaluate, theta), True, True
                 continue
             damping = _shorter(near, damping, change)
             if damping > MOST_DAMPING:
@@ -155,8 +164,10 @@ def gauss_newton(
         damping = damping / 10.0 if damping > 1e-6 else 0.0
         missed = new_residual - residual - change
         theta, residual, own = theta + step, new_residual, False
-        if np.linalg.norm(missed) > serves * np.linalg.norm(change) and not (error == 1.0 and next_length <= still):
-            residual, jacobian, own = *_both(evaluate, theta), True
+        off, length_now = float(np.linalg.norm(missed)), float(np.linalg.norm(change))
+        sure = off < trusted * length_now and sure is not False
+        if off > max(serves * length_now, gain**0.5) and not idle and not (error == 1.0 and next_length <= still):
+            residual, jacobian, own, sure = *_both(evaluate, theta), True, True
         else:
             jacobian = _as_seen(jacobian, step, near.scale, missed)
         costs.append(float(residual @ residual))

@@ -12,9 +12,9 @@ from scipy.spatial import cKDTree
 from femsense.arrays import FloatArray, IntArray, freeze
 from femsense.effects.effect import Effect, Entry, Parameter, number
 from femsense.errors import InputError
-from femsense.fem.body import BodyModel, Cable, Chamber, make_body, tie_cable
+from femsense.fem.body import BodyModel, Chamber, make_body, tie_cable
 from femsense.fem.chambers import find_chamber
-from femsense.fem.mesh import TetMesh, embed_points, refined, to_linear, to_quadratic
+from femsense.fem.mesh import Embedding, TetMesh, embed_points, refined, to_linear, to_quadratic
 from femsense.model import Robot
 
 MOST_REFINEMENTS = 3
@@ -124,7 +124,8 @@ def body_on_mesh(body: BodyModel, mesh: TetMesh, *, clamped: IntArray | None = N
         is_clamped[body.clamped] = True
         clamped = np.flatnonzero(np.abs(np.where(is_clamped[ties.nodes], 0.0, ties.weights)).max(axis=1) < 1e-6)
     nodes = clamped.astype(np.int64).tobytes(), body.clamp_nodes.astype(np.int64).tobytes()
-    made, parent = _plain_body(body.mesh, mesh, body.cables, body.chambers, *nodes)
+    made, parent = _plain_body(body.mesh, mesh, tuple((c.name, c.path) for c in body.cables), body.chambers, *nodes)
+    made = made.with_cables(tuple(replace(c, path=tied.path) for c, tied in zip(body.cables, made.cables)))
     material = body.material
     young, poisson = material.young_modulus[parent], material.poisson_ratio[parent]
     made = made.with_material(replace(material, young_modulus=freeze(young), poisson_ratio=freeze(poisson)))
@@ -139,12 +140,18 @@ def body_on_mesh(body: BodyModel, mesh: TetMesh, *, clamped: IntArray | None = N
 
 @functools.lru_cache(maxsize=2)
 def _plain_body(
-    old: TetMesh, mesh: TetMesh, cables: tuple[Cable, ...], chambers: tuple[Chamber, ...], clamped: bytes, springs: bytes
+    old: TetMesh,
+    mesh: TetMesh,
+    paths: tuple[tuple[str, Embedding], ...],
+    chambers: tuple[Chamber, ...],
+    clamped: bytes,
+    springs: bytes,
 ) -> tuple[BodyModel, IntArray]:
-    """Return a body of any one material on a mesh with the cables and chambers of an old one, and which old element each element lies in.
+    """Return a body of any one material on a mesh with the paths of cables and the chambers of an old one, and which old element each element
+    lies in.
 
-    The last ones are kept: pattern, order and ties take as long as some states, and no material changes them. Nodes are bytes of int64:
-    those that are clamped on the new mesh, and those of the old one that carry springs where the clamp gives.
+    The last ones are kept: pattern, order and ties take as long as some states, and neither material nor friction changes them. Nodes are
+    bytes of int64: those that are clamped on the new mesh, and those of the old one that carry springs where the clamp gives.
     """
     parent = embed_points(old, mesh.nodes[mesh.tets[:, :4]].mean(axis=1)).element
     held = old.nodes[np.frombuffer(springs, np.int64)]
@@ -154,7 +161,7 @@ def _plain_body(
         poisson_ratio=0.3,
         clamped=np.frombuffer(clamped, np.int64),
         clamp_nodes=cKDTree(mesh.nodes).query(held)[1] if len(held) else np.zeros(0, np.int64),
-        cables=tuple(replace(c, path=tie_cable(mesh, c.name, c.path.positions(old.nodes), c.pull_point).path) for c in cables),
+        cables=tuple(tie_cable(mesh, name, path.positions(old.nodes), np.zeros(3)) for name, path in paths),
         chambers=tuple(find_chamber(mesh, c.name, c.seed, max_pressure=c.max_pressure) for c in chambers),
     )
     return made, parent

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from femsense.arrays import FloatArray, IntArray
-from femsense.calib.calibrate import calibrate_states, first_inputs, first_poses, input_bounds, usable_frames
+from femsense.calib.calibrate import calibrated_start, first_inputs, first_poses, input_bounds, usable_frames
 from femsense.calib.forward import Scene, make_scene, rest_residual, with_rest_markers
 from femsense.effects import FORMS, Effect
 from femsense.errors import DataError, InputError
@@ -197,9 +197,8 @@ def _start(robot: Robot, recording: Recording, frames: IntArray) -> tuple[tuple[
     """
     unknown = recording.actuation_zero == "unknown" and bool(robot.body.cables)
     if np.isin(recording.marker_frame, frames).any():
-        calibration, states = calibrate_states(robot, recording, frames=frames.tolist())
-        table = calibration.cable_tension_n if recording.actuation == "tension" else calibration.cable_displacement_m
-        return calibration.poses, np.array([table[name] for name in robot.body.cable_names]) if unknown else None, states
+        poses, inputs, states = calibrated_start(robot, recording, frames)
+        return poses, inputs if unknown else None, states
     initial = first_inputs(robot, recording)
     if recording.rest is not None:
         return tuple(first_poses(robot, _bare_scene(robot, recording, frames, with_rest=True))), initial, {}

@@ -386,6 +386,10 @@ def _as_near(kept: States, near: States, body: BodyModel) -> States:
     return {**kept, **{k: state for k, state in near.items() if serves(k, state)}}
 
 
+TRUSTED = 0.02
+"""Derivatives that missed less than this share of every step since they were computed are believed that nothing is left to gain."""
+GAIN = 0.5
+"""What counts as a gain of a step in χ², where a fit goes on by little: half of what a parameter of noise brings."""
 SERVES = 0.25
 """Derivatives serve for another step of a fit where they missed the change of the residual by less than this share of it."""
 
@@ -423,10 +427,12 @@ def fit_jointly(
     problem.scale = problem.scale if begin is None or begin[1] is None else np.linalg.norm(begin[1], axis=0)
     fit = gauss_newton(
         problem.evaluate, theta, low=low, high=high, max_iterations=max_iterations, tolerance=1e-6, still=0.2,
-        known=begin, borrowed=None if near is None else problem.rows_of(near, theta, True)[1], serves=SERVES, worth=worth, kinks=problem.kinks,
+        known=begin, borrowed=None if near is None else problem.rows_of(near, theta, True)[1], serves=SERVES, worth=worth, trusted=TRUSTED, enough=GAIN, kinks=problem.kinks,
     )  # fmt: skip
     if problem.last is None or not np.array_equal(problem.last.theta, fit.theta):
         if not fit.own:
+            if problem.seen is None or not np.array_equal(problem.seen.theta, fit.theta):  # a step further was tried
+                problem.evaluate(fit.theta, False)
             jets = problem.settle_for(near)
             return JointFit(hypothesis, prior, fit, problem.own, float(fit.residual @ fit.residual), jets)
         problem.evaluate(fit.theta, True)

@@ -197,7 +197,7 @@ class Whitener:
 def whiten(whitener: Whitener, values: FloatArray) -> FloatArray:
     """Return rows (k, c, …) whitened, flattened to (c k, …)."""
     k, c = values.shape[:2]
-    flat = solve_triangular(whitener.lower, values.reshape(k, -1), lower=True)
+    flat = solve_triangular(whitener.lower, values.reshape(k, -1), lower=True, check_finite=False)
     rows = np.asarray(flat.reshape(c * k, *values.shape[2:]))
     if not whitener.shrink.size:
         return rows
@@ -241,11 +241,12 @@ def estimate_noise(
     near = None if before is None else np.log([max(before.get(n, 0.0), np.exp(lowest)) for n in names])
     likelihood = _Likelihood(names, residuals, basis, groups, near)
 
-    def from_start(white: float) -> Any:
-        start = np.clip(np.log([white if n == "white" else 0.3 * scale for n in names]), lowest, highest)
-        return minimize(likelihood, start, jac=True, method="L-BFGS-B", bounds=bounds)
+    def from_start(start: FloatArray) -> Any:
+        return minimize(likelihood, np.clip(start, lowest, highest), jac=True, method="L-BFGS-B", bounds=bounds)
 
-    best = min(each(from_start, {max(jitter, FLOOR), 0.3 * scale, 0.7 * scale}), key=lambda answer: answer.fun)
+    whites = {max(jitter, FLOOR), 0.3 * scale, 0.7 * scale}
+    starts = [near] if near is not None else [np.log([w if n == "white" else 0.3 * scale for n in names]) for w in whites]
+    best = min(each(from_start, starts), key=lambda answer: answer.fun)
     std = {name: float(v) for name, v in zip(names, np.exp(best.x))}
     std = {name: max(v, FLOOR) if name == "white" else v if v > 2e-2 * scale else 0.0 for name, v in std.items()}
     how = "with repeats" if "state" in names else "no repeated state: assumed from the residual"
