@@ -10,7 +10,7 @@ import pytest
 from analytic import bar_body, random_rotation
 from helpers import DATA, block_mesh
 
-from femsense.calib.calibrate import calibrate, input_bounds, usable_frames
+from femsense.calib.calibrate import calibrate, calibrated_start, input_bounds, usable_frames
 from femsense.calib.forward import Hypothesis, evaluate_scene, make_scene
 from femsense.effects import apply_effects, find_effect
 from femsense.errors import DataError, InputError
@@ -409,3 +409,17 @@ def test_other_cables_are_an_input_error() -> None:
     rec = replace(seen_by_camera(bar_robot(), STEPS), cable_names=("north", "side"))
     with pytest.raises(InputError, match="other cables than those of the robot"):
         calibrate(bar_robot(), rec)
+
+
+@pytest.mark.parametrize("initial", [INITIAL, None])
+def test_a_start_for_further_fits_is_where_calibration_ends(initial: np.ndarray | None) -> None:
+    robot = bar_robot()
+    recording = seen_by_camera(robot, STEPS, initial=initial, noise=1e-4)
+    whole = calibrate(robot, recording)
+    poses, inputs, states = calibrated_start(robot, check_against(robot, recording), usable_frames(recording))
+    np.testing.assert_array_equal(poses, whole.poses)
+    if initial is None:
+        assert inputs is None
+    else:
+        np.testing.assert_allclose(inputs, list(whole.cable_tension_n.values()), atol=1e-12)
+    assert sorted(states) == [0, 1, 2, 3] and all(s.converged for s in states.values())

@@ -257,6 +257,54 @@ def test_a_borrowed_jacobian_never_decides_the_end() -> None:
     assert asked[:2] == [False, True]
 
 
+@pytest.mark.parametrize("borrows", [False, True])
+def test_a_jacobian_that_missed_next_to_nothing_of_a_step_is_believed_at_the_end(borrows: bool) -> None:
+    start, results, jacobians = np.array([0.6, 0.2, 0.1]), [], []
+    for trusted, off in ((0.0, 0.0), (0.05, 0.0), (0.05, 0.2)):
+        evaluate, asked = counted(0.05)  # nearly linear
+        J = evaluate(start, True)[1] * (1.0 + off) if borrows else None
+        asked.clear()
+        results.append(gauss_newton(evaluate, start, borrowed=J, serves=0.5, trusted=trusted, still=1e-3))
+        jacobians.append(sum(asked))
+    assert jacobians[1] == jacobians[0] - 1 and not results[1].own and results[0].own
+    if borrows:
+        assert results[2].own  # it missed a fifth
+    np.testing.assert_allclose(results[1].residual, results[0].residual, atol=1e-3)
+
+
+def rough_valley(theta: np.ndarray, derivative: bool) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return a residual with a jagged floor: each Jacobian promises a little, and the step brings less."""
+    u, v = theta
+    r = np.array([u - 3.0, 0.4 * abs(np.sin(25.0 * v)) + 0.02 * v, 0.3])
+    slope = 0.4 * 25.0 * np.cos(25.0 * v) * np.sign(np.sin(25.0 * v)) + 0.02
+    return r, np.array([[1.0, 0.0], [0.0, slope], [0.0, 0.0]]) if derivative else None
+
+
+def test_idle_steps_end_a_fit() -> None:
+    costs, asked = [], []
+    for enough in (0.0, 0.5):
+        seen = list[bool]()
+
+        def evaluate(theta: np.ndarray, derivative: bool, seen: list[bool] = seen) -> tuple[np.ndarray, np.ndarray | None]:
+            seen.append(derivative)
+            return rough_valley(theta, derivative)
+
+        fit = gauss_newton(evaluate, np.array([0.0, 0.7]), enough=enough, still=1e-6)
+        costs.append(fit.cost[-1])
+        asked.append(len(seen))
+        assert fit.status == "converged" and fit.theta[0] == pytest.approx(3.0, abs=1e-3)
+    assert asked[1] < asked[0] and costs[1] < costs[0] + 0.5
+
+
+def test_a_step_that_struggles_far_from_the_end_is_not_idle() -> None:
+    def evaluate(theta: np.ndarray, derivative: bool) -> tuple[np.ndarray, np.ndarray | None]:
+        x, y = theta
+        return np.array([10.0 * (y - x**2), 1.0 - x]), np.array([[-20.0 * x, 10.0], [-1.0, 0.0]]) if derivative else None
+
+    fit = gauss_newton(evaluate, np.array([-1.2, 1.0]), enough=0.3, max_iterations=200)
+    assert fit.cost[-1] < fit_module.NEARLY * 0.3  # short steps along the valley bring little, a whole one promised more
+
+
 def test_a_fit_that_is_not_worth_it_is_given_up_before_its_own_jacobian() -> None:
     asked: list[bool] = []
     J = np.array([[1.0, 0.0], [0.0, 2.0], [0.0, 0.0]])

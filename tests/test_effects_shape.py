@@ -248,3 +248,16 @@ def test_bodies_of_other_materials_share_what_the_finer_mesh_needs():
         assert body.material.density == of.material.density and body.material.law == of.material.law
         assert body.material.poisson_ratio == pytest.approx(np.repeat(of.material.poisson_ratio, 8))
         np.testing.assert_array_equal(body.gravity, of.gravity)
+
+
+def test_what_the_finer_mesh_needs_is_kept_whatever_rubs_or_stretches():
+    robot = arm((4, 2, 2))
+    cables = tuple(replace(c, friction=0.3, stretch_stiffness=5e3, max_tension=7.0) for c in robot.body.cables)
+    mesh = finer_mesh(robot.body.mesh, None, 1)
+    one = robot_on_mesh(robot, mesh).body
+    other = robot_on_mesh(robot.with_body(robot.body.with_cables(cables)), mesh).body
+    assert one.free_map is other.free_map
+    for c, own, plain in zip(other.cables, cables, one.cables):
+        assert (c.name, c.friction, c.stretch_stiffness, c.max_tension) == (own.name, 0.3, 5e3, 7.0)
+        assert c.pull_point is own.pull_point and c.path is plain.path
+        np.testing.assert_allclose(c.path.positions(mesh.nodes), own.path.positions(robot.body.mesh.nodes), atol=1e-9)

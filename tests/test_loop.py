@@ -11,6 +11,7 @@ from arm import arm, record, sweeps
 
 from femsense.errors import DataError, InputError
 from femsense.loop import improve
+from femsense.loop import noise as noise_module
 from femsense.loop.noise import Groups, Noise, estimate_noise, whiten
 from femsense.loop.split import hold_out, sweeps_of
 from femsense.recording import make_recording
@@ -169,6 +170,22 @@ def test_the_components_of_the_noise_are_told_apart():
     assert noise.std["frame"] == pytest.approx(2e-4, rel=0.3)
     white = whiten(noise.whitener(groups), residual)
     assert white.std() == pytest.approx(1.0, rel=0.1)
+
+
+def test_a_later_estimate_of_the_noise_begins_at_the_one_before(monkeypatch: pytest.MonkeyPatch):
+    rng = np.random.default_rng(3)
+    frames, markers = 20, 6
+    frame, marker = np.repeat(np.arange(frames), markers), np.tile(np.arange(markers), frames)
+    groups = Groups(marker, frame, frame // 5, np.arange(frames * markers))
+    residual = 1e-4 * rng.normal(size=(frames * markers, 3)) + 2e-4 * rng.normal(size=(frames, 3))[frame]
+    given = [residual], [np.full((frames * markers, 3, 1), 1e-6)], [np.zeros((frames * markers, 3, 0))], [groups]
+    first = estimate_noise(*given)
+    starts, plain = list[np.ndarray](), noise_module.minimize
+    monkeypatch.setattr(noise_module, "minimize", lambda f, x, **more: starts.append(x) or plain(f, x, **more))
+    again = estimate_noise(*given, before=first.std)
+    assert len(starts) == 1 and np.exp(starts[0][0]) == pytest.approx(first.std["white"])
+    for name in ("white", "frame"):
+        assert again.std[name] == pytest.approx(first.std[name], rel=0.05)
 
 
 def test_whitening_inverts_the_covariance():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,12 +15,12 @@ from femsense.effects.shape import robot_on_mesh
 from femsense.errors import DataError
 from femsense.fem.equilibrium import solve_equilibrium
 from femsense.fem.mesh import to_linear
-from femsense.loop import conclude, improve
+from femsense.loop import conclude, improve, joint
 from femsense.loop.conclude import Search
 from femsense.loop.data import Data, prepare
 from femsense.loop.grow import with_term
 from femsense.loop.joint import Jets, JointProblem, Prior
-from femsense.loop.noise import Noise
+from femsense.loop.noise import Noise, whiten
 from femsense.loop.screen import effect_fields
 from femsense.loop.stages import Stage, make_stage, with_nuisance
 from femsense.model import Robot
@@ -134,6 +135,23 @@ def test_a_fit_begins_at_the_states_of_the_model_before_unless_their_clamp_is_an
     wanted = kept if clamp else stage.fit.jets[0].states
     (starts,) = begins._starts(theta, True)
     assert wanted and all(starts[k].positions is state.positions for k, state in wanted.items())
+
+
+def test_a_fit_that_ends_on_its_way_has_the_residual_of_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    data, stage = staged(arm((4, 2, 2)))
+    plain = joint.gauss_newton
+
+    def tries_further(evaluate: Any, theta: np.ndarray, **more: Any) -> Any:
+        fit = plain(evaluate, theta, **{**more, "trusted": 1e9})
+        evaluate(fit.theta + 1e-3, False)  # a step that is not taken
+        return replace(fit, own=False)
+
+    monkeypatch.setattr(joint, "gauss_newton", tries_further)
+    trial = replace(data.train[0], initial=None)
+    start = stage.fit.coordinates + 0.02
+    fit = joint.fit_jointly(stage.fit.hypothesis, stage.fit.prior, [trial], NOISE, 1.0, start, near=stage.fit.jets)
+    white = whiten(NOISE.whitener(trial.groups, None), fit.jets[0].residual)
+    np.testing.assert_allclose(white, fit.fit.residual[: white.size], atol=1e-3)
 
 
 def test_a_model_without_equilibrium_is_not_handed_back(monkeypatch: pytest.MonkeyPatch) -> None:

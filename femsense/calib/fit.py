@@ -19,7 +19,7 @@ STILL = 1e-2
 
 
 NEARLY = 4.0
-"""A step is idle that promised less than so many times what counts as a gain, and gained less than that."""
+"""A step is idle that gained less than what counts as a gain where a whole step promised less than so many times that."""
 LEAST_SHRINKING = 0.25
 """No step is foretold to be shorter than this share of the one before."""
 GIVEN_UP = "given up"
@@ -89,9 +89,9 @@ def gauss_newton(
     """Minimise ‖r(θ)‖² within bounds (Levenberg's damping where a plain step does not pay).
 
     A Jacobian that predicted the last step well serves for the next one too; the fit ends only where the Jacobian at θ itself says that
-    there is nothing left to gain, or, where what is left is noise, where it would: steps of a Gauss–Newton fit, each with a Jacobian of its own,
-    shrink like a geometric series, so that two of them foretell the next. It ends as well where two steps in turn were idle, as on kinks that
-    hold a fit up.
+    there is nothing left to gain (or one that is `trusted`), or, where what is left is noise, where it would: steps of a Gauss–Newton fit, each
+    with a Jacobian of its own, shrink like a geometric series, so that two of them foretell the next. It ends as well where two steps in turn
+    were idle, promised little and brought less (`enough`), or one and the next would move by nothing: on a kink there may always be a little to gain.
 
     Arguments:
         evaluate: residual and Jacobian; priors are rows of them.
@@ -102,7 +102,8 @@ def gauss_newton(
         still: length of a step in whitened residual at which it stops, in units of the misfit where that is more than noise.
         known: residual and Jacobian at the start, where they are known.
         borrowed: a Jacobian from near the start to begin with.
-        serves: a Jacobian serves for another step where it missed the change of the residual by less than this share of it.
+        serves: a Jacobian serves for another step where it missed the change of the residual by less than this share of it, or by less than what
+            counts as a gain.
         worth: a fit whose sum of squares stays above this is given up: where a step promises less than half of what is missing, or a
             borrowed Jacobian says that nothing is left to gain.
         trusted: a Jacobian that missed less than this share of every step since it was made is believed, too, that nothing is left to gain.
@@ -129,7 +130,7 @@ def gauss_newton(
         change, predicted = near.change(step), near.promise(step)
         error = max(1.0, costs[-1] / max(len(residual), 1)) ** 0.5  # what a standard error is worth where the model misfits
         small = predicted <= tolerance * costs[-1] or np.linalg.norm(change) <= still * error
-        plain = predicted if damping == 0.0 or costs[-1] <= worth else near.promise(near.step(0.0))
+        plain = predicted if damping == 0.0 else near.promise(near.step(0.0))
         hopeless = costs[-1] - 2.0 * plain > worth
         if costs[-1] > worth and (hopeless or (not own and (small or steps >= max_iterations))):
             status = GIVEN_UP
@@ -148,7 +149,7 @@ def gauss_newton(
         except DataError:
             cost = np.inf
         gain = enough * error**2
-        idle = idle + 1 if predicted < NEARLY * gain and not costs[-1] - cost >= gain else 0
+        idle = idle + 1 if plain < NEARLY * gain and not costs[-1] - cost >= gain else 0
         if not cost <= costs[-1] - 1e-4 * predicted:
             if not own and idle < 2:
                 residual, jacobian, own, sure = *_both(evaluate, theta), True, True
@@ -164,9 +165,9 @@ def gauss_newton(
         damping = damping / 10.0 if damping > 1e-6 else 0.0
         missed = new_residual - residual - change
         theta, residual, own = theta + step, new_residual, False
-        off, length_now = float(np.linalg.norm(missed)), float(np.linalg.norm(change))
-        sure = off < trusted * length_now and sure is not False
-        if off > max(serves * length_now, gain**0.5) and not idle and not (error == 1.0 and next_length <= still):
+        off, way = float(np.linalg.norm(missed)), float(np.linalg.norm(change))
+        sure = off < trusted * way and sure is not False
+        if off > max(serves * way, gain**0.5) and not idle and not (error == 1.0 and next_length <= still):
             residual, jacobian, own, sure = *_both(evaluate, theta), True, True
         else:
             jacobian = _as_seen(jacobian, step, near.scale, missed)
