@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from helpers import block_mesh, changed, write_block_robot
 
+from femsense import steps
 from femsense.errors import InputError
 from femsense.report import words, write_report
 from femsense.report.compare import load_error
@@ -668,3 +669,18 @@ def test_the_skin_is_seen_from_outside() -> None:
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     assert np.einsum("tc,tc->", normals, corners.mean(axis=1) - mesh.nodes.mean(axis=0)) > 0
     assert len(surface.triangles) == 2 * (2 + 4 * 2)
+
+
+# Loading beside other work
+
+
+def test_what_draws_pages_is_loaded_beside_other_work_and_may_be_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+
+    def missing(name: str) -> None:
+        asked.append(name)
+        raise ImportError(name)
+
+    monkeypatch.setattr(steps.importlib, "import_module", missing)
+    steps._load_pages()
+    assert asked == ["femsense.report"]

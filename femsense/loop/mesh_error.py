@@ -31,7 +31,7 @@ from femsense.recording import Recording
 
 MOST_TETS = 24000
 """A finer mesh than this takes too long in every state."""
-MOST_WORK = 125_000
+MOST_WORK = 100_000
 """Tetrahedra × states of a recording; beyond it the errors of other states are interpolated between those that were computed."""
 SHARE = 0.35
 """Standard deviation of the share of the error that a body shows in all sweeps (anchors that are some millimetres wide sink less than points) …"""

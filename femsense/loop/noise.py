@@ -208,6 +208,8 @@ def whiten(whitener: Whitener, values: FloatArray) -> FloatArray:
 NEAR_STD = float(np.log(2.0))
 JITTER = 0.4
 """The white part of the noise is no less than this share of what repeats of a state scatter by."""
+FLAT = 1e-6
+"""Relative decrease of the likelihood at which the estimate of the noise ends: a hundredth of a log-likelihood of ten thousand."""
 MAX_REML_ROWS = 700
 """Rows that the estimate of the noise uses at most; more are thinned out by whole frames."""
 MAX_CLOUD_ROWS = 500
@@ -242,7 +244,9 @@ def estimate_noise(
     likelihood = _Likelihood(names, residuals, basis, groups, near)
 
     def from_start(start: FloatArray) -> Any:
-        return minimize(likelihood, np.clip(start, lowest, highest), jac=True, method="L-BFGS-B", bounds=bounds)
+        return minimize(
+            likelihood, np.clip(start, lowest, highest), jac=True, method="L-BFGS-B", bounds=bounds, options={"ftol": FLAT}
+        )
 
     whites = {max(jitter, FLOOR), 0.3 * scale, 0.7 * scale}
     starts = [near] if near is not None else [np.log([w if n == "white" else 0.3 * scale for n in names]) for w in whites]
