@@ -19,8 +19,7 @@ STILL = 1e-2
 
 
 NEARLY = 4.0
-"""A step is idle that gained less than what counts as a gain where a whole step promised less than so many times that; after one that gained less than
-so many times that, a Jacobian from near by is believed that nothing is left."""
+"""A step is idle that gained less than what counts as a gain where a whole step promised less than so many times that."""
 LEAST_SHRINKING = 0.25
 """No step is foretold to be shorter than this share of the one before."""
 GIVEN_UP = "given up"
@@ -92,8 +91,7 @@ def gauss_newton(
     A Jacobian that predicted the last step well serves for the next one too; the fit ends only where the Jacobian at θ itself says that
     there is nothing left to gain (or one that is `trusted`), or, where what is left is noise, where it would: steps of a Gauss–Newton fit, each
     with a Jacobian of its own, shrink like a geometric series, so that two of them foretell the next. It ends as well where two steps in turn
-    were idle, promised little and brought less (`enough`), or one brought little and the next would move by nothing: on a kink there may always be
-    a little to gain.
+    were idle, promised little and brought less (`enough`), or one and the next would move by nothing: on a kink there may always be a little to gain.
 
     Arguments:
         evaluate: residual and Jacobian; priors are rows of them.
@@ -125,7 +123,7 @@ def gauss_newton(
     damping, status, steps = 0.0, "iterations", 0
     length, next_length = np.inf, np.inf  # of the last step with a Jacobian of its own; of the next one, foretold
     sure: bool | None = own or None  # whether the Jacobian foretold all steps since it was made; None: not known
-    idle, modest = 0, False  # idle steps in turn; whether the last step brought next to nothing
+    idle = 0  # idle steps in turn
     while steps < max_iterations or not own:
         near = _Near(residual, jacobian, None if kinks is None else kinks(theta), low - theta, high - theta)
         step = near.step(damping)
@@ -138,7 +136,7 @@ def gauss_newton(
             status = GIVEN_UP
             break
         foretold = not own and error == 1.0 and next_length <= still
-        if foretold or idle > 1 or (small and (own or sure or modest)):
+        if foretold or idle > 1 or (small and (own or sure or idle)):
             status = "converged"
             break
         if not own and (small or steps >= max_iterations):
@@ -168,7 +166,7 @@ def gauss_newton(
         missed = new_residual - residual - change
         theta, residual, own = theta + step, new_residual, False
         off, way = float(np.linalg.norm(missed)), float(np.linalg.norm(change))
-        sure, modest = off < trusted * way and sure is not False, costs[-1] - cost < NEARLY * gain
+        sure = off < trusted * way and sure is not False
         if off > max(serves * way, gain**0.5) and not idle and not (error == 1.0 and next_length <= still):
             residual, jacobian, own, sure = *_both(evaluate, theta), True, True
         else:
