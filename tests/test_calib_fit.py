@@ -294,6 +294,7 @@ def test_idle_steps_end_a_fit() -> None:
         asked.append(len(seen))
         assert fit.status == "converged" and fit.theta[0] == pytest.approx(3.0, abs=1e-3)
     assert asked[1] < asked[0] and costs[1] < costs[0] + 0.5
+    assert asked[1] == 5  # the start, a step that brings something, its Jacobian, two idle ones
 
 
 def test_a_step_that_struggles_far_from_the_end_is_not_idle() -> None:
