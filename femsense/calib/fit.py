@@ -20,6 +20,8 @@ STILL = 1e-2
 
 NEARLY = 4.0
 """A step is idle that gained less than what counts as a gain where a whole step promised less than so many times that."""
+LITTLE = 2.0
+"""A step is the last that promised less than so many times what counts as a gain, by a Jacobian of its own."""
 LEAST_SHRINKING = 0.25
 """No step is foretold to be shorter than this share of the one before."""
 GIVEN_UP = "given up"
@@ -150,12 +152,13 @@ def gauss_newton(
             cost = np.inf
         gain = enough * error**2
         idle = idle + 1 if plain < NEARLY * gain and not costs[-1] - cost >= gain else 0
+        last = own and plain < LITTLE * gain
         if not cost <= costs[-1] - 1e-4 * predicted:
             if not own and idle < 2:
                 residual, jacobian, own, sure = *_both(evaluate, theta), True, True
                 continue
             damping = _shorter(near, damping, change)
-            if damping > MOST_DAMPING:
+            if last or damping > MOST_DAMPING:
                 status = "converged"
                 break
             continue
@@ -167,11 +170,14 @@ def gauss_newton(
         theta, residual, own = theta + step, new_residual, False
         off, way = float(np.linalg.norm(missed)), float(np.linalg.norm(change))
         sure = off < trusted * way and sure is not False
-        if off > max(serves * way, gain**0.5) and not idle and not (error == 1.0 and next_length <= still):
+        if off > max(serves * way, gain**0.5) and not idle and not last and not (error == 1.0 and next_length <= still):
             residual, jacobian, own, sure = *_both(evaluate, theta), True, True
         else:
             jacobian = _as_seen(jacobian, step, near.scale, missed)
         costs.append(float(residual @ residual))
+        if last:
+            status = "converged"
+            break
     bends = None if kinks is None or status == GIVEN_UP else kinks(theta)
     jacobian = jacobian if bends is None else _on_kinks(jacobian, residual, bends)
     return FitResult(

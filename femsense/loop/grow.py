@@ -40,7 +40,7 @@ REFITTABLE = 0.04
 """A candidate of which calibration leaves less than this is not refitted."""
 EVIDENCE = 10.0
 """dBIC that a named effect needs."""
-PROMISING = 7.0
+PROMISING = 8.0
 """Linear dBIC that a candidate needs to be refitted: what is small is nearly linear, so that a refit finds about as much."""
 HINTED = 0.5
 """A richer form is tried where fields of the model without the effect promise this share of what it needs."""

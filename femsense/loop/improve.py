@@ -25,7 +25,7 @@ from femsense.loop.data import Data, prepare
 from femsense.loop.exchange import BETTER, exchanged
 from femsense.loop.grow import Progress, Refit, evidence, grow, mesh_cost, moved_by, prune, shortlist
 from femsense.loop.joint import Prior
-from femsense.loop.mesh_error import few_states, make_finer, with_mesh_errors
+from femsense.loop.mesh_error import errs_alike, few_states, make_finer, with_mesh_errors
 from femsense.loop.noise import Noise
 from femsense.loop.result import LoopResult
 from femsense.loop.screen import Candidate, Fields
@@ -185,10 +185,10 @@ def _search(data: Data, before: Stage, base: Stage, names: list[str], most: int,
             break
         earlier = data
         name, winner, ties = next_one.candidate.effect.name, next_one.stage, others
-        far = moved_by(stage, winner) > mesh_cost(data, stage, whole=True)
+        anew = moved_by(stage, winner) > mesh_cost(data, stage, whole=True) and not errs_alike(stage, winner)
         stage = prune(data, winner, noise, n_effective, say)
         history.append((name, stage))
-        if far:  # the mesh errs in another way in these states
+        if anew:
             data = with_mesh_errors(data, stage, names)
         found_so = history
         history, refits = exchanged(data, history, refits, noise, n_effective, say)

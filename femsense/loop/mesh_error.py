@@ -11,7 +11,7 @@ from __future__ import annotations
 import contextlib
 import functools
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 from scipy.interpolate import RBFInterpolator
@@ -20,9 +20,10 @@ from femsense.arrays import FloatArray, IntArray
 from femsense.calib.forward import seats
 from femsense.effects.shape import finer_mesh, robot_on_mesh
 from femsense.errors import DataError, FemsenseError
+from femsense.fem.body import BodyModel
 from femsense.fem.mesh import Embedding, TetMesh, embed_points
 from femsense.loop.data import Data
-from femsense.loop.joint import Trial, normals_of
+from femsense.loop.joint import Trial, normals_of, rms_of
 from femsense.loop.stages import Stage, placed
 from femsense.march import Walk, drive_of, finer_state, share_on_finer, walk_along
 from femsense.model import Robot
@@ -39,6 +40,10 @@ VARIES = 0.25
 """… of what each sweep adds to it …"""
 TURNS = 0.07
 """… and of the nine entries of a matrix that turns and stretches it in all sweeps: another mesh is not as much finer along the body as across."""
+ELSEWHERE = 0.2
+"""The mesh errs in another way in states that differ by more than this share of how far they are from rest; less than what sweeps may add."""
+PULLING = "cables", "cable_slots"
+"""What of a body only tells how its cables pull."""
 
 
 def with_mesh_errors(data: Data, stage: Stage, tried: Sequence[str]) -> Data:
@@ -61,6 +66,22 @@ def with_mesh_errors(data: Data, stage: Stage, tried: Sequence[str]) -> Data:
     except FemsenseError:
         return data
     return replace(data, train=train, held=held)
+
+
+def errs_alike(before: Stage, after: Stage) -> bool:
+    """Return whether the mesh errs after an effect was added as it did before: where the effect changes nothing of the body but how its cables
+    pull, or what the camera sees, and the states are nearly the same."""
+    old, new = before.fit.hypothesis, after.fit.hypothesis
+    known = [effect for effect, _, _ in old.terms]
+    robot = new.robot
+    for (effect, _, _), entry in zip(new.terms, new.entries(after.fit.coordinates)):
+        if effect not in known:
+            robot = effect.apply(robot, {k: v for k, v in entry.items() if k != "name"})
+    if any(getattr(robot.body, f.name) is not getattr(old.robot.body, f.name) for f in fields(BodyModel) if f.name not in PULLING):
+        return False
+    rest = robot.body.mesh.nodes
+    pairs = [(a.states[k].positions, b.states[k].positions) for a, b in zip(before.fit.jets, after.fit.jets) for k in a.states]
+    return rms_of([b - a for a, b in pairs]) <= ELSEWHERE * rms_of([a - rest for a, _ in pairs])
 
 
 def _on_firm_clamp(robot: Robot) -> Robot:
@@ -194,4 +215,4 @@ def _representatives(vectors: FloatArray, most: int) -> list[int]:
     return chosen
 
 
-__all__ = ["SHARE", "few_states", "make_finer", "mesh_errors", "with_mesh_errors"]
+__all__ = ["SHARE", "errs_alike", "few_states", "make_finer", "mesh_errors", "with_mesh_errors"]
