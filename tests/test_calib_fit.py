@@ -281,20 +281,40 @@ def rough_valley(theta: np.ndarray, derivative: bool) -> tuple[np.ndarray, np.nd
 
 
 def test_idle_steps_end_a_fit() -> None:
-    costs, asked = [], []
-    for enough in (0.0, 0.5):
+    start, costs, asked = np.array([3.0, 0.74]), [], []
+    borrowed = rough_valley(start, True)[1]
+    for enough in (0.0, 0.06):
         seen = list[bool]()
 
         def evaluate(theta: np.ndarray, derivative: bool, seen: list[bool] = seen) -> tuple[np.ndarray, np.ndarray | None]:
             seen.append(derivative)
             return rough_valley(theta, derivative)
 
-        fit = gauss_newton(evaluate, np.array([0.0, 0.7]), enough=enough, still=1e-6)
+        fit = gauss_newton(evaluate, start, borrowed=borrowed, enough=enough, still=1e-6)
         costs.append(fit.cost[-1])
         asked.append(len(seen))
-        assert fit.status == "converged" and fit.theta[0] == pytest.approx(3.0, abs=1e-3)
-    assert asked[1] < asked[0] and costs[1] < costs[0] + 0.5
-    assert asked[1] == 5  # the start, a step that brings something, its Jacobian, two idle ones
+        assert fit.status == "converged"
+    assert asked[1] < asked[0] and costs[1] < costs[0] + 0.06
+    assert asked[1] == 3  # the start and two idle ones
+
+
+@pytest.mark.parametrize("pays", [True, False])
+def test_a_step_that_promises_little_by_its_own_jacobian_is_the_last(pays: bool) -> None:
+    ends, asked = [], []
+    for enough in (0.0, 0.5):
+        seen = list[bool]()
+
+        def evaluate(theta: np.ndarray, derivative: bool, seen: list[bool] = seen) -> tuple[np.ndarray, np.ndarray | None]:
+            seen.append(derivative)
+            bend = 0.5 if pays else 3.0  # of what no Jacobian tells
+            u = 2.0 * theta[0]
+            r, slope = np.array([theta[0] - 0.9, bend * np.sin(u) ** 2, 0.3]), 4.0 * bend * np.sin(u) * np.cos(u)
+            return r, np.array([[1.0], [slope], [0.0]]) if derivative else None
+
+        ends.append(gauss_newton(evaluate, np.zeros(1), enough=enough, still=1e-6))
+        asked.append(seen)
+    assert asked[1] == [True, False] and len(asked[0]) > 4 and ends[1].status == "converged"
+    assert (ends[1].theta[0] != 0.0) == (ends[1].cost[-1] < ends[1].cost[0]) == pays
 
 
 def test_a_step_that_struggles_far_from_the_end_is_not_idle() -> None:

@@ -121,7 +121,7 @@ def test_weight_that_nobody_declared_is_refitted_however_far_behind_it_looks(mon
     hypothesis, prior = with_nuisance(data)
     base = make_stage(data, hypothesis, prior, NOISE, np.zeros(len(prior.mean)))
     table = screen_stage(data, base.fit, NOISE, fields_of(data, base, ["gravity", "payload"]), COUNT)
-    looks = [replace(c, score=8.0 if c.effect.name == "gravity" else c.score) for c in table]
+    looks = [replace(c, score=grow.PROMISING + 1.0 if c.effect.name == "gravity" else c.score) for c in table]
     table = sorted(looks, key=lambda c: -c.score)
     winner, _, records = grow.grow(data, base, table, NOISE, ["gravity", "payload"], COUNT, lambda text: None)
     assert {r["name"] for r in records} == {"gravity", "payload"}
@@ -143,7 +143,7 @@ def test_until_an_effect_explains_the_data_rivals_are_refitted_to_the_end(monkey
 
     data, base = started()
     table = screen_stage(data, base.fit, NOISE, fields_of(data, base, ["payload", "cable_gain"]), COUNT)
-    looks = [replace(c, score=8.0 if c.effect.name == "cable_gain" else 1e3 + c.score) for c in table]
+    looks = [replace(c, score=grow.PROMISING + 1.0 if c.effect.name == "cable_gain" else 1e3 + c.score) for c in table]
     monkeypatch.setattr(grow, "refit", seen)
     monkeypatch.setattr(grow, "judged", lenient)
     monkeypatch.setattr(grow, "_polish", lambda data, stage, winner, *_: winner.stage)

@@ -25,7 +25,7 @@ from femsense.loop.conclude import _excess, _lacks
 from femsense.loop.data import Data, prepare
 from femsense.loop.grow import MOUNTED, _plainly_worse, tilt_cost
 from femsense.loop.joint import Prior
-from femsense.loop.mesh_error import SHARE, TURNS, VARIES, make_finer, mesh_errors, with_mesh_errors
+from femsense.loop.mesh_error import SHARE, TURNS, VARIES, errs_alike, make_finer, mesh_errors, with_mesh_errors
 from femsense.loop.noise import Groups, Noise, _Likelihood, whiten
 from femsense.loop.predict import sweeps_predicted
 from femsense.loop.screen import _parts, penalty
@@ -205,6 +205,24 @@ def test_springs_of_a_clamp_do_not_sink_into_the_finer_mesh():
     nearest = np.unique(trial.scene.marker)[:4]  # beside the clamp, where a finer body would sink onto its springs
     by_clamp, by_firm = (np.abs(e[np.isin(trial.scene.marker, nearest)]).max() for e in (error, mesh_errors(firm)[0]))
     assert by_clamp < 3.0 * by_firm
+
+
+@pytest.mark.parametrize("name, size, alike", [("cable_friction", 0.05, True), ("cable_friction", 0.5, False), ("depth_scale", 1.03, True),
+                                               ("gravity", 1.0, False), ("poisson", 0.4, False), ("base_compliance", 1e5, False)])  # fmt: skip
+def test_the_mesh_errs_in_another_way_where_the_body_is_another_or_goes_elsewhere(name: str, size: float, alike: bool):
+    robot = arm((4, 1, 1))
+    recording, _ = record(sweeps(each=1)[0], labels=sweeps(each=1)[1], truth=robot)
+    noise, data = Noise({"white": 1e-4}, ""), prepare(robot, [recording], [])
+    hypothesis, prior = with_nuisance(data)
+    before = make_stage(data, hypothesis, prior, noise, np.zeros(len(prior.mean)))
+    effect = find_effect(name)
+    own = effect.parameters(robot, "tension")
+    coordinates = np.concatenate([before.fit.coordinates, [p.coordinate(size) for p in own]])
+    wider = Prior(np.append(prior.mean, np.zeros(len(own))), np.append(prior.std, np.full(len(own), np.inf)))
+    after = make_stage(
+        data, Hypothesis(data.robot, (*hypothesis.terms, (effect, {}, own))), wider, noise, coordinates, max_iterations=0
+    )
+    assert errs_alike(before, after) == alike
 
 
 def on_both_meshes(inputs: list[float], actuation: str = "tension") -> tuple[Walk, Walk, int, Equilibrium, Embedding]:

@@ -77,7 +77,9 @@ def errs_alike(before: Stage, after: Stage) -> bool:
     for (effect, _, _), entry in zip(new.terms, new.entries(after.fit.coordinates)):
         if effect not in known:
             robot = effect.apply(robot, {k: v for k, v in entry.items() if k != "name"})
-    if any(getattr(robot.body, f.name) is not getattr(old.robot.body, f.name) for f in fields(BodyModel) if f.name not in PULLING):
+    if any(
+        getattr(robot.body, f.name) is not getattr(old.robot.body, f.name) for f in fields(BodyModel) if f.name not in PULLING
+    ):
         return False
     rest = robot.body.mesh.nodes
     pairs = [(a.states[k].positions, b.states[k].positions) for a, b in zip(before.fit.jets, after.fit.jets) for k in a.states]
