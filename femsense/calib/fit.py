@@ -9,6 +9,7 @@ import numpy as np
 from scipy.optimize import lsq_linear
 
 from femsense.arrays import BoolArray, FloatArray, freeze
+from femsense.errors import DataError
 
 Evaluate = Callable[[FloatArray, bool], tuple[FloatArray, FloatArray | None]]
 """(θ, with derivative) → whitened residual (N,), Jacobian (N, p) or None. A θ that cannot be evaluated raises DataError."""
@@ -24,7 +25,7 @@ LITTLE = 2.0
 """A step is the last that promised less than so many times what counts as a gain, by a Jacobian of its own."""
 LEAST_SHRINKING = 0.25
 """No step is foretold to be shorter than this share of the one before."""
-GIVEN_UP = "given up"
+CONVERGED, GIVEN_UP = "converged", "given up"
 MOST_DAMPING = 1e8
 WIDTHS = 0.3, 0.1, 0.03, 0.01, 1e-3, 1e-5
 """How far kinks are rounded, in shares of the way that a plain step goes past them; one after the other."""
@@ -112,77 +113,94 @@ def gauss_newton(
         enough: what counts as a gain in the sum of squares, in units of the misfit where that is more than noise; 0: all that `tolerance` says.
         kinks: θ → where the residual bends near by, for the Jacobian that was computed last.
     """
-    from femsense.errors import DataError
-
     p = len(theta)
     low = np.full(p, -np.inf) if low is None else low
     high = np.full(p, np.inf) if high is None else high
     clipped = np.clip(theta, low, high)
     known = known if np.array_equal(clipped, theta) else None
     theta = clipped
-    residual, jacobian, own = _first(evaluate, theta, known, borrowed)
+    residual, slope = _first(evaluate, theta, known, borrowed)
     costs = [float(residual @ residual)]
-    damping, status, steps = 0.0, "iterations", 0
-    length, next_length = np.inf, np.inf  # of the last step with a Jacobian of its own; of the next one, foretold
-    sure: bool | None = own or None  # whether the Jacobian foretold all steps since it was made; None: not known
+    damping, status, steps, pace = 0.0, "iterations", 0, _Pace()
     idle = 0  # idle steps in turn
-    while steps < max_iterations or not own:
-        near = _Near(residual, jacobian, None if kinks is None else kinks(theta), low - theta, high - theta)
+    while steps < max_iterations or not slope.own:
+        near = _Near(residual, slope.J, None if kinks is None else kinks(theta), low - theta, high - theta)
         step = near.step(damping)
-        change, predicted = near.change(step), near.promise(step)
+        change, promised = near.change(step), near.promise(step)
+        whole = promised if damping == 0.0 else near.promise(near.step(0.0))
         error = max(1.0, costs[-1] / max(len(residual), 1)) ** 0.5  # what a standard error is worth where the model misfits
-        small = predicted <= tolerance * costs[-1] or np.linalg.norm(change) <= still * error
-        plain = predicted if damping == 0.0 else near.promise(near.step(0.0))
-        hopeless = costs[-1] - 2.0 * plain > worth
-        if costs[-1] > worth and (hopeless or (not own and (small or steps >= max_iterations))):
+        gain = enough * error**2
+        small = promised <= tolerance * costs[-1] or np.linalg.norm(change) <= still * error
+        at_end = not slope.own and (small or steps >= max_iterations)
+        if costs[-1] > worth and (at_end or costs[-1] - 2.0 * whole > worth):
             status = GIVEN_UP
             break
-        foretold = not own and error == 1.0 and next_length <= still
-        if foretold or idle > 1 or (small and (own or sure or idle)):
-            status = "converged"
+        foretold = not slope.own and error == 1.0 and pace.next <= still
+        if foretold or idle > 1 or (small and (slope.own or slope.sure or idle)):
+            status = CONVERGED
             break
-        if not own and (small or steps >= max_iterations):
-            residual, jacobian, own, sure = *_both(evaluate, theta), True, True
+        if at_end:
+            residual, slope = _both(evaluate, theta)
             continue
         steps += 1
-        try:
-            new_residual, _ = evaluate(theta + step, False)
-            cost = float(new_residual @ new_residual)
-        except DataError:
-            cost = np.inf
-        gain = enough * error**2
-        idle = idle + 1 if plain < NEARLY * gain and not costs[-1] - cost >= gain else 0
-        last = own and plain < LITTLE * gain
-        if not cost <= costs[-1] - 1e-4 * predicted:
-            if not own and idle < 2:
-                residual, jacobian, own, sure = *_both(evaluate, theta), True, True
+        tried = _tried(evaluate, theta + step)
+        cost = np.inf if tried is None else float(tried @ tried)
+        idle = idle + 1 if whole < NEARLY * gain and not costs[-1] - cost >= gain else 0
+        last = slope.own and whole < LITTLE * gain
+        if tried is None or not cost <= costs[-1] - 1e-4 * promised:
+            if not slope.own and idle < 2:
+                residual, slope = _both(evaluate, theta)
                 continue
             damping = _shorter(near, damping, change)
             if last or damping > MOST_DAMPING:
-                status = "converged"
+                status = CONVERGED
                 break
             continue
-        if own:
-            before, length = length, float(np.linalg.norm(change)) if damping == 0.0 else np.inf
-            next_length = _foretold(before, length)
+        if slope.own:
+            pace.took(float(np.linalg.norm(change)) if damping == 0.0 else np.inf)
         damping = damping / 10.0 if damping > 1e-6 else 0.0
-        missed = new_residual - residual - change
-        theta, residual, own = theta + step, new_residual, False
+        missed = tried - residual - change
         off, way = float(np.linalg.norm(missed)), float(np.linalg.norm(change))
-        sure = off < trusted * way and sure is not False
-        if off > max(serves * way, gain**0.5) and not idle and not last and not (error == 1.0 and next_length <= still):
-            residual, jacobian, own, sure = *_both(evaluate, theta), True, True
-        else:
-            jacobian = _as_seen(jacobian, step, near.scale, missed)
+        theta, residual, slope = theta + step, tried, slope.after(step, near.scale, missed, off < trusted * way)
+        ends = idle or last or (error == 1.0 and pace.next <= still)
+        if off > max(serves * way, gain**0.5) and not ends:
+            residual, slope = _both(evaluate, theta)
         costs.append(float(residual @ residual))
         if last:
-            status = "converged"
+            status = CONVERGED
             break
     bends = None if kinks is None or status == GIVEN_UP else kinks(theta)
-    jacobian = jacobian if bends is None else _on_kinks(jacobian, residual, bends)
+    jacobian = slope.J if bends is None else _on_kinks(slope.J, residual, bends)
     return FitResult(
-        freeze(theta), freeze(covariance_of(jacobian)), freeze(residual), freeze(jacobian), tuple(costs), status, own
+        freeze(theta), freeze(covariance_of(jacobian)), freeze(residual), freeze(jacobian), tuple(costs), status, slope.own
     )
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Slope:
+    """The Jacobian at hand, and how far it may be believed."""
+
+    J: FloatArray
+    own: bool = True
+    """Whether it is that at θ."""
+    sure: bool | None = True
+    """Whether it foretold all steps since it was made; None: it was made elsewhere, and no step has been taken by it."""
+
+    def after(self, step: FloatArray, scale: FloatArray, missed: FloatArray, foretold: bool) -> _Slope:
+        """Return it with what it missed along a step."""
+        return _Slope(_as_seen(self.J, step, scale, missed), False, foretold and self.sure is not False)
+
+
+class _Pace:
+    """How long steps with a Jacobian of their own are, and how long the next one will be if they go on shrinking; inf: not known."""
+
+    def __init__(self) -> None:
+        self.last, self.next = np.inf, np.inf
+
+    def took(self, length: float) -> None:
+        """Count a step; inf where it was damped."""
+        self.next = length * max(length / self.last, LEAST_SHRINKING) if length < self.last < np.inf else np.inf
+        self.last = length
 
 
 def _as_seen(J: FloatArray, step: FloatArray, scale: FloatArray, missed: FloatArray) -> FloatArray:
@@ -190,11 +208,6 @@ def _as_seen(J: FloatArray, step: FloatArray, scale: FloatArray, missed: FloatAr
     along = scale**2 * step
     size = float(along @ step)
     return J if size == 0.0 else J + np.outer(missed, along / size)
-
-
-def _foretold(before: float, length: float) -> float:
-    """Return how long the step after two steps will be if they go on shrinking; inf where they do not."""
-    return length * max(length / before, LEAST_SHRINKING) if length < before < np.inf else np.inf
 
 
 def _shorter(near: _Near, damping: float, change: FloatArray) -> float:
@@ -309,19 +322,27 @@ def _cut(value: FloatArray, width: float) -> tuple[FloatArray, FloatArray]:
 
 def _first(
     evaluate: Evaluate, theta: FloatArray, known: tuple[FloatArray, FloatArray | None] | None, borrowed: FloatArray | None
-) -> tuple[FloatArray, FloatArray, bool]:
-    """Return residual and Jacobian to begin with, and whether the Jacobian is that at θ."""
+) -> tuple[FloatArray, _Slope]:
+    """Return residual and Jacobian to begin with."""
     if known is not None and known[1] is not None:
-        return known[0], known[1], True
+        return known[0], _Slope(known[1])
     if borrowed is not None:
-        return evaluate(theta, False)[0], borrowed, False
-    return *_both(evaluate, theta), True
+        return evaluate(theta, False)[0], _Slope(borrowed, own=False, sure=None)
+    return _both(evaluate, theta)
 
 
-def _both(evaluate: Evaluate, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _both(evaluate: Evaluate, theta: FloatArray) -> tuple[FloatArray, _Slope]:
     residual, jacobian = evaluate(theta, True)
     assert jacobian is not None
-    return residual, jacobian
+    return residual, _Slope(jacobian)
+
+
+def _tried(evaluate: Evaluate, theta: FloatArray) -> FloatArray | None:
+    """Return the residual; None where θ cannot be evaluated."""
+    try:
+        return evaluate(theta, False)[0]
+    except DataError:
+        return None
 
 
 def _bounded_step(
