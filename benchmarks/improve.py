@@ -1,7 +1,7 @@
 """How long `femsense improve` takes: 100 frames, 20 effects, 1536 tetrahedra.
 
     python benchmarks/improve.py                        # tet10 and tet4, something hidden and nothing, three runs each
-    python benchmarks/improve.py --case tet10/friction --runs 1
+    python benchmarks/improve.py --case tet10/friction --case tet10/gain --runs 1
     python benchmarks/improve.py --case tet4/friction --without discretisation
 
 A bar of 120 × 24 × 24 mm with four cables (16 × 4 × 4 cells, six tetrahedra each) goes through ten sweeps of ten frames: up, held, down. Truth
@@ -55,6 +55,11 @@ HIDDEN: dict[str, tuple[dict[str, Any], ...]] = {
     "nothing": (),
     "clamp": ({"name": "base_compliance", "stiffness_n_m": 60.0},),
     "friction": ({"name": "cable_friction", "coefficient": 0.15},),
+    "gain": ({"name": "cable_gain", "scale": {"b": 0.88}},),
+    "creep": ({"name": "creep", "fraction": 0.12, "time_s": 8.0},),
+    "payload": ({"name": "payload", "point_m": [0.09, 0.0, 0.012], "force_n": [0.03, -0.05, -0.08]},),
+    "soft": ({"name": "soft_region", "center_m": [0.045, 0.0, 0.0], "radius_m": 0.02, "scale": 0.6},),
+    "depth": ({"name": "depth_scale", "scale": 1.015, "offset_m": 0.0},),
     "two": ({"name": "cable_friction", "coefficient": 0.15}, {"name": "creep", "fraction": 0.12, "time_s": 8.0}),
 }
 OWN = {
@@ -213,7 +218,7 @@ def main() -> None:
     parser.add_argument(
         "--case",
         action="append",
-        help="ELEMENT/HIDDEN, of tet10 | tet4 and nothing | clamp | friction | two; several by repeating",
+        help=f"ELEMENT/HIDDEN, of tet10 | tet4 and {' | '.join(HIDDEN)}; several by repeating",
     )
     parser.add_argument("--runs", type=int, default=3)
     parser.add_argument(

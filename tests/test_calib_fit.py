@@ -298,6 +298,18 @@ def test_idle_steps_end_a_fit() -> None:
     assert asked[1] == 3  # the start and two idle ones
 
 
+def test_what_is_little_is_not_told_by_the_misfit() -> None:
+    def evaluate(theta: np.ndarray, derivative: bool) -> tuple[np.ndarray, np.ndarray | None]:
+        x = theta[0]
+        r, slope = (
+            (30.0 - 18.0 * x, -18.0) if x < 1.0 else (24.0 - 12.0 * x, -12.0)
+        )  # the first step goes a third of the way too short
+        return np.array([40.0, r]), np.array([[0.0], [slope]]) if derivative else None
+
+    fit = gauss_newton(evaluate, np.zeros(1), enough=0.5)
+    assert fit.cost[-1] == pytest.approx(1600.0)
+
+
 @pytest.mark.parametrize("pays", [True, False])
 def test_a_step_that_promises_little_by_its_own_jacobian_is_the_last(pays: bool) -> None:
     ends, asked = [], []

@@ -22,7 +22,8 @@ STILL = 1e-2
 NEARLY = 4.0
 """A step is idle that gained less than what counts as a gain where a whole step promised less than so many times that."""
 LITTLE = 2.0
-"""A step is the last that promised less than so many times what counts as a gain, by a Jacobian of its own."""
+"""A step is the last that promised less than so many times what counts as a gain, by a Jacobian of its own; not in units of the misfit, which
+may be large because the fit is far from its end."""
 LEAST_SHRINKING = 0.25
 """No step is foretold to be shorter than this share of the one before."""
 CONVERGED, GIVEN_UP = "converged", "given up"
@@ -146,7 +147,7 @@ def gauss_newton(
         tried = _tried(evaluate, theta + step)
         cost = np.inf if tried is None else float(tried @ tried)
         idle = idle + 1 if whole < NEARLY * gain and not costs[-1] - cost >= gain else 0
-        last = slope.own and whole < LITTLE * gain
+        last = slope.own and whole < LITTLE * enough
         if tried is None or not cost <= costs[-1] - 1e-4 * promised:
             if not slope.own and idle < 2:
                 residual, slope = _both(evaluate, theta)
