@@ -207,7 +207,7 @@ def test_springs_of_a_clamp_do_not_sink_into_the_finer_mesh():
     assert by_clamp < 3.0 * by_firm
 
 
-@pytest.mark.parametrize("name, size, alike", [("cable_friction", 0.05, True), ("cable_friction", 0.5, False), ("depth_scale", 1.03, True),
+@pytest.mark.parametrize("name, size, alike", [("cable_friction", 0.01, True), ("cable_friction", 0.3, False), ("depth_scale", 1.03, True),
                                                ("gravity", 1.0, False), ("poisson", 0.4, False), ("base_compliance", 1e5, False)])  # fmt: skip
 def test_the_mesh_errs_in_another_way_where_the_body_is_another_or_goes_elsewhere(name: str, size: float, alike: bool):
     robot = arm((4, 1, 1))
