@@ -66,6 +66,7 @@ SABOTAGES = (
     S("calib/fit.py", "foretold and self.sure is not False", "True", "test_calib_fit.py::test_a_jacobian_that_missed_next_to_nothing_of_a_step_is_believed_at_the_end"),
     S("calib/fit.py", "foretold or idle > 1 or", "foretold or", "test_calib_fit.py::test_idle_steps_end_a_fit"),
     S("calib/fit.py", "last = slope.own and whole < LITTLE * enough", "last = False", "test_calib_fit.py::test_a_step_that_promises_little_by_its_own_jacobian_is_the_last"),
+    S("calib/fit.py", "whole < LITTLE * enough", "whole < LITTLE * gain", "test_calib_fit.py::test_what_is_little_is_not_told_by_the_misfit"),
     S("calib/fit.py", "if last or damping > MOST_DAMPING", "if damping > MOST_DAMPING", "test_calib_fit.py::test_a_step_that_promises_little_by_its_own_jacobian_is_the_last"),
     S("calib/fit.py", "if whole < NEARLY * gain", "if promised < NEARLY * gain", "test_calib_fit.py::test_a_step_that_struggles_far_from_the_end_is_not_idle"),
     S("loop/joint.py", "problem.evaluate(fit.theta, False)", "pass", "test_loop_screen.py::test_a_fit_that_ends_on_its_way_has_the_residual_of_its_end"),

@@ -301,9 +301,7 @@ def test_idle_steps_end_a_fit() -> None:
 def test_what_is_little_is_not_told_by_the_misfit() -> None:
     def evaluate(theta: np.ndarray, derivative: bool) -> tuple[np.ndarray, np.ndarray | None]:
         x = theta[0]
-        r, slope = (
-            (30.0 - 18.0 * x, -18.0) if x < 1.0 else (24.0 - 12.0 * x, -12.0)
-        )  # the first step goes a third of the way too short
+        r, slope = (30.0 - 18.0 * x, -18.0) if x < 1.0 else (24.0 - 12.0 * x, -12.0)  # the first step falls short
         return np.array([40.0, r]), np.array([[0.0], [slope]]) if derivative else None
 
     fit = gauss_newton(evaluate, np.zeros(1), enough=0.5)
