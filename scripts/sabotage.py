@@ -208,7 +208,7 @@ SABOTAGES = (
     S("loop/conclude.py", "shown = not zeros and", "shown =", "test_loop_screen.py::test_a_larger_error_is_not_for_zeros_of_cables_which_much_else_looks_like"),
     S("loop/conclude.py", "if mesh and before.held_rms > BEYOND_NOISE * noise.total:", "if False:", "test_loop_screen.py::test_where_the_data_are_explained_by_what_the_mesh_costs_the_sentence_says_so"),
     S("loop/mesh_error.py", 'if "discretisation" not in tried and len(mesh.tets) <= MOST_TETS else None', "if False else None", "test_loop_parts.py::test_a_linear_mesh_has_no_error_where_it_is_asked_about_as_an_effect"),
-    S("loop/mesh_error.py", "        if effect not in known:", "        if effect in known:", "test_loop_parts.py::test_the_mesh_errs_in_another_way_where_the_body_is_another_or_goes_elsewhere"),
+    S("loop/mesh_error.py", "if name not in old.names])", "if name in old.names])", "test_loop_parts.py::test_the_mesh_errs_in_another_way_where_the_body_is_another_or_goes_elsewhere"),
     S("loop/mesh_error.py", "<= ELSEWHERE * rms_of(", "<= 1e3 * rms_of(", "test_loop_parts.py::test_the_mesh_errs_in_another_way_where_the_body_is_another_or_goes_elsewhere"),
     S("loop/conclude.py", "if not mesh or data.robot.body.mesh.is_quadratic or", "if not mesh or", "test_loop_screen.py::test_effects_that_are_named_on_linear_elements_may_stand_for_these"),
     S("rig/truth.py", "motors = passes[-1] if ahead is None else ahead", "motors = self._motors(load)", "test_rig_truth.py::test_held_cables_that_rub_come_to_rest_when_they_are_let_out"),

@@ -95,7 +95,8 @@ def gauss_newton(
     A Jacobian that predicted the last step well serves for the next one too; the fit ends only where the Jacobian at θ itself says that
     there is nothing left to gain (or one that is `trusted`), or, where what is left is noise, where it would: steps of a Gauss–Newton fit, each
     with a Jacobian of its own, shrink like a geometric series, so that two of them foretell the next. It ends as well where two steps in turn
-    were idle, promised little and brought less (`enough`), or one and the next would move by nothing: on a kink there may always be a little to gain.
+    were idle, promised little and brought less (`enough`), or one and the next would move by nothing: on a kink there may always be a little to gain. And a step
+    that promises next to nothing by a Jacobian of its own is the last (`LITTLE`), whatever it brings.
 
     Arguments:
         evaluate: residual and Jacobian; priors are rows of them.

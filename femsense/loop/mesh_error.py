@@ -24,7 +24,7 @@ from femsense.fem.body import BodyModel
 from femsense.fem.mesh import Embedding, TetMesh, embed_points
 from femsense.loop.data import Data
 from femsense.loop.joint import Trial, normals_of, rms_of
-from femsense.loop.stages import Stage, placed
+from femsense.loop.stages import Stage, placed, some_terms
 from femsense.march import Walk, drive_of, finer_state, share_on_finer, walk_along
 from femsense.model import Robot
 from femsense.parallel import each
@@ -72,12 +72,9 @@ def with_mesh_errors(data: Data, stage: Stage, tried: Sequence[str]) -> Data:
 def errs_alike(before: Stage, after: Stage) -> bool:
     """Return whether the mesh errs after an effect was added as it did before: where the effect changes nothing of the body but how its cables
     pull, or what the camera sees, and the states are nearly the same."""
-    old, new = before.fit.hypothesis, after.fit.hypothesis
-    known = [effect for effect, _, _ in old.terms]
-    robot = new.robot
-    for (effect, _, _), entry in zip(new.terms, new.entries(after.fit.coordinates)):
-        if effect not in known:
-            robot = effect.apply(robot, {k: v for k, v in entry.items() if k != "name"})
+    old = before.fit.hypothesis
+    added, _, mask = some_terms(after, [name for name in after.fit.hypothesis.names if name not in old.names])
+    robot = added.robot_at(after.fit.coordinates[mask])
     if any(
         getattr(robot.body, f.name) is not getattr(old.robot.body, f.name) for f in fields(BodyModel) if f.name not in PULLING
     ):

@@ -112,7 +112,7 @@ def keeping(
     data: Data, stage: Stage, names: Sequence[str], noise: Noise, *, max_iterations: int = 12, worth: float = np.inf
 ) -> Stage:
     """Return a stage with some of its terms only, fitted again (roughly where χ² stays above `worth`). Raises DataError."""
-    hypothesis, prior, mask = _some_terms(stage, names)
+    hypothesis, prior, mask = some_terms(stage, names)
     return make_stage(
         data,
         hypothesis,
@@ -128,7 +128,7 @@ def keeping(
 
 def with_sizes_still(data: Data, stage: Stage, names: Sequence[str], noise: Noise) -> Stage:
     """Return a stage with some of its terms only, which keep the sizes that they have beside all of them; poses are fitted again. Raises DataError."""
-    hypothesis, _, mask = _some_terms(stage, names)
+    hypothesis, _, mask = some_terms(stage, names)
     sizes = stage.fit.coordinates[mask]
     still = Prior(sizes, STILL * stage.fit.std[mask])
     return make_stage(data, hypothesis, still, noise, sizes, own=own_of(stage), near=jets_without(stage, mask))
@@ -159,7 +159,7 @@ def with_seeds_still(data: Data, stage: Stage) -> Stage:
     return replace(stage, fit=less)
 
 
-def _some_terms(stage: Stage, names: Sequence[str]) -> tuple[Hypothesis, Prior, BoolArray]:
+def some_terms(stage: Stage, names: Sequence[str]) -> tuple[Hypothesis, Prior, BoolArray]:
     """Return the hypothesis and prior of a stage with some of its terms only, and which coordinates these have."""
     terms = stage.fit.hypothesis.terms
     mask = np.concatenate([np.full(len(p), e.name in names) for e, _, p in terms]) if terms else np.zeros(0, dtype=bool)
@@ -169,7 +169,7 @@ def _some_terms(stage: Stage, names: Sequence[str]) -> tuple[Hypothesis, Prior, 
 
 def roughly_keeping(data: Data, stage: Stage, names: Sequence[str], noise: Noise, frames: Sequence[IntArray]) -> Stage:
     """Return a stage with some of its terms only, fitted in a few steps to some frames of each trial; nothing is held out. Raises DataError."""
-    hypothesis, prior, mask = _some_terms(stage, names)
+    hypothesis, prior, mask = some_terms(stage, names)
     trials = [t.part(f) for t, f in zip(data.train, frames)]
     fit = fit_jointly(
         hypothesis, prior, trials, noise, data.seat_std, stage.fit.coordinates[mask], own=own_of(stage), max_iterations=ROUGHLY
