@@ -23,8 +23,9 @@ from loop_cases import Case, make_cases, make_data
 from femsense.errors import FemsenseError
 from femsense.loop import improve
 from femsense.loop.data import Data
-from femsense.loop.grow import EVIDENCE, PROMISING, REFITTABLE
+from femsense.loop.grow import PROMISING, REFITTABLE
 from femsense.loop.noise import Noise
+from femsense.loop.refit import EVIDENCE
 from femsense.loop.screen import Candidate, Fields
 from femsense.loop.stages import Stage, fields_of, screen_stage
 

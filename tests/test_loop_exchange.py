@@ -15,9 +15,11 @@ from femsense.effects import find_effect
 from femsense.loop import grow
 from femsense.loop.data import Data, prepare
 from femsense.loop.exchange import exchanged
-from femsense.loop.grow import Refit, _closer, evidence, judged, polished, refit, shortlist, without_last
+from femsense.loop.grow import Refit, judged, polished, shortlist
 from femsense.loop.joint import Prior
 from femsense.loop.noise import Noise, whiten
+from femsense.loop.place import closer, without_last
+from femsense.loop.refit import evidence, refit
 from femsense.loop.screen import Candidate, linear_gain
 from femsense.loop.spread import spreads
 from femsense.loop.stages import Stage, fields_of, make_stage, own_of, screen_stage, with_nuisance
@@ -337,9 +339,9 @@ def test_a_place_moves_on_where_the_body_is_as_the_load_has_bent_it():
     alone = without_last(stage.fit)
     back = alone.fit.residual + np.asarray(stage.fit.fit.jacobian)[:, -3:] @ stage.fit.coordinates[-3:]
     np.testing.assert_allclose(back, stage.fit.fit.residual, atol=1e-9)
-    closer, scatter = _closer(data, stage, NOISE)
-    assert np.linalg.norm(np.subtract(closer.fit.hypothesis.terms[-1][1]["point_m"], hidden["point_m"])) < 0.004
-    assert closer.fit.chi2 < 0.5 * stage.fit.chi2 and np.all(np.array(scatter) < 0.2)
+    moved, scatter = closer(data, stage, NOISE)
+    assert np.linalg.norm(np.subtract(moved.fit.hypothesis.terms[-1][1]["point_m"], hidden["point_m"])) < 0.004
+    assert moved.fit.chi2 < 0.5 * stage.fit.chi2 and np.all(np.array(scatter) < 0.2)
     whole = polished(data, base, Refit(candidate, stage, 0.0, 0.0, {}), NOISE, lambda text: None).stage
     found, std = whole.fit.coordinates[-6:], spreads(data, whole, NOISE, {})["payload"]
     assert whole.fit.hypothesis.entries(whole.fit.coordinates)[-1]["point_m"] == found[3:].tolist()

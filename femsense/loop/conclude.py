@@ -14,10 +14,11 @@ from femsense.errors import FemsenseError
 from femsense.loop.advice import next_element
 from femsense.loop.data import Data
 from femsense.loop.evidence import gather
-from femsense.loop.grow import EVIDENCE, at_edge
+from femsense.loop.grow import at_edge
 from femsense.loop.joint import Trial, heads_of, normal_rms_of, rms_of, vectors_of
 from femsense.loop.mesh_error import few_states, mesh_errors
 from femsense.loop.noise import Noise, whiten
+from femsense.loop.refit import EVIDENCE
 from femsense.loop.result import LoopResult
 from femsense.loop.screen import NUISANCE, TESTABLE, Candidate, confounding, one_each
 from femsense.loop.spread import spreads

@@ -12,8 +12,10 @@ from typing import Any
 
 from femsense.errors import FemsenseError
 from femsense.loop.data import Data
-from femsense.loop.grow import EVIDENCE, Progress, Refit, evidence, judged, polished, refit, shortlist, tilt_cost, weighs
+from femsense.loop.grow import Progress, Refit, judged, polished, shortlist, tilt_cost, weighs
 from femsense.loop.noise import Noise
+from femsense.loop.place import may_lie_elsewhere
+from femsense.loop.refit import EVIDENCE, evidence, refit
 from femsense.loop.screen import NUISANCE, Candidate
 from femsense.loop.stages import Stage, fields_of, keeping, screen_stage
 
@@ -36,7 +38,7 @@ def exchanged(
     for name in [name for name, _ in history[1:-1]]:
         stage = history[-1][1]
         rivals = _rivals(stage, refits, name)
-        if not rivals:
+        if not rivals or (rivals == [name] and not may_lie_elsewhere(data, stage, name, noise)):
             continue
         say(f"refitting {' or '.join(rivals)} in the place of {name}")
         try:

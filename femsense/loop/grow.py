@@ -10,23 +10,21 @@ import numpy as np
 
 from femsense.arrays import FloatArray
 from femsense.calib.fit import GIVEN_UP
-from femsense.calib.forward import Hypothesis
-from femsense.effects import Effect, Entry, Parameter, find_effect
-from femsense.effects.loads import STANDARD_GRAVITY
-from femsense.errors import DataError, FemsenseError
+from femsense.effects import find_effect
+from femsense.errors import FemsenseError
 from femsense.loop.data import Data
 from femsense.loop.joint import JointFit, Prior, rms_of
 from femsense.loop.mesh_error import mesh_errors
 from femsense.loop.noise import Noise
+from femsense.loop.place import POLISHED, placed
 from femsense.loop.predict import sweeps_predicted
-from femsense.loop.screen import NUISANCE, Candidate, effect_fields, linear_gain, penalty, screen
+from femsense.loop.refit import EVIDENCE, FORGONE, beyond, evidence, explains, refit, tried, with_term, within
+from femsense.loop.screen import NUISANCE, Candidate, linear_gain, penalty
 from femsense.loop.stages import (
     QUADRATIC,
     Stage,
     held_chi2,
     held_shift,
-    jets_with,
-    jets_without,
     keeping,
     make_stage,
     own_of,
@@ -38,8 +36,6 @@ REFITS = 6
 """Candidates that are refitted in full nonlinearity at the first step; half as many later."""
 REFITTABLE = 0.04
 """A candidate of which calibration leaves less than this is not refitted."""
-EVIDENCE = 10.0
-"""dBIC that a named effect needs."""
 PROMISING = 8.0
 """Linear dBIC that a candidate needs to be refitted: what is small is nearly linear, so that a refit finds about as much."""
 HINTED = 0.5
@@ -48,14 +44,6 @@ ENOUGH_SPREAD = 0.5
 """Standard errors by which the prediction of left-out sweeps must get better."""
 PREDICTS = 0.25
 """Share of the decrease of χ², a row, that must show on held-out rows too (unless the effect hardly acts there)."""
-NEARLY = 0.05
-"""Seeds whose gain is less by this share are as good."""
-STARTS = 3
-"""So many seeds of an effect, the best, are improved."""
-ROUNDS = 4
-"""So often an effect's seed is moved to a neighbour that explains more."""
-PROMISED = 0.3
-"""A fit from the null that brings less than this share of the linear gain is tried from other starts too."""
 ABOVE_MESH = 0.5
 """An effect must move the markers by this much of what the mesh itself costs (beyond what calibration absorbs) …"""
 ABOVE_MESH_IF_SURE = 0.25
@@ -64,21 +52,11 @@ NOT_PLAINLY_WORSE = 1.25
 """No effect may leave so many times the plain error where fitted: it would live on a larger share of what the mesh costs."""
 MOUNTED = np.radians(5.0)
 """A base is mounted as it is declared to about this angle, and a declared gravity is believed as much [rad]."""
-DECLARED = -1.0
-"""Start from what is declared, where a discrete alternative does not fit from where calibration has gone without it …"""
-STRAYED = 2.0
-"""… or where this has gone so many of the standard deviations known beforehand, for the sake of what is missing …"""
-EXPLAINS = 1.25
-"""… and an effect leaves more than this mean square from there, in units of the noise. Until one leaves less, linear scores say little."""
 SURE = 2.5
 """Standard errors of the gain on left-out sweeps beyond which held-out data need only not speak against an effect."""
-POLISHED = 2.0
-"""Decrease of χ² that each further parameter of a polished effect must bring."""
 
 MORE_STEPS = 30
 """Steps for a refit that could win and is still on its way after the first ones."""
-FORGONE = 2.0, 1.25
-"""A refit is given up where the evidence in sight is too little by this much and this factor."""
 
 Progress = Callable[[str], None]
 
@@ -108,7 +86,7 @@ def grow(
     asked = _quadratic(data, stage, names, n_effective) if first else []
     screened = [c for c in shortlist(table, first=first) if not any(c.effect is a.effect and c.seed == a.seed for a in asked)]
     for candidate in [*asked, *screened]:
-        ahead = [r for r in refits if r.record["verdict"] == "passes" and _explains(r.stage)]
+        ahead = [r for r in refits if r.record["verdict"] == "passes" and explains(r.stage)]
         best = max((r.score for r in ahead), default=-np.inf)
         behind = candidate.score < max((0.5 * _bar(r, candidate) for r in ahead), default=-np.inf) - EVIDENCE
         if behind and not weighs(data, candidate.effect.name):
@@ -117,7 +95,14 @@ def grow(
         record: dict[str, Any] = {"name": candidate.effect.name, "seed": candidate.seed}
         records.append(record)
         try:
-            made = refit(data, stage, candidate, noise, wanted=max(EVIDENCE, best - 2.0 * EVIDENCE))
+            made = refit(
+                data,
+                stage,
+                candidate,
+                noise,
+                wanted=max(EVIDENCE, best - 2.0 * EVIDENCE),
+                settled=_settled(data, candidate, ahead),
+            )
         except FemsenseError as error:
             record["verdict"] = f"no equilibrium: {error}"
             continue
@@ -137,6 +122,16 @@ def grow(
     winner.record["verdict"] = "named"
     ties = [r for r in leaders if r.candidate.effect.name != winner.candidate.effect.name]
     return winner, sorted(ties, key=lambda r: -r.score), records
+
+
+def _settled(data: Data, candidate: Candidate, ahead: Sequence[Refit]) -> bool:
+    """Return whether what a refit ends with is the last word on it: others explain the data, and it has no place or time to move."""
+    effect = candidate.effect
+    return (
+        bool(ahead)
+        and not effect.nearby(data.robot, candidate.seed)
+        and not effect.polish(data.robot, data.control, candidate.seed)
+    )
 
 
 def _bar(ahead: Refit, candidate: Candidate) -> float:
@@ -205,7 +200,7 @@ def _richer(data: Data, stage: Stage, winner: Refit, form: Candidate, noise: Noi
     settled, terms = winner.stage.fit.hypothesis.settled, winner.stage.fit.hypothesis.terms
     keys = {p.key for p in form.parameters}
     if settled != stage.fit.hypothesis.settled or not {p.key for p in terms[-1][2]} <= keys:
-        return _tried(data, stage, form, noise, winner.score + EVIDENCE)
+        return tried(data, stage, form, noise, winner.score + EVIDENCE)
     split = len(winner.stage.fit.coordinates) - len(terms[-1][2])
     found = {(p.key, p.part): float(v) for p, v in zip(terms[-1][2], winner.stage.fit.coordinates[split:])}
     own = [found.get((p.key, p.part), found.get((p.key, None), p.null)) for p in form.parameters]
@@ -215,7 +210,7 @@ def _richer(data: Data, stage: Stage, winner: Refit, form: Candidate, noise: Noi
         price = (form.cost - winner.candidate.cost + EVIDENCE - FORGONE[0]) / FORGONE[1]
         if linear_gain(winner.stage.fit, problem_of(data, winner.stage.fit, noise), form.raw, form.seats) < HINTED * price:
             return None
-        worth = _within(winner.stage.fit, price)
+        worth = within(winner.stage.fit, price)
         return make_stage(data, hypothesis, prior, noise, coordinates, own=own_of(winner.stage), max_iterations=10, worth=worth)
     except FemsenseError:
         return None
@@ -325,122 +320,6 @@ def sure_beyond_mesh(better: float, spread: float, held: float, expected: float)
     return better > SURE * spread and held * better > 2.0 * SURE * spread * expected
 
 
-def evidence(before: JointFit, after: JointFit) -> float:
-    """Return the decrease of χ², or that of (rows − parameters) log χ² where it is smaller: the scale of the noise is an estimate too."""
-    freedom = max(len(after.fit.residual) - len(after.fit.theta), 1)
-    return min(before.chi2 - after.chi2, freedom * float(np.log(before.chi2 / max(after.chi2, 1e-12))))
-
-
-def _within(fit: JointFit, price: float) -> float:
-    """Return the χ² below which a model with something more is better than a fit by so much evidence."""
-    freedom = max(len(fit.fit.residual) - len(fit.fit.theta), 1)
-    return min(fit.chi2 - price, fit.chi2 * float(np.exp(-price / freedom)))
-
-
-def _beyond(fit: JointFit, price: float) -> float:
-    """Return the χ² beyond which a model without something is worse than a fit by so much evidence."""
-    freedom = max(len(fit.fit.residual) - len(fit.fit.theta), 1)
-    return fit.chi2 * float(np.exp(price / freedom)) + price
-
-
-def refit(data: Data, stage: Stage, candidate: Candidate, noise: Noise, *, wanted: float = EVIDENCE) -> Stage:
-    """Joint fit with one more effect, started from its linear step. Raises DataError where no start helps.
-
-    Where the dBIC would stay well below what is wanted, the fit is given up on its way.
-    """
-    null = np.array([p.null for p in candidate.parameters])
-    low, high = np.array([p.low for p in candidate.parameters]), np.array([p.high for p in candidate.parameters])
-    start = null if candidate.effect.discrete else np.clip(_first_guess(candidate, null), low, high)
-    hypothesis, prior = with_term(stage.fit, candidate.effect, candidate.seed, candidate.parameters)
-    gravity = candidate.effect.name == "gravity"
-    free = not candidate.effect.discrete and not gravity  # for these the null is no start
-    answer = 0.0 if candidate.effect.discrete else candidate.response @ (start - null)  # of what is fitted already
-    worth = _within(stage.fit, (candidate.cost + wanted - FORGONE[0]) / FORGONE[1])
-
-    def fitted(share: float) -> Stage | None:
-        part = share if share != DECLARED else 0.0 if free else 1.0
-        known = jets_with(stage, candidate) if free and share == 0.0 else None
-        near = stage.fit.jets if not candidate.parameters and share != DECLARED else None
-        try:
-            theta = _declared(data, stage, hypothesis, noise) if share == DECLARED else stage.fit.fit.theta + share * answer
-            coordinates = np.concatenate([theta[stage.fit.own :], null + part * (start - null)])
-            return make_stage(
-                data, hypothesis, prior, noise, coordinates,
-                own=theta[: stage.fit.own], max_iterations=10, known=known, near=near, worth=worth,
-            )  # fmt: skip
-        except DataError:
-            return None
-
-    best: Stage | None = None
-    given_up: Stage | None = None
-    for share in _shares(candidate, free):
-        made = fitted(share)
-        if made is not None and made.fit.chi2 <= (stage.fit.chi2 + 1.0 if best is None else best.fit.chi2):
-            best = made
-        if made is not None and made.fit.fit.status == GIVEN_UP:
-            given_up = made
-            break
-        if best is not None and not (free and share == 0.0 and stage.fit.chi2 - best.fit.chi2 <= PROMISED * candidate.gain):
-            break
-    if gravity and _has_strayed(stage) and not _explains(best):
-        made = fitted(DECLARED)
-        best = made if made is not None and (best is None or made.fit.chi2 <= best.fit.chi2) else best
-    found = best or given_up
-    if found is None:
-        raise DataError("no start from which the fit improves")
-    return found
-
-
-def _shares(candidate: Candidate, free: bool) -> tuple[float, ...]:
-    """Return the shares of the linear step from which a refit may start, in order: that step may go too far."""
-    if candidate.effect.discrete:
-        return (1.0, DECLARED) if candidate.gain < np.inf else (DECLARED, 1.0)
-    return (0.0, 1.0, 0.3) if free else (1.0, 0.3, 0.0)
-
-
-def _has_strayed(stage: Stage) -> bool:
-    """Return whether calibration alone has gone far beyond what is known of it beforehand."""
-    fit = stage.fit
-    known = np.isfinite(fit.prior.std)
-    far = np.abs(fit.coordinates - fit.prior.mean)[known] > STRAYED * fit.prior.std[known]
-    return bool(far.any()) and all(name in NUISANCE for name in fit.hypothesis.names)
-
-
-def _explains(stage: Stage | None) -> bool:
-    """Return whether a model leaves little more than the noise where it is fitted."""
-    return stage is not None and stage.fit.chi2 < EXPLAINS * max(len(stage.fit.fit.residual) - len(stage.fit.fit.theta), 1)
-
-
-def _declared(data: Data, stage: Stage, hypothesis: Hypothesis, noise: Noise) -> FloatArray:
-    """Return where an effect starts if what is fitted stays as declared: with its own poses and initial inputs."""
-    alone = replace(hypothesis, terms=())
-    for trial in data.train:
-        if hypothesis.robot.body.mesh is not stage.fit.hypothesis.robot.body.mesh:
-            trial.starts_on(hypothesis.robot.body.mesh).clear()  # states that were carried there from elsewhere may have folded
-    nothing = Prior(np.zeros(0), np.zeros(0))
-    placed = make_stage(data, alone, nothing, noise, np.zeros(0), own=own_of(stage))
-    return np.concatenate([own_of(placed), stage.fit.prior.mean])
-
-
-def with_term(fit: JointFit, effect: Effect, seed: Entry, parameters: tuple[Parameter, ...]) -> tuple[Hypothesis, Prior]:
-    """Return the hypothesis of a fit with one more effect, and its prior."""
-    old = fit.hypothesis
-    if not parameters:
-        settled = (*old.settled, (effect, seed))
-        return replace(old, robot=effect.apply(old.robot, seed), settled=settled), fit.prior
-    null = np.array([p.null for p in parameters])
-    prior = Prior(np.concatenate([fit.prior.mean, null]), np.concatenate([fit.prior.std, [p.known for p in parameters]]))
-    return replace(old, terms=(*old.terms, (effect, seed, parameters))), prior
-
-
-def _first_guess(candidate: Candidate, null: FloatArray) -> FloatArray:
-    """Return the linear step; for gravity its direction with the size that is known."""
-    start = null + candidate.step
-    if candidate.effect.name == "gravity":
-        start = start / max(float(np.linalg.norm(start)), 1e-9) * STANDARD_GRAVITY
-    return np.asarray(start)
-
-
 def _taken_over(before: Stage, after: Stage) -> list[str]:
     """Return the nuisances that are significant before an effect is added, and not after."""
     return [n for n in NUISANCE if _z(before, n) > 3.0 and _z(after, n) < 3.0]
@@ -526,7 +405,7 @@ def _polish(data: Data, stage: Stage, winner: Refit, noise: Noise, say: Progress
     best, effect = winner.stage, winner.candidate.effect
     if effect.nearby(data.robot, winner.candidate.seed):
         say(f"looking near by for {effect.name}")
-        best, winner.record["seed_spread"] = _placed(data, stage, winner, noise)
+        best, winner.record["seed_spread"] = placed(data, stage, winner.candidate, winner.stage, noise)
     else:
         winner.record["seed_spread"] = [0.0] * len(winner.candidate.parameters)
     if not winner.candidate.parameters:
@@ -547,100 +426,6 @@ def _polish(data: Data, stage: Stage, winner: Refit, noise: Noise, say: Progress
     return made if made.fit.chi2 < best.fit.chi2 - POLISHED * len(more) and inside else best
 
 
-def _placed(data: Data, stage: Stage, winner: Refit, noise: Noise) -> tuple[Stage, list[float]]:
-    """Return the best of the fits that begin where the climbs from several seeds end, its seed moved on, and the scatter of its parameters:
-    that of `_closer`, or that over the places that explain as much where this is larger."""
-    ends = [_closer(data, winner.stage, noise)]
-    for candidate in _climbed(data, stage, winner.candidate, noise):
-        made = _tried(data, stage, candidate, noise)
-        if made is not None and made.fit.fit.status != GIVEN_UP:
-            ends.append(_closer(data, made, noise))
-    best, scatter = min(ends, key=lambda end: end[0].fit.chi2)
-    values = [s.fit.coordinates[-len(scatter) :] for s, _ in ends if s.fit.chi2 < best.fit.chi2 + EVIDENCE]
-    return best, np.maximum(scatter, np.std(values, axis=0)).tolist()
-
-
-def _climbed(data: Data, stage: Stage, start: Candidate, noise: Noise) -> list[Candidate]:
-    """Return where the best STARTS seeds come to when each goes from neighbour to neighbour, the best first: a soft place here and a stiff
-    one there look alike when the modulus is open."""
-    others = _screen_seeds(data, stage, start, start.effect.seeds(data.robot), noise)
-    ends = list[Candidate]()
-    for begin in [start, *(c for c in others if c.seed != start.seed)][:STARTS]:
-        here = begin
-        for _ in range(ROUNDS):
-            around = _screen_seeds(data, stage, start, start.effect.nearby(data.robot, here.seed), noise)
-            found = max([here, *around], key=lambda c: c.gain)
-            if found.gain < here.gain + POLISHED:
-                break
-            here = found
-        if here is not start and not any(here.seed == end.seed for end in ends):
-            ends.append(here)
-    most = max((end.gain for end in ends), default=0.0)
-    return sorted((end for end in ends if end.gain > 0.5 * most), key=lambda c: -c.gain)
-
-
-def _scatter(seen: Sequence[Candidate], best: Candidate) -> list[float]:
-    """Return by how much the steps of those that explain nearly as much as the best scatter."""
-    steps = [c.step for c in seen if c.gain >= best.gain - max(EVIDENCE, NEARLY * best.gain)]
-    return [float(v) for v in np.std(steps, axis=0)]
-
-
-def _closer(data: Data, stage: Stage, noise: Noise) -> tuple[Stage, list[float]]:
-    """Return a stage whose last effect has moved to neighbours of its seed as long as these explain more where the body is as the effect
-    has bent it (what a seed does to the body before that ranks neighbours of a large effect wrongly), and by how much the step of each of
-    its parameters scatters over the seeds that explain as much but for NEARLY."""
-    while True:
-        *_, (effect, seed, parameters) = stage.fit.hypothesis.terms
-        fields = effect_fields(stage.fit, data.train, [(effect, s, parameters) for s in effect.nearby(data.robot, seed)])
-        around = screen(without_last(stage.fit), problem_of(data, stage.fit, noise), fields, 100.0)
-        here = next((c for c in around if c.seed == seed), None)
-        if here is None:  # it does nothing to these markers
-            return stage, [0.0] * len(parameters)
-        best = max(around, key=lambda c: c.gain)
-        if best.gain < here.gain + POLISHED:
-            return stage, _scatter(around, best)
-        made = _moved(data, stage, best, noise)
-        if made is None or made.fit.chi2 > stage.fit.chi2 - POLISHED:
-            return stage, _scatter(around, best)
-        stage = made
-
-
-def without_last(fit: JointFit) -> JointFit:
-    """Return a fit as it would be without its last effect if all were linear about where it is."""
-    *terms, (_, _, parameters) = fit.hypothesis.terms
-    q, J = len(parameters), np.asarray(fit.fit.jacobian)
-    own = fit.coordinates[-q:] - np.array([p.null for p in parameters])
-    less = replace(fit.fit, theta=fit.fit.theta[:-q], residual=fit.fit.residual - J[:, -q:] @ own, jacobian=J[:, :-q])
-    return replace(fit, hypothesis=replace(fit.hypothesis, terms=tuple(terms)), fit=less)
-
-
-def _moved(data: Data, stage: Stage, candidate: Candidate, noise: Noise) -> Stage | None:
-    """Return a stage with the seed of its last effect exchanged for that of a candidate beside it, fitted again; None where that does not fit."""
-    fit, q = stage.fit, len(candidate.parameters)
-    *terms, _ = fit.hypothesis.terms
-    hypothesis = replace(fit.hypothesis, terms=(*terms, (candidate.effect, candidate.seed, candidate.parameters)))
-    start = np.array([p.null for p in candidate.parameters]) + candidate.step
-    keep = np.arange(len(fit.coordinates)) < len(fit.coordinates) - q
-    near = jets_with(replace(stage, fit=replace(fit, jets=jets_without(stage, keep))), candidate)
-    try:
-        coordinates = np.concatenate([fit.coordinates[:-q], start])
-        return make_stage(data, hypothesis, fit.prior, noise, coordinates, own=own_of(stage), near=near)
-    except FemsenseError:
-        return None
-
-
-def _screen_seeds(data: Data, stage: Stage, start: Candidate, seeds: Sequence[Entry], noise: Noise) -> list[Candidate]:
-    fields = effect_fields(stage.fit, data.train, [(start.effect, seed, start.parameters) for seed in seeds])
-    return screen(stage.fit, problem_of(data, stage.fit, noise), fields, 100.0)
-
-
-def _tried(data: Data, stage: Stage, candidate: Candidate, noise: Noise, wanted: float = EVIDENCE) -> Stage | None:
-    try:
-        return refit(data, stage, candidate, noise, wanted=wanted)
-    except FemsenseError:
-        return None
-
-
 # --- pruning ---------------------------------------------------------------------------------------------------------------
 
 
@@ -655,7 +440,7 @@ def prune(data: Data, stage: Stage, noise: Noise, n_effective: float, say: Progr
         say(f"asking whether {name} is still needed")
         price = count * float(np.log(n_effective))
         try:
-            without = keeping(data, stage, others, noise, worth=_beyond(stage.fit, FORGONE[1] * price + FORGONE[0]))
+            without = keeping(data, stage, others, noise, worth=beyond(stage.fit, FORGONE[1] * price + FORGONE[0]))
         except FemsenseError:
             continue
         if evidence(without.fit, stage.fit) <= price:
@@ -665,11 +450,9 @@ def prune(data: Data, stage: Stage, noise: Noise, n_effective: float, say: Progr
 
 __all__ = [
     "ABOVE_MESH",
-    "EVIDENCE",
     "Progress",
     "Refit",
     "at_edge",
-    "evidence",
     "grow",
     "held_share",
     "judged",
@@ -677,10 +460,8 @@ __all__ = [
     "moved_by",
     "polished",
     "prune",
-    "refit",
     "shortlist",
     "sure_beyond_mesh",
     "tilt_cost",
     "weighs",
-    "with_term",
 ]

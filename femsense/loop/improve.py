@@ -23,10 +23,11 @@ from femsense.errors import DataError, FemsenseError
 from femsense.loop.conclude import Search, conclude
 from femsense.loop.data import Data, prepare
 from femsense.loop.exchange import BETTER, exchanged
-from femsense.loop.grow import Progress, Refit, evidence, grow, mesh_cost, moved_by, prune, shortlist
+from femsense.loop.grow import Progress, Refit, grow, mesh_cost, moved_by, prune, shortlist
 from femsense.loop.joint import Prior
 from femsense.loop.mesh_error import errs_alike, few_states, make_finer, with_mesh_errors
 from femsense.loop.noise import Noise
+from femsense.loop.refit import evidence
 from femsense.loop.result import LoopResult
 from femsense.loop.screen import Candidate, Fields
 from femsense.loop.stages import (

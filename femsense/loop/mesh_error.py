@@ -43,6 +43,8 @@ TURNS = 0.07
 ELSEWHERE = 0.05
 """The mesh errs in another way in states that differ by more than this share of how far they are from rest. With 0.2 the gain of a held cable came out
 as 0.836 ± 0.006 for 0.85, with this as 0.842 (`benchmarks/effects.py`)."""
+FEWEST = 12
+"""Where some states speak for all, they are as many at least."""
 PULLING = "cables", "cable_slots"
 """What of a body only tells how its cables pull."""
 
@@ -157,6 +159,13 @@ def few_states(trial: Trial, tets: int) -> IntArray:
     return np.asarray(frames[np.sort(_chosen(_state_vectors(trial.scene.recording, frames), 8 * tets))])
 
 
+def spread_states(trial: Trial, share: float) -> IntArray:
+    """Return a share of the frames of a trial, FEWEST at least, in states that differ as much as they can, ascending."""
+    frames = trial.scene.frames
+    most = max(FEWEST, round(share * len(frames)))
+    return np.asarray(frames[np.sort(_representatives(_state_vectors(trial.scene.recording, frames), most))])
+
+
 def _moves(
     robot: Robot, fine: Robot, trials: Sequence[Trial], places: FloatArray, initial: FloatArray | None
 ) -> dict[int, FloatArray]:
@@ -215,4 +224,4 @@ def _representatives(vectors: FloatArray, most: int) -> list[int]:
     return chosen
 
 
-__all__ = ["SHARE", "errs_alike", "few_states", "make_finer", "mesh_errors", "with_mesh_errors"]
+__all__ = ["SHARE", "errs_alike", "few_states", "make_finer", "mesh_errors", "spread_states", "with_mesh_errors"]

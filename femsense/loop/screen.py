@@ -186,7 +186,8 @@ def effect_fields(base: JointFit, trials: list[Trial], todo: list[tuple[Effect, 
     null = np.array([p.null for p in every.parameters])
     probe = JointProblem(every, Prior(np.zeros(0), np.zeros(0)), trials, [], 1.0)
     raw, rest = [], []
-    for trial, span in zip(trials, spans_of(trials)):
+    for trial, known, span in zip(trials, base.jets, spans_of(trials)):
+        trial.starts_on(fixed.body.mesh).update(_starts_of(trial, fixed, fixed, known.states))
         jet = probe.jet(trial, base.fit.theta[span], null, True)
         raw.append(jet.by_effect)
         rest.append(jet.rest_by_effect)

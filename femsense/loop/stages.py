@@ -177,6 +177,21 @@ def roughly_keeping(data: Data, stage: Stage, names: Sequence[str], noise: Noise
     return Stage(fit, [], float("nan"))
 
 
+def few_of(data: Data, fit: JointFit, noise: Noise, frames: Sequence[IntArray]) -> tuple[Data, JointFit]:
+    """Return the data to fit in some frames of each trial only, and what a fit to all of them makes of these."""
+    trials, jets = list[Trial](), list[SceneJet]()
+    for trial, jet, few in zip(data.train, fit.jets, frames):
+        rows = np.isin(trial.scene.frame, few)
+        error = None if trial.mesh_error is None else trial.mesh_error[rows]
+        trials.append(replace(trial.part(few), mesh_error=error))
+        jets.append(jet.pick(rows))
+    part = replace(data, train=trials)
+    residual, jacobian = problem_of(part, fit, noise).rows_of(jets, fit.fit.theta, True)
+    assert jacobian is not None
+    own = replace(fit.fit, residual=residual, jacobian=jacobian)
+    return part, replace(fit, fit=own, chi2=float(residual @ residual), jets=jets)
+
+
 def own_of(stage: Stage) -> FloatArray:
     return np.array(stage.fit.fit.theta[: stage.fit.own])
 

@@ -17,21 +17,19 @@ from femsense.errors import FemsenseError
 from femsense.loop.data import Data
 from femsense.loop.grow import (
     ABOVE_MESH_IF_SURE,
-    EVIDENCE,
     Progress,
     Refit,
-    evidence,
     held_share,
     judged,
     mesh_cost,
     moved_by,
     polished,
-    refit,
     shortlist,
     sure_beyond_mesh,
 )
 from femsense.loop.noise import Noise
 from femsense.loop.predict import sweeps_predicted
+from femsense.loop.refit import EVIDENCE, evidence, refit
 from femsense.loop.stages import Stage, fields_of, held_chi2, keeping, screen_stage
 from femsense.loop.structure import beyond_mesh
 

@@ -1,0 +1,160 @@
+"""Places: where on the body an effect explains most, from climbs over its seeds to fits."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from femsense.calib.fit import GIVEN_UP
+from femsense.effects import Entry
+from femsense.errors import FemsenseError
+from femsense.loop.data import Data
+from femsense.loop.joint import JointFit
+from femsense.loop.mesh_error import spread_states
+from femsense.loop.noise import Noise
+from femsense.loop.refit import EVIDENCE, tried
+from femsense.loop.screen import Candidate, confounding, effect_fields, screen
+from femsense.loop.stages import Stage, few_of, jets_with, jets_without, make_stage, own_of, problem_of
+
+NEARLY = 0.05
+"""Seeds whose gain is less by this share are as good."""
+STARTS = 3
+"""So many seeds of an effect, the best, are improved …"""
+ROUNDS = 4
+"""… and so often moved to a neighbour that explains more …"""
+CLIMBING = 0.25
+"""… as this share of the states have it."""
+ALIKE = 0.98
+"""Two places are one where what a force in one does can be had by this share in the other."""
+POLISHED = 2.0
+"""Decrease of χ² that each further parameter of a polished effect must bring."""
+
+
+def placed(data: Data, stage: Stage, candidate: Candidate, made: Stage, noise: Noise) -> tuple[Stage, list[float]]:
+    """Return the best of a candidate's fits, that which was `made` from its own seed or one that begins where a climb ends, its seed moved on,
+    and the scatter of its parameters: that of `closer`, or that over the places that explain as much where this is larger."""
+    begun = [made]
+    for other in _climbed(data, stage, candidate, noise):
+        there = tried(data, stage, other, noise)
+        if there is not None and there.fit.fit.status != GIVEN_UP:
+            begun.append(there)
+    ends = list[tuple[Stage, list[float]]]()
+    for one in sorted(begun, key=lambda s: s.fit.chi2):
+        if not ends or one.fit.chi2 < ends[0][0].fit.chi2 + 2.0 * EVIDENCE:
+            ends.append(closer(data, one, noise))
+    best, scatter = min(ends, key=lambda end: end[0].fit.chi2)
+    values = [s.fit.coordinates[-len(scatter) :] for s, _ in ends if s.fit.chi2 < best.fit.chi2 + EVIDENCE]
+    return best, np.maximum(scatter, np.std(values, axis=0)).tolist()
+
+
+def _climbed(data: Data, stage: Stage, start: Candidate, noise: Noise) -> list[Candidate]:
+    """Return where the best STARTS seeds come to when each goes from neighbour to neighbour, the best first: a soft place here and a stiff
+    one there look alike when the modulus is open. Some of the states show the way."""
+    few, fit = few_of(data, stage.fit, noise, [spread_states(t, CLIMBING) for t in data.train])
+    problem = problem_of(few, fit, noise)
+
+    def seen(seeds: Sequence[Entry]) -> list[Candidate]:
+        fields = effect_fields(fit, few.train, [(start.effect, seed, start.parameters) for seed in seeds])
+        return screen(fit, problem, fields, 100.0)
+
+    others = seen([start.seed, *(s for s in start.effect.seeds(data.robot) if s != start.seed)])
+    ends = list[Candidate]()
+    for begin in sorted(others, key=lambda c: c.seed != start.seed)[:STARTS]:
+        here = begin
+        for _ in range(ROUNDS):
+            found = max([here, *seen(start.effect.nearby(data.robot, here.seed))], key=lambda c: c.gain)
+            if found.gain < here.gain + POLISHED:
+                break
+            here = found
+        if here.seed != start.seed and not any(here.seed == end.seed for end in ends):
+            ends.append(here)
+    most = max((end.gain for end in ends), default=0.0)
+    apart = list[Candidate]()
+    for end in sorted((end for end in ends if end.gain > 0.5 * most), key=lambda c: -c.gain):
+        if all(confounding(end, other) < ALIKE for other in apart):
+            apart.append(end)
+    return _screen_seeds(data, stage, start, [end.seed for end in apart], noise) if apart else []
+
+
+def _scatter(seen: Sequence[Candidate], best: Candidate) -> list[float]:
+    """Return by how much the steps of those that explain nearly as much as the best scatter."""
+    steps = [c.step for c in seen if c.gain >= best.gain - max(EVIDENCE, NEARLY * best.gain)]
+    return [float(v) for v in np.std(steps, axis=0)]
+
+
+def closer(data: Data, stage: Stage, noise: Noise) -> tuple[Stage, list[float]]:
+    """Return a stage whose last effect has moved to neighbours of its seed as long as these explain more where the body is as the effect
+    has bent it (what a seed does to the body before that ranks neighbours of a large effect wrongly), and by how much the step of each of
+    its parameters scatters over the seeds that explain as much but for NEARLY."""
+    while True:
+        *_, (effect, seed, parameters) = stage.fit.hypothesis.terms
+        fields = effect_fields(stage.fit, data.train, [(effect, s, parameters) for s in effect.nearby(data.robot, seed)])
+        around = screen(without_last(stage.fit), problem_of(data, stage.fit, noise), fields, 100.0)
+        here = next((c for c in around if c.seed == seed), None)
+        if here is None:  # it does nothing to these markers
+            return stage, [0.0] * len(parameters)
+        best = max(around, key=lambda c: c.gain)
+        if best.gain < here.gain + POLISHED:
+            return stage, _scatter(around, best)
+        made = _moved(data, stage, best, noise)
+        if made is None or made.fit.chi2 > stage.fit.chi2 - POLISHED:
+            return stage, _scatter(around, best)
+        stage = made
+
+
+def without_last(fit: JointFit) -> JointFit:
+    """Return a fit as it would be without its last effect if all were linear about where it is."""
+    return _without(fit, len(fit.hypothesis.terms) - 1)
+
+
+def _without(fit: JointFit, i: int) -> JointFit:
+    """Return a fit as it would be without one of its terms if all were linear about where it is."""
+    terms = fit.hypothesis.terms
+    at, q = sum(len(p) for _, _, p in terms[:i]), len(terms[i][2])
+    columns = fit.own + np.arange(at, at + q)
+    J, own = np.asarray(fit.fit.jacobian), fit.coordinates[at : at + q] - np.array([p.null for p in terms[i][2]])
+    residual = fit.fit.residual - J[:, columns] @ own
+    less = replace(fit.fit, theta=np.delete(fit.fit.theta, columns), residual=residual, jacobian=np.delete(J, columns, axis=1))
+    return replace(fit, hypothesis=replace(fit.hypothesis, terms=(*terms[:i], *terms[i + 1 :])), fit=less)
+
+
+def may_lie_elsewhere(data: Data, stage: Stage, name: str, noise: Noise) -> bool:
+    """Return whether an effect of a stage, but for its place, may explain more at one of its other seeds: to first order, with the body as it is
+    bent, as `closer` asks. Of one whose seed is no place nothing is known."""
+    fit, terms = stage.fit, stage.fit.hypothesis.terms
+    i = [effect.name for effect, _, _ in terms].index(name)
+    effect, seed, fitted = terms[i]
+    around = effect.nearby(data.robot, seed)
+    if not around:
+        return True
+    own = {(p.key, p.part) for p in effect.parameters(data.robot, data.control)}
+    parameters = tuple(p for p in fitted if (p.key, p.part) in own)
+    fields = effect_fields(fit, data.train, [(effect, s, parameters) for s in (*effect.seeds(data.robot), *around)])
+    seen = screen(_without(fit, i), problem_of(data, fit, noise), fields, 100.0)
+    here = next((c for c in seen if c.seed == seed), None)
+    return here is None or max(c.gain for c in seen) > here.gain + POLISHED
+
+
+def _moved(data: Data, stage: Stage, candidate: Candidate, noise: Noise) -> Stage | None:
+    """Return a stage with the seed of its last effect exchanged for that of a candidate beside it, fitted again; None where that does not fit."""
+    fit, q = stage.fit, len(candidate.parameters)
+    *terms, _ = fit.hypothesis.terms
+    hypothesis = replace(fit.hypothesis, terms=(*terms, (candidate.effect, candidate.seed, candidate.parameters)))
+    start = np.array([p.null for p in candidate.parameters]) + candidate.step
+    keep = np.arange(len(fit.coordinates)) < len(fit.coordinates) - q
+    near = jets_with(replace(stage, fit=replace(fit, jets=jets_without(stage, keep))), candidate)
+    try:
+        coordinates = np.concatenate([fit.coordinates[:-q], start])
+        return make_stage(data, hypothesis, fit.prior, noise, coordinates, own=own_of(stage), near=near)
+    except FemsenseError:
+        return None
+
+
+def _screen_seeds(data: Data, stage: Stage, start: Candidate, seeds: Sequence[Entry], noise: Noise) -> list[Candidate]:
+    fields = effect_fields(stage.fit, data.train, [(start.effect, seed, start.parameters) for seed in seeds])
+    return screen(stage.fit, problem_of(data, stage.fit, noise), fields, 100.0)
+
+
+__all__ = ["POLISHED", "closer", "may_lie_elsewhere", "placed", "without_last"]
