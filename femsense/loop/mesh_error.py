@@ -159,10 +159,9 @@ def few_states(trial: Trial, tets: int) -> IntArray:
     return np.asarray(frames[np.sort(_chosen(_state_vectors(trial.scene.recording, frames), 8 * tets))])
 
 
-def spread_states(trial: Trial, share: float) -> IntArray:
-    """Return a share of the frames of a trial, FEWEST at least, in states that differ as much as they can, ascending."""
-    frames = trial.scene.frames
-    most = max(FEWEST, round(share * len(frames)))
+def spread_states(trial: Trial, most: int) -> IntArray:
+    """Return so many frames of a trial at most, FEWEST at least, in states that differ as much as they can, ascending."""
+    frames, most = trial.scene.frames, max(FEWEST, most)
     return np.asarray(frames[np.sort(_representatives(_state_vectors(trial.scene.recording, frames), most))])
 
 

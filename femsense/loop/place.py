@@ -24,8 +24,8 @@ STARTS = 3
 """So many seeds of an effect, the best, are improved …"""
 ROUNDS = 4
 """… and so often moved to a neighbour that explains more …"""
-CLIMBING = 0.25
-"""… as this share of the states have it."""
+CLIMBING = 30_000
+"""… as the states of a recording have it, where these are more than so many tetrahedra × states some of them."""
 ALIKE = 0.98
 """Two places are one where what a force in one does can be had by this share in the other."""
 POLISHED = 2.0
@@ -52,7 +52,8 @@ def placed(data: Data, stage: Stage, candidate: Candidate, made: Stage, noise: N
 def _climbed(data: Data, stage: Stage, start: Candidate, noise: Noise) -> list[Candidate]:
     """Return where the best STARTS seeds come to when each goes from neighbour to neighbour, the best first: a soft place here and a stiff
     one there look alike when the modulus is open. Some of the states show the way."""
-    few, fit = few_of(data, stage.fit, noise, [spread_states(t, CLIMBING) for t in data.train])
+    most = CLIMBING // len(stage.fit.hypothesis.robot.body.mesh.tets)
+    few, fit = few_of(data, stage.fit, noise, [spread_states(t, most) for t in data.train])
     problem = problem_of(few, fit, noise)
 
     def seen(seeds: Sequence[Entry]) -> list[Candidate]:

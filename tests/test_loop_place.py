@@ -1,0 +1,172 @@
+"""Where an effect acts: some states show the way to places, fits decide, and what is in its place is not sought again."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from arm import arm, record, sweeps
+
+from femsense.calib.fit import GIVEN_UP
+from femsense.calib.forward import Hypothesis
+from femsense.effects import find_effect
+from femsense.fem import linear
+from femsense.loop import place
+from femsense.loop.data import Data, prepare
+from femsense.loop.exchange import exchanged
+from femsense.loop.grow import Refit, _settled
+from femsense.loop.joint import Prior
+from femsense.loop.mesh_error import FEWEST, spread_states, with_mesh_errors
+from femsense.loop.noise import Noise
+from femsense.loop.place import may_lie_elsewhere, placed
+from femsense.loop.refit import evidence, refit
+from femsense.loop.screen import Candidate, effect_fields, screen
+from femsense.loop.stages import Stage, few_of, fields_of, make_stage, own_of, problem_of, screen_stage, with_nuisance
+
+NOISE = Noise({"white": 1e-4}, "")
+COUNT = 300.0
+HIDDEN: list[dict[str, Any]] = [
+    {"name": "payload", "point_m": [0.066, 0.004, 0.01], "force_n": [0.0, 0.3, -0.4]},
+    {"name": "cable_gain", "scale": {"up": 1.15}},
+]
+
+
+@pytest.fixture(scope="module")
+def started() -> tuple[Data, Stage]:
+    inputs, labels = sweeps(each=6)
+    recording, _ = record(inputs, labels=labels, truth=arm((4, 1, 1)), effects=HIDDEN[:1])
+    data = prepare(arm((4, 1, 1)), [recording], [])
+    hypothesis, prior = with_nuisance(data)
+    return data, make_stage(data, hypothesis, prior, NOISE, np.zeros(len(prior.mean)))
+
+
+def payloads(data: Data, stage: Stage) -> list[Candidate]:
+    table = screen_stage(data, stage.fit, NOISE, fields_of(data, stage, ["payload"]), COUNT)
+    return [c for c in table if len(c.parameters) == 3]
+
+
+def off(candidate: Candidate) -> float:
+    return float(np.linalg.norm(np.subtract(candidate.seed["point_m"], HIDDEN[0]["point_m"])))
+
+
+def test_some_frames_of_a_fit_are_what_a_fit_to_these_frames_begins_with(started: tuple[Data, Stage]):
+    data, stage = started
+    data = with_mesh_errors(data, stage, [])
+    assert data.train[0].mesh_error is not None
+    frames = [t.scene.frames[::3] for t in data.train]
+    few, fit = few_of(data, stage.fit, NOISE, frames)
+    assert few.train[0].scene.frames.tolist() == frames[0].tolist()
+    residual, jacobian = problem_of(few, fit, NOISE).evaluate(stage.fit.fit.theta, True)
+    assert jacobian is not None and len(residual) < 0.5 * len(stage.fit.fit.residual)
+    np.testing.assert_allclose(fit.fit.residual, residual, atol=1e-4)
+    np.testing.assert_allclose(fit.fit.jacobian, jacobian, atol=1e-3 * np.abs(jacobian).max())
+    assert fit.chi2 == pytest.approx(residual @ residual, rel=1e-4)
+
+
+def test_some_states_are_spread_and_never_too_few(started: tuple[Data, Stage]):
+    trial = started[0].train[0]
+    every = len(trial.scene.frames)
+    assert every > 2 * FEWEST
+    few, half = spread_states(trial, 1), spread_states(trial, every // 2)
+    assert len(few) == FEWEST and FEWEST < len(half) <= every // 2
+    pulled = trial.scene.recording.inputs[few].max(axis=0)
+    np.testing.assert_allclose(pulled, trial.scene.recording.inputs[trial.scene.frames].max(axis=0))
+
+
+def test_fields_are_those_of_the_fit_whatever_was_solved_last(started: tuple[Data, Stage], monkeypatch: pytest.MonkeyPatch):
+    data, stage = started
+    robot, trial = stage.fit.hypothesis.robot_at(stage.fit.coordinates), data.train[0]
+    payload = find_effect("payload")
+    one = (payload, payload.seeds(robot)[0], payload.parameters(robot, data.control))
+    expected = effect_fields(stage.fit, data.train, [one]).raw[0]
+    elsewhere = Hypothesis(robot.with_body(robot.body.with_gravity(np.array([0.0, 9.0, 0.0]))))
+    make_stage(data, elsewhere, Prior(np.zeros(0), np.zeros(0)), NOISE, np.zeros(0), own=own_of(stage))
+    states = trial.starts_on(robot.body.mesh)
+    assert any(not np.array_equal(states[k].positions, s.positions) for k, s in stage.fit.jets[0].states.items())
+    factors, plain = list[int](), linear.cholesky
+    monkeypatch.setattr(linear, "cholesky", lambda *given, **named: (factors.append(1), plain(*given, **named))[1])
+    found = effect_fields(stage.fit, data.train, [one]).raw[0]
+    np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(expected).max())
+    distinct = {s.positions.tobytes() for s in stage.fit.jets[0].states.values()}
+    assert len(factors) < 1.5 * len(distinct)  # one for the derivatives of each state, hardly any to find it
+
+
+def test_a_few_states_lead_to_the_place_and_alike_places_are_fitted_once(
+    started: tuple[Data, Stage], monkeypatch: pytest.MonkeyPatch
+):
+    data, stage = started
+    far = max(payloads(data, stage)[:6], key=off)
+    begun = refit(data, stage, far, NOISE)
+    fitted = list[Candidate]()
+
+    def counted(data: Data, stage: Stage, candidate: Candidate, noise: Noise) -> Stage | None:
+        fitted.append(candidate)
+        return refit(data, stage, candidate, noise)
+
+    monkeypatch.setattr(place, "tried", counted)
+    best, _ = placed(data, stage, far, begun, NOISE)
+    where = best.fit.hypothesis.terms[-1][1]["point_m"]
+    assert off(far) > 0.012 and np.linalg.norm(np.subtract(where, HIDDEN[0]["point_m"])) < 0.004
+    once = len(fitted)
+    monkeypatch.setattr(place, "ALIKE", 1.1)
+    placed(data, stage, far, begun, NOISE)
+    assert 0 < once < len(fitted) - once
+
+
+def test_an_effect_in_its_place_is_not_sought_elsewhere_and_one_that_is_not_is():
+    inputs, labels = sweeps(each=1)
+    recording, _ = record(inputs, labels=labels, truth=arm((4, 1, 1)), effects=HIDDEN)
+    data = prepare(arm((4, 1, 1)), [recording], [])
+    hypothesis, prior = with_nuisance(data)
+    base = make_stage(data, hypothesis, prior, NOISE, np.zeros(len(prior.mean)))
+    table = payloads(data, base)
+    far = max((c for c in table[:6] if off(c) > 0.012), key=off)
+    wrong = refit(data, base, far, NOISE)
+    right, _ = placed(data, base, far, wrong, NOISE)
+
+    def with_gain(stage: Stage) -> Stage:
+        gains = screen_stage(data, stage.fit, NOISE, fields_of(data, stage, ["cable_gain"]), COUNT)
+        return refit(data, stage, gains[0], NOISE)
+
+    assert may_lie_elsewhere(data, with_gain(wrong), "payload", NOISE)
+    both = with_gain(right)
+    assert may_lie_elsewhere(data, both, "cable_gain", NOISE)  # it has no place: nothing is known
+    moved = [("", base), ("payload", right), ("cable_gain", both)]
+    assert not may_lie_elsewhere(data, both, "payload", NOISE)
+    named, said = {"name": "payload", "step": 1, "dbic": 1000.0, "verdict": "named"}, list[str]()
+    assert exchanged(data, moved, [named], NOISE, COUNT, said.append) == (moved, [named]) and not said
+
+
+def test_a_refit_with_nowhere_to_go_is_given_up_where_a_rival_explains_more(started: tuple[Data, Stage]):
+    data, stage = started
+    table = screen_stage(data, stage.fit, NOISE, fields_of(data, stage, ["cable_gain", "creep", "payload"]), COUNT)
+    first = {name: next(c for c in table if c.effect.name == name) for name in ("cable_gain", "creep", "payload")}
+    one = first["payload"]
+    made = refit(data, stage, one, NOISE)
+    score = evidence(stage.fit, made.fit) - one.cost
+    assert score > 100.0 and made.fit.fit.status != GIVEN_UP
+    for settled in (True, False):
+        rival = refit(data, stage, one, NOISE, wanted=1.1 * score, settled=settled)
+        assert (rival.fit.fit.status == GIVEN_UP) == settled
+    ahead = [Refit(one, made, 0.0, 0.0, {})]
+    assert [_settled(data, first[name], ahead) for name in first] == [True, False, False]
+    assert not _settled(data, first["cable_gain"], [])
+
+
+def test_a_term_taken_out_leaves_the_others_where_they_are(started: tuple[Data, Stage]):
+    data, stage = started
+    one = payloads(data, stage)[0]
+    made = refit(data, stage, one, NOISE)
+    less = place._without(made.fit, 0)
+    _, _, parameters = made.fit.hypothesis.terms[0]
+    kept = [n for n in made.fit.hypothesis.names if n != made.fit.hypothesis.terms[0][0].name]
+    assert list(less.hypothesis.names) == kept
+    np.testing.assert_array_equal(less.coordinates, made.fit.coordinates[len(parameters) :])
+    assert less.fit.jacobian.shape[1] == made.fit.fit.jacobian.shape[1] - len(parameters)
+    assert screen(
+        less,
+        problem_of(data, made.fit, NOISE),
+        effect_fields(made.fit, data.train, [(one.effect, one.seed, one.parameters)]),
+        COUNT,
+    )
