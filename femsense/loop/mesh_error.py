@@ -15,6 +15,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 from scipy.interpolate import RBFInterpolator
+from scipy.spatial.distance import cdist
 
 from femsense.arrays import FloatArray, IntArray
 from femsense.calib.forward import seats
@@ -43,6 +44,8 @@ TURNS = 0.07
 ELSEWHERE = 0.05
 """The mesh errs in another way in states that differ by more than this share of how far they are from rest. With 0.2 the gain of a held cable came out
 as 0.836 ± 0.006 for 0.85, with this as 0.842 (`benchmarks/effects.py`)."""
+SAME = 1e-9
+"""States whose inputs and loads differ by less, in units of their ranges, are one."""
 FEWEST = 12
 """Where some states speak for all, they are as many at least."""
 PULLING = "cables", "cable_slots"
@@ -160,9 +163,11 @@ def few_states(trial: Trial, tets: int) -> IntArray:
 
 
 def spread_states(trial: Trial, most: int) -> IntArray:
-    """Return so many frames of a trial at most, FEWEST at least, in states that differ as much as they can, ascending."""
-    frames, most = trial.scene.frames, max(FEWEST, most)
-    return np.asarray(frames[np.sort(_representatives(_state_vectors(trial.scene.recording, frames), most))])
+    """Return the frames of a trial in so many of its states at most, FEWEST at least, which differ as much as they can, ascending."""
+    frames = trial.scene.frames
+    vectors = _state_vectors(trial.scene.recording, frames)
+    chosen = vectors[_representatives(vectors, max(FEWEST, most))]
+    return np.asarray(frames[cdist(vectors, chosen).min(axis=1) <= SAME])
 
 
 def _moves(
@@ -217,7 +222,7 @@ def _representatives(vectors: FloatArray, most: int) -> list[int]:
     """Return indices of distinct states, at most so many, spread widely (farthest-point sampling)."""
     chosen = [0]
     distance = np.linalg.norm(vectors - vectors[0], axis=1)
-    while len(chosen) < most and distance.max() > 1e-9:
+    while len(chosen) < most and distance.max() > SAME:
         chosen.append(int(distance.argmax()))
         distance = np.minimum(distance, np.linalg.norm(vectors - vectors[chosen[-1]], axis=1))
     return chosen

@@ -26,8 +26,8 @@ ROUNDS = 4
 """… and so often moved to a neighbour that explains more …"""
 CLIMBING = 30_000
 """… as the states of a recording have it, where these are more than so many tetrahedra × states some of them."""
-ALIKE = 0.98
-"""Two places are one where what a force in one does can be had by this share in the other."""
+ALIKE = 0.98, 0.1
+"""Two places count as one where this share of what an effect does in one can be had in the other, with parameters that differ by no more than that share."""
 POLISHED = 2.0
 """Decrease of χ² that each further parameter of a polished effect must bring."""
 
@@ -52,8 +52,8 @@ def placed(data: Data, stage: Stage, candidate: Candidate, made: Stage, noise: N
 def _climbed(data: Data, stage: Stage, start: Candidate, noise: Noise) -> list[Candidate]:
     """Return where the best STARTS seeds come to when each goes from neighbour to neighbour, the best first: a soft place here and a stiff
     one there look alike when the modulus is open. Some of the states show the way."""
-    most = CLIMBING // len(stage.fit.hypothesis.robot.body.mesh.tets)
-    few, fit = few_of(data, stage.fit, noise, [spread_states(t, most) for t in data.train])
+    states = CLIMBING // len(stage.fit.hypothesis.robot.body.mesh.tets)
+    few, fit = few_of(data, stage.fit, noise, [spread_states(t, states) for t in data.train])
     problem = problem_of(few, fit, noise)
 
     def seen(seeds: Sequence[Entry]) -> list[Candidate]:
@@ -74,9 +74,15 @@ def _climbed(data: Data, stage: Stage, start: Candidate, noise: Noise) -> list[C
     most = max((end.gain for end in ends), default=0.0)
     apart = list[Candidate]()
     for end in sorted((end for end in ends if end.gain > 0.5 * most), key=lambda c: -c.gain):
-        if all(confounding(end, other) < ALIKE for other in apart):
+        if not any(_alike(end, other) for other in apart):
             apart.append(end)
     return _screen_seeds(data, stage, start, [end.seed for end in apart], noise) if apart else []
+
+
+def _alike(a: Candidate, b: Candidate) -> bool:
+    """Return whether two places do the same for the same: a soft one here and a stiff one there may look alike, but do not say the same."""
+    same, apart = ALIKE
+    return confounding(a, b) >= same and bool(np.linalg.norm(a.step - b.step) <= apart * np.linalg.norm(b.step))
 
 
 def _scatter(seen: Sequence[Candidate], best: Candidate) -> list[float]:

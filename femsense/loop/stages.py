@@ -178,7 +178,9 @@ def roughly_keeping(data: Data, stage: Stage, names: Sequence[str], noise: Noise
 
 
 def few_of(data: Data, fit: JointFit, noise: Noise, frames: Sequence[IntArray]) -> tuple[Data, JointFit]:
-    """Return the data to fit in some frames of each trial only, and what a fit to all of them makes of these."""
+    """Return the data to fit in some frames of each trial only, and what a fit to all of them makes of these (kinks are left as they are)."""
+    if all(np.isin(t.scene.frames, few).all() for t, few in zip(data.train, frames)):
+        return data, fit
     trials, jets = list[Trial](), list[SceneJet]()
     for trial, jet, few in zip(data.train, fit.jets, frames):
         rows = np.isin(trial.scene.frame, few)
