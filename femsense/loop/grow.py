@@ -13,12 +13,13 @@ from femsense.calib.fit import GIVEN_UP
 from femsense.effects import find_effect
 from femsense.errors import FemsenseError
 from femsense.loop.data import Data
+from femsense.loop.few import Few, few_of
 from femsense.loop.joint import JointFit, Prior, rms_of
 from femsense.loop.mesh_error import mesh_errors
 from femsense.loop.noise import Noise
 from femsense.loop.place import POLISHED, placed
 from femsense.loop.predict import sweeps_predicted
-from femsense.loop.refit import EVIDENCE, FORGONE, beyond, evidence, explains, refit, tried, with_term, within
+from femsense.loop.refit import EVIDENCE, FORGONE, beyond, evidence, explains, refit, tried, with_term, within, worth_of
 from femsense.loop.screen import NUISANCE, Candidate, linear_gain, penalty
 from femsense.loop.stages import (
     QUADRATIC,
@@ -82,6 +83,7 @@ def grow(
     refitted."""
     refits: list[Refit] = []
     records: list[dict[str, Any]] = []
+    few: Few | None = None
     first = not _added(stage)
     asked = _quadratic(data, stage, names, n_effective) if first else []
     screened = [c for c in shortlist(table, first=first) if not any(c.effect is a.effect and c.seed == a.seed for a in asked)]
@@ -94,15 +96,13 @@ def grow(
         say(f"refitting with {candidate.effect.name}")
         record: dict[str, Any] = {"name": candidate.effect.name, "seed": candidate.seed}
         records.append(record)
+        settled = _settled(data, candidate, ahead)
         try:
-            made = refit(
-                data,
-                stage,
-                candidate,
-                noise,
-                wanted=max(EVIDENCE, best - 2.0 * EVIDENCE),
-                settled=_settled(data, candidate, ahead),
-            )
+            few = few_of(data, stage, noise) if ahead and few is None else few
+            if few is not None and ahead and _falls_behind(few, candidate, max(ahead, key=lambda r: r.score), noise, settled):
+                record["verdict"] = "given up: in some of the states another one explains more by far"
+                continue
+            made = refit(data, stage, candidate, noise, wanted=max(EVIDENCE, best - 2.0 * EVIDENCE), settled=settled)
         except FemsenseError as error:
             record["verdict"] = f"no equilibrium: {error}"
             continue
@@ -132,6 +132,17 @@ def _settled(data: Data, candidate: Candidate, ahead: Sequence[Refit]) -> bool:
         and not effect.nearby(data.robot, candidate.seed)
         and not effect.polish(data.robot, data.control, candidate.seed)
     )
+
+
+def _falls_behind(few: Few, candidate: Candidate, ahead: Refit, noise: Noise, settled: bool) -> bool:
+    """Return whether a candidate that is fitted in some of the states stays as far behind another one there as ends a refit, where these spare time."""
+    own = few.candidate(candidate, noise) if few.spares else None
+    if own is None:
+        return False
+    base, leading = few.stage.fit, few.of(ahead.stage.fit, noise)
+    wanted = max(EVIDENCE, evidence(base, leading) - ahead.candidate.cost - 2.0 * EVIDENCE)
+    made = refit(few.data, few.stage, own, noise, wanted=wanted, settled=settled)
+    return made.fit.chi2 > worth_of(base, own, wanted, settled)
 
 
 def _bar(ahead: Refit, candidate: Candidate) -> float:

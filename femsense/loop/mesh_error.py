@@ -15,7 +15,6 @@ from dataclasses import fields, replace
 
 import numpy as np
 from scipy.interpolate import RBFInterpolator
-from scipy.spatial.distance import cdist
 
 from femsense.arrays import FloatArray, IntArray
 from femsense.calib.forward import seats
@@ -24,12 +23,12 @@ from femsense.errors import DataError, FemsenseError
 from femsense.fem.body import BodyModel
 from femsense.fem.mesh import Embedding, TetMesh, embed_points
 from femsense.loop.data import Data
+from femsense.loop.few import representatives, state_vectors
 from femsense.loop.joint import Trial, normals_of, rms_of
 from femsense.loop.stages import Stage, placed, some_terms
 from femsense.march import Walk, drive_of, finer_state, share_on_finer, walk_along
 from femsense.model import Robot
 from femsense.parallel import each
-from femsense.recording import Recording
 
 MOST_TETS = 24000
 """A finer mesh than this takes too long in every state."""
@@ -44,10 +43,6 @@ TURNS = 0.07
 ELSEWHERE = 0.05
 """The mesh errs in another way in states that differ by more than this share of how far they are from rest. With 0.2 the gain of a held cable came out
 as 0.836 ± 0.006 for 0.85, with this as 0.842 (`benchmarks/effects.py`)."""
-SAME = 1e-9
-"""States whose inputs and loads differ by less, in units of their ranges, are one."""
-FEWEST = 12
-"""Where some states speak for all, they are as many at least."""
 PULLING = "cables", "cable_slots"
 """What of a body only tells how its cables pull."""
 
@@ -159,15 +154,7 @@ def mesh_errors(data: Data) -> list[FloatArray]:
 def few_states(trial: Trial, tets: int) -> IntArray:
     """Return the frames of a trial in which the error of a mesh of so many elements would be computed, ascending."""
     frames = trial.scene.frames
-    return np.asarray(frames[np.sort(_chosen(_state_vectors(trial.scene.recording, frames), 8 * tets))])
-
-
-def spread_states(trial: Trial, most: int) -> IntArray:
-    """Return the frames of a trial in so many of its states at most, FEWEST at least, which differ as much as they can, ascending."""
-    frames = trial.scene.frames
-    vectors = _state_vectors(trial.scene.recording, frames)
-    chosen = vectors[_representatives(vectors, max(FEWEST, most))]
-    return np.asarray(frames[cdist(vectors, chosen).min(axis=1) <= SAME])
+    return np.asarray(frames[np.sort(_chosen(state_vectors(trial.scene.recording, frames), 8 * tets))])
 
 
 def _moves(
@@ -181,7 +168,7 @@ def _moves(
     share_on_finer(fine.body)
     here, there = robot.tie_markers(places), fine.tie_markers(places)
     frames = np.unique(np.concatenate([t.scene.frames for t in trials]))
-    vectors = _state_vectors(recording, frames)
+    vectors = state_vectors(recording, frames)
     chosen = _chosen(vectors, len(fine.body.mesh.tets))
     walked = walk_along(coarse_walk, frames[chosen].tolist(), lambda r, s: s.positions[:0], starts=starts)
     states = {k: state for k, state, _, _ in walked}
@@ -204,28 +191,9 @@ def _moves(
     return dict(zip(frames.tolist(), between.reshape(-1, *known[0].shape)))
 
 
-def _state_vectors(recording: Recording, frames: IntArray) -> FloatArray:
-    """Return inputs, pressures, gravity and total load of each frame, each in units of its range, shape (f, q)."""
-    load = np.zeros((len(recording.time_s), 3))
-    np.add.at(load, recording.load_frame, recording.load_forces)
-    gravity = np.zeros((len(load), 0)) if recording.gravity is None else recording.gravity
-    table = np.hstack([recording.inputs, recording.pressures, gravity, load])[frames]
-    return np.asarray((table - table[0]) / np.maximum(np.ptp(table, axis=0), 1e-12))
-
-
 def _chosen(vectors: FloatArray, tets: int) -> list[int]:
     """Return indices of the states in which a finer mesh of so many elements is asked."""
-    return _representatives(vectors, max(8, MOST_WORK // tets))
+    return representatives(vectors, max(8, MOST_WORK // tets))
 
 
-def _representatives(vectors: FloatArray, most: int) -> list[int]:
-    """Return indices of distinct states, at most so many, spread widely (farthest-point sampling)."""
-    chosen = [0]
-    distance = np.linalg.norm(vectors - vectors[0], axis=1)
-    while len(chosen) < most and distance.max() > SAME:
-        chosen.append(int(distance.argmax()))
-        distance = np.minimum(distance, np.linalg.norm(vectors - vectors[chosen[-1]], axis=1))
-    return chosen
-
-
-__all__ = ["SHARE", "errs_alike", "few_states", "make_finer", "mesh_errors", "spread_states", "with_mesh_errors"]
+__all__ = ["SHARE", "errs_alike", "few_states", "make_finer", "mesh_errors", "with_mesh_errors"]

@@ -11,21 +11,19 @@ from femsense.calib.fit import GIVEN_UP
 from femsense.effects import Entry
 from femsense.errors import FemsenseError
 from femsense.loop.data import Data
+from femsense.loop.few import few_of
 from femsense.loop.joint import JointFit
-from femsense.loop.mesh_error import spread_states
 from femsense.loop.noise import Noise
 from femsense.loop.refit import EVIDENCE, tried
 from femsense.loop.screen import Candidate, confounding, effect_fields, screen
-from femsense.loop.stages import Stage, few_of, jets_with, jets_without, make_stage, own_of, problem_of
+from femsense.loop.stages import Stage, jets_with, jets_without, make_stage, own_of, problem_of
 
 NEARLY = 0.05
 """Seeds whose gain is less by this share are as good."""
 STARTS = 3
 """So many seeds of an effect, the best, are improved …"""
 ROUNDS = 4
-"""… and so often moved to a neighbour that explains more …"""
-CLIMBING = 30_000
-"""… as the states of a recording have it, where these are more than so many tetrahedra × states some of them."""
+"""… and so often moved to a neighbour that explains more."""
 ALIKE = 0.98, 0.1
 """Two places count as one where this share of what an effect does in one can be had in the other, with parameters that differ by no more than that share."""
 POLISHED = 2.0
@@ -52,13 +50,10 @@ def placed(data: Data, stage: Stage, candidate: Candidate, made: Stage, noise: N
 def _climbed(data: Data, stage: Stage, start: Candidate, noise: Noise) -> list[Candidate]:
     """Return where the best STARTS seeds come to when each goes from neighbour to neighbour, the best first: a soft place here and a stiff
     one there look alike when the modulus is open. Some of the states show the way."""
-    states = CLIMBING // len(stage.fit.hypothesis.robot.body.mesh.tets)
-    few, fit = few_of(data, stage.fit, noise, [spread_states(t, states) for t in data.train])
-    problem = problem_of(few, fit, noise)
+    few = few_of(data, stage, noise)
 
     def seen(seeds: Sequence[Entry]) -> list[Candidate]:
-        fields = effect_fields(fit, few.train, [(start.effect, seed, start.parameters) for seed in seeds])
-        return screen(fit, problem, fields, 100.0)
+        return _screen_seeds(few.data, few.stage, start, seeds, noise)
 
     others = seen([start.seed, *(s for s in start.effect.seeds(data.robot) if s != start.seed)])
     ends = list[Candidate]()

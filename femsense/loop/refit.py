@@ -64,7 +64,7 @@ def refit(
     gravity = candidate.effect.name == "gravity"
     free = not candidate.effect.discrete and not gravity  # for these the null is no start
     answer = 0.0 if candidate.effect.discrete else candidate.response @ (start - null)  # of what is fitted already
-    worth = within(stage.fit, (candidate.cost + wanted - FORGONE[0]) / (1.0 if settled else FORGONE[1]))
+    worth = worth_of(stage.fit, candidate, wanted, settled)
 
     def fitted(share: float) -> Stage | None:
         part = share if share != DECLARED else 0.0 if free else 1.0
@@ -98,6 +98,11 @@ def refit(
     if found is None:
         raise DataError("no start from which the fit improves")
     return found
+
+
+def worth_of(fit: JointFit, candidate: Candidate, wanted: float, settled: bool) -> float:
+    """Return the χ² above which a refit of a candidate is given up: its dBIC is wanted to be so much."""
+    return within(fit, (candidate.cost + wanted - FORGONE[0]) / (1.0 if settled else FORGONE[1]))
 
 
 def _shares(candidate: Candidate, free: bool) -> tuple[float, ...]:
@@ -158,4 +163,4 @@ def tried(data: Data, stage: Stage, candidate: Candidate, noise: Noise, wanted: 
         return None
 
 
-__all__ = ["EVIDENCE", "FORGONE", "beyond", "evidence", "explains", "refit", "tried", "with_term", "within"]
+__all__ = ["EVIDENCE", "FORGONE", "beyond", "evidence", "explains", "refit", "tried", "with_term", "within", "worth_of"]

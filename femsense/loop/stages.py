@@ -88,7 +88,7 @@ def make_stage(
         own=own, max_iterations=max_iterations, known=known, near=near, worth=worth,
     )  # fmt: skip
     held = held_out(data, fit, noise)
-    return Stage(fit, held, rms_of([h.jet.residual for h in held]))
+    return Stage(fit, held, rms_of([h.jet.residual for h in held]) if held else float("nan"))
 
 
 def jets_with(stage: Stage, candidate: Candidate) -> list[SceneJet]:
@@ -175,23 +175,6 @@ def roughly_keeping(data: Data, stage: Stage, names: Sequence[str], noise: Noise
         hypothesis, prior, trials, noise, data.seat_std, stage.fit.coordinates[mask], own=own_of(stage), max_iterations=ROUGHLY
     )
     return Stage(fit, [], float("nan"))
-
-
-def few_of(data: Data, fit: JointFit, noise: Noise, frames: Sequence[IntArray]) -> tuple[Data, JointFit]:
-    """Return the data to fit in some frames of each trial only, and what a fit to all of them makes of these (kinks are left as they are)."""
-    if all(np.isin(t.scene.frames, few).all() for t, few in zip(data.train, frames)):
-        return data, fit
-    trials, jets = list[Trial](), list[SceneJet]()
-    for trial, jet, few in zip(data.train, fit.jets, frames):
-        rows = np.isin(trial.scene.frame, few)
-        error = None if trial.mesh_error is None else trial.mesh_error[rows]
-        trials.append(replace(trial.part(few), mesh_error=error))
-        jets.append(jet.pick(rows))
-    part = replace(data, train=trials)
-    residual, jacobian = problem_of(part, fit, noise).rows_of(jets, fit.fit.theta, True)
-    assert jacobian is not None
-    own = replace(fit.fit, residual=residual, jacobian=jacobian)
-    return part, replace(fit, fit=own, chi2=float(residual @ residual), jets=jets)
 
 
 def own_of(stage: Stage) -> FloatArray:
