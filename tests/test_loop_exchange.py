@@ -13,6 +13,7 @@ from arm import arm, record, sweeps
 from femsense.calib.forward import Hypothesis
 from femsense.effects import find_effect
 from femsense.loop import grow
+from femsense.loop import refit as refits
 from femsense.loop.data import Data, prepare
 from femsense.loop.exchange import exchanged
 from femsense.loop.grow import Refit, judged, polished, shortlist
@@ -116,7 +117,7 @@ def test_weight_that_nobody_declared_is_refitted_however_far_behind_it_looks(mon
         return own
 
     monkeypatch.setattr(grow, "judged", lenient)
-    monkeypatch.setattr(grow, "_explains", lambda stage: True)
+    monkeypatch.setattr(grow, "explains", lambda stage: True)
     inputs, labels = sweeps(each=1)
     recording, _ = record(inputs, labels=labels, truth=arm((4, 1, 1)))
     data = prepare(arm((4, 1, 1), gravity=(0, 0, 0)), [recording], [])
@@ -134,7 +135,7 @@ def test_weight_that_nobody_declared_is_refitted_however_far_behind_it_looks(mon
 def test_until_an_effect_explains_the_data_rivals_are_refitted_to_the_end(monkeypatch: pytest.MonkeyPatch, explains: bool):
     asked = []
 
-    def seen(data: Data, stage: Stage, candidate: Candidate, noise: Noise, *, wanted: float) -> Stage:
+    def seen(data: Data, stage: Stage, candidate: Candidate, noise: Noise, *, wanted: float, settled: bool) -> Stage:
         asked.append((candidate.effect.name, wanted))
         return refit(data, stage, candidate, noise)
 
@@ -149,7 +150,7 @@ def test_until_an_effect_explains_the_data_rivals_are_refitted_to_the_end(monkey
     monkeypatch.setattr(grow, "refit", seen)
     monkeypatch.setattr(grow, "judged", lenient)
     monkeypatch.setattr(grow, "_polish", lambda data, stage, winner, *_: winner.stage)
-    monkeypatch.setattr(grow, "_explains", lambda stage: explains)
+    monkeypatch.setattr(grow, "explains", lambda stage: explains)
     grow.grow(data, base, sorted(looks, key=lambda c: -c.score), NOISE, ["payload", "cable_gain"], COUNT, lambda text: None)
     assert asked == [("payload", grow.EVIDENCE)] + [("cable_gain", grow.EVIDENCE)] * (not explains)
 
@@ -172,7 +173,7 @@ def test_another_form_of_what_leads_is_held_against_what_that_one_promised(monke
 
     monkeypatch.setattr(grow, "judged", lenient)
     monkeypatch.setattr(grow, "polished", lambda data, stage, refitted, *_: refitted)
-    monkeypatch.setattr(grow, "_explains", lambda stage: True)
+    monkeypatch.setattr(grow, "explains", lambda stage: True)
     monkeypatch.setattr(grow, "_predicts", lambda refitted: 0.0)
     forms = [replace(payload, score=100.0), replace(rival, score=60.0)]
     grow.grow(data, base, forms, NOISE, ["payload", "cable_gain"], COUNT, lambda text: None)
@@ -196,8 +197,8 @@ def test_where_calibration_has_strayed_gravity_starts_from_what_is_declared_too(
         starts.append(coordinates)
         return make_stage(data, hypothesis, prior, noise, coordinates, **given)
 
-    monkeypatch.setattr(grow, "make_stage", seen)
-    monkeypatch.setattr(grow, "_explains", lambda stage: explains)
+    monkeypatch.setattr(refits, "make_stage", seen)
+    monkeypatch.setattr(refits, "explains", lambda stage: explains)
     refit(data, base, candidate, NOISE)
     shared = len(base.fit.coordinates)
     declared = [c for c in starts if len(c) > shared and np.array_equal(c[:shared], base.fit.prior.mean)]
