@@ -134,7 +134,8 @@ def test_some_states_are_spread_and_never_too_few(started: tuple[Data, Stage]):
     every = len(set(states.values()))
     assert every > FEWEST + 2 and len(frames) > every  # some states come back
     for most, count in ((1, FEWEST), (FEWEST + 2, FEWEST + 2), (1000, every)):
-        few = spread_states(trial, most)
+        few, share = spread_states(trial, most)
+        assert share == pytest.approx(count / every)
         assert len({states[k] for k in few}) == count
         assert few.tolist() == [k for k in frames if states[k] in {states[f] for f in few}]
         np.testing.assert_allclose(inputs[few].max(axis=0), inputs[frames].max(axis=0))

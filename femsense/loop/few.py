@@ -37,13 +37,14 @@ class Few:
     stage: Stage
     rows: list[BoolArray]
     """Which rows of each trial are theirs, shape (k,)."""
+    share: float
+    """How many of all distinct states they are."""
 
     @property
     def spares(self) -> bool:
         """Whether they are few enough to spare time: where a state depends on those before, all of these are solved, too."""
         fit = self.stage.fit
-        share = np.concatenate(self.rows).mean()
-        return bool(share < SPARED) and not has_history(fit.hypothesis.robot_at(fit.coordinates))
+        return self.share < SPARED and not has_history(fit.hypothesis.robot_at(fit.coordinates))
 
     def of(self, fit: JointFit, noise: Noise) -> JointFit:
         """Return what another fit makes of these states."""
@@ -69,17 +70,19 @@ class Few:
 def few_of(data: Data, stage: Stage, noise: Noise) -> Few:
     """Return some states of a stage that differ as much as they can, or all of them where these are not too much work."""
     tets = len(stage.fit.hypothesis.robot.body.mesh.tets)
-    frames = [spread_states(t, MOST_WORK // tets) for t in data.train]
+    chosen = [spread_states(t, MOST_WORK // tets) for t in data.train]
+    frames = [few for few, _ in chosen]
     rows = [np.isin(t.scene.frame, few) for t, few in zip(data.train, frames)]
     bare = replace(data, held=[], held_of=[])
     if all(own.all() for own in rows):
-        return Few(bare, stage, rows)
+        return Few(bare, stage, rows, 1.0)
     trials = [
         replace(t.part(few), mesh_error=None if t.mesh_error is None else t.mesh_error[own])
         for t, few, own in zip(data.train, frames, rows)
     ]
     part = replace(bare, train=trials)
-    return Few(part, Stage(_picked(part, stage.fit, noise, rows), [], float("nan")), rows)
+    share = float(np.mean([share for _, share in chosen]))
+    return Few(part, Stage(_picked(part, stage.fit, noise, rows), [], float("nan")), rows, share)
 
 
 def _picked(data: Data, fit: JointFit, noise: Noise, rows: list[BoolArray]) -> JointFit:
@@ -91,12 +94,14 @@ def _picked(data: Data, fit: JointFit, noise: Noise, rows: list[BoolArray]) -> J
     return replace(fit, fit=own, chi2=float(residual @ residual), jets=jets)
 
 
-def spread_states(trial: Trial, most: int) -> IntArray:
-    """Return the frames of a trial in so many of its states at most, FEWEST at least, which differ as much as they can, ascending."""
+def spread_states(trial: Trial, most: int) -> tuple[IntArray, float]:
+    """Return the frames of a trial in so many of its states at most, FEWEST at least, which differ as much as they can, ascending; and the share of
+    its states that these are."""
     frames = trial.scene.frames
     vectors = state_vectors(trial.scene.recording, frames)
-    chosen = vectors[representatives(vectors, max(FEWEST, most))]
-    return np.asarray(frames[cdist(vectors, chosen).min(axis=1) <= SAME])
+    every = representatives(vectors, len(vectors))
+    chosen = vectors[every[: max(FEWEST, most)]]
+    return np.asarray(frames[cdist(vectors, chosen).min(axis=1) <= SAME]), len(chosen) / len(every)
 
 
 def state_vectors(recording: Recording, frames: IntArray) -> FloatArray:
