@@ -198,6 +198,7 @@ SABOTAGES = (
     S("loop/place.py", "max(c.gain for c in seen) > here.gain + POLISHED", "True", "test_loop_place.py::test_an_effect_in_its_place_is_not_sought_elsewhere_and_one_that_is_not_is"),
     S("loop/exchange.py", " or (rivals == [name] and not may_lie_elsewhere(data, stage, name, noise))", "", "test_loop_place.py::test_an_effect_in_its_place_is_not_sought_elsewhere_and_one_that_is_not_is"),
     S("loop/place.py", "np.delete(fit.fit.theta, columns)", "fit.fit.theta[: -len(columns)]", "test_loop_place.py::test_a_term_taken_out_leaves_the_others_where_they_are"),
+    S("loop/grow.py", "return closer(data, stage, noise)[0] if places else stage", "return stage", "test_loop_place.py::test_a_place_moves_on_where_what_it_was_found_beside_is_dropped"),
     S("loop/refit.py", "(1.0 if settled else FORGONE[1])", "FORGONE[1]", "test_loop_place.py::test_a_refit_with_nowhere_to_go_is_given_up_where_a_rival_explains_more"),
     S("loop/grow.py", "and not effect.polish(data.robot, data.control, candidate.seed)", "", "test_loop_place.py::test_a_refit_with_nowhere_to_go_is_given_up_where_a_rival_explains_more"),
     S("loop/place.py", "if best.gain < here.gain + POLISHED:", "if True:", "test_loop_exchange.py::test_a_place_moves_on_where_the_body_is_as_the_load_has_bent_it"),

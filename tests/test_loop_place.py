@@ -225,6 +225,24 @@ def test_a_refit_with_nowhere_to_go_is_given_up_where_a_rival_explains_more(star
     assert not _settled(data, first["cable_gain"], [])
 
 
+@pytest.mark.parametrize("needless", [True, False])
+def test_a_place_moves_on_where_what_it_was_found_beside_is_dropped(
+    started: tuple[Data, Stage], monkeypatch: pytest.MonkeyPatch, needless: bool
+):
+    data, stage = started
+    gains = screen_stage(data, stage.fit, NOISE, fields_of(data, stage, ["cable_gain"]), COUNT)
+    beside = refit(data, stage, gains[0], NOISE)
+    far = max((c for c in payloads(data, beside)[:6] if off(c) > 0.012), key=off)
+    both = refit(data, beside, far, NOISE)
+    monkeypatch.setattr(growing, "evidence", lambda before, after: -1.0 if needless else 1e6)
+    left = growing.prune(data, both, NOISE, COUNT, lambda text: None)
+    if not needless:
+        assert left is both
+        return
+    assert left.fit.hypothesis.names == ("stiffness", "cable_offset", "payload")
+    assert np.linalg.norm(np.subtract(left.fit.hypothesis.terms[-1][1]["point_m"], HIDDEN[0]["point_m"])) < 0.004
+
+
 def test_a_term_taken_out_leaves_the_others_where_they_are(started: tuple[Data, Stage]):
     data, stage = started
     one = payloads(data, stage)[0]

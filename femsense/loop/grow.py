@@ -17,7 +17,7 @@ from femsense.loop.few import Few, few_of
 from femsense.loop.joint import JointFit, Prior, rms_of
 from femsense.loop.mesh_error import mesh_errors
 from femsense.loop.noise import Noise
-from femsense.loop.place import POLISHED, placed
+from femsense.loop.place import POLISHED, closer, placed
 from femsense.loop.predict import sweeps_predicted
 from femsense.loop.refit import EVIDENCE, FORGONE, beyond, evidence, explains, refit, tried, with_term, within, worth_of
 from femsense.loop.screen import NUISANCE, Candidate, linear_gain, penalty
@@ -441,8 +441,9 @@ def _polish(data: Data, stage: Stage, winner: Refit, noise: Noise, say: Progress
 
 
 def prune(data: Data, stage: Stage, noise: Noise, n_effective: float, say: Progress) -> Stage:
-    """Return the stage without effects that those added later have made needless (dBIC for keeping them not above 0)."""
-    added = _added(stage)
+    """Return the stage without effects that those added later have made needless (dBIC for keeping them not above 0); the place of the last one,
+    which was found beside them, then moves on."""
+    whole, added = stage, _added(stage)
     for name in added[:-1]:
         others = [n for n in stage.fit.hypothesis.names if n != name]
         count = sum(len(p) for e, _, p in stage.fit.hypothesis.terms if e.name == name)
@@ -456,7 +457,13 @@ def prune(data: Data, stage: Stage, noise: Noise, n_effective: float, say: Progr
             continue
         if evidence(without.fit, stage.fit) <= price:
             stage = without
-    return stage
+    *_, (effect, seed, parameters) = stage.fit.hypothesis.terms
+    places = (
+        stage is not whole
+        and effect.nearby(data.robot, seed)
+        and len(parameters) == len(effect.parameters(data.robot, data.control))
+    )
+    return closer(data, stage, noise)[0] if places else stage
 
 
 __all__ = [
