@@ -16,9 +16,11 @@ from femsense.errors import DataError, InputError
 from femsense.fem.mesh import surface_triangles
 from femsense.frames import Camera
 from femsense.loop import improve
+from femsense.loop.advice import next_element
 from femsense.loop.data import Data, prepare
 from femsense.loop.joint import normals_of, spans_of, vectors_of
 from femsense.loop.noise import Groups, Noise, Surface, whiten
+from femsense.loop.stages import make_stage, with_nuisance
 from femsense.pointcloud.patches import fit_patches
 from femsense.pose import move_pose
 from femsense.recording import Recording, load_recording, save_recording
@@ -247,3 +249,11 @@ def test_a_camera_that_looks_past_the_robot_is_refused(rubbing: Recording):
     none = {f"marker_{n}": getattr(rubbing, f"marker_{n}")[:0] for n in ("frame", "index", "view", "xyz")}
     with pytest.raises(DataError, match="no camera sees the robot"):
         prepare(arm(COARSE), [replace(rubbing, marker_names=(), T_robot_camera=(away,), **none)], [])
+
+
+def test_what_to_record_next_is_told_from_markers_and_clouds_together(both: Data):
+    hypothesis, prior = with_nuisance(both)
+    noise = Noise({"white": 1e-4}, "")
+    stage = make_stage(both, hypothesis, prior, noise, np.zeros(len(prior.mean)))
+    told = next_element(both, stage.fit, noise, [("cable_gain", "poisson")], ["gravity"])
+    assert told and all(after > before for _, _, before, after in told)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ import numpy as np
 from femsense.arrays import FloatArray
 from femsense.errors import FemsenseError
 from femsense.loop.data import Data
-from femsense.loop.joint import JointFit, Trial
+from femsense.loop.joint import JointFit, Trial, numbers_of
 from femsense.loop.menu import Element, menu, setup_for
 from femsense.loop.noise import Noise
 from femsense.loop.outlook import EVIDENCE, Block, Form, Judge, Outlook, Row, forms_of, make_block, turns_of
@@ -150,8 +151,8 @@ def next_element(
         forms = _open_forms(robot, data, names)
         shares = [len(few.scene.frames) / len(t.scene.frames) for few, t in zip(trials, data.train)]
         have = [
-            _trial_block(t, robot, forms, noise.row_std(t.groups) * np.sqrt(share), str(i))
-            for i, (t, share) in enumerate(zip(trials, shares))
+            _trial_block(t, robot, forms, noise.row_std(t.groups) * np.sqrt(share), str(number))
+            for t, share, number in zip(trials, shares, numbers_of(data.train))
         ]
     except FemsenseError:
         return []
@@ -190,7 +191,7 @@ def _one_of_each_first(elements: Sequence[Element]) -> list[Element]:
 def _few(trial: Trial) -> Trial:
     frames = trial.scene.frames
     every = np.unique(np.linspace(0, len(frames) - 1, min(MOST_LOOKED_AT, len(frames))).round().astype(int))
-    return trial.part(frames[every])
+    return replace(trial.part(frames[every]), together=False)  # it goes by its number with the markers of its recording
 
 
 def _open_forms(robot: Robot, data: Data, names: set[str]) -> list[Form]:
