@@ -55,7 +55,7 @@ class Few:
         effect, seed, parameters = candidate.effect, candidate.seed, candidate.parameters
         fit = self.stage.fit
         try:
-            moved = np.array([p.null for p in parameters]) + candidate.step[: len(parameters)]
+            moved = np.array([np.clip(p.null + s, p.low, p.high) for p, s in zip(parameters, candidate.step)])
             acting = Hypothesis(fit.hypothesis.robot_at(fit.coordinates), ((effect, seed, parameters),)).robot_at(moved)
         except FemsenseError:
             return None
