@@ -176,10 +176,12 @@ def test_a_few_states_lead_to_the_place_and_alike_places_are_fitted_once(
     best, _ = placed(data, stage, far, begun, NOISE)
     where = best.fit.hypothesis.terms[-1][1]["point_m"]
     assert off(far) > 0.012 and np.linalg.norm(np.subtract(where, HIDDEN[0]["point_m"])) < 0.004
-    fitted.clear()
-    monkeypatch.setattr(place, "_alike", lambda one, other: True)
-    placed(data, stage, far, begun, NOISE)
-    assert len(fitted) == 1
+    monkeypatch.setattr(place, "ROUNDS", 0)  # climbs end where they begin
+    for alike, count in ((False, 2), (True, 1)):
+        fitted.clear()
+        monkeypatch.setattr(place, "_alike", lambda one, other, alike=alike: alike)
+        placed(data, stage, far, begun, NOISE)
+        assert len(fitted) == count
 
 
 def test_places_are_alike_if_they_do_the_same_for_the_same(started: tuple[Data, Stage]):
