@@ -98,11 +98,12 @@ def searched(started: tuple[Data, Stage], monkeypatch: pytest.MonkeyPatch) -> tu
     table = screen_stage(data, stage.fit, NOISE, fields_of(data, stage, names), COUNT)
     fitted = list[tuple[str, bool]]()
 
-    def counted(own: Data, before: Stage, candidate: Candidate, *given: Any, **named: Any) -> Stage:
+    def counted(own: Data, before: Stage, candidate: Candidate, noise: Noise, wanted: float = 0.0, **named: Any) -> Stage:
         fitted.append((candidate.effect.name, before is stage))
-        return refit(own, before, candidate, *given, **named)
+        return refit(own, before, candidate, noise, wanted=wanted, **named)
 
     monkeypatch.setattr(growing, "refit", counted)
+    monkeypatch.setattr(growing, "tried", counted)
     monkeypatch.setattr(growing, "explains", lambda stage: True)
     monkeypatch.setattr(growing, "shortlist", lambda table, first: [next(c for c in table if c.effect.name == n) for n in names])
     monkeypatch.setattr(growing, "_bar", lambda ahead, candidate: -np.inf)

@@ -54,12 +54,14 @@ class Few:
         """Return a candidate as these states have it; None where they do not tell, or the states before them would be needed."""
         effect, seed, parameters = candidate.effect, candidate.seed, candidate.parameters
         fit = self.stage.fit
+        if not candidate.raw:
+            return None
         try:
             moved = np.array([np.clip(p.null + s, p.low, p.high) for p, s in zip(parameters, candidate.step)])
             acting = Hypothesis(fit.hypothesis.robot_at(fit.coordinates), ((effect, seed, parameters),)).robot_at(moved)
         except FemsenseError:
             return None
-        if not candidate.raw or has_history(acting):
+        if has_history(acting):
             return None
         raw = [block[rows] for block, rows in zip(candidate.raw, self.rows)]
         fields = Fields([(effect, seed, parameters)], raw, candidate.seats, fit.hypothesis)

@@ -141,8 +141,8 @@ def _falls_behind(few: Few, candidate: Candidate, ahead: Refit, noise: Noise, se
         return False
     base, leading = few.stage.fit, few.of(ahead.stage.fit, noise)
     wanted = max(EVIDENCE, evidence(base, leading) - ahead.candidate.cost - 2.0 * EVIDENCE)
-    made = refit(few.data, few.stage, own, noise, wanted=wanted, settled=settled)
-    return made.fit.chi2 > worth_of(base, own, wanted, settled)
+    made = tried(few.data, few.stage, own, noise, wanted, settled=settled)
+    return made is not None and made.fit.chi2 > worth_of(base, own, wanted, settled)  # where it does not fit, all states decide
 
 
 def _bar(ahead: Refit, candidate: Candidate) -> float:

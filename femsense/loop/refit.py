@@ -155,10 +155,12 @@ def _first_guess(candidate: Candidate, null: FloatArray) -> FloatArray:
     return np.asarray(start)
 
 
-def tried(data: Data, stage: Stage, candidate: Candidate, noise: Noise, wanted: float = EVIDENCE) -> Stage | None:
+def tried(
+    data: Data, stage: Stage, candidate: Candidate, noise: Noise, wanted: float = EVIDENCE, *, settled: bool = False
+) -> Stage | None:
     """Return a refit, or None where there is none."""
     try:
-        return refit(data, stage, candidate, noise, wanted=wanted)
+        return refit(data, stage, candidate, noise, wanted=wanted, settled=settled)
     except FemsenseError:
         return None
 
