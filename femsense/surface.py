@@ -447,9 +447,14 @@ def crossing_triangles(points: FloatArray, triangles: IntArray) -> IntArray:
 
 
 def distance_to(points: FloatArray, triangles: IntArray, places: FloatArray) -> FloatArray:
-    """Return the distance of places (p, 3) from a surface, in its unit, shape (p,).
+    """Return the distance of places (p, 3) from a surface, in its unit, shape (p,)."""
+    return np.asarray(np.linalg.norm(places - nearest_on(points, triangles, places), axis=1))
 
-    The nearest triangle is found in single precision, the distance to it in double.
+
+def nearest_on(points: FloatArray, triangles: IntArray, places: FloatArray) -> FloatArray:
+    """Return the points of a surface that are nearest to places (p, 3), shape (p, 3).
+
+    The nearest triangle is found in single precision, the point in it in double.
     """
     import open3d as o3d
 
@@ -457,8 +462,7 @@ def distance_to(points: FloatArray, triangles: IntArray, places: FloatArray) -> 
     _, scene = _scene(points, triangles)
     nearest = scene.compute_closest_points(o3d.core.Tensor(((places - centre) / size).astype(np.float32)))["primitive_ids"]
     corners = points[triangles[nearest.numpy().astype(np.int64)]]
-    foot = np.einsum("pi,pic->pc", closest_in_triangle(corners, places), corners)
-    return np.asarray(np.linalg.norm(places - foot, axis=1))
+    return np.asarray(np.einsum("pi,pic->pc", closest_in_triangle(corners, places), corners))
 
 
 def wall_thickness(points: FloatArray, triangles: IntArray, places: FloatArray, inward: FloatArray) -> FloatArray:

@@ -177,15 +177,19 @@ def test_a_row_is_positive_where_the_measured_surface_lies_outside(both: Data):
 def test_noise_of_clouds_is_shared_by_neighbours_along_their_normals():
     marker = np.array([0, 1, 0, 1])
     surface = Surface(
-        np.array([[0.0, 0, 0], [0.01, 0, 0]] * 2), np.array([[0.0, 0, 1], [0.6, 0, 0.8]] * 2), np.array([0, 0, 1, 1]), 0.01
+        points=np.array([[0.0, 0, 0], [0.01, 0, 0]] * 2),
+        normals=np.array([[0.0, 0, 1], [0.6, 0, 0.8]] * 2),
+        rest_normals=np.array([[0.0, 0, 1], [0, 0.8, 0.6]] * 2),
+        states=np.array([0, 0, 1, 1]),
+        length=0.01,
     )
     groups = Groups(marker, np.array([0, 0, 1, 1]), np.zeros(4, int), np.arange(4), surface)
     noise = Noise({}, "", {"white": 0.5, "marker": 0.3, "frame": 0.2, "state": 0.1})
     sigma, near = noise.covariance(groups), np.exp(-0.5)
     assert sigma[0, 0] == pytest.approx(0.25 + 0.09 + 0.04 + 0.01)
-    assert sigma[0, 1] == pytest.approx(0.8 * (near * (0.09 + 0.01) + 0.04))
+    assert sigma[0, 1] == pytest.approx(0.6 * near * (0.09 + 0.01) + 0.8 * 0.04)
     assert sigma[0, 2] == pytest.approx(0.09)
-    assert sigma[0, 3] == pytest.approx(0.8 * near * 0.09)
+    assert sigma[0, 3] == pytest.approx(0.6 * near * 0.09)
     W = whiten(noise.whitener(groups), np.eye(4)[:, None, :])
     np.testing.assert_allclose(np.linalg.inv(W.T @ W), sigma, atol=1e-12)
 

@@ -12,7 +12,17 @@ from femsense.calib.calibrate import calibrated_start, first_inputs, first_poses
 from femsense.calib.forward import Scene, make_scene, rest_residual, with_rest_markers
 from femsense.effects import FORMS, Effect
 from femsense.errors import DataError, InputError
-from femsense.loop.clouds import SMOOTH, cloud_frames, diagonal_of, has_clouds, make_rows, read_sheets, states_of, with_surface
+from femsense.loop.clouds import (
+    SMOOTH,
+    cloud_frames,
+    diagonal_of,
+    has_clouds,
+    make_rows,
+    read_sheets,
+    states_of,
+    surface_normals,
+    with_surface,
+)
 from femsense.loop.joint import States, Trial, normals_of
 from femsense.loop.noise import Groups, Surface
 from femsense.loop.split import hold_out, sweeps_of
@@ -227,7 +237,8 @@ def surface_of(robot: Robot, scene: Scene, poses: Sequence[FloatArray]) -> Surfa
         return None
     keys = {k: state_key(scene.recording, int(k)).hex() for k in np.unique(scene.frame)}
     states = np.unique([keys[f] for f in scene.frame], return_inverse=True)[1]
-    return Surface(robot.marker_points[scene.marker], normals_of(scene, poses), states, SMOOTH * diagonal_of(robot))
+    at_rest = surface_normals(robot, robot.body.mesh.nodes)[scene.marker - len(robot.glued_names)]
+    return Surface(robot.marker_points[scene.marker], normals_of(scene, poses), at_rest, states, SMOOTH * diagonal_of(robot))
 
 
 def groups_of(scene: Scene, frames: IntArray | None = None, surface: Surface | None = None) -> Groups:

@@ -2,10 +2,11 @@
 
     Σ = s² I + h² [same marker in the same state] + m² [same marker] + f² [same frame] + r² [same sweep]
 
-for each axis alike. Rows of a cloud are one number each, along the normal nᵢ at the point Xᵢ of the body at rest; what is common to
-two of them, whatever it is, shows in both as far as their normals agree, and errors of neighbouring points are alike:
+for each axis alike. Rows of a cloud are one number each, along the measured normal nᵢ at the point Xᵢ of the body at rest, where the
+body's own is Nᵢ. What is common to two of them shows in both as far as their normals agree: errors of the camera those in space, errors
+of the body those of the body, which turn with it. Errors of neighbouring points of the body are alike:
 
-    Σᵢⱼ = s² δᵢⱼ + (nᵢ·nⱼ) { ρᵢⱼ (h² [same state] + m²) + f² [same frame] + r² [same sweep] },  ρᵢⱼ = exp(−|Xᵢ − Xⱼ|² / 2 ℓ²).
+    Σᵢⱼ = s² δᵢⱼ + (Nᵢ·Nⱼ) ρᵢⱼ (h² [same state] + m²) + (nᵢ·nⱼ) (f² [same frame] + r² [same sweep]),  ρᵢⱼ = exp(−|Xᵢ − Xⱼ|² / 2 ℓ²).
 
 The variances come by restricted maximum likelihood (Patterson & Thompson 1971) from the residual that the
 richest linear model leaves, so that no effect under test counts as noise. Jitter within a hold is not the noise: a state
@@ -88,7 +89,9 @@ class Surface:
     points: FloatArray
     """At rest [m], shape (k, 3)."""
     normals: FloatArray
-    """Shape (k, 3)."""
+    """Measured, shape (k, 3)."""
+    rest_normals: FloatArray
+    """Of the body at rest, shape (k, 3)."""
     states: IntArray
     """Which state (same inputs and loads) each row was measured in, shape (k,)."""
     length: float
@@ -96,8 +99,10 @@ class Surface:
 
     def shared(self, name: str, labels: IntArray) -> FloatArray:
         """Return how much of a component each two rows have in common, shape (k, k)."""
-        alike = self.normals @ self.normals.T
-        if name in ("state", "marker"):
+        of_body = name in ("state", "marker")
+        normals = self.rest_normals if of_body else self.normals
+        alike = normals @ normals.T
+        if of_body:
             square = (self.points**2).sum(axis=1)
             apart = np.maximum(square[:, None] + square[None, :] - 2.0 * self.points @ self.points.T, 0.0)
             alike *= np.exp(-0.5 * apart / self.length**2)
@@ -108,7 +113,7 @@ class Surface:
 
     def of_rows(self, rows: BoolArray | IntArray) -> Surface:
         """Return some of the rows."""
-        return Surface(self.points[rows], self.normals[rows], self.states[rows], self.length)
+        return Surface(self.points[rows], self.normals[rows], self.rest_normals[rows], self.states[rows], self.length)
 
     def cells(self) -> int:
         """Return the number of cells of the size of ℓ that are seen, summed over states."""
