@@ -1,6 +1,6 @@
 """Effects found from clouds: the loop on the four-leg robot in front of its depth camera, from markers, from clouds and from both.
 
-    python benchmarks/clouds.py [--cases friction,gain,gravity,null] [--from markers,clouds,both] [--folder DIR]
+    python benchmarks/clouds.py [--cases friction,gain,…] [--from markers,clouds,both] [--seed 20] [--folder DIR]
 
 The truth has a mesh of half the size, quadratic elements, a neo-Hookean law (in the null case those that are declared, refined) and the
 rig's own integrator of friction; the camera is that of `femsense demo`, with its noise. Poses are declared, 2 mm and 5 mrad off.
@@ -29,18 +29,27 @@ CASES: dict[str, list[dict[str, Any]]] = {
     "friction": [{"name": "cable_friction", "coefficient": 0.2}],
     "gain": [{"name": "cable_gain", "scale": {"west": 0.8}}],
     "gravity": [{"name": "gravity", "vector_m_s2": [0.0, 0.0, -9.81]}],
+    "depth": [{"name": "depth_scale", "scale": 1.015}],
+    "payload": [{"name": "payload", "point_m": [-0.073, 0.0, 0.065], "force_n": [0.0, 0.1, -0.15]}],
+    "soft": [{"name": "soft_region", "center_m": [0.0, -0.045, 0.085], "radius_m": 0.02, "scale": 0.5}],
     "null": [],
 }
 POSE_OFF = np.array([5e-3, -3e-3, 4e-3, 2e-3, -1e-3, 1.5e-3])
 """By how much the declared pose is off: rotation [rad], shift [m]."""
 
 
-def script_of(robot: Robot, case: str) -> dict[str, Any]:
-    """Return the script of a case: the sweeps of the demo without the touch, and a depth image in every frame."""
+def script_of(robot: Robot, case: str, seed: int) -> dict[str, Any]:
+    """Return the script of a case, with a seed of its noise: the sweeps of the demo without the touch, and a depth image in every frame."""
     assert robot.folder is not None
     script = tomllib.loads((robot.folder / "demo_script.toml").read_text(encoding="utf-8"))
     script["sweeps"] = [sweep for sweep in script["sweeps"] if sweep["label"] != "touch"]
-    script |= {"contacts": [], "effects": CASES[case], "actuation_zero": "absolute", "clouds": {"kind": "depth", "frames": "all"}}
+    script |= {
+        "contacts": [],
+        "effects": CASES[case],
+        "actuation_zero": "absolute",
+        "clouds": {"kind": "depth", "frames": "all"},
+        "seed": seed,
+    }
     script["truth"]["law"] = "corotational" if case == "null" else "neo_hookean"
     script["camera"]["declare_pose"] = True
     return script
@@ -51,11 +60,11 @@ def declared_robot(case: str) -> Robot:
     return robot.with_body(robot.body.with_gravity(np.zeros(3))) if case == "gravity" else robot
 
 
-def recording_of(folder: Path, case: str) -> Recording:
+def recording_of(folder: Path, case: str, seed: int) -> Recording:
     """Return the recording of a case, made if it is not there yet."""
-    place = folder / case
+    place = folder / f"{case}-{seed}"
     if not (place / "recording.toml").is_file():
-        simulate(declared_robot(case), script_of(load_robot("four-leg"), case), place)
+        simulate(declared_robot(case), script_of(load_robot("four-leg"), case, seed), place)
     recording = load_recording(place)
     pose = recording.T_robot_camera[0]
     assert pose is not None
@@ -74,20 +83,21 @@ def size_of(loop: Any, truth: dict[str, Any]) -> str:
     if isinstance(value, dict):
         value, std = (float(np.mean([t[k] for k in (true if isinstance(true, dict) else value)])) for t in (value, std))
     true = float(np.mean(list(true.values()))) if isinstance(true, dict) else true
-    return f"{value:.3g} ± {std:.1g} (true {true:g})"
+    return f"{value:.4g} ± {std:.1g} (true {true:g})"
 
 
 def main() -> None:
     parser = argparse.ArgumentParser()
-    parser.add_argument("--cases", default="friction,gain,gravity,null")
+    parser.add_argument("--cases", default=",".join(CASES))
     parser.add_argument("--from", dest="kinds", default="markers,clouds,both")
+    parser.add_argument("--seed", type=int, default=20)
     parser.add_argument("--folder", type=Path)
     options = parser.parse_args()
     folder = options.folder or Path(tempfile.mkdtemp(prefix="clouds-"))
     print("| hidden | from | verdict | named | size | held out, markers [mm] | held out, clouds [mm] | noise [mm] | CPU [s] |")
     print("|---|---|---|---|---|---|---|---|---|", flush=True)
     for case in options.cases.split(","):
-        recording = recording_of(folder, case)
+        recording = recording_of(folder, case, options.seed)
         for kind in options.kinds.split(","):
             began = time.process_time()
             loop = improve(declared_robot(case), [recording], measured=kind)

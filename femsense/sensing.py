@@ -51,13 +51,14 @@ class SensingOptions:
     match_line_m: float | None = None
     """d_m: largest distance of a match from the normal line [m]; None: 3 voxels."""
     match_reach_m: float | None = None
-    """d_l: largest distance along the normal [m]; None: 12 % of the diagonal."""
+    """d_l: largest distance along the normal [m]; None: 20 % of the diagonal."""
     contact_radius_m: float | None = None
     """Search radius of Algorithm 2 [m]; None: 3 voxels."""
     contact_neighbors: int = 3
     """Robot points that make a contact."""
     friction: float | None = None
-    """Coulomb coefficient of a contact: forces within its cone. None: along the inward normal only."""
+    """Coulomb coefficient of a contact that was found: its force lies within that cone about the inward normal, with 0 along it. None: the
+    data say where the force points; beside an edge the normal that the camera sees may be that of another side than the one that is touched."""
     match_points: int = 200
     """Points of the surface that are matched, spread evenly off sharp edges; at least as many as the robot has features."""
     modulus_std: float = 0.03
@@ -714,12 +715,16 @@ def _robust(rows: Rows, outlying: float) -> Rows:
 
 def _directions(sensor: Sensor, patches: Sequence[Patch], state: Equilibrium, source: str) -> FloatArray:
     """Return what the unknowns are: all three components, or the inward normal of each patch, shape (3k, unknowns)."""
-    if source == "given" or sensor.options.friction is not None:
+    if not _along_normals(sensor, source):
         return np.eye(3 * len(patches))
     directions = np.zeros((3 * len(patches), len(patches)))
     for i, patch in enumerate(patches):
         directions[3 * i : 3 * i + 3, i] = -_normal(sensor, patch, state)
     return directions
+
+
+def _along_normals(sensor: Sensor, source: str) -> bool:
+    return source == "cloud" and sensor.options.friction == 0
 
 
 def _normal(sensor: Sensor, patch: Patch, state: Equilibrium) -> FloatArray:
@@ -758,9 +763,8 @@ def _solve_qp(
         the estimate, and the size of that prior [N] (inf where each force has one component).
     """
     now = np.linalg.lstsq(directions, forces, rcond=None)[0]
-    pushing = source == "cloud" and sensor.options.friction is None
-    cone = None
-    if source == "cloud" and sensor.options.friction is not None:
+    pushing, cone = _along_normals(sensor, source), None
+    if source == "cloud" and sensor.options.friction:
         cone = FrictionCone(normals=np.array([_normal(sensor, p, state) for p in patches]), mu=sensor.options.friction)
 
     def answer(prior: float) -> ForceEstimate:

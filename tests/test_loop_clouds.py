@@ -13,14 +13,17 @@ from arm import T_ROBOT_CAMERA, arm, record, sweeps
 from femsense.calib.forward import Hypothesis, evaluate_scene
 from femsense.effects import find_effect
 from femsense.errors import DataError, InputError
-from femsense.fem.mesh import surface_triangles
+from femsense.fem.equilibrium import Equilibrium, solve_equilibrium
+from femsense.fem.mesh import surface_triangles, triangle_normals
 from femsense.frames import Camera
 from femsense.loop import improve
 from femsense.loop.advice import next_element
+from femsense.loop.clouds import FACING, RADIUS, _on_model, _patches_of, _seen, surface_normals, with_surface
 from femsense.loop.data import Data, prepare
 from femsense.loop.joint import normals_of, spans_of, vectors_of
 from femsense.loop.noise import Groups, Noise, Surface, whiten
 from femsense.loop.stages import make_stage, with_nuisance
+from femsense.model import Robot
 from femsense.pointcloud.patches import fit_patches
 from femsense.pose import move_pose
 from femsense.recording import Recording, load_recording, save_recording
@@ -124,6 +127,48 @@ def test_rows_are_what_the_true_pose_says_and_markers_and_clouds_share_it(both: 
         Hypothesis(both.robot), scene, np.zeros(0), [T_ROBOT_CAMERA], None, derivative=False, vary_initial=False, pivot=pivot
     )
     assert np.sqrt((jet.residual**2).mean()) < 4e-4  # no cable pulls yet
+
+
+def rest_state(robot: Robot) -> Equilibrium:
+    return solve_equilibrium(robot.with_body(robot.body.with_gravity(np.zeros(3))).body)
+
+
+def on_sides(robot: Robot, facing: tuple[float, ...]) -> np.ndarray:
+    """Return points (r, 3) [m] all over the sides of a robot at rest that a camera sees from a direction."""
+    nodes, triangles = robot.body.mesh.nodes, surface_triangles(robot.body.mesh)
+    seen = triangles[triangle_normals(nodes, triangles) @ facing > 0.0]
+    weights = np.random.default_rng(1).dirichlet(np.ones(3), (len(seen), 400))
+    return np.einsum("tsi,tic->tsc", weights, nodes[seen]).reshape(-1, 3)
+
+
+def test_what_a_patch_rounds_off_is_no_residual():
+    robot = with_surface(arm(COARSE))
+    places = robot.body.mesh.nodes[np.abs(robot.body.mesh.nodes[:, 1:]).max(axis=1) > 9e-3]
+    robot = robot.with_surface_points(np.concatenate([places, places + np.array([4e-3, 0.0, 0.0])]))  # edges among them
+    pose = np.eye(4)
+    pose[:3, 3] = 0.05, 0.2, 0.3
+    points = on_sides(robot, (0.0, 0.2, 0.3)) - pose[:3, 3]
+    state = rest_state(robot)
+    patches, numbers = _patches_of(robot, points, state, pose, 2e-3)
+    assert len(numbers) > 8
+    np.testing.assert_allclose(patches.heights[:, 0], 0.0, atol=1e-9)
+    plain = fit_patches(
+        _seen(robot, robot.marker_points[len(robot.glued_names) :], pose), surface_normals(robot, state.positions), points,
+        radius=RADIUS * 2e-3, reach=0.01, min_facing=FACING,
+    )[0]  # fmt: skip
+    assert np.abs(plain.heights[:, 0]).max() > 5e-4
+    higher, again = _patches_of(robot, points + 1e-3 * np.array([0.0, 0.0, 1.0]), state, pose, 2e-3)
+    top = surface_normals(robot, state.positions)[again][:, 2] > 0.99
+    assert top.sum() > 2
+    np.testing.assert_allclose(higher.heights[top, 0], 1e-3, atol=1e-9)
+
+
+def test_only_sides_that_face_the_camera_stand_for_what_it_measured():
+    robot = with_surface(arm(COARSE))
+    pose = np.eye(4)
+    pose[:3, 3] = 0.05, 0.0, 0.4
+    deep = np.array([[0.05, 0.002, -0.009], [0.03, 0.001, -0.02]]) - pose[:3, 3]  # nearer to the side below
+    np.testing.assert_allclose(_on_model(robot, deep, rest_state(robot), pose)[:, 2], 0.01 - 0.4, atol=1e-9)
 
 
 def test_derivatives_of_cloud_rows_are_those_of_finite_differences(both: Data):

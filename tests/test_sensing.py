@@ -97,21 +97,32 @@ def cloud_of(states: np.ndarray, force_at: np.ndarray | None, rng: np.random.Gen
     return PointCloud(transform_points(invert_pose(T_ROBOT_CAMERA), noisy), colors)
 
 
-@pytest.fixture(scope="module")
-def seen(tmp_path_factory, touched) -> Recording:
-    """Clouds of the arm, pushed down on its upper face near the tip by 0.1 N in the last frame."""
-    folder = Path(tmp_path_factory.mktemp("clouds"))
-    place, push = np.array([0.085, 0.0, 0.01]), np.array([0.0, 0.0, -0.1])
-    recording, states = record(INPUTS, noise=1e-4, forces={3: (place, push)})
+def seen_clouds(folder: Path, place: np.ndarray, *, hides: float = 0.0) -> Recording:
+    """Return a recording with clouds of the arm, pushed down on its upper face by 0.1 N in the last frame, by a ball that hides this face so far [m]."""
+    recording, states = record(INPUTS, noise=1e-4, forces={3: (place, np.array([0.0, 0.0, -0.1]))})
     rng = np.random.default_rng(5)
     files = []
     true = arm((8, 3, 3), law="neo_hookean")
-    node = int(np.argmin(np.linalg.norm(true.body.mesh.nodes - place, axis=1)))
+    rest = true.body.mesh.nodes
+    node = int(np.argmin(np.linalg.norm(rest - place, axis=1)))
     for k, x in enumerate(states):
         ball = x[node] + [0, 0, 0.006] if k == 3 else None
-        write_cloud(folder / f"{k:06d}.ply", cloud_of(x, ball, rng))
+        cloud = cloud_of(x, ball, rng)
+        if hides and ball is not None:
+            points = transform_points(T_ROBOT_CAMERA, cloud.points)
+            level = np.interp(points[:, 0], *np.sort(x[rest[:, 2] > 0.0099][:, [0, 2]], axis=0).T)
+            hidden = (points[:, 2] > level - 2e-3) & (np.linalg.norm(points[:, :2] - x[node, :2], axis=1) < hides)
+            keep = ~hidden | (cloud.colors[:, 0] > 0.5)
+            cloud = PointCloud(cloud.points[keep], cloud.colors[keep])
+        write_cloud(folder / f"{k:06d}.ply", cloud)
         files.append((folder / f"{k:06d}.ply",))
     return replace(recording, free=np.array([True, True, True, False]), cloud_files=tuple(files), color_files=((None,),) * 4)
+
+
+@pytest.fixture(scope="module")
+def seen(tmp_path_factory) -> Recording:
+    """Clouds of the arm, pushed down in the middle of its upper face near the tip."""
+    return seen_clouds(Path(tmp_path_factory.mktemp("clouds")), np.array([0.085, 0.0, 0.01]))
 
 
 def test_a_push_is_found_in_a_coloured_cloud_with_its_force(seen):
@@ -130,6 +141,18 @@ def test_a_friction_cone_allows_a_force_beside_the_normal(seen):
     contact = run.contacts[0]
     along = -contact.force_n_xyz @ contact.normal
     assert np.linalg.norm(contact.force_n_xyz + along * contact.normal) <= 0.5 * along + 1e-9
+
+
+def test_the_data_say_where_a_force_points_that_was_found(tmp_path):
+    """What touches hides the side that it touches: here the camera sees but the flank of the arm beside the ball."""
+    seen = seen_clouds(tmp_path, np.array([0.085, 0.01, 0.01]), hides=0.015)
+    calibration = calibrate(arm(), seen)
+    contact = estimate(arm(), seen, calibration).contacts[0]
+    along_normal = estimate(arm(), seen, calibration, options=SensingOptions(friction=0.0)).contacts[0]
+    np.testing.assert_allclose(np.cross(along_normal.force_n_xyz, along_normal.normal), 0.0, atol=1e-2 * along_normal.force_n)
+    assert along_normal.force_n < 0.05
+    assert abs(contact.force_n - 0.1) < min(0.02, contact.std_n)
+    assert contact.force_n_xyz[2] < -0.95 * contact.force_n
 
 
 def test_a_cloud_that_is_no_cloud_is_reported(seen, tmp_path):

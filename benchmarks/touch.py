@@ -1,0 +1,113 @@
+"""Forces from clouds: the four-leg robot in front of its depth camera, touched by a ball at several places.
+
+    python benchmarks/touch.py [--folder DIR]
+
+The truth is that of `femsense demo` (half the element size, quadratic elements, neo-Hookean, cables that rub) with other seeds; the robot
+that senses is declared with the effects that the truth has, on its own mesh. Forces are sensed where contacts are found: in any direction,
+and along the normal that is seen.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import tempfile
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from femsense.calib.calibrate import calibrate
+from femsense.effects import apply_effects
+from femsense.model import Robot
+from femsense.recording import Recording, load_recording
+from femsense.rig.simulate import simulate
+from femsense.robot import load_robot
+from femsense.sensing import SensingOptions, estimate
+
+PLACES = {
+    "leg, from above": [0.0, -0.042964, 0.09057],
+    "leg, from the side": [-0.043, -0.009, 0.085],
+    "leg, ridge, left": [-0.05, 0.0, 0.089],
+    "leg, ridge, right": [0.045, 0.0, 0.0895],
+    "leg, outer face": [-0.0845, 0.0, 0.045],
+}
+LAW = {"name": "hyperelastic", "law": "neo_hookean"}
+DIRECTIONS = {"any": SensingOptions(), "normal": SensingOptions(friction=0.0)}
+
+
+def script_of(robot: Robot, place: list[float], seed: int) -> dict[str, Any]:
+    """Return the script of the demo with its touch at another place, with a seed of its noise."""
+    assert robot.folder is not None
+    script = tomllib.loads((robot.folder / "demo_script.toml").read_text(encoding="utf-8"))
+    script["contacts"][0]["point_m"] = place
+    return script | {"seed": seed}
+
+
+def touched(folder: Path, robot: Robot, name: str, seed: int) -> Recording:
+    """Return the recording of a touch, made if it is not there yet."""
+    place = folder / f"{name.replace(', ', '-').replace(' ', '-')}-{seed}"
+    if not (place / "recording.toml").is_file():
+        simulate(robot, script_of(robot, PLACES[name], seed), place)
+    return load_recording(place)
+
+
+def true_contacts(recording: Recording) -> dict[int, tuple[np.ndarray, float]]:
+    """Return frame → place [m] and force [N] of the touch."""
+    assert recording.folder is not None
+    with (recording.folder / "truth" / "contacts.csv").open(encoding="utf-8") as file:
+        rows = [row for row in csv.DictReader(file) if float(row["force_n"]) > 0]
+    return {
+        int(row["frame"]): (np.array([float(row[key]) for key in ("x_m", "y_m", "z_m")]), float(row["force_n"])) for row in rows
+    }
+
+
+def errors_of(robot: Robot, recording: Recording, options: SensingOptions) -> np.ndarray:
+    """Return error of the force relative to it, in standard deviations, and of the place [m], a row a contact that was found."""
+    run, truth = estimate(robot, recording, calibrate(robot, recording), options=options), true_contacts(recording)
+    rows = []
+    for contact in run.contacts:
+        if contact.frame in truth:
+            place, force = truth[contact.frame]
+            error = contact.force_n - force
+            rows.append((error / force, error / contact.std_n, np.linalg.norm(contact.position_m - place)))
+    return np.array(rows).reshape(-1, 3)
+
+
+def row(name: str, direction: str, errors: np.ndarray) -> str:
+    relative, z, place = errors.T
+    cells = [
+        name,
+        direction,
+        str(len(errors)),
+        f"{np.median(np.abs(relative)):.1%}",
+        f"{np.median(relative):+.1%}",
+        f"{(np.abs(z) < 1).mean():.0%}",
+        f"{(np.abs(z) < 2).mean():.0%}",
+        f"{1e3 * np.median(place):.1f}",
+    ]
+    return "| " + " | ".join(cells) + " |"
+
+
+def main() -> None:
+    """Print a row for each place and direction, and one for all places together."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--folder", type=Path)
+    folder = parser.parse_args().folder or Path(tempfile.mkdtemp(prefix="touch-"))
+    declared = load_robot("four-leg")
+    every: dict[str, list[np.ndarray]] = {direction: [] for direction in DIRECTIONS}
+    print("| touched | force points | contacts | error (median) | signed | within 1 std | within 2 std | place [mm] |")
+    print("|---|---|---|---|---|---|---|---|", flush=True)
+    for seed, name in enumerate(PLACES, start=21):
+        recording = touched(folder, declared, name, seed)
+        robot = apply_effects(declared, [*script_of(declared, PLACES[name], seed)["effects"], LAW])
+        for direction, options in DIRECTIONS.items():
+            every[direction].append(errors_of(robot, recording, options))
+            print(row(name, direction, every[direction][-1]), flush=True)
+    for direction, errors in every.items():
+        print(row("all", direction, np.concatenate(errors)), flush=True)
+
+
+if __name__ == "__main__":
+    main()
