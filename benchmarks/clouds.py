@@ -72,18 +72,23 @@ def recording_of(folder: Path, case: str, seed: int) -> Recording:
 
 
 def size_of(loop: Any, truth: dict[str, Any]) -> str:
-    """Return the value that was found beside the true one."""
-    key, true = next((k, v) for k, v in truth.items() if k != "name")
+    """Return the values that were found beside the true ones."""
     entry = next((e for e in loop.effects if e["name"] == truth["name"]), None)
     if entry is None:
         return "–"
-    value, std = entry["parameters"][key]["value"], entry["parameters"][key]["std"]
+    return ", ".join(_off(key, entry["parameters"][key], true) for key, true in truth.items() if key != "name")
+
+
+def _off(key: str, found: dict[str, Any], true: Any) -> str:
+    value, std = found["value"], found["std"]
     if isinstance(value, list):
-        return f"{np.linalg.norm(np.subtract(value, true)) / np.linalg.norm(true):.1%} off"
+        away = float(np.linalg.norm(np.subtract(value, true)))
+        return f"place {1e3 * away:.0f} mm off" if key.endswith("_m") else f"{away / np.linalg.norm(true):.1%} off"
     if isinstance(value, dict):
         value, std = (float(np.mean([t[k] for k in (true if isinstance(true, dict) else value)])) for t in (value, std))
     true = float(np.mean(list(true.values()))) if isinstance(true, dict) else true
-    return f"{value:.4g} ± {std:.1g} (true {true:g})"
+    unit = f"{key.removesuffix('_m')} " if key.endswith("_m") else ""
+    return f"{unit}{value:.4g} ± {std:.1g} (true {true:g})"
 
 
 def main() -> None:

@@ -97,7 +97,7 @@ def main() -> None:
     folder = parser.parse_args().folder or Path(tempfile.mkdtemp(prefix="touch-"))
     declared = load_robot("four-leg")
     every: dict[str, list[np.ndarray]] = {direction: [] for direction in DIRECTIONS}
-    print("| touched | force points | contacts | error (median) | signed | within 1 std | within 2 std | place [mm] |")
+    print("| touched | force along | contacts | error (median) | signed | within 1 std | within 2 std | place [mm] |")
     print("|---|---|---|---|---|---|---|---|", flush=True)
     for seed, name in enumerate(PLACES, start=21):
         recording = touched(folder, declared, name, seed)
