@@ -88,7 +88,8 @@ def _off(key: str, found: dict[str, Any], true: Any) -> str:
         value, std = (float(np.mean([t[k] for k in (true if isinstance(true, dict) else value)])) for t in (value, std))
     true = float(np.mean(list(true.values()))) if isinstance(true, dict) else true
     unit = f"{key.removesuffix('_m')} " if key.endswith("_m") else ""
-    return f"{unit}{value:.4g} ± {std:.1g} (true {true:g})"
+    spread = "" if std is None else f" ± {std:.1g}"
+    return f"{unit}{value:.4g}{spread} (true {true:g})"
 
 
 def main() -> None:

@@ -53,6 +53,7 @@ STAGES = (
 )
 HIDDEN: dict[str, tuple[dict[str, Any], ...]] = {
     "nothing": (),
+    "gravity": (),  # it is the declared robot that has none
     "clamp": ({"name": "base_compliance", "stiffness_n_m": 60.0},),
     "friction": ({"name": "cable_friction", "coefficient": 0.15},),
     "gain": ({"name": "cable_gain", "scale": {"b": 0.88}},),
@@ -116,7 +117,8 @@ BAR = Design(
 def make(hidden: str, folder: Path) -> None:
     """Write robot, recording and a user's own effects into a folder."""
     case = Case(1, "single", BAR, "tension", 1e-4, HIDDEN[hidden], seats=True, hyperelastic=False)
-    declared = BAR.robot(fine=False, law="corotational", gravity=EARTH, modulus=BAR.modulus)
+    gravity = np.zeros(3) if hidden == "gravity" else EARTH
+    declared = BAR.robot(fine=False, law="corotational", gravity=gravity, modulus=BAR.modulus)
     true = BAR.robot(fine=True, law="corotational", gravity=EARTH, modulus=0.9 * BAR.modulus)
     true = apply_effects(true, [_on_clamp(e, len(declared.body.clamped), len(true.body.clamped)) for e in case.hidden])
     mixes = np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1], [0.7, 0.7, 0, 0], [0, 0.7, 0.6, 0], [0, 0, 0.8, 0.5], [0.5, 0, 0, 0.8],

@@ -10,8 +10,10 @@ import numpy as np
 from femsense.calib.calibration import Calibration
 
 if TYPE_CHECKING:
-    from femsense.sensing import ContactForce, Run
+    from femsense.sensing import ContactForce, FrameReport, Run
 
+OFF = 4.0
+"""A residual so many times that of a frame that went well is said."""
 LISTED = 6
 """So many frames are listed one by one."""
 VERDICTS = {
@@ -67,7 +69,14 @@ def run_document(run: Run) -> dict[str, Any]:
         "ms_per_frame": _median([frame.ms for frame in good]),
         "known_loads": run.known_loads,
         "failed": [{"frame": frame.frame, "status": frame.status} for frame in run.frames if frame.status != "ok"],
+        "unexplained": [{"frame": frame.frame, "rms_after_m": frame.rms_after_m} for frame in _unexplained(good)],
     }
+
+
+def _unexplained(frames: Sequence[FrameReport]) -> list[FrameReport]:
+    """Return frames whose residual with the forces that were found is OFF times that of a frame that went well, the lower quartile."""
+    usual = np.quantile([frame.rms_after_m for frame in frames], 0.25) if frames else np.inf
+    return [frame for frame in frames if frame.rms_after_m > OFF * usual]
 
 
 def run_text(run: Run) -> str:
@@ -87,6 +96,20 @@ def run_text(run: Run) -> str:
             [
                 "largest force",
                 f"{strongest.force_n:.3f} ± {strongest.std_n:.3f} N in frame {strongest.frame}, at {_millimetres(strongest.position_m)}",
+            ]
+        )
+    if facts["unexplained"]:
+        worst = max(facts["unexplained"], key=lambda frame: frame["rms_after_m"])
+        rows.append(
+            [
+                "not explained",
+                f"{len(facts['unexplained'])} of {facts['frames_ok']} frames, most frame {worst['frame']}: off by {1e3 * worst['rms_after_m']:.1f} mm with the forces that were found",
+            ]
+        )
+        rows.append(
+            [
+                "",
+                "something out of sight may touch it there (--at names a place), or the model lacks something (femsense improve)",
             ]
         )
     for load in run.known_loads:

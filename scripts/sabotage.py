@@ -247,6 +247,7 @@ SABOTAGES = (
     S("loop/noise.py", "normals = self.rest_normals if of_body else self.normals", "normals = self.normals", "test_loop_clouds.py::test_noise_of_clouds_is_shared_by_neighbours_along_their_normals"),
     S("loop/clouds.py", "own.heights[:, 0] -= modelled.heights[j, 0]", "pass", "test_loop_clouds.py::test_what_a_patch_rounds_off_is_no_residual"),
     S("loop/clouds.py", "nearest_on(nodes, triangles[faces], points) if faces.any()", "nearest_on(nodes, triangles, points) if faces.any()", "test_loop_clouds.py::test_only_sides_that_face_the_camera_stand_for_what_it_measured"),
+    S("summary.py", "frame.rms_after_m > OFF * usual", "frame.rms_before_m > OFF * usual", "test_demo.py::test_a_frame_that_no_force_explains_is_said"),
     S("sensing.py", 'return source == "cloud" and sensor.options.friction == 0', 'return source == "cloud" and not sensor.options.friction', "test_sensing.py::test_the_data_say_where_a_force_points_that_was_found"),
     S("sensing.py", 'return source == "cloud" and sensor.options.friction == 0', "return False", "test_sensing.py::test_the_data_say_where_a_force_points_that_was_found"),
     S("pointcloud/patches.py", "out[3:6] /= across**2", "out[3:6] /= across", "test_loop_clouds.py::test_a_patch_measures_the_distance_from_a_curved_surface_wherever_the_point_goes"),

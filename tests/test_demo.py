@@ -101,6 +101,17 @@ def test_texts_name_what_matters(run: Run) -> None:
     assert "0.1234 ± 0.01\n" in text and "top 1 ± 0.5 N" in text and "2.500 → 0.400 mm" in text
 
 
+def test_a_frame_that_no_force_explains_is_said(run: Run) -> None:
+    def text(*after_mm: float) -> str:
+        one = next(frame for frame in run.frames if frame.status == "ok")
+        frames = [replace(one, frame=k, rms_after_m=1e-3 * rms) for k, rms in enumerate(after_mm)]
+        return run_text(replace(run, frames=tuple(frames)))
+
+    assert "2 of 6 frames, most frame 4: off by 8.8 mm" in text(0.3, 0.3, 0.4, 3.5, 8.8, 1.1)
+    assert "not explained" not in text(0.3, 0.3, 0.4, 1.1)
+    assert "not explained" not in run_text(replace(run, frames=()))
+
+
 def test_the_closing_table_and_the_picture(run: Run, tmp_path: Path) -> None:
     document = demo.demo_document(
         tmp_path, run, LOOP, replace(run, contacts=()), TRUTH, [{"name": "cable_friction", "coefficient": 0.2}]
