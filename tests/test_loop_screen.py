@@ -203,6 +203,15 @@ def test_a_larger_error_is_not_for_zeros_of_cables_which_much_else_looks_like(
     assert conclude._holds_out(data, search, back) == held
 
 
+@pytest.mark.parametrize(("noise_mm", "small"), [(0.2, False), (0.4, True)])
+def test_a_residual_no_larger_than_the_noise_is_said_to_be_so(noise_mm: float, small: bool) -> None:
+    stage = replace(staged(arm((4, 2, 2)), 1.0)[1], held_rms=3e-4)
+    noise = Noise({"white": 1e-3 * noise_mm / np.sqrt(3.0)}, "")
+    sentence = conclude._sentence("unexplained", [], [], stage, stage, noise, None)
+    assert sentence.startswith("A residual is left that no effect of the list explains")
+    assert ("no larger than the noise" in sentence) == small and f"0.30 mm, noise {noise_mm:.2f} mm" in sentence
+
+
 @pytest.mark.parametrize("error, mesh, expected", [(0.5, None, False), (0.5, 1.0, False), (0.9, None, False), (0.9, 1.0, True)])
 def test_where_the_data_are_explained_by_what_the_mesh_costs_the_sentence_says_so(
     error: float, mesh: float | None, expected: bool

@@ -523,7 +523,8 @@ def _sentence(
         return f"The model explains the data {known}: {error}."
     if verdict == "unexplained" and not effects:
         explains = "nothing that may be handed back" if found else "no effect of the list"
-        return f"A residual is left that {explains} explains: {error}, noise {1e3 * noise.total:.2f} mm."
+        small = ", though it is no larger than the noise" if before.held_rms <= noise.total else ""
+        return f"A residual is left that {explains} explains{small}: {error}, noise {1e3 * noise.total:.2f} mm."
     what = ", ".join(f"{e['name']} ({_short(e['parameters'])})" for e in effects)
     tail = "" if verdict == "effects" else " A structured residual is left that no effect explains."
     where = "" if noise.std else " along the normals of the surface"
