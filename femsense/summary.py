@@ -13,7 +13,9 @@ if TYPE_CHECKING:
     from femsense.sensing import ContactForce, FrameReport, Run
 
 OFF = 4.0
-"""A residual so many times that of a frame that went well is said."""
+"""A residual so many times that of a frame that went well is said …"""
+LITTLE = 1e-4
+"""… which no camera has smaller than this [m]."""
 LISTED = 6
 """So many frames are listed one by one."""
 VERDICTS = {
@@ -75,7 +77,8 @@ def run_document(run: Run) -> dict[str, Any]:
 
 def _unexplained(frames: Sequence[FrameReport]) -> list[FrameReport]:
     """Return frames whose residual with the forces that were found is OFF times that of a frame that went well, the lower quartile."""
-    usual = np.quantile([frame.rms_after_m for frame in frames], 0.25) if frames else np.inf
+    known = [frame.rms_after_m for frame in frames if np.isfinite(frame.rms_after_m)]
+    usual = max(float(np.quantile(known, 0.25)), LITTLE) if known else np.inf
     return [frame for frame in frames if frame.rms_after_m > OFF * usual]
 
 

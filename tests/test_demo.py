@@ -109,6 +109,8 @@ def test_a_frame_that_no_force_explains_is_said(run: Run) -> None:
 
     assert "2 of 6 frames, most frame 4: off by 8.8 mm" in text(0.3, 0.3, 0.4, 3.5, 8.8, 1.1)
     assert "not explained" not in text(0.3, 0.3, 0.4, 1.1)
+    assert "not explained" not in text(0.0, 0.0, 0.0, 0.3)  # no camera is that good
+    assert "1 of 5 frames, most frame 4" in text(np.nan, 0.3, 0.3, 0.3, 3.5)
     assert "not explained" not in run_text(replace(run, frames=()))
 
 
