@@ -1,6 +1,6 @@
 """Effects found from clouds: the loop on the four-leg robot in front of its depth camera, from markers, from clouds and from both.
 
-    python benchmarks/clouds.py [--cases friction,gain,…] [--from markers,clouds,both] [--seed 20] [--folder DIR]
+    python benchmarks/clouds.py [--cases friction,gain,…] [--from markers,clouds,both] [--seed 20] [--without-colours] [--folder DIR]
 
 The truth has a mesh of half the size, quadratic elements, a neo-Hookean law (in the null case those that are declared, refined) and the
 rig's own integrator of friction; the camera is that of `femsense demo`, with its noise. Poses are declared, 2 mm and 5 mrad off.
@@ -97,6 +97,7 @@ def main() -> None:
     parser.add_argument("--cases", default=",".join(CASES))
     parser.add_argument("--from", dest="kinds", default="markers,clouds,both")
     parser.add_argument("--seed", type=int, default=20)
+    parser.add_argument("--without-colours", action="store_true", help="the camera has depth alone")
     parser.add_argument("--folder", type=Path)
     options = parser.parse_args()
     folder = options.folder or Path(tempfile.mkdtemp(prefix="clouds-"))
@@ -104,6 +105,8 @@ def main() -> None:
     print("|---|---|---|---|---|---|---|---|---|", flush=True)
     for case in options.cases.split(","):
         recording = recording_of(folder, case, options.seed)
+        if options.without_colours:
+            recording = replace(recording, color_files=tuple((None,) * len(files) for files in recording.color_files))
         for kind in options.kinds.split(","):
             began = time.process_time()
             loop = improve(declared_robot(case), [recording], measured=kind)

@@ -484,7 +484,7 @@ def _segment(sensor: Sensor, cloud: PointCloud, state: Equilibrium) -> tuple[Poi
     distance = 0.08 * sensor.size
     color = sensor.robot.color_rgb
     if cloud.colors is None:
-        return segment_by_model(cloud, state.positions[nodes], normals, 0.5 * distance)
+        return segment_by_model(cloud, state.positions[nodes], normals, 0.5 * distance, plane_m=1.5 * _voxel(sensor))
     if color is None:
         return segment_by_model(cloud, state.positions[nodes], normals, distance)
     return segment_robot(cloud, color, vote_radius_m=1.5 * _voxel(sensor))

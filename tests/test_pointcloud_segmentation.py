@@ -217,6 +217,34 @@ def test_model_without_colours_takes_what_is_near() -> None:
     np.testing.assert_array_equal(chosen[~is_robot], np.abs(points[~is_robot, 2]) <= 0.003)
 
 
+def test_a_floor_that_goes_on_beside_the_robot_is_not_robot() -> None:
+    rng = np.random.default_rng(0)
+    along = rng.uniform(size=(3000, 2)) * [0.1, 0.06]
+    wall = np.column_stack([along[:, 0], 3e-4 * rng.normal(size=3000), along[:, 1]])  # stands on the floor
+    floor = np.column_stack([rng.uniform(-0.1, 0.2, size=(6000, 2)) - [0.0, 0.05], 3e-4 * rng.normal(size=6000)])
+    cloud, is_robot = PointCloud(np.vstack([wall, floor])), np.arange(9000) < 3000
+    normals = np.tile([0.0, 1.0, 0.0], (len(wall), 1))
+    robot, _ = segment_by_model(cloud, wall, normals, 0.01)
+    assert kept(cloud, robot)[~is_robot].sum() > 100
+    robot, surroundings = segment_by_model(cloud, wall, normals, 0.01, plane_m=1.5e-3)
+    chosen = kept(cloud, robot)
+    assert len(robot) + len(surroundings) == len(cloud)
+    assert chosen[~is_robot].sum() <= 5 and chosen[is_robot & (cloud.points[:, 2] > 1.6e-3)].all()
+    np.testing.assert_array_equal(segment_by_model(cloud, wall, normals, 0.01, plane_m=1.5e-3)[0].points, robot.points)
+
+
+def test_what_lies_beside_the_robot_but_in_no_plane_or_flush_with_it_decides_nothing() -> None:
+    rng = np.random.default_rng(0)
+    wall = np.column_stack([0.1 * rng.uniform(size=3000), 3e-4 * rng.normal(size=3000), 0.06 * rng.uniform(size=3000)])
+    normals = np.tile([0.0, 1.0, 0.0], (len(wall), 1))
+    ball = rng.normal(size=(3000, 3))
+    ball = 0.05 * ball / np.linalg.norm(ball, axis=1, keepdims=True) + [0.05, 0.08, 0.03]
+    flush = np.column_stack([rng.uniform(0.13, 0.4, 3000), 3e-4 * rng.normal(size=3000), 0.06 * rng.uniform(size=3000)])
+    for beside in (ball, flush, flush[:50]):
+        robot, _ = segment_by_model(PointCloud(np.vstack([wall, beside])), wall, normals, 0.01, plane_m=1.5e-3)
+        assert len(robot) == 3000
+
+
 def test_points_deep_inside_or_beside_the_surface_are_not_robot() -> None:
     cloud = PointCloud([[0.05, 0.05, 0.0], [0.05, 0.05, -0.05], [0.05, 0.05, 0.05], [0.2, 0.05, 0.0]])
     surface = sheet((0, 0, 0), 0.1, 0.01)

@@ -46,6 +46,8 @@ FACING = 0.35
 """Smallest cosine between a normal and the ray to the camera."""
 SMOOTH = 0.06
 """Distance over which errors go together, in diagonals."""
+PLANE = 1.5
+"""Half the thickness of a floor or wall beside the robot, in cells."""
 STANDS_OUT = 5.0
 """A row farther from its neighbours in the frame than this many of their usual differences is left out."""
 NEIGHBOURS = 6
@@ -134,7 +136,8 @@ def _robot_points(
     else:
         nodes = np.unique(triangles)
         near = 0.08 * size if placed.colors is not None else 0.04 * size
-        own, _ = segment_by_model(placed, state.positions[nodes], vertex_normals(state.positions, triangles)[nodes], near)
+        normals = vertex_normals(state.positions, triangles)[nodes]
+        own, _ = segment_by_model(placed, state.positions[nodes], normals, near, plane_m=PLANE * voxel)
     return as_measured(own.points, np.zeros(len(own), dtype=np.int64), [pose], robot.observation)
 
 
