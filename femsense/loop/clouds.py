@@ -3,7 +3,7 @@
 A point of the surface plays the part of a marker, and its distance from the measured surface along the normal that of its residual: one
 row. The measured surface near a normal is a height field (`femsense.pointcloud.patches`) that stays as it is while a model is fitted, so
 that derivatives are those of the residual and two models are compared on the same rows. As the fit moves on, the patches are made anew
-(`renewed_rows`); which rows there are is decided once, on the model with all that calibration may move.
+(`renewed_rows`); which points are the robot's and which rows there are is decided on the model with all that calibration may move.
 
 A patch is as wide as a finger and rounds off edges, steps and facets. So its height is counted from that of a second patch, which is
 made in the same way of the places on the model's own surface that are nearest to the measured points: what the model has rounded off as
