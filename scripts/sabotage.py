@@ -245,7 +245,6 @@ SABOTAGES = (
     S("loop/noise.py", "alike *= np.exp(-0.5 * apart / self.length**2)", "pass", "test_loop_clouds.py::test_noise_of_clouds_is_shared_by_neighbours_along_their_normals"),
     S("loop/noise.py", "alike = normals @ normals.T", "alike = np.ones((len(self.points),) * 2)", "test_loop_clouds.py::test_noise_of_clouds_is_shared_by_neighbours_along_their_normals"),
     S("loop/noise.py", "normals = self.rest_normals if of_body else self.normals", "normals = self.normals", "test_loop_clouds.py::test_noise_of_clouds_is_shared_by_neighbours_along_their_normals"),
-    S("loop/stages.py", "sheets = read_sheets(robot, trial.scene.recording, states, tuple(poses))", "sheets = trial.sheets", "test_loop_clouds.py::test_which_points_are_the_robots_is_asked_again_of_the_calibrated_model"),
     S("loop/clouds.py", "own.heights[:, 0] -= modelled.heights[j, 0]", "pass", "test_loop_clouds.py::test_what_a_patch_rounds_off_is_no_residual"),
     S("loop/clouds.py", "nearest_on(nodes, triangles[faces], points) if faces.any()", "nearest_on(nodes, triangles, points) if faces.any()", "test_loop_clouds.py::test_only_sides_that_face_the_camera_stand_for_what_it_measured"),
     S("pointcloud/segmentation.py", "left = near & (away > width)", "left = near & (away < width)", "test_pointcloud_segmentation.py::test_a_floor_that_goes_on_beside_the_robot_is_not_robot"),

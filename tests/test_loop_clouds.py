@@ -22,7 +22,7 @@ from femsense.loop.clouds import FACING, RADIUS, _on_model, _patches_of, _seen, 
 from femsense.loop.data import Data, prepare
 from femsense.loop.joint import normals_of, spans_of, vectors_of
 from femsense.loop.noise import Groups, Noise, Surface, whiten
-from femsense.loop.stages import make_stage, rematched, with_nuisance
+from femsense.loop.stages import make_stage, with_nuisance
 from femsense.model import Robot
 from femsense.pointcloud.patches import fit_patches
 from femsense.pose import move_pose
@@ -131,20 +131,6 @@ def test_rows_are_what_the_true_pose_says_and_markers_and_clouds_share_it(both: 
 
 def rest_state(robot: Robot) -> Equilibrium:
     return solve_equilibrium(robot.with_body(robot.body.with_gravity(np.zeros(3))).body)
-
-
-def test_which_points_are_the_robots_is_asked_again_of_the_calibrated_model(both: Data):
-    hypothesis, prior = with_nuisance(both)
-    noise = Noise({"white": 2e-4}, "")
-    stage = make_stage(both, hypothesis, prior, noise, np.zeros(len(prior.mean)), max_iterations=1)
-    whole = both.train[1].sheets
-    assert whole is not None
-    half = replace(whole, points={key: points[::3] for key, points in whole.points.items()})  # as the declared model had it
-    data = replace(both, train=[both.train[0], replace(both.train[1], sheets=half)])
-    kept, asked = (rematched(data, stage, noise, anew=anew).train[1] for anew in (False, True))
-    assert kept.sheets is half and asked.sheets is not None
-    count = {key: len(points) for key, points in asked.sheets.points.items()}
-    assert all(count[key] > 0.9 * len(whole.points[key]) for key in count) and set(count) <= set(whole.points)
 
 
 def on_sides(robot: Robot, facing: tuple[float, ...]) -> np.ndarray:

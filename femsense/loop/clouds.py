@@ -3,7 +3,7 @@
 A point of the surface plays the part of a marker, and its distance from the measured surface along the normal that of its residual: one
 row. The measured surface near a normal is a height field (`femsense.pointcloud.patches`) that stays as it is while a model is fitted, so
 that derivatives are those of the residual and two models are compared on the same rows. As the fit moves on, the patches are made anew
-(`renewed_rows`); which points are the robot's and which rows there are is decided on the model with all that calibration may move.
+(`renewed_rows`); which rows there are is decided once, on the model with all that calibration may move.
 
 A patch is as wide as a finger and rounds off edges, steps and facets. So its height is counted from that of a second patch, which is
 made in the same way of the places on the model's own surface that are nearest to the measured points: what the model has rounded off as
@@ -46,6 +46,8 @@ FACING = 0.35
 """Smallest cosine between a normal and the ray to the camera."""
 SMOOTH = 0.06
 """Distance over which errors go together, in diagonals."""
+NEAR = 0.08
+"""Largest distance of the robot's points from the declared model where colours do not tell, in diagonals: it may be that far off."""
 PLANE = 1.5
 """Half the thickness of a floor or wall beside the robot, in cells."""
 STANDS_OUT = 5.0
@@ -135,9 +137,8 @@ def _robot_points(
         own, _ = segment_robot(placed, robot.color_rgb, vote_radius_m=1.5 * voxel)
     else:
         nodes = np.unique(triangles)
-        near = 0.08 * size if placed.colors is not None else 0.04 * size
         normals = vertex_normals(state.positions, triangles)[nodes]
-        own, _ = segment_by_model(placed, state.positions[nodes], normals, near, plane_m=PLANE * voxel)
+        own, _ = segment_by_model(placed, state.positions[nodes], normals, NEAR * size, plane_m=PLANE * voxel)
     return as_measured(own.points, np.zeros(len(own), dtype=np.int64), [pose], robot.observation)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from femsense.arrays import BoolArray, FloatArray, IntArray
 from femsense.calib.forward import Hypothesis, SceneJet, evaluate_scene
 from femsense.effects import Effect, Entry, Parameter, find_effect
-from femsense.loop.clouds import make_rows, read_sheets, renewed_rows, states_of
+from femsense.loop.clouds import make_rows, renewed_rows, states_of
 from femsense.loop.data import Data, groups_of, surface_of
 from femsense.loop.joint import JointFit, JointProblem, Prior, Trial, fit_jointly, rms_of, spans_of
 from femsense.loop.noise import Noise, estimate_noise, whiten
@@ -249,8 +249,7 @@ def placed(data: Data, fit: JointFit) -> list[Placed]:
 
 
 def rematched(data: Data, stage: Stage, noise: Noise, *, anew: bool = False) -> Data:
-    """Return the data with the clouds' patches made anew where a stage has the surface; with `anew` it is asked again which points are the robot's
-    and which rows there are."""
+    """Return the data with the clouds' patches made anew where a stage has the surface; with `anew` it is asked again which rows there are."""
     if "clouds" not in data.measured:
         return data
     robot = stage.fit.hypothesis.robot_at(stage.fit.coordinates)
@@ -265,11 +264,8 @@ def _rematched(robot: Robot, trial: Trial, poses: list[FloatArray], initial: Flo
     states = states_of(robot, trial.scene, poses, initial, trial.starts_on(robot.body.mesh))
     if not anew:
         return replace(trial, scene=renewed_rows(robot, trial.scene, trial.sheets, states, poses))
-    sheets = read_sheets(robot, trial.scene.recording, states, tuple(poses))
-    scene = make_rows(robot, trial.scene, sheets, states, poses)
-    return replace(
-        trial, sheets=sheets, scene=scene, groups=groups_of(scene, trial.frames, surface_of(robot, scene, poses)), mesh_error=None
-    )
+    scene = make_rows(robot, trial.scene, trial.sheets, states, poses)
+    return replace(trial, scene=scene, groups=groups_of(scene, trial.frames, surface_of(robot, scene, poses)), mesh_error=None)
 
 
 def held_chi2(data: Data, stage: Stage, noise: Noise) -> float:
