@@ -10,7 +10,6 @@ and along the normal that is seen.
 from __future__ import annotations
 
 import argparse
-import csv
 import tempfile
 import tomllib
 from pathlib import Path
@@ -25,6 +24,7 @@ from femsense.recording import Recording, load_recording
 from femsense.rig.simulate import simulate
 from femsense.robot import load_robot
 from femsense.sensing import SensingOptions, estimate
+from femsense.truth import read_truth, true_effects
 
 PLACES = {
     "leg, from above": [0.0, -0.042964, 0.09057],
@@ -33,7 +33,6 @@ PLACES = {
     "leg, ridge, right": [0.045, 0.0, 0.0895],
     "leg, outer face": [-0.0845, 0.0, 0.045],
 }
-LAW = {"name": "hyperelastic", "law": "neo_hookean"}
 DIRECTIONS = {"any": SensingOptions(), "normal": SensingOptions(friction=0.0)}
 
 
@@ -53,25 +52,17 @@ def touched(folder: Path, robot: Robot, name: str, seed: int) -> Recording:
     return load_recording(place)
 
 
-def true_contacts(recording: Recording) -> dict[int, tuple[np.ndarray, float]]:
-    """Return frame → place [m] and force [N] of the touch."""
-    assert recording.folder is not None
-    with (recording.folder / "truth" / "contacts.csv").open(encoding="utf-8") as file:
-        rows = [row for row in csv.DictReader(file) if float(row["force_n"]) > 0]
-    return {
-        int(row["frame"]): (np.array([float(row[key]) for key in ("x_m", "y_m", "z_m")]), float(row["force_n"])) for row in rows
-    }
-
-
 def errors_of(robot: Robot, recording: Recording, options: SensingOptions) -> np.ndarray:
     """Return error of the force relative to it, in standard deviations, and of the place [m], a row a contact that was found."""
-    run, truth = estimate(robot, recording, calibrate(robot, recording), options=options), true_contacts(recording)
+    assert recording.folder is not None
+    truth = {true.frame: true for true in read_truth(recording.folder)}
     rows = []
-    for contact in run.contacts:
+    for contact in estimate(robot, recording, calibrate(robot, recording), options=options).contacts:
         if contact.frame in truth:
-            place, force = truth[contact.frame]
+            true = truth[contact.frame]
+            force = float(np.linalg.norm(true.force_n_xyz))
             error = contact.force_n - force
-            rows.append((error / force, error / contact.std_n, np.linalg.norm(contact.position_m - place)))
+            rows.append((error / force, error / contact.std_n, np.linalg.norm(contact.position_m - true.position_m)))
     return np.array(rows).reshape(-1, 3)
 
 
@@ -101,7 +92,8 @@ def main() -> None:
     print("|---|---|---|---|---|---|---|---|", flush=True)
     for seed, name in enumerate(PLACES, start=21):
         recording = touched(folder, declared, name, seed)
-        robot = apply_effects(declared, [*script_of(declared, PLACES[name], seed)["effects"], LAW])
+        assert recording.folder is not None
+        robot = apply_effects(declared, true_effects(recording.folder))
         for direction, options in DIRECTIONS.items():
             every[direction].append(errors_of(robot, recording, options))
             print(row(name, direction, every[direction][-1]), flush=True)

@@ -110,7 +110,9 @@ def seen_clouds(folder: Path, place: np.ndarray, *, hides: float = 0.0) -> Recor
         cloud = cloud_of(x, ball, rng)
         if hides and ball is not None:
             points = transform_points(T_ROBOT_CAMERA, cloud.points)
-            level = np.interp(points[:, 0], *np.sort(x[rest[:, 2] > 0.0099][:, [0, 2]], axis=0).T)
+            top = x[rest[:, 2] > 0.0099]
+            top = top[np.argsort(top[:, 0])]
+            level = np.interp(points[:, 0], top[:, 0], top[:, 2])
             hidden = (points[:, 2] > level - 2e-3) & (np.linalg.norm(points[:, :2] - x[node, :2], axis=1) < hides)
             keep = ~hidden | (cloud.colors[:, 0] > 0.5)
             cloud = PointCloud(cloud.points[keep], cloud.colors[keep])

@@ -7,7 +7,7 @@ that derivatives are those of the residual and two models are compared on the sa
 
 A patch is as wide as a finger and rounds off edges, steps and facets. So its height is counted from that of a second patch, which is
 made in the same way of the places on the model's own surface that are nearest to the measured points: what the model has rounded off as
-well is no residual. Without it the right model of the four-leg robot is off by half a millimetre, in the same places in all frames.
+well is no residual. Without it the right model is off, in the same places in all frames.
 """
 
 from __future__ import annotations
