@@ -18,12 +18,12 @@ from femsense.loop import grow as growing
 from femsense.loop.data import Data, prepare
 from femsense.loop.exchange import exchanged
 from femsense.loop.few import FEWEST, Few, few_of, spread_states
-from femsense.loop.grow import Refit, _settled
+from femsense.loop.grow import Refit, _settled, polished
 from femsense.loop.joint import Prior
 from femsense.loop.mesh_error import with_mesh_errors
 from femsense.loop.noise import Noise
-from femsense.loop.place import may_lie_elsewhere, placed
-from femsense.loop.refit import evidence, refit
+from femsense.loop.place import climbed, may_lie_elsewhere, placed
+from femsense.loop.refit import EVIDENCE, evidence, refit
 from femsense.loop.screen import Candidate, effect_fields, screen
 from femsense.loop.stages import Stage, fields_of, make_stage, own_of, problem_of, screen_stage, with_nuisance
 
@@ -174,15 +174,40 @@ def test_a_few_states_lead_to_the_place_and_alike_places_are_fitted_once(
         return refit(data, stage, candidate, noise)
 
     monkeypatch.setattr(place, "tried", counted)
-    best, _ = placed(data, stage, far, begun, NOISE)
+    best, _ = placed(data, stage, far, begun, climbed(data, stage, far, NOISE), NOISE)
     where = best.fit.hypothesis.terms[-1][1]["point_m"]
     assert off(far) > 0.012 and np.linalg.norm(np.subtract(where, HIDDEN[0]["point_m"])) < 0.004
     monkeypatch.setattr(place, "ROUNDS", 0)  # climbs end where they begin
     for alike, count in ((False, 2), (True, 1)):
         fitted.clear()
         monkeypatch.setattr(place, "_alike", lambda one, other, alike=alike: alike)
-        placed(data, stage, far, begun, NOISE)
+        placed(data, stage, far, begun, climbed(data, stage, far, NOISE), NOISE)
         assert len(fitted) == count
+
+
+def test_a_rival_that_its_place_brings_ahead_goes_there_before_one_is_named(
+    started: tuple[Data, Stage], monkeypatch: pytest.MonkeyPatch
+):
+    data, stage = started
+    far = max(payloads(data, stage)[:6], key=off)
+    rival = growing.judged(data, stage, far, refit(data, stage, far, NOISE), {}, NOISE)
+    there = polished(data, stage, rival, NOISE, lambda text: None)
+    gains = screen_stage(data, stage.fit, NOISE, fields_of(data, stage, ["cable_gain"]), COUNT)
+    other = growing.judged(data, stage, gains[0], refit(data, stage, gains[0], NOISE), {}, NOISE)
+    monkeypatch.setattr(growing, "WITHIN_REACH", rival.score / there.score / 2.0)
+
+    def leaders(lead: float) -> list[Refit]:
+        """Of both, the other one ahead of the rival by this share of what the rival gains where it is."""
+        first = replace(other, score=rival.score + lead * (there.score - rival.score))
+        assert first.score - EVIDENCE > rival.score
+        return growing._leaders(data, stage, [first, rival], NOISE, lambda text: None)[1:]
+
+    (moved,) = leaders(0.2)
+    assert moved.candidate.effect.name == "payload" and moved.score == pytest.approx(there.score)
+    monkeypatch.setattr(growing, "polished", lambda data, stage, refitted, noise, say: there if refitted.climbs else refitted)
+    monkeypatch.setattr(growing, "_in_sight", lambda refitted: np.inf)
+    assert leaders(0.9) and not leaders(1.2)  # it keeps less than it promised
+    assert not leaders(4.0)  # out of reach
 
 
 def test_places_are_alike_if_they_do_the_same_for_the_same(started: tuple[Data, Stage]):
@@ -204,7 +229,7 @@ def test_an_effect_in_its_place_is_not_sought_elsewhere_and_one_that_is_not_is()
     gained = refit(data, base, gains[0], NOISE)
     far = max((c for c in payloads(data, gained)[:6] if off(c) > 0.012), key=off)
     wrong = refit(data, gained, far, NOISE)
-    right, _ = placed(data, gained, far, wrong, NOISE)
+    right, _ = placed(data, gained, far, wrong, climbed(data, gained, far, NOISE), NOISE)
     assert may_lie_elsewhere(data, wrong, "payload", NOISE)
     assert may_lie_elsewhere(data, right, "cable_gain", NOISE)  # it has no place: nothing is known
     assert not may_lie_elsewhere(data, right, "payload", NOISE)

@@ -17,7 +17,7 @@ from femsense.loop.few import Few, few_of
 from femsense.loop.joint import JointFit, Prior, rms_of
 from femsense.loop.mesh_error import mesh_errors
 from femsense.loop.noise import Noise
-from femsense.loop.place import POLISHED, closer, placed
+from femsense.loop.place import POLISHED, Climbs, climbed, closer, placed
 from femsense.loop.predict import sweeps_predicted
 from femsense.loop.refit import EVIDENCE, FORGONE, beyond, evidence, explains, refit, tried, with_term, within, worth_of
 from femsense.loop.screen import NUISANCE, Candidate, linear_gain, penalty
@@ -53,6 +53,8 @@ NOT_PLAINLY_WORSE = 1.25
 """No effect may leave so many times the plain error where fitted: it would live on a larger share of what the mesh costs."""
 MOUNTED = np.radians(5.0)
 """A base is mounted as it is declared to about this angle, and a declared gravity is believed as much [rad]."""
+WITHIN_REACH = 0.4
+"""What has this share of the best's dBIC at its seed may be ahead of it where its place is."""
 SURE = 2.5
 """Standard errors of the gain on left-out sweeps beyond which held-out data need only not speak against an effect."""
 
@@ -74,6 +76,8 @@ class Refit:
     """Decrease of χ² less the cost: as linear scores are."""
     record: dict[str, Any]
     """What the report says of it."""
+    climbs: Climbs | None = None
+    """Where its place may lie instead, once that is asked."""
 
 
 def grow(
@@ -114,14 +118,38 @@ def grow(
     passing = [r for r in refits if r.record["verdict"] == "passes"]
     if not passing:
         return None, [], records
+    leaders = _leaders(data, stage, passing, noise, say)
     # where evidence is close, what surely predicts better
-    leaders = [r for r in passing if r.score > max(p.score for p in passing) - EVIDENCE]
-    leaders = [r if "seed_spread" in r.record else polished(data, stage, r, noise, say) for r in leaders]
     winner = max(leaders, key=lambda r: r.score + _predicts(r) + weighs(data, r.candidate.effect.name))
+    close = [r for r in leaders if r.score > winner.score - EVIDENCE]
     winner = _enriched(data, stage, winner, table, noise, say)
     winner.record["verdict"] = "named"
-    ties = [r for r in leaders if r.candidate.effect.name != winner.candidate.effect.name]
+    ties = [r for r in close if r.candidate.effect.name != winner.candidate.effect.name]
     return winner, sorted(ties, key=lambda r: -r.score), records
+
+
+def _leaders(data: Data, stage: Stage, passing: Sequence[Refit], noise: Noise, say: Progress) -> list[Refit]:
+    """Return the refits that are as good as the best but for EVIDENCE, and those that their places bring ahead of these, each with its seed improved."""
+    best = max(r.score for r in passing)
+    near = [
+        r if "seed_spread" in r.record else polished(data, stage, r, noise, say) for r in passing if r.score > best - EVIDENCE
+    ]
+    behind = [_with_climbs(data, stage, r, noise) for r in passing if best - EVIDENCE >= r.score > WITHIN_REACH * best]
+    moved = [polished(data, stage, r, noise, say) for r in behind if _in_sight(r) > best]
+    ahead = max(r.score for r in near)
+    return near + [r for r in moved if r.score > ahead]
+
+
+def _with_climbs(data: Data, stage: Stage, refitted: Refit, noise: Noise) -> Refit:
+    """Return a refit with where its place may lie instead, if it has one."""
+    places = refitted.candidate.effect.nearby(data.robot, refitted.candidate.seed)
+    return replace(refitted, climbs=climbed(data, stage, refitted.candidate, noise)) if places else refitted
+
+
+def _in_sight(refitted: Refit) -> float:
+    """Return the dBIC of a refit where its place promises the most."""
+    more = 0.0 if refitted.climbs is None else refitted.climbs.more - 1.0
+    return refitted.score + more * (refitted.score + refitted.candidate.cost)
 
 
 def _settled(data: Data, candidate: Candidate, ahead: Sequence[Refit]) -> bool:
@@ -416,7 +444,8 @@ def _polish(data: Data, stage: Stage, winner: Refit, noise: Noise, say: Progress
     best, effect = winner.stage, winner.candidate.effect
     if effect.nearby(data.robot, winner.candidate.seed):
         say(f"looking near by for {effect.name}")
-        best, winner.record["seed_spread"] = placed(data, stage, winner.candidate, winner.stage, noise)
+        climbs = winner.climbs or climbed(data, stage, winner.candidate, noise)
+        best, winner.record["seed_spread"] = placed(data, stage, winner.candidate, winner.stage, climbs, noise)
     else:
         winner.record["seed_spread"] = [0.0] * len(winner.candidate.parameters)
     if not winner.candidate.parameters:

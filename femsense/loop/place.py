@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -30,48 +30,65 @@ POLISHED = 2.0
 """Decrease of χ² that each further parameter of a polished effect must bring."""
 
 
-def placed(data: Data, stage: Stage, candidate: Candidate, made: Stage, noise: Noise) -> tuple[Stage, list[float]]:
+@dataclass(frozen=True, eq=False, slots=True)
+class Climbs:
+    """Where climbs over the seeds of an effect end, in some of the states."""
+
+    ends: list[Candidate]
+    """The best first, none of them at the seed that was asked about."""
+    more: float
+    """How many times as much as this seed the best end explains, at least 1: a soft place is worth little beside where it is."""
+
+
+def placed(
+    data: Data, stage: Stage, candidate: Candidate, made: Stage, climbs: Climbs, noise: Noise
+) -> tuple[Stage, list[float]]:
     """Return the best of a candidate's fits, that which was `made` from its own seed or one that begins where a climb ends, its seed moved on,
     and the scatter of its parameters: that of `closer`, or that over the places that explain as much where this is larger."""
-    begun = [made]
-    for other in _climbed(data, stage, candidate, noise):
+    begun, ends = [made], [end.seed for end in climbs.ends]
+    for other in _screen_seeds(data, stage, candidate, ends, noise) if ends else []:
         there = tried(data, stage, other, noise)
         if there is not None and there.fit.fit.status != GIVEN_UP:
             begun.append(there)
-    ends = list[tuple[Stage, list[float]]]()
+    moved = list[tuple[Stage, list[float]]]()
     for one in sorted(begun, key=lambda s: s.fit.chi2):
-        if not ends or one.fit.chi2 < ends[0][0].fit.chi2 + 2.0 * EVIDENCE:
-            ends.append(closer(data, one, noise))
-    best, scatter = min(ends, key=lambda end: end[0].fit.chi2)
-    values = [s.fit.coordinates[-len(scatter) :] for s, _ in ends if s.fit.chi2 < best.fit.chi2 + EVIDENCE]
+        if not moved or one.fit.chi2 < moved[0][0].fit.chi2 + 2.0 * EVIDENCE:
+            moved.append(closer(data, one, noise))
+    best, scatter = min(moved, key=lambda end: end[0].fit.chi2)
+    values = [s.fit.coordinates[-len(scatter) :] for s, _ in moved if s.fit.chi2 < best.fit.chi2 + EVIDENCE]
     return best, np.maximum(scatter, np.std(values, axis=0)).tolist()
 
 
-def _climbed(data: Data, stage: Stage, start: Candidate, noise: Noise) -> list[Candidate]:
-    """Return where the best STARTS seeds come to when each goes from neighbour to neighbour, the best first: a soft place here and a stiff
-    one there look alike when the modulus is open. Some of the states show the way."""
+def climbed(data: Data, stage: Stage, start: Candidate, noise: Noise) -> Climbs:
+    """Return where the best STARTS seeds come to when each goes from neighbour to neighbour: a soft place here and a stiff one there look alike
+    when the modulus is open. Some of the states show the way."""
     few = few_of(data, stage, noise)
+    asked, known = list[Entry](), list[Candidate]()
 
-    def seen(seeds: Sequence[Entry]) -> list[Candidate]:
-        return _screen_seeds(few.data, few.stage, start, seeds, noise)
+    def at(seeds: Sequence[Entry]) -> list[Candidate]:
+        fresh = [seed for i, seed in enumerate(seeds) if seed not in seeds[:i] and seed not in asked]
+        asked.extend(fresh)
+        known.extend(_screen_seeds(few.data, few.stage, start, fresh, noise) if fresh else [])
+        return [c for c in known if c.seed in seeds]
 
-    others = seen([start.seed, *(s for s in start.effect.seeds(data.robot) if s != start.seed)])
-    ends = list[Candidate]()
-    for begin in sorted(others, key=lambda c: c.seed != start.seed)[:STARTS]:
-        here = begin
-        for _ in range(ROUNDS):
-            found = max([here, *seen(start.effect.nearby(data.robot, here.seed))], key=lambda c: c.gain)
-            if found.gain < here.gain + POLISHED:
-                break
-            here = found
-        if here.seed != start.seed and not any(here.seed == end.seed for end in ends):
-            ends.append(here)
+    others = at([start.seed, *start.effect.seeds(data.robot)])
+    ways = sorted(others, key=lambda c: (c.seed != start.seed, -c.gain))[:STARTS]
+    for _ in range(ROUNDS):  # all of them at once, since a factor serves for all
+        around = [start.effect.nearby(data.robot, here.seed) for here in ways]
+        at([seed for seeds in around for seed in seeds])
+        best = [max([here, *at(seeds)], key=lambda c: c.gain) for here, seeds in zip(ways, around)]
+        further = [found if found.gain >= here.gain + POLISHED else here for here, found in zip(ways, best)]
+        if further == ways:
+            break
+        ways = further
+    ends = [here for here in ways if here.seed != start.seed]
     most = max((end.gain for end in ends), default=0.0)
     apart = list[Candidate]()
     for end in sorted((end for end in ends if end.gain > 0.5 * most), key=lambda c: -c.gain):
         if not any(_alike(end, other) for other in apart):
             apart.append(end)
-    return _screen_seeds(data, stage, start, [end.seed for end in apart], noise) if apart else []
+    begun = max((c.gain for c in others if c.seed == start.seed), default=0.0)
+    return Climbs(apart, max(most / begun, 1.0) if begun > 0.0 else 1.0)
 
 
 def _alike(a: Candidate, b: Candidate) -> bool:
@@ -159,4 +176,4 @@ def _screen_seeds(data: Data, stage: Stage, start: Candidate, seeds: Sequence[En
     return screen(stage.fit, problem_of(data, stage.fit, noise), fields, 100.0)
 
 
-__all__ = ["POLISHED", "closer", "may_lie_elsewhere", "placed", "without_last"]
+__all__ = ["POLISHED", "Climbs", "climbed", "closer", "may_lie_elsewhere", "placed", "without_last"]
