@@ -24,7 +24,7 @@ from femsense.pose import move_pose
 if TYPE_CHECKING:
     from femsense.loop.clouds import Sheets
 
-POSE_FREEDOM = 10.0
+POSE_FREEDOM = 40.0
 """ν: a declared pose that is off by √ν standard deviations or more is believed less and less."""
 DECLARED_POSE_STD = np.array([2e-3] * 3 + [3e-4] * 3)
 """How far a declared pose is trusted [rad, m]."""
