@@ -194,8 +194,6 @@ SABOTAGES = (
     S("loop/grow.py", "if few is not None and ahead and _falls_behind(", "if False and _falls_behind(", "test_loop_place.py::test_rivals_that_stay_far_behind_in_some_states_are_not_fitted_to_all"),
     S("loop/grow.py", "own = few.candidate(candidate, noise) if few.spares else None", "own = few.candidate(candidate, noise)", "test_loop_place.py::test_rivals_are_fitted_to_all_states_where_these_are_little_work"),
     S("loop/place.py", "if not any(_alike(end, other) for other in apart):", "if True:", "test_loop_place.py::test_a_few_states_lead_to_the_place_and_alike_places_are_fitted_once"),
-    S("loop/joint.py", "share = np.log1p(q) / q if q > 1e-9 else 1.0", "share = 1.0", "test_loop_parts.py::test_a_declared_pose_is_held_as_far_as_it_is_known_and_let_go_beyond"),
-    S("loop/joint.py", "turn / np.sqrt(share) * np.outer(z, z)", "0.0 * np.outer(z, z)", "test_loop_parts.py::test_a_declared_pose_is_held_as_far_as_it_is_known_and_let_go_beyond"),
     S("loop/grow.py", "for r in behind if _in_sight(r) > best]", "for r in behind if r.score > best]", "test_loop_place.py::test_a_rival_that_its_place_brings_ahead_goes_there_before_one_is_named"),
     S("loop/grow.py", "return near + [r for r in moved if r.score > ahead]", "return near + moved", "test_loop_place.py::test_a_rival_that_its_place_brings_ahead_goes_there_before_one_is_named"),
     S("loop/place.py", "<= apart * np.linalg.norm(b.step)", "<= np.inf", "test_loop_place.py::test_places_are_alike_if_they_do_the_same_for_the_same"),

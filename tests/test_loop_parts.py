@@ -24,7 +24,7 @@ from femsense.loop import improve
 from femsense.loop.conclude import _excess, _lacks
 from femsense.loop.data import Data, prepare
 from femsense.loop.grow import MOUNTED, _plainly_worse, tilt_cost
-from femsense.loop.joint import DECLARED_POSE_STD, POSE_FREEDOM, Prior, _pose_rows
+from femsense.loop.joint import Prior
 from femsense.loop.mesh_error import SHARE, TURNS, VARIES, errs_alike, make_finer, mesh_errors, with_mesh_errors
 from femsense.loop.noise import Groups, Noise, _Likelihood, whiten
 from femsense.loop.predict import sweeps_predicted
@@ -344,19 +344,6 @@ def structure_of(values: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> dict[st
     )
     monkeypatch.setattr("femsense.loop.structure.state_key", lambda recording, k: inputs[k].tobytes())
     return structure_tests([trial], [values.reshape(-1, 3)], rng=np.random.default_rng(0)).p
-
-
-@pytest.mark.parametrize("off", [0.0, 0.3, 2.0, 30.0])
-def test_a_declared_pose_is_held_as_far_as_it_is_known_and_let_go_beyond(off: float):
-    z = off * np.array([0.6, 0.0, -0.5, 0.3, -0.4, np.sqrt(0.14)])
-    moved = np.array([z * DECLARED_POSE_STD, [0.1] * 6])
-    rows, slope = _pose_rows(moved, [True, False])
-    assert rows @ rows == pytest.approx(POSE_FREEDOM * np.log1p(off**2 / POSE_FREEDOM), abs=1e-12) and not rows[6:].any()
-    steps = 1e-6 * np.tile(DECLARED_POSE_STD, 2)
-    shifted = [
-        [_pose_rows((moved.ravel() + sign * row).reshape(2, 6), [True, False])[0] for row in np.diag(steps)] for sign in (1, -1)
-    ]
-    np.testing.assert_allclose(slope, (np.subtract(*shifted) / (2.0 * steps[:, None])).T, rtol=1e-5, atol=1e-6 * slope.max())
 
 
 def test_noise_alone_has_no_structure_and_a_pattern_has(monkeypatch: pytest.MonkeyPatch):

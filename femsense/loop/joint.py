@@ -24,8 +24,6 @@ from femsense.pose import move_pose
 if TYPE_CHECKING:
     from femsense.loop.clouds import Sheets
 
-POSE_FREEDOM = 40.0
-"""ν: a declared pose that is off by √ν standard deviations or more is believed less and less."""
 DECLARED_POSE_STD = np.array([2e-3] * 3 + [3e-4] * 3)
 """How far a declared pose is trusted [rad, m]."""
 GRAVITY_STD = 0.1
@@ -338,9 +336,9 @@ class JointProblem:
         self, trial: Trial, factor: Whitener, jet: SceneJet, own: FloatArray, at: int, width: int, derivative: bool
     ) -> tuple[FloatArray, FloatArray]:
         poses = 6 * len(trial.poses)
-        declared = [T is not None and not trial.together for T in trial.scene.recording.T_robot_camera]
-        moved, trust = _pose_rows(own[:poses].reshape(-1, 6), declared)
-        r = np.concatenate([whiten(factor, jet.residual), jet.rest.ravel() / self.seat_std, moved])
+        declared = np.array([T is not None and not trial.together for T in trial.scene.recording.T_robot_camera]).repeat(6)
+        trust = np.where(declared, 1.0 / np.tile(DECLARED_POSE_STD, len(trial.poses)), 0.0)
+        r = np.concatenate([whiten(factor, jet.residual), jet.rest.ravel() / self.seat_std, trust * own[:poses]])
         J = np.zeros((len(r), width if derivative else 0))
         if not derivative:
             return r, J
@@ -350,7 +348,7 @@ class JointProblem:
         J[:k, self.own :] = whiten(factor, jet.by_effect)
         J[k : k + s, at : at + poses] = jet.rest_by_pose.reshape(s, poses) / self.seat_std
         J[k : k + s, self.own :] = jet.rest_by_effect.reshape(s, jet.rest_by_effect.shape[2]) / self.seat_std
-        J[k + s :, at : at + poses] = trust
+        J[k + s :, at : at + poses] = np.diag(trust)
         return r, J
 
     def _prior_rows(self, coordinates: FloatArray, width: int) -> tuple[FloatArray, FloatArray]:
@@ -371,23 +369,6 @@ class JointProblem:
         """Return which coordinates are the components of gravity, or None."""
         mask = np.array([p.key == "vector_m_s2" for p in self.hypothesis.parameters], dtype=bool)
         return mask if mask.any() else None
-
-
-def _pose_rows(moved: FloatArray, declared: list[bool]) -> tuple[FloatArray, FloatArray]:
-    """Return the rows that hold declared poses, moved by (v, 6), where they are, and their derivatives (6 v, 6 v).
-
-    Their sum of squares is ν log(1 + z²/ν), with z² that of the moves in standard deviations: −2 log of a Student's t but for its scale. A pose that
-    is off by more than was thought is let go, instead of asking effects to make up for it.
-    """
-    rows, slope = np.zeros(moved.size), np.zeros((moved.size, moved.size))
-    for i in np.flatnonzero(declared):
-        z, part = moved[i] / DECLARED_POSE_STD, slice(6 * i, 6 * i + 6)
-        q = float(z @ z) / POSE_FREEDOM
-        share = np.log1p(q) / q if q > 1e-9 else 1.0
-        turn = (1.0 / (1.0 + q) - share) / (q * POSE_FREEDOM) if q > 1e-9 else 0.0
-        rows[part] = np.sqrt(share) * z
-        slope[part, part] = (np.sqrt(share) * np.eye(6) + turn / np.sqrt(share) * np.outer(z, z)) / DECLARED_POSE_STD
-    return rows, slope
 
 
 def _as_near(kept: States, near: States, body: BodyModel) -> States:
