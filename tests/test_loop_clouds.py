@@ -18,13 +18,22 @@ from femsense.fem.mesh import surface_triangles, triangle_normals
 from femsense.frames import Camera
 from femsense.loop import improve
 from femsense.loop.advice import next_element
-from femsense.loop.clouds import FACING, RADIUS, _on_model, _patches_of, _seen, surface_normals, with_surface
+from femsense.loop.clouds import (
+    Seen,
+    _crossings_of,
+    _in_camera,
+    _on_model,
+    _sheet_of,
+    renewed_rows,
+    surface_normals,
+    with_surface,
+)
 from femsense.loop.data import Data, prepare
 from femsense.loop.joint import normals_of, spans_of, vectors_of
 from femsense.loop.noise import Groups, Noise, Surface, whiten
 from femsense.loop.stages import make_stage, with_nuisance
 from femsense.model import Robot
-from femsense.pointcloud.patches import fit_patches
+from femsense.pointcloud.sheets import Sheets, fit_sheet, joined
 from femsense.pose import move_pose
 from femsense.recording import Recording, load_recording, save_recording
 from femsense.rig.camera import Shape, cloud_of, render, write_ply
@@ -70,7 +79,7 @@ def both(rubbing: Recording) -> Data:
     return prepare(arm(COARSE), [rubbing], [], "both")
 
 
-# Patches
+# Measured surfaces
 
 
 def sphere(center: np.ndarray, radius: float, noise: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
@@ -82,27 +91,54 @@ def sphere(center: np.ndarray, radius: float, noise: float = 0.0) -> tuple[np.nd
     return out[out[:, 2] < -0.5][:40], center + radius * out + noise * rng.normal(size=out.shape)
 
 
-def test_a_patch_measures_the_distance_from_a_curved_surface_wherever_the_point_goes():
-    center, radius = np.array([0.01, -0.02, 0.4]), 0.03
-    out, points = sphere(center, radius)
-    patches, own, _ = fit_patches(center + (radius + 1e-3) * out, out, points, radius=0.006, reach=0.01, min_facing=0.3)
-    assert len(own) > 25
-    np.testing.assert_allclose(np.linalg.norm(patches.feet - center, axis=1), radius, atol=3e-6)
-    np.testing.assert_allclose(np.einsum("kc,kc->k", patches.normals, out[own]), 1.0, atol=1e-5)
-    moved = center + (radius + 1e-3) * out[own] + 2e-3 * np.random.default_rng(0).normal(size=(len(own), 3))
-    exact = np.linalg.norm(moved - center, axis=1) - radius
-    np.testing.assert_allclose(patches.distance(moved), exact, atol=2e-5)  # of 1 … 8 mm
+CENTER, BALL = np.array([0.01, -0.02, 0.4]), 0.03
 
 
-def test_no_patch_where_nothing_was_measured_or_on_the_far_side():
-    center, radius = np.array([0.0, 0.0, 0.4]), 0.03
-    out, points = sphere(center, radius)
-    away = -out
-    assert not len(fit_patches(center + radius * away, away, points, radius=0.006, reach=0.01, min_facing=0.3)[1])
-    assert not len(fit_patches(center + (radius + 0.02) * out, out, points, radius=0.006, reach=0.01, min_facing=0.3)[1])
-    half = points[points[:, 0] < -0.002]  # the line of a point beside the edge crosses nothing
-    beside = out[(radius * out[:, 0] > 0.001)]
-    assert not len(fit_patches(center + radius * beside, beside, half, radius=0.006, reach=0.01, min_facing=0.3)[1])
+def ball(noise: float = 0.0) -> tuple[np.ndarray, Sheets]:
+    """Return directions that face the camera, and the measured surface of a ball."""
+    out, points = sphere(CENTER, BALL, noise)
+    chosen = points[::20]
+    return out, fit_sheet(points, chosen, chosen - CENTER, 0.006)
+
+
+def off(sheets: Sheets, points: np.ndarray, sides: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return sheets.distance(points, np.zeros(len(points), dtype=np.int64), sides)
+
+
+def test_the_distance_from_a_curved_surface_is_right_wherever_a_point_goes():
+    out, sheets = ball()
+    far = (
+        CENTER
+        + (BALL + np.linspace(-4e-3, 4e-3, len(out))[:, None]) * out
+        + 4e-3 * np.random.default_rng(0).normal(size=out.shape)
+    )
+    way = far - CENTER
+    exact = np.linalg.norm(way, axis=1) - BALL
+    assert np.ptp(exact) > 0.015
+    distance, normals = off(sheets, far, out)
+    np.testing.assert_allclose(distance, exact, atol=5e-5)
+    np.testing.assert_allclose(np.einsum("kc,kc->k", normals, way / np.linalg.norm(way, axis=1, keepdims=True)), 1.0, atol=1e-3)
+
+
+def test_nothing_jumps_where_a_point_goes_along_the_surface():
+    _, sheets = ball(noise=3e-4)
+    turn = np.linspace(-0.7, 0.7, 4001)  # 42 mm along the surface, past some dozen of its fields
+    sides = np.stack([np.sin(turn), 0.0 * turn, -np.cos(turn)], axis=1)
+    distance, _ = off(sheets, CENTER + (BALL + 1e-3) * sides, sides)
+    assert np.abs(distance - 1e-3).max() < 2.5e-4
+    assert np.abs(np.diff(distance, 2)).max() < 1e-7  # of 0.01 mm steps
+
+
+def test_a_surface_has_nothing_of_the_far_side_and_goes_on_as_a_plane_beyond_its_border():
+    out, sheets = ball()
+    assert np.isnan(off(sheets, CENTER - BALL * out, np.tile([0.0, 0.0, 1.0], (len(out), 1)))[0]).all()
+    flat = np.random.default_rng(1).uniform((-0.02, -0.02, 0.3), (0.02, 0.02, 0.3), (3000, 3))
+    up = np.tile([0.0, 0.0, -1.0], (len(flat), 1))
+    beside = np.array([[0.03, 0.0, 0.301], [0.0, -0.028, 0.298]])
+    distance, normals = off(joined([fit_sheet(flat, flat[::30], up[::30], 0.006)]), beside, up[:2])
+    np.testing.assert_allclose(distance, [-1e-3, 2e-3], atol=1e-9)
+    np.testing.assert_allclose(normals, up[:2], atol=1e-9)
+    assert not len(fit_sheet(flat[:5], flat[:5], up[:5], 0.006).centres)
 
 
 # Rows
@@ -111,7 +147,7 @@ def test_no_patch_where_nothing_was_measured_or_on_the_far_side():
 def test_rows_are_what_the_true_pose_says_and_markers_and_clouds_share_it(both: Data):
     marked, cloudy = both.train
     assert both.measured == ("markers", "clouds")
-    assert (marked.scene.patches is None, cloudy.together, both.held[1].together) == (True, True, True)
+    assert (marked.scene.crossings is None, cloudy.together, both.held[1].together) == (True, True, True)
     assert spans_of(both.train) == [slice(0, 6), slice(0, 6)]
     assert set(cloudy.groups.sweep) == set(marked.groups.sweep)
     first = cloudy.scene.frame == 0
@@ -141,7 +177,11 @@ def on_sides(robot: Robot, facing: tuple[float, ...]) -> np.ndarray:
     return np.einsum("tsi,tic->tsc", weights, nodes[seen]).reshape(-1, 3)
 
 
-def test_what_a_patch_rounds_off_is_no_residual():
+def seen_as(points: np.ndarray) -> Seen:
+    return Seen({(0, 0): points}, joined([_sheet_of(points, 6e-3)]), 2e-3)
+
+
+def test_what_a_measured_surface_rounds_off_is_no_residual():
     robot = with_surface(arm(COARSE))
     places = robot.body.mesh.nodes[np.abs(robot.body.mesh.nodes[:, 1:]).max(axis=1) > 9e-3]
     robot = robot.with_surface_points(np.concatenate([places, places + np.array([4e-3, 0.0, 0.0])]))  # edges among them
@@ -149,18 +189,33 @@ def test_what_a_patch_rounds_off_is_no_residual():
     pose[:3, 3] = 0.05, 0.2, 0.3
     points = on_sides(robot, (0.0, 0.2, 0.3)) - pose[:3, 3]
     state = rest_state(robot)
-    patches, numbers = _patches_of(robot, points, state, pose, 2e-3)
+    seen = seen_as(points)
+    numbers, heights, crossings = _crossings_of(robot, seen, 0, state, pose)
     assert len(numbers) > 8
-    np.testing.assert_allclose(patches.heights[:, 0], 0.0, atol=1e-9)
-    plain = fit_patches(
-        _seen(robot, robot.marker_points[len(robot.glued_names) :], pose), surface_normals(robot, state.positions), points,
-        radius=RADIUS * 2e-3, reach=0.01, min_facing=FACING,
-    )[0]  # fmt: skip
-    assert np.abs(plain.heights[:, 0]).max() > 5e-4
-    higher, again = _patches_of(robot, points + 1e-3 * np.array([0.0, 0.0, 1.0]), state, pose, 2e-3)
+    np.testing.assert_allclose(heights, 0.0, atol=1e-9)
+    at = _in_camera(robot, robot.marker_points[len(robot.glued_names) :][numbers], pose)
+    np.testing.assert_allclose(crossings.distance(at), 0.0, atol=1e-9)
+    plain, _ = seen.sheets.distance(at, crossings.sheet, crossings.sides)
+    assert np.abs(plain).max() > 5e-4
+    again, higher, _ = _crossings_of(robot, seen_as(points + 1e-3 * np.array([0.0, 0.0, 1.0])), 0, state, pose)
     top = surface_normals(robot, state.positions)[again][:, 2] > 0.99
     assert top.sum() > 2
-    np.testing.assert_allclose(higher.heights[top, 0], 1e-3, atol=1e-9)
+    np.testing.assert_allclose(higher[top], 1e-3, atol=2e-4)
+
+
+def test_rows_hardly_change_when_they_are_made_anew_elsewhere(both: Data):
+    trial, robot = both.train[1], both.robot
+    frames = trial.scene.frames[:4]
+    scene, pivot = trial.scene.pick(frames), robot.marker_points.mean(axis=0)
+    moved = [move_pose(trial.poses[0], np.array([0.0, 0.0, 0.0, 2e-3, -2e-3, 2e-3]), pivot_a=pivot)]
+    assert trial.seen is not None
+    states = evaluate_scene(
+        Hypothesis(robot), scene, np.zeros(0), list(trial.poses), None, derivative=False, vary_initial=False, pivot=pivot
+    ).states
+    rows = renewed_rows(robot, scene, trial.seen, states, moved)
+    assert rows.crossings is not None and scene.crossings is not None
+    change = rows.crossings.rounded - scene.crossings.rounded
+    assert np.sqrt((change**2).mean()) < 1e-4  # where the model went 3.5 mm
 
 
 def test_only_sides_that_face_the_camera_stand_for_what_it_measured():

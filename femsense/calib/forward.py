@@ -19,7 +19,7 @@ from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.mesh import Embedding
 from femsense.march import Walk, drive_of, has_history, inputs_wanted, walk_along
 from femsense.model import Observation, Robot
-from femsense.pointcloud.patches import Patches
+from femsense.pointcloud.sheets import Crossings
 from femsense.pose import invert_pose, move_pose, transform_points
 from femsense.recording import Recording
 
@@ -50,14 +50,14 @@ class Scene:
     """shape (r,)."""
     rest_points: FloatArray
     """[m], camera frame, shape (r, 3)."""
-    patches: Patches | None = None
+    crossings: Crossings | None = None
     """Measured surface at each row, camera frame; `points` are then where the model's normals cross it. None: points are markers."""
 
     def pick(self, frames: IntArray) -> Scene:
         """Return the scene of some of its frames."""
         rows = np.isin(self.frame, frames)
         return replace(self, frames=np.intersect1d(self.frames, frames), frame=self.frame[rows], marker=self.marker[rows],
-                       view=self.view[rows], points=self.points[rows], patches=None if self.patches is None else self.patches.pick(rows))  # fmt: skip
+                       view=self.view[rows], points=self.points[rows], crossings=None if self.crossings is None else self.crossings.pick(rows))  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -192,8 +192,8 @@ def marker_residual(robot: Robot, scene: Scene, poses: Sequence[FloatArray], mod
     """
     predicted = np.array([model[int(f)][m] for f, m in zip(scene.frame, scene.marker)]).reshape(-1, 3)
     expected = as_measured(predicted, scene.view, poses, robot.observation)
-    if scene.patches is not None:
-        return -scene.patches.distance(expected)[:, None]
+    if scene.crossings is not None:
+        return -scene.crossings.distance(expected)[:, None]
     turns = np.array([T[:3, :3] for T in poses])[scene.view]
     return np.asarray(np.einsum("kij,kj->ki", turns, scene.points - expected))
 

@@ -27,8 +27,9 @@ from femsense.model import Robot, spread_features
 from femsense.patch import flat_nodes, make_surface
 from femsense.pointcloud.cloud import PointCloud
 from femsense.pointcloud.filters import pass_through, remove_radius_outliers, voxel_grid
-from femsense.pointcloud.patches import Patches, fit_patches
+from femsense.pointcloud.normals import estimate_normals
 from femsense.pointcloud.segmentation import segment_by_model, segment_robot
+from femsense.pointcloud.sheets import Crossings, Sheets, fit_sheet, joined
 from femsense.recording import Recording, read_frame_cloud
 from femsense.surface import nearest_on
 
@@ -38,8 +39,16 @@ FEWEST_POINTS = 12
 """With fewer off sharp edges those on edges count too."""
 VOXEL = 0.01
 """Edge of the cells that measured points are averaged over, in diagonals of the body."""
-RADIUS = 3.0
-"""Radius of a patch, in cells."""
+RADIUS = 3.5
+"""Radius of a height field, in cells."""
+SPACING = 0.5
+"""Distance of the centres of height fields, in radii."""
+STEEPEST = 0.78
+"""Cosine between the measured and the modelled normal below which a place is of another side of the body."""
+AROUND = 16
+"""Measured points around a place that tell whether it lies at the border of what was measured."""
+LOPSIDED = 0.5
+"""Largest distance of their mean from the place, in their mean distance: it is 0.64 on a straight border."""
 REACH = 0.1
 """Largest distance of the measured surface from the model's, in diagonals."""
 FACING = 0.35
@@ -58,11 +67,13 @@ FEWEST_ROWS = 8
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Sheets:
+class Seen:
     """What the cameras measured of the robot."""
 
     points: dict[tuple[int, int], FloatArray]
     """(frame, view) → points [m], shape (r, 3), frame of that camera."""
+    sheets: Sheets
+    """The surfaces of these, in this order."""
     voxel: float
     """Distance of neighbouring points [m]."""
 
@@ -94,7 +105,7 @@ def diagonal_of(robot: Robot) -> float:
 # What the cameras measured
 
 
-def read_sheets(robot: Robot, recording: Recording, states: dict[int, Equilibrium], poses: tuple[FloatArray, ...]) -> Sheets:
+def read_clouds(robot: Robot, recording: Recording, states: dict[int, Equilibrium], poses: tuple[FloatArray, ...]) -> Seen:
     """Return the robot's points in the clouds of some frames.
 
     Arguments:
@@ -120,7 +131,14 @@ def read_sheets(robot: Robot, recording: Recording, states: dict[int, Equilibriu
         raise DataError(
             "no camera sees the robot in any frame that can be used: check T_robot_camera, appearance.color_rgb, and that the clouds are in metres"
         )
-    return Sheets(points, voxel)
+    return Seen(points, joined([_sheet_of(own, RADIUS * voxel) for own in points.values()]), voxel)
+
+
+def _sheet_of(points: FloatArray, radius: float) -> Sheets:
+    """Return the measured surface of one cloud: height fields at points that are evenly thinned out."""
+    thin = voxel_grid(PointCloud(points), SPACING * radius).points
+    chosen = np.unique(np.asarray(cKDTree(points).query(thin)[1]))
+    return fit_sheet(points, points[chosen], estimate_normals(points, radius)[0][chosen], radius)
 
 
 def _robot_points(
@@ -159,68 +177,89 @@ def states_of(
 # Rows
 
 
-def make_rows(robot: Robot, scene: Scene, sheets: Sheets, states: dict[int, Equilibrium], poses: list[FloatArray]) -> Scene:
+def make_rows(robot: Robot, scene: Scene, seen: Seen, states: dict[int, Equilibrium], poses: list[FloatArray]) -> Scene:
     """Return the scene of a recording's clouds: one row for each point of the surface whose normal the measured surface crosses.
 
     Arguments:
         robot: with points of its surface.
         scene: of the recording; its frames count, its rows do not.
-        sheets: what was measured.
+        seen: what was measured.
         states: of each frame, as the model has them.
         poses: of the cameras.
 
     Raises:
         DataError: too few points are found.
     """
-    frame, marker, view = [], [], []
-    patches: list[Patches] = []
-    glued = len(robot.glued_names)
-    for (k, v), points in sheets.points.items():
+    every: list[tuple[IntArray, IntArray, IntArray, FloatArray, Crossings]] = []
+    for i, (k, v) in enumerate(seen.points):
         if k not in states:
             continue
-        own, numbers = _patches_of(robot, points, states[k], poses[v], sheets.voxel)
-        if len(numbers) < FEWEST_ROWS:
-            continue
-        frame.append(np.full(len(numbers), k))
-        marker.append(glued + numbers)
-        view.append(np.full(len(numbers), v))
-        patches.append(own)
-    if not patches:
+        numbers, heights, own = _crossings_of(robot, seen, i, states[k], poses[v])
+        if len(numbers) >= FEWEST_ROWS:
+            every.append((np.full(len(numbers), k), len(robot.glued_names) + numbers, np.full(len(numbers), v), heights, own))
+    if not every:
         raise DataError(
             f"the measured surface lies nowhere within {1e3 * REACH * diagonal_of(robot):.0f} mm of the model's: check T_robot_camera and the inputs"
         )
-    every = Patches(*(np.concatenate([getattr(p, n) for p in patches]) for n in ("origin", "axes", "heights", "radius")))
-    rows = replace(scene, frames=np.unique(np.concatenate(frame)), frame=np.concatenate(frame), marker=np.concatenate(marker),
-                   view=np.concatenate(view), points=every.feet, patches=every)  # fmt: skip
-    return _without_outliers(robot, rows)
+    frame, marker, view = (np.concatenate([e[i] for e in every]) for i in range(3))
+    heights = np.concatenate([e[3] for e in every])
+    parts = ("sheet", "sides", "rounded", "feet", "normals")
+    own = Crossings(seen.sheets, *(np.concatenate([getattr(e[4], n) for e in every]) for n in parts))
+    rows = replace(scene, frames=np.unique(frame), frame=frame, marker=marker, view=view, points=own.feet, crossings=own)
+    return _without_outliers(robot, rows, heights)
 
 
-def _patches_of(robot: Robot, points: FloatArray, state: Equilibrium, pose: FloatArray, voxel: float) -> tuple[Patches, IntArray]:
-    """Return patches of one cloud and the numbers of the surface points they belong to; only those that rest on many points.
+def _crossings_of(
+    robot: Robot, seen: Seen, sheet: int, state: Equilibrium, pose: FloatArray
+) -> tuple[IntArray, FloatArray, Crossings]:
+    """Return the numbers of the surface points whose normals one measured surface crosses amid measured points, how far outside of the model
+    [m], and where."""
+    at = _in_camera(robot, robot.markers.positions(state.positions)[len(robot.glued_names) :], pose)
+    sides = surface_normals(robot, state.positions) @ pose[:3, :3]
+    rays = -at / np.linalg.norm(at, axis=1, keepdims=True)
+    distance, normals = seen.sheets.distance(at, np.full(len(at), sheet), sides)
+    steep = np.einsum("kc,kc->k", normals, sides)
+    feet = at - (distance / np.maximum(steep, STEEPEST))[:, None] * sides
+    good = (np.einsum("kc,kc->k", rays, sides) >= FACING) & (np.abs(distance) <= REACH * diagonal_of(robot)) & (steep >= STEEPEST)
+    good[good] = _amid(feet[good], normals[good], list(seen.points.values())[sheet], RADIUS * seen.voxel)
+    rounded = np.full(len(at), np.nan)
+    rounded[good] = _rounded(robot, seen, sheet, state, pose, at[good], sides[good])
+    own = np.flatnonzero(np.isfinite(rounded))
+    crossings = Crossings(seen.sheets, np.full(len(own), sheet), sides[own], rounded[own], feet[own], normals[own])
+    return own, (rounded - distance)[own], crossings
 
-    Heights on the normals are those above the model's own patches.
-    """
-    at = robot.markers.positions(state.positions)[len(robot.glued_names) :]
-    measured = _seen(robot, at, pose)
-    normals = surface_normals(robot, state.positions) @ pose[:3, :3]
-    wide: dict[str, float] = {"radius": RADIUS * voxel, "reach": REACH * diagonal_of(robot), "min_facing": FACING}
-    patches, numbers, std = fit_patches(measured, normals, points, **wide)
-    modelled, also, _ = fit_patches(measured, normals, _on_model(robot, points, state, pose), **wide)
-    good = std <= 3.0 * np.median(std) if len(std) else np.zeros(0, dtype=bool)
-    both, i, j = np.intersect1d(numbers[good], also, return_indices=True)
-    own = patches.pick(np.flatnonzero(good)[i])
-    own.heights[:, 0] -= modelled.heights[j, 0]
-    return own, both
+
+def _amid(places: FloatArray, normals: FloatArray, points: FloatArray, radius: float) -> BoolArray:
+    """Return which places of a measured surface have measured points on all sides, shape (p,)."""
+    if not len(places) or len(points) < AROUND:
+        return np.zeros(len(places), dtype=bool)
+    distance, near = map(np.asarray, cKDTree(points).query(places, k=AROUND))
+    apart = points[near] - places[:, None, :]
+    apart -= np.einsum("pkc,pc->pk", apart, normals)[:, :, None] * normals[:, None, :]
+    off = np.linalg.norm(apart.mean(axis=1), axis=1)
+    return np.asarray((off <= LOPSIDED * np.linalg.norm(apart, axis=2).mean(axis=1)) & (distance[:, 0] <= radius))
+
+
+def _rounded(
+    robot: Robot, seen: Seen, sheet: int, state: Equilibrium, pose: FloatArray, at: FloatArray, sides: FloatArray
+) -> FloatArray:
+    """Return how far places on the model lie outside of its own surface as it would be measured [m], shape (k,); NaN: not measured there."""
+    points, (centres, normals) = list(seen.points.values())[sheet], seen.sheets.fields_of(sheet)
+    modelled = _on_model(robot, np.concatenate([points, centres]), state, pose)
+    if not len(modelled):
+        return np.full(len(at), np.nan)
+    own = fit_sheet(modelled[: len(points)], modelled[len(points) :], normals, seen.sheets.radius)
+    return own.distance(at, np.zeros(len(at), dtype=np.int64), sides)[0]
 
 
 def _on_model(robot: Robot, points: FloatArray, state: Equilibrium, pose: FloatArray) -> FloatArray:
     """Return the places on the model's surface nearest to measured points (r, 3) [m], frame of the camera; only sides that face it count."""
-    nodes, triangles = _seen(robot, state.positions, pose), surface_triangles(robot.body.mesh)
+    nodes, triangles = _in_camera(robot, state.positions, pose), surface_triangles(robot.body.mesh)
     faces = np.einsum("tc,tc->t", triangle_normals(nodes, triangles), nodes[triangles[:, 0]]) < 0.0
     return nearest_on(nodes, triangles[faces], points) if faces.any() else points[:0]
 
 
-def _seen(robot: Robot, points: FloatArray, pose: FloatArray) -> FloatArray:
+def _in_camera(robot: Robot, points: FloatArray, pose: FloatArray) -> FloatArray:
     """Return points of the robot frame as one camera measures them [m], frame of the camera."""
     return as_measured(points, np.zeros(len(points), dtype=np.int64), [pose], robot.observation)
 
@@ -233,43 +272,30 @@ def surface_normals(robot: Robot, positions: FloatArray) -> FloatArray:
     return np.asarray(vertex_normals(positions, triangles)[nearest])
 
 
-def _without_outliers(robot: Robot, scene: Scene) -> Scene:
+def _without_outliers(robot: Robot, scene: Scene, heights: FloatArray) -> Scene:
     """Leave out rows that lie apart from their neighbours in the frame: another limb, a cable, a flying pixel."""
-    height = scene.patches.heights[:, 0] if scene.patches is not None else np.zeros(0)
-    apart = np.zeros(len(height))
+    apart = np.zeros(len(heights))
     for k in scene.frames:
         rows = np.flatnonzero(scene.frame == k)
         at = robot.marker_points[scene.marker[rows]]
         near = np.asarray(cKDTree(at).query(at, k=min(NEIGHBOURS + 1, len(rows)))[1])[:, 1:]
-        apart[rows] = height[rows] - np.median(height[rows][near], axis=1)
+        apart[rows] = heights[rows] - np.median(heights[rows][near], axis=1)
     usual = 1.4826 * float(np.median(np.abs(apart)))
-    return _rows(scene, np.abs(apart) <= STANDS_OUT * max(usual, 2e-4))
-
-
-def _rows(scene: Scene, keep: BoolArray) -> Scene:
-    assert scene.patches is not None
+    keep = np.abs(apart) <= STANDS_OUT * max(usual, 2e-4)
+    assert scene.crossings is not None
     return replace(scene, frames=np.unique(scene.frame[keep]), frame=scene.frame[keep], marker=scene.marker[keep], view=scene.view[keep],
-                   points=scene.points[keep], patches=scene.patches.pick(keep))  # fmt: skip
+                   points=scene.points[keep], crossings=scene.crossings.pick(keep))  # fmt: skip
 
 
-def renewed_rows(robot: Robot, scene: Scene, sheets: Sheets, states: dict[int, Equilibrium], poses: list[FloatArray]) -> Scene:
-    """Return the same rows with their patches made anew where the model now is; a patch that is not found again stays as it was."""
-    assert scene.patches is not None
-    patches, glued = scene.patches, len(robot.glued_names)
-    for (k, v), points in sheets.points.items():
+def renewed_rows(robot: Robot, scene: Scene, seen: Seen, states: dict[int, Equilibrium], poses: list[FloatArray]) -> Scene:
+    """Return the same rows with what the model rounds off counted anew where it now has the surface."""
+    assert scene.crossings is not None
+    rounded = scene.crossings.rounded.copy()
+    for i, (k, v) in enumerate(seen.points):
         rows = np.flatnonzero((scene.frame == k) & (scene.view == v))
         if k not in states or not len(rows):
             continue
-        own, numbers = _patches_of(robot, points, states[k], poses[v], sheets.voxel)
-        place = {int(n): i for i, n in enumerate(numbers)}
-        again = np.array([i for i in rows if int(scene.marker[i]) - glued in place], dtype=np.int64)
-        if len(again):
-            fresh = own.pick(np.array([place[int(scene.marker[i]) - glued] for i in again]))
-            still = np.abs(fresh.heights[:, 0] - _height_now(patches.pick(again), fresh)) < patches.radius[again]
-            patches = patches.put(again[still], fresh.pick(still))
-    return replace(scene, patches=patches, points=patches.feet)
-
-
-def _height_now(old: Patches, fresh: Patches) -> FloatArray:
-    """Return how far old patches lie outside of where the model is now [m], shape (k,): a fresh one much farther is of another limb."""
-    return -old.distance(fresh.origin)
+        at = _in_camera(robot, robot.markers.positions(states[k].positions)[scene.marker[rows]], poses[v])
+        fresh = _rounded(robot, seen, i, states[k], poses[v], at, scene.crossings.sides[rows])
+        rounded[rows] = np.where(np.isfinite(fresh), fresh, rounded[rows])
+    return replace(scene, crossings=replace(scene.crossings, rounded=rounded))

@@ -602,7 +602,7 @@ def _card(data: Data, final: Stage, spread: dict[str, FloatArray], noise: Noise,
 
 def _cloud_card(data: Data, noise: Noise) -> dict[str, Any] | None:
     """Return what was used of clouds; None where they were not."""
-    own = [t for t in data.train if t.scene.patches is not None]
+    own = [t for t in data.train if t.scene.crossings is not None]
     if not own:
         return None
     rows = [len(t.scene.frame) for t in own]

@@ -18,7 +18,7 @@ from femsense.loop.clouds import (
     diagonal_of,
     has_clouds,
     make_rows,
-    read_sheets,
+    read_clouds,
     states_of,
     surface_normals,
     with_surface,
@@ -62,7 +62,7 @@ class Data:
     @property
     def measured(self) -> tuple[str, ...]:
         """What the data are: "markers", "clouds" or both."""
-        kinds = {"markers" if t.scene.patches is None else "clouds" for t in self.train}
+        kinds = {"markers" if t.scene.crossings is None else "clouds" for t in self.train}
         return tuple(sorted(kinds, reverse=True))
 
 
@@ -188,12 +188,12 @@ def _trials(
         return result
     empty = _bare_scene(robot, recording, np.intersect1d(cloudy, every), with_rest=not result)
     states = states_of(robot, empty, poses, initial)
-    sheets = read_sheets(robot, recording, states, poses)
+    seen = read_clouds(robot, recording, states, poses)
     pair: list[Trial | None] = []
     for frames in (fitted, kept):
         own = {k: s for k, s in states.items() if k in frames}
-        scene = make_rows(robot, empty, sheets, own, list(poses)) if own else None
-        pair.append(None if scene is None else replace(trial(scene, frames), together=bool(result), sheets=sheets))
+        scene = make_rows(robot, empty, seen, own, list(poses)) if own else None
+        pair.append(None if scene is None else replace(trial(scene, frames), together=bool(result), seen=seen))
     assert pair[0] is not None
     result.append((pair[0], pair[1]))
     return result
@@ -233,7 +233,7 @@ def _bare_scene(robot: Robot, recording: Recording, frames: IntArray, *, with_re
 
 def surface_of(robot: Robot, scene: Scene, poses: Sequence[FloatArray]) -> Surface | None:
     """Return where the rows of a scene lie on the body, and their normals; None where they are markers."""
-    if scene.patches is None:
+    if scene.crossings is None:
         return None
     keys = {k: state_key(scene.recording, int(k)).hex() for k in np.unique(scene.frame)}
     states = np.unique([keys[f] for f in scene.frame], return_inverse=True)[1]

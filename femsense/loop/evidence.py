@@ -165,7 +165,7 @@ def _tip(data: Data, old: list[View], new: list[View]) -> dict[str, Any]:
     Measured points are where the handed-back calibration puts them; a model stands at measured − residual. Clouds do not tell where a
     point of the surface went: {}.
     """
-    if any(v.trial.scene.patches is not None for v in old):
+    if any(v.trial.scene.crossings is not None for v in old):
         return {}
     seen = set.intersection(*({int(m) for m in v.trial.scene.marker} for v in old))
     if not seen:

@@ -66,7 +66,7 @@ class View:
         units = [ties.spread(np.eye(3 * len(places))[j].reshape(-1, 3), len(mesh.nodes)) for j in range(3 * len(places))]
         marks = self.robot.tie_markers(seats(self.robot, self.trial.scene, self.poses))[self.trial.scene.marker[rows]]
         moves = np.array([marks.moves(move) for move in tangent.respond(np.array(units))])
-        if self.trial.scene.patches is not None:
+        if self.trial.scene.crossings is not None:
             moves = np.einsum("jkc,kc->jk", moves, normals_of(self.trial.scene, self.poses)[rows])
         return moves.reshape(len(moves), -1).T
 

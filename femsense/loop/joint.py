@@ -22,7 +22,7 @@ from femsense.march import has_given
 from femsense.pose import move_pose
 
 if TYPE_CHECKING:
-    from femsense.loop.clouds import Sheets
+    from femsense.loop.clouds import Seen
 
 DECLARED_POSE_STD = np.array([2e-3] * 3 + [3e-4] * 3)
 """How far a declared pose is trusted [rad, m]."""
@@ -52,7 +52,7 @@ class Trial:
     """Fields of what a finer mesh would move the markers by [m], shape (k, c, b); each counts as noise of its size (`loop.mesh_error`)."""
     together: bool = False
     """Whether these are the clouds of the recording whose markers are the trial before: pose and initial inputs are shared."""
-    sheets: Sheets | None = None
+    seen: Seen | None = None
     """What the cameras measured of the robot; only of clouds."""
     frames: IntArray | None = None
     """All frames of the recording that are fitted (or held out) with these, markers and clouds; None: those of the scene."""
@@ -108,16 +108,16 @@ def heads_of(trials: Sequence[Trial]) -> list[int]:
 
 def vectors_of(trial: Trial, residual: FloatArray, poses: Sequence[FloatArray] | None = None) -> FloatArray:
     """Return a residual (k, c) [m] as vectors of the robot frame, shape (k, 3): those of clouds along the measured normals."""
-    if trial.scene.patches is None:
+    if trial.scene.crossings is None:
         return residual
     return residual * normals_of(trial.scene, trial.poses if poses is None else poses)
 
 
 def normals_of(scene: Scene, poses: Sequence[FloatArray]) -> FloatArray:
     """Return the measured outward normals of the rows of a cloud, robot frame, shape (k, 3)."""
-    assert scene.patches is not None
+    assert scene.crossings is not None
     turn = np.array([T[:3, :3] for T in poses])[scene.view]
-    return np.asarray(np.einsum("kij,kj->ki", turn, scene.patches.normals))
+    return np.asarray(np.einsum("kij,kj->ki", turn, scene.crossings.normals))
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -135,7 +135,7 @@ def _by_sweep(trial: Trial, moves: dict[int, FloatArray], poses: Sequence[FloatA
     """
     error = np.array([moves[int(f)][m] for f, m in zip(trial.scene.frame, trial.scene.marker)])
     along = np.broadcast_to(np.eye(3), (len(error), 3, 3))  # (k, c, axis)
-    if trial.scene.patches is not None:
+    if trial.scene.crossings is not None:
         along = normals_of(trial.scene, poses)[:, None, :]
     turned = TURNS * (along[:, :, :, None] * error[:, None, None, :]).reshape(len(error), -1, 9)
     error = np.einsum("kca,ka->kc", along, error)

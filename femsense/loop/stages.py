@@ -259,12 +259,12 @@ def rematched(data: Data, stage: Stage, noise: Noise, *, anew: bool = False) -> 
 
 
 def _rematched(robot: Robot, trial: Trial, poses: list[FloatArray], initial: FloatArray | None, anew: bool) -> Trial:
-    if trial.sheets is None:
+    if trial.seen is None:
         return trial
     states = states_of(robot, trial.scene, poses, initial, trial.starts_on(robot.body.mesh))
     if not anew:
-        return replace(trial, scene=renewed_rows(robot, trial.scene, trial.sheets, states, poses))
-    scene = make_rows(robot, trial.scene, trial.sheets, states, poses)
+        return replace(trial, scene=renewed_rows(robot, trial.scene, trial.seen, states, poses))
+    scene = make_rows(robot, trial.scene, trial.seen, states, poses)
     return replace(trial, scene=scene, groups=groups_of(scene, trial.frames, surface_of(robot, scene, poses)), mesh_error=None)
 
 
@@ -311,7 +311,7 @@ def noise_of(data: Data, stage: Stage, fields: Fields, before: Noise | None = No
     noise = Noise({}, "")
     residuals = [j.residual for j in stage.fit.jets]
     for clouds in (False, True):
-        which = [i for i, t in enumerate(data.train) if (t.scene.patches is not None) == clouds]
+        which = [i for i, t in enumerate(data.train) if (t.scene.crossings is not None) == clouds]
         if which:
             known = None if before is None else before.surface if clouds else before.std
             picked = (

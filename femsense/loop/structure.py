@@ -55,7 +55,7 @@ def structure_tests(trials: list[Trial], residuals: list[FloatArray], *, rng: np
 
     Errors of a cloud are alike where points are near to each other, so that its states are shuffled whole, and `pattern` is not asked.
     """
-    if any(t.scene.patches is not None for t in trials):
+    if any(t.scene.crossings is not None for t in trials):
         return _cloud_tests(trials, residuals, rng)
     fields = [_field(t, r) for t, r in zip(trials, residuals)]
     observed = _lag_one(fields, None)
@@ -72,9 +72,9 @@ def structure_tests(trials: list[Trial], residuals: list[FloatArray], *, rng: np
 def _cloud_tests(trials: list[Trial], residuals: list[FloatArray], rng: np.random.Generator) -> StructureTests:
     """Return the tests of clouds, with those of the markers beside them where there are some."""
     pairs = list(zip(trials, residuals))
-    marked = [(t, r) for t, r in pairs if t.scene.patches is None]
+    marked = [(t, r) for t, r in pairs if t.scene.crossings is None]
     markers = structure_tests([t for t, _ in marked], [r for _, r in marked], rng=rng) if marked else None
-    fields = [_field(t, r) for t, r in pairs if t.scene.patches is not None]
+    fields = [_field(t, r) for t, r in pairs if t.scene.crossings is not None]
     p = {} if markers is None else dict(markers.p)
     observed = _lag_one(fields, None)
     if np.isfinite(observed):
