@@ -245,7 +245,7 @@ def _height_field(local: FloatArray, radius: float, out: FloatArray) -> None:
         values = np.linalg.eigvalsh(normal)
         if values[0] < 1e-3 * values[-1] / 6.0:
             return
-        coefficients = np.linalg.solve(normal, weighted.T @ w)
+        coefficients = np.linalg.inv(normal) @ (weighted.T @ w)
         rest = w - rows @ coefficients
         usual = 4.0 * 1.4826 * np.median(np.abs(rest)) + 1e-12
         least = near / (1.0 + (rest / usual) ** 2) ** 2
