@@ -41,7 +41,7 @@ VOXEL = 0.01
 """Edge of the cells that measured points are averaged over, in diagonals of the body."""
 RADIUS = 3.5
 """Radius of a height field, in cells."""
-SPACING = 0.5
+SPACING = 0.6
 """Distance of the centres of height fields, in radii."""
 STEEPEST = 0.78
 """Cosine between the measured and the modelled normal below which a place is of another side of the body."""

@@ -37,8 +37,8 @@ ALONG = 0.5
 """What a distance along the normal counts beside one across it there."""
 SAME_SIDE = 0.3
 """Cosine between a field's normal and that of the side in question below which the field is of another side of the body."""
-FARTHEST = 16.0
-"""A field with e to the power of this less weight than the nearest one is left out."""
+FARTHEST = 9.0
+"""Exponent of the nearest field's weight beside that of the farthest that counts; weights are less by that of the farthest, so that they begin at nothing."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -143,27 +143,26 @@ def _blend(
     starts: IntArray, radius: float, distances: FloatArray, normals: FloatArray,
 ) -> None:  # fmt: skip
     """Write distances and normals of points."""
-    scale = 0.5 / (ACROSS * radius) ** 2
-    local, spread = np.zeros(3), np.zeros(starts[-1])
+    scale, least = 0.5 / (ACROSS * radius) ** 2, np.exp(-FARTHEST)
+    local, away = np.zeros(3), np.zeros(starts[-1])
     for k in range(len(points)):
         first, last, nearest = starts[sheet[k]], starts[sheet[k] + 1], np.inf
         for i in range(first, last):
-            spread[i] = np.inf
-            alike = axes[i, 2, 0] * sides[k, 0] + axes[i, 2, 1] * sides[k, 1] + axes[i, 2, 2] * sides[k, 2]
-            if alike <= SAME_SIDE:
+            away[i] = np.inf
+            if _alike(axes[i, 2], sides[k]) <= SAME_SIDE:
                 continue
             square, along = 0.0, 0.0
             for c in range(3):
                 apart = points[k, c] - centres[i, c]
                 square += apart * apart
                 along += apart * sides[k, c]
-            spread[i] = scale * (square - (1.0 - ALONG**2) * along * along) - np.log((alike - SAME_SIDE) * weights[i])
-            nearest = min(nearest, spread[i])
+            away[i] = scale * (square - (1.0 - ALONG**2) * along * along)
+            nearest = min(nearest, away[i])
         total, sum_d = 0.0, 0.0
         for i in range(first, last):
-            if spread[i] > nearest + FARTHEST:
+            if away[i] >= nearest + FARTHEST:
                 continue
-            share = np.exp(nearest - spread[i])
+            share = (np.exp(nearest - away[i]) - least) * (_alike(axes[i, 2], sides[k]) - SAME_SIDE) * weights[i]
             for a in range(3):
                 local[a] = 0.0
                 for c in range(3):
@@ -177,6 +176,12 @@ def _blend(
         if total > 0.0:
             distances[k] = sum_d / total
             normals[k] /= np.sqrt((normals[k] ** 2).sum())
+
+
+@njit(cache=True)
+def _alike(a: FloatArray, b: FloatArray) -> float:
+    """Return the product of two vectors, shape (3,)."""
+    return float(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
 @njit(cache=True)
