@@ -94,7 +94,7 @@ def _folder(name: str) -> Path:
 
 
 def declared_robot(name: str, case: str) -> Robot:
-    robot = replace(load_robot(name), color_rgb=load_robot(name).color_rgb or (0.2, 0.5, 0.8))
+    robot = load_robot(name)
     return robot.with_body(robot.body.with_gravity(np.zeros(3))) if case == "gravity" else robot
 
 

@@ -129,6 +129,16 @@ def test_nothing_jumps_where_a_point_goes_along_the_surface():
     assert np.abs(np.diff(distance, 2)).max() < 1e-7  # of 0.01 mm steps
 
 
+def test_a_field_hardly_feels_a_point_at_its_border_come_or_go():
+    points = np.random.default_rng(2).normal(size=(4000, 3)) * (0.01, 0.01, 3e-4)
+    centres = np.zeros((200, 3))
+    centres[:, 0] = np.linspace(0.0, 2e-3, 200)  # some 100 points come and go on the way
+    sheets = joined([fit_sheet(points, c[None], np.array([[0.0, 0.0, 1.0]]), 0.006) for c in centres])
+    height, _ = sheets.distance(np.zeros((200, 3)), np.arange(200), np.tile([0.0, 0.0, 1.0], (200, 1)))
+    assert np.ptp(height) > 1e-6
+    assert np.abs(np.diff(height, 2)).max() < 4e-7
+
+
 def test_a_surface_has_nothing_of_the_far_side_and_goes_on_as_a_plane_beyond_its_border():
     out, sheets = ball()
     assert np.isnan(off(sheets, CENTER - BALL * out, np.tile([0.0, 0.0, 1.0], (len(out), 1)))[0]).all()
@@ -216,6 +226,11 @@ def test_rows_hardly_change_when_they_are_made_anew_elsewhere(both: Data):
     assert rows.crossings is not None and scene.crossings is not None
     change = rows.crossings.rounded - scene.crossings.rounded
     assert np.sqrt((change**2).mean()) < 1e-4  # where the model went 3.5 mm
+    first = np.flatnonzero(scene.frame == frames[0])
+    numbers, _, made = _crossings_of(robot, trial.seen, 0, states[int(frames[0])], moved[0])
+    _, i, j = np.intersect1d(scene.marker[first] - len(robot.glued_names), numbers, return_indices=True)
+    assert len(i) > 12
+    np.testing.assert_allclose(rows.crossings.rounded[first][i], made.rounded[j], atol=2e-6)  # as rows made there have it
 
 
 def test_only_sides_that_face_the_camera_stand_for_what_it_measured():

@@ -51,7 +51,7 @@ class Scene:
     rest_points: FloatArray
     """[m], camera frame, shape (r, 3)."""
     crossings: Crossings | None = None
-    """Measured surface at each row, camera frame; `points` are then where the model's normals cross it. None: points are markers."""
+    """Where rows cross measured surfaces, camera frame; `points` are then their feet. None: points are markers."""
 
     def pick(self, frames: IntArray) -> Scene:
         """Return the scene of some of its frames."""
@@ -187,7 +187,7 @@ def marker_residual(robot: Robot, scene: Scene, poses: Sequence[FloatArray], mod
     """Return measured minus modelled markers [m], shape (k, 3), along the axes of the robot; model: frame → markers (m, 3).
 
     They are compared as the camera measures them. Measured points put right by a scale of depth would shrink with it, noise and all,
-    and a fit would take that for a better model. Of patches of a measured surface: how far it lies outside of the model's points, along
+    and a fit would take that for a better model. Of crossings of a measured surface: how far it lies outside of the model's points, along
     its normal, shape (k, 1).
     """
     predicted = np.array([model[int(f)][m] for f, m in zip(scene.frame, scene.marker)]).reshape(-1, 3)
@@ -208,7 +208,7 @@ class SceneJet:
     """Marker residuals of a scene with their derivatives."""
 
     residual: FloatArray
-    """[m], shape (k, c): c = 3 for markers, 1 for patches of a surface; so in all that follows."""
+    """[m], shape (k, c): c = 3 for markers, 1 for crossings of a measured surface; so in all that follows."""
     rest: FloatArray
     """Seat residual [m], shape (r, 3)."""
     by_pose: FloatArray

@@ -1,13 +1,12 @@
 """Clouds as data of the loop: points of the surface, and where in each frame the measured surface crosses the normals there.
 
-A point of the surface plays the part of a marker, and its distance from the measured surface along the normal that of its residual: one
-row. The measured surface near a normal is a height field (`femsense.pointcloud.patches`) that stays as it is while a model is fitted, so
-that derivatives are those of the residual and two models are compared on the same rows. As the fit moves on, the patches are made anew
-(`renewed_rows`); which rows there are is decided once, on the model with all that calibration may move.
+A point of the surface plays the part of a marker, and its distance from the measured surface that of its residual: one row. The measured
+surface is a smooth function of place (`femsense.pointcloud.sheets`) that knows nothing of a model, so that derivatives are those of the
+residual and two models are compared on the same rows; which rows there are is decided once, on the model with all that calibration may move.
 
-A patch is as wide as a finger and rounds off edges, steps and facets. So its height is counted from that of a second patch, which is
-made in the same way of the places on the model's own surface that are nearest to the measured points: what the model has rounded off as
-well is no residual. Without it the right model is off, in the same places in all frames.
+Height fields are as wide as a finger and round off edges, steps and facets. So a row counts from what the model's own surface gives, made
+in the same way of the places on it that are nearest to the measured points: what the model has rounded off as well is no residual. Without
+it the right model is off, in the same places in all frames. That part is counted anew as the fit moves on (`renewed_rows`).
 """
 
 from __future__ import annotations

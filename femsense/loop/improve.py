@@ -204,7 +204,7 @@ def _search(data: Data, before: Stage, base: Stage, names: list[str], most: int,
             stage = swap.stage
             history.append((swap.name, stage))
     if len(history) > 1 and "clouds" in data.measured:
-        before = _declared(data, noise, before)  # before and after on the same patches
+        before = _declared(data, noise, before)  # before and after on the same rows
     return data, Search(before, history, stage, noise, n_effective, first, table, refits, swap)
 
 

@@ -65,7 +65,7 @@ class Groups:
 
     @property
     def observations(self) -> int:
-        """Number of independent observations, as BIC counts them: coordinates of markers, or patches of the surface, in distinct states."""
+        """Number of independent observations, as BIC counts them: coordinates of markers, or crossings of a surface, in distinct states."""
         if self.surface is None:
             return 3 * (int(self.state.max(initial=-1)) + 1)
         return self.surface.cells()

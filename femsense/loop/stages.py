@@ -249,7 +249,7 @@ def placed(data: Data, fit: JointFit) -> list[Placed]:
 
 
 def rematched(data: Data, stage: Stage, noise: Noise, *, anew: bool = False) -> Data:
-    """Return the data with the clouds' patches made anew where a stage has the surface; with `anew` it is asked again which rows there are."""
+    """Return the data with what clouds round off counted anew where a stage has the surface; with `anew` it is asked again which rows there are."""
     if "clouds" not in data.measured:
         return data
     robot = stage.fit.hypothesis.robot_at(stage.fit.coordinates)
