@@ -1,11 +1,11 @@
 """Effects found from clouds: the loop on a robot in front of a depth camera, from markers, from clouds and from both.
 
-    python benchmarks/clouds.py [--robot four-leg] [--cases friction,gain,…] [--from markers,clouds,both] [--seed 20]
+    python benchmarks/clouds.py [--robot four-leg|arm|gripper|finger] [--cases friction,gain,…] [--from markers,clouds,both] [--seed 20]
                                 [--pose-off 1] [--without-colours] [--folder DIR]
 
 The truth has a mesh of half the size, quadratic elements and the rig's own integrator of friction. The four-leg robot has also another law
-(neo-Hookean; in the null case the declared one); its camera is that of `femsense demo`, with its noise. The arm hangs before a camera of the
-same kind, 62 frames. Poses are declared, `--pose-off` times 2 mm and 7 mrad off.
+(neo-Hookean; in the null case the declared one); its camera is that of `femsense demo`, with its noise. The others have a camera of the
+same kind at their stands. Poses are declared, `--pose-off` times 2.7 mm and 7 mrad off.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import argparse
 import tempfile
 import time
 import tomllib
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -46,11 +46,39 @@ CASES: dict[str, dict[str, list[dict[str, Any]]]] = {
         "soft": [{"name": "soft_region", "center_m": [-0.0142, -0.0029, -0.09], "radius_m": 0.0224, "scale": 0.5}],
         "null": [],
     },
+    "gripper": {
+        "gain": [{"name": "cable_gain", "scale": {"right": 0.8}}],
+        "soft": [{"name": "soft_region", "center_m": [-0.016, 0.0, -0.04625], "radius_m": 0.0136, "scale": 0.5}],
+        "null": [],
+    },
+    "finger": {
+        "gain": [{"name": "cable_gain", "scale": {"flexor": 0.8}}],
+        "gravity": [{"name": "gravity", "vector_m_s2": [0.0, 0.0, -9.81]}],
+        "depth": [{"name": "depth_scale", "scale": 1.015}],
+        "soft": [{"name": "soft_region", "center_m": [0.045, -0.0085, 0.0021], "radius_m": 0.0115, "scale": 0.5}],
+        "null": [],
+    },
 }
 POSE_OFF = np.array([5e-3, -3e-3, 4e-3, 2e-3, -1e-3, 1.5e-3])
 """By how much the declared pose is off: rotation [rad], shift [m]."""
-ARM_TENSION = 2.25
-"""The largest tension of each of the arm's cables [N]."""
+
+
+@dataclass(frozen=True)
+class Stand:
+    """Where a robot hangs or stands, and how far its cables pull."""
+
+    cables: tuple[str, ...]
+    pull_n: float
+    eye_m: tuple[float, float, float]
+    target_m: tuple[float, float, float]
+    floor_m: float
+
+
+STANDS = {
+    "arm": Stand(("north", "west", "south", "east"), 2.25, (0.065, -0.3, 0.115), (0.0, 0.0, -0.09), -0.275),
+    "gripper": Stand(("left", "right"), 0.45, (0.04, -0.182, 0.079), (0.0, 0.0, -0.046), -0.149),
+    "finger": Stand(("flexor",), 0.72, (0.08, -0.154, 0.116), (0.046, 0.0, 0.01), -0.048),
+}
 
 
 def script_of(name: str, case: str, seed: int) -> dict[str, Any]:
@@ -64,26 +92,26 @@ def script_of(name: str, case: str, seed: int) -> dict[str, Any]:
         "seed": seed,
     }
     script["camera"]["declare_pose"] = True
-    if name == "arm":
-        return _of_the_arm(script)
+    if name in STANDS:
+        return _at_its_stand(script, STANDS[name])
     script["sweeps"] = [sweep for sweep in script["sweeps"] if sweep["label"] != "touch"]
     script["truth"]["law"] = "corotational" if case == "null" else "neo_hookean"
     return script
 
 
-def _of_the_arm(script: dict[str, Any]) -> dict[str, Any]:
-    """Return a script with the arm's sweeps, the law that is declared, and a camera that sees all of the arm."""
-    cables, pull = ("north", "west", "south", "east"), ARM_TENSION
+def _at_its_stand(script: dict[str, Any], stand: Stand) -> dict[str, Any]:
+    """Return a script with the sweeps of a robot at its stand, the law that is declared, and a camera that sees all of it."""
+    cables, pull = stand.cables, stand.pull_n
     script.pop("initial")
     script["dt_s"] = 2.0
     script["sweeps"] = [
         *({"label": c, "cables": {c: pull}, "rest": 1, "up": 4, "down": 3} for c in cables),
         *({"label": f"{c} again", "cables": {c: 0.6 * pull}, "up": 3, "down": 3} for c in cables),
-        {"label": "both", "cables": {"north": 0.7 * pull, "west": 0.7 * pull}, "up": 3, "down": 3},
+        {"label": "last", "cables": {c: (0.7 if cables[1:] else 0.8) * pull for c in cables[:2]}, "up": 3, "down": 3},
     ]
     script["truth"]["law"] = "corotational"
-    script["camera"] |= {"eye_m": [0.065, -0.3, 0.115], "target_m": [0.0, 0.0, -0.09]}
-    script["scene"] = {"floor_z_m": -0.275}
+    script["camera"] |= {"eye_m": list(stand.eye_m), "target_m": list(stand.target_m)}
+    script["scene"] = {"floor_z_m": stand.floor_m}
     return script
 
 
@@ -133,7 +161,7 @@ def _off(key: str, found: dict[str, Any], true: Any) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--robot", choices=CASES, default="four-leg")
-    parser.add_argument("--cases", default=",".join(CASES["four-leg"]))
+    parser.add_argument("--cases", help="default: all of the robot's")
     parser.add_argument("--from", dest="kinds", default="markers,clouds,both")
     parser.add_argument("--seed", type=int, default=20)
     parser.add_argument("--pose-off", type=float, default=1.0, help="0: as it is")
@@ -143,7 +171,7 @@ def main() -> None:
     folder = options.folder or Path(tempfile.mkdtemp(prefix="clouds-"))
     print("| hidden | from | verdict | named | size | held out, markers [mm] | held out, clouds [mm] | noise [mm] | CPU [s] |")
     print("|---|---|---|---|---|---|---|---|---|", flush=True)
-    for case in options.cases.split(","):
+    for case in options.cases.split(",") if options.cases else CASES[options.robot]:
         recording = recording_of(folder, options.robot, case, options.seed, options.pose_off)
         if options.without_colours:
             recording = replace(recording, color_files=tuple((None,) * len(files) for files in recording.color_files))
