@@ -151,6 +151,8 @@ def _off(key: str, found: dict[str, Any], true: Any) -> str:
         away = float(np.linalg.norm(np.subtract(value, true)))
         return f"place {1e3 * away:.0f} mm off" if key.endswith("_m") else f"{away / np.linalg.norm(true):.1%} off"
     if isinstance(value, dict):
+        if isinstance(true, dict) and not set(true) <= set(value):
+            return f"{key} of {', '.join(value)} (true: {', '.join(true)})"
         value, std = (float(np.mean([t[k] for k in (true if isinstance(true, dict) else value)])) for t in (value, std))
     true = float(np.mean(list(true.values()))) if isinstance(true, dict) else true
     unit = f"{key.removesuffix('_m')} " if key.endswith("_m") else ""
