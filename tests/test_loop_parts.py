@@ -339,7 +339,7 @@ def structure_of(values: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> dict[st
     frame, marker = np.repeat(np.arange(frames), markers), np.tile(np.arange(markers), frames)
     fake = SimpleNamespace(time_s=np.arange(frames) * 1.0, inputs=inputs)
     trial = SimpleNamespace(
-        scene=SimpleNamespace(frame=frame, recording=fake, patches=None),
+        scene=SimpleNamespace(frame=frame, recording=fake, crossings=None),
         groups=Groups(marker, frame, np.unique(labels, return_inverse=True)[1][frame], frame),
     )
     monkeypatch.setattr("femsense.loop.structure.state_key", lambda recording, k: inputs[k].tobytes())

@@ -82,7 +82,7 @@ def sweeps_fit(values: np.ndarray, rows: int) -> tuple[Any, Any]:
     fit = SimpleNamespace(own=0, jets=[jet], fit=SimpleNamespace(jacobian=J, residual=residual, theta=np.zeros(1)))
     groups = SimpleNamespace(sweep=np.repeat(np.arange(len(values)), rows))
     return SimpleNamespace(
-        train=[SimpleNamespace(groups=groups, poses=(), together=False, sheets=None, scene=SimpleNamespace(patches=None))]
+        train=[SimpleNamespace(groups=groups, poses=(), together=False, seen=None, scene=SimpleNamespace(crossings=None))]
     ), SimpleNamespace(fit=fit)
 
 
