@@ -76,6 +76,10 @@ class Seen:
     voxel: float
     """Distance of neighbouring points [m]."""
 
+    def cloud(self, sheet: int) -> FloatArray:
+        """Return the points of a surface by its number [m], shape (r, 3)."""
+        return list(self.points.values())[sheet]
+
 
 def has_clouds(recording: Recording) -> bool:
     """Return whether any frame of a recording has a cloud or a depth image."""
@@ -220,7 +224,7 @@ def _crossings_of(
     steep = np.einsum("kc,kc->k", normals, sides)
     feet = at - (distance / np.maximum(steep, STEEPEST))[:, None] * sides
     good = (np.einsum("kc,kc->k", rays, sides) >= FACING) & (np.abs(distance) <= REACH * diagonal_of(robot)) & (steep >= STEEPEST)
-    good[good] = _amid(feet[good], normals[good], list(seen.points.values())[sheet], RADIUS * seen.voxel)
+    good[good] = _amid(feet[good], normals[good], seen.cloud(sheet), RADIUS * seen.voxel)
     rounded = np.full(len(at), np.nan)
     rounded[good] = _rounded(robot, seen, sheet, state, pose, at[good], sides[good])
     own = np.flatnonzero(np.isfinite(rounded))
@@ -243,7 +247,7 @@ def _rounded(
     robot: Robot, seen: Seen, sheet: int, state: Equilibrium, pose: FloatArray, at: FloatArray, sides: FloatArray
 ) -> FloatArray:
     """Return how far places on the model lie outside of its own surface as it would be measured [m], shape (k,); NaN: not measured there."""
-    points, (centres, normals) = list(seen.points.values())[sheet], seen.sheets.fields_of(sheet)
+    points, (centres, normals) = seen.cloud(sheet), seen.sheets.fields_of(sheet)
     modelled = _on_model(robot, np.concatenate([points, centres]), state, pose)
     if not len(modelled):
         return np.full(len(at), np.nan)
