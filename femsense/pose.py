@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import numpy.typing as npt
 
@@ -60,3 +62,8 @@ def move_pose(T_a_b: FloatArray, step: npt.ArrayLike, *, pivot_a: npt.ArrayLike 
     pivot = np.asarray(pivot_a, dtype=np.float64)
     R = rotation_from_vector(delta[:3])
     return make_pose(R, pivot - R @ pivot + delta[3:]) @ T_a_b
+
+
+def moved_poses(poses: Sequence[FloatArray], steps: FloatArray, pivot_a: FloatArray) -> list[FloatArray]:
+    """Return each pose moved by its six of the steps, shape (6 v,); see `move_pose`."""
+    return [move_pose(T, step, pivot_a=pivot_a) for T, step in zip(poses, steps.reshape(-1, 6), strict=True)]

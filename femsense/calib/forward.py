@@ -20,7 +20,7 @@ from femsense.fem.mesh import Embedding
 from femsense.march import Walk, drive_of, has_history, inputs_wanted, walk_along
 from femsense.model import Observation, Robot
 from femsense.pointcloud.sheets import Crossings
-from femsense.pose import invert_pose, move_pose, transform_points
+from femsense.pose import invert_pose, moved_poses, transform_points
 from femsense.recording import Recording
 
 POSE_STEP = np.array([1e-5, 1e-5, 1e-5, 1e-6, 1e-6, 1e-6])
@@ -237,10 +237,11 @@ class SceneJet:
 def evaluate_scene(
     hypothesis: Hypothesis, scene: Scene, coordinates: FloatArray, poses: Sequence[FloatArray], initial: FloatArray | None,
     *, derivative: bool, vary_initial: bool, pivot: FloatArray, starts: dict[int, Equilibrium] | None = None, rough: bool = False,
-    known: dict[int, Equilibrium] | None = None, vary_inputs: bool = False,
+    known: dict[int, Equilibrium] | None = None, vary_inputs: bool = False, moves: FloatArray | None = None,
 ) -> SceneJet:  # fmt: skip
     """Evaluate marker residuals of a scene at a point of parameter space, and their derivatives by differences.
 
+    Each pose is moved about `pivot` by its six of the `moves`, shape (6 v,), and derivatives are by these.
     `starts` holds states of earlier evaluations near by and is brought up to date; states that are only tried may be
     `rough`: a frame that Newton does not reach from there then has no equilibrium. `known` are the states at this very point, as far as it
     moves the body; they serve where no derivative by what moves it is wanted. With `vary_inputs` come derivatives by the tension of
@@ -250,6 +251,8 @@ def evaluate_scene(
         DataError: a frame has no equilibrium.
     """
     robot = hypothesis.robot_at(coordinates)
+    begun, moves = poses, np.zeros(6 * len(poses)) if moves is None else moves
+    poses = moved_poses(begun, moves, pivot)
     base = Walk(robot, drive_of(robot, scene.recording, initial=initial))
     steps, variants = _variants(hypothesis, scene, coordinates, initial, base, vary_initial) if derivative else ([], [])
     split, last = len(hypothesis.parameters) if derivative else 0, len(variants)
@@ -275,7 +278,7 @@ def evaluate_scene(
     residual = marker_residual(robot, scene, poses, model)
     columns = [(marker_residual(v.robot, scene, poses, m) - residual) / h for v, m, h in zip(variants, shifted, steps)]
     by_pose, rest_by_pose = (
-        _pose_derivative(robot, scene, poses, states, residual, pivot)
+        _pose_derivative(robot, scene, begun, moves, states, residual, pivot)
         if derivative
         else (np.zeros((*residual.shape, 0)), np.zeros((0, 3, 0)))
     )
@@ -341,25 +344,24 @@ def _pulling(hypothesis: Hypothesis, base: Walk, steps: list[float], variants: l
 def _pose_derivative(
     robot: Robot,
     scene: Scene,
-    poses: Sequence[FloatArray],
+    begun: Sequence[FloatArray],
+    moves: FloatArray,
     states: Mapping[int, Equilibrium],
     residual: FloatArray,
     pivot: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the derivatives of marker and seat residuals by each pose; only seats that move need the states again."""
+    """Return the derivatives of marker and seat residuals by the move of each pose; only seats that move need the states again."""
     columns, rest_columns = [], []
-    rest = rest_residual(robot, scene, poses)
+    rest = rest_residual(robot, scene, moved_poses(begun, moves, pivot))
     still = {k: robot.markers.positions(s.positions) for k, s in states.items()} if not len(scene.rest_marker) else None
-    for v in range(len(poses)):
-        for j in range(6):
-            step = np.zeros(6)
-            step[j] = POSE_STEP[j]
-            moved = list(poses)
-            moved[v] = move_pose(poses[v], step, pivot_a=pivot)
-            model = still
-            if model is None:
-                place = robot.tie_markers(seats(robot, scene, moved))
-                model = {k: place.positions(s.positions) for k, s in states.items()}
-            columns.append((marker_residual(robot, scene, moved, model) - residual) / step[j])
-            rest_columns.append((rest_residual(robot, scene, moved) - rest) / step[j])
+    for j, h in enumerate(np.tile(POSE_STEP, len(begun))):
+        further = moves.copy()
+        further[j] += h
+        moved = moved_poses(begun, further, pivot)
+        model = still
+        if model is None:
+            place = robot.tie_markers(seats(robot, scene, moved))
+            model = {k: place.positions(s.positions) for k, s in states.items()}
+        columns.append((marker_residual(robot, scene, moved, model) - residual) / h)
+        rest_columns.append((rest_residual(robot, scene, moved) - rest) / h)
     return np.stack(columns, axis=2), np.stack(rest_columns, axis=2)

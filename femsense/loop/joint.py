@@ -19,7 +19,7 @@ from femsense.fem.mesh import TetMesh
 from femsense.loop.kinks import Part, joined, trial_kinks
 from femsense.loop.noise import Groups, Noise, Whitener, whiten
 from femsense.march import has_given
-from femsense.pose import move_pose
+from femsense.pose import moved_poses
 
 if TYPE_CHECKING:
     from femsense.loop.clouds import Seen
@@ -79,8 +79,8 @@ class Trial:
 
     def place(self, own: FloatArray, pivot: FloatArray) -> tuple[list[FloatArray], FloatArray | None]:
         """Return poses and initial inputs for the trial's own parameters."""
-        poses = [move_pose(T, own[6 * v : 6 * v + 6], pivot_a=pivot) for v, T in enumerate(self.poses)]
-        return poses, None if self.initial is None else own[6 * len(self.poses) :]
+        at = 6 * len(self.poses)
+        return moved_poses(self.poses, own[:at], pivot), None if self.initial is None else own[at:]
 
 
 def spans_of(trials: Sequence[Trial]) -> list[slice]:
@@ -326,11 +326,11 @@ class JointProblem:
     ) -> SceneJet:
         """Return the residuals and derivatives of one trial, from its own states or others to start from, or at states that are `known`."""
         pivot = self.hypothesis.robot.marker_points.mean(axis=0)
-        poses, initial = trial.place(own, pivot)
+        _, initial = trial.place(own, pivot)
         starts = trial.starts_on(self.hypothesis.robot.body.mesh) if starts is None else starts
-        return evaluate_scene(self.hypothesis, trial.scene, coordinates, poses, initial, derivative=derivative,
+        return evaluate_scene(self.hypothesis, trial.scene, coordinates, trial.poses, initial, derivative=derivative,
                               vary_initial=trial.initial is not None, pivot=pivot, starts=starts, rough=rough, known=known,
-                              vary_inputs=vary_inputs)  # fmt: skip
+                              vary_inputs=vary_inputs, moves=own[: 6 * len(trial.poses)])  # fmt: skip
 
     def _scene_rows(
         self, trial: Trial, factor: Whitener, jet: SceneJet, own: FloatArray, at: int, width: int, derivative: bool
