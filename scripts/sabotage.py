@@ -169,7 +169,8 @@ SABOTAGES = (
     S("calib/fit.py", "np.concatenate([-r, np.zeros(p)]) if damping > 0 else -r", "np.concatenate([r, np.zeros(p)]) if damping > 0 else r", "test_calib_fit.py::test_it_finds_the_least_squares_of_scipy"),
     S("calib/forward.py", "points * (distance - seen.depth_offset)", "points * (distance + seen.depth_offset)", "test_effects.py::test_depth_is_undone_as_it_was_made"),
     S("calib/forward.py", "scene.points - expected)", "scene.points - 1e3 * expected)", "test_calib_calibrate.py::test_exact_markers_give_pose_and_inputs_back"),
-    S("calib/forward.py", "columns.append((marker_residual(robot, scene, moved, model) - residual) / step[j])", "columns.append((marker_residual(robot, scene, moved, model) - residual) / step[0])", "test_calib_calibrate.py::test_derivatives_of_residuals_are_differences"),
+    S("calib/forward.py", "moved = moved_poses(begun, further, pivot)", "moved = moved_poses(moved_poses(begun, moves, pivot), further - moves, pivot)", "test_calib_calibrate.py::test_derivatives_of_residuals_are_differences"),
+    S("calib/forward.py", "columns.append((marker_residual(robot, scene, moved, model) - residual) / h)", "columns.append((marker_residual(robot, scene, moved, model) - residual) / POSE_STEP[0])", "test_calib_calibrate.py::test_derivatives_of_residuals_are_differences"),
     S("calib/calibrate.py", "freedom = max(rows - parameters, 1.0)", "freedom = max(4.0 * rows, 1.0)", "test_calib_calibrate.py::test_errors_reach_the_cramer_rao_bound_and_are_as_large_as_stated"),
     S("calib/calibrate.py", "return np.asarray(np.sqrt(np.minimum(1.0, 3.5 * scale / np.maximum(distance, 1e-300))))", "return np.ones(len(distance))", "test_calib_calibrate.py::test_an_outlier_does_little_and_hardly_widens_what_is_stated"),
     # the loop
