@@ -42,6 +42,8 @@ RADIUS = 3.5
 """Radius of a height field, in cells."""
 SPACING = 0.6
 """Distance of the centres of height fields, in radii."""
+ROUNDS = 0.15
+"""Most that a height field rounds off, in radii: edges of the tested robots come to 0.12, places that the model's own fields do not cover to more than 0.2."""
 STEEPEST = 0.78
 """Cosine between the measured and the modelled normal below which a place is of another side of the body."""
 AROUND = 16
@@ -252,7 +254,8 @@ def _rounded(
     if not len(modelled):
         return np.full(len(at), np.nan)
     own = fit_sheet(modelled[: len(points)], modelled[len(points) :], normals, seen.sheets.radius)
-    return own.distance(at, np.zeros(len(at), dtype=np.int64), sides)[0]
+    distance = own.distance(at, np.zeros(len(at), dtype=np.int64), sides)[0]
+    return np.where(np.abs(distance) <= ROUNDS * seen.sheets.radius, distance, np.nan)
 
 
 def _on_model(robot: Robot, points: FloatArray, state: Equilibrium, pose: FloatArray) -> FloatArray:
