@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from femsense.calib.forward import Hypothesis
+from femsense.calib.forward import Hypothesis, SceneJet
 from femsense.effects import EFFECTS, FORMS, Effect, find_effect, load_own_effect
 from femsense.errors import DataError, FemsenseError
 from femsense.loop.conclude import Search, conclude
@@ -27,7 +27,7 @@ from femsense.loop.grow import Progress, Refit, grow, mesh_cost, moved_by, prune
 from femsense.loop.joint import Prior
 from femsense.loop.mesh_error import errs_alike, few_states, make_finer, with_mesh_errors
 from femsense.loop.noise import Noise
-from femsense.loop.refit import evidence
+from femsense.loop.refit import EVIDENCE, evidence
 from femsense.loop.result import LoopResult
 from femsense.loop.screen import Candidate, Fields
 from femsense.loop.stages import (
@@ -49,6 +49,8 @@ from femsense.recording import Recording, state_key
 MAX_EFFECTS = 3
 STATES = 5
 """So many different states can tell effects apart though what is held out only repeats them."""
+MATCHINGS = 4
+"""Times that the rows of clouds are made again, at most."""
 ROUGHLY, STEPS = 4, 12
 """Steps of the fit whose residual tells the noise; and at most with that, to the end."""
 
@@ -118,8 +120,8 @@ def _calibrated(data: Data, names: Sequence[str], say: Progress, finer_is_made: 
     )
     if "clouds" in data.measured:
         say("matching the clouds again")
-        data = rematched(data, base, noise, anew=True)
-        base = make_stage(data, hypothesis, prior, noise, base.fit.coordinates, own=own_of(base))
+        rough = base.fit.normal_rms
+        data, base = _matched(data, base, noise if rough is None else replace(noise, surface={"white": rough}), anew=True)
         before = _declared(data, noise, before)
     say("asking what the mesh costs")
     try:  # zeros may have gone far, for an effect's sake
@@ -159,8 +161,8 @@ def _search(data: Data, before: Stage, base: Stage, names: list[str], most: int,
         say(f"screening effects ({found} found so far)")
         if found and "clouds" in data.measured:
             assert noise is not None
-            data, fields = rematched(data, stage, noise), None
-            stage = _again(data, stage, noise, own_derivatives=False)
+            fields = None
+            data, stage = _matched(data, stage, noise)
         try:
             stage, noise, n_effective, fields, table = _screened(data, stage, fields, noise, names)
         except FemsenseError as error:
@@ -215,7 +217,7 @@ def _screened(
     of what may come next: by the fields of the model before, as long as these promise nothing."""
     fields = _fields(data, stage, before, names)
     noise, n_effective = noise_of(data, stage, fields, noise)
-    stage = _again(data, stage, noise)
+    stage = _again(data, stage, noise, known=stage.fit.jets)
     return stage, noise, n_effective, *_scored(data, stage, fields, noise, names, n_effective)
 
 
@@ -249,7 +251,9 @@ def _beside_a_tie(
     """Return the model with what was as good as the last effect in its place, and what comes next there, or None: the two together must be
     better than the stage. What hides behind a wrong one of two that look alike shows beside the right one."""
     say(f"trying {tie.candidate.effect.name} in the place of the last one, and what goes with it")
-    instead = _again(data, tie.stage, noise, own_derivatives="clouds" not in data.measured)
+    jets = tie.stage.fit.jets
+    same = "clouds" not in data.measured
+    instead = _again(data, tie.stage, noise, known=jets if same else None, near=None if same else jets)
     _, table = _scored(data, instead, _fields(data, instead, fields, names), noise, names, n_effective)
     both, _, tried = grow(data, instead, table, noise, names, n_effective, say)
     if both is None or evidence(stage.fit, both.stage.fit) - both.candidate.cost <= BETTER:
@@ -271,9 +275,21 @@ def _renamed(refits: list[dict[str, Any]], step: int, name: str) -> list[dict[st
     ]
 
 
-def _again(data: Data, stage: Stage, noise: Noise, *, own_derivatives: bool = True) -> Stage:
-    """Return a stage fitted to other weights or rows, from where it is; with its own derivatives where the rows are the same."""
-    known, near = (stage.fit.jets, None) if own_derivatives else (None, stage.fit.jets)
+def _matched(data: Data, stage: Stage, noise: Noise, *, anew: bool = False) -> tuple[Data, Stage]:
+    """Return the data with the rows of clouds as a stage has them, and the stage fitted to these, time and again until neither changes much: what is
+    rounded off where the model was draws it back there. With `anew` it is asked again which rows there are."""
+    for _ in range(MATCHINGS):
+        data = rematched(data, stage, noise, anew=anew)
+        stage = _again(data, stage, noise, near=None if anew else stage.fit.jets)
+        if stage.fit.fit.cost[0] - stage.fit.chi2 <= EVIDENCE / 2.0:
+            break
+    return data, stage
+
+
+def _again(
+    data: Data, stage: Stage, noise: Noise, *, known: list[SceneJet] | None = None, near: list[SceneJet] | None = None
+) -> Stage:
+    """Return a stage fitted to other weights or rows, from where it is: with derivatives that are known there, or that are near."""
     fit, own = stage.fit, own_of(stage)
 
     def fitted(steps: int) -> Stage:
