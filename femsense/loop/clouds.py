@@ -42,8 +42,8 @@ RADIUS = 3.5
 """Radius of a height field, in cells."""
 SPACING = 0.6
 """Distance of the centres of height fields, in radii."""
-ROUNDS = 0.15
-"""Most that a height field rounds off, in radii: edges of the tested robots come to 0.12, places that the model's own fields do not cover to more than 0.2."""
+ROUNDS = 0.2
+"""Most that a height field rounds off, in radii: a right angle comes to 0.16, a place that the model's own fields do not cover to 0.2 … 2."""
 STEEPEST = 0.78
 """Cosine between the measured and the modelled normal below which a place is of another side of the body."""
 AROUND = 16
