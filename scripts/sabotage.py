@@ -249,6 +249,8 @@ SABOTAGES = (
     S("loop/noise.py", "alike = normals @ normals.T", "alike = np.ones((len(self.points),) * 2)", "test_loop_clouds.py::test_noise_of_clouds_is_shared_by_neighbours_along_their_normals"),
     S("loop/noise.py", "normals = self.rest_normals if of_body else self.normals", "normals = self.normals", "test_loop_clouds.py::test_noise_of_clouds_is_shared_by_neighbours_along_their_normals"),
     S("loop/clouds.py", "sides[own], rounded[own]", "sides[own], 0.0 * rounded[own]", "test_loop_clouds.py::test_what_a_measured_surface_rounds_off_is_no_residual"),
+    S("loop/clouds.py", "np.where(np.abs(distance) <= ROUNDS * seen.sheets.radius, distance, np.nan)", "distance", "test_loop_clouds.py::test_a_place_that_the_models_own_fields_do_not_cover_is_no_row"),
+    S("loop/improve.py", "if stage.fit.fit.cost[0] - stage.fit.chi2 <= EVIDENCE / 2.0:", "if True:", "test_loop_clouds.py::test_rows_are_made_again_until_the_fit_stays_where_it_is"),
     S("loop/clouds.py", "nearest_on(nodes, triangles[faces], points) if faces.any()", "nearest_on(nodes, triangles, points) if faces.any()", "test_loop_clouds.py::test_only_sides_that_face_the_camera_stand_for_what_it_measured"),
     S("pointcloud/segmentation.py", "left = near & (away > width)", "left = near & (away < width)", "test_pointcloud_segmentation.py::test_a_floor_that_goes_on_beside_the_robot_is_not_robot"),
     S("pointcloud/segmentation.py", "if len(inside) < _FLAT * len(far):", "if len(inside) < 0:", "test_pointcloud_segmentation.py::test_what_lies_beside_the_robot_but_in_no_plane_or_flush_with_it_decides_nothing"),

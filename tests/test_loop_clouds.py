@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from femsense.frames import Camera
 from femsense.loop import improve
 from femsense.loop.advice import next_element
 from femsense.loop.clouds import (
+    ROUNDS,
     Seen,
     _crossings_of,
     _in_camera,
@@ -29,9 +31,10 @@ from femsense.loop.clouds import (
     with_surface,
 )
 from femsense.loop.data import Data, prepare
+from femsense.loop.improve import _matched
 from femsense.loop.joint import normals_of, spans_of, vectors_of
 from femsense.loop.noise import Groups, Noise, Surface, whiten
-from femsense.loop.stages import make_stage, with_nuisance
+from femsense.loop.stages import make_stage, own_of, rematched, with_nuisance
 from femsense.model import Robot
 from femsense.pointcloud.sheets import Sheets, fit_sheet, joined
 from femsense.pose import move_pose
@@ -211,6 +214,39 @@ def test_what_a_measured_surface_rounds_off_is_no_residual():
     top = surface_normals(robot, state.positions)[again][:, 2] > 0.99
     assert top.sum() > 2
     np.testing.assert_allclose(higher[top], 1e-3, atol=2e-4)
+
+
+def test_a_place_that_the_models_own_fields_do_not_cover_is_no_row():
+    robot = with_surface(arm(COARSE))
+    places = robot.body.mesh.nodes[np.abs(robot.body.mesh.nodes[:, 1:]).max(axis=1) > 9e-3]
+    robot, state = robot.with_surface_points(np.concatenate([places, places + np.array([4e-3, 0.0, 0.0])])), rest_state(robot)
+    pose = np.eye(4)
+    pose[:3, 3] = 0.05, 0.2, 0.3
+    seen = seen_as(on_sides(robot, (0.0, 0.2, 0.3)) - pose[:3, 3])
+    for off in ([0.0, 0.0, 0.0], [5e-3, 0.0, 0.0]):  # there, beyond the end, fields are of points along its edge alone
+        numbers, _, crossings = _crossings_of(robot, seen, 0, state, move_pose(pose, np.r_[np.zeros(3), off]))
+        assert len(numbers) > 50
+        assert np.abs(crossings.rounded).max() < ROUNDS * seen.sheets.radius
+
+
+def test_rows_are_made_again_until_the_fit_stays_where_it_is(rubbing: Recording, monkeypatch: pytest.MonkeyPatch):
+    data = prepare(arm(COARSE), [rubbing], [], "clouds")
+    hypothesis, prior = with_nuisance(data)
+    noise, nothing = Noise({}, "", {"white": 1e-4}), np.zeros(len(prior.mean))
+    off = np.array([0.01, -0.01, 0.01, 2e-3, -2e-3, 2e-3])
+    start = make_stage(
+        data, hypothesis, prior, noise, nothing, own=np.r_[off, np.zeros(data.train[0].size - 6)], max_iterations=0
+    )
+    data = rematched(data, start, noise, anew=True)  # rows as they are found from there
+
+    def to_gain(rounds: int) -> float:
+        monkeypatch.setattr(sys.modules[improve.__module__], "MATCHINGS", rounds)
+        found, stage = _matched(data, start, noise, anew=True)
+        again = make_stage(rematched(found, stage, noise), hypothesis, prior, noise, stage.fit.coordinates, own=own_of(stage))
+        return again.fit.fit.cost[0] - again.fit.chi2
+
+    assert to_gain(1) > 10.0
+    assert to_gain(4) < 5.0
 
 
 def test_rows_hardly_change_when_they_are_made_anew_elsewhere(both: Data):
