@@ -21,7 +21,7 @@ from femsense.errors import DataError
 from femsense.fem.equilibrium import Equilibrium
 from femsense.march import Walk, drive_of, solve_frame
 from femsense.model import Robot
-from femsense.pose import move_pose, moved_poses
+from femsense.pose import move_pose
 from femsense.recording import Recording, check_against, state_key
 
 MAX_FRAMES = 16
@@ -210,41 +210,40 @@ def fit_joint(
     pivot = robot.marker_points.mean(axis=0)
     moving = [v for v, T in enumerate(scene.recording.T_robot_camera) if T is None]
     a = len(initial) if initial is not None and free_inputs else 0
-    sigma = 5e-4
+    base_poses, sigma = list(poses), 5e-4
     seat_std = SEAT_STD_FLOOR
     repeats = _repeats(scene)
     weights = repeats
     jet: SceneJet | None = None
     starts: dict[int, Equilibrium] = {}
 
-    columns = [c for v in moving for c in range(6 * v, 6 * v + 6)]
-
-    def parts(theta: FloatArray) -> tuple[FloatArray, FloatArray | None]:
-        moves = np.zeros(6 * len(poses))
-        moves[columns] = theta[: len(columns)]
-        return moves, theta[len(columns) :] if a else initial
+    def place(theta: FloatArray) -> tuple[list[FloatArray], FloatArray | None]:
+        moved = list(base_poses)
+        for i, v in enumerate(moving):
+            moved[v] = move_pose(base_poses[v], theta[6 * i : 6 * i + 6], pivot_a=pivot)
+        return moved, theta[6 * len(moving) :] if a else initial
 
     def evaluate(theta: FloatArray, derivative: bool) -> tuple[FloatArray, FloatArray | None]:
         nonlocal jet
-        moves, inputs = parts(theta)
+        moved, inputs = place(theta)
         known = None if a or jet is None else jet.states  # a pose does not move the body
         jet = evaluate_scene(
             plain,
             scene,
             empty,
-            poses,
+            moved,
             inputs,
             derivative=derivative,
             vary_initial=bool(a),
             pivot=pivot,
             starts=starts,
             known=known,
-            moves=moves,
         )
         row = (weights / sigma)[:, None]
         residual = np.concatenate([(row * jet.residual).ravel(), jet.rest.ravel() / seat_std])
         if not derivative:
             return residual, None
+        columns = [c for v in moving for c in range(6 * v, 6 * v + 6)]
         J_pose = np.vstack([(row[:, :, None] * jet.by_pose[:, :, columns]).reshape(jet.residual.size, len(columns)),
                             jet.rest_by_pose[:, :, columns].reshape(jet.rest.size, len(columns)) / seat_std])  # fmt: skip
         J_in = np.vstack([(row[:, :, None] * jet.by_initial).reshape(jet.residual.size, a), np.zeros((jet.rest.size, a))])
@@ -269,9 +268,9 @@ def fit_joint(
         sigma = _spread(winsorised, float(3 * (repeats**2).sum()), len(theta))
         seat_std = max(SEAT_STD_FLOOR, float(np.sqrt((jet.rest**2).mean()))) if len(jet.rest) else seat_std
     assert jet is not None
-    moves, inputs = parts(theta)
+    moved, inputs = place(theta)
     fit = _with_bound_inputs(fit, theta, bounds)
-    return fit, moved_poses(poses, moves, pivot), inputs, jet
+    return fit, moved, inputs, jet
 
 
 def _with_bound_inputs(fit: FitResult, theta: FloatArray, bounds: tuple[FloatArray, FloatArray]) -> FitResult:
