@@ -145,6 +145,8 @@ def test_some_states_are_spread_and_never_too_few(started: tuple[Data, Stage]):
 
 def test_fields_are_those_of_the_fit_whatever_was_solved_last(started: tuple[Data, Stage], monkeypatch: pytest.MonkeyPatch):
     data, stage = started
+    fit = stage.fit
+    stage = make_stage(data, fit.hypothesis, fit.prior, NOISE, fit.coordinates, own=own_of(stage))  # not of a rough step
     robot, trial = stage.fit.hypothesis.robot_at(stage.fit.coordinates), data.train[0]
     payload = find_effect("payload")
     one = (payload, payload.seeds(robot)[0], payload.parameters(robot, data.control))
