@@ -319,12 +319,9 @@ def test_what_is_handed_back_keeps_the_size_that_it_has_beside_all_nuisances_unl
 def test_a_linear_mesh_is_asked_for_quadratic_elements_whatever_else_makes_up_for_it() -> None:
     """Calibration makes the locking arm so soft that quadratic elements of that softness fold: screening cannot see them."""
     inputs, labels = sweeps(2.0)
-    recording, _ = record(inputs, labels=labels)
     declared = arm((7, 2, 2), law="neo_hookean")
+    recording, _ = record(inputs, labels=labels, truth=declared)  # a finer truth is softer by 1 %, which is named beside it
     linear = robot_on_mesh(declared, to_linear(declared.body.mesh))
     found = improve(linear, [recording], effects=["discretisation", "poisson", "cable_gain"])
-    assert [e["name"] for e in found.effects if e["name"] != "stiffness"] == ["discretisation"]
-    assert all(
-        abs(e["parameters"]["scale"]["value"] - 1.0) < 0.01 for e in found.effects if e["name"] == "stiffness"
-    )  # this mesh is that stiff
+    assert [e["name"] for e in found.effects] == ["discretisation"]
     assert found.after["validation_rms_m"] < 0.2 * found.before["validation_rms_m"]
