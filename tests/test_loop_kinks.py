@@ -9,7 +9,8 @@ import pytest
 from arm import arm, record, sweeps
 from scipy.optimize import lsq_linear
 
-from femsense.calib.fit import Kinks, _Near, gauss_newton
+from femsense.calib.fit import gauss_newton
+from femsense.calib.near import Kinks, Near
 from femsense.effects import apply_effects
 from femsense.loop.data import prepare
 from femsense.loop.joint import JointProblem
@@ -49,7 +50,7 @@ def test_a_fit_that_knows_its_kinks_goes_through_them_at_once(seed: int) -> None
     evaluate, kinks, tries, best = bent(seed)
     plain = gauss_newton(evaluate, np.zeros(3))
     tries.clear()
-    near = _Near(*evaluate(np.zeros(3), True), kinks(np.zeros(3)), np.full(3, -np.inf), np.full(3, np.inf))
+    near = Near(*evaluate(np.zeros(3), True), kinks(np.zeros(3)), np.full(3, -np.inf), np.full(3, np.inf))
     cost = float(np.sum(evaluate(near.step(0.0), False)[0] ** 2))
     assert best * (1 - 1e-9) <= cost <= 1.05 * best
     assert cost <= plain.cost[-1] * 1.001
@@ -58,7 +59,7 @@ def test_a_fit_that_knows_its_kinks_goes_through_them_at_once(seed: int) -> None
 def test_what_a_step_changes_is_known_across_a_kink() -> None:
     evaluate, kinks, _, _ = bent(1)
     r, J = evaluate(np.zeros(3), True)
-    near = _Near(r, J, kinks(np.zeros(3)), np.full(3, -np.inf), np.full(3, np.inf))
+    near = Near(r, J, kinks(np.zeros(3)), np.full(3, -np.inf), np.full(3, np.inf))
     for step in np.random.default_rng(2).normal(size=(5, 3)):
         np.testing.assert_allclose(near.change(step), evaluate(step, False)[0] - r, atol=1e-12)
         assert np.linalg.norm(J @ step - near.change(step)) > 0.1
@@ -98,7 +99,7 @@ def test_zeros_on_both_sides_are_predicted(creep: bool, scatter: float) -> None:
     there = problem.start(np.array([0.01, -0.03, 0.05, -0.04, 0.05]))
     r, J = problem.evaluate(at, True)
     kinks = problem.kinks(at)
-    near = _Near(r, J, kinks, at - 1.0, at + 1.0)
+    near = Near(r, J, kinks, at - 1.0, at + 1.0)
     assert len(kinks.value) <= 12
     np.testing.assert_allclose(near.J, J, atol=0.02 * np.abs(J).max())
     true = problem.evaluate(there, False)[0] - r

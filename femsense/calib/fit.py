@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import lsq_linear
 
-from femsense.arrays import BoolArray, FloatArray, freeze
+from femsense.arrays import FloatArray, freeze
+from femsense.calib.near import Curvature, Kinks, Near
 from femsense.errors import DataError
 
 Evaluate = Callable[[FloatArray, bool], tuple[FloatArray, FloatArray | None]]
@@ -28,29 +29,8 @@ LEAST_SHRINKING = 0.25
 """No step is foretold to be shorter than this share of the one before."""
 CONVERGED, GIVEN_UP = "converged", "given up"
 MOST_DAMPING = 1e8
-WIDTHS = 0.3, 0.1, 0.03, 0.01, 1e-3, 1e-5
-"""How far kinks are rounded, in shares of the way that a plain step goes past them; one after the other."""
-TURNS = 4
-"""Gauss–Newton steps for each of these, of a problem that costs nothing to evaluate."""
 ON_KINK = 0.2
 """A fit rests on a kink that is nearer than so many standard errors."""
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Kinks:
-    """Where the residual bends, although what makes it bend is known:  r(θ + s) ≈ r + J₀ s + W (max(v + U s, 0) − max(v, 0)).
-
-    A cable that is not pulled does not push, so that the tension that its zero and its log make together ends at 0.
-    """
-
-    columns: FloatArray
-    """W: change of the whitened residual by each value that is cut off at 0, shape (N, g)."""
-    value: FloatArray
-    """v: what it would be at θ if it were not cut off, shape (g,)."""
-    slope: FloatArray
-    """U: its derivative by θ, shape (g, p)."""
-    counted: BoolArray
-    """Whether the Jacobian counts it as not cut off, shape (g,)."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -125,8 +105,12 @@ def gauss_newton(
     costs = [float(residual @ residual)]
     damping, status, steps, pace = 0.0, "iterations", 0, _Pace()
     idle = 0  # idle steps in turn
+    curvature = Curvature()
     while steps < max_iterations or not slope.own:
-        near = _Near(residual, slope.J, None if kinks is None else kinks(theta), low - theta, high - theta)
+        bends = None if kinks is None else kinks(theta)
+        if slope.own:
+            curvature.learn(theta, residual, slope.J, bends)
+        near = Near(residual, slope.J, bends, low - theta, high - theta, curvature.S)
         step = near.step(damping)
         change, promised = near.change(step), near.promise(step)
         whole = promised if damping == 0.0 else near.promise(near.step(0.0))
@@ -212,84 +196,13 @@ def _as_seen(J: FloatArray, step: FloatArray, scale: FloatArray, missed: FloatAr
     return J if size == 0.0 else J + np.outer(missed, along / size)
 
 
-def _shorter(near: _Near, damping: float, change: FloatArray) -> float:
+def _shorter(near: Near, damping: float, change: FloatArray) -> float:
     """Return the damping that makes a step change the residual by half as much as `change` or less."""
     while damping <= MOST_DAMPING:
         damping = max(10.0 * damping, 1e-4)
         if np.linalg.norm(near.change(near.step(damping))) <= 0.5 * np.linalg.norm(change):
             break
     return damping
-
-
-class _Near:
-    """What the residual is near θ: linear, but for kinks."""
-
-    def __init__(self, r: FloatArray, J: FloatArray, kinks: Kinks | None, low: FloatArray, high: FloatArray) -> None:
-        self.kinks, self.low, self.high = kinks, low, high
-        self.plain = J if kinks is None else J - (kinks.columns * kinks.counted) @ kinks.slope
-        """J₀"""
-        self.scale = np.linalg.norm(J, axis=0)
-        self.scale[self.scale == 0] = 1.0
-        self.r, self.J = r, J
-        if kinks is not None:  # of all rows, these are what sums of squares depend on
-            p, g = len(self.scale), len(kinks.value)
-            R = np.asarray(np.linalg.qr(np.column_stack([self.plain, kinks.columns, r]), mode="r"))
-            self.J0, self.W, self.r0 = R[:, :p], R[:, p : p + g], R[:, -1]
-            self.J = self.plain + (kinks.columns * (kinks.value >= 0)) @ kinks.slope
-
-    def change(self, step: FloatArray) -> FloatArray:
-        """Return by how much a step changes the residual, shape (N,)."""
-        k = self.kinks
-        if k is None:
-            return np.asarray(self.J @ step)
-        return np.asarray(self.plain @ step + k.columns @ (_cut(k.value + k.slope @ step, 0.0)[0] - _cut(k.value, 0.0)[0]))
-
-    def promise(self, step: FloatArray) -> float:
-        """Return by how much a step lowers the sum of squares."""
-        return float(np.sum(self.r**2) - np.sum((self.r + self.change(step)) ** 2))
-
-    def step(self, damping: float) -> FloatArray:
-        """Return the step that minimises the sum of squares + damping ‖scale · s‖² within bounds."""
-        straight = _bounded_step(self.J, self.r, self.scale, damping, self.low, self.high)
-        k = self.kinks
-        if k is None:
-            return straight
-        best, best_cost = straight, self._cost(straight, damping)
-        past = float(np.abs(k.slope @ straight).max(initial=0.0))
-        s = np.zeros_like(straight)
-        for width in WIDTHS:
-            for _ in range(TURNS):
-                s, moved = self._turn(s, damping, width * past)
-                if not moved:
-                    break
-            cost = self._cost(s, damping)
-            if cost < best_cost:
-                best, best_cost = s, cost
-        return best
-
-    def _turn(self, s: FloatArray, damping: float, width: float) -> tuple[FloatArray, bool]:
-        """Return a better step, and whether there was one, where kinks are rounded to a width."""
-        k = self.kinks
-        assert k is not None
-        root = np.sqrt(damping) * self.scale
-        r = np.concatenate([self._reduced(s, width), root * s])
-        J = np.vstack([self.J0 + (self.W * _cut(k.value + k.slope @ s, width)[1]) @ k.slope, np.diag(root)])
-        turn = _bounded_step(J, r, self.scale, 0.0, self.low - s, self.high - s)
-        cost, part = float(r @ r), 1.0
-        while part > 1e-3:
-            new = s + part * turn
-            if float(np.sum(self._reduced(new, width) ** 2) + np.sum((root * new) ** 2)) < cost * (1.0 - 1e-9):
-                return new, True
-            part *= 0.5
-        return s, False
-
-    def _reduced(self, s: FloatArray, width: float) -> FloatArray:
-        k = self.kinks
-        assert k is not None
-        return np.asarray(self.r0 + self.J0 @ s + self.W @ (_cut(k.value + k.slope @ s, width)[0] - _cut(k.value, width)[0]))
-
-    def _cost(self, s: FloatArray, damping: float) -> float:
-        return float(np.sum(self._reduced(s, 0.0) ** 2) + damping * np.sum((self.scale * s) ** 2))
 
 
 def _on_kinks(J: FloatArray, r: FloatArray, kinks: Kinks) -> FloatArray:
@@ -316,12 +229,6 @@ def _finite(covariance: FloatArray) -> FloatArray:
     return np.where(np.isfinite(covariance), covariance, 0.0)
 
 
-def _cut(value: FloatArray, width: float) -> tuple[FloatArray, FloatArray]:
-    """Return max(value, 0), rounded to a width, and its derivative."""
-    length = np.sqrt(value**2 + width**2)
-    return 0.5 * (value + length), 0.5 * (1.0 + value / np.maximum(length, 1e-300))
-
-
 def _first(
     evaluate: Evaluate, theta: FloatArray, known: tuple[FloatArray, FloatArray | None] | None, borrowed: FloatArray | None
 ) -> tuple[FloatArray, _Slope]:
@@ -345,21 +252,6 @@ def _tried(evaluate: Evaluate, theta: FloatArray) -> FloatArray | None:
         return evaluate(theta, False)[0]
     except DataError:
         return None
-
-
-def _bounded_step(
-    J: FloatArray, r: FloatArray, scale: FloatArray, damping: float, low: FloatArray, high: FloatArray
-) -> FloatArray:
-    """Return the step that minimises ‖r + J s‖² + damping ‖scale · s‖² within bounds."""
-    p = J.shape[1]
-    A = np.vstack([J / scale, np.sqrt(damping) * np.eye(p)]) if damping > 0 else J / scale
-    b = np.concatenate([-r, np.zeros(p)]) if damping > 0 else -r
-    step = np.linalg.lstsq(A, b, rcond=1e-12)[0] / scale
-    if (step >= low).all() and (step <= high).all():
-        return np.asarray(step)
-    open_low, open_high = np.minimum(low * scale, -1e-15), np.maximum(high * scale, 1e-15)
-    bounded = lsq_linear(A, b, bounds=(open_low, open_high), method="bvls", max_iter=10 * p + 50)
-    return np.clip(np.asarray(bounded.x) / scale, low, high)
 
 
 def covariance_of(jacobian: FloatArray) -> FloatArray:

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from femsense.arrays import BoolArray, FloatArray, IntArray
-from femsense.calib.fit import FitResult, Kinks, gauss_newton
+from femsense.calib.fit import FitResult, gauss_newton
 from femsense.calib.forward import Hypothesis, Scene, SceneJet, evaluate_scene, rest_residual
+from femsense.calib.near import Kinks
 from femsense.effects.loads import STANDARD_GRAVITY
 from femsense.errors import DataError
 from femsense.fem.body import BodyModel

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from femsense.arrays import FloatArray, IntArray
-from femsense.calib.fit import Kinks
 from femsense.calib.forward import Hypothesis, SceneJet
+from femsense.calib.near import Kinks
 from femsense.loop.noise import Whitener, whiten
 from femsense.march import creep_response, inputs_wanted
 
