@@ -110,7 +110,7 @@ def gauss_newton(
         bends = None if kinks is None else kinks(theta)
         if slope.own:
             curvature.learn(theta, residual, slope.J, bends)
-        near = Near(residual, slope.J, bends, low - theta, high - theta, curvature.S)
+        near = Near(residual, slope.J, bends, low - theta, high - theta, curvature.S, believed=curvature.believed)
         step = near.step(damping)
         change, promised = near.change(step), near.promise(step)
         whole = promised if damping == 0.0 else near.promise(near.step(0.0))
@@ -137,7 +137,10 @@ def gauss_newton(
             if not slope.own and idle < 2:
                 residual, slope = _both(evaluate, theta)
                 continue
-            damping = _shorter(near, damping, change)
+            if curvature.believed:  # straight lines may do better
+                curvature.believed = False
+            else:
+                damping = _shorter(near, damping, change)
             if last or damping > MOST_DAMPING:
                 status = CONVERGED
                 break
@@ -145,6 +148,7 @@ def gauss_newton(
         if slope.own:
             pace.took(float(np.linalg.norm(change)) if damping == 0.0 else np.inf)
         damping = damping / 10.0 if damping > 1e-6 else 0.0
+        curvature.judge(near, step, costs[-1] - cost)
         missed = tried - residual - change
         off, way = float(np.linalg.norm(missed)), float(np.linalg.norm(change))
         theta, residual, slope = theta + step, tried, slope.after(step, near.scale, missed, off < trusted * way)

@@ -66,6 +66,8 @@ class Curvature:
     def __init__(self) -> None:
         self.S: FloatArray | None = None
         """Shape (p, p); None: nothing is known."""
+        self.believed = False
+        """Whether the last step was foretold better with it."""
         self.last: _Point | None = None
 
     def learn(self, theta: FloatArray, r: FloatArray, J: FloatArray, kinks: Kinks | None) -> None:
@@ -89,6 +91,11 @@ class Curvature:
         outer = np.outer(missed, along) / size
         self.S = S + outer + outer.T - float(step @ missed) / size**2 * np.outer(along, along)
 
+    def judge(self, near: Near, step: FloatArray, gain: float) -> None:
+        """Believe in S from now on if it foretells what a step brought better than straight lines do."""
+        straight, curved = (abs(near.promise(step, curved=curved) - gain) for curved in (False, True))
+        self.believed = curved < straight
+
 
 def _with_curvature(J: FloatArray, S: FloatArray, scale: FloatArray) -> FloatArray:
     """Return C with CᵀC = JᵀJ + S, S being cut so that it leaves the least share of JᵀJ, and nothing where J sees nothing."""
@@ -104,8 +111,9 @@ class Near:
     """What the sum of squares is near θ."""
 
     def __init__(
-        self, r: FloatArray, J: FloatArray, kinks: Kinks | None, low: FloatArray, high: FloatArray, S: FloatArray | None = None
-    ) -> None:
+        self, r: FloatArray, J: FloatArray, kinks: Kinks | None, low: FloatArray, high: FloatArray,
+        S: FloatArray | None = None, *, believed: bool = True,
+    ) -> None:  # fmt: skip
         self.kinks, self.low, self.high = kinks, low, high
         self.plain = J if kinks is None else J - (kinks.columns * kinks.counted) @ kinks.slope
         """J₀"""
@@ -117,8 +125,7 @@ class Near:
             R = np.asarray(np.linalg.qr(np.column_stack([self.plain, kinks.columns, r]), mode="r"))
             self.J0, self.W, self.r0 = R[:, :p], R[:, p : p + g], R[:, -1]
             self.J = self.plain + (kinks.columns * (kinks.value >= 0)) @ kinks.slope
-        self.S = np.zeros((len(self.scale),) * 2)
-        self.curved = S is not None
+        self.S, self.curved = np.zeros((len(self.scale),) * 2), S is not None and believed
         if S is not None:
             C = _with_curvature(self.J, S, self.scale)
             self.S = C.T @ C - self.J.T @ self.J
@@ -130,9 +137,14 @@ class Near:
             return np.asarray(self.J @ step)
         return np.asarray(self.plain @ step + k.columns @ (_cut(k.value + k.slope @ step, 0.0)[0] - _cut(k.value, 0.0)[0]))
 
-    def promise(self, step: FloatArray) -> float:
-        """Return by how much a step lowers the sum of squares."""
-        return float(np.sum(self.r**2) - np.sum((self.r + self.change(step)) ** 2) - step @ self.S @ step)
+    def promise(self, step: FloatArray, *, curved: bool | None = None) -> float:
+        """Return by how much a step lowers the sum of squares; with S or without it, by default as far as it is believed."""
+        bend = self.bend(step) if curved is None else curved * float(step @ self.S @ step)
+        return float(np.sum(self.r**2) - np.sum((self.r + self.change(step)) ** 2)) - bend
+
+    def bend(self, step: FloatArray) -> float:
+        """Return what S adds to the sum of squares, as far as it is believed."""
+        return float(step @ self.S @ step) if self.curved else 0.0
 
     def step(self, damping: float) -> FloatArray:
         """Return the step that minimises the sum of squares + damping ‖scale · s‖² within bounds."""
@@ -185,7 +197,7 @@ class Near:
         return np.asarray(self.r0 + self.J0 @ s + self.W @ (_cut(k.value + k.slope @ s, width)[0] - _cut(k.value, width)[0]))
 
     def _cost(self, s: FloatArray, damping: float, width: float = 0.0) -> float:
-        return float(np.sum(self._reduced(s, width) ** 2) + damping * np.sum((self.scale * s) ** 2) + s @ self.S @ s)
+        return float(np.sum(self._reduced(s, width) ** 2) + damping * np.sum((self.scale * s) ** 2)) + self.bend(s)
 
 
 def _cut(value: FloatArray, width: float) -> tuple[FloatArray, FloatArray]:
