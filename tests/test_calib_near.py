@@ -55,6 +55,42 @@ def test_it_is_exact_along_the_last_step_and_symmetric() -> None:
     assert curvature.S is S
 
 
+def test_it_is_believed_after_a_step_that_it_foretold_better(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[tuple[bool, bool]] = []  # whether it was known, and whether it was believed
+    make = Near.__init__
+
+    def watched(self: Near, *args: object, believed: bool = True) -> None:
+        asked.append((args[5] is not None, believed))
+        make(self, *args, believed=believed)
+
+    monkeypatch.setattr(Near, "__init__", watched)
+    gauss_newton(circle, np.array([-0.5, 0.0]), still=1e-6, tolerance=1e-14)
+    first = [known for known, _ in asked].index(True)
+    assert not asked[first][1] and asked[first + 1][1]
+    x = np.array([0.4, -0.3])
+    near = Near(*circle(x, True), None, np.full(2, -9.0), np.full(2, 9.0), np.diag([-50.0, 0.0]))
+    curvature, step = Curvature(), np.array([0.2, 0.1])
+    for gain, believed in ((near.promise(step, curved=True), True), (near.promise(step, curved=False), False)):
+        curvature.judge(near, step, gain)
+        assert curvature.believed == believed
+
+
+def test_where_a_bent_step_fails_a_straight_one_is_tried(monkeypatch: pytest.MonkeyPatch) -> None:
+    def wrong(self: Curvature, *_: object) -> None:
+        self.believed |= self.S is None  # once
+        self.S = np.array([[-0.8 * 4.0]])
+
+    monkeypatch.setattr(Curvature, "learn", wrong)
+    tried: list[float] = []
+
+    def evaluate(x: np.ndarray, derivative: bool) -> tuple[np.ndarray, np.ndarray | None]:
+        tried.append(float(x[0]))
+        return 2.0 * (x - 1.0), np.array([[2.0]]) if derivative else None
+
+    gauss_newton(evaluate, np.zeros(1))
+    assert tried[1:3] == pytest.approx([5.0, 1.0])
+
+
 def test_units_do_not_matter() -> None:
     evaluate, _ = curved_line(2)
     points, unit = np.random.default_rng(3).normal(size=(4, 4)), np.array([1e-3, 1.0, 50.0, 1e4])
