@@ -46,7 +46,6 @@ class _Point:
     """Where a Jacobian was computed."""
 
     theta: FloatArray
-    r: FloatArray
     J: FloatArray
     kinks: Kinks | None
 
@@ -72,7 +71,7 @@ class Curvature:
 
     def learn(self, theta: FloatArray, r: FloatArray, J: FloatArray, kinks: Kinks | None) -> None:
         """Learn from residual and Jacobian at a point of the fit."""
-        here, before = _Point(theta, r, J, kinks), self.last
+        here, before = _Point(theta, J, kinks), self.last
         if before is not None and np.array_equal(theta, before.theta):
             return
         self.last = here
