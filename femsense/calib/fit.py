@@ -71,7 +71,7 @@ def gauss_newton(
     kinks: Callable[[FloatArray], Kinks | None] | None = None,
 ) -> FitResult:
     """Minimise ‖r(θ)‖² within bounds (Levenberg's damping where a plain step does not pay; how the residual bends, as far as its Jacobians have
-    shown it, counts while that foretells steps better than straight lines do: `calib.near`).
+    shown it, counts while that foretells steps no worse than straight lines do: `calib.near`).
 
     A Jacobian that predicted the last step well serves for the next one too; the fit ends only where the Jacobian at θ itself says that
     there is nothing left to gain (or one that is `trusted`), or, where what is left is noise, where it would: steps of a Gauss–Newton fit, each

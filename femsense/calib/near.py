@@ -65,8 +65,8 @@ class Curvature:
     def __init__(self) -> None:
         self.S: FloatArray | None = None
         """Shape (p, p); None: nothing is known."""
-        self.believed = False
-        """Whether the last step was foretold better with it."""
+        self.believed = True
+        """Whether it foretold the last step no worse than straight lines; at first it is."""
         self.last: _Point | None = None
 
     def learn(self, theta: FloatArray, r: FloatArray, J: FloatArray, kinks: Kinks | None) -> None:
@@ -91,9 +91,9 @@ class Curvature:
         self.S = S + outer + outer.T - float(step @ missed) / size**2 * np.outer(along, along)
 
     def judge(self, near: Near, step: FloatArray, gain: float) -> None:
-        """Believe in S from now on if it foretells what a step brought better than straight lines do."""
+        """Go on believing in S if it foretells what a step brought no worse than straight lines do."""
         straight, curved = (abs(near.promise(step, curved=curved) - gain) for curved in (False, True))
-        self.believed = curved < straight
+        self.believed = curved <= straight
 
 
 def _with_curvature(J: FloatArray, S: FloatArray, scale: FloatArray) -> FloatArray:
