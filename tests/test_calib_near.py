@@ -76,11 +76,7 @@ def test_it_is_believed_until_straight_lines_foretell_a_step_better(monkeypatch:
 
 
 def test_where_a_bent_step_fails_a_straight_one_is_tried(monkeypatch: pytest.MonkeyPatch) -> None:
-    def wrong(self: Curvature, *_: object) -> None:
-        self.believed |= self.S is None  # once
-        self.S = np.array([[-0.8 * 4.0]])
-
-    monkeypatch.setattr(Curvature, "learn", wrong)
+    monkeypatch.setattr(Curvature, "learn", lambda self, *_: setattr(self, "S", np.array([[-0.8 * 4.0]])))  # wrong
     tried: list[float] = []
 
     def evaluate(x: np.ndarray, derivative: bool) -> tuple[np.ndarray, np.ndarray | None]:
