@@ -307,6 +307,7 @@ def doctor(json: Json = False) -> Answer:
 def main() -> NoReturn:
     """Run the command of `sys.argv` and exit with its status."""
     signal.signal(signal.SIGTERM, _stop)
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is loaded; why: `femsense.parallel.one_blas_thread`
     sys.exit(run(sys.argv[1:]))
 
 

@@ -50,16 +50,14 @@ def workers() -> int:
 
 
 def each(function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
-    """Yield function(item) of each item in order; no more than two a thread are worked on ahead.
-
-    Meanwhile BLAS takes one thread a call: with several, the threads would wait for those of each other's calls.
-    """
+    """Yield function(item) of each item in order; no more than two a thread are worked on ahead. Meanwhile BLAS takes one thread a call."""
     count = workers()
     if count < 2:
-        yield from map(function, items)
+        with one_blas_thread():
+            yield from map(function, items)
         return
     waiting: deque[Future[Result]] = deque()
-    with _blas().limit(limits=1, user_api="blas"), ThreadPoolExecutor(count) as pool:
+    with one_blas_thread(), ThreadPoolExecutor(count) as pool:
         try:
             for item in items:
                 waiting.append(pool.submit(function, item))
@@ -70,6 +68,17 @@ def each(function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[
         finally:
             for future in waiting:
                 future.cancel()
+
+
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Let BLAS take one thread a call meanwhile; a decorator, too.
+
+    The threads of a call wait for each other. On matrices as large as ours two of them gain a tenth on an idle machine; where other threads
+    are busy, ours or another program's, they take many times as long (`python benchmarks/body.py crowded`).
+    """
+    with _blas().limit(limits=1, user_api="blas"):
+        yield
 
 
 @cache
@@ -90,4 +99,4 @@ def beside(function: Callable[[], None]) -> Iterator[Callable[[], None]]:
         yield pool.submit(function).result
 
 
-__all__ = ["beside", "each", "set_workers", "workers"]
+__all__ = ["beside", "each", "one_blas_thread", "set_workers", "workers"]

@@ -25,6 +25,7 @@ from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.mesh import vertex_normals
 from femsense.march import Walk, drive_of, has_history, solve_frame
 from femsense.model import Robot, spread_features
+from femsense.parallel import one_blas_thread
 from femsense.patch import Patch, Surface, flat_nodes, make_surface, patch_at
 from femsense.pointcloud.cloud import PointCloud
 from femsense.pointcloud.contact import detect_contacts
@@ -213,6 +214,7 @@ class Sensor:
     """Diagonal of the body at rest [m]."""
 
 
+@one_blas_thread()
 def estimate(
     robot: Robot,
     recording: Recording,

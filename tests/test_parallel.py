@@ -12,6 +12,8 @@ from test_march import recording, robot
 
 from femsense import parallel
 from femsense.errors import DataError, InputError
+from femsense.fem import cholesky
+from femsense.fem.equilibrium import solve_equilibrium
 from femsense.march import Walk, drive_of, marker_positions, walk_along
 from femsense.parallel import beside, each, set_workers, workers
 
@@ -40,20 +42,40 @@ def test_one_worker_works_in_this_thread():
     assert set(each(lambda _: threading.get_ident(), range(4))) == {threading.get_ident()}
 
 
-def test_blas_takes_one_thread_while_ours_work_and_has_its_own_back_afterwards():
-    set_workers(2)
-    blas = threadpoolctl.ThreadpoolController().select(user_api="blas")
+BLAS = threadpoolctl.ThreadpoolController().select(user_api="blas")
 
-    def threads(_: int = 0) -> int:
-        return max(library["num_threads"] for library in blas.info())
 
-    with blas.limit(limits=2):
-        if threads() < 2:
+def blas_threads(*_: object) -> int:
+    return max(library["num_threads"] for library in BLAS.info())
+
+
+@pytest.fixture
+def _two_blas_threads():
+    with BLAS.limit(limits=2):
+        if blas_threads() < 2:
             pytest.skip("this BLAS has one thread")
-        assert set(each(threads, range(4))) == {1} and threads() == 2
-        with beside(lambda: list(each(threads, range(20)))):
-            list(each(threads, range(20)))
-        assert threads() == 2
+        yield
+
+
+@pytest.mark.usefixtures("_two_blas_threads")
+@pytest.mark.parametrize("count", [1, 2])
+def test_blas_takes_one_thread_while_ours_work_and_has_its_own_back_afterwards(count: int):
+    set_workers(count)
+    assert set(each(blas_threads, range(4))) == {1} and blas_threads() == 2
+    with beside(lambda: list(each(blas_threads, range(20)))):
+        list(each(blas_threads, range(20)))
+    assert blas_threads() == 2
+
+
+@pytest.mark.usefixtures("_two_blas_threads")
+def test_a_factor_is_made_with_one_thread_of_blas(monkeypatch):
+    """Two of them wait for each other: eight times as long where another program keeps a core busy."""
+    seen = []
+    whole = cholesky._factorise
+    monkeypatch.setattr(cholesky, "_factorise", lambda *given: seen.append(blas_threads()) or whole(*given))
+    body = robot().body
+    assert solve_equilibrium(body, tension={body.cable_names[0]: 1.0}).converged
+    assert set(seen) == {1} and blas_threads() == 2
 
 
 def test_the_first_error_arrives_and_the_rest_is_left():

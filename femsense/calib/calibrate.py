@@ -21,6 +21,7 @@ from femsense.errors import DataError
 from femsense.fem.equilibrium import Equilibrium
 from femsense.march import Walk, drive_of, solve_frame
 from femsense.model import Robot
+from femsense.parallel import one_blas_thread
 from femsense.pose import move_pose
 from femsense.recording import Recording, check_against, state_key
 
@@ -46,6 +47,7 @@ def usable_frames(recording: Recording) -> IntArray:
     return every[known]
 
 
+@one_blas_thread()
 def calibrate(robot: Robot, recording: Recording, *, frames: Sequence[int] | None = None) -> Calibration:
     """Find the pose of each camera and, where their zero is unknown, the initial inputs of the cables.
 

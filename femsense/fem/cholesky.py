@@ -39,6 +39,7 @@ from femsense.fem.tiles import (
     subtract_three_side_dots,
     subtract_three_sides,
 )
+from femsense.parallel import one_blas_thread
 
 FEW = 4
 """Right-hand sides that are solved one by one; more go through BLAS together."""
@@ -920,10 +921,11 @@ def cholesky(
     a, kind = analysis, "f" if single else "d"
     L = a.take(kind)
     stack, head, follow = np.empty(a.stack, kind), np.empty(len(a.parent), np.int64), np.empty(len(a.parent), np.int64)
-    definite = _factorise(
-        values, a.entries, a.source if source is None else source, a.target, a.unit, a.firsts, a.parent, a.begin, a.place, a.offset, a.heads, a.runs, a.room,
-        _BLAS[kind], L, stack, head, follow, *_constants(kind),
-    )  # fmt: skip
+    with one_blas_thread():
+        definite = _factorise(
+            values, a.entries, a.source if source is None else source, a.target, a.unit, a.firsts, a.parent, a.begin, a.place, a.offset, a.heads, a.runs, a.room,
+            _BLAS[kind], L, stack, head, follow, *_constants(kind),
+        )  # fmt: skip
     if definite:
         return Cholesky(a, L)
     a.idle.append(L)

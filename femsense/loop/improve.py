@@ -43,7 +43,7 @@ from femsense.loop.stages import (
 )
 from femsense.loop.zeros import in_place_of_zeros
 from femsense.model import Robot
-from femsense.parallel import beside
+from femsense.parallel import beside, one_blas_thread
 from femsense.recording import Recording, state_key
 
 MAX_EFFECTS = 3
@@ -55,6 +55,7 @@ ROUGHLY, STEPS = 4, 12
 """Steps of the fit whose residual tells the noise; and at most with that, to the end."""
 
 
+@one_blas_thread()
 def improve(
     robot: Robot,
     recordings: Sequence[Recording],
