@@ -78,7 +78,8 @@ def conclude(data: Data, search: Search, rng: np.random.Generator) -> LoopResult
     lacks = _lacks(data, back, final, noise)
     shown = back if lacks else final  # what nuisances take away unnamed is left, too
     residuals = [without_mesh_error(t, jet.residual, noise) for t, jet in zip(data.train, shown.fit.jets)]
-    tests = structure_tests(data.train, residuals, rng=rng)
+    plain = [without_mesh_error(t, jet.residual, noise, nor_seats=True) for t, jet in zip(data.train, shown.fit.jets)]
+    tests = structure_tests(data.train, plain, rng=rng)
     excess = _excess(data, before, final, back, noise)
     found = _not_handed_back(search, names)
     unexplained = (

@@ -55,7 +55,9 @@ def gather(
     """
     old, new = views_of(data, before), views_of(data, back)
     score, pattern = _pattern(data, old, new)
-    cleaned = [without_mesh_error(t, jet.residual, noise) for t, jet in zip(data.train, before.fit.jets)]
+    cleaned, left = (
+        [without_mesh_error(t, j.residual, noise, nor_seats=True) for t, j in zip(data.train, s.fit.jets)] for s in (before, shown)
+    )
     found: dict[str, Any] = _rounded({
         "frames": _frame_table(data, old, new, score),
         "score": pattern,
@@ -66,7 +68,7 @@ def gather(
         "calibration": _calibration(data, {"before": before, "nuisance": base, "after": final}),
         "tests": {
             "before": _tests(data.train, cleaned, before.fit, structure_tests(data.train, cleaned, rng=rng)),
-            "after": _tests(data.train, [without_mesh_error(t, j.residual, noise) for t, j in zip(data.train, shown.fit.jets)], shown.fit, after_tests),
+            "after": _tests(data.train, left, shown.fit, after_tests),
         },
         "power": _power(last),
         "excluded": [_excluded(data.train[i].scene.recording, data) for i in heads_of(data.train)],

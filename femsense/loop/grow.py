@@ -20,7 +20,7 @@ from femsense.loop.noise import Noise
 from femsense.loop.place import POLISHED, Climbs, climbed, closer, placed
 from femsense.loop.predict import sweeps_predicted
 from femsense.loop.refit import EVIDENCE, FORGONE, beyond, evidence, explains, refit, tried, with_term, within, worth_of
-from femsense.loop.screen import NUISANCE, Candidate, linear_gain, penalty
+from femsense.loop.screen import NUISANCE, Candidate, joined, linear_gain, penalty
 from femsense.loop.stages import (
     QUADRATIC,
     Stage,
@@ -217,6 +217,7 @@ def polished(data: Data, stage: Stage, refitted: Refit, noise: Noise, say: Progr
 
 def _enriched(data: Data, stage: Stage, winner: Refit, table: list[Candidate], noise: Noise, say: Progress) -> Refit:
     """Return the winner in a form with more parameters where that has EVIDENCE over the simple one."""
+    winner = _with_more_parts(data, stage, winner, table, noise, say)
     for form in _forms(table, winner.candidate.effect.name):
         if len(form.parameters) <= len(winner.candidate.parameters):
             continue
@@ -231,6 +232,28 @@ def _enriched(data: Data, stage: Stage, winner: Refit, table: list[Candidate], n
         if rich.record["verdict"] == "passes" and more > EVIDENCE:
             winner.record.update(rich.record | {"seed": form.seed})
             winner = replace(rich, record=winner.record)
+    return winner
+
+
+def _with_more_parts(data: Data, stage: Stage, winner: Refit, table: list[Candidate], noise: Noise, say: Progress) -> Refit:
+    """Return the winner with the offsets of further markers, one after the other, as long as each has EVIDENCE: all of them at once cost too much."""
+    while winner.candidate.effect.name == "marker_offset":
+        taken = set(winner.candidate.parameters)
+        others = [c for c in table if c.effect is winner.candidate.effect and not taken & set(c.parameters)]
+        problem = problem_of(data, winner.stage.fit, noise)
+        gains = [linear_gain(winner.stage.fit, problem, c.raw, c.seats) - c.cost for c in others]
+        if max(gains, default=-np.inf) < EVIDENCE:
+            break
+        form = joined(winner.candidate, others[int(np.argmax(gains))])
+        say(f"trying {form.effect.name} with {len(form.parameters)} parameters")
+        made = _richer(data, stage, winner, form, noise)
+        if made is None:
+            break
+        more = judged(data, stage, form, made, dict(winner.record), noise)
+        if more.record["verdict"] != "passes" or evidence(winner.stage.fit, made.fit) <= form.cost - winner.candidate.cost + EVIDENCE:
+            break
+        winner.record.update(more.record)
+        winner = replace(more, record=winner.record)
     return winner
 
 

@@ -30,6 +30,7 @@ from femsense.loop.noise import Noise
 from femsense.loop.refit import EVIDENCE, evidence
 from femsense.loop.result import LoopResult
 from femsense.loop.screen import Candidate, Fields
+from femsense.loop.seats import with_turning_seats
 from femsense.loop.stages import (
     Stage,
     fields_of,
@@ -131,7 +132,7 @@ def _calibrated(data: Data, names: Sequence[str], say: Progress, finer_is_made: 
     except FemsenseError:
         plain = base
     finer_is_made()
-    return with_mesh_errors(data, plain, names), before, base
+    return with_turning_seats(with_mesh_errors(data, plain, names), base), before, base
 
 
 def _as_far_as_held_out_states_rest(fit: Callable[[int], Stage], steps: int) -> Stage:
@@ -192,8 +193,7 @@ def _search(data: Data, before: Stage, base: Stage, names: list[str], most: int,
         anew = moved_by(stage, winner) > mesh_cost(data, stage, whole=True) and not errs_alike(stage, winner)
         stage = prune(data, winner, noise, n_effective, say)
         history.append((name, stage))
-        if anew:
-            data = with_mesh_errors(data, stage, names)
+        data = with_turning_seats(with_mesh_errors(data, stage, names) if anew else data, stage)
         found_so = history
         history, refits = exchanged(data, history, refits, noise, n_effective, say)
         if history is not found_so:

@@ -1,8 +1,9 @@
 """The noise of marker residuals: what is common to a marker, a frame, a sweep and a repeated state, and what is left.
 
-    Σ = s² I + h² [same marker in the same state] + m² [same marker] + f² [same frame] + r² [same sweep]
+    Σ = s² I + h² [same marker in the same state] + f² [same frame] + r² [same sweep] + m² [same marker] Gᵢ Gⱼᵀ
 
-for each axis alike. Rows of a cloud are one number each, along the measured normal nᵢ at the point Xᵢ of the body at rest, where the
+for each axis alike, but for the last term: a marker that is glued elsewhere than declared turns with the body, Gᵢ being what a shift of its place at
+rest moves it by (`Groups.turns`). Rows of a cloud are one number each, along the measured normal nᵢ at the point Xᵢ of the body at rest, where the
 body's own is Nᵢ. What is common to two of them shows in both as far as their normals agree: errors of the camera those in space, errors
 of the body those of the body, which turn with it. Errors of neighbouring points of the body are alike:
 
@@ -29,6 +30,8 @@ from femsense.arrays import BoolArray, FloatArray, IntArray
 from femsense.parallel import each
 
 COMPONENTS = ("white", "state", "marker", "frame", "sweep")
+ROUNDING = 1e-12
+"""Directions of fields with less of the largest square are rounding."""
 FLOOR = 2e-6
 """No camera's markers are better than this [m]."""
 CLOUD_START = 5e-4
@@ -46,6 +49,18 @@ class Groups:
     """Marker within a state (same inputs and loads)."""
     surface: Surface | None = None
     """Where the rows lie if they are points of a surface; None: they are markers, three axes each."""
+    turns: FloatArray | None = None
+    """By how much a marker moves if its place on the body at rest does, shape (k, 3, 3), by the axes of that place last; None: as if it did not turn."""
+
+    @property
+    def seats(self) -> FloatArray | None:
+        """The fields of markers that sit elsewhere by a unit, shape (k, 3, 3 markers); None: not known."""
+        if self.turns is None:
+            return None
+        count = int(self.marker.max(initial=-1)) + 1
+        fields = np.zeros((len(self.marker), 3, count, 3))
+        fields[np.arange(len(self.marker)), :, self.marker] = self.turns
+        return fields.reshape(len(self.marker), 3, 3 * count)
 
     def shared(self, name: str) -> FloatArray:
         """Return how much of a component each two rows have in common, shape (k, k)."""
@@ -61,7 +76,8 @@ class Groups:
         marker, frame, sweep, state = (
             np.unique(labels[rows], return_inverse=True)[1] for labels in (self.marker, self.frame, self.sweep, self.state)
         )
-        return Groups(marker, frame, sweep, state, None if self.surface is None else self.surface.of_rows(rows))
+        surface = None if self.surface is None else self.surface.of_rows(rows)
+        return Groups(marker, frame, sweep, state, surface, None if self.turns is None else self.turns[rows])
 
     @property
     def observations(self) -> int:
@@ -146,25 +162,30 @@ class Noise:
         return float(np.sqrt(sum(v**2 for v in self.components(groups).values())))
 
     def covariance(self, groups: Groups) -> FloatArray:
-        """Return the covariance of the rows of one axis [m²], shape (k, k)."""
+        """Return the covariance of the rows of one axis [m²], shape (k, k), but for seats that turn."""
         std = self.components(groups)
         sigma = np.eye(len(groups.marker)) * std["white"] ** 2
         for name in COMPONENTS[1:]:
-            if std.get(name, 0.0) > 0:
+            if std.get(name, 0.0) > 0 and not (name == "marker" and groups.turns is not None):
                 sigma += std[name] ** 2 * groups.shared(name)
         return sigma
+
+    def seats(self, groups: Groups) -> FloatArray:
+        """Return the fields of markers that sit elsewhere [m], each of one standard deviation, shape (k, c, b); none where they do not turn."""
+        fields = groups.seats
+        none = np.zeros((len(groups.marker), 3 if groups.surface is None else 1, 0))
+        return none if fields is None or not self.std.get("marker", 0.0) else self.std["marker"] * fields
+
+    def plain_whitener(self, groups: Groups) -> Whitener:
+        """Return what whitens rows with these groups, but for seats that turn."""
+        return Whitener(_lower(self, groups), np.zeros((0, 0)), np.zeros(0))
 
     def whitener(self, groups: Groups, error: FloatArray | None = None) -> Whitener:
         """Return what whitens rows with these groups.
 
-        `error` (k, c, b) are fields [m] that the residual may hold by chance, each with a standard deviation of once its size.
+        `error` (k, c, b) are fields [m] that the residual may hold by chance besides, each with a standard deviation of once its size.
         """
-        lower = _lower(self, groups)
-        plain = Whitener(lower, np.zeros((0, 0)), np.zeros(0))
-        if error is None:
-            return plain
-        directions, size, _ = np.linalg.svd(whiten(plain, error), full_matrices=False)
-        return Whitener(lower, directions, 1.0 - 1.0 / np.sqrt(1.0 + size**2))
+        return _whitener(self, groups, _Same(error))
 
     @property
     def total(self) -> float:
@@ -185,6 +206,33 @@ def _lower(noise: Noise, groups: Groups) -> FloatArray:
     lower = np.asarray(cholesky(noise.covariance(groups), lower=True))
     lower.flags.writeable = False
     return lower
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Same:
+    """An array that a cache knows again by being the same one."""
+
+    array: FloatArray | None
+
+    def __hash__(self) -> int:
+        return id(self.array)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Same) and self.array is other.array
+
+
+@lru_cache(maxsize=8)
+def _whitener(noise: Noise, groups: Groups, error: _Same) -> Whitener:
+    """Return what `Noise.whitener` is after; fit after fit asks for the same one."""
+    plain, seats = noise.plain_whitener(groups), noise.seats(groups)
+    fields = seats if error.array is None else np.concatenate([error.array, seats], axis=2)
+    if not fields.shape[2]:
+        return plain
+    whole = whiten(plain, fields)
+    square, turn = np.linalg.eigh(whole.T @ whole)
+    seen = square > ROUNDING * square[-1]
+    size = np.sqrt(square[seen])
+    return Whitener(plain.lower, whole @ (turn[:, seen] / size), 1.0 - 1.0 / np.sqrt(1.0 + size**2))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -266,7 +314,9 @@ class _Likelihood:
     """Minus the restricted log-likelihood of log standard deviations, with its gradient.
 
     2 L = log|V| + log|XᵀV⁻¹X| + rᵀPr,  ∂(2 L)/∂v_i = tr(P V_i) − rᵀP V_i P r,  P = V⁻¹ − V⁻¹X(XᵀV⁻¹X)⁻¹XᵀV⁻¹,  V = Σ v_i V_i, the
-    same for each axis and block-diagonal over recordings.
+    same for each axis and block-diagonal over recordings. Seats that turn are random effects u beside the fixed ones (Henderson 1975): with
+    X extended by their fields and 1/m² added to their part of the normal matrix N, all of this holds as it stands, but for n log m², and
+    ∂(2 L)/∂m² = n/m² − (tr N⁻¹ᵤᵤ + |û|²)/m⁴.
     """
 
     def __init__(
@@ -277,23 +327,33 @@ class _Likelihood:
         groups: list[Groups],
         near: FloatArray | None = None,
     ) -> None:
-        self.names, self.residuals, self.basis, self.near = names, residuals, basis, near
-        self.parts = [[g.shared(name) for name in names] for g in groups]
+        self.names, self.residuals, self.near = names, residuals, near
+        seats = [np.zeros((*r.shape, 0)) if g.seats is None else g.seats for g, r in zip(groups, residuals)]
+        self.fixed = basis[0].shape[2]
+        self.basis = [np.concatenate([X, block], axis=2) for X, block in zip(basis, _beside_each_other(seats))]
+        self.seat = names.index("marker") if "marker" in names and self.basis[0].shape[2] > self.fixed else None
+        self.parts = [
+            [None if i == self.seat and g.turns is not None else g.shared(name) for i, name in enumerate(names)] for g in groups
+        ]
 
     def __call__(self, log_std: FloatArray) -> tuple[float, FloatArray]:
         variance = np.exp(2.0 * log_std)
-        p = self.basis[0].shape[2]
+        p, fixed, seat = self.basis[0].shape[2], self.fixed, self.seat
         normal, right, log_det, own = np.zeros((p, p)), np.zeros(p), 0.0, 0.0
         pieces = []
         for r, X, parts in zip(self.residuals, self.basis, self.parts):
-            inverse, log_size = _inverse(sum(v * part for v, part in zip(variance, parts)))
+            inverse, log_size = _inverse(sum(v * part for v, part in zip(variance, parts) if part is not None))
             ViX, Vir = np.einsum("kl,lcp->kcp", inverse, X, optimize=True), inverse @ r
             normal += np.einsum("kcp,kcq->pq", X, ViX, optimize=True)
             right += np.einsum("kcp,kc->p", X, Vir)
             log_det += r.shape[1] * log_size
             own += float((r * Vir).sum())
             pieces.append((inverse, ViX, Vir, parts))
-        factor = cholesky(normal + 1e-12 * np.trace(normal) / max(p, 1) * np.eye(p), lower=True)
+        normal += 1e-12 * np.trace(normal) / max(p, 1) * np.eye(p)
+        if seat is not None:
+            normal[fixed:, fixed:] += np.eye(p - fixed) / variance[seat]
+            log_det += (p - fixed) * float(np.log(variance[seat]))
+        factor = cholesky(normal, lower=True)
         fitted = cho_solve((factor, True), right)
         value = log_det + 2.0 * float(np.log(np.diag(factor)).sum()) + own - float(right @ fitted)
         gradient = np.zeros(len(variance))
@@ -303,12 +363,22 @@ class _Likelihood:
             inner = np.einsum("kcp,lcp->kl", ViX, half, optimize=True)
             outer = np.einsum("kc,lc->kl", Pr, Pr)
             kernel = Pr.shape[1] * inverse - inner - outer
-            gradient += [float((kernel * part).sum()) for part in parts]
+            gradient += [0.0 if part is None else float((kernel * part).sum()) for part in parts]
+        if seat is not None:
+            of_seats = cho_solve((factor, True), np.eye(p)[:, fixed:])[fixed:]
+            left = float(np.trace(of_seats) + fitted[fixed:] @ fitted[fixed:]) / variance[seat]
+            gradient[seat] += (p - fixed - left) / variance[seat]
         gradient = np.asarray(gradient * variance)
         if self.near is None:
             return 0.5 * value, gradient
         off = (log_std - self.near) / NEAR_STD
         return 0.5 * value + 0.5 * float(off @ off), gradient + off / NEAR_STD
+
+
+def _beside_each_other(blocks: list[FloatArray]) -> list[FloatArray]:
+    """Return columns (k, c, q) of several recordings, each with columns of its own and zeros in those of the others."""
+    ends = np.cumsum([0, *(b.shape[2] for b in blocks)])
+    return [np.pad(b, ((0, 0), (0, 0), (a, ends[-1] - a - b.shape[2]))) for b, a in zip(blocks, ends)]
 
 
 def _inverse(matrix: FloatArray) -> tuple[FloatArray, float]:

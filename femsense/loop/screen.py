@@ -57,6 +57,24 @@ class Candidate:
     """Size of each parameter (in its coordinate) that would just have been seen, shape (q,)."""
 
 
+def joined(a: Candidate, b: Candidate) -> Candidate:
+    """Return two parts of an effect as one candidate, scored as if they did not know of each other."""
+    return replace(
+        a,
+        parameters=(*a.parameters, *b.parameters),
+        raw=[np.concatenate(pair, axis=2) for pair in zip(a.raw, b.raw)],
+        seats=[np.concatenate(pair, axis=2) for pair in zip(a.seats, b.seats)],
+        columns=np.hstack([a.columns, b.columns]),
+        response=np.hstack([a.response, b.response]),
+        retained=min(a.retained, b.retained),
+        step=np.concatenate([a.step, b.step]),
+        gain=a.gain + b.gain,
+        score=a.score + b.score,
+        cost=a.cost + b.cost,
+        smallest=np.concatenate([a.smallest, b.smallest]),
+    )
+
+
 def penalty(count: int, seed: Entry, alone: int, effects: int, n_effective: float) -> float:
     """Return what a candidate's freedom costs: (q + s) log n + 2 log (m a).
 

@@ -27,6 +27,8 @@ QUADRATIC: Entry = {"element": "tet10"}
 """The seed of quadratic elements, which growth asks first where the mesh is linear."""
 ROUGHLY = 3
 """Steps of a fit that only has to come near."""
+APART = 3.0
+"""A marker stands apart that sits elsewhere by so many times the median of all: of seats that scatter alike one in ten thousand does."""
 STILL = 1e-3
 """Freedom of a size that is held still, as a share of its standard deviation."""
 
@@ -294,7 +296,7 @@ def problem_of(data: Data, fit: JointFit, noise: Noise) -> JointProblem:
 def noise_of(data: Data, stage: Stage, fields: Fields, before: Noise | None = None) -> tuple[Noise, float]:
     """Estimate the noise from what the richest linear model leaves; return it with the effective number of observations."""
     table = screen(stage.fit, problem_of(data, stage.fit, Noise({"white": 5e-4}, "")), fields, 100.0)
-    own = stage.fit.own
+    apart, own = _apart(table), stage.fit.own
     errors = [t.error_by_sweep for t in data.train]
     widest = max(0 if e is None else e.shape[2] for e in errors)
     columns, extra = [], []
@@ -305,7 +307,7 @@ def noise_of(data: Data, stage: Stage, fields: Fields, before: Noise | None = No
         if error is not None:
             block[:, :, own : own + error.shape[2]] = error
         columns.append(np.concatenate([block, jet.by_effect], axis=2))
-        others = [c.raw[i] for c in one_each(table) if c.effect.name != "marker_offset"]
+        others = [c.raw[i] for c in (*apart, *(c for c in one_each(table) if c.effect.name != "marker_offset"))]
         extra.append(np.concatenate([np.zeros((*shape, 0)), *others], axis=2))
     groups = [t.groups for t in data.train]
     noise = Noise({}, "")
@@ -322,6 +324,17 @@ def noise_of(data: Data, stage: Stage, fields: Fields, before: Noise | None = No
             )
             noise = noise.joined(estimate_noise(*picked, known), clouds)
     return noise, float(sum(g.observations for g in groups))
+
+
+def _apart(table: list[Candidate]) -> list[Candidate]:
+    """Return the offsets of single markers that are much larger than most: one that sits elsewhere does not tell how well the others sit."""
+    alone = [c for c in table if c.effect.name == "marker_offset" and len({_marker(p) for p in c.parameters}) == 1]
+    size = np.array([np.linalg.norm(c.step) for c in alone])
+    return [c for c, s in zip(alone, size) if s > APART * np.median(size)]
+
+
+def _marker(parameter: Parameter) -> str | None:
+    return parameter.part[0] if isinstance(parameter.part, tuple) else None
 
 
 def screen_stage(data: Data, fit: JointFit, noise: Noise, fields: Fields, n_effective: float) -> list[Candidate]:

@@ -113,14 +113,16 @@ def _largest(fields: list[tuple[FloatArray, IntArray]], rng: np.random.Generator
     return singular, apart
 
 
-def without_mesh_error(trial: Trial, residual: FloatArray, noise: Noise) -> FloatArray:
-    """Return the residual [m], (k, c), less what of it is likeliest to be the mesh's own error."""
-    if trial.mesh_error is None:
-        return residual
-    plain = noise.whitener(trial.groups)
-    G, r = whiten(plain, trial.mesh_error), whiten(plain, residual)
+def without_mesh_error(trial: Trial, residual: FloatArray, noise: Noise, *, nor_seats: bool = False) -> FloatArray:
+    """Return the residual [m], (k, c), less what of it is likeliest to be the mesh's own error; `nor_seats`: nor that of seats that turn."""
+    seats = noise.seats(trial.groups)
+    mesh = np.zeros((*residual.shape, 0)) if trial.mesh_error is None else trial.mesh_error
+    fields = np.concatenate([mesh, seats], axis=2)
+    plain = noise.plain_whitener(trial.groups)
+    G, r = whiten(plain, fields), whiten(plain, residual)
     share = np.linalg.solve(np.eye(G.shape[1]) + G.T @ G, G.T @ r)
-    return np.asarray(residual - trial.mesh_error @ share)
+    count = fields.shape[2] if nor_seats else mesh.shape[2]
+    return np.asarray(residual - fields[:, :, :count] @ share[:count])
 
 
 def beyond_mesh(trials: list[Trial], residuals: list[FloatArray], noise: Noise) -> float:
