@@ -135,9 +135,8 @@ def make(hidden: str, folder: Path) -> None:
         pressures=freeze(np.zeros((F, 0))), gravity=None, load_frame=freeze(loaded, np.int64), load_points=freeze(np.tile([0.117, 0.0, 0.012], (len(loaded), 1))),
         load_forces=freeze(np.tile([0.0, 0.0, -0.08], (len(loaded), 1))), contacts=(),
     )  # fmt: skip
-    frames = walk_truth(true, plan, substeps=2)
-    markers = np.array([true.markers.positions(f.state.positions) for f in frames])
-    recording = _measure(case, declared, true, plan, recorded, markers, np.random.default_rng(7))[0]
+    states = [f.state for f in walk_truth(true, plan, substeps=2)]
+    recording = _measure(case, declared, true, plan, recorded, states, np.random.default_rng(7))[0]
     for kind in ("tet10", "tet4"):
         save_robot(declared, folder / f"robot-{kind}")
         file = folder / f"robot-{kind}" / "robot.toml"

@@ -16,6 +16,7 @@ import numpy as np
 from femsense.arrays import FloatArray, freeze
 from femsense.effects import apply_effects
 from femsense.fem.body import make_body, tie_cable
+from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.mesh import TetMesh, embed_points, to_quadratic
 from femsense.frames import Recording, RestMarkers, make_recording
 from femsense.model import Observation, Robot, plain_actuation, spread_features
@@ -285,10 +286,15 @@ def make_data(case: Case, seed: int) -> Made:
     if case.outside == "draught":
         true = replace(true, body=true.body.with_gravity(true.body.gravity + 1.2 * case.size * np.array([0.3, 1.0, 0.2])))
         plan = replace(plan, gravity=freeze(_gusts(declared, true, labels)))
-    frames = walk_truth(true, plan, substeps=2)
-    markers = np.array([true.markers.positions(f.state.positions) for f in frames])
-    recording, T, noise = _measure(case, declared, true, plan, recorded, markers, rng)
-    return Made(case, declared, recording, markers, T, scale, noise)
+    states = [f.state for f in walk_truth(true, plan, substeps=2)]
+    recording, T, noise = _measure(case, declared, true, plan, recorded, states, rng)
+    return Made(case, declared, recording, _seen(true, states), T, scale, noise)
+
+
+def _seen(true: Robot, states: Sequence[Equilibrium], seat: FloatArray | None = None) -> FloatArray:
+    """Return the true markers [m], shape (F, k, 3), that sit elsewhere on the body at rest by `seat` (k, 3): their error turns with the body."""
+    ties = true.markers if seat is None else true.tie_markers(true.marker_points + seat)
+    return np.array([ties.positions(s.positions) for s in states])
 
 
 def _on_fine_clamp(entry: dict[str, Any], declared: Robot, true: Robot) -> dict[str, Any]:
@@ -361,14 +367,20 @@ def _gusts(declared: Robot, true: Robot, labels: list[str]) -> FloatArray:
 
 
 def _measure(
-    case: Case, declared: Robot, true: Robot, plan: Plan, recorded: FloatArray, markers: FloatArray, rng: np.random.Generator
+    case: Case,
+    declared: Robot,
+    true: Robot,
+    plan: Plan,
+    recorded: FloatArray,
+    states: Sequence[Equilibrium],
+    rng: np.random.Generator,
 ) -> tuple[Recording, FloatArray, dict[str, float]]:
     noise = {"white": case.white_m, "marker": 2e-4, "frame": 0.5 * case.white_m, "sweep": 0.5 * case.white_m}
     T = make_pose(rotation_from_vector([2.3, 0.2, 0.1] + 0.1 * rng.normal(size=3)), [0.05, 0.24, 0.3] + 0.01 * rng.normal(size=3))
-    F, k, _ = markers.shape
+    F, k = len(states), len(true.marker_points)
     sweep = np.unique(plan.sweep, return_inverse=True)[1]
-    seat = noise["marker"] * rng.normal(size=(1, k, 3))
-    shown = markers + seat
+    seat = noise["marker"] * rng.normal(size=(k, 3))
+    shown = _seen(true, states, seat)
     if case.outside == "slipped_marker":
         shown[F // 2 :, -2] += 1.5e-3 * case.size * np.array([0.6, 0.6, 0.5])
     if case.outside == "camera_drift":
@@ -377,7 +389,7 @@ def _measure(
     seen = _through(T, shown.reshape(-1, 3), true.observation) + case.white_m * rng.normal(size=(F * k, 3))
     rest = None
     if case.seats:
-        points = _through(T, true.marker_points + seat[0], true.observation) + case.white_m * rng.normal(size=(k, 3))
+        points = _through(T, true.marker_points + seat, true.observation) + case.white_m * rng.normal(size=(k, 3))
         rest = RestMarkers(true.marker_names, freeze(points), freeze(np.full(k, case.white_m)), freeze(np.zeros(k), np.int64))
     recording = make_recording(
         time_s=plan.time_s, actuation=case.control, cable_names=declared.body.cable_names, inputs=recorded, sweep=list(plan.sweep), free=np.ones(F, bool),

@@ -357,7 +357,9 @@ def weight_slopes(mesh: TetMesh, ties: Embedding, points: FloatArray) -> FloatAr
     """Return how the weights of tied points change with their places at rest [1/m], shape (p, k, 3), each in the element that carries it."""
     corners = mesh.nodes[mesh.tets[ties.element, :4]]
     slopes = shape_slopes(closest_in_tet(corners, points), quadratic=mesh.is_quadratic)
-    by_place = np.linalg.inv(corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1)  # of the last three barycentric coordinates, which add to one with the first
+    by_place = np.linalg.inv(corners[:, 1:] - corners[:, :1]).transpose(
+        0, 2, 1
+    )  # of the last three barycentric coordinates, which add to one with the first
     by_place = np.concatenate([-by_place.sum(axis=1, keepdims=True), by_place], axis=1)
     return np.asarray(slopes @ by_place)
 

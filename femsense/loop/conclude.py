@@ -440,7 +440,7 @@ def _confounded(search: Search, names: list[str]) -> list[dict[str, Any]]:
         pairs += [
             {"pair": pair, "dbic_gap": abs(search.in_place.ahead)} for pair in [["cable_offset", other]] if set(pair) & set(names)
         ]
-    if "cable_offset" in names and any(c.effect.name == "cable_slack" for c in first):
+    if {"cable_offset", "cable_slack"} & set(names) and any(c.effect.name == "cable_slack" for c in first):
         pairs.append({"pair": ["cable_offset", "cable_slack"], "cosine": 1.0})  # play is a negative zero of the displacement
     ones = one_each(first)
     for i, a in enumerate(ones):

@@ -56,7 +56,8 @@ def gather(
     old, new = views_of(data, before), views_of(data, back)
     score, pattern = _pattern(data, old, new)
     cleaned, left = (
-        [without_mesh_error(t, j.residual, noise, nor_seats=True) for t, j in zip(data.train, s.fit.jets)] for s in (before, shown)
+        [without_mesh_error(t, j.residual, noise, nor_seats=True) for t, j in zip(data.train, s.fit.jets)]
+        for s in (before, shown)
     )
     found: dict[str, Any] = _rounded({
         "frames": _frame_table(data, old, new, score),

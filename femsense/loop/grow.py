@@ -250,7 +250,10 @@ def _with_more_parts(data: Data, stage: Stage, winner: Refit, table: list[Candid
         if made is None:
             break
         more = judged(data, stage, form, made, dict(winner.record), noise)
-        if more.record["verdict"] != "passes" or evidence(winner.stage.fit, made.fit) <= form.cost - winner.candidate.cost + EVIDENCE:
+        if (
+            more.record["verdict"] != "passes"
+            or evidence(winner.stage.fit, made.fit) <= form.cost - winner.candidate.cost + EVIDENCE
+        ):
             break
         winner.record.update(more.record)
         winner = replace(more, record=winner.record)

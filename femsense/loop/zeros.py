@@ -98,7 +98,10 @@ def zeros_are_evident(data: Data, stage: Stage, noise: Noise, n_effective: float
 def in_place_of_zeros(
     data: Data, stage: Stage, names: Sequence[str], noise: Noise, n_effective: float, say: Progress
 ) -> InPlace | None:
-    """Ask which effect explains what the zeros of a model explain; None where they explain nothing."""
+    """Ask which effect explains what the zeros of a model explain; None where they explain nothing.
+
+    Play of held cables does what zeros below those declared do. Of the two it is named where no zero is above: zeros err both ways.
+    """
     without = zeros_are_evident(data, stage, noise, n_effective)
     if without is None:
         return None
@@ -125,6 +128,9 @@ def in_place_of_zeros(
     ahead = best.score - worth
     predicts = best.record["cv_gain"] - sweeps_predicted(data.train, without.fit, stage.fit)[0]
     takes = ahead > BETTER or (ahead > -EVIDENCE and ahead + predicts > BETTER)  # where evidence is close, what predicts better
+    takes = takes or (
+        best.candidate.effect.name == "cable_slack" and best.stage.fit.chi2 < stage.fit.chi2 + EVIDENCE
+    )  # its mirror image
     if takes:
         best.record["verdict"] = "named"
     return InPlace(best.stage if takes else None, best.candidate.effect.name, ahead, records)
