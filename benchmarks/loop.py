@@ -99,8 +99,8 @@ def detection_index(made: Made, hidden: dict[str, Any]) -> dict[str, float]:
     turns = [np.cross(axis, x) for axis in np.eye(3)]
     noise = Noise(made.noise, "")
     sweep = np.unique(made.recording.sweep, return_inverse=True)[1]
-    turns = _walked(scaled, made, lambda r, e: seat_turns(r, r.marker_points, e.positions).reshape(-1, 3)).reshape(-1, 3, 3)
-    groups = Groups(np.tile(np.arange(k), F), np.repeat(np.arange(F), k), np.repeat(sweep, k), np.arange(F * k), turns=turns)
+    seats = _walked(scaled, made, lambda r, e: seat_turns(r, r.marker_points, e.positions).reshape(-1, 3)).reshape(-1, 3, 3)
+    groups = Groups(np.tile(np.arange(k), F), np.repeat(np.arange(F), k), np.repeat(sweep, k), np.arange(F * k), turns=seats)
     W = noise.whitener(groups)
     Z = np.stack([whiten(W, np.asarray(f).reshape(-1, 3)) for f in (*fields, *shifts, *turns)], axis=1)
     s = whiten(W, field.reshape(-1, 3))

@@ -20,7 +20,7 @@ from femsense.report.compare import load_error
 from femsense.report.documents import KnownLoad
 from femsense.report.drawing import VIEWS, best_view, nice, skin
 from femsense.report.loop import recovered
-from femsense.report.loop_tables import size_words
+from femsense.report.loop_tables import smallest_words
 
 MARKERS = {"tip": [0.1, 0.015, 0.03], "middle": [0.05, 0.015, 0.03], "stalk": [0.1, 0.015, 0.05]}
 SENTENCE = "The model lacks gravity (vector_m_s2 [0.1, 0.02, -9.7] m/s²); held-out error 2.04 mm before, 0.17 mm after."
@@ -56,11 +56,11 @@ def loop_document(**overrides: Any) -> dict[str, Any]:
         "next_experiment": "turn the base by 90° between frames, camera fixed",
         "not_testable": [{"name": "poisson", "absorbed_share": 0.97, "retained_share": 0.24}],
         "detectable": {
-            "poisson": {"smallest": {"poisson_ratio": 0.031}, "coordinate": "linear", "unit": "1"},
-            "soft_region": {"smallest": {"scale": 0.2}, "coordinate": "log", "unit": "1"},
-            "cable_stretch": {"smallest": {"stiffness_n_m": 1e-4}, "coordinate": "reciprocal", "unit": "N/m"},
-            "marker_offset": {"smallest": {f"offset_m[{name}][{i}]": 1e-4 * (i + 1) for name in MARKERS for i in range(3)}, "coordinate": "linear", "unit": "m"},
-            "base_compliance": {"smallest": {"stiffness_n_m": None}, "coordinate": "reciprocal", "unit": "N/m"},
+            "poisson": {"smallest": {"poisson_ratio": 0.031}, "kind": "change", "unit": "1"},
+            "soft_region": {"smallest": {"scale": 1.2214}, "kind": "factor", "unit": "1"},
+            "cable_stretch": {"smallest": {"stiffness_n_m": 1e4}, "kind": "softer_than", "unit": "N/m"},
+            "marker_offset": {"smallest": {f"offset_m[{name}][{i}]": 1e-4 * (i + 1) for name in MARKERS for i in range(3)}, "kind": "change", "unit": "m"},
+            "base_compliance": {"smallest": {"stiffness_n_m": None}, "kind": "softer_than", "unit": "N/m"},
         },
         "left": {
             "rms_m": 1.7e-4, "marker_rms_m": {"tip": 2.1e-4, "middle": 1.2e-4, "stalk": None},
@@ -638,11 +638,11 @@ def test_what_was_recovered_counts_squares_above_the_noise() -> None:
 
 
 @pytest.mark.parametrize(
-    ("size", "coordinate", "unit", "text"),
-    [(0.1, "log", "1", "a change of 11 %"), (1.0, "log", "1", "a factor of 2.7"), (1e-3, "reciprocal", "N/m", "softer than 1000 N/m"), (2e-3, "linear", "m", "2.0 mm"), (None, "linear", "m", "cannot be seen")],
+    ("size", "kind", "unit", "text"),
+    [(1.11, "factor", "1", "a change of 11 %"), (2.7, "factor", "1", "a factor of 2.7"), (1e3, "softer_than", "N/m", "softer than 1000 N/m"), (2e-3, "change", "m", "2.0 mm"), (None, "change", "m", "cannot be seen")],
 )  # fmt: skip
-def test_smallest_sizes_in_words(size: float | None, coordinate: str, unit: str, text: str) -> None:
-    assert size_words(size, coordinate, unit).replace("\u00a0", " ") == text
+def test_smallest_sizes_in_words(size: float | None, kind: str, unit: str, text: str) -> None:
+    assert smallest_words(size, kind, unit).replace("\u00a0", " ") == text
 
 
 def test_the_error_at_known_loads_is_the_median_of_its_size() -> None:

@@ -13,7 +13,7 @@ from femsense.effects import Entry, apply_effects
 from femsense.errors import FemsenseError
 from femsense.loop.advice import next_element
 from femsense.loop.data import Data
-from femsense.loop.evidence import gather
+from femsense.loop.evidence import KINDS, gather, own_size
 from femsense.loop.grow import at_edge
 from femsense.loop.joint import Trial, heads_of, normal_rms_of, rms_of, vectors_of
 from femsense.loop.mesh_error import few_states, mesh_errors
@@ -458,6 +458,7 @@ def _step_of(search: Search, name: str) -> int:
 
 
 def _detectable(table: list[Candidate], found: set[str]) -> dict[str, Any]:
+    """Return for each effect that was not found the smallest size that would have been seen, in the unit of its parameter."""
     result: dict[str, Any] = {}
     for c in one_each(table):
         if c.effect.name in found:
@@ -466,8 +467,8 @@ def _detectable(table: list[Candidate], found: set[str]) -> dict[str, Any]:
             seen = c.smallest[0] < 1.0 if len(c.smallest) else False
             result[c.effect.name] = {"smallest": {}, "would_be_seen": bool(seen), "share_seen": float(c.smallest[0])}
             continue
-        sizes = {p.label: float(s) if np.isfinite(s) else None for p, s in zip(c.parameters, c.smallest)}
-        result[c.effect.name] = {"smallest": sizes, "coordinate": c.parameters[0].scale, "unit": c.parameters[0].unit}
+        sizes = {p.label: own_size(float(s), p.scale) for p, s in zip(c.parameters, c.smallest)}
+        result[c.effect.name] = {"smallest": sizes, "kind": KINDS[c.parameters[0].scale], "unit": c.parameters[0].unit}
     return result
 
 

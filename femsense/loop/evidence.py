@@ -302,25 +302,26 @@ def _confounding(first: list[Candidate]) -> dict[str, Any]:
 
 
 def _power(last: list[Candidate]) -> dict[str, list[dict[str, Any]]]:
-    """Return the smallest change of each parameter of each effect that would have been seen, in its own unit.
-
-    Multiplicative coordinates become a factor, reciprocal ones the softest stiffness that would not have been seen.
-    """
+    """Return the smallest change of each parameter of each effect that would have been seen, in its own unit."""
     result: dict[str, list[dict[str, Any]]] = {}
     for c in one_each(last):
         if c.effect.discrete:
             whole = float(c.smallest[0]) if len(c.smallest) else None
             result[c.effect.name] = [{"label": "", "kind": "whole", "size": whole, "unit": "1"}]
             continue
-        kinds = {"log": "factor", "reciprocal": "softer_than"}
         result[c.effect.name] = [
-            {"label": p.label, "kind": kinds.get(p.scale, "change"), "size": _own_unit(float(size), p.scale), "unit": p.unit}
+            {"label": p.label, "kind": KINDS[p.scale], "size": own_size(float(size), p.scale), "unit": p.unit}
             for p, size in zip(c.parameters, c.smallest)
         ]
     return result
 
 
-def _own_unit(size: float, scale: str) -> float | None:
+KINDS = {"linear": "change", "log": "factor", "reciprocal": "softer_than"}
+"""What the size of a parameter is, by how its coordinate gives its value."""
+
+
+def own_size(size: float, scale: str) -> float | None:
+    """Return a size in a coordinate as a change of the value, a factor on it, or the stiffness below which it is; None where it cannot be seen."""
     if not np.isfinite(size) or size <= 0:
         return None
     if scale == "log":
@@ -459,4 +460,4 @@ def _excluded(recording: Recording, data: Data) -> dict[str, list[int]]:
     return reasons
 
 
-__all__ = ["gather", "lack_of_fit"]
+__all__ = ["KINDS", "gather", "lack_of_fit", "own_size"]

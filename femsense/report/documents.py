@@ -81,7 +81,7 @@ class Untestable(Document):
 
 class Detectable(Document):
     smallest: dict[str, Number] = Field(default_factory=dict)
-    coordinate: str = "linear"
+    kind: str = "change"
     unit: str = "1"
 
 

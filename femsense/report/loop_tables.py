@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -195,7 +194,7 @@ def power_table(detectable: Mapping[str, Detectable], power: Mapping[str, Sequen
 
 def _sizes(own: Sequence[Size], entry: Detectable) -> Html:
     lines = [(s.label, smallest_words(s.size, s.kind, s.unit)) for s in own]
-    lines = lines or [(label, size_words(value, entry.coordinate, entry.unit)) for label, value in entry.smallest.items()]
+    lines = lines or [(label, smallest_words(value, entry.kind, entry.unit)) for label, value in entry.smallest.items()]
     if len(lines) <= LISTED:
         return together(*(element("div", code(label) if label else "", f" {text}" if label else text) for label, text in lines))
     if own:
@@ -203,7 +202,7 @@ def _sizes(own: Sequence[Size], entry: Detectable) -> Html:
         ends = [smallest_words(s.size, s.kind, s.unit) for s in (best[0], best[-1])] if best else []
     else:
         seen = sorted(v for v in entry.smallest.values() if v is not None and words.known(v))
-        ends = [size_words(v, entry.coordinate, entry.unit) for v in (seen[0], seen[-1])] if seen else []
+        ends = [smallest_words(v, entry.kind, entry.unit) for v in (seen[0], seen[-1])] if seen else []
     return Html(f"{' … '.join(ends)} ({len(lines)} parameters)" if ends else "cannot be seen")
 
 
@@ -222,15 +221,6 @@ def smallest_words(size: float | None, kind: str, unit: str) -> str:
     if kind == "softer_than":
         return f"softer than {words.quantity(size, unit, 2)}"
     return words.quantity(size, unit, 2)
-
-
-def size_words(size: float | None, coordinate: str, unit: str) -> str:
-    """Return the smallest visible size of a parameter, given in the coordinate of the fit, in words."""
-    if size is None or not words.known(size) or size <= 0:
-        return "cannot be seen"
-    kinds = {"log": ("factor", math.exp(min(size, 50.0))), "reciprocal": ("softer_than", 1.0 / size)}
-    kind, own = kinds.get(coordinate, ("change", size))
-    return smallest_words(own, kind, unit)
 
 
 # Covariates, calibration, tests
