@@ -84,14 +84,16 @@ def sweeps(height: float = 2.0, *, each: int = 2) -> tuple[np.ndarray, list[str]
 def record(
     inputs: np.ndarray, *, effects: Sequence[dict] = (), noise: float = 1e-4, seed: int = 0, zero: str = "absolute", initial: np.ndarray | None = None,
     labels: list[str] | None = None, free: bool = True, forces: dict[int, tuple[np.ndarray, np.ndarray]] | None = None, truth: Robot | None = None,
+    seats: np.ndarray | None = None, actuation: str = "tension",
 ) -> tuple[Recording, list[np.ndarray]]:  # fmt: skip
     """Return a recording of the true arm (finer mesh, neo-Hookean) and its node positions in each frame.
 
-    `forces`: frame → (place at rest, force) of an undeclared contact.
+    `forces`: frame → (place at rest, force) of an undeclared contact. `seats`: by how much the markers sit elsewhere on the body at rest [m], (k, 3).
     """
     rng = np.random.default_rng(seed)
     true = apply_effects(truth or arm((8, 3, 3), law="neo_hookean"), effects)
-    plain = make_recording(time_s=np.arange(len(inputs)) * 1.0, cable_names=NAMES, inputs=inputs)
+    ties = true.markers if seats is None else true.tie_markers(true.marker_points + seats)
+    plain = make_recording(time_s=np.arange(len(inputs)) * 1.0, actuation=actuation, cable_names=NAMES, inputs=inputs)
     walk = Walk(true, drive_of(true, plain, initial=initial))
     points, states, state = [], [], None
     for k in range(len(inputs)):
@@ -102,13 +104,13 @@ def record(
         state = solve_frame(walk, k, start=state, before=None if state is None else state.segment_tensions, nodal_forces=extra)
         assert state.converged
         states.append(state.positions)
-        points.append(true.markers.positions(state.positions))
+        points.append(ties.positions(state.positions))
     measured = transform_points(invert_pose(T_ROBOT_CAMERA), np.vstack(points)) + noise * rng.normal(
         size=(len(inputs) * len(true.marker_names), 3)
     )
     count = len(true.marker_names)
     recording = make_recording(
-        time_s=np.arange(len(inputs)) * 1.0, actuation_zero=zero, cable_names=NAMES, inputs=inputs, sweep=labels, free=np.full(len(inputs), free),
+        time_s=np.arange(len(inputs)) * 1.0, actuation=actuation, actuation_zero=zero, cable_names=NAMES, inputs=inputs, sweep=labels, free=np.full(len(inputs), free),
         marker_names=true.marker_names, marker_frame=np.repeat(np.arange(len(inputs)), count), marker_index=np.tile(np.arange(count), len(inputs)), marker_xyz=measured,
     )  # fmt: skip
     return recording, states

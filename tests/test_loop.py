@@ -88,6 +88,14 @@ def test_a_model_that_lacks_nothing_is_told_so():
     assert not loop.effects
     assert loop.noise_m == pytest.approx(2e-4 * np.sqrt(3), rel=0.15)
     assert loop.detectable["cable_friction"]["smallest"]["coefficient"] < 0.2
+    clamp = loop.detectable[
+        "base_compliance"
+    ]  # a stiffness in its own unit, below which a clamp gives by what would have been seen
+    assert clamp["kind"] == "softer_than" and (clamp["unit"], *clamp["smallest"]) in {
+        ("N/m", "stiffness_n_m"),
+        ("N m/rad", "rotation_stiffness_nm_rad"),
+    }
+    assert all(1e-3 < value < 1e6 for value in clamp["smallest"].values())
 
 
 def test_a_second_round_on_the_improved_robot_finds_nothing():

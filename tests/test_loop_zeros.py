@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from arm import arm, record
 
 from femsense.loop.data import prepare
@@ -14,11 +15,11 @@ from femsense.model import Robot
 NOISE = Noise({"white": 3e-4}, "")
 
 
-def asked(robot: Robot, truth: Robot, cables: list[int], tried: list[str], **changes) -> InPlace | None:
+def asked(robot: Robot, truth: Robot, cables: list[int], tried: list[str], top: float = 1.5, **changes) -> InPlace | None:
     """Return what may be in the place of zeros that moved; the cables are pulled one after another."""
     inputs = np.zeros((4 * len(cables), 4))
     for i, cable in enumerate(cables):
-        inputs[4 * i : 4 * i + 4, cable] = np.linspace(0.0, 1.5, 4)
+        inputs[4 * i : 4 * i + 4, cable] = np.linspace(0.0, top, 4)
     data = prepare(robot, [record(inputs, truth=truth, noise=3e-4, **changes)[0]], [])
     hypothesis, prior = with_nuisance(data)
     full = make_stage(data, hypothesis, prior, NOISE, np.zeros(len(prior.mean)))
@@ -35,6 +36,15 @@ def test_a_zero_that_is_wrong_keeps_its_place():
     wrong = [{"name": "cable_offset", "tension_n": {"left": 0.4}}]
     found = asked(arm((4, 1, 1)), arm((4, 1, 1)), [0, 2, 1, 3], ["gravity", "cable_gain"], effects=wrong)
     assert found is not None and found.stage is None and found.ahead < -10.0
+
+
+@pytest.mark.parametrize(("zero", "named"), [(-1.5e-3, "cable_slack"), (1.5e-3, "")])
+def test_play_is_named_where_held_cables_pull_less_than_declared_and_a_zero_where_they_pull_more(zero: float, named: str):
+    wrong = [{"name": "cable_offset", "displacement_m": {"left": zero}}]
+    found = asked(arm((4, 1, 1)), arm((4, 1, 1)), [0, 2, 1, 3], ["cable_slack"], 6e-3, effects=wrong, actuation="displacement")
+    assert found is not None and (found.stage is not None) == bool(named)
+    if found.stage is not None:
+        assert found.name == named and found.stage.fit.coordinates[-1] == pytest.approx(-zero, rel=0.1)
 
 
 def test_zeros_that_are_right_are_not_asked_about():
