@@ -40,6 +40,8 @@ BEYOND_NOISE = 1.2
 """Held-out errors that are so many times the noise need another reason."""
 EXPLAINED = 0.8
 """Share of the excess over the noise that effects must take away where structure is left."""
+MOSTLY = 0.9
+"""Share of an effect's field, beyond poses, that a named nuisance imitates on its own where the two are said together."""
 LACKS = 2.0
 """A model that is handed back may leave so many times the mean square, in units of all noise, that calibration of all nuisances leaves."""
 
@@ -421,14 +423,17 @@ def _confounded(search: Search, names: list[str]) -> list[dict[str, Any]]:
     """Return pairs that these data cannot tell apart: fields that agree, or refits whose evidence is within 10 of the named one."""
     pairs = []
     first = search.first
-    best = {r["name"]: r["dbic"] for r in search.refits if r.get("verdict") == "named"}
     rivals = [r for r in search.refits if r["name"] not in names and r.get("verdict") == "passes"]
-    for name in (n for n in names if n in best):
+    for own in (
+        r for r in search.refits if r["name"] in names and (r.get("verdict") == "named" or r.get("in_place_of") == r["name"])
+    ):
         pairs += [
-            {"pair": [name, r["name"]], "dbic_gap": float(best[name] - r["dbic"])}
+            {"pair": [own["name"], r["name"]], "dbic_gap": float(own["dbic"] - r["dbic"])}
             for r in rivals
-            if r["step"] == _step_of(search, name) and r["dbic"] > best[name] - EVIDENCE
+            if (r["step"], r.get("in_place_of")) == (own["step"], own.get("in_place_of")) and r["dbic"] > own["dbic"] - EVIDENCE
         ]
+    for name in (n for n in names if n in NUISANCE):
+        pairs += [{"pair": [name, other], "absorbed_share": share} for other, share in _swallowed(search, name).items()]
     for name in (n for n in names if n in NUISANCE):
         pairs += [
             {"pair": [name, r["name"]], "dbic_gap": 0.0}
@@ -453,8 +458,25 @@ def _confounded(search: Search, names: list[str]) -> list[dict[str, Any]]:
     return pairs
 
 
-def _step_of(search: Search, name: str) -> int:
-    return next(int(r["step"]) for r in search.refits if r["name"] == name and r.get("verdict") == "named")
+def _swallowed(search: Search, name: str) -> dict[str, float]:
+    """Return the effects that this recording cannot test because one nuisance imitates most of each, with the share that calibration absorbs."""
+    fit, at = search.history[0][1].fit, 0
+    columns = np.zeros(0, dtype=np.int64)
+    for effect, _, parameters in fit.hypothesis.terms:
+        columns = fit.own + at + np.arange(len(parameters)) if effect.name == name else columns
+        at += len(parameters)
+    J, found = np.asarray(fit.fit.jacobian), dict[str, float]()
+    poses = np.linalg.qr(J[:, : fit.own])[0]
+    own = J[:, columns] - poses @ (poses.T @ J[:, columns])
+    for c in (
+        c for c in one_each(search.first) if c.retained < TESTABLE and c.effect.name not in search.final.fit.hypothesis.names
+    ):
+        whole = c.columns - J @ c.response
+        whole = whole - poses @ (poses.T @ whole)
+        left = whole - own @ np.linalg.lstsq(own, whole, rcond=None)[0]
+        if np.linalg.norm(left) < (1.0 - MOSTLY**2) ** 0.5 * np.linalg.norm(whole):
+            found[c.effect.name] = float(np.sqrt(1.0 - c.retained**2))
+    return found
 
 
 def _detectable(table: list[Candidate], found: set[str]) -> dict[str, Any]:
@@ -596,6 +618,7 @@ def _card(data: Data, final: Stage, spread: dict[str, FloatArray], noise: Noise,
         "noise_components_m": noise.std or noise.surface,
         "noise_source": noise.source,
         "mesh_error_m": _mesh_error(data),
+        "strays": [{"frame": number, "marker": name} for number, name in data.strays],
         "effective_observations": n_effective,
         "nuisance_after": nuisance,
         "seat_std_m": data.seat_std,

@@ -58,6 +58,8 @@ class Data:
     """As it came."""
     forms: tuple[Effect, ...] = FORMS
     """What may be tried, a user's effects among it."""
+    strays: tuple[tuple[int, str], ...] = ()
+    """Frame numbers and names of markers that are left out because they are far from where others let expect them."""
 
     @property
     def measured(self) -> tuple[str, ...]:

@@ -42,6 +42,7 @@ from femsense.loop.stages import (
     screen_stage,
     with_nuisance,
 )
+from femsense.loop.strays import without_strays
 from femsense.loop.zeros import in_place_of_zeros
 from femsense.model import Robot
 from femsense.parallel import beside, one_blas_thread
@@ -114,6 +115,8 @@ def _calibrated(data: Data, names: Sequence[str], say: Progress, finer_is_made: 
     """Return the data with what the mesh costs, the declared model calibrated, and the model with all that calibration may move."""
     noise = Noise({"white": 5e-4}, "start")
     before = _declared(data, noise, None)
+    while (fewer := without_strays(data, before)) is not data:
+        data, before = fewer, _declared(fewer, noise, None)
     hypothesis, prior = with_nuisance(data)
     say("fitting what calibration may move")
     nothing = np.zeros(len(prior.mean))
