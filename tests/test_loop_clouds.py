@@ -230,23 +230,21 @@ def test_a_place_that_the_models_own_fields_do_not_cover_is_no_row():
 
 
 def test_rows_are_made_again_until_the_fit_stays_where_it_is(rubbing: Recording, monkeypatch: pytest.MonkeyPatch):
-    data = prepare(arm(COARSE), [rubbing], [], "clouds")
-    hypothesis, prior = with_nuisance(data)
-    noise, nothing = Noise({}, "", {"white": 1e-4}), np.zeros(len(prior.mean))
-    off = np.array([0.01, -0.01, 0.01, 2e-3, -2e-3, 2e-3])
-    start = make_stage(
-        data, hypothesis, prior, noise, nothing, own=np.r_[off, np.zeros(data.train[0].size - 6)], max_iterations=0
-    )
-    data = rematched(data, start, noise, anew=True)  # rows as they are found from there
+    noise, off = Noise({}, "", {"white": 1e-4}), np.array([0.02, -0.02, 0.02, 4e-3, -4e-3, 4e-3])
 
     def to_gain(rounds: int) -> float:
+        data = prepare(arm(COARSE), [rubbing], [], "clouds")  # anew: it remembers the states that were solved
+        hypothesis, prior = with_nuisance(data)
+        nothing, own = np.zeros(len(prior.mean)), np.r_[off, np.zeros(data.train[0].size - 6)]
+        start = make_stage(data, hypothesis, prior, noise, nothing, own=own, max_iterations=0)
+        data = rematched(data, start, noise, anew=True)  # rows as they are found from there
         monkeypatch.setattr(sys.modules[improve.__module__], "MATCHINGS", rounds)
         found, stage = _matched(data, start, noise, anew=True)
         again = make_stage(rematched(found, stage, noise), hypothesis, prior, noise, stage.fit.coordinates, own=own_of(stage))
         return again.fit.fit.cost[0] - again.fit.chi2
 
-    assert to_gain(1) > 10.0
-    assert to_gain(4) < 5.0
+    assert to_gain(1) > 50.0  # 99 on one machine
+    assert to_gain(4) < 20.0  # 0 there; a row more or less is worth about ten
 
 
 def test_rows_hardly_change_when_they_are_made_anew_elsewhere(both: Data):

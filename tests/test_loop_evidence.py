@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from femsense.loop.covariates import actuation_of, rank_with, unloading
-from femsense.loop.evidence import _own_unit, _rounded, _without, lack_of_fit
+from femsense.loop.evidence import _rounded, _without, lack_of_fit, own_size
 from femsense.loop.forces import _smallest_field, _solved
 from femsense.recording import make_recording
 
@@ -88,8 +88,8 @@ def test_projecting_in_the_gram_matrix_is_projecting_the_columns():
     np.testing.assert_allclose(_without(A.T @ A, 2), left.T @ left, atol=1e-10)
 
 
-def test_sizes_in_their_own_unit():
-    assert _own_unit(np.log(1.2), "log") == pytest.approx(1.2)
-    assert _own_unit(1e-3, "reciprocal") == pytest.approx(1000.0)
-    assert _own_unit(0.3, "linear") == 0.3 and _own_unit(np.inf, "linear") is None
+def test_sizes_in_theirown_size():
+    assert own_size(np.log(1.2), "log") == pytest.approx(1.2)
+    assert own_size(1e-3, "reciprocal") == pytest.approx(1000.0)
+    assert own_size(0.3, "linear") == 0.3 and own_size(np.inf, "linear") is None
     assert _rounded({"a": [np.float64(1 / 3), float("nan"), np.int64(2)]}) == {"a": [0.3333333, None, 2]}

@@ -22,9 +22,9 @@ from femsense.loop.refit import EVIDENCE
 from femsense.loop.result import LoopResult
 from femsense.loop.screen import NUISANCE, TESTABLE, Candidate, confounding, one_each
 from femsense.loop.spread import spreads
-from femsense.loop.stages import Stage, held_chi2, held_out, keeping, roughly_keeping, with_seeds_still, with_sizes_still
+from femsense.loop.stages import Stage, held_chi2, held_out, keeping, roughly_keeping, span_of, with_seeds_still, with_sizes_still
 from femsense.loop.structure import beyond_mesh, describe_left, structure_tests, without_mesh_error
-from femsense.loop.zeros import InPlace, moved_nuisance, zeros_are_evident
+from femsense.loop.zeros import SIGNIFICANT, InPlace, moved_nuisance, zeros_are_evident
 
 MIN_SWEEPS = 4
 """With fewer held-out sweeps the interval of the held-out error resamples frames."""
@@ -42,6 +42,8 @@ EXPLAINED = 0.8
 """Share of the excess over the noise that effects must take away where structure is left."""
 MOSTLY = 0.9
 """Share of an effect's field, beyond poses, that a named nuisance imitates on its own where the two are said together."""
+GROSS = 0.03
+"""Noise of more than this share of the body's reach is said to be suspicious."""
 LACKS = 2.0
 """A model that is handed back may leave so many times the mean square, in units of all noise, that calibration of all nuisances leaves."""
 
@@ -69,13 +71,13 @@ class Search:
 def conclude(data: Data, search: Search, rng: np.random.Generator) -> LoopResult:
     """Return the verdict with all that the report shows."""
     before, final, noise = search.before, search.final, search.noise
-    promoted = _promoted(data, search)
+    spread = spreads(data, final, noise, _seed_spread(search))
+    promoted = [n for n in _promoted(data, search) if _is_sure(final, n, spread[n])]
     names = [*promoted, *(n for n, _ in search.history[1:] if n in final.fit.hypothesis.names)]
     names, back = _worth_handing_back(data, search, promoted, names)
     strayed = "stiffness" in promoted and "stiffness" not in names  # what a modulus beyond all bounds takes away is not explained
     promoted = [n for n in names if n in NUISANCE]
     entries = _entries(back, names)
-    spread = spreads(data, final, noise, _seed_spread(search))
     effects = _chain(data, search, promoted, names, back, spread)
     lacks = _lacks(data, back, final, noise)
     shown = back if lacks else final  # what nuisances take away unnamed is left, too
@@ -103,6 +105,7 @@ def conclude(data: Data, search: Search, rng: np.random.Generator) -> LoopResult
     return LoopResult(
         verdict=verdict,
         sentence=_sentence(verdict, effects, found, before, back, noise, _mesh_error(data))
+        + _by_noise(data, noise)
         + _by_mesh(data, search, back)
         + _on_linear(data, back)
         + _evidence_for(data, found),
@@ -133,6 +136,11 @@ def _promoted(data: Data, search: Search) -> list[str]:
     """Return the nuisances that the data moved significantly away from what is declared; of the zeros, those that are missed."""
     names = [n for n in search.final.fit.hypothesis.names if n in NUISANCE and moved_nuisance(data, search.final, n)]
     return [n for n in names if n == "stiffness" or zeros_are_evident(data, search.final, search.noise, search.n_effective)]
+
+
+def _is_sure(stage: Stage, name: str, std: FloatArray) -> bool:
+    """Return whether a value of a nuisance differs from what is declared by more than SIGNIFICANT of the standard deviations that are reported."""
+    return bool((np.abs(stage.fit.coordinates[span_of(stage.fit, name)]) > SIGNIFICANT * std).any())
 
 
 def _worth_handing_back(data: Data, search: Search, promoted: list[str], names: list[str]) -> tuple[list[str], Stage]:
@@ -460,14 +468,10 @@ def _confounded(search: Search, names: list[str]) -> list[dict[str, Any]]:
 
 def _swallowed(search: Search, name: str) -> dict[str, float]:
     """Return the effects that this recording cannot test because one nuisance imitates most of each, with the share that calibration absorbs."""
-    fit, at = search.history[0][1].fit, 0
-    columns = np.zeros(0, dtype=np.int64)
-    for effect, _, parameters in fit.hypothesis.terms:
-        columns = fit.own + at + np.arange(len(parameters)) if effect.name == name else columns
-        at += len(parameters)
+    fit = search.history[0][1].fit
     J, found = np.asarray(fit.fit.jacobian), dict[str, float]()
-    poses = np.linalg.qr(J[:, : fit.own])[0]
-    own = J[:, columns] - poses @ (poses.T @ J[:, columns])
+    poses, own = np.linalg.qr(J[:, : fit.own])[0], J[:, fit.own :][:, span_of(fit, name)]
+    own = own - poses @ (poses.T @ own)
     for c in (
         c for c in one_each(search.first) if c.retained < TESTABLE and c.effect.name not in search.final.fit.hypothesis.names
     ):
@@ -584,6 +588,17 @@ def _evidence_for(data: Data, found: list[str]) -> str:
     finer = f"; the mesh itself costs {1e3 * mesh:.2f} mm, and a finer one may tell" if mesh else ""
     return (
         f" There is evidence for {', '.join(found)}, but the held-out error would grow with it or a value be implausible{finer}."
+    )
+
+
+def _by_noise(data: Data, noise: Noise) -> str:
+    """Return in words that the noise is beyond what cameras have."""
+    reach = data.robot.body.reach
+    if noise.total < GROSS * reach:
+        return ""
+    return (
+        f" Noise of {1e3 * noise.total:.1f} mm on a body of {1e3 * reach:.0f} mm is no camera's: frames that should be alike are not."
+        " Look whether inputs belong to their frames and names to their markers and cables."
     )
 
 

@@ -30,6 +30,7 @@ from femsense.loop.stages import (
     make_stage,
     own_of,
     problem_of,
+    span_of,
 )
 from femsense.model import Robot
 
@@ -392,13 +393,8 @@ def _taken_over(before: Stage, after: Stage) -> list[str]:
 
 def _z(stage: Stage, name: str) -> float:
     """Return by how many standard deviations the values of a nuisance differ from none, at most."""
-    at = 0
-    for effect, _, parameters in stage.fit.hypothesis.terms:
-        part = slice(at, at + len(parameters))
-        at += len(parameters)
-        if effect.name == name:
-            return float(np.max(np.abs(stage.fit.coordinates[part]) / np.maximum(stage.fit.std[part], 1e-300)))
-    return 0.0
+    part = span_of(stage.fit, name)
+    return float(np.max(np.abs(stage.fit.coordinates[part]) / np.maximum(stage.fit.std[part], 1e-300), initial=0.0))
 
 
 def held_share(data: Data) -> float:

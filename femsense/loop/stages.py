@@ -179,6 +179,16 @@ def roughly_keeping(data: Data, stage: Stage, names: Sequence[str], noise: Noise
     return Stage(fit, [], float("nan"))
 
 
+def span_of(fit: JointFit, name: str) -> slice:
+    """Return where the coordinates of an effect stand among those of a fit; nowhere if it has none."""
+    at = 0
+    for effect, _, parameters in fit.hypothesis.terms:
+        if effect.name == name:
+            return slice(at, at + len(parameters))
+        at += len(parameters)
+    return slice(0, 0)
+
+
 def own_of(stage: Stage) -> FloatArray:
     return np.array(stage.fit.fit.theta[: stage.fit.own])
 

@@ -15,8 +15,8 @@ from femsense.loop.data import Data
 from femsense.loop.joint import Trial
 from femsense.loop.stages import Stage
 
-STRAYS = 10.0
-"""A stray is off by so many times what is usual …"""
+STRAYS = 4.0
+"""A stray is off by so many times what nine in ten are off by at most …"""
 FAR = 0.05
 """… and by more than this share of the body's reach; nearer ones may be what is sought."""
 RARE = 0.02
@@ -45,10 +45,10 @@ def _kept(data: Data, trial: Trial, residual: FloatArray) -> Trial:
 
 
 def strays(residual: FloatArray, frame: IntArray, marker: IntArray, far: float) -> BoolArray:
-    """Return which rows of a residual (k, 3) [m] stand out from their frame and their marker by more than `far` [m], and STRAYS times what is usual."""
+    """Return which rows of a residual (k, 3) [m] stand out from their frame and their marker by more than `far` [m], and by STRAYS times the 90 % quantile."""
     size = np.linalg.norm(_less_medians(_less_medians(residual, frame), marker), axis=1)
-    off = size > max(far, STRAYS * float(np.median(size)))
-    return off if off.mean() <= RARE else np.zeros(len(off), dtype=bool)
+    off = size > max(far, STRAYS * float(np.quantile(size, 0.9)))
+    return off if off.sum() <= max(RARE * len(off), 1) else np.zeros(len(off), dtype=bool)
 
 
 def _less_medians(values: FloatArray, labels: IntArray) -> FloatArray:

@@ -30,7 +30,7 @@ from femsense.loop.grow import (
 from femsense.loop.noise import Noise
 from femsense.loop.predict import sweeps_predicted
 from femsense.loop.refit import EVIDENCE, evidence, refit
-from femsense.loop.stages import Stage, fields_of, held_chi2, keeping, screen_stage
+from femsense.loop.stages import Stage, fields_of, held_chi2, keeping, screen_stage, span_of
 from femsense.loop.structure import beyond_mesh
 
 ZEROS = "cable_offset"
@@ -58,16 +58,12 @@ class InPlace:
 
 def moved_nuisance(data: Data, stage: Stage, name: str, *, relevant: float = RELEVANT) -> int:
     """Return how many values of a nuisance the data moved significantly away from what is declared, and by more than a share of it."""
-    at = 0
-    for effect, _, parameters in stage.fit.hypothesis.terms:
-        part = slice(at, at + len(parameters))
-        at += len(parameters)
-        if effect.name != name:
-            continue
-        values, std = stage.fit.coordinates[part], stage.fit.std[part]
-        size = np.abs(values) / (1.0 if name == "stiffness" else np.maximum(data.input_scale, 1e-12))
-        return int(((np.abs(values) > SIGNIFICANT * std) & (size > relevant)).sum())
-    return 0
+    part = span_of(stage.fit, name)
+    values, std = stage.fit.coordinates[part], stage.fit.std[part]
+    if not len(values):
+        return 0
+    size = np.abs(values) / (1.0 if name == "stiffness" else np.maximum(data.input_scale, 1e-12))
+    return int(((np.abs(values) > SIGNIFICANT * std) & (size > relevant)).sum())
 
 
 def evidence_for_zeros(data: Data, stage: Stage, without: Stage, n_effective: float) -> float:
@@ -136,4 +132,11 @@ def in_place_of_zeros(
     return InPlace(best.stage if takes else None, best.candidate.effect.name, ahead, records)
 
 
-__all__ = ["RELEVANT", "SIGNIFICANT", "InPlace", "in_place_of_zeros", "moved_nuisance", "zeros_are_evident"]
+__all__ = [
+    "RELEVANT",
+    "SIGNIFICANT",
+    "InPlace",
+    "in_place_of_zeros",
+    "moved_nuisance",
+    "zeros_are_evident",
+]
