@@ -72,6 +72,7 @@ def loop_document(**overrides: Any) -> dict[str, Any]:
         "data": {
             "recordings": ["somewhere/first", None], "split": ["2 of 6 sweeps", "1 of 4 sweeps"],
             "frames_fitted": [[0, 1, 2, 3, 7], [0, 1]], "frames_held_out": [list(range(8, 20)), list(range(8, 20))],
+            "strays": [{"frame": 4, "marker": "tip"}, {"frame": 9, "marker": "stalk"}],
             "noise_components_m": {"white": 8e-5, "marker": 6e-5}, "noise_source": "restricted maximum likelihood, with repeats",
             "effective_observations": 252.0, "nuisance_after": {"stiffness": {"scale": {"value": 1.113, "std": 0.012, "unit": "1"}}},
             "seat_std_m": 3e-4, "mesh_error_m": 5e-5, "seed": 0,
@@ -328,7 +329,7 @@ def test_a_loop_shows_its_sentence_and_its_ten_items_with_their_numbers(tmp_path
         "most at marker tip, mean (0.0100, −0.0200, 0.0600) mm", "most in frame 17, 0.290 mm", "none seen beyond noise (correlation of neighbouring states 0.050, smallest p = 0.31)", "unloading −0.41 0.030 0.15",
         "8. Smallest effects that would have been seen", "poisson_ratio 0.031", "scale a change of 22 %", "radius_m 2.0 mm", "softer than 10000 N/m", "0.10 mm … 0.30 mm (9 parameters)",
         "stiffness_n_m cannot be seen", "or softening with stretch would have been seen", "would have to be 3.0 times as large",
-        "9. Data", "Split, recording 1 (first) 2 of 6 sweeps", "0–3, 7 (5)", "touched, load not declared: 4–6 (3)", "no markers: 9 (1)", "Frames left out, 2 none", "reached again the same way) 2",
+        "9. Data", "Split, recording 1 (first) 2 of 6 sweeps", "0–3, 7 (5)", "touched, load not declared: 4–6 (3)", "no markers: 9 (1)", "Frames left out, 2 none", "Stray markers left out tip in frame 4, stalk in frame 9", "reached again the same way) 2",
         "each measurement by itself 0.080 mm", "restricted maximum likelihood, with repeats", "Error of the mesh, at the markers 0.050 mm", "Fitted along: stiffness scale 1.113 ± 0.012", "Seed 0", "femsense 0.1.0, numpy 2.0", "Recording 1 first abcdabcdabcdabcd",
         "10. What it means for forces", "in held-out frames", "0.14 N (19.0 %) with the declared robot, calibrated; 10 mN (1.5 %) with the improved one".replace("10 mN", "0.010 N"),
         "9 0.500 N 0.410 ± 0.010 N −18 % 0.490 ± 0.010 N −2.0 %", "11 1.00 N 0.800 ± 0.020 N −20 % 1.010 ± 0.020 N +1.0 %",

@@ -133,6 +133,11 @@ class Clouds(Document):
     points_m: dict[str, Triple] = Field(default_factory=dict)
 
 
+class Stray(Document):
+    frame: int
+    marker: str = ""
+
+
 class Card(Document):
     measured: list[str] = Field(default_factory=lambda: ["markers"])
     clouds: Clouds | None = None
@@ -140,6 +145,7 @@ class Card(Document):
     split: list[str] = Field(default_factory=list)
     frames_fitted: list[list[int]] = Field(default_factory=list)
     frames_held_out: list[list[int]] = Field(default_factory=list)
+    strays: list[Stray] = Field(default_factory=list)
     noise_components_m: dict[str, Number] = Field(default_factory=dict)
     noise_source: str = ""
     mesh_error_m: Number = None

@@ -25,6 +25,7 @@ from femsense.report.documents import (
     Ranked,
     Score,
     Size,
+    Stray,
     Structure,
     Tested,
     Tests,
@@ -40,7 +41,7 @@ LISTED = 6
 COMPONENTS = {
     "white": "each measurement by itself",
     "state": "a marker in a repeated state",
-    "marker": "a marker in all frames",
+    "marker": "a marker on the body, in all frames",
     "frame": "all markers of a frame",
     "sweep": "all frames of a sweep",
 }
@@ -396,6 +397,11 @@ def _span(ratio: Sequence[float | None]) -> str:
 # The data
 
 
+def _stray_list(strays: Sequence[Stray]) -> str:
+    said = ", ".join(f"{s.marker} in frame {s.frame}" for s in strays[:LISTED])
+    return f"{said} … ({len(strays)})" if len(strays) > LISTED else said
+
+
 def data_card(loop: Loop) -> Html | None:
     """Return what the result rests on."""
     card, evidence = loop.data, loop.evidence or Evidence()
@@ -413,6 +419,7 @@ def data_card(loop: Loop) -> Html | None:
         rows.append(
             [f"Frames left out{f', {i + 1}' if len(evidence.excluded) > 1 else ''}", together(*lines) if lines else "none"]
         )
+    rows += [["Stray markers left out", _stray_list(card.strays)]] if card.strays else []
     rows += [["Repeats (a state reached again the same way)", str(evidence.repeats)]] if evidence.repeats is not None else []
     rows += _noise_rows(card)
     for name, parameters in card.nuisance_after.items():
