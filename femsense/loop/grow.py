@@ -104,10 +104,14 @@ def grow(
         settled = _settled(data, candidate, ahead)
         try:
             few = few_of(data, stage, noise) if ahead and few is None else few
-            if few is not None and ahead and _falls_behind(few, candidate, max(ahead, key=lambda r: r.score), noise, settled):
-                record["verdict"] = "given up: in some of the states another one explains more by far"
-                continue
-            made = refit(data, stage, candidate, noise, wanted=max(EVIDENCE, best - 2.0 * EVIDENCE), settled=settled)
+            begin: JointFit | None = None
+            if few is not None and ahead:
+                behind, begin = _in_some_states(few, candidate, max(ahead, key=lambda r: r.score), noise, settled)
+                if behind:
+                    record["verdict"] = "given up: in some of the states another one explains more by far"
+                    continue
+            wanted = max(EVIDENCE, best - 2.0 * EVIDENCE)
+            made = refit(data, stage, candidate, noise, wanted=wanted, settled=settled, begin=begin)
         except FemsenseError as error:
             record["verdict"] = f"no equilibrium: {error}"
             continue
@@ -163,15 +167,18 @@ def _settled(data: Data, candidate: Candidate, ahead: Sequence[Refit]) -> bool:
     )
 
 
-def _falls_behind(few: Few, candidate: Candidate, ahead: Refit, noise: Noise, settled: bool) -> bool:
-    """Return whether a candidate that is fitted in some of the states stays as far behind another one there as ends a refit, where these spare time."""
+def _in_some_states(few: Few, candidate: Candidate, ahead: Refit, noise: Noise, settled: bool) -> tuple[bool, JointFit | None]:
+    """Return whether a candidate that is fitted in some of the states stays as far behind another one there as ends a refit, where these spare time;
+    and where that fit ended."""
     own = few.candidate(candidate, noise) if few.spares else None
     if own is None:
-        return False
+        return False, None
     base, leading = few.stage.fit, few.of(ahead.stage.fit, noise)
     wanted = max(EVIDENCE, evidence(base, leading) - ahead.candidate.cost - 2.0 * EVIDENCE)
     made = tried(few.data, few.stage, own, noise, wanted, settled=settled)
-    return made is not None and made.fit.chi2 > worth_of(base, own, wanted, settled)  # where it does not fit, all states decide
+    if made is None:  # where it does not fit, all states decide
+        return False, None
+    return made.fit.chi2 > worth_of(base, own, wanted, settled), made.fit
 
 
 def _bar(ahead: Refit, candidate: Candidate) -> float:
@@ -218,7 +225,7 @@ def polished(data: Data, stage: Stage, refitted: Refit, noise: Noise, say: Progr
 
 def _enriched(data: Data, stage: Stage, winner: Refit, table: list[Candidate], noise: Noise, say: Progress) -> Refit:
     """Return the winner in a form with more parameters where that has EVIDENCE over the simple one."""
-    winner = _with_more_parts(data, stage, winner, table, noise, say)
+    winner = _with_more_markers(data, stage, winner, table, noise, say)
     for form in _forms(table, winner.candidate.effect.name):
         if len(form.parameters) <= len(winner.candidate.parameters):
             continue
@@ -236,14 +243,14 @@ def _enriched(data: Data, stage: Stage, winner: Refit, table: list[Candidate], n
     return winner
 
 
-def _with_more_parts(data: Data, stage: Stage, winner: Refit, table: list[Candidate], noise: Noise, say: Progress) -> Refit:
-    """Return the winner with the offsets of further markers, one after the other, as long as each has EVIDENCE: all of them at once cost too much."""
-    while winner.candidate.effect.name == "marker_offset":
-        taken = set(winner.candidate.parameters)
-        others = [c for c in table if c.effect is winner.candidate.effect and not taken & set(c.parameters)]
+def _with_more_markers(data: Data, stage: Stage, winner: Refit, table: list[Candidate], noise: Noise, say: Progress) -> Refit:
+    """Return offsets of markers with those of further markers, one after the other, as long as each has EVIDENCE: all of them at once cost too much.
+    Other effects are returned as they are."""
+    alone = [c for c in table if c.effect is winner.candidate.effect] if winner.candidate.effect.name == "marker_offset" else []
+    while others := [c for c in alone if not set(c.parameters) & set(winner.candidate.parameters)]:
         problem = problem_of(data, winner.stage.fit, noise)
         gains = [linear_gain(winner.stage.fit, problem, c.raw, c.seats) - c.cost for c in others]
-        if max(gains, default=-np.inf) < EVIDENCE:
+        if max(gains) <= EVIDENCE:
             break
         form = joined(winner.candidate, others[int(np.argmax(gains))])
         say(f"trying {form.effect.name} with {len(form.parameters)} parameters")
@@ -251,10 +258,8 @@ def _with_more_parts(data: Data, stage: Stage, winner: Refit, table: list[Candid
         if made is None:
             break
         more = judged(data, stage, form, made, dict(winner.record), noise)
-        if (
-            more.record["verdict"] != "passes"
-            or evidence(winner.stage.fit, made.fit) <= form.cost - winner.candidate.cost + EVIDENCE
-        ):
+        gain = evidence(winner.stage.fit, made.fit)
+        if more.record["verdict"] != "passes" or gain <= form.cost - winner.candidate.cost + EVIDENCE:
             break
         winner.record.update(more.record)
         winner = replace(more, record=winner.record)

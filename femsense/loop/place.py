@@ -46,8 +46,11 @@ def placed(
     """Return the best of a candidate's fits, that which was `made` from its own seed or one that begins where a climb ends, its seed moved on,
     and the scatter of its parameters: that of `closer`, or that over the places that explain as much where this is larger."""
     begun, ends = [made], [end.seed for end in climbs.ends]
+    few = few_of(data, stage, noise)
     for other in _screen_seeds(data, stage, candidate, ends, noise) if ends else []:
-        there = tried(data, stage, other, noise)
+        own = few.candidate(other, noise) if few.spares else None
+        near = None if own is None else tried(few.data, few.stage, own, noise)
+        there = tried(data, stage, other, noise, begin=None if near is None else near.fit)
         if there is not None and there.fit.fit.status != GIVEN_UP:
             begun.append(there)
     moved = list[tuple[Stage, list[float]]]()

@@ -51,9 +51,11 @@ def beyond(fit: JointFit, price: float) -> float:
 
 
 def refit(
-    data: Data, stage: Stage, candidate: Candidate, noise: Noise, *, wanted: float = EVIDENCE, settled: bool = False
-) -> Stage:
-    """Joint fit with one more effect, started from its linear step. Raises DataError where no start helps.
+    data: Data, stage: Stage, candidate: Candidate, noise: Noise, *, wanted: float = EVIDENCE, settled: bool = False,
+    begin: JointFit | None = None,
+) -> Stage:  # fmt: skip
+    """Joint fit with one more effect, started where a fit to some of the states ended (`begin`), else from its linear step. Raises DataError where
+    no start helps.
 
     Where the dBIC would stay well below what is wanted, or below it at all if it is `settled`, the fit is given up on its way.
     """
@@ -80,7 +82,9 @@ def refit(
         except DataError:
             return None
 
-    best: Stage | None = None
+    best = None if begin is None else _from(data, stage, hypothesis, prior, noise, begin, worth)
+    if best is not None:
+        return best
     given_up: Stage | None = None
     for share in _shares(candidate, free):
         made = fitted(share)
@@ -98,6 +102,19 @@ def refit(
     if found is None:
         raise DataError("no start from which the fit improves")
     return found
+
+
+def _from(
+    data: Data, stage: Stage, hypothesis: Hypothesis, prior: Prior, noise: Noise, begin: JointFit, worth: float
+) -> Stage | None:
+    """Return the fit of a hypothesis from where another one ended; None where it does not fit, or does not help."""
+    try:
+        made = make_stage(
+            data, hypothesis, prior, noise, begin.coordinates, own=begin.fit.theta[: begin.own], max_iterations=10, worth=worth
+        )
+    except DataError:
+        return None
+    return made if made.fit.chi2 <= stage.fit.chi2 + 1.0 else None
 
 
 def worth_of(fit: JointFit, candidate: Candidate, wanted: float, settled: bool) -> float:
@@ -156,11 +173,12 @@ def _first_guess(candidate: Candidate, null: FloatArray) -> FloatArray:
 
 
 def tried(
-    data: Data, stage: Stage, candidate: Candidate, noise: Noise, wanted: float = EVIDENCE, *, settled: bool = False
-) -> Stage | None:
+    data: Data, stage: Stage, candidate: Candidate, noise: Noise, wanted: float = EVIDENCE, *, settled: bool = False,
+    begin: JointFit | None = None,
+) -> Stage | None:  # fmt: skip
     """Return a refit, or None where there is none."""
     try:
-        return refit(data, stage, candidate, noise, wanted=wanted, settled=settled)
+        return refit(data, stage, candidate, noise, wanted=wanted, settled=settled, begin=begin)
     except FemsenseError:
         return None
 
