@@ -135,7 +135,7 @@ def test_weight_that_nobody_declared_is_refitted_however_far_behind_it_looks(mon
 def test_until_an_effect_explains_the_data_rivals_are_refitted_to_the_end(monkeypatch: pytest.MonkeyPatch, explains: bool):
     asked = []
 
-    def seen(data: Data, stage: Stage, candidate: Candidate, noise: Noise, *, wanted: float, settled: bool) -> Stage:
+    def seen(data: Data, stage: Stage, candidate: Candidate, noise: Noise, *, wanted: float, **named: Any) -> Stage:
         asked.append((candidate.effect.name, wanted))
         return refit(data, stage, candidate, noise)
 

@@ -15,6 +15,7 @@ from femsense.effects import find_effect
 from femsense.fem import linear
 from femsense.loop import few, place
 from femsense.loop import grow as growing
+from femsense.loop import refit as refits
 from femsense.loop.data import Data, prepare
 from femsense.loop.exchange import exchanged
 from femsense.loop.few import FEWEST, Few, few_of, spread_states
@@ -171,9 +172,9 @@ def test_a_few_states_lead_to_the_place_and_alike_places_are_fitted_once(
     begun = refit(data, stage, far, NOISE)
     fitted = list[Candidate]()
 
-    def counted(data: Data, stage: Stage, candidate: Candidate, noise: Noise) -> Stage | None:
-        fitted.append(candidate)
-        return refit(data, stage, candidate, noise)
+    def counted(own: Data, before: Stage, candidate: Candidate, noise: Noise, **named: Any) -> Stage | None:
+        fitted.extend([candidate] if before is stage else [])
+        return refit(own, before, candidate, noise, **named)
 
     monkeypatch.setattr(place, "tried", counted)
     best, _ = placed(data, stage, far, begun, climbed(data, stage, far, NOISE), NOISE)
@@ -185,6 +186,25 @@ def test_a_few_states_lead_to_the_place_and_alike_places_are_fitted_once(
         monkeypatch.setattr(place, "_alike", lambda one, other, alike=alike: alike)
         placed(data, stage, far, begun, climbed(data, stage, far, NOISE), NOISE)
         assert len(fitted) == count
+
+
+def test_a_refit_begins_where_one_to_some_of_the_states_ended(
+    started: tuple[Data, Stage], some: Few, monkeypatch: pytest.MonkeyPatch
+):
+    data, stage = started
+    one = payloads(data, stage)[0]
+    own = some.candidate(one, NOISE)
+    assert own is not None
+    near, plain, starts = refit(some.data, some.stage, own, NOISE), refit(data, stage, one, NOISE), list[np.ndarray]()
+
+    def seen(data: Data, hypothesis: Hypothesis, prior: Prior, noise: Noise, coordinates: np.ndarray, **given: Any) -> Stage:
+        starts.append(coordinates)
+        return make_stage(data, hypothesis, prior, noise, coordinates, **given)
+
+    monkeypatch.setattr(refits, "make_stage", seen)
+    made = refit(data, stage, one, NOISE, begin=near.fit)
+    assert len(starts) == 1 and np.array_equal(starts[0], near.fit.coordinates)
+    assert made.fit.chi2 == pytest.approx(plain.fit.chi2, abs=1.0)
 
 
 def test_a_rival_that_its_place_brings_ahead_goes_there_before_one_is_named(
