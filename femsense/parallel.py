@@ -74,8 +74,8 @@ def each(function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[
 def one_blas_thread() -> Iterator[None]:
     """Let BLAS take one thread a call meanwhile; a decorator, too.
 
-    The threads of a call wait for each other. On matrices as large as ours two of them gain a tenth on an idle machine; where other threads
-    are busy, ours or another program's, they take many times as long (`python benchmarks/body.py crowded`).
+    The threads of a call wait for each other. On matrices as large as ours two of them gain a fifth on an idle machine; where other threads
+    are busy, ours or another program's, they take twice as long and more (`python benchmarks/body.py crowded`).
     """
     with _blas().limit(limits=1, user_api="blas"):
         yield

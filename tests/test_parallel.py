@@ -69,7 +69,7 @@ def test_blas_takes_one_thread_while_ours_work_and_has_its_own_back_afterwards(c
 
 @pytest.mark.usefixtures("_two_blas_threads")
 def test_a_factor_is_made_with_one_thread_of_blas(monkeypatch):
-    """Two of them wait for each other: eight times as long where another program keeps a core busy."""
+    """Two of them wait for each other: twice as long where another program keeps a core busy."""
     seen = []
     whole = cholesky._factorise
     monkeypatch.setattr(cholesky, "_factorise", lambda *given: seen.append(blas_threads()) or whole(*given))
