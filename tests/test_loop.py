@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -202,3 +203,29 @@ def test_whitening_inverts_the_covariance():
     rows = whiten(noise.whitener(groups), np.repeat(np.eye(4)[:, None, :], 3, axis=1))  # (12, 4): one block an axis
     one_axis = rows.reshape(4, 3, 4)[:, 0]
     np.testing.assert_allclose(one_axis.T @ one_axis, np.linalg.inv(noise.covariance(groups)), rtol=1e-10)
+
+
+@pytest.mark.parametrize("hidden", [{"name": "stiffness", "scale": 1.25}, {"name": "cable_friction", "coefficient": 0.15}])
+def test_what_one_pull_without_unloading_cannot_tell_from_a_modulus_is_said_with_it(hidden: dict[str, Any]):
+    weightless = arm((4, 1, 1), gravity=(0.0, 0.0, 0.0))
+    inputs = np.outer(np.linspace(0.0, 2.0, 9), [1.0, 0.0, 0.0, 0.0])
+    recording, _ = record(inputs, effects=[hidden], truth=weightless, noise=3e-4)
+    loop = improve(weightless, [recording], effects=["cable_friction", "cable_gain"])
+    assert [e["name"] for e in loop.effects] == ["stiffness"]
+    pairs = [set(c["pair"]) for c in loop.confounded if "absorbed_share" in c]
+    assert pairs == [{"stiffness", "cable_friction"}, {"stiffness", "cable_gain"}]
+
+
+def test_noise_that_no_camera_has_is_said():
+    data = SimpleNamespace(robot=arm((4, 1, 1)))
+    by_noise = sys.modules["femsense.loop.conclude"]._by_noise
+    assert by_noise(data, Noise({"white": 1e-3}, "")) == ""
+    assert "Noise of 3.5 mm on a body of 100 mm is no camera's" in by_noise(data, Noise({"white": 2e-3}, ""))
+
+
+def test_a_nuisance_is_named_only_beyond_the_deviations_that_are_reported():
+    terms = ((SimpleNamespace(name="stiffness"), {}, (None,)), (SimpleNamespace(name="cable_offset"), {}, (None, None)))
+    stage = SimpleNamespace(fit=SimpleNamespace(hypothesis=SimpleNamespace(terms=terms), coordinates=np.array([0.09, 0.0, -0.4])))
+    is_sure = sys.modules["femsense.loop.conclude"]._is_sure
+    assert is_sure(stage, "stiffness", np.array([0.029])) and not is_sure(stage, "stiffness", np.array([0.031]))
+    assert is_sure(stage, "cable_offset", np.array([0.1, 0.1])) and not is_sure(stage, "cable_offset", np.array([0.1, 0.2]))
