@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from arm import arm, record, sweeps
+from arm import T_ROBOT_CAMERA, arm, record, sweeps
 from scipy.spatial.transform import Rotation
 
 from femsense.effects import apply_effects
@@ -13,7 +15,7 @@ from femsense.loop import improve
 from femsense.loop.data import prepare
 from femsense.loop.noise import Groups, Noise, _Likelihood, estimate_noise, whiten
 from femsense.loop.seats import seat_turns, with_turning_seats
-from femsense.loop.stages import make_stage, with_nuisance
+from femsense.loop.stages import make_stage, problem_of, with_nuisance
 
 HEIGHT = 3.0
 """Tension that bends the arm by 60° [N]."""
@@ -103,6 +105,19 @@ def test_both_what_is_fitted_and_what_is_held_out_knows_how_its_seats_turn():
         rows = trial.scene.frame == frame
         expected = seat_turns(data.robot, data.robot.marker_points, jet.states[frame].positions)[trial.scene.marker[rows]]
         np.testing.assert_allclose(trial.groups.turns[rows], expected, atol=1e-9)
+
+
+def test_a_declared_pose_is_trusted_to_a_millimetre_and_ten_milliradians_beside_markers():
+    inputs, labels = sweeps(HEIGHT)
+    recording, _ = record(inputs, labels=labels, truth=arm((4, 1, 1)))
+    data = prepare(arm((4, 1, 1)), [replace(recording, T_robot_camera=(T_ROBOT_CAMERA,))], [])
+    hypothesis, prior = with_nuisance(data)
+    noise = Noise({"white": 1e-4}, "")
+    stage = make_stage(data, hypothesis, prior, noise, np.zeros(len(prior.mean)), max_iterations=0)
+    rows = 3 * len(data.train[0].scene.frame)
+    pulls = problem_of(data, stage.fit, noise).rows_of(stage.fit.jets, stage.fit.fit.theta, True)[1]
+    assert pulls is not None
+    np.testing.assert_allclose(pulls[rows : rows + 6, :6], np.diag([1e2] * 3 + [1e3] * 3))
 
 
 def test_seats_that_scatter_on_an_arm_that_bends_are_no_effect():

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 DECLARED_POSE_STD = np.array([2e-3] * 3 + [3e-4] * 3)
 """How far a declared pose is trusted [rad, m] where there are clouds alone …"""
 BESIDE_MARKERS = np.array([1e-2] * 3 + [1e-3] * 3)
-"""… and where there are markers, which tell the pose much better: with the same trust a pose that was 1 mm and ½° off had zeros of cables named."""
+"""… and where there are markers, which tell the pose much better: with the same trust a pose that is 1 mm and ½° off would bend zeros of cables."""
 GRAVITY_STD = 0.1
 """How far the size of gravity is known to be 9.80665 m/s² on an unknown site [m/s²]."""
 
