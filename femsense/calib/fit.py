@@ -68,6 +68,7 @@ def gauss_newton(
     worth: float = np.inf,
     trusted: float = 0.0,
     enough: float = 0.0,
+    spare: float = 0.0,
     kinks: Callable[[FloatArray], Kinks | None] | None = None,
 ) -> FitResult:
     """Minimise ‖r(θ)‖² within bounds (Levenberg's damping where a plain step does not pay; how the residual bends, as far as its Jacobians have
@@ -94,6 +95,7 @@ def gauss_newton(
             borrowed Jacobian says that nothing is left to gain.
         trusted: a Jacobian that missed less than this share of every step since it was made is believed, too, that nothing is left to gain.
         enough: what counts as a gain in the sum of squares, in units of the misfit where that is more than noise; 0: all that `tolerance` says.
+        spare: a fit ends where a whole step, by the Jacobian at hand, promises less than this: what is asked next is worth so much more.
         kinks: θ → where the residual bends near by, for the Jacobian that was computed last.
     """
     p = len(theta)
@@ -123,7 +125,7 @@ def gauss_newton(
             status = GIVEN_UP
             break
         foretold = not slope.own and error == 1.0 and pace.next <= still
-        if foretold or idle > 1 or (small and (slope.own or slope.sure or idle)):
+        if foretold or whole < spare or idle > 1 or (small and (slope.own or slope.sure or idle)):
             status = CONVERGED
             break
         if at_end:

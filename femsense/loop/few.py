@@ -14,11 +14,11 @@ from femsense.loop.data import Data
 from femsense.loop.joint import JointFit, Trial
 from femsense.loop.noise import Noise
 from femsense.loop.screen import Candidate, Fields, screen
-from femsense.loop.stages import Stage, problem_of
+from femsense.loop.stages import Stage, problem_of, weighed
 from femsense.march import has_history
 from femsense.recording import Recording
 
-MOST_WORK = 30_000
+MOST_WORK = 20_000
 """Tetrahedra × states of a recording that are fitted as they are; where there are more, some states speak for all."""
 FEWEST = 12
 """They are as many at least …"""
@@ -88,12 +88,8 @@ def few_of(data: Data, stage: Stage, noise: Noise) -> Few:
 
 
 def _picked(data: Data, fit: JointFit, noise: Noise, rows: list[BoolArray]) -> JointFit:
-    """Return what a fit makes of some rows, which are the data (kinks are left as they are)."""
-    jets = [jet.pick(own) for jet, own in zip(fit.jets, rows)]
-    residual, jacobian = problem_of(data, fit, noise).rows_of(jets, fit.fit.theta, True)
-    assert jacobian is not None
-    own = replace(fit.fit, residual=residual, jacobian=jacobian)
-    return replace(fit, fit=own, chi2=float(residual @ residual), jets=jets)
+    """Return what a fit makes of some rows, which are the data."""
+    return weighed(data, fit, noise, [jet.pick(own) for jet, own in zip(fit.jets, rows)])
 
 
 def spread_states(trial: Trial, most: int) -> tuple[IntArray, float]:

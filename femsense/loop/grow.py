@@ -38,6 +38,8 @@ REFITS = 6
 """Candidates that are refitted in full nonlinearity at the first step; half as many later."""
 REFITTABLE = 0.04
 """A candidate of which calibration leaves less than this is not refitted."""
+ALIKE = 0.95
+"""Candidates that promise this share of what the best does are refitted in the order of their cost: to the first refit all others are held up."""
 PROMISING = 8.0
 """Linear dBIC that a candidate needs to be refitted: what is small is nearly linear, so that a refit finds about as much."""
 HINTED = 0.5
@@ -103,13 +105,11 @@ def grow(
         records.append(record)
         settled = _settled(data, candidate, ahead)
         try:
-            few = few_of(data, stage, noise) if ahead and few is None else few
-            begin: JointFit | None = None
-            if few is not None and ahead:
-                behind, begin = _in_some_states(few, candidate, max(ahead, key=lambda r: r.score), noise, settled)
-                if behind:
-                    record["verdict"] = "given up: in some of the states another one explains more by far"
-                    continue
+            few = few_of(data, stage, noise) if few is None else few
+            behind, begin = _in_some_states(few, candidate, max(ahead, key=lambda r: r.score, default=None), noise, settled)
+            if behind:
+                record["verdict"] = "given up: in some of the states another one explains more by far"
+                continue
             wanted = max(EVIDENCE, best - 2.0 * EVIDENCE)
             made = refit(data, stage, candidate, noise, wanted=wanted, settled=settled, begin=begin)
         except FemsenseError as error:
@@ -167,18 +167,22 @@ def _settled(data: Data, candidate: Candidate, ahead: Sequence[Refit]) -> bool:
     )
 
 
-def _in_some_states(few: Few, candidate: Candidate, ahead: Refit, noise: Noise, settled: bool) -> tuple[bool, JointFit | None]:
+def _in_some_states(
+    few: Few, candidate: Candidate, ahead: Refit | None, noise: Noise, settled: bool
+) -> tuple[bool, JointFit | None]:
     """Return whether a candidate that is fitted in some of the states stays as far behind another one there as ends a refit, where these spare time;
     and where that fit ended."""
     own = few.candidate(candidate, noise) if few.spares else None
     if own is None:
         return False, None
-    base, leading = few.stage.fit, few.of(ahead.stage.fit, noise)
-    wanted = max(EVIDENCE, evidence(base, leading) - ahead.candidate.cost - 2.0 * EVIDENCE)
+    base, wanted = few.stage.fit, -np.inf
+    if ahead is not None:
+        leading = few.of(ahead.stage.fit, noise)
+        wanted = max(EVIDENCE, evidence(base, leading) - ahead.candidate.cost - 2.0 * EVIDENCE)
     made = tried(few.data, few.stage, own, noise, wanted, settled=settled)
     if made is None:  # where it does not fit, all states decide
         return False, None
-    return made.fit.chi2 > worth_of(base, own, wanted, settled), made.fit
+    return ahead is not None and made.fit.chi2 > worth_of(base, own, wanted, settled), made.fit
 
 
 def _bar(ahead: Refit, candidate: Candidate) -> float:
@@ -304,14 +308,17 @@ def _added(stage: Stage) -> list[str]:
 
 
 def shortlist(table: list[Candidate], *, first: bool) -> list[Candidate]:
-    """Return the best candidate of each name, in its simplest form (or forms, if several are equally simple), the best first."""
+    """Return the best candidate of each name, in its simplest form (or forms, if several are equally simple), the best first; of those that promise
+    as much, the simplest."""
     names = list(dict.fromkeys(c.effect.name for c in table if c.score > PROMISING and c.retained >= REFITTABLE))
     chosen: list[Candidate] = []
     for name in names[: REFITS if first else (REFITS + 1) // 2]:
         forms = _forms(table, name)
         simple = min(len(c.parameters) for c in forms)
         chosen += [c for c in forms if len(c.parameters) == simple]
-    return chosen
+    best = max((c.score for c in chosen), default=0.0)
+    alike = [c for c in chosen if c.score >= ALIKE * best]
+    return sorted(alike, key=lambda c: c.cost) + [c for c in chosen if c.score < ALIKE * best]
 
 
 def _forms(table: list[Candidate], name: str) -> list[Candidate]:
@@ -350,6 +357,8 @@ def judged(
         fit_objection = f"sweeps that are left out do not speak for it ({better:+.1f} ± {spread:.1f})"
     if fit_objection is None and held < wanted:
         fit_objection = f"it does not predict the held-out data (χ² falls by {held:.1f}, by {gain:.1f} where fitted)"
+    if fit_objection is None and score + held <= EVIDENCE:  # what was not fitted speaks against it
+        fit_objection = f"too little evidence (dBIC {score:.1f}) where held-out data speak against it (χ² falls by {held:.1f})"
     least = ABOVE_MESH_IF_SURE if sure_beyond_mesh(better, spread, held, gain * held_share(data)) else ABOVE_MESH
     if fit_objection is None and moved < least * mesh:
         fit_objection = f"it moves the markers by {1e3 * moved:.3f} mm, the mesh itself by {1e3 * mesh:.3f} mm"

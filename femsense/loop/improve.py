@@ -40,6 +40,7 @@ from femsense.loop.stages import (
     rematched,
     roughly_keeping,
     screen_stage,
+    weighed,
     with_nuisance,
 )
 from femsense.loop.strays import without_strays
@@ -54,7 +55,9 @@ STATES = 5
 MATCHINGS = 4
 """Times that the rows of clouds are made again, at most."""
 ROUGHLY, STEPS = 4, 12
-"""Steps of the fit whose residual tells the noise; and at most with that, to the end."""
+"""Steps of the fit whose residual tells the noise; and at most with that, to the end …"""
+SPARED = 0.01
+"""… or to where they promise less than this share of what an effect promises on top."""
 
 
 @one_blas_thread()
@@ -221,8 +224,14 @@ def _screened(
     of what may come next: by the fields of the model before, as long as these promise nothing."""
     fields = _fields(data, stage, before, names)
     noise, n_effective = noise_of(data, stage, fields, noise)
-    stage = _again(data, stage, noise, known=stage.fit.jets)
+    stage = _again(data, stage, noise, known=stage.fit.jets, spare=_spared(data, stage, fields, noise, n_effective))
     return stage, noise, n_effective, *_scored(data, stage, fields, noise, names, n_effective)
+
+
+def _spared(data: Data, stage: Stage, fields: Fields, noise: Noise, n_effective: float) -> float:
+    """Return what a stage need not gain any more before effects are tried on top of it, since one of these promises so much more."""
+    fit = weighed(data, stage.fit, noise, stage.fit.jets)
+    return SPARED * max((c.gain for c in screen_stage(data, fit, noise, fields, n_effective)), default=0.0)
 
 
 def _fields(data: Data, stage: Stage, before: Fields | None, names: Sequence[str]) -> Fields:
@@ -291,15 +300,22 @@ def _matched(data: Data, stage: Stage, noise: Noise, *, anew: bool = False) -> t
 
 
 def _again(
-    data: Data, stage: Stage, noise: Noise, *, known: list[SceneJet] | None = None, near: list[SceneJet] | None = None
+    data: Data,
+    stage: Stage,
+    noise: Noise,
+    *,
+    known: list[SceneJet] | None = None,
+    near: list[SceneJet] | None = None,
+    spare: float = 0.0,
 ) -> Stage:
     """Return a stage fitted to other weights or rows, from where it is: with derivatives that are known there, or that are near."""
     fit, own = stage.fit, own_of(stage)
 
     def fitted(steps: int) -> Stage:
         return make_stage(
-            data, fit.hypothesis, fit.prior, noise, fit.coordinates, own=own, max_iterations=steps, known=known, near=near
-        )
+            data, fit.hypothesis, fit.prior, noise, fit.coordinates, own=own, max_iterations=steps, known=known, near=near,
+            spare=spare,
+        )  # fmt: skip
 
     return _as_far_as_held_out_states_rest(fitted, STEPS)
 

@@ -401,7 +401,7 @@ SERVES = 0.25
 def fit_jointly(
     hypothesis: Hypothesis, prior: Prior, trials: list[Trial], noise: Noise, seat_std: float, coordinates: FloatArray,
     *, own: FloatArray | None = None, max_iterations: int = 12, known: list[SceneJet] | None = None, near: list[SceneJet] | None = None,
-    worth: float = np.inf,
+    worth: float = np.inf, spare: float = 0.0,
 ) -> JointFit:  # fmt: skip
     """Fit poses, initial inputs and the coordinates of a hypothesis together, in full nonlinearity.
 
@@ -416,6 +416,7 @@ def fit_jointly(
         known: residuals and derivatives at the start, one jet a trial, where they are known.
         near: derivatives from near the start, to begin with.
         worth: χ² above which the fit is not worth derivatives of its own at the end.
+        spare: the fit ends where a step promises to lower χ² by less than this.
 
     Raises:
         DataError: no equilibrium at the start.
@@ -431,7 +432,8 @@ def fit_jointly(
     problem.scale = problem.scale if begin is None or begin[1] is None else np.linalg.norm(begin[1], axis=0)
     fit = gauss_newton(
         problem.evaluate, theta, low=low, high=high, max_iterations=max_iterations, tolerance=1e-6, still=0.2,
-        known=begin, borrowed=None if near is None else problem.rows_of(near, theta, True)[1], serves=SERVES, worth=worth, trusted=TRUSTED, enough=GAIN, kinks=problem.kinks,
+        known=begin, borrowed=None if near is None else problem.rows_of(near, theta, True)[1], serves=SERVES, worth=worth, trusted=TRUSTED, enough=GAIN, spare=spare,
+        kinks=problem.kinks,
     )  # fmt: skip
     if problem.last is None or not np.array_equal(problem.last.theta, fit.theta):
         if not fit.own:

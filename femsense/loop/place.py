@@ -14,7 +14,7 @@ from femsense.loop.data import Data
 from femsense.loop.few import few_of
 from femsense.loop.joint import JointFit
 from femsense.loop.noise import Noise
-from femsense.loop.refit import EVIDENCE, tried
+from femsense.loop.refit import EVIDENCE, refit_from, tried
 from femsense.loop.screen import Candidate, confounding, effect_fields, screen
 from femsense.loop.stages import Stage, jets_with, jets_without, make_stage, own_of, problem_of
 
@@ -45,14 +45,7 @@ def placed(
 ) -> tuple[Stage, list[float]]:
     """Return the best of a candidate's fits, that which was `made` from its own seed or one that begins where a climb ends, its seed moved on,
     and the scatter of its parameters: that of `closer`, or that over the places that explain as much where this is larger."""
-    begun, ends = [made], [end.seed for end in climbs.ends]
-    few = few_of(data, stage, noise)
-    for other in _screen_seeds(data, stage, candidate, ends, noise) if ends else []:
-        own = few.candidate(other, noise) if few.spares else None
-        near = None if own is None else tried(few.data, few.stage, own, noise)
-        there = tried(data, stage, other, noise, begin=None if near is None else near.fit)
-        if there is not None and there.fit.fit.status != GIVEN_UP:
-            begun.append(there)
+    begun = [made, *_fitted_at(data, stage, candidate, made, climbs.ends, noise)]
     moved = list[tuple[Stage, list[float]]]()
     for one in sorted(begun, key=lambda s: s.fit.chi2):
         if not moved or one.fit.chi2 < moved[0][0].fit.chi2 + 2.0 * EVIDENCE:
@@ -60,6 +53,23 @@ def placed(
     best, scatter = min(moved, key=lambda end: end[0].fit.chi2)
     values = [s.fit.coordinates[-len(scatter) :] for s, _ in moved if s.fit.chi2 < best.fit.chi2 + EVIDENCE]
     return best, np.maximum(scatter, np.std(values, axis=0)).tolist()
+
+
+def _fitted_at(
+    data: Data, stage: Stage, candidate: Candidate, made: Stage, ends: Sequence[Candidate], noise: Noise
+) -> list[Stage]:
+    """Return fits of a candidate that begin where climbs end; where some of the states spare time, of those ends only that explain as much as the
+    best in these, with what was `made` from the candidate's own seed among them."""
+    few = few_of(data, stage, noise)
+    if few.spares:
+        near = [fit for end in ends if (fit := tried(few.data, few.stage, end, noise)) is not None]
+        least = min([few.of(made.fit, noise).chi2, *(one.fit.chi2 for one in near)])
+        begins = [one for one in near if one.fit.chi2 < least + 2.0 * EVIDENCE]
+        there = [refit_from(data, stage, one.fit, noise) for one in begins]
+    else:
+        others = _screen_seeds(data, stage, candidate, [end.seed for end in ends], noise) if ends else []
+        there = [tried(data, stage, other, noise) for other in others]
+    return [one for one in there if one is not None and one.fit.fit.status != GIVEN_UP]
 
 
 def climbed(data: Data, stage: Stage, start: Candidate, noise: Noise) -> Climbs:
@@ -100,30 +110,41 @@ def _alike(a: Candidate, b: Candidate) -> bool:
     return confounding(a, b) >= same and bool(np.linalg.norm(a.step - b.step) <= apart * np.linalg.norm(b.step))
 
 
-def _scatter(seen: Sequence[Candidate], best: Candidate) -> list[float]:
-    """Return by how much the steps of those that explain nearly as much as the best scatter."""
-    steps = [c.step for c in seen if c.gain >= best.gain - max(EVIDENCE, NEARLY * best.gain)]
+def _scatter(seen: Sequence[Candidate], best: Candidate, share: float) -> list[float]:
+    """Return by how much the steps of those that explain nearly as much as the best scatter, in so large a share of the data."""
+    steps = [c.step for c in seen if c.gain >= best.gain - max(share * EVIDENCE, NEARLY * best.gain)]
     return [float(v) for v in np.std(steps, axis=0)]
 
 
 def closer(data: Data, stage: Stage, noise: Noise) -> tuple[Stage, list[float]]:
     """Return a stage whose last effect has moved to neighbours of its seed as long as these explain more where the body is as the effect
     has bent it (what a seed does to the body before that ranks neighbours of a large effect wrongly), and by how much the step of each of
-    its parameters scatters over the seeds that explain as much but for NEARLY."""
+    its parameters scatters over the seeds that explain as much but for NEARLY. Some of the states show which neighbour it may be."""
     while True:
         *_, (effect, seed, parameters) = stage.fit.hypothesis.terms
-        fields = effect_fields(stage.fit, data.train, [(effect, s, parameters) for s in effect.nearby(data.robot, seed)])
-        around = screen(without_last(stage.fit), problem_of(data, stage.fit, noise), fields, 100.0)
+        few = few_of(data, stage, noise)
+        share = float(np.mean(np.concatenate(few.rows))) if few.spares else 1.0
+        asked = (few.data, few.stage) if few.spares else (data, stage)
+        around = _seeds_instead(*asked, noise, effect.nearby(data.robot, seed))
         here = next((c for c in around if c.seed == seed), None)
         if here is None:  # it does nothing to these markers
             return stage, [0.0] * len(parameters)
         best = max(around, key=lambda c: c.gain)
-        if best.gain < here.gain + POLISHED:
-            return stage, _scatter(around, best)
-        made = _moved(data, stage, best, noise)
+        scatter = _scatter(around, best, share)
+        if best.gain < here.gain + share * POLISHED:
+            return stage, scatter
+        there = _seeds_instead(data, stage, noise, [best.seed]) if few.spares else [best]
+        made = _moved(data, stage, there[0], noise) if there else None
         if made is None or made.fit.chi2 > stage.fit.chi2 - POLISHED:
-            return stage, _scatter(around, best)
+            return stage, scatter
         stage = made
+
+
+def _seeds_instead(data: Data, stage: Stage, noise: Noise, seeds: Sequence[Entry]) -> list[Candidate]:
+    """Return the last effect of a stage at other seeds as candidates in its place, to first order where the body is."""
+    *_, (effect, _, parameters) = stage.fit.hypothesis.terms
+    fields = effect_fields(stage.fit, data.train, [(effect, s, parameters) for s in seeds])
+    return screen(without_last(stage.fit), problem_of(data, stage.fit, noise), fields, 100.0)
 
 
 def without_last(fit: JointFit) -> JointFit:

@@ -82,7 +82,7 @@ def refit(
         except DataError:
             return None
 
-    best = None if begin is None else _from(data, stage, hypothesis, prior, noise, begin, worth)
+    best = None if begin is None else refit_from(data, stage, begin, noise, worth)
     if best is not None:
         return best
     given_up: Stage | None = None
@@ -104,14 +104,12 @@ def refit(
     return found
 
 
-def _from(
-    data: Data, stage: Stage, hypothesis: Hypothesis, prior: Prior, noise: Noise, begin: JointFit, worth: float
-) -> Stage | None:
-    """Return the fit of a hypothesis from where another one ended; None where it does not fit, or does not help."""
+def refit_from(data: Data, stage: Stage, begin: JointFit, noise: Noise, worth: float = np.inf) -> Stage | None:
+    """Return the fit to all states of a hypothesis that was fitted to some of them, from where that ended; None where it has no equilibrium, or does
+    not help."""
+    coordinates, own = begin.coordinates, begin.fit.theta[: begin.own]
     try:
-        made = make_stage(
-            data, hypothesis, prior, noise, begin.coordinates, own=begin.fit.theta[: begin.own], max_iterations=10, worth=worth
-        )
+        made = make_stage(data, begin.hypothesis, begin.prior, noise, coordinates, own=own, max_iterations=10, worth=worth)
     except DataError:
         return None
     return made if made.fit.chi2 <= stage.fit.chi2 + 1.0 else None
@@ -183,4 +181,4 @@ def tried(
         return None
 
 
-__all__ = ["EVIDENCE", "FORGONE", "beyond", "evidence", "explains", "refit", "tried", "with_term", "within", "worth_of"]
+__all__ = ["EVIDENCE", "FORGONE", "beyond", "evidence", "explains", "refit", "refit_from", "tried", "with_term", "within", "worth_of"]

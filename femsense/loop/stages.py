@@ -83,11 +83,12 @@ def make_stage(
     known: list[SceneJet] | None = None,
     near: list[SceneJet] | None = None,
     worth: float = np.inf,
+    spare: float = 0.0,
 ) -> Stage:
     """Return the fit of a hypothesis and what it makes of the held-out data; arguments as of `fit_jointly`."""
     fit = fit_jointly(
         hypothesis, prior, data.train, noise, data.seat_std, coordinates,
-        own=own, max_iterations=max_iterations, known=known, near=near, worth=worth,
+        own=own, max_iterations=max_iterations, known=known, near=near, worth=worth, spare=spare,
     )  # fmt: skip
     held = held_out(data, fit, noise)
     return Stage(fit, held, rms_of([h.jet.residual for h in held]) if held else float("nan"))
@@ -301,6 +302,13 @@ def problem_of(data: Data, fit: JointFit, noise: Noise) -> JointProblem:
     return JointProblem(
         fit.hypothesis, fit.prior, data.train, [noise.whitener(t.groups, t.mesh_error) for t in data.train], data.seat_std
     )
+
+
+def weighed(data: Data, fit: JointFit, noise: Noise, jets: list[SceneJet]) -> JointFit:
+    """Return a fit, from where it is, with other weights or rows (kinks are left as they are); jets: those of the rows."""
+    residual, jacobian = problem_of(data, fit, noise).rows_of(jets, fit.fit.theta, True)
+    assert jacobian is not None
+    return replace(fit, fit=replace(fit.fit, residual=residual, jacobian=jacobian), chi2=float(residual @ residual), jets=jets)
 
 
 def noise_of(data: Data, stage: Stage, fields: Fields, before: Noise | None = None) -> tuple[Noise, float]:
