@@ -199,7 +199,7 @@ SABOTAGES = (
     S("march.py", "moves[pulling] = rest", "pass", "test_effects_derivatives.py"),
     S("march.py", "self.own.update(zip(asked, solved))", "pass", "test_effects_derivatives.py"),
     S("loop/few.py", "None if t.mesh_error is None else t.mesh_error[own]", "None", "test_loop_place.py::test_some_states_of_a_fit_are_what_a_fit_to_these_begins_with"),
-    S("loop/few.py", "every[: max(FEWEST, most)]", "every[:most]", "test_loop_place.py::test_some_states_are_spread_and_never_too_few"),
+    S("loop/states.py", "every[: max(FEWEST, most)]", "every[:most]", "test_loop_place.py::test_some_states_are_spread_and_never_too_few"),
     S("loop/screen.py", "trial.starts_on(fixed.body.mesh).update(_starts_of(trial, fixed, fixed, known.states))", "pass", "test_loop_place.py::test_fields_are_those_of_the_fit_whatever_was_solved_last"),
     S("loop/few.py", "if has_history(acting):", "if False:", "test_loop_place.py::test_a_candidate_is_the_same_to_some_states"),
     S("loop/grow.py", "                if behind:\n", "                if False:\n", "test_loop_place.py::test_rivals_that_stay_far_behind_in_some_states_are_not_fitted_to_all"),

@@ -18,7 +18,7 @@ from femsense.loop import grow as growing
 from femsense.loop import refit as refits
 from femsense.loop.data import Data, prepare
 from femsense.loop.exchange import exchanged
-from femsense.loop.few import FEWEST, Few, few_of, spread_states
+from femsense.loop.few import Few, few_of
 from femsense.loop.grow import Refit, _settled, polished
 from femsense.loop.joint import Prior
 from femsense.loop.mesh_error import with_mesh_errors
@@ -27,6 +27,7 @@ from femsense.loop.place import climbed, may_lie_elsewhere, placed
 from femsense.loop.refit import EVIDENCE, evidence, refit
 from femsense.loop.screen import Candidate, effect_fields, screen
 from femsense.loop.stages import Stage, fields_of, make_stage, own_of, problem_of, screen_stage, with_nuisance
+from femsense.loop.states import FEWEST, spread_states
 
 NOISE = Noise({"white": 1e-4}, "")
 COUNT = 300.0

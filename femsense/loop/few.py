@@ -5,27 +5,20 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.distance import cdist
 
-from femsense.arrays import BoolArray, FloatArray, IntArray
+from femsense.arrays import BoolArray
 from femsense.calib.forward import Hypothesis
 from femsense.errors import FemsenseError
 from femsense.loop.data import Data
-from femsense.loop.joint import JointFit, Trial
+from femsense.loop.joint import JointFit
 from femsense.loop.noise import Noise
 from femsense.loop.screen import Candidate, Fields, screen
 from femsense.loop.stages import Stage, problem_of, weighed
+from femsense.loop.states import MOST_WORK, spread_states
 from femsense.march import has_history
-from femsense.recording import Recording
 
-MOST_WORK = 20_000
-"""Tetrahedra × states of a recording that are fitted as they are; where there are more, some states speak for all."""
-FEWEST = 12
-"""They are as many at least …"""
 SPARED = 0.6
-"""… and no more than this share of all, or rivals are fitted on all at once."""
-SAME = 1e-9
-"""States whose inputs and loads differ by less, in units of their ranges, are one."""
+"""They are no more than this share of all, or rivals are fitted on all at once."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -92,33 +85,4 @@ def _picked(data: Data, fit: JointFit, noise: Noise, rows: list[BoolArray]) -> J
     return weighed(data, fit, noise, [jet.pick(own) for jet, own in zip(fit.jets, rows)])
 
 
-def spread_states(trial: Trial, most: int) -> tuple[IntArray, float]:
-    """Return the frames of a trial in so many of its states at most, FEWEST at least, which differ as much as they can, ascending; and the share of
-    its states that these are."""
-    frames = trial.scene.frames
-    vectors = state_vectors(trial.scene.recording, frames)
-    every = representatives(vectors, len(vectors))
-    chosen = vectors[every[: max(FEWEST, most)]]
-    return np.asarray(frames[cdist(vectors, chosen).min(axis=1) <= SAME]), len(chosen) / len(every)
-
-
-def state_vectors(recording: Recording, frames: IntArray) -> FloatArray:
-    """Return inputs, pressures, gravity and total load of each frame, each in units of its range, shape (f, q)."""
-    load = np.zeros((len(recording.time_s), 3))
-    np.add.at(load, recording.load_frame, recording.load_forces)
-    gravity = np.zeros((len(load), 0)) if recording.gravity is None else recording.gravity
-    table = np.hstack([recording.inputs, recording.pressures, gravity, load])[frames]
-    return np.asarray((table - table[0]) / np.maximum(np.ptp(table, axis=0), 1e-12))
-
-
-def representatives(vectors: FloatArray, most: int) -> list[int]:
-    """Return indices of distinct states, at most so many, spread widely (farthest-point sampling)."""
-    chosen = [0]
-    distance = np.linalg.norm(vectors - vectors[0], axis=1)
-    while len(chosen) < most and distance.max() > SAME:
-        chosen.append(int(distance.argmax()))
-        distance = np.minimum(distance, np.linalg.norm(vectors - vectors[chosen[-1]], axis=1))
-    return chosen
-
-
-__all__ = ["Few", "few_of", "representatives", "spread_states", "state_vectors"]
+__all__ = ["Few", "few_of"]

@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from dataclasses import fields, replace
 
 import numpy as np
-from scipy.interpolate import RBFInterpolator
 
 from femsense.arrays import FloatArray, IntArray
 from femsense.calib.forward import seats
@@ -23,9 +22,9 @@ from femsense.errors import DataError, FemsenseError
 from femsense.fem.body import BodyModel
 from femsense.fem.mesh import Embedding, TetMesh, embed_points
 from femsense.loop.data import Data
-from femsense.loop.few import representatives, state_vectors
 from femsense.loop.joint import Trial, normals_of, rms_of
 from femsense.loop.stages import Stage, placed, some_terms
+from femsense.loop.states import between, representatives, state_vectors
 from femsense.march import Walk, drive_of, finer_state, share_on_finer, walk_along
 from femsense.model import Robot
 from femsense.parallel import each
@@ -187,8 +186,7 @@ def _moves(
             known.append(there.positions(finer) - here.positions(states[int(frames[i])].positions))
     if not known:
         raise DataError("no state settles on the finer mesh")
-    between = RBFInterpolator(vectors[settled], np.reshape(known, (len(known), -1)), kernel="linear", degree=0)(vectors)
-    return dict(zip(frames.tolist(), between.reshape(-1, *known[0].shape)))
+    return dict(zip(frames.tolist(), between(vectors, settled, np.array(known))))
 
 
 def _chosen(vectors: FloatArray, tets: int) -> list[int]:

@@ -20,6 +20,8 @@ from femsense.errors import DataError, FemsenseError
 from femsense.fem.mesh import embed_points
 from femsense.loop.joint import JointFit, JointProblem, Prior, States, Trial, spans_of
 from femsense.loop.noise import whiten
+from femsense.loop.states import MOST_WORK, between, representatives, spread_states, state_vectors
+from femsense.march import has_history
 from femsense.model import Robot
 
 NUISANCE = ("stiffness", "cable_offset")
@@ -234,6 +236,7 @@ def _whole_change(
     """Return by how much a discrete alternative changes the residual of each trial [m], (k, c); None where it has no equilibrium.
 
     It starts from states `near`, which those of another law take the place of: laws differ less from each other than from what is declared.
+    On large meshes some of the states tell it for the markers in all.
     """
     parameters = one[2]
     robot = Hypothesis(fixed, (one,)).robot_at(np.array([p.null for p in parameters]))
@@ -242,15 +245,39 @@ def _whole_change(
     try:
         for i, (trial, jet, span) in enumerate(zip(trials, base.jets, spans_of(trials))):
             own, starts = base.fit.theta[span], _starts_of(trial, fixed, robot, near[i])
+            asked = _part_that_tells(trial, robot)
             try:
-                moved = probe.jet(trial, own, np.zeros(0), False, starts, rough=True)
+                moved = probe.jet(asked, own, np.zeros(0), False, starts, rough=True)
             except DataError:
-                moved = probe.jet(trial, own, np.zeros(0), False, starts)
-            changes.append(moved.residual - jet.residual)
+                moved = probe.jet(asked, own, np.zeros(0), False, starts)
+            whole = asked is trial
+            changes.append(moved.residual - jet.residual if whole else -_between(trial, fixed, jet.states, robot, moved.states))
             near[i] = starts if robot.body.mesh is fixed.body.mesh else near[i]
     except FemsenseError:
         return None
     return changes
+
+
+def _part_that_tells(trial: Trial, robot: Robot) -> Trial:
+    """Return a trial with some states that tell what changes in all; the whole of it where they are few, or clouds, or depend on each other."""
+    if trial.scene.crossings is not None or has_history(robot):
+        return trial
+    frames, share = spread_states(trial, MOST_WORK // len(robot.body.mesh.tets))
+    return trial if share == 1.0 else trial.part(frames)
+
+
+def _between(trial: Trial, fixed: Robot, before: States, robot: Robot, after: States) -> FloatArray:
+    """Return by how much the marker of each row of a trial moves from one robot to another [m], (k, 3), from its moves in some of the states."""
+    frames = trial.scene.frames
+    vectors = state_vectors(trial.scene.recording, frames)
+    asked = np.flatnonzero(np.isin(frames, list(after)))
+    known = asked[representatives(vectors[asked], len(asked))]  # states that come back are one
+
+    def move(k: int) -> FloatArray:
+        return robot.markers.positions(after[k].positions) - fixed.markers.positions(before[k].positions)
+
+    every = between(vectors, known, np.array([move(int(k)) for k in frames[known]]))
+    return np.asarray(every[np.searchsorted(frames, trial.scene.frame), trial.scene.marker])
 
 
 def _starts_of(trial: Trial, fixed: Robot, robot: Robot, states: States) -> States:
