@@ -26,6 +26,8 @@ from femsense.fem.linear import Factorization, factorize, factorize_definite
 from femsense.fem.turning import turned_step
 
 CONVERGED = "converged"
+TRIES = 30
+"""Newton steps of a state that is only tried: it is too far off where they do not do."""
 MOST_STEPS = 1500
 """Newton steps in all, load steps included."""
 SMALLEST_PART = 2e-3
@@ -200,7 +202,7 @@ def solve_equilibrium(
     rough = rough and start is not None
     state.single = rough or single
     shares = [s.copy() for s in state.shares]
-    status, reached = _settle(body, loads, state, max_iterations), 1.0
+    status, reached = _settle(body, loads, state, min(max_iterations, TRIES) if rough else max_iterations), 1.0
     if not rough and status not in (CONVERGED, "singular") and start is not None and start.converged and body.is_held():
         first = _loads_of(body, start, loads)
         state, status, reached = _step_loads(
