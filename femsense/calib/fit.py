@@ -95,7 +95,7 @@ def gauss_newton(
             borrowed Jacobian says that nothing is left to gain.
         trusted: a Jacobian that missed less than this share of every step since it was made is believed, too, that nothing is left to gain.
         enough: what counts as a gain in the sum of squares, in units of the misfit where that is more than noise; 0: all that `tolerance` says.
-        spare: a fit ends where a whole step, by the Jacobian at hand, promises less than this: what is asked next is worth so much more.
+        spare: a fit ends where a whole step promises less than this, by its own Jacobian or one that foretold a step: what is asked next is worth more.
         kinks: θ → where the residual bends near by, for the Jacobian that was computed last.
     """
     p = len(theta)
@@ -125,7 +125,7 @@ def gauss_newton(
             status = GIVEN_UP
             break
         foretold = not slope.own and error == 1.0 and pace.next <= still
-        if foretold or whole < spare or idle > 1 or (small and (slope.own or slope.sure or idle)):
+        if foretold or (whole < spare and slope.sure is not None) or idle > 1 or (small and (slope.own or slope.sure or idle)):
             status = CONVERGED
             break
         if at_end:

@@ -432,7 +432,7 @@ def fit_jointly(
     problem.scale = problem.scale if begin is None or begin[1] is None else np.linalg.norm(begin[1], axis=0)
     fit = gauss_newton(
         problem.evaluate, theta, low=low, high=high, max_iterations=max_iterations, tolerance=1e-6, still=0.2,
-        known=begin, borrowed=None if near is None else problem.rows_of(near, theta, True)[1], serves=SERVES, worth=worth, trusted=TRUSTED, enough=GAIN, spare=max(spare, GAIN),
+        known=begin, borrowed=None if near is None else problem.rows_of(near, theta, True)[1], serves=SERVES, worth=worth, trusted=TRUSTED, enough=GAIN, spare=spare,
         kinks=problem.kinks,
     )  # fmt: skip
     if problem.last is None or not np.array_equal(problem.last.theta, fit.theta):

@@ -28,6 +28,8 @@ STRAYED = 2.0
 """… or where this has gone so many of the standard deviations known beforehand, for the sake of what is missing …"""
 EXPLAINS = 1.25
 """… and an effect leaves more than this mean square from there, in units of the noise. Until one leaves less, linear scores say little."""
+LEFT = 0.5
+"""What a refit may leave to be gained in χ²: the winner is fitted to the end when the next effect is sought."""
 FORGONE = 2.0, 1.25
 """A refit is given up where the evidence in sight is too little by this much and this factor."""
 
@@ -77,7 +79,7 @@ def refit(
             coordinates = np.concatenate([theta[stage.fit.own :], null + part * (start - null)])
             return make_stage(
                 data, hypothesis, prior, noise, coordinates,
-                own=theta[: stage.fit.own], max_iterations=10, known=known, near=near, worth=worth,
+                own=theta[: stage.fit.own], max_iterations=10, known=known, near=near, worth=worth, spare=LEFT,
             )  # fmt: skip
         except DataError:
             return None
@@ -109,7 +111,9 @@ def refit_from(data: Data, stage: Stage, begin: JointFit, noise: Noise, worth: f
     not help."""
     coordinates, own = begin.coordinates, begin.fit.theta[: begin.own]
     try:
-        made = make_stage(data, begin.hypothesis, begin.prior, noise, coordinates, own=own, max_iterations=10, worth=worth)
+        made = make_stage(
+            data, begin.hypothesis, begin.prior, noise, coordinates, own=own, max_iterations=10, worth=worth, spare=LEFT
+        )
     except DataError:
         return None
     return made if made.fit.chi2 <= stage.fit.chi2 + 1.0 else None
@@ -181,4 +185,16 @@ def tried(
         return None
 
 
-__all__ = ["EVIDENCE", "FORGONE", "beyond", "evidence", "explains", "refit", "refit_from", "tried", "with_term", "within", "worth_of"]
+__all__ = [
+    "EVIDENCE",
+    "FORGONE",
+    "beyond",
+    "evidence",
+    "explains",
+    "refit",
+    "refit_from",
+    "tried",
+    "with_term",
+    "within",
+    "worth_of",
+]
