@@ -11,19 +11,20 @@ from arm import arm, record, sweeps
 
 from femsense.calib.fit import GIVEN_UP
 from femsense.calib.forward import Hypothesis
-from femsense.effects import find_effect
+from femsense.effects import apply_effects, find_effect
 from femsense.fem import linear
 from femsense.loop import few, place
 from femsense.loop import grow as growing
 from femsense.loop import refit as refits
+from femsense.loop import screen as screening
 from femsense.loop.data import Data, prepare
 from femsense.loop.exchange import exchanged
 from femsense.loop.few import Few, few_of
 from femsense.loop.grow import Refit, _settled, polished
-from femsense.loop.joint import Prior
+from femsense.loop.joint import Prior, Trial, rms_of
 from femsense.loop.mesh_error import with_mesh_errors
 from femsense.loop.noise import Noise
-from femsense.loop.place import climbed, may_lie_elsewhere, placed
+from femsense.loop.place import climbed, closer, may_lie_elsewhere, placed
 from femsense.loop.refit import EVIDENCE, evidence, refit
 from femsense.loop.screen import Candidate, effect_fields, screen
 from femsense.loop.stages import Stage, fields_of, make_stage, own_of, problem_of, screen_stage, with_nuisance
@@ -311,3 +312,80 @@ def test_a_term_taken_out_leaves_the_others_where_they_are(started: tuple[Data, 
         effect_fields(made.fit, data.train, [(one.effect, one.seed, one.parameters)]),
         COUNT,
     )
+
+
+@pytest.mark.usefixtures("some")
+def test_where_a_climb_ends_a_fit_to_all_states_is_made_if_some_of_them_are_for_it(
+    started: tuple[Data, Stage], monkeypatch: pytest.MonkeyPatch
+):
+    data, stage = started
+    far = max(payloads(data, stage)[:6], key=off)
+    begun, climbs = refit(data, stage, far, NOISE), climbed(data, stage, far, NOISE)
+    best, _ = placed(data, stage, far, begun, climbs, NOISE)
+    assert np.linalg.norm(np.subtract(best.fit.hypothesis.terms[-1][1]["point_m"], HIDDEN[0]["point_m"])) < 0.004
+    assert len(best.fit.fit.residual) == len(begun.fit.fit.residual)
+    whole = list[np.ndarray]()
+    monkeypatch.setattr(place, "refit_from", lambda data, stage, fit, noise: whole.append(fit.coordinates))
+    there = place._fitted_at(data, stage, far, begun, climbs.ends, NOISE)
+    assert whole and not there
+    whole.clear()
+    own = few_of(data, stage, NOISE).candidate(far, NOISE)
+    assert own is not None and not place._fitted_at(data, stage, far, best, [own], NOISE)  # what was made explains more by far
+    assert not whole
+
+
+def test_a_place_moves_on_as_some_of_the_states_have_it(started: tuple[Data, Stage], some: Few, monkeypatch: pytest.MonkeyPatch):
+    data, stage = started
+    far = max(payloads(data, stage)[:6], key=off)
+    made = refit(data, stage, far, NOISE)
+    moved, scatter = closer(data, made, NOISE)
+    monkeypatch.setattr(few, "MOST_WORK", 10**9)
+    expected, wide = closer(data, made, NOISE)
+    assert moved.fit.hypothesis.terms[-1][1] == expected.fit.hypothesis.terms[-1][1]
+    assert moved.fit.chi2 == pytest.approx(expected.fit.chi2, abs=1.0)
+    np.testing.assert_allclose(scatter, wide, rtol=0.5)
+
+
+def test_another_law_is_told_by_some_of_the_states(started: tuple[Data, Stage], monkeypatch: pytest.MonkeyPatch):
+    data, stage = started
+    law = next(f for f in data.forms if f.name == "hyperelastic" and f.discrete)
+    seed = law.seeds(data.robot)[0]
+    todo, asked, part = [(law, seed, law.parameters(data.robot, data.control))], list[int](), Trial.part
+
+    def change() -> np.ndarray:
+        return effect_fields(stage.fit, data.train, todo).raw[0][:, :, 0]
+
+    whole, tets = change(), len(data.robot.body.mesh.tets)
+    monkeypatch.setattr(screening, "MOST_WORK", FEWEST * tets)
+    monkeypatch.setattr(Trial, "part", lambda trial, frames: (asked.append(len(frames)), part(trial, frames))[1])
+    between = change()
+    assert asked and asked[0] < 0.6 * len(data.train[0].scene.frames)
+    assert 0.0 < rms_of([between - whole]) < 0.25 * rms_of([whole])
+    exact = np.isin(data.train[0].scene.frame, spread_states(data.train[0], FEWEST)[0])
+    assert rms_of([(between - whole)[exact]]) < 0.02 * rms_of([whole])
+    rubbing = apply_effects(data.robot, [{"name": "cable_friction", "coefficient": 0.2}])
+    assert screening._part_that_tells(data.train[0], rubbing) is data.train[0]  # states there need those before
+
+
+def test_what_promises_as_much_is_refitted_in_the_order_of_its_cost(started: tuple[Data, Stage]):
+    data, stage = started
+    one, *_ = payloads(data, stage)
+    gain = screen_stage(data, stage.fit, NOISE, fields_of(data, stage, ["cable_gain"]), COUNT)[0]
+    for share, names in ((0.96, ["cable_gain", "payload"]), (0.94, ["payload", "cable_gain"])):
+        second = replace(gain, score=share * one.score, retained=1.0)
+        assert second.cost < one.cost
+        assert [c.effect.name for c in growing.shortlist([one, second], first=True)] == names
+
+
+@pytest.mark.parametrize(("score", "passes"), [(16.0, True), (14.0, False)])
+def test_held_out_data_that_speak_against_an_effect_count(
+    started: tuple[Data, Stage], monkeypatch: pytest.MonkeyPatch, score: float, passes: bool
+):
+    data, stage = started
+    one = payloads(data, stage)[0]
+    made = refit(data, stage, one, NOISE)
+    dear = replace(one, cost=evidence(stage.fit, made.fit) - score)
+    monkeypatch.setattr(growing, "held_shift", lambda *given: 6.25)  # it acts little there, so that chance may have it
+    monkeypatch.setattr(growing, "held_chi2", lambda data, at, noise: 5.0 * (at is made))
+    verdict = growing.judged(data, stage, dear, made, {}, NOISE).record["verdict"]
+    assert verdict == "passes" if passes else "held-out data speak against it" in verdict
