@@ -300,3 +300,14 @@ def test_a_held_cable_moves_a_body_on_which_nothing_at_all_acts_at_rest(law: str
     assert not internal(body, np.array(mesh.nodes)).forces.any()
     state = solve_equilibrium(body, shortening={"c": 0.01})
     assert state.converged and state.tension["c"] > 1.0 and abs(state.shortening["c"] - 0.01) < 1e-9
+
+
+def test_a_state_that_is_only_tried_is_given_up_after_some_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    body = bar_body(block_mesh((5, 2, 2), (LENGTH, WIDTH, SIDE)))
+    rest = solve_equilibrium(body)
+    pull = dict.fromkeys(body.cable_names, 0.5)
+    assert solve_equilibrium(body, tension=pull, start=rest, rough=True).converged
+    monkeypatch.setattr(equilibrium, "TRIES", 1)
+    tried = solve_equilibrium(body, tension=pull, start=rest, rough=True)
+    assert tried.status == "iterations" and tried.iterations == 1
+    assert solve_equilibrium(body, tension=pull, start=rest).converged  # what is not only tried goes on

@@ -348,3 +348,18 @@ def test_a_place_moves_on_where_the_body_is_as_the_load_has_bent_it():
     assert whole.fit.hypothesis.entries(whole.fit.coordinates)[-1]["point_m"] == found[3:].tolist()
     off = np.abs(found - [*hidden["force_n"], *hidden["point_m"]])
     assert np.all(off[3:] < 0.001) and np.all(off < 4.0 * std)
+
+
+def test_a_model_on_top_of_which_much_is_promised_need_not_be_fitted_to_the_end():
+    data, stage = started()
+    rough = make_stage(data, stage.fit.hypothesis, stage.fit.prior, NOISE, np.zeros(len(stage.fit.coordinates)), max_iterations=1)
+    fields = fields_of(data, rough, ["payload", "cable_gain"])
+    best = max(c.gain for c in screen_stage(data, rough.fit, NOISE, fields, COUNT))
+    spare = improving._spared(data, rough, fields, NOISE, COUNT)
+    assert spare == pytest.approx(improving.SPARED * best)
+    finer = replace(NOISE, std={"white": 1e-5})
+    assert improving._spared(data, rough, fields, finer, COUNT) > 50.0 * spare  # by the noise that is known now
+    known = rough.fit.jets
+    whole, part = (improving._again(data, rough, NOISE, known=known, spare=s) for s in (0.0, 100.0 * spare))
+    assert len(part.fit.fit.cost) < len(whole.fit.fit.cost) and part.fit.chi2 < whole.fit.chi2 + 100.0 * spare
+    assert part.fit.fit.status == "converged"

@@ -14,7 +14,7 @@ from femsense.errors import FemsenseError
 from femsense.loop.advice import next_element
 from femsense.loop.data import Data
 from femsense.loop.evidence import KINDS, gather, own_size
-from femsense.loop.grow import at_edge, held_share, largest_z
+from femsense.loop.grow import at_edge
 from femsense.loop.joint import Trial, heads_of, normal_rms_of, rms_of, vectors_of
 from femsense.loop.mesh_error import few_states, mesh_errors
 from femsense.loop.noise import Noise, whiten
@@ -38,8 +38,6 @@ FAR_BETTER = 50.0
 """… or, where the mesh's own error is what is larger, if χ² of the held-out data falls by so much."""
 BEYOND_NOISE = 1.2
 """Held-out errors that are so many times the noise need another reason."""
-SURELY = 5.0
-"""What held-out data are expected to miss by so many times the evidence that is wanted need not be tried."""
 EXPLAINED = 0.8
 """Share of the excess over the noise that effects must take away where structure is left."""
 MOSTLY = 0.9
@@ -179,13 +177,8 @@ def _may_be_handed_back(data: Data, search: Search, back: Stage) -> bool:
 def _with_modulus(data: Data, search: Search, names: list[str], *, sizes_still: bool) -> tuple[list[str], Stage | None]:
     """Return names with the model of just these; with the modulus beside effects if it moved significantly there, by whatever share (zeros that are
     not named may have moved in its place), and held-out data miss it."""
-    alone = "stiffness" in names or not _has_effects(names)
-    if not alone and sizes_still and _is_surely_missed(data, search.final, "stiffness"):
-        along = _handed_back(data, search.final, ["stiffness", *names], search.noise, sizes_still=True)
-        if along is not None:
-            return ["stiffness", *names], along
     back = _handed_back(data, search.final, names, search.noise, sizes_still=sizes_still)
-    if back is None or alone:
+    if back is None or "stiffness" in names or not _has_effects(names):
         return names, back
     if sizes_still and not moved_nuisance(data, search.final, "stiffness", relevant=0.0):
         return names, back
@@ -194,12 +187,6 @@ def _with_modulus(data: Data, search: Search, names: list[str], *, sizes_still: 
         return names, back
     missed = held_chi2(data, back, search.noise) - held_chi2(data, along, search.noise) > EVIDENCE
     return (["stiffness", *names], along) if missed else (names, back)
-
-
-def _is_surely_missed(data: Data, stage: Stage, name: str) -> bool:
-    """Return whether held-out data would miss a nuisance by far: without it χ² of the fitted ones grows by z² at least, that of the others by their
-    share of it."""
-    return largest_z(stage, name) ** 2 * held_share(data) > SURELY * EVIDENCE
 
 
 def _has_effects(names: Iterable[str]) -> bool:

@@ -402,10 +402,10 @@ def sure_beyond_mesh(better: float, spread: float, held: float, expected: float)
 
 def _taken_over(before: Stage, after: Stage) -> list[str]:
     """Return the nuisances that are significant before an effect is added, and not after."""
-    return [n for n in NUISANCE if largest_z(before, n) > 3.0 and largest_z(after, n) < 3.0]
+    return [n for n in NUISANCE if _z(before, n) > 3.0 and _z(after, n) < 3.0]
 
 
-def largest_z(stage: Stage, name: str) -> float:
+def _z(stage: Stage, name: str) -> float:
     """Return by how many standard deviations the values of a nuisance differ from none, at most."""
     part = span_of(stage.fit, name)
     return float(np.max(np.abs(stage.fit.coordinates[part]) / np.maximum(stage.fit.std[part], 1e-300), initial=0.0))
@@ -539,7 +539,6 @@ __all__ = [
     "grow",
     "held_share",
     "judged",
-    "largest_z",
     "mesh_cost",
     "moved_by",
     "polished",
