@@ -12,7 +12,7 @@ from arm import arm, record, sweeps
 
 from femsense.calib.forward import Hypothesis
 from femsense.effects import find_effect
-from femsense.loop import grow
+from femsense.loop import few, grow
 from femsense.loop import refit as refits
 from femsense.loop.data import Data, prepare
 from femsense.loop.exchange import exchanged
@@ -350,11 +350,13 @@ def test_a_place_moves_on_where_the_body_is_as_the_load_has_bent_it():
     assert np.all(off[3:] < 0.001) and np.all(off < 4.0 * std)
 
 
-def test_a_model_on_top_of_which_much_is_promised_need_not_be_fitted_to_the_end():
+def test_a_model_on_top_of_which_much_is_promised_need_not_be_fitted_to_the_end(monkeypatch: pytest.MonkeyPatch):
     data, stage = started()
     rough = make_stage(data, stage.fit.hypothesis, stage.fit.prior, NOISE, np.zeros(len(stage.fit.coordinates)), max_iterations=1)
     fields = fields_of(data, rough, ["payload", "cable_gain"])
     best = max(c.gain for c in screen_stage(data, rough.fit, NOISE, fields, COUNT))
+    assert improving._spared(data, rough, fields, NOISE, COUNT) == 0.0  # all states are little work
+    monkeypatch.setattr(few.Few, "spares", True)
     spare = improving._spared(data, rough, fields, NOISE, COUNT)
     assert spare == pytest.approx(improving.SPARED * best)
     finer = replace(NOISE, std={"white": 1e-5})

@@ -23,6 +23,7 @@ from femsense.errors import DataError, FemsenseError
 from femsense.loop.conclude import Search, conclude
 from femsense.loop.data import Data, prepare
 from femsense.loop.exchange import BETTER, exchanged
+from femsense.loop.few import few_of
 from femsense.loop.grow import Progress, Refit, grow, mesh_cost, moved_by, prune, shortlist
 from femsense.loop.joint import Prior
 from femsense.loop.mesh_error import errs_alike, few_states, make_finer, with_mesh_errors
@@ -57,7 +58,7 @@ MATCHINGS = 4
 ROUGHLY, STEPS = 4, 12
 """Steps of the fit whose residual tells the noise; and at most with that, to the end …"""
 SPARED = 0.01
-"""… or to where they promise less than this share of what an effect promises on top."""
+"""… or, on large meshes, to where they promise less than this share of what an effect promises on top."""
 
 
 @one_blas_thread()
@@ -229,7 +230,10 @@ def _screened(
 
 
 def _spared(data: Data, stage: Stage, fields: Fields, noise: Noise, n_effective: float) -> float:
-    """Return what a stage need not gain any more before effects are tried on top of it, since one of these promises so much more."""
+    """Return what a stage need not gain any more before effects are tried on top of it, since one of these promises so much more; nothing where all
+    states are little work."""
+    if not few_of(data, stage, noise).spares:
+        return 0.0
     fit = weighed(data, stage.fit, noise, stage.fit.jets)
     return SPARED * max((c.gain for c in screen_stage(data, fit, noise, fields, n_effective)), default=0.0)
 

@@ -29,7 +29,7 @@ STRAYED = 2.0
 EXPLAINS = 1.25
 """… and an effect leaves more than this mean square from there, in units of the noise. Until one leaves less, linear scores say little."""
 LEFT = 0.5
-"""What a refit may leave to be gained in χ²: the winner is fitted to the end when the next effect is sought."""
+"""What a refit to all states, begun where one to some of them ended, may leave to be gained in χ²: the winner is fitted to the end."""
 FORGONE = 2.0, 1.25
 """A refit is given up where the evidence in sight is too little by this much and this factor."""
 
@@ -79,7 +79,7 @@ def refit(
             coordinates = np.concatenate([theta[stage.fit.own :], null + part * (start - null)])
             return make_stage(
                 data, hypothesis, prior, noise, coordinates,
-                own=theta[: stage.fit.own], max_iterations=10, known=known, near=near, worth=worth, spare=LEFT,
+                own=theta[: stage.fit.own], max_iterations=10, known=known, near=near, worth=worth,
             )  # fmt: skip
         except DataError:
             return None
