@@ -182,7 +182,7 @@ def _in_some_states(
     made = tried(few.data, few.stage, own, noise, wanted, settled=settled)
     if made is None:  # where it does not fit, all states decide
         return False, None
-    return ahead is not None and made.fit.chi2 > worth_of(base, own, wanted, settled), made.fit
+    return made.fit.chi2 > worth_of(base, own, wanted, settled), made.fit
 
 
 def _bar(ahead: Refit, candidate: Candidate) -> float:
@@ -317,8 +317,7 @@ def shortlist(table: list[Candidate], *, first: bool) -> list[Candidate]:
         simple = min(len(c.parameters) for c in forms)
         chosen += [c for c in forms if len(c.parameters) == simple]
     best = max((c.score for c in chosen), default=0.0)
-    alike = [c for c in chosen if c.score >= ALIKE * best]
-    return sorted(alike, key=lambda c: c.cost) + [c for c in chosen if c.score < ALIKE * best]
+    return sorted(chosen, key=lambda c: c.cost if c.score >= ALIKE * best else np.inf)
 
 
 def _forms(table: list[Candidate], name: str) -> list[Candidate]:
