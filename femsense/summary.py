@@ -140,7 +140,7 @@ def loop_text(document: Mapping[str, Any]) -> str:
     for effect in document.get("effects") or []:
         lines += ["", effect_text(effect)]
     for title, said in (
-        ("cannot be told apart", ", ".join(" / ".join(p["pair"]) for p in document.get("confounded") or ())),
+        ("cannot be told apart", ", ".join(" / ".join(pair) for pair in _open_pairs(document))),
         ("not testable", ", ".join(map(_untestable, document.get("not_testable") or ()))),
         ("next experiment", document.get("next_experiment")),
     ):
@@ -148,6 +148,13 @@ def loop_text(document: Mapping[str, Any]) -> str:
             lines += ["", f"{title}: {said}"]
     left = _left(document.get("left") or {})
     return "\n".join([*lines, "", f"what is left: {left}"] if left else lines)
+
+
+def _open_pairs(document: Mapping[str, Any]) -> list[list[str]]:
+    """Return the pairs that the data cannot tell apart: those of what is named, or all where nothing is."""
+    names = {str(effect["name"]) for effect in document.get("effects") or ()}
+    pairs = [p["pair"] for p in document.get("confounded") or ()]
+    return [pair for pair in pairs if names & set(pair) or not names]
 
 
 def _untestable(effect: Mapping[str, Any]) -> str:

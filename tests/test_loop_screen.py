@@ -16,12 +16,12 @@ from femsense.errors import DataError
 from femsense.fem.equilibrium import solve_equilibrium
 from femsense.fem.mesh import to_linear
 from femsense.loop import conclude, improve, joint
-from femsense.loop.conclude import Search
 from femsense.loop.data import Data, prepare
 from femsense.loop.joint import Jets, JointProblem, Prior
 from femsense.loop.noise import Noise, whiten
 from femsense.loop.refit import with_term
 from femsense.loop.screen import effect_fields
+from femsense.loop.search import Search
 from femsense.loop.stages import Stage, make_stage, with_nuisance
 from femsense.model import Robot
 

@@ -20,11 +20,13 @@ from femsense.loop.mesh_error import few_states, mesh_errors
 from femsense.loop.noise import Noise, whiten
 from femsense.loop.refit import EVIDENCE
 from femsense.loop.result import LoopResult
-from femsense.loop.screen import NUISANCE, TESTABLE, Candidate, confounding, one_each
+from femsense.loop.rivals import confounded, in_words
+from femsense.loop.screen import NUISANCE, TESTABLE, Candidate, one_each
+from femsense.loop.search import Search
 from femsense.loop.spread import spreads
 from femsense.loop.stages import Stage, held_chi2, held_out, keeping, roughly_keeping, span_of, with_seeds_still, with_sizes_still
 from femsense.loop.structure import beyond_mesh, describe_left, structure_tests, without_mesh_error
-from femsense.loop.zeros import SIGNIFICANT, InPlace, moved_nuisance, zeros_are_evident
+from femsense.loop.zeros import SIGNIFICANT, moved_nuisance, zeros_are_evident
 
 MIN_SWEEPS = 4
 """With fewer held-out sweeps the interval of the held-out error resamples frames."""
@@ -40,32 +42,10 @@ BEYOND_NOISE = 1.2
 """Held-out errors that are so many times the noise need another reason."""
 EXPLAINED = 0.8
 """Share of the excess over the noise that effects must take away where structure is left."""
-MOSTLY = 0.9
-"""Share of an effect's field, beyond poses, that a named nuisance imitates on its own where the two are said together."""
 GROSS = 0.03
 """Noise of more than this share of the body's reach is said to be suspicious."""
 LACKS = 2.0
 """A model that is handed back may leave so many times the mean square, in units of all noise, that calibration of all nuisances leaves."""
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Search:
-    """What the search went through."""
-
-    before: Stage
-    """The declared model, calibrated."""
-    history: list[tuple[str, Stage]]
-    """("", the model with what calibration may move), then each effect with the stage that added it."""
-    final: Stage
-    noise: Noise
-    n_effective: float
-    first: list[Candidate]
-    """The first screening."""
-    last: list[Candidate]
-    """The last one."""
-    refits: list[dict[str, Any]]
-    in_place: InPlace | None
-    """What might be in the place of the cable zeros."""
 
 
 def conclude(data: Data, search: Search, rng: np.random.Generator) -> LoopResult:
@@ -92,7 +72,7 @@ def conclude(data: Data, search: Search, rng: np.random.Generator) -> LoopResult
         or (tests.significant and excess.left > excess.tolerated and (strayed or excess.explained < EXPLAINED))
     )
     verdict = "unexplained" if unexplained else "effects" if effects else "none"
-    rivals = _confounded(search, names)
+    rivals = confounded(search, names)
     not_testable = [
         {"name": c.effect.name, "absorbed_share": float(np.sqrt(max(0.0, 1.0 - c.retained**2))), "retained_share": c.retained}
         for c in one_each(search.first)
@@ -105,6 +85,7 @@ def conclude(data: Data, search: Search, rng: np.random.Generator) -> LoopResult
     return LoopResult(
         verdict=verdict,
         sentence=_sentence(verdict, effects, found, before, back, noise, _mesh_error(data))
+        + in_words(rivals, names)
         + _by_noise(data, noise)
         + _by_mesh(data, search, back)
         + _on_linear(data, back)
@@ -425,62 +406,6 @@ def _why_not(c: Candidate, end: Candidate | None) -> str:
     if c.score > EVIDENCE:
         return f"not refitted: far behind the best (dBIC {c.score:.0f})"
     return f"too little evidence (dBIC {c.score:.1f})"
-
-
-def _confounded(search: Search, names: list[str]) -> list[dict[str, Any]]:
-    """Return pairs that these data cannot tell apart: fields that agree, or refits whose evidence is within 10 of the named one."""
-    pairs = []
-    first = search.first
-    rivals = [r for r in search.refits if r["name"] not in names and r.get("verdict") == "passes"]
-    for own in (
-        r for r in search.refits if r["name"] in names and (r.get("verdict") == "named" or r.get("in_place_of") == r["name"])
-    ):
-        pairs += [
-            {"pair": [own["name"], r["name"]], "dbic_gap": float(own["dbic"] - r["dbic"])}
-            for r in rivals
-            if (r["step"], r.get("in_place_of")) == (own["step"], own.get("in_place_of")) and r["dbic"] > own["dbic"] - EVIDENCE
-        ]
-    for name in (n for n in names if n in NUISANCE):
-        pairs += [{"pair": [name, other], "absorbed_share": share} for other, share in _swallowed(search, name).items()]
-    for name in (n for n in names if n in NUISANCE):
-        pairs += [
-            {"pair": [name, r["name"]], "dbic_gap": 0.0}
-            for r in search.refits
-            if name in r.get("takes_over", []) and r["name"] not in names and r["dbic"] > EVIDENCE
-        ]
-    if search.in_place is not None and abs(search.in_place.ahead) < EVIDENCE:
-        other = search.in_place.name
-        pairs += [
-            {"pair": pair, "dbic_gap": abs(search.in_place.ahead)} for pair in [["cable_offset", other]] if set(pair) & set(names)
-        ]
-    if {"cable_offset", "cable_slack"} & set(names) and any(c.effect.name == "cable_slack" for c in first):
-        pairs.append({"pair": ["cable_offset", "cable_slack"], "cosine": 1.0})  # play is a negative zero of the displacement
-    ones = one_each(first)
-    for i, a in enumerate(ones):
-        for b in ones[i + 1 :]:
-            if a.retained < TESTABLE or b.retained < TESTABLE or len(b.parameters) > 6 or len(a.parameters) > 6:
-                continue
-            share = min(confounding(a, b), confounding(b, a))
-            if share > 0.95:
-                pairs.append({"pair": [a.effect.name, b.effect.name], "cosine": share})
-    return pairs
-
-
-def _swallowed(search: Search, name: str) -> dict[str, float]:
-    """Return the effects that this recording cannot test because one nuisance imitates most of each, with the share that calibration absorbs."""
-    fit = search.history[0][1].fit
-    J, found = np.asarray(fit.fit.jacobian), dict[str, float]()
-    poses, own = np.linalg.qr(J[:, : fit.own])[0], J[:, fit.own :][:, span_of(fit, name)]
-    own = own - poses @ (poses.T @ own)
-    for c in (
-        c for c in one_each(search.first) if c.retained < TESTABLE and c.effect.name not in search.final.fit.hypothesis.names
-    ):
-        whole = c.columns - J @ c.response
-        whole = whole - poses @ (poses.T @ whole)
-        left = whole - own @ np.linalg.lstsq(own, whole, rcond=None)[0]
-        if np.linalg.norm(left) < (1.0 - MOSTLY**2) ** 0.5 * np.linalg.norm(whole):
-            found[c.effect.name] = float(np.sqrt(1.0 - c.retained**2))
-    return found
 
 
 def _detectable(table: list[Candidate], found: set[str]) -> dict[str, Any]:

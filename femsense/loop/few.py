@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from femsense.arrays import BoolArray
+from femsense.arrays import BoolArray, IntArray
 from femsense.calib.forward import Hypothesis
 from femsense.errors import FemsenseError
 from femsense.loop.data import Data
@@ -16,6 +16,7 @@ from femsense.loop.screen import Candidate, Fields, screen
 from femsense.loop.stages import Stage, problem_of, weighed
 from femsense.loop.states import MOST_WORK, spread_states
 from femsense.march import has_history
+from femsense.model import Robot
 
 SPARED = 0.6
 """They are no more than this share of all, or rivals are fitted on all at once."""
@@ -30,14 +31,8 @@ class Few:
     stage: Stage
     rows: list[BoolArray]
     """Which rows of each trial are theirs, shape (k,)."""
-    share: float
-    """How many of all distinct states they are."""
-
-    @property
-    def spares(self) -> bool:
-        """Whether they are few enough to spare time: where a state depends on those before, all of these are solved, too."""
-        fit = self.stage.fit
-        return self.share < SPARED and not has_history(fit.hypothesis.robot_at(fit.coordinates))
+    spares: bool
+    """Whether they are few enough to spare time."""
 
     def of(self, fit: JointFit, noise: Noise) -> JointFit:
         """Return what another fit makes of these states."""
@@ -62,22 +57,32 @@ class Few:
         return replace(seen[0], cost=candidate.cost) if seen else None
 
 
+def spares(data: Data, robot: Robot) -> bool:
+    """Return whether some states of a robot, which speak for all, are few enough to spare time: where a state depends on those before, all of these
+    are solved, too."""
+    return _chosen(data, robot)[1] < SPARED and not has_history(robot)
+
+
+def _chosen(data: Data, robot: Robot) -> tuple[list[IntArray], float]:
+    """Return the frames of these states, of each trial, and how many of all distinct states they are."""
+    chosen = [spread_states(t, MOST_WORK // len(robot.body.mesh.tets)) for t in data.train]
+    return [frames for frames, _ in chosen], float(np.mean([share for _, share in chosen]))
+
+
 def few_of(data: Data, stage: Stage, noise: Noise) -> Few:
     """Return some states of a stage that differ as much as they can, or all of them where these are not too much work."""
-    tets = len(stage.fit.hypothesis.robot.body.mesh.tets)
-    chosen = [spread_states(t, MOST_WORK // tets) for t in data.train]
-    frames = [few for few, _ in chosen]
+    robot = stage.fit.hypothesis.robot_at(stage.fit.coordinates)
+    frames, _ = _chosen(data, robot)
     rows = [np.isin(t.scene.frame, few) for t, few in zip(data.train, frames)]
-    bare = replace(data, held=[], held_of=[])
+    bare, less = replace(data, held=[], held_of=[]), spares(data, robot)
     if all(own.all() for own in rows):
-        return Few(bare, stage, rows, 1.0)
+        return Few(bare, stage, rows, less)
     trials = [
         replace(t.part(few), mesh_error=None if t.mesh_error is None else t.mesh_error[own])
         for t, few, own in zip(data.train, frames, rows)
     ]
     part = replace(bare, train=trials)
-    share = float(np.mean([share for _, share in chosen]))
-    return Few(part, Stage(_picked(part, stage.fit, noise, rows), [], float("nan")), rows, share)
+    return Few(part, Stage(_picked(part, stage.fit, noise, rows), [], float("nan")), rows, less)
 
 
 def _picked(data: Data, fit: JointFit, noise: Noise, rows: list[BoolArray]) -> JointFit:
@@ -85,4 +90,4 @@ def _picked(data: Data, fit: JointFit, noise: Noise, rows: list[BoolArray]) -> J
     return weighed(data, fit, noise, [jet.pick(own) for jet, own in zip(fit.jets, rows)])
 
 
-__all__ = ["Few", "few_of"]
+__all__ = ["Few", "few_of", "spares"]

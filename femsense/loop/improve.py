@@ -20,10 +20,10 @@ import numpy as np
 from femsense.calib.forward import Hypothesis, SceneJet
 from femsense.effects import EFFECTS, FORMS, Effect, find_effect, load_own_effect
 from femsense.errors import DataError, FemsenseError
-from femsense.loop.conclude import Search, conclude
+from femsense.loop.conclude import conclude
 from femsense.loop.data import Data, prepare
 from femsense.loop.exchange import BETTER, exchanged
-from femsense.loop.few import few_of
+from femsense.loop.few import spares
 from femsense.loop.grow import Progress, Refit, grow, mesh_cost, moved_by, prune, shortlist
 from femsense.loop.joint import Prior
 from femsense.loop.mesh_error import errs_alike, few_states, make_finer, with_mesh_errors
@@ -31,6 +31,7 @@ from femsense.loop.noise import Noise
 from femsense.loop.refit import EVIDENCE, evidence
 from femsense.loop.result import LoopResult
 from femsense.loop.screen import Candidate, Fields
+from femsense.loop.search import Search
 from femsense.loop.seats import with_turning_seats
 from femsense.loop.stages import (
     Stage,
@@ -232,7 +233,7 @@ def _screened(
 def _spared(data: Data, stage: Stage, fields: Fields, noise: Noise, n_effective: float) -> float:
     """Return what a stage need not gain any more before effects are tried on top of it, since one of these promises so much more; nothing where all
     states are little work."""
-    if not few_of(data, stage, noise).spares:
+    if not spares(data, stage.fit.hypothesis.robot_at(stage.fit.coordinates)):
         return 0.0
     fit = weighed(data, stage.fit, noise, stage.fit.jets)
     return SPARED * max((c.gain for c in screen_stage(data, fit, noise, fields, n_effective)), default=0.0)

@@ -70,6 +70,7 @@ class Candidate(Document):
 class Rivals(Document):
     pair: Pair
     dbic_gap: Number = None
+    absorbed_share: Number = None
     cosine: Number = None
 
 
