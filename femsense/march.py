@@ -761,6 +761,8 @@ PACES = (1.0, 0.5)
 """Shares of the first steps that are gone, tried in turn: whole ones fold elements where a body is bent much …"""
 NEAR = 0.1
 """… until the unbalanced force has fallen to this share."""
+LET_BE = 0.01
+"""A held cable may push by this share of the largest tension, or a slack one be too long by this share of the way, before it goes slack or taut."""
 EARLY = 3e-2
 """Share of the first of these steps that may be missing, in energy, which the next one mends; of the last ones ROUGH."""
 
@@ -804,22 +806,21 @@ def finer_state(walk: Walk, fine: Walk, frame: int, base: Equilibrium, ties: Emb
 def _stepped(walk: Walk, fine: Walk, frame: int, base: Equilibrium, ties: Embedding, pace: float) -> FloatArray | None:
     """Return what `finer_state` is after; the first steps go so far of the way."""
     body, balance = fine.robot.body, _Balance(walk, frame, base)
-
-    def left(x: FloatArray) -> tuple[FloatArray, float]:
-        return _unbalanced(body, base, x, balance.whole(fine, _rubbed(fine, frame, base, x), x))
-
     x = coarse = ties.positions(base.positions)
-    force, first = left(x)
+    at, force, first = _pulling(fine, balance, base, x)
     size, share = first, 1.0
     for _ in range(FINER_STEPS):
         if size <= FINER_ENOUGH * first and share <= LAST_STEP:
-            return x
+            held, at = at.held, _retaut(fine, frame, at, x, LET_BE * np.abs(x - coarse).max())
+            if (at.held == held).all():
+                return x
         enough = min(EARLY, ROUGH * first / size) if size < first else EARLY
-        tangent = tangent_at(body, replace(base, positions=x, factor=None), partial(roughly, tolerance=enough))
+        here = replace(base, positions=x, factor=None, held=at.held)
+        tangent = tangent_at(body, here, partial(roughly, tolerance=enough))
         move = tangent.respond(force[None])[0]
-        if base.held.any():
-            pulled = balance.pulled(fine, x)[base.held[: len(body.cables)]]
-            move = move + np.tensordot(pulled, tangent.respond_to_held(), axes=1)
+        if at.held.any():
+            missing = _missing(fine, frame, at, x)[at.held[: len(body.cables)]]
+            move = move + np.tensordot(missing, tangent.respond_to_held(), axes=1)
         move *= pace if size > NEAR * first else 1.0
         turned = turned_step(body, x, move)
         x = np.asarray(x + move) if turned is None else turned
@@ -827,20 +828,44 @@ def _stepped(walk: Walk, fine: Walk, frame: int, base: Equilibrium, ties: Embedd
         if not way < body.reach:
             return None
         share = np.abs(move).max() / max(way, 1e-300)
-        force, size = left(x)
+        at, force, size = _pulling(fine, balance, at, x)
     return x if size <= FINER_ENOUGH * first else None
 
 
-def _unbalanced(body: BodyModel, base: Equilibrium, x: FloatArray, force: FloatArray) -> tuple[FloatArray, float]:
-    """Return nodal forces [N], (n, 3), less what the tensions of held cables, which are free to change, balance; and their size [N]."""
-    dofs = body.free_map.dofs
-    rest, held = force.ravel()[dofs], np.flatnonzero(base.held[: len(body.cables)])
+def _pulling(fine: Walk, balance: _Balance, at: Equilibrium, x: FloatArray) -> tuple[Equilibrium, FloatArray, float]:
+    """Return a state with the tensions of its held cables that balance best at x, what they leave of the nodal forces there [N], (n, 3), and its
+    size [N]."""
+    body, dofs = fine.robot.body, fine.robot.body.free_map.dofs
+    force = balance.whole(fine, _rubbed(fine, balance.frame, at, x), x)
+    rest, held = force.ravel()[dofs], np.flatnonzero(at.held[: len(body.cables)])
     if len(held):
         pulls = drive_rows(body, x)[held][:, dofs].T
-        rest = rest - pulls @ np.linalg.lstsq(pulls, rest, rcond=None)[0]
+        more = -np.linalg.lstsq(pulls, rest, rcond=None)[0]
+        rest = rest + pulls @ more
+        names = body.cable_names
+        at = replace(at, tension={**at.tension, **{names[i]: at.tension[names[i]] + float(m) for i, m in zip(held, more)}})
     whole = np.zeros(force.size)
     whole[dofs] = rest
-    return whole.reshape(force.shape), float(np.linalg.norm(rest))
+    return at, whole.reshape(force.shape), float(np.linalg.norm(rest))
+
+
+def _missing(fine: Walk, frame: int, at: Equilibrium, x: FloatArray) -> FloatArray:
+    """Return the shortening that each cable lacks at x [m], (a,): what is wanted less what it has and what it stretches by."""
+    body = fine.robot.body
+    stretch = np.array([at.tension[c.name] / c.stretch_stiffness for c in body.cables])
+    return np.asarray(fine.drive.inputs[frame] - stretch - shortening(body, x))
+
+
+def _retaut(fine: Walk, frame: int, at: Equilibrium, x: FloatArray, least: float) -> Equilibrium:
+    """Return a state at x with the held cables slack that would push there, and those taut that are too long by more than a length [m]."""
+    if fine.drive.control != "displacement":
+        return at
+    names, held = fine.robot.body.cable_names, at.held.copy()
+    T = np.array([at.tension[name] for name in names])
+    taut, most = held[: len(names)], np.abs(T).max(initial=0.0)
+    now = np.where(taut, -LET_BE * most < T, _missing(fine, frame, at, x) > least)
+    held[: len(names)] = now
+    return replace(at, held=held, tension={name: float(t) for name, t in zip(names, np.where(now, T, 0.0))})
 
 
 def _same_but_modulus(body: BodyModel, other: BodyModel) -> bool:

@@ -244,7 +244,8 @@ def test_a_finer_state_that_runs_away_says_nothing_though_its_forces_look_small(
     asked = on_both_meshes([2.0, 0.0, 0.0, 0.0])
     assert finer_state(*asked) is not None
     sizes = itertools.cycle([1.0, 1e-6])
-    monkeypatch.setattr(march, "_unbalanced", lambda body, base, x, force: (force, next(sizes)))
+    pulling = march._pulling
+    monkeypatch.setattr(march, "_pulling", lambda *given: (*pulling(*given)[:2], next(sizes)))
     monkeypatch.setattr(march, "turned_step", lambda body, x, move: 1e3 * x)
     assert finer_state(*asked) is None
 
@@ -263,6 +264,24 @@ def test_a_finer_state_that_folds_is_sought_in_shorter_steps(monkeypatch: pytest
     monkeypatch.setattr(march, "PACES", (1.0,))
     with pytest.raises(FemsenseError):
         finer_state(*asked)
+
+
+def test_a_slack_cable_that_is_too_long_on_the_finer_mesh_goes_taut():
+    asked = on_both_meshes([0.0045, 0.0064, 0.0029, 0.0051], "displacement")
+    exact, base = solve_frame(asked[1], 0), asked[3]
+    assert exact.held[2] and not base.held[2]
+    wanted = beyond(asked, exact.positions)
+    np.testing.assert_allclose(beyond(asked, finer_state(*asked)), wanted, atol=0.03 * np.abs(wanted).max())
+
+
+def test_a_held_cable_that_would_push_on_the_finer_mesh_goes_slack():
+    _, fine, frame, base, ties = on_both_meshes([0.004, 0.0, 0.002, 0.0], "displacement")
+    x = ties.positions(base.positions)
+    for push, slack in ((-2e-3, True), (-5e-4, False)):
+        pushing = replace(base, held=np.ones(4, bool), tension={**dict.fromkeys(NAMES, 0.1), NAMES[2]: push})
+        now = march._retaut(fine, frame, pushing, x, 1e-4)
+        assert now.held.tolist() == [True, True, not slack, True]
+        assert now.tension[NAMES[2]] == (0.0 if slack else push)
 
 
 @pytest.mark.parametrize("rough_from", [0, 10**6], ids=["conjugate gradients", "factor"])
