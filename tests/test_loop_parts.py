@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -14,7 +15,7 @@ from arm import NAMES, T_ROBOT_CAMERA, arm, record, sweeps
 
 from femsense import march
 from femsense.calib.forward import Hypothesis, evaluate_scene, make_scene
-from femsense.effects import find_effect
+from femsense.effects import apply_effects, find_effect
 from femsense.effects.shape import finer_mesh, robot_on_mesh
 from femsense.errors import DataError, FemsenseError
 from femsense.fem import solves
@@ -225,9 +226,11 @@ def test_the_mesh_errs_in_another_way_where_the_body_is_another_or_goes_elsewher
     assert errs_alike(before, after) == alike
 
 
-def on_both_meshes(inputs: list[float], actuation: str = "tension") -> tuple[Walk, Walk, int, Equilibrium, Embedding]:
+def on_both_meshes(
+    inputs: list[float], actuation: str = "tension", effects: Sequence[dict[str, Any]] = ()
+) -> tuple[Walk, Walk, int, Equilibrium, Embedding]:
     """Return what `finer_state` is asked with: an arm whose cables are driven so."""
-    robot = arm((4, 2, 2))
+    robot = apply_effects(arm((4, 2, 2)), effects)
     fine = robot_on_mesh(robot, finer_mesh(robot.body.mesh, None, 1))
     recording = make_recording(time_s=[0.0], cable_names=NAMES, inputs=[inputs], actuation=actuation)
     walk, fine_walk = (Walk(r, drive_of(r, recording)) for r in (robot, fine))
@@ -264,6 +267,12 @@ def test_a_finer_state_that_folds_is_sought_in_shorter_steps(monkeypatch: pytest
     monkeypatch.setattr(march, "PACES", (1.0,))
     with pytest.raises(FemsenseError):
         finer_state(*asked)
+
+
+def test_held_cables_stretch_as_far_as_they_pull_on_the_finer_mesh():
+    asked = on_both_meshes([0.004, 0.002, 0.0, 0.0], "displacement", [{"name": "cable_stretch", "stiffness_n_m": 300.0}])
+    wanted = beyond(asked, solve_frame(asked[1], 0).positions)
+    np.testing.assert_allclose(beyond(asked, finer_state(*asked)), wanted, atol=0.02 * np.abs(wanted).max())
 
 
 def test_a_slack_cable_that_is_too_long_on_the_finer_mesh_goes_taut():
