@@ -3,6 +3,7 @@
     python benchmarks/loop.py tune                    # the seeds that thresholds may be tuned on
     python benchmarks/loop.py report                  # the sealed ones: figures of README and docs come from these
     python benchmarks/loop.py tune --every 6          # some of each kind
+    python benchmarks/loop.py tune --finer 2          # truths on meshes of half the size, instead of 1.3 to 1.5 times as many cells along a side
 
 Results stand in a file beside the script's working directory (one line a case) and are not computed again; `--table` prints from it.
 """
@@ -324,16 +325,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("which", choices=sorted(SEEDS))
     parser.add_argument("--every", type=int, default=1, help="take every so many-th case of each kind")
+    parser.add_argument("--finer", type=int, default=None, help="cells of truths along each side, in units of the declared ones")
     parser.add_argument("--out", type=Path, default=None)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--table", action="store_true", help="print from the file, run nothing")
     options = parser.parse_args()
-    out = options.out or Path(f"loop-{options.which}.jsonl")
+    out = options.out or Path(f"loop-{options.which}{'' if options.finer is None else f'-finer-{options.finer}'}.jsonl")
     records = [json.loads(line) for line in out.read_text().splitlines()] if out.exists() else []
     known = {r["number"] for r in records}
     counted: dict[str, int] = {}
     jobs = []
-    for case in make_cases(SEEDS[options.which], COUNTS):
+    for case in make_cases(SEEDS[options.which], COUNTS, options.finer):
         counted[case.kind] = counted.get(case.kind, 0) + 1
         if case.number not in known and (counted[case.kind] - 1) % options.every == 0:
             jobs.append((options.which, case))

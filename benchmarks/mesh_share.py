@@ -1,6 +1,7 @@
 """How much of what a finer mesh would change does a truth on another mesh show, and is it the same share in all sweeps?
 
     python benchmarks/mesh_share.py
+    python benchmarks/mesh_share.py --finer 3 --each 3   # truths with three times the declared cells along each side
 
 Of blind cases in which nothing is hidden (seeds of `loop.py tune`), with pose and modulus as in the truth: D, how far the truth's markers
 lie from the declared robot's; E, how far a mesh of half the size moves them (`femsense.loop.mesh_error`); the share a of E that is
@@ -10,6 +11,7 @@ modulus, zeros) of D alone, beside one share of E, and beside one matrix times E
 
 from __future__ import annotations
 
+import argparse
 import warnings
 
 import numpy as np
@@ -25,9 +27,6 @@ from femsense.loop.mesh_error import mesh_errors, with_mesh_errors
 from femsense.loop.noise import Noise
 from femsense.loop.stages import make_stage, with_nuisance
 from femsense.model import Robot
-
-EACH = 6
-"""Cases of each way to drive."""
 
 
 def rms_mm(field: FloatArray) -> float:
@@ -82,10 +81,14 @@ def model(fit: JointFit, robot: Robot, data: Data) -> FloatArray:
 
 def main() -> None:
     """Print a line for each case."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--finer", type=int, default=None, help="cells of truths along each side, in units of the declared ones")
+    parser.add_argument("--each", type=int, default=6, help="cases of each way to drive")
+    options = parser.parse_args()
     warnings.simplefilter("ignore")
-    cases = [case for case in make_cases(SEEDS["tune"], COUNTS) if case.kind == "null"]
+    cases = [case for case in make_cases(SEEDS["tune"], COUNTS, options.finer) if case.kind == "null"]
     for control in ("displacement", "tension"):
-        for case in [c for c in cases if c.control == control][:EACH]:
+        for case in [c for c in cases if c.control == control][: options.each]:
             compared(case)
 
 

@@ -361,8 +361,12 @@ def _frame_dots(frames: Sequence[tuple[int, int, float, float]], noise_m: float 
 
 def _open_questions(loop: Loop, evidence: Evidence) -> Html | None:
     names = {effect.name for effect in loop.effects}
-    pairs = [_pair(r, f": {_why_alike(r)}") for r in loop.confounded if names & set(r.pair) or not names]
-    others = [_pair(r) for r in loop.confounded if names and not names & set(r.pair)]
+    pairs = [
+        element("span", code(r.pair[0]), " and ", code(r.pair[1]), f": {_why_alike(r)}")
+        for r in loop.confounded
+        if names & set(r.pair) or not names
+    ]
+    others = [" / ".join(r.pair) for r in loop.confounded if names and not names & set(r.pair)]
     hidden = [
         element("span", code(u.name), f": calibration imitates {words.percent(u.absorbed_share)} of it")
         for u in loop.not_testable
@@ -371,15 +375,11 @@ def _open_questions(loop: Loop, evidence: Evidence) -> Html | None:
     advice = paragraph(element("strong", "Next experiment: "), experiment, class_="next") if experiment else None
     return together(
         section("Cannot be told apart", bullets(pairs), level=4),
-        section("Nor could these, were one of them there", bullets(others), level=4),
+        paragraph("Nor could these, were one of them there: ", ", ".join(others), ".") if others else None,
         section("Not testable with these data", bullets(hidden), level=4),
         advice,
         confounding_map(evidence.confounding),
     ) or None  # fmt: skip
-
-
-def _pair(rivals: Rivals, why: str = "") -> Html:
-    return element("span", code(rivals.pair[0]), " and ", code(rivals.pair[1]), why)
 
 
 def _why_alike(rivals: Rivals) -> str:
