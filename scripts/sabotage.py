@@ -276,6 +276,7 @@ SABOTAGES = (
     S("loop/conclude.py", "own_size(float(s), p.scale) for p, s in", "float(s) for p, s in", "test_loop.py::test_a_model_that_lacks_nothing_is_told_so"),
     S("march.py", "_missing(fine, frame, at, x) > least)", "False)", "test_loop_parts.py::test_a_slack_cable_that_is_too_long_on_the_finer_mesh_goes_taut"),
     S("march.py", "-LET_BE * most < T", "-np.inf < T", "test_loop_parts.py::test_a_held_cable_that_would_push_on_the_finer_mesh_goes_slack"),
+    S("loop/rivals.py", "NEXT_TO_NOTHING * max(a.gain, b.gain)", "0.0", "test_loop_rivals.py::test_fields_that_agree_are_told_apart_by_a_sign"),
     S("loop/rivals.py", "if np.linalg.norm(left) < (1.0 - MOSTLY**2)", "if np.linalg.norm(left) < 0.0 * (1.0 - MOSTLY**2)", "test_loop.py::test_what_one_pull_without_unloading_cannot_tell_from_a_modulus_is_said_with_it"),
     S("loop/rivals.py", "pair = found.setdefault(frozenset((a, b)), {", "pair = found.setdefault((a, b, what, value), {", "test_loop_rivals.py::test_a_rival_with_nearly_as_much_evidence_is_said_once_with_all_that_is_known_of_it"),
     S("loop/rivals.py", "max(EVIDENCE, ahead - EVIDENCE)", "EVIDENCE", "test_loop_rivals.py::test_an_effect_that_makes_the_modulus_needless_is_its_rival_unless_another_one_is_far_ahead"),

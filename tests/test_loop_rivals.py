@@ -18,7 +18,9 @@ def candidate(name: str, *field: float) -> SimpleNamespace:
     """Return what screening found of an effect with one parameter."""
     columns = np.array(field)[:, None]
     effect = SimpleNamespace(name=name)
-    return SimpleNamespace(effect=effect, retained=1.0, parameters=(None,), columns=columns, step=np.ones(1), score=0.0)
+    return SimpleNamespace(
+        effect=effect, retained=1.0, parameters=(None,), columns=columns, step=np.ones(1), score=0.0, gain=100.0
+    )
 
 
 def searched(refits: list[dict[str, Any]], first: list[SimpleNamespace] | None = None) -> Search:
@@ -60,6 +62,13 @@ def test_fields_that_agree_are_no_rivals_where_a_refit_tells_them_apart() -> Non
         refits = [refit("cable_friction", 100.0, "named"), refit("creep", dbic, "too little")]
         assert bool(confounded(searched(refits, fields), ["cable_friction"])) == alike
         assert bool(confounded(searched(refits[:1], fields), ["cable_friction"]))
+
+
+def test_fields_that_agree_are_told_apart_by_a_sign() -> None:
+    fields = [candidate("gravity", 1, 1, 0), candidate("creep", 1, 1, 0.1)]
+    for gain, alike in ((6.0, True), (4.0, False)):
+        fields[1].gain = gain
+        assert bool(confounded(searched([], fields), [])) == alike
 
 
 def test_what_calibration_imitates_is_said_with_the_nuisance_that_does() -> None:

@@ -17,7 +17,9 @@ MOSTLY = 0.9
 ALIKE = 0.95
 """Fields that agree so well are said to be alike …"""
 REFUTED = 0.5
-"""… unless a refit in the place of the named one brought less than this share of its evidence (a sign, or what bends, may tell them apart)."""
+"""… unless a refit in the place of the named one brought less than this share of its evidence (what bends may tell them apart) …"""
+NEXT_TO_NOTHING = 0.05
+"""… or one explains less than this share of what the other does, to first order (it would need a sign that it cannot have)."""
 MOST_NUMBERS = 6
 """An effect with more parameters imitates much, which says little."""
 
@@ -100,7 +102,8 @@ def _alike(search: Search, names: Sequence[str]) -> Iterator[Alike]:
         for b in ones[i + 1 :]:
             share = min(confounding(a, b), confounding(b, a))
             pair = a.effect.name, b.effect.name
-            if share > ALIKE and not (_is_refuted(search, names, *pair) or _is_refuted(search, names, *pair[::-1])):
+            apart = min(a.gain, b.gain) < NEXT_TO_NOTHING * max(a.gain, b.gain) and max(a.gain, b.gain) > EVIDENCE
+            if share > ALIKE and not (apart or _is_refuted(search, names, *pair) or _is_refuted(search, names, *pair[::-1])):
                 yield *pair, "cosine", share
 
 
