@@ -60,7 +60,11 @@ class Few:
 def spares(data: Data, robot: Robot) -> bool:
     """Return whether some states of a robot, which speak for all, are few enough to spare time: where a state depends on those before, all of these
     are solved, too."""
-    return _chosen(data, robot)[1] < SPARED and not has_history(robot)
+    return _spares(_chosen(data, robot)[1], robot)
+
+
+def _spares(share: float, robot: Robot) -> bool:
+    return share < SPARED and not has_history(robot)
 
 
 def _chosen(data: Data, robot: Robot) -> tuple[list[IntArray], float]:
@@ -72,9 +76,9 @@ def _chosen(data: Data, robot: Robot) -> tuple[list[IntArray], float]:
 def few_of(data: Data, stage: Stage, noise: Noise) -> Few:
     """Return some states of a stage that differ as much as they can, or all of them where these are not too much work."""
     robot = stage.fit.hypothesis.robot_at(stage.fit.coordinates)
-    frames, _ = _chosen(data, robot)
+    frames, share = _chosen(data, robot)
     rows = [np.isin(t.scene.frame, few) for t, few in zip(data.train, frames)]
-    bare, less = replace(data, held=[], held_of=[]), spares(data, robot)
+    bare, less = replace(data, held=[], held_of=[]), _spares(share, robot)
     if all(own.all() for own in rows):
         return Few(bare, stage, rows, less)
     trials = [
