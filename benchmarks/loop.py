@@ -4,6 +4,7 @@
     python benchmarks/loop.py report                  # the sealed ones: figures of README and docs come from these
     python benchmarks/loop.py tune --every 6          # some of each kind
     python benchmarks/loop.py tune --finer 2          # truths on meshes of half the size, instead of 1.3 to 1.5 times as many cells along a side
+    python benchmarks/loop.py tune --linear           # declared meshes with linear elements, which `discretisation` mends
 
 Results stand in a file beside the script's working directory (one line a case) and are not computed again; `--table` prints from it.
 """
@@ -48,7 +49,7 @@ def run_case(job: tuple[str, Case]) -> dict[str, Any]:
     warnings.simplefilter("ignore")
     which, case = job
     record: dict[str, Any] = {"number": case.number, "kind": case.kind, "robot": case.design.name, "control": case.control, "label": case.label,
-                              "hidden": list(case.hidden), "white_m": case.white_m, "seats": case.seats}  # fmt: skip
+                              "hidden": list(case.hidden), "white_m": case.white_m, "seats": case.seats, "element": case.element}  # fmt: skip
     try:
         made = make_data(case, SEEDS[which])
     except FemsenseError as error:
@@ -76,8 +77,13 @@ def run_case(job: tuple[str, Case]) -> dict[str, Any]:
 
 def detection_index(made: Made, hidden: dict[str, Any]) -> dict[str, float]:
     """Return d′ = |P W Δ|: a hidden effect's field on the declared mesh, beside what else is hidden, whitened by the true noise; pose,
-    modulus, zeros and the fields of what else is hidden are projected out."""
-    case, robot = made.case, made.declared
+    modulus, zeros and the fields of what else is hidden are projected out. Linear elements are quadratic there."""
+    case = made.case
+    robot = (
+        made.declared
+        if case.element == "tet10"
+        else apply_effects(made.declared, [{"name": "discretisation", "element": "tet10"}])
+    )
     others = [e for e in case.hidden if e is not hidden]
     scaled = apply_effects(robot, [{"name": "stiffness", "scale": made.modulus_scale}])
     unit = "tension_n" if case.control == "tension" else "displacement_m"
@@ -141,9 +147,10 @@ def wilson(hits: int, count: int) -> str:
 
 
 def named(record: dict[str, Any]) -> list[str]:
-    """Return what was named beside the nuisances that every case has (unless one of them is what is hidden)."""
+    """Return what was named beside what every case has (unless that is what is hidden)."""
     hidden = {e["name"] for e in record["hidden"]}
-    return [e["name"] for e in record["effects"] if e["name"] not in NUISANCE - hidden - {"cable_offset"}]
+    own = NUISANCE | ({"discretisation"} if record.get("element") == "tet4" else set())
+    return [e["name"] for e in record["effects"] if e["name"] not in own - hidden - {"cable_offset"}]
 
 
 def answer_set(record: dict[str, Any]) -> set[str]:
@@ -326,16 +333,18 @@ def main() -> None:
     parser.add_argument("which", choices=sorted(SEEDS))
     parser.add_argument("--every", type=int, default=1, help="take every so many-th case of each kind")
     parser.add_argument("--finer", type=int, default=None, help="cells of truths along each side, in units of the declared ones")
+    parser.add_argument("--linear", action="store_true", help="declare linear elements")
     parser.add_argument("--out", type=Path, default=None)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--table", action="store_true", help="print from the file, run nothing")
     options = parser.parse_args()
-    out = options.out or Path(f"loop-{options.which}{'' if options.finer is None else f'-finer-{options.finer}'}.jsonl")
+    kind = ("" if options.finer is None else f"-finer-{options.finer}") + ("-linear" if options.linear else "")
+    out = options.out or Path(f"loop-{options.which}{kind}.jsonl")
     records = [json.loads(line) for line in out.read_text().splitlines()] if out.exists() else []
     known = {r["number"] for r in records}
     counted: dict[str, int] = {}
     jobs = []
-    for case in make_cases(SEEDS[options.which], COUNTS, options.finer):
+    for case in make_cases(SEEDS[options.which], COUNTS, options.finer, "tet4" if options.linear else "tet10"):
         counted[case.kind] = counted.get(case.kind, 0) + 1
         if case.number not in known and (counted[case.kind] - 1) % options.every == 0:
             jobs.append((options.which, case))

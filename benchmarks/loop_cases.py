@@ -8,7 +8,7 @@ an unknown camera pose, and markers with noise of their own, of the frame, of th
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -32,8 +32,8 @@ EARTH = (0.0, 0.0, -9.81)
 # --- three robots ----------------------------------------------------------------------------------------------------------
 
 
-def bar_mesh(cells: Sequence[int], shape: Callable[[FloatArray], FloatArray]) -> TetMesh:
-    """Return a bar of cells × 6 tetrahedra with ten nodes each; `shape` maps the box [0, 1] × [−1, 1]² to metres."""
+def bar_mesh(cells: Sequence[int], shape: Callable[[FloatArray], FloatArray], element: str = "tet10") -> TetMesh:
+    """Return a bar of cells × 6 tetrahedra; `shape` maps the box [0, 1] × [−1, 1]² to metres."""
     axes = [np.linspace(low, 1.0, count + 1) for low, count in zip((0.0, -1.0, -1.0), cells)]
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     number = np.arange(len(nodes)).reshape(np.asarray(cells) + 1)
@@ -44,7 +44,8 @@ def bar_mesh(cells: Sequence[int], shape: Callable[[FloatArray], FloatArray]) ->
     x = nodes[tets]
     flip = np.linalg.det(x[:, 1:] - x[:, :1]) < 0
     tets[flip] = tets[flip][:, [0, 2, 1, 3]]
-    return to_quadratic(TetMesh(nodes, tets))
+    mesh = TetMesh(nodes, tets)
+    return to_quadratic(mesh) if element == "tet10" else mesh
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,9 @@ class Design:
 
     def robot(self, *, fine: bool, law: str, gravity: Sequence[float], modulus: float, element: str = "tet10") -> Robot:
         """Return the robot on its coarse (declared) or fine (true) mesh."""
-        mesh = bar_mesh(self.fine if fine else self.coarse, self.shape)
+        mesh = bar_mesh(self.fine if fine else self.coarse, self.shape, element)
+        clamped = np.flatnonzero(mesh.nodes[:, 0] < 1e-9)
+        corners = clamped[np.isin(clamped, mesh.tets[:, :4])]
         cables = tuple(
             tie_cable(
                 mesh,
@@ -87,7 +90,8 @@ class Design:
             poisson_ratio=0.45,
             density=1070.0,
             law=law,
-            clamped=mesh.nodes[:, 0] < 1e-9,
+            clamped=clamped,
+            clamp_nodes=clamped if fine else corners,  # as a file has it that declares corners, whatever the elements
             cables=cables,
             gravity=gravity,
         )
@@ -154,8 +158,8 @@ class Case:
     hyperelastic: bool = True
     """Whether truth is neo-Hookean (and the declared robot says so, unless the law is what is hidden)."""
     declared_gravity: bool = True
-    tetrahedra: str = "tet10"
-    names: tuple[str, ...] = field(default=())
+    element: str = "tet10"
+    """Of the declared mesh."""
     modulus_scale: float | None = None
     """True over declared modulus; None draws it."""
 
@@ -207,14 +211,14 @@ DISPLACEMENT_EFFECTS = ("gravity", "poisson", "soft_region", "hyperelastic", "pa
 OUTSIDE = ("contact", "cross_talk", "slipped_marker", "draught", "kinked_cable", "camera_drift", "late_log")
 
 
-def make_cases(seed: int, counts: dict[str, int], finer: int | None = None) -> list[Case]:
+def make_cases(seed: int, counts: dict[str, int], finer: int | None = None, element: str = "tet10") -> list[Case]:
     """Return cases of the kinds and numbers asked for; the same for the same seed. `finer`: cells of truths, in units of the declared ones; by default
-    1.3 to 1.5."""
+    1.3 to 1.5. `element`: of the declared meshes."""
     rng = np.random.default_rng(seed)
     cases: list[Case] = []
     for kind, count in counts.items():
         for i in range(count):
-            case = _case(len(cases), kind, i, rng)
+            case = replace(_case(len(cases), kind, i, rng), element=element)
             cases.append(case if finer is None else replace(case, design=case.design.finer(finer)))
     return cases
 
@@ -276,6 +280,7 @@ def make_data(case: Case, seed: int) -> Made:
         law="corotational" if law_hidden else law,
         gravity=EARTH if case.declared_gravity else (0, 0, 0),
         modulus=design.modulus,
+        element=case.element,
     )
     if law == "corotational" and any(e["name"] == "hyperelastic" for e in case.hidden):
         raise ValueError("the hidden law needs a hyperelastic truth")

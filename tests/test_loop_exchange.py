@@ -126,7 +126,7 @@ def test_weight_that_nobody_declared_is_refitted_however_far_behind_it_looks(mon
     table = screen_stage(data, base.fit, NOISE, fields_of(data, base, ["gravity", "payload"]), COUNT)
     looks = [replace(c, score=grow.PROMISING + 1.0 if c.effect.name == "gravity" else c.score) for c in table]
     table = sorted(looks, key=lambda c: -c.score)
-    winner, _, records = grow.grow(data, base, table, NOISE, ["gravity", "payload"], COUNT, lambda text: None)
+    winner, _, records = grow.grow(data, base, table, NOISE, lambda text: None)
     assert {r["name"] for r in records} == {"gravity", "payload"}
     assert winner is not None and winner.candidate.effect.name == "gravity"
 
@@ -151,7 +151,7 @@ def test_until_an_effect_explains_the_data_rivals_are_refitted_to_the_end(monkey
     monkeypatch.setattr(grow, "judged", lenient)
     monkeypatch.setattr(grow, "_polish", lambda data, stage, winner, *_: winner.stage)
     monkeypatch.setattr(grow, "explains", lambda stage: explains)
-    grow.grow(data, base, sorted(looks, key=lambda c: -c.score), NOISE, ["payload", "cable_gain"], COUNT, lambda text: None)
+    grow.grow(data, base, sorted(looks, key=lambda c: -c.score), NOISE, lambda text: None)
     assert asked == [("payload", grow.EVIDENCE)] + [("cable_gain", grow.EVIDENCE)] * (not explains)
 
 
@@ -176,7 +176,7 @@ def test_another_form_of_what_leads_is_held_against_what_that_one_promised(monke
     monkeypatch.setattr(grow, "explains", lambda stage: True)
     monkeypatch.setattr(grow, "_predicts", lambda refitted: 0.0)
     forms = [replace(payload, score=100.0), replace(rival, score=60.0)]
-    grow.grow(data, base, forms, NOISE, ["payload", "cable_gain"], COUNT, lambda text: None)
+    grow.grow(data, base, forms, NOISE, lambda text: None)
     assert asked == ["payload", "payload"] if form else asked == ["payload"]
 
 
@@ -227,7 +227,7 @@ def test_a_refit_that_could_win_goes_to_its_end(monkeypatch: pytest.MonkeyPatch)
 
     monkeypatch.setattr(grow, "refit", cut_short)
     monkeypatch.setattr(grow, "_polish", lambda data, stage, winner, *_: winner.stage)
-    winner, _, records = grow.grow(data, base, table, NOISE, ["payload"], COUNT, lambda text: None)
+    winner, _, records = grow.grow(data, base, table, NOISE, lambda text: None)
     assert winner is not None and winner.stage.fit.fit.status == "converged"
     assert winner.stage.fit.chi2 == pytest.approx(whole.fit.chi2, rel=0.02)
     assert records[0]["dchi2"] == pytest.approx(evidence(base.fit, winner.stage.fit))
@@ -239,11 +239,11 @@ def test_what_goes_with_an_effect_that_was_as_good_is_found_beside_it():
     table = screen_stage(data, base.fit, NOISE, fields_of(data, base, ["cable_gain"]), COUNT)
     candidate = (shortlist(table, first=True) or table)[0]
     tie = Refit(candidate, refit(data, base, candidate, NOISE), 0.0, 0.0, {})
-    instead, both, tried = beside_a_tie(data, wrong, tie, None, NOISE, ["payload"], COUNT, lambda text: None)
+    instead, both, tried = beside_a_tie(data, wrong, tie, None, NOISE, lambda text: None)
     assert both is not None and both.candidate.effect.name == "payload" and tried[-1]["verdict"] == "named"
     assert instead.fit.hypothesis.names[-1] == "cable_gain"
     assert both.stage.fit.hypothesis.names[-2:] == ("cable_gain", "payload")
-    assert beside_a_tie(data, both.stage, tie, None, NOISE, ["payload"], COUNT, lambda text: None)[1] is None
+    assert beside_a_tie(data, both.stage, tie, None, NOISE, lambda text: None)[1] is None
 
 
 def test_what_fields_of_the_model_before_promise_is_what_its_own_do():
@@ -321,7 +321,7 @@ def test_a_place_is_improved_before_a_refit_is_turned_down_for_what_it_predicts(
 
     monkeypatch.setattr(grow, "judged", strict)
     monkeypatch.setattr(grow, "_polish", lambda data, stage, winner, *_: replace(winner.stage))
-    winner, _, records = grow.grow(data, base, table, NOISE, ["payload"], COUNT, lambda text: None)
+    winner, _, records = grow.grow(data, base, table, NOISE, lambda text: None)
     assert winner is not None and asked[:2] == ["payload", "payload"] and records[0]["verdict"] == "named"
 
 

@@ -110,7 +110,7 @@ def searched(started: tuple[Data, Stage], monkeypatch: pytest.MonkeyPatch) -> tu
     monkeypatch.setattr(growing, "explains", lambda stage: True)
     monkeypatch.setattr(growing, "shortlist", lambda table, first: [next(c for c in table if c.effect.name == n) for n in names])
     monkeypatch.setattr(growing, "_bar", lambda ahead, candidate: -np.inf)
-    winner, _, records = growing.grow(data, stage, table, NOISE, names, COUNT, lambda text: None)
+    winner, _, records = growing.grow(data, stage, table, NOISE, lambda text: None)
     assert winner is not None and winner.candidate.effect.name == "payload" and ("payload", True) in fitted
     return [f for f in fitted if f[0] != "payload"], records
 

@@ -159,7 +159,7 @@ def test_a_model_without_equilibrium_is_not_handed_back(monkeypatch: pytest.Monk
         raise DataError("no equilibrium in frame 3")
 
     data, stage = staged(arm((4, 2, 2)), 1.0)
-    search = Search(stage, [("", stage)], stage, NOISE, 10.0, [], [], [], None)
+    search = Search(stage, [("", stage)], stage, stage, NOISE, 10.0, [], [], [], None)
     monkeypatch.setattr(conclude, "keeping", collapses)
     assert conclude._worth_handing_back(data, search, ["stiffness"], ["stiffness"]) == ([], stage)
     chain = conclude._chain(data, search, ["stiffness"], ["stiffness"], stage, {})
@@ -172,7 +172,7 @@ def test_a_model_may_have_a_larger_error_on_held_out_data_where_that_is_the_mesh
     back = replace(
         back, fit=replace(stage.fit, hypothesis=replace(stage.fit.hypothesis, settled=((find_effect("hyperelastic"), {}),)))
     )
-    search = Search(before, [("", base)], back, NOISE, 10.0, [], [], [], None)
+    search = Search(before, [("", base)], base, back, NOISE, 10.0, [], [], [], None)
 
     def holds(error: float, *, chi2: float = 50.0, beyond: float = 0.5) -> bool:
         model = replace(back, held_rms=error)
@@ -197,7 +197,7 @@ def test_a_larger_error_is_not_for_zeros_of_cables_which_much_else_looks_like(
     data, stage = staged(arm((4, 2, 2)), 1.0)
     terms = tuple(t for t in stage.fit.hypothesis.terms if t[0].name in names)
     back = replace(stage, held_rms=1.4, fit=replace(stage.fit, hypothesis=replace(stage.fit.hypothesis, terms=terms)))
-    search = Search(replace(stage, held_rms=1.0), [("", back)], back, NOISE, 10.0, [], [], [], None)
+    search = Search(replace(stage, held_rms=1.0), [("", back)], back, back, NOISE, 10.0, [], [], [], None)
     monkeypatch.setattr(conclude, "held_chi2", lambda _, s, noise: 40.0 if s is back else 80.0)
     monkeypatch.setattr(conclude, "beyond_mesh", lambda *_: 0.5)
     assert conclude._holds_out(data, search, back) == held
@@ -240,7 +240,7 @@ def test_a_modulus_that_is_as_declared_once_zeros_stay_is_not_handed_back(monkey
     as_declared = replace(
         softer.fit, fit=replace(softer.fit.fit, theta=np.append(softer.fit.fit.theta[: softer.fit.own], [0.0] * 5))
     )
-    search = Search(softer, [("", softer)], softer, NOISE, 10.0, [], [], [], None)
+    search = Search(softer, [("", softer)], softer, softer, NOISE, 10.0, [], [], [], None)
     assert conclude._worth_handing_back(data, search, ["stiffness"], ["stiffness"])[0] == ["stiffness"]
     monkeypatch.setattr(conclude, "keeping", lambda *_, **__: replace(softer, fit=as_declared))
     assert conclude._worth_handing_back(data, search, ["stiffness"], ["stiffness"])[0] == []
@@ -260,7 +260,7 @@ def with_gain(modulus: float) -> tuple[Data, Search]:
     gain = find_effect("cable_gain")
     parameters = tuple(p for p in gain.parameters(declared, "tension") if p.part == "left")
     final = make_stage(data, *with_term(base.fit, gain, {}, parameters), noise, np.append(base.fit.coordinates, 0.0))
-    return data, Search(before, [("", base), ("cable_gain", final)], final, noise, 100.0, [], [], [], None)
+    return data, Search(before, [("", base), ("cable_gain", final)], base, final, noise, 100.0, [], [], [], None)
 
 
 def handed_back(data: Data, search: Search) -> tuple[list[str], float]:

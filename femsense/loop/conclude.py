@@ -109,7 +109,7 @@ def conclude(data: Data, search: Search, rng: np.random.Generator) -> LoopResult
         declared=data.declared,
         data=_card(data, final, spread, noise, search.n_effective),
         residuals=_residual_table(data, before, back),
-        evidence=gather(data, before, search.history[0][1], final, back, shown, noise, search.first, search.last, tests, rng),
+        evidence=gather(data, before, search.base, final, back, shown, noise, search.first, search.last, tests, rng),
     )
 
 
@@ -189,7 +189,7 @@ def _holds_out(data: Data, search: Search, back: Stage) -> bool:
         return True
     before, after = _held_beyond_mesh(data, search, back)
     zeros = only_calibrated and "cable_offset" in back.fit.hypothesis.names  # much else looks like them
-    shown = not zeros and back.held_rms <= NOT_WORSE * search.history[0][1].held_rms
+    shown = not zeros and back.held_rms <= NOT_WORSE * search.base.held_rms
     return after <= NOT_WORSE * before and (shown or (gain > FAR_BETTER and worse <= NOISY))
 
 
@@ -381,7 +381,14 @@ def _interval(data: Data, stage: Stage, kind: int, rng: np.random.Generator) -> 
 def _candidate_rows(first: list[Candidate], table: list[Candidate], refits: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return every effect that was tried with its scores: linear at the start, linear at the end, and the joint refits."""
     last = {c.effect.name: c for c in one_each(table)}
-    rows = []
+    screened = {c.effect.name for c in first}
+    rows = [  # the mesh is asked about without screening it
+        {
+            "name": r["name"], "seed": r["seed"], "dchi2": r.get("dchi2"), "dbic": r.get("dbic"), "retained_share": None, "dbic_at_end": None,
+            "refits": [o for o in refits if o["name"] == r["name"]], "verdict": r["verdict"],
+        }
+        for r in {r["name"]: r for r in reversed(refits) if r["name"] not in screened}.values()
+    ]  # fmt: skip
     for c in one_each(first):
         joint = [r for r in refits if r["name"] == c.effect.name]
         end = last.get(c.effect.name)
@@ -495,7 +502,7 @@ def _by_mesh(data: Data, search: Search, back: Stage) -> str:
 def _on_linear(data: Data, back: Stage) -> str:
     """Return a sentence on what effects that are named on a linear mesh may stand for; nothing elsewhere, or where that is an effect itself."""
     mesh = _mesh_error(data)
-    if not mesh or data.robot.body.mesh.is_quadratic or not _has_effects(back.fit.hypothesis.names):
+    if not mesh or back.fit.hypothesis.robot.body.mesh.is_quadratic or not _has_effects(back.fit.hypothesis.names):
         return ""
     return f" Linear elements cost {1e3 * mesh:.2f} mm themselves, which other effects may stand for: try discretisation too."
 

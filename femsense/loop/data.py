@@ -10,7 +10,8 @@ import numpy as np
 from femsense.arrays import FloatArray, IntArray
 from femsense.calib.calibrate import calibrated_start, first_inputs, first_poses, input_bounds, usable_frames
 from femsense.calib.forward import Scene, make_scene, rest_residual, with_rest_markers
-from femsense.effects import FORMS, Effect
+from femsense.effects import FORMS, Effect, Entry, find_effect
+from femsense.effects.shape import robot_on_mesh
 from femsense.errors import DataError, InputError
 from femsense.loop.clouds import (
     SMOOTH,
@@ -35,6 +36,9 @@ ROWS_A_CLOUD = 60
 """Points of the surface that a camera sees in one frame, about."""
 FEWEST_CLOUDS = 4
 """Where there are markers, fewer frames with clouds than this are not looked at."""
+MESH = find_effect("discretisation")
+QUADRATIC: Entry = {"element": "tet10"}
+"""What stands for a mesh fine enough while effects are sought, where linear elements are declared (see `elements`)."""
 MEASURED = ("auto", "markers", "clouds", "both")
 """What may be used of a recording; auto: its markers, or its clouds where it has no markers."""
 
@@ -44,7 +48,7 @@ class Data:
     """Recordings, split. Where a recording has both, its markers are one trial and its clouds the next."""
 
     robot: Robot
-    """As declared; with points of its surface behind the markers where there are clouds."""
+    """As declared, or on quadratic elements where effects are sought with these; with points of its surface behind the markers where there are clouds."""
     control: str
     train: list[Trial]
     held: list[Trial]
@@ -66,6 +70,16 @@ class Data:
         """What the data are: "markers", "clouds" or both."""
         kinds = {"markers" if t.scene.crossings is None else "clouds" for t in self.train}
         return tuple(sorted(kinds, reverse=True))
+
+    @property
+    def settled(self) -> tuple[tuple[Effect, Entry], ...]:
+        """What the robot has that is not declared, as an effect: quadratic elements."""
+        return ((MESH, QUADRATIC),) if self.robot.body.mesh.is_quadratic != self.declared.body.mesh.is_quadratic else ()
+
+    @property
+    def robot_as_declared(self) -> Robot:
+        """The robot on its declared mesh."""
+        return robot_on_mesh(self.robot, self.declared.body.mesh) if self.settled else self.robot
 
 
 def prepare(robot: Robot, recordings: Sequence[Recording], validation: Sequence[Recording], measured: str = "auto") -> Data:

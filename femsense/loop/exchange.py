@@ -115,4 +115,4 @@ def _without(data: Data, history: History, without: Stage, name: str, noise: Noi
     return steps
 
 
-__all__ = ["BETTER", "exchanged"]
+__all__ = ["BETTER", "History", "exchanged"]

@@ -10,7 +10,6 @@ import numpy as np
 
 from femsense.arrays import FloatArray
 from femsense.calib.fit import GIVEN_UP
-from femsense.effects import find_effect
 from femsense.errors import FemsenseError
 from femsense.loop.data import Data
 from femsense.loop.few import Few, few_of
@@ -20,10 +19,10 @@ from femsense.loop.noise import Noise
 from femsense.loop.place import POLISHED, Climbs, climbed, closer, placed
 from femsense.loop.predict import sweeps_predicted
 from femsense.loop.refit import EVIDENCE, FORGONE, beyond, evidence, explains, refit, tried, with_term, within, worth_of
-from femsense.loop.screen import NUISANCE, Candidate, joined, linear_gain, penalty
+from femsense.loop.screen import NUISANCE, Candidate, joined, linear_gain
 from femsense.loop.stages import (
-    QUADRATIC,
     Stage,
+    found_in,
     held_chi2,
     held_shift,
     keeping,
@@ -84,17 +83,14 @@ class Refit:
 
 
 def grow(
-    data: Data, stage: Stage, table: list[Candidate], noise: Noise, names: Sequence[str], n_effective: float, say: Progress
+    data: Data, stage: Stage, table: list[Candidate], noise: Noise, say: Progress
 ) -> tuple[Refit | None, list[Refit], list[dict[str, Any]]]:
     """Return the effect that comes next, or None where nothing passes; others that are as good; and what became of each candidate that was
     refitted."""
     refits: list[Refit] = []
     records: list[dict[str, Any]] = []
     few: Few | None = None
-    first = not _added(stage)
-    asked = _quadratic(data, stage, names, n_effective) if first else []
-    screened = [c for c in shortlist(table, first=first) if not any(c.effect is a.effect and c.seed == a.seed for a in asked)]
-    for candidate in [*asked, *screened]:
+    for candidate in shortlist(table, first=not found_in(stage)):
         ahead = [r for r in refits if r.record["verdict"] == "passes" and explains(r.stage)]
         best = max((r.score for r in ahead), default=-np.inf)
         behind = candidate.score < max((0.5 * _bar(r, candidate) for r in ahead), default=-np.inf) - EVIDENCE
@@ -289,22 +285,6 @@ def _richer(data: Data, stage: Stage, winner: Refit, form: Candidate, noise: Noi
         return make_stage(data, hypothesis, prior, noise, coordinates, own=own_of(winner.stage), max_iterations=10, worth=worth)
     except FemsenseError:
         return None
-
-
-def _quadratic(data: Data, stage: Stage, names: Sequence[str], n_effective: float) -> list[Candidate]:
-    """Return quadratic elements as a candidate where the mesh is linear: always asked, and not by screening, since the modulus and
-    whatever else has made up for what a linear mesh costs is far from where quadratic elements have it."""
-    effect, seed = find_effect("discretisation"), QUADRATIC
-    if effect.name not in names or seed not in effect.seeds(stage.fit.hypothesis.robot):
-        return []
-    nothing = np.zeros(0)
-    cost = penalty(0, seed, 1, max(len(names), 1), n_effective)
-    return [Candidate(effect, seed, (), [], [], np.zeros((0, 0)), np.zeros((0, 0)), 1.0, nothing, np.inf, np.inf, cost, nothing)]
-
-
-def _added(stage: Stage) -> list[str]:
-    """Return the effects that growth has added."""
-    return [name for name in stage.fit.hypothesis.names if name not in NUISANCE]
 
 
 def shortlist(table: list[Candidate], *, first: bool) -> list[Candidate]:
@@ -507,7 +487,7 @@ def _polish(data: Data, stage: Stage, winner: Refit, noise: Noise, say: Progress
 def prune(data: Data, stage: Stage, noise: Noise, n_effective: float, say: Progress) -> Stage:
     """Return the stage without effects that those added later have made needless (dBIC for keeping them not above 0); the place of the last one,
     which was found beside them, then moves on."""
-    whole, added = stage, _added(stage)
+    whole, added = stage, found_in(stage)
     for name in added[:-1]:
         others = [n for n in stage.fit.hypothesis.names if n != name]
         count = sum(len(p) for e, _, p in stage.fit.hypothesis.terms if e.name == name)

@@ -21,8 +21,9 @@ from femsense.calib.forward import Hypothesis, SceneJet
 from femsense.effects import EFFECTS, FORMS, Effect, find_effect, load_own_effect
 from femsense.errors import DataError, FemsenseError
 from femsense.loop.conclude import conclude
-from femsense.loop.data import Data, prepare
-from femsense.loop.exchange import BETTER, exchanged
+from femsense.loop.data import MESH, Data, prepare
+from femsense.loop.elements import need_quadratic, seeks_with_quadratic, with_quadratic
+from femsense.loop.exchange import BETTER, History, exchanged
 from femsense.loop.few import spares
 from femsense.loop.grow import Progress, Refit, grow, mesh_cost, moved_by, prune, shortlist
 from femsense.loop.joint import Prior
@@ -52,8 +53,12 @@ from femsense.parallel import beside, one_blas_thread
 from femsense.recording import Recording, state_key
 
 MAX_EFFECTS = 3
+Ready = tuple[Data, Stage, History]
+"""Data, the declared model with its camera calibrated, and the models that effects are sought on top of."""
 STATES = 5
 """So many different states can tell effects apart though what is held out only repeats them."""
+START = Noise({"white": 5e-4}, "start")
+"""The noise until it is estimated."""
 MATCHINGS = 4
 """Times that the rows of clouds are made again, at most."""
 ROUGHLY, STEPS = 4, 12
@@ -95,19 +100,41 @@ def improve(
     own = tuple(load_own_effect(file) for file in user_effects)
     names = _names(effects, without, own)
     rng = np.random.default_rng(seed)
-    say("reading and calibrating")
-    with beside(lambda: _get_ready(robot, names)) as finer_is_made:
-        data = replace(prepare(robot, recordings, validation, measured), forms=(*FORMS, *own))
-        data, before, base = _calibrated(data, names, say, finer_is_made)
-    growing = _tells_apart(data)
-    data, search = _search(data, before, base, names, MAX_EFFECTS if growing else 0, say)
+
+    def ready(body: Robot, names: Sequence[str]) -> Ready:
+        say("reading and calibrating")
+        with beside(lambda: _get_ready(body, names)) as finer_is_made:
+            data = prepare(body, recordings, validation, measured)
+            data, before, start = _calibrated(replace(data, forms=(*FORMS, *own), declared=robot), say)
+            finer_is_made()
+        return _with_cost_of_mesh(data, start[-1][1], names, say), before, start
+
+    data, search = _searched(robot, names, ready, say)
     say("testing what is left")
     result = conclude(data, search, rng)
     result = replace(result, data={**result.data, "seed": seed})
-    if growing:
+    if _tells_apart(data):
         return result
     only = "record another state (other inputs, load or direction of gravity): these data repeat too few states, which cannot tell effects apart"
     return replace(result, next_experiment="; ".join(t for t in (only, result.next_experiment) if t))
+
+
+def _searched(
+    robot: Robot, names: list[str], ready: Callable[[Robot, Sequence[str]], Ready], say: Progress
+) -> tuple[Data, Search]:
+    """Return the data with what a search finds in them: on quadratic elements where the robot declares linear ones and the data miss those, else on what
+    is declared."""
+    refits: list[dict[str, Any]] = []
+    if seeks_with_quadratic(robot, names):
+        with contextlib.suppress(FemsenseError):  # linear elements lock, and come to rest where quadratic ones fold
+            data, search = _search(*ready(with_quadratic(robot), names), names, say)
+            say("asking whether quadratic elements are needed")
+            needed, refits = need_quadratic(data, search, names)
+            if needed:
+                return data, replace(search, refits=[*refits, *search.refits])
+            names = [name for name in names if name != MESH.name]
+    data, search = _search(*ready(robot, names), names, say)
+    return data, replace(search, refits=[*refits, *search.refits])
 
 
 def _get_ready(robot: Robot, names: Sequence[str]) -> None:
@@ -116,31 +143,51 @@ def _get_ready(robot: Robot, names: Sequence[str]) -> None:
     importlib.import_module("open3d")
 
 
-def _calibrated(data: Data, names: Sequence[str], say: Progress, finer_is_made: Callable[[], None]) -> tuple[Data, Stage, Stage]:
-    """Return the data with what the mesh costs, the declared model calibrated, and the model with all that calibration may move."""
-    noise = Noise({"white": 5e-4}, "start")
-    before = _declared(data, noise, None)
-    while (fewer := without_strays(data, before)) is not data:
-        data, before = fewer, _declared(fewer, noise, None)
-    hypothesis, prior = with_nuisance(data)
+def _calibrated(data: Data, say: Progress) -> Ready:
+    """Return the data without strays, the declared model calibrated, and the model with all that calibration may move; before that the same on the
+    declared mesh, where it is another one."""
+    placed = _placed(data, data.robot, START)
+    while (fewer := without_strays(data, placed)) is not data:
+        data, placed = fewer, _placed(fewer, data.robot, START)
     say("fitting what calibration may move")
-    nothing = np.zeros(len(prior.mean))
-    base = _as_far_as_held_out_states_rest(
-        lambda steps: make_stage(data, hypothesis, prior, noise, nothing, own=own_of(before), max_iterations=steps), ROUGHLY
-    )
+    base = _calibrated_on(data, data.robot, placed)
     if "clouds" in data.measured:
         say("matching the clouds again")
         rough = base.fit.normal_rms
-        data, base = _matched(data, base, noise if rough is None else replace(noise, surface={"white": rough}), anew=True)
-        before = _declared(data, noise, before)
+        data, base = _matched(data, base, START if rough is None else replace(START, surface={"white": rough}), anew=True)
+        placed = _placed(data, data.robot, START, placed)
+    if not data.settled:
+        return data, placed, [("", base)]
+    declared = data.robot_as_declared
+    before = _placed(data, declared, START)
+    return data, before, [("", _calibrated_on(data, declared, before)), (MESH.name, base)]
+
+
+def _placed(data: Data, robot: Robot, noise: Noise, start: Stage | None = None) -> Stage:
+    """Return a robot with its camera calibrated."""
+    nothing = Prior(np.zeros(0), np.zeros(0))
+    own = None if start is None else own_of(start)
+    return make_stage(data, Hypothesis(robot), nothing, noise, np.zeros(0), own=own)
+
+
+def _calibrated_on(data: Data, robot: Robot, placed: Stage) -> Stage:
+    """Return a robot with all that calibration may move, fitted roughly."""
+    hypothesis, prior = with_nuisance(data, robot)
+    nothing = np.zeros(len(prior.mean))
+    return _as_far_as_held_out_states_rest(
+        lambda steps: make_stage(data, hypothesis, prior, START, nothing, own=own_of(placed), max_iterations=steps), ROUGHLY
+    )
+
+
+def _with_cost_of_mesh(data: Data, base: Stage, names: Sequence[str], say: Progress) -> Data:
+    """Return the data with what the mesh costs, and seats that turn with the body."""
     say("asking what the mesh costs")
     try:  # zeros may have gone far, for an effect's sake
         frames = [few_states(t, len(base.fit.hypothesis.robot.body.mesh.tets)) for t in data.train]
-        plain = roughly_keeping(data, base, ["stiffness"], noise, frames)
+        plain = roughly_keeping(data, base, ["stiffness"], START, frames)
     except FemsenseError:
         plain = base
-    finer_is_made()
-    return with_turning_seats(with_mesh_errors(data, plain, names), base), before, base
+    return with_turning_seats(with_mesh_errors(data, plain, names), base)
 
 
 def _as_far_as_held_out_states_rest(fit: Callable[[int], Stage], steps: int) -> Stage:
@@ -152,22 +199,17 @@ def _as_far_as_held_out_states_rest(fit: Callable[[int], Stage], steps: int) -> 
     return fit(0)
 
 
-def _declared(data: Data, noise: Noise, start: Stage | None) -> Stage:
-    """Return the declared model with its camera calibrated."""
-    nothing = Prior(np.zeros(0), np.zeros(0))
-    own = None if start is None else own_of(start)
-    return make_stage(data, Hypothesis(data.robot), nothing, noise, np.zeros(0), own=own)
-
-
-def _search(data: Data, before: Stage, base: Stage, names: list[str], most: int, say: Progress) -> tuple[Data, Search]:
-    """Screen, refit and add effects, at most so many, until none passes; return the data as the last model has them, and the search."""
-    history: list[tuple[str, Stage]] = [("", base)]
+def _search(data: Data, before: Stage, start: History, names: list[str], say: Progress) -> tuple[Data, Search]:
+    """Screen, refit and add effects on top of the last model of a history until none passes; return the data as the last model has them, and the
+    search."""
+    most = MAX_EFFECTS if _tells_apart(data) else 0
+    history, base = list(start), start[-1][1]
     stage, first, table, refits, ties = base, list[Candidate](), list[Candidate](), list[dict[str, Any]](), list[Refit]()
     noise: Noise | None = None
     n_effective, earlier = 0.0, data
     fields: Fields | None = None
     while True:
-        found = len(history) - 1
+        found = len(history) - len(start)
         say(f"screening effects ({found} found so far)")
         if found and "clouds" in data.measured:
             assert noise is not None
@@ -178,21 +220,25 @@ def _search(data: Data, before: Stage, base: Stage, names: list[str], most: int,
         except FemsenseError as error:
             if not found:
                 raise
-            refits = _unsettled(refits, found, error)
+            refits = _unsettled(refits, len(history) - 1, error)
             data, history = earlier, history[:-1]
             stage = history[-1][1]
             break
         history[-1] = (history[-1][0], stage)
-        first = first or table
+        if not found:
+            base, first = stage, table
         if found >= most:
             break
-        next_one, others, tried = grow(data, stage, table, noise, names, n_effective, say)
-        refits += [{**record, "step": found + 1} for record in tried]
+        next_one, others, tried = grow(data, stage, table, noise, say)
+        refits += [{**record, "step": len(history)} for record in tried]
         if next_one is None and ties:
             instead, next_one, tried = _beside_a_tie(data, stage, ties[0], fields, noise, names, n_effective, say)
             if next_one is not None:
                 history[-1] = (ties[0].candidate.effect.name, instead)
-                refits = [*_renamed(refits, found, history[-1][0]), *({**record, "step": found + 1} for record in tried)]
+                refits = [
+                    *_renamed(refits, len(history) - 1, history[-1][0]),
+                    *({**record, "step": len(history)} for record in tried),
+                ]
                 stage, others = instead, []
         if next_one is None:
             break
@@ -215,8 +261,8 @@ def _search(data: Data, before: Stage, base: Stage, names: list[str], most: int,
             stage = swap.stage
             history.append((swap.name, stage))
     if len(history) > 1 and "clouds" in data.measured:
-        before = _declared(data, noise, before)  # before and after on the same rows
-    return data, Search(before, history, stage, noise, n_effective, first, table, refits, swap)
+        before = _placed(data, data.robot_as_declared, noise, before)  # before and after on the same rows
+    return data, Search(before, history, base, stage, noise, n_effective, first, table, refits, swap)
 
 
 def _screened(
@@ -273,7 +319,7 @@ def _beside_a_tie(
     same = "clouds" not in data.measured
     instead = _again(data, tie.stage, noise, known=jets if same else None, near=None if same else jets)
     _, table = _scored(data, instead, _fields(data, instead, fields, names), noise, names, n_effective)
-    both, _, tried = grow(data, instead, table, noise, names, n_effective, say)
+    both, _, tried = grow(data, instead, table, noise, say)
     if both is None or evidence(stage.fit, both.stage.fit) - both.candidate.cost <= BETTER:
         return instead, None, []
     return instead, both, tried

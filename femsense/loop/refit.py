@@ -15,8 +15,8 @@ from femsense.errors import DataError, FemsenseError
 from femsense.loop.data import Data
 from femsense.loop.joint import JointFit, Prior
 from femsense.loop.noise import Noise
-from femsense.loop.screen import NUISANCE, Candidate
-from femsense.loop.stages import Stage, jets_with, make_stage, own_of
+from femsense.loop.screen import Candidate
+from femsense.loop.stages import Stage, found_in, jets_with, make_stage, own_of
 
 EVIDENCE = 10.0
 """dBIC that a named effect needs."""
@@ -136,7 +136,7 @@ def _has_strayed(stage: Stage) -> bool:
     fit = stage.fit
     known = np.isfinite(fit.prior.std)
     far = np.abs(fit.coordinates - fit.prior.mean)[known] > STRAYED * fit.prior.std[known]
-    return bool(far.any()) and all(name in NUISANCE for name in fit.hypothesis.names)
+    return bool(far.any()) and not found_in(stage)
 
 
 def explains(stage: Stage | None) -> bool:

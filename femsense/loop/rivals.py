@@ -77,7 +77,7 @@ def _same_question(a: dict[str, Any], b: dict[str, Any]) -> bool:
 
 def _imitated(search: Search, names: Sequence[str]) -> Iterator[Alike]:
     """Yield the effects that this recording cannot test because one named nuisance imitates most of each, with the share that calibration absorbs."""
-    fit = search.history[0][1].fit
+    fit = search.base.fit
     J = np.asarray(fit.fit.jacobian)
     poses = np.linalg.qr(J[:, : fit.own])[0]
     present = search.final.fit.hypothesis.names

@@ -18,7 +18,9 @@ class Search:
     before: Stage
     """The declared model, calibrated."""
     history: list[tuple[str, Stage]]
-    """("", the model with what calibration may move), then each effect with the stage that added it."""
+    """("", the model with what calibration may move on the declared mesh), then each effect with the stage that added it."""
+    base: Stage
+    """The model of the first screening: with what calibration may move, on quadratic elements if effects were sought with these."""
     final: Stage
     noise: Noise
     n_effective: float

@@ -11,7 +11,7 @@ from femsense.arrays import BoolArray, FloatArray, IntArray
 from femsense.calib.forward import Hypothesis, SceneJet, evaluate_scene
 from femsense.effects import Effect, Entry, Parameter, find_effect
 from femsense.loop.clouds import make_rows, renewed_rows, states_of
-from femsense.loop.data import Data, groups_of, surface_of
+from femsense.loop.data import MESH, Data, groups_of, surface_of
 from femsense.loop.joint import JointFit, JointProblem, Prior, Trial, fit_jointly, rms_of, spans_of
 from femsense.loop.noise import Noise, estimate_noise, whiten
 from femsense.loop.screen import NUISANCE, Candidate, Fields, candidates_for, effect_fields, one_each, screen
@@ -22,9 +22,6 @@ MODULUS_STD = 0.5
 ZERO_STD = 0.1
 """How well the zero of a cable is known beforehand, as a share of its range in the recording."""
 
-
-QUADRATIC: Entry = {"element": "tet10"}
-"""The seed of quadratic elements, which growth asks first where the mesh is linear."""
 ROUGHLY = 3
 """Steps of a fit that only has to come near."""
 APART = 3.0
@@ -56,8 +53,8 @@ class Stage:
         return [h.jet.residual for h in self.held]
 
 
-def with_nuisance(data: Data) -> tuple[Hypothesis, Prior]:
-    """Return the declared model with what is always fitted along: the modulus and, where inputs are absolute, the cables' zeros."""
+def with_nuisance(data: Data, robot: Robot | None = None) -> tuple[Hypothesis, Prior]:
+    """Return a robot, by default that of the data, with what is always fitted along: the modulus and, where inputs are absolute, the cables' zeros."""
     terms: list[tuple[Effect, Entry, tuple[Parameter, ...]]] = []
     std: list[float] = []
     for name in NUISANCE:
@@ -68,7 +65,10 @@ def with_nuisance(data: Data) -> tuple[Hypothesis, Prior]:
             continue
         terms.append((effect, {}, parameters))
         std += [MODULUS_STD] if name == "stiffness" else [max(ZERO_STD * float(s), 1e-9) for s in data.input_scale]
-    return Hypothesis(data.robot, tuple(terms)), Prior(np.zeros(len(std)), np.array(std))
+    own = robot is None or robot is data.robot
+    return Hypothesis(data.robot if robot is None else robot, tuple(terms), data.settled if own else ()), Prior(
+        np.zeros(len(std)), np.array(std)
+    )
 
 
 def make_stage(
@@ -180,6 +180,11 @@ def roughly_keeping(data: Data, stage: Stage, names: Sequence[str], noise: Noise
     return Stage(fit, [], float("nan"))
 
 
+def found_in(stage: Stage) -> list[str]:
+    """Return the effects of a stage beside what calibration may move and quadratic elements."""
+    return [name for name in stage.fit.hypothesis.names if name not in (*NUISANCE, MESH.name)]
+
+
 def span_of(fit: JointFit, name: str) -> slice:
     """Return where the coordinates of an effect stand among those of a fit; nowhere if it has none."""
     at = 0
@@ -249,9 +254,6 @@ def fields_of(data: Data, stage: Stage, names: Sequence[str]) -> Fields:
     todo = candidates_for(
         stage.fit, data.control, forms=data.forms, names=[n for n in names if n not in NUISANCE], has_seats=seated
     )
-    finer = [seed for effect, seed, _ in todo if effect.name == "discretisation"]
-    if len(finer) > 1 and not [n for n in stage.fit.hypothesis.names if n not in NUISANCE]:
-        todo = [t for t in todo if t[1] != QUADRATIC]  # asked in any case
     return effect_fields(stage.fit, data.train, todo)
 
 
