@@ -239,11 +239,11 @@ def test_what_goes_with_an_effect_that_was_as_good_is_found_beside_it():
     table = screen_stage(data, base.fit, NOISE, fields_of(data, base, ["cable_gain"]), COUNT)
     candidate = (shortlist(table, first=True) or table)[0]
     tie = Refit(candidate, refit(data, base, candidate, NOISE), 0.0, 0.0, {})
-    instead, both, tried = beside_a_tie(data, wrong, tie, None, NOISE, lambda text: None)
+    instead, both, tried = beside_a_tie(data, wrong, tie, None, NOISE, ["cable_gain", "payload"], COUNT, lambda text: None)
     assert both is not None and both.candidate.effect.name == "payload" and tried[-1]["verdict"] == "named"
     assert instead.fit.hypothesis.names[-1] == "cable_gain"
     assert both.stage.fit.hypothesis.names[-2:] == ("cable_gain", "payload")
-    assert beside_a_tie(data, both.stage, tie, None, NOISE, lambda text: None)[1] is None
+    assert beside_a_tie(data, both.stage, tie, None, NOISE, ["cable_gain", "payload"], COUNT, lambda text: None)[1] is None
 
 
 def test_what_fields_of_the_model_before_promise_is_what_its_own_do():

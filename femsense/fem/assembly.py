@@ -11,7 +11,7 @@ from numba import njit
 
 from femsense.arrays import FloatArray, IntArray
 from femsense.fem.body import BodyModel
-from femsense.fem.clamp import clamp_energy_and_forces, ties_of
+from femsense.fem.clamp import add_followers, clamp_energy_and_forces, followers_of, ties_of
 from femsense.fem.corotational import corotational_tet4, corotational_tet10, stretched_tet10
 from femsense.fem.hyperelastic import hyperelastic_tet4, hyperelastic_tet10
 from femsense.fem.stencil import block_row_numbers
@@ -71,6 +71,9 @@ def internal(
         forces[ties.nodes] += slopes
         if tangent:
             blocks[np.ix_(diagonal_slots(body)[ties.nodes], np.array([0, 4, 8]))] += ties.stiffness
+    followers = followers_of(body)
+    if followers is not None:
+        energy += add_followers(followers, positions, forces, blocks if tangent else None)
     return Internal(float(energy), forces, blocks if tangent else None)
 
 

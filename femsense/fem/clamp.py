@@ -12,6 +12,7 @@ sparse stiffness (Woodbury).
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +21,8 @@ import scipy.sparse as sp
 from femsense.arrays import FloatArray, IntArray
 from femsense.fem.body import BodyModel
 from femsense.fem.linear import Factorization
+from femsense.fem.mesh import EDGES, TetMesh
+from femsense.fem.stencil import Stencil, block_row_numbers
 from femsense.pose import rotation_from_vector
 
 TIE = 1e4
@@ -38,6 +41,18 @@ class Ties:
     """The plate's centre of rotation [m], shape (3,)."""
     turn_stiffness: float
     """Of the plate [N m/rad]; inf: it does not turn."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Followers:
+    """Clamped nodes in the middle of an edge whose ends have springs: they are tied to the middle of these."""
+
+    nodes: IntArray
+    """shape (m, 3): a middle, and the ends of its edge."""
+    slots: IntArray
+    """Where their blocks are, shape (m, 6): middle, both ends, ends with each other, middle with each end."""
+    stiffness: float
+    """Of each tie [N/m]."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -61,6 +76,45 @@ def ties_of(body: BodyModel) -> Ties | None:
         nodes = body.clamped
         stiffness = TIE * float(np.median(body.material.young_modulus)) * body.reach / len(nodes)
     return Ties(nodes, stiffness, body.clamp_center, body.clamp_turn_stiffness)
+
+
+def followers_of(body: BodyModel) -> Followers | None:
+    """Return the clamped nodes that follow those with springs; None where there are none.
+
+    Between springs at the corners of quadratic elements alone the middles of the edges would bulge out: an even pull on a face acts on these.
+    """
+    if np.isinf(body.clamp_stiffness) or body.mesh.tets.shape[1] != 10:
+        return None
+    nodes, slots = _middles(body.mesh, body.stencil, body.clamped.tobytes(), body.clamp_nodes.tobytes())
+    if not len(nodes):
+        return None
+    return Followers(nodes, slots, TIE * float(np.median(body.material.young_modulus)) * body.reach / len(body.clamped))
+
+
+@functools.lru_cache(maxsize=4)
+def _middles(mesh: TetMesh, stencil: Stencil, clamped: bytes, springs: bytes) -> tuple[IntArray, IntArray]:
+    """Return the clamped nodes in the middle of edges whose ends have springs, with these, and the slots of their blocks; as `Followers` has them."""
+    held, sprung = np.frombuffer(clamped, np.int64), np.frombuffer(springs, np.int64)
+    edges = np.column_stack([mesh.tets[:, 4:].ravel(), mesh.tets[:, EDGES].reshape(-1, 2)]).astype(np.int64)
+    edges = np.unique(edges, axis=0)
+    nodes = edges[np.isin(edges[:, 0], held) & ~np.isin(edges[:, 0], sprung) & np.isin(edges[:, 1:], sprung).all(axis=1)]
+    count = len(stencil.block_rows) - 1
+    keys = block_row_numbers(stencil) * count + stencil.block_columns[:-1]
+    pairs = np.sort(nodes[:, [[0, 0], [1, 1], [2, 2], [1, 2], [0, 1], [0, 2]]], axis=2)
+    return nodes, np.searchsorted(keys, pairs[:, :, 0] * count + pairs[:, :, 1])
+
+
+def add_followers(followers: Followers, positions: FloatArray, forces: FloatArray, blocks: FloatArray | None) -> float:
+    """Add slopes [N] and stiffness of ties of nodes to the middle of their edges; return their energy [J]."""
+    middle, a, b = followers.nodes.T
+    gap, k = positions[middle] - 0.5 * (positions[a] + positions[b]), followers.stiffness
+    for node, share in ((middle, 1.0), (a, -0.5), (b, -0.5)):
+        np.add.at(forces, node, share * k * gap)
+    if blocks is not None:
+        for slot, share in zip(followers.slots.T, (1.0, 0.25, 0.25, 0.25, -0.5, -0.5)):
+            for axis in (0, 4, 8):
+                np.add.at(blocks[:, axis], slot, share * k)
+    return 0.5 * k * float((gap**2).sum())
 
 
 def plate_at(body: BodyModel, ties: Ties, positions: FloatArray) -> Plate:

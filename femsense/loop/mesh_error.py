@@ -56,7 +56,7 @@ def with_mesh_errors(data: Data, stage: Stage, tried: Sequence[str]) -> Data:
         finer = _finer(robot.body.mesh, tried)
         if finer is None:
             return data
-        fine = robot_on_mesh(_on_firm_clamp(robot), finer)
+        fine = _on_its_clamp(robot, robot_on_mesh(_on_firm_clamp(robot), finer))
         for i, (trial, (poses, initial)) in enumerate(zip(data.train, fitted)):
             own = [j for j, of in enumerate(data.held_of) if of == i]
             train[i], *later = _with_errors(robot, fine, [trial, *(held[j] for j in own)], poses, initial)
@@ -85,13 +85,25 @@ def errs_alike(before: Stage, after: Stage) -> bool:
 
 
 def _on_firm_clamp(robot: Robot) -> Robot:
-    """Return the robot on a clamp that does not give: on the finer mesh it stays where the state on the declared one has it.
-
-    Springs at the nodes of the declared mesh sink into a finer body as if it ended in as many points. How much the clamp gives is fitted on the
-    declared mesh, its error included; what is asked is what the body's error is.
-    """
+    """Return the robot on a clamp that does not give: on the finer mesh a plate that turns stays where the state on the declared one has it, since how
+    much it turns is fitted."""
     body = robot.body
     return robot if body.clamp_is_rigid else robot.with_body(body.with_clamp_stiffness())
+
+
+def _on_its_clamp(robot: Robot, fine: Robot) -> Robot:
+    """Return the robot on the finer mesh with the springs of its clamp, where it has them, shared out over all clamped nodes, so that they resist turning
+    alike: between the springs of few nodes a body bulges as none does that is held by a face."""
+    body, finer = robot.body, fine.body
+    if np.isinf(body.clamp_stiffness):
+        return fine
+    second = [
+        float(((b.mesh.nodes[n] - body.clamp_center) ** 2).sum()) for b, n in ((body, body.clamp_nodes), (finer, finer.clamped))
+    ]
+    shared = replace(finer, clamp_nodes=finer.clamped)
+    return fine.with_body(
+        shared.with_clamp_stiffness(body.clamp_stiffness * second[0] / second[1], turn=body.clamp_turn_stiffness)
+    )
 
 
 def _finer(mesh: TetMesh, tried: Sequence[str]) -> TetMesh | None:
