@@ -19,6 +19,7 @@ from femsense.effects import apply_effects, find_effect
 from femsense.effects.shape import finer_mesh, robot_on_mesh
 from femsense.errors import DataError, FemsenseError
 from femsense.fem import solves
+from femsense.fem.assembly import internal, reduced_matrix
 from femsense.fem.equilibrium import Equilibrium, solve_equilibrium
 from femsense.fem.mesh import Embedding, embed_points, to_linear
 from femsense.loop import improve
@@ -26,7 +27,7 @@ from femsense.loop.conclude import _excess, _lacks
 from femsense.loop.data import Data, prepare
 from femsense.loop.grow import MOUNTED, _plainly_worse, tilt_cost
 from femsense.loop.joint import Prior
-from femsense.loop.mesh_error import SHARE, TURNS, VARIES, errs_alike, make_finer, mesh_errors, with_mesh_errors
+from femsense.loop.mesh_error import SHARE, TURNS, VARIES, _on_its_clamp, errs_alike, make_finer, mesh_errors, with_mesh_errors
 from femsense.loop.noise import Groups, Noise, _Likelihood, whiten
 from femsense.loop.predict import sweeps_predicted
 from femsense.loop.screen import _parts, penalty
@@ -194,18 +195,31 @@ def test_the_error_of_the_mesh_is_what_the_finer_mesh_adds(linear: bool, finer: 
     np.testing.assert_allclose(turned @ matrix.ravel(), TURNS * error @ matrix.T, atol=1e-12)
 
 
-def test_springs_of_a_clamp_do_not_sink_into_the_finer_mesh():
+def test_springs_of_a_clamp_are_shared_out_over_the_finer_face():
     soft = arm((4, 2, 2))
     soft = soft.with_body(soft.body.with_clamp_stiffness(40.0))
-    recording, _ = record(sweeps(each=1)[0], labels=sweeps(each=1)[1], truth=soft)
-    noise = Noise({"white": 1e-4}, "")
-    data = prepare(soft, [recording], [])
-    stage = make_stage(data, Hypothesis(data.robot), Prior(np.zeros(0), np.zeros(0)), noise, np.zeros(0))
-    trial, error = data.train[0], mesh_errors(with_mesh_errors(data, stage, []))[0]
-    _, _, firm = with_error_of_the_mesh(noise)
-    nearest = np.unique(trial.scene.marker)[:4]  # beside the clamp, where a finer body would sink onto its springs
-    by_clamp, by_firm = (np.abs(e[np.isin(trial.scene.marker, nearest)]).max() for e in (error, mesh_errors(firm)[0]))
-    assert by_clamp < 3.0 * by_firm
+    finer = robot_on_mesh(soft.with_body(soft.body.with_clamp_stiffness()), finer_mesh(soft.body.mesh, None, 1))
+    body = _on_its_clamp(soft, finer).body
+    moments = [b.clamp_stiffness * ((b.mesh.nodes[b.clamp_nodes] - soft.body.clamp_center) ** 2).sum() for b in (soft.body, body)]
+    assert len(body.clamp_nodes) == len(body.clamped) > 2 * len(soft.body.clamp_nodes)
+    assert moments[1] == pytest.approx(moments[0])
+
+
+def test_the_middles_of_clamped_edges_follow_the_ends_that_have_springs():
+    body = arm((4, 2, 2)).body
+    corners = np.intersect1d(body.clamped, body.mesh.tets[:, :4])
+    body = replace(body, clamp_nodes=corners)
+    nearly = solve_equilibrium(body.with_clamp_stiffness(1e6), tension={NAMES[0]: 1.0})
+    firm = solve_equilibrium(body, tension={NAMES[0]: 1.0})
+    assert np.abs(nearly.positions - firm.positions).max() < 3e-3 * np.abs(firm.positions - body.mesh.nodes).max()
+    soft, random = body.with_clamp_stiffness(40.0), np.random.default_rng(0)
+    x = body.mesh.nodes + 1e-4 * random.normal(size=body.mesh.nodes.shape)
+    step = 1e-8 * random.normal(size=x.shape)
+    here, sides = internal(soft, x), [internal(soft, x + sign * step) for sign in (1.0, -1.0)]
+    assert (here.forces * step).sum() == pytest.approx((sides[0].energy - sides[1].energy) / 2, rel=1e-5)
+    change = ((sides[0].forces - sides[1].forces) / 2).reshape(-1)[soft.free_map.dofs]
+    K = reduced_matrix(soft, here.blocks)
+    np.testing.assert_allclose(K @ step.reshape(-1)[soft.free_map.dofs], change, atol=1e-6 * np.abs(change).max())
 
 
 @pytest.mark.parametrize("name, size, alike", [("cable_friction", 0.01, True), ("cable_friction", 0.3, False), ("depth_scale", 1.03, True),

@@ -28,7 +28,9 @@ def searched(refits: list[dict[str, Any]], first: list[SimpleNamespace] | None =
     hypothesis = SimpleNamespace(terms=((SimpleNamespace(name="stiffness"), {}, (None,)),), names=("stiffness",))
     jacobian = np.array([[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]])
     stage = SimpleNamespace(fit=SimpleNamespace(fit=SimpleNamespace(jacobian=jacobian), own=1, hypothesis=hypothesis))
-    return cast(Search, SimpleNamespace(refits=refits, first=first or [], history=[("", stage)], base=stage, final=stage, in_place=None))
+    return cast(
+        Search, SimpleNamespace(refits=refits, first=first or [], history=[("", stage)], base=stage, final=stage, in_place=None)
+    )
 
 
 def test_a_rival_with_nearly_as_much_evidence_is_said_once_with_all_that_is_known_of_it() -> None:

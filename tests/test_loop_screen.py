@@ -325,3 +325,5 @@ def test_a_linear_mesh_is_asked_for_quadratic_elements_whatever_else_makes_up_fo
     found = improve(linear, [recording], effects=["discretisation", "poisson", "cable_gain"])
     assert [e["name"] for e in found.effects] == ["discretisation"]
     assert found.after["validation_rms_m"] < 0.2 * found.before["validation_rms_m"]
+    row = next(c for c in found.candidates if c["name"] == "discretisation")
+    assert row["verdict"] == "named" and row["dbic"] > 10.0
