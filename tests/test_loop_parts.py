@@ -203,6 +203,13 @@ def test_springs_of_a_clamp_are_shared_out_over_the_finer_face():
     moments = [b.clamp_stiffness * ((b.mesh.nodes[b.clamp_nodes] - soft.body.clamp_center) ** 2).sum() for b in (soft.body, body)]
     assert len(body.clamp_nodes) == len(body.clamped) > 2 * len(soft.body.clamp_nodes)
     assert moments[1] == pytest.approx(moments[0])
+    recording, _ = record(sweeps(each=1)[0], labels=sweeps(each=1)[1], truth=soft)
+    noise, data = Noise({"white": 1e-4}, ""), prepare(soft, [recording], [])
+    stage = make_stage(data, Hypothesis(data.robot), Prior(np.zeros(0), np.zeros(0)), noise, np.zeros(0))
+    trial, error = data.train[0], mesh_errors(with_mesh_errors(data, stage, []))[0]
+    firm = mesh_errors(with_error_of_the_mesh(noise)[2])[0]
+    nearest = np.isin(trial.scene.marker, np.unique(trial.scene.marker)[:4])  # beside the clamp, which does not give alike there
+    assert np.abs(error[nearest]).max() > 3.0 * np.abs(firm[nearest]).max()
 
 
 def test_the_middles_of_clamped_edges_follow_the_ends_that_have_springs():

@@ -327,3 +327,16 @@ def test_a_linear_mesh_is_asked_for_quadratic_elements_whatever_else_makes_up_fo
     assert found.after["validation_rms_m"] < 0.2 * found.before["validation_rms_m"]
     row = next(c for c in found.candidates if c["name"] == "discretisation")
     assert row["verdict"] == "named" and row["dbic"] > 10.0
+    assert {str(r["seed"]) for r in row["refits"]} == {"{'element': 'tet10'}", "{'refinements': 1}"}
+
+
+def test_linear_elements_stay_where_the_data_do_not_miss_quadratic_ones() -> None:
+    inputs, labels = sweeps(0.005)  # it hardly moves
+    declared = arm((7, 2, 2))
+    declared = declared.with_body(declared.body.with_gravity([0.0, 0.0, 0.0]))
+    recording, _ = record(inputs, labels=labels, truth=declared)
+    linear = robot_on_mesh(declared, to_linear(declared.body.mesh))
+    found = improve(linear, [recording], effects=["discretisation", "cable_gain"])
+    assert found.verdict == "none" and not found.effects
+    row = next(c for c in found.candidates if c["name"] == "discretisation")
+    assert row["refits"][0]["verdict"].startswith("too little evidence")

@@ -8,6 +8,9 @@ anchor at c + b_i, b_i = R (X_i − c), and with y_i = x_i − c the clamp's ene
 At the minimum κ φ = Σ k b_i × y_i; the force on a node is k (b_i − y_i), and d²E/dx² = k I − P J⁻¹ Pᵀ with P_i = k [b_i]× and
 J = κ J_l⁻¹(φ) + Σ k ((b·y) I − b yᵀ), J_l the left Jacobian of the rotation. The part P J⁻¹ Pᵀ has rank three and goes beside the
 sparse stiffness (Woodbury).
+
+A clamped node without a spring, in the middle of an edge whose ends a and b have some, is tied to (x_a + x_b)/2: the clamp that hardly gives is
+the clamp.
 """
 
 from __future__ import annotations

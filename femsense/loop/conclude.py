@@ -385,7 +385,7 @@ def _candidate_rows(first: list[Candidate], table: list[Candidate], refits: list
     rows = [  # the mesh is asked about without screening it
         {
             "name": r["name"], "seed": r["seed"], "dchi2": r.get("dchi2"), "dbic": r.get("dbic"), "retained_share": None, "dbic_at_end": None,
-            "refits": [o for o in refits if o["name"] == r["name"]], "verdict": r["verdict"],
+            "refits": [o for o in refits if o["name"] == r["name"]], "verdict": _verdict_of([o for o in refits if o["name"] == r["name"]]),
         }
         for r in {r["name"]: r for r in reversed(refits) if r["name"] not in screened}.values()
     ]  # fmt: skip

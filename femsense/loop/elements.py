@@ -13,12 +13,13 @@ from typing import Any
 
 import numpy as np
 
+from femsense.effects import Entry
 from femsense.errors import FemsenseError
 from femsense.loop.data import MESH, QUADRATIC, Data
 from femsense.loop.few import few_of
 from femsense.loop.grow import judged
 from femsense.loop.noise import Noise
-from femsense.loop.refit import EVIDENCE, FORGONE, beyond, explains
+from femsense.loop.refit import EVIDENCE, FORGONE, beyond
 from femsense.loop.screen import NUISANCE, Candidate, penalty
 from femsense.loop.search import Search
 from femsense.loop.stages import Stage, make_stage, span_of
@@ -41,8 +42,6 @@ def with_quadratic(robot: Robot) -> Robot:
 def need_quadratic(data: Data, search: Search, names: Sequence[str]) -> tuple[bool, list[dict[str, Any]]]:
     """Return whether the data miss quadratic elements where the whole model has linear ones, and what became of both kinds of mesh that were tried.
 
-    A refined linear mesh is tried where quadratic elements leave more than the noise.
-
     Arguments:
         data: the data.
         search: what was found with quadratic elements.
@@ -59,7 +58,7 @@ def need_quadratic(data: Data, search: Search, names: Sequence[str]) -> tuple[bo
     passes = record["verdict"] == "passes"
     if passes:
         record["verdict"] = "named"
-    return passes, [record, *_refined(data, search)]
+    return passes, [record, *(_refined(data, search, seed) for seed in MESH.seeds(data.robot_as_declared) if seed != QUADRATIC)]
 
 
 def _candidate(names: Sequence[str], n_effective: float) -> Candidate:
@@ -87,21 +86,16 @@ def _on(
     return make_stage(data, hypothesis, fit.prior, noise, start, own=own, worth=worth, max_iterations=steps)
 
 
-def _refined(data: Data, search: Search) -> list[dict[str, Any]]:
-    """Return what became of refined linear elements, tried in some states where quadratic ones leave more than the noise; nothing where these do not."""
-    seeds = [seed for seed in MESH.seeds(data.robot_as_declared) if seed != QUADRATIC]
-    if explains(search.final) or not seeds:
-        return []
-    record: dict[str, Any] = {"name": MESH.name, "seed": seeds[0], "step": 1}
+def _refined(data: Data, search: Search, seed: Entry) -> dict[str, Any]:
+    """Return what became of refined linear elements, tried in some states."""
+    record: dict[str, Any] = {"name": MESH.name, "seed": seed, "step": 1}
     few = few_of(data, search.final, search.noise)
     try:
-        made = _on(
-            few.data, MESH.apply(data.robot_as_declared, seeds[0]), search.history[0][1], few.stage, search.noise, steps=STEPS
-        )
+        made = _on(few.data, MESH.apply(data.robot_as_declared, seed), search.history[0][1], few.stage, search.noise, steps=STEPS)
         record["verdict"] = f"in some of the states χ² is {made.fit.chi2:.0f}, with quadratic elements {few.stage.fit.chi2:.0f}"
     except FemsenseError as error:
         record["verdict"] = f"no equilibrium: {error}"
-    return [record]
+    return record
 
 
 __all__ = ["need_quadratic", "seeks_with_quadratic", "with_quadratic"]

@@ -65,10 +65,9 @@ def with_nuisance(data: Data, robot: Robot | None = None) -> tuple[Hypothesis, P
             continue
         terms.append((effect, {}, parameters))
         std += [MODULUS_STD] if name == "stiffness" else [max(ZERO_STD * float(s), 1e-9) for s in data.input_scale]
-    own = robot is None or robot is data.robot
-    return Hypothesis(data.robot if robot is None else robot, tuple(terms), data.settled if own else ()), Prior(
-        np.zeros(len(std)), np.array(std)
-    )
+    body = data.robot if robot is None else robot
+    settled = data.settled if body is data.robot else ()
+    return Hypothesis(body, tuple(terms), settled), Prior(np.zeros(len(std)), np.array(std))
 
 
 def make_stage(
