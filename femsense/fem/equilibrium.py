@@ -41,6 +41,12 @@ LENT = 0.1
 """So does one that was lent by a state near by."""
 RUBS = 0.3
 """So does any where tensions along cables follow the bends, which converge no faster with a stiffness of their own."""
+PATIENCE = 5
+"""In single precision one serves, too, where so many more steps are enough if each leaves the share that the last one left: a factor takes longer."""
+PAIRS = 8
+"""Steps since the last factor that are remembered (`_Secants`)."""
+ARRIVED = 5e-7
+"""A state that is only tried is there when a step was shorter than this share of the body's size."""
 FAR = 1e6
 """A stiffness factorised where the residual was more than this times its tolerance says nothing of the stability of the end."""
 CLOSED = 1e-12
@@ -141,6 +147,7 @@ class _State:
     shifted: bool = False  # the stiffness was not positive definite where it was last factorised
     shift: float = 0.0  # what made the stiffness positive definite there [N/m]
     single: bool = False  # factors in single precision
+    rough: bool = False  # the state is only tried
     indefinite_steps: int = 0
     factored_at: float = 0.0  # residual where the stiffness was last factorised [N]
     here: Internal | None = None  # what Newton saw last, at x
@@ -200,7 +207,7 @@ def solve_equilibrium(
     loads = _collect_loads(body, given, nodal_forces, start, before, bilateral, relative_tolerance)
     state = _initial_state(body, loads, start, reuse_factor, along)
     rough = rough and start is not None
-    state.single = rough or single
+    state.single, state.rough = rough or single, rough
     shares = [s.copy() for s in state.shares]
     status, reached = _settle(body, loads, state, min(max_iterations, TRIES) if rough else max_iterations), 1.0
     if not rough and status not in (CONVERGED, "singular") and start is not None and start.converged and body.is_held():
@@ -410,8 +417,9 @@ def _newton(body: BodyModel, loads: _Loads, state: _State, max_iterations: int) 
     held = np.flatnonzero(state.taut)
     stretch = _stretch(body)[held]
     here = state.here = internal(body, state.x, tangent=not state.borrowed)
-    last = np.inf
+    last, length, shrinking = np.inf, np.inf, np.inf
     frictional = any(c.friction > 0 for c in body.cables)
+    secants = _Secants()
     for iteration in range(max_iterations):
         follows = frictional and not len(held) and iteration < FOLLOW_FRICTION
         if follows and (iteration or state.borrowed):  # from a state near by at once: its bends are nearly those of the end
@@ -424,21 +432,32 @@ def _newton(body: BodyModel, loads: _Loads, state: _State, max_iterations: int) 
         state.residual = float(np.linalg.norm(force.reshape(-1, 3), axis=1).max(initial=0.0))
         sound = bool(np.isfinite(state.residual) and np.isfinite(here.energy))
         closed = bool((np.abs(gap) / loads.lever[held]).max(initial=0.0) <= CLOSED)
-        if sound and closed and state.residual <= loads.tolerance:
+        arrived = state.rough and not frictional and length <= ARRIVED * body.reach
+        if sound and closed and (arrived or state.residual <= loads.tolerance):
             return CONVERGED
         if not sound:
             return "stalled"
         left = state.residual / last if last > 0.0 else np.inf
         enough = RUBS if follows else LENT if state.borrowed else CHORD
         sound_to_the_end = state.factored_at <= FAR * loads.tolerance and state.residual * min(left, 1.0) ** 2 <= loads.tolerance
-        serves = left <= enough or sound_to_the_end
+        in_sight = state.residual * left**PATIENCE <= loads.tolerance
+        in_sight |= state.rough and length * shrinking**PATIENCE <= ARRIVED * body.reach
+        serves = left <= enough or sound_to_the_end or (state.single and in_sight)
+        if not frictional and not len(held):
+            secants.learn(state.x.ravel()[free], force)
         if state.factor is None or not serves:
             state.factor, state.borrowed = _factor_here(body, here, state, H, C, stretch, loads.lever[held]), False
             if state.factor is None:
                 return "singular"
             state.factored_at = state.residual
+            secants.pairs.clear()
         last, state.serves = state.residual, state.borrowed or 0.0 < left <= SURE
-        du, dT = _bordered_step(state.factor, force, gap, H, C, stretch, loads.lever[held])
+        if secants.pairs:
+            du, dT = secants.step(state.factor, force), gap
+        else:
+            du, dT = _bordered_step(state.factor, force, gap, H, C, stretch, loads.lever[held])
+        longer, length = length, float(np.abs(du).max(initial=0.0))
+        shrinking = length / longer
         if not closed and _contradicts(H @ du + stretch * dT, gap, loads.lever[held]):
             return "cables"
         if not (np.isfinite(du).all() and np.isfinite(dT).all()):
@@ -452,6 +471,35 @@ def _newton(body: BodyModel, loads: _Loads, state: _State, max_iterations: int) 
             return CONVERGED if closed and state.residual <= 1e3 * loads.tolerance else "stalled"
         here = state.here = moved
     return "iterations"
+
+
+class _Secants:
+    """What steps since the last factor have shown of the stiffness, where nothing is held: BFGS updates of its inverse (Matthies & Strang 1979)."""
+
+    def __init__(self) -> None:
+        self.pairs: list[tuple[FloatArray, FloatArray, float]] = []
+        """Steps [m], what they took away from the unbalanced force [N], and one over their product."""
+        self.last: tuple[FloatArray, FloatArray] | None = None
+
+    def learn(self, x: FloatArray, force: FloatArray) -> None:
+        """See the free positions [m] and the unbalanced force there [N], each (f,)."""
+        if self.last is not None:
+            step, fell = x - self.last[0], self.last[1] - force
+            work = float(step @ fell)
+            if work > 0.0:
+                self.pairs = [*self.pairs[1 - PAIRS :], (step, fell, 1.0 / work)]
+        self.last = x, force
+
+    def step(self, factor: Factorization, force: FloatArray) -> FloatArray:
+        """Return the step that an unbalanced force asks for [m], shape (f,)."""
+        shares = []
+        for step, fell, weight in reversed(self.pairs):
+            shares.append(weight * float(step @ force))
+            force = force - shares[-1] * fell
+        answer = factor.solve(force)
+        for (step, fell, weight), share in zip(self.pairs, reversed(shares)):
+            answer = answer + (share - weight * float(fell @ answer)) * step
+        return answer
 
 
 def _unbalanced(loads: _Loads, state: _State, here: Internal, rows: FloatArray) -> FloatArray:

@@ -377,19 +377,26 @@ class JointProblem:
 
 def _as_near(kept: States, near: States, body: BodyModel) -> States:
     """Return states of a body to start from: those of a fit near by where they are on the same mesh, since others may have gone far since
-    then, unless it is those whose clamp has given way, or not, as this body's does."""
+    then, unless it is those whose clamp has given way, or not, as this body's does. What is kept lends them its factors."""
     shape = next(iter(near.values())).positions.shape
     if any(state.positions.shape != shape for state in kept.values()):
         return dict(kept)
-
-    def serves(k: int, state: Equilibrium) -> bool:
-        if k not in kept or kept[k].positions is state.positions:  # such states have their factors
-            return k not in kept
-        return has_given(body, state) != body.clamp_is_rigid or has_given(body, kept[k]) == body.clamp_is_rigid
-
-    return {**kept, **{k: state for k, state in near.items() if serves(k, state)}}
+    return {**kept, **{k: _lent(kept.get(k), state, body) for k, state in near.items()}}
 
 
+def _lent(kept: Equilibrium | None, state: Equilibrium, body: BodyModel) -> Equilibrium:
+    """Return the state that a frame starts from, of one that is kept and one of a fit near by."""
+    if kept is None or kept.positions is state.positions:  # such states have their factors
+        return state if kept is None else kept
+    gives, gave = has_given(body, state), has_given(body, kept)
+    if gives == body.clamp_is_rigid and gave != body.clamp_is_rigid:
+        return kept
+    near = gives == gave and np.abs(kept.positions - state.positions).max() < NEAR * body.reach
+    return replace(state, factor=kept.factor if near else None)
+
+
+NEAR = 1e-2
+"""A factor serves for a state that differs by less than this share of the body."""
 TRUSTED = 0.02
 """Derivatives that missed less than this share of every step since they were computed are believed that nothing is left to gain."""
 GAIN = 0.5
