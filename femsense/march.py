@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 
 import numpy as np
 
@@ -106,8 +106,13 @@ def creep_response(robot: Robot, recording: Recording) -> FloatArray:
 
 
 def _load_ties(mesh: TetMesh, points: FloatArray) -> Embedding:
-    """Return the ties of loads, each place looked up once."""
-    places, number = np.unique(points, axis=0, return_inverse=True)
+    """Return the ties of loads, each place looked up once; variant after variant asks for the same ones."""
+    return _ties_at(mesh, points.tobytes())
+
+
+@lru_cache(maxsize=4)
+def _ties_at(mesh: TetMesh, points: bytes) -> Embedding:
+    places, number = np.unique(np.frombuffer(points).reshape(-1, 3), axis=0, return_inverse=True)
     return embed_points(mesh, places)[number.ravel()]
 
 

@@ -190,7 +190,9 @@ def marker_residual(robot: Robot, scene: Scene, poses: Sequence[FloatArray], mod
     and a fit would take that for a better model. Of crossings of a measured surface: how far it lies outside of the model's points, along
     its normal, shape (k, 1).
     """
-    predicted = np.array([model[int(f)][m] for f, m in zip(scene.frame, scene.marker)]).reshape(-1, 3)
+    frames, number = np.unique(scene.frame, return_inverse=True)
+    each_frame = [model[k] for k in frames.tolist()]
+    predicted = np.stack(each_frame)[number, scene.marker] if each_frame else np.zeros((0, 3))
     expected = as_measured(predicted, scene.view, poses, robot.observation)
     if scene.crossings is not None:
         return -scene.crossings.distance(expected)[:, None]

@@ -1,3 +1,4 @@
+# mypy: allow-untyped-decorators
 """Tetrahedral meshes: linear (4 nodes) and quadratic (10 nodes), their surface and points embedded in them.
 
 Nodes of an element are ordered as in VTK: corners 0 1 2 3, then the middles of the edges 01 12 02 03 13 23.
@@ -8,13 +9,15 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import chain
 from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
+from numba import njit
 from scipy.spatial import cKDTree
 
-from femsense.arrays import FloatArray, IntArray, as_points, freeze
+from femsense.arrays import BoolArray, FloatArray, IntArray, as_points, freeze
 from femsense.errors import InputError
 
 EDGES = np.array([[0, 1], [1, 2], [0, 2], [0, 3], [1, 3], [2, 3]])
@@ -241,12 +244,16 @@ def vertex_normals(positions: FloatArray, triangles: IntArray) -> FloatArray:
 
 def barycentric(mesh: TetMesh, elements: IntArray, points: FloatArray) -> FloatArray:
     """Return barycentric coordinates of points in the given elements at rest, shape (p, 4). Raises InputError where one is flat."""
-    corners = mesh.nodes[mesh.tets[elements, :4]]
-    edge = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
     try:
-        inner = np.linalg.solve(edge, (points - corners[:, 0])[..., None])[..., 0]
+        return _coordinates(mesh.nodes[mesh.tets[elements, :4]], points)
     except np.linalg.LinAlgError:
         raise InputError("tetrahedra without volume", where="mesh", expected="positive volumes") from None
+
+
+def _coordinates(corners: FloatArray, points: FloatArray) -> FloatArray:
+    """Return barycentric coordinates (p, 4) of points (p, 3) in tetrahedra (p, 4, 3)."""
+    edge = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
+    inner = np.linalg.solve(edge, (points - corners[:, 0])[..., None])[..., 0]
     return np.concatenate([1.0 - inner.sum(axis=1, keepdims=True), inner], axis=1)
 
 
@@ -265,27 +272,18 @@ def shape_slopes(barycentric_coordinates: FloatArray, *, quadratic: bool) -> Flo
     if not quadratic:
         return np.broadcast_to(np.eye(4), (p, 4, 4)).copy()
     slopes = np.zeros((p, 10, 4))
-    for i in range(4):
-        slopes[:, i, i] = 4.0 * L[:, i] - 1.0
-    for e, (i, j) in enumerate(EDGES):
-        slopes[:, 4 + e, i] = 4.0 * L[:, j]
-        slopes[:, 4 + e, j] = 4.0 * L[:, i]
+    corner, edge, (i, j) = np.arange(4), np.arange(4, 10), EDGES.T
+    slopes[:, corner, corner] = 4.0 * L - 1.0
+    slopes[:, edge, i] = 4.0 * L[:, j]
+    slopes[:, edge, j] = 4.0 * L[:, i]
     return slopes
 
 
 def closest_in_tet(corners: FloatArray, points: FloatArray) -> FloatArray:
     """Return barycentric coordinates (p, 4) of the point of each tetrahedron (p, 4, 3) that is closest to points (p, 3)."""
-    edge = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
-    inner = np.linalg.solve(edge, (points - corners[:, 0])[..., None])[..., 0]
-    best = np.concatenate([1.0 - inner.sum(axis=1, keepdims=True), inner], axis=1)
-    distance = np.where((best >= 0).all(axis=1), 0.0, np.inf)
-    for face in FACES:
-        weights = closest_in_triangle(corners[:, face], points)
-        d = np.linalg.norm(np.einsum("pi,pic->pc", weights, corners[:, face]) - points, axis=1)
-        closer = d < distance
-        best[closer] = 0.0
-        best[np.ix_(closer, face)] = weights[closer]
-        distance = np.minimum(d, distance)
+    best = _coordinates(corners, points)
+    if not (best >= 0).all():
+        _drawn_to_faces(freeze(corners), freeze(points), best)
     return best
 
 
@@ -294,27 +292,8 @@ def closest_in_triangle(corners: FloatArray, points: FloatArray) -> FloatArray:
 
     The plane's foot where it is inside, else the best of the three sides (Ericson, Real-Time Collision Detection, 5.1).
     """
-    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
-    ab, ac, ap = b - a, c - a, points - a
-    d00, d01, d11 = (np.einsum("pc,pc->p", u, v) for u, v in ((ab, ab), (ab, ac), (ac, ac)))
-    d20, d21 = np.einsum("pc,pc->p", ap, ab), np.einsum("pc,pc->p", ap, ac)
-    det = d00 * d11 - d01 * d01
-    safe = np.where(det > 0, det, 1.0)
-    v, w = (d11 * d20 - d01 * d21) / safe, (d00 * d21 - d01 * d20) / safe
-    best = np.stack([1.0 - v - w, v, w], axis=1)
-    inside = (det > 0) & (best >= 0).all(axis=1)
-    distance = np.where(inside, 0.0, np.inf)  # the foot beats every side
-    for i, j in ((0, 1), (1, 2), (2, 0)):
-        p, q = corners[:, i], corners[:, j]
-        along = q - p
-        length = np.einsum("pc,pc->p", along, along)
-        t = np.clip(np.einsum("pc,pc->p", points - p, along) / np.where(length > 0, length, 1.0), 0.0, 1.0)
-        d = np.linalg.norm(p + t[:, None] * along - points, axis=1)
-        closer = d < distance
-        best[closer] = 0.0
-        best[closer, i] = 1.0 - t[closer]
-        best[closer, j] = t[closer]
-        distance = np.where(closer, d, distance)
+    best = np.empty((len(points), 3))
+    _feet(freeze(corners), freeze(points), best)
     return best
 
 
@@ -334,21 +313,23 @@ def embed_points(mesh: TetMesh, points: FloatArray, *, outside_rule: str = "near
         the embedding, with the distance outside.
     """
     points = as_points(points)
-    corners, reach, tree = _by_centre(mesh)
-    near = tree.query(points, k=1)
+    elements = _by_centre(mesh)
+    near = elements.tree.query(points, k=1)
     centre_distance = np.asarray(near[0], dtype=np.float64).reshape(len(points))
     element = np.asarray(near[1], dtype=np.int64).reshape(len(points))
     outside = np.zeros(len(points))
     for first in range(0, len(points), AT_ONCE):
         part = slice(first, first + AT_ONCE)
-        free = first + _find_holders(mesh, tree, points[part], reach, element[part])
+        free = first + _find_holders(mesh, elements, points[part], element[part])
         if len(free):
-            carrier, outside[free] = _carriers_of_outsiders(corners, tree, points[free], centre_distance[free] + reach)
+            carrier, outside[free] = _carriers_of_outsiders(elements, points[free], centre_distance[free] + elements.reach)
             element[free] = carrier if outside_rule == "nearest_element" else element[free]
-    at = closest_in_tet(corners[element], points)
-    slopes = shape_slopes(at, quadratic=mesh.is_quadratic)
-    beyond = barycentric(mesh, element, points) - at
-    weights = shape_values(at, quadratic=mesh.is_quadratic) + np.einsum("pkl,pl->pk", slopes, beyond)
+    coordinates = barycentric(mesh, element, points)
+    at = coordinates.copy()
+    _drawn_to_faces(freeze(elements.corners[element]), freeze(points), at)
+    weights = shape_values(at, quadratic=mesh.is_quadratic)
+    if (at != coordinates).any():
+        weights += np.einsum("pkl,pl->pk", shape_slopes(at, quadratic=mesh.is_quadratic), coordinates - at)
     weights[np.abs(weights) < ROUNDING] = 0.0
     return Embedding(mesh.tets[element], weights, element, outside)
 
@@ -370,60 +351,208 @@ for them: factors in single precision took twice the time."""
 ALIKE, ALIKE_CENTRES = 1e-9, 1e-4
 """Elements whose distances to a point differ by less, in units of the mesh, are as near, and so are centres of elements: the first of them carries
 it, so that neither rounding nor a step of a derivative by the body's size chooses."""
+NEARLY = 1e-6
+"""Elements outside of which a point is by more, in barycentric coordinates, do not hold it, whatever the rounding."""
 AT_ONCE = 4096
 """Points that are looked for together."""
 
 
+@dataclass(frozen=True, eq=False, slots=True)
+class _Elements:
+    """The elements of a mesh, to look up by their centres."""
+
+    corners: FloatArray
+    """[m], shape (m, 4, 3)."""
+    centres: FloatArray
+    """[m], shape (m, 3)."""
+    reach: float
+    """How far the farthest corner is from its element's centre [m]."""
+    size: float
+    """Length of the longest side of the box around the mesh [m]."""
+    tree: cKDTree
+    """The centres."""
+
+
 @lru_cache(maxsize=4)
-def _by_centre(mesh: TetMesh) -> tuple[FloatArray, float, cKDTree]:
-    """Return the corners of the elements of a mesh [m], (m, 4, 3), how far the farthest is from its element's centre [m], and the centres
-    as a tree."""
+def _by_centre(mesh: TetMesh) -> _Elements:
     corners = mesh.nodes[mesh.tets[:, :4]]
     centres = corners.mean(axis=1)
-    return corners, float(np.linalg.norm(corners - centres[:, None], axis=2).max()), cKDTree(centres)
+    reach = np.linalg.norm(corners - centres[:, None], axis=2).max()
+    return _Elements(freeze(corners), freeze(centres), float(reach), float(np.ptp(corners, axis=(0, 1)).max()), cKDTree(centres))
 
 
-def _find_holders(mesh: TetMesh, tree: cKDTree, points: FloatArray, reach: float, element: IntArray) -> IntArray:
+def _find_holders(mesh: TetMesh, elements: _Elements, points: FloatArray, element: IntArray) -> IntArray:
     """Write the element that holds each point; return the points that none holds."""
-    point, candidate, start = _pairs(tree.query_ball_point(points, reach * (1 + 1e-9), return_sorted=False))
-    if not len(point):
-        return np.arange(len(points))
-    depth = barycentric(mesh, candidate, points[point]).min(axis=1)
-    best, which = _first_largest(depth, start)
-    held = best >= -1e-9
-    element[held] = candidate[which[held]]
-    return np.flatnonzero(~held)
+    point, candidate, _ = _pairs(elements.tree.query_ball_point(points, elements.reach * (1 + 1e-9), return_sorted=False))
+    may = np.empty(len(point), dtype=bool)
+    _may_hold(elements.corners, freeze(points), point, candidate, may)
+    point, candidate = point[may], candidate[may]
+    best = np.full(len(points), -np.inf)
+    _keep_deepest(point, candidate, barycentric(mesh, candidate, points[point]).min(axis=1), best, element)
+    return np.flatnonzero(best == -np.inf)
 
 
-def _carriers_of_outsiders(
-    corners: FloatArray, tree: cKDTree, points: FloatArray, radius: FloatArray
-) -> tuple[IntArray, FloatArray]:
+def _carriers_of_outsiders(elements: _Elements, points: FloatArray, radius: FloatArray) -> tuple[IntArray, FloatArray]:
     """Return the element nearest to each point outside of the mesh, of those that are as near the one with the nearest centre, and the distance to it [m]."""
-    point, candidate, start = _pairs(tree.query_ball_point(points, radius, return_sorted=False))
-    nearest = closest_in_tet(corners[candidate], points[point])
-    distance = np.linalg.norm(np.einsum("pi,pic->pc", nearest, corners[candidate]) - points[point], axis=1)
-    size = np.ptp(corners, axis=(0, 1)).max()
-    best = np.minimum.reduceat(distance, start[:-1])
-    alike = distance <= np.repeat(best, np.diff(start)) + ALIKE * size
-    off = np.where(alike, np.linalg.norm(corners[candidate].mean(axis=1) - points[point], axis=1), np.inf)
-    alike = off <= np.repeat(np.minimum.reduceat(off, start[:-1]), np.diff(start)) + ALIKE_CENTRES * size
-    return np.minimum.reduceat(np.where(alike, candidate, len(corners)), start[:-1]), best
+    _, candidate, start = _pairs(elements.tree.query_ball_point(points, radius, return_sorted=False))
+    carrier, outside = np.empty(len(points), dtype=np.int64), np.empty(len(points))
+    _carry(elements.corners, elements.centres, elements.reach, elements.size, freeze(points), candidate, start, carrier, outside)
+    return carrier, outside
 
 
 def _pairs(found: Any) -> tuple[IntArray, IntArray, IntArray]:
     """Return pairs (point, candidate) of lists of candidates, one a point, and where those of each point begin, with the end."""
     count = np.array([len(one) for one in found], dtype=np.int64)
-    candidate = np.array([c for one in found for c in one], dtype=np.int64)
+    candidate = np.fromiter(chain.from_iterable(found), np.int64, count.sum())
     return np.repeat(np.arange(len(count)), count), candidate, np.concatenate([[0], np.cumsum(count)])
 
 
-def _first_largest(values: FloatArray, start: IntArray) -> tuple[FloatArray, IntArray]:
-    """Return the largest of each group of values, and where it first stands; −inf where a group is empty."""
-    count = np.diff(start)
-    full = np.flatnonzero(count)
-    best, which = np.full(len(count), -np.inf), np.zeros(len(count), dtype=np.int64)
-    best[full] = np.maximum.reduceat(values, start[full])
-    hits = np.flatnonzero(values == np.repeat(best, count))
-    group, first = np.unique(np.repeat(np.arange(len(count)), count)[hits], return_index=True)
-    which[group] = hits[first]
-    return best, which
+Vector = tuple[float, float, float]
+
+
+@njit(cache=True, nogil=True)
+def _vector(points: FloatArray, row: int) -> Vector:
+    return points[row, 0], points[row, 1], points[row, 2]
+
+
+@njit(cache=True, nogil=True)
+def _minus(u: Vector, v: Vector) -> Vector:
+    return u[0] - v[0], u[1] - v[1], u[2] - v[2]
+
+
+@njit(cache=True, nogil=True)
+def _dot(u: Vector, v: Vector) -> float:
+    return u[0] * v[0] + u[2] * v[2] + u[1] * v[1]
+
+
+@njit(cache=True, nogil=True)
+def _triple(u: Vector, v: Vector, w: Vector) -> float:
+    return u[0] * (v[1] * w[2] - v[2] * w[1]) + u[1] * (v[2] * w[0] - v[0] * w[2]) + u[2] * (v[0] * w[1] - v[1] * w[0])
+
+
+@njit(cache=True, nogil=True)
+def _length(u: Vector) -> float:
+    return float(np.sqrt(u[0] * u[0] + u[1] * u[1] + u[2] * u[2]))
+
+
+@njit(cache=True, nogil=True)
+def _along(a: Vector, b: Vector, point: Vector) -> tuple[float, float]:
+    """Return where between a (0) and b (1) a point comes nearest, and how near."""
+    side = _minus(b, a)
+    square, t = _dot(side, side), 0.0
+    if square > 0:
+        t = min(max(_dot(_minus(point, a), side) / square, 0.0), 1.0)
+    return t, _length(_minus((a[0] + t * side[0], a[1] + t * side[1], a[2] + t * side[2]), point))
+
+
+@njit(cache=True, nogil=True)
+def _foot(a: Vector, b: Vector, c: Vector, point: Vector) -> Vector:
+    """Return the barycentric coordinates of the point of a triangle that is closest to a point."""
+    ab, ac, ap = _minus(b, a), _minus(c, a), _minus(point, a)
+    d00, d01, d11, d20, d21 = _dot(ab, ab), _dot(ab, ac), _dot(ac, ac), _dot(ap, ab), _dot(ap, ac)
+    det = d00 * d11 - d01 * d01
+    if det > 0:
+        v, w = (d11 * d20 - d01 * d21) / det, (d00 * d21 - d01 * d20) / det
+        u = 1.0 - v - w
+        if u >= 0 and v >= 0 and w >= 0:
+            return u, v, w
+    t, least = _along(a, b, point)
+    best = 1.0 - t, t, 0.0
+    t, distance = _along(b, c, point)
+    if distance < least:
+        best, least = (0.0, 1.0 - t, t), distance
+    t, distance = _along(c, a, point)
+    return (t, 0.0, 1.0 - t) if distance < least else best
+
+
+@njit(cache=True, nogil=True)
+def _feet(corners: FloatArray, points: FloatArray, best: FloatArray) -> None:
+    """Write `closest_in_triangle`."""
+    for i in range(len(points)):
+        T = corners[i]
+        best[i, 0], best[i, 1], best[i, 2] = _foot(_vector(T, 0), _vector(T, 1), _vector(T, 2), _vector(points, i))
+
+
+@njit(cache=True, nogil=True)
+def _drawn_to_face(corners: FloatArray, point: Vector, best: FloatArray) -> None:
+    """Write the barycentric coordinates (4,) of the point on the faces of a tetrahedron (4, 3) that is closest to a point."""
+    least = np.inf
+    for face in range(4):
+        i, j, k = FACES[face, 0], FACES[face, 1], FACES[face, 2]
+        a, b, c = _vector(corners, i), _vector(corners, j), _vector(corners, k)
+        u, v, w = _foot(a, b, c, point)
+        x, y, z = u * a[0] + v * b[0] + w * c[0], u * a[1] + v * b[1] + w * c[1], u * a[2] + v * b[2] + w * c[2]
+        distance = _length(_minus((x, y, z), point))
+        if distance < least:
+            least = distance
+            best[:] = 0.0
+            best[i], best[j], best[k] = u, v, w
+
+
+@njit(cache=True, nogil=True)
+def _drawn_to_faces(corners: FloatArray, points: FloatArray, best: FloatArray) -> None:
+    """Put the closest points on the faces in the place of barycentric coordinates (p, 4) of points outside of their tetrahedra."""
+    for i in range(len(points)):
+        if not best[i].min() >= 0:
+            _drawn_to_face(corners[i], _vector(points, i), best[i])
+
+
+@njit(cache=True, nogil=True)
+def _may_hold(corners: FloatArray, points: FloatArray, point: IntArray, candidate: IntArray, may: BoolArray) -> None:
+    """Write which elements are flat or hold a point, or nearly so, for pairs of points and candidates."""
+    for i in range(len(point)):
+        T, p = corners[candidate[i]], _vector(points, point[i])
+        o = _vector(T, 0)
+        d, a, b, c = _minus(p, o), _minus(_vector(T, 1), o), _minus(_vector(T, 2), o), _minus(_vector(T, 3), o)
+        volume, u, v, w = _triple(a, b, c), _triple(d, b, c), _triple(a, d, c), _triple(a, b, d)
+        if volume < 0:
+            volume, u, v, w = -volume, -u, -v, -w
+        may[i] = volume == 0 or min(u, v, w, volume - u - v - w) >= -NEARLY * volume
+
+
+@njit(cache=True, nogil=True)
+def _keep_deepest(point: IntArray, candidate: IntArray, depth: FloatArray, best: FloatArray, element: IntArray) -> None:
+    """Write the element that a point is deepest in, of those that hold it, and how deep."""
+    for i in range(len(point)):
+        if depth[i] >= -1e-9 and depth[i] > best[point[i]]:
+            best[point[i]], element[point[i]] = depth[i], candidate[i]
+
+
+@njit(cache=True, nogil=True)
+def _carry(
+    corners: FloatArray, centres: FloatArray, reach: float, size: float, points: FloatArray, candidate: IntArray, start: IntArray,
+    carrier: IntArray, outside: FloatArray,
+) -> None:  # fmt: skip
+    """Write `_carriers_of_outsiders`: those of each point stand in `candidate` from `start` on."""
+    off, distance = np.empty(len(candidate)), np.empty(len(candidate))
+    for i in range(len(points)):
+        p = _vector(points, i)
+        for k in range(start[i], start[i + 1]):
+            off[k] = _length(_minus(_vector(centres, candidate[k]), p))
+        first = start[i] + off[start[i] : start[i + 1]].argmin()
+        least = _distance(corners[candidate[first]], p)
+        for k in range(start[i], start[i + 1]):
+            distance[k] = np.inf
+            if off[k] <= least + reach + ALIKE * size:
+                distance[k] = _distance(corners[candidate[k]], p)
+                least = min(least, distance[k])
+        nearest = np.inf
+        for k in range(start[i], start[i + 1]):
+            if distance[k] <= least + ALIKE * size:
+                nearest = min(nearest, off[k])
+        carrier[i], outside[i] = len(corners), least
+        for k in range(start[i], start[i + 1]):
+            if distance[k] <= least + ALIKE * size and off[k] <= nearest + ALIKE_CENTRES * size:
+                carrier[i] = min(carrier[i], candidate[k])
+
+
+@njit(cache=True, nogil=True)
+def _distance(corners: FloatArray, point: Vector) -> float:
+    """Return how far a point is from the faces of a tetrahedron (4, 3)."""
+    w = np.empty(4)
+    _drawn_to_face(corners, point, w)
+    a, b, c, d = _vector(corners, 0), _vector(corners, 1), _vector(corners, 2), _vector(corners, 3)
+    x = w[0] * a[0] + w[1] * b[0] + w[2] * c[0] + w[3] * d[0]
+    y = w[0] * a[1] + w[1] * b[1] + w[2] * c[1] + w[3] * d[1]
+    z = w[0] * a[2] + w[1] * b[2] + w[2] * c[2] + w[3] * d[2]
+    return float(_length(_minus((x, y, z), point)))

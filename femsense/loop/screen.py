@@ -168,9 +168,9 @@ def screen(base: JointFit, problem: JointProblem, fields: Fields, n_effective: f
     residual = base.fit.residual - Q @ (Q.T @ base.fit.residual)
     effects = max(len({e.name for e, _, _ in fields.todo}), 1)
     result = []
+    every = np.split(_whitened(base, problem, fields.raw, fields.rest), fields._spans()[1:-1], axis=1)
     for i, (effect, seed, parameters) in enumerate(fields.todo):
-        own, rest = fields.of(i)
-        whole = _whitened(base, problem, own, rest)
+        (own, rest), whole = fields.of(i), every[i]
         if not np.isfinite(whole).all() or np.linalg.norm(whole) == 0:
             continue
         absorbed = Q.T @ whole
