@@ -228,12 +228,13 @@ def walk_along(
     bases = dict(zip(unique, _base_states(walk, unique, starts, past, rough)))
     seen = {k: observe(walk.robot, bases[k]) for k in {alike[k]: None for k in wanted}}
     others = {k: np.zeros((len(variants), *seen[alike[k]].shape)) for k in wanted}
-    answers = _Variants(walk, variants, {k: bases[alike[k]] for k in todo}, alike, others, observe)
+    lent = {k: s.factor for k, s in (starts or {}).items() if k in bases and s.positions is bases[k].positions}
+    answers = _Variants(walk, variants, {k: bases[alike[k]] for k in todo}, alike, others, observe, lent)
     room = _room(len(unique))
     for k, factor in answers.write():
-        lent = factor.plain if isinstance(factor, Refined) else factor
-        if starts is not None and lent.bytes < _most_lent(starts[k], room):
-            starts[k] = replace(starts[k], factor=lent)
+        plain = factor.plain if isinstance(factor, Refined) else factor
+        if starts is not None and plain.bytes < _most_lent(starts[k], room):
+            starts[k] = replace(starts[k], factor=plain)
     for k in wanted:
         yield k, bases[alike[k]], seen[alike[k]], others[k]
 
@@ -479,15 +480,16 @@ class _Variants:
 
     def __init__(
         self, walk: Walk, variants: Sequence[Walk], bases: dict[int, Equilibrium], alike: dict[int, int], others: dict[int, FloatArray],
-        observe: Callable[[Robot, Equilibrium], FloatArray],
+        observe: Callable[[Robot, Equilibrium], FloatArray], lent: dict[int, Factorization | None],
     ) -> None:  # fmt: skip
-        self.walk, self.variants, self.bases, self.alike, self.others, self.observe = (
+        self.walk, self.variants, self.bases, self.alike, self.others, self.observe, self.lent = (
             walk,
             variants,
             bases,
             alike,
             others,
             observe,
+            lent,
         )
         own = [not _same_mechanics(walk, v) for v in variants]
         linear = [_linear(walk, v) for v in variants]
@@ -555,7 +557,7 @@ class _Variants:
 
     def _answers(self, k: int) -> _Answers:
         few = len(self.plain) + len(self.rubbing) <= FEW_COLUMNS
-        solver = refined if few else factorize
+        solver = partial(refined, lent=self.lent.get(k)) if few else factorize
         return _Answers(lambda: tangent_at(self.walk.robot.body, self.bases[k], solver), 2 if self.rubbing else 1)
 
     def _jobs(self, group: list[int], which: Sequence[int]) -> list[Job]:

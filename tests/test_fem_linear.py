@@ -11,7 +11,7 @@ import scipy.sparse as sp
 from analytic import bar_body
 from helpers import block_mesh
 
-from femsense.fem import linear
+from femsense.fem import linear, solves
 from femsense.fem.assembly import internal, reduced_values
 from femsense.fem.body import BodyModel
 from femsense.fem.cholesky import analyse, cholesky
@@ -211,3 +211,23 @@ def test_the_upper_half_of_a_pattern() -> None:
     p = pattern_of(A)
     upper = sp.csr_matrix((A.data[p.upper], p.upper_indices, p.upper_indptr), shape=A.shape).toarray()
     np.testing.assert_array_equal(upper, np.triu(A.toarray()))
+
+
+def test_a_factor_of_a_state_near_by_is_taken_where_it_serves(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(solves, "REFINED_FROM", 1)
+    body = bar_body(block_mesh((5, 2, 2), (0.1, 0.013, 0.01)))
+    state, pattern = solve_equilibrium(body), body.free_map.pattern
+    values = reduced_values(body, internal(body, state.positions).blocks)
+    right = np.random.default_rng(0).standard_normal((pattern.size, 3))
+    exact = factorize(pattern, values).solve(right)
+    smaller = bar_body(block_mesh((4, 2, 2), (0.1, 0.013, 0.01)))
+    other = factorize(smaller.free_map.pattern, reduced_values(smaller, internal(smaller, smaller.mesh.nodes).blocks))
+    for lent, taken in (
+        (factorize(pattern, 1.005 * values), True),
+        (factorize(pattern, 1.05 * values), False),
+        (other, False),
+        (None, False),
+    ):
+        refined = solves.refined(pattern, values, lent)
+        assert isinstance(refined, solves.Refined) and (refined.plain is lent) == taken
+        assert np.abs(refined.solve(right) - exact).max() < 1e-6 * np.abs(exact).max()

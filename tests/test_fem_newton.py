@@ -311,3 +311,51 @@ def test_a_state_that_is_only_tried_is_given_up_after_some_steps(monkeypatch: py
     tried = solve_equilibrium(body, tension=pull, start=rest, rough=True)
     assert tried.status == "iterations" and tried.iterations == 1
     assert solve_equilibrium(body, tension=pull, start=rest).converged  # what is not only tried goes on
+
+
+class _Known:
+    """A stiffness that is solved exactly."""
+
+    def __init__(self, matrix: np.ndarray) -> None:
+        self.matrix = matrix
+
+    def solve(self, right: np.ndarray) -> np.ndarray:
+        return np.linalg.solve(self.matrix, right)
+
+
+def test_a_stiffness_learns_from_the_steps_since_it_was_factorised() -> None:
+    rng = np.random.default_rng(2)
+    turned = np.linalg.qr(rng.standard_normal((20, 20)))[0]
+    true = turned * np.geomspace(1.0, 100.0, 20) @ turned.T
+    factor: Any = _Known(true + 0.4 * turned[:, :3] @ turned[:, :3].T)  # too stiff along three motions
+    load, ends = rng.standard_normal(20), list[float]()
+    for learns in (False, True):
+        secants, x = equilibrium._Secants(), np.zeros(20)
+        for _ in range(7):
+            force = load - true @ x
+            if learns:
+                secants.learn(x, force)
+            x = x + secants.step(factor, force)
+        ends.append(float(np.linalg.norm(load - true @ x)))
+    assert ends[1] < 0.02 * ends[0]
+    step, fell, _ = secants.pairs[-1]
+    np.testing.assert_allclose(secants.step(factor, fell), step, atol=1e-12 + 1e-9 * np.abs(step).max())
+
+
+def test_a_state_that_is_only_tried_takes_a_lent_factor_as_far_as_it_goes(monkeypatch: pytest.MonkeyPatch) -> None:
+    body = bar_body(block_mesh((5, 2, 2), (LENGTH, WIDTH, SIDE)))
+    pull = {"top": 0.3}
+    start = solve_equilibrium(body, tension=pull)
+    start = replace(start, factor=tangent_at(body, start).factor)
+    factors, plain = list[int](), equilibrium._factor_here
+    monkeypatch.setattr(equilibrium, "_factor_here", lambda *a: (factors.append(1), plain(*a))[1])
+    soft = body.with_stiffness_scale(0.97)
+    there = solve_equilibrium(soft, tension=pull, start=start)
+    assert np.abs(there.positions - start.positions).max() > 1e-3 * body.reach
+    factors.clear()
+    tried = solve_equilibrium(soft, tension=pull, start=start, reuse_factor=True, rough=True)
+    assert tried.converged and not factors
+    assert np.abs(tried.positions - there.positions).max() < 2 * equilibrium.ARRIVED * body.reach
+    monkeypatch.setattr(equilibrium, "PATIENCE", 0)
+    solve_equilibrium(soft, tension=pull, start=start, reuse_factor=True, rough=True)
+    assert factors

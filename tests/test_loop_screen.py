@@ -137,6 +137,16 @@ def test_a_fit_begins_at_the_states_of_the_model_before_unless_their_clamp_is_an
     assert wanted and all(starts[k].positions is state.positions for k, state in wanted.items())
 
 
+def test_states_that_are_far_apart_lend_each_other_no_factors() -> None:
+    data, _ = staged(arm((4, 2, 2)))
+    body, kept = data.robot.body, data.train[0].starts_on(data.robot.body.mesh)
+    k = next(k for k, state in kept.items() if state.factor is not None)
+    free = ~np.isin(np.arange(len(body.mesh.nodes)), body.clamped)[:, None]
+    beside, far = (replace(kept[k], positions=kept[k].positions + by * body.reach * free, factor=None) for by in (0.005, 0.02))
+    assert joint._lent(kept[k], beside, body).factor is kept[k].factor and joint._lent(kept[k], far, body).factor is None
+    assert all(joint._lent(kept[k], state, body).positions is state.positions for state in (beside, far))
+
+
 def test_a_fit_that_ends_on_its_way_has_the_residual_of_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
     data, stage = staged(arm((4, 2, 2)))
     plain = joint.gauss_newton

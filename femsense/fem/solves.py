@@ -15,6 +15,8 @@ REFINED_FROM = 3000
 """Unknowns from which on a factor in single precision, and a solve more, take less time than one in double precision."""
 REFINED, MOST_REFINED = 1e-3, 3
 """A correction by less than this share squares to what may be left of an error; solves at most before the factor is made in double precision."""
+SERVES = 1e-2
+"""A factor of a state near by serves where a correction of what it makes of an even load is smaller than this share: one more solve is enough then."""
 ROUGH = 1e-3
 """Share of a rough solution that may be missing, in energy. With ten times as much in the mesh's error the order of the nodes moved a fit by two percent."""
 ROUGH_FROM = 9000
@@ -37,7 +39,7 @@ class Refined:
             return self._exact.solve(right)
         answer = self.plain.solve(right)
         for _ in range(MOST_REFINED):
-            more = self.plain.solve(right - self._matrix @ answer)
+            more = self._correction(right, answer)
             answer = answer + more
             if (np.abs(more).max(axis=0) <= REFINED * np.abs(answer).max(axis=0)).all():
                 return np.asarray(answer)
@@ -50,11 +52,23 @@ class Refined:
         """Return BᵀK⁻¹B, shape (k, k), for sparse columns B, shape (f, k)."""
         return np.asarray(columns.T @ self.solve(columns.toarray()))
 
+    def serves(self) -> bool:
+        """Return whether the factor, which may be that of a state near by, is nearly that of this stiffness."""
+        load = np.ones(self.size)
+        answer = self.plain.solve(load)
+        return bool(np.abs(self._correction(load, answer)).max() <= SERVES * np.abs(answer).max())
 
-def refined(pattern: Pattern, values: FloatArray) -> Factorization | None:
-    """Return a stiffness that is solved to 1e-6 or better, from a factor in single precision where that pays and is enough."""
+    def _correction(self, right: FloatArray, answer: FloatArray) -> FloatArray:
+        return self.plain.solve(right - self._matrix @ answer)
+
+
+def refined(pattern: Pattern, values: FloatArray, lent: Factorization | None = None) -> Factorization | None:
+    """Return a stiffness that is solved to 1e-6 or better, from a factor in single precision where that pays and is enough: from that which a state
+    near by has lent, if it serves."""
     if pattern.size < REFINED_FROM or not np.isfinite(values).all():
         return factorize(pattern, values)
+    if isinstance(lent, Cholesky) and lent.size == pattern.size and (near := Refined(pattern, values, lent)).serves():
+        return near
     plain = factorize_definite(pattern, values, tries=0, single=True)[0]
     return Refined(pattern, values, plain) if isinstance(plain, Cholesky) else plain or factorize(pattern, values)
 
