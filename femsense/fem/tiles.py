@@ -2,7 +2,8 @@
 """Dense work on fronts too small for a BLAS to pay: tiles that stay in the vector registers, written as LLVM code for the processor at hand.
 
 A tile is up to three registers of rows times six columns. Reading beyond the last row or column of a matrix is harmless (what is
-read there reaches no result), so that only what is written is masked; the memory must reach PADDING entries beyond its end.
+read there reaches no result). Registers are written whole, what stands beyond the last row with its old value: a store with a mask
+takes a dozen cycles where there is no AVX-512. The memory must reach PADDING entries beyond its end, and nobody else may write there.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ BYTES = 64 if llvm.get_host_cpu_features().get("avx512f", False) else 32
 REGISTERS = 3 if BYTES == 64 else 2
 """Registers of rows in a tile."""
 PADDING = 4 * BYTES
-"""Entries that may be read beyond the end of a matrix."""
+"""Entries beyond the end of a matrix that may be read, and written again as they are."""
 INTEGER = ir.IntType(64)
 LINE = 64
 """Bytes of a line of the cache."""
@@ -41,6 +42,15 @@ def subtract_product(
     """
     del context
     return types.void(like, *[types.int64] * 8), _builder("subtract", like, solves=False)
+
+
+@intrinsic
+def write_product(
+    context: Any, like: Any, a: Any, b: Any, step: Any, c: Any, step_c: Any, rows: Any, columns: Any, depth: Any
+) -> Any:
+    """The same with C ← −A Bᵀ, whatever was there."""
+    del context
+    return types.void(like, *[types.int64] * 8), _builder("write", like, solves=False)
 
 
 @intrinsic
@@ -211,9 +221,10 @@ def _tile(module: Any, name: str, like: Any, registers: int, solves: bool) -> An
     multiply_add = _declared(module, f"llvm.fmuladd.v{lanes}{'f64' if letter == 'd' else 'f32'}", vector, [vector] * 3)
     bytes_a, bytes_c = builder.mul(step, _number(size)), builder.mul(step_c, _number(size))
     sums, end = _products(builder, (a, b, bytes_a, depth), (kind, lanes, registers), multiply_add)
-    load, store = _masked(builder, kind, lanes)
-    align, nothing = ir.Constant(ir.IntType(32), size), ir.Constant(vector, [0.0] * lanes)
-    masks = [_mask(builder, rows, v * lanes, lanes) for v in range(registers)]
+    fence = _declared(  # without it LLVM makes a masked store of what follows
+        module, f"llvm.arithmetic.fence.v{lanes}{'f64' if letter == 'd' else 'f32'}", vector, [vector]
+    )
+    written = _mask(builder, rows, (registers - 1) * lanes, lanes)
     done: list[list[Any]] = []
     for n in range(WIDE):
         here = function.append_basic_block()
@@ -223,11 +234,14 @@ def _tile(module: Any, name: str, like: Any, registers: int, solves: bool) -> An
         done.append([])
         for v in range(registers):
             pointer = _at(builder, column, _number(v * BYTES), vector)
-            value = builder.fsub(builder.call(load, [pointer, align, masks[v], nothing]), sums[n][v])
+            there = builder.load(pointer, align=size)
+            value = builder.fneg(sums[n][v]) if name == "write" else builder.fsub(there, sums[n][v])
             if solves:
                 value = _eliminated(builder, value, [d[v] for d in done[:n]], rest[0], (n, size, kind, lanes))
             done[n].append(value)
-            builder.call(store, [value, pointer, align, masks[v]])
+            if v == registers - 1:
+                value = builder.call(fence, [builder.select(written, value, there)])
+            builder.store(value, pointer, align=size)
     builder.branch(end)
     builder.position_at_end(end)
     builder.ret_void()
@@ -283,32 +297,41 @@ def _eliminated(builder: Any, value: Any, known: list[Any], L: Any, shape: tuple
 
 
 def _run_function(module: Any, like: Any) -> Any:
-    """Return the function that adds a run of numbers, a register at a time."""
+    """Return the function that adds a run of numbers, a register at a time and what is left in halves of one: the next run may begin right after."""
     letter, kind, lanes = _kind(like)
     function, known = _function(module, f"femsense_add_{letter}", 3)
     if known:
         return function
-    vector, size = ir.VectorType(kind, lanes), BYTES // lanes
+    size = BYTES // lanes
     builder = ir.IRBuilder(function.append_basic_block("entry"))
     to, source, count = function.args
+
+    def add(at: Any, width: int) -> None:
+        kinds = ir.VectorType(kind, width) if width > 1 else kind
+        pointer = _at(builder, to, at, kinds)
+        more = builder.load(_at(builder, source, at, kinds), align=size)
+        builder.store(builder.fadd(builder.load(pointer, align=size), more), pointer, align=size)
+
     entry, loop, end = builder.block, function.append_basic_block("loop"), function.append_basic_block("end")
-    load, store = _masked(builder, kind, lanes)
-    align, nothing = ir.Constant(ir.IntType(32), size), ir.Constant(vector, [0.0] * lanes)
-    builder.branch(loop)
+    whole = builder.and_(count, _number(-lanes))
+    builder.cbranch(builder.icmp_signed(">", whole, _number(0)), loop, end)
     builder.position_at_end(loop)
-    left, at = builder.phi(INTEGER), builder.phi(INTEGER)
-    left.add_incoming(count, entry)
-    at.add_incoming(_number(0), entry)
-    mask = _mask(builder, left, 0, lanes)
-    pointer = _at(builder, to, at, vector)
-    there = builder.call(load, [pointer, align, mask, nothing])
-    more = builder.call(load, [_at(builder, source, at, vector), align, mask, nothing])
-    builder.call(store, [builder.fadd(there, more), pointer, align, mask])
-    left_next, at_next = builder.sub(left, _number(lanes)), builder.add(at, _number(BYTES))
-    left.add_incoming(left_next, loop)
-    at.add_incoming(at_next, loop)
-    builder.cbranch(builder.icmp_signed(">", left_next, _number(0)), loop, end)
+    done = builder.phi(INTEGER)
+    done.add_incoming(_number(0), entry)
+    add(builder.mul(done, _number(size)), lanes)
+    following = builder.add(done, _number(lanes))
+    done.add_incoming(following, loop)
+    builder.cbranch(builder.icmp_signed("<", following, whole), loop, end)
     builder.position_at_end(end)
+    width = lanes // 2
+    while width:
+        here, after = function.append_basic_block(), function.append_basic_block()
+        builder.cbranch(builder.icmp_signed("!=", builder.and_(count, _number(width)), _number(0)), here, after)
+        builder.position_at_end(here)
+        add(builder.mul(builder.and_(count, _number(-2 * width)), _number(size)), width)
+        builder.branch(after)
+        builder.position_at_end(after)
+        width //= 2
     builder.ret_void()
     return function
 
