@@ -32,6 +32,7 @@ from loop_cases import EARTH, Case, Design, _around, _measure
 
 from femsense.arrays import FloatArray, freeze
 from femsense.effects import apply_effects
+from femsense.fem import linear
 from femsense.files import write_text
 from femsense.recording import save_recording
 from femsense.rig.script import Plan
@@ -157,6 +158,7 @@ def one_run(folder: Path, element: str, without: list[str]) -> None:
     from femsense.steps import improve_into
 
     warnings.simplefilter("ignore")
+    factors = _count_factors()
     marks = [("reading", float(os.environ["FEMSENSE_BEGAN"]), 0.0)]
 
     def mark(text: str) -> None:
@@ -179,9 +181,27 @@ def one_run(folder: Path, element: str, without: list[str]) -> None:
         entry[1] += cpu_then - cpu
     print(
         json.dumps(
-            {"stages": spent, "verdict": document["verdict"], "sentence": document["sentence"], "steps": [m[0] for m in marks]}
+            {
+                "stages": spent,
+                "verdict": document["verdict"],
+                "sentence": document["sentence"],
+                "steps": [m[0] for m in marks],
+                "factors": len(factors),
+            }
         )
     )
+
+
+def _count_factors() -> list[int]:
+    """Return a list that grows by the size of each stiffness that is factorised from now on: time depends on the machine and the hour, this does not."""
+    sizes, plain = list[int](), vars(linear)["cholesky"]
+
+    def counted(analysis: Any, *given: Any, **named: Any) -> Any:
+        sizes.append(analysis.size)
+        return plain(analysis, *given, **named)
+
+    vars(linear)["cholesky"] = counted
+    return sizes
 
 
 def timed(folder: Path, element: str, without: list[str]) -> dict[str, Any]:
@@ -210,7 +230,8 @@ def show(name: str, runs: list[dict[str, Any]]) -> None:
         rows = [r["stages"].get(stage, [0.0, 0.0]) for r in runs]
         if any(row[0] > 0 for row in rows):
             print(f"  {stage:36s}{np.median([r[0] for r in rows]):8.1f}{np.median([r[1] for r in rows]):8.1f}")
-    print(f"  {'all':36s}{np.median([r['wall_s'] for r in runs]):8.1f}{np.median([r['cpu_s'] for r in runs]):8.1f}", flush=True)
+    print(f"  {'all':36s}{np.median([r['wall_s'] for r in runs]):8.1f}{np.median([r['cpu_s'] for r in runs]):8.1f}")
+    print(f"  {runs[0]['factors']} stiffnesses factorised", flush=True)
 
 
 def main() -> None:
