@@ -340,6 +340,8 @@ def test_a_stiffness_learns_from_the_steps_since_it_was_factorised() -> None:
     assert ends[1] < 0.02 * ends[0]
     step, fell, _ = secants.pairs[-1]
     np.testing.assert_allclose(secants.step(factor, fell), step, atol=1e-12 + 1e-9 * np.abs(step).max())
+    inverse = np.array([secants.step(factor, unit) for unit in np.eye(20)])
+    np.testing.assert_allclose(inverse, inverse.T, atol=1e-9 * np.abs(inverse).max())
 
 
 def test_a_state_that_is_only_tried_takes_a_lent_factor_as_far_as_it_goes(monkeypatch: pytest.MonkeyPatch) -> None:
