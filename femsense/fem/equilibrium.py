@@ -42,7 +42,8 @@ LENT = 0.1
 RUBS = 0.3
 """So does any where tensions along cables follow the bends, which converge no faster with a stiffness of their own."""
 PATIENCE = 5
-"""In single precision one serves, too, where so many more steps are enough if each leaves the share that the last one left: a factor takes longer."""
+"""In single precision one serves, too, where so many more steps are enough if each leaves the share that the last one left: a factor takes longer.
+Of a first step nothing is known yet: states that are only tried take a second one."""
 PAIRS = 8
 """Steps since the last factor that are remembered (`_Secants`)."""
 ARRIVED = 5e-7
