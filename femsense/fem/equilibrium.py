@@ -42,7 +42,7 @@ LENT = 0.1
 RUBS = 0.3
 """So does any where tensions along cables follow the bends, which converge no faster with a stiffness of their own."""
 PATIENCE = 5
-"""In single precision one serves, too, where so many more steps are enough if each leaves the share that the last one left: a factor takes longer.
+"""In single precision one serves, too, where so many more steps are enough if each leaves the share that the last one left: a factor took as long as five when this was set.
 Of a first step nothing is known yet: states that are only tried take a second one."""
 PAIRS = 8
 """Steps since the last factor that are remembered (`_Secants`)."""
@@ -441,8 +441,8 @@ def _newton(body: BodyModel, loads: _Loads, state: _State, max_iterations: int) 
         left = state.residual / last if last > 0.0 else np.inf
         enough = RUBS if follows else LENT if state.borrowed else CHORD
         sound_to_the_end = state.factored_at <= FAR * loads.tolerance and state.residual * min(left, 1.0) ** 2 <= loads.tolerance
-        in_sight = state.residual * left**PATIENCE <= loads.tolerance
-        in_sight |= state.rough and length * shrinking**PATIENCE <= ARRIVED * body.reach
+        in_sight = state.residual * min(left, 1.0) ** PATIENCE <= loads.tolerance
+        in_sight |= state.rough and length * min(shrinking, 1.0) ** PATIENCE <= ARRIVED * body.reach
         serves = left <= enough or sound_to_the_end or (state.single and in_sight)
         if not frictional and not len(held):
             secants.learn(state.x.ravel()[free], force)
@@ -458,7 +458,7 @@ def _newton(body: BodyModel, loads: _Loads, state: _State, max_iterations: int) 
         else:
             du, dT = _bordered_step(state.factor, force, gap, H, C, stretch, loads.lever[held])
         longer, length = length, float(np.abs(du).max(initial=0.0))
-        shrinking = length / longer
+        shrinking = length / longer if longer > 0.0 else np.inf
         if not closed and _contradicts(H @ du + stretch * dT, gap, loads.lever[held]):
             return "cables"
         if not (np.isfinite(du).all() and np.isfinite(dT).all()):

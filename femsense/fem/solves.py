@@ -15,7 +15,7 @@ REFINED_FROM = 3000
 """Unknowns from which on a factor in single precision, and a solve more, take less time than one in double precision."""
 REFINED, MOST_REFINED = 1e-3, 3
 """A correction by less than this share squares to what may be left of an error; solves at most before the factor is made in double precision."""
-SERVES = 1e-2
+NEAR_ENOUGH = 1e-2
 """A factor of a state near by serves where a correction of what it makes of an even load is smaller than this share: one more solve is enough then."""
 ROUGH = 1e-3
 """Share of a rough solution that may be missing, in energy. With ten times as much in the mesh's error the order of the nodes moved a fit by two percent."""
@@ -56,7 +56,7 @@ class Refined:
         """Return whether the factor, which may be that of a state near by, is nearly that of this stiffness."""
         load = np.ones(self.size)
         answer = self.plain.solve(load)
-        return bool(np.abs(self._correction(load, answer)).max() <= SERVES * np.abs(answer).max())
+        return bool(np.abs(self._correction(load, answer)).max() <= NEAR_ENOUGH * np.abs(answer).max())
 
     def _correction(self, right: FloatArray, answer: FloatArray) -> FloatArray:
         return self.plain.solve(right - self._matrix @ answer)
