@@ -19,6 +19,7 @@ import time
 import warnings
 from collections.abc import Callable, Sequence
 from itertools import pairwise
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -130,7 +131,8 @@ def _markers(robot: Robot, made: Made) -> FloatArray:
 def _walked(robot: Robot, made: Made, observe: Callable[[Robot, Equilibrium], FloatArray]) -> FloatArray:
     """Return what is observed of a robot along the recording, shape (F, …)."""
     walk = Walk(robot, drive_of(robot, made.recording))
-    return np.array([seen for _, _, seen, _ in walk_along(walk, list(range(len(made.recording.time_s))), observe)])
+    frames = list(range(len(made.recording.time_s)))
+    return np.array([observe(robot, state) for _, state, _, _ in walk_along(walk, frames, attrgetter("markers"))])
 
 
 # --- scores --------------------------------------------------------------------------------------------------------------------

@@ -199,7 +199,7 @@ def solve_frame(
 
 
 def walk_along(
-    walk: Walk, frames: Sequence[int], observe: Callable[[Robot, Equilibrium], FloatArray], variants: Sequence[Walk] = (),
+    walk: Walk, frames: Sequence[int], ties: Callable[[Robot], Embedding], variants: Sequence[Walk] = (),
     *, starts: dict[int, Equilibrium] | None = None, rough: bool = False,
 ) -> Iterator[tuple[int, Equilibrium, FloatArray, FloatArray]]:  # fmt: skip
     """Solve frames in order, and with each the same frame of variants that differ from it by little.
@@ -211,14 +211,14 @@ def walk_along(
     Arguments:
         walk: the base.
         frames: indices, ascending; frames between them are solved too where the past matters.
-        observe: (robot, state) → what is kept of a state, shape (p, 3).
+        ties: robot → the points that are observed, p of them.
         variants: other robots or drives.
         starts: frame → a state near by, such as that of an earlier walk; brought up to date as frames are solved. Their
             factors are kept as long as they fit into FACTOR_MEMORY.
         rough: states are only tried, where one near by is known.
 
     Yields:
-        frame index, equilibrium, observation (p, 3), observations of the variants (v, p, 3).
+        frame index, equilibrium, where the points are [m], shape (p, 3), and where those of the variants are, shape (v, p, 3).
     """
     wanted = sorted(set(int(f) for f in frames))
     past = has_history(walk.robot)
@@ -226,10 +226,10 @@ def walk_along(
     alike = _alike(walk, todo, past)
     unique = [k for k in todo if alike[k] == k]
     bases = dict(zip(unique, _base_states(walk, unique, starts, past, rough)))
-    seen = {k: observe(walk.robot, bases[k]) for k in {alike[k]: None for k in wanted}}
+    seen = {k: ties(walk.robot).positions(bases[k].positions) for k in {alike[k]: None for k in wanted}}
     others = {k: np.zeros((len(variants), *seen[alike[k]].shape)) for k in wanted}
     lent = {k: s.factor for k, s in (starts or {}).items() if k in bases and s.positions is bases[k].positions}
-    answers = _Variants(walk, variants, {k: bases[alike[k]] for k in todo}, alike, others, observe, lent)
+    answers = _Variants(walk, variants, {k: bases[alike[k]] for k in todo}, alike, others, ties, lent)
     room = _room(len(unique))
     for k, factor in answers.write():
         plain = factor.plain if isinstance(factor, Refined) else factor
@@ -402,6 +402,22 @@ Job = tuple[int, int, list[int]]
 """Variant, the frame it is computed in, and all frames that it is the same in."""
 
 
+@dataclass(frozen=True, eq=False, slots=True)
+class _Upset:
+    """What a variant adds to the balance of a base state."""
+
+    key: tuple[int, int]
+    """Variant, and the frame it is computed in."""
+    start: FloatArray
+    """Where its response starts [m], (n, 3)."""
+    force: FloatArray | None
+    """What it changes of the forces, but for tensions along cables [N], (n, 3); None: the answer to that is known."""
+    tension: FloatArray
+    """What it adds to the tensions along the segments of all cables [N], (s,)."""
+    pulled: FloatArray
+    """Shortening that it adds to held cables [m], (a,)."""
+
+
 class _Answers:
     """The tangent of a base state, and what was solved with it."""
 
@@ -435,34 +451,37 @@ class _Answers:
         if self.by_segment:
             self.__dict__.pop("tangent", None)
 
-    def moves(
-        self,
-        body: BodyModel,
-        x: FloatArray,
-        keys: list[tuple[int, int]],
-        forces: dict[tuple[int, int], FloatArray],
-        tensions: FloatArray,
-    ) -> FloatArray:
-        """Return the answers [m], (v, n, 3), to forces [N], those of some variants and the others' as known, and tensions along the segments of all
-        cables [N], (v, s): sums of one answer for each segment where that takes fewer of them."""
-        asked = [key for key, force in forces.items() if force.any()]
+    def to_forces_at(self, ties: Embedding) -> FloatArray:
+        """Return the answers [m/N], (3p, n, 3), to a unit force at each of p points along each axis."""
+        count = self.tangent.node_count
+        at = ties.matrix(count).toarray()
+        return self.tangent.respond(np.einsum("pn,ac->panc", at, np.eye(3)).reshape(-1, count, 3))
+
+    def moves(self, body: BodyModel, x: FloatArray, upsets: list[_Upset]) -> FloatArray:
+        """Return the answers to upsets [m], (v, n, 3): to their forces, where the answer is not known yet, and to tensions along the segments of all
+        cables, sums of one answer for each segment where that takes fewer of them."""
+        asked = [u for u in upsets if u.force is not None and u.force.any()]
+        tensions = np.array([u.tension for u in upsets])
         pulling, used = np.flatnonzero(tensions.any(axis=1)), np.flatnonzero(tensions.any(axis=0)).tolist()
         new = [s for s in used if s not in self.by_segment]
         few = len(new) <= self.times * len(pulling)
         pulls = _segment_forces(body, x, new if few else used)
-        columns = [*(forces[key] for key in asked), *(pulls if few else np.tensordot(tensions[pulling][:, used], pulls, axes=1))]
+        columns = [
+            *(u.force for u in asked if u.force is not None),
+            *(pulls if few else np.tensordot(tensions[pulling][:, used], pulls, axes=1)),
+        ]
         solved = self.tangent.respond(np.array(columns)) if columns else np.zeros((0, *x.shape))
-        self.own.update(dict.fromkeys(forces))
-        self.own.update(zip(asked, solved))
-        moves, rest = np.zeros((len(keys), *x.shape)), solved[len(asked) :]
+        self.own.update({u.key: None for u in upsets if u.force is not None})
+        self.own.update((u.key, move) for u, move in zip(asked, solved))
+        moves, rest = np.zeros((len(upsets), *x.shape)), solved[len(asked) :]
         if few:
             self.by_segment.update(zip(new, rest))
             rest = (
                 np.tensordot(tensions[pulling][:, used], np.array([self.by_segment[s] for s in used]), axes=1) if used else rest
             )
         moves[pulling] = rest
-        for move, key in zip(moves, keys):
-            own = self.own[key]
+        for move, upset in zip(moves, upsets):
+            own = self.own[upset.key]
             if own is not None:
                 move += own
         return moves
@@ -480,17 +499,11 @@ class _Variants:
 
     def __init__(
         self, walk: Walk, variants: Sequence[Walk], bases: dict[int, Equilibrium], alike: dict[int, int], others: dict[int, FloatArray],
-        observe: Callable[[Robot, Equilibrium], FloatArray], lent: dict[int, Factorization | None],
+        ties: Callable[[Robot], Embedding], lent: dict[int, Factorization | None],
     ) -> None:  # fmt: skip
-        self.walk, self.variants, self.bases, self.alike, self.others, self.observe, self.lent = (
-            walk,
-            variants,
-            bases,
-            alike,
-            others,
-            observe,
-            lent,
-        )
+        self.walk, self.variants, self.bases, self.alike, self.others, self.lent = walk, variants, bases, alike, others, lent
+        self.ties = [ties(v.robot) for v in variants]
+        self.own_ties = ties(walk.robot)
         own = [not _same_mechanics(walk, v) for v in variants]
         linear = [_linear(walk, v) for v in variants]
         rubs = [has_history(v.robot) for v in variants]
@@ -508,7 +521,7 @@ class _Variants:
         """Write all observations; yield the factors that gave them, with their frames."""
         for k, table in self.others.items():
             for i in self.still:
-                table[i] = self.observe(self.variants[i].robot, self.bases[k])
+                table[i] = self.ties[i].positions(self.bases[k].positions)
         for i in self.alone:
             self._write_alone(i)
         if not self.plain and not self.rubbing:
@@ -532,7 +545,7 @@ class _Variants:
             state = _require(solve_frame(variant, k, start=self.bases[k], before=memory), k)
             memory = state.segment_tensions if has_history(variant.robot) else None
             if k in self.others:
-                self.others[k][i] = self.observe(variant.robot, state)
+                self.others[k][i] = self.ties[i].positions(state.positions)
 
     def _groups(self, frames: Iterable[int]) -> list[list[int]]:
         """Return the frames with one base state together."""
@@ -574,7 +587,8 @@ class _Variants:
         memory; write what is observed of the other variants."""
         first = self.alike[group[0]]
         answers, jobs = self._answers(first), self._jobs(group, self.rubbing)
-        factor, moved = answers.tangent.factor, list(zip(jobs, self._respond(group[0], jobs, answers)))
+        factor = answers.tangent.factor
+        moved = list(zip(jobs, self._respond(group[0], self._upsets(group[0], jobs, answers), answers)))
         self._write(group, self.plain, answers)
         answers.keep(job[:2] for job in jobs)
         if answers.bytes < self.room:
@@ -595,36 +609,74 @@ class _Variants:
 
     def _write(self, group: list[int], which: Sequence[int], answers: _Answers) -> None:
         """Write what is observed of some variants in frames with one base state, as far as that is asked."""
-        first, frames = self.alike[group[0]], [k for k in group if k in self.others]
+        frames = [k for k in group if k in self.others]
         jobs = self._jobs(frames, which)
-        for (i, _, alike), x in zip(jobs, self._respond(group[0], jobs, answers)) if jobs else ():
-            seen = self.observe(self.variants[i].robot, replace(self.bases[first], positions=x))
+        for (i, _, alike), seen in zip(jobs, self._seen(group[0], jobs, answers)) if jobs else ():
             for frame in alike:
                 self.others[frame][i] = seen
 
-    def _respond(self, frame: int, jobs: list[Job], answers: _Answers) -> list[FloatArray]:
+    def _seen(self, frame: int, jobs: list[Job], answers: _Answers) -> list[FloatArray]:
+        """Return where the points of variants are [m], each (p, 3): where these have so many forces of their own that it takes fewer solves, from the
+        answers of the base state to forces at its points (Maxwell's reciprocity; friction of a held cable has none)."""
+        base, upsets = self.bases[frame], self._upsets(frame, jobs, answers)
+        still = [u.start is base.positions and self.ties[u.key[0]] is self.own_ties for u in upsets]
+        pushes = sum(u.force is not None and bool(u.force.any()) for u, s in zip(upsets, still) if s)
+        if pushes <= 3 * len(self.own_ties) or has_history(self.walk.robot):
+            still = [False] * len(upsets)
+        others = [u for u, s in zip(upsets, still) if not s]
+        moved = iter(self._respond(frame, others, answers) if others else ())
+        pulled = iter(self._answered(frame, [u for u, s in zip(upsets, still) if s], answers) if any(still) else ())
+        return [next(pulled) if s else self.ties[u.key[0]].positions(next(moved)) for u, s in zip(upsets, still)]
+
+    def _upsets(self, frame: int, jobs: list[Job], answers: _Answers) -> list[_Upset]:
+        """Return what variants add to the balance of a base state."""
+        base = self.bases[frame]
+        balances = {k: _Balance(self.walk, k, base) for k in {k for _, k, _ in jobs}}
+        upsets = list[_Upset]()
+        for i, k, _ in jobs:
+            balance, variant = balances[k], self.variants[i]
+            start = balance.carried(variant)
+            still = start is base.positions
+            along = balance.along(variant) if (i, k) not in self.along else self.along[i, k]
+            force = None
+            if not still:
+                force = balance.whole(variant, along, start) - balance.left()
+            elif (i, k) not in answers.own:
+                force = balance.change(variant)
+            upsets.append(
+                _Upset(
+                    (i, k), start, force, balance.more_tension(along) * still, balance.pulled(variant, None if still else start)
+                )
+            )
+        return upsets
+
+    def _respond(self, frame: int, upsets: list[_Upset], answers: _Answers) -> list[FloatArray]:
         """Return the positions of variants [m], each (n, 3): to first order in what they add to the forces of the base state.
 
         Tensions along cables are all that many of them change: their answers are sums of one for each segment.
         """
         base, body = self.bases[frame], self.walk.robot.body
-        balances = {k: _Balance(self.walk, k, base) for k in {k for _, k, _ in jobs}}
-        starts = [balances[k].carried(self.variants[i]) for i, k, _ in jobs]
-        rows, pulls, forces = list[FloatArray](), list[FloatArray](), dict[tuple[int, int], FloatArray]()
-        for (i, k, _), start in zip(jobs, starts):
-            balance, variant, still = balances[k], self.variants[i], start is base.positions
-            along = balance.along(variant) if (i, k) not in self.along else self.along[i, k]
-            rows.append(balance.more_tension(along) * still)
-            pulls.append(balance.pulled(variant, None if still else start))
-            if not still:
-                forces[i, k] = balance.whole(variant, along, start) - balance.left()
-            elif (i, k) not in answers.own:
-                forces[i, k] = balance.change(variant)
-        moves = answers.moves(body, base.positions, [job[:2] for job in jobs], forces, np.array(rows))
+        moves = answers.moves(body, base.positions, upsets)
         if base.held.any():  # cables: pressures are never held here
             held = base.held[: len(body.cables)]
-            moves += np.tensordot(np.array(pulls)[:, held], answers.by_held, axes=1)
-        return [start + move for start, move in zip(starts, moves)]
+            moves += np.tensordot(np.array([u.pulled for u in upsets])[:, held], answers.by_held, axes=1)
+        return [u.start + move for u, move in zip(upsets, moves)]
+
+    def _answered(self, frame: int, upsets: list[_Upset], answers: _Answers) -> list[FloatArray]:
+        """Return the same of the points alone [m], each (p, 3), from the answers to forces at these."""
+        base, body, ties = self.bases[frame], self.walk.robot.body, self.own_ties
+        x, tensions = base.positions, np.array([u.tension for u in upsets])
+        by_point = answers.to_forces_at(ties)
+        used = np.flatnonzero(tensions.any(axis=0)).tolist()
+        forces = np.array([np.zeros_like(x) if u.force is None else u.force for u in upsets])
+        moves = np.tensordot(forces, by_point, axes=((1, 2), (1, 2)))
+        moves += tensions[:, used] @ np.tensordot(_segment_forces(body, x, used), by_point, axes=((1, 2), (1, 2)))
+        moves = moves.reshape(len(upsets), len(ties), 3)
+        if base.held.any():
+            held = base.held[: len(body.cables)]
+            by_held = np.array([ties.moves(move) for move in answers.by_held])
+            moves += np.tensordot(np.array([u.pulled for u in upsets])[:, held], by_held, axes=1)
+        return list(ties.positions(x) + moves)
 
 
 def _motor_tensions(variant: Walk, frame: int, base: Equilibrium) -> list[float]:
@@ -907,8 +959,3 @@ def _require(state: Equilibrium, frame: int) -> Equilibrium:
     if not state.converged:
         raise DataError(f"no equilibrium in frame {frame}: {state.status}: {state.advice} (unbalanced {state.residual_n:.2g} N)")
     return state
-
-
-def marker_positions(robot: Robot, state: Equilibrium) -> FloatArray:
-    """Return the markers of a robot in a state [m], shape (k, 3), robot frame."""
-    return robot.markers.positions(state.positions)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from operator import attrgetter
 
 import numpy as np
 import pytest
@@ -26,7 +27,7 @@ def scene_of(control):
     inputs[:, [0, 2]] = np.array(INPUTS[control]) * (1.0 if control == "tension" else 1e-3)
     options = {"time_s": np.arange(len(frames)) * 1.7, "cable_names": NAMES, "inputs": inputs, "actuation": control}
     walk = Walk(robot, drive_of(robot, make_recording(**options)))
-    seen = [points for *_, points, _ in walk_along(walk, frames, lambda r, s: r.markers.positions(s.positions))]
+    seen = [points for *_, points, _ in walk_along(walk, frames, attrgetter("markers"))]
     markers = transform_points(invert_pose(T_ROBOT_CAMERA), np.vstack(seen))
     count = len(robot.marker_names)
     recording = make_recording(**options, marker_names=robot.marker_names, marker_frame=np.repeat(np.arange(len(frames)), count),

@@ -229,5 +229,7 @@ def test_a_factor_of_a_state_near_by_is_taken_where_it_serves(monkeypatch: pytes
         (None, False),
     ):
         refined = solves.refined(pattern, values, lent)
-        assert isinstance(refined, solves.Refined) and (refined.plain is lent) == taken
-        assert np.abs(refined.solve(right) - exact).max() < 1e-6 * np.abs(exact).max()
+        assert isinstance(refined, solves.Refined)
+        for _ in range(2):
+            assert np.abs(refined.solve(right) - exact).max() < 1e-6 * np.abs(exact).max()
+            assert (refined.plain is lent) == taken

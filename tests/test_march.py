@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -13,11 +14,13 @@ from analytic import bar_body
 from helpers import block_mesh
 
 from femsense import march
+from femsense.arrays import FloatArray
 from femsense.effects import apply_effects
 from femsense.errors import DataError
+from femsense.fem.compliance import Tangent
 from femsense.fem.equilibrium import Equilibrium, solve_equilibrium
 from femsense.fem.mesh import embed_points
-from femsense.march import Walk, drive_of, has_history, marker_positions, solve_frame, walk_along
+from femsense.march import Walk, drive_of, has_history, solve_frame, walk_along
 from femsense.model import Observation, Robot, plain_actuation
 from femsense.recording import Recording, make_recording
 
@@ -41,12 +44,12 @@ def recording(inputs: Sequence[Sequence[float]], **parts: Any) -> Recording:
 
 def walked(r: Robot, rec: Recording, frames: Sequence[int] | None = None, **options: Any) -> dict[int, np.ndarray]:
     frames = range(rec.frame_count) if frames is None else frames
-    return {k: seen for k, _, seen, _ in walk_along(Walk(r, drive_of(r, rec)), frames, marker_positions, **options)}
+    return {k: seen for k, _, seen, _ in walk_along(Walk(r, drive_of(r, rec)), frames, attrgetter("markers"), **options)}
 
 
 def walk_states(r: Robot, rec: Recording) -> list[Equilibrium]:
     starts: dict[int, Equilibrium] = {}
-    deque(walk_along(Walk(r, drive_of(r, rec)), range(rec.frame_count), marker_positions, starts=starts), maxlen=0)
+    deque(walk_along(Walk(r, drive_of(r, rec)), range(rec.frame_count), attrgetter("markers"), starts=starts), maxlen=0)
     return list(starts.values())
 
 
@@ -153,7 +156,7 @@ def test_equal_frames_share_one_solve_and_come_out_the_same(monkeypatch: pytest.
     assert calls == [0, 1]
     for k in range(5):
         alone = solve_frame(Walk(robot(), drive_of(robot(), rec)), k)
-        np.testing.assert_allclose(seen[k], marker_positions(robot(), alone), atol=1e-9)
+        np.testing.assert_allclose(seen[k], robot().markers.positions(alone.positions), atol=1e-9)
 
 
 def test_frames_with_other_loads_or_gravity_are_not_the_same() -> None:
@@ -230,10 +233,10 @@ def test_variants_give_the_derivative_of_frames_solved_anew() -> None:
     variants = [robot([{"name": "stiffness", "scale": 1 + h}]), robot([{"name": "poisson", "poisson_ratio": 0.4 + h}]), robot([{"name": "payload", "point_m": MARKERS[1].tolist(), "force_n": [0, 0, h]}])]  # fmt: skip
     behind = [robot([{"name": "stiffness", "scale": 1 - h}]), robot([{"name": "poisson", "poisson_ratio": 0.4 - h}]), robot([{"name": "payload", "point_m": MARKERS[1].tolist(), "force_n": [0, 0, -h]}])]  # fmt: skip
     for k, _, seen, others in walk_along(
-        Walk(base, drive_of(base, rec)), [0, 1], marker_positions, [Walk(v, drive_of(v, rec)) for v in variants]
+        Walk(base, drive_of(base, rec)), [0, 1], attrgetter("markers"), [Walk(v, drive_of(v, rec)) for v in variants]
     ):
         for forward, ahead, back in zip(others, variants, behind):
-            alone = [marker_positions(r, solve_equilibrium(r.body, tension=dict(zip(("top", "side"), rec.inputs[k])), relative_tolerance=1e-12)) for r in (ahead, back)]  # fmt: skip
+            alone = [r.markers.positions(solve_equilibrium(r.body, tension=dict(zip(("top", "side"), rec.inputs[k])), relative_tolerance=1e-12).positions) for r in (ahead, back)]  # fmt: skip
             central = (alone[0] - alone[1]) / (2 * h)
             assert np.abs((forward - seen) / h - central).max() < 1e-3 * np.abs(central).max()  # one-sided: h of curvature
             np.testing.assert_allclose(forward, alone[0], atol=1e-4 * h * np.abs(central).max() + 1e-11)
@@ -247,11 +250,40 @@ def test_another_modulus_of_some_elements_moves_a_frame_as_if_it_were_solved_ane
     ):
         ahead, back = (apply_effects(base, [{**entry, "scale": 1 + s}]) for s in (h, -h))
         [(_, _, seen, others)] = walk_along(
-            Walk(base, drive_of(base, rec)), [0], marker_positions, [Walk(ahead, drive_of(ahead, rec))]
+            Walk(base, drive_of(base, rec)), [0], attrgetter("markers"), [Walk(ahead, drive_of(ahead, rec))]
         )
-        alone = [marker_positions(r, solve_equilibrium(r.body, tension={"top": 1.0, "side": 0.3}, relative_tolerance=1e-12)) for r in (ahead, back)]  # fmt: skip
+        alone = [r.markers.positions(solve_equilibrium(r.body, tension={"top": 1.0, "side": 0.3}, relative_tolerance=1e-12).positions) for r in (ahead, back)]  # fmt: skip
         central = (alone[0] - alone[1]) / (2 * h)
         assert np.abs((others[0] - seen) / h - central).max() < 1e-3 * np.abs(central).max()  # one-sided: h of curvature
+
+
+@pytest.mark.parametrize("control", ["tension", "displacement"])
+def test_many_forces_are_answered_by_the_points_that_are_observed(control: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    rec = recording([[1.0, 0.3], [2.0, 0.1]] if control == "tension" else [[2e-3, 0.0], [1e-3, 5e-4]], actuation=control)
+    base = apply_effects(robot(), [{"name": "cable_stretch", "stiffness_n_m": 2000.0}] if control == "displacement" else [])
+    payloads = [{"name": "payload", "point_m": MARKERS[i % len(MARKERS)].tolist(), "force_n": f} for i, f in enumerate((1e-3 * np.random.default_rng(2).standard_normal((3 * len(MARKERS) + 1, 3))).tolist())]  # fmt: skip
+    entries = [
+        *payloads,
+        {"name": "stiffness", "scale": 1.001},
+        {"name": "cable_gain", "scale": {"top": 1.001}},
+        {"name": "geometry", "scale": 1.001},
+        {"name": "marker_offset", "offset_m": {"a": [1e-4, 0.0, 0.0]}},
+    ]
+    robots = [apply_effects(base, [entry]) for entry in entries]
+    walks = [Walk(r, drive_of(r, rec)) for r in robots]
+    solved, plain = list[int](), Tangent.respond
+    monkeypatch.setattr(Tangent, "respond", lambda self, forces: solved.append(len(forces)) or plain(self, forces))
+
+    def seen(variants: Sequence[Walk]) -> FloatArray:
+        return np.array(
+            [others for *_, others in walk_along(Walk(base, drive_of(base, rec)), [0, 1], attrgetter("markers"), variants)]
+        )
+
+    together = seen(walks)
+    assert solved and max(solved) == 3 * len(MARKERS)  # one a point and axis, none a payload
+    alone = np.concatenate([seen([walk]) for walk in walks], axis=1)
+    still = next(iter(walk_along(Walk(base, drive_of(base, rec)), [0], attrgetter("markers"))))[2]
+    np.testing.assert_allclose(together, alone, atol=1e-6 * np.abs(alone - still).max())
 
 
 def test_a_variant_in_observation_alone_costs_no_solve(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -262,7 +294,7 @@ def test_a_variant_in_observation_alone_costs_no_solve(monkeypatch: pytest.Monke
     plain = march.solve_frame
     monkeypatch.setattr(march, "solve_frame", lambda *a, **k: calls.append(a[1]) or plain(*a, **k))
     drive = drive_of(base, rec)
-    _, _, seen, others = next(iter(walk_along(Walk(base, drive), [0], marker_positions, [Walk(moved, drive)])))
+    _, _, seen, others = next(iter(walk_along(Walk(base, drive), [0], attrgetter("markers"), [Walk(moved, drive)])))
     assert calls == [0] and 5e-4 < np.abs(others[0] - seen).max() < 2e-3
 
 
@@ -273,11 +305,11 @@ def test_variants_that_rub_are_answered_twice_with_one_factor_a_state(monkeypatc
     made, plain = list[Any](), march.tangent_at
     monkeypatch.setattr(march, "tangent_at", lambda *given: made.append(given) or plain(*given))
     walks = [Walk(r, drive_of(r, rec)) for r in (*rubs, *others)]
-    seen = list(walk_along(Walk(base, drive_of(base, rec)), range(4), marker_positions, walks))
+    seen = list(walk_along(Walk(base, drive_of(base, rec)), range(4), attrgetter("markers"), walks))
     assert len(made) == 2  # frames of two states
     monkeypatch.setattr(march, "FACTOR_MEMORY", 0.0)
     for (_, _, _, kept), (_, _, _, again) in zip(
-        seen, walk_along(Walk(base, drive_of(base, rec)), range(4), marker_positions, walks)
+        seen, walk_along(Walk(base, drive_of(base, rec)), range(4), attrgetter("markers"), walks)
     ):
         np.testing.assert_allclose(kept, again, atol=1e-12)
     assert len(made) == 6
@@ -295,7 +327,7 @@ def test_a_variant_in_gravity_is_solved() -> None:
     base, rec = robot(), recording([[1.0, 0.3]])
     tilted = replace(base, body=base.body.with_gravity([1.0, 0, -9.81]))
     _, _, seen, others = next(
-        iter(walk_along(Walk(base, drive_of(base, rec)), [0], marker_positions, [Walk(tilted, drive_of(tilted, rec))]))
+        iter(walk_along(Walk(base, drive_of(base, rec)), [0], attrgetter("markers"), [Walk(tilted, drive_of(tilted, rec))]))
     )
     assert np.abs(others[0] - seen).max() > 1e-6
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from operator import attrgetter
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from femsense import parallel
 from femsense.errors import DataError, InputError
 from femsense.fem import cholesky
 from femsense.fem.equilibrium import solve_equilibrium
-from femsense.march import Walk, drive_of, marker_positions, walk_along
+from femsense.march import Walk, drive_of, walk_along
 from femsense.parallel import beside, each, set_workers, workers
 
 
@@ -124,7 +125,7 @@ def test_a_walk_does_not_depend_on_how_many_work(friction):
         set_workers(count)
         starts: dict = {}
         walks = [Walk(r, drive_of(r, rec)) for r in (base, *variants)]
-        rows = [list(walk_along(walks[0], range(5), marker_positions, walks[1:], starts=starts)) for _ in range(2)]
+        rows = [list(walk_along(walks[0], range(5), attrgetter("markers"), walks[1:], starts=starts)) for _ in range(2)]
         found.append([np.vstack([seen[None], others]) for again in rows for _, _, seen, others in again])
     np.testing.assert_array_equal(found[0], found[1])
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from femsense.effects import apply_effects
 from femsense.errors import DataError, InputError
 from femsense.fem.mesh import element_volumes
 from femsense.files import folder_hash
-from femsense.march import Walk, drive_of, marker_positions, walk_along
+from femsense.march import Walk, drive_of, walk_along
 from femsense.model import Robot
 from femsense.recording import load_recording, make_recording
 from femsense.rig import truth
@@ -41,7 +42,7 @@ def _estimators_markers(robot: Robot, script: dict[str, Any]) -> np.ndarray:
     checked = check_script(script)
     recording = recording_of(run_experiment(robot, checked))
     walk = Walk(robot, drive_of(robot, recording))
-    return np.array([seen for _, _, seen, _ in walk_along(walk, range(recording.frame_count), marker_positions)])
+    return np.array([seen for _, _, seen, _ in walk_along(walk, range(recording.frame_count), attrgetter("markers"))])
 
 
 def _true_markers(robot: Robot, script: dict[str, Any]) -> np.ndarray:
@@ -91,7 +92,7 @@ def test_held_cables_that_rub_come_to_rest_when_they_are_let_out(monkeypatch: py
 
     def markers(declared: Robot) -> np.ndarray:
         walk = Walk(declared, drive_of(declared, recording))
-        return np.array([seen for _, _, seen, _ in walk_along(walk, range(2), marker_positions)])
+        return np.array([seen for _, _, seen, _ in walk_along(walk, range(2), attrgetter("markers"))])
 
     true = np.array([rubbing.markers.positions(f.state.positions) for f in walk_truth(rubbing, plan, substeps=2)])
     expected = markers(rubbing)
@@ -120,7 +121,7 @@ def test_an_effect_of_the_truth_is_what_the_estimator_means_by_it(robot: Robot, 
     recording = recording_of(run_experiment(robot, checked))
     declared = apply_effects(robot, [effect])
     walk = Walk(declared, drive_of(declared, recording))
-    expected = np.array([seen for _, _, seen, _ in walk_along(walk, range(recording.frame_count), marker_positions)])
+    expected = np.array([seen for _, _, seen, _ in walk_along(walk, range(recording.frame_count), attrgetter("markers"))])
     plain = _estimators_markers(robot, BARE)
     # friction depends on the way between frames (the bends turn), which the estimator takes in one step
     tolerance = 2e-2 * np.abs(expected - plain).max() if effect["name"] == "cable_friction" else 1e-9

@@ -264,16 +264,16 @@ def evaluate_scene(
         if id(v.robot) not in places:
             places[id(v.robot)] = places[id(robot)] if _tied_alike(v.robot, robot) else _ties(v.robot, scene, poses)
 
-    def observe(r: Robot, state: Equilibrium) -> FloatArray:
-        return places.get(id(r), places[id(robot)]).positions(state.positions)
+    def ties(r: Robot) -> Embedding:
+        return places.get(id(r), places[id(robot)])
 
     states: dict[int, Equilibrium] = {}
     model: dict[int, FloatArray] = {}
     shifted: list[dict[int, FloatArray]] = [{} for _ in variants]
     if known is not None and not variants:
-        states, model = known, {k: observe(robot, state) for k, state in known.items()}
+        states, model = known, {k: ties(robot).positions(state.positions) for k, state in known.items()}
     frames = [] if model else scene.frames.tolist()
-    for k, state, seen, varied in walk_along(base, frames, observe, variants, starts=starts, rough=rough):
+    for k, state, seen, varied in walk_along(base, frames, ties, variants, starts=starts, rough=rough):
         states[k], model[k] = state, seen
         for i in range(len(variants)):
             shifted[i][k] = varied[i]

@@ -123,7 +123,7 @@ class BodyModel:
     @property
     def reach(self) -> float:
         """Longest side of the box around the body at rest [m]."""
-        return float(np.ptp(self.mesh.nodes, axis=0).max())
+        return self.mesh.reach
 
     parts: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     """The connected part that each node belongs to, shape (n,); a robot has one (see `mesh.check_mesh`)."""

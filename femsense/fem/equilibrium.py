@@ -257,7 +257,7 @@ def _collect_loads(
     areas = [np.linalg.norm(volume_gradient(c, body.mesh.nodes), axis=1).sum() for c in body.chambers]
     lever = np.concatenate([np.ones(len(T)), areas])
     effort, target = np.concatenate([T, p]), np.concatenate([d, grown])
-    reach = np.ptp(body.mesh.nodes, axis=0).max()
+    reach = body.reach
     stiffness = float(np.median(body.material.young_modulus)) * reach
     scale = np.linalg.norm(forces, axis=1).sum() + np.abs(effort) @ lever + (np.abs(target) / lever).sum() * stiffness * 1e-2
     tolerance = relative_tolerance * max(scale, 1e-6 * stiffness * reach * 1e-2) + 1e-13 * stiffness * reach
@@ -592,7 +592,7 @@ def _can_fall(body: BodyModel, loads: _Loads, state: _State) -> bool:
         motion, _ = _bordered_step(factor, motion, np.zeros(len(held)), H, H, stretch, lever)
         motion /= np.abs(motion).max()
     step = np.zeros(state.x.size)
-    step[free] = 1e-6 * np.ptp(body.mesh.nodes, axis=0).max() * motion
+    step[free] = 1e-6 * body.reach * motion
     forces = []
     for sign in (1.0, -1.0):
         there = replace(state, x=state.x + sign * step.reshape(-1, 3))

@@ -7,7 +7,7 @@ Nodes of an element are ordered as in VTK: corners 0 1 2 3, then the middles of 
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import chain
 from typing import Any
@@ -33,9 +33,12 @@ class TetMesh:
     """Node positions [m], shape (n, 3): those of the linear mesh first, then the mid-edge nodes."""
     tets: IntArray
     """Node indices, shape (m, 4) or (m, 10)."""
+    reach: float = field(init=False)
+    """Longest side of the box around it [m]."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "nodes", freeze(as_points(self.nodes, "nodes")))
+        object.__setattr__(self, "reach", float(np.ptp(self.nodes, axis=0).max()) if len(self.nodes) else 0.0)
         object.__setattr__(self, "tets", freeze(self.tets, np.int64))
         if self.tets.ndim != 2 or self.tets.shape[1] not in (4, 10):
             raise InputError("tets has the wrong shape", where="tets", found=self.tets.shape, expected="(m, 4) or (m, 10)")

@@ -16,7 +16,7 @@ REFINED_FROM = 3000
 REFINED, MOST_REFINED = 1e-3, 3
 """A correction by less than this share squares to what may be left of an error; solves at most before the factor is made in double precision."""
 NEAR_ENOUGH = 1e-2
-"""A factor of a state near by serves where a correction of what it makes of an even load is smaller than this share: one more solve is enough then."""
+"""A factor of a state near by serves where the first correction of what it makes of the loads that are asked is smaller than this share."""
 ROUGH = 1e-3
 """Share of a rough solution that may be missing, in energy. With ten times as much in the mesh's error the order of the nodes moved a fit by two percent."""
 ROUGH_FROM = 9000
@@ -26,49 +26,63 @@ ROUGH_FROM = 9000
 class Refined:
     """A stiffness behind its factor in single precision: solutions are corrected from their true residual (Wilkinson 1963)."""
 
-    def __init__(self, pattern: Pattern, values: FloatArray, plain: Factorization) -> None:
+    def __init__(self, pattern: Pattern, values: FloatArray, plain: Cholesky, *, lent: bool = False) -> None:
         self.negative, self.size, self.bytes = 0, pattern.size, plain.bytes + values.nbytes
         self.plain = plain
+        self._lent = lent
+        """Whether the factor is that of a state near by, and has not shown yet that it serves."""
         self._pattern, self._values = pattern, values
         self._matrix = sp.csr_matrix((values, pattern.indices, pattern.indptr), shape=(pattern.size,) * 2)
         self._exact: Factorization | None = None
 
     def solve(self, right: FloatArray) -> FloatArray:
         """Return K⁻¹ right, shape (f,) or (f, k)."""
-        if self._exact is not None:
-            return self._exact.solve(right)
-        answer = self.plain.solve(right)
-        for _ in range(MOST_REFINED):
-            more = self._correction(right, answer)
-            answer = answer + more
-            if (np.abs(more).max(axis=0) <= REFINED * np.abs(answer).max(axis=0)).all():
-                return np.asarray(answer)
-        self._exact = factorize(self._pattern, self._values)
         if self._exact is None:
-            raise FemsenseError("the stiffness is singular")
+            answer = self._refined(right)
+            if answer is not None:
+                return answer
+            self._exact = factorize(self._pattern, self._values)
+            if self._exact is None:
+                raise FemsenseError("the stiffness is singular")
         return self._exact.solve(right)
 
     def gram(self, columns: sp.csc_matrix) -> FloatArray:
         """Return BᵀK⁻¹B, shape (k, k), for sparse columns B, shape (f, k)."""
         return np.asarray(columns.T @ self.solve(columns.toarray()))
 
-    def serves(self) -> bool:
-        """Return whether the factor, which may be that of a state near by, is nearly that of this stiffness."""
-        load = np.ones(self.size)
-        answer = self.plain.solve(load)
-        return bool(np.abs(self._correction(load, answer)).max() <= NEAR_ENOUGH * np.abs(answer).max())
+    def _refined(self, right: FloatArray) -> FloatArray | None:
+        """Return the corrected solution; None where corrections do not shrink as they should."""
+        answer = self.plain.solve(right)
+        for _ in range(MOST_REFINED):
+            more = self.plain.solve(right - self._matrix @ answer)
+            if self._lent and not _small(more, answer, NEAR_ENOUGH):
+                return self._refined(right) if self._factorised() else None
+            self._lent = False
+            answer = answer + more
+            if _small(more, answer, REFINED):
+                return np.asarray(answer)
+        return None
 
-    def _correction(self, right: FloatArray, answer: FloatArray) -> FloatArray:
-        return self.plain.solve(right - self._matrix @ answer)
+    def _factorised(self) -> bool:
+        """Put a factor of its own in the place of the one that was lent; return whether there is one in single precision."""
+        own = factorize_definite(self._pattern, self._values, tries=0, single=True)[0]
+        self._lent = False
+        self.plain = own if isinstance(own, Cholesky) else self.plain
+        return isinstance(own, Cholesky)
+
+
+def _small(more: FloatArray, answer: FloatArray, share: float) -> bool:
+    """Return whether corrections are smaller than a share of what they correct, column by column."""
+    return bool((np.abs(more).max(axis=0) <= share * np.abs(answer).max(axis=0)).all())
 
 
 def refined(pattern: Pattern, values: FloatArray, lent: Factorization | None = None) -> Factorization | None:
     """Return a stiffness that is solved to 1e-6 or better, from a factor in single precision where that pays and is enough: from that which a state
-    near by has lent, if it serves."""
+    near by has lent, as long as it serves."""
     if pattern.size < REFINED_FROM or not np.isfinite(values).all():
         return factorize(pattern, values)
-    if isinstance(lent, Cholesky) and lent.size == pattern.size and (near := Refined(pattern, values, lent)).serves():
-        return near
+    if isinstance(lent, Cholesky) and lent.size == pattern.size:
+        return Refined(pattern, values, lent, lent=True)
     plain = factorize_definite(pattern, values, tries=0, single=True)[0]
     return Refined(pattern, values, plain) if isinstance(plain, Cholesky) else plain or factorize(pattern, values)
 

@@ -39,6 +39,8 @@ REFITTABLE = 0.04
 """A candidate of which calibration leaves less than this is not refitted."""
 ALIKE = 0.95
 """Candidates that promise this share of what the best does are refitted in the order of their cost: to the first refit all others are held up."""
+RIVALS = 0.5
+"""Those that promise this share are all fitted to some of the states first, where these spare time, and to all in the order of what they explain there."""
 PROMISING = 8.0
 """Linear dBIC that a candidate needs to be refitted: what is small is nearly linear, so that a refit finds about as much."""
 HINTED = 0.5
@@ -89,8 +91,10 @@ def grow(
     refitted."""
     refits: list[Refit] = []
     records: list[dict[str, Any]] = []
-    few: Few | None = None
-    for candidate in shortlist(table, first=not found_in(stage)):
+    listed = shortlist(table, first=not found_in(stage))
+    few = few_of(data, stage, noise) if listed else None
+    scouts = {} if few is None else _scouted(data, few, listed, noise, say)
+    for candidate in sorted(listed, key=lambda c: -scouts[id(c)][1] if id(c) in scouts else np.inf):
         ahead = [r for r in refits if r.record["verdict"] == "passes" and explains(r.stage)]
         best = max((r.score for r in ahead), default=-np.inf)
         behind = candidate.score < max((0.5 * _bar(r, candidate) for r in ahead), default=-np.inf) - EVIDENCE
@@ -101,8 +105,11 @@ def grow(
         records.append(record)
         settled = _settled(data, candidate, ahead)
         try:
-            few = few_of(data, stage, noise) if few is None else few
-            behind, begin = _in_some_states(few, candidate, max(ahead, key=lambda r: r.score, default=None), noise, settled)
+            assert few is not None
+            scout, _ = scouts.get(id(candidate), (None, 0.0))
+            behind, begin = _in_some_states(
+                few, candidate, max(ahead, key=lambda r: r.score, default=None), noise, settled, scout
+            )
             if behind:
                 record["verdict"] = "given up: in some of the states another one explains more by far"
                 continue
@@ -163,11 +170,29 @@ def _settled(data: Data, candidate: Candidate, ahead: Sequence[Refit]) -> bool:
     )
 
 
+def _scouted(data: Data, few: Few, listed: Sequence[Candidate], noise: Noise, say: Progress) -> dict[int, tuple[JointFit, float]]:
+    """Return how the leading ones of a shortlist fit some of the states, with their dBIC there, each under its `id`; none of them where these do not
+    tell it of all, or spare no time."""
+    best = max(c.score for c in listed)
+    leading = [(c, few.candidate(c, noise)) for c in listed if few.spares and c.score >= RIVALS * best]
+    if len(leading) < 2 or any(own is None for _, own in leading):
+        return {}
+    scouts = dict[int, tuple[JointFit, float]]()
+    for candidate, own in leading:
+        say(f"refitting with {candidate.effect.name} in some states")
+        assert own is not None
+        made = tried(few.data, few.stage, own, noise, -np.inf)
+        if made is None:
+            return {}
+        scouts[id(candidate)] = made.fit, evidence(few.stage.fit, made.fit) - own.cost + weighs(data, candidate.effect.name)
+    return scouts
+
+
 def _in_some_states(
-    few: Few, candidate: Candidate, ahead: Refit | None, noise: Noise, settled: bool
+    few: Few, candidate: Candidate, ahead: Refit | None, noise: Noise, settled: bool, scout: JointFit | None
 ) -> tuple[bool, JointFit | None]:
-    """Return whether a candidate that is fitted in some of the states stays as far behind another one there as ends a refit, where these spare time;
-    and where that fit ended."""
+    """Return whether a candidate that is fitted in some of the states, as a scout already or now, stays as far behind another one there as ends a refit,
+    where these spare time; and where that fit ended."""
     own = few.candidate(candidate, noise) if few.spares else None
     if own is None:
         return False, None
@@ -175,10 +200,12 @@ def _in_some_states(
     if ahead is not None:
         leading = few.of(ahead.stage.fit, noise)
         wanted = max(EVIDENCE, evidence(base, leading) - ahead.candidate.cost - 2.0 * EVIDENCE)
-    made = tried(few.data, few.stage, own, noise, wanted, settled=settled)
-    if made is None:  # where it does not fit, all states decide
+    if scout is None:
+        made = tried(few.data, few.stage, own, noise, wanted, settled=settled)
+        scout = None if made is None else made.fit
+    if scout is None:  # where it does not fit, all states decide
         return False, None
-    return made.fit.chi2 > worth_of(base, own, wanted, settled), made.fit
+    return scout.chi2 > worth_of(base, own, wanted, settled), scout
 
 
 def _bar(ahead: Refit, candidate: Candidate) -> float:

@@ -186,7 +186,7 @@ def _moves(
     frames = np.unique(np.concatenate([t.scene.frames for t in trials]))
     vectors = state_vectors(recording, frames)
     chosen = _chosen(vectors, len(fine.body.mesh.tets))
-    walked = walk_along(coarse_walk, frames[chosen].tolist(), lambda r, s: s.positions[:0], starts=starts)
+    walked = walk_along(coarse_walk, frames[chosen].tolist(), lambda r: r.markers[:0], starts=starts)
     states = {k: state for k, state, _, _ in walked}
     known, settled = [], []
 
