@@ -177,14 +177,16 @@ def _scouted(data: Data, few: Few, listed: Sequence[Candidate], noise: Noise, sa
     leading = [(c, few.candidate(c, noise)) for c in listed if few.spares and c.score >= RIVALS * best]
     if len(leading) < 2 or any(own is None for _, own in leading):
         return {}
-    scouts = dict[int, tuple[JointFit, float]]()
+    scouts, lead = dict[int, tuple[JointFit, float]](), -np.inf
     for candidate, own in leading:
         say(f"refitting with {candidate.effect.name} in some states")
         assert own is not None
-        made = tried(few.data, few.stage, own, noise, -np.inf)
-        if made is None:
-            return {}
-        scouts[id(candidate)] = made.fit, evidence(few.stage.fit, made.fit) - own.cost + weighs(data, candidate.effect.name)
+        made = tried(few.data, few.stage, own, noise, max(EVIDENCE, lead - 2.0 * EVIDENCE))
+        if made is None:  # where it does not fit, all states decide
+            continue
+        score = evidence(few.stage.fit, made.fit) - own.cost + weighs(data, candidate.effect.name)
+        scouts[id(candidate)] = made.fit, score
+        lead = max(lead, score) if explains(made) else lead
     return scouts
 
 
