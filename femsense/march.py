@@ -19,7 +19,7 @@ from femsense.fem.assembly import add_elements, element_forces, internal
 from femsense.fem.body import BodyModel
 from femsense.fem.cables import bend_angles, cable_forces, rub, shortening
 from femsense.fem.chambers import volume_gradient
-from femsense.fem.clamp import first_give
+from femsense.fem.clamp import first_give, rigid_give
 from femsense.fem.compliance import Tangent, drive_rows, tangent_at
 from femsense.fem.equilibrium import Equilibrium, solve_equilibrium
 from femsense.fem.linear import Factorization, available_memory, factorize
@@ -37,8 +37,6 @@ TRIED = 1e-8
 """Relative tolerance of states that are only tried: below a thousandth of a millimetre, where derivatives want a tenth of it."""
 PARTS, SHORTEST_PART = 4, 6
 """Parts at most that frames are walked in side by side where each starts from the one before, and frames of a part at least."""
-GIVES = 1e-3
-"""A state with a rigid clamp is a start for one that gives by less than this share of the body at first."""
 FEW_COLUMNS = 16
 """With more right-hand sides of a state the solves that correct them take longer than a factor in double precision."""
 PAST, PAST_TRIED = 1e-8, 1e-6
@@ -268,7 +266,7 @@ def _base_states(
 ) -> Iterator[Equilibrium]:
     """Yield the states of frames, without their factors; `starts` gets them with these where they fit into memory."""
     room = _room(len(frames))
-    near = {k: state for k, state in sorted((starts or {}).items()) if _clamp_fits(walk, k, state)}
+    near = {k: state for k, state in sorted((starts or {}).items()) if _clamp_fits(walk.robot.body, state)}
 
     def keep(k: int, state: Equilibrium) -> Equilibrium:
         bare = replace(state, factor=None)
@@ -277,6 +275,8 @@ def _base_states(
         return bare
 
     known = near.keys() & set(frames)
+    if not near:
+        near = {k: start for k, state in sorted((starts or {}).items()) if (start := _taken_along(walk, k, state)) is not None}
     if near:
         near.update(_nearest(walk, near, [k for k in frames if k not in near]))
 
@@ -382,13 +382,19 @@ def _as_before(now: tuple[FloatArray, ...], then: tuple[FloatArray, ...], slack:
     return all(np.abs(a - b).max(initial=0.0) <= slack * max(1.0, float(a.max(initial=0.0))) for a, b in zip(now, then))
 
 
-def _clamp_fits(walk: Walk, frame: int, state: Equilibrium) -> bool:
-    """Return whether a state can serve as a start: a clamp that gave way elsewhere would be torn back, and one that gives by much, and
-    has not yet, would let go of the whole load at once, which takes longer than the way from rest."""
-    body = walk.robot.body
-    if body.clamp_is_rigid or has_given(body, state):
-        return not (body.clamp_is_rigid and has_given(body, state))
-    return bool(np.abs(first_give(body, _Balance(walk, frame, state).left())).max(initial=0.0) < GIVES * body.reach)
+def _clamp_fits(body: BodyModel, state: Equilibrium) -> bool:
+    """Return whether a state can serve as a start as it is: one whose clamp gave way elsewhere would be torn back, one whose clamp has not yet would let
+    go of the whole load at once."""
+    return body.clamp_is_rigid != has_given(body, state)
+
+
+def _taken_along(walk: Walk, frame: int, state: Equilibrium) -> Equilibrium | None:
+    """Return a state with a rigid clamp as a start for a clamp that gives, the whole body taken along; None where that is no start."""
+    if walk.robot.body.clamp_is_rigid:
+        return None
+    balance = _Balance(walk, frame, state)
+    moved = rigid_give(walk.robot.body, state.positions, balance.whole(walk, balance.along(walk), state.positions))
+    return None if moved is None else replace(state, positions=moved)
 
 
 def has_given(body: BodyModel, state: Equilibrium) -> bool:

@@ -94,10 +94,11 @@ def test_a_candidate_is_the_same_to_some_states(started: tuple[Data, Stage], som
     assert some.candidate(replace(rubbing, step=np.array([0.1])), NOISE) is None  # its states need those before
 
 
-def searched(started: tuple[Data, Stage], monkeypatch: pytest.MonkeyPatch) -> tuple[list[tuple[str, bool]], list[dict[str, Any]]]:
-    """Return what growth has refitted beside what leads, each with whether to all states, and its records."""
+def searched(
+    started: tuple[Data, Stage], monkeypatch: pytest.MonkeyPatch, *names: str, alike: bool = False
+) -> tuple[list[tuple[str, bool]], list[dict[str, Any]]]:
+    """Return what growth has refitted of a shortlist, whose scores may be alike, each with whether to all states, and its records."""
     data, stage = started
-    names = ["payload", "cable_gain", "poisson"]
     table = screen_stage(data, stage.fit, NOISE, fields_of(data, stage, names), COUNT)
     fitted = list[tuple[str, bool]]()
 
@@ -108,27 +109,38 @@ def searched(started: tuple[Data, Stage], monkeypatch: pytest.MonkeyPatch) -> tu
     monkeypatch.setattr(growing, "refit", counted)
     monkeypatch.setattr(growing, "tried", counted)
     monkeypatch.setattr(growing, "explains", lambda stage: True)
-    monkeypatch.setattr(growing, "shortlist", lambda table, first: [next(c for c in table if c.effect.name == n) for n in names])
+    listed = [next(c for c in table if c.effect.name == n) for n in names]
+    monkeypatch.setattr(growing, "shortlist", lambda table, first: [replace(c, score=100.0) if alike else c for c in listed])
     monkeypatch.setattr(growing, "_bar", lambda ahead, candidate: -np.inf)
     winner, _, records = growing.grow(data, stage, table, NOISE, lambda text: None)
     assert winner is not None and winner.candidate.effect.name == "payload" and ("payload", True) in fitted
-    return [f for f in fitted if f[0] != "payload"], records
+    return fitted, records
 
 
 @pytest.mark.usefixtures("some")
 def test_rivals_that_stay_far_behind_in_some_states_are_not_fitted_to_all(
     started: tuple[Data, Stage], monkeypatch: pytest.MonkeyPatch
 ):
-    rivals, records = searched(started, monkeypatch)
-    assert rivals == [("cable_gain", False), ("poisson", False)]
+    fitted, records = searched(started, monkeypatch, "payload", "cable_gain", "poisson")
+    assert [f for f in fitted if f[0] != "payload"] == [("cable_gain", False), ("poisson", False)]
     assert all(r["verdict"].startswith("given up: in some of the states") for r in records[1:])
+
+
+@pytest.mark.usefixtures("some")
+def test_what_promises_as_much_is_fitted_to_all_states_in_the_order_of_what_it_explains_in_some(
+    started: tuple[Data, Stage], monkeypatch: pytest.MonkeyPatch
+):
+    fitted, records = searched(started, monkeypatch, "cable_gain", "payload", alike=True)
+    assert fitted[:3] == [("cable_gain", False), ("payload", False), ("payload", True)]
+    assert ("cable_gain", True) not in fitted
+    assert [r["name"] for r in records] == ["payload", "cable_gain"] and records[1]["verdict"].startswith("given up: in some")
 
 
 def test_rivals_are_fitted_to_all_states_where_these_are_little_work(
     started: tuple[Data, Stage], monkeypatch: pytest.MonkeyPatch
 ):
-    rivals, records = searched(started, monkeypatch)
-    assert rivals == [("cable_gain", True), ("poisson", True)]
+    fitted, records = searched(started, monkeypatch, "payload", "cable_gain", "poisson")
+    assert [f for f in fitted if f[0] != "payload"] == [("cable_gain", True), ("poisson", True)]
     assert not any("some of the states" in r["verdict"] for r in records)
 
 

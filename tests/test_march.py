@@ -349,14 +349,36 @@ def test_a_frame_without_equilibrium_names_itself() -> None:
         walked(loose, recording([[0.0, 0]]))
 
 
-def test_states_with_a_rigid_clamp_are_starts_for_one_that_gives_by_little_and_the_answer_does_not_depend_on_them() -> None:
+@pytest.mark.parametrize(
+    "entry",
+    [
+        {"stiffness_n_m": 300.0},
+        {"rotation_stiffness_nm_rad": 0.05},
+        {"stiffness_n_m": 300.0, "rotation_stiffness_nm_rad": 0.3},
+    ],
+)
+def test_a_clamp_that_gives_takes_the_body_along_first(entry: dict[str, float], monkeypatch: pytest.MonkeyPatch) -> None:
     rec = recording([[1.0, 0.0], [2.0, 0.5]])
-    rigid, starts = robot(), {}
+    rigid, starts, begun = robot(), {}, dict[int, Equilibrium]()
     walked(rigid, rec, starts=starts)
-    for stiffness, serves in ((1e6, True), (20.0, False)):
-        soft = robot([{"name": "base_compliance", "stiffness_n_m": stiffness}])
-        walk = Walk(soft, drive_of(soft, rec))
-        assert all(march._clamp_fits(walk, k, state) == serves for k, state in starts.items())
-        there = walked(soft, rec, starts=dict(starts))
-        for k, alone in walked(soft, rec).items():
-            np.testing.assert_allclose(there[k], alone, atol=1e-8)
+    soft = robot([{"name": "base_compliance", **entry}])
+    alone = walk_states(soft, rec)
+    plain = march.solve_frame
+
+    def solve(walk: Walk, k: int, **given: Any) -> Equilibrium:
+        begun[k] = given["start"]
+        return plain(walk, k, **given)
+
+    monkeypatch.setattr(march, "solve_frame", solve)
+    there = walked(soft, rec, starts=dict(starts))
+    for k, state in enumerate(alone):
+        np.testing.assert_allclose(there[k], soft.markers.positions(state.positions), atol=1e-8)
+        way = np.abs(state.positions - starts[k].positions).max()
+        assert np.abs(begun[k].positions - state.positions).max() < 0.5 * way
+
+
+def test_a_clamp_that_cannot_hold_the_body_is_walked_from_rest() -> None:
+    rec = recording([[1.0, 0.0]])
+    starts = walk_states(robot(), rec)
+    soft = robot([{"name": "base_compliance", "stiffness_n_m": 1.0}])
+    assert march._taken_along(Walk(soft, drive_of(soft, rec)), 0, starts[0]) is None

@@ -211,6 +211,38 @@ def first_give(body: BodyModel, forces: FloatArray) -> FloatArray:
     return moves
 
 
+def rigid_give(body: BodyModel, positions: FloatArray, forces: FloatArray) -> FloatArray | None:
+    """Return where the nodes come to [m], shape (n, 3), when the whole body moves with its clamp, which was rigid until now and gives as `body` says,
+    as one rigid piece; None where the clamp does not hold the moment, or turns by more than a radian.
+
+    Arguments:
+        body: with springs that give.
+        positions: with the rigid clamp [m], shape (n, 3).
+        forces: all that act on the body but the clamp [N], shape (n, 3); they stay as they are in space.
+    """
+    ties = ties_of(body)
+    if ties is None:
+        return positions
+    force, arms = forces.sum(axis=0), body.mesh.nodes[ties.nodes] - ties.center
+    moment = np.cross(positions - ties.center, forces).sum(axis=0)
+    plate = moment / ties.turn_stiffness
+    anchors, turn, shift = arms @ rotation_from_vector(plate).T, plate, np.zeros(3)
+    if np.isfinite(body.clamp_stiffness):
+        shift = force / (ties.stiffness * len(arms))
+        for _ in range(20):
+            turned = arms @ rotation_from_vector(turn).T
+            jacobian = float((turned * anchors).sum()) * np.eye(3) - turned.T @ anchors
+            step = np.linalg.lstsq(jacobian, moment / ties.stiffness - np.cross(anchors, turned).sum(axis=0))[0]
+            turn = _vector_of(rotation_from_vector(step) @ rotation_from_vector(turn))
+            if np.abs(step).max() < 1e-9:
+                break
+        else:
+            return None
+    if np.linalg.norm(turn) > 1.0:
+        return None
+    return np.asarray((positions - ties.center) @ rotation_from_vector(turn).T + ties.center + shift)
+
+
 def _shares(points: FloatArray, nodes: FloatArray) -> FloatArray:
     """Return how much of each point (p, 3) goes with each node (k, 3): all with a node that it is, half with both ends of its edge."""
     distance = np.linalg.norm(points[:, None] - nodes[None], axis=2)
@@ -256,6 +288,7 @@ __all__ = [
     "clamp_turn",
     "first_give",
     "plate_at",
+    "rigid_give",
     "ties_of",
     "with_turning_plate",
 ]

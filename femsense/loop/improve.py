@@ -63,8 +63,6 @@ MATCHINGS = 4
 """Times that the rows of clouds are made again, at most."""
 ROUGHLY, STEPS = 4, 12
 """Steps of the fit whose residual tells the noise; and at most with that, to the end …"""
-ENOUGH = 5e-3
-"""The first of these ends, too, where a step promises less than this share of χ²: the noise is told beside all that its fields may still take away."""
 SPARED = 0.01
 """… or, on large meshes, to where they promise less than this share of what an effect promises on top."""
 
@@ -177,10 +175,7 @@ def _calibrated_on(data: Data, robot: Robot, placed: Stage) -> Stage:
     hypothesis, prior = with_nuisance(data, robot)
     nothing = np.zeros(len(prior.mean))
     return _as_far_as_held_out_states_rest(
-        lambda steps: make_stage(
-            data, hypothesis, prior, START, nothing, own=own_of(placed), max_iterations=steps, tolerance=ENOUGH
-        ),
-        ROUGHLY,
+        lambda steps: make_stage(data, hypothesis, prior, START, nothing, own=own_of(placed), max_iterations=steps), ROUGHLY
     )
 
 

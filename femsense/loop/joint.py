@@ -401,8 +401,6 @@ TRUSTED = 0.02
 """Derivatives that missed less than this share of every step since they were computed are believed that nothing is left to gain."""
 GAIN = 0.5
 """What counts as a gain of a step in χ², where a fit goes on by little: half of what a parameter of noise brings."""
-TOLERANCE = 1e-6
-"""A fit ends where a step promises to lower χ² by less than this share."""
 SERVES = 0.25
 """Derivatives serve for another step of a fit where they missed the change of the residual by less than this share of it."""
 
@@ -410,7 +408,7 @@ SERVES = 0.25
 def fit_jointly(
     hypothesis: Hypothesis, prior: Prior, trials: list[Trial], noise: Noise, seat_std: float, coordinates: FloatArray,
     *, own: FloatArray | None = None, max_iterations: int = 12, known: list[SceneJet] | None = None, near: list[SceneJet] | None = None,
-    worth: float = np.inf, spare: float = 0.0, tolerance: float = TOLERANCE,
+    worth: float = np.inf, spare: float = 0.0,
 ) -> JointFit:  # fmt: skip
     """Fit poses, initial inputs and the coordinates of a hypothesis together, in full nonlinearity.
 
@@ -425,8 +423,7 @@ def fit_jointly(
         known: residuals and derivatives at the start, one jet a trial, where they are known.
         near: derivatives from near the start, to begin with.
         worth: χ² above which the fit is not worth derivatives of its own at the end.
-        spare: the fit ends where a step promises to lower χ² by less than this …
-        tolerance: … or by less than this share, by derivatives of its own.
+        spare: the fit ends where a step promises to lower χ² by less than this.
 
     Raises:
         DataError: no equilibrium at the start.
@@ -441,7 +438,7 @@ def fit_jointly(
     problem.last = None if known is None else Jets(known, np.array(theta))
     problem.scale = problem.scale if begin is None or begin[1] is None else np.linalg.norm(begin[1], axis=0)
     fit = gauss_newton(
-        problem.evaluate, theta, low=low, high=high, max_iterations=max_iterations, tolerance=tolerance, still=0.2,
+        problem.evaluate, theta, low=low, high=high, max_iterations=max_iterations, tolerance=1e-6, still=0.2,
         known=begin, borrowed=None if near is None else problem.rows_of(near, theta, True)[1], serves=SERVES, worth=worth, trusted=TRUSTED, enough=GAIN, spare=spare,
         kinks=problem.kinks,
     )  # fmt: skip
@@ -458,7 +455,6 @@ def fit_jointly(
 
 __all__ = [
     "GAIN",
-    "TOLERANCE",
     "JointFit",
     "JointProblem",
     "Prior",

@@ -110,6 +110,8 @@ def refit_from(data: Data, stage: Stage, begin: JointFit, noise: Noise, worth: f
     """Return the fit to all states of a hypothesis that was fitted to some of them, from where that ended; None where it has no equilibrium, or does
     not help."""
     coordinates, own = begin.coordinates, begin.fit.theta[: begin.own]
+    for trial, jet in zip(data.train, begin.jets):
+        trial.starts_on(begin.hypothesis.robot.body.mesh).update(jet.states)
     try:
         made = make_stage(
             data, begin.hypothesis, begin.prior, noise, coordinates, own=own, max_iterations=10, worth=worth, spare=LEFT

@@ -12,7 +12,7 @@ from femsense.calib.forward import Hypothesis, SceneJet, evaluate_scene
 from femsense.effects import Effect, Entry, Parameter, find_effect
 from femsense.loop.clouds import make_rows, renewed_rows, states_of
 from femsense.loop.data import MESH, Data, groups_of, surface_of
-from femsense.loop.joint import GAIN, TOLERANCE, JointFit, JointProblem, Prior, Trial, fit_jointly, rms_of, spans_of
+from femsense.loop.joint import GAIN, JointFit, JointProblem, Prior, Trial, fit_jointly, rms_of, spans_of
 from femsense.loop.noise import Noise, estimate_noise, whiten
 from femsense.loop.screen import NUISANCE, Candidate, Fields, candidates_for, effect_fields, one_each, screen
 from femsense.model import Robot
@@ -83,12 +83,11 @@ def make_stage(
     near: list[SceneJet] | None = None,
     worth: float = np.inf,
     spare: float = 0.0,
-    tolerance: float = TOLERANCE,
 ) -> Stage:
     """Return the fit of a hypothesis and what it makes of the held-out data; arguments as of `fit_jointly`."""
     fit = fit_jointly(
         hypothesis, prior, data.train, noise, data.seat_std, coordinates,
-        own=own, max_iterations=max_iterations, known=known, near=near, worth=worth, spare=spare, tolerance=tolerance,
+        own=own, max_iterations=max_iterations, known=known, near=near, worth=worth, spare=spare,
     )  # fmt: skip
     held = held_out(data, fit, noise)
     return Stage(fit, held, rms_of([h.jet.residual for h in held]) if held else float("nan"))
