@@ -23,6 +23,7 @@ import sys
 import tempfile
 import time
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -33,11 +34,12 @@ from loop_cases import EARTH, Case, Design, _around, _measure
 from femsense.arrays import FloatArray, freeze
 from femsense.effects import apply_effects
 from femsense.fem import linear
+from femsense.fem.assembly import internal, reduced_values
 from femsense.files import write_text
 from femsense.recording import save_recording
 from femsense.rig.script import Plan
 from femsense.rig.truth import walk_truth
-from femsense.robot import save_robot
+from femsense.robot import load_robot, save_robot
 
 STAGES = (
     ("reading", "start, reading, calibrating"),
@@ -234,6 +236,27 @@ def show(name: str, runs: list[dict[str, Any]]) -> None:
     print(f"  {runs[0]['factors']} stiffnesses factorised", flush=True)
 
 
+def measure_factor(folder: Path) -> tuple[float, float]:
+    """Return how long a stiffness of the quadratic bar takes to factorise in single precision on this machine now [s], alone and with a second thread
+    at the same: what the seconds of this table are made of, whatever the machine."""
+    body = load_robot(folder / "robot-tet10").body
+    blocks = internal(body, body.mesh.nodes).blocks
+    assert blocks is not None
+    pattern, values = body.free_map.pattern, reduced_values(body, blocks)
+
+    def median(_: int) -> float:
+        times = []
+        for _ in range(20):
+            began = time.perf_counter()
+            linear.factorize_definite(pattern, values, single=True, tries=0)
+            times.append(time.perf_counter() - began)
+        return float(np.median(times))
+
+    median(0)
+    with ThreadPoolExecutor(2) as pool:
+        return median(0), max(pool.map(median, range(2)))
+
+
 def main() -> None:
     """Time the cases and print their tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -260,8 +283,13 @@ def main() -> None:
         if not (folder / "recording" / "recording.toml").is_file():
             print(f"making the recording of {hidden} …", flush=True)
             make(hidden, folder)
+        alone, both = measure_factor(folder)
         runs = [timed(folder, element, given.without) for _ in range(given.runs)]
         show(name + "".join(f" without {effect}" for effect in given.without), runs)
+        print(
+            f"  one such factor of the quadratic bar: {1e3 * alone:.0f} ms alone, {1e3 * both:.0f} ms beside a second one",
+            flush=True,
+        )
         if given.steps:
             print("  " + "; ".join(runs[0]["steps"]))
 

@@ -390,8 +390,6 @@ def _clamp_fits(body: BodyModel, state: Equilibrium) -> bool:
 
 def _taken_along(walk: Walk, frame: int, state: Equilibrium) -> Equilibrium | None:
     """Return a state with a rigid clamp as a start for a clamp that gives, the whole body taken along; None where that is no start."""
-    if walk.robot.body.clamp_is_rigid:
-        return None
     balance = _Balance(walk, frame, state)
     moved = rigid_give(walk.robot.body, state.positions, balance.whole(walk, balance.along(walk), state.positions))
     return None if moved is None else replace(state, positions=moved)

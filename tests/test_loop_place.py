@@ -221,6 +221,27 @@ def test_a_refit_begins_where_one_to_some_of_the_states_ended(
     assert made.fit.chi2 == pytest.approx(plain.fit.chi2, abs=1.0)
 
 
+def test_a_fit_to_all_states_starts_from_those_of_the_fit_to_some(
+    started: tuple[Data, Stage], some: Few, monkeypatch: pytest.MonkeyPatch
+):
+    data, stage = started
+    one = payloads(data, stage)[0]
+    own = some.candidate(one, NOISE)
+    assert own is not None
+    near = refit(some.data, some.stage, own, NOISE).fit
+    refit(data, stage, one, NOISE)  # what else was tried has left its states since then
+    begun = list[bool]()
+
+    def seen(given: Data, hypothesis: Hypothesis, *_: Any, **__: Any) -> Stage:
+        starts = given.train[0].starts_on(hypothesis.robot.body.mesh)
+        begun.extend(starts[k] is state for k, state in near.jets[0].states.items())
+        return stage
+
+    monkeypatch.setattr(refits, "make_stage", seen)
+    refits.refit_from(data, stage, near, NOISE)
+    assert begun and all(begun)
+
+
 def test_a_rival_that_its_place_brings_ahead_goes_there_before_one_is_named(
     started: tuple[Data, Stage], monkeypatch: pytest.MonkeyPatch
 ):

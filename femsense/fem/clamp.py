@@ -213,16 +213,16 @@ def first_give(body: BodyModel, forces: FloatArray) -> FloatArray:
 
 def rigid_give(body: BodyModel, positions: FloatArray, forces: FloatArray) -> FloatArray | None:
     """Return where the nodes come to [m], shape (n, 3), when the whole body moves with its clamp, which was rigid until now and gives as `body` says,
-    as one rigid piece; None where the clamp does not hold the moment, or turns by more than a radian.
+    as one rigid piece; None where the clamp does not give, does not hold the moment, or turns by more than a radian.
 
     Arguments:
-        body: with springs that give.
+        body: with the clamp that gives.
         positions: with the rigid clamp [m], shape (n, 3).
         forces: all that act on the body but the clamp [N], shape (n, 3); they stay as they are in space.
     """
     ties = ties_of(body)
     if ties is None:
-        return positions
+        return None
     force, arms = forces.sum(axis=0), body.mesh.nodes[ties.nodes] - ties.center
     moment = np.cross(positions - ties.center, forces).sum(axis=0)
     plate = moment / ties.turn_stiffness

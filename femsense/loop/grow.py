@@ -92,8 +92,10 @@ def grow(
     refits: list[Refit] = []
     records: list[dict[str, Any]] = []
     listed = shortlist(table, first=not found_in(stage))
-    few = few_of(data, stage, noise) if listed else None
-    scouts = {} if few is None else _scouted(data, few, listed, noise, say)
+    if not listed:
+        return None, [], []
+    few = few_of(data, stage, noise)
+    scouts = _scouted(data, few, listed, noise, say)
     for candidate in sorted(listed, key=lambda c: -scouts[id(c)][1] if id(c) in scouts else np.inf):
         ahead = [r for r in refits if r.record["verdict"] == "passes" and explains(r.stage)]
         best = max((r.score for r in ahead), default=-np.inf)
@@ -105,7 +107,6 @@ def grow(
         records.append(record)
         settled = _settled(data, candidate, ahead)
         try:
-            assert few is not None
             scout, _ = scouts.get(id(candidate), (None, 0.0))
             behind, begin = _in_some_states(
                 few, candidate, max(ahead, key=lambda r: r.score, default=None), noise, settled, scout
@@ -174,13 +175,13 @@ def _scouted(data: Data, few: Few, listed: Sequence[Candidate], noise: Noise, sa
     """Return how the leading ones of a shortlist fit some of the states, with their dBIC there, each under its `id`; none of them where these do not
     tell it of all, or spare no time."""
     best = max(c.score for c in listed)
-    leading = [(c, few.candidate(c, noise)) for c in listed if few.spares and c.score >= RIVALS * best]
-    if len(leading) < 2 or any(own is None for _, own in leading):
+    leading = [c for c in listed if few.spares and c.score >= RIVALS * best]
+    there = [own for c in leading if (own := few.candidate(c, noise)) is not None]
+    if len(leading) < 2 or len(there) < len(leading):
         return {}
     scouts, lead = dict[int, tuple[JointFit, float]](), -np.inf
-    for candidate, own in leading:
+    for candidate, own in zip(leading, there):
         say(f"refitting with {candidate.effect.name} in some states")
-        assert own is not None
         made = tried(few.data, few.stage, own, noise, max(EVIDENCE, lead - 2.0 * EVIDENCE))
         if made is None:  # where it does not fit, all states decide
             continue
