@@ -260,7 +260,7 @@ SABOTAGES = (
     S("march.py", "if pushes <= 3 * len(self.own_ties) or", "if True or", "test_march.py::test_many_forces_are_answered_by_the_points_that_are_observed"),
     S("march.py", "moves += tensions[:, used] @", "0.0 * tensions[:, used] @", "test_march.py::test_many_forces_are_answered_by_the_points_that_are_observed"),
     S("march.py", "u.start is base.positions and self.ties[u.key[0]] is self.own_ties", "self.ties[u.key[0]] is self.own_ties", "test_march.py::test_many_forces_are_answered_by_the_points_that_are_observed"),
-    S("fem/solves.py", "lent.size == pattern.size and ", "", "test_fem_linear.py::test_a_factor_of_a_state_near_by_is_taken_where_it_serves"),
+    S("fem/solves.py", " and lent.size == pattern.size", "", "test_fem_linear.py::test_a_factor_of_a_state_near_by_is_taken_where_it_serves"),
     S("fem/solves.py", "_small(more, answer, NEAR_ENOUGH)", "_small(more, answer, 10.0)", "test_fem_linear.py::test_a_factor_of_a_state_near_by_is_taken_where_it_serves"),
     S("loop/joint.py", "begun = self.near if self.last is None else self.last.jets", "begun = self.near", "test_loop_screen.py::test_a_fit_begins_at_the_states_of_the_model_before_unless_their_clamp_is_another"),
     S("loop/conclude.py", "shown = not zeros and", "shown =", "test_loop_screen.py::test_a_larger_error_is_not_for_zeros_of_cables_which_much_else_looks_like"),

@@ -267,6 +267,7 @@ def test_many_forces_are_answered_by_the_points_that_are_observed(control: str, 
         {"name": "stiffness", "scale": 1.001},
         {"name": "cable_gain", "scale": {"top": 1.001}},
         {"name": "geometry", "scale": 1.001},
+        {"name": "base_compliance", "stiffness_n_m": 1e6},
         {"name": "marker_offset", "offset_m": {"a": [1e-4, 0.0, 0.0]}},
     ]
     robots = [apply_effects(base, [entry]) for entry in entries]
@@ -377,8 +378,9 @@ def test_a_clamp_that_gives_takes_the_body_along_first(entry: dict[str, float], 
         assert np.abs(begun[k].positions - state.positions).max() < 0.5 * way
 
 
-def test_a_clamp_that_cannot_hold_the_body_is_walked_from_rest() -> None:
+@pytest.mark.parametrize("entry", [{"stiffness_n_m": 1.0}, {"rotation_stiffness_nm_rad": 1e-3}])
+def test_a_clamp_that_cannot_hold_the_body_is_walked_from_rest(entry: dict[str, float]) -> None:
     rec = recording([[1.0, 0.0]])
     starts = walk_states(robot(), rec)
-    soft = robot([{"name": "base_compliance", "stiffness_n_m": 1.0}])
+    soft = robot([{"name": "base_compliance", **entry}])
     assert march._taken_along(Walk(soft, drive_of(soft, rec)), 0, starts[0]) is None
