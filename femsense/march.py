@@ -622,15 +622,15 @@ class _Variants:
     def _seen(self, frame: int, jobs: list[Job], answers: _Answers) -> list[FloatArray]:
         """Return where the points of variants are [m], each (p, 3): where these have so many forces of their own that it takes fewer solves, from the
         answers of the base state to forces at its points (Maxwell's reciprocity; friction of a held cable has none)."""
-        base, upsets = self.bases[frame], self._upsets(frame, jobs, answers)
-        still = [u.start is base.positions and self.ties[u.key[0]] is self.own_ties for u in upsets]
-        pushes = sum(u.force is not None and bool(u.force.any()) for u, s in zip(upsets, still) if s)
+        upsets = self._upsets(frame, jobs, answers)
+        alike = [self.ties[u.key[0]] is self.own_ties for u in upsets]
+        pushes = sum(u.force is not None and bool(u.force.any()) for u, same in zip(upsets, alike) if same)
         if pushes <= 3 * len(self.own_ties) or has_history(self.walk.robot):
-            still = [False] * len(upsets)
-        others = [u for u, s in zip(upsets, still) if not s]
+            alike = [False] * len(upsets)
+        others = [u for u, same in zip(upsets, alike) if not same]
         moved = iter(self._respond(frame, others, answers) if others else ())
-        pulled = iter(self._answered(frame, [u for u, s in zip(upsets, still) if s], answers) if any(still) else ())
-        return [next(pulled) if s else self.ties[u.key[0]].positions(next(moved)) for u, s in zip(upsets, still)]
+        pulled = iter(self._answered(frame, [u for u, same in zip(upsets, alike) if same], answers) if any(alike) else ())
+        return [next(pulled) if same else self.ties[u.key[0]].positions(next(moved)) for u, same in zip(upsets, alike)]
 
     def _upsets(self, frame: int, jobs: list[Job], answers: _Answers) -> list[_Upset]:
         """Return what variants add to the balance of a base state."""
@@ -680,7 +680,7 @@ class _Variants:
             held = base.held[: len(body.cables)]
             by_held = np.array([ties.moves(move) for move in answers.by_held])
             moves += np.tensordot(np.array([u.pulled for u in upsets])[:, held], by_held, axes=1)
-        return list(ties.positions(x) + moves)
+        return [ties.positions(u.start) + move for u, move in zip(upsets, moves)]
 
 
 def _motor_tensions(variant: Walk, frame: int, base: Equilibrium) -> list[float]:

@@ -259,7 +259,7 @@ SABOTAGES = (
     S("loop/grow.py", "few.spares and c.score >= RIVALS * best]", "few.spares and c.score > best]", "test_loop_place.py::test_what_promises_as_much_is_fitted_to_all_states_in_the_order_of_what_it_explains_in_some"),
     S("march.py", "if pushes <= 3 * len(self.own_ties) or", "if True or", "test_march.py::test_many_forces_are_answered_by_the_points_that_are_observed"),
     S("march.py", "moves += tensions[:, used] @", "0.0 * tensions[:, used] @", "test_march.py::test_many_forces_are_answered_by_the_points_that_are_observed"),
-    S("march.py", "u.start is base.positions and self.ties[u.key[0]] is self.own_ties", "self.ties[u.key[0]] is self.own_ties", "test_march.py::test_many_forces_are_answered_by_the_points_that_are_observed"),
+    S("march.py", "alike = [self.ties[u.key[0]] is self.own_ties for", "alike = [True for", "test_march.py::test_many_forces_are_answered_by_the_points_that_are_observed"),
     S("fem/solves.py", " and lent.size == pattern.size", "", "test_fem_linear.py::test_a_factor_of_a_state_near_by_is_taken_where_it_serves"),
     S("fem/solves.py", "_small(more, answer, NEAR_ENOUGH)", "_small(more, answer, 10.0)", "test_fem_linear.py::test_a_factor_of_a_state_near_by_is_taken_where_it_serves"),
     S("loop/joint.py", "begun = self.near if self.last is None else self.last.jets", "begun = self.near", "test_loop_screen.py::test_a_fit_begins_at_the_states_of_the_model_before_unless_their_clamp_is_another"),

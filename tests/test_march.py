@@ -268,9 +268,9 @@ def test_many_forces_are_answered_by_the_points_that_are_observed(control: str, 
         {"name": "cable_gain", "scale": {"top": 1.001}},
         {"name": "geometry", "scale": 1.001},
         {"name": "base_compliance", "stiffness_n_m": 1e6},
-        {"name": "marker_offset", "offset_m": {"a": [1e-4, 0.0, 0.0]}},
     ]
-    robots = [apply_effects(base, [entry]) for entry in entries]
+    moved = {"name": "marker_offset", "offset_m": {"a": [1e-4, 0.0, 0.0]}}
+    robots = [*(apply_effects(base, [entry]) for entry in entries), apply_effects(base, [payloads[0], moved])]
     walks = [Walk(r, drive_of(r, rec)) for r in robots]
     solved, plain = list[int](), Tangent.respond
     monkeypatch.setattr(Tangent, "respond", lambda self, forces: solved.append(len(forces)) or plain(self, forces))
