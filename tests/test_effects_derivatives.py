@@ -87,6 +87,7 @@ def test_the_sensitivity_to_an_effect_is_that_of_marches_solved_anew(case):
     coordinates = np.array([p.null for p in parameters]) + away
     scene = as_seen(hypothesis, scene, coordinates, starts)
     here = jet(hypothesis, scene, coordinates, starts, derivative=True)
+    near = starts if at == "away" and form.name != "base_compliance" else {}  # a clamp's range is wide: nanometres would count
     nuisance = NUISANCE[control]
     for key in dict.fromkeys(p.key for p in parameters):
         j, parameter = next((j, p) for j, p in enumerate(parameters) if p.key == key)
@@ -94,7 +95,7 @@ def test_the_sensitivity_to_an_effect_is_that_of_marches_solved_anew(case):
         def residual(step, j=j):
             moved = coordinates.copy()
             moved[j] += step
-            return jet(hypothesis, scene, moved, dict(starts) if at == "away" else {}).residual
+            return jet(hypothesis, scene, moved, dict(near)).residual
 
         exact = slope(residual, parameter, coordinates[j], at)
         error = here.by_effect[:, :, j] - exact
