@@ -6,6 +6,7 @@ same inputs and loads share one solve.
 
 from __future__ import annotations
 
+import contextlib
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -274,7 +275,7 @@ def _base_states(
             starts[k] = state if state.factor is not None and state.factor.bytes < room else bare
         return bare
 
-    known = near.keys() & set(frames)
+    known, fits = near.keys() & set(frames), bool(near)
     if not near:
         near = {k: start for k, state in sorted((starts or {}).items()) if (start := _taken_along(walk, k, state)) is not None}
     if near:
@@ -297,9 +298,12 @@ def _base_states(
         )
 
     if near:
-        states = _march(walk, frames, near, again, rough) if past else each(again, frames)
-        yield from (keep(k, state) for k, state in zip(frames, states))
-        return
+        with contextlib.suppress(
+            *(() if fits else (DataError,))
+        ):  # from where a body was taken along, one may not come to rest: then from rest
+            states = list(_march(walk, frames, near, again, rough) if past else each(again, frames))
+            yield from (keep(k, state) for k, state in zip(frames, states))
+            return
 
     def along(part: list[int]) -> list[Equilibrium]:
         states: list[Equilibrium] = []

@@ -12,6 +12,7 @@ from arm import arm, record, sweeps
 
 from femsense.calib.forward import Hypothesis
 from femsense.effects import find_effect
+from femsense.errors import DataError
 from femsense.loop import grow
 from femsense.loop import refit as refits
 from femsense.loop.data import Data, prepare
@@ -231,6 +232,21 @@ def test_a_refit_that_could_win_goes_to_its_end(monkeypatch: pytest.MonkeyPatch)
     assert winner is not None and winner.stage.fit.fit.status == "converged"
     assert winner.stage.fit.chi2 == pytest.approx(whole.fit.chi2, rel=0.02)
     assert records[0]["dchi2"] == pytest.approx(evidence(base.fit, winner.stage.fit))
+
+
+def test_a_refit_that_cannot_go_further_is_compared_as_it_is(monkeypatch: pytest.MonkeyPatch):
+    def collapses(*_: Any, **__: Any) -> Stage:
+        raise DataError("no equilibrium in a held-out frame")
+
+    data, base = started()
+    candidate = screen_stage(data, base.fit, NOISE, fields_of(data, base, ["payload"]), COUNT)[0]
+    hypothesis, prior = grow.with_term(base.fit, candidate.effect, candidate.seed, candidate.parameters)
+    begun = np.concatenate([base.fit.coordinates, [p.null for p in candidate.parameters]])
+    made = make_stage(data, hypothesis, prior, NOISE, begun, own=own_of(base), max_iterations=1)
+    cut = judged(data, base, candidate, made, {}, NOISE)
+    assert made.fit.fit.status == "iterations"
+    monkeypatch.setattr(grow, "make_stage", collapses)
+    assert grow._to_the_end(data, base, cut, NOISE) is cut
 
 
 def test_what_goes_with_an_effect_that_was_as_good_is_found_beside_it():

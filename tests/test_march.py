@@ -384,3 +384,19 @@ def test_a_clamp_that_cannot_hold_the_body_is_walked_from_rest(entry: dict[str, 
     starts = walk_states(robot(), rec)
     soft = robot([{"name": "base_compliance", **entry}])
     assert march._taken_along(Walk(soft, drive_of(soft, rec)), 0, starts[0]) is None
+
+
+def test_where_a_body_that_was_taken_along_does_not_come_to_rest_it_is_walked_from_rest(monkeypatch: pytest.MonkeyPatch) -> None:
+    rec, starts = recording([[1.0, 0.0], [2.0, 0.5]]), {}
+    walked(robot(), rec, starts=starts)
+    soft = robot([{"name": "base_compliance", "stiffness_n_m": 300.0}])
+    alone, plain = walked(soft, rec), march.solve_frame
+
+    def solve(walk: Walk, k: int, **given: Any) -> Equilibrium:
+        state = plain(walk, k, **given)
+        return replace(state, status="overload") if given.get("reuse_factor") else state
+
+    monkeypatch.setattr(march, "solve_frame", solve)
+    there = walked(soft, rec, starts=starts)
+    for k, seen in alone.items():
+        np.testing.assert_allclose(there[k], seen, atol=1e-9)

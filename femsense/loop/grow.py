@@ -218,20 +218,18 @@ def _bar(ahead: Refit, candidate: Candidate) -> float:
 
 
 def _to_the_end(data: Data, stage: Stage, refitted: Refit, noise: Noise) -> Refit:
-    """Return a refit that ran out of steps on its way down with more of them: rivals are compared where each of them ends."""
+    """Return a refit that ran out of steps on its way down with more of them: rivals are compared where each of them ends, or were when a held-out
+    state does not come to rest there."""
     fit = refitted.stage.fit
     if fit.fit.status != "iterations":
         return refitted
-    made = make_stage(
-        data,
-        fit.hypothesis,
-        fit.prior,
-        noise,
-        fit.coordinates,
-        own=own_of(refitted.stage),
-        max_iterations=MORE_STEPS,
-        known=fit.jets,
-    )
+    try:
+        made = make_stage(
+            data, fit.hypothesis, fit.prior, noise, fit.coordinates,
+            own=own_of(refitted.stage), max_iterations=MORE_STEPS, known=fit.jets,
+        )  # fmt: skip
+    except FemsenseError:
+        return refitted
     return judged(data, stage, refitted.candidate, made, refitted.record, noise)
 
 
