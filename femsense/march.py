@@ -298,9 +298,7 @@ def _base_states(
         )
 
     if near:
-        with contextlib.suppress(
-            *(() if fits else (DataError,))
-        ):  # from where a body was taken along, one may not come to rest: then from rest
+        with contextlib.suppress(*(() if fits else (DataError,))):  # taken along, a body may not come to rest: then from rest
             states = list(_march(walk, frames, near, again, rough) if past else each(again, frames))
             yield from (keep(k, state) for k, state in zip(frames, states))
             return
