@@ -66,6 +66,21 @@ def test_fields_that_agree_are_no_rivals_where_a_refit_tells_them_apart() -> Non
         assert bool(confounded(searched(refits[:1], fields), ["cable_friction"]))
 
 
+@pytest.mark.parametrize(
+    "verdict", ["given up: in some of the states another one explains more by far", "no equilibrium: it folds"]
+)
+def test_a_refit_that_was_given_up_before_it_had_a_dbic_refutes_nothing(verdict: str) -> None:
+    fields = [candidate("cable_friction", 1, 1, 0), candidate("creep", 1, 1, 0.1)]
+    early = {"name": "creep", "verdict": verdict, "step": 1}
+    (pair,) = confounded(searched([refit("cable_friction", 100.0, "named"), early], fields), ["cable_friction"])
+    assert pair["pair"] == ["cable_friction", "creep"]
+
+
+def test_a_mesh_without_which_nothing_comes_to_rest_has_no_rivals() -> None:
+    alone = {"name": "discretisation", "verdict": "named", "step": 1}
+    assert confounded(searched([alone, refit("creep", 20.0)]), ["discretisation"]) == []
+
+
 def test_fields_that_agree_are_told_apart_by_a_sign() -> None:
     fields = [candidate("gravity", 1, 1, 0), candidate("creep", 1, 1, 0.1)]
     for gain, alike in ((6.0, True), (4.0, False)):

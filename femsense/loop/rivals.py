@@ -66,8 +66,9 @@ def _as_evident(search: Search, names: Sequence[str]) -> Iterator[Alike]:
 
 
 def _named(search: Search, names: Sequence[str]) -> list[dict[str, Any]]:
-    """Return the refits of what is named."""
-    return [r for r in search.refits if r["name"] in names and (r.get("verdict") == "named" or r.get("in_place_of") == r["name"])]
+    """Return the refits of what is named, but for a mesh without which nothing comes to rest: that has no dBIC."""
+    ours = [r for r in search.refits if r["name"] in names and "dbic" in r]
+    return [r for r in ours if r.get("verdict") == "named" or r.get("in_place_of") == r["name"]]
 
 
 def _same_question(a: dict[str, Any], b: dict[str, Any]) -> bool:
@@ -110,7 +111,8 @@ def _alike(search: Search, names: Sequence[str]) -> Iterator[Alike]:
 def _is_refuted(search: Search, names: Sequence[str], own: str, other: str) -> bool:
     """Return whether refits of another effect in the place of a named one brought much less."""
     for named in (r for r in _named(search, names) if r["name"] == own and r.get("verdict") == "named"):
-        tried = [r["dbic"] for r in search.refits if r["name"] == other and _same_question(named, r) and np.isfinite(r["dbic"])]
+        there = [r for r in search.refits if r["name"] == other and _same_question(named, r)]
+        tried = [r["dbic"] for r in there if np.isfinite(r.get("dbic", np.nan))]  # one that was given up early has none
         if tried and max(tried) < REFUTED * named["dbic"]:
             return True
     return False
