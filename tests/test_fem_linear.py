@@ -101,6 +101,21 @@ def test_a_random_pattern_is_factorised_as_the_dense_matrix(seed: int) -> None:
     np.testing.assert_allclose(factor.solve(right), np.linalg.solve(A.toarray(), right), rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.parametrize("single", [False, True])
+@pytest.mark.parametrize("count", [1, 2, 8, 9, 17, 40, 41])
+def test_any_number_of_right_hand_sides_is_solved_as_by_the_dense_matrix(count: int, single: bool) -> None:
+    """One, groups side by side whose last one is full or not, and as many as BLAS takes."""
+    body = bar_body(block_mesh((5, 3, 2)), quadratic=True, cables=False)
+    pattern, values = body.free_map.pattern, stiffness(body)
+    factor = cholesky(pattern.analysis(), values, single=single)
+    assert factor is not None
+    A = sp.csc_matrix((values, pattern.indices, pattern.indptr)).toarray()
+    right = np.random.default_rng(count).normal(0, 1, (pattern.size, count))
+    wanted = np.linalg.solve(A, right)
+    error = np.abs(factor.solve(right) - wanted).max(axis=0) / np.abs(wanted).max(axis=0)
+    assert error.max() < (2e-3 if single else 1e-9)
+
+
 def test_single_precision_is_a_preconditioner() -> None:
     body = bar_body(block_mesh((6, 2, 2)), quadratic=True, cables=False)
     pattern, values = body.free_map.pattern, stiffness(body)

@@ -27,23 +27,26 @@ from femsense.fem.tiles import (
     SIDES,
     WIDE,
     add_run,
-    fetch_ahead,
+    down_one,
+    down_six,
+    down_six_sides,
+    down_three,
+    down_three_sides,
     subtract_and_solve,
     subtract_product,
-    subtract_six_columns,
-    subtract_six_dots,
-    subtract_six_side_dots,
-    subtract_six_sides,
-    subtract_three_columns,
-    subtract_three_dots,
-    subtract_three_side_dots,
-    subtract_three_sides,
+    up_one,
+    up_six,
+    up_six_sides,
+    up_three,
+    up_three_sides,
     write_product,
 )
 from femsense.parallel import one_blas_thread
 
 FEW = 4
-"""Right-hand sides that are solved one by one; more go through BLAS together."""
+"""Right-hand sides of a matrix that has no blocks that are solved one by one; more go through BLAS together."""
+BESIDE = 40
+"""Right-hand sides that are solved beside each other in groups of SIDES; BLAS takes less time for more. For 10 of a bar it took three times as long."""
 LARGE = 144
 """Columns of a front from which on BLAS does as well as tiles in registers, and that tiles factorise at a time: two solid bars were slower
 by up to 2 % with 120, and with 180 by up to 5 % in double precision (in single 1–2 % faster)."""
@@ -589,7 +592,7 @@ def _factorise(
     return True
 
 
-@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+@njit(cache=True, nogil=True)
 def _solve_one(
     unit: int,
     firsts: IntArray,
@@ -601,11 +604,10 @@ def _solve_one(
     half: FloatArray,
 ) -> None:
     """Solve in place for one right-hand side in the order of elimination."""
-    width, base, y, last = L.itemsize, L.ctypes.data, half.ctypes.data, len(firsts) - 1
-    for s in range(last):
+    width, base, y = L.itemsize, L.ctypes.data, half.ctypes.data
+    for s in range(len(firsts) - 1):
         c0, columns = unit * firsts[s], unit * (firsts[s + 1] - firsts[s])
         height = columns + unit * (begin[s + 1] - begin[s])
-        fetch_ahead(base + width * offset[s + 1], width * (offset[min(s + 2, last)] - offset[s + 1]))
         for i in range(columns):
             half[i] = x[c0 + i]
         for i in range(columns, height):
@@ -613,63 +615,47 @@ def _solve_one(
         j = 0
         while j < columns:
             size = 6 if columns - j >= 6 else 3 if columns - j >= 3 else 1
-            at, after = offset[s] + j * height + j, j + size
-            for k in range(size):
-                value = half[j + k] / L[at + k * height + k]
-                half[j + k] = value
-                for i in range(k + 1, size):
-                    half[j + i] -= L[at + k * height + i] * value
-            column, to, left = base + width * (at + size), y + width * after, height - after
+            at, to = base + width * (offset[s] + j * height + j), y + width * j
+            left, ahead = height - j - size, width * size * (height + 1)
             if size == 6:
-                subtract_six_columns(L, column, height, y + width * j, to, left)
+                down_six(L, at, height, to, left, ahead)
             elif size == 3:
-                subtract_three_columns(L, column, height, y + width * j, to, left)
+                down_three(L, at, height, to, left, ahead)
             else:
-                for i in range(after, height):
-                    half[i] -= L[at + i - j] * half[j]
-            j = after
+                down_one(L, at, height, to, left, ahead)
+            j += size
         for i in range(columns):
             x[c0 + i] = half[i]
         for q in range(begin[s + 1] - begin[s]):
-            to = unit * below[begin[s] + q]
+            line = unit * below[begin[s] + q]
             for a in range(unit):
-                x[to + a] += half[columns + unit * q + a]
+                x[line + a] += half[columns + unit * q + a]
     for s in range(len(firsts) - 2, -1, -1):
         c0, columns = unit * firsts[s], unit * (firsts[s + 1] - firsts[s])
         height = columns + unit * (begin[s + 1] - begin[s])
-        before = max(s - 1, 0)
-        fetch_ahead(base + width * offset[before], width * (offset[s] - offset[before]))
         for i in range(columns):
             half[i] = x[c0 + i]
         for q in range(begin[s + 1] - begin[s]):
-            to = unit * below[begin[s] + q]
+            line = unit * below[begin[s] + q]
             for a in range(unit):
-                half[columns + unit * q + a] = x[to + a]
-        after = columns
-        while after > 0:
-            size = 6 if after >= 6 else 3 if after >= 3 else 1
-            j = after - size
-            at = offset[s] + j * height + j
-            column, to, left = base + width * (at + size), y + width * after, height - after
+                half[columns + unit * q + a] = x[line + a]
+        j = columns
+        while j > 0:
+            size = 6 if j >= 6 else 3 if j >= 3 else 1
+            j -= size
+            at, to = base + width * (offset[s] + j * height + j), y + width * j
+            left, ahead = height - j - size, -width * size * (height + 1)
             if size == 6:
-                subtract_six_dots(L, column, height, y + width * j, to, left)
+                up_six(L, at, height, to, left, ahead)
             elif size == 3:
-                subtract_three_dots(L, column, height, y + width * j, to, left)
+                up_three(L, at, height, to, left, ahead)
             else:
-                known = L[0] * 0
-                for i in range(after, height):
-                    known += L[at + i - j] * half[i]
-                half[j] -= known
-            for k in range(size - 1, -1, -1):
-                for i in range(k + 1, size):
-                    half[j + k] -= L[at + k * height + i] * half[j + i]
-                half[j + k] /= L[at + k * height + k]
-            after = j
+                up_one(L, at, height, to, left, ahead)
         for i in range(columns):
             x[c0 + i] = half[i]
 
 
-@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+@njit(cache=True, nogil=True)
 def _solve_sides(
     unit: int,
     firsts: IntArray,
@@ -680,65 +666,48 @@ def _solve_sides(
     x: FloatArray,
     half: FloatArray,
 ) -> None:
-    """Solve in place for SIDES right-hand sides, x (f · SIDES), in the order of elimination; unit is 3 here. half has room for the tallest front."""
-    width, base, y, last = L.itemsize, L.ctypes.data, half.ctypes.data, len(firsts) - 1
+    """Solve in place for groups of SIDES right-hand sides, x (g, f · SIDES), in the order of elimination; unit is 3 here. half (g, …) has room for the
+    tallest front. What is read of the factor for one group is in the cache for the others."""
+    width, base, groups = L.itemsize, L.ctypes.data, len(x)
     line, block = width * SIDES, SIDES * unit
-    for s in range(last):
+    for s in range(len(firsts) - 1):
         c0, columns = unit * firsts[s], unit * (firsts[s + 1] - firsts[s])
         height = columns + unit * (begin[s + 1] - begin[s])
-        fetch_ahead(base + width * offset[s + 1], width * (offset[min(s + 2, last)] - offset[s + 1]))
-        half[: SIDES * columns] = x[SIDES * c0 : SIDES * (c0 + columns)]
-        half[SIDES * columns : SIDES * height] = 0.0
+        half[:, : SIDES * columns] = x[:, SIDES * c0 : SIDES * (c0 + columns)]
+        half[:, SIDES * columns : SIDES * height] = 0.0
         j = 0
         while j < columns:
             size = 6 if columns - j >= 6 else 3
-            at = offset[s] + j * height + j
-            for k in range(size):
-                inverse = 1 / L[at + k * height + k]
-                for r in range(SIDES * (j + k), SIDES * (j + k + 1)):
-                    half[r] *= inverse
-                for i in range(k + 1, size):
-                    factor, more = L[at + k * height + i], SIDES * (i - k)
-                    for r in range(SIDES * (j + k), SIDES * (j + k + 1)):
-                        half[r + more] -= factor * half[r]
-            column, to, left = base + width * (at + size), y + line * (j + size), height - j - size
-            if size == 6:
-                subtract_six_sides(L, column, height, y + line * j, to, left)
-            else:
-                subtract_three_sides(L, column, height, y + line * j, to, left)
+            at, left, ahead = base + width * (offset[s] + j * height + j), height - j - size, width * size * (height + 1)
+            for g in range(groups):
+                if size == 6:
+                    down_six_sides(L, at, height, half[g].ctypes.data + line * j, left, ahead)
+                else:
+                    down_three_sides(L, at, height, half[g].ctypes.data + line * j, left, ahead)
             j += size
-        x[SIDES * c0 : SIDES * (c0 + columns)] = half[: SIDES * columns]
-        for q in range(begin[s + 1] - begin[s]):
-            add_run(L, x.ctypes.data + width * block * below[begin[s] + q], y + line * (columns + unit * q), block)
-    for s in range(last - 1, -1, -1):
+        x[:, SIDES * c0 : SIDES * (c0 + columns)] = half[:, : SIDES * columns]
+        for g in range(groups):
+            to, y = x[g].ctypes.data, half[g].ctypes.data
+            for q in range(begin[s + 1] - begin[s]):
+                add_run(L, to + width * block * below[begin[s] + q], y + line * (columns + unit * q), block)
+    for s in range(len(firsts) - 2, -1, -1):
         c0, columns = unit * firsts[s], unit * (firsts[s + 1] - firsts[s])
         height = columns + unit * (begin[s + 1] - begin[s])
-        before = max(s - 1, 0)
-        fetch_ahead(base + width * offset[before], width * (offset[s] - offset[before]))
-        half[: SIDES * columns] = x[SIDES * c0 : SIDES * (c0 + columns)]
+        half[:, : SIDES * columns] = x[:, SIDES * c0 : SIDES * (c0 + columns)]
         for q in range(begin[s + 1] - begin[s]):
-            to, own = block * below[begin[s] + q], SIDES * (columns + unit * q)
-            half[own : own + block] = x[to : to + block]
-        after = columns
-        while after > 0:
-            size = 6 if after >= 6 else 3
-            j = after - size
-            at = offset[s] + j * height + j
-            column, to, left = base + width * (at + size), y + line * after, height - after
-            if size == 6:
-                subtract_six_side_dots(L, column, height, y + line * j, to, left)
-            else:
-                subtract_three_side_dots(L, column, height, y + line * j, to, left)
-            for k in range(size - 1, -1, -1):
-                for i in range(k + 1, size):
-                    factor, more = L[at + k * height + i], SIDES * (i - k)
-                    for r in range(SIDES * (j + k), SIDES * (j + k + 1)):
-                        half[r] -= factor * half[r + more]
-                inverse = 1 / L[at + k * height + k]
-                for r in range(SIDES * (j + k), SIDES * (j + k + 1)):
-                    half[r] *= inverse
-            after = j
-        x[SIDES * c0 : SIDES * (c0 + columns)] = half[: SIDES * columns]
+            source, to = block * below[begin[s] + q], SIDES * (columns + unit * q)
+            half[:, to : to + block] = x[:, source : source + block]
+        j = columns
+        while j > 0:
+            size = 6 if j >= 6 else 3
+            j -= size
+            at, left, ahead = base + width * (offset[s] + j * height + j), height - j - size, -width * size * (height + 1)
+            for g in range(groups):
+                if size == 6:
+                    up_six_sides(L, at, height, half[g].ctypes.data + line * j, left, ahead)
+                else:
+                    up_three_sides(L, at, height, half[g].ctypes.data + line * j, left, ahead)
+        x[:, SIDES * c0 : SIDES * (c0 + columns)] = half[:, : SIDES * columns]
 
 
 @njit(cache=True, nogil=True)
@@ -864,12 +833,15 @@ class Cholesky:
         a, kind = self._analysis, self._L.dtype
         right = np.asarray(right)
         columns = right.reshape(a.size, -1)
-        if 1 < columns.shape[1] <= SIDES and a.unit == 3:
-            x, half = np.zeros((a.size, SIDES), kind), np.empty(SIDES * a.tallest, kind)
-            x[:, : columns.shape[1]] = columns[a.order]
-            _solve_sides(a.unit, a.firsts, a.begin, a.below, a.offset, self._L, x.reshape(-1), half)
-            ordered = x[:, : columns.shape[1]]
-        elif columns.shape[1] < FEW:
+        count = columns.shape[1]
+        if 1 < count <= BESIDE and a.unit == 3:
+            groups = -(-count // SIDES)
+            x, half = np.zeros((groups, a.size, SIDES), kind), np.empty((groups, SIDES * a.tallest), kind)
+            for own, part in zip(x, np.split(columns, range(SIDES, count, SIDES), axis=1)):
+                own[:, : part.shape[1]] = part[a.order]
+            _solve_sides(a.unit, a.firsts, a.begin, a.below, a.offset, self._L, x.reshape(groups, -1), half)
+            ordered = np.concatenate(list(x), axis=1)[:, :count]
+        elif count < FEW:
             x = np.ascontiguousarray(columns[a.order].T, dtype=kind)
             work = np.empty(a.size, kind)
             for one in x:

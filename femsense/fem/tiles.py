@@ -8,6 +8,7 @@ takes a dozen cycles where there is no AVX-512. The memory must reach PADDING en
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import llvmlite.binding as llvm
@@ -406,15 +407,15 @@ def _lane_function(module: Any, name: str) -> Any:
     return function
 
 
-def _columns(name: str, count: int) -> Any:
-    """Return the intrinsic of `subtract_columns` or `subtract_dots` for so many columns."""
+def _columns(name: str, count: int, write: Callable[[Any, str, Any, int], Any]) -> Any:
+    """Return the intrinsic of what `write` writes for so many columns."""
 
     @intrinsic
-    def columns(context: Any, like: Any, a: Any, step: Any, x: Any, y: Any, rows: Any) -> Any:
+    def columns(context: Any, like: Any, a: Any, step: Any, x: Any, rows: Any, ahead: Any) -> Any:
         del context
 
         def build(target: Any, builder: Any, signature: Any, values: Any) -> Any:
-            builder.call(_column_function(builder.module, name, like, count), values[1:])
+            builder.call(write(builder.module, name, like, count), values[1:])
             return target.get_dummy_value()
 
         return types.void(like, *[types.int64] * 5), build
@@ -422,133 +423,206 @@ def _columns(name: str, count: int) -> Any:
     return columns
 
 
-subtract_three_columns, subtract_six_columns = _columns("columns", 3), _columns("columns", 6)
-"""(like, a, step, x, y, rows): y −= A x for a matrix of three or six columns, `step` apart."""
-subtract_three_dots, subtract_six_dots = _columns("dots", 3), _columns("dots", 6)
-"""(like, a, step, x, y, rows): x −= Aᵀ y."""
-
-
-def _sides(name: str, count: int) -> Any:
-    """Return the intrinsic of the same for SIDES right-hand sides that lie beside each other."""
-
-    @intrinsic
-    def sides(context: Any, like: Any, a: Any, step: Any, x: Any, y: Any, rows: Any) -> Any:
-        del context
-
-        def build(target: Any, builder: Any, signature: Any, values: Any) -> Any:
-            builder.call(_side_function(builder.module, name, like, count), values[1:])
-            return target.get_dummy_value()
-
-        return types.void(like, *[types.int64] * 5), build
-
-    return sides
-
-
-subtract_three_sides, subtract_six_sides = _sides("columns", 3), _sides("columns", 6)
-"""(like, a, step, x, y, rows): Y −= A X for a matrix of three or six columns, `step` apart; each row of X and of Y is SIDES numbers."""
-subtract_three_side_dots, subtract_six_side_dots = _sides("dots", 3), _sides("dots", 6)
-"""(like, a, step, x, y, rows): X −= Aᵀ Y."""
-
-
 def _side_function(module: Any, name: str, like: Any, count: int) -> Any:
-    """Return the function that goes down a few columns row by row, all right-hand sides at once."""
+    """Return the function that goes down a few columns row by row, SIDES right-hand sides at once."""
     letter, kind, _ = _kind(like)
     function, known = _function(module, f"femsense_sides_{name}_{letter}{count}", 5)
     if known:
         return function
     size = 8 if letter == "d" else 4
-    vector = ir.VectorType(kind, SIDES)
+    line, vector = size * SIDES, ir.VectorType(kind, SIDES)
     builder = ir.IRBuilder(function.append_basic_block("entry"))
-    a, step, x, y, rows = function.args
-    multiply_add = _declared(module, f"llvm.fmuladd.v{SIDES}{'f64' if letter == 'd' else 'f32'}", vector, [vector] * 3)
-    columns = [builder.add(a, builder.mul(step, _number(size * k))) for k in range(count)]
-    given = [builder.load(_at(builder, x, _number(size * SIDES * k), vector), align=size) for k in range(count)]
-    factors = [builder.fneg(value) for value in given]
+    a, step, x, rows, ahead = function.args
+    work = _Elimination(builder, kind, vector, a, step)
+    values = [builder.load(_at(builder, x, _number(line * k), vector), align=size) for k in range(count)]
+    if name == "down":
+        values = work.forward(values)
+    factors = [builder.fneg(value) for value in values]
+    column, y, further = (
+        [builder.add(at, _number(count * size)) for at in work.columns(count)],
+        builder.add(x, _number(count * line)),
+        builder.add(a, ahead),
+    )
     entry, loop, end = builder.block, function.append_basic_block("loop"), function.append_basic_block("end")
     builder.cbranch(builder.icmp_signed(">", rows, _number(0)), loop, end)
     builder.position_at_end(loop)
     row = builder.phi(INTEGER)
     row.add_incoming(_number(0), entry)
-    sums = [builder.phi(vector) for _ in given] if name == "dots" else []
-    pointer = _at(builder, y, builder.mul(row, _number(size * SIDES)), vector)
+    sums = [builder.phi(vector) for _ in values] if name == "up" else []
+    _fetch(builder, builder.add(further, builder.mul(row, _number(count * size))), 1)
+    pointer = _at(builder, y, builder.mul(row, _number(line)), vector)
     value, place, results = builder.load(pointer, align=size), builder.mul(row, _number(size)), []
-    for k, column in enumerate(columns):
-        entry_of = _spread(builder, builder.load(_at(builder, column, place, kind), align=size), SIDES)
-        if name == "columns":
-            value = builder.call(multiply_add, [entry_of, factors[k], value])
+    for k in range(count):
+        part = _spread(builder, builder.load(_at(builder, column[k], place, kind), align=size), SIDES)
+        if name == "down":
+            value = work.add_product(part, factors[k], value)
         else:
-            results.append(builder.call(multiply_add, [entry_of, builder.fneg(value), sums[k]]))
-    if name == "columns":
+            results.append(work.add_product(part, builder.fneg(value), sums[k]))
+    if name == "down":
         builder.store(value, pointer, align=size)
     following = builder.add(row, _number(1))
     row.add_incoming(following, loop)
-    for phi, first, result in zip(sums, given, results):
+    for phi, first, result in zip(sums, values, results):
         phi.add_incoming(first, entry)
         phi.add_incoming(result, loop)
     builder.cbranch(builder.icmp_signed("<", following, rows), loop, end)
     builder.position_at_end(end)
-    last = []
-    for first, result in zip(given, results):
-        last.append(builder.phi(vector))
-        last[-1].add_incoming(first, entry)
-        last[-1].add_incoming(result, loop)
-    for k, result in enumerate(last):
-        builder.store(result, _at(builder, x, _number(size * SIDES * k), vector), align=size)
+    if name == "up":
+        values = work.backward(
+            [_either(builder, vector, [(first, entry), (result, loop)]) for first, result in zip(values, results)]
+        )
+    for k, value in enumerate(values):
+        builder.store(value, _at(builder, x, _number(line * k), vector), align=size)
     builder.ret_void()
     return function
 
 
 def _column_function(module: Any, name: str, like: Any, count: int) -> Any:
-    """Return the function that goes down a few columns, a register at a time."""
+    """Return the function that goes down a few columns a register at a time."""
     letter, kind, lanes = _kind(like)
     function, known = _function(module, f"femsense_{name}_{letter}{count}", 5)
     if known:
         return function
-    vector, size, width = ir.VectorType(kind, lanes), BYTES // lanes, ir.IntType(32)
+    size, vector = BYTES // lanes, ir.VectorType(kind, lanes)
     builder = ir.IRBuilder(function.append_basic_block("entry"))
-    a, step, x, y, rows = function.args
-    multiply_add = _declared(module, f"llvm.fmuladd.v{lanes}{'f64' if letter == 'd' else 'f32'}", vector, [vector] * 3)
+    a, step, x, rows, ahead = function.args
+    work, registers = _Elimination(builder, kind, kind, a, step), _Elimination(builder, kind, vector, a, step)
     load, store = _masked(builder, kind, lanes)
-    align, nothing = ir.Constant(width, size), ir.Constant(vector, [0.0] * lanes)
-    columns = [builder.add(a, builder.mul(step, _number(size * k))) for k in range(count)]
-    factors = [builder.load(_at(builder, x, _number(size * k), kind), align=size) for k in range(count)]
-    spread = [_spread(builder, builder.fneg(factor), lanes) for factor in factors] if name == "columns" else []
-    entry, loop, end = builder.block, function.append_basic_block("loop"), function.append_basic_block("end")
-    builder.cbranch(builder.icmp_signed(">", rows, _number(0)), loop, end)
-    builder.position_at_end(loop)
-    left, offset = builder.phi(INTEGER), builder.phi(INTEGER)
-    left.add_incoming(rows, entry)
-    offset.add_incoming(_number(0), entry)
-    sums = [builder.phi(vector) for _ in range(count if name == "dots" else 0)]
-    mask, pointer = _mask(builder, left, 0, lanes), _at(builder, y, offset, vector)
-    value = builder.call(load, [pointer, align, mask, nothing])
-    results = []
-    for k in range(count):
-        part = builder.call(load, [_at(builder, columns[k], offset, vector), align, mask, nothing])
-        if name == "columns":
-            value = builder.call(multiply_add, [part, spread[k], value])
-        else:
-            results.append(builder.call(multiply_add, [part, value, sums[k]]))
-    if name == "columns":
-        builder.call(store, [value, pointer, align, mask])
-    left_next, offset_next = builder.sub(left, _number(lanes)), builder.add(offset, _number(BYTES))
-    left.add_incoming(left_next, loop)
-    offset.add_incoming(offset_next, loop)
-    for phi, result in zip(sums, results):
-        phi.add_incoming(nothing, entry)
-        phi.add_incoming(result, loop)
-    builder.cbranch(builder.icmp_signed(">", left_next, _number(0)), loop, end)
+    align, nothing = ir.Constant(ir.IntType(32), size), ir.Constant(vector, [0.0] * lanes)
+    values = [builder.load(_at(builder, x, _number(size * k), kind), align=size) for k in range(count)]
+    if name == "down":
+        values = work.forward(values)
+    factors = [_spread(builder, builder.fneg(value), lanes) for value in values] if name == "down" else []
+    column, y, further = (
+        [builder.add(at, _number(count * size)) for at in work.columns(count)],
+        builder.add(x, _number(count * size)),
+        builder.add(a, ahead),
+    )
+
+    def register(offset: Any, sums: list[Any], take: Callable[[Any], Any], put: Callable[[Any, Any], Any]) -> list[Any]:
+        """Write the work on one register of rows; return the sums with it."""
+        pointer = _at(builder, y, offset, vector)
+        value, results = take(pointer), []
+        for k in range(count):
+            part = take(_at(builder, column[k], offset, vector))
+            if name == "down":
+                value = registers.add_product(part, factors[k], value)
+            else:
+                results.append(registers.add_product(part, value, sums[k]))
+        if name == "down":
+            put(value, pointer)
+        return results
+
+    entry = builder.block
+    whole, check, rest, end = (function.append_basic_block(part) for part in ("whole", "check", "rest", "end"))
+    builder.cbranch(builder.icmp_signed(">=", rows, _number(lanes)), whole, check)
+    builder.position_at_end(whole)
+    left, offset, *sums = [builder.phi(kind) for kind in (INTEGER, INTEGER, *[vector] * (count if name == "up" else 0))]
+    _fetch(builder, builder.add(further, builder.mul(offset, _number(count))), count * BYTES)
+    results = register(
+        offset, sums, lambda at: builder.load(at, align=size), lambda value, at: builder.store(value, at, align=size)
+    )
+    after = [builder.sub(left, _number(lanes)), builder.add(offset, _number(BYTES)), *results]
+    before = [rows, _number(0), *[nothing] * len(sums)]
+    for phi, first, result in zip((left, offset, *sums), before, after):
+        phi.add_incoming(first, entry)
+        phi.add_incoming(result, whole)
+    builder.cbranch(builder.icmp_signed(">=", after[0], _number(lanes)), whole, check)
+    builder.position_at_end(check)
+    left, offset, *sums = [
+        _either(builder, first.type, [(first, entry), (result, whole)]) for first, result in zip(before, after)
+    ]
+    builder.cbranch(builder.icmp_signed(">", left, _number(0)), rest, end)
+    builder.position_at_end(rest)  # a store with a mask takes a dozen cycles, but there is one
+    mask = _mask(builder, left, 0, lanes)
+    results = register(
+        offset,
+        sums,
+        lambda at: builder.call(load, [at, align, mask, nothing]),
+        lambda value, at: builder.call(store, [value, at, align, mask]),
+    )
+    builder.branch(end)
     builder.position_at_end(end)
-    if name == "dots":
-        ending = f"v{lanes}f{64 if letter == 'd' else 32}"
-        add = _declared(module, f"llvm.vector.reduce.fadd.{ending}", kind, [kind, vector])
-        for k in range(count):
-            total = builder.phi(vector)
-            total.add_incoming(nothing, entry)
-            total.add_incoming(results[k], loop)
-            sums[k] = total
-        for k in range(count):
-            whole = builder.call(add, [ir.Constant(kind, -0.0), sums[k]], fastmath=("reassoc",))
-            builder.store(builder.fsub(factors[k], whole), _at(builder, x, _number(size * k), kind), align=size)
+    if name == "up":
+        add = _declared(module, f"llvm.vector.reduce.fadd.v{lanes}f{8 * size}", kind, [kind, vector])
+        sums = [_either(builder, vector, [(first, check), (result, rest)]) for first, result in zip(sums, results)]
+        totals = [builder.call(add, [ir.Constant(kind, -0.0), total], fastmath=("reassoc",)) for total in sums]
+        values = work.backward([builder.fsub(value, total) for value, total in zip(values, totals)])
+    for k, value in enumerate(values):
+        builder.store(value, _at(builder, x, _number(size * k), kind), align=size)
     builder.ret_void()
     return function
+
+
+class _Elimination:
+    """What is written about the columns of a matrix at the address `a`, `step` entries apart, that begin with a lower triangle."""
+
+    def __init__(self, builder: Any, kind: Any, vector: Any, a: Any, step: Any) -> None:
+        self.builder, self.kind, self.vector, self.a, self.step = builder, kind, vector, a, step
+        self.size = 8 if isinstance(kind, ir.DoubleType) else 4
+        ending = f"f{8 * self.size}" if vector is kind else f"v{vector.count}f{8 * self.size}"
+        self._fused = _declared(builder.module, f"llvm.fmuladd.{ending}", vector, [vector] * 3)
+
+    def columns(self, count: int) -> list[Any]:
+        """Return the addresses of so many columns."""
+        return [self.builder.add(self.a, self.builder.mul(self.step, _number(self.size * k))) for k in range(count)]
+
+    def add_product(self, a: Any, b: Any, c: Any) -> Any:
+        return self.builder.call(self._fused, [a, b, c])
+
+    def forward(self, values: list[Any]) -> list[Any]:
+        """Return T⁻¹ times some values, T the triangle."""
+        values, T = list(values), self._triangle(len(values))
+        for k in range(len(values)):
+            values[k] = self.builder.fmul(values[k], T[k, k])
+            for i in range(k + 1, len(values)):
+                values[i] = self.add_product(T[i, k], values[k], values[i])
+        return values
+
+    def backward(self, values: list[Any]) -> list[Any]:
+        """Return T⁻ᵀ times some values."""
+        values, T = list(values), self._triangle(len(values))
+        for k in reversed(range(len(values))):
+            for i in reversed(range(k + 1, len(values))):
+                values[k] = self.add_product(T[i, k], values[i], values[k])
+            values[k] = self.builder.fmul(values[k], T[k, k])
+        return values
+
+    def _triangle(self, count: int) -> dict[tuple[int, int], Any]:
+        """Return the reciprocals of the diagonal of T and its other entries with their sign turned."""
+        builder, columns, one = self.builder, self.columns(count), ir.Constant(self.kind, 1.0)
+        entries = {
+            (i, k): builder.load(_at(builder, columns[k], _number(self.size * i), self.kind), align=self.size)
+            for k in range(count)
+            for i in range(k, count)
+        }
+        turned = {(i, k): builder.fdiv(one, entry) if i == k else builder.fneg(entry) for (i, k), entry in entries.items()}
+        return turned if self.vector is self.kind else {at: _spread(builder, entry, SIDES) for at, entry in turned.items()}
+
+
+def _either(builder: Any, kind: Any, ways: list[tuple[Any, Any]]) -> Any:
+    """Return the value that belongs to the block from which this one is reached."""
+    phi = builder.phi(kind)
+    for value, block in ways:
+        phi.add_incoming(value, block)
+    return phi
+
+
+def _fetch(builder: Any, address: Any, size: int) -> None:
+    """Ask for so many bytes at an address to be brought into the cache, line by line; what lies there does not matter."""
+    pointer, word = ir.IntType(8).as_pointer(), ir.IntType(32)
+    fetch = _declared(builder.module, "llvm.prefetch.p0", ir.VoidType(), [pointer, word, word, word])
+    for line in range(0, size, LINE):
+        builder.call(
+            fetch, [_at(builder, address, _number(line), ir.IntType(8)), *(ir.Constant(word, value) for value in (0, 2, 1))]
+        )
+
+
+down_one, down_three, down_six = (_columns("down", count, _column_function) for count in (1, 3, 6))
+"""(like, a, step, x, rows, ahead): for a matrix at the address `a`, its columns `step` entries apart, that begins with a lower triangle T and goes on with
+`rows` rows A: x ← T⁻¹ x, and y −= A x for the y behind x. What lies `ahead` bytes further is brought into the cache meanwhile."""
+up_one, up_three, up_six = (_columns("up", count, _column_function) for count in (1, 3, 6))
+"""The same with x −= Aᵀ y, and x ← T⁻ᵀ x."""
+down_three_sides, down_six_sides = (_columns("down", count, _side_function) for count in (3, 6))
+up_three_sides, up_six_sides = (_columns("up", count, _side_function) for count in (3, 6))
+"""The same for SIDES right-hand sides: each row of x and of y is SIDES numbers."""
