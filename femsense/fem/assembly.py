@@ -12,9 +12,9 @@ from numba import njit
 from femsense.arrays import FloatArray, IntArray
 from femsense.fem.body import BodyModel
 from femsense.fem.clamp import add_followers, clamp_energy_and_forces, followers_of, ties_of
-from femsense.fem.corotational import corotational_tet4, corotational_tet10, stretched_tet10
+from femsense.fem.corotational import corotational_forces, corotational_tet4, corotational_tet10, stretched_tet10
 from femsense.fem.hyperelastic import hyperelastic_tet4, hyperelastic_tet10
-from femsense.fem.stencil import block_row_numbers
+from femsense.fem.stencil import block_row_numbers, lanes_of
 
 KERNELS = {
     ("corotational", 4): corotational_tet4,
@@ -60,7 +60,10 @@ def internal(
     x = np.ascontiguousarray(positions).view()
     x.flags.writeable = False  # one compiled kernel, whether the caller's array can be written to or not
     mesh = x, stencil.tets, stencil.gradients, stencil.volumes, mu, lam
-    if stretch is None:
+    if stretch is None and not tangent and material.law == "corotational":
+        lanes = lanes_of(stencil)
+        energy = corotational_forces(x, lanes.nodes, lanes.gradients, stencil.volumes, mu, lam, forces)
+    elif stretch is None:
         energy = kernel(*mesh, limit, tangent, stencil.slots, forces, blocks)
     else:
         energy = stretched_tet10(*mesh, tangent, stencil.slots, forces, blocks, stretch)

@@ -204,6 +204,7 @@ class BodyModel:
         grown = replace(
             stencil,
             gradients=freeze(stencil.gradients / scale),
+            lanes=[],
             volumes=freeze(stencil.volumes * scale**3),
             node_volume=freeze(stencil.node_volume * scale**3),
         )

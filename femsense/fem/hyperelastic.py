@@ -21,7 +21,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from femsense.fem.corotational import FAST, LANES, LOCAL, add_blocks, determinant
+from femsense.fem.corotational import FAST, LOCAL, add_blocks, determinant
+from femsense.fem.tiles import LANES
 
 
 @njit(inline="always")

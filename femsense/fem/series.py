@@ -26,7 +26,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numba import njit
@@ -37,6 +36,7 @@ from femsense.fem.body import BodyModel
 from femsense.fem.cables import add_cable_stiffness, pull_rows
 from femsense.fem.cholesky import Cholesky, cholesky
 from femsense.fem.corotational import FAST, LOCAL, closest_rotation
+from femsense.fem.stencil import in_lanes, lanes_of
 from femsense.fem.tiles import LANES, add_divergence, add_gradient
 
 ROWS = 54
@@ -63,8 +63,8 @@ TERMS = 3
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Lanes:
-    """The elements of a mesh in groups of LANES, the element being the last axis; elements of no volume fill the last group up."""
+class SeriesLanes:
+    """What a series needs of the elements in groups of LANES, the element being the last axis; elements of no volume fill the last group up."""
 
     nodes: IntArray
     """shape (g, a, LANES)."""
@@ -198,19 +198,15 @@ def _read_only(x: FloatArray) -> FloatArray:
     return view
 
 
-def _lanes(body: BodyModel) -> Lanes:
+def _lanes(body: BodyModel) -> SeriesLanes:
     stencil, (mu, lam) = body.stencil, body.material.lame()
     count, points = stencil.volumes.shape
-    groups, local = -(-count // LANES), np.minimum(lam, LOCAL * mu)
-    which = np.concatenate([np.arange(count), np.zeros(groups * LANES - count, dtype=np.int64)])
-
-    def grouped(values: Any) -> Any:
-        return np.ascontiguousarray(np.moveaxis(values[which].reshape(groups, LANES, *values.shape[1:]), 1, -1))
-
-    constants = grouped(np.column_stack([stencil.volumes, local, lam - local, 2.0 * mu]))
+    lanes, local = lanes_of(stencil), np.minimum(lam, LOCAL * mu)
+    constants = in_lanes(np.column_stack([stencil.volumes, local, lam - local, 2.0 * mu]))
+    groups = len(constants)
     constants[-1, :points, LANES - (groups * LANES - count) :] = 1e-300
-    gradients = stencil.gradients.transpose(0, 1, 3, 2).reshape(count, points, -1).astype(np.float32)
-    return Lanes(grouped(stencil.tets), grouped(gradients), constants, np.zeros((groups, points, 15 * LANES)))
+    gradients: FloatArray = np.asarray(lanes.gradients, dtype=np.float32)
+    return SeriesLanes(lanes.nodes, gradients, constants, np.zeros((groups, points, 15 * LANES)))
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
@@ -225,7 +221,9 @@ def _frames(x, nodes, gradients, frames):  # type: ignore[no-untyped-def]
                     X[a, i, q] = x[nodes[e, a, q], i]
         for p in range(points):
             F[:] = 0.0
-            add_gradient(F, F.ctypes.data, X.ctypes.data, gradients.ctypes.data + 12 * (e * points + p) * count * LANES, count)
+            add_gradient(
+                gradients, F.ctypes.data, X.ctypes.data, gradients.ctypes.data + 12 * (e * points + p) * count * LANES, count
+            )
             out = frames[e, p]
             for q in range(LANES):
                 closest_rotation(F, R, q)
@@ -390,7 +388,9 @@ def series_forces(terms, nodes, gradients, constants, frames, forces):  # type: 
             for k in range(18 * LANES):
                 v[k] = 0.0
             for t in range(N):
-                add_gradient(v, room + 8 * t * SECOND, base + 8 * (X + t * wide), first + 4 * (e * points + p) * wide, count)
+                add_gradient(
+                    gradients, room + 8 * t * SECOND, base + 8 * (X + t * wide), first + 4 * (e * points + p) * wide, count
+                )
             for k in range(15 * LANES):
                 v[ROTATION + k] = f[(e * points + p) * 15 * LANES + k]
             for q in range(LANES):
@@ -407,7 +407,7 @@ def series_forces(terms, nodes, gradients, constants, frames, forces):  # type: 
             for k in range(ROWS * LANES):
                 v[k] = w[p * ROWS * LANES + k]
             _stress(v, N + 1)
-            add_divergence(v, base + 8 * X, room, first + 4 * (e * points + p) * wide, count)
+            add_divergence(gradients, base + 8 * X, room, first + 4 * (e * points + p) * wide, count)
         for a in range(count):
             to = X + 3 * a * LANES
             for q in range(LANES):

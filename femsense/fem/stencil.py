@@ -6,16 +6,28 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from femsense.arrays import BoolArray, FloatArray, IntArray, freeze
 from femsense.fem.cholesky import fill_reducing_order
 from femsense.fem.iterative import Grid
 from femsense.fem.linear import Pattern, make_pattern
 from femsense.fem.mesh import EDGES, TetMesh, shape_slopes, shape_values
+from femsense.fem.tiles import LANES
 
 _A, _B = 0.5854101966249685, 0.1381966011250105
 QUADRATURE = np.array([[_A, _B, _B, _B], [_B, _A, _B, _B], [_B, _B, _A, _B], [_B, _B, _B, _A]])
 """Four points of degree 2 (barycentric coordinates), equal weights (Keast 1986, rule 2)."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Lanes:
+    """The elements of a mesh in groups of LANES, the element being the last axis (see `in_lanes`)."""
+
+    nodes: IntArray
+    """shape (g, a, LANES)."""
+    gradients: FloatArray
+    """Of the shape functions [1/m], shape (g, q, 3 a, LANES)."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -40,6 +52,8 @@ class Stencil:
     """Block pattern in CSR: indptr, shape (n + 1,)."""
     block_columns: IntArray
     """Block pattern in CSR: indices ≥ their row, shape (nb,); the last entry is −1 for the row that nobody reads."""
+    lanes: list[Lanes] = field(default_factory=list)
+    """What `lanes_of` made of it, once it was needed."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -87,6 +101,23 @@ def make_stencil(mesh: TetMesh, cliques: list[IntArray] | None = None) -> tuple[
         freeze(slots[0][:, first, second], np.int32), freeze(rows, np.int64), freeze(columns, np.int64),
     )  # fmt: skip
     return stencil, slots[1:]
+
+
+def in_lanes(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Return what belongs to elements (m, …) in groups, shape (g, …, LANES); the first element fills the last group up."""
+    count = len(values)
+    groups = -(-count // LANES)
+    which = np.concatenate([np.arange(count), np.zeros(groups * LANES - count, dtype=np.int64)])
+    return np.ascontiguousarray(np.moveaxis(values[which].reshape(groups, LANES, *values.shape[1:]), 1, -1))
+
+
+def lanes_of(stencil: Stencil) -> Lanes:
+    """Return the elements of a mesh side by side, as processors take them."""
+    if not stencil.lanes:
+        m, q, _, a = stencil.gradients.shape
+        gradients = in_lanes(stencil.gradients.transpose(0, 1, 3, 2).reshape(m, q, 3 * a))
+        stencil.lanes.append(Lanes(freeze(in_lanes(stencil.tets), np.int32), freeze(gradients)))
+    return stencil.lanes[0]
 
 
 def _moments(mesh: TetMesh, volumes: FloatArray) -> FloatArray:

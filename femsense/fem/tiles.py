@@ -339,11 +339,11 @@ def _run_function(module: Any, like: Any) -> Any:
 
 @intrinsic
 def add_gradient(context: Any, like: Any, to: Any, x: Any, slopes: Any, count: Any) -> Any:
-    """Add Σ_a x_ai g_aj to nine rows (i, j) of eight numbers at the address `to`: x of three rows of eight a node, g too but in single precision."""
+    """Add Σ_a x_ai g_aj to nine rows (i, j) of eight numbers at the address `to`: x of three rows of eight a node, g too, of the precision of `like`."""
     del context
 
     def build(target: Any, builder: Any, signature: Any, values: Any) -> Any:
-        builder.call(_lane_function(builder.module, "gradient"), values[1:])
+        builder.call(_lane_function(builder.module, "gradient", like), values[1:])
         return target.get_dummy_value()
 
     return types.void(like, *[types.int64] * 4), build
@@ -355,18 +355,19 @@ def add_divergence(context: Any, like: Any, to: Any, stress: Any, slopes: Any, c
     del context
 
     def build(target: Any, builder: Any, signature: Any, values: Any) -> Any:
-        builder.call(_lane_function(builder.module, "divergence"), values[1:])
+        builder.call(_lane_function(builder.module, "divergence", like), values[1:])
         return target.get_dummy_value()
 
     return types.void(like, *[types.int64] * 4), build
 
 
-def _lane_function(module: Any, name: str) -> Any:
+def _lane_function(module: Any, name: str, like: Any) -> Any:
     """Return the function of a loop over nodes: nine products each, eight elements at once."""
-    function, known = _function(module, f"femsense_{name}", 4)
+    letter, kind, _ = _kind(like)
+    function, known = _function(module, f"femsense_{name}_{letter}", 4)
     if known:
         return function
-    wide, narrow = ir.VectorType(ir.DoubleType(), 8), ir.VectorType(ir.FloatType(), 8)
+    wide, given, size = ir.VectorType(ir.DoubleType(), 8), ir.VectorType(kind, 8), 8 if letter == "d" else 4
     multiply_add = _declared(module, "llvm.fmuladd.v8f64", wide, [wide] * 3)
     builder = ir.IRBuilder(function.append_basic_block("entry"))
     to, other, slopes, count = function.args
@@ -382,8 +383,9 @@ def _lane_function(module: Any, name: str) -> Any:
         for value in nine:
             sums.append(builder.phi(wide))
             sums[-1].add_incoming(value, entry)
-    place, slope = builder.mul(node, _number(192)), builder.add(slopes, builder.mul(node, _number(96)))
-    g = [builder.fpext(builder.load(_at(builder, slope, _number(32 * j), narrow), align=4), wide) for j in range(3)]
+    place, slope = builder.mul(node, _number(192)), builder.add(slopes, builder.mul(node, _number(24 * size)))
+    g = [builder.load(_at(builder, slope, _number(8 * size * j), given), align=size) for j in range(3)]
+    g = g if letter == "d" else [builder.fpext(value, wide) for value in g]
     row = builder.add(other if name == "gradient" else to, place)
     results = []
     for i in range(3):
