@@ -173,6 +173,34 @@ def test_inverted_corotational_elements_are_finite_and_right() -> None:
     assert np.isfinite(point.energy) and np.isfinite(point.forces).all() and np.isfinite(point.blocks).all()
 
 
+@pytest.mark.parametrize("quadratic", [False, True])
+@pytest.mark.parametrize("folds", [False, True])
+@pytest.mark.parametrize("scale", [1.0, 1.3])
+def test_forces_side_by_side_are_those_that_come_with_the_stiffness(quadratic: bool, folds: bool, scale: float) -> None:
+    """Without a stiffness eight elements are worked on at once; 18 leave places empty in the last group. Some are inside out, or the body has grown."""
+    rng = np.random.default_rng(11)
+    mesh = block_mesh((3, 1, 1), (0.09, 0.04, 0.03))
+    mesh = to_quadratic(mesh) if quadratic else mesh
+    body = make_body(mesh, young_modulus=1e5 * rng.uniform(0.5, 2, 18), poisson_ratio=rng.uniform(0.1, 0.49, 18))
+    internal(body, mesh.nodes, tangent=False)  # what is kept with a body is not that of one that grew from it
+    body = body.scaled(scale)
+    x = distorted(body.mesh, rng, noise=0.03)
+    x = x * [1.0, 1.0, -1.0] if folds else x
+    alone, beside = internal(body, x, tangent=False), internal(body, x)
+    assert alone.blocks is None
+    assert alone.energy == pytest.approx(beside.energy, rel=1e-12)
+    np.testing.assert_allclose(alone.forces, beside.forces, atol=1e-12 * np.abs(beside.forces).max())
+
+
+@pytest.mark.parametrize("quadratic", [False, True])
+def test_forces_of_positions_that_are_no_numbers_are_none(quadratic: bool) -> None:
+    body = small_body("corotational", quadratic)
+    x = body.mesh.nodes.copy()
+    x[3] = np.nan
+    there = internal(body, x, tangent=False)
+    assert not np.isfinite(there.energy) and not np.isfinite(there.forces).all()
+
+
 @pytest.mark.parametrize("law", ["neo_hookean", "gent"])
 def test_inverted_hyperelastic_elements_have_infinite_energy(law: str) -> None:
     body = small_body(law, False)

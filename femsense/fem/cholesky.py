@@ -44,9 +44,9 @@ from femsense.fem.tiles import (
 from femsense.parallel import one_blas_thread
 
 FEW = 4
-"""Right-hand sides of a matrix that has no blocks that are solved one by one; more go through BLAS together."""
+"""Right-hand sides that are solved one by one where the matrix has no blocks; more go through BLAS together."""
 BESIDE = 40
-"""Right-hand sides that are solved beside each other in groups of SIDES; BLAS takes less time for more. For 10 of a bar it took three times as long."""
+"""Right-hand sides that are solved beside each other in groups of SIDES; BLAS takes less time for more. For 10 to 16 of a bar it took twice as long in a trial."""
 LARGE = 144
 """Columns of a front from which on BLAS does as well as tiles in registers, and that tiles factorise at a time: two solid bars were slower
 by up to 2 % with 120, and with 180 by up to 5 % in double precision (in single 1–2 % faster)."""

@@ -93,21 +93,29 @@ def _fetch_function(module: Any) -> Any:
         return function
     builder = ir.IRBuilder(function.append_basic_block("entry"))
     address, size = function.args
-    pointer, word = ir.IntType(8).as_pointer(), ir.IntType(32)
-    fetch = _declared(module, "llvm.prefetch.p0", ir.VoidType(), [pointer, word, word, word])
     loop, end = function.append_basic_block("loop"), function.append_basic_block("end")
     entry = builder.block
     builder.cbranch(builder.icmp_signed(">", size, _number(0)), loop, end)
     builder.position_at_end(loop)
     at = builder.phi(INTEGER)
     at.add_incoming(_number(0), entry)
-    builder.call(fetch, [_at(builder, address, at, ir.IntType(8)), *(ir.Constant(word, value) for value in (0, 2, 1))])
+    _fetch(builder, builder.add(address, at), LINE)
     further = builder.add(at, _number(LINE))
     at.add_incoming(further, loop)
     builder.cbranch(builder.icmp_signed("<", further, size), loop, end)
     builder.position_at_end(end)
     builder.ret_void()
     return function
+
+
+def _fetch(builder: Any, address: Any, size: int) -> None:
+    """Ask for so many bytes at an address to be brought into the cache, line by line; what lies there does not matter."""
+    pointer, word = ir.IntType(8).as_pointer(), ir.IntType(32)
+    fetch = _declared(builder.module, "llvm.prefetch.p0", ir.VoidType(), [pointer, word, word, word])
+    for line in range(0, size, LINE):
+        builder.call(
+            fetch, [_at(builder, address, _number(line), ir.IntType(8)), *(ir.Constant(word, value) for value in (0, 2, 1))]
+        )
 
 
 def _builder(name: str, like: Any, *, solves: bool) -> Any:
@@ -608,16 +616,6 @@ def _either(builder: Any, kind: Any, ways: list[tuple[Any, Any]]) -> Any:
     for value, block in ways:
         phi.add_incoming(value, block)
     return phi
-
-
-def _fetch(builder: Any, address: Any, size: int) -> None:
-    """Ask for so many bytes at an address to be brought into the cache, line by line; what lies there does not matter."""
-    pointer, word = ir.IntType(8).as_pointer(), ir.IntType(32)
-    fetch = _declared(builder.module, "llvm.prefetch.p0", ir.VoidType(), [pointer, word, word, word])
-    for line in range(0, size, LINE):
-        builder.call(
-            fetch, [_at(builder, address, _number(line), ir.IntType(8)), *(ir.Constant(word, value) for value in (0, 2, 1))]
-        )
 
 
 down_one, down_three, down_six = (_columns("down", count, _column_function) for count in (1, 3, 6))
