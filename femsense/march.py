@@ -38,8 +38,10 @@ TRIED = 1e-8
 """Relative tolerance of states that are only tried: below a thousandth of a millimetre, where derivatives want a tenth of it."""
 PARTS, SHORTEST_PART = 4, 6
 """Parts at most that frames are walked in side by side where each starts from the one before, and frames of a part at least."""
-FEW_COLUMNS = 16
+FEW_COLUMNS = 40
 """With more right-hand sides of a state the solves that correct them take longer than a factor in double precision."""
+MANY_POINTS = 40
+"""Answers to forces at more points than that are not kept."""
 PAST, PAST_TRIED = 1e-8, 1e-6
 """Tensions along a cable that agree so well [N], and as shares of the largest, are the same past; the latter for states that are only tried."""
 
@@ -150,6 +152,17 @@ class Walk:
     drive: Drive
 
 
+@dataclass(frozen=True, eq=False, slots=True)
+class AtPoints:
+    """What the observed points of a state answer to, whatever the variant."""
+
+    to_forces: FloatArray
+    """Moves of the nodes under a unit force at each of p points along each axis, and so (Maxwell's reciprocity) of the points along each axis under
+    unit nodal forces [m/N], (3p, n, 3)."""
+    to_held: FloatArray
+    """Moves of the points for a shortening of each held cable by one metre [1], (h, p, 3)."""
+
+
 def has_history(robot: Robot) -> bool:
     """Return whether the state depends on what was before (friction along a cable)."""
     return any(cable.friction > 0 for cable in robot.body.cables)
@@ -199,7 +212,7 @@ def solve_frame(
 
 def walk_along(
     walk: Walk, frames: Sequence[int], ties: Callable[[Robot], Embedding], variants: Sequence[Walk] = (),
-    *, starts: dict[int, Equilibrium] | None = None, rough: bool = False,
+    *, starts: dict[int, Equilibrium] | None = None, rough: bool = False, known: dict[int, AtPoints] | None = None,
 ) -> Iterator[tuple[int, Equilibrium, FloatArray, FloatArray]]:  # fmt: skip
     """Solve frames in order, and with each the same frame of variants that differ from it by little.
 
@@ -215,6 +228,8 @@ def walk_along(
         starts: frame → a state near by, such as that of an earlier walk; brought up to date as frames are solved. Their
             factors are kept as long as they fit into FACTOR_MEMORY.
         rough: states are only tried, where one near by is known.
+        known: frame → what its points answer to, from an earlier walk along these very states with other variants; what is missing is
+            added where the points are few.
 
     Yields:
         frame index, equilibrium, where the points are [m], shape (p, 3), and where those of the variants are, shape (v, p, 3).
@@ -228,11 +243,11 @@ def walk_along(
     seen = {k: ties(walk.robot).positions(bases[k].positions) for k in {alike[k]: None for k in wanted}}
     others = {k: np.zeros((len(variants), *seen[alike[k]].shape)) for k in wanted}
     lent = {k: s.factor for k, s in (starts or {}).items() if k in bases and s.positions is bases[k].positions}
-    answers = _Variants(walk, variants, {k: bases[alike[k]] for k in todo}, alike, others, ties, lent)
+    answers = _Variants(walk, variants, {k: bases[alike[k]] for k in todo}, alike, others, ties, lent, known)
     room = _room(len(unique))
     for k, factor in answers.write():
         plain = factor.plain if isinstance(factor, Refined) else factor
-        if starts is not None and plain.bytes < _most_lent(starts[k], room):
+        if plain is not None and starts is not None and plain.bytes < _most_lent(starts[k], room):
             starts[k] = replace(starts[k], factor=plain)
     for k in wanted:
         yield k, bases[alike[k]], seen[alike[k]], others[k]
@@ -438,12 +453,17 @@ class _Answers:
     @property
     def bytes(self) -> int:
         every = [*self.own.values(), *self.by_segment.values()]
-        factor = self.tangent.factor.bytes if "tangent" in self.__dict__ else 0
+        factor = 0 if self.factor is None else self.factor.bytes
         return factor + sum(a.nbytes for a in every if a is not None)
 
     @cached_property
     def tangent(self) -> Tangent:
         return self.make()
+
+    @property
+    def factor(self) -> Factorization | None:
+        """The factor, if one was needed."""
+        return self.tangent.factor if "tangent" in self.__dict__ else None
 
     @cached_property
     def by_held(self) -> FloatArray:
@@ -505,11 +525,12 @@ class _Variants:
 
     def __init__(
         self, walk: Walk, variants: Sequence[Walk], bases: dict[int, Equilibrium], alike: dict[int, int], others: dict[int, FloatArray],
-        ties: Callable[[Robot], Embedding], lent: dict[int, Factorization | None],
+        ties: Callable[[Robot], Embedding], lent: dict[int, Factorization | None], known: dict[int, AtPoints] | None,
     ) -> None:  # fmt: skip
         self.walk, self.variants, self.bases, self.alike, self.others, self.lent = walk, variants, bases, alike, others, lent
         self.ties = [ties(v.robot) for v in variants]
         self.own_ties = ties(walk.robot)
+        self.known = known if len(self.own_ties) <= MANY_POINTS else None
         own = [not _same_mechanics(walk, v) for v in variants]
         linear = [_linear(walk, v) for v in variants]
         rubs = [has_history(v.robot) for v in variants]
@@ -523,7 +544,7 @@ class _Variants:
         self.kept: dict[int, _Answers] = {}
         self.room = _room(len(set(alike.values())))
 
-    def write(self) -> Iterator[tuple[int, Factorization]]:
+    def write(self) -> Iterator[tuple[int, Factorization | None]]:
         """Write all observations; yield the factors that gave them, with their frames."""
         for k, table in self.others.items():
             for i in self.still:
@@ -575,7 +596,8 @@ class _Variants:
         return [bend_angles(c, x) if c.friction > 0 else np.zeros(len(c.path)) for c in self.variants[i].robot.body.cables]
 
     def _answers(self, k: int) -> _Answers:
-        few = len(self.plain) + len(self.rubbing) <= FEW_COLUMNS
+        columns, at_points = len(self.plain) + len(self.rubbing), 3 * len(self.own_ties)
+        few = (at_points if self.known is not None else min(columns, at_points)) <= FEW_COLUMNS
         solver = partial(refined, lent=self.lent.get(k)) if few else factorize
         return _Answers(lambda: tangent_at(self.walk.robot.body, self.bases[k], solver), 2 if self.rubbing else 1)
 
@@ -588,14 +610,14 @@ class _Variants:
                 jobs.setdefault((i, key), (i, k, []))[2].append(k)
         return list(jobs.values())
 
-    def _bent(self, group: list[int]) -> tuple[int, Factorization, dict[tuple[int, int], list[FloatArray]]]:
+    def _bent(self, group: list[int]) -> tuple[int, Factorization | None, dict[tuple[int, int], list[FloatArray]]]:
         """Return the bends of the variants that rub, as the first response leaves them, and keep what the second one takes, where that fits into
         memory; write what is observed of the other variants."""
         first = self.alike[group[0]]
         answers, jobs = self._answers(first), self._jobs(group, self.rubbing)
-        factor = answers.tangent.factor
         moved = list(zip(jobs, self._respond(group[0], self._upsets(group[0], jobs, answers), answers)))
         self._write(group, self.plain, answers)
+        factor = answers.factor
         answers.keep(job[:2] for job in jobs)
         if answers.bytes < self.room:
             self.kept[first] = answers
@@ -606,12 +628,12 @@ class _Variants:
         first = self.alike[group[0]]
         self._write(group, self.rubbing, self.kept.pop(first) if first in self.kept else self._answers(first))
 
-    def _written(self, group: list[int]) -> tuple[int, Factorization]:
+    def _written(self, group: list[int]) -> tuple[int, Factorization | None]:
         """Write what is observed of the variants, none of which rubs, in frames with one base state."""
         first = self.alike[group[0]]
         answers = self._answers(first)
         self._write(group, self.plain, answers)
-        return first, answers.tangent.factor
+        return first, answers.factor
 
     def _write(self, group: list[int], which: Sequence[int], answers: _Answers) -> None:
         """Write what is observed of some variants in frames with one base state, as far as that is asked."""
@@ -622,12 +644,12 @@ class _Variants:
                 self.others[frame][i] = seen
 
     def _seen(self, frame: int, jobs: list[Job], answers: _Answers) -> list[FloatArray]:
-        """Return where the points of variants are [m], each (p, 3): where these have so many forces of their own that it takes fewer solves, from the
-        answers of the base state to forces at its points (Maxwell's reciprocity; friction of a held cable has none)."""
+        """Return where the points of variants are [m], each (p, 3): where these have so many forces of their own that it takes fewer solves, or the
+        answers are kept, from those of the base state to forces at its points (Maxwell's reciprocity; friction of a held cable has none)."""
         upsets = self._upsets(frame, jobs, answers)
         alike = [self.ties[u.key[0]] is self.own_ties for u in upsets]
         pushes = sum(u.force is not None and bool(u.force.any()) for u, same in zip(upsets, alike) if same)
-        if pushes <= 3 * len(self.own_ties) or has_history(self.walk.robot):
+        if (self.known is None and pushes <= 3 * len(self.own_ties)) or has_history(self.walk.robot):
             alike = [False] * len(upsets)
         others = [u for u, same in zip(upsets, alike) if not same]
         moved = iter(self._respond(frame, others, answers) if others else ())
@@ -672,7 +694,8 @@ class _Variants:
         """Return the same of the points alone [m], each (p, 3), from the answers to forces at these."""
         base, body, ties = self.bases[frame], self.walk.robot.body, self.own_ties
         x, tensions = base.positions, np.array([u.tension for u in upsets])
-        by_point = answers.to_forces_at(ties)
+        at = self._at_points(frame, answers)
+        by_point = at.to_forces
         used = np.flatnonzero(tensions.any(axis=0)).tolist()
         forces = np.array([np.zeros_like(x) if u.force is None else u.force for u in upsets])
         moves = np.tensordot(forces, by_point, axes=((1, 2), (1, 2)))
@@ -680,9 +703,19 @@ class _Variants:
         moves = moves.reshape(len(upsets), len(ties), 3)
         if base.held.any():
             held = base.held[: len(body.cables)]
-            by_held = np.array([ties.moves(move) for move in answers.by_held])
-            moves += np.tensordot(np.array([u.pulled for u in upsets])[:, held], by_held, axes=1)
+            moves += np.tensordot(np.array([u.pulled for u in upsets])[:, held], at.to_held, axes=1)
         return [ties.positions(u.start) + move for u, move in zip(upsets, moves)]
+
+    def _at_points(self, frame: int, answers: _Answers) -> AtPoints:
+        """Return what the points of a base state answer to, kept where that is asked."""
+        first, ties = self.alike[frame], self.own_ties
+        if self.known is not None and first in self.known:
+            return self.known[first]
+        held = answers.by_held if self.bases[frame].held.any() else ()
+        made = AtPoints(answers.to_forces_at(ties), np.array([ties.moves(move) for move in held]))
+        if self.known is not None:
+            self.known[first] = made
+        return made
 
 
 def _motor_tensions(variant: Walk, frame: int, base: Equilibrium) -> list[float]:

@@ -358,6 +358,6 @@ def test_a_state_that_is_only_tried_takes_a_lent_factor_as_far_as_it_goes(monkey
     tried = solve_equilibrium(soft, tension=pull, start=start, reuse_factor=True, rough=True)
     assert tried.converged and not factors
     assert np.abs(tried.positions - there.positions).max() < 2 * equilibrium.ARRIVED * body.reach
-    monkeypatch.setattr(equilibrium, "PATIENCE", 0)
+    monkeypatch.setattr(equilibrium, "PATIENCE_TRIED", 0)
     solve_equilibrium(soft, tension=pull, start=start, reuse_factor=True, rough=True)
     assert factors

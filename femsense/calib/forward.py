@@ -17,7 +17,7 @@ from femsense.effects import Effect, Entry, Parameter, build_entry
 from femsense.errors import DataError
 from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.mesh import Embedding
-from femsense.march import Walk, drive_of, has_history, inputs_wanted, walk_along
+from femsense.march import AtPoints, Walk, drive_of, has_history, inputs_wanted, walk_along
 from femsense.model import Observation, Robot
 from femsense.pointcloud.sheets import Crossings
 from femsense.pose import invert_pose, moved_poses, transform_points
@@ -240,13 +240,15 @@ def evaluate_scene(
     hypothesis: Hypothesis, scene: Scene, coordinates: FloatArray, poses: Sequence[FloatArray], initial: FloatArray | None,
     *, derivative: bool, vary_initial: bool, pivot: FloatArray, starts: dict[int, Equilibrium] | None = None, rough: bool = False,
     known: dict[int, Equilibrium] | None = None, vary_inputs: bool = False, moves: FloatArray | None = None,
+    answers: dict[int, AtPoints] | None = None,
 ) -> SceneJet:  # fmt: skip
     """Evaluate marker residuals of a scene at a point of parameter space, and their derivatives by differences.
 
     Each pose is moved about `pivot` by its six of the `moves`, shape (6 v,), and derivatives are by these; without them by a first move.
     `starts` holds states of earlier evaluations near by and is brought up to date; states that are only tried may be
     `rough`: a frame that Newton does not reach from there then has no equilibrium. `known` are the states at this very point, as far as it
-    moves the body; they serve where no derivative by what moves it is wanted. With `vary_inputs` come derivatives by the tension of
+    moves the body; they serve where no derivative by what moves it is wanted. `answers` of an earlier evaluation at this very point serve
+    derivatives by other parameters, and are brought up to date. With `vary_inputs` come derivatives by the tension of
     each frame (where the robot has a past, by that of all frames).
 
     Raises:
@@ -273,7 +275,7 @@ def evaluate_scene(
     if known is not None and not variants:
         states, model = known, {k: ties(robot).positions(state.positions) for k, state in known.items()}
     frames = [] if model else scene.frames.tolist()
-    for k, state, seen, varied in walk_along(base, frames, ties, variants, starts=starts, rough=rough):
+    for k, state, seen, varied in walk_along(base, frames, ties, variants, starts=starts, rough=rough, known=answers):
         states[k], model[k] = state, seen
         for i in range(len(variants)):
             shifted[i][k] = varied[i]

@@ -41,8 +41,9 @@ LENT = 0.1
 """So does one that was lent by a state near by."""
 RUBS = 0.3
 """So does any where tensions along cables follow the bends, which converge no faster with a stiffness of their own."""
-PATIENCE = 5
-"""In single precision one serves, too, where so many more steps are enough if each leaves the share that the last one left: a factor took as long as five when this was set.
+PATIENCE, PATIENCE_TRIED = 5, 8
+"""In single precision one serves, too, where so many more steps are enough if each leaves the share that the last one left; the latter, about what a
+factor takes, for states that are only tried: others end the farther below their tolerance the better these steps shrink.
 Of a first step nothing is known yet: states that are only tried take a second one."""
 PAIRS = 8
 """Steps since the last factor that are remembered (`_Secants`)."""
@@ -441,8 +442,9 @@ def _newton(body: BodyModel, loads: _Loads, state: _State, max_iterations: int) 
         left = state.residual / last if last > 0.0 else np.inf
         enough = RUBS if follows else LENT if state.borrowed else CHORD
         sound_to_the_end = state.factored_at <= FAR * loads.tolerance and state.residual * min(left, 1.0) ** 2 <= loads.tolerance
-        in_sight = state.residual * min(left, 1.0) ** PATIENCE <= loads.tolerance
-        in_sight |= state.rough and length * min(shrinking, 1.0) ** PATIENCE <= ARRIVED * body.reach
+        patience = PATIENCE_TRIED if state.rough else PATIENCE
+        in_sight = state.residual * min(left, 1.0) ** patience <= loads.tolerance
+        in_sight |= state.rough and length * min(shrinking, 1.0) ** patience <= ARRIVED * body.reach
         serves = left <= enough or sound_to_the_end or (state.single and in_sight)
         if not frictional and not len(held):
             secants.learn(state.x.ravel()[free], force)

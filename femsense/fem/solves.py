@@ -13,9 +13,9 @@ from femsense.fem.linear import Factorization, Pattern, factorize, factorize_def
 
 REFINED_FROM = 3000
 """Unknowns from which on a factor in single precision, and a solve more, take less time than one in double precision."""
-REFINED, MOST_REFINED = 1e-3, 3
-"""A correction by less than this share squares to what may be left of an error; solves at most before the factor is made in double precision."""
-NEAR_ENOUGH = 1e-2
+REFINED, MOST_REFINED = 1e-6, 4
+"""Share of a solution that the next correction may still bring; corrections at most before the factor is made in double precision."""
+NEAR_ENOUGH = 3e-2
 """A factor of a state near by serves where the first correction of what it makes of the loads that are asked is smaller than this share."""
 ROUGH = 1e-3
 """Share of a rough solution that may be missing, in energy. With ten times as much in the mesh's error the order of the nodes moved a fit by two percent."""
@@ -52,14 +52,15 @@ class Refined:
 
     def _refined(self, right: FloatArray) -> FloatArray | None:
         """Return the corrected solution; None where corrections do not shrink as they should."""
-        answer = self.plain.solve(right)
+        answer, first = self.plain.solve(right), 0.0
         for _ in range(MOST_REFINED):
             more = self.plain.solve(right - self._matrix @ answer)
-            if self._lent and not _small(more, answer, NEAR_ENOUGH):
+            share = _share(more, answer)
+            if self._lent and not share <= NEAR_ENOUGH:
                 return self._refined(right) if self._factorised() else None
-            self._lent = False
+            self._lent, first = False, first or share
             answer = answer + more
-            if _small(more, answer, REFINED):
+            if share * first <= REFINED:
                 return np.asarray(answer)
         return None
 
@@ -71,13 +72,14 @@ class Refined:
         return isinstance(own, Cholesky)
 
 
-def _small(more: FloatArray, answer: FloatArray, share: float) -> bool:
-    """Return whether corrections are smaller than a share of what they correct, column by column."""
-    return bool((np.abs(more).max(axis=0) <= share * np.abs(answer).max(axis=0)).all())
+def _share(more: FloatArray, answer: FloatArray) -> float:
+    """Return the largest share that corrections are of what they correct, column by column."""
+    sizes = np.abs(answer).max(axis=0)
+    return float((np.abs(more).max(axis=0) / np.where(sizes > 0, sizes, 1.0)).max(initial=0.0))
 
 
 def refined(pattern: Pattern, values: FloatArray, lent: Factorization | None = None) -> Factorization | None:
-    """Return a stiffness that is solved to 1e-6 or better, from a factor in single precision where that pays and is enough: from that which a state
+    """Return a stiffness that is solved to REFINED or better, from a factor in single precision where that pays and is enough: from that which a state
     near by has lent, as long as it serves."""
     if pattern.size < REFINED_FROM or not np.isfinite(values).all():
         return factorize(pattern, values)

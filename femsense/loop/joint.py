@@ -19,7 +19,7 @@ from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.mesh import TetMesh
 from femsense.loop.kinks import Part, joined, trial_kinks
 from femsense.loop.noise import Groups, Noise, Whitener, whiten
-from femsense.march import has_given
+from femsense.march import AtPoints, has_given
 from femsense.pose import moved_poses
 
 if TYPE_CHECKING:
@@ -326,14 +326,16 @@ class JointProblem:
         rough: bool = False,
         known: States | None = None,
         vary_inputs: bool = False,
+        answers: dict[int, AtPoints] | None = None,
     ) -> SceneJet:
-        """Return the residuals and derivatives of one trial, from its own states or others to start from, or at states that are `known`."""
+        """Return the residuals and derivatives of one trial, from its own states or others to start from, or at states that are `known`, or whose
+        `answers` are."""
         pivot = self.hypothesis.robot.marker_points.mean(axis=0)
         _, initial = trial.place(own, pivot)
         starts = trial.starts_on(self.hypothesis.robot.body.mesh) if starts is None else starts
         return evaluate_scene(self.hypothesis, trial.scene, coordinates, trial.poses, initial, derivative=derivative,
                               vary_initial=trial.initial is not None, pivot=pivot, starts=starts, rough=rough, known=known,
-                              vary_inputs=vary_inputs, moves=own[: 6 * len(trial.poses)])  # fmt: skip
+                              vary_inputs=vary_inputs, moves=own[: 6 * len(trial.poses)], answers=answers)  # fmt: skip
 
     def _scene_rows(
         self, trial: Trial, factor: Whitener, jet: SceneJet, own: FloatArray, at: int, width: int, derivative: bool

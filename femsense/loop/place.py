@@ -15,7 +15,7 @@ from femsense.loop.few import few_of
 from femsense.loop.joint import JointFit
 from femsense.loop.noise import Noise
 from femsense.loop.refit import EVIDENCE, refit_from, tried
-from femsense.loop.screen import Candidate, confounding, effect_fields, screen
+from femsense.loop.screen import Answers, Candidate, confounding, effect_fields, screen
 from femsense.loop.stages import Stage, jets_with, jets_without, make_stage, own_of, problem_of
 
 NEARLY = 0.05
@@ -77,11 +77,12 @@ def climbed(data: Data, stage: Stage, start: Candidate, noise: Noise) -> Climbs:
     when the modulus is open. Some of the states show the way."""
     few = few_of(data, stage, noise)
     asked, known = list[Entry](), list[Candidate]()
+    answers: list[Answers] = [{} for _ in few.data.train]
 
     def at(seeds: Sequence[Entry]) -> list[Candidate]:
         fresh = [seed for i, seed in enumerate(seeds) if seed not in seeds[:i] and seed not in asked]
         asked.extend(fresh)
-        known.extend(_screen_seeds(few.data, few.stage, start, fresh, noise) if fresh else [])
+        known.extend(_screen_seeds(few.data, few.stage, start, fresh, noise, answers) if fresh else [])
         return [c for c in known if c.seed in seeds]
 
     others = at([start.seed, *start.effect.seeds(data.robot)])
@@ -195,8 +196,10 @@ def _moved(data: Data, stage: Stage, candidate: Candidate, noise: Noise) -> Stag
         return None
 
 
-def _screen_seeds(data: Data, stage: Stage, start: Candidate, seeds: Sequence[Entry], noise: Noise) -> list[Candidate]:
-    fields = effect_fields(stage.fit, data.train, [(start.effect, seed, start.parameters) for seed in seeds])
+def _screen_seeds(
+    data: Data, stage: Stage, start: Candidate, seeds: Sequence[Entry], noise: Noise, answers: list[Answers] | None = None
+) -> list[Candidate]:
+    fields = effect_fields(stage.fit, data.train, [(start.effect, seed, start.parameters) for seed in seeds], answers)
     return screen(stage.fit, problem_of(data, stage.fit, noise), fields, 100.0)
 
 

@@ -21,13 +21,16 @@ from femsense.fem.mesh import embed_points
 from femsense.loop.joint import JointFit, JointProblem, Prior, States, Trial, spans_of
 from femsense.loop.noise import whiten
 from femsense.loop.states import MOST_WORK, between, representatives, spread_states, state_vectors
-from femsense.march import has_history
+from femsense.march import AtPoints, has_history
 from femsense.model import Robot
 
 NUISANCE = ("stiffness", "cable_offset")
 """Effects that are always fitted along."""
 TESTABLE = 0.1
 """An effect of which calibration imitates more than 90 % cannot be tested."""
+
+Answers = dict[int, AtPoints]
+"""Frame → what the points of its state answer to."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -197,18 +200,21 @@ def linear_gain(base: JointFit, problem: JointProblem, raw: list[FloatArray], se
     return float(np.sum((more.T @ base.fit.residual) ** 2))
 
 
-def effect_fields(base: JointFit, trials: list[Trial], todo: list[tuple[Effect, Entry, tuple[Parameter, ...]]]) -> Fields:
-    """Return what each effect does to the markers: those with parameters to first order, all of them with one factorisation a frame;
-    discrete alternatives as a whole, each with a walk of its own."""
+def effect_fields(
+    base: JointFit, trials: list[Trial], todo: list[tuple[Effect, Entry, tuple[Parameter, ...]]], answers: list[Answers] | None = None
+) -> Fields:
+    """Return what each effect does to the markers: those with parameters to first order, all of them with one factorisation a frame, or none where
+    the `answers` of each trial are known from an earlier call for this fit; discrete alternatives as a whole, each with a walk of its own."""
     fixed = base.hypothesis.robot_at(base.coordinates)
     smooth = [t for t in todo if not t[0].discrete and _can_act(fixed, t)]
     every = Hypothesis(fixed, tuple(smooth))
     null = np.array([p.null for p in every.parameters])
     probe = JointProblem(every, Prior(np.zeros(0), np.zeros(0)), trials, [], 1.0)
     raw, rest = [], []
-    for trial, known, span in zip(trials, base.jets, spans_of(trials)):
+    asked = [None] * len(trials) if answers is None else answers
+    for trial, known, span, own in zip(trials, base.jets, spans_of(trials), asked):
         trial.starts_on(fixed.body.mesh).update(_starts_of(trial, fixed, fixed, known.states))
-        jet = probe.jet(trial, base.fit.theta[span], null, True)
+        jet = probe.jet(trial, base.fit.theta[span], null, True, answers=own)
         raw.append(jet.by_effect)
         rest.append(jet.rest_by_effect)
     usable, near = smooth, [jet.states for jet in base.jets]
