@@ -239,6 +239,7 @@ def test_a_factor_of_a_state_near_by_is_taken_where_it_serves(monkeypatch: pytes
     other = factorize(smaller.free_map.pattern, reduced_values(smaller, internal(smaller, smaller.mesh.nodes).blocks))
     for lent, taken in (
         (factorize(pattern, 1.005 * values), True),
+        (factorize(pattern, 1.028 * values), True),
         (factorize(pattern, 1.05 * values), False),
         (other, False),
         (None, False),

@@ -275,16 +275,22 @@ def test_many_forces_are_answered_by_the_points_that_are_observed(control: str, 
     solved, plain = list[int](), Tangent.respond
     monkeypatch.setattr(Tangent, "respond", lambda self, forces: solved.append(len(forces)) or plain(self, forces))
 
-    def seen(variants: Sequence[Walk]) -> FloatArray:
-        return np.array(
-            [others for *_, others in walk_along(Walk(base, drive_of(base, rec)), [0, 1], attrgetter("markers"), variants)]
-        )
+    def seen(variants: Sequence[Walk], known: dict[int, march.AtPoints] | None = None) -> FloatArray:
+        walk = Walk(base, drive_of(base, rec))
+        return np.array([others for *_, others in walk_along(walk, [0, 1], attrgetter("markers"), variants, known=known)])
 
     together = seen(walks)
     assert solved and max(solved) == 3 * len(MARKERS)  # one a point and axis, none a payload
     alone = np.concatenate([seen([walk]) for walk in walks], axis=1)
     still = next(iter(walk_along(Walk(base, drive_of(base, rec)), [0], attrgetter("markers"))))[2]
     np.testing.assert_allclose(together, alone, atol=1e-6 * np.abs(alone - still).max())
+    known = dict[int, march.AtPoints]()
+    np.testing.assert_allclose(seen(walks[:1], known), alone[:, :1], atol=1e-6 * np.abs(alone - still).max())
+    solved.clear()
+    monkeypatch.setattr(march, "tangent_at", lambda *given: pytest.fail("a tangent is made though the answers are known"))
+    kept = seen(walks[1 : len(payloads) + 2], known)
+    np.testing.assert_allclose(kept, alone[:, 1 : len(payloads) + 2], atol=1e-6 * np.abs(alone - still).max())
+    assert known.keys() == {0, 1} and not solved
 
 
 def test_a_variant_in_observation_alone_costs_no_solve(monkeypatch: pytest.MonkeyPatch) -> None:
