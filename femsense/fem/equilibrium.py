@@ -22,7 +22,7 @@ from femsense.fem.body import BodyModel, Cable
 from femsense.fem.cables import add_cable_stiffness, bend_angles, cable_forces, cable_length, rub, segments, shortening
 from femsense.fem.chambers import add_pressure_stiffness, chamber_volume, volume_changes, volume_gradient
 from femsense.fem.clamp import with_turning_plate
-from femsense.fem.linear import Factorization, factorize, factorize_definite
+from femsense.fem.linear import Factorization, Pattern, factorize, factorize_definite, least_shift
 from femsense.fem.turning import turned_step
 
 CONVERGED = "converged"
@@ -525,11 +525,7 @@ def _factor_here(
     """Factorise the stiffness, made positive definite where it is not: then steps lead downhill. Held cables and chambers hold too:
     a stiffness that is indefinite only where they do not let the body go stays as it is."""
     values = reduced_values(body, _stiffness_blocks(body, here, state))
-    pattern, first = body.free_map.pattern, state.shift / 4.0
-    plain, state.shift = factorize_definite(pattern, values, single=True, tries=0) if state.single else (None, 0.0)
-    if plain is None:  # perhaps in single precision alone
-        state.single = False
-        plain, state.shift = factorize_definite(pattern, values, first=first)
+    plain = _definite_factor(body.free_map.pattern, values, state)
     whole = with_turning_plate(body, state.x, plain)
     state.shifted = state.shift > 0.0 or whole is None or whole.negative > 0
     if state.shifted and len(H):
@@ -539,6 +535,20 @@ def _factor_here(
     state.indefinite_steps += state.shifted
     # the plate only ever softens, so that the factor without it leads downhill
     return plain if state.shifted and whole is not None and whole.negative > 0 else whole
+
+
+def _definite_factor(pattern: Pattern, values: FloatArray, state: _State) -> Factorization | None:
+    """Factorise a stiffness with the shift that makes it positive definite, which is near that which served last. Where it is indefinite in single
+    precision alone, as a body about to buckle may be, no other factor of this state is."""
+    first, plain = state.shift / 4.0, None
+    if state.single:
+        plain, state.shift = factorize_definite(pattern, values, single=True, tries=0)
+    if plain is None and state.single and (first == 0.0 or first < least_shift(pattern, values)):
+        plain = factorize_definite(pattern, values, tries=0)[0]
+        state.single = plain is None
+    if plain is None:
+        plain, state.shift = factorize_definite(pattern, values, first=first, single=state.single, indefinite=state.single)
+    return plain
 
 
 def _stiffness_blocks(body: BodyModel, here: Internal, state: _State) -> FloatArray:

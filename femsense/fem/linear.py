@@ -32,6 +32,8 @@ ITERATIVE_LEAST = 60
 """Bodies with fewer unknowns always have a direct factor: they may be too small for aggregates with rigid motions."""
 MEMORY_SHARE = 0.6
 """A direct factor may take this share of the memory that is free."""
+LEAST_SHIFT = 1e-6
+"""Share of the typical diagonal entry that is tried first to make a matrix positive definite."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -123,26 +125,25 @@ def factorize(pattern: Pattern, values: FloatArray) -> Factorization | None:
 
 
 def factorize_definite(
-    pattern: Pattern, values: FloatArray, *, first: float = 0.0, tries: int = 30, single: bool = False
+    pattern: Pattern, values: FloatArray, *, first: float = 0.0, tries: int = 30, single: bool = False, indefinite: bool = False
 ) -> tuple[Factorization | None, float]:
     """Factorise matrix + shift·I with the smallest tried shift that makes it positive definite.
 
     Arguments:
         first: the shift to try first where one is needed [N/m], such as a quarter of that which served near by.
         single: single precision is enough, as for a step that is corrected by others.
+        indefinite: the matrix is known not to be positive definite as it is.
 
     Returns:
         the factorisation (None where nothing helped) and the shift [N/m], 0 where none was needed.
     """
-    factor = _definite(pattern, values, single)
+    factor = None if indefinite else _definite(pattern, values, single)
     if factor is not None:
         return factor, 0.0
-    columns = np.repeat(np.arange(pattern.size), np.diff(pattern.indptr))
-    diagonal = np.flatnonzero(pattern.indices == columns)
-    size = np.abs(values[diagonal])
-    if not np.isfinite(size).all() or size.max(initial=0.0) == 0.0:
+    least = least_shift(pattern, values)
+    if not 0.0 < least < np.inf:
         return None, 0.0
-    shift = max(first, 1e-6 * float(np.median(size)))
+    shift, diagonal = max(first, least), _diagonal(pattern)
     for _ in range(tries):
         shifted = values.copy()
         shifted[diagonal] += shift
@@ -151,6 +152,18 @@ def factorize_definite(
             return factor, shift
         shift *= 4.0
     return None, shift
+
+
+def least_shift(pattern: Pattern, values: FloatArray) -> float:
+    """Return the smallest shift that `factorize_definite` tries [N/m]: a matrix that needs more is indefinite, in single precision, too."""
+    size = np.abs(values[_diagonal(pattern)])
+    return LEAST_SHIFT * float(np.median(size)) if len(size) and np.isfinite(size).all() else np.inf
+
+
+def _diagonal(pattern: Pattern) -> IntArray:
+    """Return where the entries on the diagonal are, shape (f,)."""
+    columns = np.repeat(np.arange(pattern.size), np.diff(pattern.indptr))
+    return np.flatnonzero(pattern.indices == columns)
 
 
 def _wanted() -> str:
