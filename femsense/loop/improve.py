@@ -171,7 +171,8 @@ def _placed(data: Data, robot: Robot, noise: Noise, start: Stage | None = None) 
 
 
 def _calibrated_on(data: Data, robot: Robot, placed: Stage) -> Stage:
-    """Return a robot with all that calibration may move, fitted roughly."""
+    """Return a robot with all that calibration may move, fitted roughly. To begin with some of the states leads elsewhere: what the model lacks pulls
+    zeros and modulus further where fewer states hold them."""
     hypothesis, prior = with_nuisance(data, robot)
     nothing = np.zeros(len(prior.mean))
     return _as_far_as_held_out_states_rest(

@@ -201,7 +201,10 @@ def linear_gain(base: JointFit, problem: JointProblem, raw: list[FloatArray], se
 
 
 def effect_fields(
-    base: JointFit, trials: list[Trial], todo: list[tuple[Effect, Entry, tuple[Parameter, ...]]], answers: list[Answers] | None = None
+    base: JointFit,
+    trials: list[Trial],
+    todo: list[tuple[Effect, Entry, tuple[Parameter, ...]]],
+    answers: list[Answers] | None = None,
 ) -> Fields:
     """Return what each effect does to the markers: those with parameters to first order, all of them with one factorisation a frame, or none where
     the `answers` of each trial are known from an earlier call for this fit; discrete alternatives as a whole, each with a walk of its own."""
