@@ -815,7 +815,9 @@ class _Balance:
         x, own, drive = self.base.positions, self.body, variant.drive
         force = np.zeros_like(x)
         if body is not own:
-            force += body.dead_load() - self.dead
+            force += body.dead_forces - own.dead_forces
+            if not _same_weight(body, own):
+                force += body.weight() - own.weight()
             self._add_inner(body, force)
         if drive.load_forces is not self.walk.drive.load_forces:
             force += self._loads(variant) - self._loads(self.walk)
@@ -972,6 +974,15 @@ def _same_but_modulus(body: BodyModel, other: BodyModel) -> bool:
     if a is b or body.mesh is not other.mesh:
         return a is b
     return np.array_equal(a.poisson_ratio, b.poisson_ratio) and (a.law, a.stretch_limit) == (b.law, b.stretch_limit)
+
+
+def _same_weight(body: BodyModel, other: BodyModel) -> bool:
+    volume, others = body.stencil.node_volume, other.stencil.node_volume
+    return (
+        (volume is others or np.array_equal(volume, others))
+        and body.material.density == other.material.density
+        and np.array_equal(body.gravity, other.gravity)
+    )
 
 
 def _same_mechanics(walk: Walk, variant: Walk) -> bool:

@@ -14,7 +14,7 @@ from test_fem_chambers import hollow
 
 from femsense.errors import InputError
 from femsense.fem import equilibrium
-from femsense.fem.assembly import internal
+from femsense.fem.assembly import internal, reduced_matrix
 from femsense.fem.body import BodyModel, make_body, tie_cable
 from femsense.fem.cables import bend_angles
 from femsense.fem.chambers import find_chamber
@@ -311,6 +311,42 @@ def test_a_state_that_is_only_tried_is_given_up_after_some_steps(monkeypatch: py
     tried = solve_equilibrium(body, tension=pull, start=rest, rough=True)
     assert tried.status == "iterations" and tried.iterations == 1
     assert solve_equilibrium(body, tension=pull, start=rest).converged  # what is not only tried goes on
+
+
+def test_a_state_that_is_only_tried_is_given_up_where_its_stiffness_stays_indefinite(monkeypatch: pytest.MonkeyPatch) -> None:
+    body = bar_body(block_mesh((5, 2, 2), (LENGTH, WIDTH, SIDE)))
+    rest = solve_equilibrium(body)
+    x = rest.positions * [1.0, 1.0, 0.1]  # pressed flat
+    flat = replace(rest, positions=np.where(body.mesh.nodes[:, :1] < 1e-9, body.mesh.nodes, x))
+    back = solve_equilibrium(body, start=flat, rough=True)
+    assert back.converged and 1 <= back.indefinite_steps <= equilibrium.INDEFINITE_TRIES
+    monkeypatch.setattr(equilibrium, "INDEFINITE_TRIES", back.indefinite_steps - 1)
+    tried = solve_equilibrium(body, start=flat, rough=True)
+    assert tried.status == "iterations" and tried.iterations < back.iterations
+    assert solve_equilibrium(body, start=flat).converged  # what is not only tried goes on
+
+
+def test_a_stiffness_is_shifted_in_single_precision_where_it_is_indefinite_in_double_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    body = bar_body(block_mesh((5, 2, 2), (LENGTH, WIDTH, SIDE)))
+    pattern, K = body.free_map.pattern, reduced_matrix(body, internal(body, body.mesh.nodes).blocks)
+    lowest = float(np.linalg.eigvalsh(K.toarray())[0])
+
+    def factored(share: float, shift: float = 0.0) -> tuple[Any, equilibrium._State]:
+        state = equilibrium._State(body.mesh.nodes, np.zeros(0), np.zeros(0, dtype=bool), [], single=True, shift=shift)
+        values = K.data - share * lowest * (pattern.indices == np.repeat(np.arange(pattern.size), np.diff(pattern.indptr)))
+        return equilibrium._definite_factor(pattern, values, state), state
+
+    for share, shift in ((1.5, 0.0), (1.5, 2.2 * lowest), (30.0, 0.0)):
+        factor, state = factored(share, shift)
+        assert state.single and factor._L.dtype == np.float32 and (share - 1.0) * lowest < state.shift
+    factor, state = factored(0.5, 30.0 * lowest)
+    assert state.single and factor._L.dtype == np.float32 and state.shift == 0.0
+    plain = equilibrium.factorize_definite
+    monkeypatch.setattr(
+        equilibrium, "factorize_definite", lambda *a, single=False, **k: (None, 0.0) if single else plain(*a, **k)
+    )
+    factor, state = factored(1.0 - 1e-9)  # definite, but not with seven digits
+    assert not state.single and factor._L.dtype == np.float64 and state.shift == 0.0
 
 
 class _Known:

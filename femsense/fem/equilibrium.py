@@ -26,8 +26,9 @@ from femsense.fem.linear import Factorization, Pattern, factorize, factorize_def
 from femsense.fem.turning import turned_step
 
 CONVERGED = "converged"
-TRIES = 30
-"""Newton steps of a state that is only tried: it is too far off where they do not do."""
+TRIES, INDEFINITE_TRIES = 30, 6
+"""Newton steps of a state that is only tried, and stiffnesses of it that are indefinite: it is too far off where they do not do. Bodies that fold
+meet 8 to 11 of these in their 30 steps, those that come to rest 4 at most (bars of `benchmarks/improve.py`)."""
 MOST_STEPS = 1500
 """Newton steps in all, load steps included."""
 SMALLEST_PART = 2e-3
@@ -452,6 +453,8 @@ def _newton(body: BodyModel, loads: _Loads, state: _State, max_iterations: int) 
             state.factor, state.borrowed = _factor_here(body, here, state, H, C, stretch, loads.lever[held]), False
             if state.factor is None:
                 return "singular"
+            if state.rough and state.indefinite_steps > INDEFINITE_TRIES:
+                return "iterations"
             state.factored_at = state.residual
             secants.pairs.clear()
         last, state.serves = state.residual, state.borrowed or 0.0 < left <= SURE
