@@ -212,7 +212,7 @@ def solve_frame(
 
 def walk_along(
     walk: Walk, frames: Sequence[int], ties: Callable[[Robot], Embedding], variants: Sequence[Walk] = (),
-    *, starts: dict[int, Equilibrium] | None = None, rough: bool = False, known: dict[int, AtPoints] | None = None,
+    *, starts: dict[int, Equilibrium] | None = None, rough: bool = False, answers: dict[int, AtPoints] | None = None,
 ) -> Iterator[tuple[int, Equilibrium, FloatArray, FloatArray]]:  # fmt: skip
     """Solve frames in order, and with each the same frame of variants that differ from it by little.
 
@@ -228,7 +228,7 @@ def walk_along(
         starts: frame → a state near by, such as that of an earlier walk; brought up to date as frames are solved. Their
             factors are kept as long as they fit into FACTOR_MEMORY.
         rough: states are only tried, where one near by is known.
-        known: frame → what its points answer to, from an earlier walk along these very states with other variants; what is missing is
+        answers: frame → what its points answer to, from an earlier walk along these very states with other variants; what is missing is
             added where the points are few.
 
     Yields:
@@ -243,9 +243,9 @@ def walk_along(
     seen = {k: ties(walk.robot).positions(bases[k].positions) for k in {alike[k]: None for k in wanted}}
     others = {k: np.zeros((len(variants), *seen[alike[k]].shape)) for k in wanted}
     lent = {k: s.factor for k, s in (starts or {}).items() if k in bases and s.positions is bases[k].positions}
-    answers = _Variants(walk, variants, {k: bases[alike[k]] for k in todo}, alike, others, ties, lent, known)
+    observed = _Variants(walk, variants, {k: bases[alike[k]] for k in todo}, alike, others, ties, lent, answers)
     room = _room(len(unique))
-    for k, factor in answers.write():
+    for k, factor in observed.write():
         plain = factor.plain if isinstance(factor, Refined) else factor
         if plain is not None and starts is not None and plain.bytes < _most_lent(starts[k], room):
             starts[k] = replace(starts[k], factor=plain)

@@ -277,7 +277,7 @@ def test_many_forces_are_answered_by_the_points_that_are_observed(control: str, 
 
     def seen(variants: Sequence[Walk], known: dict[int, march.AtPoints] | None = None) -> FloatArray:
         walk = Walk(base, drive_of(base, rec))
-        return np.array([others for *_, others in walk_along(walk, [0, 1], attrgetter("markers"), variants, known=known)])
+        return np.array([others for *_, others in walk_along(walk, [0, 1], attrgetter("markers"), variants, answers=known)])
 
     together = seen(walks)
     assert solved and max(solved) == 3 * len(MARKERS)  # one a point and axis, none a payload

@@ -275,7 +275,7 @@ def evaluate_scene(
     if known is not None and not variants:
         states, model = known, {k: ties(robot).positions(state.positions) for k, state in known.items()}
     frames = [] if model else scene.frames.tolist()
-    for k, state, seen, varied in walk_along(base, frames, ties, variants, starts=starts, rough=rough, known=answers):
+    for k, state, seen, varied in walk_along(base, frames, ties, variants, starts=starts, rough=rough, answers=answers):
         states[k], model[k] = state, seen
         for i in range(len(variants)):
             shifted[i][k] = varied[i]
