@@ -530,7 +530,7 @@ class _Variants:
         self.walk, self.variants, self.bases, self.alike, self.others, self.lent = walk, variants, bases, alike, others, lent
         self.ties = [ties(v.robot) for v in variants]
         self.own_ties = ties(walk.robot)
-        self.known = known if len(self.own_ties) <= MANY_POINTS else None
+        self.known = None if len(self.own_ties) > MANY_POINTS or has_history(walk.robot) else known
         own = [not _same_mechanics(walk, v) for v in variants]
         linear = [_linear(walk, v) for v in variants]
         rubs = [has_history(v.robot) for v in variants]

@@ -28,7 +28,7 @@ from femsense.fem.turning import turned_step
 CONVERGED = "converged"
 TRIES, INDEFINITE_TRIES = 30, 6
 """Newton steps of a state that is only tried, and stiffnesses of it that are indefinite: it is too far off where they do not do. Bodies that fold
-meet 8 to 11 of these in their 30 steps, those that come to rest 4 at most (bars of `benchmarks/improve.py`)."""
+meet 8 to 11 of these in their 30 steps, those that come to rest 4 at most (a trial on bars of `benchmarks/improve.py`)."""
 MOST_STEPS = 1500
 """Newton steps in all, load steps included."""
 SMALLEST_PART = 2e-3
@@ -546,7 +546,7 @@ def _definite_factor(pattern: Pattern, values: FloatArray, state: _State) -> Fac
     first, plain = state.shift / 4.0, None
     if state.single:
         plain, state.shift = factorize_definite(pattern, values, single=True, tries=0)
-    if plain is None and state.single and (first == 0.0 or first < least_shift(pattern, values)):
+    if plain is None and state.single and first < least_shift(pattern, values):
         plain = factorize_definite(pattern, values, tries=0)[0]
         state.single = plain is None
     if plain is None:
