@@ -599,7 +599,7 @@ class _Variants:
         columns, at_points = len(self.plain) + len(self.rubbing), 3 * len(self.own_ties)
         few = (at_points if self.known is not None else min(columns, at_points)) <= FEW_COLUMNS
         solver = partial(refined, lent=self.lent.get(k)) if few else factorize
-        return _Answers(lambda: tangent_at(self.walk.robot.body, self.bases[k], solver), 2 if self.rubbing else 1)
+        return _Answers(partial(tangent_at, self.walk.robot.body, self.bases[k], solver), 2 if self.rubbing else 1)
 
     def _jobs(self, group: list[int], which: Sequence[int]) -> list[Job]:
         """Return what is to be computed of some variants in frames with one base state."""
@@ -619,7 +619,7 @@ class _Variants:
         self._write(group, self.plain, answers)
         factor = answers.factor
         answers.keep(job[:2] for job in jobs)
-        if answers.bytes < self.room:
+        if answers.bytes < self.room and any(k in self.others for k in group):
             self.kept[first] = answers
         return first, factor, {(i, k): self._bends(i, x) for (i, _, frames), x in moved for k in frames}
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -320,6 +322,28 @@ def test_variants_that_rub_are_answered_twice_with_one_factor_a_state(monkeypatc
     ):
         np.testing.assert_allclose(kept, again, atol=1e-12)
     assert len(made) == 6
+
+
+def test_factors_of_a_walk_with_friction_are_gone_with_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    base, rec = robot(), recording([[0.5, 0.0], [1.0, 0.2], [1.5, 0.4]])
+    rubs = apply_effects(base, [{"name": "cable_friction", "coefficient": 0.2}])
+    made, plain = list[weakref.ref[Any]](), march.tangent_at
+
+    def tangent_at(*given: Any) -> Tangent:
+        tangent = plain(*given)
+        made.append(weakref.ref(tangent.factor))
+        return tangent
+
+    monkeypatch.setattr(march, "tangent_at", tangent_at)
+    gc.disable()  # a circle of references would keep gigabytes until its next round
+    try:
+        deque(
+            walk_along(Walk(base, drive_of(base, rec)), [0, 2], attrgetter("markers"), [Walk(rubs, drive_of(rubs, rec))]),
+            maxlen=0,
+        )
+        assert made and all(factor() is None for factor in made)
+    finally:
+        gc.enable()
 
 
 def test_a_factor_takes_the_place_of_no_smaller_one() -> None:

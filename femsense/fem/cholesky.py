@@ -397,8 +397,8 @@ class Analysis:
     """Place of each unknown in the order of elimination, shape (f,)."""
     owner: IntArray
     """Supernode of each unknown in the order of elimination, shape (f,)."""
-    idle: list[npt.NDArray[Any]]
-    """Memory of factors that are gone, taken again by new ones."""
+    idle: dict[tuple[str, int], list[npt.NDArray[Any]]]
+    """Memory of what is gone, by kind and number of entries, taken again by what is new: pages that are fresh from the system take longer than a factor."""
     columns: dict[tuple[str, int], npt.NDArray[Any]]
     """Zeros for the columns of `Cholesky.gram`, by kind and number: it leaves them as it finds them."""
 
@@ -411,21 +411,17 @@ class Analysis:
         """Rows of the tallest front."""
         return int(self.unit * (np.diff(self.firsts) + np.diff(self.begin)).max(initial=0))
 
-    def take(self, kind: str) -> npt.NDArray[Any]:
-        """Return memory for a factor."""
-        others = []
+    def take(self, kind: str, entries: int) -> npt.NDArray[Any]:
+        """Return memory for so many numbers and what may be read beyond them."""
+        size = entries + PADDING
         try:
-            while True:  # other threads may take from the list meanwhile
-                array: npt.NDArray[Any] = self.idle.pop()
-                if array.dtype.char == kind:
-                    return array
-                others.append(array)
+            return self.idle.setdefault((kind, size), []).pop()
         except IndexError:
-            pass
-        finally:
-            self.idle.extend(others)
-        fresh: npt.NDArray[Any] = np.empty(self.offset[-1] + PADDING, kind)
-        return fresh
+            return np.empty(size, kind)
+
+    def give_back(self, memory: npt.NDArray[Any]) -> None:
+        """Let others take memory that is needed no more."""
+        self.idle[memory.dtype.char, len(memory)].append(memory)
 
 
 def analyse(indptr: IntArray, indices: IntArray) -> Analysis:
@@ -456,7 +452,7 @@ def analyse(indptr: IntArray, indices: IntArray) -> Analysis:
     owner = np.repeat(np.arange(len(above)), width)
     return Analysis(
         unit=unit, order=unknowns, firsts=firsts, parent=above, begin=begin, below=below, place=place, offset=offset, entries=starts,
-        source=source, target=target, heads=run_heads, runs=runs, room=room, stack=int(stack), rank=rank, owner=owner, idle=[], columns={},
+        source=source, target=target, heads=run_heads, runs=runs, room=room, stack=int(stack), rank=rank, owner=owner, idle={}, columns={},
     )  # fmt: skip
 
 
@@ -826,7 +822,7 @@ class Cholesky:
         self.size = analysis.size
         self.bytes = int(analysis.offset[-1]) * L.itemsize
         self._analysis, self._L = analysis, L
-        weakref.finalize(self, analysis.idle.append, L)
+        weakref.finalize(self, analysis.give_back, L)
 
     def solve(self, right: FloatArray) -> FloatArray:
         """Return K⁻¹ right, shape (f,) or (f, k)."""
@@ -898,16 +894,17 @@ def cholesky(
         source: where the entries that `Analysis.source` names are in `values`, where these are in another order.
     """
     a, kind = analysis, "f" if single else "d"
-    L = a.take(kind)
-    stack, head, follow = np.empty(a.stack + PADDING, kind), np.empty(len(a.parent), np.int64), np.empty(len(a.parent), np.int64)
+    L, stack = a.take(kind, int(a.offset[-1])), a.take(kind, a.stack)
+    head, follow = np.empty(len(a.parent), np.int64), np.empty(len(a.parent), np.int64)
     with one_blas_thread():
         definite = _factorise(
             values, a.entries, a.source if source is None else source, a.target, a.unit, a.firsts, a.parent, a.begin, a.place, a.offset, a.heads, a.runs, a.room,
             _BLAS[kind], L, stack, head, follow, *_constants(kind),
         )  # fmt: skip
+    a.give_back(stack)
     if definite:
         return Cholesky(a, L)
-    a.idle.append(L)
+    a.give_back(L)
     return None
 
 
