@@ -1,6 +1,6 @@
-"""How long `femsense improve` takes: 100 frames, 20 effects, 1536 tetrahedra.
+"""How long `femsense improve` takes, and what memory: 100 frames, 20 effects, 1536 tetrahedra.
 
-    python benchmarks/improve.py                        # tet10 and tet4, something hidden and nothing, three runs each
+    python benchmarks/improve.py                        # everything that can be hidden, and tet4, three runs each
     python benchmarks/improve.py --case tet10/friction --case tet10/gain --runs 1
     python benchmarks/improve.py --case tet4/friction --without discretisation
 
@@ -189,6 +189,7 @@ def one_run(folder: Path, element: str, without: list[str]) -> None:
                 "sentence": document["sentence"],
                 "steps": [m[0] for m in marks],
                 "factors": len(factors),
+                "memory_gb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6,
             }
         )
     )
@@ -233,7 +234,7 @@ def show(name: str, runs: list[dict[str, Any]]) -> None:
         if any(row[0] > 0 for row in rows):
             print(f"  {stage:36s}{np.median([r[0] for r in rows]):8.1f}{np.median([r[1] for r in rows]):8.1f}")
     print(f"  {'all':36s}{np.median([r['wall_s'] for r in runs]):8.1f}{np.median([r['cpu_s'] for r in runs]):8.1f}")
-    print(f"  {runs[0]['factors']} stiffnesses factorised", flush=True)
+    print(f"  {runs[0]['factors']} stiffnesses factorised, {max(r['memory_gb'] for r in runs):.1f} GB at most", flush=True)
 
 
 def measure_factor(folder: Path) -> tuple[float, float]:
@@ -277,7 +278,7 @@ def main() -> None:
     if given.one is not None:
         one_run(given.one, given.element, given.without)
         return
-    for name in given.case or ["tet10/nothing", "tet10/clamp", "tet10/friction", "tet4/nothing", "tet4/friction"]:
+    for name in given.case or [*(f"tet10/{hidden}" for hidden in HIDDEN), "tet4/nothing", "tet4/friction"]:
         element, hidden = name.split("/")
         folder = given.data / hidden
         if not (folder / "recording" / "recording.toml").is_file():

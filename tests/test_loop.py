@@ -139,6 +139,30 @@ def test_a_sweep_that_is_a_repetition_is_not_held_out_where_another_can_be_spare
     assert held(one, other, other) == {2}  # nothing drives the first one but `one`
 
 
+def test_what_only_one_sweep_shows_is_not_held_out_where_another_can_be_spared():
+    """A gain of a cable that is driven far in held-out sweeps alone would not be seen."""
+    tops = [[2.0, 0.0], [0.5, 1.0], [0.0, 2.0], [1.0, 0.5], [2.0, 0.1], [0.0, 2.0]]
+    inputs = np.array([row for top in tops for row in ([0.0, 0.0], top)])
+    parts: dict[str, Any] = {
+        "time_s": np.arange(12),
+        "cable_names": ["a", "b"],
+        "inputs": inputs,
+        "sweep": [str(k // 2) for k in range(12)],
+    }
+
+    def held(**more: Any) -> set[int]:
+        return {k // 2 for k in hold_out(make_recording(**parts, **more), np.arange(12))[1].tolist()}
+
+    assert held() == {3, 4}  # evenly spread: 2 and 5, which are the same
+    weights = {"load_frame": [3, 7], "load_points": np.zeros((2, 3))}
+    assert held(**weights, load_forces=[[0, 0, -0.5], [0, 0, -1.0]]) == {1, 4}
+    turned = np.tile([0.0, 0.0, -9.81], (12, 1))
+    turned[6:8] = [0.0, -9.81, 0.0]
+    assert held(gravity=turned) == {1, 4}
+    inputs[[3, 7]] = 0.0, 0.0
+    assert held() == {4}
+
+
 def test_repeated_sweeps_of_many_states_tell_effects_apart():
     def data(levels: list[float]) -> SimpleNamespace:
         inputs = np.array([[v] for v in levels * 2])

@@ -51,27 +51,56 @@ def _fresh(recording: Recording, frames: IntArray, held: BoolArray) -> bool:
 
 
 def _can_be_spared(recording: Recording, frames: IntArray, held: BoolArray) -> bool:
-    """Return whether frames that are held out have a state of their own, while the others drive every input as far."""
-    size = np.abs(_drives(recording)[frames])
-    return _fresh(recording, frames, held) and bool((size[~held].max(axis=0) >= 0.9 * size.max(axis=0)).all())
+    """Return whether frames may be held out while the others drive every input as far, under loads as heavy, in as many directions of gravity."""
+    size = np.hstack([np.abs(_drives(recording)), _loads(recording)[:, None]])[frames]
+    if (size[~held].max(axis=0, initial=0.0) < 0.9 * size.max(axis=0)).any():
+        return False
+    if recording.gravity is None:
+        return True
+    down = recording.gravity[frames]
+    return len(np.unique(down[~held], axis=0)) == len(np.unique(down, axis=0))
+
+
+def _loads(recording: Recording) -> FloatArray:
+    """Return how heavy the known loads of each frame are [N], shape (F,)."""
+    weights = np.linalg.norm(recording.load_forces, axis=1)
+    return np.bincount(recording.load_frame, weights=weights, minlength=recording.frame_count).astype(float)
 
 
 def hold_out(recording: Recording, frames: IntArray) -> tuple[IntArray, IntArray, str]:
     """Return frames to fit, frames to hold out, and how they were chosen in words.
 
     A quarter of the sweeps, evenly spread and the last among them; of two or three sweeps the last one; of a single sweep
-    its last quarter. Where these only repeat states that are fitted, the last sweep with a state of its own that can be spared takes
-    the place of the last: the others drive every input as far.
+    its last quarter. Where what is left does not drive every input as far, under loads as heavy and in all directions of gravity (nobody could
+    tell then what an input does that is held out), or where these only repeat states that are fitted, sweeps that can be spared take their
+    places, if there are any that have states of their own: the evenly spread ones first, then from the last one on.
     """
     number = sweeps_of(recording, frames)
     count = int(number.max()) + 1
     if count >= 2:
         wanted = max(1, round(count / 4))
-        held = np.unique(np.round(np.linspace(count - 1, 0, wanted + 1)[:-1]).astype(int))
-        if not _fresh(recording, frames, np.isin(number, held)):
-            swaps = [np.append(held[:-1], s) for s in range(count - 1, -1, -1) if s not in held]
-            held = next((h for h in swaps if _can_be_spared(recording, frames, np.isin(number, h))), held)
+        even = np.unique(np.round(np.linspace(count - 1, 0, wanted + 1)[:-1]).astype(int))
+        held = _spared(recording, frames, number, even)
         mask = np.isin(number, held)
         return frames[~mask], frames[mask], f"{len(held)} of {count} sweeps"
     split = max(1, round(0.75 * len(frames)))
     return frames[:split], frames[split:], "the last quarter of the frames (one sweep only)"
+
+
+def _spared(recording: Recording, frames: IntArray, number: IntArray, even: IntArray) -> IntArray:
+    """Return the sweeps that are held out: `even` or, where these would be missed or only repeat what is fitted, as many of others that are not."""
+
+    def fits(sweeps: list[int]) -> bool:
+        return _can_be_spared(recording, frames, np.isin(number, sweeps))
+
+    def fresh(sweeps: list[int]) -> bool:
+        return _fresh(recording, frames, np.isin(number, sweeps))
+
+    order = [*even[::-1].tolist(), *(s for s in range(int(number.max()), -1, -1) if s not in even)]
+    if fresh(even.tolist()) and fits(even.tolist()):
+        return even
+    chosen = list[int]()
+    for sweep in order:
+        if len(chosen) < len(even) and fresh([sweep]) and fits([*chosen, sweep]):
+            chosen.append(sweep)
+    return np.array(sorted(chosen)) if chosen else even
