@@ -42,6 +42,18 @@ def test_a_wrong_modulus_is_named_stiffness_and_nothing_else():
     assert loop.robot.body.material.young_modulus[0] == pytest.approx(1.25 * 300e3, rel=0.06)
 
 
+def test_what_only_held_out_data_show_is_said():
+    """Nothing that is fitted drives the last cable: only what is held out tells that it pulls less than it is told."""
+    level = np.array([0.0, 0.5, 1.0, 1.0, 0.5, 0.1])
+    inputs = np.concatenate([3.0 * np.outer(level, row) for row in np.eye(4)])
+    labels = [f"s{k // 6}" for k in range(24)]
+    recording, _ = record(inputs, effects=[{"name": "cable_gain", "scale": {"right": 0.6}}], labels=labels, truth=arm((4, 1, 1)))
+    loop = improve(arm((4, 1, 1)), [recording], effects=["cable_gain", "cable_friction"])
+    assert loop.verdict == "unexplained" and loop.left["held_out"]
+    assert "Held-out data show what the fitted ones do not, most in frame 2" in loop.sentence
+    assert loop.left["worst_frame"]["frame"] in (20, 21) and loop.left["rms_m"] > 3 * loop.noise_m
+
+
 def test_what_is_taken_away_by_what_nobody_names_is_left(monkeypatch: pytest.MonkeyPatch):
     inputs, labels = sweeps()
     recording, _ = record(inputs, effects=[{"name": "stiffness", "scale": 1.25}], labels=labels, truth=arm())

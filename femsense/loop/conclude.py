@@ -61,16 +61,13 @@ def conclude(data: Data, search: Search, rng: np.random.Generator) -> LoopResult
     effects = _chain(data, search, promoted, names, back, spread)
     lacks = _lacks(data, back, final, noise)
     shown = back if lacks else final  # what nuisances take away unnamed is left, too
-    residuals = [without_mesh_error(t, jet.residual, noise) for t, jet in zip(data.train, shown.fit.jets)]
+    surprise = _surprise(data, back, noise)
     plain = [without_mesh_error(t, jet.residual, noise, nor_seats=True) for t, jet in zip(data.train, shown.fit.jets)]
     tests = structure_tests(data.train, plain, rng=rng)
     excess = _excess(data, before, final, back, noise)
     found = _not_handed_back(search, names)
-    unexplained = (
-        lacks
-        or (found and not effects)
-        or (tests.significant and excess.left > excess.tolerated and (strayed or excess.explained < EXPLAINED))
-    )
+    structured = tests.significant and excess.left > excess.tolerated
+    unexplained = lacks or (found and not effects) or ((structured or surprise) and (strayed or excess.explained < EXPLAINED))
     verdict = "unexplained" if unexplained else "effects" if effects else "none"
     rivals = confounded(search, names)
     not_testable = [
@@ -89,7 +86,8 @@ def conclude(data: Data, search: Search, rng: np.random.Generator) -> LoopResult
         + _by_noise(data, noise)
         + _by_mesh(data, search, back)
         + _on_linear(data, back)
-        + _evidence_for(data, found),
+        + _evidence_for(data, found)
+        + surprise,
         noise_m=noise.total,
         before=_errors(data, before, rng),
         after=_errors(data, back, rng),
@@ -101,7 +99,7 @@ def conclude(data: Data, search: Search, rng: np.random.Generator) -> LoopResult
         not_testable=tuple(not_testable),
         detectable=_detectable(search.last, {e["name"] for e in effects}),
         left={
-            **describe_left(data.robot, data.train, residuals),
+            **(_left(data, back, noise, held=True) if surprise and not structured and not lacks else _left(data, shown, noise)),
             "structure": tests.document(),
             "explained_share": excess.explained,
         },
@@ -283,6 +281,29 @@ def _lacks(data: Data, back: Stage, final: Stage, noise: Noise) -> bool:
     train = [_mean_square(data.train, [j.residual for j in s.fit.jets], noise) for s in (back, final)]
     held = [_mean_square(data.held, s.held_residuals, noise) for s in (back, final)]
     return any(own > LACKS * max(full, 1.0) for own, full in (train, held))
+
+
+def _surprise(data: Data, back: Stage, noise: Noise) -> str:
+    """Return a sentence on what held-out data show of what is handed back and fitted data do not; nothing where these are as well explained."""
+    fitted = _mean_square(data.train, [j.residual for j in back.fit.jets], noise)
+    held = _mean_square(data.held, back.held_residuals, noise)
+    if held <= LACKS * max(fitted, 1.0):
+        return ""
+    worst = describe_left(data.robot, data.held, _beyond_mesh(data.held, back.held_residuals, noise))["worst_frame"]
+    return (
+        f" Held-out data show what the fitted ones do not, most in frame {worst['frame']} ({1e3 * worst['rms_m']:.2f} mm):"
+        " record more sweeps like that one."
+    )
+
+
+def _left(data: Data, stage: Stage, noise: Noise, *, held: bool = False) -> dict[str, Any]:
+    """Return what the residual of the fitted data looks like, or of the held-out data where these alone show it."""
+    trials, residuals = (data.held, stage.held_residuals) if held else (data.train, [jet.residual for jet in stage.fit.jets])
+    return {**describe_left(data.robot, trials, _beyond_mesh(trials, residuals, noise)), "held_out": held}
+
+
+def _beyond_mesh(trials: list[Trial], residuals: list[FloatArray], noise: Noise) -> list[FloatArray]:
+    return [without_mesh_error(t, r, noise) for t, r in zip(trials, residuals)]
 
 
 def _mean_square(trials: list[Trial], residuals: list[FloatArray], noise: Noise) -> float:
@@ -486,7 +507,7 @@ def _sentence(
         small = ", though it is no larger than the noise" if before.held_rms <= noise.total else ""
         return f"A residual is left that {explains} explains{small}: {error}, noise {1e3 * noise.total:.2f} mm."
     what = ", ".join(f"{e['name']} ({_short(e['parameters'])})" for e in effects)
-    tail = "" if verdict == "effects" else " A structured residual is left that no effect explains."
+    tail = "" if verdict == "effects" else " A residual is left that no effect explains."
     where = "" if noise.std else " along the normals of the surface"
     return f"The model lacks {what}; held-out error{where} {1e3 * before.held_rms:.2f} mm before, {1e3 * after.held_rms:.2f} mm after.{tail}"
 

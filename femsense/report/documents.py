@@ -120,6 +120,7 @@ class Left(Document):
     where: Where = Where()
     worst_frame: WorstFrame = WorstFrame()
     worst_frames: list[WorstFrame] = Field(default_factory=list)
+    held_out: bool = False
     half_in_frames: Number = None
     explained_share: Number = None
     goes_with: list[Covariate] = Field(default_factory=list)

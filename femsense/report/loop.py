@@ -403,7 +403,7 @@ def _left(loop: Loop, evidence: Evidence, surface: Surface | None) -> Html | Non
     ]
     headers = ("Goes with", "Rank correlation", "p", "p (Holm)")
     goes = table(headers, rows, caption="What the size of the residual of a frame goes with.", numeric=(1, 2, 3))
-    structured = loop.verdict == "unexplained" or left.structure.significant
+    structured = left.structure.significant or (loop.verdict == "unexplained" and not left.held_out)
     field = force_field(evidence.equivalent_forces, surface) if structured else None
     return together(bullets(_left_facts(left)), panels(goes, _marker_bars(left.marker_rms_m), field)) or None
 
@@ -411,7 +411,7 @@ def _left(loop: Loop, evidence: Evidence, surface: Surface | None) -> Html | Non
 def _left_facts(left: Left) -> list[str]:
     facts = []
     if words.known(left.rms_m):
-        facts.append(f"Size: {words.length(left.rms_m)} rms on the fitted data.")
+        facts.append(f"Size: {words.length(left.rms_m)} rms on the {'held-out' if left.held_out else 'fitted'} data.")
     where = left.where
     if where.marker:
         mean = f", mean {words.parameter(list(where.mean_residual_m), None, 'm')}" if where.mean_residual_m else ""
