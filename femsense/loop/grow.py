@@ -36,7 +36,7 @@ from femsense.model import Robot
 REFITS = 6
 """Candidates that are refitted in full nonlinearity at the first step; half as many later."""
 REFITTABLE = 0.04
-"""A candidate of which calibration leaves less than this is not refitted."""
+"""A candidate of which calibration leaves less than this is not refitted, unless it promises more than any other."""
 ALIKE = 0.95
 """Candidates that promise this share of what the best does are refitted in the order of their cost: to the first refit all others are held up."""
 RIVALS = 0.5
@@ -254,7 +254,8 @@ def polished(data: Data, stage: Stage, refitted: Refit, noise: Noise, say: Progr
 def _enriched(data: Data, stage: Stage, winner: Refit, table: list[Candidate], noise: Noise, say: Progress) -> Refit:
     """Return the winner in a form with more parameters where that has EVIDENCE over the simple one."""
     winner = _with_more_markers(data, stage, winner, table, noise, say)
-    for form in _forms(table, winner.candidate.effect.name):
+    least = min(REFITTABLE, winner.candidate.retained)
+    for form in _forms([c for c in table if c.retained >= least], winner.candidate.effect.name):
         if len(form.parameters) <= len(winner.candidate.parameters):
             continue
         say(f"trying {form.effect.name} with {len(form.parameters)} parameters")
@@ -318,7 +319,9 @@ def _richer(data: Data, stage: Stage, winner: Refit, form: Candidate, noise: Noi
 def shortlist(table: list[Candidate], *, first: bool) -> list[Candidate]:
     """Return the best candidate of each name, in its simplest form (or forms, if several are equally simple), the best first; of those that promise
     as much, the simplest."""
-    names = list(dict.fromkeys(c.effect.name for c in table if c.score > PROMISING and c.retained >= REFITTABLE))
+    most = max((c.score for c in table if c.retained >= REFITTABLE), default=np.inf)
+    table = [c for c in table if c.retained >= REFITTABLE or c.score > most]
+    names = list(dict.fromkeys(c.effect.name for c in table if c.score > PROMISING))
     chosen: list[Candidate] = []
     for name in names[: REFITS if first else (REFITS + 1) // 2]:
         forms = _forms(table, name)
@@ -332,7 +335,7 @@ def _forms(table: list[Candidate], name: str) -> list[Candidate]:
     """Return the best candidate of each form of an effect (one cable or marker alone is a form of its own)."""
     best: dict[tuple[int, int], Candidate] = {}
     for candidate in table:
-        if candidate.effect.name == name and candidate.retained >= REFITTABLE:
+        if candidate.effect.name == name:
             best.setdefault((id(candidate.effect), len(candidate.parameters)), candidate)
     return list(best.values())
 
