@@ -10,7 +10,7 @@ from arm import arm, record, sweeps
 from helpers import write_block_robot
 
 from femsense.calib.forward import redo_depth, undo_depth
-from femsense.effects import apply_effects, build_entry, load_own_effect
+from femsense.effects import apply_effects, build_entry, load_own_effect, try_own_effect
 from femsense.errors import InputError
 from femsense.loop import improve
 from femsense.robot import load_robot, save_robot
@@ -151,6 +151,22 @@ def test_a_function_that_fails_is_told_with_its_line(tmp_path, text, texts):
         applied(written(tmp_path, text), arm((2, 1, 1)), push_n=0.5)
     for part in texts:
         assert part in str(error.value)
+
+
+def test_an_effect_that_fails_or_does_not_vanish_is_told_before_anything_is_tried(tmp_path):
+    robot = arm((2, 1, 1))
+    for i, (text, said) in enumerate(
+        [
+            (DRAUGHT.replace("push_n / len", "push / len"), "forces fails"),
+            (DRAUGHT.replace("return result", "return result + 1.0"), "does not vanish at its null"),
+            (SOFTER.replace("1 + per_m", "2 + per_m"), "does not vanish at its null"),
+        ]
+    ):
+        (folder := tmp_path / str(i)).mkdir()
+        with pytest.raises(InputError, match=said):
+            try_own_effect(load_own_effect(written(folder, text)), robot)
+    try_own_effect(load_own_effect(written(tmp_path, DRAUGHT)), robot)
+    try_own_effect(load_own_effect(written(tmp_path, SOFTER)), robot)
 
 
 def test_entries_are_checked(tmp_path):

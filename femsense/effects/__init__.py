@@ -11,7 +11,7 @@ from femsense.effects.effect import Effect, Entry, Parameter, build_entry
 from femsense.effects.loads import GRAVITY, PAYLOAD
 from femsense.effects.material import CREEP, CREEP_TWICE, GENT, HYPERELASTIC, POISSON, SOFT_REGION, STIFFNESS
 from femsense.effects.observation import CLAMPED_MARKER, DEPTH_SCALE, MARKER_OFFSET
-from femsense.effects.own import find_own_file, load_own_effect
+from femsense.effects.own import find_own_file, load_own_effect, try_own_effect
 from femsense.effects.shape import DISCRETISATION, GEOMETRY
 from femsense.effects.support import BASE_COMPLIANCE, BASE_ROTATION
 from femsense.errors import InputError
@@ -63,4 +63,15 @@ def _own(entry: Mapping[str, Any], robot: Robot) -> Effect:
     return effect
 
 
-__all__ = ["EFFECTS", "FORMS", "Effect", "Entry", "Parameter", "apply_effects", "build_entry", "find_effect", "load_own_effect"]
+__all__ = [
+    "EFFECTS",
+    "FORMS",
+    "Effect",
+    "Entry",
+    "Parameter",
+    "apply_effects",
+    "build_entry",
+    "find_effect",
+    "load_own_effect",
+    "try_own_effect",
+]

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from femsense.arrays import FloatArray
-from femsense.effects.effect import Effect, Entry, Parameter
+from femsense.effects.effect import Effect, Entry, Parameter, build_entry
 from femsense.errors import FemsenseError, InputError
 from femsense.model import Robot
 
@@ -69,6 +69,37 @@ def load_own_effect(path: str | Path) -> Effect:
         lambda robot: tuple({"file": str(file), **seed} for seed in seeds),
         keys=("file", *keys),
     )
+
+
+def try_own_effect(effect: Effect, robot: Robot) -> None:
+    """Run an effect of a user once beside its null and once there, from each seed.
+
+    Raises:
+        InputError: where a function fails or gives something else, or where the effect does not vanish at its null.
+    """
+    parameters = effect.parameters(robot, "")
+    for seed in effect.seeds(robot):
+        effect.apply(robot, build_entry(parameters, [p.null + p.step for p in parameters], seed))
+        null = build_entry(parameters, [p.null for p in parameters], seed)
+        if not _is_same(effect.apply(robot, null), robot):
+            raise InputError(
+                "the effect does not vanish at its null", where=seed["file"], expected="no forces, the same robot, the same points",
+                found=", ".join(f"{p.key} = {null[p.key]}" for p in parameters if p.part in (None, 0)) + ", which changes the robot",
+                hint='say where it vanishes: "null" (docs/effects/own.md)',
+            )  # fmt: skip
+
+
+def _is_same(robot: Robot, other: Robot) -> bool:
+    """Return whether two robots carry, resist and are seen alike, as far as arrays show it."""
+    points = np.array([[0.0, 0.0, 0.5], [0.1, -0.1, 1.0]])
+    for correct in robot.observation.corrections[len(other.observation.corrections) :]:
+        if not np.allclose(correct(points), points, rtol=0.0, atol=1e-9):
+            return False
+    a, b = robot.body, other.body
+    if a.mesh is not b.mesh:
+        return True  # a change of the mesh is tried as a whole
+    pairs = [(a.dead_forces, b.dead_forces), (a.gravity, b.gravity), *zip(a.material.lame(), b.material.lame())]
+    return all(np.allclose(x, y, rtol=1e-9, atol=1e-12) for x, y in pairs)
 
 
 def find_own_file(entry: Mapping[str, Any], robot: Robot) -> Path:
@@ -198,4 +229,4 @@ def _correct(robot: Robot, function: Callable[..., Any], values: Mapping[str, An
 
 ACTIONS = {"forces": _add_forces, "change": _change, "correct": _correct}
 
-__all__ = ["find_own_file", "load_own_effect"]
+__all__ = ["find_own_file", "load_own_effect", "try_own_effect"]

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from femsense.calib.forward import Hypothesis, SceneJet
-from femsense.effects import EFFECTS, FORMS, Effect, find_effect, load_own_effect
+from femsense.effects import EFFECTS, FORMS, Effect, find_effect, load_own_effect, try_own_effect
 from femsense.errors import DataError, FemsenseError
 from femsense.loop.conclude import conclude
 from femsense.loop.data import MESH, Data, prepare
@@ -98,6 +98,8 @@ def improve(
     """
     say = progress or (lambda text: None)
     own = tuple(load_own_effect(file) for file in user_effects)
+    for effect in own:
+        try_own_effect(effect, robot)
     names = _names(effects, without, own)
     rng = np.random.default_rng(seed)
 
