@@ -22,7 +22,7 @@ import typer
 from typer.exceptions import TyperException
 
 import femsense
-from femsense.errors import FemsenseError
+from femsense.errors import FemsenseError, InputError
 
 T = TypeVar("T")
 STOPPED = 130
@@ -223,6 +223,14 @@ def improve(
     from femsense.summary import loop_text
 
     set_workers(workers)
+    if plan and recordings:
+        raise InputError(
+            "recordings are not asked with --plan",
+            where="--plan",
+            found=str(recordings[0]),
+            expected="ROBOT alone",
+            hint="--given RECORDING plans beside one that exists",
+        )
     if plan:
         with _progress("plan") as progress:
             return Answer(
@@ -508,8 +516,15 @@ def _places(texts: Sequence[str]) -> list[list[float]] | None:
 
 
 def _names(texts: Sequence[str] | None) -> list[str] | None:
-    """Return names that stand between commas or in options of their own; None where there are none."""
+    """Return names that stand between commas or in options of their own; None where there is no such option."""
     names = [name.strip() for text in texts or [] for name in text.split(",") if name.strip()]
+    if texts and not names:
+        raise InputError(
+            "no name",
+            where="--effects, --without",
+            found=", ".join(map(repr, texts)),
+            expected="names of effects, with commas between",
+        )
     return names or None
 
 

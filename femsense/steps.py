@@ -103,6 +103,9 @@ def improve_into(
     from femsense.loop import improve
 
     results.check_loop_folder(folder)
+    twice = {Path(path).resolve() for path in recordings} & {Path(path).resolve() for path in validation}
+    if twice:
+        raise InputError("a recording is fitted and judged on", where="--validation", found=str(min(twice)), expected="another recording", hint="without --validation whole sweeps are held out")  # fmt: skip
     body = load_robot(robot)
     train, test = [load_recording(path) for path in recordings], [load_recording(path) for path in validation]
     own = {str(file): file_hash(Path(file)) for file in user_effects if Path(file).is_file()}

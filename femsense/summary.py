@@ -142,6 +142,7 @@ def loop_text(document: Mapping[str, Any]) -> str:
     for title, said in (
         ("cannot be told apart", ", ".join(" / ".join(pair) for pair in _open_pairs(document))),
         ("not testable", ", ".join(map(_untestable, document.get("not_testable") or ()))),
+        ("would have been seen", _seen(document) if verdict == "none" else ""),
         ("next experiment", document.get("next_experiment")),
     ):
         if said:
@@ -162,14 +163,34 @@ def _untestable(effect: Mapping[str, Any]) -> str:
     return str(effect["name"]) + ("" if share is None else f" (calibration imitates {100 * share:.1f} % of it)")
 
 
+def _seen(document: Mapping[str, Any]) -> str:
+    """Return in one line from which size on effects that are testable, and were not found, would have been seen."""
+    hidden = {str(effect["name"]) for effect in document.get("not_testable") or ()}
+    words = []
+    for name, entry in (document.get("detectable") or {}).items():
+        sizes = list((entry.get("smallest") or {}).values())
+        if name in hidden or not sizes or entry.get("would_be_seen") is False:
+            continue
+        size = f"{max(sizes):.3g}" + ("" if entry.get("unit") in (None, "", "1") else f" {entry['unit']}")
+        said = {"factor": f"a factor of {size}", "softer_than": f"softer than {size}"}.get(str(entry.get("kind")), size)
+        words.append(f"{name} ({said})")
+    return ", ".join(words)
+
+
 def _left(left: Mapping[str, Any]) -> str:
-    """Return in one line how large the remaining residual is, where, and whether it has structure."""
+    """Return in one line how large the remaining residual is, where, when, what it goes with, and whether it has structure."""
     if left.get("rms_m") is None:
         return ""
-    words = [f"{1e3 * left['rms_m']:.3g} mm rms"]
+    words = [f"{1e3 * left['rms_m']:.3g} mm rms" + (" in held-out data" if left.get("held_out") else "")]
     marker = (left.get("where") or {}).get("marker")
     if marker:
         words.append(f"most at {marker}" if str(marker).startswith("surface ") else f"most at marker {marker}")
+    frame = (left.get("worst_frame") or {}).get("frame")
+    if frame is not None:
+        words.append(f"in frame {frame}")
+    goes = next((c for c in left.get("goes_with") or () if (c.get("p_holm") or 0.0) < 0.05), None)
+    if goes is not None:
+        words.append(f"going with {goes['covariate']}")
     tests = left.get("structure") or {}
     if "significant" in tests:
         words.append("with structure" if tests["significant"] else "without structure")

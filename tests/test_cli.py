@@ -346,12 +346,23 @@ def test_unknown_effects_are_refused_with_a_hint(run: Any, robot: Path, recordin
     assert said.status == 2 and "unknown effect" in said.err and not (tmp_path / "out").exists()
 
 
+def test_what_would_be_ignored_is_refused(run: Any, robot: Path, recording: Path, tmp_path: Path) -> None:
+    for options, text in (
+        (("--plan",), "recordings are not asked with --plan"),
+        (("-o", tmp_path / "out", "--validation", recording), "a recording is fitted and judged on"),
+        (("-o", tmp_path / "out", "--effects", ""), "no name"),
+        (("-o", tmp_path / "out", "--effects", "cable_slack"), "none of these effects can act here"),
+    ):
+        said = run("improve", robot, recording, *options)
+        assert said.status == 2 and text in said.err
+
+
 def test_an_effect_of_ones_own_that_is_not_there_is_said(run: Any, robot: Path, recording: Path, tmp_path: Path) -> None:
     said = run("improve", robot, recording, "-o", tmp_path / "out", "--user-effect", tmp_path / "magnet.py")
     assert said.status == 2 and "magnet.py: no such file" in said.err and not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize(("names", "parsed"), [(None, None), (["a,b"], ["a", "b"]), (["a", " b ,"], ["a", "b"]), ([""], None)])
+@pytest.mark.parametrize(("names", "parsed"), [(None, None), (["a,b"], ["a", "b"]), (["a", " b ,"], ["a", "b"])])
 def test_names(names: list[str] | None, parsed: list[str] | None) -> None:
     assert cli._names(names) == parsed
 

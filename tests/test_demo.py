@@ -101,6 +101,25 @@ def test_texts_name_what_matters(run: Run) -> None:
     assert "0.1234 ± 0.01\n" in text and "top 1 ± 0.5 N" in text and "2.500 → 0.400 mm" in text
 
 
+def test_what_would_have_been_seen_and_what_is_left_are_said_in_a_line() -> None:
+    sizes = {
+        "cable_gain": {"smallest": {"scale[a]": 1.02, "scale[b]": 1.05}, "kind": "factor", "unit": "1", "would_be_seen": True},
+        "payload": {"smallest": {"force_n[0]": 0.012}, "kind": "change", "unit": "N", "would_be_seen": True},
+        "base_compliance": {"smallest": {"stiffness_n_m": 340.0}, "kind": "softer_than", "unit": "N/m"},
+        "creep": {"smallest": {"fraction": 2.4}, "kind": "change", "unit": "1", "would_be_seen": False},
+        "gravity": {"smallest": {"vector_m_s2[2]": 1.0}, "kind": "change", "unit": "m/s²", "would_be_seen": True},
+        "hyperelastic": {"smallest": {}, "would_be_seen": True},
+    }
+    left = {"rms_m": 1e-3, "where": {"marker": "tip"}, "worst_frame": {"frame": 7}, "held_out": True,
+            "goes_with": [{"covariate": "time", "p_holm": 0.2}, {"covariate": "cable north", "p_holm": 0.01}]}  # fmt: skip
+    text = loop_text({"verdict": "none", "detectable": sizes, "not_testable": [{"name": "gravity"}], "left": left})
+    assert (
+        "would have been seen: cable_gain (a factor of 1.05), payload (0.012 N), base_compliance (softer than 340 N/m)\n" in text
+    )
+    assert text.endswith("what is left: 1 mm rms in held-out data, most at marker tip, in frame 7, going with cable north")
+    assert "would have been seen" not in loop_text({"verdict": "effects", "detectable": sizes})
+
+
 def test_a_frame_that_no_force_explains_is_said(run: Run) -> None:
     def text(*after_mm: float) -> str:
         one = next(frame for frame in run.frames if frame.status == "ok")

@@ -428,7 +428,8 @@ def _verdict_of(joint: list[dict[str, Any]]) -> str:
 
 def _why_not(c: Candidate, end: Candidate | None) -> str:
     if c.retained < TESTABLE:
-        return f"not testable: calibration imitates {100 * np.sqrt(max(0.0, 1 - c.retained**2)):.0f} % of it"
+        share = 100.0 * np.sqrt(max(0.0, 1.0 - c.retained**2))
+        return f"not testable: calibration imitates {'more than 99' if share > 99.0 else f'{share:.0f}'} % of it"
     if c.score > EVIDENCE and end is not None and end.score <= EVIDENCE:
         return f"nothing is left for it once what is named is in the model (dBIC {c.score:.0f}, then {end.score:.1f})"
     if c.score > EVIDENCE:
@@ -437,7 +438,8 @@ def _why_not(c: Candidate, end: Candidate | None) -> str:
 
 
 def _detectable(table: list[Candidate], found: set[str]) -> dict[str, Any]:
-    """Return for each effect that was not found the smallest size that would have been seen, in the unit of its parameter."""
+    """Return for each effect that was not found the smallest size that would have been seen, in the unit of its parameter, and whether any plausible
+    size would."""
     result: dict[str, Any] = {}
     for c in one_each(table):
         if c.effect.name in found:
@@ -447,7 +449,10 @@ def _detectable(table: list[Candidate], found: set[str]) -> dict[str, Any]:
             result[c.effect.name] = {"smallest": {}, "would_be_seen": bool(seen), "share_seen": float(c.smallest[0])}
             continue
         sizes = {p.label: own_size(float(s), p.scale) for p, s in zip(c.parameters, c.smallest)}
-        result[c.effect.name] = {"smallest": sizes, "kind": KINDS[c.parameters[0].scale], "unit": c.parameters[0].unit}
+        seen = any(s <= max(p.high - p.null, p.null - p.low) for p, s in zip(c.parameters, c.smallest))
+        result[c.effect.name] = {
+            "smallest": sizes, "kind": KINDS[c.parameters[0].scale], "unit": c.parameters[0].unit, "would_be_seen": bool(seen)
+        }  # fmt: skip
     return result
 
 
@@ -563,7 +568,8 @@ def _short(parameters: dict[str, Any]) -> str:
             return "[" + ", ".join(show(v) for v in value) + "]"
         return ", ".join(f"{k} {show(v)}" for k, v in value.items()) if isinstance(value, dict) else str(value)
 
-    return ", ".join(f"{k} {show(p['value'])}" + ("" if p["unit"] == "1" else f" {p['unit']}") for k, p in parameters.items())
+    said = {k: p for k, p in parameters.items() if k != "file"}
+    return ", ".join(f"{k} {show(p['value'])}" + ("" if p["unit"] == "1" else f" {p['unit']}") for k, p in said.items())
 
 
 def _card(data: Data, final: Stage, spread: dict[str, FloatArray], noise: Noise, n_effective: float) -> dict[str, Any]:

@@ -19,7 +19,7 @@ import numpy as np
 
 from femsense.calib.forward import Hypothesis, SceneJet
 from femsense.effects import EFFECTS, FORMS, Effect, find_effect, load_own_effect, try_own_effect
-from femsense.errors import DataError, FemsenseError
+from femsense.errors import DataError, FemsenseError, InputError
 from femsense.loop.conclude import conclude
 from femsense.loop.data import MESH, Data, prepare
 from femsense.loop.elements import need_quadratic, seeks_with_quadratic, with_quadratic
@@ -101,6 +101,7 @@ def improve(
     for effect in own:
         try_own_effect(effect, robot)
     names = _names(effects, without, own)
+    _require_one_that_acts(names if effects else [], own, robot, recordings)
     rng = np.random.default_rng(seed)
 
     def ready(body: Robot, names: Sequence[str]) -> Ready:
@@ -381,6 +382,17 @@ def _names(effects: Sequence[str] | None, without: Sequence[str] | None, own: Se
             find_effect(name)
     chosen = [*(e.name for e in EFFECTS), *mine] if effects is None else list(effects)
     return [name for name in chosen if name not in (without or [])]
+
+
+def _require_one_that_acts(names: Sequence[str], own: Sequence[Effect], robot: Robot, recordings: Sequence[Recording]) -> None:
+    """Raise InputError where none of the effects that are asked for can act in the recordings: nothing would be tried then."""
+    asked = [effect for effect in (*EFFECTS, *own) if effect.name in names]
+    drives = sorted({r.actuation for r in recordings})
+    if asked and not any(effect.discrete or effect.parameters(robot, control) for effect in asked for control in drives):
+        raise InputError(
+            "none of these effects can act here", where="effects", found=", ".join(names),
+            expected=f"effects of a robot that is driven by {' or '.join(drives)} (docs/effects/)",
+        )  # fmt: skip
 
 
 def _tells_apart(data: Data) -> bool:
