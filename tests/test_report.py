@@ -15,12 +15,12 @@ from helpers import block_mesh, changed, write_block_robot
 
 from femsense import steps
 from femsense.errors import InputError
-from femsense.report import words, write_report
+from femsense.report import loop, loop_figures, words, write_report
 from femsense.report.compare import load_error
 from femsense.report.documents import KnownLoad
-from femsense.report.drawing import VIEWS, best_view, nice, skin
+from femsense.report.drawing import VIEWS, Key, best_view, body_height, frame_body, new_axes, new_panels, nice, skin
 from femsense.report.loop import recovered
-from femsense.report.loop_tables import smallest_words
+from femsense.report.loop_tables import is_beyond, smallest_words
 
 MARKERS = {"tip": [0.1, 0.015, 0.03], "middle": [0.05, 0.015, 0.03], "stalk": [0.1, 0.015, 0.05]}
 SENTENCE = "The model lacks gravity (vector_m_s2 [0.1, 0.02, -9.7] m/s²); held-out error 2.04 mm before, 0.17 mm after."
@@ -320,15 +320,15 @@ def test_a_loop_shows_its_sentence_and_its_ten_items_with_their_numbers(tmp_path
         "3. Error on held-out data", "72 measurements of 3 markers", "the error fell in 24 of 24 held-out frames", "The error fell in 2 of 2 held-out sweeps",
         "4. Effects", "vector_m_s2 (0.10 ± 0.30, 0.02 ± 0.25, −9.70 ± 0.12) m/s² 2.04 mm 0.310 mm", "coefficient 0.210 ± 0.015 0.310 mm 0.173 mm",
         "law capstan", "scale top 1.0310 ± 0.0040 – –", "scale side 0.985", "−9.70 ± 0.12) m/s² in [−12, 12] m/s² 5321 5290 42.0 ± 8.0 83 % 97 % named: part of the improved model",
-        "force_n[0] 0.120 ± 0.010 N in [−20, 20] N 4100 4070 – 40 % 3 % rival: passes all tests too", "poisson_ratio in [0.050, 0.50] 1.50 × 10⁻⁵ −7.40 – 5 % – not testable: calibration imitates 97 % of it",
+        "force_n[0] 0.120 ± 0.010 N in [−20, 20] N 4100 4070 – 40 % 3 % rival: passes all tests too", "poisson_ratio in [0.050, 0.50] 0 −7.40 – 5 % – not testable: calibration imitates 97 % of it",
         "5. What these data cannot say", "gravity and payload: their evidence differs by a ΔBIC of 3.2 only", "leave the same trace (agreement 97.2 %)", "poisson: calibration imitates 97 % of it",
         "Next experiment: turn the base by 90°", "How much of the trace of the effect on the left the effect below imitates",
         "6. What calibration had taken up", "Camera turned, recording 2 – 0 (0.0573 ± 0.0011, 0.1146 ± 0.0011, −0.0573 ± 0.0011) °", "Camera shifted, recording 1 – 0 (1.000 ± 0.020,",
         "Initial input of top – 0.310 ± 0.020 N 0.400 ± 0.030 N 0.300 N", "stiffness: scale 1.00 – 0.800 ± 0.010 1.010 ± 0.012",
         "7. Tests, and what is left", "neighbouring states are alike p = 0.0020 p = 0.31", "Any structure (1 %, Holm) yes no", "F = 31, p = 1.0 × 10⁻⁹ (40, 12 degrees of freedom; repeats differ by 0.200 mm) not testable",
         "most at marker tip, mean (0.0100, −0.0200, 0.0600) mm", "most in frame 17, 0.290 mm", "none seen beyond noise (correlation of neighbouring states 0.050, smallest p = 0.31)", "unloading −0.41 0.030 0.15",
-        "8. Smallest effects that would have been seen", "poisson_ratio 0.031", "scale a change of 22 %", "radius_m 2.0 mm", "softer than 10000 N/m", "0.10 mm … 0.30 mm (9 parameters)",
-        "stiffness_n_m cannot be seen", "or softening with stretch would have been seen", "would have to be 3.0 times as large",
+        "8. Smallest effects that would have been seen", "the right Poisson ratio not testable soft_region", "scale a change of 22 %", "radius_m a change of 2.0 mm", "softer than 10000 N/m", "a change of 0.10 mm … 0.30 mm (9 parameters)",
+        "stiffness_n_m cannot be seen", "or softening with stretch would have been seen", "too small to be seen here: its whole change would have to be 3.00 times as large",
         "9. Data", "Split, recording 1 (first) 2 of 6 sweeps", "0–3, 7 (5)", "touched, load not declared: 4–6 (3)", "no markers: 9 (1)", "Frames left out, 2 none", "Stray markers left out tip in frame 4, stalk in frame 9", "reached again the same way) 2",
         "each measurement by itself 0.080 mm", "restricted maximum likelihood, with repeats", "Error of the mesh, at the markers 0.050 mm", "Fitted along: stiffness scale 1.113 ± 0.012", "Seed 0", "femsense 0.1.0, numpy 2.0", "Recording 1 first abcdabcdabcdabcd",
         "10. What it means for forces", "in held-out frames", "0.14 N (19.0 %) with the declared robot, calibrated; 10 mN (1.5 %) with the improved one".replace("10 mN", "0.010 N"),
@@ -350,10 +350,14 @@ def test_what_no_effect_explains_is_shown_where_it_acts(tmp_path: Path) -> None:
     }  # fmt: skip
     page = report(write_loop_folder(tmp_path, verdict="unexplained", effects=[], left=left))
     expect(
-        page, "91 % of it there lies along (0, 0.60, 0.80)", "most in frame 17, 2.00 mm rms, then in 18.", "8 % of the frames hold half", "took away 32 %",
+        page, "91 % of it there lies along (0, 0.60, 0.80)", "most in frame 17, 2.00 mm rms, then in 18.", "8 % of the frames hold half",
         "the residual is not mere noise", "known load 0.70 0.00010 0.0010", "Not evidence: the smallest forces on the surface", "they explain 93 % of it", "Together they make (0, 0, −100) mN.",
     )  # fmt: skip
-    assert len(page.all("img")) == 10
+    assert len(page.all("img")) == 10 and "took away" not in page.text
+    expect(
+        report(write_loop_folder(tmp_path / "some", left=left)),
+        "The effects took away 32 % of the squared residual beyond the noise.",
+    )
     calm = report(write_loop_folder(tmp_path / "calm", verdict="none", effects=[]))
     assert "Not evidence" not in calm.text
 
@@ -626,10 +630,21 @@ def test_numbers(value: Any, text: str) -> None:
         (1.25e-3, 8e-5, "m", "1.250 ± 0.080 mm"), (320e3, 12e3, "Pa", "320 ± 12 kPa"), (0.21, None, "1", "0.210"), (None, 1.0, "N", "–"),
         (5000.0, 300.0, "N/m", "5000 ± 300 N/m"), ([1e-3, None, -2e-3], [1e-4, 1e-4, None], "m", "(1.00 ± 0.10, –, −2.00) mm"), ("capstan", None, "1", "capstan"),
         (1e-9, 1e-10, "s", "1.00 × 10⁻⁹ ± 1.0 × 10⁻¹⁰ s"), (0.3, 0.0, "N", "0.300 N"),
+        (4.18394e14, 1.28e25, "N/m", "4.18 × 10¹⁴ ± 1.3 × 10²⁵ N/m"), (-2e-15, 2e-3, "1", "0.0000 ± 0.0020"),
     ],
 )  # fmt: skip
 def test_values_with_deviations(value: Any, std: Any, unit: str, text: str) -> None:
     assert words.parameter(value, std, unit).replace("\u00a0", " ") == text
+
+
+def test_nearly_the_whole_is_not_rounded_up_to_it() -> None:
+    shares = [words.nearly(v).replace("\u00a0", " ") for v in (0.9, 0.989, 0.9996, 1.0, None)]
+    assert shares == ["90 %", "99 %", "more than 99 %", "more than 99 %", "–"]
+    assert words.nearly(0.9996, 1).replace("\u00a0", " ") == "more than 99.9 %"
+
+
+def test_rounding_is_no_evidence() -> None:
+    assert [words.statistic(v) for v in (3.41e-12, -9e-12, 0.0057, -8.7, None)] == ["0", "0", "0.00570", "−8.70", "–"]
 
 
 def test_what_was_recovered_counts_squares_above_the_noise() -> None:
@@ -640,10 +655,96 @@ def test_what_was_recovered_counts_squares_above_the_noise() -> None:
 
 @pytest.mark.parametrize(
     ("size", "kind", "unit", "text"),
-    [(1.11, "factor", "1", "a change of 11 %"), (2.7, "factor", "1", "a factor of 2.7"), (1e3, "softer_than", "N/m", "softer than 1000 N/m"), (2e-3, "change", "m", "2.0 mm"), (None, "change", "m", "cannot be seen")],
+    [(1.11, "factor", "1", "a change of 11 %"), (2.7, "factor", "1", "a factor of 2.7"), (1e3, "softer_than", "N/m", "softer than 1000 N/m"), (2e-3, "change", "m", "a change of 2.0 mm"), (None, "change", "m", "cannot be seen")],
 )  # fmt: skip
 def test_smallest_sizes_in_words(size: float | None, kind: str, unit: str, text: str) -> None:
     assert smallest_words(size, kind, unit).replace("\u00a0", " ") == text
+
+
+@pytest.mark.parametrize(
+    ("size", "kind", "ends", "beyond"),
+    [
+        (1.3, "change", [0.05, 0.4995], True), (0.22, "change", [0.05, 0.4995], False), (11.0, "factor", [0.5, 5.0], True), (3.7, "factor", [0.1, 5.0], False),
+        (0.1, "softer_than", [0.2, None], True), (0.9, "softer_than", [0.2, None], False), (9.0, "change", [], False), (9.0, "change", [0.0, None], False),
+    ],
+)  # fmt: skip
+def test_a_change_beyond_what_is_plausible(size: float, kind: str, ends: list[float | None], beyond: bool) -> None:
+    assert is_beyond(size, kind, ends) == beyond
+
+
+def test_sizes_that_are_not_plausible_cannot_be_seen(tmp_path: Path) -> None:
+    seen = {"smallest": {"poisson_ratio": 0.031}, "would_be_seen": False}
+    many = {"smallest": {f"offset_m[{i}]": 1e-3 * (i + 1) for i in range(7)}, "unit": "m", "would_be_seen": False}
+    page = report(
+        write_loop_folder(tmp_path, not_testable=[], detectable={"poisson": seen, "marker_offset": many}, evidence__power={})
+    )
+    expect(
+        page,
+        "poisson_ratio too small to be seen here: it would take a change of 0.031",
+        "too small to be seen here (a change of 1.0 mm … 7.0 mm (7 parameters))",
+    )
+    plausible = {"poisson": {"smallest": {"poisson_ratio": 0.6}}}
+    page = report(write_loop_folder(tmp_path / "range", not_testable=[], detectable=plausible, evidence__power={}))
+    expect(page, "poisson_ratio too small to be seen here: it would take a change of 0.60")
+
+
+def test_verdicts_have_the_names_of_the_columns(tmp_path: Path) -> None:
+    page = report(write_loop_folder(tmp_path, candidates__1__verdict="too little evidence (dBIC -8.1)"))
+    expect(page, "excluded: too little evidence (ΔBIC −8.1)")
+
+
+# What is written in pictures
+
+
+def boxes(figure: Any) -> list[Any]:
+    """Return where the texts of a figure stand, each with its place [pixel]; checks that they lie in the figure."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    renderer = FigureCanvasAgg(figure).get_renderer()
+    figure.draw_without_rendering()
+    texts = [t for axes in figure.axes for t in (*axes.texts, axes.title, axes._left_title) if t.get_text().strip()]
+    found = [(t.get_text(), t.get_window_extent(renderer)) for t in texts]
+    for text, box in found:
+        assert figure.bbox.x0 <= box.x0 < box.x1 <= figure.bbox.x1 and figure.bbox.y0 <= box.y0 < box.y1 <= figure.bbox.y1, text
+    return found
+
+
+def check_apart(figure: Any) -> None:
+    """Check that no two texts of a figure are printed over each other."""
+    found = boxes(figure)
+    assert [(a, b) for i, (a, one) in enumerate(found) for b, other in found[:i] if one.overlaps(other)] == []
+
+
+@pytest.mark.parametrize("high", [(20.0, 200.0), (100.0, 100.0), (200.0, 20.0)])
+@pytest.mark.parametrize("cameras", [0, 1, 2])
+@pytest.mark.parametrize("panels", [False, True])
+def test_keys_below_a_body_stand_apart(high: tuple[float, float], cameras: int, panels: bool) -> None:
+    low, corner = np.zeros(2), np.array(high)
+    if panels:
+        figure, grid = new_panels(2, 3, width=9.4, height=2 * body_height(low, corner, width=9.4 / 3, most=4.7))
+    else:
+        figure, axes = new_axes(height=body_height(low, corner))
+        grid = [[axes]]
+    ways = [np.array([0.0, 0.0, -1.0]), np.array([0.0, 1.0, 0.0])][:cameras]
+    for axes in (axes for line in grid for axes in line):
+        frame_body(axes, VIEWS[0], low, corner, key=Key(20.0, "0.5 mm residual", "red"), cameras=ways)
+        axes.set_title("before, max (frame 127)\n12.34 mm", fontsize=9.5, fontweight="bold")
+    check_apart(figure)
+
+
+def test_pictures_of_residuals_have_one_scale_and_texts_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    figures: list[Any] = []
+    for module in (loop_figures, loop):
+        monkeypatch.setattr(module, "as_image", lambda figure, **_: figures.append(figure))
+    write_report(write_loop_folder(tmp_path))
+    bodies = [figure for figure in figures if any("residual" in t.get_text() for t in figure.axes[0].texts)]
+    assert [len(figure.axes) for figure in bodies] == [1, 1, 6]
+    for figure in bodies:
+        check_apart(figure)
+        sizes = np.array([axes.get_position().size for axes in figure.axes])
+        np.testing.assert_allclose(sizes, sizes[[0]].repeat(len(sizes), axis=0), rtol=0.01)
+    one, two = (figure.axes[0].get_position().size for figure in bodies[:2])
+    np.testing.assert_allclose(one, two, rtol=0.01)
 
 
 def test_the_error_at_known_loads_is_the_median_of_its_size() -> None:

@@ -84,6 +84,7 @@ class Detectable(Document):
     smallest: dict[str, Number] = Field(default_factory=dict)
     kind: str = "change"
     unit: str = "1"
+    would_be_seen: bool | None = None
 
 
 class Covariate(Document):

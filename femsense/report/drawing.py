@@ -23,6 +23,8 @@ WIDTH, HEIGHT = 4.5, 3.0
 SIZE = 9.5
 MANY = 1500
 """So many points are drawn as pixels."""
+ROW, SIGN = 15.0, 36.0
+"""Heights below a body [pt]: of a line of text, and of the arrows that say where things point."""
 BODY = np.array([0.80, 0.84, 0.89])
 
 
@@ -104,29 +106,12 @@ def new_panels(rows: int, columns: int, *, width: float, height: float) -> tuple
     return figure, [list(line) for line in grid]
 
 
-def arrow_options(width: float = 0.0075) -> dict[str, Any]:
-    """Return how arrows in units of the axes are drawn."""
+def arrow_options(width: float = 0.018) -> dict[str, Any]:
+    """Return how arrows in units of the axes are drawn, their shafts so wide [inch]."""
     return {
-        "angles": "xy", "scale_units": "xy", "scale": 1.0, "width": width, "headwidth": 3.6, "headlength": 4.2, "headaxislength": 3.8,
+        "angles": "xy", "scale_units": "xy", "scale": 1.0, "units": "inches", "width": width, "headwidth": 3.6, "headlength": 4.2, "headaxislength": 3.8,
         "minlength": 0.2, "zorder": 5,
     }  # fmt: skip
-
-
-def draw_camera(axes: Any, view: View, directions: Sequence[FloatArray], low: FloatArray, high: FloatArray) -> None:
-    """Draw which way the cameras look, below the body where `frame_body` leaves room [mm]; across the page as a ring with a dot
-    (to the eye) or a cross."""
-    margin = 0.04 * float((high - low).max())
-    for i, direction in enumerate(directions[:2]):
-        at = np.array([high[0] - (0.8 + 5.0 * i) * margin, low[1] - 1.4 * margin])
-        flat = view.flat(direction)
-        if float(np.linalg.norm(flat)) > 0.35:
-            tip, tail = at + 1.3 * margin * flat, at - 1.3 * margin * flat
-            axes.annotate("", xy=tuple(tip), xytext=tuple(tail), arrowprops={"arrowstyle": "-|>", "color": INK, "linewidth": 1.1, "shrinkA": 0, "shrinkB": 0})  # fmt: skip
-        else:
-            axes.plot([at[0]], [at[1]], "o", color="white", markeredgecolor=INK, markersize=8)
-            axes.plot([at[0]], [at[1]], "." if float(direction @ view.towards) > 0 else "x", color=INK, markersize=4)
-        name = "camera" if len(directions) == 1 else f"camera {i + 1}"
-        axes.text(at[0] + 0.8 * margin, at[1] - 1.6 * margin, name, ha="right", va="top", fontsize=SIZE - 0.5, color=INK)
 
 
 def name_axes(axes: Any, x: str, y: str) -> None:
@@ -171,32 +156,104 @@ def draw_body(axes: Any, surface: Surface, view: View) -> None:
     )
 
 
-def frame_body(axes: Any, view: View, low: FloatArray, high: FloatArray, *, corner: bool = True) -> None:
-    """Show a rectangle [mm] with equal scales, without axes, and with a cross of the directions and a scale bar below it."""
-    size = high - low
-    margin = 0.04 * float(size.max())
-    bar = nice(0.3 * float(size.max()))
-    y = low[1] - 1.4 * margin
-    axes.plot([low[0], low[0] + bar], [y, y], color=INK, linewidth=2, solid_capstyle="butt")
-    axes.text(low[0] + bar / 2, y - 0.6 * margin, f"{bar:g} mm", ha="center", va="top", fontsize=SIZE - 0.5, color=INK)
-    axes.set(xlim=(low[0] - margin, high[0] + margin), ylim=(y - 4.0 * margin, high[1] + margin))
-    axes.set_aspect("equal")
+@dataclass(frozen=True, slots=True)
+class Key:
+    """A length that is explained below a body."""
+
+    length_mm: float
+    text: str
+    color: str
+    width: float | None = 0.018
+    """Of the shaft of its arrow [inch]; None for a bar."""
+
+
+def body_height(low: FloatArray, high: FloatArray, *, width: float = WIDTH, most: float = 4.9) -> float:
+    """Return how high a picture of a rectangle with its title and keys is [inch], where it takes the whole width."""
+    across, up = high - low + 0.08 * float((high - low).max())
+    return min(most, float((width - 0.1) * up / across) + (2 * ROW + SIGN) / 72.0 + 0.6)
+
+
+def frame_body(
+    axes: Any, view: View, low: FloatArray, high: FloatArray, *, key: Key | None = None, cameras: Sequence[FloatArray] = (), corner: bool = True
+) -> None:  # fmt: skip
+    """Show a rectangle [mm] with equal scales, without axes. Below it stand, each in a line of its own, a scale bar, the key, and which way the
+    cameras look, or else (where `corner`) the axes of the robot frame."""
+    margin = 0.04 * float((high - low).max())
+    axes.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin))
     axes.axis("off")
-    if corner:
-        _cross(axes, view, np.array([high[0] - 3.0 * margin, y - 2.6 * margin]), 2.2 * margin)
+    bar = nice(0.3 * float((high - low).max()))
+    keys = [Key(bar, f"{bar:g} mm", INK, None), *([key] if key else [])]
+    for i, one in enumerate(keys):
+        _draw_key(axes, one, low[0], (i + 0.5) * ROW)
+    below = len(keys) * ROW
+    if len(cameras):
+        _draw_cameras(axes, view, cameras, low[0], below)
+    elif corner:
+        _draw_cross(axes, view, low[0], below)
+    room = _below(axes, 0.0, below + SIGN)  # the same in all pictures, whatever stands there
+    axes.plot([low[0]], [0.0], "o", color="none", markersize=1, transform=room, clip_on=False)
+    axes.dataLim.set_points(axes.viewLim.get_points())
+    axes.set_autoscale_on(True)  # limits may be widened
+    axes.set_aspect("equal", adjustable="datalim")  # widens what is shown: the layout knows nothing of a box that shrinks
 
 
-def _cross(axes: Any, view: View, at: FloatArray, size: float) -> None:
-    """Draw which way the axes of the robot frame point."""
-    for name, (dx, dy) in zip(view.axes, ((1.0, 0.0), (0.0, 1.0))):
-        tip = at + size * np.array([dx, dy])
-        axes.annotate(
-            "",
-            xy=tuple(tip),
-            xytext=tuple(at),
-            arrowprops={"arrowstyle": "->", "color": SOFT, "linewidth": 0.9, "shrinkA": 0, "shrinkB": 0},
+def _below(axes: Any, right: float, down: float) -> Any:
+    """Return the transform from x [mm] and a height to so many points right of and below the lower edge of the axes."""
+    from matplotlib.transforms import ScaledTranslation, blended_transform_factory
+
+    edge = blended_transform_factory(axes.transData, axes.transAxes)
+    return edge + ScaledTranslation(right / 72.0, -down / 72.0, axes.figure.dpi_scale_trans)
+
+
+def _draw_key(axes: Any, key: Key, x: float, down: float) -> None:
+    """Draw a bar or an arrow of the length of a key from x [mm], with its text on the right."""
+    line = _below(axes, 0.0, down)
+    if key.width is None:
+        axes.plot([x, x + key.length_mm], [0.0, 0.0], color=key.color, linewidth=2, solid_capstyle="butt", transform=line, clip_on=False)  # fmt: skip
+    else:
+        axes.quiver(
+            [x], [0.0], [key.length_mm], [0.0], color=key.color, transform=line, clip_on=False, **arrow_options(key.width)
         )
-        axes.text(*(at + 1.35 * size * np.array([dx, dy])), name, ha="center", va="center", fontsize=SIZE - 1, color=SOFT)
+    _write(axes, x + key.length_mm, 6.0, down, key.text)
+
+
+def _write(
+    axes: Any, x: float, right: float, down: float, text: str, *, color: str = INK, size: float = SIZE - 0.5, ha: str = "left"
+) -> None:
+    axes.text(x, 0.0, text, transform=_below(axes, right, down), ha=ha, va="center_baseline", fontsize=size, color=color)
+
+
+def _draw_cameras(axes: Any, view: View, directions: Sequence[FloatArray], x: float, down: float) -> None:
+    """Draw which way the cameras look, beside each other; across the page as a ring with a dot (to the eye) or a cross."""
+    middle = down + 0.5 * SIGN
+    for i, direction in enumerate(directions[:2]):
+        right = 12.0 + 72.0 * i
+        flat = 11.0 * view.flat(direction)
+        if float(np.linalg.norm(flat)) > 0.35 * 11.0:
+            _draw_way(axes, x, (right - flat[0], middle + flat[1]), (right + flat[0], middle - flat[1]), "-|>", INK, 1.1)
+        else:
+            place = _below(axes, right, middle)
+            axes.plot([x], [0.0], "o", color="white", markeredgecolor=INK, markersize=8, transform=place, clip_on=False)
+            inner = "." if float(direction @ view.towards) > 0 else "x"
+            axes.plot([x], [0.0], inner, color=INK, markersize=4, transform=place, clip_on=False)
+        _write(axes, x, right + 16.0, middle, "camera" if len(directions) == 1 else f"camera {i + 1}")
+
+
+def _draw_cross(axes: Any, view: View, x: float, down: float) -> None:
+    """Draw which way the axes of the robot frame point."""
+    foot = (5.0, down + SIGN - 9.0)
+    for name, (dx, dy) in zip(view.axes, ((1.0, 0.0), (0.0, 1.0))):
+        _draw_way(axes, x, foot, (foot[0] + 14.0 * dx, foot[1] - 14.0 * dy), "->", SOFT, 0.9)
+        _write(axes, x, foot[0] + 19.5 * dx, foot[1] - 19.5 * dy, name, color=SOFT, size=SIZE - 1, ha="center")
+
+
+def _draw_way(
+    axes: Any, x: float, start: tuple[float, float], end: tuple[float, float], style: str, color: str, width: float
+) -> None:
+    """Draw an arrow between two places, each so many points right of x [mm] and below the axes."""
+    tail, tip = (_below(axes, *place) for place in (start, end))
+    arrow = {"arrowstyle": style, "color": color, "linewidth": width, "shrinkA": 0, "shrinkB": 0}
+    axes.annotate("", xy=(x, 0.0), xycoords=tip, xytext=(x, 0.0), textcoords=tail, arrowprops=arrow, annotation_clip=False)
 
 
 def draw_bars(names: Sequence[str], values_mm: Sequence[float], unit: str, *, color: str = AFTER) -> Any:

@@ -21,15 +21,16 @@ from femsense.report.drawing import (
     PALE,
     SIZE,
     SOFT,
+    Key,
     Surface,
     View,
     add_legend,
     arrow_options,
     as_image,
     best_view,
+    body_height,
     draw_bars,
     draw_body,
-    draw_camera,
     frame_body,
     name_axes,
     new_axes,
@@ -98,7 +99,7 @@ def loop_chapter(file: Path, title: str) -> Chapter:
         section("5. What these data cannot say", _open_questions(loop, evidence)),
         section("6. What calibration had taken up", calibration_table(evidence.calibration)),
         section("7. Tests, and what is left", tests_table(evidence.tests), _left(loop, evidence, rest)),
-        section("8. Smallest effects that would have been seen", power_table(loop.detectable, evidence.power)),
+        section("8. Smallest effects that would have been seen", power_table(loop, evidence)),
         section("9. Data", data_card(loop)),
         section("10. What it means for forces", forces_part(evidence.forces)),
     )  # fmt: skip
@@ -238,8 +239,7 @@ def _quiver(
     reach: tuple[FloatArray, FloatArray], color: str, title: str, cameras: Sequence[FloatArray],
 ) -> Any:  # fmt: skip
     low, high = reach
-    height = float(np.clip(4.2 * (high[1] - low[1]) / (high[0] - low[0]) + 0.9, 1.9, 4.4))
-    figure, axes = new_axes(height=height)
+    figure, axes = new_axes(height=body_height(low, high))
     draw_body(axes, surface, view)
     step = max(1, len(single[0]) // SPOTS)
     tips = 1e3 * view.flat(single[0] + factor * single[1])[::step]
@@ -247,14 +247,8 @@ def _quiver(
     seats = 1e3 * view.flat(mean[0])
     axes.plot(*seats.T, "o", color="white", markeredgecolor=INK, markeredgewidth=0.8, markersize=3.5)
     axes.quiver(*seats.T, *(1e3 * factor * view.flat(mean[1])).T, color=color, **arrow_options())
-    with_camera = title == "before" and len(cameras) > 0
-    frame_body(axes, view, low, high, corner=not with_camera)
-    if with_camera:
-        draw_camera(axes, view, cameras, low, high)
-    bottom, margin = low[1], 0.04 * float((high - low).max())
-    start = low[0] + 0.42 * (high[0] - low[0])
-    axes.quiver([start], [bottom - 1.4 * margin], [1e3 * factor * key], [0.0], color=color, **arrow_options())
-    axes.text(start, bottom - 2.0 * margin, f"{1e3 * key:g} mm residual", ha="left", va="top", fontsize=SIZE - 0.5, color=INK)
+    explained = Key(1e3 * factor * key, f"{1e3 * key:g} mm residual", color)
+    frame_body(axes, view, low, high, key=explained, cameras=cameras if title == "before" else ())
     axes.set_title(title, fontsize=SIZE + 1, color=color, loc="left", fontweight="bold")
     return figure
 
@@ -368,8 +362,7 @@ def _open_questions(loop: Loop, evidence: Evidence) -> Html | None:
     ]
     others = [" / ".join(r.pair) for r in loop.confounded if names and not names & set(r.pair)]
     hidden = [
-        element("span", code(u.name), f": calibration imitates {words.percent(u.absorbed_share)} of it")
-        for u in loop.not_testable
+        element("span", code(u.name), f": calibration imitates {words.nearly(u.absorbed_share)} of it") for u in loop.not_testable
     ]
     experiment = loop.next_experiment
     advice = paragraph(element("strong", "Next experiment: "), experiment, class_="next") if experiment else None
@@ -386,7 +379,7 @@ def _why_alike(rivals: Rivals) -> str:
     if words.known(rivals.dbic_gap):
         return f"their evidence differs by a ΔBIC of {words.number(rivals.dbic_gap, 2)} only"
     if words.known(rivals.absorbed_share):
-        return f"calibration imitates {words.percent(rivals.absorbed_share, 1)} of the second, most of it by the first"
+        return f"calibration imitates {words.nearly(rivals.absorbed_share, 1)} of the second, most of it by the first"
     if words.known(rivals.cosine):
         return f"they leave the same trace (agreement {words.percent(rivals.cosine, 1)})"
     return "these data do not tell which it is"
@@ -405,10 +398,13 @@ def _left(loop: Loop, evidence: Evidence, surface: Surface | None) -> Html | Non
     goes = table(headers, rows, caption="What the size of the residual of a frame goes with.", numeric=(1, 2, 3))
     structured = left.structure.significant or (loop.verdict == "unexplained" and not left.held_out)
     field = force_field(evidence.equivalent_forces, surface) if structured else None
-    return together(bullets(_left_facts(left)), panels(goes, _marker_bars(left.marker_rms_m), field)) or None
+    return (
+        together(bullets(_left_facts(left, effects=bool(loop.effects))), panels(goes, _marker_bars(left.marker_rms_m), field))
+        or None
+    )
 
 
-def _left_facts(left: Left) -> list[str]:
+def _left_facts(left: Left, *, effects: bool) -> list[str]:
     facts = []
     if words.known(left.rms_m):
         facts.append(f"Size: {words.length(left.rms_m)} rms on the {'held-out' if left.held_out else 'fitted'} data.")
@@ -426,7 +422,7 @@ def _left_facts(left: Left) -> list[str]:
         facts.append(f"When: most in frame {left.worst_frame.frame}, {words.length(left.worst_frame.rms_m)} rms{more}.")
     if words.known(left.half_in_frames):
         facts.append(f"How spread: {words.percent(left.half_in_frames)} of the frames hold half of the squared residual.")
-    if words.known(left.explained_share):
+    if effects and words.known(left.explained_share):
         facts.append(f"The effects took away {words.percent(left.explained_share)} of the squared residual beyond the noise.")
     if words.known(left.structure.p_value):
         facts.append(f"Structure: {_structure_words(left.structure)}.")

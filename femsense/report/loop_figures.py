@@ -20,14 +20,15 @@ from femsense.report.drawing import (
     SERIES,
     SIZE,
     SOFT,
+    Key,
     Surface,
     add_legend,
     arrow_options,
     as_image,
     best_view,
+    body_height,
     clipped,
     draw_body,
-    draw_camera,
     frame_body,
     name_axes,
     new_axes,
@@ -64,23 +65,23 @@ def residual_in_frames(pictures: Pictures, rest: Surface | None) -> Html | None:
     tips = np.vstack([m + (factor - 1.0) * r for part in fields.values() for m, r in zip(measured, part)])
     corners = 1e3 * np.vstack([view.flat(everything), view.flat(tips)])
     low, high = corners.min(axis=0), corners.max(axis=0)
-    span = high - low
-    height = float(np.clip(2 * (3.1 * span[1] / span[0] + 0.75), 3.2, 8.0))
-    figure, grid = new_panels(2, len(shown), width=9.4, height=height)
+    width = 9.4
+    height = 2 * body_height(low, high, width=width / len(shown), most=4.7)
+    figure, grid = new_panels(2, len(shown), width=width, height=height)
+    seen = [np.asarray(c.axis, float) for c in pictures.cameras]
     for row, (name, color) in enumerate((("before", BEFORE), ("after", AFTER))):
+        key = Key(1e3 * factor * nice(largest), f"{1e3 * nice(largest):g} mm residual", color, 0.014)
         for column, (snapshot, shape, places) in enumerate(zip(shown, shapes, measured)):
             axes, r = grid[row][column], fields[name][column]
             if shape is not None:
                 draw_body(axes, shape, view)
             foot = 1e3 * view.flat(places - r)
             axes.plot(*foot.T, "o", color="white", markeredgecolor=INK, markeredgewidth=0.7, markersize=2.8)
-            axes.quiver(*foot.T, *(1e3 * factor * view.flat(r)).T, color=color, **arrow_options(0.009))
-            frame_body(axes, view, low, high, corner=column == 0 and (row == 1 or not pictures.cameras))
-            _arrow_key(axes, low, high, factor, nice(largest), color)
-            title = f"{name}, {snapshot.title} (frame {snapshot.frame}): {1e3 * float(np.sqrt((r**2).sum(axis=1).mean())):.2f} mm"
-            axes.set_title(title, fontsize=SIZE, color=color, loc="left", fontweight="bold")
-            if row == 0 and column == 0:
-                draw_camera(axes, view, [np.asarray(c.axis, float) for c in pictures.cameras], low, high)
+            axes.quiver(*foot.T, *(1e3 * factor * view.flat(r)).T, color=color, **arrow_options(0.014))
+            cameras = seen if row == column == 0 else []
+            frame_body(axes, view, low, high, key=key, cameras=cameras, corner=column == 0)
+            title = f"{name}, {snapshot.title} (frame {snapshot.frame})\n{1e3 * _rms(r):.2f} mm"
+            axes.set_title(title, fontsize=SIZE, color=color, loc="center", fontweight="bold")
     text = paragraph(
         f"Single frames of the fitted data, from little to much actuation, on the shape that the declared model has there. Arrows point from the model to the measurement, "
         f"{'at true length' if factor == 1 else f'drawn {factor:g} times as long'}, with one scale in all pictures; numbers are the rms of the frame."
@@ -102,13 +103,6 @@ def _shape(snapshot: Snapshot, pictures: Pictures, rest: Surface | None) -> Surf
     return Surface(nodes, triangles) if len(triangles) and triangles.max() < len(nodes) else None
 
 
-def _arrow_key(axes: Any, low: FloatArray, high: FloatArray, factor: float, key: float, color: str) -> None:
-    margin = 0.04 * float((high - low).max())
-    start = low[0] + 0.42 * (high[0] - low[0])
-    axes.quiver([start], [low[1] - 1.4 * margin], [1e3 * factor * key], [0.0], color=color, **arrow_options(0.009))
-    axes.text(start, low[1] - 2.0 * margin, f"{1e3 * key:g} mm residual", ha="left", va="top", fontsize=SIZE - 0.5, color=INK)
-
-
 def force_field(field: ForceField, surface: Surface | None) -> Html | None:
     """Return the field of equivalent forces as a picture."""
     if not field.points_m or surface is None:
@@ -123,7 +117,7 @@ def force_field(field: ForceField, surface: Surface | None) -> Html | None:
     tips = points + scale * forces
     corners = 1e3 * np.vstack([view.flat(surface.nodes), view.flat(tips)])
     low, high = corners.min(axis=0), corners.max(axis=0)
-    figure, axes = new_axes(height=float(np.clip(4.2 * (high[1] - low[1]) / (high[0] - low[0]) + 0.9, 1.9, 4.4)))
+    figure, axes = new_axes(height=body_height(low, high))
     draw_body(axes, surface, view)
     front = points @ view.towards >= np.median(points @ view.towards)
     for rows, alpha in ((~front, 0.35), (front, 1.0)):
@@ -134,13 +128,9 @@ def force_field(field: ForceField, surface: Surface | None) -> Html | None:
             alpha=alpha,
             **arrow_options(),
         )
-    frame_body(axes, view, low, high)
     factor, unit = words.force_unit(largest)
     key = nice(largest)
-    margin = 0.04 * float((high - low).max())
-    start = low[0] + 0.42 * (high[0] - low[0])
-    axes.quiver([start], [low[1] - 1.4 * margin], [1e3 * scale * key], [0.0], color=SERIES[6], **arrow_options())
-    axes.text(start, low[1] - 2.0 * margin, f"{factor * key:g} {unit}", ha="left", va="top", fontsize=SIZE - 0.5, color=INK)
+    frame_body(axes, view, low, high, key=Key(1e3 * scale * key, f"{factor * key:g} {unit}", SERIES[6]))
     total = [words.number(factor * (v or 0.0), 2) for v in field.total_n]
     sum_words = f" Together they make ({', '.join(total)}) {unit}." if len(total) == 3 else ""
     return as_image(

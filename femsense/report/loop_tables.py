@@ -31,7 +31,7 @@ from femsense.report.documents import (
     Tests,
     Triple,
 )
-from femsense.report.page import Cell, Html, code, element, paragraph, table, together
+from femsense.report.page import Cell, Html, code, element, escape, paragraph, table, together
 
 OUTCOMES = {
     "named": "named: part of the improved model",
@@ -54,6 +54,8 @@ TESTS = {
     "cloud sweep": "one sweep of the clouds stands apart",
 }
 STAGES = ("before", "nuisance", "after")
+CHANGE = "a change of "
+UNSEEN = "too small to be seen here"
 
 
 def lacks(name: str) -> str:
@@ -101,7 +103,7 @@ def ranking_table(candidates: Sequence[Candidate], ranked: Mapping[str, Ranked],
     final = {effect.name: effect for effect in effects}
     rows = [
         [
-            effect_name(c.name), together(*_values(final.get(c.name), ranked.get(c.name, Ranked()))), words.number(c.dchi2), words.number(c.dbic),
+            effect_name(c.name), together(*_values(final.get(c.name), ranked.get(c.name, Ranked()))), words.statistic(c.dchi2), words.statistic(c.dbic),
             _left_out(c), words.percent(c.retained_share), words.percent(ranked.get(c.name, Ranked()).first_share), _verdict(c),
         ]
         for c in candidates
@@ -109,7 +111,7 @@ def ranking_table(candidates: Sequence[Candidate], ranked: Mapping[str, Ranked],
     ranking = table(
         ("Effect", "Value, plausible range", "Δχ²", "ΔBIC", "Left-out sweeps", "Retained", "First", "Verdict"), rows,
         caption="Every effect that was tried, by what the first screening says of it.", numeric=(2, 3, 4, 5, 6),
-        strong=[i for i, c in enumerate(candidates) if c.verdict == "named"],
+        strong=[i for i, c in enumerate(candidates) if c.verdict == "named"], dense=True,
     )  # fmt: skip
     text = paragraph(
         "Δχ² is what the effect explains of the residual beyond all that calibration can imitate; ΔBIC takes off a price for each parameter and each effect tried, "
@@ -128,7 +130,7 @@ def _left_out(c: Candidate) -> str:
 
 
 def _verdict(c: Candidate) -> str:
-    text = c.verdict
+    text = c.verdict.replace("dBIC ", "ΔBIC\u00a0").replace("\u00a0-", "\u00a0−")
     if text in OUTCOMES or not text or text.startswith("not testable"):
         return OUTCOMES.get(text, text) or words.NOTHING
     return f"excluded: {text}"
@@ -154,7 +156,7 @@ def _value_line(label: str, text: str, estimate: Estimate | None) -> Html:
     span = ""
     if len(ends) == 2 and words.known(ends[0]):
         top = words.number(factor * (ends[1] or 0.0), 2) if words.known(ends[1]) else "∞"
-        span = f" in [{words.number(factor * (ends[0] or 0.0), 2)}, {top}]" + (f" {unit}" if unit else "")
+        span = " " + words.joined(f"in\u00a0[{words.number(factor * (ends[0] or 0.0), 2)},\u00a0{top}]", unit)
     return element("div", code(label), f" {text}", element("span", span, class_="soft") if span else "", class_="value")
 
 
@@ -163,8 +165,8 @@ def refits_table(candidates: Sequence[Candidate]) -> Html | None:
     rows = [
         [
             code(c.name),
-            words.number(r.dchi2),
-            words.number(r.dbic),
+            words.statistic(r.dchi2),
+            words.statistic(r.dbic),
             words.length(r.validation_rms_m),
             OUTCOMES.get(r.verdict, r.verdict) or words.NOTHING,
         ]
@@ -180,31 +182,59 @@ def refits_table(candidates: Sequence[Candidate]) -> Html | None:
 # What would have been seen
 
 
-def power_table(detectable: Mapping[str, Detectable], power: Mapping[str, Sequence[Size]]) -> Html | None:
-    """Return the smallest size of every effect that was not found."""
+def power_table(loop: Loop, evidence: Evidence) -> Html | None:
+    """Return the smallest change of every effect that was not found."""
+    hidden = {u.name for u in loop.not_testable}
     rows = [
-        [effect_name(name), _sizes(power.get(name, ()), entry)]
-        for name, entry in detectable.items()
-        if entry.smallest or power.get(name)
-    ]
+        [effect_name(name), "not testable" if name in hidden else _sizes(entry, evidence.power.get(name, ()), evidence.ranking.get(name, Ranked()))]
+        for name, entry in loop.detectable.items()
+        if entry.smallest or evidence.power.get(name)
+    ]  # fmt: skip
     return table(
-        ("Effect", "Smallest size"), rows,
-        caption="For each effect that was not found: the size at which the data would have named it (expected ΔBIC of 10).",
+        ("Effect", "Smallest change that would have been seen"), rows,
+        caption="For each effect that was not found: the change from what is declared at which the data would have named it (expected ΔBIC of 10).",
     )  # fmt: skip
 
 
-def _sizes(own: Sequence[Size], entry: Detectable) -> Html:
-    lines = [(s.label, smallest_words(s.size, s.kind, s.unit)) for s in own]
-    lines = lines or [(label, smallest_words(value, entry.kind, entry.unit)) for label, value in entry.smallest.items()]
-    if len(lines) <= LISTED:
-        return together(*(element("div", code(label) if label else "", f" {text}" if label else text) for label, text in lines))
-    if own:
-        best = sorted((s for s in own if words.known(s.size)), key=lambda s: s.size or 0.0)
-        ends = [smallest_words(s.size, s.kind, s.unit) for s in (best[0], best[-1])] if best else []
-    else:
-        seen = sorted(v for v in entry.smallest.values() if v is not None and words.known(v))
-        ends = [smallest_words(v, entry.kind, entry.unit) for v in (seen[0], seen[-1])] if seen else []
-    return Html(f"{' … '.join(ends)} ({len(lines)} parameters)" if ends else "cannot be seen")
+def _sizes(entry: Detectable, own: Sequence[Size], ranked: Ranked) -> Html:
+    """Return the smallest change of each parameter of an effect, a line each; a span where there are many."""
+    sizes = own or [Size(label=n, kind=entry.kind, size=v, unit=entry.unit) for n, v in entry.smallest.items()]
+    if len(sizes) > LISTED:
+        return Html(escape(_size_span(entry, sizes)))
+    ends = {p.label: p.ends for p in ranked.parameters}
+    lines = [(s.label, _seen_words(entry, s, ends.get(s.label, []))) for s in sizes]
+    return together(*(element("div", code(label) if label else "", f" {text}" if label else text) for label, text in lines))
+
+
+def _size_span(entry: Detectable, sizes: Sequence[Size]) -> str:
+    count = f"({len(sizes)} parameters)"
+    known = sorted((s for s in sizes if words.known(s.size)), key=lambda s: s.size or 0.0)
+    if not known:
+        return f"cannot be seen {count}"
+    least, most = (smallest_words(s.size, s.kind, s.unit) for s in (known[0], known[-1]))
+    span = f"{least} … {most.removeprefix(CHANGE)} {count}"
+    return f"{UNSEEN} ({span})" if entry.would_be_seen is False else span
+
+
+def _seen_words(entry: Detectable, size: Size, ends: Sequence[float | None]) -> str:
+    """Return the smallest visible size of a parameter, or that no plausible one would be seen."""
+    text = smallest_words(size.size, size.kind, size.unit)
+    if size.kind == "whole" or not words.known(size.size):
+        return text
+    beyond = entry.would_be_seen is False or is_beyond(size.size or 0.0, size.kind, ends)
+    return f"{UNSEEN}: it would take {text}" if beyond else text
+
+
+def is_beyond(size: float, kind: str, ends: Sequence[float | None]) -> bool:
+    """Return whether a change leads out of the plausible range from wherever in it one starts."""
+    low, high = ends if len(ends) == 2 else (None, None)
+    if low is None or not words.known(low):
+        return False
+    if kind == "softer_than":
+        return size < low
+    if high is None or not words.known(high):
+        return False
+    return size * low > high > 0 if kind == "factor" else size > high - low
 
 
 def smallest_words(size: float | None, kind: str, unit: str) -> str:
@@ -215,13 +245,13 @@ def smallest_words(size: float | None, kind: str, unit: str) -> str:
         return (
             "would have been seen"
             if size < 1.0
-            else f"cannot be seen: its whole change would have to be {words.number(size, 2)} times as large"
+            else f"{UNSEEN}: its whole change would have to be {words.number(size)} times as large"
         )
     if kind == "factor":
-        return f"a change of {words.number(100.0 * (size - 1.0), 2)} %" if size < 2.0 else f"a factor of {words.number(size, 2)}"
+        return f"{CHANGE}{words.number(100.0 * (size - 1.0), 2)} %" if size < 2.0 else f"a factor of {words.number(size, 2)}"
     if kind == "softer_than":
         return f"softer than {words.quantity(size, unit, 2)}"
-    return words.quantity(size, unit, 2)
+    return f"{CHANGE}{words.quantity(size, unit, 2)}"
 
 
 # Covariates, calibration, tests

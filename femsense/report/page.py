@@ -29,7 +29,7 @@ nav ul { padding: 0; list-style: none; display: flex; flex-wrap: wrap; gap: 4px 
 a { color: var(--accent); }
 code { font: 0.92em ui-monospace, SFMono-Regular, Menlo, Consolas, monospace; }
 .soft { color: var(--soft); }
-.value { min-width: 190px; }
+.value { min-width: 190px; overflow-wrap: anywhere; }
 .next { border-left: 4px solid var(--accent); padding: 2px 0 2px 14px; }
 .tiles { display: grid; grid-template-columns: repeat(auto-fit, minmax(170px, 1fr)); gap: 12px; margin: 14px 0 8px; }
 .tile { margin: 0; background: var(--pale); border-radius: 8px; padding: 11px 14px 12px; break-inside: avoid; }
@@ -45,13 +45,17 @@ figcaption { font-size: 14px; color: var(--soft); }
 table { border-collapse: collapse; font-size: 14.5px; font-variant-numeric: tabular-nums; }
 caption { text-align: left; color: var(--soft); font-size: 14px; padding-bottom: 4px; }
 .cap { display: inline-block; position: sticky; left: 0; max-width: calc(100vw - 34px); }
-tbody th .soft { min-width: 150px; font-weight: 400; } td:last-child:not(.n) { min-width: 130px; }
+tbody th .soft { min-width: 150px; font-weight: 400; } td:last-child:not(.n) { min-width: 130px; overflow-wrap: anywhere; }
 th, td { text-align: left; vertical-align: top; padding: 5px 18px 5px 0; border-bottom: 1px solid var(--line); }
 thead th { border-bottom: 1.5px solid var(--ink); font-weight: 600; vertical-align: bottom; }
 tbody th { font-weight: 500; }
-td.n, th.n { text-align: right; white-space: nowrap; }
+td.n, th.n { text-align: right; white-space: nowrap; } .dense th.n { white-space: normal; }
 tr.strong th, tr.strong td { background: #eef6f3; }
 footer { margin-top: 52px; padding-top: 12px; padding-bottom: 40px; color: var(--soft); font-size: 13px; }
+@media (max-width: 1000px) {
+  .dense table { font-size: 12.5px; } .dense th, .dense td { padding-right: 10px; }
+  .dense .value { min-width: 120px; } .dense tbody th .soft, .dense td:last-child:not(.n) { min-width: 100px; }
+}
 @media (max-width: 560px) {
   main, header, footer { padding-left: 14px; padding-right: 14px; }
   .verdict { font-size: 22px; } .verdict.long { font-size: 18px; }
@@ -65,7 +69,8 @@ footer { margin-top: 52px; padding-top: 12px; padding-bottom: 40px; color: var(-
   .tiles { grid-template-columns: repeat(4, 1fr); } .tile { border: 1px solid var(--line); } .tile dd { font-size: 15pt; }
   .panels { grid-template-columns: 1fr 1fr; } .scroll { overflow: visible; } table { font-size: 9pt; }
   th, td { padding-right: 9pt; } thead { display: table-header-group; } tr { break-inside: avoid; }
-  h2, h3, h4, caption { break-after: avoid; } .value { min-width: 34mm; } nav { display: none; }
+  h2, h3, h4, caption { break-after: avoid; } .value { min-width: 30mm; }
+  tbody th .soft { min-width: 26mm; } td:last-child:not(.n) { min-width: 26mm; } nav { display: none; }
 }
 """
 BLOCKS = {"p", "div", "dl", "dt", "dd", "li", "th", "td", "tr", "caption", "figcaption", "h1", "h2", "h3", "h4", "title"}
@@ -154,6 +159,7 @@ def table(
     caption: str,
     numeric: Sequence[int] = (),
     strong: Sequence[int] = (),
+    dense: bool = False,
 ) -> Html | None:
     """Return a table that scrolls by itself where the page is narrow; None where it has no rows.
 
@@ -163,6 +169,7 @@ def table(
         caption: what the table shows.
         numeric: columns that are aligned to the right.
         strong: rows that stand out.
+        dense: with many columns, so that headers break, too.
     """
     if not rows:
         return None
@@ -177,7 +184,7 @@ def table(
         element("thead", head),
         element("tbody", together(*lines)),
     )
-    return element("div", whole, class_="scroll", tabindex="0", role="region", aria_label=caption)
+    return element("div", whole, class_="scroll dense" if dense else "scroll", tabindex="0", role="region", aria_label=caption)
 
 
 def _row(row: Sequence[Any], numeric: Sequence[int]) -> list[Html]:

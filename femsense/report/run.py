@@ -18,14 +18,14 @@ from femsense.report.documents import KnownLoad, RunFacts, read_document
 from femsense.report.drawing import (
     AFTER,
     BEFORE,
-    INK,
     MANY,
     SERIES,
-    SIZE,
     SOFT,
+    Key,
     add_legend,
     as_image,
     best_view,
+    body_height,
     clipped,
     draw_body,
     frame_body,
@@ -262,8 +262,7 @@ def _force_on_body(contacts: ContactTable, frames: FrameTable | None, folder: Pa
     tails = tips - scale * contacts.force_n[rows]
     flat = 1e3 * view.flat(np.vstack([surface.nodes, tips, tails]))
     low, high = flat.min(axis=0), flat.max(axis=0)
-    height = float(np.clip(4.2 * (high[1] - low[1]) / (high[0] - low[0]) + 0.7, 1.9, 4.2))
-    figure, axes = new_axes(height=height)
+    figure, axes = new_axes(height=body_height(low, high))
     draw_body(axes, surface, view)
     for i, tail, tip in zip(rows, 1e3 * view.flat(tails), 1e3 * view.flat(tips)):
         color = SERIES[int(contacts.contact[i]) % len(SERIES)]
@@ -280,15 +279,9 @@ def _force_on_body(contacts: ContactTable, frames: FrameTable | None, folder: Pa
             },
             zorder=6,
         )
-    frame_body(axes, view, low, high)
     factor, unit = words.force_unit(largest)
     bar = nice(largest)
-    margin = 0.04 * float((high - low).max())
-    start = low[0] + 0.45 * (high[0] - low[0])
-    axes.plot(
-        [start, start + 1e3 * scale * bar], [low[1] - 1.4 * margin] * 2, color=SERIES[0], linewidth=2, solid_capstyle="butt"
-    )
-    axes.text(start, low[1] - 2.0 * margin, f"{factor * bar:g} {unit}", ha="left", va="top", fontsize=SIZE - 0.5, color=INK)
+    frame_body(axes, view, low, high, key=Key(1e3 * scale * bar, f"{factor * bar:g} {unit}", SERIES[0], None))
     text = "; ".join(f"contact {contacts.contact[i]} {_force(contacts.size_n[i], contacts.std_n[i])}" for i in rows)
     return as_image(
         figure,

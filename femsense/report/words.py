@@ -12,6 +12,10 @@ UNITS = {"m": (1e3, "mm"), "Pa": (1e-3, "kPa"), "rad": (180.0 / math.pi, "°"), 
 """What is shown instead of the units of files: factor and name."""
 MILLI = 0.1
 """Forces below this [N] are shown in mN."""
+NIL = 1e-4
+"""Differences of χ² below this are none."""
+HUGE = 1e6
+"""Deviations from this on are shown as powers of ten."""
 
 
 def known(value: Any) -> bool:
@@ -48,6 +52,17 @@ def percent(share: Any, digits: int = 0) -> str:
     return joined(_minus(f"{100 * share:.{digits}f}"), "%") if known(share) else NOTHING
 
 
+def nearly(share: Any, digits: int = 0) -> str:
+    """Return a share in percent; one that is nearly the whole is not rounded up to it."""
+    most = 1.0 - 10.0 ** (-2 - digits)
+    return f"more than {percent(most, digits)}" if known(share) and share > most else percent(share, digits)
+
+
+def statistic(value: Any, digits: int = 3) -> str:
+    """Return a difference of χ² or BIC; what is nothing but rounding is 0."""
+    return "0" if known(value) and abs(value) < NIL else number(value, digits)
+
+
 def signed(value: Any, digits: int = 2) -> str:
     """Return a number with its sign, also where it is positive."""
     text = number(value, digits)
@@ -68,9 +83,10 @@ def with_std(value: Any, std: Any, unit: str | None = None) -> str:
         return quantity(value, unit)
     value, std = factor * value, factor * std
     decimals = 1 - math.floor(math.log10(std))
-    if decimals > 6:
+    if decimals > 6 or std >= HUGE:
         return joined(f"{number(value)} ± {number(std, 2)}", name)
     shown = max(0, decimals)
+    value = round(value, shown) + 0.0  # no minus before a zero
     return joined(_minus(f"{value:.{shown}f} ± {std:.{shown}f}"), name)
 
 
