@@ -306,7 +306,7 @@ def estimate_noise(
     best = min(each(from_start, starts), key=lambda answer: answer.fun)
     std = {name: float(v) for name, v in zip(names, np.exp(best.x))}
     std = {name: max(v, FLOOR) if name == "white" else v if v > 2e-2 * scale else 0.0 for name, v in std.items()}
-    how = "with repeats" if "state" in names else "no repeated state: assumed from the residual"
+    how = "with states that are reached again" if "state" in names else "no repeated state: assumed from the residual"
     return Noise(std, f"restricted maximum likelihood, {how}")
 
 

@@ -197,7 +197,7 @@ def _scatter(x: FloatArray, y: FloatArray, after: FloatArray | None, groups: Seq
         )
     axes.axhline(0.0, color=PALE, linewidth=0.8)
     name_axes(axes, _with_unit(name), "pattern of the residual [mm]")
-    add_legend(axes, columns=min(len(groups) + (after is not None), 4))
+    add_legend(axes)
     return figure
 
 
