@@ -38,7 +38,7 @@ def find_effect(name: str) -> Effect:
         where="effects.name",
         found=name,
         expected=", ".join(names),
-        hint=f"did you mean {near[0]}?" if near else None,
+        hint=f"did you mean {near[0]}?" if near else "an effect of your own comes with its file (docs/effects/own.md)",
     )
 
 
