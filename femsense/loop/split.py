@@ -9,15 +9,15 @@ from femsense.recording import Recording, state_key
 
 
 def sweeps_of(recording: Recording, frames: IntArray) -> IntArray:
-    """Return the number of the sweep that each frame belongs to, in the order in which they begin, shape (f,).
+    """Return the number of the sweep that each frame belongs to, shape (f,): in the order of their names, so that it does not matter in which
+    order they were recorded; else in the order of time.
 
     A sweep is what the column `sweep` says; without it an excursion of the inputs from their lowest level and back; where
     the inputs do not move, a run of frames under the same loads.
     """
     if recording.sweep is not None:
         labels = [recording.sweep[k] for k in frames]
-        place = {label: i for i, label in enumerate(dict.fromkeys(labels))}
-        return np.array([place[label] for label in labels]) if len(place) > 1 else _runs(recording, frames)
+        return np.unique(labels, return_inverse=True)[1] if len(set(labels)) > 1 else _runs(recording, frames)
     inputs = _drives(recording)
     moving = np.ptp(inputs, axis=0).max(initial=0.0) > 0
     return _excursions(inputs, frames) if moving else _runs(recording, frames)
