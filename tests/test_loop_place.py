@@ -410,6 +410,15 @@ def test_what_promises_as_much_is_refitted_in_the_order_of_its_cost(started: tup
         assert [c.effect.name for c in growing.shortlist([one, second], first=True)] == names
 
 
+def test_what_calibration_imitates_is_refitted_only_if_it_promises_more_than_all_others(started: tuple[Data, Stage]):
+    data, stage = started
+    one, *_ = payloads(data, stage)
+    gain = screen_stage(data, stage.fit, NOISE, fields_of(data, stage, ["cable_gain"]), COUNT)[0]
+    for share, names in ((1.1, {"cable_gain", "payload"}), (0.9, {"payload"})):
+        second = replace(gain, score=share * one.score, retained=0.01)
+        assert {c.effect.name for c in growing.shortlist([one, second], first=True)} == names
+
+
 @pytest.mark.parametrize(("score", "passes"), [(16.0, True), (14.0, False)])
 def test_held_out_data_that_speak_against_an_effect_count(
     started: tuple[Data, Stage], monkeypatch: pytest.MonkeyPatch, score: float, passes: bool
