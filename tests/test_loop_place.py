@@ -144,6 +144,25 @@ def test_rivals_are_fitted_to_all_states_where_these_are_little_work(
     assert not any("some of the states" in r["verdict"] for r in records)
 
 
+def test_another_form_of_an_effect_is_held_against_other_effects_alone(
+    started: tuple[Data, Stage], monkeypatch: pytest.MonkeyPatch
+):
+    data, stage = started
+    table = screen_stage(data, stage.fit, NOISE, fields_of(data, stage, ["payload", "cable_gain"]), COUNT)
+    listed = [*[c for c in table if c.effect.name == "payload"][:2], next(c for c in table if c.effect.name == "cable_gain")]
+    asked = list[float]()
+
+    def counted(own: Data, before: Stage, candidate: Candidate, noise: Noise, wanted: float = 0.0, **named: Any) -> Stage:
+        asked.append(wanted)
+        return refit(own, before, candidate, noise, wanted=wanted, **named)
+
+    for name, value in (("refit", counted), ("explains", lambda stage: True), ("shortlist", lambda table, first: listed)):
+        monkeypatch.setattr(growing, name, value)
+    monkeypatch.setattr(growing, "_bar", lambda ahead, candidate: -np.inf)
+    growing.grow(data, stage, table, NOISE, lambda text: None)
+    assert asked[:2] == [growing.EVIDENCE] * 2 and asked[2] > 3 * growing.EVIDENCE
+
+
 def test_some_states_are_spread_and_never_too_few(started: tuple[Data, Stage]):
     trial = started[0].train[0]
     inputs, frames = trial.scene.recording.inputs, trial.scene.frames

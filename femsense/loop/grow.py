@@ -98,7 +98,6 @@ def grow(
     scouts = _scouted(data, few, listed, noise, say)
     for candidate in sorted(listed, key=lambda c: -scouts[id(c)][1] if id(c) in scouts else np.inf):
         ahead = [r for r in refits if r.record["verdict"] == "passes" and explains(r.stage)]
-        best = max((r.score for r in ahead), default=-np.inf)
         behind = candidate.score < max((0.5 * _bar(r, candidate) for r in ahead), default=-np.inf) - EVIDENCE
         if behind and not weighs(data, candidate.effect.name):
             continue  # where little is left to explain, a refit seldom gains that much on its linear score, but for a weight that cables lift
@@ -114,7 +113,10 @@ def grow(
             if behind:
                 record["verdict"] = "given up: in some of the states another one explains more by far"
                 continue
-            wanted = max(EVIDENCE, best - 2.0 * EVIDENCE)
+            others = [
+                r.score for r in ahead if r.candidate.effect.name != candidate.effect.name
+            ]  # what bends one form bends both
+            wanted = max([EVIDENCE, *(score - 2.0 * EVIDENCE for score in others)])
             made = refit(data, stage, candidate, noise, wanted=wanted, settled=settled, begin=begin)
         except FemsenseError as error:
             record["verdict"] = f"no equilibrium: {error}"
