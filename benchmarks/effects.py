@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from loop_cases import ARM, EARTH, Case, Made, make_data
+from loop_cases import ARM, EARTH, Case, Made, make_data, on_other_clamp
 
 from femsense.cli import run
 from femsense.effects.shape import robot_on_mesh
@@ -34,7 +34,7 @@ from femsense.fem.mesh import to_linear
 from femsense.files import write_toml
 from femsense.model import Robot
 from femsense.recording import save_recording
-from femsense.robot import save_robot
+from femsense.robot import load_robot, save_robot
 
 SMALL_ARM = replace(ARM, name="small-arm", coarse=(7, 2, 2), fine=(10, 3, 3))
 HIDDEN: tuple[tuple[str, dict[str, Any]], ...] = (
@@ -103,7 +103,7 @@ def run_case(number: int, folder: Path) -> dict[str, Any]:
     save_robot(declared, robot)
     for recording, where in ((made.recording, first), (fresh.recording, other)):
         save_recording(recording, where)
-    truth = dict(entry)
+    truth = on_other_clamp(dict(entry), declared, load_robot(robot))
     if entry["name"] == "stiffness":
         truth["scale"] = entry["scale"] * made.modulus_scale
     began = time.process_time()

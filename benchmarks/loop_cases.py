@@ -285,7 +285,7 @@ def make_data(case: Case, seed: int) -> Made:
     if law == "corotational" and any(e["name"] == "hyperelastic" for e in case.hidden):
         raise ValueError("the hidden law needs a hyperelastic truth")
     true = design.robot(fine=True, law=law, gravity=EARTH if case.declared_gravity else (0, 0, 0), modulus=scale * design.modulus)
-    true = apply_effects(true, [_on_fine_clamp(e, declared, true) for e in case.hidden if e["name"] != "hyperelastic"])
+    true = apply_effects(true, [on_other_clamp(e, declared, true) for e in case.hidden if e["name"] != "hyperelastic"])
     recorded, labels, time_s = excursions(design, case.control, rng, poor=case.poor)
     loads = _known_loads(design, labels, rng) if not case.poor else (np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
     F, a = recorded.shape
@@ -308,12 +308,12 @@ def _seen(true: Robot, states: Sequence[Equilibrium], seat: FloatArray | None = 
     return np.array([ties.positions(s.positions) for s in states])
 
 
-def _on_fine_clamp(entry: dict[str, Any], declared: Robot, true: Robot) -> dict[str, Any]:
-    """Return an entry whose springs, one a node of the declared mesh, are spread over the nodes of the true one and resist turning alike."""
+def on_other_clamp(entry: dict[str, Any], declared: Robot, other: Robot) -> dict[str, Any]:
+    """Return an entry whose springs, one a node of the declared mesh, are spread over the nodes of another one and resist turning alike."""
     if entry["name"] != "base_compliance" or "stiffness_n_m" not in entry:
         return entry
     second = [
-        float(np.sum(np.square(n - n.mean(axis=0)))) for n in (r.body.mesh.nodes[r.body.clamp_nodes] for r in (declared, true))
+        float(np.sum(np.square(n - n.mean(axis=0)))) for n in (r.body.mesh.nodes[r.body.clamp_nodes] for r in (declared, other))
     ]
     return {**entry, "stiffness_n_m": entry["stiffness_n_m"] * second[0] / second[1]}
 
