@@ -389,12 +389,12 @@ def test_where_a_climb_ends_a_fit_to_all_states_is_made_if_some_of_them_are_for_
 
 def test_a_place_moves_on_as_some_of_the_states_have_it(started: tuple[Data, Stage], some: Few, monkeypatch: pytest.MonkeyPatch):
     data, stage = started
-    far = max(payloads(data, stage)[:6], key=off)
-    made = refit(data, stage, far, NOISE)
+    near = payloads(data, stage)[0]  # from far away the way to the place is steep, and where it ends a matter of luck
+    made = refit(data, stage, near, NOISE)
     moved, scatter = closer(data, made, NOISE)
     monkeypatch.setattr(few, "MOST_WORK", 10**9)
     expected, wide = closer(data, made, NOISE)
-    assert moved.fit.hypothesis.terms[-1][1] == expected.fit.hypothesis.terms[-1][1]
+    assert moved.fit.hypothesis.terms[-1][1] == expected.fit.hypothesis.terms[-1][1] != near.seed
     assert moved.fit.chi2 == pytest.approx(expected.fit.chi2, abs=1.0)
     np.testing.assert_allclose(scatter, wide, rtol=0.5)
 
