@@ -94,6 +94,15 @@ def test_the_noise_of_seats_that_turn_is_told_from_the_rest():
     assert std["marker"] == pytest.approx(float(seat.std()), rel=0.15) and std["white"] == pytest.approx(1e-4, rel=0.05)
 
 
+def test_seats_that_could_not_be_seen_beside_what_was_not_explained_yet_are_seen_later():
+    rng, groups = np.random.default_rng(5), turning_groups(20, 17)
+    seat = 5e-5 * rng.normal(size=(17, 3))
+    residual = np.einsum("kij,kj->ki", groups.turns, seat[groups.marker]) + 1e-4 * rng.normal(size=(340, 3))
+    before = {"white": 6e-4, "frame": 2e-4, "marker": 0.0, "sweep": 0.0}
+    std = estimate_noise([residual], [np.full((340, 3, 1), 1e-6)], [np.zeros((340, 3, 0))], [groups], before).std
+    assert std["marker"] == pytest.approx(float(seat.std()), rel=0.2) and std["white"] == pytest.approx(1e-4, rel=0.1)
+
+
 def test_both_what_is_fitted_and_what_is_held_out_knows_how_its_seats_turn():
     inputs, labels = sweeps(HEIGHT)
     data = prepare(arm((4, 1, 1)), [record(inputs, labels=labels, truth=arm((4, 1, 1)))[0]], [])
