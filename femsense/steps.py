@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import femsense
 from femsense import results
 from femsense.errors import FemsenseError, InputError
 from femsense.files import file_hash
@@ -21,6 +22,9 @@ if TYPE_CHECKING:
 
 Progress = Callable[..., None]
 Say = Callable[[str], None]
+
+UNFINISHED = ".unfinished"
+"""File of a search that is not at its end, in its folder."""
 
 
 def estimate_into(
@@ -123,6 +127,7 @@ def improve_into(
             user_effects=user_effects,
             measured=measured,
             progress=progress,
+            keep=(Path(folder) / UNFINISHED, {**inputs, "version": femsense.__version__}),
         )
     results.write_loop(loop, folder, inputs=inputs)
     return results.read_loop(folder)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,12 +27,13 @@ from femsense.loop.exchange import BETTER, History, exchanged
 from femsense.loop.few import spares
 from femsense.loop.grow import Progress, Refit, grow, mesh_cost, moved_by, prune, shortlist
 from femsense.loop.joint import Prior
+from femsense.loop.keep import Keeper
 from femsense.loop.mesh_error import errs_alike, few_states, make_finer, with_mesh_errors
 from femsense.loop.noise import Noise
 from femsense.loop.refit import EVIDENCE, evidence
 from femsense.loop.result import LoopResult
 from femsense.loop.screen import Candidate, Fields
-from femsense.loop.search import Search
+from femsense.loop.search import Course, Search
 from femsense.loop.seats import with_turning_seats
 from femsense.loop.stages import (
     Stage,
@@ -79,6 +80,7 @@ def improve(
     measured: str = "auto",
     progress: Progress | None = None,
     seed: int = 0,
+    keep: tuple[str | Path, Mapping[str, Any]] | None = None,
 ) -> LoopResult:
     """Find what the model lacks, add it, and report the error on held-out data before and after.
 
@@ -92,6 +94,8 @@ def improve(
         measured: "markers", "clouds" or "both": what is used of a recording; "auto": its markers, or its clouds where it has none.
         progress: told what is going on.
         seed: of the permutation test and the bootstrap.
+        keep: a file that holds how far the search has come, so that one that is killed goes on there, and what it is made from: a file that says
+            something else is not used. It is removed at the end.
 
     Raises:
         InputError: unknown names, no recording; DataError: the data do not allow a fit.
@@ -112,9 +116,11 @@ def improve(
             finer_is_made()
         return _with_cost_of_mesh(data, start[-1][1], names, say), before, start
 
-    data, search = _searched(robot, names, ready, say)
-    say("testing what is left")
-    result = conclude(data, search, rng)
+    keeper = Keeper(keep, (*FORMS, *own))
+    with keeper:
+        data, search = _searched(robot, names, ready, keeper, say)
+        say("testing what is left")
+        result = conclude(data, search, rng)
     result = replace(result, data={**result.data, "seed": seed})
     if _tells_apart(data):
         return result
@@ -123,21 +129,25 @@ def improve(
 
 
 def _searched(
-    robot: Robot, names: list[str], ready: Callable[[Robot, Sequence[str]], Ready], say: Progress
+    robot: Robot, names: list[str], ready: Callable[[Robot, Sequence[str]], Ready], keeper: Keeper, say: Progress
 ) -> tuple[Data, Search]:
     """Return the data with what a search finds in them: on quadratic elements where the robot declares linear ones and the data miss those, else on what
-    is declared."""
+    is declared. One that was killed goes on where it was."""
     refits: list[dict[str, Any]] = []
-    if seeks_with_quadratic(robot, names):
+    kept = keeper.kept()
+    if kept is not None:
+        say(f"going on where it stopped ({kept.found} effects found)")
+    if seeks_with_quadratic(robot, names) and (kept is None or kept.quadratic):
         with contextlib.suppress(FemsenseError):  # linear elements lock, and come to rest where quadratic ones fold
-            data, search = _search(*ready(with_quadratic(robot), names), names, say)
+            course = kept or _begun(ready(with_quadratic(robot), names), names, [], quadratic=True)
+            data, search = _search(course, keeper, say)
             say("asking whether quadratic elements are needed")
             needed, refits = need_quadratic(data, search, names)
             if needed:
                 return data, replace(search, refits=[*refits, *search.refits])
             names = [name for name in names if name != MESH.name]
-    data, search = _search(*ready(robot, names), names, say)
-    return data, replace(search, refits=[*refits, *search.refits])
+        kept = None
+    return _search(kept or _begun(ready(robot, names), names, refits, quadratic=False), keeper, say)
 
 
 def _get_ready(robot: Robot, names: Sequence[str]) -> None:
@@ -203,70 +213,88 @@ def _as_far_as_held_out_states_rest(fit: Callable[[int], Stage], steps: int) -> 
     return fit(0)
 
 
-def _search(data: Data, before: Stage, start: History, names: list[str], say: Progress) -> tuple[Data, Search]:
-    """Screen, refit and add effects on top of the last model of a history until none passes; return the data as the last model has them, and the
-    search."""
-    most = MAX_EFFECTS if _tells_apart(data) else 0
-    history, base = list(start), start[-1][1]
-    stage, first, table, refits, ties = base, list[Candidate](), list[Candidate](), list[dict[str, Any]](), list[Refit]()
-    noise: Noise | None = None
-    n_effective, earlier = 0.0, data
-    fields: Fields | None = None
-    while True:
-        found = len(history) - len(start)
-        say(f"screening effects ({found} found so far)")
-        if found and "clouds" in data.measured:
-            assert noise is not None
-            fields = None
-            data, stage = _matched(data, stage, noise)
-        try:
-            stage, noise, n_effective, fields, table = _screened(data, stage, fields, noise, names)
-        except FemsenseError as error:
-            if not found:
-                raise
-            refits = _unsettled(refits, len(history) - 1, error)
-            data, history = earlier, history[:-1]
-            stage = history[-1][1]
-            break
-        history[-1] = (history[-1][0], stage)
-        if not found:
-            base, first = stage, table
-        if found >= most:
-            break
-        next_one, others, tried = grow(data, stage, table, noise, say)
-        refits += [{**record, "step": len(history)} for record in tried]
-        if next_one is None and ties:
-            instead, next_one, tried = _beside_a_tie(data, stage, ties[0], fields, noise, names, n_effective, say)
-            if next_one is not None:
-                history[-1] = (ties[0].candidate.effect.name, instead)
-                refits = [
-                    *_renamed(refits, len(history) - 1, history[-1][0]),
-                    *({**record, "step": len(history)} for record in tried),
-                ]
-                stage, others = instead, []
-        if next_one is None:
-            break
-        earlier = data
-        name, winner, ties = next_one.candidate.effect.name, next_one.stage, others
-        anew = moved_by(stage, winner) > mesh_cost(data, stage, whole=True) and not errs_alike(stage, winner)
-        stage = prune(data, winner, noise, n_effective, say)
-        history.append((name, stage))
-        data = with_turning_seats(with_mesh_errors(data, stage, names) if anew else data, stage)
-        found_so = history
-        history, refits = exchanged(data, history, refits, noise, n_effective, say)
-        if history is not found_so:
-            history[-1] = (history[-1][0], prune(data, history[-1][1], noise, n_effective, say))
-        stage = history[-1][1]
+def _begun(ready: Ready, names: Sequence[str], refits: list[dict[str, Any]], *, quadratic: bool) -> Course:
+    """Return a search on top of the last model of a history that has found nothing yet."""
+    data, before, history = ready
+    last = history[-1][1]
+    return Course(data, data, before, list(history), len(history), last, last, list(names), quadratic, refits)
+
+
+def _search(course: Course, keeper: Keeper, say: Progress) -> tuple[Data, Search]:
+    """Screen, refit and add effects until none passes; return the data as the last model has them, and the search."""
+    while not course.over:
+        keeper.keep(course)
+        say(f"screening effects ({course.found} found so far)")
+        _take_step(course, say)
+    keeper.keep(course)
+    data, history, noise = course.data, course.history, course.noise
     assert noise is not None
-    swap = in_place_of_zeros(data, stage, names, noise, n_effective, say) if most else None
+    stage, refits, before = course.stage, course.refits, course.before
+    most = _most_effects(data)
+    swap = in_place_of_zeros(data, stage, course.names, noise, course.n_effective, say) if most else None
     if swap is not None:
-        refits += [{**record, "step": len(history)} for record in swap.records]
+        refits = [*refits, *({**record, "step": len(history)} for record in swap.records)]
         if swap.stage is not None:
-            stage = swap.stage
-            history.append((swap.name, stage))
+            stage, history = swap.stage, [*history, (swap.name, swap.stage)]
     if len(history) > 1 and "clouds" in data.measured:
         before = _placed(data, data.robot_as_declared, noise, before)  # before and after on the same rows
-    return data, Search(before, history, base, stage, noise, n_effective, first, table, refits, swap)
+    found = Search(before, history, course.base, stage, noise, course.n_effective, course.first, course.table, refits, swap)
+    return data, found
+
+
+def _most_effects(data: Data) -> int:
+    return MAX_EFFECTS if _tells_apart(data) else 0
+
+
+def _take_step(course: Course, say: Progress) -> None:
+    """Screen what a model may lack and add the effect that comes next; where none does, the search is over."""
+    names, found = course.names, course.found
+    data, stage, noise, fields = course.data, course.stage, course.noise, course.fields
+    if found and "clouds" in data.measured:
+        assert noise is not None
+        fields = None
+        data, stage = _matched(data, stage, noise)
+    try:
+        stage, noise, n_effective, fields, table = _screened(data, stage, fields, noise, names)
+    except FemsenseError as error:
+        if not found:
+            raise
+        course.take_back(error)
+        return
+    history, refits, ties = [*course.history[:-1], (course.history[-1][0], stage)], course.refits, course.ties
+    course.data, course.stage, course.noise, course.n_effective = data, stage, noise, n_effective
+    course.fields, course.table, course.history = fields, table, history
+    if not found:
+        course.base, course.first = stage, table
+    if found >= _most_effects(data):
+        course.over = True
+        return
+    next_one, others, tried = grow(data, stage, table, noise, say)
+    refits = [*refits, *({**record, "step": len(history)} for record in tried)]
+    if next_one is None and ties:
+        instead, next_one, tried = _beside_a_tie(data, stage, ties[0], fields, noise, names, n_effective, say)
+        if next_one is not None:
+            history[-1] = (ties[0].candidate.effect.name, instead)
+            refits = [
+                *_renamed(refits, len(history) - 1, history[-1][0]),
+                *({**record, "step": len(history)} for record in tried),
+            ]
+            stage, others = instead, []
+    course.refits = refits
+    if next_one is None:
+        course.over = True
+        return
+    course.earlier = data
+    name, winner, course.ties = next_one.candidate.effect.name, next_one.stage, others
+    anew = moved_by(stage, winner) > mesh_cost(data, stage, whole=True) and not errs_alike(stage, winner)
+    stage = prune(data, winner, noise, n_effective, say)
+    history = [*history, (name, stage)]
+    data = with_turning_seats(with_mesh_errors(data, stage, names) if anew else data, stage)
+    found_so = history
+    history, refits = exchanged(data, history, refits, noise, n_effective, say)
+    if history is not found_so:
+        history[-1] = (history[-1][0], prune(data, history[-1][1], noise, n_effective, say))
+    course.data, course.history, course.refits, course.stage = data, history, refits, history[-1][1]
 
 
 def _screened(
@@ -327,12 +355,6 @@ def _beside_a_tie(
     if both is None or evidence(stage.fit, both.stage.fit) - both.candidate.cost <= BETTER:
         return instead, None, []
     return instead, both, tried
-
-
-def _unsettled(refits: list[dict[str, Any]], step: int, error: FemsenseError) -> list[dict[str, Any]]:
-    """Return the records of refits with what was named in a step taken back, since its states do not come to rest when they are asked for again."""
-    back = {"verdict": f"no equilibrium: {error}"}
-    return [{**r, **back} if r["step"] == step and r["verdict"] == "named" else r for r in refits]
 
 
 def _renamed(refits: list[dict[str, Any]], step: int, name: str) -> list[dict[str, Any]]:

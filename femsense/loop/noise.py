@@ -303,7 +303,7 @@ def estimate_noise(
 
     whites = {max(jitter, FLOOR), 0.3 * scale, 0.7 * scale}
     starts = [np.log([w if n == "white" else 0.3 * scale for n in names]) for w in whites]
-    if near is not None:  # a component that was none before would stay none, since its logarithm has no slope there: it is lifted once
+    if near is not None:  # what was none before would stay none, since its logarithm has no slope there: it is lifted once
         starts = [near, np.maximum(near, np.log(0.3 * scale))]
     best = min(each(from_start, starts), key=lambda answer: answer.fun)
     std = {name: float(v) for name, v in zip(names, np.exp(best.x))}

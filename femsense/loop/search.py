@@ -1,14 +1,63 @@
-"""What the search for effects went through, as the conclusion needs it."""
+"""How far a search for effects has come, and what it went through, as the conclusion needs it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
+from femsense.errors import FemsenseError
+from femsense.loop.data import Data
+from femsense.loop.grow import Refit
 from femsense.loop.noise import Noise
-from femsense.loop.screen import Candidate
+from femsense.loop.screen import Candidate, Fields
 from femsense.loop.stages import Stage
 from femsense.loop.zeros import InPlace
+
+
+@dataclass(eq=False, slots=True)
+class Course:
+    """How far a search has come."""
+
+    data: Data
+    earlier: Data
+    """The data as they were before the last effect was added."""
+    before: Stage
+    """The declared model, calibrated."""
+    history: list[tuple[str, Stage]]
+    """As of `Search`."""
+    given: int
+    """How many models of the history were there before the search."""
+    stage: Stage
+    """The model that comes next is this one with one effect more."""
+    base: Stage
+    """As of `Search`, from the first screening on."""
+    names: list[str]
+    """Effects that are tried."""
+    quadratic: bool
+    """Whether it goes on quadratic elements though linear ones are declared."""
+    refits: list[dict[str, Any]]
+    """What became of candidates that were refitted."""
+    ties: list[Refit] = field(default_factory=list)
+    """What was as good as the last effect."""
+    noise: Noise | None = None
+    n_effective: float = 0.0
+    fields: Fields | None = None
+    first: list[Candidate] = field(default_factory=list)
+    table: list[Candidate] = field(default_factory=list)
+    """The last screening."""
+    over: bool = False
+
+    @property
+    def found(self) -> int:
+        """How many effects were found."""
+        return len(self.history) - self.given
+
+    def take_back(self, error: FemsenseError) -> None:
+        """End without the last effect, whose states do not come to rest when they are asked for again."""
+        step, back = len(self.history) - 1, {"verdict": f"no equilibrium: {error}"}
+        self.refits = [{**r, **back} if r["step"] == step and r["verdict"] == "named" else r for r in self.refits]
+        self.data, self.history, self.over = self.earlier, self.history[:-1], True
+        self.stage = self.history[-1][1]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -33,4 +82,4 @@ class Search:
     """What might be in the place of the cable zeros."""
 
 
-__all__ = ["Search"]
+__all__ = ["Course", "Search"]

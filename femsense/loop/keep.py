@@ -1,0 +1,109 @@
+"""How far a search has come, kept in a file: one that is killed goes on there.
+
+The file is a pickle, of which only numbers and the package's own data are read back, so that a folder from elsewhere runs nothing.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import pickle
+from collections.abc import Mapping, Sequence
+from dataclasses import is_dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, BinaryIO
+
+from femsense.effects import Effect
+from femsense.errors import FemsenseError
+from femsense.fem.linear import PardisoHandle, SuperLU
+from femsense.files import json_text, write_beside
+from femsense.loop.search import Course
+
+NUMPY = ("ndarray", "dtype", "scalar", "_reconstruct", "_frombuffer")
+PATHS = ("Path", "PosixPath", "WindowsPath", "PurePosixPath", "PureWindowsPath")
+DIGEST = 32
+"""Bytes at the beginning of the file that say what the search is made from."""
+NOTHING = -1
+"""Written for a factor that SciPy keeps in its own memory; states are solved again without it."""
+UNREADABLE = (OSError, EOFError, ValueError, TypeError, LookupError, AttributeError, ImportError, pickle.UnpicklingError)
+"""What comes of a file that is cut off, or that another version wrote."""
+
+
+class Keeper:
+    """Keeps a search, if it is told where: a help that may fail, and then the search begins anew."""
+
+    def __init__(self, where: tuple[str | Path, Mapping[str, Any]] | None, effects: Sequence[Effect]) -> None:
+        """where: the file, and what the search is made from. effects: all those that it may hold; they are not written."""
+        self.file = None if where is None else Path(where[0])
+        self.made_from = b"" if where is None else hashlib.sha256(json_text(where[1]).encode()).digest()
+        self.effects = effects
+
+    def keep(self, course: Course) -> None:
+        """Write how far a search has come."""
+        if self.file is None:
+            return
+        with contextlib.suppress(OSError, TypeError, pickle.PicklingError), write_beside(self.file) as part, part.open("wb") as stream:
+            stream.write(self.made_from)
+            _Writer(stream, self.effects).dump(course)
+
+    def kept(self) -> Course | None:
+        """Return how far a search came that is made from the same; None where there is none, or none that can be read."""
+        if self.file is None:
+            return None
+        try:
+            with self.file.open("rb") as stream:
+                if stream.read(DIGEST) != self.made_from:
+                    return None
+                course = _Reader(stream, self.effects).load()
+        except UNREADABLE:
+            return None
+        return course if isinstance(course, Course) else None
+
+    def __enter__(self) -> None: ...
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        """Remove the file, and its folder where it is empty, after a result and after an error that would come again."""
+        if self.file is not None and (error is None or isinstance(error, FemsenseError)):
+            with contextlib.suppress(OSError):
+                self.file.unlink(missing_ok=True)
+                self.file.parent.rmdir()
+
+
+class _Writer(pickle.Pickler):
+    def __init__(self, stream: BinaryIO, effects: Sequence[Effect]) -> None:
+        super().__init__(stream, protocol=5)
+        self.number = {id(effect): i for i, effect in enumerate(effects)}
+
+    def persistent_id(self, thing: Any) -> int | None:
+        if isinstance(thing, SuperLU):
+            return NOTHING
+        if isinstance(thing, PardisoHandle):
+            raise pickle.PicklingError("PARDISO's factors live in its own memory")
+        if not isinstance(thing, Effect):
+            return None
+        if id(thing) not in self.number:
+            raise pickle.PicklingError(f"{thing.name} is none of the effects")
+        return self.number[id(thing)]
+
+
+class _Reader(pickle.Unpickler):
+    def __init__(self, stream: BinaryIO, effects: Sequence[Effect]) -> None:
+        super().__init__(stream)
+        self.effects = effects
+
+    def persistent_load(self, number: Any) -> Effect | None:
+        return None if number == NOTHING else self.effects[number]
+
+    def find_class(self, module: str, name: str) -> Any:
+        package = module.split(".")[0]
+        if (package == "numpy" and name in NUMPY) or (package == "pathlib" and name in PATHS):
+            return super().find_class(module, name)
+        if package == "femsense":
+            found = super().find_class(module, name)
+            if isinstance(found, type) and (is_dataclass(found) or module.startswith("femsense.fem.")):
+                return found
+        raise pickle.UnpicklingError(f"{module}.{name} is no part of a search")
+
+
+__all__ = ["Keeper"]
