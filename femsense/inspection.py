@@ -23,6 +23,7 @@ from femsense.files import plain
 from femsense.model import Robot
 from femsense.pose import check_pose
 from femsense.recording import Recording
+from femsense.rig.script import read_script
 from femsense.tables import near, read_toml
 
 Report = dict[str, Any]
@@ -53,7 +54,7 @@ def inspect_path(path: str | Path) -> Report:
     """Return what a file or folder is and holds, and what is wrong with it.
 
     Returns:
-        plain tables: `path`, `kind` (robot, recording, mesh, surface, cloud, image, calibration, run, loop, capture, table or
+        plain tables: `path`, `kind` (robot, recording, script, mesh, surface, cloud, image, calibration, run, loop, capture, table or
         unknown), what is in it with units in the names, and at the end `problems` and `warnings`, lists of texts.
 
     Raises:
@@ -117,6 +118,7 @@ TITLES = {
     "calibration": "a calibration",
     "run": "the results of an estimate",
     "loop": "the result of a closed loop",
+    "script": "a script of the virtual rig",
     "capture": "a capture of another program",
     "table": "a table",
     "unknown": "not a kind of file that femsense knows",
@@ -155,7 +157,7 @@ def _kind_of_folder(folder: Path) -> tuple[str, Inspector]:
 def _kind_of_file(file: Path) -> tuple[str, Inspector]:
     ending = file.suffix.lower()
     if ending == ".toml":
-        return ("recording", _recording) if file.name == "recording.toml" or _format(file).startswith("femsense-recording") else ("robot", _robot)  # fmt: skip
+        return _kind_of_toml(file)
     if ending == ".json":
         return _kind_of_json(file)
     if ending == ".pcd" or (ending == ".ply" and not _has_faces(file)):
@@ -168,6 +170,13 @@ def _kind_of_file(file: Path) -> tuple[str, Inspector]:
         return "capture", _capture
     others: dict[str, tuple[str, Inspector]] = {".png": ("image", _image), ".csv": ("table", _table_file)}
     return others.get(ending, ("unknown", _unknown))
+
+
+def _kind_of_toml(file: Path) -> tuple[str, Inspector]:
+    own = _format(file)
+    if file.name == "recording.toml" or own.startswith("femsense-recording"):
+        return "recording", _recording
+    return ("script", _script) if own.startswith("femsense-script") else ("robot", _robot)
 
 
 def _kind_of_json(file: Path) -> tuple[str, Inspector]:
@@ -528,6 +537,19 @@ def _expect(data: Mapping[str, Any], name: str, keys: Sequence[str], file: Path)
     if missing:
         texts.append(str(InputError("keys are missing", where=file, found=", ".join(data), expected=", ".join(missing))))
     return texts
+
+
+def _script(file: Path, report: Report, problems: list[str]) -> None:
+    script = read_script(file)
+    report["actuation"] = script.actuation
+    report["sweeps"] = [
+        {"label": s.label, "frames": len(s.profile()), "drives": ", ".join([*s.cables, *s.chambers])} for s in script.sweeps
+    ]
+    report["frames"] = sum(len(s.profile()) for s in script.sweeps)
+    report["effects"] = [str(entry.get("name", "")) for entry in script.effects]
+    report["contacts"], report["loads"] = len(script.contacts), len(script.loads)
+    report["camera"] = f"{script.camera.width} × {script.camera.height}"
+    report["clouds"] = script.clouds.kind
 
 
 def _calibration(file: Path, report: Report, problems: list[str]) -> None:

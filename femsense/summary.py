@@ -182,9 +182,9 @@ def _left(left: Mapping[str, Any]) -> str:
     if left.get("rms_m") is None:
         return ""
     words = [f"{1e3 * left['rms_m']:.3g} mm rms" + (" in held-out data" if left.get("held_out") else "")]
-    marker = (left.get("where") or {}).get("marker")
-    if marker:
-        words.append(f"most at {marker}" if str(marker).startswith("surface ") else f"most at marker {marker}")
+    where = left.get("where") or {}
+    if where.get("marker"):
+        words.append("most " + _place_text(where))
     frame = (left.get("worst_frame") or {}).get("frame")
     if frame is not None:
         words.append(f"in frame {frame}")
@@ -195,6 +195,13 @@ def _left(left: Mapping[str, Any]) -> str:
     if "significant" in tests:
         words.append("with structure" if tests["significant"] else "without structure")
     return ", ".join(words)
+
+
+def _place_text(where: Mapping[str, Any]) -> str:
+    """Return where a residual is largest: at a marker, or at a place on the body at rest."""
+    if not str(where["marker"]).startswith("surface "):
+        return f"at marker {where['marker']}"
+    return "at ({:.0f}, {:.0f}, {:.0f}) mm on the body".format(*(1e3 * v for v in where["position_m"]))
 
 
 def effect_text(effect: Mapping[str, Any]) -> str:

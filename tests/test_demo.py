@@ -118,6 +118,8 @@ def test_what_would_have_been_seen_and_what_is_left_are_said_in_a_line() -> None
     )
     assert text.endswith("what is left: 1 mm rms in held-out data, most at marker tip, in frame 7, going with cable north")
     assert "would have been seen" not in loop_text({"verdict": "effects", "detectable": sizes})
+    on_body = {"rms_m": 1e-3, "where": {"marker": "surface 103", "position_m": [0.0119, -0.02, 0.1]}}
+    assert loop_text({"verdict": "none", "left": on_body}).endswith("most at (12, -20, 100) mm on the body")
 
 
 def test_a_frame_that_no_force_explains_is_said(run: Run) -> None:

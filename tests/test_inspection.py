@@ -17,7 +17,7 @@ from femsense.errors import InputError
 from femsense.fem.mesh import TetMesh
 from femsense.inspection import describe, inspect_path
 from femsense.recording import load_recording
-from femsense.robot import load_robot
+from femsense.robot import load_robot, robot_names
 
 TOML = RECORDING_FILES["recording.toml"]
 
@@ -236,6 +236,16 @@ def test_a_run_and_what_it_lacks(tmp_path: Path) -> None:
     np.savez(tmp_path / "states.npz", nodes_m=np.zeros((3, 5, 3), dtype=np.float32))
     report = inspect(tmp_path)
     assert report["states"] == {"nodes_m": "3 × 5 × 3"} and report["problems"] == []
+
+
+def test_a_script(tmp_path: Path) -> None:
+    text = (robot_names()["four-leg"] / "demo_script.toml").read_text(encoding="utf-8")
+    (tmp_path / "plan.toml").write_text(text, encoding="utf-8")
+    report = inspect(tmp_path / "plan.toml")
+    assert report["kind"] == "script" and report["frames"] == 44 and report["effects"] == ["cable_friction", "stiffness"]
+    assert report["sweeps"][0] == {"label": "north", "frames": 7, "drives": "north"} and not report["problems"]
+    (tmp_path / "plan.toml").write_text(text.replace("eye_m", "eye"), encoding="utf-8")
+    assert "camera.eye" in inspect(tmp_path / "plan.toml")["problems"][0]
 
 
 # Whatever else

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import pytest
 from helpers import changed, write_block_robot
 
 from femsense.errors import InputError
+from femsense.rig import script as script_module
 from femsense.rig.script import check_script, plan_script, read_script
 from femsense.robot import load_robot
 
@@ -97,3 +99,14 @@ def test_a_missing_or_broken_file_is_named(tmp_path: Path) -> None:
     (tmp_path / "broken.toml").write_text("format = ", encoding="utf-8")
     with pytest.raises(InputError, match=r"broken\.toml"):
         read_script(tmp_path / "broken.toml")
+
+
+def test_every_key_of_a_script_is_in_its_page():
+    page = (Path(__file__).parents[1] / "docs" / "scripts.md").read_text(encoding="utf-8")
+    tables = [t for t in vars(script_module).values() if isinstance(t, type) and issubclass(t, script_module.Schema) and t.model_fields]
+    assert len(tables) == 10
+    for table in tables:
+        for key, field in table.model_fields.items():
+            assert f"| `{key}` | {field.description} |" in page, f"{table.__name__}.{key}"
+    example = tomllib.loads(page.split("```toml")[1].split("```")[0])
+    assert check_script(example).sweeps[1].hold == 2

@@ -43,7 +43,11 @@ class Keeper:
         """Write how far a search has come."""
         if self.file is None:
             return
-        with contextlib.suppress(OSError, TypeError, pickle.PicklingError), write_beside(self.file) as part, part.open("wb") as stream:
+        with (
+            contextlib.suppress(OSError, TypeError, pickle.PicklingError),
+            write_beside(self.file) as part,
+            part.open("wb") as stream,
+        ):
             stream.write(self.made_from)
             _Writer(stream, self.effects).dump(course)
 

@@ -411,8 +411,10 @@ def _left_facts(left: Left, *, effects: bool) -> list[str]:
     where = left.where
     if where.marker:
         mean = f", mean {words.parameter(list(where.mean_residual_m), None, 'm')}" if where.mean_residual_m else ""
-        kind = "" if where.marker.startswith("surface ") else "marker "
-        facts.append(f"Where: most at {kind}{where.marker}{mean}.")
+        place = f"marker {where.marker}"
+        if where.marker.startswith("surface "):
+            place = where.marker + (f" ({words.parameter(list(where.position_m), None, 'm')})" if where.position_m else "")
+        facts.append(f"Where: most at {place}{mean}.")
     if where.direction and all(map(words.known, where.direction)):
         along = ", ".join(words.number(v, 2) for v in where.direction)
         facts.append(f"Which way: {words.percent(where.direction_share)} of it there lies along ({along}).")
