@@ -103,7 +103,9 @@ def test_a_missing_or_broken_file_is_named(tmp_path: Path) -> None:
 
 def test_every_key_of_a_script_is_in_its_page():
     page = (Path(__file__).parents[1] / "docs" / "scripts.md").read_text(encoding="utf-8")
-    tables = [t for t in vars(script_module).values() if isinstance(t, type) and issubclass(t, script_module.Schema) and t.model_fields]
+    tables = [
+        t for t in vars(script_module).values() if isinstance(t, type) and issubclass(t, script_module.Schema) and t.model_fields
+    ]
     assert len(tables) == 10
     for table in tables:
         for key, field in table.model_fields.items():
