@@ -38,10 +38,11 @@ def stop_at(what: str) -> Callable[[str], None]:
 
 @pytest.fixture(scope="module")
 def stopped(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The file of a search that was stopped when it had found one effect."""
+    """The file of a search that was stopped when it had found one effect; it holds no factors."""
     file = tmp_path_factory.mktemp("stopped") / "loop" / ".unfinished"
     with pytest.raises(KeyboardInterrupt):
         search(file, stop_at("screening effects (1 found"))
+    assert 0 < file.stat().st_size < 4e6
     return file
 
 

@@ -246,14 +246,12 @@ def _factorize_any(pattern: Pattern, values: FloatArray) -> Factorization | None
         return _factorize_pardiso(pattern, values)
     matrix = sp.csc_matrix((values, pattern.indices, pattern.indptr), shape=(pattern.size,) * 2)
     try:
-        return SuperLU(splu(matrix, permc_spec="NATURAL", diag_pivot_thresh=0.0, options={"SymmetricMode": True}))
+        return _SuperLU(splu(matrix, permc_spec="NATURAL", diag_pivot_thresh=0.0, options={"SymmetricMode": True}))
     except RuntimeError:  # exactly singular
         return None
 
 
-class SuperLU:
-    """A factor of SciPy's SuperLU."""
-
+class _SuperLU:
     def __init__(self, lu: Any) -> None:
         kept_order = bool((lu.perm_r == np.arange(len(lu.perm_r))).all())
         pivots = lu.U.diagonal()
@@ -285,7 +283,7 @@ def pardiso_library() -> Any:
     return solver.libmkl.pardiso
 
 
-class PardisoHandle:
+class _PardisoHandle:
     """PARDISO's memory for one pattern: its analysis, and one factor at a time."""
 
     def __init__(self, pattern: Pattern) -> None:
@@ -327,7 +325,7 @@ def _release(pt: Any, iparm: Any, size: int) -> None:
 
 
 class _Pardiso:
-    def __init__(self, handle: PardisoHandle, pattern: Pattern) -> None:
+    def __init__(self, handle: _PardisoHandle, pattern: Pattern) -> None:
         self.negative = int(handle.iparm[22]) + int(handle.iparm[13])  # negative eigenvalues and perturbed pivots
         self.size = handle.size
         self.bytes = 8 * handle.entries
@@ -349,7 +347,7 @@ class _Pardiso:
 
 
 def _factorize_pardiso(pattern: Pattern, values: FloatArray) -> Factorization | None:
-    handle = pattern.idle.pop() if pattern.idle else PardisoHandle(pattern)
+    handle = pattern.idle.pop() if pattern.idle else _PardisoHandle(pattern)
     handle.values = values[pattern.upper]
     if handle.call(22):
         pattern.idle.append(handle)

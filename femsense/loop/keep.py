@@ -8,15 +8,17 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import pickle
-from collections.abc import Mapping, Sequence
-from dataclasses import is_dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import is_dataclass, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO
 
 from femsense.effects import Effect
 from femsense.errors import FemsenseError
-from femsense.fem.linear import PardisoHandle, SuperLU
+from femsense.fem.cholesky import Analysis
+from femsense.fem.equilibrium import Equilibrium
+from femsense.fem.linear import Pattern
 from femsense.files import json_text, write_beside
 from femsense.loop.search import Course
 
@@ -24,8 +26,12 @@ NUMPY = ("ndarray", "dtype", "scalar", "_reconstruct", "_frombuffer")
 PATHS = ("Path", "PosixPath", "WindowsPath", "PurePosixPath", "PureWindowsPath")
 DIGEST = 32
 """Bytes at the beginning of the file that say what the search is made from."""
-NOTHING = -1
-"""Written for a factor that SciPy keeps in its own memory; states are solved again without it."""
+NEEDLESS: dict[type, tuple[str, Callable[[], Any]]] = {
+    Equilibrium: ("factor", lambda: None),
+    Analysis: ("idle", dict),
+    Pattern: ("idle", list),
+}
+"""What is large and soon made again: factors that later ones start from, and memory that waits for use."""
 UNREADABLE = (OSError, EOFError, ValueError, TypeError, LookupError, AttributeError, ImportError, pickle.UnpicklingError)
 """What comes of a file that is cut off, or that another version wrote."""
 
@@ -80,15 +86,17 @@ class _Writer(pickle.Pickler):
         self.number = {id(effect): i for i, effect in enumerate(effects)}
 
     def persistent_id(self, thing: Any) -> int | None:
-        if isinstance(thing, SuperLU):
-            return NOTHING
-        if isinstance(thing, PardisoHandle):
-            raise pickle.PicklingError("PARDISO's factors live in its own memory")
         if not isinstance(thing, Effect):
             return None
         if id(thing) not in self.number:
             raise pickle.PicklingError(f"{thing.name} is none of the effects")
         return self.number[id(thing)]
+
+    def reducer_override(self, thing: Any) -> Any:
+        if type(thing) not in NEEDLESS:
+            return NotImplemented
+        name, nothing = NEEDLESS[type(thing)]
+        return replace(thing, **{name: nothing()}).__reduce_ex__(pickle.HIGHEST_PROTOCOL)
 
 
 class _Reader(pickle.Unpickler):
@@ -96,8 +104,8 @@ class _Reader(pickle.Unpickler):
         super().__init__(stream)
         self.effects = effects
 
-    def persistent_load(self, number: Any) -> Effect | None:
-        return None if number == NOTHING else self.effects[number]
+    def persistent_load(self, number: Any) -> Effect:
+        return self.effects[int(number)]
 
     def find_class(self, module: str, name: str) -> Any:
         package = module.split(".")[0]
