@@ -8,9 +8,10 @@ equilibrium under the inputs ─ match along normals (or markers) ─► rows �
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -23,6 +24,7 @@ from femsense.fem.assembly import internal
 from femsense.fem.compliance import Tangent, tangent_at
 from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.mesh import vertex_normals
+from femsense.keep import Keeper
 from femsense.march import Walk, drive_of, has_history, solve_frame
 from femsense.model import Robot, spread_features
 from femsense.parallel import one_blas_thread
@@ -39,6 +41,8 @@ from femsense.recording import Recording, check_against, read_frame_cloud
 
 ROUGH = 1e-6
 """Unbalanced force, relative to all loads, of the states on the way to the forces; the last one is exact."""
+KEEP_S = 10.0
+"""Seconds of work that a killed estimate may lose."""
 PLACE_STD = 0.5
 """How well the place of a contact is known, in search radii."""
 
@@ -160,6 +164,18 @@ class SensedFrame:
     contacts: tuple[ContactForce, ...]
 
 
+@dataclass(eq=False, slots=True)
+class Done:
+    """The frames of a recording that are sensed so far."""
+
+    reports: list[FrameReport] = field(default_factory=list)
+    contacts: list[ContactForce] = field(default_factory=list)
+    states: list[FloatArray] = field(default_factory=list)
+    """Node positions [m], shape (n, 3), one array a frame."""
+    last: SensedFrame | None = None
+    """The last frame that gave a result."""
+
+
 @dataclass(frozen=True, eq=False, slots=True)
 class Seen:
     """What the cameras see in one frame, robot frame."""
@@ -223,6 +239,7 @@ def estimate(
     at: npt.ArrayLike | None = None,
     options: SensingOptions | None = None,
     progress: Callable[[int, int], None] | None = None,
+    keep: tuple[str | Path, Mapping[str, Any]] | None = None,
 ) -> Run:
     """Find contacts and forces in every frame: from clouds, or from markers where there are none.
 
@@ -236,36 +253,37 @@ def estimate(
         at: places of contact at rest [m], shape (g, 3); needed where there are only markers.
         options: thresholds and assumptions.
         progress: called with (frames done, frames in all).
+        keep: a file that holds the frames that are done, so that an estimate that is killed goes on there, and what it is made from: a file that
+            says something else is not used. It is removed at the end.
 
     Raises:
         InputError: no clouds and no places; DataError: not one frame gave a result.
     """
     sensor = make_sensor(robot, recording, calibration, at=at, options=options)
-    reports: list[FrameReport] = []
-    contacts: list[ContactForce] = []
-    states: list[FloatArray] = []
-    sensed: SensedFrame | None = None
     count = len(recording.time_s)
-    for k in range(count):
-        try:
-            sensed = sense_frame(sensor, k, sensed)
-            reports.append(sensed.report)
-            contacts.extend(sensed.contacts)
-        except FemsenseError as error:
-            reports.append(_failed(sensor, k, error))
-        states.append(robot.body.mesh.nodes if sensed is None else sensed.state.positions)
-        if progress is not None:
-            progress(k + 1, count)
-    if sensed is None:
-        raise DataError(f"not one of {count} frames gave a result; the first: {reports[0].status}")
+    with Keeper(keep) as keeper:
+        done = keeper.kept(Done) or Done()
+        for k in range(len(done.reports), count):
+            try:
+                done.last = sense_frame(sensor, k, done.last)
+                done.reports.append(done.last.report)
+                done.contacts.extend(done.last.contacts)
+            except FemsenseError as error:
+                done.reports.append(_failed(sensor, k, error))
+            done.states.append(robot.body.mesh.nodes if done.last is None else done.last.state.positions)
+            if progress is not None:
+                progress(k + 1, count)
+            keeper.keep(done, every=KEEP_S)
+    if done.last is None:
+        raise DataError(f"not one of {count} frames gave a result; the first: {done.reports[0].status}")
     mesh = robot.body.mesh
     return Run(
-        contacts=tuple(contacts),
-        frames=tuple(reports),
-        states=States(recording.time_s, np.asarray(states, dtype=np.float32), mesh.tets, mesh.nodes),
+        contacts=tuple(done.contacts),
+        frames=tuple(done.reports),
+        states=States(recording.time_s, np.asarray(done.states, dtype=np.float32), mesh.tets, mesh.nodes),
         robot=robot,
         recording_folder=recording.folder,
-        known_loads=_compare_loads(recording, sensor.places, contacts, sensor.size),
+        known_loads=_compare_loads(recording, sensor.places, done.contacts, sensor.size),
     )
 
 

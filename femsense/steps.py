@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +13,7 @@ import femsense
 from femsense import results
 from femsense.errors import FemsenseError, InputError
 from femsense.files import file_hash
+from femsense.keep import UNFINISHED
 from femsense.parallel import beside
 from femsense.recording import load_recording
 from femsense.robot import load_robot
@@ -22,9 +23,6 @@ if TYPE_CHECKING:
 
 Progress = Callable[..., None]
 Say = Callable[[str], None]
-
-UNFINISHED = ".unfinished"
-"""File of a search that is not at its end, in its folder."""
 
 
 def estimate_into(
@@ -66,7 +64,7 @@ def estimate_into(
         say(f"no calibration given: calibrating first, into {Path(folder) / 'calibration.json'}")
     used = calibrate(body, frames) if given is None else given
     began = time.perf_counter()
-    run = estimate(body, frames, used, at=at, progress=progress)
+    run = estimate(body, frames, used, at=at, progress=progress, keep=_kept(folder, inputs))
     results.write_run(run, folder, inputs=inputs, seconds=time.perf_counter() - began, calibration=used)
     return run
 
@@ -127,10 +125,15 @@ def improve_into(
             user_effects=user_effects,
             measured=measured,
             progress=progress,
-            keep=(Path(folder) / UNFINISHED, {**inputs, "version": femsense.__version__}),
+            keep=_kept(folder, inputs),
         )
     results.write_loop(loop, folder, inputs=inputs)
     return results.read_loop(folder)
+
+
+def _kept(folder: str | Path, inputs: Mapping[str, Any]) -> tuple[Path, dict[str, Any]]:
+    """Return where a killed command has left how far it came, and what that is made from."""
+    return Path(folder) / UNFINISHED, {**inputs, "version": femsense.__version__}
 
 
 def _load_pages() -> None:

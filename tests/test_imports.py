@@ -20,7 +20,7 @@ LAYERS = (
     ("model",),
     ("effects",),
     ("surface",),
-    ("files", "tables", "meshfile", "quality", "frames", "frame_clouds", "robot", "recording", "materials", "regions"),
+    ("files", "tables", "meshfile", "quality", "frames", "frame_clouds", "robot", "recording", "materials", "regions", "keep"),
     ("march", "patch", "meshing"),
     ("calib", "xr", "rig"),
     ("sensing", "loop", "importers", "learn", "stream"),

@@ -20,6 +20,7 @@ import numpy as np
 from femsense.calib.forward import Hypothesis, SceneJet
 from femsense.effects import EFFECTS, FORMS, Effect, find_effect, load_own_effect, try_own_effect
 from femsense.errors import DataError, FemsenseError, InputError
+from femsense.keep import Keeper
 from femsense.loop.conclude import conclude
 from femsense.loop.data import MESH, Data, prepare
 from femsense.loop.elements import need_quadratic, seeks_with_quadratic, with_quadratic
@@ -27,7 +28,6 @@ from femsense.loop.exchange import BETTER, History, exchanged
 from femsense.loop.few import spares
 from femsense.loop.grow import Progress, Refit, grow, mesh_cost, moved_by, prune, shortlist
 from femsense.loop.joint import Prior
-from femsense.loop.keep import Keeper
 from femsense.loop.mesh_error import errs_alike, few_states, make_finer, with_mesh_errors
 from femsense.loop.noise import Noise
 from femsense.loop.refit import EVIDENCE, evidence
@@ -116,8 +116,7 @@ def improve(
             finer_is_made()
         return _with_cost_of_mesh(data, start[-1][1], names, say), before, start
 
-    keeper = Keeper(keep, (*FORMS, *own))
-    with keeper:
+    with Keeper(keep, (*FORMS, *own)) as keeper:
         data, search = _searched(robot, names, ready, keeper, say)
         say("testing what is left")
         result = conclude(data, search, rng)
@@ -134,9 +133,9 @@ def _searched(
     """Return the data with what a search finds in them: on quadratic elements where the robot declares linear ones and the data miss those, else on what
     is declared. One that was killed goes on where it was."""
     refits: list[dict[str, Any]] = []
-    kept = keeper.kept()
+    kept = keeper.kept(Course)
     if kept is not None:
-        say(f"going on where it stopped ({kept.found} effects found)")
+        say(f"going on where it stopped (effects found: {kept.found})")
     if seeks_with_quadratic(robot, names) and (kept is None or kept.quadratic):
         with contextlib.suppress(FemsenseError):  # linear elements lock, and come to rest where quadratic ones fold
             course = kept or _begun(ready(with_quadratic(robot), names), names, [], quadratic=True)

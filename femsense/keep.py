@@ -1,4 +1,4 @@
-"""How far a search has come, kept in a file: one that is killed goes on there.
+"""How far a long computation has come, kept in a file: one that is killed goes on there.
 
 The file is a pickle, of which only numbers and the package's own data are read back, so that a folder from elsewhere runs nothing.
 """
@@ -8,11 +8,12 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import pickle
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import is_dataclass, replace
 from pathlib import Path
 from types import TracebackType
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeVar
 
 from femsense.effects import Effect
 from femsense.errors import FemsenseError
@@ -20,8 +21,10 @@ from femsense.fem.cholesky import Analysis
 from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.linear import Pattern
 from femsense.files import json_text, write_beside
-from femsense.loop.search import Course
 
+Course = TypeVar("Course")
+UNFINISHED = ".unfinished"
+"""Name of the file, in the folder of the results."""
 NUMPY = ("ndarray", "dtype", "scalar", "_reconstruct", "_frombuffer")
 PATHS = ("Path", "PosixPath", "WindowsPath", "PurePosixPath", "PureWindowsPath")
 DIGEST = 32
@@ -37,17 +40,18 @@ UNREADABLE = (OSError, EOFError, ValueError, TypeError, LookupError, AttributeEr
 
 
 class Keeper:
-    """Keeps a search, if it is told where: a help that may fail, and then the search begins anew."""
+    """Keeps how far a computation has come, if it is told where: a help that may fail, and then all begins anew."""
 
-    def __init__(self, where: tuple[str | Path, Mapping[str, Any]] | None, effects: Sequence[Effect]) -> None:
-        """where: the file, and what the search is made from. effects: all those that it may hold; they are not written."""
+    def __init__(self, where: tuple[str | Path, Mapping[str, Any]] | None, effects: Sequence[Effect] = ()) -> None:
+        """where: the file, and what the computation is made from. effects: all those that it may hold; they are not written."""
         self.file = None if where is None else Path(where[0])
         self.made_from = b"" if where is None else hashlib.sha256(json_text(where[1]).encode()).digest()
         self.effects = effects
+        self.last = time.monotonic()
 
-    def keep(self, course: Course) -> None:
-        """Write how far a search has come."""
-        if self.file is None:
+    def keep(self, course: object, *, every: float = 0.0) -> None:
+        """Write how far a computation has come, not more often than `every` so many seconds."""
+        if self.file is None or time.monotonic() < self.last + every:
             return
         with (
             contextlib.suppress(OSError, TypeError, pickle.PicklingError),
@@ -56,9 +60,10 @@ class Keeper:
         ):
             stream.write(self.made_from)
             _Writer(stream, self.effects).dump(course)
+        self.last = time.monotonic()
 
-    def kept(self) -> Course | None:
-        """Return how far a search came that is made from the same; None where there is none, or none that can be read."""
+    def kept(self, kind: type[Course]) -> Course | None:
+        """Return how far a computation came that is made from the same; None where there is none, or none that can be read."""
         if self.file is None:
             return None
         try:
@@ -68,9 +73,10 @@ class Keeper:
                 course = _Reader(stream, self.effects).load()
         except UNREADABLE:
             return None
-        return course if isinstance(course, Course) else None
+        return course if isinstance(course, kind) else None
 
-    def __enter__(self) -> None: ...
+    def __enter__(self) -> Keeper:
+        return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         """Remove the file, and its folder where it is empty, after a result and after an error that would come again."""
@@ -115,7 +121,7 @@ class _Reader(pickle.Unpickler):
             found = super().find_class(module, name)
             if isinstance(found, type) and (is_dataclass(found) or module.startswith("femsense.fem.")):
                 return found
-        raise pickle.UnpicklingError(f"{module}.{name} is no part of a search")
+        raise pickle.UnpicklingError(f"{module}.{name} is no part of a computation")
 
 
-__all__ = ["Keeper"]
+__all__ = ["UNFINISHED", "Keeper"]

@@ -1,4 +1,4 @@
-"""A search that is stopped goes on where it was; what is read back is the package's own."""
+"""A search or an estimate that is stopped goes on where it was; what is read back is the package's own."""
 
 from __future__ import annotations
 
@@ -9,15 +9,21 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from arm import arm, record, sweeps
 
-from femsense.effects import FORMS
+from femsense import sensing
+from femsense.calib.calibrate import calibrate
+from femsense.effects import FORMS, apply_effects
 from femsense.errors import DataError
+from femsense.keep import DIGEST, Keeper
 from femsense.loop import LoopResult, improve
-from femsense.loop.keep import DIGEST, Keeper
+from femsense.loop.search import Course
 
 HIDDEN = [{"name": "cable_friction", "coefficient": 0.2}]
+TIP, FORCE = np.array([0.1, 0.0, 0.01]), np.array([0.01, 0.08, -0.15])
+INPUTS = np.array([[0.0, 0, 0, 0], [0.5, 0, 0, 0], [0.5, 0, 0.3, 0], [0.5, 0, 0.3, 0]])
 MADE_FROM = {"recordings": [{"sha256": "1"}]}
 
 
@@ -51,7 +57,7 @@ def test_a_search_that_was_stopped_goes_on_where_it_was(stopped: Path, tmp_path:
     file.parent.mkdir()
     file.write_bytes(stopped.read_bytes())
     found, whole = search(file, said.append), search(None, lambda text: None)
-    assert said[:2] == ["going on where it stopped (1 effects found)", "screening effects (1 found so far)"]
+    assert said[:2] == ["going on where it stopped (effects found: 1)", "screening effects (1 found so far)"]
     assert found.verdict == whole.verdict and found.sentence == whole.sentence
     assert [e["name"] for e in found.effects] == [e["name"] for e in whole.effects] and "cable_friction" in found.sentence
     assert found.after["validation_rms_m"] == pytest.approx(whole.after["validation_rms_m"], rel=1e-4)
@@ -66,8 +72,8 @@ def test_a_file_that_is_cut_off_or_made_from_something_else_is_not_used(
 ):
     file = tmp_path / ".unfinished"
     file.write_bytes(change(stopped.read_bytes()))
-    assert Keeper((stopped, MADE_FROM), FORMS).kept() is not None
-    assert Keeper((file, MADE_FROM), FORMS).kept() is None
+    assert Keeper((stopped, MADE_FROM), FORMS).kept(Course) is not None
+    assert Keeper((file, MADE_FROM), FORMS).kept(Course) is None
 
 
 class Hostile:
@@ -83,7 +89,7 @@ def test_a_file_from_elsewhere_runs_nothing(tmp_path: Path, call: Callable[..., 
     made, keeper = tmp_path / "made", Keeper((tmp_path / ".unfinished", MADE_FROM), FORMS)
     hostile = Hostile(call, str(made) if call is os.mkdir else f"__import__('os').mkdir({str(made)!r})")
     keeper.file.write_bytes(keeper.made_from + pickle.dumps(hostile))
-    assert keeper.kept() is None and not made.exists()
+    assert keeper.kept(Course) is None and not made.exists()
     pickle.loads(pickle.dumps(hostile))
     assert made.exists()  # anyone else would have run it
 
@@ -96,3 +102,23 @@ def test_an_error_that_would_come_again_leaves_nothing(tmp_path: Path, monkeypat
     with pytest.raises(DataError):
         search(tmp_path / "loop" / ".unfinished", lambda text: None)
     assert not (tmp_path / "loop").exists()
+
+
+def test_an_estimate_that_was_stopped_goes_on_at_the_next_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    rubbing = apply_effects(arm((4, 1, 1)), HIDDEN)  # each state needs the one before
+    recording, _ = record(INPUTS, noise=1e-4, forces={2: (TIP, FORCE), 3: (TIP, 2 * FORCE)}, truth=rubbing)
+    calibration, keep = calibrate(rubbing, recording), (tmp_path / "run" / ".unfinished", MADE_FROM)
+    asked = list[int]()
+
+    def stop(done: int, count: int) -> None:
+        if done == 4:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(sensing, "KEEP_S", 0.0)
+    with pytest.raises(KeyboardInterrupt):
+        sensing.estimate(rubbing, recording, calibration, at=TIP, keep=keep, progress=stop)
+    run = sensing.estimate(rubbing, recording, calibration, at=TIP, keep=keep, progress=lambda done, count: asked.append(done))
+    whole = sensing.estimate(rubbing, recording, calibration, at=TIP)
+    assert asked == [4] and not keep[0].exists() and [f.status for f in run.frames] == [f.status for f in whole.frames]
+    np.testing.assert_allclose([c.force_n_xyz for c in run.contacts], [c.force_n_xyz for c in whole.contacts], atol=1e-5)
+    np.testing.assert_allclose(run.states.nodes_m, whole.states.nodes_m, atol=1e-7)
