@@ -42,16 +42,37 @@ def test_a_wrong_modulus_is_named_stiffness_and_nothing_else():
     assert loop.robot.body.material.young_modulus[0] == pytest.approx(1.25 * 300e3, rel=0.06)
 
 
+LEVEL = np.array([0.0, 0.5, 1.0, 1.0, 0.5, 0.1])
+ONE_EACH = np.concatenate([3.0 * np.outer(LEVEL, row) for row in np.eye(4)])
+"""Inputs of four sweeps, each of which pulls a cable that no other pulls [N]."""
+
+
 def test_what_only_held_out_data_show_is_said():
     """Nothing that is fitted drives the last cable: only what is held out tells that it pulls less than it is told."""
-    level = np.array([0.0, 0.5, 1.0, 1.0, 0.5, 0.1])
-    inputs = np.concatenate([3.0 * np.outer(level, row) for row in np.eye(4)])
-    labels = [f"s{k // 6}" for k in range(24)]
-    recording, _ = record(inputs, effects=[{"name": "cable_gain", "scale": {"right": 0.6}}], labels=labels, truth=arm((4, 1, 1)))
-    loop = improve(arm((4, 1, 1)), [recording], effects=["cable_gain", "cable_friction"])
+    labels, hidden = [f"s{k // 6}" for k in range(24)], [{"name": "cable_gain", "scale": {"right": 0.6}}]
+    fitted, held = (
+        record(ONE_EACH[rows], effects=hidden, labels=labels[rows], truth=arm((4, 1, 1)))[0]
+        for rows in (slice(18), slice(18, 24))
+    )
+    loop = improve(arm((4, 1, 1)), [fitted], validation=[held], effects=["cable_gain", "cable_friction"])
     assert loop.verdict == "unexplained" and loop.left["held_out"]
-    assert "Held-out data show what the fitted ones do not, most in frame 2" in loop.sentence
-    assert loop.left["worst_frame"]["frame"] in (20, 21) and loop.left["rms_m"] > 3 * loop.noise_m
+    assert "Held-out data show what the fitted ones do not, most in frame" in loop.sentence
+    assert loop.left["worst_frame"]["frame"] in (2, 3) and loop.left["rms_m"] > 3 * loop.noise_m
+
+
+def test_where_each_sweep_pulls_a_cable_of_its_own_a_quarter_of_its_frames_is_held_out():
+    labels = [f"s{k // 6}" for k in range(24)]
+    recording, _ = record(
+        ONE_EACH, effects=[{"name": "cable_gain", "scale": {"right": 0.8}}], labels=labels, truth=arm((4, 1, 1))
+    )
+    train, held, how = hold_out(recording, np.arange(24))
+    assert how == f"{len(held)} of 24 frames (each sweep holds what no other does)" and set(train) | set(held) == set(range(24))
+    assert {int(k) // 6 for k in held} == {0, 1, 2, 3} and len(held) == 8 and not set(train) & set(held)
+    np.testing.assert_array_equal(recording.inputs[train].max(axis=0), recording.inputs.max(axis=0))
+    loop = improve(arm((4, 1, 1)), [recording], effects=["cable_gain", "cable_friction"])
+    assert loop.verdict == "effects" and found(loop, "cable_gain")["parameters"]["scale"]["value"]["right"] == pytest.approx(
+        0.8, abs=0.02
+    )
 
 
 def test_what_is_taken_away_by_what_nobody_names_is_left(monkeypatch: pytest.MonkeyPatch):

@@ -74,22 +74,27 @@ def hold_out(recording: Recording, frames: IntArray) -> tuple[IntArray, IntArray
     A quarter of the sweeps, evenly spread and the last among them; of two or three sweeps the last one; of a single sweep
     its last quarter. Where what is left does not drive every input as far, under loads as heavy and in all directions of gravity (nobody could
     tell then what an input does that is held out), or where these only repeat states that are fitted, sweeps that can be spared take their
-    places, if there are any that have states of their own: the evenly spread ones first, then from the last one on.
+    places, if there are any that have states of their own: the evenly spread ones first, then from the last one on. Where no sweep can be
+    spared, a quarter of the frames of each.
     """
     number = sweeps_of(recording, frames)
     count = int(number.max()) + 1
-    if count >= 2:
-        wanted = max(1, round(count / 4))
-        even = np.unique(np.round(np.linspace(count - 1, 0, wanted + 1)[:-1]).astype(int))
-        held = _spared(recording, frames, number, even)
+    if count == 1:
+        split = max(1, round(0.75 * len(frames)))
+        return frames[:split], frames[split:], "the last quarter of the frames (one sweep only)"
+    wanted = max(1, round(count / 4))
+    even = np.unique(np.round(np.linspace(count - 1, 0, wanted + 1)[:-1]).astype(int))
+    held = _spared(recording, frames, number, even)
+    if held is not None:
         mask = np.isin(number, held)
         return frames[~mask], frames[mask], f"{len(held)} of {count} sweeps"
-    split = max(1, round(0.75 * len(frames)))
-    return frames[:split], frames[split:], "the last quarter of the frames (one sweep only)"
+    mask = _spared_within(recording, frames, number)
+    return frames[~mask], frames[mask], f"{mask.sum()} of {len(frames)} frames (each sweep holds what no other does)"
 
 
-def _spared(recording: Recording, frames: IntArray, number: IntArray, even: IntArray) -> IntArray:
-    """Return the sweeps that are held out: `even` or, where these would be missed or only repeat what is fitted, as many of others that are not."""
+def _spared(recording: Recording, frames: IntArray, number: IntArray, even: IntArray) -> IntArray | None:
+    """Return the sweeps that are held out: `even` or, where these would be missed or only repeat what is fitted, as many of others that are not. None
+    where each sweep would be missed."""
 
     def fits(sweeps: list[int]) -> bool:
         return _can_be_spared(recording, frames, np.isin(number, sweeps))
@@ -104,4 +109,22 @@ def _spared(recording: Recording, frames: IntArray, number: IntArray, even: IntA
     for sweep in order:
         if len(chosen) < len(even) and fresh([sweep]) and fits([*chosen, sweep]):
             chosen.append(sweep)
+    if not chosen and not any(fits([sweep]) for sweep in order) and _spared_within(recording, frames, number).any():
+        return None
     return np.array(sorted(chosen)) if chosen else even
+
+
+def _spared_within(recording: Recording, frames: IntArray, number: IntArray) -> BoolArray:
+    """Return which frames are held out where each sweep would be missed, shape (f,): of each a quarter, evenly spread over those that would not, then
+    those with the largest inputs."""
+    held, height = np.zeros(len(frames), dtype=bool), np.abs(_drives(recording)[frames]).sum(axis=1)
+    for sweep in range(int(number.max()) + 1):
+        own = np.flatnonzero(number == sweep)
+        ones = [i for i in own if _can_be_spared(recording, frames, held | (np.arange(len(frames)) == i))]
+        most = min(round(len(own) / 4), len(ones))
+        spread = [ones[j] for j in np.round(np.linspace(0, len(ones) - 1, most + 2)[1:-1]).astype(int)]
+        for i in [*spread, *sorted(ones, key=lambda i: -height[i])]:
+            trial = held | (np.arange(len(frames)) == i)
+            if trial[own].sum() <= most and _can_be_spared(recording, frames, trial):
+                held = trial
+    return held
