@@ -26,6 +26,7 @@ from femsense.errors import FemsenseError, InputError
 
 T = TypeVar("T")
 STOPPED = 130
+STOPPED_TEXT = "stopped; nothing half-written is left, and the same command goes on"
 """Exit status after Ctrl-C, as shells have it."""
 SEVERAL = ("--at", "--validation", "--effects", "--without")
 """Options that take several values after one another."""
@@ -330,14 +331,12 @@ def run(arguments: Sequence[str]) -> int:
                 answer = app(args=words, prog_name="femsense", standalone_mode=False)
             if isinstance(answer, Answer):
                 return _print(answer, as_json, notes)
-            return (
-                _fail("stopped; nothing half-written is left", STOPPED, as_json, notes) if answer == STOPPED else int(answer or 0)
-            )
+            return _fail(STOPPED_TEXT, STOPPED, as_json, notes) if answer == STOPPED else int(answer or 0)
         except BrokenPipeError:
             os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
             return 1
         except (KeyboardInterrupt, typer.Abort):
-            return _fail("stopped; nothing half-written is left", STOPPED, as_json, notes)
+            return _fail(STOPPED_TEXT, STOPPED, as_json, notes)
         except Exception as error:
             if os.environ.get("FEMSENSE_DEBUG") == "1":
                 raise

@@ -20,6 +20,7 @@ from femsense.fem.body import Cable, Chamber
 from femsense.fem.chambers import chamber_volume
 from femsense.fem.mesh import TetMesh, check_mesh, element_volumes, surface_triangles, triangle_normals
 from femsense.files import plain
+from femsense.keep import UNFINISHED
 from femsense.model import Robot
 from femsense.pose import check_pose
 from femsense.recording import Recording
@@ -119,6 +120,7 @@ TITLES = {
     "run": "the results of an estimate",
     "loop": "the result of a closed loop",
     "script": "a script of the virtual rig",
+    "unfinished": "results that are not finished",
     "capture": "a capture of another program",
     "table": "a table",
     "unknown": "not a kind of file that femsense knows",
@@ -149,7 +151,7 @@ def _kind(path: Path) -> tuple[str, Inspector]:
 def _kind_of_folder(folder: Path) -> tuple[str, Inspector]:
     signs: tuple[tuple[str, str, Inspector], ...] = (
         ("loop.json", "loop", _loop), ("robot.toml", "robot", _robot), ("recording.toml", "recording", _recording),
-        ("run.json", "run", _run), ("contacts.csv", "run", _run), ("frames.csv", "recording", _recording),
+        ("run.json", "run", _run), ("contacts.csv", "run", _run), ("frames.csv", "recording", _recording), (UNFINISHED, "unfinished", _unfinished),
     )  # fmt: skip
     return next(((kind, inspect) for name, kind, inspect in signs if (folder / name).is_file()), ("unknown", _folder))
 
@@ -550,6 +552,15 @@ def _script(file: Path, report: Report, problems: list[str]) -> None:
     report["contacts"], report["loads"] = len(script.contacts), len(script.loads)
     report["camera"] = f"{script.camera.width} × {script.camera.height}"
     report["clouds"] = script.clouds.kind
+
+
+def _unfinished(folder: Path, report: Report, problems: list[str]) -> None:
+    report["holds"] = f"{(folder / UNFINISHED).stat().st_size / 1e6:.0f} MB of work that is done"
+    problems.append(
+        str(
+            InputError("a command was stopped here", where=folder, hint="run the same command again: it goes on where it stopped")
+        )
+    )
 
 
 def _calibration(file: Path, report: Report, problems: list[str]) -> None:

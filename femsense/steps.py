@@ -112,6 +112,7 @@ def improve_into(
     train, test = [load_recording(path) for path in recordings], [load_recording(path) for path in validation]
     own = {str(file): file_hash(Path(file)) for file in user_effects if Path(file).is_file()}
     inputs = results.loop_inputs(body, train, test, effects=effects, without=without, user_effects=own, measured=measured)
+    _require_different([*inputs["recordings"], *inputs["validation"]])
     if not again and results.finished(folder, inputs):
         say(f"{folder} holds this result already (--again computes it anew)")
         return results.read_loop(folder)
@@ -129,6 +130,15 @@ def improve_into(
         )
     results.write_loop(loop, folder, inputs=inputs)
     return results.read_loop(folder)
+
+
+def _require_different(recordings: Sequence[Mapping[str, Any]]) -> None:
+    """Raise InputError where two recordings have the same content: it would count twice."""
+    seen = dict[str, str]()
+    for one in recordings:
+        if one["sha256"] in seen:
+            raise InputError("the same recording is given twice", where=one["path"], found=f"the content of {seen[one['sha256']]}", expected="different recordings")  # fmt: skip
+        seen[one["sha256"]] = one["path"]
 
 
 def _kept(folder: str | Path, inputs: Mapping[str, Any]) -> tuple[Path, dict[str, Any]]:

@@ -171,7 +171,8 @@ def _seen(document: Mapping[str, Any]) -> str:
         sizes = list((entry.get("smallest") or {}).values())
         if name in hidden or not sizes or entry.get("would_be_seen") is False:
             continue
-        size = f"{max(sizes):.3g}" + ("" if entry.get("unit") in (None, "", "1") else f" {entry['unit']}")
+        digits = 4 if entry.get("kind") == "factor" else 3
+        size = f"{max(sizes):.{digits}g}" + ("" if entry.get("unit") in (None, "", "1") else f" {entry['unit']}")
         said = {"factor": f"a factor of {size}", "softer_than": f"softer than {size}"}.get(str(entry.get("kind")), size)
         words.append(f"{name} ({said})")
     return ", ".join(words)

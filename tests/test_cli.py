@@ -216,7 +216,7 @@ def test_warnings_of_libraries_that_mean_nothing_to_users_are_not_shown(run: Any
         (PermissionError(13, "Permission denied", "/place"), 2, "femsense: /place: Permission denied\n"),
         (RuntimeError("two\nlines"), 2, "internal error: RuntimeError: two lines; the details are in "),
         (KeyError("x"), 2, "internal error: KeyError: 'x'"),
-        (KeyboardInterrupt(), 130, "femsense: stopped; nothing half-written is left\n"),
+        (KeyboardInterrupt(), 130, "femsense: stopped; nothing half-written is left, and the same command goes on\n"),
     ],
 )  # fmt: skip
 def test_every_error_is_a_message_and_an_exit_status(
@@ -350,6 +350,8 @@ def test_what_would_be_ignored_is_refused(run: Any, robot: Path, recording: Path
     for options, text in (
         (("--plan",), "recordings are not asked with --plan"),
         (("-o", tmp_path / "out", "--validation", recording), "a recording is fitted and judged on"),
+        (("-o", tmp_path / "out", recording), "the same recording is given twice"),
+        (("-o", tmp_path / "out", "--effects", "creep", "--without", "creep"), "no effect is left to try"),
         (("-o", tmp_path / "out", "--effects", ""), "no name"),
         (("-o", tmp_path / "out", "--effects", "cable_slack"), "none of these effects can act here"),
     ):
@@ -440,7 +442,7 @@ def test_stopping_leaves_nothing_half_written(tmp_path: Path, robot: Path, recor
         time.sleep(0.1)
         process.send_signal(number)
         rest = process.stderr.read()
-    assert process.returncode == 130 and rest == "femsense: stopped; nothing half-written is left\n"
+    assert process.returncode == 130 and rest == "femsense: stopped; nothing half-written is left, and the same command goes on\n"
     assert not (tmp_path / "run").exists() and not [p for p in tmp_path.iterdir() if PART_PREFIX in p.name]
 
 

@@ -17,6 +17,7 @@ from femsense import sensing
 from femsense.calib.calibrate import calibrate
 from femsense.effects import FORMS, apply_effects
 from femsense.errors import DataError
+from femsense.inspection import inspect_path
 from femsense.keep import DIGEST, Keeper
 from femsense.loop import LoopResult, improve
 from femsense.loop.search import Course
@@ -102,6 +103,11 @@ def test_an_error_that_would_come_again_leaves_nothing(tmp_path: Path, monkeypat
     with pytest.raises(DataError):
         search(tmp_path / "loop" / ".unfinished", lambda text: None)
     assert not (tmp_path / "loop").exists()
+
+
+def test_a_folder_that_holds_unfinished_work_says_so(stopped: Path):
+    report = inspect_path(stopped.parent)
+    assert report["kind"] == "unfinished" and "run the same command again: it goes on" in report["problems"][0]
 
 
 def test_an_estimate_that_was_stopped_goes_on_at_the_next_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -38,6 +39,9 @@ def test_a_wrong_modulus_is_named_stiffness_and_nothing_else():
     recording, _ = record(inputs, effects=[{"name": "stiffness", "scale": 1.25}], labels=labels, truth=arm((8, 3, 3)))
     loop = improve(arm(), [recording])
     assert [e["name"] for e in loop.effects] == ["stiffness"]
+    assert loop.sentence.endswith(
+        "These data do not tell stiffness from cable_gain."
+    )  # of all cables alike: nothing known pulls besides
     assert found(loop, "stiffness")["parameters"]["scale"]["value"] == pytest.approx(1.25, rel=0.06)
     assert loop.robot.body.material.young_modulus[0] == pytest.approx(1.25 * 300e3, rel=0.06)
 
@@ -45,6 +49,24 @@ def test_a_wrong_modulus_is_named_stiffness_and_nothing_else():
 LEVEL = np.array([0.0, 0.5, 1.0, 1.0, 0.5, 0.1])
 ONE_EACH = np.concatenate([3.0 * np.outer(LEVEL, row) for row in np.eye(4)])
 """Inputs of four sweeps, each of which pulls a cable that no other pulls [N]."""
+
+
+@pytest.mark.parametrize("load", [0.0, 0.3])
+def test_a_modulus_is_not_told_from_a_gain_of_all_cables_where_nothing_known_pulls_besides(load: float):
+    weightless, truth = (arm((4, 1, 1), gravity=(0.0, 0.0, 0.0)) for _ in range(2))
+    inputs, labels = sweeps(each=6)
+    tip, forces = np.array([0.1, 0.0, 0.01]), {k: np.array([0.0, 0.0, -load]) for k in range(len(inputs)) if load and k % 2}
+    hidden = [{"name": "stiffness", "scale": 1.25}]
+    recording, _ = record(inputs, labels=labels, truth=truth, effects=hidden, forces={k: (tip, f) for k, f in forces.items()})
+    known = {
+        "load_frame": np.array(list(forces)),
+        "load_points": np.tile(tip, (len(forces), 1)),
+        "load_forces": np.array(list(forces.values())),
+    }
+    loop = improve(weightless, [replace(recording, **known) if forces else recording], effects=["cable_gain", "cable_friction"])
+    said = "These data do not tell stiffness from cable_gain." in loop.sentence
+    assert [e["name"] for e in loop.effects] == ["stiffness"] and said == (not load)
+    assert loop.next_experiment.startswith("hang a known weight") == (not load)
 
 
 def test_what_only_held_out_data_show_is_said():

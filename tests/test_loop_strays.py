@@ -28,6 +28,16 @@ def test_a_marker_that_is_far_off_in_one_frame_is_a_stray():
     assert not strays(values, frame, marker, 9e-3).any()
 
 
+def test_two_markers_that_exchange_their_names_are_strays_and_neighbours_that_are_off_alike_are_not():
+    values, frame, marker = rows()
+    first, second = np.flatnonzero((frame == 9) & np.isin(marker, (2, 5)))
+    values[first] += [0.0, 9e-3, 0.0]
+    values[second] -= [0.0, 9e-3, 0.0]
+    assert np.flatnonzero(strays(values, frame, marker, 5e-3)).tolist() == [first, second]
+    values[second] += [2e-3, 18e-3, 0.0]
+    assert not strays(values, frame, marker, 5e-3).any()
+
+
 def test_a_marker_that_slips_or_a_frame_that_is_off_is_none():
     values, frame, marker = rows()
     values[(marker == 4) & (frame > 14)] += 9e-3

@@ -289,3 +289,10 @@ def test_a_probe_touches_from_outside(kind: str) -> None:
     assert local[:, 2].min() == pytest.approx(0.0, abs=1e-5)
     assert np.hypot(local[:, 0], local[:, 1]).max() == pytest.approx(0.006, rel=0.02)
     assert local[:, 2].max() > 0.1
+
+
+def test_a_camera_that_sees_no_marker_is_refused(robot: Robot, tmp_path: Path) -> None:
+    away = changed(SCRIPT, {"camera__eye_m": [1.0, 0.0, 0.3], "camera__target_m": [2.0, 0.0, 0.3]})
+    with pytest.raises(InputError, match="sees no marker"):
+        simulate(robot, away, tmp_path / "out")
+    assert not (tmp_path / "out").exists()

@@ -38,6 +38,8 @@ NOISY = 1.15
 Three effects that were wrong would have needed it in blind cases, so that they have to do more …"""
 FAR_BETTER = 50.0
 """… or, where the mesh's own error is what is larger, if χ² of the held-out data falls by so much."""
+ROUNDED = 1e-6
+"""What is so small beside the largest component of a vector is said as 0."""
 BEYOND_NOISE = 1.2
 """Held-out errors that are so many times the noise need another reason."""
 EXPLAINED = 0.8
@@ -463,9 +465,16 @@ def _next_experiment(
     pairs = [(r["pair"][0], r["pair"][1]) for r in rivals]
     predicted = next_element(data, final.fit, noise, pairs, [r["name"] for r in not_testable])
     if predicted:
-        return "; or ".join(
-            f"{words} ({what}: expected dBIC {before:.0f} → {after:.0f})" for words, what, before, after in predicted[:2]
-        )
+        said = [
+            f"{words} ({what}: expected dBIC {round(before)} → {round(after)})" for words, what, before, after in predicted[:2]
+        ]
+        loaded = any(len(t.scene.recording.load_frame) for t in data.train)
+        if not loaded and any(set(pair) == {"stiffness", "cable_gain"} for pair in pairs):
+            said.insert(
+                0,
+                "hang a known weight on the robot in some frames (loads.csv): a modulus answers to it, a gain of all cables does not",
+            )
+        return "; or ".join(said)
     names = {n for r in rivals for n in r["pair"]} | {r["name"] for r in not_testable}
     advice = []
     recordings = [data.train[i].scene.recording for i in heads_of(data.train)]
@@ -502,6 +511,9 @@ def _sentence(
     error = f"held-out error {1e3 * before.held_rms:.2f} mm"
     if not noise.std:
         error += " along the normals of the surface"
+    if verdict == "none" and before.held_rms > BEYOND_NOISE * np.hypot(noise.total, mesh or 0.0):
+        costs = f", and its mesh costs {1e3 * mesh:.2f} mm" if mesh else ""
+        return f"Nothing that was tried explains more of the data: {error}; their noise is {1e3 * noise.total:.2f} mm{costs}."
     if verdict == "none":
         known = f"to their noise ({1e3 * noise.total:.2f} mm)"
         if mesh and before.held_rms > BEYOND_NOISE * noise.total:
@@ -565,7 +577,8 @@ def _short(parameters: dict[str, Any]) -> str:
         if isinstance(value, float):
             return f"{value:.3g}"
         if isinstance(value, list):
-            return "[" + ", ".join(show(v) for v in value) + "]"
+            largest = max(map(abs, value), default=0.0)
+            return "[" + ", ".join(show(v if abs(v) > ROUNDED * largest else 0.0) for v in value) + "]"
         return ", ".join(f"{k} {show(v)}" for k, v in value.items()) if isinstance(value, dict) else str(value)
 
     said = {k: p for k, p in parameters.items() if k != "file"}

@@ -368,9 +368,9 @@ def judged(
     if fit_objection is None and np.isfinite(spread) and better <= ENOUGH_SPREAD * spread:
         fit_objection = f"sweeps that are left out do not speak for it ({better:+.1f} ± {spread:.1f})"
     if fit_objection is None and held < wanted:
-        fit_objection = f"it does not predict the held-out data (χ² falls by {held:.1f}, by {gain:.1f} where fitted)"
+        fit_objection = f"it does not predict the held-out data (χ² {_moves(held)} there, and falls by {gain:.1f} where fitted)"
     if fit_objection is None and score + held <= EVIDENCE:  # what was not fitted speaks against it
-        fit_objection = f"too little evidence (dBIC {score:.1f}) where held-out data speak against it (χ² falls by {held:.1f})"
+        fit_objection = f"too little evidence (dBIC {score:.1f}) where held-out data speak against it (χ² {_moves(held)} there)"
     least = ABOVE_MESH_IF_SURE if sure_beyond_mesh(better, spread, held, gain * held_share(data)) else ABOVE_MESH
     if fit_objection is None and moved < least * mesh:
         fit_objection = f"it moves the markers by {1e3 * moved:.3f} mm, the mesh itself by {1e3 * mesh:.3f} mm"
@@ -378,6 +378,10 @@ def judged(
         fit_objection = f"the plain error grows where fitted ({1e3 * stage.fit.rms:.3f} mm, then {1e3 * made.fit.rms:.3f} mm)"
     record["verdict"] = fit_objection or "passes"
     return Refit(candidate, made, score, stage.fit.chi2 - made.fit.chi2 - candidate.cost, record)
+
+
+def _moves(decrease: float) -> str:
+    return f"{'falls' if decrease >= 0.0 else 'rises'} by {abs(decrease):.1f}"
 
 
 def _plainly_worse(before: Stage, after: Stage) -> bool:

@@ -105,6 +105,8 @@ def improve(
     for effect in own:
         try_own_effect(effect, robot)
     names = _names(effects, without, own)
+    if not names:
+        raise InputError("no effect is left to try", where="effects, without", expected="at least one of docs/effects/")
     _require_one_that_acts(names if effects else [], own, robot, recordings)
     rng = np.random.default_rng(seed)
 

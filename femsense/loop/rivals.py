@@ -27,7 +27,12 @@ MOST_NUMBERS = 6
 def confounded(search: Search, names: Sequence[str]) -> list[dict[str, Any]]:
     """Return pairs that these data cannot tell apart, those of what is named first: {pair, and what is known of dbic_gap, absorbed_share, cosine}."""
     found: dict[frozenset[str], dict[str, Any]] = {}
-    for a, b, what, value in (*_as_evident(search, names), *_imitated(search, names), *_alike(search, names)):
+    for a, b, what, value in (
+        *_as_evident(search, names),
+        *_imitated(search, names),
+        *_gain_of_all(search, names),
+        *_alike(search, names),
+    ):
         pair = found.setdefault(frozenset((a, b)), {"pair": [a, b]})
         pair[what] = min(value, pair.get(what, value)) if what == "dbic_gap" else max(value, pair.get(what, value))
     return sorted(found.values(), key=lambda pair: not set(pair["pair"]) & set(names))
@@ -92,6 +97,21 @@ def _imitated(search: Search, names: Sequence[str]) -> Iterator[Alike]:
             left = whole - own @ np.linalg.lstsq(own, whole, rcond=None)[0]
             if np.linalg.norm(left) < (1.0 - MOSTLY**2) ** 0.5 * np.linalg.norm(whole):
                 yield name, c.effect.name, "absorbed_share", float(np.sqrt(1.0 - c.retained**2))
+
+
+def _gain_of_all(search: Search, names: Sequence[str]) -> Iterator[Alike]:
+    """Yield a named modulus and the gain that all cables may have in common, where calibration imitates that: a gain of one cable alone it does not."""
+    gains = [c for c in search.first if c.effect.name == "cable_gain" and len(c.parameters) > 1]
+    if "stiffness" not in names or "cable_gain" in search.final.fit.hypothesis.names or not gains:
+        return
+    fit, widest = search.base.fit, max(gains, key=lambda c: len(c.parameters))
+    poses = np.linalg.qr(np.asarray(fit.fit.jacobian)[:, : fit.own])[0]
+    left = widest.columns.sum(axis=1)
+    whole = left - np.asarray(fit.fit.jacobian) @ widest.response.sum(axis=1)
+    size = float(np.linalg.norm(whole - poses @ (poses.T @ whole)))
+    retained = float(np.linalg.norm(left)) / size if size > 0.0 else 1.0
+    if retained < TESTABLE:
+        yield "stiffness", "cable_gain", "absorbed_share", float(np.sqrt(1.0 - retained**2))
 
 
 def _alike(search: Search, names: Sequence[str]) -> Iterator[Alike]:

@@ -45,9 +45,18 @@ def _kept(data: Data, trial: Trial, residual: FloatArray) -> Trial:
 
 
 def strays(residual: FloatArray, frame: IntArray, marker: IntArray, far: float) -> BoolArray:
-    """Return which rows of a residual (k, 3) [m] stand out from their frame and their marker by more than `far` [m], and by STRAYS times the 90 % quantile."""
-    size = np.linalg.norm(_less_medians(_less_medians(residual, frame), marker), axis=1)
+    """Return which rows of a residual (k, 3) [m] stand out from their frame and their marker by more than `far` [m], and by STRAYS times the 90 % quantile.
+
+    Several of a frame that are off the same way are no strays: a part of the body is elsewhere than the model has it. Two that exchanged their names
+    are off opposite ways.
+    """
+    apart = _less_medians(_less_medians(residual, frame), marker)
+    size = np.linalg.norm(apart, axis=1)
     off = size > max(far, STRAYS * float(np.quantile(size, 0.9)))
+    for k in np.unique(frame[off]):
+        rows = np.flatnonzero(off & (frame == k))
+        if len(rows) > 1 and (apart[rows] @ apart[rows].T > 0.0).all():
+            off[rows] = False
     return off if off.sum() <= max(RARE * len(off), 1) else np.zeros(len(off), dtype=bool)
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from femsense.arrays import BoolArray, FloatArray, freeze
+from femsense.errors import InputError
 from femsense.fem.mesh import embed_points, to_linear
 from femsense.files import write_csv, write_json
 from femsense.frames import Camera, Recording, RestMarkers, make_recording
@@ -92,6 +93,8 @@ def run_experiment(robot: Robot, script: ScriptTable, where: Path = Path("script
     for k, frame in enumerate(frames):
         shapes = frame_shapes(real, frame, plan, script.scene)
         visible[k] = chosen & (visible_points(camera, T_robot_camera, shapes, positions[k]) if script.markers.occlusion else True)
+    if not visible.any() and chosen.any() and script.clouds.kind == "none":
+        raise InputError("the camera sees no marker in any frame", where=f"{where}: camera", expected="markers, or [clouds]", hint="another eye_m; scene.floor_z_m below the robot; or markers.occlusion = false")  # fmt: skip
     return Experiment(script, plan, robot, real, camera, T_robot_camera, frames, freeze(positions), freeze(visible, bool))
 
 
