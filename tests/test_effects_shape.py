@@ -261,3 +261,8 @@ def test_what_the_finer_mesh_needs_is_kept_whatever_rubs_or_stretches():
         assert (c.name, c.friction, c.stretch_stiffness, c.max_tension) == (own.name, 0.3, 5e3, 7.0)
         assert c.pull_point is own.pull_point and c.path is plain.path
         np.testing.assert_allclose(c.path.positions(mesh.nodes), own.path.positions(robot.body.mesh.nodes), atol=1e-9)
+
+
+def test_clamps_in_which_a_soft_body_hangs_by_tens_of_millimetres_are_plausible():
+    (spring,) = find_effect("base_compliance").parameters(arm((4, 1, 1)), "tension")
+    assert 15.0 < 1.0 / spring.high < 30.0  # N/m at each of nine nodes

@@ -9,6 +9,9 @@ from femsense.errors import InputError
 from femsense.model import Robot
 
 KEYS = ("stiffness_n_m", "rotation_stiffness_nm_rad")
+SOFTEST = 150.0
+"""The softest clamp: its springs give together so many times what a cube of the material and of the body's reach does. Clamps in which soft bodies hang by
+tens of millimetres are at a third of that; with 50 they lay beyond what was plausible, and nothing else came near."""
 
 
 def _spring_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
@@ -17,7 +20,7 @@ def _spring_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
     if not count:
         return ()
     compliance = count / (float(robot.body.material.young_modulus.mean()) * robot.body.reach)
-    return (Parameter(KEYS[0], None, "N/m", 0.0, 0.0, 50.0 * compliance, 1e-6 * compliance, "reciprocal"),)
+    return (Parameter(KEYS[0], None, "N/m", 0.0, 0.0, SOFTEST * compliance, 1e-6 * compliance, "reciprocal"),)
 
 
 def _plate_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
