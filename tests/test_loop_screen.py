@@ -233,6 +233,17 @@ def test_where_the_data_are_explained_by_what_the_mesh_costs_the_sentence_says_s
     assert ("its mesh costs (1.00 mm" in sentence) == expected and "noise (0.50 mm)" in sentence
 
 
+def test_values_are_said_in_short_whatever_they_are() -> None:
+    values = {
+        "center_m": {"value": [0.0151, -1.4e-19, -0.0264], "unit": "m"},
+        "share": {"value": 0.24567, "unit": "1"},
+        "markers": {"value": ["Base-1", "Base-2"], "unit": "1"},
+        "scale": {"value": {"a": 0.9, "b": [0.0, 0.0]}, "unit": "1"},
+    }
+    said = conclude._short(values)
+    assert said == "center_m [0.0151, 0, -0.0264] m, share 0.246, markers [Base-1, Base-2], scale a 0.9, b [0, 0]"
+
+
 @pytest.mark.parametrize("mesh, costs", [(None, "0.50 mm."), (0.3e-3, "0.50 mm, and its mesh costs 0.30 mm.")])
 def test_what_neither_the_noise_nor_the_mesh_explains_is_not_said_to_be_explained(mesh: float | None, costs: str) -> None:
     stage = replace(staged(arm((4, 2, 2)), 1.0)[1], held_rms=0.9e-3)

@@ -577,8 +577,8 @@ def _short(parameters: dict[str, Any]) -> str:
         if isinstance(value, float):
             return f"{value:.3g}"
         if isinstance(value, list):
-            largest = max(map(abs, value), default=0.0)
-            return "[" + ", ".join(show(v if abs(v) > ROUNDED * largest else 0.0) for v in value) + "]"
+            largest = max((abs(v) for v in value if isinstance(v, float)), default=0.0)
+            return "[" + ", ".join(show(0.0 if isinstance(v, float) and abs(v) <= ROUNDED * largest else v) for v in value) + "]"
         return ", ".join(f"{k} {show(v)}" for k, v in value.items()) if isinstance(value, dict) else str(value)
 
     said = {k: p for k, p in parameters.items() if k != "file"}
