@@ -122,12 +122,12 @@ def test_solvers_agree(seed: int) -> None:
             np.testing.assert_allclose(answer.x / (problem.ub - problem.lb), answers[0].x / (problem.ub - problem.lb), atol=1e-5)
 
 
-def test_nearly_all_problems_are_solved_by_another_solver_too() -> None:
+def test_problems_are_solved_by_another_solver_too() -> None:
     """So that solvers that agree are not one alone; a rare problem is too much for all but the first (seed 6007)."""
     solved = [
         any(solve(random_problem(seed), solver=name, fallback=False).solved for name in INSTALLED[1:]) for seed in range(25)
     ]
-    assert sum(solved) >= 23
+    assert all(solved)
 
 
 @settings(max_examples=15, deadline=None)
