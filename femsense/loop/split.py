@@ -85,11 +85,12 @@ def hold_out(recording: Recording, frames: IntArray) -> tuple[IntArray, IntArray
     wanted = max(1, round(count / 4))
     even = np.unique(np.round(np.linspace(count - 1, 0, wanted + 1)[:-1]).astype(int))
     held = _spared(recording, frames, number, even)
-    if held is not None:
-        mask = np.isin(number, held)
-        return frames[~mask], frames[mask], f"{len(held)} of {count} sweeps"
-    mask = _spared_within(recording, frames, number)
-    return frames[~mask], frames[mask], f"{mask.sum()} of {len(frames)} frames (each sweep holds what no other does)"
+    if held is None:
+        mask, held = _spared_within(recording, frames, number), even
+        if mask.any():
+            return frames[~mask], frames[mask], f"{mask.sum()} of {len(frames)} frames (each sweep holds what no other does)"
+    mask = np.isin(number, held)
+    return frames[~mask], frames[mask], f"{len(held)} of {count} sweeps"
 
 
 def _spared(recording: Recording, frames: IntArray, number: IntArray, even: IntArray) -> IntArray | None:
@@ -109,7 +110,7 @@ def _spared(recording: Recording, frames: IntArray, number: IntArray, even: IntA
     for sweep in order:
         if len(chosen) < len(even) and fresh([sweep]) and fits([*chosen, sweep]):
             chosen.append(sweep)
-    if not chosen and not any(fits([sweep]) for sweep in order) and _spared_within(recording, frames, number).any():
+    if not any(fits([sweep]) for sweep in order):
         return None
     return np.array(sorted(chosen)) if chosen else even
 
