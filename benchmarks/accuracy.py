@@ -16,14 +16,14 @@ from typing import Any
 
 import numpy as np
 
-from femsense.accuracy import assess_accuracy
-from femsense.effects.shape import body_on_mesh, finer_mesh
+from femsense.app.mesh_accuracy import assess_accuracy
 from femsense.fem.blocks import block_mesh
 from femsense.fem.equilibrium import solve_equilibrium
 from femsense.fem.mesh import embed_points
-from femsense.files import write_toml
-from femsense.meshfile import write_mesh
-from femsense.robot import load_robot, robot_names
+from femsense.io.files import write_toml
+from femsense.io.mesh_files import write_mesh
+from femsense.io.robot_toml import load_robot, robot_names
+from femsense.model.remeshing import body_on_mesh, finer_mesh
 
 
 def main(arguments: list[str]) -> None:

@@ -19,23 +19,25 @@ from typing import Any
 
 import numpy as np
 
-from femsense.arrays import FloatArray
 from femsense.calib.calibrate import calibrate
-from femsense.calib.forward import Hypothesis, in_robot_frame
-from femsense.effects import FORMS, Effect, Entry, apply_effects
-from femsense.effects.shape import robot_on_mesh
+from femsense.core.arrays import FloatArray
 from femsense.fem.mesh import TetMesh, to_quadratic
-from femsense.loop import improve
-from femsense.loop.data import Data, groups_of, prepare
-from femsense.loop.joint import Prior, Trial
-from femsense.loop.noise import Noise
+from femsense.io.recording_folder import load_recording
+from femsense.io.robot_toml import load_robot
+from femsense.loop.data.dataset import Data, groups_of, prepare
+from femsense.loop.data.trial import Trial
+from femsense.loop.fit.covariance import coordinate_std
+from femsense.loop.fit.fitted_model import Stage, make_stage, placed
+from femsense.loop.fit.joint_fit import Prior
+from femsense.loop.fit.noise_components import Noise
+from femsense.loop.improve import improve
 from femsense.loop.result import LoopResult
-from femsense.loop.spread import coordinate_std
-from femsense.loop.stages import Stage, make_stage, placed
-from femsense.model import Robot
-from femsense.recording import Recording, load_recording
-from femsense.robot import load_robot
-from femsense.sensing import estimate
+from femsense.model.effects import FORMS, Effect, Entry, apply_effects
+from femsense.model.observation import Hypothesis, in_robot_frame
+from femsense.model.recording import Recording
+from femsense.model.remeshing import robot_on_mesh
+from femsense.model.robot import Robot
+from femsense.sensing.pipeline import estimate
 
 EDGE = [[0.1, 0.0, 0.015]]
 """The middle of the loaded edge at rest [m]."""
@@ -177,7 +179,10 @@ def print_models(beam: Beam) -> dict[str, tuple[Stage, list[tuple[float, float]]
         modulus = f"{150 * scale[0]:.0f} ± {150 * scale[1]:.0f} kPa" if scale[1] else "150 kPa"
         more = "; ".join(f"{k} {shown(v)}" for k, v in table.items())
         weights = " | ".join(f"{v:.3f} ± {s:.3f} N" for v, s in forces)
-        print(f"| {name} | {1e3 * stage.fit.rms:.2f} mm | {1e3 * stage.held_rms:.2f} mm | {stage.held_rms / first:.2f} | {modulus} | {weights} | {more} |", flush=True)  # fmt: skip
+        print(
+            f"| {name} | {1e3 * stage.fit.rms:.2f} mm | {1e3 * stage.held_rms:.2f} mm | {stage.held_rms / first:.2f} | {modulus} | {weights} | {more} |",
+            flush=True,
+        )
     return stages
 
 
@@ -226,7 +231,10 @@ def print_cause(name: str, data: Data, stage: Stage) -> None:
     table = values(data, stage)
     scale, gravity = table.pop("stiffness")[0], table.pop("gravity")
     own = "; ".join(shown(v) for v in table.values())
-    print(f"| {name} | {1e3 * stage.fit.rms:.2f} mm | {1e3 * stage.held_rms:.2f} mm | {stage.fit.chi2:.1f} | {shown(gravity)} | {150 * scale[0]:.0f} ± {150 * scale[1]:.0f} kPa | {own} |", flush=True)  # fmt: skip
+    print(
+        f"| {name} | {1e3 * stage.fit.rms:.2f} mm | {1e3 * stage.held_rms:.2f} mm | {stage.fit.chi2:.1f} | {shown(gravity)} | {150 * scale[0]:.0f} ± {150 * scale[1]:.0f} kPa | {own} |",
+        flush=True,
+    )
 
 
 def with_tip(data: Data, shift: Sequence[float]) -> Data:
@@ -260,8 +268,16 @@ def without(data: Data, marker: int) -> Data:
 
     def fewer(trial: Trial) -> Trial:
         s, keep, rest = trial.scene, trial.scene.marker != marker, trial.scene.rest_marker != marker
-        scene = replace(s, frame=s.frame[keep], marker=s.marker[keep], view=s.view[keep], points=s.points[keep],
-                        rest_marker=s.rest_marker[rest], rest_view=s.rest_view[rest], rest_points=s.rest_points[rest])  # fmt: skip
+        scene = replace(
+            s,
+            frame=s.frame[keep],
+            marker=s.marker[keep],
+            view=s.view[keep],
+            points=s.points[keep],
+            rest_marker=s.rest_marker[rest],
+            rest_view=s.rest_view[rest],
+            rest_points=s.rest_points[rest],
+        )
         return replace(trial, scene=scene, groups=groups_of(scene))
 
     return replace(data, train=[fewer(t) for t in data.train], held=[fewer(t) for t in data.held])
@@ -322,7 +338,10 @@ def parameter_words(parameters: dict[str, Any]) -> str:
             return "(" + ", ".join(words(v) for v in value) + ")"
         return f"{value:.3g}" if isinstance(value, float) else str(value)
 
-    return ", ".join(f"{k} {words(p['value'])} ± {words(p['std'])}" if p["std"] is not None else f"{k} {words(p['value'])}" for k, p in parameters.items())  # fmt: skip
+    return ", ".join(
+        f"{k} {words(p['value'])} ± {words(p['std'])}" if p["std"] is not None else f"{k} {words(p['value'])}"
+        for k, p in parameters.items()
+    )
 
 
 def print_meshes(beam: Beam, folder: Path) -> None:
@@ -335,7 +354,10 @@ def print_meshes(beam: Beam, folder: Path) -> None:
         robot = apply_effects(in_cells(declared, cells), [DOWN])
         stage = fitted(beam.data, robot, [STIFF])
         scale = values(beam.data, stage)["stiffness"][0][0]
-        print(f"| {' × '.join(map(str, cells))} | {3 * len(robot.body.mesh.nodes)} | {1e3 * stage.fit.rms:.2f} mm | {1e3 * stage.held_rms:.2f} mm | {150 * scale:.0f} kPa |", flush=True)  # fmt: skip
+        print(
+            f"| {' × '.join(map(str, cells))} | {3 * len(robot.body.mesh.nodes)} | {1e3 * stage.fit.rms:.2f} mm | {1e3 * stage.held_rms:.2f} mm | {150 * scale:.0f} kPa |",
+            flush=True,
+        )
 
 
 def print_loops(beam: Beam, folder: Path, declared_mesh: bool, cells: Sequence[int]) -> None:
@@ -346,10 +368,20 @@ def print_loops(beam: Beam, folder: Path, declared_mesh: bool, cells: Sequence[i
         robots = {n: in_cells(r, cells) for n, r in robots.items()}
     r = beam.recordings
     cases = [
-        ("(a) gravity undeclared, fit on 0 and 0.51 N, judged on 1.00 N", "robot", [r["gravity_a"], r["load52_a"]], [r["load101_a"]]),
-        ("(b) gravity declared, fit on 0 and 0.51 N, judged on 1.00 N", "robot_gravity", [r["gravity_a"], r["load52_a"]], [r["load101_a"]]),
+        (
+            "(a) gravity undeclared, fit on 0 and 0.51 N, judged on 1.00 N",
+            "robot",
+            [r["gravity_a"], r["load52_a"]],
+            [r["load101_a"]],
+        ),
+        (
+            "(b) gravity declared, fit on 0 and 0.51 N, judged on 1.00 N",
+            "robot_gravity",
+            [r["gravity_a"], r["load52_a"]],
+            [r["load101_a"]],
+        ),
         ("(c) gravity declared, unloaded run alone", "robot_gravity", [r["gravity_a"]], []),
-    ]  # fmt: skip
+    ]
     for title, name, train, judge in cases:
         began = time.process_time()
         result = improve(robots[name], train, validation=judge)
@@ -365,8 +397,10 @@ def draw_states(beam: Beam, stages: dict[str, tuple[Stage, Any]]) -> None:
     """Draw the beam from its side in the three states, before and after, residuals three times as long."""
     from matplotlib import pyplot as plt
 
-    chosen = [("as declared: 150 kPa, weightless", "as declared: 150 kPa, weightless"),
-              ("straight down, modulus, base markers on the clamp", "gravity, modulus, base markers on the clamp")]  # fmt: skip
+    chosen = [
+        ("as declared: 150 kPa, weightless", "as declared: 150 kPa, weightless"),
+        ("straight down, modulus, base markers on the clamp", "gravity, modulus, base markers on the clamp"),
+    ]
     figure, axes = plt.subplots(1, 2, figsize=(9.0, 3.6), sharey=True)
     for axis, (name, title) in zip(axes, chosen):
         stage = stages[name][0]

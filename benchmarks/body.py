@@ -23,24 +23,25 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
+import femsense.fem.cholesky as factoring
 import numpy as np
 import scipy.sparse as sp
 from threadpoolctl import ThreadpoolController
 
-import femsense.fem.cholesky as factoring
 from femsense.fem import equilibrium
 from femsense.fem.assembly import internal, reduced_values
 from femsense.fem.body import BodyModel, make_body, tie_cable
 from femsense.fem.cables import pull_rows
-from femsense.fem.cholesky import _nested_dissection, cholesky, elimination_work, minimum_degree
 from femsense.fem.compliance import compliance, direction_rows, tangent_at
 from femsense.fem.equilibrium import solve_equilibrium
-from femsense.fem.linear import factorize, pardiso_library
+from femsense.fem.linalg.cholesky import cholesky
+from femsense.fem.linalg.factorization import factorize, pardiso_library
+from femsense.fem.linalg.ordering import _nested_dissection, elimination_work, minimum_degree
 from femsense.fem.mesh import embed_points, refined, surface_triangles, to_quadratic, vertex_normals
-from femsense.fem.series import Expansion
-from femsense.fem.tracker import Tracked, Tracker
-from femsense.fem.turning import turned_step
-from femsense.robot import load_robot
+from femsense.fem.realtime.power_series import Expansion
+from femsense.fem.realtime.tracker import Tracked, Tracker
+from femsense.fem.rotated_step import turned_step
+from femsense.io.robot_toml import load_robot
 
 DATA = Path(__file__).resolve().parents[1].parent / "shared" / "data"
 
@@ -349,7 +350,12 @@ def growth(data: Path, levels: int) -> None:
     """Uniform refinement: each mesh in a process of its own."""
     rows = []
     for level in range(levels):
-        text = subprocess.run([sys.executable, __file__, "one", "--level", str(level), "--data", str(data)], capture_output=True, text=True, check=False).stdout  # fmt: skip
+        text = subprocess.run(
+            [sys.executable, __file__, "one", "--level", str(level), "--data", str(data)],
+            capture_output=True,
+            text=True,
+            check=False,
+        ).stdout
         print(text.strip() or f"level {level}: did not finish")
         if text.strip():
             rows.append([float(v) for v in text.split("|")[1].split()])
@@ -411,7 +417,9 @@ def iterative_growth(data: Path, levels: int) -> None:
         for level in range(counts):
             for solver in ("direct", "iterative"):
                 arguments = [sys.executable, __file__, "side", "--level", str(level), "--element", element, "--data", str(data)]
-                done = subprocess.run(arguments, capture_output=True, text=True, check=False, env={**os.environ, "FEMSENSE_SOLVER": solver})  # fmt: skip
+                done = subprocess.run(
+                    arguments, capture_output=True, text=True, check=False, env={**os.environ, "FEMSENSE_SOLVER": solver}
+                )
                 print(done.stdout.rstrip() or f"{element}, level {level}, {solver}: did not finish", flush=True)
 
 
@@ -421,7 +429,9 @@ def one_side(data: Path, level: int, element: str) -> None:
     for _ in range(level):
         mesh = refined(mesh)
     mesh = to_quadratic(mesh) if element == "tet10" else mesh
-    body = make_body(mesh, young_modulus=180e3, poisson_ratio=0.45, density=1070.0, clamped=in_boxes(mesh.nodes), gravity=[0, 0, -9.81])  # fmt: skip
+    body = make_body(
+        mesh, young_modulus=180e3, poisson_ratio=0.45, density=1070.0, clamped=in_boxes(mesh.nodes), gravity=[0, 0, -9.81]
+    )
     pattern, blocks = body.free_map.pattern, internal(body, np.array(mesh.nodes)).blocks
     assert blocks is not None
     values, right = reduced_values(body, blocks), body.weight().ravel()[body.free_map.dofs]
@@ -465,4 +475,14 @@ if __name__ == "__main__":
             one_side(given.data, given.level, given.element)
             continue
         print(f"\n== {what}", flush=True)
-        {"cold": lambda: cold(given.data), "parts": lambda: parts(given.data), "orders": lambda: orders(given.data), "frames": lambda: frames(given.data), "crowded": lambda: crowded(given.data), "terms": lambda: terms(given.data), "kept": lambda: kept(given.data), "growth": lambda: growth(given.data, given.levels), "iterative": lambda: iterative_growth(given.data, given.levels)}[what]()  # fmt: skip
+        {
+            "cold": lambda: cold(given.data),
+            "parts": lambda: parts(given.data),
+            "orders": lambda: orders(given.data),
+            "frames": lambda: frames(given.data),
+            "crowded": lambda: crowded(given.data),
+            "terms": lambda: terms(given.data),
+            "kept": lambda: kept(given.data),
+            "growth": lambda: growth(given.data, given.levels),
+            "iterative": lambda: iterative_growth(given.data, given.levels),
+        }[what]()

@@ -20,12 +20,13 @@ from typing import Any
 
 import numpy as np
 
-from femsense.loop import improve
-from femsense.model import Robot
-from femsense.pose import move_pose
-from femsense.recording import Recording, load_recording
+from femsense.core.pose import move_pose
+from femsense.io.recording_folder import load_recording
+from femsense.io.robot_toml import load_robot
+from femsense.loop.improve import improve
+from femsense.model.recording import Recording
+from femsense.model.robot import Robot
 from femsense.rig.simulate import simulate
-from femsense.robot import load_robot
 
 CASES: dict[str, dict[str, list[dict[str, Any]]]] = {
     "four-leg": {

@@ -28,13 +28,13 @@ from typing import Any
 import numpy as np
 from loop_cases import ARM, EARTH, Case, Made, make_data, on_other_clamp
 
-from femsense.cli import run
-from femsense.effects.shape import robot_on_mesh
+from femsense.app.cli import run
 from femsense.fem.mesh import to_linear
-from femsense.files import write_toml
-from femsense.model import Robot
-from femsense.recording import save_recording
-from femsense.robot import load_robot, save_robot
+from femsense.io.files import write_toml
+from femsense.io.recording_folder import save_recording
+from femsense.io.robot_toml import load_robot, save_robot
+from femsense.model.remeshing import robot_on_mesh
+from femsense.model.robot import Robot
 
 SMALL_ARM = replace(ARM, name="small-arm", coarse=(7, 2, 2), fine=(10, 3, 3))
 HIDDEN: tuple[tuple[str, dict[str, Any]], ...] = (
@@ -61,7 +61,7 @@ HIDDEN: tuple[tuple[str, dict[str, Any]], ...] = (
     ("displacement", {"name": "geometry", "scale": 0.97}),
     ("tension", {"name": "depth_scale", "scale": 1.02}),
     ("tension", {"name": "marker_offset", "offset_m": {"m10": [0.002, -0.001, 0.001]}}),
-)  # fmt: skip
+)
 SEED, FRESH_SEED = 7, 1007
 ALWAYS_OFF = ("stiffness",)
 """The modulus of every case is off: naming it is right."""
@@ -75,12 +75,23 @@ def make(number: int) -> tuple[Robot, Made, Made]:
     control, entry = HIDDEN[number]
     name = entry["name"]
     hidden = () if name in ("discretisation", "hyperelastic") else (entry,)
-    case = Case(number, "single", SMALL_ARM, control, 1e-4, hidden, hyperelastic=name == "hyperelastic", declared_gravity=name != "gravity")  # fmt: skip
+    case = Case(
+        number,
+        "single",
+        SMALL_ARM,
+        control,
+        1e-4,
+        hidden,
+        hyperelastic=name == "hyperelastic",
+        declared_gravity=name != "gravity",
+    )
     made = make_data(case, SEED)
     fresh = make_data(replace(case, modulus_scale=made.modulus_scale), FRESH_SEED)
     declared = made.declared
     if name == "hyperelastic":
-        declared = declared.with_body(declared.body.with_material(replace(declared.body.material, law="corotational", stretch_limit=np.inf)))  # fmt: skip
+        declared = declared.with_body(
+            declared.body.with_material(replace(declared.body.material, law="corotational", stretch_limit=np.inf))
+        )
     if name == "discretisation":
         declared = robot_on_mesh(declared, to_linear(declared.body.mesh))
     return declared, made, fresh
@@ -108,8 +119,14 @@ def run_case(number: int, folder: Path) -> dict[str, Any]:
         truth["scale"] = entry["scale"] * made.modulus_scale
     began = time.process_time()
     loop, error = command("improve", robot, first, "-o", out, "--again")
-    record: dict[str, Any] = {"number": number, "control": control, "truth": truth, "modulus_scale": made.modulus_scale,
-                              "improve_cpu_s": time.process_time() - began, "error": error}  # fmt: skip
+    record: dict[str, Any] = {
+        "number": number,
+        "control": control,
+        "truth": truth,
+        "modulus_scale": made.modulus_scale,
+        "improve_cpu_s": time.process_time() - began,
+        "error": error,
+    }
     if loop is None:
         return record
     record |= {key: loop[key] for key in ("verdict", "sentence", "effects", "confounded", "noise_m")}
@@ -130,12 +147,18 @@ def use(robot: Path, recording: Path, folder: Path, control: str) -> list[str]:
     """Take an improved robot through the other commands; return what went wrong."""
     script = folder / "script.toml"
     top = SMALL_ARM.tension if control == "tension" else 4e-3
-    write_toml(script, {
-        "format": "femsense-script-1", "actuation": control,
-        "sweeps": [{"label": label, "cables": {"a": top}, "rest": 1, "up": 1, "down": 1} for label in ("free", "s")],
-        "truth": {"refinements": 0, "law": "corotational", "substeps": 1}, "camera": {"eye_m": [0.05, 0.25, 0.3], "target_m": [0.05, 0.0, 0.0]},
-        "contacts": [{"sweep": "s", "point_m": [0.08, 0.0, 0.01], "force_n": 0.1}], "markers": {"std_m": 1e-4},
-    })  # fmt: skip
+    write_toml(
+        script,
+        {
+            "format": "femsense-script-1",
+            "actuation": control,
+            "sweeps": [{"label": label, "cables": {"a": top}, "rest": 1, "up": 1, "down": 1} for label in ("free", "s")],
+            "truth": {"refinements": 0, "law": "corotational", "substeps": 1},
+            "camera": {"eye_m": [0.05, 0.25, 0.3], "target_m": [0.05, 0.0, 0.0]},
+            "contacts": [{"sweep": "s", "point_m": [0.08, 0.0, 0.01], "force_n": 0.1}],
+            "markers": {"std_m": 1e-4},
+        },
+    )
     made, run, calibration = folder / "simulated", folder / "run", folder / "calibration.json"
     jobs: tuple[tuple[Any, ...], ...] = (
         ("inspect", robot),
@@ -251,7 +274,9 @@ def main() -> None:
         if options.table or (file.is_file() and not options.again):
             continue
         try:
-            subprocess.run([sys.executable, __file__, "--case", str(i), "--folder", str(options.folder)], timeout=options.limit, check=False)  # fmt: skip
+            subprocess.run(
+                [sys.executable, __file__, "--case", str(i), "--folder", str(options.folder)], timeout=options.limit, check=False
+            )
         except subprocess.TimeoutExpired:
             print(f"{HIDDEN[i][1]['name']}: not done within {options.limit:g} s", file=sys.stderr)
     files = [options.folder / f"{i:02d}" / "result.json" for i in chosen]

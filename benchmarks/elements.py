@@ -19,17 +19,17 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.linalg import LinearOperator, cg
 
-from femsense.arrays import FloatArray
+from femsense.core.arrays import FloatArray
 from femsense.fem.assembly import internal, reduced_matrix, reduced_values
 from femsense.fem.body import BodyModel, make_body
-from femsense.fem.cholesky import cholesky
 from femsense.fem.equilibrium import solve_equilibrium
-from femsense.fem.linear import factorize
+from femsense.fem.linalg.cholesky import cholesky
+from femsense.fem.linalg.factorization import factorize
 from femsense.fem.mesh import EDGES, TetMesh, oriented, refined, shape_values, surface_triangles, to_quadratic
 from femsense.fem.stencil import QUADRATURE
+from femsense.io.robot_toml import load_robot
 from femsense.rig.script import TruthTable
 from femsense.rig.truth import true_robot
-from femsense.robot import load_robot
 
 POISSON = (0.30, 0.45, 0.49, 0.499)
 SHARED = Path(__file__).parents[1].parent / "shared" / "data" / "diamond"

@@ -20,14 +20,15 @@ import numpy as np
 from loop import COUNTS, SEEDS
 from loop_cases import Case, make_cases, make_data
 
-from femsense.errors import FemsenseError
-from femsense.loop import improve
-from femsense.loop.data import Data
-from femsense.loop.grow import PROMISING, REFITTABLE
-from femsense.loop.noise import Noise
-from femsense.loop.refit import EVIDENCE
-from femsense.loop.screen import Candidate, Fields
-from femsense.loop.stages import Stage, fields_of, screen_stage
+from femsense.core.errors import FemsenseError
+from femsense.loop.data.dataset import Data
+from femsense.loop.fit.fitted_model import Stage
+from femsense.loop.fit.noise_components import Noise
+from femsense.loop.improve import improve
+from femsense.loop.search.effect_fields import Fields, fields_of
+from femsense.loop.search.forward_selection import PROMISING, REFITTABLE
+from femsense.loop.search.refit import EVIDENCE
+from femsense.loop.search.screening import Candidate, screen_stage
 
 Scores = dict[str, float]
 """Effect → its best linear score [dBIC]."""

@@ -31,15 +31,15 @@ from typing import Any
 import numpy as np
 from loop_cases import EARTH, Case, Design, _around, _measure
 
-from femsense.arrays import FloatArray, freeze
-from femsense.effects import apply_effects
-from femsense.fem import linear
+from femsense.core.arrays import FloatArray, freeze
 from femsense.fem.assembly import internal, reduced_values
-from femsense.files import write_text
-from femsense.recording import save_recording
+from femsense.fem.linalg import factorization
+from femsense.io.files import write_text
+from femsense.io.recording_folder import save_recording
+from femsense.io.robot_toml import load_robot, save_robot
+from femsense.model.effects import apply_effects
 from femsense.rig.script import Plan
 from femsense.rig.truth import walk_truth
-from femsense.robot import load_robot, save_robot
 
 STAGES = (
     ("reading", "start, reading, calibrating"),
@@ -110,11 +110,18 @@ def _bar(p: FloatArray) -> FloatArray:
 
 
 BAR = Design(
-    "bar", (16, 4, 4), (14, 5, 5), _bar,
-    {n: ([[0.115, *_around(0.008, a)], [0.075, *_around(0.008, a)], [0.035, *_around(0.008, a)]], [-0.012, *_around(0.012, a)])
-     for n, a in (("a", 0.1), ("b", np.pi / 2), ("c", np.pi), ("d", -np.pi / 2))},
-    (0.02, 0.27, 0.5, 0.74, 0.98), 300e3, 3.0,
-)  # fmt: skip
+    "bar",
+    (16, 4, 4),
+    (14, 5, 5),
+    _bar,
+    {
+        n: ([[0.115, *_around(0.008, a)], [0.075, *_around(0.008, a)], [0.035, *_around(0.008, a)]], [-0.012, *_around(0.012, a)])
+        for n, a in (("a", 0.1), ("b", np.pi / 2), ("c", np.pi), ("d", -np.pi / 2))
+    },
+    (0.02, 0.27, 0.5, 0.74, 0.98),
+    300e3,
+    3.0,
+)
 
 
 def make(hidden: str, folder: Path) -> None:
@@ -124,8 +131,20 @@ def make(hidden: str, folder: Path) -> None:
     declared = BAR.robot(fine=False, law="corotational", gravity=gravity, modulus=BAR.modulus)
     true = BAR.robot(fine=True, law="corotational", gravity=EARTH, modulus=0.9 * BAR.modulus)
     true = apply_effects(true, [_on_clamp(e, len(declared.body.clamped), len(true.body.clamped)) for e in case.hidden])
-    mixes = np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1], [0.7, 0.7, 0, 0], [0, 0.7, 0.6, 0], [0, 0, 0.8, 0.5], [0.5, 0, 0, 0.8],
-                      [0.5, 0.5, 0.5, 0.5], [1, 0, 0.4, 0]])  # fmt: skip
+    mixes = np.array(
+        [
+            [1, 0, 0, 0],
+            [0, 1, 0, 0],
+            [0, 0, 1, 0],
+            [0, 0, 0, 1],
+            [0.7, 0.7, 0, 0],
+            [0, 0.7, 0.6, 0],
+            [0, 0, 0.8, 0.5],
+            [0.5, 0, 0, 0.8],
+            [0.5, 0.5, 0.5, 0.5],
+            [1, 0, 0.4, 0],
+        ]
+    )
     order = np.random.default_rng(3).permutation(len(mixes))
     levels = np.array([0.0, 0.35, 0.7, 1.0, 1.0, 1.0, 0.8, 0.5, 0.2, 0.0])
     pace = np.array([1.0, 1.0, 1.0, 1.0, 4.0, 8.0, 1.0, 1.0, 1.0, 1.0])
@@ -134,10 +153,19 @@ def make(hidden: str, folder: Path) -> None:
     time_s = np.cumsum(np.tile(pace, len(mixes))) - 1.0
     F, loaded = len(recorded), np.flatnonzero([label == "s1" for label in labels])
     plan = Plan(
-        control="tension", time_s=freeze(time_s), sweep=labels, free=freeze(np.ones(F), bool), commanded=freeze(recorded), initial=freeze(np.zeros(4)),
-        pressures=freeze(np.zeros((F, 0))), gravity=None, load_frame=freeze(loaded, np.int64), load_points=freeze(np.tile([0.117, 0.0, 0.012], (len(loaded), 1))),
-        load_forces=freeze(np.tile([0.0, 0.0, -0.08], (len(loaded), 1))), contacts=(),
-    )  # fmt: skip
+        control="tension",
+        time_s=freeze(time_s),
+        sweep=labels,
+        free=freeze(np.ones(F), bool),
+        commanded=freeze(recorded),
+        initial=freeze(np.zeros(4)),
+        pressures=freeze(np.zeros((F, 0))),
+        gravity=None,
+        load_frame=freeze(loaded, np.int64),
+        load_points=freeze(np.tile([0.117, 0.0, 0.012], (len(loaded), 1))),
+        load_forces=freeze(np.tile([0.0, 0.0, -0.08], (len(loaded), 1))),
+        contacts=(),
+    )
     states = [f.state for f in walk_truth(true, plan, substeps=2)]
     recording = _measure(case, declared, true, plan, recorded, states, np.random.default_rng(7))[0]
     for kind in ("tet10", "tet4"):
@@ -156,8 +184,8 @@ def _on_clamp(entry: dict[str, Any], declared: int, true: int) -> dict[str, Any]
 
 def one_run(folder: Path, element: str, without: list[str]) -> None:
     """Close the loop as the command does, and print what each stage took."""
+    from femsense.app.commands import improve_into
     from femsense.report import write_report
-    from femsense.steps import improve_into
 
     warnings.simplefilter("ignore")
     factors = _count_factors()
@@ -169,9 +197,14 @@ def one_run(folder: Path, element: str, without: list[str]) -> None:
 
     with tempfile.TemporaryDirectory() as out:
         document = improve_into(
-            Path(out) / "loop", folder / f"robot-{element}", [folder / "recording"], user_effects=[folder / f"{n}.py" for n in OWN],
-            without=without or None, say=lambda text: None, progress=mark,
-        )  # fmt: skip
+            Path(out) / "loop",
+            folder / f"robot-{element}",
+            [folder / "recording"],
+            user_effects=[folder / f"{n}.py" for n in OWN],
+            without=without or None,
+            say=lambda text: None,
+            progress=mark,
+        )
         mark("report")
         write_report(Path(out) / "loop")
         mark("end")
@@ -197,13 +230,13 @@ def one_run(folder: Path, element: str, without: list[str]) -> None:
 
 def _count_factors() -> list[int]:
     """Return a list that grows by the size of each stiffness that is factorised from now on: time depends on the machine and the hour, this does not."""
-    sizes, plain = list[int](), vars(linear)["cholesky"]
+    sizes, plain = list[int](), vars(factorization)["cholesky"]
 
     def counted(analysis: Any, *given: Any, **named: Any) -> Any:
         sizes.append(analysis.size)
         return plain(analysis, *given, **named)
 
-    vars(linear)["cholesky"] = counted
+    vars(factorization)["cholesky"] = counted
     return sizes
 
 
@@ -249,7 +282,7 @@ def measure_factor(folder: Path) -> tuple[float, float]:
         times = []
         for _ in range(20):
             began = time.perf_counter()
-            linear.factorize_definite(pattern, values, single=True, tries=0)
+            factorization.factorize_definite(pattern, values, single=True, tries=0)
             times.append(time.perf_counter() - began)
         return float(np.median(times))
 

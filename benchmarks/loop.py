@@ -26,15 +26,17 @@ from typing import Any
 import numpy as np
 from loop_cases import Case, Made, make_cases, make_data
 
-from femsense.arrays import FloatArray
-from femsense.effects import apply_effects, find_effect
-from femsense.errors import FemsenseError
+from femsense.core.arrays import FloatArray
+from femsense.core.errors import FemsenseError
 from femsense.fem.equilibrium import Equilibrium
-from femsense.loop import improve
-from femsense.loop.noise import Groups, Noise, whiten
-from femsense.loop.seats import seat_turns
-from femsense.march import Walk, drive_of, walk_along
-from femsense.model import Robot
+from femsense.loop.data.trial import Groups
+from femsense.loop.fit.marker_placement import seat_turns
+from femsense.loop.fit.noise_components import Noise, whiten
+from femsense.loop.improve import improve
+from femsense.model.drive import Walk, drive_of
+from femsense.model.effects import apply_effects, find_effect
+from femsense.model.quasi_static_path import walk_along
+from femsense.model.robot import Robot
 
 SEEDS = {"tune": 1, "report": 20300}
 COUNTS = {"null": 60, "single": 104, "two": 20, "outside": 21, "poor": 10}
@@ -49,8 +51,17 @@ def run_case(job: tuple[str, Case]) -> dict[str, Any]:
     """Make the data of a case, close the loop on them, and return what came of it."""
     warnings.simplefilter("ignore")
     which, case = job
-    record: dict[str, Any] = {"number": case.number, "kind": case.kind, "robot": case.design.name, "control": case.control, "label": case.label,
-                              "hidden": list(case.hidden), "white_m": case.white_m, "seats": case.seats, "element": case.element}  # fmt: skip
+    record: dict[str, Any] = {
+        "number": case.number,
+        "kind": case.kind,
+        "robot": case.design.name,
+        "control": case.control,
+        "label": case.label,
+        "hidden": list(case.hidden),
+        "white_m": case.white_m,
+        "seats": case.seats,
+        "element": case.element,
+    }
     try:
         made = make_data(case, SEEDS[which])
         if case.kind == "single":
@@ -67,13 +78,22 @@ def run_case(job: tuple[str, Case]) -> dict[str, Any]:
     spent = time.process_time() - cpu
     floor = np.sqrt(3.0 * sum(v**2 for v in made.noise.values()))
     return {
-        **record, "modulus_scale": made.modulus_scale, "verdict": loop.verdict, "sentence": loop.sentence,
+        **record,
+        "modulus_scale": made.modulus_scale,
+        "verdict": loop.verdict,
+        "sentence": loop.sentence,
         "effects": [{"name": e["name"], "parameters": e["parameters"]} for e in loop.effects],
-        "confounded": list(loop.confounded), "not_testable": [n["name"] for n in loop.not_testable],
-        "before_m": loop.before["validation_rms_m"], "after_m": loop.after["validation_rms_m"], "floor_m": float(floor), "noise_m": loop.noise_m,
-        "left": loop.left["structure"], "refits": [{k: c[k] for k in ("name", "dbic", "retained_share", "verdict")} for c in loop.candidates],
-        "cpu_s": spent, "wall_s": time.perf_counter() - began,
-    }  # fmt: skip
+        "confounded": list(loop.confounded),
+        "not_testable": [n["name"] for n in loop.not_testable],
+        "before_m": loop.before["validation_rms_m"],
+        "after_m": loop.after["validation_rms_m"],
+        "floor_m": float(floor),
+        "noise_m": loop.noise_m,
+        "left": loop.left["structure"],
+        "refits": [{k: c[k] for k in ("name", "dbic", "retained_share", "verdict")} for c in loop.candidates],
+        "cpu_s": spent,
+        "wall_s": time.perf_counter() - began,
+    }
 
 
 def detection_index(made: Made, hidden: dict[str, Any]) -> dict[str, float]:

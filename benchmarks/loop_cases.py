@@ -13,14 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from femsense.arrays import FloatArray, freeze
-from femsense.effects import apply_effects
+from femsense.core.arrays import FloatArray, freeze
+from femsense.core.pose import invert_pose, make_pose, rotation_from_vector, transform_points
 from femsense.fem.body import make_body, tie_cable
 from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.mesh import TetMesh, embed_points, to_quadratic
-from femsense.frames import Recording, RestMarkers, make_recording
-from femsense.model import Observation, Robot, plain_actuation, spread_features
-from femsense.pose import invert_pose, make_pose, rotation_from_vector, transform_points
+from femsense.model.effects import apply_effects
+from femsense.model.recording import Recording, RestMarkers, make_recording
+from femsense.model.robot import Observation, Robot, plain_actuation, spread_features
 from femsense.rig.script import ContactTable, Plan, PlannedContact
 from femsense.rig.truth import walk_truth
 
@@ -98,7 +98,17 @@ class Design:
         corners = [self.shape(np.array([[s, *c]]))[0] for s in self.marker_stations for c in ((0, 1), (0, -1), (1, 0), (-1, 0))]
         points = np.array(corners)
         names = tuple(f"m{i:02d}" for i in range(len(points)))
-        return Robot(self.name, body, names, freeze(points), embed_points(mesh, points), spread_features(body, 30), None, plain_actuation(len(cables)), Observation())  # fmt: skip
+        return Robot(
+            self.name,
+            body,
+            names,
+            freeze(points),
+            embed_points(mesh, points),
+            spread_features(body, 30),
+            None,
+            plain_actuation(len(cables)),
+            Observation(),
+        )
 
 
 def _arm(p: FloatArray) -> FloatArray:
@@ -118,20 +128,41 @@ def _around(radius: float, angle: float) -> list[float]:
 
 
 ARM = Design(
-    "arm", (11, 2, 2), (15, 3, 3), _arm,
-    {n: ([[0.095, *_around(0.007, a)], [0.05, *_around(0.007, a)]], [-0.01, *_around(0.010, a)]) for n, a in (("a", 0.0), ("b", np.pi / 2), ("c", np.pi), ("d", -np.pi / 2))},
-    (0.04, 0.35, 0.65, 0.98), 300e3, 2.0,
-)  # fmt: skip
+    "arm",
+    (11, 2, 2),
+    (15, 3, 3),
+    _arm,
+    {
+        n: ([[0.095, *_around(0.007, a)], [0.05, *_around(0.007, a)]], [-0.01, *_around(0.010, a)])
+        for n, a in (("a", 0.0), ("b", np.pi / 2), ("c", np.pi), ("d", -np.pi / 2))
+    },
+    (0.04, 0.35, 0.65, 0.98),
+    300e3,
+    2.0,
+)
 TRUNK = Design(
-    "trunk", (12, 2, 2), (16, 3, 3), _trunk,
-    {n: ([[0.115, *_around(0.005, a)], [0.08, *_around(0.006, a)], [0.04, *_around(0.007, a)]], [-0.01, *_around(0.011, a)]) for n, a in (("a", 0.1), ("b", 2.2), ("c", 4.3))},
-    (0.04, 0.3, 0.6, 0.97), 250e3, 1.6,
-)  # fmt: skip
+    "trunk",
+    (12, 2, 2),
+    (16, 3, 3),
+    _trunk,
+    {
+        n: ([[0.115, *_around(0.005, a)], [0.08, *_around(0.006, a)], [0.04, *_around(0.007, a)]], [-0.01, *_around(0.011, a)])
+        for n, a in (("a", 0.1), ("b", 2.2), ("c", 4.3))
+    },
+    (0.04, 0.3, 0.6, 0.97),
+    250e3,
+    1.6,
+)
 FINGER = Design(
-    "finger", (11, 2, 2), (15, 3, 3), _finger,
+    "finger",
+    (11, 2, 2),
+    (15, 3, 3),
+    _finger,
     {"bend": ([[0.085, 0.0, -0.0045], [0.06, 0.0, -0.005], [0.04, 0.0, -0.0055], [0.02, 0.0, -0.006]], [-0.012, 0.0, -0.009])},
-    (0.05, 0.35, 0.65, 0.98), 400e3, 0.9,
-)  # fmt: skip
+    (0.05, 0.35, 0.65, 0.98),
+    400e3,
+    0.9,
+)
 DESIGNS = (ARM, TRUNK, FINGER)
 
 
@@ -187,27 +218,71 @@ def hidden_effect(name: str, design: Design, control: str, rng: np.random.Genera
         "gravity": lambda: {"vector_m_s2": list(EARTH)},
         "stiffness": lambda: {"scale": float(np.exp(sign * _size(rng, 0.05, 0.3)))},
         "poisson": lambda: {"poisson_ratio": float(0.45 - _size(rng, 0.02, 0.15))},
-        "soft_region": lambda: {"center_m": middle.tolist(), "radius_m": float(rng.uniform(0.15, 0.22) * span), "scale": float(np.exp(sign * _size(rng, 0.2, 0.9)))},
+        "soft_region": lambda: {
+            "center_m": middle.tolist(),
+            "radius_m": float(rng.uniform(0.15, 0.22) * span),
+            "scale": float(np.exp(sign * _size(rng, 0.2, 0.9))),
+        },
         "hyperelastic": lambda: {"law": "neo_hookean"},
         "creep": lambda: {"fraction": _size(rng, 0.04, 0.3), "time_s": _size(rng, 2.0, 30.0)},
-        "payload": lambda: {"point_m": place.tolist(), "force_n": (force / np.linalg.norm(force) * _size(rng, 0.02, 0.2)).tolist()},
+        "payload": lambda: {
+            "point_m": place.tolist(),
+            "force_n": (force / np.linalg.norm(force) * _size(rng, 0.02, 0.2)).tolist(),
+        },
         "base_compliance": lambda: {"stiffness_n_m": _size(rng, 30.0, 1500.0)},
         "cable_friction": lambda: {"coefficient": _size(rng, 0.03, 0.4)},
-        "cable_offset": lambda: {unit: {k: sign * scale * _size(rng, 0.04, 0.2) if control == "displacement" else scale * _size(rng, 0.04, 0.2) for k in one}},
+        "cable_offset": lambda: {
+            unit: {
+                k: sign * scale * _size(rng, 0.04, 0.2) if control == "displacement" else scale * _size(rng, 0.04, 0.2)
+                for k in one
+            }
+        },
         "cable_gain": lambda: {"scale": {k: float(np.exp(sign * _size(rng, 0.03, 0.25))) for k in one}},
         "cable_stretch": lambda: {"stiffness_n_m": _size(rng, 500.0, 1e4)},
         "cable_slack": lambda: {"displacement_m": {k: _size(rng, 2e-4, 2e-3) for k in one}},
         "geometry": lambda: {"scale": 1.0 + sign * _size(rng, 0.005, 0.05)},
         "depth_scale": lambda: {"scale": 1.0 + sign * _size(rng, 0.003, 0.03), "offset_m": 0.0},
-        "marker_offset": lambda: {"offset_m": {f"m{rng.integers(len(design.marker_stations) * 4):02d}": (force / np.linalg.norm(force) * _size(rng, 8e-4, 4e-3)).tolist()}},
-    }  # fmt: skip
+        "marker_offset": lambda: {
+            "offset_m": {
+                f"m{rng.integers(len(design.marker_stations) * 4):02d}": (
+                    force / np.linalg.norm(force) * _size(rng, 8e-4, 4e-3)
+                ).tolist()
+            }
+        },
+    }
     return {"name": name, **tables[name]()}
 
 
-TENSION_EFFECTS = ("gravity", "poisson", "soft_region", "hyperelastic", "creep", "payload", "base_compliance", "cable_friction", "cable_offset",
-                   "cable_gain", "depth_scale", "marker_offset", "geometry")  # fmt: skip
-DISPLACEMENT_EFFECTS = ("gravity", "poisson", "soft_region", "hyperelastic", "payload", "base_compliance", "cable_offset", "cable_gain",
-                        "cable_stretch", "cable_slack", "depth_scale", "marker_offset", "geometry")  # fmt: skip
+TENSION_EFFECTS = (
+    "gravity",
+    "poisson",
+    "soft_region",
+    "hyperelastic",
+    "creep",
+    "payload",
+    "base_compliance",
+    "cable_friction",
+    "cable_offset",
+    "cable_gain",
+    "depth_scale",
+    "marker_offset",
+    "geometry",
+)
+DISPLACEMENT_EFFECTS = (
+    "gravity",
+    "poisson",
+    "soft_region",
+    "hyperelastic",
+    "payload",
+    "base_compliance",
+    "cable_offset",
+    "cable_gain",
+    "cable_stretch",
+    "cable_slack",
+    "depth_scale",
+    "marker_offset",
+    "geometry",
+)
 OUTSIDE = ("contact", "cross_talk", "slipped_marker", "draught", "kinked_cable", "camera_drift", "late_log")
 
 
@@ -245,9 +320,19 @@ def _case(number: int, kind: str, i: int, rng: np.random.Generator) -> Case:
     found = [e["name"] for e in hidden]
     law_hidden = "hyperelastic" in found
     return Case(
-        number, kind, design, control, float(rng.choice([1e-4, 3e-4])), hidden, outside, _size(rng, 0.5, 2.0), bool(rng.random() < 0.5) and "marker_offset" not in found,
-        kind == "poor", law_hidden or bool(rng.random() < 0.5), "gravity" not in found,
-    )  # fmt: skip
+        number,
+        kind,
+        design,
+        control,
+        float(rng.choice([1e-4, 3e-4])),
+        hidden,
+        outside,
+        _size(rng, 0.5, 2.0),
+        bool(rng.random() < 0.5) and "marker_offset" not in found,
+        kind == "poor",
+        law_hidden or bool(rng.random() < 0.5),
+        "gravity" not in found,
+    )
 
 
 # --- from case to data ---------------------------------------------------------------------------------------------------------
@@ -290,10 +375,19 @@ def make_data(case: Case, seed: int) -> Made:
     loads = _known_loads(design, labels, rng) if not case.poor else (np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
     F, a = recorded.shape
     plan = Plan(
-        control=case.control, time_s=freeze(time_s), sweep=tuple(labels), free=freeze(np.ones(F), bool), commanded=freeze(_driven(case, recorded, time_s)),
-        initial=freeze(np.zeros(a)), pressures=freeze(np.zeros((F, 0))), gravity=None, load_frame=freeze(loads[0], np.int64), load_points=freeze(loads[1]), load_forces=freeze(loads[2]),
+        control=case.control,
+        time_s=freeze(time_s),
+        sweep=tuple(labels),
+        free=freeze(np.ones(F), bool),
+        commanded=freeze(_driven(case, recorded, time_s)),
+        initial=freeze(np.zeros(a)),
+        pressures=freeze(np.zeros((F, 0))),
+        gravity=None,
+        load_frame=freeze(loads[0], np.int64),
+        load_points=freeze(loads[1]),
+        load_forces=freeze(loads[2]),
         contacts=_contacts(case, labels, rng),
-    )  # fmt: skip
+    )
     if case.outside == "draught":
         true = replace(true, body=true.body.with_gravity(true.body.gravity + 1.2 * case.size * np.array([0.3, 1.0, 0.2])))
         plan = replace(plan, gravity=freeze(_gusts(declared, true, labels)))
@@ -403,10 +497,21 @@ def _measure(
         points = _through(T, true.marker_points + seat, true.observation) + case.white_m * rng.normal(size=(k, 3))
         rest = RestMarkers(true.marker_names, freeze(points), freeze(np.full(k, case.white_m)), freeze(np.zeros(k), np.int64))
     recording = make_recording(
-        time_s=plan.time_s, actuation=case.control, cable_names=declared.body.cable_names, inputs=recorded, sweep=list(plan.sweep), free=np.ones(F, bool),
-        marker_names=declared.marker_names, marker_frame=np.repeat(np.arange(F), k), marker_index=np.tile(np.arange(k), F), marker_xyz=seen, rest=rest,
-        load_frame=plan.load_frame, load_points=plan.load_points, load_forces=plan.load_forces,
-    )  # fmt: skip
+        time_s=plan.time_s,
+        actuation=case.control,
+        cable_names=declared.body.cable_names,
+        inputs=recorded,
+        sweep=list(plan.sweep),
+        free=np.ones(F, bool),
+        marker_names=declared.marker_names,
+        marker_frame=np.repeat(np.arange(F), k),
+        marker_index=np.tile(np.arange(k), F),
+        marker_xyz=seen,
+        rest=rest,
+        load_frame=plan.load_frame,
+        load_points=plan.load_points,
+        load_forces=plan.load_forces,
+    )
     return recording, T, noise
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from femsense.materials import SILICONES
+from femsense.io.materials import SILICONES
 
 
 def main() -> None:

@@ -4,7 +4,7 @@
     python benchmarks/mesh_share.py --finer 3 --each 3   # truths with three times the declared cells along each side
 
 Of blind cases in which nothing is hidden (seeds of `loop.py tune`), with pose and modulus as in the truth: D, how far the truth's markers
-lie from the declared robot's; E, how far a mesh of half the size moves them (`femsense.loop.mesh_error`); the share a of E that is
+lie from the declared robot's; E, how far a mesh of half the size moves them (`femsense.loop.fit.discretisation_error`); the share a of E that is
 nearest to D in all sweeps, and in the sweeps one by one; what is left of D beside it; and what is left beyond what calibration may move (pose,
 modulus, zeros) of D alone, beside one share of E, and beside one matrix times E.
 """
@@ -18,15 +18,15 @@ import numpy as np
 from loop import COUNTS, SEEDS
 from loop_cases import Case, make_cases, make_data
 
-from femsense.arrays import FloatArray
-from femsense.calib.forward import Hypothesis, evaluate_scene
-from femsense.effects import apply_effects
-from femsense.loop.data import Data, prepare
-from femsense.loop.joint import JointFit, JointProblem, Prior
-from femsense.loop.mesh_error import mesh_errors, with_mesh_errors
-from femsense.loop.noise import Noise
-from femsense.loop.stages import make_stage, with_nuisance
-from femsense.model import Robot
+from femsense.core.arrays import FloatArray
+from femsense.loop.data.dataset import Data, prepare
+from femsense.loop.fit.discretisation_error import mesh_errors, with_mesh_errors
+from femsense.loop.fit.fitted_model import make_stage, with_nuisance
+from femsense.loop.fit.joint_fit import JointFit, JointProblem, Prior
+from femsense.loop.fit.noise_components import Noise
+from femsense.model.effects import apply_effects
+from femsense.model.observation import Hypothesis, evaluate_scene
+from femsense.model.robot import Robot
 
 
 def rms_mm(field: FloatArray) -> float:
@@ -48,8 +48,11 @@ def compared(case: Case) -> None:
     share = float((D * E).sum() / (E**2).sum())
     sweep = trial.groups.sweep
     own = [float((D[sweep == s] * E[sweep == s]).sum() / (E[sweep == s] ** 2).sum()) for s in np.unique(sweep)]
-    print(f"{case.number:4d} {case.design.name:7s}{case.control:13s} D {rms_mm(D):5.2f}  E {rms_mm(E):5.2f} mm  a {share:5.2f}  left {rms_mm(D - share * E):5.2f} mm"
-          f"  beyond calibration {beyond(data, D, E)} mm  sweeps {'  '.join(f'{a:5.2f}' for a in own)}", flush=True)  # fmt: skip
+    print(
+        f"{case.number:4d} {case.design.name:7s}{case.control:13s} D {rms_mm(D):5.2f}  E {rms_mm(E):5.2f} mm  a {share:5.2f}  left {rms_mm(D - share * E):5.2f} mm"
+        f"  beyond calibration {beyond(data, D, E)} mm  sweeps {'  '.join(f'{a:5.2f}' for a in own)}",
+        flush=True,
+    )
 
 
 def beyond(data: Data, D: FloatArray, E: FloatArray) -> str:
@@ -73,9 +76,15 @@ def model(fit: JointFit, robot: Robot, data: Data) -> FloatArray:
     trial = data.train[0]
     poses, initial = trial.place(fit.fit.theta[: fit.own], data.robot.marker_points.mean(axis=0))
     states = evaluate_scene(
-        Hypothesis(robot), trial.scene, np.zeros(0), poses, initial, derivative=False, vary_initial=False,
+        Hypothesis(robot),
+        trial.scene,
+        np.zeros(0),
+        poses,
+        initial,
+        derivative=False,
+        vary_initial=False,
         pivot=robot.marker_points.mean(axis=0),
-    ).states  # fmt: skip
+    ).states
     return np.array([robot.markers.positions(states[int(f)].positions)[m] for f, m in zip(trial.scene.frame, trial.scene.marker)])
 
 

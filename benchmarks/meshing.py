@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from femsense.errors import InputError
-from femsense.meshing import MeshOptions, fill
-from femsense.quality import quality_report
+from femsense.core.errors import InputError
+from femsense.io.meshing.quality import quality_report
+from femsense.io.meshing.robot_from_surface import MeshOptions, fill
 
 
 def main() -> None:

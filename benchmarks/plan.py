@@ -21,16 +21,16 @@ from typing import Any
 
 from loop_cases import ARM, EARTH
 
-from femsense.errors import FemsenseError
-from femsense.loop import improve
-from femsense.loop.advice import proposal_text
-from femsense.loop.menu import script_of
-from femsense.loop.outlook import EVIDENCE
-from femsense.loop.plan import Proposal, plan_experiment
-from femsense.model import Robot
-from femsense.recording import load_recording
+from femsense.core.errors import FemsenseError
+from femsense.io.recording_folder import load_recording
+from femsense.io.robot_toml import load_robot
+from femsense.loop.design.advice import proposal_text
+from femsense.loop.design.candidate_experiments import script_of
+from femsense.loop.design.identifiability import EVIDENCE
+from femsense.loop.design.planner import Proposal, plan_experiment
+from femsense.loop.improve import improve
+from femsense.model.robot import Robot
 from femsense.rig.simulate import simulate
-from femsense.robot import load_robot
 
 TINY_ARM = replace(ARM, name="tiny-arm", coarse=(5, 2, 2))
 NOISE_M, FRAMES = 2e-4, 45
@@ -70,8 +70,13 @@ def come_true(robot: Robot, script: dict[str, Any], hidden: dict[str, Any]) -> d
             return {"verdict": f"refused: {error}", "named": [], "set": [], "frames": recording.frame_count}
     named = [e["name"] for e in loop.effects]
     rivals = sorted({n for p in loop.confounded if set(p["pair"]) & set(named) for n in p["pair"]} - set(named))
-    return {"verdict": loop.verdict, "named": named, "set": rivals, "frames": recording.frame_count,
-            "not_testable": [n["name"] for n in loop.not_testable]}  # fmt: skip
+    return {
+        "verdict": loop.verdict,
+        "named": named,
+        "set": rivals,
+        "frames": recording.frame_count,
+        "not_testable": [n["name"] for n in loop.not_testable],
+    }
 
 
 def outcome(hidden: dict[str, Any], result: dict[str, Any]) -> str:

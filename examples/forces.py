@@ -9,9 +9,9 @@ import sys
 from pathlib import Path
 
 import femsense as fs
-from femsense.recording import select_frames
-from femsense.results import run_inputs
-from femsense.robot import robot_names
+from femsense.io.robot_toml import robot_names
+from femsense.model.recording import select_frames
+from femsense.sensing.run_files import run_inputs
 
 FRAMES = range(36, 44)
 """Of the demo's recording: something touches the robot in the last six."""

@@ -16,16 +16,20 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from femsense.calib.calibrate import calibrate
     from femsense.calib.calibration import Calibration
-    from femsense.errors import DataError, FemsenseError, InputError, MissingDependency
+    from femsense.calib.files import read_calibration, write_calibration
+    from femsense.core.errors import DataError, FemsenseError, InputError, MissingDependency
     from femsense.fem.compliance import compliance
     from femsense.fem.equilibrium import Equilibrium, solve_equilibrium
+    from femsense.io.recording_folder import load_recording
+    from femsense.io.robot_toml import load_robot, save_robot
+    from femsense.loop.files import read_loop, write_loop
     from femsense.loop.improve import improve
     from femsense.loop.result import LoopResult
-    from femsense.model import Robot
-    from femsense.recording import Recording, load_recording
-    from femsense.results import read_calibration, read_loop, read_run, write_calibration, write_loop, write_run
-    from femsense.robot import load_robot, save_robot
-    from femsense.sensing import Run, estimate
+    from femsense.model.recording import Recording
+    from femsense.model.robot import Robot
+    from femsense.sensing.pipeline import estimate
+    from femsense.sensing.run_files import read_run, write_run
+    from femsense.sensing.types import Run
     from femsense.xr.export import export_glb
 
 __version__ = "0.1.0"
@@ -62,15 +66,20 @@ __all__ = [
 _HOMES = {
     "calib.calibrate": ("calibrate",),
     "calib.calibration": ("Calibration",),
-    "errors": ("DataError", "FemsenseError", "InputError", "MissingDependency"),
+    "calib.files": ("read_calibration", "write_calibration"),
+    "core.errors": ("DataError", "FemsenseError", "InputError", "MissingDependency"),
     "fem.compliance": ("compliance",),
     "fem.equilibrium": ("Equilibrium", "solve_equilibrium"),
-    "loop": ("LoopResult", "improve"),
-    "model": ("Robot",),
-    "recording": ("Recording", "load_recording"),
-    "results": ("read_calibration", "read_loop", "read_run", "write_calibration", "write_loop", "write_run"),
-    "robot": ("load_robot", "save_robot"),
-    "sensing": ("Run", "estimate"),
+    "io.recording_folder": ("load_recording",),
+    "io.robot_toml": ("load_robot", "save_robot"),
+    "loop.files": ("read_loop", "write_loop"),
+    "loop.improve": ("improve",),
+    "loop.result": ("LoopResult",),
+    "model.recording": ("Recording",),
+    "model.robot": ("Robot",),
+    "sensing.pipeline": ("estimate",),
+    "sensing.run_files": ("read_run", "write_run"),
+    "sensing.types": ("Run",),
     "xr.export": ("export_glb",),
 }
 _MODULE_OF = {name: f"femsense.{module}" for module, names in _HOMES.items() for name in names}

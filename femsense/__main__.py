@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from femsense.cli import main
+from femsense.app.cli import main
 
 if __name__ == "__main__":
     main()

@@ -14,17 +14,17 @@ from typing import Any
 
 import numpy as np
 
-from femsense.arrays import FloatArray
+from femsense.core.arrays import FloatArray
+from femsense.core.pose import invert_pose, transform_points
 from femsense.fem.equilibrium import solve_equilibrium
 from femsense.fem.mesh import TetMesh, check_mesh
-from femsense.files import write_toml
-from femsense.meshfile import write_mesh
-from femsense.model import Robot
-from femsense.pose import invert_pose, transform_points
+from femsense.io.files import write_toml
+from femsense.io.mesh_files import write_mesh
+from femsense.io.robot_toml import load_robot
+from femsense.model.robot import Robot
 from femsense.rig.camera import camera_of, look_at, render, visible_points
 from femsense.rig.scene import body_shape
 from femsense.rig.script import SceneTable, ViewTable
-from femsense.robot import load_robot
 
 CABLE_RGB = "#d9480f"
 SILICONE = {"poisson_ratio": 0.46, "density_kg_m3": 1070.0}

@@ -12,29 +12,26 @@ from dataclasses import replace
 
 import numpy as np
 
-from femsense.arrays import FloatArray, IntArray
 from femsense.calib.calibration import Calibration
-from femsense.calib.fit import FitResult, covariance_of, gauss_newton
-from femsense.calib.forward import Hypothesis, Scene, SceneJet, evaluate_scene, in_robot_frame, make_scene, rest_residual
+from femsense.calib.inputs import _initial_displacement, _input_std, _largest_input, first_inputs, input_bounds
+from femsense.calib.joint import SEAT_STD_FLOOR, _rms, fit_joint
 from femsense.calib.rigid import fit_rigid, fit_rigid_robust
-from femsense.errors import DataError
+from femsense.core.arrays import FloatArray, IntArray
+from femsense.core.errors import DataError
+from femsense.core.least_squares import FitResult, covariance_of
+from femsense.core.parallel import one_blas_thread
+from femsense.core.pose import move_pose
 from femsense.fem.equilibrium import Equilibrium
-from femsense.march import Walk, drive_of, solve_frame
-from femsense.model import Robot
-from femsense.parallel import one_blas_thread
-from femsense.pose import move_pose
-from femsense.recording import Recording, check_against, state_key
+from femsense.model.drive import Walk, drive_of
+from femsense.model.observation import Hypothesis, Scene, SceneJet, evaluate_scene, in_robot_frame, make_scene, rest_residual
+from femsense.model.recording import Recording, check_against
+from femsense.model.robot import Robot
+from femsense.model.variants import solve_frame
 
 MAX_FRAMES = 16
 """More frames than this are thinned out evenly; they would add time and hardly any accuracy."""
 START_FRAMES = 5
 """Frames that Algorithm 1 uses for the start."""
-MAX_REWEIGHTINGS = 10
-"""Fits until the outliers are set aside; without any it takes two."""
-NOISE_FLOOR = 1e-7
-"""No camera measures better than this [m]."""
-SEAT_STD_FLOOR = 1e-4
-"""Markers are not glued better than this [m]."""
 
 
 def usable_frames(recording: Recording) -> IntArray:
@@ -95,14 +92,6 @@ def _fitted(
         few = seen[np.unique(np.linspace(0, len(seen) - 1, START_FRAMES).round().astype(int))]
         poses, initial = _alternate(robot, make_scene(robot, recording, few), poses, initial, history)
     return scene, *fit_joint(robot, scene, poses, initial, history)
-
-
-def first_inputs(robot: Robot, recording: Recording) -> FloatArray | None:
-    """Return initial inputs to start from [N] or [m], shape (a,): the smallest that leave no cable pushing; None where they are known."""
-    if recording.actuation_zero == "absolute":
-        return None
-    lowest = recording.inputs.min(axis=0) if recording.inputs.size else np.zeros(len(robot.body.cables))
-    return np.maximum(0.0, -lowest) if recording.actuation == "tension" else np.zeros(len(robot.body.cables))
 
 
 def first_poses(robot: Robot, scene: Scene) -> list[FloatArray]:
@@ -170,151 +159,12 @@ def _alternate(
     return poses, initial
 
 
-def _largest_input(robot: Robot, actuation: str) -> float:
-    """Return the size of an input that would crush the body: a tenth of E × reach² [N], or of its reach [m]."""
-    body = robot.body
-    return 0.1 * body.reach * (float(np.median(body.material.young_modulus)) * body.reach if actuation == "tension" else 1.0)
-
-
 def _rigid_again(robot: Robot, scene: Scene, jet: SceneJet) -> list[FloatArray]:
     model = {k: robot.markers.positions(s.positions) for k, s in jet.states.items()}
     predicted = np.array([model[int(f)][m] for f, m in zip(scene.frame, scene.marker)])
     return [
         fit_rigid(predicted[scene.view == v], scene.points[scene.view == v]) for v in range(len(scene.recording.camera_names))
     ]
-
-
-def input_bounds(robot: Robot, recording: Recording) -> tuple[FloatArray, FloatArray]:
-    """Return bounds of the initial inputs, so that no frame leaves the limits of its cable: initial + recorded stays within them.
-
-    A cable whose recorded tensions alone span more than its limits (`check_against` warns of it) keeps max_tension_n as its bound.
-    """
-    cables = robot.body.cables
-    if recording.actuation == "displacement":
-        reach = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
-        return np.full(len(cables), -reach), np.full(len(cables), reach)
-    order = [recording.cable_names.index(c.name) for c in cables]
-    recorded = recording.inputs[:, order] if recording.inputs.size else np.zeros((1, len(cables)))
-    low = np.array([max(c.min_tension, 0.0) for c in cables]) - np.minimum(recorded.min(axis=0), 0.0)
-    limit = np.array([c.max_tension for c in cables])
-    high = limit - np.maximum(recorded.max(axis=0), 0.0)
-    return low, np.maximum(np.where(high > low, high, limit), low + 1e-9)
-
-
-def fit_joint(
-    robot: Robot, scene: Scene, poses: list[FloatArray], initial: FloatArray | None, history: list[float], *, free_inputs: bool = True,
-) -> tuple[FitResult, list[FloatArray], FloatArray | None, SceneJet]:  # fmt: skip
-    """Finish over poses and initial inputs together; the noise is estimated from the residual, twice.
-
-    Poses that the recording declares stay as they are.
-    """
-    plain, empty = Hypothesis(robot), np.zeros(0)
-    pivot = robot.marker_points.mean(axis=0)
-    moving = [v for v, T in enumerate(scene.recording.T_robot_camera) if T is None]
-    a = len(initial) if initial is not None and free_inputs else 0
-    base_poses, sigma = list(poses), 5e-4
-    seat_std = SEAT_STD_FLOOR
-    repeats = _repeats(scene)
-    weights = repeats
-    jet: SceneJet | None = None
-    starts: dict[int, Equilibrium] = {}
-
-    def place(theta: FloatArray) -> tuple[list[FloatArray], FloatArray | None]:
-        moved = list(base_poses)
-        for i, v in enumerate(moving):
-            moved[v] = move_pose(base_poses[v], theta[6 * i : 6 * i + 6], pivot_a=pivot)
-        return moved, theta[6 * len(moving) :] if a else initial
-
-    def evaluate(theta: FloatArray, derivative: bool) -> tuple[FloatArray, FloatArray | None]:
-        nonlocal jet
-        moved, inputs = place(theta)
-        known = None if a or jet is None else jet.states  # a pose does not move the body
-        jet = evaluate_scene(
-            plain,
-            scene,
-            empty,
-            moved,
-            inputs,
-            derivative=derivative,
-            vary_initial=bool(a),
-            pivot=pivot,
-            starts=starts,
-            known=known,
-        )
-        row = (weights / sigma)[:, None]
-        residual = np.concatenate([(row * jet.residual).ravel(), jet.rest.ravel() / seat_std])
-        if not derivative:
-            return residual, None
-        columns = [c for v in moving for c in range(6 * v, 6 * v + 6)]
-        J_pose = np.vstack([(row[:, :, None] * jet.by_pose[:, :, columns]).reshape(jet.residual.size, len(columns)),
-                            jet.rest_by_pose[:, :, columns].reshape(jet.rest.size, len(columns)) / seat_std])  # fmt: skip
-        J_in = np.vstack([(row[:, :, None] * jet.by_initial).reshape(jet.residual.size, a), np.zeros((jet.rest.size, a))])
-        return residual, np.hstack([J_pose, J_in])
-
-    low, high = input_bounds(robot, scene.recording) if a else (np.zeros(0), np.zeros(0))
-    free = np.full(6 * len(moving), np.inf)
-    bounds = np.concatenate([-free, low]), np.concatenate([free, high])
-    theta = np.concatenate([np.zeros(6 * len(moving)), initial if a and initial is not None else np.zeros(0)])
-    huber = np.ones(len(scene.points))
-    for again in range(MAX_REWEIGHTINGS):
-        fit = gauss_newton(evaluate, theta, low=bounds[0], high=bounds[1])
-        theta = fit.theta
-        evaluate(theta, True)
-        assert jet is not None
-        history.append(_rms(jet.residual))
-        before, huber = huber, _huber_weights(jet.residual)
-        if again and np.abs(huber - before).max() < 0.1:
-            break
-        weights = repeats * huber
-        winsorised = jet.residual * (repeats * huber**2)[:, None]  # an outlier counts as the largest residual that is none
-        sigma = _spread(winsorised, float(3 * (repeats**2).sum()), len(theta))
-        seat_std = max(SEAT_STD_FLOOR, float(np.sqrt((jet.rest**2).mean()))) if len(jet.rest) else seat_std
-    assert jet is not None
-    moved, inputs = place(theta)
-    fit = _with_bound_inputs(fit, theta, bounds)
-    return fit, moved, inputs, jet
-
-
-def _with_bound_inputs(fit: FitResult, theta: FloatArray, bounds: tuple[FloatArray, FloatArray]) -> FitResult:
-    """A parameter at its bound stays there: it takes no part in the covariance of the others."""
-    at = (theta <= bounds[0]) | (theta >= bounds[1])
-    if not at.any():
-        return fit
-    covariance = np.zeros_like(fit.covariance)
-    covariance[np.ix_(~at, ~at)] = covariance_of(fit.jacobian[:, ~at])
-    own = np.linalg.norm(fit.jacobian[:, at], axis=0)
-    covariance[at, at] = np.where(own > 0, 1.0 / np.where(own > 0, own, 1.0) ** 2, np.inf)
-    return FitResult(fit.theta, covariance, fit.residual, fit.jacobian, fit.cost, fit.status)
-
-
-def _repeats(scene: Scene) -> FloatArray:
-    """Return square-root weights by which frames under the same inputs and loads count once together, shape (k,).
-
-    Such frames repeat the same error of the model; taking them for independent would make every standard deviation too small.
-    """
-    keys = [state_key(scene.recording, int(f)) for f in scene.frame]
-    count: dict[tuple[bytes, int], int] = {}
-    for key, marker in zip(keys, scene.marker):
-        count[key, int(marker)] = count.get((key, int(marker)), 0) + 1
-    return np.array([count[key, int(marker)] ** -0.5 for key, marker in zip(keys, scene.marker)])
-
-
-def _huber_weights(residual: FloatArray) -> FloatArray:
-    """Return square-root weights of Huber's loss for 3-D residuals, scaled by their median."""
-    distance = np.linalg.norm(residual, axis=1)
-    if len(distance) < 8:
-        return np.ones(len(distance))
-    scale = max(float(np.median(distance)) / 1.538, 1e-12)  # median of a chi distribution with 3 degrees
-    return np.asarray(np.sqrt(np.minimum(1.0, 3.5 * scale / np.maximum(distance, 1e-300))))
-
-
-def _spread(weighted: FloatArray, rows: float, parameters: int) -> float:
-    freedom = max(rows - parameters, 1.0)
-    return max(float(np.sqrt((weighted**2).sum() / freedom)), NOISE_FLOOR)
-
-
-def _rms(residual: FloatArray) -> float:
-    return float(np.sqrt((residual**2).sum(axis=1).mean()))
 
 
 def _initial_state(robot: Robot, recording: Recording, initial: FloatArray | None) -> Equilibrium:
@@ -325,8 +175,14 @@ def _initial_state(robot: Robot, recording: Recording, initial: FloatArray | Non
 
 
 def _result(
-    robot: Robot, scene: Scene, fit: FitResult, poses: list[FloatArray], initial: FloatArray | None, jet: SceneJet, history: list[float],
-) -> Calibration:  # fmt: skip
+    robot: Robot,
+    scene: Scene,
+    fit: FitResult,
+    poses: list[FloatArray],
+    initial: FloatArray | None,
+    jet: SceneJet,
+    history: list[float],
+) -> Calibration:
     recording, names = scene.recording, robot.body.cable_names
     state = _initial_state(robot, recording, initial)
     moving = [v for v, T in enumerate(recording.T_robot_camera) if T is None]
@@ -359,14 +215,6 @@ def _result(
     )
 
 
-def _initial_displacement(
-    state: Equilibrium, recording: Recording, names: tuple[str, ...], initial: FloatArray | None
-) -> dict[str, float]:
-    if recording.actuation == "displacement" and initial is not None:
-        return {name: float(v) for name, v in zip(names, initial)}
-    return dict(state.shortening)
-
-
 def _pose_std(T: FloatArray, covariance: FloatArray, pivot: FloatArray) -> FloatArray:
     """Return one standard deviation of the entries of T from the covariance of (rotation about the pivot, shift)."""
     std = np.zeros((4, 4))
@@ -377,27 +225,6 @@ def _pose_std(T: FloatArray, covariance: FloatArray, pivot: FloatArray) -> Float
         J[:, :, j] = (move_pose(T, step, pivot_a=pivot) - T)[:3] / 1e-6
     std[:3] = np.sqrt(np.maximum(np.einsum("abi,ij,abj->ab", J, covariance, J), 0.0))
     return std
-
-
-def _input_std(
-    robot: Robot, recording: Recording, state: Equilibrium, covariance: FloatArray
-) -> tuple[dict[str, float | None], dict[str, float | None]]:
-    """Return the standard deviations of the fitted inputs and of the others (tension ↔ shortening, through W_aa)."""
-    from femsense.fem.compliance import compliance
-
-    names = robot.body.cable_names
-    if not covariance.size:
-        return {n: 0.0 for n in names}, {n: 0.0 for n in names}
-    W = compliance(robot.body, state)[: len(names), : len(names)]
-    J = W if recording.actuation == "tension" else np.linalg.pinv(W)
-    finite = np.isfinite(np.diag(covariance)).all()
-    derived = np.sqrt(np.maximum(np.diag(J @ covariance @ J.T), 0.0)) if finite else np.full(len(names), np.inf)
-    own = np.sqrt(np.diag(covariance))
-
-    def table(values: FloatArray) -> dict[str, float | None]:
-        return {n: float(v) if np.isfinite(v) else None for n, v in zip(names, values)}
-
-    return table(own), table(derived)
 
 
 def _status(fit: FitResult, robot: Robot, own: dict[str, float | None], recording: Recording) -> str:
@@ -436,9 +263,22 @@ def _from_rest(robot: Robot, recording: Recording) -> Calibration:
     per_marker = {robot.marker_names[m]: float(np.linalg.norm(r)) for m, r in zip(scene.rest_marker, left)}
     places = in_robot_frame(scene.rest_points, scene.rest_view, poses, robot.observation)
     seats_m = {robot.marker_names[m]: p.tolist() for m, p in zip(scene.rest_marker, places)}
-    return Calibration(poses[0], tuple(poses), recording.camera_names, dict(state.tension), dict(state.shortening), _rms(left), per_marker, (),
-                       _pose_std(poses[0], covariance, robot.marker_points.mean(axis=0)), covariance, none, dict(none),
-                       "converged (from rest.csv alone: no frame is free)", seats_m)  # fmt: skip
+    return Calibration(
+        poses[0],
+        tuple(poses),
+        recording.camera_names,
+        dict(state.tension),
+        dict(state.shortening),
+        _rms(left),
+        per_marker,
+        (),
+        _pose_std(poses[0], covariance, robot.marker_points.mean(axis=0)),
+        covariance,
+        none,
+        dict(none),
+        "converged (from rest.csv alone: no frame is free)",
+        seats_m,
+    )
 
 
 def _cross(v: FloatArray) -> FloatArray:
@@ -457,8 +297,19 @@ def _declared(robot: Robot, recording: Recording, frames: IntArray) -> Calibrati
     poses = tuple(T for T in recording.T_robot_camera if T is not None)
     state = _initial_state(robot, recording, None)
     none: dict[str, float | None] = {n: 0.0 for n in robot.body.cable_names}
-    return Calibration(poses[0], poses, recording.camera_names, dict(state.tension), dict(state.shortening), float("nan"), {}, (),
-                       np.zeros((4, 4)), np.zeros((6, 6)), none, dict(none), "as declared: there are no markers to fit", frames=tuple(int(recording.frame_numbers[k]) for k in frames))  # fmt: skip
-
-
-__all__ = ["calibrate", "calibrated_start", "first_inputs", "first_poses", "fit_joint", "input_bounds", "usable_frames"]
+    return Calibration(
+        poses[0],
+        poses,
+        recording.camera_names,
+        dict(state.tension),
+        dict(state.shortening),
+        float("nan"),
+        {},
+        (),
+        np.zeros((4, 4)),
+        np.zeros((6, 6)),
+        none,
+        dict(none),
+        "as declared: there are no markers to fit",
+        frames=tuple(int(recording.frame_numbers[k]) for k in frames),
+    )

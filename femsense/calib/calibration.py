@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from femsense.arrays import FloatArray
+from femsense.core.arrays import FloatArray
 
 
 @dataclass(frozen=True, eq=False, slots=True)

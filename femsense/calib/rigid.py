@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from femsense.arrays import FloatArray, as_points
-from femsense.errors import DataError, InputError
-from femsense.pose import make_pose
+from femsense.core.arrays import FloatArray, as_points
+from femsense.core.errors import DataError, InputError
+from femsense.core.pose import make_pose
 
 
 def fit_rigid(points_a: FloatArray, points_b: FloatArray, *, weights: FloatArray | None = None) -> FloatArray:

@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from femsense.arrays import BoolArray, FloatArray
-from femsense.errors import InputError
+from femsense.core.arrays import BoolArray, FloatArray
+from femsense.core.errors import InputError
 from femsense.fem.mesh import TetMesh, oriented
 
 KUHN = np.array([[0, 1, 3, 7], [0, 3, 2, 7], [0, 2, 6, 7], [0, 6, 4, 7], [0, 4, 5, 7], [0, 5, 1, 7]])

@@ -8,79 +8,14 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
-from femsense.arrays import BoolArray, FloatArray, IntArray, as_indices, as_points, freeze
-from femsense.errors import InputError
-from femsense.fem.mesh import Embedding, TetMesh, body_parts, element_volumes, embed_points
+from femsense.core.arrays import BoolArray, FloatArray, IntArray, as_indices, as_points, freeze
+from femsense.core.errors import InputError
+from femsense.fem.body_parts import LAWS, Cable, Chamber, Material, segment_ties
+from femsense.fem.mesh import TetMesh, body_parts, element_volumes, embed_points
 from femsense.fem.stencil import FreeMap, Stencil, make_free_map, make_stencil
 
 FLAT = 1e-12
 """Tetrahedra smaller than this times the median one are flat but for rounding."""
-LAWS = ("corotational", "neo_hookean", "gent")
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Material:
-    """An isotropic material, one modulus and Poisson ratio for each element."""
-
-    young_modulus: FloatArray
-    """[Pa], shape (m,)."""
-    poisson_ratio: FloatArray
-    """[1], shape (m,), in (−1, 0.5)."""
-    density: float
-    """[kg/m³]."""
-    law: str = "corotational"
-    """One of LAWS."""
-    stretch_limit: float = np.inf
-    """Gent's limit of I₁ − 3 [1]."""
-
-    def lame(self) -> tuple[FloatArray, FloatArray]:
-        """Return μ and λ [Pa], shapes (m,)."""
-        E, nu = self.young_modulus, self.poisson_ratio
-        return E / (2.0 * (1.0 + nu)), E * nu / ((1.0 + nu) * (1.0 - 2.0 * nu))
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Cable:
-    """A cable through points of the body to a pull point that is fixed in space."""
-
-    name: str
-    path: Embedding
-    """Points of the body, far end first."""
-    pull_point: FloatArray
-    """[m], shape (3,)."""
-    exit_direction: FloatArray | None = None
-    """Unit vector in which the cable leaves the pull point, shape (3,); only friction feels it."""
-    min_tension: float = 0.0
-    """[N]."""
-    max_tension: float = np.inf
-    """[N]."""
-    friction: float = 0.0
-    """Capstan coefficient μ at every bend [1]."""
-    stretch_stiffness: float = np.inf
-    """Stiffness of the cable itself [N/m]; inf: it does not stretch."""
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Chamber:
-    """A closed cavity of the body under pressure (see `chambers.find_chamber`)."""
-
-    name: str
-    faces: IntArray
-    """Nodes of its surface, looking into the material, shape (t, 3), or (t, 6): corners, then the middles of ab, bc, ca."""
-    seed: FloatArray
-    """A point inside at rest [m], shape (3,)."""
-    max_pressure: float = np.inf
-    """[Pa]."""
-
-
-def segment_ties(path: Embedding) -> tuple[IntArray, FloatArray]:
-    """Return the nodes that move each segment of a cable and their weights in the difference of its ends, shapes (s, 2k).
-
-    The last segment ends at the pull point, which no node moves: its second half has weight 0.
-    """
-    ahead = np.vstack([path.nodes[1:], path.nodes[-1:]])
-    weight = np.vstack([path.weights[1:], np.zeros((1, path.weights.shape[1]))])
-    return np.hstack([path.nodes, ahead]), np.hstack([-path.weights, weight])
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -252,7 +187,7 @@ def make_body(
         )
     if law not in LAWS:
         raise InputError("unknown law", where="law", found=law, expected=" | ".join(LAWS))
-    from femsense.fem.chambers import check_chambers, curvature_map
+    from femsense.fem.cavities import check_chambers, curvature_map
 
     mask = np.asarray(clamped)
     indices = (
@@ -276,9 +211,22 @@ def make_body(
     cable_slots = slots[: len(cables)]
     curvature = tuple(curvature_map(c, s, len(stencil.block_columns), n) for c, s in zip(chambers, slots[len(cables) :]))
     material = Material(freeze(E), freeze(nu), float(density), law)
-    return BodyModel(mesh, material, freeze(np.unique(indices), np.int64), np.inf, freeze(springs, np.int64), cables,
-                     _finite_vector(gravity, "gravity"), freeze(np.zeros((n, 3))), stencil, cable_slots, make_free_map(stencil, mesh, indices),
-                     parts=freeze(body_parts(mesh), np.int64), chambers=chambers, chamber_curvature=curvature)  # fmt: skip
+    return BodyModel(
+        mesh,
+        material,
+        freeze(np.unique(indices), np.int64),
+        np.inf,
+        freeze(springs, np.int64),
+        cables,
+        _finite_vector(gravity, "gravity"),
+        freeze(np.zeros((n, 3))),
+        stencil,
+        cable_slots,
+        make_free_map(stencil, mesh, indices),
+        parts=freeze(body_parts(mesh), np.int64),
+        chambers=chambers,
+        chamber_curvature=curvature,
+    )
 
 
 def _spread_out(points: FloatArray) -> bool:

@@ -11,8 +11,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from femsense.arrays import FloatArray, IntArray
-from femsense.fem.body import BodyModel, Cable
+from femsense.core.arrays import FloatArray, IntArray
+from femsense.fem.body import BodyModel
+from femsense.fem.body_parts import Cable
 
 
 def segments(cable: Cable, positions: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -21,12 +21,12 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 
-from femsense.arrays import FloatArray, IntArray
+from femsense.core.arrays import FloatArray, IntArray
+from femsense.core.pose import rotation_from_vector
 from femsense.fem.body import BodyModel
-from femsense.fem.linear import Factorization
+from femsense.fem.linalg.factorization import Factorization
 from femsense.fem.mesh import EDGES, TetMesh
 from femsense.fem.stencil import Stencil, block_row_numbers
-from femsense.pose import rotation_from_vector
 
 TIE = 1e4
 """Where the plate alone gives, its nodes are tied to it with springs that are together so many times as stiff as Young's modulus × reach."""
@@ -278,17 +278,3 @@ def _vector_of(rotation: FloatArray) -> FloatArray:
     from scipy.spatial.transform import Rotation
 
     return np.asarray(Rotation.from_matrix(rotation).as_rotvec())
-
-
-__all__ = [
-    "TIE",
-    "Plate",
-    "Ties",
-    "clamp_energy_and_forces",
-    "clamp_turn",
-    "first_give",
-    "plate_at",
-    "rigid_give",
-    "ties_of",
-    "with_turning_plate",
-]

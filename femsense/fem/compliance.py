@@ -14,15 +14,15 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
-from femsense.arrays import FloatArray, as_points
-from femsense.errors import FemsenseError, InputError
+from femsense.core.arrays import FloatArray, as_points
+from femsense.core.errors import FemsenseError, InputError
 from femsense.fem.assembly import internal, reduced_values
 from femsense.fem.body import BodyModel
-from femsense.fem.cables import add_cable_stiffness, cable_forces, pull_rows
+from femsense.fem.cables import add_cable_stiffness, pull_rows
 from femsense.fem.chambers import add_pressure_stiffness, volume_gradient
 from femsense.fem.clamp import with_turning_plate
 from femsense.fem.equilibrium import Equilibrium
-from femsense.fem.linear import Factorization, Pattern, factorize
+from femsense.fem.linalg.factorization import Factorization, Pattern, factorize
 from femsense.fem.mesh import Embedding, embed_points
 
 Solver = Callable[[Pattern, FloatArray], Factorization | None]
@@ -135,6 +135,3 @@ def direction_rows(embedding: Embedding, directions: FloatArray, node_count: int
     values = embedding.weights[:, :, None] * directions[:, None, :]
     np.add.at(rows, (np.arange(k)[:, None], embedding.nodes), values)
     return rows.reshape(k, -1)
-
-
-__all__ = ["Tangent", "cable_forces", "compliance", "direction_rows", "drive_rows", "tangent_at"]

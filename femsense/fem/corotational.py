@@ -22,8 +22,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from femsense.arrays import FloatArray
-from femsense.fem.tiles import LANES, add_divergence, add_gradient, add_run, fetch_ahead, subtract_product
+from femsense.core.arrays import FloatArray
+from femsense.fem.linalg.simd_kernels import LANES, add_divergence, add_gradient, add_run, fetch_ahead, subtract_product
 
 FAST = {"contract", "reassoc", "nsz", "arcp"}
 """Rounding may differ; infinities and NaN are kept."""
@@ -201,8 +201,16 @@ def _add_product(T, K, slots, blocks):  # type: ignore[no-untyped-def]
     K[:] = 0.0
     for first, count in ((0, 6), (6, 4)):
         subtract_product(
-            T, T.ctypes.data, T.ctypes.data + width * (96 + first), STEP, K.ctypes.data + width * first * STEP, STEP, 9 * (first + count), count, 15
-        )  # fmt: skip
+            T,
+            T.ctypes.data,
+            T.ctypes.data + width * (96 + first),
+            STEP,
+            K.ctypes.data + width * first * STEP,
+            STEP,
+            9 * (first + count),
+            count,
+            15,
+        )
     pair, row = 0, blocks.ctypes.data
     for a in range(10):
         for b in range(a, 10):

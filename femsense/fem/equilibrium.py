@@ -15,15 +15,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from femsense.arrays import BoolArray, FloatArray, as_points, freeze
-from femsense.errors import InputError
+from femsense.core.arrays import BoolArray, FloatArray, as_points, freeze
+from femsense.core.errors import InputError
 from femsense.fem.assembly import Internal, internal, reduced_values
-from femsense.fem.body import BodyModel, Cable
-from femsense.fem.cables import add_cable_stiffness, bend_angles, cable_forces, cable_length, rub, segments, shortening
+from femsense.fem.body import BodyModel
+from femsense.fem.body_parts import Cable
+from femsense.fem.cables import add_cable_stiffness, bend_angles, cable_forces, rub, segments, shortening
 from femsense.fem.chambers import add_pressure_stiffness, chamber_volume, volume_changes, volume_gradient
 from femsense.fem.clamp import with_turning_plate
-from femsense.fem.linear import Factorization, Pattern, factorize, factorize_definite, least_shift
-from femsense.fem.turning import turned_step
+from femsense.fem.linalg.factorization import Factorization, Pattern, factorize, factorize_definite, least_shift
+from femsense.fem.rotated_step import turned_step
 
 CONVERGED = "converged"
 TRIES, INDEFINITE_TRIES = 30, 6
@@ -235,9 +236,14 @@ def solve_equilibrium(
 
 
 def _collect_loads(
-    body: BodyModel, given: Mapping[str, Mapping[str, float] | None], nodal_forces: npt.ArrayLike | None, start: Equilibrium | None,
-    before: tuple[FloatArray, ...] | None, bilateral: bool, relative_tolerance: float,
-) -> _Loads:  # fmt: skip
+    body: BodyModel,
+    given: Mapping[str, Mapping[str, float] | None],
+    nodal_forces: npt.ArrayLike | None,
+    start: Equilibrium | None,
+    before: tuple[FloatArray, ...] | None,
+    bilateral: bool,
+    relative_tolerance: float,
+) -> _Loads:
     n = len(body.mesh.nodes)
     T, d, pulled = _drive_values(body.cable_names, "a cable", "tension", "shortening", given)
     p, grown, filled = _drive_values(body.chamber_names, "a chamber", "pressure", "volume", given)
@@ -254,8 +260,12 @@ def _collect_loads(
     if before is None:
         before = start.segment_tensions if start is not None else tuple(np.zeros(len(c.path)) for c in body.cables)
     if [len(b) for b in before] != [len(c.path) for c in body.cables] or not all(np.isfinite(b).all() for b in before):
-        raise InputError("not the tensions along these cables", where="before", found=[len(b) for b in before],
-                         expected=f"finite, segments {[len(c.path) for c in body.cables]}")  # fmt: skip
+        raise InputError(
+            "not the tensions along these cables",
+            where="before",
+            found=[len(b) for b in before],
+            expected=f"finite, segments {[len(c.path) for c in body.cables]}",
+        )
     areas = [np.linalg.norm(volume_gradient(c, body.mesh.nodes), axis=1).sum() for c in body.chambers]
     lever = np.concatenate([np.ones(len(T)), areas])
     effort, target = np.concatenate([T, p]), np.concatenate([d, grown])
@@ -286,17 +296,23 @@ def _drive_values(
     if twice:
         what = "pulled or held" if effort == "tension" else "under pressure or held"
         raise InputError(f"{kind} is either {what}", where=travel, found=f"{sorted(twice)} in {effort} too")
-    return (np.array([tables[effort].get(name, 0.0) for name in names], dtype=float),
-            np.array([tables[travel].get(name, 0.0) for name in names], dtype=float),
-            np.array([name in tables[travel] for name in names], dtype=bool))  # fmt: skip
+    return (
+        np.array([tables[effort].get(name, 0.0) for name in names], dtype=float),
+        np.array([tables[travel].get(name, 0.0) for name in names], dtype=float),
+        np.array([name in tables[travel] for name in names], dtype=bool),
+    )
 
 
 def _check_start(body: BodyModel, start: Equilibrium) -> None:
     if start.positions.shape != body.mesh.nodes.shape:
         raise InputError("belongs to another mesh", where="start", found=start.positions.shape, expected=body.mesh.nodes.shape)
     if set(start.tension) != set(body.cable_names) or set(start.pressure) != set(body.chamber_names):
-        raise InputError("belongs to a body with other cables or chambers", where="start", found=[*start.tension, *start.pressure],
-                         expected=[*body.cable_names, *body.chamber_names])  # fmt: skip
+        raise InputError(
+            "belongs to a body with other cables or chambers",
+            where="start",
+            found=[*start.tension, *start.pressure],
+            expected=[*body.cable_names, *body.chamber_names],
+        )
 
 
 def _loads_of(body: BodyModel, start: Equilibrium, loads: _Loads) -> _Loads:
@@ -304,8 +320,12 @@ def _loads_of(body: BodyModel, start: Equilibrium, loads: _Loads) -> _Loads:
     effort = np.array([*start.tension.values(), *start.pressure.values()])
     travel = _travel(body, start.positions) + _stretch(body) * effort
     free = ~loads.controlled
-    return replace(loads, forces=body.dead_load() + start.nodal_forces, effort=np.where(free, np.maximum(effort, 0.0) if not loads.bilateral else effort, 0.0),
-                   target=np.where(free, 0.0, travel))  # fmt: skip
+    return replace(
+        loads,
+        forces=body.dead_load() + start.nodal_forces,
+        effort=np.where(free, np.maximum(effort, 0.0) if not loads.bilateral else effort, 0.0),
+        target=np.where(free, 0.0, travel),
+    )
 
 
 def _first_taut(body: BodyModel, loads: _Loads) -> BoolArray:
@@ -670,9 +690,16 @@ def _contradicts(reached: FloatArray, gap: FloatArray, lever: FloatArray) -> boo
 
 
 def _line_search(
-    body: BodyModel, loads: _Loads, state: _State, held: npt.NDArray[np.intp], here: Internal, du: FloatArray, dT: FloatArray, gap: FloatArray,
+    body: BodyModel,
+    loads: _Loads,
+    state: _State,
+    held: npt.NDArray[np.intp],
+    here: Internal,
+    du: FloatArray,
+    dT: FloatArray,
+    gap: FloatArray,
     force: FloatArray,
-) -> Internal | None:  # fmt: skip
+) -> Internal | None:
     """Go along a Newton step as far as the potential allows (Armijo); return the internal state there, None if nowhere.
 
     Held cables enter the merit as an exact penalty ρ |gap| with ρ above their tensions.
@@ -802,6 +829,3 @@ def _result(body: BodyModel, state: _State, status: str, reached: float, nodal_f
         nodal_forces=freeze(nodal_forces),
         factor=state.factor,
     )
-
-
-__all__ = ["ADVICE", "Equilibrium", "cable_length", "solve_equilibrium"]

@@ -22,7 +22,7 @@ import numpy as np
 from numba import njit
 
 from femsense.fem.corotational import FAST, LOCAL, add_blocks, determinant
-from femsense.fem.tiles import LANES
+from femsense.fem.linalg.simd_kernels import LANES
 
 
 @njit(inline="always")

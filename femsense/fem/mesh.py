@@ -17,8 +17,8 @@ import scipy.sparse as sp
 from numba import njit
 from scipy.spatial import cKDTree
 
-from femsense.arrays import BoolArray, FloatArray, IntArray, as_points, freeze
-from femsense.errors import InputError
+from femsense.core.arrays import BoolArray, FloatArray, IntArray, as_points, freeze
+from femsense.core.errors import InputError
 
 EDGES = np.array([[0, 1], [1, 2], [0, 2], [0, 3], [1, 3], [2, 3]])
 FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])  # outward where the volume is positive
@@ -100,8 +100,13 @@ class Embedding:
 
     def __getitem__(self, index: Any) -> Embedding:
         still = None if self.still is None else np.atleast_2d(self.still[index])
-        return Embedding(np.atleast_2d(self.nodes[index]), np.atleast_2d(self.weights[index]),
-                         np.atleast_1d(self.element[index]), np.atleast_1d(self.outside[index]), still)  # fmt: skip
+        return Embedding(
+            np.atleast_2d(self.nodes[index]),
+            np.atleast_2d(self.weights[index]),
+            np.atleast_1d(self.element[index]),
+            np.atleast_1d(self.outside[index]),
+            still,
+        )
 
 
 def element_volumes(mesh: TetMesh) -> FloatArray:
@@ -198,22 +203,45 @@ def check_mesh(mesh: TetMesh, where: str) -> None:
     size = np.median(np.abs(volumes))
     flat = np.flatnonzero(np.abs(volumes) <= 1e-9 * size)
     if len(flat):
-        raise InputError("tetrahedra without volume", where=where, found=f"{len(flat)}, the first is number {flat[0]}",
-                         expected="positive volumes", hint="femsense mesh SURFACE -o ROBOT makes a sound mesh")  # fmt: skip
+        raise InputError(
+            "tetrahedra without volume",
+            where=where,
+            found=f"{len(flat)}, the first is number {flat[0]}",
+            expected="positive volumes",
+            hint="femsense mesh SURFACE -o ROBOT makes a sound mesh",
+        )
     inverted = np.flatnonzero(volumes < 0)
     if len(inverted):
-        raise InputError("inverted tetrahedra", where=where, found=f"{len(inverted)} of {len(volumes)}, the first is number {inverted[0]}",
-                         expected="node order with positive volume", hint="swap two nodes of each inverted tetrahedron")  # fmt: skip
+        raise InputError(
+            "inverted tetrahedra",
+            where=where,
+            found=f"{len(inverted)} of {len(volumes)}, the first is number {inverted[0]}",
+            expected="node order with positive volume",
+            hint="swap two nodes of each inverted tetrahedron",
+        )
     parts = body_parts(mesh)
     if (parts < 0).any():
-        raise InputError("nodes that belong to no tetrahedron", where=where, found=f"{int((parts < 0).sum())}, the first is number {int(np.flatnonzero(parts < 0)[0])}",
-                         expected="every node in an element", hint="remove the unused nodes")  # fmt: skip
+        raise InputError(
+            "nodes that belong to no tetrahedron",
+            where=where,
+            found=f"{int((parts < 0).sum())}, the first is number {int(np.flatnonzero(parts < 0)[0])}",
+            expected="every node in an element",
+            hint="remove the unused nodes",
+        )
     if parts.max() > 0:
-        raise InputError("the mesh falls into separate parts", where=where, found=f"{parts.max() + 1} parts of {np.bincount(parts).tolist()} nodes",
-                         expected="one connected body", hint="merge duplicate nodes, or keep one part")  # fmt: skip
+        raise InputError(
+            "the mesh falls into separate parts",
+            where=where,
+            found=f"{parts.max() + 1} parts of {np.bincount(parts).tolist()} nodes",
+            expected="one connected body",
+            hint="merge duplicate nodes, or keep one part",
+        )
     hinged = np.bincount(hinged_parts(mesh))
     if len(hinged) > 1:
-        warnings.warn(f"{where}: {len(hinged)} parts of {np.sort(hinged)[::-1][:6].tolist()} tetrahedra hang together by an edge or a corner alone and swing about it", stacklevel=3)  # fmt: skip
+        warnings.warn(
+            f"{where}: {len(hinged)} parts of {np.sort(hinged)[::-1][:6].tolist()} tetrahedra hang together by an edge or a corner alone and swing about it",
+            stacklevel=3,
+        )
 
 
 def surface_triangles(mesh: TetMesh) -> IntArray:
@@ -523,9 +551,16 @@ def _keep_deepest(point: IntArray, candidate: IntArray, depth: FloatArray, best:
 
 @njit(cache=True, nogil=True)
 def _carry(
-    corners: FloatArray, centres: FloatArray, reach: float, size: float, points: FloatArray, candidate: IntArray, start: IntArray,
-    carrier: IntArray, outside: FloatArray,
-) -> None:  # fmt: skip
+    corners: FloatArray,
+    centres: FloatArray,
+    reach: float,
+    size: float,
+    points: FloatArray,
+    candidate: IntArray,
+    start: IntArray,
+    carrier: IntArray,
+    outside: FloatArray,
+) -> None:
     """Write `_carriers_of_outsiders`: those of each point stand in `candidate` from `start` on."""
     off, distance = np.empty(len(candidate)), np.empty(len(candidate))
     for i in range(len(points)):

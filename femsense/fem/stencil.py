@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from femsense.arrays import BoolArray, FloatArray, IntArray, freeze
-from femsense.fem.cholesky import fill_reducing_order
-from femsense.fem.iterative import Grid
-from femsense.fem.linear import Pattern, make_pattern
+from femsense.core.arrays import BoolArray, FloatArray, IntArray, freeze
+from femsense.fem.linalg.factorization import Pattern, make_pattern
+from femsense.fem.linalg.iterative import Grid
+from femsense.fem.linalg.ordering import fill_reducing_order
+from femsense.fem.linalg.simd_kernels import LANES
 from femsense.fem.mesh import EDGES, TetMesh, shape_slopes, shape_values
-from femsense.fem.tiles import LANES
 
 _A, _B = 0.5854101966249685, 0.1381966011250105
 QUADRATURE = np.array([[_A, _B, _B, _B], [_B, _A, _B, _B], [_B, _B, _A, _B], [_B, _B, _B, _A]])
@@ -97,9 +97,14 @@ def make_stencil(mesh: TetMesh, cliques: list[IntArray] | None = None) -> tuple[
     rows, columns, slots = _block_pattern(len(mesh.nodes), [tets, *(cliques or [])])
     first, second = np.triu_indices(tets.shape[1])
     stencil = Stencil(
-        freeze(tets, np.int32), freeze(gradients), freeze(volumes), freeze(node_volume),
-        freeze(slots[0][:, first, second], np.int32), freeze(rows, np.int64), freeze(columns, np.int64),
-    )  # fmt: skip
+        freeze(tets, np.int32),
+        freeze(gradients),
+        freeze(volumes),
+        freeze(node_volume),
+        freeze(slots[0][:, first, second], np.int32),
+        freeze(rows, np.int64),
+        freeze(columns, np.int64),
+    )
     return stencil, slots[1:]
 
 

@@ -17,41 +17,34 @@ from typing import Any
 
 import numpy as np
 
-from femsense.calib.forward import Hypothesis, SceneJet
-from femsense.effects import EFFECTS, FORMS, Effect, find_effect, load_own_effect, try_own_effect
-from femsense.errors import DataError, FemsenseError, InputError
-from femsense.keep import Keeper
-from femsense.loop.conclude import conclude
-from femsense.loop.data import MESH, Data, prepare
-from femsense.loop.elements import need_quadratic, seeks_with_quadratic, with_quadratic
-from femsense.loop.exchange import BETTER, History, exchanged
-from femsense.loop.few import spares
-from femsense.loop.grow import Progress, Refit, grow, mesh_cost, moved_by, prune, shortlist
-from femsense.loop.joint import Prior
-from femsense.loop.mesh_error import errs_alike, few_states, make_finer, with_mesh_errors
-from femsense.loop.noise import Noise
-from femsense.loop.refit import EVIDENCE, evidence
+from femsense.core.errors import DataError, FemsenseError, InputError
+from femsense.core.parallel import beside, one_blas_thread
+from femsense.io.checkpoint import Keeper
+from femsense.loop.data.dataset import MESH, Data, prepare
+from femsense.loop.data.outliers import without_strays
+from femsense.loop.design.next_experiment import next_experiment
+from femsense.loop.fit.discretisation_error import errs_alike, few_states, make_finer, with_mesh_errors
+from femsense.loop.fit.fitted_model import Stage, make_stage, own_of, rematched, roughly_keeping, weighed, with_nuisance
+from femsense.loop.fit.joint_fit import Prior
+from femsense.loop.fit.marker_placement import with_turning_seats
+from femsense.loop.fit.noise_components import Noise
 from femsense.loop.result import LoopResult
-from femsense.loop.screen import Candidate, Fields
-from femsense.loop.search import Course, Search
-from femsense.loop.seats import with_turning_seats
-from femsense.loop.stages import (
-    Stage,
-    fields_of,
-    make_stage,
-    noise_of,
-    own_of,
-    rematched,
-    roughly_keeping,
-    screen_stage,
-    weighed,
-    with_nuisance,
-)
-from femsense.loop.strays import without_strays
-from femsense.loop.zeros import in_place_of_zeros
-from femsense.model import Robot
-from femsense.parallel import beside, one_blas_thread
-from femsense.recording import Recording, state_key
+from femsense.loop.search.acceptance import mesh_cost, moved_by
+from femsense.loop.search.effect_fields import Fields, fields_of
+from femsense.loop.search.element_order import need_quadratic, seeks_with_quadratic, with_quadratic
+from femsense.loop.search.forward_selection import grow, shortlist
+from femsense.loop.search.input_offset import in_place_of_zeros
+from femsense.loop.search.pruning import prune
+from femsense.loop.search.refit import EVIDENCE, evidence
+from femsense.loop.search.screening import Candidate, noise_of, screen_stage
+from femsense.loop.search.search_state import Course, Progress, Refit, Search
+from femsense.loop.search.subsampling import spares
+from femsense.loop.search.swaps import BETTER, History, exchanged
+from femsense.loop.verdict.verdict import conclude
+from femsense.model.effects import EFFECTS, FORMS, Effect, find_effect, load_own_effect, try_own_effect
+from femsense.model.observation import Hypothesis, SceneJet
+from femsense.model.recording import Recording, state_key
+from femsense.model.robot import Robot
 
 MAX_EFFECTS = 3
 Ready = tuple[Data, Stage, History]
@@ -122,7 +115,8 @@ def improve(
         data, search = _searched(robot, names, ready, keeper, say)
         say("testing what is left")
         result = conclude(data, search, rng)
-    result = replace(result, data={**result.data, "seed": seed})
+        record = next_experiment(data, search.final, search.noise, result.confounded, result.not_testable)
+    result = replace(result, next_experiment=record, data={**result.data, "seed": seed})
     if _tells_apart(data):
         return result
     only = "record another state (other inputs, load or direction of gravity): these data repeat too few states, which cannot tell effects apart"
@@ -161,7 +155,7 @@ def _calibrated(data: Data, say: Progress) -> Ready:
     """Return the data without strays, the declared model calibrated, and the model with all that calibration may move; before that the same on the
     declared mesh, where it is another one."""
     placed = _placed(data, data.robot, START)
-    while (fewer := without_strays(data, placed)) is not data:
+    while (fewer := without_strays(data, [jet.residual for jet in placed.fit.jets], placed.held_residuals)) is not data:
         data, placed = fewer, _placed(fewer, data.robot, START)
     say("fitting what calibration may move")
     base = _calibrated_on(data, data.robot, placed)
@@ -391,9 +385,17 @@ def _again(
 
     def fitted(steps: int) -> Stage:
         return make_stage(
-            data, fit.hypothesis, fit.prior, noise, fit.coordinates, own=own, max_iterations=steps, known=known, near=near,
+            data,
+            fit.hypothesis,
+            fit.prior,
+            noise,
+            fit.coordinates,
+            own=own,
+            max_iterations=steps,
+            known=known,
+            near=near,
             spare=spare,
-        )  # fmt: skip
+        )
 
     return _as_far_as_held_out_states_rest(fitted, STEPS)
 
@@ -413,9 +415,11 @@ def _require_one_that_acts(names: Sequence[str], own: Sequence[Effect], robot: R
     drives = sorted({r.actuation for r in recordings})
     if asked and not any(effect.discrete or effect.parameters(robot, control) for effect in asked for control in drives):
         raise InputError(
-            "none of these effects can act here", where="effects", found=", ".join(names),
+            "none of these effects can act here",
+            where="effects",
+            found=", ".join(names),
             expected=f"effects of a robot that is driven by {' or '.join(drives)} (docs/effects/)",
-        )  # fmt: skip
+        )
 
 
 def _tells_apart(data: Data) -> bool:
@@ -423,6 +427,3 @@ def _tells_apart(data: Data) -> bool:
     fitted = {state_key(t.scene.recording, int(k)) for t in data.train for k in t.scene.frames}
     fresh = any(state_key(t.scene.recording, int(k)) not in fitted for t in data.held for k in t.scene.frames)
     return fresh or len(fitted) >= STATES
-
-
-__all__ = ["improve"]

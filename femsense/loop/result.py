@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from femsense.model import Robot
+from femsense.model.robot import Robot
 
 FORMAT = "femsense-loop-1"
 
@@ -42,7 +42,7 @@ class LoopResult:
     """Held-out residuals before and after, for figures: {frame, marker, before_m, after_m, position_m}."""
 
     evidence: dict[str, Any] = field(default_factory=dict)
-    """What the report draws and tabulates besides; see `femsense.loop.evidence`."""
+    """What the report draws and tabulates besides; see `femsense.loop.verdict.report_data`."""
 
     def document(self) -> dict[str, Any]:
         """Return the content of loop.json."""

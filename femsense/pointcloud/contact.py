@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from femsense.arrays import FloatArray, IntArray, as_points, freeze
-from femsense.errors import InputError
+from femsense.core.arrays import FloatArray, IntArray, as_points, freeze
+from femsense.core.errors import InputError
 from femsense.pointcloud.grid import build_grid, count_within, positive
 from femsense.pointcloud.objects import euclidean_clusters
 

@@ -8,8 +8,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from femsense.arrays import FloatArray, IntArray
-from femsense.errors import InputError
+from femsense.core.arrays import FloatArray, IntArray
+from femsense.core.errors import InputError
 from femsense.pointcloud.cloud import PointCloud
 from femsense.pointcloud.grid import build_grid, cell_keys, count_neighbors, positive
 

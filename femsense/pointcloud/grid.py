@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from femsense.arrays import FloatArray, IntArray
-from femsense.errors import InputError
+from femsense.core.arrays import FloatArray, IntArray
+from femsense.core.errors import InputError
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from femsense.arrays import BoolArray, FloatArray, IntArray, as_points, freeze
-from femsense.errors import InputError
+from femsense.core.arrays import BoolArray, FloatArray, IntArray, as_points, freeze
+from femsense.core.errors import InputError
 from femsense.pointcloud.grid import Grid, build_grid, key_of, positive, runs_around
 from femsense.pointcloud.segmentation import surface_pair
 

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from femsense.arrays import FloatArray, IntArray, as_points
+from femsense.core.arrays import FloatArray, IntArray, as_points
 from femsense.pointcloud.grid import build_grid, positive, runs_around, squared_distance
 
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from femsense.arrays import BoolArray, FloatArray, IntArray, as_points, freeze
-from femsense.errors import DataError
+from femsense.core.arrays import BoolArray, FloatArray, IntArray, as_points, freeze
+from femsense.core.errors import DataError
 from femsense.pointcloud.cloud import PointCloud
 from femsense.pointcloud.grid import adjacent_labels, build_grid, by_size, connected_labels, positive
 from femsense.pointcloud.normals import estimate_normals

@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from femsense.arrays import BoolArray, FloatArray, IntArray, as_points
-from femsense.errors import InputError
+from femsense.core.arrays import BoolArray, FloatArray, IntArray, as_points
+from femsense.core.errors import InputError
 from femsense.pointcloud.cloud import PointCloud
 from femsense.pointcloud.grid import (
     adjacent_labels,

@@ -25,7 +25,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from femsense.arrays import FloatArray, IntArray, as_points
+from femsense.core.arrays import FloatArray, IntArray, as_points
 from femsense.pointcloud.grid import build_grid, key_of, positive, runs_around
 from femsense.pointcloud.segmentation import surface_pair
 
@@ -75,8 +75,19 @@ class Sheets:
             distances [m], shape (k,), NaN where the surface has nothing of that side; outward unit normals, shape (k, 3).
         """
         distances, normals = np.full(len(points), np.nan), np.zeros((len(points), 3))
-        _blend(np.array(points), np.array(sheet), np.array(sides), self.centres, self.axes, self.heights, self.weights, self.starts,
-               self.radius, distances, normals)  # fmt: skip
+        _blend(
+            np.array(points),
+            np.array(sheet),
+            np.array(sides),
+            self.centres,
+            self.axes,
+            self.heights,
+            self.weights,
+            self.starts,
+            self.radius,
+            distances,
+            normals,
+        )
         return distances, normals
 
 
@@ -139,9 +150,18 @@ class Crossings:
 
 @njit(cache=True)
 def _blend(
-    points: FloatArray, sheet: IntArray, sides: FloatArray, centres: FloatArray, axes: FloatArray, heights: FloatArray, weights: FloatArray,
-    starts: IntArray, radius: float, distances: FloatArray, normals: FloatArray,
-) -> None:  # fmt: skip
+    points: FloatArray,
+    sheet: IntArray,
+    sides: FloatArray,
+    centres: FloatArray,
+    axes: FloatArray,
+    heights: FloatArray,
+    weights: FloatArray,
+    starts: IntArray,
+    radius: float,
+    distances: FloatArray,
+    normals: FloatArray,
+) -> None:
     """Write distances and normals of points."""
     scale, least = 0.5 / (ACROSS * radius) ** 2, np.exp(-FARTHEST)
     local, away = np.zeros(3), np.zeros(starts[-1])
@@ -198,9 +218,15 @@ def _outside(local: FloatArray, c: FloatArray, radius: float) -> tuple[float, fl
 
 @njit(cache=True)
 def _fit_all(
-    points: FloatArray, keys: IntArray, origin: FloatArray, dims: IntArray, cell: float, places: FloatArray, directions: FloatArray,
+    points: FloatArray,
+    keys: IntArray,
+    origin: FloatArray,
+    dims: IntArray,
+    cell: float,
+    places: FloatArray,
+    directions: FloatArray,
     radius: float,
-) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+) -> tuple[FloatArray, FloatArray]:
     """Return per centre: six coefficients and the sum of weights, 0 where there is no field; and its axes."""
     numbers, axes = np.zeros((len(places), 7)), np.zeros((len(places), 3, 3))
     starts, ends = np.zeros(9, dtype=np.int64), np.zeros(9, dtype=np.int64)
@@ -258,6 +284,3 @@ def _height_field(local: FloatArray, radius: float, out: FloatArray) -> None:
     out[1:3] /= radius
     out[3:6] /= radius**2
     out[6] = near.sum()
-
-
-__all__ = ["Crossings", "Sheets", "fit_sheet", "joined"]

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from femsense.arrays import BoolArray, FloatArray, freeze
-from femsense.errors import InputError
+from femsense.core.arrays import BoolArray, FloatArray, freeze
+from femsense.core.errors import InputError
 from femsense.qp.problem import FrictionCone, Problem, build_force_problem, prior_precision
 from femsense.qp.solve import Solution, solve
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from femsense.arrays import FloatArray, freeze
-from femsense.errors import InputError
+from femsense.core.arrays import FloatArray, freeze
+from femsense.core.errors import InputError
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -13,8 +13,8 @@ from enum import StrEnum
 
 import numpy as np
 
-from femsense.arrays import FloatArray, freeze
-from femsense.errors import InputError
+from femsense.core.arrays import FloatArray, freeze
+from femsense.core.errors import InputError
 from femsense.qp.problem import Multipliers, Problem, Residuals, kkt_residuals
 
 SOLVERS = ("daqp", "quadprog", "osqp")

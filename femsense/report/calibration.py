@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from femsense.calib.calibration import Calibration
+from femsense.calib.files import read_calibration
 from femsense.report import words
 from femsense.report.drawing import AFTER, as_image, draw_bars, name_axes, new_axes, whole_numbers
 from femsense.report.page import Chapter, Html, panels, section, table, tiles, together
-from femsense.results import read_calibration
 
 MARKERS = 40
 
@@ -47,7 +47,14 @@ def _pose(c: Calibration) -> Html | None:
         camera = name or ("camera" if len(c.poses) == 1 else f"camera {i + 1}")
         spread = _spread(c) if i == 0 else ([None] * 3, [None] * 3)
         turn = _rotation_vector(T)
-        rows.append([camera, words.parameter(T[:3, 3].tolist(), spread[0], "m"), words.parameter(turn, spread[1], "rad"), words.parameter(T[:3, 2].tolist(), None, "1")])  # fmt: skip
+        rows.append(
+            [
+                camera,
+                words.parameter(T[:3, 3].tolist(), spread[0], "m"),
+                words.parameter(turn, spread[1], "rad"),
+                words.parameter(T[:3, 2].tolist(), None, "1"),
+            ]
+        )
     headers = ("Camera", "Position x, y, z", "Rotation vector", "Looks along")
     return table(headers, rows, caption="In the robot frame. The deviations of the rotation are about the middle of the markers.")
 
@@ -70,10 +77,12 @@ def _inputs(c: Calibration) -> Html | None:
     names = list(dict.fromkeys([*c.cable_tension_n, *c.cable_displacement_m]))
     rows = [
         [
-            name, _input(c.cable_tension_n, c.tension_std_n, name, "N"), _input(c.cable_displacement_m, c.displacement_std_m, name, "m")
+            name,
+            _input(c.cable_tension_n, c.tension_std_n, name, "N"),
+            _input(c.cable_displacement_m, c.displacement_std_m, name, "m"),
         ]
         for name in names
-    ]  # fmt: skip
+    ]
     return table(("Cable", "Tension", "Shortening"), rows, caption="Of each cable at the start of the recording.", numeric=(1, 2))
 
 

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
+from femsense.io.tables import validated
 from femsense.report import words
 from femsense.report.documents import Demo, DemoRun, KnownLoad, RunFacts, read_document, read_json
 from femsense.report.page import Chapter, Html, image, section, table, together
-from femsense.results import RUN_FORMAT
-from femsense.tables import validated
+from femsense.sensing.run_files import RUN_FORMAT
 
 PICTURE = 1_500_000
 """Pictures up to this size [bytes] go into the page."""
@@ -79,8 +79,16 @@ def _runs(root: Path, runs: Sequence[Path]) -> Html | None:
     for file in runs:
         facts = read_document(file, RunFacts, RUN_FORMAT)
         name = file.parent.relative_to(root).as_posix()
-        rows.append([name if name != "." else "this folder", facts.robot, f"{facts.frames_ok} of {facts.frames}", str(facts.contacts), load_error(facts.known_loads),
-                     words.joined(words.number(facts.timing.ms_per_frame_median), "ms")])  # fmt: skip
+        rows.append(
+            [
+                name if name != "." else "this folder",
+                facts.robot,
+                f"{facts.frames_ok} of {facts.frames}",
+                str(facts.contacts),
+                load_error(facts.known_loads),
+                words.joined(words.number(facts.timing.ms_per_frame_median), "ms"),
+            ]
+        )
     headers = ("Run", "Robot", "Frames", "Contacts", "Error at known loads", "Time a frame")
     return table(
         headers,

@@ -9,8 +9,9 @@ from typing import Annotated, Any, Self, TypeVar
 
 from pydantic import ConfigDict, Field, model_validator
 
-from femsense.errors import InputError
-from femsense.tables import Schema, read_text, short, validated
+from femsense.core.errors import InputError
+from femsense.core.text import short
+from femsense.io.tables import Schema, read_text, validated
 
 Number = float | None
 Pair = Annotated[list[str], Field(min_length=2, max_length=2)]

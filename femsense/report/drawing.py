@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from femsense.arrays import FloatArray, IntArray
+from femsense.core.arrays import FloatArray, IntArray
 from femsense.fem.mesh import TetMesh, surface_triangles
 from femsense.report.page import Html, image
 
@@ -109,9 +109,17 @@ def new_panels(rows: int, columns: int, *, width: float, height: float) -> tuple
 def arrow_options(width: float = 0.018) -> dict[str, Any]:
     """Return how arrows in units of the axes are drawn, their shafts so wide [inch]."""
     return {
-        "angles": "xy", "scale_units": "xy", "scale": 1.0, "units": "inches", "width": width, "headwidth": 3.6, "headlength": 4.2, "headaxislength": 3.8,
-        "minlength": 0.2, "zorder": 5,
-    }  # fmt: skip
+        "angles": "xy",
+        "scale_units": "xy",
+        "scale": 1.0,
+        "units": "inches",
+        "width": width,
+        "headwidth": 3.6,
+        "headlength": 4.2,
+        "headaxislength": 3.8,
+        "minlength": 0.2,
+        "zorder": 5,
+    }
 
 
 def name_axes(axes: Any, x: str, y: str) -> None:
@@ -126,9 +134,18 @@ def add_legend(axes: Any, **options: Any) -> None:
     columns = options.pop("columns", min(len(handles), 3))
     if handles:
         axes.legend(
-            loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns, frameon=False, fontsize=SIZE - 0.5,
-            labelcolor=INK, borderaxespad=0.2, handlelength=1.4, columnspacing=1.3, handletextpad=0.5, **options,
-        )  # fmt: skip
+            loc="lower left",
+            bbox_to_anchor=(0.0, 1.0),
+            ncols=columns,
+            frameon=False,
+            fontsize=SIZE - 0.5,
+            labelcolor=INK,
+            borderaxespad=0.2,
+            handlelength=1.4,
+            columnspacing=1.3,
+            handletextpad=0.5,
+            **options,
+        )
 
 
 def whole_numbers(axes: Any) -> None:
@@ -174,8 +191,15 @@ def body_height(low: FloatArray, high: FloatArray, *, width: float = WIDTH, most
 
 
 def frame_body(
-    axes: Any, view: View, low: FloatArray, high: FloatArray, *, key: Key | None = None, cameras: Sequence[FloatArray] = (), corner: bool = True
-) -> None:  # fmt: skip
+    axes: Any,
+    view: View,
+    low: FloatArray,
+    high: FloatArray,
+    *,
+    key: Key | None = None,
+    cameras: Sequence[FloatArray] = (),
+    corner: bool = True,
+) -> None:
     """Show a rectangle [mm] with equal scales, without axes. Below it stand, each in a line of its own, a scale bar, the key, and which way the
     cameras look, or else (where `corner`) the axes of the robot frame."""
     margin = 0.04 * float((high - low).max())
@@ -209,7 +233,9 @@ def _draw_key(axes: Any, key: Key, x: float, down: float) -> None:
     """Draw a bar or an arrow of the length of a key from x [mm], with its text on the right."""
     line = _below(axes, 0.0, down)
     if key.width is None:
-        axes.plot([x, x + key.length_mm], [0.0, 0.0], color=key.color, linewidth=2, solid_capstyle="butt", transform=line, clip_on=False)  # fmt: skip
+        axes.plot(
+            [x, x + key.length_mm], [0.0, 0.0], color=key.color, linewidth=2, solid_capstyle="butt", transform=line, clip_on=False
+        )
     else:
         axes.quiver(
             [x], [0.0], [key.length_mm], [0.0], color=key.color, transform=line, clip_on=False, **arrow_options(key.width)

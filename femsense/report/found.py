@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from femsense.errors import InputError
-from femsense.files import PART_PREFIX
-from femsense.results import CALIBRATION_FORMAT
+from femsense.calib.files import CALIBRATION_FORMAT
+from femsense.core.errors import InputError
+from femsense.io.files import PART_PREFIX
 
 MARKERS = {"loop.json": "loop", "run.json": "run", "calibration.json": "calibration"}
 ORDER = ("loop", "run", "calibration")
@@ -36,12 +36,20 @@ def find_results(folder: str | Path) -> tuple[Found, ...]:
     root = Path(folder).expanduser()
     if not root.is_dir():
         hint = f"femsense report {root.parent}" if root.is_file() else None
-        raise InputError("not a folder", where=root, found="a file" if root.is_file() else "nothing", expected="a folder of results", hint=hint)  # fmt: skip
+        raise InputError(
+            "not a folder", where=root, found="a file" if root.is_file() else "nothing", expected="a folder of results", hint=hint
+        )
     inner = sorted(part for part in root.iterdir() if part.is_dir() and not part.name.startswith((".", PART_PREFIX)))
     groups = [_in_folder(root), *sorted(map(_in_folder, inner), key=lambda group: not any(item.kind == "loop" for item in group))]
     found = tuple(item for group in groups for item in group)
     if not found:
-        raise InputError("nothing to report on", where=root, found=_what_is(root), expected="loop.json, run.json or calibration.json, there or in a subfolder", hint="femsense estimate … -o DIR, femsense improve … -o DIR")  # fmt: skip
+        raise InputError(
+            "nothing to report on",
+            where=root,
+            found=_what_is(root),
+            expected="loop.json, run.json or calibration.json, there or in a subfolder",
+            hint="femsense estimate … -o DIR, femsense improve … -o DIR",
+        )
     return found
 
 

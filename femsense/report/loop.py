@@ -9,8 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from femsense.arrays import FloatArray
-from femsense.model import Robot
+from femsense.core.arrays import FloatArray
+from femsense.io.robot_toml import load_robot
+from femsense.loop.files import LOOP_FORMAT
+from femsense.model.robot import Robot
 from femsense.report import words
 from femsense.report.documents import Evidence, Frames, Left, Loop, Residuals, Rivals, Structure, read_document
 from femsense.report.drawing import (
@@ -50,8 +52,6 @@ from femsense.report.loop_tables import (
     tests_table,
 )
 from femsense.report.page import Chapter, Html, bullets, code, element, panels, paragraph, section, table, tiles, together
-from femsense.results import LOOP_FORMAT
-from femsense.robot import load_robot
 
 VERDICTS = {
     "effects": "The data name what the model lacks.",
@@ -92,17 +92,30 @@ def loop_chapter(file: Path, title: str) -> Chapter:
         _summary(loop),
         None if loop.evidence or not _is_old(loop) else paragraph(OLDER, class_="next"),
         None if has_markers(loop) else paragraph(CLOUDS, class_="soft"),
-        section("1. Residual on the robot", _mean_residual(residuals, robot, rest, cameras, _points(loop)), residual_in_frames(evidence.pictures, rest)),
-        section("2. What the residual goes with", residual_against(evidence.frames, evidence.score, evidence.tip), covariate_table(evidence.score)),
+        section(
+            "1. Residual on the robot",
+            _mean_residual(residuals, robot, rest, cameras, _points(loop)),
+            residual_in_frames(evidence.pictures, rest),
+        ),
+        section(
+            "2. What the residual goes with",
+            residual_against(evidence.frames, evidence.score, evidence.tip),
+            covariate_table(evidence.score),
+        ),
         section("3. Error on held-out data", _held_out(residuals, evidence.frames, loop.noise_m)),
-        section("4. Effects", effects_table(loop.effects), ranking_table(loop.candidates, evidence.ranking, loop.effects), refits_table(loop.candidates)),
+        section(
+            "4. Effects",
+            effects_table(loop.effects),
+            ranking_table(loop.candidates, evidence.ranking, loop.effects),
+            refits_table(loop.candidates),
+        ),
         section("5. What these data cannot say", _open_questions(loop, evidence)),
         section("6. What calibration had taken up", calibration_table(evidence.calibration)),
         section("7. Tests, and what is left", tests_table(evidence.tests), _left(loop, evidence, rest)),
         section("8. Smallest effects that would have been seen", power_table(loop, evidence)),
         section("9. Data", data_card(loop)),
         section("10. What it means for forces", forces_part(evidence.forces)),
-    )  # fmt: skip
+    )
     return Chapter(title, body, loop.sentence or VERDICTS.get(loop.verdict, ""), loop.inputs.robot.name or "")
 
 
@@ -235,9 +248,17 @@ def _reach(
 
 
 def _quiver(
-    surface: Surface, view: View, mean: tuple[FloatArray, FloatArray], single: tuple[FloatArray, FloatArray], factor: float, key: float,
-    reach: tuple[FloatArray, FloatArray], color: str, title: str, cameras: Sequence[FloatArray],
-) -> Any:  # fmt: skip
+    surface: Surface,
+    view: View,
+    mean: tuple[FloatArray, FloatArray],
+    single: tuple[FloatArray, FloatArray],
+    factor: float,
+    key: float,
+    reach: tuple[FloatArray, FloatArray],
+    color: str,
+    title: str,
+    cameras: Sequence[FloatArray],
+) -> Any:
     low, high = reach
     figure, axes = new_axes(height=body_height(low, high))
     draw_body(axes, surface, view)
@@ -366,13 +387,16 @@ def _open_questions(loop: Loop, evidence: Evidence) -> Html | None:
     ]
     experiment = loop.next_experiment
     advice = paragraph(element("strong", "Next experiment: "), experiment, class_="next") if experiment else None
-    return together(
-        section("Cannot be told apart", bullets(pairs), level=4),
-        paragraph("Nor could these, were one of them there: ", ", ".join(others), ".") if others else None,
-        section("Not testable with these data", bullets(hidden), level=4),
-        advice,
-        confounding_map(evidence.confounding),
-    ) or None  # fmt: skip
+    return (
+        together(
+            section("Cannot be told apart", bullets(pairs), level=4),
+            paragraph("Nor could these, were one of them there: ", ", ".join(others), ".") if others else None,
+            section("Not testable with these data", bullets(hidden), level=4),
+            advice,
+            confounding_map(evidence.confounding),
+        )
+        or None
+    )
 
 
 def _why_alike(rivals: Rivals) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from femsense.arrays import FloatArray
+from femsense.core.arrays import FloatArray
 from femsense.report import words
 from femsense.report.documents import Confounding, ForceField, Frames, Pictures, Score, Snapshot, Tip
 from femsense.report.drawing import (
@@ -159,22 +159,26 @@ def residual_against(frames: Frames, score: Score, tip: Tip) -> Html | None:
             ("loading", BEFORE, ~np.asarray(frames.unloading, bool)),
             ("unloading", SERIES[0], np.asarray(frames.unloading, bool)),
         ]
-        figures.append(as_image(
-            _scatter(x, y, z, by_way, score.covariate),
-            alt=f"Leading pattern of the residual against {score.covariate}{strength}, by direction.",
-            caption=f"The pattern holds {words.percent(score.share)} of the squared residual before, mean of each marker taken off; it goes best with: {score.covariate}{strength}.",
-        ))  # fmt: skip
+        figures.append(
+            as_image(
+                _scatter(x, y, z, by_way, score.covariate),
+                alt=f"Leading pattern of the residual against {score.covariate}{strength}, by direction.",
+                caption=f"The pattern holds {words.percent(score.share)} of the squared residual before, mean of each marker taken off; it goes best with: {score.covariate}{strength}.",
+            )
+        )
         labels = _sweep_labels(frames)
         names = list(dict.fromkeys(labels))
         chosen = names if len(names) <= SWEEPS else names[: SWEEPS - 1]
         groups = [(clipped(n, 12), SERIES[i], np.array([v == n for v in labels])) for i, n in enumerate(chosen)]
         if len(names) > len(chosen):
             groups.append((f"{len(names) - len(chosen)} others", PALE, np.array([v not in chosen for v in labels])))
-        figures.append(as_image(
-            _scatter(x, y, None, groups, score.covariate),
-            alt=f"Leading pattern of the residual against {score.covariate}, by sweep.",
-            caption=f"The same, by sweep ({words.counted(len(names), 'sweep')}).",
-        ))  # fmt: skip
+        figures.append(
+            as_image(
+                _scatter(x, y, None, groups, score.covariate),
+                alt=f"Leading pattern of the residual against {score.covariate}, by sweep.",
+                caption=f"The same, by sweep ({words.counted(len(names), 'sweep')}).",
+            )
+        )
     loop = _tip_loop(frames, tip)
     return panels(*figures, loop)
 
@@ -362,7 +366,4 @@ def confounding_map(confounding: Confounding) -> Html | None:
         alt=f"Map of {n} effects: how much of the trace of one another one imitates; the most {top[0]:.0%} of {top[1]} by {top[2]}.",
         caption="How much of the trace of the effect on the left the effect below imitates [%], with all that calibration can imitate taken off. Above 95 (bold) these data cannot tell the two apart.",
         wide=wide,
-    )  # fmt: skip
-
-
-__all__ = ["confounding_map", "force_field", "residual_against", "residual_in_frames", "sweep_dots"]
+    )

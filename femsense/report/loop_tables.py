@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from femsense.effects import EFFECTS
+from femsense.model.effects import EFFECTS
 from femsense.report import words
 from femsense.report.documents import (
     CalibrationShift,
@@ -103,16 +103,25 @@ def ranking_table(candidates: Sequence[Candidate], ranked: Mapping[str, Ranked],
     final = {effect.name: effect for effect in effects}
     rows = [
         [
-            effect_name(c.name), together(*_values(final.get(c.name), ranked.get(c.name, Ranked()))), words.statistic(c.dchi2), words.statistic(c.dbic),
-            _left_out(c), words.percent(c.retained_share), words.percent(ranked.get(c.name, Ranked()).first_share), _verdict(c),
+            effect_name(c.name),
+            together(*_values(final.get(c.name), ranked.get(c.name, Ranked()))),
+            words.statistic(c.dchi2),
+            words.statistic(c.dbic),
+            _left_out(c),
+            words.percent(c.retained_share),
+            words.percent(ranked.get(c.name, Ranked()).first_share),
+            _verdict(c),
         ]
         for c in candidates
-    ]  # fmt: skip
+    ]
     ranking = table(
-        ("Effect", "Value, plausible range", "Δχ²", "ΔBIC", "Left-out sweeps", "Retained", "First", "Verdict"), rows,
-        caption="Every effect that was tried, by what the first screening says of it.", numeric=(2, 3, 4, 5, 6),
-        strong=[i for i, c in enumerate(candidates) if c.verdict == "named"], dense=True,
-    )  # fmt: skip
+        ("Effect", "Value, plausible range", "Δχ²", "ΔBIC", "Left-out sweeps", "Retained", "First", "Verdict"),
+        rows,
+        caption="Every effect that was tried, by what the first screening says of it.",
+        numeric=(2, 3, 4, 5, 6),
+        strong=[i for i, c in enumerate(candidates) if c.verdict == "named"],
+        dense=True,
+    )
     text = paragraph(
         "Δχ² is what the effect explains of the residual beyond all that calibration can imitate; ΔBIC takes off a price for each parameter and each effect tried, "
         "and a named effect needs 10. Left-out sweeps: by how much twice the log-likelihood of sweeps that are not fitted rises, ± its standard error. “Retained” is the share of its trace "
@@ -140,7 +149,11 @@ def _values(effect: Effect | None, ranked: Ranked) -> list[Html]:
     """Return the values of an effect with their plausible range, a line each; a span where there are many."""
     if effect is not None and effect.parameters:
         ranges = {p.label.partition("[")[0]: p for p in ranked.parameters}
-        parts = [(key, words.parameter(v, s, p.unit), ranges.get(key)) for key, p in effect.parameters.items() for _, v, s in words.entries(p.value, p.std)]  # fmt: skip
+        parts = [
+            (key, words.parameter(v, s, p.unit), ranges.get(key))
+            for key, p in effect.parameters.items()
+            for _, v, s in words.entries(p.value, p.std)
+        ]
         return [_value_line(label, text, estimate) for label, text, estimate in parts[:LISTED]]
     shown = [p for p in ranked.parameters if words.known(p.value) or p.ends]
     if len(shown) > LISTED:
@@ -174,9 +187,11 @@ def refits_table(candidates: Sequence[Candidate]) -> Html | None:
         for r in c.refits
     ]
     return table(
-        ("Effect", "Δχ²", "ΔBIC", "Held-out error", "Outcome"), rows,
-        caption="The best of them, fitted together with calibration in full.", numeric=(1, 2, 3),
-    )  # fmt: skip
+        ("Effect", "Δχ²", "ΔBIC", "Held-out error", "Outcome"),
+        rows,
+        caption="The best of them, fitted together with calibration in full.",
+        numeric=(1, 2, 3),
+    )
 
 
 # What would have been seen
@@ -186,14 +201,20 @@ def power_table(loop: Loop, evidence: Evidence) -> Html | None:
     """Return the smallest change of every effect that was not found."""
     hidden = {u.name for u in loop.not_testable}
     rows = [
-        [effect_name(name), "not testable" if name in hidden else _sizes(entry, evidence.power.get(name, ()), evidence.ranking.get(name, Ranked()))]
+        [
+            effect_name(name),
+            "not testable"
+            if name in hidden
+            else _sizes(entry, evidence.power.get(name, ()), evidence.ranking.get(name, Ranked())),
+        ]
         for name, entry in loop.detectable.items()
         if entry.smallest or evidence.power.get(name)
-    ]  # fmt: skip
+    ]
     return table(
-        ("Effect", "Smallest change that would have been seen"), rows,
+        ("Effect", "Smallest change that would have been seen"),
+        rows,
         caption="For each effect that was not found: the change from what is declared at which the data would have named it (expected ΔBIC of 10).",
-    )  # fmt: skip
+    )
 
 
 def _sizes(entry: Detectable, own: Sequence[Size], ranked: Ranked) -> Html:
@@ -270,9 +291,11 @@ def covariate_table(score: Score) -> Html | None:
         for c in score.goes_with_before
     ]
     return table(
-        ("Goes with", "Rank correlation before", "p (Holm)", "after"), rows,
-        caption="The leading pattern of the residual and what it goes with (Spearman; neighbouring frames are not independent, so p is optimistic).", numeric=(1, 2, 3),
-    )  # fmt: skip
+        ("Goes with", "Rank correlation before", "p (Holm)", "after"),
+        rows,
+        caption="The leading pattern of the residual and what it goes with (Spearman; neighbouring frames are not independent, so p is optimistic).",
+        numeric=(1, 2, 3),
+    )
 
 
 def calibration_table(shift: CalibrationShift) -> Html | None:
@@ -295,9 +318,10 @@ def calibration_table(shift: CalibrationShift) -> Html | None:
             [element("span", code(term.label)), words.quantity(term.declared, term.unit), *_three(term.values, term.unit)]
         )
     return table(
-        ("Quantity", "Declared", "Calibrated (before)", "With all that calibration may move", "With the effects"), rows,
+        ("Quantity", "Declared", "Calibrated (before)", "With all that calibration may move", "With the effects"),
+        rows,
         caption="Camera: against where the calibration of the declared model put it (± one standard deviation). What moves back when effects are added is where they had been hiding. In the last two columns everything is free, so that values may differ from those that are handed back.",
-    )  # fmt: skip
+    )
 
 
 def _vector(value: Triple | None, std: Triple | None, unit: str) -> str:
@@ -369,9 +393,11 @@ def _loads(loads: Sequence[LoadRow]) -> Html | None:
         f"Median size of the error: {medians[0]} with the declared robot, calibrated; {medians[1]} with the improved one."
     )
     numbers = table(
-        ("Recording: frame" if several else "Frame", "Declared load", "Declared robot", "error", "Improved robot", "error"), rows,
-        caption="Forces at declared loads, ± one standard deviation from the noise of the markers, taken as independent.", numeric=(1, 2, 3, 4, 5),
-    )  # fmt: skip
+        ("Recording: frame" if several else "Frame", "Declared load", "Declared robot", "error", "Improved robot", "error"),
+        rows,
+        caption="Forces at declared loads, ± one standard deviation from the noise of the markers, taken as independent.",
+        numeric=(1, 2, 3, 4, 5),
+    )
     return together(text, numbers)
 
 
@@ -385,7 +411,11 @@ def _sensed(value: float | None, std: float | None, declared: float | None) -> l
 def _median_error(loads: Sequence[LoadRow], name: str) -> str:
     import statistics
 
-    gaps = [(abs(value - row.declared_n), abs(value - row.declared_n) / row.declared_n) for row in loads if words.known(value := getattr(row, name)) and words.known(row.declared_n) and row.declared_n]  # fmt: skip
+    gaps = [
+        (abs(value - row.declared_n), abs(value - row.declared_n) / row.declared_n)
+        for row in loads
+        if words.known(value := getattr(row, name)) and words.known(row.declared_n) and row.declared_n
+    ]
     if not gaps:
         return words.NOTHING
     size, share = (statistics.median(g[i] for g in gaps) for i in (0, 1))
@@ -413,9 +443,11 @@ def _softer(compliance: Compliance) -> Html | None:
         for frame in compliance.frames
     ]
     numbers = table(
-        ("Frame", "Force, improved over declared", "False force before", "after"), rows,
-        caption="False force: what would have been sensed at the free end, where nothing touches, from the residual alone.", numeric=(1, 2, 3),
-    )  # fmt: skip
+        ("Frame", "Force, improved over declared", "False force before", "after"),
+        rows,
+        caption="False force: what would have been sensed at the free end, where nothing touches, from the residual alone.",
+        numeric=(1, 2, 3),
+    )
     return together(text, numbers)
 
 

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from femsense.arrays import FloatArray, IntArray
+from femsense.core.arrays import FloatArray, IntArray
+from femsense.io.tables import read_csv
 from femsense.report import words
 from femsense.report.compare import load_error
 from femsense.report.documents import KnownLoad, RunFacts, read_document
@@ -36,8 +37,7 @@ from femsense.report.drawing import (
     whole_numbers,
 )
 from femsense.report.page import Chapter, Html, panels, paragraph, section, table, tiles, together
-from femsense.results import CONTACT_COLUMNS, FRAME_COLUMNS, RUN_FORMAT, read_states
-from femsense.tables import read_csv
+from femsense.sensing.run_files import CONTACT_COLUMNS, FRAME_COLUMNS, RUN_FORMAT, read_states
 
 ROWS = 150
 """So many contacts are listed one by one."""
@@ -117,9 +117,15 @@ def _contacts(file: Path) -> ContactTable:
     table_ = read_csv(file, required=CONTACT_COLUMNS)
     values = table_.numbers(("time_s", *CONTACT_COLUMNS[3:14]), empty_is_nan=True)
     return ContactTable(
-        table_.integers("frame"), table_.integers("contact"), values[:, 0], values[:, 1:4], values[:, 7:10], values[:, 10], values[:, 11],
+        table_.integers("frame"),
+        table_.integers("contact"),
+        values[:, 0],
+        values[:, 1:4],
+        values[:, 7:10],
+        values[:, 10],
+        values[:, 11],
         table_.text("source"),
-    )  # fmt: skip
+    )
 
 
 def _frames(file: Path) -> FrameTable:
@@ -130,9 +136,17 @@ def _frames(file: Path) -> FrameTable:
     tension = {c.removeprefix("tension_").removesuffix("_n"): values[:, 4 + j] for j, c in enumerate(cables)}
     pressure = {c.removeprefix("pressure_").removesuffix("_pa"): values[:, 4 + len(cables) + j] for j, c in enumerate(chambers)}
     return FrameTable(
-        table_.integers("frame"), values[:, 0], table_.text("status"), table_.integers("contacts"), table_.integers("matched"), values[:, 1],
-        values[:, 2], values[:, 3], tension, pressure,
-    )  # fmt: skip
+        table_.integers("frame"),
+        values[:, 0],
+        table_.text("status"),
+        table_.integers("contacts"),
+        table_.integers("matched"),
+        values[:, 1],
+        values[:, 2],
+        values[:, 3],
+        tension,
+        pressure,
+    )
 
 
 # On top
@@ -216,9 +230,16 @@ def _force_figure(contacts: ContactTable, frames: FrameTable | None, numbers: Se
             _draw_run(axes, contacts.time_s[run], factor * contacts.size_n[run], factor * contacts.std_n[run], color)
         many = len(rows) > MANY
         axes.plot(
-            contacts.time_s[rows], factor * contacts.size_n[rows], "o", color=color, markersize=2.0 if len(rows) > 150 else 3.8,
-            markeredgewidth=0, label=f"contact {number}", rasterized=many, zorder=4,
-        )  # fmt: skip
+            contacts.time_s[rows],
+            factor * contacts.size_n[rows],
+            "o",
+            color=color,
+            markersize=2.0 if len(rows) > 150 else 3.8,
+            markeredgewidth=0,
+            label=f"contact {number}",
+            rasterized=many,
+            zorder=4,
+        )
     size, std = factor * contacts.size_n, factor * np.nan_to_num(contacts.std_n)
     top = min(float(np.nanmax(size + 2 * std)), 2.5 * float(np.nanmax(size)))
     margin = 0.03 * (span[1] - span[0]) or 1.0
@@ -318,12 +339,16 @@ def _contact_rows(contacts: ContactTable | None) -> Html | None:
     factor, unit = words.force_unit(float(np.nanmax(contacts.size_n, initial=0.0)))
     rows = [
         [
-            str(contacts.frame[i]), words.number(float(contacts.time_s[i])), str(contacts.contact[i]),
+            str(contacts.frame[i]),
+            words.number(float(contacts.time_s[i])),
+            str(contacts.contact[i]),
             words.with_std(factor * float(contacts.size_n[i]), factor * float(contacts.std_n[i])),
-            _vector(factor * contacts.force_n[i]), _vector(1e3 * contacts.place_m[i], 1), contacts.source[i] or words.NOTHING,
+            _vector(factor * contacts.force_n[i]),
+            _vector(1e3 * contacts.place_m[i], 1),
+            contacts.source[i] or words.NOTHING,
         ]
         for i in range(min(len(contacts), ROWS))
-    ]  # fmt: skip
+    ]
     headers = ("Frame", "Time [s]", "Contact", f"Force [{unit}]", f"Components x, y, z [{unit}]", "Place x, y, z [mm]", "Source")
     caption = "Force on the body and its place on the deformed body, robot frame." + _cut(len(contacts), ROWS, "contacts.csv")
     return table(headers, rows, caption=caption, numeric=(1, 2, 3, 4, 5))
@@ -422,6 +447,10 @@ def _drive_panel(frames: FrameTable, drives: dict[str, FloatArray], label: str, 
 
 def _origin(facts: RunFacts) -> Html | None:
     recording = Path(facts.inputs.recording.path or "").name
-    rows = [["Robot", facts.robot], ["Recording", recording], ["Time in all", f"{words.number(facts.timing.seconds)} s" if words.known(facts.timing.seconds) else ""],
-            ["Versions", ", ".join(f"{name} {version}" for name, version in facts.versions.items())]]  # fmt: skip
+    rows = [
+        ["Robot", facts.robot],
+        ["Recording", recording],
+        ["Time in all", f"{words.number(facts.timing.seconds)} s" if words.known(facts.timing.seconds) else ""],
+        ["Versions", ", ".join(f"{name} {version}" for name, version in facts.versions.items())],
+    ]
     return table(("Item", "Value"), [row for row in rows if row[1]], caption="run.json beside this file has the hashes.")

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from femsense.errors import InputError
-from femsense.files import write_text
+from femsense.core.errors import InputError
+from femsense.io.files import write_text
 from femsense.report.calibration import calibration_chapter
 from femsense.report.compare import comparison_chapter
 from femsense.report.found import Found, find_results
@@ -38,7 +38,12 @@ def write_report(folder: str | Path, path: str | Path | None = None) -> Path:
     root = Path(folder).expanduser()
     target = root / "report.html" if path is None else Path(path).expanduser()
     if target.is_dir():
-        raise InputError("a folder stands where the file should be written", where=target, expected="the name of a file", hint=str(target / "report.html"))  # fmt: skip
+        raise InputError(
+            "a folder stands where the file should be written",
+            where=target,
+            expected="the name of a file",
+            hint=str(target / "report.html"),
+        )
     write_text(target, report_html(root))
     return target
 

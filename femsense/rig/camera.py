@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from femsense.arrays import BoolArray, FloatArray, IntArray, freeze
-from femsense.errors import InputError
-from femsense.frames import Camera
-from femsense.model import Observation
+from femsense.core.arrays import BoolArray, FloatArray, IntArray, freeze
+from femsense.core.errors import InputError
+from femsense.core.pose import check_pose, invert_pose, make_pose, rotation_from_vector, transform_points
+from femsense.model.recording import Camera
+from femsense.model.robot import Observation
 from femsense.pointcloud.cloud import PointCloud
-from femsense.pose import check_pose, invert_pose, make_pose, rotation_from_vector, transform_points
 from femsense.rig.script import NoiseTable, ViewTable
 
 AMBIENT = 0.35
@@ -103,9 +103,14 @@ def pixel_rays(camera: Camera) -> FloatArray:
 
 
 def render(
-    camera: Camera, T_robot_camera: FloatArray, shapes: Sequence[Shape], *,
-    noise: NoiseTable | None = None, observation: Observation = TRUE_DEPTH, rng: np.random.Generator | None = None,
-) -> DepthImage:  # fmt: skip
+    camera: Camera,
+    T_robot_camera: FloatArray,
+    shapes: Sequence[Shape],
+    *,
+    noise: NoiseTable | None = None,
+    observation: Observation = TRUE_DEPTH,
+    rng: np.random.Generator | None = None,
+) -> DepthImage:
     """Return what a camera sees.
 
     Arguments:
@@ -159,7 +164,12 @@ def write_images(depth_file: Path, color_file: Path, image: DepthImage, camera: 
 
     units = np.rint(image.depth / camera.depth_unit)
     if units.max(initial=0.0) > np.iinfo(np.uint16).max:
-        raise InputError("depths beyond 16 bits", where="camera.depth_unit_m", found=f"{image.depth.max():.3g} m in units of {camera.depth_unit:g} m", expected=f"depth_unit_m ≥ {image.depth.max() / 65535:.2g}")  # fmt: skip
+        raise InputError(
+            "depths beyond 16 bits",
+            where="camera.depth_unit_m",
+            found=f"{image.depth.max():.3g} m in units of {camera.depth_unit:g} m",
+            expected=f"depth_unit_m ≥ {image.depth.max() / 65535:.2g}",
+        )
     for file, pixels in ((depth_file, units.astype(np.uint16)), (color_file, image.color[..., ::-1])):
         file.write_bytes(cv2.imencode(".png", pixels)[1].tobytes())
 

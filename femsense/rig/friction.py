@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from femsense.arrays import FloatArray
+from femsense.core.arrays import FloatArray
 
 
 @dataclass(frozen=True, eq=False, slots=True)

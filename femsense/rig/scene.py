@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from femsense.arrays import FloatArray
+from femsense.core.arrays import FloatArray
 from femsense.fem.mesh import surface_triangles
-from femsense.model import Robot
+from femsense.model.robot import Robot
 from femsense.rig.camera import Shape
 from femsense.rig.script import Plan, SceneTable
 from femsense.rig.truth import TrueContact, TrueFrame

@@ -10,11 +10,12 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from femsense.arrays import BoolArray, FloatArray, IntArray, freeze
-from femsense.errors import InputError
-from femsense.model import Robot
-from femsense.robot import Matrix, Share, Vector
-from femsense.tables import Schema, key_path, near, read_toml, validated
+from femsense.core.arrays import BoolArray, FloatArray, IntArray, freeze
+from femsense.core.errors import InputError
+from femsense.core.text import key_path, near
+from femsense.io.robot_toml import Matrix, Share, Vector
+from femsense.io.tables import Schema, read_toml, validated
+from femsense.model.robot import Robot
 
 FORMAT = "femsense-script-1"
 COLOR = "three numbers from 0 to 1: [red, green, blue]"
@@ -289,7 +290,12 @@ def plan_script(script: ScriptTable, robot: Robot, where: Path = Path("script"))
         control=script.actuation,
         time_s=freeze(np.cumsum(steps) - steps[0]),
         sweep=tuple(s.label for s, n in zip(script.sweeps, counts) for _ in range(n)),
-        free=freeze(np.concatenate([np.full(n, s.label not in touched if s.free is None else s.free) for s, n in zip(script.sweeps, counts)]), bool),
+        free=freeze(
+            np.concatenate(
+                [np.full(n, s.label not in touched if s.free is None else s.free) for s, n in zip(script.sweeps, counts)]
+            ),
+            bool,
+        ),
         commanded=freeze(commanded),
         initial=freeze(initial),
         pressures=freeze(pressures),
@@ -298,7 +304,7 @@ def plan_script(script: ScriptTable, robot: Robot, where: Path = Path("script"))
         load_points=freeze(points),
         load_forces=freeze(forces),
         contacts=contacts,
-    )  # fmt: skip
+    )
 
 
 def _check_sweep(sweep: SweepTable, i: int, where: Path) -> None:
@@ -361,7 +367,9 @@ def _sweep_inputs(sweep: SweepTable, values: dict[str, float | list[float]], nam
     return table
 
 
-def _planned_contact(script: ScriptTable, i: int, first: dict[str, int], count: dict[str, int], total: int, where: Path) -> PlannedContact:  # fmt: skip
+def _planned_contact(
+    script: ScriptTable, i: int, first: dict[str, int], count: dict[str, int], total: int, where: Path
+) -> PlannedContact:
     table = script.contacts[i]
     n, start = count[table.sweep], first[table.sweep]
     values = np.full(n, table.force_n) if isinstance(table.force_n, float | int) else np.array(table.force_n, dtype=float)
@@ -378,7 +386,9 @@ def _planned_contact(script: ScriptTable, i: int, first: dict[str, int], count: 
     return PlannedContact(table, freeze(force))
 
 
-def _planned_loads(script: ScriptTable, first: dict[str, int], count: dict[str, int], where: Path) -> tuple[IntArray, FloatArray, FloatArray]:  # fmt: skip
+def _planned_loads(
+    script: ScriptTable, first: dict[str, int], count: dict[str, int], where: Path
+) -> tuple[IntArray, FloatArray, FloatArray]:
     frames, points, forces = [], [], []
     for i, table in enumerate(script.loads):
         n = count[table.sweep]

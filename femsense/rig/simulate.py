@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from femsense.arrays import BoolArray, FloatArray, freeze
-from femsense.errors import InputError
+from femsense.core.arrays import BoolArray, FloatArray, freeze
+from femsense.core.errors import InputError
+from femsense.core.pose import transform_points
 from femsense.fem.mesh import embed_points, to_linear
-from femsense.files import write_csv, write_json
-from femsense.frames import Camera, Recording, RestMarkers, make_recording
-from femsense.model import Robot
-from femsense.pose import transform_points
-from femsense.recording import save_recording
+from femsense.io.files import write_csv, write_json
+from femsense.io.recording_folder import save_recording
+from femsense.model.recording import Camera, Recording, RestMarkers, make_recording
+from femsense.model.robot import Robot
 from femsense.rig.camera import (
     DepthImage,
     Shape,
@@ -94,7 +94,12 @@ def run_experiment(robot: Robot, script: ScriptTable, where: Path = Path("script
         shapes = frame_shapes(real, frame, plan, script.scene)
         visible[k] = chosen & (visible_points(camera, T_robot_camera, shapes, positions[k]) if script.markers.occlusion else True)
     if not visible.any() and chosen.any() and script.clouds.kind == "none":
-        raise InputError("the camera sees no marker in any frame", where=f"{where}: camera", expected="markers, or [clouds]", hint="another eye_m; scene.floor_z_m below the robot; or markers.occlusion = false")  # fmt: skip
+        raise InputError(
+            "the camera sees no marker in any frame",
+            where=f"{where}: camera",
+            expected="markers, or [clouds]",
+            hint="another eye_m; scene.floor_z_m below the robot; or markers.occlusion = false",
+        )
     return Experiment(script, plan, robot, real, camera, T_robot_camera, frames, freeze(positions), freeze(visible, bool))
 
 
@@ -232,8 +237,14 @@ def _write_images(experiment: Experiment, shapes: list[Shape], k: int, folder: P
 
 def _image(experiment: Experiment, shapes: list[Shape], k: int) -> DepthImage:
     script = experiment.script
-    return render(experiment.camera, experiment.T_robot_camera, shapes, noise=script.camera.noise,
-                  observation=experiment.robot.observation, rng=_rng(script, "clouds", k))  # fmt: skip
+    return render(
+        experiment.camera,
+        experiment.T_robot_camera,
+        shapes,
+        noise=script.camera.noise,
+        observation=experiment.robot.observation,
+        rng=_rng(script, "clouds", k),
+    )
 
 
 # The truth

@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from femsense.arrays import FloatArray, IntArray, freeze
-from femsense.effects import apply_effects
-from femsense.effects.shape import body_on_mesh
-from femsense.errors import DataError, InputError
+from femsense.core.arrays import FloatArray, IntArray, freeze
+from femsense.core.errors import DataError, InputError
 from femsense.fem.body import BodyModel
 from femsense.fem.cables import bend_angles
 from femsense.fem.equilibrium import Equilibrium, solve_equilibrium
 from femsense.fem.mesh import TetMesh, embed_points, refined, surface_triangles, to_linear, to_quadratic, triangle_normals
-from femsense.model import Robot
+from femsense.model.effects import apply_effects
+from femsense.model.remeshing import body_on_mesh
+from femsense.model.robot import Robot
 from femsense.rig.friction import Grip, new_grip, pull
 from femsense.rig.script import Plan, TruthTable
 
@@ -301,7 +301,16 @@ class _Walker:
         shares = tuple(t / motor[n] if motor[n] > 0 else np.ones_like(t) for n, t in zip(names, along))
         tension, held = (values, None) if self.control == "tension" else (None, values)
         pressure = dict(zip(body.chamber_names, load.pressures.tolist()))
-        state = solve_equilibrium(body, tension=tension, shortening=held, pressure=pressure, nodal_forces=forces, start=start, along=shares, reuse_factor=True)  # fmt: skip
+        state = solve_equilibrium(
+            body,
+            tension=tension,
+            shortening=held,
+            pressure=pressure,
+            nodal_forces=forces,
+            start=start,
+            along=shares,
+            reuse_factor=True,
+        )
         if not state.converged:
             raise DataError(f"the truth has no equilibrium in frame {frame}: {state.status}: {state.advice}")
         return state

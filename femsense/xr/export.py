@@ -8,8 +8,8 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from femsense.arrays import FloatArray, IntArray
-from femsense.model import Robot
+from femsense.core.arrays import FloatArray, IntArray
+from femsense.model.robot import Robot
 from femsense.xr.gltf import ExportReport, export_states
 from femsense.xr.view import export_run
 

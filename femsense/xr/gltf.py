@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from femsense.arrays import FloatArray, IntArray, as_indices, as_points
-from femsense.errors import InputError
+from femsense.core.arrays import FloatArray, IntArray, as_indices, as_points
+from femsense.core.errors import InputError
 from femsense.fem.mesh import TetMesh, surface_triangles, vertex_normals
 from femsense.xr.skinning import Skin, as_states, fit_poses, fit_skin, rms, skin_vertices
 
@@ -172,15 +172,24 @@ def glb_bytes(
         "scenes": [{"name": name, "nodes": [0, 1]}],
         "nodes": [
             {"name": name, "mesh": 0, "skin": 0},
-            {"name": "robot_frame", "rotation": [-float(np.sqrt(0.5)), 0.0, 0.0, float(np.sqrt(0.5))], "children": list(range(2, 2 + bones))},
+            {
+                "name": "robot_frame",
+                "rotation": [-float(np.sqrt(0.5)), 0.0, 0.0, float(np.sqrt(0.5))],
+                "children": list(range(2, 2 + bones)),
+            },
             *joints,
         ],
         "meshes": [{"name": name, "primitives": [primitive]}],
-        "materials": [{"name": "body", "pbrMetallicRoughness": {"baseColorFactor": base_color, "metallicFactor": 0.0, "roughnessFactor": 0.55}}],
+        "materials": [
+            {
+                "name": "body",
+                "pbrMetallicRoughness": {"baseColorFactor": base_color, "metallicFactor": 0.0, "roughnessFactor": 0.55},
+            }
+        ],
         "skins": [{"name": name, "skeleton": 1, "joints": list(range(2, 2 + bones)), "inverseBindMatrices": inverse_bind}],
         "animations": [{"name": "run", "samplers": samplers, "channels": channels}],
         **buffer.description(),
-    }  # fmt: skip
+    }
     return _container(gltf, bytes(buffer.content))
 
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from femsense.arrays import FloatArray, IntArray, as_points, freeze
-from femsense.errors import InputError
+from femsense.core.arrays import FloatArray, IntArray, as_points, freeze
+from femsense.core.errors import InputError
 
 MAX_BONES = 255
 """The joint numbers of a file are bytes."""

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from femsense.arrays import FloatArray, IntArray, as_points, freeze
-from femsense.errors import InputError
+from femsense.core.arrays import FloatArray, IntArray, as_points, freeze
+from femsense.core.errors import InputError
 from femsense.xr.skeleton import MAX_BONES, Skeleton, farthest_points, skeleton_at
-from femsense.xr.sweeps import sweep_poses, weights_of_vertices
+from femsense.xr.skinning_kernels import sweep_poses, weights_of_vertices
 
 INFLUENCES = 4
 BONE_COUNTS = (4, 6, 8, 12, 16, 20, 24, 32)

@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from femsense.arrays import FloatArray
-from femsense.errors import InputError, MissingDependency
+from femsense.core.arrays import FloatArray
+from femsense.core.errors import InputError, MissingDependency
 from femsense.xr.gltf import ExportReport, export_states
 
 PAGE = Path(__file__).with_name("viewer") / "dist"

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from femsense.arrays import FloatArray
+from femsense.core.arrays import FloatArray
 from femsense.fem.blocks import block_mesh, rounded_square
 from femsense.fem.mesh import TetMesh
 

@@ -18,11 +18,11 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from femsense.arrays import FloatArray
-from femsense.errors import InputError
+from femsense.core.arrays import FloatArray
+from femsense.core.errors import InputError
 from femsense.fem.mesh import TetMesh, check_mesh, to_quadratic
-from femsense.files import write_toml
-from femsense.meshfile import radius_ratio, tetrahedralise, write_mesh
+from femsense.io.files import write_toml
+from femsense.io.mesh_files import radius_ratio, tetrahedralise, write_mesh
 
 HERE = Path(__file__).resolve().parent
 LEGS = {"east": 0, "north": 1, "west": 2, "south": 3}

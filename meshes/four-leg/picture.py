@@ -9,14 +9,14 @@ from pathlib import Path
 
 import numpy as np
 
-from femsense.arrays import FloatArray
+from femsense.core.arrays import FloatArray
+from femsense.core.pose import invert_pose, transform_points
 from femsense.fem.equilibrium import solve_equilibrium
-from femsense.model import Robot
-from femsense.pose import invert_pose, transform_points
+from femsense.io.robot_toml import load_robot
+from femsense.model.robot import Robot
 from femsense.rig.camera import camera_of, look_at, render, visible_points
 from femsense.rig.scene import body_shape
 from femsense.rig.script import SceneTable, ViewTable
-from femsense.robot import load_robot
 
 VIEW = ViewTable.model_validate(
     {"width": 900, "height": 640, "fx": 1680.0, "eye_m": [-0.22, -0.34, 0.30], "target_m": [0.0, 0.0, 0.050]}

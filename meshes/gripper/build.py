@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from femsense.arrays import BoolArray, FloatArray
+from femsense.core.arrays import BoolArray, FloatArray
 from femsense.fem.blocks import block_mesh
 from femsense.fem.mesh import TetMesh
 

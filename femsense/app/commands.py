@@ -1,0 +1,256 @@
+"""From files to files: what the commands do between reading their arguments and saying the result, with resuming."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import femsense
+from femsense.calib.files import read_calibration
+from femsense.core.errors import FemsenseError, InputError
+from femsense.core.parallel import beside
+from femsense.io.checkpoint import UNFINISHED
+from femsense.io.files import file_hash
+from femsense.io.provenance import finished
+from femsense.io.recording_folder import load_recording
+from femsense.io.robot_toml import load_robot
+from femsense.loop.files import check_loop_folder, loop_inputs, read_loop, write_loop
+from femsense.sensing.run_files import check_run_folder, read_run, run_inputs, write_run
+
+if TYPE_CHECKING:
+    from femsense.sensing.types import Run
+
+Progress = Callable[..., None]
+Say = Callable[[str], None]
+
+
+def estimate_into(
+    folder: str | Path,
+    robot: str | Path,
+    recording: str | Path,
+    *,
+    say: Say,
+    calibration: str | Path | None = None,
+    at: Sequence[Sequence[float]] | None = None,
+    again: bool = False,
+    progress: Progress | None = None,
+) -> Run:
+    """Estimate a recording into a folder, or return what stands there if it was made from the same input.
+
+    Arguments:
+        folder: of the run.
+        robot, recording: folders (or the name of a robot).
+        say: told in one line what happens beside the estimate.
+        calibration: calibration.json; None calibrates first.
+        at: places of contact at rest [m], shape (k, 3).
+        again: compute even where the result is there.
+        progress: called with (frames done, frames in all).
+
+    Raises:
+        FemsenseError: bad input, a folder that holds something else, or data that allow no result.
+    """
+    from femsense.calib.calibrate import calibrate
+    from femsense.sensing.pipeline import estimate
+
+    check_run_folder(folder)
+    body, frames = load_robot(robot), load_recording(recording)
+    given = None if calibration is None else read_calibration(calibration)
+    inputs = run_inputs(body, frames, given, at=at)
+    if not again and finished(folder, inputs):
+        say(f"{folder} holds this result already (--again computes it anew)")
+        return read_run(folder, robot=body)
+    if given is None:
+        say(f"no calibration given: calibrating first, into {Path(folder) / 'calibration.json'}")
+    used = calibrate(body, frames) if given is None else given
+    began = time.perf_counter()
+    run = estimate(body, frames, used, at=at, progress=progress, keep=_kept(folder, inputs))
+    write_run(run, folder, inputs=inputs, seconds=time.perf_counter() - began, calibration=used)
+    return run
+
+
+def improve_into(
+    folder: str | Path,
+    robot: str | Path,
+    recordings: Sequence[str | Path],
+    *,
+    say: Say,
+    validation: Sequence[str | Path] = (),
+    effects: Sequence[str] | None = None,
+    without: Sequence[str] | None = None,
+    user_effects: Sequence[str | Path] = (),
+    measured: str = "auto",
+    again: bool = False,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Close the loop into a folder, or return what stands there if it was made from the same input.
+
+    Arguments:
+        folder: gets loop.json, robot.toml and the mesh.
+        robot: a folder, or the name of a robot.
+        recordings: what effects are found on; validation: what they are tested on.
+        say: told in one line what happens beside the loop.
+        effects, without: names of effects to try, or not to try.
+        user_effects: Python files of effects that are tried too.
+        measured: "markers", "clouds" or "both": what is used of a recording; "auto": its markers, or its clouds where it has none.
+        again: compute even where the result is there.
+        progress: as of `improve`.
+
+    Returns:
+        the content of loop.json.
+
+    Raises:
+        FemsenseError: bad input, a folder that holds something else, or data that allow no result.
+    """
+    from femsense.loop.improve import improve
+
+    check_loop_folder(folder)
+    twice = {Path(path).resolve() for path in recordings} & {Path(path).resolve() for path in validation}
+    if twice:
+        raise InputError(
+            "a recording is fitted and judged on",
+            where="--validation",
+            found=str(min(twice)),
+            expected="another recording",
+            hint="without --validation whole sweeps are held out",
+        )
+    body = load_robot(robot)
+    train, test = [load_recording(path) for path in recordings], [load_recording(path) for path in validation]
+    own = {str(file): file_hash(Path(file)) for file in user_effects if Path(file).is_file()}
+    inputs = loop_inputs(body, train, test, effects=effects, without=without, user_effects=own, measured=measured)
+    _require_different([*inputs["recordings"], *inputs["validation"]])
+    if not again and finished(folder, inputs):
+        say(f"{folder} holds this result already (--again computes it anew)")
+        return read_loop(folder)
+    with beside(_load_pages):
+        loop = improve(
+            body,
+            train,
+            validation=test,
+            effects=effects,
+            without=without,
+            user_effects=user_effects,
+            measured=measured,
+            progress=progress,
+            keep=_kept(folder, inputs),
+        )
+    write_loop(loop, folder, inputs=inputs)
+    return read_loop(folder)
+
+
+def _require_different(recordings: Sequence[Mapping[str, Any]]) -> None:
+    """Raise InputError where two recordings have the same content: it would count twice."""
+    seen = dict[str, str]()
+    for one in recordings:
+        if one["sha256"] in seen:
+            raise InputError(
+                "the same recording is given twice",
+                where=one["path"],
+                found=f"the content of {seen[one['sha256']]}",
+                expected="different recordings",
+            )
+        seen[one["sha256"]] = one["path"]
+
+
+def _kept(folder: str | Path, inputs: Mapping[str, Any]) -> tuple[Path, dict[str, Any]]:
+    """Return where a killed command has left how far it came, and what that is made from."""
+    return Path(folder) / UNFINISHED, {**inputs, "version": femsense.__version__}
+
+
+def _load_pages() -> None:
+    """Load what draws pages, which takes a second; an installation without it has no pages."""
+    with contextlib.suppress(ImportError):
+        for name in ("femsense.report", "matplotlib.figure", "matplotlib.backends.backend_svg"):
+            importlib.import_module(name)
+
+
+def loop_page(folder: str | Path, *, say: Say) -> Path | None:
+    """Return report.html of a folder with loop.json, written where it is missing or older; None where this installation cannot."""
+    page, loop = Path(folder) / "report.html", Path(folder) / "loop.json"
+    if page.is_file() and page.stat().st_mtime_ns >= loop.stat().st_mtime_ns:
+        return page
+    try:
+        from femsense.report import write_report
+
+        return write_report(folder)
+    except (ImportError, FemsenseError) as error:
+        say(f"no report: {' '.join(str(error).split())}")
+        return None
+
+
+def simulate_into(folder: str | Path, robot: str | Path, script: str | Path) -> Path:
+    """Write the recording of a script; return its folder.
+
+    Raises:
+        InputError: where the folder holds anything but a recording, which would be replaced. FemsenseError: as `simulate`.
+    """
+    from femsense.rig.simulate import simulate
+
+    target = Path(folder).expanduser()
+    if target.exists() and not (target / "recording.toml").is_file() and not (target.is_dir() and not any(target.iterdir())):
+        raise InputError(
+            "something else than a recording stands there, which would be replaced",
+            where=target,
+            expected="a new folder",
+            hint="another -o",
+        )
+    return simulate(load_robot(robot), script, target)
+
+
+def script_outlook(robot: str | Path, script: str | Path, *, noise: float) -> tuple[dict[str, Any], str]:
+    """Return what the experiment of a script could show, as plain tables and as text; `noise` is of a marker's coordinate [m]."""
+    from femsense.loop.design.advice import outlook_text
+    from femsense.loop.design.planner import outlook_document, outlook_of_script
+    from femsense.rig.script import read_script
+
+    outlook = outlook_of_script(load_robot(robot), read_script(script), Path(script), noise=noise)
+    return outlook_document(outlook), outlook_text(outlook)
+
+
+def plan_into(
+    file: str | Path | None,
+    robot: str | Path,
+    *,
+    given: str | Path | None,
+    noise: float,
+    frames: int,
+    control: str,
+    progress: Progress | None = None,
+) -> tuple[dict[str, Any], str]:
+    """Propose an experiment; write it as a script where a file is named. Return it as plain tables and as text.
+
+    Arguments:
+        file: script to write; one with `-far` in its name is written beside it for a second distance of the camera.
+        robot: a folder, or the name of a robot.
+        given: a recording that exists; None starts from nothing.
+        noise: of a marker's coordinate [m].
+        frames: budget.
+        control: "tension" or "displacement"; a given recording says it itself.
+        progress: called with (items done, items in all).
+
+    Raises:
+        FemsenseError: bad input, or a robot without an equilibrium.
+    """
+    from femsense.io.files import write_toml
+    from femsense.loop.design.advice import proposal_text
+    from femsense.loop.design.planner import plan_experiment, proposal_document
+
+    if control not in ("tension", "displacement"):
+        raise InputError("unknown actuation", where="--actuation", found=control, expected="tension | displacement")
+    if file is not None and Path(file).suffix != ".toml":
+        raise InputError("not the name of a script", where="-o", found=str(file), expected="a file that ends in .toml")
+    recording = None if given is None else load_recording(given)
+    proposal = plan_experiment(load_robot(robot), control=control, noise=noise, frames=frames, given=recording, progress=progress)
+    files = []
+    for name, script in proposal.scripts().items() if file is not None else ():
+        target = Path(str(file))
+        target = target.with_stem(target.stem + name)
+        write_toml(target, script)
+        files.append(str(target))
+    text = proposal_text(proposal) + "".join(
+        f"\n\nwritten: {f} (femsense simulate ROBOT {f} -o RECORDING tries it)" for f in files
+    )
+    return {**proposal_document(proposal), "scripts": files}, text

@@ -1,0 +1,137 @@
+"""The whole chain on a recording that comes along, measured against the truth beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from femsense.app.commands import estimate_into, improve_into
+from femsense.app.demo.truth import TrueContact, force_errors, read_truth, true_effects
+from femsense.core.errors import FemsenseError, InputError
+from femsense.io.files import write_json
+from femsense.io.provenance import versions
+from femsense.io.robot_toml import robot_names
+from femsense.report.text import columns, effect_text, run_document
+
+if TYPE_CHECKING:
+    from femsense.sensing.types import Run
+
+ROBOT = "four-leg"
+
+
+def run_demo(folder: str | Path, *, say: Callable[[str], None], progress: Callable[..., None] | None = None) -> dict[str, Any]:
+    """Estimate with the declared robot, improve it, estimate again; export the result and measure both against the truth.
+
+    Steps that the folder holds already are not done again.
+
+    Arguments:
+        folder: gets `declared/`, `loop/`, `run/`, robot.glb, picture.png, report.html and demo.json.
+        say: told in one line what happens.
+        progress: called with what is done and how much there is.
+
+    Returns:
+        the content of demo.json.
+
+    Raises:
+        FemsenseError: the demo's recording is not there, or a step failed.
+    """
+    from femsense.app.demo.picture import draw_demo
+    from femsense.xr.export import export_glb
+
+    out, recording = Path(folder), demo_recording()
+    say(f"1/4  forces with the robot as it is declared → {out / 'declared'}")
+    before = estimate_into(out / "declared", ROBOT, recording, say=say, progress=progress)
+    say(f"2/4  what does its model lack? → {out / 'loop'}")
+    loop = improve_into(out / "loop", ROBOT, [recording], say=say, progress=progress)
+    say(f"3/4  forces with the improved robot → {out / 'run'}")
+    after = estimate_into(out / "run", out / "loop", recording, say=say, progress=progress)
+    say(f"4/4  mesh, picture and report → {out}")
+    truth = read_truth(recording)
+    document = demo_document(out, before, loop, after, truth, true_effects(recording))
+    export_glb(after, out / "robot.glb")
+    draw_demo(before, after, truth, document, out / "picture.png")
+    document["report"] = str(out / "report.html")
+    write_json(out / "demo.json", document)
+    document["report"] = _report(out, say)
+    return document
+
+
+def demo_recording() -> Path:
+    """Return the folder of the recording that comes along. Raises InputError."""
+    folder = robot_names().get(ROBOT)
+    recording = None if folder is None else folder / "recordings" / "demo"
+    if recording is None or not (recording / "recording.toml").is_file():
+        raise InputError(
+            "the demo's recording is not in this installation",
+            where=recording or ROBOT,
+            expected="meshes/four-leg/recordings/demo",
+            hint="reinstall femsense",
+        )
+    return recording
+
+
+def demo_document(
+    out: Path,
+    before: Run,
+    loop: Mapping[str, Any],
+    after: Run,
+    truth: Sequence[TrueContact],
+    effects: Sequence[Mapping[str, Any]],
+) -> dict[str, Any]:
+    """Return the figures of the demo: both runs, the loop, and the errors against the truth."""
+    return {
+        "folder": str(out),
+        "declared": {**run_document(before), **force_errors(before, truth)},
+        "improved": {**run_document(after), **force_errors(after, truth)},
+        "loop": {key: loop.get(key) for key in ("verdict", "noise_m", "before", "after", "effects")},
+        "truth": {"contacts": len(truth), "effects": list(effects)},
+        "versions": versions(),
+    }
+
+
+def demo_text(document: Mapping[str, Any]) -> str:
+    """Return the closing table of the demo."""
+    a, b, loop = document["declared"], document["improved"], document["loop"]
+    out = Path(document["folder"])
+    rows = [["", "declared robot", "improved robot"]]
+    for title, key, scale, unit in (
+        ("error of force (median)", "force_error_n", 1.0, "N"),
+        ("  in percent", "force_error_share", 100.0, "%"),
+        ("error of place (median)", "place_error_m", 1e3, "mm"),
+    ):
+        rows.append([title, _figure(a[key], scale, unit), _figure(b[key], scale, unit)])
+    rows.append(["true contacts found", *(f"{run['contacts_found']} of {run['contacts_true']}" for run in (a, b))])
+    rows.append(["contacts that are none", *(str(run["contacts_false"]) for run in (a, b))])
+    for title, key in (("residual of the markers", "train_rms_m"), ("  on held-out sweeps", "validation_rms_m")):
+        rows.append([title, *(_figure((loop.get(when) or {}).get(key), 1e3, "mm") for when in ("before", "after"))])
+    rows.append(["time a frame", *(_figure(run["ms_per_frame"], 1.0, "ms") for run in (a, b))])
+    lines = [columns(rows, indent=0), "", f"what the declared model lacks (verdict: {loop['verdict']}):"]
+    lines += ["  " + line for effect in loop.get("effects") or [] for line in effect_text(effect).splitlines()] or [
+        "  nothing that these data show"
+    ]
+    true = [[effect["name"], _entry(effect)] for effect in document["truth"]["effects"]]
+    lines += ["", "what it lacks in truth:", columns(true)] if true else []
+    places = [["see it", f"femsense view {out / 'run'}"], ["mesh", str(out / "robot.glb")], ["picture", str(out / "picture.png")]]
+    if document.get("report"):
+        places.append(["report", str(document["report"])])
+    return "\n".join([*lines, "", columns(places, indent=0)])
+
+
+def _entry(effect: Mapping[str, Any]) -> str:
+    return ", ".join(f"{key} {value}" for key, value in effect.items() if key != "name")
+
+
+def _report(folder: Path, say: Callable[[str], None]) -> str | None:
+    """Write the report where this installation can."""
+    try:
+        from femsense.report import write_report
+
+        return str(write_report(folder))
+    except (ImportError, FemsenseError) as error:
+        say(f"no report: {' '.join(str(error).split())}")
+        return None
+
+
+def _figure(value: float | None, scale: float, unit: str) -> str:
+    return "–" if value is None else f"{scale * value:.3g} {unit}"

@@ -1,0 +1,287 @@
+"""What this installation has and lacks, with the line that mends it."""
+
+from __future__ import annotations
+
+import ctypes
+import importlib.util
+import os
+import platform
+import re
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from importlib.metadata import PackageNotFoundError
+from importlib.metadata import version as version_of
+from pathlib import Path
+from typing import Any
+
+import femsense
+
+PACKAGES = {
+    "numpy": "numpy",
+    "scipy": "scipy",
+    "numba": "numba",
+    "pydantic": "pydantic",
+    "typer": "typer",
+    "rich": "rich",
+    "tomli_w": "tomli-w",
+    "meshio": "meshio",
+    "qpsolvers": "qpsolvers",
+    "daqp": "daqp",
+    "osqp": "osqp",
+    "matplotlib": "matplotlib",
+    "cv2": "opencv-python-headless",
+    "trimesh": "trimesh",
+    "open3d": "open3d-cpu",
+}
+"""Module → the package that has it."""
+LIBRARIES = {
+    "libGL.so.1": "libgl1",
+    "libgomp.so.1": "libgomp1",
+    "libX11.so.6": "libx11-6",
+    "libudev.so.1": "libudev1",
+}
+"""What Open3D is linked to on Linux → the Debian package that has it."""
+OTHER_LIBRARIES = {"libusb-1.0.so.0": "libusb-1.0-0", "libEGL.so.1": "libegl1", "libglib-2.0.so.0": "libglib2.0-0"}
+"""What other versions of it may want."""
+LITTLE_MEMORY_GB = 2.0
+SMALL_RESIDUAL_N = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One finding."""
+
+    name: str
+    level: str
+    """"ok", "warning" (something is slower or missing that is not always needed) or "error"."""
+    found: str
+    hint: str | None = None
+    """What to do."""
+
+
+def diagnose() -> dict[str, Any]:
+    """Check this installation.
+
+    Returns:
+        `ok` (no check has level "error") and `checks`, each `{name, level, found, hint}`.
+    """
+    checks = [_python(), *(_package(module, package) for module, package in PACKAGES.items())]
+    parts: tuple[Callable[[], Check], ...] = (
+        _tetrahedra,
+        _libraries,
+        _solver,
+        _viewer,
+        _robots,
+        _numba_cache,
+        _tiny_solve,
+        _machine,
+    )
+    checks += [_guarded(part) for part in parts]
+    return {"ok": all(check.level != "error" for check in checks), "checks": [asdict(check) for check in checks]}
+
+
+def doctor_text(document: dict[str, Any]) -> str:
+    """Return what `diagnose` found as a table."""
+    marks = {"ok": "ok", "warning": "note", "error": "BAD"}
+    width = max(len(check["name"]) for check in document["checks"])
+    lines = []
+    for check in document["checks"]:
+        lines.append(f"{marks[check['level']]:<4}  {check['name']:<{width}}  {check['found']}")
+        if check["hint"]:
+            lines.append(f"{'':<{width + 8}}→ {check['hint']}")
+    bad = sum(check["level"] == "error" for check in document["checks"])
+    lines += ["", "everything that is needed works" if not bad else f"{bad} checks failed: femsense will not work fully"]
+    return "\n".join(lines)
+
+
+def _guarded(part: Callable[[], Check]) -> Check:
+    """Return a check; one that fails in itself is an error, not a crash."""
+    try:
+        return part()
+    except Exception as error:  # a broken installation may fail in any way
+        return Check(
+            part.__name__.strip("_").replace("_", " "),
+            "error",
+            _short(error),
+            "reinstall: pip install --force-reinstall femsense",
+        )
+
+
+def _python() -> Check:
+    found = f"{platform.python_version()} on {platform.system()} {platform.machine()}"
+    good = (3, 11) <= sys.version_info[:2] <= (3, 12)
+    return Check("python", "ok" if good else "error", found, None if good else "femsense runs on Python 3.11 and 3.12")
+
+
+def _package(module: str, package: str) -> Check:
+    try:
+        loaded = importlib.import_module(module)
+    except Exception as error:  # OSError and ImportError, and what a broken binary raises
+        return Check(module, "error", _short(error), import_hint(str(error), package))
+    return Check(module, "ok", _version(package) or str(getattr(loaded, "__version__", "version not known")))
+
+
+def import_hint(message: str, package: str) -> str:
+    """Return what to do where an import failed with this message: the system's package, or pip's."""
+    library = re.search(r"(lib[\w.+-]+\.so(?:\.\d+)*)", message)
+    debian = {**LIBRARIES, **OTHER_LIBRARIES}.get(library.group(1)) if library else None
+    if debian is not None:
+        return f"a system library is missing: apt-get install {debian}"
+    return f"pip install {package}"
+
+
+def _tetrahedra() -> Check:
+    """pytetwild runs in a process of its own and is not loaded here."""
+    if importlib.util.find_spec("pytetwild") is None:
+        return Check("pytetwild", "warning", "not installed: surfaces cannot become tetrahedra", "pip install pytetwild")
+    return Check("pytetwild", "ok", _version("pytetwild") or "version not known")
+
+
+def _libraries() -> Check:
+    if not sys.platform.startswith("linux"):
+        return Check("system libraries", "ok", "only checked on Linux")
+    missing = [name for name in LIBRARIES if not _loads(name)]
+    if not missing:
+        return Check("system libraries", "ok", "all that Open3D wants")
+    return Check(
+        "system libraries",
+        "error",
+        "missing: " + ", ".join(missing),
+        "apt-get install " + " ".join(LIBRARIES[name] for name in missing),
+    )
+
+
+def _solver() -> Check:
+    chosen = os.environ.get("FEMSENSE_SOLVER", "").lower()
+    if chosen in ("", "cholesky", "direct"):
+        return Check("linear solver", "ok", "Cholesky of femsense, with the BLAS of SciPy")
+    if chosen == "iterative":
+        return Check(
+            "linear solver",
+            "warning",
+            "conjugate gradients",
+            "FEMSENSE_SOLVER=iterative asks for them: they save memory, not time",
+        )
+    if chosen not in ("pardiso", "superlu"):
+        return Check("linear solver", "error", f"FEMSENSE_SOLVER={chosen} is not known", "direct, iterative, pardiso or superlu")
+    from femsense.fem.linalg.factorization import pardiso_library
+
+    name = f"PARDISO (pypardiso {_version('pypardiso')})" if pardiso_library() is not None else "SuperLU of SciPy"
+    return Check(
+        "linear solver", "warning", name, f"FEMSENSE_SOLVER={chosen} asks for it: slower than the solver that comes along"
+    )
+
+
+def _viewer() -> Check:
+    from femsense.xr.view import PAGE
+
+    if (PAGE / "index.html").is_file():
+        size = sum(file.stat().st_size for file in PAGE.iterdir() if file.is_file())
+        return Check("viewer page", "ok", f"{size / 1e3:.0f} kB")
+    return Check(
+        "viewer page",
+        "warning",
+        "not built into this installation: femsense view will not work",
+        "pip install . (in a checkout: pip install -e .)",
+    )
+
+
+def _robots() -> Check:
+    from femsense.io.robot_toml import robot_names
+
+    names = ", ".join(robot_names())
+    return Check("robots that come along", "ok" if names else "warning", names or "none", None if names else "reinstall femsense")
+
+
+def _numba_cache() -> Check:
+    """Compiled kernels are kept in __pycache__, in NUMBA_CACHE_DIR, or in the user's cache folder."""
+    package = Path(femsense.__file__).parent / "fem"
+    chosen = os.environ.get("NUMBA_CACHE_DIR")
+    places = [Path(chosen)] if chosen else [package / "__pycache__", package, Path.home() / ".cache"]
+    usable = next((place for place in places if place.is_dir() and _writable(place)), None)
+    if usable is None:
+        return Check(
+            "cache of compiled kernels",
+            "warning",
+            "no folder can be written: each start compiles anew",
+            "set NUMBA_CACHE_DIR to a folder of your own",
+        )
+    return Check("cache of compiled kernels", "ok", "can be written")
+
+
+def _tiny_solve() -> Check:
+    """Let a soft cube hang by one face: the equilibrium certifies itself by its residual, and the weight must be carried."""
+    import numpy as np
+
+    from femsense.fem.body import make_body
+    from femsense.fem.equilibrium import solve_equilibrium
+    from femsense.fem.mesh import TetMesh
+
+    corners = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)]) * 0.05
+    tets = np.array([[0, 1, 3, 7], [0, 3, 2, 7], [0, 2, 6, 7], [0, 6, 4, 7], [0, 4, 5, 7], [0, 5, 1, 7]])
+    x = corners[tets]
+    flip = np.linalg.det(x[:, 1:] - x[:, :1]) < 0
+    tets[flip] = tets[flip][:, [0, 2, 1, 3]]
+    body = make_body(
+        TetMesh(corners, tets),
+        young_modulus=1e5,
+        poisson_ratio=0.45,
+        density=1000.0,
+        clamped=np.flatnonzero(corners[:, 2] > 0.04),
+        gravity=(0.0, 0.0, -9.81),
+    )
+    state = solve_equilibrium(body)
+    sag = 1e3 * float((corners - state.positions)[:, 2].max())
+    found = f"{state.status}, residual {state.residual_n:.1e} N, sag {sag:.3f} mm"
+    good = state.status == "converged" and state.residual_n < SMALL_RESIDUAL_N and 0.01 < sag < 1.0
+    return Check(
+        "a tiny solve", "ok" if good else "error", found, None if good else "reinstall: pip install --force-reinstall femsense"
+    )
+
+
+def _machine() -> Check:
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    free = _free_memory_gb()
+    text = f"{cores} cores" + ("" if free is None else f", {free:.1f} GB of memory free")
+    if free is not None and free < LITTLE_MEMORY_GB:
+        return Check("machine", "warning", text, f"large meshes want more than {LITTLE_MEMORY_GB:g} GB")
+    return Check("machine", "ok", text)
+
+
+def _free_memory_gb() -> float | None:
+    try:
+        text = Path("/proc/meminfo").read_text(encoding="ascii")
+    except OSError:
+        return None
+    found = re.search(r"MemAvailable:\s+(\d+) kB", text)
+    return int(found.group(1)) / 1e6 if found else None
+
+
+def _loads(library: str) -> bool:
+    try:
+        ctypes.CDLL(library)
+    except OSError:
+        return False
+    return True
+
+
+def _writable(folder: Path) -> bool:
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            return True
+    except OSError:
+        return False
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version_of(package)
+    except PackageNotFoundError:
+        return None
+
+
+def _short(error: Exception) -> str:
+    text = " ".join(str(error).split())
+    return f"{type(error).__name__}: {text[:120]}"

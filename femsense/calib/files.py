@@ -1,0 +1,100 @@
+"""calibration.json, written and read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from femsense.calib.calibration import Calibration
+from femsense.core.arrays import FloatArray, freeze
+from femsense.core.errors import InputError
+from femsense.core.pose import check_pose
+from femsense.io.files import plain, write_json
+from femsense.io.result_folder import _number, _numbers, _of, _read_document, _table
+
+CALIBRATION_FORMAT = "femsense-calibration-1"
+
+
+# Calibration
+
+
+def calibration_document(calibration: Calibration) -> dict[str, Any]:
+    """Return the content of calibration.json."""
+    c = calibration
+    document: dict[str, Any] = {
+        "format": CALIBRATION_FORMAT,
+        "status": c.status,
+        "T_robot_camera": c.T_robot_camera,
+        "cable_tension_n": c.cable_tension_n,
+        "cable_displacement_m": c.cable_displacement_m,
+        "rms_m": c.rms_m,
+        "marker_rms_m": c.marker_rms_m,
+        "history": c.history,
+        "std": {"T_robot_camera": c.pose_std, "cable_tension_n": c.tension_std_n, "cable_displacement_m": c.displacement_std_m},
+        "pose_covariance": c.pose_covariance,
+        "seats_m": c.seats_m,
+        "frames": c.frames,
+        "cameras": [{"name": name, "T_robot_camera": T} for name, T in zip(c.camera_names, c.poses)],
+    }
+    checked: dict[str, Any] = plain(document)
+    return checked
+
+
+def write_calibration(calibration: Calibration, path: str | Path) -> Path:
+    """Write calibration.json and return its path. Raises InputError where the path is a folder."""
+    target = Path(path)
+    if target.is_dir():
+        raise InputError(
+            "a folder stands where the file should be written", where=target, hint=f"-o {target / 'calibration.json'}"
+        )
+    write_json(target, calibration_document(calibration))
+    return target
+
+
+def read_calibration(path: str | Path) -> Calibration:
+    """Read calibration.json (or the one of a folder).
+
+    Raises:
+        InputError: another kind of file, or one that is broken; with the key, what was found and what was expected.
+    """
+    file = Path(path).expanduser()
+    file = file / "calibration.json" if file.is_dir() else file
+    document = _read_document(file, CALIBRATION_FORMAT)
+    std = _table(document, "std", file)
+    T = check_pose(_of(document, "T_robot_camera", file), f"{file}: T_robot_camera")
+    cameras = document.get("cameras") or [{"name": "", "T_robot_camera": T}]
+    try:
+        return Calibration(
+            T_robot_camera=freeze(T),
+            poses=tuple(freeze(check_pose(camera["T_robot_camera"], f"{file}: cameras")) for camera in cameras),
+            camera_names=tuple(str(camera["name"]) for camera in cameras),
+            cable_tension_n=_numbers(document, "cable_tension_n", file),
+            cable_displacement_m=_numbers(document, "cable_displacement_m", file),
+            rms_m=_number(document.get("rms_m")),
+            marker_rms_m=_numbers(document, "marker_rms_m", file),
+            history=tuple(dict(entry) for entry in document.get("history", [])),
+            pose_std=_matrix(std.get("T_robot_camera"), 4),
+            pose_covariance=_matrix(document.get("pose_covariance"), 6),
+            tension_std_n=dict(std.get("cable_tension_n", {})),
+            displacement_std_m=dict(std.get("cable_displacement_m", {})),
+            status=str(document.get("status", "")),
+            seats_m={name: [float(x) for x in point] for name, point in document.get("seats_m", {}).items()},
+            frames=tuple(int(frame) for frame in document.get("frames", [])),
+        )
+    except (TypeError, ValueError, KeyError, AttributeError) as error:
+        raise InputError(
+            "a broken calibration",
+            where=file,
+            found=f"{type(error).__name__}: {error}",
+            expected="what femsense calibrate wrote",
+            hint="calibrate again",
+        ) from None
+
+
+def _matrix(rows: Any, size: int) -> FloatArray:
+    """Return a square matrix, zero where it is not given."""
+    return freeze(
+        np.zeros((size, size)) if rows is None else np.array([[_number(x) for x in row] for row in rows]).reshape(size, size)
+    )

@@ -1,0 +1,1 @@
+"""What every room uses: errors, arrays, poses, least squares, parallel work, words of messages."""

@@ -1,0 +1,50 @@
+"""The only coercion of input arrays, and the array types that the code speaks of."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from femsense.core.errors import InputError
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
+
+
+def freeze(array: npt.ArrayLike, dtype: Any = np.float64) -> npt.NDArray[Any]:
+    """Return a C-contiguous read-only array of the given type (a copy where the input was writable)."""
+    result = np.array(array, dtype=dtype, order="C")
+    result.setflags(write=False)
+    return result
+
+
+def as_points(values: npt.ArrayLike | Iterable[Iterable[float]], name: str = "points") -> FloatArray:
+    """Coerce to finite points, shape (n, 3); a single point becomes (1, 3). Raises InputError."""
+    try:
+        points = np.atleast_2d(np.asarray(values, dtype=np.float64))
+    except (TypeError, ValueError):
+        raise InputError(f"{name} must be numbers", where=name, found=repr(values)[:80], expected="shape (n, 3)") from None
+    if points.size == 0:
+        return np.zeros((0, 3))
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise InputError(f"{name} has the wrong shape", where=name, found=points.shape, expected="(n, 3)")
+    if not np.isfinite(points).all():
+        row = int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])
+        raise InputError(f"{name} must be finite", where=f"{name}[{row}]", found=points[row].tolist(), expected="finite numbers")
+    return points
+
+
+def as_indices(values: npt.ArrayLike, count: int, name: str = "indices") -> IntArray:
+    """Coerce to indices in [0, count), shape (k,). Raises InputError."""
+    indices = np.atleast_1d(np.asarray(values))
+    if indices.size and not np.issubdtype(indices.dtype, np.integer):
+        raise InputError(f"{name} must be integers", where=name, found=indices.dtype, expected="integers")
+    if indices.size and (indices.min() < 0 or indices.max() >= count):
+        raise InputError(
+            f"{name} out of range", where=name, found=(int(indices.min()), int(indices.max())), expected=f"0 … {count - 1}"
+        )
+    return indices.astype(np.int64)

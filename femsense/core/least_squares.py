@@ -1,0 +1,279 @@
+"""Bounded Gauss–Newton with priors, a covariance, and a statement of what the data do not determine."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import lsq_linear
+
+from femsense.core.arrays import FloatArray, freeze
+from femsense.core.errors import DataError
+from femsense.core.local_model import Curvature, Kinks, Near
+
+Evaluate = Callable[[FloatArray, bool], tuple[FloatArray, FloatArray | None]]
+"""(θ, with derivative) → whitened residual (N,), Jacobian (N, p) or None. A θ that cannot be evaluated raises DataError."""
+
+
+STILL = 1e-2
+"""A step that changes the whitened residual by less than this is none."""
+
+
+NEARLY = 4.0
+"""A step is idle that gained less than what counts as a gain where a whole step promised less than so many times that."""
+LITTLE = 2.0
+"""A step is the last that promised less than so many times what counts as a gain, by a Jacobian of its own; not in units of the misfit, which
+may be large because the fit is far from its end."""
+LEAST_SHRINKING = 0.25
+"""No step is foretold to be shorter than this share of the one before."""
+CONVERGED, GIVEN_UP = "converged", "given up"
+MOST_DAMPING = 1e8
+ON_KINK = 0.2
+"""A fit rests on a kink that is nearer than so many standard errors."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class FitResult:
+    """A least-squares estimate."""
+
+    theta: FloatArray
+    """Shape (p,)."""
+    covariance: FloatArray
+    """Of θ for unit residual variance, shape (p, p); infinite variance where the data say nothing."""
+    residual: FloatArray
+    """Whitened residual, shape (N,)."""
+    jacobian: FloatArray
+    """Its derivative, shape (N, p); on a kink the mean of both sides that leaves no gradient."""
+    cost: tuple[float, ...]
+    """Sum of squares after each iteration, the start first."""
+    status: str
+    """"converged", "iterations", or "given up" (see `worth` of `gauss_newton`)."""
+    own: bool = True
+    """Whether the Jacobian is that at θ; else that of a step before."""
+
+
+def gauss_newton(
+    evaluate: Evaluate,
+    theta: FloatArray,
+    *,
+    low: FloatArray | None = None,
+    high: FloatArray | None = None,
+    max_iterations: int = 30,
+    tolerance: float = 1e-10,
+    still: float = STILL,
+    known: tuple[FloatArray, FloatArray | None] | None = None,
+    borrowed: FloatArray | None = None,
+    serves: float = 0.0,
+    worth: float = np.inf,
+    trusted: float = 0.0,
+    enough: float = 0.0,
+    spare: float = 0.0,
+    kinks: Callable[[FloatArray], Kinks | None] | None = None,
+) -> FitResult:
+    """Minimise ‖r(θ)‖² within bounds (Levenberg's damping where a plain step does not pay; how the residual bends, as far as its Jacobians have
+    shown it, counts while that foretells steps no worse than straight lines do: `core.local_model`).
+
+    A Jacobian that predicted the last step well serves for the next one too; the fit ends only where the Jacobian at θ itself says that
+    there is nothing left to gain (or one that is `trusted`), or, where what is left is noise, where it would: steps of a Gauss–Newton fit, each
+    with a Jacobian of its own, shrink like a geometric series, so that two of them foretell the next. It ends as well where two steps in turn
+    were idle, promised little and brought less (`enough`), or one and the next would move by nothing: on a kink there may always be a little to gain. And a step
+    that promises next to nothing by a Jacobian of its own is the last (`LITTLE`), whatever it brings.
+
+    Arguments:
+        evaluate: residual and Jacobian; priors are rows of them.
+        theta: the start, shape (p,).
+        low, high: bounds, shape (p,).
+        max_iterations: Gauss–Newton steps.
+        tolerance: relative decrease at which it stops.
+        still: length of a step in whitened residual at which it stops, in units of the misfit where that is more than noise.
+        known: residual and Jacobian at the start, where they are known.
+        borrowed: a Jacobian from near the start to begin with.
+        serves: a Jacobian serves for another step where it missed the change of the residual by less than this share of it, or by less than what
+            counts as a gain.
+        worth: a fit whose sum of squares stays above this is given up: where a step promises less than half of what is missing, or a
+            borrowed Jacobian says that nothing is left to gain.
+        trusted: a Jacobian that missed less than this share of every step since it was made is believed, too, that nothing is left to gain.
+        enough: what counts as a gain in the sum of squares, in units of the misfit where that is more than noise; 0: all that `tolerance` says.
+        spare: a fit ends where a whole step promises less than this, by its own Jacobian or one that foretold a step: what is asked next is worth more.
+        kinks: θ → where the residual bends near by, for the Jacobian that was computed last.
+    """
+    p = len(theta)
+    low = np.full(p, -np.inf) if low is None else low
+    high = np.full(p, np.inf) if high is None else high
+    clipped = np.clip(theta, low, high)
+    known = known if np.array_equal(clipped, theta) else None
+    theta = clipped
+    residual, slope = _first(evaluate, theta, known, borrowed)
+    costs = [float(residual @ residual)]
+    damping, status, steps, pace = 0.0, "iterations", 0, _Pace()
+    idle = 0  # idle steps in turn
+    curvature = Curvature()
+    while steps < max_iterations or not slope.own:
+        bends = None if kinks is None else kinks(theta)
+        if slope.own:
+            curvature.learn(theta, residual, slope.J, bends)
+        near = Near(residual, slope.J, bends, low - theta, high - theta, curvature.S, believed=curvature.believed)
+        step = near.step(damping)
+        change, promised = near.change(step), near.promise(step)
+        whole = promised if damping == 0.0 else near.promise(near.step(0.0))
+        error = max(1.0, costs[-1] / max(len(residual), 1)) ** 0.5  # what a standard error is worth where the model misfits
+        gain = enough * error**2
+        small = promised <= tolerance * costs[-1] or np.linalg.norm(change) <= still * error
+        at_end = not slope.own and (small or steps >= max_iterations)
+        if costs[-1] > worth and (at_end or costs[-1] - 2.0 * whole > worth):
+            status = GIVEN_UP
+            break
+        foretold = not slope.own and error == 1.0 and pace.next <= still
+        if foretold or (whole < spare and slope.sure is not None) or idle > 1 or (small and (slope.own or slope.sure or idle)):
+            status = CONVERGED
+            break
+        if at_end:
+            residual, slope = _both(evaluate, theta)
+            continue
+        steps += 1
+        tried = _tried(evaluate, theta + step)
+        cost = np.inf if tried is None else float(tried @ tried)
+        idle = idle + 1 if whole < NEARLY * gain and not costs[-1] - cost >= gain else 0
+        last = slope.own and whole < LITTLE * enough
+        if tried is None or not cost <= costs[-1] - 1e-4 * promised:
+            if not slope.own and idle < 2:
+                residual, slope = _both(evaluate, theta)
+                continue
+            if curvature.believed:  # straight lines may do better
+                curvature.believed = False
+            else:
+                damping = _shorter(near, damping, change)
+            if last or damping > MOST_DAMPING:
+                status = CONVERGED
+                break
+            continue
+        if slope.own:
+            pace.took(float(np.linalg.norm(change)) if damping == 0.0 else np.inf)
+        damping = damping / 10.0 if damping > 1e-6 else 0.0
+        curvature.judge(near, step, costs[-1] - cost)
+        missed = tried - residual - change
+        off, way = float(np.linalg.norm(missed)), float(np.linalg.norm(change))
+        theta, residual, slope = theta + step, tried, slope.after(step, near.scale, missed, off < trusted * way)
+        ends = idle or last or (error == 1.0 and pace.next <= still)
+        if off > max(serves * way, gain**0.5) and not ends:
+            residual, slope = _both(evaluate, theta)
+        costs.append(float(residual @ residual))
+        if last:
+            status = CONVERGED
+            break
+    bends = None if kinks is None or status == GIVEN_UP else kinks(theta)
+    jacobian = slope.J if bends is None else _on_kinks(slope.J, residual, bends)
+    return FitResult(
+        freeze(theta), freeze(covariance_of(jacobian)), freeze(residual), freeze(jacobian), tuple(costs), status, slope.own
+    )
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Slope:
+    """The Jacobian at hand, and how far it may be believed."""
+
+    J: FloatArray
+    own: bool = True
+    """Whether it is that at θ."""
+    sure: bool | None = True
+    """Whether it foretold all steps since it was made; None: it was made elsewhere, and no step has been taken by it."""
+
+    def after(self, step: FloatArray, scale: FloatArray, missed: FloatArray, foretold: bool) -> _Slope:
+        """Return it with what it missed along a step."""
+        return _Slope(_as_seen(self.J, step, scale, missed), False, foretold and self.sure is not False)
+
+
+class _Pace:
+    """How long steps with a Jacobian of their own are, and how long the next one will be if they go on shrinking; inf: not known."""
+
+    def __init__(self) -> None:
+        self.last, self.next = np.inf, np.inf
+
+    def took(self, length: float) -> None:
+        """Count a step; inf where it was damped."""
+        self.next = length * max(length / self.last, LEAST_SHRINKING) if length < self.last < np.inf else np.inf
+        self.last = length
+
+
+def _as_seen(J: FloatArray, step: FloatArray, scale: FloatArray, missed: FloatArray) -> FloatArray:
+    """Return the Jacobian that is nearest to J and has what J missed along a step (Broyden 1965)."""
+    along = scale**2 * step
+    size = float(along @ step)
+    return J if size == 0.0 else J + np.outer(missed, along / size)
+
+
+def _shorter(near: Near, damping: float, change: FloatArray) -> float:
+    """Return the damping that makes a step change the residual by half as much as `change` or less."""
+    while damping <= MOST_DAMPING:
+        damping = max(10.0 * damping, 1e-4)
+        if np.linalg.norm(near.change(near.step(damping))) <= 0.5 * np.linalg.norm(change):
+            break
+    return damping
+
+
+def _on_kinks(J: FloatArray, r: FloatArray, kinks: Kinks) -> FloatArray:
+    """Return the derivative that stands for both sides of the kinks on which a fit came to rest: the mean of them that leaves no gradient.
+
+    Straight lines of one side alone would go on down where the other side goes up (Clarke's generalised Jacobian has 0 among its gradients).
+    """
+    spread = np.sqrt(np.maximum(np.einsum("gp,pq,gq->g", kinks.slope, _finite(covariance_of(J)), kinks.slope), 0.0))
+    here = np.abs(kinks.value) < ON_KINK * spread
+    if not here.any():
+        return J
+    scale = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
+    counted = kinks.counted.astype(float)
+    pull = (kinks.columns[:, here].T @ r)[:, None] * kinks.slope[here] / scale
+    gradient = J.T @ r / scale - counted[here] @ pull
+    stay = 1e-6 * float(np.linalg.norm(pull)) * np.eye(len(pull))
+    A, b = np.vstack([pull.T, stay]), np.concatenate([-gradient, stay @ counted[here]])
+    share = counted.copy()
+    share[here] = lsq_linear(A, b, bounds=(0.0, 1.0)).x
+    return np.asarray(J + (kinks.columns * (share - counted)) @ kinks.slope)
+
+
+def _finite(covariance: FloatArray) -> FloatArray:
+    return np.where(np.isfinite(covariance), covariance, 0.0)
+
+
+def _first(
+    evaluate: Evaluate, theta: FloatArray, known: tuple[FloatArray, FloatArray | None] | None, borrowed: FloatArray | None
+) -> tuple[FloatArray, _Slope]:
+    """Return residual and Jacobian to begin with."""
+    if known is not None and known[1] is not None:
+        return known[0], _Slope(known[1])
+    if borrowed is not None:
+        return evaluate(theta, False)[0], _Slope(borrowed, own=False, sure=None)
+    return _both(evaluate, theta)
+
+
+def _both(evaluate: Evaluate, theta: FloatArray) -> tuple[FloatArray, _Slope]:
+    residual, jacobian = evaluate(theta, True)
+    assert jacobian is not None
+    return residual, _Slope(jacobian)
+
+
+def _tried(evaluate: Evaluate, theta: FloatArray) -> FloatArray | None:
+    """Return the residual; None where θ cannot be evaluated."""
+    try:
+        return evaluate(theta, False)[0]
+    except DataError:
+        return None
+
+
+def covariance_of(jacobian: FloatArray) -> FloatArray:
+    """Return (JᵀJ)⁻¹, with infinite variance along parameters that J does not see."""
+    scale = np.linalg.norm(jacobian, axis=0)
+    seen = scale > 0
+    covariance = np.full((jacobian.shape[1],) * 2, 0.0)
+    covariance[~seen, ~seen] = np.inf
+    if not seen.any():
+        return covariance
+    _, s, Vt = np.linalg.svd(jacobian[:, seen] / scale[seen], full_matrices=False)
+    weak = s < 1e-9 * s.max()
+    inverse = np.where(weak, 0.0, 1.0 / np.where(weak, 1.0, s))
+    part = (Vt.T * inverse**2) @ Vt
+    blind = (Vt[weak] ** 2).sum(axis=0) > 1e-6 if weak.any() else np.zeros(len(part), dtype=bool)
+    part[blind, blind] = np.inf
+    covariance[np.ix_(seen, seen)] = part / np.outer(scale[seen], scale[seen])
+    return covariance

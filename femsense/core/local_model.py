@@ -1,0 +1,227 @@
+"""What a sum of squares is near a point: that of a linear residual, but for kinks that are known and for the curvature that earlier steps showed.
+
+Half the second derivative of ‖r‖² is JᵀJ + S with S = Σᵢ rᵢ ∇²rᵢ. Gauss–Newton takes S for 0. Along a bent valley where much residual is left S
+takes away most of JᵀJ, and each step covers a small share of the way; how J changed from one point of the fit to the next tells S along that way.
+
+Source: Dennis, Gay & Welsch, "An adaptive nonlinear least-squares algorithm" (1981). S is what they learn, and sized as they do it; of all S that
+agree with the last step it is the nearest to the one before, measured by JᵀJ (they measure by the change of the slope, which may be next to nothing).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import lsq_linear
+
+from femsense.core.arrays import BoolArray, FloatArray
+
+WIDTHS = 0.3, 0.1, 0.03, 0.01, 1e-3, 1e-5
+"""How far kinks are rounded, in shares of the way that a plain step goes past them; one after the other."""
+TURNS = 4
+"""Gauss–Newton steps for each of these, of a problem that costs nothing to evaluate."""
+LEAST = 0.2
+"""Share of JᵀJ that S leaves in any direction: what is learnt from few steps may be wrong elsewhere."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Kinks:
+    """Where the residual bends, although what makes it bend is known:  r(θ + s) ≈ r + J₀ s + W (max(v + U s, 0) − max(v, 0)).
+
+    A cable that is not pulled does not push, so that the tension that its zero and its log make together ends at 0.
+    """
+
+    columns: FloatArray
+    """W: change of the whitened residual by each value that is cut off at 0, shape (N, g)."""
+    value: FloatArray
+    """v: what it would be at θ if it were not cut off, shape (g,)."""
+    slope: FloatArray
+    """U: its derivative by θ, shape (g, p)."""
+    counted: BoolArray
+    """Whether the Jacobian counts it as not cut off, shape (g,)."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Point:
+    """Where a Jacobian was computed."""
+
+    theta: FloatArray
+    J: FloatArray
+    kinks: Kinks | None
+
+    def as_counted_at(self, other: _Point) -> FloatArray | None:
+        """Return the Jacobian here with the kinks counted as they are elsewhere, so that no jump is taken for a bend; None: they are others."""
+        here, there = self.kinks, other.kinks
+        if here is None or there is None:
+            return self.J if here is there else None
+        if here.counted.shape != there.counted.shape:
+            return None
+        return np.asarray(self.J + (here.columns * (there.counted.astype(float) - here.counted)) @ here.slope)
+
+
+class Curvature:
+    """S as far as the Jacobians of a fit have shown it."""
+
+    def __init__(self) -> None:
+        self.S: FloatArray | None = None
+        """Shape (p, p); None: nothing is known."""
+        self.believed = True
+        """Whether it foretold the last step no worse than straight lines; at first it is."""
+        self.last: _Point | None = None
+
+    def learn(self, theta: FloatArray, r: FloatArray, J: FloatArray, kinks: Kinks | None) -> None:
+        """Learn from residual and Jacobian at a point of the fit."""
+        here, before = _Point(theta, J, kinks), self.last
+        if before is not None and np.array_equal(theta, before.theta):
+            return
+        self.last = here
+        J_before = None if before is None else before.as_counted_at(here)
+        if before is None or J_before is None:
+            return
+        step, bend = theta - before.theta, (J - J_before).T @ r
+        along = J.T @ (J @ step)
+        size = float(along @ step)
+        if size == 0.0:
+            return
+        S = np.zeros((len(step),) * 2) if self.S is None else self.S
+        old = float(step @ S @ step)
+        S = S if old == 0.0 else S * min(1.0, abs(float(step @ bend) / old))
+        missed = bend - S @ step
+        outer = np.outer(missed, along) / size
+        self.S = S + outer + outer.T - float(step @ missed) / size**2 * np.outer(along, along)
+
+    def judge(self, near: Near, step: FloatArray, gain: float) -> None:
+        """Go on believing in S if it foretells what a step brought no worse than straight lines do."""
+        straight, curved = (abs(near.promise(step, curved=curved) - gain) for curved in (False, True))
+        self.believed = curved <= straight
+
+
+def _with_curvature(J: FloatArray, S: FloatArray, scale: FloatArray) -> FloatArray:
+    """Return C with CᵀC = JᵀJ + S, S being cut so that it leaves the least share of JᵀJ, and nothing where J sees nothing."""
+    _, size, Vt = np.linalg.svd(J / scale, full_matrices=False)
+    seen = size > 1e-9 * size.max()
+    root = size[seen, None] * Vt[seen]
+    inverse = Vt[seen].T / size[seen]
+    share, turn = np.linalg.eigh(inverse.T @ (S / np.outer(scale, scale)) @ inverse)
+    return np.asarray(np.sqrt(np.maximum(1.0 + share, LEAST))[:, None] * (turn.T @ root) * scale)
+
+
+class Near:
+    """What the sum of squares is near θ."""
+
+    def __init__(
+        self,
+        r: FloatArray,
+        J: FloatArray,
+        kinks: Kinks | None,
+        low: FloatArray,
+        high: FloatArray,
+        S: FloatArray | None = None,
+        *,
+        believed: bool = True,
+    ) -> None:
+        self.kinks, self.low, self.high = kinks, low, high
+        self.plain = J if kinks is None else J - (kinks.columns * kinks.counted) @ kinks.slope
+        """J₀"""
+        self.scale = np.linalg.norm(J, axis=0)
+        self.scale[self.scale == 0] = 1.0
+        self.r, self.J = r, J
+        if kinks is not None:  # of all rows, these are what sums of squares depend on
+            p, g = len(self.scale), len(kinks.value)
+            R = np.asarray(np.linalg.qr(np.column_stack([self.plain, kinks.columns, r]), mode="r"))
+            self.J0, self.W, self.r0 = R[:, :p], R[:, p : p + g], R[:, -1]
+            self.J = self.plain + (kinks.columns * (kinks.value >= 0)) @ kinks.slope
+        self.S, self.curved = np.zeros((len(self.scale),) * 2), S is not None and believed
+        if S is not None:
+            C = _with_curvature(self.J, S, self.scale)
+            self.S = C.T @ C - self.J.T @ self.J
+
+    def change(self, step: FloatArray) -> FloatArray:
+        """Return by how much a step changes the residual, shape (N,)."""
+        k = self.kinks
+        if k is None:
+            return np.asarray(self.J @ step)
+        return np.asarray(self.plain @ step + k.columns @ (_cut(k.value + k.slope @ step, 0.0)[0] - _cut(k.value, 0.0)[0]))
+
+    def promise(self, step: FloatArray, *, curved: bool | None = None) -> float:
+        """Return by how much a step lowers the sum of squares; with S or without it, by default as far as it is believed."""
+        bend = self.bend(step) if curved is None else curved * float(step @ self.S @ step)
+        return float(np.sum(self.r**2) - np.sum((self.r + self.change(step)) ** 2)) - bend
+
+    def bend(self, step: FloatArray) -> float:
+        """Return what S adds to the sum of squares, as far as it is believed."""
+        return float(step @ self.S @ step) if self.curved else 0.0
+
+    def step(self, damping: float) -> FloatArray:
+        """Return the step that minimises the sum of squares + damping ‖scale · s‖² within bounds."""
+        J, r = self._squares(self.J, self.r, np.zeros(len(self.scale)))
+        straight = _bounded_step(J, r, self.scale, damping, self.low, self.high)
+        k = self.kinks
+        if k is None:
+            return straight
+        best, best_cost = straight, self._cost(straight, damping)
+        past = float(np.abs(k.slope @ straight).max(initial=0.0))
+        s = np.zeros_like(straight)
+        for width in WIDTHS:
+            for _ in range(TURNS):
+                s, moved = self._turn(s, damping, width * past)
+                if not moved:
+                    break
+            cost = self._cost(s, damping)
+            if cost < best_cost:
+                best, best_cost = s, cost
+        return best
+
+    def _turn(self, s: FloatArray, damping: float, width: float) -> tuple[FloatArray, bool]:
+        """Return a better step, and whether there was one, where kinks are rounded to a width."""
+        k = self.kinks
+        assert k is not None
+        root = np.sqrt(damping) * self.scale
+        r = np.concatenate([self._reduced(s, width), root * s])
+        J = np.vstack([self.J0 + (self.W * _cut(k.value + k.slope @ s, width)[1]) @ k.slope, np.diag(root)])
+        J, r = self._squares(J, r, s)
+        turn = _bounded_step(J, r, self.scale, 0.0, self.low - s, self.high - s)
+        cost, part = self._cost(s, damping, width), 1.0
+        while part > 1e-3:
+            new = s + part * turn
+            if self._cost(new, damping, width) < cost - 1e-9 * abs(cost):
+                return new, True
+            part *= 0.5
+        return s, False
+
+    def _squares(self, J: FloatArray, r: FloatArray, s: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return C, c whose ‖c + C t‖² is, but for a constant, ‖r + J t‖² + (s + t)ᵀ S (s + t)."""
+        if not self.curved:
+            return J, r
+        C = _with_curvature(J, self.S, self.scale)
+        slope = (J.T @ r + self.S @ s) / self.scale
+        return C, np.asarray(np.linalg.lstsq((C / self.scale).T, slope, rcond=None)[0])
+
+    def _reduced(self, s: FloatArray, width: float) -> FloatArray:
+        k = self.kinks
+        assert k is not None
+        return np.asarray(self.r0 + self.J0 @ s + self.W @ (_cut(k.value + k.slope @ s, width)[0] - _cut(k.value, width)[0]))
+
+    def _cost(self, s: FloatArray, damping: float, width: float = 0.0) -> float:
+        return float(np.sum(self._reduced(s, width) ** 2) + damping * np.sum((self.scale * s) ** 2)) + self.bend(s)
+
+
+def _cut(value: FloatArray, width: float) -> tuple[FloatArray, FloatArray]:
+    """Return max(value, 0), rounded to a width, and its derivative."""
+    length = np.sqrt(value**2 + width**2)
+    return 0.5 * (value + length), 0.5 * (1.0 + value / np.maximum(length, 1e-300))
+
+
+def _bounded_step(
+    J: FloatArray, r: FloatArray, scale: FloatArray, damping: float, low: FloatArray, high: FloatArray
+) -> FloatArray:
+    """Return the step that minimises ‖r + J s‖² + damping ‖scale · s‖² within bounds."""
+    p = J.shape[1]
+    A = np.vstack([J / scale, np.sqrt(damping) * np.eye(p)]) if damping > 0 else J / scale
+    b = np.concatenate([-r, np.zeros(p)]) if damping > 0 else -r
+    step = np.linalg.lstsq(A, b, rcond=1e-12)[0] / scale
+    if (step >= low).all() and (step <= high).all():
+        return np.asarray(step)
+    open_low, open_high = np.minimum(low * scale, -1e-15), np.maximum(high * scale, 1e-15)
+    bounded = lsq_linear(A, b, bounds=(open_low, open_high), method="bvls", max_iter=10 * p + 50)
+    return np.clip(np.asarray(bounded.x) / scale, low, high)

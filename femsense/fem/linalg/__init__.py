@@ -1,0 +1,1 @@
+"""Sparse factors and solves."""

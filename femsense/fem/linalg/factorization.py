@@ -1,0 +1,369 @@
+"""Factor once, solve many: the sparse symmetric systems of the body.
+
+A stiffness that is positive definite goes to `femsense.fem.linalg.cholesky`, with its analysis kept for a sparsity pattern. One that
+is not goes to PARDISO of the MKL (through pypardiso) where it is installed, and to SuperLU of SciPy elsewhere. Where the factor
+would not fit into memory, conjugate gradients take its place (see `femsense.fem.linalg.iterative`).
+FEMSENSE_SOLVER chooses by hand: `direct` or `iterative`; `pardiso` or `superlu` send all of them there.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import os
+import weakref
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+import scipy.sparse as sp
+from scipy.sparse.linalg import splu
+
+from femsense.core.arrays import FloatArray, IntArray
+from femsense.core.errors import FemsenseError
+from femsense.fem.linalg.cholesky import cholesky
+from femsense.fem.linalg.iterative import Grid, Levels, UnsettledError, iterative, make_levels
+from femsense.fem.linalg.symbolic import Analysis, analyse
+
+ITERATIVE_FROM = 100_000
+"""Unknowns from which on the memory of a direct factor is looked at. Up to 165 321 unknowns the direct factor was several times faster,
+linear and quadratic (docs/speed.md, `python benchmarks/body.py iterative`), so that memory alone switches."""
+ITERATIVE_LEAST = 60
+"""Bodies with fewer unknowns always have a direct factor: they may be too small for aggregates with rigid motions."""
+MEMORY_SHARE = 0.6
+"""A direct factor may take this share of the memory that is free."""
+LEAST_SHIFT = 1e-6
+"""Share of the typical diagonal entry that is tried first to make a matrix positive definite."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Pattern:
+    """The sparsity pattern of a symmetric matrix in CSC (which is CSR too)."""
+
+    indptr: IntArray
+    """shape (f + 1,)."""
+    indices: IntArray
+    """shape (nnz,)."""
+    upper: IntArray
+    """Entries on and above the diagonal, in CSR, shape (nnz_upper,)."""
+    upper_indptr: npt.NDArray[np.int32]
+    upper_indices: npt.NDArray[np.int32]
+    idle: list[Any] = field(default_factory=list)
+    """PARDISO solvers that hold the analysis of this pattern and no factor that is still needed."""
+    analyses: list[Analysis] = field(default_factory=list)
+    """The analysis for Cholesky, once it was needed."""
+    grid: Grid | None = None
+    """The nodes behind the unknowns, for the iterative solver; None: unknown."""
+    levels_made: list[Levels] = field(default_factory=list)
+    """The levels of the iterative solver, once they were needed."""
+    fits: list[bool] = field(default_factory=list)
+    """Whether a direct factor fits into memory, once that was asked."""
+
+    @property
+    def size(self) -> int:
+        return len(self.indptr) - 1
+
+    def analysis(self) -> Analysis:
+        """Return the analysis for Cholesky, made when it is first asked for."""
+        if not self.analyses:
+            self.analyses.append(analyse(self.indptr, self.indices))
+        return self.analyses[0]
+
+    def levels(self) -> Levels:
+        """Return the levels of the iterative solver, made when they are first asked for."""
+        if not self.levels_made:
+            assert self.grid is not None
+            self.levels_made.append(make_levels(self.indptr, self.indices, self.grid))
+        return self.levels_made[0]
+
+
+def make_pattern(indptr: IntArray, indices: IntArray) -> Pattern:
+    """Return the pattern of a symmetric CSC matrix with sorted indices."""
+    size = len(indptr) - 1
+    rows = np.repeat(np.arange(size), np.diff(indptr))
+    upper = np.flatnonzero(indices >= rows)
+    counts = np.bincount(rows[upper], minlength=size)
+    return Pattern(
+        indptr, indices, upper, np.concatenate([[0], np.cumsum(counts)]).astype(np.int32), indices[upper].astype(np.int32)
+    )
+
+
+class Factorization(Protocol):
+    """A factorised stiffness of the free unknowns."""
+
+    negative: int
+    """Negative pivots: 0 where the matrix is positive definite (Sylvester's law of inertia)."""
+    size: int
+    """Number of unknowns."""
+    bytes: int
+    """Rough size in memory."""
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        """Return K⁻¹ right, shape (f,) or (f, k)."""
+        ...
+
+    def gram(self, columns: sp.csc_matrix) -> FloatArray:
+        """Return BᵀK⁻¹B, shape (k, k), for sparse columns B, shape (f, k)."""
+        ...
+
+
+def factorize(pattern: Pattern, values: FloatArray) -> Factorization | None:
+    """Factorise a symmetric matrix; None where it is singular or not finite.
+
+    Arguments:
+        pattern: its sparsity pattern.
+        values: its entries in CSC order [N/m], shape (nnz,).
+    """
+    if not np.isfinite(values).all():
+        return None
+    if _iterates(pattern):
+        found = _iterate(pattern, values)
+        if found is not None:
+            return found
+        _require_memory(pattern)
+    return (_cholesky(pattern, values) if _wanted() == "cholesky" else None) or _factorize_any(pattern, values)
+
+
+def factorize_definite(
+    pattern: Pattern, values: FloatArray, *, first: float = 0.0, tries: int = 30, single: bool = False, indefinite: bool = False
+) -> tuple[Factorization | None, float]:
+    """Factorise matrix + shift·I with the smallest tried shift that makes it positive definite.
+
+    Arguments:
+        first: the shift to try first where one is needed [N/m], such as a quarter of that which served near by.
+        single: single precision is enough, as for a step that is corrected by others.
+        indefinite: the matrix is known not to be positive definite as it is.
+
+    Returns:
+        the factorisation (None where nothing helped) and the shift [N/m], 0 where none was needed.
+    """
+    factor = None if indefinite else _definite(pattern, values, single)
+    if factor is not None:
+        return factor, 0.0
+    least = least_shift(pattern, values)
+    if not 0.0 < least < np.inf:
+        return None, 0.0
+    shift, diagonal = max(first, least), _diagonal(pattern)
+    for _ in range(tries):
+        shifted = values.copy()
+        shifted[diagonal] += shift
+        factor = _definite(pattern, shifted, single)
+        if factor is not None:
+            return factor, shift
+        shift *= 4.0
+    return None, shift
+
+
+def least_shift(pattern: Pattern, values: FloatArray) -> float:
+    """Return the smallest shift that `factorize_definite` tries [N/m]: a matrix that needs more is indefinite, in single precision, too."""
+    size = np.abs(values[_diagonal(pattern)])
+    return LEAST_SHIFT * float(np.median(size)) if len(size) and np.isfinite(size).all() else np.inf
+
+
+def _diagonal(pattern: Pattern) -> IntArray:
+    """Return where the entries on the diagonal are, shape (f,)."""
+    columns = np.repeat(np.arange(pattern.size), np.diff(pattern.indptr))
+    return np.flatnonzero(pattern.indices == columns)
+
+
+def _wanted() -> str:
+    """Return which direct solver is wanted."""
+    chosen = os.environ.get("FEMSENSE_SOLVER", "").lower()
+    return "cholesky" if chosen in ("", "direct", "iterative") else chosen
+
+
+def _iterates(pattern: Pattern) -> bool:
+    """Return whether a pattern is one for conjugate gradients: by choice, or because its factor does not fit into memory."""
+    chosen = os.environ.get("FEMSENSE_SOLVER", "").lower()
+    if pattern.grid is None or pattern.size < ITERATIVE_LEAST:
+        return False
+    if chosen:
+        return chosen == "iterative"
+    if pattern.size < ITERATIVE_FROM:
+        return False
+    if not pattern.fits:  # decided once: the memory of a factor that is made is no longer free, but it is used again
+        pattern.fits.append(direct_bytes(pattern) <= MEMORY_SHARE * available_memory())
+    return not pattern.fits[0]
+
+
+def _iterate(pattern: Pattern, values: FloatArray) -> Factorization | None:
+    """Return a stiffness solved by conjugate gradients, None where it is not definite or they take too long."""
+    try:
+        return iterative(pattern.levels(), values)
+    except UnsettledError:
+        return None
+
+
+def _require_memory(pattern: Pattern) -> None:
+    """Raise FemsenseError where a direct factor is needed and does not fit into memory."""
+    needed, free = direct_bytes(pattern), MEMORY_SHARE * available_memory()
+    if needed > free:
+        raise FemsenseError(
+            f"conjugate gradients cannot solve this stiffness (not definite, or too ill-conditioned), and its factor needs {needed / 1e9:.1f} GB where {free / 1e9:.1f} GB may be used: "
+            "(a) smaller loads, (b) a coarser mesh, (c) more memory"
+        )
+
+
+def direct_bytes(pattern: Pattern) -> int:
+    """Return the memory that the direct factor takes while it is made [bytes]."""
+    analysis = pattern.analysis()
+    return 8 * (int(analysis.offset[-1]) + analysis.stack)
+
+
+def available_memory() -> float:
+    """Return the free memory of the machine [bytes]; inf where it is unknown."""
+    try:
+        with open("/proc/meminfo", encoding="ascii") as lines:
+            return next(1024.0 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable"))
+    except (OSError, StopIteration):
+        pass
+    try:
+        return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    except (AttributeError, ValueError, OSError):
+        return float("inf")
+
+
+def _cholesky(pattern: Pattern, values: FloatArray, single: bool = False) -> Factorization | None:
+    return cholesky(pattern.analysis(), values, single=single)
+
+
+def _definite(pattern: Pattern, values: FloatArray, single: bool = False) -> Factorization | None:
+    """Return the factor of a matrix that is positive definite, None where it is not."""
+    if _iterates(pattern):
+        try:
+            return iterative(pattern.levels(), values)
+        except UnsettledError:
+            _require_memory(pattern)
+    if _wanted() == "cholesky":
+        return _cholesky(pattern, values, single)
+    factor = factorize(pattern, values)
+    return factor if factor is not None and factor.negative == 0 else None
+
+
+def _factorize_any(pattern: Pattern, values: FloatArray) -> Factorization | None:
+    """Factorise a matrix that may be indefinite."""
+    if pardiso_library() is not None:
+        return _factorize_pardiso(pattern, values)
+    matrix = sp.csc_matrix((values, pattern.indices, pattern.indptr), shape=(pattern.size,) * 2)
+    try:
+        return _SuperLU(splu(matrix, permc_spec="NATURAL", diag_pivot_thresh=0.0, options={"SymmetricMode": True}))
+    except RuntimeError:  # exactly singular
+        return None
+
+
+class _SuperLU:
+    def __init__(self, lu: Any) -> None:
+        kept_order = bool((lu.perm_r == np.arange(len(lu.perm_r))).all())
+        pivots = lu.U.diagonal()
+        self.negative = int((pivots <= 0).sum()) if kept_order else len(pivots)
+        self.size = len(pivots)
+        self.bytes = 12 * int(lu.nnz)
+        self._lu = lu
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        return np.asarray(self._lu.solve(np.ascontiguousarray(right)))
+
+    def gram(self, columns: sp.csc_matrix) -> FloatArray:
+        return np.asarray(columns.T @ self.solve(columns.toarray()))
+
+
+@functools.cache
+def pardiso_library() -> Any:
+    """Return MKL's PARDISO as a C function, or None where it is not installed or not wanted."""
+    if _wanted() == "superlu":
+        return None
+    try:
+        from pypardiso.pardiso_wrapper import PyPardisoSolver
+
+        solver = PyPardisoSolver()
+    except (ImportError, OSError):
+        return None
+    threads = int(os.environ.get("FEMSENSE_THREADS", "1"))
+    solver.libmkl.MKL_Set_Num_Threads(threads)
+    return solver.libmkl.pardiso
+
+
+class _PardisoHandle:
+    """PARDISO's memory for one pattern: its analysis, and one factor at a time."""
+
+    def __init__(self, pattern: Pattern) -> None:
+        self.indptr, self.indices, self.size = pattern.upper_indptr, pattern.upper_indices, pattern.size
+        self.pt = np.zeros(64, dtype=np.int64)
+        self.iparm = np.zeros(64, dtype=np.int32)
+        # own settings, METIS, pivot floor 1e-8, count the factor's entries, Bunch–Kaufman, indices from 0
+        self.iparm[[0, 1, 9, 17, 20, 34]] = 1, 2, 8, -1, 1, 1
+        self.values = np.zeros(len(self.indices))
+        self.call(11)
+        self.entries = int(self.iparm[17])
+        weakref.finalize(self, _release, self.pt, self.iparm, self.size)
+
+    def call(self, phase: int, right: FloatArray | None = None, answer: FloatArray | None = None) -> int:
+        count = 1 if right is None or right.ndim == 1 else right.shape[1]
+        return _pardiso(self.pt, phase, self.size, self.values, self.indptr, self.indices, count, self.iparm, right, answer)
+
+
+def _pardiso(
+    pt: Any, phase: int, size: int, values: Any, indptr: Any, indices: Any, count: int, iparm: Any, right: Any, answer: Any
+) -> int:
+    def integer(value: int) -> Any:
+        return ctypes.byref(ctypes.c_int32(value))
+
+    def at(array: Any, kind: Any) -> Any:
+        return array.ctypes.data_as(ctypes.POINTER(kind)) if array is not None else None
+
+    error = ctypes.c_int32(0)
+    pardiso_library()(
+        at(pt, ctypes.c_int64),
+        integer(1),
+        integer(1),
+        integer(-2),
+        integer(phase),
+        integer(size),
+        at(values, ctypes.c_double),
+        at(indptr, ctypes.c_int32),
+        at(indices, ctypes.c_int32),
+        at(np.zeros(1, np.int32), ctypes.c_int32),
+        integer(count),
+        at(iparm, ctypes.c_int32),
+        integer(0),
+        at(right, ctypes.c_double),
+        at(answer, ctypes.c_double),
+        ctypes.byref(error),
+    )
+    return int(error.value)
+
+
+def _release(pt: Any, iparm: Any, size: int) -> None:
+    _pardiso(pt, -1, size, None, np.zeros(1, np.int32), np.zeros(1, np.int32), 1, iparm, None, None)
+
+
+class _Pardiso:
+    def __init__(self, handle: _PardisoHandle, pattern: Pattern) -> None:
+        self.negative = int(handle.iparm[22]) + int(handle.iparm[13])  # negative eigenvalues and perturbed pivots
+        self.size = handle.size
+        self.bytes = 8 * handle.entries
+        self._handle = handle
+        weakref.finalize(self, pattern.idle.append, handle)
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        b = np.asfortranarray(right, dtype=np.float64)
+        if b.size == 0:
+            return np.zeros_like(b)
+        x = np.empty_like(b, order="F")
+        error = self._handle.call(33, b, x)
+        if error:
+            raise RuntimeError(f"PARDISO could not solve (error {error})")
+        return x
+
+    def gram(self, columns: sp.csc_matrix) -> FloatArray:
+        return np.asarray(columns.T @ self.solve(columns.toarray()))
+
+
+def _factorize_pardiso(pattern: Pattern, values: FloatArray) -> Factorization | None:
+    handle = pattern.idle.pop() if pattern.idle else _PardisoHandle(pattern)
+    handle.values = values[pattern.upper]
+    if handle.call(22):
+        pattern.idle.append(handle)
+        return None
+    return _Pardiso(handle, pattern)

@@ -1,0 +1,336 @@
+# mypy: allow-untyped-decorators
+"""The symbolic factorisation: what the factors of all matrices of one pattern share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from femsense.core.arrays import IntArray
+from femsense.fem.linalg.ordering import _elimination_tree, _structures
+from femsense.fem.linalg.simd_kernels import PADDING
+
+
+@njit(cache=True)
+def _postorder(parent: IntArray, weight: IntArray) -> IntArray:
+    """Return the nodes of a forest, children before parents, the heaviest child last."""
+    n = len(parent)
+    head, follow = np.full(n, -1, np.int64), np.full(n, -1, np.int64)
+    for j in np.argsort(weight):  # lists are filled from the front: the heaviest comes first in a list, last in the order
+        if parent[j] != -1:
+            follow[j] = head[parent[j]]
+            head[parent[j]] = j
+    order, stack, count = np.empty(n, np.int64), np.empty(n, np.int64), n
+    for root in range(n - 1, -1, -1):
+        if parent[root] != -1:
+            continue
+        top = 0
+        stack[0] = root
+        while top >= 0:
+            j = stack[top]
+            top -= 1
+            count -= 1
+            order[count] = j
+            light = np.int64(head[j])
+            first = top + 1
+            while light != -1:
+                top += 1
+                stack[top] = light
+                light = follow[light]
+            stack[first : top + 1] = stack[first : top + 1][::-1].copy()
+    return order
+
+
+@njit(cache=True)
+def _supernodes(count: IntArray, parent: IntArray, unit: int) -> IntArray:
+    """Return the first column of each supernode and the end; small ones are merged with their parents where few zeros result."""
+    n = len(parent)
+    firsts = np.empty(n + 1, np.int64)
+    zeros = np.zeros(n + 1, np.float64)
+    k = 0
+    for j in range(n):
+        if k > 0 and parent[j - 1] == j and count[j - 1] == count[j] + 1:
+            continue
+        firsts[k] = j
+        k += 1
+    firsts[k] = n
+    # merge from the left: a stack of supernodes, the top is tried with what follows
+    kept = np.empty(n + 1, np.int64)
+    top = 0
+    for s in range(k):
+        first, last = firsts[s], firsts[s + 1] - 1
+        empty = 0.0
+        while top > 0:
+            below = kept[top - 1]
+            if parent[first - 1] == -1 or parent[first - 1] > last:
+                break
+            wide, own = first - below, last + 1 - first
+            height = own + count[last]
+            fill = 0.0
+            for c in range(below, first):
+                fill += (first - c) + height - (count[c] + 1)
+            total = 0.5 * (wide + own) * (wide + own + 1) + (wide + own) * count[last]
+            share = (fill + empty) / total
+            columns = unit * (wide + own)
+            if not (columns <= 12 or (columns <= 36 and share < 0.2) or (columns <= 96 and share < 0.08) or share < 0.02):
+                break
+            empty = fill + empty
+            first = below
+            top -= 1
+        kept[top] = first
+        zeros[top] = empty
+        top += 1
+    kept[top] = n
+    return kept[: top + 1].copy()
+
+
+@njit(cache=True)
+def _relations(firsts: IntArray, start: IntArray, rows: IntArray) -> tuple[IntArray, IntArray, IntArray, IntArray]:
+    """Return parent of each supernode, its rows (indptr, indices), and where these stand in the front of the parent."""
+    count = len(firsts) - 1
+    n = firsts[count]
+    owner = np.empty(n, np.int64)
+    for s in range(count):
+        owner[firsts[s] : firsts[s + 1]] = s
+    begin = np.zeros(count + 1, np.int64)
+    for s in range(count):
+        last = firsts[s + 1] - 1
+        begin[s + 1] = begin[s] + start[last + 1] - start[last]
+    below = np.empty(begin[count], np.int64)
+    place = np.empty(begin[count], np.int64)
+    parent = np.full(count, -1, np.int64)
+    for s in range(count):
+        last = firsts[s + 1] - 1
+        below[begin[s] : begin[s + 1]] = rows[start[last] : start[last + 1]]
+        if begin[s + 1] > begin[s]:
+            parent[s] = owner[below[begin[s]]]
+    where = np.empty(n, np.int64)
+    for s in range(count):
+        p = parent[s]
+        if p == -1:
+            continue
+        own = firsts[p + 1] - firsts[p]
+        for q in range(begin[p], begin[p + 1]):
+            where[below[q]] = own + q - begin[p]
+        for q in range(begin[s], begin[s + 1]):
+            i = below[q]
+            place[q] = i - firsts[p] if i < firsts[p + 1] else where[i]
+    return parent, begin, below, place
+
+
+@njit(cache=True)
+def _targets(
+    indptr: IntArray,
+    indices: IntArray,
+    order: IntArray,
+    inverse: IntArray,
+    firsts: IntArray,
+    begin: IntArray,
+    below: IntArray,
+    unit: int,
+) -> tuple[IntArray, npt.NDArray[np.int32], npt.NDArray[np.int32]]:
+    """Return where the entries of a matrix (in its scalar CSC) go: their begin for each supernode, source, place in its panel."""
+    source = np.empty(len(indices), np.int32)
+    target = np.empty(len(indices), np.int32)
+    where = np.empty(len(order), np.int64)
+    entries = np.zeros(len(firsts), np.int64)
+    k = 0
+    for s in range(len(firsts) - 1):
+        own = firsts[s + 1] - firsts[s]
+        height = unit * (own + begin[s + 1] - begin[s])
+        for q in range(begin[s], begin[s + 1]):
+            where[below[q]] = own + q - begin[s]
+        for j in range(firsts[s], firsts[s + 1]):
+            for b in range(unit):
+                column = unit * order[j] + b
+                at = (unit * (j - firsts[s]) + b) * height
+                for p in range(indptr[column], indptr[column + 1]):
+                    node, a = divmod(indices[p], unit)
+                    i = inverse[node]
+                    if i < j or (i == j and a < b):
+                        continue
+                    line = i - firsts[s] if i < firsts[s + 1] else where[i]
+                    source[k] = p
+                    target[k] = at + unit * line + a
+                    k += 1
+        entries[s + 1] = k
+    return entries, source[:k].copy(), target[:k].copy()
+
+
+@njit(cache=True)
+def _runs(begin: IntArray, place: IntArray) -> tuple[IntArray, IntArray]:
+    """Return the begin of each supernode's runs of rows that follow each other in the parent's front too, and where each run begins."""
+    heads = np.zeros(len(begin), np.int64)
+    runs = np.empty(len(place), np.int64)
+    k = 0
+    for s in range(len(begin) - 1):
+        for q in range(begin[s], begin[s + 1]):
+            if q == begin[s] or place[q] != place[q - 1] + 1:
+                runs[k] = q - begin[s]
+                k += 1
+        heads[s + 1] = k
+    return heads, runs[:k].copy()
+
+
+@njit(cache=True)
+def _rooms(parent: IntArray, begin: IntArray, unit: int) -> tuple[IntArray, int]:
+    """Return where the update matrix of each supernode lives until its parent has taken it, and how much room all of them need.
+
+    Each takes the first gap that is large enough.
+    """
+    count = len(parent)
+    room, alive, kept, most = np.zeros(count, np.int64), np.empty(count, np.int64), 0, 0
+    for s in range(count):
+        size = (unit * (begin[s + 1] - begin[s])) ** 2
+        at, end = 0, 0
+        while at < kept:
+            other = alive[at]
+            if room[other] - end >= size:
+                break
+            end = room[other] + (unit * (begin[other + 1] - begin[other])) ** 2
+            at += 1
+        room[s] = end
+        most = max(most, end + size)
+        alive[at + 1 : kept + 1] = alive[at:kept].copy()
+        alive[at] = s
+        kept += 1
+        left = 0
+        for k in range(kept):
+            if parent[alive[k]] != s and (alive[k] != s or size > 0):
+                alive[left] = alive[k]
+                left += 1
+        kept = left
+    return room, most
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Analysis:
+    """What the factorisation of every matrix of one pattern shares. Nodes are `unit` unknowns each."""
+
+    unit: int
+    order: IntArray
+    """Unknowns in the order of elimination, shape (f,)."""
+    firsts: IntArray
+    """First node of each supernode, and the end, shape (s + 1,)."""
+    parent: IntArray
+    """Supernode above, −1 at a root, shape (s,)."""
+    begin: IntArray
+    """Where the nodes below each supernode begin in `below`, shape (s + 1,)."""
+    below: IntArray
+    place: IntArray
+    """Where each of `below` stands in the front of the parent."""
+    offset: IntArray
+    """Where the panel of each supernode begins in the factor, shape (s + 1,)."""
+    entries: IntArray
+    """Where the entries of the matrix that go into each panel begin in `source` and `target`, shape (s + 1,)."""
+    source: npt.NDArray[np.int32]
+    target: npt.NDArray[np.int32]
+    """Their places in the matrix and in the panel."""
+    heads: IntArray
+    """Where the runs of each supernode begin in `runs`, shape (s + 1,)."""
+    runs: IntArray
+    """First row of each run of rows below that follow each other in the front of the parent as well."""
+    room: IntArray
+    """Where the update matrix of each supernode lives, shape (s,)."""
+    stack: int
+    """Entries of the room of all update matrices."""
+    rank: IntArray
+    """Place of each unknown in the order of elimination, shape (f,)."""
+    owner: IntArray
+    """Supernode of each unknown in the order of elimination, shape (f,)."""
+    idle: dict[tuple[str, int], list[npt.NDArray[Any]]]
+    """Memory of what is gone, by kind and number of entries, taken again by what is new: pages that are fresh from the system take longer than a factor."""
+    columns: dict[tuple[str, int], npt.NDArray[Any]]
+    """Zeros for the columns of `Cholesky.gram`, by kind and number: it leaves them as it finds them."""
+
+    @property
+    def size(self) -> int:
+        return len(self.order)
+
+    @property
+    def tallest(self) -> int:
+        """Rows of the tallest front."""
+        return int(self.unit * (np.diff(self.firsts) + np.diff(self.begin)).max(initial=0))
+
+    def take(self, kind: str, entries: int) -> npt.NDArray[Any]:
+        """Return memory for so many numbers and what may be read beyond them."""
+        size = entries + PADDING
+        try:
+            return self.idle.setdefault((kind, size), []).pop()
+        except IndexError:
+            return np.empty(size, kind)
+
+    def give_back(self, memory: npt.NDArray[Any]) -> None:
+        """Let others take memory that is needed no more."""
+        self.idle[memory.dtype.char, len(memory)].append(memory)
+
+
+def analyse(indptr: IntArray, indices: IntArray) -> Analysis:
+    """Analyse the pattern of a symmetric matrix in CSC with sorted indices; its order is taken as one of little fill."""
+    unit = 3 if _has_blocks(indptr, indices) else 1
+    heads, entries = np.asarray(indptr, np.int64), np.asarray(indices, np.int64)
+    counts = np.diff(heads)[::unit] // unit
+    rows = np.concatenate([[0], np.cumsum(counts)])
+    columns = entries[_ranges(heads[:-1:unit], counts, unit)] // unit
+    parent = _elimination_tree(rows, columns)
+    order = _postorder(parent, np.diff(_structures(rows, columns, parent)[0]))
+    inverse = np.empty_like(order)
+    inverse[order] = np.arange(len(order))
+    columns = inverse[columns[_ranges(rows[:-1][order], counts[order], 1)]]
+    rows = np.concatenate([[0], np.cumsum(counts[order])])
+    parent = np.where(parent[order] >= 0, inverse[parent[order]], -1)
+    start, structure = _structures(rows, columns, parent)
+    firsts = _supernodes(np.diff(start), parent, unit)
+    above, begin, below, place = _relations(firsts, start, structure)
+    width = unit * np.diff(firsts)
+    offset = np.concatenate([[0], np.cumsum(width * (width + unit * np.diff(begin)))])
+    starts, source, target = _targets(heads, entries, order, inverse, firsts, begin, below, unit)
+    room, stack = _rooms(above, begin, unit)
+    run_heads, runs = _runs(begin, place)
+    unknowns = (unit * order[:, None] + np.arange(unit)).ravel()
+    rank = np.empty_like(unknowns)
+    rank[unknowns] = np.arange(len(unknowns))
+    owner = np.repeat(np.arange(len(above)), width)
+    return Analysis(
+        unit=unit,
+        order=unknowns,
+        firsts=firsts,
+        parent=above,
+        begin=begin,
+        below=below,
+        place=place,
+        offset=offset,
+        entries=starts,
+        source=source,
+        target=target,
+        heads=run_heads,
+        runs=runs,
+        room=room,
+        stack=int(stack),
+        rank=rank,
+        owner=owner,
+        idle={},
+        columns={},
+    )
+
+
+def _ranges(starts: IntArray, counts: IntArray, step: int) -> IntArray:
+    """Return starts[0], starts[0] + step, … counts[0] times, then the same of starts[1], and so on."""
+    ends = np.cumsum(counts)
+    inner = np.arange(int(counts.sum()), dtype=np.int64) - np.repeat(ends - counts, counts)
+    return np.asarray(np.repeat(starts, counts) + step * inner)
+
+
+def _has_blocks(indptr: IntArray, indices: IntArray) -> bool:
+    """Return whether a pattern consists of full 3 × 3 blocks."""
+    if (len(indptr) - 1) % 3 or len(indices) % 9:
+        return False
+    counts = np.diff(indptr).reshape(-1, 3)
+    if (counts != counts[:, :1]).any() or (counts % 3).any():
+        return False
+    triples = np.asarray(indices).reshape(-1, 3)
+    return bool((triples[:, 0] % 3 == 0).all() and (np.diff(triples, axis=1) == 1).all())

@@ -1,0 +1,1 @@
+"""States at the rate of a camera."""

@@ -1,0 +1,1 @@
+"""Files: robots, recordings, clouds, meshes, results."""

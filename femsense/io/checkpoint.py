@@ -1,0 +1,124 @@
+"""How far a long computation has come, kept in a file: one that is killed goes on there.
+
+The file is a pickle, of which only numbers and the package's own data are read back, so that a folder from elsewhere runs nothing.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import pickle
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import is_dataclass, replace
+from pathlib import Path
+from types import TracebackType
+from typing import Any, BinaryIO, TypeVar
+
+from femsense.core.errors import FemsenseError
+from femsense.fem.equilibrium import Equilibrium
+from femsense.fem.linalg.factorization import Pattern
+from femsense.fem.linalg.symbolic import Analysis
+from femsense.io.files import json_text, write_beside
+from femsense.model.effects import Effect
+
+Course = TypeVar("Course")
+UNFINISHED = ".unfinished"
+"""Name of the file, in the folder of the results."""
+NUMPY = ("ndarray", "dtype", "scalar", "_reconstruct", "_frombuffer")
+PATHS = ("Path", "PosixPath", "WindowsPath", "PurePosixPath", "PureWindowsPath")
+DIGEST = 32
+"""Bytes at the beginning of the file that say what the search is made from."""
+NEEDLESS: dict[type, tuple[str, Callable[[], Any]]] = {
+    Equilibrium: ("factor", lambda: None),
+    Analysis: ("idle", dict),
+    Pattern: ("idle", list),
+}
+"""What is large and soon made again: factors that later ones start from, and memory that waits for use."""
+UNREADABLE = (OSError, EOFError, ValueError, TypeError, LookupError, AttributeError, ImportError, pickle.UnpicklingError)
+"""What comes of a file that is cut off, or that another version wrote."""
+
+
+class Keeper:
+    """Keeps how far a computation has come, if it is told where: a help that may fail, and then all begins anew."""
+
+    def __init__(self, where: tuple[str | Path, Mapping[str, Any]] | None, effects: Sequence[Effect] = ()) -> None:
+        """where: the file, and what the computation is made from. effects: all those that it may hold; they are not written."""
+        self.file = None if where is None else Path(where[0])
+        self.made_from = b"" if where is None else hashlib.sha256(json_text(where[1]).encode()).digest()
+        self.effects = effects
+        self.last = time.monotonic()
+
+    def keep(self, course: object, *, every: float = 0.0) -> None:
+        """Write how far a computation has come, not more often than `every` so many seconds."""
+        if self.file is None or time.monotonic() < self.last + every:
+            return
+        with (
+            contextlib.suppress(OSError, TypeError, pickle.PicklingError),
+            write_beside(self.file) as part,
+            part.open("wb") as stream,
+        ):
+            stream.write(self.made_from)
+            _Writer(stream, self.effects).dump(course)
+        self.last = time.monotonic()
+
+    def kept(self, kind: type[Course]) -> Course | None:
+        """Return how far a computation came that is made from the same; None where there is none, or none that can be read."""
+        if self.file is None:
+            return None
+        try:
+            with self.file.open("rb") as stream:
+                if stream.read(DIGEST) != self.made_from:
+                    return None
+                course = _Reader(stream, self.effects).load()
+        except UNREADABLE:
+            return None
+        return course if isinstance(course, kind) else None
+
+    def __enter__(self) -> Keeper:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        """Remove the file, and its folder where it is empty, after a result and after an error that would come again."""
+        if self.file is not None and (error is None or isinstance(error, FemsenseError)):
+            with contextlib.suppress(OSError):
+                self.file.unlink(missing_ok=True)
+                self.file.parent.rmdir()
+
+
+class _Writer(pickle.Pickler):
+    def __init__(self, stream: BinaryIO, effects: Sequence[Effect]) -> None:
+        super().__init__(stream, protocol=5)
+        self.number = {id(effect): i for i, effect in enumerate(effects)}
+
+    def persistent_id(self, thing: Any) -> int | None:
+        if not isinstance(thing, Effect):
+            return None
+        if id(thing) not in self.number:
+            raise pickle.PicklingError(f"{thing.name} is none of the effects")
+        return self.number[id(thing)]
+
+    def reducer_override(self, thing: Any) -> Any:
+        if type(thing) not in NEEDLESS:
+            return NotImplemented
+        name, nothing = NEEDLESS[type(thing)]
+        return replace(thing, **{name: nothing()}).__reduce_ex__(pickle.HIGHEST_PROTOCOL)
+
+
+class _Reader(pickle.Unpickler):
+    def __init__(self, stream: BinaryIO, effects: Sequence[Effect]) -> None:
+        super().__init__(stream)
+        self.effects = effects
+
+    def persistent_load(self, number: Any) -> Effect:
+        return self.effects[int(number)]
+
+    def find_class(self, module: str, name: str) -> Any:
+        package = module.split(".")[0]
+        if (package == "numpy" and name in NUMPY) or (package == "pathlib" and name in PATHS):
+            return super().find_class(module, name)
+        if package == "femsense":
+            found = super().find_class(module, name)
+            if isinstance(found, type) and (is_dataclass(found) or module.startswith("femsense.fem.")):
+                return found
+        raise pickle.UnpicklingError(f"{module}.{name} is no part of a computation")

@@ -1,0 +1,1 @@
+"""Clouds and depth images in files."""

@@ -1,0 +1,98 @@
+"""The cloud of a frame, from a PLY or PCD file or from a depth image; nothing is read before it is asked for."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from femsense.core.arrays import IntArray
+from femsense.core.errors import InputError
+from femsense.io.clouds.images import check_image_size, read_png
+from femsense.model.recording import Camera, Recording
+
+if TYPE_CHECKING:
+    from femsense.pointcloud.cloud import PointCloud
+
+
+def read_frame_cloud(recording: Recording, k: int, *, view: int = 0) -> PointCloud | None:
+    """Return the cloud of frame k (an index 0 … F − 1) in the frame of its camera; None where the frame has none.
+
+    Arguments:
+        recording: the recording.
+        k: index of the frame.
+        view: index of the camera.
+
+    Raises:
+        InputError: a file that is broken, or of another size than the camera table says.
+    """
+    file = recording.cloud_files[k][view]
+    if file is None:
+        return None
+    if file.suffix.lower() == ".png":
+        return _cloud_of_images(file, recording.color_files[k][view], recording.cameras[view])
+    from femsense.io.clouds.cloud_files import read_cloud
+
+    try:
+        return read_cloud(file)
+    except InputError:
+        raise
+    except Exception as error:
+        raise InputError(
+            "not readable as a cloud", where=file, found=f"{type(error).__name__}: {error}", expected="a PLY or PCD file"
+        ) from None
+
+
+def _cloud_of_images(depth_file: Path, color_file: Path | None, camera: Camera | None) -> PointCloud:
+    from femsense.pointcloud.cloud import cloud_from_depth
+
+    if camera is None:
+        raise InputError("a depth image without a camera", where=depth_file, expected="a table [camera] in recording.toml")
+    depth = read_png(depth_file)
+    if depth.ndim != 2 or depth.dtype != np.uint16:
+        raise InputError(
+            "not a depth image", where=depth_file, found=f"{depth.dtype}, shape {depth.shape}", expected="one channel of 16 bits"
+        )
+    check_image_size(depth.shape[1], depth.shape[0], camera, depth_file)
+    color = None
+    if color_file is not None:
+        image = read_png(color_file)
+        check_image_size(image.shape[1], image.shape[0], camera, color_file)
+        color = np.stack([image] * 3, axis=2) if image.ndim == 2 else image[:, :, 2::-1]
+    c = camera
+    return cloud_from_depth(depth, c.fx, c.fy, c.cx, c.cy, c.distortion, c.depth_unit, color=color)
+
+
+def find_clouds(folder: Path, views: tuple[str, ...], numbers: IntArray) -> tuple[Any, Any]:
+    """Return the cloud (or depth) files and the colour files of each frame and view."""
+    clouds, colors = [], []
+    for name in views:
+        found = numbered_files(folder / "clouds" / name, (".ply", ".pcd"))
+        depth = numbered_files(folder / "depth" / name, (".png",))
+        color = numbered_files(folder / "color" / name, (".png",))
+        clouds.append([found.get(n) or depth.get(n) for n in numbers.tolist()])
+        colors.append([color.get(n) if n not in found and n in depth else None for n in numbers.tolist()])
+    return tuple(zip(*clouds)), tuple(zip(*colors))
+
+
+def numbered_files(folder: Path, endings: tuple[str, ...]) -> dict[int, Path]:
+    """Return the files of a folder by the number that is their name."""
+    files: dict[int, Path] = {}
+    for file in sorted(folder.iterdir()) if folder.is_dir() else []:
+        if file.name.startswith(".") or file.suffix.lower() not in endings or not file.is_file():
+            continue
+        if not re.fullmatch("[0-9]+", file.stem):
+            raise InputError(
+                "the name is not a frame number", where=file, found=file.name, expected=f"such as 000000{endings[0]}"
+            )
+        if int(file.stem) in files:
+            raise InputError(
+                "two files for one frame",
+                where=file,
+                found=f"{files[int(file.stem)].name} and {file.name}",
+                expected="one file a frame",
+            )
+        files[int(file.stem)] = file
+    return files

@@ -1,0 +1,70 @@
+"""PNG images as cameras write them: depth of 16 bits and colour."""
+
+from __future__ import annotations
+
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from femsense.core.errors import InputError
+from femsense.model.recording import Camera
+
+
+def read_png(path: Path) -> npt.NDArray[Any]:
+    """Return a PNG image as it is: shape (H, W), or (H, W, 3) in the order blue, green, red. Raises InputError where it is broken."""
+    import cv2
+
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError("cannot be read", where=path, found=error.strerror) from None
+    _check_png(data, path)
+    image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    if image is None:
+        raise InputError("not readable as an image", where=path, found=f"{len(data)} bytes", expected="a PNG image")
+    return np.asarray(image)
+
+
+def png_header(path: Path) -> tuple[int, int, int, int] | None:
+    """Return (width, height, bits a channel, colour type) of a PNG image; None where the file is none."""
+    with path.open("rb") as stream:
+        head = stream.read(26)
+    if len(head) < 26 or head[:8] != b"\x89PNG\r\n\x1a\n" or head[12:16] != b"IHDR":
+        return None
+    return int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big"), head[24], head[25]
+
+
+def check_image_size(width: int, height: int, camera: Camera, file: Path) -> None:
+    """Refuse an image whose size [px] is not that of its camera. Raises InputError."""
+    if (width, height) != (camera.width, camera.height):
+        raise InputError(
+            "the image has another size than the camera table says",
+            where=file,
+            found=f"{width} × {height}",
+            expected=f"{camera.width} × {camera.height}",
+            hint="the intrinsics belong to one size: use those of this one",
+        )
+
+
+def _check_png(data: bytes, path: Path) -> None:
+    """Refuse a PNG that is cut off or damaged: decoders return such images half filled."""
+    position = 8
+    while data[:8] == b"\x89PNG\r\n\x1a\n" and position + 12 <= len(data):
+        length = int.from_bytes(data[position : position + 4], "big")
+        end = position + 12 + length
+        body, mark = data[position + 4 : end - 4], data[end - 4 : end]
+        if end > len(data) or zlib.crc32(body) != int.from_bytes(mark, "big"):
+            break
+        if body[:4] == b"IEND":
+            return
+        position = end
+    raise InputError(
+        "a broken image",
+        where=path,
+        found=f"damaged or cut off at byte {position} of {len(data)}",
+        expected="a whole PNG image",
+        hint="leave the file out: the frame then has no cloud",
+    )

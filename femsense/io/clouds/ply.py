@@ -1,0 +1,139 @@
+"""The vertices of PLY files: ascii, and binary of either byte order.
+
+Format: Greg Turk's PLY 1.0. Read here and not through a library, because a shortened file must be an error and not a cloud of
+whatever was in memory.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from femsense.core.errors import InputError
+
+Column = npt.NDArray[np.generic]
+
+_TYPES = {
+    "char": "i1",
+    "uchar": "u1",
+    "short": "i2",
+    "ushort": "u2",
+    "int": "i4",
+    "uint": "u4",
+    "float": "f4",
+    "double": "f8",
+    "int8": "i1",
+    "uint8": "u1",
+    "int16": "i2",
+    "uint16": "u2",
+    "int32": "i4",
+    "uint32": "u4",
+    "float32": "f4",
+    "float64": "f8",
+}
+_ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Element:
+    name: str
+    count: int
+    properties: tuple[tuple[str, str], ...]
+    """Name and type; the type of a list is `list`."""
+
+    def row_type(self, order: str) -> np.dtype[np.void]:
+        return np.dtype([(name, order + _TYPES[kind]) for name, kind in self.properties])
+
+    @property
+    def regular(self) -> bool:
+        return all(kind != "list" for _, kind in self.properties)
+
+
+def read_ply_vertices(path: str | Path) -> dict[str, Column]:
+    """Return the scalar properties of the vertices of a PLY file by name, each of shape (n,), in the file's own types.
+
+    Raises:
+        InputError: no such file, a broken header, fewer data than it promises, lists in or before the vertices.
+    """
+    file = Path(path)
+    if not file.is_file():
+        raise InputError("no such file", where=file, expected="a PLY file")
+    storage, elements, body = _parse(file.read_bytes(), file)
+    index = next((i for i, element in enumerate(elements) if element.name == "vertex"), None)
+    if index is None:
+        found = ", ".join(element.name for element in elements) or "no elements"
+        raise InputError("the PLY header names no vertices", where=file, found=found, expected="element vertex N")
+    if not all(element.regular for element in elements[: index + 1]):
+        raise InputError(
+            "lists in or before the vertices", where=file, found="property list", expected="vertices of plain numbers first"
+        )
+    vertex = elements[index]
+    if storage == "ascii":
+        return _read_ascii(body, sum(element.count for element in elements[:index]), vertex, file)
+    order = _ORDERS[storage]
+    return _read_binary(body, sum(e.count * e.row_type(order).itemsize for e in elements[:index]), vertex, order, file)
+
+
+def _parse(data: bytes, file: Path) -> tuple[str, list[_Element], bytes]:
+    """Return the storage, the elements, and what comes after the header."""
+    end = data.find(b"end_header")
+    line_end = data.find(b"\n", end)
+    lines = data[: max(end, 0)].decode("ascii", "replace").splitlines()
+    if not lines or lines[0].strip() != "ply" or line_end < 0:
+        raise InputError("not a PLY file", where=file, found=repr(data[:30]), expected="a header from `ply` to `end_header`")
+    storage, elements = "", list[_Element]()
+    for line in lines[1:]:
+        words = line.split()
+        match words:
+            case ["format", name, *_]:
+                storage = name
+            case ["element", name, count] if count.isdigit():
+                elements.append(_Element(name, int(count), ()))
+            case ["property", "list", _, _, name] if elements:
+                elements[-1] = _with_property(elements[-1], name, "list")
+            case ["property", kind, name] if elements and kind in _TYPES:
+                elements[-1] = _with_property(elements[-1], name, kind)
+            case [] | ["comment" | "obj_info", *_]:
+                continue
+            case _:
+                raise InputError(
+                    "a line of the PLY header that says nothing", where=file, found=line, expected="format, element, property"
+                )
+    if storage not in _ORDERS:
+        raise InputError("unknown storage", where=file, found=f"format {storage}", expected=", ".join(_ORDERS))
+    return storage, elements, data[line_end + 1 :]
+
+
+def _with_property(element: _Element, name: str, kind: str) -> _Element:
+    return _Element(element.name, element.count, (*element.properties, (name, kind)))
+
+
+def _short(file: Path, found: str, expected: str) -> InputError:
+    return InputError("a broken or shortened PLY file", where=file, found=found, expected=expected)
+
+
+def _read_binary(body: bytes, start: int, vertex: _Element, order: str, file: Path) -> dict[str, Column]:
+    kind = vertex.row_type(order)
+    size = vertex.count * kind.itemsize
+    if len(body) < start + size:
+        whole = max(len(body) - start, 0) // max(kind.itemsize, 1)
+        raise _short(file, f"{whole} whole vertices", f"{vertex.count} vertices, as the header says")
+    rows = np.frombuffer(body, dtype=kind, count=vertex.count, offset=start)
+    return {name: np.ascontiguousarray(rows[name]) for name, _ in vertex.properties}
+
+
+def _read_ascii(body: bytes, skip: int, vertex: _Element, file: Path) -> dict[str, Column]:
+    lines = [line.split() for line in body.decode("ascii", "replace").splitlines() if line.strip()]
+    rows = lines[skip : skip + vertex.count]
+    width = len(vertex.properties)
+    if len(rows) < vertex.count or any(len(row) != width for row in rows):
+        bad = next((i for i, row in enumerate(rows) if len(row) != width), len(rows))
+        raise _short(file, f"{len(rows)} vertices; vertex {bad} is not whole", f"{vertex.count} vertices of {width} numbers")
+    table = np.array(rows, dtype=object).reshape(vertex.count, width)
+    try:
+        return {name: table[:, i].astype(_TYPES[kind]) for i, (name, kind) in enumerate(vertex.properties)}
+    except ValueError as error:
+        raise _short(file, str(error), "numbers") from None

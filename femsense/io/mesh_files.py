@@ -1,0 +1,439 @@
+"""Mesh files: tetrahedra in any format that meshio reads, closed surfaces through fTetWild (cached), and element quality."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import importlib.util
+import io
+import os
+import re
+import secrets
+import subprocess
+import sys
+import tempfile
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from femsense.core.arrays import FloatArray, IntArray
+from femsense.core.errors import InputError, MissingDependency
+from femsense.core.text import near
+from femsense.fem.mesh import EDGES, TetMesh, element_volumes, oriented
+from femsense.io.files import PART_PREFIX, write_beside
+from femsense.io.meshing.surface import check_finite, merged, repaired
+
+SURFACE_ENDINGS = (".ply", ".stl", ".obj", ".off")
+SOLID_KINDS = ("hexahedron", "wedge", "pyramid", "hexahedron20", "hexahedron27", "wedge15", "pyramid13")
+FTETWILD = """
+import importlib.util, sys, types
+import numpy as np
+if importlib.util.find_spec("pyvista") is None:  # some versions import it for an accessor that is not used here
+    sys.modules["pytetwild._accessor"] = types.ModuleType("pytetwild._accessor")
+import pytetwild
+data = np.load("surface.npz")
+nodes, tets = pytetwild.tetrahedralize(
+    data["points"], data["triangles"], edge_length_fac=float(data["edge"]), epsilon=float(data["envelope"]), vtk_ordering=True,
+    quiet=True,
+)
+np.savez("tets.npz", nodes=nodes, tets=tets)
+"""
+EDGE_FRACTION = 0.05
+"""Edge length of a mesh made from a surface, over the diagonal of its bounding box."""
+FILL_SECONDS = 300.0
+"""fTetWild is given up after this time."""
+ENVELOPE = 1e-3
+"""How far a mesh made from a surface may leave it, over the diagonal of its bounding box."""
+
+
+def read_tets(path: Path, *, where: str | None = None) -> TetMesh:
+    """Return the tetrahedra of a mesh file, in the file's unit, corner nodes first.
+
+    A closed surface is tetrahedralised on first use; the result is kept beside it (or in the cache folder). Nodes that no tetrahedron uses
+    are dropped with a warning. A mesh whose elements are all inverted has another order of nodes and is turned.
+
+    Arguments:
+        path: the file.
+        where: what a message names; by default the file.
+
+    Raises:
+        InputError: no such file, not readable, no tetrahedra, other solid elements, an open surface.
+    """
+    where = where or str(path)
+    _check_exists(path, where)
+    if path.suffix.lower() in SURFACE_ENDINGS:
+        return _tets_of_surface(path, *read_surface(path, where=where), where)
+    points, cells = read_cells(path, where)
+    kinds = [kind for kind in ("tetra", "tetra10") if kind in cells]
+    others = sorted(set(cells) & set(SOLID_KINDS))
+    if others or len(kinds) > 1:
+        raise InputError(
+            "elements that femsense does not compute with",
+            where=where,
+            found=", ".join(sorted(cells)),
+            expected="tetrahedra of one kind (tetra or tetra10)",
+            hint="split them into tetrahedra where the mesh is made",
+        )
+    if kinds:
+        return ordered_tets(points, cells[kinds[0]], where)
+    if "triangle" in cells:
+        return _tets_of_surface(path, *closed_surface(points, cells["triangle"], where), where)
+    raise InputError(
+        "the mesh has no tetrahedra",
+        where=where,
+        found=", ".join(sorted(cells)) or "no cells",
+        expected="tetra or tetra10 cells, or a closed surface of triangles",
+    )
+
+
+def read_surface(path: Path, *, where: str | None = None) -> tuple[FloatArray, IntArray]:
+    """Return points, shape (n, 3), in the file's unit, and triangles, shape (t, 3), of a closed surface. Raises InputError."""
+    where = where or str(path)
+    _check_exists(path, where)
+    points, triangles = read_triangles(path, where=where)
+    return closed_surface(points, triangles, where)
+
+
+def read_triangles(path: Path, *, where: str | None = None) -> tuple[FloatArray, IntArray]:
+    """Return points, shape (n, 3), and triangles, shape (t, 3), of a surface file, equal points merged. Raises InputError."""
+    import trimesh
+
+    where = where or str(path)
+    try:
+        surface: Any = trimesh.load_mesh(str(path), process=False)  # else triangles that are not finite would leave holes
+        points, triangles = np.array(surface.vertices, dtype=np.float64), np.array(surface.faces, dtype=np.int64)
+    except Exception as error:
+        raise InputError(
+            "not readable as a surface",
+            where=where,
+            found=_reason(error),
+            expected="triangles (ply, stl, obj, off)",
+            hint="is the file whole, and what its ending says?",
+        ) from None
+    if not len(triangles):
+        raise _no_triangles(path, where)
+    check_finite(points, where)
+    return merged(points, triangles)
+
+
+def _no_triangles(path: Path, where: str) -> InputError:
+    """Return what to say of a file without triangles: points alone are a cloud; else it is something else than its ending says."""
+    with path.open("rb") as stream:
+        head = stream.read(1_000_000)
+    announced, size = int.from_bytes(head[80:84], "little"), path.stat().st_size
+    if path.suffix.lower() == ".stl" and size >= 84 and not head.lstrip().startswith(b"solid") and announced:
+        return InputError(
+            "the file does not hold what it announces",
+            where=where,
+            found=f"{announced} triangles announced, room for {(size - 84) // 50}",
+            expected="a whole binary STL file",
+            hint="copy or export it again",
+        )
+    declared = re.search(rb"^element vertex (\d+)", head, re.MULTILINE)
+    count = int(declared[1]) if declared else len(re.findall(rb"^v\s", head, re.MULTILINE))
+    if count:
+        return InputError(
+            "the surface has no triangles",
+            where=where,
+            found=f"a cloud of {count} points",
+            expected="triangles",
+            hint="reconstruct a closed surface first (MeshLab, Open3D: Poisson reconstruction)",
+        )
+    return InputError(
+        "the surface has no triangles",
+        where=where,
+        found="no points either",
+        expected="triangles",
+        hint="is this file what its ending says?",
+    )
+
+
+def tetrahedralise(
+    points: FloatArray,
+    triangles: IntArray,
+    *,
+    edge_fraction: float = EDGE_FRACTION,
+    envelope: float = ENVELOPE,
+    where: str = "surface",
+    check_volume: bool = True,
+    seconds: float = FILL_SECONDS,
+) -> TetMesh:
+    """Return tetrahedra that fill a closed surface (fTetWild; another mesh each time, see `_tets_of_surface`).
+
+    Arguments:
+        points: shape (n, 3), any unit.
+        triangles: shape (t, 3), outward; a cavity's surface points into the cavity.
+        edge_fraction: wanted edge length over the diagonal of the bounding box [1].
+        envelope: how far the mesh may leave the surface, over that diagonal [1].
+        where: what a message names.
+        check_volume: warn where the tetrahedra hold more or less than the surface (which may where shells cross).
+        seconds: it is given up after so long [s].
+
+    Raises:
+        InputError: where nothing came out, or not in time. MissingDependency: without pytetwild.
+    """
+    nodes, tets = _run_ftetwild(points, triangles, edge_fraction, envelope, where, seconds)
+    if not len(tets):
+        raise InputError(
+            "no tetrahedra came out of this surface",
+            where=where,
+            found=f"{len(triangles)} triangles",
+            expected="a closed surface around a volume",
+        )
+    mesh = oriented(_compact(nodes, tets))
+    corners = points[triangles]
+    inside = float(np.linalg.det(corners).sum() / 6.0)  # Σ a · (b × c) / 6 over outward triangles
+    filled = float(element_volumes(mesh).sum()) / inside if inside else np.nan
+    if check_volume and not 0.95 < filled < 1.05:
+        warnings.warn(
+            f"{where}: the tetrahedra fill {100 * filled:.3g} % of the surface's volume; are its walls thin?", stacklevel=4
+        )
+    return mesh
+
+
+def write_mesh(mesh: TetMesh, path: Path) -> None:
+    """Write a mesh in metres, in the format that the ending names (.vtu keeps all digits)."""
+    import meshio
+
+    kind = "tetra10" if mesh.is_quadratic else "tetra"
+    with write_beside(path) as part:
+        meshio.Mesh(np.asarray(mesh.nodes), [(kind, np.asarray(mesh.tets))]).write(part)
+
+
+def mesh_companions(path: Path) -> list[Path]:
+    """Return the files that a mesh needs to load back the same: itself, the other files of its format, kept tetrahedra."""
+    pairs = {".node": (".ele",), ".ele": (".node",), ".xdmf": (".h5",), ".xmf": (".h5",)}
+    files = [path, *(path.with_suffix(ending) for ending in pairs.get(path.suffix.lower(), ()))]
+    if path.suffix.lower() in SURFACE_ENDINGS:
+        places = kept_tets(path, *read_surface(path))
+        files += [next((place for place in places if place.is_file()), path)]
+    return [file for file in dict.fromkeys(files) if file.is_file()]
+
+
+def radius_ratio(mesh: TetMesh) -> FloatArray:
+    """Return 3 × inradius / circumradius of each corner tetrahedron [1], shape (m,): 1 regular, 0 flat."""
+    corners = mesh.nodes[mesh.tets[:, :4]]
+    a, b, c = (corners[:, i] - corners[:, 0] for i in (1, 2, 3))
+    volume = np.abs(element_volumes(mesh))
+    faces = [np.cross(a, b), np.cross(b, c), np.cross(c, a), np.cross(b - a, c - a)]
+    area = sum(np.linalg.norm(face, axis=1) for face in faces) / 2.0
+    opposite = [np.linalg.norm(p, axis=1) * np.linalg.norm(q - r, axis=1) for p, q, r in ((a, b, c), (b, a, c), (c, a, b))]
+    s = sum(opposite) / 2.0
+    product = s * np.prod([s - side for side in opposite], axis=0)  # 6 V R = √(s (s−p) (s−q) (s−r))
+    circumradius_volume = np.sqrt(np.maximum(product, 0.0)) / 6.0
+    return np.asarray(
+        np.divide(9.0 * volume**2, area * circumradius_volume, out=np.zeros_like(volume), where=circumradius_volume > 0)
+    )
+
+
+def cache_folder() -> Path:
+    """Return where meshes made from surfaces are kept: $FEMSENSE_CACHE, else femsense in the user's cache folder."""
+    if chosen := os.environ.get("FEMSENSE_CACHE"):
+        return Path(chosen)
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "femsense"
+
+
+def file_format(path: Path) -> str | None:
+    """Return meshio's name of a mesh file's format from its content; None where only the ending says it."""
+    with path.open("rb") as stream:
+        head = stream.read(512).lstrip()
+    starts = ((b"# vtk DataFile", "vtk"), (b"$MeshFormat", "gmsh"), (b"MeshVersionFormatted", "medit"), (b"<Xdmf", "xdmf"))
+    if b"<VTKFile" in head:
+        return "vtu"
+    return next((name for start, name in starts if head.startswith(start)), None)
+
+
+def _check_exists(path: Path, where: str) -> None:
+    if path.is_file():
+        return
+    names = [file.name for file in path.parent.iterdir() if file.is_file()] if path.parent.is_dir() else []
+    raise InputError("no such mesh file", where=where, found=str(path), expected="a file", hint=near(path.name, names))
+
+
+def read_cells(path: Path, where: str) -> tuple[FloatArray, dict[str, IntArray]]:
+    """Return points and the cells of each kind through meshio, which may print and exit."""
+    import meshio
+
+    try:
+        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+            mesh = meshio.read(path, file_format=file_format(path))
+        points = np.asarray(mesh.points, dtype=np.float64)
+        cells = {kind: np.asarray(data, dtype=np.int64) for kind, data in mesh.cells_dict.items()}
+    except (Exception, SystemExit) as error:
+        raise InputError(
+            "not readable as a mesh",
+            where=where,
+            found=_reason(error),
+            expected="tetrahedra in a format that meshio reads (vtu, vtk, msh, …)",
+        ) from None
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise InputError(
+            "not a mesh in space", where=where, found=f"points of shape {points.shape}", expected="three coordinates a point"
+        )
+    if not np.isfinite(points).all():
+        bad = int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])
+        raise InputError(
+            "a node is not finite", where=where, found=f"node {bad}: {points[bad].tolist()}", expected="finite coordinates"
+        )
+    return points, cells
+
+
+def ordered_tets(points: FloatArray, tets: IntArray, where: str) -> TetMesh:
+    """Return the mesh with its corner nodes first, all elements turned where all are inverted."""
+    if tets.size and (tets.min() < 0 or tets.max() >= len(points)):
+        raise InputError(
+            "an element names a node that does not exist", where=where, found=int(tets.max()), expected=f"0 … {len(points) - 1}"
+        )
+    unused = len(points) - len(np.unique(tets))
+    if unused:
+        warnings.warn(f"{where}: {unused} nodes that belong to no tetrahedron were dropped", stacklevel=4)
+    mesh = _compact(points, tets)
+    if mesh.is_quadratic:
+        _check_middles(mesh, where)
+    volumes = element_volumes(mesh)
+    return oriented(mesh) if len(volumes) and (volumes < 0).all() else mesh
+
+
+def _compact(points: FloatArray, tets: IntArray) -> TetMesh:
+    """Return the mesh of the used nodes: corners in their order, then the nodes that are only middles of edges."""
+    corners = np.unique(tets[:, :4])
+    order = np.concatenate([corners, np.setdiff1d(tets, corners)])
+    number = np.full(len(points), -1)
+    number[order] = np.arange(len(order))
+    return TetMesh(points[order], number[tets])
+
+
+def _check_middles(mesh: TetMesh, where: str) -> None:
+    ends = mesh.nodes[mesh.tets[:, EDGES]]
+    off = np.linalg.norm(mesh.nodes[mesh.tets[:, 4:]] - ends.mean(axis=2), axis=2)
+    length = np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=2)
+    bad = np.flatnonzero((off > 0.25 * length).any(axis=1))
+    if len(bad):
+        raise InputError(
+            "mid-edge nodes that are not in the middle of their edges",
+            where=where,
+            found=f"{len(bad)} of {len(mesh.tets)} elements, the first is number {bad[0]}",
+            expected="the order of VTK: corners 0 1 2 3, then the edges 01 12 02 03 13 23",
+        )
+
+
+def closed_surface(points: FloatArray, triangles: IntArray, where: str) -> tuple[FloatArray, IntArray]:
+    """Return the surface, outward, inner shells as cavities, as it is otherwise. Raises InputError where it is open or in parts."""
+    points, triangles = merged(points, triangles)
+    edges = np.sort(np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
+    count = np.unique(edges, axis=0, return_counts=True)[1]
+    if (count != 2).any():
+        raise InputError(
+            "the surface is not closed",
+            where=where,
+            found=f"{int((count == 1).sum())} edges with one triangle, {int((count > 2).sum())} with more than two",
+            expected="every edge between two triangles",
+            hint="femsense mesh SURFACE -o ROBOT closes holes and mends what it can",
+        )
+    made = repaired(points, triangles, where=where)
+    return np.array(made.points), np.array(made.triangles)
+
+
+def kept_tets(surface: Path, points: FloatArray, triangles: IntArray) -> tuple[Path, Path]:
+    """Return where the tetrahedra of a surface file are kept: beside it, or in the cache where that cannot be written."""
+    content = points.tobytes() + triangles.tobytes() + f"1 {EDGE_FRACTION}".encode()
+    name = f"{surface.stem}-{hashlib.sha256(content).hexdigest()[:16]}.tets.npz"
+    return surface.with_name(name), cache_folder() / "tetrahedra" / name
+
+
+def _tets_of_surface(file: Path, points: FloatArray, triangles: IntArray, where: str) -> TetMesh:
+    """Return the tetrahedra of a surface as they are kept, or made and kept.
+
+    fTetWild shuffles with a seed of its own, so that only the kept mesh makes two runs equal: the first one written counts.
+    """
+    places = kept_tets(file, points, triangles)
+    for place in places:
+        kept = _read_kept(place)
+        if kept is not None:
+            return kept
+    mesh = tetrahedralise(points, triangles, edge_fraction=EDGE_FRACTION, where=where)
+    for place in places:
+        if _keep(mesh, place):
+            return _read_kept(place) or mesh
+    warnings.warn(
+        f"{where}: the tetrahedra cannot be kept, so that each run makes another mesh; femsense mesh writes one", stacklevel=4
+    )
+    return mesh
+
+
+def _keep(mesh: TetMesh, place: Path) -> bool:
+    """Write the mesh where none stands yet (two processes may come here at once); False where that is not possible."""
+    part = place.with_name(f"{PART_PREFIX}{secrets.token_hex(4)}-{place.name}")
+    try:
+        place.parent.mkdir(parents=True, exist_ok=True)
+        np.savez_compressed(part, nodes=mesh.nodes, tets=mesh.tets)
+        if _read_kept(place) is None:
+            place.unlink(missing_ok=True)
+        with contextlib.suppress(FileExistsError):
+            os.link(part, place)
+    except OSError:
+        return False
+    finally:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
+    return True
+
+
+def _read_kept(place: Path) -> TetMesh | None:
+    """Return a kept mesh; None where there is none or it cannot be read."""
+    try:
+        with np.load(place) as data:
+            return TetMesh(data["nodes"], data["tets"])
+    except Exception:
+        return None
+
+
+def _run_ftetwild(
+    points: FloatArray, triangles: IntArray, edge_fraction: float, envelope: float, where: str, seconds: float
+) -> tuple[FloatArray, IntArray]:
+    """Return nodes and tetrahedra from a process of its own: fTetWild writes files where it runs, and it may crash."""
+    if importlib.util.find_spec("pytetwild") is None:
+        raise MissingDependency("a surface becomes tetrahedra through pytetwild: pip install pytetwild")
+    with tempfile.TemporaryDirectory(prefix="femsense-") as folder:
+        np.savez(
+            Path(folder) / "surface.npz",
+            points=points,
+            triangles=triangles.astype(np.int32),
+            edge=edge_fraction,
+            envelope=envelope,
+        )
+        try:
+            result = subprocess.run(
+                [sys.executable, "-c", FTETWILD], cwd=folder, capture_output=True, text=True, errors="replace", timeout=seconds
+            )
+        except subprocess.TimeoutExpired:
+            raise InputError(
+                "fTetWild did not come to an end",
+                where=where,
+                found=f"{len(triangles)} triangles, given up after {seconds:.0f} s",
+                expected="tetrahedra",
+                hint="surfaces that nearly coincide and walls thinner than the tolerance are what takes long: mend them, or femsense mesh with another --tolerance or a larger --size",
+            ) from None
+        made = Path(folder) / "tets.npz"
+        if result.returncode or not made.is_file():
+            last = (result.stderr.strip().splitlines() or [f"exit status {result.returncode}"])[-1]
+            raise InputError(
+                "fTetWild failed on this surface",
+                where=where,
+                found=last[:200],
+                expected="tetrahedra",
+                hint="mend the surface (self-intersections, thin walls), or give tetrahedra",
+            )
+        with np.load(made) as data:
+            return np.asarray(data["nodes"], dtype=np.float64), np.asarray(data["tets"], dtype=np.int64)
+
+
+def _reason(error: BaseException) -> str:
+    text = str(error).strip().splitlines()
+    return (
+        f"{type(error).__name__}: {text[0][:120]}"
+        if text and not isinstance(error, SystemExit)
+        else "another format, or a broken file"
+    )

@@ -1,0 +1,502 @@
+"""From a surface to a robot: tetrahedra of a wanted size, their quality, and a robot.toml to start from."""
+
+from __future__ import annotations
+
+import re
+import tempfile
+import time
+import tomllib
+import warnings
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import femsense
+from femsense.core.arrays import FloatArray, IntArray, freeze
+from femsense.core.errors import FemsenseError, InputError
+from femsense.fem.mesh import TetMesh, check_mesh, element_volumes, hinged_parts, surface_triangles
+from femsense.io.files import file_hash, write_json, write_text
+from femsense.io.mesh_files import (
+    FILL_SECONDS,
+    SURFACE_ENDINGS,
+    radius_ratio,
+    read_cells,
+    read_triangles,
+    tetrahedralise,
+    write_mesh,
+)
+from femsense.io.meshing.quality import quality_report, quality_text
+from femsense.io.meshing.surface import Surface, check_finite, crossing_triangles, distance_to, repaired, shared_edges, thinned
+from femsense.io.robot_toml import LARGEST_BODY, PER_METRE, SMALLEST_BODY, likely_unit, load_robot
+
+MESH_FILE, REPORT_FILE = "mesh.vtu", "mesh.json"
+USUAL = (5e-3, 2.0)
+"""Bodies smaller or larger than this [m] make one ask whether the unit is right."""
+MOST_TETS = 2000
+ENVELOPE_OF_EDGE = 0.04
+"""The mesh may leave the surface by this share of an edge, if nothing else is asked for …"""
+LARGEST_ENVELOPE = 0.01
+"""… and by this share of the diagonal at most."""
+CAD_ENDINGS = (".step", ".stp", ".iges", ".igs", ".brep", ".x_t", ".x_b", ".sldprt", ".sldasm", ".ipt", ".f3d", ".fcstd", ".3dm")
+TRIES = 5
+MOST_SECONDS = 600.0
+"""All fillings together take no longer than this."""
+POOR = 0.05
+"""A worst radius ratio below this has the surface filled anew (fTetWild shuffles)."""
+LOOSE = 1e-3
+"""Tetrahedra that hang loose and hold less than this share of the volume are left out."""
+Progress = Callable[..., None]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class MeshOptions:
+    """What a user asks of a mesh."""
+
+    unit: str | None = None
+    """Of the surface file: "m", "cm" or "mm"; required."""
+    size_mm: float | None = None
+    """Wanted edge length; by default from `most_tets`."""
+    most_tets: int = MOST_TETS
+    """Not more tetrahedra than this."""
+    tolerance_mm: float | None = None
+    """How far the mesh may leave the surface; by default a share of the edge length."""
+    element: str = "tet10"
+    close_holes: bool = False
+    fill_cavities: bool = False
+    part: int | None = None
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Filled:
+    """A surface filled with tetrahedra."""
+
+    mesh: TetMesh
+    """In metres."""
+    edge_mm: float
+    tolerance_mm: float
+    strays_mm: float
+    """Largest distance of a point of one surface from the other."""
+    done: tuple[str, ...]
+
+
+def mesh_into(
+    folder: str | Path,
+    surface: str | Path,
+    options: MeshOptions,
+    *,
+    say: Callable[[str], None],
+    again: bool = False,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Fill a surface with tetrahedra and write them into a robot's folder; return the report that mesh.json holds.
+
+    A folder without robot.toml gets one to start from. One that has it keeps it, with the new mesh in place of the old one.
+
+    Arguments:
+        folder: of the robot.
+        surface: STL, OBJ, PLY, OFF, or triangles in a format that meshio reads.
+        options: unit, size and repairs.
+        say: told in one line what happens beside.
+        again: fill even where the folder holds this result.
+        progress: called with what is being done.
+
+    Raises:
+        InputError: a surface that cannot be filled, with what, where, found, expected and a hint; a robot.toml that the new mesh
+            does not fit, in which case nothing is written. MissingDependency: without pytetwild.
+    """
+    source, target = Path(surface).expanduser(), Path(folder).expanduser()
+    _check_target(target)
+    points, triangles = read_any_surface(source)
+    check_unit(points, options.unit, source)
+    inputs = {"surface": source.name, "sha256": file_hash(source), "options": asdict(options)}
+    if not again and (known := _finished(target, inputs)):
+        say(f"{target} holds this mesh already (--again fills the surface anew)")
+        return known
+    filled = fill(points, triangles, options, where=str(source), progress=progress)
+    report = mesh_report(filled, options) | {"inputs": inputs, "femsense": femsense.__version__}
+    report["robot"] = _write_robot(target, filled.mesh, options, source)
+    report["mesh_sha256"] = file_hash(target / report["robot"]["mesh_file"])
+    write_json(target / REPORT_FILE, report)
+    return report
+
+
+# The surface
+
+
+def read_any_surface(path: Path) -> tuple[FloatArray, IntArray]:
+    """Return points and triangles of a surface file in its unit, as they are. Raises InputError."""
+    if not path.is_file():
+        raise InputError("no such surface", where=path, expected="an STL, OBJ, PLY or OFF file")
+    if not path.stat().st_size:
+        raise InputError("the file is empty", where=path, found="0 bytes", expected="an STL, OBJ, PLY or OFF file")
+    if path.suffix.lower() in SURFACE_ENDINGS:
+        return read_triangles(path)
+    if path.suffix.lower() in CAD_ENDINGS:
+        raise InputError(
+            "a CAD file, not triangles",
+            where=path,
+            found=path.suffix,
+            expected="an STL, OBJ, PLY or OFF file",
+            hint="export it as STL from the CAD program, in mm",
+        )
+    points, cells = read_cells(path, str(path))
+    check_finite(points, str(path))
+    if "triangle" not in cells or any(kind.startswith("tetra") for kind in cells):
+        raise InputError(
+            "not a surface",
+            where=path,
+            found=", ".join(sorted(cells)) or "no cells",
+            expected="triangles",
+            hint="a mesh of tetrahedra needs no meshing: name it in robot.toml",
+        )
+    return points, cells["triangle"]
+
+
+def check_unit(points: FloatArray, unit: str | None, path: Path) -> None:
+    """Refuse a missing unit and one that makes the body unlikely small or large; warn of a doubtful one."""
+    extents = np.ptp(points, axis=0)
+    size = float(extents.max())
+    text = " × ".join(f"{value:.4g}" for value in extents)
+    best = likely_unit(size)
+    hint = f"--unit {best} makes it {1e3 * size / PER_METRE[best]:.4g} mm long" if best else "scale the surface"
+    if unit is None:
+        raise InputError(
+            "the unit of a surface file stands nowhere in it",
+            where=path,
+            found=f"extents of {text}",
+            expected="--unit m, --unit cm or --unit mm",
+            hint=hint,
+        )
+    if unit not in PER_METRE:
+        raise InputError("unknown unit", where="--unit", found=unit, expected=" | ".join(PER_METRE), hint=hint)
+    metres = size / PER_METRE[unit]
+    if not SMALLEST_BODY <= metres <= LARGEST_BODY:
+        raise InputError(
+            "the body has an unlikely size",
+            where=path,
+            found=f"extents of {text} {unit}: {_length(metres)} across",
+            expected="between 1 mm and 20 m",
+            hint=hint,
+        )
+    if not USUAL[0] <= metres <= USUAL[1]:
+        warnings.warn(
+            f"{path}: the body is {_length(metres)} across with --unit {unit}; {hint}, if that is what was meant", stacklevel=3
+        )
+
+
+def _length(metres: float) -> str:
+    return f"{metres:.3g} m" if metres >= 1 else f"{1e3 * metres:.3g} mm"
+
+
+# Filling
+
+
+def fill(
+    points: FloatArray,
+    triangles: IntArray,
+    options: MeshOptions,
+    *,
+    where: str = "surface",
+    progress: Progress | None = None,
+) -> Filled:
+    """Mend a surface and fill it with tetrahedra of the wanted size.
+
+    Arguments:
+        points, triangles: of the file, in `options.unit`, shapes (n, 3) and (t, 3).
+        options: size and repairs.
+        where: what a message names.
+        progress: called with what is being done.
+
+    Raises:
+        InputError: see `repaired` and `tetrahedralise`; or no mesh that is small enough.
+    """
+    tell = progress or (lambda *_: None)
+    tell("mending the surface")
+    unit = options.unit or "m"
+    surface = repaired(
+        points,
+        triangles,
+        where=where,
+        close_holes=options.close_holes,
+        fill_cavities=options.fill_cavities,
+        part=options.part,
+        unit=unit,
+    )
+    surface = replace(surface, points=freeze(surface.points / PER_METRE[unit]))
+    crossing = len(np.unique(crossing_triangles(surface.points, surface.triangles)))
+    if crossing:
+        note = f"{crossing} triangles cross others: what lies inside any of them was filled"
+        surface = replace(surface, done=(*surface.done, note))
+    walls = len(shared_edges(surface.triangles))
+    if walls:
+        note = (
+            f"{walls} edges have more than two triangles (walls inside, or bodies that touch there): what lies inside was filled"
+        )
+        surface = replace(surface, done=(*surface.done, note))
+    edge, began = _first_edge(surface, options), time.monotonic()
+    for attempt in range(TRIES):
+        left = MOST_SECONDS - (time.monotonic() - began)
+        seconds = min(left, FILL_SECONDS)
+        tell(f"filling, edges of {1e3 * edge:.2g} mm, try {attempt + 1}, {seconds / 60:.0f} min at most")
+        filled = _fill_once(surface, edge, options, where, crosses=crossing + walls > 0, seconds=seconds)
+        count = len(filled.mesh.tets)
+        poor = radius_ratio(filled.mesh).min() < POOR
+        slow = time.monotonic() - began > 0.5 * MOST_SECONDS  # another try might not come to an end
+        if count <= options.most_tets and (not poor or slow or attempt == TRIES - 1):
+            return filled
+        if slow:
+            break
+        if count > options.most_tets:
+            if options.size_mm is not None:
+                raise _too_many(
+                    count,
+                    options,
+                    where,
+                    f"--size {1e3 * edge * (count / options.most_tets) ** (1 / 3):.3g}, or --max-tets {count}",
+                )
+            edge = min(edge * 1.08 * (count / options.most_tets) ** (1.0 / 3.0), 0.5 * surface.diagonal)
+    raise _too_many(count, options, where, f"--max-tets {count}, or a larger --tolerance")
+
+
+def _too_many(count: int, options: MeshOptions, where: str, hint: str) -> InputError:
+    return InputError(
+        "more tetrahedra than wanted",
+        where=where,
+        found=f"{count}",
+        expected=f"--max-tets {options.most_tets} at most",
+        hint=hint,
+    )
+
+
+def _first_edge(surface: Surface, options: MeshOptions) -> float:
+    """Return the edge length to begin with [m]: as wanted, or such that regular tetrahedra fill the volume."""
+    if options.size_mm is not None:
+        return 1e-3 * options.size_mm
+    return float(np.cbrt(6.0 * np.sqrt(2.0) * surface.volume / (0.6 * options.most_tets)))
+
+
+def _fill_once(surface: Surface, edge: float, options: MeshOptions, where: str, *, crosses: bool, seconds: float) -> Filled:
+    diagonal = surface.diagonal
+    given = options.tolerance_mm
+    tolerance = 1e-3 * given if given is not None else min(ENVELOPE_OF_EDGE * edge, LARGEST_ENVELOPE * diagonal)
+    thin, strayed = thinned(surface, tolerance=0.5 * tolerance)
+    made = tetrahedralise(
+        np.array(thin.points),
+        np.array(thin.triangles),
+        edge_fraction=edge / diagonal,
+        envelope=(tolerance - strayed) / diagonal,
+        where=where,
+        check_volume=not crosses,
+        seconds=seconds,
+    )
+    mesh, notes = _one_body(made, where)
+    strays = _strays(mesh, surface, crosses)
+    return Filled(mesh, 1e3 * edge, 1e3 * tolerance, 1e3 * strays, (*thin.done, *notes))
+
+
+def _strays(mesh: TetMesh, surface: Surface, crosses: bool) -> float:
+    """Return the largest distance of a point of one surface from the other [m]; where shells cross, of the mesh from the surface."""
+    skin, numbers = np.unique(surface_triangles(mesh), return_inverse=True)
+    out = float(distance_to(surface.points, surface.triangles, mesh.nodes[skin]).max())
+    if crosses:  # what lies inside another shell has no counterpart
+        return out
+    return max(out, float(distance_to(mesh.nodes[skin], numbers.reshape(-1, 3), surface.points).max()))
+
+
+def _one_body(mesh: TetMesh, where: str) -> tuple[TetMesh, tuple[str, ...]]:
+    """Return the mesh without loose crumbs. Raises InputError where larger parts hang loose."""
+    parts = hinged_parts(mesh)
+    volume = np.bincount(parts, element_volumes(mesh))
+    if len(volume) == 1:
+        check_mesh(mesh, where)
+        return mesh, ()
+    main = int(volume.argmax())
+    loose = 1.0 - volume[main] / volume.sum()
+    if loose > LOOSE:
+        raise InputError(
+            "the tetrahedra fall into parts that no face joins",
+            where=where,
+            found=f"{len(volume)} parts; all but the largest hold {100 * loose:.3g} % of the volume",
+            expected="one connected body (an edge or a corner alone is a hinge)",
+            hint="a larger --max-tets or a smaller --size keeps thin bridges; bodies that only touch: let them overlap in the CAD program",
+        )
+    nodes, tets = np.unique(mesh.tets[parts == main], return_inverse=True)
+    kept = TetMesh(mesh.nodes[nodes], tets.reshape(-1, mesh.tets.shape[1]))
+    check_mesh(kept, where)
+    return kept, (f"{len(volume) - 1} loose crumbs were left out",)
+
+
+# The report
+
+
+def mesh_report(filled: Filled, options: MeshOptions) -> dict[str, Any]:
+    """Return size, deviation, quality and what was done, as plain numbers."""
+    quality = quality_report(filled.mesh)
+    return {
+        "edge_wanted_mm": filled.edge_mm,
+        "tolerance_mm": filled.tolerance_mm,
+        "strays_mm": filled.strays_mm,
+        "done": list(filled.done),
+        "quality": quality,
+        "advice": _advice(quality, options),
+    }
+
+
+def _advice(quality: dict[str, Any], options: MeshOptions) -> list[str]:
+    advice = []
+    least = 1.0 if options.element == "tet10" else 2.0
+    if quality["elements_through"]["fifth_percentile"] < least:
+        advice.append(
+            f"thin walls have less than {least:g} elements through them: the model is too stiff there; a smaller --size, or more --max-tets"
+        )
+    if quality["radius_ratio"]["min"] < POOR:
+        advice.append("the worst element is nearly flat: another --size or a larger --tolerance gives better ones")
+    if options.element == "tet4":
+        advice.append('tet4 bends much too stiffly at this size; element = "tet10" in robot.toml')
+    return advice
+
+
+def mesh_text(report: dict[str, Any]) -> str:
+    """Return a report as a table."""
+    lines = [
+        quality_text(report["quality"]),
+        f"  {'from the surface':<19}at most {report['strays_mm']:.3g} mm (allowed: {report['tolerance_mm']:.3g} mm)",
+    ]
+    for title, texts in (("done to the surface", report["done"]), ("advice", report["advice"])):
+        if texts:
+            lines += ["", f"{title}:", *(f"  - {text}" for text in texts)]
+    return "\n".join(lines)
+
+
+# The folder
+
+
+def _check_target(target: Path) -> None:
+    if target.exists() and not target.is_dir():
+        raise InputError("stands in the way", where=target, found="a file", expected="a folder", hint="another -o")
+    if target.is_dir() and any(target.iterdir()) and not (target / "robot.toml").is_file():
+        raise InputError(
+            "something else than a robot stands there",
+            where=target,
+            expected="a new folder, or one with robot.toml",
+            hint="another -o",
+        )
+
+
+def _finished(target: Path, inputs: dict[str, Any]) -> dict[str, Any] | None:
+    """Return the report of a folder that holds the mesh of these inputs already."""
+    import json
+
+    try:
+        known: dict[str, Any] = json.loads((target / REPORT_FILE).read_text(encoding="utf-8"))
+        same = known["inputs"] == json.loads(json.dumps(inputs)) and known["femsense"] == femsense.__version__
+        whole = file_hash(target / known["robot"]["mesh_file"]) == known["mesh_sha256"] and (target / "robot.toml").is_file()
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return known if same and whole else None
+
+
+def _write_robot(target: Path, mesh: TetMesh, options: MeshOptions, source: Path) -> dict[str, Any]:
+    """Write mesh and robot.toml where they load together; return the report's part about them."""
+    toml = target / "robot.toml"
+    is_new = not toml.is_file()
+    text = starter_text(mesh, options, target.absolute().name, source.name) if is_new else toml.read_text(encoding="utf-8-sig")
+    text, name, unit = (text, MESH_FILE, options.unit or "m") if is_new else _with_mesh(text, toml)
+    scaled = TetMesh(mesh.nodes * PER_METRE[unit], mesh.tets)
+    with tempfile.TemporaryDirectory(prefix="femsense-") as trial:
+        write_mesh(scaled, Path(trial) / name)
+        (Path(trial) / "robot.toml").write_text(text, encoding="utf-8")
+        _check_loads(Path(trial), toml)
+        target.mkdir(parents=True, exist_ok=True)
+        write_mesh(scaled, target / name)
+    if is_new or text != toml.read_text(encoding="utf-8-sig"):
+        write_text(toml, text)
+    return {"folder": str(target), "mesh_file": name, "unit": unit, "robot_toml": "written" if is_new else "kept"}
+
+
+def _check_loads(trial: Path, toml: Path) -> None:
+    try:
+        load_robot(trial)
+    except FemsenseError as error:
+        text = str(error).replace(str(trial), str(toml.parent))
+        raise InputError(
+            "robot.toml does not fit the new mesh; nothing was written",
+            where=toml,
+            found=text,
+            expected="a robot that loads",
+            hint="mend robot.toml, or -o another folder",
+        ) from None
+
+
+def _with_mesh(text: str, toml: Path) -> tuple[str, str, str]:
+    """Return robot.toml with a mesh file that can be written, that file's name and its unit."""
+    try:
+        table = tomllib.loads(text)["mesh"]
+        file, unit = str(table["file"]), str(table["unit"])
+    except (tomllib.TOMLDecodeError, KeyError, TypeError):
+        raise InputError(
+            "robot.toml has no table [mesh] with file and unit",
+            where=toml,
+            expected="a robot.toml, or a new folder",
+            hint="femsense inspect says what is wrong with it",
+        ) from None
+    if unit not in PER_METRE:
+        raise InputError("unknown unit", where=f"{toml}: mesh.unit", found=unit, expected=" | ".join(PER_METRE))
+    if file.endswith(".vtu"):
+        return text, file, unit
+    named = re.compile(r"^(\s*file\s*=\s*)([\"'])" + re.escape(file) + r"\2", re.MULTILINE)
+    if len(named.findall(text)) != 1:
+        raise InputError(
+            "the mesh file cannot be exchanged",
+            where=f"{toml}: mesh.file",
+            found=file,
+            expected=f'file = "{MESH_FILE}"',
+            hint="write that line by hand and run it again",
+        )
+    return named.sub(rf'\1"{MESH_FILE}"', text), MESH_FILE, unit
+
+
+def starter_text(mesh: TetMesh, options: MeshOptions, name: str, source: str) -> str:
+    """Return a robot.toml for a mesh in metres that loads at once and says what to change."""
+    low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
+    box = _lowest_slab(mesh)
+    top = mesh.nodes[mesh.nodes[:, 2].argmax()]
+    inner = mesh.nodes[mesh.tets[:, :4]].mean(axis=1)
+    upper = inner[np.argmax(inner[:, 2] - 0.5 * np.linalg.norm(inner[:, :2] - inner[:, :2].mean(axis=0), axis=1))]
+    values = {
+        "name": re.sub(r"[^\w.-]", "-", name) or "robot",
+        "source": source.replace("\n", " "),
+        "file": MESH_FILE,
+        "unit": options.unit or "m",
+        "element": options.element,
+        "low": _triple(low),
+        "high": _triple(high),
+        "box": f"[{_triple(box[0])}, {_triple(box[1])}]",
+        "height": f"{1e3 * (high[2] - low[2]):.4g}",
+        "path": _triple(upper),
+        "pull": _triple([upper[0], upper[1], low[2] - 0.1 * (high[2] - low[2])]),
+        "marker": _triple(top),
+    }
+    template = (Path(__file__).parent / "starter.toml").read_text(encoding="utf-8")
+    return re.sub(r"<(\w+)>", lambda found: values[found[1]], template)
+
+
+def _triple(point: FloatArray | list[float]) -> str:
+    return "[" + ", ".join(f"{round(float(value), 6) + 0.0:g}" for value in point) + "]"
+
+
+def _lowest_slab(mesh: TetMesh) -> FloatArray:
+    """Return a box [m] around the lowest nodes, high enough to hold the body but a tenth of its height if that does."""
+    low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
+    size = high - low
+    for share in (0.02, 0.05, 0.1, 0.2, 0.4):
+        top = low[2] + share * size[2]
+        held = mesh.nodes[mesh.nodes[:, 2] <= top]
+        spread = np.linalg.svd(held - held.mean(axis=0), compute_uv=False)
+        if len(held) >= 6 and spread[1] > 0.05 * size.max():
+            break
+    margin = 0.02 * size
+    return np.round([low - margin, [high[0] + margin[0], high[1] + margin[1], top]], 6)

@@ -1,0 +1,111 @@
+"""Parts of a body that are made of another material: the tables [[regions]] of robot.toml.
+
+An element belongs to a region where its centroid at rest (of its four corners) lies in the box or in the sphere, or where the
+mesh file's cell data say so. Regions that overlap: the later one wins.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from femsense.core.arrays import BoolArray, FloatArray
+from femsense.core.errors import InputError
+from femsense.fem.mesh import TetMesh
+from femsense.io.tables import Schema
+
+Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
+
+
+class RegionTable(Schema):
+    box_m: Annotated[list[Vector], Field(min_length=2, max_length=2)] | None = Field(
+        None, description="two corners in metres: [[x, y, z], [x, y, z]]"
+    )
+    center_m: Vector | None = Field(None, description="centre of a sphere in metres [x, y, z], with radius_m")
+    radius_m: float | None = Field(None, gt=0, description="radius of the sphere in metres, > 0, with center_m")
+    cells: str | None = Field(None, description="the name of an array of cell data in the mesh file, with value")
+    value: int | None = Field(None, description="the cells with this value in that array")
+    young_modulus_pa: float | None = Field(None, gt=0, description="Young's modulus of the region in pascal, > 0")
+    poisson_ratio: float | None = Field(None, gt=-1, lt=0.5, description="Poisson's ratio of the region, −1 < ν < 0.5")
+
+    @model_validator(mode="after")
+    def _says_where_and_what(self) -> RegionTable:
+        ways = [self.box_m is not None, self.center_m is not None, self.cells is not None]
+        if sum(ways) != 1 or (self.center_m is None) != (self.radius_m is None) or (self.cells is None) != (self.value is None):
+            raise ValueError("a region is a box_m, or center_m with radius_m, or cells with value")
+        if self.young_modulus_pa is None and self.poisson_ratio is None:
+            raise ValueError("a region needs its own young_modulus_pa or poisson_ratio")
+        return self
+
+
+def regional(
+    mesh: TetMesh, regions: Sequence[RegionTable], file: Path, path: Path, E: float, nu: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return Young's modulus [Pa] and Poisson's ratio of each element, shapes (m,).
+
+    Arguments:
+        mesh: the mesh at rest, elements in the order of its file.
+        regions: the tables.
+        file: the mesh file, for its cell data.
+        path: robot.toml, for messages.
+        E: modulus outside of all regions [Pa].
+        nu: Poisson's ratio outside of all regions.
+
+    Raises:
+        InputError: a region that holds no element; cell data that are not there.
+    """
+    moduli, ratios = np.full(len(mesh.tets), E), np.full(len(mesh.tets), nu)
+    centroids = mesh.nodes[mesh.tets[:, :4]].mean(axis=1)
+    for i, region in enumerate(regions):
+        inside = _inside(region, centroids, file, f"{path}: regions[{i}]")
+        if not inside.any():
+            raise InputError(
+                "no element has its centroid in the region",
+                where=f"{path}: regions[{i}]",
+                expected="a part of the body",
+                hint=f"the body spans {centroids.min(axis=0).round(4).tolist()} to {centroids.max(axis=0).round(4).tolist()} m",
+            )
+        if region.young_modulus_pa is not None:
+            moduli[inside] = region.young_modulus_pa
+        if region.poisson_ratio is not None:
+            ratios[inside] = region.poisson_ratio
+    return moduli, ratios
+
+
+def _inside(region: RegionTable, centroids: FloatArray, file: Path, where: str) -> BoolArray:
+    if region.box_m is not None:
+        low, high = np.asarray(region.box_m)
+        return np.asarray(((centroids >= low) & (centroids <= high)).all(axis=1))
+    if region.center_m is not None:
+        return np.asarray(np.linalg.norm(centroids - region.center_m, axis=1) <= region.radius_m)
+    return np.asarray(_cell_data(file, str(region.cells), len(centroids), where) == region.value)
+
+
+def _cell_data(file: Path, name: str, count: int, where: str) -> FloatArray:
+    """Return one value an element from the cell data of the mesh file, shape (m,). Raises InputError."""
+    import meshio
+
+    try:
+        data: dict[str, Any] = meshio.read(file).cell_data_dict
+    except Exception as error:  # surfaces and formats that only trimesh reads
+        raise InputError(
+            "the mesh file has no cell data", where=where, found=str(error), expected="a mesh of tetrahedra"
+        ) from None
+    arrays = {key: kinds.get("tetra", kinds.get("tetra10")) for key, kinds in data.items()}
+    values = arrays.get(name)
+    if values is None:
+        raise InputError(
+            "no such cell data in the mesh file", where=where, found=repr(name), expected=" | ".join(arrays) or "none there"
+        )
+    if np.shape(values) != (count,):
+        raise InputError(
+            "the cell data do not fit the elements",
+            where=where,
+            found=np.shape(values),
+            expected=f"one number for each of {count} tetrahedra",
+        )
+    return np.asarray(values)

@@ -1,0 +1,90 @@
+"""Folders of results: written whole or not at all, and documents of one format."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from femsense.core.errors import InputError
+from femsense.io.files import PART_PREFIX, write_beside
+
+# Parts
+
+
+@contextmanager
+def _results_folder(folder: str | Path, marker: str) -> Iterator[Path]:
+    """Yield an empty folder; what the block writes there moves into `folder` at its end, `marker` last.
+
+    A new folder appears in one step. In one that is there, the old marker goes first, so that a folder with a marker is always
+    complete; its other files stay.
+    """
+    root = Path(folder).expanduser().absolute()
+    if not root.exists():
+        with write_beside(root) as part:
+            part.mkdir(parents=True)
+            yield part
+        return
+    with tempfile.TemporaryDirectory(prefix=PART_PREFIX, dir=root) as scratch:
+        yield Path(scratch)
+        (root / marker).unlink(missing_ok=True)
+        for file in sorted(Path(scratch).iterdir(), key=lambda file: file.name == marker):
+            os.replace(file, root / file.name)
+
+
+def _check_folder(root: Path, not_beside: Sequence[str]) -> None:
+    foreign = next((name for name in not_beside if (root / name).is_file()), None)
+    if foreign is not None:
+        raise InputError(
+            "the results would mix with what stands there",
+            where=root,
+            found=foreign,
+            expected="a folder of their own",
+            hint="another -o",
+        )
+    if root.exists() and not root.is_dir():
+        raise InputError("a file stands where the folder should be written", where=root, expected="a folder", hint="another -o")
+
+
+def _read_document(file: Path, expected: str) -> dict[str, Any]:
+    """Return a JSON object of a format. Raises InputError."""
+    try:
+        document = json.loads(file.read_text(encoding="utf-8-sig"))
+    except OSError as error:
+        raise InputError("cannot be read", where=file, found=error.strerror, expected=f"a file of format {expected}") from None
+    except ValueError as error:
+        raise InputError("not valid JSON", where=file, found=error, expected=f"a file of format {expected}") from None
+    found = document.get("format") if isinstance(document, dict) else type(document).__name__
+    if found != expected:
+        raise InputError("another kind of file", where=f"{file}: format", found=repr(found), expected=repr(expected))
+    checked: dict[str, Any] = document
+    return checked
+
+
+def _of(document: Mapping[str, Any], key: str, file: Path) -> Any:
+    if key not in document:
+        raise InputError("a key is missing", where=file, found=", ".join(document), expected=key)
+    return document[key]
+
+
+def _table(document: Mapping[str, Any], key: str, file: Path) -> dict[str, Any]:
+    value = _of(document, key, file)
+    if not isinstance(value, dict):
+        raise InputError("not a table", where=f"{file}: {key}", found=repr(value)[:80], expected="an object")
+    return value
+
+
+def _numbers(document: Mapping[str, Any], key: str, file: Path) -> dict[str, float]:
+    return {str(name): _number(value) for name, value in _table(document, key, file).items()}
+
+
+def _number(value: Any) -> float:
+    """Return a number of JSON, where null stands for one that is not finite."""
+    return float("nan") if value is None else float(value)
+
+
+RUN_FILES = ("contacts.csv", "frames.csv", "states.npz", "run.json")

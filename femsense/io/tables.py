@@ -1,0 +1,273 @@
+"""Reading TOML and CSV with errors that say file, place, what was found and what was expected."""
+
+from __future__ import annotations
+
+import csv
+import io
+import tomllib
+import types
+import typing
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from femsense.core.arrays import FloatArray, IntArray
+from femsense.core.errors import InputError
+from femsense.core.text import key_path, near, short
+
+
+class Schema(BaseModel):
+    """Base of the tables of a TOML file: unknown keys, wrong types and numbers that are not finite are refused."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+
+SchemaType = TypeVar("SchemaType", bound=Schema)
+
+
+# TOML
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Return the document of a TOML file. Raises InputError with line and column."""
+    try:
+        return tomllib.loads(read_text(path))
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(
+            "not valid TOML", where=path, found=str(error), hint="text needs quotes; a [table] goes on until the next one"
+        ) from None
+
+
+def read_text(path: Path) -> str:
+    """Return a text file's content without a byte order mark. Raises InputError."""
+    try:
+        return path.read_bytes().decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(
+            "not a UTF-8 text file", where=path, found=f"byte {error.start}", expected="UTF-8", hint="save it as UTF-8"
+        ) from None
+    except OSError as error:
+        raise InputError("cannot be read", where=path, found=error.strerror) from None
+
+
+def validated(schema: type[SchemaType], document: dict[str, Any], path: Path) -> SchemaType:
+    """Return the checked document. Raises the first InputError of `schema_problems`."""
+    problems = schema_problems(schema, document, path)
+    if problems:
+        raise problems[0]
+    return schema.model_validate(document)
+
+
+def schema_problems(schema: type[Schema], document: dict[str, Any], path: Path) -> list[InputError]:
+    """Return what is wrong with a document, unknown keys first (a misspelt key also shows as a missing one)."""
+    try:
+        schema.model_validate(document)
+    except ValidationError as error:
+        found = sorted(error.errors(include_url=False), key=lambda item: item["type"] != "extra_forbidden")
+        return [_problem(schema, item, path) for item in found]
+    return []
+
+
+def _problem(schema: type[Schema], item: Any, path: Path) -> InputError:
+    """Translate one finding of pydantic."""
+    location = tuple(item["loc"])
+    where = f"{path}: {key_path(location)}" if location else str(path)
+    kind = item["type"]
+    if kind == "extra_forbidden":
+        known = list(_keys_at(schema, location[:-1]))
+        return InputError(
+            "unknown key",
+            where=where,
+            found=short(str(location[-1])),
+            expected=" | ".join(known),
+            hint=near(str(location[-1]), known),
+        )
+    expected = _description_at(schema, location)
+    if kind == "missing":
+        return InputError("a required key is missing", where=where, found="nothing", expected=expected)
+    if kind == "value_error":
+        error = item["ctx"]["error"]
+        return InputError(str(error), where=where, found=short(item["input"]), expected=expected)
+    what = str(item["msg"]).replace("Input should", "should").replace(", got inf or nan", "")
+    what = what.replace("List should have", "should have").replace("String should", "should")
+    return InputError(what, where=where, found=short(item["input"]), expected=expected)
+
+
+def _keys_at(schema: type[Schema], location: Sequence[int | str]) -> Iterable[str]:
+    inner = _annotation_at(schema, location)
+    return inner.model_fields if isinstance(inner, type) and issubclass(inner, BaseModel) else ()
+
+
+def _description_at(schema: type[Schema], location: Sequence[int | str]) -> str | None:
+    """Return what the schema says of the innermost described key of a place."""
+    description: str | None = None
+    for i, part in enumerate(location):
+        table = _annotation_at(schema, location[:i])
+        field = table.model_fields.get(str(part)) if isinstance(table, type) and issubclass(table, BaseModel) else None
+        description = field.description or description if field else description
+    return description
+
+
+def _annotation_at(schema: Any, location: Sequence[int | str]) -> Any:
+    for part in location:
+        if isinstance(schema, type) and issubclass(schema, BaseModel):
+            field = schema.model_fields.get(str(part))
+            schema = _bare(field.annotation) if field else None
+        else:
+            arguments = typing.get_args(schema)
+            schema = _bare(arguments[-1]) if arguments else None
+    return schema
+
+
+def _bare(annotation: Any) -> Any:
+    """Strip Optional and Annotated."""
+    while True:
+        origin = typing.get_origin(annotation)
+        if origin is typing.Annotated:
+            annotation = typing.get_args(annotation)[0]
+        elif origin in (typing.Union, types.UnionType):
+            annotation = next(a for a in typing.get_args(annotation) if a is not type(None))
+        else:
+            return annotation
+
+
+# CSV
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Table:
+    """The cells of a CSV file, as text."""
+
+    path: Path
+    columns: tuple[str, ...]
+    cells: tuple[tuple[str, ...], ...]
+    """One tuple a row."""
+    lines: tuple[int, ...]
+    """Line of each row in the file, from 1."""
+
+    def __len__(self) -> int:
+        return len(self.cells)
+
+    def place(self, row: int, column: str | None = None) -> str:
+        """Return where a cell stands, for messages."""
+        return f"{self.path}, line {self.lines[row]}" + (f", column {column}" if column else "")
+
+    def text(self, column: str) -> tuple[str, ...]:
+        """Return a column as text without blanks at the ends."""
+        index = self.columns.index(column)
+        return tuple(row[index].strip() for row in self.cells)
+
+    def numbers(self, columns: Sequence[str], *, empty_is_nan: bool = False) -> FloatArray:
+        """Return columns as finite numbers, shape (rows, columns). Raises InputError with line and column."""
+        result = np.empty((len(self.cells), len(columns)))
+        for j, column in enumerate(columns):
+            result[:, j] = self._column(column, empty_is_nan)
+        return result
+
+    def integers(self, column: str) -> IntArray:
+        """Return a column of whole numbers ≥ 0, shape (rows,). Raises InputError with line and column."""
+        values = self._column(column, False)
+        bad = np.flatnonzero((values != np.rint(values)) | (values < 0))
+        if len(bad):
+            raise InputError(
+                "not a whole number ≥ 0", where=self.place(bad[0], column), found=self.text(column)[bad[0]], expected="0, 1, 2, …"
+            )
+        return values.astype(np.int64)
+
+    def _column(self, column: str, empty_is_nan: bool) -> FloatArray:
+        cells = self.text(column)
+        if empty_is_nan:
+            filled = [cell or "nan" for cell in cells]
+            allowed = np.array([not cell for cell in cells], dtype=bool)
+        else:
+            filled, allowed = list(cells), np.zeros(len(cells), dtype=bool)
+        try:
+            values = np.array([float(cell) for cell in filled], dtype=np.float64)
+        except ValueError:
+            raise self._not_a_number(column, filled) from None
+        bad = np.flatnonzero(~np.isfinite(values) & ~allowed)
+        if len(bad):
+            raise InputError(
+                "not a finite number",
+                where=self.place(bad[0], column),
+                found=cells[bad[0]],
+                expected="a finite number",
+                hint="leave the row out where nothing was measured",
+            )
+        return values
+
+    def _not_a_number(self, column: str, cells: Sequence[str]) -> InputError:
+        row = next(i for i, cell in enumerate(cells) if not _is_number(cell))
+        found = cells[row] or "an empty cell"
+        hint = "decimal points, not commas" if "," in found else None
+        return InputError("not a number", where=self.place(row, column), found=found, expected="a number", hint=hint)
+
+
+def read_csv(path: Path, *, required: Sequence[str], optional: Sequence[str] = (), prefixes: Sequence[str] = ()) -> Table:
+    """Return the cells of a CSV file with a header.
+
+    A byte order mark, CRLF, blanks around names and empty lines are accepted.
+
+    Arguments:
+        path: the file.
+        required, optional: names of columns.
+        prefixes: columns that start so (and have more than that) are accepted too.
+
+    Raises:
+        InputError: a missing, unknown or double column, or a row of another length.
+    """
+    reader = csv.reader(io.StringIO(read_text(path), newline=""))
+    rows = [(reader.line_num, tuple(row)) for row in reader if any(cell.strip() for cell in row)]
+    if not rows:
+        raise InputError("the file is empty", where=path, expected=f"a header: {','.join(required)}")
+    columns = tuple(cell.strip() for cell in rows[0][1])
+    _check_header(path, columns, required, optional, prefixes)
+    for line, row in rows[1:]:
+        if len(row) != len(columns):
+            raise InputError(
+                "a row of another length than the header",
+                where=f"{path}, line {line}",
+                found=f"{len(row)} cells",
+                expected=f"{len(columns)} cells: {','.join(columns)}",
+                hint="decimal points, not commas",
+            )
+    return Table(path, columns, tuple(row for _, row in rows[1:]), tuple(line for line, _ in rows[1:]))
+
+
+def _check_header(
+    path: Path, columns: Sequence[str], required: Sequence[str], optional: Sequence[str], prefixes: Sequence[str]
+) -> None:
+    where = f"{path}, header"
+    if len(columns) == 1 and any(separator in columns[0] for separator in (";", "\t")):
+        raise InputError(
+            "separated by semicolons or tabs",
+            where=where,
+            found=short(columns[0]),
+            expected="commas between the cells, points in the numbers",
+            hint="export it again as comma-separated values",
+        )
+    known = [*required, *optional]
+    for i, column in enumerate(columns):
+        prefixed = any(column.startswith(prefix) and len(column) > len(prefix) for prefix in prefixes)
+        if column not in known and not prefixed:
+            names = [*known, *(f"{prefix}NAME" for prefix in prefixes)]
+            raise InputError(
+                "unknown column", where=where, found=short(column), expected=", ".join(names), hint=near(column, known)
+            )
+        if column in columns[:i]:
+            raise InputError("a column stands twice", where=where, found=column, expected="each column once")
+    missing = [column for column in required if column not in columns]
+    if missing:
+        raise InputError("columns are missing", where=where, found=", ".join(columns), expected=", ".join(missing))
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True

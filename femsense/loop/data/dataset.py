@@ -1,0 +1,296 @@
+"""The data of the loop: recordings, checked, split by sweeps, and calibrated for a start."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from femsense.calib.calibrate import calibrated_start, first_poses, usable_frames
+from femsense.calib.inputs import first_inputs, input_bounds
+from femsense.core.arrays import FloatArray, IntArray
+from femsense.core.errors import DataError, InputError
+from femsense.loop.data.holdout import hold_out, sweeps_of
+from femsense.loop.data.surface_rows import (
+    SMOOTH,
+    cloud_frames,
+    diagonal_of,
+    has_clouds,
+    make_rows,
+    read_clouds,
+    states_of,
+    surface_normals,
+    with_surface,
+)
+from femsense.loop.data.trial import Groups, States, Surface, Trial, normals_of
+from femsense.model.effects import FORMS, Effect, Entry, find_effect
+from femsense.model.observation import Scene, make_scene, rest_residual, with_rest_markers
+from femsense.model.recording import Recording, check_against, state_key
+from femsense.model.remeshing import robot_on_mesh
+from femsense.model.robot import Robot
+
+MAX_ROWS = 3000
+"""Marker rows a recording at most, and rows of clouds; more are thinned out by whole frames."""
+ROWS_A_CLOUD = 60
+"""Points of the surface that a camera sees in one frame, about."""
+FEWEST_CLOUDS = 4
+"""Where there are markers, fewer frames with clouds than this are not looked at."""
+MESH = find_effect("discretisation")
+QUADRATIC: Entry = {"element": "tet10"}
+"""What stands for a mesh fine enough while effects are sought, where linear elements are declared (see `elements`)."""
+MEASURED = ("auto", "markers", "clouds", "both")
+"""What may be used of a recording; auto: its markers, or its clouds where it has no markers."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Data:
+    """Recordings, split. Where a recording has both, its markers are one trial and its clouds the next."""
+
+    robot: Robot
+    """As declared, or on quadratic elements where effects are sought with these; with points of its surface behind the markers where there are clouds."""
+    control: str
+    train: list[Trial]
+    held: list[Trial]
+    held_of: list[int | None]
+    """The training trial whose pose a held-out trial shares; None: it gets its own."""
+    split: list[str]
+    seat_std: float
+    input_scale: FloatArray
+    """Typical range of each cable's input [N] or [m], shape (a,)."""
+    declared: Robot
+    """As it came."""
+    forms: tuple[Effect, ...] = FORMS
+    """What may be tried, a user's effects among it."""
+    strays: tuple[tuple[int, str], ...] = ()
+    """Frame numbers and names of markers that are left out because they are far from where others let expect them."""
+
+    @property
+    def measured(self) -> tuple[str, ...]:
+        """What the data are: "markers", "clouds" or both."""
+        kinds = {"markers" if t.scene.crossings is None else "clouds" for t in self.train}
+        return tuple(sorted(kinds, reverse=True))
+
+    @property
+    def settled(self) -> tuple[tuple[Effect, Entry], ...]:
+        """What the robot has that is not declared, as an effect: quadratic elements."""
+        return ((MESH, QUADRATIC),) if self.robot.body.mesh.is_quadratic != self.declared.body.mesh.is_quadratic else ()
+
+    @property
+    def robot_as_declared(self) -> Robot:
+        """The robot on its declared mesh."""
+        return robot_on_mesh(self.robot, self.declared.body.mesh) if self.settled else self.robot
+
+
+def prepare(robot: Robot, recordings: Sequence[Recording], validation: Sequence[Recording], measured: str = "auto") -> Data:
+    """Check the recordings, split them, and calibrate each for a start.
+
+    Arguments:
+        robot: as it is declared.
+        recordings: to fit.
+        validation: to judge on.
+        measured: "markers", "clouds" or "both": what is used of a recording; "auto": its markers, or its clouds where it has none.
+
+    Raises:
+        InputError: bad arguments; DataError: the data do not allow a fit.
+    """
+    if not recordings:
+        raise InputError("nothing to learn from", where="recordings", expected="at least one recording")
+    if measured not in MEASURED:
+        raise InputError("no such kind of data", where="measured", found=measured, expected=", ".join(MEASURED))
+    recordings = [check_against(robot, r) for r in recordings]
+    validation = [check_against(robot, r) for r in validation]
+    control = recordings[0].actuation
+    if any(r.actuation != control for r in [*recordings, *validation]):
+        raise InputError(
+            "recordings differ in actuation",
+            where="recordings",
+            found=[r.actuation for r in [*recordings, *validation]],
+            expected="all tension or all displacement",
+        )
+    used = [_frames_of(r, measured) for r in [*recordings, *validation]]
+    declared, robot = robot, with_surface(robot) if any(len(clouds) for _, clouds in used) else robot
+    train: list[Trial] = []
+    held: list[Trial] = []
+    held_of: list[int | None] = []
+    words: list[str] = []
+    for recording, kinds in zip(recordings, used):
+        frames = np.union1d(*kinds)
+        fitted, kept, how = (
+            (frames, frames[:0], "all frames fitted; held out: other recordings") if validation else hold_out(recording, frames)
+        )
+        if not len(kept) and not validation:
+            raise DataError("one frame is too few to hold anything out: record more frames, or give --validation")
+        first = len(train)
+        for one, later in _trials(robot, declared, recording, kinds, fitted, kept):
+            train.append(one)
+            if later is not None:
+                held.append(replace(later, together=bool(held) and later.together and held_of[-1] == first))
+                held_of.append(first)
+        words.append(how)
+    for recording, kinds in zip(validation, used[len(recordings) :]):
+        frames = np.union1d(*kinds)
+        for one, _ in _trials(robot, declared, recording, kinds, frames, frames[:0], first_only=True):
+            held.append(one)
+            held_of.append(None)
+        words.append("validation recording")
+    rest = [r for t in train for r in [_rest_spread(robot, t)] if r is not None]
+    scale = np.max([np.ptp(r.inputs, axis=0) if r.inputs.size else np.zeros(len(robot.body.cables)) for r in recordings], axis=0)
+    seat_std = float(np.sqrt(np.mean(np.square(rest)))) if rest else 1e-3
+    return Data(robot, control, train, held, held_of, words, seat_std, scale, declared)
+
+
+def _frames_of(recording: Recording, measured: str) -> tuple[IntArray, IntArray]:
+    """Return the frames whose markers, and those whose clouds are used. Raises DataError where there are none."""
+    usable = usable_frames(recording)
+    none = usable[:0]
+    marked = none if measured == "clouds" else usable[np.isin(usable, recording.marker_frame)]
+    cloudy = none if measured == "markers" else np.intersect1d(usable, cloud_frames(recording))
+    if len(marked) and (measured == "auto" or len(cloudy) < FEWEST_CLOUDS):
+        cloudy = none
+    if not len(marked) and not len(cloudy):
+        raise DataError(_nothing(recording, measured))
+    rows = int(np.isin(recording.marker_frame, marked).sum())
+    return marked[:: max(1, int(np.ceil(rows / MAX_ROWS)))], _evenly(recording, cloudy, MAX_ROWS // ROWS_A_CLOUD)
+
+
+def _evenly(recording: Recording, frames: IntArray, most: int) -> IntArray:
+    """Return so many of the frames at most, evenly spread."""
+    return (
+        frames[np.unique(np.linspace(0, len(frames) - 1, min(most, len(frames))).round().astype(int))] if len(frames) else frames
+    )
+
+
+def _nothing(recording: Recording, measured: str) -> str:
+    wanted = measured if measured in ("markers", "clouds") else "markers or clouds"
+    has = {"markers": bool(len(recording.marker_frame)), "clouds": has_clouds(recording)}
+    if not any(has[kind] for kind in has if kind in wanted):
+        return f"the recording has no {wanted}: the loop needs markers.csv, clouds/ or depth/ in frames that are free (or whose loads are declared)"
+    return f"no frame with {wanted} is free of undeclared contact: the loop needs {wanted} in free frames (or declared loads)"
+
+
+def marked_frames(recording: Recording) -> IntArray:
+    """Return the frames whose markers are used, thinned out. Raises DataError where there are none."""
+    return _frames_of(recording, "markers")[0]
+
+
+def _trials(
+    robot: Robot,
+    declared: Robot,
+    recording: Recording,
+    kinds: tuple[IntArray, IntArray],
+    fitted: IntArray,
+    kept: IntArray,
+    *,
+    first_only: bool = False,
+) -> list[tuple[Trial, Trial | None]]:
+    """Return the trials of a recording, (fitted, held out): its markers and its clouds, with a calibration to start from.
+
+    `first_only` fits the pose on the first frames.
+    """
+    marked, cloudy = kinds
+    few = fitted[: max(1, round(0.2 * len(fitted)))] if first_only else fitted
+    poses, initial, states = _start(declared, recording, few)
+    low, high = input_bounds(robot, recording)
+    every = np.union1d(fitted, kept)
+    mesh = declared.body.mesh
+    starts = {id(mesh.tets): (mesh, states)} if states else {}
+
+    def trial(scene: Scene, frames: IntArray) -> Trial:
+        return Trial(
+            scene, groups_of(scene, frames, surface_of(robot, scene, poses)), poses, initial, low, high, starts, frames=frames
+        )
+
+    result: list[tuple[Trial, Trial | None]] = []
+    if len(np.intersect1d(marked, fitted)):
+        later = np.intersect1d(marked, kept)
+        result.append(
+            (
+                trial(make_scene(robot, recording, np.intersect1d(marked, fitted)), fitted),
+                trial(make_scene(robot, recording, later), kept) if len(later) else None,
+            )
+        )
+    if not len(np.intersect1d(cloudy, fitted)):
+        return result
+    empty = _bare_scene(robot, recording, np.intersect1d(cloudy, every), with_rest=not result)
+    states = states_of(robot, empty, poses, initial)
+    seen = read_clouds(robot, recording, states, poses)
+    pair: list[Trial | None] = []
+    for frames in (fitted, kept):
+        own = {k: s for k, s in states.items() if k in frames}
+        scene = make_rows(robot, empty, seen, own, list(poses)) if own else None
+        pair.append(None if scene is None else replace(trial(scene, frames), together=bool(result), seen=seen))
+    assert pair[0] is not None
+    result.append((pair[0], pair[1]))
+    return result
+
+
+def _start(robot: Robot, recording: Recording, frames: IntArray) -> tuple[tuple[FloatArray, ...], FloatArray | None, States]:
+    """Return poses, initial inputs and states to start from: of the calibration where there are markers, else as declared.
+
+    Raises:
+        InputError: neither markers, nor a declared pose.
+    """
+    unknown = recording.actuation_zero == "unknown" and bool(robot.body.cables)
+    if np.isin(recording.marker_frame, frames).any():
+        poses, inputs, states = calibrated_start(robot, recording, frames)
+        return poses, inputs if unknown else None, states
+    initial = first_inputs(robot, recording)
+    if recording.rest is not None:
+        return tuple(first_poses(robot, _bare_scene(robot, recording, frames, with_rest=True))), initial, {}
+    missing = [name or "(only one)" for name, T in zip(recording.camera_names, recording.T_robot_camera) if T is None]
+    if missing:
+        raise InputError(
+            "clouds without markers need to know where the camera stands",
+            where=recording.folder,
+            found=f"no T_robot_camera of camera {', '.join(missing)}, no markers.csv, no rest.csv",
+            expected="T_robot_camera in recording.toml (maps camera coordinates to robot coordinates; a few millimetres and degrees off will do)",
+            hint="or show three markers in one frame, or measure them at rest (rest.csv)",
+        )
+    return tuple(T for T in recording.T_robot_camera if T is not None), initial, {}
+
+
+def _bare_scene(robot: Robot, recording: Recording, frames: IntArray, *, with_rest: bool) -> Scene:
+    """Return a scene of some frames without rows."""
+    none, nowhere = np.zeros(0, np.int64), np.zeros((0, 3))
+    scene = Scene(recording, frames, none, none, none, nowhere, none, none, nowhere)
+    return with_rest_markers(robot, scene) if with_rest else scene
+
+
+def surface_of(robot: Robot, scene: Scene, poses: Sequence[FloatArray]) -> Surface | None:
+    """Return where the rows of a scene lie on the body, and their normals; None where they are markers."""
+    if scene.crossings is None:
+        return None
+    keys = {k: state_key(scene.recording, int(k)).hex() for k in np.unique(scene.frame)}
+    states = np.unique([keys[f] for f in scene.frame], return_inverse=True)[1]
+    at_rest = surface_normals(robot, robot.body.mesh.nodes)[scene.marker - len(robot.glued_names)]
+    return Surface(robot.marker_points[scene.marker], normals_of(scene, poses), at_rest, states, SMOOTH * diagonal_of(robot))
+
+
+def groups_of(scene: Scene, frames: IntArray | None = None, surface: Surface | None = None) -> Groups:
+    """Return what the rows of a scene have in common; sweeps are counted among `frames`, by default those of the scene.
+
+    `surface`: where the rows lie, if they are of clouds.
+    """
+    recording = scene.recording
+    frames = scene.frames if frames is None else frames
+    keys = {k: state_key(recording, int(k)) for k in np.unique(scene.frame)}
+    sweep = dict(zip(frames.tolist(), sweeps_of(recording, frames)))
+    state = np.unique([f"{m}:{keys[f].hex()}" for m, f in zip(scene.marker, scene.frame)], return_inverse=True)[1]
+    return Groups(
+        np.unique(scene.marker, return_inverse=True)[1],
+        np.unique(scene.frame, return_inverse=True)[1],
+        np.array([sweep[int(f)] for f in scene.frame], dtype=np.int64),
+        state,
+        surface,
+    )
+
+
+def _rest_spread(robot: Robot, trial: Trial) -> float | None:
+    if not len(trial.scene.rest_marker):
+        return None
+    return max(float(np.sqrt((rest_residual(robot, trial.scene, trial.poses) ** 2).mean())), 1e-4)
+
+
+NUISANCE = ("stiffness", "cable_offset")
+"""Effects that are always fitted along."""

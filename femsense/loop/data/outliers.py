@@ -1,0 +1,80 @@
+"""Stray markers: single measurements that are far from where the others of their frame and of their marker let expect them.
+
+A reflex, or a name that two markers exchanged for a frame, weighs more than all the rest in a fit of squares, and spoils the error that is reported.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from femsense.core.arrays import BoolArray, FloatArray, IntArray
+from femsense.loop.data.dataset import Data
+from femsense.loop.data.trial import Trial
+
+STRAYS = 4.0
+"""A stray is off by so many times what nine in ten are off by at most …"""
+FAR = 0.05
+"""… and by more than this share of the body's reach; nearer ones may be what is sought."""
+RARE = 0.02
+"""Where more than this share is, it is no accident."""
+
+
+def without_strays(data: Data, fitted: Sequence[FloatArray], held_out: Sequence[FloatArray]) -> Data:
+    """Return the data without outliers, as residuals (k, c) [m] of the fitted and of the held-out trials show them, and warn of each recording's."""
+    train = [_kept(data, t, r) for t, r in zip(data.train, fitted)]
+    held = [_kept(data, t, r) for t, r in zip(data.held, held_out)]
+    pairs = [*zip(data.train, train), *zip(data.held, held)]
+    found = [s for before, after in pairs if after is not before for s in _named(data, before, after)]
+    return replace(data, train=train, held=held, strays=(*data.strays, *found)) if found else data
+
+
+def _kept(data: Data, trial: Trial, residual: FloatArray) -> Trial:
+    """Return a trial without its strays; itself where there are none, or it is of clouds."""
+    if trial.scene.crossings is not None:
+        return trial
+    off = strays(residual, trial.scene.frame, trial.scene.marker, FAR * data.robot.body.reach)
+    if not off.any():
+        return trial
+    scene, keep = trial.scene, ~off
+    fewer = replace(scene, frame=scene.frame[keep], marker=scene.marker[keep], view=scene.view[keep], points=scene.points[keep])
+    return replace(trial, scene=fewer, groups=trial.groups.of_rows(keep), mesh_error=None)
+
+
+def strays(residual: FloatArray, frame: IntArray, marker: IntArray, far: float) -> BoolArray:
+    """Return which rows of a residual (k, 3) [m] stand out from their frame and their marker by more than `far` [m], and by STRAYS times the 90 % quantile.
+
+    Several of a frame that are off the same way are no strays: a part of the body is elsewhere than the model has it. Two that exchanged their names
+    are off opposite ways.
+    """
+    apart = _less_medians(_less_medians(residual, frame), marker)
+    size = np.linalg.norm(apart, axis=1)
+    off = size > max(far, STRAYS * float(np.quantile(size, 0.9)))
+    for k in np.unique(frame[off]):
+        rows = np.flatnonzero(off & (frame == k))
+        if len(rows) > 1 and (apart[rows] @ apart[rows].T > 0.0).all():
+            off[rows] = False
+    return off if off.sum() <= max(RARE * len(off), 1) else np.zeros(len(off), dtype=bool)
+
+
+def _less_medians(values: FloatArray, labels: IntArray) -> FloatArray:
+    """Return values (k, 3) less the median of those with the same label."""
+    result = values.copy()
+    for label in np.unique(labels):
+        rows = labels == label
+        result[rows] -= np.median(values[rows], axis=0)
+    return result
+
+
+def _named(data: Data, before: Trial, after: Trial) -> list[tuple[int, str]]:
+    """Return frame numbers and names of the markers that a trial has lost, and warn of them."""
+    scene = before.scene
+    kept = set(zip(after.scene.frame.tolist(), after.scene.marker.tolist(), after.scene.view.tolist()))
+    lost = [r for r in zip(scene.frame.tolist(), scene.marker.tolist(), scene.view.tolist()) if r not in kept]
+    found = [(int(scene.recording.frame_numbers[f]), data.robot.marker_names[m]) for f, m, _ in lost]
+    said = ", ".join(f"{name} in frame {number}" for number, name in found[:5]) + (" …" if len(found) > 5 else "")
+    warnings.warn(f"{scene.recording.folder}: stray markers are left out: {said}", stacklevel=2)
+    return found

@@ -1,0 +1,214 @@
+"""A plan in words: tables for people, and the next experiment that a finished loop asks for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from femsense.core.arrays import FloatArray
+from femsense.core.errors import FemsenseError
+from femsense.core.parallel import each
+from femsense.loop.data.dataset import NUISANCE, Data
+from femsense.loop.data.trial import Trial, numbers_of
+from femsense.loop.design.candidate_experiments import Element, menu, setup_for
+from femsense.loop.design.identifiability import EVIDENCE, Block, Form, Judge, Outlook, Row, forms_of, make_block, turns_of
+from femsense.loop.design.planner import Proposal, element_block
+from femsense.loop.fit.joint_fit import JointFit
+from femsense.loop.fit.noise_components import Noise
+from femsense.model.drive import has_history
+from femsense.model.robot import Robot
+
+MOST_WORK, MOST_FRAMES = 30_000, 40
+"""Tetrahedra × frames, and frames, that items may cost as advice after a loop; the recordings may cost twice that. A few seconds."""
+MOST_LOOKED_AT = 6
+"""Frames of each recording that are looked at then."""
+
+
+# Tables
+
+
+def outlook_text(outlook: Outlook, before: Outlook | None = None) -> str:
+    """Return what an experiment could show as a table; with what came before beside it."""
+    first = {r.label: r for r in before.rows} if before is not None else {}
+    wide = max(len(r.label) for r in outlook.rows) + 2
+    head = f"{'effect':{wide}}{'left by calibration':>22}{'smallest seen':>32}{'dBIC at plausible size':>26}"
+    lines = [head, "-" * len(head)]
+    for r in outlook.rows:
+        old = first.get(r.label)
+        cells = [_arrow(None if old is None else old.retained, r.retained, "{:.1%}"), _both(old, r)]
+        cells.append(_arrow(None if old is None else old.dbic, r.dbic, "{:.0f}"))
+        lines.append(f"{r.label:{wide}}{cells[0]:>22}{cells[1]:>32}{cells[2]:>26}  {_verdict(r)}")
+    for label in (k for k in first if k not in {r.label for r in outlook.rows}):
+        lines.append(f"{label:{wide}}measured by rest.csv, no longer in question")
+    return "\n".join([*lines, "", *_summary(outlook, before)])
+
+
+def _arrow(old: float | None, new: float, form: str) -> str:
+    return form.format(new) if old is None else f"{form.format(old)} → {form.format(new)}"
+
+
+def _both(old: Row | None, new: Row) -> str:
+    if new.form.effect.discrete:
+        return "as a whole"
+    after = _smallest(new)
+    return after if old is None else f"{_smallest(old, bare=True)} → {after}"
+
+
+def _smallest(r: Row, *, bare: bool = False) -> str:
+    """Return the smallest size of the effect's middle parameter in its own unit."""
+    of = [i for i, p in enumerate(r.form.parameters) if p.key == r.form.parameters[0].key]
+    size = float(np.sort(r.smallest[of])[(len(of) - 1) // 2])
+    p = r.form.parameters[0]
+    if not np.isfinite(size) or not r.testable:
+        return "–"
+    value, unit = size, "" if p.unit == "1" else f" {p.unit}"
+    if p.scale == "log":
+        value, unit = 100 * float(np.expm1(min(size, 7.0))), " %"
+    elif p.scale == "reciprocal":
+        value = 1.0 / size
+    elif p.unit == "m":
+        value, unit = 1e3 * size, " mm"
+    return f"{value:.3g}" + ("" if bare else unit)
+
+
+def _verdict(r: Row) -> str:
+    return "" if r.seen else "too small to be seen" if r.testable else "not testable"
+
+
+def _summary(outlook: Outlook, before: Outlook | None) -> list[str]:
+    def count(what: str) -> str:
+        new = len(getattr(outlook, what)()) if what == "confused" else len(getattr(outlook, what))
+        if before is None:
+            return str(new)
+        old = len(before.confused()) if what == "confused" else len(getattr(before, what))
+        return f"{old} → {new}"
+
+    apart = " → ".join("{} of {}".format(*o.told_apart()) for o in (before, outlook) if o is not None)
+    lines = [
+        f"not testable: {count('untestable')}; too small to be seen: {count('unseen')}; pairs of effects that would be told apart: {apart}",
+        f"pairs that would both be seen and look alike: {count('confused')}",
+    ]
+    for i, j, share, gap in sorted(outlook.confused(), key=lambda p: p[3])[:12]:
+        names = f"{outlook.rows[i].label} / {outlook.rows[j].label}"
+        lines.append(f"  {names}: one imitates {100 * share:.0f} % of the other, dBIC gap {gap:.0f}")
+    return lines
+
+
+def proposal_text(proposal: Proposal) -> str:
+    """Return a proposal in words and its table."""
+    brings = {s.element.key: s.better for s in proposal.steps}
+    frames, seconds = sum(e.frames for e in proposal.elements), sum(e.seconds for e in proposal.elements)
+    lines = [f"What to record ({frames} frames, {seconds / 60:.1f} minutes of motion; every item starts and ends at rest):", ""]
+    for i, e in enumerate(proposal.elements):
+        how = f" ({e.frames} frame{'s' if e.frames > 1 else ''}, {e.seconds:.0f} s)" if e.frames else ""
+        lines.append(f"{i + 1:3d}. {e.words}{how}")
+        lines += [f"       {text}" for text in brings.get(e.key, ())[:4]]
+    if not proposal.steps:
+        lines.append("nothing on the menu helps within these frames")
+    lines += [f"left out: {text}" for text in proposal.left_out]
+    title = f"Predicted, before → after, {1e3 * proposal.noise:g} mm noise a coordinate, on the declared robot:"
+    note = (
+        "Validation needs frames beyond these: one more sweep of a kind that is not in the list (femsense improve --validation)."
+    )
+    return "\n".join([*lines, "", note, "", title, "", outlook_text(proposal.after, proposal.before)])
+
+
+# What a finished loop asks for
+
+
+def next_element(
+    data: Data, fit: JointFit, noise: Noise, confounded: Sequence[tuple[str, str]], not_testable: Sequence[str]
+) -> list[tuple[str, str, float, float]]:
+    """Return which item of the menu would help most with what the data leave open, and by how much.
+
+    Arguments:
+        data: of the loop; few of its frames are looked at.
+        fit: the model.
+        noise: of the data.
+        confounded: pairs of effects that the data cannot tell apart.
+        not_testable: effects that they cannot show.
+
+    Returns:
+        (what to do, the open question that gains most by it, the expected evidence on it before and after), the best first; empty where nothing
+        brings any question towards an answer or where it would take too long. What an item is worth is the evidence between 0 and
+        `EVIDENCE` that it adds to each question: below 0 the wrong answer is expected, and less wrong is no better.
+    """
+    robot = fit.hypothesis.robot_at(fit.coordinates)
+    names = {n for pair in confounded for n in pair} | set(not_testable)
+    trials = [_few(t) for t in data.train]
+    tets = len(robot.body.mesh.tets)
+    past = has_history(robot) or "cable_friction" in names
+    cost = sum(int(t.scene.frames.max()) + 1 if past else len(t.scene.frames) for t in trials)
+    if not names or cost > 2 * min(MOST_WORK // tets, MOST_FRAMES):
+        return []
+    try:
+        zero = "unknown" if any(t.initial is not None for t in trials) else "absolute"
+        marked = robot.without_surface_points() if robot.glued_names else robot  # what an experiment would have on it
+        setup = setup_for(marked, data.control, zero, most=data.input_scale)
+        forms = _open_forms(robot, data, names)
+        shares = [len(few.scene.frames) / len(t.scene.frames) for few, t in zip(trials, data.train)]
+        have = [
+            _trial_block(t, robot, forms, noise.row_std(t.groups) * np.sqrt(share), str(number))
+            for t, share, number in zip(trials, shares, numbers_of(data.train))
+        ]
+    except FemsenseError:
+        return []
+    judge, left = Judge(forms, data.input_scale), min(MOST_WORK // tets, MOST_FRAMES)
+    now = _open(judge.judge(have), confounded, not_testable)
+    questions = [*(f"{a} or {b}" for a, b in confounded), *not_testable]
+    chosen = []
+    for element in _one_of_each_first(menu(setup)):
+        if element.sweeps and element.frames < left:
+            left -= element.frames + 1
+            chosen.append(element)
+
+    def block_of(element: Element) -> Block | None:
+        try:
+            return element_block(setup, forms, element, noise.row_std(data.train[0].groups), with_rest=False)
+        except FemsenseError:
+            return None
+
+    found = []
+    for element, block in zip(chosen, each(block_of, chosen)):
+        if block is None:
+            continue
+        then = _open(judge.judge([*have, block]), confounded, not_testable)
+        gain = np.clip(then, 0.0, EVIDENCE) - np.clip(now, 0.0, EVIDENCE)
+        if gain.sum() > 1.0:
+            most = int(np.argmax(gain))
+            found.append((float(gain.sum()), (element.words, questions[most], float(now[most]), float(then[most]))))
+    return [item for _, item in sorted(found, key=lambda f: -f[0])]
+
+
+def _one_of_each_first(elements: Sequence[Element]) -> list[Element]:
+    kinds = [e.key.split(":")[0] for e in elements]
+    return [e for _, _, e in sorted(((kinds[:i].count(kinds[i]), i, e) for i, e in enumerate(elements)), key=lambda t: t[:2])]
+
+
+def _few(trial: Trial) -> Trial:
+    frames = trial.scene.frames
+    every = np.unique(np.linspace(0, len(frames) - 1, min(MOST_LOOKED_AT, len(frames))).round().astype(int))
+    return replace(trial.part(frames[every]), together=False)  # it goes by its number with the markers of its recording
+
+
+def _open_forms(robot: Robot, data: Data, names: set[str]) -> list[Form]:
+    unknown = any(t.initial is not None for t in data.train)
+    wanted = (names | set(NUISANCE)) - ({"cable_offset"} if unknown else set())
+    return forms_of(robot, data.control, data.input_scale, names=sorted(wanted))
+
+
+def _trial_block(trial: Trial, robot: Robot, forms: list[Form], noise: float, key: str) -> Block:
+    turns = turns_of(trial.scene.recording.gravity, robot.body.gravity)
+    return make_block(trial, robot, forms, recording=key, noise=noise, turns=turns, measured=True)
+
+
+def _open(outlook: Outlook, pairs: Sequence[tuple[str, str]], not_testable: Sequence[str]) -> FloatArray:
+    """Return the expected evidence on each open question: the gap of a pair, or of an effect over no effect."""
+    of = {frozenset({outlook.rows[i].name, outlook.rows[j].name}): gap for i, j, _, gap in reversed(outlook.pairs())}
+    alone = {r.name: r.dbic for r in reversed(outlook.rows)}
+    answers: list[Any] = [of.get(frozenset(p), EVIDENCE) for p in pairs]
+    answers += [alone.get(n, EVIDENCE) for n in not_testable]
+    return np.array(answers or [EVIDENCE])

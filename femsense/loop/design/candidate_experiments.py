@@ -1,0 +1,368 @@
+"""The menu of an experiment: what a person can do with a robot and a camera, each item as sweeps of a script.
+
+An item starts and ends at rest, so that items can follow each other in any order and be judged one by one. How far to
+pull comes from the declared robot: as far as moves its markers by a quarter of its length, within what a cable bears.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from femsense.core.arrays import FloatArray
+from femsense.core.errors import DataError
+from femsense.core.parallel import each
+from femsense.fem.equilibrium import Equilibrium
+from femsense.model.drive import Walk, drive_of
+from femsense.model.effects.loads import STANDARD_GRAVITY
+from femsense.model.recording import make_recording
+from femsense.model.robot import Robot, spread_features
+from femsense.model.variants import solve_frame
+from femsense.rig.camera import camera_of, look_at, visible_points
+from femsense.rig.scene import body_shape
+from femsense.rig.script import FORMAT, SceneTable, ViewTable
+
+BEND = 0.25
+"""A full pull moves a marker by this share of the robot's length."""
+SAG = 0.08
+"""A weight moves one by this share."""
+BEARABLE = 0.9
+"""Share of the largest tension or pressure that a pull uses at most."""
+TOGETHER = 0.6
+"""Each of two cables that are pulled together goes to this share of its height."""
+STEP_S = 1.0
+SLOW_S = 10.0
+HOLD_S = 15.0
+"""Time from frame to frame [s]: usual, slow, and while holding."""
+MOST_PAIRS = 6
+FAR = 1.6
+"""The second camera stands so many times as far away."""
+DOWN = np.array([0.0, 0.0, -1.0])
+"""Where weight points on a robot that declares none."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Pull:
+    """One cable or chamber."""
+
+    kind: str
+    """"cables" or "chambers"."""
+    name: str
+    height: float
+    """A full pull [N], [m] or [Pa]."""
+    unit: str
+    move: FloatArray
+    """Where a full pull moves the marker that moves most, to first order [m], shape (3,)."""
+
+    def words(self, share: float = 1.0) -> str:
+        size = {"N": 1.0, "m": 1e3, "Pa": 1e-3}[self.unit] * share * self.height
+        return f"{self.name} to {size:.3g} {({'N': 'N', 'm': 'mm', 'Pa': 'kPa'})[self.unit]}"
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Setup:
+    """A robot with what an experiment on it can use."""
+
+    robot: Robot
+    control: str
+    zero: str
+    """"absolute" or "unknown"."""
+    pulls: tuple[Pull, ...]
+    tip: FloatArray
+    """Where a weight hangs [m], shape (3,)."""
+    middle: FloatArray
+    """Half way to it [m], shape (3,)."""
+    weight: float
+    """Of what hangs at the tip [N]."""
+    gravity: FloatArray
+    """Of the base as it stands [m/s²], shape (3,)."""
+    view: dict[str, Any]
+    """The table [camera] of a script."""
+    distance: float
+    """Of the camera [m]."""
+
+    def view_at(self, factor: float) -> dict[str, Any]:
+        """Return the camera moved along its line of sight."""
+        eye, target = np.array(self.view["eye_m"]), np.array(self.view["target_m"])
+        return {**self.view, "eye_m": np.round(target + factor * (eye - target), 4).tolist()}
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Element:
+    """One item of the menu."""
+
+    key: str
+    words: str
+    sweeps: tuple[dict[str, Any], ...] = ()
+    loads: tuple[dict[str, Any], ...] = ()
+    far: bool = False
+    """Seen by the camera at a second distance, in a recording of its own."""
+    rest_file: bool = False
+    """Not a sweep but rest.csv."""
+
+    @property
+    def frames(self) -> int:
+        return sum(len(s["levels"]) for s in self.sweeps)
+
+    @property
+    def seconds(self) -> float:
+        return float(sum(len(s["levels"]) * s["dt_s"] for s in self.sweeps))
+
+
+def script_of(setup: Setup, elements: Sequence[Element], *, noise: float, far: bool = False) -> dict[str, Any]:
+    """Return the tables of a script (femsense-script-1) of some elements, those of one camera distance."""
+    chosen = [e for e in elements if e.far == far and e.sweeps]
+    turned = any("gravity_m_s2" in s for e in chosen for s in e.sweeps)
+    still = {"gravity_m_s2": setup.gravity.tolist()} if turned else {}
+    document: dict[str, Any] = {
+        "format": FORMAT,
+        "actuation": setup.control,
+        "actuation_zero": setup.zero,
+        "dt_s": STEP_S,
+        "sweeps": [{**still, **s} for e in chosen for s in e.sweeps],
+        "loads": [dict(load) for e in chosen for load in e.loads],
+        "camera": setup.view_at(FAR if far else 1.0),
+        "markers": {"std_m": noise, "rest_file": any(e.rest_file for e in elements)},
+        "scene": {"floor_z_m": round(float(setup.robot.body.mesh.nodes[:, 2].min()) - setup.robot.body.reach, 3)},
+    }
+    return document
+
+
+# What is on the menu
+
+
+def minimal(setup: Setup) -> list[Element]:
+    """Return the least that is worth recording: the robot at rest, and each cable and chamber pulled up once."""
+    return [Element("rest", "record the robot at rest", (_sweep("rest", [], [0.0]),)), *(_up(p) for p in setup.pulls)]
+
+
+def menu(setup: Setup) -> list[Element]:
+    """Return what may be added, in a fixed order."""
+    leads = _leads(setup.pulls)
+    items = [_unload(p) for p in setup.pulls]
+    items += [_together(a, b) for a, b in _pairs(setup.pulls)]
+    items += [_hold(p) for p in leads]
+    items += [_slowly(p) for p in leads[:1]]
+    items += [_hang(setup, where, leads[:1]) for where in ("tip", "middle")]
+    if setup.robot.body.material.density > 0:
+        items += [_turn(setup, i, leads[:1]) for i in range(2)]
+    items.append(
+        Element("rest.csv", "measure the markers on the unloaded body (held, lying or floating): rest.csv", rest_file=True)
+    )
+    items.append(_farther(setup, leads[:1]))
+    return items
+
+
+def _sweep(label: str, pulls: Sequence[tuple[Pull, float]], levels: list[float], dt: float = STEP_S) -> dict[str, Any]:
+    result: dict[str, Any] = {"label": label, "levels": levels, "dt_s": dt}
+    for kind in ("cables", "chambers"):
+        values = {p.name: float(f"{share * p.height:.4g}") for p, share in pulls if p.kind == kind}
+        if values:
+            result[kind] = values
+    return result
+
+
+def _up(p: Pull) -> Element:
+    return Element(f"up:{p.name}", f"pull {p.words()} in 3 steps", (_sweep(f"{p.name} up", [(p, 1.0)], [0.333, 0.667, 1.0]),))
+
+
+def _unload(p: Pull) -> Element:
+    words = f"pull {p.words()} with unloading at two levels: ½, ¼, full, ½, rest"
+    return Element(f"unload:{p.name}", words, (_sweep(f"{p.name} up and down", [(p, 1.0)], [0.5, 0.25, 1.0, 0.5, 0.0]),))
+
+
+def _together(a: Pull, b: Pull) -> Element:
+    how = "against each other" if _cosine(a, b) < -0.5 else "together"
+    words = f"pull {a.words(TOGETHER)} and {b.words(TOGETHER)} {how}, in 2 steps"
+    return Element(
+        f"mix:{a.name}+{b.name}", words, (_sweep(f"{a.name} and {b.name}", [(a, TOGETHER), (b, TOGETHER)], [0.5, 1.0]),)
+    )
+
+
+def _hold(p: Pull) -> Element:
+    words = f"hold {p.words(0.5)} and then {p.words()} for a minute each, a frame every {HOLD_S:g} s, and let go"
+    return Element(f"hold:{p.name}", words, (_sweep(f"{p.name} held", [(p, 1.0)], [0.5] * 4 + [1.0] * 4 + [0.0], HOLD_S),))
+
+
+def _slowly(p: Pull) -> Element:
+    words = f"pull {p.words()} and let go slowly, {SLOW_S:g} s a step: ½, full, ½, rest"
+    return Element(f"slow:{p.name}", words, (_sweep(f"{p.name} slowly", [(p, 1.0)], [0.5, 1.0, 0.5, 0.0], SLOW_S),))
+
+
+def _hang(setup: Setup, where: str, pulls: Sequence[Pull]) -> Element:
+    """A weight at the tip, or twice as much half way, where it moves the body less."""
+    size = setup.weight if where == "tip" else 2.0 * setup.weight
+    point = setup.tip if where == "tip" else setup.middle
+    force = size * setup.gravity / np.linalg.norm(setup.gravity)
+    label = f"weight at {where}"
+    then = f", then pull {pulls[0].words()} in 2 steps" if pulls else ""
+    words = f"hang a known weight of {1e3 * size / STANDARD_GRAVITY:.3g} g ({size:.3g} N, into loads.csv) at [{_place(point)}] m{then}"
+    load = {"sweep": label, "point_m": np.round(point, 6).tolist(), "force_n": np.round(force, 6).tolist()}
+    return Element(f"weight:{where}", words, (_sweep(label, [(p, 1.0) for p in pulls], [0.0, 0.5, 1.0]),), (load,))
+
+
+def _turn(setup: Setup, i: int, pulls: Sequence[Pull]) -> Element:
+    """The rest before the turn belongs to it: it is the difference that tells."""
+    aside = _aside(setup.gravity)[i]
+    words = (
+        f"turn the base by 90° together with its camera, so that weight points along [{_place(aside)}] "
+        "(gravity_*_m_s2 in frames.csv), and record it at rest before and after"
+    ) + (f", then pull {pulls[0].words()} in 2 steps" if pulls else "")
+    still, turned = np.round(setup.gravity, 5).tolist(), np.round(aside * np.linalg.norm(setup.gravity), 5).tolist()
+    before = {**_sweep(f"before turn {i + 1}", [], [0.0]), "gravity_m_s2": still}
+    after = {**_sweep(f"turn {i + 1}", [(p, 1.0) for p in pulls], [0.0, 0.5, 1.0]), "gravity_m_s2": turned}
+    return Element(f"turn:{i + 1}", words, (before, after))
+
+
+def _farther(setup: Setup, pulls: Sequence[Pull]) -> Element:
+    then = f", and pull {pulls[0].words()}" if pulls else ""
+    words = f"move the camera to {FAR * setup.distance:.2g} m and record again at rest{then} (a second recording)"
+    return Element("camera:far", words, (_sweep("seen from farther away", [(p, 1.0) for p in pulls], [0.0, 0.5, 1.0]),), far=True)
+
+
+def _leads(pulls: Sequence[Pull]) -> list[Pull]:
+    """Return the first pull and the one that moves the body most across it."""
+    if len(pulls) < 2:
+        return list(pulls)
+    return [pulls[0], min(pulls[1:], key=lambda p: abs(_cosine(pulls[0], p)))]
+
+
+def _pairs(pulls: Sequence[Pull]) -> list[tuple[Pull, Pull]]:
+    """Return pairs, opposite ones first, each pull in turn."""
+    every = sorted(combinations(pulls, 2), key=lambda ab: _cosine(*ab))
+    return every[:MOST_PAIRS]
+
+
+def _cosine(a: Pull, b: Pull) -> float:
+    return float(a.move @ b.move / max(float(np.linalg.norm(a.move) * np.linalg.norm(b.move)), 1e-300))
+
+
+def _aside(gravity: FloatArray) -> FloatArray:
+    """Return two unit vectors across gravity and each other, shape (2, 3)."""
+    down = gravity / np.linalg.norm(gravity)
+    first = np.eye(3)[int(np.argmin(np.abs(down)))]
+    first = first - (first @ down) * down
+    first = first / np.linalg.norm(first)
+    return np.stack([first, np.cross(down, first)])
+
+
+def _place(point: FloatArray) -> str:
+    return ", ".join(f"{v:.3g}" for v in np.round(point, 4) + 0.0)
+
+
+# How far to pull, and where the camera stands
+
+
+def setup_for(robot: Robot, control: str, zero: str = "absolute", *, most: FloatArray | None = None) -> Setup:
+    """Return what an experiment can use.
+
+    Arguments:
+        robot: the declared robot.
+        control: "tension" or "displacement".
+        zero: "absolute" or "unknown".
+        most: heights of the cables, where a recording has shown them [N] or [m], shape (a,).
+
+    Raises:
+        DataError: the robot has no equilibrium at rest.
+    """
+    body = robot.body
+    own = np.linalg.norm(body.gravity)
+    gravity = np.array(body.gravity) if own > 0 else STANDARD_GRAVITY * DOWN
+    surface = body.mesh.nodes[spread_features(body, 40)]
+    tip = surface[0]
+    middle = surface[int(np.argmin(np.linalg.norm(surface - 0.5 * (tip + body.clamp_center), axis=1)))]
+    slots = [("cables", c.name, c.max_tension if control == "tension" else np.inf) for c in body.cables]
+    slots += [("chambers", c.name, c.max_pressure) for c in body.chambers]
+    small = np.array([_small_step(robot, control, kind, top) for kind, _, top in slots])
+    moves, sag = _moves(robot, control, small, tip, gravity)
+    units = {"cables": "N" if control == "tension" else "m", "chambers": "Pa"}
+
+    def pull(i: int) -> Pull:
+        kind, name, top = slots[i]
+        far = float(np.linalg.norm(moves[i]))
+        height = min(BEND * body.reach / max(far, 1e-9) * small[i], BEARABLE * top)
+        if most is not None and kind == "cables" and most[i] > 0:
+            height = float(most[i])
+        height = _bearable(robot, control, len(slots), i, float(f"{height:.2g}"))
+        return Pull(kind, name, height, units[kind], moves[i] * height / small[i])
+
+    pulls = tuple(each(pull, range(len(slots))))
+    weight = float(f"{SAG * body.reach / max(sag, 1e-12):.2g}")
+    view, distance = _camera(robot)
+    return Setup(robot, control, zero, pulls, tip, middle, weight, gravity, view, distance)
+
+
+def _small_step(robot: Robot, control: str, kind: str, top: float) -> float:
+    if kind == "cables" and control == "displacement":
+        return 2e-3 * robot.body.reach
+    modulus = float(robot.body.material.young_modulus.mean())
+    scale = 1e-4 * modulus * (1.0 if kind == "chambers" else 0.01 * robot.body.reach**2)
+    return 0.01 * top if np.isfinite(top) else scale
+
+
+def _still(robot: Robot, control: str, inputs: FloatArray, loads: dict[str, Any] | None = None) -> Walk:
+    """Return a walk over inputs of cables and chambers (F, a + c)."""
+    a = len(robot.body.cables)
+    recording = make_recording(
+        time_s=np.arange(len(inputs)),
+        actuation=control,
+        cable_names=robot.body.cable_names,
+        inputs=inputs[:, :a],
+        chamber_names=robot.body.chamber_names,
+        pressures=inputs[:, a:],
+        **(loads or {}),
+    )
+    return Walk(robot, drive_of(robot, recording))
+
+
+def _moves(robot: Robot, control: str, small: FloatArray, tip: FloatArray, gravity: FloatArray) -> tuple[FloatArray, float]:
+    """Return how small steps of each pull move the marker that moves most (d, 3), and how far 1 N at the tip does, to first order."""
+    push = 1e-3 * gravity / np.linalg.norm(gravity)
+    inputs = np.vstack([np.zeros(len(small)), np.diag(small), np.zeros(len(small))])
+    loads = {"load_frame": [len(inputs) - 1], "load_points": tip[None], "load_forces": push[None]}
+    walk = _still(robot, control, inputs, loads)
+
+    def place(k: int, start: Equilibrium | None) -> tuple[Equilibrium, FloatArray]:
+        state = solve_frame(walk, k, start=start, single=True)
+        if not state.converged:
+            raise DataError(f"the declared robot has no equilibrium near rest: {state.status}: {state.advice}")
+        return state, robot.markers.positions(state.positions)
+
+    rest, places = place(0, None)
+    change = np.array([there for _, there in each(lambda k: place(k, rest), range(1, len(inputs)))]) - places
+    most = np.linalg.norm(change, axis=2).argmax(axis=1)
+    best = change[np.arange(len(change)), most]
+    return best[:-1], float(np.linalg.norm(best[-1]) / 1e-3)
+
+
+def _bearable(robot: Robot, control: str, count: int, i: int, height: float) -> float:
+    """Return a height at which the robot still finds its equilibrium."""
+    for _ in range(5):
+        inputs = np.zeros((1, count))
+        inputs[0, i] = height
+        if solve_frame(_still(robot, control, inputs), 0, single=True).converged:
+            return height
+        height = float(f"{0.6 * height:.2g}")
+    raise DataError(f"no equilibrium at {height:g} of pull {i}: the declared robot is too soft for its cables")
+
+
+def _camera(robot: Robot) -> tuple[dict[str, Any], float]:
+    """Return the camera that sees most markers from beside or above, and its distance [m]."""
+    target = np.round(robot.marker_points.mean(axis=0), 4)
+    distance = float(f"{max(3.5 * robot.body.reach, 0.25):.2g}")
+    shape = body_shape(robot, robot.body.mesh.nodes, SceneTable.model_validate({}))
+    best: tuple[int, dict[str, Any]] | None = None
+    for angle in np.arange(8) * np.pi / 4:
+        for rise in (0.5, 0.1, 1.0):
+            side = np.array([np.cos(angle) * np.cos(rise), np.sin(angle) * np.cos(rise), np.sin(rise)])
+            eye = np.round(target + distance * side, 4)
+            view = {"eye_m": eye.tolist(), "target_m": target.tolist()}
+            lens = camera_of(ViewTable.model_validate(view))
+            seen = int(visible_points(lens, look_at(eye.tolist(), target.tolist()), [shape], robot.marker_points).sum())
+            best = (seen, view) if best is None or seen > best[0] else best
+    assert best is not None
+    return best[1], distance

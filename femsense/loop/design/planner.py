@@ -1,0 +1,387 @@
+"""The experiment advisor: which recording makes effects distinguishable, with the predicted confusion before and after.
+
+Columns of every item of the menu are computed once (`outlook`); the search over experiments is linear algebra only. It starts from
+the least that is worth recording, or from a recording that exists, and adds what lowers the confusion most, as long as anything
+does and the frames suffice.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from femsense.calib.calibrate import calibrate
+from femsense.core.arrays import FloatArray, IntArray
+from femsense.core.errors import FemsenseError, InputError
+from femsense.loop.data.dataset import groups_of, marked_frames
+from femsense.loop.data.trial import Trial
+from femsense.loop.design.candidate_experiments import Element, Setup, menu, minimal, script_of, setup_for
+from femsense.loop.design.identifiability import ALIKE, EVIDENCE, Block, Form, Judge, Outlook, Row, forms_of, make_block, turns_of
+from femsense.model.observation import make_scene
+from femsense.model.recording import Recording, check_against, make_recording
+from femsense.model.robot import Robot
+from femsense.rig.camera import camera_of, pose_of
+from femsense.rig.script import Plan, ScriptTable, check_script, plan_script
+
+NOISE_M = 2e-4
+"""Standard deviation of each coordinate of a marker, if nothing else is known: a depth camera at half a metre [m]."""
+FRAMES = 60
+WORTH = 0.05
+"""An item must lower the confusion by this to be added."""
+MOST_GIVEN = 60
+"""Frames of a recording that exists that are looked at; more are thinned out evenly and count for those between them."""
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Step:
+    """One item that was added."""
+
+    element: Element
+    confusion: float
+    """Before it."""
+    better: tuple[str, ...]
+    """What it brings, in words."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Proposal:
+    """An experiment, and what it could show."""
+
+    setup: Setup
+    noise: float
+    """[m]."""
+    start: tuple[Element, ...]
+    """The least that is worth recording; empty where a recording is given."""
+    steps: tuple[Step, ...]
+    left_out: tuple[str, ...]
+    """Items without an equilibrium on the declared robot."""
+    before: Outlook
+    after: Outlook
+
+    @property
+    def elements(self) -> tuple[Element, ...]:
+        return (*self.start, *(s.element for s in self.steps))
+
+    def scripts(self) -> dict[str, dict[str, Any]]:
+        """Return the scripts of the experiment: "" for the camera where it stands, "-far" for its second distance, if it has one."""
+        made = {name: script_of(self.setup, self.elements, noise=self.noise, far=bool(name)) for name in ("", "-far")}
+        return {name: script for name, script in made.items() if script["sweeps"]}
+
+
+def plan_experiment(
+    robot: Robot,
+    *,
+    control: str = "tension",
+    noise: float = NOISE_M,
+    frames: int = FRAMES,
+    given: Recording | None = None,
+    progress: Progress | None = None,
+) -> Proposal:
+    """Return the recording that makes the effects distinguishable, on the declared robot and to first order.
+
+    Arguments:
+        robot: the declared robot.
+        control: "tension" or "displacement"; a given recording says it itself.
+        noise: standard deviation of each coordinate of each marker in each frame [m].
+        frames: budget of new frames.
+        given: a recording that exists; without it the proposal starts from the least that is worth recording.
+        progress: told (items done, items in all).
+
+    Raises:
+        InputError: no markers, no budget. DataError: the declared robot has no equilibrium.
+    """
+    _check(robot, noise)
+    given = None if given is None else check_against(robot, given)
+    zero = "absolute" if given is None else given.actuation_zero
+    most = None if given is None or not given.inputs.size else given.inputs.max(axis=0)
+    setup = setup_for(robot, control if given is None else given.actuation, zero, most=most)
+    ranges = np.array([p.height for p in setup.pulls if p.kind == "cables"])
+    forms = _forms(robot, setup.control, zero, ranges)
+    start, extras = ([], [*minimal(setup)[:1], *menu(setup)]) if given is not None else (minimal(setup), menu(setup))
+    if sum(e.frames for e in start) > frames:
+        raise InputError(
+            "too few frames",
+            where="--frames",
+            found=frames,
+            expected=f"at least {sum(e.frames for e in start)}, for the least that is worth recording",
+        )
+    blocks, left_out = _blocks(setup, forms, [*start, *extras], noise, progress)
+    if not all(e.key in blocks for e in start):
+        raise InputError(
+            "no equilibrium on the way up", where="robot", found="; ".join(left_out), expected="a robot that its cables can bend"
+        )
+    judge = Judge(forms, ranges)
+    have = [blocks[e.key] for e in start] if given is None else [_given_block(robot, given, forms, noise)]
+    before = judge.judge(have)
+    steps, after = _grow(
+        judge, have, blocks, [e for e in extras if e.rest_file or e.key in blocks], before, frames - sum(e.frames for e in start)
+    )
+    return Proposal(setup, noise, tuple(start), tuple(steps), tuple(left_out), before, after)
+
+
+def outlook_of_script(robot: Robot, script: ScriptTable, where: Path = Path("script"), *, noise: float = NOISE_M) -> Outlook:
+    """Return what the experiment of a script could show, if it is recorded and closes the loop with all its free frames.
+
+    Arguments:
+        robot: the declared robot; effects, mesh and law of the script's truth count for nothing.
+        script: its sweeps, loads, markers and camera are used.
+        where: what messages name.
+        noise: standard deviation of each coordinate of each marker [m].
+
+    Raises:
+        InputError: the script does not fit. DataError: the declared robot has no equilibrium in a frame.
+    """
+    _check(robot, noise)
+    plan = plan_script(script, robot, where)
+    ranges = np.ptp(plan.commanded, axis=0) if plan.commanded.size else np.zeros(len(robot.body.cables))
+    forms = _forms(robot, plan.control, script.actuation_zero, ranges)
+    trial = trial_of(robot, script, plan)
+    block = make_block(
+        trial,
+        robot,
+        forms,
+        recording="",
+        noise=noise,
+        turns=turns_of(trial.scene.recording.gravity, robot.body.gravity),
+        see=script.markers.occlusion,
+        with_rest=script.markers.rest_file,
+    )
+    return Judge(forms, ranges).judge([block], rest=script.markers.rest_file)
+
+
+def _check(robot: Robot, noise: float) -> None:
+    if not len(robot.marker_points):
+        raise InputError("the robot has no markers", where="robot.toml: markers", expected="[[markers]], which a plan needs")
+    if not noise > 0:
+        raise InputError("noise is positive", where="--noise", found=1e3 * noise, expected="> 0 mm")
+
+
+def _forms(robot: Robot, control: str, zero: str, ranges: FloatArray) -> list[Form]:
+    forms = forms_of(robot, control, ranges)
+    if zero == "absolute":
+        return forms
+    kept, at = [], 0
+    for f in forms:  # unknown zeros are fitted with the pose
+        if f.name != "cable_offset":
+            kept.append(replace(f, at=at))
+            at += len(f.size)
+    return kept
+
+
+# Blocks of the menu
+
+
+def _blocks(
+    setup: Setup, forms: list[Form], elements: Sequence[Element], noise: float, progress: Progress | None
+) -> tuple[dict[str, Block], list[str]]:
+    """Return the block of each element that has an equilibrium, and in words which have none."""
+    blocks, left_out = dict[str, Block](), list[str]()
+    todo = [e for e in elements if e.sweeps]
+    for i, element in enumerate(todo):
+        try:
+            blocks[element.key] = element_block(setup, forms, element, noise)
+        except FemsenseError as error:
+            left_out.append(f"{element.words}: {error}")
+        if progress is not None:
+            progress(i + 1, len(todo))
+    return blocks, left_out
+
+
+def element_block(setup: Setup, forms: Sequence[Form], element: Element, noise: float, *, with_rest: bool = True) -> Block:
+    """Return the block of an element. Raises DataError where the declared robot has no equilibrium in it."""
+    script = check_script(script_of(setup, [element], noise=noise, far=element.far))
+    robot, turns = setup.robot, None
+    if any(s.gravity_m_s2 is not None for s in script.sweeps):
+        rows = [np.array(s.gravity_m_s2) for s in script.sweeps for _ in s.profile()]
+        turns = turns_of(np.array([rows[0], *rows]), setup.gravity)
+        if not np.any(robot.body.gravity):  # a weightless robot stays so: turns only say where its weight would point
+            script = script.model_copy(update={"sweeps": [s.model_copy(update={"gravity_m_s2": None}) for s in script.sweeps]})
+    trial = trial_of(robot, script, plan_script(script, robot), lead=True)
+    key = "new, far" if element.far else "new"
+    return make_block(trial, robot, forms, recording=key, noise=noise, turns=turns, see=True, with_rest=with_rest)
+
+
+def trial_of(robot: Robot, script: ScriptTable, plan: Plan, *, lead: bool = False) -> Trial:
+    """Return the frames of a script as the loop would see them, marker positions left open.
+
+    Arguments:
+        robot: the declared robot.
+        script, plan: the script and its frames.
+        lead: whether the robot rests before the first frame, unrecorded (friction and creep start from there).
+    """
+    head = 1 if lead else 0
+    recorded = plan.commanded + (plan.initial if script.actuation_zero == "absolute" else 0.0)
+    at_rest = recorded[:1] - plan.commanded[:1]
+    dt = script.sweeps[0].dt_s or script.dt_s
+    frames: IntArray = np.flatnonzero(plan.free) + head
+    names = script.markers.names or robot.marker_names
+    count = len(names)
+    recording = make_recording(
+        time_s=np.concatenate([[0.0], plan.time_s + dt]) if lead else plan.time_s,
+        actuation=script.actuation,
+        actuation_zero=script.actuation_zero,
+        cameras=[camera_of(script.camera)],
+        cable_names=robot.body.cable_names,
+        inputs=np.vstack([at_rest, recorded]) if lead else recorded,
+        chamber_names=robot.body.chamber_names,
+        pressures=np.vstack([0.0 * plan.pressures[:1], plan.pressures]) if lead else plan.pressures,
+        sweep=[*plan.sweep[:head], *plan.sweep],
+        gravity=None if plan.gravity is None else np.vstack([plan.gravity[:head], plan.gravity]),
+        marker_names=names,
+        marker_frame=np.repeat(frames, count),
+        marker_index=np.tile(np.arange(count), len(frames)),
+        marker_xyz=np.tile([0.0, 0.0, 1.0], (count * len(frames), 1)),
+        load_frame=plan.load_frame + head,
+        load_points=plan.load_points,
+        load_forces=plan.load_forces,
+    )
+    scene = make_scene(robot, recording, frames)
+    free = np.full(len(robot.body.cables), np.inf)
+    initial = plan.initial if script.actuation_zero == "unknown" and len(plan.initial) else None
+    return Trial(scene, groups_of(scene), (pose_of(script.camera),), initial, -free, free, {})
+
+
+def _given_block(robot: Robot, recording: Recording, forms: list[Form], noise: float) -> Block:
+    """Return the block of a recording that exists, calibrated."""
+    frames = marked_frames(recording)
+    thin = int(np.ceil(len(frames) / MOST_GIVEN))
+    calibration = calibrate(robot, recording, frames=frames[::thin].tolist())
+    scene = make_scene(robot, recording, frames[::thin])
+    initial = None
+    if recording.actuation_zero == "unknown" and robot.body.cables:
+        table = calibration.cable_tension_n if recording.actuation == "tension" else calibration.cable_displacement_m
+        initial = np.array([table[name] for name in robot.body.cable_names])
+    free = np.full(len(robot.body.cables), np.inf)
+    trial = Trial(scene, groups_of(scene), calibration.poses, initial, -free, free, {})
+    turns = turns_of(recording.gravity, robot.body.gravity)
+    return make_block(trial, robot, forms, recording="given", noise=noise / np.sqrt(thin), turns=turns, measured=True)
+
+
+# The search
+
+
+def _grow(
+    judge: Judge, have: list[Block], blocks: dict[str, Block], extras: list[Element], start: Outlook, budget: int
+) -> tuple[list[Step], Outlook]:
+    """Return what is added, in order, and what all of it could show."""
+    steps, now, rest = list[Step](), start, False
+    while True:
+        best: tuple[float, Element, Outlook] | None = None
+        for element in (e for e in extras if e.frames <= budget):
+            more = [] if element.rest_file else [blocks[element.key]]
+            then = judge.judge([*have, *more], rest=rest or element.rest_file)
+            if best is None or then.confusion < best[0] - 1e-9:
+                best = (then.confusion, element, then)
+        if best is None or best[0] > now.confusion - WORTH:
+            return steps, now
+        _, element, then = best
+        steps.append(Step(element, now.confusion, tuple(_better(now, then))))
+        have = have if element.rest_file else [*have, blocks[element.key]]
+        rest, now, budget = rest or element.rest_file, then, budget - element.frames
+        extras = [e for e in extras if e is not element]
+
+
+def _better(before: Outlook, after: Outlook) -> list[str]:
+    """Return in words what an experiment shows that another does not."""
+    then = {r.label: r for r in after.rows}
+    words = []
+    for r in before.rows:
+        new = then.get(r.label)
+        if new is None:
+            words.append(f"{r.label} is measured instead of fitted")
+        elif new.testable and not r.testable:
+            words.append(f"{r.label} becomes testable ({100 * r.retained:.1f} → {100 * new.retained:.0f} % left by calibration)")
+        elif new.seen and not r.seen:
+            words.append(f"{r.label} becomes visible (dBIC {r.dbic:.0f} → {new.dbic:.0f})")
+    old = {_names(before, p): p for p in before.pairs()}
+    for p in after.pairs():
+        was = old.get(_names(after, p))
+        if (
+            was is not None
+            and _alike(was)
+            and not _alike(p)
+            and then[_names(after, p)[0]].seen
+            and then[_names(after, p)[1]].seen
+        ):
+            words.append(f"{' and '.join(_names(after, p))} come apart (dBIC gap {was[3]:.0f} → {p[3]:.0f})")
+    return words
+
+
+def _names(outlook: Outlook, pair: tuple[int, int, float, float]) -> tuple[str, str]:
+    return outlook.rows[pair[0]].label, outlook.rows[pair[1]].label
+
+
+def _alike(pair: tuple[int, int, float, float]) -> bool:
+    return pair[2] > ALIKE or pair[3] < EVIDENCE
+
+
+# Documents
+
+
+def outlook_document(outlook: Outlook) -> dict[str, Any]:
+    """Return what an experiment could show as plain tables."""
+    return {
+        "effects": [_row_document(r) for r in outlook.rows],
+        "not_testable": outlook.untestable,
+        "not_seen": outlook.unseen,
+        "confounded": [{"pair": list(_names(outlook, p)), "cosine": p[2], "dbic_gap": p[3]} for p in outlook.confused()],
+        "confusion": outlook.confusion,
+        "names": [r.label for r in outlook.rows],
+        "confounding": outlook.confounding,
+        "dbic_gap": outlook.gap,
+    }
+
+
+def _row_document(r: Row) -> dict[str, Any]:
+    f = r.form
+    return {
+        "name": r.label,
+        "seed": f.seed,
+        "retained_share": r.retained,
+        "dbic": r.dbic,
+        "would_be_seen": r.seen,
+        "plausible": {
+            p.label: {"change": _change(p, s), "unit": _unit(p)} for p, s in zip(f.parameters, f.size) if not f.effect.discrete
+        },
+        "smallest": {
+            p.label: {"change": _change(p, s), "unit": _unit(p)}
+            for p, s in zip(f.parameters, r.smallest)
+            if not f.effect.discrete
+        },
+    }
+
+
+def _change(p: Any, coordinate: float) -> float | None:
+    """Return a size in the effect's own unit: a relative change for scales, the stiffness itself for compliances."""
+    if not np.isfinite(coordinate):
+        return None
+    if p.scale == "log":
+        return float(np.expm1(min(coordinate, 50.0)))
+    return 1.0 / float(coordinate) if p.scale == "reciprocal" else float(coordinate)
+
+
+def _unit(p: Any) -> str:
+    return f"{p.unit} or softer" if p.scale == "reciprocal" else "share" if p.scale == "log" else str(p.unit)
+
+
+def proposal_document(proposal: Proposal) -> dict[str, Any]:
+    """Return a proposal as plain tables."""
+    brings = {s.element.key: list(s.better) for s in proposal.steps}
+    return {
+        "noise_m": proposal.noise,
+        "frames": sum(e.frames for e in proposal.elements),
+        "seconds": sum(e.seconds for e in proposal.elements),
+        "do": [
+            {"key": e.key, "words": e.words, "frames": e.frames, "seconds": e.seconds, "brings": brings.get(e.key, [])}
+            for e in proposal.elements
+        ],
+        "left_out": list(proposal.left_out),
+        "before": outlook_document(proposal.before),
+        "after": outlook_document(proposal.after),
+    }

@@ -1,0 +1,61 @@
+"""loop.json and the improved robot, written and read."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from femsense.io.files import plain, write_json
+from femsense.io.provenance import recording_input, robot_input, versions
+from femsense.io.result_folder import _check_folder, _read_document, _results_folder
+
+if TYPE_CHECKING:
+    from femsense.loop.result import LoopResult
+    from femsense.model.recording import Recording
+    from femsense.model.robot import Robot
+
+
+LOOP_FORMAT = "femsense-loop-1"
+
+
+def loop_inputs(robot: Robot, recordings: Sequence[Recording], validation: Sequence[Recording], **options: Any) -> dict[str, Any]:
+    """Return what a closed loop is made from; see `run_inputs`."""
+    return {
+        "robot": robot_input(robot),
+        "recordings": [recording_input(recording) for recording in recordings],
+        "validation": [recording_input(recording) for recording in validation],
+        "options": plain(options),
+    }
+
+
+# Loops
+
+
+def write_loop(loop: LoopResult, folder: str | Path, *, inputs: Mapping[str, Any] | None = None) -> Path:
+    """Write the improved robot and at last loop.json; return the folder.
+
+    Raises:
+        InputError: see `check_loop_folder`.
+    """
+    from femsense.io.robot_toml import save_robot
+
+    check_loop_folder(folder)
+    with _results_folder(folder, "loop.json") as part:
+        declared = (loop.declared.document or {}).get("effects", [])
+        save_robot(loop.declared, part, effects=[*declared, *loop.entries])
+        write_json(part / "loop.json", {**loop.document(), "inputs": inputs or {}, "versions": versions()})
+    return Path(folder)
+
+
+def check_loop_folder(folder: str | Path) -> None:
+    """Raise InputError where a loop cannot be written: in a recording, a run or a robot that no loop wrote, or at a file."""
+    root = Path(folder).expanduser()
+    own = (root / "loop.json").is_file()
+    _check_folder(root, ("recording.toml", "run.json") if own else ("recording.toml", "run.json", "robot.toml"))
+
+
+def read_loop(path: str | Path) -> dict[str, Any]:
+    """Return the content of loop.json (or of the one in a folder). Raises InputError."""
+    file = Path(path).expanduser()
+    return _read_document(file / "loop.json" if file.is_dir() else file, LOOP_FORMAT)

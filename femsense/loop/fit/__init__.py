@@ -1,0 +1,1 @@
+"""Joint fits, their noise, covariance and discretisation error."""

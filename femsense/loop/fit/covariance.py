@@ -1,0 +1,173 @@
+"""How far the values of a fit may be off, where (JᵀJ)⁻¹ says too little.
+
+* A model that leaves more than the noise was fitted with weights that are too large: all variances grow by the factor by which it does
+  (Birge 1932).
+* Where sweeps disagree by more than their noise, each sweep's own pull on the parameters shows it (cluster-robust covariance with half
+  leverage: Bell & McCaffrey 2002).
+* A time or a place that was chosen from a few seeds and held still while the rest was fitted is not known exactly.
+* The size of gravity is known, so that its direction lives on a sphere: where the data see one component only, the tangent to the sphere
+  bounds the others, although a whole circle is as likely. Second moments about the estimate over the sphere, weighted by the likelihood, say so.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from femsense.core.arrays import FloatArray, IntArray
+from femsense.core.least_squares import covariance_of
+from femsense.loop.data.dataset import Data
+from femsense.loop.data.trial import Trial
+from femsense.loop.fit.cross_validation import half_inverse, sweep_rows
+from femsense.loop.fit.fitted_model import Stage
+from femsense.loop.fit.joint_fit import GRAVITY_STD, JointFit, JointProblem, Prior
+from femsense.loop.fit.noise_components import Noise
+from femsense.model.effects.loads import STANDARD_GRAVITY
+
+RINGS, SPOKES = 160, 48
+"""Directions that are looked at: rings about the estimate, close to each other near it, and places on each ring."""
+
+LEAST_SWEEPS = 3
+"""Fewer cannot disagree."""
+SEED_STD = 0.7
+"""How well a seed's own number is known beforehand, in its coordinate (the logarithm of a time: a factor of two)."""
+
+
+def spreads(data: Data, stage: Stage, noise: Noise, seed_spread: dict[str, FloatArray]) -> dict[str, FloatArray]:
+    """Return the standard deviations of the coordinates of each effect.
+
+    Arguments:
+        data, stage, noise: of the final fit.
+        seed_spread: effect → scatter of its coordinates over seeds that explain as much.
+    """
+    own = stage.fit.own
+    std = np.maximum.reduce(
+        [coordinate_std(stage.fit, data.train, noise), _by_sweeps(data, stage)[own:], _with_open_seeds(data, stage, noise)]
+    )
+    result, at = dict[str, FloatArray](), 0
+    for effect, _, parameters in stage.fit.hypothesis.terms:
+        part = std[at : at + len(parameters)]
+        at += len(parameters)
+        extra = np.zeros(len(part))
+        known = seed_spread.get(effect.name, extra)
+        extra[: len(known)] = known[: len(part)]
+        result[effect.name] = np.hypot(part, extra)
+    return result
+
+
+def coordinate_std(fit: JointFit, trials: list[Trial], noise: Noise) -> FloatArray:
+    """Return standard deviations of the coordinates of a hypothesis about their estimates, shape (p,)."""
+    growth = misfit(fit, trials, noise)
+    std = growth * fit.std
+    mask = np.array([p.key == "vector_m_s2" for p in fit.hypothesis.parameters], dtype=bool)
+    if mask.sum() != 3 or np.linalg.norm(fit.coordinates[mask]) < 1e-3:
+        return std
+    sphere = _over_the_sphere(fit, np.flatnonzero(mask), growth)
+    return np.where(mask, sphere, np.maximum(std, sphere))
+
+
+def misfit(fit: JointFit, trials: list[Trial], noise: Noise) -> float:
+    """Return by which factor the residual exceeds the noise, at least 1.
+
+    States that repeat count once: with n state means of markers in three axes (of clouds along normals) and p parameters it is √(Σ|r̄|² / (n − p) / σ²).
+    """
+    square, count, expected = 0.0, 0, 0.0
+    for trial, jet in zip(trials, fit.jets):
+        state = trial.groups.state
+        size = np.bincount(state)
+        axes, std = jet.residual.shape[1], noise.components(trial.groups)
+        means = np.stack([np.bincount(state, column) for column in jet.residual.T], axis=1) / size[:, None]
+        square, count = square + float((means**2).sum()), count + means.size
+        if trial.mesh_error is not None:
+            expected += float((trial.mesh_error**2).sum()) / len(state) * len(size)
+        expected += axes * float((_variance(std) + std["white"] ** 2 / size).sum())
+    freedom = count - len(fit.fit.theta)
+    if freedom < 1 or expected <= 0.0:
+        return 1.0
+    return max(1.0, float(np.sqrt(square / expected * count / freedom)))
+
+
+def _variance(std: dict[str, float]) -> float:
+    return sum(v**2 for name, v in std.items() if name != "white")
+
+
+def _over_the_sphere(fit: JointFit, at: IntArray, growth: float) -> FloatArray:
+    """Return root mean squares about the estimate when gravity roams the sphere and all else follows, shape (p,)."""
+    rows = np.asarray(fit.fit.jacobian)[:-1] / growth  # the last row is what is known of gravity's size
+    residual = np.asarray(fit.fit.residual)[:-1] / growth
+    normal, slope = rows.T @ rows, rows.T @ residual
+    own = np.asarray(at) + fit.own
+    rest = np.setdiff1d(np.arange(len(normal)), own)
+    inverse = np.linalg.pinv(normal[np.ix_(rest, rest)], rcond=1e-12, hermitian=True)
+    gain = inverse @ normal[np.ix_(rest, own)]
+    inner = normal[np.ix_(own, own)] - normal[np.ix_(own, rest)] @ gain
+    pull = slope[own] - gain.T @ slope[rest]
+    towards, area = _directions(np.asarray(fit.coordinates)[at])
+    moves = STANDARD_GRAVITY * towards - np.asarray(fit.coordinates)[at]
+    # along each direction the size is Gaussian: curvature, slope, and χ² at its best
+    curve = np.einsum("ki,ij,kj->k", towards, inner, towards) + 1.0 / GRAVITY_STD**2
+    rise = np.einsum("ki,ki->k", towards, moves @ inner + pull)
+    chi2 = np.einsum("ki,ki->k", moves @ inner + 2.0 * pull, moves) - rise**2 / curve
+    weight = area * np.exp(-0.5 * (chi2 - chi2.min())) / np.sqrt(curve)
+    weight /= weight.sum()
+    moves = moves - (rise / curve)[:, None] * towards
+    square = np.zeros(len(normal))
+    square[own] = weight @ (moves**2 + towards**2 / curve[:, None])
+    followers = -(moves @ gain.T) - inverse @ slope[rest]
+    square[rest] = np.diag(inverse) + weight @ (followers**2 + (towards @ gain.T) ** 2 / curve[:, None])
+    return np.sqrt(square)[fit.own :]
+
+
+def _directions(estimate: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return unit vectors all over the sphere (k, 3), dense about an estimate, with their areas (k,)."""
+    axis = estimate / np.linalg.norm(estimate)
+    side = np.linalg.svd(axis[None])[2][1:]
+    edge = np.pi * np.linspace(0.0, 1.0, RINGS + 1) ** 3
+    ring, turn = 0.5 * (edge[1:] + edge[:-1]), 2.0 * np.pi * np.arange(SPOKES) / SPOKES
+    around = np.cos(turn)[:, None] * side[0] + np.sin(turn)[:, None] * side[1]
+    directions = np.cos(ring)[:, None, None] * axis + np.sin(ring)[:, None, None] * around
+    return directions.reshape(-1, 3), np.repeat(np.sin(ring) * np.diff(edge), SPOKES)
+
+
+def _by_sweeps(data: Data, stage: Stage) -> FloatArray:
+    """Return the standard deviations of all parameters that the disagreement of sweeps shows, shape (p,)."""
+    J, r = np.asarray(stage.fit.fit.jacobian), np.asarray(stage.fit.fit.residual)
+    sweeps = sweep_rows(data.train, stage.fit)
+    if len(sweeps) < LEAST_SWEEPS:
+        return np.zeros(J.shape[1])
+    A = half_inverse(J)
+    pulls = []
+    for rows in sweeps:
+        U, s, _ = np.linalg.svd(J[rows] @ A, full_matrices=False)
+        along = U.T @ r[rows]
+        freed = r[rows] + U @ ((1.0 / np.sqrt(np.maximum(1.0 - s**2, 0.05)) - 1.0) * along)
+        pulls.append(A @ (A.T @ (J[rows].T @ freed)))
+    return np.asarray(np.sqrt(np.sum(np.square(pulls), axis=0)))
+
+
+def _with_open_seeds(data: Data, stage: Stage, noise: Noise) -> FloatArray:
+    """Return the standard deviations of the coordinates with the numbers that seeds held still fitted along, shape (p,)."""
+    hypothesis = stage.fit.hypothesis
+    terms, null, fitted, known = [], [], [], []
+    at = 0
+    for effect, seed, parameters in hypothesis.terms:
+        held = {p.key for p in parameters}
+        more = tuple(p for p in effect.polish(data.robot, data.control, seed) if p.key not in held)
+        terms.append((effect, seed, (*parameters, *more)))
+        null += [*stage.fit.coordinates[at : at + len(parameters)], *(p.null for p in more)]
+        fitted += [True] * len(parameters) + [False] * len(more)
+        known += [min(p.known, SEED_STD) for p in (*parameters, *more)]
+        at += len(parameters)
+    mask = np.array(fitted, dtype=bool)
+    if mask.all():
+        return np.zeros(len(stage.fit.coordinates))
+    mean, std = np.array(null), np.array(known)
+    mean[mask], std[mask] = stage.fit.prior.mean, stage.fit.prior.std
+    factors = [noise.whitener(t.groups, t.mesh_error) for t in data.train]
+    problem = JointProblem(replace(hypothesis, terms=tuple(terms)), Prior(mean, std), data.train, factors, data.seat_std)
+    theta = np.concatenate([stage.fit.fit.theta[: stage.fit.own], null])
+    jacobian = problem.evaluate(theta, True)[1]
+    assert jacobian is not None
+    variance = np.diag(covariance_of(jacobian))[stage.fit.own :]
+    return np.asarray(np.sqrt(np.maximum(variance[mask], 0.0)))

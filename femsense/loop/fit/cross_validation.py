@@ -1,0 +1,62 @@
+"""Leave one sweep out: how well a model predicts a sweep that it was not fitted to, without fitting it again.
+
+At the optimum of a fit linearised in its parameters, the rows b of a sweep that is left out are predicted with the error (1 − H_bb)⁻¹ r_b,
+whose covariance is (1 − H_bb)⁻¹, H = J (JᵀJ)⁻¹ Jᵀ (Cook & Weisberg 1982). Twice the logarithm of the predictive density is then
+log|1 − H_bb| − r_bᵀ (1 − H_bb)⁻¹ r_b + const.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from femsense.core.arrays import FloatArray, IntArray
+from femsense.loop.data.trial import Trial, numbers_of
+from femsense.loop.fit.joint_fit import JointFit
+
+OPEN = 1e-8
+"""Share of what is known of a direction that comes from the sweeps that are not left out; below it they leave it open."""
+
+
+def sweeps_predicted(trials: list[Trial], before: JointFit, after: JointFit) -> tuple[float, float]:
+    """Return by how much twice the log predictive density of a left-out sweep rises, summed over sweeps, and the standard error of that sum.
+
+    The standard error is infinite for fewer than three sweeps.
+    """
+    rows = sweep_rows(trials, before)
+    gains = np.array([_density(after, r) - _density(before, r) for r in rows])
+    if len(gains) < 3:
+        return float(gains.sum()), float("inf")
+    return float(gains.sum()), float(np.sqrt(len(gains)) * gains.std(ddof=1))
+
+
+def sweep_rows(trials: list[Trial], fit: JointFit) -> list[IntArray]:
+    """Return the rows of the whitened residual that belong to each sweep of each recording, markers and clouds together."""
+    found: dict[tuple[int, int], list[IntArray]] = {}
+    at = 0
+    for number, trial, jet in zip(numbers_of(trials), trials, fit.jets):
+        sweep = np.repeat(trial.groups.sweep, jet.residual.shape[1])
+        for s in np.unique(sweep):
+            found.setdefault((number, int(s)), []).append(at + np.flatnonzero(sweep == s))
+        at += len(sweep) + jet.rest.size + 6 * len(trial.poses)
+    return [np.concatenate(rows) for rows in found.values()]
+
+
+def _density(fit: JointFit, rows: IntArray) -> float:
+    """Return twice the log density of left-out rows, up to a constant."""
+    J, r = np.asarray(fit.fit.jacobian), np.asarray(fit.fit.residual)
+    A = half_inverse(J)
+    B = J[rows] @ A  # H_bb = B Bᵀ
+    inner = np.eye(B.shape[1]) - B.T @ B
+    values, vectors = np.linalg.eigh(inner)
+    mixed = vectors.T @ (B.T @ r[rows])
+    mixed[values < OPEN] = 0.0  # whatever the value, these rows fit it
+    values = np.maximum(values, OPEN)
+    return float(np.log(values).sum() - r[rows] @ r[rows] - (mixed**2 / values).sum())
+
+
+def half_inverse(J: FloatArray) -> FloatArray:
+    """Return A with A Aᵀ = (JᵀJ)⁻¹ over the directions that J sees."""
+    scale = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
+    _, s, Vt = np.linalg.svd(J / scale, full_matrices=False)
+    keep = s > 1e-9 * s[0]
+    return np.asarray(Vt[keep].T / s[keep] / scale[:, None])

@@ -1,0 +1,231 @@
+"""What the mesh itself costs: how far a mesh of half the size would move the markers, in every state; where it is linear, quadratic elements.
+
+A residual of that shape says nothing of the robot, whatever its size: how much of it a body shows is not known (a cable that is tied to points
+sinks the deeper the finer the mesh is), but it is the same share in all sweeps, but for what directions and sweeps differ by. So it counts as
+noise, once for all sweeps together (`SHARE`), once for each by itself (`VARIES`) and turned (`TURNS`), so that no effect is named for what a
+finer mesh would explain. A few Newton steps from the state on the declared mesh, which the finer one holds exactly, give it (a hierarchical estimate: Bank & Smith 1993).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+from collections.abc import Sequence
+from dataclasses import fields, replace
+
+import numpy as np
+
+from femsense.core.arrays import FloatArray, IntArray
+from femsense.core.errors import DataError, FemsenseError
+from femsense.core.parallel import each
+from femsense.fem.body import BodyModel
+from femsense.fem.mesh import Embedding, TetMesh, embed_points
+from femsense.loop.data.dataset import Data
+from femsense.loop.data.representative_states import between, representatives, state_vectors
+from femsense.loop.data.trial import Trial, normals_of, rms_of
+from femsense.loop.fit.fitted_model import Stage, placed, some_terms
+from femsense.loop.fit.noise_components import Noise, whiten
+from femsense.model.drive import Walk, drive_of
+from femsense.model.finer_mesh import finer_state, share_on_finer
+from femsense.model.observation import seats
+from femsense.model.quasi_static_path import walk_along
+from femsense.model.remeshing import finer_mesh, robot_on_mesh
+from femsense.model.robot import Robot
+
+MOST_TETS = 24000
+"""A finer mesh than this takes too long in every state."""
+MOST_WORK = 100_000
+"""Tetrahedra × states of a recording; beyond it the errors of other states are interpolated between those that were computed."""
+SHARE = 0.7
+"""Standard deviation of the share of the error that a body shows in all sweeps (anchors that are some millimetres wide sink less than points; a body
+shows more than a mesh of half the size does) …"""
+VARIES, VARIES_HELD = 0.25, 0.12
+"""… of what each sweep adds to it, and does where cables are held: then it is mostly that they sink in, by the same share …"""
+TURNS = 0.07
+"""… and of the nine entries of a matrix that turns and stretches it in all sweeps: another mesh is not as much finer along the body as across."""
+ELSEWHERE = 0.05
+"""The mesh errs in another way in states that differ by more than this share of how far they are from rest. With 0.2 the gain of a held cable came out
+as 0.836 ± 0.006 for 0.85, with this as 0.842 (`benchmarks/effects.py`)."""
+PULLING = "cables", "cable_slots"
+"""What of a body only tells how its cables pull."""
+
+
+def with_mesh_errors(data: Data, stage: Stage, tried: Sequence[str]) -> Data:
+    """Return the data with the error of the mesh at a stage; without it where the mesh is huge, or linear and `discretisation` among the
+    effects that are tried."""
+    robot = stage.fit.hypothesis.robot_at(stage.fit.coordinates)
+    train, held, fitted = list(data.train), list(data.held), placed(data, stage.fit)
+    try:
+        finer = _finer(robot.body.mesh, tried)
+        if finer is None:
+            return data
+        fine = _on_its_clamp(robot, robot_on_mesh(_on_firm_clamp(robot), finer))
+        for i, (trial, (poses, initial)) in enumerate(zip(data.train, fitted)):
+            own = [j for j, of in enumerate(data.held_of) if of == i]
+            train[i], *later = _with_errors(robot, fine, [trial, *(held[j] for j in own)], poses, initial)
+            for j, one in zip(own, later):
+                held[j] = one
+        for j in (j for j, of in enumerate(data.held_of) if of is None):
+            held[j] = _with_errors(robot, fine, [held[j]], held[j].poses, held[j].initial)[0]
+    except FemsenseError:
+        return data
+    return replace(data, train=train, held=held)
+
+
+def errs_alike(before: Stage, after: Stage) -> bool:
+    """Return whether the mesh errs after an effect was added as it did before: where the effect changes nothing of the body but how its cables
+    pull, or what the camera sees, and the states are nearly the same."""
+    old = before.fit.hypothesis
+    added, _, mask = some_terms(after, [name for name in after.fit.hypothesis.names if name not in old.names])
+    robot = added.robot_at(after.fit.coordinates[mask])
+    if any(
+        getattr(robot.body, f.name) is not getattr(old.robot.body, f.name) for f in fields(BodyModel) if f.name not in PULLING
+    ):
+        return False
+    rest = robot.body.mesh.nodes
+    pairs = [(a.states[k].positions, b.states[k].positions) for a, b in zip(before.fit.jets, after.fit.jets) for k in a.states]
+    return rms_of([b - a for a, b in pairs]) <= ELSEWHERE * rms_of([a - rest for a, _ in pairs])
+
+
+def _on_firm_clamp(robot: Robot) -> Robot:
+    """Return the robot on a clamp that does not give: on the finer mesh a plate that turns stays where the state on the declared one has it, since how
+    much it turns is fitted."""
+    body = robot.body
+    return robot if body.clamp_is_rigid else robot.with_body(body.with_clamp_stiffness())
+
+
+def _on_its_clamp(robot: Robot, fine: Robot) -> Robot:
+    """Return the robot on the finer mesh with the springs of its clamp, where it has them, shared out over all clamped nodes, so that they resist turning
+    alike: between the springs of few nodes a body bulges as none does that is held by a face."""
+    body, finer = robot.body, fine.body
+    if np.isinf(body.clamp_stiffness):
+        return fine
+    second = [
+        float(((b.mesh.nodes[n] - body.clamp_center) ** 2).sum()) for b, n in ((body, body.clamp_nodes), (finer, finer.clamped))
+    ]
+    shared = replace(finer, clamp_nodes=finer.clamped)
+    return fine.with_body(
+        shared.with_clamp_stiffness(body.clamp_stiffness * second[0] / second[1], turn=body.clamp_turn_stiffness)
+    )
+
+
+def _finer(mesh: TetMesh, tried: Sequence[str]) -> TetMesh | None:
+    """Return the mesh that tells what a mesh costs: one of half the size, or of quadratic elements where it is linear. None where that takes
+    too long, or where a linear mesh is asked about as an effect."""
+    if mesh.is_quadratic:
+        return finer_mesh(mesh, None, 1) if 8 * len(mesh.tets) <= MOST_TETS else None
+    return finer_mesh(mesh, "tet10", 0) if "discretisation" not in tried and len(mesh.tets) <= MOST_TETS else None
+
+
+def make_finer(robot: Robot, tried: Sequence[str]) -> None:
+    """Make what `with_mesh_errors` needs of the finer mesh whatever the material, beside other work: what is made is kept.
+
+    A mesh that cannot be had is none here; it is asked for again where it is needed.
+    """
+    with contextlib.suppress(FemsenseError):
+        finer = _finer(robot.body.mesh, tried)
+        if finer is not None:
+            share_on_finer(robot_on_mesh(robot, finer).body)
+            _ties(robot.body.mesh, finer)
+
+
+@functools.lru_cache(maxsize=2)
+def _ties(mesh: TetMesh, fine: TetMesh) -> Embedding:
+    """Return how the nodes of a finer mesh go with a mesh."""
+    return embed_points(mesh, fine.nodes)
+
+
+def _with_errors(
+    robot: Robot, fine: Robot, trials: Sequence[Trial], poses: Sequence[FloatArray], initial: FloatArray | None
+) -> list[Trial]:
+    """Return trials of one recording with the error of the mesh in their states."""
+    moves = _moves(robot, fine, trials, seats(robot, trials[0].scene, poses), initial)
+    return [replace(t, mesh_error=_by_sweep(t, moves, poses)) for t in trials]
+
+
+def _by_sweep(trial: Trial, moves: dict[int, FloatArray], poses: Sequence[FloatArray]) -> FloatArray:
+    """Return the fields of the error [m], shape (k, c, 1 + sweeps + 9), each of one standard deviation.
+
+    `SHARE` times the error of all sweeps together, `VARIES` (`VARIES_HELD`) times that of each sweep, `TURNS` times each of its axes along each axis.
+    """
+    error = np.array([moves[int(f)][m] for f, m in zip(trial.scene.frame, trial.scene.marker)])
+    along = np.broadcast_to(np.eye(3), (len(error), 3, 3))  # (k, c, axis)
+    if trial.scene.crossings is not None:
+        along = normals_of(trial.scene, poses)[:, None, :]
+    turned = TURNS * (along[:, :, :, None] * error[:, None, None, :]).reshape(len(error), -1, 9)
+    error = np.einsum("kca,ka->kc", along, error)
+    number = np.unique(trial.groups.sweep, return_inverse=True)[1]
+    by_sweep = np.zeros((*error.shape, int(number.max()) + 1))
+    by_sweep[np.arange(len(error)), :, number] = _varies(trial) * error
+    return np.concatenate([SHARE * error[:, :, None], by_sweep, turned], axis=2)
+
+
+def _varies(trial: Trial) -> float:
+    return VARIES_HELD if trial.scene.recording.actuation == "displacement" else VARIES
+
+
+def mesh_errors(data: Data) -> list[FloatArray]:
+    """Return the error of the mesh in the rows of each fitted trial [m], (k, c); none where one is not known."""
+    known = [t.mesh_error[:, :, 0] / SHARE for t in data.train if t.mesh_error is not None]
+    return known if len(known) == len(data.train) else []
+
+
+def few_states(trial: Trial, tets: int) -> IntArray:
+    """Return the frames of a trial in which the error of a mesh of so many elements would be computed, ascending."""
+    frames = trial.scene.frames
+    return np.asarray(frames[np.sort(_chosen(state_vectors(trial.scene.recording, frames), 8 * tets))])
+
+
+def _moves(
+    robot: Robot, fine: Robot, trials: Sequence[Trial], places: FloatArray, initial: FloatArray | None
+) -> dict[int, FloatArray]:
+    """Return by how much the finer mesh moves the markers in each frame [m], (m, 3)."""
+    recording, starts = trials[0].scene.recording, trials[0].starts_on(robot.body.mesh)
+    coarse_walk = Walk(robot, drive_of(robot, recording, initial=initial))
+    fine_walk = Walk(fine, drive_of(fine, recording, initial=initial))
+    ties = _ties(robot.body.mesh, fine.body.mesh)
+    share_on_finer(fine.body)
+    here, there = robot.tie_markers(places), fine.tie_markers(places)
+    frames = np.unique(np.concatenate([t.scene.frames for t in trials]))
+    vectors = state_vectors(recording, frames)
+    chosen = _chosen(vectors, len(fine.body.mesh.tets))
+    walked = walk_along(coarse_walk, frames[chosen].tolist(), lambda r: r.markers[:0], starts=starts)
+    states = {k: state for k, state, _, _ in walked}
+    known, settled = [], []
+
+    def finer_at(i: int) -> FloatArray | None:
+        k = int(frames[i])
+        try:
+            return finer_state(coarse_walk, fine_walk, k, states[k], ties)
+        except FemsenseError:  # it folds there
+            return None
+
+    for i, finer in zip(chosen, each(finer_at, chosen)):
+        if finer is not None:
+            settled.append(i)
+            known.append(there.positions(finer) - here.positions(states[int(frames[i])].positions))
+    if not known:
+        raise DataError("no state settles on the finer mesh")
+    return dict(zip(frames.tolist(), between(vectors, settled, np.array(known))))
+
+
+def _chosen(vectors: FloatArray, tets: int) -> list[int]:
+    """Return indices of the states in which a finer mesh of so many elements is asked."""
+    return representatives(vectors, max(8, MOST_WORK // tets))
+
+
+def without_mesh_error(trial: Trial, residual: FloatArray, noise: Noise, *, nor_seats: bool = False) -> FloatArray:
+    """Return the residual [m], (k, c), less what of it is likeliest to be the mesh's own error; `nor_seats`: nor that of seats that turn."""
+    seats = noise.seats(trial.groups)
+    mesh = np.zeros((*residual.shape, 0)) if trial.mesh_error is None else trial.mesh_error
+    fields = np.concatenate([mesh, seats], axis=2)
+    plain = noise.plain_whitener(trial.groups)
+    G, r = whiten(plain, fields), whiten(plain, residual)
+    share = np.linalg.solve(np.eye(G.shape[1]) + G.T @ G, G.T @ r)
+    count = fields.shape[2] if nor_seats else mesh.shape[2]
+    return np.asarray(residual - fields[:, :, :count] @ share[:count])
+
+
+def beyond_mesh(trials: list[Trial], residuals: list[FloatArray], noise: Noise) -> float:
+    """Return the root mean square [m] of residuals less what of them is likeliest to be the mesh's own error."""
+    return rms_of([without_mesh_error(t, r, noise) for t, r in zip(trials, residuals)])

@@ -1,0 +1,300 @@
+"""Stages: a model, fitted jointly, with its error on held-out data, its noise and the fields of what it may lack."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from femsense.core.arrays import BoolArray, FloatArray, IntArray
+from femsense.loop.data.dataset import MESH, NUISANCE, Data, groups_of, surface_of
+from femsense.loop.data.surface_rows import make_rows, renewed_rows, states_of
+from femsense.loop.data.trial import Trial, rms_of, spans_of
+from femsense.loop.fit.joint_fit import GAIN, JointFit, JointProblem, Prior, fit_jointly
+from femsense.loop.fit.noise_components import Noise, whiten
+from femsense.model.effects import Effect, Entry, Parameter, find_effect
+from femsense.model.observation import Hypothesis, SceneJet, evaluate_scene
+from femsense.model.robot import Robot
+
+MODULUS_STD = 0.5
+"""How well the modulus is known beforehand, in its logarithm: a soft region in a stiff body and a stiff one in a soft body act nearly alike."""
+ZERO_STD = 0.1
+"""How well the zero of a cable is known beforehand, as a share of its range in the recording."""
+
+ROUGHLY = 3
+"""Steps of a fit that only has to come near."""
+STILL = 1e-3
+"""Freedom of a size that is held still, as a share of its standard deviation."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class HeldOut:
+    """What a model makes of a held-out trial."""
+
+    jet: SceneJet
+    """Residuals and states, no derivatives."""
+    poses: list[FloatArray]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Stage:
+    """A model with its fit and its error on held-out data."""
+
+    fit: JointFit
+    held: list[HeldOut]
+    held_rms: float
+
+    @property
+    def held_residuals(self) -> list[FloatArray]:
+        """Residuals of the held-out data [m], (k, c) a trial."""
+        return [h.jet.residual for h in self.held]
+
+
+def with_nuisance(data: Data, robot: Robot | None = None) -> tuple[Hypothesis, Prior]:
+    """Return a robot, by default that of the data, with what is always fitted along: the modulus and, where inputs are absolute, the cables' zeros."""
+    terms: list[tuple[Effect, Entry, tuple[Parameter, ...]]] = []
+    std: list[float] = []
+    for name in NUISANCE:
+        effect = find_effect(name)
+        parameters = effect.parameters(data.robot, data.control)
+        unknown_zero = any(t.initial is not None for t in data.train)
+        if not parameters or (name == "cable_offset" and unknown_zero):
+            continue
+        terms.append((effect, {}, parameters))
+        std += [MODULUS_STD] if name == "stiffness" else [max(ZERO_STD * float(s), 1e-9) for s in data.input_scale]
+    body = data.robot if robot is None else robot
+    settled = data.settled if body is data.robot else ()
+    return Hypothesis(body, tuple(terms), settled), Prior(np.zeros(len(std)), np.array(std))
+
+
+def make_stage(
+    data: Data,
+    hypothesis: Hypothesis,
+    prior: Prior,
+    noise: Noise,
+    coordinates: FloatArray,
+    *,
+    own: FloatArray | None = None,
+    max_iterations: int = 12,
+    known: list[SceneJet] | None = None,
+    near: list[SceneJet] | None = None,
+    worth: float = np.inf,
+    spare: float = 0.0,
+) -> Stage:
+    """Return the fit of a hypothesis and what it makes of the held-out data; arguments as of `fit_jointly`."""
+    fit = fit_jointly(
+        hypothesis,
+        prior,
+        data.train,
+        noise,
+        data.seat_std,
+        coordinates,
+        own=own,
+        max_iterations=max_iterations,
+        known=known,
+        near=near,
+        worth=worth,
+        spare=spare,
+    )
+    held = held_out(data, fit, noise)
+    return Stage(fit, held, rms_of([h.jet.residual for h in held]) if held else float("nan"))
+
+
+def jets_without(stage: Stage, keep: BoolArray) -> list[SceneJet]:
+    """Return the jets of a stage with the columns of some coordinates only."""
+    return [replace(j, by_effect=j.by_effect[:, :, keep], rest_by_effect=j.rest_by_effect[:, :, keep]) for j in stage.fit.jets]
+
+
+def keeping(
+    data: Data, stage: Stage, names: Sequence[str], noise: Noise, *, max_iterations: int = 12, worth: float = np.inf
+) -> Stage:
+    """Return a stage with some of its terms only, fitted again (roughly where χ² stays above `worth`). Raises DataError."""
+    hypothesis, prior, mask = some_terms(stage, names)
+    return make_stage(
+        data,
+        hypothesis,
+        prior,
+        noise,
+        stage.fit.coordinates[mask],
+        own=own_of(stage),
+        max_iterations=max_iterations,
+        near=jets_without(stage, mask),
+        worth=worth,
+    )
+
+
+def with_sizes_still(data: Data, stage: Stage, names: Sequence[str], noise: Noise) -> Stage:
+    """Return a stage with some of its terms only, which keep the sizes that they have beside all of them; poses are fitted again, to where little
+    is left to gain. Raises DataError."""
+    hypothesis, _, mask = some_terms(stage, names)
+    sizes = stage.fit.coordinates[mask]
+    still = Prior(sizes, STILL * stage.fit.std[mask])
+    return make_stage(data, hypothesis, still, noise, sizes, own=own_of(stage), near=jets_without(stage, mask), spare=GAIN)
+
+
+def with_seeds_still(data: Data, stage: Stage) -> Stage:
+    """Return a stage whose places and times, which were fitted along at last, are part of the seeds, as they are there.
+
+    A time that data see the beginning of only runs off to the end of its range where the rest is fitted again.
+    """
+    fit, terms, keep = stage.fit, list[tuple[Effect, Entry, tuple[Parameter, ...]]](), list[bool]()
+    for (effect, seed, parameters), entry in zip(fit.hypothesis.terms, fit.hypothesis.entries(fit.coordinates)):
+        own = {p.key for p in effect.parameters(data.robot, data.control)}
+        mask = [p.key in own for p in parameters]
+        still = {p.key: entry[p.key] for p, kept in zip(parameters, mask) if not kept}
+        terms.append((effect, {**seed, **still}, tuple(p for p, kept in zip(parameters, mask) if kept)))
+        keep += mask
+    kept = np.array(keep, dtype=bool)
+    theta = np.concatenate([fit.fit.theta[: fit.own], fit.coordinates[kept]])
+    prior = Prior(fit.prior.mean[kept], fit.prior.std[kept])
+    less = replace(
+        fit,
+        hypothesis=replace(fit.hypothesis, terms=tuple(terms)),
+        prior=prior,
+        fit=replace(fit.fit, theta=theta),
+        jets=jets_without(stage, kept),
+    )
+    return replace(stage, fit=less)
+
+
+def some_terms(stage: Stage, names: Sequence[str]) -> tuple[Hypothesis, Prior, BoolArray]:
+    """Return the hypothesis and prior of a stage with some of its terms only, and which coordinates these have."""
+    terms = stage.fit.hypothesis.terms
+    mask = np.concatenate([np.full(len(p), e.name in names) for e, _, p in terms]) if terms else np.zeros(0, dtype=bool)
+    hypothesis = replace(stage.fit.hypothesis, terms=tuple(t for t in terms if t[0].name in names))
+    return hypothesis, Prior(stage.fit.prior.mean[mask], stage.fit.prior.std[mask]), mask
+
+
+def roughly_keeping(data: Data, stage: Stage, names: Sequence[str], noise: Noise, frames: Sequence[IntArray]) -> Stage:
+    """Return a stage with some of its terms only, fitted in a few steps to some frames of each trial; nothing is held out. Raises DataError."""
+    hypothesis, prior, mask = some_terms(stage, names)
+    trials = [t.part(f) for t, f in zip(data.train, frames)]
+    fit = fit_jointly(
+        hypothesis, prior, trials, noise, data.seat_std, stage.fit.coordinates[mask], own=own_of(stage), max_iterations=ROUGHLY
+    )
+    return Stage(fit, [], float("nan"))
+
+
+def found_in(stage: Stage) -> list[str]:
+    """Return the effects of a stage beside what calibration may move and quadratic elements."""
+    return [name for name in stage.fit.hypothesis.names if name not in (*NUISANCE, MESH.name)]
+
+
+def span_of(fit: JointFit, name: str) -> slice:
+    """Return where the coordinates of an effect stand among those of a fit; nowhere if it has none."""
+    at = 0
+    for effect, _, parameters in fit.hypothesis.terms:
+        if effect.name == name:
+            return slice(at, at + len(parameters))
+        at += len(parameters)
+    return slice(0, 0)
+
+
+def own_of(stage: Stage) -> FloatArray:
+    return np.array(stage.fit.fit.theta[: stage.fit.own])
+
+
+def held_out(data: Data, fit: JointFit, noise: Noise) -> list[HeldOut]:
+    """Return what a fit makes of each held-out trial; a recording of its own gets its own pose from its first frames."""
+    robot = fit.hypothesis.robot_at(fit.coordinates)
+    plain, pivot = Hypothesis(robot), data.robot.marker_points.mean(axis=0)
+    result: list[HeldOut] = []
+    for trial, (poses, initial) in zip(data.held, placed_held(data, fit, noise)):
+        jet = evaluate_scene(
+            plain,
+            trial.scene,
+            np.zeros(0),
+            poses,
+            initial,
+            derivative=False,
+            vary_initial=False,
+            pivot=pivot,
+            starts=trial.starts_on(robot.body.mesh),
+        )
+        result.append(HeldOut(jet, list(poses)))
+    return result
+
+
+Placed = tuple[list[FloatArray], FloatArray | None]
+"""Poses of the cameras, and initial inputs where they are unknown."""
+
+
+def placed_held(data: Data, fit: JointFit, noise: Noise) -> list[Placed]:
+    """Return poses and initial inputs of each held-out trial: those of its recording, or its own from its first frames."""
+    train, result = placed(data, fit), list[Placed]()
+    robot = fit.hypothesis.robot_at(fit.coordinates)
+    for i, (trial, of) in enumerate(zip(data.held, data.held_of)):
+        if of is not None:
+            result.append(train[of])
+        elif trial.together:
+            result.append(result[-1])
+        else:
+            both = [trial, *(t for t in data.held[i + 1 : i + 2] if t.together)]
+            result.append(_pose_on_first_frames(robot, both, noise, data.seat_std, data.robot.marker_points.mean(axis=0)))
+    return result
+
+
+def _pose_on_first_frames(robot: Robot, trials: list[Trial], noise: Noise, seat_std: float, pivot: FloatArray) -> Placed:
+    frames = np.unique(np.concatenate([t.scene.frames for t in trials]))
+    few = frames[: max(1, round(0.2 * len(frames)))]
+    first = [t.part(few) for t in trials if np.isin(t.scene.frames, few).any()]
+    first = [replace(t, together=bool(i)) for i, t in enumerate(first)]
+    fit = fit_jointly(Hypothesis(robot), Prior(np.zeros(0), np.zeros(0)), first, noise, seat_std, np.zeros(0))
+    return first[0].place(fit.fit.theta, pivot)
+
+
+def placed(data: Data, fit: JointFit) -> list[Placed]:
+    """Return poses and initial inputs of each training trial at a fit."""
+    pivot = data.robot.marker_points.mean(axis=0)
+    return [t.place(fit.fit.theta[span], pivot) for t, span in zip(data.train, spans_of(data.train))]
+
+
+def rematched(data: Data, stage: Stage, noise: Noise, *, anew: bool = False) -> Data:
+    """Return the data with what clouds round off counted anew where a stage has the surface; with `anew` it is asked again which rows there are."""
+    if "clouds" not in data.measured:
+        return data
+    robot = stage.fit.hypothesis.robot_at(stage.fit.coordinates)
+    train = [_rematched(robot, t, *own, anew) for t, own in zip(data.train, placed(data, stage.fit))]
+    held = [_rematched(robot, t, *own, anew) for t, own in zip(data.held, placed_held(data, stage.fit, noise))]
+    return replace(data, train=train, held=held)
+
+
+def _rematched(robot: Robot, trial: Trial, poses: list[FloatArray], initial: FloatArray | None, anew: bool) -> Trial:
+    if trial.seen is None:
+        return trial
+    states = states_of(robot, trial.scene, poses, initial, trial.starts_on(robot.body.mesh))
+    if not anew:
+        return replace(trial, scene=renewed_rows(robot, trial.scene, trial.seen, states, poses))
+    scene = make_rows(robot, trial.scene, trial.seen, states, poses)
+    return replace(trial, scene=scene, groups=groups_of(scene, trial.frames, surface_of(robot, scene, poses)), mesh_error=None)
+
+
+def held_chi2(data: Data, stage: Stage, noise: Noise) -> float:
+    """Return the whitened sum of squares of the held-out residuals."""
+    return float(
+        sum((whiten(noise.whitener(t.groups, t.mesh_error), r) ** 2).sum() for t, r in zip(data.held, stage.held_residuals))
+    )
+
+
+def held_shift(data: Data, before: Stage, after: Stage, noise: Noise) -> float:
+    """Return the whitened sum of squares of the difference between two models on held-out data."""
+    return float(
+        sum(
+            (whiten(noise.whitener(t.groups, t.mesh_error), b - a) ** 2).sum()
+            for t, b, a in zip(data.held, before.held_residuals, after.held_residuals)
+        )
+    )
+
+
+def problem_of(data: Data, fit: JointFit, noise: Noise) -> JointProblem:
+    return JointProblem(
+        fit.hypothesis, fit.prior, data.train, [noise.whitener(t.groups, t.mesh_error) for t in data.train], data.seat_std
+    )
+
+
+def weighed(data: Data, fit: JointFit, noise: Noise, jets: list[SceneJet]) -> JointFit:
+    """Return a fit, from where it is, with other weights or rows (kinks are left as they are); jets: those of the rows."""
+    residual, jacobian = problem_of(data, fit, noise).rows_of(jets, fit.fit.theta, True)
+    assert jacobian is not None
+    return replace(fit, fit=replace(fit.fit, residual=residual, jacobian=jacobian), chi2=float(residual @ residual), jets=jets)

@@ -1,0 +1,387 @@
+"""The joint fit of poses, initial inputs, modulus, cable zeros and effects over several recordings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from femsense.core.arrays import BoolArray, FloatArray
+from femsense.core.errors import DataError
+from femsense.core.least_squares import FitResult, gauss_newton
+from femsense.core.local_model import Kinks
+from femsense.fem.body import BodyModel
+from femsense.fem.equilibrium import Equilibrium
+from femsense.loop.data.trial import States, Trial, normal_rms_of, rms_of, spans_of
+from femsense.loop.fit.noise_components import Noise, Whitener, whiten
+from femsense.loop.fit.slack_nonsmoothness import Part, joined, trial_kinks
+from femsense.model.effects.loads import STANDARD_GRAVITY
+from femsense.model.observation import Hypothesis, SceneJet, evaluate_scene
+from femsense.model.quasi_static_path import has_given
+from femsense.model.variants import AtPoints
+
+if TYPE_CHECKING:
+    pass
+
+DECLARED_POSE_STD = np.array([2e-3] * 3 + [3e-4] * 3)
+"""How far a declared pose is trusted [rad, m] where there are clouds alone …"""
+BESIDE_MARKERS = np.array([1e-2] * 3 + [1e-3] * 3)
+"""… and where there are markers, which tell the pose much better: with the same trust a pose that is 1 mm and ½° off would bend zeros of cables."""
+GRAVITY_STD = 0.1
+"""How far the size of gravity is known to be 9.80665 m/s² on an unknown site [m/s²]."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Prior:
+    """Independent Gaussian priors on the coordinates of a hypothesis."""
+
+    mean: FloatArray
+    std: FloatArray
+    """inf: none."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Jets:
+    """Unwhitened residuals and derivatives of all trials at one point."""
+
+    jets: list[SceneJet]
+    theta: FloatArray
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class JointFit:
+    """The outcome of a joint fit."""
+
+    hypothesis: Hypothesis
+    prior: Prior
+    fit: FitResult
+    own: int
+    """Number of parameters that belong to recordings; those of the hypothesis follow."""
+    chi2: float
+    """Whitened sum of squares of markers and priors."""
+    jets: list[SceneJet]
+
+    @property
+    def coordinates(self) -> FloatArray:
+        """Coordinates of the hypothesis, shape (p,)."""
+        return self.fit.theta[self.own :]
+
+    @property
+    def std(self) -> FloatArray:
+        """Standard deviations of the coordinates, shape (p,)."""
+        return np.sqrt(np.maximum(np.diag(self.fit.covariance)[self.own :], 0.0))
+
+    @property
+    def rms(self) -> float:
+        """Root mean square residual [m]: 3-D of the markers, where there are none along the normals of the clouds."""
+        return rms_of([jet.residual for jet in self.jets])
+
+    @property
+    def normal_rms(self) -> float | None:
+        """Root mean square residual of the clouds along their normals [m]; None without clouds."""
+        return normal_rms_of([jet.residual for jet in self.jets])
+
+
+@dataclass(eq=False, slots=True)
+class JointProblem:
+    """Whitened residual and Jacobian over trials; remembers the last jets."""
+
+    hypothesis: Hypothesis
+    prior: Prior
+    trials: list[Trial]
+    factors: list[Whitener]
+    seat_std: float
+    last: Jets | None = None
+    """With derivatives."""
+    seen: Jets | None = None
+    """Without derivatives."""
+    tried: tuple[FloatArray, list[States]] | None = None
+    """The step that was tried last, and its states."""
+    near: list[SceneJet] | None = None
+    """Derivatives from near the start, until there are own ones."""
+    scale: FloatArray = field(default_factory=lambda: np.zeros(0))
+    """How much the residual answers to each parameter, shape (p,)."""
+
+    @property
+    def own(self) -> int:
+        return sum(t.size for t in self.trials if not t.together)
+
+    def start(self, coordinates: FloatArray) -> FloatArray:
+        """Return θ at the trials' starts."""
+        parts = [
+            np.concatenate([np.zeros(6 * len(t.poses)), t.initial if t.initial is not None else np.zeros(0)])
+            for t in self.trials
+            if not t.together
+        ]
+        return np.concatenate([*parts, coordinates])
+
+    def bounds(self) -> tuple[FloatArray, FloatArray]:
+        """Return bounds of θ."""
+        low, high = [], []
+        for t in (t for t in self.trials if not t.together):
+            free = np.full(6 * len(t.poses), np.inf)
+            low += [-free, t.input_low if t.initial is not None else np.zeros(0)]
+            high += [free, t.input_high if t.initial is not None else np.zeros(0)]
+        parameters = self.hypothesis.parameters
+        return np.concatenate([*low, [p.low for p in parameters]]), np.concatenate([*high, [p.high for p in parameters]])
+
+    def evaluate(self, theta: FloatArray, derivative: bool) -> tuple[FloatArray, FloatArray | None]:
+        """Return whitened residual (N,) and Jacobian (N, p): markers, seats, declared poses, priors.
+
+        What is asked without a derivative, once one is known, is a step that is tried: its states are solved roughly and kept only if
+        the fit goes there.
+        """
+        rough = not derivative and (self.last is not None or self.near is not None)
+        try:
+            starts, jets = self._jets(theta, derivative, rough)
+        except DataError:
+            if self.last is not None or self.seen is not None or not rough:
+                raise
+            rough = False  # the start is far from the states that are known
+            starts, jets = self._jets(theta, derivative, rough)
+        if rough:
+            self.tried = (np.array(theta), starts)
+        if derivative:
+            self.last = Jets(jets, np.array(theta))
+        else:
+            self.seen = Jets(jets, np.array(theta))
+        rows = self.rows_of(jets, theta, derivative)
+        self.scale = self.scale if rows[1] is None else np.linalg.norm(rows[1], axis=0)
+        return rows
+
+    def _jets(self, theta: FloatArray, derivative: bool, rough: bool) -> tuple[list[States], list[SceneJet]]:
+        """Return the states and the jets of all trials at θ."""
+        starts, spans, before = self._starts(theta, rough), spans_of(self.trials), self.last or self.seen
+        jets = []
+        for i, (trial, span) in enumerate(zip(self.trials, spans)):
+            still = before is not None and not self.hypothesis.parameters and trial.initial is None
+            known = before.jets[i].states if still and before is not None else None
+            jets.append(self.jet(trial, theta[span], theta[self.own :], derivative, starts[i], rough, known, derivative))
+        return starts, jets
+
+    def kinks(self, theta: FloatArray) -> Kinks | None:
+        """Return where tensions that end at 0 bend the residual near θ, as far as the derivatives that were computed last tell."""
+        jets = self.near if self.last is None else self.last.jets
+        if jets is None or not any(jet.by_input.shape[2] for jet in jets):
+            return None
+        at, parts = 0, list[Part]()
+        for trial, factor, jet, span in zip(self.trials, self.factors, jets, spans_of(self.trials)):
+            found = trial_kinks(self.hypothesis, trial, jet, factor, theta[span], theta[self.own :])
+            if found is not None:
+                parts.append((slice(at, at + jet.residual.size), np.r_[span, self.own : len(theta)], found))
+            at += jet.residual.size + jet.rest.size + 6 * len(trial.poses)
+        rows = at + len(self._prior_rows(theta[self.own :], len(theta))[0])
+        return joined(parts, rows, len(theta)) if parts else None
+
+    def settle_for(self, near: list[SceneJet] | None) -> list[SceneJet]:
+        """Return the residuals that were seen last, with the derivatives from before; their states serve as starts from now on."""
+        derivatives = near if self.last is None else self.last.jets
+        assert self.seen is not None and derivatives is not None
+        self._starts(self.seen.theta, False)
+        return [replace(d, residual=s.residual, rest=s.rest, states=s.states) for d, s in zip(derivatives, self.seen.jets)]
+
+    def _starts(self, theta: FloatArray, rough: bool) -> list[States]:
+        """Return the states to start from, of each trial: those of the step that was tried last where it is nearer."""
+        kept = [t.starts_on(self.hypothesis.robot.body.mesh) for t in self.trials]
+        if not rough:
+            for own, tried in zip(kept, self.tried[1] if self.tried is not None and np.array_equal(self.tried[0], theta) else []):
+                own.update(tried)
+            return kept
+        begun = self.near if self.last is None else self.last.jets
+        if self.tried is None and begun is not None:
+            body = self.hypothesis.robot_at(theta[self.own :]).body
+            return [_as_near(own, jet.states, body) for own, jet in zip(kept, begun)]
+        if self.tried is None:
+            return [dict(s) for s in kept]
+        at, states = self.tried
+        nearer = self.last is None or (
+            len(self.scale) == len(theta)
+            and np.linalg.norm(self.scale * (theta - at)) < np.linalg.norm(self.scale * (theta - self.last.theta))
+        )
+        return [dict(s) for s in (states if nearer else kept)]
+
+    def rows_of(self, jets: list[SceneJet], theta: FloatArray, derivative: bool) -> tuple[FloatArray, FloatArray | None]:
+        """Return what `evaluate` makes of the jets of all trials at θ."""
+        rows, blocks = [], []
+        for trial, factor, jet, span in zip(self.trials, self.factors, jets, spans_of(self.trials)):
+            r, J = self._scene_rows(trial, factor, jet, theta[span], span.start, len(theta), derivative)
+            rows.append(r)
+            blocks.append(J)
+        r, J = self._prior_rows(theta[self.own :], len(theta))
+        rows.append(r)
+        blocks.append(J)
+        return np.concatenate(rows), np.vstack(blocks) if derivative else None
+
+    def jet(
+        self,
+        trial: Trial,
+        own: FloatArray,
+        coordinates: FloatArray,
+        derivative: bool,
+        starts: States | None = None,
+        rough: bool = False,
+        known: States | None = None,
+        vary_inputs: bool = False,
+        answers: dict[int, AtPoints] | None = None,
+    ) -> SceneJet:
+        """Return the residuals and derivatives of one trial, from its own states or others to start from, or at states that are `known`, or whose
+        `answers` are."""
+        pivot = self.hypothesis.robot.marker_points.mean(axis=0)
+        _, initial = trial.place(own, pivot)
+        starts = trial.starts_on(self.hypothesis.robot.body.mesh) if starts is None else starts
+        return evaluate_scene(
+            self.hypothesis,
+            trial.scene,
+            coordinates,
+            trial.poses,
+            initial,
+            derivative=derivative,
+            vary_initial=trial.initial is not None,
+            pivot=pivot,
+            starts=starts,
+            rough=rough,
+            known=known,
+            vary_inputs=vary_inputs,
+            moves=own[: 6 * len(trial.poses)],
+            answers=answers,
+        )
+
+    def _scene_rows(
+        self, trial: Trial, factor: Whitener, jet: SceneJet, own: FloatArray, at: int, width: int, derivative: bool
+    ) -> tuple[FloatArray, FloatArray]:
+        poses = 6 * len(trial.poses)
+        declared = np.array([T is not None and not trial.together for T in trial.scene.recording.T_robot_camera]).repeat(6)
+        known = BESIDE_MARKERS if trial.scene.crossings is None else DECLARED_POSE_STD
+        trust = np.where(declared, 1.0 / np.tile(known, len(trial.poses)), 0.0)
+        r = np.concatenate([whiten(factor, jet.residual), jet.rest.ravel() / self.seat_std, trust * own[:poses]])
+        J = np.zeros((len(r), width if derivative else 0))
+        if not derivative:
+            return r, J
+        k, s = jet.residual.size, jet.rest.size
+        J[:k, at : at + poses] = whiten(factor, jet.by_pose)
+        J[:k, at + poses : at + trial.size] = whiten(factor, jet.by_initial)
+        J[:k, self.own :] = whiten(factor, jet.by_effect)
+        J[k : k + s, at : at + poses] = jet.rest_by_pose.reshape(s, poses) / self.seat_std
+        J[k : k + s, self.own :] = jet.rest_by_effect.reshape(s, jet.rest_by_effect.shape[2]) / self.seat_std
+        J[k + s :, at : at + poses] = np.diag(trust)
+        return r, J
+
+    def _prior_rows(self, coordinates: FloatArray, width: int) -> tuple[FloatArray, FloatArray]:
+        known = np.isfinite(self.prior.std)
+        r = (coordinates - self.prior.mean)[known] / self.prior.std[known]
+        J = np.zeros((len(r), width))
+        J[np.arange(len(r)), self.own + np.flatnonzero(known)] = 1.0 / self.prior.std[known]
+        gravity = self.gravity_at()
+        if gravity is None or np.linalg.norm(coordinates[gravity]) < 1e-3:
+            return r, J
+        vector = coordinates[gravity]
+        size = float(np.linalg.norm(vector))
+        row = np.zeros((1, width))
+        row[0, self.own + np.flatnonzero(gravity)] = vector / size / GRAVITY_STD
+        return np.append(r, (size - STANDARD_GRAVITY) / GRAVITY_STD), np.vstack([J, row])
+
+    def gravity_at(self) -> BoolArray | None:
+        """Return which coordinates are the components of gravity, or None."""
+        mask = np.array([p.key == "vector_m_s2" for p in self.hypothesis.parameters], dtype=bool)
+        return mask if mask.any() else None
+
+
+def _as_near(kept: States, near: States, body: BodyModel) -> States:
+    """Return states of a body to start from: those of a fit near by where they are on the same mesh, since others may have gone far since
+    then, unless it is those whose clamp has given way, or not, as this body's does. What is kept lends them its factors."""
+    shape = next(iter(near.values())).positions.shape
+    if any(state.positions.shape != shape for state in kept.values()):
+        return dict(kept)
+    return {**kept, **{k: _lent(kept.get(k), state, body) for k, state in near.items()}}
+
+
+def _lent(kept: Equilibrium | None, state: Equilibrium, body: BodyModel) -> Equilibrium:
+    """Return the state that a frame starts from, of one that is kept and one of a fit near by."""
+    if kept is None or kept.positions is state.positions:  # such states have their factors
+        return state if kept is None else kept
+    gives, gave = has_given(body, state), has_given(body, kept)
+    if gives == body.clamp_is_rigid and gave != body.clamp_is_rigid:
+        return kept
+    near = gives == gave and np.abs(kept.positions - state.positions).max() < NEAR * body.reach
+    return replace(state, factor=kept.factor if near else None)
+
+
+NEAR = 1e-2
+"""A factor serves for a state that differs by less than this share of the body."""
+TRUSTED = 0.02
+"""Derivatives that missed less than this share of every step since they were computed are believed that nothing is left to gain."""
+GAIN = 0.5
+"""What counts as a gain of a step in χ², where a fit goes on by little: half of what a parameter of noise brings."""
+SERVES = 0.25
+"""Derivatives serve for another step of a fit where they missed the change of the residual by less than this share of it."""
+
+
+def fit_jointly(
+    hypothesis: Hypothesis,
+    prior: Prior,
+    trials: list[Trial],
+    noise: Noise,
+    seat_std: float,
+    coordinates: FloatArray,
+    *,
+    own: FloatArray | None = None,
+    max_iterations: int = 12,
+    known: list[SceneJet] | None = None,
+    near: list[SceneJet] | None = None,
+    worth: float = np.inf,
+    spare: float = 0.0,
+) -> JointFit:
+    """Fit poses, initial inputs and the coordinates of a hypothesis together, in full nonlinearity.
+
+    Arguments:
+        hypothesis, prior: what is fitted, and what is known of it beforehand.
+        trials: the recordings.
+        noise: weights of the residuals.
+        seat_std: of seats measured by rest.csv against their declared places [m].
+        coordinates: start of the hypothesis, shape (p,).
+        own: start of the recordings' own parameters; by default where the trials start.
+        max_iterations: Gauss–Newton steps.
+        known: residuals and derivatives at the start, one jet a trial, where they are known.
+        near: derivatives from near the start, to begin with.
+        worth: χ² above which the fit is not worth derivatives of its own at the end.
+        spare: the fit ends where a step promises to lower χ² by less than this.
+
+    Raises:
+        DataError: no equilibrium at the start.
+    """
+    problem = JointProblem(hypothesis, prior, trials, [noise.whitener(t.groups, t.mesh_error) for t in trials], seat_std)
+    theta = problem.start(coordinates)
+    if own is not None:
+        theta[: problem.own] = own
+    low, high = problem.bounds()
+    begin = None if known is None else problem.rows_of(known, theta, True)
+    problem.near = near
+    problem.last = None if known is None else Jets(known, np.array(theta))
+    problem.scale = problem.scale if begin is None or begin[1] is None else np.linalg.norm(begin[1], axis=0)
+    fit = gauss_newton(
+        problem.evaluate,
+        theta,
+        low=low,
+        high=high,
+        max_iterations=max_iterations,
+        tolerance=1e-6,
+        still=0.2,
+        known=begin,
+        borrowed=None if near is None else problem.rows_of(near, theta, True)[1],
+        serves=SERVES,
+        worth=worth,
+        trusted=TRUSTED,
+        enough=GAIN,
+        spare=spare,
+        kinks=problem.kinks,
+    )
+    if problem.last is None or not np.array_equal(problem.last.theta, fit.theta):
+        if not fit.own:
+            if problem.seen is None or not np.array_equal(problem.seen.theta, fit.theta):  # a step further was tried
+                problem.evaluate(fit.theta, False)
+            jets = problem.settle_for(near)
+            return JointFit(hypothesis, prior, fit, problem.own, float(fit.residual @ fit.residual), jets)
+        problem.evaluate(fit.theta, True)
+    assert problem.last is not None
+    return JointFit(hypothesis, prior, fit, problem.own, float(fit.residual @ fit.residual), problem.last.jets)

@@ -1,0 +1,95 @@
+"""Where residuals bend because a cable cannot push: tensions that zero, gain and log let come out below 0.
+
+Where a log says 0 for every cable that is not used, all these frames bend at once as its zero goes through 0, and a fit that believes
+in straight lines overshoots again and again. What makes them bend is known without solving anything: the tension that drives each frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from femsense.core.arrays import FloatArray, IntArray
+from femsense.core.local_model import Kinks
+from femsense.loop.fit.noise_components import Whitener, whiten
+from femsense.model.drive import creep_response, inputs_wanted
+from femsense.model.observation import Hypothesis, SceneJet
+
+if TYPE_CHECKING:
+    from femsense.loop.data.trial import Trial
+
+DRIVING = ("cable_offset", "cable_gain", "creep")
+"""Effects that change the tension that drives a frame, and leave the body as it is."""
+NEAR_ZERO = 0.25
+"""Tensions below this share of the largest one may come to 0 in a step."""
+ALIKE = 0.01
+"""Tensions that differ by less than this share of the largest one count as one: logs are noisy where cables are idle."""
+
+
+Part = tuple[slice, IntArray, Kinks]
+"""Rows of a trial, which parameters its slopes are by, and its kinks."""
+
+
+def trial_kinks(
+    hypothesis: Hypothesis, trial: Trial, jet: SceneJet, factor: Whitener, own: FloatArray, coordinates: FloatArray
+) -> Kinks | None:
+    """Return where the residual rows of a trial bend near a point; its slopes are by the trial's own parameters, then the coordinates.
+
+    Frames in which a cable is driven alike bend together.
+    """
+    if trial.scene.recording.actuation != "tension" or not jet.by_input.shape[2]:
+        return None
+    value, slope, response = _wanted(hypothesis, trial, own, coordinates)
+    largest = value.max(axis=0).clip(1e-9)
+    near = (value < NEAR_ZERO * largest) & (np.abs(slope).max(axis=2) > 0)
+    frame, cable = np.nonzero(near)
+    if not len(frame):
+        return None
+    table = np.column_stack([cable, np.rint((value / largest)[near] / ALIKE), jet.pulled[near]])
+    _, group, count = np.unique(table, axis=0, return_inverse=True, return_counts=True)
+    share = np.zeros((len(count), len(frame)))
+    share[group.ravel(), np.arange(len(frame))] = 1.0
+    weight = response[:, frame] @ share.T  # what drives each frame by what is wanted in all frames of a group
+    first = share.argmax(axis=1)
+    field = jet.by_input[:, :, cable[first]] * weight[trial.scene.frame][:, None, :]
+    some = np.abs(field).max(axis=(0, 1)) > 0
+    mean = (share / count[:, None])[some]
+    return Kinks(whiten(factor, field[:, :, some]), mean @ value[near], mean @ slope[near], jet.pulled[near][first][some])
+
+
+def joined(parts: Sequence[Part], rows: int, width: int) -> Kinks:
+    """Return the kinks of several trials together, for so many rows and parameters."""
+    columns, slopes = list[FloatArray](), list[FloatArray]()
+    for own, by, part in parts:
+        columns.append(np.zeros((rows, len(part.value))))
+        columns[-1][own] = part.columns
+        slopes.append(np.zeros((len(part.value), width)))
+        slopes[-1][:, by] = part.slope
+    value, counted = (np.concatenate([getattr(part, name) for _, _, part in parts]) for name in ("value", "counted"))
+    return Kinks(np.hstack(columns), value, np.vstack(slopes), counted)
+
+
+def _wanted(
+    hypothesis: Hypothesis, trial: Trial, own: FloatArray, coordinates: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the tensions that are wanted [N], (F, a), their derivatives by all parameters, (F, a, p), and what each frame is driven by
+    of those of all frames, (F, F)."""
+    recording = trial.scene.recording
+    poses = 6 * len(trial.poses)
+    initial = None if trial.initial is None else own[poses:]
+    chosen = np.concatenate([np.full(len(p), e.name in DRIVING) for e, _, p in hypothesis.terms] or [np.zeros(0, bool)])
+    driving = replace(hypothesis, terms=tuple(t for t in hypothesis.terms if t[0].name in DRIVING))
+    at = coordinates[chosen]
+    robot = driving.robot_at(at)
+    value = inputs_wanted(robot, recording, initial)
+    slope = np.zeros((*value.shape, len(own) + len(coordinates)))
+    for i in range(0 if initial is None else len(initial)):
+        slope[:, i, poses + i] = robot.actuation.gain[i]
+    for j, parameter, k in zip(range(len(at)), driving.parameters, len(own) + np.flatnonzero(chosen)):
+        moved = at.copy()
+        moved[j] += parameter.step
+        slope[:, :, k] = (inputs_wanted(driving.robot_at(moved), recording, initial) - value) / parameter.step
+    return value, slope, creep_response(robot, recording)

@@ -1,0 +1,1 @@
+"""The search for effects: screening, refits, forward selection, acceptance, pruning, swaps."""

@@ -1,0 +1,194 @@
+"""The acceptance test: what decides that a refitted effect is added to the model."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from femsense.core.arrays import FloatArray
+from femsense.core.least_squares import GIVEN_UP
+from femsense.loop.data.dataset import NUISANCE, Data
+from femsense.loop.data.trial import rms_of
+from femsense.loop.fit.cross_validation import sweeps_predicted
+from femsense.loop.fit.discretisation_error import mesh_errors
+from femsense.loop.fit.fitted_model import Stage, held_chi2, held_shift, span_of
+from femsense.loop.fit.joint_fit import JointFit
+from femsense.loop.fit.noise_components import Noise
+from femsense.loop.search.refit import EVIDENCE, evidence
+from femsense.loop.search.screening import Candidate
+from femsense.loop.search.search_state import Refit
+from femsense.model.robot import Robot
+
+ENOUGH_SPREAD = 0.5
+"""Standard errors by which the prediction of left-out sweeps must get better."""
+
+
+PREDICTS = 0.25
+"""Share of the decrease of χ², a row, that must show on held-out rows too (unless the effect hardly acts there)."""
+
+
+ABOVE_MESH = 0.5
+"""An effect must move the markers by this much of what the mesh itself costs (beyond what calibration absorbs) …"""
+
+
+ABOVE_MESH_IF_SURE = 0.25
+"""… or by this much, if left-out sweeps speak for it by SURE standard errors and, the more of these the less, held-out data gain too."""
+
+
+NOT_PLAINLY_WORSE = 1.25
+"""No effect may leave so many times the plain error where fitted: it would live on a larger share of what the mesh costs."""
+
+
+MOUNTED = np.radians(5.0)
+"""A base is mounted as it is declared to about this angle, and a declared gravity is believed as much [rad]."""
+
+
+SURE = 2.5
+"""Standard errors of the gain on left-out sweeps beyond which held-out data need only not speak against an effect."""
+
+
+def judged(
+    data: Data,
+    stage: Stage,
+    candidate: Candidate,
+    made: Stage,
+    record: dict[str, Any],
+    noise: Noise,
+) -> Refit:
+    gain = evidence(stage.fit, made.fit)
+    score = gain - candidate.cost - tilt_cost(data.declared, candidate, made.fit)
+    better, spread = sweeps_predicted(data.train, stage.fit, made.fit)
+    record |= {"dchi2": gain, "dbic": score, "validation_rms_m": made.held_rms, "cv_gain": better, "cv_spread": spread}
+    held = held_chi2(data, stage, noise) - held_chi2(data, made, noise)
+    acts = held_shift(
+        data, stage, made, noise
+    )  # what `held` is on average for the true effect, with a variance of four times that
+    wanted = min(PREDICTS * gain * held_share(data), acts - 5.0 * float(np.sqrt(acts)))
+    moved, mesh = moved_by(stage, made), mesh_cost(data, stage)
+    record |= {"held_dchi2": held, "moved_m": moved, "mesh_cost_m": mesh, "takes_over": _taken_over(stage, made)}
+    surely = better > SURE * spread
+    if surely:
+        wanted = min(wanted, 0.0)
+    fit_objection = _objection(made, candidate, score)
+    if fit_objection is None and np.isfinite(spread) and better <= ENOUGH_SPREAD * spread:
+        fit_objection = f"sweeps that are left out do not speak for it ({better:+.1f} ± {spread:.1f})"
+    if fit_objection is None and held < wanted:
+        fit_objection = f"it does not predict the held-out data (χ² {_moves(held)} there, and falls by {gain:.1f} where fitted)"
+    if fit_objection is None and score + held <= EVIDENCE:  # what was not fitted speaks against it
+        fit_objection = f"too little evidence (dBIC {score:.1f}) where held-out data speak against it (χ² {_moves(held)} there)"
+    least = ABOVE_MESH_IF_SURE if sure_beyond_mesh(better, spread, held, gain * held_share(data)) else ABOVE_MESH
+    if fit_objection is None and moved < least * mesh:
+        fit_objection = f"it moves the markers by {1e3 * moved:.3f} mm, the mesh itself by {1e3 * mesh:.3f} mm"
+    if fit_objection is None and _plainly_worse(stage, made):
+        fit_objection = f"the plain error grows where fitted ({1e3 * stage.fit.rms:.3f} mm, then {1e3 * made.fit.rms:.3f} mm)"
+    record["verdict"] = fit_objection or "passes"
+    return Refit(candidate, made, score, stage.fit.chi2 - made.fit.chi2 - candidate.cost, record)
+
+
+def _moves(decrease: float) -> str:
+    return f"{'falls' if decrease >= 0.0 else 'rises'} by {abs(decrease):.1f}"
+
+
+def _plainly_worse(before: Stage, after: Stage) -> bool:
+    """Return whether an effect makes the plain error larger where fitted, without a smaller one on held-out data."""
+    return after.fit.rms > NOT_PLAINLY_WORSE * before.fit.rms and after.held_rms > before.held_rms
+
+
+def tilt_cost(declared: Robot, candidate: Candidate, fit: JointFit) -> float:
+    """Return −2 log of how likely it is that a declared gravity is off by the angle of the fitted one: a Student's t with four degrees."""
+    own = declared.body.gravity
+    mask = np.array([p.key == "vector_m_s2" for p in fit.hypothesis.parameters], dtype=bool)
+    if candidate.effect.name != "gravity" or not np.any(own) or mask.sum() != 3:
+        return 0.0
+    vector = fit.coordinates[mask]
+    angle = np.arctan2(np.linalg.norm(np.cross(own, vector)), own @ vector)
+    return float(5.0 * np.log1p((angle / MOUNTED) ** 2 / 4.0))
+
+
+def _predicts(refitted: Refit) -> float:
+    """Return the gain on left-out sweeps less its standard error, where that is known."""
+    spread = refitted.record["cv_spread"]
+    return float(refitted.record["cv_gain"] - (spread if np.isfinite(spread) else 0.0))
+
+
+def weighs(data: Data, name: str) -> float:
+    """Return by how much dBIC an effect is ahead of its rivals beforehand: every body has weight, though the robot does not declare it."""
+    return EVIDENCE if name == "gravity" and not np.any(data.declared.body.gravity) else 0.0
+
+
+def sure_beyond_mesh(better: float, spread: float, held: float, expected: float) -> bool:
+    """Return whether left-out sweeps (gain ± spread) and held-out data (gain, against what is expected of them) are sure together."""
+    return better > SURE * spread and held * better > 2.0 * SURE * spread * expected
+
+
+def _taken_over(before: Stage, after: Stage) -> list[str]:
+    """Return the nuisances that are significant before an effect is added, and not after."""
+    return [n for n in NUISANCE if _z(before, n) > 3.0 and _z(after, n) < 3.0]
+
+
+def _z(stage: Stage, name: str) -> float:
+    """Return by how many standard deviations the values of a nuisance differ from none, at most."""
+    part = span_of(stage.fit, name)
+    return float(np.max(np.abs(stage.fit.coordinates[part]) / np.maximum(stage.fit.std[part], 1e-300), initial=0.0))
+
+
+def held_share(data: Data) -> float:
+    """Return held-out rows for each fitted one."""
+    return sum(len(t.scene.frame) for t in data.held) / max(sum(len(t.scene.frame) for t in data.train), 1)
+
+
+def moved_by(before: Stage, after: Stage) -> float:
+    """Return by how much an effect moves the markers beyond what calibration does [m], root mean square."""
+    return rms_of([b.residual - a.residual for a, b in zip(after.fit.jets, before.fit.jets)])
+
+
+def mesh_cost(data: Data, stage: Stage, *, whole: bool = False) -> float:
+    """Return what the mesh costs beyond what calibration absorbs [m], root mean square as `rms_of` has it; 0 where it is not known.
+
+    Not whole: beyond the share of it that all sweeps have in common, too, where there are several: what it may turn by and what sweeps add.
+    """
+    errors = mesh_errors(data)
+    J = [np.concatenate([j.by_pose, j.by_effect], axis=2).reshape(e.size, -1) for j, e in zip(stage.fit.jets, errors)]
+    fields = [t.mesh_error for t in data.train if t.mesh_error is not None]
+    if whole or any(len(np.unique(t.groups.sweep)) < 2 for t in data.train):
+        return rms_of([_rest(j, e.ravel()).reshape(e.shape) for j, e in zip(J, errors)]) if errors else 0.0
+    left = [_rest(np.column_stack([j, e.ravel()]), f.reshape(e.size, -1)[:, 1:]) for j, e, f in zip(J, errors, fields)]
+    return rms_of([np.linalg.norm(own, axis=1).reshape(e.shape) for own, e in zip(left, errors)]) if errors else 0.0
+
+
+def _rest(columns: FloatArray, values: FloatArray) -> FloatArray:
+    scale = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    fitted = np.linalg.lstsq(columns / scale, values, rcond=1e-9)[0]
+    return np.asarray(values - columns / scale @ fitted)
+
+
+def _objection(made: Stage, candidate: Candidate, score: float) -> str | None:
+    """Return why an effect is not accepted, or None."""
+    q = len(candidate.parameters)
+    std = made.fit.std[len(made.fit.std) - q :]
+    if score <= EVIDENCE and made.fit.fit.status == GIVEN_UP:
+        return "given up: a step promised too little"
+    if score <= EVIDENCE:
+        return f"too little evidence (dBIC {score:.1f})"
+    if not np.isfinite(std).all():
+        return "not identifiable: the data leave a parameter open"
+    edge = at_edge(made.fit)
+    if candidate.effect.name in edge:
+        return "acts like it, but its value lies at the edge of what is plausible"
+    if edge:
+        return f"with it {edge[0]} goes to the edge of what is plausible"
+    return None
+
+
+def at_edge(fit: JointFit, *, nuisance: bool = False) -> list[str]:
+    """Return the effects, or the nuisances, with a value at the edge of what is plausible (a law's limit may be none at all)."""
+    names, at = [], 0
+    for effect, _, parameters in fit.hypothesis.terms:
+        values = fit.coordinates[at : at + len(parameters)]
+        at += len(parameters)
+        low, high = np.array([p.low for p in parameters]), np.array([p.high for p in parameters])
+        beyond = (values >= high - 1e-9) | ((values <= low + 1e-9) & (low > -np.inf) & (not effect.discrete))
+        if beyond.any() and (effect.name in NUISANCE) == nuisance:
+            names.append(effect.name)
+    return names

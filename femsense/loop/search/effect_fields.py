@@ -1,0 +1,205 @@
+"""What effects do to the markers at a fitted model, to first order."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from femsense.core.arrays import FloatArray, IntArray
+from femsense.core.errors import DataError, FemsenseError
+from femsense.fem.mesh import embed_points
+from femsense.loop.data.dataset import NUISANCE, Data
+from femsense.loop.data.representative_states import MOST_WORK, between, representatives, spread_states, state_vectors
+from femsense.loop.data.trial import States, Trial, spans_of
+from femsense.loop.fit.fitted_model import Stage
+from femsense.loop.fit.joint_fit import JointFit, JointProblem, Prior
+from femsense.model.drive import has_history
+from femsense.model.effects import Effect, Entry, Parameter
+from femsense.model.observation import Hypothesis
+from femsense.model.robot import Robot
+from femsense.model.variants import AtPoints
+
+Answers = dict[int, AtPoints]
+"""Frame → what the points of its state answer to."""
+
+
+def candidates_for(
+    base: JointFit, control: str, *, forms: Sequence[Effect], names: Sequence[str], has_seats: bool
+) -> list[tuple[Effect, Entry, tuple[Parameter, ...]]]:
+    """Return the effects and seeds to try on top of a fitted model."""
+    present = set(base.hypothesis.names)
+    robot = base.hypothesis.robot_at(base.coordinates)
+    result = []
+    for effect in forms:
+        if effect.name not in names or effect.name in present or (effect.name == "marker_offset" and has_seats):
+            continue
+        for seed in effect.seeds(robot):
+            parameters = effect.parameters(robot, control)
+            if parameters or effect.discrete:
+                result.append((effect, seed, parameters))
+            parts = _parts(parameters)
+            if len(parts) > 1:
+                result += [(effect, seed, part) for part in parts]
+    return result
+
+
+def _parts(parameters: tuple[Parameter, ...]) -> list[tuple[Parameter, ...]]:
+    """Return the parameters of each cable or marker, or of each key, by itself: an effect may be that of one of them alone."""
+    parts: dict[str, list[Parameter]] = {}
+    for p in parameters:
+        owner = p.part[0] if isinstance(p.part, tuple) else p.part
+        parts.setdefault(owner if isinstance(owner, str) else p.key, []).append(p)
+    return [tuple(part) for part in parts.values()]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Fields:
+    """What effects do to the markers at a fitted model, to first order."""
+
+    todo: list[tuple[Effect, Entry, tuple[Parameter, ...]]]
+    """The effects and seeds that can be evaluated."""
+    raw: list[FloatArray]
+    """Columns [m], one array (k, 3, Σq) a trial; a discrete alternative has one column, its whole change."""
+    rest: list[FloatArray]
+    """The same of the seats that rest.csv measures [m], (r, 3, Σq) a trial."""
+    model: Hypothesis
+    """The fitted model."""
+
+    def beside(self, fit: JointFit) -> Fields | None:
+        """Return the fields of what a model with more effects does not have yet, or None where they say little of it: it lies on another mesh,
+        has another law, or lacks an effect of this one.
+
+        What an effect does to the markers changes little with what else the body has (`benchmarks/hints.py`).
+        """
+        new = fit.hypothesis
+        if new.settled != self.model.settled or not set(self.model.names) <= set(new.names):
+            return None
+        spans = self._spans()
+        keep = [i for i, (effect, _, _) in enumerate(self.todo) if effect.name not in new.names]
+        columns = np.concatenate([np.arange(0), *(np.arange(spans[i], spans[i + 1]) for i in keep)])
+        raw, rest = [b[:, :, columns] for b in self.raw], [b[:, :, columns] for b in self.rest]
+        return Fields([self.todo[i] for i in keep], raw, rest, self.model)
+
+    def of(self, i: int) -> tuple[list[FloatArray], list[FloatArray]]:
+        """Return the columns of one effect in markers and seats, one array (k, c, q) and (r, 3, q) a trial."""
+        spans = self._spans()
+        part = slice(spans[i], spans[i + 1])
+        return [block[:, :, part] for block in self.raw], [block[:, :, part] for block in self.rest]
+
+    def _spans(self) -> IntArray:
+        """Return where the columns of each effect begin, and where the last end."""
+        return np.cumsum([0, *(1 if e.discrete else len(p) for e, _, p in self.todo)])
+
+
+def effect_fields(
+    base: JointFit,
+    trials: list[Trial],
+    todo: list[tuple[Effect, Entry, tuple[Parameter, ...]]],
+    answers: list[Answers] | None = None,
+) -> Fields:
+    """Return what each effect does to the markers: those with parameters to first order, all of them with one factorisation a frame, or none where
+    the `answers` of each trial are known from an earlier call for this fit; discrete alternatives as a whole, each with a walk of its own."""
+    fixed = base.hypothesis.robot_at(base.coordinates)
+    smooth = [t for t in todo if not t[0].discrete and _can_act(fixed, t)]
+    every = Hypothesis(fixed, tuple(smooth))
+    null = np.array([p.null for p in every.parameters])
+    probe = JointProblem(every, Prior(np.zeros(0), np.zeros(0)), trials, [], 1.0)
+    raw, rest = [], []
+    asked = [None] * len(trials) if answers is None else answers
+    for trial, known, span, own in zip(trials, base.jets, spans_of(trials), asked):
+        trial.starts_on(fixed.body.mesh).update(_starts_of(trial, fixed, fixed, known.states))
+        jet = probe.jet(trial, base.fit.theta[span], null, True, answers=own)
+        raw.append(jet.by_effect)
+        rest.append(jet.rest_by_effect)
+    usable, near = smooth, [jet.states for jet in base.jets]
+    for one in (t for t in todo if t[0].discrete and _can_act(fixed, t)):
+        changes = _whole_change(base, trials, fixed, one, near)
+        if changes is not None:
+            usable = [*usable, one]
+            raw = [np.concatenate([block, change[:, :, None]], axis=2) for block, change in zip(raw, changes)]
+            rest = [np.concatenate([block, np.zeros((*block.shape[:2], 1))], axis=2) for block in rest]
+    return Fields(usable, raw, rest, base.hypothesis)
+
+
+def _can_act(robot: Robot, one: tuple[Effect, Entry, tuple[Parameter, ...]]) -> bool:
+    parameters = one[2]
+    try:
+        Hypothesis(robot, (one,)).robot_at(np.array([p.null + p.step for p in parameters]))
+    except FemsenseError:
+        return False
+    return True
+
+
+def _whole_change(
+    base: JointFit, trials: list[Trial], fixed: Robot, one: tuple[Effect, Entry, tuple[Parameter, ...]], near: list[States]
+) -> list[FloatArray] | None:
+    """Return by how much a discrete alternative changes the residual of each trial [m], (k, c); None where it has no equilibrium.
+
+    It starts from states `near`, which those of another law take the place of: laws differ less from each other than from what is declared.
+    On large meshes some of the states tell it for the markers in all.
+    """
+    parameters = one[2]
+    robot = Hypothesis(fixed, (one,)).robot_at(np.array([p.null for p in parameters]))
+    probe = JointProblem(Hypothesis(robot), Prior(np.zeros(0), np.zeros(0)), trials, [], 1.0)
+    changes = []
+    try:
+        for i, (trial, jet, span) in enumerate(zip(trials, base.jets, spans_of(trials))):
+            own, starts = base.fit.theta[span], _starts_of(trial, fixed, robot, near[i])
+            asked = _part_that_tells(trial, robot)
+            try:
+                moved = probe.jet(asked, own, np.zeros(0), False, starts, rough=True)
+            except DataError:
+                moved = probe.jet(asked, own, np.zeros(0), False, starts)
+            whole = asked is trial
+            changes.append(moved.residual - jet.residual if whole else -_between(trial, fixed, jet.states, robot, moved.states))
+            near[i] = starts if robot.body.mesh is fixed.body.mesh else near[i]
+    except FemsenseError:
+        return None
+    return changes
+
+
+def _part_that_tells(trial: Trial, robot: Robot) -> Trial:
+    """Return a trial with some states that tell what changes in all; the whole of it where they are few, or clouds, or depend on each other."""
+    if trial.scene.crossings is not None or has_history(robot):
+        return trial
+    frames, share = spread_states(trial, MOST_WORK // len(robot.body.mesh.tets))
+    return trial if share == 1.0 else trial.part(frames)
+
+
+def _between(trial: Trial, fixed: Robot, before: States, robot: Robot, after: States) -> FloatArray:
+    """Return by how much the marker of each row of a trial moves from one robot to another [m], (k, 3), from its moves in some of the states."""
+    frames = trial.scene.frames
+    vectors = state_vectors(trial.scene.recording, frames)
+    asked = np.flatnonzero(np.isin(frames, list(after)))
+    known = asked[representatives(vectors[asked], len(asked))]  # states that come back are one
+
+    def move(k: int) -> FloatArray:
+        return robot.markers.positions(after[k].positions) - fixed.markers.positions(before[k].positions)
+
+    every = between(vectors, known, np.array([move(int(k)) for k in frames[known]]))
+    return np.asarray(every[np.searchsorted(frames, trial.scene.frame), trial.scene.marker])
+
+
+def _starts_of(trial: Trial, fixed: Robot, robot: Robot, states: States) -> States:
+    """Return starts for a robot with another law, or on another mesh of the same body, from states of it as it was."""
+    mesh = robot.body.mesh
+    starts = trial.starts_on(mesh)
+    if mesh is fixed.body.mesh:  # the factors of these states are lent
+        return {k: replace(s, factor=starts[k].factor) if s.factor is None and k in starts else s for k, s in states.items()}
+    if not states.keys() <= starts.keys():
+        ties, still = embed_points(fixed.body.mesh, mesh.nodes), np.zeros_like(mesh.nodes)
+        starts.update(
+            {k: replace(s, positions=ties.positions(s.positions), nodal_forces=still, factor=None) for k, s in states.items()}
+        )
+    return starts
+
+
+def fields_of(data: Data, stage: Stage, names: Sequence[str]) -> Fields:
+    """Return what each effect that is not in the model yet would do to the markers."""
+    seated = any(len(t.scene.rest_marker) for t in data.train)
+    todo = candidates_for(
+        stage.fit, data.control, forms=data.forms, names=[n for n in names if n not in NUISANCE], has_seats=seated
+    )
+    return effect_fields(stage.fit, data.train, todo)

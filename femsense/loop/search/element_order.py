@@ -1,0 +1,98 @@
+"""Linear meshes: effects are sought with quadratic elements, and at the end it is asked whether these are needed.
+
+Linear elements lock, which looks like a stiff body, a small Poisson's ratio, or a clamp that does not give: what is found beside them stands for
+their error as well. Whether quadratic elements of the same mesh err less is no question that data have to answer; whether these data show the
+difference is one, and it is asked when everything else is in the model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from femsense.core.errors import FemsenseError
+from femsense.loop.data.dataset import MESH, NUISANCE, QUADRATIC, Data
+from femsense.loop.fit.fitted_model import Stage, make_stage, span_of
+from femsense.loop.fit.noise_components import Noise
+from femsense.loop.search.acceptance import judged
+from femsense.loop.search.refit import EVIDENCE, FORGONE, beyond
+from femsense.loop.search.screening import Candidate, penalty
+from femsense.loop.search.search_state import Search
+from femsense.loop.search.subsampling import few_of
+from femsense.model.effects import Entry
+from femsense.model.robot import Robot
+
+STEPS = 6
+"""Steps of a fit that tries refined linear elements."""
+
+
+def seeks_with_quadratic(robot: Robot, names: Sequence[str]) -> bool:
+    """Return whether effects are sought with quadratic elements where a robot declares linear ones."""
+    return MESH.name in names and QUADRATIC in MESH.seeds(robot)
+
+
+def with_quadratic(robot: Robot) -> Robot:
+    """Return a robot with quadratic elements."""
+    return MESH.apply(robot, QUADRATIC)
+
+
+def need_quadratic(data: Data, search: Search, names: Sequence[str]) -> tuple[bool, list[dict[str, Any]]]:
+    """Return whether the data miss quadratic elements where the whole model has linear ones, and what became of both kinds of mesh that were tried.
+
+    Arguments:
+        data: the data.
+        search: what was found with quadratic elements.
+        names: effects that are tried.
+    """
+    candidate = _candidate(names, search.n_effective)
+    record: dict[str, Any] = {"name": MESH.name, "seed": QUADRATIC, "step": 1}
+    worth = beyond(search.final.fit, FORGONE[1] * (candidate.cost + EVIDENCE) + FORGONE[0])
+    try:
+        without = _on(data, data.robot_as_declared, search.history[0][1], search.final, search.noise, worth=worth)
+        judged(data, without, candidate, search.final, record, search.noise)
+    except FemsenseError:
+        record["verdict"] = "passes"  # without them it has no equilibrium
+    passes = record["verdict"] == "passes"
+    if passes:
+        record["verdict"] = "named"
+    return passes, [record, *(_refined(data, search, seed) for seed in MESH.seeds(data.robot_as_declared) if seed != QUADRATIC)]
+
+
+def _candidate(names: Sequence[str], n_effective: float) -> Candidate:
+    """Return quadratic elements as a candidate that was not screened."""
+    nothing = np.zeros(0)
+    cost = penalty(0, QUADRATIC, 1, max(len(names), 1), n_effective)
+    return Candidate(MESH, QUADRATIC, (), [], [], np.zeros((0, 0)), np.zeros((0, 0)), 1.0, nothing, np.inf, np.inf, cost, nothing)
+
+
+def _on(
+    data: Data, mesh_of: Robot, linear: Stage, final: Stage, noise: Noise, *, worth: float = np.inf, steps: int = 12
+) -> Stage:
+    """Return a model fitted on the mesh of another robot: what calibration may move from where it was on linear elements, effects from where they are.
+    Raises DataError."""
+    fit, robot = final.fit, mesh_of
+    others = tuple((effect, seed) for effect, seed in fit.hypothesis.settled if effect is not MESH)
+    for effect, seed in others:
+        robot = effect.apply(robot, seed)
+    start = fit.coordinates.copy()
+    for name in NUISANCE:
+        if name in fit.hypothesis.names:
+            start[span_of(fit, name)] = linear.fit.coordinates[span_of(linear.fit, name)]
+    hypothesis = replace(fit.hypothesis, robot=robot, settled=others)
+    own = fit.fit.theta[: fit.own]
+    return make_stage(data, hypothesis, fit.prior, noise, start, own=own, worth=worth, max_iterations=steps)
+
+
+def _refined(data: Data, search: Search, seed: Entry) -> dict[str, Any]:
+    """Return what became of refined linear elements, tried in some states."""
+    record: dict[str, Any] = {"name": MESH.name, "seed": seed, "step": 1}
+    few = few_of(data, search.final, search.noise)
+    try:
+        made = _on(few.data, MESH.apply(data.robot_as_declared, seed), search.history[0][1], few.stage, search.noise, steps=STEPS)
+        record["verdict"] = f"in some of the states χ² is {made.fit.chi2:.0f}, with quadratic elements {few.stage.fit.chi2:.0f}"
+    except FemsenseError as error:
+        record["verdict"] = f"no equilibrium: {error}"
+    return record

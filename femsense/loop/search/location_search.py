@@ -1,0 +1,204 @@
+"""Places: where on the body an effect explains most, from climbs over its seeds to fits."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from femsense.core.errors import FemsenseError
+from femsense.core.least_squares import GIVEN_UP
+from femsense.loop.data.dataset import Data
+from femsense.loop.fit.fitted_model import Stage, jets_without, make_stage, own_of, problem_of
+from femsense.loop.fit.joint_fit import JointFit
+from femsense.loop.fit.noise_components import Noise
+from femsense.loop.search.effect_fields import Answers, effect_fields
+from femsense.loop.search.refit import EVIDENCE, refit_from, tried
+from femsense.loop.search.screening import Candidate, confounding, jets_with, screen
+from femsense.loop.search.subsampling import few_of
+from femsense.model.effects import Entry
+
+NEARLY = 0.05
+"""Seeds whose gain is less by this share are as good."""
+STARTS = 3
+"""So many seeds of an effect, the best, are improved …"""
+ROUNDS = 4
+"""… and so often moved to a neighbour that explains more."""
+ALIKE = 0.98, 0.1
+"""Two places count as one where this share of what an effect does in one can be had in the other, with parameters that differ by no more than that share."""
+POLISHED = 2.0
+"""Decrease of χ² that each further parameter of a polished effect must bring."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Climbs:
+    """Where climbs over the seeds of an effect end, in some of the states."""
+
+    ends: list[Candidate]
+    """The best first, none of them at the seed that was asked about."""
+    more: float
+    """How many times as much as this seed the best end explains, at least 1: a soft place is worth little beside where it is."""
+
+
+def placed(
+    data: Data, stage: Stage, candidate: Candidate, made: Stage, climbs: Climbs, noise: Noise
+) -> tuple[Stage, list[float]]:
+    """Return the best of a candidate's fits, that which was `made` from its own seed or one that begins where a climb ends, its seed moved on,
+    and the scatter of its parameters: that of `closer`, or that over the places that explain as much where this is larger."""
+    begun = [made, *_fitted_at(data, stage, candidate, made, climbs.ends, noise)]
+    moved = list[tuple[Stage, list[float]]]()
+    for one in sorted(begun, key=lambda s: s.fit.chi2):
+        if not moved or one.fit.chi2 < moved[0][0].fit.chi2 + 2.0 * EVIDENCE:
+            moved.append(closer(data, one, noise))
+    best, scatter = min(moved, key=lambda end: end[0].fit.chi2)
+    values = [s.fit.coordinates[-len(scatter) :] for s, _ in moved if s.fit.chi2 < best.fit.chi2 + EVIDENCE]
+    return best, np.maximum(scatter, np.std(values, axis=0)).tolist()
+
+
+def _fitted_at(
+    data: Data, stage: Stage, candidate: Candidate, made: Stage, ends: Sequence[Candidate], noise: Noise
+) -> list[Stage]:
+    """Return fits of a candidate that begin where climbs end; where some of the states spare time, of those ends only that explain as much as the
+    best in these, with what was `made` from the candidate's own seed among them."""
+    few = few_of(data, stage, noise)
+    if few.spares:
+        near = [fit for end in ends if (fit := tried(few.data, few.stage, end, noise)) is not None]
+        least = min([few.of(made.fit, noise).chi2, *(one.fit.chi2 for one in near)])
+        begins = [one for one in near if one.fit.chi2 < least + 2.0 * EVIDENCE]
+        there = [refit_from(data, stage, one.fit, noise) for one in begins]
+    else:
+        others = _screen_seeds(data, stage, candidate, [end.seed for end in ends], noise) if ends else []
+        there = [tried(data, stage, other, noise) for other in others]
+    return [one for one in there if one is not None and one.fit.fit.status != GIVEN_UP]
+
+
+def climbed(data: Data, stage: Stage, start: Candidate, noise: Noise) -> Climbs:
+    """Return where the best STARTS seeds come to when each goes from neighbour to neighbour: a soft place here and a stiff one there look alike
+    when the modulus is open. Some of the states show the way."""
+    few = few_of(data, stage, noise)
+    asked, known = list[Entry](), list[Candidate]()
+    answers: list[Answers] = [{} for _ in few.data.train]
+
+    def at(seeds: Sequence[Entry]) -> list[Candidate]:
+        fresh = [seed for i, seed in enumerate(seeds) if seed not in seeds[:i] and seed not in asked]
+        asked.extend(fresh)
+        known.extend(_screen_seeds(few.data, few.stage, start, fresh, noise, answers) if fresh else [])
+        return [c for c in known if c.seed in seeds]
+
+    others = at([start.seed, *start.effect.seeds(data.robot)])
+    ways = sorted(others, key=lambda c: (c.seed != start.seed, -c.gain))[:STARTS]
+    for _ in range(ROUNDS):  # all of them at once, since a factor serves for all
+        around = [start.effect.nearby(data.robot, here.seed) for here in ways]
+        at([seed for seeds in around for seed in seeds])
+        best = [max([here, *at(seeds)], key=lambda c: c.gain) for here, seeds in zip(ways, around)]
+        further = [found if found.gain >= here.gain + POLISHED else here for here, found in zip(ways, best)]
+        if further == ways:
+            break
+        ways = further
+    ends = [here for here in ways if here.seed != start.seed]
+    most = max((end.gain for end in ends), default=0.0)
+    apart = list[Candidate]()
+    for end in sorted((end for end in ends if end.gain > 0.5 * most), key=lambda c: -c.gain):
+        if not any(_alike(end, other) for other in apart):
+            apart.append(end)
+    begun = max((c.gain for c in others if c.seed == start.seed), default=0.0)
+    return Climbs(apart, max(most / begun, 1.0) if begun > 0.0 else 1.0)
+
+
+def _alike(a: Candidate, b: Candidate) -> bool:
+    """Return whether two places do the same for the same: a soft one here and a stiff one there may look alike, but do not say the same."""
+    same, apart = ALIKE
+    return confounding(a, b) >= same and bool(np.linalg.norm(a.step - b.step) <= apart * np.linalg.norm(b.step))
+
+
+def _scatter(seen: Sequence[Candidate], best: Candidate, share: float) -> list[float]:
+    """Return by how much the steps of those that explain nearly as much as the best scatter, in so large a share of the data."""
+    steps = [c.step for c in seen if c.gain >= best.gain - max(share * EVIDENCE, NEARLY * best.gain)]
+    return [float(v) for v in np.std(steps, axis=0)]
+
+
+def closer(data: Data, stage: Stage, noise: Noise) -> tuple[Stage, list[float]]:
+    """Return a stage whose last effect has moved to neighbours of its seed as long as these explain more where the body is as the effect
+    has bent it (what a seed does to the body before that ranks neighbours of a large effect wrongly), and by how much the step of each of
+    its parameters scatters over the seeds that explain as much but for NEARLY. Some of the states show which neighbour it may be."""
+    while True:
+        *_, (effect, seed, parameters) = stage.fit.hypothesis.terms
+        few = few_of(data, stage, noise)
+        share = float(np.mean(np.concatenate(few.rows))) if few.spares else 1.0
+        asked = (few.data, few.stage) if few.spares else (data, stage)
+        around = _seeds_instead(*asked, noise, effect.nearby(data.robot, seed))
+        here = next((c for c in around if c.seed == seed), None)
+        if here is None:  # it does nothing to these markers
+            return stage, [0.0] * len(parameters)
+        best = max(around, key=lambda c: c.gain)
+        scatter = _scatter(around, best, share)
+        if best.gain < here.gain + share * POLISHED:
+            return stage, scatter
+        there = _seeds_instead(data, stage, noise, [best.seed]) if few.spares else [best]
+        made = _moved(data, stage, there[0], noise) if there else None
+        if made is None or made.fit.chi2 > stage.fit.chi2 - POLISHED:
+            return stage, scatter
+        stage = made
+
+
+def _seeds_instead(data: Data, stage: Stage, noise: Noise, seeds: Sequence[Entry]) -> list[Candidate]:
+    """Return the last effect of a stage at other seeds as candidates in its place, to first order where the body is."""
+    *_, (effect, _, parameters) = stage.fit.hypothesis.terms
+    fields = effect_fields(stage.fit, data.train, [(effect, s, parameters) for s in seeds])
+    return screen(without_last(stage.fit), problem_of(data, stage.fit, noise), fields, 100.0)
+
+
+def without_last(fit: JointFit) -> JointFit:
+    """Return a fit as it would be without its last effect if all were linear about where it is."""
+    return _without(fit, len(fit.hypothesis.terms) - 1)
+
+
+def _without(fit: JointFit, i: int) -> JointFit:
+    """Return a fit as it would be without one of its terms if all were linear about where it is."""
+    terms = fit.hypothesis.terms
+    at, q = sum(len(p) for _, _, p in terms[:i]), len(terms[i][2])
+    columns = fit.own + np.arange(at, at + q)
+    J, own = np.asarray(fit.fit.jacobian), fit.coordinates[at : at + q] - np.array([p.null for p in terms[i][2]])
+    residual = fit.fit.residual - J[:, columns] @ own
+    less = replace(fit.fit, theta=np.delete(fit.fit.theta, columns), residual=residual, jacobian=np.delete(J, columns, axis=1))
+    return replace(fit, hypothesis=replace(fit.hypothesis, terms=(*terms[:i], *terms[i + 1 :])), fit=less)
+
+
+def may_lie_elsewhere(data: Data, stage: Stage, name: str, noise: Noise) -> bool:
+    """Return whether an effect of a stage, but for its place, may explain more at one of its other seeds: to first order, with the body as it is
+    bent, as `closer` asks. Of one whose seed is no place nothing is known."""
+    fit, terms = stage.fit, stage.fit.hypothesis.terms
+    i = [effect.name for effect, _, _ in terms].index(name)
+    effect, seed, fitted = terms[i]
+    around = effect.nearby(data.robot, seed)
+    if not around:
+        return True
+    own = {(p.key, p.part) for p in effect.parameters(data.robot, data.control)}
+    parameters = tuple(p for p in fitted if (p.key, p.part) in own)
+    fields = effect_fields(fit, data.train, [(effect, s, parameters) for s in (*effect.seeds(data.robot), *around)])
+    seen = screen(_without(fit, i), problem_of(data, fit, noise), fields, 100.0)
+    here = next((c for c in seen if c.seed == seed), None)
+    return here is None or max(c.gain for c in seen) > here.gain + POLISHED
+
+
+def _moved(data: Data, stage: Stage, candidate: Candidate, noise: Noise) -> Stage | None:
+    """Return a stage with the seed of its last effect exchanged for that of a candidate beside it, fitted again; None where that does not fit."""
+    fit, q = stage.fit, len(candidate.parameters)
+    *terms, _ = fit.hypothesis.terms
+    hypothesis = replace(fit.hypothesis, terms=(*terms, (candidate.effect, candidate.seed, candidate.parameters)))
+    start = np.array([p.null for p in candidate.parameters]) + candidate.step
+    keep = np.arange(len(fit.coordinates)) < len(fit.coordinates) - q
+    near = jets_with(replace(stage, fit=replace(fit, jets=jets_without(stage, keep))), candidate)
+    try:
+        coordinates = np.concatenate([fit.coordinates[:-q], start])
+        return make_stage(data, hypothesis, fit.prior, noise, coordinates, own=own_of(stage), near=near)
+    except FemsenseError:
+        return None
+
+
+def _screen_seeds(
+    data: Data, stage: Stage, start: Candidate, seeds: Sequence[Entry], noise: Noise, answers: list[Answers] | None = None
+) -> list[Candidate]:
+    fields = effect_fields(stage.fit, data.train, [(start.effect, seed, start.parameters) for seed in seeds], answers)
+    return screen(stage.fit, problem_of(data, stage.fit, noise), fields, 100.0)

@@ -1,0 +1,207 @@
+"""Refits: a candidate fitted together with all that the model has, in full nonlinearity."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from femsense.core.arrays import FloatArray
+from femsense.core.errors import DataError, FemsenseError
+from femsense.core.least_squares import GIVEN_UP
+from femsense.loop.data.dataset import Data
+from femsense.loop.fit.fitted_model import Stage, found_in, make_stage, own_of
+from femsense.loop.fit.joint_fit import JointFit, Prior
+from femsense.loop.fit.noise_components import Noise
+from femsense.loop.search.screening import Candidate, jets_with
+from femsense.model.effects import Effect, Entry, Parameter
+from femsense.model.effects.loads import STANDARD_GRAVITY
+from femsense.model.observation import Hypothesis
+
+EVIDENCE = 10.0
+"""dBIC that a named effect needs."""
+PROMISED = 0.3
+"""A fit from the null that brings less than this share of the linear gain is tried from other starts too."""
+DECLARED = -1.0
+"""Start from what is declared, where a discrete alternative does not fit from where calibration has gone without it …"""
+STRAYED = 2.0
+"""… or where this has gone so many of the standard deviations known beforehand, for the sake of what is missing …"""
+EXPLAINS = 1.25
+"""… and an effect leaves more than this mean square from there, in units of the noise. Until one leaves less, linear scores say little."""
+LEFT = 0.5
+"""What a refit to all states, begun where one to some of them ended, may leave to be gained in χ²: the winner is fitted to the end."""
+FORGONE = 2.0, 1.25
+"""A refit is given up where the evidence in sight is too little by this much and this factor."""
+
+
+def evidence(before: JointFit, after: JointFit) -> float:
+    """Return the decrease of χ², or that of (rows − parameters) log χ² where it is smaller: the scale of the noise is an estimate too."""
+    freedom = max(len(after.fit.residual) - len(after.fit.theta), 1)
+    return min(before.chi2 - after.chi2, freedom * float(np.log(before.chi2 / max(after.chi2, 1e-12))))
+
+
+def within(fit: JointFit, price: float) -> float:
+    """Return the χ² below which a model with something more is better than a fit by so much evidence."""
+    freedom = max(len(fit.fit.residual) - len(fit.fit.theta), 1)
+    return min(fit.chi2 - price, fit.chi2 * float(np.exp(-price / freedom)))
+
+
+def beyond(fit: JointFit, price: float) -> float:
+    """Return the χ² beyond which a model without something is worse than a fit by so much evidence."""
+    freedom = max(len(fit.fit.residual) - len(fit.fit.theta), 1)
+    return fit.chi2 * float(np.exp(price / freedom)) + price
+
+
+def refit(
+    data: Data,
+    stage: Stage,
+    candidate: Candidate,
+    noise: Noise,
+    *,
+    wanted: float = EVIDENCE,
+    settled: bool = False,
+    begin: JointFit | None = None,
+) -> Stage:
+    """Joint fit with one more effect, started where a fit to some of the states ended (`begin`), else from its linear step. Raises DataError where
+    no start helps.
+
+    Where the dBIC would stay well below what is wanted, or below it at all if it is `settled`, the fit is given up on its way.
+    """
+    null = np.array([p.null for p in candidate.parameters])
+    low, high = np.array([p.low for p in candidate.parameters]), np.array([p.high for p in candidate.parameters])
+    start = null if candidate.effect.discrete else np.clip(_first_guess(candidate, null), low, high)
+    hypothesis, prior = with_term(stage.fit, candidate.effect, candidate.seed, candidate.parameters)
+    gravity = candidate.effect.name == "gravity"
+    free = not candidate.effect.discrete and not gravity  # for these the null is no start
+    answer = 0.0 if candidate.effect.discrete else candidate.response @ (start - null)  # of what is fitted already
+    worth = worth_of(stage.fit, candidate, wanted, settled)
+
+    def fitted(share: float) -> Stage | None:
+        part = share if share != DECLARED else 0.0 if free else 1.0
+        known = jets_with(stage, candidate) if free and share == 0.0 else None
+        near = stage.fit.jets if not candidate.parameters and share != DECLARED else None
+        try:
+            theta = _declared(data, stage, hypothesis, noise) if share == DECLARED else stage.fit.fit.theta + share * answer
+            coordinates = np.concatenate([theta[stage.fit.own :], null + part * (start - null)])
+            return make_stage(
+                data,
+                hypothesis,
+                prior,
+                noise,
+                coordinates,
+                own=theta[: stage.fit.own],
+                max_iterations=10,
+                known=known,
+                near=near,
+                worth=worth,
+            )
+        except DataError:
+            return None
+
+    best = None if begin is None else refit_from(data, stage, begin, noise, worth)
+    if best is not None:
+        return best
+    given_up: Stage | None = None
+    for share in _shares(candidate, free):
+        made = fitted(share)
+        if made is not None and made.fit.chi2 <= (stage.fit.chi2 + 1.0 if best is None else best.fit.chi2):
+            best = made
+        if made is not None and made.fit.fit.status == GIVEN_UP:
+            given_up = made
+            break
+        if best is not None and not (free and share == 0.0 and stage.fit.chi2 - best.fit.chi2 <= PROMISED * candidate.gain):
+            break
+    if gravity and _has_strayed(stage) and not explains(best):
+        made = fitted(DECLARED)
+        best = made if made is not None and (best is None or made.fit.chi2 <= best.fit.chi2) else best
+    found = best or given_up
+    if found is None:
+        raise DataError("no start from which the fit improves")
+    return found
+
+
+def refit_from(data: Data, stage: Stage, begin: JointFit, noise: Noise, worth: float = np.inf) -> Stage | None:
+    """Return the fit to all states of a hypothesis that was fitted to some of them, from where that ended; None where it has no equilibrium, or does
+    not help."""
+    coordinates, own = begin.coordinates, begin.fit.theta[: begin.own]
+    for trial, jet in zip(data.train, begin.jets):
+        trial.starts_on(begin.hypothesis.robot.body.mesh).update(jet.states)
+    try:
+        made = make_stage(
+            data, begin.hypothesis, begin.prior, noise, coordinates, own=own, max_iterations=10, worth=worth, spare=LEFT
+        )
+    except DataError:
+        return None
+    return made if made.fit.chi2 <= stage.fit.chi2 + 1.0 else None
+
+
+def worth_of(fit: JointFit, candidate: Candidate, wanted: float, settled: bool) -> float:
+    """Return the χ² above which a refit of a candidate is given up: its dBIC is wanted to be so much."""
+    return within(fit, (candidate.cost + wanted - FORGONE[0]) / (1.0 if settled else FORGONE[1]))
+
+
+def _shares(candidate: Candidate, free: bool) -> tuple[float, ...]:
+    """Return the shares of the linear step from which a refit may start, in order: that step may go too far."""
+    if candidate.effect.discrete:
+        return (1.0, DECLARED) if candidate.gain < np.inf else (DECLARED, 1.0)
+    return (0.0, 1.0, 0.3) if free else (1.0, 0.3, 0.0)
+
+
+def _has_strayed(stage: Stage) -> bool:
+    """Return whether calibration alone has gone far beyond what is known of it beforehand."""
+    fit = stage.fit
+    known = np.isfinite(fit.prior.std)
+    far = np.abs(fit.coordinates - fit.prior.mean)[known] > STRAYED * fit.prior.std[known]
+    return bool(far.any()) and not found_in(stage)
+
+
+def explains(stage: Stage | None) -> bool:
+    """Return whether a model leaves little more than the noise where it is fitted."""
+    return stage is not None and stage.fit.chi2 < EXPLAINS * max(len(stage.fit.fit.residual) - len(stage.fit.fit.theta), 1)
+
+
+def _declared(data: Data, stage: Stage, hypothesis: Hypothesis, noise: Noise) -> FloatArray:
+    """Return where an effect starts if what is fitted stays as declared: with its own poses and initial inputs."""
+    alone = replace(hypothesis, terms=())
+    for trial in data.train:
+        if hypothesis.robot.body.mesh is not stage.fit.hypothesis.robot.body.mesh:
+            trial.starts_on(hypothesis.robot.body.mesh).clear()  # states that were carried there from elsewhere may have folded
+    nothing = Prior(np.zeros(0), np.zeros(0))
+    placed = make_stage(data, alone, nothing, noise, np.zeros(0), own=own_of(stage))
+    return np.concatenate([own_of(placed), stage.fit.prior.mean])
+
+
+def with_term(fit: JointFit, effect: Effect, seed: Entry, parameters: tuple[Parameter, ...]) -> tuple[Hypothesis, Prior]:
+    """Return the hypothesis of a fit with one more effect, and its prior."""
+    old = fit.hypothesis
+    if not parameters:
+        settled = (*old.settled, (effect, seed))
+        return replace(old, robot=effect.apply(old.robot, seed), settled=settled), fit.prior
+    null = np.array([p.null for p in parameters])
+    prior = Prior(np.concatenate([fit.prior.mean, null]), np.concatenate([fit.prior.std, [p.known for p in parameters]]))
+    return replace(old, terms=(*old.terms, (effect, seed, parameters))), prior
+
+
+def _first_guess(candidate: Candidate, null: FloatArray) -> FloatArray:
+    """Return the linear step; for gravity its direction with the size that is known."""
+    start = null + candidate.step
+    if candidate.effect.name == "gravity":
+        start = start / max(float(np.linalg.norm(start)), 1e-9) * STANDARD_GRAVITY
+    return np.asarray(start)
+
+
+def tried(
+    data: Data,
+    stage: Stage,
+    candidate: Candidate,
+    noise: Noise,
+    wanted: float = EVIDENCE,
+    *,
+    settled: bool = False,
+    begin: JointFit | None = None,
+) -> Stage | None:
+    """Return a refit, or None where there is none."""
+    try:
+        return refit(data, stage, candidate, noise, wanted=wanted, settled=settled, begin=begin)
+    except FemsenseError:
+        return None

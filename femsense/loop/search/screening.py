@@ -1,0 +1,261 @@
+"""Screening: how much of the residual each effect explains beyond what calibration can imitate.
+
+With z the whitened nuisance columns (poses, initial inputs, modulus, zeros, and the effects that are in the model already) and P the
+projector on their orthogonal complement, an effect's field s is judged by P s alone (Frisch–Waugh–Lovell): it is as if every nuisance were
+refitted with it. ρ = |P s| / |s| is the share that calibration leaves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import lsq_linear
+
+from femsense.core.arrays import FloatArray
+from femsense.loop.data.dataset import Data
+from femsense.loop.data.trial import spans_of
+from femsense.loop.fit.fitted_model import Stage, problem_of
+from femsense.loop.fit.joint_fit import JointFit, JointProblem
+from femsense.loop.fit.noise_components import Noise, estimate_noise, whiten
+from femsense.loop.search.effect_fields import Fields
+from femsense.model.effects import Effect, Entry, Parameter
+from femsense.model.observation import SceneJet
+
+TESTABLE = 0.1
+"""An effect of which calibration imitates more than 90 % cannot be tested."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Candidate:
+    """An effect with a seed, as a column block at the current model."""
+
+    effect: Effect
+    seed: Entry
+    parameters: tuple[Parameter, ...]
+    raw: list[FloatArray]
+    """Columns in metres, one array (k, c, q) a trial."""
+    seats: list[FloatArray]
+    """The same of the seats that rest.csv measures [m], (r, 3, q) a trial."""
+    columns: FloatArray
+    """Whitened, nuisance projected out, shape (N, q)."""
+    response: FloatArray
+    """How the fitted parameters answer to a unit of each column, shape (p, q)."""
+    retained: float
+    """ρ."""
+    step: FloatArray
+    """Best linear step from the null, shape (q,)."""
+    gain: float
+    """Decrease of χ² by that step."""
+    score: float
+    """dBIC: gain − cost."""
+    cost: float
+    """What the evidence must bring for the candidate's freedom."""
+    smallest: FloatArray
+    """Size of each parameter (in its coordinate) that would just have been seen, shape (q,)."""
+
+
+def joined(a: Candidate, b: Candidate) -> Candidate:
+    """Return two parts of an effect as one candidate, scored as if they did not know of each other."""
+    return replace(
+        a,
+        parameters=(*a.parameters, *b.parameters),
+        raw=[np.concatenate(pair, axis=2) for pair in zip(a.raw, b.raw)],
+        seats=[np.concatenate(pair, axis=2) for pair in zip(a.seats, b.seats)],
+        columns=np.hstack([a.columns, b.columns]),
+        response=np.hstack([a.response, b.response]),
+        retained=min(a.retained, b.retained),
+        step=np.concatenate([a.step, b.step]),
+        gain=a.gain + b.gain,
+        score=a.score + b.score,
+        cost=a.cost + b.cost,
+        smallest=np.concatenate([a.smallest, b.smallest]),
+    )
+
+
+def penalty(count: int, seed: Entry, alone: int, effects: int, n_effective: float) -> float:
+    """Return what a candidate's freedom costs: (q + s) log n + 2 log (m a).
+
+    q parameters are fitted; the s numbers of its seed (a place, a radius, a time) are chosen from many, so they count as parameters
+    too; m effects are looked at, and a is the number of cables or markers that it might be alone.
+    """
+    chosen = sum(int(np.size(v)) for v in seed.values() if not isinstance(v, bool) and np.asarray(v).dtype.kind in "iuf")
+    return float((count + chosen) * np.log(n_effective) + 2.0 * np.log(max(effects * alone, 1)))
+
+
+def screen(base: JointFit, problem: JointProblem, fields: Fields, n_effective: float) -> list[Candidate]:
+    """Return all candidates with their linear scores, the best first.
+
+    Arguments:
+        base: the current fit.
+        problem: its problem (trials and noise).
+        fields: of the effects to try, at this fit or very near to it.
+        n_effective: number of independent observations, for BIC.
+    """
+    Q, inverse = _factors(np.asarray(base.fit.jacobian))
+    residual = base.fit.residual - Q @ (Q.T @ base.fit.residual)
+    effects = max(len({e.name for e, _, _ in fields.todo}), 1)
+    result = []
+    every = np.split(_whitened(base, problem, fields.raw, fields.rest), fields._spans()[1:-1], axis=1)
+    for i, (effect, seed, parameters) in enumerate(fields.todo):
+        (own, rest), whole = fields.of(i), every[i]
+        if not np.isfinite(whole).all() or np.linalg.norm(whole) == 0:
+            continue
+        absorbed = Q.T @ whole
+        left = whole - Q @ absorbed
+        step, gain = _whole_step(left, residual) if effect.discrete else _best_step(left, residual, parameters)
+        q = len(parameters)
+        alone = sum(e is effect and len(p) == len(parameters) and s == seed for e, s, p in fields.todo)
+        cost = penalty(q, seed, alone, effects, n_effective)
+        score = gain - cost
+        retained = float(np.linalg.norm(left) / np.linalg.norm(whole))
+        smallest = _smallest(left, q, n_effective)
+        response = -inverse @ absorbed
+        result.append(
+            Candidate(effect, seed, parameters, own, rest, left, response, retained, step, gain, float(score), cost, smallest)
+        )
+    return sorted(result, key=lambda c: -c.score)
+
+
+def linear_gain(base: JointFit, problem: JointProblem, raw: list[FloatArray], seats: list[FloatArray]) -> float:
+    """Return the decrease of χ² that columns of markers and seats (see `Candidate`) promise beside a fit, without bounds."""
+    Q = _orthonormal(np.asarray(base.fit.jacobian))
+    whole = _whitened(base, problem, raw, seats)
+    more = _orthonormal(whole - Q @ (Q.T @ whole))
+    return float(np.sum((more.T @ base.fit.residual) ** 2))
+
+
+def _whitened(base: JointFit, problem: JointProblem, own: list[FloatArray], rest: list[FloatArray]) -> FloatArray:
+    """Return columns of markers and seats, whitened, with zeros for the other rows of the fit (declared poses and priors)."""
+    q = own[0].shape[2]
+    result = np.zeros((len(base.fit.residual), q))
+    at = 0
+    for trial, factor, block, rows in zip(problem.trials, problem.factors, own, rest):
+        k, s = block.shape[0] * block.shape[1], 3 * len(rows)
+        result[at : at + k] = whiten(factor, block)
+        result[at + k : at + k + s] = rows.reshape(s, q) / problem.seat_std
+        at += k + s + 6 * len(trial.poses)
+    return result
+
+
+def _orthonormal(columns: FloatArray) -> FloatArray:
+    return _factors(columns)[0]
+
+
+def _factors(columns: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return Q, an orthonormal basis of columns J (N, p), and A with A Qᵀ = J⁺."""
+    norm = np.linalg.norm(columns, axis=0)
+    seen = norm > 0
+    inverse = np.zeros((columns.shape[1], 0))
+    if not seen.any():
+        return np.zeros((len(columns), 0)), inverse
+    U, s, Vt = np.linalg.svd(columns[:, seen] / norm[seen], full_matrices=False)
+    kept = s > 1e-9 * s[0]
+    inverse = np.zeros((columns.shape[1], int(kept.sum())))
+    inverse[seen] = (Vt[kept].T / s[kept]) / norm[seen, None]
+    return np.asarray(U[:, kept]), inverse
+
+
+def _best_step(columns: FloatArray, residual: FloatArray, parameters: Sequence[Parameter]) -> tuple[FloatArray, float]:
+    """Return the bounded step that explains most, and the decrease of χ²."""
+    null = np.array([p.null for p in parameters])
+    low, high = np.array([p.low for p in parameters]) - null, np.array([p.high for p in parameters]) - null
+    scale = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    low, high = np.minimum(low * scale, -1e-12), np.maximum(high * scale, 1e-12)
+    answer = lsq_linear(columns / scale, -residual, bounds=(low, high))
+    gain = float(residual @ residual) - float(np.sum((residual + columns / scale @ answer.x) ** 2))
+    return np.asarray(answer.x / scale), gain
+
+
+def _smallest(columns: FloatArray, q: int, n_effective: float) -> FloatArray:
+    """Return the size of each parameter at which the expected dBIC reaches 10."""
+    needed = np.sqrt(10.0 + q * np.log(n_effective))
+    norm = np.linalg.norm(columns, axis=0)
+    return np.asarray(np.where(norm > 0, needed / np.maximum(norm, 1e-300), np.inf))
+
+
+def _whole_step(columns: FloatArray, residual: FloatArray) -> tuple[FloatArray, float]:
+    """Return the step to a discrete alternative, which is taken as a whole, and the decrease of χ²."""
+    return np.ones(1), float(residual @ residual) - float(np.sum((residual + columns[:, 0]) ** 2))
+
+
+def one_each(table: list[Candidate]) -> list[Candidate]:
+    """Return the best candidate of each name."""
+    seen: dict[str, Candidate] = {}
+    for candidate in table:
+        seen.setdefault(candidate.effect.name, candidate)
+    return list(seen.values())
+
+
+def confounding(a: Candidate, b: Candidate) -> float:
+    """Return how much of a's field b can imitate once nuisance is projected out (the largest canonical correlation)."""
+    A, B = _orthonormal(a.columns), _orthonormal(b.columns)
+    if not A.size or not B.size:
+        return 0.0
+    direction = a.columns @ a.step if np.linalg.norm(a.columns @ a.step) > 0 else a.columns[:, 0]
+    return float(np.linalg.norm(B.T @ direction) / max(float(np.linalg.norm(direction)), 1e-300))
+
+
+APART = 3.0
+"""A marker stands apart that sits elsewhere by so many times the median of all: of seats that scatter alike one in ten thousand does."""
+
+
+def jets_with(stage: Stage, candidate: Candidate) -> list[SceneJet]:
+    """Return the jets of a stage with the columns of a candidate behind the others."""
+    return [
+        replace(
+            jet,
+            by_effect=np.concatenate([jet.by_effect, own], axis=2),
+            rest_by_effect=np.concatenate([jet.rest_by_effect, seats], axis=2),
+        )
+        for jet, own, seats in zip(stage.fit.jets, candidate.raw, candidate.seats)
+    ]
+
+
+def noise_of(data: Data, stage: Stage, fields: Fields, before: Noise | None = None) -> tuple[Noise, float]:
+    """Estimate the noise from what the richest linear model leaves; return it with the effective number of observations."""
+    table = screen(stage.fit, problem_of(data, stage.fit, Noise({"white": 5e-4}, "")), fields, 100.0)
+    apart, own = _apart(table), stage.fit.own
+    errors = [t.error_by_sweep for t in data.train]
+    widest = max(0 if e is None else e.shape[2] for e in errors)
+    columns, extra = [], []
+    for i, (error, jet, span) in enumerate(zip(errors, stage.fit.jets, spans_of(data.train))):
+        shape = jet.residual.shape
+        block = np.zeros((*shape, own + widest))
+        block[:, :, span] = np.concatenate([jet.by_pose, jet.by_initial], axis=2)
+        if error is not None:
+            block[:, :, own : own + error.shape[2]] = error
+        columns.append(np.concatenate([block, jet.by_effect], axis=2))
+        others = [c.raw[i] for c in (*apart, *(c for c in one_each(table) if c.effect.name != "marker_offset"))]
+        extra.append(np.concatenate([np.zeros((*shape, 0)), *others], axis=2))
+    groups = [t.groups for t in data.train]
+    noise = Noise({}, "")
+    residuals = [j.residual for j in stage.fit.jets]
+    for clouds in (False, True):
+        which = [i for i, t in enumerate(data.train) if (t.scene.crossings is not None) == clouds]
+        if which:
+            known = None if before is None else before.surface if clouds else before.std
+            picked = (
+                [residuals[i] for i in which],
+                [columns[i] for i in which],
+                [extra[i] for i in which],
+                [groups[i] for i in which],
+            )
+            noise = noise.joined(estimate_noise(*picked, known), clouds)
+    return noise, float(sum(g.observations for g in groups))
+
+
+def _apart(table: list[Candidate]) -> list[Candidate]:
+    """Return the offsets of single markers that are much larger than most: one that sits elsewhere does not tell how well the others sit."""
+    alone = [c for c in table if c.effect.name == "marker_offset" and len({_marker(p) for p in c.parameters}) == 1]
+    size = np.array([np.linalg.norm(c.step) for c in alone])
+    return [c for c, s in zip(alone, size) if s > APART * np.median(size)]
+
+
+def _marker(parameter: Parameter) -> str | None:
+    return parameter.part[0] if isinstance(parameter.part, tuple) else None
+
+
+def screen_stage(data: Data, fit: JointFit, noise: Noise, fields: Fields, n_effective: float) -> list[Candidate]:
+    return screen(fit, problem_of(data, fit, noise), fields, n_effective)

@@ -1,0 +1,115 @@
+"""How far a search for effects has come, and what it went through, as the conclusion needs it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+from femsense.core.errors import FemsenseError
+from femsense.loop.data.dataset import Data
+from femsense.loop.fit.fitted_model import Stage
+from femsense.loop.fit.noise_components import Noise
+from femsense.loop.search.effect_fields import Fields
+from femsense.loop.search.location_search import Climbs
+from femsense.loop.search.screening import Candidate
+
+
+@dataclass(eq=False, slots=True)
+class Course:
+    """How far a search has come."""
+
+    data: Data
+    earlier: Data
+    """The data as they were before the last effect was added."""
+    before: Stage
+    """The declared model, calibrated."""
+    history: list[tuple[str, Stage]]
+    """As of `Search`."""
+    given: int
+    """How many models of the history were there before the search."""
+    stage: Stage
+    """The model that comes next is this one with one effect more."""
+    base: Stage
+    """As of `Search`, from the first screening on."""
+    names: list[str]
+    """Effects that are tried."""
+    quadratic: bool
+    """Whether it goes on quadratic elements though linear ones are declared."""
+    refits: list[dict[str, Any]]
+    """What became of candidates that were refitted."""
+    ties: list[Refit] = field(default_factory=list)
+    """What was as good as the last effect."""
+    noise: Noise | None = None
+    n_effective: float = 0.0
+    fields: Fields | None = None
+    first: list[Candidate] = field(default_factory=list)
+    table: list[Candidate] = field(default_factory=list)
+    """The last screening."""
+    over: bool = False
+
+    @property
+    def found(self) -> int:
+        """How many effects were found."""
+        return len(self.history) - self.given
+
+    def take_back(self, error: FemsenseError) -> None:
+        """End without the last effect, whose states do not come to rest when they are asked for again."""
+        step, back = len(self.history) - 1, {"verdict": f"no equilibrium: {error}"}
+        self.refits = [{**r, **back} if r["step"] == step and r["verdict"] == "named" else r for r in self.refits]
+        self.data, self.history, self.over = self.earlier, self.history[:-1], True
+        self.stage = self.history[-1][1]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Search:
+    """What the search went through."""
+
+    before: Stage
+    """The declared model, calibrated."""
+    history: list[tuple[str, Stage]]
+    """("", the model with what calibration may move on the declared mesh), then each effect with the stage that added it."""
+    base: Stage
+    """The model of the first screening: with what calibration may move, on quadratic elements if effects were sought with these."""
+    final: Stage
+    noise: Noise
+    n_effective: float
+    first: list[Candidate]
+    """The first screening."""
+    last: list[Candidate]
+    """The last one."""
+    refits: list[dict[str, Any]]
+    in_place: InPlace | None
+    """What might be in the place of the cable zeros."""
+
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Refit:
+    """A candidate after its joint fit."""
+
+    candidate: Candidate
+    stage: Stage
+    score: float
+    """dBIC of the nonlinear fit."""
+    gain: float
+    """Decrease of χ² less the cost: as linear scores are."""
+    record: dict[str, Any]
+    """What the report says of it."""
+    climbs: Climbs | None = None
+    """Where its place may lie instead, once that is asked."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class InPlace:
+    """What became of the question."""
+
+    stage: Stage | None
+    """A model with an effect in the place of the zeros, where that is better."""
+    name: str
+    """The effect that is best in their place; empty: none passes."""
+    ahead: float
+    """dBIC of that effect less that of the zeros."""
+    records: list[dict[str, Any]]

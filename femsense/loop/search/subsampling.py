@@ -1,0 +1,95 @@
+"""Some states that speak for all: where meshes are large, they show the way to places, and which rivals cannot win."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from femsense.core.arrays import BoolArray, IntArray
+from femsense.core.errors import FemsenseError
+from femsense.loop.data.dataset import Data
+from femsense.loop.data.representative_states import MOST_WORK, spread_states
+from femsense.loop.fit.fitted_model import Stage, problem_of, weighed
+from femsense.loop.fit.joint_fit import JointFit
+from femsense.loop.fit.noise_components import Noise
+from femsense.loop.search.effect_fields import Fields
+from femsense.loop.search.screening import Candidate, screen
+from femsense.model.drive import has_history
+from femsense.model.observation import Hypothesis
+from femsense.model.robot import Robot
+
+SPARED = 0.6
+"""They are no more than this share of all, or rivals are fitted on all at once."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Few:
+    """What a stage makes of some of its states."""
+
+    data: Data
+    """Nothing is held out."""
+    stage: Stage
+    rows: list[BoolArray]
+    """Which rows of each trial are theirs, shape (k,)."""
+    spares: bool
+    """Whether they are few enough to spare time."""
+
+    def of(self, fit: JointFit, noise: Noise) -> JointFit:
+        """Return what another fit makes of these states."""
+        return _picked(self.data, fit, noise, self.rows)
+
+    def candidate(self, candidate: Candidate, noise: Noise) -> Candidate | None:
+        """Return a candidate as these states have it; None where they do not tell, or the states before them would be needed."""
+        effect, seed, parameters = candidate.effect, candidate.seed, candidate.parameters
+        fit = self.stage.fit
+        if not candidate.raw:
+            return None
+        try:
+            moved = np.array([np.clip(p.null + s, p.low, p.high) for p, s in zip(parameters, candidate.step)])
+            acting = Hypothesis(fit.hypothesis.robot_at(fit.coordinates), ((effect, seed, parameters),)).robot_at(moved)
+        except FemsenseError:
+            return None
+        if has_history(acting):
+            return None
+        raw = [block[rows] for block, rows in zip(candidate.raw, self.rows)]
+        fields = Fields([(effect, seed, parameters)], raw, candidate.seats, fit.hypothesis)
+        seen = screen(fit, problem_of(self.data, fit, noise), fields, 1.0)
+        return replace(seen[0], cost=candidate.cost) if seen else None
+
+
+def spares(data: Data, robot: Robot) -> bool:
+    """Return whether some states of a robot, which speak for all, are few enough to spare time: where a state depends on those before, all of these
+    are solved, too."""
+    return _spares(_chosen(data, robot)[1], robot)
+
+
+def _spares(share: float, robot: Robot) -> bool:
+    return share < SPARED and not has_history(robot)
+
+
+def _chosen(data: Data, robot: Robot) -> tuple[list[IntArray], float]:
+    """Return the frames of these states, of each trial, and how many of all distinct states they are."""
+    chosen = [spread_states(t, MOST_WORK // len(robot.body.mesh.tets)) for t in data.train]
+    return [frames for frames, _ in chosen], float(np.mean([share for _, share in chosen]))
+
+
+def few_of(data: Data, stage: Stage, noise: Noise) -> Few:
+    """Return some states of a stage that differ as much as they can, or all of them where these are not too much work."""
+    robot = stage.fit.hypothesis.robot_at(stage.fit.coordinates)
+    frames, share = _chosen(data, robot)
+    rows = [np.isin(t.scene.frame, few) for t, few in zip(data.train, frames)]
+    bare, less = replace(data, held=[], held_of=[]), _spares(share, robot)
+    if all(own.all() for own in rows):
+        return Few(bare, stage, rows, less)
+    trials = [
+        replace(t.part(few), mesh_error=None if t.mesh_error is None else t.mesh_error[own])
+        for t, few, own in zip(data.train, frames, rows)
+    ]
+    part = replace(bare, train=trials)
+    return Few(part, Stage(_picked(part, stage.fit, noise, rows), [], float("nan")), rows, less)
+
+
+def _picked(data: Data, fit: JointFit, noise: Noise, rows: list[BoolArray]) -> JointFit:
+    """Return what a fit makes of some rows, which are the data."""
+    return weighed(data, fit, noise, [jet.pick(own) for jet, own in zip(fit.jets, rows)])

@@ -1,0 +1,243 @@
+"""What a model means for the forces that are sensed with it: at declared loads, or where nothing is declared by its compliance.
+
+A smaller error of shape with a wrong effect can make forces worse; this is where it would show. All of it is linear about the state
+in which the declared load acts, with one factorisation a frame and model:  δf = argmin |r − C δf|²,  C the markers' answer to unit
+forces at the place of the load, r the residual with the declared load; sensed = declared + δf.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from femsense.core.arrays import FloatArray, IntArray
+from femsense.core.errors import FemsenseError
+from femsense.core.parallel import each
+from femsense.fem.compliance import Tangent, compliance, tangent_at
+from femsense.fem.mesh import embed_points, surface_triangles, vertex_normals
+from femsense.loop.data.covariates import actuation_of
+from femsense.loop.data.dataset import Data
+from femsense.loop.data.trial import Trial, heads_of, normals_of, numbers_of, vectors_of
+from femsense.loop.fit.fitted_model import Stage, placed
+from femsense.loop.fit.noise_components import Noise
+from femsense.model.observation import SceneJet, in_robot_frame, seats
+from femsense.model.robot import Robot, spread_features
+
+LOADED_FRAMES = 8
+"""Frames with known loads at most."""
+POINTS = 8
+"""Places of the body at which compliances are compared."""
+FIELD_POINTS = 48
+"""Points of the surface that carry the field of equivalent forces."""
+WEAKEST = 0.03
+"""Directions of force that the markers see less than this, relative to the best one, are left as declared."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class View:
+    """One trial as a model has it."""
+
+    robot: Robot
+    trial: Trial
+    jet: SceneJet
+    poses: list[FloatArray]
+    recording: int
+    """Number of the recording; those for validation come after the others."""
+    held_out: bool
+
+    def rows(self, frame: int) -> IntArray:
+        """Return the rows of the residual that belong to a frame."""
+        return np.flatnonzero(self.trial.scene.frame == frame)
+
+    def number(self, frame: int) -> int:
+        """Return the number that frames.csv gives a frame."""
+        return int(self.trial.scene.recording.frame_numbers[frame])
+
+    def tangent(self, frame: int) -> Tangent:
+        """Return the linearised body in a frame."""
+        return tangent_at(self.robot.body, self.jet.states[frame])
+
+    def answers(self, tangent: Tangent, frame: int, places: FloatArray) -> FloatArray:
+        """Return how the markers of a frame answer to unit forces along x, y, z at places of the body at rest [m/N], (3k, 3p)."""
+        mesh, rows = self.robot.body.mesh, self.rows(frame)
+        ties = embed_points(mesh, places)
+        units = [ties.spread(np.eye(3 * len(places))[j].reshape(-1, 3), len(mesh.nodes)) for j in range(3 * len(places))]
+        marks = self.robot.tie_markers(seats(self.robot, self.trial.scene, self.poses))[self.trial.scene.marker[rows]]
+        moves = np.array([marks.moves(move) for move in tangent.respond(np.array(units))])
+        if self.trial.scene.crossings is not None:
+            moves = np.einsum("jkc,kc->jk", moves, normals_of(self.trial.scene, self.poses)[rows])
+        return moves.reshape(len(moves), -1).T
+
+    @property
+    def vectors(self) -> FloatArray:
+        """Residuals as vectors of the robot frame [m], shape (k, 3): those of clouds along the normals."""
+        return vectors_of(self.trial, self.jet.residual, self.poses)
+
+    @property
+    def measured(self) -> FloatArray:
+        """Measured points [m], shape (k, 3), robot frame; of clouds where the normals cross the measured surface."""
+        scene = self.trial.scene
+        return in_robot_frame(scene.points, scene.view, self.poses, self.robot.observation)
+
+
+def views_of(data: Data, stage: Stage) -> list[View]:
+    """Return one trial of each recording as a stage has it: the fitted ones, then those that are held out. Markers come before clouds."""
+    robot = stage.fit.hypothesis.robot_at(stage.fit.coordinates)
+    poses, numbers = placed(data, stage.fit), numbers_of(data.train)
+    fitted = [View(robot, data.train[i], stage.fit.jets[i], list(poses[i][0]), numbers[i], False) for i in heads_of(data.train)]
+    held, extra = [], len(fitted)
+    for i in heads_of(data.held):
+        of, own = data.held_of[i], stage.held[i]
+        held.append(View(robot, data.held[i], own.jet, own.poses, extra if of is None else numbers[of], True))
+        extra += of is None
+    return fitted + held
+
+
+def force_consequence(before: list[View], after: list[View], noise: Noise) -> dict[str, Any]:
+    """Return what both models make of forces: {"loads": …} where loads are declared, else {"compliance": …}; {} where neither can be had."""
+    pairs = list(zip(before, after))
+    loaded = [(a, b, k) for a, b in pairs if a.held_out for k in _loaded_frames(a)]
+    loaded = loaded or [(a, b, k) for a, b in pairs for k in _loaded_frames(a)]
+    try:
+        if loaded:
+            chosen = np.unique(np.linspace(0, len(loaded) - 1, LOADED_FRAMES).round().astype(int))
+            rows = each(lambda at: _at_loads(at[0], at[1], at[2], noise), [loaded[i] for i in chosen])
+            return {"loads": [row for row in rows if row is not None]}
+        return {"compliance": _compliances(*pairs[0])}
+    except FemsenseError:
+        return {}
+
+
+def _loaded_frames(view: View) -> list[int]:
+    recording = view.trial.scene.recording
+    heavy = np.linalg.norm(recording.load_forces, axis=1) > 0 if len(recording.load_frame) else np.zeros(0, dtype=bool)
+    return [int(k) for k in view.trial.scene.frames if k in recording.load_frame[heavy] and k in view.jet.states]
+
+
+def _at_loads(before: View, after: View, frame: int, noise: Noise) -> dict[str, Any] | None:
+    """Return the strongest declared load of a frame next to what either model senses there."""
+    recording = before.trial.scene.recording
+    own = np.flatnonzero(recording.load_frame == frame)
+    size = np.linalg.norm(recording.load_forces[own], axis=1)
+    places, main = recording.load_points[own], int(size.argmax())
+    direction = recording.load_forces[own][main] / size[main]
+    row: dict[str, Any] = {
+        "recording": before.recording,
+        "frame": before.number(frame),
+        "held_out": before.held_out,
+        "declared_n": float(size[main]),
+    }
+    for name, view in (("before", before), ("after", after)):
+        rows = view.rows(frame)
+        if len(rows) < len(own):
+            return None
+        C = view.answers(view.tangent(frame), frame, places)
+        change, spread = _solved(C, view.jet.residual[rows].ravel(), noise.row_std(view.trial.groups))
+        part = slice(3 * main, 3 * main + 3)
+        row[f"{name}_n"] = float(size[main] + change[part] @ direction)
+        row[f"{name}_std_n"] = float(np.sqrt(direction @ spread[part, part] @ direction))
+    return row
+
+
+def _solved(C: FloatArray, residual: FloatArray, std: float) -> tuple[FloatArray, FloatArray]:
+    """Return the forces that explain a residual best, and their covariance; directions that the markers hardly see stay at zero."""
+    U, s, Vt = np.linalg.svd(C, full_matrices=False)
+    keep = s > WEAKEST * s[0]
+    inverse = Vt[keep].T / s[keep]
+    return inverse @ (U[:, keep].T @ residual), std**2 * inverse @ inverse.T
+
+
+def _compliances(before: View, after: View) -> dict[str, Any]:
+    """Return how much a sensed force changes from model to model where no load is declared.
+
+    A dent d along the normal is sensed as d / W, so that forces change by W_before / W_after. `phantom` is the force at the free end
+    that each model would have sensed from its residual, where nothing touches.
+    """
+    frames = chosen_frames(before)
+    declared = before.robot.body.mesh
+    nodes = spread_features(before.robot.body, POINTS)
+    normals = vertex_normals(declared.nodes, surface_triangles(declared))[nodes]
+    rows = []
+    for title, k in frames:
+        ends: dict[str, Any] = {}
+        for name, view in (("before", before), ("after", after)):
+            tangent = view.tangent(k)
+            W = compliance(view.robot.body, view.jet.states[k], points=declared.nodes[nodes], directions=normals, tangent=tangent)
+            C = view.answers(tangent, k, declared.nodes[nodes[:1]])
+            phantom = _solved(C, view.jet.residual[view.rows(k)].ravel(), 1.0)[0]
+            ends[name] = (np.diag(W)[: len(nodes)], float(np.linalg.norm(phantom)))
+        rows.append(
+            {
+                "title": title,
+                "frame": before.number(k),
+                "ratio": (ends["before"][0] / ends["after"][0]).tolist(),
+                "phantom_before_n": ends["before"][1],
+                "phantom_after_n": ends["after"][1],
+            }
+        )
+    return {"points_m": declared.nodes[nodes].tolist(), "frames": rows}
+
+
+def chosen_frames(view: View) -> list[tuple[str, int]]:
+    """Return three frames of a trial, (title, index): the least driven, one half way and the most driven; by time where nothing drives."""
+    frames = view.trial.scene.frames
+    drive = actuation_of(view.trial.scene.recording)[frames]
+    if np.ptp(drive) == 0:
+        picked = [("first", 0), ("middle", len(frames) // 2), ("last", len(frames) - 1)]
+    else:
+        half = 0.5 * (drive.min() + drive.max())
+        picked = [("rest", int(drive.argmin())), ("mid", int(np.abs(drive - half).argmin())), ("max", int(drive.argmax()))]
+    found: dict[int, str] = {}
+    for title, i in picked:
+        found.setdefault(int(frames[i]), title)
+    return [(title, k) for k, title in found.items()]
+
+
+def equivalent_forces(views: list[View], noise: Noise) -> dict[str, Any]:
+    """Return forces on the surface that would explain the frame with the largest residual; a picture, no evidence.
+
+    Any residual is some field of forces. The field is the smallest one (Tikhonov) that leaves the noise: |C f − r|² = 3 k σ².
+    {} where that frame holds no more than noise.
+    """
+    worst = max(((v, int(k)) for v in views for k in v.trial.scene.frames), key=lambda at: _mean_square(*at))
+    view, frame = worst
+    r = view.jet.residual[view.rows(frame)].ravel()
+    goal = len(r) * noise.row_std(view.trial.groups) ** 2
+    if float(r @ r) <= goal:
+        return {}
+    body = view.robot.body
+    nodes = spread_features(body, FIELD_POINTS)
+    places = body.mesh.nodes[nodes]
+    try:
+        C = view.answers(view.tangent(frame), frame, places)
+    except FemsenseError:
+        return {}
+    forces = _smallest_field(C, r, goal).reshape(-1, 3)
+    left = r - C @ forces.ravel()
+    return {
+        "recording": view.recording,
+        "frame": view.number(frame),
+        "points_m": places.tolist(),
+        "forces_n": forces.tolist(),
+        "total_n": forces.sum(axis=0).tolist(),
+        "explained_share": float(1.0 - left @ left / (r @ r)),
+    }
+
+
+def _mean_square(view: View, frame: int) -> float:
+    return float((view.jet.residual[view.rows(frame)] ** 2).sum(axis=1).mean())
+
+
+def _smallest_field(C: FloatArray, r: FloatArray, goal: float) -> FloatArray:
+    """Return the smallest f with |C f − r|² ≤ goal, or where none comes so near the least regular one that still is stable."""
+    U, s, Vt = np.linalg.svd(C, full_matrices=False)
+    b = U.T @ r
+    outside = float(r @ r - b @ b)
+    low, high = 1e-4 * s[0], 1e3 * s[0]
+    for _ in range(60):
+        ridge = float(np.sqrt(low * high))
+        left = outside + float(((ridge**2 / (s**2 + ridge**2) * b) ** 2).sum())
+        low, high = (ridge, high) if left < goal else (low, ridge)
+    return np.asarray(Vt.T @ (s / (s**2 + low**2) * b))

@@ -1,0 +1,217 @@
+"""What a residual still holds: tests of structure, and what it goes with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from femsense.core.arrays import FloatArray, IntArray
+from femsense.loop.data.covariates import covariates_of, rank_with, stacked
+from femsense.loop.data.trial import Trial, heads_of, vectors_of
+from femsense.model.recording import state_key
+from femsense.model.robot import Robot
+
+PERMUTATIONS = 499
+WORST_FRAMES = 5
+GOES_WITH = 8
+"""So many frames and covariates are listed."""
+LEVEL = 0.01
+"""Probability, over all tests together (Holm 1979), of calling mere noise structure."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class StructureTests:
+    """Tests for structure in a residual; p-values as they are, not adjusted."""
+
+    lag_one: float
+    p: dict[str, float]
+    """Test → p-value: neighbouring states alike, one pattern in many states, one sweep apart, one marker apart."""
+
+    @property
+    def significant(self) -> bool:
+        """Whether any test stands after Holm's adjustment."""
+        return min(self.p.values(), default=1.0) * len(self.p) <= LEVEL
+
+    def document(self) -> dict[str, Any]:
+        """Return the tests as plain tables."""
+        return {
+            "lag_one": self.lag_one,
+            "p_value": min(self.p.values(), default=1.0),
+            "tests": dict(self.p),
+            "significant": self.significant,
+        }
+
+
+def structure_tests(trials: list[Trial], residuals: list[FloatArray], *, rng: np.random.Generator) -> StructureTests:
+    """Return tests for structure in residuals [m], (k, c) a trial.
+
+    * `neighbours`: marker means and frame means removed; T = Σ r_k·r_{k+1} / Σ |r_k|² over neighbouring states of a sweep, against
+      shuffles of the states within sweeps. It knows no scale, so that a wrong noise level cannot trip it.
+    * `pattern`: the largest singular value of states × markers, against shuffles of each marker's states among themselves (Horn 1965).
+    * `sweep`, `marker`: the sweep or marker with the largest mean square, against the same shuffles.
+
+    Errors of a cloud are alike where points are near to each other, so that its states are shuffled whole, and `pattern` is not asked.
+    """
+    if any(t.scene.crossings is not None for t in trials):
+        return _cloud_tests(trials, residuals, rng)
+    fields = [_field(t, r) for t, r in zip(trials, residuals)]
+    observed = _lag_one(fields, None)
+    p: dict[str, float] = {}
+    if np.isfinite(observed):
+        shuffled = np.array([_lag_one(fields, rng) for _ in range(PERMUTATIONS)])
+        p["neighbours"] = _share(shuffled, observed)
+    seen = np.array([_largest(fields, None)])
+    null = np.array([_largest(fields, rng) for _ in range(PERMUTATIONS)])
+    p |= {name: _share(null[:, i], float(seen[0, i])) for i, name in enumerate(("pattern", "sweep"))}
+    return StructureTests(observed if np.isfinite(observed) else 0.0, p)
+
+
+def _cloud_tests(trials: list[Trial], residuals: list[FloatArray], rng: np.random.Generator) -> StructureTests:
+    """Return the tests of clouds, with those of the markers beside them where there are some."""
+    pairs = list(zip(trials, residuals))
+    marked = [(t, r) for t, r in pairs if t.scene.crossings is None]
+    markers = structure_tests([t for t, _ in marked], [r for _, r in marked], rng=rng) if marked else None
+    fields = [_field(t, r) for t, r in pairs if t.scene.crossings is not None]
+    p = {} if markers is None else dict(markers.p)
+    observed = _lag_one(fields, None)
+    if np.isfinite(observed):
+        p["cloud neighbours"] = _share(np.array([_lag_one(fields, rng) for _ in range(PERMUTATIONS)]), observed)
+    whole = [_largest(_shuffled(fields, rng), None)[1] for _ in range(PERMUTATIONS)]
+    p["cloud sweep"] = _share(np.array(whole), _largest(fields, None)[1])
+    lag = observed if np.isfinite(observed) else 0.0
+    return StructureTests(lag if markers is None else markers.lag_one, p)
+
+
+def _shuffled(fields: list[tuple[FloatArray, IntArray]], rng: np.random.Generator) -> list[tuple[FloatArray, IntArray]]:
+    """Return fields with their states in another order, each whole."""
+    return [(values[rng.permutation(len(values))], sweep) for values, sweep in fields]
+
+
+def _share(null: FloatArray, observed: float) -> float:
+    return float((1 + (null >= observed - 1e-12).sum()) / (1 + len(null)))
+
+
+def _largest(fields: list[tuple[FloatArray, IntArray]], rng: np.random.Generator | None) -> tuple[float, float]:
+    """Return the largest singular value, and the largest mean square of a sweep, relative to all; with `rng` after shuffling."""
+    singular, apart = 0.0, 0.0
+    for values, sweep in fields:
+        flat = values.reshape(len(values), -1)
+        if rng is not None:
+            markers = values.shape[1]
+            order = np.argsort(rng.random((len(values), markers)), axis=0)
+            flat = values[order, np.arange(markers)[None, :]].reshape(len(values), -1)
+        total = float((flat**2).sum())
+        if total <= 0 or len(flat) < 3:
+            continue
+        singular = max(singular, float(np.linalg.svd(flat, compute_uv=False)[0] ** 2 / total))
+        power = (flat**2).sum(axis=1)
+        means = [power[sweep == s].mean() for s in np.unique(sweep)]
+        apart = max(apart, float(np.max(means) / power.mean()))
+    return singular, apart
+
+
+def _field(trial: Trial, residual: FloatArray) -> tuple[FloatArray, IntArray]:
+    """Return residuals as (distinct states, markers, c) with means removed, and the sweep of each state."""
+    frames = np.unique(trial.scene.frame)
+    count = int(trial.groups.marker.max()) + 1
+    grid = np.full((len(frames), count, residual.shape[1]), np.nan)
+    place = np.searchsorted(frames, trial.scene.frame)
+    grid[place, trial.groups.marker] = residual
+    sweep = np.zeros(len(frames), dtype=np.int64)
+    sweep[place] = trial.groups.sweep
+    keys = [state_key(trial.scene.recording, int(f)) for f in frames]
+    first = [i for i in range(len(frames)) if i == 0 or keys[i] != keys[i - 1]]
+    merged = np.array([_mean_seen(grid[a:b]) for a, b in zip(first, [*first[1:], len(frames)])])
+    merged = np.nan_to_num(merged - _mean_seen(merged)[None])
+    merged = merged - merged.mean(axis=1, keepdims=True)
+    return merged, sweep[first]
+
+
+def _mean_seen(values: FloatArray) -> FloatArray:
+    """Return the mean over the first axis of what is not NaN; NaN where all is."""
+    seen = np.isfinite(values)
+    count = seen.sum(axis=0)
+    total = np.where(seen, values, 0.0).sum(axis=0)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+def _lag_one(fields: list[tuple[FloatArray, IntArray]], rng: np.random.Generator | None) -> float:
+    above, below = 0.0, 0.0
+    for values, sweep in fields:
+        order = np.arange(len(values))
+        if rng is not None:
+            for s in np.unique(sweep):
+                members = np.flatnonzero(sweep == s)
+                order[members] = rng.permutation(members)
+        v = values[order]
+        same = sweep[1:] == sweep[:-1]
+        above += float((v[1:] * v[:-1]).sum(axis=(1, 2))[same].sum())
+        below += float((v**2).sum())
+        if len(values) < 3 or not same.any():
+            below += 0.0
+    pairs = sum(int((s[1:] == s[:-1]).sum()) for _, s in fields)
+    return above / below if below > 0 and pairs >= 4 else float("nan")
+
+
+def describe_left(robot: Robot, trials: list[Trial], residuals: list[FloatArray]) -> dict[str, Any]:
+    """Return what the remaining residual looks like: how large, where on the body, in which frames, which way, and what it goes with.
+
+    The direction is the one that holds most of the mean square of the worst marker (its sign: that of the mean); `share` says how much.
+    """
+    heads = heads_of(trials)
+    trials, residuals = [trials[i] for i in heads], [residuals[i] for i in heads]
+    marker = np.concatenate([t.scene.marker for t in trials])
+    field = np.concatenate([vectors_of(t, r) for t, r in zip(trials, residuals)])
+    size = np.linalg.norm(field, axis=1)
+    per_marker = {robot.marker_names[m]: float(np.sqrt((size[marker == m] ** 2).mean())) for m in np.unique(marker)}
+    worst = max(per_marker, key=lambda name: per_marker[name])
+    own = field[marker == robot.marker_names.index(worst)]
+    rms, numbers, recordings = _frame_sizes(trials, residuals)
+    order = np.argsort(-rms, kind="stable")
+    direction, share = _direction(own)
+    return {
+        "rms_m": float(np.sqrt((size**2).mean())),
+        "marker_rms_m": per_marker,
+        "where": {
+            "marker": worst,
+            "position_m": robot.marker_points[robot.marker_names.index(worst)].tolist(),
+            "mean_residual_m": own.mean(axis=0).tolist(),
+            "direction": direction.tolist(),
+            "direction_share": share,
+        },
+        "worst_frame": {"recording": int(recordings[order[0]]), "frame": int(numbers[order[0]]), "rms_m": float(rms[order[0]])},
+        "worst_frames": [
+            {"recording": int(recordings[i]), "frame": int(numbers[i]), "rms_m": float(rms[i])} for i in order[:WORST_FRAMES]
+        ],
+        "half_in_frames": _share_of_half(rms[order]),
+        "goes_with": rank_with(rms, stacked([covariates_of(t.scene) for t in trials]))[:GOES_WITH],
+    }
+
+
+def _frame_sizes(trials: list[Trial], residuals: list[FloatArray]) -> tuple[FloatArray, IntArray, IntArray]:
+    """Return root mean square [m], number and recording of each frame, in order."""
+    sizes = [frame_rms(t, r) for t, r in zip(trials, residuals)]
+    numbers = [t.scene.recording.frame_numbers[t.scene.frames] for t in trials]
+    return np.concatenate(sizes), np.concatenate(numbers), np.repeat(np.arange(len(trials)), [len(s) for s in sizes])
+
+
+def frame_rms(trial: Trial, residual: FloatArray) -> FloatArray:
+    """Return the root mean square of a residual (k, c) in each frame of a trial [m], shape (f,)."""
+    place = np.searchsorted(trial.scene.frames, trial.scene.frame)
+    count = np.bincount(place, minlength=len(trial.scene.frames))
+    return np.sqrt(np.bincount(place, (residual**2).sum(axis=1), minlength=len(count)) / np.maximum(count, 1))
+
+
+def _direction(vectors: FloatArray) -> tuple[FloatArray, float]:
+    """Return the unit vector that holds most of the mean square of vectors (k, 3), and the share it holds."""
+    _, s, Vt = np.linalg.svd(vectors, full_matrices=False)
+    sign = -1.0 if float(vectors.mean(axis=0) @ Vt[0]) < 0 else 1.0
+    return sign * Vt[0], float(s[0] ** 2 / max(float((s**2).sum()), 1e-300))
+
+
+def _share_of_half(rms_falling: FloatArray) -> float:
+    """Return the share of the frames, the worst first, that hold half of the mean square."""
+    held = np.cumsum(rms_falling**2)
+    return float((np.searchsorted(held, 0.5 * held[-1]) + 1) / len(held))

@@ -1,0 +1,150 @@
+"""The robot that is handed back: which of the effects that were found, and with which sizes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from femsense.core.arrays import FloatArray
+from femsense.core.errors import FemsenseError
+from femsense.loop.data.dataset import NUISANCE, Data
+from femsense.loop.fit.discretisation_error import beyond_mesh
+from femsense.loop.fit.fitted_model import Stage, held_chi2, keeping, span_of, with_seeds_still, with_sizes_still
+from femsense.loop.fit.noise_components import Noise
+from femsense.loop.search.acceptance import at_edge
+from femsense.loop.search.input_offset import SIGNIFICANT, moved_nuisance, zeros_are_evident
+from femsense.loop.search.refit import EVIDENCE
+from femsense.loop.search.search_state import Search
+from femsense.model.effects import Entry
+
+NOT_WORSE = 1.02
+"""What is handed back may not have a larger held-out error than the declared model, but for this factor …"""
+
+
+NOISY = 1.15
+"""… or, where only what calibration may move is handed back, for this one, if χ² of the held-out data says that noise hides a better model.
+Three effects that were wrong would have needed it in blind cases, so that they have to do more …"""
+
+
+FAR_BETTER = 50.0
+"""… or, where the mesh's own error is what is larger, if χ² of the held-out data falls by so much."""
+
+
+def _promoted(data: Data, search: Search) -> list[str]:
+    """Return the nuisances that the data moved significantly away from what is declared; of the zeros, those that are missed."""
+    names = [n for n in search.final.fit.hypothesis.names if n in NUISANCE and moved_nuisance(data, search.final, n)]
+    return [n for n in names if n == "stiffness" or zeros_are_evident(data, search.final, search.noise, search.n_effective)]
+
+
+def _is_sure(stage: Stage, name: str, std: FloatArray) -> bool:
+    """Return whether a value of a nuisance differs from what is declared by more than SIGNIFICANT of the standard deviations that are reported."""
+    return bool((np.abs(stage.fit.coordinates[span_of(stage.fit, name)]) > SIGNIFICANT * std).any())
+
+
+def _worth_handing_back(data: Data, search: Search, promoted: list[str], names: list[str]) -> tuple[list[str], Stage]:
+    """Return the names that are handed back with the model of just these: with the sizes that they have beside all nuisances where held-out data
+    do not miss those, else fitted again. Nuisances that stay as declared are taken out, too if they only do so here, and so is, from the last one
+    on, what would make the error on held-out data larger than it was, or goes to the edge of what is plausible."""
+    while names:
+        kept, back = _with_modulus(data, search, names, sizes_still=True)
+        if back is not None and not _misses(data, search, back) and _may_be_handed_back(data, search, back):
+            return kept, back
+        kept, back = _with_modulus(data, search, names, sizes_still=False)
+        idle = [n for n in promoted if n in names and back is not None and not moved_nuisance(data, back, n)]
+        if idle:
+            names = [n for n in names if n not in idle]
+            continue
+        if back is not None and at_edge(back.fit):
+            back = _handed_back(data, with_seeds_still(data, search.final), kept, search.noise)
+        if back is not None and _may_be_handed_back(data, search, back):
+            return kept, back
+        names = names[:-1]
+    return [], search.before
+
+
+def _misses(data: Data, search: Search, back: Stage) -> bool:
+    """Return whether held-out data miss what the final model moves and this one does not."""
+    more = held_chi2(data, back, search.noise) - held_chi2(data, search.final, search.noise)
+    return back.held_rms > NOT_WORSE * search.final.held_rms or more > EVIDENCE
+
+
+def _may_be_handed_back(data: Data, search: Search, back: Stage) -> bool:
+    return not at_edge(back.fit) and "stiffness" not in at_edge(back.fit, nuisance=True) and _holds_out(data, search, back)
+
+
+def _with_modulus(data: Data, search: Search, names: list[str], *, sizes_still: bool) -> tuple[list[str], Stage | None]:
+    """Return names with the model of just these; with the modulus beside effects if it moved significantly there, by whatever share (zeros that are
+    not named may have moved in its place), and held-out data miss it."""
+    back = _handed_back(data, search.final, names, search.noise, sizes_still=sizes_still)
+    if back is None or "stiffness" in names or not _has_effects(names):
+        return names, back
+    if sizes_still and not moved_nuisance(data, search.final, "stiffness", relevant=0.0):
+        return names, back
+    along = _handed_back(data, search.final, ["stiffness", *names], search.noise, sizes_still=sizes_still)
+    if along is None or not moved_nuisance(data, search.final if sizes_still else along, "stiffness", relevant=0.0):
+        return names, back
+    missed = held_chi2(data, back, search.noise) - held_chi2(data, along, search.noise) > EVIDENCE
+    return (["stiffness", *names], along) if missed else (names, back)
+
+
+def _has_effects(names: Iterable[str]) -> bool:
+    return any(name not in NUISANCE for name in names)
+
+
+def _holds_out(data: Data, search: Search, back: Stage) -> bool:
+    """Return whether a model is no worse on held-out data in millimetres; or else better by the noise that these data have, where it is calibrated
+    only and within reason, or where the mesh's own error is all that is larger: then it must be no worse beyond that, nor in millimetres than
+    the model with all that calibration may move, and not be zeros of cables alone, unless it is far better by the noise and within reason."""
+    worse = back.held_rms / search.before.held_rms
+    if worse <= NOT_WORSE:
+        return True
+    only_calibrated = not _has_effects(back.fit.hypothesis.names)
+    gain = held_chi2(data, search.before, search.noise) - held_chi2(data, back, search.noise)
+    if gain <= (EVIDENCE if only_calibrated else 0.0):  # effects have been judged by held-out data before
+        return False
+    if only_calibrated and worse <= NOISY:
+        return True
+    before, after = _held_beyond_mesh(data, search, back)
+    zeros = only_calibrated and "cable_offset" in back.fit.hypothesis.names  # much else looks like them
+    shown = not zeros and back.held_rms <= NOT_WORSE * search.base.held_rms
+    return after <= NOT_WORSE * before and (shown or (gain > FAR_BETTER and worse <= NOISY))
+
+
+def _held_beyond_mesh(data: Data, search: Search, back: Stage) -> tuple[float, float]:
+    """Return the held-out errors before and after [m] less the likeliest share of what the mesh itself costs."""
+    before, after = (beyond_mesh(data.held, s.held_residuals, search.noise) for s in (search.before, back))
+    return before, after
+
+
+def _handed_back(data: Data, final: Stage, names: list[str], noise: Noise, *, sizes_still: bool = False) -> Stage | None:
+    """Return the model of some names alone, fitted again, or with the sizes that they have beside all that calibration may move: whoever
+    calibrates what is handed back moves that too. None where it has no equilibrium, or where another effect that they were found beside is gone."""
+    present = {effect.name for effect, _, _ in final.fit.hypothesis.terms}
+    if present <= set(names):
+        return final
+    if sizes_still and not (_has_effects(names) and present <= {*names, *NUISANCE}):
+        return None
+    try:
+        return (with_sizes_still if sizes_still else keeping)(data, final, names, noise)
+    except FemsenseError:
+        return None
+
+
+def _entries(stage: Stage, names: list[str]) -> list[Entry]:
+    """Return the tables of `[[effects]]`: those that change the mesh or the law first, then in the order in which they were found."""
+    settled = [{"name": effect.name, **seed} for effect, seed in stage.fit.hypothesis.settled]
+    tables = {e["name"]: e for e in stage.fit.hypothesis.entries(stage.fit.coordinates)}
+    return [_rounded(e) for e in settled] + [_rounded(tables[name]) for name in names if name in tables]
+
+
+def _rounded(entry: Entry) -> Entry:
+    def tidy(value: Any) -> Any:
+        if isinstance(value, float):
+            return float(f"{value:.9g}")
+        if isinstance(value, list):
+            return [tidy(v) for v in value]
+        return {k: tidy(v) for k, v in value.items()} if isinstance(value, dict) else value
+
+    return {k: tidy(v) for k, v in entry.items()}

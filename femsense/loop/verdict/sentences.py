@@ -1,0 +1,108 @@
+"""The verdict in words."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from femsense.loop.data.dataset import Data
+from femsense.loop.data.trial import rms_of
+from femsense.loop.fit.discretisation_error import mesh_errors
+from femsense.loop.fit.fitted_model import Stage
+from femsense.loop.fit.noise_components import Noise
+from femsense.loop.search.search_state import Search
+from femsense.loop.verdict.returned_model import NOT_WORSE, _has_effects, _held_beyond_mesh
+
+ROUNDED = 1e-6
+"""What is so small beside the largest component of a vector is said as 0."""
+
+
+BEYOND_NOISE = 1.2
+"""Held-out errors that are so many times the noise need another reason."""
+
+
+GROSS = 0.03
+"""Noise of more than this share of the body's reach is said to be suspicious."""
+
+
+def _sentence(
+    verdict: str, effects: list[dict[str, Any]], found: list[str], before: Stage, after: Stage, noise: Noise, mesh: float | None
+) -> str:
+    """Return the sentence on top; `mesh` is what the mesh itself costs [m], where that is known."""
+    error = f"held-out error {1e3 * before.held_rms:.2f} mm"
+    if not noise.std:
+        error += " along the normals of the surface"
+    if verdict == "none" and before.held_rms > BEYOND_NOISE * np.hypot(noise.total, mesh or 0.0):
+        costs = f", and its mesh costs {1e3 * mesh:.2f} mm" if mesh else ""
+        return f"Nothing that was tried explains more of the data: {error}; their noise is {1e3 * noise.total:.2f} mm{costs}."
+    if verdict == "none":
+        known = f"to their noise ({1e3 * noise.total:.2f} mm)"
+        if mesh and before.held_rms > BEYOND_NOISE * noise.total:
+            known += f" and to what its mesh costs ({1e3 * mesh:.2f} mm; a finer one would show more)"
+        return f"The model explains the data {known}: {error}."
+    if verdict == "unexplained" and not effects:
+        explains = "nothing that may be handed back" if found else "no effect of the list"
+        small = ", though it is no larger than the noise" if before.held_rms <= noise.total else ""
+        return f"A residual is left that {explains} explains{small}: {error}, noise {1e3 * noise.total:.2f} mm."
+    what = ", ".join(f"{e['name']} ({_short(e['parameters'])})" for e in effects)
+    tail = "" if verdict == "effects" else " A residual is left that no effect explains."
+    where = "" if noise.std else " along the normals of the surface"
+    return f"The model lacks {what}; held-out error{where} {1e3 * before.held_rms:.2f} mm before, {1e3 * after.held_rms:.2f} mm after.{tail}"
+
+
+def _by_mesh(data: Data, search: Search, back: Stage) -> str:
+    """Return a sentence on what the held-out error is beyond the mesh's own, where that is what makes it larger; nothing where it is not larger."""
+    if back.held_rms <= NOT_WORSE * search.before.held_rms or not mesh_errors(data):
+        return ""
+    before, after = _held_beyond_mesh(data, search, back)
+    return f" Less the likeliest share of what the mesh itself costs, that is {1e3 * before:.2f} mm before, {1e3 * after:.2f} mm after."
+
+
+def _on_linear(data: Data, back: Stage) -> str:
+    """Return a sentence on what effects that are named on a linear mesh may stand for; nothing elsewhere, or where that is an effect itself."""
+    mesh = _mesh_error(data)
+    if not mesh or back.fit.hypothesis.robot.body.mesh.is_quadratic or not _has_effects(back.fit.hypothesis.names):
+        return ""
+    return f" Linear elements cost {1e3 * mesh:.2f} mm themselves, which other effects may stand for: try discretisation too."
+
+
+def _evidence_for(data: Data, found: list[str]) -> str:
+    """Return a sentence on effects that were found and are not handed back; nothing where there are none."""
+    if not found:
+        return ""
+    mesh = _mesh_error(data)
+    finer = f"; the mesh itself costs {1e3 * mesh:.2f} mm, and a finer one may tell" if mesh else ""
+    return (
+        f" There is evidence for {', '.join(found)}, but the held-out error would grow with it or a value be implausible{finer}."
+    )
+
+
+def _by_noise(data: Data, noise: Noise) -> str:
+    """Return in words that the noise is beyond what cameras have."""
+    reach = data.robot.body.reach
+    if noise.total < GROSS * reach:
+        return ""
+    return (
+        f" Noise of {1e3 * noise.total:.1f} mm on a body of {1e3 * reach:.0f} mm is no camera's: frames that should be alike are not."
+        " Look whether inputs belong to their frames and names to their markers and cables."
+    )
+
+
+def _short(parameters: dict[str, Any]) -> str:
+    def show(value: Any) -> str:
+        if isinstance(value, float):
+            return f"{value:.3g}"
+        if isinstance(value, list):
+            largest = max((abs(v) for v in value if isinstance(v, float)), default=0.0)
+            return "[" + ", ".join(show(0.0 if isinstance(v, float) and abs(v) <= ROUNDED * largest else v) for v in value) + "]"
+        return ", ".join(f"{k} {show(v)}" for k, v in value.items()) if isinstance(value, dict) else str(value)
+
+    said = {k: p for k, p in parameters.items() if k != "file"}
+    return ", ".join(f"{k} {show(p['value'])}" + ("" if p["unit"] == "1" else f" {p['unit']}") for k, p in said.items())
+
+
+def _mesh_error(data: Data) -> float | None:
+    """Return how far a finer mesh would move the markers, root mean square [m]; None where it was not computed."""
+    errors = mesh_errors(data)
+    return rms_of(errors) if errors else None

@@ -1,0 +1,1 @@
+"""The robot, its recording, its effects, and what cameras see of them."""

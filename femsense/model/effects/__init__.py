@@ -1,0 +1,93 @@
+"""Effects: what a plain model may lack, by name. One tuple of them; robot.toml and loop.json use the same names."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
+from typing import Any
+
+from femsense.core.errors import InputError
+from femsense.model.effects.base import Effect, Entry, Parameter, build_entry
+from femsense.model.effects.cables import CABLE_FRICTION, CABLE_FRICTIONS, CABLE_GAIN, CABLE_OFFSET, CABLE_SLACK, CABLE_STRETCH
+from femsense.model.effects.loads import GRAVITY, PAYLOAD
+from femsense.model.effects.material import CREEP, CREEP_TWICE, GENT, HYPERELASTIC, POISSON, SOFT_REGION, STIFFNESS
+from femsense.model.effects.observation import CLAMPED_MARKER, DEPTH_SCALE, MARKER_OFFSET
+from femsense.model.effects.shape import DISCRETISATION, GEOMETRY
+from femsense.model.effects.support import BASE_COMPLIANCE, BASE_ROTATION
+from femsense.model.effects.user_defined import find_own_file, load_own_effect, try_own_effect
+from femsense.model.robot import Robot
+
+EFFECTS: tuple[Effect, ...] = (
+    GRAVITY,
+    STIFFNESS,
+    POISSON,
+    SOFT_REGION,
+    DISCRETISATION,
+    HYPERELASTIC,
+    CREEP,
+    PAYLOAD,
+    BASE_COMPLIANCE,
+    CABLE_FRICTION,
+    CABLE_OFFSET,
+    CABLE_GAIN,
+    CABLE_STRETCH,
+    CABLE_SLACK,
+    GEOMETRY,
+    DEPTH_SCALE,
+    MARKER_OFFSET,
+    CLAMPED_MARKER,
+)
+"""Each name once."""
+FORMS: tuple[Effect, ...] = (*EFFECTS, GENT, CREEP_TWICE, BASE_ROTATION, CABLE_FRICTIONS)
+"""Every way in which an effect can be fitted: some have further parameters, under the same name."""
+
+
+def find_effect(name: str) -> Effect:
+    """Return the effect of a name. Raises InputError."""
+    for effect in EFFECTS:
+        if effect.name == name:
+            return effect
+    names = [effect.name for effect in EFFECTS]
+    near = get_close_matches(name, names, 1)
+    raise InputError(
+        "unknown effect",
+        where="effects.name",
+        found=name,
+        expected=", ".join(names),
+        hint=f"did you mean {near[0]}?" if near else "an effect of your own comes with its file (docs/effects/own.md)",
+    )
+
+
+def apply_effects(robot: Robot, entries: Sequence[Mapping[str, Any]]) -> Robot:
+    """Return the robot with the effects of `[[effects]]`, one after the other. Raises InputError."""
+    for entry in entries:
+        rest = {key: value for key, value in entry.items() if key != "name"}
+        effect = find_effect(str(entry.get("name"))) if "file" not in entry else _own(entry, robot)
+        unknown = sorted(set(rest) - set(effect.keys))
+        if unknown:
+            raise InputError("unknown key", where=f"effects.{effect.name}", found=unknown[0], expected=", ".join(effect.keys))
+        robot = effect.apply(robot, rest)
+    return robot
+
+
+def _own(entry: Mapping[str, Any], robot: Robot) -> Effect:
+    """Return the effect of an entry with `file`. Raises InputError."""
+    file = find_own_file(entry, robot)
+    effect = load_own_effect(file)
+    if effect.name != entry.get("name"):
+        raise InputError("the file holds another effect", where=f"{file}: name", found=effect.name, expected=entry.get("name"))
+    return effect
+
+
+__all__ = [
+    "EFFECTS",
+    "FORMS",
+    "Effect",
+    "Entry",
+    "Parameter",
+    "apply_effects",
+    "build_entry",
+    "find_effect",
+    "load_own_effect",
+    "try_own_effect",
+]

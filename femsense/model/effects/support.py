@@ -1,0 +1,52 @@
+"""Effects of what holds the body."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from femsense.core.errors import InputError
+from femsense.model.effects.base import Effect, Entry, Parameter, number
+from femsense.model.robot import Robot
+
+KEYS = ("stiffness_n_m", "rotation_stiffness_nm_rad")
+SOFTEST = 150.0
+"""The softest clamp: its springs give together so many times what a cube of the material and of the body's reach does. Clamps in which soft bodies hang by
+tens of millimetres are at a third of that; with 50 they lay beyond what was plausible, and nothing else came near."""
+
+
+def _spring_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
+    """The coordinate is the compliance of a node's spring [m/N], which is 0 for the clamp."""
+    count = len(robot.body.clamp_nodes)
+    if not count:
+        return ()
+    compliance = count / (float(robot.body.material.young_modulus.mean()) * robot.body.reach)
+    return (Parameter(KEYS[0], None, "N/m", 0.0, 0.0, SOFTEST * compliance, 1e-6 * compliance, "reciprocal"),)
+
+
+def _plate_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
+    """The coordinate is the compliance of the plate [rad/(N m)], which is 0 for the clamp."""
+    nodes = robot.body.mesh.nodes[robot.body.clamp_nodes]
+    if len(nodes) < 3:
+        return ()
+    width = float(
+        np.sort(np.ptp(nodes, axis=0))[-2]
+    )  # of the clamped face; a bar of that width bends by reach/(E w⁴/12) a moment
+    bending = 12.0 * robot.body.reach / (float(robot.body.material.young_modulus.mean()) * max(width, 1e-3) ** 4)
+    return (Parameter(KEYS[1], None, "N m/rad", 0.0, 0.0, 2.0 * bending, 1e-6 * bending, "reciprocal"),)
+
+
+def _apply_clamp(robot: Robot, entry: Entry) -> Robot:
+    if not any(key in entry for key in KEYS):
+        raise InputError("neither spring is given", where="base_compliance", expected=" or ".join(KEYS))
+    if not len(robot.body.clamp_nodes):
+        raise InputError("nothing of this body is clamped", where="base_compliance", expected="[[fixed]]")
+    spring, plate = (
+        float("inf") if entry.get(key, np.inf) == float("inf") else number(entry, key, "base_compliance", low=1e-9)
+        for key in KEYS
+    )
+    return robot.with_body(robot.body.with_clamp_stiffness(spring, turn=plate))
+
+
+BASE_COMPLIANCE = Effect("base_compliance", "a clamp that gives", _spring_parameters, _apply_clamp, keys=KEYS)
+BASE_ROTATION = Effect("base_compliance", "a clamp that gives", _plate_parameters, _apply_clamp, keys=KEYS)
+"""The same effect with the other key: the loop tries both."""

@@ -1,0 +1,414 @@
+"""From parameters to marker residuals: poses of the cameras, initial inputs and effects, over one or several recordings.
+
+The residual of a marker is  T_robot_camera · y − p(x),  y the measured point (after the camera's depth law) and p its
+place on the body in the state x. Where `rest.csv` measures the markers on the unloaded body, it says where they really
+sit: seat = T_robot_camera · y_rest, and how far seats lie from their declared places ties the pose down.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from femsense.core.arrays import BoolArray, FloatArray, IntArray, freeze
+from femsense.core.errors import DataError
+from femsense.core.pose import invert_pose, moved_poses, transform_points
+from femsense.fem.equilibrium import Equilibrium
+from femsense.fem.mesh import Embedding
+from femsense.model.drive import Walk, drive_of, has_history, inputs_wanted
+from femsense.model.effects import Effect, Entry, Parameter, build_entry
+from femsense.model.quasi_static_path import walk_along
+from femsense.model.recording import Recording
+from femsense.model.robot import Observation, Robot
+from femsense.model.variants import AtPoints
+from femsense.pointcloud.sheets import Crossings
+
+POSE_STEP = np.array([1e-5, 1e-5, 1e-5, 1e-6, 1e-6, 1e-6])
+"""Steps for derivatives by a pose [rad, m]."""
+TENSION_STEP = 1e-4
+"""Step for derivatives by a tension [N]."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Scene:
+    """The markers of one recording that a fit uses."""
+
+    recording: Recording
+    frames: IntArray
+    """Indices of the frames that are used, ascending, shape (f,)."""
+    frame: IntArray
+    """Frame index of each measured marker, shape (k,)."""
+    marker: IntArray
+    """Its index among the robot's markers, shape (k,)."""
+    view: IntArray
+    """The camera that saw it, shape (k,)."""
+    points: FloatArray
+    """Where it was measured [m], camera frame, shape (k, 3)."""
+    rest_marker: IntArray
+    """Markers that rest.csv has, as indices of the robot's markers, shape (r,)."""
+    rest_view: IntArray
+    """shape (r,)."""
+    rest_points: FloatArray
+    """[m], camera frame, shape (r, 3)."""
+    crossings: Crossings | None = None
+    """Where rows cross measured surfaces, camera frame; `points` are then their feet. None: points are markers."""
+
+    def pick(self, frames: IntArray) -> Scene:
+        """Return the scene of some of its frames."""
+        rows = np.isin(self.frame, frames)
+        return replace(
+            self,
+            frames=np.intersect1d(self.frames, frames),
+            frame=self.frame[rows],
+            marker=self.marker[rows],
+            view=self.view[rows],
+            points=self.points[rows],
+            crossings=None if self.crossings is None else self.crossings.pick(rows),
+        )
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Hypothesis:
+    """Effects whose parameters are fitted, on top of a robot."""
+
+    robot: Robot
+    terms: tuple[tuple[Effect, Entry, tuple[Parameter, ...]], ...] = ()
+    """(effect, what is fixed of its entry, parameters that are fitted)."""
+    settled: tuple[tuple[Effect, Entry], ...] = ()
+    """Effects without parameters, which the robot has already."""
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        return tuple(p for _, _, parameters in self.terms for p in parameters)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the effects, those without parameters first."""
+        return tuple(effect.name for effect, _ in self.settled) + tuple(effect.name for effect, _, _ in self.terms)
+
+    def entries(self, coordinates: FloatArray) -> list[Entry]:
+        """Return the tables of the terms, name included, for coordinates of the fit, shape (p,)."""
+        result, at = [], 0
+        for effect, seed, parameters in self.terms:
+            entry = build_entry(parameters, list(coordinates[at : at + len(parameters)]), seed)
+            result.append({"name": effect.name, **entry})
+            at += len(parameters)
+        return result
+
+    def robot_at(self, coordinates: FloatArray) -> Robot:
+        """Return the robot with the effects at coordinates, shape (p,)."""
+        robot, at = self.robot, 0
+        for (effect, _, parameters), entry in zip(self.terms, self.entries(coordinates)):
+            own = coordinates[at : at + len(parameters)]
+            at += len(parameters)
+            if parameters and not effect.discrete and all(c == p.null for p, c in zip(parameters, own)):
+                continue
+            robot = effect.apply(robot, {k: v for k, v in entry.items() if k != "name"})
+        return robot
+
+
+def make_scene(robot: Robot, recording: Recording, frames: IntArray) -> Scene:
+    """Return the markers of some frames of a recording. Raises DataError where there are none."""
+    known = {name: i for i, name in enumerate(robot.marker_names)}
+    number = np.array([known.get(name, -1) for name in recording.marker_names], dtype=np.int64)
+    marker = number[recording.marker_index] if len(recording.marker_index) else np.zeros(0, np.int64)
+    rows = np.isin(recording.marker_frame, frames) & (marker >= 0)
+    if not rows.any():
+        raise DataError("the recording has no markers that the robot knows in the frames that can be used")
+    used, none = np.intersect1d(frames, recording.marker_frame[rows]), np.zeros(0, np.int64)
+    scene = Scene(
+        recording,
+        used,
+        recording.marker_frame[rows],
+        marker[rows],
+        recording.marker_view[rows],
+        recording.marker_xyz[rows],
+        none,
+        none,
+        np.zeros((0, 3)),
+    )
+    return with_rest_markers(robot, scene)
+
+
+def with_rest_markers(robot: Robot, scene: Scene) -> Scene:
+    """Return a scene with the markers that rest.csv measures on the unloaded body."""
+    rest = scene.recording.rest
+    if rest is None:
+        return scene
+    known = {name: i for i, name in enumerate(robot.marker_names)}
+    every = np.array([known.get(name, -1) for name in rest.names], dtype=np.int64)
+    own = every >= 0
+    return replace(scene, rest_marker=every[own], rest_view=rest.view[own], rest_points=rest.positions[own])
+
+
+def undo_depth(points: FloatArray, seen: Observation) -> FloatArray:
+    """Return true camera points [m] from measured ones: measured distance = scale × true distance + offset."""
+    if seen.depth_scale != 1.0 or seen.depth_offset != 0.0:
+        distance = np.linalg.norm(points, axis=1, keepdims=True)
+        points = np.asarray(points * (distance - seen.depth_offset) / seen.depth_scale / distance)
+    for correct in seen.corrections:
+        points = correct(points)
+    return points
+
+
+def redo_depth(points: FloatArray, seen: Observation) -> FloatArray:
+    """Return what the camera measures of true camera points [m]; the inverse of `undo_depth` (corrections by fixed point)."""
+    if seen.depth_scale == 1.0 and seen.depth_offset == 0.0 and not seen.corrections:
+        return points
+    for correct in reversed(seen.corrections):
+        target = points
+        for _ in range(20):
+            points = points + (target - correct(points))
+    distance = np.linalg.norm(points, axis=1, keepdims=True)
+    return np.asarray(points * (seen.depth_scale * distance + seen.depth_offset) / distance)
+
+
+def in_robot_frame(points: FloatArray, view: IntArray, poses: Sequence[FloatArray], seen: Observation) -> FloatArray:
+    """Return measured points in the robot frame [m], each through the pose of its camera."""
+    corrected = undo_depth(points, seen)
+    result = np.empty_like(corrected)
+    for v, T in enumerate(poses):
+        result[view == v] = transform_points(T, corrected[view == v])
+    return result
+
+
+def as_measured(points: FloatArray, view: IntArray, poses: Sequence[FloatArray], seen: Observation) -> FloatArray:
+    """Return where each camera measures points of the robot frame [m], camera frame; the inverse of `in_robot_frame`."""
+    result = np.empty_like(points)
+    for v, T in enumerate(poses):
+        result[view == v] = transform_points(invert_pose(T), points[view == v])
+    return redo_depth(result, seen)
+
+
+def seats(robot: Robot, scene: Scene, poses: Sequence[FloatArray]) -> FloatArray:
+    """Return where the markers sit at rest [m], shape (m, 3): measured by rest.csv, or as declared."""
+    places = robot.marker_points.copy()
+    if len(scene.rest_marker):
+        places[scene.rest_marker] = in_robot_frame(scene.rest_points, scene.rest_view, poses, robot.observation)
+    return places
+
+
+def _ties(robot: Robot, scene: Scene, poses: Sequence[FloatArray]) -> Embedding:
+    """Return the ties of the markers to the body, at their seats."""
+    return robot.tie_markers(seats(robot, scene, poses)) if len(scene.rest_marker) else robot.markers
+
+
+def _tied_alike(robot: Robot, other: Robot) -> bool:
+    """Return whether the markers of two robots are tied to the same nodes in the same way, as far as declared places and cameras say."""
+    same_seats = robot.marker_points is other.marker_points and robot.observation == other.observation
+    return same_seats and robot.body.mesh is other.body.mesh and robot.marker_share is other.marker_share
+
+
+def marker_residual(robot: Robot, scene: Scene, poses: Sequence[FloatArray], model: Mapping[int, FloatArray]) -> FloatArray:
+    """Return measured minus modelled markers [m], shape (k, 3), along the axes of the robot; model: frame → markers (m, 3).
+
+    They are compared as the camera measures them. Measured points put right by a scale of depth would shrink with it, noise and all,
+    and a fit would take that for a better model. Of crossings of a measured surface: how far it lies outside of the model's points, along
+    its normal, shape (k, 1).
+    """
+    frames, number = np.unique(scene.frame, return_inverse=True)
+    each_frame = [model[k] for k in frames.tolist()]
+    predicted = np.stack(each_frame)[number, scene.marker] if each_frame else np.zeros((0, 3))
+    expected = as_measured(predicted, scene.view, poses, robot.observation)
+    if scene.crossings is not None:
+        return -scene.crossings.distance(expected)[:, None]
+    turns = np.array([T[:3, :3] for T in poses])[scene.view]
+    return np.asarray(np.einsum("kij,kj->ki", turns, scene.points - expected))
+
+
+def rest_residual(robot: Robot, scene: Scene, poses: Sequence[FloatArray]) -> FloatArray:
+    """Return how far the measured seats lie from the declared places [m], shape (r, 3)."""
+    return (seats(robot, scene, poses) - robot.marker_points)[scene.rest_marker]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class SceneJet:
+    """Marker residuals of a scene with their derivatives."""
+
+    residual: FloatArray
+    """[m], shape (k, c): c = 3 for markers, 1 for crossings of a measured surface; so in all that follows."""
+    rest: FloatArray
+    """Seat residual [m], shape (r, 3)."""
+    by_pose: FloatArray
+    """d residual / d pose step (rotation about the pivot, shift), shape (k, 3, 6 v)."""
+    rest_by_pose: FloatArray
+    """shape (r, 3, 6 v)."""
+    rest_by_effect: FloatArray
+    """d seat residual / d coordinate of the hypothesis, shape (r, 3, p)."""
+    by_initial: FloatArray
+    """d residual / d initial input, shape (k, 3, a or 0)."""
+    by_effect: FloatArray
+    """d residual / d coordinate of the hypothesis, shape (k, 3, p)."""
+    states: dict[int, Equilibrium]
+    """The equilibrium of each frame."""
+    by_input: FloatArray
+    """d residual / d tension that pulls in its own frame, cut off at 0 or not, shape (k, c, a); (k, c, 0) where it was not asked."""
+    pulled: BoolArray
+    """Whether the derivatives count the tension of a frame as not cut off, shape (F, a)."""
+
+    def pick(self, rows: BoolArray) -> SceneJet:
+        """Return the jet of some of the rows (k,)."""
+        return replace(
+            self,
+            residual=self.residual[rows],
+            by_pose=self.by_pose[rows],
+            by_initial=self.by_initial[rows],
+            by_effect=self.by_effect[rows],
+            by_input=self.by_input[rows],
+        )
+
+
+def evaluate_scene(
+    hypothesis: Hypothesis,
+    scene: Scene,
+    coordinates: FloatArray,
+    poses: Sequence[FloatArray],
+    initial: FloatArray | None,
+    *,
+    derivative: bool,
+    vary_initial: bool,
+    pivot: FloatArray,
+    starts: dict[int, Equilibrium] | None = None,
+    rough: bool = False,
+    known: dict[int, Equilibrium] | None = None,
+    vary_inputs: bool = False,
+    moves: FloatArray | None = None,
+    answers: dict[int, AtPoints] | None = None,
+) -> SceneJet:
+    """Evaluate marker residuals of a scene at a point of parameter space, and their derivatives by differences.
+
+    Each pose is moved about `pivot` by its six of the `moves`, shape (6 v,), and derivatives are by these; without them by a first move.
+    `starts` holds states of earlier evaluations near by and is brought up to date; states that are only tried may be
+    `rough`: a frame that Newton does not reach from there then has no equilibrium. `known` are the states at this very point, as far as it
+    moves the body; they serve where no derivative by what moves it is wanted. `answers` of an earlier evaluation at this very point serve
+    derivatives by other parameters, and are brought up to date. With `vary_inputs` come derivatives by the tension of
+    each frame (where the robot has a past, by that of all frames).
+
+    Raises:
+        DataError: a frame has no equilibrium.
+    """
+    robot = hypothesis.robot_at(coordinates)
+    begun, moves = poses, np.zeros(6 * len(poses)) if moves is None else moves
+    poses = moved_poses(begun, moves, pivot)
+    base = Walk(robot, drive_of(robot, scene.recording, initial=initial))
+    steps, variants = _variants(hypothesis, scene, coordinates, initial, base, vary_initial) if derivative else ([], [])
+    split, last = len(hypothesis.parameters) if derivative else 0, len(variants)
+    pulling = _pulling(hypothesis, base, steps, variants) if derivative and vary_inputs else []
+    places = {id(robot): _ties(robot, scene, poses)}
+    for v in variants:
+        if id(v.robot) not in places:
+            places[id(v.robot)] = places[id(robot)] if _tied_alike(v.robot, robot) else _ties(v.robot, scene, poses)
+
+    def ties(r: Robot) -> Embedding:
+        return places.get(id(r), places[id(robot)])
+
+    states: dict[int, Equilibrium] = {}
+    model: dict[int, FloatArray] = {}
+    shifted: list[dict[int, FloatArray]] = [{} for _ in variants]
+    if known is not None and not variants:
+        states, model = known, {k: ties(robot).positions(state.positions) for k, state in known.items()}
+    frames = [] if model else scene.frames.tolist()
+    for k, state, seen, varied in walk_along(base, frames, ties, variants, starts=starts, rough=rough, answers=answers):
+        states[k], model[k] = state, seen
+        for i in range(len(variants)):
+            shifted[i][k] = varied[i]
+    residual = marker_residual(robot, scene, poses, model)
+    columns = [(marker_residual(v.robot, scene, poses, m) - residual) / h for v, m, h in zip(variants, shifted, steps)]
+    by_pose, rest_by_pose = (
+        _pose_derivative(robot, scene, begun, moves, states, residual, pivot)
+        if derivative
+        else (np.zeros((*residual.shape, 0)), np.zeros((0, 3, 0)))
+    )
+    rest = rest_residual(robot, scene, poses)
+    rest_columns = [(rest_residual(v.robot, scene, poses) - rest) / h for v, h in zip(variants[:split], steps)]
+    pulled, by_input = inputs_wanted(robot, scene.recording, initial) >= 0.0, [columns[j] for j in pulling]
+    for i, j in ((i, j) for i, j in enumerate(pulling) if j < split):
+        columns[j] = columns[j] * pulled[scene.frame, i][:, None]
+    return SceneJet(
+        residual,
+        rest,
+        by_pose,
+        rest_by_pose,
+        _stack(rest_columns, rest),
+        _stack(columns[split:last], residual),
+        _stack(columns[:split], residual),
+        states,
+        _stack(by_input, residual),
+        pulled,
+    )
+
+
+def _stack(columns: list[FloatArray], residual: FloatArray) -> FloatArray:
+    return np.stack(columns, axis=2) if columns else np.zeros((*residual.shape, 0))
+
+
+def _variants(
+    hypothesis: Hypothesis, scene: Scene, coordinates: FloatArray, initial: FloatArray | None, base: Walk, vary_initial: bool
+) -> tuple[list[float], list[Walk]]:
+    """Return steps and walks: first one for each coordinate, then one for each initial input if they vary."""
+    steps, walks = [], []
+    for j, parameter in enumerate(hypothesis.parameters):
+        h = parameter.step if coordinates[j] + parameter.step <= parameter.high else -parameter.step
+        moved = coordinates.copy()
+        moved[j] += h
+        robot = hypothesis.robot_at(moved)
+        steps.append(h)
+        walks.append(Walk(robot, drive_of(robot, scene.recording, initial=initial)))
+    names = base.robot.body.cable_names if vary_initial else ()
+    start = np.zeros(len(names)) if initial is None else initial
+    for i in range(len(names)):
+        h = TENSION_STEP if scene.recording.actuation == "tension" else 1e-6
+        moved = start.copy()
+        moved[i] += h
+        steps.append(h)
+        walks.append(Walk(base.robot, drive_of(base.robot, scene.recording, initial=moved)))
+    return steps, walks
+
+
+def _pulling(hypothesis: Hypothesis, base: Walk, steps: list[float], variants: list[Walk]) -> list[int]:
+    """Return which variants pull a little more at each cable in every frame; none where nothing moves tensions.
+
+    They are added; where nothing depends on other frames, they are put in the place of those of the cables' zeros, whose derivative is
+    theirs wherever a tension is not cut off.
+    """
+    driving = "cable_offset" in hypothesis.names or len(variants) > len(hypothesis.parameters)
+    if base.drive.control != "tension" or not driving:
+        return []
+    past = bool(base.robot.creep) or any(has_history(w.robot) for w in (base, *variants))
+    zeros = {} if past else {p.part: j for j, p in enumerate(hypothesis.parameters) if p.key == "tension_n"}
+    chosen = []
+    for i, name in enumerate(base.robot.body.cable_names):
+        inputs = base.drive.inputs.copy()
+        inputs[:, i] += TENSION_STEP
+        walk, at = Walk(base.robot, replace(base.drive, inputs=freeze(inputs))), zeros.get(name, len(variants))
+        steps[at : at + 1], variants[at : at + 1] = [TENSION_STEP], [walk]
+        chosen.append(at)
+    return chosen
+
+
+def _pose_derivative(
+    robot: Robot,
+    scene: Scene,
+    begun: Sequence[FloatArray],
+    moves: FloatArray,
+    states: Mapping[int, Equilibrium],
+    residual: FloatArray,
+    pivot: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Return the derivatives of marker and seat residuals by the move of each pose; only seats that move need the states again."""
+    columns, rest_columns = [], []
+    rest = rest_residual(robot, scene, moved_poses(begun, moves, pivot))
+    still = {k: robot.markers.positions(s.positions) for k, s in states.items()} if not len(scene.rest_marker) else None
+    for j, h in enumerate(np.tile(POSE_STEP, len(begun))):
+        further = moves.copy()
+        further[j] += h
+        moved = moved_poses(begun, further, pivot)
+        model = still
+        if model is None:
+            place = robot.tie_markers(seats(robot, scene, moved))
+            model = {k: place.positions(s.positions) for k, s in states.items()}
+        columns.append((marker_residual(robot, scene, moved, model) - residual) / h)
+        rest_columns.append((rest_residual(robot, scene, moved) - rest) / h)
+    return np.stack(columns, axis=2), np.stack(rest_columns, axis=2)

@@ -1,0 +1,241 @@
+"""The quasi-static walk along a recording: from recorded inputs to one equilibrium a frame.
+
+History (friction of cables, creep) is carried from frame to frame in the order of time. Without history, frames with the
+same inputs and loads share one solve.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from femsense.core.arrays import FloatArray
+from femsense.core.errors import DataError
+from femsense.core.parallel import each
+from femsense.fem.body import BodyModel
+from femsense.fem.cables import bend_angles, rub
+from femsense.fem.clamp import rigid_give
+from femsense.fem.equilibrium import Equilibrium
+from femsense.fem.linalg.refinement import Refined
+from femsense.fem.mesh import Embedding
+from femsense.model.drive import Walk, _key, has_history
+from femsense.model.robot import Robot
+from femsense.model.variants import AtPoints, _Balance, _require, _room, _Variants, solve_frame
+
+TRIED = 1e-8
+"""Relative tolerance of states that are only tried: below a thousandth of a millimetre, where derivatives want a tenth of it."""
+PARTS, SHORTEST_PART = 4, 6
+"""Parts at most that frames are walked in side by side where each starts from the one before, and frames of a part at least."""
+PAST, PAST_TRIED = 1e-8, 1e-6
+"""Tensions along a cable that agree so well [N], and as shares of the largest, are the same past; the latter for states that are only tried."""
+
+
+def walk_along(
+    walk: Walk,
+    frames: Sequence[int],
+    ties: Callable[[Robot], Embedding],
+    variants: Sequence[Walk] = (),
+    *,
+    starts: dict[int, Equilibrium] | None = None,
+    rough: bool = False,
+    answers: dict[int, AtPoints] | None = None,
+) -> Iterator[tuple[int, Equilibrium, FloatArray, FloatArray]]:
+    """Solve frames in order, and with each the same frame of variants that differ from it by little.
+
+    A variant's state is the linear response of the base state to the forces that the variant adds there, so that all of them
+    together cost one factorisation and one solve with many right-hand sides; they must differ by little. A variant on another
+    mesh, or with a rigid clamp where that of the base gives, is solved for itself.
+
+    Arguments:
+        walk: the base.
+        frames: indices, ascending; frames between them are solved too where the past matters.
+        ties: robot → the points that are observed, p of them.
+        variants: other robots or drives.
+        starts: frame → a state near by, such as that of an earlier walk; brought up to date as frames are solved. Their
+            factors are kept as long as they fit into FACTOR_MEMORY.
+        rough: states are only tried, where one near by is known.
+        answers: frame → what its points answer to, from an earlier walk along these very states with other variants; what is missing is
+            added where the points are few.
+
+    Yields:
+        frame index, equilibrium, where the points are [m], shape (p, 3), and where those of the variants are, shape (v, p, 3).
+    """
+    wanted = sorted(set(int(f) for f in frames))
+    past = has_history(walk.robot)
+    todo = list(range(max(wanted) + 1)) if wanted and any(has_history(w.robot) for w in (walk, *variants)) else wanted
+    alike = _alike(walk, todo, past)
+    unique = [k for k in todo if alike[k] == k]
+    bases = dict(zip(unique, _base_states(walk, unique, starts, past, rough)))
+    seen = {k: ties(walk.robot).positions(bases[k].positions) for k in {alike[k]: None for k in wanted}}
+    others = {k: np.zeros((len(variants), *seen[alike[k]].shape)) for k in wanted}
+    lent = {k: s.factor for k, s in (starts or {}).items() if k in bases and s.positions is bases[k].positions}
+    observed = _Variants(walk, variants, {k: bases[alike[k]] for k in todo}, alike, others, ties, lent, answers)
+    room = _room(len(unique))
+    for k, factor in observed.write():
+        plain = factor.plain if isinstance(factor, Refined) else factor
+        if plain is not None and starts is not None and plain.bytes < _most_lent(starts[k], room):
+            starts[k] = replace(starts[k], factor=plain)
+    for k in wanted:
+        yield k, bases[alike[k]], seen[alike[k]], others[k]
+
+
+def _alike(walk: Walk, frames: list[int], past: bool) -> dict[int, int]:
+    """Return for each frame the first one with the same state: the same inputs and loads, with a past the frames just before."""
+    first: dict[bytes, int] = {}
+    result: dict[int, int] = {}
+    last = b""
+    for k in frames:
+        key = _key(walk, k)
+        if past and key != last:
+            first[key] = k
+        result[k] = first.setdefault(key, k)
+        last = key
+    return result
+
+
+def _most_lent(state: Equilibrium, room: float) -> float:
+    """Return how many bytes a factor may take to be kept with a state: no more than the one it takes the place of, which is near enough."""
+    return room if state.factor is None else min(room, state.factor.bytes + 1)
+
+
+def _base_states(
+    walk: Walk, frames: list[int], starts: dict[int, Equilibrium] | None, past: bool, rough: bool
+) -> Iterator[Equilibrium]:
+    """Yield the states of frames, without their factors; `starts` gets them with these where they fit into memory."""
+    room = _room(len(frames))
+    near = {k: state for k, state in sorted((starts or {}).items()) if _clamp_fits(walk.robot.body, state)}
+
+    def keep(k: int, state: Equilibrium) -> Equilibrium:
+        bare = replace(state, factor=None)
+        if starts is not None:
+            starts[k] = state if state.factor is not None and state.factor.bytes < room else bare
+        return bare
+
+    known, fits = near.keys() & set(frames), bool(near)
+    if not near:
+        near = {k: start for k, state in sorted((starts or {}).items()) if (start := _taken_along(walk, k, state)) is not None}
+    if near:
+        near.update(_nearest(walk, near, [k for k in frames if k not in near]))
+
+    def again(k: int, before: tuple[FloatArray, ...] | None = None, start: Equilibrium | None = None) -> Equilibrium:
+        start, tried = near[k] if start is None else start, rough and k in known
+        return _require(
+            solve_frame(
+                walk,
+                k,
+                start=start,
+                before=before,
+                reuse_factor=True,
+                relative_tolerance=TRIED if tried else 1e-9,
+                rough=tried,
+                single=True,
+            ),
+            k,
+        )
+
+    if near:
+        with contextlib.suppress(*(() if fits else (DataError,))):  # taken along, a body may not come to rest: then from rest
+            states = list(_march(walk, frames, near, again, rough) if past else each(again, frames))
+            yield from (keep(k, state) for k, state in zip(frames, states))
+            return
+
+    def along(part: list[int]) -> list[Equilibrium]:
+        states: list[Equilibrium] = []
+        for k in part:
+            last = states[-1] if states else None
+            before = last.segment_tensions if past and last is not None else None
+            states.append(keep(k, _require(solve_frame(walk, k, start=last, before=before, single=True), k)))
+        return states
+
+    for states in each(along, [frames] if past else _parts(frames)):
+        yield from states
+
+
+def _parts(frames: list[int]) -> list[list[int]]:
+    """Return frames cut into parts that are walked side by side; as many wherever it runs."""
+    size = max(SHORTEST_PART, -(-len(frames) // PARTS))
+    return [frames[i : i + size] for i in range(0, len(frames), size)]
+
+
+def _nearest(walk: Walk, near: dict[int, Equilibrium], frames: list[int]) -> dict[int, Equilibrium]:
+    """Return for other frames the states of those frames whose inputs and loads are most like theirs."""
+    drive = walk.drive
+    load = np.zeros((len(drive.inputs), 3))
+    np.add.at(load, drive.load_frame, drive.load_forces)
+    gravity = np.zeros((len(load), 0)) if drive.gravity is None else drive.gravity
+    table = np.hstack([drive.inputs, drive.pressures, gravity, load])
+    table = (table - table[0]) / np.maximum(np.ptp(table, axis=0), 1e-12)
+    known = list(near)
+    return {k: near[known[int(np.linalg.norm(table[known] - table[k], axis=1).argmin())]] for k in frames}
+
+
+def _march(
+    walk: Walk, frames: list[int], near: dict[int, Equilibrium], again: Callable[..., Equilibrium], rough: bool
+) -> list[Equilibrium]:
+    """Return the states of frames with a past, from states near by.
+
+    The frames are cut into parts that are walked side by side, each from the tensions along the cables that the states near by let
+    expect there. Then, part after part, frames are solved again until these are what the part before left.
+    """
+    parts = _parts(frames)
+    expected = _expected_tensions(walk, frames, near)
+    assumed = [None, *(expected[part[-1]] for part in parts[:-1])]
+    result: dict[int, Equilibrium] = {}
+    slack = PAST_TRIED if rough else PAST
+
+    def along(i: int) -> list[Equilibrium]:
+        states, before = [], assumed[i]
+        for k in parts[i]:
+            states.append(again(k, before))
+            before = states[-1].segment_tensions
+        return states
+
+    for i, states in enumerate(each(along, range(len(parts)))):
+        before = result[parts[i - 1][-1]].segment_tensions if i else None
+        result.update(zip(parts[i], states))
+        last = assumed[i]
+        for k in parts[i]:
+            if before is None or last is None or _as_before(before, last, slack):
+                break
+            last, result[k] = result[k].segment_tensions, again(k, before, result[k])
+            before = result[k].segment_tensions
+    return [result[k] for k in frames]
+
+
+def _expected_tensions(walk: Walk, frames: list[int], near: dict[int, Equilibrium]) -> dict[int, tuple[FloatArray, ...]]:
+    """Return the tensions along the cables in each frame if they bend as in states near by."""
+    result: dict[int, tuple[FloatArray, ...]] = {}
+    held, cables = walk.drive.control == "displacement", walk.robot.body.cables
+    before = tuple(np.zeros(len(c.path)) for c in cables)
+    for k in frames:
+        state = near[k]
+        motors = [state.tension[c.name] if held else float(T) for c, T in zip(cables, walk.drive.inputs[k])]
+        before = tuple(rub(c, bend_angles(c, state.positions), b, max(T, 0.0)) for c, b, T in zip(cables, before, motors))
+        result[k] = before
+    return result
+
+
+def _as_before(now: tuple[FloatArray, ...], then: tuple[FloatArray, ...], slack: float) -> bool:
+    """Return whether the tensions along all cables are what they were."""
+    return all(np.abs(a - b).max(initial=0.0) <= slack * max(1.0, float(a.max(initial=0.0))) for a, b in zip(now, then))
+
+
+def _clamp_fits(body: BodyModel, state: Equilibrium) -> bool:
+    """Return whether a state can serve as a start as it is: one whose clamp gave way elsewhere would be torn back, one whose clamp has not yet would let
+    go of the whole load at once."""
+    return body.clamp_is_rigid != has_given(body, state)
+
+
+def _taken_along(walk: Walk, frame: int, state: Equilibrium) -> Equilibrium | None:
+    """Return a state with a rigid clamp as a start for a clamp that gives, the whole body taken along; None where that is no start."""
+    balance = _Balance(walk, frame, state)
+    moved = rigid_give(walk.robot.body, state.positions, balance.whole(walk, balance.along(walk), state.positions))
+    return None if moved is None else replace(state, positions=moved)
+
+
+def has_given(body: BodyModel, state: Equilibrium) -> bool:
+    """Return whether the clamp has given way in a state."""
+    return bool(np.abs(state.positions[body.clamped] - body.mesh.nodes[body.clamped]).max(initial=0.0) >= 1e-9)

@@ -1,0 +1,145 @@
+"""A robot as the program sees it: a body, what is measured on it, and how commands become inputs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from femsense.core.arrays import FloatArray, IntArray, freeze
+from femsense.fem.body import BodyModel
+from femsense.fem.mesh import Embedding, embed_points, surface_triangles
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Actuation:
+    """From recorded cable inputs to true ones, one value a cable, in the order of the body's cables."""
+
+    gain: FloatArray
+    """true = gain × recorded [1], shape (a,)."""
+    tension_offset: FloatArray
+    """true = max(0, recorded + offset) [N], shape (a,); at rest too."""
+    displacement_offset: FloatArray
+    """true = recorded + offset [m], shape (a,)."""
+    slack: FloatArray
+    """Play that is taken up before a cable pulls [m], shape (a,)."""
+    stretch_stiffness: FloatArray
+    """Cable stiffness [N/m], shape (a,); inf: does not stretch."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Observation:
+    """What stands between the body and the measured points."""
+
+    depth_scale: float = 1.0
+    """measured distance along the ray = scale × true distance + offset [1]."""
+    depth_offset: float = 0.0
+    """[m]."""
+    corrections: tuple[Callable[[FloatArray], FloatArray], ...] = ()
+    """What a user's effects do after that: measured points [m], (k, 3), camera frame → truer ones."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Robot:
+    """A robot: a body with markers, features and the effects that its model holds."""
+
+    name: str
+    body: BodyModel
+    marker_names: tuple[str, ...]
+    marker_points: FloatArray
+    """Markers at rest [m], shape (k, 3)."""
+    markers: Embedding
+    """The markers' ties to the body."""
+    features: IntArray
+    """Surface nodes that serve as feature points, spread evenly over the free surface, shape (e,)."""
+    color_rgb: FloatArray | None
+    """What the segmentation looks for, each in [0, 1], shape (3,)."""
+    actuation: Actuation
+    observation: Observation
+    creep: tuple[tuple[float, float], ...] = ()
+    """Terms (fraction [1], time [s]) of the creep compliance."""
+    document: dict[str, Any] | None = None
+    """The declared robot.toml (before effects), as plain tables; None where the robot was made in Python."""
+    folder: Path | None = None
+    """Where robot.toml and the mesh stand."""
+    marker_share: FloatArray | None = None
+    """By which share each marker follows the body, shape (k,): 1 sits on it, 0 sits on what holds it; None: all sit on it."""
+    surface_points: int = 0
+    """So many of the markers, the last ones, are points of the surface that clouds are measured at; nobody glued them on."""
+
+    def with_body(self, body: BodyModel) -> Robot:
+        """Return the robot with another body on the same mesh."""
+        return replace(self, body=body)
+
+    @property
+    def glued_names(self) -> tuple[str, ...]:
+        """Names of the markers proper."""
+        return self.marker_names[: len(self.marker_names) - self.surface_points]
+
+    def with_surface_points(self, points: FloatArray) -> Robot:
+        """Return the robot with points of its surface at rest [m], shape (p, 3), behind its markers."""
+        names = tuple(f"surface {i + 1}" for i in range(len(points)))
+        share = None if self.marker_share is None else np.concatenate([self.marker_share, np.ones(len(points))])
+        more = replace(
+            self, marker_names=(*self.marker_names, *names), marker_share=share, surface_points=self.surface_points + len(points)
+        )
+        return more.with_marker_points(np.vstack([self.marker_points.reshape(-1, 3), points]))
+
+    def without_surface_points(self) -> Robot:
+        """Return the robot with its markers proper only."""
+        k = len(self.glued_names)
+        share = None if self.marker_share is None else self.marker_share[:k]
+        return replace(
+            self,
+            marker_names=self.glued_names,
+            marker_points=self.marker_points[:k],
+            markers=self.markers[np.arange(k)],
+            marker_share=share,
+            surface_points=0,
+        )
+
+    def with_marker_points(self, points: FloatArray) -> Robot:
+        """Return the robot with its markers elsewhere at rest [m], shape (k, 3)."""
+        return replace(self, marker_points=freeze(points), markers=self.tie_markers(points))
+
+    def tie_markers(self, places: FloatArray) -> Embedding:
+        """Return the ties of all markers when they sit at places [m], shape (k, 3)."""
+        ties = embed_points(self.body.mesh, places)
+        return ties if self.marker_share is None else ties.following(places, self.marker_share)
+
+
+def plain_actuation(cable_count: int) -> Actuation:
+    """Return the actuation of cables that do exactly what was recorded."""
+    one, zero = np.ones(cable_count), np.zeros(cable_count)
+    return Actuation(freeze(one), freeze(zero), freeze(zero), freeze(zero), freeze(one * np.inf))
+
+
+def spread_features(body: BodyModel, count: int, *, among: IntArray | None = None) -> IntArray:
+    """Return surface nodes spread evenly over the free surface (farthest-point sampling), shape (≤ count,).
+
+    Only nodes `among` the given ones are taken, if given. Nodes of the clamp do not count; the first is the free surface node that is farthest from the clamp, so that the
+    result is the same whatever the numbering.
+    """
+    surface = np.unique(surface_triangles(body.mesh)) if among is None else among
+    free = np.setdiff1d(surface, body.clamped)
+    if not len(free) or count <= 0:
+        return np.zeros(0, dtype=np.int64)
+    x = body.mesh.nodes[free]
+    anchor = body.mesh.nodes[body.clamped].mean(axis=0) if len(body.clamped) else x.mean(axis=0)
+    first = int(np.argmax(np.linalg.norm(x - anchor, axis=1)))
+    return freeze(free[spread_points(x, count, first=first)], np.int64)
+
+
+def spread_points(points: FloatArray, count: int, *, first: int = 0) -> IntArray:
+    """Return which of some points (p, 3) are spread evenly among them (farthest-point sampling), shape (≤ count,)."""
+    if not len(points) or count <= 0:
+        return np.zeros(0, dtype=np.int64)
+    chosen = [first]
+    distance = np.linalg.norm(points - points[first], axis=1)
+    while len(chosen) < min(count, len(points)):
+        chosen.append(int(np.argmax(distance)))
+        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
+    return np.array(chosen, dtype=np.int64)

@@ -1,0 +1,1 @@
+"""Contacts and forces, frame by frame."""

@@ -1,0 +1,265 @@
+"""What the commands leave behind: calibration.json, the files of a run, loop.json with the improved robot.
+
+Everything is written beside and renamed. run.json and loop.json are the last of their folder to appear and the first to go,
+so that a folder that has them is complete; they hold what it was made from, so that a second run sees that nothing is to be done.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from femsense.calib.calibration import Calibration
+from femsense.calib.files import calibration_document, write_calibration
+from femsense.core.arrays import freeze
+from femsense.core.errors import InputError
+from femsense.io.files import json_text, write_beside, write_csv, write_json
+from femsense.io.provenance import _text_hash, recording_input, robot_input, versions
+from femsense.io.result_folder import RUN_FILES, _check_folder, _read_document, _results_folder, _table
+from femsense.io.tables import read_csv
+
+if TYPE_CHECKING:
+    from femsense.model.recording import Recording
+    from femsense.model.robot import Robot
+    from femsense.sensing.types import ContactForce, FrameReport, Run, States
+
+RUN_FORMAT = "femsense-run-1"
+CONTACT_COLUMNS = (
+    "frame",
+    "time_s",
+    "contact",
+    "x_m",
+    "y_m",
+    "z_m",
+    "nx",
+    "ny",
+    "nz",
+    "fx_n",
+    "fy_n",
+    "fz_n",
+    "force_n",
+    "std_n",
+    "source",
+)
+FRAME_COLUMNS = ("frame", "time_s", "status", "contacts", "matched", "rms_before_m", "rms_after_m", "ms")
+
+
+# What results were made from
+
+
+def run_inputs(
+    robot: Robot, recording: Recording, calibration: Calibration | None, *, at: npt.ArrayLike | None = None
+) -> dict[str, Any]:
+    """Return what a run is made from: name or place and SHA-256 of each input, and the options.
+
+    Arguments:
+        robot, recording: as loaded.
+        calibration: None where the run calibrates by itself.
+        at: declared places of contact [m], shape (k, 3).
+    """
+    own = None if calibration is None else {"sha256": _text_hash(json_text(calibration_document(calibration)))}
+    options = {"at": None if at is None else np.asarray(at, dtype=np.float64).reshape(-1, 3).tolist()}
+    return {"robot": robot_input(robot), "recording": recording_input(recording), "calibration": own, "options": options}
+
+
+# Runs
+
+
+def write_run(
+    run: Run,
+    folder: str | Path,
+    *,
+    inputs: Mapping[str, Any],
+    seconds: float | None = None,
+    calibration: Calibration | None = None,
+) -> Path:
+    """Write contacts.csv, frames.csv, states.npz, the calibration and at last run.json.
+
+    Arguments:
+        run: of `estimate`.
+        folder: made where it is missing; its other files stay.
+        inputs: of `run_inputs`.
+        seconds: how long the estimate took [s].
+        calibration: what it was made with; stands beside it as calibration.json.
+
+    Returns:
+        the folder.
+
+    Raises:
+        InputError: see `check_run_folder`.
+    """
+    check_run_folder(folder)
+    with _results_folder(folder, "run.json") as part:
+        if calibration is not None:
+            write_calibration(calibration, part / "calibration.json")
+        write_csv(part / "contacts.csv", CONTACT_COLUMNS, [_contact_row(contact) for contact in run.contacts])
+        cables, chambers = run.robot.body.cable_names, run.robot.body.chamber_names
+        columns = [*FRAME_COLUMNS, *(f"tension_{name}_n" for name in cables), *(f"pressure_{name}_pa" for name in chambers)]
+        write_csv(part / "frames.csv", columns, [_frame_row(frame, cables, chambers) for frame in run.frames])
+        _write_states(run.states, part / "states.npz")
+        write_json(part / "run.json", _run_document(run, inputs, seconds))
+    return Path(folder)
+
+
+def check_run_folder(folder: str | Path) -> None:
+    """Raise InputError where a run cannot be written: in a robot, a recording or a loop, or where a file stands."""
+    _check_folder(Path(folder).expanduser(), ("robot.toml", "recording.toml", "loop.json"))
+
+
+def read_run(folder: str | Path, *, robot: Robot | None = None) -> Run:
+    """Read a run back.
+
+    Arguments:
+        folder: of `write_run`.
+        robot: by default loaded from where run.json says it was.
+
+    Raises:
+        InputError: files are missing or broken, or the robot is no longer there.
+    """
+    from femsense.sensing.types import Run
+
+    root = Path(folder).expanduser()
+    missing = [name for name in RUN_FILES if not (root / name).is_file()]
+    if missing:
+        raise InputError(
+            "not a complete run",
+            where=root,
+            found=f"no {', '.join(missing)}",
+            expected="a folder that femsense estimate wrote",
+            hint="femsense estimate … -o RUN",
+        )
+    document = _read_document(root / "run.json", RUN_FORMAT)
+    known = robot or _robot_of_run(document, root)
+    recording = _table(_table(document, "inputs", root / "run.json"), "recording", root / "run.json").get("path")
+    return Run(
+        contacts=_read_contacts(root / "contacts.csv"),
+        frames=_read_frames(root / "frames.csv"),
+        states=read_states(root / "states.npz"),
+        robot=known,
+        recording_folder=None if recording is None else Path(recording),
+        known_loads=tuple(document.get("known_loads", [])),
+    )
+
+
+def read_states(path: str | Path) -> States:
+    """Read states.npz. Raises InputError."""
+    from femsense.sensing.types import States
+
+    file = Path(path)
+    try:
+        with np.load(file, allow_pickle=False) as data:
+            arrays = {name: data[name] for name in ("time_s", "nodes_m", "tets", "rest_nodes_m")}
+    except Exception as error:  # whatever the archive reader meets in a broken file
+        raise InputError("not readable", where=file, found=error, expected="arrays time_s, nodes_m, tets, rest_nodes_m") from None
+    return States(
+        time_s=freeze(arrays["time_s"]),
+        nodes_m=freeze(arrays["nodes_m"], np.float32),
+        tets=freeze(arrays["tets"], np.int64),
+        rest_nodes_m=freeze(arrays["rest_nodes_m"]),
+    )
+
+
+def _contact_row(contact: ContactForce) -> list[object]:
+    c = contact
+    return [c.frame, c.time_s, c.contact, *c.position_m, *c.normal, *c.force_n_xyz, c.force_n, c.std_n, c.source]
+
+
+def _frame_row(frame: FrameReport, cables: Sequence[str], chambers: Sequence[str]) -> list[object]:
+    drives = [*(frame.tension_n.get(name) for name in cables), *(frame.pressure_pa.get(name) for name in chambers)]
+    return [*(getattr(frame, name) for name in FRAME_COLUMNS), *drives]
+
+
+def _write_states(states: States, path: Path) -> None:
+    with write_beside(path) as part, part.open("wb") as stream:
+        np.savez_compressed(
+            stream,
+            time_s=np.asarray(states.time_s, dtype=np.float64),
+            nodes_m=np.asarray(states.nodes_m, dtype=np.float32),
+            tets=np.asarray(states.tets, dtype=np.int32),
+            rest_nodes_m=np.asarray(states.rest_nodes_m, dtype=np.float64),
+        )
+
+
+def _run_document(run: Run, inputs: Mapping[str, Any], seconds: float | None) -> dict[str, Any]:
+    times = np.array([frame.ms for frame in run.frames if frame.status == "ok"], dtype=np.float64)
+    good = [frame.status for frame in run.frames].count("ok")
+    return {
+        "format": RUN_FORMAT,
+        "robot": run.robot.name,
+        "frames": len(run.frames),
+        "frames_ok": good,
+        "contacts": len(run.contacts),
+        "known_loads": run.known_loads,
+        "inputs": inputs,
+        "versions": versions(),
+        "timing": {"seconds": seconds, "ms_per_frame_median": float(np.median(times)) if len(times) else None},
+    }
+
+
+def _robot_of_run(document: Mapping[str, Any], root: Path) -> Robot:
+    from femsense.io.robot_toml import load_robot
+
+    path = _table(_table(document, "inputs", root / "run.json"), "robot", root / "run.json").get("path")
+    if path is None or not Path(path).is_dir():
+        raise InputError(
+            "the robot of this run is not there",
+            where=root / "run.json",
+            found=path or "a robot made in Python",
+            expected="its folder",
+            hint="read_run(folder, robot=…)",
+        )
+    return load_robot(path)
+
+
+def _read_contacts(file: Path) -> tuple[ContactForce, ...]:
+    from femsense.sensing.types import ContactForce
+
+    table = read_csv(file, required=CONTACT_COLUMNS)
+    frames, contacts = table.integers("frame"), table.integers("contact")
+    values, sources = table.numbers(("time_s", *CONTACT_COLUMNS[3:14]), empty_is_nan=True), table.text("source")
+    return tuple(
+        ContactForce(
+            frame=int(frames[i]),
+            time_s=float(row[0]),
+            contact=int(contacts[i]),
+            position_m=freeze(row[1:4]),
+            normal=freeze(row[4:7]),
+            force_n_xyz=freeze(row[7:10]),
+            force_n=float(row[10]),
+            std_n=float(row[11]),
+            source=sources[i],
+        )
+        for i, row in enumerate(values)
+    )
+
+
+def _read_frames(file: Path) -> tuple[FrameReport, ...]:
+    from femsense.sensing.types import FrameReport
+
+    table = read_csv(file, required=FRAME_COLUMNS, prefixes=("tension_", "pressure_"))
+    tensions = [c for c in table.columns if c.startswith("tension_") and c.endswith("_n")]
+    pressures = [c for c in table.columns if c.startswith("pressure_") and c.endswith("_pa")]
+    cables = [c.removeprefix("tension_").removesuffix("_n") for c in tensions]
+    chambers = [c.removeprefix("pressure_").removesuffix("_pa") for c in pressures]
+    counts = {name: table.integers(name) for name in ("frame", "contacts", "matched")}
+    values = table.numbers(("time_s", "rms_before_m", "rms_after_m", "ms", *tensions, *pressures), empty_is_nan=True)
+    status = table.text("status")
+    return tuple(
+        FrameReport(
+            frame=int(counts["frame"][i]),
+            time_s=float(row[0]),
+            status=status[i],
+            contacts=int(counts["contacts"][i]),
+            matched=int(counts["matched"][i]),
+            rms_before_m=float(row[1]),
+            rms_after_m=float(row[2]),
+            ms=float(row[3]),
+            tension_n={name: float(value) for name, value in zip(cables, row[4:])},
+            pressure_pa={name: float(value) for name, value in zip(chambers, row[4 + len(cables) :])},
+        )
+        for i, row in enumerate(values)
+    )

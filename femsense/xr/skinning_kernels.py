@@ -1,0 +1,399 @@
+"""Inner loops of the skinning fit, compiled: rigid sweeps over the bones of a frame, weights of single vertices.
+
+Plain loops over small arrays, which compile in a moment and need no linear-algebra library.
+"""
+
+# mypy: disable-error-code="untyped-decorator"
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from femsense.core.arrays import BoolArray, FloatArray, IntArray
+
+INFLUENCES = 4
+CANDIDATES = 10
+"""Bones among which the weights of a vertex are sought."""
+
+
+# ---- poses ------------------------------------------------------------------------------------------------------------
+
+
+@njit(cache=True)
+def rotation_of(covariance: FloatArray, R: FloatArray) -> None:
+    """Write the rotation R (3, 3) with the largest trace(R C), for C = Σ w p qᵀ: it turns p to q.
+
+    Horn 1987: its quaternion is the eigenvector of the largest eigenvalue of a symmetric 4 × 4 matrix, found by Jacobi
+    rotations. Always proper, also for flat and mirrored clouds.
+    """
+    C = covariance
+    K, V = np.zeros((4, 4)), np.eye(4)
+    K[0, 0] = C[0, 0] + C[1, 1] + C[2, 2]
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        K[0, i + 1] = K[i + 1, 0] = C[j, k] - C[k, j]
+        K[i + 1, i + 1] = C[i, i] - C[j, j] - C[k, k]
+        K[j + 1, k + 1] = K[k + 1, j + 1] = C[j, k] + C[k, j]
+    diagonalise(K, V)
+    best = 0
+    for i in range(1, 4):
+        if K[i, i] > K[best, best]:
+            best = i
+    w, x, y, z = V[0, best], V[1, best], V[2, best], V[3, best]
+    n = w * w + x * x + y * y + z * z
+    R[0, 0], R[0, 1], R[0, 2] = 1.0 - 2.0 * (y * y + z * z) / n, 2.0 * (x * y - z * w) / n, 2.0 * (x * z + y * w) / n
+    R[1, 0], R[1, 1], R[1, 2] = 2.0 * (x * y + z * w) / n, 1.0 - 2.0 * (x * x + z * z) / n, 2.0 * (y * z - x * w) / n
+    R[2, 0], R[2, 1], R[2, 2] = 2.0 * (x * z - y * w) / n, 2.0 * (y * z + x * w) / n, 1.0 - 2.0 * (x * x + y * y) / n
+
+
+@njit(cache=True)
+def diagonalise(K: FloatArray, V: FloatArray) -> None:
+    """Turn a symmetric 4 × 4 matrix into its eigenvalues on the diagonal, V (identity before) into its eigenvectors.
+
+    Cyclic Jacobi rotations (Golub and Van Loan, Matrix Computations, 8.5).
+    """
+    for _ in range(20):
+        off, size = 0.0, 0.0
+        for i in range(4):
+            size += K[i, i] * K[i, i]
+            for j in range(i):
+                off += K[i, j] * K[i, j]
+        if off <= 1e-32 * size or off == 0.0:
+            return
+        for p in range(3):
+            for q in range(p + 1, 4):
+                if K[p, q] != 0.0:
+                    jacobi_rotation(K, V, p, q)
+
+
+@njit(cache=True)
+def jacobi_rotation(K: FloatArray, V: FloatArray, p: int, q: int) -> None:
+    """Turn K in the plane p, q so that K[p, q] vanishes, and V along."""
+    ratio = (K[q, q] - K[p, p]) / (2.0 * K[p, q])
+    t = 1.0 / (abs(ratio) + np.sqrt(1.0 + ratio * ratio))
+    if ratio < 0.0:
+        t = -t
+    c = 1.0 / np.sqrt(1.0 + t * t)
+    s = t * c
+    for i in range(4):
+        a, b = K[i, p], K[i, q]
+        K[i, p], K[i, q] = c * a - s * b, s * a + c * b
+    for i in range(4):
+        a, b = K[p, i], K[q, i]
+        K[p, i], K[q, i] = c * a - s * b, s * a + c * b
+    for i in range(4):
+        a, b = V[i, p], V[i, q]
+        V[i, p], V[i, q] = c * a - s * b, s * a + c * b
+
+
+@njit(cache=True)
+def misfit(N: FloatArray, Y: FloatArray, M: FloatArray) -> float:
+    """Return Σ |A M − x|² − Σ |x|² of a frame, for stacked transposed transforms M, shape (B, 4, 3)."""
+    total = 0.0
+    for b in range(len(M)):
+        for i in range(4):
+            for k in range(3):
+                product = -2.0 * Y[b, i, k]
+                for c in range(len(M)):
+                    for j in range(4):
+                        product += N[b, i, c, j] * M[c, j, k]
+                total += M[b, i, k] * product
+    return total
+
+
+@njit(cache=True)
+def set_bone(M: FloatArray, b: int, sums: FloatArray, moment: FloatArray, weight: float, prior: float, R: FloatArray) -> None:
+    """Write the rigid fit of one bone into M[b] = [Rᵀ; tᵀ].
+
+    Arguments:
+        M: transposed transforms of all bones, shape (B, 4, 3).
+        b: the bone.
+        sums: Σ w p qᵀ over Σ w qᵀ, shape (4, 3).
+        moment: Σ w p, shape (3,).
+        weight: Σ w.
+        prior: weight of the present rotation, which decides what the vertices leave open.
+        R: work, shape (3, 3).
+    """
+    if weight <= 1e-300:
+        return
+    covariance = np.empty((3, 3))
+    for i in range(3):
+        for k in range(3):
+            covariance[i, k] = sums[i, k] - moment[i] * sums[3, k] / weight + prior * M[b, i, k]
+    rotation_of(covariance, R)
+    for k in range(3):
+        M[b, 3, k] = sums[3, k] / weight
+        for i in range(3):
+            M[b, i, k] = R[k, i]
+            M[b, 3, k] -= R[k, i] * moment[i] / weight
+
+
+@njit(cache=True)
+def sweep_poses(N: FloatArray, Y: FloatArray, share: FloatArray, start: FloatArray, sweeps: int) -> FloatArray:
+    """Return bone poses (B, 4, 4) after sweeps of rigid fits, each bone against what the others leave.
+
+    Arguments:
+        N: normal matrices of all pairs of bones, shape (B, 4, B, 4).
+        Y: sums of weighted rest positions times vertices of the frame, shape (B, 4, 3).
+        share: Σ w of each bone, shape (B,).
+        start: poses to start from where they fit better than separate fits, shape (B, 4, 4), or (0, 4, 4).
+        sweeps: how many.
+    """
+    bones = len(N)
+    R, sums, moment = np.empty((3, 3)), np.empty((4, 3)), np.empty(3)
+    before = np.zeros((bones, 4, 3))
+    for b in range(bones):
+        for i in range(3):
+            before[b, i, i] = 1.0
+            if len(start) == bones:
+                before[b, 3, i] = start[b, i, 3]
+                for k in range(3):
+                    before[b, i, k] = start[b, k, i]
+    M = separate_fits(N, Y, share, before)
+    if len(start) == bones and misfit(N, Y, before) <= misfit(N, Y, M):
+        M = before
+    for _ in range(sweeps):
+        for b in range(bones):
+            left_by_others(N, Y, M, b, sums)
+            for i in range(3):
+                moment[i] = N[b, i, b, 3]
+            set_bone(M, b, sums, moment, N[b, 3, b, 3], prior_of(N, b), R)
+    poses = np.zeros((bones, 4, 4))
+    for b in range(bones):
+        poses[b, 3, 3] = 1.0
+        for k in range(3):
+            poses[b, k, 3] = M[b, 3, k]
+            for i in range(3):
+                poses[b, k, i] = M[b, i, k]
+    return poses
+
+
+@njit(cache=True)
+def separate_fits(N: FloatArray, Y: FloatArray, share: FloatArray, before: FloatArray) -> FloatArray:
+    """Return [Rᵀ; tᵀ] of each bone (B, 4, 3), fitted to its vertices with its weights, without regard to the others."""
+    M = before.copy()
+    R, moment = np.empty((3, 3)), np.empty(3)
+    for b in range(len(N)):
+        for i in range(3):
+            moment[i] = 0.0
+            for c in range(len(N)):  # weights sum to 1 at each vertex: Σ_c Σ w_b w_c p = Σ w_b p
+                moment[i] += N[b, i, c, 3]
+        set_bone(M, b, Y[b], moment, share[b], prior_of(N, b), R)
+    return M
+
+
+@njit(cache=True)
+def prior_of(N: FloatArray, b: int) -> float:
+    """Return the small weight of a bone's present rotation, which decides what its vertices leave open."""
+    return 1e-9 * float(N[b, 0, b, 0] + N[b, 1, b, 1] + N[b, 2, b, 2])
+
+
+@njit(cache=True)
+def left_by_others(N: FloatArray, Y: FloatArray, M: FloatArray, b: int, sums: FloatArray) -> None:
+    """Write what bone b has to explain: its sums of the frame less what the other bones do, shape (4, 3)."""
+    for i in range(4):
+        for k in range(3):
+            rest = Y[b, i, k]
+            for c in range(len(M)):
+                if c != b:
+                    for j in range(4):
+                        rest -= N[b, i, c, j] * M[c, j, k]
+            sums[i, k] = rest
+
+
+# ---- weights ----------------------------------------------------------------------------------------------------------
+
+
+@njit(cache=True)
+def weights_of_vertices(
+    rest: FloatArray, states: FloatArray, origins: FloatArray, poses: FloatArray, smooth: FloatArray, tiny: float, pull: float
+) -> tuple[IntArray, FloatArray]:
+    """Return joints (V, 4) and weights (V, 4) of least squares over the frames, each vertex for itself.
+
+    Minimises (1/F) Σ_f |Σ_b w_b (R_b p + t_b) − x|² + λ |w − smooth|² with λ = tiny + pull · (smallest error of a single bone).
+
+    Arguments:
+        rest: vertices at rest [m], shape (V, 3).
+        states: vertices of all frames [m], shape (V, F, 3).
+        origins: bone origins at rest [m], shape (B, 3).
+        poses: T_robot_bone, shape (F, B, 4, 4).
+        smooth: weights where motion says nothing, shape (V, B).
+        tiny: squared motion that says nothing [m²].
+        pull: share of a single bone's squared error.
+    """
+    vertices, frames, bones = len(rest), len(poses), len(origins)
+    count = min(CANDIDATES, bones)
+    few = min(INFLUENCES, bones)
+    joints = np.zeros((vertices, INFLUENCES), dtype=np.int64)
+    weights = np.zeros((vertices, INFLUENCES))
+    D = np.empty((bones, 3 * frames))
+    rank = np.empty(bones)
+    G, g = np.empty((count, count)), np.empty(count)
+    G4, g4 = np.empty((few, few)), np.empty(few)
+    for v in range(vertices):
+        least, mean = misses_of_bones(rest[v], states[v], origins, poses, D, rank)
+        size = tiny + pull * least
+        for b in range(bones):
+            rank[b] -= (1e-3 * mean + tiny) * smooth[v, b]
+        chosen = smallest(rank, count)
+        for i in range(count):
+            for j in range(i + 1):
+                G[i, j] = G[j, i] = dot(D[chosen[i]], D[chosen[j]]) / frames
+            G[i, i] += size
+            g[i] = size * smooth[v, chosen[i]]
+        kept = smallest(-simplex_least_squares(G, g), few)
+        for i in range(few):
+            g4[i] = g[kept[i]]
+            for j in range(few):
+                G4[i, j] = G[kept[i], kept[j]]
+        w = simplex_least_squares(G4, g4)
+        order = smallest(-w, few)
+        total = 0.0
+        for k in range(few):
+            if w[order[k]] > 1e-6:
+                joints[v, k] = chosen[kept[order[k]]]
+                weights[v, k] = w[order[k]]
+                total += w[order[k]]
+        for k in range(few):
+            weights[v, k] /= total
+    return joints, weights
+
+
+@njit(cache=True)
+def misses_of_bones(
+    rest: FloatArray, states: FloatArray, origins: FloatArray, poses: FloatArray, D: FloatArray, error: FloatArray
+) -> tuple[float, float]:
+    """Write how far each bone alone misses a vertex, (B, 3 F), and its mean square (B,); return the least and the mean of these."""
+    frames = len(poses)
+    p = np.empty(3)
+    least, mean = np.inf, 0.0
+    for b in range(len(origins)):
+        for i in range(3):
+            p[i] = rest[i] - origins[b, i]
+        total = 0.0
+        for f in range(frames):
+            for i in range(3):
+                d = poses[f, b, i, 3] - states[f, i]
+                for j in range(3):
+                    d += poses[f, b, i, j] * p[j]
+                D[b, 3 * f + i] = d
+                total += d * d
+        error[b] = total / frames
+        mean += error[b] / len(origins)
+        least = min(least, error[b])
+    return least, mean
+
+
+@njit(cache=True, fastmath=True)
+def dot(a: FloatArray, b: FloatArray) -> float:
+    """Return a · b."""
+    total = 0.0
+    for i in range(len(a)):
+        total += a[i] * b[i]
+    return total
+
+
+@njit(cache=True)
+def smallest(values: FloatArray, count: int) -> IntArray:
+    """Return the indices of the smallest values in their order, shape (count,); the first of equal ones first."""
+    taken = np.zeros(len(values), dtype=np.bool_)
+    result = np.empty(count, dtype=np.int64)
+    for k in range(count):
+        best = -1
+        for i in range(len(values)):
+            if not taken[i] and (best < 0 or values[i] < values[best]):
+                best = i
+        taken[best] = True
+        result[k] = best
+    return result
+
+
+@njit(cache=True)
+def simplex_least_squares(G: FloatArray, g: FloatArray) -> FloatArray:
+    """Return w ≥ 0 with Σ w = 1 that minimises wᵀ G w / 2 − g w, shape (k,), for positive definite G.
+
+    Active set in the manner of Lawson and Hanson (1974): begin with the best single entry, let in the entry that gains most,
+    step back to the border where an entry would turn negative.
+    """
+    k = len(g)
+    first = 0
+    for i in range(1, k):
+        if 0.5 * G[i, i] - g[i] < 0.5 * G[first, first] - g[first]:
+            first = i
+    w, free, gradient = np.zeros(k), np.zeros(k, dtype=np.bool_), np.empty(k)
+    w[first], free[first] = 1.0, True
+    for _ in range(3 * k):
+        level = 0.0
+        for i in range(k):
+            gradient[i] = -g[i]
+            for j in range(k):
+                gradient[i] += G[i, j] * w[j]
+            level += w[i] * gradient[i]
+        entering = -1
+        for i in range(k):
+            if not free[i] and (entering < 0 or gradient[i] < gradient[entering]):
+                entering = i
+        if entering < 0 or gradient[entering] - level >= -1e-10 * G[first, first]:
+            break
+        free[entering] = True
+        settle(G, g, free, w)
+    return w
+
+
+@njit(cache=True)
+def settle(G: FloatArray, g: FloatArray, free: BoolArray, w: FloatArray) -> None:
+    """Move w to the minimum over the free entries; entries that would turn negative stop at zero and are free no more."""
+    for _ in range(len(g)):
+        target = equality_least_squares(G, g, free)
+        step = 1.0
+        for i in range(len(g)):
+            if free[i] and target[i] < 0.0:
+                step = min(step, w[i] / (w[i] - target[i]))
+        for i in range(len(g)):
+            w[i] += step * (target[i] - w[i])
+        if step >= 1.0:
+            return
+        for i in range(len(g)):
+            if free[i] and target[i] < 0.0 and w[i] <= 1e-12:
+                free[i] = False
+                w[i] = 0.0
+
+
+@njit(cache=True)
+def equality_least_squares(G: FloatArray, g: FloatArray, free: BoolArray) -> FloatArray:
+    """Return the minimiser of wᵀ G w / 2 − g w with Σ w = 1 over the free entries, zero elsewhere, shape (k,).
+
+    Gauss elimination of the free part with right-hand sides g and 1; the second carries the constraint's multiplier.
+    """
+    k = len(g)
+    index = np.empty(k, dtype=np.int64)
+    n = 0
+    for i in range(k):
+        if free[i]:
+            index[n] = i
+            n += 1
+    A = np.empty((n, n + 2))
+    for a in range(n):
+        for b in range(n):
+            A[a, b] = G[index[a], index[b]]
+        A[a, n] = g[index[a]]
+        A[a, n + 1] = 1.0
+    for a in range(n):  # positive definite: no pivoting needed
+        for b in range(a + 1, n):
+            factor = A[b, a] / A[a, a]
+            for c in range(a, n + 2):
+                A[b, c] -= factor * A[a, c]
+    plain, ones = 0.0, 0.0
+    for back in range(n):
+        a = n - 1 - back
+        for right in (n, n + 1):
+            for c in range(a + 1, n):
+                A[a, right] -= A[a, c] * A[c, right]
+            A[a, right] /= A[a, a]
+        plain += A[a, n]
+        ones += A[a, n + 1]
+    w = np.zeros(k)
+    for a in range(n):
+        w[index[a]] = A[a, n] + (1.0 - plain) / ones * A[a, n + 1]
+    return w

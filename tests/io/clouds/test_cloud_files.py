@@ -1,0 +1,226 @@
+"""Clouds, their files, and depth images."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from femsense.core.errors import InputError
+from femsense.io.clouds.pcd import _unpack_lzf
+from femsense.pointcloud import PointCloud, cloud_from_depth, read_cloud, read_pcd_fields, write_cloud
+
+
+def some_cloud(count: int = 50, *, colors: bool = True, seed: int = 0) -> PointCloud:
+    rng = np.random.default_rng(seed)
+    return PointCloud(rng.normal(size=(count, 3)), rng.integers(0, 256, size=(count, 3)) / 255.0 if colors else None)
+
+
+def pcd_text(rows: str = "0 0 1 7\n1 2 3 8\n", *, points: int = 2, kind: str = "F F F U", data: str = "ascii") -> str:
+    head = f"# .PCD v0.7\nVERSION 0.7\nFIELDS x y z label\nSIZE 4 4 4 4\nTYPE {kind}\nCOUNT 1 1 1 1\nWIDTH {points}\nHEIGHT 1\n"
+    return head + f"VIEWPOINT 0 0 0 1 0 0 0\nPOINTS {points}\nDATA {data}\n" + rows
+
+
+def test_arrays_are_read_only_copies() -> None:
+    points = np.zeros((2, 3))
+    cloud = PointCloud(points)
+    points[0] = 5.0
+    assert cloud.points.max() == 0.0
+    with pytest.raises(ValueError, match="read-only"):
+        cloud.points[0, 0] = 1.0
+
+
+def test_select_takes_colours_along() -> None:
+    cloud = some_cloud()
+    chosen = cloud.select([3, 1])
+    np.testing.assert_array_equal(chosen.points, cloud.points[[3, 1]])
+    np.testing.assert_array_equal(chosen.colors, cloud.colors[[3, 1]])
+    assert len(cloud.select(cloud.points[:, 0] > 0)) == (cloud.points[:, 0] > 0).sum()
+
+
+@pytest.mark.parametrize(
+    "colors, text", [(np.zeros((1, 3)), "one colour per point"), (np.full((2, 3), 255.0), "divide bytes by 255")]
+)
+def test_bad_colours_say_so(colors: np.ndarray, text: str) -> None:
+    with pytest.raises(InputError, match=text):
+        PointCloud(np.zeros((2, 3)), colors)
+
+
+@pytest.mark.parametrize("suffix, tolerance", [(".ply", 0.0), (".pcd", 1e-6)])
+@pytest.mark.parametrize("colors", [True, False])
+def test_files_round_trip(tmp_path: Path, suffix: str, tolerance: float, colors: bool) -> None:
+    cloud = some_cloud(colors=colors)
+    write_cloud(tmp_path / f"cloud{suffix}", cloud)
+    again = read_cloud(tmp_path / f"cloud{suffix}")
+    np.testing.assert_allclose(again.points, cloud.points, rtol=tolerance, atol=0)
+    assert (again.colors is not None) == colors
+    if colors:
+        np.testing.assert_allclose(again.colors, cloud.colors, atol=0.5 / 255)
+
+
+def test_compressed_pcd_of_another_writer(tmp_path: Path) -> None:
+    import open3d as o3d
+
+    rng = np.random.default_rng(1)
+    points = np.repeat(rng.normal(size=(40, 3)), 20, axis=0)  # repeats, so that the stream holds back references
+    path = tmp_path / "packed.pcd"
+    o3d.io.write_point_cloud(str(path), o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points)), compressed=True)
+    assert b"DATA binary_compressed" in path.read_bytes()[:400]
+    np.testing.assert_array_equal(read_cloud(path).points, points.astype(np.float32))
+
+
+def test_lzf_against_streams_written_by_hand() -> None:
+    target = np.zeros(9, dtype=np.uint8)
+    # copy 2 bytes "ab", then length 1 + 2 at distance 2 ("aba"), then length 7 + 0 … would overflow: stop at 5
+    assert _unpack_lzf(np.array([1, 97, 98, 0x20, 1], dtype=np.uint8), target) == 5
+    assert bytes(target[:5]) == b"ababa"
+    # long form: length 7 + 0 + 2 = 9 bytes would not fit behind one literal
+    assert _unpack_lzf(np.array([0, 97, 0xE0, 0, 0], dtype=np.uint8), target) == -1
+    assert _unpack_lzf(np.array([0, 97, 0xE0, 0, 0], dtype=np.uint8), np.zeros(10, dtype=np.uint8)) == 10
+    assert _unpack_lzf(np.array([0x20, 0], dtype=np.uint8), target) == -1  # refers to before the beginning
+
+
+def test_all_fields_of_a_pcd_are_kept(tmp_path: Path) -> None:
+    path = tmp_path / "labels.pcd"
+    path.write_text(pcd_text())
+    fields = read_pcd_fields(path)
+    assert list(fields) == ["x", "y", "z", "label"]
+    assert fields["label"].tolist() == [7, 8] and fields["label"].dtype == np.uint32
+    assert fields["z"].tolist() == [1.0, 3.0]
+
+
+def test_points_that_are_not_finite_are_dropped(tmp_path: Path) -> None:
+    path = tmp_path / "holes.pcd"
+    path.write_text(pcd_text("nan nan nan 7\n1 2 3 8\n"))
+    assert read_cloud(path).points.tolist() == [[1.0, 2.0, 3.0]]
+    assert len(read_pcd_fields(path)["x"]) == 2
+
+
+@pytest.mark.parametrize(
+    "text, pattern",
+    [
+        ("nothing", "not a PCD file"),
+        (pcd_text(points=3), r"(?s)broken or shortened.*2 rows.*3 rows of 4 numbers"),
+        (pcd_text(kind="F F F Q"), r"(?s)unknown field types.*F F F Q"),
+        (pcd_text(data="zipped"), r"(?s)unknown storage.*DATA zipped.*binary_compressed"),
+        (pcd_text("1 2 3 4", data="binary"), r"(?s)broken or shortened.*7 bytes of data.*32 bytes"),
+        (pcd_text("12345678", data="binary_compressed"), r"(?s)broken or shortened.*unpack"),
+        (pcd_text("0 0 1 7\n1 2 x 8\n"), r"(?s)broken or shortened.*numbers"),
+        (pcd_text().replace("FIELDS x y z label", "FIELDS x y a label"), r"(?s)fields are missing.*x, y, a, label.*x, y, z"),
+    ],
+)
+def test_broken_pcd_files_name_the_problem(tmp_path: Path, text: str, pattern: str) -> None:
+    path = tmp_path / "broken.pcd"
+    path.write_text(text)
+    with pytest.raises(InputError, match=pattern) as caught:
+        read_cloud(path)
+    assert "broken.pcd" in str(caught.value)
+
+
+def test_a_shortened_ply_is_an_error(tmp_path: Path) -> None:
+    path = tmp_path / "cloud.ply"
+    write_cloud(path, some_cloud(100))
+    path.write_bytes(path.read_bytes()[:-200])
+    with pytest.raises(InputError, match=r"(?s)broken or shortened PLY.*92 whole vertices.*100 vertices"):
+        read_cloud(path)
+
+
+PLY = "ply\nformat ascii 1.0\ncomment by hand\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\n"
+COLORED = PLY + "property uchar red\nproperty uchar green\nproperty uchar blue\n"
+FACES = "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+
+
+def test_an_ascii_ply_with_faces_behind_its_vertices(tmp_path: Path) -> None:
+    path = tmp_path / "cloud.ply"
+    path.write_text(COLORED + FACES + "0 1 2 255 0 51\nnan 4 5 0 0 0\n3 0 1 1\n")
+    cloud = read_cloud(path)
+    assert cloud.points.tolist() == [[0.0, 1.0, 2.0]]
+    np.testing.assert_allclose(cloud.colors, [[1.0, 0.0, 0.2]])
+
+
+def test_a_big_endian_ply_with_float_colours(tmp_path: Path) -> None:
+    path = tmp_path / "cloud.ply"
+    head = COLORED.replace("ascii", "binary_big_endian").replace("uchar", "float") + "end_header\n"
+    path.write_bytes(head.encode() + np.arange(12, dtype=">f4").__truediv__(12).astype(">f4").tobytes())
+    cloud = read_cloud(path)
+    np.testing.assert_allclose(cloud.points[1], np.arange(6, 9) / 12, rtol=1e-6)
+    np.testing.assert_allclose(cloud.colors[0], np.arange(3, 6) / 12, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "name, text, pattern",
+    [
+        ("a.ply", "no header", "not a PLY file"),
+        ("a.ply", "ply\nformat ascii 1.0\nend_header\n", "names no vertices"),
+        ("a.ply", "ply\nformat zip 1.0\nend_header\n", r"(?s)unknown storage.*format zip"),
+        ("a.ply", "ply\nformat ascii 1.0\nelement vertex some\nend_header\n", r"(?s)says nothing.*element vertex some"),
+        ("a.ply", "ply\nformat ascii 1.0\nelement vertex 1\nproperty list uchar int x\nend_header\n", "lists in or before"),
+        (
+            "a.ply",
+            "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n3\n",
+            r"(?s)fields are missing.*x, y, z",
+        ),
+        (
+            "a.ply",
+            "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\nx\n",
+            r"(?s)broken or shortened PLY.*numbers",
+        ),
+        (
+            "a.ply",
+            "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nend_header\n1\n",
+            r"(?s)1 vertices.*2 vertices of 1",
+        ),
+        ("a.xyz", "", r"not a format of point clouds"),
+    ],
+)
+def test_other_files_are_refused(tmp_path: Path, name: str, text: str, pattern: str) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(InputError, match=pattern):
+        read_cloud(tmp_path / name)
+
+
+def test_missing_places_are_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such file"):
+        read_cloud(tmp_path / "none.ply")
+    with pytest.raises(InputError, match="no such folder"):
+        write_cloud(tmp_path / "none" / "cloud.ply", some_cloud())
+
+
+def depth_of_plane(fx: float, fy: float, cx: float, cy: float) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return the depth [units of 0.1 mm] of the plane normal · p = offset in a 40 × 60 image."""
+    normal, offset = np.array([0.2, -0.1, 1.0]), 0.8
+    v, u = np.mgrid[0:40, 0:60]
+    rays = np.stack([(u - cx) / fx, (v - cy) / fy, np.ones_like(u)], axis=-1)
+    return np.round(offset / (rays @ normal) * 1e4).astype(np.uint16), normal, offset
+
+
+def test_depth_image_of_a_plane_gives_that_plane() -> None:
+    depth, normal, offset = depth_of_plane(50.0, 55.0, 31.0, 18.0)
+    depth[3, 4] = 0
+    cloud = cloud_from_depth(depth, 50.0, 55.0, 31.0, 18.0, depth_unit_m=1e-4)
+    assert len(cloud) == depth.size - 1
+    np.testing.assert_allclose(cloud.points @ normal, offset, atol=1e-4)
+    np.testing.assert_allclose(cloud.points[0], depth[0, 0] * 1e-4 * np.array([-31 / 50, -18 / 55, 1.0]), rtol=1e-12)
+
+
+def test_depth_image_is_projected_back_to_its_pixels_through_the_lens() -> None:
+    import cv2
+
+    depth, _, _ = depth_of_plane(50.0, 55.0, 31.0, 18.0)
+    lens = np.array([-0.2, 0.05, 0.001, -0.002, 0.01])
+    cloud = cloud_from_depth(depth, 50.0, 55.0, 31.0, 18.0, lens, 1e-4)
+    K = np.array([[50.0, 0, 31.0], [0, 55.0, 18.0], [0, 0, 1]])
+    pixels = cv2.projectPoints(cloud.points, np.zeros(3), np.zeros(3), K, lens)[0].reshape(-1, 2)
+    v, u = np.mgrid[0:40, 0:60]
+    np.testing.assert_allclose(pixels, np.stack([u.ravel(), v.ravel()], axis=1), atol=1e-6)
+
+
+def test_colours_of_a_depth_image_belong_to_their_pixels() -> None:
+    color = np.arange(12, dtype=np.uint8).reshape(2, 2, 3)
+    cloud = cloud_from_depth(np.array([[0, 5], [6, 7]], dtype=np.uint16), 1, 1, 0, 0, color=color)
+    np.testing.assert_allclose(cloud.colors, color[[0, 1, 1], [1, 0, 1]] / 255.0)
+    with pytest.raises(InputError, match="colour image does not fit"):
+        cloud_from_depth(np.ones((2, 3)), 1, 1, 0, 0, color=color)
+    with pytest.raises(InputError, match="fx must be positive"):
+        cloud_from_depth(np.ones((2, 3)), 0, 1, 0, 0)

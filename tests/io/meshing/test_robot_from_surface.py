@@ -1,0 +1,351 @@
+"""femsense mesh: from a surface file to a robot that loads, and what is refused with which words."""
+
+from __future__ import annotations
+
+import json
+import re
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from helpers import block_mesh, write_block_robot
+
+from femsense.app import cli
+from femsense.core.errors import InputError
+from femsense.fem.equilibrium import solve_equilibrium
+from femsense.fem.mesh import TetMesh, element_volumes, surface_triangles, to_linear
+from femsense.io import mesh_files
+from femsense.io.meshing import robot_from_surface
+from femsense.io.meshing.robot_from_surface import MeshOptions, fill, mesh_into, starter_text
+from femsense.io.robot_toml import load_robot
+
+MM = MeshOptions(unit="mm", most_tets=1200)
+BOX = trimesh.creation.box((100, 30, 30))
+
+
+def stl_bytes(corners: np.ndarray) -> bytes:
+    """Return a binary STL file of triangles, shape (t, 3, 3)."""
+    record = np.zeros(len(corners), dtype=[("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("rest", "<u2")])
+    record["corners"] = corners
+    return bytes(80) + len(corners).to_bytes(4, "little") + record.tobytes()
+
+
+def write_box(path: Path, extents: tuple[float, float, float] = (100, 30, 30)) -> Path:
+    box = trimesh.creation.box(extents)
+    box.apply_translation(np.array(extents) / 2)
+    box.export(path)
+    return path
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
+    """Blocks in place of fTetWild; the calls are listed."""
+    calls: list[dict[str, Any]] = []
+
+    def block(points: np.ndarray, triangles: np.ndarray, **options: Any) -> TetMesh:
+        calls.append(options)
+        edge = options["edge_fraction"] * np.linalg.norm(np.ptp(points, axis=0))
+        cells = np.maximum(np.round(np.ptp(points, axis=0) / edge), 1).astype(int)
+        return block_mesh(cells, np.ptp(points, axis=0), start=points.min(axis=0))
+
+    monkeypatch.setattr(robot_from_surface, "tetrahedralise", block)
+    return calls
+
+
+def quiet(_: str) -> None: ...
+
+
+# With fTetWild
+
+
+def test_a_chamber_stays_hollow_and_the_robot_bends(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """Both shells face outwards, as some programs write them; two triangles are missing, some are turned."""
+    chamber = trimesh.creation.box((60, 12, 12))
+    body = trimesh.util.concatenate([trimesh.creation.box((100, 30, 30)).subdivide().subdivide(), chamber])
+    faces = np.delete(np.array(body.faces), [5], axis=0)
+    faces[::7] = faces[::7, ::-1]
+    trimesh.Trimesh(body.vertices, faces, process=False).export(tmp_path / "body.stl")
+    arguments = [
+        "mesh",
+        tmp_path / "body.stl",
+        "-o",
+        tmp_path / "robot",
+        "--unit",
+        "mm",
+        "--max-tets",
+        "1500",
+        "--close-holes",
+        "--json",
+    ]
+    assert cli.run([str(a) for a in arguments]) == 0
+    report = json.loads(capfd.readouterr().out)
+    said = " ".join(report["done"])
+    assert "triangles were turned" in said and "1 holes were closed" in said and "1 inner shells are kept as cavities" in said
+    robot = load_robot(tmp_path / "robot")
+    mesh = to_linear(robot.body.mesh)
+    assert element_volumes(mesh).sum() == pytest.approx(90e-6 - 8.64e-6, rel=0.02)
+    inner = np.abs(mesh.nodes).max(axis=1) < 0.0145
+    assert inner.any()  # the walls of the chamber
+    edges = len(np.unique(np.sort(surface_triangles(mesh)[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0))
+    assert len(np.unique(surface_triangles(mesh))) - edges + len(surface_triangles(mesh)) == 4  # two spheres (Euler)
+    assert report["quality"]["tetrahedra"] == len(mesh.tets) <= 1500 and report["strays_mm"] < report["tolerance_mm"] * 1.5
+    assert solve_equilibrium(robot.body).converged
+
+
+def test_shells_that_cross_are_filled_as_one(tmp_path: Path) -> None:
+    post = trimesh.creation.box((20, 20, 60))
+    post.apply_translation([10, 0, 20])
+    both = trimesh.util.concatenate([trimesh.creation.box((100, 30, 30)), post])
+    filled = fill(np.array(both.vertices), np.array(both.faces), MM)
+    assert element_volumes(filled.mesh).sum() == pytest.approx(90e-6 + 20 * 20 * 35e-9, rel=0.02)
+    assert any("triangles cross others" in note for note in filled.done)
+
+
+# The folder
+
+
+def test_the_new_robot_loads_and_says_what_is_guessed(tmp_path: Path, quick: list[dict[str, Any]]) -> None:
+    report = mesh_into(tmp_path / "my robot", write_box(tmp_path / "block.stl"), MM, say=quiet)
+    robot = load_robot(tmp_path / "my robot")
+    text = (tmp_path / "my robot" / "robot.toml").read_text()
+    assert robot.name == "my-robot" and robot.body.mesh.is_quadratic and "block.stl" in text and "GUESSED" in text
+    held = robot.body.mesh.nodes[robot.body.clamped]
+    assert held[:, 2].max() < 0.002 and (robot.body.mesh.nodes[:, 2].min() == held[:, 2].min())
+    np.testing.assert_allclose(np.ptp(robot.body.mesh.nodes, axis=0), [0.1, 0.03, 0.03])
+    assert report["robot"] == {
+        "folder": str(tmp_path / "my robot"),
+        "mesh_file": "mesh.vtu",
+        "unit": "mm",
+        "robot_toml": "written",
+    }
+    assert json.loads((tmp_path / "my robot" / "mesh.json").read_text()) == json.loads(json.dumps(report))
+
+
+def test_the_examples_in_the_new_robot_work_once_they_are_uncommented(tmp_path: Path, quick: list[dict[str, Any]]) -> None:
+    mesh_into(tmp_path / "robot", write_box(tmp_path / "block.stl"), MM, say=quiet)
+    file = tmp_path / "robot" / "robot.toml"
+    file.write_text(re.sub(r"^# (?=\[|\w+ = )", "", file.read_text(), flags=re.MULTILINE))
+    robot = load_robot(tmp_path / "robot")
+    assert robot.body.cable_names == ("cable-1",) and robot.marker_names == ("top",) and robot.color_rgb is not None
+    assert robot.body.cables[0].path.outside.max() == 0.0 and robot.markers.outside.max() < 1e-6
+    assert solve_equilibrium(robot.body, tension={"cable-1": 0.05}).converged
+
+
+def test_the_lowest_slab_holds_a_body_that_stands_on_a_tip() -> None:
+    cone = block_mesh((4, 4, 6), (2.0, 2.0, 1.0), start=(-1.0, -1.0, 0.0))
+    nodes = cone.nodes * np.hstack([np.repeat(0.02 + cone.nodes[:, 2:], 2, axis=1), np.ones((len(cone.nodes), 1))])
+    low, high = np.array(
+        tomllib.loads(starter_text(TetMesh(0.1 * nodes, cone.tets), MM, "cone", "cone.stl"))["fixed"][0]["box_m"]
+    )
+    held = ((0.1 * nodes >= low) & (0.1 * nodes <= high)).all(axis=1)
+    assert held.sum() >= 6 and np.linalg.matrix_rank(0.1 * nodes[held] - 0.1 * nodes[held].mean(axis=0), tol=1e-4) >= 2
+
+
+def test_a_robot_that_is_there_keeps_its_table(tmp_path: Path, quick: list[dict[str, Any]]) -> None:
+    robot = write_block_robot(tmp_path / "robot", cells=(3, 1, 1), cables=None)
+    before = (robot / "robot.toml").read_bytes()
+    report = mesh_into(robot, write_box(tmp_path / "block.stl", (0.1, 0.03, 0.03)), MeshOptions(unit="m"), say=quiet)
+    assert (robot / "robot.toml").read_bytes() == before
+    assert report["robot"]["mesh_file"] == "block.vtu" and report["robot"]["unit"] == "mm"
+    assert len(load_robot(robot).body.mesh.tets) == report["quality"]["tetrahedra"] > 3 * 6
+    np.testing.assert_allclose(np.ptp(load_robot(robot).body.mesh.nodes, axis=0), [0.1, 0.03, 0.03])
+
+
+def test_a_surface_named_in_the_table_gives_way_to_the_mesh(tmp_path: Path, quick: list[dict[str, Any]]) -> None:
+    robot = write_block_robot(tmp_path / "robot", mesh__file="block.stl", cables=None)
+    write_box(robot / "block.stl")
+    mesh_into(robot, robot / "block.stl", MM, say=quiet)
+    assert load_robot(robot).document["mesh"]["file"] == "mesh.vtu"
+
+
+def test_a_table_that_the_mesh_does_not_fit_stays_with_its_mesh(tmp_path: Path, quick: list[dict[str, Any]]) -> None:
+    robot = write_block_robot(tmp_path / "robot", cells=(3, 1, 1), fixed=[{"box_m": [[0.5, 0, 0], [0.6, 1, 1]]}], cables=None)
+    before = {file.name: file.read_bytes() for file in robot.iterdir()}
+    with pytest.raises(InputError, match="does not fit the new mesh; nothing was written") as error:
+        mesh_into(robot, write_box(tmp_path / "block.stl"), MM, say=quiet)
+    assert "no node of the mesh is inside the box" in str(error.value) and str(robot) in str(error.value)
+    assert {file.name: file.read_bytes() for file in robot.iterdir()} == before
+
+
+def test_it_is_not_made_twice(tmp_path: Path, quick: list[dict[str, Any]]) -> None:
+    said: list[str] = []
+    file = write_box(tmp_path / "block.stl")
+    first = mesh_into(tmp_path / "robot", file, MM, say=said.append)
+    assert mesh_into(tmp_path / "robot", file, MM, say=said.append) == json.loads(json.dumps(first)) and len(quick) == 1
+    assert "holds this mesh already" in said[0]
+    mesh_into(tmp_path / "robot", file, MM, say=said.append, again=True)
+    mesh_into(tmp_path / "robot", file, MeshOptions(unit="mm", size_mm=12.0), say=said.append)
+    assert len(quick) == 3 and len(said) == 1
+    (tmp_path / "robot" / "mesh.vtu").write_text("broken")
+    mesh_into(tmp_path / "robot", file, MeshOptions(unit="mm", size_mm=12.0), say=said.append)
+    assert len(quick) == 4
+
+
+# Size
+
+
+def test_the_number_of_tetrahedra_is_kept(quick: list[dict[str, Any]]) -> None:
+    box = trimesh.creation.box((100, 30, 30))
+    for most in (200, 600, 3000):
+        filled = fill(np.array(box.vertices), np.array(box.faces), MeshOptions(unit="mm", most_tets=most))
+        assert 0.1 * most < len(filled.mesh.tets) <= most
+    edges = [call["edge_fraction"] for call in quick]
+    assert edges[-1] < edges[0]
+
+
+def test_a_wanted_size_that_gives_too_many_says_what_would_do(quick: list[dict[str, Any]]) -> None:
+    box = trimesh.creation.box((100, 30, 30))
+    with pytest.raises(InputError, match="more tetrahedra than wanted") as error:
+        fill(np.array(box.vertices), np.array(box.faces), MeshOptions(unit="mm", size_mm=2.0))
+    assert "--size 6.46" in str(error.value) and len(quick) == 1 and "--max-tets 67500" in str(error.value)
+
+
+def test_the_envelope_follows_the_size_or_is_given(quick: list[dict[str, Any]]) -> None:
+    box = trimesh.creation.box((100, 30, 30))
+    for options in (MeshOptions(unit="mm", size_mm=10.0), MeshOptions(unit="mm", size_mm=10.0, tolerance_mm=0.2)):
+        fill(np.array(box.vertices), np.array(box.faces), options)
+    diagonal = np.linalg.norm([100, 30, 30])
+    np.testing.assert_allclose([call["envelope"] * diagonal for call in quick], [0.4, 0.2])
+
+
+def test_a_flat_element_has_the_surface_filled_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    good = block_mesh((3, 2, 2), (0.1, 0.03, 0.03), start=(-0.05, -0.015, -0.015))
+    nodes = np.array(good.nodes)
+    inner = np.flatnonzero((np.abs(nodes) < [0.049, 0.0149, 0.0149]).all(axis=1))[0]
+    tet = good.tets[(good.tets == inner).any(axis=1)][0]
+    nodes[inner] += 0.99 * (nodes[tet[tet != inner]].mean(axis=0) - nodes[inner])
+    fillings = iter([TetMesh(nodes, good.tets), good])
+    monkeypatch.setattr(robot_from_surface, "tetrahedralise", lambda *_, **__: next(fillings))
+    box = trimesh.creation.box((100, 30, 30))
+    assert fill(np.array(box.vertices), np.array(box.faces), MM).mesh is good
+
+
+def test_crumbs_are_left_out_and_parts_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    box = trimesh.creation.box((100, 30, 30))
+    body = block_mesh((3, 2, 2), (0.1, 0.03, 0.03), start=(-0.05, -0.015, -0.015))
+    for size, fits in ((0.001, True), (0.01, False)):
+        crumb = block_mesh((1, 1, 1), (size,) * 3, start=(0.06, 0.0, 0.0))
+        both = TetMesh(np.vstack([body.nodes, crumb.nodes]), np.vstack([body.tets, crumb.tets + len(body.nodes)]))
+        monkeypatch.setattr(robot_from_surface, "tetrahedralise", lambda *_, both=both, **__: both)
+        if fits:
+            filled = fill(np.array(box.vertices), np.array(box.faces), MM)
+            assert len(filled.mesh.tets) == len(body.tets) and filled.done == ("1 loose crumbs were left out",)
+            continue
+        with pytest.raises(InputError, match="fall into parts that no face joins"):
+            fill(np.array(box.vertices), np.array(box.faces), MM)
+
+
+def test_a_wall_inside_is_said_and_filled(quick: list[dict[str, Any]]) -> None:
+    """A box cut by a wall that shares its edges with it."""
+    left, right = (
+        trimesh.creation.box((size, 30, 30), trimesh.transformations.translation_matrix((x, 0, 0)))
+        for size, x in ((60, -30), (40, 20))
+    )
+    faces = np.vstack([left.triangles, right.triangles[(right.triangles[:, :, 0] > 1).any(axis=1)]])
+    filled = fill(faces.reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3), MM)
+    assert any(note.startswith("4 edges have more than two triangles (walls inside") for note in filled.done)
+    assert quick[0]["check_volume"] is False
+
+
+def test_bodies_that_touch_along_an_edge_are_no_body(monkeypatch: pytest.MonkeyPatch) -> None:
+    one, other = (block_mesh((2, 2, 2), (0.03,) * 3, start=(x, x, 0.0)) for x in (0.0, 0.03))
+    points, same = np.unique(np.vstack([one.nodes, other.nodes]), axis=0, return_inverse=True)
+    both = TetMesh(points, same.reshape(-1)[np.vstack([one.tets, other.tets + len(one.nodes)])])
+    monkeypatch.setattr(robot_from_surface, "tetrahedralise", lambda *_, **__: both)
+    boxes = trimesh.util.concatenate(
+        [trimesh.creation.box((30, 30, 30), trimesh.transformations.translation_matrix((x, x, 0))) for x in (15, 45)]
+    )
+    with pytest.raises(InputError, match="no face joins") as error:
+        fill(np.array(boxes.vertices), np.array(boxes.faces), MM)
+    assert "let them overlap" in str(error.value)
+
+
+def test_what_takes_too_long_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mesh_files, "FTETWILD", "import time; time.sleep(60)")
+    with pytest.raises(InputError, match="did not come to an end"):
+        mesh_files.tetrahedralise(np.array(BOX.vertices), np.array(BOX.faces), seconds=0.2)
+
+
+# What is refused
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "text"),
+    [
+        ("no.stl", None, "no such surface"),
+        ("empty.stl", b"", "the file is empty"),
+        ("words.stl", b"these are words\n", "no points either"),
+        ("words.obj", b"these are words\n", "no points either"),
+        ("cloud.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n", "a cloud of 3 points"),
+        (
+            "cloud.ply",
+            b"ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\nend_header\n0 0 0\n1 0 0\n",
+            "a cloud of 2 points",
+        ),
+        ("noise.stl", bytes(range(256)) * 10, "the file does not hold what it announces"),
+        ("cut.stl", stl_bytes(BOX.triangles)[:300], "12 triangles announced, room for 4"),
+        (
+            "nan.stl",
+            stl_bytes(np.where(np.arange(108).reshape(12, 3, 3) == 40, np.nan, BOX.triangles)),
+            "1 points, the first is number 13: [50",
+        ),
+        ("part.step", b"ISO-10303-21;", "a CAD file, not triangles"),
+        ("other.xyz", b"1 2 3\n", "not readable as a mesh"),
+    ],
+)
+def test_files_that_are_no_surface(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], name: str, content: bytes | None, text: str
+) -> None:
+    if content is not None:
+        (tmp_path / name).write_bytes(content)
+    assert cli.run(["mesh", str(tmp_path / name), "-o", str(tmp_path / "robot"), "--unit", "mm"]) == 2
+    assert text in capfd.readouterr().err and not (tmp_path / "robot").exists()
+
+
+def test_tetrahedra_are_no_surface(tmp_path: Path) -> None:
+    robot = write_block_robot(tmp_path / "robot")
+    with pytest.raises(InputError, match="not a surface"):
+        mesh_into(tmp_path / "other", robot / "block.vtu", MM, say=quiet)
+
+
+@pytest.mark.parametrize(
+    ("unit", "extent", "text", "hint"),
+    [
+        (None, 100.0, "the unit of a surface file stands nowhere in it", "--unit mm makes it 100 mm long"),
+        ("m", 100.0, "the body has an unlikely size", "--unit mm makes it 100 mm long"),
+        ("mm", 0.1, "the body has an unlikely size", "--unit m makes it 100 mm long"),
+        ("inch", 100.0, "unknown unit", "--unit mm makes it 100 mm long"),
+    ],
+)
+def test_units(tmp_path: Path, unit: str | None, extent: float, text: str, hint: str) -> None:
+    file = write_box(tmp_path / "block.stl", (extent, extent / 3, extent / 3))
+    with pytest.raises(InputError, match=text) as error:
+        mesh_into(tmp_path / "robot", file, MeshOptions(unit=unit), say=quiet)
+    assert hint in str(error.value)
+
+
+def test_a_doubtful_unit_is_questioned(tmp_path: Path, quick: list[dict[str, Any]]) -> None:
+    with pytest.warns(UserWarning, match=r"the body is 12 m across with --unit m; --unit cm makes it 120 mm long"):
+        mesh_into(tmp_path / "robot", write_box(tmp_path / "block.stl", (12, 4, 4)), MeshOptions(unit="m"), say=quiet)
+
+
+def test_other_folders_are_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "letters").mkdir()
+    (tmp_path / "letters" / "a.txt").write_text("a")
+    file = write_box(tmp_path / "block.stl")
+    with pytest.raises(InputError, match="something else than a robot"):
+        mesh_into(tmp_path / "letters", file, MM, say=quiet)
+    with pytest.raises(InputError, match="stands in the way"):
+        mesh_into(file, file, MM, say=quiet)
+    (tmp_path / "letters" / "robot.toml").write_text("name = 3")
+    with pytest.raises(InputError, match=r"no table \[mesh\]"):
+        mesh_into(tmp_path / "letters", file, MM, say=quiet)
+
+
+@pytest.mark.parametrize("ending", ["stl", "obj", "ply", "off"])
+def test_formats(tmp_path: Path, ending: str) -> None:
+    points, triangles = robot_from_surface.read_any_surface(write_box(tmp_path / f"block.{ending}"))
+    assert np.ptp(points, axis=0).tolist() == [100, 30, 30] and len(triangles) == 12

@@ -1,0 +1,454 @@
+"""The walk along a recording: from recorded to true inputs, sharing of equal frames, history, derivatives by variants."""
+
+from __future__ import annotations
+
+import gc
+import weakref
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import replace
+from operator import attrgetter
+from typing import Any
+
+import numpy as np
+import pytest
+from analytic import bar_body
+from driven import recording, robot
+from helpers import block_mesh
+
+from femsense.core.arrays import FloatArray
+from femsense.core.errors import DataError
+from femsense.fem.compliance import Tangent
+from femsense.fem.equilibrium import Equilibrium, solve_equilibrium
+from femsense.fem.mesh import embed_points
+from femsense.model import quasi_static_path, variants
+from femsense.model.drive import Walk, drive_of, has_history
+from femsense.model.effects import apply_effects
+from femsense.model.quasi_static_path import walk_along
+from femsense.model.recording import Recording, make_recording
+from femsense.model.robot import Robot
+from femsense.model.variants import solve_frame
+
+MARKERS = np.array([[0.1, 0.015, 0.03], [0.06, 0.0, 0.0], [0.1, 0.03, 0.015]])
+
+
+def walked(r: Robot, rec: Recording, frames: Sequence[int] | None = None, **options: Any) -> dict[int, np.ndarray]:
+    frames = range(rec.frame_count) if frames is None else frames
+    return {k: seen for k, _, seen, _ in walk_along(Walk(r, drive_of(r, rec)), frames, attrgetter("markers"), **options)}
+
+
+def walk_states(r: Robot, rec: Recording) -> list[Equilibrium]:
+    starts: dict[int, Equilibrium] = {}
+    deque(walk_along(Walk(r, drive_of(r, rec)), range(rec.frame_count), attrgetter("markers"), starts=starts), maxlen=0)
+    return list(starts.values())
+
+
+# What truly drives
+
+
+def test_true_tension_is_gain_times_recorded_plus_offset_and_never_negative() -> None:
+    r = robot([{"name": "cable_gain", "scale": {"top": 0.8}}, {"name": "cable_offset", "tension_n": {"top": 0.3, "side": -0.5}}])
+    drive = drive_of(r, recording([[1.0, 2.0], [0.0, 0.1]]))
+    np.testing.assert_allclose(drive.inputs, [[1.1, 1.5], [0.3, 0.0]])
+
+
+def test_true_displacement_is_gain_times_recorded_plus_offset_less_slack() -> None:
+    r = robot(
+        [
+            {"name": "cable_gain", "scale": 2.0},
+            {"name": "cable_offset", "displacement_m": 0.001},
+            {"name": "cable_slack", "displacement_m": {"side": 0.004}},
+        ]
+    )
+    drive = drive_of(r, recording([[0.01, 0.02]], actuation="displacement"))
+    np.testing.assert_allclose(drive.inputs, [[0.021, 0.037]])
+
+
+def test_slack_lets_a_held_cable_do_nothing_until_it_is_taken_up() -> None:
+    r = robot([{"name": "cable_slack", "displacement_m": {"top": 0.005}}], gravity=(0, 0, 0))
+    seen = walked(r, recording([[0.0, 0], [0.004, 0], [0.008, 0]], actuation="displacement"))
+    np.testing.assert_allclose(seen[1], seen[0], atol=1e-10)
+    np.testing.assert_allclose(
+        seen[2], walked(robot(gravity=(0, 0, 0)), recording([[0.003, 0]], actuation="displacement"))[0], atol=1e-9
+    )
+
+
+def test_initial_inputs_are_added_before_gain() -> None:
+    r = robot([{"name": "cable_gain", "scale": 0.5}])
+    drive = drive_of(r, recording([[1.0, 2.0]], actuation_zero="unknown"), initial=np.array([0.2, 0.4]))
+    np.testing.assert_allclose(drive.inputs, [[0.6, 1.2]])
+
+
+def test_columns_are_taken_by_name() -> None:
+    rec = make_recording(time_s=[0.0], cable_names=("side", "top"), inputs=[[1.0, 2.0]])
+    np.testing.assert_array_equal(drive_of(robot(), rec).inputs, [[2.0, 1.0]])
+
+
+# Creep
+
+
+def crept(values: Sequence[float], times: Sequence[float], fraction: float, tau: float) -> np.ndarray:
+    r = robot([{"name": "creep", "fraction": fraction, "time_s": tau}])
+    rec = recording([[v, 0.0] for v in values], time_s=times)
+    return np.asarray(drive_of(r, rec).inputs[:, 0])
+
+
+def test_creep_of_a_steep_step_follows_its_compliance() -> None:
+    t = np.array([0.0, 1e-9, 0.5, 1.0, 3.0, 20.0])
+    found = crept([0, 1, 1, 1, 1, 1], t, 0.3, 2.0)
+    np.testing.assert_allclose(found, np.concatenate([[0], 1 + 0.3 * (1 - np.exp(-t[1:] / 2.0))]), atol=1e-7)
+
+
+def test_creep_of_a_ramp_is_the_integral_of_its_steps() -> None:
+    t = np.array([0.0, 0.7, 1.0, 2.5, 4.0])
+    f, tau = 0.4, 1.3
+    np.testing.assert_allclose(crept(2 * t, t, f, tau), 2 * t + 2 * f * (t - tau * (1 - np.exp(-t / tau))), rtol=1e-10)
+
+
+def test_creep_does_not_depend_on_how_finely_time_is_cut() -> None:
+    coarse = crept([0, 2, 2, 1], [0, 1, 3, 4], 0.5, 0.8)
+    t = np.linspace(0, 4, 81)
+    fine = crept(np.interp(t, [0, 1, 3, 4], [0, 2, 2, 1]).tolist(), t.tolist(), 0.5, 0.8)
+    np.testing.assert_allclose(fine[[0, 20, 60, 80]], coarse, rtol=1e-9)
+
+
+def test_what_was_there_before_the_first_frame_has_crept_out() -> None:
+    np.testing.assert_allclose(crept([2, 2, 2], [0, 1, 5], 0.25, 3.0), 2.5)
+
+
+def test_creep_terms_add_up() -> None:
+    r = robot([{"name": "creep", "fraction": [0.2, 0.1], "time_s": [1.0, 5.0]}])
+    t = np.array([0.0, 1.0, 2.0, 6.0])
+    found = drive_of(r, recording([[v, 0] for v in (0, 1, 1, 0)], time_s=t)).inputs[:, 0]
+    one, two = crept([0, 1, 1, 0], t.tolist(), 0.2, 1.0), crept([0, 1, 1, 0], t.tolist(), 0.1, 5.0)
+    np.testing.assert_allclose(found, np.maximum(one + two - [0, 1, 1, 0], 0))
+
+
+def test_known_loads_creep_too_and_two_at_one_place_are_one() -> None:
+    r = robot([{"name": "creep", "fraction": 0.5, "time_s": 1.0}])
+    place, t = [0.1, 0.015, 0.015], [0.0, 1.0, 2.0, 3.0]
+    once = recording([[0, 0]] * 4, time_s=t, load_frame=[1, 2, 3], load_points=[place] * 3, load_forces=[[0, 0, -1.0]] * 3)
+    halves = recording(
+        [[0, 0]] * 4, time_s=t, load_frame=[1, 1, 2, 2, 3, 3], load_points=[place] * 6, load_forces=[[0, 0, -0.5]] * 6
+    )
+    drive = drive_of(r, once)
+    ramp = 0.5 * (1 - (1 - np.exp(-1.0)))  # after the ramp over the first second
+    flow = np.array([ramp, 0.5 - (0.5 - ramp) * np.exp(-1), 0.5 - (0.5 - ramp) * np.exp(-2)])
+    np.testing.assert_allclose(-drive.load_forces[:, 2], 1 + flow, rtol=1e-9)
+    other = drive_of(r, halves)
+    for k in (1, 2, 3):
+        np.testing.assert_allclose(other.load_forces[other.load_frame == k].sum(axis=0), drive.load_forces[k - 1], atol=1e-12)
+
+
+# Walking
+
+
+def test_equal_frames_share_one_solve_and_come_out_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    rec = recording([[1.0, 0], [0.5, 0.2], [1.0, 0], [1.0, 0], [0.5, 0.2]])
+    calls: list[int] = []
+    plain = quasi_static_path.solve_frame
+    monkeypatch.setattr(quasi_static_path, "solve_frame", lambda *a, **k: calls.append(a[1]) or plain(*a, **k))
+    seen = walked(robot(), rec)
+    assert calls == [0, 1]
+    for k in range(5):
+        alone = solve_frame(Walk(robot(), drive_of(robot(), rec)), k)
+        np.testing.assert_allclose(seen[k], robot().markers.positions(alone.positions), atol=1e-9)
+
+
+def test_frames_with_other_loads_or_gravity_are_not_the_same() -> None:
+    rec = recording(
+        [[1.0, 0]] * 4,
+        load_frame=[1, 2],
+        load_points=[[0.1, 0.015, 0.03]] * 2,
+        load_forces=[[0, 0, -0.1], [0, 0, 0.1]],
+        gravity=[[0, 0, -9.81], [0, 0, -9.81], [0, 0, -9.81], [0, 9.81, 0]],
+    )
+    seen = walked(robot(), rec)
+    for a in range(4):
+        for b in range(a):
+            assert np.abs(seen[a] - seen[b]).max() > 1e-5
+
+
+def test_a_known_load_acts_where_it_stands() -> None:
+    rec = recording([[0, 0]], load_frame=[0], load_points=[MARKERS[0]], load_forces=[[0, 0.2, 0]])
+    body = robot().body
+    forces = embed_points(body.mesh, MARKERS[:1]).spread(np.array([[0, 0.2, 0]]), len(body.mesh.nodes))
+    np.testing.assert_allclose(
+        walked(robot(), rec)[0], robot().markers.positions(solve_equilibrium(body, nodal_forces=forces).positions), atol=1e-9
+    )
+
+
+def test_gravity_of_a_frame_replaces_that_of_the_body() -> None:
+    rec = recording([[0, 0]], gravity=[[0.0, 3.0, 1.0]])
+    np.testing.assert_allclose(
+        walked(robot(), rec)[0], walked(robot(gravity=(0.0, 3.0, 1.0)), recording([[0, 0]]))[0], atol=1e-12
+    )
+
+
+def test_with_friction_the_past_matters_and_unwanted_frames_are_walked_too() -> None:
+    up_down = recording([[0.5, 0], [1.5, 0], [0.5, 0]])
+    r = robot(friction=0.5)
+    assert has_history(r) and not has_history(robot())
+    seen = walked(r, up_down)
+    assert np.abs(seen[2] - seen[0]).max() > 1e-5
+    np.testing.assert_allclose(walked(r, up_down, [2])[2], seen[2], atol=1e-9)
+    plain = walked(robot(), up_down)
+    np.testing.assert_array_equal(plain[2], plain[0])
+
+
+def test_parts_of_a_walk_with_a_past_join_to_the_walk_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    levels = np.array([0.4, 1.0, 1.6, 1.6, 1.0, 0.5])
+    rec = recording(np.vstack([np.outer(levels, mix) + 0.05 for mix in ([1, 0], [0, 1], [0.6, 0.6], [0.2, 0.8], [1, 0.3])]))
+    starts: dict[int, Any] = {}
+    walked(robot(friction=0.4), rec, starts=starts)
+    for friction in (0.4, 0.6):
+        joined = walked(robot(friction=friction), rec, starts=dict(starts))
+        in_order = walked(robot(friction=friction), rec)
+        for k, seen in in_order.items():
+            np.testing.assert_allclose(joined[k], seen, atol=1e-9)
+    monkeypatch.setattr(
+        quasi_static_path, "_as_before", lambda now, then, slack: True
+    )  # where the past is only guessed, it shows
+    guessed = walked(robot(friction=0.6), rec, starts=dict(starts))
+    assert max(np.abs(guessed[k] - in_order[k]).max() for k in guessed) > 1e-8
+
+
+def test_with_friction_a_hold_is_solved_once_and_a_return_is_not_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    solved, solve = [], quasi_static_path.solve_frame
+    monkeypatch.setattr(quasi_static_path, "solve_frame", lambda walk, k, **more: (solved.append(k), solve(walk, k, **more))[1])
+    seen = walked(robot(friction=0.5), recording([[0.5, 0], [1.5, 0], [1.5, 0], [0.5, 0]]))
+    assert solved == [0, 1, 3]
+    np.testing.assert_array_equal(seen[1], seen[2])
+    assert np.abs(seen[3] - seen[0]).max() > 1e-5
+
+
+def test_a_frame_starts_from_the_state_whose_inputs_are_most_like_its_own() -> None:
+    rec = recording([[0.0, 0], [1.0, 0], [0.1, 0], [0.9, 0]])
+    starts: dict[int, Any] = {}
+    walked(robot(), rec, [0, 1], starts=starts)
+    found = quasi_static_path._nearest(Walk(robot(), drive_of(robot(), rec)), starts, [2, 3])
+    assert found[2] is starts[0] and found[3] is starts[1]
+
+
+def test_variants_give_the_derivative_of_frames_solved_anew() -> None:
+    rec, h = recording([[1.0, 0.3], [1.5, 0.1]]), 1e-4
+    base = robot()
+    variants = [
+        robot([{"name": "stiffness", "scale": 1 + h}]),
+        robot([{"name": "poisson", "poisson_ratio": 0.4 + h}]),
+        robot([{"name": "payload", "point_m": MARKERS[1].tolist(), "force_n": [0, 0, h]}]),
+    ]
+    behind = [
+        robot([{"name": "stiffness", "scale": 1 - h}]),
+        robot([{"name": "poisson", "poisson_ratio": 0.4 - h}]),
+        robot([{"name": "payload", "point_m": MARKERS[1].tolist(), "force_n": [0, 0, -h]}]),
+    ]
+    for k, _, seen, others in walk_along(
+        Walk(base, drive_of(base, rec)), [0, 1], attrgetter("markers"), [Walk(v, drive_of(v, rec)) for v in variants]
+    ):
+        for forward, ahead, back in zip(others, variants, behind):
+            alone = [
+                r.markers.positions(
+                    solve_equilibrium(
+                        r.body, tension=dict(zip(("top", "side"), rec.inputs[k])), relative_tolerance=1e-12
+                    ).positions
+                )
+                for r in (ahead, back)
+            ]
+            central = (alone[0] - alone[1]) / (2 * h)
+            assert np.abs((forward - seen) / h - central).max() < 1e-3 * np.abs(central).max()  # one-sided: h of curvature
+            np.testing.assert_allclose(forward, alone[0], atol=1e-4 * h * np.abs(central).max() + 1e-11)
+
+
+def test_another_modulus_of_some_elements_moves_a_frame_as_if_it_were_solved_anew() -> None:
+    rec, h, base = recording([[1.0, 0.3]]), 1e-4, robot()
+    for entry in (
+        {"name": "stiffness"},
+        {"name": "soft_region", "center_m": MARKERS[1].tolist(), "radius_m": 0.04},
+    ):
+        ahead, back = (apply_effects(base, [{**entry, "scale": 1 + s}]) for s in (h, -h))
+        [(_, _, seen, others)] = walk_along(
+            Walk(base, drive_of(base, rec)), [0], attrgetter("markers"), [Walk(ahead, drive_of(ahead, rec))]
+        )
+        alone = [
+            r.markers.positions(solve_equilibrium(r.body, tension={"top": 1.0, "side": 0.3}, relative_tolerance=1e-12).positions)
+            for r in (ahead, back)
+        ]
+        central = (alone[0] - alone[1]) / (2 * h)
+        assert np.abs((others[0] - seen) / h - central).max() < 1e-3 * np.abs(central).max()  # one-sided: h of curvature
+
+
+@pytest.mark.parametrize("control", ["tension", "displacement"])
+def test_many_forces_are_answered_by_the_points_that_are_observed(control: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    rec = recording([[1.0, 0.3], [2.0, 0.1]] if control == "tension" else [[2e-3, 0.0], [1e-3, 5e-4]], actuation=control)
+    base = apply_effects(robot(), [{"name": "cable_stretch", "stiffness_n_m": 2000.0}] if control == "displacement" else [])
+    payloads = [
+        {"name": "payload", "point_m": MARKERS[i % len(MARKERS)].tolist(), "force_n": f}
+        for i, f in enumerate((1e-3 * np.random.default_rng(2).standard_normal((3 * len(MARKERS) + 1, 3))).tolist())
+    ]
+    entries = [
+        *payloads,
+        {"name": "stiffness", "scale": 1.001},
+        {"name": "cable_gain", "scale": {"top": 1.001}},
+        {"name": "geometry", "scale": 1.001},
+        {"name": "base_compliance", "stiffness_n_m": 1e6},
+    ]
+    moved = {"name": "marker_offset", "offset_m": {"a": [1e-4, 0.0, 0.0]}}
+    robots = [*(apply_effects(base, [entry]) for entry in entries), apply_effects(base, [payloads[0], moved])]
+    walks = [Walk(r, drive_of(r, rec)) for r in robots]
+    solved, plain = list[int](), Tangent.respond
+    monkeypatch.setattr(Tangent, "respond", lambda self, forces: solved.append(len(forces)) or plain(self, forces))
+
+    def seen(variants: Sequence[Walk], known: dict[int, quasi_static_path.AtPoints] | None = None) -> FloatArray:
+        walk = Walk(base, drive_of(base, rec))
+        return np.array([others for *_, others in walk_along(walk, [0, 1], attrgetter("markers"), variants, answers=known)])
+
+    together = seen(walks)
+    assert solved and max(solved) == 3 * len(MARKERS)  # one a point and axis, none a payload
+    alone = np.concatenate([seen([walk]) for walk in walks], axis=1)
+    still = next(iter(walk_along(Walk(base, drive_of(base, rec)), [0], attrgetter("markers"))))[2]
+    np.testing.assert_allclose(together, alone, atol=1e-6 * np.abs(alone - still).max())
+    known = dict[int, quasi_static_path.AtPoints]()
+    np.testing.assert_allclose(seen(walks[:1], known), alone[:, :1], atol=1e-6 * np.abs(alone - still).max())
+    solved.clear()
+    monkeypatch.setattr(variants, "tangent_at", lambda *given: pytest.fail("a tangent is made though the answers are known"))
+    kept = seen(walks[1 : len(payloads) + 2], known)
+    np.testing.assert_allclose(kept, alone[:, 1 : len(payloads) + 2], atol=1e-6 * np.abs(alone - still).max())
+    assert known.keys() == {0, 1} and not solved
+
+
+def test_a_variant_in_observation_alone_costs_no_solve(monkeypatch: pytest.MonkeyPatch) -> None:
+    base = robot()
+    moved = base.with_marker_points(MARKERS + 0.001)
+    rec = recording([[1.0, 0.3]])
+    calls: list[int] = []
+    plain = quasi_static_path.solve_frame
+    monkeypatch.setattr(quasi_static_path, "solve_frame", lambda *a, **k: calls.append(a[1]) or plain(*a, **k))
+    drive = drive_of(base, rec)
+    _, _, seen, others = next(iter(walk_along(Walk(base, drive), [0], attrgetter("markers"), [Walk(moved, drive)])))
+    assert calls == [0] and 5e-4 < np.abs(others[0] - seen).max() < 2e-3
+
+
+def test_variants_that_rub_are_answered_twice_with_one_factor_a_state(monkeypatch: pytest.MonkeyPatch) -> None:
+    base, rec = robot(), recording([[0.5, 0.0], [1.0, 0.2], [0.5, 0.0], [1.0, 0.2]])
+    rubs = [apply_effects(base, [{"name": "cable_friction", "coefficient": c}]) for c in (0.1, 0.2)]
+    others = [apply_effects(base, [{"name": "stiffness", "scale": scale}]) for scale in (0.9, 1.1)]
+    made, plain = list[Any](), variants.tangent_at
+    monkeypatch.setattr(variants, "tangent_at", lambda *given: made.append(given) or plain(*given))
+    walks = [Walk(r, drive_of(r, rec)) for r in (*rubs, *others)]
+    seen = list(walk_along(Walk(base, drive_of(base, rec)), range(4), attrgetter("markers"), walks))
+    assert len(made) == 2  # frames of two states
+    monkeypatch.setattr(variants, "FACTOR_MEMORY", 0.0)
+    for (_, _, _, kept), (_, _, _, again) in zip(
+        seen, walk_along(Walk(base, drive_of(base, rec)), range(4), attrgetter("markers"), walks)
+    ):
+        np.testing.assert_allclose(kept, again, atol=1e-12)
+    assert len(made) == 6
+
+
+def test_factors_of_a_walk_with_friction_are_gone_with_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    base, rec = robot(), recording([[0.5, 0.0], [1.0, 0.2], [1.5, 0.4]])
+    rubs = apply_effects(base, [{"name": "cable_friction", "coefficient": 0.2}])
+    made, plain = list[weakref.ref[Any]](), variants.tangent_at
+
+    def tangent_at(*given: Any) -> Tangent:
+        tangent = plain(*given)
+        made.append(weakref.ref(tangent.factor))
+        return tangent
+
+    monkeypatch.setattr(variants, "tangent_at", tangent_at)
+    gc.disable()  # a circle of references would keep gigabytes until its next round
+    try:
+        deque(
+            walk_along(Walk(base, drive_of(base, rec)), [0, 2], attrgetter("markers"), [Walk(rubs, drive_of(rubs, rec))]),
+            maxlen=0,
+        )
+        assert made and all(factor() is None for factor in made)
+    finally:
+        gc.enable()
+
+
+def test_a_factor_takes_the_place_of_no_smaller_one() -> None:
+    state = walk_states(robot(), recording([[0.5, 0.0]]))[0]
+    bare = replace(state, factor=None)
+    size = state.factor.bytes
+    assert quasi_static_path._most_lent(bare, 1e9) == 1e9 and size < quasi_static_path._most_lent(state, 1e9) < 2 * size
+    assert quasi_static_path._most_lent(state, 0.0) == 0.0
+
+
+def test_a_variant_in_gravity_is_solved() -> None:
+    base, rec = robot(), recording([[1.0, 0.3]])
+    tilted = replace(base, body=base.body.with_gravity([1.0, 0, -9.81]))
+    _, _, seen, others = next(
+        iter(walk_along(Walk(base, drive_of(base, rec)), [0], attrgetter("markers"), [Walk(tilted, drive_of(tilted, rec))]))
+    )
+    assert np.abs(others[0] - seen).max() > 1e-6
+
+
+def test_earlier_states_are_starts_and_are_brought_up_to_date() -> None:
+    base, starts = robot(), {}
+    cold = walked(base, recording([[1.0, 0.3], [2.0, 0.3]]), starts=starts)
+    assert set(starts) == {0, 1}
+    warm = walked(base, recording([[1.001, 0.3], [2.0, 0.3]]), starts=starts)
+    assert np.abs(warm[0] - cold[0]).max() > 1e-9
+    np.testing.assert_allclose(warm[0], walked(base, recording([[1.001, 0.3]]))[0], atol=1e-9)
+    np.testing.assert_allclose(warm[1], cold[1], atol=1e-9)
+
+
+def test_a_frame_without_equilibrium_names_itself() -> None:
+    base = robot()
+    loose = replace(base, body=bar_body(block_mesh((4, 1, 1)), clamped=False, gravity=(0, 0, -9.81)))
+    with pytest.raises(DataError, match="no equilibrium in frame 0: singular: nothing holds the body"):
+        walked(loose, recording([[0.0, 0]]))
+
+
+@pytest.mark.parametrize(
+    "entry",
+    [
+        {"stiffness_n_m": 300.0},
+        {"rotation_stiffness_nm_rad": 0.05},
+        {"stiffness_n_m": 300.0, "rotation_stiffness_nm_rad": 0.3},
+    ],
+)
+def test_a_clamp_that_gives_takes_the_body_along_first(entry: dict[str, float], monkeypatch: pytest.MonkeyPatch) -> None:
+    rec = recording([[1.0, 0.0], [2.0, 0.5]])
+    rigid, starts, begun = robot(), {}, dict[int, Equilibrium]()
+    walked(rigid, rec, starts=starts)
+    soft = robot([{"name": "base_compliance", **entry}])
+    alone = walk_states(soft, rec)
+    plain = quasi_static_path.solve_frame
+
+    def solve(walk: Walk, k: int, **given: Any) -> Equilibrium:
+        begun[k] = given["start"]
+        return plain(walk, k, **given)
+
+    monkeypatch.setattr(quasi_static_path, "solve_frame", solve)
+    there = walked(soft, rec, starts=dict(starts))
+    for k, state in enumerate(alone):
+        np.testing.assert_allclose(there[k], soft.markers.positions(state.positions), atol=1e-8)
+        way = np.abs(state.positions - starts[k].positions).max()
+        assert np.abs(begun[k].positions - state.positions).max() < 0.5 * way
+
+
+@pytest.mark.parametrize("entry", [{"stiffness_n_m": 1.0}, {"rotation_stiffness_nm_rad": 1e-3}])
+def test_a_clamp_that_cannot_hold_the_body_is_walked_from_rest(entry: dict[str, float]) -> None:
+    rec = recording([[1.0, 0.0]])
+    starts = walk_states(robot(), rec)
+    soft = robot([{"name": "base_compliance", **entry}])
+    assert quasi_static_path._taken_along(Walk(soft, drive_of(soft, rec)), 0, starts[0]) is None
+
+
+def test_where_a_body_that_was_taken_along_does_not_come_to_rest_it_is_walked_from_rest(monkeypatch: pytest.MonkeyPatch) -> None:
+    rec, starts = recording([[1.0, 0.0], [2.0, 0.5]]), {}
+    walked(robot(), rec, starts=starts)
+    soft = robot([{"name": "base_compliance", "stiffness_n_m": 300.0}])
+    alone, plain = walked(soft, rec), quasi_static_path.solve_frame
+
+    def solve(walk: Walk, k: int, **given: Any) -> Equilibrium:
+        state = plain(walk, k, **given)
+        return replace(state, status="overload") if given.get("reuse_factor") else state
+
+    monkeypatch.setattr(quasi_static_path, "solve_frame", solve)
+    there = walked(soft, rec, starts=starts)
+    for k, seen in alone.items():
+        np.testing.assert_allclose(there[k], seen, atol=1e-9)

@@ -1,0 +1,179 @@
+"""Forces from markers and clouds of an arm of another mesh and law than the estimator's."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from arm import NAMES, T_ROBOT_CAMERA, arm, record
+
+from femsense.calib.calibrate import calibrate
+from femsense.core.errors import InputError
+from femsense.core.pose import invert_pose, transform_points
+from femsense.fem.mesh import surface_triangles, triangle_normals
+from femsense.io.clouds.cloud_files import write_cloud
+from femsense.model.recording import Recording
+from femsense.pointcloud.cloud import PointCloud
+from femsense.sensing.pipeline import estimate
+from femsense.sensing.types import SensingOptions
+
+TIP = np.array([0.1, 0.0, 0.01])
+FORCE = np.array([0.01, 0.08, -0.15])
+INPUTS = np.array([[0.0, 0, 0, 0], [0.5, 0, 0, 0], [0.5, 0, 0.3, 0], [0.5, 0, 0.3, 0]])
+
+
+@pytest.fixture(scope="module")
+def touched() -> tuple[Recording, list[np.ndarray]]:
+    """Two free frames, then two with a force at the tip; noise 0.1 mm."""
+    recording, states = record(INPUTS, noise=1e-4, forces={2: (TIP, FORCE), 3: (TIP, 2 * FORCE)})
+    return replace(recording, free=np.array([True, True, False, False])), states
+
+
+def test_a_force_at_a_given_place_comes_out_of_markers(touched):
+    recording, _ = touched
+    run = estimate(arm(), recording, calibrate(arm(), recording), at=TIP)
+    for contact, true in zip(run.contacts, (0 * FORCE, 0 * FORCE, FORCE, 2 * FORCE)):
+        assert np.linalg.norm((contact.force_n_xyz - true)[1:]) < 0.03 + 0.05 * np.linalg.norm(true)
+        assert contact.source == "given"
+    assert all(report.status == "ok" for report in run.frames)
+    assert run.frames[3].rms_after_m < 0.2 * run.frames[3].rms_before_m
+
+
+def test_three_standard_deviations_hold_the_truth(touched):
+    recording, _ = touched
+    run = estimate(arm(), recording, calibrate(arm(), recording), at=TIP)
+    for contact, true in zip(run.contacts[2:], (FORCE, 2 * FORCE)):
+        assert abs(contact.force_n - np.linalg.norm(true)) < 3 * contact.std_n
+        assert contact.std_n < 0.15 * np.linalg.norm(true)
+
+
+def test_a_known_load_at_the_place_is_sensed_and_compared(touched):
+    recording, _ = touched
+    loaded = replace(recording, load_frame=np.array([3]), load_points=TIP[None], load_forces=2 * FORCE[None])
+    run = estimate(arm(), loaded, calibrate(arm(), recording), at=TIP)
+    assert run.known_loads[0]["frame"] == 3
+    assert abs(run.known_loads[0]["error_percent"]) < 15
+
+
+def test_a_broken_frame_is_reported_and_the_rest_goes_on(touched):
+    recording, _ = touched
+    keep = recording.marker_frame != 2
+    gap = replace(
+        recording,
+        marker_frame=recording.marker_frame[keep],
+        marker_index=recording.marker_index[keep],
+        marker_view=recording.marker_view[keep],
+        marker_xyz=recording.marker_xyz[keep],
+    )
+    run = estimate(arm(), gap, calibrate(arm(), recording), at=TIP)
+    assert "no marker" in run.frames[2].status
+    assert run.frames[3].status == "ok"
+
+
+def test_without_clouds_a_place_must_be_given(touched):
+    recording, _ = touched
+    with pytest.raises(InputError, match="--at"):
+        estimate(arm(), recording, calibrate(arm(), recording))
+
+
+def test_a_place_far_from_the_body_is_refused(touched):
+    recording, _ = touched
+    with pytest.raises(InputError, match="far from the surface"):
+        estimate(arm(), recording, calibrate(arm(), recording), at=[100.0, 0.0, 10.0])
+
+
+def cloud_of(states: np.ndarray, force_at: np.ndarray | None, rng: np.random.Generator) -> PointCloud:
+    """Return what the camera sees of the true arm in blue (faces towards it) and of a red ball at the place of the force."""
+    true = arm((8, 3, 3), law="neo_hookean")
+    triangles = surface_triangles(true.body.mesh)
+    facing = (
+        np.einsum("tc,tc->t", triangle_normals(states, triangles), T_ROBOT_CAMERA[:3, 3] - states[triangles].mean(axis=1)) > 0
+    )
+    triangles = triangles[facing]
+    corners = states[triangles]
+    weights = rng.dirichlet(np.ones(3), size=(len(triangles), 12))
+    points = np.einsum("tsi,tic->tsc", weights, corners).reshape(-1, 3)
+    colors = np.tile([0.2, 0.4, 0.8], (len(points), 1))
+    if force_at is not None:
+        ball = rng.normal(size=(1500, 3))
+        ball = force_at + 0.006 * ball / np.linalg.norm(ball, axis=1, keepdims=True)
+        points, colors = np.vstack([points, ball]), np.vstack([colors, np.tile([0.9, 0.1, 0.1], (1500, 1))])
+    noisy = points + 2e-4 * rng.normal(size=points.shape)
+    return PointCloud(transform_points(invert_pose(T_ROBOT_CAMERA), noisy), colors)
+
+
+def seen_clouds(folder: Path, place: np.ndarray, *, hides: float = 0.0) -> Recording:
+    """Return a recording with clouds of the arm, pushed down on its upper face by 0.1 N in the last frame, by a ball that hides this face so far [m]."""
+    recording, states = record(INPUTS, noise=1e-4, forces={3: (place, np.array([0.0, 0.0, -0.1]))})
+    rng = np.random.default_rng(5)
+    files = []
+    true = arm((8, 3, 3), law="neo_hookean")
+    rest = true.body.mesh.nodes
+    node = int(np.argmin(np.linalg.norm(rest - place, axis=1)))
+    for k, x in enumerate(states):
+        ball = x[node] + [0, 0, 0.006] if k == 3 else None
+        cloud = cloud_of(x, ball, rng)
+        if hides and ball is not None:
+            points = transform_points(T_ROBOT_CAMERA, cloud.points)
+            top = x[rest[:, 2] > 0.0099]
+            top = top[np.argsort(top[:, 0])]
+            level = np.interp(points[:, 0], top[:, 0], top[:, 2])
+            hidden = (points[:, 2] > level - 2e-3) & (np.linalg.norm(points[:, :2] - x[node, :2], axis=1) < hides)
+            keep = ~hidden | (cloud.colors[:, 0] > 0.5)
+            cloud = PointCloud(cloud.points[keep], cloud.colors[keep])
+        write_cloud(folder / f"{k:06d}.ply", cloud)
+        files.append((folder / f"{k:06d}.ply",))
+    return replace(recording, free=np.array([True, True, True, False]), cloud_files=tuple(files), color_files=((None,),) * 4)
+
+
+@pytest.fixture(scope="module")
+def seen(tmp_path_factory) -> Recording:
+    """Clouds of the arm, pushed down in the middle of its upper face near the tip."""
+    return seen_clouds(Path(tmp_path_factory.mktemp("clouds")), np.array([0.085, 0.0, 0.01]))
+
+
+def test_a_push_is_found_in_a_coloured_cloud_with_its_force(seen):
+    run = estimate(arm(), seen, calibrate(arm(), seen))
+    assert [c.frame for c in run.contacts] == [3]
+    contact = run.contacts[0]
+    assert contact.source == "cloud"
+    assert np.linalg.norm(contact.position_m[:1] - 0.085) < 0.006
+    assert contact.force_n == pytest.approx(0.1, rel=0.15)
+    assert abs(contact.force_n - 0.1) < 3 * contact.std_n
+    assert contact.force_n_xyz[2] < -0.08
+
+
+def test_a_friction_cone_allows_a_force_beside_the_normal(seen):
+    run = estimate(arm(), seen, calibrate(arm(), seen), options=SensingOptions(friction=0.5))
+    contact = run.contacts[0]
+    along = -contact.force_n_xyz @ contact.normal
+    assert np.linalg.norm(contact.force_n_xyz + along * contact.normal) <= 0.5 * along + 1e-9
+
+
+def test_the_data_say_where_a_force_points_that_was_found(tmp_path):
+    """What touches hides the side that it touches: here the camera sees but the flank of the arm beside the ball."""
+    seen = seen_clouds(tmp_path, np.array([0.085, 0.01, 0.01]), hides=0.015)
+    calibration = calibrate(arm(), seen)
+    contact = estimate(arm(), seen, calibration).contacts[0]
+    along_normal = estimate(arm(), seen, calibration, options=SensingOptions(friction=0.0)).contacts[0]
+    np.testing.assert_allclose(np.cross(along_normal.force_n_xyz, along_normal.normal), 0.0, atol=1e-2 * along_normal.force_n)
+    assert along_normal.force_n < 0.05
+    assert abs(contact.force_n - 0.1) < min(0.02, contact.std_n)
+    assert contact.force_n_xyz[2] < -0.95 * contact.force_n
+
+
+def test_a_cloud_that_is_no_cloud_is_reported(seen, tmp_path):
+    broken = tmp_path / "000002.ply"
+    broken.write_bytes(b"not a cloud")
+    files = (*seen.cloud_files[:2], (broken,), seen.cloud_files[3])
+    run = estimate(arm(), replace(seen, cloud_files=files), calibrate(arm(), seen))
+    assert run.frames[2].status != "ok"
+    assert str(broken) in run.frames[2].status
+    assert run.frames[3].status == "ok"
+
+
+def test_the_motor_tensions_are_reported(seen):
+    run = estimate(arm(), seen, calibrate(arm(), seen))
+    assert run.frames[3].tension_n == pytest.approx(dict(zip(NAMES, INPUTS[3])))

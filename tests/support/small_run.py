@@ -1,0 +1,37 @@
+"""A run made by hand."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from test_results import NAN
+
+from femsense.model.robot import Robot
+from femsense.sensing.types import ContactForce, FrameReport, Run, States
+
+
+def make_run(robot: Robot) -> Run:
+    nodes = robot.body.mesh.nodes
+    rng = np.random.default_rng(5)
+    contacts = tuple(
+        ContactForce(
+            frame, 0.5 * frame, i, rng.normal(size=3), rng.normal(size=3), rng.normal(size=3), rng.random(), std, "cloud"
+        )
+        for frame, i, std in ((1, 0, 0.1), (1, 1, NAN), (4, 0, 0.3))
+    )
+    frames = (
+        FrameReport(0, 0.0, 'no equilibrium: "stuck", try, again', 0, 0, NAN, NAN, NAN, {"top": NAN, "side": NAN}),
+        FrameReport(1, 0.5, "ok", 2, 12, 1e-3, 1e-4, 12.5, {"top": 1.0, "side": 0.25}),
+        FrameReport(4, 1.0, "ok", 1, 12, 1 / 3e3, 1e-4, 11.5, {"top": 2.0, "side": 0.5}),
+    )
+    moved = (nodes[None] + 1e-3 * rng.normal(size=(3, *nodes.shape))).astype(np.float32)
+    states = States(np.array([0.0, 0.5, 1.0]), moved, robot.body.mesh.tets, nodes)
+    return Run(
+        contacts,
+        frames,
+        states,
+        robot,
+        Path("somewhere"),
+        ({"frame": 4, "declared_n": 0.5, "sensed_n": 0.49, "error_percent": -2.0},),
+    )

@@ -1,0 +1,300 @@
+"""The page: what is served, what it is told about contacts, and the page itself in a browser."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import struct
+import subprocess
+import urllib.error
+import urllib.request
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from glb import ROOT, Glb, build_hook, npm_folder
+from xr_bar import START, write_run
+
+from femsense.core.errors import InputError, MissingDependency
+from femsense.xr import view
+
+VIEWER = ROOT / "femsense" / "xr" / "viewer"
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+
+
+@pytest.fixture
+def page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A page of two files: enough for all but the browser."""
+    folder = tmp_path / "page"
+    folder.mkdir()
+    (folder / "index.html").write_text("<p>page</p>", encoding="utf-8")
+    (folder / "app.js").write_text("1", encoding="utf-8")
+    (folder / ".sources").write_text("digest", encoding="utf-8")
+    monkeypatch.setattr(view, "PAGE", folder)
+    return folder
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    return write_run(tmp_path / "bent-bar")
+
+
+def get(url: str) -> tuple[int, str, bytes]:
+    try:
+        with urllib.request.urlopen(url, timeout=10) as answer:
+            return answer.status, answer.headers["Content-Type"], answer.read()
+    except urllib.error.HTTPError as error:
+        return error.code, "", b""
+
+
+# ---- what is served ----------------------------------------------------------------------------------------------------------
+
+
+def test_serves_page_mesh_and_contacts_and_nothing_else(run: Path, page: Path) -> None:
+    with view.serve(run, open_browser=False) as server:
+        assert server.server_address[0] == "127.0.0.1"
+        assert get(server.url) == (200, "text/html", b"<p>page</p>")
+        assert get(server.url + "app.js?x=1")[:2] == (200, "text/javascript")
+        status, kind, glb = get(server.url + "robot.glb")
+        assert (status, kind, glb[:4]) == (200, "model/gltf-binary", b"glTF")
+        assert json.loads(get(server.url + "contacts.json")[2])["format"] == "femsense-contacts-1"
+        for path in ("states.npz", "../bent-bar/states.npz", "%2e%2e/page/index.html", ".sources", "/etc/passwd"):
+            assert get(server.url + path)[0] == 404
+        url = server.url
+    with pytest.raises(urllib.error.URLError):
+        urllib.request.urlopen(url, timeout=2)
+
+
+def test_mesh_is_made_once_and_again_when_the_states_are_newer(run: Path, page: Path) -> None:
+    view.serve(run, open_browser=False).stop()
+    first = (run / "robot.glb").stat().st_mtime_ns
+    assert len(Glb(run / "robot.glb").times) == 24
+    view.serve(run, open_browser=False).stop()
+    assert (run / "robot.glb").stat().st_mtime_ns == first
+    write_run(run, frames=9)
+    os.utime(run / "robot.glb", (0, 0))
+    view.serve(run, open_browser=False).stop()
+    assert len(Glb(run / "robot.glb").times) == 9
+
+
+def test_port_in_use_is_said(run: Path, page: Path) -> None:
+    with view.serve(run, open_browser=False) as server, pytest.raises(InputError, match="cannot be served"):
+        view.serve(run, port=server.server_address[1], open_browser=False)
+
+
+def test_page_that_was_not_built_is_said(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(view, "PAGE", tmp_path / "nothing")
+    with pytest.raises(MissingDependency, match="pip install"):
+        view.serve(run, open_browser=False)
+
+
+def test_static_page(run: Path, page: Path, tmp_path: Path) -> None:
+    index = view.write_static_page(run, tmp_path / "out")
+    assert index == tmp_path / "out" / "index.html"
+    assert sorted(p.name for p in index.parent.iterdir()) == ["app.js", "contacts.json", "index.html", "robot.glb"]
+
+
+# ---- what the page is told -----------------------------------------------------------------------------------------------------
+
+
+def test_contacts_go_with_their_frames(run: Path) -> None:
+    told = view.contacts_of_run(run)
+    states = np.load(run / "states.npz")
+    np.testing.assert_allclose([f["time_s"] for f in told["frames"]], states["time_s"] - START, atol=1e-12)
+    assert told["name"] == "bent-bar" and told["frame"] == "robot"
+    assert [len(f["contacts"]) for f in told["frames"]] == [0] * 3 + [1] * 18 + [0] * 3
+    (contact,) = told["frames"][12]["contacts"]
+    assert contact["force_vector_n"] == pytest.approx([-2.0, 0.0, 0.0]) and contact["force_n"] == pytest.approx(2.0)
+    assert (contact["contact"], contact["std_n"], contact["source"]) == (1, 0.1, "cloud")
+    assert told["frames"][12]["frame"] == 22
+    nodes = states["nodes_m"][12]
+    assert np.linalg.norm(nodes - contact["point_m"], axis=1).min() < 1e-6
+
+
+def test_run_without_contacts_and_with_gaps(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run", contacts=False)
+    assert all(f["contacts"] == [] for f in view.contacts_of_run(run)["frames"])
+    (run / "frames.csv").write_text("frame,time_s,status,rms_after_m\n7,2.0,converged,0.0012\n8,4.0,,nan\n", encoding="utf-8")
+    first, last = (view.contacts_of_run(run)["frames"][i] for i in (0, -1))
+    assert (first["frame"], first["status"], first["rms_after_m"]) == (7, "converged", 0.0012)
+    assert (last["frame"], last["status"], last["rms_after_m"]) == (8, None, None)
+    json.dumps(view.contacts_of_run(run), allow_nan=False)
+
+
+def test_refusals_name_the_file(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"states\.npz"):
+        view.contacts_of_run(tmp_path)
+    run = write_run(tmp_path / "run")
+    table = (run / "contacts.csv").read_text(encoding="utf-8")
+    (run / "contacts.csv").write_text(table.replace("force_n", "newton", 1), encoding="utf-8")
+    with pytest.raises(InputError, match=r"contacts\.csv.*columns are missing[\s\S]*force_n"):
+        view.contacts_of_run(run)
+    (run / "contacts.csv").write_text(re.sub("cloud", "cloud", table).replace(",0.1,", ",much,", 1), encoding="utf-8")
+    with pytest.raises(InputError, match=r"contacts\.csv:2, std_n.*not a number[\s\S]*much"):
+        view.contacts_of_run(run)
+    (run / "states.npz").write_bytes(b"not an archive")
+    with pytest.raises(InputError, match="not readable"):
+        view.contacts_of_run(run)
+    np.savez(run / "states.npz", time_s=[0.0])
+    with pytest.raises(InputError, match="nodes_m, tets"):
+        view.export_run(run, tmp_path / "x.glb")
+
+
+# ---- the sources of the page ----------------------------------------------------------------------------------------------------
+
+
+def test_lock_file_holds_no_addresses() -> None:
+    text = (VIEWER / "package-lock.json").read_text(encoding="utf-8")
+    assert "resolved" not in text and "://" not in text
+    packages = json.loads(text)["packages"]
+    assert all("integrity" in entry for name, entry in packages.items() if name)
+    assert packages["node_modules/three"]["version"] == json.loads((VIEWER / "package.json").read_text())["dependencies"]["three"]
+
+
+def test_page_speaks_of_no_other_host() -> None:
+    for source in (VIEWER / "src").iterdir():
+        found = re.findall(r"https?://[^\s'\"]+", source.read_text(encoding="utf-8"))
+        assert [f for f in found if not f.startswith("http://www.w3.org/")] == [], source.name
+
+
+# ---- in a browser ------------------------------------------------------------------------------------------------------------------
+
+LOOK = """
+const { chromium } = require('playwright-core');
+const [browser, url, shot, phone] = process.argv.slice(2);
+const args = ['--no-sandbox', '--use-gl=angle', '--use-angle=swiftshader', '--enable-unsafe-swiftshader', '--disable-quic',
+  '--no-first-run', '--disable-background-networking', '--disable-component-update', '--disable-sync'];
+(async () => {
+  const opened = await chromium.launch({ executablePath: browser, args });
+  const page = await opened.newPage({ viewport: { width: 900, height: 600 } });
+  const problems = [], hosts = new Set();
+  page.on('console', (m) => { if (m.type() === 'error') problems.push(m.text()); });
+  page.on('pageerror', (e) => problems.push(e.message));
+  page.on('request', (r) => { if (r.url().startsWith('http')) hosts.add(new URL(r.url()).host); });
+  await page.goto(url + '?time=0.97&play=0', { timeout: 120000 });
+  await page.waitForFunction(() => document.documentElement.dataset.state, null, { timeout: 120000 });
+  const state = await page.evaluate(() => document.documentElement.dataset.state);
+  const text = () => page.evaluate(() => document.body.innerText);
+  const result = { state, problems, hosts: [...hosts], text: await text() };
+  if (state === 'ready') {
+    await page.waitForTimeout(500);
+    await page.screenshot({ path: shot });
+    const clock = () => page.textContent('#clock');
+    await page.keyboard.press('ArrowRight');
+    result.next = await clock();
+    await page.keyboard.press('Home');
+    result.home = await clock();
+    await page.keyboard.press(' ');
+    await page.waitForTimeout(700);
+    result.later = await clock();
+    result.button = await page.getAttribute('#play', 'aria-label');
+    await page.keyboard.press('f');
+    result.forces = await page.getAttribute('#forces', 'aria-pressed');
+    await page.setViewportSize({ width: 360, height: 740 });
+    await page.waitForTimeout(300);
+    await page.screenshot({ path: phone });
+    result.overflow = await page.evaluate(() => document.documentElement.scrollWidth - window.innerWidth);
+  }
+  await opened.close();
+  console.log(JSON.stringify(result));
+})().catch((e) => { console.error(e); process.exit(1); });
+"""
+
+
+@pytest.fixture(scope="module")
+def built_page(request: pytest.FixtureRequest) -> Path:
+    """The bundle as the build hook makes it, kept between runs for the same sources."""
+    hook = build_hook()
+    digest = hook.digest_of(VIEWER)
+    kept = request.config.cache.mkdir("viewer-page")
+    stamp = kept / "dist" / ".sources"
+    if not (stamp.is_file() and stamp.read_text() == digest):
+        for name in hook.SOURCES:
+            source = VIEWER / name
+            shutil.copytree(source, kept / name, dirs_exist_ok=True) if source.is_dir() else shutil.copy(source, kept / name)
+        try:
+            hook.build_page(kept, digest)
+        except RuntimeError as error:
+            pytest.skip(f"the page cannot be built here: {error}")
+    return kept / "dist"
+
+
+def look(request: pytest.FixtureRequest, url: str, folder: Path) -> dict[str, object]:
+    """What a browser finds at the page."""
+    packages = npm_folder(request.config.cache.mkdir("playwright"), "playwright-core@1.65.1")
+    script = packages / "look.cjs"
+    script.write_text(LOOK, encoding="utf-8")
+    command = [*build_hook().node_command(), str(script), str(CHROMIUM), url, str(folder / "desk.png"), str(folder / "phone.png")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr
+    found: dict[str, object] = json.loads(done.stdout)
+    return found
+
+
+def pixels(path: Path) -> np.ndarray:
+    """Colours of an 8-bit PNG without interlacing, shape (h, w, 3)."""
+    data, at, packed, head = path.read_bytes(), 8, b"", b""
+    while at < len(data):
+        (size,) = struct.unpack_from(">I", data, at)
+        kind, body = data[at + 4 : at + 8], data[at + 8 : at + 8 + size]
+        head, packed = (body, packed) if kind == b"IHDR" else (head, packed + body if kind == b"IDAT" else packed)
+        at += 12 + size
+    width, height, depth, color = struct.unpack_from(">IIBB", head)
+    n = {2: 3, 6: 4}[color]
+    assert depth == 8
+    rows = np.frombuffer(zlib.decompress(packed), np.uint8).reshape(height, 1 + n * width)
+    image = np.zeros((height, width, n), np.uint8)
+    above = np.zeros((width, n), int)
+    for y, row in enumerate(rows):
+        line, kind = row[1:].reshape(width, n).astype(int), row[0]
+        if kind == 2:
+            line = (line + above) % 256
+        elif kind in (1, 3, 4):
+            left, corner = np.zeros(n, int), np.zeros(n, int)
+            for x in range(width):
+                a, b, c = left, above[x], corner
+                guess = a if kind == 1 else (a + b) // 2 if kind == 3 else _paeth(a, b, c)
+                left = line[x] = (line[x] + guess) % 256
+                corner = b
+        image[y] = above = line
+    return image[..., :3]
+
+
+def _paeth(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+    p = a + b - c
+    pa, pb, pc = abs(p - a), abs(p - b), abs(p - c)
+    return np.where((pa <= pb) & (pa <= pc), a, np.where(pb <= pc, b, c))
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+def test_page_in_a_browser(
+    request: pytest.FixtureRequest, run: Path, built_page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(view, "PAGE", built_page)
+    with view.serve(run, open_browser=False) as server:
+        seen = look(request, server.url, tmp_path)
+        assert seen["state"] == "ready" and seen["problems"] == []
+        assert seen["hosts"] == [server.url.split("/")[2]]
+    assert "24 frames" in str(seen["text"]) and "1.98 ± 0.10 N" in str(seen["text"])  # 2 N · sin(π 11/24)
+    assert str(seen["next"]).startswith("1.04") and str(seen["home"]).startswith("0.00")
+    assert not str(seen["later"]).startswith("0.00") and seen["button"] == "Pause"
+    assert seen["forces"] == "false" and seen["overflow"] == 0
+    for name in ("desk.png", "phone.png"):
+        red, green, blue = np.moveaxis(pixels(tmp_path / name).astype(int), -1, 0)
+        assert ((blue > 120) & (blue > red + 50)).mean() > 0.005  # the blue body
+        if name == "desk.png":
+            assert ((red > 180) & (red > blue + 60) & (green > 100)).mean() > 0.0005  # the amber arrow
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+def test_page_says_what_is_missing(
+    request: pytest.FixtureRequest, run: Path, built_page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(view, "PAGE", built_page)
+    with view.serve(run, open_browser=False) as server:
+        del server.files["robot.glb"]
+        seen = look(request, server.url, tmp_path)
+    assert seen["state"] == "error" and "robot.glb could not be loaded (404)" in str(seen["text"])
