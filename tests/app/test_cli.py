@@ -161,7 +161,7 @@ def test_an_option_takes_several_values(words: str, spread: str) -> None:
 
 def test_json_is_alone_on_standard_output_whatever_libraries_print(tmp_path: Path) -> None:
     code = (
-        "import ctypes, femsense.inspection as i, os, sys\nfrom femsense import cli\nreal = i.inspect_path\n"
+        "import ctypes, femsense.app.inspect as i, os, sys\nfrom femsense.app import cli\nreal = i.inspect_path\n"
         "def noisy(path):\n    print('python says')\n    ctypes.CDLL(None).printf(b'C says\\n')\n    os.write(1, b'the system says\\n')\n"
         "    return real(path)\n"
         f"i.inspect_path = noisy\nsys.exit(cli.run(['inspect', {str(write_block_robot(tmp_path))!r}, '--json']))"
@@ -426,11 +426,11 @@ def test_doctor_names_the_package_of_the_system(message: str, hint: str) -> None
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_stopping_leaves_nothing_half_written(tmp_path: Path, robot: Path, recording: Path, number: int) -> None:
     code = (
-        "import femsense.calib.calibrate as c, sys, time\nfrom femsense.results import _write_states\nimport femsense.results as r\n"
+        "import femsense.calib.calibrate as c, sys, time\nfrom femsense.sensing.run_files import _write_states\nimport femsense.sensing.run_files as r\n"
         "def slow(*arguments):\n    _write_states(*arguments)\n    print('writing', file=sys.stderr, flush=True)\n    time.sleep(60)\n"
         "r._write_states = slow\nimport signal\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background inherits that it is ignored\n"
-        "from femsense.cli import main\nmain()"
+        "from femsense.app.cli import main\nmain()"
     )
     words: Sequence[str] = ["estimate", str(robot), str(recording), "-o", str(tmp_path / "run"), "--at", "0.1,0.015,0.015"]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import femsense.calib.fit as fit_module
 import numpy as np
 import pytest
 from analytic import central_gradient, random_rotation
 from scipy.optimize import least_squares
 
+import femsense.core.least_squares as fit_module
 from femsense.calib.rigid import fit_rigid, fit_rigid_robust
 from femsense.core.errors import DataError, InputError
 from femsense.core.least_squares import covariance_of, gauss_newton

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import femsense.calib.near as near_module
 import numpy as np
 import pytest
 from scipy.optimize import minimize
 
+import femsense.core.local_model as near_module
 from femsense.core.least_squares import gauss_newton
 from femsense.core.local_model import Curvature, Kinks, Near
 

@@ -9,7 +9,7 @@ import pytest
 from analytic import central_gradient, relative_error
 from helpers import block_mesh
 from hollow import hollow_bar, shell, without_box
-from hollow_bar_cable import hollow
+from hollow_bar_cable import SEED, hollow
 
 from femsense.core.errors import InputError
 from femsense.fem.assembly import internal, reduced_matrix
@@ -20,7 +20,6 @@ from femsense.fem.compliance import compliance, tangent_at
 from femsense.fem.equilibrium import Equilibrium, solve_equilibrium
 from femsense.fem.mesh import TetMesh
 
-SEED = [0.05, 0.015, 0.015]
 SIZE = (0.1, 0.03, 0.03)
 P = 4e3
 

@@ -193,9 +193,9 @@ def test_effects_go_to_the_effects_and_can_be_left_out(tmp_path: Path, monkeypat
         seen.extend(given)
         return replace(robot, name="with effects")
 
-    import femsense.effects
+    import femsense.model.effects
 
-    monkeypatch.setattr(femsense.effects, "apply_effects", apply_effects, raising=False)
+    monkeypatch.setattr(femsense.model.effects, "apply_effects", apply_effects, raising=False)
     assert load_robot(folder).name == "with effects" and seen == entries
     assert load_robot(folder, effects=False).name == "block"
 

@@ -109,7 +109,7 @@ def test_what_is_taken_away_by_what_nobody_names_is_left(monkeypatch: pytest.Mon
 def test_what_has_evidence_and_makes_the_held_out_error_larger_is_said_and_not_handed_back(monkeypatch: pytest.MonkeyPatch):
     inputs, labels = sweeps()
     recording, _ = record(inputs, effects=[{"name": "cable_friction", "coefficient": 0.25}], labels=labels, truth=arm((4, 1, 1)))
-    monkeypatch.setattr(sys.modules["femsense.loop.verdict.verdict"], "_holds_out", lambda data, search, back: False)
+    monkeypatch.setattr(sys.modules["femsense.loop.verdict.returned_model"], "_holds_out", lambda data, search, back: False)
     loop = improve(arm((4, 1, 1)), [recording], effects=["cable_friction"])
     assert not loop.effects and loop.robot is loop.declared
     assert "evidence for cable_friction" in loop.sentence and "mesh itself costs" in loop.sentence

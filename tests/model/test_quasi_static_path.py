@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from analytic import bar_body
-from driven import recording, robot
+from driven import MARKERS, recording, robot
 from helpers import block_mesh
 
 from femsense.core.arrays import FloatArray
@@ -28,8 +28,6 @@ from femsense.model.quasi_static_path import walk_along
 from femsense.model.recording import Recording, make_recording
 from femsense.model.robot import Robot
 from femsense.model.variants import solve_frame
-
-MARKERS = np.array([[0.1, 0.015, 0.03], [0.06, 0.0, 0.0], [0.1, 0.03, 0.015]])
 
 
 def walked(r: Robot, rec: Recording, frames: Sequence[int] | None = None, **options: Any) -> dict[int, np.ndarray]:

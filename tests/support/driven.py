@@ -7,13 +7,14 @@ from typing import Any
 
 import numpy as np
 from analytic import bar_body
-from driven import MARKERS
 from helpers import block_mesh
 
 from femsense.fem.mesh import embed_points
 from femsense.model.effects import apply_effects
 from femsense.model.recording import Recording, make_recording
 from femsense.model.robot import Observation, Robot, plain_actuation
+
+MARKERS = np.array([[0.1, 0.015, 0.03], [0.06, 0.0, 0.0], [0.1, 0.03, 0.015]])
 
 
 def robot(

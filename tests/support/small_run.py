@@ -5,10 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from test_results import NAN
 
 from femsense.model.robot import Robot
 from femsense.sensing.types import ContactForce, FrameReport, Run, States
+
+NAN = float("nan")
 
 
 def make_run(robot: Robot) -> Run:

@@ -19,13 +19,13 @@ from femsense.loop.fit.discretisation_error import with_mesh_errors
 from femsense.loop.fit.fitted_model import Stage, make_stage, own_of, problem_of, with_nuisance
 from femsense.loop.fit.joint_fit import Prior
 from femsense.loop.fit.noise_components import Noise
-from femsense.loop.search import acceptance, forward_selection, location_search, subsampling
-from femsense.loop.search import forward_selection as growing
+from femsense.loop.search import acceptance, forward_selection, location_search, pruning, subsampling
+from femsense.loop.search import effect_fields as effect_fields_module
 from femsense.loop.search import refit as refits
-from femsense.loop.search import screening as screening
 from femsense.loop.search.effect_fields import effect_fields, fields_of
 from femsense.loop.search.forward_selection import _settled, polished
 from femsense.loop.search.location_search import climbed, closer, may_lie_elsewhere, placed
+from femsense.loop.search.pruning import prune
 from femsense.loop.search.refit import EVIDENCE, evidence, refit
 from femsense.loop.search.screening import Candidate, screen, screen_stage
 from femsense.loop.search.search_state import Refit
@@ -164,7 +164,7 @@ def test_another_form_of_an_effect_is_held_against_other_effects_alone(
         return refit(own, before, candidate, noise, wanted=wanted, **named)
 
     for name, value in (("refit", counted), ("explains", lambda stage: True), ("shortlist", lambda table, first: listed)):
-        monkeypatch.setattr(growing, name, value)
+        monkeypatch.setattr(forward_selection, name, value)
     monkeypatch.setattr(forward_selection, "_bar", lambda ahead, candidate: -np.inf)
     forward_selection.grow(data, stage, table, NOISE, lambda text: None)
     assert asked[:2] == [forward_selection.EVIDENCE] * 2 and asked[2] > 3 * forward_selection.EVIDENCE
@@ -180,7 +180,7 @@ def test_some_states_are_spread_and_never_too_few(started: tuple[Data, Stage]):
         few, share = spread_states(trial, most)
         assert share == pytest.approx(count / every)
         assert len({states[k] for k in few}) == count
-        assert subsampling.tolist() == [k for k in frames if states[k] in {states[f] for f in few}]
+        assert few.tolist() == [k for k in frames if states[k] in {states[f] for f in few}]
         np.testing.assert_allclose(inputs[few].max(axis=0), inputs[frames].max(axis=0))
 
 
@@ -348,8 +348,8 @@ def test_a_place_moves_on_where_what_it_was_found_beside_is_dropped(
     beside = refit(data, stage, gains[0], NOISE)
     far = max((c for c in payloads(data, beside)[:6] if off(c) > 0.012), key=off)
     both = refit(data, beside, far, NOISE)
-    monkeypatch.setattr(forward_selection, "evidence", lambda before, after: -1.0 if needless else 1e6)
-    left = growing.prune(data, both, NOISE, COUNT, lambda text: None)
+    monkeypatch.setattr(pruning, "evidence", lambda before, after: -1.0 if needless else 1e6)
+    left = prune(data, both, NOISE, COUNT, lambda text: None)
     if not needless:
         assert left is both
         return
@@ -425,7 +425,7 @@ def test_another_law_is_told_by_some_of_the_states(started: tuple[Data, Stage], 
         return effect_fields(stage.fit, data.train, todo).raw[0][:, :, 0]
 
     whole, tets = change(), len(data.robot.body.mesh.tets)
-    monkeypatch.setattr(screening, "MOST_WORK", FEWEST * tets)
+    monkeypatch.setattr(effect_fields_module, "MOST_WORK", FEWEST * tets)
     monkeypatch.setattr(Trial, "part", lambda trial, frames: (asked.append(len(frames)), part(trial, frames))[1])
     between = change()
     assert asked and asked[0] < 0.6 * len(data.train[0].scene.frames)
@@ -433,7 +433,7 @@ def test_another_law_is_told_by_some_of_the_states(started: tuple[Data, Stage], 
     exact = np.isin(data.train[0].scene.frame, spread_states(data.train[0], FEWEST)[0])
     assert rms_of([(between - whole)[exact]]) < 0.02 * rms_of([whole])
     rubbing = apply_effects(data.robot, [{"name": "cable_friction", "coefficient": 0.2}])
-    assert screening._part_that_tells(data.train[0], rubbing) is data.train[0]  # states there need those before
+    assert effect_fields_module._part_that_tells(data.train[0], rubbing) is data.train[0]  # states there need those before
 
 
 def test_what_promises_as_much_is_refitted_in_the_order_of_its_cost(started: tuple[Data, Stage]):

@@ -190,7 +190,7 @@ def test_a_model_may_have_a_larger_error_on_held_out_data_where_that_is_the_mesh
         model = replace(back, held_rms=error)
         monkeypatch.setattr(returned_model, "held_chi2", lambda _, s, noise: chi2 if s is model else 100.0)
         sizes = iter([0.8, beyond])
-        monkeypatch.setattr(verdict, "beyond_mesh", lambda *_: next(sizes))
+        monkeypatch.setattr(returned_model, "beyond_mesh", lambda *_: next(sizes))
         return returned_model._holds_out(data, search, model)
 
     assert holds(1.4) and holds(1.0, chi2=200.0)
@@ -211,7 +211,7 @@ def test_a_larger_error_is_not_for_zeros_of_cables_which_much_else_looks_like(
     back = replace(stage, held_rms=1.4, fit=replace(stage.fit, hypothesis=replace(stage.fit.hypothesis, terms=terms)))
     search = Search(replace(stage, held_rms=1.0), [("", back)], back, back, NOISE, 10.0, [], [], [], None)
     monkeypatch.setattr(returned_model, "held_chi2", lambda _, s, noise: 40.0 if s is back else 80.0)
-    monkeypatch.setattr(verdict, "beyond_mesh", lambda *_: 0.5)
+    monkeypatch.setattr(returned_model, "beyond_mesh", lambda *_: 0.5)
     assert returned_model._holds_out(data, search, back) == held
 
 
@@ -261,8 +261,8 @@ def test_effects_that_are_named_on_linear_elements_may_stand_for_these(
     data, stage = staged(robot_on_mesh(robot, to_linear(robot.body.mesh)) if linear else robot, 1.0)
     settled = ((find_effect("hyperelastic"), {}),) if named else ()
     back = replace(stage, fit=replace(stage.fit, hypothesis=replace(stage.fit.hypothesis, settled=settled)))
-    monkeypatch.setattr(verdict, "_mesh_error", lambda data: 2e-3)
-    assert ("try discretisation" in verdict._on_linear(data, back)) == (linear and named)
+    monkeypatch.setattr(sentences, "_mesh_error", lambda data: 2e-3)
+    assert ("try discretisation" in sentences._on_linear(data, back)) == (linear and named)
 
 
 def test_a_modulus_that_is_as_declared_once_zeros_stay_is_not_handed_back(monkeypatch: pytest.MonkeyPatch) -> None:
