@@ -27,7 +27,7 @@ from femsense.io.robot_toml import load_robot
 from femsense.loop.data.dataset import Data, groups_of, prepare
 from femsense.loop.data.trial import Trial
 from femsense.loop.fit.covariance import coordinate_std
-from femsense.loop.fit.fitted_model import Stage, make_stage, placed
+from femsense.loop.fit.fitted_model import FittedModel, fit_model, poses_and_inputs
 from femsense.loop.fit.joint_fit import Prior
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.improve import improve
@@ -104,7 +104,7 @@ class Term:
     seed: Entry | None = None
 
 
-def fitted(data: Data, robot: Robot, terms: Sequence[Term]) -> Stage:
+def fitted(data: Data, robot: Robot, terms: Sequence[Term]) -> FittedModel:
     """Return the joint fit of poses and terms on the first two recordings, with its error on the third."""
     parts: list[tuple[Effect, Entry, Any]] = []
     start: list[float] = []
@@ -115,14 +115,14 @@ def fitted(data: Data, robot: Robot, terms: Sequence[Term]) -> Stage:
         start += term.start or [p.null for p in parameters]
     prior = Prior(np.zeros(len(start)), np.full(len(start), np.inf))
     fresh = replace(data, train=[replace(t, starts={}) for t in data.train], held=[replace(t, starts={}) for t in data.held])
-    return make_stage(fresh, Hypothesis(robot, tuple(parts)), prior, NOISE, np.array(start))
+    return fit_model(fresh, Hypothesis(robot, tuple(parts)), prior, NOISE, np.array(start))
 
 
 STIFF = Term(0, "stiffness", [0.5])
 FREE = Term(0, "gravity", [0.0, 0.0, -9.8])
 
 
-def values(data: Data, stage: Stage) -> dict[str, list[tuple[float, float]]]:
+def values(data: Data, stage: FittedModel) -> dict[str, list[tuple[float, float]]]:
     """Return (value, standard deviation) of each parameter of each term."""
     std, at, table = coordinate_std(stage.fit, data.train, NOISE), 0, dict[str, list[tuple[float, float]]]()
     for effect, _, parameters in stage.fit.hypothesis.terms:
@@ -150,7 +150,7 @@ def sensed(beam: Beam, robot: Robot) -> list[tuple[float, float]]:
 # The tables
 
 
-def print_models(beam: Beam) -> dict[str, tuple[Stage, list[tuple[float, float]]]]:
+def print_models(beam: Beam) -> dict[str, tuple[FittedModel, list[tuple[float, float]]]]:
     """Print each model: its error where it was fitted and where not, its modulus, and the weights it senses."""
     down, held = apply_effects(beam.robot, [DOWN]), apply_effects(beam.robot, [DOWN, HELD])
     models: list[tuple[str, Robot, list[Term]]] = [
@@ -168,7 +168,7 @@ def print_models(beam: Beam) -> dict[str, tuple[Stage, list[tuple[float, float]]
     print(
         "| model | fitted | held out | ratio | modulus | sensed at 0.510 N | at 1.001 N | further |\n|---|---|---|---|---|---|---|---|"
     )
-    stages: dict[str, tuple[Stage, list[tuple[float, float]]]] = {}
+    stages: dict[str, tuple[FittedModel, list[tuple[float, float]]]] = {}
     for name, robot, terms in models:
         stage = fitted(beam.data, robot, terms)
         forces = sensed(beam, stage.fit.hypothesis.robot_at(stage.fit.coordinates))
@@ -186,7 +186,7 @@ def print_models(beam: Beam) -> dict[str, tuple[Stage, list[tuple[float, float]]
     return stages
 
 
-def print_residuals(beam: Beam, stages: dict[str, tuple[Stage, Any]]) -> None:
+def print_residuals(beam: Beam, stages: dict[str, tuple[FittedModel, Any]]) -> None:
     """Print what three models leave at each marker at 0.51 N."""
     print("\nWhat is left at 0.51 N, measured minus model [mm], along x, y, z")
     chosen = [n for n in stages if n.startswith(("modulus alone", "gravity straight", "straight down, modulus, base markers on"))]
@@ -227,7 +227,7 @@ def print_causes(beam: Beam) -> None:
         print_cause(f"without {robot.marker_names[left_out]}", data, fitted(data, robot, [STIFF, FREE]))
 
 
-def print_cause(name: str, data: Data, stage: Stage) -> None:
+def print_cause(name: str, data: Data, stage: FittedModel) -> None:
     table = values(data, stage)
     scale, gravity = table.pop("stiffness")[0], table.pop("gravity")
     own = "; ".join(shown(v) for v in table.values())
@@ -393,7 +393,7 @@ def print_loops(beam: Beam, folder: Path, declared_mesh: bool, cells: Sequence[i
 # The pictures
 
 
-def draw_states(beam: Beam, stages: dict[str, tuple[Stage, Any]]) -> None:
+def draw_states(beam: Beam, stages: dict[str, tuple[FittedModel, Any]]) -> None:
     """Draw the beam from its side in the three states, before and after, residuals three times as long."""
     from matplotlib import pyplot as plt
 
@@ -405,7 +405,7 @@ def draw_states(beam: Beam, stages: dict[str, tuple[Stage, Any]]) -> None:
     for axis, (name, title) in zip(axes, chosen):
         stage = stages[name][0]
         robot = stage.fit.hypothesis.robot_at(stage.fit.coordinates)
-        draws = [(jet, t, p[0]) for jet, t, p in zip(stage.fit.jets, beam.data.train, placed(beam.data, stage.fit))]
+        draws = [(jet, t, p[0]) for jet, t, p in zip(stage.fit.jets, beam.data.train, poses_and_inputs(beam.data, stage.fit))]
         draws += [(h.jet, t, h.poses) for h, t in zip(stage.held, beam.data.held)]
         for color, label, (jet, trial, poses) in zip(
             ("tab:blue", "tab:orange", "tab:red"), ("0 N", "0.51 N", "1.00 N, not fitted"), draws
@@ -448,7 +448,7 @@ def draw_profile(tables: list[FloatArray]) -> None:
     save(figure, "beam-tilt")
 
 
-def draw_forces(stages: dict[str, tuple[Stage, list[tuple[float, float]]]]) -> None:
+def draw_forces(stages: dict[str, tuple[FittedModel, list[tuple[float, float]]]]) -> None:
     """Draw what each model leaves beside the weights that it senses."""
     from matplotlib import pyplot as plt
 

@@ -40,7 +40,7 @@ from femsense.fem.linalg.ordering import _nested_dissection, elimination_work, m
 from femsense.fem.mesh import embed_points, refined, surface_triangles, to_quadratic, vertex_normals
 from femsense.fem.realtime.power_series import Expansion
 from femsense.fem.realtime.tracker import Tracked, Tracker
-from femsense.fem.rotated_step import turned_step
+from femsense.fem.rotated_step import rotated_step
 from femsense.io.robot_toml import load_robot
 
 DATA = Path(__file__).resolve().parents[1].parent / "shared" / "data"
@@ -310,7 +310,7 @@ def kept(data: Path) -> None:
                     force = body.dead_load() - internal(body, x, tangent=False).forces + pull
                     step = np.zeros(x.size)
                     step[body.free_map.dofs] = factor.solve(force.ravel()[body.free_map.dofs])
-                    turned = turned_step(body, x, step.reshape(-1, 3)) if turns else None
+                    turned = rotated_step(body, x, step.reshape(-1, 3)) if turns else None
                     x = x + step.reshape(-1, 3) if turned is None else turned
                     left.append(np.abs(x - states[lag].positions).max() / motion)
                 name = "turned" if turns else "straight"

@@ -22,13 +22,13 @@ from loop_cases import Case, make_cases, make_data
 
 from femsense.core.errors import FemsenseError
 from femsense.loop.data.dataset import Data
-from femsense.loop.fit.fitted_model import Stage
+from femsense.loop.fit.fitted_model import FittedModel
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.improve import improve
 from femsense.loop.search.effect_fields import Fields, fields_of
-from femsense.loop.search.forward_selection import PROMISING, REFITTABLE
+from femsense.loop.search.forward_selection import PREDICTED_MUCH, REFITTABLE
 from femsense.loop.search.refit import EVIDENCE
-from femsense.loop.search.screening import Candidate, screen_stage
+from femsense.loop.search.screening import Candidate, screen_model
 
 Scores = dict[str, float]
 """Effect → its best linear score [dBIC]."""
@@ -41,11 +41,11 @@ def compared(case: Case) -> list[tuple[Case, tuple[str, ...], Scores, Scores]]:
     scored = module._scored
 
     def watched(
-        data: Data, stage: Stage, fields: Fields, noise: Noise, names: Sequence[str], n_effective: float
+        data: Data, stage: FittedModel, fields: Fields, noise: Noise, names: Sequence[str], n_effective: float
     ) -> tuple[Fields, list[Candidate]]:
         if fields.model is not stage.fit.hypothesis:
-            own = screen_stage(data, stage.fit, noise, fields_of(data, stage, names), n_effective)
-            hinted = screen_stage(data, stage.fit, noise, fields, n_effective)
+            own = screen_model(data, stage.fit, noise, fields_of(data, stage, names), n_effective)
+            hinted = screen_model(data, stage.fit, noise, fields, n_effective)
             seen.append((case, stage.fit.hypothesis.names, best_of(hinted), best_of(own)))
         return scored(data, stage, fields, noise, names, n_effective)  # type: ignore[no-any-return]
 
@@ -87,7 +87,7 @@ def main() -> None:
                     flush=True,
                 )
                 top = [max(scores.values(), default=-np.inf) for scores in (hinted, own)]
-                missed += top[0] <= PROMISING < EVIDENCE < top[1]
+                missed += top[0] <= PREDICTED_MUCH < EVIDENCE < top[1]
                 far += [abs(hinted[n] - own[n]) for n in hinted.keys() & own.keys()]
                 near += [abs(hinted[n] - own[n]) for n in hinted.keys() & own.keys() if min(hinted[n], own[n]) < EVIDENCE]
     print(

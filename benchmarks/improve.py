@@ -39,7 +39,7 @@ from femsense.io.recording_folder import save_recording
 from femsense.io.robot_toml import load_robot, save_robot
 from femsense.model.effects import apply_effects
 from femsense.rig.script import Plan
-from femsense.rig.truth import walk_truth
+from femsense.rig.truth import true_path
 
 STAGES = (
     ("reading", "start, reading, calibrating"),
@@ -126,7 +126,7 @@ BAR = Design(
 
 def make(hidden: str, folder: Path) -> None:
     """Write robot, recording and a user's own effects into a folder."""
-    case = Case(1, "single", BAR, "tension", 1e-4, HIDDEN[hidden], seats=True, hyperelastic=False)
+    case = Case(1, "single", BAR, "tension", 1e-4, HIDDEN[hidden], placements=True, hyperelastic=False)
     gravity = np.zeros(3) if hidden == "gravity" else EARTH
     declared = BAR.robot(fine=False, law="corotational", gravity=gravity, modulus=BAR.modulus)
     true = BAR.robot(fine=True, law="corotational", gravity=EARTH, modulus=0.9 * BAR.modulus)
@@ -166,7 +166,7 @@ def make(hidden: str, folder: Path) -> None:
         load_forces=freeze(np.tile([0.0, 0.0, -0.08], (len(loaded), 1))),
         contacts=(),
     )
-    states = [f.state for f in walk_truth(true, plan, substeps=2)]
+    states = [f.state for f in true_path(true, plan, substeps=2)]
     recording = _measure(case, declared, true, plan, recorded, states, np.random.default_rng(7))[0]
     for kind in ("tet10", "tet4"):
         save_robot(declared, folder / f"robot-{kind}")

@@ -30,12 +30,12 @@ from femsense.core.arrays import FloatArray
 from femsense.core.errors import FemsenseError
 from femsense.fem.equilibrium import Equilibrium
 from femsense.loop.data.trial import Groups
-from femsense.loop.fit.marker_placement import seat_turns
+from femsense.loop.fit.marker_placement import placement_turns
 from femsense.loop.fit.noise_components import Noise, whiten
 from femsense.loop.improve import improve
-from femsense.model.drive import Walk, drive_of
+from femsense.model.drive import DrivenRobot, drive_of
 from femsense.model.effects import apply_effects, find_effect
-from femsense.model.quasi_static_path import walk_along
+from femsense.model.quasi_static_path import solve_path
 from femsense.model.robot import Robot
 
 SEEDS = {"tune": 1, "report": 20300}
@@ -59,7 +59,7 @@ def run_case(job: tuple[str, Case]) -> dict[str, Any]:
         "label": case.label,
         "hidden": list(case.hidden),
         "white_m": case.white_m,
-        "seats": case.seats,
+        "seats": case.placements,
         "element": case.element,
     }
     try:
@@ -127,8 +127,10 @@ def detection_index(made: Made, hidden: dict[str, Any]) -> dict[str, float]:
     turns = [np.cross(axis, x) for axis in np.eye(3)]
     noise = Noise(made.noise, "")
     sweep = np.unique(made.recording.sweep, return_inverse=True)[1]
-    seats = _walked(scaled, made, lambda r, e: seat_turns(r, r.marker_points, e.positions).reshape(-1, 3)).reshape(-1, 3, 3)
-    groups = Groups(np.tile(np.arange(k), F), np.repeat(np.arange(F), k), np.repeat(sweep, k), np.arange(F * k), turns=seats)
+    placements = _walked(scaled, made, lambda r, e: placement_turns(r, r.marker_points, e.positions).reshape(-1, 3)).reshape(
+        -1, 3, 3
+    )
+    groups = Groups(np.tile(np.arange(k), F), np.repeat(np.arange(F), k), np.repeat(sweep, k), np.arange(F * k), turns=placements)
     W = noise.whitener(groups)
     Z = np.stack([whiten(W, np.asarray(f).reshape(-1, 3)) for f in (*fields, *shifts, *turns)], axis=1)
     s = whiten(W, field.reshape(-1, 3))
@@ -150,9 +152,9 @@ def _markers(robot: Robot, made: Made) -> FloatArray:
 
 def _walked(robot: Robot, made: Made, observe: Callable[[Robot, Equilibrium], FloatArray]) -> FloatArray:
     """Return what is observed of a robot along the recording, shape (F, …)."""
-    walk = Walk(robot, drive_of(robot, made.recording))
+    driven = DrivenRobot(robot, drive_of(robot, made.recording))
     frames = list(range(len(made.recording.time_s)))
-    return np.array([observe(robot, state) for _, state, _, _ in walk_along(walk, frames, attrgetter("markers"))])
+    return np.array([observe(robot, state) for _, state, _, _ in solve_path(driven, frames, attrgetter("markers"))])
 
 
 # --- scores --------------------------------------------------------------------------------------------------------------------

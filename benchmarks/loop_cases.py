@@ -22,7 +22,7 @@ from femsense.model.effects import apply_effects
 from femsense.model.recording import Recording, RestMarkers, make_recording
 from femsense.model.robot import Observation, Robot, plain_actuation, spread_features
 from femsense.rig.script import ContactTable, Plan, PlannedContact
-from femsense.rig.truth import walk_truth
+from femsense.rig.truth import true_path
 
 CUBE_TETS = np.array([[0, 1, 3, 7], [0, 3, 2, 7], [0, 2, 6, 7], [0, 6, 4, 7], [0, 4, 5, 7], [0, 5, 1, 7]])
 """Six tetrahedra of a cube with corners 4 x + 2 y + z (Kuhn)."""
@@ -182,7 +182,7 @@ class Case:
     """Entries of `[[effects]]` that only the truth has."""
     outside: str = ""
     size: float = 1.0
-    seats: bool = False
+    placements: bool = False
     """Whether rest.csv measures the seats of the markers."""
     poor: bool = False
     """One sweep up only."""
@@ -391,14 +391,14 @@ def make_data(case: Case, seed: int) -> Made:
     if case.outside == "draught":
         true = replace(true, body=true.body.with_gravity(true.body.gravity + 1.2 * case.size * np.array([0.3, 1.0, 0.2])))
         plan = replace(plan, gravity=freeze(_gusts(declared, true, labels)))
-    states = [f.state for f in walk_truth(true, plan, substeps=2)]
+    states = [f.state for f in true_path(true, plan, substeps=2)]
     recording, T, noise = _measure(case, declared, true, plan, recorded, states, rng)
     return Made(case, declared, recording, _seen(true, states), T, scale, noise)
 
 
-def _seen(true: Robot, states: Sequence[Equilibrium], seat: FloatArray | None = None) -> FloatArray:
-    """Return the true markers [m], shape (F, k, 3), that sit elsewhere on the body at rest by `seat` (k, 3): their error turns with the body."""
-    ties = true.markers if seat is None else true.tie_markers(true.marker_points + seat)
+def _seen(true: Robot, states: Sequence[Equilibrium], placement: FloatArray | None = None) -> FloatArray:
+    """Return the true markers [m], shape (F, k, 3), that sit elsewhere on the body at rest by `placement` (k, 3): their error turns with the body."""
+    ties = true.markers if placement is None else true.tie_markers(true.marker_points + placement)
     return np.array([ties.positions(s.positions) for s in states])
 
 
@@ -484,8 +484,8 @@ def _measure(
     T = make_pose(rotation_from_vector([2.3, 0.2, 0.1] + 0.1 * rng.normal(size=3)), [0.05, 0.24, 0.3] + 0.01 * rng.normal(size=3))
     F, k = len(states), len(true.marker_points)
     sweep = np.unique(plan.sweep, return_inverse=True)[1]
-    seat = noise["marker"] * rng.normal(size=(k, 3))
-    shown = _seen(true, states, seat)
+    placement = noise["marker"] * rng.normal(size=(k, 3))
+    shown = _seen(true, states, placement)
     if case.outside == "slipped_marker":
         shown[F // 2 :, -2] += 1.5e-3 * case.size * np.array([0.6, 0.6, 0.5])
     if case.outside == "camera_drift":
@@ -493,8 +493,8 @@ def _measure(
     shown = shown + noise["frame"] * rng.normal(size=(F, 1, 3)) + noise["sweep"] * rng.normal(size=(sweep.max() + 1, 1, 3))[sweep]
     seen = _through(T, shown.reshape(-1, 3), true.observation) + case.white_m * rng.normal(size=(F * k, 3))
     rest = None
-    if case.seats:
-        points = _through(T, true.marker_points + seat, true.observation) + case.white_m * rng.normal(size=(k, 3))
+    if case.placements:
+        points = _through(T, true.marker_points + placement, true.observation) + case.white_m * rng.normal(size=(k, 3))
         rest = RestMarkers(true.marker_names, freeze(points), freeze(np.full(k, case.white_m)), freeze(np.zeros(k), np.int64))
     recording = make_recording(
         time_s=plan.time_s,

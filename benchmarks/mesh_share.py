@@ -21,7 +21,7 @@ from loop_cases import Case, make_cases, make_data
 from femsense.core.arrays import FloatArray
 from femsense.loop.data.dataset import Data, prepare
 from femsense.loop.fit.discretisation_error import mesh_errors, with_mesh_errors
-from femsense.loop.fit.fitted_model import make_stage, with_nuisance
+from femsense.loop.fit.fitted_model import fit_model, with_nuisance
 from femsense.loop.fit.joint_fit import JointFit, JointProblem, Prior
 from femsense.loop.fit.noise_components import Noise
 from femsense.model.effects import apply_effects
@@ -38,7 +38,7 @@ def compared(case: Case) -> None:
     made = make_data(case, SEEDS["tune"])
     robot = apply_effects(made.declared, [{"name": "stiffness", "scale": made.modulus_scale}])
     data = prepare(robot, [made.recording], ())
-    stage = make_stage(data, Hypothesis(data.robot), Prior(np.zeros(0), np.zeros(0)), Noise({"white": 5e-4}, ""), np.zeros(0))
+    stage = fit_model(data, Hypothesis(data.robot), Prior(np.zeros(0), np.zeros(0)), Noise({"white": 5e-4}, ""), np.zeros(0))
     errors = mesh_errors(with_mesh_errors(data, stage, []))
     if not errors:
         print(f"{case.number:4d} {case.design.name:7s}{case.control:13s} no state settles on the finer mesh", flush=True)
@@ -58,7 +58,7 @@ def compared(case: Case) -> None:
 def beyond(data: Data, D: FloatArray, E: FloatArray) -> str:
     """Return what is left of D [mm] beyond calibration: of all of it, beside a E, and beside A E with any 3 × 3 matrix A."""
     hypothesis, prior = with_nuisance(data)
-    problem = JointProblem(hypothesis, prior, data.train, [], data.seat_std)
+    problem = JointProblem(hypothesis, prior, data.train, [], data.placement_std)
     jet = problem.jet(data.train[0], np.zeros(data.train[0].size), np.zeros(len(prior.mean)), True)
     J = np.concatenate([jet.by_pose, jet.by_initial, jet.by_effect], axis=2).reshape(D.size, -1)
     J = J[:, np.linalg.norm(J, axis=0) > 0]

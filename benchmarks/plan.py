@@ -94,8 +94,8 @@ def print_table(proposal: Proposal, done: dict[str, dict[str, Any]]) -> None:
     print(f"{'hidden':<16}{'least: usual size':<20}{'improve':<34}{'proposal: usual size':<23}improve")
     for hidden in HIDDEN:
         cells = []
-        for which, outlook in (("least", proposal.before), ("proposal", proposal.after)):
-            rows = [r for r in outlook.rows if r.name == hidden["name"]]
+        for which, identifiability in (("least", proposal.before), ("proposal", proposal.after)):
+            rows = [r for r in identifiability.rows if r.name == hidden["name"]]
             best = max(rows, key=lambda r: r.dbic)
             said = "not testable" if not best.testable else f"dBIC {best.dbic:.0f}" + ("" if best.dbic > EVIDENCE else ", unseen")
             result = done.get(f"{hidden['name']} {which}")

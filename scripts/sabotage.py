@@ -190,11 +190,16 @@ SABOTAGES = (
     ),
     S(
         "core/least_squares.py",
-        "foretold and self.sure is not False",
+        "expected_residual and self.sure is not False",
         "True",
         "core/test_least_squares.py::test_a_jacobian_that_missed_next_to_nothing_of_a_step_is_believed_at_the_end",
     ),
-    S("core/least_squares.py", "or idle > 1 or (small", "or (small", "core/test_least_squares.py::test_idle_steps_end_a_fit"),
+    S(
+        "core/least_squares.py",
+        "or idle > 1\n            or (small",
+        "or (small",
+        "core/test_least_squares.py::test_idle_steps_end_a_fit",
+    ),
     S(
         "core/least_squares.py",
         "last = slope.own and whole < LITTLE * enough",
@@ -739,8 +744,8 @@ SABOTAGES = (
     ),
     S(
         "core/least_squares.py",
-        "missed), False, foretold",
-        "missed), True, foretold",
+        "missed), False, expected_residual",
+        "missed), True, expected_residual",
         "core/test_least_squares.py::test_a_jacobian_that_serves_again_ends_at_the_same_place_with_fewer_of_them",
     ),
     S(
@@ -866,8 +871,8 @@ SABOTAGES = (
     # the loop
     S(
         "core/least_squares.py",
-        "slope.J if bends is None else _on_kinks(",
-        "slope.J if True else _on_kinks(",
+        "slope.J if bends is None else _at_nonsmooth(",
+        "slope.J if True else _at_nonsmooth(",
         "loop/fit/test_slack_nonsmoothness.py::test_on_a_kink_the_derivative_has_no_gradient_and_takes_a_part_of_both_sides",
     ),
     S(
@@ -944,7 +949,7 @@ SABOTAGES = (
     ),
     S(
         "loop/search/forward_selection.py",
-        "refits = [_elsewhere(data, stage, r, noise, say) for r in refits]",
+        "refits = [_elsewhere(data, fitted, r, noise, say) for r in refits]",
         "pass",
         "loop/search/test_swaps.py::test_a_place_is_improved_before_a_refit_is_turned_down_for_what_it_predicts",
     ),
@@ -988,8 +993,8 @@ SABOTAGES = (
     ),
     S(
         "loop/search/forward_selection.py",
-        "own = few.candidate(candidate, noise) if few.spares else None",
-        "own = few.candidate(candidate, noise)",
+        "own = cases.candidate(candidate, noise) if cases.spares else None",
+        "own = cases.candidate(candidate, noise)",
         "loop/search/test_location_search.py::test_rivals_are_fitted_to_all_states_where_these_are_little_work",
     ),
     S(
@@ -1012,7 +1017,7 @@ SABOTAGES = (
     ),
     S(
         "loop/search/location_search.py",
-        "there = _seeds_instead(data, stage, noise, [best.seed]) if few.spares else [best]",
+        "there = _seeds_instead(data, fitted, noise, [best.seed]) if cases.spares else [best]",
         "there = [best]",
         "loop/search/test_location_search.py::test_a_place_moves_on_as_some_of_the_states_have_it",
     ),
@@ -1048,8 +1053,8 @@ SABOTAGES = (
     ),
     S(
         "loop/improve.py",
-        "fit = weighed(data, stage.fit, noise, stage.fit.jets)",
-        "fit = stage.fit",
+        "fit = weighed(data, fitted.fit, noise, fitted.fit.jets)",
+        "fit = fitted.fit",
         "loop/search/test_swaps.py::test_a_model_on_top_of_which_much_is_promised_need_not_be_fitted_to_the_end",
     ),
     S(
@@ -1090,7 +1095,7 @@ SABOTAGES = (
     ),
     S(
         "loop/search/swaps.py",
-        " or (rivals == [name] and not may_lie_elsewhere(data, stage, name, noise))",
+        " or (rivals == [name] and not may_lie_elsewhere(data, fitted, name, noise))",
         "",
         "loop/search/test_location_search.py::test_an_effect_in_its_place_is_not_sought_elsewhere_and_one_that_is_not_is",
     ),
@@ -1102,8 +1107,8 @@ SABOTAGES = (
     ),
     S(
         "loop/search/pruning.py",
-        "return closer(data, stage, noise)[0] if places else stage",
-        "return stage",
+        "return closer(data, fitted, noise)[0] if places else fitted",
+        "return fitted",
         "loop/search/test_location_search.py::test_a_place_moves_on_where_what_it_was_found_beside_is_dropped",
     ),
     S(
@@ -1228,8 +1233,8 @@ SABOTAGES = (
     ),
     S(
         "loop/search/forward_selection.py",
-        "refitted.score - evidence(stage.fit, refitted.stage.fit) + evidence(stage.fit, made.fit)",
-        "refitted.score + evidence(refitted.stage.fit, made.fit)",
+        "refitted.score - evidence(fitted.fit, refitted.fitted.fit) + evidence(fitted.fit, made.fit)",
+        "refitted.score + evidence(refitted.fitted.fit, made.fit)",
         "loop/search/test_swaps.py::test_a_polished_refit_is_weighed_against_the_model_without_it_as_its_rivals_are",
     ),
     S(
@@ -1240,7 +1245,7 @@ SABOTAGES = (
     ),
     S(
         "loop/search/forward_selection.py",
-        '== "passes" and explains(r.stage)]',
+        '== "passes" and explains(r.fitted)]',
         '== "passes"]',
         "loop/search/test_swaps.py::test_until_an_effect_explains_the_data_rivals_are_refitted_to_the_end",
     ),
@@ -1294,8 +1299,8 @@ SABOTAGES = (
     ),
     S(
         "loop/search/forward_selection.py",
-        "few.spares and c.score >= RIVALS * best]",
-        "few.spares and c.score > best]",
+        "cases.spares and c.score >= ALTERNATIVES * best]",
+        "cases.spares and c.score > best]",
         "loop/search/test_location_search.py::test_what_promises_as_much_is_fitted_to_all_states_in_the_order_of_what_it_explains_in_some",
     ),
     S(
@@ -1396,7 +1401,7 @@ SABOTAGES = (
     ),
     S(
         "loop/search/refit.py",
-        "if gravity and _has_strayed(stage) and not explains(best):",
+        "if gravity and _has_drifted(fitted) and not explains(best):",
         "if False:",
         "loop/search/test_swaps.py::test_where_calibration_has_strayed_gravity_starts_from_what_is_declared_too",
     ),
@@ -1414,7 +1419,7 @@ SABOTAGES = (
     ),
     S(
         "loop/search/forward_selection.py",
-        "if behind and not weighs(data, candidate.effect.name):",
+        "if behind and not prior_evidence(data, candidate.effect.name):",
         "if behind:",
         "loop/search/test_swaps.py::test_weight_that_nobody_declared_is_refitted_however_far_behind_it_looks",
     ),
@@ -1432,7 +1437,7 @@ SABOTAGES = (
     ),
     S(
         "loop/search/forward_selection.py",
-        "_to_the_end(data, stage, r, noise) if r.score",
+        "_to_the_end(data, fitted, r, noise) if r.score",
         "r if r.score",
         "loop/search/test_swaps.py::test_a_refit_that_could_win_goes_to_its_end",
     ),
@@ -1468,26 +1473,26 @@ SABOTAGES = (
     ),
     S(
         "loop/fit/marker_placement.py",
-        "for t, h in zip(data.held, stage.held)]",
-        "for t, h in zip(data.held, stage.held)] and data.held",
+        "for t, h in zip(data.held, fitted.held)]",
+        "for t, h in zip(data.held, fitted.held)] and data.held",
         "loop/fit/test_marker_placement.py::test_both_what_is_fitted_and_what_is_held_out_knows_how_its_seats_turn",
     ),
     S(
         "loop/fit/noise_components.py",
-        "left = float(np.trace(of_seats) + fitted[fixed:] @ fitted[fixed:])",
+        "left = float(np.trace(of_placements) + fitted[fixed:] @ fitted[fixed:])",
         "left = float(fitted[fixed:] @ fitted[fixed:])",
         "loop/fit/test_marker_placement.py::test_the_likelihood_of_seats_that_turn_is_that_of_their_covariance",
     ),
     S(
         "loop/fit/noise_components.py",
-        "log_det += (p - fixed) * float(np.log(variance[seat]))",
+        "log_det += (p - fixed) * float(np.log(variance[placement]))",
         "pass",
         "loop/fit/test_marker_placement.py::test_the_likelihood_of_seats_that_turn_is_that_of_their_covariance",
     ),
     S(
         "loop/fit/noise_components.py",
-        "fields = seats if error.array is None else np.concatenate([error.array, seats], axis=2)",
-        "fields = seats if error.array is None else error.array",
+        "fields = placements if error.array is None else np.concatenate([error.array, placements], axis=2)",
+        "fields = placements if error.array is None else error.array",
         "loop/fit/test_marker_placement.py::test_whitening_inverts_the_covariance_of_seats_that_turn",
     ),
     S(
@@ -1498,13 +1503,13 @@ SABOTAGES = (
     ),
     S(
         "loop/search/forward_selection.py",
-        "winner = _with_more_markers(data, stage, winner, table, noise, say)",
+        "winner = _with_more_markers(data, fitted, winner, table, noise, say)",
         "pass",
         "loop/fit/test_marker_placement.py::test_several_markers_that_sit_elsewhere_are_named_and_are_no_noise",
     ),
     S(
         "loop/data/outliers.py",
-        "max(far, STRAYS * float(np.quantile(size, 0.9)))",
+        "max(far, OUTLYING * float(np.quantile(size, 0.9)))",
         "far",
         "loop/data/test_outliers.py::test_the_loop_leaves_strays_out_whether_they_are_fitted_or_held_out",
     ),
@@ -1582,7 +1587,7 @@ SABOTAGES = (
     ),
     S(
         "loop/search/input_offset.py",
-        "if not moved_nuisance(data, stage, ZEROS):",
+        "if not moved_nuisance(data, fitted, OFFSETS):",
         "if False:",
         "loop/search/test_input_offset.py::test_zeros_that_are_right_are_not_asked_about",
     ),
@@ -1642,7 +1647,7 @@ SABOTAGES = (
     ),
     S(
         "loop/improve.py",
-        "if stage.fit.fit.cost[0] - stage.fit.chi2 <= EVIDENCE / 2.0:",
+        "if fitted.fit.fit.cost[0] - fitted.fit.chi2 <= EVIDENCE / 2.0:",
         "if True:",
         "loop/data/test_surface_rows.py::test_rows_are_made_again_until_the_fit_stays_where_it_is",
     ),
@@ -1762,8 +1767,8 @@ SABOTAGES = (
     ),
     S(
         "model/finer_mesh.py",
-        "turned = turned_step(body, x, move)",
-        "turned = turned_step(body, x, -move)",
+        "turned = rotated_step(body, x, move)",
+        "turned = rotated_step(body, x, -move)",
         "loop/test_parts.py::test_the_error_of_the_mesh_is_what_the_finer_mesh_adds",
     ),
     S(
@@ -1828,7 +1833,7 @@ SABOTAGES = (
     ),
     S(
         "loop/improve.py",
-        "fields.model is stage.fit.hypothesis or not shortlist(table, first=False)",
+        "fields.model is fitted.fit.hypothesis or not shortlist(table, first=False)",
         "True",
         "loop/search/test_swaps.py::test_fields_are_computed_anew_where_those_of_the_model_before_promise_something",
     ),

@@ -104,9 +104,9 @@ def inspect(
     from femsense.app.inspect import describe, inspect_accuracy, inspect_path
 
     if accuracy:
-        from femsense.app.mesh_accuracy import promise
+        from femsense.app.mesh_accuracy import expected_duration
 
-        _say(promise())
+        _say(expected_duration())
         with _progress("accuracy") as progress:
             report = inspect_accuracy(path, progress=progress)
     else:
@@ -173,10 +173,10 @@ def simulate(
     json: Json = False,
 ) -> Answer:
     """Record on the virtual rig, with the truth beside it."""
-    from femsense.app.commands import script_outlook, simulate_into
+    from femsense.app.commands import script_identifiability, simulate_into
 
     if plan:
-        return Answer(*script_outlook(robot, script, noise=1e-3 * noise))
+        return Answer(*script_identifiability(robot, script, noise=1e-3 * noise))
     output = _required(context, output, "'-o' / '--output'", "option")
     simulate_into(output, robot, script)
     return Answer({"recording": str(output)}, f"recording: {output}\nlook at it: femsense inspect {output}")

@@ -200,14 +200,14 @@ def simulate_into(folder: str | Path, robot: str | Path, script: str | Path) -> 
     return simulate(load_robot(robot), script, target)
 
 
-def script_outlook(robot: str | Path, script: str | Path, *, noise: float) -> tuple[dict[str, Any], str]:
+def script_identifiability(robot: str | Path, script: str | Path, *, noise: float) -> tuple[dict[str, Any], str]:
     """Return what the experiment of a script could show, as plain tables and as text; `noise` is of a marker's coordinate [m]."""
-    from femsense.loop.design.advice import outlook_text
-    from femsense.loop.design.planner import outlook_document, outlook_of_script
+    from femsense.loop.design.advice import identifiability_text
+    from femsense.loop.design.planner import identifiability_document, identifiability_of_script
     from femsense.rig.script import read_script
 
-    outlook = outlook_of_script(load_robot(robot), read_script(script), Path(script), noise=noise)
-    return outlook_document(outlook), outlook_text(outlook)
+    identifiability = identifiability_of_script(load_robot(robot), read_script(script), Path(script), noise=noise)
+    return identifiability_document(identifiability), identifiability_text(identifiability)
 
 
 def plan_into(

@@ -16,7 +16,7 @@ import numpy as np
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import FemsenseError, InputError
 from femsense.core.pose import check_pose
-from femsense.core.text import near
+from femsense.core.text import did_you_mean
 from femsense.fem.body_parts import Cable, Chamber
 from femsense.fem.chambers import chamber_volume
 from femsense.fem.mesh import TetMesh, check_mesh, element_volumes, surface_triangles, triangle_normals
@@ -158,7 +158,10 @@ def _existing(path: str | Path) -> Path:
         return known[str(path)]
     around = [item.name for item in target.parent.iterdir()] if target.parent.is_dir() else []
     raise InputError(
-        "nothing there", where=path, expected="a file, a folder or the name of a robot", hint=near(target.name, [*around, *known])
+        "nothing there",
+        where=path,
+        expected="a file, a folder or the name of a robot",
+        hint=did_you_mean(target.name, [*around, *known]),
     )
 
 
@@ -412,7 +415,7 @@ def _recording(path: Path, report: Report, problems: list[str]) -> None:
     if not loaded.has_clouds and not loaded.has_markers:
         problems.append(f"{folder}: neither markers nor clouds: nothing was measured")
     _check_clouds(loaded, report, problems)
-    _warn_of_strays(loaded, folder)
+    _warn_of_unmatched(loaded, folder)
 
 
 def _recording_report(r: Recording) -> Report:
@@ -520,15 +523,15 @@ def _warn_of_gaps(r: Recording, steps: FloatArray) -> None:
         )
 
 
-def _warn_of_strays(r: Recording, folder: Path) -> None:
+def _warn_of_unmatched(r: Recording, folder: Path) -> None:
     """Warn of clouds and images whose number is no frame."""
     numbers = set(r.frame_numbers.tolist())
     for kind, endings in (("clouds", (".ply", ".pcd")), ("depth", (".png",)), ("color", (".png",))):
         for name in r.camera_names:
-            strays = sorted(set(numbered_files(folder / kind / name, endings)) - numbers)
-            if strays:
+            outliers = sorted(set(numbered_files(folder / kind / name, endings)) - numbers)
+            if outliers:
                 warnings.warn(
-                    f"{folder / kind / name}: {len(strays)} files whose number is not in frames.csv, the first is {strays[0]}",
+                    f"{folder / kind / name}: {len(outliers)} files whose number is not in frames.csv, the first is {outliers[0]}",
                     stacklevel=2,
                 )
     if any((folder / "clouds").glob("*/*.p[lc][yd]")) and r.camera_names == ("",):

@@ -24,7 +24,7 @@ from femsense.fem.body import BodyModel
 from femsense.fem.compliance import drive_rows, tangent_at
 from femsense.fem.equilibrium import Equilibrium, solve_equilibrium
 from femsense.fem.mesh import Embedding, TetMesh, embed_points, surface_triangles, triangle_normals, vertex_normals
-from femsense.model.contact_patch import closest_surface_point, make_surface
+from femsense.model.contact_patch import body_surface, closest_surface_point
 from femsense.model.remeshing import body_on_mesh, finer_mesh
 from femsense.model.robot import Robot
 
@@ -104,7 +104,7 @@ class _Solved:
     states: tuple[Equilibrium, ...]  # at rest under the weight, then under each input
 
 
-def promise() -> str:
+def expected_duration() -> str:
     """Return how long `assess_accuracy` may take, in words."""
     return f"at most about {MOST_SECONDS / 60:.0f} minutes of processor time: finer spaces that would take longer are left out"
 
@@ -262,7 +262,7 @@ def _felt(robot: Robot, rest: Equilibrium, places: FloatArray) -> IntArray:
 def _patches(robot: Robot, finest: TetMesh, features: IntArray) -> _Patches:
     """Return contact forces of one newton into the surface, as a cone over a patch, at some features."""
     body = robot.body
-    surface, radius = make_surface(finest), _patch_radius(body)
+    surface, radius = body_surface(finest), _patch_radius(body)
     corners = finest.nodes[surface.triangles]
     middles, area = corners.mean(axis=1), triangle_normals(finest.nodes, surface.triangles)
     size = np.linalg.norm(area, axis=1)
@@ -279,7 +279,7 @@ def _patches(robot: Robot, finest: TetMesh, features: IntArray) -> _Patches:
 
 def _patch_radius(body: BodyModel) -> float:
     """Return the radius of the patch that carries a contact force [m]."""
-    return max(PATCH * float(np.linalg.norm(np.ptp(body.mesh.nodes, axis=0))), 1.5 * make_surface(body.mesh).edge)
+    return max(PATCH * float(np.linalg.norm(np.ptp(body.mesh.nodes, axis=0))), 1.5 * body_surface(body.mesh).edge)
 
 
 def _facing(middles: FloatArray, area: FloatArray, centre: FloatArray, radius: float) -> FloatArray:

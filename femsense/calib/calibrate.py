@@ -14,7 +14,7 @@ import numpy as np
 
 from femsense.calib.calibration import Calibration
 from femsense.calib.inputs import _initial_displacement, _input_std, _largest_input, first_inputs, input_bounds
-from femsense.calib.joint import SEAT_STD_FLOOR, _rms, fit_joint
+from femsense.calib.joint import PLACEMENT_STD_FLOOR, _rms, fit_joint
 from femsense.calib.rigid import fit_rigid, fit_rigid_robust
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import DataError
@@ -22,7 +22,7 @@ from femsense.core.least_squares import FitResult, covariance_of
 from femsense.core.parallel import one_blas_thread
 from femsense.core.pose import move_pose
 from femsense.fem.equilibrium import Equilibrium
-from femsense.model.drive import Walk, drive_of
+from femsense.model.drive import DrivenRobot, drive_of
 from femsense.model.observation import Hypothesis, Scene, SceneJet, evaluate_scene, in_robot_frame, make_scene, rest_residual
 from femsense.model.recording import Recording, check_against
 from femsense.model.robot import Robot
@@ -115,13 +115,13 @@ def first_poses(robot: Robot, scene: Scene) -> list[FloatArray]:
 
 def _pose_from_frame(robot: Robot, scene: Scene, view: int, name: str) -> FloatArray:
     """Fit the first frame in which a camera sees enough markers to the model of that frame."""
-    walk = Walk(robot, drive_of(robot, scene.recording, initial=first_inputs(robot, scene.recording)))
+    driven = DrivenRobot(robot, drive_of(robot, scene.recording, initial=first_inputs(robot, scene.recording)))
     most = 0
     for k in scene.frames:
         rows = (scene.frame == k) & (scene.view == view)
         most = max(most, int(rows.sum()))
         if rows.sum() >= 3:
-            state = solve_frame(walk, int(k), single=True)
+            state = solve_frame(driven, int(k), single=True)
             shape = state.positions if state.converged else robot.body.mesh.nodes
             return fit_rigid(robot.markers.positions(shape)[scene.marker[rows]], scene.points[rows])
     raise DataError(
@@ -144,7 +144,7 @@ def _alternate(
         history.append(_rms(jet.residual))
         W_ea = -jet.by_initial.reshape(-1, len(initial))  # residual = measured − modelled
         ridge = (
-            SEAT_STD_FLOOR / _largest_input(robot, scene.recording.actuation) * np.eye(len(initial))
+            PLACEMENT_STD_FLOOR / _largest_input(robot, scene.recording.actuation) * np.eye(len(initial))
         )  # what no marker feels stays
         right = np.concatenate([jet.residual.ravel(), np.zeros(len(initial))])
         step = lsq_linear(np.vstack([W_ea, ridge]), right, bounds=(low - initial - 1e-12, high - initial + 1e-12)).x
@@ -171,7 +171,7 @@ def _initial_state(robot: Robot, recording: Recording, initial: FloatArray | Non
     """Return the state under the initial inputs alone (where they are unknown), else under those of the first frame."""
     if initial is not None:
         recording = replace(recording, inputs=np.zeros_like(recording.inputs), pressures=np.zeros_like(recording.pressures))
-    return solve_frame(Walk(robot, drive_of(robot, recording, initial=initial)), 0)
+    return solve_frame(DrivenRobot(robot, drive_of(robot, recording, initial=initial)), 0)
 
 
 def _result(
@@ -210,7 +210,7 @@ def _result(
         tension_std_n=tension,
         displacement_std_m=displacement,
         status=_status(fit, robot, own, recording),
-        seats_m={robot.marker_names[m]: p.tolist() for m, p in zip(scene.rest_marker, places)},
+        placements_m={robot.marker_names[m]: p.tolist() for m, p in zip(scene.rest_marker, places)},
         frames=tuple(int(recording.frame_numbers[k]) for k in scene.frames),
     )
 
@@ -254,7 +254,7 @@ def _from_rest(robot: Robot, recording: Recording) -> Calibration:
     )
     poses = first_poses(robot, scene)
     left = rest_residual(robot, scene, poses)
-    sigma = max(float(np.sqrt((left**2).sum() / max(left.size - 6 * len(poses), 1))), SEAT_STD_FLOOR)
+    sigma = max(float(np.sqrt((left**2).sum() / max(left.size - 6 * len(poses), 1))), PLACEMENT_STD_FLOOR)
     arm = robot.marker_points[scene.rest_marker] - robot.marker_points.mean(axis=0)
     J = np.concatenate([np.hstack([-_cross(a), np.eye(3)]) for a in arm])
     covariance = covariance_of(J / sigma)
@@ -262,7 +262,7 @@ def _from_rest(robot: Robot, recording: Recording) -> Calibration:
     none: dict[str, float | None] = {n: 0.0 for n in robot.body.cable_names}
     per_marker = {robot.marker_names[m]: float(np.linalg.norm(r)) for m, r in zip(scene.rest_marker, left)}
     places = in_robot_frame(scene.rest_points, scene.rest_view, poses, robot.observation)
-    seats_m = {robot.marker_names[m]: p.tolist() for m, p in zip(scene.rest_marker, places)}
+    placements_m = {robot.marker_names[m]: p.tolist() for m, p in zip(scene.rest_marker, places)}
     return Calibration(
         poses[0],
         tuple(poses),
@@ -277,7 +277,7 @@ def _from_rest(robot: Robot, recording: Recording) -> Calibration:
         none,
         dict(none),
         "converged (from rest.csv alone: no frame is free)",
-        seats_m,
+        placements_m,
     )
 
 

@@ -34,7 +34,7 @@ class Calibration:
     displacement_std_m: dict[str, float | None]
     status: str
     """"converged", or what the data leave open, in words."""
-    seats_m: dict[str, list[float]] = field(default_factory=dict)
+    placements_m: dict[str, list[float]] = field(default_factory=dict)
     """Where rest.csv shows the markers to sit [m], robot frame."""
     frames: tuple[int, ...] = ()
     """Numbers of the frames that were used."""

@@ -34,7 +34,7 @@ def calibration_document(calibration: Calibration) -> dict[str, Any]:
         "history": c.history,
         "std": {"T_robot_camera": c.pose_std, "cable_tension_n": c.tension_std_n, "cable_displacement_m": c.displacement_std_m},
         "pose_covariance": c.pose_covariance,
-        "seats_m": c.seats_m,
+        "placements_m": c.placements_m,
         "frames": c.frames,
         "cameras": [{"name": name, "T_robot_camera": T} for name, T in zip(c.camera_names, c.poses)],
     }
@@ -80,7 +80,7 @@ def read_calibration(path: str | Path) -> Calibration:
             tension_std_n=dict(std.get("cable_tension_n", {})),
             displacement_std_m=dict(std.get("cable_displacement_m", {})),
             status=str(document.get("status", "")),
-            seats_m={name: [float(x) for x in point] for name, point in document.get("seats_m", {}).items()},
+            placements_m={name: [float(x) for x in point] for name, point in document.get("placements_m", {}).items()},
             frames=tuple(int(frame) for frame in document.get("frames", [])),
         )
     except (TypeError, ValueError, KeyError, AttributeError) as error:

@@ -21,7 +21,7 @@ NOISE_FLOOR = 1e-7
 """No camera measures better than this [m]."""
 
 
-SEAT_STD_FLOOR = 1e-4
+PLACEMENT_STD_FLOOR = 1e-4
 """Markers are not glued better than this [m]."""
 
 
@@ -43,7 +43,7 @@ def fit_joint(
     moving = [v for v, T in enumerate(scene.recording.T_robot_camera) if T is None]
     a = len(initial) if initial is not None and free_inputs else 0
     base_poses, sigma = list(poses), 5e-4
-    seat_std = SEAT_STD_FLOOR
+    placement_std = PLACEMENT_STD_FLOOR
     repeats = _repeats(scene)
     weights = repeats
     jet: SceneJet | None = None
@@ -72,14 +72,14 @@ def fit_joint(
             known=known,
         )
         row = (weights / sigma)[:, None]
-        residual = np.concatenate([(row * jet.residual).ravel(), jet.rest.ravel() / seat_std])
+        residual = np.concatenate([(row * jet.residual).ravel(), jet.rest.ravel() / placement_std])
         if not derivative:
             return residual, None
         columns = [c for v in moving for c in range(6 * v, 6 * v + 6)]
         J_pose = np.vstack(
             [
                 (row[:, :, None] * jet.by_pose[:, :, columns]).reshape(jet.residual.size, len(columns)),
-                jet.rest_by_pose[:, :, columns].reshape(jet.rest.size, len(columns)) / seat_std,
+                jet.rest_by_pose[:, :, columns].reshape(jet.rest.size, len(columns)) / placement_std,
             ]
         )
         J_in = np.vstack([(row[:, :, None] * jet.by_initial).reshape(jet.residual.size, a), np.zeros((jet.rest.size, a))])
@@ -102,7 +102,7 @@ def fit_joint(
         weights = repeats * huber
         winsorised = jet.residual * (repeats * huber**2)[:, None]  # an outlier counts as the largest residual that is none
         sigma = _spread(winsorised, float(3 * (repeats**2).sum()), len(theta))
-        seat_std = max(SEAT_STD_FLOOR, float(np.sqrt((jet.rest**2).mean()))) if len(jet.rest) else seat_std
+        placement_std = max(PLACEMENT_STD_FLOOR, float(np.sqrt((jet.rest**2).mean()))) if len(jet.rest) else placement_std
     assert jet is not None
     moved, inputs = place(theta)
     fit = _with_bound_inputs(fit, theta, bounds)

@@ -10,7 +10,7 @@ from scipy.optimize import lsq_linear
 
 from femsense.core.arrays import FloatArray, freeze
 from femsense.core.errors import DataError
-from femsense.core.local_model import Curvature, Kinks, Near
+from femsense.core.local_model import Curvature, LocalModel, Nonsmoothness
 
 Evaluate = Callable[[FloatArray, bool], tuple[FloatArray, FloatArray | None]]
 """(θ, with derivative) → whitened residual (N,), Jacobian (N, p) or None. A θ that cannot be evaluated raises DataError."""
@@ -27,9 +27,9 @@ LITTLE = 2.0
 may be large because the fit is far from its end."""
 LEAST_SHRINKING = 0.25
 """No step is foretold to be shorter than this share of the one before."""
-CONVERGED, GIVEN_UP = "converged", "given up"
+CONVERGED, STOPPED_EARLY = "converged", "given up"
 MOST_DAMPING = 1e8
-ON_KINK = 0.2
+AT_NONSMOOTH = 0.2
 """A fit rests on a kink that is nearer than so many standard errors."""
 
 
@@ -69,7 +69,7 @@ def gauss_newton(
     trusted: float = 0.0,
     enough: float = 0.0,
     spare: float = 0.0,
-    kinks: Callable[[FloatArray], Kinks | None] | None = None,
+    nonsmooth: Callable[[FloatArray], Nonsmoothness | None] | None = None,
 ) -> FitResult:
     """Minimise ‖r(θ)‖² within bounds (Levenberg's damping where a plain step does not pay; how the residual bends, as far as its Jacobians have
     shown it, counts while that foretells steps no worse than straight lines do: `core.local_model`).
@@ -110,22 +110,27 @@ def gauss_newton(
     idle = 0  # idle steps in turn
     curvature = Curvature()
     while steps < max_iterations or not slope.own:
-        bends = None if kinks is None else kinks(theta)
+        bends = None if nonsmooth is None else nonsmooth(theta)
         if slope.own:
             curvature.learn(theta, residual, slope.J, bends)
-        near = Near(residual, slope.J, bends, low - theta, high - theta, curvature.S, believed=curvature.believed)
+        near = LocalModel(residual, slope.J, bends, low - theta, high - theta, curvature.S, believed=curvature.believed)
         step = near.step(damping)
-        change, promised = near.change(step), near.promise(step)
-        whole = promised if damping == 0.0 else near.promise(near.step(0.0))
+        change, predicted_sum = near.change(step), near.predicted_gain(step)
+        whole = predicted_sum if damping == 0.0 else near.predicted_gain(near.step(0.0))
         error = max(1.0, costs[-1] / max(len(residual), 1)) ** 0.5  # what a standard error is worth where the model misfits
         gain = enough * error**2
-        small = promised <= tolerance * costs[-1] or np.linalg.norm(change) <= still * error
+        small = predicted_sum <= tolerance * costs[-1] or np.linalg.norm(change) <= still * error
         at_end = not slope.own and (small or steps >= max_iterations)
         if costs[-1] > worth and (at_end or costs[-1] - 2.0 * whole > worth):
-            status = GIVEN_UP
+            status = STOPPED_EARLY
             break
-        foretold = not slope.own and error == 1.0 and pace.next <= still
-        if foretold or (whole < spare and slope.sure is not None) or idle > 1 or (small and (slope.own or slope.sure or idle)):
+        expected_residual = not slope.own and error == 1.0 and pace.next <= still
+        if (
+            expected_residual
+            or (whole < spare and slope.sure is not None)
+            or idle > 1
+            or (small and (slope.own or slope.sure or idle))
+        ):
             status = CONVERGED
             break
         if at_end:
@@ -136,7 +141,7 @@ def gauss_newton(
         cost = np.inf if tried is None else float(tried @ tried)
         idle = idle + 1 if whole < NEARLY * gain and not costs[-1] - cost >= gain else 0
         last = slope.own and whole < LITTLE * enough
-        if tried is None or not cost <= costs[-1] - 1e-4 * promised:
+        if tried is None or not cost <= costs[-1] - 1e-4 * predicted_sum:
             if not slope.own and idle < 2:
                 residual, slope = _both(evaluate, theta)
                 continue
@@ -162,8 +167,8 @@ def gauss_newton(
         if last:
             status = CONVERGED
             break
-    bends = None if kinks is None or status == GIVEN_UP else kinks(theta)
-    jacobian = slope.J if bends is None else _on_kinks(slope.J, residual, bends)
+    bends = None if nonsmooth is None or status == STOPPED_EARLY else nonsmooth(theta)
+    jacobian = slope.J if bends is None else _at_nonsmooth(slope.J, residual, bends)
     return FitResult(
         freeze(theta), freeze(covariance_of(jacobian)), freeze(residual), freeze(jacobian), tuple(costs), status, slope.own
     )
@@ -179,9 +184,9 @@ class _Slope:
     sure: bool | None = True
     """Whether it foretold all steps since it was made; None: it was made elsewhere, and no step has been taken by it."""
 
-    def after(self, step: FloatArray, scale: FloatArray, missed: FloatArray, foretold: bool) -> _Slope:
+    def after(self, step: FloatArray, scale: FloatArray, missed: FloatArray, expected_residual: bool) -> _Slope:
         """Return it with what it missed along a step."""
-        return _Slope(_as_seen(self.J, step, scale, missed), False, foretold and self.sure is not False)
+        return _Slope(_as_seen(self.J, step, scale, missed), False, expected_residual and self.sure is not False)
 
 
 class _Pace:
@@ -203,7 +208,7 @@ def _as_seen(J: FloatArray, step: FloatArray, scale: FloatArray, missed: FloatAr
     return J if size == 0.0 else J + np.outer(missed, along / size)
 
 
-def _shorter(near: Near, damping: float, change: FloatArray) -> float:
+def _shorter(near: LocalModel, damping: float, change: FloatArray) -> float:
     """Return the damping that makes a step change the residual by half as much as `change` or less."""
     while damping <= MOST_DAMPING:
         damping = max(10.0 * damping, 1e-4)
@@ -212,24 +217,24 @@ def _shorter(near: Near, damping: float, change: FloatArray) -> float:
     return damping
 
 
-def _on_kinks(J: FloatArray, r: FloatArray, kinks: Kinks) -> FloatArray:
+def _at_nonsmooth(J: FloatArray, r: FloatArray, nonsmooth: Nonsmoothness) -> FloatArray:
     """Return the derivative that stands for both sides of the kinks on which a fit came to rest: the mean of them that leaves no gradient.
 
     Straight lines of one side alone would go on down where the other side goes up (Clarke's generalised Jacobian has 0 among its gradients).
     """
-    spread = np.sqrt(np.maximum(np.einsum("gp,pq,gq->g", kinks.slope, _finite(covariance_of(J)), kinks.slope), 0.0))
-    here = np.abs(kinks.value) < ON_KINK * spread
+    spread = np.sqrt(np.maximum(np.einsum("gp,pq,gq->g", nonsmooth.slope, _finite(covariance_of(J)), nonsmooth.slope), 0.0))
+    here = np.abs(nonsmooth.value) < AT_NONSMOOTH * spread
     if not here.any():
         return J
     scale = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
-    counted = kinks.counted.astype(float)
-    pull = (kinks.columns[:, here].T @ r)[:, None] * kinks.slope[here] / scale
+    counted = nonsmooth.counted.astype(float)
+    pull = (nonsmooth.columns[:, here].T @ r)[:, None] * nonsmooth.slope[here] / scale
     gradient = J.T @ r / scale - counted[here] @ pull
     stay = 1e-6 * float(np.linalg.norm(pull)) * np.eye(len(pull))
     A, b = np.vstack([pull.T, stay]), np.concatenate([-gradient, stay @ counted[here]])
     share = counted.copy()
     share[here] = lsq_linear(A, b, bounds=(0.0, 1.0)).x
-    return np.asarray(J + (kinks.columns * (share - counted)) @ kinks.slope)
+    return np.asarray(J + (nonsmooth.columns * (share - counted)) @ nonsmooth.slope)
 
 
 def _finite(covariance: FloatArray) -> FloatArray:

@@ -25,7 +25,7 @@ LEAST = 0.2
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Kinks:
+class Nonsmoothness:
     """Where the residual bends, although what makes it bend is known:  r(θ + s) ≈ r + J₀ s + W (max(v + U s, 0) − max(v, 0)).
 
     A cable that is not pulled does not push, so that the tension that its zero and its log make together ends at 0.
@@ -47,11 +47,11 @@ class _Point:
 
     theta: FloatArray
     J: FloatArray
-    kinks: Kinks | None
+    nonsmooth: Nonsmoothness | None
 
     def as_counted_at(self, other: _Point) -> FloatArray | None:
         """Return the Jacobian here with the kinks counted as they are elsewhere, so that no jump is taken for a bend; None: they are others."""
-        here, there = self.kinks, other.kinks
+        here, there = self.nonsmooth, other.nonsmooth
         if here is None or there is None:
             return self.J if here is there else None
         if here.counted.shape != there.counted.shape:
@@ -69,9 +69,9 @@ class Curvature:
         """Whether it foretold the last step no worse than straight lines; at first it is."""
         self.last: _Point | None = None
 
-    def learn(self, theta: FloatArray, r: FloatArray, J: FloatArray, kinks: Kinks | None) -> None:
+    def learn(self, theta: FloatArray, r: FloatArray, J: FloatArray, nonsmooth: Nonsmoothness | None) -> None:
         """Learn from residual and Jacobian at a point of the fit."""
-        here, before = _Point(theta, J, kinks), self.last
+        here, before = _Point(theta, J, nonsmooth), self.last
         if before is not None and np.array_equal(theta, before.theta):
             return
         self.last = here
@@ -90,9 +90,9 @@ class Curvature:
         outer = np.outer(missed, along) / size
         self.S = S + outer + outer.T - float(step @ missed) / size**2 * np.outer(along, along)
 
-    def judge(self, near: Near, step: FloatArray, gain: float) -> None:
+    def judge(self, near: LocalModel, step: FloatArray, gain: float) -> None:
         """Go on believing in S if it foretells what a step brought no worse than straight lines do."""
-        straight, curved = (abs(near.promise(step, curved=curved) - gain) for curved in (False, True))
+        straight, curved = (abs(near.predicted_gain(step, curved=curved) - gain) for curved in (False, True))
         self.believed = curved <= straight
 
 
@@ -106,31 +106,31 @@ def _with_curvature(J: FloatArray, S: FloatArray, scale: FloatArray) -> FloatArr
     return np.asarray(np.sqrt(np.maximum(1.0 + share, LEAST))[:, None] * (turn.T @ root) * scale)
 
 
-class Near:
+class LocalModel:
     """What the sum of squares is near θ."""
 
     def __init__(
         self,
         r: FloatArray,
         J: FloatArray,
-        kinks: Kinks | None,
+        nonsmooth: Nonsmoothness | None,
         low: FloatArray,
         high: FloatArray,
         S: FloatArray | None = None,
         *,
         believed: bool = True,
     ) -> None:
-        self.kinks, self.low, self.high = kinks, low, high
-        self.plain = J if kinks is None else J - (kinks.columns * kinks.counted) @ kinks.slope
+        self.nonsmooth, self.low, self.high = nonsmooth, low, high
+        self.plain = J if nonsmooth is None else J - (nonsmooth.columns * nonsmooth.counted) @ nonsmooth.slope
         """J₀"""
         self.scale = np.linalg.norm(J, axis=0)
         self.scale[self.scale == 0] = 1.0
         self.r, self.J = r, J
-        if kinks is not None:  # of all rows, these are what sums of squares depend on
-            p, g = len(self.scale), len(kinks.value)
-            R = np.asarray(np.linalg.qr(np.column_stack([self.plain, kinks.columns, r]), mode="r"))
+        if nonsmooth is not None:  # of all rows, these are what sums of squares depend on
+            p, g = len(self.scale), len(nonsmooth.value)
+            R = np.asarray(np.linalg.qr(np.column_stack([self.plain, nonsmooth.columns, r]), mode="r"))
             self.J0, self.W, self.r0 = R[:, :p], R[:, p : p + g], R[:, -1]
-            self.J = self.plain + (kinks.columns * (kinks.value >= 0)) @ kinks.slope
+            self.J = self.plain + (nonsmooth.columns * (nonsmooth.value >= 0)) @ nonsmooth.slope
         self.S, self.curved = np.zeros((len(self.scale),) * 2), S is not None and believed
         if S is not None:
             C = _with_curvature(self.J, S, self.scale)
@@ -138,12 +138,12 @@ class Near:
 
     def change(self, step: FloatArray) -> FloatArray:
         """Return by how much a step changes the residual, shape (N,)."""
-        k = self.kinks
+        k = self.nonsmooth
         if k is None:
             return np.asarray(self.J @ step)
         return np.asarray(self.plain @ step + k.columns @ (_cut(k.value + k.slope @ step, 0.0)[0] - _cut(k.value, 0.0)[0]))
 
-    def promise(self, step: FloatArray, *, curved: bool | None = None) -> float:
+    def predicted_gain(self, step: FloatArray, *, curved: bool | None = None) -> float:
         """Return by how much a step lowers the sum of squares; with S or without it, by default as far as it is believed."""
         bend = self.bend(step) if curved is None else curved * float(step @ self.S @ step)
         return float(np.sum(self.r**2) - np.sum((self.r + self.change(step)) ** 2)) - bend
@@ -156,7 +156,7 @@ class Near:
         """Return the step that minimises the sum of squares + damping ‖scale · s‖² within bounds."""
         J, r = self._squares(self.J, self.r, np.zeros(len(self.scale)))
         straight = _bounded_step(J, r, self.scale, damping, self.low, self.high)
-        k = self.kinks
+        k = self.nonsmooth
         if k is None:
             return straight
         best, best_cost = straight, self._cost(straight, damping)
@@ -174,7 +174,7 @@ class Near:
 
     def _turn(self, s: FloatArray, damping: float, width: float) -> tuple[FloatArray, bool]:
         """Return a better step, and whether there was one, where kinks are rounded to a width."""
-        k = self.kinks
+        k = self.nonsmooth
         assert k is not None
         root = np.sqrt(damping) * self.scale
         r = np.concatenate([self._reduced(s, width), root * s])
@@ -198,7 +198,7 @@ class Near:
         return C, np.asarray(np.linalg.lstsq((C / self.scale).T, slope, rcond=None)[0])
 
     def _reduced(self, s: FloatArray, width: float) -> FloatArray:
-        k = self.kinks
+        k = self.nonsmooth
         assert k is not None
         return np.asarray(self.r0 + self.J0 @ s + self.W @ (_cut(k.value + k.slope @ s, width)[0] - _cut(k.value, width)[0]))
 

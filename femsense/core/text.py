@@ -6,7 +6,7 @@ import difflib
 from collections.abc import Iterable, Sequence
 
 
-def near(word: str, known: Iterable[str]) -> str | None:
+def did_you_mean(word: str, known: Iterable[str]) -> str | None:
     """Return a hint that names the known words closest to a word; None where none is close."""
     likeness = {name: difflib.SequenceMatcher(None, word.lower(), name.lower()).ratio() for name in known}
     best = max(likeness.values(), default=0.0)

@@ -24,7 +24,7 @@ from femsense.fem.cables import add_cable_stiffness, bend_angles, cable_forces, 
 from femsense.fem.chambers import add_pressure_stiffness, chamber_volume, volume_changes, volume_gradient
 from femsense.fem.clamp import with_turning_plate
 from femsense.fem.linalg.factorization import Factorization, Pattern, factorize, factorize_definite, least_shift
-from femsense.fem.rotated_step import turned_step
+from femsense.fem.rotated_step import rotated_step
 
 CONVERGED = "converged"
 TRIES, INDEFINITE_TRIES = 30, 6
@@ -719,7 +719,7 @@ def _line_search(
     noise = 1e-12 * (abs(here.energy) + abs(float((loads.forces * x0).sum())) + float(np.abs(T0) @ loads.lever) * 1e-2 + 1e-12)
     reach, longest = body.reach, float(np.abs(step).max(initial=1e-300))
     length = min(1.0, 0.5 * reach / longest)
-    turned = turned_step(body, x0, length * step) if longest > CURVED * reach else None
+    turned = rotated_step(body, x0, length * step) if longest > CURVED * reach else None
     for trial in range(25):
         state.x = x0 + length * step if turned is None else turned
         state.T = T0.copy()

@@ -48,7 +48,7 @@ class Corners:
     """Of Σ w ∇N_a·∇N_b over the free corners."""
 
 
-def turned_step(body: BodyModel, positions: FloatArray, step: FloatArray) -> FloatArray | None:
+def rotated_step(body: BodyModel, positions: FloatArray, step: FloatArray) -> FloatArray | None:
     """Return where a step [m], shape (n, 3), leads from node positions [m] when elements turn; None where nothing is clamped."""
     kept = body.free_map.laplacian
     if not kept:

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from femsense.core.arrays import BoolArray, FloatArray, IntArray, freeze
 from femsense.fem.linalg.factorization import Pattern, make_pattern
-from femsense.fem.linalg.iterative import Grid
+from femsense.fem.linalg.iterative import Level
 from femsense.fem.linalg.ordering import fill_reducing_order
 from femsense.fem.linalg.simd_kernels import LANES
 from femsense.fem.mesh import EDGES, TetMesh, shape_slopes, shape_values
@@ -165,7 +165,7 @@ def make_free_map(stencil: Stencil, mesh: TetMesh, fixed: IntArray) -> FreeMap:
     sort = np.lexsort((i, j))
     pattern, source = _entries(i[sort], j[sort], where[sort], turned[sort], len(order))
     dofs = (3 * order[:, None] + np.arange(3)).ravel()
-    grid = Grid(freeze(mesh.nodes[order]), freeze(_edge_ends(mesh, place)[order], np.int64))
+    grid = Level(freeze(mesh.nodes[order]), freeze(_edge_ends(mesh, place)[order], np.int64))
     return FreeMap(freeze(dofs, np.int64), replace(pattern, grid=grid), source)
 
 

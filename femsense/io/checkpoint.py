@@ -22,7 +22,7 @@ from femsense.fem.linalg.symbolic import Analysis
 from femsense.io.files import json_text, write_beside
 from femsense.model.effects import Effect
 
-Course = TypeVar("Course")
+Progress = TypeVar("Progress")
 UNFINISHED = ".unfinished"
 """Name of the file, in the folder of the results."""
 NUMPY = ("ndarray", "dtype", "scalar", "_reconstruct", "_frombuffer")
@@ -39,7 +39,7 @@ UNREADABLE = (OSError, EOFError, ValueError, TypeError, LookupError, AttributeEr
 """What comes of a file that is cut off, or that another version wrote."""
 
 
-class Keeper:
+class Checkpoint:
     """Keeps how far a computation has come, if it is told where: a help that may fail, and then all begins anew."""
 
     def __init__(self, where: tuple[str | Path, Mapping[str, Any]] | None, effects: Sequence[Effect] = ()) -> None:
@@ -62,7 +62,7 @@ class Keeper:
             _Writer(stream, self.effects).dump(course)
         self.last = time.monotonic()
 
-    def kept(self, kind: type[Course]) -> Course | None:
+    def kept(self, kind: type[Progress]) -> Progress | None:
         """Return how far a computation came that is made from the same; None where there is none, or none that can be read."""
         if self.file is None:
             return None
@@ -75,7 +75,7 @@ class Keeper:
             return None
         return course if isinstance(course, kind) else None
 
-    def __enter__(self) -> Keeper:
+    def __enter__(self) -> Checkpoint:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:

@@ -20,7 +20,7 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import InputError, MissingDependency
-from femsense.core.text import near
+from femsense.core.text import did_you_mean
 from femsense.fem.mesh import EDGES, TetMesh, element_volumes, oriented
 from femsense.io.files import PART_PREFIX, write_beside
 from femsense.io.meshing.surface import check_finite, merged, repaired
@@ -249,7 +249,7 @@ def _check_exists(path: Path, where: str) -> None:
     if path.is_file():
         return
     names = [file.name for file in path.parent.iterdir() if file.is_file()] if path.parent.is_dir() else []
-    raise InputError("no such mesh file", where=where, found=str(path), expected="a file", hint=near(path.name, names))
+    raise InputError("no such mesh file", where=where, found=str(path), expected="a file", hint=did_you_mean(path.name, names))
 
 
 def read_cells(path: Path, where: str) -> tuple[FloatArray, dict[str, IntArray]]:

@@ -14,7 +14,7 @@ from pydantic import Field, model_validator
 from femsense.core.arrays import BoolArray, FloatArray, IntArray, freeze
 from femsense.core.errors import InputError
 from femsense.core.pose import check_pose
-from femsense.core.text import key_path, near
+from femsense.core.text import did_you_mean, key_path
 from femsense.io.clouds.frame_clouds import find_clouds
 from femsense.io.clouds.images import check_image_size, png_header
 from femsense.io.files import write_beside, write_csv, write_toml
@@ -170,7 +170,7 @@ def _recording_folder(path: Path) -> Path:
             where=path,
             found="nothing there",
             expected="a folder with recording.toml",
-            hint=near(path.name, names),
+            hint=did_you_mean(path.name, names),
         )
     if not (folder / "recording.toml").is_file():
         raise InputError(
@@ -404,7 +404,7 @@ def _view_indices(table: Table, views: tuple[str, ...]) -> IntArray:
                 where=table.place(row, "camera"),
                 found=cell or "an empty cell",
                 expected=", ".join(views) if views != ("",) else "no column camera, or [cameras.NAME] in recording.toml",
-                hint=near(cell, views),
+                hint=did_you_mean(cell, views),
             )
     return np.array([views.index(cell) for cell in cells], dtype=np.int64)
 

@@ -17,7 +17,7 @@ import femsense
 from femsense.core.arrays import FloatArray, IntArray, freeze
 from femsense.core.errors import InputError
 from femsense.core.pose import check_pose, transform_points
-from femsense.core.text import key_path, near, short
+from femsense.core.text import did_you_mean, key_path, short
 from femsense.fem.body import BodyModel, make_body, tie_cable
 from femsense.fem.body_parts import Cable, Chamber
 from femsense.fem.cavities import check_chambers, find_chamber
@@ -215,7 +215,7 @@ def find_robot(path_or_name: str | Path) -> Path:
         where=path_or_name,
         found="neither a folder, nor a file, nor a known name",
         expected=f"a folder with robot.toml, or one of: {names}",
-        hint=near(str(path_or_name), known),
+        hint=did_you_mean(str(path_or_name), known),
     )
 
 
@@ -317,7 +317,7 @@ def _effect_problems(entry: Mapping[str, Any], i: int, path: Path) -> list[Input
                 where=where,
                 found=short(entry["name"]),
                 expected=expected,
-                hint=near(str(entry["name"]), EFFECT_NAMES),
+                hint=did_you_mean(str(entry["name"]), EFFECT_NAMES),
             )
         ]
     return []

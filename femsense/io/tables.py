@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import InputError
-from femsense.core.text import key_path, near, short
+from femsense.core.text import did_you_mean, key_path, short
 
 
 class Schema(BaseModel):
@@ -84,7 +84,7 @@ def _problem(schema: type[Schema], item: Any, path: Path) -> InputError:
             where=where,
             found=short(str(location[-1])),
             expected=" | ".join(known),
-            hint=near(str(location[-1]), known),
+            hint=did_you_mean(str(location[-1]), known),
         )
     expected = _description_at(schema, location)
     if kind == "missing":
@@ -256,7 +256,7 @@ def _check_header(
         if column not in known and not prefixed:
             names = [*known, *(f"{prefix}NAME" for prefix in prefixes)]
             raise InputError(
-                "unknown column", where=where, found=short(column), expected=", ".join(names), hint=near(column, known)
+                "unknown column", where=where, found=short(column), expected=", ".join(names), hint=did_you_mean(column, known)
             )
         if column in columns[:i]:
             raise InputError("a column stands twice", where=where, found=column, expected="each column once")

@@ -19,27 +19,27 @@ import numpy as np
 
 from femsense.core.errors import DataError, FemsenseError, InputError
 from femsense.core.parallel import beside, one_blas_thread
-from femsense.io.checkpoint import Keeper
+from femsense.io.checkpoint import Checkpoint
 from femsense.loop.data.dataset import MESH, Data, prepare
-from femsense.loop.data.outliers import without_strays
+from femsense.loop.data.outliers import without_outliers
 from femsense.loop.design.next_experiment import next_experiment
 from femsense.loop.fit.discretisation_error import errs_alike, few_states, make_finer, with_mesh_errors
-from femsense.loop.fit.fitted_model import Stage, make_stage, own_of, rematched, roughly_keeping, weighed, with_nuisance
+from femsense.loop.fit.fitted_model import FittedModel, fit_model, own_of, rematched, roughly_keeping, weighed, with_nuisance
 from femsense.loop.fit.joint_fit import Prior
-from femsense.loop.fit.marker_placement import with_turning_seats
+from femsense.loop.fit.marker_placement import with_turning_placements
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.result import LoopResult
-from femsense.loop.search.acceptance import mesh_cost, moved_by
+from femsense.loop.search.acceptance import discretisation_rms, moved_by
 from femsense.loop.search.effect_fields import Fields, fields_of
 from femsense.loop.search.element_order import need_quadratic, seeks_with_quadratic, with_quadratic
-from femsense.loop.search.forward_selection import grow, shortlist
-from femsense.loop.search.input_offset import in_place_of_zeros
+from femsense.loop.search.forward_selection import select_next, shortlist
+from femsense.loop.search.input_offset import instead_of_offsets
 from femsense.loop.search.pruning import prune
 from femsense.loop.search.refit import EVIDENCE, evidence
-from femsense.loop.search.screening import Candidate, noise_of, screen_stage
-from femsense.loop.search.search_state import Course, Progress, Refit, Search
+from femsense.loop.search.screening import Candidate, noise_of, screen_model
+from femsense.loop.search.search_state import Progress, Refit, Search, SearchProgress
 from femsense.loop.search.subsampling import spares
-from femsense.loop.search.swaps import BETTER, History, exchanged
+from femsense.loop.search.swaps import BETTER, History, swapped
 from femsense.loop.verdict.verdict import conclude
 from femsense.model.effects import EFFECTS, FORMS, Effect, find_effect, load_own_effect, try_own_effect
 from femsense.model.observation import Hypothesis, SceneJet
@@ -47,7 +47,7 @@ from femsense.model.recording import Recording, state_key
 from femsense.model.robot import Robot
 
 MAX_EFFECTS = 3
-Ready = tuple[Data, Stage, History]
+Ready = tuple[Data, FittedModel, History]
 """Data, the declared model with its camera calibrated, and the models that effects are sought on top of."""
 STATES = 5
 """So many different states can tell effects apart though what is held out only repeats them."""
@@ -109,10 +109,10 @@ def improve(
             data = prepare(body, recordings, validation, measured)
             data, before, start = _calibrated(replace(data, forms=(*FORMS, *own), declared=robot), say)
             finer_is_made()
-        return _with_cost_of_mesh(data, start[-1][1], names, say), before, start
+        return _with_discretisation_error(data, start[-1][1], names, say), before, start
 
-    with Keeper(keep, (*FORMS, *own)) as keeper:
-        data, search = _searched(robot, names, ready, keeper, say)
+    with Checkpoint(keep, (*FORMS, *own)) as checkpoint:
+        data, search = _searched(robot, names, ready, checkpoint, say)
         say("testing what is left")
         result = conclude(data, search, rng)
         record = next_experiment(data, search.final, search.noise, result.confounded, result.not_testable)
@@ -124,25 +124,25 @@ def improve(
 
 
 def _searched(
-    robot: Robot, names: list[str], ready: Callable[[Robot, Sequence[str]], Ready], keeper: Keeper, say: Progress
+    robot: Robot, names: list[str], ready: Callable[[Robot, Sequence[str]], Ready], checkpoint: Checkpoint, say: Progress
 ) -> tuple[Data, Search]:
     """Return the data with what a search finds in them: on quadratic elements where the robot declares linear ones and the data miss those, else on what
     is declared. One that was killed goes on where it was."""
     refits: list[dict[str, Any]] = []
-    kept = keeper.kept(Course)
+    kept = checkpoint.kept(SearchProgress)
     if kept is not None:
         say(f"going on where it stopped (effects found: {kept.found})")
     if seeks_with_quadratic(robot, names) and (kept is None or kept.quadratic):
         with contextlib.suppress(FemsenseError):  # linear elements lock, and come to rest where quadratic ones fold
             course = kept or _begun(ready(with_quadratic(robot), names), names, [], quadratic=True)
-            data, search = _search(course, keeper, say)
+            data, search = _search(course, checkpoint, say)
             say("asking whether quadratic elements are needed")
             needed, refits = need_quadratic(data, search, names)
             if needed:
                 return data, replace(search, refits=[*refits, *search.refits])
             names = [name for name in names if name != MESH.name]
         kept = None
-    return _search(kept or _begun(ready(robot, names), names, refits, quadratic=False), keeper, say)
+    return _search(kept or _begun(ready(robot, names), names, refits, quadratic=False), checkpoint, say)
 
 
 def _get_ready(robot: Robot, names: Sequence[str]) -> None:
@@ -155,7 +155,7 @@ def _calibrated(data: Data, say: Progress) -> Ready:
     """Return the data without strays, the declared model calibrated, and the model with all that calibration may move; before that the same on the
     declared mesh, where it is another one."""
     placed = _placed(data, data.robot, START)
-    while (fewer := without_strays(data, [jet.residual for jet in placed.fit.jets], placed.held_residuals)) is not data:
+    while (fewer := without_outliers(data, [jet.residual for jet in placed.fit.jets], placed.held_residuals)) is not data:
         data, placed = fewer, _placed(fewer, data.robot, START)
     say("fitting what calibration may move")
     base = _calibrated_on(data, data.robot, placed)
@@ -171,24 +171,24 @@ def _calibrated(data: Data, say: Progress) -> Ready:
     return data, before, [("", _calibrated_on(data, declared, before)), (MESH.name, base)]
 
 
-def _placed(data: Data, robot: Robot, noise: Noise, start: Stage | None = None) -> Stage:
+def _placed(data: Data, robot: Robot, noise: Noise, start: FittedModel | None = None) -> FittedModel:
     """Return a robot with its camera calibrated."""
     nothing = Prior(np.zeros(0), np.zeros(0))
     own = None if start is None else own_of(start)
-    return make_stage(data, Hypothesis(robot), nothing, noise, np.zeros(0), own=own)
+    return fit_model(data, Hypothesis(robot), nothing, noise, np.zeros(0), own=own)
 
 
-def _calibrated_on(data: Data, robot: Robot, placed: Stage) -> Stage:
+def _calibrated_on(data: Data, robot: Robot, placed: FittedModel) -> FittedModel:
     """Return a robot with all that calibration may move, fitted roughly. To begin with some of the states leads elsewhere: what the model lacks pulls
     zeros and modulus further where fewer states hold them."""
     hypothesis, prior = with_nuisance(data, robot)
     nothing = np.zeros(len(prior.mean))
     return _as_far_as_held_out_states_rest(
-        lambda steps: make_stage(data, hypothesis, prior, START, nothing, own=own_of(placed), max_iterations=steps), ROUGHLY
+        lambda steps: fit_model(data, hypothesis, prior, START, nothing, own=own_of(placed), max_iterations=steps), ROUGHLY
     )
 
 
-def _with_cost_of_mesh(data: Data, base: Stage, names: Sequence[str], say: Progress) -> Data:
+def _with_discretisation_error(data: Data, base: FittedModel, names: Sequence[str], say: Progress) -> Data:
     """Return the data with what the mesh costs, and seats that turn with the body."""
     say("asking what the mesh costs")
     try:  # zeros may have gone far, for an effect's sake
@@ -196,10 +196,10 @@ def _with_cost_of_mesh(data: Data, base: Stage, names: Sequence[str], say: Progr
         plain = roughly_keeping(data, base, ["stiffness"], START, frames)
     except FemsenseError:
         plain = base
-    return with_turning_seats(with_mesh_errors(data, plain, names), base)
+    return with_turning_placements(with_mesh_errors(data, plain, names), base)
 
 
-def _as_far_as_held_out_states_rest(fit: Callable[[int], Stage], steps: int) -> Stage:
+def _as_far_as_held_out_states_rest(fit: Callable[[int], FittedModel], steps: int) -> FittedModel:
     """Return a fit of so many steps, or of fewer where a held-out state collapses beyond: what calibration may move is no reason to fail, since it
     may go far for the sake of an effect that is not found yet. Raises DataError where the start has no equilibrium either."""
     for most in (steps, 2, 1):
@@ -208,32 +208,32 @@ def _as_far_as_held_out_states_rest(fit: Callable[[int], Stage], steps: int) -> 
     return fit(0)
 
 
-def _begun(ready: Ready, names: Sequence[str], refits: list[dict[str, Any]], *, quadratic: bool) -> Course:
+def _begun(ready: Ready, names: Sequence[str], refits: list[dict[str, Any]], *, quadratic: bool) -> SearchProgress:
     """Return a search on top of the last model of a history that has found nothing yet."""
     data, before, history = ready
     last = history[-1][1]
-    return Course(data, data, before, list(history), len(history), last, last, list(names), quadratic, refits)
+    return SearchProgress(data, data, before, list(history), len(history), last, last, list(names), quadratic, refits)
 
 
-def _search(course: Course, keeper: Keeper, say: Progress) -> tuple[Data, Search]:
+def _search(course: SearchProgress, checkpoint: Checkpoint, say: Progress) -> tuple[Data, Search]:
     """Screen, refit and add effects until none passes; return the data as the last model has them, and the search."""
     while not course.over:
-        keeper.keep(course)
+        checkpoint.keep(course)
         say(f"screening effects ({course.found} found so far)")
         _take_step(course, say)
-    keeper.keep(course)
+    checkpoint.keep(course)
     data, history, noise = course.data, course.history, course.noise
     assert noise is not None
-    stage, refits, before = course.stage, course.refits, course.before
+    fitted, refits, before = course.fitted, course.refits, course.before
     most = _most_effects(data)
-    swap = in_place_of_zeros(data, stage, course.names, noise, course.n_effective, say) if most else None
+    swap = instead_of_offsets(data, fitted, course.names, noise, course.n_effective, say) if most else None
     if swap is not None:
         refits = [*refits, *({**record, "step": len(history)} for record in swap.records)]
-        if swap.stage is not None:
-            stage, history = swap.stage, [*history, (swap.name, swap.stage)]
+        if swap.fitted is not None:
+            fitted, history = swap.fitted, [*history, (swap.name, swap.fitted)]
     if len(history) > 1 and "clouds" in data.measured:
         before = _placed(data, data.robot_as_declared, noise, before)  # before and after on the same rows
-    found = Search(before, history, course.base, stage, noise, course.n_effective, course.first, course.table, refits, swap)
+    found = Search(before, history, course.base, fitted, noise, course.n_effective, course.first, course.table, refits, swap)
     return data, found
 
 
@@ -241,113 +241,113 @@ def _most_effects(data: Data) -> int:
     return MAX_EFFECTS if _tells_apart(data) else 0
 
 
-def _take_step(course: Course, say: Progress) -> None:
+def _take_step(course: SearchProgress, say: Progress) -> None:
     """Screen what a model may lack and add the effect that comes next; where none does, the search is over."""
     names, found = course.names, course.found
-    data, stage, noise, fields = course.data, course.stage, course.noise, course.fields
+    data, fitted, noise, fields = course.data, course.fitted, course.noise, course.fields
     if found and "clouds" in data.measured:
         assert noise is not None
         fields = None
-        data, stage = _matched(data, stage, noise)
+        data, fitted = _matched(data, fitted, noise)
     try:
-        stage, noise, n_effective, fields, table = _screened(data, stage, fields, noise, names)
+        fitted, noise, n_effective, fields, table = _screened(data, fitted, fields, noise, names)
     except FemsenseError as error:
         if not found:
             raise
         course.take_back(error)
         return
-    history, refits, ties = [*course.history[:-1], (course.history[-1][0], stage)], course.refits, course.ties
-    course.data, course.stage, course.noise, course.n_effective = data, stage, noise, n_effective
+    history, refits, ties = [*course.history[:-1], (course.history[-1][0], fitted)], course.refits, course.ties
+    course.data, course.fitted, course.noise, course.n_effective = data, fitted, noise, n_effective
     course.fields, course.table, course.history = fields, table, history
     if not found:
-        course.base, course.first = stage, table
+        course.base, course.first = fitted, table
     if found >= _most_effects(data):
         course.over = True
         return
-    next_one, others, tried = grow(data, stage, table, noise, say)
+    next_one, others, tried = select_next(data, fitted, table, noise, say)
     refits = [*refits, *({**record, "step": len(history)} for record in tried)]
     if next_one is None and ties:
-        instead, next_one, tried = _beside_a_tie(data, stage, ties[0], fields, noise, names, n_effective, say)
+        instead, next_one, tried = _beside_a_tie(data, fitted, ties[0], fields, noise, names, n_effective, say)
         if next_one is not None:
             history[-1] = (ties[0].candidate.effect.name, instead)
             refits = [
                 *_renamed(refits, len(history) - 1, history[-1][0]),
                 *({**record, "step": len(history)} for record in tried),
             ]
-            stage, others = instead, []
+            fitted, others = instead, []
     course.refits = refits
     if next_one is None:
         course.over = True
         return
     course.earlier = data
-    name, winner, course.ties = next_one.candidate.effect.name, next_one.stage, others
-    anew = moved_by(stage, winner) > mesh_cost(data, stage, whole=True) and not errs_alike(stage, winner)
-    stage = prune(data, winner, noise, n_effective, say)
-    history = [*history, (name, stage)]
-    data = with_turning_seats(with_mesh_errors(data, stage, names) if anew else data, stage)
+    name, winner, course.ties = next_one.candidate.effect.name, next_one.fitted, others
+    anew = moved_by(fitted, winner) > discretisation_rms(data, fitted, whole=True) and not errs_alike(fitted, winner)
+    fitted = prune(data, winner, noise, n_effective, say)
+    history = [*history, (name, fitted)]
+    data = with_turning_placements(with_mesh_errors(data, fitted, names) if anew else data, fitted)
     found_so = history
-    history, refits = exchanged(data, history, refits, noise, n_effective, say)
+    history, refits = swapped(data, history, refits, noise, n_effective, say)
     if history is not found_so:
         history[-1] = (history[-1][0], prune(data, history[-1][1], noise, n_effective, say))
-    course.data, course.history, course.refits, course.stage = data, history, refits, history[-1][1]
+    course.data, course.history, course.refits, course.fitted = data, history, refits, history[-1][1]
 
 
 def _screened(
-    data: Data, stage: Stage, before: Fields | None, noise: Noise | None, names: Sequence[str]
-) -> tuple[Stage, Noise, float, Fields, list[Candidate]]:
+    data: Data, fitted: FittedModel, before: Fields | None, noise: Noise | None, names: Sequence[str]
+) -> tuple[FittedModel, Noise, float, Fields, list[Candidate]]:
     """Return a stage fitted with the noise that its residual tells, that noise, the effective number of observations, and the fields and scores
     of what may come next: by the fields of the model before, as long as these promise nothing."""
-    fields = _fields(data, stage, before, names)
-    noise, n_effective = noise_of(data, stage, fields, noise)
-    stage = _again(data, stage, noise, known=stage.fit.jets, spare=_spared(data, stage, fields, noise, n_effective))
-    return stage, noise, n_effective, *_scored(data, stage, fields, noise, names, n_effective)
+    fields = _fields(data, fitted, before, names)
+    noise, n_effective = noise_of(data, fitted, fields, noise)
+    fitted = _again(data, fitted, noise, known=fitted.fit.jets, spare=_spared(data, fitted, fields, noise, n_effective))
+    return fitted, noise, n_effective, *_scored(data, fitted, fields, noise, names, n_effective)
 
 
-def _spared(data: Data, stage: Stage, fields: Fields, noise: Noise, n_effective: float) -> float:
+def _spared(data: Data, fitted: FittedModel, fields: Fields, noise: Noise, n_effective: float) -> float:
     """Return what a stage need not gain any more before effects are tried on top of it, since one of these promises so much more; nothing where all
     states are little work."""
-    if not spares(data, stage.fit.hypothesis.robot_at(stage.fit.coordinates)):
+    if not spares(data, fitted.fit.hypothesis.robot_at(fitted.fit.coordinates)):
         return 0.0
-    fit = weighed(data, stage.fit, noise, stage.fit.jets)
-    return SPARED * max((c.gain for c in screen_stage(data, fit, noise, fields, n_effective)), default=0.0)
+    fit = weighed(data, fitted.fit, noise, fitted.fit.jets)
+    return SPARED * max((c.gain for c in screen_model(data, fit, noise, fields, n_effective)), default=0.0)
 
 
-def _fields(data: Data, stage: Stage, before: Fields | None, names: Sequence[str]) -> Fields:
+def _fields(data: Data, fitted: FittedModel, before: Fields | None, names: Sequence[str]) -> Fields:
     """Return the fields of the model before where they tell what may come next, else those of the stage itself."""
-    hints = None if before is None else before.beside(stage.fit)
-    return fields_of(data, stage, names) if hints is None else hints
+    hints = None if before is None else before.beside(fitted.fit)
+    return fields_of(data, fitted, names) if hints is None else hints
 
 
 def _scored(
-    data: Data, stage: Stage, fields: Fields, noise: Noise, names: Sequence[str], n_effective: float
+    data: Data, fitted: FittedModel, fields: Fields, noise: Noise, names: Sequence[str], n_effective: float
 ) -> tuple[Fields, list[Candidate]]:
     """Return fields and the scores by them: those of the stage itself where others promise something."""
-    table = screen_stage(data, stage.fit, noise, fields, n_effective)
-    if fields.model is stage.fit.hypothesis or not shortlist(table, first=False):
+    table = screen_model(data, fitted.fit, noise, fields, n_effective)
+    if fields.model is fitted.fit.hypothesis or not shortlist(table, first=False):
         return fields, table
-    fields = fields_of(data, stage, names)
-    return fields, screen_stage(data, stage.fit, noise, fields, n_effective)
+    fields = fields_of(data, fitted, names)
+    return fields, screen_model(data, fitted.fit, noise, fields, n_effective)
 
 
 def _beside_a_tie(
     data: Data,
-    stage: Stage,
+    fitted: FittedModel,
     tie: Refit,
     fields: Fields | None,
     noise: Noise,
     names: Sequence[str],
     n_effective: float,
     say: Progress,
-) -> tuple[Stage, Refit | None, list[dict[str, Any]]]:
+) -> tuple[FittedModel, Refit | None, list[dict[str, Any]]]:
     """Return the model with what was as good as the last effect in its place, and what comes next there, or None: the two together must be
     better than the stage. What hides behind a wrong one of two that look alike shows beside the right one."""
     say(f"trying {tie.candidate.effect.name} in the place of the last one, and what goes with it")
-    jets = tie.stage.fit.jets
+    jets = tie.fitted.fit.jets
     same = "clouds" not in data.measured
-    instead = _again(data, tie.stage, noise, known=jets if same else None, near=None if same else jets)
+    instead = _again(data, tie.fitted, noise, known=jets if same else None, near=None if same else jets)
     _, table = _scored(data, instead, _fields(data, instead, fields, names), noise, names, n_effective)
-    both, _, tried = grow(data, instead, table, noise, say)
-    if both is None or evidence(stage.fit, both.stage.fit) - both.candidate.cost <= BETTER:
+    both, _, tried = select_next(data, instead, table, noise, say)
+    if both is None or evidence(fitted.fit, both.fitted.fit) - both.candidate.cost <= BETTER:
         return instead, None, []
     return instead, both, tried
 
@@ -360,31 +360,31 @@ def _renamed(refits: list[dict[str, Any]], step: int, name: str) -> list[dict[st
     ]
 
 
-def _matched(data: Data, stage: Stage, noise: Noise, *, anew: bool = False) -> tuple[Data, Stage]:
+def _matched(data: Data, fitted: FittedModel, noise: Noise, *, anew: bool = False) -> tuple[Data, FittedModel]:
     """Return the data with the rows of clouds as a stage has them, and the stage fitted to these, time and again until neither changes much: what is
     rounded off where the model was draws it back there. With `anew` it is asked again which rows there are."""
     for _ in range(MATCHINGS):
-        data = rematched(data, stage, noise, anew=anew)
-        stage = _again(data, stage, noise, near=None if anew else stage.fit.jets)
-        if stage.fit.fit.cost[0] - stage.fit.chi2 <= EVIDENCE / 2.0:
+        data = rematched(data, fitted, noise, anew=anew)
+        fitted = _again(data, fitted, noise, near=None if anew else fitted.fit.jets)
+        if fitted.fit.fit.cost[0] - fitted.fit.chi2 <= EVIDENCE / 2.0:
             break
-    return data, stage
+    return data, fitted
 
 
 def _again(
     data: Data,
-    stage: Stage,
+    fitted: FittedModel,
     noise: Noise,
     *,
     known: list[SceneJet] | None = None,
     near: list[SceneJet] | None = None,
     spare: float = 0.0,
-) -> Stage:
+) -> FittedModel:
     """Return a stage fitted to other weights or rows, from where it is: with derivatives that are known there, or that are near."""
-    fit, own = stage.fit, own_of(stage)
+    fit, own = fitted.fit, own_of(fitted)
 
-    def fitted(steps: int) -> Stage:
-        return make_stage(
+    def refitted(steps: int) -> FittedModel:
+        return fit_model(
             data,
             fit.hypothesis,
             fit.prior,
@@ -397,7 +397,7 @@ def _again(
             spare=spare,
         )
 
-    return _as_far_as_held_out_states_rest(fitted, STEPS)
+    return _as_far_as_held_out_states_rest(refitted, STEPS)
 
 
 def _names(effects: Sequence[str] | None, without: Sequence[str] | None, own: Sequence[Effect]) -> list[str]:

@@ -11,7 +11,7 @@ from femsense.fem.mesh import TetMesh, closest_in_triangle, surface_triangles, t
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Surface:
+class BodySurface:
     """The boundary of a body's mesh."""
 
     triangles: IntArray
@@ -25,7 +25,7 @@ class Surface:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Patch:
+class ContactPatch:
     """A piece of the surface that carries one force."""
 
     nodes: IntArray
@@ -44,7 +44,7 @@ class Patch:
         return np.asarray(self.weights @ values[self.nodes])
 
 
-def make_surface(mesh: TetMesh) -> Surface:
+def body_surface(mesh: TetMesh) -> BodySurface:
     """Return the boundary of a mesh."""
     triangles = surface_triangles(mesh)
     nodes = np.unique(triangles)
@@ -53,10 +53,10 @@ def make_surface(mesh: TetMesh) -> Surface:
     area = np.asarray(per_node[nodes], dtype=np.float64)
     corners = mesh.nodes[triangles]
     edge = float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean())
-    return Surface(triangles, nodes, area, edge)
+    return BodySurface(triangles, nodes, area, edge)
 
 
-def flat_nodes(surface: Surface, positions: FloatArray) -> IntArray:
+def flat_nodes(surface: BodySurface, positions: FloatArray) -> IntArray:
     """Return surface nodes around which the surface is nearly flat, shape (k,): along a sharp edge a normal means little."""
     area = triangle_normals(positions, surface.triangles)
     total, together = np.zeros(len(positions)), np.zeros_like(positions)
@@ -68,14 +68,14 @@ def flat_nodes(surface: Surface, positions: FloatArray) -> IntArray:
 
 
 def patch_at(
-    surface: Surface,
+    surface: BodySurface,
     positions: FloatArray,
     place: FloatArray,
     radius: float,
     clamped: IntArray,
     *,
     facing: FloatArray | None = None,
-) -> Patch:
+) -> ContactPatch:
     """Return the patch around the point of the surface that is closest to a place.
 
     The weights fall off as a cone of the given radius, times the area of each node; clamped nodes carry nothing.
@@ -98,11 +98,11 @@ def patch_at(
         weight = np.zeros(len(distance))
         weight[np.flatnonzero(free)[np.argmin(distance[free])]] = 1.0
     keep = weight > 0
-    return Patch(surface.nodes[keep], weight[keep] / weight.sum())
+    return ContactPatch(surface.nodes[keep], weight[keep] / weight.sum())
 
 
 def closest_surface_point(
-    surface: Surface, positions: FloatArray, place: FloatArray, *, facing: FloatArray | None = None
+    surface: BodySurface, positions: FloatArray, place: FloatArray, *, facing: FloatArray | None = None
 ) -> FloatArray:
     """Return the point of the surface that is closest to a place [m], shape (3,); only faces within 70° of `facing`, if given."""
     triangles = surface.triangles

@@ -112,7 +112,7 @@ def _creep_loads(recording: Recording, terms: tuple[tuple[float, float], ...]) -
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Walk:
+class DrivenRobot:
     """One way to walk: a robot and its drive."""
 
     robot: Robot
@@ -124,17 +124,17 @@ def has_history(robot: Robot) -> bool:
     return any(cable.friction > 0 for cable in robot.body.cables)
 
 
-def frame_loads(walk: Walk, frame: int) -> FloatArray | None:
+def frame_loads(driven: DrivenRobot, frame: int) -> FloatArray | None:
     """Return the nodal forces of the known loads of a frame [N], shape (n, 3); None where there are none."""
-    rows = np.flatnonzero(walk.drive.load_frame == frame)
+    rows = np.flatnonzero(driven.drive.load_frame == frame)
     if not len(rows):
         return None
-    return walk.drive.load_ties[rows].spread(walk.drive.load_forces[rows], len(walk.robot.body.mesh.nodes))
+    return driven.drive.load_ties[rows].spread(driven.drive.load_forces[rows], len(driven.robot.body.mesh.nodes))
 
 
-def _key(walk: Walk, frame: int) -> bytes:
+def _key(driven: DrivenRobot, frame: int) -> bytes:
     """Return what tells the drive of two frames apart."""
-    drive = walk.drive
+    drive = driven.drive
     rows = drive.load_frame == frame
     parts = [drive.inputs[frame], drive.pressures[frame], drive.load_points[rows].ravel(), drive.load_forces[rows].ravel()]
     if drive.gravity is not None:

@@ -15,8 +15,8 @@ from femsense.fem.compliance import drive_rows, tangent_at
 from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.linalg.refinement import ROUGH, prepare_roughly, roughly
 from femsense.fem.mesh import Embedding
-from femsense.fem.rotated_step import turned_step
-from femsense.model.drive import Walk
+from femsense.fem.rotated_step import rotated_step
+from femsense.model.drive import DrivenRobot
 from femsense.model.variants import _Balance, _rubbed
 
 FINER_STEPS = 8
@@ -49,10 +49,10 @@ EARLY = 3e-2
 def share_on_finer(body: BodyModel) -> None:
     """Make what the steps of all states on a finer mesh share, whatever its material: it is kept with the body's free map."""
     prepare_roughly(body.free_map.pattern)
-    turned_step(body, body.mesh.nodes, np.zeros_like(body.mesh.nodes))
+    rotated_step(body, body.mesh.nodes, np.zeros_like(body.mesh.nodes))
 
 
-def finer_state(walk: Walk, fine: Walk, frame: int, base: Equilibrium, ties: Embedding) -> FloatArray | None:
+def finer_state(driven: DrivenRobot, fine: DrivenRobot, frame: int, base: Equilibrium, ties: Embedding) -> FloatArray | None:
     """Return where the nodes of a finer mesh come to rest [m], shape (n, 3), nearly: Newton steps from a state of a coarser one.
 
     The finer mesh holds the coarse state exactly, but what it softens are single elements, so that two to four steps are needed, with
@@ -72,7 +72,7 @@ def finer_state(walk: Walk, fine: Walk, frame: int, base: Equilibrium, ties: Emb
     """
     for pace in PACES:
         try:
-            x = _stepped(walk, fine, frame, base, ties, pace)
+            x = _stepped(driven, fine, frame, base, ties, pace)
         except FemsenseError:
             if pace == PACES[-1]:
                 raise
@@ -82,9 +82,11 @@ def finer_state(walk: Walk, fine: Walk, frame: int, base: Equilibrium, ties: Emb
     return None
 
 
-def _stepped(walk: Walk, fine: Walk, frame: int, base: Equilibrium, ties: Embedding, pace: float) -> FloatArray | None:
+def _stepped(
+    driven: DrivenRobot, fine: DrivenRobot, frame: int, base: Equilibrium, ties: Embedding, pace: float
+) -> FloatArray | None:
     """Return what `finer_state` is after; the first steps go so far of the way."""
-    body, balance = fine.robot.body, _Balance(walk, frame, base)
+    body, balance = fine.robot.body, _Balance(driven, frame, base)
     x = coarse = ties.positions(base.positions)
     at, force, first = _pulling(fine, balance, base, x)
     size, share = first, 1.0
@@ -101,7 +103,7 @@ def _stepped(walk: Walk, fine: Walk, frame: int, base: Equilibrium, ties: Embedd
             missing = _missing(fine, frame, at, x)[at.held[: len(body.cables)]]
             move = move + np.tensordot(missing, tangent.respond_to_held(), axes=1)
         move *= pace if size > NEAR * first else 1.0
-        turned = turned_step(body, x, move)
+        turned = rotated_step(body, x, move)
         x = np.asarray(x + move) if turned is None else turned
         way = np.abs(x - coarse).max()
         if not way < body.reach:
@@ -111,7 +113,7 @@ def _stepped(walk: Walk, fine: Walk, frame: int, base: Equilibrium, ties: Embedd
     return x if size <= FINER_ENOUGH * first else None
 
 
-def _pulling(fine: Walk, balance: _Balance, at: Equilibrium, x: FloatArray) -> tuple[Equilibrium, FloatArray, float]:
+def _pulling(fine: DrivenRobot, balance: _Balance, at: Equilibrium, x: FloatArray) -> tuple[Equilibrium, FloatArray, float]:
     """Return a state with the tensions of its held cables that balance best at x, what they leave of the nodal forces there [N], (n, 3), and its
     size [N]."""
     body, dofs = fine.robot.body, fine.robot.body.free_map.dofs
@@ -128,14 +130,14 @@ def _pulling(fine: Walk, balance: _Balance, at: Equilibrium, x: FloatArray) -> t
     return at, whole.reshape(force.shape), float(np.linalg.norm(rest))
 
 
-def _missing(fine: Walk, frame: int, at: Equilibrium, x: FloatArray) -> FloatArray:
+def _missing(fine: DrivenRobot, frame: int, at: Equilibrium, x: FloatArray) -> FloatArray:
     """Return the shortening that each cable lacks at x [m], (a,): what is wanted less what it has and what it stretches by."""
     body = fine.robot.body
     stretch = np.array([at.tension[c.name] / c.stretch_stiffness for c in body.cables])
     return np.asarray(fine.drive.inputs[frame] - stretch - shortening(body, x))
 
 
-def _retaut(fine: Walk, frame: int, at: Equilibrium, x: FloatArray, least: float) -> Equilibrium:
+def _retaut(fine: DrivenRobot, frame: int, at: Equilibrium, x: FloatArray, least: float) -> Equilibrium:
     """Return a state at x with the held cables slack that would push there, and those taut that are too long by more than a length [m]."""
     if fine.drive.control != "displacement":
         return at

@@ -17,9 +17,9 @@ from femsense.core.errors import DataError
 from femsense.core.pose import invert_pose, moved_poses, transform_points
 from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.mesh import Embedding
-from femsense.model.drive import Walk, drive_of, has_history, inputs_wanted
+from femsense.model.drive import DrivenRobot, drive_of, has_history, inputs_wanted
 from femsense.model.effects import Effect, Entry, Parameter, build_entry
-from femsense.model.quasi_static_path import walk_along
+from femsense.model.quasi_static_path import solve_path
 from femsense.model.recording import Recording
 from femsense.model.robot import Observation, Robot
 from femsense.model.variants import AtPoints
@@ -182,7 +182,7 @@ def as_measured(points: FloatArray, view: IntArray, poses: Sequence[FloatArray],
     return redo_depth(result, seen)
 
 
-def seats(robot: Robot, scene: Scene, poses: Sequence[FloatArray]) -> FloatArray:
+def placements(robot: Robot, scene: Scene, poses: Sequence[FloatArray]) -> FloatArray:
     """Return where the markers sit at rest [m], shape (m, 3): measured by rest.csv, or as declared."""
     places = robot.marker_points.copy()
     if len(scene.rest_marker):
@@ -192,13 +192,13 @@ def seats(robot: Robot, scene: Scene, poses: Sequence[FloatArray]) -> FloatArray
 
 def _ties(robot: Robot, scene: Scene, poses: Sequence[FloatArray]) -> Embedding:
     """Return the ties of the markers to the body, at their seats."""
-    return robot.tie_markers(seats(robot, scene, poses)) if len(scene.rest_marker) else robot.markers
+    return robot.tie_markers(placements(robot, scene, poses)) if len(scene.rest_marker) else robot.markers
 
 
 def _tied_alike(robot: Robot, other: Robot) -> bool:
     """Return whether the markers of two robots are tied to the same nodes in the same way, as far as declared places and cameras say."""
-    same_seats = robot.marker_points is other.marker_points and robot.observation == other.observation
-    return same_seats and robot.body.mesh is other.body.mesh and robot.marker_share is other.marker_share
+    same_placements = robot.marker_points is other.marker_points and robot.observation == other.observation
+    return same_placements and robot.body.mesh is other.body.mesh and robot.marker_share is other.marker_share
 
 
 def marker_residual(robot: Robot, scene: Scene, poses: Sequence[FloatArray], model: Mapping[int, FloatArray]) -> FloatArray:
@@ -220,7 +220,7 @@ def marker_residual(robot: Robot, scene: Scene, poses: Sequence[FloatArray], mod
 
 def rest_residual(robot: Robot, scene: Scene, poses: Sequence[FloatArray]) -> FloatArray:
     """Return how far the measured seats lie from the declared places [m], shape (r, 3)."""
-    return (seats(robot, scene, poses) - robot.marker_points)[scene.rest_marker]
+    return (placements(robot, scene, poses) - robot.marker_points)[scene.rest_marker]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -292,7 +292,7 @@ def evaluate_scene(
     robot = hypothesis.robot_at(coordinates)
     begun, moves = poses, np.zeros(6 * len(poses)) if moves is None else moves
     poses = moved_poses(begun, moves, pivot)
-    base = Walk(robot, drive_of(robot, scene.recording, initial=initial))
+    base = DrivenRobot(robot, drive_of(robot, scene.recording, initial=initial))
     steps, variants = _variants(hypothesis, scene, coordinates, initial, base, vary_initial) if derivative else ([], [])
     split, last = len(hypothesis.parameters) if derivative else 0, len(variants)
     pulling = _pulling(hypothesis, base, steps, variants) if derivative and vary_inputs else []
@@ -310,7 +310,7 @@ def evaluate_scene(
     if known is not None and not variants:
         states, model = known, {k: ties(robot).positions(state.positions) for k, state in known.items()}
     frames = [] if model else scene.frames.tolist()
-    for k, state, seen, varied in walk_along(base, frames, ties, variants, starts=starts, rough=rough, answers=answers):
+    for k, state, seen, varied in solve_path(base, frames, ties, variants, starts=starts, rough=rough, answers=answers):
         states[k], model[k] = state, seen
         for i in range(len(variants)):
             shifted[i][k] = varied[i]
@@ -345,8 +345,13 @@ def _stack(columns: list[FloatArray], residual: FloatArray) -> FloatArray:
 
 
 def _variants(
-    hypothesis: Hypothesis, scene: Scene, coordinates: FloatArray, initial: FloatArray | None, base: Walk, vary_initial: bool
-) -> tuple[list[float], list[Walk]]:
+    hypothesis: Hypothesis,
+    scene: Scene,
+    coordinates: FloatArray,
+    initial: FloatArray | None,
+    base: DrivenRobot,
+    vary_initial: bool,
+) -> tuple[list[float], list[DrivenRobot]]:
     """Return steps and walks: first one for each coordinate, then one for each initial input if they vary."""
     steps, walks = [], []
     for j, parameter in enumerate(hypothesis.parameters):
@@ -355,7 +360,7 @@ def _variants(
         moved[j] += h
         robot = hypothesis.robot_at(moved)
         steps.append(h)
-        walks.append(Walk(robot, drive_of(robot, scene.recording, initial=initial)))
+        walks.append(DrivenRobot(robot, drive_of(robot, scene.recording, initial=initial)))
     names = base.robot.body.cable_names if vary_initial else ()
     start = np.zeros(len(names)) if initial is None else initial
     for i in range(len(names)):
@@ -363,11 +368,11 @@ def _variants(
         moved = start.copy()
         moved[i] += h
         steps.append(h)
-        walks.append(Walk(base.robot, drive_of(base.robot, scene.recording, initial=moved)))
+        walks.append(DrivenRobot(base.robot, drive_of(base.robot, scene.recording, initial=moved)))
     return steps, walks
 
 
-def _pulling(hypothesis: Hypothesis, base: Walk, steps: list[float], variants: list[Walk]) -> list[int]:
+def _pulling(hypothesis: Hypothesis, base: DrivenRobot, steps: list[float], variants: list[DrivenRobot]) -> list[int]:
     """Return which variants pull a little more at each cable in every frame; none where nothing moves tensions.
 
     They are added; where nothing depends on other frames, they are put in the place of those of the cables' zeros, whose derivative is
@@ -382,8 +387,8 @@ def _pulling(hypothesis: Hypothesis, base: Walk, steps: list[float], variants: l
     for i, name in enumerate(base.robot.body.cable_names):
         inputs = base.drive.inputs.copy()
         inputs[:, i] += TENSION_STEP
-        walk, at = Walk(base.robot, replace(base.drive, inputs=freeze(inputs))), zeros.get(name, len(variants))
-        steps[at : at + 1], variants[at : at + 1] = [TENSION_STEP], [walk]
+        driven, at = DrivenRobot(base.robot, replace(base.drive, inputs=freeze(inputs))), zeros.get(name, len(variants))
+        steps[at : at + 1], variants[at : at + 1] = [TENSION_STEP], [driven]
         chosen.append(at)
     return chosen
 
@@ -407,7 +412,7 @@ def _pose_derivative(
         moved = moved_poses(begun, further, pivot)
         model = still
         if model is None:
-            place = robot.tie_markers(seats(robot, scene, moved))
+            place = robot.tie_markers(placements(robot, scene, moved))
             model = {k: place.positions(s.positions) for k, s in states.items()}
         columns.append((marker_residual(robot, scene, moved, model) - residual) / h)
         rest_columns.append((rest_residual(robot, scene, moved) - rest) / h)

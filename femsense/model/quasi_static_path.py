@@ -21,7 +21,7 @@ from femsense.fem.clamp import rigid_give
 from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.linalg.refinement import Refined
 from femsense.fem.mesh import Embedding
-from femsense.model.drive import Walk, _key, has_history
+from femsense.model.drive import DrivenRobot, _key, has_history
 from femsense.model.robot import Robot
 from femsense.model.variants import AtPoints, _Balance, _require, _room, _Variants, solve_frame
 
@@ -33,11 +33,11 @@ PAST, PAST_TRIED = 1e-8, 1e-6
 """Tensions along a cable that agree so well [N], and as shares of the largest, are the same past; the latter for states that are only tried."""
 
 
-def walk_along(
-    walk: Walk,
+def solve_path(
+    driven: DrivenRobot,
     frames: Sequence[int],
     ties: Callable[[Robot], Embedding],
-    variants: Sequence[Walk] = (),
+    variants: Sequence[DrivenRobot] = (),
     *,
     starts: dict[int, Equilibrium] | None = None,
     rough: bool = False,
@@ -64,15 +64,15 @@ def walk_along(
         frame index, equilibrium, where the points are [m], shape (p, 3), and where those of the variants are, shape (v, p, 3).
     """
     wanted = sorted(set(int(f) for f in frames))
-    past = has_history(walk.robot)
-    todo = list(range(max(wanted) + 1)) if wanted and any(has_history(w.robot) for w in (walk, *variants)) else wanted
-    alike = _alike(walk, todo, past)
+    past = has_history(driven.robot)
+    todo = list(range(max(wanted) + 1)) if wanted and any(has_history(w.robot) for w in (driven, *variants)) else wanted
+    alike = _alike(driven, todo, past)
     unique = [k for k in todo if alike[k] == k]
-    bases = dict(zip(unique, _base_states(walk, unique, starts, past, rough)))
-    seen = {k: ties(walk.robot).positions(bases[k].positions) for k in {alike[k]: None for k in wanted}}
+    bases = dict(zip(unique, _base_states(driven, unique, starts, past, rough)))
+    seen = {k: ties(driven.robot).positions(bases[k].positions) for k in {alike[k]: None for k in wanted}}
     others = {k: np.zeros((len(variants), *seen[alike[k]].shape)) for k in wanted}
     lent = {k: s.factor for k, s in (starts or {}).items() if k in bases and s.positions is bases[k].positions}
-    observed = _Variants(walk, variants, {k: bases[alike[k]] for k in todo}, alike, others, ties, lent, answers)
+    observed = _Variants(driven, variants, {k: bases[alike[k]] for k in todo}, alike, others, ties, lent, answers)
     room = _room(len(unique))
     for k, factor in observed.write():
         plain = factor.plain if isinstance(factor, Refined) else factor
@@ -82,13 +82,13 @@ def walk_along(
         yield k, bases[alike[k]], seen[alike[k]], others[k]
 
 
-def _alike(walk: Walk, frames: list[int], past: bool) -> dict[int, int]:
+def _alike(driven: DrivenRobot, frames: list[int], past: bool) -> dict[int, int]:
     """Return for each frame the first one with the same state: the same inputs and loads, with a past the frames just before."""
     first: dict[bytes, int] = {}
     result: dict[int, int] = {}
     last = b""
     for k in frames:
-        key = _key(walk, k)
+        key = _key(driven, k)
         if past and key != last:
             first[key] = k
         result[k] = first.setdefault(key, k)
@@ -102,11 +102,11 @@ def _most_lent(state: Equilibrium, room: float) -> float:
 
 
 def _base_states(
-    walk: Walk, frames: list[int], starts: dict[int, Equilibrium] | None, past: bool, rough: bool
+    driven: DrivenRobot, frames: list[int], starts: dict[int, Equilibrium] | None, past: bool, rough: bool
 ) -> Iterator[Equilibrium]:
     """Yield the states of frames, without their factors; `starts` gets them with these where they fit into memory."""
     room = _room(len(frames))
-    near = {k: state for k, state in sorted((starts or {}).items()) if _clamp_fits(walk.robot.body, state)}
+    near = {k: state for k, state in sorted((starts or {}).items()) if _clamp_fits(driven.robot.body, state)}
 
     def keep(k: int, state: Equilibrium) -> Equilibrium:
         bare = replace(state, factor=None)
@@ -116,15 +116,15 @@ def _base_states(
 
     known, fits = near.keys() & set(frames), bool(near)
     if not near:
-        near = {k: start for k, state in sorted((starts or {}).items()) if (start := _taken_along(walk, k, state)) is not None}
+        near = {k: start for k, state in sorted((starts or {}).items()) if (start := _taken_along(driven, k, state)) is not None}
     if near:
-        near.update(_nearest(walk, near, [k for k in frames if k not in near]))
+        near.update(_nearest(driven, near, [k for k in frames if k not in near]))
 
     def again(k: int, before: tuple[FloatArray, ...] | None = None, start: Equilibrium | None = None) -> Equilibrium:
         start, tried = near[k] if start is None else start, rough and k in known
         return _require(
             solve_frame(
-                walk,
+                driven,
                 k,
                 start=start,
                 before=before,
@@ -138,7 +138,7 @@ def _base_states(
 
     if near:
         with contextlib.suppress(*(() if fits else (DataError,))):  # taken along, a body may not come to rest: then from rest
-            states = list(_march(walk, frames, near, again, rough) if past else each(again, frames))
+            states = list(_solve_with_history(driven, frames, near, again, rough) if past else each(again, frames))
             yield from (keep(k, state) for k, state in zip(frames, states))
             return
 
@@ -147,7 +147,7 @@ def _base_states(
         for k in part:
             last = states[-1] if states else None
             before = last.segment_tensions if past and last is not None else None
-            states.append(keep(k, _require(solve_frame(walk, k, start=last, before=before, single=True), k)))
+            states.append(keep(k, _require(solve_frame(driven, k, start=last, before=before, single=True), k)))
         return states
 
     for states in each(along, [frames] if past else _parts(frames)):
@@ -160,9 +160,9 @@ def _parts(frames: list[int]) -> list[list[int]]:
     return [frames[i : i + size] for i in range(0, len(frames), size)]
 
 
-def _nearest(walk: Walk, near: dict[int, Equilibrium], frames: list[int]) -> dict[int, Equilibrium]:
+def _nearest(driven: DrivenRobot, near: dict[int, Equilibrium], frames: list[int]) -> dict[int, Equilibrium]:
     """Return for other frames the states of those frames whose inputs and loads are most like theirs."""
-    drive = walk.drive
+    drive = driven.drive
     load = np.zeros((len(drive.inputs), 3))
     np.add.at(load, drive.load_frame, drive.load_forces)
     gravity = np.zeros((len(load), 0)) if drive.gravity is None else drive.gravity
@@ -172,8 +172,8 @@ def _nearest(walk: Walk, near: dict[int, Equilibrium], frames: list[int]) -> dic
     return {k: near[known[int(np.linalg.norm(table[known] - table[k], axis=1).argmin())]] for k in frames}
 
 
-def _march(
-    walk: Walk, frames: list[int], near: dict[int, Equilibrium], again: Callable[..., Equilibrium], rough: bool
+def _solve_with_history(
+    driven: DrivenRobot, frames: list[int], near: dict[int, Equilibrium], again: Callable[..., Equilibrium], rough: bool
 ) -> list[Equilibrium]:
     """Return the states of frames with a past, from states near by.
 
@@ -181,7 +181,7 @@ def _march(
     expect there. Then, part after part, frames are solved again until these are what the part before left.
     """
     parts = _parts(frames)
-    expected = _expected_tensions(walk, frames, near)
+    expected = _expected_tensions(driven, frames, near)
     assumed = [None, *(expected[part[-1]] for part in parts[:-1])]
     result: dict[int, Equilibrium] = {}
     slack = PAST_TRIED if rough else PAST
@@ -205,14 +205,14 @@ def _march(
     return [result[k] for k in frames]
 
 
-def _expected_tensions(walk: Walk, frames: list[int], near: dict[int, Equilibrium]) -> dict[int, tuple[FloatArray, ...]]:
+def _expected_tensions(driven: DrivenRobot, frames: list[int], near: dict[int, Equilibrium]) -> dict[int, tuple[FloatArray, ...]]:
     """Return the tensions along the cables in each frame if they bend as in states near by."""
     result: dict[int, tuple[FloatArray, ...]] = {}
-    held, cables = walk.drive.control == "displacement", walk.robot.body.cables
+    held, cables = driven.drive.control == "displacement", driven.robot.body.cables
     before = tuple(np.zeros(len(c.path)) for c in cables)
     for k in frames:
         state = near[k]
-        motors = [state.tension[c.name] if held else float(T) for c, T in zip(cables, walk.drive.inputs[k])]
+        motors = [state.tension[c.name] if held else float(T) for c, T in zip(cables, driven.drive.inputs[k])]
         before = tuple(rub(c, bend_angles(c, state.positions), b, max(T, 0.0)) for c, b, T in zip(cables, before, motors))
         result[k] = before
     return result
@@ -229,10 +229,10 @@ def _clamp_fits(body: BodyModel, state: Equilibrium) -> bool:
     return body.clamp_is_rigid != has_given(body, state)
 
 
-def _taken_along(walk: Walk, frame: int, state: Equilibrium) -> Equilibrium | None:
+def _taken_along(driven: DrivenRobot, frame: int, state: Equilibrium) -> Equilibrium | None:
     """Return a state with a rigid clamp as a start for a clamp that gives, the whole body taken along; None where that is no start."""
-    balance = _Balance(walk, frame, state)
-    moved = rigid_give(walk.robot.body, state.positions, balance.whole(walk, balance.along(walk), state.positions))
+    balance = _Balance(driven, frame, state)
+    moved = rigid_give(driven.robot.body, state.positions, balance.whole(driven, balance.along(driven), state.positions))
     return None if moved is None else replace(state, positions=moved)
 
 

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from femsense.core.arrays import BoolArray, FloatArray, IntArray, freeze
 from femsense.core.errors import InputError
 from femsense.core.pose import check_pose
-from femsense.core.text import near
+from femsense.core.text import did_you_mean
 
 if TYPE_CHECKING:
     from femsense.model.robot import Robot
@@ -382,7 +382,7 @@ def _drive_order(robot: Robot, recording: Recording, kind: str, wanted: tuple[st
             where=_place(recording, "frames.csv"),
             found=", ".join(f"{kind}_{name}" for name in given) or f"no {kind} columns",
             expected=", ".join(f"{kind}_{name}" for name in wanted) or f"no {kind} columns",
-            hint=near(extra[0], wanted) if extra else f"{idle} has a column of zeros",
+            hint=did_you_mean(extra[0], wanted) if extra else f"{idle} has a column of zeros",
         )
     return [given.index(name) for name in wanted]
 
@@ -397,7 +397,7 @@ def _without_strangers(robot: Robot, recording: Recording) -> Recording:
             where=_place(recording, "markers.csv"),
             found=", ".join(recording.marker_names),
             expected=", ".join(robot.marker_names) or "the robot declares no [[markers]]",
-            hint=near(strangers[0], robot.marker_names),
+            hint=did_you_mean(strangers[0], robot.marker_names),
         )
     result = _without_rest_strangers(known, recording)
     if not strangers:

@@ -22,7 +22,7 @@ from femsense.fem.equilibrium import Equilibrium, solve_equilibrium
 from femsense.fem.linalg.factorization import Factorization, available_memory, factorize
 from femsense.fem.linalg.refinement import refined
 from femsense.fem.mesh import Embedding
-from femsense.model.drive import Walk, _key, frame_loads, has_history
+from femsense.model.drive import DrivenRobot, _key, frame_loads, has_history
 from femsense.model.robot import Robot
 
 FACTOR_MEMORY = 2e9
@@ -52,7 +52,7 @@ class AtPoints:
 
 
 def solve_frame(
-    walk: Walk,
+    driven: DrivenRobot,
     frame: int,
     *,
     start: Equilibrium | None = None,
@@ -76,10 +76,10 @@ def solve_frame(
         rough: the state is only tried (see `solve_equilibrium`).
         single: factors in single precision, which the true residual makes up for.
     """
-    drive, body = walk.drive, walk.robot.body
+    drive, body = driven.drive, driven.robot.body
     if drive.gravity is not None:
         body = body.with_gravity(drive.gravity[frame])
-    loads = frame_loads(walk, frame)
+    loads = frame_loads(driven, frame)
     if nodal_forces is not None:
         loads = nodal_forces if loads is None else loads + nodal_forces
     values = {name: float(v) for name, v in zip(body.cable_names, drive.inputs[frame])}
@@ -216,8 +216,8 @@ class _Variants:
 
     def __init__(
         self,
-        walk: Walk,
-        variants: Sequence[Walk],
+        driven: DrivenRobot,
+        variants: Sequence[DrivenRobot],
         bases: dict[int, Equilibrium],
         alike: dict[int, int],
         others: dict[int, FloatArray],
@@ -225,12 +225,12 @@ class _Variants:
         lent: dict[int, Factorization | None],
         known: dict[int, AtPoints] | None,
     ) -> None:
-        self.walk, self.variants, self.bases, self.alike, self.others, self.lent = walk, variants, bases, alike, others, lent
+        self.driven, self.variants, self.bases, self.alike, self.others, self.lent = driven, variants, bases, alike, others, lent
         self.ties = [ties(v.robot) for v in variants]
-        self.own_ties = ties(walk.robot)
-        self.known = None if len(self.own_ties) > MANY_POINTS or has_history(walk.robot) else known
-        own = [not _same_mechanics(walk, v) for v in variants]
-        linear = [_linear(walk, v) for v in variants]
+        self.own_ties = ties(driven.robot)
+        self.known = None if len(self.own_ties) > MANY_POINTS or has_history(driven.robot) else known
+        own = [not _same_mechanics(driven, v) for v in variants]
+        linear = [_linear(driven, v) for v in variants]
         rubs = [has_history(v.robot) for v in variants]
         every = range(len(variants))
         self.still = [i for i in every if not own[i]]
@@ -297,7 +297,7 @@ class _Variants:
         columns, at_points = len(self.plain) + len(self.rubbing), 3 * len(self.own_ties)
         few = (at_points if self.known is not None else min(columns, at_points)) <= FEW_COLUMNS
         solver = partial(refined, lent=self.lent.get(k)) if few else factorize
-        return _Answers(partial(tangent_at, self.walk.robot.body, self.bases[k], solver), 2 if self.rubbing else 1)
+        return _Answers(partial(tangent_at, self.driven.robot.body, self.bases[k], solver), 2 if self.rubbing else 1)
 
     def _jobs(self, group: list[int], which: Sequence[int]) -> list[Job]:
         """Return what is to be computed of some variants in frames with one base state."""
@@ -347,7 +347,7 @@ class _Variants:
         upsets = self._upsets(frame, jobs, answers)
         alike = [self.ties[u.key[0]] is self.own_ties for u in upsets]
         pushes = sum(u.force is not None and bool(u.force.any()) for u, same in zip(upsets, alike) if same)
-        if (self.known is None and pushes <= 3 * len(self.own_ties)) or has_history(self.walk.robot):
+        if (self.known is None and pushes <= 3 * len(self.own_ties)) or has_history(self.driven.robot):
             alike = [False] * len(upsets)
         others = [u for u, same in zip(upsets, alike) if not same]
         moved = iter(self._respond(frame, others, answers) if others else ())
@@ -357,7 +357,7 @@ class _Variants:
     def _upsets(self, frame: int, jobs: list[Job], answers: _Answers) -> list[_Upset]:
         """Return what variants add to the balance of a base state."""
         base = self.bases[frame]
-        balances = {k: _Balance(self.walk, k, base) for k in {k for _, k, _ in jobs}}
+        balances = {k: _Balance(self.driven, k, base) for k in {k for _, k, _ in jobs}}
         upsets = list[_Upset]()
         for i, k, _ in jobs:
             balance, variant = balances[k], self.variants[i]
@@ -381,7 +381,7 @@ class _Variants:
 
         Tensions along cables are all that many of them change: their answers are sums of one for each segment.
         """
-        base, body = self.bases[frame], self.walk.robot.body
+        base, body = self.bases[frame], self.driven.robot.body
         moves = answers.moves(body, base.positions, upsets)
         if base.held.any():  # cables: pressures are never held here
             held = base.held[: len(body.cables)]
@@ -390,7 +390,7 @@ class _Variants:
 
     def _answered(self, frame: int, upsets: list[_Upset], answers: _Answers) -> list[FloatArray]:
         """Return the same of the points alone [m], each (p, 3), from the answers to forces at these."""
-        base, body, ties = self.bases[frame], self.walk.robot.body, self.own_ties
+        base, body, ties = self.bases[frame], self.driven.robot.body, self.own_ties
         x, tensions = base.positions, np.array([u.tension for u in upsets])
         at = self._at_points(frame, answers)
         by_point = at.to_forces
@@ -416,20 +416,20 @@ class _Variants:
         return made
 
 
-def _motor_tensions(variant: Walk, frame: int, base: Equilibrium) -> list[float]:
+def _motor_tensions(variant: DrivenRobot, frame: int, base: Equilibrium) -> list[float]:
     """Return the tension at the motor of each cable [N]: of held ones as in the base state."""
     names = variant.robot.body.cable_names
     held = variant.drive.control == "displacement"
     return [base.tension[name] if held else float(T) for name, T in zip(names, variant.drive.inputs[frame])]
 
 
-def _linear(walk: Walk, variant: Walk) -> bool:
+def _linear(driven: DrivenRobot, variant: DrivenRobot) -> bool:
     """Return whether the linear response gives a variant: the same elements, and a clamp that moves by little."""
-    base, other = walk.robot.body, variant.robot.body
+    base, other = driven.robot.body, variant.robot.body
     return base.stencil.slots is other.stencil.slots and (base.clamp_is_rigid or not other.clamp_is_rigid)
 
 
-def _rubbed(variant: Walk, frame: int, base: Equilibrium, x: FloatArray) -> Tensions:
+def _rubbed(variant: DrivenRobot, frame: int, base: Equilibrium, x: FloatArray) -> Tensions:
     """Return the tensions along the cables of a variant at positions x if those of the base state are what was before."""
     motors = _motor_tensions(variant, frame, base)
     return tuple(
@@ -441,9 +441,9 @@ def _rubbed(variant: Walk, frame: int, base: Equilibrium, x: FloatArray) -> Tens
 class _Balance:
     """The forces that balance in the base state of a frame, and by how much a variant upsets them."""
 
-    def __init__(self, walk: Walk, frame: int, base: Equilibrium) -> None:
-        self.walk, self.frame, self.base = walk, frame, base
-        self.body = self._body(walk)
+    def __init__(self, driven: DrivenRobot, frame: int, base: Equilibrium) -> None:
+        self.driven, self.frame, self.base = driven, frame, base
+        self.body = self._body(driven)
 
     @cached_property
     def dead(self) -> FloatArray:
@@ -460,15 +460,15 @@ class _Balance:
         """Inner forces of each element [N], (m, k, 3)."""
         return element_forces(self.body, self.base.positions)
 
-    def _body(self, walk: Walk) -> BodyModel:
-        body, gravity = walk.robot.body, walk.drive.gravity
+    def _body(self, driven: DrivenRobot) -> BodyModel:
+        body, gravity = driven.robot.body, driven.drive.gravity
         return body if gravity is None else body.with_gravity(gravity[self.frame])
 
-    def _loads(self, walk: Walk) -> FloatArray:
-        loads = frame_loads(walk, self.frame)
-        return np.zeros((len(walk.robot.body.mesh.nodes), 3)) if loads is None else loads
+    def _loads(self, driven: DrivenRobot) -> FloatArray:
+        loads = frame_loads(driven, self.frame)
+        return np.zeros((len(driven.robot.body.mesh.nodes), 3)) if loads is None else loads
 
-    def carried(self, variant: Walk) -> FloatArray:
+    def carried(self, variant: DrivenRobot) -> FloatArray:
         """Return where the variant's response starts [m], (n, 3): the base state, grown as its body is and with its clamp given way."""
         body, other, x = self.body, variant.robot.body, self.base.positions
         if other.mesh is not body.mesh:
@@ -487,7 +487,7 @@ class _Balance:
             force = force + self.base.pressure[chamber.name] * volume_gradient(chamber, x)
         return np.asarray(force - self.inner)
 
-    def along(self, variant: Walk) -> Tensions:
+    def along(self, variant: DrivenRobot) -> Tensions:
         """Return the tensions along a variant's cables where these do not rub."""
         motors = _motor_tensions(variant, self.frame, self.base)
         return tuple(np.full(len(c.path), T) for c, T in zip(variant.robot.body.cables, motors))
@@ -497,7 +497,7 @@ class _Balance:
         differences = [a - b for a, b in zip(along, self.base.segment_tensions)]
         return np.concatenate(differences) if differences else np.zeros(0)
 
-    def whole(self, variant: Walk, tensions: Tensions, x: FloatArray) -> FloatArray:
+    def whole(self, variant: DrivenRobot, tensions: Tensions, x: FloatArray) -> FloatArray:
         """Return all forces on a variant's body at x near the base state [N], (n, 3), for tensions along its cables."""
         body = self._body(variant)
         force = body.dead_load() + self._loads(variant) - internal(body, x, tangent=False).forces
@@ -507,7 +507,7 @@ class _Balance:
             force = force + pressure * volume_gradient(chamber, x)
         return np.asarray(force)
 
-    def change(self, variant: Walk) -> FloatArray:
+    def change(self, variant: DrivenRobot) -> FloatArray:
         """Return what a variant changes of the forces in the base state, where they sum to nothing, but for tensions along cables [N], (n, 3)."""
         body = self._body(variant)
         x, own, drive = self.base.positions, self.body, variant.drive
@@ -517,10 +517,10 @@ class _Balance:
             if not _same_weight(body, own):
                 force += body.weight() - own.weight()
             self._add_inner(body, force)
-        if drive.load_forces is not self.walk.drive.load_forces:
-            force += self._loads(variant) - self._loads(self.walk)
+        if drive.load_forces is not self.driven.drive.load_forces:
+            force += self._loads(variant) - self._loads(self.driven)
         for i, chamber in enumerate(body.chambers):
-            more = drive.pressures[self.frame, i] - self.walk.drive.pressures[self.frame, i]
+            more = drive.pressures[self.frame, i] - self.driven.drive.pressures[self.frame, i]
             if more != 0.0:
                 force += more * volume_gradient(chamber, x)
         return force
@@ -535,7 +535,7 @@ class _Balance:
             softer = 1.0 - body.material.young_modulus / own.material.young_modulus
             add_elements(own.stencil.tets, self.by_element, softer, force)
 
-    def pulled(self, variant: Walk, x: FloatArray | None) -> FloatArray:
+    def pulled(self, variant: DrivenRobot, x: FloatArray | None) -> FloatArray:
         """Return the shortening that a variant adds to held cables at x, by default in the base state [m], (a,)."""
         body, cables = self._body(variant), self.body.cables
         if variant.drive.control != "displacement":
@@ -544,7 +544,7 @@ class _Balance:
             self.base.tension[c.name] * (1.0 / b.stretch_stiffness - 1.0 / c.stretch_stiffness)
             for b, c in zip(cables, body.cables)
         ]
-        pulled = variant.drive.inputs[self.frame] - self.walk.drive.inputs[self.frame] + np.array(stretch)
+        pulled = variant.drive.inputs[self.frame] - self.driven.drive.inputs[self.frame] + np.array(stretch)
         if x is not None:
             pulled = pulled - shortening(body, x) + shortening(self.body, self.base.positions)
         return np.asarray(pulled)
@@ -567,10 +567,10 @@ def _same_weight(body: BodyModel, other: BodyModel) -> bool:
     )
 
 
-def _same_mechanics(walk: Walk, variant: Walk) -> bool:
-    a, b = walk.drive, variant.drive
+def _same_mechanics(driven: DrivenRobot, variant: DrivenRobot) -> bool:
+    a, b = driven.drive, variant.drive
     return (
-        variant.robot.body is walk.robot.body
+        variant.robot.body is driven.robot.body
         and np.array_equal(a.inputs, b.inputs)
         and np.array_equal(a.pressures, b.pressures)
         and np.array_equal(a.load_forces, b.load_forces)

@@ -17,7 +17,7 @@ from femsense.core.errors import InputError
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Grid:
+class VoxelGrid:
     """Points sorted by their cell."""
 
     points: FloatArray
@@ -68,17 +68,17 @@ def cell_keys(points: FloatArray, cell: float, origin: FloatArray) -> tuple[IntA
     return (steps[:, 0] * sizes[1] + steps[:, 1]) * sizes[2] + steps[:, 2], sizes
 
 
-def build_grid(points: FloatArray, cell: float) -> Grid:
+def build_grid(points: FloatArray, cell: float) -> VoxelGrid:
     """Return the points sorted into cells of the given edge [m]; points [m], shape (n, 3). Raises InputError."""
     if len(points) == 0:
-        return Grid(np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(3), np.zeros(3, np.int64), cell)
+        return VoxelGrid(np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(3), np.zeros(3, np.int64), cell)
     low = points.min(axis=0)
     keys, dims = cell_keys(points, cell, low)
     order = np.argsort(keys, kind="stable")
-    return Grid(points[order], order, keys[order], low - cell, dims, cell)
+    return VoxelGrid(points[order], order, keys[order], low - cell, dims, cell)
 
 
-def count_within(grid: Grid, queries: FloatArray, radius: float, *, enough: int = 2**62) -> IntArray:
+def count_within(grid: VoxelGrid, queries: FloatArray, radius: float, *, enough: int = 2**62) -> IntArray:
     """Return how many of the grid's points lie within radius [m] of each query (n, 3); counting may end at `enough`."""
     if len(grid.keys) == 0 or len(queries) == 0:
         return np.zeros(len(queries), dtype=np.int64)
@@ -87,7 +87,7 @@ def count_within(grid: Grid, queries: FloatArray, radius: float, *, enough: int 
     return counts
 
 
-def count_neighbors(grid: Grid, radius: float, *, enough: int = 2**62) -> IntArray:
+def count_neighbors(grid: VoxelGrid, radius: float, *, enough: int = 2**62) -> IntArray:
     """Return how many other points of the grid lie within radius [m] of each one, in the original order, shape (n,)."""
     counts = np.zeros(len(grid.keys), dtype=np.int64)
     if len(counts):
@@ -95,7 +95,7 @@ def count_neighbors(grid: Grid, radius: float, *, enough: int = 2**62) -> IntArr
     return counts
 
 
-def connected_labels(grid: Grid, radius: float, features: FloatArray, feature_distance: float) -> IntArray:
+def connected_labels(grid: VoxelGrid, radius: float, features: FloatArray, feature_distance: float) -> IntArray:
     """Return the root of each point's component, in the original order, shape (n,).
 
     Two points are joined where they are within radius [m] and their features (n, k) within feature_distance.
@@ -106,7 +106,7 @@ def connected_labels(grid: Grid, radius: float, features: FloatArray, feature_di
     return labels
 
 
-def adjacent_labels(grid: Grid, radius: float, labels: IntArray) -> IntArray:
+def adjacent_labels(grid: VoxelGrid, radius: float, labels: IntArray) -> IntArray:
     """Return the pairs (a < b) of labels that meet within radius [m], unique and ascending, shape (m, 2)."""
     if len(grid.keys) == 0:
         return np.zeros((0, 2), dtype=np.int64)

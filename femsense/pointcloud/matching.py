@@ -16,7 +16,7 @@ from numba import njit
 
 from femsense.core.arrays import BoolArray, FloatArray, IntArray, as_points, freeze
 from femsense.core.errors import InputError
-from femsense.pointcloud.grid import Grid, build_grid, key_of, positive, runs_around
+from femsense.pointcloud.grid import VoxelGrid, build_grid, key_of, positive, runs_around
 from femsense.pointcloud.segmentation import surface_pair
 
 _TERMS = (1, 3, 6)  # of a height field of order 0, 1, 2
@@ -137,11 +137,11 @@ def _visible(
     return np.asarray((cosine >= min_facing).any(axis=1))
 
 
-def _sorted(grid: Grid, facing: FloatArray) -> tuple[FloatArray, FloatArray, IntArray, FloatArray, IntArray, float]:
+def _sorted(grid: VoxelGrid, facing: FloatArray) -> tuple[FloatArray, FloatArray, IntArray, FloatArray, IntArray, float]:
     return grid.points, facing[grid.order] if len(facing) else np.zeros((0, 3)), grid.keys, grid.origin, grid.dims, grid.cell
 
 
-def _matches(raw: tuple[FloatArray, IntArray], grid: Grid, visible: BoolArray, average: bool, floor: float) -> Matches:
+def _matches(raw: tuple[FloatArray, IntArray], grid: VoxelGrid, visible: BoolArray, average: bool, floor: float) -> Matches:
     """Turn the kernel's columns into standard deviations and the frozen result."""
     numbers, whole = raw
     nearest, count, fitted, terms = whole.T

@@ -54,7 +54,7 @@ class Refit(Document):
     dbic: Number = None
     validation_rms_m: Number = None
     cv_gain: Number = None
-    cv_spread: Number = None
+    cv_std: Number = None
     verdict: str = ""
 
 
@@ -137,7 +137,7 @@ class Clouds(Document):
     points_m: dict[str, Triple] = Field(default_factory=dict)
 
 
-class Stray(Document):
+class Outlier(Document):
     frame: int
     marker: str = ""
 
@@ -149,13 +149,13 @@ class Card(Document):
     split: list[str] = Field(default_factory=list)
     frames_fitted: list[list[int]] = Field(default_factory=list)
     frames_held_out: list[list[int]] = Field(default_factory=list)
-    strays: list[Stray] = Field(default_factory=list)
+    outliers: list[Outlier] = Field(default_factory=list)
     noise_components_m: dict[str, Number] = Field(default_factory=dict)
     noise_source: str = ""
     mesh_error_m: Number = None
     effective_observations: Number = None
     nuisance_after: dict[str, dict[str, Parameter]] = Field(default_factory=dict)
-    seat_std_m: Number = None
+    placement_std_m: Number = None
     seed: int | None = None
 
 

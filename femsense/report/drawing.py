@@ -51,7 +51,7 @@ VIEWS = (View(X, Z, ("x", "z")), View(Y, Z, ("y", "z")), View(X, Y, ("x", "y")))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Surface:
+class DrawnSurface:
     """The skin of a body."""
 
     nodes: FloatArray
@@ -60,9 +60,9 @@ class Surface:
     """shape (t, 3)."""
 
 
-def skin(nodes: FloatArray, tets: IntArray) -> Surface:
+def skin(nodes: FloatArray, tets: IntArray) -> DrawnSurface:
     """Return the skin of a body; mid-edge nodes are left out."""
-    return Surface(np.asarray(nodes, dtype=np.float64), surface_triangles(TetMesh(nodes, tets[:, :4])))
+    return DrawnSurface(np.asarray(nodes, dtype=np.float64), surface_triangles(TetMesh(nodes, tets[:, :4])))
 
 
 def best_view(points: FloatArray, vectors: FloatArray) -> View:
@@ -155,7 +155,7 @@ def whole_numbers(axes: Any) -> None:
     axes.xaxis.set_major_locator(MaxNLocator(nbins=7, integer=True))
 
 
-def draw_body(axes: Any, surface: Surface, view: View) -> None:
+def draw_body(axes: Any, surface: DrawnSurface, view: View) -> None:
     """Draw the skin of a body [mm], shaded, as pixels."""
     from matplotlib.collections import PolyCollection
 

@@ -23,8 +23,8 @@ from femsense.report.drawing import (
     PALE,
     SIZE,
     SOFT,
+    DrawnSurface,
     Key,
-    Surface,
     View,
     add_legend,
     arrow_options,
@@ -176,30 +176,30 @@ def recovered(before_m: float | None, after_m: float | None, noise_m: float | No
 def _mean_residual(
     residuals: Residuals,
     robot: Robot | None,
-    surface: Surface | None,
+    surface: DrawnSurface | None,
     cameras: Sequence[FloatArray],
     points_m: Mapping[str, FloatArray],
 ) -> Html | None:
     """Draw the mean residual of each marker, or point of the surface, before and after on the robot of the loop."""
     if not residuals.marker or robot is None or surface is None:
         return None
-    seat = {name: point for name, point in zip(robot.marker_names, robot.marker_points)} | dict(points_m)
-    rows = np.array([i for i, name in enumerate(residuals.marker) if name in seat], dtype=np.int64)
+    placement = {name: point for name, point in zip(robot.marker_names, robot.marker_points)} | dict(points_m)
+    rows = np.array([i for i, name in enumerate(residuals.marker) if name in placement], dtype=np.int64)
     if not len(rows):
         return None
     names = [residuals.marker[i] for i in rows]
-    points = np.array([seat[name] for name in names])
+    points = np.array([placement[name] for name in names])
     before, after = np.asarray(residuals.before_m, float)[rows], np.asarray(residuals.after_m, float)[rows]
     mean = [_per_marker(names, values) for values in (before, after)]
-    seats = _per_marker(names, points)
-    view = best_view(np.vstack([surface.nodes, seats]), mean[0])
+    placements = _per_marker(names, points)
+    view = best_view(np.vstack([surface.nodes, placements]), mean[0])
     factor = _exaggeration(surface, [m for m in mean if len(m)])
     key = _key_length(mean[0], mean[1])
     reach = _reach(surface, view, points, factor, (before, after))
     figures = [
         as_image(
-            _quiver(surface, view, (seats, m), (points, values), factor, key, reach, color, title, cameras),
-            alt=f"Mean residual of {words.counted(len(seats), 'marker')} {title}: {_sizes(m)}.",
+            _quiver(surface, view, (placements, m), (points, values), factor, key, reach, color, title, cameras),
+            alt=f"Mean residual of {words.counted(len(placements), 'marker')} {title}: {_sizes(m)}.",
             caption=f"{title.capitalize()}: mean over the held-out frames {_sizes(m)}.",
         )
         for m, values, color, title in ((mean[0], before, BEFORE, "before"), (mean[1], after, AFTER, "after"))
@@ -225,7 +225,7 @@ def _per_marker(names: Sequence[str], values: FloatArray) -> FloatArray:
     return np.array([np.mean(values[labels == name], axis=0) for name in sorted(set(names))])
 
 
-def _exaggeration(surface: Surface, means: Sequence[FloatArray]) -> float:
+def _exaggeration(surface: DrawnSurface, means: Sequence[FloatArray]) -> float:
     largest = max(float(np.linalg.norm(m, axis=1).max(initial=0.0)) for m in means)
     size = float(np.linalg.norm(np.ptp(surface.nodes, axis=0)))
     return max(1.0, nice(ARROW_SHARE * size / largest)) if largest > 0 else 1.0
@@ -238,7 +238,7 @@ def _key_length(before: FloatArray, after: FloatArray) -> float:
 
 
 def _reach(
-    surface: Surface, view: View, points: FloatArray, factor: float, fields: Sequence[FloatArray]
+    surface: DrawnSurface, view: View, points: FloatArray, factor: float, fields: Sequence[FloatArray]
 ) -> tuple[FloatArray, FloatArray]:
     """Return the corners [mm] of what both pictures show: the body and all arrows (of single frames all but the farthest)."""
     tips = [points + factor * field for field in fields]
@@ -248,7 +248,7 @@ def _reach(
 
 
 def _quiver(
-    surface: Surface,
+    surface: DrawnSurface,
     view: View,
     mean: tuple[FloatArray, FloatArray],
     single: tuple[FloatArray, FloatArray],
@@ -265,9 +265,9 @@ def _quiver(
     step = max(1, len(single[0]) // SPOTS)
     tips = 1e3 * view.flat(single[0] + factor * single[1])[::step]
     axes.plot(*tips.T, ".", color=color, alpha=0.35, markersize=3, markeredgewidth=0, rasterized=len(tips) > MANY)
-    seats = 1e3 * view.flat(mean[0])
-    axes.plot(*seats.T, "o", color="white", markeredgecolor=INK, markeredgewidth=0.8, markersize=3.5)
-    axes.quiver(*seats.T, *(1e3 * factor * view.flat(mean[1])).T, color=color, **arrow_options())
+    placements = 1e3 * view.flat(mean[0])
+    axes.plot(*placements.T, "o", color="white", markeredgecolor=INK, markeredgewidth=0.8, markersize=3.5)
+    axes.quiver(*placements.T, *(1e3 * factor * view.flat(mean[1])).T, color=color, **arrow_options())
     explained = Key(1e3 * factor * key, f"{1e3 * key:g} mm residual", color)
     frame_body(axes, view, low, high, key=explained, cameras=cameras if title == "before" else ())
     axes.set_title(title, fontsize=SIZE + 1, color=color, loc="left", fontweight="bold")
@@ -412,7 +412,7 @@ def _why_alike(rivals: Rivals) -> str:
 # What is left
 
 
-def _left(loop: Loop, evidence: Evidence, surface: Surface | None) -> Html | None:
+def _left(loop: Loop, evidence: Evidence, surface: DrawnSurface | None) -> Html | None:
     left = loop.left
     rows = [
         [c.covariate, words.number(c.rank_correlation, 2), words.number(c.p_value, 2), words.number(c.p_holm, 2)]

@@ -20,8 +20,8 @@ from femsense.report.drawing import (
     SERIES,
     SIZE,
     SOFT,
+    DrawnSurface,
     Key,
-    Surface,
     add_legend,
     arrow_options,
     as_image,
@@ -48,7 +48,7 @@ DASH = (0, (4, 3))
 # On the robot
 
 
-def residual_in_frames(pictures: Pictures, rest: Surface | None) -> Html | None:
+def residual_in_frames(pictures: Pictures, rest: DrawnSurface | None) -> Html | None:
     """Return the residuals of three frames on the deformed body, before above after, all with one scale."""
     shown = [f for f in pictures.frames if f.measured_m]
     if not shown:
@@ -96,14 +96,14 @@ def _rms(values: FloatArray) -> float:
     return float(np.sqrt((values**2).sum(axis=1).mean()))
 
 
-def _shape(snapshot: Snapshot, pictures: Pictures, rest: Surface | None) -> Surface | None:
+def _shape(snapshot: Snapshot, pictures: Pictures, rest: DrawnSurface | None) -> DrawnSurface | None:
     if snapshot.nodes_m is None or pictures.triangles is None:
         return rest if snapshot.title == "rest" else None
     nodes, triangles = np.asarray(snapshot.nodes_m, float), np.asarray(pictures.triangles, np.int64)
-    return Surface(nodes, triangles) if len(triangles) and triangles.max() < len(nodes) else None
+    return DrawnSurface(nodes, triangles) if len(triangles) and triangles.max() < len(nodes) else None
 
 
-def force_field(field: ForceField, surface: Surface | None) -> Html | None:
+def force_field(field: ForceField, surface: DrawnSurface | None) -> Html | None:
     """Return the field of equivalent forces as a picture."""
     if not field.points_m or surface is None:
         return None

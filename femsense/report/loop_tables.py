@@ -22,10 +22,10 @@ from femsense.report.documents import (
     LoadRow,
     Loop,
     LoopInputs,
+    Outlier,
     Ranked,
     Score,
     Size,
-    Stray,
     Structure,
     Tested,
     Tests,
@@ -135,7 +135,7 @@ def _left_out(c: Candidate) -> str:
     known = [r for r in c.refits if words.known(r.cv_gain)]
     if not known:
         return words.NOTHING
-    return words.with_std(known[-1].cv_gain, known[-1].cv_spread)
+    return words.with_std(known[-1].cv_gain, known[-1].cv_std)
 
 
 def _verdict(c: Candidate) -> str:
@@ -459,9 +459,9 @@ def _span(ratio: Sequence[float | None]) -> str:
 # The data
 
 
-def _stray_list(strays: Sequence[Stray]) -> str:
-    said = ", ".join(f"{s.marker} in frame {s.frame}" for s in strays[:LISTED])
-    return f"{said} … ({len(strays)})" if len(strays) > LISTED else said
+def _outlier_list(outliers: Sequence[Outlier]) -> str:
+    said = ", ".join(f"{s.marker} in frame {s.frame}" for s in outliers[:LISTED])
+    return f"{said} … ({len(outliers)})" if len(outliers) > LISTED else said
 
 
 def data_card(loop: Loop) -> Html | None:
@@ -481,7 +481,7 @@ def data_card(loop: Loop) -> Html | None:
         rows.append(
             [f"Frames left out{f', {i + 1}' if len(evidence.excluded) > 1 else ''}", together(*lines) if lines else "none"]
         )
-    rows += [["Stray markers left out", _stray_list(card.strays)]] if card.strays else []
+    rows += [["Stray markers left out", _outlier_list(card.outliers)]] if card.outliers else []
     rows += [["Repeats (a state reached again the same way)", str(evidence.repeats)]] if evidence.repeats is not None else []
     rows += _noise_rows(card)
     for name, parameters in card.nuisance_after.items():
@@ -512,7 +512,7 @@ def _noise_rows(card: Card) -> list[list[object]]:
         return [
             [str(a).replace("each axis", "along the normal").replace("at the markers", "along the normals"), b] for a, b in rows
         ]
-    rows += [["Uncertainty of marker seats", words.length(card.seat_std_m, 2)]] if words.known(card.seat_std_m) else []
+    rows += [["Uncertainty of marker seats", words.length(card.placement_std_m, 2)]] if words.known(card.placement_std_m) else []
     return rows
 
 

@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 
 from femsense.core.arrays import BoolArray, FloatArray, IntArray, freeze
 from femsense.core.errors import InputError
-from femsense.core.text import key_path, near
+from femsense.core.text import did_you_mean, key_path
 from femsense.io.robot_toml import Matrix, Share, Vector
 from femsense.io.tables import Schema, read_toml, validated
 from femsense.model.robot import Robot
@@ -248,7 +248,9 @@ def check_script(document: dict[str, Any], where: Path = Path("script")) -> Scri
     named += [("loads", i, table.sweep) for i, table in enumerate(script.loads)]
     for kind, i, label in named:
         if label not in labels:
-            raise _problem("no such sweep", where, (kind, i, "sweep"), repr(label), ", ".join(labels), near(label, labels))
+            raise _problem(
+                "no such sweep", where, (kind, i, "sweep"), repr(label), ", ".join(labels), did_you_mean(label, labels)
+            )
     for i, sweep in enumerate(script.sweeps):
         _check_sweep(sweep, i, where)
     return script
@@ -339,7 +341,7 @@ def _check_names(script: ScriptTable, robot: Robot, where: Path) -> None:
         known = robot.body.cable_names if kind == "cable" else robot.body.chamber_names
         if name not in known:
             expected = ", ".join(known) or f"a robot with {kind}s"
-            raise _problem(f"unknown {kind}", where, place, repr(name), expected, near(name, known))
+            raise _problem(f"unknown {kind}", where, place, repr(name), expected, did_you_mean(name, known))
     for i, name in enumerate(script.markers.names or ()):
         if name not in robot.marker_names:
             raise _problem(
@@ -348,7 +350,7 @@ def _check_names(script: ScriptTable, robot: Robot, where: Path) -> None:
                 ("markers", "names", i),
                 repr(name),
                 ", ".join(robot.marker_names),
-                near(name, robot.marker_names),
+                did_you_mean(name, robot.marker_names),
             )
 
 

@@ -32,7 +32,7 @@ from femsense.rig.camera import (
 )
 from femsense.rig.scene import frame_shapes
 from femsense.rig.script import Plan, ScriptTable, check_script, plan_script, read_script
-from femsense.rig.truth import TrueFrame, true_robot, walk_truth
+from femsense.rig.truth import TrueFrame, true_path, true_robot
 
 TRUTH_FORMAT = "femsense-truth-1"
 CONTACT_COLUMNS = ("frame", "time_s", "contact", "x_m", "y_m", "z_m", "nx", "ny", "nz", "fx_n", "fy_n", "fz_n", "force_n")
@@ -86,7 +86,7 @@ def run_experiment(robot: Robot, script: ScriptTable, where: Path = Path("script
     plan = plan_script(script, robot, where)
     camera, T_robot_camera = camera_of(script.camera), pose_of(script.camera)
     real = _with_placement(true_robot(robot, script.truth, script.effects), script)
-    frames = tuple(walk_truth(real, plan, substeps=script.truth.substeps))
+    frames = tuple(true_path(real, plan, substeps=script.truth.substeps))
     chosen = _chosen_markers(real, script)
     positions = np.array([real.markers.positions(frame.state.positions) for frame in frames])
     visible = np.zeros(positions.shape[:2], dtype=bool)

@@ -34,7 +34,7 @@ TINY = 1e-12
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Patch:
+class LoadPatch:
     """A part of the surface that a probe presses on."""
 
     triangles: IntArray
@@ -137,7 +137,7 @@ def true_mesh(mesh: TetMesh, table: TruthTable) -> TetMesh:
     return to_quadratic(fine) if table.element == "tet10" else fine
 
 
-def contact_patch(mesh: TetMesh, point: Sequence[float], radius: float) -> Patch:
+def contact_patch(mesh: TetMesh, point: Sequence[float], radius: float) -> LoadPatch:
     """Return the surface triangles around a place at rest; the pressure falls to nothing at the radius.
 
     Arguments:
@@ -154,7 +154,7 @@ def contact_patch(mesh: TetMesh, point: Sequence[float], radius: float) -> Patch
     normals = triangle_normals(mesh.nodes, triangles[near])
     near = near[normals @ normals[distance[near].argmin()] > 0]  # not the far side of a thin part
     share = area[near] * np.maximum(1.0 - (distance[near] / radius) ** 2, 1e-3)
-    return Patch(triangles[near], share / share.sum())
+    return LoadPatch(triangles[near], share / share.sum())
 
 
 # The inputs
@@ -192,7 +192,7 @@ def creep_matrix(time_s: FloatArray, terms: Sequence[tuple[float, float]]) -> Fl
 # The walk
 
 
-def walk_truth(robot: Robot, plan: Plan, *, substeps: int = 3) -> list[TrueFrame]:
+def true_path(robot: Robot, plan: Plan, *, substeps: int = 3) -> list[TrueFrame]:
     """Return the truth of every frame.
 
     Arguments:
@@ -204,7 +204,7 @@ def walk_truth(robot: Robot, plan: Plan, *, substeps: int = 3) -> list[TrueFrame
         DataError: where there is no equilibrium.
     """
     inputs = true_inputs(robot, plan)
-    walker = _Walker(robot, plan)
+    walker = _TruePath(robot, plan)
     frames, last = [], walker.nothing()
     loads = walker.frame_loads(inputs)
     for k, load in enumerate(loads):
@@ -215,7 +215,7 @@ def walk_truth(robot: Robot, plan: Plan, *, substeps: int = 3) -> list[TrueFrame
     return frames
 
 
-class _Walker:
+class _TruePath:
     """The state of the truth, moved on step by step; bodies without friction carry given tensions along their cables."""
 
     def __init__(self, robot: Robot, plan: Plan) -> None:

@@ -13,12 +13,12 @@ from femsense.fem.assembly import internal
 from femsense.fem.compliance import Tangent, tangent_at
 from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.mesh import vertex_normals
-from femsense.model.contact_patch import Patch, patch_at
+from femsense.model.contact_patch import ContactPatch, patch_at
 from femsense.model.variants import solve_frame
 from femsense.qp.forces import ForceEstimate, estimate_forces
 from femsense.qp.problem import FrictionCone
 from femsense.sensing.measurement import _measure, _voxel
-from femsense.sensing.types import Rows, Seen, Sensor
+from femsense.sensing.types import Rows, SeenPoints, Sensor
 
 ROUGH = 1e-6
 """Unbalanced force, relative to all loads, of the states on the way to the forces; the last one is exact."""
@@ -34,8 +34,8 @@ PLACE_STD = 0.5
 def _fit_forces(
     sensor: Sensor,
     k: int,
-    clouds: Seen | None,
-    patches: Sequence[Patch],
+    clouds: SeenPoints | None,
+    patches: Sequence[ContactPatch],
     source: str,
     free_state: Equilibrium,
     start: tuple[Equilibrium, FloatArray] | None,
@@ -106,7 +106,7 @@ def _predicted(state: Equilibrium, tangent: Tangent, move: FloatArray) -> Equili
 
 
 def _place_covariance(
-    sensor: Sensor, patches: Sequence[Patch], state: Equilibrium, tangent: Tangent, rows: Rows, forces: FloatArray
+    sensor: Sensor, patches: Sequence[ContactPatch], state: Equilibrium, tangent: Tangent, rows: Rows, forces: FloatArray
 ) -> FloatArray:
     """Return what not knowing the place of contact exactly adds to the covariance of the forces [N²], shape (3k, 3k).
 
@@ -152,7 +152,7 @@ def _robust(rows: Rows, outlying: float) -> Rows:
     return replace(rows, std=rows.sharp * np.sqrt(np.maximum(np.abs(rows.residual / rows.sharp) / outlying, 1.0)))
 
 
-def _directions(sensor: Sensor, patches: Sequence[Patch], state: Equilibrium, source: str) -> FloatArray:
+def _directions(sensor: Sensor, patches: Sequence[ContactPatch], state: Equilibrium, source: str) -> FloatArray:
     """Return what the unknowns are: all three components, or the inward normal of each patch, shape (3k, unknowns)."""
     if not _along_normals(sensor, source):
         return np.eye(3 * len(patches))
@@ -166,7 +166,7 @@ def _along_normals(sensor: Sensor, source: str) -> bool:
     return source == "cloud" and sensor.options.friction == 0
 
 
-def _normal(sensor: Sensor, patch: Patch, state: Equilibrium) -> FloatArray:
+def _normal(sensor: Sensor, patch: ContactPatch, state: Equilibrium) -> FloatArray:
     mean = patch.mean(vertex_normals(state.positions, sensor.surface.triangles))
     return mean / max(float(np.linalg.norm(mean)), 1e-12)
 
@@ -197,7 +197,7 @@ def _solve_qp(
     directions: FloatArray,
     forces: FloatArray,
     state: Equilibrium,
-    patches: Sequence[Patch],
+    patches: Sequence[ContactPatch],
     source: str,
     size: float,
 ) -> tuple[ForceEstimate, float]:
@@ -255,7 +255,7 @@ def _solve(
     tolerance: float = 1e-9,
 ) -> Equilibrium:
     state = solve_frame(
-        sensor.walk,
+        sensor.driven,
         k,
         start=start,
         before=before,

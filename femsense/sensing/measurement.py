@@ -11,7 +11,7 @@ from femsense.core.errors import DataError
 from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.mesh import vertex_normals
 from femsense.io.clouds.frame_clouds import read_frame_cloud
-from femsense.model.contact_patch import Surface, flat_nodes
+from femsense.model.contact_patch import BodySurface, flat_nodes
 from femsense.model.observation import in_robot_frame
 from femsense.model.recording import Recording
 from femsense.model.robot import Robot, spread_features
@@ -20,10 +20,10 @@ from femsense.pointcloud.filters import pass_through, remove_radius_outliers, vo
 from femsense.pointcloud.matching import Matches, match_along_normals
 from femsense.pointcloud.normals import estimate_normals
 from femsense.pointcloud.segmentation import segment_by_model, segment_robot
-from femsense.sensing.types import Rows, Seen, SensingOptions, Sensor
+from femsense.sensing.types import Rows, SeenPoints, SensingOptions, Sensor
 
 
-def _probes(robot: Robot, surface: Surface, options: SensingOptions) -> npt.NDArray[np.int64]:
+def _probes(robot: Robot, surface: BodySurface, options: SensingOptions) -> npt.NDArray[np.int64]:
     """Return the surface nodes that are matched with clouds: as many as the robot's features at least, off sharp edges where it has enough others."""
     count = max(len(robot.features), options.match_points)
     flat = spread_features(robot.body, count, among=flat_nodes(surface, robot.body.mesh.nodes))
@@ -41,7 +41,7 @@ def _voxel(sensor: Sensor) -> float:
     return sensor.options.voxel_m or 0.01 * sensor.size
 
 
-def _robot_and_surroundings(sensor: Sensor, k: int, state: Equilibrium) -> Seen | None:
+def _robot_and_surroundings(sensor: Sensor, k: int, state: Equilibrium) -> SeenPoints | None:
     """Return robot points and surrounding points of all cameras [m], robot frame; None where the frame has no cloud."""
     parts: list[PointCloud] = []
     for view in range(len(sensor.recording.camera_names)):
@@ -70,7 +70,7 @@ def _robot_and_surroundings(sensor: Sensor, k: int, state: Equilibrium) -> Seen 
     normals = None
     if len(sensor.calibration.poses) == 1:
         normals = estimate_normals(robot.points, 2.5 * voxel, camera_position=sensor.calibration.poses[0][:3, 3])[0]
-    return Seen(robot.points, normals, others.points)
+    return SeenPoints(robot.points, normals, others.points)
 
 
 def _segment(sensor: Sensor, cloud: PointCloud, state: Equilibrium) -> tuple[PointCloud, PointCloud]:
@@ -88,13 +88,13 @@ def _segment(sensor: Sensor, cloud: PointCloud, state: Equilibrium) -> tuple[Poi
 # --- measurements --------------------------------------------------------------------------------------------------------
 
 
-def _measure(sensor: Sensor, k: int, clouds: Seen | None, state: Equilibrium, reach: float = np.inf) -> Rows:
+def _measure(sensor: Sensor, k: int, clouds: SeenPoints | None, state: Equilibrium, reach: float = np.inf) -> Rows:
     if clouds is not None:
         return _cloud_rows(sensor, clouds, state, reach)
     return _marker_rows(sensor, k, state)
 
 
-def _cloud_rows(sensor: Sensor, seen_now: Seen, state: Equilibrium, reach: float) -> Rows:
+def _cloud_rows(sensor: Sensor, seen_now: SeenPoints, state: Equilibrium, reach: float) -> Rows:
     """Feature points matched along their normals (Algorithm 3), no farther than `reach` [m]."""
     options, features = sensor.options, sensor.probes
     normals = vertex_normals(state.positions, sensor.surface.triangles)[features]
@@ -156,7 +156,7 @@ def _marker_rows(sensor: Sensor, k: int, state: Equilibrium) -> Rows:
     way = np.linalg.norm(place.positions(state.positions) - robot.marker_points[marker], axis=1)
     noise = sensor.options.marker_std_m or _marker_std(sensor.calibration)
     std = np.repeat(np.hypot(noise, sensor.options.model_std * way), 3)
-    seated = np.array([robot.marker_names[m] in sensor.calibration.seats_m for m in marker])
+    seated = np.array([robot.marker_names[m] in sensor.calibration.placements_m for m in marker])
     # a seat that rest.csv measured moves with the pose: only the marker's motion since then is left to turn
     by_pose = _pose_columns(sensor, measured) - seated[:, None, None] * _pose_columns(sensor, robot.marker_points[marker])
     by_pose = by_pose.reshape(residual.size, -1)

@@ -21,9 +21,9 @@ from femsense.core.arrays import FloatArray, as_points
 from femsense.core.errors import DataError, FemsenseError, InputError
 from femsense.core.parallel import one_blas_thread
 from femsense.fem.equilibrium import Equilibrium
-from femsense.io.checkpoint import Keeper
-from femsense.model.contact_patch import Patch, make_surface
-from femsense.model.drive import Walk, drive_of, has_history
+from femsense.io.checkpoint import Checkpoint
+from femsense.model.contact_patch import ContactPatch, body_surface
+from femsense.model.drive import DrivenRobot, drive_of, has_history
 from femsense.model.recording import Recording, check_against
 from femsense.model.robot import Robot
 from femsense.qp.forces import ForceEstimate
@@ -32,7 +32,7 @@ from femsense.sensing.measurement import _has_clouds, _measure, _probes, _robot_
 from femsense.sensing.places import _check_places, _find_contacts, _near_places, _same_places, _wandered
 from femsense.sensing.types import ContactForce, Done, FrameReport, Run, SensedFrame, SensingOptions, Sensor, States
 
-KEEP_S = 10.0
+CHECKPOINT_S = 10.0
 """Seconds of work that a killed estimate may lose."""
 
 
@@ -67,8 +67,8 @@ def estimate(
     """
     sensor = make_sensor(robot, recording, calibration, at=at, options=options)
     count = len(recording.time_s)
-    with Keeper(keep) as keeper:
-        done = keeper.kept(Done) or Done()
+    with Checkpoint(keep) as checkpoint:
+        done = checkpoint.kept(Done) or Done()
         for k in range(len(done.reports), count):
             try:
                 done.last = sense_frame(sensor, k, done.last)
@@ -79,7 +79,7 @@ def estimate(
             done.states.append(robot.body.mesh.nodes if done.last is None else done.last.state.positions)
             if progress is not None:
                 progress(k + 1, count)
-            keeper.keep(done, every=KEEP_S)
+            checkpoint.keep(done, every=CHECKPOINT_S)
     if done.last is None:
         raise DataError(f"not one of {count} frames gave a result; the first: {done.reports[0].status}")
     mesh = robot.body.mesh
@@ -105,7 +105,7 @@ def make_sensor(
     recording = check_against(robot, recording)
     places = as_points(at if at is not None else np.zeros((0, 3)), "at")
     size = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
-    surface = make_surface(robot.body.mesh)
+    surface = body_surface(robot.body.mesh)
     _check_places(places, surface, robot, size)
     if not _has_clouds(recording) and not len(places):
         raise InputError(
@@ -114,11 +114,11 @@ def make_sensor(
             expected="clouds/, depth/, or --at X,Y,Z",
             hint="name the place at rest in metres, robot frame: --at 0.1,0,0.015",
         )
-    if calibration.seats_m:
+    if calibration.placements_m:
         points = robot.marker_points.copy()
-        for name, seat in calibration.seats_m.items():
+        for name, placement in calibration.placements_m.items():
             if name in robot.marker_names:
-                points[robot.marker_names.index(name)] = seat
+                points[robot.marker_names.index(name)] = placement
         robot = robot.with_marker_points(points)
     initial = None
     if recording.actuation_zero == "unknown":
@@ -137,7 +137,7 @@ def make_sensor(
         robot,
         recording,
         calibration,
-        Walk(robot, drive),
+        DrivenRobot(robot, drive),
         surface,
         options or SensingOptions(),
         places,
@@ -195,7 +195,7 @@ def sense_frame(sensor: Sensor, k: int, previous: SensedFrame | None) -> SensedF
 
 
 def _contacts(
-    sensor: Sensor, k: int, patches: Sequence[Patch], estimate: ForceEstimate | None, state: Equilibrium, source: str
+    sensor: Sensor, k: int, patches: Sequence[ContactPatch], estimate: ForceEstimate | None, state: Equilibrium, source: str
 ) -> tuple[ContactForce, ...]:
     if estimate is None:
         return ()

@@ -10,19 +10,19 @@ import numpy.typing as npt
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.fem.equilibrium import Equilibrium
-from femsense.model.contact_patch import Patch, Surface, patch_at
+from femsense.model.contact_patch import BodySurface, ContactPatch, patch_at
 from femsense.model.robot import Robot
 from femsense.pointcloud.contact import detect_contacts
 from femsense.sensing.measurement import _voxel
-from femsense.sensing.types import Seen, SensedFrame, Sensor
+from femsense.sensing.types import SeenPoints, SensedFrame, Sensor
 
 
-def _wandered(patches: Sequence[Patch], again: Sequence[Patch], state: Equilibrium) -> float:
+def _wandered(patches: Sequence[ContactPatch], again: Sequence[ContactPatch], state: Equilibrium) -> float:
     """Return how far the farthest patch has moved [m]."""
     return max(float(np.linalg.norm(a.mean(state.positions) - b.mean(state.positions))) for a, b in zip(patches, again))
 
 
-def _same_places(previous: SensedFrame, patches: Sequence[Patch], state: Equilibrium) -> bool:
+def _same_places(previous: SensedFrame, patches: Sequence[ContactPatch], state: Equilibrium) -> bool:
     """Return whether the contacts are those of the frame before, so that its forces are a start."""
     if len(previous.contacts) != len(patches):
         return False
@@ -33,7 +33,7 @@ def _same_places(previous: SensedFrame, patches: Sequence[Patch], state: Equilib
 # --- places ------------------------------------------------------------------------------------------------------------
 
 
-def _find_contacts(sensor: Sensor, k: int, clouds: Seen | None, state: Equilibrium) -> tuple[list[Patch], str]:
+def _find_contacts(sensor: Sensor, k: int, clouds: SeenPoints | None, state: Equilibrium) -> tuple[list[ContactPatch], str]:
     """Return where forces may act: the given places, else where surroundings touch the robot (Algorithm 2)."""
     mesh, clamped, radius = sensor.robot.body.mesh, sensor.robot.body.clamped, 1.5 * sensor.surface.edge
     if len(sensor.places):
@@ -60,7 +60,7 @@ def _find_contacts(sensor: Sensor, k: int, clouds: Seen | None, state: Equilibri
     return patches, "cloud"
 
 
-def _seen_normal(clouds: Seen, place: FloatArray, radius: float) -> FloatArray | None:
+def _seen_normal(clouds: SeenPoints, place: FloatArray, radius: float) -> FloatArray | None:
     """Return the mean outward normal of the robot as it is seen around a place, shape (3,); None where it is not known."""
     if clouds.normals is None:
         return None
@@ -80,7 +80,7 @@ def _clamp_mask(sensor: Sensor, places: FloatArray, reach: float) -> npt.NDArray
     return np.asarray(cKDTree(clamped).query(places)[0] < reach)
 
 
-def _check_places(places: FloatArray, surface: Surface, robot: Robot, size: float) -> None:
+def _check_places(places: FloatArray, surface: BodySurface, robot: Robot, size: float) -> None:
     from femsense.model.contact_patch import closest_surface_point
 
     nodes = robot.body.mesh.nodes

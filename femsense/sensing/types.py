@@ -12,8 +12,8 @@ import numpy.typing as npt
 from femsense.calib.calibration import Calibration
 from femsense.core.arrays import FloatArray
 from femsense.fem.equilibrium import Equilibrium
-from femsense.model.contact_patch import Surface
-from femsense.model.drive import Walk
+from femsense.model.contact_patch import BodySurface
+from femsense.model.drive import DrivenRobot
 from femsense.model.recording import Recording
 from femsense.model.robot import Robot
 
@@ -148,7 +148,7 @@ class Done:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Seen:
+class SeenPoints:
     """What the cameras see in one frame, robot frame."""
 
     robot: FloatArray
@@ -188,8 +188,8 @@ class Sensor:
     robot: Robot
     recording: Recording
     calibration: Calibration
-    walk: Walk
-    surface: Surface
+    driven: DrivenRobot
+    surface: BodySurface
     options: SensingOptions
     places: FloatArray
     """Given places of contact at rest [m], shape (g, 3)."""

@@ -39,11 +39,11 @@ def recording(tmp_path: Path, robot: Path) -> Path:
     """Three frames of that robot at rest under its weight, seen from its own frame; in the last one its tip is held up."""
     from femsense.fem.equilibrium import solve_equilibrium
     from femsense.io.robot_toml import load_robot
-    from femsense.model.contact_patch import make_surface, patch_at
+    from femsense.model.contact_patch import body_surface, patch_at
 
     body = load_robot(robot)
     mesh = body.body.mesh
-    surface = make_surface(mesh)
+    surface = body_surface(mesh)
     end = patch_at(surface, mesh.nodes, np.array([0.1, 0.015, 0.015]), 1.5 * surface.edge, body.body.clamped)
     tip = end.spread(np.array([0.0, 0.0, 0.3]), len(mesh.nodes))
     rows = ["frame,marker,x_m,y_m,z_m"]

@@ -17,7 +17,7 @@ from femsense.core.pose import invert_pose, make_pose, move_pose, transform_poin
 from femsense.fem.equilibrium import solve_equilibrium
 from femsense.fem.mesh import embed_points
 from femsense.io.robot_toml import load_robot
-from femsense.model.drive import Walk, drive_of
+from femsense.model.drive import DrivenRobot, drive_of
 from femsense.model.effects import apply_effects, find_effect
 from femsense.model.observation import Hypothesis, evaluate_scene, make_scene
 from femsense.model.recording import Recording, RestMarkers, check_against, make_recording
@@ -71,9 +71,9 @@ def seen_by_camera(
             **parts,
         }
     )
-    walk, rng = Walk(robot, drive_of(robot, rec, initial=initial)), np.random.default_rng(seed)
+    driven, rng = DrivenRobot(robot, drive_of(robot, rec, initial=initial)), np.random.default_rng(seed)
     rows = [(k, i) for k in range(len(inputs)) for i in range(len(robot.marker_points)) if (k, i) not in (hidden or [])]
-    places = np.array([robot.markers.positions(solve_frame(walk, k).positions) for k in range(len(inputs))])
+    places = np.array([robot.markers.positions(solve_frame(driven, k).positions) for k in range(len(inputs))])
     xyz = transform_points(invert_pose(T), np.array([places[k, i] for k, i in rows])) + rng.normal(0, noise, (len(rows), 3))
     return replace(
         rec,
@@ -318,7 +318,7 @@ def test_rest_says_where_markers_really_sit() -> None:
     declared = bar_robot()
     found, blind = calibrate(declared, rec), calibrate(declared, replace(rec, rest=None))
     assert found.rms_m < 1.5e-4 < blind.rms_m
-    np.testing.assert_allclose(found.seats_m["b"], true[1], atol=6e-4)
+    np.testing.assert_allclose(found.placements_m["b"], true[1], atol=6e-4)
     assert np.abs(errors_of(found)[6:]).max() < np.abs(errors_of(blind)[6:]).max()
 
 

@@ -8,7 +8,7 @@ from scipy.optimize import minimize
 
 import femsense.core.local_model as near_module
 from femsense.core.least_squares import gauss_newton
-from femsense.core.local_model import Curvature, Kinks, Near
+from femsense.core.local_model import Curvature, LocalModel, Nonsmoothness
 
 
 def circle(theta: np.ndarray, derivative: bool) -> tuple[np.ndarray, np.ndarray | None]:
@@ -57,20 +57,20 @@ def test_it_is_exact_along_the_last_step_and_symmetric() -> None:
 
 def test_it_is_believed_until_straight_lines_foretell_a_step_better(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[bool] = []
-    make = Near.__init__
+    make = LocalModel.__init__
 
-    def watched(self: Near, *args: object, believed: bool = True) -> None:
+    def watched(self: LocalModel, *args: object, believed: bool = True) -> None:
         asked.append(believed)
         make(self, *args, believed=believed)
 
-    monkeypatch.setattr(Near, "__init__", watched)
+    monkeypatch.setattr(LocalModel, "__init__", watched)
     monkeypatch.setattr(Curvature, "learn", lambda self, *_: setattr(self, "S", np.array([[1.0]])))
     gauss_newton(lambda x, d: (2.0 * (x - 1.0), np.array([[2.0]]) if d else None), np.zeros(1), serves=1.0)
     assert asked[:2] == [True, False]  # the line is straight
     x = np.array([0.4, -0.3])
-    near = Near(*circle(x, True), None, np.full(2, -9.0), np.full(2, 9.0), np.diag([-50.0, 0.0]))
+    near = LocalModel(*circle(x, True), None, np.full(2, -9.0), np.full(2, 9.0), np.diag([-50.0, 0.0]))
     curvature, step = Curvature(), np.array([0.2, 0.1])
-    for gain, believed in ((near.promise(step, curved=True), True), (near.promise(step, curved=False), False)):
+    for gain, believed in ((near.predicted_gain(step, curved=True), True), (near.predicted_gain(step, curved=False), False)):
         curvature.judge(near, step, gain)
         assert curvature.believed == believed
 
@@ -102,9 +102,9 @@ def test_a_kink_that_was_crossed_is_no_curvature() -> None:
     rng = np.random.default_rng(4)
     A, W, U = rng.normal(size=(20, 2)), rng.normal(size=(20, 3)), rng.normal(size=(3, 2))
 
-    def point(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, Kinks]:
+    def point(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, Nonsmoothness]:
         on = U @ x >= 0
-        return x, A @ x + W @ np.maximum(U @ x, 0.0), A + (W * on) @ U, Kinks(W, U @ x, U, on)
+        return x, A @ x + W @ np.maximum(U @ x, 0.0), A + (W * on) @ U, Nonsmoothness(W, U @ x, U, on)
 
     curvature = Curvature()
     curvature.learn(*point(np.array([1.0, 0.3])))
@@ -128,11 +128,11 @@ def test_a_step_is_the_best_there_is_and_promises_what_it_brings(kinked: bool, f
     rng = np.random.default_rng(6)
     A, r, W, U = rng.normal(size=(30, 3)), rng.normal(size=30), rng.normal(size=(30, 2)), 0.5 * rng.normal(size=(2, 3))
     v = np.array([0.2, -0.1])
-    kinks = Kinks(W, v, U, v >= 0) if kinked else None
+    nonsmooth = Nonsmoothness(W, v, U, v >= 0) if kinked else None
     J = A + (W * (v >= 0)) @ U if kinked else A
     S = np.diag([-12.0, 8.0, 3.0])
     wide = np.full(3, np.inf if free else 0.1)
-    near = Near(r, J, kinks, -wide, wide, S)
+    near = LocalModel(r, J, nonsmooth, -wide, wide, S)
 
     def cost(s: np.ndarray) -> float:
         return float(np.sum((r + near.change(s)) ** 2) + s @ S @ s)
@@ -144,4 +144,4 @@ def test_a_step_is_the_best_there_is_and_promises_what_it_brings(kinked: bool, f
     found = [minimize(damped, s, bounds=[(-w, w) for w in wide], method="L-BFGS-B").fun for s in starts]
     step = near.step(damping)
     assert (np.abs(step) <= wide).all() and damped(step) <= min(found) + 1e-3 * (damped(np.zeros(3)) - min(found))
-    assert near.promise(step) == pytest.approx(cost(np.zeros(3)) - cost(step), rel=1e-9)
+    assert near.predicted_gain(step) == pytest.approx(cost(np.zeros(3)) - cost(step), rel=1e-9)

@@ -16,8 +16,8 @@ from femsense.core.errors import DataError, InputError
 from femsense.core.parallel import beside, each, set_workers, workers
 from femsense.fem.equilibrium import solve_equilibrium
 from femsense.fem.linalg import cholesky
-from femsense.model.drive import Walk, drive_of
-from femsense.model.quasi_static_path import walk_along
+from femsense.model.drive import DrivenRobot, drive_of
+from femsense.model.quasi_static_path import solve_path
 
 
 @pytest.fixture(autouse=True)
@@ -125,8 +125,8 @@ def test_a_walk_does_not_depend_on_how_many_work(friction):
     for count in (1, 3):
         set_workers(count)
         starts: dict = {}
-        walks = [Walk(r, drive_of(r, rec)) for r in (base, *variants)]
-        rows = [list(walk_along(walks[0], range(5), attrgetter("markers"), walks[1:], starts=starts)) for _ in range(2)]
+        walks = [DrivenRobot(r, drive_of(r, rec)) for r in (base, *variants)]
+        rows = [list(solve_path(walks[0], range(5), attrgetter("markers"), walks[1:], starts=starts)) for _ in range(2)]
         found.append([np.vstack([seen[None], others]) for again in rows for _, _, seen, others in again])
     np.testing.assert_array_equal(found[0], found[1])
 

@@ -18,7 +18,7 @@ from femsense.fem.mesh import embed_points
 from femsense.io.recording_folder import load_recording
 from femsense.io.robot_toml import load_robot, robot_document, save_robot
 from femsense.loop.data.holdout import sweeps_of
-from femsense.model.drive import Walk, drive_of
+from femsense.model.drive import DrivenRobot, drive_of
 from femsense.model.finer_mesh import finer_state
 from femsense.model.recording import check_against, make_recording, state_key
 from femsense.model.remeshing import finer_mesh, robot_on_mesh
@@ -118,9 +118,9 @@ def test_pressure_pushes_on_the_finer_mesh_too(folder: Path) -> None:
     coarse = load_robot(folder)
     fine = robot_on_mesh(coarse, finer_mesh(coarse.body.mesh, None, 1))
     recording = make_recording(time_s=[0.0], chamber_names=["core"], pressures=[[10e3]])
-    walk, fine_walk = (Walk(r, drive_of(r, recording)) for r in (coarse, fine))
-    state, ties = solve_frame(walk, 0), embed_points(coarse.body.mesh, fine.body.mesh.nodes)
-    found, wanted = finer_state(walk, fine_walk, 0, state, ties), solve_frame(fine_walk, 0).positions
+    driven, fine_driven = (DrivenRobot(r, drive_of(r, recording)) for r in (coarse, fine))
+    state, ties = solve_frame(driven, 0), embed_points(coarse.body.mesh, fine.body.mesh.nodes)
+    found, wanted = finer_state(driven, fine_driven, 0, state, ties), solve_frame(fine_driven, 0).positions
     assert found is not None
     gone = np.abs(wanted - fine.body.mesh.nodes).max()
     assert gone > 1e-3

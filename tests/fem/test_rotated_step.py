@@ -7,12 +7,13 @@ import pytest
 from helpers import block_mesh
 
 from femsense.core.pose import rotation_from_vector
-from femsense.fem import equilibrium, rotated_step
+from femsense.fem import equilibrium
+from femsense.fem import rotated_step as rotated_step_module
 from femsense.fem.assembly import internal
 from femsense.fem.body import BodyModel, make_body
 from femsense.fem.equilibrium import solve_equilibrium
 from femsense.fem.mesh import to_quadratic
-from femsense.fem.rotated_step import turned_step
+from femsense.fem.rotated_step import rotated_step
 
 
 def bar(quadratic: bool, *, on_an_edge: bool = False) -> BodyModel:
@@ -34,7 +35,7 @@ def test_a_small_step_is_the_straight_one_to_first_order(quadratic: bool) -> Non
     step = 1e-3 * (free * rng.normal(size=free.size)).reshape(-1, 3)
     apart = []
     for share in (1.0, 0.1, 0.01):
-        there = turned_step(body, x, share * step)
+        there = rotated_step(body, x, share * step)
         assert there is not None
         assert np.abs(there[body.clamped] - x[body.clamped]).max() == 0.0
         apart.append(np.abs(there - x - share * step).max() / share**2)
@@ -44,10 +45,10 @@ def test_a_small_step_is_the_straight_one_to_first_order(quadratic: bool) -> Non
 @pytest.mark.parametrize("quadratic", [False, True])
 def test_a_turn_about_a_hinge_is_a_rotation_without_stretch(quadratic: bool) -> None:
     body = bar(quadratic, on_an_edge=True)
-    body.free_map.laplacian.append(rotated_step._corners(body))  # a hinge holds no body, but a Laplacian
+    body.free_map.laplacian.append(rotated_step_module._corners(body))  # a hinge holds no body, but a Laplacian
     hinge, turn = body.mesh.nodes[body.clamped][0], np.array([0.0, 0.0, 0.7])
     arms = body.mesh.nodes - hinge
-    there = turned_step(body, body.mesh.nodes, np.cross(turn, arms))
+    there = rotated_step(body, body.mesh.nodes, np.cross(turn, arms))
     assert there is not None
     np.testing.assert_allclose(there, hinge + arms @ rotation_from_vector(turn).T, atol=1e-12)
     assert internal(body, there).energy < 1e-20
@@ -55,7 +56,7 @@ def test_a_turn_about_a_hinge_is_a_rotation_without_stretch(quadratic: bool) -> 
 
 def test_where_nothing_is_clamped_there_is_no_turned_step() -> None:
     body = bar(False, on_an_edge=True)
-    assert turned_step(body, body.mesh.nodes, np.zeros_like(body.mesh.nodes)) is None
+    assert rotated_step(body, body.mesh.nodes, np.zeros_like(body.mesh.nodes)) is None
 
 
 def test_fewer_newton_steps_lead_to_the_same_state(monkeypatch: pytest.MonkeyPatch) -> None:

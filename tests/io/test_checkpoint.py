@@ -16,10 +16,10 @@ from arm import arm, record, sweeps
 from femsense.app.inspect import inspect_path
 from femsense.calib.calibrate import calibrate
 from femsense.core.errors import DataError
-from femsense.io.checkpoint import DIGEST, Keeper
+from femsense.io.checkpoint import DIGEST, Checkpoint
 from femsense.loop.improve import improve
 from femsense.loop.result import LoopResult
-from femsense.loop.search.search_state import Course
+from femsense.loop.search.search_state import SearchProgress
 from femsense.model.effects import FORMS, apply_effects
 from femsense.sensing import pipeline
 
@@ -74,8 +74,8 @@ def test_a_file_that_is_cut_off_or_made_from_something_else_is_not_used(
 ):
     file = tmp_path / ".unfinished"
     file.write_bytes(change(stopped.read_bytes()))
-    assert Keeper((stopped, MADE_FROM), FORMS).kept(Course) is not None
-    assert Keeper((file, MADE_FROM), FORMS).kept(Course) is None
+    assert Checkpoint((stopped, MADE_FROM), FORMS).kept(SearchProgress) is not None
+    assert Checkpoint((file, MADE_FROM), FORMS).kept(SearchProgress) is None
 
 
 class Hostile:
@@ -88,10 +88,10 @@ class Hostile:
 
 @pytest.mark.parametrize("call", [os.mkdir, eval])
 def test_a_file_from_elsewhere_runs_nothing(tmp_path: Path, call: Callable[..., Any]):
-    made, keeper = tmp_path / "made", Keeper((tmp_path / ".unfinished", MADE_FROM), FORMS)
+    made, checkpoint = tmp_path / "made", Checkpoint((tmp_path / ".unfinished", MADE_FROM), FORMS)
     hostile = Hostile(call, str(made) if call is os.mkdir else f"__import__('os').mkdir({str(made)!r})")
-    keeper.file.write_bytes(keeper.made_from + pickle.dumps(hostile))
-    assert keeper.kept(Course) is None and not made.exists()
+    checkpoint.file.write_bytes(checkpoint.made_from + pickle.dumps(hostile))
+    assert checkpoint.kept(SearchProgress) is None and not made.exists()
     pickle.loads(pickle.dumps(hostile))
     assert made.exists()  # anyone else would have run it
 

@@ -62,7 +62,7 @@ def make_calibration(**changes: Any) -> Calibration:
         tension_std_n={"top": 0.01, "side": None},
         displacement_std_m={"top": 1e-5, "side": None},
         status="converged",
-        seats_m={"tip": [0.1, 0.0, 0.03]},
+        placements_m={"tip": [0.1, 0.0, 0.03]},
         frames=(0, 4),
     )
     return replace(calibration, **changes)
@@ -124,7 +124,7 @@ def nothing_half_written(folder: Path) -> bool:
 # Calibrations
 
 
-@pytest.mark.parametrize("changes", [{}, {"rms_m": NAN, "marker_rms_m": {}, "history": ()}, {"seats_m": {}, "frames": ()}])
+@pytest.mark.parametrize("changes", [{}, {"rms_m": NAN, "marker_rms_m": {}, "history": ()}, {"placements_m": {}, "frames": ()}])
 def test_a_calibration_comes_back_the_same(tmp_path: Path, changes: dict[str, Any]) -> None:
     calibration = make_calibration(**changes)
     path = write_calibration(calibration, tmp_path / "new" / "calibration.json")
@@ -175,7 +175,7 @@ def test_foreign_and_broken_calibrations_are_refused(tmp_path: Path, text: str, 
         ("cable_tension_n", {"top": "much"}),
         ("history", 3),
         ("cameras", [{}]),
-        ("seats_m", {"tip": 1}),
+        ("placements_m", {"tip": 1}),
         ("pose_covariance", [[1.0]]),
         ("frames", "x"),
     ],

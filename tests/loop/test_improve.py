@@ -122,11 +122,11 @@ def test_an_effect_whose_states_do_not_come_to_rest_again_is_taken_back(monkeypa
     module = sys.modules["femsense.loop.improve"]
     again, asked = module._again, list[tuple[str, ...]]()
 
-    def folds(data, stage, noise, **given):
-        asked.append(stage.fit.hypothesis.names)
+    def folds(data, fitted, noise, **given):
+        asked.append(fitted.fit.hypothesis.names)
         if "cable_friction" in asked[-1]:
             raise DataError("no equilibrium in frame 3")
-        return again(data, stage, noise, **given)
+        return again(data, fitted, noise, **given)
 
     monkeypatch.setattr(module, "_again", folds)
     loop = improve(arm((4, 1, 1)), [recording], effects=["cable_friction"])
@@ -316,7 +316,9 @@ def test_noise_that_no_camera_has_is_said():
 
 def test_a_nuisance_is_named_only_beyond_the_deviations_that_are_reported():
     terms = ((SimpleNamespace(name="stiffness"), {}, (None,)), (SimpleNamespace(name="cable_offset"), {}, (None, None)))
-    stage = SimpleNamespace(fit=SimpleNamespace(hypothesis=SimpleNamespace(terms=terms), coordinates=np.array([0.09, 0.0, -0.4])))
+    fitted = SimpleNamespace(
+        fit=SimpleNamespace(hypothesis=SimpleNamespace(terms=terms), coordinates=np.array([0.09, 0.0, -0.4]))
+    )
     is_sure = sys.modules["femsense.loop.verdict.verdict"]._is_sure
-    assert is_sure(stage, "stiffness", np.array([0.029])) and not is_sure(stage, "stiffness", np.array([0.031]))
-    assert is_sure(stage, "cable_offset", np.array([0.1, 0.1])) and not is_sure(stage, "cable_offset", np.array([0.1, 0.2]))
+    assert is_sure(fitted, "stiffness", np.array([0.029])) and not is_sure(fitted, "stiffness", np.array([0.031]))
+    assert is_sure(fitted, "cable_offset", np.array([0.1, 0.1])) and not is_sure(fitted, "cable_offset", np.array([0.1, 0.2]))

@@ -32,17 +32,17 @@ from femsense.loop.fit.discretisation_error import (
     with_mesh_errors,
     without_mesh_error,
 )
-from femsense.loop.fit.fitted_model import Stage, keeping, make_stage, with_nuisance, with_seeds_still
+from femsense.loop.fit.fitted_model import FittedModel, fit_model, keeping, with_nuisance, with_seeds_still
 from femsense.loop.fit.joint_fit import Prior
 from femsense.loop.fit.noise_components import Noise, _Likelihood, whiten
 from femsense.loop.improve import improve
-from femsense.loop.search.acceptance import MOUNTED, _plainly_worse, tilt_cost
+from femsense.loop.search.acceptance import MOUNTED, _plainly_worse, tilt_penalty
 from femsense.loop.search.effect_fields import _parts
 from femsense.loop.search.screening import penalty
 from femsense.loop.verdict.residual_diagnostics import structure_tests
 from femsense.loop.verdict.verdict import _excess, _lacks
 from femsense.model import finer_mesh as finer_path
-from femsense.model.drive import Walk, drive_of
+from femsense.model.drive import DrivenRobot, drive_of
 from femsense.model.effects import apply_effects, find_effect
 from femsense.model.finer_mesh import finer_state
 from femsense.model.observation import Hypothesis, evaluate_scene, make_scene
@@ -161,7 +161,9 @@ def test_the_plain_error_may_grow_where_fitted_if_that_on_held_out_data_falls():
     assert not _plainly_worse(before, errors(1.3, 0.9)) and not _plainly_worse(before, errors(1.2, 1.1))
 
 
-def with_error_of_the_mesh(noise: Noise, *, linear: bool = False, tried: tuple[str, ...] = ()) -> tuple[Recording, Stage, Data]:
+def with_error_of_the_mesh(
+    noise: Noise, *, linear: bool = False, tried: tuple[str, ...] = ()
+) -> tuple[Recording, FittedModel, Data]:
     """Return a recording of a small arm, its calibrated stage, and the data with what the mesh costs there."""
     inputs, labels = sweeps(each=1)
     robot = arm((4, 2, 2))
@@ -169,8 +171,8 @@ def with_error_of_the_mesh(noise: Noise, *, linear: bool = False, tried: tuple[s
     recording, _ = record(inputs, labels=labels, truth=robot)
     data = prepare(robot, [recording], [])
     hypothesis, prior = with_nuisance(data)
-    stage = make_stage(data, hypothesis, prior, noise, np.zeros(len(prior.mean)))
-    return recording, stage, with_mesh_errors(data, stage, tried)
+    fitted = fit_model(data, hypothesis, prior, noise, np.zeros(len(prior.mean)))
+    return recording, fitted, with_mesh_errors(data, fitted, tried)
 
 
 def test_a_linear_mesh_has_no_error_where_it_is_asked_about_as_an_effect():
@@ -190,9 +192,9 @@ def test_what_is_made_of_the_finer_mesh_beforehand_serves_the_fitted_robot():
 
 @pytest.mark.parametrize("linear, finer", [(False, (None, 1)), (True, ("tet10", 0))], ids=["tet10", "tet4"])
 def test_the_error_of_the_mesh_is_what_the_finer_mesh_adds(linear: bool, finer: tuple[str | None, int]):
-    recording, stage, data = with_error_of_the_mesh(Noise({"white": 1e-4}, ""), linear=linear)
+    recording, fitted, data = with_error_of_the_mesh(Noise({"white": 1e-4}, ""), linear=linear)
     trial, error = data.train[0], mesh_errors(data)[0]
-    fitted = stage.fit.hypothesis.robot_at(stage.fit.coordinates)
+    fitted = fitted.fit.hypothesis.robot_at(fitted.fit.coordinates)
     fine = robot_on_mesh(fitted, finer_mesh(fitted.body.mesh, *finer))
     k = int(trial.scene.frames[2])
     tension = dict(zip(fitted.body.cable_names, recording.inputs[k] + fitted.actuation.tension_offset))
@@ -219,8 +221,8 @@ def test_springs_of_a_clamp_are_shared_out_over_the_finer_face():
     assert moments[1] == pytest.approx(moments[0])
     recording, _ = record(sweeps(each=1)[0], labels=sweeps(each=1)[1], truth=soft)
     noise, data = Noise({"white": 1e-4}, ""), prepare(soft, [recording], [])
-    stage = make_stage(data, Hypothesis(data.robot), Prior(np.zeros(0), np.zeros(0)), noise, np.zeros(0))
-    trial, error = data.train[0], mesh_errors(with_mesh_errors(data, stage, []))[0]
+    fitted = fit_model(data, Hypothesis(data.robot), Prior(np.zeros(0), np.zeros(0)), noise, np.zeros(0))
+    trial, error = data.train[0], mesh_errors(with_mesh_errors(data, fitted, []))[0]
     firm = mesh_errors(with_error_of_the_mesh(noise)[2])[0]
     nearest = np.isin(trial.scene.marker, np.unique(trial.scene.marker)[:4])  # beside the clamp, which does not give alike there
     assert np.abs(error[nearest]).max() > 3.0 * np.abs(firm[nearest]).max()
@@ -259,12 +261,12 @@ def test_the_mesh_errs_in_another_way_where_the_body_is_another_or_goes_elsewher
     recording, _ = record(sweeps(each=1)[0], labels=sweeps(each=1)[1], truth=robot)
     noise, data = Noise({"white": 1e-4}, ""), prepare(robot, [recording], [])
     hypothesis, prior = with_nuisance(data)
-    before = make_stage(data, hypothesis, prior, noise, np.zeros(len(prior.mean)))
+    before = fit_model(data, hypothesis, prior, noise, np.zeros(len(prior.mean)))
     effect = find_effect(name)
     own = effect.parameters(robot, "tension")
     coordinates = np.concatenate([before.fit.coordinates, [p.coordinate(size) for p in own]])
     wider = Prior(np.append(prior.mean, np.zeros(len(own))), np.append(prior.std, np.full(len(own), np.inf)))
-    after = make_stage(
+    after = fit_model(
         data, Hypothesis(data.robot, (*hypothesis.terms, (effect, {}, own))), wider, noise, coordinates, max_iterations=0
     )
     assert errs_alike(before, after) == alike
@@ -272,16 +274,16 @@ def test_the_mesh_errs_in_another_way_where_the_body_is_another_or_goes_elsewher
 
 def on_both_meshes(
     inputs: list[float], actuation: str = "tension", effects: Sequence[dict[str, Any]] = ()
-) -> tuple[Walk, Walk, int, Equilibrium, Embedding]:
+) -> tuple[DrivenRobot, DrivenRobot, int, Equilibrium, Embedding]:
     """Return what `finer_state` is asked with: an arm whose cables are driven so."""
     robot = apply_effects(arm((4, 2, 2)), effects)
     fine = robot_on_mesh(robot, finer_mesh(robot.body.mesh, None, 1))
     recording = make_recording(time_s=[0.0], cable_names=NAMES, inputs=[inputs], actuation=actuation)
-    walk, fine_walk = (Walk(r, drive_of(r, recording)) for r in (robot, fine))
-    return walk, fine_walk, 0, solve_frame(walk, 0), embed_points(robot.body.mesh, fine.body.mesh.nodes)
+    driven, fine_driven = (DrivenRobot(r, drive_of(r, recording)) for r in (robot, fine))
+    return driven, fine_driven, 0, solve_frame(driven, 0), embed_points(robot.body.mesh, fine.body.mesh.nodes)
 
 
-def beyond(asked: tuple[Walk, Walk, int, Equilibrium, Embedding], x: np.ndarray | None) -> np.ndarray:
+def beyond(asked: tuple[DrivenRobot, DrivenRobot, int, Equilibrium, Embedding], x: np.ndarray | None) -> np.ndarray:
     """Return how far nodes of the finer mesh lie from the state of the declared one [m]."""
     assert x is not None
     return x - asked[4].positions(asked[3].positions)
@@ -394,7 +396,7 @@ def test_a_declared_gravity_is_believed_to_a_few_degrees():
     def cost(declared: list[float], found: list[float]) -> float:
         body = SimpleNamespace(body=SimpleNamespace(gravity=np.array(declared)))
         fit = SimpleNamespace(hypothesis=SimpleNamespace(parameters=terms), coordinates=np.array(found))
-        return tilt_cost(body, candidate, fit)
+        return tilt_penalty(body, candidate, fit)
 
     down = [0.0, 0.0, -9.81]
     angles = np.radians([0.0, 5.0, 30.0, 180.0])
@@ -487,11 +489,11 @@ def test_times_that_are_held_still_stay_where_the_fit_had_them():
     data = prepare(robot, [recording], [])
     parameters = (*creep.parameters(robot, "tension"), *creep.polish(robot, "tension", seed))
     start, flat = np.array([0.1, np.log(5.0)]), Prior(np.zeros(2), np.full(2, np.inf))
-    stage = make_stage(data, Hypothesis(robot, ((creep, seed, parameters),)), flat, noise, start, max_iterations=2)
-    still = with_seeds_still(data, stage)
+    fitted = fit_model(data, Hypothesis(robot, ((creep, seed, parameters),)), flat, noise, start, max_iterations=2)
+    still = with_seeds_still(data, fitted)
     assert [p.key for p in still.fit.hypothesis.parameters] == ["fraction"]
-    assert still.fit.hypothesis.entries(still.fit.coordinates) == stage.fit.hypothesis.entries(stage.fit.coordinates)
+    assert still.fit.hypothesis.entries(still.fit.coordinates) == fitted.fit.hypothesis.entries(fitted.fit.coordinates)
     again = keeping(data, still, ["creep"], noise)
-    (_, held, _), time_s = again.fit.hypothesis.terms[0], stage.fit.hypothesis.entries(stage.fit.coordinates)[0]["time_s"]
+    (_, held, _), time_s = again.fit.hypothesis.terms[0], fitted.fit.hypothesis.entries(fitted.fit.coordinates)[0]["time_s"]
     assert held["time_s"] == time_s != 2.0
-    assert again.fit.std.shape == (1,) and again.fit.chi2 < 1.1 * stage.fit.chi2
+    assert again.fit.std.shape == (1,) and again.fit.chi2 < 1.1 * fitted.fit.chi2

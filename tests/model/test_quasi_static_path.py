@@ -22,9 +22,9 @@ from femsense.fem.compliance import Tangent
 from femsense.fem.equilibrium import Equilibrium, solve_equilibrium
 from femsense.fem.mesh import embed_points
 from femsense.model import quasi_static_path, variants
-from femsense.model.drive import Walk, drive_of, has_history
+from femsense.model.drive import DrivenRobot, drive_of, has_history
 from femsense.model.effects import apply_effects
-from femsense.model.quasi_static_path import walk_along
+from femsense.model.quasi_static_path import solve_path
 from femsense.model.recording import Recording, make_recording
 from femsense.model.robot import Robot
 from femsense.model.variants import solve_frame
@@ -32,12 +32,12 @@ from femsense.model.variants import solve_frame
 
 def walked(r: Robot, rec: Recording, frames: Sequence[int] | None = None, **options: Any) -> dict[int, np.ndarray]:
     frames = range(rec.frame_count) if frames is None else frames
-    return {k: seen for k, _, seen, _ in walk_along(Walk(r, drive_of(r, rec)), frames, attrgetter("markers"), **options)}
+    return {k: seen for k, _, seen, _ in solve_path(DrivenRobot(r, drive_of(r, rec)), frames, attrgetter("markers"), **options)}
 
 
 def walk_states(r: Robot, rec: Recording) -> list[Equilibrium]:
     starts: dict[int, Equilibrium] = {}
-    deque(walk_along(Walk(r, drive_of(r, rec)), range(rec.frame_count), attrgetter("markers"), starts=starts), maxlen=0)
+    deque(solve_path(DrivenRobot(r, drive_of(r, rec)), range(rec.frame_count), attrgetter("markers"), starts=starts), maxlen=0)
     return list(starts.values())
 
 
@@ -149,7 +149,7 @@ def test_equal_frames_share_one_solve_and_come_out_the_same(monkeypatch: pytest.
     seen = walked(robot(), rec)
     assert calls == [0, 1]
     for k in range(5):
-        alone = solve_frame(Walk(robot(), drive_of(robot(), rec)), k)
+        alone = solve_frame(DrivenRobot(robot(), drive_of(robot(), rec)), k)
         np.testing.assert_allclose(seen[k], robot().markers.positions(alone.positions), atol=1e-9)
 
 
@@ -213,7 +213,9 @@ def test_parts_of_a_walk_with_a_past_join_to_the_walk_in_order(monkeypatch: pyte
 
 def test_with_friction_a_hold_is_solved_once_and_a_return_is_not_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     solved, solve = [], quasi_static_path.solve_frame
-    monkeypatch.setattr(quasi_static_path, "solve_frame", lambda walk, k, **more: (solved.append(k), solve(walk, k, **more))[1])
+    monkeypatch.setattr(
+        quasi_static_path, "solve_frame", lambda driven, k, **more: (solved.append(k), solve(driven, k, **more))[1]
+    )
     seen = walked(robot(friction=0.5), recording([[0.5, 0], [1.5, 0], [1.5, 0], [0.5, 0]]))
     assert solved == [0, 1, 3]
     np.testing.assert_array_equal(seen[1], seen[2])
@@ -224,7 +226,7 @@ def test_a_frame_starts_from_the_state_whose_inputs_are_most_like_its_own() -> N
     rec = recording([[0.0, 0], [1.0, 0], [0.1, 0], [0.9, 0]])
     starts: dict[int, Any] = {}
     walked(robot(), rec, [0, 1], starts=starts)
-    found = quasi_static_path._nearest(Walk(robot(), drive_of(robot(), rec)), starts, [2, 3])
+    found = quasi_static_path._nearest(DrivenRobot(robot(), drive_of(robot(), rec)), starts, [2, 3])
     assert found[2] is starts[0] and found[3] is starts[1]
 
 
@@ -241,8 +243,11 @@ def test_variants_give_the_derivative_of_frames_solved_anew() -> None:
         robot([{"name": "poisson", "poisson_ratio": 0.4 - h}]),
         robot([{"name": "payload", "point_m": MARKERS[1].tolist(), "force_n": [0, 0, -h]}]),
     ]
-    for k, _, seen, others in walk_along(
-        Walk(base, drive_of(base, rec)), [0, 1], attrgetter("markers"), [Walk(v, drive_of(v, rec)) for v in variants]
+    for k, _, seen, others in solve_path(
+        DrivenRobot(base, drive_of(base, rec)),
+        [0, 1],
+        attrgetter("markers"),
+        [DrivenRobot(v, drive_of(v, rec)) for v in variants],
     ):
         for forward, ahead, back in zip(others, variants, behind):
             alone = [
@@ -265,8 +270,8 @@ def test_another_modulus_of_some_elements_moves_a_frame_as_if_it_were_solved_ane
         {"name": "soft_region", "center_m": MARKERS[1].tolist(), "radius_m": 0.04},
     ):
         ahead, back = (apply_effects(base, [{**entry, "scale": 1 + s}]) for s in (h, -h))
-        [(_, _, seen, others)] = walk_along(
-            Walk(base, drive_of(base, rec)), [0], attrgetter("markers"), [Walk(ahead, drive_of(ahead, rec))]
+        [(_, _, seen, others)] = solve_path(
+            DrivenRobot(base, drive_of(base, rec)), [0], attrgetter("markers"), [DrivenRobot(ahead, drive_of(ahead, rec))]
         )
         alone = [
             r.markers.positions(solve_equilibrium(r.body, tension={"top": 1.0, "side": 0.3}, relative_tolerance=1e-12).positions)
@@ -293,18 +298,18 @@ def test_many_forces_are_answered_by_the_points_that_are_observed(control: str, 
     ]
     moved = {"name": "marker_offset", "offset_m": {"a": [1e-4, 0.0, 0.0]}}
     robots = [*(apply_effects(base, [entry]) for entry in entries), apply_effects(base, [payloads[0], moved])]
-    walks = [Walk(r, drive_of(r, rec)) for r in robots]
+    walks = [DrivenRobot(r, drive_of(r, rec)) for r in robots]
     solved, plain = list[int](), Tangent.respond
     monkeypatch.setattr(Tangent, "respond", lambda self, forces: solved.append(len(forces)) or plain(self, forces))
 
-    def seen(variants: Sequence[Walk], known: dict[int, quasi_static_path.AtPoints] | None = None) -> FloatArray:
-        walk = Walk(base, drive_of(base, rec))
-        return np.array([others for *_, others in walk_along(walk, [0, 1], attrgetter("markers"), variants, answers=known)])
+    def seen(variants: Sequence[DrivenRobot], known: dict[int, quasi_static_path.AtPoints] | None = None) -> FloatArray:
+        driven = DrivenRobot(base, drive_of(base, rec))
+        return np.array([others for *_, others in solve_path(driven, [0, 1], attrgetter("markers"), variants, answers=known)])
 
     together = seen(walks)
     assert solved and max(solved) == 3 * len(MARKERS)  # one a point and axis, none a payload
-    alone = np.concatenate([seen([walk]) for walk in walks], axis=1)
-    still = next(iter(walk_along(Walk(base, drive_of(base, rec)), [0], attrgetter("markers"))))[2]
+    alone = np.concatenate([seen([driven]) for driven in walks], axis=1)
+    still = next(iter(solve_path(DrivenRobot(base, drive_of(base, rec)), [0], attrgetter("markers"))))[2]
     np.testing.assert_allclose(together, alone, atol=1e-6 * np.abs(alone - still).max())
     known = dict[int, quasi_static_path.AtPoints]()
     np.testing.assert_allclose(seen(walks[:1], known), alone[:, :1], atol=1e-6 * np.abs(alone - still).max())
@@ -323,7 +328,7 @@ def test_a_variant_in_observation_alone_costs_no_solve(monkeypatch: pytest.Monke
     plain = quasi_static_path.solve_frame
     monkeypatch.setattr(quasi_static_path, "solve_frame", lambda *a, **k: calls.append(a[1]) or plain(*a, **k))
     drive = drive_of(base, rec)
-    _, _, seen, others = next(iter(walk_along(Walk(base, drive), [0], attrgetter("markers"), [Walk(moved, drive)])))
+    _, _, seen, others = next(iter(solve_path(DrivenRobot(base, drive), [0], attrgetter("markers"), [DrivenRobot(moved, drive)])))
     assert calls == [0] and 5e-4 < np.abs(others[0] - seen).max() < 2e-3
 
 
@@ -333,12 +338,12 @@ def test_variants_that_rub_are_answered_twice_with_one_factor_a_state(monkeypatc
     others = [apply_effects(base, [{"name": "stiffness", "scale": scale}]) for scale in (0.9, 1.1)]
     made, plain = list[Any](), variants.tangent_at
     monkeypatch.setattr(variants, "tangent_at", lambda *given: made.append(given) or plain(*given))
-    walks = [Walk(r, drive_of(r, rec)) for r in (*rubs, *others)]
-    seen = list(walk_along(Walk(base, drive_of(base, rec)), range(4), attrgetter("markers"), walks))
+    walks = [DrivenRobot(r, drive_of(r, rec)) for r in (*rubs, *others)]
+    seen = list(solve_path(DrivenRobot(base, drive_of(base, rec)), range(4), attrgetter("markers"), walks))
     assert len(made) == 2  # frames of two states
     monkeypatch.setattr(variants, "FACTOR_MEMORY", 0.0)
     for (_, _, _, kept), (_, _, _, again) in zip(
-        seen, walk_along(Walk(base, drive_of(base, rec)), range(4), attrgetter("markers"), walks)
+        seen, solve_path(DrivenRobot(base, drive_of(base, rec)), range(4), attrgetter("markers"), walks)
     ):
         np.testing.assert_allclose(kept, again, atol=1e-12)
     assert len(made) == 6
@@ -358,7 +363,9 @@ def test_factors_of_a_walk_with_friction_are_gone_with_it(monkeypatch: pytest.Mo
     gc.disable()  # a circle of references would keep gigabytes until its next round
     try:
         deque(
-            walk_along(Walk(base, drive_of(base, rec)), [0, 2], attrgetter("markers"), [Walk(rubs, drive_of(rubs, rec))]),
+            solve_path(
+                DrivenRobot(base, drive_of(base, rec)), [0, 2], attrgetter("markers"), [DrivenRobot(rubs, drive_of(rubs, rec))]
+            ),
             maxlen=0,
         )
         assert made and all(factor() is None for factor in made)
@@ -378,7 +385,11 @@ def test_a_variant_in_gravity_is_solved() -> None:
     base, rec = robot(), recording([[1.0, 0.3]])
     tilted = replace(base, body=base.body.with_gravity([1.0, 0, -9.81]))
     _, _, seen, others = next(
-        iter(walk_along(Walk(base, drive_of(base, rec)), [0], attrgetter("markers"), [Walk(tilted, drive_of(tilted, rec))]))
+        iter(
+            solve_path(
+                DrivenRobot(base, drive_of(base, rec)), [0], attrgetter("markers"), [DrivenRobot(tilted, drive_of(tilted, rec))]
+            )
+        )
     )
     assert np.abs(others[0] - seen).max() > 1e-6
 
@@ -416,9 +427,9 @@ def test_a_clamp_that_gives_takes_the_body_along_first(entry: dict[str, float], 
     alone = walk_states(soft, rec)
     plain = quasi_static_path.solve_frame
 
-    def solve(walk: Walk, k: int, **given: Any) -> Equilibrium:
+    def solve(driven: DrivenRobot, k: int, **given: Any) -> Equilibrium:
         begun[k] = given["start"]
-        return plain(walk, k, **given)
+        return plain(driven, k, **given)
 
     monkeypatch.setattr(quasi_static_path, "solve_frame", solve)
     there = walked(soft, rec, starts=dict(starts))
@@ -433,7 +444,7 @@ def test_a_clamp_that_cannot_hold_the_body_is_walked_from_rest(entry: dict[str, 
     rec = recording([[1.0, 0.0]])
     starts = walk_states(robot(), rec)
     soft = robot([{"name": "base_compliance", **entry}])
-    assert quasi_static_path._taken_along(Walk(soft, drive_of(soft, rec)), 0, starts[0]) is None
+    assert quasi_static_path._taken_along(DrivenRobot(soft, drive_of(soft, rec)), 0, starts[0]) is None
 
 
 def test_where_a_body_that_was_taken_along_does_not_come_to_rest_it_is_walked_from_rest(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -442,8 +453,8 @@ def test_where_a_body_that_was_taken_along_does_not_come_to_rest_it_is_walked_fr
     soft = robot([{"name": "base_compliance", "stiffness_n_m": 300.0}])
     alone, plain = walked(soft, rec), quasi_static_path.solve_frame
 
-    def solve(walk: Walk, k: int, **given: Any) -> Equilibrium:
-        state = plain(walk, k, **given)
+    def solve(driven: DrivenRobot, k: int, **given: Any) -> Equilibrium:
+        state = plain(driven, k, **given)
         return replace(state, status="overload") if given.get("reuse_factor") else state
 
     monkeypatch.setattr(quasi_static_path, "solve_frame", solve)

@@ -80,7 +80,7 @@ def loop_document(**overrides: Any) -> dict[str, Any]:
                         "dbic": 5360.0,
                         "validation_rms_m": 3.1e-4,
                         "cv_gain": 42.0,
-                        "cv_spread": 8.0,
+                        "cv_std": 8.0,
                         "verdict": "named",
                     }
                 ],
@@ -137,12 +137,12 @@ def loop_document(**overrides: Any) -> dict[str, Any]:
             "split": ["2 of 6 sweeps", "1 of 4 sweeps"],
             "frames_fitted": [[0, 1, 2, 3, 7], [0, 1]],
             "frames_held_out": [list(range(8, 20)), list(range(8, 20))],
-            "strays": [{"frame": 4, "marker": "tip"}, {"frame": 9, "marker": "stalk"}],
+            "outliers": [{"frame": 4, "marker": "tip"}, {"frame": 9, "marker": "stalk"}],
             "noise_components_m": {"white": 8e-5, "marker": 6e-5},
             "noise_source": "restricted maximum likelihood, with repeats",
             "effective_observations": 252.0,
             "nuisance_after": {"stiffness": {"scale": {"value": 1.113, "std": 0.012, "unit": "1"}}},
-            "seat_std_m": 3e-4,
+            "placement_std_m": 3e-4,
             "mesh_error_m": 5e-5,
             "seed": 0,
         },
@@ -177,7 +177,7 @@ def evidence_document() -> dict[str, Any]:
     mesh = block_mesh((4, 2, 2))
     surface = skin(mesh.nodes, mesh.tets)
     corners, triangles = np.unique(surface.triangles, return_inverse=True)
-    seats = np.array(list(MARKERS.values()))
+    placements = np.array(list(MARKERS.values()))
     residual = np.outer([1.0, 0.5, 1.0], [0.0, 0.0, -2e-3])
     shots = [
         {
@@ -185,7 +185,7 @@ def evidence_document() -> dict[str, Any]:
             "recording": 0,
             "frame": i,
             "marker": list(MARKERS),
-            "measured_m": (seats + residual).tolist(),
+            "measured_m": (placements + residual).tolist(),
             "before_m": residual.tolist(),
             "after_m": (0.1 * residual).tolist(),
             "nodes_m": mesh.nodes[corners].tolist(),
@@ -330,7 +330,7 @@ def evidence_document() -> dict[str, Any]:
         "equivalent_forces": {
             "recording": 0,
             "frame": 7,
-            "points_m": seats.tolist(),
+            "points_m": placements.tolist(),
             "forces_n": (20 * residual).tolist(),
             "total_n": [0.0, 0.0, -0.1],
             "explained_share": 0.93,
@@ -426,7 +426,7 @@ def write_calibration_file(file: Path, **overrides: Any) -> Path:
             "cable_displacement_m": {"top": 8e-5, "side": None},
         },
         "pose_covariance": (1e-6 * np.eye(6)).tolist(),
-        "seats_m": {},
+        "placements_m": {},
         "frames": [0, 1, 2, 5],
         "cameras": [{"name": "front", "T_robot_camera": T}],
     }

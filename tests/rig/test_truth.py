@@ -19,16 +19,16 @@ from femsense.fem.mesh import element_volumes
 from femsense.io.files import folder_hash
 from femsense.io.recording_folder import load_recording
 from femsense.io.robot_toml import load_robot
-from femsense.model.drive import Walk, drive_of
+from femsense.model.drive import DrivenRobot, drive_of
 from femsense.model.effects import apply_effects
-from femsense.model.quasi_static_path import walk_along
+from femsense.model.quasi_static_path import solve_path
 from femsense.model.recording import make_recording
 from femsense.model.robot import Robot
 from femsense.rig import truth
 from femsense.rig.scene import probe_shape
 from femsense.rig.script import Plan, TruthTable, check_script, plan_script
 from femsense.rig.simulate import recording_of, run_experiment, simulate
-from femsense.rig.truth import TrueContact, contact_patch, creep_matrix, true_robot, walk_truth
+from femsense.rig.truth import TrueContact, contact_patch, creep_matrix, true_path, true_robot
 
 LOAD = {"sweep": "b", "point_m": [0.1, 0.015, 0.015], "force_n": [0.0, 0.0, -0.05]}
 BARE = changed(SCRIPT, {"contacts": [], "loads": [*SCRIPT["loads"], LOAD]})
@@ -43,8 +43,8 @@ def _estimators_markers(robot: Robot, script: dict[str, Any]) -> np.ndarray:
     """Return the markers of the estimator's own walk [m], shape (F, k, 3)."""
     checked = check_script(script)
     recording = recording_of(run_experiment(robot, checked))
-    walk = Walk(robot, drive_of(robot, recording))
-    return np.array([seen for _, _, seen, _ in walk_along(walk, range(recording.frame_count), attrgetter("markers"))])
+    driven = DrivenRobot(robot, drive_of(robot, recording))
+    return np.array([seen for _, _, seen, _ in solve_path(driven, range(recording.frame_count), attrgetter("markers"))])
 
 
 def _true_markers(robot: Robot, script: dict[str, Any]) -> np.ndarray:
@@ -95,7 +95,7 @@ def let_out() -> tuple[Robot, Plan, np.ndarray]:
 
 def test_bends_remember_the_tensions_at_which_a_held_cable_came_to_rest() -> None:
     rubbing, plan, inputs = let_out()
-    walker = truth._Walker(rubbing, plan)
+    walker = truth._TruePath(rubbing, plan)
     for k, load in enumerate(walker.frame_loads(inputs)):
         walker.go(load, k)
         pulled = list(walker.state.tension.values())
@@ -110,10 +110,10 @@ def test_held_cables_that_rub_come_to_rest_when_they_are_let_out(monkeypatch: py
     recording = make_recording(time_s=plan.time_s, cable_names=NAMES, inputs=inputs, actuation="displacement")
 
     def markers(declared: Robot) -> np.ndarray:
-        walk = Walk(declared, drive_of(declared, recording))
-        return np.array([seen for _, _, seen, _ in walk_along(walk, range(2), attrgetter("markers"))])
+        driven = DrivenRobot(declared, drive_of(declared, recording))
+        return np.array([seen for _, _, seen, _ in solve_path(driven, range(2), attrgetter("markers"))])
 
-    true = np.array([rubbing.markers.positions(f.state.positions) for f in walk_truth(rubbing, plan, substeps=2)])
+    true = np.array([rubbing.markers.positions(f.state.positions) for f in true_path(rubbing, plan, substeps=2)])
     expected = markers(rubbing)
     matters = np.abs(expected - markers(arm((5, 2, 2)))).max()
     np.testing.assert_allclose(true, expected, atol=5e-2 * matters)
@@ -139,8 +139,8 @@ def test_an_effect_of_the_truth_is_what_the_estimator_means_by_it(robot: Robot, 
     checked = check_script(script)
     recording = recording_of(run_experiment(robot, checked))
     declared = apply_effects(robot, [effect])
-    walk = Walk(declared, drive_of(declared, recording))
-    expected = np.array([seen for _, _, seen, _ in walk_along(walk, range(recording.frame_count), attrgetter("markers"))])
+    driven = DrivenRobot(declared, drive_of(declared, recording))
+    expected = np.array([seen for _, _, seen, _ in solve_path(driven, range(recording.frame_count), attrgetter("markers"))])
     plain = _estimators_markers(robot, BARE)
     # friction depends on the way between frames (the bends turn), which the estimator takes in one step
     tolerance = 2e-2 * np.abs(expected - plain).max() if effect["name"] == "cable_friction" else 1e-9
@@ -201,7 +201,7 @@ def test_creep_of_a_step_is_the_closed_form() -> None:
 def test_a_contact_presses_with_its_force_into_the_surface(robot: Robot) -> None:
     plan = plan_script(check_script(SCRIPT), robot)
     real = true_robot(robot, check_script(SCRIPT).truth, [])
-    frames = walk_truth(real, plan)
+    frames = true_path(real, plan)
     assert [len(frame.contacts) for frame in frames] == [0] * 7 + [1, 1]
     for frame, force in zip(frames[7:], (0.3, 0.1)):
         contact = frame.contacts[0]
@@ -209,7 +209,7 @@ def test_a_contact_presses_with_its_force_into_the_surface(robot: Robot) -> None
         np.testing.assert_allclose(contact.force / force, -contact.normal, atol=1e-9)
         np.testing.assert_allclose(frame.state.nodal_forces.sum(axis=0), contact.force, atol=1e-7)
         assert contact.place[0] == pytest.approx(frame.state.positions[:, 0].max(), abs=2e-3)
-    free = walk_truth(real, replace(plan, contacts=()))
+    free = true_path(real, replace(plan, contacts=()))
     assert np.abs(free[7].state.positions - frames[7].state.positions).max() > 1e-4
 
 

@@ -12,7 +12,7 @@ from femsense.core.arrays import freeze
 from femsense.core.pose import invert_pose, make_pose, rotation_from_vector, transform_points
 from femsense.fem.body import make_body, tie_cable
 from femsense.fem.mesh import embed_points, to_quadratic
-from femsense.model.drive import Walk, drive_of, frame_loads
+from femsense.model.drive import DrivenRobot, drive_of, frame_loads
 from femsense.model.effects import apply_effects
 from femsense.model.recording import Recording, make_recording
 from femsense.model.robot import Observation, Robot, plain_actuation, spread_features
@@ -94,25 +94,25 @@ def record(
     free: bool = True,
     forces: dict[int, tuple[np.ndarray, np.ndarray]] | None = None,
     truth: Robot | None = None,
-    seats: np.ndarray | None = None,
+    placements: np.ndarray | None = None,
     actuation: str = "tension",
 ) -> tuple[Recording, list[np.ndarray]]:
     """Return a recording of the true arm (finer mesh, neo-Hookean) and its node positions in each frame.
 
-    `forces`: frame → (place at rest, force) of an undeclared contact. `seats`: by how much the markers sit elsewhere on the body at rest [m], (k, 3).
+    `forces`: frame → (place at rest, force) of an undeclared contact. `placements`: by how much the markers sit elsewhere on the body at rest [m], (k, 3).
     """
     rng = np.random.default_rng(seed)
     true = apply_effects(truth or arm((8, 3, 3), law="neo_hookean"), effects)
-    ties = true.markers if seats is None else true.tie_markers(true.marker_points + seats)
+    ties = true.markers if placements is None else true.tie_markers(true.marker_points + placements)
     plain = make_recording(time_s=np.arange(len(inputs)) * 1.0, actuation=actuation, cable_names=NAMES, inputs=inputs)
-    walk = Walk(true, drive_of(true, plain, initial=initial))
+    driven = DrivenRobot(true, drive_of(true, plain, initial=initial))
     points, states, state = [], [], None
     for k in range(len(inputs)):
         extra = None
         if forces and k in forces:
             place, force = forces[k]
             extra = embed_points(true.body.mesh, np.atleast_2d(place)).spread(np.atleast_2d(force), len(true.body.mesh.nodes))
-        state = solve_frame(walk, k, start=state, before=None if state is None else state.segment_tensions, nodal_forces=extra)
+        state = solve_frame(driven, k, start=state, before=None if state is None else state.segment_tensions, nodal_forces=extra)
         assert state.converged
         states.append(state.positions)
         points.append(ties.positions(state.positions))

@@ -23,7 +23,7 @@ from scipy.sparse.linalg import splu
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import FemsenseError
 from femsense.fem.linalg.cholesky import cholesky
-from femsense.fem.linalg.iterative import Grid, Levels, UnsettledError, iterative, make_levels
+from femsense.fem.linalg.iterative import Level, Levels, UnsettledError, iterative, make_levels
 from femsense.fem.linalg.symbolic import Analysis, analyse
 
 ITERATIVE_FROM = 100_000
@@ -53,7 +53,7 @@ class Pattern:
     """PARDISO solvers that hold the analysis of this pattern and no factor that is still needed."""
     analyses: list[Analysis] = field(default_factory=list)
     """The analysis for Cholesky, once it was needed."""
-    grid: Grid | None = None
+    grid: Level | None = None
     """The nodes behind the unknowns, for the iterative solver; None: unknown."""
     levels_made: list[Levels] = field(default_factory=list)
     """The levels of the iterative solver, once they were needed."""

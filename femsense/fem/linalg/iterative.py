@@ -42,7 +42,7 @@ class UnsettledError(Exception):
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Grid:
+class Level:
     """What the coarse space needs to know of the free nodes, in the order of the matrix."""
 
     points: FloatArray
@@ -82,7 +82,7 @@ class Levels:
     """Of the coarse matrix."""
 
 
-def make_levels(indptr: IntArray, indices: IntArray, grid: Grid) -> Levels:
+def make_levels(indptr: IntArray, indices: IntArray, grid: Level) -> Levels:
     """Return the two levels of a pattern of 3 × 3 blocks (CSC, sorted) on the nodes of a grid."""
     p = len(grid.points)
     counts = np.diff(indptr)[::3] // 3
@@ -120,7 +120,7 @@ def make_levels(indptr: IntArray, indices: IntArray, grid: Grid) -> Levels:
     )
 
 
-def _corners(grid: Grid) -> tuple[sp.csr_matrix, FloatArray]:
+def _corners(grid: Level) -> tuple[sp.csr_matrix, FloatArray]:
     """Return which corners each node follows and how: as itself, or half with each end of its edge that is free."""
     p = len(grid.points)
     corner = grid.ends[:, 0] == np.arange(p)
@@ -134,7 +134,7 @@ def _corners(grid: Grid) -> tuple[sp.csr_matrix, FloatArray]:
     return follows, follows.data[:, None, None] * np.eye(3)
 
 
-def _aggregates(grid: Grid, rows: ShortArray, columns: ShortArray) -> tuple[sp.csr_matrix, FloatArray]:
+def _aggregates(grid: Level, rows: ShortArray, columns: ShortArray) -> tuple[sp.csr_matrix, FloatArray]:
     """Return the aggregate that each node belongs to, and its move under the six rigid motions of the aggregate."""
     group = _grouped(rows, columns)
     count = int(group.max()) + 1

@@ -29,7 +29,15 @@ from femsense.io.mesh_files import (
     write_mesh,
 )
 from femsense.io.meshing.quality import quality_report, quality_text
-from femsense.io.meshing.surface import Surface, check_finite, crossing_triangles, distance_to, repaired, shared_edges, thinned
+from femsense.io.meshing.surface import (
+    ClosedSurface,
+    check_finite,
+    crossing_triangles,
+    distance_to,
+    repaired,
+    shared_edges,
+    thinned,
+)
 from femsense.io.robot_toml import LARGEST_BODY, PER_METRE, SMALLEST_BODY, likely_unit, load_robot
 
 MESH_FILE, REPORT_FILE = "mesh.vtu", "mesh.json"
@@ -271,33 +279,33 @@ def _too_many(count: int, options: MeshOptions, where: str, hint: str) -> InputE
     )
 
 
-def _first_edge(surface: Surface, options: MeshOptions) -> float:
+def _first_edge(surface: ClosedSurface, options: MeshOptions) -> float:
     """Return the edge length to begin with [m]: as wanted, or such that regular tetrahedra fill the volume."""
     if options.size_mm is not None:
         return 1e-3 * options.size_mm
     return float(np.cbrt(6.0 * np.sqrt(2.0) * surface.volume / (0.6 * options.most_tets)))
 
 
-def _fill_once(surface: Surface, edge: float, options: MeshOptions, where: str, *, crosses: bool, seconds: float) -> Filled:
+def _fill_once(surface: ClosedSurface, edge: float, options: MeshOptions, where: str, *, crosses: bool, seconds: float) -> Filled:
     diagonal = surface.diagonal
     given = options.tolerance_mm
     tolerance = 1e-3 * given if given is not None else min(ENVELOPE_OF_EDGE * edge, LARGEST_ENVELOPE * diagonal)
-    thin, strayed = thinned(surface, tolerance=0.5 * tolerance)
+    thin, drifted = thinned(surface, tolerance=0.5 * tolerance)
     made = tetrahedralise(
         np.array(thin.points),
         np.array(thin.triangles),
         edge_fraction=edge / diagonal,
-        envelope=(tolerance - strayed) / diagonal,
+        envelope=(tolerance - drifted) / diagonal,
         where=where,
         check_volume=not crosses,
         seconds=seconds,
     )
     mesh, notes = _one_body(made, where)
-    strays = _strays(mesh, surface, crosses)
-    return Filled(mesh, 1e3 * edge, 1e3 * tolerance, 1e3 * strays, (*thin.done, *notes))
+    outliers = _strays(mesh, surface, crosses)
+    return Filled(mesh, 1e3 * edge, 1e3 * tolerance, 1e3 * outliers, (*thin.done, *notes))
 
 
-def _strays(mesh: TetMesh, surface: Surface, crosses: bool) -> float:
+def _strays(mesh: TetMesh, surface: ClosedSurface, crosses: bool) -> float:
     """Return the largest distance of a point of one surface from the other [m]; where shells cross, of the mesh from the surface."""
     skin, numbers = np.unique(surface_triangles(mesh), return_inverse=True)
     out = float(distance_to(surface.points, surface.triangles, mesh.nodes[skin]).max())

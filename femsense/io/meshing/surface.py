@@ -35,7 +35,7 @@ Progress = Callable[..., None]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Surface:
+class ClosedSurface:
     """A closed surface, outward; the surfaces of cavities face into them."""
 
     points: FloatArray
@@ -80,7 +80,7 @@ def repaired(
     fill_cavities: bool = False,
     part: int | None = None,
     unit: str = "units",
-) -> Surface:
+) -> ClosedSurface:
     """Return a closed surface that can be filled, and what had to be done for it.
 
     Arguments:
@@ -103,7 +103,7 @@ def repaired(
     triangles, cavities = _faced(triangles, shells, fill_cavities, done)
     triangles, cavities = _chosen(points, triangles, shells, part, fill_cavities, cavities, where, unit, done)
     used, numbers = np.unique(triangles, return_inverse=True)
-    return Surface(freeze(points[used]), freeze(numbers.reshape(-1, 3), np.int64), cavities, tuple(done))
+    return ClosedSurface(freeze(points[used]), freeze(numbers.reshape(-1, 3), np.int64), cavities, tuple(done))
 
 
 # Points and triangles
@@ -546,7 +546,7 @@ def _scene(points: FloatArray, triangles: IntArray) -> tuple[FloatArray, Any]:
 # Fewer triangles
 
 
-def thinned(surface: Surface, *, tolerance: float, most: int = MANY_TRIANGLES) -> tuple[Surface, float]:
+def thinned(surface: ClosedSurface, *, tolerance: float, most: int = MANY_TRIANGLES) -> tuple[ClosedSurface, float]:
     """Return a surface with fewer triangles that stays near, and how far it strays [unit of the file].
 
     Edges are drawn together where that costs least (quadric error metrics, Garland and Heckbert 1997, as Open3D has them); the
@@ -567,15 +567,15 @@ def thinned(surface: Surface, *, tolerance: float, most: int = MANY_TRIANGLES) -
     while wanted < 0.7 * len(surface.triangles):
         thin = whole.simplify_quadric_decimation(wanted)
         points, triangles = np.asarray(thin.vertices), np.asarray(thin.triangles, dtype=np.int64)
-        strays = _strays(surface, points, triangles)
-        if strays <= tolerance and not len(_open_edges(triangles)):
+        outliers = _strays(surface, points, triangles)
+        if outliers <= tolerance and not len(_open_edges(triangles)):
             done = (*surface.done, f"thinned out from {len(surface.triangles)} to {len(triangles)} triangles")
-            return Surface(freeze(points), freeze(triangles, np.int64), surface.cavities, done), strays
+            return ClosedSurface(freeze(points), freeze(triangles, np.int64), surface.cavities, done), outliers
         wanted *= 2
     return surface, 0.0
 
 
-def _strays(surface: Surface, points: FloatArray, triangles: IntArray) -> float:
+def _strays(surface: ClosedSurface, points: FloatArray, triangles: IntArray) -> float:
     """Return the largest distance of points and middles of either surface from the other."""
     middles = points[triangles].mean(axis=1)
     out = distance_to(surface.points, surface.triangles, np.vstack([points, middles])).max()

@@ -23,7 +23,7 @@ from femsense.loop.data.surface_rows import (
     surface_normals,
     with_surface,
 )
-from femsense.loop.data.trial import Groups, States, Surface, Trial, normals_of
+from femsense.loop.data.trial import Groups, States, SurfaceRows, Trial, normals_of
 from femsense.model.effects import FORMS, Effect, Entry, find_effect
 from femsense.model.observation import Scene, make_scene, rest_residual, with_rest_markers
 from femsense.model.recording import Recording, check_against, state_key
@@ -55,14 +55,14 @@ class Data:
     held_of: list[int | None]
     """The training trial whose pose a held-out trial shares; None: it gets its own."""
     split: list[str]
-    seat_std: float
+    placement_std: float
     input_scale: FloatArray
     """Typical range of each cable's input [N] or [m], shape (a,)."""
     declared: Robot
     """As it came."""
     forms: tuple[Effect, ...] = FORMS
     """What may be tried, a user's effects among it."""
-    strays: tuple[tuple[int, str], ...] = ()
+    outliers: tuple[tuple[int, str], ...] = ()
     """Frame numbers and names of markers that are left out because they are far from where others let expect them."""
 
     @property
@@ -134,10 +134,10 @@ def prepare(robot: Robot, recordings: Sequence[Recording], validation: Sequence[
             held.append(one)
             held_of.append(None)
         words.append("validation recording")
-    rest = [r for t in train for r in [_rest_spread(robot, t)] if r is not None]
+    rest = [r for t in train for r in [_rest_std(robot, t)] if r is not None]
     scale = np.max([np.ptp(r.inputs, axis=0) if r.inputs.size else np.zeros(len(robot.body.cables)) for r in recordings], axis=0)
-    seat_std = float(np.sqrt(np.mean(np.square(rest)))) if rest else 1e-3
-    return Data(robot, control, train, held, held_of, words, seat_std, scale, declared)
+    placement_std = float(np.sqrt(np.mean(np.square(rest)))) if rest else 1e-3
+    return Data(robot, control, train, held, held_of, words, placement_std, scale, declared)
 
 
 def _frames_of(recording: Recording, measured: str) -> tuple[IntArray, IntArray]:
@@ -189,8 +189,8 @@ def _trials(
     `first_only` fits the pose on the first frames.
     """
     marked, cloudy = kinds
-    few = fitted[: max(1, round(0.2 * len(fitted)))] if first_only else fitted
-    poses, initial, states = _start(declared, recording, few)
+    cases = fitted[: max(1, round(0.2 * len(fitted)))] if first_only else fitted
+    poses, initial, states = _start(declared, recording, cases)
     low, high = input_bounds(robot, recording)
     every = np.union1d(fitted, kept)
     mesh = declared.body.mesh
@@ -257,17 +257,17 @@ def _bare_scene(robot: Robot, recording: Recording, frames: IntArray, *, with_re
     return with_rest_markers(robot, scene) if with_rest else scene
 
 
-def surface_of(robot: Robot, scene: Scene, poses: Sequence[FloatArray]) -> Surface | None:
+def surface_of(robot: Robot, scene: Scene, poses: Sequence[FloatArray]) -> SurfaceRows | None:
     """Return where the rows of a scene lie on the body, and their normals; None where they are markers."""
     if scene.crossings is None:
         return None
     keys = {k: state_key(scene.recording, int(k)).hex() for k in np.unique(scene.frame)}
     states = np.unique([keys[f] for f in scene.frame], return_inverse=True)[1]
     at_rest = surface_normals(robot, robot.body.mesh.nodes)[scene.marker - len(robot.glued_names)]
-    return Surface(robot.marker_points[scene.marker], normals_of(scene, poses), at_rest, states, SMOOTH * diagonal_of(robot))
+    return SurfaceRows(robot.marker_points[scene.marker], normals_of(scene, poses), at_rest, states, SMOOTH * diagonal_of(robot))
 
 
-def groups_of(scene: Scene, frames: IntArray | None = None, surface: Surface | None = None) -> Groups:
+def groups_of(scene: Scene, frames: IntArray | None = None, surface: SurfaceRows | None = None) -> Groups:
     """Return what the rows of a scene have in common; sweeps are counted among `frames`, by default those of the scene.
 
     `surface`: where the rows lie, if they are of clouds.
@@ -286,7 +286,7 @@ def groups_of(scene: Scene, frames: IntArray | None = None, surface: Surface | N
     )
 
 
-def _rest_spread(robot: Robot, trial: Trial) -> float | None:
+def _rest_std(robot: Robot, trial: Trial) -> float | None:
     if not len(trial.scene.rest_marker):
         return None
     return max(float(np.sqrt((rest_residual(robot, trial.scene, trial.poses) ** 2).mean())), 1e-4)

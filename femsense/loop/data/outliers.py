@@ -15,7 +15,7 @@ from femsense.core.arrays import BoolArray, FloatArray, IntArray
 from femsense.loop.data.dataset import Data
 from femsense.loop.data.trial import Trial
 
-STRAYS = 4.0
+OUTLYING = 4.0
 """A stray is off by so many times what nine in ten are off by at most …"""
 FAR = 0.05
 """… and by more than this share of the body's reach; nearer ones may be what is sought."""
@@ -23,20 +23,20 @@ RARE = 0.02
 """Where more than this share is, it is no accident."""
 
 
-def without_strays(data: Data, fitted: Sequence[FloatArray], held_out: Sequence[FloatArray]) -> Data:
+def without_outliers(data: Data, fitted: Sequence[FloatArray], held_out: Sequence[FloatArray]) -> Data:
     """Return the data without outliers, as residuals (k, c) [m] of the fitted and of the held-out trials show them, and warn of each recording's."""
     train = [_kept(data, t, r) for t, r in zip(data.train, fitted)]
     held = [_kept(data, t, r) for t, r in zip(data.held, held_out)]
     pairs = [*zip(data.train, train), *zip(data.held, held)]
     found = [s for before, after in pairs if after is not before for s in _named(data, before, after)]
-    return replace(data, train=train, held=held, strays=(*data.strays, *found)) if found else data
+    return replace(data, train=train, held=held, outliers=(*data.outliers, *found)) if found else data
 
 
 def _kept(data: Data, trial: Trial, residual: FloatArray) -> Trial:
     """Return a trial without its strays; itself where there are none, or it is of clouds."""
     if trial.scene.crossings is not None:
         return trial
-    off = strays(residual, trial.scene.frame, trial.scene.marker, FAR * data.robot.body.reach)
+    off = outliers(residual, trial.scene.frame, trial.scene.marker, FAR * data.robot.body.reach)
     if not off.any():
         return trial
     scene, keep = trial.scene, ~off
@@ -44,7 +44,7 @@ def _kept(data: Data, trial: Trial, residual: FloatArray) -> Trial:
     return replace(trial, scene=fewer, groups=trial.groups.of_rows(keep), mesh_error=None)
 
 
-def strays(residual: FloatArray, frame: IntArray, marker: IntArray, far: float) -> BoolArray:
+def outliers(residual: FloatArray, frame: IntArray, marker: IntArray, far: float) -> BoolArray:
     """Return which rows of a residual (k, 3) [m] stand out from their frame and their marker by more than `far` [m], and by STRAYS times the 90 % quantile.
 
     Several of a frame that are off the same way are no strays: a part of the body is elsewhere than the model has it. Two that exchanged their names
@@ -52,7 +52,7 @@ def strays(residual: FloatArray, frame: IntArray, marker: IntArray, far: float) 
     """
     apart = _less_medians(_less_medians(residual, frame), marker)
     size = np.linalg.norm(apart, axis=1)
-    off = size > max(far, STRAYS * float(np.quantile(size, 0.9)))
+    off = size > max(far, OUTLYING * float(np.quantile(size, 0.9)))
     for k in np.unique(frame[off]):
         rows = np.flatnonzero(off & (frame == k))
         if len(rows) > 1 and (apart[rows] @ apart[rows].T > 0.0).all():

@@ -23,7 +23,7 @@ from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.mesh import surface_triangles, triangle_normals, vertex_normals
 from femsense.io.clouds.frame_clouds import read_frame_cloud
 from femsense.io.meshing.surface import nearest_on
-from femsense.model.contact_patch import flat_nodes, make_surface
+from femsense.model.contact_patch import body_surface, flat_nodes
 from femsense.model.observation import Hypothesis, Scene, as_measured, evaluate_scene, in_robot_frame
 from femsense.model.recording import Recording
 from femsense.model.robot import Robot, spread_features
@@ -69,7 +69,7 @@ FEWEST_ROWS = 8
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Seen:
+class MeasuredSurface:
     """What the cameras measured of the robot."""
 
     points: dict[tuple[int, int], FloatArray]
@@ -96,7 +96,7 @@ def cloud_frames(recording: Recording) -> IntArray:
 
 def with_surface(robot: Robot) -> Robot:
     """Return the robot with points of its free surface behind its markers, evenly spread and off sharp edges."""
-    surface = make_surface(robot.body.mesh)
+    surface = body_surface(robot.body.mesh)
     nodes = robot.body.mesh.nodes
     flat = spread_features(robot.body, SURFACE_POINTS, among=flat_nodes(surface, nodes))
     chosen = flat if len(flat) >= FEWEST_POINTS else spread_features(robot.body, SURFACE_POINTS)
@@ -111,7 +111,9 @@ def diagonal_of(robot: Robot) -> float:
 # What the cameras measured
 
 
-def read_clouds(robot: Robot, recording: Recording, states: dict[int, Equilibrium], poses: tuple[FloatArray, ...]) -> Seen:
+def read_clouds(
+    robot: Robot, recording: Recording, states: dict[int, Equilibrium], poses: tuple[FloatArray, ...]
+) -> MeasuredSurface:
     """Return the robot's points in the clouds of some frames.
 
     Arguments:
@@ -137,7 +139,7 @@ def read_clouds(robot: Robot, recording: Recording, states: dict[int, Equilibriu
         raise DataError(
             "no camera sees the robot in any frame that can be used: check T_robot_camera, appearance.color_rgb, and that the clouds are in metres"
         )
-    return Seen(points, joined([_sheet_of(own, RADIUS * voxel) for own in points.values()]), voxel)
+    return MeasuredSurface(points, joined([_sheet_of(own, RADIUS * voxel) for own in points.values()]), voxel)
 
 
 def _sheet_of(points: FloatArray, radius: float) -> Sheets:
@@ -190,7 +192,9 @@ def states_of(
 # Rows
 
 
-def make_rows(robot: Robot, scene: Scene, seen: Seen, states: dict[int, Equilibrium], poses: list[FloatArray]) -> Scene:
+def make_rows(
+    robot: Robot, scene: Scene, seen: MeasuredSurface, states: dict[int, Equilibrium], poses: list[FloatArray]
+) -> Scene:
     """Return the scene of a recording's clouds: one row for each point of the surface whose normal the measured surface crosses.
 
     Arguments:
@@ -223,7 +227,7 @@ def make_rows(robot: Robot, scene: Scene, seen: Seen, states: dict[int, Equilibr
 
 
 def _crossings_of(
-    robot: Robot, seen: Seen, sheet: int, state: Equilibrium, pose: FloatArray
+    robot: Robot, seen: MeasuredSurface, sheet: int, state: Equilibrium, pose: FloatArray
 ) -> tuple[IntArray, FloatArray, Crossings]:
     """Return the numbers of the surface points whose normals one measured surface crosses amid measured points, how far outside of the model
     [m], and where."""
@@ -254,7 +258,7 @@ def _amid(places: FloatArray, normals: FloatArray, points: FloatArray, radius: f
 
 
 def _rounded(
-    robot: Robot, seen: Seen, sheet: int, state: Equilibrium, pose: FloatArray, at: FloatArray, sides: FloatArray
+    robot: Robot, seen: MeasuredSurface, sheet: int, state: Equilibrium, pose: FloatArray, at: FloatArray, sides: FloatArray
 ) -> FloatArray:
     """Return how far places on the model lie outside of its own surface as it would be measured [m], shape (k,); NaN: not measured there."""
     points, (centres, normals) = seen.cloud(sheet), seen.sheets.fields_of(sheet)
@@ -308,7 +312,9 @@ def _without_outliers(robot: Robot, scene: Scene, heights: FloatArray) -> Scene:
     )
 
 
-def renewed_rows(robot: Robot, scene: Scene, seen: Seen, states: dict[int, Equilibrium], poses: list[FloatArray]) -> Scene:
+def renewed_rows(
+    robot: Robot, scene: Scene, seen: MeasuredSurface, states: dict[int, Equilibrium], poses: list[FloatArray]
+) -> Scene:
     """Return the same rows with what the model rounds off counted anew where it now has the surface."""
     assert scene.crossings is not None
     rounded = scene.crossings.rounded.copy()

@@ -15,7 +15,7 @@ from femsense.fem.mesh import TetMesh
 from femsense.model.observation import Scene
 
 if TYPE_CHECKING:
-    from femsense.loop.data.surface_rows import Seen
+    from femsense.loop.data.surface_rows import MeasuredSurface
 
 
 COMPONENTS = ("white", "state", "marker", "frame", "sweep")
@@ -30,13 +30,13 @@ class Groups:
     sweep: IntArray
     state: IntArray
     """Marker within a state (same inputs and loads)."""
-    surface: Surface | None = None
+    surface: SurfaceRows | None = None
     """Where the rows lie if they are points of a surface; None: they are markers, three axes each."""
     turns: FloatArray | None = None
     """By how much a marker moves if its place on the body at rest does, shape (k, 3, 3), by the axes of that place last; None: as if it did not turn."""
 
     @property
-    def seats(self) -> FloatArray | None:
+    def placements(self) -> FloatArray | None:
         """The fields of markers that sit elsewhere by a unit, shape (k, 3, 3 markers); None: not known."""
         if self.turns is None:
             return None
@@ -82,7 +82,7 @@ class Groups:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Surface:
+class SurfaceRows:
     """Rows of a cloud: where they lie on the body, and along which normals they are measured."""
 
     points: FloatArray
@@ -110,9 +110,9 @@ class Surface:
         groups = self.states if name == "state" else labels
         return np.asarray(alike * (groups[:, None] == groups[None, :]))
 
-    def of_rows(self, rows: BoolArray | IntArray) -> Surface:
+    def of_rows(self, rows: BoolArray | IntArray) -> SurfaceRows:
         """Return some of the rows."""
-        return Surface(self.points[rows], self.normals[rows], self.rest_normals[rows], self.states[rows], self.length)
+        return SurfaceRows(self.points[rows], self.normals[rows], self.rest_normals[rows], self.states[rows], self.length)
 
     def cells(self) -> int:
         """Return the number of cells of the size of ℓ that are seen, summed over states."""
@@ -142,7 +142,7 @@ class Trial:
     """Fields of what a finer mesh would move the markers by [m], shape (k, c, b); each counts as noise of its size (`loop.fit.discretisation_error`)."""
     together: bool = False
     """Whether these are the clouds of the recording whose markers are the trial before: pose and initial inputs are shared."""
-    seen: Seen | None = None
+    seen: MeasuredSurface | None = None
     """What the cameras measured of the robot; only of clouds."""
     frames: IntArray | None = None
     """All frames of the recording that are fitted (or held out) with these, markers and clouds; None: those of the scene."""

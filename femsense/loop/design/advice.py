@@ -13,8 +13,18 @@ from femsense.core.errors import FemsenseError
 from femsense.core.parallel import each
 from femsense.loop.data.dataset import NUISANCE, Data
 from femsense.loop.data.trial import Trial, numbers_of
-from femsense.loop.design.candidate_experiments import Element, menu, setup_for
-from femsense.loop.design.identifiability import EVIDENCE, Block, Form, Judge, Outlook, Row, forms_of, make_block, turns_of
+from femsense.loop.design.candidate_experiments import Element, candidate_experiments, setup_for
+from femsense.loop.design.identifiability import (
+    EVIDENCE,
+    Block,
+    Form,
+    Identifiability,
+    Judge,
+    Row,
+    forms_of,
+    make_block,
+    turns_of,
+)
 from femsense.loop.design.planner import Proposal, element_block
 from femsense.loop.fit.joint_fit import JointFit
 from femsense.loop.fit.noise_components import Noise
@@ -30,20 +40,20 @@ MOST_LOOKED_AT = 6
 # Tables
 
 
-def outlook_text(outlook: Outlook, before: Outlook | None = None) -> str:
+def identifiability_text(identifiability: Identifiability, before: Identifiability | None = None) -> str:
     """Return what an experiment could show as a table; with what came before beside it."""
     first = {r.label: r for r in before.rows} if before is not None else {}
-    wide = max(len(r.label) for r in outlook.rows) + 2
+    wide = max(len(r.label) for r in identifiability.rows) + 2
     head = f"{'effect':{wide}}{'left by calibration':>22}{'smallest seen':>32}{'dBIC at plausible size':>26}"
     lines = [head, "-" * len(head)]
-    for r in outlook.rows:
+    for r in identifiability.rows:
         old = first.get(r.label)
         cells = [_arrow(None if old is None else old.retained, r.retained, "{:.1%}"), _both(old, r)]
         cells.append(_arrow(None if old is None else old.dbic, r.dbic, "{:.0f}"))
         lines.append(f"{r.label:{wide}}{cells[0]:>22}{cells[1]:>32}{cells[2]:>26}  {_verdict(r)}")
-    for label in (k for k in first if k not in {r.label for r in outlook.rows}):
+    for label in (k for k in first if k not in {r.label for r in identifiability.rows}):
         lines.append(f"{label:{wide}}measured by rest.csv, no longer in question")
-    return "\n".join([*lines, "", *_summary(outlook, before)])
+    return "\n".join([*lines, "", *_summary(identifiability, before)])
 
 
 def _arrow(old: float | None, new: float, form: str) -> str:
@@ -78,21 +88,21 @@ def _verdict(r: Row) -> str:
     return "" if r.seen else "too small to be seen" if r.testable else "not testable"
 
 
-def _summary(outlook: Outlook, before: Outlook | None) -> list[str]:
+def _summary(identifiability: Identifiability, before: Identifiability | None) -> list[str]:
     def count(what: str) -> str:
-        new = len(getattr(outlook, what)()) if what == "confused" else len(getattr(outlook, what))
+        new = len(getattr(identifiability, what)()) if what == "confused" else len(getattr(identifiability, what))
         if before is None:
             return str(new)
         old = len(before.confused()) if what == "confused" else len(getattr(before, what))
         return f"{old} → {new}"
 
-    apart = " → ".join("{} of {}".format(*o.told_apart()) for o in (before, outlook) if o is not None)
+    apart = " → ".join("{} of {}".format(*o.distinguished()) for o in (before, identifiability) if o is not None)
     lines = [
         f"not testable: {count('untestable')}; too small to be seen: {count('unseen')}; pairs of effects that would be told apart: {apart}",
         f"pairs that would both be seen and look alike: {count('confused')}",
     ]
-    for i, j, share, gap in sorted(outlook.confused(), key=lambda p: p[3])[:12]:
-        names = f"{outlook.rows[i].label} / {outlook.rows[j].label}"
+    for i, j, share, gap in sorted(identifiability.confused(), key=lambda p: p[3])[:12]:
+        names = f"{identifiability.rows[i].label} / {identifiability.rows[j].label}"
         lines.append(f"  {names}: one imitates {100 * share:.0f} % of the other, dBIC gap {gap:.0f}")
     return lines
 
@@ -113,7 +123,7 @@ def proposal_text(proposal: Proposal) -> str:
     note = (
         "Validation needs frames beyond these: one more sweep of a kind that is not in the list (femsense improve --validation)."
     )
-    return "\n".join([*lines, "", note, "", title, "", outlook_text(proposal.after, proposal.before)])
+    return "\n".join([*lines, "", note, "", title, "", identifiability_text(proposal.after, proposal.before)])
 
 
 # What a finished loop asks for
@@ -138,7 +148,7 @@ def next_element(
     """
     robot = fit.hypothesis.robot_at(fit.coordinates)
     names = {n for pair in confounded for n in pair} | set(not_testable)
-    trials = [_few(t) for t in data.train]
+    trials = [_representative(t) for t in data.train]
     tets = len(robot.body.mesh.tets)
     past = has_history(robot) or "cable_friction" in names
     cost = sum(int(t.scene.frames.max()) + 1 if past else len(t.scene.frames) for t in trials)
@@ -149,7 +159,7 @@ def next_element(
         marked = robot.without_surface_points() if robot.glued_names else robot  # what an experiment would have on it
         setup = setup_for(marked, data.control, zero, most=data.input_scale)
         forms = _open_forms(robot, data, names)
-        shares = [len(few.scene.frames) / len(t.scene.frames) for few, t in zip(trials, data.train)]
+        shares = [len(cases.scene.frames) / len(t.scene.frames) for cases, t in zip(trials, data.train)]
         have = [
             _trial_block(t, robot, forms, noise.row_std(t.groups) * np.sqrt(share), str(number))
             for t, share, number in zip(trials, shares, numbers_of(data.train))
@@ -160,7 +170,7 @@ def next_element(
     now = _open(judge.judge(have), confounded, not_testable)
     questions = [*(f"{a} or {b}" for a, b in confounded), *not_testable]
     chosen = []
-    for element in _one_of_each_first(menu(setup)):
+    for element in _one_of_each_first(candidate_experiments(setup)):
         if element.sweeps and element.frames < left:
             left -= element.frames + 1
             chosen.append(element)
@@ -188,7 +198,7 @@ def _one_of_each_first(elements: Sequence[Element]) -> list[Element]:
     return [e for _, _, e in sorted(((kinds[:i].count(kinds[i]), i, e) for i, e in enumerate(elements)), key=lambda t: t[:2])]
 
 
-def _few(trial: Trial) -> Trial:
+def _representative(trial: Trial) -> Trial:
     frames = trial.scene.frames
     every = np.unique(np.linspace(0, len(frames) - 1, min(MOST_LOOKED_AT, len(frames))).round().astype(int))
     return replace(trial.part(frames[every]), together=False)  # it goes by its number with the markers of its recording
@@ -205,10 +215,13 @@ def _trial_block(trial: Trial, robot: Robot, forms: list[Form], noise: float, ke
     return make_block(trial, robot, forms, recording=key, noise=noise, turns=turns, measured=True)
 
 
-def _open(outlook: Outlook, pairs: Sequence[tuple[str, str]], not_testable: Sequence[str]) -> FloatArray:
+def _open(identifiability: Identifiability, pairs: Sequence[tuple[str, str]], not_testable: Sequence[str]) -> FloatArray:
     """Return the expected evidence on each open question: the gap of a pair, or of an effect over no effect."""
-    of = {frozenset({outlook.rows[i].name, outlook.rows[j].name}): gap for i, j, _, gap in reversed(outlook.pairs())}
-    alone = {r.name: r.dbic for r in reversed(outlook.rows)}
+    of = {
+        frozenset({identifiability.rows[i].name, identifiability.rows[j].name}): gap
+        for i, j, _, gap in reversed(identifiability.pairs())
+    }
+    alone = {r.name: r.dbic for r in reversed(identifiability.rows)}
     answers: list[Any] = [of.get(frozenset(p), EVIDENCE) for p in pairs]
     answers += [alone.get(n, EVIDENCE) for n in not_testable]
     return np.array(answers or [EVIDENCE])

@@ -17,7 +17,7 @@ from femsense.core.arrays import FloatArray
 from femsense.core.errors import DataError
 from femsense.core.parallel import each
 from femsense.fem.equilibrium import Equilibrium
-from femsense.model.drive import Walk, drive_of
+from femsense.model.drive import DrivenRobot, drive_of
 from femsense.model.effects.loads import STANDARD_GRAVITY
 from femsense.model.recording import make_recording
 from femsense.model.robot import Robot, spread_features
@@ -140,7 +140,7 @@ def minimal(setup: Setup) -> list[Element]:
     return [Element("rest", "record the robot at rest", (_sweep("rest", [], [0.0]),)), *(_up(p) for p in setup.pulls)]
 
 
-def menu(setup: Setup) -> list[Element]:
+def candidate_experiments(setup: Setup) -> list[Element]:
     """Return what may be added, in a fixed order."""
     leads = _leads(setup.pulls)
     items = [_unload(p) for p in setup.pulls]
@@ -304,7 +304,7 @@ def _small_step(robot: Robot, control: str, kind: str, top: float) -> float:
     return 0.01 * top if np.isfinite(top) else scale
 
 
-def _still(robot: Robot, control: str, inputs: FloatArray, loads: dict[str, Any] | None = None) -> Walk:
+def _still(robot: Robot, control: str, inputs: FloatArray, loads: dict[str, Any] | None = None) -> DrivenRobot:
     """Return a walk over inputs of cables and chambers (F, a + c)."""
     a = len(robot.body.cables)
     recording = make_recording(
@@ -316,7 +316,7 @@ def _still(robot: Robot, control: str, inputs: FloatArray, loads: dict[str, Any]
         pressures=inputs[:, a:],
         **(loads or {}),
     )
-    return Walk(robot, drive_of(robot, recording))
+    return DrivenRobot(robot, drive_of(robot, recording))
 
 
 def _moves(robot: Robot, control: str, small: FloatArray, tip: FloatArray, gravity: FloatArray) -> tuple[FloatArray, float]:
@@ -324,10 +324,10 @@ def _moves(robot: Robot, control: str, small: FloatArray, tip: FloatArray, gravi
     push = 1e-3 * gravity / np.linalg.norm(gravity)
     inputs = np.vstack([np.zeros(len(small)), np.diag(small), np.zeros(len(small))])
     loads = {"load_frame": [len(inputs) - 1], "load_points": tip[None], "load_forces": push[None]}
-    walk = _still(robot, control, inputs, loads)
+    driven = _still(robot, control, inputs, loads)
 
     def place(k: int, start: Equilibrium | None) -> tuple[Equilibrium, FloatArray]:
-        state = solve_frame(walk, k, start=start, single=True)
+        state = solve_frame(driven, k, start=start, single=True)
         if not state.converged:
             raise DataError(f"the declared robot has no equilibrium near rest: {state.status}: {state.advice}")
         return state, robot.markers.positions(state.positions)

@@ -197,7 +197,7 @@ class Block:
     gram: Gram
     rested: Gram | None
     """The same with rest.csv; None where it was not asked for."""
-    seats: Gram
+    placements: Gram
     """What rest.csv says, once a recording."""
     states: int
     """Distinct states of markers."""
@@ -237,9 +237,9 @@ def make_block(
     rows = _seen(trial, robot, jet) if see else np.ones(len(jet.residual), dtype=bool)
     columns, rest_columns = _columns(trial, robot, jet, forms, turns, width=max((f.columns.stop for f in forms), default=0))
     states = len(np.unique(trial.groups.state[rows]))
-    gram, seats = _gram(_own(jet)[rows], columns[rows], noise), _seats(jet, rest_columns, noise)
+    gram, placements = _gram(_own(jet)[rows], columns[rows], noise), _placements(jet, rest_columns, noise)
     if not with_rest:
-        return Block(recording, gram, None, seats, states, int(rows.sum()))
+        return Block(recording, gram, None, placements, states, int(rows.sum()))
     placed = _with_rest(trial, robot)
     jet = _jet(placed, robot)
     moved = [f for f in forms if f.name in ("geometry", "depth_scale")]  # the others leave the measured seats where they are
@@ -247,7 +247,7 @@ def make_block(
     for f in moved:
         columns[:, :, f.columns] = fresh[:, :, f.columns]
     rested = _gram(_own(jet)[rows], columns[rows], noise)
-    return Block(recording, gram, rested, _seats(jet, rest_columns, noise), states, int(rows.sum()))
+    return Block(recording, gram, rested, _placements(jet, rest_columns, noise), states, int(rows.sum()))
 
 
 def _own(jet: SceneJet) -> FloatArray:
@@ -305,10 +305,10 @@ def _columns(
     where = {(id(f.effect), id(f.seed)): f for f in forms}
     for i, (effect, seed, _) in enumerate(fields.todo):
         form = where[id(effect), id(seed)]
-        (own,), (seats,) = fields.of(i)
+        (own,), (placements,) = fields.of(i)
         if form.effect is WEIGHT and turns is not None:
             own = np.einsum("kci,kij->kcj", own, turns[trial.scene.frame])
-        result[:, :, form.columns], rest[:, :, form.columns] = own, seats
+        result[:, :, form.columns], rest[:, :, form.columns] = own, placements
     return result, rest
 
 
@@ -317,7 +317,7 @@ def _gram(own: FloatArray, shared: FloatArray, noise: float) -> Gram:
     return Gram(A.T @ A, A.T @ B, B.T @ B)
 
 
-def _seats(jet: SceneJet, shared: FloatArray, noise: float) -> Gram:
+def _placements(jet: SceneJet, shared: FloatArray, noise: float) -> Gram:
     """Return what measured seats say; they are trusted as markers are, but not better than 0.1 mm."""
     r = len(jet.rest)
     own = np.concatenate(
@@ -370,7 +370,7 @@ class Row:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Outlook:
+class Identifiability:
     """What an experiment could show."""
 
     rows: tuple[Row, ...]
@@ -393,7 +393,7 @@ class Outlook:
         seen = [r.seen for r in self.rows]
         return [p for p in self.pairs() if seen[p[0]] and seen[p[1]] and (p[2] > ALIKE or p[3] < EVIDENCE)]
 
-    def told_apart(self) -> tuple[int, int]:
+    def distinguished(self) -> tuple[int, int]:
         """Return the number of pairs of effects that would both be seen and told apart, and of all pairs."""
         pairs = self.pairs()
         seen = sum(self.rows[i].seen and self.rows[j].seen for i, j, *_ in pairs)
@@ -433,7 +433,7 @@ class Judge:
         for i, f in enumerate(self.forms):
             self._by_label.setdefault(f.label, []).append(i)
 
-    def judge(self, blocks: Sequence[Block], *, rest: bool = False) -> Outlook:
+    def judge(self, blocks: Sequence[Block], *, rest: bool = False) -> Identifiability:
         """Return what an experiment could show.
 
         Arguments:
@@ -453,7 +453,7 @@ class Judge:
                 if a.name != b.name:
                     left = free[self._dropped(a.label) | self._dropped(b.label)]
                     confounding[i, j], gap[i, j] = left.rival(self.forms.index(a.form), self._by_label[b.label])
-        return Outlook(tuple(rows), confounding, gap)
+        return Identifiability(tuple(rows), confounding, gap)
 
     def _dropped(self, label: str) -> frozenset[str]:
         return frozenset({label} & set(self.calibrated))
@@ -471,7 +471,7 @@ class Judge:
         for key in dict.fromkeys(b.recording for b in blocks):
             mine = [b for b in blocks if b.recording == key]
             grams = [b.rested if rest and b.rested is not None else b.gram for b in mine]
-            grams += [mine[0].seats] if rest or mine[0].rested is None else []
+            grams += [mine[0].placements] if rest or mine[0].rested is None else []
             own, cross, shared = (np.sum([getattr(g, n) for g in grams], axis=0) for n in ("own", "cross", "shared"))
             left, whole = left + shared - cross.T @ _inverse(own) @ cross, whole + shared
         return np.asarray(left), np.asarray(whole)

@@ -10,12 +10,12 @@ import numpy as np
 from femsense.loop.data.dataset import Data
 from femsense.loop.data.trial import heads_of
 from femsense.loop.design.advice import next_element
-from femsense.loop.fit.fitted_model import Stage
+from femsense.loop.fit.fitted_model import FittedModel
 from femsense.loop.fit.noise_components import Noise
 
 
 def next_experiment(
-    data: Data, final: Stage, noise: Noise, rivals: Sequence[dict[str, Any]], not_testable: Sequence[dict[str, Any]]
+    data: Data, final: FittedModel, noise: Noise, rivals: Sequence[dict[str, Any]], not_testable: Sequence[dict[str, Any]]
 ) -> str:
     """Return in words what to record to tell apart what these data cannot: as predicted where that is cheap, else by rule."""
     pairs = [(r["pair"][0], r["pair"][1]) for r in rivals]

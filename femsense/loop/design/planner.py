@@ -1,6 +1,6 @@
 """The experiment advisor: which recording makes effects distinguishable, with the predicted confusion before and after.
 
-Columns of every item of the menu are computed once (`outlook`); the search over experiments is linear algebra only. It starts from
+Columns of every item of the menu are computed once (`identifiability`); the search over experiments is linear algebra only. It starts from
 the least that is worth recording, or from a recording that exists, and adds what lowers the confusion most, as long as anything
 does and the frames suffice.
 """
@@ -19,8 +19,19 @@ from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import FemsenseError, InputError
 from femsense.loop.data.dataset import groups_of, marked_frames
 from femsense.loop.data.trial import Trial
-from femsense.loop.design.candidate_experiments import Element, Setup, menu, minimal, script_of, setup_for
-from femsense.loop.design.identifiability import ALIKE, EVIDENCE, Block, Form, Judge, Outlook, Row, forms_of, make_block, turns_of
+from femsense.loop.design.candidate_experiments import Element, Setup, candidate_experiments, minimal, script_of, setup_for
+from femsense.loop.design.identifiability import (
+    ALIKE,
+    EVIDENCE,
+    Block,
+    Form,
+    Identifiability,
+    Judge,
+    Row,
+    forms_of,
+    make_block,
+    turns_of,
+)
 from femsense.model.observation import make_scene
 from femsense.model.recording import Recording, check_against, make_recording
 from femsense.model.robot import Robot
@@ -61,8 +72,8 @@ class Proposal:
     steps: tuple[Step, ...]
     left_out: tuple[str, ...]
     """Items without an equilibrium on the declared robot."""
-    before: Outlook
-    after: Outlook
+    before: Identifiability
+    after: Identifiability
 
     @property
     def elements(self) -> tuple[Element, ...]:
@@ -103,7 +114,11 @@ def plan_experiment(
     setup = setup_for(robot, control if given is None else given.actuation, zero, most=most)
     ranges = np.array([p.height for p in setup.pulls if p.kind == "cables"])
     forms = _forms(robot, setup.control, zero, ranges)
-    start, extras = ([], [*minimal(setup)[:1], *menu(setup)]) if given is not None else (minimal(setup), menu(setup))
+    start, extras = (
+        ([], [*minimal(setup)[:1], *candidate_experiments(setup)])
+        if given is not None
+        else (minimal(setup), candidate_experiments(setup))
+    )
     if sum(e.frames for e in start) > frames:
         raise InputError(
             "too few frames",
@@ -125,7 +140,9 @@ def plan_experiment(
     return Proposal(setup, noise, tuple(start), tuple(steps), tuple(left_out), before, after)
 
 
-def outlook_of_script(robot: Robot, script: ScriptTable, where: Path = Path("script"), *, noise: float = NOISE_M) -> Outlook:
+def identifiability_of_script(
+    robot: Robot, script: ScriptTable, where: Path = Path("script"), *, noise: float = NOISE_M
+) -> Identifiability:
     """Return what the experiment of a script could show, if it is recorded and closes the loop with all its free frames.
 
     Arguments:
@@ -267,12 +284,12 @@ def _given_block(robot: Robot, recording: Recording, forms: list[Form], noise: f
 
 
 def _grow(
-    judge: Judge, have: list[Block], blocks: dict[str, Block], extras: list[Element], start: Outlook, budget: int
-) -> tuple[list[Step], Outlook]:
+    judge: Judge, have: list[Block], blocks: dict[str, Block], extras: list[Element], start: Identifiability, budget: int
+) -> tuple[list[Step], Identifiability]:
     """Return what is added, in order, and what all of it could show."""
     steps, now, rest = list[Step](), start, False
     while True:
-        best: tuple[float, Element, Outlook] | None = None
+        best: tuple[float, Element, Identifiability] | None = None
         for element in (e for e in extras if e.frames <= budget):
             more = [] if element.rest_file else [blocks[element.key]]
             then = judge.judge([*have, *more], rest=rest or element.rest_file)
@@ -287,7 +304,7 @@ def _grow(
         extras = [e for e in extras if e is not element]
 
 
-def _better(before: Outlook, after: Outlook) -> list[str]:
+def _better(before: Identifiability, after: Identifiability) -> list[str]:
     """Return in words what an experiment shows that another does not."""
     then = {r.label: r for r in after.rows}
     words = []
@@ -313,8 +330,8 @@ def _better(before: Outlook, after: Outlook) -> list[str]:
     return words
 
 
-def _names(outlook: Outlook, pair: tuple[int, int, float, float]) -> tuple[str, str]:
-    return outlook.rows[pair[0]].label, outlook.rows[pair[1]].label
+def _names(identifiability: Identifiability, pair: tuple[int, int, float, float]) -> tuple[str, str]:
+    return identifiability.rows[pair[0]].label, identifiability.rows[pair[1]].label
 
 
 def _alike(pair: tuple[int, int, float, float]) -> bool:
@@ -324,17 +341,19 @@ def _alike(pair: tuple[int, int, float, float]) -> bool:
 # Documents
 
 
-def outlook_document(outlook: Outlook) -> dict[str, Any]:
+def identifiability_document(identifiability: Identifiability) -> dict[str, Any]:
     """Return what an experiment could show as plain tables."""
     return {
-        "effects": [_row_document(r) for r in outlook.rows],
-        "not_testable": outlook.untestable,
-        "not_seen": outlook.unseen,
-        "confounded": [{"pair": list(_names(outlook, p)), "cosine": p[2], "dbic_gap": p[3]} for p in outlook.confused()],
-        "confusion": outlook.confusion,
-        "names": [r.label for r in outlook.rows],
-        "confounding": outlook.confounding,
-        "dbic_gap": outlook.gap,
+        "effects": [_row_document(r) for r in identifiability.rows],
+        "not_testable": identifiability.untestable,
+        "not_seen": identifiability.unseen,
+        "confounded": [
+            {"pair": list(_names(identifiability, p)), "cosine": p[2], "dbic_gap": p[3]} for p in identifiability.confused()
+        ],
+        "confusion": identifiability.confusion,
+        "names": [r.label for r in identifiability.rows],
+        "confounding": identifiability.confounding,
+        "dbic_gap": identifiability.gap,
     }
 
 
@@ -382,6 +401,6 @@ def proposal_document(proposal: Proposal) -> dict[str, Any]:
             for e in proposal.elements
         ],
         "left_out": list(proposal.left_out),
-        "before": outlook_document(proposal.before),
-        "after": outlook_document(proposal.after),
+        "before": identifiability_document(proposal.before),
+        "after": identifiability_document(proposal.after),
     }

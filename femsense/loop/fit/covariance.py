@@ -20,7 +20,7 @@ from femsense.core.least_squares import covariance_of
 from femsense.loop.data.dataset import Data
 from femsense.loop.data.trial import Trial
 from femsense.loop.fit.cross_validation import half_inverse, sweep_rows
-from femsense.loop.fit.fitted_model import Stage
+from femsense.loop.fit.fitted_model import FittedModel
 from femsense.loop.fit.joint_fit import GRAVITY_STD, JointFit, JointProblem, Prior
 from femsense.loop.fit.noise_components import Noise
 from femsense.model.effects.loads import STANDARD_GRAVITY
@@ -34,23 +34,23 @@ SEED_STD = 0.7
 """How well a seed's own number is known beforehand, in its coordinate (the logarithm of a time: a factor of two)."""
 
 
-def spreads(data: Data, stage: Stage, noise: Noise, seed_spread: dict[str, FloatArray]) -> dict[str, FloatArray]:
+def parameter_std(data: Data, fitted: FittedModel, noise: Noise, seed_std: dict[str, FloatArray]) -> dict[str, FloatArray]:
     """Return the standard deviations of the coordinates of each effect.
 
     Arguments:
         data, stage, noise: of the final fit.
         seed_spread: effect → scatter of its coordinates over seeds that explain as much.
     """
-    own = stage.fit.own
+    own = fitted.fit.own
     std = np.maximum.reduce(
-        [coordinate_std(stage.fit, data.train, noise), _by_sweeps(data, stage)[own:], _with_open_seeds(data, stage, noise)]
+        [coordinate_std(fitted.fit, data.train, noise), _by_sweeps(data, fitted)[own:], _with_open_seeds(data, fitted, noise)]
     )
     result, at = dict[str, FloatArray](), 0
-    for effect, _, parameters in stage.fit.hypothesis.terms:
+    for effect, _, parameters in fitted.fit.hypothesis.terms:
         part = std[at : at + len(parameters)]
         at += len(parameters)
         extra = np.zeros(len(part))
-        known = seed_spread.get(effect.name, extra)
+        known = seed_std.get(effect.name, extra)
         extra[: len(known)] = known[: len(part)]
         result[effect.name] = np.hypot(part, extra)
     return result
@@ -130,10 +130,10 @@ def _directions(estimate: FloatArray) -> tuple[FloatArray, FloatArray]:
     return directions.reshape(-1, 3), np.repeat(np.sin(ring) * np.diff(edge), SPOKES)
 
 
-def _by_sweeps(data: Data, stage: Stage) -> FloatArray:
+def _by_sweeps(data: Data, fitted: FittedModel) -> FloatArray:
     """Return the standard deviations of all parameters that the disagreement of sweeps shows, shape (p,)."""
-    J, r = np.asarray(stage.fit.fit.jacobian), np.asarray(stage.fit.fit.residual)
-    sweeps = sweep_rows(data.train, stage.fit)
+    J, r = np.asarray(fitted.fit.fit.jacobian), np.asarray(fitted.fit.fit.residual)
+    sweeps = sweep_rows(data.train, fitted.fit)
     if len(sweeps) < LEAST_SWEEPS:
         return np.zeros(J.shape[1])
     A = half_inverse(J)
@@ -146,28 +146,28 @@ def _by_sweeps(data: Data, stage: Stage) -> FloatArray:
     return np.asarray(np.sqrt(np.sum(np.square(pulls), axis=0)))
 
 
-def _with_open_seeds(data: Data, stage: Stage, noise: Noise) -> FloatArray:
+def _with_open_seeds(data: Data, fitted: FittedModel, noise: Noise) -> FloatArray:
     """Return the standard deviations of the coordinates with the numbers that seeds held still fitted along, shape (p,)."""
-    hypothesis = stage.fit.hypothesis
-    terms, null, fitted, known = [], [], [], []
+    hypothesis = fitted.fit.hypothesis
+    terms, null, moving, known = [], [], [], []
     at = 0
     for effect, seed, parameters in hypothesis.terms:
         held = {p.key for p in parameters}
         more = tuple(p for p in effect.polish(data.robot, data.control, seed) if p.key not in held)
         terms.append((effect, seed, (*parameters, *more)))
-        null += [*stage.fit.coordinates[at : at + len(parameters)], *(p.null for p in more)]
-        fitted += [True] * len(parameters) + [False] * len(more)
+        null += [*fitted.fit.coordinates[at : at + len(parameters)], *(p.null for p in more)]
+        moving += [True] * len(parameters) + [False] * len(more)
         known += [min(p.known, SEED_STD) for p in (*parameters, *more)]
         at += len(parameters)
-    mask = np.array(fitted, dtype=bool)
+    mask = np.array(moving, dtype=bool)
     if mask.all():
-        return np.zeros(len(stage.fit.coordinates))
+        return np.zeros(len(fitted.fit.coordinates))
     mean, std = np.array(null), np.array(known)
-    mean[mask], std[mask] = stage.fit.prior.mean, stage.fit.prior.std
+    mean[mask], std[mask] = fitted.fit.prior.mean, fitted.fit.prior.std
     factors = [noise.whitener(t.groups, t.mesh_error) for t in data.train]
-    problem = JointProblem(replace(hypothesis, terms=tuple(terms)), Prior(mean, std), data.train, factors, data.seat_std)
-    theta = np.concatenate([stage.fit.fit.theta[: stage.fit.own], null])
+    problem = JointProblem(replace(hypothesis, terms=tuple(terms)), Prior(mean, std), data.train, factors, data.placement_std)
+    theta = np.concatenate([fitted.fit.fit.theta[: fitted.fit.own], null])
     jacobian = problem.evaluate(theta, True)[1]
     assert jacobian is not None
-    variance = np.diag(covariance_of(jacobian))[stage.fit.own :]
+    variance = np.diag(covariance_of(jacobian))[fitted.fit.own :]
     return np.asarray(np.sqrt(np.maximum(variance[mask], 0.0)))

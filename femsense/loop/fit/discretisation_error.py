@@ -23,12 +23,12 @@ from femsense.fem.mesh import Embedding, TetMesh, embed_points
 from femsense.loop.data.dataset import Data
 from femsense.loop.data.representative_states import between, representatives, state_vectors
 from femsense.loop.data.trial import Trial, normals_of, rms_of
-from femsense.loop.fit.fitted_model import Stage, placed, some_terms
+from femsense.loop.fit.fitted_model import FittedModel, poses_and_inputs, some_terms
 from femsense.loop.fit.noise_components import Noise, whiten
-from femsense.model.drive import Walk, drive_of
+from femsense.model.drive import DrivenRobot, drive_of
 from femsense.model.finer_mesh import finer_state, share_on_finer
-from femsense.model.observation import seats
-from femsense.model.quasi_static_path import walk_along
+from femsense.model.observation import placements
+from femsense.model.quasi_static_path import solve_path
 from femsense.model.remeshing import finer_mesh, robot_on_mesh
 from femsense.model.robot import Robot
 
@@ -50,17 +50,17 @@ PULLING = "cables", "cable_slots"
 """What of a body only tells how its cables pull."""
 
 
-def with_mesh_errors(data: Data, stage: Stage, tried: Sequence[str]) -> Data:
+def with_mesh_errors(data: Data, fitted: FittedModel, tried: Sequence[str]) -> Data:
     """Return the data with the error of the mesh at a stage; without it where the mesh is huge, or linear and `discretisation` among the
     effects that are tried."""
-    robot = stage.fit.hypothesis.robot_at(stage.fit.coordinates)
-    train, held, fitted = list(data.train), list(data.held), placed(data, stage.fit)
+    robot = fitted.fit.hypothesis.robot_at(fitted.fit.coordinates)
+    train, held, known = list(data.train), list(data.held), poses_and_inputs(data, fitted.fit)
     try:
         finer = _finer(robot.body.mesh, tried)
         if finer is None:
             return data
         fine = _on_its_clamp(robot, robot_on_mesh(_on_firm_clamp(robot), finer))
-        for i, (trial, (poses, initial)) in enumerate(zip(data.train, fitted)):
+        for i, (trial, (poses, initial)) in enumerate(zip(data.train, known)):
             own = [j for j, of in enumerate(data.held_of) if of == i]
             train[i], *later = _with_errors(robot, fine, [trial, *(held[j] for j in own)], poses, initial)
             for j, one in zip(own, later):
@@ -72,7 +72,7 @@ def with_mesh_errors(data: Data, stage: Stage, tried: Sequence[str]) -> Data:
     return replace(data, train=train, held=held)
 
 
-def errs_alike(before: Stage, after: Stage) -> bool:
+def errs_alike(before: FittedModel, after: FittedModel) -> bool:
     """Return whether the mesh errs after an effect was added as it did before: where the effect changes nothing of the body but how its cables
     pull, or what the camera sees, and the states are nearly the same."""
     old = before.fit.hypothesis
@@ -139,7 +139,7 @@ def _with_errors(
     robot: Robot, fine: Robot, trials: Sequence[Trial], poses: Sequence[FloatArray], initial: FloatArray | None
 ) -> list[Trial]:
     """Return trials of one recording with the error of the mesh in their states."""
-    moves = _moves(robot, fine, trials, seats(robot, trials[0].scene, poses), initial)
+    moves = _moves(robot, fine, trials, placements(robot, trials[0].scene, poses), initial)
     return [replace(t, mesh_error=_by_sweep(t, moves, poses)) for t in trials]
 
 
@@ -181,22 +181,22 @@ def _moves(
 ) -> dict[int, FloatArray]:
     """Return by how much the finer mesh moves the markers in each frame [m], (m, 3)."""
     recording, starts = trials[0].scene.recording, trials[0].starts_on(robot.body.mesh)
-    coarse_walk = Walk(robot, drive_of(robot, recording, initial=initial))
-    fine_walk = Walk(fine, drive_of(fine, recording, initial=initial))
+    coarse_driven = DrivenRobot(robot, drive_of(robot, recording, initial=initial))
+    fine_driven = DrivenRobot(fine, drive_of(fine, recording, initial=initial))
     ties = _ties(robot.body.mesh, fine.body.mesh)
     share_on_finer(fine.body)
     here, there = robot.tie_markers(places), fine.tie_markers(places)
     frames = np.unique(np.concatenate([t.scene.frames for t in trials]))
     vectors = state_vectors(recording, frames)
     chosen = _chosen(vectors, len(fine.body.mesh.tets))
-    walked = walk_along(coarse_walk, frames[chosen].tolist(), lambda r: r.markers[:0], starts=starts)
+    walked = solve_path(coarse_driven, frames[chosen].tolist(), lambda r: r.markers[:0], starts=starts)
     states = {k: state for k, state, _, _ in walked}
     known, settled = [], []
 
     def finer_at(i: int) -> FloatArray | None:
         k = int(frames[i])
         try:
-            return finer_state(coarse_walk, fine_walk, k, states[k], ties)
+            return finer_state(coarse_driven, fine_driven, k, states[k], ties)
         except FemsenseError:  # it folds there
             return None
 
@@ -214,15 +214,15 @@ def _chosen(vectors: FloatArray, tets: int) -> list[int]:
     return representatives(vectors, max(8, MOST_WORK // tets))
 
 
-def without_mesh_error(trial: Trial, residual: FloatArray, noise: Noise, *, nor_seats: bool = False) -> FloatArray:
-    """Return the residual [m], (k, c), less what of it is likeliest to be the mesh's own error; `nor_seats`: nor that of seats that turn."""
-    seats = noise.seats(trial.groups)
+def without_mesh_error(trial: Trial, residual: FloatArray, noise: Noise, *, nor_placements: bool = False) -> FloatArray:
+    """Return the residual [m], (k, c), less what of it is likeliest to be the mesh's own error; `nor_placements`: nor that of seats that turn."""
+    placements = noise.placements(trial.groups)
     mesh = np.zeros((*residual.shape, 0)) if trial.mesh_error is None else trial.mesh_error
-    fields = np.concatenate([mesh, seats], axis=2)
+    fields = np.concatenate([mesh, placements], axis=2)
     plain = noise.plain_whitener(trial.groups)
     G, r = whiten(plain, fields), whiten(plain, residual)
     share = np.linalg.solve(np.eye(G.shape[1]) + G.T @ G, G.T @ r)
-    count = fields.shape[2] if nor_seats else mesh.shape[2]
+    count = fields.shape[2] if nor_placements else mesh.shape[2]
     return np.asarray(residual - fields[:, :, :count] @ share[:count])
 
 

@@ -19,7 +19,7 @@ from femsense.model.robot import Robot
 
 MODULUS_STD = 0.5
 """How well the modulus is known beforehand, in its logarithm: a soft region in a stiff body and a stiff one in a soft body act nearly alike."""
-ZERO_STD = 0.1
+OFFSET_STD = 0.1
 """How well the zero of a cable is known beforehand, as a share of its range in the recording."""
 
 ROUGHLY = 3
@@ -38,7 +38,7 @@ class HeldOut:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Stage:
+class FittedModel:
     """A model with its fit and its error on held-out data."""
 
     fit: JointFit
@@ -62,13 +62,13 @@ def with_nuisance(data: Data, robot: Robot | None = None) -> tuple[Hypothesis, P
         if not parameters or (name == "cable_offset" and unknown_zero):
             continue
         terms.append((effect, {}, parameters))
-        std += [MODULUS_STD] if name == "stiffness" else [max(ZERO_STD * float(s), 1e-9) for s in data.input_scale]
+        std += [MODULUS_STD] if name == "stiffness" else [max(OFFSET_STD * float(s), 1e-9) for s in data.input_scale]
     body = data.robot if robot is None else robot
     settled = data.settled if body is data.robot else ()
     return Hypothesis(body, tuple(terms), settled), Prior(np.zeros(len(std)), np.array(std))
 
 
-def make_stage(
+def fit_model(
     data: Data,
     hypothesis: Hypothesis,
     prior: Prior,
@@ -81,14 +81,14 @@ def make_stage(
     near: list[SceneJet] | None = None,
     worth: float = np.inf,
     spare: float = 0.0,
-) -> Stage:
+) -> FittedModel:
     """Return the fit of a hypothesis and what it makes of the held-out data; arguments as of `fit_jointly`."""
     fit = fit_jointly(
         hypothesis,
         prior,
         data.train,
         noise,
-        data.seat_std,
+        data.placement_std,
         coordinates,
         own=own,
         max_iterations=max_iterations,
@@ -98,47 +98,47 @@ def make_stage(
         spare=spare,
     )
     held = held_out(data, fit, noise)
-    return Stage(fit, held, rms_of([h.jet.residual for h in held]) if held else float("nan"))
+    return FittedModel(fit, held, rms_of([h.jet.residual for h in held]) if held else float("nan"))
 
 
-def jets_without(stage: Stage, keep: BoolArray) -> list[SceneJet]:
+def jets_without(fitted: FittedModel, keep: BoolArray) -> list[SceneJet]:
     """Return the jets of a stage with the columns of some coordinates only."""
-    return [replace(j, by_effect=j.by_effect[:, :, keep], rest_by_effect=j.rest_by_effect[:, :, keep]) for j in stage.fit.jets]
+    return [replace(j, by_effect=j.by_effect[:, :, keep], rest_by_effect=j.rest_by_effect[:, :, keep]) for j in fitted.fit.jets]
 
 
 def keeping(
-    data: Data, stage: Stage, names: Sequence[str], noise: Noise, *, max_iterations: int = 12, worth: float = np.inf
-) -> Stage:
+    data: Data, fitted: FittedModel, names: Sequence[str], noise: Noise, *, max_iterations: int = 12, worth: float = np.inf
+) -> FittedModel:
     """Return a stage with some of its terms only, fitted again (roughly where χ² stays above `worth`). Raises DataError."""
-    hypothesis, prior, mask = some_terms(stage, names)
-    return make_stage(
+    hypothesis, prior, mask = some_terms(fitted, names)
+    return fit_model(
         data,
         hypothesis,
         prior,
         noise,
-        stage.fit.coordinates[mask],
-        own=own_of(stage),
+        fitted.fit.coordinates[mask],
+        own=own_of(fitted),
         max_iterations=max_iterations,
-        near=jets_without(stage, mask),
+        near=jets_without(fitted, mask),
         worth=worth,
     )
 
 
-def with_sizes_still(data: Data, stage: Stage, names: Sequence[str], noise: Noise) -> Stage:
+def with_sizes_still(data: Data, fitted: FittedModel, names: Sequence[str], noise: Noise) -> FittedModel:
     """Return a stage with some of its terms only, which keep the sizes that they have beside all of them; poses are fitted again, to where little
     is left to gain. Raises DataError."""
-    hypothesis, _, mask = some_terms(stage, names)
-    sizes = stage.fit.coordinates[mask]
-    still = Prior(sizes, STILL * stage.fit.std[mask])
-    return make_stage(data, hypothesis, still, noise, sizes, own=own_of(stage), near=jets_without(stage, mask), spare=GAIN)
+    hypothesis, _, mask = some_terms(fitted, names)
+    sizes = fitted.fit.coordinates[mask]
+    still = Prior(sizes, STILL * fitted.fit.std[mask])
+    return fit_model(data, hypothesis, still, noise, sizes, own=own_of(fitted), near=jets_without(fitted, mask), spare=GAIN)
 
 
-def with_seeds_still(data: Data, stage: Stage) -> Stage:
+def with_seeds_still(data: Data, fitted: FittedModel) -> FittedModel:
     """Return a stage whose places and times, which were fitted along at last, are part of the seeds, as they are there.
 
     A time that data see the beginning of only runs off to the end of its range where the rest is fitted again.
     """
-    fit, terms, keep = stage.fit, list[tuple[Effect, Entry, tuple[Parameter, ...]]](), list[bool]()
+    fit, terms, keep = fitted.fit, list[tuple[Effect, Entry, tuple[Parameter, ...]]](), list[bool]()
     for (effect, seed, parameters), entry in zip(fit.hypothesis.terms, fit.hypothesis.entries(fit.coordinates)):
         own = {p.key for p in effect.parameters(data.robot, data.control)}
         mask = [p.key in own for p in parameters]
@@ -153,32 +153,41 @@ def with_seeds_still(data: Data, stage: Stage) -> Stage:
         hypothesis=replace(fit.hypothesis, terms=tuple(terms)),
         prior=prior,
         fit=replace(fit.fit, theta=theta),
-        jets=jets_without(stage, kept),
+        jets=jets_without(fitted, kept),
     )
-    return replace(stage, fit=less)
+    return replace(fitted, fit=less)
 
 
-def some_terms(stage: Stage, names: Sequence[str]) -> tuple[Hypothesis, Prior, BoolArray]:
+def some_terms(fitted: FittedModel, names: Sequence[str]) -> tuple[Hypothesis, Prior, BoolArray]:
     """Return the hypothesis and prior of a stage with some of its terms only, and which coordinates these have."""
-    terms = stage.fit.hypothesis.terms
+    terms = fitted.fit.hypothesis.terms
     mask = np.concatenate([np.full(len(p), e.name in names) for e, _, p in terms]) if terms else np.zeros(0, dtype=bool)
-    hypothesis = replace(stage.fit.hypothesis, terms=tuple(t for t in terms if t[0].name in names))
-    return hypothesis, Prior(stage.fit.prior.mean[mask], stage.fit.prior.std[mask]), mask
+    hypothesis = replace(fitted.fit.hypothesis, terms=tuple(t for t in terms if t[0].name in names))
+    return hypothesis, Prior(fitted.fit.prior.mean[mask], fitted.fit.prior.std[mask]), mask
 
 
-def roughly_keeping(data: Data, stage: Stage, names: Sequence[str], noise: Noise, frames: Sequence[IntArray]) -> Stage:
+def roughly_keeping(
+    data: Data, fitted: FittedModel, names: Sequence[str], noise: Noise, frames: Sequence[IntArray]
+) -> FittedModel:
     """Return a stage with some of its terms only, fitted in a few steps to some frames of each trial; nothing is held out. Raises DataError."""
-    hypothesis, prior, mask = some_terms(stage, names)
+    hypothesis, prior, mask = some_terms(fitted, names)
     trials = [t.part(f) for t, f in zip(data.train, frames)]
     fit = fit_jointly(
-        hypothesis, prior, trials, noise, data.seat_std, stage.fit.coordinates[mask], own=own_of(stage), max_iterations=ROUGHLY
+        hypothesis,
+        prior,
+        trials,
+        noise,
+        data.placement_std,
+        fitted.fit.coordinates[mask],
+        own=own_of(fitted),
+        max_iterations=ROUGHLY,
     )
-    return Stage(fit, [], float("nan"))
+    return FittedModel(fit, [], float("nan"))
 
 
-def found_in(stage: Stage) -> list[str]:
+def found_in(fitted: FittedModel) -> list[str]:
     """Return the effects of a stage beside what calibration may move and quadratic elements."""
-    return [name for name in stage.fit.hypothesis.names if name not in (*NUISANCE, MESH.name)]
+    return [name for name in fitted.fit.hypothesis.names if name not in (*NUISANCE, MESH.name)]
 
 
 def span_of(fit: JointFit, name: str) -> slice:
@@ -191,8 +200,8 @@ def span_of(fit: JointFit, name: str) -> slice:
     return slice(0, 0)
 
 
-def own_of(stage: Stage) -> FloatArray:
-    return np.array(stage.fit.fit.theta[: stage.fit.own])
+def own_of(fitted: FittedModel) -> FloatArray:
+    return np.array(fitted.fit.fit.theta[: fitted.fit.own])
 
 
 def held_out(data: Data, fit: JointFit, noise: Noise) -> list[HeldOut]:
@@ -200,7 +209,7 @@ def held_out(data: Data, fit: JointFit, noise: Noise) -> list[HeldOut]:
     robot = fit.hypothesis.robot_at(fit.coordinates)
     plain, pivot = Hypothesis(robot), data.robot.marker_points.mean(axis=0)
     result: list[HeldOut] = []
-    for trial, (poses, initial) in zip(data.held, placed_held(data, fit, noise)):
+    for trial, (poses, initial) in zip(data.held, held_poses_and_inputs(data, fit, noise)):
         jet = evaluate_scene(
             plain,
             trial.scene,
@@ -216,13 +225,13 @@ def held_out(data: Data, fit: JointFit, noise: Noise) -> list[HeldOut]:
     return result
 
 
-Placed = tuple[list[FloatArray], FloatArray | None]
+PosesAndInputs = tuple[list[FloatArray], FloatArray | None]
 """Poses of the cameras, and initial inputs where they are unknown."""
 
 
-def placed_held(data: Data, fit: JointFit, noise: Noise) -> list[Placed]:
+def held_poses_and_inputs(data: Data, fit: JointFit, noise: Noise) -> list[PosesAndInputs]:
     """Return poses and initial inputs of each held-out trial: those of its recording, or its own from its first frames."""
-    train, result = placed(data, fit), list[Placed]()
+    train, result = poses_and_inputs(data, fit), list[PosesAndInputs]()
     robot = fit.hypothesis.robot_at(fit.coordinates)
     for i, (trial, of) in enumerate(zip(data.held, data.held_of)):
         if of is not None:
@@ -231,32 +240,34 @@ def placed_held(data: Data, fit: JointFit, noise: Noise) -> list[Placed]:
             result.append(result[-1])
         else:
             both = [trial, *(t for t in data.held[i + 1 : i + 2] if t.together)]
-            result.append(_pose_on_first_frames(robot, both, noise, data.seat_std, data.robot.marker_points.mean(axis=0)))
+            result.append(_pose_on_first_frames(robot, both, noise, data.placement_std, data.robot.marker_points.mean(axis=0)))
     return result
 
 
-def _pose_on_first_frames(robot: Robot, trials: list[Trial], noise: Noise, seat_std: float, pivot: FloatArray) -> Placed:
+def _pose_on_first_frames(
+    robot: Robot, trials: list[Trial], noise: Noise, placement_std: float, pivot: FloatArray
+) -> PosesAndInputs:
     frames = np.unique(np.concatenate([t.scene.frames for t in trials]))
-    few = frames[: max(1, round(0.2 * len(frames)))]
-    first = [t.part(few) for t in trials if np.isin(t.scene.frames, few).any()]
+    cases = frames[: max(1, round(0.2 * len(frames)))]
+    first = [t.part(cases) for t in trials if np.isin(t.scene.frames, cases).any()]
     first = [replace(t, together=bool(i)) for i, t in enumerate(first)]
-    fit = fit_jointly(Hypothesis(robot), Prior(np.zeros(0), np.zeros(0)), first, noise, seat_std, np.zeros(0))
+    fit = fit_jointly(Hypothesis(robot), Prior(np.zeros(0), np.zeros(0)), first, noise, placement_std, np.zeros(0))
     return first[0].place(fit.fit.theta, pivot)
 
 
-def placed(data: Data, fit: JointFit) -> list[Placed]:
+def poses_and_inputs(data: Data, fit: JointFit) -> list[PosesAndInputs]:
     """Return poses and initial inputs of each training trial at a fit."""
     pivot = data.robot.marker_points.mean(axis=0)
     return [t.place(fit.fit.theta[span], pivot) for t, span in zip(data.train, spans_of(data.train))]
 
 
-def rematched(data: Data, stage: Stage, noise: Noise, *, anew: bool = False) -> Data:
+def rematched(data: Data, fitted: FittedModel, noise: Noise, *, anew: bool = False) -> Data:
     """Return the data with what clouds round off counted anew where a stage has the surface; with `anew` it is asked again which rows there are."""
     if "clouds" not in data.measured:
         return data
-    robot = stage.fit.hypothesis.robot_at(stage.fit.coordinates)
-    train = [_rematched(robot, t, *own, anew) for t, own in zip(data.train, placed(data, stage.fit))]
-    held = [_rematched(robot, t, *own, anew) for t, own in zip(data.held, placed_held(data, stage.fit, noise))]
+    robot = fitted.fit.hypothesis.robot_at(fitted.fit.coordinates)
+    train = [_rematched(robot, t, *own, anew) for t, own in zip(data.train, poses_and_inputs(data, fitted.fit))]
+    held = [_rematched(robot, t, *own, anew) for t, own in zip(data.held, held_poses_and_inputs(data, fitted.fit, noise))]
     return replace(data, train=train, held=held)
 
 
@@ -270,14 +281,14 @@ def _rematched(robot: Robot, trial: Trial, poses: list[FloatArray], initial: Flo
     return replace(trial, scene=scene, groups=groups_of(scene, trial.frames, surface_of(robot, scene, poses)), mesh_error=None)
 
 
-def held_chi2(data: Data, stage: Stage, noise: Noise) -> float:
+def held_chi2(data: Data, fitted: FittedModel, noise: Noise) -> float:
     """Return the whitened sum of squares of the held-out residuals."""
     return float(
-        sum((whiten(noise.whitener(t.groups, t.mesh_error), r) ** 2).sum() for t, r in zip(data.held, stage.held_residuals))
+        sum((whiten(noise.whitener(t.groups, t.mesh_error), r) ** 2).sum() for t, r in zip(data.held, fitted.held_residuals))
     )
 
 
-def held_shift(data: Data, before: Stage, after: Stage, noise: Noise) -> float:
+def held_shift(data: Data, before: FittedModel, after: FittedModel, noise: Noise) -> float:
     """Return the whitened sum of squares of the difference between two models on held-out data."""
     return float(
         sum(
@@ -289,7 +300,7 @@ def held_shift(data: Data, before: Stage, after: Stage, noise: Noise) -> float:
 
 def problem_of(data: Data, fit: JointFit, noise: Noise) -> JointProblem:
     return JointProblem(
-        fit.hypothesis, fit.prior, data.train, [noise.whitener(t.groups, t.mesh_error) for t in data.train], data.seat_std
+        fit.hypothesis, fit.prior, data.train, [noise.whitener(t.groups, t.mesh_error) for t in data.train], data.placement_std
     )
 
 

@@ -10,12 +10,12 @@ import numpy as np
 from femsense.core.arrays import BoolArray, FloatArray
 from femsense.core.errors import DataError
 from femsense.core.least_squares import FitResult, gauss_newton
-from femsense.core.local_model import Kinks
+from femsense.core.local_model import Nonsmoothness
 from femsense.fem.body import BodyModel
 from femsense.fem.equilibrium import Equilibrium
 from femsense.loop.data.trial import States, Trial, normal_rms_of, rms_of, spans_of
 from femsense.loop.fit.noise_components import Noise, Whitener, whiten
-from femsense.loop.fit.slack_nonsmoothness import Part, joined, trial_kinks
+from femsense.loop.fit.slack_nonsmoothness import Part, joined, trial_nonsmoothness
 from femsense.model.effects.loads import STANDARD_GRAVITY
 from femsense.model.observation import Hypothesis, SceneJet, evaluate_scene
 from femsense.model.quasi_static_path import has_given
@@ -91,7 +91,7 @@ class JointProblem:
     prior: Prior
     trials: list[Trial]
     factors: list[Whitener]
-    seat_std: float
+    placement_std: float
     last: Jets | None = None
     """With derivatives."""
     seen: Jets | None = None
@@ -160,14 +160,14 @@ class JointProblem:
             jets.append(self.jet(trial, theta[span], theta[self.own :], derivative, starts[i], rough, known, derivative))
         return starts, jets
 
-    def kinks(self, theta: FloatArray) -> Kinks | None:
+    def nonsmooth(self, theta: FloatArray) -> Nonsmoothness | None:
         """Return where tensions that end at 0 bend the residual near θ, as far as the derivatives that were computed last tell."""
         jets = self.near if self.last is None else self.last.jets
         if jets is None or not any(jet.by_input.shape[2] for jet in jets):
             return None
         at, parts = 0, list[Part]()
         for trial, factor, jet, span in zip(self.trials, self.factors, jets, spans_of(self.trials)):
-            found = trial_kinks(self.hypothesis, trial, jet, factor, theta[span], theta[self.own :])
+            found = trial_nonsmoothness(self.hypothesis, trial, jet, factor, theta[span], theta[self.own :])
             if found is not None:
                 parts.append((slice(at, at + jet.residual.size), np.r_[span, self.own : len(theta)], found))
             at += jet.residual.size + jet.rest.size + 6 * len(trial.poses)
@@ -254,7 +254,7 @@ class JointProblem:
         declared = np.array([T is not None and not trial.together for T in trial.scene.recording.T_robot_camera]).repeat(6)
         known = BESIDE_MARKERS if trial.scene.crossings is None else DECLARED_POSE_STD
         trust = np.where(declared, 1.0 / np.tile(known, len(trial.poses)), 0.0)
-        r = np.concatenate([whiten(factor, jet.residual), jet.rest.ravel() / self.seat_std, trust * own[:poses]])
+        r = np.concatenate([whiten(factor, jet.residual), jet.rest.ravel() / self.placement_std, trust * own[:poses]])
         J = np.zeros((len(r), width if derivative else 0))
         if not derivative:
             return r, J
@@ -262,8 +262,8 @@ class JointProblem:
         J[:k, at : at + poses] = whiten(factor, jet.by_pose)
         J[:k, at + poses : at + trial.size] = whiten(factor, jet.by_initial)
         J[:k, self.own :] = whiten(factor, jet.by_effect)
-        J[k : k + s, at : at + poses] = jet.rest_by_pose.reshape(s, poses) / self.seat_std
-        J[k : k + s, self.own :] = jet.rest_by_effect.reshape(s, jet.rest_by_effect.shape[2]) / self.seat_std
+        J[k : k + s, at : at + poses] = jet.rest_by_pose.reshape(s, poses) / self.placement_std
+        J[k : k + s, self.own :] = jet.rest_by_effect.reshape(s, jet.rest_by_effect.shape[2]) / self.placement_std
         J[k + s :, at : at + poses] = np.diag(trust)
         return r, J
 
@@ -322,7 +322,7 @@ def fit_jointly(
     prior: Prior,
     trials: list[Trial],
     noise: Noise,
-    seat_std: float,
+    placement_std: float,
     coordinates: FloatArray,
     *,
     own: FloatArray | None = None,
@@ -350,7 +350,7 @@ def fit_jointly(
     Raises:
         DataError: no equilibrium at the start.
     """
-    problem = JointProblem(hypothesis, prior, trials, [noise.whitener(t.groups, t.mesh_error) for t in trials], seat_std)
+    problem = JointProblem(hypothesis, prior, trials, [noise.whitener(t.groups, t.mesh_error) for t in trials], placement_std)
     theta = problem.start(coordinates)
     if own is not None:
         theta[: problem.own] = own
@@ -374,7 +374,7 @@ def fit_jointly(
         trusted=TRUSTED,
         enough=GAIN,
         spare=spare,
-        kinks=problem.kinks,
+        nonsmooth=problem.nonsmooth,
     )
     if problem.last is None or not np.array_equal(problem.last.theta, fit.theta):
         if not fit.own:

@@ -16,16 +16,19 @@ from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.mesh import weight_slopes
 from femsense.loop.data.dataset import Data
 from femsense.loop.data.trial import Trial
-from femsense.loop.fit.fitted_model import Stage, placed
-from femsense.model.observation import seats
+from femsense.loop.fit.fitted_model import FittedModel, poses_and_inputs
+from femsense.model.observation import placements
 from femsense.model.robot import Robot
 
 
-def with_turning_seats(data: Data, stage: Stage) -> Data:
+def with_turning_placements(data: Data, fitted: FittedModel) -> Data:
     """Return the data with how the seats of markers turn where a stage has the body; nothing is solved."""
-    robot = stage.fit.hypothesis.robot_at(stage.fit.coordinates)
-    train = [_turned(robot, t, poses, j.states) for t, (poses, _), j in zip(data.train, placed(data, stage.fit), stage.fit.jets)]
-    held = [_turned(robot, t, h.poses, h.jet.states) for t, h in zip(data.held, stage.held)]
+    robot = fitted.fit.hypothesis.robot_at(fitted.fit.coordinates)
+    train = [
+        _turned(robot, t, poses, j.states)
+        for t, (poses, _), j in zip(data.train, poses_and_inputs(data, fitted.fit), fitted.fit.jets)
+    ]
+    held = [_turned(robot, t, h.poses, h.jet.states) for t, h in zip(data.held, fitted.held)]
     return replace(data, train=train, held=held)
 
 
@@ -33,13 +36,13 @@ def _turned(robot: Robot, trial: Trial, poses: Sequence[FloatArray], states: Map
     """Return the markers of a trial with how their seats turn; clouds as they are."""
     if trial.scene.crossings is not None:
         return trial
-    places = seats(robot, trial.scene, poses)
-    by_frame = {k: seat_turns(robot, places, state.positions) for k, state in states.items()}
+    places = placements(robot, trial.scene, poses)
+    by_frame = {k: placement_turns(robot, places, state.positions) for k, state in states.items()}
     turns = np.array([by_frame[int(k)][m] for k, m in zip(trial.scene.frame, trial.scene.marker)]).reshape(-1, 3, 3)
     return replace(trial, groups=replace(trial.groups, turns=turns))
 
 
-def seat_turns(robot: Robot, places: FloatArray, positions: FloatArray) -> FloatArray:
+def placement_turns(robot: Robot, places: FloatArray, positions: FloatArray) -> FloatArray:
     """Return by how much the markers of a robot move if their places at rest [m], shape (m, 3), do, for node positions [m], shape (n, 3): the
     deformation gradient there, shape (m, 3, 3), axes of the place last."""
     mesh = robot.body.mesh

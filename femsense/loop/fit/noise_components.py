@@ -71,9 +71,9 @@ class Noise:
                 sigma += std[name] ** 2 * groups.shared(name)
         return sigma
 
-    def seats(self, groups: Groups) -> FloatArray:
+    def placements(self, groups: Groups) -> FloatArray:
         """Return the fields of markers that sit elsewhere [m], each of one standard deviation, shape (k, c, b); none where they do not turn."""
-        fields = groups.seats
+        fields = groups.placements
         none = np.zeros((len(groups.marker), 3 if groups.surface is None else 1, 0))
         return none if fields is None or not self.std.get("marker", 0.0) else self.std["marker"] * fields
 
@@ -125,8 +125,8 @@ class _Same:
 @lru_cache(maxsize=8)
 def _whitener(noise: Noise, groups: Groups, error: _Same) -> Whitener:
     """Return what `Noise.whitener` is after; fit after fit asks for the same one."""
-    plain, seats = noise.plain_whitener(groups), noise.seats(groups)
-    fields = seats if error.array is None else np.concatenate([error.array, seats], axis=2)
+    plain, placements = noise.plain_whitener(groups), noise.placements(groups)
+    fields = placements if error.array is None else np.concatenate([error.array, placements], axis=2)
     if not fields.shape[2]:
         return plain
     whole = whiten(plain, fields)
@@ -231,17 +231,18 @@ class _Likelihood:
         near: FloatArray | None = None,
     ) -> None:
         self.names, self.residuals, self.near = names, residuals, near
-        seats = [np.zeros((*r.shape, 0)) if g.seats is None else g.seats for g, r in zip(groups, residuals)]
+        placements = [np.zeros((*r.shape, 0)) if g.placements is None else g.placements for g, r in zip(groups, residuals)]
         self.fixed = basis[0].shape[2]
-        self.basis = [np.concatenate([X, block], axis=2) for X, block in zip(basis, _beside_each_other(seats))]
-        self.seat = names.index("marker") if "marker" in names and self.basis[0].shape[2] > self.fixed else None
+        self.basis = [np.concatenate([X, block], axis=2) for X, block in zip(basis, _beside_each_other(placements))]
+        self.placement = names.index("marker") if "marker" in names and self.basis[0].shape[2] > self.fixed else None
         self.parts = [
-            [None if i == self.seat and g.turns is not None else g.shared(name) for i, name in enumerate(names)] for g in groups
+            [None if i == self.placement and g.turns is not None else g.shared(name) for i, name in enumerate(names)]
+            for g in groups
         ]
 
     def __call__(self, log_std: FloatArray) -> tuple[float, FloatArray]:
         variance = np.exp(2.0 * log_std)
-        p, fixed, seat = self.basis[0].shape[2], self.fixed, self.seat
+        p, fixed, placement = self.basis[0].shape[2], self.fixed, self.placement
         normal, right, log_det, own = np.zeros((p, p)), np.zeros(p), 0.0, 0.0
         pieces = []
         for r, X, parts in zip(self.residuals, self.basis, self.parts):
@@ -253,9 +254,9 @@ class _Likelihood:
             own += float((r * Vir).sum())
             pieces.append((inverse, ViX, Vir, parts))
         normal += 1e-12 * np.trace(normal) / max(p, 1) * np.eye(p)
-        if seat is not None:
-            normal[fixed:, fixed:] += np.eye(p - fixed) / variance[seat]
-            log_det += (p - fixed) * float(np.log(variance[seat]))
+        if placement is not None:
+            normal[fixed:, fixed:] += np.eye(p - fixed) / variance[placement]
+            log_det += (p - fixed) * float(np.log(variance[placement]))
         factor = cholesky(normal, lower=True)
         fitted = cho_solve((factor, True), right)
         value = log_det + 2.0 * float(np.log(np.diag(factor)).sum()) + own - float(right @ fitted)
@@ -267,10 +268,10 @@ class _Likelihood:
             outer = np.einsum("kc,lc->kl", Pr, Pr)
             kernel = Pr.shape[1] * inverse - inner - outer
             gradient += [0.0 if part is None else float((kernel * part).sum()) for part in parts]
-        if seat is not None:
-            of_seats = cho_solve((factor, True), np.eye(p)[:, fixed:])[fixed:]
-            left = float(np.trace(of_seats) + fitted[fixed:] @ fitted[fixed:]) / variance[seat]
-            gradient[seat] += (p - fixed - left) / variance[seat]
+        if placement is not None:
+            of_placements = cho_solve((factor, True), np.eye(p)[:, fixed:])[fixed:]
+            left = float(np.trace(of_placements) + fitted[fixed:] @ fitted[fixed:]) / variance[placement]
+            gradient[placement] += (p - fixed - left) / variance[placement]
         gradient = np.asarray(gradient * variance)
         if self.near is None:
             return 0.5 * value, gradient

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from femsense.core.arrays import FloatArray, IntArray
-from femsense.core.local_model import Kinks
+from femsense.core.local_model import Nonsmoothness
 from femsense.loop.fit.noise_components import Whitener, whiten
 from femsense.model.drive import creep_response, inputs_wanted
 from femsense.model.observation import Hypothesis, SceneJet
@@ -29,13 +29,13 @@ ALIKE = 0.01
 """Tensions that differ by less than this share of the largest one count as one: logs are noisy where cables are idle."""
 
 
-Part = tuple[slice, IntArray, Kinks]
+Part = tuple[slice, IntArray, Nonsmoothness]
 """Rows of a trial, which parameters its slopes are by, and its kinks."""
 
 
-def trial_kinks(
+def trial_nonsmoothness(
     hypothesis: Hypothesis, trial: Trial, jet: SceneJet, factor: Whitener, own: FloatArray, coordinates: FloatArray
-) -> Kinks | None:
+) -> Nonsmoothness | None:
     """Return where the residual rows of a trial bend near a point; its slopes are by the trial's own parameters, then the coordinates.
 
     Frames in which a cable is driven alike bend together.
@@ -57,10 +57,10 @@ def trial_kinks(
     field = jet.by_input[:, :, cable[first]] * weight[trial.scene.frame][:, None, :]
     some = np.abs(field).max(axis=(0, 1)) > 0
     mean = (share / count[:, None])[some]
-    return Kinks(whiten(factor, field[:, :, some]), mean @ value[near], mean @ slope[near], jet.pulled[near][first][some])
+    return Nonsmoothness(whiten(factor, field[:, :, some]), mean @ value[near], mean @ slope[near], jet.pulled[near][first][some])
 
 
-def joined(parts: Sequence[Part], rows: int, width: int) -> Kinks:
+def joined(parts: Sequence[Part], rows: int, width: int) -> Nonsmoothness:
     """Return the kinks of several trials together, for so many rows and parameters."""
     columns, slopes = list[FloatArray](), list[FloatArray]()
     for own, by, part in parts:
@@ -69,7 +69,7 @@ def joined(parts: Sequence[Part], rows: int, width: int) -> Kinks:
         slopes.append(np.zeros((len(part.value), width)))
         slopes[-1][:, by] = part.slope
     value, counted = (np.concatenate([getattr(part, name) for _, _, part in parts]) for name in ("value", "counted"))
-    return Kinks(np.hstack(columns), value, np.vstack(slopes), counted)
+    return Nonsmoothness(np.hstack(columns), value, np.vstack(slopes), counted)
 
 
 def _wanted(

@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 
 from femsense.core.arrays import FloatArray
-from femsense.core.least_squares import GIVEN_UP
+from femsense.core.least_squares import STOPPED_EARLY
 from femsense.loop.data.dataset import NUISANCE, Data
 from femsense.loop.data.trial import rms_of
 from femsense.loop.fit.cross_validation import sweeps_predicted
 from femsense.loop.fit.discretisation_error import mesh_errors
-from femsense.loop.fit.fitted_model import Stage, held_chi2, held_shift, span_of
+from femsense.loop.fit.fitted_model import FittedModel, held_chi2, held_shift, span_of
 from femsense.loop.fit.joint_fit import JointFit
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.search.refit import EVIDENCE, evidence
@@ -48,25 +48,25 @@ SURE = 2.5
 """Standard errors of the gain on left-out sweeps beyond which held-out data need only not speak against an effect."""
 
 
-def judged(
+def acceptance_test(
     data: Data,
-    stage: Stage,
+    fitted: FittedModel,
     candidate: Candidate,
-    made: Stage,
+    made: FittedModel,
     record: dict[str, Any],
     noise: Noise,
 ) -> Refit:
-    gain = evidence(stage.fit, made.fit)
-    score = gain - candidate.cost - tilt_cost(data.declared, candidate, made.fit)
-    better, spread = sweeps_predicted(data.train, stage.fit, made.fit)
-    record |= {"dchi2": gain, "dbic": score, "validation_rms_m": made.held_rms, "cv_gain": better, "cv_spread": spread}
-    held = held_chi2(data, stage, noise) - held_chi2(data, made, noise)
+    gain = evidence(fitted.fit, made.fit)
+    score = gain - candidate.cost - tilt_penalty(data.declared, candidate, made.fit)
+    better, spread = sweeps_predicted(data.train, fitted.fit, made.fit)
+    record |= {"dchi2": gain, "dbic": score, "validation_rms_m": made.held_rms, "cv_gain": better, "cv_std": spread}
+    held = held_chi2(data, fitted, noise) - held_chi2(data, made, noise)
     acts = held_shift(
-        data, stage, made, noise
+        data, fitted, made, noise
     )  # what `held` is on average for the true effect, with a variance of four times that
     wanted = min(PREDICTS * gain * held_share(data), acts - 5.0 * float(np.sqrt(acts)))
-    moved, mesh = moved_by(stage, made), mesh_cost(data, stage)
-    record |= {"held_dchi2": held, "moved_m": moved, "mesh_cost_m": mesh, "takes_over": _taken_over(stage, made)}
+    moved, mesh = moved_by(fitted, made), discretisation_rms(data, fitted)
+    record |= {"held_dchi2": held, "moved_m": moved, "mesh_cost_m": mesh, "takes_over": _taken_over(fitted, made)}
     surely = better > SURE * spread
     if surely:
         wanted = min(wanted, 0.0)
@@ -80,22 +80,22 @@ def judged(
     least = ABOVE_MESH_IF_SURE if sure_beyond_mesh(better, spread, held, gain * held_share(data)) else ABOVE_MESH
     if fit_objection is None and moved < least * mesh:
         fit_objection = f"it moves the markers by {1e3 * moved:.3f} mm, the mesh itself by {1e3 * mesh:.3f} mm"
-    if fit_objection is None and _plainly_worse(stage, made):
-        fit_objection = f"the plain error grows where fitted ({1e3 * stage.fit.rms:.3f} mm, then {1e3 * made.fit.rms:.3f} mm)"
+    if fit_objection is None and _plainly_worse(fitted, made):
+        fit_objection = f"the plain error grows where fitted ({1e3 * fitted.fit.rms:.3f} mm, then {1e3 * made.fit.rms:.3f} mm)"
     record["verdict"] = fit_objection or "passes"
-    return Refit(candidate, made, score, stage.fit.chi2 - made.fit.chi2 - candidate.cost, record)
+    return Refit(candidate, made, score, fitted.fit.chi2 - made.fit.chi2 - candidate.cost, record)
 
 
 def _moves(decrease: float) -> str:
     return f"{'falls' if decrease >= 0.0 else 'rises'} by {abs(decrease):.1f}"
 
 
-def _plainly_worse(before: Stage, after: Stage) -> bool:
+def _plainly_worse(before: FittedModel, after: FittedModel) -> bool:
     """Return whether an effect makes the plain error larger where fitted, without a smaller one on held-out data."""
     return after.fit.rms > NOT_PLAINLY_WORSE * before.fit.rms and after.held_rms > before.held_rms
 
 
-def tilt_cost(declared: Robot, candidate: Candidate, fit: JointFit) -> float:
+def tilt_penalty(declared: Robot, candidate: Candidate, fit: JointFit) -> float:
     """Return −2 log of how likely it is that a declared gravity is off by the angle of the fitted one: a Student's t with four degrees."""
     own = declared.body.gravity
     mask = np.array([p.key == "vector_m_s2" for p in fit.hypothesis.parameters], dtype=bool)
@@ -108,11 +108,11 @@ def tilt_cost(declared: Robot, candidate: Candidate, fit: JointFit) -> float:
 
 def _predicts(refitted: Refit) -> float:
     """Return the gain on left-out sweeps less its standard error, where that is known."""
-    spread = refitted.record["cv_spread"]
+    spread = refitted.record["cv_std"]
     return float(refitted.record["cv_gain"] - (spread if np.isfinite(spread) else 0.0))
 
 
-def weighs(data: Data, name: str) -> float:
+def prior_evidence(data: Data, name: str) -> float:
     """Return by how much dBIC an effect is ahead of its rivals beforehand: every body has weight, though the robot does not declare it."""
     return EVIDENCE if name == "gravity" and not np.any(data.declared.body.gravity) else 0.0
 
@@ -122,15 +122,15 @@ def sure_beyond_mesh(better: float, spread: float, held: float, expected: float)
     return better > SURE * spread and held * better > 2.0 * SURE * spread * expected
 
 
-def _taken_over(before: Stage, after: Stage) -> list[str]:
+def _taken_over(before: FittedModel, after: FittedModel) -> list[str]:
     """Return the nuisances that are significant before an effect is added, and not after."""
     return [n for n in NUISANCE if _z(before, n) > 3.0 and _z(after, n) < 3.0]
 
 
-def _z(stage: Stage, name: str) -> float:
+def _z(fitted: FittedModel, name: str) -> float:
     """Return by how many standard deviations the values of a nuisance differ from none, at most."""
-    part = span_of(stage.fit, name)
-    return float(np.max(np.abs(stage.fit.coordinates[part]) / np.maximum(stage.fit.std[part], 1e-300), initial=0.0))
+    part = span_of(fitted.fit, name)
+    return float(np.max(np.abs(fitted.fit.coordinates[part]) / np.maximum(fitted.fit.std[part], 1e-300), initial=0.0))
 
 
 def held_share(data: Data) -> float:
@@ -138,18 +138,18 @@ def held_share(data: Data) -> float:
     return sum(len(t.scene.frame) for t in data.held) / max(sum(len(t.scene.frame) for t in data.train), 1)
 
 
-def moved_by(before: Stage, after: Stage) -> float:
+def moved_by(before: FittedModel, after: FittedModel) -> float:
     """Return by how much an effect moves the markers beyond what calibration does [m], root mean square."""
     return rms_of([b.residual - a.residual for a, b in zip(after.fit.jets, before.fit.jets)])
 
 
-def mesh_cost(data: Data, stage: Stage, *, whole: bool = False) -> float:
+def discretisation_rms(data: Data, fitted: FittedModel, *, whole: bool = False) -> float:
     """Return what the mesh costs beyond what calibration absorbs [m], root mean square as `rms_of` has it; 0 where it is not known.
 
     Not whole: beyond the share of it that all sweeps have in common, too, where there are several: what it may turn by and what sweeps add.
     """
     errors = mesh_errors(data)
-    J = [np.concatenate([j.by_pose, j.by_effect], axis=2).reshape(e.size, -1) for j, e in zip(stage.fit.jets, errors)]
+    J = [np.concatenate([j.by_pose, j.by_effect], axis=2).reshape(e.size, -1) for j, e in zip(fitted.fit.jets, errors)]
     fields = [t.mesh_error for t in data.train if t.mesh_error is not None]
     if whole or any(len(np.unique(t.groups.sweep)) < 2 for t in data.train):
         return rms_of([_rest(j, e.ravel()).reshape(e.shape) for j, e in zip(J, errors)]) if errors else 0.0
@@ -163,11 +163,11 @@ def _rest(columns: FloatArray, values: FloatArray) -> FloatArray:
     return np.asarray(values - columns / scale @ fitted)
 
 
-def _objection(made: Stage, candidate: Candidate, score: float) -> str | None:
+def _objection(made: FittedModel, candidate: Candidate, score: float) -> str | None:
     """Return why an effect is not accepted, or None."""
     q = len(candidate.parameters)
     std = made.fit.std[len(made.fit.std) - q :]
-    if score <= EVIDENCE and made.fit.fit.status == GIVEN_UP:
+    if score <= EVIDENCE and made.fit.fit.status == STOPPED_EARLY:
         return "given up: a step promised too little"
     if score <= EVIDENCE:
         return f"too little evidence (dBIC {score:.1f})"

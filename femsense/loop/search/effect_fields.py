@@ -13,7 +13,7 @@ from femsense.fem.mesh import embed_points
 from femsense.loop.data.dataset import NUISANCE, Data
 from femsense.loop.data.representative_states import MOST_WORK, between, representatives, spread_states, state_vectors
 from femsense.loop.data.trial import States, Trial, spans_of
-from femsense.loop.fit.fitted_model import Stage
+from femsense.loop.fit.fitted_model import FittedModel
 from femsense.loop.fit.joint_fit import JointFit, JointProblem, Prior
 from femsense.model.drive import has_history
 from femsense.model.effects import Effect, Entry, Parameter
@@ -26,14 +26,14 @@ Answers = dict[int, AtPoints]
 
 
 def candidates_for(
-    base: JointFit, control: str, *, forms: Sequence[Effect], names: Sequence[str], has_seats: bool
+    base: JointFit, control: str, *, forms: Sequence[Effect], names: Sequence[str], has_placements: bool
 ) -> list[tuple[Effect, Entry, tuple[Parameter, ...]]]:
     """Return the effects and seeds to try on top of a fitted model."""
     present = set(base.hypothesis.names)
     robot = base.hypothesis.robot_at(base.coordinates)
     result = []
     for effect in forms:
-        if effect.name not in names or effect.name in present or (effect.name == "marker_offset" and has_seats):
+        if effect.name not in names or effect.name in present or (effect.name == "marker_offset" and has_placements):
             continue
         for seed in effect.seeds(robot):
             parameters = effect.parameters(robot, control)
@@ -196,10 +196,10 @@ def _starts_of(trial: Trial, fixed: Robot, robot: Robot, states: States) -> Stat
     return starts
 
 
-def fields_of(data: Data, stage: Stage, names: Sequence[str]) -> Fields:
+def fields_of(data: Data, fitted: FittedModel, names: Sequence[str]) -> Fields:
     """Return what each effect that is not in the model yet would do to the markers."""
     seated = any(len(t.scene.rest_marker) for t in data.train)
     todo = candidates_for(
-        stage.fit, data.control, forms=data.forms, names=[n for n in names if n not in NUISANCE], has_seats=seated
+        fitted.fit, data.control, forms=data.forms, names=[n for n in names if n not in NUISANCE], has_placements=seated
     )
-    return effect_fields(stage.fit, data.train, todo)
+    return effect_fields(fitted.fit, data.train, todo)

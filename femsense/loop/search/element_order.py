@@ -15,13 +15,13 @@ import numpy as np
 
 from femsense.core.errors import FemsenseError
 from femsense.loop.data.dataset import MESH, NUISANCE, QUADRATIC, Data
-from femsense.loop.fit.fitted_model import Stage, make_stage, span_of
+from femsense.loop.fit.fitted_model import FittedModel, fit_model, span_of
 from femsense.loop.fit.noise_components import Noise
-from femsense.loop.search.acceptance import judged
+from femsense.loop.search.acceptance import acceptance_test
 from femsense.loop.search.refit import EVIDENCE, FORGONE, beyond
 from femsense.loop.search.screening import Candidate, penalty
 from femsense.loop.search.search_state import Search
-from femsense.loop.search.subsampling import few_of
+from femsense.loop.search.subsampling import representative_cases
 from femsense.model.effects import Entry
 from femsense.model.robot import Robot
 
@@ -52,7 +52,7 @@ def need_quadratic(data: Data, search: Search, names: Sequence[str]) -> tuple[bo
     worth = beyond(search.final.fit, FORGONE[1] * (candidate.cost + EVIDENCE) + FORGONE[0])
     try:
         without = _on(data, data.robot_as_declared, search.history[0][1], search.final, search.noise, worth=worth)
-        judged(data, without, candidate, search.final, record, search.noise)
+        acceptance_test(data, without, candidate, search.final, record, search.noise)
     except FemsenseError:
         record["verdict"] = "passes"  # without them it has no equilibrium
     passes = record["verdict"] == "passes"
@@ -69,8 +69,8 @@ def _candidate(names: Sequence[str], n_effective: float) -> Candidate:
 
 
 def _on(
-    data: Data, mesh_of: Robot, linear: Stage, final: Stage, noise: Noise, *, worth: float = np.inf, steps: int = 12
-) -> Stage:
+    data: Data, mesh_of: Robot, linear: FittedModel, final: FittedModel, noise: Noise, *, worth: float = np.inf, steps: int = 12
+) -> FittedModel:
     """Return a model fitted on the mesh of another robot: what calibration may move from where it was on linear elements, effects from where they are.
     Raises DataError."""
     fit, robot = final.fit, mesh_of
@@ -83,16 +83,20 @@ def _on(
             start[span_of(fit, name)] = linear.fit.coordinates[span_of(linear.fit, name)]
     hypothesis = replace(fit.hypothesis, robot=robot, settled=others)
     own = fit.fit.theta[: fit.own]
-    return make_stage(data, hypothesis, fit.prior, noise, start, own=own, worth=worth, max_iterations=steps)
+    return fit_model(data, hypothesis, fit.prior, noise, start, own=own, worth=worth, max_iterations=steps)
 
 
 def _refined(data: Data, search: Search, seed: Entry) -> dict[str, Any]:
     """Return what became of refined linear elements, tried in some states."""
     record: dict[str, Any] = {"name": MESH.name, "seed": seed, "step": 1}
-    few = few_of(data, search.final, search.noise)
+    cases = representative_cases(data, search.final, search.noise)
     try:
-        made = _on(few.data, MESH.apply(data.robot_as_declared, seed), search.history[0][1], few.stage, search.noise, steps=STEPS)
-        record["verdict"] = f"in some of the states χ² is {made.fit.chi2:.0f}, with quadratic elements {few.stage.fit.chi2:.0f}"
+        made = _on(
+            cases.data, MESH.apply(data.robot_as_declared, seed), search.history[0][1], cases.fitted, search.noise, steps=STEPS
+        )
+        record["verdict"] = (
+            f"in some of the states χ² is {made.fit.chi2:.0f}, with quadratic elements {cases.fitted.fit.chi2:.0f}"
+        )
     except FemsenseError as error:
         record["verdict"] = f"no equilibrium: {error}"
     return record

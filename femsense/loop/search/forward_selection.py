@@ -11,20 +11,20 @@ import numpy as np
 from femsense.core.errors import FemsenseError
 from femsense.loop.data.dataset import Data
 from femsense.loop.fit.fitted_model import (
-    Stage,
+    FittedModel,
+    fit_model,
     found_in,
-    make_stage,
     own_of,
     problem_of,
 )
 from femsense.loop.fit.joint_fit import JointFit, Prior
 from femsense.loop.fit.noise_components import Noise
-from femsense.loop.search.acceptance import _predicts, judged, weighs
-from femsense.loop.search.location_search import POLISHED, climbed, placed
+from femsense.loop.search.acceptance import _predicts, acceptance_test, prior_evidence
+from femsense.loop.search.location_search import POLISHED, climbed, located
 from femsense.loop.search.refit import EVIDENCE, FORGONE, evidence, explains, refit, tried, with_term, within, worth_of
 from femsense.loop.search.screening import Candidate, joined, linear_gain
 from femsense.loop.search.search_state import Progress, Refit
-from femsense.loop.search.subsampling import Few, few_of
+from femsense.loop.search.subsampling import RepresentativeCases, representative_cases
 
 REFITS = 6
 """Candidates that are refitted in full nonlinearity at the first step; half as many later."""
@@ -32,9 +32,9 @@ REFITTABLE = 0.04
 """A candidate of which calibration leaves less than this is not refitted, unless it promises more than any other."""
 ALIKE = 0.95
 """Candidates that promise this share of what the best does are refitted in the order of their cost: to the first refit all others are held up."""
-RIVALS = 0.5
+ALTERNATIVES = 0.5
 """Those that promise this share are all fitted to some of the states first, where these spare time, and to all in the order of what they explain there."""
-PROMISING = 8.0
+PREDICTED_MUCH = 8.0
 """Linear dBIC that a candidate needs to be refitted: what is small is nearly linear, so that a refit finds about as much."""
 HINTED = 0.5
 """A richer form is tried where fields of the model without the effect promise this share of what it needs."""
@@ -45,22 +45,22 @@ MORE_STEPS = 30
 """Steps for a refit that could win and is still on its way after the first ones."""
 
 
-def grow(
-    data: Data, stage: Stage, table: list[Candidate], noise: Noise, say: Progress
+def select_next(
+    data: Data, fitted: FittedModel, table: list[Candidate], noise: Noise, say: Progress
 ) -> tuple[Refit | None, list[Refit], list[dict[str, Any]]]:
     """Return the effect that comes next, or None where nothing passes; others that are as good; and what became of each candidate that was
     refitted."""
     refits: list[Refit] = []
     records: list[dict[str, Any]] = []
-    listed = shortlist(table, first=not found_in(stage))
+    listed = shortlist(table, first=not found_in(fitted))
     if not listed:
         return None, [], []
-    few = few_of(data, stage, noise)
-    scouts = _scouted(data, few, listed, noise, say)
+    cases = representative_cases(data, fitted, noise)
+    scouts = _scouted(data, cases, listed, noise, say)
     for candidate in sorted(listed, key=lambda c: -scouts[id(c)][1] if id(c) in scouts else np.inf):
-        ahead = [r for r in refits if r.record["verdict"] == "passes" and explains(r.stage)]
+        ahead = [r for r in refits if r.record["verdict"] == "passes" and explains(r.fitted)]
         behind = candidate.score < max((0.5 * _bar(r, candidate) for r in ahead), default=-np.inf) - EVIDENCE
-        if behind and not weighs(data, candidate.effect.name):
+        if behind and not prior_evidence(data, candidate.effect.name):
             continue  # where little is left to explain, a refit seldom gains that much on its linear score, but for a weight that cables lift
         say(f"refitting with {candidate.effect.name}")
         record: dict[str, Any] = {"name": candidate.effect.name, "seed": candidate.seed}
@@ -69,7 +69,7 @@ def grow(
         try:
             scout, _ = scouts.get(id(candidate), (None, 0.0))
             behind, begin = _in_some_states(
-                few, candidate, max(ahead, key=lambda r: r.score, default=None), noise, settled, scout
+                cases, candidate, max(ahead, key=lambda r: r.score, default=None), noise, settled, scout
             )
             if behind:
                 record["verdict"] = "given up: in some of the states another one explains more by far"
@@ -78,44 +78,42 @@ def grow(
                 r.score for r in ahead if r.candidate.effect.name != candidate.effect.name
             ]  # what bends one form bends both
             wanted = max([EVIDENCE, *(score - 2.0 * EVIDENCE for score in others)])
-            made = refit(data, stage, candidate, noise, wanted=wanted, settled=settled, begin=begin)
+            made = refit(data, fitted, candidate, noise, wanted=wanted, settled=settled, begin=begin)
         except FemsenseError as error:
             record["verdict"] = f"no equilibrium: {error}"
             continue
-        refits.append(judged(data, stage, candidate, made, record, noise))
+        refits.append(acceptance_test(data, fitted, candidate, made, record, noise))
     best = max((r.score for r in refits if r.record["verdict"] == "passes"), default=np.inf)
-    refits = [_to_the_end(data, stage, r, noise) if r.score > 0.5 * best - EVIDENCE else r for r in refits]
+    refits = [_to_the_end(data, fitted, r, noise) if r.score > 0.5 * best - EVIDENCE else r for r in refits]
     if not any(r.record["verdict"] == "passes" for r in refits):
-        refits = [_elsewhere(data, stage, r, noise, say) for r in refits]
+        refits = [_elsewhere(data, fitted, r, noise, say) for r in refits]
     passing = [r for r in refits if r.record["verdict"] == "passes"]
     if not passing:
         return None, [], records
-    leaders = _leaders(data, stage, passing, noise, say)
+    leaders = _leaders(data, fitted, passing, noise, say)
     # where evidence is close, what surely predicts better
-    winner = max(leaders, key=lambda r: r.score + _predicts(r) + weighs(data, r.candidate.effect.name))
+    winner = max(leaders, key=lambda r: r.score + _predicts(r) + prior_evidence(data, r.candidate.effect.name))
     close = [r for r in leaders if r.score > winner.score - EVIDENCE]
-    winner = _enriched(data, stage, winner, table, noise, say)
+    winner = _enriched(data, fitted, winner, table, noise, say)
     winner.record["verdict"] = "named"
     ties = [r for r in close if r.candidate.effect.name != winner.candidate.effect.name]
     return winner, sorted(ties, key=lambda r: -r.score), records
 
 
-def _leaders(data: Data, stage: Stage, passing: Sequence[Refit], noise: Noise, say: Progress) -> list[Refit]:
+def _leaders(data: Data, fitted: FittedModel, passing: Sequence[Refit], noise: Noise, say: Progress) -> list[Refit]:
     """Return the refits that are as good as the best but for EVIDENCE, and those that their places bring ahead of these, each with its seed improved."""
     best = max(r.score for r in passing)
-    near = [
-        r if "seed_spread" in r.record else polished(data, stage, r, noise, say) for r in passing if r.score > best - EVIDENCE
-    ]
-    behind = [_with_climbs(data, stage, r, noise) for r in passing if best - EVIDENCE >= r.score > WITHIN_REACH * best]
-    moved = [polished(data, stage, r, noise, say) for r in behind if _in_sight(r) > best]
+    near = [r if "seed_std" in r.record else polished(data, fitted, r, noise, say) for r in passing if r.score > best - EVIDENCE]
+    behind = [_with_climbs(data, fitted, r, noise) for r in passing if best - EVIDENCE >= r.score > WITHIN_REACH * best]
+    moved = [polished(data, fitted, r, noise, say) for r in behind if _in_sight(r) > best]
     ahead = max(r.score for r in near)
     return near + [r for r in moved if r.score > ahead]
 
 
-def _with_climbs(data: Data, stage: Stage, refitted: Refit, noise: Noise) -> Refit:
+def _with_climbs(data: Data, fitted: FittedModel, refitted: Refit, noise: Noise) -> Refit:
     """Return a refit with where its place may lie instead, if it has one."""
     places = refitted.candidate.effect.nearby(data.robot, refitted.candidate.seed)
-    return replace(refitted, climbs=climbed(data, stage, refitted.candidate, noise)) if places else refitted
+    return replace(refitted, climbs=climbed(data, fitted, refitted.candidate, noise)) if places else refitted
 
 
 def _in_sight(refitted: Refit) -> float:
@@ -134,40 +132,42 @@ def _settled(data: Data, candidate: Candidate, ahead: Sequence[Refit]) -> bool:
     )
 
 
-def _scouted(data: Data, few: Few, listed: Sequence[Candidate], noise: Noise, say: Progress) -> dict[int, tuple[JointFit, float]]:
+def _scouted(
+    data: Data, cases: RepresentativeCases, listed: Sequence[Candidate], noise: Noise, say: Progress
+) -> dict[int, tuple[JointFit, float]]:
     """Return how the leading ones of a shortlist fit some of the states, with their dBIC there, each under its `id`; none of them where these do not
     tell it of all, or spare no time."""
     best = max(c.score for c in listed)
-    leading = [c for c in listed if few.spares and c.score >= RIVALS * best]
-    there = [own for c in leading if (own := few.candidate(c, noise)) is not None]
+    leading = [c for c in listed if cases.spares and c.score >= ALTERNATIVES * best]
+    there = [own for c in leading if (own := cases.candidate(c, noise)) is not None]
     if len(leading) < 2 or len(there) < len(leading):
         return {}
     scouts, lead = dict[int, tuple[JointFit, float]](), -np.inf
     for candidate, own in zip(leading, there):
         say(f"refitting with {candidate.effect.name} in some states")
-        made = tried(few.data, few.stage, own, noise, max(EVIDENCE, lead - 2.0 * EVIDENCE))
+        made = tried(cases.data, cases.fitted, own, noise, max(EVIDENCE, lead - 2.0 * EVIDENCE))
         if made is None:  # where it does not fit, all states decide
             continue
-        score = evidence(few.stage.fit, made.fit) - own.cost + weighs(data, candidate.effect.name)
+        score = evidence(cases.fitted.fit, made.fit) - own.cost + prior_evidence(data, candidate.effect.name)
         scouts[id(candidate)] = made.fit, score
         lead = max(lead, score) if explains(made) else lead
     return scouts
 
 
 def _in_some_states(
-    few: Few, candidate: Candidate, ahead: Refit | None, noise: Noise, settled: bool, scout: JointFit | None
+    cases: RepresentativeCases, candidate: Candidate, ahead: Refit | None, noise: Noise, settled: bool, scout: JointFit | None
 ) -> tuple[bool, JointFit | None]:
     """Return whether a candidate that is fitted in some of the states, as a scout already or now, stays as far behind another one there as ends a refit,
     where these spare time; and where that fit ended."""
-    own = few.candidate(candidate, noise) if few.spares else None
+    own = cases.candidate(candidate, noise) if cases.spares else None
     if own is None:
         return False, None
-    base, wanted = few.stage.fit, -np.inf
+    base, wanted = cases.fitted.fit, -np.inf
     if ahead is not None:
-        leading = few.of(ahead.stage.fit, noise)
+        leading = cases.of(ahead.fitted.fit, noise)
         wanted = max(EVIDENCE, evidence(base, leading) - ahead.candidate.cost - 2.0 * EVIDENCE)
     if scout is None:
-        made = tried(few.data, few.stage, own, noise, wanted, settled=settled)
+        made = tried(cases.data, cases.fitted, own, noise, wanted, settled=settled)
         scout = None if made is None else made.fit
     if scout is None:  # where it does not fit, all states decide
         return False, None
@@ -180,83 +180,85 @@ def _bar(ahead: Refit, candidate: Candidate) -> float:
     return min(ahead.gain, ahead.candidate.score) if candidate.effect.name == ahead.candidate.effect.name else ahead.gain
 
 
-def _to_the_end(data: Data, stage: Stage, refitted: Refit, noise: Noise) -> Refit:
+def _to_the_end(data: Data, fitted: FittedModel, refitted: Refit, noise: Noise) -> Refit:
     """Return a refit that ran out of steps on its way down with more of them: rivals are compared where each of them ends, or were when a held-out
     state does not come to rest there."""
-    fit = refitted.stage.fit
+    fit = refitted.fitted.fit
     if fit.fit.status != "iterations":
         return refitted
     try:
-        made = make_stage(
+        made = fit_model(
             data,
             fit.hypothesis,
             fit.prior,
             noise,
             fit.coordinates,
-            own=own_of(refitted.stage),
+            own=own_of(refitted.fitted),
             max_iterations=MORE_STEPS,
             known=fit.jets,
         )
     except FemsenseError:
         return refitted
-    return judged(data, stage, refitted.candidate, made, refitted.record, noise)
+    return acceptance_test(data, fitted, refitted.candidate, made, refitted.record, noise)
 
 
-def _elsewhere(data: Data, stage: Stage, refitted: Refit, noise: Noise, say: Progress) -> Refit:
+def _elsewhere(data: Data, fitted: FittedModel, refitted: Refit, noise: Noise, say: Progress) -> Refit:
     """Return a refit with evidence that does not predict as it should, judged again with its seed improved: its place may be to blame."""
     if refitted.score <= EVIDENCE or not refitted.candidate.effect.nearby(data.robot, refitted.candidate.seed):
         return refitted
-    better = polished(data, stage, refitted, noise, say)
-    return better if better is refitted else judged(data, stage, better.candidate, better.stage, better.record, noise)
+    better = polished(data, fitted, refitted, noise, say)
+    return better if better is refitted else acceptance_test(data, fitted, better.candidate, better.fitted, better.record, noise)
 
 
-def polished(data: Data, stage: Stage, refitted: Refit, noise: Noise, say: Progress) -> Refit:
+def polished(data: Data, fitted: FittedModel, refitted: Refit, noise: Noise, say: Progress) -> Refit:
     """Return a refit with its seed improved."""
-    made = _polish(data, stage, refitted, noise, say)
-    if made is refitted.stage:
+    made = _polish(data, fitted, refitted, noise, say)
+    if made is refitted.fitted:
         return refitted
-    score = refitted.score - evidence(stage.fit, refitted.stage.fit) + evidence(stage.fit, made.fit)
+    score = refitted.score - evidence(fitted.fit, refitted.fitted.fit) + evidence(fitted.fit, made.fit)
     refitted.record.update({"dbic": score, "validation_rms_m": made.held_rms})
-    return replace(refitted, stage=made, score=score)
+    return replace(refitted, fitted=made, score=score)
 
 
-def _enriched(data: Data, stage: Stage, winner: Refit, table: list[Candidate], noise: Noise, say: Progress) -> Refit:
+def _enriched(data: Data, fitted: FittedModel, winner: Refit, table: list[Candidate], noise: Noise, say: Progress) -> Refit:
     """Return the winner in a form with more parameters where that has EVIDENCE over the simple one."""
-    winner = _with_more_markers(data, stage, winner, table, noise, say)
+    winner = _with_more_markers(data, fitted, winner, table, noise, say)
     least = min(REFITTABLE, winner.candidate.retained)
     for form in _forms([c for c in table if c.retained >= least], winner.candidate.effect.name):
         if len(form.parameters) <= len(winner.candidate.parameters):
             continue
         say(f"trying {form.effect.name} with {len(form.parameters)} parameters")
-        made = _richer(data, stage, winner, form, noise)
+        made = _richer(data, fitted, winner, form, noise)
         if made is None:
             continue
-        rich = judged(data, stage, form, made, dict(winner.record), noise)
+        rich = acceptance_test(data, fitted, form, made, dict(winner.record), noise)
         if rich.record["verdict"] == "passes":
-            rich = polished(data, stage, rich, noise, say)
-        more = evidence(winner.stage.fit, rich.stage.fit) - (rich.candidate.cost - winner.candidate.cost)
+            rich = polished(data, fitted, rich, noise, say)
+        more = evidence(winner.fitted.fit, rich.fitted.fit) - (rich.candidate.cost - winner.candidate.cost)
         if rich.record["verdict"] == "passes" and more > EVIDENCE:
             winner.record.update(rich.record | {"seed": form.seed})
             winner = replace(rich, record=winner.record)
     return winner
 
 
-def _with_more_markers(data: Data, stage: Stage, winner: Refit, table: list[Candidate], noise: Noise, say: Progress) -> Refit:
+def _with_more_markers(
+    data: Data, fitted: FittedModel, winner: Refit, table: list[Candidate], noise: Noise, say: Progress
+) -> Refit:
     """Return offsets of markers with those of further markers, one after the other, as long as each has EVIDENCE: all of them at once cost too much.
     Other effects are returned as they are."""
     alone = [c for c in table if c.effect is winner.candidate.effect] if winner.candidate.effect.name == "marker_offset" else []
     while others := [c for c in alone if not set(c.parameters) & set(winner.candidate.parameters)]:
-        problem = problem_of(data, winner.stage.fit, noise)
-        gains = [linear_gain(winner.stage.fit, problem, c.raw, c.seats) - c.cost for c in others]
+        problem = problem_of(data, winner.fitted.fit, noise)
+        gains = [linear_gain(winner.fitted.fit, problem, c.raw, c.placements) - c.cost for c in others]
         if max(gains) <= EVIDENCE:
             break
         form = joined(winner.candidate, others[int(np.argmax(gains))])
         say(f"trying {form.effect.name} with {len(form.parameters)} parameters")
-        made = _richer(data, stage, winner, form, noise)
+        made = _richer(data, fitted, winner, form, noise)
         if made is None:
             break
-        more = judged(data, stage, form, made, dict(winner.record), noise)
-        gain = evidence(winner.stage.fit, made.fit)
+        more = acceptance_test(data, fitted, form, made, dict(winner.record), noise)
+        gain = evidence(winner.fitted.fit, made.fit)
         if more.record["verdict"] != "passes" or gain <= form.cost - winner.candidate.cost + EVIDENCE:
             break
         winner.record.update(more.record)
@@ -264,23 +266,23 @@ def _with_more_markers(data: Data, stage: Stage, winner: Refit, table: list[Cand
     return winner
 
 
-def _richer(data: Data, stage: Stage, winner: Refit, form: Candidate, noise: Noise) -> Stage | None:
+def _richer(data: Data, fitted: FittedModel, winner: Refit, form: Candidate, noise: Noise) -> FittedModel | None:
     """Return the fit of a richer form of the winner, started from the winner itself where its parameters are among those of the form."""
-    settled, terms = winner.stage.fit.hypothesis.settled, winner.stage.fit.hypothesis.terms
+    settled, terms = winner.fitted.fit.hypothesis.settled, winner.fitted.fit.hypothesis.terms
     keys = {p.key for p in form.parameters}
-    if settled != stage.fit.hypothesis.settled or not {p.key for p in terms[-1][2]} <= keys:
-        return tried(data, stage, form, noise, winner.score + EVIDENCE)
-    split = len(winner.stage.fit.coordinates) - len(terms[-1][2])
-    found = {(p.key, p.part): float(v) for p, v in zip(terms[-1][2], winner.stage.fit.coordinates[split:])}
+    if settled != fitted.fit.hypothesis.settled or not {p.key for p in terms[-1][2]} <= keys:
+        return tried(data, fitted, form, noise, winner.score + EVIDENCE)
+    split = len(winner.fitted.fit.coordinates) - len(terms[-1][2])
+    found = {(p.key, p.part): float(v) for p, v in zip(terms[-1][2], winner.fitted.fit.coordinates[split:])}
     own = [found.get((p.key, p.part), found.get((p.key, None), p.null)) for p in form.parameters]
-    hypothesis, prior = with_term(stage.fit, form.effect, form.seed, form.parameters)
+    hypothesis, prior = with_term(fitted.fit, form.effect, form.seed, form.parameters)
     try:
-        coordinates = np.concatenate([winner.stage.fit.coordinates[:split], own])
+        coordinates = np.concatenate([winner.fitted.fit.coordinates[:split], own])
         price = (form.cost - winner.candidate.cost + EVIDENCE - FORGONE[0]) / FORGONE[1]
-        if linear_gain(winner.stage.fit, problem_of(data, winner.stage.fit, noise), form.raw, form.seats) < HINTED * price:
+        if linear_gain(winner.fitted.fit, problem_of(data, winner.fitted.fit, noise), form.raw, form.placements) < HINTED * price:
             return None
-        worth = within(winner.stage.fit, price)
-        return make_stage(data, hypothesis, prior, noise, coordinates, own=own_of(winner.stage), max_iterations=10, worth=worth)
+        worth = within(winner.fitted.fit, price)
+        return fit_model(data, hypothesis, prior, noise, coordinates, own=own_of(winner.fitted), max_iterations=10, worth=worth)
     except FemsenseError:
         return None
 
@@ -290,7 +292,7 @@ def shortlist(table: list[Candidate], *, first: bool) -> list[Candidate]:
     as much, the simplest."""
     most = max((c.score for c in table if c.retained >= REFITTABLE), default=np.inf)
     table = [c for c in table if c.retained >= REFITTABLE or c.score > most]
-    names = list(dict.fromkeys(c.effect.name for c in table if c.score > PROMISING))
+    names = list(dict.fromkeys(c.effect.name for c in table if c.score > PREDICTED_MUCH))
     chosen: list[Candidate] = []
     for name in names[: REFITS if first else (REFITS + 1) // 2]:
         forms = _forms(table, name)
@@ -312,15 +314,15 @@ def _forms(table: list[Candidate], name: str) -> list[Candidate]:
 # --- polishing -------------------------------------------------------------------------------------------------------------
 
 
-def _polish(data: Data, stage: Stage, winner: Refit, noise: Noise, say: Progress) -> Stage:
+def _polish(data: Data, fitted: FittedModel, winner: Refit, noise: Noise, say: Progress) -> FittedModel:
     """Return the winner with its seed (place, radius, time) improved: first seeds near by, then fitted along."""
-    best, effect = winner.stage, winner.candidate.effect
+    best, effect = winner.fitted, winner.candidate.effect
     if effect.nearby(data.robot, winner.candidate.seed):
         say(f"looking near by for {effect.name}")
-        climbs = winner.climbs or climbed(data, stage, winner.candidate, noise)
-        best, winner.record["seed_spread"] = placed(data, stage, winner.candidate, winner.stage, climbs, noise)
+        climbs = winner.climbs or climbed(data, fitted, winner.candidate, noise)
+        best, winner.record["seed_std"] = located(data, fitted, winner.candidate, winner.fitted, climbs, noise)
     else:
-        winner.record["seed_spread"] = [0.0] * len(winner.candidate.parameters)
+        winner.record["seed_std"] = [0.0] * len(winner.candidate.parameters)
     if not winner.candidate.parameters:
         return best
     *others, (_, seed, parameters) = best.fit.hypothesis.terms
@@ -332,7 +334,7 @@ def _polish(data: Data, stage: Stage, winner: Refit, noise: Noise, say: Progress
     null = np.array([p.null for p in more])
     prior = Prior(np.concatenate([best.fit.prior.mean, null]), np.concatenate([best.fit.prior.std, [p.known for p in more]]))
     try:
-        made = make_stage(data, hypothesis, prior, noise, np.concatenate([best.fit.coordinates, null]), own=own_of(best))
+        made = fit_model(data, hypothesis, prior, noise, np.concatenate([best.fit.coordinates, null]), own=own_of(best))
     except FemsenseError:
         return best
     inside = all(p.low + 1e-9 < v < p.high - 1e-9 for p, v in zip(more, made.fit.coordinates[-len(more) :]))

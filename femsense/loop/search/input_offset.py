@@ -16,16 +16,23 @@ from femsense.core.errors import FemsenseError
 from femsense.loop.data.dataset import Data
 from femsense.loop.fit.cross_validation import sweeps_predicted
 from femsense.loop.fit.discretisation_error import beyond_mesh
-from femsense.loop.fit.fitted_model import Stage, held_chi2, keeping, span_of
+from femsense.loop.fit.fitted_model import FittedModel, held_chi2, keeping, span_of
 from femsense.loop.fit.noise_components import Noise
-from femsense.loop.search.acceptance import ABOVE_MESH_IF_SURE, held_share, judged, mesh_cost, moved_by, sure_beyond_mesh
+from femsense.loop.search.acceptance import (
+    ABOVE_MESH_IF_SURE,
+    acceptance_test,
+    discretisation_rms,
+    held_share,
+    moved_by,
+    sure_beyond_mesh,
+)
 from femsense.loop.search.effect_fields import fields_of
 from femsense.loop.search.forward_selection import polished, shortlist
 from femsense.loop.search.refit import EVIDENCE, evidence, refit
-from femsense.loop.search.screening import screen_stage
-from femsense.loop.search.search_state import InPlace, Progress, Refit
+from femsense.loop.search.screening import screen_model
+from femsense.loop.search.search_state import OffsetAlternative, Progress, Refit
 
-ZEROS = "cable_offset"
+OFFSETS = "cable_offset"
 SIGNIFICANT = 3.0
 RELEVANT = 0.02
 """A nuisance that moved by more than three standard deviations and 2 % is named as an effect."""
@@ -35,77 +42,81 @@ BETTER = 2.0
 """dBIC by which an effect must be better than the zeros to take their place."""
 
 
-def moved_nuisance(data: Data, stage: Stage, name: str, *, relevant: float = RELEVANT) -> int:
+def moved_nuisance(data: Data, fitted: FittedModel, name: str, *, relevant: float = RELEVANT) -> int:
     """Return how many values of a nuisance the data moved significantly away from what is declared, and by more than a share of it."""
-    part = span_of(stage.fit, name)
-    values, std = stage.fit.coordinates[part], stage.fit.std[part]
+    part = span_of(fitted.fit, name)
+    values, std = fitted.fit.coordinates[part], fitted.fit.std[part]
     if not len(values):
         return 0
     size = np.abs(values) / (1.0 if name == "stiffness" else np.maximum(data.input_scale, 1e-12))
     return int(((np.abs(values) > SIGNIFICANT * std) & (size > relevant)).sum())
 
 
-def evidence_for_zeros(data: Data, stage: Stage, without: Stage, n_effective: float) -> float:
+def evidence_for_offsets(data: Data, fitted: FittedModel, without: FittedModel, n_effective: float) -> float:
     """Return the dBIC of the zeros that moved: the others, as good as declared, cost nothing."""
-    moved, count = moved_nuisance(data, stage, ZEROS), len(data.robot.body.cables)
-    return evidence(without.fit, stage.fit) - moved * float(np.log(n_effective)) - 2.0 * float(np.log(max(count, 1)))
+    moved, count = moved_nuisance(data, fitted, OFFSETS), len(data.robot.body.cables)
+    return evidence(without.fit, fitted.fit) - moved * float(np.log(n_effective)) - 2.0 * float(np.log(max(count, 1)))
 
 
-def zeros_are_evident(data: Data, stage: Stage, noise: Noise, n_effective: float) -> Stage | None:
+def offsets_are_evident(data: Data, fitted: FittedModel, noise: Noise, n_effective: float) -> FittedModel | None:
     """Return the model without the zeros if it misses them, else None."""
-    if not moved_nuisance(data, stage, ZEROS):
+    if not moved_nuisance(data, fitted, OFFSETS):
         return None
     try:
-        without = keeping(data, stage, [n for n in stage.fit.hypothesis.names if n != ZEROS], noise)
+        without = keeping(data, fitted, [n for n in fitted.fit.hypothesis.names if n != OFFSETS], noise)
     except FemsenseError:
         return None
-    if evidence_for_zeros(data, stage, without, n_effective) <= EVIDENCE:
+    if evidence_for_offsets(data, fitted, without, n_effective) <= EVIDENCE:
         return None
-    fitted, declared = (beyond_mesh(data.held, s.held_residuals, noise) for s in (stage, without))
-    if fitted >= declared:
+    moved, declared = (beyond_mesh(data.held, s.held_residuals, noise) for s in (fitted, without))
+    if moved >= declared:
         return None
-    better, spread = sweeps_predicted(data.train, without.fit, stage.fit)
-    held = held_chi2(data, without, noise) - held_chi2(data, stage, noise)
-    sure = sure_beyond_mesh(better, spread, held, held_share(data) * evidence(without.fit, stage.fit))
-    return without if moved_by(without, stage) > (ABOVE_MESH_IF_SURE if sure else ABOVE_MESH) * mesh_cost(data, without) else None
+    better, spread = sweeps_predicted(data.train, without.fit, fitted.fit)
+    held = held_chi2(data, without, noise) - held_chi2(data, fitted, noise)
+    sure = sure_beyond_mesh(better, spread, held, held_share(data) * evidence(without.fit, fitted.fit))
+    return (
+        without
+        if moved_by(without, fitted) > (ABOVE_MESH_IF_SURE if sure else ABOVE_MESH) * discretisation_rms(data, without)
+        else None
+    )
 
 
-def in_place_of_zeros(
-    data: Data, stage: Stage, names: Sequence[str], noise: Noise, n_effective: float, say: Progress
-) -> InPlace | None:
+def instead_of_offsets(
+    data: Data, fitted: FittedModel, names: Sequence[str], noise: Noise, n_effective: float, say: Progress
+) -> OffsetAlternative | None:
     """Ask which effect explains what the zeros of a model explain; None where they explain nothing.
 
     Play of held cables does what zeros below those declared do. Of the two it is named where no zero is above: zeros err both ways.
     """
-    without = zeros_are_evident(data, stage, noise, n_effective)
+    without = offsets_are_evident(data, fitted, noise, n_effective)
     if without is None:
         return None
     say("asking what else might be in the place of the cable zeros")
-    worth = evidence_for_zeros(data, stage, without, n_effective)
-    table = screen_stage(data, without.fit, noise, fields_of(data, without, names), n_effective)
+    worth = evidence_for_offsets(data, fitted, without, n_effective)
+    table = screen_model(data, without.fit, noise, fields_of(data, without, names), n_effective)
     best: Refit | None = None
     records: list[dict[str, Any]] = []
     for candidate in shortlist(table, first=False):
         if candidate.score < 0.5 * worth - EVIDENCE:
             continue
-        record: dict[str, Any] = {"name": candidate.effect.name, "seed": candidate.seed, "in_place_of": ZEROS}
+        record: dict[str, Any] = {"name": candidate.effect.name, "seed": candidate.seed, "in_place_of": OFFSETS}
         try:
             made = refit(data, without, candidate, noise)
         except FemsenseError:
             continue
-        tried = judged(data, without, candidate, made, record, noise)
+        tried = acceptance_test(data, without, candidate, made, record, noise)
         records.append(record)
         if record["verdict"] == "passes" and (best is None or tried.score > best.score):
             best = tried
     if best is None:
-        return InPlace(None, "", -np.inf, records)
+        return OffsetAlternative(None, "", -np.inf, records)
     best = polished(data, without, best, noise, say)
     ahead = best.score - worth
-    predicts = best.record["cv_gain"] - sweeps_predicted(data.train, without.fit, stage.fit)[0]
+    predicts = best.record["cv_gain"] - sweeps_predicted(data.train, without.fit, fitted.fit)[0]
     takes = ahead > BETTER or (ahead > -EVIDENCE and ahead + predicts > BETTER)  # where evidence is close, what predicts better
     takes = takes or (
-        best.candidate.effect.name == "cable_slack" and best.stage.fit.chi2 < stage.fit.chi2 + EVIDENCE
+        best.candidate.effect.name == "cable_slack" and best.fitted.fit.chi2 < fitted.fit.chi2 + EVIDENCE
     )  # its mirror image
     if takes:
         best.record["verdict"] = "named"
-    return InPlace(best.stage if takes else None, best.candidate.effect.name, ahead, records)
+    return OffsetAlternative(best.fitted if takes else None, best.candidate.effect.name, ahead, records)

@@ -8,15 +8,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from femsense.core.errors import FemsenseError
-from femsense.core.least_squares import GIVEN_UP
+from femsense.core.least_squares import STOPPED_EARLY
 from femsense.loop.data.dataset import Data
-from femsense.loop.fit.fitted_model import Stage, jets_without, make_stage, own_of, problem_of
+from femsense.loop.fit.fitted_model import FittedModel, fit_model, jets_without, own_of, problem_of
 from femsense.loop.fit.joint_fit import JointFit
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.search.effect_fields import Answers, effect_fields
 from femsense.loop.search.refit import EVIDENCE, refit_from, tried
 from femsense.loop.search.screening import Candidate, confounding, jets_with, screen
-from femsense.loop.search.subsampling import few_of
+from femsense.loop.search.subsampling import representative_cases
 from femsense.model.effects import Entry
 
 NEARLY = 0.05
@@ -41,13 +41,13 @@ class Climbs:
     """How many times as much as this seed the best end explains, at least 1: a soft place is worth little beside where it is."""
 
 
-def placed(
-    data: Data, stage: Stage, candidate: Candidate, made: Stage, climbs: Climbs, noise: Noise
-) -> tuple[Stage, list[float]]:
+def located(
+    data: Data, fitted: FittedModel, candidate: Candidate, made: FittedModel, climbs: Climbs, noise: Noise
+) -> tuple[FittedModel, list[float]]:
     """Return the best of a candidate's fits, that which was `made` from its own seed or one that begins where a climb ends, its seed moved on,
     and the scatter of its parameters: that of `closer`, or that over the places that explain as much where this is larger."""
-    begun = [made, *_fitted_at(data, stage, candidate, made, climbs.ends, noise)]
-    moved = list[tuple[Stage, list[float]]]()
+    begun = [made, *_fitted_at(data, fitted, candidate, made, climbs.ends, noise)]
+    moved = list[tuple[FittedModel, list[float]]]()
     for one in sorted(begun, key=lambda s: s.fit.chi2):
         if not moved or one.fit.chi2 < moved[0][0].fit.chi2 + 2.0 * EVIDENCE:
             moved.append(closer(data, one, noise))
@@ -57,33 +57,33 @@ def placed(
 
 
 def _fitted_at(
-    data: Data, stage: Stage, candidate: Candidate, made: Stage, ends: Sequence[Candidate], noise: Noise
-) -> list[Stage]:
+    data: Data, fitted: FittedModel, candidate: Candidate, made: FittedModel, ends: Sequence[Candidate], noise: Noise
+) -> list[FittedModel]:
     """Return fits of a candidate that begin where climbs end; where some of the states spare time, of those ends only that explain as much as the
     best in these, with what was `made` from the candidate's own seed among them."""
-    few = few_of(data, stage, noise)
-    if few.spares:
-        near = [fit for end in ends if (fit := tried(few.data, few.stage, end, noise)) is not None]
-        least = min([few.of(made.fit, noise).chi2, *(one.fit.chi2 for one in near)])
+    cases = representative_cases(data, fitted, noise)
+    if cases.spares:
+        near = [fit for end in ends if (fit := tried(cases.data, cases.fitted, end, noise)) is not None]
+        least = min([cases.of(made.fit, noise).chi2, *(one.fit.chi2 for one in near)])
         begins = [one for one in near if one.fit.chi2 < least + 2.0 * EVIDENCE]
-        there = [refit_from(data, stage, one.fit, noise) for one in begins]
+        there = [refit_from(data, fitted, one.fit, noise) for one in begins]
     else:
-        others = _screen_seeds(data, stage, candidate, [end.seed for end in ends], noise) if ends else []
-        there = [tried(data, stage, other, noise) for other in others]
-    return [one for one in there if one is not None and one.fit.fit.status != GIVEN_UP]
+        others = _screen_seeds(data, fitted, candidate, [end.seed for end in ends], noise) if ends else []
+        there = [tried(data, fitted, other, noise) for other in others]
+    return [one for one in there if one is not None and one.fit.fit.status != STOPPED_EARLY]
 
 
-def climbed(data: Data, stage: Stage, start: Candidate, noise: Noise) -> Climbs:
+def climbed(data: Data, fitted: FittedModel, start: Candidate, noise: Noise) -> Climbs:
     """Return where the best STARTS seeds come to when each goes from neighbour to neighbour: a soft place here and a stiff one there look alike
     when the modulus is open. Some of the states show the way."""
-    few = few_of(data, stage, noise)
+    cases = representative_cases(data, fitted, noise)
     asked, known = list[Entry](), list[Candidate]()
-    answers: list[Answers] = [{} for _ in few.data.train]
+    answers: list[Answers] = [{} for _ in cases.data.train]
 
     def at(seeds: Sequence[Entry]) -> list[Candidate]:
         fresh = [seed for i, seed in enumerate(seeds) if seed not in seeds[:i] and seed not in asked]
         asked.extend(fresh)
-        known.extend(_screen_seeds(few.data, few.stage, start, fresh, noise, answers) if fresh else [])
+        known.extend(_screen_seeds(cases.data, cases.fitted, start, fresh, noise, answers) if fresh else [])
         return [c for c in known if c.seed in seeds]
 
     others = at([start.seed, *start.effect.seeds(data.robot)])
@@ -118,35 +118,35 @@ def _scatter(seen: Sequence[Candidate], best: Candidate, share: float) -> list[f
     return [float(v) for v in np.std(steps, axis=0)]
 
 
-def closer(data: Data, stage: Stage, noise: Noise) -> tuple[Stage, list[float]]:
+def closer(data: Data, fitted: FittedModel, noise: Noise) -> tuple[FittedModel, list[float]]:
     """Return a stage whose last effect has moved to neighbours of its seed as long as these explain more where the body is as the effect
     has bent it (what a seed does to the body before that ranks neighbours of a large effect wrongly), and by how much the step of each of
     its parameters scatters over the seeds that explain as much but for NEARLY. Some of the states show which neighbour it may be."""
     while True:
-        *_, (effect, seed, parameters) = stage.fit.hypothesis.terms
-        few = few_of(data, stage, noise)
-        share = float(np.mean(np.concatenate(few.rows))) if few.spares else 1.0
-        asked = (few.data, few.stage) if few.spares else (data, stage)
+        *_, (effect, seed, parameters) = fitted.fit.hypothesis.terms
+        cases = representative_cases(data, fitted, noise)
+        share = float(np.mean(np.concatenate(cases.rows))) if cases.spares else 1.0
+        asked = (cases.data, cases.fitted) if cases.spares else (data, fitted)
         around = _seeds_instead(*asked, noise, effect.nearby(data.robot, seed))
         here = next((c for c in around if c.seed == seed), None)
         if here is None:  # it does nothing to these markers
-            return stage, [0.0] * len(parameters)
+            return fitted, [0.0] * len(parameters)
         best = max(around, key=lambda c: c.gain)
         scatter = _scatter(around, best, share)
         if best.gain < here.gain + share * POLISHED:
-            return stage, scatter
-        there = _seeds_instead(data, stage, noise, [best.seed]) if few.spares else [best]
-        made = _moved(data, stage, there[0], noise) if there else None
-        if made is None or made.fit.chi2 > stage.fit.chi2 - POLISHED:
-            return stage, scatter
-        stage = made
+            return fitted, scatter
+        there = _seeds_instead(data, fitted, noise, [best.seed]) if cases.spares else [best]
+        made = _moved(data, fitted, there[0], noise) if there else None
+        if made is None or made.fit.chi2 > fitted.fit.chi2 - POLISHED:
+            return fitted, scatter
+        fitted = made
 
 
-def _seeds_instead(data: Data, stage: Stage, noise: Noise, seeds: Sequence[Entry]) -> list[Candidate]:
+def _seeds_instead(data: Data, fitted: FittedModel, noise: Noise, seeds: Sequence[Entry]) -> list[Candidate]:
     """Return the last effect of a stage at other seeds as candidates in its place, to first order where the body is."""
-    *_, (effect, _, parameters) = stage.fit.hypothesis.terms
-    fields = effect_fields(stage.fit, data.train, [(effect, s, parameters) for s in seeds])
-    return screen(without_last(stage.fit), problem_of(data, stage.fit, noise), fields, 100.0)
+    *_, (effect, _, parameters) = fitted.fit.hypothesis.terms
+    fields = effect_fields(fitted.fit, data.train, [(effect, s, parameters) for s in seeds])
+    return screen(without_last(fitted.fit), problem_of(data, fitted.fit, noise), fields, 100.0)
 
 
 def without_last(fit: JointFit) -> JointFit:
@@ -165,40 +165,40 @@ def _without(fit: JointFit, i: int) -> JointFit:
     return replace(fit, hypothesis=replace(fit.hypothesis, terms=(*terms[:i], *terms[i + 1 :])), fit=less)
 
 
-def may_lie_elsewhere(data: Data, stage: Stage, name: str, noise: Noise) -> bool:
+def may_lie_elsewhere(data: Data, fitted: FittedModel, name: str, noise: Noise) -> bool:
     """Return whether an effect of a stage, but for its place, may explain more at one of its other seeds: to first order, with the body as it is
     bent, as `closer` asks. Of one whose seed is no place nothing is known."""
-    fit, terms = stage.fit, stage.fit.hypothesis.terms
+    fit, terms = fitted.fit, fitted.fit.hypothesis.terms
     i = [effect.name for effect, _, _ in terms].index(name)
-    effect, seed, fitted = terms[i]
+    effect, seed, moving = terms[i]
     around = effect.nearby(data.robot, seed)
     if not around:
         return True
     own = {(p.key, p.part) for p in effect.parameters(data.robot, data.control)}
-    parameters = tuple(p for p in fitted if (p.key, p.part) in own)
+    parameters = tuple(p for p in moving if (p.key, p.part) in own)
     fields = effect_fields(fit, data.train, [(effect, s, parameters) for s in (*effect.seeds(data.robot), *around)])
     seen = screen(_without(fit, i), problem_of(data, fit, noise), fields, 100.0)
     here = next((c for c in seen if c.seed == seed), None)
     return here is None or max(c.gain for c in seen) > here.gain + POLISHED
 
 
-def _moved(data: Data, stage: Stage, candidate: Candidate, noise: Noise) -> Stage | None:
+def _moved(data: Data, fitted: FittedModel, candidate: Candidate, noise: Noise) -> FittedModel | None:
     """Return a stage with the seed of its last effect exchanged for that of a candidate beside it, fitted again; None where that does not fit."""
-    fit, q = stage.fit, len(candidate.parameters)
+    fit, q = fitted.fit, len(candidate.parameters)
     *terms, _ = fit.hypothesis.terms
     hypothesis = replace(fit.hypothesis, terms=(*terms, (candidate.effect, candidate.seed, candidate.parameters)))
     start = np.array([p.null for p in candidate.parameters]) + candidate.step
     keep = np.arange(len(fit.coordinates)) < len(fit.coordinates) - q
-    near = jets_with(replace(stage, fit=replace(fit, jets=jets_without(stage, keep))), candidate)
+    near = jets_with(replace(fitted, fit=replace(fit, jets=jets_without(fitted, keep))), candidate)
     try:
         coordinates = np.concatenate([fit.coordinates[:-q], start])
-        return make_stage(data, hypothesis, fit.prior, noise, coordinates, own=own_of(stage), near=near)
+        return fit_model(data, hypothesis, fit.prior, noise, coordinates, own=own_of(fitted), near=near)
     except FemsenseError:
         return None
 
 
 def _screen_seeds(
-    data: Data, stage: Stage, start: Candidate, seeds: Sequence[Entry], noise: Noise, answers: list[Answers] | None = None
+    data: Data, fitted: FittedModel, start: Candidate, seeds: Sequence[Entry], noise: Noise, answers: list[Answers] | None = None
 ) -> list[Candidate]:
-    fields = effect_fields(stage.fit, data.train, [(start.effect, seed, start.parameters) for seed in seeds], answers)
-    return screen(stage.fit, problem_of(data, stage.fit, noise), fields, 100.0)
+    fields = effect_fields(fitted.fit, data.train, [(start.effect, seed, start.parameters) for seed in seeds], answers)
+    return screen(fitted.fit, problem_of(data, fitted.fit, noise), fields, 100.0)

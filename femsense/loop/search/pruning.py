@@ -6,7 +6,7 @@ import numpy as np
 
 from femsense.core.errors import FemsenseError
 from femsense.loop.data.dataset import Data
-from femsense.loop.fit.fitted_model import Stage, found_in, keeping
+from femsense.loop.fit.fitted_model import FittedModel, found_in, keeping
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.search.location_search import closer
 from femsense.loop.search.refit import FORGONE, beyond, evidence
@@ -15,27 +15,27 @@ from femsense.loop.search.search_state import Progress
 # --- pruning ---------------------------------------------------------------------------------------------------------------
 
 
-def prune(data: Data, stage: Stage, noise: Noise, n_effective: float, say: Progress) -> Stage:
+def prune(data: Data, fitted: FittedModel, noise: Noise, n_effective: float, say: Progress) -> FittedModel:
     """Return the stage without effects that those added later have made needless (dBIC for keeping them not above 0); the place of the last one,
     which was found beside them, then moves on."""
-    whole, added = stage, found_in(stage)
+    whole, added = fitted, found_in(fitted)
     for name in added[:-1]:
-        others = [n for n in stage.fit.hypothesis.names if n != name]
-        count = sum(len(p) for e, _, p in stage.fit.hypothesis.terms if e.name == name)
+        others = [n for n in fitted.fit.hypothesis.names if n != name]
+        count = sum(len(p) for e, _, p in fitted.fit.hypothesis.terms if e.name == name)
         if not count:
             continue
         say(f"asking whether {name} is still needed")
         price = count * float(np.log(n_effective))
         try:
-            without = keeping(data, stage, others, noise, worth=beyond(stage.fit, FORGONE[1] * price + FORGONE[0]))
+            without = keeping(data, fitted, others, noise, worth=beyond(fitted.fit, FORGONE[1] * price + FORGONE[0]))
         except FemsenseError:
             continue
-        if evidence(without.fit, stage.fit) <= price:
-            stage = without
-    *_, (effect, seed, parameters) = stage.fit.hypothesis.terms
+        if evidence(without.fit, fitted.fit) <= price:
+            fitted = without
+    *_, (effect, seed, parameters) = fitted.fit.hypothesis.terms
     places = (
-        stage is not whole
+        fitted is not whole
         and effect.nearby(data.robot, seed)
         and len(parameters) == len(effect.parameters(data.robot, data.control))
     )
-    return closer(data, stage, noise)[0] if places else stage
+    return closer(data, fitted, noise)[0] if places else fitted

@@ -8,9 +8,9 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import DataError, FemsenseError
-from femsense.core.least_squares import GIVEN_UP
+from femsense.core.least_squares import STOPPED_EARLY
 from femsense.loop.data.dataset import Data
-from femsense.loop.fit.fitted_model import Stage, found_in, make_stage, own_of
+from femsense.loop.fit.fitted_model import FittedModel, fit_model, found_in, own_of
 from femsense.loop.fit.joint_fit import JointFit, Prior
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.search.screening import Candidate, jets_with
@@ -20,11 +20,11 @@ from femsense.model.observation import Hypothesis
 
 EVIDENCE = 10.0
 """dBIC that a named effect needs."""
-PROMISED = 0.3
+PREDICTED = 0.3
 """A fit from the null that brings less than this share of the linear gain is tried from other starts too."""
 DECLARED = -1.0
 """Start from what is declared, where a discrete alternative does not fit from where calibration has gone without it …"""
-STRAYED = 2.0
+DRIFTED = 2.0
 """… or where this has gone so many of the standard deviations known beforehand, for the sake of what is missing …"""
 EXPLAINS = 1.25
 """… and an effect leaves more than this mean square from there, in units of the noise. Until one leaves less, linear scores say little."""
@@ -54,14 +54,14 @@ def beyond(fit: JointFit, price: float) -> float:
 
 def refit(
     data: Data,
-    stage: Stage,
+    fitted: FittedModel,
     candidate: Candidate,
     noise: Noise,
     *,
     wanted: float = EVIDENCE,
     settled: bool = False,
     begin: JointFit | None = None,
-) -> Stage:
+) -> FittedModel:
     """Joint fit with one more effect, started where a fit to some of the states ended (`begin`), else from its linear step. Raises DataError where
     no start helps.
 
@@ -70,26 +70,26 @@ def refit(
     null = np.array([p.null for p in candidate.parameters])
     low, high = np.array([p.low for p in candidate.parameters]), np.array([p.high for p in candidate.parameters])
     start = null if candidate.effect.discrete else np.clip(_first_guess(candidate, null), low, high)
-    hypothesis, prior = with_term(stage.fit, candidate.effect, candidate.seed, candidate.parameters)
+    hypothesis, prior = with_term(fitted.fit, candidate.effect, candidate.seed, candidate.parameters)
     gravity = candidate.effect.name == "gravity"
     free = not candidate.effect.discrete and not gravity  # for these the null is no start
     answer = 0.0 if candidate.effect.discrete else candidate.response @ (start - null)  # of what is fitted already
-    worth = worth_of(stage.fit, candidate, wanted, settled)
+    worth = worth_of(fitted.fit, candidate, wanted, settled)
 
-    def fitted(share: float) -> Stage | None:
+    def started_at(share: float) -> FittedModel | None:
         part = share if share != DECLARED else 0.0 if free else 1.0
-        known = jets_with(stage, candidate) if free and share == 0.0 else None
-        near = stage.fit.jets if not candidate.parameters and share != DECLARED else None
+        known = jets_with(fitted, candidate) if free and share == 0.0 else None
+        near = fitted.fit.jets if not candidate.parameters and share != DECLARED else None
         try:
-            theta = _declared(data, stage, hypothesis, noise) if share == DECLARED else stage.fit.fit.theta + share * answer
-            coordinates = np.concatenate([theta[stage.fit.own :], null + part * (start - null)])
-            return make_stage(
+            theta = _declared(data, fitted, hypothesis, noise) if share == DECLARED else fitted.fit.fit.theta + share * answer
+            coordinates = np.concatenate([theta[fitted.fit.own :], null + part * (start - null)])
+            return fit_model(
                 data,
                 hypothesis,
                 prior,
                 noise,
                 coordinates,
-                own=theta[: stage.fit.own],
+                own=theta[: fitted.fit.own],
                 max_iterations=10,
                 known=known,
                 near=near,
@@ -98,41 +98,41 @@ def refit(
         except DataError:
             return None
 
-    best = None if begin is None else refit_from(data, stage, begin, noise, worth)
+    best = None if begin is None else refit_from(data, fitted, begin, noise, worth)
     if best is not None:
         return best
-    given_up: Stage | None = None
+    stopped_early: FittedModel | None = None
     for share in _shares(candidate, free):
-        made = fitted(share)
-        if made is not None and made.fit.chi2 <= (stage.fit.chi2 + 1.0 if best is None else best.fit.chi2):
+        made = started_at(share)
+        if made is not None and made.fit.chi2 <= (fitted.fit.chi2 + 1.0 if best is None else best.fit.chi2):
             best = made
-        if made is not None and made.fit.fit.status == GIVEN_UP:
-            given_up = made
+        if made is not None and made.fit.fit.status == STOPPED_EARLY:
+            stopped_early = made
             break
-        if best is not None and not (free and share == 0.0 and stage.fit.chi2 - best.fit.chi2 <= PROMISED * candidate.gain):
+        if best is not None and not (free and share == 0.0 and fitted.fit.chi2 - best.fit.chi2 <= PREDICTED * candidate.gain):
             break
-    if gravity and _has_strayed(stage) and not explains(best):
-        made = fitted(DECLARED)
+    if gravity and _has_drifted(fitted) and not explains(best):
+        made = started_at(DECLARED)
         best = made if made is not None and (best is None or made.fit.chi2 <= best.fit.chi2) else best
-    found = best or given_up
+    found = best or stopped_early
     if found is None:
         raise DataError("no start from which the fit improves")
     return found
 
 
-def refit_from(data: Data, stage: Stage, begin: JointFit, noise: Noise, worth: float = np.inf) -> Stage | None:
+def refit_from(data: Data, fitted: FittedModel, begin: JointFit, noise: Noise, worth: float = np.inf) -> FittedModel | None:
     """Return the fit to all states of a hypothesis that was fitted to some of them, from where that ended; None where it has no equilibrium, or does
     not help."""
     coordinates, own = begin.coordinates, begin.fit.theta[: begin.own]
     for trial, jet in zip(data.train, begin.jets):
         trial.starts_on(begin.hypothesis.robot.body.mesh).update(jet.states)
     try:
-        made = make_stage(
+        made = fit_model(
             data, begin.hypothesis, begin.prior, noise, coordinates, own=own, max_iterations=10, worth=worth, spare=LEFT
         )
     except DataError:
         return None
-    return made if made.fit.chi2 <= stage.fit.chi2 + 1.0 else None
+    return made if made.fit.chi2 <= fitted.fit.chi2 + 1.0 else None
 
 
 def worth_of(fit: JointFit, candidate: Candidate, wanted: float, settled: bool) -> float:
@@ -147,28 +147,28 @@ def _shares(candidate: Candidate, free: bool) -> tuple[float, ...]:
     return (0.0, 1.0, 0.3) if free else (1.0, 0.3, 0.0)
 
 
-def _has_strayed(stage: Stage) -> bool:
+def _has_drifted(fitted: FittedModel) -> bool:
     """Return whether calibration alone has gone far beyond what is known of it beforehand."""
-    fit = stage.fit
+    fit = fitted.fit
     known = np.isfinite(fit.prior.std)
-    far = np.abs(fit.coordinates - fit.prior.mean)[known] > STRAYED * fit.prior.std[known]
-    return bool(far.any()) and not found_in(stage)
+    far = np.abs(fit.coordinates - fit.prior.mean)[known] > DRIFTED * fit.prior.std[known]
+    return bool(far.any()) and not found_in(fitted)
 
 
-def explains(stage: Stage | None) -> bool:
+def explains(fitted: FittedModel | None) -> bool:
     """Return whether a model leaves little more than the noise where it is fitted."""
-    return stage is not None and stage.fit.chi2 < EXPLAINS * max(len(stage.fit.fit.residual) - len(stage.fit.fit.theta), 1)
+    return fitted is not None and fitted.fit.chi2 < EXPLAINS * max(len(fitted.fit.fit.residual) - len(fitted.fit.fit.theta), 1)
 
 
-def _declared(data: Data, stage: Stage, hypothesis: Hypothesis, noise: Noise) -> FloatArray:
+def _declared(data: Data, fitted: FittedModel, hypothesis: Hypothesis, noise: Noise) -> FloatArray:
     """Return where an effect starts if what is fitted stays as declared: with its own poses and initial inputs."""
     alone = replace(hypothesis, terms=())
     for trial in data.train:
-        if hypothesis.robot.body.mesh is not stage.fit.hypothesis.robot.body.mesh:
+        if hypothesis.robot.body.mesh is not fitted.fit.hypothesis.robot.body.mesh:
             trial.starts_on(hypothesis.robot.body.mesh).clear()  # states that were carried there from elsewhere may have folded
     nothing = Prior(np.zeros(0), np.zeros(0))
-    placed = make_stage(data, alone, nothing, noise, np.zeros(0), own=own_of(stage))
-    return np.concatenate([own_of(placed), stage.fit.prior.mean])
+    placed = fit_model(data, alone, nothing, noise, np.zeros(0), own=own_of(fitted))
+    return np.concatenate([own_of(placed), fitted.fit.prior.mean])
 
 
 def with_term(fit: JointFit, effect: Effect, seed: Entry, parameters: tuple[Parameter, ...]) -> tuple[Hypothesis, Prior]:
@@ -192,16 +192,16 @@ def _first_guess(candidate: Candidate, null: FloatArray) -> FloatArray:
 
 def tried(
     data: Data,
-    stage: Stage,
+    fitted: FittedModel,
     candidate: Candidate,
     noise: Noise,
     wanted: float = EVIDENCE,
     *,
     settled: bool = False,
     begin: JointFit | None = None,
-) -> Stage | None:
+) -> FittedModel | None:
     """Return a refit, or None where there is none."""
     try:
-        return refit(data, stage, candidate, noise, wanted=wanted, settled=settled, begin=begin)
+        return refit(data, fitted, candidate, noise, wanted=wanted, settled=settled, begin=begin)
     except FemsenseError:
         return None

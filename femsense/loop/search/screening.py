@@ -16,7 +16,7 @@ from scipy.optimize import lsq_linear
 from femsense.core.arrays import FloatArray
 from femsense.loop.data.dataset import Data
 from femsense.loop.data.trial import spans_of
-from femsense.loop.fit.fitted_model import Stage, problem_of
+from femsense.loop.fit.fitted_model import FittedModel, problem_of
 from femsense.loop.fit.joint_fit import JointFit, JointProblem
 from femsense.loop.fit.noise_components import Noise, estimate_noise, whiten
 from femsense.loop.search.effect_fields import Fields
@@ -36,7 +36,7 @@ class Candidate:
     parameters: tuple[Parameter, ...]
     raw: list[FloatArray]
     """Columns in metres, one array (k, c, q) a trial."""
-    seats: list[FloatArray]
+    placements: list[FloatArray]
     """The same of the seats that rest.csv measures [m], (r, 3, q) a trial."""
     columns: FloatArray
     """Whitened, nuisance projected out, shape (N, q)."""
@@ -62,7 +62,7 @@ def joined(a: Candidate, b: Candidate) -> Candidate:
         a,
         parameters=(*a.parameters, *b.parameters),
         raw=[np.concatenate(pair, axis=2) for pair in zip(a.raw, b.raw)],
-        seats=[np.concatenate(pair, axis=2) for pair in zip(a.seats, b.seats)],
+        placements=[np.concatenate(pair, axis=2) for pair in zip(a.placements, b.placements)],
         columns=np.hstack([a.columns, b.columns]),
         response=np.hstack([a.response, b.response]),
         retained=min(a.retained, b.retained),
@@ -118,10 +118,10 @@ def screen(base: JointFit, problem: JointProblem, fields: Fields, n_effective: f
     return sorted(result, key=lambda c: -c.score)
 
 
-def linear_gain(base: JointFit, problem: JointProblem, raw: list[FloatArray], seats: list[FloatArray]) -> float:
+def linear_gain(base: JointFit, problem: JointProblem, raw: list[FloatArray], placements: list[FloatArray]) -> float:
     """Return the decrease of χ² that columns of markers and seats (see `Candidate`) promise beside a fit, without bounds."""
     Q = _orthonormal(np.asarray(base.fit.jacobian))
-    whole = _whitened(base, problem, raw, seats)
+    whole = _whitened(base, problem, raw, placements)
     more = _orthonormal(whole - Q @ (Q.T @ whole))
     return float(np.sum((more.T @ base.fit.residual) ** 2))
 
@@ -134,7 +134,7 @@ def _whitened(base: JointFit, problem: JointProblem, own: list[FloatArray], rest
     for trial, factor, block, rows in zip(problem.trials, problem.factors, own, rest):
         k, s = block.shape[0] * block.shape[1], 3 * len(rows)
         result[at : at + k] = whiten(factor, block)
-        result[at + k : at + k + s] = rows.reshape(s, q) / problem.seat_std
+        result[at + k : at + k + s] = rows.reshape(s, q) / problem.placement_std
         at += k + s + 6 * len(trial.poses)
     return result
 
@@ -201,26 +201,26 @@ APART = 3.0
 """A marker stands apart that sits elsewhere by so many times the median of all: of seats that scatter alike one in ten thousand does."""
 
 
-def jets_with(stage: Stage, candidate: Candidate) -> list[SceneJet]:
+def jets_with(fitted: FittedModel, candidate: Candidate) -> list[SceneJet]:
     """Return the jets of a stage with the columns of a candidate behind the others."""
     return [
         replace(
             jet,
             by_effect=np.concatenate([jet.by_effect, own], axis=2),
-            rest_by_effect=np.concatenate([jet.rest_by_effect, seats], axis=2),
+            rest_by_effect=np.concatenate([jet.rest_by_effect, placements], axis=2),
         )
-        for jet, own, seats in zip(stage.fit.jets, candidate.raw, candidate.seats)
+        for jet, own, placements in zip(fitted.fit.jets, candidate.raw, candidate.placements)
     ]
 
 
-def noise_of(data: Data, stage: Stage, fields: Fields, before: Noise | None = None) -> tuple[Noise, float]:
+def noise_of(data: Data, fitted: FittedModel, fields: Fields, before: Noise | None = None) -> tuple[Noise, float]:
     """Estimate the noise from what the richest linear model leaves; return it with the effective number of observations."""
-    table = screen(stage.fit, problem_of(data, stage.fit, Noise({"white": 5e-4}, "")), fields, 100.0)
-    apart, own = _apart(table), stage.fit.own
+    table = screen(fitted.fit, problem_of(data, fitted.fit, Noise({"white": 5e-4}, "")), fields, 100.0)
+    apart, own = _apart(table), fitted.fit.own
     errors = [t.error_by_sweep for t in data.train]
     widest = max(0 if e is None else e.shape[2] for e in errors)
     columns, extra = [], []
-    for i, (error, jet, span) in enumerate(zip(errors, stage.fit.jets, spans_of(data.train))):
+    for i, (error, jet, span) in enumerate(zip(errors, fitted.fit.jets, spans_of(data.train))):
         shape = jet.residual.shape
         block = np.zeros((*shape, own + widest))
         block[:, :, span] = np.concatenate([jet.by_pose, jet.by_initial], axis=2)
@@ -231,7 +231,7 @@ def noise_of(data: Data, stage: Stage, fields: Fields, before: Noise | None = No
         extra.append(np.concatenate([np.zeros((*shape, 0)), *others], axis=2))
     groups = [t.groups for t in data.train]
     noise = Noise({}, "")
-    residuals = [j.residual for j in stage.fit.jets]
+    residuals = [j.residual for j in fitted.fit.jets]
     for clouds in (False, True):
         which = [i for i, t in enumerate(data.train) if (t.scene.crossings is not None) == clouds]
         if which:
@@ -257,5 +257,5 @@ def _marker(parameter: Parameter) -> str | None:
     return parameter.part[0] if isinstance(parameter.part, tuple) else None
 
 
-def screen_stage(data: Data, fit: JointFit, noise: Noise, fields: Fields, n_effective: float) -> list[Candidate]:
+def screen_model(data: Data, fit: JointFit, noise: Noise, fields: Fields, n_effective: float) -> list[Candidate]:
     return screen(fit, problem_of(data, fit, noise), fields, n_effective)

@@ -8,7 +8,7 @@ from typing import Any
 
 from femsense.core.errors import FemsenseError
 from femsense.loop.data.dataset import Data
-from femsense.loop.fit.fitted_model import Stage
+from femsense.loop.fit.fitted_model import FittedModel
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.search.effect_fields import Fields
 from femsense.loop.search.location_search import Climbs
@@ -16,21 +16,21 @@ from femsense.loop.search.screening import Candidate
 
 
 @dataclass(eq=False, slots=True)
-class Course:
+class SearchProgress:
     """How far a search has come."""
 
     data: Data
     earlier: Data
     """The data as they were before the last effect was added."""
-    before: Stage
+    before: FittedModel
     """The declared model, calibrated."""
-    history: list[tuple[str, Stage]]
+    history: list[tuple[str, FittedModel]]
     """As of `Search`."""
     given: int
     """How many models of the history were there before the search."""
-    stage: Stage
+    fitted: FittedModel
     """The model that comes next is this one with one effect more."""
-    base: Stage
+    base: FittedModel
     """As of `Search`, from the first screening on."""
     names: list[str]
     """Effects that are tried."""
@@ -58,20 +58,20 @@ class Course:
         step, back = len(self.history) - 1, {"verdict": f"no equilibrium: {error}"}
         self.refits = [{**r, **back} if r["step"] == step and r["verdict"] == "named" else r for r in self.refits]
         self.data, self.history, self.over = self.earlier, self.history[:-1], True
-        self.stage = self.history[-1][1]
+        self.fitted = self.history[-1][1]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Search:
     """What the search went through."""
 
-    before: Stage
+    before: FittedModel
     """The declared model, calibrated."""
-    history: list[tuple[str, Stage]]
+    history: list[tuple[str, FittedModel]]
     """("", the model with what calibration may move on the declared mesh), then each effect with the stage that added it."""
-    base: Stage
+    base: FittedModel
     """The model of the first screening: with what calibration may move, on quadratic elements if effects were sought with these."""
-    final: Stage
+    final: FittedModel
     noise: Noise
     n_effective: float
     first: list[Candidate]
@@ -79,7 +79,7 @@ class Search:
     last: list[Candidate]
     """The last one."""
     refits: list[dict[str, Any]]
-    in_place: InPlace | None
+    in_place: OffsetAlternative | None
     """What might be in the place of the cable zeros."""
 
 
@@ -91,7 +91,7 @@ class Refit:
     """A candidate after its joint fit."""
 
     candidate: Candidate
-    stage: Stage
+    fitted: FittedModel
     score: float
     """dBIC of the nonlinear fit."""
     gain: float
@@ -103,10 +103,10 @@ class Refit:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class InPlace:
+class OffsetAlternative:
     """What became of the question."""
 
-    stage: Stage | None
+    fitted: FittedModel | None
     """A model with an effect in the place of the zeros, where that is better."""
     name: str
     """The effect that is best in their place; empty: none passes."""

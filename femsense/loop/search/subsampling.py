@@ -10,7 +10,7 @@ from femsense.core.arrays import BoolArray, IntArray
 from femsense.core.errors import FemsenseError
 from femsense.loop.data.dataset import Data
 from femsense.loop.data.representative_states import MOST_WORK, spread_states
-from femsense.loop.fit.fitted_model import Stage, problem_of, weighed
+from femsense.loop.fit.fitted_model import FittedModel, problem_of, weighed
 from femsense.loop.fit.joint_fit import JointFit
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.search.effect_fields import Fields
@@ -24,12 +24,12 @@ SPARED = 0.6
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Few:
+class RepresentativeCases:
     """What a stage makes of some of its states."""
 
     data: Data
     """Nothing is held out."""
-    stage: Stage
+    fitted: FittedModel
     rows: list[BoolArray]
     """Which rows of each trial are theirs, shape (k,)."""
     spares: bool
@@ -42,7 +42,7 @@ class Few:
     def candidate(self, candidate: Candidate, noise: Noise) -> Candidate | None:
         """Return a candidate as these states have it; None where they do not tell, or the states before them would be needed."""
         effect, seed, parameters = candidate.effect, candidate.seed, candidate.parameters
-        fit = self.stage.fit
+        fit = self.fitted.fit
         if not candidate.raw:
             return None
         try:
@@ -53,7 +53,7 @@ class Few:
         if has_history(acting):
             return None
         raw = [block[rows] for block, rows in zip(candidate.raw, self.rows)]
-        fields = Fields([(effect, seed, parameters)], raw, candidate.seats, fit.hypothesis)
+        fields = Fields([(effect, seed, parameters)], raw, candidate.placements, fit.hypothesis)
         seen = screen(fit, problem_of(self.data, fit, noise), fields, 1.0)
         return replace(seen[0], cost=candidate.cost) if seen else None
 
@@ -74,20 +74,20 @@ def _chosen(data: Data, robot: Robot) -> tuple[list[IntArray], float]:
     return [frames for frames, _ in chosen], float(np.mean([share for _, share in chosen]))
 
 
-def few_of(data: Data, stage: Stage, noise: Noise) -> Few:
+def representative_cases(data: Data, fitted: FittedModel, noise: Noise) -> RepresentativeCases:
     """Return some states of a stage that differ as much as they can, or all of them where these are not too much work."""
-    robot = stage.fit.hypothesis.robot_at(stage.fit.coordinates)
+    robot = fitted.fit.hypothesis.robot_at(fitted.fit.coordinates)
     frames, share = _chosen(data, robot)
-    rows = [np.isin(t.scene.frame, few) for t, few in zip(data.train, frames)]
+    rows = [np.isin(t.scene.frame, cases) for t, cases in zip(data.train, frames)]
     bare, less = replace(data, held=[], held_of=[]), _spares(share, robot)
     if all(own.all() for own in rows):
-        return Few(bare, stage, rows, less)
+        return RepresentativeCases(bare, fitted, rows, less)
     trials = [
-        replace(t.part(few), mesh_error=None if t.mesh_error is None else t.mesh_error[own])
-        for t, few, own in zip(data.train, frames, rows)
+        replace(t.part(cases), mesh_error=None if t.mesh_error is None else t.mesh_error[own])
+        for t, cases, own in zip(data.train, frames, rows)
     ]
     part = replace(bare, train=trials)
-    return Few(part, Stage(_picked(part, stage.fit, noise, rows), [], float("nan")), rows, less)
+    return RepresentativeCases(part, FittedModel(_picked(part, fitted.fit, noise, rows), [], float("nan")), rows, less)
 
 
 def _picked(data: Data, fit: JointFit, noise: Noise, rows: list[BoolArray]) -> JointFit:

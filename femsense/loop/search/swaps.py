@@ -12,43 +12,43 @@ from typing import Any
 
 from femsense.core.errors import FemsenseError
 from femsense.loop.data.dataset import NUISANCE, Data
-from femsense.loop.fit.fitted_model import Stage, keeping
+from femsense.loop.fit.fitted_model import FittedModel, keeping
 from femsense.loop.fit.noise_components import Noise
-from femsense.loop.search.acceptance import judged, tilt_cost, weighs
+from femsense.loop.search.acceptance import acceptance_test, prior_evidence, tilt_penalty
 from femsense.loop.search.effect_fields import fields_of
 from femsense.loop.search.forward_selection import polished, shortlist
 from femsense.loop.search.location_search import may_lie_elsewhere
 from femsense.loop.search.refit import EVIDENCE, evidence, refit
-from femsense.loop.search.screening import Candidate, screen_stage
+from femsense.loop.search.screening import Candidate, screen_model
 from femsense.loop.search.search_state import Progress, Refit
 
-RIVALS = 2
+ALTERNATIVES = 2
 """So many rivals of an effect are asked."""
 NEAR = 0.75
 """A rival had this share of the evidence of the effect at least when that was named."""
 BETTER = 2.0
 """dBIC by which a rival must be better; it takes EVIDENCE in the place of gravity where none is declared, since every body has weight."""
 
-History = list[tuple[str, Stage]]
+History = list[tuple[str, FittedModel]]
 Records = list[dict[str, Any]]
 
 
-def exchanged(
+def swapped(
     data: Data, history: History, refits: Records, noise: Noise, n_effective: float, say: Progress
 ) -> tuple[History, Records]:
     """Return the history with rivals in the places of effects, but for the last one, that they beat in the whole model, and the
     refits with what became of those that were asked."""
     for name in [name for name, _ in history[1:-1]]:
-        stage = history[-1][1]
-        rivals = _rivals(stage, refits, name)
-        if not rivals or (rivals == [name] and not may_lie_elsewhere(data, stage, name, noise)):
+        fitted = history[-1][1]
+        rivals = _rivals(fitted, refits, name)
+        if not rivals or (rivals == [name] and not may_lie_elsewhere(data, fitted, name, noise)):
             continue
         say(f"refitting {' or '.join(rivals)} in the place of {name}")
         try:
-            without = keeping(data, stage, [n for n in stage.fit.hypothesis.names if n != name], noise)
-            best, records = _best(data, stage, without, name, rivals, noise, n_effective, say)
+            without = keeping(data, fitted, [n for n in fitted.fit.hypothesis.names if n != name], noise)
+            best, records = _best(data, fitted, without, name, rivals, noise, n_effective, say)
             if best is not None:
-                history = [*_without(data, history, without, name, noise), (best.candidate.effect.name, best.stage)]
+                history = [*_without(data, history, without, name, noise), (best.candidate.effect.name, best.fitted)]
         except FemsenseError:
             continue
         if best is not None:
@@ -58,9 +58,9 @@ def exchanged(
     return history, refits
 
 
-def _rivals(stage: Stage, refits: Records, name: str) -> list[str]:
+def _rivals(fitted: FittedModel, refits: Records, name: str) -> list[str]:
     """Return the effects that were nearly as good when one was named, the best first; the effect itself if its seed was chosen from many."""
-    seeds = {effect.name: seed for effect, seed, parameters in stage.fit.hypothesis.terms if parameters}
+    seeds = {effect.name: seed for effect, seed, parameters in fitted.fit.hypothesis.terms if parameters}
     named = [r for r in refits if r["name"] == name and r["verdict"] == "named"]
     if name not in seeds or not named:
         return []
@@ -72,23 +72,30 @@ def _rivals(stage: Stage, refits: Records, name: str) -> list[str]:
         and r["verdict"] == "passes"
         and r.get("in_place_of") == own.get("in_place_of")
         and r["dbic"] > NEAR * own["dbic"] - EVIDENCE
-        and r["name"] not in stage.fit.hypothesis.names
+        and r["name"] not in fitted.fit.hypothesis.names
     ]
     others = list(dict.fromkeys(r["name"] for r in sorted(near, key=lambda r: -r["dbic"])))
-    return [name] * bool(seeds[name]) + others[:RIVALS]
+    return [name] * bool(seeds[name]) + others[:ALTERNATIVES]
 
 
 def _best(
-    data: Data, stage: Stage, without: Stage, name: str, rivals: list[str], noise: Noise, n_effective: float, say: Progress
+    data: Data,
+    fitted: FittedModel,
+    without: FittedModel,
+    name: str,
+    rivals: list[str],
+    noise: Noise,
+    n_effective: float,
+    say: Progress,
 ) -> tuple[Refit | None, Records]:
     """Return the best rival if it is better than what is named, and what became of each."""
-    table = screen_stage(data, without.fit, noise, fields_of(data, without, [name, *rivals]), n_effective)
-    own = _same(table, stage, name)
+    table = screen_model(data, without.fit, noise, fields_of(data, without, [name, *rivals]), n_effective)
+    own = _same(table, fitted, name)
     if own is None:
         return None, []
-    worth = evidence(without.fit, stage.fit) - own.cost - tilt_cost(data.declared, own, stage.fit)
+    worth = evidence(without.fit, fitted.fit) - own.cost - tilt_penalty(data.declared, own, fitted.fit)
     records: Records = [{"name": name, "seed": own.seed, "in_place_of": name, "dbic": worth, "verdict": "passes"}]
-    margin = max(BETTER, weighs(data, name))
+    margin = max(BETTER, prior_evidence(data, name))
     best: Refit | None = None
     for candidate in shortlist([c for c in table if c.effect.name in rivals], first=True):
         record: dict[str, Any] = {"name": candidate.effect.name, "seed": candidate.seed, "in_place_of": name}
@@ -96,7 +103,7 @@ def _best(
             made = refit(data, without, candidate, noise)
         except FemsenseError:
             continue
-        tried = judged(data, without, candidate, made, record, noise)
+        tried = acceptance_test(data, without, candidate, made, record, noise)
         if record["verdict"] == "passes":
             tried = polished(data, without, tried, noise, say)
             records.append(record)
@@ -105,14 +112,14 @@ def _best(
     return best, records
 
 
-def _same(table: Sequence[Candidate], stage: Stage, name: str) -> Candidate | None:
+def _same(table: Sequence[Candidate], fitted: FittedModel, name: str) -> Candidate | None:
     """Return the candidate of the form that is named: the one with most of what is fitted, which may be its place or time, too."""
-    fitted = {(p.key, p.part) for effect, _, parameters in stage.fit.hypothesis.terms if effect.name == name for p in parameters}
-    forms = [c for c in table if c.effect.name == name and {(p.key, p.part) for p in c.parameters} <= fitted]
+    moving = {(p.key, p.part) for effect, _, parameters in fitted.fit.hypothesis.terms if effect.name == name for p in parameters}
+    forms = [c for c in table if c.effect.name == name and {(p.key, p.part) for p in c.parameters} <= moving]
     return max(forms, key=lambda c: len(c.parameters), default=None)
 
 
-def _without(data: Data, history: History, without: Stage, name: str, noise: Noise) -> History:
+def _without(data: Data, history: History, without: FittedModel, name: str, noise: Noise) -> History:
     """Return the history as if one effect had never been found."""
     left = [n for n, _ in history[1:] if n != name]
     steps: History = [history[0]]

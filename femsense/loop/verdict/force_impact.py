@@ -20,9 +20,9 @@ from femsense.fem.mesh import embed_points, surface_triangles, vertex_normals
 from femsense.loop.data.covariates import actuation_of
 from femsense.loop.data.dataset import Data
 from femsense.loop.data.trial import Trial, heads_of, normals_of, numbers_of, vectors_of
-from femsense.loop.fit.fitted_model import Stage, placed
+from femsense.loop.fit.fitted_model import FittedModel, poses_and_inputs
 from femsense.loop.fit.noise_components import Noise
-from femsense.model.observation import SceneJet, in_robot_frame, seats
+from femsense.model.observation import SceneJet, in_robot_frame, placements
 from femsense.model.robot import Robot, spread_features
 
 LOADED_FRAMES = 8
@@ -64,7 +64,7 @@ class View:
         mesh, rows = self.robot.body.mesh, self.rows(frame)
         ties = embed_points(mesh, places)
         units = [ties.spread(np.eye(3 * len(places))[j].reshape(-1, 3), len(mesh.nodes)) for j in range(3 * len(places))]
-        marks = self.robot.tie_markers(seats(self.robot, self.trial.scene, self.poses))[self.trial.scene.marker[rows]]
+        marks = self.robot.tie_markers(placements(self.robot, self.trial.scene, self.poses))[self.trial.scene.marker[rows]]
         moves = np.array([marks.moves(move) for move in tangent.respond(np.array(units))])
         if self.trial.scene.crossings is not None:
             moves = np.einsum("jkc,kc->jk", moves, normals_of(self.trial.scene, self.poses)[rows])
@@ -82,17 +82,17 @@ class View:
         return in_robot_frame(scene.points, scene.view, self.poses, self.robot.observation)
 
 
-def views_of(data: Data, stage: Stage) -> list[View]:
+def views_of(data: Data, fitted: FittedModel) -> list[View]:
     """Return one trial of each recording as a stage has it: the fitted ones, then those that are held out. Markers come before clouds."""
-    robot = stage.fit.hypothesis.robot_at(stage.fit.coordinates)
-    poses, numbers = placed(data, stage.fit), numbers_of(data.train)
-    fitted = [View(robot, data.train[i], stage.fit.jets[i], list(poses[i][0]), numbers[i], False) for i in heads_of(data.train)]
-    held, extra = [], len(fitted)
+    robot = fitted.fit.hypothesis.robot_at(fitted.fit.coordinates)
+    poses, numbers = poses_and_inputs(data, fitted.fit), numbers_of(data.train)
+    known = [View(robot, data.train[i], fitted.fit.jets[i], list(poses[i][0]), numbers[i], False) for i in heads_of(data.train)]
+    held, extra = [], len(known)
     for i in heads_of(data.held):
-        of, own = data.held_of[i], stage.held[i]
+        of, own = data.held_of[i], fitted.held[i]
         held.append(View(robot, data.held[i], own.jet, own.poses, extra if of is None else numbers[of], True))
         extra += of is None
-    return fitted + held
+    return known + held
 
 
 def force_consequence(before: list[View], after: list[View], noise: Noise) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from femsense.loop.data.surface_rows import cloud_frames
 from femsense.loop.data.trial import Trial, heads_of
 from femsense.loop.fit.cross_validation import sweep_rows
 from femsense.loop.fit.discretisation_error import without_mesh_error
-from femsense.loop.fit.fitted_model import Stage
+from femsense.loop.fit.fitted_model import FittedModel
 from femsense.loop.fit.joint_fit import JointFit
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.search.screening import TESTABLE, Candidate, one_each
@@ -41,11 +41,11 @@ REPEATS = 6
 
 def gather(
     data: Data,
-    before: Stage,
-    base: Stage,
-    final: Stage,
-    back: Stage,
-    shown: Stage,
+    before: FittedModel,
+    base: FittedModel,
+    final: FittedModel,
+    back: FittedModel,
+    shown: FittedModel,
     noise: Noise,
     first: list[Candidate],
     last: list[Candidate],
@@ -67,7 +67,7 @@ def gather(
     old, new = views_of(data, before), views_of(data, back)
     score, pattern = _pattern(data, old, new)
     cleaned, left = (
-        [without_mesh_error(t, j.residual, noise, nor_seats=True) for t, j in zip(data.train, s.fit.jets)]
+        [without_mesh_error(t, j.residual, noise, nor_placements=True) for t, j in zip(data.train, s.fit.jets)]
         for s in (before, shown)
     )
     found: dict[str, Any] = _rounded(
@@ -360,16 +360,16 @@ def own_size(size: float, scale: str) -> float | None:
 # Calibration, tests and card
 
 
-def _calibration(data: Data, stages: dict[str, Stage]) -> dict[str, Any]:
+def _calibration(data: Data, models: dict[str, FittedModel]) -> dict[str, Any]:
     """Return poses, initial inputs, modulus and zeros of each stage; poses as they moved from the first of them."""
-    zero = stages["before"].fit.fit.theta
+    zero = models["before"].fit.fit.theta
     poses, inputs, terms = [], [], []
     at = 0
     for i, trial in enumerate(data.train[j] for j in heads_of(data.train)):
         for v in range(len(trial.poses)):
             part = slice(at + 6 * v, at + 6 * v + 6)
-            moved = {name: (s.fit.fit.theta[part] - zero[part]).tolist() for name, s in stages.items() if name != "before"}
-            spread = {name: _deviations(s.fit, part) for name, s in stages.items()}
+            moved = {name: (s.fit.fit.theta[part] - zero[part]).tolist() for name, s in models.items() if name != "before"}
+            spread = {name: _deviations(s.fit, part) for name, s in models.items()}
             poses.append(
                 {
                     "recording": i,
@@ -383,13 +383,13 @@ def _calibration(data: Data, stages: dict[str, Stage]) -> dict[str, Any]:
         for j, cable in enumerate(data.robot.body.cable_names if trial.initial is not None else ()):
             one = at + 6 * len(trial.poses) + j
             values = {
-                name: [float(s.fit.fit.theta[one]), _deviations(s.fit, slice(one, one + 1))[0]] for name, s in stages.items()
+                name: [float(s.fit.fit.theta[one]), _deviations(s.fit, slice(one, one + 1))[0]] for name, s in models.items()
             }
             inputs.append({"recording": i, "cable": cable, "unit": "N" if data.control == "tension" else "m", "values": values})
         at += trial.size
     labels = dict[str, Any]()
-    for name, stage in stages.items():
-        for label, entry in _nuisance(stage.fit).items():
+    for name, fitted in models.items():
+        for label, entry in _nuisance(fitted.fit).items():
             labels.setdefault(label, {"unit": entry["unit"], "declared": entry["declared"], "values": {}})["values"][name] = (
                 entry["value"]
             )

@@ -11,10 +11,10 @@ from femsense.core.arrays import FloatArray
 from femsense.core.errors import FemsenseError
 from femsense.loop.data.dataset import NUISANCE, Data
 from femsense.loop.fit.discretisation_error import beyond_mesh
-from femsense.loop.fit.fitted_model import Stage, held_chi2, keeping, span_of, with_seeds_still, with_sizes_still
+from femsense.loop.fit.fitted_model import FittedModel, held_chi2, keeping, span_of, with_seeds_still, with_sizes_still
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.search.acceptance import at_edge
-from femsense.loop.search.input_offset import SIGNIFICANT, moved_nuisance, zeros_are_evident
+from femsense.loop.search.input_offset import SIGNIFICANT, moved_nuisance, offsets_are_evident
 from femsense.loop.search.refit import EVIDENCE
 from femsense.loop.search.search_state import Search
 from femsense.model.effects import Entry
@@ -35,15 +35,15 @@ FAR_BETTER = 50.0
 def _promoted(data: Data, search: Search) -> list[str]:
     """Return the nuisances that the data moved significantly away from what is declared; of the zeros, those that are missed."""
     names = [n for n in search.final.fit.hypothesis.names if n in NUISANCE and moved_nuisance(data, search.final, n)]
-    return [n for n in names if n == "stiffness" or zeros_are_evident(data, search.final, search.noise, search.n_effective)]
+    return [n for n in names if n == "stiffness" or offsets_are_evident(data, search.final, search.noise, search.n_effective)]
 
 
-def _is_sure(stage: Stage, name: str, std: FloatArray) -> bool:
+def _is_sure(fitted: FittedModel, name: str, std: FloatArray) -> bool:
     """Return whether a value of a nuisance differs from what is declared by more than SIGNIFICANT of the standard deviations that are reported."""
-    return bool((np.abs(stage.fit.coordinates[span_of(stage.fit, name)]) > SIGNIFICANT * std).any())
+    return bool((np.abs(fitted.fit.coordinates[span_of(fitted.fit, name)]) > SIGNIFICANT * std).any())
 
 
-def _worth_handing_back(data: Data, search: Search, promoted: list[str], names: list[str]) -> tuple[list[str], Stage]:
+def _worth_handing_back(data: Data, search: Search, promoted: list[str], names: list[str]) -> tuple[list[str], FittedModel]:
     """Return the names that are handed back with the model of just these: with the sizes that they have beside all nuisances where held-out data
     do not miss those, else fitted again. Nuisances that stay as declared are taken out, too if they only do so here, and so is, from the last one
     on, what would make the error on held-out data larger than it was, or goes to the edge of what is plausible."""
@@ -64,17 +64,17 @@ def _worth_handing_back(data: Data, search: Search, promoted: list[str], names: 
     return [], search.before
 
 
-def _misses(data: Data, search: Search, back: Stage) -> bool:
+def _misses(data: Data, search: Search, back: FittedModel) -> bool:
     """Return whether held-out data miss what the final model moves and this one does not."""
     more = held_chi2(data, back, search.noise) - held_chi2(data, search.final, search.noise)
     return back.held_rms > NOT_WORSE * search.final.held_rms or more > EVIDENCE
 
 
-def _may_be_handed_back(data: Data, search: Search, back: Stage) -> bool:
+def _may_be_handed_back(data: Data, search: Search, back: FittedModel) -> bool:
     return not at_edge(back.fit) and "stiffness" not in at_edge(back.fit, nuisance=True) and _holds_out(data, search, back)
 
 
-def _with_modulus(data: Data, search: Search, names: list[str], *, sizes_still: bool) -> tuple[list[str], Stage | None]:
+def _with_modulus(data: Data, search: Search, names: list[str], *, sizes_still: bool) -> tuple[list[str], FittedModel | None]:
     """Return names with the model of just these; with the modulus beside effects if it moved significantly there, by whatever share (zeros that are
     not named may have moved in its place), and held-out data miss it."""
     back = _handed_back(data, search.final, names, search.noise, sizes_still=sizes_still)
@@ -93,7 +93,7 @@ def _has_effects(names: Iterable[str]) -> bool:
     return any(name not in NUISANCE for name in names)
 
 
-def _holds_out(data: Data, search: Search, back: Stage) -> bool:
+def _holds_out(data: Data, search: Search, back: FittedModel) -> bool:
     """Return whether a model is no worse on held-out data in millimetres; or else better by the noise that these data have, where it is calibrated
     only and within reason, or where the mesh's own error is all that is larger: then it must be no worse beyond that, nor in millimetres than
     the model with all that calibration may move, and not be zeros of cables alone, unless it is far better by the noise and within reason."""
@@ -112,13 +112,15 @@ def _holds_out(data: Data, search: Search, back: Stage) -> bool:
     return after <= NOT_WORSE * before and (shown or (gain > FAR_BETTER and worse <= NOISY))
 
 
-def _held_beyond_mesh(data: Data, search: Search, back: Stage) -> tuple[float, float]:
+def _held_beyond_mesh(data: Data, search: Search, back: FittedModel) -> tuple[float, float]:
     """Return the held-out errors before and after [m] less the likeliest share of what the mesh itself costs."""
     before, after = (beyond_mesh(data.held, s.held_residuals, search.noise) for s in (search.before, back))
     return before, after
 
 
-def _handed_back(data: Data, final: Stage, names: list[str], noise: Noise, *, sizes_still: bool = False) -> Stage | None:
+def _handed_back(
+    data: Data, final: FittedModel, names: list[str], noise: Noise, *, sizes_still: bool = False
+) -> FittedModel | None:
     """Return the model of some names alone, fitted again, or with the sizes that they have beside all that calibration may move: whoever
     calibrates what is handed back moves that too. None where it has no equilibrium, or where another effect that they were found beside is gone."""
     present = {effect.name for effect, _, _ in final.fit.hypothesis.terms}
@@ -132,10 +134,10 @@ def _handed_back(data: Data, final: Stage, names: list[str], noise: Noise, *, si
         return None
 
 
-def _entries(stage: Stage, names: list[str]) -> list[Entry]:
+def _entries(fitted: FittedModel, names: list[str]) -> list[Entry]:
     """Return the tables of `[[effects]]`: those that change the mesh or the law first, then in the order in which they were found."""
-    settled = [{"name": effect.name, **seed} for effect, seed in stage.fit.hypothesis.settled]
-    tables = {e["name"]: e for e in stage.fit.hypothesis.entries(stage.fit.coordinates)}
+    settled = [{"name": effect.name, **seed} for effect, seed in fitted.fit.hypothesis.settled]
+    tables = {e["name"]: e for e in fitted.fit.hypothesis.entries(fitted.fit.coordinates)}
     return [_rounded(e) for e in settled] + [_rounded(tables[name]) for name in names if name in tables]
 
 

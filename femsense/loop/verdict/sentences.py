@@ -9,7 +9,7 @@ import numpy as np
 from femsense.loop.data.dataset import Data
 from femsense.loop.data.trial import rms_of
 from femsense.loop.fit.discretisation_error import mesh_errors
-from femsense.loop.fit.fitted_model import Stage
+from femsense.loop.fit.fitted_model import FittedModel
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.search.search_state import Search
 from femsense.loop.verdict.returned_model import NOT_WORSE, _has_effects, _held_beyond_mesh
@@ -27,7 +27,13 @@ GROSS = 0.03
 
 
 def _sentence(
-    verdict: str, effects: list[dict[str, Any]], found: list[str], before: Stage, after: Stage, noise: Noise, mesh: float | None
+    verdict: str,
+    effects: list[dict[str, Any]],
+    found: list[str],
+    before: FittedModel,
+    after: FittedModel,
+    noise: Noise,
+    mesh: float | None,
 ) -> str:
     """Return the sentence on top; `mesh` is what the mesh itself costs [m], where that is known."""
     error = f"held-out error {1e3 * before.held_rms:.2f} mm"
@@ -51,7 +57,7 @@ def _sentence(
     return f"The model lacks {what}; held-out error{where} {1e3 * before.held_rms:.2f} mm before, {1e3 * after.held_rms:.2f} mm after.{tail}"
 
 
-def _by_mesh(data: Data, search: Search, back: Stage) -> str:
+def _by_mesh(data: Data, search: Search, back: FittedModel) -> str:
     """Return a sentence on what the held-out error is beyond the mesh's own, where that is what makes it larger; nothing where it is not larger."""
     if back.held_rms <= NOT_WORSE * search.before.held_rms or not mesh_errors(data):
         return ""
@@ -59,7 +65,7 @@ def _by_mesh(data: Data, search: Search, back: Stage) -> str:
     return f" Less the likeliest share of what the mesh itself costs, that is {1e3 * before:.2f} mm before, {1e3 * after:.2f} mm after."
 
 
-def _on_linear(data: Data, back: Stage) -> str:
+def _on_linear(data: Data, back: FittedModel) -> str:
     """Return a sentence on what effects that are named on a linear mesh may stand for; nothing elsewhere, or where that is an effect itself."""
     mesh = _mesh_error(data)
     if not mesh or back.fit.hypothesis.robot.body.mesh.is_quadratic or not _has_effects(back.fit.hypothesis.names):

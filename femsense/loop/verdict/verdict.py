@@ -11,10 +11,10 @@ from femsense.core.arrays import FloatArray
 from femsense.core.errors import FemsenseError
 from femsense.loop.data.dataset import NUISANCE, Data
 from femsense.loop.data.trial import Trial, heads_of, normal_rms_of, rms_of, vectors_of
-from femsense.loop.fit.covariance import spreads
+from femsense.loop.fit.covariance import parameter_std
 from femsense.loop.fit.discretisation_error import beyond_mesh, few_states, without_mesh_error
 from femsense.loop.fit.fitted_model import (
-    Stage,
+    FittedModel,
     held_out,
     roughly_keeping,
 )
@@ -42,23 +42,23 @@ LACKS = 2.0
 def conclude(data: Data, search: Search, rng: np.random.Generator) -> LoopResult:
     """Return the verdict with all that the report shows."""
     before, final, noise = search.before, search.final, search.noise
-    spread = spreads(data, final, noise, _seed_spread(search))
+    spread = parameter_std(data, final, noise, _seed_std(search))
     promoted = [n for n in _promoted(data, search) if _is_sure(final, n, spread[n])]
     names = [*promoted, *(n for n, _ in search.history[1:] if n in final.fit.hypothesis.names)]
     names, back = _worth_handing_back(data, search, promoted, names)
-    strayed = "stiffness" in promoted and "stiffness" not in names  # what a modulus beyond all bounds takes away is not explained
+    drifted = "stiffness" in promoted and "stiffness" not in names  # what a modulus beyond all bounds takes away is not explained
     promoted = [n for n in names if n in NUISANCE]
     entries = _entries(back, names)
     effects = _chain(data, search, promoted, names, back, spread)
     lacks = _lacks(data, back, final, noise)
     shown = back if lacks else final  # what nuisances take away unnamed is left, too
     surprise = _surprise(data, back, noise)
-    plain = [without_mesh_error(t, jet.residual, noise, nor_seats=True) for t, jet in zip(data.train, shown.fit.jets)]
+    plain = [without_mesh_error(t, jet.residual, noise, nor_placements=True) for t, jet in zip(data.train, shown.fit.jets)]
     tests = structure_tests(data.train, plain, rng=rng)
     excess = _excess(data, before, final, back, noise)
     found = _not_handed_back(search, names)
     structured = tests.significant and excess.left > excess.tolerated
-    unexplained = lacks or (found and not effects) or ((structured or surprise) and (strayed or excess.explained < EXPLAINED))
+    unexplained = lacks or (found and not effects) or ((structured or surprise) and (drifted or excess.explained < EXPLAINED))
     verdict = "unexplained" if unexplained else "effects" if effects else "none"
     rivals = confounded(search, names)
     not_testable = [
@@ -102,20 +102,20 @@ def conclude(data: Data, search: Search, rng: np.random.Generator) -> LoopResult
     )
 
 
-def _seed_spread(search: Search) -> dict[str, FloatArray]:
-    named = [r for r in search.refits if r.get("verdict") == "named" and "seed_spread" in r]
-    return {r["name"]: np.array(r["seed_spread"]) for r in named}
+def _seed_std(search: Search) -> dict[str, FloatArray]:
+    named = [r for r in search.refits if r.get("verdict") == "named" and "seed_std" in r]
+    return {r["name"]: np.array(r["seed_std"]) for r in named}
 
 
 def _chain(
-    data: Data, search: Search, promoted: list[str], names: list[str], back: Stage, spread: dict[str, FloatArray]
+    data: Data, search: Search, promoted: list[str], names: list[str], back: FittedModel, spread: dict[str, FloatArray]
 ) -> list[dict[str, Any]]:
     """Return the effects in the order in which they were added, each with the held-out error before and after it."""
-    stages = dict(search.history)
+    models = dict(search.history)
     errors = []
     for i in range(len(promoted) - (names == promoted)):  # the last one's is that of what is handed back
-        errors.append(_rough_error(data, stages[""], promoted[: i + 1], search.noise))
-    errors += [stages[name].held_rms for name in names[len(promoted) : -1]] + [back.held_rms] * bool(names)
+        errors.append(_rough_error(data, models[""], promoted[: i + 1], search.noise))
+    errors += [models[name].held_rms for name in names[len(promoted) : -1]] + [back.held_rms] * bool(names)
     return [
         {
             "name": name,
@@ -127,16 +127,16 @@ def _chain(
     ]
 
 
-def _rough_error(data: Data, stage: Stage, names: list[str], noise: Noise) -> float:
+def _rough_error(data: Data, fitted: FittedModel, names: list[str], noise: Noise) -> float:
     """Return the held-out error [m] of a stage with some of its terms only, fitted to some states; its own where they have no equilibrium."""
-    if set(stage.fit.hypothesis.names) <= set(names):
-        return stage.held_rms
+    if set(fitted.fit.hypothesis.names) <= set(names):
+        return fitted.held_rms
     try:
-        frames = [few_states(t, len(stage.fit.hypothesis.robot.body.mesh.tets)) for t in data.train]
-        rough = roughly_keeping(data, stage, names, noise, frames)
+        frames = [few_states(t, len(fitted.fit.hypothesis.robot.body.mesh.tets)) for t in data.train]
+        rough = roughly_keeping(data, fitted, names, noise, frames)
         return rms_of([h.jet.residual for h in held_out(data, rough.fit, noise)])
     except FemsenseError:
-        return stage.held_rms
+        return fitted.held_rms
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,7 +151,7 @@ class Excess:
     handed back; the smaller one."""
 
 
-def _excess(data: Data, before: Stage, final: Stage, back: Stage, noise: Noise) -> Excess:
+def _excess(data: Data, before: FittedModel, final: FittedModel, back: FittedModel, noise: Noise) -> Excess:
     axes, std = (3.0, noise.std) if noise.std else (1.0, noise.surface)
     floor = float(np.sqrt(axes * sum(v**2 for k, v in std.items() if k != "state")))
     fitted = [beyond_mesh(data.train, [j.residual for j in s.fit.jets], noise) for s in (before, final)]
@@ -160,14 +160,14 @@ def _excess(data: Data, before: Stage, final: Stage, back: Stage, noise: Noise) 
     return Excess(left, 0.25 * floor, min(_taken_away(fitted[0], fitted[1], floor), _taken_away(held[0], held[1], floor)))
 
 
-def _lacks(data: Data, back: Stage, final: Stage, noise: Noise) -> bool:
+def _lacks(data: Data, back: FittedModel, final: FittedModel, noise: Noise) -> bool:
     """Return whether what is handed back leaves much that the final model takes away with nuisances that are not named."""
     train = [_mean_square(data.train, [j.residual for j in s.fit.jets], noise) for s in (back, final)]
     held = [_mean_square(data.held, s.held_residuals, noise) for s in (back, final)]
     return any(own > LACKS * max(full, 1.0) for own, full in (train, held))
 
 
-def _surprise(data: Data, back: Stage, noise: Noise) -> str:
+def _surprise(data: Data, back: FittedModel, noise: Noise) -> str:
     """Return a sentence on what held-out data show of what is handed back and fitted data do not; nothing where these are as well explained."""
     fitted = _mean_square(data.train, [j.residual for j in back.fit.jets], noise)
     held = _mean_square(data.held, back.held_residuals, noise)
@@ -180,9 +180,9 @@ def _surprise(data: Data, back: Stage, noise: Noise) -> str:
     )
 
 
-def _left(data: Data, stage: Stage, noise: Noise, *, held: bool = False) -> dict[str, Any]:
+def _left(data: Data, fitted: FittedModel, noise: Noise, *, held: bool = False) -> dict[str, Any]:
     """Return what the residual of the fitted data looks like, or of the held-out data where these alone show it."""
-    trials, residuals = (data.held, stage.held_residuals) if held else (data.train, [jet.residual for jet in stage.fit.jets])
+    trials, residuals = (data.held, fitted.held_residuals) if held else (data.train, [jet.residual for jet in fitted.fit.jets])
     return {**describe_left(data.robot, trials, _beyond_mesh(trials, residuals, noise)), "held_out": held}
 
 
@@ -201,7 +201,7 @@ def _taken_away(before: float, after: float, floor: float) -> float:
     return 1.0 if after <= floor else float((before**2 - after**2) / max(before**2 - floor**2, 1e-18))
 
 
-def _parameters(spread: dict[str, FloatArray], back: Stage, name: str) -> dict[str, Any]:
+def _parameters(spread: dict[str, FloatArray], back: FittedModel, name: str) -> dict[str, Any]:
     """Return {key: {value, std, unit}} of one effect; vectors and tables keep their shape. What was not fitted has std None.
 
     Values are those that are handed back; standard deviations are not smaller than those of the full fit, in which nothing was held still.
@@ -244,26 +244,26 @@ def _placed(slot: Any, part: Any, number: float | None) -> Any:
     return {**(slot or {}), part: number}
 
 
-def _errors(data: Data, stage: Stage, rng: np.random.Generator) -> dict[str, Any]:
+def _errors(data: Data, fitted: FittedModel, rng: np.random.Generator) -> dict[str, Any]:
     """Return the errors of a stage: of the markers, of clouds along their normals beside them; where there are no markers, twice those."""
-    kind = max(r.shape[1] for r in stage.held_residuals)
-    interval, by = _interval(data, stage, kind, rng)
+    kind = max(r.shape[1] for r in fitted.held_residuals)
+    interval, by = _interval(data, fitted, kind, rng)
     errors = {
-        "train_rms_m": stage.fit.rms,
-        "validation_rms_m": stage.held_rms,
+        "train_rms_m": fitted.fit.rms,
+        "validation_rms_m": fitted.held_rms,
         "validation_ci_m": interval,
         "validation_ci_by": by,
     }
-    held = normal_rms_of(stage.held_residuals)
+    held = normal_rms_of(fitted.held_residuals)
     if held is not None:
-        own = interval if kind == 1 else _interval(data, stage, 1, rng)[0]
-        errors |= {"train_normal_rms_m": stage.fit.normal_rms, "validation_normal_rms_m": held, "validation_normal_ci_m": own}
+        own = interval if kind == 1 else _interval(data, fitted, 1, rng)[0]
+        errors |= {"train_normal_rms_m": fitted.fit.normal_rms, "validation_normal_rms_m": held, "validation_normal_ci_m": own}
     return errors
 
 
-def _interval(data: Data, stage: Stage, kind: int, rng: np.random.Generator) -> tuple[list[float], str]:
+def _interval(data: Data, fitted: FittedModel, kind: int, rng: np.random.Generator) -> tuple[list[float], str]:
     """Return the 95 % interval of the held-out error of markers (kind 3) or clouds (1) [m], and what was drawn again."""
-    pairs = [((r**2).sum(axis=1), t.groups) for r, t in zip(stage.held_residuals, data.held) if r.shape[1] == kind]
+    pairs = [((r**2).sum(axis=1), t.groups) for r, t in zip(fitted.held_residuals, data.held) if r.shape[1] == kind]
     by_sweep = sum(np.unique(g.sweep).size for _, g in pairs) >= MIN_SWEEPS
     blocks = [s[labels == g] for s, own in pairs for labels in [own.sweep if by_sweep else own.frame] for g in np.unique(labels)]
     sums, counts = np.array([b.sum() for b in blocks]), np.array([len(b) for b in blocks])
@@ -351,7 +351,7 @@ def _not_handed_back(search: Search, names: list[str]) -> list[str]:
     return [n for n, _ in search.history[1:] if n not in names and n in search.final.fit.hypothesis.names]
 
 
-def _card(data: Data, final: Stage, spread: dict[str, FloatArray], noise: Noise, n_effective: float) -> dict[str, Any]:
+def _card(data: Data, final: FittedModel, spread: dict[str, FloatArray], noise: Noise, n_effective: float) -> dict[str, Any]:
     nuisance = {
         name: _parameters(spread, final, name)
         for name in NUISANCE
@@ -371,10 +371,10 @@ def _card(data: Data, final: Stage, spread: dict[str, FloatArray], noise: Noise,
         "noise_components_m": noise.std or noise.surface,
         "noise_source": noise.source,
         "mesh_error_m": _mesh_error(data),
-        "strays": [{"frame": number, "marker": name} for number, name in data.strays],
+        "outliers": [{"frame": number, "marker": name} for number, name in data.outliers],
         "effective_observations": n_effective,
         "nuisance_after": nuisance,
-        "seat_std_m": data.seat_std,
+        "placement_std_m": data.placement_std,
     }
 
 
@@ -396,7 +396,7 @@ def _cloud_card(data: Data, noise: Noise) -> dict[str, Any] | None:
     }
 
 
-def _residual_table(data: Data, before: Stage, after: Stage) -> dict[str, Any]:
+def _residual_table(data: Data, before: FittedModel, after: FittedModel) -> dict[str, Any]:
     rows: dict[str, list[Any]] = {"recording": [], "frame": [], "marker": [], "before_m": [], "after_m": []}
     for i, at in enumerate(heads_of(data.held)):
         trial = data.held[at]

@@ -10,7 +10,7 @@ import trimesh
 
 from femsense.core.errors import InputError
 from femsense.io.meshing.surface import (
-    Surface,
+    ClosedSurface,
     crossing_triangles,
     distance_to,
     repaired,
@@ -24,7 +24,7 @@ TUBE = trimesh.creation.cylinder(10, 100, sections=32)
 CAPSULE = trimesh.creation.capsule(80, 12, count=[24, 24])
 
 
-def mended(*meshes: Any, **options: Any) -> Surface:
+def mended(*meshes: Any, **options: Any) -> ClosedSurface:
     mesh = trimesh.util.concatenate(list(meshes))
     return repaired(np.array(mesh.vertices), np.array(mesh.faces), **options)
 
@@ -194,8 +194,8 @@ def test_distances_and_walls() -> None:
 def test_a_fine_surface_is_thinned_within_its_tolerance() -> None:
     ball = trimesh.creation.icosphere(subdivisions=5, radius=30.0)
     surface = mended(ball)
-    thin, strays = thinned(surface, tolerance=0.2, most=1000)
-    assert len(thin.triangles) <= 2000 and 0 < strays <= 0.2
+    thin, outliers = thinned(surface, tolerance=0.2, most=1000)
+    assert len(thin.triangles) <= 2000 and 0 < outliers <= 0.2
     assert thin.volume == pytest.approx(surface.volume, rel=0.01)
     assert f"thinned out from 20480 to {len(thin.triangles)} triangles" in thin.done
     distances = np.abs(np.linalg.norm(thin.points, axis=1) - 30.0)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from arm import arm, record, sweeps
 
-from femsense.loop.data.outliers import strays
+from femsense.loop.data.outliers import outliers
 from femsense.loop.improve import improve
 from femsense.model.recording import Recording
 
@@ -22,10 +22,10 @@ def rows(frames: int = 30, markers: int = 10) -> tuple[np.ndarray, np.ndarray, n
 
 def test_a_marker_that_is_far_off_in_one_frame_is_a_stray():
     values, frame, marker = rows()
-    assert not strays(values, frame, marker, 5e-3).any()
+    assert not outliers(values, frame, marker, 5e-3).any()
     values[57] += [0.0, 8e-3, 0.0]
-    assert np.flatnonzero(strays(values, frame, marker, 5e-3)).tolist() == [57]
-    assert not strays(values, frame, marker, 9e-3).any()
+    assert np.flatnonzero(outliers(values, frame, marker, 5e-3)).tolist() == [57]
+    assert not outliers(values, frame, marker, 9e-3).any()
 
 
 def test_two_markers_that_exchange_their_names_are_strays_and_neighbours_that_are_off_alike_are_not():
@@ -33,16 +33,16 @@ def test_two_markers_that_exchange_their_names_are_strays_and_neighbours_that_ar
     first, second = np.flatnonzero((frame == 9) & np.isin(marker, (2, 5)))
     values[first] += [0.0, 9e-3, 0.0]
     values[second] -= [0.0, 9e-3, 0.0]
-    assert np.flatnonzero(strays(values, frame, marker, 5e-3)).tolist() == [first, second]
+    assert np.flatnonzero(outliers(values, frame, marker, 5e-3)).tolist() == [first, second]
     values[second] += [2e-3, 18e-3, 0.0]
-    assert not strays(values, frame, marker, 5e-3).any()
+    assert not outliers(values, frame, marker, 5e-3).any()
 
 
 def test_a_marker_that_slips_or_a_frame_that_is_off_is_none():
     values, frame, marker = rows()
     values[(marker == 4) & (frame > 14)] += 9e-3
     values[frame == 7] += 20e-3
-    assert not strays(values, frame, marker, 5e-3).any()
+    assert not outliers(values, frame, marker, 5e-3).any()
 
 
 @pytest.mark.parametrize("k", [2, -2])
@@ -54,7 +54,7 @@ def test_the_loop_leaves_strays_out_whether_they_are_fitted_or_held_out(k: int):
     loop = improve(arm(), [plain])
     with pytest.warns(UserWarning, match=f"stray markers are left out: m3 in frame {k % len(inputs)}"):
         spoiled = improve(arm(), [_moved(plain, row)])
-    assert spoiled.data["strays"] == [{"frame": k % len(inputs), "marker": "m3"}] and loop.data["strays"] == []
+    assert spoiled.data["outliers"] == [{"frame": k % len(inputs), "marker": "m3"}] and loop.data["outliers"] == []
     assert [e["name"] for e in spoiled.effects] == [e["name"] for e in loop.effects] == ["stiffness"]
     assert spoiled.after["validation_rms_m"] == pytest.approx(loop.after["validation_rms_m"], rel=0.05)
 

@@ -19,7 +19,7 @@ from femsense.io.recording_folder import load_recording, save_recording
 from femsense.loop.data.dataset import Data, prepare
 from femsense.loop.data.surface_rows import (
     ROUNDS,
-    Seen,
+    MeasuredSurface,
     _crossings_of,
     _in_camera,
     _on_model,
@@ -28,9 +28,9 @@ from femsense.loop.data.surface_rows import (
     surface_normals,
     with_surface,
 )
-from femsense.loop.data.trial import Groups, Surface, normals_of, spans_of, vectors_of
+from femsense.loop.data.trial import Groups, SurfaceRows, normals_of, spans_of, vectors_of
 from femsense.loop.design.advice import next_element
-from femsense.loop.fit.fitted_model import make_stage, own_of, rematched, with_nuisance
+from femsense.loop.fit.fitted_model import fit_model, own_of, rematched, with_nuisance
 from femsense.loop.fit.noise_components import Noise, whiten
 from femsense.loop.improve import MATCHINGS, _matched, improve
 from femsense.model.effects import find_effect
@@ -189,8 +189,8 @@ def on_sides(robot: Robot, facing: tuple[float, ...]) -> np.ndarray:
     return np.einsum("tsi,tic->tsc", weights, nodes[seen]).reshape(-1, 3)
 
 
-def seen_as(points: np.ndarray) -> Seen:
-    return Seen({(0, 0): points}, joined([_sheet_of(points, 6e-3)]), 2e-3)
+def seen_as(points: np.ndarray) -> MeasuredSurface:
+    return MeasuredSurface({(0, 0): points}, joined([_sheet_of(points, 6e-3)]), 2e-3)
 
 
 def test_what_a_measured_surface_rounds_off_is_no_residual():
@@ -235,11 +235,11 @@ def test_rows_are_made_again_until_the_fit_stays_where_it_is(rubbing: Recording,
         data = prepare(arm(COARSE), [rubbing], [], "clouds")  # anew: it remembers the states that were solved
         hypothesis, prior = with_nuisance(data)
         nothing, own = np.zeros(len(prior.mean)), np.r_[off, np.zeros(data.train[0].size - 6)]
-        start = make_stage(data, hypothesis, prior, noise, nothing, own=own, max_iterations=0)
+        start = fit_model(data, hypothesis, prior, noise, nothing, own=own, max_iterations=0)
         data = rematched(data, start, noise, anew=True)  # rows as they are found from there
         monkeypatch.setattr(sys.modules[improve.__module__], "MATCHINGS", rounds)
-        found, stage = _matched(data, start, noise, anew=True)
-        again = make_stage(rematched(found, stage, noise), hypothesis, prior, noise, stage.fit.coordinates, own=own_of(stage))
+        found, fitted = _matched(data, start, noise, anew=True)
+        again = fit_model(rematched(found, fitted, noise), hypothesis, prior, noise, fitted.fit.coordinates, own=own_of(fitted))
         return again.fit.fit.cost[0] - again.fit.chi2
 
     assert to_gain(1) > 50.0  # 99 on one machine
@@ -325,7 +325,7 @@ def test_a_row_is_positive_where_the_measured_surface_lies_outside(both: Data):
 
 def test_noise_of_clouds_is_shared_by_neighbours_along_their_normals():
     marker = np.array([0, 1, 0, 1])
-    surface = Surface(
+    surface = SurfaceRows(
         points=np.array([[0.0, 0, 0], [0.01, 0, 0]] * 2),
         normals=np.array([[0.0, 0, 1], [0.6, 0, 0.8]] * 2),
         rest_normals=np.array([[0.0, 0, 1], [0, 0.8, 0.6]] * 2),
@@ -407,6 +407,6 @@ def test_a_camera_that_looks_past_the_robot_is_refused(rubbing: Recording):
 def test_what_to_record_next_is_told_from_markers_and_clouds_together(both: Data):
     hypothesis, prior = with_nuisance(both)
     noise = Noise({"white": 1e-4}, "")
-    stage = make_stage(both, hypothesis, prior, noise, np.zeros(len(prior.mean)))
-    told = next_element(both, stage.fit, noise, [("cable_gain", "poisson")], ["gravity"])
+    fitted = fit_model(both, hypothesis, prior, noise, np.zeros(len(prior.mean)))
+    told = next_element(both, fitted.fit, noise, [("cable_gain", "poisson")], ["gravity"])
     assert told and all(after > before for _, _, before, after in told)

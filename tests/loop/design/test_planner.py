@@ -13,13 +13,13 @@ from femsense.core.errors import InputError
 from femsense.io.recording_folder import load_recording
 from femsense.loop.data.dataset import prepare
 from femsense.loop.design.advice import proposal_text
-from femsense.loop.design.candidate_experiments import menu, minimal, script_of, setup_for
+from femsense.loop.design.candidate_experiments import candidate_experiments, minimal, script_of, setup_for
 from femsense.loop.design.identifiability import Block, Form, Gram, Judge, forms_of, turns_of
-from femsense.loop.design.planner import element_block, outlook_of_script, plan_experiment
-from femsense.loop.fit.fitted_model import MODULUS_STD, make_stage, with_nuisance
+from femsense.loop.design.planner import element_block, identifiability_of_script, plan_experiment
+from femsense.loop.fit.fitted_model import MODULUS_STD, fit_model, with_nuisance
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.search.effect_fields import fields_of
-from femsense.loop.search.screening import screen_stage
+from femsense.loop.search.screening import screen_model
 from femsense.model.effects import find_effect
 from femsense.rig.script import check_script, plan_script
 from femsense.rig.simulate import simulate
@@ -40,14 +40,14 @@ def outlook_with(setup, names, *keys, start=True):
     """Return what the minimal recording with some more elements says of some effects."""
     ranges = np.array([p.height for p in setup.pulls])
     forms = forms_of(setup.robot, "tension", ranges, names=["stiffness", "cable_offset", *names])
-    more = {e.key: e for e in menu(setup)}
+    more = {e.key: e for e in candidate_experiments(setup)}
     elements = [*(minimal(setup) if start else []), *(more[k] for k in keys)]
     blocks = [element_block(setup, forms, e, NOISE, with_rest=False) for e in elements]
     return Judge(forms, ranges).judge(blocks)
 
 
-def row(outlook, label):
-    return next(r for r in outlook.rows if r.label == label)
+def row(identifiability, label):
+    return next(r for r in identifiability.rows if r.label == label)
 
 
 def form(name, at, count, size=1.0):
@@ -66,7 +66,7 @@ def test_gram_matrices_say_what_projections_of_the_columns_say():
     shared[:, 4] = shared[:, 1] + 0.3 * shared[:, 4]
     forms = [form("stiffness", 0, 1), form("poisson", 1, 1), form("gravity", 2, 2), form("geometry", 4, 1)]
     gram = Gram(own.T @ own, own.T @ shared, shared.T @ shared)
-    outlook = Judge(forms, np.ones(4)).judge([Block("a", gram, None, nothing(3, 5), 40, 40)])
+    identifiability = Judge(forms, np.ones(4)).judge([Block("a", gram, None, nothing(3, 5), 40, 40)])
     prior = np.zeros((1, 4))
     prior[0, 3] = 1 / MODULUS_STD
     N = np.vstack([np.hstack([own, shared[:, :1]]), prior])
@@ -74,17 +74,17 @@ def test_gram_matrices_say_what_projections_of_the_columns_say():
     E = np.vstack([shared[:, 1:], np.zeros((1, 4))])
     left = E - Q @ (Q.T @ E)
     for label, columns in (("poisson", [0]), ("gravity", [1, 2]), ("geometry", [3])):
-        assert row(outlook, label).retained == pytest.approx(
+        assert row(identifiability, label).retained == pytest.approx(
             np.linalg.norm(left[:, columns]) / np.linalg.norm(E[:, columns]), rel=1e-6
         )
-    names = [r.label for r in outlook.rows]
+    names = [r.label for r in identifiability.rows]
     cosine = abs(left[:, 0] @ left[:, 3]) / np.linalg.norm(left[:, 0]) / np.linalg.norm(left[:, 3])
-    assert outlook.confounding[names.index("poisson"), names.index("geometry")] == pytest.approx(cosine, rel=1e-6)
+    assert identifiability.confounding[names.index("poisson"), names.index("geometry")] == pytest.approx(cosine, rel=1e-6)
     B = np.linalg.qr(left[:, 1:3])[0]
     by_two = np.linalg.norm(B.T @ left[:, 0]) / np.linalg.norm(left[:, 0])
-    assert outlook.confounding[names.index("poisson"), names.index("gravity")] == pytest.approx(by_two, rel=1e-6)
+    assert identifiability.confounding[names.index("poisson"), names.index("gravity")] == pytest.approx(by_two, rel=1e-6)
     gap = np.sum(left[:, 0] ** 2) * (1 - by_two**2) + np.log(120.0)  # one parameter more
-    assert outlook.gap[names.index("poisson"), names.index("gravity")] == pytest.approx(gap, rel=1e-6)
+    assert identifiability.gap[names.index("poisson"), names.index("gravity")] == pytest.approx(gap, rel=1e-6)
 
 
 def test_two_recordings_have_two_poses_and_one_has_one():
@@ -94,12 +94,12 @@ def test_two_recordings_have_two_poses_and_one_has_one():
     forms = [form("poisson", 0, 1)]
     halves = [(own[s], shared[s]) for s in (slice(0, 15), slice(15, 30))]
 
-    def judged(keys):
+    def acceptance_test(keys):
         blocks = [Block(k, Gram(o.T @ o, o.T @ s, s.T @ s), None, nothing(3, 1), 15, 15) for k, (o, s) in zip(keys, halves)]
         return Judge(forms, np.ones(4)).judge(blocks).rows[0].retained
 
-    assert judged("aa") > 0.5
-    assert judged("ab") < 1e-4
+    assert acceptance_test("aa") > 0.5
+    assert acceptance_test("ab") < 1e-4
 
 
 def test_turning_the_base_makes_gravity_testable(setup):
@@ -121,11 +121,11 @@ def test_a_known_weight_separates_the_scale_of_the_tensions_from_the_modulus(set
     assert row(without, "cable_gain (all alike)").retained < 0.02
     assert row(hung, "cable_gain (all alike)").retained > 5 * row(without, "cable_gain (all alike)").retained
 
-    def alike(outlook):
+    def alike(identifiability):
         return next(
             p[2]
-            for p in outlook.pairs()
-            if {outlook.rows[p[0]].label, outlook.rows[p[1]].label} == {"stiffness", "cable_gain (all alike)"}
+            for p in identifiability.pairs()
+            if {identifiability.rows[p[0]].label, identifiability.rows[p[1]].label} == {"stiffness", "cable_gain (all alike)"}
         )
 
     assert alike(without) > 0.99
@@ -133,18 +133,18 @@ def test_a_known_weight_separates_the_scale_of_the_tensions_from_the_modulus(set
 
 
 def test_the_prediction_is_what_screening_finds_on_a_recording_of_that_script(setup, tmp_path):
-    elements = [*minimal(setup)[:4], *(e for e in menu(setup) if e.key in {"unload:up", "weight:tip"})]
+    elements = [*minimal(setup)[:4], *(e for e in candidate_experiments(setup) if e.key in {"unload:up", "weight:tip"})]
     truth = {"refinements": 0, "law": "corotational", "substeps": 1}
     taut = {p.name: 0.3 for p in setup.pulls}  # a zero that is off either way acts alike only where no cable goes slack
     script = check_script({**script_of(setup, elements, noise=NOISE), "truth": truth, "initial": taut})
-    predicted = outlook_of_script(setup.robot, script, noise=NOISE)
+    predicted = identifiability_of_script(setup.robot, script, noise=NOISE)
     recording = load_recording(simulate(setup.robot, script, tmp_path / "recording"))
     names = ["poisson", "cable_friction", "geometry", "depth_scale", "gravity", "base_compliance", "cable_gain"]
     data = prepare(setup.robot, [recording], [recording])
     hypothesis, prior = with_nuisance(data)
     noise = Noise({"white": NOISE}, "known")
-    stage = make_stage(data, hypothesis, prior, noise, np.zeros(len(prior.mean)))
-    table = screen_stage(data, stage.fit, noise, fields_of(data, stage, names), 1000.0)
+    fitted = fit_model(data, hypothesis, prior, noise, np.zeros(len(prior.mean)))
+    table = screen_model(data, fitted.fit, noise, fields_of(data, fitted, names), 1000.0)
     found = {(c.effect.name, *(p.label for p in c.parameters)): c.retained for c in table}
     compared = [r for r in predicted.rows if r.name in names and r.label != "cable_gain (all alike)"]
     assert len(compared) == len(names) + 1
@@ -153,7 +153,7 @@ def test_the_prediction_is_what_screening_finds_on_a_recording_of_that_script(se
 
 
 def test_a_script_of_all_elements_can_be_run(setup):
-    elements = [*minimal(setup), *menu(setup)]
+    elements = [*minimal(setup), *candidate_experiments(setup)]
     for far in (False, True):
         script = check_script(script_of(setup, elements, noise=NOISE, far=far))
         plan = plan_script(script, setup.robot)
@@ -170,8 +170,8 @@ def test_turns_take_gravity_as_declared_to_that_of_the_frame():
 
 
 def test_a_proposal_lowers_the_confusion_within_its_frames(monkeypatch):
-    few = {"unload:up", "weight:tip", "turn:1", "rest.csv"}
-    monkeypatch.setattr("femsense.loop.design.planner.menu", lambda s: [e for e in menu(s) if e.key in few])
+    cases = {"unload:up", "weight:tip", "turn:1", "rest.csv"}
+    monkeypatch.setattr("femsense.loop.design.planner.menu", lambda s: [e for e in candidate_experiments(s) if e.key in cases])
     monkeypatch.setattr("femsense.loop.design.identifiability.MOST_SEEDS", 1)
     proposal = plan_experiment(tiny(), noise=NOISE, frames=20)
     assert sum(e.frames for e in proposal.elements) <= 20

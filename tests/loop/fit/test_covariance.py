@@ -11,8 +11,8 @@ from arm import arm, record, sweeps
 
 from femsense.core.least_squares import covariance_of
 from femsense.loop.data.dataset import prepare
-from femsense.loop.fit.covariance import _by_sweeps, coordinate_std, misfit, spreads
-from femsense.loop.fit.fitted_model import make_stage
+from femsense.loop.fit.covariance import _by_sweeps, coordinate_std, misfit, parameter_std
+from femsense.loop.fit.fitted_model import fit_model
 from femsense.loop.fit.joint_fit import GRAVITY_STD, Prior
 from femsense.loop.fit.noise_components import Noise
 from femsense.model.effects import find_effect
@@ -92,12 +92,12 @@ def sweeps_fit(values: np.ndarray, rows: int) -> tuple[Any, Any]:
 
 def test_sweeps_that_disagree_say_by_how_much() -> None:
     values = np.array([0.3, -0.5, 0.9, 0.1, -0.8])
-    data, stage = sweeps_fit(values, 4)
+    data, fitted = sweeps_fit(values, 4)
     # of equal sweeps: the variance of a mean of five; half leverage gives each its share back, 1 / (1 − 1/5)
     expected = np.sqrt(np.sum((values - values.mean()) ** 2) / 5 / 4)
-    np.testing.assert_allclose(_by_sweeps(data, stage), expected, rtol=1e-6)
-    two, stage = sweeps_fit(values[:2], 4)
-    assert not _by_sweeps(two, stage).any()
+    np.testing.assert_allclose(_by_sweeps(data, fitted), expected, rtol=1e-6)
+    two, fitted = sweeps_fit(values[:2], 4)
+    assert not _by_sweeps(two, fitted).any()
 
 
 def test_a_time_that_a_seed_holds_still_leaves_the_fraction_open() -> None:
@@ -107,8 +107,8 @@ def test_a_time_that_a_seed_holds_still_leaves_the_fraction_open() -> None:
     data = prepare(robot, [record(inputs, labels=labels, truth=robot, effects=truth, noise=1e-4)[0]], [])
     noise, effect = Noise({"white": 1e-4}, ""), find_effect("creep")
     hypothesis = Hypothesis(robot, ((effect, {"time_s": 8.0}, effect.parameters(robot, "tension")),))
-    stage = make_stage(data, hypothesis, Prior(np.zeros(1), np.full(1, np.inf)), noise, np.array([0.2]))
-    std = spreads(data, stage, noise, {})["creep"]
-    assert std[0] > 1.5 * stage.fit.std[0]
-    more = spreads(data, stage, noise, {"creep": np.array([0.3])})["creep"]
+    fitted = fit_model(data, hypothesis, Prior(np.zeros(1), np.full(1, np.inf)), noise, np.array([0.2]))
+    std = parameter_std(data, fitted, noise, {})["creep"]
+    assert std[0] > 1.5 * fitted.fit.std[0]
+    more = parameter_std(data, fitted, noise, {"creep": np.array([0.3])})["creep"]
     assert more[0] == pytest.approx(np.hypot(std[0], 0.3))

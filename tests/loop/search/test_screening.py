@@ -14,7 +14,7 @@ from femsense.fem.equilibrium import solve_equilibrium
 from femsense.fem.mesh import to_linear
 from femsense.loop.data.dataset import Data, prepare
 from femsense.loop.fit import joint_fit
-from femsense.loop.fit.fitted_model import Stage, make_stage, with_nuisance
+from femsense.loop.fit.fitted_model import FittedModel, fit_model, with_nuisance
 from femsense.loop.fit.joint_fit import Jets, JointProblem, Prior
 from femsense.loop.fit.noise_components import Noise, whiten
 from femsense.loop.improve import improve
@@ -23,27 +23,27 @@ from femsense.loop.search.refit import with_term
 from femsense.loop.search.search_state import Search
 from femsense.loop.verdict import returned_model, sentences, verdict
 from femsense.model.effects import FORMS, apply_effects, find_effect
-from femsense.model.observation import Hypothesis, marker_residual, seats
+from femsense.model.observation import Hypothesis, marker_residual, placements
 from femsense.model.remeshing import robot_on_mesh
 from femsense.model.robot import Robot
 
 NOISE = Noise({"white": 1e-4}, "")
 
 
-def staged(robot: Robot, height: float = 3.0) -> tuple[Data, Stage]:
+def staged(robot: Robot, height: float = 3.0) -> tuple[Data, FittedModel]:
     inputs, labels = sweeps(height, each=1)
     recording, _ = record(inputs, labels=labels)
     data = prepare(robot, [recording], [])
     hypothesis, prior = with_nuisance(data)
-    return data, make_stage(data, hypothesis, prior, NOISE, np.zeros(len(prior.mean)))
+    return data, fit_model(data, hypothesis, prior, NOISE, np.zeros(len(prior.mean)))
 
 
-def whole_change(data: Data, stage: Stage, other: Robot) -> np.ndarray:
+def whole_change(data: Data, fitted: FittedModel, other: Robot) -> np.ndarray:
     """Return by how much another robot changes the residual, each state solved for itself."""
-    trial, jet = data.train[0], stage.fit.jets[0]
-    fixed = stage.fit.hypothesis.robot_at(stage.fit.coordinates)
-    poses, _ = trial.place(stage.fit.fit.theta[: stage.fit.own], data.robot.marker_points.mean(axis=0))
-    ties, model = other.tie_markers(seats(fixed, trial.scene, poses)), {}
+    trial, jet = data.train[0], fitted.fit.jets[0]
+    fixed = fitted.fit.hypothesis.robot_at(fitted.fit.coordinates)
+    poses, _ = trial.place(fitted.fit.fit.theta[: fitted.fit.own], data.robot.marker_points.mean(axis=0))
+    ties, model = other.tie_markers(placements(fixed, trial.scene, poses)), {}
     for k in jet.states:
         inputs = trial.scene.recording.inputs[k] + fixed.actuation.tension_offset
         tension = dict(zip(other.body.cable_names, np.maximum(fixed.actuation.gain * inputs, 0.0)))
@@ -53,13 +53,13 @@ def whole_change(data: Data, stage: Stage, other: Robot) -> np.ndarray:
 
 @pytest.mark.parametrize("form", [f for f in FORMS if f.name == "hyperelastic"], ids=["neo_hookean", "gent"])
 def test_another_law_is_screened_by_what_it_would_do(form) -> None:
-    data, stage = staged(arm((5, 2, 2)))
-    robot = stage.fit.hypothesis.robot_at(stage.fit.coordinates)
+    data, fitted = staged(arm((5, 2, 2)))
+    robot = fitted.fit.hypothesis.robot_at(fitted.fit.coordinates)
     (seed,) = form.seeds(robot)
     parameters = form.parameters(robot, "tension")
-    fields = effect_fields(stage.fit, data.train, [(form, seed, parameters)])
+    fields = effect_fields(fitted.fit, data.train, [(form, seed, parameters)])
     entry = {**seed, "jm": 1 / 0.3} if parameters else seed
-    whole = whole_change(data, stage, form.apply(robot, entry))
+    whole = whole_change(data, fitted, form.apply(robot, entry))
     assert np.linalg.norm(fields.raw[0][:, :, 0] - whole) < 1e-3 * np.linalg.norm(whole)
     assert np.abs(whole).max() > 1e-4
 
@@ -68,22 +68,22 @@ def test_another_mesh_is_screened_by_what_it_would_do() -> None:
     declared = arm((5, 2, 2))
     linear = to_linear(declared.body.mesh)
     effect = find_effect("discretisation")
-    data, stage = staged(robot_on_mesh(declared, linear), 1.0)
-    robot = stage.fit.hypothesis.robot_at(stage.fit.coordinates)
+    data, fitted = staged(robot_on_mesh(declared, linear), 1.0)
+    robot = fitted.fit.hypothesis.robot_at(fitted.fit.coordinates)
     seed = {"element": "tet10"}
-    fields = effect_fields(stage.fit, data.train, [(effect, seed, ())])
-    whole = whole_change(data, stage, effect.apply(robot, seed))
+    fields = effect_fields(fitted.fit, data.train, [(effect, seed, ())])
+    whole = whole_change(data, fitted, effect.apply(robot, seed))
     assert np.linalg.norm(fields.raw[0][:, :, 0] - whole) < 1e-3 * np.linalg.norm(whole)
     assert np.abs(whole).max() > 1e-3
 
 
 def test_a_step_that_is_not_taken_leaves_no_state_behind() -> None:
-    data, stage = staged(arm((4, 2, 2)))
+    data, fitted = staged(arm((4, 2, 2)))
     trial = replace(data.train[0], starts={})
-    problem = JointProblem(stage.fit.hypothesis, stage.fit.prior, [trial], [NOISE.whitener(trial.groups, None)], 1.0)
-    theta = np.array(stage.fit.fit.theta)
+    problem = JointProblem(fitted.fit.hypothesis, fitted.fit.prior, [trial], [NOISE.whitener(trial.groups, None)], 1.0)
+    theta = np.array(fitted.fit.fit.theta)
     at = problem.evaluate(theta, True)[0]
-    kept = trial.starts_on(stage.fit.hypothesis.robot.body.mesh)
+    kept = trial.starts_on(fitted.fit.hypothesis.robot.body.mesh)
     before = {k: s.positions for k, s in kept.items()}
     far, soft = theta.copy(), theta.copy()
     far[problem.own] += np.log(0.8)
@@ -98,9 +98,9 @@ def test_a_step_that_is_not_taken_leaves_no_state_behind() -> None:
 
 
 def test_a_step_that_goes_too_far_is_refused_and_not_solved_by_all_means(monkeypatch: pytest.MonkeyPatch) -> None:
-    data, stage = staged(arm((4, 2, 2)))
-    problem = JointProblem(stage.fit.hypothesis, stage.fit.prior, data.train, [NOISE.whitener(data.train[0].groups, None)], 1.0)
-    problem.near = stage.fit.jets
+    data, fitted = staged(arm((4, 2, 2)))
+    problem = JointProblem(fitted.fit.hypothesis, fitted.fit.prior, data.train, [NOISE.whitener(data.train[0].groups, None)], 1.0)
+    problem.near = fitted.fit.jets
     rough_only, plain = list[bool](), JointProblem._jets
 
     def too_far(self: JointProblem, theta: np.ndarray, derivative: bool, rough: bool) -> object:
@@ -110,7 +110,7 @@ def test_a_step_that_goes_too_far_is_refused_and_not_solved_by_all_means(monkeyp
         return plain(self, theta, derivative, rough)
 
     monkeypatch.setattr(JointProblem, "_jets", too_far)
-    theta = np.array(stage.fit.fit.theta)
+    theta = np.array(fitted.fit.fit.theta)
     problem.evaluate(theta, False)  # the start is solved by all means
     with pytest.raises(DataError):
         problem.evaluate(theta + 0.01, False)
@@ -119,22 +119,22 @@ def test_a_step_that_goes_too_far_is_refused_and_not_solved_by_all_means(monkeyp
 
 @pytest.mark.parametrize("clamp", ["base_compliance", None])
 def test_a_fit_begins_at_the_states_of_the_model_before_unless_their_clamp_is_another(clamp: str | None) -> None:
-    data, stage = staged(arm((4, 2, 2)))
-    hypothesis, prior = stage.fit.hypothesis, stage.fit.prior
-    theta = np.array(stage.fit.fit.theta)
-    theta[stage.fit.own] += np.log(0.9)  # a rival went elsewhere
+    data, fitted = staged(arm((4, 2, 2)))
+    hypothesis, prior = fitted.fit.hypothesis, fitted.fit.prior
+    theta = np.array(fitted.fit.fit.theta)
+    theta[fitted.fit.own] += np.log(0.9)  # a rival went elsewhere
     if clamp is not None:
         effect = find_effect(clamp)
         parameters = effect.parameters(data.robot, "tension")
-        hypothesis, prior = with_term(stage.fit, effect, {}, parameters)
+        hypothesis, prior = with_term(fitted.fit, effect, {}, parameters)
         theta = np.append(theta, [0.2 * p.high for p in parameters])
     trial = replace(data.train[0], starts={})
     problem = JointProblem(hypothesis, prior, [trial], [NOISE.whitener(trial.groups, None)], 1.0)
     problem.evaluate(theta, True)
     kept = dict(trial.starts_on(data.robot.body.mesh))
     begins = JointProblem(hypothesis, prior, [trial], problem.factors, 1.0)
-    begins.last = Jets(stage.fit.jets, theta)
-    wanted = kept if clamp else stage.fit.jets[0].states
+    begins.last = Jets(fitted.fit.jets, theta)
+    wanted = kept if clamp else fitted.fit.jets[0].states
     (starts,) = begins._starts(theta, True)
     assert wanted and all(starts[k].positions is state.positions for k, state in wanted.items())
 
@@ -150,7 +150,7 @@ def test_states_that_are_far_apart_lend_each_other_no_factors() -> None:
 
 
 def test_a_fit_that_ends_on_its_way_has_the_residual_of_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    data, stage = staged(arm((4, 2, 2)))
+    data, fitted = staged(arm((4, 2, 2)))
     plain = joint_fit.gauss_newton
 
     def tries_further(evaluate: Any, theta: np.ndarray, **more: Any) -> Any:
@@ -160,29 +160,29 @@ def test_a_fit_that_ends_on_its_way_has_the_residual_of_its_end(monkeypatch: pyt
 
     monkeypatch.setattr(joint_fit, "gauss_newton", tries_further)
     trial = replace(data.train[0], initial=None)
-    start = stage.fit.coordinates + 0.02
-    fit = joint_fit.fit_jointly(stage.fit.hypothesis, stage.fit.prior, [trial], NOISE, 1.0, start, near=stage.fit.jets)
+    start = fitted.fit.coordinates + 0.02
+    fit = joint_fit.fit_jointly(fitted.fit.hypothesis, fitted.fit.prior, [trial], NOISE, 1.0, start, near=fitted.fit.jets)
     white = whiten(NOISE.whitener(trial.groups, None), fit.jets[0].residual)
     np.testing.assert_allclose(white, fit.fit.residual[: white.size], atol=1e-3)
 
 
 def test_a_model_without_equilibrium_is_not_handed_back(monkeypatch: pytest.MonkeyPatch) -> None:
-    def collapses(*_: object, **__: object) -> Stage:
+    def collapses(*_: object, **__: object) -> FittedModel:
         raise DataError("no equilibrium in frame 3")
 
-    data, stage = staged(arm((4, 2, 2)), 1.0)
-    search = Search(stage, [("", stage)], stage, stage, NOISE, 10.0, [], [], [], None)
+    data, fitted = staged(arm((4, 2, 2)), 1.0)
+    search = Search(fitted, [("", fitted)], fitted, fitted, NOISE, 10.0, [], [], [], None)
     monkeypatch.setattr(returned_model, "keeping", collapses)
-    assert verdict._worth_handing_back(data, search, ["stiffness"], ["stiffness"]) == ([], stage)
-    chain = verdict._chain(data, search, ["stiffness"], ["stiffness"], stage, {})
-    assert [c["validation_rms_after_m"] for c in chain] == [stage.held_rms]
+    assert verdict._worth_handing_back(data, search, ["stiffness"], ["stiffness"]) == ([], fitted)
+    chain = verdict._chain(data, search, ["stiffness"], ["stiffness"], fitted, {})
+    assert [c["validation_rms_after_m"] for c in chain] == [fitted.held_rms]
 
 
 def test_a_model_may_have_a_larger_error_on_held_out_data_where_that_is_the_mesh_s_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    data, stage = staged(arm((4, 2, 2)), 1.0)
-    before, base, back = (replace(stage, held_rms=v) for v in (1.0, 1.5, 1.4))
+    data, fitted = staged(arm((4, 2, 2)), 1.0)
+    before, base, back = (replace(fitted, held_rms=v) for v in (1.0, 1.5, 1.4))
     back = replace(
-        back, fit=replace(stage.fit, hypothesis=replace(stage.fit.hypothesis, settled=((find_effect("hyperelastic"), {}),)))
+        back, fit=replace(fitted.fit, hypothesis=replace(fitted.fit.hypothesis, settled=((find_effect("hyperelastic"), {}),)))
     )
     search = Search(before, [("", base)], base, back, NOISE, 10.0, [], [], [], None)
 
@@ -195,7 +195,7 @@ def test_a_model_may_have_a_larger_error_on_held_out_data_where_that_is_the_mesh
 
     assert holds(1.4) and holds(1.0, chi2=200.0)
     assert not holds(1.6)  # more than all that calibration may move
-    search = replace(search, before=replace(stage, held_rms=1.4))
+    search = replace(search, before=replace(fitted, held_rms=1.4))
     assert holds(1.56, chi2=49.0) and not holds(1.56, chi2=51.0) and not holds(1.65, chi2=49.0)  # a fall by 50 is far better
     search = replace(search, before=before)
     assert not holds(1.4, chi2=105.0) and holds(1.4, chi2=95.0)
@@ -206,10 +206,10 @@ def test_a_model_may_have_a_larger_error_on_held_out_data_where_that_is_the_mesh
 def test_a_larger_error_is_not_for_zeros_of_cables_which_much_else_looks_like(
     monkeypatch: pytest.MonkeyPatch, names: list[str], held: bool
 ) -> None:
-    data, stage = staged(arm((4, 2, 2)), 1.0)
-    terms = tuple(t for t in stage.fit.hypothesis.terms if t[0].name in names)
-    back = replace(stage, held_rms=1.4, fit=replace(stage.fit, hypothesis=replace(stage.fit.hypothesis, terms=terms)))
-    search = Search(replace(stage, held_rms=1.0), [("", back)], back, back, NOISE, 10.0, [], [], [], None)
+    data, fitted = staged(arm((4, 2, 2)), 1.0)
+    terms = tuple(t for t in fitted.fit.hypothesis.terms if t[0].name in names)
+    back = replace(fitted, held_rms=1.4, fit=replace(fitted.fit, hypothesis=replace(fitted.fit.hypothesis, terms=terms)))
+    search = Search(replace(fitted, held_rms=1.0), [("", back)], back, back, NOISE, 10.0, [], [], [], None)
     monkeypatch.setattr(returned_model, "held_chi2", lambda _, s, noise: 40.0 if s is back else 80.0)
     monkeypatch.setattr(returned_model, "beyond_mesh", lambda *_: 0.5)
     assert returned_model._holds_out(data, search, back) == held
@@ -217,9 +217,9 @@ def test_a_larger_error_is_not_for_zeros_of_cables_which_much_else_looks_like(
 
 @pytest.mark.parametrize(("noise_mm", "small"), [(0.2, False), (0.4, True)])
 def test_a_residual_no_larger_than_the_noise_is_said_to_be_so(noise_mm: float, small: bool) -> None:
-    stage = replace(staged(arm((4, 2, 2)), 1.0)[1], held_rms=3e-4)
+    fitted = replace(staged(arm((4, 2, 2)), 1.0)[1], held_rms=3e-4)
     noise = Noise({"white": 1e-3 * noise_mm / np.sqrt(3.0)}, "")
-    sentence = verdict._sentence("unexplained", [], [], stage, stage, noise, None)
+    sentence = verdict._sentence("unexplained", [], [], fitted, fitted, noise, None)
     assert sentence.startswith("A residual is left that no effect of the list explains")
     assert ("no larger than the noise" in sentence) == small and f"0.30 mm, noise {noise_mm:.2f} mm" in sentence
 
@@ -228,10 +228,10 @@ def test_a_residual_no_larger_than_the_noise_is_said_to_be_so(noise_mm: float, s
 def test_where_the_data_are_explained_by_what_the_mesh_costs_the_sentence_says_so(
     error: float, mesh: float | None, expected: bool
 ) -> None:
-    _, stage = staged(arm((4, 2, 2)), 1.0)
-    stage = replace(stage, held_rms=1e-3 * error)
+    _, fitted = staged(arm((4, 2, 2)), 1.0)
+    fitted = replace(fitted, held_rms=1e-3 * error)
     noise = Noise({"white": 0.5e-3 / np.sqrt(3.0)}, "")
-    sentence = verdict._sentence("none", [], [], stage, stage, noise, None if mesh is None else 1e-3 * mesh)
+    sentence = verdict._sentence("none", [], [], fitted, fitted, noise, None if mesh is None else 1e-3 * mesh)
     assert ("its mesh costs (1.00 mm" in sentence) == expected and "noise (0.50 mm)" in sentence
 
 
@@ -248,8 +248,8 @@ def test_values_are_said_in_short_whatever_they_are() -> None:
 
 @pytest.mark.parametrize("mesh, costs", [(None, "0.50 mm."), (0.3e-3, "0.50 mm, and its mesh costs 0.30 mm.")])
 def test_what_neither_the_noise_nor_the_mesh_explains_is_not_said_to_be_explained(mesh: float | None, costs: str) -> None:
-    stage = replace(staged(arm((4, 2, 2)), 1.0)[1], held_rms=0.9e-3)
-    sentence = verdict._sentence("none", [], [], stage, stage, Noise({"white": 0.5e-3 / np.sqrt(3.0)}, ""), mesh)
+    fitted = replace(staged(arm((4, 2, 2)), 1.0)[1], held_rms=0.9e-3)
+    sentence = verdict._sentence("none", [], [], fitted, fitted, Noise({"white": 0.5e-3 / np.sqrt(3.0)}, ""), mesh)
     assert sentence == f"Nothing that was tried explains more of the data: held-out error 0.90 mm; their noise is {costs}"
 
 
@@ -258,9 +258,9 @@ def test_effects_that_are_named_on_linear_elements_may_stand_for_these(
     monkeypatch: pytest.MonkeyPatch, linear: bool, named: bool
 ) -> None:
     robot = arm((4, 2, 2))
-    data, stage = staged(robot_on_mesh(robot, to_linear(robot.body.mesh)) if linear else robot, 1.0)
+    data, fitted = staged(robot_on_mesh(robot, to_linear(robot.body.mesh)) if linear else robot, 1.0)
     settled = ((find_effect("hyperelastic"), {}),) if named else ()
-    back = replace(stage, fit=replace(stage.fit, hypothesis=replace(stage.fit.hypothesis, settled=settled)))
+    back = replace(fitted, fit=replace(fitted.fit, hypothesis=replace(fitted.fit.hypothesis, settled=settled)))
     monkeypatch.setattr(sentences, "_mesh_error", lambda data: 2e-3)
     assert ("try discretisation" in sentences._on_linear(data, back)) == (linear and named)
 
@@ -285,11 +285,11 @@ def with_gain(modulus: float) -> tuple[Data, Search]:
     data = prepare(declared, [recording], [])
     noise = Noise({"white": 5e-5}, "")
     hypothesis, prior = with_nuisance(data)
-    base = make_stage(data, hypothesis, prior, noise, np.zeros(len(prior.mean)))
-    before = make_stage(data, Hypothesis(declared), Prior(np.zeros(0), np.zeros(0)), noise, np.zeros(0))
+    base = fit_model(data, hypothesis, prior, noise, np.zeros(len(prior.mean)))
+    before = fit_model(data, Hypothesis(declared), Prior(np.zeros(0), np.zeros(0)), noise, np.zeros(0))
     gain = find_effect("cable_gain")
     parameters = tuple(p for p in gain.parameters(declared, "tension") if p.part == "left")
-    final = make_stage(data, *with_term(base.fit, gain, {}, parameters), noise, np.append(base.fit.coordinates, 0.0))
+    final = fit_model(data, *with_term(base.fit, gain, {}, parameters), noise, np.append(base.fit.coordinates, 0.0))
     return data, Search(before, [("", base), ("cable_gain", final)], base, final, noise, 100.0, [], [], [], None)
 
 
@@ -324,7 +324,7 @@ def test_a_modulus_that_zeros_hide_goes_along_where_it_is_plain_without_them() -
 def test_a_modulus_that_moved_too_little_to_be_named_by_itself_goes_along_where_held_out_data_miss_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def folds(*_: object) -> Stage:
+    def folds(*_: object) -> FittedModel:
         raise DataError("no equilibrium in frame 3")
 
     data, search = with_gain(300e3 * 0.982)
@@ -342,7 +342,7 @@ def test_what_is_handed_back_keeps_the_size_that_it_has_beside_all_nuisances_unl
     alone = float(np.exp(returned_model.keeping(data, search.final, ["cable_gain"], search.noise).fit.coordinates[0]))
     assert abs(alone - beside) > 1e-3
     monkeypatch.setattr(returned_model, "NOT_WORSE", tolerated)
-    monkeypatch.setattr(returned_model, "held_chi2", lambda _, stage, noise: 100.0 + more * (stage is not search.final))
+    monkeypatch.setattr(returned_model, "held_chi2", lambda _, fitted, noise: 100.0 + more * (fitted is not search.final))
     assert handed_back(data, search) == (["cable_gain"], pytest.approx(beside if kept else alone, abs=1e-5))
 
 

@@ -27,9 +27,10 @@ def searched(refits: list[dict[str, Any]], first: list[SimpleNamespace] | None =
     """Return a search that went so, with a modulus fitted along."""
     hypothesis = SimpleNamespace(terms=((SimpleNamespace(name="stiffness"), {}, (None,)),), names=("stiffness",))
     jacobian = np.array([[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]])
-    stage = SimpleNamespace(fit=SimpleNamespace(fit=SimpleNamespace(jacobian=jacobian), own=1, hypothesis=hypothesis))
+    fitted = SimpleNamespace(fit=SimpleNamespace(fit=SimpleNamespace(jacobian=jacobian), own=1, hypothesis=hypothesis))
     return cast(
-        Search, SimpleNamespace(refits=refits, first=first or [], history=[("", stage)], base=stage, final=stage, in_place=None)
+        Search,
+        SimpleNamespace(refits=refits, first=first or [], history=[("", fitted)], base=fitted, final=fitted, in_place=None),
     )
 
 

@@ -10,10 +10,10 @@ import pytest
 from arm import NAMES, T_ROBOT_CAMERA, arm
 
 from femsense.core.pose import invert_pose, transform_points
-from femsense.model.drive import Walk, drive_of
+from femsense.model.drive import DrivenRobot, drive_of
 from femsense.model.effects import FORMS, find_effect
 from femsense.model.observation import Hypothesis, evaluate_scene, make_scene
-from femsense.model.quasi_static_path import walk_along
+from femsense.model.quasi_static_path import solve_path
 from femsense.model.recording import make_recording
 
 INPUTS = {"tension": [[0.3, 0.2], [1.5, 0.4], [0.9, 1.2]], "displacement": [[1.0, 1.0], [5.0, 1.5], [3.0, 4.0]]}
@@ -27,8 +27,8 @@ def scene_of(control):
     inputs = np.full((len(frames), 4), 0.0 if control == "tension" else -0.05)
     inputs[:, [0, 2]] = np.array(INPUTS[control]) * (1.0 if control == "tension" else 1e-3)
     options = {"time_s": np.arange(len(frames)) * 1.7, "cable_names": NAMES, "inputs": inputs, "actuation": control}
-    walk = Walk(robot, drive_of(robot, make_recording(**options)))
-    seen = [points for *_, points, _ in walk_along(walk, frames, attrgetter("markers"))]
+    driven = DrivenRobot(robot, drive_of(robot, make_recording(**options)))
+    seen = [points for *_, points, _ in solve_path(driven, frames, attrgetter("markers"))]
     markers = transform_points(invert_pose(T_ROBOT_CAMERA), np.vstack(seen))
     count = len(robot.marker_names)
     recording = make_recording(

@@ -17,7 +17,7 @@ from femsense.core.errors import InputError
 from femsense.fem.equilibrium import solve_equilibrium
 from femsense.fem.mesh import embed_points
 from femsense.io.robot_toml import EFFECT_NAMES, load_robot
-from femsense.model.drive import Walk, drive_of
+from femsense.model.drive import DrivenRobot, drive_of
 from femsense.model.effects import EFFECTS, FORMS, Effect, Entry, Parameter, apply_effects, build_entry, find_effect
 from femsense.model.observation import undo_depth
 from femsense.model.recording import make_recording
@@ -49,9 +49,9 @@ def measured(r: Robot, control: str) -> np.ndarray:
         control
     ]
     rec = make_recording(time_s=[0.0, 1.0, 2.0], cable_names=("top", "side"), inputs=inputs, actuation=control)
-    walk, before, seen = Walk(r, drive_of(r, rec)), None, []
+    driven, before, seen = DrivenRobot(r, drive_of(r, rec)), None, []
     for k in range(3):
-        state = solve_frame(walk, k, before=before)
+        state = solve_frame(driven, k, before=before)
         assert state.converged
         before = state.segment_tensions
         y = r.markers.positions(state.positions) + np.array([0, 0, 0.5])
