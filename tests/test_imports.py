@@ -58,7 +58,7 @@ def module_of(file: Path) -> str:
 
 def imported_modules(tree: ast.AST) -> Iterator[str]:
     """Yield the full names of what a tree imports, anywhere in it."""
-    for node in ast.driven(tree):
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module == "femsense":
@@ -88,7 +88,7 @@ def inner_imports(file: Path) -> list[str]:
     """Return the modules of femsense that a file imports, names of modules that are imported from packages resolved."""
     known = {module_of(f) for f in FILES}
     found = []
-    for node in ast.driven(parse(file)):
+    for node in ast.walk(parse(file)):
         if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("femsense"):
             inside = [f"{node.module}.{alias.name}" for alias in node.names]
             found += [name if name in known else node.module for name in inside]

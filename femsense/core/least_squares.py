@@ -27,7 +27,7 @@ LITTLE = 2.0
 may be large because the fit is far from its end."""
 LEAST_SHRINKING = 0.25
 """No step is foretold to be shorter than this share of the one before."""
-CONVERGED, STOPPED_EARLY = "converged", "given up"
+CONVERGED, STOPPED_EARLY = "converged", "stopped early"
 MOST_DAMPING = 1e8
 AT_NONSMOOTH = 0.2
 """A fit rests on a kink that is nearer than so many standard errors."""
@@ -48,7 +48,7 @@ class FitResult:
     cost: tuple[float, ...]
     """Sum of squares after each iteration, the start first."""
     status: str
-    """"converged", "iterations", or "given up" (see `worth` of `gauss_newton`)."""
+    """"converged", "iterations", or "stopped early" (see `worth` of `gauss_newton`)."""
     own: bool = True
     """Whether the Jacobian is that at θ; else that of a step before."""
 
@@ -91,7 +91,7 @@ def gauss_newton(
         borrowed: a Jacobian from near the start to begin with.
         serves: a Jacobian serves for another step where it missed the change of the residual by less than this share of it, or by less than what
             counts as a gain.
-        worth: a fit whose sum of squares stays above this is given up: where a step promises less than half of what is missing, or a
+        worth: a fit whose sum of squares stays above this is stopped early: where a step promises less than half of what is missing, or a
             borrowed Jacobian says that nothing is left to gain.
         trusted: a Jacobian that missed less than this share of every step since it was made is believed, too, that nothing is left to gain.
         enough: what counts as a gain in the sum of squares, in units of the misfit where that is more than noise; 0: all that `tolerance` says.

@@ -33,7 +33,7 @@ meet 8 to 11 of these in their 30 steps, those that come to rest 4 at most (a tr
 MOST_STEPS = 1500
 """Newton steps in all, load steps included."""
 SMALLEST_PART = 2e-3
-"""Load steps smaller than this share of the load are given up."""
+"""Load steps smaller than this share of the load are stopped early."""
 CHORD = 1e-2
 """A stiffness serves for another step where the last one left less than this share of the residual, or where two more such steps are enough
 (unless it was factorised so far off that another one is needed at the end)."""

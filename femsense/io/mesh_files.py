@@ -43,7 +43,7 @@ np.savez("tets.npz", nodes=nodes, tets=tets)
 EDGE_FRACTION = 0.05
 """Edge length of a mesh made from a surface, over the diagonal of its bounding box."""
 FILL_SECONDS = 300.0
-"""fTetWild is given up after this time."""
+"""fTetWild is stopped early after this time."""
 ENVELOPE = 1e-3
 """How far a mesh made from a surface may leave it, over the diagonal of its bounding box."""
 
@@ -169,7 +169,7 @@ def tetrahedralise(
         envelope: how far the mesh may leave the surface, over that diagonal [1].
         where: what a message names.
         check_volume: warn where the tetrahedra hold more or less than the surface (which may where shells cross).
-        seconds: it is given up after so long [s].
+        seconds: it is stopped early after so long [s].
 
     Raises:
         InputError: where nothing came out, or not in time. MissingDependency: without pytetwild.
@@ -412,7 +412,7 @@ def _run_ftetwild(
             raise InputError(
                 "fTetWild did not come to an end",
                 where=where,
-                found=f"{len(triangles)} triangles, given up after {seconds:.0f} s",
+                found=f"{len(triangles)} triangles, stopped early after {seconds:.0f} s",
                 expected="tetrahedra",
                 hint="surfaces that nearly coincide and walls thinner than the tolerance are what takes long: mend them, or femsense mesh with another --tolerance or a larger --size",
             ) from None

@@ -351,7 +351,7 @@ def test_a_fit_that_is_not_worth_it_is_given_up_before_its_own_jacobian() -> Non
         return J @ theta + np.array([1.0, 1.0, 3.0]) + 1e-3 * np.sin(theta[0]), J if derivative else None
 
     start = np.zeros(2)
-    for worth, status in ((8.0, "given up"), (10.0, "converged")):
+    for worth, status in ((8.0, "stopped early"), (10.0, "converged")):
         asked.clear()
         fit = gauss_newton(evaluate, start, borrowed=J, serves=0.25, worth=worth)
         assert fit.status == status and any(asked) == (status == "converged")
@@ -368,8 +368,8 @@ def test_a_fit_whose_steps_promise_less_than_half_of_what_is_missing_is_given_up
 
     start = np.zeros(2)  # 11, of which a step takes 2
     fit = gauss_newton(evaluate, start, worth=6.9)
-    assert fit.status == "given up" and asked == [True] and fit.cost == (11.0,)
-    assert gauss_newton(evaluate, start, worth=7.1).status == "given up"  # tried, and no better than that
+    assert fit.status == "stopped early" and asked == [True] and fit.cost == (11.0,)
+    assert gauss_newton(evaluate, start, worth=7.1).status == "stopped early"  # tried, and no better than that
     assert gauss_newton(evaluate, start, worth=9.1).cost[-1] == pytest.approx(9.0)
 
 

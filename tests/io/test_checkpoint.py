@@ -121,7 +121,7 @@ def test_an_estimate_that_was_stopped_goes_on_at_the_next_frame(tmp_path: Path, 
         if done == 4:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(pipeline, "KEEP_S", 0.0)
+    monkeypatch.setattr(pipeline, "CHECKPOINT_S", 0.0)
     with pytest.raises(KeyboardInterrupt):
         pipeline.estimate(rubbing, recording, calibration, at=TIP, keep=keep, progress=stop)
     run = pipeline.estimate(rubbing, recording, calibration, at=TIP, keep=keep, progress=lambda done, count: asked.append(done))

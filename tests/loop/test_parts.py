@@ -295,7 +295,7 @@ def test_a_finer_state_that_runs_away_says_nothing_though_its_forces_look_small(
     sizes = itertools.cycle([1.0, 1e-6])
     pulling = finer_path._pulling
     monkeypatch.setattr(finer_path, "_pulling", lambda *given: (*pulling(*given)[:2], next(sizes)))
-    monkeypatch.setattr(finer_path, "turned_step", lambda body, x, move: 1e3 * x)
+    monkeypatch.setattr(finer_path, "rotated_step", lambda body, x, move: 1e3 * x)
     assert finer_state(*asked) is None
 
 

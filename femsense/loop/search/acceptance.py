@@ -168,7 +168,7 @@ def _objection(made: FittedModel, candidate: Candidate, score: float) -> str | N
     q = len(candidate.parameters)
     std = made.fit.std[len(made.fit.std) - q :]
     if score <= EVIDENCE and made.fit.fit.status == STOPPED_EARLY:
-        return "given up: a step promised too little"
+        return "stopped early: a step promised too little"
     if score <= EVIDENCE:
         return f"too little evidence (dBIC {score:.1f})"
     if not np.isfinite(std).all():

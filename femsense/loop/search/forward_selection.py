@@ -72,7 +72,7 @@ def select_next(
                 cases, candidate, max(ahead, key=lambda r: r.score, default=None), noise, settled, scout
             )
             if behind:
-                record["verdict"] = "given up: in some of the states another one explains more by far"
+                record["verdict"] = "stopped early: in some of the states another one explains more by far"
                 continue
             others = [
                 r.score for r in ahead if r.candidate.effect.name != candidate.effect.name

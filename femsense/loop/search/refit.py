@@ -31,7 +31,7 @@ EXPLAINS = 1.25
 LEFT = 0.5
 """What a refit to all states, begun where one to some of them ended, may leave to be gained in χ²: the winner is fitted to the end."""
 FORGONE = 2.0, 1.25
-"""A refit is given up where the evidence in sight is too little by this much and this factor."""
+"""A refit is stopped early where the evidence in sight is too little by this much and this factor."""
 
 
 def evidence(before: JointFit, after: JointFit) -> float:
@@ -65,7 +65,7 @@ def refit(
     """Joint fit with one more effect, started where a fit to some of the states ended (`begin`), else from its linear step. Raises DataError where
     no start helps.
 
-    Where the dBIC would stay well below what is wanted, or below it at all if it is `settled`, the fit is given up on its way.
+    Where the dBIC would stay well below what is wanted, or below it at all if it is `settled`, the fit is stopped early on its way.
     """
     null = np.array([p.null for p in candidate.parameters])
     low, high = np.array([p.low for p in candidate.parameters]), np.array([p.high for p in candidate.parameters])
@@ -136,7 +136,7 @@ def refit_from(data: Data, fitted: FittedModel, begin: JointFit, noise: Noise, w
 
 
 def worth_of(fit: JointFit, candidate: Candidate, wanted: float, settled: bool) -> float:
-    """Return the χ² above which a refit of a candidate is given up: its dBIC is wanted to be so much."""
+    """Return the χ² above which a refit of a candidate is stopped early: its dBIC is wanted to be so much."""
     return within(fit, (candidate.cost + wanted - FORGONE[0]) / (1.0 if settled else FORGONE[1]))
 
 

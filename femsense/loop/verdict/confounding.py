@@ -133,7 +133,7 @@ def _is_refuted(search: Search, names: Sequence[str], own: str, other: str) -> b
     """Return whether refits of another effect in the place of a named one brought much less."""
     for named in (r for r in _named(search, names) if r["name"] == own and r.get("verdict") == "named"):
         there = [r for r in search.refits if r["name"] == other and _same_question(named, r)]
-        tried = [r["dbic"] for r in there if np.isfinite(r.get("dbic", np.nan))]  # one that was given up early has none
+        tried = [r["dbic"] for r in there if np.isfinite(r.get("dbic", np.nan))]  # one that was stopped early early has none
         if tried and max(tried) < REFUTED * named["dbic"]:
             return True
     return False

@@ -171,7 +171,9 @@ def test_turns_take_gravity_as_declared_to_that_of_the_frame():
 
 def test_a_proposal_lowers_the_confusion_within_its_frames(monkeypatch):
     cases = {"unload:up", "weight:tip", "turn:1", "rest.csv"}
-    monkeypatch.setattr("femsense.loop.design.planner.menu", lambda s: [e for e in candidate_experiments(s) if e.key in cases])
+    monkeypatch.setattr(
+        "femsense.loop.design.planner.candidate_experiments", lambda s: [e for e in candidate_experiments(s) if e.key in cases]
+    )
     monkeypatch.setattr("femsense.loop.design.identifiability.MOST_SEEDS", 1)
     proposal = plan_experiment(tiny(), noise=NOISE, frames=20)
     assert sum(e.frames for e in proposal.elements) <= 20

@@ -105,12 +105,12 @@ def searched(
     """Return what growth has refitted of a shortlist, whose scores may be alike, each with whether to all states, and its records."""
     data, fitted = started
     table = screen_model(data, fitted.fit, NOISE, fields_of(data, fitted, names), COUNT)
-    fitted = list[tuple[str, bool]]()
+    refitted = list[tuple[str, bool]]()
 
     def counted(
         own: Data, before: FittedModel, candidate: Candidate, noise: Noise, wanted: float = 0.0, **named: Any
     ) -> FittedModel:
-        fitted.append((candidate.effect.name, before is fitted))
+        refitted.append((candidate.effect.name, before is fitted))
         return refit(own, before, candidate, noise, wanted=wanted, **named)
 
     monkeypatch.setattr(forward_selection, "refit", counted)
@@ -122,8 +122,8 @@ def searched(
     )
     monkeypatch.setattr(forward_selection, "_bar", lambda ahead, candidate: -np.inf)
     winner, _, records = forward_selection.select_next(data, fitted, table, NOISE, lambda text: None)
-    assert winner is not None and winner.candidate.effect.name == "payload" and ("payload", True) in fitted
-    return fitted, records
+    assert winner is not None and winner.candidate.effect.name == "payload" and ("payload", True) in refitted
+    return refitted, records
 
 
 @pytest.mark.usefixtures("some")
@@ -132,7 +132,7 @@ def test_rivals_that_stay_far_behind_in_some_states_are_not_fitted_to_all(
 ):
     fitted, records = searched(started, monkeypatch, "payload", "cable_gain", "poisson")
     assert [f for f in fitted if f[0] != "payload"] == [("cable_gain", False), ("poisson", False)]
-    assert all(r["verdict"].startswith("given up: in some of the states") for r in records[1:])
+    assert all(r["verdict"].startswith("stopped early: in some of the states") for r in records[1:])
 
 
 @pytest.mark.usefixtures("some")
@@ -142,7 +142,9 @@ def test_what_promises_as_much_is_fitted_to_all_states_in_the_order_of_what_it_e
     fitted, records = searched(started, monkeypatch, "cable_gain", "payload", alike=True)
     assert fitted[:3] == [("cable_gain", False), ("payload", False), ("payload", True)]
     assert ("cable_gain", True) not in fitted
-    assert [r["name"] for r in records] == ["payload", "cable_gain"] and records[1]["verdict"].startswith("given up: in some")
+    assert [r["name"] for r in records] == ["payload", "cable_gain"] and records[1]["verdict"].startswith(
+        "stopped early: in some"
+    )
 
 
 def test_rivals_are_fitted_to_all_states_where_these_are_little_work(
@@ -214,10 +216,10 @@ def test_a_few_states_lead_to_the_place_and_alike_places_are_fitted_once(
     data, fitted = started
     far = max(payloads(data, fitted)[:6], key=off)
     begun = refit(data, fitted, far, NOISE)
-    fitted = list[Candidate]()
+    refitted = list[Candidate]()
 
     def counted(own: Data, before: FittedModel, candidate: Candidate, noise: Noise, **named: Any) -> FittedModel | None:
-        fitted.extend([candidate] if before is fitted else [])
+        refitted.extend([candidate] if before is fitted else [])
         return refit(own, before, candidate, noise, **named)
 
     monkeypatch.setattr(location_search, "tried", counted)
@@ -226,10 +228,10 @@ def test_a_few_states_lead_to_the_place_and_alike_places_are_fitted_once(
     assert off(far) > 0.012 and np.linalg.norm(np.subtract(where, HIDDEN[0]["point_m"])) < 0.004
     monkeypatch.setattr(location_search, "ROUNDS", 0)  # climbs end where they begin
     for alike, count in ((False, 2), (True, 1)):
-        fitted.clear()
+        refitted.clear()
         monkeypatch.setattr(location_search, "_alike", lambda one, other, alike=alike: alike)
         located(data, fitted, far, begun, climbed(data, fitted, far, NOISE), NOISE)
-        assert len(fitted) == count
+        assert len(refitted) == count
 
 
 def test_a_refit_begins_where_one_to_some_of_the_states_ended(
@@ -247,7 +249,7 @@ def test_a_refit_begins_where_one_to_some_of_the_states_ended(
         starts.append(coordinates)
         return fit_model(data, hypothesis, prior, noise, coordinates, **given)
 
-    monkeypatch.setattr(refits, "make_stage", seen)
+    monkeypatch.setattr(refits, "fit_model", seen)
     made = refit(data, fitted, one, NOISE, begin=near.fit)
     assert len(starts) == 1 and np.array_equal(starts[0], near.fit.coordinates)
     assert made.fit.chi2 == pytest.approx(plain.fit.chi2, abs=1.0)
@@ -269,7 +271,7 @@ def test_a_fit_to_all_states_starts_from_those_of_the_fit_to_some(
         begun.extend(starts[k] is state for k, state in near.jets[0].states.items())
         return fitted
 
-    monkeypatch.setattr(refits, "make_stage", seen)
+    monkeypatch.setattr(refits, "fit_model", seen)
     refits.refit_from(data, fitted, near, NOISE)
     assert begun and all(begun)
 

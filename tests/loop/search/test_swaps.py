@@ -122,7 +122,7 @@ def test_weight_that_nobody_declared_is_refitted_however_far_behind_it_looks(mon
         record["verdict"] = "passes"
         return own
 
-    monkeypatch.setattr(forward_selection, "judged", lenient)
+    monkeypatch.setattr(forward_selection, "acceptance_test", lenient)
     monkeypatch.setattr(forward_selection, "explains", lambda fitted: True)
     inputs, labels = sweeps(each=1)
     recording, _ = record(inputs, labels=labels, truth=arm((4, 1, 1)))
@@ -157,7 +157,7 @@ def test_until_an_effect_explains_the_data_rivals_are_refitted_to_the_end(monkey
         for c in table
     ]
     monkeypatch.setattr(forward_selection, "refit", seen)
-    monkeypatch.setattr(forward_selection, "judged", lenient)
+    monkeypatch.setattr(forward_selection, "acceptance_test", lenient)
     monkeypatch.setattr(forward_selection, "_polish", lambda data, fitted, winner, *_: winner.fitted)
     monkeypatch.setattr(forward_selection, "explains", lambda fitted: explains)
     forward_selection.select_next(data, base, sorted(looks, key=lambda c: -c.score), NOISE, lambda text: None)
@@ -182,7 +182,7 @@ def test_another_form_of_what_leads_is_held_against_what_that_one_promised(monke
             gain=800.0,
         )
 
-    monkeypatch.setattr(forward_selection, "judged", lenient)
+    monkeypatch.setattr(forward_selection, "acceptance_test", lenient)
     monkeypatch.setattr(forward_selection, "polished", lambda data, fitted, refitted, *_: refitted)
     monkeypatch.setattr(forward_selection, "explains", lambda fitted: True)
     monkeypatch.setattr(forward_selection, "_predicts", lambda refitted: 0.0)
@@ -192,10 +192,10 @@ def test_another_form_of_what_leads_is_held_against_what_that_one_promised(monke
 
 
 @pytest.mark.parametrize(
-    "name, strayed, explains, expected",
+    "name, drifted, explains, expected",
     [("gravity", False, False, 0), ("gravity", True, True, 0), ("gravity", True, False, 1), ("payload", True, False, 0)],
 )
-def test_where_calibration_has_strayed_gravity_starts_from_what_is_declared_too(
+def test_where_calibration_has_drifted_gravity_starts_from_what_is_declared_too(
     monkeypatch: pytest.MonkeyPatch, name: str, drifted: bool, explains: bool, expected: int
 ):
     data, base = started()
@@ -210,7 +210,7 @@ def test_where_calibration_has_strayed_gravity_starts_from_what_is_declared_too(
         starts.append(coordinates)
         return fit_model(data, hypothesis, prior, noise, coordinates, **given)
 
-    monkeypatch.setattr(refits, "make_stage", seen)
+    monkeypatch.setattr(refits, "fit_model", seen)
     monkeypatch.setattr(refits, "explains", lambda fitted: explains)
     refit(data, base, candidate, NOISE)
     shared = len(base.fit.coordinates)
@@ -257,7 +257,7 @@ def test_a_refit_that_cannot_go_further_is_compared_as_it_is(monkeypatch: pytest
     made = fit_model(data, hypothesis, prior, NOISE, begun, own=own_of(base), max_iterations=1)
     cut = acceptance_test(data, base, candidate, made, {}, NOISE)
     assert made.fit.fit.status == "iterations"
-    monkeypatch.setattr(forward_selection, "make_stage", collapses)
+    monkeypatch.setattr(forward_selection, "fit_model", collapses)
     assert forward_selection._to_the_end(data, base, cut, NOISE) is cut
 
 
@@ -301,7 +301,7 @@ def test_fields_are_computed_anew_where_those_of_the_model_before_promise_someth
     asked = list[str]()
     monkeypatch.setattr(improving, "fields_of", lambda *given: asked.append("anew") or fields_of(*given))
     if not promises:
-        monkeypatch.setattr(forward_selection, "PROMISING", 1e3)
+        monkeypatch.setattr(forward_selection, "PREDICTED_MUCH", 1e3)
     fields, table = improving._scored(data, fitted, hints, NOISE, ["payload", "poisson"], COUNT)
     assert asked == ["anew"] * promises and (fields is hints) != promises
     assert {c.effect.name for c in table} <= {"payload", "poisson"}
@@ -329,7 +329,7 @@ def test_a_richer_form_is_tried_only_where_fields_promise_something(monkeypatch:
     expected = np.sum((r + J @ alone) ** 2) - np.sum((r + np.column_stack([J, whole]) @ best) ** 2)
     assert predicted_sum == pytest.approx(expected, rel=1e-3, abs=1e-6)
     tried = list[bool]()
-    monkeypatch.setattr(forward_selection, "make_stage", lambda *given, **more: tried.append(True) or fit_model(*given, **more))
+    monkeypatch.setattr(forward_selection, "fit_model", lambda *given, **more: tried.append(True) or fit_model(*given, **more))
     for share in (0.0, 1e9):
         monkeypatch.setattr(forward_selection, "HINTED", share)
         forward_selection._richer(data, base, winner, all_of_them, NOISE)
@@ -349,7 +349,7 @@ def test_a_place_is_improved_before_a_refit_is_turned_down_for_what_it_predicts(
         asked.append(candidate.effect.name)
         return own
 
-    monkeypatch.setattr(forward_selection, "judged", strict)
+    monkeypatch.setattr(forward_selection, "acceptance_test", strict)
     monkeypatch.setattr(forward_selection, "_polish", lambda data, fitted, winner, *_: replace(winner.fitted))
     winner, _, records = forward_selection.select_next(data, base, table, NOISE, lambda text: None)
     assert winner is not None and asked[:2] == ["payload", "payload"] and records[0]["verdict"] == "named"

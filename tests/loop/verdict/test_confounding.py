@@ -71,7 +71,7 @@ def test_fields_that_agree_are_no_rivals_where_a_refit_tells_them_apart() -> Non
 
 
 @pytest.mark.parametrize(
-    "verdict", ["given up: in some of the states another one explains more by far", "no equilibrium: it folds"]
+    "verdict", ["stopped early: in some of the states another one explains more by far", "no equilibrium: it folds"]
 )
 def test_a_refit_that_was_given_up_before_it_had_a_dbic_refutes_nothing(verdict: str) -> None:
     fields = [candidate("cable_friction", 1, 1, 0), candidate("creep", 1, 1, 0.1)]
