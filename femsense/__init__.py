@@ -17,69 +17,169 @@ if TYPE_CHECKING:
     from femsense.calib.calibrate import calibrate
     from femsense.calib.calibration import Calibration
     from femsense.calib.files import read_calibration, write_calibration
+    from femsense.control.motion import Motion, WallContact
+    from femsense.control.reach import ReachOptions, reach
     from femsense.core.errors import DataError, FemsenseError, InputError, MissingDependency
+    from femsense.fem.blocks import block_mesh
+    from femsense.fem.body import BodyModel, make_body, tie_cable
     from femsense.fem.compliance import compliance
     from femsense.fem.equilibrium import Equilibrium, solve_equilibrium
-    from femsense.io.recording_folder import load_recording
-    from femsense.io.robot_toml import load_robot, save_robot
+    from femsense.fem.mesh import TetMesh, embed_points
+    from femsense.fem.realtime.tracker import Tracker
+    from femsense.io.mesh_files import write_mesh
+    from femsense.io.recording_folder import load_recording, save_recording
+    from femsense.io.robot_toml import load_robot, robot_names, save_robot
     from femsense.loop.files import read_loop, write_loop
     from femsense.loop.improve import improve
     from femsense.loop.result import LoopResult
-    from femsense.model.recording import Recording
+    from femsense.model.effects import EFFECTS, Effect, apply_effects, find_effect
+    from femsense.model.recording import Camera, Recording, RestMarkers, make_recording, select_frames
     from femsense.model.robot import Robot
+    from femsense.report.write import write_report
+    from femsense.rig.simulate import simulate
     from femsense.sensing.pipeline import estimate
-    from femsense.sensing.run_files import read_run, write_run
-    from femsense.sensing.types import Run
+    from femsense.sensing.run_files import read_run, run_inputs, write_run
+    from femsense.sensing.types import ContactForce, Run, SensingOptions
     from femsense.xr.export import export_glb
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "EFFECTS",
+    "BodyModel",
     "Calibration",
+    "Camera",
+    "ContactForce",
     "DataError",
+    "Effect",
     "Equilibrium",
     "FemsenseError",
     "InputError",
     "LoopResult",
     "MissingDependency",
+    "Motion",
+    "ReachOptions",
     "Recording",
+    "RestMarkers",
     "Robot",
     "Run",
+    "SensingOptions",
+    "TetMesh",
+    "Tracker",
+    "WallContact",
     "__version__",
+    "apply_effects",
+    "block_mesh",
     "calibrate",
     "compliance",
+    "embed_points",
     "estimate",
     "export_glb",
+    "find_effect",
     "improve",
     "load_recording",
     "load_robot",
+    "make_body",
+    "make_recording",
+    "reach",
     "read_calibration",
     "read_loop",
     "read_run",
+    "robot_names",
+    "run_inputs",
+    "save_recording",
     "save_robot",
+    "select_frames",
+    "simulate",
     "solve_equilibrium",
+    "tie_cable",
     "write_calibration",
     "write_loop",
+    "write_mesh",
+    "write_report",
     "write_run",
 ]
 
 _HOMES = {
     "calib.calibrate": ("calibrate",),
     "calib.calibration": ("Calibration",),
-    "calib.files": ("read_calibration", "write_calibration"),
-    "core.errors": ("DataError", "FemsenseError", "InputError", "MissingDependency"),
+    "calib.files": (
+        "read_calibration",
+        "write_calibration",
+    ),
+    "control.motion": (
+        "Motion",
+        "WallContact",
+    ),
+    "control.reach": (
+        "ReachOptions",
+        "reach",
+    ),
+    "core.errors": (
+        "DataError",
+        "FemsenseError",
+        "InputError",
+        "MissingDependency",
+    ),
+    "fem.body": (
+        "BodyModel",
+        "make_body",
+        "tie_cable",
+    ),
+    "fem.blocks": ("block_mesh",),
     "fem.compliance": ("compliance",),
-    "fem.equilibrium": ("Equilibrium", "solve_equilibrium"),
-    "io.recording_folder": ("load_recording",),
-    "io.robot_toml": ("load_robot", "save_robot"),
-    "loop.files": ("read_loop", "write_loop"),
+    "fem.equilibrium": (
+        "Equilibrium",
+        "solve_equilibrium",
+    ),
+    "fem.mesh": (
+        "TetMesh",
+        "embed_points",
+    ),
+    "fem.realtime.tracker": ("Tracker",),
+    "io.mesh_files": ("write_mesh",),
+    "io.recording_folder": (
+        "load_recording",
+        "save_recording",
+    ),
+    "io.robot_toml": (
+        "load_robot",
+        "robot_names",
+        "save_robot",
+    ),
+    "loop.files": (
+        "read_loop",
+        "write_loop",
+    ),
     "loop.improve": ("improve",),
     "loop.result": ("LoopResult",),
-    "model.recording": ("Recording",),
+    "model.effects": (
+        "EFFECTS",
+        "Effect",
+        "apply_effects",
+        "find_effect",
+    ),
+    "model.recording": (
+        "Camera",
+        "Recording",
+        "RestMarkers",
+        "make_recording",
+        "select_frames",
+    ),
     "model.robot": ("Robot",),
+    "report.write": ("write_report",),
+    "rig.simulate": ("simulate",),
     "sensing.pipeline": ("estimate",),
-    "sensing.run_files": ("read_run", "write_run"),
-    "sensing.types": ("Run",),
+    "sensing.run_files": (
+        "read_run",
+        "run_inputs",
+        "write_run",
+    ),
+    "sensing.types": (
+        "ContactForce",
+        "Run",
+        "SensingOptions",
+    ),
     "xr.export": ("export_glb",),
 }
 _MODULE_OF = {name: f"femsense.{module}" for module, names in _HOMES.items() for name in names}

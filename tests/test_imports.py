@@ -20,6 +20,7 @@ ROOMS = (
     ("model",),
     ("io",),
     ("calib",),
+    ("control",),
     ("rig",),
     ("sensing",),
     ("loop",),

@@ -28,7 +28,7 @@ T = TypeVar("T")
 STOPPED = 130
 STOPPED_TEXT = "stopped; nothing half-written is left, and the same command goes on"
 """Exit status after Ctrl-C, as shells have it."""
-SEVERAL = ("--at", "--validation", "--effects", "--without")
+SEVERAL = ("--at", "--validation", "--effects", "--without", "--target", "--force")
 """Options that take several values after one another."""
 
 
@@ -355,6 +355,38 @@ def export(
     document = {name: getattr(report, name) for name in ("bones", "vertices", "frames", "rms_m", "max_m")}
     text = f"{report.frames} frames, {report.bones} bones, {report.vertices} vertices; {1e3 * report.rms_m:.3f} mm rms from the finite elements"
     return Answer({"path": str(output), **document}, f"{text}\n\nwritten: {output}")
+
+
+@app.command()
+def reach(
+    robot: RobotPath,
+    target: Annotated[
+        list[str],
+        typer.Option(
+            "--target", metavar="MARKER=X,Y,Z …", help="Where a marker is wanted, in metres, robot frame.", show_default=False
+        ),
+    ],
+    control: Annotated[str, typer.Option("--control", help="What is commanded of cables: tension or displacement.")] = "tension",
+    force: Annotated[
+        list[str] | None,
+        typer.Option("--force", metavar="X,Y,Z=FX,FY,FZ …", help="Known contact forces.", show_default=False),
+    ] = None,
+    calibration: Annotated[
+        Path | None,
+        typer.Option("-c", "--calibration", metavar="FILE", help="Commands count from its initial inputs.", show_default=False),
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="FILE", help="A JSON file to write.", show_default=False)
+    ] = None,
+    json: Json = False,
+) -> Answer:
+    """Find the cable inputs or pressures that bring points of the body to places."""
+    from femsense.app.reach_command import reach_targets
+
+    document, text, reached = reach_targets(
+        robot, target, control=control, forces=force or [], calibration=calibration, output=output
+    )
+    return Answer(document, text, exit_status=0 if reached else 1)
 
 
 @app.command()

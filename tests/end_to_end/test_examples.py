@@ -50,6 +50,12 @@ def test_forces(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run.contacts and (tmp_path / "out" / "robot.glb").read_bytes()[:4] == b"glTF"
 
 
+def test_reach() -> None:
+    example = load("reach")
+    assert example.near.status == "reached" and example.near.error_m < 1e-9
+    assert example.far.status == "nearest" and example.far.limits and example.far.error_m > 0.1
+
+
 def test_magnet() -> None:
     effect = load_own_effect(EXAMPLES / "magnet.py")
     robot = fs.load_robot("four-leg")

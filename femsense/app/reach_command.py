@@ -1,0 +1,104 @@
+"""`femsense reach`: from places on the command line to inputs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from femsense.core.errors import InputError
+from femsense.io.files import write_json
+
+FORMAT = "femsense-motion-1"
+FREE = ("", "*")
+"""A coordinate that is written so is left free."""
+
+
+def reach_targets(
+    robot: str,
+    targets: Sequence[str],
+    *,
+    control: str = "tension",
+    forces: Sequence[str] = (),
+    calibration: Path | None = None,
+    output: Path | None = None,
+) -> tuple[dict[str, Any], str, bool]:
+    """Find the inputs for targets NAME=X,Y,Z; return the motion as plain tables and as text, and whether all is reached.
+
+    Raises:
+        InputError: an argument cannot be read, or names no marker.
+    """
+    from femsense.calib.files import read_calibration
+    from femsense.control.motion import REACHED
+    from femsense.control.reach import reach
+    from femsense.io.robot_toml import load_robot
+
+    body = load_robot(robot)
+    wanted = dict(_target(text) for text in targets)
+    known = None if calibration is None else read_calibration(calibration)
+    motion = reach(body, wanted, control=control, forces=[_force(text) for text in forces], calibration=known)
+    unit = {name: "N" if control == "tension" else "m" for name in body.body.cable_names}
+    document = {
+        "format": FORMAT,
+        "status": motion.status,
+        "error_m": motion.error_m,
+        "control": control,
+        "inputs": motion.inputs,
+        "units": {name: unit.get(name, "Pa") for name in motion.inputs},
+        "reached_m": motion.reached_m,
+        "limits": list(motion.limits),
+        "tension_n": motion.equilibrium.tension,
+        "certificate": {
+            "equilibrium_n": motion.certificate.equilibrium_n,
+            "gradient": motion.certificate.gradient,
+            "violation": motion.certificate.violation,
+        },
+        "equilibria": motion.iterations,
+    }
+    if output is not None:
+        write_json(output, document)
+    lines = [motion.text, ""]
+    width = max((len(name) for name in motion.inputs), default=0)
+    for name, value in motion.inputs.items():
+        lines.append(f"  {name:<{width}}  {_amount(value, unit.get(name, 'Pa'))}")
+    if output is not None:
+        lines += ["", f"written: {output}"]
+    return document, "\n".join(lines), motion.status == REACHED
+
+
+def _amount(value: float, unit: str) -> str:
+    return f"{1e3 * value:+.3f} mm" if unit == "m" else f"{value:.4g} {unit}"
+
+
+def _target(text: str) -> tuple[str | tuple[float, float, float], np.ndarray]:
+    """Return what NAME=X,Y,Z or X,Y,Z=X,Y,Z says."""
+    name, equals, place = text.rpartition("=")
+    if not equals or not name:
+        raise InputError("not a target", where="--target", found=text, expected="MARKER=X,Y,Z in metres, robot frame")
+    point = _numbers(place, "--target", free=True)
+    if name.count(",") == 2:
+        x, y, z = _numbers(name, "--target")
+        return (float(x), float(y), float(z)), point
+    return name, point
+
+
+def _force(text: str) -> tuple[np.ndarray, np.ndarray]:
+    place, equals, force = text.partition("=")
+    if not equals:
+        raise InputError(
+            "not a force", where="--force", found=text, expected="X,Y,Z=FX,FY,FZ (metres on the body at rest, newtons)"
+        )
+    return _numbers(place, "--force"), _numbers(force, "--force")
+
+
+def _numbers(text: str, where: str, *, free: bool = False) -> np.ndarray:
+    parts = [part.strip() for part in text.split(",")]
+    try:
+        values = [float("nan") if free and part in FREE else float(part) for part in parts]
+    except ValueError:
+        values = []
+    if len(values) != 3 or not (free or np.isfinite(values).all()):
+        raise InputError("not three numbers", where=where, found=text, expected="X,Y,Z in metres (an empty one is left free)")
+    return np.array(values)

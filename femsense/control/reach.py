@@ -1,0 +1,280 @@
+"""The inverse problem of motion: cable inputs and pressures that bring points of the body to wanted places.
+
+The unknowns are the tensions of the cables and the pressures of the chambers, u. Each round linearises the equilibrium,
+
+    p(u + du) ≈ p(u) + W_pa du,    s(u + du) ≈ s(u) + W_aa du,
+
+(W of the exact tangent, p the wanted coordinates, s the shortening of the cables) and solves the quadratic problem
+
+    min ½ |p + W_pa du − p*|² + ½ λ |du|²   with  u_min ≤ u + du ≤ u_max,  s_min ≤ s + W_aa du ≤ s_max,
+
+as Duriez (2013) and Coevoet et al. (2017) pose it, within a trust region that the next equilibrium widens or narrows.
+The damping λ acts on the step, not on the input, so that it moves no answer. A wanted contact force is applied to the body, and the
+place of the wall becomes one more target: both hold where the robot presses the wall with that force.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from femsense.calib.calibration import Calibration
+from femsense.control.goal import Goal, Target, make_goal
+from femsense.control.limits import CONTROLS, Limits, command, make_limits
+from femsense.control.motion import NEAREST, REACHED, STOPPED, Certificate, Motion, WallContact
+from femsense.core.arrays import FloatArray, freeze
+from femsense.core.errors import InputError
+from femsense.fem.body import BodyModel
+from femsense.fem.cables import pull_rows
+from femsense.fem.compliance import drive_rows, tangent_at
+from femsense.fem.equilibrium import Equilibrium, solve_equilibrium
+from femsense.model.robot import Robot
+from femsense.qp.problem import Problem
+from femsense.qp.solve import solve
+
+WEAKEST = 1e-3
+"""An actuator that moves the points less than this share of the strongest is not pulled harder for it."""
+PENALTY = 50.0
+"""A limit of length that is missed by so much weighs like an error so many times as large."""
+ACTIVE = 1e-9
+"""A limit holds a step back if its multiplier is larger than this, in units of the scaled problem."""
+FIRST_RADIUS, SMALLEST_STEP, NEAR = 0.3, 1e-9, 1e-5
+"""Trust region at first and the step at which a search is over, in units of the body's reach; error from which states are solved finely [m]."""
+COARSE, FINE = 1e-9, 1e-13
+"""Relative tolerance of equilibria on the way, and within a hundredth of a millimetre of the target."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReachOptions:
+    """When a search for inputs ends."""
+
+    tolerance_m: float = 1e-10
+    """A target is reached that is missed by less than this [m]."""
+    max_iterations: int = 60
+    """Equilibria at most."""
+    least_gain: float = 1e-9
+    """The search ends where a step promises less than this share of the squared error."""
+    damping: float = 1e-10
+    """λ, in units of the largest eigenvalue of W_paᵀ W_pa; actuators that do the same share their work by it."""
+
+
+def reach(
+    robot: Robot,
+    target: Target,
+    *,
+    control: str = "tension",
+    limits: Mapping[str, tuple[float, float]] | None = None,
+    forces: Sequence[tuple[npt.ArrayLike, npt.ArrayLike]] | None = None,
+    start: Equilibrium | Motion | None = None,
+    calibration: Calibration | None = None,
+    contacts: Sequence[WallContact] = (),
+    options: ReachOptions | None = None,
+) -> Motion:
+    """Find the inputs that bring points of the body to wanted places, within limits.
+
+    Arguments:
+        robot: the robot with its effects; its cables' and chambers' limits hold.
+        target: a marker's name, or a point of the body at rest [m] → where it is wanted, robot frame [m], shape (3,); NaN leaves
+            a direction free.
+        control: what is commanded of the cables: "tension" [N] or "displacement" [m].
+        limits: cable → (least, largest) command [N or m], chamber → pressure [Pa], beside those of the robot.
+        forces: known or sensed contact forces: (place on the body at rest [m], force on the body [N]), each of shape (3,).
+        start: where the robot is now; by default at rest without inputs.
+        calibration: its initial inputs are taken off the commands.
+        contacts: walls to press against with a wanted force.
+        options: when to end.
+
+    Returns:
+        the motion; a target out of reach is a status with the nearest state and what limits it, no exception.
+
+    Raises:
+        InputError: an unknown marker, cable or control, or limits the wrong way round.
+    """
+    body, known = robot.body, options or ReachOptions()
+    if control not in CONTROLS:
+        raise InputError("unknown control", where="control", found=control, expected=" or ".join(CONTROLS))
+    goal = make_goal(robot, target, forces or (), contacts)
+    bounds = make_limits(robot, control, limits or {}, calibration)
+    first = start.equilibrium if isinstance(start, Motion) else start
+    state = _begin(body, goal, bounds, first)
+    return _searched(robot, control, goal, bounds, state, known, calibration)
+
+
+def _searched(
+    robot: Robot,
+    control: str,
+    goal: Goal,
+    bounds: Limits,
+    state: Equilibrium,
+    options: ReachOptions,
+    calibration: Calibration | None,
+) -> Motion:
+    """Step by step to the inputs: each step is taken if the error falls, else the trust region shrinks."""
+    body, before = robot.body, state.segment_tensions
+    radius, count, status, last = FIRST_RADIUS, 1, STOPPED, _Step(np.zeros(len(bounds.low)), 0.0, 0.0)
+    while state.converged and count < options.max_iterations:
+        error, miss2 = goal.error(state.positions), float((goal.miss(state.positions) ** 2).sum())
+        within = bounds.violation(_wound(body, state)) <= options.tolerance_m
+        last = _step(body, goal, bounds, state, radius, options)
+        if within and error <= options.tolerance_m:
+            status = REACHED
+            break
+        if within and last.gain <= options.least_gain * miss2:
+            status = NEAREST
+            break
+        wanted = np.clip(_effort(state) + last.change, bounds.low, bounds.high)
+        tried = _solved(body, goal, wanted, state, before, fine=error < NEAR)
+        count += 1
+        if tried.converged and _is_better(body, goal, bounds, tried, state):
+            state, radius = tried, 4.0 * radius
+        elif last.size < SMALLEST_STEP:
+            status = NEAREST if within and last.gain <= np.sqrt(options.least_gain) * miss2 else STOPPED
+            break
+        else:
+            radius = 0.25 * min(radius, last.size)
+    return _motion(robot, control, goal, bounds, state, last, status, count, calibration)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Step:
+    """The answer of one quadratic problem."""
+
+    change: FloatArray
+    """Of the efforts [N, Pa], shape (a + c,)."""
+    size: float
+    """Largest change, in units of what would move the points by the body's reach [1]."""
+    gain: float
+    """By how much the squared error falls to first order [m²]."""
+    active: tuple[tuple[float, int, str], ...] = ()
+    """Limits that hold it back: (multiplier, index of the effort, "least", "largest", "shortest" or "longest"), the largest first."""
+
+
+def _step(body: BodyModel, goal: Goal, bounds: Limits, state: Equilibrium, radius: float, options: ReachOptions) -> _Step:
+    """Return the best step of the linearised problem in a trust region."""
+    u, miss = _effort(state), goal.miss(state.positions)
+    J, W = _slopes(body, goal, state)
+    moved = np.linalg.norm(J, axis=0)
+    unit = body.reach / np.maximum(moved, WEAKEST * max(float(moved.max(initial=0.0)), 1e-300))
+    scaled = J * unit
+    top = max(float(np.linalg.norm(scaled, 2)) ** 2, 1e-300) if scaled.size else 1.0
+    low, high = np.minimum((bounds.low - u) / unit, 0.0), np.maximum((bounds.high - u) / unit, 0.0)
+    G, h, names = bounds.rows(W * unit, _wound(body, state), np.maximum(low, -radius), np.minimum(high, radius))
+    problem = Problem(
+        P=scaled.T @ scaled / top + options.damping * np.eye(len(u)),
+        q=-scaled.T @ miss / top,
+        G=G,
+        h=h,
+        lb=np.maximum(low, -radius),
+        ub=np.minimum(high, radius),
+    )
+    answer = solve(problem)
+    if answer.x is None or answer.multipliers is None:
+        return _Step(np.zeros(len(u)), 0.0, 0.0)
+    change = np.asarray(answer.x)
+    left = miss - scaled @ change
+    box = zip(answer.multipliers.z_box, low, high)
+    active = [
+        (abs(float(z)), i, "least" if z < 0 else "largest") for i, (z, a, b) in enumerate(box) if abs(a if z < 0 else b) < radius
+    ]
+    active += [(float(z), i, which) for z, (i, which) in zip(answer.multipliers.z, names)]
+    gain = float(miss @ miss - left @ left)
+    shown = tuple(sorted((limit for limit in active if limit[0] > ACTIVE), reverse=True))
+    return _Step(unit * change, float(np.abs(change).max(initial=0.0)), gain, shown)
+
+
+def _slopes(body: BodyModel, goal: Goal, state: Equilibrium) -> tuple[FloatArray, FloatArray]:
+    """Return W_pa, the rows' change by unit efforts [m/N], shape (r, a + c), and W_aa, that of what the cables wind up, shape (a, a + c)."""
+    tangent = tangent_at(body, state)
+    shares = [t / T if T > 0 else np.ones_like(t) for t, T in zip(state.segment_tensions, state.tension.values())]
+    forces = drive_rows(body, state.positions, shares)
+    moves = tangent.respond(forces.reshape(len(forces), -1, 3))
+    wound = pull_rows(body, state.positions) @ moves.reshape(len(forces), -1).T
+    stretch = np.array([1.0 / cable.stretch_stiffness for cable in body.cables])
+    wound[:, : len(stretch)] += np.diag(stretch)
+    return goal.rows(moves), wound
+
+
+def _effort(state: Equilibrium) -> FloatArray:
+    """Return tensions [N], then pressures [Pa], shape (a + c,)."""
+    return np.array([*state.tension.values(), *state.pressure.values()])
+
+
+def _wound(body: BodyModel, state: Equilibrium) -> FloatArray:
+    """Return what each motor has wound up [m], shape (a,): the cable's shortening and its stretch."""
+    stretch = [state.tension[cable.name] / cable.stretch_stiffness for cable in body.cables]
+    return np.asarray(np.array(list(state.shortening.values())) + np.array(stretch))
+
+
+def _solved(
+    body: BodyModel,
+    goal: Goal,
+    effort: FloatArray,
+    start: Equilibrium | None,
+    before: tuple[FloatArray, ...] | None,
+    *,
+    fine: bool = False,
+) -> Equilibrium:
+    """Return the equilibrium under efforts (a + c,); `before` are the tensions along the cables before the robot began to move."""
+    a = len(body.cables)
+    return solve_equilibrium(
+        body,
+        tension=dict(zip(body.cable_names, effort[:a].tolist())),
+        pressure=dict(zip(body.chamber_names, effort[a:].tolist())),
+        nodal_forces=goal.nodal_forces,
+        start=start,
+        before=before,
+        bilateral=True,
+        relative_tolerance=FINE if fine else COARSE,
+    )
+
+
+def _begin(body: BodyModel, goal: Goal, bounds: Limits, start: Equilibrium | None) -> Equilibrium:
+    """Return the state to begin with, within the limits of efforts."""
+    effort = np.zeros(len(bounds.low)) if start is None else _effort(start)
+    before = None if start is None else start.segment_tensions
+    return _solved(body, goal, np.clip(effort, bounds.low, bounds.high), start, before)
+
+
+def _is_better(body: BodyModel, goal: Goal, bounds: Limits, tried: Equilibrium, state: Equilibrium) -> bool:
+    """Return whether a state is nearer, limits of length that are violated included (an exact penalty: the more is missed, the more they count)."""
+    weight = PENALTY * float(np.linalg.norm(goal.miss(state.positions)))
+
+    def merit(one: Equilibrium) -> float:
+        return float((goal.miss(one.positions) ** 2).sum()) + weight * bounds.violation(_wound(body, one))
+
+    return merit(tried) < merit(state)
+
+
+def _motion(
+    robot: Robot,
+    control: str,
+    goal: Goal,
+    bounds: Limits,
+    state: Equilibrium,
+    last: _Step,
+    status: str,
+    count: int,
+    calibration: Calibration | None,
+) -> Motion:
+    body = robot.body
+    effort, wound, miss = _effort(state), _wound(body, state), goal.miss(state.positions)
+    true = effort[: len(wound)] if control == "tension" else wound
+    inputs = {name: command(robot, control, i, float(true[i]), calibration) for i, name in enumerate(body.cable_names)}
+    inputs.update(state.pressure)
+    places = goal.ties.positions(state.positions)
+    share = last.gain / max(float(miss @ miss), 1e-300) if status != REACHED else 0.0
+    certificate = Certificate(state.residual_n, max(share, 0.0), bounds.violation(wound) + bounds.outside(effort))
+    return Motion(
+        inputs=inputs,
+        positions=state.positions,
+        reached_m={name: freeze(place) for name, place in zip(goal.names, places)},
+        error_m=goal.error(state.positions),
+        status=status,
+        limits=tuple(bounds.text(i, which, body) for _, i, which in last.active) if status != REACHED else (),
+        certificate=certificate,
+        iterations=count,
+        equilibrium=state,
+    )

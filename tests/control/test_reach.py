@@ -1,0 +1,224 @@
+"""The inverse problem of motion: what can be reached is reached, limits are kept, and what limits is named."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from analytic import bar_body
+from helpers import DATA, block_mesh
+
+import femsense as fs
+from femsense.core.errors import InputError
+from femsense.fem.mesh import embed_points
+from femsense.io.robot_toml import load_robot
+from femsense.model.effects import apply_effects
+from femsense.model.robot import Observation, Robot, plain_actuation
+
+TIP = np.array([[0.1, 0.015, 0.03], [0.1, 0.0, 0.015]])
+
+
+def bar(*, friction: float = 0.0) -> Robot:
+    """A bar with two cables, pulled up and aside, and two markers at its end."""
+    body = bar_body(block_mesh((4, 1, 1)), friction=friction)
+    return Robot(
+        name="bar",
+        body=body,
+        marker_names=("tip", "side"),
+        marker_points=TIP,
+        markers=embed_points(body.mesh, TIP),
+        features=np.zeros(0, np.int64),
+        color_rgb=None,
+        actuation=plain_actuation(2),
+        observation=Observation(),
+    )
+
+
+def place(robot: Robot, tension: dict[str, float], marker: int = 0, **more: object) -> np.ndarray:
+    """Where a marker comes to rest under tensions [m]."""
+    return robot.markers.positions(fs.solve_equilibrium(robot.body, tension=tension, **more).positions)[marker]
+
+
+def limited(robot: Robot, **limits: float) -> Robot:
+    """The robot with other limits of its cables."""
+    return robot.with_body(robot.body.with_cables(tuple(replace(c, **limits) for c in robot.body.cables)))
+
+
+@pytest.mark.parametrize("control", ["tension", "displacement"])
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_what_some_inputs_reach_is_reached_and_the_inputs_do_it(control: str, seed: int) -> None:
+    robot = bar()
+    tension = dict(zip(robot.body.cable_names, np.random.default_rng(seed).uniform(0.05, 0.8, 2)))
+    wanted = place(robot, tension)
+    motion = fs.reach(robot, {"tip": wanted}, control=control)
+    assert motion.status == "reached" and motion.error_m <= 1e-10 and not motion.limits
+    drive = {"tension": motion.inputs} if control == "tension" else {"shortening": motion.inputs}
+    again = fs.solve_equilibrium(robot.body, **drive)
+    np.testing.assert_allclose(robot.markers.positions(again.positions)[0], wanted, atol=2e-7)
+    np.testing.assert_allclose(motion.reached_m["tip"], wanted, atol=1e-10)
+    assert motion.certificate.equilibrium_n < 1e-8 and motion.certificate.violation == 0.0
+
+
+def test_a_direction_may_be_left_free() -> None:
+    robot = bar()
+    up = place(robot, {})[2] + 0.004
+    motion = fs.reach(robot, {"tip": [np.nan, np.nan, up]})
+    assert motion.status == "reached" and motion.reached_m["tip"][2] == pytest.approx(up, abs=1e-10)
+
+
+def test_what_no_input_reaches_is_answered_with_the_nearest_and_its_limits() -> None:
+    robot = limited(bar(), max_tension=0.3)
+    names = robot.body.cable_names
+    wanted = np.add(place(robot, {}), [0.0, 0.0, 0.2])
+    motion = fs.reach(robot, {"tip": wanted})
+    assert motion.status == "nearest" and any("largest tension, 0.3 N" in limit for limit in motion.limits)
+    assert all(0.0 <= motion.inputs[name] <= 0.3 for name in names) and motion.certificate.gradient < 1e-6
+    for i, name in enumerate(names):  # no neighbour within the limits is nearer
+        for step in (-0.01, 0.01):
+            tension = {**motion.inputs, name: float(np.clip(motion.inputs[name] + step, 0.0, 0.3))}
+            assert np.linalg.norm(place(robot, tension) - wanted) >= motion.error_m - 1e-9, (i, step)
+
+
+def test_limits_of_length_are_kept() -> None:
+    robot = bar()
+    name = robot.body.cable_names[0]
+    wanted = place(robot, {name: 0.6})
+    free = fs.reach(robot, {"tip": wanted}, control="displacement")
+    most = 0.5 * free.inputs[name]
+    motion = fs.reach(robot, {"tip": wanted}, control="displacement", limits={name: (-1.0, most)})
+    assert motion.status == "nearest" and motion.inputs[name] == pytest.approx(most, abs=1e-9)
+    assert any(limit.startswith(f"{name} wound up by no more than") for limit in motion.limits)
+
+
+def test_a_cable_that_cannot_push_is_said_to_be_what_limits() -> None:
+    robot = bar()
+    motion = fs.reach(robot, {"tip": np.subtract(place(robot, {}), [0.0, 0.0, 0.01])})
+    assert motion.status == "nearest" and any("cannot push" in limit for limit in motion.limits)
+    assert min(motion.inputs.values()) >= 0.0
+
+
+def test_known_contact_forces_act_meanwhile() -> None:
+    robot = bar()
+    name = robot.body.cable_names[0]
+    push = np.zeros_like(robot.body.mesh.nodes)
+    at = int(np.argmin(np.linalg.norm(robot.body.mesh.nodes - TIP[0], axis=1)))
+    point = robot.body.mesh.nodes[at]
+    push[at] = [0.0, 0.02, -0.05]
+    wanted = place(robot, {name: 0.4}, nodal_forces=push)
+    motion = fs.reach(robot, {"tip": wanted}, forces=[(point, push[at])])
+    assert motion.status == "reached" and motion.inputs[name] == pytest.approx(0.4, abs=1e-4)
+
+
+def test_a_wall_is_pressed_with_the_wanted_force() -> None:
+    robot = bar()
+    above = place(robot, {})[2] + 0.002
+    wall = fs.WallContact(tuple(TIP[0]), (0.0, 0.0, -1.0), -above, 0.05)
+    motion = fs.reach(robot, {"side": [np.nan, place(robot, {}, 1)[1], np.nan]}, contacts=[wall])
+    assert motion.status == "reached"
+    tip = embed_points(robot.body.mesh, TIP[:1])
+    np.testing.assert_allclose(tip.positions(motion.positions)[0, 2], above, atol=1e-9)
+    lift = tip.spread(np.array([[0.0, 0.0, -0.05]]), len(robot.body.mesh.nodes))  # the wall pushes down with what was wanted
+    held = fs.solve_equilibrium(robot.body, tension=motion.equilibrium.tension, nodal_forces=lift)
+    np.testing.assert_allclose(tip.positions(held.positions)[0, 2], above, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("control", "effects"),
+    [
+        (
+            "tension",
+            [{"name": "cable_gain", "scale": {"top": 0.8, "side": 1.1}}, {"name": "cable_offset", "tension_n": {"top": 0.1}}],
+        ),
+        (
+            "displacement",
+            [{"name": "cable_slack", "displacement_m": {"top": 1e-3}}, {"name": "cable_stretch", "stiffness_n_m": 800.0}],
+        ),
+    ],
+)
+def test_commands_are_those_of_the_motors(control: str, effects: list[dict[str, object]]) -> None:
+    plain = bar()
+    robot = apply_effects(plain, effects)
+    wanted = place(plain, {"top": 0.5, "side": 0.2})
+    motion = fs.reach(robot, {"tip": wanted}, control=control)
+    assert motion.status == "reached"
+    recording = fs.make_recording(
+        time_s=[0.0], cable_names=robot.body.cable_names, inputs=[list(motion.inputs.values())], actuation=control
+    )
+    from femsense.model.drive import DrivenRobot, drive_of
+    from femsense.model.variants import solve_frame
+
+    state = solve_frame(DrivenRobot(robot, drive_of(robot, recording)), 0)
+    np.testing.assert_allclose(robot.markers.positions(state.positions)[0], wanted, atol=1e-6)
+
+
+def test_friction_is_paid_for() -> None:
+    plain, rubbing = bar(), bar(friction=0.3)
+    wanted = place(plain, {"top": 0.5})
+    motion = fs.reach(rubbing, {"tip": [np.nan, np.nan, wanted[2]]})
+    assert motion.status == "reached"
+    assert sum(motion.inputs.values()) > sum(fs.reach(plain, {"tip": [np.nan, np.nan, wanted[2]]}).inputs.values()) + 0.01
+
+
+def test_pressures_reach_too() -> None:
+    robot = load_robot("pneu-finger")
+    name = robot.body.chamber_names[0]
+    pressed = fs.solve_equilibrium(robot.body, pressure={name: 4e3})
+    wanted = robot.markers.positions(pressed.positions)[0]
+    motion = fs.reach(robot, {robot.marker_names[0]: wanted})
+    assert motion.status == "reached" and motion.inputs[name] == pytest.approx(4e3, rel=1e-6)
+
+
+@pytest.mark.skipif(not (DATA / "finger").is_dir(), reason="the finger of the peers is not here")
+def test_the_finger_of_the_peers_reaches_its_heights_and_keeps_its_limits() -> None:
+    """Goals and limits of SoftRobots.Inverse's own scenes: heights are met to 1e-10 in its unit, millimetres (PEERS, H)."""
+    robot = load_robot(str(DATA / "finger"))
+    cable, nodes = robot.body.cable_names[0], robot.body.mesh.nodes
+    far_end = nodes[np.argmax(np.linalg.norm(nodes - nodes[robot.body.clamped].mean(axis=0), axis=1))]
+    name, tip = tuple(far_end.tolist()), embed_points(robot.body.mesh, far_end[None])
+    here = tip.positions(fs.solve_equilibrium(robot.body).positions)[0]
+    way = tip.positions(fs.solve_equilibrium(robot.body, tension={cable: 1.0}).positions)[0] - here
+    axis = int(np.argmax(np.abs(way)))
+    start = None
+    for share in (0.3, 0.6, 0.9):
+        wanted = np.full(3, np.nan)
+        wanted[axis] = here[axis] + share * way[axis]
+        start = fs.reach(robot, {name: wanted}, start=start)
+        assert start.status == "reached" and start.error_m <= 1e-10
+    back = np.full(3, np.nan)
+    back[axis] = here[axis] - 0.5 * way[axis]
+    assert fs.reach(robot, {name: back}).inputs[cable] >= 0.0
+    far = np.full(3, np.nan)
+    far[axis] = here[axis] + 3.0 * way[axis]
+    assert fs.reach(robot, {name: far}, limits={cable: (0.0, 0.8)}).inputs[cable] == pytest.approx(0.8)
+
+
+@pytest.mark.parametrize(
+    ("target", "more", "text"),
+    [
+        ({"tap": [0.0, 0.0, 0.0]}, {}, "did you mean 'tip'"),
+        ({}, {}, "nothing is wanted"),
+        ({"tip": [0.0, 0.0]}, {}, "not a place"),
+        ({"tip": [0.0, 0.0, 0.0]}, {"control": "torque"}, "unknown control"),
+        ({"tip": [0.0, 0.0, 0.0]}, {"limits": {"bottom": (0.0, 1.0)}}, "no cable or chamber"),
+        ({"tip": [0.0, 0.0, 0.0]}, {"limits": {"top": (1.0, 0.0)}}, "wrong way round"),
+    ],
+)
+def test_what_cannot_be_meant_is_refused(target: dict[str, list[float]], more: dict[str, object], text: str) -> None:
+    with pytest.raises(InputError, match=text):
+        fs.reach(bar(), target, **more)
+
+
+def test_the_command_says_inputs_limits_and_exit_status(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from femsense.app.cli import run
+
+    robot = load_robot("four-leg")
+    name = robot.marker_names[0]
+    x, y, _ = place(robot, {})
+    out = tmp_path / "motion.json"
+    assert run(["reach", "four-leg", "--target", f"{name}={x + 0.003},{y},", "-o", str(out)]) == 0
+    assert "reached" in capsys.readouterr().out and out.is_file()
+    assert run(["reach", "four-leg", "--target", f"{name}={x + 0.3},,"]) == 1
+    assert "out of reach" in capsys.readouterr().out
+    assert run(["reach", "four-leg", "--target", "0.1,0.2"]) == 2
