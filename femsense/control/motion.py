@@ -67,4 +67,5 @@ class Motion:
         if self.status == NEAREST:
             reason = by or "; no input moves the points that way"
             return f"out of reach: the nearest is {1e3 * self.error_m:.3g} mm off{reason}"
-        return f"stopped {1e3 * self.error_m:.3g} mm off: {self.equilibrium.advice}{by}"
+        why = by if self.equilibrium.converged else f": {self.equilibrium.advice}{by}"
+        return f"stopped {1e3 * self.error_m:.3g} mm off after {self.iterations} equilibria{why}"

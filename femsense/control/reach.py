@@ -82,7 +82,7 @@ def reach(
         control: what is commanded of the cables: "tension" [N] or "displacement" [m].
         limits: cable → (least, largest) command [N or m], chamber → pressure [Pa], beside those of the robot.
         forces: known or sensed contact forces: (place on the body at rest [m], force on the body [N]), each of shape (3,).
-        start: where the robot is now; by default at rest without inputs.
+        start: where the robot is now; by default at rest without inputs. Where no way leads on from there, one from rest is tried.
         calibration: its initial inputs are taken off the commands.
         contacts: walls to press against with a wanted force.
         options: when to end.
@@ -99,8 +99,11 @@ def reach(
     goal = make_goal(robot, target, forces or (), contacts)
     bounds = make_limits(robot, control, limits or {}, calibration)
     first = start.equilibrium if isinstance(start, Motion) else start
-    state = _begin(body, goal, bounds, first)
-    return _searched(robot, control, goal, bounds, state, known, calibration)
+    motion = _searched(robot, control, goal, bounds, _begin(body, goal, bounds, first), known, calibration)
+    if motion.status == REACHED or first is None:
+        return motion
+    again = _searched(robot, control, goal, bounds, _begin(body, goal, bounds, None), known, calibration)
+    return again if again.error_m < motion.error_m else motion
 
 
 def _searched(
@@ -114,7 +117,7 @@ def _searched(
 ) -> Motion:
     """Step by step to the inputs: each step is taken if the error falls, else the trust region shrinks."""
     body, before = robot.body, state.segment_tensions
-    radius, count, status, last = FIRST_RADIUS, 1, STOPPED, _Step(np.zeros(len(bounds.low)), 0.0, 0.0)
+    radius, count, status, last, beyond = FIRST_RADIUS, 1, STOPPED, _Step(np.zeros(len(bounds.low)), 0.0, 0.0), ""
     while state.converged and count < options.max_iterations:
         error, miss2 = goal.error(state.positions), float((goal.miss(state.positions) ** 2).sum())
         within = bounds.violation(_wound(body, state)) <= options.tolerance_m
@@ -126,16 +129,16 @@ def _searched(
             status = NEAREST
             break
         wanted = np.clip(_effort(state) + last.change, bounds.low, bounds.high)
-        tried = _solved(body, goal, wanted, state, before, fine=error < NEAR)
+        tried = _solved(body, goal, wanted, state, before, fine=error < NEAR, tried=True)
         count += 1
         if tried.converged and _is_better(body, goal, bounds, tried, state):
-            state, radius = tried, 4.0 * radius
+            state, radius, beyond = tried, 4.0 * radius, ""
         elif last.size < SMALLEST_STEP:
             status = NEAREST if within and last.gain <= np.sqrt(options.least_gain) * miss2 else STOPPED
             break
         else:
-            radius = 0.25 * min(radius, last.size)
-    return _motion(robot, control, goal, bounds, state, last, status, count, calibration)
+            radius, beyond = 0.25 * min(radius, last.size), "" if tried.converged else tried.status
+    return _motion(robot, control, goal, bounds, state, last, status, count, calibration, beyond)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -216,6 +219,7 @@ def _solved(
     before: tuple[FloatArray, ...] | None,
     *,
     fine: bool = False,
+    tried: bool = False,
 ) -> Equilibrium:
     """Return the equilibrium under efforts (a + c,); `before` are the tensions along the cables before the robot began to move."""
     a = len(body.cables)
@@ -228,6 +232,7 @@ def _solved(
         before=before,
         bilateral=True,
         relative_tolerance=FINE if fine else COARSE,
+        rough=tried,
     )
 
 
@@ -258,6 +263,7 @@ def _motion(
     status: str,
     count: int,
     calibration: Calibration | None,
+    beyond: str,
 ) -> Motion:
     body = robot.body
     effort, wound, miss = _effort(state), _wound(body, state), goal.miss(state.positions)
@@ -273,8 +279,14 @@ def _motion(
         reached_m={name: freeze(place) for name, place in zip(goal.names, places)},
         error_m=goal.error(state.positions),
         status=status,
-        limits=tuple(bounds.text(i, which, body) for _, i, which in last.active) if status != REACHED else (),
+        limits=() if status == REACHED else _words(body, bounds, last, beyond),
         certificate=certificate,
         iterations=count,
         equilibrium=state,
     )
+
+
+def _words(body: BodyModel, bounds: Limits, last: _Step, beyond: str) -> tuple[str, ...]:
+    """Return what stops a motion in words: limits that are active, and equilibria that end."""
+    active = tuple(bounds.text(i, which, body) for _, i, which in last.active)
+    return (*active, f"no equilibrium further on ({beyond})") if beyond else active
