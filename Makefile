@@ -1,7 +1,8 @@
-# make demo   the whole chain on the recording that comes along, into femsense-demo/
-# make test   lint, types and all tests
-# make lint   ruff and mypy
-# make clean  what the targets above have made
+# make demo      the whole chain on the recording that comes along, into femsense-demo/
+# make test      lint, types, all tests, and a sample of the sabotages: key lines are broken, and tests must notice
+# make sabotage  every sabotage
+# make lint      ruff and mypy
+# make clean     what the targets above have made
 #
 # Each sets up what it needs first: a virtual environment in .venv with femsense and what it depends on. PYTHON=… chooses the
 # Python (3.11 or 3.12); DEMO=… the folder of the demo's results; JOBS=… how many tests run at a time.
@@ -15,7 +16,7 @@ export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 export MKL_NUM_THREADS ?= 1
 
-.PHONY: demo test lint clean
+.PHONY: demo test sabotage lint clean
 .DEFAULT_GOAL := demo
 
 demo: $(VENV)/.installed
@@ -23,6 +24,10 @@ demo: $(VENV)/.installed
 
 test: lint
 	$(RUN)/python -m pytest -n $(JOBS)
+	$(RUN)/python scripts/sabotage.py --green --sample 64 --seconds 330 --jobs $(JOBS)
+
+sabotage: $(VENV)/.installed-dev
+	$(RUN)/python scripts/sabotage.py --jobs $(JOBS)
 
 lint: $(VENV)/.installed-dev
 	$(RUN)/ruff check .

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import ast
+import copy
 import inspect
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -57,6 +59,9 @@ def module_of(file: Path) -> str:
     return ".".join(("femsense", *file.relative_to(PACKAGE).with_suffix("").parts))
 
 
+KNOWN = {module_of(file) for file in FILES}
+
+
 def imported_modules(tree: ast.AST) -> Iterator[str]:
     """Yield the full names of what a tree imports, anywhere in it."""
     for node in ast.walk(tree):
@@ -78,21 +83,22 @@ def without_functions(tree: ast.AST) -> ast.AST:
         def visit_If(self, node: ast.If) -> ast.AST | None:
             return None if ast.unparse(node.test) == "TYPE_CHECKING" else self.generic_visit(node)
 
-    return Cut().visit(tree)
+    return Cut().visit(copy.deepcopy(tree))
 
 
+@cache
 def parse(file: Path) -> ast.AST:
     return ast.parse(file.read_text(encoding="utf-8"))
 
 
+@cache
 def inner_imports(file: Path) -> list[str]:
     """Return the modules of femsense that a file imports, names of modules that are imported from packages resolved."""
-    known = {module_of(f) for f in FILES}
     found = []
     for node in ast.walk(parse(file)):
         if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("femsense"):
             inside = [f"{node.module}.{alias.name}" for alias in node.names]
-            found += [name if name in known else node.module for name in inside]
+            found += [name if name in KNOWN else node.module for name in inside]
         elif isinstance(node, ast.Import):
             found += [alias.name for alias in node.names if alias.name.startswith("femsense.")]
     return [name for name in found if name != "femsense"]

@@ -325,8 +325,8 @@ def improve(
             robot,
             recordings,
             validation=validation or [],
-            effects=_names(effects),
-            without=_names(without),
+            effects=split_names(effects),
+            without=split_names(without),
             user_effects=user_effect or [],
             measured=measured,
             again=again,
@@ -450,7 +450,7 @@ def run(arguments: Sequence[str]) -> int:
     """Run a command, print its answer or its error, and return the exit status."""
     notes: list[str] = []
     as_json = "--json" in arguments
-    words = _spread(list(arguments)) or ["--help"]
+    words = repeat_options(list(arguments)) or ["--help"]
     with _calm_warnings(notes, as_json):
         try:
             with _clean_stdout(as_json):
@@ -602,7 +602,7 @@ def _say(text: str) -> None:
 # Arguments
 
 
-def _spread(words: list[str]) -> list[str]:
+def repeat_options(words: list[str]) -> list[str]:
     """Repeat an option for each of the values that follow it: --validation A B is --validation A --validation B."""
     result: list[str] = []
     option: str | None = None
@@ -640,7 +640,7 @@ def _places(texts: Sequence[str]) -> list[list[float]] | None:
     return places or None
 
 
-def _names(texts: Sequence[str] | None) -> list[str] | None:
+def split_names(texts: Sequence[str] | None) -> list[str] | None:
     """Return names that stand between commas or in options of their own; None where there is no such option."""
     names = [name.strip() for text in texts or [] for name in text.split(",") if name.strip()]
     if texts and not names:

@@ -125,7 +125,7 @@ def improve_into(
     if not again and finished(folder, inputs):
         say(f"{folder} holds this result already (--again computes it anew)")
         return read_loop(folder)
-    with beside(_load_pages):
+    with beside(load_pages):
         loop = improve(
             body,
             train,
@@ -160,22 +160,28 @@ def _kept(folder: str | Path, inputs: Mapping[str, Any]) -> tuple[Path, dict[str
     return Path(folder) / UNFINISHED, {**inputs, "version": femsense.__version__}
 
 
-def _load_pages() -> None:
-    """Load what draws pages, which takes a second; an installation without it has no pages."""
+def load_pages(load: Callable[[str], object] = importlib.import_module) -> None:
+    """Load what draws pages, which takes a second; an installation without it has no pages. `load` imports a module by its name."""
     with contextlib.suppress(ImportError):
         for name in ("femsense.report", "matplotlib.figure", "matplotlib.backends.backend_svg"):
-            importlib.import_module(name)
+            load(name)
 
 
-def loop_page(folder: str | Path, *, say: Say) -> Path | None:
-    """Return report.html of a folder with loop.json, written where it is missing or older; None where this installation cannot."""
+def loop_page(folder: str | Path, *, say: Say, write: Callable[[str | Path], Path] | None = None) -> Path | None:
+    """Return report.html of a folder with loop.json, written where it is missing or older; None where this installation cannot.
+
+    Arguments:
+        folder: what the loop wrote.
+        say: called with why there is no page.
+        write: writes the page of a folder; None: `femsense.report.write_report`.
+    """
     page, loop = Path(folder) / "report.html", Path(folder) / "loop.json"
     if page.is_file() and page.stat().st_mtime_ns >= loop.stat().st_mtime_ns:
         return page
     try:
         from femsense.report import write_report
 
-        return write_report(folder)
+        return (write or write_report)(folder)
     except (ImportError, FemsenseError) as error:
         say(f"no report: {' '.join(str(error).split())}")
         return None

@@ -9,7 +9,7 @@ import platform
 import re
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError
 from importlib.metadata import version as version_of
@@ -61,13 +61,16 @@ class Check:
     """What to do."""
 
 
-def diagnose() -> dict[str, Any]:
+def diagnose(packages: Mapping[str, str] = PACKAGES) -> dict[str, Any]:
     """Check this installation.
+
+    Arguments:
+        packages: modules that have to be there, and what pip calls them.
 
     Returns:
         `ok` (no check has level "error") and `checks`, each `{name, level, found, hint}`.
     """
-    checks = [_python(), *(_package(module, package) for module, package in PACKAGES.items())]
+    checks = [_python(), *(_package(module, package) for module, package in packages.items())]
     parts: tuple[Callable[[], Check], ...] = (
         _tetrahedra,
         _libraries,

@@ -53,6 +53,46 @@ class FitResult:
     """Whether the Jacobian is that at θ; else that of a step before."""
 
 
+class Pace:
+    """How long steps with a Jacobian of their own are, and how long the next one will be if they go on shrinking; inf: not known."""
+
+    def __init__(self) -> None:
+        self.last, self.next = np.inf, np.inf
+
+    def took(self, length: float) -> None:
+        """Count a step; inf where it was damped."""
+        self.next = length * max(length / self.last, LEAST_SHRINKING) if length < self.last < np.inf else np.inf
+        self.last = length
+
+
+def broyden_update(J: FloatArray, step: FloatArray, scale: FloatArray, missed: FloatArray) -> FloatArray:
+    """Return the Jacobian that is nearest to J and has what J missed along a step, shape (N, p).
+
+    Arguments:
+        J: a Jacobian, shape (N, p).
+        step: the step that was taken, shape (p,).
+        scale: size of each column, in whose units steps are short or long, shape (p,).
+        missed: what the residual changed by beside J step, shape (N,).
+
+    J + missed (D²s)ᵀ / (sᵀD²s), D = diag(scale).  Source: Broyden, "A class of methods for solving nonlinear simultaneous equations" (1965).
+    """
+    along = scale**2 * step
+    size = float(along @ step)
+    return J if size == 0.0 else J + np.outer(missed, along / size)
+
+
+@dataclass(frozen=True, slots=True)
+class Learning:
+    """How a fit learns from its own steps."""
+
+    update: Callable[[FloatArray, FloatArray, FloatArray, FloatArray], FloatArray] = broyden_update
+    """J, step, scale, missed → the Jacobian after a step."""
+    pace: Callable[[], Pace] = Pace
+    """Makes what foretells the length of the next step."""
+    curvature: Callable[[], Curvature] = Curvature
+    """Makes what knows of second derivatives."""
+
+
 def gauss_newton(
     evaluate: Evaluate,
     theta: FloatArray,
@@ -70,6 +110,7 @@ def gauss_newton(
     enough: float = 0.0,
     spare: float = 0.0,
     nonsmooth: Callable[[FloatArray], Nonsmoothness | None] | None = None,
+    learning: Learning | None = None,
 ) -> FitResult:
     """Minimise ‖r(θ)‖² within bounds (Levenberg's damping where a plain step does not pay; how the residual bends, as far as its Jacobians have
     shown it, counts while that foretells steps no worse than straight lines do: `core.local_model`).
@@ -96,7 +137,8 @@ def gauss_newton(
         trusted: a Jacobian that missed less than this share of every step since it was made is believed, too, that nothing is left to gain.
         enough: what counts as a gain in the sum of squares, in units of the misfit where that is more than noise; 0: all that `tolerance` says.
         spare: a fit ends where a whole step promises less than this, by its own Jacobian or one that foretold a step: what is asked next is worth more.
-        kinks: θ → where the residual bends near by, for the Jacobian that was computed last.
+        nonsmooth: θ → where the residual bends near by, for the Jacobian that was computed last.
+        learning: how it learns from its own steps; None: as the defaults of `Learning` say.
     """
     p = len(theta)
     low = np.full(p, -np.inf) if low is None else low
@@ -106,9 +148,10 @@ def gauss_newton(
     theta = clipped
     residual, slope = _first(evaluate, theta, known, borrowed)
     costs = [float(residual @ residual)]
-    damping, status, steps, pace = 0.0, "iterations", 0, _Pace()
+    learning = learning or Learning()
+    damping, status, steps, pace = 0.0, "iterations", 0, learning.pace()
     idle = 0  # idle steps in turn
-    curvature = Curvature()
+    curvature = learning.curvature()
     while steps < max_iterations or not slope.own:
         bends = None if nonsmooth is None else nonsmooth(theta)
         if slope.own:
@@ -159,7 +202,8 @@ def gauss_newton(
         curvature.judge(near, step, costs[-1] - cost)
         missed = tried - residual - change
         off, way = float(np.linalg.norm(missed)), float(np.linalg.norm(change))
-        theta, residual, slope = theta + step, tried, slope.after(step, near.scale, missed, off < trusted * way)
+        theta, residual = theta + step, tried
+        slope = _Slope(learning.update(slope.J, step, near.scale, missed), False, off < trusted * way and slope.sure is not False)
         ends = idle or last or (error == 1.0 and pace.next <= still)
         if off > max(serves * way, gain**0.5) and not ends:
             residual, slope = _both(evaluate, theta)
@@ -183,29 +227,6 @@ class _Slope:
     """Whether it is that at θ."""
     sure: bool | None = True
     """Whether it foretold all steps since it was made; None: it was made elsewhere, and no step has been taken by it."""
-
-    def after(self, step: FloatArray, scale: FloatArray, missed: FloatArray, expected_residual: bool) -> _Slope:
-        """Return it with what it missed along a step."""
-        return _Slope(_as_seen(self.J, step, scale, missed), False, expected_residual and self.sure is not False)
-
-
-class _Pace:
-    """How long steps with a Jacobian of their own are, and how long the next one will be if they go on shrinking; inf: not known."""
-
-    def __init__(self) -> None:
-        self.last, self.next = np.inf, np.inf
-
-    def took(self, length: float) -> None:
-        """Count a step; inf where it was damped."""
-        self.next = length * max(length / self.last, LEAST_SHRINKING) if length < self.last < np.inf else np.inf
-        self.last = length
-
-
-def _as_seen(J: FloatArray, step: FloatArray, scale: FloatArray, missed: FloatArray) -> FloatArray:
-    """Return the Jacobian that is nearest to J and has what J missed along a step (Broyden 1965)."""
-    along = scale**2 * step
-    size = float(along @ step)
-    return J if size == 0.0 else J + np.outer(missed, along / size)
 
 
 def _shorter(near: LocalModel, damping: float, change: FloatArray) -> float:

@@ -96,8 +96,14 @@ class Curvature:
         self.believed = curved <= straight
 
 
-def _with_curvature(J: FloatArray, S: FloatArray, scale: FloatArray) -> FloatArray:
-    """Return C with CᵀC = JᵀJ + S, S being cut so that it leaves the least share of JᵀJ, and nothing where J sees nothing."""
+def with_curvature(J: FloatArray, S: FloatArray, scale: FloatArray) -> FloatArray:
+    """Return C with CᵀC = JᵀJ + S, S being cut so that it leaves the least share of JᵀJ, and nothing where J sees nothing.
+
+    Arguments:
+        J: the Jacobian, shape (N, p).
+        S: what curvature adds to JᵀJ, symmetric, shape (p, p).
+        scale: size of each column of J, shape (p,).
+    """
     _, size, Vt = np.linalg.svd(J / scale, full_matrices=False)
     seen = size > 1e-9 * size.max()
     root = size[seen, None] * Vt[seen]
@@ -133,7 +139,7 @@ class LocalModel:
             self.J = self.plain + (nonsmooth.columns * (nonsmooth.value >= 0)) @ nonsmooth.slope
         self.S, self.curved = np.zeros((len(self.scale),) * 2), S is not None and believed
         if S is not None:
-            C = _with_curvature(self.J, S, self.scale)
+            C = with_curvature(self.J, S, self.scale)
             self.S = C.T @ C - self.J.T @ self.J
 
     def change(self, step: FloatArray) -> FloatArray:
@@ -193,7 +199,7 @@ class LocalModel:
         """Return C, c whose ‖c + C t‖² is, but for a constant, ‖r + J t‖² + (s + t)ᵀ S (s + t)."""
         if not self.curved:
             return J, r
-        C = _with_curvature(J, self.S, self.scale)
+        C = with_curvature(J, self.S, self.scale)
         slope = (J.T @ r + self.S @ s) / self.scale
         return C, np.asarray(np.linalg.lstsq((C / self.scale).T, slope, rcond=None)[0])
 

@@ -52,7 +52,7 @@ def rotated_step(body: BodyModel, positions: FloatArray, step: FloatArray) -> Fl
     """Return where a step [m], shape (n, 3), leads from node positions [m] when elements turn; None where nothing is clamped."""
     kept = body.free_map.laplacian
     if not kept:
-        kept.append(_corners(body) if body.clamp_is_rigid and body.is_held() else None)
+        kept.append(corners_of(body) if body.clamp_is_rigid and body.is_held() else None)
     corners: Corners | None = kept[0]
     if corners is None:
         return None
@@ -66,7 +66,8 @@ def rotated_step(body: BodyModel, positions: FloatArray, step: FloatArray) -> Fl
     return np.asarray(x + step + further)
 
 
-def _corners(body: BodyModel) -> Corners:
+def corners_of(body: BodyModel) -> Corners:
+    """Return what turning the elements of a body needs of its shape at rest, with the factor of its Laplacian."""
     mesh, tets = body.mesh, body.mesh.tets[:, :4]
     edges = mesh.nodes[tets[:, 1:]] - mesh.nodes[tets[:, :1]]
     slopes = np.linalg.inv(edges)  # columns: gradients of N1, N2, N3

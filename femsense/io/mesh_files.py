@@ -159,6 +159,7 @@ def tetrahedralise(
     where: str = "surface",
     check_volume: bool = True,
     seconds: float = FILL_SECONDS,
+    program: str = FTETWILD,
 ) -> TetMesh:
     """Return tetrahedra that fill a closed surface (fTetWild; another mesh each time, see `_tets_of_surface`).
 
@@ -170,11 +171,12 @@ def tetrahedralise(
         where: what a message names.
         check_volume: warn where the tetrahedra hold more or less than the surface (which may where shells cross).
         seconds: it is stopped early after so long [s].
+        program: Python that fills `surface.npz` and writes `tets.npz` where it runs.
 
     Raises:
         InputError: where nothing came out, or not in time. MissingDependency: without pytetwild.
     """
-    nodes, tets = _run_ftetwild(points, triangles, edge_fraction, envelope, where, seconds)
+    nodes, tets = _run_ftetwild(points, triangles, edge_fraction, envelope, where, seconds, program)
     if not len(tets):
         raise InputError(
             "no tetrahedra came out of this surface",
@@ -391,7 +393,7 @@ def _read_kept(place: Path) -> TetMesh | None:
 
 
 def _run_ftetwild(
-    points: FloatArray, triangles: IntArray, edge_fraction: float, envelope: float, where: str, seconds: float
+    points: FloatArray, triangles: IntArray, edge_fraction: float, envelope: float, where: str, seconds: float, program: str
 ) -> tuple[FloatArray, IntArray]:
     """Return nodes and tetrahedra from a process of its own: fTetWild writes files where it runs, and it may crash."""
     if importlib.util.find_spec("pytetwild") is None:
@@ -406,7 +408,7 @@ def _run_ftetwild(
         )
         try:
             result = subprocess.run(
-                [sys.executable, "-c", FTETWILD], cwd=folder, capture_output=True, text=True, errors="replace", timeout=seconds
+                [sys.executable, "-c", program], cwd=folder, capture_output=True, text=True, errors="replace", timeout=seconds
             )
         except subprocess.TimeoutExpired:
             raise InputError(

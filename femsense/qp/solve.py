@@ -8,6 +8,7 @@ small; otherwise the next solver tries.
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -94,7 +95,18 @@ class Solution:
         return self.status is Status.SOLVED
 
 
-def solve(problem: Problem, *, solver: str = "daqp", tolerance: float = 1e-7, fallback: bool = True) -> Solution:
+Answer = tuple[FloatArray | None, Multipliers | None]
+"""x and multipliers of one solver; None where it has no answer or is not installed."""
+
+
+def solve(
+    problem: Problem,
+    *,
+    solver: str = "daqp",
+    tolerance: float = 1e-7,
+    fallback: bool = True,
+    call: Callable[[Problem, str], Answer] | None = None,
+) -> Solution:
     """Return the answer to a convex quadratic problem.
 
     Arguments:
@@ -102,6 +114,7 @@ def solve(problem: Problem, *, solver: str = "daqp", tolerance: float = 1e-7, fa
         solver: `daqp` (active set, dual), `quadprog` (optional package) or `osqp`; the first to try.
         tolerance: largest residual of the scaled problem, where unknowns and gradient are of order one.
         fallback: try the other installed solvers where the first one fails or misses the tolerance.
+        call: asks a solver by its name; None: `call_solver`.
     Returns:
         Solution; a problem without an answer is a status, not an exception.
     Raises:
@@ -118,7 +131,7 @@ def solve(problem: Problem, *, solver: str = "daqp", tolerance: float = 1e-7, fa
     order = (solver, *(name for name in SOLVERS if name != solver)) if fallback else (solver,)
     best, best_error, best_solver = None, np.inf, ""
     for name in order:
-        answer = _call(scaled, name)
+        answer = (call or call_solver)(scaled, name)
         error = _largest(kkt_residuals(scaled, *answer))
         if error < best_error:
             best, best_error, best_solver = answer, error, name
@@ -207,7 +220,7 @@ def _without_answer(status: Status) -> Solution:
 # --- solvers ----------------------------------------------------------------------------------------------------------
 
 
-def _call(problem: Problem, solver: str) -> tuple[FloatArray | None, Multipliers | None]:
+def call_solver(problem: Problem, solver: str) -> Answer:
     """Return x and multipliers of one solver, None where it has no answer or is not installed."""
     import qpsolvers
 

@@ -64,7 +64,7 @@ class ViewServer(ThreadingHTTPServer):
         self.stop()
 
 
-def serve(run_folder: str | Path, *, port: int = 0, open_browser: bool = True) -> ViewServer:
+def serve(run_folder: str | Path, *, port: int = 0, open_browser: bool = True, page: Path = PAGE) -> ViewServer:
     """Start the page of a run on 127.0.0.1 and return at once.
 
     Arguments:
@@ -72,6 +72,7 @@ def serve(run_folder: str | Path, *, port: int = 0, open_browser: bool = True) -
             made where it is missing or older than the states; in a temporary place where the folder cannot be written.
         port: 0 takes a free one.
         open_browser: shows the page in the default browser.
+        page: folder of the built page.
 
     Returns:
         the running server: `.url`, `.wait()`, `.stop()`; also a context manager.
@@ -80,12 +81,12 @@ def serve(run_folder: str | Path, *, port: int = 0, open_browser: bool = True) -
         MissingDependency: the page was not built into this installation.
         InputError: no readable states in the folder, or the port is taken.
     """
-    page = _page_files()
+    built = _page_files(page)
     run = _as_run_folder(run_folder)
     scratch = tempfile.TemporaryDirectory(prefix="femsense-view-")
     try:
         glb = _current_glb(run, Path(scratch.name))
-        files: dict[str, Path | bytes] = {**page, "robot.glb": glb, "contacts.json": _json(contacts_of_run(run))}
+        files: dict[str, Path | bytes] = {**built, "robot.glb": glb, "contacts.json": _json(contacts_of_run(run))}
         server = ViewServer(("127.0.0.1", port), files, scratch)
     except OSError as error:
         scratch.cleanup()
@@ -101,18 +102,18 @@ def serve(run_folder: str | Path, *, port: int = 0, open_browser: bool = True) -
     return server
 
 
-def write_static_page(run_folder: str | Path, out_dir: str | Path) -> Path:
+def write_static_page(run_folder: str | Path, out_dir: str | Path, *, page: Path = PAGE) -> Path:
     """Write page, mesh and contacts into a folder that any web server can serve; return the path of its `index.html`.
 
-    Raises as `serve`.
+    `page` is the folder of the built page. Raises as `serve`.
     """
-    page = _page_files()
+    files = _page_files(page)
     run = _as_run_folder(run_folder)
     out = Path(out_dir)
     out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="femsense-view-") as scratch:
         glb = _current_glb(run, Path(scratch))
-        for name, source in page.items():
+        for name, source in files.items():
             shutil.copyfile(source, out / name)
         if glb.resolve() != (out / "robot.glb").resolve():
             shutil.copyfile(glb, out / "robot.glb")
@@ -280,14 +281,14 @@ def _current_glb(run: Path, scratch: Path) -> Path:
 # ---- the page --------------------------------------------------------------------------------------------------------------
 
 
-def _page_files() -> dict[str, Path]:
-    """Return the files of the built page by name. Raises MissingDependency."""
-    if not (PAGE / "index.html").is_file():
+def _page_files(page: Path) -> dict[str, Path]:
+    """Return the files of a built page by name. Raises MissingDependency."""
+    if not (page / "index.html").is_file():
         raise MissingDependency(
             "the viewer page was not built into this installation (its build was skipped, or the sources are used without "
             "installing them)\n  try:      pip install --force-reinstall --no-deps femsense, or in a checkout: pip install -e ."
         )
-    return {path.name: path for path in sorted(PAGE.iterdir()) if path.is_file() and not path.name.startswith(".")}
+    return {path.name: path for path in sorted(page.iterdir()) if path.is_file() and not path.name.startswith(".")}
 
 
 def _json(value: dict[str, Any]) -> bytes:

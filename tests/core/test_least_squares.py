@@ -7,10 +7,9 @@ import pytest
 from analytic import central_gradient, random_rotation
 from scipy.optimize import least_squares
 
-import femsense.core.least_squares as fit_module
 from femsense.calib.rigid import fit_rigid, fit_rigid_robust
 from femsense.core.errors import DataError, InputError
-from femsense.core.least_squares import covariance_of, gauss_newton
+from femsense.core.least_squares import NEARLY, Learning, Pace, broyden_update, covariance_of, gauss_newton
 from femsense.core.pose import invert_pose, make_pose, move_pose, transform_points
 
 
@@ -204,38 +203,44 @@ def test_a_jacobian_that_serves_again_ends_at_the_same_place_with_fewer_of_them(
     np.testing.assert_array_equal(results[1].jacobian, evaluate(results[1].theta, True)[1])  # that at the end
 
 
-def test_a_jacobian_that_serves_again_learns_from_the_steps_it_predicted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_jacobian_that_serves_again_learns_from_the_steps_it_predicted() -> None:
     J, step, missed = np.eye(4)[:, :3], np.array([1.0, 2.0, 0.0]), np.array([0.1, 0.0, -0.2, 0.3])
-    seen = fit_module._as_seen(J, step, np.array([1.0, 3.0, 1.0]), missed)
+    seen = broyden_update(J, step, np.array([1.0, 3.0, 1.0]), missed)
     np.testing.assert_allclose((seen - J) @ step, missed)
     results, costs = [], []
-    for learns in (fit_module._as_seen, lambda J, *_: J):
-        monkeypatch.setattr(fit_module, "_as_seen", learns)
+    for learning in (Learning(), Learning(update=lambda J, *_: J)):
         evaluate, asked = counted(1.0)
-        results.append(gauss_newton(evaluate, np.array([0.6, 0.2, 0.1]), serves=0.5, still=1e-9, tolerance=1e-14))
+        start = np.array([0.6, 0.2, 0.1])
+        results.append(gauss_newton(evaluate, start, serves=0.5, still=1e-9, tolerance=1e-14, learning=learning))
         costs.append((len(asked), sum(asked)))
     np.testing.assert_allclose(results[0].theta, results[1].theta, atol=1e-6)
     assert costs[0][0] < costs[1][0] and costs[0][1] <= costs[1][1]
 
 
-def test_steps_that_shrink_foretell_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+class NoPace(Pace):
+    """Foretells nothing."""
+
+    def took(self, length: float) -> None:
+        pass
+
+
+def test_steps_that_shrink_foretell_the_end() -> None:
     results, jacobians = [], []
-    for least in (fit_module.LEAST_SHRINKING, np.inf):  # inf: nothing is foretold
-        monkeypatch.setattr(fit_module, "LEAST_SHRINKING", least)
+    for learning in (Learning(), Learning(pace=NoPace)):
         evaluate, asked = counted(1.0)
-        results.append(gauss_newton(evaluate, np.array([0.9, 1.0, 0.4]), serves=0.3, still=1e-2))
+        results.append(gauss_newton(evaluate, np.array([0.9, 1.0, 0.4]), serves=0.3, still=1e-2, learning=learning))
         jacobians.append(sum(asked))
     np.testing.assert_allclose(results[0].theta, results[1].theta, atol=1e-5)
     assert jacobians[0] == jacobians[1] - 1 and results[0].status == "converged"
     assert results[1].own and not results[0].own
 
 
-def test_where_the_end_is_foretold_a_step_that_was_missed_asks_for_no_jacobian(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_the_end_is_foretold_a_step_that_was_missed_asks_for_no_jacobian() -> None:
     results, jacobians = [], []
-    for least in (fit_module.LEAST_SHRINKING, np.inf):
-        monkeypatch.setattr(fit_module, "LEAST_SHRINKING", least)
+    for learning in (Learning(), Learning(pace=NoPace)):
         evaluate, asked = counted(1.0)
-        results.append(gauss_newton(evaluate, np.array([0.9, 1.0, 0.4]), still=1e-2))  # every step is missed
+        fit = gauss_newton(evaluate, np.array([0.9, 1.0, 0.4]), still=1e-2, learning=learning)  # every step is missed
+        results.append(fit)
         jacobians.append(sum(asked))
     np.testing.assert_allclose(results[0].theta, results[1].theta, atol=1e-4)
     assert jacobians[0] < jacobians[1] and not results[0].own
@@ -339,7 +344,7 @@ def test_a_step_that_struggles_far_from_the_end_is_not_idle() -> None:
         return np.array([10.0 * (y - x**2), 1.0 - x]), np.array([[-20.0 * x, 10.0], [-1.0, 0.0]]) if derivative else None
 
     fit = gauss_newton(evaluate, np.array([-1.2, 1.0]), enough=0.3, max_iterations=200)
-    assert fit.cost[-1] < fit_module.NEARLY * 0.3  # short steps along the valley bring little, a whole one promised more
+    assert fit.cost[-1] < NEARLY * 0.3  # short steps along the valley bring little, a whole one promised more
 
 
 def test_a_fit_that_is_not_worth_it_is_given_up_before_its_own_jacobian() -> None:

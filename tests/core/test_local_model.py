@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-import femsense.core.local_model as near_module
-from femsense.core.least_squares import gauss_newton
-from femsense.core.local_model import Curvature, LocalModel, Nonsmoothness
+from femsense.core.least_squares import Learning, gauss_newton
+from femsense.core.local_model import LEAST, Curvature, LocalModel, Nonsmoothness, with_curvature
 
 
 def circle(theta: np.ndarray, derivative: bool) -> tuple[np.ndarray, np.ndarray | None]:
@@ -32,11 +31,29 @@ def curved_line(seed: int):
     return evaluate, Q
 
 
-def test_where_much_is_left_a_bent_way_takes_few_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+class Given(Curvature):
+    """A curvature that is given and never learns; it notes whether it is believed after each step."""
+
+    def __init__(self, S: np.ndarray | None, noted: list[bool]) -> None:
+        super().__init__()
+        self.S, self.noted = S, noted
+
+    def learn(self, *_: object) -> None:
+        pass
+
+    def judge(self, near: LocalModel, step: np.ndarray, gain: float) -> None:
+        super().judge(near, step, gain)
+        self.noted.append(self.believed)
+
+
+def given(S: np.ndarray | None, noted: list[bool] | None = None) -> Learning:
+    return Learning(curvature=lambda: Given(S, [] if noted is None else noted))
+
+
+def test_where_much_is_left_a_bent_way_takes_few_steps() -> None:
     steps = []
-    for learns in (Curvature.learn, lambda *_: None):
-        monkeypatch.setattr(Curvature, "learn", learns)
-        fit = gauss_newton(circle, np.array([-0.5, 0.0]), max_iterations=100, still=1e-6, tolerance=1e-14)
+    for learning in (Learning(), given(None)):
+        fit = gauss_newton(circle, np.array([-0.5, 0.0]), max_iterations=100, still=1e-6, tolerance=1e-14, learning=learning)
         assert fit.status == "converged" and fit.theta[0] == pytest.approx(np.arctan2(0.2, 0.1), abs=1e-4)
         steps.append(len(fit.cost))
     assert steps[0] < 0.2 * steps[1]
@@ -55,18 +72,11 @@ def test_it_is_exact_along_the_last_step_and_symmetric() -> None:
     assert curvature.S is S
 
 
-def test_it_is_believed_until_straight_lines_foretell_a_step_better(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[bool] = []
-    make = LocalModel.__init__
-
-    def watched(self: LocalModel, *args: object, believed: bool = True) -> None:
-        asked.append(believed)
-        make(self, *args, believed=believed)
-
-    monkeypatch.setattr(LocalModel, "__init__", watched)
-    monkeypatch.setattr(Curvature, "learn", lambda self, *_: setattr(self, "S", np.array([[1.0]])))
-    gauss_newton(lambda x, d: (2.0 * (x - 1.0), np.array([[2.0]]) if d else None), np.zeros(1), serves=1.0)
-    assert asked[:2] == [True, False]  # the line is straight
+def test_it_is_believed_until_straight_lines_foretell_a_step_better() -> None:
+    noted: list[bool] = []
+    learning = given(np.array([[1.0]]), noted)
+    gauss_newton(lambda x, d: (2.0 * (x - 1.0), np.array([[2.0]]) if d else None), np.zeros(1), serves=1.0, learning=learning)
+    assert noted[0] is False  # the line is straight
     x = np.array([0.4, -0.3])
     near = LocalModel(*circle(x, True), None, np.full(2, -9.0), np.full(2, 9.0), np.diag([-50.0, 0.0]))
     curvature, step = Curvature(), np.array([0.2, 0.1])
@@ -75,15 +85,14 @@ def test_it_is_believed_until_straight_lines_foretell_a_step_better(monkeypatch:
         assert curvature.believed == believed
 
 
-def test_where_a_bent_step_fails_a_straight_one_is_tried(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Curvature, "learn", lambda self, *_: setattr(self, "S", np.array([[-0.8 * 4.0]])))  # wrong
+def test_where_a_bent_step_fails_a_straight_one_is_tried() -> None:
     tried: list[float] = []
 
     def evaluate(x: np.ndarray, derivative: bool) -> tuple[np.ndarray, np.ndarray | None]:
         tried.append(float(x[0]))
         return 2.0 * (x - 1.0), np.array([[2.0]]) if derivative else None
 
-    gauss_newton(evaluate, np.zeros(1))
+    gauss_newton(evaluate, np.zeros(1), learning=given(np.array([[-0.8 * 4.0]])))  # wrong
     assert tried[1:3] == pytest.approx([5.0, 1.0])
 
 
@@ -117,8 +126,8 @@ def test_as_much_is_left_as_asked_and_nothing_where_nothing_is_seen(share: float
     J = np.random.default_rng(5).normal(size=(9, 4)) * [1.0, 1e3, 1e-2, 0.0]
     S = share * J.T @ J + np.diag([0.0, 0.0, 0.0, 5.0])
     scale = np.where(J.any(axis=0), np.linalg.norm(J, axis=0), 1.0)
-    C = near_module._with_curvature(J, S, scale)
-    np.testing.assert_allclose(C.T @ C, max(1.0 + share, near_module.LEAST) * J.T @ J, rtol=1e-7, atol=1e-9)
+    C = with_curvature(J, S, scale)
+    np.testing.assert_allclose(C.T @ C, max(1.0 + share, LEAST) * J.T @ J, rtol=1e-7, atol=1e-9)
 
 
 @pytest.mark.parametrize("kinked", [False, True])

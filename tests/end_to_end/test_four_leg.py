@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from helpers import ROOT
 from scipy.spatial import cKDTree
-from triangles import _distances
+from triangles import distances
 
 from femsense.core.errors import InputError
 from femsense.core.pose import transform_points
@@ -106,7 +106,7 @@ def test_the_mesh_fills_the_surface(robot: Robot) -> None:
     drawn = np.array(surface.triangles)
     for one, other in ((skin, drawn), (drawn, skin)):
         samples = np.unique(np.vstack([one.mean(axis=1), *(one[:, i] for i in range(3))]), axis=0)
-        assert _distances(samples, other).max() < 1e-3
+        assert distances(samples, other).max() < 1e-3
 
 
 def test_the_script_makes_the_table_that_is_there() -> None:
@@ -153,7 +153,7 @@ def test_markers_and_cables_sit_on_and_in_the_body(robot: Robot) -> None:
     assert 14 <= len(robot.marker_names) <= 20
     assert robot.markers.outside.max() < 2e-4  # fTetWild leaves the surface by up to a thousandth of the diagonal
     skin = robot.body.mesh.nodes[surface_triangles(robot.body.mesh)]
-    assert _distances(robot.marker_points, skin).max() < 3e-4
+    assert distances(robot.marker_points, skin).max() < 3e-4
     assert sum(point[2] < 0.02 for point in robot.marker_points) == 4
     assert len(robot.features) == 51
     for cable in robot.body.cables:

@@ -10,7 +10,7 @@ from types import ModuleType
 import meshio
 import numpy as np
 import pytest
-from triangles import _distances
+from triangles import distances
 
 from femsense.app import cli
 from femsense.fem.equilibrium import Equilibrium, solve_equilibrium
@@ -58,7 +58,7 @@ def test_the_mesh_is_sound_and_small(robot: Robot) -> None:
 def test_markers_sit_on_the_body_and_cables_in_it(robot: Robot) -> None:
     assert 8 <= len(robot.marker_names) <= 20 and len(robot.features) == 51
     skin = robot.body.mesh.nodes[surface_triangles(robot.body.mesh)]
-    assert _distances(robot.marker_points, skin).max() < 1e-3 * LENGTH[robot.name]
+    assert distances(robot.marker_points, skin).max() < 1e-3 * LENGTH[robot.name]
     for cable in robot.body.cables:
         assert cable.path.outside.max() == 0.0 and cable.exit_direction is not None and np.isfinite(cable.max_tension)
     outward = robot.marker_points - robot.body.mesh.nodes.mean(axis=0)

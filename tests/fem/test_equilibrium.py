@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -223,13 +222,26 @@ def test_nothing_clamped_is_singular_and_says_what_to_do() -> None:
     assert "clamp more nodes" in state.advice
 
 
-def test_a_body_on_a_hinge_hangs_down_or_is_singular() -> None:
-    body = make_body(MESH, young_modulus=1e5, poisson_ratio=0.4, density=1000.0, gravity=[0, 0, -9.81], clamped=[0, 1])
-    assert not body.is_held() and bar().is_held()
+def on_a_hinge(gravity: list[float]) -> BodyModel:
+    """Return a bar that is clamped at two nodes, one above the other along z: it turns about them."""
+    return make_body(MESH, young_modulus=1e5, poisson_ratio=0.4, density=1000.0, gravity=gravity, clamped=[0, 1])
+
+
+@pytest.mark.parametrize("gravity", [[0.0, -9.81, 0.0], [3.0, -9.0, 0.0]])
+def test_a_body_on_a_hinge_hangs_below_it(gravity: list[float]) -> None:
+    body = on_a_hinge(gravity)
     state = solve_equilibrium(body)
-    assert state.status in ("converged", "singular") and np.isfinite(state.positions).all()
-    if state.converged:
-        assert unbalanced(body, state) < 1e-7
+    assert not body.is_held() and bar().is_held()
+    assert state.converged and unbalanced(body, state) < 1e-7
+    share = np.linalg.norm(body.weight(), axis=1)
+    centre = share @ state.positions[:, :2] / share.sum()
+    down = np.array(gravity[:2]) / np.linalg.norm(gravity)
+    assert centre @ down > 0.04 and abs(centre @ [-down[1], down[0]]) < 1e-6
+
+
+def test_a_hinge_that_nothing_turns_is_singular_and_says_what_to_do() -> None:
+    state = solve_equilibrium(on_a_hinge([0.0, 0.0, -9.81]))
+    assert state.status == "singular" and "clamp more nodes" in state.advice
 
 
 def test_a_body_on_springs_is_held() -> None:
@@ -241,25 +253,21 @@ def test_a_body_on_springs_is_held() -> None:
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_an_absurd_load_ends_soon_with_a_status(law: str) -> None:
-    began = time.monotonic()
+def test_an_absurd_load_is_no_equilibrium_and_says_why(law: str) -> None:
     state = solve_equilibrium(bar(law), tension={"top": 1e6, "side": 1e5})
-    assert state.status in ADVICE and state.advice
-    assert np.isfinite(state.positions).all()
-    assert time.monotonic() - began < 60.0  # an end, not a speed
-    if not state.converged:
-        assert state.residual_n > 1e-6
+    assert state.status == "overload" and state.reached < 1.0 and state.iterations < 500
+    assert state.advice == ADVICE[state.status]
+    assert np.isfinite(state.positions).all() and state.residual_n > 1e-6
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_random_loads_converge_or_say_why(seed: int) -> None:
+def test_random_loads_are_balanced(seed: int) -> None:
     rng = np.random.default_rng(seed)
     body = bar(LAWS[seed % 3], quadratic=bool(seed % 2))
     forces = rng.normal(0, 10 ** rng.uniform(-3, 0.0), body.mesh.nodes.shape)
     state = solve_equilibrium(body, tension={"top": float(rng.uniform(0, 5))}, nodal_forces=forces)
-    assert state.status in ADVICE
-    if state.converged:
-        assert unbalanced(body, state) < 1e-6
+    assert state.converged and state.reached == 1.0
+    assert unbalanced(body, state) < 1e-6
 
 
 @pytest.mark.parametrize(

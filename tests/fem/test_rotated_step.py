@@ -8,12 +8,11 @@ from helpers import block_mesh
 
 from femsense.core.pose import rotation_from_vector
 from femsense.fem import equilibrium
-from femsense.fem import rotated_step as rotated_step_module
 from femsense.fem.assembly import internal
 from femsense.fem.body import BodyModel, make_body
 from femsense.fem.equilibrium import solve_equilibrium
 from femsense.fem.mesh import to_quadratic
-from femsense.fem.rotated_step import rotated_step
+from femsense.fem.rotated_step import corners_of, rotated_step
 
 
 def bar(quadratic: bool, *, on_an_edge: bool = False) -> BodyModel:
@@ -45,7 +44,7 @@ def test_a_small_step_is_the_straight_one_to_first_order(quadratic: bool) -> Non
 @pytest.mark.parametrize("quadratic", [False, True])
 def test_a_turn_about_a_hinge_is_a_rotation_without_stretch(quadratic: bool) -> None:
     body = bar(quadratic, on_an_edge=True)
-    body.free_map.laplacian.append(rotated_step_module._corners(body))  # a hinge holds no body, but a Laplacian
+    body.free_map.laplacian.append(corners_of(body))  # a hinge holds no body, but a Laplacian
     hinge, turn = body.mesh.nodes[body.clamped][0], np.array([0.0, 0.0, 0.7])
     arms = body.mesh.nodes - hinge
     there = rotated_step(body, body.mesh.nodes, np.cross(turn, arms))

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers import block_mesh, changed, write_block_robot
+from matplotlib.text import Text
 
 from femsense.app import commands
 from femsense.core.errors import InputError
@@ -1079,7 +1080,7 @@ def boxes(figure: Any) -> list[Any]:
 
     renderer = FigureCanvasAgg(figure).get_renderer()
     figure.draw_without_rendering()
-    texts = [t for axes in figure.axes for t in (*axes.texts, axes.title, axes._left_title) if t.get_text().strip()]
+    texts = [t for axes in figure.axes for t in axes.get_children() if isinstance(t, Text) and t.get_text().strip()]
     found = [(t.get_text(), t.get_window_extent(renderer)) for t in texts]
     for text, box in found:
         assert figure.bbox.x0 <= box.x0 < box.x1 <= figure.bbox.x1 and figure.bbox.y0 <= box.y0 < box.y1 <= figure.bbox.y1, text
@@ -1153,13 +1154,12 @@ def test_the_skin_is_seen_from_outside() -> None:
 # Loading beside other work
 
 
-def test_what_draws_pages_is_loaded_beside_other_work_and_may_be_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_draws_pages_is_loaded_beside_other_work_and_may_be_missing() -> None:
     asked: list[str] = []
 
     def missing(name: str) -> None:
         asked.append(name)
         raise ImportError(name)
 
-    monkeypatch.setattr(commands.importlib, "import_module", missing)
-    commands._load_pages()
+    commands.load_pages(missing)
     assert asked == ["femsense.report"]

@@ -103,9 +103,8 @@ def test_bends_remember_the_tensions_at_which_a_held_cable_came_to_rest() -> Non
         assert max(pulled) > 0.5
 
 
-def test_held_cables_that_rub_come_to_rest_when_they_are_let_out(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_held_cables_that_rub_come_to_rest_when_they_are_let_out() -> None:
     """Tensions at their motors then creep, pass by pass, as long as their bends hold."""
-    monkeypatch.setattr(truth, "PASSES", 40)
     rubbing, plan, inputs = let_out()
     recording = make_recording(time_s=plan.time_s, cable_names=NAMES, inputs=inputs, actuation="displacement")
 

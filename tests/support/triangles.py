@@ -7,7 +7,7 @@ import numpy as np
 from femsense.fem.mesh import closest_in_triangle
 
 
-def _distances(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+def distances(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """Distance of each point from the nearest of the triangles (t, 3, 3)."""
     found = np.empty(len(points))
     for i, point in enumerate(points):

@@ -26,14 +26,13 @@ CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shuti
 
 
 @pytest.fixture
-def page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def page(tmp_path: Path) -> Path:
     """A page of two files: enough for all but the browser."""
     folder = tmp_path / "page"
     folder.mkdir()
     (folder / "index.html").write_text("<p>page</p>", encoding="utf-8")
     (folder / "app.js").write_text("1", encoding="utf-8")
     (folder / ".sources").write_text("digest", encoding="utf-8")
-    monkeypatch.setattr(view, "PAGE", folder)
     return folder
 
 
@@ -54,7 +53,7 @@ def get(url: str) -> tuple[int, str, bytes]:
 
 
 def test_serves_page_mesh_and_contacts_and_nothing_else(run: Path, page: Path) -> None:
-    with view.serve(run, open_browser=False) as server:
+    with view.serve(run, open_browser=False, page=page) as server:
         assert server.server_address[0] == "127.0.0.1"
         assert get(server.url) == (200, "text/html", b"<p>page</p>")
         assert get(server.url + "app.js?x=1")[:2] == (200, "text/javascript")
@@ -69,30 +68,29 @@ def test_serves_page_mesh_and_contacts_and_nothing_else(run: Path, page: Path) -
 
 
 def test_mesh_is_made_once_and_again_when_the_states_are_newer(run: Path, page: Path) -> None:
-    view.serve(run, open_browser=False).stop()
+    view.serve(run, open_browser=False, page=page).stop()
     first = (run / "robot.glb").stat().st_mtime_ns
     assert len(Glb(run / "robot.glb").times) == 24
-    view.serve(run, open_browser=False).stop()
+    view.serve(run, open_browser=False, page=page).stop()
     assert (run / "robot.glb").stat().st_mtime_ns == first
     write_run(run, frames=9)
     os.utime(run / "robot.glb", (0, 0))
-    view.serve(run, open_browser=False).stop()
+    view.serve(run, open_browser=False, page=page).stop()
     assert len(Glb(run / "robot.glb").times) == 9
 
 
 def test_port_in_use_is_said(run: Path, page: Path) -> None:
-    with view.serve(run, open_browser=False) as server, pytest.raises(InputError, match="cannot be served"):
-        view.serve(run, port=server.server_address[1], open_browser=False)
+    with view.serve(run, open_browser=False, page=page) as server, pytest.raises(InputError, match="cannot be served"):
+        view.serve(run, port=server.server_address[1], open_browser=False, page=page)
 
 
-def test_page_that_was_not_built_is_said(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(view, "PAGE", tmp_path / "nothing")
+def test_page_that_was_not_built_is_said(run: Path, tmp_path: Path) -> None:
     with pytest.raises(MissingDependency, match="pip install"):
-        view.serve(run, open_browser=False)
+        view.serve(run, open_browser=False, page=tmp_path / "nothing")
 
 
 def test_static_page(run: Path, page: Path, tmp_path: Path) -> None:
-    index = view.write_static_page(run, tmp_path / "out")
+    index = view.write_static_page(run, tmp_path / "out", page=page)
     assert index == tmp_path / "out" / "index.html"
     assert sorted(p.name for p in index.parent.iterdir()) == ["app.js", "contacts.json", "index.html", "robot.glb"]
 
@@ -270,11 +268,8 @@ def _paeth(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
-def test_page_in_a_browser(
-    request: pytest.FixtureRequest, run: Path, built_page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(view, "PAGE", built_page)
-    with view.serve(run, open_browser=False) as server:
+def test_page_in_a_browser(request: pytest.FixtureRequest, run: Path, built_page: Path, tmp_path: Path) -> None:
+    with view.serve(run, open_browser=False, page=built_page) as server:
         seen = look(request, server.url, tmp_path)
         assert seen["state"] == "ready" and seen["problems"] == []
         assert seen["hosts"] == [server.url.split("/")[2]]
@@ -290,11 +285,8 @@ def test_page_in_a_browser(
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
-def test_page_says_what_is_missing(
-    request: pytest.FixtureRequest, run: Path, built_page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(view, "PAGE", built_page)
-    with view.serve(run, open_browser=False) as server:
+def test_page_says_what_is_missing(request: pytest.FixtureRequest, run: Path, built_page: Path, tmp_path: Path) -> None:
+    with view.serve(run, open_browser=False, page=built_page) as server:
         del server.files["robot.glb"]
         seen = look(request, server.url, tmp_path)
     assert seen["state"] == "error" and "robot.glb could not be loaded (404)" in str(seen["text"])

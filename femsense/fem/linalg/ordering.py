@@ -84,7 +84,7 @@ def fill_reducing_order(rows: IntArray, columns: IntArray, free: BoolArray) -> I
     upper = sp.csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(n, n))
     nodes = np.flatnonzero(free)
     graph = sp.csr_matrix((upper + upper.T)[nodes][:, nodes])
-    orders = _nested_dissection(graph)
+    orders = nested_dissection(graph)
     if len(nodes) < WORTH_PEELING or not orders:
         orders.insert(0, minimum_degree(graph))
     best = min(orders, key=lambda order: elimination_work(graph, order)) if len(orders) > 1 else orders[0]
@@ -98,11 +98,16 @@ def minimum_degree(graph: sp.csr_matrix) -> IntArray:
     return np.asarray(np.argsort(lu.perm_c))
 
 
-def _nested_dissection(graph: sp.csr_matrix) -> list[IntArray]:
-    """Return the order of METIS; none where there is little to cut (and where nodes stand alone, which METIS does not survive)."""
+def nested_dissection(graph: sp.csr_matrix, *, worth_cutting: int = WORTH_CUTTING) -> list[IntArray]:
+    """Return the order of METIS; none where there is little to cut (and where nodes stand alone, which METIS does not survive).
+
+    Arguments:
+        graph: nodes that are not 0 where they are coupled, shape (n, n).
+        worth_cutting: with fewer nodes there is little to cut.
+    """
     between = sp.csr_matrix(graph - sp.diags_array(graph.diagonal()))
     between.eliminate_zeros()
-    if graph.shape[0] < WORTH_CUTTING or (np.diff(between.indptr) == 0).any():
+    if graph.shape[0] < worth_cutting or (np.diff(between.indptr) == 0).any():
         return []
     try:
         import pymetis

@@ -78,10 +78,12 @@ def _share(more: FloatArray, answer: FloatArray) -> float:
     return float((np.abs(more).max(axis=0) / np.where(sizes > 0, sizes, 1.0)).max(initial=0.0))
 
 
-def refined(pattern: Pattern, values: FloatArray, lent: Factorization | None = None) -> Factorization | None:
+def refined(
+    pattern: Pattern, values: FloatArray, lent: Factorization | None = None, *, pays_from: int = REFINED_FROM
+) -> Factorization | None:
     """Return a stiffness that is solved to REFINED or better, from a factor in single precision where that pays and is enough: from that which a state
-    near by has lent, as long as it serves."""
-    if pattern.size < REFINED_FROM or not np.isfinite(values).all():
+    near by has lent, as long as it serves. `pays_from`: unknowns from which single precision pays."""
+    if pattern.size < pays_from or not np.isfinite(values).all():
         return factorize(pattern, values)
     if isinstance(lent, Cholesky) and lent.size == pattern.size:
         return Refined(pattern, values, lent, lent=True)

@@ -80,6 +80,7 @@ def repaired(
     fill_cavities: bool = False,
     part: int | None = None,
     unit: str = "units",
+    most_shells: int = MOST_SHELLS,
 ) -> ClosedSurface:
     """Return a closed surface that can be filled, and what had to be done for it.
 
@@ -90,6 +91,7 @@ def repaired(
         fill_cavities: take inner shells as solid.
         part: which of several separate bodies is meant, 1 the largest.
         unit: of the points, for messages.
+        most_shells: a surface in more pieces is refused.
 
     Raises:
         InputError: not finite, flat, large holes, one-sided, several bodies and none chosen.
@@ -99,7 +101,7 @@ def repaired(
     triangles = _turned_alike(points, triangles, where, done)
     points, triangles = _closed(points, triangles, where, close_holes, unit, done)
     triangles = _without_dust(points, triangles, where, done)
-    shells = _find_shells(points, triangles, where)
+    shells = _find_shells(points, triangles, where, most_shells)
     triangles, cavities = _faced(triangles, shells, fill_cavities, done)
     triangles, cavities = _chosen(points, triangles, shells, part, fill_cavities, cavities, where, unit, done)
     used, numbers = np.unique(triangles, return_inverse=True)
@@ -331,15 +333,15 @@ def _holes(triangles: IntArray) -> tuple[list[IntArray], IntArray]:
 # Shells
 
 
-def _find_shells(points: FloatArray, triangles: IntArray, where: str) -> _Shells:
+def _find_shells(points: FloatArray, triangles: IntArray, where: str, most: int) -> _Shells:
     of = _pieces(triangles)
     volume, count = _shell_volumes(points, triangles, of), int(of.max()) + 1
-    if count > MOST_SHELLS:
+    if count > most:
         raise InputError(
             "the surface falls into too many pieces",
             where=where,
             found=f"{count} pieces of {len(triangles) / count:.1f} triangles on average",
-            expected=f"a closed surface, or at most {MOST_SHELLS} shells",
+            expected=f"a closed surface, or at most {most} shells",
             hint="merge equal points and remove what is inside, in a mesh editor",
         )
     if count == 1:

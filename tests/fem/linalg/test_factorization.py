@@ -229,8 +229,7 @@ def test_the_upper_half_of_a_pattern() -> None:
     np.testing.assert_array_equal(upper, np.triu(A.toarray()))
 
 
-def test_a_factor_of_a_state_near_by_is_taken_where_it_serves(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(refinement, "REFINED_FROM", 1)
+def test_a_factor_of_a_state_near_by_is_taken_where_it_serves() -> None:
     body = bar_body(block_mesh((5, 2, 2), (0.1, 0.013, 0.01)))
     state, pattern = solve_equilibrium(body), body.free_map.pattern
     values = reduced_values(body, internal(body, state.positions).blocks)
@@ -245,7 +244,7 @@ def test_a_factor_of_a_state_near_by_is_taken_where_it_serves(monkeypatch: pytes
         (other, False),
         (None, False),
     ):
-        refined = refinement.refined(pattern, values, lent)
+        refined = refinement.refined(pattern, values, lent, pays_from=1)
         assert isinstance(refined, refinement.Refined)
         for _ in range(2):
             assert np.abs(refined.solve(right) - exact).max() < 1e-6 * np.abs(exact).max()

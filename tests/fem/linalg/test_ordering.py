@@ -7,8 +7,7 @@ import pytest
 import scipy.sparse as sp
 from helpers import block_mesh
 
-from femsense.fem.linalg import ordering
-from femsense.fem.linalg.ordering import elimination_work, fill_reducing_order, minimum_degree
+from femsense.fem.linalg.ordering import elimination_work, fill_reducing_order, minimum_degree, nested_dissection
 from femsense.fem.mesh import TetMesh
 
 
@@ -49,10 +48,9 @@ def test_a_solid_is_cut_and_a_thin_bar_is_peeled() -> None:
         assert elimination_work(graph, order) <= share * elimination_work(graph, minimum_degree(graph))
 
 
-def test_small_meshes_and_lone_nodes_are_left_to_minimum_degree(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ordering, "WORTH_CUTTING", 3)
+def test_small_meshes_and_lone_nodes_are_left_to_minimum_degree() -> None:
     alone = sp.csr_matrix((5, 5))
-    assert ordering._nested_dissection(alone) == []
+    assert nested_dissection(alone, worth_cutting=3) == []
     chain = sp.diags_array([1.0, 1.0], offsets=[-1, 1], shape=(5, 5)).tocsr()
-    assert sorted(ordering._nested_dissection(chain)[0]) == list(range(5))
-    assert ordering._nested_dissection(chain[:2][:, :2]) == []
+    assert sorted(nested_dissection(chain, worth_cutting=3)[0]) == list(range(5))
+    assert nested_dissection(chain[:2][:, :2], worth_cutting=3) == []
