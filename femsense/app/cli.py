@@ -97,7 +97,9 @@ def demo(
 @app.command()
 def inspect(
     path: Annotated[str, typer.Argument(metavar="PATH", help="A file, a folder, or the name of a robot.", show_default=False)],
-    accuracy: Annotated[bool, typer.Option("--accuracy", help="Of a robot: what its mesh costs in motion and in force.")] = False,
+    accuracy: Annotated[
+        bool, typer.Option("--accuracy", help="Of a robot: its discretisation error in motion and in force.")
+    ] = False,
     json: Json = False,
 ) -> Answer:
     """Say what a file or folder is and what is wrong with it."""
@@ -283,7 +285,7 @@ def improve(
         ),
     ] = None,
     plan: Annotated[
-        bool, typer.Option("--plan", help="Propose what to record, so that effects can be told apart; needs no RECORDING.")
+        bool, typer.Option("--plan", help="Propose what to record, so that effects can be distinguished; needs no RECORDING.")
     ] = False,
     given: Annotated[
         Path | None,

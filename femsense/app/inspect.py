@@ -90,7 +90,7 @@ def inspect_path(path: str | Path) -> Report:
 
 
 def inspect_accuracy(path: str | Path, *, progress: Callable[..., None] | None = None) -> Report:
-    """Return a report of a robot with what its mesh costs, under `accuracy` (see `assess_accuracy`); without where it has problems.
+    """Return a report of a robot with its discretisation error, under `accuracy` (see `assess_accuracy`); without where it has problems.
 
     Raises:
         InputError: where the path is no robot. DataError: where its model has no equilibrium.

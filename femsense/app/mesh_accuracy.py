@@ -1,4 +1,4 @@
-"""What the mesh of a robot costs: motions and sensed forces on it against those on finer spaces of the same body.
+"""The discretisation error of a robot: motions and sensed forces on it against those on finer spaces of the same body.
 
 The same loads act on the declared mesh, on quadratic elements and on a mesh with each element split into eight. Where a mesh h and its
 refinement h/2 with the same element are both known, the limit of ever finer meshes is estimated by Richardson's extrapolation,
@@ -49,7 +49,7 @@ USUAL_MOTION = 0.1
 MOST_PILOT_UNKNOWNS = 40_000
 """Inputs are sized on quadratic elements if these have no more unknowns; linear ones move too little."""
 PATCH = 0.06
-"""Radius of the patch that carries a contact force, over the diagonal; one and a half edges of the surface at least."""
+"""Radius of the contact patch, over the diagonal; one and a half edges of the surface at least."""
 GOOD_MOTION, GOOD_FORCE = 0.03, 0.05
 """A space is fine enough where motions are off by less than the first share and forces by less than the second."""
 SPACES = (("tet4", 0), ("tet10", 0), ("tet4", 1), ("tet10", 1))
@@ -260,7 +260,7 @@ def _felt(robot: Robot, rest: Equilibrium, places: FloatArray) -> IntArray:
 
 
 def _patches(robot: Robot, finest: TetMesh, features: IntArray) -> _Patches:
-    """Return contact forces of one newton into the surface, as a cone over a patch, at some features."""
+    """Return contact forces of one newton into the surface, as a cone over a contact patch, at some features."""
     body = robot.body
     surface, radius = body_surface(finest), _patch_radius(body)
     corners = finest.nodes[surface.triangles]
@@ -278,7 +278,7 @@ def _patches(robot: Robot, finest: TetMesh, features: IntArray) -> _Patches:
 
 
 def _patch_radius(body: BodyModel) -> float:
-    """Return the radius of the patch that carries a contact force [m]."""
+    """Return the radius of the contact patch [m]."""
     return max(PATCH * float(np.linalg.norm(np.ptp(body.mesh.nodes, axis=0))), 1.5 * body_surface(body.mesh).edge)
 
 

@@ -1,7 +1,7 @@
 """Calibration of camera pose and initial cable inputs from markers.
 
 Algorithm 1 of Zhang et al. 2019 gives the start: a rigid fit by SVD, then the inputs by a bounded QP on the compliance, then a
-new equilibrium, in turns. Its fixed point is not the joint optimum where the pose can imitate the inputs, so a bounded
+new equilibrium, in turns. Its fixed point is not the joint optimum where the pose can absorb the inputs, so a bounded
 Gauss–Newton over pose and inputs together finishes, and its normal matrix gives the standard deviations.
 """
 

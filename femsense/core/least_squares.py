@@ -21,16 +21,16 @@ STILL = 1e-2
 
 
 NEARLY = 4.0
-"""A step is idle that gained less than what counts as a gain where a whole step promised less than so many times that."""
+"""A step is idle that gained less than what counts as a gain where the predicted gain of a whole step was less than so many times that."""
 LITTLE = 2.0
-"""A step is the last that promised less than so many times what counts as a gain, by a Jacobian of its own; not in units of the misfit, which
+"""A step is the last whose predicted gain was less than so many times what counts as a gain, by a Jacobian of its own; not in units of the misfit, which
 may be large because the fit is far from its end."""
 LEAST_SHRINKING = 0.25
 """No step is foretold to be shorter than this share of the one before."""
 CONVERGED, STOPPED_EARLY = "converged", "stopped early"
 MOST_DAMPING = 1e8
 AT_NONSMOOTH = 0.2
-"""A fit rests on a kink that is nearer than so many standard errors."""
+"""A fit has converged on a bend that is nearer than so many standard errors."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -44,7 +44,7 @@ class FitResult:
     residual: FloatArray
     """Whitened residual, shape (N,)."""
     jacobian: FloatArray
-    """Its derivative, shape (N, p); on a kink the mean of both sides that leaves no gradient."""
+    """Its derivative, shape (N, p); on a bend the mean of both sides that leaves no gradient."""
     cost: tuple[float, ...]
     """Sum of squares after each iteration, the start first."""
     status: str
@@ -118,8 +118,8 @@ def gauss_newton(
     A Jacobian that predicted the last step well serves for the next one too; the fit ends only where the Jacobian at θ itself says that
     there is nothing left to gain (or one that is `trusted`), or, where what is left is noise, where it would: steps of a Gauss–Newton fit, each
     with a Jacobian of its own, shrink like a geometric series, so that two of them foretell the next. It ends as well where two steps in turn
-    were idle, promised little and brought less (`enough`), or one and the next would move by nothing: on a kink there may always be a little to gain. And a step
-    that promises next to nothing by a Jacobian of its own is the last (`LITTLE`), whatever it brings.
+    were idle: their predicted gain was little and they brought less (`enough`). On a bend there may always be a little to gain. And a step with next
+    to no predicted gain by a Jacobian of its own is the last (`LITTLE`), whatever it brings.
 
     Arguments:
         evaluate: residual and Jacobian; priors are rows of them.
@@ -132,7 +132,7 @@ def gauss_newton(
         borrowed: a Jacobian from near the start to begin with.
         serves: a Jacobian serves for another step where it missed the change of the residual by less than this share of it, or by less than what
             counts as a gain.
-        worth: a fit whose sum of squares stays above this is stopped early: where a step promises less than half of what is missing, or a
+        worth: a fit whose sum of squares stays above this is stopped early: where the predicted gain of a step is less than half of what is missing, or a
             borrowed Jacobian says that nothing is left to gain.
         trusted: a Jacobian that missed less than this share of every step since it was made is believed, too, that nothing is left to gain.
         enough: what counts as a gain in the sum of squares, in units of the misfit where that is more than noise; 0: all that `tolerance` says.
@@ -239,7 +239,7 @@ def _shorter(near: LocalModel, damping: float, change: FloatArray) -> float:
 
 
 def _at_nonsmooth(J: FloatArray, r: FloatArray, nonsmooth: Nonsmoothness) -> FloatArray:
-    """Return the derivative that stands for both sides of the kinks on which a fit came to rest: the mean of them that leaves no gradient.
+    """Return the derivative that stands for both sides of the bends on which a fit converged: the mean of them that leaves no gradient.
 
     Straight lines of one side alone would go on down where the other side goes up (Clarke's generalised Jacobian has 0 among its gradients).
     """

@@ -1,9 +1,9 @@
-"""What a sum of squares is near a point: that of a linear residual, but for kinks that are known and for the curvature that earlier steps showed.
+"""A sum of squares near a point: that of a linear residual, but for known nonsmoothness and for the curvature that earlier steps showed.
 
 Half the second derivative of ‖r‖² is JᵀJ + S with S = Σᵢ rᵢ ∇²rᵢ. Gauss–Newton takes S for 0. Along a bent valley where much residual is left S
 takes away most of JᵀJ, and each step covers a small share of the way; how J changed from one point of the fit to the next tells S along that way.
 
-Source: Dennis, Gay & Welsch, "An adaptive nonlinear least-squares algorithm" (1981). S is what they learn, and sized as they do it; of all S that
+Source: Dennis, Gay & Welsch, "An adaptive nonlinear least-squares algorithm" (1981). S is updated and sized as they do it; of all S that
 agree with the last step it is the nearest to the one before, measured by JᵀJ (they measure by the change of the slope, which may be next to nothing).
 """
 
@@ -17,11 +17,11 @@ from scipy.optimize import lsq_linear
 from femsense.core.arrays import BoolArray, FloatArray
 
 WIDTHS = 0.3, 0.1, 0.03, 0.01, 1e-3, 1e-5
-"""How far kinks are rounded, in shares of the way that a plain step goes past them; one after the other."""
+"""How far bends of the residual are rounded, in shares of the way that a plain step goes past them; one after the other."""
 TURNS = 4
 """Gauss–Newton steps for each of these, of a problem that costs nothing to evaluate."""
 LEAST = 0.2
-"""Share of JᵀJ that S leaves in any direction: what is learnt from few steps may be wrong elsewhere."""
+"""Share of JᵀJ that S leaves in any direction: what few steps show may be wrong elsewhere."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -50,7 +50,7 @@ class _Point:
     nonsmooth: Nonsmoothness | None
 
     def as_counted_at(self, other: _Point) -> FloatArray | None:
-        """Return the Jacobian here with the kinks counted as they are elsewhere, so that no jump is taken for a bend; None: they are others."""
+        """Return the Jacobian here with the bends counted as they are elsewhere, so that no jump is taken for curvature; None: they are others."""
         here, there = self.nonsmooth, other.nonsmooth
         if here is None or there is None:
             return self.J if here is there else None
@@ -70,7 +70,7 @@ class Curvature:
         self.last: _Point | None = None
 
     def learn(self, theta: FloatArray, r: FloatArray, J: FloatArray, nonsmooth: Nonsmoothness | None) -> None:
-        """Learn from residual and Jacobian at a point of the fit."""
+        """Update S from residual and Jacobian at a point of the fit."""
         here, before = _Point(theta, J, nonsmooth), self.last
         if before is not None and np.array_equal(theta, before.theta):
             return
@@ -179,7 +179,7 @@ class LocalModel:
         return best
 
     def _turn(self, s: FloatArray, damping: float, width: float) -> tuple[FloatArray, bool]:
-        """Return a better step, and whether there was one, where kinks are rounded to a width."""
+        """Return a better step, and whether there was one, where bends are rounded to a width."""
         k = self.nonsmooth
         assert k is not None
         root = np.sqrt(damping) * self.scale

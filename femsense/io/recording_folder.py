@@ -1,4 +1,4 @@
-"""A recording folder ↔ Recording. The types are in `frames`, the clouds in `frame_clouds`; this is the door to all three."""
+"""A recording folder ↔ Recording. The types are in `femsense.model.recording`, the clouds in `femsense.io.clouds.frame_clouds`."""
 
 from __future__ import annotations
 

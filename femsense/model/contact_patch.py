@@ -1,4 +1,4 @@
-"""Patches of the surface: where a contact force is spread."""
+"""Contact patches: the parts of the surface over which a contact force is spread."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class ContactPatch:
         return result
 
     def mean(self, values: FloatArray) -> FloatArray:
-        """Return the weighted mean of nodal values (n, 3) over the patch, shape (3,)."""
+        """Return the weighted mean of nodal values (n, 3) over the contact patch, shape (3,)."""
         return np.asarray(self.weights @ values[self.nodes])
 
 
@@ -76,7 +76,7 @@ def patch_at(
     *,
     facing: FloatArray | None = None,
 ) -> ContactPatch:
-    """Return the patch around the point of the surface that is closest to a place.
+    """Return the contact patch around the point of the surface that is closest to a place.
 
     The weights fall off as a cone of the given radius, times the area of each node; clamped nodes carry nothing.
 

@@ -113,7 +113,7 @@ def _creep_loads(recording: Recording, terms: tuple[tuple[float, float], ...]) -
 
 @dataclass(frozen=True, eq=False, slots=True)
 class DrivenRobot:
-    """One way to walk: a robot and its drive."""
+    """A robot and its drive: what a quasi-static path is computed of."""
 
     robot: Robot
     drive: Drive

@@ -53,7 +53,7 @@ def share_on_finer(body: BodyModel) -> None:
 
 
 def finer_state(driven: DrivenRobot, fine: DrivenRobot, frame: int, base: Equilibrium, ties: Embedding) -> FloatArray | None:
-    """Return where the nodes of a finer mesh come to rest [m], shape (n, 3), nearly: Newton steps from a state of a coarser one.
+    """Return the equilibrium on a finer mesh [m], shape (n, 3), nearly: Newton steps from a state of a coarser one.
 
     The finer mesh holds the coarse state exactly, but what it softens are single elements, so that two to four steps are needed, with
     elements that turn along each of them. None where the steps do not settle, or run away: far off, forces look small again.
@@ -64,7 +64,7 @@ def finer_state(driven: DrivenRobot, fine: DrivenRobot, frame: int, base: Equili
     then missing, and the error of the mesh a third too small in that frame.
 
     Arguments:
-        walk: the coarse robot and its drive.
+        driven: the coarse robot and its drive.
         fine: the same on the finer mesh.
         frame: index of the frame.
         base: the coarse state of that frame.

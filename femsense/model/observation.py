@@ -2,7 +2,7 @@
 
 The residual of a marker is  T_robot_camera · y − p(x),  y the measured point (after the camera's depth law) and p its
 place on the body in the state x. Where `rest.csv` measures the markers on the unloaded body, it says where they really
-sit: seat = T_robot_camera · y_rest, and how far seats lie from their declared places ties the pose down.
+sit: placement = T_robot_camera · y_rest. How far placements lie from their declared places ties the pose down.
 """
 
 from __future__ import annotations
@@ -191,7 +191,7 @@ def placements(robot: Robot, scene: Scene, poses: Sequence[FloatArray]) -> Float
 
 
 def _ties(robot: Robot, scene: Scene, poses: Sequence[FloatArray]) -> Embedding:
-    """Return the ties of the markers to the body, at their seats."""
+    """Return the ties of the markers to the body, at their placements."""
     return robot.tie_markers(placements(robot, scene, poses)) if len(scene.rest_marker) else robot.markers
 
 
@@ -219,7 +219,7 @@ def marker_residual(robot: Robot, scene: Scene, poses: Sequence[FloatArray], mod
 
 
 def rest_residual(robot: Robot, scene: Scene, poses: Sequence[FloatArray]) -> FloatArray:
-    """Return how far the measured seats lie from the declared places [m], shape (r, 3)."""
+    """Return how far the measured placements lie from the declared places [m], shape (r, 3)."""
     return (placements(robot, scene, poses) - robot.marker_points)[scene.rest_marker]
 
 
@@ -230,13 +230,13 @@ class SceneJet:
     residual: FloatArray
     """[m], shape (k, c): c = 3 for markers, 1 for crossings of a measured surface; so in all that follows."""
     rest: FloatArray
-    """Seat residual [m], shape (r, 3)."""
+    """Placement residual [m], shape (r, 3)."""
     by_pose: FloatArray
     """d residual / d pose step (rotation about the pivot, shift), shape (k, 3, 6 v)."""
     rest_by_pose: FloatArray
     """shape (r, 3, 6 v)."""
     rest_by_effect: FloatArray
-    """d seat residual / d coordinate of the hypothesis, shape (r, 3, p)."""
+    """d placement residual / d coordinate of the hypothesis, shape (r, 3, p)."""
     by_initial: FloatArray
     """d residual / d initial input, shape (k, 3, a or 0)."""
     by_effect: FloatArray
@@ -352,15 +352,15 @@ def _variants(
     base: DrivenRobot,
     vary_initial: bool,
 ) -> tuple[list[float], list[DrivenRobot]]:
-    """Return steps and walks: first one for each coordinate, then one for each initial input if they vary."""
-    steps, walks = [], []
+    """Return steps and variants: first one for each coordinate, then one for each initial input if they vary."""
+    steps, variants = [], []
     for j, parameter in enumerate(hypothesis.parameters):
         h = parameter.step if coordinates[j] + parameter.step <= parameter.high else -parameter.step
         moved = coordinates.copy()
         moved[j] += h
         robot = hypothesis.robot_at(moved)
         steps.append(h)
-        walks.append(DrivenRobot(robot, drive_of(robot, scene.recording, initial=initial)))
+        variants.append(DrivenRobot(robot, drive_of(robot, scene.recording, initial=initial)))
     names = base.robot.body.cable_names if vary_initial else ()
     start = np.zeros(len(names)) if initial is None else initial
     for i in range(len(names)):
@@ -368,8 +368,8 @@ def _variants(
         moved = start.copy()
         moved[i] += h
         steps.append(h)
-        walks.append(DrivenRobot(base.robot, drive_of(base.robot, scene.recording, initial=moved)))
-    return steps, walks
+        variants.append(DrivenRobot(base.robot, drive_of(base.robot, scene.recording, initial=moved)))
+    return steps, variants
 
 
 def _pulling(hypothesis: Hypothesis, base: DrivenRobot, steps: list[float], variants: list[DrivenRobot]) -> list[int]:
@@ -402,7 +402,7 @@ def _pose_derivative(
     residual: FloatArray,
     pivot: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the derivatives of marker and seat residuals by the move of each pose; only seats that move need the states again."""
+    """Return the derivatives of marker and placement residuals by the move of each pose; only placements that move need the states again."""
     columns, rest_columns = [], []
     rest = rest_residual(robot, scene, moved_poses(begun, moves, pivot))
     still = {k: robot.markers.positions(s.positions) for k, s in states.items()} if not len(scene.rest_marker) else None

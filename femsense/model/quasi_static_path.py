@@ -1,4 +1,4 @@
-"""The quasi-static walk along a recording: from recorded inputs to one equilibrium a frame.
+"""The quasi-static path along a recording: from recorded inputs to one equilibrium a frame.
 
 History (friction of cables, creep) is carried from frame to frame in the order of time. Without history, frames with the
 same inputs and loads share one solve.
@@ -28,7 +28,7 @@ from femsense.model.variants import AtPoints, _Balance, _require, _room, _Varian
 TRIED = 1e-8
 """Relative tolerance of states that are only tried: below a thousandth of a millimetre, where derivatives want a tenth of it."""
 PARTS, SHORTEST_PART = 4, 6
-"""Parts at most that frames are walked in side by side where each starts from the one before, and frames of a part at least."""
+"""Parts at most in which frames are solved side by side where each starts from the one before, and frames of a part at least."""
 PAST, PAST_TRIED = 1e-8, 1e-6
 """Tensions along a cable that agree so well [N], and as shares of the largest, are the same past; the latter for states that are only tried."""
 
@@ -50,14 +50,14 @@ def solve_path(
     mesh, or with a rigid clamp where that of the base gives, is solved for itself.
 
     Arguments:
-        walk: the base.
+        driven: the base.
         frames: indices, ascending; frames between them are solved too where the past matters.
         ties: robot → the points that are observed, p of them.
         variants: other robots or drives.
-        starts: frame → a state near by, such as that of an earlier walk; brought up to date as frames are solved. Their
+        starts: frame → a state near by, such as that of an earlier path; brought up to date as frames are solved. Their
             factors are kept as long as they fit into FACTOR_MEMORY.
         rough: states are only tried, where one near by is known.
-        answers: frame → what its points answer to, from an earlier walk along these very states with other variants; what is missing is
+        answers: frame → what its points answer to, from an earlier path along these very states with other variants; what is missing is
             added where the points are few.
 
     Yields:
@@ -137,7 +137,7 @@ def _base_states(
         )
 
     if near:
-        with contextlib.suppress(*(() if fits else (DataError,))):  # taken along, a body may not come to rest: then from rest
+        with contextlib.suppress(*(() if fits else (DataError,))):  # taken along, a body may not converge: then from rest
             states = list(_solve_with_history(driven, frames, near, again, rough) if past else each(again, frames))
             yield from (keep(k, state) for k, state in zip(frames, states))
             return
@@ -155,7 +155,7 @@ def _base_states(
 
 
 def _parts(frames: list[int]) -> list[list[int]]:
-    """Return frames cut into parts that are walked side by side; as many wherever it runs."""
+    """Return frames cut into parts that are solved side by side; as many wherever it runs."""
     size = max(SHORTEST_PART, -(-len(frames) // PARTS))
     return [frames[i : i + size] for i in range(0, len(frames), size)]
 
@@ -177,7 +177,7 @@ def _solve_with_history(
 ) -> list[Equilibrium]:
     """Return the states of frames with a past, from states near by.
 
-    The frames are cut into parts that are walked side by side, each from the tensions along the cables that the states near by let
+    The frames are cut into parts that are solved side by side, each from the tensions along the cables that the states near by let
     expect there. Then, part after part, frames are solved again until these are what the part before left.
     """
     parts = _parts(frames)

@@ -265,7 +265,7 @@ def with_marker_table(
 
 
 def state_key(recording: Recording, frame: int) -> bytes:
-    """Return what tells apart frames under different inputs, loads or gravity."""
+    """Return a key that differs between frames under different inputs, loads or gravity."""
     rows = recording.load_frame == frame
     parts = [
         recording.inputs[frame],

@@ -66,7 +66,7 @@ def solve_frame(
     """Return the equilibrium of one frame.
 
     Arguments:
-        walk: robot and drive.
+        driven: robot and drive.
         frame: index of the frame.
         start: a state to start from.
         before: tensions along the cables until now (friction); by default none.
@@ -212,7 +212,7 @@ def _segment_forces(body: BodyModel, x: FloatArray, which: list[int]) -> FloatAr
 
 
 class _Variants:
-    """What is observed of variants in the frames of a walk."""
+    """What is observed of variants in the frames of a path."""
 
     def __init__(
         self,

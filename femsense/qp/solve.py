@@ -62,7 +62,7 @@ _TEXTS = {
         "check the weights (≥ 0) and how P was made",
     ),
     Status.INACCURATE: (
-        "no solver reached the tolerance: the problem is badly conditioned (contacts that the rows cannot tell apart)",
+        "no solver reached the tolerance: the problem is badly conditioned (contacts that the rows do not distinguish)",
         "merge contacts that lie close together, add a ridge, or loosen the tolerance",
     ),
 }

@@ -35,7 +35,7 @@ from femsense.report.page import Cell, Html, code, element, escape, paragraph, t
 
 OUTCOMES = {
     "named": "named: part of the improved model",
-    "passes": "rival: passes all tests too, with less evidence than the one that was named",
+    "passes": "passes all tests too, with less evidence than the one that was named",
 }
 LISTED = 6
 COMPONENTS = {
@@ -123,7 +123,7 @@ def ranking_table(candidates: Sequence[Candidate], ranked: Mapping[str, Ranked],
         dense=True,
     )
     text = paragraph(
-        "Δχ² is what the effect explains of the residual beyond all that calibration can imitate; ΔBIC takes off a price for each parameter and each effect tried, "
+        "Δχ² is what the effect explains of the residual beyond all that calibration absorbs; ΔBIC takes off a price for each parameter and each effect tried, "
         "and a named effect needs 10. Left-out sweeps: by how much twice the log-likelihood of sweeps that are not fitted rises, ± its standard error. “Retained” is the share of its trace "
         "that calibration leaves. “First” is how often the effect comes first when whole sweeps are drawn anew. Values: of the final fit where named, else of the linear screening. The modulus and the zeros of the cables are not among them: they are always fitted along.",
         class_="soft",
@@ -320,7 +320,7 @@ def calibration_table(shift: CalibrationShift) -> Html | None:
     return table(
         ("Quantity", "Declared", "Calibrated (before)", "With all that calibration may move", "With the effects"),
         rows,
-        caption="Camera: against where the calibration of the declared model put it (± one standard deviation). What moves back when effects are added is where they had been hiding. In the last two columns everything is free, so that values may differ from those that are handed back.",
+        caption="Camera: against where the calibration of the declared model put it (± one standard deviation). What moves back when effects are added is where they had been hiding. In the last two columns everything is free, so that values may differ from those that are returned.",
     )
 
 
@@ -481,7 +481,7 @@ def data_card(loop: Loop) -> Html | None:
         rows.append(
             [f"Frames left out{f', {i + 1}' if len(evidence.excluded) > 1 else ''}", together(*lines) if lines else "none"]
         )
-    rows += [["Stray markers left out", _outlier_list(card.outliers)]] if card.outliers else []
+    rows += [["Outlying markers left out", _outlier_list(card.outliers)]] if card.outliers else []
     rows += [["Repeats (a state reached again the same way)", str(evidence.repeats)]] if evidence.repeats is not None else []
     rows += _noise_rows(card)
     for name, parameters in card.nuisance_after.items():
@@ -512,7 +512,9 @@ def _noise_rows(card: Card) -> list[list[object]]:
         return [
             [str(a).replace("each axis", "along the normal").replace("at the markers", "along the normals"), b] for a, b in rows
         ]
-    rows += [["Uncertainty of marker seats", words.length(card.placement_std_m, 2)]] if words.known(card.placement_std_m) else []
+    rows += (
+        [["Uncertainty of marker placements", words.length(card.placement_std_m, 2)]] if words.known(card.placement_std_m) else []
+    )
     return rows
 
 

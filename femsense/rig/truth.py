@@ -1,4 +1,4 @@
-"""The true body: another mesh and law than the estimator's, its own friction and creep, walked along a plan in small steps."""
+"""The true body: another mesh and law than the estimator's, its own friction and creep, on a quasi-static path along a plan in small steps."""
 
 from __future__ import annotations
 
@@ -43,11 +43,11 @@ class LoadPatch:
     """Part of the force that each triangle carries [1], shape (t,)."""
 
     def place(self, positions: FloatArray) -> FloatArray:
-        """Return the centre of the patch [m], shape (3,)."""
+        """Return the centre of the contact patch [m], shape (3,)."""
         return np.asarray(self.share @ positions[self.triangles].mean(axis=1))
 
     def normal(self, positions: FloatArray) -> FloatArray:
-        """Return the outward unit normal of the patch, shape (3,)."""
+        """Return the outward unit normal of the contact patch, shape (3,)."""
         area = self.share @ triangle_normals(positions, self.triangles)
         return np.asarray(area / np.linalg.norm(area))
 
@@ -66,7 +66,7 @@ class TrueContact:
     contact: int
     """Which of the script's contacts."""
     place: FloatArray
-    """Centre of the patch on the deformed body [m], shape (3,)."""
+    """Centre of the contact patch on the deformed body [m], shape (3,)."""
     normal: FloatArray
     """Outward unit normal there, shape (3,)."""
     force: FloatArray
@@ -189,7 +189,7 @@ def creep_matrix(time_s: FloatArray, terms: Sequence[tuple[float, float]]) -> Fl
     return np.asarray(rate @ change)
 
 
-# The walk
+# The path
 
 
 def true_path(robot: Robot, plan: Plan, *, substeps: int = 3) -> list[TrueFrame]:
@@ -204,13 +204,13 @@ def true_path(robot: Robot, plan: Plan, *, substeps: int = 3) -> list[TrueFrame]
         DataError: where there is no equilibrium.
     """
     inputs = true_inputs(robot, plan)
-    walker = _TruePath(robot, plan)
-    frames, last = [], walker.nothing()
-    loads = walker.frame_loads(inputs)
+    path = _TruePath(robot, plan)
+    frames, last = [], path.nothing()
+    loads = path.frame_loads(inputs)
     for k, load in enumerate(loads):
         for step in range(1, substeps + 1):
-            walker.go(last.towards(load, step / substeps), k)
-        frames.append(TrueFrame(replace(walker.state, factor=None), freeze(inputs[k]), walker.contacts_now(load)))
+            path.go(last.towards(load, step / substeps), k)
+        frames.append(TrueFrame(replace(path.state, factor=None), freeze(inputs[k]), path.contacts_now(load)))
         last = load
     return frames
 
@@ -262,7 +262,7 @@ class _TruePath:
             forces = load.forces + self._contact_forces(load)
             self.state = self._solve(body, load, motors, along, forces, frame)
             if self._settled(load, along, forces):
-                # of where it came to rest: while bends slide, any tension at the motor gives the same shares
+                # of where it converged: while bends slide, any tension at the motor gives the same shares
                 self.grips = self._along(self._motors(load))[1]
                 return
             passes.append(self._motors(load))
