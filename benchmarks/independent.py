@@ -48,7 +48,9 @@ def main() -> int:
         if not (folder / "truth.json").exists():
             truth = make(case, folder, given.seed, diamond=given.diamond)
             print(
-                f"{case.name}: made in {truth['made_in_s']} s, {truth['mesh']}, residual {truth['certificate']['worst_residual_n']:.1e} N",
+                f"{case.name}: made in {truth['made_in_s']} s, {truth['mesh']}, ",
+                f"residual {truth['certificate']['worst_residual_n']:.1e} N",
+                sep="",
                 flush=True,
             )
         if given.run:

@@ -93,7 +93,8 @@ def measure(camera: Camera, shot: Shot, rng: np.random.Generator) -> Array:
     high, low = stack.max(axis=0).ravel(), np.where(stack > 0, stack, np.inf).min(axis=0).ravel()
     edge = (z > 0) & ((high - low > 0.010) | (stack == 0).any(axis=0).ravel())
     fly = edge & (rng.random(z.size) < camera.flying)
-    mixed = low + rng.random(z.size) * np.minimum(high - low, 0.25)
+    low = np.where(edge, low, z)
+    mixed = low + rng.random(z.size) * np.clip(high - low, 0.0, 0.25)
     out = np.where(fly, mixed, z)
     noise = rng.normal(size=z.size)
     with np.errstate(divide="ignore", invalid="ignore"):

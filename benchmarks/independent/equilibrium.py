@@ -141,7 +141,7 @@ class Problem:
         return self.solid.strain_energy(x) - work + cables
 
     def certificate(self, state: State, rng: np.random.Generator) -> dict[str, float]:
-        """Residual, and the potential's slope and curvature along a smooth direction: zero and positive at a stable equilibrium."""
+        """Residual, slope (0) and curvature (> 0 where stable) of the potential along a smooth direction."""
         wave = rng.normal(size=(3, 3)) / np.ptp(self.solid.rest, axis=0).max()
         direction = np.sin(self.solid.rest @ wave.T) * (~self.solid.clamped)[:, None]
         step = 1e-4 / np.abs(direction).max()
@@ -155,12 +155,9 @@ class Problem:
 
 
 def _between(a: Load, b: Load, share: float, state: State) -> Load:
-    mix = lambda u, v: u + share * (v - u)  # noqa: E731
     now = np.where(b.held & ~a.held, b.shortening, a.shortening)
-    return Load(
-        mix(a.gravity, b.gravity),
-        mix(np.where(a.held, state.tension, a.tension), b.tension),
-        mix(now, b.shortening),
-        b.held,
-        mix(a.force, b.force),
-    )
+    pulls = np.where(a.held, state.tension, a.tension)
+    mixed = [
+        u + share * (v - u) for u, v in ((a.gravity, b.gravity), (pulls, b.tension), (now, b.shortening), (a.force, b.force))
+    ]
+    return Load(float(mixed[0]), mixed[1], mixed[2], b.held, mixed[3])

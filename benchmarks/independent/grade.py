@@ -67,8 +67,10 @@ class Row:
 def heading() -> str:
     """What the columns are."""
     return (
-        "forces where the bound on |f| is below 20 % (of `true` contacts, `res` are); matched within 30 mm; quiet: missed with status ok\n"
-        "case            | true  res | bound | |f| med   p95  vec | place mm p95 | miss quiet extra | false/calm N | cover | /bound | status"
+        "forces where the bound on |f| is below 20 % (of `true` contacts, `res` are); matched within 30 mm;\n"
+        "quiet: missed with status ok; N: largest false force; /bound: rms error over the bound\n"
+        "case            | true  res | bound | |f| med   p95   vec | place mm p95 | miss quiet xtra"
+        " | false/calm N | cover | /bound | status"
     )
 
 

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
-import scipy.sparse.linalg
 import skfem
 from numpy.typing import NDArray
+from scipy.sparse.linalg import splu
 
 Array = NDArray[np.float64]
 
@@ -38,7 +38,7 @@ class Factor:
     def __init__(self, matrix: sp.csr_matrix) -> None:
         solver = _pardiso()
         if solver is None:
-            self._solve = sp.linalg.splu(matrix.tocsc()).solve
+            self._solve = splu(matrix.tocsc()).solve
             return
         solver.factorize(matrix)
         self._solve = lambda right: solver.solve(matrix, right)

@@ -84,7 +84,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple:
 
 def _inspect(path) -> dict:
     here = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run([sys.executable, "-m", "femsense", "inspect", str(path), "--json"], capture_output=True, text=True, env=here)
+    words = [sys.executable, "-m", "femsense", "inspect", str(path), "--json"]
+    done = subprocess.run(words, capture_output=True, text=True, env=here)
     assert done.returncode == 0, done.stdout + done.stderr
     return json.loads(done.stdout)
 
@@ -92,7 +93,7 @@ def _inspect(path) -> dict:
 @pytest.mark.parametrize("part", ["robot", "recording"])
 def test_nothing_is_wrong_with_what_it_writes(made: tuple, part: str) -> None:
     answer = _inspect(made[0] / part)
-    assert answer["wrong"] == [], answer
+    assert answer["problems"] == [], answer
 
 
 def test_what_it_says_of_a_case_is_whole(made: tuple) -> None:
