@@ -133,7 +133,7 @@ class Solid:
         self.weight = np.asarray(basis.dx)
         self.mu = young / (2 * (1 + poisson))
         self.lam = young * poisson / ((1 + poisson) * (1 - 2 * poisson))
-        shape = np.stack([np.broadcast_to(basis.basis[a][0].value, self.weight.shape) for a in range(count)], axis=-1)
+        shape = np.stack([np.broadcast_to(np.asarray(basis.basis[a][0]), self.weight.shape) for a in range(count)], axis=-1)
         lumps = np.zeros(len(self.rest))
         np.add.at(lumps, self.cells, np.einsum("eqa,eq->ea", shape, self.weight) * density)
         self.pull_down = lumps[:, None] * gravity
@@ -225,7 +225,7 @@ class Solid:
         place = self._place(points, cells)[:, :, None]
         count = self.cells.shape[1]
         value = [
-            np.broadcast_to(self.element.gbasis(self.mapping, place, a, tind=cells)[0].value, (len(points), 1))
+            np.broadcast_to(np.asarray(self.element.gbasis(self.mapping, place, a, tind=cells)[0]), (len(points), 1))
             for a in range(count)
         ]
         matrix = np.hstack(value)

@@ -21,10 +21,10 @@ from independent.solid import Cable, Load, Solid  # noqa: E402
 YOUNG, SIDE, LENGTH = 450e3, 0.02, 0.1
 
 
-def _cantilever(kind: str) -> Solid:
+def _cantilever(kind: str, *, poisson: float = 0.0) -> Solid:
     axes = np.linspace(0, LENGTH, 11), np.linspace(-SIDE / 2, SIDE / 2, 3), np.linspace(-SIDE / 2, SIDE / 2, 3)
     mesh = (skfem.MeshHex if kind == "hex" else skfem.MeshTet).init_tensor(*axes)
-    return Solid(mesh, YOUNG, 0.0, 0.0, np.zeros(3), np.array([[-1, -1, -1], [0, 1, 1]]))
+    return Solid(mesh, YOUNG, poisson, 0.0, np.zeros(3), np.array([[-1, -1, -1], [0, 1, 1]]))
 
 
 def _face(solid: Solid) -> np.ndarray:
@@ -65,12 +65,15 @@ def test_a_cable_beside_the_axis_bends_the_bar_by_its_moment() -> None:
     assert np.abs(again.x - state.x).max() < 1e-7
 
 
-def test_the_stiffness_is_the_derivative_of_the_forces() -> None:
-    solid = _cantilever("tet")
+def test_forces_and_stiffness_are_derivatives_of_the_energy() -> None:
+    solid = _cantilever("tet", poisson=0.45)
     rng = np.random.default_rng(3)
     x = solid.rest + 2e-4 * rng.normal(size=solid.rest.shape)
     d = rng.normal(size=x.shape) * (~solid.clamped)[:, None]
-    change = (solid.inner_forces(x + 1e-6 * d) - solid.inner_forces(x - 1e-6 * d)).ravel()[solid.free] / 2e-6
+    high, low = x + 1e-6 * d, x - 1e-6 * d
+    slope = (solid.strain_energy(high) - solid.strain_energy(low)) / 2e-6
+    assert np.sum(solid.inner_forces(x) * d) == pytest.approx(slope, rel=1e-4)
+    change = (solid.inner_forces(high) - solid.inner_forces(low)).ravel()[solid.free] / 2e-6
     product = solid.stiffness(x) @ d.ravel()[solid.free]
     assert np.abs(product - change).max() < 1e-4 * np.abs(change).max()
 
