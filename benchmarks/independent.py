@@ -1,0 +1,68 @@
+"""Recordings of touched soft robots by an independent generator, and how far the program's forces are from their truth.
+
+    python benchmarks/independent.py OUT --seed S [--case NAME …] [--run] [--diamond FOLDER]
+    python benchmarks/independent.py --list
+
+Below OUT, each case has `robot/`, `recording/` and `truth.json`; with `--run` the installed `femsense` calibrates and estimates
+every case and a table follows. Everything that is drawn comes from the seed. Needs scikit-fem.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from independent.cases import CASES
+from independent.grade import grade, heading, run, summary
+from independent.make import make
+
+DIAMOND = Path(__file__).resolve().parents[2] / "shared" / "data" / "diamond"
+
+
+def main() -> int:
+    """Make, run and grade the cases that were asked for."""
+    ask = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    ask.add_argument("out", nargs="?", type=Path)
+    ask.add_argument("--seed", type=int, default=1)
+    ask.add_argument("--case", action="append", default=[], metavar="NAME", help="one of the cases; may be repeated; else all")
+    ask.add_argument("--diamond", type=Path, default=DIAMOND, help="folder with diamond.vtu")
+    ask.add_argument("--run", action="store_true", help="run femsense on each case and grade it")
+    ask.add_argument("--at", action="store_true", help="with --run: give the true places at rest")
+    ask.add_argument("--timeout", type=float, default=900.0, help="of one femsense command [s]")
+    ask.add_argument("--list", action="store_true", help="name the cases")
+    given = ask.parse_args()
+    if given.list or given.out is None:
+        print("\n".join(f"{c.name:16s} {c.robot}, {c.control}, {c.camera} at {c.distance_m} m" for c in CASES))
+        return 0
+    unknown = set(given.case) - {c.name for c in CASES}
+    if unknown:
+        ask.error(f"no such case: {', '.join(sorted(unknown))}")
+    rows = []
+    for case in CASES:
+        if given.case and case.name not in given.case:
+            continue
+        folder = given.out / case.name
+        if case.robot == "diamond" and not (given.diamond / "diamond.vtu").exists():
+            print(f"{case.name}: left out, no diamond.vtu in {given.diamond}")
+            continue
+        if not (folder / "truth.json").exists():
+            truth = make(case, folder, given.seed, diamond=given.diamond)
+            print(
+                f"{case.name}: made in {truth['made_in_s']} s, {truth['mesh']}, ",
+                f"residual {truth['certificate']['worst_residual_n']:.1e} N",
+                sep="",
+                flush=True,
+            )
+        if given.run:
+            note = run(folder, at=given.at, timeout=given.timeout)
+            row = grade(folder / ("run-at" if given.at else "run"), folder / "truth.json", note=note)
+            rows.append(row)
+            print(heading() if len(rows) == 1 else "", end="\n" if len(rows) == 1 else "")
+            print(row.line(), flush=True)
+    if rows:
+        print(summary(rows))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

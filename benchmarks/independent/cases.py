@@ -1,0 +1,63 @@
+"""The cases: which robot, camera, control and touches; everything else is drawn from the seed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Touch:
+    """One touch."""
+
+    kind: str = "ball"
+    """"ball", "rod" or "plate"."""
+    hidden: bool = False
+    """Out of the camera's sight."""
+    tangent: float = 0.0
+    """Tangential force over normal force."""
+    slide_m: float = 0.0
+    """How far it slides over its frames [m]."""
+    first: int = 0
+    """Its first frame, counted from the first touched one."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One recording."""
+
+    name: str
+    robot: str
+    touches: tuple[Touch, ...]
+    control: str = "tension"
+    camera: str = "stereo"
+    distance_m: float = 0.35
+    images: bool = False
+    """Depth images in place of clouds."""
+    jump: bool = False
+    """All of the force at once, and a jump of the inputs."""
+    zero: str = "absolute"
+    declared_noise: bool = False
+    tool: bool = False
+    """The touching ball is declared in [[tools]]."""
+    hard: bool = False
+    """Three times the dropouts, more flying pixels."""
+
+
+FREE, TOUCHED, AFTER = 6, 10, 2
+
+CASES = (
+    Case("bar-normal", "bar", (Touch(),)),
+    Case("bar-tangential", "bar", (Touch(tangent=0.8),), "displacement", "tof", images=True, declared_noise=True),
+    Case("bar-hidden", "bar", (Touch(hidden=True),), declared_noise=True),
+    Case("bar-jump", "bar", (Touch(),), "displacement", jump=True, hard=True),
+    Case("arm-rod", "arm", (Touch("rod"),), "tension", "stereo", 0.6, images=True, zero="unknown"),
+    Case("arm-two", "arm", (Touch(), Touch("plate", first=3)), "displacement"),
+    Case("arm-slide", "arm", (Touch(tangent=0.3, slide_m=0.02),), camera="tof", declared_noise=True, tool=True),
+    Case("arm-hidden", "arm", (Touch(hidden=True),), "displacement", "tof", 0.6),
+    Case("diamond-normal", "diamond", (Touch(),), declared_noise=True, tool=True),
+    Case("diamond-three", "diamond", (Touch(), Touch("rod", first=2), Touch(first=4)), "tension", "tof", images=True),
+    Case("diamond-far", "diamond", (Touch(tangent=0.5),), "displacement", "stereo", 0.7, hard=True),
+    Case("pad-normal", "pad", (Touch(),)),
+    Case("pad-plate", "pad", (Touch("plate"),), camera="tof", images=True, declared_noise=True),
+    Case("pad-slide", "pad", (Touch(tangent=0.3, slide_m=0.012),), camera="stereo", distance_m=0.5, hard=True),
+)

@@ -1,0 +1,196 @@
+"""How far a run's contacts are from the truth, and running the program."""
+
+from __future__ import annotations
+
+import csv
+import json
+import subprocess
+import sys
+import time
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+MATCH_M = 0.030
+"""A reported contact farther than this from a true one is another contact."""
+RESOLVED = 0.2
+"""Forces are graded where the bound is below this share: five times the resolution."""
+
+
+@dataclass(eq=False)
+class Row:
+    """The grade of one case; errors are of forces that the camera can resolve."""
+
+    case: str
+    true: int = 0
+    resolvable: int = 0
+    size_error: list[float] = field(default_factory=list)
+    vector_error: list[float] = field(default_factory=list)
+    place_m: list[float] = field(default_factory=list)
+    covered: list[bool] = field(default_factory=list)
+    over_bound: list[float] = field(default_factory=list)
+    """|error| over the bound's standard deviation."""
+    bound: list[float] = field(default_factory=list)
+    missed: int = 0
+    missed_quietly: int = 0
+    """Of these, in a frame whose status is ok."""
+    extra: int = 0
+    """Reported beside the true ones in touched frames."""
+    false: int = 0
+    calm: int = 0
+    """Frames without a touch."""
+    largest_false_n: float = 0.0
+    status: Counter[str] = field(default_factory=Counter)
+    note: str = ""
+
+    def line(self) -> str:
+        """One row of the table."""
+        size, vector, place = self.size_error, self.vector_error, self.place_m
+        cells = [
+            f"{self.case:15s}",
+            f"{self.true:4d} {self.resolvable:4d}",
+            f"{_percent(np.median, self.bound)}",
+            f"{_percent(np.median, size)} {_percent(_p95, size)} {_percent(np.median, vector)}",
+            f"{_mm(np.median, place)} {_mm(_p95, place)}",
+            f"{self.missed:4d} {self.missed_quietly:4d} {self.extra:4d}",
+            f"{self.false:3d}/{self.calm:<3d} {self.largest_false_n:5.2f}",
+            f"{_percent(np.mean, self.covered)}",
+            f"{np.sqrt(np.mean(np.square(self.over_bound))) if self.over_bound else float('nan'):5.1f}",
+            " ".join(f"{k}:{v}" for k, v in self.status.most_common(3)) + (f" {self.note}" if self.note else ""),
+        ]
+        return " | ".join(cells)
+
+
+def heading() -> str:
+    """What the columns are."""
+    return (
+        "forces where the bound on |f| is below 20 % (of `true` contacts, `res` are); matched within 30 mm;\n"
+        "quiet: missed with status ok; N: largest false force; /bound: rms error over the bound\n"
+        "case            | true  res | bound | |f| med   p95   vec | place mm p95 | miss quiet xtra"
+        " | false/calm N | cover | /bound | status"
+    )
+
+
+def _p95(values: list[float]) -> float:
+    return float(np.percentile(values, 95))
+
+
+def _percent(of, values) -> str:  # type: ignore[no-untyped-def]
+    return f"{100 * of(values):5.1f}" if len(values) else "    -"
+
+
+def _mm(of, values) -> str:  # type: ignore[no-untyped-def]
+    return f"{1e3 * of(values):5.1f}" if len(values) else "    -"
+
+
+def _rows(path: Path) -> list[dict[str, str]]:
+    if not path.exists():
+        return []
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def _vector(row: dict[str, str], *names: str) -> np.ndarray:
+    return np.array([float(row[n]) for n in names])
+
+
+def grade(run_folder: Path, truth_file: Path, *, note: str = "") -> Row:
+    """Compare contacts.csv and frames.csv of a run with truth.json."""
+    truth = json.loads(Path(truth_file).read_text(encoding="utf-8"))
+    row = Row(truth["case"], note=note)
+    frames = _rows(Path(run_folder) / "frames.csv")
+    contacts = [c for c in _rows(Path(run_folder) / "contacts.csv") if float(c["force_n"]) > 0]
+    status = {int(f["frame"]): f["status"] for f in frames}
+    row.status = Counter(status.values())
+    for frame in range(truth["frames"]):
+        true = [c for c in truth["contacts"] if c["frame"] == frame]
+        found = [c for c in contacts if int(c["frame"]) == frame]
+        if not true:
+            row.calm += 1
+            row.false += bool(found)
+            row.largest_false_n = max([row.largest_false_n, *(float(c["force_n"]) for c in found)])
+            continue
+        _frame(row, true, found, status.get(frame, "none"))
+    return row
+
+
+def _frame(row: Row, true: list[dict], found: list[dict[str, str]], status: str) -> None:
+    far = np.array([[np.linalg.norm(_vector(f, "x_m", "y_m", "z_m") - t["point"]) for f in found] for t in true]).reshape(
+        len(true), -1
+    )
+    pairs = {i: j for i, j in zip(*linear_sum_assignment(far)) if far[i, j] <= MATCH_M}
+    row.extra += len(found) - len(pairs)
+    for i, one in enumerate(true):
+        row.true += 1
+        resolvable = one["bound_rel"] < RESOLVED
+        row.resolvable += resolvable
+        if not resolvable:
+            continue
+        row.bound.append(one["bound_rel"])
+        if i not in pairs:
+            row.missed += 1
+            row.missed_quietly += status == "ok"
+            continue
+        answer = found[pairs[i]]
+        size = float(np.linalg.norm(one["force"]))
+        error = float(answer["force_n"]) - size
+        row.size_error.append(abs(error) / size)
+        row.vector_error.append(float(np.linalg.norm(_vector(answer, "fx_n", "fy_n", "fz_n") - one["force"])) / size)
+        row.place_m.append(float(far[i, pairs[i]]))
+        row.over_bound.append(abs(error) / size / one["bound_rel"])
+        if answer.get("std_n"):
+            row.covered.append(abs(error) <= 1.96 * float(answer["std_n"]))
+
+
+def run(folder: Path, *, at: bool = False, timeout: float = 900.0) -> str:
+    """Run `femsense calibrate` and `estimate` on a case; what went wrong and how long it took, in words."""
+    robot, recording, results = str(folder / "robot"), str(folder / "recording"), str(folder / ("run-at" if at else "run"))
+    calibration = str(folder / "calibration.json")
+    places: list[str] = []
+    if at:
+        truth = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
+        last = {c["contact"]: c["rest"] for c in truth["contacts"]}
+        places = [word for rest in last.values() for word in ("--at", ",".join(f"{v:.6f}" for v in rest))]
+    begin = time.perf_counter()
+    for words in (
+        ["calibrate", robot, recording, "-o", calibration, "--json"],
+        ["estimate", robot, recording, "-c", calibration, "-o", results, "--json", *places],
+    ):
+        try:
+            done = subprocess.run(
+                [sys.executable, "-m", "femsense", *words], capture_output=True, text=True, timeout=timeout, check=False
+            )
+        except subprocess.TimeoutExpired:
+            return f"{words[0]} took more than {timeout:.0f} s"
+        (folder / f"{words[0]}{'-at' if at and words[0] == 'estimate' else ''}.log").write_text(
+            done.stdout + done.stderr, encoding="utf-8"
+        )
+        if done.returncode:
+            return f"{words[0]} ended with {done.returncode}: {(done.stdout + done.stderr).strip()[-160:]!r}"
+    pose = np.asarray(json.loads(Path(calibration).read_text(encoding="utf-8"))["T_robot_camera"])
+    true = np.asarray(json.loads((folder / "truth.json").read_text(encoding="utf-8"))["T_robot_camera"])
+    points = [p["point"] for p in json.loads((folder / "truth.json").read_text(encoding="utf-8"))["contacts"]]
+    off = np.linalg.norm(_moved(pose, true, np.asarray(points)), axis=1).mean()
+    return f"pose {1e3 * off:.2f} mm off, {time.perf_counter() - begin:.0f} s"
+
+
+def _moved(pose: np.ndarray, true: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """By how much a wrong pose moves points of the robot [m]."""
+    local = (points - true[:3, 3]) @ true[:3, :3]
+    return np.asarray(local @ pose[:3, :3].T + pose[:3, 3] - points)
+
+
+def summary(rows: list[Row]) -> str:
+    """All cases in one row."""
+    total = Row("all")
+    for row in rows:
+        for name in ("true", "resolvable", "missed", "missed_quietly", "extra", "false", "calm"):
+            setattr(total, name, getattr(total, name) + getattr(row, name))
+        for name in ("size_error", "vector_error", "place_m", "covered", "over_bound", "bound"):
+            getattr(total, name).extend(getattr(row, name))
+        total.status.update(row.status)
+        total.largest_false_n = max(total.largest_false_n, row.largest_false_n)
+    return total.line()
