@@ -558,6 +558,39 @@ def test_inputs_beyond_the_limits_warn(tmp_path: Path, robot: Any, value: str, t
         check_against(robot, replace(r, actuation="displacement"))
 
 
+def test_colour_of_16_bits_or_as_jpeg_goes_with_its_depth(tmp_path: Path) -> None:
+    import cv2
+
+    image = np.zeros((6, 8, 3), dtype=np.uint16)
+    image[:, :, 2] = 65535
+    write_png(depth_recording(tmp_path / "a") / "color" / "000000.png", image)
+    cloud = read_frame_cloud(load_recording(tmp_path / "a"), 0)
+    assert cloud is not None and cloud.colors is not None
+    np.testing.assert_array_equal(cloud.colors, np.tile([1.0, 0.0, 0.0], (len(cloud), 1)))
+    folder = depth_recording(tmp_path / "b")
+    for file in (folder / "color").glob("*"):
+        file.unlink()
+    assert cv2.imwrite(str(folder / "color" / "000000.jpg"), (image // 257).astype(np.uint8))
+    cloud = read_frame_cloud(load_recording(folder), 0)
+    assert cloud is not None and cloud.colors is not None
+    np.testing.assert_allclose(cloud.colors, np.tile([1.0, 0.0, 0.0], (len(cloud), 1)), atol=0.02)
+    whole = (folder / "color" / "000000.jpg").read_bytes()
+    (folder / "color" / "000000.jpg").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(InputError, match="a broken image"):
+        read_frame_cloud(load_recording(folder), 0)
+
+
+def test_files_that_are_not_read_are_named(tmp_path: Path) -> None:
+    folder = write_small_recording(tmp_path)
+    (folder / "clouds").mkdir()
+    for name in ("000000.las", "000001.las", "000001.xyz", "notes.txt"):
+        (folder / "clouds" / name).write_text("0 0 1\n")
+    with pytest.warns(UserWarning, match=r"files that are not read: 2 × \.las"):
+        r = load_recording(folder)
+    cloud = read_frame_cloud(r, 1)
+    assert cloud is not None and len(cloud) == 1
+
+
 # What is wrong
 
 FRAMES = "frame,time_s,cable_top,cable_side\n"
