@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
@@ -11,11 +12,11 @@ from typing import Any
 import numpy as np
 
 from femsense.core.arrays import BoolArray, FloatArray, IntArray, freeze
-from femsense.core.errors import InputError
+from femsense.core.errors import DataError, InputError
 from femsense.core.text import did_you_mean
 from femsense.io.clouds.frame_clouds import find_clouds
 from femsense.io.clouds.images import check_image_size, png_header
-from femsense.io.files import write_beside, write_csv, write_toml
+from femsense.io.files import check_target, write_beside, write_csv, write_toml
 from femsense.io.recording_toml import (
     LENS_KEYS,
     PER_METRE,
@@ -196,6 +197,8 @@ def _read_markers(path: Path, views: tuple[str, ...], numbers: IntArray) -> dict
     view = _view_indices(table, views)
     xyz = table.numbers(PLACE_COLUMNS)
     _check_metres(table, xyz)
+    measured = _measured(table, xyz, numbers[frame])
+    table, frame, view, xyz = table.without(~measured), frame[measured], view[measured], xyz[measured]
     unnamed = _unnamed(table, frame, numbers)
     parts = {"unnamed_frame": frame[unnamed], "unnamed_view": view[unnamed], "unnamed_xyz": xyz[unnamed]}
     table, frame, view, xyz = table.without(unnamed), frame[~unnamed], view[~unnamed], xyz[~unnamed]
@@ -212,6 +215,28 @@ def _read_markers(path: Path, views: tuple[str, ...], numbers: IntArray) -> dict
         )
     named = {"marker_names": names, "marker_frame": frame, "marker_index": index, "marker_view": view, "marker_xyz": xyz}
     return {**named, **parts}
+
+
+def _measured(table: Table, xyz: FloatArray, frame: IntArray) -> BoolArray:
+    """Return which rows are places, shape (rows,): 0, 0, 0 is the middle of the lens, and how many programs write a lost marker.
+
+    Raises:
+        DataError: a marker that has no other row.
+    """
+    lost = np.asarray((xyz == 0.0).all(axis=1))
+    if not lost.any():
+        return np.asarray(~lost)
+    cells = np.array(table.text("marker"))
+    never = sorted({str(name) for name in cells[lost]} - {str(name) for name in cells[~lost]})
+    if never:
+        names = ", ".join(name or "(without a name)" for name in never)
+        raise DataError(
+            f"{table.path}: 0, 0, 0 in every row of {names}: these markers were lost all the time. Take their rows out, or name the columns anew"
+        )
+    rows = [f"{name or '(without a name)'} in frame {number}" for name, number in zip(cells[lost], frame[lost])]
+    text = ", ".join(rows[:6]) + (f" and {len(rows) - 6} more" if len(rows) > 6 else "")
+    warnings.warn(f"{table.path}: 0, 0, 0 is how a lost marker is written; left out: {text}", stacklevel=4)
+    return np.asarray(~lost)
 
 
 def _unnamed(table: Table, frame: IntArray, numbers: IntArray) -> BoolArray:
@@ -376,6 +401,14 @@ def save_recording(recording: Recording, folder: str | Path, *, fill: Callable[[
         the folder.
     """
     final = Path(folder)
+    check_target(final, folder=True)
+    if final.is_dir() and any(final.iterdir()) and not (final / "recording.toml").is_file():
+        raise InputError(
+            "something else than a recording stands there, which would be replaced",
+            where=final,
+            expected="a new folder, or a recording",
+            hint="another -o",
+        )
     with write_beside(final) as part:
         part.mkdir()
         write_toml(part / "recording.toml", recording_document(recording))

@@ -19,6 +19,10 @@ from femsense.core.text import did_you_mean
 if TYPE_CHECKING:
     from femsense.model.robot import Robot
 
+SLOW = 5.0
+"""Frames that are farther apart than this [s] are more likely counted in milliseconds: cameras take 5 to 90 a second."""
+LONG_PULL = 0.5
+"""A cable that moves farther than this [m] is more likely given in millimetres or centimetres."""
 FAR_LOAD = 0.25
 """A known load farther from the body than this times the mesh's diagonal is an error."""
 
@@ -417,13 +421,38 @@ def _check_parts(recording: Recording) -> None:
             raise InputError(f"{name} has the wrong length", where=name, found=found, expected=expected)
 
 
+# Whether the numbers can be meant
+
+
+def warn_of_values(recording: Recording) -> None:
+    """Warn of times, displacements and signs that can be computed with but are hardly meant."""
+    r, where = recording, _place(recording, "frames.csv")
+    steps = np.diff(r.time_s)
+    if len(steps) and np.median(steps) > SLOW:
+        text = f"one frame every {np.median(steps):.4g} s by the column time_s; is it in milliseconds?"
+        warnings.warn(f"{where}: {text}", stacklevel=3)
+    if r.actuation != "displacement":
+        return
+    for name, pulled in zip(r.cable_names, r.inputs.T):
+        longest = float(np.abs(pulled).max(initial=0.0))
+        if longest > LONG_PULL:
+            text = f"cable {name!r} moves by up to {longest:.4g} m; are displacements in millimetres?"
+            warnings.warn(f"{where}: {text}", stacklevel=3)
+        back, forth = int((pulled < 0).sum()), int((pulled > 0).sum())
+        if r.actuation_zero == "absolute" and back > forth:
+            text = (
+                f"cable {name!r} is slack in {len(pulled) - forth} of {len(pulled)} frames, its displacement below zero in {back}"
+            )
+            warnings.warn(f"{where}: {text}; is the sign right? > 0 shortens", stacklevel=3)
+
+
 # Against a robot
 
 
 def check_against(robot: Robot, recording: Recording) -> Recording:
     """Return the recording as this robot needs it: cables and chambers in the robot's order, without markers that the robot lacks.
 
-    Warns of markers that are dropped and of inputs beyond the limits of cables and chambers.
+    Warns of markers that are dropped, of inputs beyond the limits of cables and chambers, and of numbers that are hardly meant.
 
     Raises:
         InputError: other cables or chambers than the robot's, no marker in common, a known load far from the body.
@@ -431,6 +460,7 @@ def check_against(robot: Robot, recording: Recording) -> Recording:
     fitted = _without_strangers(robot, _with_chamber_order(robot, _with_cable_order(robot, recording)))
     _check_loads(robot, fitted)
     _warn_of_inputs(robot, fitted)
+    warn_of_values(fitted)
     return fitted
 
 
