@@ -194,10 +194,12 @@ def calibrate(
     """Find the camera's pose and the cables' initial inputs."""
     from femsense.calib.calibrate import calibrate as calibrate_recording
     from femsense.calib.files import calibration_document, write_calibration
+    from femsense.io.files import check_target
     from femsense.io.recording_folder import load_recording
     from femsense.io.robot_toml import load_robot
     from femsense.report.text import calibration_text
 
+    check_target(output, folder=False)
     calibration = calibrate_recording(load_robot(robot), load_recording(recording))
     write_calibration(calibration, output)
     text = calibration_text(calibration) + f"\n\nwritten: {output}"

@@ -27,14 +27,14 @@ from femsense.io.files import plain
 from femsense.io.mesh_files import (
     SURFACE_ENDINGS,
     closed_surface,
-    file_format,
     ordered_tets,
     radius_ratio,
-    read_cells,
     read_tets,
     read_triangles,
 )
-from femsense.io.recording_folder import TOO_FAR, load_recording, recording_problems
+from femsense.io.meshes.reading import file_format, read_content
+from femsense.io.recording_folder import TOO_FAR, load_recording
+from femsense.io.recording_toml import recording_problems
 from femsense.io.robot_toml import RobotTable, load_robot, read_declared_mesh, robot_names, robot_problems
 from femsense.io.tables import read_toml
 from femsense.model.recording import Recording
@@ -44,6 +44,7 @@ from femsense.rig.script import read_script
 Report = dict[str, Any]
 MESH_ENDINGS = (
     ".vtu",
+    ".pvtu",
     ".vtk",
     ".msh",
     ".mesh",
@@ -357,7 +358,8 @@ def _warn_of_quality(worst: float, name: str) -> None:
 
 
 def _mesh(file: Path, report: Report, problems: list[str]) -> None:
-    points, cells = read_cells(file, str(file))
+    content = read_content(file, str(file))
+    points, cells = content.points, content.cells
     report["cells"] = {kind: len(data) for kind, data in cells.items()}
     kinds = [kind for kind in ("tetra", "tetra10") if kind in cells]
     if not kinds and "triangle" in cells:

@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from femsense.calib.calibration import Calibration
+from femsense.calib.checks import check_reading, pairs_of, relabelled
 from femsense.calib.inputs import _initial_displacement, _input_std, _largest_input, first_inputs, input_bounds
 from femsense.calib.joint import PLACEMENT_STD_FLOOR, _rms, fit_joint
 from femsense.calib.rigid import fit_rigid, fit_rigid_robust
@@ -74,14 +75,31 @@ def calibrated_start(
     robot: Robot, recording: Recording, frames: IntArray
 ) -> tuple[tuple[FloatArray, ...], FloatArray | None, dict[int, Equilibrium]]:
     """Return poses, initial inputs (None where they are known) and states of frames by which further fits begin; frames need markers."""
-    _, _, poses, initial, jet = _fitted(robot, recording, frames, [])
+    _, _, poses, initial, jet = _fitted(robot, recording, frames, [], strict=False)
     return tuple(poses), initial, jet.states
 
 
 def _fitted(
+    robot: Robot, recording: Recording, chosen: IntArray, history: list[float], *, strict: bool = True
+) -> tuple[Scene, FitResult, list[FloatArray], FloatArray | None, SceneJet]:
+    """Return the scene of the frames that are used, and the fit to it; labels put right, strays left out.
+
+    Raises:
+        DataError: markers that cannot be the robot's as they are written (`check_reading`).
+    """
+    scene, fit, poses, initial, jet = _fitted_as_named(robot, recording, chosen, history)
+    pairs = pairs_of(robot, scene, poses, jet.residual)
+    better, changed = relabelled(robot, scene, pairs, _rms(jet.residual) / 60.0)
+    if changed:
+        scene, fit, poses, initial, jet = _fitted_as_named(robot, better, chosen, history)
+        pairs = pairs_of(robot, scene, poses, jet.residual)
+    check_reading(robot, pairs, strict=strict)
+    return scene, fit, poses, initial, jet
+
+
+def _fitted_as_named(
     robot: Robot, recording: Recording, chosen: IntArray, history: list[float]
 ) -> tuple[Scene, FitResult, list[FloatArray], FloatArray | None, SceneJet]:
-    """Return the scene of the frames that are used, and the fit to it."""
     seen = chosen[np.isin(chosen, recording.marker_frame)]
     if len(seen) > MAX_FRAMES:
         seen = seen[np.unique(np.linspace(0, len(seen) - 1, MAX_FRAMES).round().astype(int))]

@@ -10,12 +10,16 @@ import os
 import re
 import secrets
 import shutil
+import stat
+import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from femsense.core.errors import InputError
 
 PART_PREFIX = ".part-"
 """Names of unfinished files and folders start so."""
@@ -28,19 +32,105 @@ def write_beside(path: str | Path) -> Iterator[Path]:
     """Yield a free path beside `path`; what the block writes there (a file or a folder) gets the final name at its end.
 
     The temporary name keeps the ending of the final one. If the block raises, nothing is left behind and what stood at
-    `path` before is untouched. A folder replaces the whole folder that stood there.
+    `path` before is untouched. A folder replaces the whole folder that stood there. Symbolic links are followed; devices and
+    pipes are written through, not replaced.
 
     Raises:
-        FileNotFoundError: where the block wrote nothing.
+        InputError: a place that cannot be written, or holds something of another kind. FileNotFoundError: the block wrote nothing.
     """
-    final = Path(path).absolute()
-    final.parent.mkdir(parents=True, exist_ok=True)
+    if writes_through(path):
+        with _through(Path(path)) as part:
+            yield part
+        return
+    final = _followed(path)
+    _check_writable(final)
     part = final.with_name(f"{PART_PREFIX}{secrets.token_hex(4)}-{final.name}")
     try:
         yield part
+        _check_kind(final, folder=part.is_dir())
         _replace(part, final)
+    except OSError as error:
+        if PART_PREFIX in str(error.filename) and part.name in str(error.filename) and not isinstance(error, FileNotFoundError):
+            raise _refusal(final, error.strerror or "an error of the system") from None
+        raise
     finally:
         _remove(part)
+
+
+def check_target(path: str | Path, *, folder: bool) -> None:
+    """Refuse, before anything is computed, a place where no result can be written. Raises InputError."""
+    if writes_through(path):
+        if folder:
+            raise _wrong_kind(path, "a device or a pipe", "a folder")
+        return
+    final = _followed(path)
+    nearest = next(place for place in (final, *final.parents) if place.exists())
+    if nearest != final and not nearest.is_dir():
+        raise _wrong_kind(nearest, "a file", "a folder")
+    if nearest != final and not os.access(nearest, os.W_OK):
+        raise _refusal(final, f"no right to write in {nearest}")
+    if nearest == final:
+        _check_writable(final)
+        _check_kind(final, folder=folder)
+
+
+def writes_through(path: str | Path) -> bool:
+    """Return whether a path is a device, a pipe or an open stream, which takes bytes and is not to be replaced by a file."""
+    if str(Path(path).absolute()).startswith(("/dev/", "/proc/")):
+        return True
+    try:
+        mode = Path(path).stat().st_mode
+    except OSError:
+        return False
+    return not (stat.S_ISREG(mode) or stat.S_ISDIR(mode))
+
+
+@contextmanager
+def _through(final: Path) -> Iterator[Path]:
+    """Yield a path elsewhere; the file that the block writes there goes through the device or pipe."""
+    with tempfile.TemporaryDirectory(prefix="femsense-") as folder:
+        part = Path(folder) / (final.name if final.suffix else "result")
+        yield part
+        if part.is_dir():
+            raise _wrong_kind(final, "a device or a pipe", "a folder")
+        try:
+            with part.open("rb") as source, final.open("r+b" if final.is_block_device() else "wb") as sink:
+                shutil.copyfileobj(source, sink)
+        except OSError as error:
+            raise _refusal(final, error.strerror or "an error of the system") from None
+
+
+def _followed(path: str | Path) -> Path:
+    """Return where a path leads, links followed, with its parent made."""
+    final = Path(path).absolute()
+    return final.resolve() if final.is_symlink() else final
+
+
+def _check_writable(final: Path) -> None:
+    """Make the parent; refuse what is protected against writing. Raises InputError."""
+    try:
+        final.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise _refusal(final, f"{error.strerror}: {final.parent}") from None
+    if not os.access(final.parent, os.W_OK):
+        raise _refusal(final, f"no right to write in {final.parent}")
+    if final.exists() and (not os.access(final, os.W_OK) or not final.stat().st_mode & 0o222):
+        raise _refusal(final, "it is read-only")
+
+
+def _check_kind(final: Path, *, folder: bool) -> None:
+    if final.exists() and final.is_dir() != folder:
+        raise _wrong_kind(final, *(("a file", "a folder") if folder else ("a folder", "a file")))
+
+
+def _refusal(final: Path, found: str) -> InputError:
+    return InputError("cannot be written", where=final, found=found, expected="a place that can be written", hint="another -o")
+
+
+def _wrong_kind(final: str | Path, found: str, wanted: str) -> InputError:
+    return InputError(
+        f"{found} stands where {wanted} is to be written", where=final, expected=f"a new name, or {wanted}", hint="another -o"
+    )
 
 
 def write_text(path: str | Path, text: str) -> None:

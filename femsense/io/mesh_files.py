@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import importlib.util
-import io
 import os
 import re
 import secrets
@@ -17,16 +16,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import InputError, MissingDependency
 from femsense.core.text import did_you_mean
-from femsense.fem.mesh import EDGES, TetMesh, element_volumes, oriented
+from femsense.fem.mesh import EDGES, FACES, TetMesh, element_volumes, oriented
 from femsense.io.files import PART_PREFIX, write_beside
+from femsense.io.meshes.content import distinct_cells, gathered
+from femsense.io.meshes.reading import read_content, reason
 from femsense.io.meshing.surface import check_finite, merged, repaired
 
 SURFACE_ENDINGS = (".ply", ".stl", ".obj", ".off")
-SOLID_KINDS = ("hexahedron", "wedge", "pyramid", "hexahedron20", "hexahedron27", "wedge15", "pyramid13")
+SOLID_KINDS = ("tetra", "hexahedron", "wedge", "pyramid", "voxel", "polyhedron", "C3D", "type ")
+"""How the names of solid elements begin."""
 FTETWILD = """
 import importlib.util, sys, types
 import numpy as np
@@ -65,9 +68,10 @@ def read_tets(path: Path, *, where: str | None = None) -> TetMesh:
     _check_exists(path, where)
     if path.suffix.lower() in SURFACE_ENDINGS:
         return _tets_of_surface(path, *read_surface(path, where=where), where)
-    points, cells = read_cells(path, where)
+    content = read_content(path, where)
+    points, cells = content.points, content.cells
     kinds = [kind for kind in ("tetra", "tetra10") if kind in cells]
-    others = sorted(set(cells) & set(SOLID_KINDS))
+    others = [kind for kind in cells if kind.startswith(SOLID_KINDS) and kind not in kinds]
     if others or len(kinds) > 1:
         raise InputError(
             "elements that femsense does not compute with",
@@ -108,7 +112,7 @@ def read_triangles(path: Path, *, where: str | None = None) -> tuple[FloatArray,
         raise InputError(
             "not readable as a surface",
             where=where,
-            found=_reason(error),
+            found=reason(error),
             expected="triangles (ply, stl, obj, off)",
             hint="is the file whole, and what its ending says?",
         ) from None
@@ -237,16 +241,6 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "femsense"
 
 
-def file_format(path: Path) -> str | None:
-    """Return meshio's name of a mesh file's format from its content; None where only the ending says it."""
-    with path.open("rb") as stream:
-        head = stream.read(512).lstrip()
-    starts = ((b"# vtk DataFile", "vtk"), (b"$MeshFormat", "gmsh"), (b"MeshVersionFormatted", "medit"), (b"<Xdmf", "xdmf"))
-    if b"<VTKFile" in head:
-        return "vtu"
-    return next((name for start, name in starts if head.startswith(start)), None)
-
-
 def _check_exists(path: Path, where: str) -> None:
     if path.is_file():
         return
@@ -254,48 +248,80 @@ def _check_exists(path: Path, where: str) -> None:
     raise InputError("no such mesh file", where=where, found=str(path), expected="a file", hint=did_you_mean(path.name, names))
 
 
-def read_cells(path: Path, where: str) -> tuple[FloatArray, dict[str, IntArray]]:
-    """Return points and the cells of each kind through meshio, which may print and exit."""
-    import meshio
-
-    try:
-        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-            mesh = meshio.read(path, file_format=file_format(path))
-        points = np.asarray(mesh.points, dtype=np.float64)
-        cells = {kind: np.asarray(data, dtype=np.int64) for kind, data in mesh.cells_dict.items()}
-    except (Exception, SystemExit) as error:
-        raise InputError(
-            "not readable as a mesh",
-            where=where,
-            found=_reason(error),
-            expected="tetrahedra in a format that meshio reads (vtu, vtk, msh, …)",
-        ) from None
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise InputError(
-            "not a mesh in space", where=where, found=f"points of shape {points.shape}", expected="three coordinates a point"
-        )
-    if not np.isfinite(points).all():
-        bad = int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])
-        raise InputError(
-            "a node is not finite", where=where, found=f"node {bad}: {points[bad].tolist()}", expected="finite coordinates"
-        )
-    return points, cells
-
-
 def ordered_tets(points: FloatArray, tets: IntArray, where: str) -> TetMesh:
-    """Return the mesh with its corner nodes first, all elements turned where all are inverted."""
-    if tets.size and (tets.min() < 0 or tets.max() >= len(points)):
-        raise InputError(
-            "an element names a node that does not exist", where=where, found=int(tets.max()), expected=f"0 … {len(points) - 1}"
-        )
+    """Return the mesh with its corner nodes first, each tetrahedron once, all elements turned where all are inverted."""
+    tets = _from_zero(tets, len(points), where)
     unused = len(points) - len(np.unique(tets))
     if unused:
         warnings.warn(f"{where}: {unused} nodes that belong to no tetrahedron were dropped", stacklevel=4)
-    mesh = _compact(points, tets)
+    kept, _ = distinct_cells(tets)
+    if len(kept) < len(tets):
+        warnings.warn(
+            f"{where}: {len(tets) - len(kept)} of {len(tets)} tetrahedra stand there twice (once for each physical group?): each is used once",
+            stacklevel=4,
+        )
+    mesh = _compact(points, tets[kept])
+    _check_faces(mesh, where)
     if mesh.is_quadratic:
         _check_middles(mesh, where)
     volumes = element_volumes(mesh)
     return oriented(mesh) if len(volumes) and (volumes < 0).all() else mesh
+
+
+def tet_values(path: Path, name: str, where: str) -> npt.NDArray[np.generic]:
+    """Return what a mesh file says of each tetrahedron of `read_tets`, shape (m, p): p values where it says several.
+
+    Raises:
+        InputError: no tetrahedra, or no such cell data.
+    """
+    content = read_content(path, where)
+    kind = next((kind for kind in ("tetra", "tetra10") if kind in content.cells), None)
+    if kind is None:
+        raise InputError("the mesh file has no cell data", where=where, found=path.name, expected="a mesh of tetrahedra")
+    values = content.data.get(name, {}).get(kind)
+    if values is None:
+        known = " | ".join(key for key, kinds in content.data.items() if kind in kinds)
+        raise InputError("no such cell data in the mesh file", where=where, found=repr(name), expected=known or "none there")
+    return gathered(np.asarray(values), *distinct_cells(_from_zero(content.cells[kind], len(content.points), where)))
+
+
+def _from_zero(tets: IntArray, count: int, where: str) -> IntArray:
+    """Return the elements with nodes counted from zero. Raises InputError where a node does not exist.
+
+    Readers of formats that count from one take one away: a file that counts from zero then begins at −1.
+    """
+    low, high = (int(tets.min()), int(tets.max())) if tets.size else (0, count - 1)
+    if low == -1 and high < count - 1:
+        warnings.warn(f"{where}: the nodes of the elements count from 0 where this format counts from 1: read so", stacklevel=5)
+        return tets + 1
+    if low >= 1 and high == count:
+        warnings.warn(f"{where}: the nodes of the elements count from 1 where this format counts from 0: read so", stacklevel=5)
+        return tets - 1
+    if low < 0 or high >= count:
+        raise InputError(
+            "an element names a node that does not exist",
+            where=where,
+            found=low if low < 0 else high,
+            expected=f"0 … {count - 1}",
+            hint="does the file count its nodes from 0 where its format counts from 1?" if low < 0 else None,
+        )
+    return tets
+
+
+def _check_faces(mesh: TetMesh, where: str) -> None:
+    """Refuse elements that overlap: a face belongs to one tetrahedron, or lies between two. Raises InputError."""
+    faces = np.sort(mesh.tets[:, FACES].reshape(-1, 3), axis=1)
+    count = np.unique(faces, axis=0, return_counts=True)[1]
+    if len(count) and (count > 2).any():
+        raise InputError(
+            "tetrahedra that overlap",
+            where=where,
+            found=f"{int((count > 2).sum())} faces of more than two tetrahedra",
+            expected="each face belongs to one or two",
+            hint="is a part of the mesh written twice, or meshed twice?",
+        )
+    if len(count) and not (count == 1).any():
+        raise InputError("the mesh has no surface", where=where, found="no face of one tetrahedron only", expected="a body")
 
 
 def _compact(points: FloatArray, tets: IntArray) -> TetMesh:
@@ -430,12 +456,3 @@ def _run_ftetwild(
             )
         with np.load(made) as data:
             return np.asarray(data["nodes"], dtype=np.float64), np.asarray(data["tets"], dtype=np.int64)
-
-
-def _reason(error: BaseException) -> str:
-    text = str(error).strip().splitlines()
-    return (
-        f"{type(error).__name__}: {text[0][:120]}"
-        if text and not isinstance(error, SystemExit)
-        else "another format, or a broken file"
-    )

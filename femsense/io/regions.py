@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -16,6 +16,7 @@ from pydantic import Field, model_validator
 from femsense.core.arrays import BoolArray, FloatArray
 from femsense.core.errors import InputError
 from femsense.fem.mesh import TetMesh
+from femsense.io.mesh_files import tet_values
 from femsense.io.tables import Schema
 
 Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
@@ -82,30 +83,12 @@ def _inside(region: RegionTable, centroids: FloatArray, file: Path, where: str) 
         return np.asarray(((centroids >= low) & (centroids <= high)).all(axis=1))
     if region.center_m is not None:
         return np.asarray(np.linalg.norm(centroids - region.center_m, axis=1) <= region.radius_m)
-    return np.asarray(_cell_data(file, str(region.cells), len(centroids), where) == region.value)
-
-
-def _cell_data(file: Path, name: str, count: int, where: str) -> FloatArray:
-    """Return one value an element from the cell data of the mesh file, shape (m,). Raises InputError."""
-    import meshio
-
-    try:
-        data: dict[str, Any] = meshio.read(file).cell_data_dict
-    except Exception as error:  # surfaces and formats that only trimesh reads
-        raise InputError(
-            "the mesh file has no cell data", where=where, found=str(error), expected="a mesh of tetrahedra"
-        ) from None
-    arrays = {key: kinds.get("tetra", kinds.get("tetra10")) for key, kinds in data.items()}
-    values = arrays.get(name)
-    if values is None:
-        raise InputError(
-            "no such cell data in the mesh file", where=where, found=repr(name), expected=" | ".join(arrays) or "none there"
-        )
-    if np.shape(values) != (count,):
+    values = tet_values(file, str(region.cells), where)
+    if len(values) != len(centroids):
         raise InputError(
             "the cell data do not fit the elements",
             where=where,
-            found=np.shape(values),
-            expected=f"one number for each of {count} tetrahedra",
+            found=values.shape,
+            expected=f"one number for each of {len(centroids)} tetrahedra",
         )
-    return np.asarray(values)
+    return np.asarray((values == region.value).any(axis=1))

@@ -200,12 +200,22 @@ def load_robot(path_or_name: str | Path, *, effects: bool = True) -> Robot:
 def find_robot(path_or_name: str | Path) -> Path:
     """Return the robot.toml of a folder, a file or a NAME. Raises InputError that lists the known names."""
     path = Path(path_or_name).expanduser()
+    known = robot_names()
     if path.is_file():
         return path
     if (path / "robot.toml").is_file():
+        if str(path_or_name) in known and known[str(path_or_name)].resolve() != path.resolve():
+            warnings.warn(
+                f"{path_or_name}: the folder {path.absolute()} is used; the robot of that name that comes along is {known[str(path_or_name)]}",
+                stacklevel=3,
+            )
         return path / "robot.toml"
-    known = robot_names()
     if str(path_or_name) in known:
+        if path.exists():
+            warnings.warn(
+                f"{path_or_name}: the robot that comes along is used; the folder {path.absolute()} has no robot.toml",
+                stacklevel=3,
+            )
         return known[str(path_or_name)] / "robot.toml"
     if path.is_dir():
         raise InputError("not a robot: the folder has no robot.toml", where=path, found=_listing(path), expected="robot.toml")
@@ -546,6 +556,11 @@ def _warn_of_units(table: RobotTable, path: Path) -> None:
     if table.material.young_modulus_pa < 1e3:
         warnings.warn(
             f"{_at(path, 'material', 'young_modulus_pa')}: {table.material.young_modulus_pa:g} Pa is softer than any silicone; is it in kPa or MPa?",
+            stacklevel=4,
+        )
+    if table.material.density_kg_m3 < 20.0:
+        warnings.warn(
+            f"{_at(path, 'material', 'density_kg_m3')}: {table.material.density_kg_m3:g} kg/m³ is lighter than any foam; is it in g/cm³? Silicone has 1070 kg/m³",
             stacklevel=4,
         )
     if table.gravity and np.linalg.norm(table.gravity.vector_m_s2) > 100.0:

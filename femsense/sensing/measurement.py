@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import numpy.typing as npt
 
 from femsense.calib.calibration import Calibration
-from femsense.core.arrays import FloatArray
+from femsense.calib.checks import true_labels
+from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import DataError
 from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.mesh import vertex_normals
@@ -151,6 +154,7 @@ def _marker_rows(sensor: Sensor, k: int, state: Equilibrium) -> Rows:
     measured = in_robot_frame(
         recording.marker_xyz[rows], recording.marker_view[rows], sensor.calibration.poses, robot.observation
     )
+    marker = _as_seen(sensor, k, state, measured, marker, recording.marker_view[rows])
     place = robot.markers[marker]
     residual = measured - place.positions(state.positions)
     way = np.linalg.norm(place.positions(state.positions) - robot.marker_points[marker], axis=1)
@@ -165,6 +169,19 @@ def _marker_rows(sensor: Sensor, k: int, state: Equilibrium) -> Rows:
         return np.array([place.moves(v).ravel() for v in u]).reshape(len(u), -1).T
 
     return Rows(functional, residual.ravel(), std, by_pose, len(rows), float(np.sqrt((residual**2).sum(axis=1).mean())), std)
+
+
+def _as_seen(sensor: Sensor, k: int, state: Equilibrium, measured: FloatArray, marker: IntArray, view: IntArray) -> IntArray:
+    """Return which markers were seen, shape (r,): as named, or put right where labels are exchanged, with a warning."""
+    places, best = sensor.robot.markers.positions(state.positions), marker.copy()
+    for v in np.unique(view):
+        mine = view == v
+        best[mine] = true_labels(places, measured[mine], marker[mine], noise=_marker_std(sensor.calibration))
+    if (best != marker).any():
+        names = " and ".join(sensor.robot.marker_names[m] for m in marker[best != marker])
+        number = int(sensor.recording.frame_numbers[k])
+        warnings.warn(f"{sensor.recording.folder}: frame {number}: the labels {names} are exchanged, put right", stacklevel=4)
+    return best
 
 
 def _marker_std(calibration: Calibration) -> float:

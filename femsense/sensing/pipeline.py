@@ -158,6 +158,8 @@ def sense_frame(sensor: Sensor, k: int, previous: SensedFrame | None) -> SensedF
     free_state = _solve(sensor, k, None, None if previous is None else previous.free_state, before)
     expected = free_state if previous is None else previous.state
     clouds = _robot_and_surroundings(sensor, k, expected) if _has_clouds(sensor.recording) else None
+    if clouds is None and not (sensor.recording.marker_frame == k).any():
+        return _predicted(sensor, k, free_state, began)
     patches, source = _find_contacts(sensor, k, clouds, expected)
     rows = _measure(sensor, k, clouds, free_state)
     rows = rows if clouds is None else _measure(sensor, k, clouds, free_state, _reach(sensor, rows))
@@ -189,6 +191,18 @@ def sense_frame(sensor: Sensor, k: int, previous: SensedFrame | None) -> SensedF
         dict(state.pressure),
     )
     return SensedFrame(state, free_state, forces, report, contacts)
+
+
+PREDICTED = "nothing was measured: the model's prediction under the inputs"
+"""Status of a frame without markers and cloud."""
+
+
+def _predicted(sensor: Sensor, k: int, state: Equilibrium, began: float) -> SensedFrame:
+    """Return frame k as the model has it where nothing was measured."""
+    number, stamp, nan = int(sensor.recording.frame_numbers[k]), float(sensor.recording.time_s[k]), float("nan")
+    elapsed = 1e3 * (time.perf_counter() - began)
+    report = FrameReport(number, stamp, PREDICTED, 0, 0, nan, nan, elapsed, dict(state.tension), dict(state.pressure))
+    return SensedFrame(state, state, np.zeros(0), report, ())
 
 
 # --- results -------------------------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Point clouds in PLY and PCD files."""
+"""Point clouds in PLY, PCD and XYZ files."""
 
 from __future__ import annotations
 
@@ -11,13 +11,17 @@ from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.io.clouds.pcd import read_pcd_fields
 from femsense.io.clouds.ply import read_ply_vertices
+from femsense.io.clouds.xyz import read_xyz_columns
 from femsense.pointcloud.cloud import PointCloud
 
-_SUFFIXES = (".ply", ".pcd")
+CLOUD_ENDINGS = (".ply", ".pcd", ".xyz")
+_WRITTEN = (".ply", ".pcd")
+_COLOR_NAMES = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
+"""Names of three columns of colour, in any case: of most writers, of MeshLab's and VCG's older ones, of hand-made ones."""
 
 
 def read_cloud(path: str | Path) -> PointCloud:
-    """Return the cloud of a PLY or PCD file; points that are not finite are left out.
+    """Return the cloud of a PLY, PCD or XYZ file; points that are not finite are left out.
 
     Arguments:
         path: the file; positions in metres.
@@ -26,9 +30,10 @@ def read_cloud(path: str | Path) -> PointCloud:
     """
     file = Path(path)
     if not file.is_file():
-        raise InputError("no such file", where=file, expected="a PLY or PCD file")
-    _check_suffix(file)
-    fields = read_pcd_fields(file) if file.suffix.lower() == ".pcd" else read_ply_vertices(file)
+        raise InputError("no such file", where=file, expected="a PLY, PCD or XYZ file")
+    _check_suffix(file, CLOUD_ENDINGS)
+    readers = {".pcd": read_pcd_fields, ".ply": read_ply_vertices, ".xyz": read_xyz_columns}
+    fields = readers[file.suffix.lower()](file)
     return _cloud_of_fields(fields, file)
 
 
@@ -39,7 +44,7 @@ def write_cloud(path: str | Path, cloud: PointCloud) -> None:
         InputError: another suffix, or a place that cannot be written.
     """
     file = Path(path)
-    _check_suffix(file)
+    _check_suffix(file, _WRITTEN)
     if not file.parent.is_dir():
         raise InputError("no such folder", where=file.parent, expected="a folder that exists")
     import open3d as o3d
@@ -56,9 +61,11 @@ def write_cloud(path: str | Path, cloud: PointCloud) -> None:
 # --- helpers ----------------------------------------------------------------------------------------------------------
 
 
-def _check_suffix(file: Path) -> None:
-    if file.suffix.lower() not in _SUFFIXES:
-        raise InputError("not a format of point clouds", where=file, found=file.suffix or "no suffix", expected=".ply or .pcd")
+def _check_suffix(file: Path, known: tuple[str, ...]) -> None:
+    if file.suffix.lower() not in known:
+        raise InputError(
+            "not a format of point clouds", where=file, found=file.suffix or "no suffix", expected=" or ".join(known)
+        )
 
 
 def _cloud_of_fields(fields: dict[str, npt.NDArray[np.generic]], file: Path) -> PointCloud:
@@ -67,23 +74,40 @@ def _cloud_of_fields(fields: dict[str, npt.NDArray[np.generic]], file: Path) -> 
         raise InputError("fields are missing", where=file, found=", ".join(fields), expected="x, y, z")
     points = np.stack([fields[name].astype(np.float64) for name in "xyz"], axis=1)
     finite = np.isfinite(points).all(axis=1)
-    colors = _field_colors(fields)
+    colors = _field_colors({name.lower(): column for name, column in fields.items()}, file)
     return PointCloud(points[finite], None if colors is None else colors[finite])
 
 
-def _field_colors(fields: dict[str, npt.NDArray[np.generic]]) -> FloatArray | None:
-    """Return colours (n, 3) in 0 … 1: packed as in PCD, or three numbers as in PLY (whole ones count up to their type's largest)."""
+def _field_colors(fields: dict[str, npt.NDArray[np.generic]], file: Path) -> FloatArray | None:
+    """Return colours (n, 3) in 0 … 1: packed in one number, three of one field, or three columns. Raises InputError."""
     packed = fields.get("rgba", fields.get("rgb"))
     if packed is not None:
-        return _unpacked(packed)
-    if not all(name in fields for name in ("red", "green", "blue")):
-        return None
-    columns = np.stack([fields[name] for name in ("red", "green", "blue")], axis=1)
+        return _unpacked(packed) if packed.ndim == 1 else _scaled(packed[:, :3], file)
+    for names in _COLOR_NAMES:
+        if all(name in fields for name in names):
+            return _scaled(np.stack([fields[name] for name in names], axis=1), file)
+    return None
+
+
+def _scaled(columns: npt.NDArray[np.generic], file: Path) -> FloatArray:
+    """Return colours in 0 … 1, by the type of whole numbers, or by the largest value: up to 1, 255 or 65535."""
+    colors = columns.astype(np.float64)
+    if not colors.size:
+        return colors
+    low, high = float(np.nanmin(colors)), float(np.nanmax(colors))
     whole = np.issubdtype(columns.dtype, np.integer)
-    return columns / float(np.iinfo(columns.dtype).max) if whole else columns.astype(np.float64)
+    limits: tuple[float, ...] = (255.0, 65535.0) if whole else (1.0, 255.0, 65535.0)
+    if whole and columns.dtype.itemsize == 2 and high > 0:
+        limits = (65535.0,)
+    limit = next((limit for limit in limits if high <= limit), None)
+    if low < 0 or limit is None:
+        raise InputError(
+            "colours that are not understood", where=file, found=f"{low:g} … {high:g}", expected="0 … 1, 0 … 255 or 0 … 65535"
+        )
+    return np.nan_to_num(colors) / limit
 
 
 def _unpacked(packed: npt.NDArray[np.generic]) -> FloatArray:
     """Return colours (n, 3) from 0x..RRGGBB, kept as an integer or in the bits of a float."""
-    bits = packed.view(np.uint32) if packed.dtype == np.float32 else packed.astype(np.uint32)
+    bits = packed.view(np.uint32) if packed.dtype == np.float32 else packed.astype(np.int64)
     return np.stack([(bits >> shift) & 255 for shift in (16, 8, 0)], axis=1) / 255.0

@@ -1,8 +1,10 @@
-"""The cloud of a frame, from a PLY or PCD file or from a depth image; nothing is read before it is asked for."""
+"""The cloud of a frame, from a PLY, PCD or XYZ file or from a depth image; nothing is read before it is asked for."""
 
 from __future__ import annotations
 
 import re
+import warnings
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,11 +12,17 @@ import numpy as np
 
 from femsense.core.arrays import IntArray
 from femsense.core.errors import InputError
-from femsense.io.clouds.images import check_image_size, read_png
+from femsense.io.clouds.images import check_image_size, read_color, read_png
 from femsense.model.recording import Camera, Recording
 
 if TYPE_CHECKING:
     from femsense.pointcloud.cloud import PointCloud
+
+
+FOLDERS = {"clouds": (".ply", ".pcd", ".xyz"), "depth": (".png",), "color": (".png", ".jpg", ".jpeg")}
+"""Folders of a recording and the endings of what is read there."""
+BESIDE = (".txt", ".md", ".json", ".toml", ".csv", ".yaml", ".yml")
+"""Endings of notes that may lie beside clouds and images."""
 
 
 def read_frame_cloud(recording: Recording, k: int, *, view: int = 0) -> PointCloud | None:
@@ -41,7 +49,7 @@ def read_frame_cloud(recording: Recording, k: int, *, view: int = 0) -> PointClo
         raise
     except Exception as error:
         raise InputError(
-            "not readable as a cloud", where=file, found=f"{type(error).__name__}: {error}", expected="a PLY or PCD file"
+            "not readable as a cloud", where=file, found=f"{type(error).__name__}: {error}", expected="a PLY, PCD or XYZ file"
         ) from None
 
 
@@ -58,23 +66,34 @@ def _cloud_of_images(depth_file: Path, color_file: Path | None, camera: Camera |
     check_image_size(depth.shape[1], depth.shape[0], camera, depth_file)
     color = None
     if color_file is not None:
-        image = read_png(color_file)
-        check_image_size(image.shape[1], image.shape[0], camera, color_file)
-        color = np.stack([image] * 3, axis=2) if image.ndim == 2 else image[:, :, 2::-1]
+        color = read_color(color_file)
+        check_image_size(color.shape[1], color.shape[0], camera, color_file)
     c = camera
-    return cloud_from_depth(depth, c.fx, c.fy, c.cx, c.cy, c.distortion, c.depth_unit, color=color)
+    lens = (c.fx, c.fy, c.cx, c.cy, c.distortion, c.depth_unit)
+    return cloud_from_depth(depth, *lens, color=color, distortion_model=c.distortion_model)
 
 
 def find_clouds(folder: Path, views: tuple[str, ...], numbers: IntArray) -> tuple[Any, Any]:
     """Return the cloud (or depth) files and the colour files of each frame and view."""
     clouds, colors = [], []
     for name in views:
-        found = numbered_files(folder / "clouds" / name, (".ply", ".pcd"))
-        depth = numbered_files(folder / "depth" / name, (".png",))
-        color = numbered_files(folder / "color" / name, (".png",))
+        found, depth, color = (numbered_files(folder / kind / name, endings) for kind, endings in FOLDERS.items())
+        for kind, endings in FOLDERS.items():
+            _warn_of_unread(folder / kind / name, endings)
         clouds.append([found.get(n) or depth.get(n) for n in numbers.tolist()])
         colors.append([color.get(n) if n not in found and n in depth else None for n in numbers.tolist()])
     return tuple(zip(*clouds)), tuple(zip(*colors))
+
+
+def _warn_of_unread(folder: Path, endings: tuple[str, ...]) -> None:
+    """Warn of files that are neither read nor notes."""
+    files = [file for file in folder.iterdir() if file.is_file() and file.name[0] != "."] if folder.is_dir() else []
+    others = Counter(file.suffix.lower() or "no ending" for file in files if file.suffix.lower() not in (*endings, *BESIDE))
+    if others:
+        found = ", ".join(f"{count} × {ending}" for ending, count in others.items())
+        warnings.warn(
+            f"{folder}: files that are not read: {found}; what is read there ends in {', '.join(endings)}", stacklevel=4
+        )
 
 
 def numbered_files(folder: Path, endings: tuple[str, ...]) -> dict[int, Path]:

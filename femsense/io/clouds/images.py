@@ -1,4 +1,4 @@
-"""PNG images as cameras write them: depth of 16 bits and colour."""
+"""Images as cameras write them: depth of 16 bits (PNG) and colour (PNG, JPEG)."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.model.recording import Camera
 
@@ -25,6 +26,27 @@ def read_png(path: Path) -> npt.NDArray[Any]:
     image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
     if image is None:
         raise InputError("not readable as an image", where=path, found=f"{len(data)} bytes", expected="a PNG image")
+    return np.asarray(image)
+
+
+def read_color(path: Path) -> FloatArray:
+    """Return a colour image in 0 … 1, shape (H, W, 3), red first; grey becomes three equal ones. Raises InputError."""
+    image = read_png(path) if path.suffix.lower() == ".png" else _read_jpeg(path)
+    if image.dtype not in (np.uint8, np.uint16):
+        raise InputError("not a colour image", where=path, found=str(image.dtype), expected="8 or 16 bits a channel")
+    top = 255.0 if image.dtype == np.uint8 else 65535.0
+    rgb = np.stack([image] * 3, axis=2) if image.ndim == 2 else image[:, :, 2::-1]
+    return np.asarray(rgb / top, dtype=np.float64)
+
+
+def _read_jpeg(path: Path) -> npt.NDArray[Any]:
+    import cv2
+
+    data = path.read_bytes()
+    whole = data[:2] == b"\xff\xd8" and data.rstrip(b"\0")[-2:] == b"\xff\xd9"
+    image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED) if whole else None
+    if image is None:
+        raise InputError("a broken image", where=path, found=f"{len(data)} bytes", expected="a whole JPEG image")
     return np.asarray(image)
 
 

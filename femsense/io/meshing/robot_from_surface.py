@@ -23,11 +23,11 @@ from femsense.io.mesh_files import (
     FILL_SECONDS,
     SURFACE_ENDINGS,
     radius_ratio,
-    read_cells,
     read_triangles,
     tetrahedralise,
     write_mesh,
 )
+from femsense.io.meshes.reading import read_content
 from femsense.io.meshing.quality import quality_report, quality_text
 from femsense.io.meshing.surface import (
     ClosedSurface,
@@ -150,7 +150,8 @@ def read_any_surface(path: Path) -> tuple[FloatArray, IntArray]:
             expected="an STL, OBJ, PLY or OFF file",
             hint="export it as STL from the CAD program, in mm",
         )
-    points, cells = read_cells(path, str(path))
+    content = read_content(path, str(path))
+    points, cells = content.points, content.cells
     check_finite(points, str(path))
     if "triangle" not in cells or any(kind.startswith("tetra") for kind in cells):
         raise InputError(

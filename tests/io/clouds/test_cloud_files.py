@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import DATA
 
 from femsense.core.errors import InputError
-from femsense.io.clouds.pcd import _unpack_lzf
-from femsense.pointcloud import PointCloud, cloud_from_depth, read_cloud, read_pcd_fields, write_cloud
+from femsense.io.clouds.cloud_files import read_cloud, write_cloud
+from femsense.io.clouds.pcd import _unpack_lzf, read_pcd_fields
+from femsense.pointcloud import PointCloud, cloud_from_depth
 
 
 def some_cloud(count: int = 50, *, colors: bool = True, seed: int = 0) -> PointCloud:
@@ -171,7 +174,7 @@ def test_a_big_endian_ply_with_float_colours(tmp_path: Path) -> None:
             "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nend_header\n1\n",
             r"(?s)1 vertices.*2 vertices of 1",
         ),
-        ("a.xyz", "", r"not a format of point clouds"),
+        ("a.las", "", r"not a format of point clouds"),
     ],
 )
 def test_other_files_are_refused(tmp_path: Path, name: str, text: str, pattern: str) -> None:
@@ -216,6 +219,33 @@ def test_depth_image_is_projected_back_to_its_pixels_through_the_lens() -> None:
     np.testing.assert_allclose(pixels, np.stack([u.ravel(), v.ravel()], axis=1), atol=1e-6)
 
 
+def test_a_fisheye_is_undone() -> None:
+    import cv2
+
+    depth, _, _ = depth_of_plane(25.0, 27.0, 31.0, 18.0)
+    k = np.array([-0.05, 0.02, -0.003, 0.001])
+    cloud = cloud_from_depth(depth, 25.0, 27.0, 31.0, 18.0, [*k, 0.0], 1e-4, distortion_model="kannala_brandt")
+    K = np.array([[25.0, 0, 31.0], [0, 27.0, 18.0], [0, 0, 1]])
+    pixels = cv2.fisheye.projectPoints(cloud.points[:, None], np.zeros(3), np.zeros(3), K, k)[0].reshape(-1, 2)
+    v, u = np.mgrid[0:40, 0:60]
+    np.testing.assert_allclose(pixels, np.stack([u.ravel(), v.ravel()], axis=1), atol=1e-6)
+
+
+def test_the_inverse_model_takes_bent_rays_to_straight_ones() -> None:
+    """The formula of rs2_deproject_pixel_to_point in librealsense."""
+    k1, k2, p1, p2, k3 = lens = (-0.2, 0.05, 0.001, -0.002, 0.01)
+    depth = np.full((3, 4), 2, dtype=np.uint16)
+    cloud = cloud_from_depth(depth, 5.0, 6.0, 1.5, 1.0, lens, 0.5, distortion_model="inverse_brown_conrady")
+    v, u = np.mgrid[0:3, 0:4].reshape(2, -1)
+    x, y = (u - 1.5) / 5.0, (v - 1.0) / 6.0
+    r2 = x * x + y * y
+    f = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+    straight = [x * f + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * f + 2 * p2 * x * y + p1 * (r2 + 2 * y * y), 1.0 + 0 * x]
+    np.testing.assert_allclose(cloud.points, np.stack(straight, axis=1), rtol=1e-12)
+    with pytest.raises(InputError, match="unknown lens model"):
+        cloud_from_depth(depth, 5.0, 6.0, 1.5, 1.0, lens, distortion_model="pinhole")
+
+
 def test_colours_of_a_depth_image_belong_to_their_pixels() -> None:
     color = np.arange(12, dtype=np.uint8).reshape(2, 2, 3)
     cloud = cloud_from_depth(np.array([[0, 5], [6, 7]], dtype=np.uint16), 1, 1, 0, 0, color=color)
@@ -224,3 +254,72 @@ def test_colours_of_a_depth_image_belong_to_their_pixels() -> None:
         cloud_from_depth(np.ones((2, 3)), 1, 1, 0, 0, color=color)
     with pytest.raises(InputError, match="fx must be positive"):
         cloud_from_depth(np.ones((2, 3)), 0, 1, 0, 0)
+
+
+# Colours as people write them
+
+
+def ply_file(path: Path, names: Sequence[str], kind: str, values: np.ndarray) -> Path:
+    header = "ply\nformat ascii 1.0\nelement vertex 2\n" + "".join(f"property float {c}\n" for c in "xyz")
+    header += "".join(f"property {kind} {name}\n" for name in names) + "end_header\n"
+    path.write_text(header + "".join(f"0 0 1 {' '.join(map(str, row))}\n" for row in values.tolist()))
+    return path
+
+
+@pytest.mark.parametrize("names", [("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("R", "G", "B")])
+@pytest.mark.parametrize(
+    ("kind", "largest"), [("uchar", 255), ("ushort", 65535), ("int", 255), ("float", 1.0), ("float", 255.0), ("float", 65535.0)]
+)
+def test_colours_under_their_names_and_types(tmp_path: Path, names: Sequence[str], kind: str, largest: float) -> None:
+    values = np.array([[largest, 0, largest], [0, largest, 0]])
+    cloud = read_cloud(ply_file(tmp_path / "a.ply", names, kind, values if kind == "float" else values.astype(int)))
+    np.testing.assert_allclose(cloud.colors, [[1, 0, 1], [0, 1, 0]], atol=1e-12)
+
+
+def test_colours_that_are_not_understood_name_the_file(tmp_path: Path) -> None:
+    file = ply_file(tmp_path / "a.ply", ("red", "green", "blue"), "float", np.array([[-1.0, 0, 0], [0, 0, 0]]))
+    with pytest.raises(InputError, match="colours that are not understood") as error:
+        read_cloud(file)
+    assert str(file) in str(error.value)
+
+
+def test_three_colours_in_one_field_of_a_pcd(tmp_path: Path) -> None:
+    head = (
+        "VERSION 0.7\nFIELDS x y z rgb\nSIZE 4 4 4 1\nTYPE F F F U\nCOUNT 1 1 1 3\nWIDTH 1\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\n"
+    )
+    (tmp_path / "a.pcd").write_text(head + "POINTS 1\nDATA ascii\n0 0 1 255 0 51\n")
+    np.testing.assert_allclose(read_cloud(tmp_path / "a.pcd").colors, [[1.0, 0.0, 0.2]])
+
+
+@pytest.mark.parametrize(
+    ("text", "colors"),
+    [
+        ("0 0 1\n1 2 3\n", None),
+        ("2\n0,0,1\n1,2,3\n", None),
+        ("x y z r g b\n# a note\n0 0 1 255 0 0\n1 2 3 0 51 0\n", [[1, 0, 0], [0, 0.2, 0]]),
+        ("0 0 1 0 0 1\n1 2 3 0 1 0\n", None),
+        ("0 0 1 9 0.5 0 0\n1 2 3 9 0 0.25 0\n", [[0.5, 0, 0], [0, 0.25, 0]]),
+    ],
+)
+def test_points_in_a_text_file(tmp_path: Path, text: str, colors: list[list[float]] | None) -> None:
+    (tmp_path / "a.xyz").write_text(text)
+    cloud = read_cloud(tmp_path / "a.xyz")
+    np.testing.assert_array_equal(cloud.points, [[0, 0, 1], [1, 2, 3]])
+    assert (cloud.colors is None) == (colors is None)
+    if colors is not None:
+        np.testing.assert_allclose(cloud.colors, colors)
+
+
+@pytest.mark.parametrize("text", ["0 0 1\n1 2\n", "0 0 1\na b c\n", "0 0\n1 1\n"])
+def test_lines_that_are_no_points(tmp_path: Path, text: str) -> None:
+    (tmp_path / "a.xyz").write_text(text)
+    with pytest.raises(InputError, match="not a line of a point") as error:
+        read_cloud(tmp_path / "a.xyz")
+    assert ", line " in str(error.value)
+
+
+@pytest.mark.skipif(not (DATA / "trials" / "files").is_dir(), reason="the trials are not here")
+@pytest.mark.parametrize("name", ["diffuse.ply", "rgb_names.ply", "rgb3.pcd"])
+def test_files_whose_colours_were_dropped(name: str) -> None:
+    cloud = read_cloud(DATA / "trials" / "files" / name)
+    assert len(cloud) == 50 and cloud.colors is not None and cloud.colors.max() > 0.1

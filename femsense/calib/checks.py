@@ -1,0 +1,244 @@
+"""Whether measured markers can be those of the robot: unit, handedness, exchanged labels, strays.
+
+All is judged against the fitted model, by what another reading of the same numbers would leave: a scale, a mirror or an exchange counts
+where it takes most of the residual away.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from femsense.core.arrays import BoolArray, FloatArray, IntArray
+from femsense.core.errors import DataError
+from femsense.model.observation import Scene, in_robot_frame
+from femsense.model.recording import Recording, with_marker_table
+from femsense.model.robot import Robot
+
+SUSPICIOUS = 0.02
+"""A residual below this share of the markers' spread needs no other reading: real recordings in data/ leave 0.001 to 0.01."""
+EXPLAINED = 4.0
+"""Another reading counts where the residual falls by this factor."""
+HOPELESS = 0.5
+"""A residual above this share of the markers' spread is no fit, whatever the reason."""
+UNITS = {1e3: "millimetres", 1e2: "centimetres", 39.37: "inches", 3.281: "feet", 1e6: "micrometres", 1e-3: "kilometres"}
+"""Numbers so many times too large are in this unit."""
+STRAY = 0.1
+"""A stray is off by this share of the markers' spread at least: real recordings in data/ leave a tenth of it."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Pairs:
+    """Where the model has markers and where they were measured, both in the robot frame."""
+
+    modelled: FloatArray
+    """[m], shape (k, 3)."""
+    measured: FloatArray
+    """[m], shape (k, 3)."""
+    marker: IntArray
+    """shape (k,)."""
+    group: IntArray
+    """Frame of each row, an index 0 … F − 1, shape (k,)."""
+
+    @property
+    def spread(self) -> float:
+        """Root mean square distance of the modelled markers from their middle [m]."""
+        return float(np.sqrt(((self.modelled - self.modelled.mean(axis=0)) ** 2).sum(axis=1).mean()))
+
+
+def similarity(a: FloatArray, b: FloatArray, *, mirrored: bool = False) -> tuple[float, FloatArray]:
+    """Return the scale of b against a, and the residual [m], shape (k, 3), of the best turned, shifted and scaled b (Umeyama 1991).
+
+    Arguments:
+        a, b: corresponding points [m], shape (k, 3).
+        mirrored: mirror b first.
+    """
+    p, q = a - a.mean(axis=0), (b - b.mean(axis=0)) * ([-1.0, 1.0, 1.0] if mirrored else [1.0, 1.0, 1.0])
+    U, values, Vt = np.linalg.svd(p.T @ q)
+    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
+    scale = float((values * sign).sum() / max((q**2).sum(), 1e-300))
+    return 1.0 / max(scale, 1e-12), p - scale * q @ (U * sign @ Vt).T
+
+
+def _rigid(a: FloatArray, b: FloatArray, *, mirrored: bool = False, scale: float = 1.0) -> float:
+    """Return the rms [m] that the best turn and shift of b / scale leaves."""
+    p, q = a - a.mean(axis=0), (b - b.mean(axis=0)) / scale * ([-1.0, 1.0, 1.0] if mirrored else [1.0, 1.0, 1.0])
+    U, _, Vt = np.linalg.svd(p.T @ q)
+    R = U * [1.0, 1.0, np.sign(np.linalg.det(U @ Vt))] @ Vt
+    return float(np.sqrt(((p - q @ R.T) ** 2).sum(axis=1).mean()))
+
+
+def pairs_of(robot: Robot, scene: Scene, poses: Sequence[FloatArray], residual: FloatArray) -> list[Pairs]:
+    """Return modelled and measured markers of each camera; the residual [m], shape (k, 3), is measured − modelled."""
+    measured = in_robot_frame(scene.points, scene.view, poses, robot.observation)
+    views = [scene.view == v for v in range(len(poses))]
+    return [Pairs(measured[m] - residual[m], measured[m], scene.marker[m], scene.frame[m]) for m in views]
+
+
+def check_reading(robot: Robot, pairs: Sequence[Pairs], *, strict: bool = True) -> None:
+    """Refuse markers that are in another unit, mirrored, or have exchanged labels in all frames.
+
+    Arguments:
+        robot: for the names of its markers.
+        pairs: the markers of each camera.
+        strict: also refuse what does not fit for a reason that is not found.
+
+    Raises:
+        DataError: says what was found and what it looks like.
+    """
+    for one in pairs:
+        if len(np.unique(one.marker)) < 4 or one.spread <= 0:
+            continue
+        plain = _rigid(one.modelled, one.measured)
+        if plain < SUSPICIOUS * one.spread:
+            continue
+        found = f"the markers do not fit the robot: {100 * plain / one.spread:.3g} % of their spread of {1e3 * one.spread:.3g} mm is left"
+        scale, _ = similarity(one.modelled, one.measured)
+        if max(scale, 1 / scale) > 1.5 and _rigid(one.modelled, one.measured, scale=scale) * EXPLAINED < plain:
+            raise DataError(f"{found}. They are {scale:.4g} times too large: {_unit(scale)}. The files hold metres")
+        if _rigid(one.modelled, one.measured, mirrored=True) * EXPLAINED < plain:
+            raise DataError(
+                f"{found}. Mirrored they fit: are the axes left-handed? Camera frames are right-handed (x right, y down, z forward): change the sign of one axis"
+            )
+        exchanged = _exchanged(one, plain)
+        if exchanged:
+            names = "; ".join(f"{robot.marker_names[a]} and {robot.marker_names[b]}" for a, b in exchanged)
+            raise DataError(f"{found}. The labels seem exchanged: {names}. Exchange them in markers.csv")
+        if strict and plain > HOPELESS * one.spread:
+            raise DataError(f"{found}. Are these the markers of {robot.name!r}, in metres, under their names?")
+
+
+def _unit(scale: float) -> str:
+    nearest = min(UNITS, key=lambda known: abs(np.log(scale / known)))
+    return f"are they in {UNITS[nearest]}?" if abs(np.log(scale / nearest)) < 0.25 else "is the robot's mesh.unit right?"
+
+
+def _exchanged(pairs: Pairs, plain: float) -> list[tuple[int, int]]:
+    """Return the exchanges of two markers each that take most of the residual away; empty where none do."""
+    model = {int(m): pairs.modelled[pairs.marker == m].mean(axis=0) for m in np.unique(pairs.marker)}
+    named, result, left = pairs.marker.copy(), list[tuple[int, int]](), plain
+    for _ in range(len(model)):
+        best, chosen = left, None
+        for a, b in combinations(model, 2):
+            rms = _rigid(_modelled(pairs, model, _swapped(named, a, b)), pairs.measured)
+            best, chosen = (rms, (a, b)) if rms < 0.9 * best else (best, chosen)
+        if chosen is None:
+            break
+        named, left = _swapped(named, *chosen), best
+        result.append(chosen)
+    return result if left * EXPLAINED < plain else []
+
+
+def _swapped(named: IntArray, a: int, b: int) -> IntArray:
+    return np.where(named == a, b, np.where(named == b, a, named))
+
+
+def _modelled(pairs: Pairs, model: dict[int, FloatArray], named: IntArray) -> FloatArray:
+    """Return where the model has the markers under other names; each keeps its motion from frame to frame only roughly."""
+    return np.where((named == pairs.marker)[:, None], pairs.modelled, np.array([model[int(m)] for m in named]))
+
+
+def true_labels(places: FloatArray, measured: FloatArray, marker: IntArray, *, noise: float) -> IntArray:
+    """Return which marker each measured point is: as named, or exchanged where the names cannot be right.
+
+    The assignment with the least sum of squared distances (Kuhn 1955) counts where it takes EXPLAINED of the distance away of those that it
+    renames, and that distance was far above the noise.
+
+    Arguments:
+        places: where the model has all markers [m], shape (m, 3).
+        measured: one frame of one camera [m], same frame, shape (k, 3).
+        marker: as named, shape (k,).
+        noise: one standard deviation of a marker along an axis [m].
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    if len(marker) < 2:
+        return marker
+    squares = ((measured[:, None] - places[None]) ** 2).sum(axis=2)
+    rows, columns = linear_sum_assignment(squares)
+    best = marker.copy()
+    best[rows] = columns
+    changed = best != marker
+    if not changed.any() or len(np.unique(best)) < len(best):
+        return marker
+    before = np.sqrt(squares[changed, marker[changed]].mean())
+    after = np.sqrt(squares[changed, best[changed]].mean())
+    return best if after * EXPLAINED < before and before > 10.0 * noise else marker
+
+
+def relabelled(robot: Robot, scene: Scene, pairs: Sequence[Pairs], noise: float) -> tuple[Recording, bool]:
+    """Return the recording with exchanged labels put right and strays left out in the scene's frames, each named in a warning.
+
+    Arguments:
+        robot: the robot.
+        scene: the markers that were fitted.
+        pairs: their places, one item a camera, rows in the order of the scene's.
+        noise: what the fit leaves along an axis [m].
+
+    Returns:
+        the recording, and whether anything changed.
+    """
+    said: list[str] = []
+    marker, kept, groups, renamed = scene.marker.copy(), np.ones(len(scene.marker), dtype=np.bool_), 0, 0
+    for view, one in enumerate(pairs):
+        rows = np.flatnonzero(scene.view == view)
+        for group in np.unique(one.group):
+            mine = one.group == group
+            name, named = f"frame {int(scene.recording.frame_numbers[group])}", one.marker[mine]
+            new = true_labels(_all_places(robot, one, mine), one.measured[mine], named, noise=noise)
+            off = np.linalg.norm(one.measured[mine] - one.modelled[mine], axis=1)
+            far = _strays(off, one.spread) & (new == named)
+            if (new != named).any():
+                exchanged = " and ".join(robot.marker_names[m] for m in named[new != named])
+                said.append(f"{name}: the labels {exchanged} are exchanged, put right")
+            said += [
+                f"{name}: marker {robot.marker_names[m]} is {1e3 * d:.3g} mm off, left out" for m, d in zip(named[far], off[far])
+            ]
+            marker[rows[mine]], kept[rows[mine]] = new, ~far
+            groups, renamed = groups + 1, renamed + int((new != named).any())
+    if not said or renamed > 0.5 * groups:  # an exchange in most frames is one of the whole recording
+        return scene.recording, False
+    text = "; ".join(said[:6]) + (f"; and {len(said) - 6} more" if len(said) > 6 else "")
+    warnings.warn(f"{scene.recording.folder or 'the recording'}: {text}", stacklevel=4)
+    return _rewritten(robot, scene, marker, kept), True
+
+
+def _all_places(robot: Robot, pairs: Pairs, mine: BoolArray) -> FloatArray:
+    """Return where the model has every marker in a frame; one that nobody sees is far away."""
+    places = np.full((len(robot.marker_names), 3), 1e3)
+    places[pairs.marker[mine]] = pairs.modelled[mine]
+    return places
+
+
+def _strays(off: FloatArray, spread: float) -> BoolArray:
+    """Return which markers of one frame [m], shape (k,), are far from where the model has them while most others are near.
+
+    Sorted by distance, strays stand behind a jump by the factor EXPLAINED in the upper two fifths: errors of a model grow along the body
+    without one.
+    """
+    order = np.argsort(off)
+    first = max(int(np.ceil(0.6 * len(off))), 3)
+    jumps = [i for i in range(first, len(off)) if off[order[i]] > max(EXPLAINED * off[order[i - 1]], STRAY * spread)]
+    far = np.zeros(len(off), dtype=np.bool_)
+    far[order[jumps[0] :] if jumps else []] = True
+    return far
+
+
+def _rewritten(robot: Robot, scene: Scene, marker: IntArray, kept: BoolArray) -> Recording:
+    """Return the recording whose rows in the scene's frames have other names, or are gone."""
+    r = scene.recording
+    others = ~np.isin(r.marker_frame, scene.frames)
+    number = {name: i for i, name in enumerate(robot.marker_names)}
+    index = np.array([number[r.marker_names[i]] for i in r.marker_index], dtype=np.int64)
+    return with_marker_table(
+        replace(r, marker_names=robot.marker_names),
+        robot.marker_names,
+        np.concatenate([r.marker_frame[others], scene.frame[kept]]),
+        np.concatenate([index[others], marker[kept]]),
+        np.vstack([r.marker_xyz[others], scene.points[kept]]),
+        view=np.concatenate([r.marker_view[others], scene.view[kept]]),
+    )
