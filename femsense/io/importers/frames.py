@@ -44,9 +44,12 @@ class Lens:
 
     @property
     def storable(self) -> bool:
-        """Whether five numbers of Brown and Conrady hold this lens, as recording.toml has them."""
-        bent = np.any(self.distortion != 0.0)
-        return not bent or (self.model == "brown_conrady" and not np.any(self.distortion[5:] != 0.0))
+        """Whether a depth image of this lens is kept as an image.
+
+        What the RealSense SDK calls inverse is not what OpenCV's polynomial taken backwards gives (20 mm at 1 m with its usual
+        coefficients): such images become clouds, which nobody can misread.
+        """
+        return not np.any(self.distortion != 0.0) or self.model != "inverse_brown_conrady"
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -388,7 +388,10 @@ def _clock(bag: Bag, choice: Choice, options: Options) -> str:
             continue
         shifts, last = [], -np.inf
         for message, _ in zip(bag.messages([stream.topic.name]), range(PEEKED)):
-            time, _ = stamp_of(bag.decode(message))
+            try:
+                time, _ = stamp_of(bag.decode(message))
+            except InputError:
+                continue  # told when the frames are read
             if time <= 0.0 or time < last:
                 return "record"
             last = time

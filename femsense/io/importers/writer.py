@@ -18,7 +18,8 @@ from femsense.io.importers.frames import Frame, Images, Lens, Source
 from femsense.io.importers.journal import JOURNAL, Entry, Journal
 from femsense.io.importers.pictures import write_cloud_file, write_color, write_depth
 from femsense.io.importers.summary import summary
-from femsense.io.recording_folder import FORCE_COLUMNS, FORMAT, PLACE_COLUMNS
+from femsense.io.recording_folder import FORCE_COLUMNS, PLACE_COLUMNS
+from femsense.io.recording_toml import FORMAT
 from femsense.pointcloud.cloud import PointCloud
 
 RECORD = "import.json"
@@ -115,6 +116,8 @@ def _write_frame(source: Source, frame: Frame, part: Path, number: int) -> Entry
             kind = "broken"
     markers = {name: np.asarray(place, dtype=float).tolist() for name, place in frame.markers.items()}
     strangers = np.asarray(frame.unlabelled, dtype=float).reshape(-1, 3)
+    if markers:
+        strangers = strangers[:0]  # a recording has named markers or unnamed ones in a frame
     if center is None and (markers or len(strangers)):
         center = np.mean([*markers.values(), *strangers.tolist()], axis=0).tolist()
     loads = [[*np.asarray(p, dtype=float).tolist(), *np.asarray(f, dtype=float).tolist()] for p, f in frame.loads]
@@ -207,8 +210,10 @@ def _document(source: Source, actuation: str, zero: str, part: Path) -> dict[str
     if lens is None or not (part / "depth").is_dir():
         return document
     table = {key: getattr(lens, key) for key in ("width", "height", "fx", "fy", "cx", "cy")}
-    distortion = np.concatenate([lens.distortion, np.zeros(5)])[:5].tolist()
-    return document | {"camera": {**table, "distortion": distortion, "depth_unit_m": source.depth_unit_m}}
+    count = 5 if not np.any(lens.distortion[5:] != 0.0) else 8
+    distortion = np.concatenate([lens.distortion, np.zeros(8)])[:count].tolist()
+    model = {"distortion_model": lens.model} if lens.model != "brown_conrady" else {}
+    return document | {"camera": {**table, "distortion": distortion, **model, "depth_unit_m": source.depth_unit_m}}
 
 
 def _frame_rows(journal: Journal, start: float, columns: list[str], applied: Mapping[str, Any]) -> Iterator[Sequence[object]]:
