@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -90,12 +89,17 @@ def import_into(
         return known
     source = open_source(source_path, options)
     log = None if actuation is None else read_actuation_log(actuation, options)
-    old = _set_aside(final) if again else None
     found = write_recording(
-        source, final, identity=identity, actuation=inputs, zero=zero, log=log, offset=offset, progress=progress
+        source,
+        final,
+        identity=identity,
+        actuation=inputs,
+        zero=zero,
+        log=log,
+        offset=offset,
+        replace=again,
+        progress=progress,
     )
-    if old is not None:
-        shutil.rmtree(old, ignore_errors=True)
     return {**found, "notes": list(source.notes), **_accepted(final, found)}
 
 
@@ -155,16 +159,6 @@ def _standing(final: Path, identity: Mapping[str, Any], again: bool) -> dict[str
         found=str(kept.get("identity", {}).get("source", ["?"])[0]),
         expected="a new place, or --again to replace it",
     )
-
-
-def _set_aside(final: Path) -> Path | None:
-    """Move an earlier import out of the way until the new one is written."""
-    if not final.is_dir():
-        return None
-    old = final.with_name(f".part-old-{final.name}")
-    shutil.rmtree(old, ignore_errors=True)
-    final.rename(old)
-    return old
 
 
 def _accepted(final: Path, found: Mapping[str, Any]) -> dict[str, Any]:

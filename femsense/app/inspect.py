@@ -59,7 +59,7 @@ MESH_ENDINGS = (
     ".med",
     ".vol",
 )
-CAPTURE_ENDINGS = (".bag", ".db3", ".mcap", ".c3d")
+CAPTURE_ENDINGS = (".bag", ".db3", ".mcap", ".c3d", ".xyz", ".gz")
 CLOUDS_READ = 8
 """So many clouds of a recording are read whole; of the others only the name and the size are checked."""
 POOR_QUALITY = 0.05

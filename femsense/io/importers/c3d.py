@@ -20,6 +20,8 @@ from femsense.core.errors import InputError
 from femsense.io.importers.frames import Frame, Options, Source, unit_of, upright
 
 BLOCK = 512
+MOST = 65535
+"""The header cannot count farther; some writers stop there without the longer count of TRIAL."""
 INTEL, DEC, MIPS = 84, 85, 86
 """The processors whose numbers a file holds: little-endian, VAX, big-endian."""
 
@@ -54,7 +56,9 @@ def open_c3d(path: Path, options: Options) -> Source:
     header = read_c3d_header(path)
     if not header.points:
         raise InputError("no points", where=path, found=f"{header.analog} analog values a frame", expected="markers over time")
-    whole = min(header.frames, max(path.stat().st_size - header.data_at, 0) // _frame_size(header))
+    whole = min(header.frames, _whole_frames(path, header))
+    if header.frames == MOST:
+        whole = _whole_frames(path, header)
     if not whole:
         raise InputError(
             "a C3D file without a whole frame",
@@ -65,6 +69,7 @@ def open_c3d(path: Path, options: Options) -> Source:
     chosen = _chosen_labels(header, options, path)
     scale = unit_of(options, header.unit, path, _extent(path, header, whole))
     notes = [f"the file is cut off: {whole} of {header.frames} frames"] if whole < header.frames else []
+    notes += [f"the header counts to {MOST} only: {whole} frames by the size of the file"] if whole > header.frames else []
     return Source(
         "c3d",
         path,
@@ -127,6 +132,19 @@ def _frames(
             kept = {name: k for k, name in chosen if not missing[k]}
             xyz = upright(scale * places[list(kept.values())], up)
             yield Frame(number / header.rate, markers=dict(zip(kept, xyz)))
+
+
+def _whole_frames(path: Path, header: Header) -> int:
+    """Return how many frames the file holds, without the zeros that fill its last block."""
+    size = _frame_size(header)
+    count = max(path.stat().st_size - header.data_at, 0) // size
+    with path.open("rb") as stream:
+        for _ in range(min(count, BLOCK // size)):
+            stream.seek(header.data_at + (count - 1) * size)
+            if any(stream.read(size)):
+                break
+            count -= 1
+    return count
 
 
 def _frame_size(header: Header) -> int:

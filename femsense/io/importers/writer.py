@@ -36,18 +36,20 @@ def write_recording(
     zero: str | None = None,
     log: ActuationLog | None = None,
     offset: float | None = None,
+    replace: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Write the frames of a source as a recording, or go on where an earlier import of the same was stopped.
 
     Arguments:
         source: what an importer found.
-        folder: the final place; nothing may stand there.
+        folder: the final place.
         identity: what the import is made from: only an unfinished folder of the same is continued.
         actuation: "tension" or "displacement", where the source does not say.
         zero: "absolute" or "unknown"; by default tensions are absolute, displacements count from an unknown zero.
         log: inputs on a clock of their own.
         offset: source time minus the log's time [s]; None finds it from the motion.
+        replace: an earlier recording at this place goes when the new one is whole.
         progress: called with (frames done, frames in all).
 
     Returns:
@@ -64,8 +66,19 @@ def write_recording(
     found = _finish(source, part, journal, counts, actuation, zero, log, offset)
     write_json(part / RECORD, {"identity": identity, "found": found})
     (part / JOURNAL).unlink()
-    part.rename(final)
+    _give_name(part, final, replace)
     return found
+
+
+def _give_name(part: Path, final: Path, replace: bool) -> None:
+    """Rename the finished folder. Raises InputError where something stands there that nobody said to replace."""
+    if final.exists() and not (final.is_dir() and (replace or not any(final.iterdir()))):
+        raise InputError("something stands there already", where=final, expected="a new place for the recording")
+    old = final.with_name(f"{PART_PREFIX}old-{final.name}")
+    if final.exists():
+        final.rename(old)
+    part.rename(final)
+    shutil.rmtree(old, ignore_errors=True)
 
 
 def _prepare(part: Path, identity: Mapping[str, Any]) -> None:
