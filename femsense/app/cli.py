@@ -409,6 +409,10 @@ def improve(
 def export(
     run: RunPath,
     output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="The file to write.")] = Path("robot.glb"),
+    mcap: Annotated[
+        Path | None,
+        typer.Option("--mcap", metavar="FILE", help="Write messages of ROS 2 for Foxglove instead.", show_default=False),
+    ] = None,
     bones: Annotated[
         int | None,
         typer.Option("--bones", min=1, max=255, help="How many bones; chosen by itself if not given.", show_default=False),
@@ -416,6 +420,14 @@ def export(
     json: Json = False,
 ) -> Answer:
     """Write a run as a skinned, animated mesh (glTF)."""
+    if mcap is not None:
+        from dataclasses import asdict
+
+        from femsense.xr.mcap_export import export_mcap
+
+        written = export_mcap(run, mcap)
+        text = f"{written.frames} frames, {written.clouds} clouds, {written.contacts} contacts on {len(written.topics)} topics"
+        return Answer({"path": str(mcap), **asdict(written)}, f"{text}\n\nwritten: {mcap}")
     from femsense.xr.export import export_glb
 
     report = export_glb(run, output, bones=bones)
