@@ -28,7 +28,7 @@ T = TypeVar("T")
 STOPPED = 130
 STOPPED_TEXT = "stopped; nothing half-written is left, and the same command goes on"
 """Exit status after Ctrl-C, as shells have it."""
-SEVERAL = ("--at", "--validation", "--effects", "--without", "--target", "--force")
+SEVERAL = ("--at", "--validation", "--effects", "--without", "--target", "--force", "--topic", "--map")
 """Options that take several values after one another."""
 
 
@@ -114,6 +114,73 @@ def inspect(
     else:
         report = inspect_path(path)
     return Answer(report, describe(report), exit_status=2 if report["problems"] else 0)
+
+
+@app.command("import")
+def import_(
+    source: Annotated[
+        Path, typer.Argument(metavar="SOURCE", help="A bag, a motion capture, a folder of images or clouds.", show_default=False)
+    ],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="RECORDING", help="The folder to write.", show_default=False)],
+    format: Annotated[
+        str | None,
+        typer.Option("--format", metavar="NAME", help="If the guess is wrong; see docs/importing.md.", show_default=False),
+    ] = None,
+    topic: Annotated[
+        list[str] | None,
+        typer.Option("--topic", metavar="NAME", help="What to take, where there is a choice.", show_default=False),
+    ] = None,
+    map_: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--map", metavar="NAME=TARGET", help="Such as motor1=cable_north*4.6, 3=tip.x, /ft=load@X,Y,Z.", show_default=False
+        ),
+    ] = None,
+    unit: Annotated[str | None, typer.Option("--unit", metavar="m|cm|mm", help="Of lengths.", show_default=False)] = None,
+    up: Annotated[
+        str | None, typer.Option("--up", metavar="x|y|z", help="The vertical axis; it is turned to z.", show_default=False)
+    ] = None,
+    clock: Annotated[str, typer.Option("--clock", metavar="auto|header|record", help="Which time stamps of a bag.")] = "auto",
+    rate: Annotated[
+        float | None, typer.Option("--rate", metavar="HZ", help="Where the source has no times.", show_default=False)
+    ] = None,
+    inputs: Annotated[
+        str | None,
+        typer.Option("--inputs", metavar="tension|displacement", help="What the cables' values are.", show_default=False),
+    ] = None,
+    zero: Annotated[
+        str | None, typer.Option("--zero", metavar="absolute|unknown", help="What they count from.", show_default=False)
+    ] = None,
+    actuation: Annotated[
+        Path | None,
+        typer.Option("--actuation", metavar="FILE", help="A CSV file with the inputs over time.", show_default=False),
+    ] = None,
+    offset: Annotated[
+        float | None,
+        typer.Option("--offset", metavar="S", help="The frames' time minus that file's; else from motion.", show_default=False),
+    ] = None,
+    again: Annotated[bool, typer.Option("--again", help="Import even where RECORDING holds an import.")] = False,
+    json: Json = False,
+) -> Answer:
+    """Make a recording of what other programs recorded."""
+    from femsense.app.import_command import import_into, import_options, import_text
+
+    options = import_options(format=format, topics=topic or [], columns=map_ or [], unit=unit, up=up, clock=clock, rate=rate)
+    with _progress("import") as progress:
+        document = import_into(
+            output,
+            source,
+            options,
+            say=_say,
+            inputs=inputs,
+            zero=zero,
+            actuation=actuation,
+            offset=offset,
+            again=again,
+            progress=progress,
+        )
+    text = f"{import_text(output, document)}\n\nwritten: {output}\nlook at it: femsense inspect {output}"
+    return Answer({"recording": str(output), **document}, text)
 
 
 @app.command()
@@ -346,6 +413,10 @@ def improve(
 def export(
     run: RunPath,
     output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="The file to write.")] = Path("robot.glb"),
+    mcap: Annotated[
+        Path | None,
+        typer.Option("--mcap", metavar="FILE", help="Write messages of ROS 2 for Foxglove instead.", show_default=False),
+    ] = None,
     bones: Annotated[
         int | None,
         typer.Option("--bones", min=1, max=255, help="How many bones; chosen by itself if not given.", show_default=False),
@@ -353,6 +424,14 @@ def export(
     json: Json = False,
 ) -> Answer:
     """Write a run as a skinned, animated mesh (glTF)."""
+    if mcap is not None:
+        from dataclasses import asdict
+
+        from femsense.xr.mcap_export import export_mcap
+
+        written = export_mcap(run, mcap)
+        text = f"{written.frames} frames, {written.clouds} clouds, {written.contacts} contacts on {len(written.topics)} topics"
+        return Answer({"path": str(mcap), **asdict(written)}, f"{text}\n\nwritten: {mcap}")
     from femsense.xr.export import export_glb
 
     report = export_glb(run, output, bones=bones)

@@ -59,7 +59,7 @@ MESH_ENDINGS = (
     ".med",
     ".vol",
 )
-CAPTURE_ENDINGS = (".bag", ".db3", ".mcap", ".c3d")
+CAPTURE_ENDINGS = (".bag", ".db3", ".mcap", ".c3d", ".xyz", ".gz")
 CLOUDS_READ = 8
 """So many clouds of a recording are read whole; of the others only the name and the size are checked."""
 POOR_QUALITY = 0.05
@@ -124,7 +124,9 @@ def describe(report: Mapping[str, Any]) -> str:
         if texts:
             lines += ["", f"{len(texts)} {title if len(texts) > 1 else title[:-1]}:"]
             lines += [_bullet(text) for text in texts]
-    if not report.get("problems"):
+    if report["kind"] in ("capture", "table") and not report.get("problems"):
+        lines += ["", "this much was read; femsense import reads the rest"]
+    elif not report.get("problems"):
         lines += ["", "nothing is wrong with it" if not report.get("warnings") else "no problems"]
     return "\n".join(lines)
 
@@ -709,16 +711,32 @@ def _npz_report(file: Path) -> Report:
 
 
 def _table_file(file: Path, report: Report, problems: list[str]) -> None:
+    from femsense.io.importers.guess import guess_format
+
+    if guess_format(file) in ("optitrack", "vicon"):
+        report["kind"] = "capture"
+        _capture(file, report, problems)
+        return
     report.update(_csv_report(file))
 
 
-def _capture(file: Path, report: Report, problems: list[str]) -> None:
-    report.update({"bytes": file.stat().st_size, "next": "femsense import makes a recording of it"})
-    if not file.stat().st_size:
-        problems.append(f"{file}: the file is empty")
+def _capture(path: Path, report: Report, problems: list[str]) -> None:
+    """Ask the importer what is in it; frames are not read here."""
+    from femsense.io.importers.guess import contents
+
+    report["bytes"] = path.stat().st_size if path.is_file() else None
+    found = _attempt(lambda: contents(path), problems)
+    if found is not None:
+        report.update({**found, "next": "femsense import reads its frames and makes a recording of it"})
 
 
 def _folder(folder: Path, report: Report, problems: list[str]) -> None:
+    from femsense.io.importers.guess import guess_format
+
+    if guess_format(folder) is not None:
+        report["kind"] = "capture"
+        _capture(folder, report, problems)
+        return
     endings = Counter(item.suffix.lower() or "(none)" for item in folder.iterdir() if item.is_file())
     report.update({"files": dict(endings), "folders": sorted(item.name for item in folder.iterdir() if item.is_dir())})
     problems.append(
@@ -749,6 +767,12 @@ def _unknown(file: Path, report: Report, problems: list[str]) -> None:
 
 
 # Text
+
+
+def section_text(items: Mapping[str, Any]) -> list[str]:
+    """Return lines of aligned labels and values."""
+    return _section(items, 2)
+
 
 UNITS = {
     "kg_m3": "kg/m³",

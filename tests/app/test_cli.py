@@ -24,7 +24,20 @@ from femsense.app.commands import loop_page
 from femsense.core.errors import DataError, InputError
 from femsense.io.files import PART_PREFIX
 
-COMMANDS = ("demo", "inspect", "mesh", "simulate", "calibrate", "estimate", "improve", "export", "view", "report", "doctor")
+COMMANDS = (
+    "demo",
+    "inspect",
+    "import",
+    "mesh",
+    "simulate",
+    "calibrate",
+    "estimate",
+    "improve",
+    "export",
+    "view",
+    "report",
+    "doctor",
+)
 ROOT = Path(femsense.__file__).parents[1]
 
 

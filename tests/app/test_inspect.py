@@ -273,8 +273,8 @@ def test_nothing_at_a_path_is_the_only_error(tmp_path: Path) -> None:
 
 
 def test_what_is_not_known(tmp_path: Path) -> None:
-    (tmp_path / "a.xyz").write_text("x")
-    assert inspect(tmp_path / "a.xyz")["kind"] == "unknown"
+    (tmp_path / "a.abc").write_text("x")
+    assert inspect(tmp_path / "a.abc")["kind"] == "unknown"
     report = inspect(tmp_path)
     assert report["kind"] == "unknown" and "femsense import" in report["problems"][0]
 

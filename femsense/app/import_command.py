@@ -1,0 +1,174 @@
+"""`femsense import`: from a capture of another program to a recording folder, and what is said of it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import femsense
+from femsense.core.errors import InputError
+from femsense.io.importers.actuation import read_actuation_log
+from femsense.io.importers.frames import UNITS, Options
+from femsense.io.importers.guess import open_source
+from femsense.io.importers.writer import RECORD, write_recording
+
+Progress = Callable[..., None]
+Say = Callable[[str], None]
+
+
+def import_options(
+    *,
+    format: str | None = None,
+    topics: Sequence[str] = (),
+    columns: Sequence[str] = (),
+    unit: str | None = None,
+    up: str | None = None,
+    clock: str = "auto",
+    rate: float | None = None,
+) -> Options:
+    """Return the options of the command line, checked. Raises InputError."""
+    for name, value, allowed in (
+        ("--unit", unit, tuple(UNITS)),
+        ("--up", up, ("x", "y", "z")),
+        ("--clock", clock, ("auto", "header", "record")),
+    ):
+        if value is not None and value not in allowed:
+            raise InputError(f"not a value of {name}", where=name, found=value, expected="|".join(allowed))
+    pairs = [text.rpartition("=") if "@" not in text else text.partition("=") for text in columns]
+    for text, (old, mark, new) in zip(columns, pairs):
+        if not (old and mark and new):
+            raise InputError(
+                "not a mapping", where="--map", found=text, expected="NAME=TARGET, such as motor1=cable_north or 3=tip.x"
+            )
+    if rate is not None and rate <= 0:
+        raise InputError("not a rate", where="--rate", found=rate, expected="frames a second, > 0")
+    return Options(format, tuple(topics), {old: new for old, _, new in pairs}, unit, up, clock, rate)
+
+
+def import_into(
+    folder: str | Path,
+    path: str | Path,
+    options: Options,
+    *,
+    say: Say,
+    inputs: str | None = None,
+    zero: str | None = None,
+    actuation: str | Path | None = None,
+    offset: float | None = None,
+    again: bool = False,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Import a capture into a recording folder, or return what stands there if it was made from the same.
+
+    Arguments:
+        folder: of the recording.
+        path: the capture.
+        options: what a person says about it.
+        say: told in one line what happens beside.
+        inputs: what cables' values are, "tension" or "displacement", where the capture does not say.
+        zero: "absolute" or "unknown".
+        actuation: a CSV file with the inputs over time.
+        offset: the frames' time minus that file's [s]; None finds it from the motion.
+        again: import anew although the recording is there.
+        progress: called with (frames done, frames in all).
+
+    Raises:
+        InputError: whatever is wrong with the capture, or another thing at this place.
+    """
+    for name, value, allowed in (("--inputs", inputs, ("tension", "displacement")), ("--zero", zero, ("absolute", "unknown"))):
+        if value is not None and value not in allowed:
+            raise InputError(f"not a value of {name}", where=name, found=value, expected="|".join(allowed))
+    final, source_path = Path(folder), Path(path).expanduser()
+    identity = _identity(source_path, options, inputs, zero, actuation, offset)
+    known = _standing(final, identity, again)
+    if known is not None:
+        say(f"{final} holds this import already (--again makes it anew)")
+        return known
+    source = open_source(source_path, options)
+    log = None if actuation is None else read_actuation_log(actuation, options)
+    found = write_recording(
+        source,
+        final,
+        identity=identity,
+        actuation=inputs,
+        zero=zero,
+        log=log,
+        offset=offset,
+        replace=again,
+        progress=progress,
+    )
+    return {**found, "notes": list(source.notes), **_accepted(final, found)}
+
+
+def import_text(folder: str | Path, document: Mapping[str, Any]) -> str:
+    """Return what was imported as plain text."""
+    from femsense.app.inspect import section_text
+
+    notes = document.get("notes", [])
+    shown = {key: value for key, value in document.items() if key not in ("notes",)}
+    lines = [f"{folder}: a recording of {document['frames']} frames", "", *section_text(shown)]
+    lines += ["", *(f"note: {note}" for note in notes)] if notes else []
+    return "\n".join(lines)
+
+
+def _identity(
+    path: Path, options: Options, inputs: str | None, zero: str | None, actuation: str | Path | None, offset: float | None
+) -> dict[str, Any]:
+    """Return what an import is made from: another file, another time of its change or another option is another import."""
+    return {
+        "source": _state(path),
+        "options": asdict(options),
+        "inputs": inputs,
+        "zero": zero,
+        "actuation": None if actuation is None else _state(Path(actuation)),
+        "offset": offset,
+        "femsense": femsense.__version__,
+    }
+
+
+def _state(path: Path) -> list[Any]:
+    if not path.exists():
+        raise InputError("nothing there", where=path, expected="a file or a folder")
+    files = sorted(item for item in path.rglob("*") if item.is_file()) if path.is_dir() else [path]
+    stats = [file.stat() for file in files]
+    return [str(path.resolve()), len(files), sum(s.st_size for s in stats), max((s.st_mtime_ns for s in stats), default=0)]
+
+
+def _standing(final: Path, identity: Mapping[str, Any], again: bool) -> dict[str, Any] | None:
+    """Return what an earlier import of the same says; None where there is none. Raises InputError where something else stands."""
+    if not final.exists() and not final.is_symlink():
+        return None
+    if final.is_dir() and not any(final.iterdir()):
+        return None
+    record = final / RECORD
+    if not record.is_file():
+        raise InputError(
+            "something stands there already", where=final, found="no import of femsense", expected="a new place for the recording"
+        )
+    kept = json.loads(record.read_text(encoding="utf-8"))
+    if again:
+        return None
+    if kept.get("identity") == json.loads(json.dumps(identity)):
+        return dict(kept["found"])
+    raise InputError(
+        "another import stands there already",
+        where=final,
+        found=str(kept.get("identity", {}).get("source", ["?"])[0]),
+        expected="a new place, or --again to replace it",
+    )
+
+
+def _accepted(final: Path, found: Mapping[str, Any]) -> dict[str, Any]:
+    """Say whether the other commands take the recording as it is."""
+    from femsense.io.recording_folder import load_recording
+
+    try:
+        load_recording(final)
+    except InputError as problem:
+        if not found.get("unlabelled_markers"):
+            raise
+        return {"not_ready": " ".join(str(problem).split())}
+    return {}

@@ -1,0 +1,158 @@
+"""A log of what drove the robot, on a clock of its own: laid onto the frames by a known offset, or by the motion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from femsense.core.arrays import FloatArray
+from femsense.core.errors import InputError
+from femsense.io.importers.frames import Options
+from femsense.io.importers.journal import Journal
+from femsense.io.importers.plain_csv import named_columns, read_numbers, time_column
+
+SURE = 0.6
+"""A correlation below this does not tell the offset."""
+APART = 0.1
+"""The best correlation must lie this much above the next peak."""
+GRID = 4000
+"""Samples of the common clock on which motion and inputs are compared, at most."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ActuationLog:
+    """Inputs over time."""
+
+    path: Path
+    time_s: FloatArray
+    """On the log's clock [s], increasing, shape (n,)."""
+    columns: tuple[str, ...]
+    """Columns of frames.csv."""
+    values: FloatArray
+    """[N], [m] or [Pa], shape (n, columns)."""
+    actuation: str | None = None
+
+    def at(self, times: FloatArray) -> dict[str, FloatArray]:
+        """Return each column at these times of the log's clock [s], linearly between the rows, held at the ends."""
+        return {name: np.interp(times, self.time_s, self.values[:, j]) for j, name in enumerate(self.columns)}
+
+
+def read_actuation_log(path: str | Path, options: Options) -> ActuationLog:
+    """Read a CSV file with a column of time and columns of inputs.
+
+    Arguments:
+        path: the file.
+        options: `columns` maps its columns; without it, those named cable_… or chamber_… are taken, else all but the time.
+
+    Raises:
+        InputError: no time, no inputs, times that go back.
+    """
+    file = Path(path)
+    names, table = read_numbers(file)
+    clock, scale = time_column(names, file)
+    time_s = table[:, clock] * scale
+    mapped = named_columns(names, options.columns, ("cable_", "chamber_"))
+    direct = [(name, j, 1.0) for j, name in enumerate(names) if name.startswith(("cable_", "chamber_"))]
+    others = [(f"cable_{name}", j, 1.0) for j, name in enumerate(names) if j != clock and name.lower() not in ("frame", "id")]
+    chosen = mapped or direct or others
+    if not chosen:
+        raise InputError(
+            "no inputs", where=file, found=", ".join(names), expected="columns cable_… or chamber_…, or --map NAME=cable_x"
+        )
+    kept = np.isfinite(time_s) & np.isfinite(table[:, [j for _, j, _ in chosen]]).all(axis=1)
+    time_s = time_s[kept]
+    if len(time_s) < 2 or (np.diff(time_s) <= 0).any():
+        raise InputError("time does not increase", where=file, found=f"{len(time_s)} rows", expected="rows in order of time")
+    values = np.stack([factor * table[kept, j] for _, j, factor in chosen], axis=1)
+    return ActuationLog(file, time_s, tuple(name for name, _, _ in chosen), values)
+
+
+def align(log: ActuationLog, journal: Journal, offset: float | None) -> tuple[ActuationLog, dict[str, Any]]:
+    """Return the log on the frames' clock, and how it got there.
+
+    Arguments:
+        log: the inputs.
+        journal: the frames, with the centre of what was seen.
+        offset: the frames' time minus the log's [s]; None finds it.
+
+    Raises:
+        InputError: the motion does not tell the offset, or the two do not overlap.
+    """
+    times = journal.times()
+    said: dict[str, Any] = {"actuation_log": log.path.name, "actuation_offset_from": "--offset"}
+    if offset is None:
+        offset, best, next_best = _offset_of_motion(log, journal, times)
+        said = {
+            "actuation_log": log.path.name,
+            "actuation_offset_from": "correlation of motion and inputs",
+            "actuation_correlation": best,
+            "actuation_next_correlation": next_best,
+        }
+    moved = ActuationLog(log.path, log.time_s + offset, log.columns, log.values, log.actuation)
+    inside = (times >= moved.time_s[0]) & (times <= moved.time_s[-1])
+    if not inside.any():
+        raise InputError(
+            "the log of actuation and the frames do not overlap",
+            where=log.path,
+            found=f"log {moved.time_s[0]:.3f} … {moved.time_s[-1]:.3f} s, frames {times[0]:.3f} … {times[-1]:.3f} s",
+            expected="the same clock, or --offset SECONDS (frames' time minus the log's)",
+        )
+    return moved, {**said, "actuation_offset_s": float(offset), "frames_beyond_log": int((~inside).sum())}
+
+
+def _offset_of_motion(log: ActuationLog, journal: Journal, times: FloatArray) -> tuple[float, float, float]:
+    """Return the offset [s], its correlation, and that of the next peak."""
+    centers = np.array([entry.center or [np.nan] * 3 for entry in journal.entries()])
+    kept = np.isfinite(centers).all(axis=1)
+    if kept.sum() < 8:
+        raise _unsure(log, "fewer than eight frames show the robot")
+    step = max(float(np.median(np.diff(times))), (times[-1] - times[0] + np.ptp(log.time_s)) / GRID)
+    motion = _activity(times[kept], centers[kept], step)
+    drive = _activity(log.time_s, log.values / np.maximum(np.ptp(log.values, axis=0), 1e-12), step)
+    score = _correlations(motion, drive)
+    best = int(np.argmax(score))
+    width = max(3, len(motion) // 50)
+    others = np.delete(score, np.arange(max(best - width, 0), min(best + width + 1, len(score))))
+    next_best = float(others.max(initial=0.0))
+    if score[best] < SURE or score[best] - next_best < APART:
+        raise _unsure(log, f"the best correlation is {score[best]:.2f}, the next {next_best:.2f}")
+    lag = best - (len(drive) - 1)
+    return float(times[kept][0] - log.time_s[0] + lag * step), float(score[best]), next_best
+
+
+def _activity(times: FloatArray, values: FloatArray, step: float) -> FloatArray:
+    """Return how fast values change, on a grid of `step` [s]."""
+    grid = np.arange(times[0], times[-1] + 0.5 * step, step)
+    even = np.stack([np.interp(grid, times, column) for column in values.T], axis=1)
+    return np.asarray(np.linalg.norm(np.diff(even, axis=0), axis=1))
+
+
+def _correlations(motion: FloatArray, drive: FloatArray) -> FloatArray:
+    """Return Pearson's correlation over the overlap for each lag −(len(drive) − 1) … len(motion) − 1; 0 below half an overlap."""
+    from scipy.signal import fftconvolve
+
+    ones_m, ones_d = np.ones_like(motion), np.ones_like(drive)
+
+    def over(a: FloatArray, b: FloatArray) -> FloatArray:
+        return np.asarray(fftconvolve(a, b[::-1]))
+
+    n = np.rint(over(ones_m, ones_d))
+    sum_m, sum_d = over(motion, ones_d), over(ones_m, drive)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        covariance = over(motion, drive) - sum_m * sum_d / n
+        spread = (over(motion**2, ones_d) - sum_m**2 / n) * (over(ones_m, drive**2) - sum_d**2 / n)
+        score = covariance / np.sqrt(np.maximum(spread, 1e-300))
+    enough = n >= max(8, min(len(motion), len(drive)) // 2)
+    return np.where(enough & np.isfinite(score), np.clip(score, -1.0, 1.0), 0.0)
+
+
+def _unsure(log: ActuationLog, found: str) -> InputError:
+    return InputError(
+        "the motion does not tell the offset between the log of actuation and the frames",
+        where=log.path,
+        found=found,
+        expected="--offset SECONDS: the frames' time minus the log's (0 where both have one clock)",
+    )

@@ -1,0 +1,289 @@
+"""C3D files of motion capture (https://www.c3d.org): points over time, in the unit that the file names.
+
+Read here, one frame after the other: the readers that exist load the whole file.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from femsense.core.arrays import FloatArray
+from femsense.core.errors import InputError
+from femsense.io.importers.frames import Frame, Options, Source, unit_of, upright
+
+BLOCK = 512
+MOST = 65535
+"""The header cannot count farther; some writers stop there without the longer count of TRIAL."""
+INTEL, DEC, MIPS = 84, 85, 86
+"""The processors whose numbers a file holds: little-endian, VAX, big-endian."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Header:
+    """What a C3D file says of itself."""
+
+    points: int
+    analog: int
+    """Analog values a frame."""
+    frames: int
+    rate: float
+    """[1/s]."""
+    scale: float
+    """Of integer coordinates; negative where they are floats."""
+    data_at: int
+    """Byte at which the frames begin."""
+    processor: int
+    labels: tuple[str, ...]
+    unit: str | None
+    up: str | None
+    """The vertical axis as the file says it, such as "+Y"."""
+
+
+def open_c3d(path: Path, options: Options) -> Source:
+    """Return a C3D file as a source; points without a place (residual −1) are left out.
+
+    Raises:
+        InputError: no C3D file, no points, shorter than it says and without a whole frame, a unit that nobody says.
+    """
+    header = read_c3d_header(path)
+    if not header.points:
+        raise InputError("no points", where=path, found=f"{header.analog} analog values a frame", expected="markers over time")
+    whole = min(header.frames, _whole_frames(path, header))
+    if header.frames == MOST:
+        whole = _whole_frames(path, header)
+    if not whole:
+        raise InputError(
+            "a C3D file without a whole frame",
+            where=path,
+            found=f"{path.stat().st_size} bytes",
+            expected=f"{header.frames} frames",
+        )
+    chosen = _chosen_labels(header, options, path)
+    scale = unit_of(options, header.unit, path, _extent(path, header, whole))
+    notes = [f"the file is cut off: {whole} of {header.frames} frames"] if whole < header.frames else []
+    notes += [f"the header counts to {MOST} only: {whole} frames by the size of the file"] if whole > header.frames else []
+    return Source(
+        "c3d",
+        path,
+        partial(_frames, path, header, whole, chosen, scale, options.up),
+        found={
+            "unit": header.unit or options.unit,
+            "up_in_file": header.up,
+            "up": options.up or "as in the file",
+            "frames_declared": header.frames,
+        },
+        count=whole,
+        notes=notes,
+    )
+
+
+def read_c3d_header(path: Path) -> Header:
+    """Return the header and the parameters of a C3D file. Raises InputError."""
+    with path.open("rb") as stream:
+        head = stream.read(BLOCK)
+        if len(head) < BLOCK or head[1] != 0x50:
+            raise InputError(
+                "not a C3D file", where=path, found=f"{len(head)} bytes that begin {head[:2]!r}", expected="a header of 512 bytes"
+            )
+        stream.seek((head[0] - 1) * BLOCK)
+        block = stream.read(4)
+        count, processor = (block[2], block[3]) if len(block) == 4 else (0, 0)
+        if processor not in (INTEL, DEC, MIPS):
+            raise InputError("unknown numbers in a C3D file", where=path, found=f"processor {processor}", expected="84, 85 or 86")
+        body = stream.read(max(count * BLOCK, BLOCK) - 4)
+    values = _Numbers(processor)
+    words = np.frombuffer(head, dtype=values.u2)
+    first, last = int(words[3]), int(words[4])
+    parameters = _parameters(body, values, path)
+    points = int(words[1])
+    rate = values.real(head[20:24])
+    labels = _labels(parameters, points)
+    frames = _frame_count(parameters, last - first + 1)
+    return Header(
+        points,
+        int(words[2]),
+        frames,
+        _scalar(parameters.get(("POINT", "RATE")), rate) or rate or 1.0,
+        values.real(head[12:16]),
+        (_data_block(parameters, int(words[8])) - 1) * BLOCK,
+        processor,
+        labels,
+        _text(parameters.get(("POINT", "UNITS"))),
+        _up(parameters),
+    )
+
+
+def _frames(
+    path: Path, header: Header, whole: int, chosen: list[tuple[int, str]], scale: float, up: str | None
+) -> Iterator[Frame]:
+    size = _frame_size(header)
+    with path.open("rb") as stream:
+        stream.seek(header.data_at)
+        for number in range(whole):
+            places, missing = _points(stream.read(size), header)
+            kept = {name: k for k, name in chosen if not missing[k]}
+            xyz = upright(scale * places[list(kept.values())], up)
+            yield Frame(number / header.rate, markers=dict(zip(kept, xyz)))
+
+
+def _whole_frames(path: Path, header: Header) -> int:
+    """Return how many frames the file holds, without the zeros that fill its last block."""
+    size = _frame_size(header)
+    count = max(path.stat().st_size - header.data_at, 0) // size
+    with path.open("rb") as stream:
+        for _ in range(min(count, BLOCK // size)):
+            stream.seek(header.data_at + (count - 1) * size)
+            if any(stream.read(size)):
+                break
+            count -= 1
+    return count
+
+
+def _frame_size(header: Header) -> int:
+    return (4 * header.points + header.analog) * (4 if header.scale < 0 else 2)
+
+
+def _points(data: bytes, header: Header) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+    """Return the places in the file's unit (points, 3) and which are missing."""
+    values = _Numbers(header.processor)
+    if header.scale < 0:
+        table = values.reals(data[: 16 * header.points]).reshape(-1, 4)
+        places, residual = table[:, :3], table[:, 3]
+    else:
+        words = np.frombuffer(data[: 8 * header.points], dtype=values.i2).reshape(-1, 4)
+        places, residual = words[:, :3] * header.scale, words[:, 3].astype(np.float64)
+    missing = (residual < 0) | ~np.isfinite(places).all(axis=1) | (places == 0.0).all(axis=1)
+    return places.astype(np.float64), missing
+
+
+def _chosen_labels(header: Header, options: Options, path: Path) -> list[tuple[int, str]]:
+    """Return the columns to take and their names; the same label twice gets a number."""
+    for wanted in [*options.topics, *options.columns]:
+        if wanted not in header.labels:
+            raise InputError("no such point", where=path, found=wanted, expected=", ".join(header.labels))
+    taken = [(k, name) for k, name in enumerate(header.labels) if not options.topics or name in options.topics]
+    renamed = [(k, options.columns.get(name, name).removeprefix("marker.")) for k, name in taken]
+    seen: dict[str, int] = {}
+    result = []
+    for k, name in renamed:
+        seen[name] = seen.get(name, 0) + 1
+        result.append((k, name if seen[name] == 1 else f"{name}_{seen[name]}"))
+    return result
+
+
+def _extent(path: Path, header: Header, whole: int) -> float:
+    with path.open("rb") as stream:
+        stream.seek(header.data_at)
+        seen = [_points(stream.read(_frame_size(header)), header) for _ in range(min(whole, 10))]
+    values = np.concatenate([places[~missing] for places, missing in seen])
+    return float(np.ptp(values, axis=0).max()) if len(values) else 0.0
+
+
+# Parameters
+
+Parameters = dict[tuple[str, str], Any]
+
+
+class _Numbers:
+    """Numbers as one kind of processor writes them."""
+
+    def __init__(self, processor: int) -> None:
+        order = ">" if processor == MIPS else "<"
+        self.vax = processor == DEC
+        self.i2, self.u2, self.f4 = np.dtype(order + "i2"), np.dtype(order + "u2"), np.dtype(order + "f4")
+
+    def real(self, data: bytes) -> float:
+        return float(self.reals(data)[0])
+
+    def reals(self, data: bytes) -> FloatArray:
+        """Return single-precision numbers; those of the VAX have their halves exchanged and an exponent higher by two."""
+        if not self.vax:
+            return np.frombuffer(data, dtype=self.f4).astype(np.float64)
+        halves = np.frombuffer(data, dtype="<u2").reshape(-1, 2)[:, ::-1]
+        return np.ascontiguousarray(halves).view("<f4")[:, 0].astype(np.float64) / 4.0
+
+
+def _parameters(body: bytes, values: _Numbers, path: Path) -> Parameters:
+    """Return (group, name) → value: a text, a list of texts or an array."""
+    groups: dict[int, str] = {}
+    raw: list[tuple[int, str, Any]] = []
+    at = 0
+    try:
+        while at + 4 < len(body):
+            length, group = struct.unpack_from("<bb", body, at)
+            if length == 0 or group == 0:
+                break
+            name_end = at + 2 + abs(length)
+            name = body[at + 2 : name_end].decode("latin-1").strip().upper()
+            step = int(np.frombuffer(body[name_end : name_end + 2], dtype=values.i2)[0])
+            if group < 0:
+                groups[-group] = name
+            else:
+                raw.append((group, name, _value(body[name_end + 2 :], values)))
+            if step <= 0:
+                break
+            at = name_end + step
+    except (struct.error, IndexError, ValueError) as error:
+        raise InputError(
+            "broken parameters in a C3D file", where=path, found=str(error), expected="a whole parameter section"
+        ) from None
+    return {(groups.get(group, str(group)), name): value for group, name, value in raw}
+
+
+def _value(data: bytes, values: _Numbers) -> Any:
+    kind, count = struct.unpack_from("<bB", data, 0)
+    shape = list(data[2 : 2 + count])
+    size = int(np.prod(shape)) if shape else 1
+    start = 2 + count
+    if kind == -1:
+        text = data[start : start + size].decode("latin-1")
+        if len(shape) < 2:
+            return text.strip()
+        return [text[i : i + shape[0]].strip() for i in range(0, size, shape[0])] if shape[0] else []
+    if kind == 4:
+        return values.reals(data[start : start + 4 * size])
+    return np.frombuffer(data[start : start + kind * size], dtype=values.u2 if kind == 2 else np.uint8)
+
+
+def _labels(parameters: Parameters, points: int) -> tuple[str, ...]:
+    found: list[str] = []
+    for name in ("LABELS", "LABELS2", "LABELS3", "LABELS4"):
+        value = parameters.get(("POINT", name), [])
+        found += [value] if isinstance(value, str) else list(value)
+    found = [name or f"point{k + 1}" for k, name in enumerate(found[:points])]
+    return tuple(found + [f"point{k + 1}" for k in range(len(found), points)])
+
+
+def _frame_count(parameters: Parameters, header: int) -> int:
+    """Return the number of frames: beyond 65535 the header cannot say it."""
+    start, end = parameters.get(("TRIAL", "ACTUAL_START_FIELD")), parameters.get(("TRIAL", "ACTUAL_END_FIELD"))
+    if start is None or end is None or len(start) < 2 or len(end) < 2:
+        long = _scalar(parameters.get(("POINT", "LONG_FRAMES")), 0.0)
+        return int(long) or max(header, 0)
+    first, last = int(start[0]) + 65536 * int(start[1]), int(end[0]) + 65536 * int(end[1])
+    return last - first + 1 if last >= first else max(header, 0)
+
+
+def _data_block(parameters: Parameters, header: int) -> int:
+    return int(_scalar(parameters.get(("POINT", "DATA_START")), header)) or header
+
+
+def _scalar(value: Any, default: float) -> float:
+    return float(value[0]) if isinstance(value, np.ndarray) and len(value) else default
+
+
+def _text(value: Any) -> str | None:
+    text = value[0] if isinstance(value, list) and value else value
+    return str(text) if isinstance(text, str) and text else None
+
+
+def _up(parameters: Parameters) -> str | None:
+    return _text(parameters.get(("POINT", "Y_SCREEN")))

@@ -1,0 +1,330 @@
+"""Folders: TUM RGB-D, Redwood, and clouds in PLY, PCD, XYZ, NPY or NPZ."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from femsense.core.arrays import FloatArray
+from femsense.core.errors import InputError
+from femsense.io.clouds.cloud_files import read_cloud
+from femsense.io.clouds.images import png_header, read_png
+from femsense.io.importers.frames import Frame, Images, Lens, Options, Source, unit_of
+from femsense.io.importers.pictures import NO_DEPTH, decoded_image
+from femsense.pointcloud.cloud import PointCloud
+
+CLOUDS = (".ply", ".pcd", ".xyz", ".npy", ".npz")
+TUM_UNIT = 1 / 5000
+"""Metres in one unit of a TUM RGB-D depth image."""
+REDWOOD_UNIT = 1 / 1000
+TUM_LENS = (525.0, 525.0, 319.5, 239.5)
+"""The lens that the TUM benchmark gives for all its sequences, 640 × 480."""
+NEAR_S = 0.02
+"""Images of TUM RGB-D belong together up to this time apart, as its own `associate.py` has it."""
+
+
+def folder_kind(folder: Path) -> str | None:
+    """Return "tum", "redwood" or "clouds"; None where a folder is none of these."""
+    if (folder / "depth.txt").is_file() and (folder / "depth").is_dir():
+        return "tum"
+    if (folder / "depth").is_dir() and any((folder / "depth").glob("*.png")):
+        return "redwood"
+    return "clouds" if folder.is_dir() and _cloud_files(folder) else None
+
+
+def open_tum(folder: Path, options: Options) -> Source:
+    """Return a TUM RGB-D folder (depth.txt, rgb.txt, associated by time) as a source. Raises InputError."""
+    depth = _list(folder / "depth.txt")
+    color = _list(folder / "rgb.txt") if (folder / "rgb.txt").is_file() else []
+    header = png_header(folder / depth[0][1]) if (folder / depth[0][1]).is_file() else None
+    if header is None:
+        raise InputError("the first depth image is missing or none", where=folder / depth[0][1], expected="a PNG of 16 bits")
+    lens, said = _folder_lens(folder, header[0], header[1])
+    notes = [f"the lens is {said}"] if said else []
+    pairs = _associated(depth, color)
+    lost = sum(c is None for _, _, c in pairs) if color else 0
+    found = {"depth_unit_m": TUM_UNIT, "images_without_colour": lost or None, "lens": said}
+    frames = partial(_image_frames, [(t, folder / d, folder / c if c else None) for t, d, c in pairs])
+    return Source("tum", folder, frames, found=_given(found), lens=lens, depth_unit_m=TUM_UNIT, count=len(pairs), notes=notes)
+
+
+def open_redwood(folder: Path, options: Options) -> Source:
+    """Return a folder with depth/ and color/ in Redwood's or Open3D's layout as a source. Raises InputError."""
+    depth = _numbered(folder / "depth", (".png",))
+    colors = next((folder / n for n in ("color", "image", "rgb") if (folder / n).is_dir()), None)
+    images = [] if colors is None else _numbered(colors, (".png", ".jpg", ".jpeg"))
+    header = png_header(depth[0])
+    if header is None or header[2:] != (16, 0):
+        raise InputError("not a depth image", where=depth[0], found=header and f"{header[2]} bits", expected="a PNG of 16 bits")
+    lens, said = _folder_lens(folder, header[0], header[1])
+    times = _file_times(depth)
+    if times is None and options.rate is None:
+        raise InputError(
+            "no times", where=folder / "depth", found=depth[0].name, expected="--rate HZ, the camera's frames a second"
+        )
+    color_of = _color_of(depth, images)
+    clock = times if times is not None else [i / (options.rate or 1.0) for i in range(len(depth))]
+    items = [(clock[i], file, color_of.get(file)) for i, file in enumerate(depth)]
+    found = {
+        "depth_unit_m": REDWOOD_UNIT,
+        "lens": said,
+        "times": "in the names of the files" if times is not None else f"{options.rate:g} a second",
+    }
+    notes = [f"the lens is {said}"] if said else []
+    return Source(
+        "redwood",
+        folder,
+        partial(_image_frames, items),
+        found=_given(found),
+        lens=lens,
+        depth_unit_m=REDWOOD_UNIT,
+        count=len(items),
+        notes=notes,
+    )
+
+
+def open_clouds(folder: Path, options: Options) -> Source:
+    """Return a folder of clouds (or one file of them) as a source; times from names, times.txt or a rate. Raises InputError."""
+    files = [folder] if folder.is_file() else _cloud_files(folder)
+    if not files:
+        raise InputError("no clouds", where=folder, expected=", ".join(CLOUDS))
+    times = _cloud_times(folder, files, options)
+    scale = unit_of(options, _declared_unit(files[0]), files[0], _extent(files[0]))
+    frames = [Frame(t, picture=partial(_scaled_cloud, file, scale)) for t, file in zip(times, files)]
+    endings = sorted({file.suffix.lower() for file in files})
+    return Source(
+        "clouds", folder, lambda: iter(frames), found={"files": ", ".join(endings), "unit": options.unit or "m"}, count=len(files)
+    )
+
+
+def read_points(file: Path) -> PointCloud:
+    """Return the cloud of a PLY, PCD, XYZ, NPY or NPZ file in the file's unit. Raises InputError."""
+    ending = file.suffix.lower()
+    if ending in (".ply", ".pcd"):
+        return read_cloud(file)
+    try:
+        table = _array(file)
+    except (OSError, ValueError, EOFError, KeyError) as error:
+        raise InputError(
+            "not readable as a cloud", where=file, found=f"{type(error).__name__}: {error}", expected="rows x y z [r g b]"
+        ) from None
+    if table.ndim == 3 and table.shape[2] >= 3:
+        table = table.reshape(-1, table.shape[2])
+    if table.ndim != 2 or table.shape[1] < 3:
+        raise InputError(
+            "not a cloud", where=file, found=f"shape {table.shape}", expected="(n, 3) places, or (n, 6) with colours"
+        )
+    kept = np.isfinite(table[:, :3]).all(axis=1) & (table[:, :3] != 0).any(axis=1)
+    colors = table[kept, 3:6] if table.shape[1] == 6 else None
+    if colors is not None and colors.size and (colors.min() < 0 or colors.max() > 255):
+        colors = None  # normals, or something else
+    return PointCloud(table[kept, :3], colors if colors is None or colors.max(initial=0) <= 1 else colors / 255.0)
+
+
+# Images
+
+
+def _image_frames(items: Sequence[tuple[float, Path, Path | None]]) -> Iterator[Frame]:
+    for time, depth, color in items:
+        yield Frame(time, picture=partial(_images, depth, color))
+
+
+def _images(depth: Path, color: Path | None) -> Images:
+    if not depth.is_file():
+        raise InputError("a depth image is missing", where=depth, found="no such file")
+    image = read_png(depth)
+    if image.ndim != 2 or image.dtype != np.uint16:
+        raise InputError(
+            "not a depth image", where=depth, found=f"{image.dtype}, shape {image.shape}", expected="one channel of 16 bits"
+        )
+    image = np.where(image == NO_DEPTH, 0, image).astype(np.uint16)
+    if color is None or not color.is_file():
+        return Images(image)
+    pixels = decoded_image(color.read_bytes(), color)
+    if pixels.shape != (*image.shape, 3):
+        raise InputError(
+            "the colour image does not fit",
+            where=color,
+            found=pixels.shape,
+            expected=(*image.shape, 3),
+            hint="register it to the depth image",
+        )
+    return Images(image, pixels)
+
+
+def _list(path: Path) -> list[tuple[float, str]]:
+    """Return (time [s], file) of each line of a list of TUM RGB-D."""
+    found = []
+    for number, line in enumerate(path.read_text(encoding="utf-8-sig", errors="replace").splitlines(), start=1):
+        words = line.replace(",", " ").split()
+        if not words or words[0].startswith("#"):
+            continue
+        try:
+            found.append((float(words[0]), words[1]))
+        except (ValueError, IndexError):
+            raise InputError(
+                "not a line of a list of images", where=f"{path}, line {number}", found=line, expected="time file"
+            ) from None
+    if not found:
+        raise InputError("an empty list of images", where=path, expected="lines: time file")
+    return found
+
+
+def _associated(depth: list[tuple[float, str]], color: list[tuple[float, str]]) -> list[tuple[float, str, str | None]]:
+    """Return each depth image with the colour image nearest in time, at most NEAR_S away."""
+    times = np.array([t for t, _ in color])
+    result: list[tuple[float, str, str | None]] = []
+    for time, file in depth:
+        k = int(np.abs(times - time).argmin()) if len(times) else -1
+        near = k >= 0 and abs(times[k] - time) <= NEAR_S
+        result.append((time, file, color[k][1] if near else None))
+    return result
+
+
+def _folder_lens(folder: Path, width: int, height: int) -> tuple[Lens, str]:
+    """Return the lens of a folder and where it is from."""
+    files = [folder / n for n in ("camera_intrinsic.json", "intrinsic.json", "camera.json") if (folder / n).is_file()]
+    if files:
+        return _json_lens(files[0], width, height), files[0].name
+    texts = [folder / n for n in ("calibration.txt", "camera.txt", "intrinsics.txt") if (folder / n).is_file()]
+    if texts:
+        values = [float(v) for v in re.findall(r"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?", texts[0].read_text())]
+        if len(values) >= 9 and values[1] == 0.0:
+            values = [values[0], values[4], values[2], values[5]]
+        if len(values) >= 4:
+            fx, fy, cx, cy = values[:4]
+            return Lens(width, height, fx, fy, cx, cy, np.array((values[4:9] + [0.0] * 5)[:5])), texts[0].name
+    if (width, height) == (640, 480):
+        return Lens(640, 480, *TUM_LENS), "the default of TUM and Redwood for 640 × 480 (525, 525, 319.5, 239.5)"
+    raise InputError(
+        "no lens",
+        where=folder,
+        found=f"images of {width} × {height}",
+        expected="camera_intrinsic.json, or calibration.txt with fx fy cx cy",
+    )
+
+
+def _json_lens(path: Path, width: int, height: int) -> Lens:
+    try:
+        data: dict[str, Any] = json.loads(path.read_text(encoding="utf-8-sig"))
+        given = np.asarray(data["intrinsic_matrix"], dtype=float).reshape(3, 3)
+        K = given.T if given[0, 2] == 0.0 else given  # Open3D writes it by columns
+        size = int(data.get("width", width)), int(data.get("height", height))
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            "not a lens", where=path, found=str(error), expected="width, height, intrinsic_matrix as Open3D writes them"
+        ) from None
+    if size != (width, height):
+        raise InputError("the lens is of another size than the images", where=path, found=size, expected=(width, height))
+    return Lens(width, height, float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
+
+
+def _color_of(depth: list[Path], images: list[Path]) -> dict[Path, Path]:
+    """Return the colour image of each depth image: the same number, else the same position in the lists."""
+    by_number = {_number(file): file for file in images}
+    if images and all(_number(file) in by_number for file in depth):
+        return {file: by_number[_number(file)] for file in depth}
+    return (
+        dict(zip(depth, images))
+        if len(images) == len(depth)
+        else {f: by_number[_number(f)] for f in depth if _number(f) in by_number}
+    )
+
+
+# Files in order
+
+
+def _cloud_files(folder: Path) -> list[Path]:
+    found = [f for f in folder.iterdir() if f.suffix.lower() in CLOUDS and f.is_file() and not f.name.startswith(".")]
+    return sorted(found, key=_order)
+
+
+def _numbered(folder: Path, endings: tuple[str, ...]) -> list[Path]:
+    files = [f for f in folder.iterdir() if f.suffix.lower() in endings and not f.name.startswith(".")]
+    if not files:
+        raise InputError("no images", where=folder, expected=", ".join(endings))
+    return sorted(files, key=_order)
+
+
+def _order(file: Path) -> tuple[float, str]:
+    return (_number(file), file.name)
+
+
+def _number(file: Path) -> float:
+    """Return the first number in a file's name (Redwood: frame-time)."""
+    match = re.search(r"\d+(?:\.\d+)?", file.stem)
+    return float(match[0]) if match else -1.0
+
+
+def _file_times(files: Sequence[Path]) -> list[float] | None:
+    """Return times [s] from names such as 0000012-000000400400 (Redwood, microseconds) or 1305031102.175304; None without."""
+    stems = [file.stem for file in files]
+    redwood = [re.fullmatch(r"\d+-(\d{9,})", stem) for stem in stems]
+    if all(redwood):
+        return [1e-6 * int(m[1]) for m in redwood if m]
+    seconds = [re.fullmatch(r"(?:\w*?[_-])?(\d+\.\d+)", stem) for stem in stems]
+    if all(seconds):
+        return [float(m[1]) for m in seconds if m]
+    nanoseconds = [re.fullmatch(r"\d{18,19}", stem) for stem in stems]
+    return [1e-9 * int(m[0]) for m in nanoseconds if m] if all(nanoseconds) else None
+
+
+def _cloud_times(folder: Path, files: list[Path], options: Options) -> list[float]:
+    times = _file_times(files)
+    listed = folder / "times.txt"
+    if times is None and listed.is_file():
+        times = [float(word) for word in listed.read_text().split()]
+        if len(times) != len(files):
+            raise InputError("other times than files", where=listed, found=len(times), expected=f"{len(files)} times [s]")
+    if times is None and options.rate is None and len(files) > 1:
+        raise InputError(
+            "no times", where=folder, found=files[0].name, expected="--rate HZ, times.txt, or names that are times in seconds"
+        )
+    return times if times is not None else [i / (options.rate or 1.0) for i in range(len(files))]
+
+
+# Clouds
+
+
+def _array(file: Path) -> FloatArray:
+    ending = file.suffix.lower()
+    if ending == ".xyz":
+        text = file.read_text(encoding="utf-8-sig").replace(",", " ").splitlines()
+        rows = [line.split() for line in text if line.strip() and not line.lstrip().startswith(("#", "//"))]
+        if rows and len(rows[0]) == 1:
+            rows = rows[1:]  # a count at the top
+        return np.array([[float(cell) for cell in row] for row in rows], dtype=np.float64).reshape(len(rows), -1)
+    loaded = np.load(file, allow_pickle=False)
+    if ending == ".npy":
+        return np.asarray(loaded, dtype=np.float64)
+    key = next((k for k in ("points", "xyz", "cloud", "pts", "arr_0") if k in loaded), None)
+    if key is None:
+        raise KeyError(f"none of points, xyz, cloud among {', '.join(loaded.files)}")
+    points = np.asarray(loaded[key], dtype=np.float64)
+    colors = next((np.asarray(loaded[k], dtype=np.float64) for k in ("colors", "rgb") if k in loaded), None)
+    return points if colors is None or colors.shape != points.shape else np.concatenate([points, colors], axis=-1)
+
+
+def _scaled_cloud(file: Path, scale: float) -> PointCloud:
+    cloud = read_points(file)
+    return cloud if scale == 1.0 else PointCloud(scale * cloud.points, cloud.colors)
+
+
+def _extent(file: Path) -> float:
+    points = read_points(file).points
+    return float(np.ptp(points, axis=0).max()) if len(points) else 0.0
+
+
+def _declared_unit(file: Path) -> str | None:
+    """Return "m" for formats whose writers use metres where the size agrees with it (PLY and PCD of cameras, within 20 m)."""
+    return "m" if file.suffix.lower() in (".ply", ".pcd") and _extent(file) < 20.0 else None
+
+
+def _given(found: dict[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in found.items() if value is not None}

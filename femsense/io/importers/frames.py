@@ -1,0 +1,173 @@
+"""What an importer hands on: a source that says what it holds, and its frames one after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from femsense.core.arrays import FloatArray
+from femsense.core.errors import InputError
+from femsense.pointcloud.cloud import PointCloud
+
+UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
+"""Metres in one unit."""
+MODELS = ("brown_conrady", "inverse_brown_conrady", "kannala_brandt")
+DepthImage = npt.NDArray[np.uint16]
+ColorImage = npt.NDArray[np.uint8]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Lens:
+    """A camera's lens; the centre of the first pixel is (0, 0)."""
+
+    width: int
+    """[px]."""
+    height: int
+    """[px]."""
+    fx: float
+    """[px]."""
+    fy: float
+    """[px]."""
+    cx: float
+    """[px]."""
+    cy: float
+    """[px]."""
+    distortion: FloatArray = field(default_factory=lambda: np.zeros(5))
+    """OpenCV's order: k1, k2, p1, p2, k3, k4, k5, k6; kannala_brandt: k1 … k4. Shape (n,)."""
+    model: str = "brown_conrady"
+    """One of MODELS."""
+
+    @property
+    def storable(self) -> bool:
+        """Whether a depth image of this lens is kept as an image.
+
+        What the RealSense SDK calls inverse is not what OpenCV's polynomial taken backwards gives (20 mm at 1 m with its usual
+        coefficients): such images become clouds, which nobody can misread.
+        """
+        return not np.any(self.distortion != 0.0) or self.model != "inverse_brown_conrady"
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Images:
+    """What a depth camera gives in one frame."""
+
+    depth: DepthImage
+    """Units of the source's `depth_unit_m`, 0 where there is none, shape (H, W)."""
+    color: ColorImage | None = None
+    """Red, green, blue, registered to the depth image, shape (H, W, 3)."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Frame:
+    """One moment of a recording."""
+
+    time: float
+    """[s] on the source's clock."""
+    picture: Callable[[], Images | PointCloud] | None = None
+    """Decodes the images or the cloud [m, camera frame] when it is asked for; raises InputError where they are broken."""
+    markers: Mapping[str, npt.ArrayLike] = field(default_factory=dict)
+    """Name → place [m], shape (3,); hidden ones are left out."""
+    unlabelled: npt.ArrayLike = ()
+    """Places of markers of unknown name [m], shape (k, 3)."""
+    inputs: Mapping[str, float] = field(default_factory=dict)
+    """Column of frames.csv (cable_…, chamber_…) → value [N], [m] or [Pa]."""
+    loads: Sequence[tuple[npt.ArrayLike, npt.ArrayLike]] = ()
+    """Place [m] and force [N], robot frame, each of shape (3,)."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Source:
+    """What was found in a file or a folder."""
+
+    format: str
+    """A name of `guess.FORMATS`."""
+    path: Path
+    frames: Callable[[], Iterator[Frame]]
+    """Starts from the first frame at each call; a live source may go on for ever."""
+    found: Mapping[str, Any] = field(default_factory=dict)
+    """What was found beyond the frames, for the report."""
+    lens: Lens | None = None
+    """Where pictures are depth images."""
+    depth_unit_m: float = 0.001
+    actuation: str | None = None
+    """"tension" or "displacement"; None where the source does not say."""
+    count: int | None = None
+    """Frames that are expected, where it is known."""
+    notes: Sequence[str] = ()
+    """What a person should know before trusting it."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Options:
+    """What a person says about a source; empty where nothing was said."""
+
+    format: str | None = None
+    topics: Sequence[str] = ()
+    """Topics, streams, tracks or names to take."""
+    columns: Mapping[str, str] = field(default_factory=dict)
+    """Name in the source → name in the recording, such as cable_north, chamber_a, marker.x or load@0.1,0,0.02; may end in *FACTOR."""
+    unit: str | None = None
+    """Of lengths, a key of UNITS."""
+    up: str | None = None
+    """The source's vertical axis: "x", "y" or "z"; turned to z."""
+    clock: str = "auto"
+    """"header", "record" or "auto"."""
+    rate: float | None = None
+    """Frames a second where a source has no times."""
+
+
+def unit_of(options: Options, declared: str | None, where: str | Path | None, extent: float) -> float:
+    """Return metres in one unit of length: what a person said, else what the file says.
+
+    Arguments:
+        options: what was said.
+        declared: the unit that the file names; None where it names none.
+        where: the file, for the message.
+        extent: size of what was recorded in the file's unit, for the message.
+
+    Raises:
+        InputError: nobody says the unit.
+    """
+    said = options.unit or declared
+    key = {"meters": "m", "metres": "m", "meter": "m", "millimeters": "mm", "millimetres": "mm", "centimeters": "cm"}
+    name = key.get(str(said).strip().lower(), str(said).strip().lower())
+    if said is not None and name in UNITS:
+        return UNITS[name]
+    raise InputError(
+        "the unit of length is not known" if said is None else "an unknown unit of length",
+        where=where,
+        found=f"no unit; the positions span {extent:.4g}" if said is None else said,
+        expected="--unit " + "|".join(UNITS),
+        hint=f"in metres the scene would be {extent:.4g} m wide, in millimetres {1e-3 * extent:.4g} m",
+    )
+
+
+def upright(points: npt.ArrayLike, up: str | None) -> FloatArray:
+    """Return points (n, 3) turned so that the axis `up` becomes z (a rotation: handedness stays)."""
+    xyz = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+    if up == "y":
+        return np.stack([xyz[:, 0], -xyz[:, 2], xyz[:, 1]], axis=1)
+    if up == "x":
+        return np.stack([-xyz[:, 2], xyz[:, 1], xyz[:, 0]], axis=1)
+    return xyz
+
+
+def need(module: str, extra: str, what: str) -> Any:
+    """Return an optional package. Raises InputError with the line that installs it."""
+    import importlib
+
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise InputError(
+            f"{what} needs a package that is not there",
+            where=module.split(".")[0],
+            found=" ".join(str(error).split()),
+            expected=f"the extra [{extra}]",
+            hint=f"pip install 'femsense[{extra}]'",
+        ) from None

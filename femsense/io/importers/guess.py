@@ -1,0 +1,128 @@
+"""Which importer a file or folder is for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from femsense.core.errors import InputError
+from femsense.core.text import did_you_mean
+from femsense.io.importers.c3d import open_c3d, read_c3d_header
+from femsense.io.importers.folders import CLOUDS, folder_kind, open_clouds, open_redwood, open_tum
+from femsense.io.importers.frames import Options, Source
+from femsense.io.importers.mocap_csv import is_mocap_csv, open_mocap_csv, read_export
+from femsense.io.importers.plain_csv import header_of, open_plain_csv
+from femsense.io.importers.ros import list_ros, open_ros
+from femsense.io.importers.ros_bag import ENDINGS
+
+FORMATS: dict[str, Callable[[Path, Options], Source]] = {
+    "ros": open_ros,
+    "realsense": open_ros,
+    "c3d": open_c3d,
+    "optitrack": open_mocap_csv,
+    "vicon": open_mocap_csv,
+    "csv": open_plain_csv,
+    "tum": open_tum,
+    "redwood": open_redwood,
+    "clouds": open_clouds,
+}
+"""Names of `--format`. Each importer says what it finds as a `Source`, whose frames come one after the other."""
+SIGNATURES = (
+    (b"#ROSBAG V2.0", "ros"),
+    (b"\x89MCAP0\r\n", "ros"),
+    (b"SQLite format 3\x00", "ros"),
+    (b"Format Version,", "optitrack"),
+)
+"""How files begin; the ending comes second."""
+
+
+def open_source(path: str | Path, options: Options | None = None) -> Source:
+    """Return what a file or a folder holds, ready to be read frame by frame.
+
+    Arguments:
+        path: the file or folder.
+        options: what a person says about it.
+
+    Raises:
+        InputError: nothing there, no format that is known, or a choice that a person must make: what can be chosen is named.
+    """
+    source, said = Path(path).expanduser(), options or Options()
+    if not source.exists():
+        names = [item.name for item in source.parent.iterdir()] if source.parent.is_dir() else []
+        raise InputError("nothing there", where=source, expected="a file or a folder", hint=did_you_mean(source.name, names))
+    name = said.format or guess_format(source)
+    if name not in FORMATS:
+        found = f"{source.suffix or 'no ending'}" if name is None else name
+        raise InputError(
+            "not a format that femsense imports" if name is None else "no such format",
+            where=source,
+            found=found,
+            expected="--format " + "|".join(FORMATS),
+            hint=None if name is None else did_you_mean(name, FORMATS),
+        )
+    return FORMATS[name](source, said)
+
+
+def guess_format(path: Path) -> str | None:
+    """Return a key of FORMATS from the first bytes, the ending and the files of a folder; None where nothing fits."""
+    if path.is_dir():
+        if (path / "metadata.yaml").is_file() or any(item.suffix in (".db3", ".mcap") for item in path.iterdir()):
+            return "ros"
+        return folder_kind(path)
+    with path.open("rb") as stream:
+        head = stream.read(512)
+    by_content = next((name for begin, name in SIGNATURES if head.startswith(begin)), None)
+    ending = path.suffix.lower()
+    if by_content is not None or ending in ENDINGS:
+        return by_content or "ros"
+    if ending == ".c3d" or (len(head) == 512 and head[1] == 0x50 and head[0] == 2):
+        return "c3d"
+    if ending in (".csv", ".txt", ".tsv") or path.name.lower().endswith((".csv.gz", ".tsv.gz")):
+        return _csv_kind(path)
+    return "clouds" if ending in CLOUDS else None
+
+
+def contents(path: Path) -> dict[str, Any]:
+    """Return what a capture holds, without reading its frames: for `femsense inspect`.
+
+    Raises:
+        InputError: it is broken, empty, or nothing that is known.
+    """
+    name = guess_format(path)
+    if name is None:
+        raise InputError(
+            "not a format that femsense imports", where=path, found=path.suffix or "no ending", expected=", ".join(FORMATS)
+        )
+    if name == "ros":
+        return {"format": name, **list_ros(path)}
+    if name == "c3d":
+        header = read_c3d_header(path)
+        open_c3d(path, Options(unit=None if header.unit else "mm"))
+        table = {
+            "frames": header.frames,
+            "rate_hz": header.rate,
+            "points": list(header.labels),
+            "unit": header.unit,
+            "up_in_file": header.up,
+        }
+        return {"format": name, **table}
+    if name in ("optitrack", "vicon"):
+        export = read_export(path)
+        return {
+            "format": export.program,
+            "markers": [n or "(unnamed)" for n, _ in export.markers],
+            "unit": export.unit,
+            "rate_hz": export.rate,
+        }
+    if name == "csv":
+        names, headed = header_of(path)
+        return {"format": name, "columns": names if headed else len(names)}
+    source = FORMATS[name](path, Options(rate=1.0, unit="m"))
+    return {"format": name, "frames": source.count, **source.found}
+
+
+def _csv_kind(path: Path) -> str:
+    if not is_mocap_csv(path):
+        return "csv"
+    return read_export(path).program

@@ -1,0 +1,95 @@
+"""The frames that were written so far, one line of JSON each: an import that is killed goes on after the last whole line."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TextIO
+
+import numpy as np
+
+from femsense.core.arrays import FloatArray
+from femsense.io.files import plain
+
+JOURNAL = ".import-journal"
+"""Name of the file in the unfinished folder; its first line says what the import is made from."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Entry:
+    """One written frame."""
+
+    time: float
+    """[s] on the source's clock."""
+    inputs: Mapping[str, float]
+    markers: Mapping[str, list[float]]
+    unlabelled: list[list[float]]
+    loads: list[list[float]]
+    """Six numbers each: place [m], force [N]."""
+    picture: str
+    """ "depth", "cloud", "broken" or ""."""
+    center: list[float] | None
+    """Mean of the points that were seen [m]; None where none were."""
+
+
+class Journal:
+    """Appends entries, and reads them one after the other."""
+
+    def __init__(self, folder: Path, identity: Mapping[str, Any]) -> None:
+        """folder: the unfinished recording. identity: what the import is made from; another one begins anew."""
+        self.file = folder / JOURNAL
+        self.head = json.dumps(plain(identity), sort_keys=True)
+        self.done = self._whole_entries()
+        self.stream: TextIO | None = None
+
+    def __enter__(self) -> Journal:
+        if self.done is None:
+            self.file.write_text(self.head + "\n", encoding="utf-8")
+            self.done = 0
+        self.stream = self.file.open("a", encoding="utf-8")
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.stream is not None:
+            self.stream.close()
+
+    @property
+    def belongs(self) -> bool:
+        """Whether the folder holds an import made from the same."""
+        return self.done is not None
+
+    def add(self, entry: Entry) -> None:
+        """Append a frame whose files are written."""
+        if self.stream is None:
+            raise RuntimeError("the journal is not open")
+        line = [entry.time, entry.inputs, entry.markers, entry.unlabelled, entry.loads, entry.picture, entry.center]
+        self.stream.write(json.dumps(line) + "\n")
+        self.stream.flush()
+
+    def entries(self) -> Iterator[Entry]:
+        """Yield the frames in the order in which they were written."""
+        with self.file.open(encoding="utf-8") as stream:
+            next(stream)
+            for line in stream:
+                yield Entry(*json.loads(line))
+
+    def times(self) -> FloatArray:
+        """Return the times of all frames [s], shape (F,)."""
+        return np.fromiter((entry.time for entry in self.entries()), dtype=np.float64)
+
+    def _whole_entries(self) -> int | None:
+        """Return how many whole lines there are after cutting off a half one; None where the file is another's or none."""
+        if not self.file.is_file():
+            return None
+        with self.file.open("r+b") as stream:
+            if stream.readline().decode("utf-8", "replace").rstrip("\n") != self.head:
+                return None
+            count, end = 0, stream.tell()
+            for line in stream:
+                if not line.endswith(b"\n"):
+                    break
+                count, end = count + 1, end + len(line)
+            stream.truncate(end)
+        return count

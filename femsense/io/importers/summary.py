@@ -1,0 +1,105 @@
+"""What was found in a source, counted over its frames: rate, gaps, lost and exchanged markers, span."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from femsense.io.importers.frames import Source
+from femsense.io.importers.journal import Journal
+
+GAP = 1.5
+"""A step in time longer than this times the usual one lacks frames."""
+JUMP = 5.0
+"""Two markers that each jump farther than this times their usual step, and land where the other was, are called exchanged."""
+
+
+def summary(source: Source, journal: Journal, counts: Mapping[str, int]) -> dict[str, Any]:
+    """Return what was found, with units in the names; warns of exchanged labels and of lost frames."""
+    times = journal.times()
+    step = np.diff(times)
+    usual = float(np.median(step)) if len(step) else None
+    gaps = step[step > GAP * usual] if usual else np.zeros(0)
+    found: dict[str, Any] = {
+        "format": source.format,
+        "frames": len(times),
+        "start_s": float(times[0]),
+        "duration_s": float(times[-1] - times[0]),
+        "rate_hz": None if not usual else 1.0 / usual,
+        "gaps": len(gaps),
+        "longest_gap_s": float(gaps.max()) if len(gaps) else None,
+        "frames_missing": int(np.rint(gaps / usual - 1).sum()) if usual else 0,
+        "dropped_out_of_order": counts["out_of_order"],
+        **_pictures(journal),
+        **_markers(journal),
+        **source.found,
+    }
+    if found["broken_pictures"]:
+        warnings.warn(f"{source.path}: {found['broken_pictures']} of {len(times)} pictures are broken", stacklevel=2)
+    return {key: value for key, value in found.items() if value is not None}
+
+
+def _pictures(journal: Journal) -> dict[str, int]:
+    kinds = {"depth": 0, "cloud": 0, "broken": 0, "": 0}
+    for entry in journal.entries():
+        kinds[entry.picture] += 1
+    return {"depth_images": kinds["depth"], "clouds": kinds["cloud"], "broken_pictures": kinds["broken"]}
+
+
+def _markers(journal: Journal) -> dict[str, Any]:
+    """Return the markers, how often each is missing, the span [m] and the frames in which two seem to change places."""
+    seen: dict[str, int] = {}
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    most, loads, frames = 0, 0, 0
+    swaps = _Exchanges()
+    for number, entry in enumerate(journal.entries()):
+        frames, loads, most = number + 1, loads + len(entry.loads), max(most, len(entry.unlabelled))
+        places = np.array([*entry.markers.values(), *entry.unlabelled], dtype=float).reshape(-1, 3)
+        if len(places):
+            low, high = np.minimum(low, places.min(axis=0)), np.maximum(high, places.max(axis=0))
+        for name in entry.markers:
+            seen[name] = seen.get(name, 0) + 1
+        swaps.look(number, entry.markers)
+    if not seen and not most:
+        return {"loads": loads} if loads else {}
+    if swaps.found:
+        warnings.warn(
+            "labels of markers seem exchanged: "
+            + "; ".join(f"{a} and {b} at frame {k}" for k, a, b in swaps.found[:5])
+            + (f" and {len(swaps.found) - 5} more" if len(swaps.found) > 5 else ""),
+            stacklevel=3,
+        )
+    return {
+        "markers": sorted(seen),
+        "unlabelled_markers": most or None,
+        "missing_share": {name: 1 - count / frames for name, count in sorted(seen.items()) if count < frames},
+        "span_m": (high - low).tolist(),
+        "label_exchanges": len(swaps.found),
+        "loads": loads or None,
+    }
+
+
+class _Exchanges:
+    """Watches named markers for two that jump to each other's place."""
+
+    def __init__(self) -> None:
+        self.last: dict[str, Any] = {}
+        self.usual: dict[str, float] = {}
+        self.found: list[tuple[int, str, str]] = []
+
+    def look(self, number: int, markers: Mapping[str, list[float]]) -> None:
+        now = {name: np.asarray(place) for name, place in markers.items()}
+        step = {name: float(np.linalg.norm(now[name] - self.last[name])) for name in now if name in self.last}
+        jumped = [name for name, size in step.items() if name in self.usual and size > JUMP * max(self.usual[name], 1e-4)]
+        for i, a in enumerate(jumped):
+            for b in jumped[i + 1 :]:
+                crossed = np.linalg.norm(now[a] - self.last[b]) + np.linalg.norm(now[b] - self.last[a])
+                if crossed < 0.25 * (step[a] + step[b]):
+                    self.found.append((number, a, b))
+        for name, size in step.items():
+            if name not in jumped:
+                self.usual[name] = 0.9 * self.usual.get(name, size) + 0.1 * size
+        self.last.update(now)

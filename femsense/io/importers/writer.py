@@ -1,0 +1,261 @@
+"""Frames → a recording folder, written beside and renamed at the end; memory is that of one frame, whatever the length."""
+
+from __future__ import annotations
+
+import shutil
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from femsense.core.errors import InputError
+from femsense.io.files import PART_PREFIX, write_csv, write_json, write_toml
+from femsense.io.importers.actuation import ActuationLog, align
+from femsense.io.importers.frames import Frame, Images, Lens, Source
+from femsense.io.importers.journal import JOURNAL, Entry, Journal
+from femsense.io.importers.pictures import write_cloud_file, write_color, write_depth
+from femsense.io.importers.summary import summary
+from femsense.io.recording_folder import FORCE_COLUMNS, PLACE_COLUMNS
+from femsense.io.recording_toml import FORMAT
+from femsense.pointcloud.cloud import PointCloud
+
+RECORD = "import.json"
+"""What a recording was made from; lies in its folder."""
+Progress = Callable[..., None]
+
+
+def write_recording(
+    source: Source,
+    folder: str | Path,
+    *,
+    identity: Mapping[str, Any],
+    actuation: str | None = None,
+    zero: str | None = None,
+    log: ActuationLog | None = None,
+    offset: float | None = None,
+    replace: bool = False,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Write the frames of a source as a recording, or go on where an earlier import of the same was stopped.
+
+    Arguments:
+        source: what an importer found.
+        folder: the final place.
+        identity: what the import is made from: only an unfinished folder of the same is continued.
+        actuation: "tension" or "displacement", where the source does not say.
+        zero: "absolute" or "unknown"; by default tensions are absolute, displacements count from an unknown zero.
+        log: inputs on a clock of their own.
+        offset: source time minus the log's time [s]; None finds it from the motion.
+        replace: an earlier recording at this place goes when the new one is whole.
+        progress: called with (frames done, frames in all).
+
+    Returns:
+        what was found and written, as in import.json.
+
+    Raises:
+        InputError: no frames, none of the pictures readable, columns whose meaning nobody said.
+    """
+    final = Path(folder).absolute()
+    part = final.with_name(f"{PART_PREFIX}import-{final.name}")
+    _prepare(part, identity)
+    with Journal(part, identity) as journal:
+        counts = _write_frames(source, part, journal, progress)
+    found = _finish(source, part, journal, counts, actuation, zero, log, offset)
+    write_json(part / RECORD, {"identity": identity, "found": found})
+    (part / JOURNAL).unlink()
+    _give_name(part, final, replace)
+    return found
+
+
+def _give_name(part: Path, final: Path, replace: bool) -> None:
+    """Rename the finished folder. Raises InputError where something stands there that nobody said to replace."""
+    if final.exists() and not (final.is_dir() and (replace or not any(final.iterdir()))):
+        raise InputError("something stands there already", where=final, expected="a new place for the recording")
+    old = final.with_name(f"{PART_PREFIX}old-{final.name}")
+    if final.exists():
+        final.rename(old)
+    part.rename(final)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def _prepare(part: Path, identity: Mapping[str, Any]) -> None:
+    if part.is_dir() and not Journal(part, identity).belongs:
+        shutil.rmtree(part)
+    part.mkdir(parents=True, exist_ok=True)
+
+
+def _write_frames(source: Source, part: Path, journal: Journal, progress: Progress | None) -> dict[str, int]:
+    """Write what comes after the frames that the journal holds; return the count of frames that were left out."""
+    done = journal.done or 0
+    last = -np.inf if not done else float(journal.times()[-1])
+    number, counts = done, {"out_of_order": 0, "resumed": done}
+    for frame in _after(source.frames(), done, counts):
+        if not frame.time > last:
+            counts["out_of_order"] += 1
+            continue
+        journal.add(_write_frame(source, frame, part, number))
+        last, number = frame.time, number + 1
+        if progress is not None:
+            progress(number, source.count or number)
+    return counts
+
+
+def _after(frames: Iterator[Frame], done: int, counts: dict[str, int]) -> Iterator[Frame]:
+    """Yield what comes after the first `done` frames that time goes on in; nothing of those is decoded."""
+    last, passed = -np.inf, 0
+    while passed < done:
+        frame = next(frames, None)
+        if frame is None:
+            return
+        if frame.time > last:
+            last, passed = frame.time, passed + 1
+        else:
+            counts["out_of_order"] += 1
+    yield from frames
+
+
+def _write_frame(source: Source, frame: Frame, part: Path, number: int) -> Entry:
+    kind, center = "", None
+    if frame.picture is not None:
+        try:
+            kind, center = _write_picture(source, frame.picture(), part, number)
+        except InputError as problem:
+            if number == 0:
+                raise
+            warnings.warn(f"a frame keeps no picture: {' '.join(str(problem).split())}", stacklevel=2)
+            kind = "broken"
+    markers = {name: np.asarray(place, dtype=float).tolist() for name, place in frame.markers.items()}
+    strangers = np.asarray(frame.unlabelled, dtype=float).reshape(-1, 3)
+    if markers:
+        strangers = strangers[:0]  # a recording has named markers or unnamed ones in a frame
+    if center is None and (markers or len(strangers)):
+        center = np.mean([*markers.values(), *strangers.tolist()], axis=0).tolist()
+    loads = [[*np.asarray(p, dtype=float).tolist(), *np.asarray(f, dtype=float).tolist()] for p, f in frame.loads]
+    inputs = {name: float(value) for name, value in frame.inputs.items()}
+    return Entry(float(frame.time), inputs, markers, strangers.tolist(), loads, kind, center)
+
+
+def _write_picture(source: Source, picture: Images | PointCloud, part: Path, number: int) -> tuple[str, list[float] | None]:
+    if isinstance(picture, PointCloud):
+        write_cloud_file(part / "clouds" / f"{number:06d}.ply", picture)
+        return "cloud", picture.points.mean(axis=0).tolist() if len(picture) else None
+    write_depth(part / "depth" / f"{number:06d}.png", picture.depth)
+    if picture.color is not None:
+        write_color(part / "color" / f"{number:06d}.png", picture.color)
+    return "depth", _center(picture, source.lens, source.depth_unit_m)
+
+
+def _center(picture: Images, lens: Lens | None, unit: float) -> list[float] | None:
+    """Return the mean of the points of a depth image [m], without its lens's distortion: it serves to see motion."""
+    z = picture.depth[::4, ::4].astype(np.float64) * unit
+    if lens is None or not z.any():
+        return None
+    row, column = np.nonzero(z)
+    values = z[row, column]
+    x = (4 * column - lens.cx) / lens.fx * values
+    y = (4 * row - lens.cy) / lens.fy * values
+    return [float(x.mean()), float(y.mean()), float(values.mean())]
+
+
+# The tables
+
+
+def _finish(
+    source: Source,
+    part: Path,
+    journal: Journal,
+    counts: Mapping[str, int],
+    actuation: str | None,
+    zero: str | None,
+    log: ActuationLog | None,
+    offset: float | None,
+) -> dict[str, Any]:
+    times = journal.times()
+    if not len(times):
+        raise InputError(
+            "no frames", where=source.path, found=f"{source.format} without a frame", expected="frames in order of time"
+        )
+    applied, aligned = (None, {}) if log is None else align(log, journal, offset)
+    columns = _input_columns(journal) + ([] if applied is None else list(applied.columns))
+    kind = _actuation(source, columns, actuation or (log.actuation if log is not None else None))
+    zero_kind = zero or ("unknown" if kind == "displacement" and columns else "absolute")
+    write_toml(part / "recording.toml", _document(source, kind, zero_kind, part))
+    rows = _frame_rows(journal, times[0], columns, {} if applied is None else applied.at(times))
+    write_csv(part / "frames.csv", ["frame", "time_s", *columns], rows)
+    _write_rows(part / "markers.csv", ["frame", "marker", *PLACE_COLUMNS], _marker_rows(journal))
+    _write_rows(part / "loads.csv", ["frame", *PLACE_COLUMNS, *FORCE_COLUMNS], _load_rows(journal))
+    return {
+        **summary(source, journal, counts),
+        "actuation": kind if columns else None,
+        "actuation_zero": zero_kind if columns else None,
+        "inputs": columns,
+        **aligned,
+    }
+
+
+def _input_columns(journal: Journal) -> list[str]:
+    columns: dict[str, None] = {}
+    for entry in journal.entries():
+        columns.update(dict.fromkeys(entry.inputs))
+    return sorted(columns)
+
+
+def _actuation(source: Source, columns: list[str], said: str | None) -> str:
+    kind = said or source.actuation
+    cables = [name for name in columns if name.startswith("cable_")]
+    if kind is None and cables:
+        raise InputError(
+            "what the cables' values are is not known",
+            where=source.path,
+            found=", ".join(cables[:6]),
+            expected="--inputs tension (newtons) or --inputs displacement (metres, > 0 shortens)",
+            hint="--map NAME=cable_x*FACTOR converts other units",
+        )
+    return kind or "tension"
+
+
+def _document(source: Source, actuation: str, zero: str, part: Path) -> dict[str, Any]:
+    document: dict[str, Any] = {"format": FORMAT, "actuation": actuation, "actuation_zero": zero}
+    lens = source.lens
+    if lens is None or not (part / "depth").is_dir():
+        return document
+    table = {key: getattr(lens, key) for key in ("width", "height", "fx", "fy", "cx", "cy")}
+    count = 5 if not np.any(lens.distortion[5:] != 0.0) else 8
+    distortion = np.concatenate([lens.distortion, np.zeros(8)])[:count].tolist()
+    model = {"distortion_model": lens.model} if lens.model != "brown_conrady" else {}
+    return document | {"camera": {**table, "distortion": distortion, **model, "depth_unit_m": source.depth_unit_m}}
+
+
+def _frame_rows(journal: Journal, start: float, columns: list[str], applied: Mapping[str, Any]) -> Iterator[Sequence[object]]:
+    held: dict[str, float] = {}
+    for number, entry in enumerate(journal.entries()):
+        held.update(entry.inputs)
+        values = [applied[name][number] if name in applied else held.get(name, 0.0) for name in columns]
+        yield [number, entry.time - start, *values]
+
+
+def _marker_rows(journal: Journal) -> Iterator[Sequence[object]]:
+    for number, entry in enumerate(journal.entries()):
+        yield from ([number, name, *place] for name, place in entry.markers.items())
+        yield from ([number, "", *place] for place in entry.unlabelled)
+
+
+def _load_rows(journal: Journal) -> Iterator[Sequence[object]]:
+    for number, entry in enumerate(journal.entries()):
+        yield from ([number, *load] for load in entry.loads)
+
+
+def _write_rows(path: Path, columns: list[str], rows: Iterator[Sequence[object]]) -> None:
+    """Write a table, if it has a row."""
+    first = list(islice(rows, 1))
+    if not first:
+        return
+
+    def all_rows() -> Iterator[Sequence[object]]:
+        yield from first
+        yield from rows
+
+    write_csv(path, columns, all_rows())

@@ -1,0 +1,252 @@
+"""A run as an MCAP file of ROS 2: clouds, contacts, forces, inputs and the deformed body, as Foxglove shows them."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from femsense.calib.files import read_calibration
+from femsense.core.arrays import FloatArray
+from femsense.core.errors import InputError
+from femsense.fem.mesh import TetMesh, surface_triangles
+from femsense.io.files import write_beside
+from femsense.model.recording import Recording
+from femsense.sensing.run_files import read_run
+from femsense.sensing.types import ContactForce, Run
+from femsense.xr.ros_definitions import MESSAGES, definition
+
+METRES_PER_NEWTON = 0.05
+"""Length of a force's arrow."""
+BODY = (0.35, 0.55, 0.85, 0.9)
+FORCE = (0.9, 0.25, 0.15, 1.0)
+NOBODY: dict[str, list[Any]] = {
+    name: [] for name in ("metadata", "arrows", "cubes", "spheres", "cylinders", "lines", "triangles", "texts", "models")
+}
+TURNED = {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}
+
+
+@dataclass(frozen=True, slots=True)
+class McapReport:
+    """What was written."""
+
+    frames: int
+    clouds: int
+    contacts: int
+    topics: tuple[str, ...]
+
+
+def export_mcap(folder: str | Path, path: str | Path) -> McapReport:
+    """Write a run as MCAP with messages of ROS 2.
+
+    Topics: /tf (robot → camera, contact_…), /femsense/contacts (PoseArray, z along the outward normal), /femsense/force_… (WrenchStamped
+    [N] at contact_…), /femsense/inputs (JointState; effort holds tensions [N] and pressures [Pa]), /femsense/scene (SceneUpdate: the
+    deformed surface and arrows), /femsense/cloud (PointCloud2, camera frame) where the recording has clouds and is still there.
+
+    Arguments:
+        folder: a run that `femsense estimate` wrote.
+        path: the .mcap file.
+
+    Raises:
+        InputError: no run, or the package mcap-ros2-support is missing.
+    """
+    run = read_run(folder)
+    writer_module = _need()
+    calibration = Path(folder).expanduser() / "calibration.json"
+    pose = np.asarray(read_calibration(calibration).T_robot_camera, dtype=float) if calibration.is_file() else None
+    clouds, recording = 0, _recording(run.recording_folder)
+    with write_beside(path) as part, part.open("wb") as stream:
+        writer = writer_module.Writer(stream)
+        out = _Topics(writer)
+        for index, report in enumerate(run.frames):
+            at = round(1e9 * report.time_s)
+            contacts = [c for c in run.contacts if c.frame == report.frame]
+            _write_frame(out, run, index, contacts, at, pose)
+            clouds += _write_cloud(out, recording, report.frame, at)
+        writer.finish()
+    return McapReport(len(run.frames), clouds, len(run.contacts), tuple(sorted(out.topics)))
+
+
+class _Topics:
+    """Writes messages; their definitions go in once."""
+
+    def __init__(self, writer: Any) -> None:
+        self.writer = writer
+        self.schemas = {name: writer.register_msgdef(name, definition(name)) for name in MESSAGES}
+        self.topics: set[str] = set()
+
+    def write(self, topic: str, kind: str, message: Mapping[str, Any], at: int) -> None:
+        self.topics.add(topic)
+        self.writer.write_message(topic, self.schemas[kind], message, log_time=at, publish_time=at)
+
+
+def _write_frame(out: _Topics, run: Run, index: int, contacts: list[ContactForce], at: int, pose: FloatArray | None) -> None:
+    transforms = [] if pose is None else [_transform("robot", "camera", pose[:3, 3], _quaternion(pose[:3, :3]), at)]
+    transforms += [_transform("robot", f"contact_{c.contact}", c.position_m, TURNED, at) for c in contacts]
+    if transforms:
+        out.write("/tf", "tf2_msgs/msg/TFMessage", {"transforms": transforms}, at)
+    poses = [{"position": _xyz(c.position_m), "orientation": _towards(c.normal, axis=2)} for c in contacts]
+    out.write("/femsense/contacts", "geometry_msgs/msg/PoseArray", {"header": _header("robot", at), "poses": poses}, at)
+    for c in contacts:
+        wrench = {"force": _xyz(c.force_n_xyz), "torque": _xyz(np.zeros(3))}
+        message = {"header": _header(f"contact_{c.contact}", at), "wrench": wrench}
+        out.write(f"/femsense/force_{c.contact}", "geometry_msgs/msg/WrenchStamped", message, at)
+    report = run.frames[index]
+    drives = {**report.tension_n, **report.pressure_pa}
+    if drives:
+        state = {
+            "header": _header("robot", at),
+            "name": list(drives),
+            "position": [],
+            "velocity": [],
+            "effort": list(drives.values()),
+        }
+        out.write("/femsense/inputs", "sensor_msgs/msg/JointState", state, at)
+    out.write(
+        "/femsense/scene", "foxglove_msgs/msg/SceneUpdate", {"deletions": [], "entities": _entities(run, index, contacts, at)}, at
+    )
+
+
+def _entities(run: Run, index: int, contacts: list[ContactForce], at: int) -> list[Any]:
+    """Return the deformed surface and the arrows of the forces; arrows of an earlier frame go with their entity."""
+    triangles = surface_triangles(TetMesh(run.states.rest_nodes_m, run.states.tets))
+    used, corners = np.unique(triangles, return_inverse=True)
+    nodes = np.asarray(run.states.nodes_m[index], dtype=float)[used]
+    entities = []
+    if np.isfinite(nodes).all():
+        mesh = {
+            "pose": {"position": _xyz(np.zeros(3)), "orientation": TURNED},
+            "points": [_xyz(p) for p in nodes],
+            "color": _color(BODY),
+            "colors": [],
+            "indices": corners.ravel().tolist(),
+        }
+        entities.append(_entity("body", at) | {"triangles": [mesh]})
+    return [*entities, _entity("forces", at) | {"arrows": [_arrow(c) for c in contacts if np.isfinite(c.force_n_xyz).all()]}]
+
+
+def _arrow(contact: ContactForce) -> dict[str, Any]:
+    """Return an arrow that ends where the force acts."""
+    size = float(np.linalg.norm(contact.force_n_xyz))
+    length = max(METRES_PER_NEWTON * size, 1e-4)
+    start = contact.position_m - contact.force_n_xyz / max(size, 1e-12) * length
+    return {
+        "pose": {"position": _xyz(start), "orientation": _towards(contact.force_n_xyz, axis=0)},
+        "shaft_length": 0.75 * length,
+        "shaft_diameter": 0.08 * length,
+        "head_length": 0.25 * length,
+        "head_diameter": 0.18 * length,
+        "color": _color(FORCE),
+    }
+
+
+def _write_cloud(out: _Topics, recording: Recording | None, frame: int, at: int) -> int:
+    """Write the cloud of a frame, if there is one; return how many were written."""
+    cloud = None
+    if recording is not None:
+        from femsense.io.clouds.frame_clouds import read_frame_cloud
+
+        k = int(np.flatnonzero(recording.frame_numbers == frame)[0]) if (recording.frame_numbers == frame).any() else -1
+        cloud = read_frame_cloud(recording, k) if k >= 0 else None
+    if cloud is None:
+        return 0
+    kind = [(axis, "<f4") for axis in "xyz"] + ([] if cloud.colors is None else [("rgb", "<u4")])
+    rows = np.empty(len(cloud), dtype=kind)
+    for i, axis in enumerate("xyz"):
+        rows[axis] = cloud.points[:, i]
+    if cloud.colors is not None:
+        rows["rgb"] = np.rint(255 * cloud.colors).astype(np.uint32) @ np.array([65536, 256, 1], dtype=np.uint32)
+    fields = [{"name": n, "offset": 4 * i, "datatype": 7, "count": 1} for i, (n, _) in enumerate(kind)]
+    size = rows.dtype.itemsize
+    message = {
+        "header": _header("camera", at),
+        "height": 1,
+        "width": len(rows),
+        "fields": fields,
+        "is_bigendian": False,
+        "point_step": size,
+        "row_step": size * len(rows),
+        "data": rows.tobytes(),
+        "is_dense": True,
+    }
+    out.write("/femsense/cloud", "sensor_msgs/msg/PointCloud2", message, at)
+    return 1
+
+
+def _recording(folder: Path | None) -> Recording | None:
+    from femsense.io.recording_folder import load_recording
+
+    if folder is None or not (folder / "recording.toml").is_file():
+        return None
+    return load_recording(folder)
+
+
+# Parts of messages
+
+
+def _stamp(at: int) -> dict[str, int]:
+    return {"sec": at // 10**9, "nanosec": at % 10**9}
+
+
+def _header(frame: str, at: int) -> dict[str, Any]:
+    return {"stamp": _stamp(at), "frame_id": frame}
+
+
+def _xyz(values: Any) -> dict[str, float]:
+    return {axis: float(v) for axis, v in zip("xyz", values)}
+
+
+def _color(rgba: tuple[float, float, float, float]) -> dict[str, float]:
+    return dict(zip("rgba", rgba))
+
+
+def _entity(name: str, at: int) -> dict[str, Any]:
+    return {
+        "timestamp": _stamp(at),
+        "frame_id": "robot",
+        "id": name,
+        "lifetime": {"sec": 0, "nanosec": 0},
+        "frame_locked": False,
+        **NOBODY,
+    }
+
+
+def _transform(parent: str, child: str, place: Any, turn: Mapping[str, float], at: int) -> dict[str, Any]:
+    return {"header": _header(parent, at), "child_frame_id": child, "transform": {"translation": _xyz(place), "rotation": turn}}
+
+
+def _quaternion(R: FloatArray) -> dict[str, float]:
+    from scipy.spatial.transform import Rotation
+
+    return dict(zip("xyzw", Rotation.from_matrix(R).as_quat().tolist()))
+
+
+def _towards(direction: Any, *, axis: int) -> dict[str, float]:
+    """Return a rotation that takes an axis (0: x, 2: z) to a direction, shape (3,)."""
+    d = np.asarray(direction, dtype=float)
+    size = np.linalg.norm(d)
+    if not np.isfinite(size) or size == 0.0:
+        return dict(TURNED)
+    first = d / size
+    other = np.eye(3)[int(np.argmin(np.abs(first)))]
+    second = np.cross(first, other)
+    second /= np.linalg.norm(second)
+    columns = [first, second, np.cross(first, second)]
+    return _quaternion(np.stack(columns[-axis:] + columns[:-axis] if axis else columns, axis=1))
+
+
+def _need() -> Any:
+    try:
+        return importlib.import_module("mcap_ros2.writer")
+    except ImportError as error:
+        raise InputError(
+            "writing MCAP needs a package that is not there",
+            where="mcap-ros2-support",
+            found=str(error),
+            expected="the extra [mcap]",
+            hint="pip install 'femsense[mcap]'",
+        ) from None

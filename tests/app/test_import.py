@@ -1,0 +1,117 @@
+"""`femsense import` as a user types it: answers, choices, what stands in the way, and what inspect says of the same files."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from femsense.app.cli import run
+from femsense.io.recording_folder import load_recording
+
+ROWS = "time,tip_x,tip_y,tip_z,cable_north\n" + "".join(f"{0.1 * k},{k},0,1000,{0.5 * k}\n" for k in range(5))
+
+
+@pytest.fixture
+def table(tmp_path: Path) -> Path:
+    (tmp_path / "take.csv").write_text(ROWS)
+    return tmp_path / "take.csv"
+
+
+def answer(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, dict]:
+    status = run([*map(str, words), "--json"])
+    return status, json.loads(capsys.readouterr().out)
+
+
+def test_the_whole_way(table: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ("import", table, "-o", tmp_path / "out", "--unit", "mm", "--inputs", "tension")
+    status, document = answer(capsys, *words)
+    assert status == 0 and document["frames"] == 5 and document["rate_hz"] == pytest.approx(10)
+    assert document["actuation"] == "tension" and document["markers"] == ["tip"]
+    recording = load_recording(tmp_path / "out")
+    np.testing.assert_allclose(recording.marker_xyz[:, 0], 1e-3 * np.arange(5))
+    status, report = answer(capsys, "inspect", tmp_path / "out")
+    assert status == 0 and report["kind"] == "recording"
+    before = (tmp_path / "out/frames.csv").stat().st_mtime_ns
+    assert answer(capsys, *words)[0] == 0
+    assert (tmp_path / "out/frames.csv").stat().st_mtime_ns == before
+
+
+def test_text_for_people(table: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["import", str(table), "-o", str(tmp_path / "out"), "--unit", "mm", "--inputs", "tension"]) == 0
+    out = capsys.readouterr().out
+    for words in ("5 frames", "rate [1/s]", "unit", "written:"):
+        assert words in out
+
+
+def test_what_is_not_known_is_asked_with_status_2(table: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, document = answer(capsys, "import", table, "-o", tmp_path / "out")
+    assert status == 2 and "--unit" in document["error"]
+    status, document = answer(capsys, "import", table, "-o", tmp_path / "out", "--unit", "mm")
+    assert status == 2 and "--inputs" in document["error"]
+    assert not (tmp_path / "out").exists()
+
+
+def test_another_import_is_replaced_only_when_that_is_said(
+    table: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["import", table, "-o", tmp_path / "out", "--inputs", "tension"]
+    assert answer(capsys, *words, "--unit", "mm")[0] == 0
+    status, document = answer(capsys, *words, "--unit", "cm")
+    assert status == 2 and "--again" in document["error"]
+    assert answer(capsys, *words, "--unit", "cm", "--again")[0] == 0
+    assert load_recording(tmp_path / "out").marker_xyz[1, 0] == pytest.approx(0.01)
+    assert not list(tmp_path.glob(".part-*"))
+
+
+def test_what_is_no_import_is_never_replaced(table: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine/notes.txt").write_text("precious")
+    for extra in ([], ["--again"]):
+        status, document = answer(capsys, "import", table, "-o", tmp_path / "mine", "--unit", "mm", "--inputs", "tension", *extra)
+        assert status == 2 and "stands there already" in document["error"]
+    assert (tmp_path / "mine/notes.txt").read_text() == "precious"
+    status, _ = answer(capsys, "import", table, "-o", table, "--unit", "mm", "--inputs", "tension")
+    assert status == 2 and table.read_text() == ROWS
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--unit", "furlong"), "--unit"),
+        (("--up", "w"), "--up"),
+        (("--clock", "sun"), "--clock"),
+        (("--rate", "-1"), "--rate"),
+        (("--map", "tip"), "--map"),
+        (("--format", "rosbag"), "no such format"),
+        (("--inputs", "torque"), "--inputs"),
+        (("--zero", "one"), "--zero"),
+        (("--actuation", "nowhere.csv"), "nothing there"),
+    ],
+)
+def test_wrong_words(words: tuple[str, ...], said: str, table: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, document = answer(capsys, "import", table, "-o", tmp_path / "out", *words)
+    assert status == 2 and said in document["error"]
+
+
+def test_inspect_says_what_is_in_a_capture_and_never_that_nothing_is_wrong(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("rosbags")
+    from ros_writers import BagWriter, write_camera
+
+    with BagWriter(tmp_path / "take.bag", "1") as bag:
+        write_camera(bag, 3)
+    assert run(["inspect", str(tmp_path / "take.bag")]) == 0
+    out = capsys.readouterr().out
+    assert "/camera/depth/image_raw" in out and "depth" in out and "nothing is wrong" not in out
+    with BagWriter(tmp_path / "folder", "mcap") as bag:
+        write_camera(bag, 3)
+    status, report = answer(capsys, "inspect", tmp_path / "folder")
+    assert status == 0 and report["kind"] == "capture" and {t["holds"] for t in report["topics"]} == {"depth", "color", "inputs"}
+    for name, data in (("a.bag", b"random bytes" * 50), ("b.c3d", b"abc"), ("c.db3", b""), ("d.mcap", b"\x89MCAP0\r\n")):
+        (tmp_path / name).write_bytes(data)
+        status, report = answer(capsys, "inspect", tmp_path / name)
+        assert status == 2 and report["kind"] == "capture" and report["problems"]

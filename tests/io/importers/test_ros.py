@@ -1,0 +1,353 @@
+"""Bags that `rosbags` wrote: ROS 1, ROS 2 in SQLite and MCAP, whole and broken."""
+
+from __future__ import annotations
+
+import struct
+import warnings
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+pytest.importorskip("rosbags")
+from ros_writers import HEIGHT, LENS, START_NS, STEP_NS, WIDTH, BagWriter, color_of, depth_of, write_camera
+
+from femsense.core.errors import InputError
+from femsense.io.clouds.cloud_files import read_cloud
+from femsense.io.clouds.frame_clouds import read_frame_cloud
+from femsense.io.clouds.images import read_png
+from femsense.io.importers.frames import Options
+from femsense.io.importers.guess import open_source
+from femsense.io.importers.writer import write_recording
+from femsense.io.recording_folder import load_recording
+from femsense.model.recording import Recording, marker_grid
+
+FRAMES = 8
+KINDS = ("1", "sqlite3", "mcap")
+
+
+def bag_path(folder: Path, kind: str) -> Path:
+    return folder / ("take.bag" if kind == "1" else "take")
+
+
+def imported(path: Path, folder: Path, options: Options | None = None, **more: object) -> tuple[Recording, dict]:
+    found = write_recording(open_source(path, options), folder / "recording", identity={"test": str(path)}, **more)
+    return load_recording(folder / "recording"), found
+
+
+def without_invalid(image: np.ndarray) -> np.ndarray:
+    return np.where(image == 65535, 0, image)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_aligned_camera_with_motors(kind: str, tmp_path: Path) -> None:
+    with BagWriter(bag_path(tmp_path, kind), kind) as bag:
+        write_camera(bag, FRAMES)
+    recording, found = imported(bag_path(tmp_path, kind), tmp_path)
+    for k in range(FRAMES):
+        np.testing.assert_array_equal(read_png(tmp_path / f"recording/depth/{k:06d}.png"), without_invalid(depth_of(k)))
+        np.testing.assert_array_equal(read_png(tmp_path / f"recording/color/{k:06d}.png")[:, :, ::-1], color_of(k))
+    np.testing.assert_allclose(recording.time_s, 1e-9 * STEP_NS * np.arange(FRAMES), atol=1e-6)
+    assert recording.cable_names == ("north", "south") and recording.actuation == "tension"
+    np.testing.assert_allclose(recording.inputs[:-1, 0], recording.time_s[:-1], atol=1e-6)
+    np.testing.assert_allclose(recording.inputs[:-1, 1], 2 * recording.time_s[:-1] + 1, atol=1e-6)
+    lens = recording.cameras[0]
+    assert lens is not None and (lens.width, lens.height, lens.depth_unit) == (WIDTH, HEIGHT, 0.001)
+    assert (lens.fx, lens.fy, lens.cx, lens.cy) == LENS
+    assert found["clock"] == "header" and found["depth_images"] == FRAMES and found["gaps"] == 0
+
+
+@pytest.mark.parametrize("kind", ["sqlite3", "mcap"])
+def test_a_file_without_its_metadata_and_a_bare_file(kind: str, tmp_path: Path) -> None:
+    folder = bag_path(tmp_path, kind)
+    with BagWriter(folder, kind) as bag:
+        write_camera(bag, FRAMES, motors=False)
+    (folder / "metadata.yaml").unlink()
+    bare = next(folder.iterdir())
+    with pytest.warns(UserWarning, match=r"metadata\.yaml is missing"):
+        recording, _ = imported(folder, tmp_path / "a")
+    assert recording.frame_count == FRAMES
+    assert imported(bare, tmp_path / "b")[0].frame_count == FRAMES
+
+
+def test_png_and_depth_in_messages_that_are_compressed(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "take", "mcap") as bag:
+        for k in range(FRAMES):
+            at = START_NS + k * STEP_NS
+            png = bytes(12) + cv2.imencode(".png", depth_of(k))[1].tobytes()
+            bag.write("/cam/depth/image_raw/compressedDepth", at, bag.compressed(png, "16UC1; compressedDepth png", at))
+            bag.write("/cam/depth/camera_info", at, bag.info(at))
+            png = cv2.imencode(".png", color_of(k)[:, :, ::-1])[1].tobytes()
+            bag.write("/cam/color/image_raw/compressed", at, bag.compressed(png, "rgb8; png compressed bgr8", at))
+            bag.write("/cam/color/camera_info", at, bag.info(at))
+    imported(tmp_path / "take", tmp_path)
+    for k in range(FRAMES):
+        np.testing.assert_array_equal(read_png(tmp_path / f"recording/depth/{k:06d}.png"), without_invalid(depth_of(k)))
+        np.testing.assert_array_equal(read_png(tmp_path / f"recording/color/{k:06d}.png")[:, :, ::-1], color_of(k))
+
+
+def test_floating_depth_compressed_by_its_inverse(tmp_path: Path) -> None:
+    """32FC1 in compressedDepth holds a / depth + b as 16 bits (compressed_depth_image_transport)."""
+    metres = np.linspace(0.3, 1.2, WIDTH * HEIGHT).reshape(HEIGHT, WIDTH)
+    a, b = 1e4, 10.0
+    packed = np.rint(a / metres + b).astype(np.uint16)
+    packed[5, 5] = 0
+    with BagWriter(tmp_path / "take", "mcap") as bag:
+        head = struct.pack("<iff", 0, a, b)
+        data = head + cv2.imencode(".png", packed)[1].tobytes()
+        bag.write("/depth/image/compressedDepth", START_NS, bag.compressed(data, "32FC1; compressedDepth png", START_NS))
+        bag.write("/depth/camera_info", START_NS, bag.info(START_NS))
+    recording, _ = imported(tmp_path / "take", tmp_path)
+    lens = recording.cameras[0]
+    assert lens is not None
+    depth = read_png(tmp_path / "recording/depth/000000.png") * lens.depth_unit
+    assert depth[5, 5] == 0
+    depth[5, 5] = metres[5, 5]
+    np.testing.assert_allclose(depth, metres, atol=1.2e-4)
+
+
+@pytest.mark.parametrize("big", [False, True])
+def test_floating_depth_and_either_order_of_bytes(big: bool, tmp_path: Path) -> None:
+    metres = np.full((HEIGHT, WIDTH), 0.5432, dtype=np.float32)
+    metres[0, :4] = [np.nan, np.inf, 0.0, 9.0]
+    with BagWriter(tmp_path / "take", "mcap") as bag:
+        bag.write("/depth/image_raw", START_NS, bag.image(metres, "32FC1", START_NS, big=big, pad=8))
+        bag.write("/depth/camera_info", START_NS, bag.info(START_NS))
+    imported(tmp_path / "take", tmp_path)
+    depth = read_png(tmp_path / "recording/depth/000000.png")
+    np.testing.assert_array_equal(depth[0, :4], 0)
+    assert np.unique(depth[1:]).tolist() == [5432]
+
+
+@pytest.mark.parametrize("big", [False, True])
+def test_clouds_keep_places_and_colours(big: bool, tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    points = rng.normal(size=(500, 3)).astype(np.float32)
+    points[7] = np.nan
+    colors = rng.integers(0, 256, size=(500, 3))
+    with BagWriter(tmp_path / "take", "mcap") as bag:
+        for k in range(3):
+            at = START_NS + k * STEP_NS
+            bag.write("/points", at, bag.cloud(points + np.float32(k), colors, at, big=big))
+    recording, found = imported(tmp_path / "take", tmp_path)
+    assert found["clouds"] == 3
+    kept = np.arange(500) != 7
+    for k in range(3):
+        cloud = read_frame_cloud(recording, k)
+        assert cloud is not None and cloud.colors is not None
+        np.testing.assert_array_equal(cloud.points, (points + np.float32(k))[kept].astype(float))
+        np.testing.assert_array_equal(np.rint(255 * cloud.colors), colors[kept])
+
+
+def test_the_points_of_a_fisheye_depth_camera(tmp_path: Path) -> None:
+    """They are those that OpenCV finds."""
+    d = (0.05, -0.01, 0.002, 0.0)
+    with BagWriter(tmp_path / "take", "mcap") as bag:
+        bag.write("/depth/image_raw", START_NS, bag.image(depth_of(0), "16UC1", START_NS))
+        bag.write("/depth/camera_info", START_NS, bag.info(START_NS, model="equidistant", d=d))
+    recording, _ = imported(tmp_path / "take", tmp_path)
+    cloud = read_frame_cloud(recording, 0)
+    assert cloud is not None
+    depth = without_invalid(depth_of(0))
+    row, column = np.nonzero(depth)
+    fx, fy, cx, cy = LENS
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    rays = cv2.fisheye.undistortPoints(np.stack([column, row], axis=1)[:, None].astype(float), K, np.array(d))[:, 0]
+    z = 1e-3 * depth[row, column]
+    np.testing.assert_allclose(cloud.points, np.column_stack([rays * z[:, None], z]), atol=1e-6)
+
+
+def test_the_points_of_a_depth_camera_with_the_sdks_inverse_lens(tmp_path: Path) -> None:
+    """Two pixels at 1 m as `rs2_deproject_pixel_to_point` of pyrealsense2 2.57.7 and 2.59.1 gives them."""
+    d = (0.12, -0.2, 0.003, -0.002, 0.05)
+    depth = np.zeros((HEIGHT, WIDTH), dtype=np.uint16)
+    depth[7, 5] = depth[40, 60] = 1000
+    with BagWriter(tmp_path / "take", "mcap") as bag:
+        bag.write("/depth/image_raw", START_NS, bag.image(depth, "16UC1", START_NS))
+        bag.write("/depth/camera_info", START_NS, bag.info(START_NS, model="Inverse Brown Conrady", d=d))
+    recording, _ = imported(tmp_path / "take", tmp_path)
+    cloud = read_frame_cloud(recording, 0)
+    assert cloud is not None
+    np.testing.assert_allclose(cloud.points, [[-0.51902, -0.31836, 1], [0.56041, 0.31641, 1]], atol=2e-5)
+
+
+def test_colours_of_another_camera_by_static_transforms(tmp_path: Path) -> None:
+    """A wall 0.5 m away: the colour camera, 20 mm to the right, sees each place 2 pixels farther left."""
+    wall = np.full((HEIGHT, WIDTH), 500, dtype=np.uint16)
+    with BagWriter(tmp_path / "take", "mcap") as bag:
+        bag.write("/tf_static", START_NS, bag.static_transform("link", "depth_optical", (0.01, 0, 0)))
+        bag.write("/tf_static", START_NS, bag.static_transform("link", "color_optical", (0.03, 0, 0)))
+        bag.write("/depth/image_raw", START_NS, bag.image(wall, "16UC1", START_NS, "depth_optical"))
+        bag.write("/depth/camera_info", START_NS, bag.info(START_NS, "depth_optical"))
+        bag.write("/color/image_raw", START_NS, bag.image(color_of(0), "rgb8", START_NS, "color_optical"))
+        bag.write("/color/camera_info", START_NS, bag.info(START_NS, "color_optical"))
+    imported(tmp_path / "take", tmp_path)
+    color = read_png(tmp_path / "recording/color/000000.png")[:, :, ::-1]
+    np.testing.assert_array_equal(color[:, 2:], color_of(0)[:, :-2])
+    assert not color[:, :2].any()
+
+
+def test_colours_without_a_known_place_are_left_out_and_named(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "take", "mcap") as bag:
+        bag.write("/depth/image_raw", START_NS, bag.image(depth_of(0), "16UC1", START_NS, "a"))
+        bag.write("/depth/camera_info", START_NS, bag.info(START_NS, "a"))
+        bag.write("/color/image_raw", START_NS, bag.image(color_of(0), "rgb8", START_NS, "b"))
+        bag.write("/color/camera_info", START_NS, bag.info(START_NS, "b"))
+    source = open_source(tmp_path / "take")
+    assert any("/color/image_raw" in note and "left out" in note for note in source.notes)
+    imported(tmp_path / "take", tmp_path)
+    assert not (tmp_path / "recording/color").exists()
+
+
+def test_several_cameras_are_a_choice(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "take", "mcap") as bag:
+        for name in ("left", "right"):
+            bag.write(f"/{name}/depth/image_raw", START_NS, bag.image(depth_of(name == "right"), "16UC1", START_NS, name))
+            bag.write(f"/{name}/depth/camera_info", START_NS, bag.info(START_NS, name))
+    with pytest.raises(InputError) as caught:
+        open_source(tmp_path / "take")
+    assert "/left/depth/image_raw" in str(caught.value) and "/right/depth/image_raw" in str(caught.value)
+    imported(tmp_path / "take", tmp_path, Options(topics=["/right/depth/image_raw"]))
+    np.testing.assert_array_equal(read_png(tmp_path / "recording/depth/000000.png"), without_invalid(depth_of(1)))
+    with pytest.raises(InputError, match="no such topic"):
+        open_source(tmp_path / "take", Options(topics=["/middle"]))
+
+
+def test_stamps_that_are_no_clock_are_not_used(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "take.bag", "1") as bag:
+        for k in range(FRAMES):
+            bag.write("/depth/image_raw", START_NS + k * STEP_NS, bag.image(depth_of(k), "16UC1", 0))
+            bag.write("/depth/camera_info", START_NS + k * STEP_NS, bag.info(0))
+    recording, found = imported(tmp_path / "take.bag", tmp_path)
+    assert found["clock"] == "record"
+    np.testing.assert_allclose(recording.time_s, 1e-9 * STEP_NS * np.arange(FRAMES), atol=1e-6)
+
+
+def test_header_stamps_win_over_the_jitter_of_recording(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    with BagWriter(tmp_path / "take", "mcap") as bag:
+        for k in range(FRAMES):
+            stamp = START_NS + k * STEP_NS
+            bag.write("/points", stamp + int(rng.integers(1, 20)) * 10**6, bag.cloud(np.ones((4, 3)), None, stamp))
+    recording, _ = imported(tmp_path / "take", tmp_path / "a")
+    np.testing.assert_allclose(np.diff(recording.time_s), 1e-9 * STEP_NS, atol=1e-6)
+    late, _ = imported(tmp_path / "take", tmp_path / "b", Options(clock="record"))
+    assert np.ptp(np.diff(late.time_s)) > 1e-3
+
+
+def test_a_mapping_of_motors_with_a_factor(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "take", "mcap") as bag:
+        for k in range(4):
+            at = START_NS + k * STEP_NS
+            bag.write("/points", at, bag.cloud(np.ones((4, 3)), None, at))
+            bag.write("/motors", at, bag.joints(["m1", "m2"], at, position=[0.1 * k, 5.0], effort=[1.0, 2.0]))
+    recording, _ = imported(tmp_path / "take", tmp_path, Options(columns={"m1.position": "cable_north*-0.02"}))
+    assert recording.cable_names == ("north",)
+    assert recording.actuation == "displacement" and recording.actuation_zero == "unknown"
+    np.testing.assert_allclose(recording.inputs[:, 0], -0.002 * np.arange(4), atol=1e-9)
+
+
+def test_commands_in_arrays_say_no_unit(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "take", "mcap") as bag:
+        for k in range(4):
+            at = START_NS + k * STEP_NS
+            bag.write("/points", at, bag.cloud(np.ones((4, 3)), None, at))
+            bag.write("/commands", at, bag.array([k, 2.0 * k]))
+    options = Options(columns={"0": "cable_a", "1": "cable_b"})
+    with pytest.raises(InputError, match="--inputs tension"):
+        imported(tmp_path / "take", tmp_path, options)
+    recording, _ = imported(tmp_path / "take", tmp_path, options, actuation="tension")
+    np.testing.assert_allclose(recording.inputs, np.arange(4)[:, None] * [1.0, 2.0], atol=3e-5)
+
+
+def test_known_loads_need_their_place(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "take", "mcap") as bag:
+        for k in range(4):
+            at = START_NS + k * STEP_NS
+            bag.write("/points", at, bag.cloud(np.ones((4, 3)), None, at))
+            bag.write("/ft", at, bag.wrench((0.0, 0.0, -0.1 * k), at))
+    assert any("/ft" in note and "load@" in note for note in open_source(tmp_path / "take").notes)
+    recording, _ = imported(tmp_path / "take", tmp_path, Options(columns={"/ft": "load@0.1,0,0.02"}))
+    np.testing.assert_allclose(recording.load_points, [[0.1, 0, 0.02]] * 4)
+    np.testing.assert_allclose(recording.load_forces[:, 2], -0.1 * np.arange(4), atol=1e-9)
+
+
+def test_named_markers_in_a_frame_that_static_transforms_join(tmp_path: Path) -> None:
+    """The motion capture stands 1 m above the camera, turned by 90° about z."""
+    half = np.sqrt(0.5)
+    with BagWriter(tmp_path / "take", "mcap") as bag:
+        bag.write("/tf_static", START_NS, bag.static_transform("cam", "mocap", (0, 0, 1), (0, 0, half, half)))
+        for k in range(4):
+            at = START_NS + k * STEP_NS
+            bag.write("/points", at, bag.cloud(np.ones((4, 3)), None, at))
+            bag.write("/markers", at, bag.marker_array({"tip": (0.1, 0.2, 0.01 * k)}, at, "mocap"))
+    recording, _ = imported(tmp_path / "take", tmp_path)
+    assert recording.marker_names == ("tip_0",)
+    np.testing.assert_allclose(marker_grid(recording)[:, 0], [[-0.2, 0.1, 1 + 0.01 * k] for k in range(4)], atol=1e-12)
+
+
+def test_markers_without_names_stay_without(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "take", "mcap") as bag:
+        for k in range(4):
+            at = START_NS + k * STEP_NS
+            bag.write("/poses", at, bag.poses([(0.1, 0, 0), (0.2, 0, 0.01 * k)], at))
+    found = write_recording(open_source(tmp_path / "take"), tmp_path / "out", identity={})
+    rows = (tmp_path / "out/markers.csv").read_text().splitlines()
+    assert found["unlabelled_markers"] == 2 and rows[0] == "frame,marker,x_m,y_m,z_m"
+    assert rows[-1] == "3,,0.2,0.0,0.03"
+
+
+# Broken ones
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_is_cut_off_is_said_or_read_up_to_the_break(kind: str, tmp_path: Path) -> None:
+    path = bag_path(tmp_path, kind)
+    with BagWriter(path, kind) as bag:
+        write_camera(bag, 60)
+    file = path if kind == "1" else next(f for f in path.iterdir() if f.suffix in (".db3", ".mcap"))
+    data = file.read_bytes()
+    for share in (0.0, 0.01, 0.5, 0.98):
+        file.write_bytes(data[: int(share * len(data))])
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            try:
+                recording, _ = imported(file, tmp_path / f"{share}")
+            except InputError as problem:
+                assert str(file) in str(problem)
+            else:
+                assert recording.frame_count < 60
+                assert any("broken" in str(w.message) for w in caught)
+
+
+def test_garbage_with_the_ending_of_a_bag(tmp_path: Path) -> None:
+    for name in ("a.bag", "a.db3", "a.mcap"):
+        (tmp_path / name).write_bytes(np.random.default_rng(0).bytes(5000))
+        with pytest.raises(InputError, match="not readable as a ROS bag"):
+            open_source(tmp_path / name)
+
+
+def test_messages_of_another_type_store_cost_themselves_only(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "take", "mcap") as bag:
+        write_camera(bag, 4, motors=False)
+        bag.writer.write(bag.connections["/camera/depth/image_raw"], START_NS + 10**9, b"\x00\x01\x00\x00garbage")
+    with pytest.warns(UserWarning, match="a message that its type does not describe"):
+        recording, _ = imported(tmp_path / "take", tmp_path)
+    assert recording.frame_count == 4
+
+
+def test_an_image_of_another_size_than_its_lens(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "take", "mcap") as bag:
+        bag.write("/depth/image_raw", START_NS, bag.image(depth_of(0), "16UC1", START_NS))
+        bag.write("/depth/camera_info", START_NS, bag.info(START_NS, size=(32, 24)))
+    with pytest.raises(InputError, match="another size than its CameraInfo"):
+        imported(tmp_path / "take", tmp_path)
+
+
+def test_a_million_points(tmp_path: Path) -> None:
+    points = np.random.default_rng(0).random((1_000_000, 3)).astype(np.float32) + 0.1
+    with BagWriter(tmp_path / "take", "mcap") as bag:
+        bag.write("/points", START_NS, bag.cloud(points, None, START_NS))
+    imported(tmp_path / "take", tmp_path)
+    np.testing.assert_array_equal(read_cloud(tmp_path / "recording/clouds/000000.ply").points, points.astype(float))
