@@ -41,7 +41,7 @@ from femsense.loop.search.search_state import Progress, Refit, Search, SearchPro
 from femsense.loop.search.subsampling import spares
 from femsense.loop.search.swaps import BETTER, History, swapped
 from femsense.loop.verdict.verdict import conclude
-from femsense.model.effects import EFFECTS, FORMS, Effect, find_effect, load_own_effect, try_own_effect
+from femsense.model.effects import EFFECTS, FORMS, OF_BODY, Effect, find_effect, load_own_effect, try_own_effect
 from femsense.model.observation import Hypothesis, SceneJet
 from femsense.model.recording import Recording, state_key
 from femsense.model.robot import Robot
@@ -193,7 +193,7 @@ def _with_discretisation_error(data: Data, base: FittedModel, names: Sequence[st
     say("asking what the mesh costs")
     try:  # zeros may have gone far, for an effect's sake
         frames = [few_states(t, len(base.fit.hypothesis.robot.body.mesh.tets)) for t in data.train]
-        plain = roughly_keeping(data, base, ["stiffness"], START, frames)
+        plain = roughly_keeping(data, base, OF_BODY, START, frames)
     except FemsenseError:
         plain = base
     return with_turning_placements(with_mesh_errors(data, plain, names), base)

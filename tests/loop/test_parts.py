@@ -36,7 +36,7 @@ from femsense.loop.fit.fitted_model import FittedModel, fit_model, keeping, with
 from femsense.loop.fit.joint_fit import Prior
 from femsense.loop.fit.noise_components import Noise, _Likelihood, whiten
 from femsense.loop.improve import improve
-from femsense.loop.search.acceptance import MOUNTED, _plainly_worse, tilt_penalty
+from femsense.loop.search.acceptance import _plainly_worse
 from femsense.loop.search.effect_fields import _parts
 from femsense.loop.search.screening import penalty
 from femsense.loop.verdict.residual_diagnostics import structure_tests
@@ -386,23 +386,6 @@ def test_calibration_goes_as_far_as_held_out_states_come_to_rest():
     assert [as_far_as_held_out_states_rest(collapses_beyond(most), 4) for most in (4, 3, 1, 0)] == [4, 2, 1, 0]
     with pytest.raises(DataError):
         as_far_as_held_out_states_rest(collapses_beyond(-1), 4)
-
-
-def test_a_declared_gravity_is_believed_to_a_few_degrees():
-    gravity, robot = find_effect("gravity"), arm((4, 2, 2))
-    terms = gravity.parameters(robot, "tension")
-    candidate = SimpleNamespace(effect=gravity)
-
-    def cost(declared: list[float], found: list[float]) -> float:
-        body = SimpleNamespace(body=SimpleNamespace(gravity=np.array(declared)))
-        fit = SimpleNamespace(hypothesis=SimpleNamespace(parameters=terms), coordinates=np.array(found))
-        return tilt_penalty(body, candidate, fit)
-
-    down = [0.0, 0.0, -9.81]
-    angles = np.radians([0.0, 5.0, 30.0, 180.0])
-    costs = [cost(down, [9.81 * np.sin(a), 0.0, -9.81 * np.cos(a)]) for a in angles]
-    np.testing.assert_allclose(costs, 5.0 * np.log1p((angles / MOUNTED) ** 2 / 4.0), atol=1e-9)
-    assert cost([0.0, 0.0, 0.0], down) == 0.0
 
 
 def structure_of(values: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> dict[str, float]:

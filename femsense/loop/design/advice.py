@@ -29,6 +29,7 @@ from femsense.loop.design.planner import Proposal, element_block
 from femsense.loop.fit.joint_fit import JointFit
 from femsense.loop.fit.noise_components import Noise
 from femsense.model.drive import has_history
+from femsense.model.effects import OF_INPUTS
 from femsense.model.robot import Robot
 
 MOST_WORK, MOST_FRAMES = 30_000, 40
@@ -150,7 +151,7 @@ def next_element(
     names = {n for pair in confounded for n in pair} | set(not_testable)
     trials = [_representative(t) for t in data.train]
     tets = len(robot.body.mesh.tets)
-    past = has_history(robot) or "cable_friction" in names
+    past = has_history(robot) or any(form.path_dependent for form in data.forms if form.name in names)
     cost = sum(int(t.scene.frames.max()) + 1 if past else len(t.scene.frames) for t in trials)
     if not names or cost > 2 * min(MOST_WORK // tets, MOST_FRAMES):
         return []
@@ -166,7 +167,7 @@ def next_element(
         ]
     except FemsenseError:
         return []
-    judge, left = Judge(forms, data.input_scale), min(MOST_WORK // tets, MOST_FRAMES)
+    judge, left = Judge(forms), min(MOST_WORK // tets, MOST_FRAMES)
     now = _open(judge.judge(have), confounded, not_testable)
     questions = [*(f"{a} or {b}" for a, b in confounded), *not_testable]
     chosen = []
@@ -206,7 +207,7 @@ def _representative(trial: Trial) -> Trial:
 
 def _open_forms(robot: Robot, data: Data, names: set[str]) -> list[Form]:
     unknown = any(t.initial is not None for t in data.train)
-    wanted = (names | set(NUISANCE)) - ({"cable_offset"} if unknown else set())
+    wanted = (names | set(NUISANCE)) - set(OF_INPUTS if unknown else ())
     return forms_of(robot, data.control, data.input_scale, names=sorted(wanted))
 
 

@@ -22,14 +22,11 @@ from femsense.core.least_squares import FitResult
 from femsense.core.pose import rotation_from_vector
 from femsense.loop.data.dataset import NUISANCE
 from femsense.loop.data.trial import Trial
-from femsense.loop.fit.fitted_model import MODULUS_STD
 from femsense.loop.fit.joint_fit import JointFit, JointProblem, Prior
 from femsense.loop.search.effect_fields import effect_fields
 from femsense.loop.search.screening import TESTABLE, penalty
-from femsense.model.effects import EFFECTS, FORMS, Effect, Entry, Parameter
-from femsense.model.effects.base import number, vector
-from femsense.model.effects.loads import STANDARD_GRAVITY
-from femsense.model.effects.support import BASE_ROTATION
+from femsense.model.effects import EFFECTS, Effect, Entry, Parameter
+from femsense.model.effects.base import range_units
 from femsense.model.observation import Hypothesis, SceneJet
 from femsense.model.robot import Robot
 from femsense.rig.camera import measured_points, visible_points
@@ -44,63 +41,9 @@ ALIKE = 0.95
 """Effects that imitate each other by more than this share cannot be told apart."""
 ABSORBED = 1e-9
 """Share of its χ² below which a direction counts as imitated whole."""
-OFFSET_SHARE = 0.25
-"""How well the zeros are known beforehand, as a share of a cable's range."""
-
-PLAUSIBLE = {
-    ("gravity", "vector_m_s2"): 1.0,
-    ("stiffness", "scale"): 0.2,
-    ("poisson", "poisson_ratio"): 0.03,
-    ("soft_region", "scale"): 0.4,
-    ("creep", "fraction"): 0.15,
-    ("payload", "force_n"): 0.05,
-    ("cable_friction", "coefficient"): 0.15,
-    ("cable_gain", "scale"): 0.05,
-    ("cable_stretch", "stiffness_n_m"): 5e-5,
-    ("cable_slack", "displacement_m"): 5e-4,
-    ("geometry", "scale"): 0.02,
-    ("depth_scale", "scale"): 0.01,
-    ("depth_scale", "offset_m"): 2e-3,
-    ("marker_offset", "offset_m"): 5e-4,
-    ("clamped_marker", "share"): 1.0,
-}
-"""Sizes in the coordinates of the fit (logarithms, compliances): usual for cast silicone, hand-laid cables and depth cameras."""
-CLAMP_SHARE = {"stiffness_n_m": 0.01, "rotation_stiffness_nm_rad": 0.02}
-"""Plausible compliance of a clamp as a share of the largest that is tried."""
-OFFSET_PLAUSIBLE = 0.05
-"""Plausible zero of a cable as a share of its range."""
 
 
 # Forms
-
-
-def _weight_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
-    if robot.body.material.density <= 0:
-        return ()
-    return tuple(Parameter("vector_m_s2", i, "m/s²", 0.0, -12.0, 12.0, 0.05) for i in range(3))
-
-
-def _apply_weight(robot: Robot, entry: Entry) -> Robot:
-    body = robot.body
-    more = body.with_gravity(vector(entry, "vector_m_s2", "gravity")).weight()
-    return robot.with_body(body.with_dead_forces(body.dead_forces + more))
-
-
-WEIGHT = Effect("gravity", "", _weight_parameters, _apply_weight)
-"""A change of gravity as a dead force, which acts where frames say their own gravity too; it turns with the base."""
-
-
-def _one_gain(robot: Robot, control: str) -> tuple[Parameter, ...]:
-    return (Parameter("scale", None, "1", 0.0, float(np.log(0.3)), float(np.log(3.0)), 1e-3, "log"),) if robot.body.cables else ()
-
-
-def _apply_one_gain(robot: Robot, entry: Entry) -> Robot:
-    act = robot.actuation
-    return replace(robot, actuation=replace(act, gain=act.gain * number(entry, "scale", "cable_gain", low=1e-3)))
-
-
-ONE_GAIN = Effect("cable_gain", "", _one_gain, _apply_one_gain)
-"""The scales of all cables wrong by the same factor, which no per-cable difference gives away."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -117,6 +60,8 @@ class Form:
     """Plausible size of each column, in coordinates."""
     at: int
     """Where its columns start."""
+    known: FloatArray
+    """How well calibration knows each column beforehand, in coordinates, shape (q,); empty for what is sought."""
 
     @property
     def columns(self) -> slice:
@@ -140,37 +85,30 @@ def forms_of(robot: Robot, control: str, ranges: FloatArray, *, names: Sequence[
             parameters = effect.parameters(robot, control)
             if not parameters and not effect.discrete:
                 continue
-            size = np.ones(1) if effect.discrete else np.array([_plausible(effect, p, robot, ranges) for p in parameters])
-            result.append(Form(label, effect.name, effect, seed, parameters, size, at))
+            size = np.ones(1) if effect.discrete else _plausible(parameters, robot, ranges)
+            result.append(Form(label, effect.name, effect, seed, parameters, size, at, _known(effect, parameters, robot, ranges)))
             at += len(size)
     return result
 
 
 def _kinds(robot: Robot) -> list[tuple[Effect, str]]:
-    """Return the effects with their labels, one form each and a second of two of them."""
+    """Return the forms of the effects in which experiments are planned for them, with their labels."""
     result = []
     for effect in EFFECTS:
-        label, chosen = effect.name, effect
-        if effect.name == "gravity":
-            chosen = WEIGHT
-        elif effect.name == "hyperelastic" and robot.body.material.law == "neo_hookean":
-            chosen = next(e for e in FORMS if e.name == "hyperelastic" and e is not effect)
-        result.append((chosen, label))
-        if effect.name == "base_compliance":
-            result.append((BASE_ROTATION, "base_compliance (plate)"))
-        if effect.name == "cable_gain" and len(robot.body.cables) > 1:
-            result.append((ONE_GAIN, "cable_gain (all alike)"))
+        forms = [("", effect)] if effect.planned is None else effect.planned(robot)
+        result += [(form, f"{effect.name} ({which})" if which else effect.name) for which, form in forms]
     return result
 
 
-def _plausible(effect: Effect, p: Parameter, robot: Robot, ranges: FloatArray) -> float:
-    if effect.name == "gravity":
-        return 1.0 if np.any(robot.body.gravity) else STANDARD_GRAVITY / np.sqrt(3.0)
-    if effect.name == "base_compliance":
-        return CLAMP_SHARE[p.key] * p.high
-    if effect.name == "cable_offset":
-        return OFFSET_PLAUSIBLE * float(ranges[robot.body.cable_names.index(str(p.part))])
-    return PLAUSIBLE.get((effect.name, p.key), 0.05 * (p.high - p.low))
+def _known(effect: Effect, parameters: Sequence[Parameter], robot: Robot, ranges: FloatArray) -> FloatArray:
+    if effect.calibrated is None:
+        return np.zeros(0)
+    return np.maximum(effect.calibrated.planned_std * range_units(parameters, robot.body.cable_names, ranges), 1e-9)
+
+
+def _plausible(parameters: Sequence[Parameter], robot: Robot, ranges: FloatArray) -> FloatArray:
+    """Return plausible sizes of parameters, in coordinates, shape (q,)."""
+    return np.array([p.usual_size for p in parameters]) * range_units(parameters, robot.body.cable_names, ranges)
 
 
 # Blocks
@@ -242,7 +180,7 @@ def make_block(
         return Block(recording, gram, None, placements, states, int(rows.sum()))
     placed = _with_rest(trial, robot)
     jet = _jet(placed, robot)
-    moved = [f for f in forms if f.name in ("geometry", "depth_scale")]  # the others leave the measured seats where they are
+    moved = [f for f in forms if f.effect.moves_rest]  # the others leave the measured seats where they are
     fresh, rest_columns = _columns(placed, robot, jet, moved, turns, width=columns.shape[2])
     for f in moved:
         columns[:, :, f.columns] = fresh[:, :, f.columns]
@@ -306,7 +244,7 @@ def _columns(
     for i, (effect, seed, _) in enumerate(fields.todo):
         form = where[id(effect), id(seed)]
         (own,), (placements,) = fields.of(i)
-        if form.effect is WEIGHT and turns is not None:
+        if form.effect.turns_with_base and turns is not None:
             own = np.einsum("kci,kij->kcj", own, turns[trial.scene.frame])
         result[:, :, form.columns], rest[:, :, form.columns] = own, placements
     return result, rest
@@ -424,8 +362,6 @@ class Judge:
     """Judges experiments made of blocks."""
 
     forms: list[Form]
-    ranges: FloatArray
-    """Of the cables [N] or [m]; the prior of their zeros."""
     calibrated: tuple[str, ...] = NUISANCE
     _by_label: dict[str, list[int]] = field(default_factory=dict)
 
@@ -442,7 +378,7 @@ class Judge:
         """
         seen, whole = self._shared(blocks, rest)
         count = max(3.0 * sum(b.states for b in blocks), 2.0)
-        labels = [label for label in self._by_label if not (rest and label == "marker_offset")]
+        labels = [label for label, own in self._by_label.items() if not (rest and self.forms[own[0]].effect.places_markers)]
         names = len({f.name for f in self.forms if f.name not in self.calibrated})
         scale = np.sqrt(np.maximum(np.diag(whole), 1e-300))
         free = {drop: _Left(self, seen, scale, self._kept(drop), count, names) for drop in self._drops(labels)}
@@ -494,7 +430,7 @@ class _Left:
     def __init__(self, judge: Judge, shared: FloatArray, scale: FloatArray, kept: list[Form], count: float, names: int) -> None:
         self.forms, self.count, self.names = judge.forms, count, names
         N = np.concatenate([np.arange(f.at, f.at + len(f.size)) for f in kept]) if kept else np.zeros(0, dtype=np.int64)
-        prior = np.concatenate([_prior(f, judge.ranges) for f in kept]) if kept else np.zeros(0)
+        prior = np.concatenate([f.known for f in kept]) if kept else np.zeros(0)
         G = shared[np.ix_(N, N)] + np.diag(1.0 / prior**2)
         self.S = shared - shared[:, N] @ _inverse(G) @ shared[N] if len(N) else shared
         self.size = np.concatenate([f.size for f in self.forms])
@@ -520,12 +456,6 @@ class _Left:
 
     def _price(self, f: Form) -> float:
         return penalty(len(f.parameters), f.seed, 1, self.names, self.count)
-
-
-def _prior(f: Form, ranges: FloatArray) -> FloatArray:
-    if f.name == "stiffness":
-        return np.full(len(f.size), MODULUS_STD)
-    return np.maximum(OFFSET_SHARE * np.asarray(ranges, dtype=float), 1e-9)
 
 
 def _inverse(matrix: FloatArray) -> FloatArray:

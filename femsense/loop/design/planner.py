@@ -32,6 +32,7 @@ from femsense.loop.design.identifiability import (
     make_block,
     turns_of,
 )
+from femsense.model.effects import OF_INPUTS
 from femsense.model.observation import make_scene
 from femsense.model.recording import Recording, check_against, make_recording
 from femsense.model.robot import Robot
@@ -131,7 +132,7 @@ def plan_experiment(
         raise InputError(
             "no equilibrium on the way up", where="robot", found="; ".join(left_out), expected="a robot that its cables can bend"
         )
-    judge = Judge(forms, ranges)
+    judge = Judge(forms)
     have = [blocks[e.key] for e in start] if given is None else [_given_block(robot, given, forms, noise)]
     before = judge.judge(have)
     steps, after = _grow(
@@ -169,7 +170,7 @@ def identifiability_of_script(
         see=script.markers.occlusion,
         with_rest=script.markers.rest_file,
     )
-    return Judge(forms, ranges).judge([block], rest=script.markers.rest_file)
+    return Judge(forms).judge([block], rest=script.markers.rest_file)
 
 
 def _check(robot: Robot, noise: float) -> None:
@@ -185,7 +186,7 @@ def _forms(robot: Robot, control: str, zero: str, ranges: FloatArray) -> list[Fo
         return forms
     kept, at = [], 0
     for f in forms:  # unknown zeros are fitted with the pose
-        if f.name != "cable_offset":
+        if f.name not in OF_INPUTS:
             kept.append(replace(f, at=at))
             at += len(f.size)
     return kept

@@ -20,7 +20,7 @@ from femsense.core.errors import DataError, FemsenseError
 from femsense.core.parallel import each
 from femsense.fem.body import BodyModel
 from femsense.fem.mesh import Embedding, TetMesh, embed_points
-from femsense.loop.data.dataset import Data
+from femsense.loop.data.dataset import MESH, Data
 from femsense.loop.data.representative_states import between, representatives, state_vectors
 from femsense.loop.data.trial import Trial, normals_of, rms_of
 from femsense.loop.fit.fitted_model import FittedModel, poses_and_inputs, some_terms
@@ -114,7 +114,7 @@ def _finer(mesh: TetMesh, tried: Sequence[str]) -> TetMesh | None:
     too long, or where a linear mesh is asked about as an effect."""
     if mesh.is_quadratic:
         return finer_mesh(mesh, None, 1) if 8 * len(mesh.tets) <= MOST_TETS else None
-    return finer_mesh(mesh, "tet10", 0) if "discretisation" not in tried and len(mesh.tets) <= MOST_TETS else None
+    return finer_mesh(mesh, "tet10", 0) if MESH.name not in tried and len(mesh.tets) <= MOST_TETS else None
 
 
 def make_finer(robot: Robot, tried: Sequence[str]) -> None:

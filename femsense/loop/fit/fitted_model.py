@@ -14,13 +14,9 @@ from femsense.loop.data.trial import Trial, rms_of, spans_of
 from femsense.loop.fit.joint_fit import GAIN, JointFit, JointProblem, Prior, fit_jointly
 from femsense.loop.fit.noise_components import Noise, whiten
 from femsense.model.effects import Effect, Entry, Parameter, find_effect
+from femsense.model.effects.base import range_units
 from femsense.model.observation import Hypothesis, SceneJet, evaluate_scene
 from femsense.model.robot import Robot
-
-MODULUS_STD = 0.5
-"""How well the modulus is known beforehand, in its logarithm: a soft region in a stiff body and a stiff one in a soft body act nearly alike."""
-OFFSET_STD = 0.1
-"""How well the zero of a cable is known beforehand, as a share of its range in the recording."""
 
 ROUGHLY = 3
 """Steps of a fit that only has to come near."""
@@ -59,10 +55,12 @@ def with_nuisance(data: Data, robot: Robot | None = None) -> tuple[Hypothesis, P
         effect = find_effect(name)
         parameters = effect.parameters(data.robot, data.control)
         unknown_zero = any(t.initial is not None for t in data.train)
-        if not parameters or (name == "cable_offset" and unknown_zero):
+        if effect.calibrated is None or not parameters or (effect.calibrated.of_inputs and unknown_zero):
             continue
         terms.append((effect, {}, parameters))
-        std += [MODULUS_STD] if name == "stiffness" else [max(OFFSET_STD * float(s), 1e-9) for s in data.input_scale]
+        std += [
+            max(effect.calibrated.std * u, 1e-9) for u in range_units(parameters, data.robot.body.cable_names, data.input_scale)
+        ]
     body = data.robot if robot is None else robot
     settled = data.settled if body is data.robot else ()
     return Hypothesis(body, tuple(terms), settled), Prior(np.zeros(len(std)), np.array(std))

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from femsense.core.arrays import BoolArray, FloatArray
+from femsense.core.arrays import FloatArray
 from femsense.core.errors import DataError
 from femsense.core.least_squares import FitResult, gauss_newton
 from femsense.core.local_model import Nonsmoothness
@@ -16,7 +16,7 @@ from femsense.fem.equilibrium import Equilibrium
 from femsense.loop.data.trial import States, Trial, normal_rms_of, rms_of, spans_of
 from femsense.loop.fit.noise_components import Noise, Whitener, whiten
 from femsense.loop.fit.slack_nonsmoothness import Part, joined, trial_nonsmoothness
-from femsense.model.effects.loads import STANDARD_GRAVITY
+from femsense.model.effects.base import known_length
 from femsense.model.observation import Hypothesis, SceneJet, evaluate_scene
 from femsense.model.quasi_static_path import has_given
 from femsense.model.variants import AtPoints
@@ -28,8 +28,6 @@ DECLARED_POSE_STD = np.array([2e-3] * 3 + [3e-4] * 3)
 """How far a declared pose is trusted [rad, m] where there are clouds alone …"""
 BESIDE_MARKERS = np.array([1e-2] * 3 + [1e-3] * 3)
 """… and where there are markers, which tell the pose much better: with the same trust a pose that is 1 mm and ½° off would bend zeros of cables."""
-GRAVITY_STD = 0.1
-"""How far the size of gravity is known to be 9.80665 m/s² on an unknown site [m/s²]."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -272,19 +270,15 @@ class JointProblem:
         r = (coordinates - self.prior.mean)[known] / self.prior.std[known]
         J = np.zeros((len(r), width))
         J[np.arange(len(r)), self.own + np.flatnonzero(known)] = 1.0 / self.prior.std[known]
-        gravity = self.gravity_at()
-        if gravity is None or np.linalg.norm(coordinates[gravity]) < 1e-3:
+        known_vector = known_length(self.hypothesis.parameters)
+        if known_vector is None or np.linalg.norm(coordinates[known_vector[0]]) < 1e-3:
             return r, J
-        vector = coordinates[gravity]
+        at, length = known_vector
+        vector = coordinates[at]
         size = float(np.linalg.norm(vector))
         row = np.zeros((1, width))
-        row[0, self.own + np.flatnonzero(gravity)] = vector / size / GRAVITY_STD
-        return np.append(r, (size - STANDARD_GRAVITY) / GRAVITY_STD), np.vstack([J, row])
-
-    def gravity_at(self) -> BoolArray | None:
-        """Return which coordinates are the components of gravity, or None."""
-        mask = np.array([p.key == "vector_m_s2" for p in self.hypothesis.parameters], dtype=bool)
-        return mask if mask.any() else None
+        row[0, self.own + np.flatnonzero(at)] = vector / size / length.std
+        return np.append(r, (size - length.value) / length.std), np.vstack([J, row])
 
 
 def _as_near(kept: States, near: States, body: BodyModel) -> States:

@@ -21,8 +21,6 @@ from femsense.model.observation import Hypothesis, SceneJet
 if TYPE_CHECKING:
     from femsense.loop.data.trial import Trial
 
-DRIVING = ("cable_offset", "cable_gain", "creep")
-"""Effects that change the tension that drives a frame, and leave the body as it is."""
 NEAR_ZERO = 0.25
 """Tensions below this share of the largest one may come to 0 in a step."""
 ALIKE = 0.01
@@ -80,8 +78,8 @@ def _wanted(
     recording = trial.scene.recording
     poses = 6 * len(trial.poses)
     initial = None if trial.initial is None else own[poses:]
-    chosen = np.concatenate([np.full(len(p), e.name in DRIVING) for e, _, p in hypothesis.terms] or [np.zeros(0, bool)])
-    driving = replace(hypothesis, terms=tuple(t for t in hypothesis.terms if t[0].name in DRIVING))
+    chosen = np.concatenate([np.full(len(p), e.drives) for e, _, p in hypothesis.terms] or [np.zeros(0, bool)])
+    driving = replace(hypothesis, terms=tuple(t for t in hypothesis.terms if t[0].drives))
     at = coordinates[chosen]
     robot = driving.robot_at(at)
     value = inputs_wanted(robot, recording, initial)

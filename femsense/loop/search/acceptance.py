@@ -18,6 +18,7 @@ from femsense.loop.fit.noise_components import Noise
 from femsense.loop.search.refit import EVIDENCE, evidence
 from femsense.loop.search.screening import Candidate
 from femsense.loop.search.search_state import Refit
+from femsense.model.effects import Effect
 from femsense.model.robot import Robot
 
 ENOUGH_SPREAD = 0.5
@@ -40,10 +41,6 @@ NOT_PLAINLY_WORSE = 1.25
 """No effect may leave so many times the plain error where fitted: it would live on a larger share of what the mesh costs."""
 
 
-MOUNTED = np.radians(5.0)
-"""A base is mounted as it is declared to about this angle, and a declared gravity is believed as much [rad]."""
-
-
 SURE = 2.5
 """Standard errors of the gain on left-out sweeps beyond which held-out data need only not speak against an effect."""
 
@@ -57,7 +54,7 @@ def acceptance_test(
     noise: Noise,
 ) -> Refit:
     gain = evidence(fitted.fit, made.fit)
-    score = gain - candidate.cost - tilt_penalty(data.declared, candidate, made.fit)
+    score = gain - candidate.cost - prior_cost(data.declared, candidate.effect, made.fit)
     better, spread = sweeps_predicted(data.train, fitted.fit, made.fit)
     record |= {"dchi2": gain, "dbic": score, "validation_rms_m": made.held_rms, "cv_gain": better, "cv_std": spread}
     held = held_chi2(data, fitted, noise) - held_chi2(data, made, noise)
@@ -95,15 +92,9 @@ def _plainly_worse(before: FittedModel, after: FittedModel) -> bool:
     return after.fit.rms > NOT_PLAINLY_WORSE * before.fit.rms and after.held_rms > before.held_rms
 
 
-def tilt_penalty(declared: Robot, candidate: Candidate, fit: JointFit) -> float:
-    """Return −2 log of how likely it is that a declared gravity is off by the angle of the fitted one: a Student's t with four degrees."""
-    own = declared.body.gravity
-    mask = np.array([p.key == "vector_m_s2" for p in fit.hypothesis.parameters], dtype=bool)
-    if candidate.effect.name != "gravity" or not np.any(own) or mask.sum() != 3:
-        return 0.0
-    vector = fit.coordinates[mask]
-    angle = np.arctan2(np.linalg.norm(np.cross(own, vector)), own @ vector)
-    return float(5.0 * np.log1p((angle / MOUNTED) ** 2 / 4.0))
+def prior_cost(declared: Robot, effect: Effect, fit: JointFit) -> float:
+    """Return −2 log of how likely the fitted values of an effect are beforehand."""
+    return effect.prior_cost(declared, fit.coordinates[span_of(fit, effect.name)])
 
 
 def _predicts(refitted: Refit) -> float:
@@ -112,9 +103,9 @@ def _predicts(refitted: Refit) -> float:
     return float(refitted.record["cv_gain"] - (spread if np.isfinite(spread) else 0.0))
 
 
-def prior_evidence(data: Data, name: str) -> float:
-    """Return by how much dBIC an effect is ahead of its rivals beforehand: every body has weight, though the robot does not declare it."""
-    return EVIDENCE if name == "gravity" and not np.any(data.declared.body.gravity) else 0.0
+def prior_evidence(data: Data, effect: Effect) -> float:
+    """Return by how much dBIC an effect is ahead of others beforehand: every body has weight, though the robot does not declare it."""
+    return EVIDENCE if effect.expected(data.declared) else 0.0
 
 
 def sure_beyond_mesh(better: float, spread: float, held: float, expected: float) -> bool:

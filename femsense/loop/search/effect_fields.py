@@ -33,7 +33,7 @@ def candidates_for(
     robot = base.hypothesis.robot_at(base.coordinates)
     result = []
     for effect in forms:
-        if effect.name not in names or effect.name in present or (effect.name == "marker_offset" and has_placements):
+        if effect.name not in names or effect.name in present or (effect.places_markers and has_placements):
             continue
         for seed in effect.seeds(robot):
             parameters = effect.parameters(robot, control)

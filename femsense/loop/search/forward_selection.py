@@ -60,7 +60,7 @@ def select_next(
     for candidate in sorted(listed, key=lambda c: -scouts[id(c)][1] if id(c) in scouts else np.inf):
         ahead = [r for r in refits if r.record["verdict"] == "passes" and explains(r.fitted)]
         behind = candidate.score < max((0.5 * _bar(r, candidate) for r in ahead), default=-np.inf) - EVIDENCE
-        if behind and not prior_evidence(data, candidate.effect.name):
+        if behind and not prior_evidence(data, candidate.effect):
             continue  # where little is left to explain, a refit seldom gains that much on its linear score, but for a weight that cables lift
         say(f"refitting with {candidate.effect.name}")
         record: dict[str, Any] = {"name": candidate.effect.name, "seed": candidate.seed}
@@ -92,7 +92,7 @@ def select_next(
         return None, [], records
     leaders = _leaders(data, fitted, passing, noise, say)
     # where evidence is close, what surely predicts better
-    winner = max(leaders, key=lambda r: r.score + _predicts(r) + prior_evidence(data, r.candidate.effect.name))
+    winner = max(leaders, key=lambda r: r.score + _predicts(r) + prior_evidence(data, r.candidate.effect))
     close = [r for r in leaders if r.score > winner.score - EVIDENCE]
     winner = _enriched(data, fitted, winner, table, noise, say)
     winner.record["verdict"] = "named"
@@ -148,7 +148,7 @@ def _scouted(
         made = tried(cases.data, cases.fitted, own, noise, max(EVIDENCE, lead - 2.0 * EVIDENCE))
         if made is None:  # where it does not fit, all states decide
             continue
-        score = evidence(cases.fitted.fit, made.fit) - own.cost + prior_evidence(data, candidate.effect.name)
+        score = evidence(cases.fitted.fit, made.fit) - own.cost + prior_evidence(data, candidate.effect)
         scouts[id(candidate)] = made.fit, score
         lead = max(lead, score) if explains(made) else lead
     return scouts
@@ -246,7 +246,7 @@ def _with_more_markers(
 ) -> Refit:
     """Return offsets of markers with those of further markers, one after the other, as long as each has EVIDENCE: all of them at once cost too much.
     Other effects are returned as they are."""
-    alone = [c for c in table if c.effect is winner.candidate.effect] if winner.candidate.effect.name == "marker_offset" else []
+    alone = [c for c in table if c.effect is winner.candidate.effect] if winner.candidate.effect.places_markers else []
     while others := [c for c in alone if not set(c.parameters) & set(winner.candidate.parameters)]:
         problem = problem_of(data, winner.fitted.fit, noise)
         gains = [linear_gain(winner.fitted.fit, problem, c.raw, c.placements) - c.cost for c in others]

@@ -31,8 +31,11 @@ from femsense.loop.search.forward_selection import polished, shortlist
 from femsense.loop.search.refit import EVIDENCE, evidence, refit
 from femsense.loop.search.screening import screen_model
 from femsense.loop.search.search_state import OffsetAlternative, Progress, Refit
+from femsense.model.effects import OF_INPUTS
+from femsense.model.effects.base import range_units
 
-OFFSETS = "cable_offset"
+(OFFSETS,) = OF_INPUTS
+"""The zeros of the cables."""
 SIGNIFICANT = 3.0
 RELEVANT = 0.02
 """A nuisance that moved by more than three standard deviations and 2 % is named as an effect."""
@@ -48,7 +51,8 @@ def moved_nuisance(data: Data, fitted: FittedModel, name: str, *, relevant: floa
     values, std = fitted.fit.coordinates[part], fitted.fit.std[part]
     if not len(values):
         return 0
-    size = np.abs(values) / (1.0 if name == "stiffness" else np.maximum(data.input_scale, 1e-12))
+    parameters = next(own for effect, _, own in fitted.fit.hypothesis.terms if effect.name == name)
+    size = np.abs(values) / np.maximum(range_units(parameters, data.robot.body.cable_names, data.input_scale), 1e-12)
     return int(((np.abs(values) > SIGNIFICANT * std) & (size > relevant)).sum())
 
 
@@ -115,7 +119,7 @@ def instead_of_offsets(
     predicts = best.record["cv_gain"] - sweeps_predicted(data.train, without.fit, fitted.fit)[0]
     takes = ahead > BETTER or (ahead > -EVIDENCE and ahead + predicts > BETTER)  # where evidence is close, what predicts better
     takes = takes or (
-        best.candidate.effect.name == "cable_slack" and best.fitted.fit.chi2 < fitted.fit.chi2 + EVIDENCE
+        best.candidate.effect.mirrors(OFFSETS) and best.fitted.fit.chi2 < fitted.fit.chi2 + EVIDENCE
     )  # its mirror image
     if takes:
         best.record["verdict"] = "named"

@@ -227,7 +227,7 @@ def noise_of(data: Data, fitted: FittedModel, fields: Fields, before: Noise | No
         if error is not None:
             block[:, :, own : own + error.shape[2]] = error
         columns.append(np.concatenate([block, jet.by_effect], axis=2))
-        others = [c.raw[i] for c in (*apart, *(c for c in one_each(table) if c.effect.name != "marker_offset"))]
+        others = [c.raw[i] for c in (*apart, *(c for c in one_each(table) if not c.effect.places_markers))]
         extra.append(np.concatenate([np.zeros((*shape, 0)), *others], axis=2))
     groups = [t.groups for t in data.train]
     noise = Noise({}, "")
@@ -248,7 +248,7 @@ def noise_of(data: Data, fitted: FittedModel, fields: Fields, before: Noise | No
 
 def _apart(table: list[Candidate]) -> list[Candidate]:
     """Return the offsets of single markers that are much larger than most: one that sits elsewhere does not tell how well the others sit."""
-    alone = [c for c in table if c.effect.name == "marker_offset" and len({_marker(p) for p in c.parameters}) == 1]
+    alone = [c for c in table if c.effect.places_markers and len({_marker(p) for p in c.parameters}) == 1]
     size = np.array([np.linalg.norm(c.step) for c in alone])
     return [c for c, s in zip(alone, size) if s > APART * np.median(size)]
 

@@ -14,7 +14,7 @@ from femsense.core.errors import FemsenseError
 from femsense.loop.data.dataset import NUISANCE, Data
 from femsense.loop.fit.fitted_model import FittedModel, keeping
 from femsense.loop.fit.noise_components import Noise
-from femsense.loop.search.acceptance import acceptance_test, prior_evidence, tilt_penalty
+from femsense.loop.search.acceptance import acceptance_test, prior_cost, prior_evidence
 from femsense.loop.search.effect_fields import fields_of
 from femsense.loop.search.forward_selection import polished, shortlist
 from femsense.loop.search.location_search import may_lie_elsewhere
@@ -93,9 +93,9 @@ def _best(
     own = _same(table, fitted, name)
     if own is None:
         return None, []
-    worth = evidence(without.fit, fitted.fit) - own.cost - tilt_penalty(data.declared, own, fitted.fit)
+    worth = evidence(without.fit, fitted.fit) - own.cost - prior_cost(data.declared, own.effect, fitted.fit)
     records: Records = [{"name": name, "seed": own.seed, "in_place_of": name, "dbic": worth, "verdict": "passes"}]
-    margin = max(BETTER, prior_evidence(data, name))
+    margin = max(BETTER, prior_evidence(data, own.effect))
     best: Refit | None = None
     for candidate in shortlist([c for c in table if c.effect.name in rivals], first=True):
         record: dict[str, Any] = {"name": candidate.effect.name, "seed": candidate.seed, "in_place_of": name}

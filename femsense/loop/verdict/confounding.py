@@ -9,6 +9,7 @@ import numpy as np
 
 from femsense.loop.data.dataset import NUISANCE
 from femsense.loop.fit.fitted_model import span_of
+from femsense.loop.search.input_offset import OFFSETS
 from femsense.loop.search.refit import EVIDENCE
 from femsense.loop.search.screening import TESTABLE, confounding, one_each
 from femsense.loop.search.search_state import Search
@@ -31,7 +32,7 @@ def confounded(search: Search, names: Sequence[str]) -> list[dict[str, Any]]:
     for a, b, what, value in (
         *_as_evident(search, names),
         *_imitated(search, names),
-        *_gain_of_all(search, names),
+        *_in_common(search, names),
         *_alike(search, names),
     ):
         pair = found.setdefault(frozenset((a, b)), {"pair": [a, b]})
@@ -67,8 +68,8 @@ def _as_evident(search: Search, names: Sequence[str]) -> Iterator[Alike]:
             if r["dbic"] > max(EVIDENCE, ahead - EVIDENCE):
                 yield name, r["name"], "dbic_gap", float(max(ahead - r["dbic"], 0.0))
     swap = search.in_place
-    if swap is not None and abs(swap.ahead) < EVIDENCE and {"cable_offset", swap.name} & set(names):
-        yield "cable_offset", swap.name, "dbic_gap", abs(swap.ahead)
+    if swap is not None and abs(swap.ahead) < EVIDENCE and {OFFSETS, swap.name} & set(names):
+        yield OFFSETS, swap.name, "dbic_gap", abs(swap.ahead)
 
 
 def _named(search: Search, names: Sequence[str]) -> list[dict[str, Any]]:
@@ -100,25 +101,34 @@ def _imitated(search: Search, names: Sequence[str]) -> Iterator[Alike]:
                 yield name, c.effect.name, "absorbed_share", float(np.sqrt(1.0 - c.retained**2))
 
 
-def _gain_of_all(search: Search, names: Sequence[str]) -> Iterator[Alike]:
-    """Yield a named modulus and the gain that all cables may have in common, where calibration imitates that: a gain of one cable alone it does not."""
-    gains = [c for c in search.first if c.effect.name == "cable_gain" and len(c.parameters) > 1]
-    if "stiffness" not in names or "cable_gain" in search.final.fit.hypothesis.names or not gains:
-        return
-    fit, widest = search.base.fit, max(gains, key=lambda c: len(c.parameters))
+def _in_common(search: Search, names: Sequence[str]) -> Iterator[Alike]:
+    """Yield a named nuisance and what looks like it where all its parameters move alike (a modulus, and a gain that all cables have in common), where
+    calibration absorbs that: one parameter alone, as the gain of one cable, it does not."""
+    for effect in {c.effect.name: c.effect for c in search.first if len(c.parameters) > 1}.values():
+        for alias in effect.aliases if effect.name not in search.final.fit.hypothesis.names else ():
+            if alias.common and alias.name in names:
+                yield from _common(search, alias.name, effect.name)
+
+
+def _common(search: Search, own: str, other: str) -> Iterator[Alike]:
+    """Yield a named nuisance with an effect whose parameters move alike, if calibration absorbs that."""
+    forms = [c for c in search.first if c.effect.name == other and len(c.parameters) > 1]
+    fit, widest = search.base.fit, max(forms, key=lambda c: len(c.parameters))
     poses = np.linalg.qr(np.asarray(fit.fit.jacobian)[:, : fit.own])[0]
     left = widest.columns.sum(axis=1)
     whole = left - np.asarray(fit.fit.jacobian) @ widest.response.sum(axis=1)
     size = float(np.linalg.norm(whole - poses @ (poses.T @ whole)))
     retained = float(np.linalg.norm(left)) / size if size > 0.0 else 1.0
     if retained < TESTABLE:
-        yield "stiffness", "cable_gain", "absorbed_share", float(np.sqrt(1.0 - retained**2))
+        yield own, other, "absorbed_share", float(np.sqrt(1.0 - retained**2))
 
 
 def _alike(search: Search, names: Sequence[str]) -> Iterator[Alike]:
     """Yield the effects whose fields agree, once what calibration may move is projected out."""
-    if {"cable_offset", "cable_slack"} & set(names) and any(c.effect.name == "cable_slack" for c in search.first):
-        yield "cable_offset", "cable_slack", "cosine", 1.0  # play is a negative zero of the displacement
+    for effect in (c.effect for c in one_each(search.first)):  # play is a negative zero of the displacement
+        for alias in effect.aliases:
+            if effect.mirrors(alias.name) and {alias.name, effect.name} & set(names):
+                yield alias.name, effect.name, "cosine", 1.0
     ones = [c for c in one_each(search.first) if c.retained >= TESTABLE and len(c.parameters) <= MOST_NUMBERS]
     for i, a in enumerate(ones):
         for b in ones[i + 1 :]:

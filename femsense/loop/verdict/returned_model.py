@@ -14,10 +14,13 @@ from femsense.loop.fit.discretisation_error import beyond_mesh
 from femsense.loop.fit.fitted_model import FittedModel, held_chi2, keeping, span_of, with_seeds_still, with_sizes_still
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.search.acceptance import at_edge
-from femsense.loop.search.input_offset import SIGNIFICANT, moved_nuisance, offsets_are_evident
+from femsense.loop.search.input_offset import OFFSETS, SIGNIFICANT, moved_nuisance, offsets_are_evident
 from femsense.loop.search.refit import EVIDENCE
 from femsense.loop.search.search_state import Search
-from femsense.model.effects import Entry
+from femsense.model.effects import OF_BODY, Entry
+
+(MODULUS,) = OF_BODY
+"""What calibration may move of the body."""
 
 NOT_WORSE = 1.02
 """What is handed back may not have a larger held-out error than the declared model, but for this factor …"""
@@ -35,7 +38,7 @@ FAR_BETTER = 50.0
 def _promoted(data: Data, search: Search) -> list[str]:
     """Return the nuisances that the data moved significantly away from what is declared; of the zeros, those that are missed."""
     names = [n for n in search.final.fit.hypothesis.names if n in NUISANCE and moved_nuisance(data, search.final, n)]
-    return [n for n in names if n == "stiffness" or offsets_are_evident(data, search.final, search.noise, search.n_effective)]
+    return [n for n in names if n in OF_BODY or offsets_are_evident(data, search.final, search.noise, search.n_effective)]
 
 
 def _is_sure(fitted: FittedModel, name: str, std: FloatArray) -> bool:
@@ -71,22 +74,22 @@ def _misses(data: Data, search: Search, back: FittedModel) -> bool:
 
 
 def _may_be_handed_back(data: Data, search: Search, back: FittedModel) -> bool:
-    return not at_edge(back.fit) and "stiffness" not in at_edge(back.fit, nuisance=True) and _holds_out(data, search, back)
+    return not at_edge(back.fit) and not set(OF_BODY) & set(at_edge(back.fit, nuisance=True)) and _holds_out(data, search, back)
 
 
 def _with_modulus(data: Data, search: Search, names: list[str], *, sizes_still: bool) -> tuple[list[str], FittedModel | None]:
     """Return names with the model of just these; with the modulus beside effects if it moved significantly there, by whatever share (zeros that are
     not named may have moved in its place), and held-out data miss it."""
     back = _handed_back(data, search.final, names, search.noise, sizes_still=sizes_still)
-    if back is None or "stiffness" in names or not _has_effects(names):
+    if back is None or MODULUS in names or not _has_effects(names):
         return names, back
-    if sizes_still and not moved_nuisance(data, search.final, "stiffness", relevant=0.0):
+    if sizes_still and not moved_nuisance(data, search.final, MODULUS, relevant=0.0):
         return names, back
-    along = _handed_back(data, search.final, ["stiffness", *names], search.noise, sizes_still=sizes_still)
-    if along is None or not moved_nuisance(data, search.final if sizes_still else along, "stiffness", relevant=0.0):
+    along = _handed_back(data, search.final, [MODULUS, *names], search.noise, sizes_still=sizes_still)
+    if along is None or not moved_nuisance(data, search.final if sizes_still else along, MODULUS, relevant=0.0):
         return names, back
     missed = held_chi2(data, back, search.noise) - held_chi2(data, along, search.noise) > EVIDENCE
-    return (["stiffness", *names], along) if missed else (names, back)
+    return ([MODULUS, *names], along) if missed else (names, back)
 
 
 def _has_effects(names: Iterable[str]) -> bool:
@@ -107,7 +110,7 @@ def _holds_out(data: Data, search: Search, back: FittedModel) -> bool:
     if only_calibrated and worse <= NOISY:
         return True
     before, after = _held_beyond_mesh(data, search, back)
-    zeros = only_calibrated and "cable_offset" in back.fit.hypothesis.names  # much else looks like them
+    zeros = only_calibrated and OFFSETS in back.fit.hypothesis.names  # much else looks like them
     shown = not zeros and back.held_rms <= NOT_WORSE * search.base.held_rms
     return after <= NOT_WORSE * before and (shown or (gain > FAR_BETTER and worse <= NOISY))
 

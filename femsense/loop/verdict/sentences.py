@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from femsense.loop.data.dataset import Data
+from femsense.loop.data.dataset import MESH, Data
 from femsense.loop.data.trial import rms_of
 from femsense.loop.fit.discretisation_error import mesh_errors
 from femsense.loop.fit.fitted_model import FittedModel
@@ -70,7 +70,7 @@ def _on_linear(data: Data, back: FittedModel) -> str:
     mesh = _mesh_error(data)
     if not mesh or back.fit.hypothesis.robot.body.mesh.is_quadratic or not _has_effects(back.fit.hypothesis.names):
         return ""
-    return f" Linear elements cost {1e3 * mesh:.2f} mm themselves, which other effects may stand for: try discretisation too."
+    return f" Linear elements cost {1e3 * mesh:.2f} mm themselves, which other effects may stand for: try {MESH.name} too."
 
 
 def _evidence_for(data: Data, found: list[str]) -> str:

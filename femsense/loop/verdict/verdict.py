@@ -26,7 +26,7 @@ from femsense.loop.search.search_state import Search
 from femsense.loop.verdict.confounding import confounded, in_words
 from femsense.loop.verdict.report_data import KINDS, gather, own_size
 from femsense.loop.verdict.residual_diagnostics import describe_left, structure_tests
-from femsense.loop.verdict.returned_model import _entries, _is_sure, _promoted, _worth_handing_back
+from femsense.loop.verdict.returned_model import MODULUS, _entries, _is_sure, _promoted, _worth_handing_back
 from femsense.loop.verdict.sentences import _by_mesh, _by_noise, _evidence_for, _mesh_error, _on_linear, _sentence
 from femsense.model.effects import apply_effects
 
@@ -46,7 +46,7 @@ def conclude(data: Data, search: Search, rng: np.random.Generator) -> LoopResult
     promoted = [n for n in _promoted(data, search) if _is_sure(final, n, spread[n])]
     names = [*promoted, *(n for n, _ in search.history[1:] if n in final.fit.hypothesis.names)]
     names, back = _worth_handing_back(data, search, promoted, names)
-    drifted = "stiffness" in promoted and "stiffness" not in names  # what a modulus beyond all bounds takes away is not explained
+    drifted = MODULUS in promoted and MODULUS not in names  # what a modulus beyond all bounds takes away is not explained
     promoted = [n for n in names if n in NUISANCE]
     entries = _entries(back, names)
     effects = _chain(data, search, promoted, names, back, spread)
