@@ -99,7 +99,7 @@ def test_where_each_sweep_pulls_a_cable_of_its_own_a_quarter_of_its_frames_is_he
 def test_what_is_taken_away_by_what_nobody_names_is_left(monkeypatch: pytest.MonkeyPatch):
     inputs, labels = sweeps()
     recording, _ = record(inputs, effects=[{"name": "stiffness", "scale": 1.25}], labels=labels, truth=arm())
-    monkeypatch.setattr(sys.modules["femsense.loop.verdict.verdict"], "_promoted", lambda data, search: [])
+    monkeypatch.setattr(sys.modules["femsense.loop.verdict.verdict"], "promoted_nuisances", lambda data, search: [])
     loop = improve(arm(), [recording])
     assert loop.verdict == "unexplained" and not loop.effects
     assert loop.left["rms_m"] > 0.8 * loop.before["train_rms_m"] > 5.0 * loop.noise_m  # but for the error of the mesh
@@ -109,7 +109,7 @@ def test_what_is_taken_away_by_what_nobody_names_is_left(monkeypatch: pytest.Mon
 def test_what_has_evidence_and_makes_the_held_out_error_larger_is_said_and_not_handed_back(monkeypatch: pytest.MonkeyPatch):
     inputs, labels = sweeps()
     recording, _ = record(inputs, effects=[{"name": "cable_friction", "coefficient": 0.25}], labels=labels, truth=arm((4, 1, 1)))
-    monkeypatch.setattr(sys.modules["femsense.loop.verdict.returned_model"], "_holds_out", lambda data, search, back: False)
+    monkeypatch.setattr(sys.modules["femsense.loop.verdict.returned_model"], "holds_out", lambda data, search, back: False)
     loop = improve(arm((4, 1, 1)), [recording], effects=["cable_friction"])
     assert not loop.effects and loop.robot is loop.declared
     assert "evidence for cable_friction" in loop.sentence and "mesh itself costs" in loop.sentence
@@ -120,7 +120,7 @@ def test_an_effect_whose_states_do_not_come_to_rest_again_is_taken_back(monkeypa
     inputs, labels = sweeps()
     recording, _ = record(inputs, effects=[{"name": "cable_friction", "coefficient": 0.25}], labels=labels, truth=arm((4, 1, 1)))
     module = sys.modules["femsense.loop.improve"]
-    again, asked = module._again, list[tuple[str, ...]]()
+    again, asked = module.fitted_again, list[tuple[str, ...]]()
 
     def folds(data, fitted, noise, **given):
         asked.append(fitted.fit.hypothesis.names)
@@ -128,7 +128,7 @@ def test_an_effect_whose_states_do_not_come_to_rest_again_is_taken_back(monkeypa
             raise DataError("no equilibrium in frame 3")
         return again(data, fitted, noise, **given)
 
-    monkeypatch.setattr(module, "_again", folds)
+    monkeypatch.setattr(module, "fitted_again", folds)
     loop = improve(arm((4, 1, 1)), [recording], effects=["cable_friction"])
     assert "cable_friction" in asked[-1] and "cable_friction" not in {e["name"] for e in loop.effects}
     refits = [q for c in loop.candidates if c["name"] == "cable_friction" for q in c["refits"]]
@@ -242,7 +242,7 @@ def test_repeated_sweeps_of_many_states_tell_effects_apart():
             }
         )
 
-    tells_apart = sys.modules["femsense.loop.improve"]._tells_apart
+    tells_apart = sys.modules["femsense.loop.improve"].distinguishes_effects
     assert tells_apart(data([0.0, 1.0, 2.0, 3.0, 4.0]))
     assert not tells_apart(data([0.0, 1.0]))
 
@@ -309,7 +309,7 @@ def test_what_one_pull_without_unloading_cannot_tell_from_a_modulus_is_said_with
 
 def test_noise_that_no_camera_has_is_said():
     data = SimpleNamespace(robot=arm((4, 1, 1)))
-    by_noise = sys.modules["femsense.loop.verdict.verdict"]._by_noise
+    by_noise = sys.modules["femsense.loop.verdict.verdict"].by_noise
     assert by_noise(data, Noise({"white": 1e-3}, "")) == ""
     assert "Noise of 3.5 mm on a body of 100 mm is no camera's" in by_noise(data, Noise({"white": 2e-3}, ""))
 
@@ -319,6 +319,6 @@ def test_a_nuisance_is_named_only_beyond_the_deviations_that_are_reported():
     fitted = SimpleNamespace(
         fit=SimpleNamespace(hypothesis=SimpleNamespace(terms=terms), coordinates=np.array([0.09, 0.0, -0.4]))
     )
-    is_sure = sys.modules["femsense.loop.verdict.verdict"]._is_sure
+    is_sure = sys.modules["femsense.loop.verdict.verdict"].is_sure
     assert is_sure(fitted, "stiffness", np.array([0.029])) and not is_sure(fitted, "stiffness", np.array([0.031]))
     assert is_sure(fitted, "cable_offset", np.array([0.1, 0.1])) and not is_sure(fitted, "cable_offset", np.array([0.1, 0.2]))

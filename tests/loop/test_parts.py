@@ -36,11 +36,11 @@ from femsense.loop.fit.fitted_model import FittedModel, fit_model, keeping, with
 from femsense.loop.fit.joint_fit import Prior
 from femsense.loop.fit.noise_components import Noise, _Likelihood, whiten
 from femsense.loop.improve import improve
-from femsense.loop.search.acceptance import _plainly_worse
-from femsense.loop.search.effect_fields import _parts
+from femsense.loop.search.acceptance import plainly_worse
+from femsense.loop.search.effect_fields import parts_of
 from femsense.loop.search.screening import penalty
 from femsense.loop.verdict.residual_diagnostics import structure_tests
-from femsense.loop.verdict.verdict import _excess, _lacks
+from femsense.loop.verdict.verdict import excess_of, lacks_much
 from femsense.model import finer_mesh as finer_path
 from femsense.model.drive import DrivenRobot, drive_of
 from femsense.model.effects import apply_effects, find_effect
@@ -50,7 +50,7 @@ from femsense.model.recording import Recording, make_recording
 from femsense.model.remeshing import finer_mesh, robot_on_mesh
 from femsense.model.variants import solve_frame
 
-as_far_as_held_out_states_rest = sys.modules["femsense.loop.improve"]._as_far_as_held_out_states_rest
+as_far_as_held_out_states_rest = sys.modules["femsense.loop.improve"].as_far_as_held_out_states_converge
 
 RNG = np.random.default_rng(11)
 
@@ -144,12 +144,12 @@ def test_a_verdict_asks_what_the_robot_that_is_handed_back_leaves():
     trial = SimpleNamespace(groups=some_groups(), mesh_error=None)
     data = SimpleNamespace(train=[trial], held=[trial])
     before, right = leaving(1e-3, 1e-3), leaving(1.2e-4, 1.2e-4)
-    assert _excess(data, before, right, right, noise).explained > 0.99
-    assert _excess(data, before, right, leaving(1e-3, 7e-4), noise).explained == pytest.approx((1.0 - 0.49) / 0.99)
-    assert _excess(data, before, leaving(7e-4, 1e-4), right, noise).explained == pytest.approx((1.0 - 0.49) / 0.99)
-    assert not _lacks(data, right, right, noise)
-    assert not _lacks(data, before, before, noise)  # whatever calibration may move leaves as much
-    assert _lacks(data, leaving(1.2e-4, 3e-4), right, noise) and _lacks(data, leaving(3e-4, 1.2e-4), right, noise)
+    assert excess_of(data, before, right, right, noise).explained > 0.99
+    assert excess_of(data, before, right, leaving(1e-3, 7e-4), noise).explained == pytest.approx((1.0 - 0.49) / 0.99)
+    assert excess_of(data, before, leaving(7e-4, 1e-4), right, noise).explained == pytest.approx((1.0 - 0.49) / 0.99)
+    assert not lacks_much(data, right, right, noise)
+    assert not lacks_much(data, before, before, noise)  # whatever calibration may move leaves as much
+    assert lacks_much(data, leaving(1.2e-4, 3e-4), right, noise) and lacks_much(data, leaving(3e-4, 1.2e-4), right, noise)
 
 
 def test_the_plain_error_may_grow_where_fitted_if_that_on_held_out_data_falls():
@@ -157,8 +157,8 @@ def test_the_plain_error_may_grow_where_fitted_if_that_on_held_out_data_falls():
         return SimpleNamespace(fit=SimpleNamespace(rms=train), held_rms=held)
 
     before = errors(1.0, 1.0)
-    assert _plainly_worse(before, errors(1.3, 1.1))
-    assert not _plainly_worse(before, errors(1.3, 0.9)) and not _plainly_worse(before, errors(1.2, 1.1))
+    assert plainly_worse(before, errors(1.3, 1.1))
+    assert not plainly_worse(before, errors(1.3, 0.9)) and not plainly_worse(before, errors(1.2, 1.1))
 
 
 def with_error_of_the_mesh(
@@ -452,10 +452,10 @@ def test_one_marker_that_sits_elsewhere_is_named_alone():
 
 def test_parts_are_cables_markers_and_keys():
     robot = arm()
-    assert [len(p) for p in _parts(find_effect("cable_gain").parameters(robot, "tension"))] == [1] * 4
-    assert [len(p) for p in _parts(find_effect("marker_offset").parameters(robot, "tension"))] == [3] * 12
-    assert [len(p) for p in _parts(find_effect("depth_scale").parameters(robot, "tension"))] == [1, 1]
-    assert len(_parts(find_effect("payload").parameters(robot, "tension"))) == 1
+    assert [len(p) for p in parts_of(find_effect("cable_gain").parameters(robot, "tension"))] == [1] * 4
+    assert [len(p) for p in parts_of(find_effect("marker_offset").parameters(robot, "tension"))] == [3] * 12
+    assert [len(p) for p in parts_of(find_effect("depth_scale").parameters(robot, "tension"))] == [1, 1]
+    assert len(parts_of(find_effect("payload").parameters(robot, "tension"))) == 1
 
 
 def test_the_numbers_of_a_seed_cost_as_much_as_parameters():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -12,16 +11,17 @@ from femsense.loop.data.trial import heads_of
 from femsense.loop.design.advice import next_element
 from femsense.loop.fit.fitted_model import FittedModel
 from femsense.loop.fit.noise_components import Noise
+from femsense.loop.result.records import ConfoundedPair, Untestable
 from femsense.model.effects import Effect, Experiment
 from femsense.model.recording import Recording
 
 
 def next_experiment(
-    data: Data, final: FittedModel, noise: Noise, rivals: Sequence[dict[str, Any]], not_testable: Sequence[dict[str, Any]]
+    data: Data, final: FittedModel, noise: Noise, confounded: Sequence[ConfoundedPair], not_testable: Sequence[Untestable]
 ) -> str:
     """Return in words what to record to tell apart what these data cannot: as predicted where that is cheap, else by rule."""
-    pairs = [(r["pair"][0], r["pair"][1]) for r in rivals]
-    predicted = next_element(data, final.fit, noise, pairs, [r["name"] for r in not_testable])
+    pairs = [pair.pair for pair in confounded]
+    predicted = next_element(data, final.fit, noise, pairs, [effect.name for effect in not_testable])
     if predicted:
         said = [
             f"{words} ({what}: expected dBIC {round(before)} → {round(after)})" for words, what, before, after in predicted[:2]
@@ -29,7 +29,7 @@ def next_experiment(
         loaded = any(len(t.scene.recording.load_frame) for t in data.train)
         said = [*([] if loaded else _against_aliases(data.forms, pairs)), *said]
         return "; or ".join(said)
-    names = {n for r in rivals for n in r["pair"]} | {r["name"] for r in not_testable}
+    names = {name for pair in pairs for name in pair} | {effect.name for effect in not_testable}
     wanted = {effect.told_by for effect in data.forms if effect.name in names}
     recordings = [data.train[i].scene.recording for i in heads_of(data.train)]
     said = [_in_words(experiment, data, recordings) for experiment in Experiment if experiment in wanted]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from femsense.loop.fit.discretisation_error import mesh_errors
 from femsense.loop.fit.fitted_model import FittedModel, held_chi2, held_shift, span_of
 from femsense.loop.fit.joint_fit import JointFit
 from femsense.loop.fit.noise_components import Noise
+from femsense.loop.result.records import PASSES, RefitRecord
 from femsense.loop.search.refit import EVIDENCE, evidence
 from femsense.loop.search.screening import Candidate
 from femsense.loop.search.search_state import Refit
@@ -50,20 +51,19 @@ def acceptance_test(
     fitted: FittedModel,
     candidate: Candidate,
     made: FittedModel,
-    record: dict[str, Any],
+    record: RefitRecord,
     noise: Noise,
 ) -> Refit:
+    """Return a refit with its evidence and its verdict: PASSES, or what speaks against it."""
     gain = evidence(fitted.fit, made.fit)
     score = gain - candidate.cost - prior_cost(data.declared, candidate.effect, made.fit)
     better, spread = sweeps_predicted(data.train, fitted.fit, made.fit)
-    record |= {"dchi2": gain, "dbic": score, "validation_rms_m": made.held_rms, "cv_gain": better, "cv_std": spread}
     held = held_chi2(data, fitted, noise) - held_chi2(data, made, noise)
     acts = held_shift(
         data, fitted, made, noise
     )  # what `held` is on average for the true effect, with a variance of four times that
     wanted = min(PREDICTS * gain * held_share(data), acts - 5.0 * float(np.sqrt(acts)))
     moved, mesh = moved_by(fitted, made), discretisation_rms(data, fitted)
-    record |= {"held_dchi2": held, "moved_m": moved, "mesh_cost_m": mesh, "takes_over": _taken_over(fitted, made)}
     surely = better > SURE * spread
     if surely:
         wanted = min(wanted, 0.0)
@@ -77,9 +77,21 @@ def acceptance_test(
     least = ABOVE_MESH_IF_SURE if sure_beyond_mesh(better, spread, held, gain * held_share(data)) else ABOVE_MESH
     if fit_objection is None and moved < least * mesh:
         fit_objection = f"it moves the markers by {1e3 * moved:.3f} mm, the mesh itself by {1e3 * mesh:.3f} mm"
-    if fit_objection is None and _plainly_worse(fitted, made):
+    if fit_objection is None and plainly_worse(fitted, made):
         fit_objection = f"the plain error grows where fitted ({1e3 * fitted.fit.rms:.3f} mm, then {1e3 * made.fit.rms:.3f} mm)"
-    record["verdict"] = fit_objection or "passes"
+    record = replace(
+        record,
+        verdict=fit_objection or PASSES,
+        dchi2=gain,
+        dbic=score,
+        validation_rms_m=made.held_rms,
+        cv_gain=better,
+        cv_std=spread,
+        held_dchi2=held,
+        moved_m=moved,
+        mesh_cost_m=mesh,
+        takes_over=_taken_over(fitted, made),
+    )
     return Refit(candidate, made, score, fitted.fit.chi2 - made.fit.chi2 - candidate.cost, record)
 
 
@@ -87,7 +99,7 @@ def _moves(decrease: float) -> str:
     return f"{'falls' if decrease >= 0.0 else 'rises'} by {abs(decrease):.1f}"
 
 
-def _plainly_worse(before: FittedModel, after: FittedModel) -> bool:
+def plainly_worse(before: FittedModel, after: FittedModel) -> bool:
     """Return whether an effect makes the plain error larger where fitted, without a smaller one on held-out data."""
     return after.fit.rms > NOT_PLAINLY_WORSE * before.fit.rms and after.held_rms > before.held_rms
 
@@ -97,10 +109,11 @@ def prior_cost(declared: Robot, effect: Effect, fit: JointFit) -> float:
     return effect.prior_cost(declared, fit.coordinates[span_of(fit, effect.name)])
 
 
-def _predicts(refitted: Refit) -> float:
+def surely_predicts(refitted: Refit) -> float:
     """Return the gain on left-out sweeps less its standard error, where that is known."""
-    spread = refitted.record["cv_std"]
-    return float(refitted.record["cv_gain"] - (spread if np.isfinite(spread) else 0.0))
+    gain, std = refitted.record.cv_gain, refitted.record.cv_std
+    assert gain is not None and std is not None
+    return gain - (std if np.isfinite(std) else 0.0)
 
 
 def prior_evidence(data: Data, effect: Effect) -> float:
@@ -113,9 +126,9 @@ def sure_beyond_mesh(better: float, spread: float, held: float, expected: float)
     return better > SURE * spread and held * better > 2.0 * SURE * spread * expected
 
 
-def _taken_over(before: FittedModel, after: FittedModel) -> list[str]:
+def _taken_over(before: FittedModel, after: FittedModel) -> tuple[str, ...]:
     """Return the nuisances that are significant before an effect is added, and not after."""
-    return [n for n in NUISANCE if _z(before, n) > 3.0 and _z(after, n) < 3.0]
+    return tuple(n for n in NUISANCE if _z(before, n) > 3.0 and _z(after, n) < 3.0)
 
 
 def _z(fitted: FittedModel, name: str) -> float:

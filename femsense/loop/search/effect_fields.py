@@ -39,13 +39,13 @@ def candidates_for(
             parameters = effect.parameters(robot, control)
             if parameters or effect.discrete:
                 result.append((effect, seed, parameters))
-            parts = _parts(parameters)
+            parts = parts_of(parameters)
             if len(parts) > 1:
                 result += [(effect, seed, part) for part in parts]
     return result
 
 
-def _parts(parameters: tuple[Parameter, ...]) -> list[tuple[Parameter, ...]]:
+def parts_of(parameters: tuple[Parameter, ...]) -> list[tuple[Parameter, ...]]:
     """Return the parameters of each cable or marker, or of each key, by itself: an effect may be that of one of them alone."""
     parts: dict[str, list[Parameter]] = {}
     for p in parameters:

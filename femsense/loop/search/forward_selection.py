@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -19,11 +18,12 @@ from femsense.loop.fit.fitted_model import (
 )
 from femsense.loop.fit.joint_fit import JointFit, Prior
 from femsense.loop.fit.noise_components import Noise
-from femsense.loop.search.acceptance import _predicts, acceptance_test, prior_evidence
+from femsense.loop.result.records import NAMED, RefitRecord
+from femsense.loop.search.acceptance import acceptance_test, prior_evidence, surely_predicts
 from femsense.loop.search.location_search import POLISHED, climbed, located
 from femsense.loop.search.refit import EVIDENCE, FORGONE, evidence, explains, refit, tried, with_term, within, worth_of
 from femsense.loop.search.screening import Candidate, joined, linear_gain
-from femsense.loop.search.search_state import Progress, Refit
+from femsense.loop.search.search_state import Progress, Refit, no_equilibrium
 from femsense.loop.search.subsampling import RepresentativeCases, representative_cases
 
 REFITS = 6
@@ -41,38 +41,65 @@ HINTED = 0.5
 WITHIN_REACH = 0.4
 """What has this share of the best's dBIC at its seed may be ahead of it where its place is."""
 
+BEHIND = "stopped early: in some of the states another one explains more by far"
+"""Verdict on a candidate that is not refitted to all states."""
+
 MORE_STEPS = 30
 """Steps for a refit that could win and is still on its way after the first ones."""
 
 
 def select_next(
     data: Data, fitted: FittedModel, table: list[Candidate], noise: Noise, say: Progress
-) -> tuple[Refit | None, list[Refit], list[dict[str, Any]]]:
+) -> tuple[Refit | None, list[Refit], list[RefitRecord]]:
     """Return the effect that comes next, or None where nothing passes; others that are as good; and what became of each candidate that was
     refitted."""
-    refits: list[Refit] = []
-    records: list[dict[str, Any]] = []
     listed = shortlist(table, first=not found_in(fitted))
     if not listed:
         return None, [], []
+    refits, records = _refitted(data, fitted, listed, noise, say)
+    best = max((r.score for r in refits.values() if r.record.passes), default=np.inf)
+    refits = {i: _to_the_end(data, fitted, r, noise) if r.score > 0.5 * best - EVIDENCE else r for i, r in refits.items()}
+    if not any(r.record.passes for r in refits.values()):
+        refits = {i: _elsewhere(data, fitted, r, noise, say) for i, r in refits.items()}
+    passing = {i: r for i, r in refits.items() if r.record.passes}
+    if not passing:
+        return None, [], _updated(records, refits)
+    near, moved = _leaders(data, fitted, passing, noise, say)
+    ahead = max(r.score for r in near.values())
+    leaders = near | {i: r for i, r in moved.items() if r.score > ahead}
+    # where evidence is close, what surely predicts better
+    first = max(
+        leaders, key=lambda i: leaders[i].score + surely_predicts(leaders[i]) + prior_evidence(data, leaders[i].candidate.effect)
+    )
+    close = [r for r in leaders.values() if r.score > leaders[first].score - EVIDENCE]
+    winner = _enriched(data, fitted, leaders[first], table, noise, say).saying(NAMED)
+    ties = [r for r in close if r.candidate.effect.name != winner.candidate.effect.name]
+    records = _updated(records, refits | near | moved | {first: winner})
+    return winner, sorted(ties, key=lambda r: -r.score), records
+
+
+def _refitted(
+    data: Data, fitted: FittedModel, listed: Sequence[Candidate], noise: Noise, say: Progress
+) -> tuple[dict[int, Refit], list[RefitRecord]]:
+    """Return the refits of a shortlist, and what became of each candidate that was refitted: the number of a refit is that of its record."""
+    refits: dict[int, Refit] = {}
+    records: list[RefitRecord] = []
     cases = representative_cases(data, fitted, noise)
     scouts = _scouted(data, cases, listed, noise, say)
     for candidate in sorted(listed, key=lambda c: -scouts[id(c)][1] if id(c) in scouts else np.inf):
-        ahead = [r for r in refits if r.record["verdict"] == "passes" and explains(r.fitted)]
+        ahead = [r for r in refits.values() if r.record.passes and explains(r.fitted)]
         behind = candidate.score < max((0.5 * _bar(r, candidate) for r in ahead), default=-np.inf) - EVIDENCE
         if behind and not prior_evidence(data, candidate.effect):
             continue  # where little is left to explain, a refit seldom gains that much on its linear score, but for a weight that cables lift
         say(f"refitting with {candidate.effect.name}")
-        record: dict[str, Any] = {"name": candidate.effect.name, "seed": candidate.seed}
-        records.append(record)
+        record = RefitRecord(candidate.effect.name, candidate.seed)
         settled = _settled(data, candidate, ahead)
         try:
             scout, _ = scouts.get(id(candidate), (None, 0.0))
-            behind, begin = _in_some_states(
-                cases, candidate, max(ahead, key=lambda r: r.score, default=None), noise, settled, scout
-            )
+            lead = max(ahead, key=lambda r: r.score, default=None)
+            behind, begin = _in_some_states(cases, candidate, lead, noise, settled, scout)
             if behind:
-                record["verdict"] = "stopped early: in some of the states another one explains more by far"
+                records.append(replace(record, verdict=BEHIND))
                 continue
             others = [
                 r.score for r in ahead if r.candidate.effect.name != candidate.effect.name
@@ -80,34 +107,32 @@ def select_next(
             wanted = max([EVIDENCE, *(score - 2.0 * EVIDENCE for score in others)])
             made = refit(data, fitted, candidate, noise, wanted=wanted, settled=settled, begin=begin)
         except FemsenseError as error:
-            record["verdict"] = f"no equilibrium: {error}"
+            records.append(replace(record, verdict=no_equilibrium(error)))
             continue
-        refits.append(acceptance_test(data, fitted, candidate, made, record, noise))
-    best = max((r.score for r in refits if r.record["verdict"] == "passes"), default=np.inf)
-    refits = [_to_the_end(data, fitted, r, noise) if r.score > 0.5 * best - EVIDENCE else r for r in refits]
-    if not any(r.record["verdict"] == "passes" for r in refits):
-        refits = [_elsewhere(data, fitted, r, noise, say) for r in refits]
-    passing = [r for r in refits if r.record["verdict"] == "passes"]
-    if not passing:
-        return None, [], records
-    leaders = _leaders(data, fitted, passing, noise, say)
-    # where evidence is close, what surely predicts better
-    winner = max(leaders, key=lambda r: r.score + _predicts(r) + prior_evidence(data, r.candidate.effect))
-    close = [r for r in leaders if r.score > winner.score - EVIDENCE]
-    winner = _enriched(data, fitted, winner, table, noise, say)
-    winner.record["verdict"] = "named"
-    ties = [r for r in close if r.candidate.effect.name != winner.candidate.effect.name]
-    return winner, sorted(ties, key=lambda r: -r.score), records
+        refits[len(records)] = acceptance_test(data, fitted, candidate, made, record, noise)
+        records.append(record)
+    return refits, records
 
 
-def _leaders(data: Data, fitted: FittedModel, passing: Sequence[Refit], noise: Noise, say: Progress) -> list[Refit]:
-    """Return the refits that are as good as the best but for EVIDENCE, and those that their places bring ahead of these, each with its seed improved."""
-    best = max(r.score for r in passing)
-    near = [r if "seed_std" in r.record else polished(data, fitted, r, noise, say) for r in passing if r.score > best - EVIDENCE]
-    behind = [_with_climbs(data, fitted, r, noise) for r in passing if best - EVIDENCE >= r.score > WITHIN_REACH * best]
-    moved = [polished(data, fitted, r, noise, say) for r in behind if _in_sight(r) > best]
-    ahead = max(r.score for r in near)
-    return near + [r for r in moved if r.score > ahead]
+def _updated(records: Sequence[RefitRecord], refits: Mapping[int, Refit]) -> list[RefitRecord]:
+    """Return records with those of refits in their places."""
+    return [refits[i].record if i in refits else record for i, record in enumerate(records)]
+
+
+def _leaders(
+    data: Data, fitted: FittedModel, passing: Mapping[int, Refit], noise: Noise, say: Progress
+) -> tuple[dict[int, Refit], dict[int, Refit]]:
+    """Return the refits that are as good as the best but for EVIDENCE, and those that their places may bring ahead of these, each with its seed improved."""
+    best = max(r.score for r in passing.values())
+    near = {
+        i: r if r.record.seed_std is not None else polished(data, fitted, r, noise, say)
+        for i, r in passing.items()
+        if r.score > best - EVIDENCE
+    }
+    behind = {
+        i: _with_climbs(data, fitted, r, noise) for i, r in passing.items() if best - EVIDENCE >= r.score > WITHIN_REACH * best
+    }
+    return near, {i: polished(data, fitted, r, noise, say) for i, r in behind.items() if _in_sight(r) > best}
 
 
 def _with_climbs(data: Data, fitted: FittedModel, refitted: Refit, noise: Noise) -> Refit:
@@ -207,17 +232,19 @@ def _elsewhere(data: Data, fitted: FittedModel, refitted: Refit, noise: Noise, s
     if refitted.score <= EVIDENCE or not refitted.candidate.effect.nearby(data.robot, refitted.candidate.seed):
         return refitted
     better = polished(data, fitted, refitted, noise, say)
-    return better if better is refitted else acceptance_test(data, fitted, better.candidate, better.fitted, better.record, noise)
+    if better.fitted is refitted.fitted:
+        return better
+    return acceptance_test(data, fitted, better.candidate, better.fitted, better.record, noise)
 
 
 def polished(data: Data, fitted: FittedModel, refitted: Refit, noise: Noise, say: Progress) -> Refit:
-    """Return a refit with its seed improved."""
-    made = _polish(data, fitted, refitted, noise, say)
+    """Return a refit with its seed improved, and with the scatter of its coordinates over seeds that explain as much."""
+    made, scatter = _polish(data, fitted, refitted, noise, say)
+    record = replace(refitted.record, seed_std=tuple(scatter))
     if made is refitted.fitted:
-        return refitted
+        return replace(refitted, record=record)
     score = refitted.score - evidence(fitted.fit, refitted.fitted.fit) + evidence(fitted.fit, made.fit)
-    refitted.record.update({"dbic": score, "validation_rms_m": made.held_rms})
-    return replace(refitted, fitted=made, score=score)
+    return replace(refitted, fitted=made, score=score, record=replace(record, dbic=score, validation_rms_m=made.held_rms))
 
 
 def _enriched(data: Data, fitted: FittedModel, winner: Refit, table: list[Candidate], noise: Noise, say: Progress) -> Refit:
@@ -231,13 +258,12 @@ def _enriched(data: Data, fitted: FittedModel, winner: Refit, table: list[Candid
         made = _richer(data, fitted, winner, form, noise)
         if made is None:
             continue
-        rich = acceptance_test(data, fitted, form, made, dict(winner.record), noise)
-        if rich.record["verdict"] == "passes":
+        rich = acceptance_test(data, fitted, form, made, winner.record, noise)
+        if rich.record.passes:
             rich = polished(data, fitted, rich, noise, say)
         more = evidence(winner.fitted.fit, rich.fitted.fit) - (rich.candidate.cost - winner.candidate.cost)
-        if rich.record["verdict"] == "passes" and more > EVIDENCE:
-            winner.record.update(rich.record | {"seed": form.seed})
-            winner = replace(rich, record=winner.record)
+        if rich.record.passes and more > EVIDENCE:
+            winner = replace(rich, record=replace(rich.record, seed=form.seed))
     return winner
 
 
@@ -257,12 +283,11 @@ def _with_more_markers(
         made = _richer(data, fitted, winner, form, noise)
         if made is None:
             break
-        more = acceptance_test(data, fitted, form, made, dict(winner.record), noise)
+        more = acceptance_test(data, fitted, form, made, winner.record, noise)
         gain = evidence(winner.fitted.fit, made.fit)
-        if more.record["verdict"] != "passes" or gain <= form.cost - winner.candidate.cost + EVIDENCE:
+        if not more.record.passes or gain <= form.cost - winner.candidate.cost + EVIDENCE:
             break
-        winner.record.update(more.record)
-        winner = replace(more, record=winner.record)
+        winner = more
     return winner
 
 
@@ -314,18 +339,19 @@ def _forms(table: list[Candidate], name: str) -> list[Candidate]:
 # --- polishing -------------------------------------------------------------------------------------------------------------
 
 
-def _polish(data: Data, fitted: FittedModel, winner: Refit, noise: Noise, say: Progress) -> FittedModel:
-    """Return the winner with its seed (place, radius, time) improved: first seeds near by, then fitted along."""
-    best, effect = winner.fitted, winner.candidate.effect
+def _polish(data: Data, fitted: FittedModel, winner: Refit, noise: Noise, say: Progress) -> tuple[FittedModel, Sequence[float]]:
+    """Return the winner with its seed (place, radius, time) improved, first seeds near by, then fitted along; and the scatter over the seeds."""
+    best, scatter, effect = winner.fitted, [0.0] * len(winner.candidate.parameters), winner.candidate.effect
     if effect.nearby(data.robot, winner.candidate.seed):
         say(f"looking near by for {effect.name}")
         climbs = winner.climbs or climbed(data, fitted, winner.candidate, noise)
-        best, winner.record["seed_std"] = located(data, fitted, winner.candidate, winner.fitted, climbs, noise)
-    else:
-        winner.record["seed_std"] = [0.0] * len(winner.candidate.parameters)
-    if not winner.candidate.parameters:
-        return best
-    *others, (_, seed, parameters) = best.fit.hypothesis.terms
+        best, scatter = located(data, fitted, winner.candidate, winner.fitted, climbs, noise)
+    return (_with_seed_fitted(data, best, noise, say) if winner.candidate.parameters else best), scatter
+
+
+def _with_seed_fitted(data: Data, best: FittedModel, noise: Noise, say: Progress) -> FittedModel:
+    """Return a model whose last effect has its seed fitted along, where that explains more and stays inside the bounds."""
+    *others, (effect, seed, parameters) = best.fit.hypothesis.terms
     more = effect.polish(data.robot, data.control, seed)
     if not more:
         return best

@@ -8,7 +8,6 @@ without them, and every effect is asked what it would explain in their place.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -18,6 +17,7 @@ from femsense.loop.fit.cross_validation import sweeps_predicted
 from femsense.loop.fit.discretisation_error import beyond_mesh
 from femsense.loop.fit.fitted_model import FittedModel, held_chi2, keeping, span_of
 from femsense.loop.fit.noise_components import Noise
+from femsense.loop.result.records import NAMED, RefitRecord
 from femsense.loop.search.acceptance import (
     ABOVE_MESH_IF_SURE,
     acceptance_test,
@@ -98,29 +98,29 @@ def instead_of_offsets(
     say("asking what else might be in the place of the cable zeros")
     worth = evidence_for_offsets(data, fitted, without, n_effective)
     table = screen_model(data, without.fit, noise, fields_of(data, without, names), n_effective)
-    best: Refit | None = None
-    records: list[dict[str, Any]] = []
+    passing: dict[int, Refit] = {}
+    records: list[RefitRecord] = []
     for candidate in shortlist(table, first=False):
         if candidate.score < 0.5 * worth - EVIDENCE:
             continue
-        record: dict[str, Any] = {"name": candidate.effect.name, "seed": candidate.seed, "in_place_of": OFFSETS}
+        record = RefitRecord(candidate.effect.name, candidate.seed, in_place_of=OFFSETS)
         try:
             made = refit(data, without, candidate, noise)
         except FemsenseError:
             continue
         tried = acceptance_test(data, without, candidate, made, record, noise)
-        records.append(record)
-        if record["verdict"] == "passes" and (best is None or tried.score > best.score):
-            best = tried
-    if best is None:
+        passing |= {len(records): tried} if tried.record.passes else {}
+        records.append(tried.record)
+    if not passing:
         return OffsetAlternative(None, "", -np.inf, records)
-    best = polished(data, without, best, noise, say)
+    at = max(passing, key=lambda i: passing[i].score)
+    best = polished(data, without, passing[at], noise, say)
     ahead = best.score - worth
-    predicts = best.record["cv_gain"] - sweeps_predicted(data.train, without.fit, fitted.fit)[0]
+    assert best.record.cv_gain is not None
+    predicts = best.record.cv_gain - sweeps_predicted(data.train, without.fit, fitted.fit)[0]
     takes = ahead > BETTER or (ahead > -EVIDENCE and ahead + predicts > BETTER)  # where evidence is close, what predicts better
     takes = takes or (
         best.candidate.effect.mirrors(OFFSETS) and best.fitted.fit.chi2 < fitted.fit.chi2 + EVIDENCE
     )  # its mirror image
-    if takes:
-        best.record["verdict"] = "named"
+    records[at] = best.saying(NAMED).record if takes else best.record
     return OffsetAlternative(best.fitted if takes else None, best.candidate.effect.name, ahead, records)

@@ -8,19 +8,20 @@ exchanges one is what growing and pruning alone lack.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import replace
 
 from femsense.core.errors import FemsenseError
 from femsense.loop.data.dataset import NUISANCE, Data
 from femsense.loop.fit.fitted_model import FittedModel, keeping
 from femsense.loop.fit.noise_components import Noise
+from femsense.loop.result.records import NAMED, PASSES, RefitRecord
 from femsense.loop.search.acceptance import acceptance_test, prior_cost, prior_evidence
 from femsense.loop.search.effect_fields import fields_of
 from femsense.loop.search.forward_selection import polished, shortlist
 from femsense.loop.search.location_search import may_lie_elsewhere
 from femsense.loop.search.refit import EVIDENCE, evidence, refit
 from femsense.loop.search.screening import Candidate, screen_model
-from femsense.loop.search.search_state import Progress, Refit
+from femsense.loop.search.search_state import Progress, Refit, at_step
 
 ALTERNATIVES = 2
 """So many rivals of an effect are asked."""
@@ -30,12 +31,11 @@ BETTER = 2.0
 """dBIC by which a rival must be better; it takes EVIDENCE in the place of gravity where none is declared, since every body has weight."""
 
 History = list[tuple[str, FittedModel]]
-Records = list[dict[str, Any]]
 
 
 def swapped(
-    data: Data, history: History, refits: Records, noise: Noise, n_effective: float, say: Progress
-) -> tuple[History, Records]:
+    data: Data, history: History, refits: list[RefitRecord], noise: Noise, n_effective: float, say: Progress
+) -> tuple[History, list[RefitRecord]]:
     """Return the history with rivals in the places of effects, but for the last one, that they beat in the whole model, and the
     refits with what became of those that were asked."""
     for name in [name for name, _ in history[1:-1]]:
@@ -52,29 +52,28 @@ def swapped(
         except FemsenseError:
             continue
         if best is not None:
-            refits = [{**r, "verdict": "passes"} if r["name"] == name and r["verdict"] == "named" else r for r in refits]
-            best.record["verdict"] = "named"
-        refits = [*refits, *({**r, "step": len(history) - 1} for r in records)]
+            refits = [replace(r, verdict=PASSES) if r.name == name and r.is_named else r for r in refits]
+            records = [replace(r, verdict=NAMED) if r is best.record else r for r in records]
+        refits = [*refits, *at_step(records, len(history) - 1)]
     return history, refits
 
 
-def _rivals(fitted: FittedModel, refits: Records, name: str) -> list[str]:
+def _rivals(fitted: FittedModel, refits: Sequence[RefitRecord], name: str) -> list[str]:
     """Return the effects that were nearly as good when one was named, the best first; the effect itself if its seed was chosen from many."""
     seeds = {effect.name: seed for effect, seed, parameters in fitted.fit.hypothesis.terms if parameters}
-    named = [r for r in refits if r["name"] == name and r["verdict"] == "named"]
+    named = [r for r in refits if r.name == name and r.is_named]
     if name not in seeds or not named:
         return []
     own = named[-1]
     near = [
         r
         for r in refits
-        if r["step"] == own["step"]
-        and r["verdict"] == "passes"
-        and r.get("in_place_of") == own.get("in_place_of")
-        and r["dbic"] > NEAR * own["dbic"] - EVIDENCE
-        and r["name"] not in fitted.fit.hypothesis.names
+        if r.answers_as(own)
+        and r.passes
+        and r.evidence > NEAR * own.evidence - EVIDENCE
+        and r.name not in fitted.fit.hypothesis.names
     ]
-    others = list(dict.fromkeys(r["name"] for r in sorted(near, key=lambda r: -r["dbic"])))
+    others = list(dict.fromkeys(r.name for r in sorted(near, key=lambda r: -r.evidence)))
     return [name] * bool(seeds[name]) + others[:ALTERNATIVES]
 
 
@@ -87,27 +86,28 @@ def _best(
     noise: Noise,
     n_effective: float,
     say: Progress,
-) -> tuple[Refit | None, Records]:
+) -> tuple[Refit | None, list[RefitRecord]]:
     """Return the best rival if it is better than what is named, and what became of each."""
     table = screen_model(data, without.fit, noise, fields_of(data, without, [name, *rivals]), n_effective)
     own = _same(table, fitted, name)
     if own is None:
         return None, []
     worth = evidence(without.fit, fitted.fit) - own.cost - prior_cost(data.declared, own.effect, fitted.fit)
-    records: Records = [{"name": name, "seed": own.seed, "in_place_of": name, "dbic": worth, "verdict": "passes"}]
+    records = [RefitRecord(name, own.seed, PASSES, in_place_of=name, dbic=worth)]
     margin = max(BETTER, prior_evidence(data, own.effect))
     best: Refit | None = None
     for candidate in shortlist([c for c in table if c.effect.name in rivals], first=True):
-        record: dict[str, Any] = {"name": candidate.effect.name, "seed": candidate.seed, "in_place_of": name}
+        record = RefitRecord(candidate.effect.name, candidate.seed, in_place_of=name)
         try:
             made = refit(data, without, candidate, noise)
         except FemsenseError:
             continue
         tried = acceptance_test(data, without, candidate, made, record, noise)
-        if record["verdict"] == "passes":
-            tried = polished(data, without, tried, noise, say)
-            records.append(record)
-        if record["verdict"] == "passes" and tried.score > (worth + margin if best is None else best.score):
+        if not tried.record.passes:
+            continue
+        tried = polished(data, without, tried, noise, say)
+        records.append(tried.record)
+        if tried.score > (worth + margin if best is None else best.score):
             best = tried
     return best, records
 

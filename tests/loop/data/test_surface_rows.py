@@ -32,7 +32,7 @@ from femsense.loop.data.trial import Groups, SurfaceRows, normals_of, spans_of, 
 from femsense.loop.design.advice import next_element
 from femsense.loop.fit.fitted_model import fit_model, own_of, rematched, with_nuisance
 from femsense.loop.fit.noise_components import Noise, whiten
-from femsense.loop.improve import MATCHINGS, _matched, improve
+from femsense.loop.improve import MATCHINGS, improve, matched
 from femsense.model.effects import find_effect
 from femsense.model.observation import Hypothesis, evaluate_scene
 from femsense.model.recording import Camera, Recording
@@ -238,7 +238,7 @@ def test_rows_are_made_again_until_the_fit_stays_where_it_is(rubbing: Recording,
         start = fit_model(data, hypothesis, prior, noise, nothing, own=own, max_iterations=0)
         data = rematched(data, start, noise, anew=True)  # rows as they are found from there
         monkeypatch.setattr(sys.modules[improve.__module__], "MATCHINGS", rounds)
-        found, fitted = _matched(data, start, noise, anew=True)
+        found, fitted = matched(data, start, noise, anew=True)
         again = fit_model(rematched(found, fitted, noise), hypothesis, prior, noise, fitted.fit.coordinates, own=own_of(fitted))
         return again.fit.fit.cost[0] - again.fit.chi2
 

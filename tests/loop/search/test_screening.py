@@ -173,7 +173,7 @@ def test_a_model_without_equilibrium_is_not_handed_back(monkeypatch: pytest.Monk
     data, fitted = staged(arm((4, 2, 2)), 1.0)
     search = Search(fitted, [("", fitted)], fitted, fitted, NOISE, 10.0, [], [], [], None)
     monkeypatch.setattr(returned_model, "keeping", collapses)
-    assert verdict._worth_handing_back(data, search, ["stiffness"], ["stiffness"]) == ([], fitted)
+    assert verdict.worth_handing_back(data, search, ["stiffness"], ["stiffness"]) == ([], fitted)
     chain = verdict._chain(data, search, ["stiffness"], ["stiffness"], fitted, {})
     assert [c["validation_rms_after_m"] for c in chain] == [fitted.held_rms]
 
@@ -191,7 +191,7 @@ def test_a_model_may_have_a_larger_error_on_held_out_data_where_that_is_the_mesh
         monkeypatch.setattr(returned_model, "held_chi2", lambda _, s, noise: chi2 if s is model else 100.0)
         sizes = iter([0.8, beyond])
         monkeypatch.setattr(returned_model, "beyond_mesh", lambda *_: next(sizes))
-        return returned_model._holds_out(data, search, model)
+        return returned_model.holds_out(data, search, model)
 
     assert holds(1.4) and holds(1.0, chi2=200.0)
     assert not holds(1.6)  # more than all that calibration may move
@@ -212,14 +212,14 @@ def test_a_larger_error_is_not_for_zeros_of_cables_which_much_else_looks_like(
     search = Search(replace(fitted, held_rms=1.0), [("", back)], back, back, NOISE, 10.0, [], [], [], None)
     monkeypatch.setattr(returned_model, "held_chi2", lambda _, s, noise: 40.0 if s is back else 80.0)
     monkeypatch.setattr(returned_model, "beyond_mesh", lambda *_: 0.5)
-    assert returned_model._holds_out(data, search, back) == held
+    assert returned_model.holds_out(data, search, back) == held
 
 
 @pytest.mark.parametrize(("noise_mm", "small"), [(0.2, False), (0.4, True)])
 def test_a_residual_no_larger_than_the_noise_is_said_to_be_so(noise_mm: float, small: bool) -> None:
     fitted = replace(staged(arm((4, 2, 2)), 1.0)[1], held_rms=3e-4)
     noise = Noise({"white": 1e-3 * noise_mm / np.sqrt(3.0)}, "")
-    sentence = verdict._sentence("unexplained", [], [], fitted, fitted, noise, None)
+    sentence = verdict.verdict_in_words("unexplained", [], [], fitted, fitted, noise, None)
     assert sentence.startswith("A residual is left that no effect of the list explains")
     assert ("no larger than the noise" in sentence) == small and f"0.30 mm, noise {noise_mm:.2f} mm" in sentence
 
@@ -231,7 +231,7 @@ def test_where_the_data_are_explained_by_what_the_mesh_costs_the_sentence_says_s
     _, fitted = staged(arm((4, 2, 2)), 1.0)
     fitted = replace(fitted, held_rms=1e-3 * error)
     noise = Noise({"white": 0.5e-3 / np.sqrt(3.0)}, "")
-    sentence = verdict._sentence("none", [], [], fitted, fitted, noise, None if mesh is None else 1e-3 * mesh)
+    sentence = verdict.verdict_in_words("none", [], [], fitted, fitted, noise, None if mesh is None else 1e-3 * mesh)
     assert ("its mesh costs (1.00 mm" in sentence) == expected and "noise (0.50 mm)" in sentence
 
 
@@ -242,14 +242,14 @@ def test_values_are_said_in_short_whatever_they_are() -> None:
         "markers": {"value": ["Base-1", "Base-2"], "unit": "1"},
         "scale": {"value": {"a": 0.9, "b": [0.0, 0.0]}, "unit": "1"},
     }
-    said = sentences._short(values)
+    said = sentences.values_in_words(values)
     assert said == "center_m [0.0151, 0, -0.0264] m, share 0.246, markers [Base-1, Base-2], scale a 0.9, b [0, 0]"
 
 
 @pytest.mark.parametrize("mesh, costs", [(None, "0.50 mm."), (0.3e-3, "0.50 mm, and its mesh costs 0.30 mm.")])
 def test_what_neither_the_noise_nor_the_mesh_explains_is_not_said_to_be_explained(mesh: float | None, costs: str) -> None:
     fitted = replace(staged(arm((4, 2, 2)), 1.0)[1], held_rms=0.9e-3)
-    sentence = verdict._sentence("none", [], [], fitted, fitted, Noise({"white": 0.5e-3 / np.sqrt(3.0)}, ""), mesh)
+    sentence = verdict.verdict_in_words("none", [], [], fitted, fitted, Noise({"white": 0.5e-3 / np.sqrt(3.0)}, ""), mesh)
     assert sentence == f"Nothing that was tried explains more of the data: held-out error 0.90 mm; their noise is {costs}"
 
 
@@ -261,8 +261,8 @@ def test_effects_that_are_named_on_linear_elements_may_stand_for_these(
     data, fitted = staged(robot_on_mesh(robot, to_linear(robot.body.mesh)) if linear else robot, 1.0)
     settled = ((find_effect("hyperelastic"), {}),) if named else ()
     back = replace(fitted, fit=replace(fitted.fit, hypothesis=replace(fitted.fit.hypothesis, settled=settled)))
-    monkeypatch.setattr(sentences, "_mesh_error", lambda data: 2e-3)
-    assert ("try discretisation" in sentences._on_linear(data, back)) == (linear and named)
+    monkeypatch.setattr(sentences, "mesh_error_rms", lambda data: 2e-3)
+    assert ("try discretisation" in sentences.on_linear(data, back)) == (linear and named)
 
 
 def test_a_modulus_that_is_as_declared_once_zeros_stay_is_not_handed_back(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -271,9 +271,9 @@ def test_a_modulus_that_is_as_declared_once_zeros_stay_is_not_handed_back(monkey
         softer.fit, fit=replace(softer.fit.fit, theta=np.append(softer.fit.fit.theta[: softer.fit.own], [0.0] * 5))
     )
     search = Search(softer, [("", softer)], softer, softer, NOISE, 10.0, [], [], [], None)
-    assert verdict._worth_handing_back(data, search, ["stiffness"], ["stiffness"])[0] == ["stiffness"]
+    assert verdict.worth_handing_back(data, search, ["stiffness"], ["stiffness"])[0] == ["stiffness"]
     monkeypatch.setattr(returned_model, "keeping", lambda *_, **__: replace(softer, fit=as_declared))
-    assert verdict._worth_handing_back(data, search, ["stiffness"], ["stiffness"])[0] == []
+    assert verdict.worth_handing_back(data, search, ["stiffness"], ["stiffness"])[0] == []
 
 
 def with_gain(modulus: float) -> tuple[Data, Search]:
@@ -295,14 +295,14 @@ def with_gain(modulus: float) -> tuple[Data, Search]:
 
 def handed_back(data: Data, search: Search) -> tuple[list[str], float]:
     """Return the names that are handed back, and the gain."""
-    names, back = verdict._worth_handing_back(data, search, [], ["cable_gain"])
+    names, back = verdict.worth_handing_back(data, search, [], ["cable_gain"])
     (entry,) = [e for e in back.fit.hypothesis.entries(back.fit.coordinates) if e["name"] == "cable_gain"]
     return names, entry["scale"]["left"]
 
 
 def test_a_modulus_that_is_off_by_little_goes_along_with_an_effect_that_would_make_up_for_it() -> None:
     data, search = with_gain(300e3 * 0.982)
-    assert not verdict._promoted(data, search)
+    assert not verdict.promoted_nuisances(data, search)
     names, gain = handed_back(data, search)
     assert names == ["stiffness", "cable_gain"]
     alone = returned_model.keeping(data, search.final, ["cable_gain"], search.noise)
@@ -329,7 +329,7 @@ def test_a_modulus_that_moved_too_little_to_be_named_by_itself_goes_along_where_
 
     data, search = with_gain(300e3 * 0.982)
     monkeypatch.setattr(returned_model, "with_sizes_still", folds)
-    names, _ = verdict._worth_handing_back(data, search, ["stiffness"], ["stiffness", "cable_gain"])
+    names, _ = verdict.worth_handing_back(data, search, ["stiffness"], ["stiffness", "cable_gain"])
     assert names == ["stiffness", "cable_gain"]
 
 

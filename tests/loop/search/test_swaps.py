@@ -30,7 +30,7 @@ from femsense.model.effects import find_effect
 from femsense.model.observation import Hypothesis
 
 improving = sys.modules["femsense.loop.improve"]
-beside_a_tie = improving._beside_a_tie
+beside_a_tie = improving.beside_a_tie
 NOISE = Noise({"white": 1e-4}, "")
 COUNT = 300.0
 HIDDEN = [
@@ -108,7 +108,7 @@ def test_a_polished_refit_is_weighed_against_the_model_without_it_as_its_rivals_
 
 def test_what_predicts_surely_goes_before_what_may_predict():
     def predicts(gain: float, spread: float) -> float:
-        return forward_selection._predicts(Refit(None, None, 0.0, 0.0, {"cv_gain": gain, "cv_std": spread}))
+        return forward_selection.surely_predicts(Refit(None, None, 0.0, 0.0, {"cv_gain": gain, "cv_std": spread}))
 
     assert predicts(44.0, 14.0) > predicts(48.0, 45.0)
     assert predicts(44.0, np.inf) == 44.0
@@ -185,7 +185,7 @@ def test_another_form_of_what_leads_is_held_against_what_that_one_promised(monke
     monkeypatch.setattr(forward_selection, "acceptance_test", lenient)
     monkeypatch.setattr(forward_selection, "polished", lambda data, fitted, refitted, *_: refitted)
     monkeypatch.setattr(forward_selection, "explains", lambda fitted: True)
-    monkeypatch.setattr(forward_selection, "_predicts", lambda refitted: 0.0)
+    monkeypatch.setattr(forward_selection, "surely_predicts", lambda refitted: 0.0)
     forms = [replace(payload, score=100.0), replace(rival, score=60.0)]
     forward_selection.select_next(data, base, forms, NOISE, lambda text: None)
     assert asked == ["payload", "payload"] if form else asked == ["payload"]
@@ -302,7 +302,7 @@ def test_fields_are_computed_anew_where_those_of_the_model_before_promise_someth
     monkeypatch.setattr(improving, "fields_of", lambda *given: asked.append("anew") or fields_of(*given))
     if not promises:
         monkeypatch.setattr(forward_selection, "PREDICTED_MUCH", 1e3)
-    fields, table = improving._scored(data, fitted, hints, NOISE, ["payload", "poisson"], COUNT)
+    fields, table = improving.scored(data, fitted, hints, NOISE, ["payload", "poisson"], COUNT)
     assert asked == ["anew"] * promises and (fields is hints) != promises
     assert {c.effect.name for c in table} <= {"payload", "poisson"}
 
@@ -387,13 +387,13 @@ def test_a_model_on_top_of_which_much_is_promised_need_not_be_fitted_to_the_end(
     )
     fields = fields_of(data, rough, ["payload", "cable_gain"])
     best = max(c.gain for c in screen_model(data, rough.fit, NOISE, fields, COUNT))
-    assert improving._spared(data, rough, fields, NOISE, COUNT) == 0.0  # all states are little work
+    assert improving.spared_gain(data, rough, fields, NOISE, COUNT) == 0.0  # all states are little work
     monkeypatch.setattr(improving, "spares", lambda data, robot: True)
-    spare = improving._spared(data, rough, fields, NOISE, COUNT)
+    spare = improving.spared_gain(data, rough, fields, NOISE, COUNT)
     assert spare == pytest.approx(improving.SPARED * best)
     finer = replace(NOISE, std={"white": 1e-5})
-    assert improving._spared(data, rough, fields, finer, COUNT) > 50.0 * spare  # by the noise that is known now
+    assert improving.spared_gain(data, rough, fields, finer, COUNT) > 50.0 * spare  # by the noise that is known now
     known = rough.fit.jets
-    whole, part = (improving._again(data, rough, NOISE, known=known, spare=s) for s in (0.0, 100.0 * spare))
+    whole, part = (improving.fitted_again(data, rough, NOISE, known=known, spare=s) for s in (0.0, 100.0 * spare))
     assert len(part.fit.fit.cost) < len(whole.fit.fit.cost) and part.fit.chi2 < whole.fit.chi2 + 100.0 * spare
     assert part.fit.fit.status == "converged"
