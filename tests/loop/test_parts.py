@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from types import SimpleNamespace
@@ -37,6 +36,7 @@ from femsense.loop.fit.joint_fit import Prior
 from femsense.loop.fit.noise_components import Noise, _Likelihood, whiten
 from femsense.loop.improve import improve
 from femsense.loop.search.acceptance import plainly_worse
+from femsense.loop.search.calibration import as_far_as_held_out_states_converge
 from femsense.loop.search.effect_fields import parts_of
 from femsense.loop.search.screening import penalty
 from femsense.loop.verdict.residual_diagnostics import structure_tests
@@ -49,8 +49,6 @@ from femsense.model.observation import Hypothesis, evaluate_scene, make_scene
 from femsense.model.recording import Recording, make_recording
 from femsense.model.remeshing import finer_mesh, robot_on_mesh
 from femsense.model.variants import solve_frame
-
-as_far_as_held_out_states_rest = sys.modules["femsense.loop.improve"].as_far_as_held_out_states_converge
 
 RNG = np.random.default_rng(11)
 
@@ -383,9 +381,9 @@ def test_calibration_goes_as_far_as_held_out_states_come_to_rest():
 
         return fit
 
-    assert [as_far_as_held_out_states_rest(collapses_beyond(most), 4) for most in (4, 3, 1, 0)] == [4, 2, 1, 0]
+    assert [as_far_as_held_out_states_converge(collapses_beyond(most), 4) for most in (4, 3, 1, 0)] == [4, 2, 1, 0]
     with pytest.raises(DataError):
-        as_far_as_held_out_states_rest(collapses_beyond(-1), 4)
+        as_far_as_held_out_states_converge(collapses_beyond(-1), 4)
 
 
 def structure_of(values: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> dict[str, float]:
@@ -400,7 +398,7 @@ def structure_of(values: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> dict[st
         groups=Groups(marker, frame, np.unique(labels, return_inverse=True)[1][frame], frame),
     )
     monkeypatch.setattr("femsense.loop.verdict.residual_diagnostics.state_key", lambda recording, k: inputs[k].tobytes())
-    return structure_tests([trial], [values.reshape(-1, 3)], rng=np.random.default_rng(0)).p
+    return structure_tests([trial], [values.reshape(-1, 3)], rng=np.random.default_rng(0)).tests
 
 
 def test_noise_alone_has_no_structure_and_a_pattern_has(monkeypatch: pytest.MonkeyPatch):
@@ -445,9 +443,9 @@ def test_one_marker_that_sits_elsewhere_is_named_alone():
         inputs, labels=labels, truth=robot, noise=1e-4, effects=[{"name": "marker_offset", "offset_m": {"m5": [2e-3, 0.0, 1e-3]}}]
     )
     loop = improve(robot, [recording], effects=["marker_offset", "cable_gain", "payload"])
-    effect = next(e for e in loop.effects if e["name"] == "marker_offset")
-    assert list(effect["parameters"]["offset_m"]["value"]) == ["m5"]
-    np.testing.assert_allclose(effect["parameters"]["offset_m"]["value"]["m5"], [2e-3, 0.0, 1e-3], atol=2.5e-4)
+    effect = next(e for e in loop.effects if e.name == "marker_offset")
+    assert list(effect.parameters["offset_m"].value) == ["m5"]
+    np.testing.assert_allclose(effect.parameters["offset_m"].value["m5"], [2e-3, 0.0, 1e-3], atol=2.5e-4)
 
 
 def test_parts_are_cables_markers_and_keys():

@@ -72,15 +72,15 @@ class LoopResult:
     def document(self) -> dict[str, Any]:
         """Return the content of loop.json."""
         tables = table_of(self, without=("entries", "robot", "declared"))
-        return {"format": FORMAT, **tables, "evidence": _rounded(tables["evidence"])}
+        return {"format": FORMAT, **tables, "evidence": rounded(tables["evidence"])}
 
 
-def _rounded(value: Any) -> Any:
+def rounded(value: Any) -> Any:
     """Return plain tables with seven digits, NaN and infinity as null."""
     if isinstance(value, dict):
-        return {key: _rounded(item) for key, item in value.items()}
+        return {key: rounded(item) for key, item in value.items()}
     if isinstance(value, list):
-        return [_rounded(item) for item in value]
+        return [rounded(item) for item in value]
     if isinstance(value, float | np.floating):
         return float(f"{value:.7g}") if np.isfinite(value) else None
     return value.item() if isinstance(value, np.generic) else value

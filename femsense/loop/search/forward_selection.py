@@ -64,17 +64,13 @@ def select_next(
     passing = {i: r for i, r in refits.items() if r.record.passes}
     if not passing:
         return None, [], _updated(records, refits)
-    near, moved = _leaders(data, fitted, passing, noise, say)
-    ahead = max(r.score for r in near.values())
-    leaders = near | {i: r for i, r in moved.items() if r.score > ahead}
+    leading, improved = leaders(data, fitted, passing, noise, say)
     # where evidence is close, what surely predicts better
-    first = max(
-        leaders, key=lambda i: leaders[i].score + surely_predicts(leaders[i]) + prior_evidence(data, leaders[i].candidate.effect)
-    )
-    close = [r for r in leaders.values() if r.score > leaders[first].score - EVIDENCE]
-    winner = _enriched(data, fitted, leaders[first], table, noise, say).saying(NAMED)
+    first = max(leading, key=lambda i: leading[i].score + surely_predicts(leading[i]) + _ahead_beforehand(data, leading[i]))
+    close = [r for r in leading.values() if r.score > leading[first].score - EVIDENCE]
+    winner = _enriched(data, fitted, leading[first], table, noise, say).saying(NAMED)
     ties = [r for r in close if r.candidate.effect.name != winner.candidate.effect.name]
-    records = _updated(records, refits | near | moved | {first: winner})
+    records = _updated(records, refits | improved | {first: winner})
     return winner, sorted(ties, key=lambda r: -r.score), records
 
 
@@ -119,10 +115,11 @@ def _updated(records: Sequence[RefitRecord], refits: Mapping[int, Refit]) -> lis
     return [refits[i].record if i in refits else record for i, record in enumerate(records)]
 
 
-def _leaders(
+def leaders(
     data: Data, fitted: FittedModel, passing: Mapping[int, Refit], noise: Noise, say: Progress
 ) -> tuple[dict[int, Refit], dict[int, Refit]]:
-    """Return the refits that are as good as the best but for EVIDENCE, and those that their places may bring ahead of these, each with its seed improved."""
+    """Return the refits that are as good as the best but for EVIDENCE with those that their places bring ahead of these, each with its seed improved;
+    and all whose seeds were improved."""
     best = max(r.score for r in passing.values())
     near = {
         i: r if r.record.seed_std is not None else polished(data, fitted, r, noise, say)
@@ -132,7 +129,13 @@ def _leaders(
     behind = {
         i: _with_climbs(data, fitted, r, noise) for i, r in passing.items() if best - EVIDENCE >= r.score > WITHIN_REACH * best
     }
-    return near, {i: polished(data, fitted, r, noise, say) for i, r in behind.items() if _in_sight(r) > best}
+    moved = {i: polished(data, fitted, r, noise, say) for i, r in behind.items() if _in_sight(r) > best}
+    ahead = max(r.score for r in near.values())
+    return near | {i: r for i, r in moved.items() if r.score > ahead}, near | moved
+
+
+def _ahead_beforehand(data: Data, refitted: Refit) -> float:
+    return prior_evidence(data, refitted.candidate.effect)
 
 
 def _with_climbs(data: Data, fitted: FittedModel, refitted: Refit, noise: Noise) -> Refit:

@@ -72,13 +72,13 @@ def _first_share(data: Data, fit: JointFit, ones: list[Candidate], rng: np.rando
     wins = np.zeros(len(ones))
     for _ in range(DRAWS):
         counts = np.bincount(rng.integers(0, len(groups), len(groups)), minlength=len(groups))
-        G = _without(rest + np.tensordot(counts, np.array(grams), axes=1), J.shape[1])
+        G = without_first(rest + np.tensordot(counts, np.array(grams), axes=1), J.shape[1])
         gains = [_gain(G, a - J.shape[1], b - J.shape[1], c, size[a:b]) - c.cost for (a, b), c in zip(spans, ones)]
         wins[int(np.argmax(gains))] += max(gains) > 0
     return [float(w) / DRAWS for w in wins]
 
 
-def _without(gram: FloatArray, p: int) -> FloatArray:
+def without_first(gram: FloatArray, p: int) -> FloatArray:
     """Return a Gram matrix with its first p columns projected out."""
     A, B, D = gram[:p, :p], gram[:p, p:], gram[p:, p:]
     return np.asarray(D - B.T @ np.linalg.pinv(A, rcond=1e-12, hermitian=True) @ B)

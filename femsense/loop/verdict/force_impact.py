@@ -129,12 +129,12 @@ def _at_loads(before: View, after: View, frame: int, noise: Noise) -> LoadRow | 
     sensed = []
     for view in (before, after):
         C = view.answers(view.tangent(frame), frame, places)
-        change, covariance = _solved(C, view.jet.residual[view.rows(frame)].ravel(), noise.row_std(view.trial.groups))
+        change, covariance = forces_from(C, view.jet.residual[view.rows(frame)].ravel(), noise.row_std(view.trial.groups))
         sensed += [float(size[main] + change[part] @ direction), float(np.sqrt(direction @ covariance[part, part] @ direction))]
     return LoadRow(before.recording, before.number(frame), before.held_out, float(size[main]), *sensed)
 
 
-def _solved(C: FloatArray, residual: FloatArray, std: float) -> tuple[FloatArray, FloatArray]:
+def forces_from(C: FloatArray, residual: FloatArray, std: float) -> tuple[FloatArray, FloatArray]:
     """Return the forces that explain a residual best, and their covariance; directions that the markers hardly see stay at zero."""
     U, s, Vt = np.linalg.svd(C, full_matrices=False)
     keep = s > WEAKEST * s[0]
@@ -159,7 +159,7 @@ def _compliances(before: View, after: View) -> Compliance:
             tangent = view.tangent(k)
             W = compliance(view.robot.body, view.jet.states[k], points=declared.nodes[nodes], directions=normals, tangent=tangent)
             C = view.answers(tangent, k, declared.nodes[nodes[:1]])
-            phantom = _solved(C, view.jet.residual[view.rows(k)].ravel(), 1.0)[0]
+            phantom = forces_from(C, view.jet.residual[view.rows(k)].ravel(), 1.0)[0]
             ends.append((np.diag(W)[: len(nodes)], float(np.linalg.norm(phantom))))
         (first, phantom_before), (second, phantom_after) = ends
         rows.append(Softer(title, before.number(k), tuple((first / second).tolist()), phantom_before, phantom_after))
@@ -204,7 +204,7 @@ def equivalent_forces(views: list[View], noise: Noise) -> ForceField | None:
         C = view.answers(view.tangent(frame), frame, places)
     except FemsenseError:
         return None
-    forces = _smallest_field(C, r, goal).reshape(-1, 3)
+    forces = smallest_field(C, r, goal).reshape(-1, 3)
     left = r - C @ forces.ravel()
     return ForceField(
         recording=view.recording,
@@ -220,7 +220,7 @@ def _mean_square(view: View, frame: int) -> float:
     return float((view.jet.residual[view.rows(frame)] ** 2).sum(axis=1).mean())
 
 
-def _smallest_field(C: FloatArray, r: FloatArray, goal: float) -> FloatArray:
+def smallest_field(C: FloatArray, r: FloatArray, goal: float) -> FloatArray:
     """Return the smallest f with |C f − r|² ≤ goal, or where none comes so near the least regular one that still is stable."""
     U, s, Vt = np.linalg.svd(C, full_matrices=False)
     b = U.T @ r

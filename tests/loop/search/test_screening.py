@@ -353,11 +353,11 @@ def test_a_linear_mesh_is_asked_for_quadratic_elements_whatever_else_makes_up_fo
     recording, _ = record(inputs, labels=labels, truth=declared)  # a finer truth is softer by 1 %, which is named beside it
     linear = robot_on_mesh(declared, to_linear(declared.body.mesh))
     found = improve(linear, [recording], effects=["discretisation", "poisson", "cable_gain"])
-    assert [e["name"] for e in found.effects] == ["discretisation"]
-    assert found.after["validation_rms_m"] < 0.2 * found.before["validation_rms_m"]
-    row = next(c for c in found.candidates if c["name"] == "discretisation")
-    assert row["verdict"] == "named" and row["dbic"] > 10.0
-    assert {str(r["seed"]) for r in row["refits"]} == {"{'element': 'tet10'}", "{'refinements': 1}"}
+    assert [e.name for e in found.effects] == ["discretisation"]
+    assert found.after.validation_rms_m < 0.2 * found.before.validation_rms_m
+    row = next(c for c in found.candidates if c.name == "discretisation")
+    assert row.verdict == "named" and row.dbic > 10.0
+    assert {str(r.seed) for r in row.refits} == {"{'element': 'tet10'}", "{'refinements': 1}"}
 
 
 def test_linear_elements_stay_where_the_data_do_not_miss_quadratic_ones() -> None:
@@ -368,5 +368,5 @@ def test_linear_elements_stay_where_the_data_do_not_miss_quadratic_ones() -> Non
     linear = robot_on_mesh(declared, to_linear(declared.body.mesh))
     found = improve(linear, [recording], effects=["discretisation", "cable_gain"])
     assert found.verdict == "none" and not found.effects
-    row = next(c for c in found.candidates if c["name"] == "discretisation")
-    assert row["refits"][0]["verdict"].startswith("too little evidence")
+    row = next(c for c in found.candidates if c.name == "discretisation")
+    assert row.refits[0].verdict.startswith("too little evidence")
