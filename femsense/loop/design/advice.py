@@ -14,17 +14,8 @@ from femsense.core.parallel import each
 from femsense.loop.data.dataset import NUISANCE, Data
 from femsense.loop.data.trial import Trial, numbers_of
 from femsense.loop.design.candidate_experiments import Element, candidate_experiments, setup_for
-from femsense.loop.design.identifiability import (
-    EVIDENCE,
-    Block,
-    Form,
-    Identifiability,
-    Judge,
-    Row,
-    forms_of,
-    make_block,
-    turns_of,
-)
+from femsense.loop.design.experiment_blocks import Block, Form, forms_of, make_block, turns_of
+from femsense.loop.design.identifiability import EVIDENCE, Identifiability, Judge, Row
 from femsense.loop.design.planner import Proposal, element_block
 from femsense.loop.fit.joint_fit import JointFit
 from femsense.loop.fit.noise_components import Noise

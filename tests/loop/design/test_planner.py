@@ -14,7 +14,8 @@ from femsense.io.recording_folder import load_recording
 from femsense.loop.data.dataset import prepare
 from femsense.loop.design.advice import proposal_text
 from femsense.loop.design.candidate_experiments import candidate_experiments, minimal, script_of, setup_for
-from femsense.loop.design.identifiability import Block, Form, Gram, Judge, forms_of, turns_of
+from femsense.loop.design.experiment_blocks import Block, Form, Gram, forms_of, turns_of
+from femsense.loop.design.identifiability import Judge
 from femsense.loop.design.planner import element_block, identifiability_of_script, plan_experiment
 from femsense.loop.fit.fitted_model import fit_model, with_nuisance
 from femsense.loop.fit.noise_components import Noise
@@ -184,7 +185,7 @@ def test_a_proposal_lowers_the_confusion_within_its_frames(monkeypatch):
     monkeypatch.setattr(
         "femsense.loop.design.planner.candidate_experiments", lambda s: [e for e in candidate_experiments(s) if e.key in cases]
     )
-    monkeypatch.setattr("femsense.loop.design.identifiability.MOST_SEEDS", 1)
+    monkeypatch.setattr("femsense.loop.design.experiment_blocks.MOST_SEEDS", 1)
     proposal = plan_experiment(tiny(), noise=NOISE, frames=20)
     assert sum(e.frames for e in proposal.elements) <= 20
     assert proposal.steps
