@@ -1,7 +1,7 @@
 """Close the loop: measure the residual, screen every effect, refit the best jointly, decide on held-out data, hand back a better model.
 
 The order of things: split by sweeps; calibrate the declared model (that is "before"); fit what calibration may always move (poses,
-initial inputs, modulus, zeros of the cables), on quadratic elements where linear ones are declared; ask what the mesh itself costs; estimate the noise; screen; refit the best few in full
+initial inputs, modulus, input offsets), on quadratic elements where linear ones are declared; estimate the discretisation error; estimate the noise; screen; refit the best few in full
 nonlinearity; accept one if BIC, its physical range, the sweeps that are left out and the held-out data agree; start again from the
 better model until nothing passes.
 """
@@ -93,7 +93,7 @@ def improve(
     result = replace(result, next_experiment=record, data=replace(result.data, seed=seed))
     if distinguishes_effects(data):
         return result
-    only = "record another state (other inputs, load or direction of gravity): these data repeat too few states, which cannot tell effects apart"
+    only = "record another state (other inputs, load or direction of gravity): these data repeat too few states, which cannot distinguish effects"
     return replace(result, next_experiment="; ".join(t for t in (only, result.next_experiment) if t))
 
 
@@ -107,7 +107,7 @@ def _searched(
     if kept is not None:
         say(f"going on where it stopped (effects found: {kept.found})")
     if seeks_with_quadratic(robot, names) and (kept is None or kept.quadratic):
-        with contextlib.suppress(FemsenseError):  # linear elements lock, and come to rest where quadratic ones fold
+        with contextlib.suppress(FemsenseError):  # linear elements lock, and converge where quadratic ones fold
             course = kept or search_begun(ready(with_quadratic(robot), names), names, [], quadratic=True)
             data, search = search_effects(course, checkpoint, say)
             say("asking whether quadratic elements are needed")

@@ -115,7 +115,7 @@ def test_what_has_evidence_and_makes_the_held_out_error_larger_is_said_and_not_h
     monkeypatch.setattr(sys.modules["femsense.loop.verdict.returned_model"], "holds_out", lambda data, search, back: False)
     loop = improve(arm((4, 1, 1)), [recording], effects=["cable_friction"])
     assert not loop.effects and loop.robot is loop.declared
-    assert "evidence for cable_friction" in loop.sentence and "mesh itself costs" in loop.sentence
+    assert "evidence for cable_friction" in loop.sentence and "discretisation error is" in loop.sentence
     assert loop.verdict == "unexplained" and "nothing that may be handed back explains" in loop.sentence
 
 

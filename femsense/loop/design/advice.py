@@ -90,12 +90,12 @@ def _summary(identifiability: Identifiability, before: Identifiability | None) -
 
     apart = " → ".join("{} of {}".format(*o.distinguished()) for o in (before, identifiability) if o is not None)
     lines = [
-        f"not testable: {count('untestable')}; too small to be seen: {count('unseen')}; pairs of effects that would be told apart: {apart}",
+        f"not testable: {count('untestable')}; too small to be seen: {count('unseen')}; pairs of effects that would be distinguished: {apart}",
         f"pairs that would both be seen and look alike: {count('confused')}",
     ]
     for i, j, share, gap in sorted(identifiability.confused(), key=lambda p: p[3])[:12]:
         names = f"{identifiability.rows[i].label} / {identifiability.rows[j].label}"
-        lines.append(f"  {names}: one imitates {100 * share:.0f} % of the other, dBIC gap {gap:.0f}")
+        lines.append(f"  {names}: {100 * share:.0f} % collinear, dBIC gap {gap:.0f}")
     return lines
 
 
@@ -109,7 +109,7 @@ def proposal_text(proposal: Proposal) -> str:
         lines.append(f"{i + 1:3d}. {e.words}{how}")
         lines += [f"       {text}" for text in brings.get(e.key, ())[:4]]
     if not proposal.steps:
-        lines.append("nothing on the menu helps within these frames")
+        lines.append("none of the candidate experiments helps within these frames")
     lines += [f"left out: {text}" for text in proposal.left_out]
     title = f"Predicted, before → after, {1e3 * proposal.noise:g} mm noise a coordinate, on the declared robot:"
     note = (
@@ -124,13 +124,13 @@ def proposal_text(proposal: Proposal) -> str:
 def next_element(
     data: Data, fit: JointFit, noise: Noise, confounded: Sequence[tuple[str, str]], not_testable: Sequence[str]
 ) -> list[tuple[str, str, float, float]]:
-    """Return which item of the menu would help most with what the data leave open, and by how much.
+    """Return which candidate experiment would help most with what the data leave open, and by how much.
 
     Arguments:
         data: of the loop; few of its frames are looked at.
         fit: the model.
         noise: of the data.
-        confounded: pairs of effects that the data cannot tell apart.
+        confounded: pairs of effects that the data cannot distinguish.
         not_testable: effects that they cannot show.
 
     Returns:

@@ -165,7 +165,7 @@ def make_block(
         return Block(recording, gram, None, placements, states, int(rows.sum()))
     placed = _with_rest(trial, robot)
     jet = _jet(placed, robot)
-    moved = [f for f in forms if f.effect.moves_rest]  # the others leave the measured seats where they are
+    moved = [f for f in forms if f.effect.moves_rest]  # the others leave the measured placements where they are
     fresh, rest_columns = _columns(placed, robot, jet, moved, turns, width=columns.shape[2])
     for f in moved:
         columns[:, :, f.columns] = fresh[:, :, f.columns]
@@ -216,7 +216,7 @@ def _seen(trial: Trial, robot: Robot, jet: SceneJet) -> BoolArray:
 def _columns(
     trial: Trial, robot: Robot, jet: SceneJet, forms: Sequence[Form], turns: FloatArray | None, *, width: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the columns of forms at their places [m], of markers (k, c, e) and of measured seats (r, 3, e); zero where a form cannot
+    """Return the columns of forms at their places [m], of markers (k, c, e) and of measured placements (r, 3, e); zero where a form cannot
     act or finds no equilibrium."""
     result, rest = np.zeros((*jet.residual.shape, width)), np.zeros((len(jet.rest), 3, width))
     if not forms:
@@ -241,7 +241,7 @@ def _gram(own: FloatArray, shared: FloatArray, noise: float) -> Gram:
 
 
 def _placements(jet: SceneJet, shared: FloatArray, noise: float) -> Gram:
-    """Return what measured seats say; they are trusted as markers are, but not better than 0.1 mm."""
+    """Return what measured placements say; they are trusted as markers are, but not better than 0.1 mm."""
     r = len(jet.rest)
     own = np.concatenate(
         [jet.rest_by_pose.reshape(r, 3, jet.by_pose.shape[2]), np.zeros((r, 3, jet.by_initial.shape[2]))], axis=2

@@ -4,9 +4,9 @@ Each part of an experiment (a block of frames) gives the Gram matrices of its co
 (pose, initial inputs), and of what all recordings share (calibration and effects). Blocks add up, so that any experiment made of
 them is judged by linear algebra alone. With G the sum and N the columns of calibration,
 
-    S = G_ee − G_eN G_NN⁻¹ G_Ne      (what calibration cannot imitate, Frisch–Waugh–Lovell)
+    S = G_ee − G_eN G_NN⁻¹ G_Ne      (what calibration cannot absorb, Frisch–Waugh–Lovell)
 
-holds everything: an effect a of plausible size D_a raises χ² by tr(D_a S_aa D_a), of which a rival b takes back tr(D_a S_ab S_bb⁻¹ S_ba D_a).
+holds everything: an effect a of plausible size D_a raises χ² by tr(D_a S_aa D_a), of which an alternative b takes back tr(D_a S_ab S_bb⁻¹ S_ba D_a).
 Effects of several parameters count with independent ones of plausible size. This is what `screen` computes from data.
 """
 
@@ -25,9 +25,9 @@ from femsense.loop.search.screening import TESTABLE, penalty
 EVIDENCE = 10.0
 """dBIC from which an effect is seen, or told from another."""
 ALIKE = 0.95
-"""Effects that imitate each other by more than this share cannot be told apart."""
+"""Effects that are collinear by more than this share cannot be distinguished."""
 ABSORBED = 1e-9
-"""Share of its χ² below which a direction counts as imitated whole."""
+"""Share of its χ² below which a direction counts as absorbed whole."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -59,7 +59,7 @@ class Identifiability:
 
     rows: tuple[Row, ...]
     confounding: FloatArray
-    """How much of effect i (row) effect j can imitate, calibration refitted, shape (r, r)."""
+    """How much of effect i (row) is collinear with effect j, calibration refitted, shape (r, r)."""
     gap: FloatArray
     """Expected dBIC of i over j where i is the truth at plausible size, shape (r, r); inf between forms of one effect."""
 
@@ -73,12 +73,12 @@ class Identifiability:
         ]
 
     def confused(self) -> list[tuple[int, int, float, float]]:
-        """Return pairs of effects that would both be seen and cannot be told apart."""
+        """Return pairs of effects that would both be seen and cannot be distinguished."""
         seen = [r.seen for r in self.rows]
         return [p for p in self.pairs() if seen[p[0]] and seen[p[1]] and (p[2] > ALIKE or p[3] < EVIDENCE)]
 
     def distinguished(self) -> tuple[int, int]:
-        """Return the number of pairs of effects that would both be seen and told apart, and of all pairs."""
+        """Return the number of pairs of effects that would both be seen and distinguished, and of all pairs."""
         pairs = self.pairs()
         seen = sum(self.rows[i].seen and self.rows[j].seen for i, j, *_ in pairs)
         return seen - len(self.confused()), len(pairs)
@@ -134,7 +134,7 @@ class Judge:
             for j, b in enumerate(rows):
                 if a.name != b.name:
                     left = free[self._dropped(a.label) | self._dropped(b.label)]
-                    confounding[i, j], gap[i, j] = left.rival(self.forms.index(a.form), self._by_label[b.label])
+                    confounding[i, j], gap[i, j] = left.alternative(self.forms.index(a.form), self._by_label[b.label])
         return Identifiability(tuple(rows), confounding, gap)
 
     def _dropped(self, label: str) -> frozenset[str]:
@@ -191,8 +191,8 @@ class _Left:
     def dbic(self, i: int) -> float:
         return float(self.gain[i]) - self._price(self.forms[i])
 
-    def rival(self, i: int, others: list[int]) -> tuple[float, float]:
-        """Return how much of a form the best of others imitates, and the expected dBIC over it."""
+    def alternative(self, i: int, others: list[int]) -> tuple[float, float]:
+        """Return how much of a form is collinear with the best of others, and the expected dBIC over it."""
         a, gain = self.forms[i], float(self.gain[i])
         if gain <= 1e-12:
             return 0.0, 0.0
@@ -214,7 +214,7 @@ def _inverse(matrix: FloatArray) -> FloatArray:
 
 
 def _root(matrix: FloatArray, scale: FloatArray) -> FloatArray:
-    """Return R with R Rᵀ the pseudo-inverse of a block; directions that calibration imitates whole are left out."""
+    """Return R with R Rᵀ the pseudo-inverse of a block; directions that calibration absorbs whole are left out."""
     values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
     good = values > ABSORBED
     return np.asarray(vectors / scale[:, None] * np.where(good, 1.0 / np.sqrt(np.where(good, values, 1.0)), 0.0))

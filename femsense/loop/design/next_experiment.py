@@ -19,7 +19,7 @@ from femsense.model.recording import Recording
 def next_experiment(
     data: Data, final: FittedModel, noise: Noise, confounded: Sequence[ConfoundedPair], not_testable: Sequence[Untestable]
 ) -> str:
-    """Return in words what to record to tell apart what these data cannot: as predicted where that is cheap, else by rule."""
+    """Return in words what to record to distinguish what these data cannot: as predicted where that is cheap, else by rule."""
     pairs = [pair.pair for pair in confounded]
     predicted = next_element(data, final.fit, noise, pairs, [effect.name for effect in not_testable])
     if predicted:

@@ -1,6 +1,6 @@
 """The experiment advisor: which recording makes effects distinguishable, with the predicted confusion before and after.
 
-Columns of every item of the menu are computed once (`identifiability`); the search over experiments is linear algebra only. It starts from
+Columns of every candidate experiment are computed once (`identifiability`); the search over experiments is linear algebra only. It starts from
 the least that is worth recording, or from a recording that exists, and adds what lowers the confusion most, as long as anything
 does and the frames suffice.
 """
@@ -182,7 +182,7 @@ def _forms(robot: Robot, control: str, zero: str, ranges: FloatArray) -> list[Fo
     return kept
 
 
-# Blocks of the menu
+# Blocks of the candidates
 
 
 def _blocks(

@@ -38,8 +38,8 @@ def parameter_std(data: Data, fitted: FittedModel, noise: Noise, seed_std: dict[
     """Return the standard deviations of the coordinates of each effect.
 
     Arguments:
-        data, stage, noise: of the final fit.
-        seed_spread: effect → scatter of its coordinates over seeds that explain as much.
+        data, fitted, noise: of the final fit.
+        seed_std: effect → scatter of its coordinates over seeds that explain as much.
     """
     own = fitted.fit.own
     std = np.maximum.reduce(

@@ -125,7 +125,7 @@ class JointProblem:
         return np.concatenate([*low, [p.low for p in parameters]]), np.concatenate([*high, [p.high for p in parameters]])
 
     def evaluate(self, theta: FloatArray, derivative: bool) -> tuple[FloatArray, FloatArray | None]:
-        """Return whitened residual (N,) and Jacobian (N, p): markers, seats, declared poses, priors.
+        """Return whitened residual (N,) and Jacobian (N, p): markers, placements, declared poses, priors.
 
         What is asked without a derivative, once one is known, is a step that is tried: its states are solved roughly and kept only if
         the fit goes there.
@@ -332,14 +332,14 @@ def fit_jointly(
         hypothesis, prior: what is fitted, and what is known of it beforehand.
         trials: the recordings.
         noise: weights of the residuals.
-        seat_std: of seats measured by rest.csv against their declared places [m].
+        placement_std: of placements measured by rest.csv against their declared places [m].
         coordinates: start of the hypothesis, shape (p,).
         own: start of the recordings' own parameters; by default where the trials start.
         max_iterations: Gauss–Newton steps.
         known: residuals and derivatives at the start, one jet a trial, where they are known.
         near: derivatives from near the start, to begin with.
         worth: χ² above which the fit is not worth derivatives of its own at the end.
-        spare: the fit ends where a step promises to lower χ² by less than this.
+        spare: the fit ends where the predicted decrease of χ² of a step is less than this.
 
     Raises:
         DataError: no equilibrium at the start.

@@ -28,7 +28,7 @@ ALIKE = 0.01
 
 
 Part = tuple[slice, IntArray, Nonsmoothness]
-"""Rows of a trial, which parameters its slopes are by, and its kinks."""
+"""Rows of a trial, which parameters its slopes are by, and its nonsmoothness."""
 
 
 def trial_nonsmoothness(
@@ -59,7 +59,7 @@ def trial_nonsmoothness(
 
 
 def joined(parts: Sequence[Part], rows: int, width: int) -> Nonsmoothness:
-    """Return the kinks of several trials together, for so many rows and parameters."""
+    """Return the nonsmoothness of several trials together, for so many rows and parameters."""
     columns, slopes = list[FloatArray](), list[FloatArray]()
     for own, by, part in parts:
         columns.append(np.zeros((rows, len(part.value))))

@@ -31,7 +31,7 @@ PREDICTS = 0.25
 
 
 ABOVE_MESH = 0.5
-"""An effect must move the markers by this much of what the mesh itself costs (beyond what calibration absorbs) …"""
+"""An effect must move the markers by this much of the discretisation error (beyond what calibration absorbs) …"""
 
 
 ABOVE_MESH_IF_SURE = 0.25
@@ -39,7 +39,7 @@ ABOVE_MESH_IF_SURE = 0.25
 
 
 NOT_PLAINLY_WORSE = 1.25
-"""No effect may leave so many times the plain error where fitted: it would live on a larger share of what the mesh costs."""
+"""No effect may leave so many times the plain error where fitted: it would live on a larger share of the discretisation error."""
 
 
 SURE = 2.5
@@ -148,7 +148,7 @@ def moved_by(before: FittedModel, after: FittedModel) -> float:
 
 
 def discretisation_rms(data: Data, fitted: FittedModel, *, whole: bool = False) -> float:
-    """Return what the mesh costs beyond what calibration absorbs [m], root mean square as `rms_of` has it; 0 where it is not known.
+    """Return the discretisation error beyond what calibration absorbs [m], root mean square as `rms_of` has it; 0 where it is not known.
 
     Not whole: beyond the share of it that all sweeps have in common, too, where there are several: what it may turn by and what sweeps add.
     """
@@ -172,7 +172,7 @@ def _objection(made: FittedModel, candidate: Candidate, score: float) -> str | N
     q = len(candidate.parameters)
     std = made.fit.std[len(made.fit.std) - q :]
     if score <= EVIDENCE and made.fit.fit.status == STOPPED_EARLY:
-        return "stopped early: a step promised too little"
+        return "stopped early: the predicted gain of a step was too small"
     if score <= EVIDENCE:
         return f"too little evidence (dBIC {score:.1f})"
     if not np.isfinite(std).all():

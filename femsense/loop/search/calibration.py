@@ -11,7 +11,7 @@ import numpy as np
 from femsense.core.errors import DataError, FemsenseError
 from femsense.loop.data.dataset import MESH, Data
 from femsense.loop.data.outliers import without_outliers
-from femsense.loop.fit.discretisation_error import few_states, with_mesh_errors
+from femsense.loop.fit.discretisation_error import representative_frames, with_mesh_errors
 from femsense.loop.fit.fitted_model import FittedModel, fit_model, own_of, rematched, roughly_keeping, with_nuisance
 from femsense.loop.fit.joint_fit import Prior
 from femsense.loop.fit.marker_placement import with_turning_placements
@@ -34,7 +34,7 @@ Ready = tuple[Data, FittedModel, History]
 
 
 def calibrated(data: Data, say: Progress) -> Ready:
-    """Return the data without strays, the declared model calibrated, and the model with all that calibration may move; before that the same on the
+    """Return the data without outliers, the declared model calibrated, and the model with all that calibration may move; before that the same on the
     declared mesh, where it is another one."""
     placed = calibrated_pose(data, data.robot, START)
     while (fewer := without_outliers(data, [jet.residual for jet in placed.fit.jets], placed.held_residuals)) is not data:
@@ -71,10 +71,10 @@ def calibrated_on(data: Data, robot: Robot, placed: FittedModel) -> FittedModel:
 
 
 def with_discretisation_error(data: Data, base: FittedModel, names: Sequence[str], say: Progress) -> Data:
-    """Return the data with what the mesh costs, and seats that turn with the body."""
-    say("asking what the mesh costs")
+    """Return the data with the discretisation error, and placements that turn with the body."""
+    say("estimating the discretisation error")
     try:  # zeros may have gone far, for an effect's sake
-        frames = [few_states(t, len(base.fit.hypothesis.robot.body.mesh.tets)) for t in data.train]
+        frames = [representative_frames(t, len(base.fit.hypothesis.robot.body.mesh.tets)) for t in data.train]
         plain = roughly_keeping(data, base, OF_BODY, START, frames)
     except FemsenseError:
         plain = base
@@ -91,7 +91,7 @@ def as_far_as_held_out_states_converge(fit: Callable[[int], FittedModel], steps:
 
 
 def matched(data: Data, fitted: FittedModel, noise: Noise, *, anew: bool = False) -> tuple[Data, FittedModel]:
-    """Return the data with the rows of clouds as a stage has them, and the stage fitted to these, time and again until neither changes much: what is
+    """Return the data with the rows of clouds as a fitted model has them, and the fitted model fitted to these, time and again until neither changes much: what is
     rounded off where the model was draws it back there. With `anew` it is asked again which rows there are."""
     for _ in range(MATCHINGS):
         data = rematched(data, fitted, noise, anew=anew)
@@ -110,7 +110,7 @@ def fitted_again(
     near: list[SceneJet] | None = None,
     spare: float = 0.0,
 ) -> FittedModel:
-    """Return a stage fitted to other weights or rows, from where it is: with derivatives that are known there, or that are near."""
+    """Return a fitted model fitted to other weights or rows, from where it is: with derivatives that are known there, or that are near."""
     fit, own = fitted.fit, own_of(fitted)
 
     def refitted(steps: int) -> FittedModel:

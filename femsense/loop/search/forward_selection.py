@@ -29,15 +29,15 @@ from femsense.loop.search.subsampling import RepresentativeCases, representative
 REFITS = 6
 """Candidates that are refitted in full nonlinearity at the first step; half as many later."""
 REFITTABLE = 0.04
-"""A candidate of which calibration leaves less than this is not refitted, unless it promises more than any other."""
+"""A candidate of which calibration leaves less than this is not refitted, unless its predicted gain is larger than any other's."""
 ALIKE = 0.95
-"""Candidates that promise this share of what the best does are refitted in the order of their cost: to the first refit all others are held up."""
+"""Candidates whose predicted gain is this share of the best's are refitted in the order of their cost: to the first refit all others are held up."""
 ALTERNATIVES = 0.5
-"""Those that promise this share are all fitted to some of the states first, where these spare time, and to all in the order of what they explain there."""
+"""Those with this share are all fitted to some of the states first, where these spare time, and to all in the order of what they explain there."""
 PREDICTED_MUCH = 8.0
 """Linear dBIC that a candidate needs to be refitted: what is small is nearly linear, so that a refit finds about as much."""
 HINTED = 0.5
-"""A richer form is tried where fields of the model without the effect promise this share of what it needs."""
+"""A richer form is tried where its predicted gain, by fields of the model without the effect, is this share of what it needs."""
 WITHIN_REACH = 0.4
 """What has this share of the best's dBIC at its seed may be ahead of it where its place is."""
 
@@ -145,7 +145,7 @@ def _with_climbs(data: Data, fitted: FittedModel, refitted: Refit, noise: Noise)
 
 
 def _in_sight(refitted: Refit) -> float:
-    """Return the dBIC of a refit where its place promises the most."""
+    """Return the dBIC of a refit at the place of the largest predicted gain."""
     more = 0.0 if refitted.climbs is None else refitted.climbs.more - 1.0
     return refitted.score + more * (refitted.score + refitted.candidate.cost)
 
@@ -209,8 +209,8 @@ def _bar(ahead: Refit, candidate: Candidate) -> float:
 
 
 def _to_the_end(data: Data, fitted: FittedModel, refitted: Refit, noise: Noise) -> Refit:
-    """Return a refit that ran out of steps on its way down with more of them: rivals are compared where each of them ends, or were when a held-out
-    state does not come to rest there."""
+    """Return a refit that ran out of steps on its way down with more of them: alternatives are compared where each of them ends, or were when a held-out
+    state does not converge there."""
     fit = refitted.fitted.fit
     if fit.fit.status != "iterations":
         return refitted
@@ -316,8 +316,8 @@ def _richer(data: Data, fitted: FittedModel, winner: Refit, form: Candidate, noi
 
 
 def shortlist(table: list[Candidate], *, first: bool) -> list[Candidate]:
-    """Return the best candidate of each name, in its simplest form (or forms, if several are equally simple), the best first; of those that promise
-    as much, the simplest."""
+    """Return the best candidate of each name, in its simplest form (or forms, if several are equally simple), the best first; of those with
+    as large a predicted gain, the simplest."""
     most = max((c.score for c in table if c.retained >= REFITTABLE), default=np.inf)
     table = [c for c in table if c.retained >= REFITTABLE or c.score > most]
     names = list(dict.fromkeys(c.effect.name for c in table if c.score > PREDICTED_MUCH))

@@ -1,7 +1,7 @@
-"""Cable zeros that moved, and whether an effect says better what they took.
+"""Input offsets that moved, and whether an effect says better what they took.
 
-The zeros are fitted along with everything, so that an effect competes with them only for what they leave. A camera whose distances
-are off, a load or a weight can look much like a wrong zero: the zeros then swallow it, and would be named. So the model is fitted
+The offsets are fitted along with everything, so that an effect competes with them only for what they leave. A camera whose distances
+are off, a load or a weight can look much like a wrong offset: the offsets then swallow it, and would be named. So the model is fitted
 without them, and every effect is asked what it would explain in their place.
 """
 
@@ -35,12 +35,12 @@ from femsense.model.effects import OF_INPUTS
 from femsense.model.effects.base import range_units
 
 (OFFSETS,) = OF_INPUTS
-"""The zeros of the cables."""
+"""The input offsets."""
 SIGNIFICANT = 3.0
 RELEVANT = 0.02
 """A nuisance that moved by more than three standard deviations and 2 % is named as an effect."""
 ABOVE_MESH = 0.75
-"""Zeros must move the markers by this much of what the mesh itself costs, which they imitate best (less where sweeps are sure, as of any effect)."""
+"""Zeros must move the markers by this much of the discretisation error(less where sweeps are sure, as of any effect)."""
 BETTER = 2.0
 """dBIC by which an effect must be better than the zeros to take their place."""
 
@@ -95,7 +95,7 @@ def instead_of_offsets(
     without = offsets_are_evident(data, fitted, noise, n_effective)
     if without is None:
         return None
-    say("asking what else might be in the place of the cable zeros")
+    say("asking what else might be in the place of the input offsets")
     worth = evidence_for_offsets(data, fitted, without, n_effective)
     table = screen_model(data, without.fit, noise, fields_of(data, without, names), n_effective)
     passing: dict[int, Refit] = {}

@@ -29,7 +29,7 @@ from femsense.model.recording import state_key
 MAX_EFFECTS = 3
 """Effects that are added at most."""
 STATES = 5
-"""So many different states can tell effects apart though what is held out only repeats them."""
+"""So many different states can distinguish effects though what is held out only repeats them."""
 SPARED = 0.01
 """On large meshes a model is fitted until what is left to gain is less than this share of the predicted gain of an effect on top."""
 
@@ -121,7 +121,7 @@ def _take_step(course: SearchProgress, say: Progress) -> None:
 def _screened(
     data: Data, fitted: FittedModel, before: Fields | None, noise: Noise | None, names: Sequence[str]
 ) -> tuple[FittedModel, Noise, float, Fields, list[Candidate]]:
-    """Return a stage fitted with the noise that its residual tells, that noise, the effective number of observations, and the fields and scores
+    """Return a fitted model fitted with the noise that its residual tells, that noise, the effective number of observations, and the fields and scores
     of what may come next: by the fields of the model before, as long as these promise nothing."""
     fields = _fields(data, fitted, before, names)
     noise, n_effective = noise_of(data, fitted, fields, noise)
@@ -130,7 +130,7 @@ def _screened(
 
 
 def spared_gain(data: Data, fitted: FittedModel, fields: Fields, noise: Noise, n_effective: float) -> float:
-    """Return what a stage need not gain any more before effects are tried on top of it, since one of these promises so much more; nothing where all
+    """Return what a fitted model need not gain any more before effects are tried on top of it, since the predicted gain of one of these is so much larger; nothing where all
     states are little work."""
     if not spares(data, fitted.fit.hypothesis.robot_at(fitted.fit.coordinates)):
         return 0.0
@@ -139,7 +139,7 @@ def spared_gain(data: Data, fitted: FittedModel, fields: Fields, noise: Noise, n
 
 
 def _fields(data: Data, fitted: FittedModel, before: Fields | None, names: Sequence[str]) -> Fields:
-    """Return the fields of the model before where they tell what may come next, else those of the stage itself."""
+    """Return the fields of the model before where they tell what may come next, else those of the fitted model itself."""
     hints = None if before is None else before.beside(fitted.fit)
     return fields_of(data, fitted, names) if hints is None else hints
 
@@ -147,7 +147,7 @@ def _fields(data: Data, fitted: FittedModel, before: Fields | None, names: Seque
 def scored(
     data: Data, fitted: FittedModel, fields: Fields, noise: Noise, names: Sequence[str], n_effective: float
 ) -> tuple[Fields, list[Candidate]]:
-    """Return fields and the scores by them: those of the stage itself where others promise something."""
+    """Return fields and the scores by them: those of the fitted model itself where others predict a gain."""
     table = screen_model(data, fitted.fit, noise, fields, n_effective)
     if fields.model is fitted.fit.hypothesis or not shortlist(table, first=False):
         return fields, table
@@ -166,7 +166,7 @@ def beside_a_tie(
     say: Progress,
 ) -> tuple[FittedModel, Refit | None, list[RefitRecord]]:
     """Return the model with what was as good as the last effect in its place, and what comes next there, or None: the two together must be
-    better than the stage. What hides behind a wrong one of two that look alike shows beside the right one."""
+    better than the fitted model. What hides behind a wrong one of two that look alike shows beside the right one."""
     say(f"trying {tie.candidate.effect.name} in the place of the last one, and what goes with it")
     jets = tie.fitted.fit.jets
     same = "clouds" not in data.measured
@@ -187,7 +187,7 @@ def _renamed(refits: list[RefitRecord], step: int, name: str) -> list[RefitRecor
 
 
 def distinguishes_effects(data: Data) -> bool:
-    """Return whether these data can tell effects apart: a state that is not fitted is held out, or STATES different ones are fitted."""
+    """Return whether these data can distinguish effects: a state that is not fitted is held out, or STATES different ones are fitted."""
     fitted = {state_key(t.scene.recording, int(k)) for t in data.train for k in t.scene.frames}
     fresh = any(state_key(t.scene.recording, int(k)) not in fitted for t in data.held for k in t.scene.frames)
     return fresh or len(fitted) >= STATES

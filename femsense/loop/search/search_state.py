@@ -54,7 +54,7 @@ class SearchProgress:
         return len(self.history) - self.given
 
     def take_back(self, error: FemsenseError) -> None:
-        """End without the last effect, whose states do not come to rest when they are asked for again."""
+        """End without the last effect, whose states do not converge when they are solved again."""
         step, back = len(self.history) - 1, no_equilibrium(error)
         self.refits = [replace(r, verdict=back) if r.step == step and r.is_named else r for r in self.refits]
         self.data, self.history, self.over = self.earlier, self.history[:-1], True
@@ -68,7 +68,7 @@ class Search:
     before: FittedModel
     """The declared model, calibrated."""
     history: list[tuple[str, FittedModel]]
-    """("", the model with what calibration may move on the declared mesh), then each effect with the stage that added it."""
+    """("", the model with what calibration may move on the declared mesh), then each effect with the model that added it."""
     base: FittedModel
     """The model of the first screening: with what calibration may move, on quadratic elements if effects were sought with these."""
     final: FittedModel
@@ -80,7 +80,7 @@ class Search:
     """The last one."""
     refits: list[RefitRecord]
     in_place: OffsetAlternative | None
-    """What might be in the place of the cable zeros."""
+    """What might be in the place of the input offsets."""
 
 
 Progress = Callable[[str], None]

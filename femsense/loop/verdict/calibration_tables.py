@@ -19,7 +19,7 @@ Vector = tuple[float, ...]
 
 
 def calibration_shift(data: Data, models: Mapping[str, FittedModel]) -> CalibrationShift:
-    """Return poses, initial inputs, modulus and zeros of each model; poses as they moved from the first of them."""
+    """Return poses, initial inputs, modulus and input offsets of each model; poses as they moved from the first of them."""
     poses, inputs, at = list[PoseShift](), list[InputShift](), 0
     for i, trial in enumerate(data.train[j] for j in heads_of(data.train)):
         poses += [_pose_shift(models, i, v, at + 6 * v) for v in range(len(trial.poses))]

@@ -15,7 +15,7 @@ from femsense.loop.search.screening import TESTABLE, Candidate, one_each
 
 DRAWS = 200
 """Bootstrap draws of sweeps."""
-FEW_SWEEPS = 3
+LEAST_SWEEPS = 3
 """With fewer there is no such bootstrap."""
 MAP = 14
 """Effects in the map of confounding."""
@@ -52,10 +52,10 @@ def _ends(a: float, b: float) -> tuple[float, float]:
 def _first_share(data: Data, fit: JointFit, ones: list[Candidate], rng: np.random.Generator) -> list[float] | None:
     """Return how often each effect has the best linear score when whole sweeps are drawn with replacement; None for few sweeps.
 
-    Nuisance is projected out anew in each draw. Rows that belong to no sweep (seats, declared poses, priors) stay.
+    Nuisance is projected out anew in each draw. Rows that belong to no sweep (placements, declared poses, priors) stay.
     """
     groups = sweep_rows(data.train, fit)
-    if len(groups) < FEW_SWEEPS or not ones:
+    if len(groups) < LEAST_SWEEPS or not ones:
         return None
     J = np.asarray(fit.fit.jacobian)
     whole = np.hstack([J, *(c.columns for c in ones), fit.fit.residual[:, None]])

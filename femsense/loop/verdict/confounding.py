@@ -1,4 +1,4 @@
-"""What these data cannot tell apart: refits with as much evidence, fields that agree, and effects that a named nuisance imitates."""
+"""What these data cannot distinguish: refits with as much evidence, fields that agree, and effects that are collinear with a named nuisance."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from femsense.loop.search.screening import TESTABLE, confounding, one_each
 from femsense.loop.search.search_state import Search
 
 MOSTLY = 0.9
-"""Share of an effect's field, beyond poses, that a named nuisance imitates on its own where the two are said together."""
+"""Share of an effect's field, beyond poses, that is collinear with a named nuisance alone where the two are said together."""
 ALIKE = 0.95
 """Fields that agree so well are said to be alike …"""
 REFUTED = 0.5
-"""… unless a refit in the place of the named one brought less than this share of its evidence (what bends may tell them apart) …"""
+"""… unless a refit in the place of the named one brought less than this share of its evidence (what bends may distinguish them) …"""
 NEXT_TO_NOTHING = 0.05
 """… or one explains less than this share of what the other does, to first order (it would need a sign that it cannot have)."""
 MOST_NUMBERS = 6
-"""An effect with more parameters imitates much, which says little."""
+"""An effect with more parameters is collinear with much, which says little."""
 
 
 def confounded(search: Search, names: Sequence[str]) -> list[ConfoundedPair]:

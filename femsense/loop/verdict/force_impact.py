@@ -83,7 +83,7 @@ class View:
 
 
 def views_of(data: Data, fitted: FittedModel) -> list[View]:
-    """Return one trial of each recording as a stage has it: the fitted ones, then those that are held out. Markers come before clouds."""
+    """Return one trial of each recording as a fitted model has it: the fitted ones, then those that are held out. Markers come before clouds."""
     robot = fitted.fit.hypothesis.robot_at(fitted.fit.coordinates)
     poses, numbers = poses_and_inputs(data, fitted.fit), numbers_of(data.train)
     known = [View(robot, data.train[i], fitted.fit.jets[i], list(poses[i][0]), numbers[i], False) for i in heads_of(data.train)]

@@ -44,7 +44,7 @@ def lack_of_fit(trials: list[Trial], residuals: list[FloatArray], parameters: in
 
 
 def _stays(trial: Trial) -> dict[int, tuple[int, tuple[bytes, bytes]]]:
-    """Return for each frame the number of its stay, and what tells states apart: the state and the one before it."""
+    """Return for each frame the number of its stay, and what distinguishes states: the state and the one before it."""
     recording = trial.scene.recording
     keys = [state_key(recording, k) for k in range(len(recording.time_s))]
     result, stay, past = {}, 0, b""

@@ -116,7 +116,7 @@ def holds_out(data: Data, search: Search, back: FittedModel) -> bool:
 
 
 def held_beyond_mesh(data: Data, search: Search, back: FittedModel) -> tuple[float, float]:
-    """Return the held-out errors before and after [m] less the likeliest share of what the mesh itself costs."""
+    """Return the held-out errors before and after [m] less the likeliest share of the discretisation error."""
     before, after = (beyond_mesh(data.held, s.held_residuals, search.noise) for s in (search.before, back))
     return before, after
 

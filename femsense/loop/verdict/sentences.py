@@ -38,17 +38,17 @@ def verdict_in_words(
     noise: Noise,
     mesh: float | None,
 ) -> str:
-    """Return the sentence on top; `mesh` is what the mesh itself costs [m], where that is known."""
+    """Return the sentence on top; `mesh` is the discretisation error [m], where that is known."""
     error = f"held-out error {1e3 * before.held_rms:.2f} mm"
     if not noise.std:
         error += " along the normals of the surface"
     if verdict == NONE and before.held_rms > BEYOND_NOISE * np.hypot(noise.total, mesh or 0.0):
-        costs = f", and its mesh costs {1e3 * mesh:.2f} mm" if mesh else ""
+        costs = f"; the discretisation error is {1e3 * mesh:.2f} mm" if mesh else ""
         return f"Nothing that was tried explains more of the data: {error}; their noise is {1e3 * noise.total:.2f} mm{costs}."
     if verdict == NONE:
         known = f"to their noise ({1e3 * noise.total:.2f} mm)"
         if mesh and before.held_rms > BEYOND_NOISE * noise.total:
-            known += f" and to what its mesh costs ({1e3 * mesh:.2f} mm; a finer one would show more)"
+            known += f" and to its discretisation error ({1e3 * mesh:.2f} mm; a finer mesh would show more)"
         return f"The model explains the data {known}: {error}."
     if verdict == UNEXPLAINED and not effects:
         explains = "nothing that may be handed back" if found else "no effect of the list"
@@ -65,7 +65,7 @@ def by_mesh(data: Data, search: Search, back: FittedModel) -> str:
     if back.held_rms <= NOT_WORSE * search.before.held_rms or not mesh_errors(data):
         return ""
     before, after = held_beyond_mesh(data, search, back)
-    return f" Less the likeliest share of what the mesh itself costs, that is {1e3 * before:.2f} mm before, {1e3 * after:.2f} mm after."
+    return f" Less the likeliest share of the discretisation error, that is {1e3 * before:.2f} mm before, {1e3 * after:.2f} mm after."
 
 
 def on_linear(data: Data, back: FittedModel) -> str:
@@ -73,7 +73,7 @@ def on_linear(data: Data, back: FittedModel) -> str:
     mesh = mesh_error_rms(data)
     if not mesh or back.fit.hypothesis.robot.body.mesh.is_quadratic or not has_effects(back.fit.hypothesis.names):
         return ""
-    return f" Linear elements cost {1e3 * mesh:.2f} mm themselves, which other effects may stand for: try {MESH.name} too."
+    return f" Linear elements have a discretisation error of {1e3 * mesh:.2f} mm, which other effects may stand for: try {MESH.name} too."
 
 
 def evidence_for(data: Data, found: list[str]) -> str:
@@ -81,7 +81,7 @@ def evidence_for(data: Data, found: list[str]) -> str:
     if not found:
         return ""
     mesh = mesh_error_rms(data)
-    finer = f"; the mesh itself costs {1e3 * mesh:.2f} mm, and a finer one may tell" if mesh else ""
+    finer = f"; the discretisation error is {1e3 * mesh:.2f} mm, and a finer mesh may tell" if mesh else ""
     return (
         f" There is evidence for {', '.join(found)}, but the held-out error would grow with it or a value be implausible{finer}."
     )

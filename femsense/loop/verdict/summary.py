@@ -12,7 +12,7 @@ from femsense.core.arrays import FloatArray
 from femsense.core.errors import FemsenseError
 from femsense.loop.data.dataset import NUISANCE, Data
 from femsense.loop.data.trial import Trial, heads_of, normal_rms_of, rms_of, vectors_of
-from femsense.loop.fit.discretisation_error import few_states
+from femsense.loop.fit.discretisation_error import representative_frames
 from femsense.loop.fit.fitted_model import FittedModel, held_out, roughly_keeping
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.result.records import (
@@ -58,11 +58,11 @@ def chain_of_effects(
 
 
 def _rough_error(data: Data, fitted: FittedModel, names: list[str], noise: Noise) -> float:
-    """Return the held-out error [m] of a stage with some of its terms only, fitted to some states; its own where they have no equilibrium."""
+    """Return the held-out error [m] of a fitted model with some of its terms only, fitted to some states; its own where they have no equilibrium."""
     if set(fitted.fit.hypothesis.names) <= set(names):
         return fitted.held_rms
     try:
-        frames = [few_states(t, len(fitted.fit.hypothesis.robot.body.mesh.tets)) for t in data.train]
+        frames = [representative_frames(t, len(fitted.fit.hypothesis.robot.body.mesh.tets)) for t in data.train]
         rough = roughly_keeping(data, fitted, names, noise, frames)
         return rms_of([h.jet.residual for h in held_out(data, rough.fit, noise)])
     except FemsenseError:
@@ -183,7 +183,7 @@ def _verdict_of(joint: Sequence[RefitRecord]) -> str:
 def _why_not(c: Candidate, end: Candidate | None) -> str:
     if c.retained < TESTABLE:
         share = 100.0 * np.sqrt(max(0.0, 1.0 - c.retained**2))
-        return f"not testable: calibration imitates {'more than 99' if share > 99.0 else f'{share:.0f}'} % of it"
+        return f"not testable: {'more than 99' if share > 99.0 else f'{share:.0f}'} % of it is absorbed by calibration"
     if c.score > EVIDENCE and end is not None and end.score <= EVIDENCE:
         return f"nothing is left for it once what is named is in the model (dBIC {c.score:.0f}, then {end.score:.1f})"
     if c.score > EVIDENCE:

@@ -52,7 +52,7 @@ def test_the_loop_leaves_strays_out_whether_they_are_fitted_or_held_out(k: int):
     plain, _ = record(inputs, effects=[{"name": "stiffness", "scale": 1.25}], labels=labels, truth=arm((8, 3, 3)))
     row = int(np.flatnonzero(plain.marker_frame == (k % len(inputs)))[3])
     loop = improve(arm(), [plain])
-    with pytest.warns(UserWarning, match=f"stray markers are left out: m3 in frame {k % len(inputs)}"):
+    with pytest.warns(UserWarning, match=f"outliers are left out: m3 in frame {k % len(inputs)}"):
         spoiled = improve(arm(), [_moved(plain, row)])
     assert [(o.frame, o.marker) for o in spoiled.data.outliers] == [(k % len(inputs), "m3")] and not loop.data.outliers
     assert [e.name for e in spoiled.effects] == [e.name for e in loop.effects] == ["stiffness"]

@@ -232,7 +232,7 @@ def test_where_the_data_are_explained_by_what_the_mesh_costs_the_sentence_says_s
     fitted = replace(fitted, held_rms=1e-3 * error)
     noise = Noise({"white": 0.5e-3 / np.sqrt(3.0)}, "")
     sentence = verdict.verdict_in_words("none", [], [], fitted, fitted, noise, None if mesh is None else 1e-3 * mesh)
-    assert ("its mesh costs (1.00 mm" in sentence) == expected and "noise (0.50 mm)" in sentence
+    assert ("its discretisation error (1.00 mm" in sentence) == expected and "noise (0.50 mm)" in sentence
 
 
 def test_values_are_said_in_short_whatever_they_are() -> None:
@@ -246,7 +246,7 @@ def test_values_are_said_in_short_whatever_they_are() -> None:
     assert said == "center_m [0.0151, 0, -0.0264] m, share 0.246, markers [Base-1, Base-2], scale a 0.9, b [0, 0]"
 
 
-@pytest.mark.parametrize("mesh, costs", [(None, "0.50 mm."), (0.3e-3, "0.50 mm, and its mesh costs 0.30 mm.")])
+@pytest.mark.parametrize("mesh, costs", [(None, "0.50 mm."), (0.3e-3, "0.50 mm; the discretisation error is 0.30 mm.")])
 def test_what_neither_the_noise_nor_the_mesh_explains_is_not_said_to_be_explained(mesh: float | None, costs: str) -> None:
     fitted = replace(staged(arm((4, 2, 2)), 1.0)[1], held_rms=0.9e-3)
     sentence = verdict.verdict_in_words("none", [], [], fitted, fitted, Noise({"white": 0.5e-3 / np.sqrt(3.0)}, ""), mesh)
