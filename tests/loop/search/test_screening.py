@@ -370,3 +370,9 @@ def test_linear_elements_stay_where_the_data_do_not_miss_quadratic_ones() -> Non
     assert found.verdict == "none" and not found.effects
     row = next(c for c in found.candidates if c.name == "discretisation")
     assert row.refits[0].verdict.startswith("too little evidence")
+
+
+def test_the_numbers_of_a_seed_cost_as_much_as_parameters():
+    place = {"center_m": [0.0, 0.0, 0.0], "radius_m": 0.1}
+    assert penalty(1, place, 1, 10, 1000.0) == pytest.approx(5 * np.log(1000.0) + 2 * np.log(10))
+    assert penalty(0, {"law": "neo_hookean"}, 1, 10, 1000.0) == pytest.approx(2 * np.log(10))
