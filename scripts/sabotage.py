@@ -232,8 +232,8 @@ SABOTAGES = (
     ),
     S(
         "loop/fit/noise_components.py",
-        "starts = [near] if near is not None else",
-        "starts =",
+        "starts = [near, np.maximum(near, np.log(0.3 * scale))]",
+        "pass",
         "loop/test_improve.py::test_a_later_estimate_of_the_noise_begins_at_the_one_before",
     ),
     S(
@@ -1403,7 +1403,7 @@ SABOTAGES = (
         "loop/search/refit.py",
         "if directed and _has_drifted(fitted) and not explains(best):",
         "if False:",
-        "loop/search/test_swaps.py::test_where_calibration_has_strayed_gravity_starts_from_what_is_declared_too",
+        "loop/search/test_swaps.py::test_where_calibration_has_drifted_gravity_starts_from_what_is_declared_too",
     ),
     S(
         "loop/search/calibration.py",
@@ -1425,8 +1425,8 @@ SABOTAGES = (
     ),
     S(
         "loop/data/holdout.py",
-        "if not _fresh(recording, frames, np.isin(number, held)):",
-        "if False:",
+        "return _fresh(recording, frames, np.isin(number, sweeps))",
+        "return True",
         "loop/test_improve.py::test_a_sweep_that_is_a_repetition_is_not_held_out_where_another_can_be_spared",
     ),
     S(
