@@ -1341,7 +1341,7 @@ SABOTAGES = (
     ),
     S(
         "loop/verdict/returned_model.py",
-        "shown = not zeros and",
+        "shown = not only_offsets and",
         "shown =",
         "loop/verdict/test_returned_model.py::test_a_larger_error_is_not_for_zeros_of_cables_which_much_else_looks_like",
     ),

@@ -175,7 +175,7 @@ def _forms(robot: Robot, control: str, zero: str, ranges: FloatArray) -> list[Fo
     if zero == "absolute":
         return forms
     kept, at = [], 0
-    for f in forms:  # unknown zeros are fitted with the pose
+    for f in forms:  # unknown offsets are fitted with the pose
         if f.name not in OF_INPUTS:
             kept.append(replace(f, at=at))
             at += len(f.size)

@@ -1,4 +1,4 @@
-"""The joint fit of poses, initial inputs, modulus, cable zeros and effects over several recordings."""
+"""The joint fit of poses, initial inputs, modulus, input offsets and effects over several recordings."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 DECLARED_POSE_STD = np.array([2e-3] * 3 + [3e-4] * 3)
 """How far a declared pose is trusted [rad, m] where there are clouds alone …"""
 BESIDE_MARKERS = np.array([1e-2] * 3 + [1e-3] * 3)
-"""… and where there are markers, which tell the pose much better: with the same trust a pose that is 1 mm and ½° off would bend zeros of cables."""
+"""… and where there are markers, which tell the pose much better: with the same trust a pose that is 1 mm and ½° off would bend input offsets."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

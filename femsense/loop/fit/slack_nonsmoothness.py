@@ -1,6 +1,6 @@
-"""Where residuals bend because a cable cannot push: tensions that zero, gain and log let come out below 0.
+"""Where residuals bend because a cable cannot push: tensions that offset, gain and log let come out below 0.
 
-Where a log says 0 for every cable that is not used, all these frames bend at once as its zero goes through 0, and a fit that believes
+Where a log says 0 for every cable that is not used, all these frames bend at once as its offset goes through 0, and a fit that believes
 in straight lines overshoots again and again. What makes them bend is known without solving anything: the tension that drives each frame.
 """
 

@@ -57,24 +57,24 @@ def acceptance_test(
     """Return a refit with its evidence and its verdict: PASSES, or what speaks against it."""
     gain = evidence(fitted.fit, made.fit)
     score = gain - candidate.cost - prior_cost(data.declared, candidate.effect, made.fit)
-    better, spread = sweeps_predicted(data.train, fitted.fit, made.fit)
+    better, std_error = sweeps_predicted(data.train, fitted.fit, made.fit)
     held = held_chi2(data, fitted, noise) - held_chi2(data, made, noise)
     acts = held_shift(
         data, fitted, made, noise
     )  # what `held` is on average for the true effect, with a variance of four times that
     wanted = min(PREDICTS * gain * held_share(data), acts - 5.0 * float(np.sqrt(acts)))
     moved, mesh = moved_by(fitted, made), discretisation_rms(data, fitted)
-    surely = better > SURE * spread
+    surely = better > SURE * std_error
     if surely:
         wanted = min(wanted, 0.0)
     fit_objection = _objection(made, candidate, score)
-    if fit_objection is None and np.isfinite(spread) and better <= ENOUGH_SPREAD * spread:
-        fit_objection = f"sweeps that are left out do not speak for it ({better:+.1f} ± {spread:.1f})"
+    if fit_objection is None and np.isfinite(std_error) and better <= ENOUGH_SPREAD * std_error:
+        fit_objection = f"sweeps that are left out do not speak for it ({better:+.1f} ± {std_error:.1f})"
     if fit_objection is None and held < wanted:
         fit_objection = f"it does not predict the held-out data (χ² {_moves(held)} there, and falls by {gain:.1f} where fitted)"
     if fit_objection is None and score + held <= EVIDENCE:  # what was not fitted speaks against it
         fit_objection = f"too little evidence (dBIC {score:.1f}) where held-out data speak against it (χ² {_moves(held)} there)"
-    least = ABOVE_MESH_IF_SURE if sure_beyond_mesh(better, spread, held, gain * held_share(data)) else ABOVE_MESH
+    least = ABOVE_MESH_IF_SURE if sure_beyond_mesh(better, std_error, held, gain * held_share(data)) else ABOVE_MESH
     if fit_objection is None and moved < least * mesh:
         fit_objection = f"it moves the markers by {1e3 * moved:.3f} mm, the mesh itself by {1e3 * mesh:.3f} mm"
     if fit_objection is None and plainly_worse(fitted, made):
@@ -86,7 +86,7 @@ def acceptance_test(
         dbic=score,
         validation_rms_m=made.held_rms,
         cv_gain=better,
-        cv_std=spread,
+        cv_std=std_error,
         held_dchi2=held,
         moved_m=moved,
         mesh_cost_m=mesh,
@@ -121,9 +121,9 @@ def prior_evidence(data: Data, effect: Effect) -> float:
     return EVIDENCE if effect.expected(data.declared) else 0.0
 
 
-def sure_beyond_mesh(better: float, spread: float, held: float, expected: float) -> bool:
-    """Return whether left-out sweeps (gain ± spread) and held-out data (gain, against what is expected of them) are sure together."""
-    return better > SURE * spread and held * better > 2.0 * SURE * spread * expected
+def sure_beyond_mesh(better: float, std_error: float, held: float, expected: float) -> bool:
+    """Return whether left-out sweeps (gain ± std_error) and held-out data (gain, against what is expected of them) are sure together."""
+    return better > SURE * std_error and held * better > 2.0 * SURE * std_error * expected
 
 
 def _taken_over(before: FittedModel, after: FittedModel) -> tuple[str, ...]:

@@ -62,7 +62,7 @@ def calibrated_pose(data: Data, robot: Robot, noise: Noise, start: FittedModel |
 
 def calibrated_on(data: Data, robot: Robot, placed: FittedModel) -> FittedModel:
     """Return a robot with all that calibration may move, fitted roughly. To begin with some of the states leads elsewhere: what the model lacks pulls
-    zeros and modulus further where fewer states hold them."""
+    offsets and modulus further where fewer states hold them."""
     hypothesis, prior = with_nuisance(data, robot)
     nothing = np.zeros(len(prior.mean))
     return as_far_as_held_out_states_converge(
@@ -73,7 +73,7 @@ def calibrated_on(data: Data, robot: Robot, placed: FittedModel) -> FittedModel:
 def with_discretisation_error(data: Data, base: FittedModel, names: Sequence[str], say: Progress) -> Data:
     """Return the data with the discretisation error, and placements that turn with the body."""
     say("estimating the discretisation error")
-    try:  # zeros may have gone far, for an effect's sake
+    try:  # offsets may have gone far, for an effect's sake
         frames = [representative_frames(t, len(base.fit.hypothesis.robot.body.mesh.tets)) for t in data.train]
         plain = roughly_keeping(data, base, OF_BODY, START, frames)
     except FemsenseError:

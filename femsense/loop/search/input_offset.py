@@ -40,9 +40,9 @@ SIGNIFICANT = 3.0
 RELEVANT = 0.02
 """A nuisance that moved by more than three standard deviations and 2 % is named as an effect."""
 ABOVE_MESH = 0.75
-"""Zeros must move the markers by this much of the discretisation error(less where sweeps are sure, as of any effect)."""
+"""Offsets must move the markers by this much of the discretisation error (less where sweeps are sure, as of any effect)."""
 BETTER = 2.0
-"""dBIC by which an effect must be better than the zeros to take their place."""
+"""dBIC by which an effect must be better than the offsets to take their place."""
 
 
 def moved_nuisance(data: Data, fitted: FittedModel, name: str, *, relevant: float = RELEVANT) -> int:
@@ -57,13 +57,13 @@ def moved_nuisance(data: Data, fitted: FittedModel, name: str, *, relevant: floa
 
 
 def evidence_for_offsets(data: Data, fitted: FittedModel, without: FittedModel, n_effective: float) -> float:
-    """Return the dBIC of the zeros that moved: the others, as good as declared, cost nothing."""
+    """Return the dBIC of the offsets that moved: the others, as good as declared, cost nothing."""
     moved, count = moved_nuisance(data, fitted, OFFSETS), len(data.robot.body.cables)
     return evidence(without.fit, fitted.fit) - moved * float(np.log(n_effective)) - 2.0 * float(np.log(max(count, 1)))
 
 
 def offsets_are_evident(data: Data, fitted: FittedModel, noise: Noise, n_effective: float) -> FittedModel | None:
-    """Return the model without the zeros if it misses them, else None."""
+    """Return the model without the offsets if it misses them, else None."""
     if not moved_nuisance(data, fitted, OFFSETS):
         return None
     try:
@@ -75,9 +75,9 @@ def offsets_are_evident(data: Data, fitted: FittedModel, noise: Noise, n_effecti
     moved, declared = (beyond_mesh(data.held, s.held_residuals, noise) for s in (fitted, without))
     if moved >= declared:
         return None
-    better, spread = sweeps_predicted(data.train, without.fit, fitted.fit)
+    better, std_error = sweeps_predicted(data.train, without.fit, fitted.fit)
     held = held_chi2(data, without, noise) - held_chi2(data, fitted, noise)
-    sure = sure_beyond_mesh(better, spread, held, held_share(data) * evidence(without.fit, fitted.fit))
+    sure = sure_beyond_mesh(better, std_error, held, held_share(data) * evidence(without.fit, fitted.fit))
     return (
         without
         if moved_by(without, fitted) > (ABOVE_MESH_IF_SURE if sure else ABOVE_MESH) * discretisation_rms(data, without)
@@ -88,9 +88,9 @@ def offsets_are_evident(data: Data, fitted: FittedModel, noise: Noise, n_effecti
 def instead_of_offsets(
     data: Data, fitted: FittedModel, names: Sequence[str], noise: Noise, n_effective: float, say: Progress
 ) -> OffsetAlternative | None:
-    """Ask which effect explains what the zeros of a model explain; None where they explain nothing.
+    """Ask which effect explains what the input offsets of a model explain; None where they explain nothing.
 
-    Play of held cables does what zeros below those declared do. Of the two it is named where no zero is above: zeros err both ways.
+    Play of held cables does what offsets below those declared do. Of the two it is named where no offset is above: offsets err both ways.
     """
     without = offsets_are_evident(data, fitted, noise, n_effective)
     if without is None:

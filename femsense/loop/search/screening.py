@@ -1,6 +1,6 @@
 """Screening: how much of the residual each effect explains beyond what calibration can absorb.
 
-With z the whitened nuisance columns (poses, initial inputs, modulus, zeros, and the effects that are in the model already) and P the
+With z the whitened nuisance columns (poses, initial inputs, modulus, input offsets, and the effects that are in the model already) and P the
 projector on their orthogonal complement, an effect's field s is judged by P s alone (Frisch–Waugh–Lovell): it is as if every nuisance were
 refitted with it. ρ = |P s| / |s| is the share that calibration leaves.
 """

@@ -122,7 +122,7 @@ def _screened(
     data: Data, fitted: FittedModel, before: Fields | None, noise: Noise | None, names: Sequence[str]
 ) -> tuple[FittedModel, Noise, float, Fields, list[Candidate]]:
     """Return a fitted model fitted with the noise that its residual tells, that noise, the effective number of observations, and the fields and scores
-    of what may come next: by the fields of the model before, as long as these promise nothing."""
+    of what may come next: by the fields of the model before, as long as these predict no gain."""
     fields = _fields(data, fitted, before, names)
     noise, n_effective = noise_of(data, fitted, fields, noise)
     fitted = fitted_again(data, fitted, noise, known=fitted.fit.jets, spare=spared_gain(data, fitted, fields, noise, n_effective))

@@ -122,9 +122,9 @@ class OffsetAlternative:
     """What became of the question."""
 
     fitted: FittedModel | None
-    """A model with an effect in the place of the zeros, where that is better."""
+    """A model with an effect in the place of the input offsets, where that is better."""
     name: str
     """The effect that is best in their place; empty: none passes."""
     ahead: float
-    """dBIC of that effect less that of the zeros."""
+    """dBIC of that effect less that of the input offsets."""
     records: list[RefitRecord]

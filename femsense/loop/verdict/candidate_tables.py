@@ -36,9 +36,9 @@ def _estimates(c: Candidate) -> list[Estimate]:
     if c.effect.discrete:
         return [Estimate(p.label, None, None, _ends(p.value(p.low), p.value(p.high)), p.unit) for p in c.parameters]
     scale = np.maximum(np.linalg.norm(c.columns, axis=0), 1e-300)
-    spread = np.sqrt(np.maximum(np.diag(np.linalg.pinv((c.columns / scale).T @ (c.columns / scale))), 0.0)) / scale
+    std_of_steps = np.sqrt(np.maximum(np.diag(np.linalg.pinv((c.columns / scale).T @ (c.columns / scale))), 0.0)) / scale
     rows = []
-    for p, step, std in zip(c.parameters, c.step, spread):
+    for p, step, std in zip(c.parameters, c.step, std_of_steps):
         at = p.null + float(step)
         ends = _ends(p.value(p.low), p.value(p.high))
         rows.append(Estimate(p.label, p.value(at), p.value_std(at, float(std)), ends, p.unit))

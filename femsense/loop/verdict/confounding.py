@@ -126,7 +126,7 @@ def _common(search: Search, own: str, other: str) -> Iterator[ConfoundedPair]:
 
 def _alike(search: Search, names: Sequence[str]) -> Iterator[ConfoundedPair]:
     """Yield the effects whose fields agree, once what calibration may move is projected out."""
-    for effect in (c.effect for c in one_each(search.first)):  # play is a negative zero of the displacement
+    for effect in (c.effect for c in one_each(search.first)):  # play is a negative offset of the displacement
         for alias in effect.aliases:
             if effect.mirrors(alias.name) and {alias.name, effect.name} & set(names):
                 yield ConfoundedPair((alias.name, effect.name), cosine=1.0)

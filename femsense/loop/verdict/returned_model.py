@@ -36,7 +36,7 @@ FAR_BETTER = 50.0
 
 
 def promoted_nuisances(data: Data, search: Search) -> list[str]:
-    """Return the nuisances that the data moved significantly away from what is declared; of the zeros, those that are missed."""
+    """Return the nuisances that the data moved significantly away from what is declared; of the input offsets, those that are missed."""
     names = [n for n in search.final.fit.hypothesis.names if n in NUISANCE and moved_nuisance(data, search.final, n)]
     return [n for n in names if n in OF_BODY or offsets_are_evident(data, search.final, search.noise, search.n_effective)]
 
@@ -78,7 +78,7 @@ def _may_be_handed_back(data: Data, search: Search, back: FittedModel) -> bool:
 
 
 def _with_modulus(data: Data, search: Search, names: list[str], *, sizes_still: bool) -> tuple[list[str], FittedModel | None]:
-    """Return names with the model of just these; with the modulus beside effects if it moved significantly there, by whatever share (zeros that are
+    """Return names with the model of just these; with the modulus beside effects if it moved significantly there, by whatever share (offsets that are
     not named may have moved in its place), and held-out data miss it."""
     back = _handed_back(data, search.final, names, search.noise, sizes_still=sizes_still)
     if back is None or MODULUS in names or not has_effects(names):
@@ -99,7 +99,7 @@ def has_effects(names: Iterable[str]) -> bool:
 def holds_out(data: Data, search: Search, back: FittedModel) -> bool:
     """Return whether a model is no worse on held-out data in millimetres; or else better by the noise that these data have, where it is calibrated
     only and within reason, or where the mesh's own error is all that is larger: then it must be no worse beyond that, nor in millimetres than
-    the model with all that calibration may move, and not be zeros of cables alone, unless it is far better by the noise and within reason."""
+    the model with all that calibration may move, and not be input offsets alone, unless it is far better by the noise and within reason."""
     worse = back.held_rms / search.before.held_rms
     if worse <= NOT_WORSE:
         return True
@@ -110,8 +110,8 @@ def holds_out(data: Data, search: Search, back: FittedModel) -> bool:
     if only_calibrated and worse <= NOISY:
         return True
     before, after = held_beyond_mesh(data, search, back)
-    zeros = only_calibrated and OFFSETS in back.fit.hypothesis.names  # much else looks like them
-    shown = not zeros and back.held_rms <= NOT_WORSE * search.base.held_rms
+    only_offsets = only_calibrated and OFFSETS in back.fit.hypothesis.names  # much else looks like them
+    shown = not only_offsets and back.held_rms <= NOT_WORSE * search.base.held_rms
     return after <= NOT_WORSE * before and (shown or (gain > FAR_BETTER and worse <= NOISY))
 
 

@@ -45,7 +45,7 @@ DRAWS = 2000
 
 
 def chain_of_effects(
-    data: Data, search: Search, promoted: list[str], names: list[str], back: FittedModel, spread: dict[str, FloatArray]
+    data: Data, search: Search, promoted: list[str], names: list[str], back: FittedModel, full_std: dict[str, FloatArray]
 ) -> list[NamedEffect]:
     """Return the effects in the order in which they were added, each with the held-out error before and after it."""
     models = dict(search.history)
@@ -54,7 +54,7 @@ def chain_of_effects(
         errors.append(_rough_error(data, models[""], promoted[: i + 1], search.noise))
     errors += [models[name].held_rms for name in names[len(promoted) : -1]] + [back.held_rms] * bool(names)
     steps = zip(names, [search.before.held_rms, *errors], errors)
-    return [NamedEffect(name, values_of(spread, back, name), before, after) for name, before, after in steps]
+    return [NamedEffect(name, values_of(full_std, back, name), before, after) for name, before, after in steps]
 
 
 def _rough_error(data: Data, fitted: FittedModel, names: list[str], noise: Noise) -> float:
@@ -69,7 +69,7 @@ def _rough_error(data: Data, fitted: FittedModel, names: list[str], noise: Noise
         return fitted.held_rms
 
 
-def values_of(spread: dict[str, FloatArray], back: FittedModel, name: str) -> dict[str, Value]:
+def values_of(full_std: dict[str, FloatArray], back: FittedModel, name: str) -> dict[str, Value]:
     """Return the values of one effect; vectors and tables keep their shape. What was not fitted has std None.
 
     Values are those that are handed back; standard deviations are not smaller than those of the full fit, in which nothing was held still.
@@ -78,7 +78,7 @@ def values_of(spread: dict[str, FloatArray], back: FittedModel, name: str) -> di
     for effect, seed in back.fit.hypothesis.settled:
         if effect.name == name:
             result |= {k: Value(v, None, _unit(k)) for k, v in seed.items()}
-    full = spread.get(name)
+    full = full_std.get(name)
     at = 0
     for effect, seed, parameters in back.fit.hypothesis.terms:
         values = back.fit.coordinates[at : at + len(parameters)]
@@ -208,7 +208,7 @@ def _smallest_seen(c: Candidate) -> Detectable:
 # Data
 
 
-def data_card(data: Data, final: FittedModel, spread: dict[str, FloatArray], noise: Noise, n_effective: float) -> DataCard:
+def data_card(data: Data, final: FittedModel, full_std: dict[str, FloatArray], noise: Noise, n_effective: float) -> DataCard:
     """Return what the data are, how they were split, and what calibration moves beside all effects."""
     moved = {effect.name for effect, _, _ in final.fit.hypothesis.terms}
     heads = [data.train[i] for i in heads_of(data.train)]
@@ -224,7 +224,7 @@ def data_card(data: Data, final: FittedModel, spread: dict[str, FloatArray], noi
         mesh_error_m=mesh_error_rms(data),
         outliers=tuple(Outlier(number, name) for number, name in data.outliers),
         effective_observations=n_effective,
-        nuisance_after={name: values_of(spread, final, name) for name in NUISANCE if name in moved},
+        nuisance_after={name: values_of(full_std, final, name) for name in NUISANCE if name in moved},
         placement_std_m=data.placement_std,
     )
 

@@ -43,14 +43,14 @@ LACKS = 2.0
 def conclude(data: Data, search: Search, rng: np.random.Generator) -> LoopResult:
     """Return the verdict with all that the report shows."""
     before, final, noise = search.before, search.final, search.noise
-    spread = parameter_std(data, final, noise, _seed_std(search))
-    promoted = [n for n in promoted_nuisances(data, search) if is_sure(final, n, spread[n])]
+    std = parameter_std(data, final, noise, _seed_std(search))
+    promoted = [n for n in promoted_nuisances(data, search) if is_sure(final, n, std[n])]
     names = [*promoted, *(n for n, _ in search.history[1:] if n in final.fit.hypothesis.names)]
     names, back = worth_handing_back(data, search, promoted, names)
     drifted = MODULUS in promoted and MODULUS not in names  # what a modulus beyond all bounds takes away is not explained
     promoted = [n for n in names if n in NUISANCE]
     entries = entries_of(back, names)
-    effects = chain_of_effects(data, search, promoted, names, back, spread)
+    effects = chain_of_effects(data, search, promoted, names, back, std)
     lacks = lacks_much(data, back, final, noise)
     shown = back if lacks else final  # what nuisances take away unnamed is left, too
     surprise = _surprise(data, back, noise)
@@ -90,7 +90,7 @@ def conclude(data: Data, search: Search, rng: np.random.Generator) -> LoopResult
         left=left,
         robot=robot,
         declared=data.declared,
-        data=data_card(data, final, spread, noise, search.n_effective),
+        data=data_card(data, final, std, noise, search.n_effective),
         residuals=residual_table(data, before, back),
         evidence=gather(data, before, search.base, final, back, shown, noise, search.first, search.last, tests, rng),
     )

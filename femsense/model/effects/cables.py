@@ -1,4 +1,4 @@
-"""Effects between the motor and the body: friction, zero, scale, stretch and play of the cables."""
+"""Effects between the motor and the body: friction, offset, scale, stretch and play of the cables."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from femsense.model.robot import Robot
 USUAL_FRICTION = 0.15
 """Coefficient of a hand-laid cable in a soft channel."""
 USUAL_OFFSET = 0.05
-"""Usual zero of a cable as a share of its range."""
+"""Usual offset of a cable as a share of its range."""
 OFFSET_STD = 0.1
-"""How well the zero of a cable is known beforehand, as a share of its range in the recording …"""
+"""How well the offset of a cable is known beforehand, as a share of its range in the recording …"""
 PLANNED_OFFSET_STD = 0.25
 """… and of its range in an experiment that is planned."""
 GAINS = float(np.log(0.3)), float(np.log(3.0))
