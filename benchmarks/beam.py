@@ -32,6 +32,7 @@ from femsense.loop.fit.joint_fit import Prior
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.improve import improve
 from femsense.loop.result import LoopResult
+from femsense.loop.result.tables import table_of
 from femsense.model.effects import FORMS, Effect, Entry, apply_effects
 from femsense.model.observation import Hypothesis, in_robot_frame
 from femsense.model.recording import Recording
@@ -315,17 +316,17 @@ def print_profile(beam: Beam) -> list[FloatArray]:
 def print_loop(title: str, result: LoopResult, seconds: float) -> None:
     """Print what the loop says."""
     print(f"\n{title}: {result.verdict}: {result.sentence} ({seconds:.0f} s of processor time)")
-    noise = ", ".join(f"{k} {1e3 * v:.3f}" for k, v in result.data["noise_components_m"].items())
+    noise = ", ".join(f"{k} {1e3 * v:.3f}" for k, v in result.data.noise_components_m.items())
     print(
-        f"  noise along each axis [mm]: {noise}; held out {1e3 * result.before['validation_rms_m']:.2f} -> {1e3 * result.after['validation_rms_m']:.2f} mm"
+        f"  noise along each axis [mm]: {noise}; held out {1e3 * result.before.validation_rms_m:.2f} -> {1e3 * result.after.validation_rms_m:.2f} mm"
     )
     for effect in result.effects:
-        before, after = (1e3 * effect[f"validation_rms_{w}_m"] for w in ("before", "after"))
-        print(f"  {effect['name']}: {parameter_words(effect['parameters'])}; held out {before:.2f} -> {after:.2f} mm")
+        before, after = (1e3 * rms for rms in (effect.validation_rms_before_m, effect.validation_rms_after_m))
+        print(f"  {effect.name}: {parameter_words(table_of(effect.parameters))}; held out {before:.2f} -> {after:.2f} mm")
     for row in result.candidates[:8]:
-        print(f"  tried {row['name']}: {row['verdict']}")
+        print(f"  tried {row.name}: {row.verdict}")
     print(
-        f"  left: {1e3 * result.left['rms_m']:.2f} mm, most at {result.left['where']['marker']}; structure p = {result.left['structure']['p_value']:.3f}"
+        f"  left: {1e3 * result.left.rms_m:.2f} mm, most at {result.left.where.marker}; structure p = {result.left.structure.p_value:.3f}"
     )
     print(f"  next: {result.next_experiment}", flush=True)
 

@@ -24,6 +24,7 @@ from femsense.core.pose import move_pose
 from femsense.io.recording_folder import load_recording
 from femsense.io.robot_toml import load_robot
 from femsense.loop.improve import improve
+from femsense.loop.result.records import Value
 from femsense.model.recording import Recording
 from femsense.model.robot import Robot
 from femsense.rig.simulate import simulate
@@ -140,14 +141,14 @@ def recording_of(folder: Path, name: str, case: str, seed: int, pose_off: float)
 
 def size_of(loop: Any, truth: dict[str, Any]) -> str:
     """Return the values that were found beside the true ones."""
-    entry = next((e for e in loop.effects if e["name"] == truth["name"]), None)
+    entry = next((e for e in loop.effects if e.name == truth["name"]), None)
     if entry is None:
         return "–"
-    return ", ".join(_off(key, entry["parameters"][key], true) for key, true in truth.items() if key != "name")
+    return ", ".join(_off(key, entry.parameters[key], true) for key, true in truth.items() if key != "name")
 
 
-def _off(key: str, found: dict[str, Any], true: Any) -> str:
-    value, std = found["value"], found["std"]
+def _off(key: str, found: Value, true: Any) -> str:
+    value, std = found.value, found.std
     if isinstance(value, list):
         away = float(np.linalg.norm(np.subtract(value, true)))
         return f"place {1e3 * away:.0f} mm off" if key.endswith("_m") else f"{away / np.linalg.norm(true):.1%} off"
@@ -186,11 +187,11 @@ def main() -> None:
 
 def row(case: str, hidden: list[dict[str, Any]], kind: str, loop: Any, seconds: float) -> str:
     def fall(key: str) -> str:
-        ends = [part.get(key) for part in (loop.before, loop.after)]
+        ends = [getattr(part, key) for part in (loop.before, loop.after)]
         return "–" if None in ends else f"{1e3 * ends[0]:.3f} → {1e3 * ends[1]:.3f}"
 
     marked = "–" if kind == "clouds" else fall("validation_rms_m")
-    named = ", ".join(e["name"] for e in loop.effects) or "–"
+    named = ", ".join(e.name for e in loop.effects) or "–"
     size = size_of(loop, hidden[0]) if hidden else "–"
     cells = [
         case,

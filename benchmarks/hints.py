@@ -37,8 +37,8 @@ Scores = dict[str, float]
 def compared(case: Case) -> list[tuple[Case, tuple[str, ...], Scores, Scores]]:
     """Return, of each model found in a case, what it has and the scores by the fields of the model before and by its own."""
     warnings.simplefilter("ignore")
-    module, seen = sys.modules["femsense.loop.improve"], []
-    scored = module._scored
+    module, seen = sys.modules["femsense.loop.search.search"], []
+    scored = module.scored
 
     def watched(
         data: Data, stage: FittedModel, fields: Fields, noise: Noise, names: Sequence[str], n_effective: float
@@ -49,14 +49,14 @@ def compared(case: Case) -> list[tuple[Case, tuple[str, ...], Scores, Scores]]:
             seen.append((case, stage.fit.hypothesis.names, best_of(hinted), best_of(own)))
         return scored(data, stage, fields, noise, names, n_effective)  # type: ignore[no-any-return]
 
-    module._scored = watched
+    module.scored = watched
     try:
         made = make_data(case, SEEDS["tune"])
         improve(made.declared, [made.recording])
     except FemsenseError:
         pass  # what was seen until then counts
     finally:
-        module._scored = scored
+        module.scored = scored
     return seen
 
 

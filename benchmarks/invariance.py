@@ -33,6 +33,7 @@ from changed import in_unit, log_permuted, renumbered, reordered, sweeps_shuffle
 from femsense.core.errors import FemsenseError  # noqa: E402
 from femsense.core.pose import make_pose, rotation_from_vector, transform_points  # noqa: E402
 from femsense.loop.improve import improve  # noqa: E402
+from femsense.loop.result.tables import table_of  # noqa: E402
 from femsense.model.recording import Recording  # noqa: E402
 from femsense.model.robot import Robot  # noqa: E402
 
@@ -82,7 +83,7 @@ def closed(robot: Robot, recording: Recording) -> dict[str, Any]:
         loop = improve(robot, [recording])
     except FemsenseError as error:
         return {"verdict": f"refused: {error}", "effects": []}
-    effects = [{"name": e["name"], "parameters": e["parameters"]} for e in loop.effects]
+    effects = [{"name": e.name, "parameters": table_of(e.parameters)} for e in loop.effects]
     return {"verdict": loop.verdict, "effects": effects, "cpu_s": time.process_time() - began}
 
 

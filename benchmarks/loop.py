@@ -33,6 +33,7 @@ from femsense.loop.data.trial import Groups
 from femsense.loop.fit.marker_placement import placement_turns
 from femsense.loop.fit.noise_components import Noise, whiten
 from femsense.loop.improve import improve
+from femsense.loop.result.tables import table_of
 from femsense.model.drive import DrivenRobot, drive_of
 from femsense.model.effects import apply_effects, find_effect
 from femsense.model.quasi_static_path import solve_path
@@ -82,15 +83,15 @@ def run_case(job: tuple[str, Case]) -> dict[str, Any]:
         "modulus_scale": made.modulus_scale,
         "verdict": loop.verdict,
         "sentence": loop.sentence,
-        "effects": [{"name": e["name"], "parameters": e["parameters"]} for e in loop.effects],
-        "confounded": list(loop.confounded),
-        "not_testable": [n["name"] for n in loop.not_testable],
-        "before_m": loop.before["validation_rms_m"],
-        "after_m": loop.after["validation_rms_m"],
+        "effects": [{"name": e.name, "parameters": table_of(e.parameters)} for e in loop.effects],
+        "confounded": table_of(loop.confounded),
+        "not_testable": [n.name for n in loop.not_testable],
+        "before_m": loop.before.validation_rms_m,
+        "after_m": loop.after.validation_rms_m,
         "floor_m": float(floor),
         "noise_m": loop.noise_m,
-        "left": loop.left["structure"],
-        "refits": [{k: c[k] for k in ("name", "dbic", "retained_share", "verdict")} for c in loop.candidates],
+        "left": table_of(loop.left.structure),
+        "refits": [{k: getattr(c, k) for k in ("name", "dbic", "retained_share", "verdict")} for c in loop.candidates],
         "cpu_s": spent,
         "wall_s": time.perf_counter() - began,
     }

@@ -209,7 +209,8 @@ def simulate_into(folder: str | Path, robot: str | Path, script: str | Path) -> 
 def script_identifiability(robot: str | Path, script: str | Path, *, noise: float) -> tuple[dict[str, Any], str]:
     """Return what the experiment of a script could show, as plain tables and as text; `noise` is of a marker's coordinate [m]."""
     from femsense.loop.design.advice import identifiability_text
-    from femsense.loop.design.planner import identifiability_document, identifiability_of_script
+    from femsense.loop.design.documents import identifiability_document
+    from femsense.loop.design.planner import identifiability_of_script
     from femsense.rig.script import read_script
 
     identifiability = identifiability_of_script(load_robot(robot), read_script(script), Path(script), noise=noise)
@@ -242,7 +243,8 @@ def plan_into(
     """
     from femsense.io.files import write_toml
     from femsense.loop.design.advice import proposal_text
-    from femsense.loop.design.planner import plan_experiment, proposal_document
+    from femsense.loop.design.documents import proposal_document
+    from femsense.loop.design.planner import plan_experiment
 
     if control not in ("tension", "displacement"):
         raise InputError("unknown actuation", where="--actuation", found=control, expected="tension | displacement")

@@ -27,32 +27,13 @@ from femsense.io.materials import POISSON_RATIO, silicone
 from femsense.io.mesh_files import mesh_companions, read_tets, write_mesh
 from femsense.io.regions import RegionTable, regional
 from femsense.io.tables import Schema, read_toml, schema_problems, validated
+from femsense.model.effects import EFFECT_NAMES
 from femsense.model.robot import Observation, Robot, plain_actuation, spread_features
 
 FORMAT = "femsense-robot-1"
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 PER_METRE = {"m": 1.0, "cm": 100.0, "mm": 1000.0}
 """Dividing by these rounds once: 35 mm become the same number as 0.035."""
-EFFECT_NAMES = (
-    "gravity",
-    "stiffness",
-    "poisson",
-    "soft_region",
-    "discretisation",
-    "hyperelastic",
-    "creep",
-    "payload",
-    "base_compliance",
-    "cable_friction",
-    "cable_offset",
-    "cable_gain",
-    "cable_stretch",
-    "cable_slack",
-    "geometry",
-    "depth_scale",
-    "marker_offset",
-    "clamped_marker",
-)
 SMALLEST_BODY, LARGEST_BODY = 1e-3, 20.0
 """A body that is smaller or larger across than this [m] has another unit than declared."""
 FAR_CABLE = 0.25

@@ -378,7 +378,8 @@ def _pulling(hypothesis: Hypothesis, base: DrivenRobot, steps: list[float], vari
     They are added; where nothing depends on other frames, they are put in the place of those of the cables' zeros, whose derivative is
     theirs wherever a tension is not cut off.
     """
-    driving = "cable_offset" in hypothesis.names or len(variants) > len(hypothesis.parameters)
+    offsets = any(effect.calibrated is not None and effect.calibrated.of_inputs for effect, _, _ in hypothesis.terms)
+    driving = offsets or len(variants) > len(hypothesis.parameters)
     if base.drive.control != "tension" or not driving:
         return []
     past = bool(base.robot.creep) or any(has_history(w.robot) for w in (base, *variants))

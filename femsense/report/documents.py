@@ -68,7 +68,7 @@ class Candidate(Document):
     verdict: str = ""
 
 
-class Rivals(Document):
+class Confounded(Document):
     pair: Pair
     dbic_gap: Number = None
     absorbed_share: Number = None
@@ -391,7 +391,7 @@ class Loop(Document):
     after: Errors = Errors()
     effects: list[Effect] = Field(default_factory=list)
     candidates: list[Candidate] = Field(default_factory=list)
-    confounded: list[Rivals] = Field(default_factory=list)
+    confounded: list[Confounded] = Field(default_factory=list)
     next_experiment: str = ""
     not_testable: list[Untestable] = Field(default_factory=list)
     detectable: dict[str, Detectable] = Field(default_factory=dict)

@@ -14,7 +14,7 @@ from femsense.io.robot_toml import load_robot
 from femsense.loop.files import LOOP_FORMAT
 from femsense.model.robot import Robot
 from femsense.report import words
-from femsense.report.documents import Evidence, Frames, Left, Loop, Residuals, Rivals, Structure, read_document
+from femsense.report.documents import Confounded, Evidence, Frames, Left, Loop, Residuals, Structure, read_document
 from femsense.report.drawing import (
     AFTER,
     BEFORE,
@@ -383,13 +383,14 @@ def _open_questions(loop: Loop, evidence: Evidence) -> Html | None:
     ]
     others = [" / ".join(r.pair) for r in loop.confounded if names and not names & set(r.pair)]
     hidden = [
-        element("span", code(u.name), f": calibration absorbs {words.nearly(u.absorbed_share)} of it") for u in loop.not_testable
+        element("span", code(u.name), f": {words.nearly(u.absorbed_share)} of it is absorbed by calibration")
+        for u in loop.not_testable
     ]
     experiment = loop.next_experiment
     advice = paragraph(element("strong", "Next experiment: "), experiment, class_="next") if experiment else None
     return (
         together(
-            section("Not distinguishable with these data", bullets(pairs), level=4),
+            section("Cannot be distinguished", bullets(pairs), level=4),
             paragraph("Nor could these, were one of them there: ", ", ".join(others), ".") if others else None,
             section("Not testable with these data", bullets(hidden), level=4),
             advice,
@@ -399,13 +400,13 @@ def _open_questions(loop: Loop, evidence: Evidence) -> Html | None:
     )
 
 
-def _why_alike(rivals: Rivals) -> str:
-    if words.known(rivals.dbic_gap):
-        return f"their evidence differs by a ΔBIC of {words.number(rivals.dbic_gap, 2)} only"
-    if words.known(rivals.absorbed_share):
-        return f"calibration absorbs {words.nearly(rivals.absorbed_share, 1)} of the second, most of it by the first"
-    if words.known(rivals.cosine):
-        return f"they leave the same trace (agreement {words.percent(rivals.cosine, 1)})"
+def _why_alike(pair: Confounded) -> str:
+    if words.known(pair.dbic_gap):
+        return f"their evidence differs by a ΔBIC of {words.number(pair.dbic_gap, 2)} only"
+    if words.known(pair.absorbed_share):
+        return f"{words.nearly(pair.absorbed_share, 1)} of the second is absorbed by calibration, most of it by the first"
+    if words.known(pair.cosine):
+        return f"they leave the same trace (agreement {words.percent(pair.cosine, 1)})"
     return "these data do not tell which it is"
 
 

@@ -319,7 +319,7 @@ def sweep_dots(frames: Frames, noise_m: float | None) -> Html | None:
 
 
 def confounding_map(confounding: Confounding) -> Html | None:
-    """Return the heat map of how much of each effect each other one absorbs."""
+    """Return the heat map of how much each effect is collinear with each other one."""
     names, n = confounding.names, len(confounding.names)
     if n < 2 or len(confounding.share) != n or any(len(row) != n for row in confounding.share):
         return None
@@ -363,7 +363,7 @@ def confounding_map(confounding: Confounding) -> Html | None:
     top = max(worst)
     return as_image(
         figure,
-        alt=f"Map of {n} effects: how much of the trace of one another one absorbs; the most {top[0]:.0%} of {top[1]} by {top[2]}.",
-        caption="How much of the trace of the effect on the left the effect below absorbs [%], with all that calibration absorbs taken off. Above 95 (bold) these data do not distinguish the two.",
+        alt=f"Map of {n} effects: how much of the trace of one is collinear with another one; the most {top[0]:.0%} of {top[1]} by {top[2]}.",
+        caption="How much of the trace of the effect on the left is collinear with that of the effect below [%], with all that calibration can absorb taken off. Above 95 (bold) these data cannot tell the two apart.",
         wide=wide,
     )

@@ -35,7 +35,7 @@ from femsense.report.page import Cell, Html, code, element, escape, paragraph, t
 
 OUTCOMES = {
     "named": "named: part of the improved model",
-    "passes": "passes all tests too, with less evidence than the one that was named",
+    "passes": "alternative: passes all tests too, with less evidence than the one that was named",
 }
 LISTED = 6
 COMPONENTS = {
@@ -53,7 +53,7 @@ TESTS = {
     "cloud neighbours": "neighbouring states of the clouds are alike",
     "cloud sweep": "one sweep of the clouds stands apart",
 }
-STAGES = ("before", "nuisance", "after")
+MODELS = ("before", "nuisance", "after")
 CHANGE = "a change of "
 UNSEEN = "too small to be seen here"
 
@@ -123,9 +123,9 @@ def ranking_table(candidates: Sequence[Candidate], ranked: Mapping[str, Ranked],
         dense=True,
     )
     text = paragraph(
-        "Δχ² is what the effect explains of the residual beyond all that calibration absorbs; ΔBIC takes off a price for each parameter and each effect tried, "
+        "Δχ² is what the effect explains of the residual beyond all that calibration can absorb; ΔBIC takes off a price for each parameter and each effect tried, "
         "and a named effect needs 10. Left-out sweeps: by how much twice the log-likelihood of sweeps that are not fitted rises, ± its standard error. “Retained” is the share of its trace "
-        "that calibration leaves. “First” is how often the effect comes first when whole sweeps are drawn anew. Values: of the final fit where named, else of the linear screening. The modulus and the zeros of the cables are not among them: they are always fitted along.",
+        "that calibration leaves. “First” is how often the effect comes first when whole sweeps are drawn anew. Values: of the final fit where named, else of the linear screening. The modulus and the input offsets are not among them: they are always fitted along.",
         class_="soft",
     )
     return together(text, ranking) if ranking else None
@@ -308,7 +308,7 @@ def calibration_table(shift: CalibrationShift) -> Html | None:
             ("Camera turned", pose.turn_rad, pose.turn_std_rad, "rad"),
             ("Camera shifted", pose.shift_m, pose.shift_std_m, "m"),
         ):
-            cells = [_vector(moved.get(name), spread.get(name), unit) for name in STAGES[1:]]
+            cells = [_vector(moved.get(name), spread.get(name), unit) for name in MODELS[1:]]
             rows.append([f"{title}{where}", words.NOTHING, "0", *cells])
     for given in shift.initial_inputs:
         where = f", recording {given.recording + 1}" if len({g.recording for g in shift.initial_inputs}) > 1 else ""
@@ -329,7 +329,7 @@ def _vector(value: Triple | None, std: Triple | None, unit: str) -> str:
 
 
 def _three(values: Mapping[str, Sequence[Any]], unit: str) -> list[str]:
-    found = [values.get(name) for name in STAGES]
+    found = [values.get(name) for name in MODELS]
     return [words.with_std(v[0], v[1] if len(v) > 1 else None, unit) if v else words.NOTHING for v in found]
 
 
@@ -481,7 +481,7 @@ def data_card(loop: Loop) -> Html | None:
         rows.append(
             [f"Frames left out{f', {i + 1}' if len(evidence.excluded) > 1 else ''}", together(*lines) if lines else "none"]
         )
-    rows += [["Outlying markers left out", _outlier_list(card.outliers)]] if card.outliers else []
+    rows += [["Outliers left out", _outlier_list(card.outliers)]] if card.outliers else []
     rows += [["Repeats (a state reached again the same way)", str(evidence.repeats)]] if evidence.repeats is not None else []
     rows += _noise_rows(card)
     for name, parameters in card.nuisance_after.items():
@@ -513,7 +513,7 @@ def _noise_rows(card: Card) -> list[list[object]]:
             [str(a).replace("each axis", "along the normal").replace("at the markers", "along the normals"), b] for a, b in rows
         ]
     rows += (
-        [["Uncertainty of marker placements", words.length(card.placement_std_m, 2)]] if words.known(card.placement_std_m) else []
+        [["Uncertainty of marker placement", words.length(card.placement_std_m, 2)]] if words.known(card.placement_std_m) else []
     )
     return rows
 

@@ -145,7 +145,7 @@ def loop_text(document: Mapping[str, Any]) -> str:
     for effect in document.get("effects") or []:
         lines += ["", effect_text(effect)]
     for title, said in (
-        ("not distinguishable", ", ".join(" / ".join(pair) for pair in _open_pairs(document))),
+        ("cannot be distinguished", ", ".join(" / ".join(pair) for pair in _open_pairs(document))),
         ("not testable", ", ".join(map(_untestable, document.get("not_testable") or ()))),
         ("would have been seen", _seen(document) if verdict == "none" else ""),
         ("next experiment", document.get("next_experiment")),
@@ -157,7 +157,7 @@ def loop_text(document: Mapping[str, Any]) -> str:
 
 
 def _open_pairs(document: Mapping[str, Any]) -> list[list[str]]:
-    """Return the pairs that the data do not distinguish: those of what is named, or all where nothing is."""
+    """Return the pairs that the data cannot distinguish: those of what is named, or all where nothing is."""
     names = {str(effect["name"]) for effect in document.get("effects") or ()}
     pairs = [p["pair"] for p in document.get("confounded") or ()]
     return [pair for pair in pairs if names & set(pair) or not names]
@@ -165,7 +165,7 @@ def _open_pairs(document: Mapping[str, Any]) -> list[list[str]]:
 
 def _untestable(effect: Mapping[str, Any]) -> str:
     share = effect.get("absorbed_share")
-    return str(effect["name"]) + ("" if share is None else f" (calibration absorbs {100 * share:.1f} % of it)")
+    return str(effect["name"]) + ("" if share is None else f" ({100 * share:.1f} % of it is absorbed by calibration)")
 
 
 def _seen(document: Mapping[str, Any]) -> str:

@@ -17,11 +17,14 @@ from femsense.loop.data.trial import Groups
 from femsense.loop.fit import noise_components as noise_module
 from femsense.loop.fit.noise_components import Noise, estimate_noise, whiten
 from femsense.loop.improve import improve
+from femsense.loop.search.search import distinguishes_effects
+from femsense.loop.verdict.returned_model import is_sure
+from femsense.loop.verdict.sentences import by_noise
 from femsense.model.recording import make_recording
 
 
 def found(loop, name):
-    return next(e for e in loop.effects if e["name"] == name)
+    return next(e for e in loop.effects if e.name == name)
 
 
 def test_friction_is_named_with_its_coefficient_and_the_held_out_error_falls():
@@ -30,18 +33,18 @@ def test_friction_is_named_with_its_coefficient_and_the_held_out_error_falls():
     loop = improve(arm(), [recording])
     assert loop.verdict == "effects"
     effect = found(loop, "cable_friction")
-    assert effect["parameters"]["coefficient"]["value"] == pytest.approx(0.25, rel=0.15)
-    assert loop.after["validation_rms_m"] < 0.5 * loop.before["validation_rms_m"]
-    assert {e["name"] for e in loop.effects} <= {"cable_friction", "stiffness", "cable_offset", "hyperelastic"}  # the truth is
+    assert effect.parameters["coefficient"].value == pytest.approx(0.25, rel=0.15)
+    assert loop.after.validation_rms_m < 0.5 * loop.before.validation_rms_m
+    assert {e.name for e in loop.effects} <= {"cable_friction", "stiffness", "cable_offset", "hyperelastic"}  # the truth is
 
 
 def test_a_wrong_modulus_is_named_stiffness_and_nothing_else():
     inputs, labels = sweeps()
     recording, _ = record(inputs, effects=[{"name": "stiffness", "scale": 1.25}], labels=labels, truth=arm((8, 3, 3)))
     loop = improve(arm(), [recording])
-    assert [e["name"] for e in loop.effects] == ["stiffness"]
+    assert [e.name for e in loop.effects] == ["stiffness"]
     assert loop.sentence.endswith("mm after.")  # weight tells it from a gain of all cables
-    assert found(loop, "stiffness")["parameters"]["scale"]["value"] == pytest.approx(1.25, rel=0.06)
+    assert found(loop, "stiffness").parameters["scale"].value == pytest.approx(1.25, rel=0.06)
     assert loop.robot.body.material.young_modulus[0] == pytest.approx(1.25 * 300e3, rel=0.06)
 
 
@@ -64,7 +67,7 @@ def test_a_modulus_is_not_told_from_a_gain_of_all_cables_where_nothing_known_pul
     }
     loop = improve(weightless, [replace(recording, **known) if forces else recording], effects=["cable_gain", "cable_friction"])
     said = "These data do not tell stiffness from cable_gain." in loop.sentence
-    assert [e["name"] for e in loop.effects] == ["stiffness"] and said == (not load)
+    assert [e.name for e in loop.effects] == ["stiffness"] and said == (not load)
     assert loop.next_experiment.startswith("hang a known weight") == (not load)
 
 
@@ -76,9 +79,9 @@ def test_what_only_held_out_data_show_is_said():
         for rows in (slice(18), slice(18, 24))
     )
     loop = improve(arm((4, 1, 1)), [fitted], validation=[held], effects=["cable_gain", "cable_friction"])
-    assert loop.verdict == "unexplained" and loop.left["held_out"]
+    assert loop.verdict == "unexplained" and loop.left.held_out
     assert "Held-out data show what the fitted ones do not, most in frame" in loop.sentence
-    assert loop.left["worst_frame"]["frame"] in (2, 3) and loop.left["rms_m"] > 3 * loop.noise_m
+    assert loop.left.worst_frame.frame in (2, 3) and loop.left.rms_m > 3 * loop.noise_m
 
 
 def test_where_each_sweep_pulls_a_cable_of_its_own_a_quarter_of_its_frames_is_held_out():
@@ -91,7 +94,7 @@ def test_where_each_sweep_pulls_a_cable_of_its_own_a_quarter_of_its_frames_is_he
     assert {int(k) // 6 for k in held} == {0, 1, 2, 3} and len(held) == 8 and not set(train) & set(held)
     np.testing.assert_array_equal(recording.inputs[train].max(axis=0), recording.inputs.max(axis=0))
     loop = improve(arm((4, 1, 1)), [recording], effects=["cable_gain", "cable_friction"])
-    assert loop.verdict == "effects" and found(loop, "cable_gain")["parameters"]["scale"]["value"]["right"] == pytest.approx(
+    assert loop.verdict == "effects" and found(loop, "cable_gain").parameters["scale"].value["right"] == pytest.approx(
         0.8, abs=0.02
     )
 
@@ -99,28 +102,28 @@ def test_where_each_sweep_pulls_a_cable_of_its_own_a_quarter_of_its_frames_is_he
 def test_what_is_taken_away_by_what_nobody_names_is_left(monkeypatch: pytest.MonkeyPatch):
     inputs, labels = sweeps()
     recording, _ = record(inputs, effects=[{"name": "stiffness", "scale": 1.25}], labels=labels, truth=arm())
-    monkeypatch.setattr(sys.modules["femsense.loop.verdict.verdict"], "_promoted", lambda data, search: [])
+    monkeypatch.setattr(sys.modules["femsense.loop.verdict.verdict"], "promoted_nuisances", lambda data, search: [])
     loop = improve(arm(), [recording])
     assert loop.verdict == "unexplained" and not loop.effects
-    assert loop.left["rms_m"] > 0.8 * loop.before["train_rms_m"] > 5.0 * loop.noise_m  # but for the error of the mesh
-    assert loop.left["structure"]["significant"] and loop.evidence["tests"]["after"]["structure"]["significant"]
+    assert loop.left.rms_m > 0.8 * loop.before.train_rms_m > 5.0 * loop.noise_m  # but for the error of the mesh
+    assert loop.left.structure.significant and loop.evidence.tests.after.structure.significant
 
 
 def test_what_has_evidence_and_makes_the_held_out_error_larger_is_said_and_not_handed_back(monkeypatch: pytest.MonkeyPatch):
     inputs, labels = sweeps()
     recording, _ = record(inputs, effects=[{"name": "cable_friction", "coefficient": 0.25}], labels=labels, truth=arm((4, 1, 1)))
-    monkeypatch.setattr(sys.modules["femsense.loop.verdict.returned_model"], "_holds_out", lambda data, search, back: False)
+    monkeypatch.setattr(sys.modules["femsense.loop.verdict.returned_model"], "holds_out", lambda data, search, back: False)
     loop = improve(arm((4, 1, 1)), [recording], effects=["cable_friction"])
     assert not loop.effects and loop.robot is loop.declared
-    assert "evidence for cable_friction" in loop.sentence and "mesh itself costs" in loop.sentence
+    assert "evidence for cable_friction" in loop.sentence and "discretisation error is" in loop.sentence
     assert loop.verdict == "unexplained" and "nothing that may be handed back explains" in loop.sentence
 
 
 def test_an_effect_whose_states_do_not_come_to_rest_again_is_taken_back(monkeypatch: pytest.MonkeyPatch):
     inputs, labels = sweeps()
     recording, _ = record(inputs, effects=[{"name": "cable_friction", "coefficient": 0.25}], labels=labels, truth=arm((4, 1, 1)))
-    module = sys.modules["femsense.loop.improve"]
-    again, asked = module._again, list[tuple[str, ...]]()
+    module = sys.modules["femsense.loop.search.search"]
+    again, asked = module.fitted_again, list[tuple[str, ...]]()
 
     def folds(data, fitted, noise, **given):
         asked.append(fitted.fit.hypothesis.names)
@@ -128,11 +131,11 @@ def test_an_effect_whose_states_do_not_come_to_rest_again_is_taken_back(monkeypa
             raise DataError("no equilibrium in frame 3")
         return again(data, fitted, noise, **given)
 
-    monkeypatch.setattr(module, "_again", folds)
+    monkeypatch.setattr(module, "fitted_again", folds)
     loop = improve(arm((4, 1, 1)), [recording], effects=["cable_friction"])
-    assert "cable_friction" in asked[-1] and "cable_friction" not in {e["name"] for e in loop.effects}
-    refits = [q for c in loop.candidates if c["name"] == "cable_friction" for q in c["refits"]]
-    assert any("no equilibrium in frame 3" in q["verdict"] for q in refits)
+    assert "cable_friction" in asked[-1] and "cable_friction" not in {e.name for e in loop.effects}
+    refits = [q for c in loop.candidates if c.name == "cable_friction" for q in c.refits]
+    assert any("no equilibrium in frame 3" in q.verdict for q in refits)
 
 
 def test_a_model_that_lacks_nothing_is_told_so():
@@ -142,11 +145,11 @@ def test_a_model_that_lacks_nothing_is_told_so():
     assert loop.verdict == "none"
     assert not loop.effects
     assert loop.noise_m == pytest.approx(2e-4 * np.sqrt(3), rel=0.15)
-    assert loop.detectable["cable_friction"]["smallest"]["coefficient"] < 0.2
+    assert loop.detectable["cable_friction"].smallest["coefficient"] < 0.2
     clamp = loop.detectable[
         "base_compliance"
     ]  # a stiffness in its own unit, below which a clamp gives by what would have been seen
-    assert clamp["kind"] == "softer_than" and (clamp["unit"], *clamp["smallest"]) in {
+    assert clamp.kind == "softer_than" and (clamp.unit, *clamp.smallest) in {
         ("N/m", "stiffness_n_m"),
         ("N m/rad", "rotation_stiffness_nm_rad"),
     }
@@ -242,7 +245,7 @@ def test_repeated_sweeps_of_many_states_tell_effects_apart():
             }
         )
 
-    tells_apart = sys.modules["femsense.loop.improve"]._tells_apart
+    tells_apart = distinguishes_effects
     assert tells_apart(data([0.0, 1.0, 2.0, 3.0, 4.0]))
     assert not tells_apart(data([0.0, 1.0]))
 
@@ -302,14 +305,13 @@ def test_what_one_pull_without_unloading_cannot_tell_from_a_modulus_is_said_with
     inputs = np.outer(np.linspace(0.0, 2.0, 9), [1.0, 0.0, 0.0, 0.0])
     recording, _ = record(inputs, effects=[hidden], truth=weightless, noise=3e-4)
     loop = improve(weightless, [recording], effects=["cable_friction", "cable_gain"])
-    assert [e["name"] for e in loop.effects] == ["stiffness"]
-    pairs = [set(c["pair"]) for c in loop.confounded if "absorbed_share" in c]
+    assert [e.name for e in loop.effects] == ["stiffness"]
+    pairs = [set(c.pair) for c in loop.confounded if c.absorbed_share is not None]
     assert pairs == [{"stiffness", "cable_friction"}, {"stiffness", "cable_gain"}]
 
 
 def test_noise_that_no_camera_has_is_said():
     data = SimpleNamespace(robot=arm((4, 1, 1)))
-    by_noise = sys.modules["femsense.loop.verdict.verdict"]._by_noise
     assert by_noise(data, Noise({"white": 1e-3}, "")) == ""
     assert "Noise of 3.5 mm on a body of 100 mm is no camera's" in by_noise(data, Noise({"white": 2e-3}, ""))
 
@@ -319,6 +321,5 @@ def test_a_nuisance_is_named_only_beyond_the_deviations_that_are_reported():
     fitted = SimpleNamespace(
         fit=SimpleNamespace(hypothesis=SimpleNamespace(terms=terms), coordinates=np.array([0.09, 0.0, -0.4]))
     )
-    is_sure = sys.modules["femsense.loop.verdict.verdict"]._is_sure
     assert is_sure(fitted, "stiffness", np.array([0.029])) and not is_sure(fitted, "stiffness", np.array([0.031]))
     assert is_sure(fitted, "cable_offset", np.array([0.1, 0.1])) and not is_sure(fitted, "cable_offset", np.array([0.1, 0.2]))

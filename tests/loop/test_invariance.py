@@ -37,16 +37,16 @@ def numbers(loop: LoopResult) -> dict[str, tuple[float, float]]:
     """Return every number that was named, with its standard deviation; a table name → value gives one a cable."""
     result = {}
     for effect in loop.effects:
-        for key, p in effect["parameters"].items():
-            value, std = (v if isinstance(v, dict) else {"": v} for v in (p["value"], p["std"]))
-            result |= {f"{effect['name']}.{key}.{cable}": (value[cable], std[cable]) for cable in value}
+        for key, p in effect.parameters.items():
+            value, std = (v if isinstance(v, dict) else {"": v} for v in (p.value, p.std))
+            result |= {f"{effect.name}.{key}.{cable}": (value[cable], std[cable]) for cable in value}
     return result
 
 
 def assert_same(told: LoopResult, plain: LoopResult, share: float = 0.2) -> None:
     """Check names, verdict and numbers, which may differ by a share of their standard deviations."""
     assert told.verdict == plain.verdict
-    assert [e["name"] for e in told.effects] == [e["name"] for e in plain.effects]
+    assert [e.name for e in told.effects] == [e.name for e in plain.effects]
     ours, theirs = numbers(told), numbers(plain)
     assert ours.keys() == theirs.keys()
     for key, (value, std) in theirs.items():
@@ -82,7 +82,7 @@ def test_friction_does_not_care_for_the_order_of_sweeps_that_end_slack():
     shuffled = sweeps_shuffled(recording, np.random.default_rng(1))
     assert shuffled.sweep != recording.sweep
     loop = said(robot, shuffled, ["cable_friction", "cable_gain"])
-    assert [e["name"] for e in loop.effects] == ["cable_friction"]
+    assert [e.name for e in loop.effects] == ["cable_friction"]
     value, std = numbers(loop)["cable_friction.coefficient."]
     assert value == pytest.approx(0.25, abs=max(3 * std, 0.01))
 
@@ -91,5 +91,5 @@ def test_friction_does_not_care_for_the_order_of_sweeps_that_end_slack():
 def test_a_log_that_belongs_to_other_frames_is_blamed_on_no_effect(draw: int):
     robot, recording = experiment(GAIN)
     loop = said(robot, log_permuted(recording, np.random.default_rng(draw)))
-    assert not {e["name"] for e in loop.effects} & {"cable_friction", "creep"}
+    assert not {e.name for e in loop.effects} & {"cable_friction", "creep"}
     assert loop.verdict != "effects"

@@ -14,6 +14,7 @@ from femsense.calib.calibration import Calibration
 from femsense.io.files import PART_PREFIX
 from femsense.io.robot_toml import load_robot
 from femsense.loop.result import LoopResult
+from femsense.loop.result.records import DataCard, Errors, FrameError, Left, NamedEffect, Structure, Value, WorstMarker
 from femsense.model.robot import Robot
 
 NAN = float("nan")
@@ -51,9 +52,16 @@ def make_calibration(**changes: Any) -> Calibration:
     return replace(calibration, **changes)
 
 
+def what_is_left() -> Left:
+    """What a residual looks like, made by hand."""
+    frame, still = FrameError(0, 3, 1e-4), Structure(0.0, 1.0, {}, significant=False)
+    where = WorstMarker("tip", (0.1, 0.0, 0.0), (0.0, 0.0, 1e-4), (0.0, 0.0, 1.0), 0.9)
+    return Left(1e-4, {"tip": 1e-4}, where, frame, (frame,), 0.5, (), held_out=False, structure=still, explained_share=1.0)
+
+
 def make_loop(robot: Robot) -> LoopResult:
     entry = {"name": "cable_friction", "coefficient": 0.12}
-    rms = {"train_rms_m": 1e-3, "validation_rms_m": NAN, "validation_ci_m": [0.0, np.inf]}
+    rms = Errors(1e-3, NAN, (0.0, np.inf), "sweeps")
     return LoopResult(
         verdict="effects",
         sentence="the cables rub",
@@ -63,13 +71,14 @@ def make_loop(robot: Robot) -> LoopResult:
         entries=(entry,),
         candidates=(),
         confounded=(),
-        effects=({"name": "cable_friction", "parameters": {"coefficient": {"value": 0.12, "std": 0.01, "unit": "1"}}},),
+        effects=(NamedEffect("cable_friction", {"coefficient": Value(0.12, 0.01, "1")}, 2e-3, 1e-3),),
         next_experiment="",
         not_testable=(),
         detectable={},
-        left={},
+        left=what_is_left(),
         robot=robot,
         declared=robot,
+        data=DataCard((), (), (), (), ("markers",), None, {"white": 1e-4}, "start", None, (), 12.0, {}, 1e-3),
     )
 
 

@@ -7,11 +7,11 @@ p-values are optimistic even after Holm's adjustment (1979).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
 from femsense.core.arrays import BoolArray, FloatArray
+from femsense.loop.result.records import Correlation
 from femsense.model.observation import Scene
 from femsense.model.recording import Recording
 
@@ -85,17 +85,18 @@ def stacked(tables: list[dict[str, FloatArray]]) -> dict[str, FloatArray]:
     return {name: np.concatenate([table[name] for table in tables]) for name in common}
 
 
-def rank_with(values: FloatArray, covariates: Mapping[str, FloatArray]) -> list[dict[str, Any]]:
+def rank_with(values: FloatArray, covariates: Mapping[str, FloatArray]) -> list[Correlation]:
     """Return Spearman's correlation of a number a frame with each covariate, the strongest first, p-values adjusted after Holm (1979)."""
     from scipy.stats import spearmanr
 
-    rows: list[dict[str, Any]] = []
+    rows = list[tuple[str, float, float]]()
     for name, covariate in covariates.items():
         if len(values) >= FEWEST and np.ptp(covariate) > 0 and np.ptp(values) > 0:
             answer = spearmanr(values, covariate)
-            rows.append({"covariate": name, "rank_correlation": float(answer.statistic), "p_value": float(answer.pvalue)})
-    largest = 0.0
-    for i, row in enumerate(sorted(rows, key=lambda r: float(r["p_value"]))):
-        largest = max(largest, min(1.0, (len(rows) - i) * float(row["p_value"])))
-        row["p_holm"] = largest
-    return sorted(rows, key=lambda r: -abs(float(r["rank_correlation"])))
+            rows.append((name, float(answer.statistic), float(answer.pvalue)))
+    largest, found = 0.0, list[Correlation]()
+    for i, (name, correlation, p) in enumerate(sorted(rows, key=lambda row: row[2])):
+        largest = max(largest, min(1.0, (len(rows) - i) * p))
+        found.append(Correlation(name, correlation, p, largest))
+    order = {name: i for i, name in enumerate(covariates)}
+    return sorted(found, key=lambda row: (-abs(row.rank_correlation), order[row.covariate]))

@@ -24,7 +24,7 @@ from femsense.loop.data.surface_rows import (
     with_surface,
 )
 from femsense.loop.data.trial import Groups, States, SurfaceRows, Trial, normals_of
-from femsense.model.effects import FORMS, Effect, Entry, find_effect
+from femsense.model.effects import CALIBRATED, EFFECTS, FORMS, Effect, Entry
 from femsense.model.observation import Scene, make_scene, rest_residual, with_rest_markers
 from femsense.model.recording import Recording, check_against, state_key
 from femsense.model.remeshing import robot_on_mesh
@@ -36,7 +36,8 @@ ROWS_A_CLOUD = 60
 """Points of the surface that a camera sees in one frame, about."""
 FEWEST_CLOUDS = 4
 """Where there are markers, fewer frames with clouds than this are not looked at."""
-MESH = find_effect("discretisation")
+MESH = next(effect for effect in EFFECTS if effect.remeshes)
+"""The effect that says which mesh is fine enough."""
 QUADRATIC: Entry = {"element": "tet10"}
 """What stands for a mesh fine enough while effects are sought, where linear elements are declared (see `elements`)."""
 MEASURED = ("auto", "markers", "clouds", "both")
@@ -292,5 +293,5 @@ def _rest_std(robot: Robot, trial: Trial) -> float | None:
     return max(float(np.sqrt((rest_residual(robot, trial.scene, trial.poses) ** 2).mean())), 1e-4)
 
 
-NUISANCE = ("stiffness", "cable_offset")
+NUISANCE = CALIBRATED
 """Effects that are always fitted along."""

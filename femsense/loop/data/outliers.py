@@ -1,6 +1,6 @@
-"""Stray markers: single measurements that are far from where the others of their frame and of their marker let expect them.
+"""Outliers: single measurements that are far from where the others of their frame and of their marker let expect them.
 
-A reflex, or a name that two markers exchanged for a frame, weighs more than all the rest in a fit of squares, and spoils the error that is reported.
+A reflex, or a name that two markers swapped for a frame, weighs more than all the rest in a fit of squares, and spoils the error that is reported.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from femsense.loop.data.dataset import Data
 from femsense.loop.data.trial import Trial
 
 OUTLYING = 4.0
-"""A stray is off by so many times what nine in ten are off by at most …"""
+"""An outlier is off by so many times what nine in ten are off by at most …"""
 FAR = 0.05
 """… and by more than this share of the body's reach; nearer ones may be what is sought."""
 RARE = 0.02
@@ -33,7 +33,7 @@ def without_outliers(data: Data, fitted: Sequence[FloatArray], held_out: Sequenc
 
 
 def _kept(data: Data, trial: Trial, residual: FloatArray) -> Trial:
-    """Return a trial without its strays; itself where there are none, or it is of clouds."""
+    """Return a trial without its outliers; itself where there are none, or it is of clouds."""
     if trial.scene.crossings is not None:
         return trial
     off = outliers(residual, trial.scene.frame, trial.scene.marker, FAR * data.robot.body.reach)
@@ -45,9 +45,9 @@ def _kept(data: Data, trial: Trial, residual: FloatArray) -> Trial:
 
 
 def outliers(residual: FloatArray, frame: IntArray, marker: IntArray, far: float) -> BoolArray:
-    """Return which rows of a residual (k, 3) [m] stand out from their frame and their marker by more than `far` [m], and by STRAYS times the 90 % quantile.
+    """Return which rows of a residual (k, 3) [m] stand out from their frame and their marker by more than `far` [m], and by OUTLYING times the 90 % quantile.
 
-    Several of a frame that are off the same way are no strays: a part of the body is elsewhere than the model has it. Two that exchanged their names
+    Several of a frame that are off the same way are no outliers: a part of the body is elsewhere than the model has it. Two that swapped their names
     are off opposite ways.
     """
     apart = _less_medians(_less_medians(residual, frame), marker)
@@ -76,5 +76,5 @@ def _named(data: Data, before: Trial, after: Trial) -> list[tuple[int, str]]:
     lost = [r for r in zip(scene.frame.tolist(), scene.marker.tolist(), scene.view.tolist()) if r not in kept]
     found = [(int(scene.recording.frame_numbers[f]), data.robot.marker_names[m]) for f, m, _ in lost]
     said = ", ".join(f"{name} in frame {number}" for number, name in found[:5]) + (" …" if len(found) > 5 else "")
-    warnings.warn(f"{scene.recording.folder}: stray markers are left out: {said}", stacklevel=2)
+    warnings.warn(f"{scene.recording.folder}: outliers are left out: {said}", stacklevel=2)
     return found

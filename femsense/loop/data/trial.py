@@ -70,7 +70,7 @@ class Groups:
         return self.surface.cells()
 
     def members(self) -> dict[str, IntArray]:
-        """Return the groupings that can be told apart here: each has groups of several rows, and several groups."""
+        """Return the groupings that are distinguishable here: each has groups of several rows, and several groups."""
         result: dict[str, IntArray] = {}
         for name in COMPONENTS[1:]:
             labels = getattr(self, name)

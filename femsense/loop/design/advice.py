@@ -14,21 +14,13 @@ from femsense.core.parallel import each
 from femsense.loop.data.dataset import NUISANCE, Data
 from femsense.loop.data.trial import Trial, numbers_of
 from femsense.loop.design.candidate_experiments import Element, candidate_experiments, setup_for
-from femsense.loop.design.identifiability import (
-    EVIDENCE,
-    Block,
-    Form,
-    Identifiability,
-    Judge,
-    Row,
-    forms_of,
-    make_block,
-    turns_of,
-)
+from femsense.loop.design.experiment_blocks import Block, Form, forms_of, make_block, turns_of
+from femsense.loop.design.identifiability import EVIDENCE, Identifiability, Judge, Row
 from femsense.loop.design.planner import Proposal, element_block
 from femsense.loop.fit.joint_fit import JointFit
 from femsense.loop.fit.noise_components import Noise
 from femsense.model.drive import has_history
+from femsense.model.effects import OF_INPUTS
 from femsense.model.robot import Robot
 
 MOST_WORK, MOST_FRAMES = 30_000, 40
@@ -98,12 +90,12 @@ def _summary(identifiability: Identifiability, before: Identifiability | None) -
 
     apart = " → ".join("{} of {}".format(*o.distinguished()) for o in (before, identifiability) if o is not None)
     lines = [
-        f"not testable: {count('untestable')}; too small to be seen: {count('unseen')}; pairs of effects that would be told apart: {apart}",
+        f"not testable: {count('untestable')}; too small to be seen: {count('unseen')}; pairs of effects that would be distinguished: {apart}",
         f"pairs that would both be seen and look alike: {count('confused')}",
     ]
     for i, j, share, gap in sorted(identifiability.confused(), key=lambda p: p[3])[:12]:
         names = f"{identifiability.rows[i].label} / {identifiability.rows[j].label}"
-        lines.append(f"  {names}: one imitates {100 * share:.0f} % of the other, dBIC gap {gap:.0f}")
+        lines.append(f"  {names}: {100 * share:.0f} % collinear, dBIC gap {gap:.0f}")
     return lines
 
 
@@ -117,7 +109,7 @@ def proposal_text(proposal: Proposal) -> str:
         lines.append(f"{i + 1:3d}. {e.words}{how}")
         lines += [f"       {text}" for text in brings.get(e.key, ())[:4]]
     if not proposal.steps:
-        lines.append("nothing on the menu helps within these frames")
+        lines.append("none of the candidate experiments helps within these frames")
     lines += [f"left out: {text}" for text in proposal.left_out]
     title = f"Predicted, before → after, {1e3 * proposal.noise:g} mm noise a coordinate, on the declared robot:"
     note = (
@@ -132,13 +124,13 @@ def proposal_text(proposal: Proposal) -> str:
 def next_element(
     data: Data, fit: JointFit, noise: Noise, confounded: Sequence[tuple[str, str]], not_testable: Sequence[str]
 ) -> list[tuple[str, str, float, float]]:
-    """Return which item of the menu would help most with what the data leave open, and by how much.
+    """Return which candidate experiment would help most with what the data leave open, and by how much.
 
     Arguments:
         data: of the loop; few of its frames are looked at.
         fit: the model.
         noise: of the data.
-        confounded: pairs of effects that the data cannot tell apart.
+        confounded: pairs of effects that the data cannot distinguish.
         not_testable: effects that they cannot show.
 
     Returns:
@@ -150,7 +142,7 @@ def next_element(
     names = {n for pair in confounded for n in pair} | set(not_testable)
     trials = [_representative(t) for t in data.train]
     tets = len(robot.body.mesh.tets)
-    past = has_history(robot) or "cable_friction" in names
+    past = has_history(robot) or any(form.path_dependent for form in data.forms if form.name in names)
     cost = sum(int(t.scene.frames.max()) + 1 if past else len(t.scene.frames) for t in trials)
     if not names or cost > 2 * min(MOST_WORK // tets, MOST_FRAMES):
         return []
@@ -166,7 +158,7 @@ def next_element(
         ]
     except FemsenseError:
         return []
-    judge, left = Judge(forms, data.input_scale), min(MOST_WORK // tets, MOST_FRAMES)
+    judge, left = Judge(forms), min(MOST_WORK // tets, MOST_FRAMES)
     now = _open(judge.judge(have), confounded, not_testable)
     questions = [*(f"{a} or {b}" for a, b in confounded), *not_testable]
     chosen = []
@@ -206,7 +198,7 @@ def _representative(trial: Trial) -> Trial:
 
 def _open_forms(robot: Robot, data: Data, names: set[str]) -> list[Form]:
     unknown = any(t.initial is not None for t in data.train)
-    wanted = (names | set(NUISANCE)) - ({"cable_offset"} if unknown else set())
+    wanted = (names | set(NUISANCE)) - set(OF_INPUTS if unknown else ())
     return forms_of(robot, data.control, data.input_scale, names=sorted(wanted))
 
 

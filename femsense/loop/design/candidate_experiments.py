@@ -1,4 +1,4 @@
-"""The menu of an experiment: what a person can do with a robot and a camera, each item as sweeps of a script.
+"""Candidate experiments: what a person can do with a robot and a camera, each item as sweeps of a script.
 
 An item starts and ends at rest, so that items can follow each other in any order and be judged one by one. How far to
 pull comes from the declared robot: as far as moves its markers by a quarter of its length, within what a cable bears.
@@ -93,7 +93,7 @@ class Setup:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Element:
-    """One item of the menu."""
+    """One candidate experiment."""
 
     key: str
     words: str
@@ -132,7 +132,7 @@ def script_of(setup: Setup, elements: Sequence[Element], *, noise: float, far: b
     return document
 
 
-# What is on the menu
+# The candidates
 
 
 def minimal(setup: Setup) -> list[Element]:
@@ -305,7 +305,7 @@ def _small_step(robot: Robot, control: str, kind: str, top: float) -> float:
 
 
 def _still(robot: Robot, control: str, inputs: FloatArray, loads: dict[str, Any] | None = None) -> DrivenRobot:
-    """Return a walk over inputs of cables and chambers (F, a + c)."""
+    """Return a quasi-static path over inputs of cables and chambers (F, a + c)."""
     a = len(robot.body.cables)
     recording = make_recording(
         time_s=np.arange(len(inputs)),

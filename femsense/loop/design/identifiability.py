@@ -4,346 +4,30 @@ Each part of an experiment (a block of frames) gives the Gram matrices of its co
 (pose, initial inputs), and of what all recordings share (calibration and effects). Blocks add up, so that any experiment made of
 them is judged by linear algebra alone. With G the sum and N the columns of calibration,
 
-    S = G_ee − G_eN G_NN⁻¹ G_Ne      (what calibration cannot imitate, Frisch–Waugh–Lovell)
+    S = G_ee − G_eN G_NN⁻¹ G_Ne      (what calibration cannot absorb, Frisch–Waugh–Lovell)
 
-holds everything: an effect a of plausible size D_a raises χ² by tr(D_a S_aa D_a), of which a rival b takes back tr(D_a S_ab S_bb⁻¹ S_ba D_a).
+holds everything: an effect a of plausible size D_a raises χ² by tr(D_a S_aa D_a), of which an alternative b takes back tr(D_a S_ab S_bb⁻¹ S_ba D_a).
 Effects of several parameters count with independent ones of plausible size. This is what `screen` computes from data.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from femsense.core.arrays import BoolArray, FloatArray
-from femsense.core.least_squares import FitResult
-from femsense.core.pose import rotation_from_vector
+from femsense.core.arrays import FloatArray
 from femsense.loop.data.dataset import NUISANCE
-from femsense.loop.data.trial import Trial
-from femsense.loop.fit.fitted_model import MODULUS_STD
-from femsense.loop.fit.joint_fit import JointFit, JointProblem, Prior
-from femsense.loop.search.effect_fields import effect_fields
+from femsense.loop.design.experiment_blocks import Block, Form
 from femsense.loop.search.screening import TESTABLE, penalty
-from femsense.model.effects import EFFECTS, FORMS, Effect, Entry, Parameter
-from femsense.model.effects.base import number, vector
-from femsense.model.effects.loads import STANDARD_GRAVITY
-from femsense.model.effects.support import BASE_ROTATION
-from femsense.model.observation import Hypothesis, SceneJet
-from femsense.model.robot import Robot
-from femsense.rig.camera import measured_points, visible_points
-from femsense.rig.scene import body_shape
-from femsense.rig.script import SceneTable
 
-MOST_SEEDS = 6
-"""Places and times of one effect that are tried; the most spread ones come first."""
 EVIDENCE = 10.0
 """dBIC from which an effect is seen, or told from another."""
 ALIKE = 0.95
-"""Effects that imitate each other by more than this share cannot be told apart."""
+"""Effects that are collinear by more than this share cannot be distinguished."""
 ABSORBED = 1e-9
-"""Share of its χ² below which a direction counts as imitated whole."""
-OFFSET_SHARE = 0.25
-"""How well the zeros are known beforehand, as a share of a cable's range."""
-
-PLAUSIBLE = {
-    ("gravity", "vector_m_s2"): 1.0,
-    ("stiffness", "scale"): 0.2,
-    ("poisson", "poisson_ratio"): 0.03,
-    ("soft_region", "scale"): 0.4,
-    ("creep", "fraction"): 0.15,
-    ("payload", "force_n"): 0.05,
-    ("cable_friction", "coefficient"): 0.15,
-    ("cable_gain", "scale"): 0.05,
-    ("cable_stretch", "stiffness_n_m"): 5e-5,
-    ("cable_slack", "displacement_m"): 5e-4,
-    ("geometry", "scale"): 0.02,
-    ("depth_scale", "scale"): 0.01,
-    ("depth_scale", "offset_m"): 2e-3,
-    ("marker_offset", "offset_m"): 5e-4,
-    ("clamped_marker", "share"): 1.0,
-}
-"""Sizes in the coordinates of the fit (logarithms, compliances): usual for cast silicone, hand-laid cables and depth cameras."""
-CLAMP_SHARE = {"stiffness_n_m": 0.01, "rotation_stiffness_nm_rad": 0.02}
-"""Plausible compliance of a clamp as a share of the largest that is tried."""
-OFFSET_PLAUSIBLE = 0.05
-"""Plausible zero of a cable as a share of its range."""
-
-
-# Forms
-
-
-def _weight_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
-    if robot.body.material.density <= 0:
-        return ()
-    return tuple(Parameter("vector_m_s2", i, "m/s²", 0.0, -12.0, 12.0, 0.05) for i in range(3))
-
-
-def _apply_weight(robot: Robot, entry: Entry) -> Robot:
-    body = robot.body
-    more = body.with_gravity(vector(entry, "vector_m_s2", "gravity")).weight()
-    return robot.with_body(body.with_dead_forces(body.dead_forces + more))
-
-
-WEIGHT = Effect("gravity", "", _weight_parameters, _apply_weight)
-"""A change of gravity as a dead force, which acts where frames say their own gravity too; it turns with the base."""
-
-
-def _one_gain(robot: Robot, control: str) -> tuple[Parameter, ...]:
-    return (Parameter("scale", None, "1", 0.0, float(np.log(0.3)), float(np.log(3.0)), 1e-3, "log"),) if robot.body.cables else ()
-
-
-def _apply_one_gain(robot: Robot, entry: Entry) -> Robot:
-    act = robot.actuation
-    return replace(robot, actuation=replace(act, gain=act.gain * number(entry, "scale", "cable_gain", low=1e-3)))
-
-
-ONE_GAIN = Effect("cable_gain", "", _one_gain, _apply_one_gain)
-"""The scales of all cables wrong by the same factor, which no per-cable difference gives away."""
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Form:
-    """An effect with a seed and its columns."""
-
-    label: str
-    """What the table calls it: the effect's name, and which form where there are two."""
-    name: str
-    effect: Effect
-    seed: Entry
-    parameters: tuple[Parameter, ...]
-    size: FloatArray
-    """Plausible size of each column, in coordinates."""
-    at: int
-    """Where its columns start."""
-
-    @property
-    def columns(self) -> slice:
-        return slice(self.at, self.at + len(self.size))
-
-
-def forms_of(robot: Robot, control: str, ranges: FloatArray, *, names: Sequence[str] | None = None) -> list[Form]:
-    """Return the forms to judge.
-
-    Arguments:
-        robot: the declared robot.
-        control: "tension" or "displacement".
-        ranges: of the cables [N] or [m], shape (a,).
-        names: effects to take; by default all.
-    """
-    result: list[Form] = []
-    at = 0
-    for effect, label in _kinds(robot):
-        seeds = effect.seeds(robot)[:MOST_SEEDS]
-        for seed in seeds if names is None or effect.name in names else []:
-            parameters = effect.parameters(robot, control)
-            if not parameters and not effect.discrete:
-                continue
-            size = np.ones(1) if effect.discrete else np.array([_plausible(effect, p, robot, ranges) for p in parameters])
-            result.append(Form(label, effect.name, effect, seed, parameters, size, at))
-            at += len(size)
-    return result
-
-
-def _kinds(robot: Robot) -> list[tuple[Effect, str]]:
-    """Return the effects with their labels, one form each and a second of two of them."""
-    result = []
-    for effect in EFFECTS:
-        label, chosen = effect.name, effect
-        if effect.name == "gravity":
-            chosen = WEIGHT
-        elif effect.name == "hyperelastic" and robot.body.material.law == "neo_hookean":
-            chosen = next(e for e in FORMS if e.name == "hyperelastic" and e is not effect)
-        result.append((chosen, label))
-        if effect.name == "base_compliance":
-            result.append((BASE_ROTATION, "base_compliance (plate)"))
-        if effect.name == "cable_gain" and len(robot.body.cables) > 1:
-            result.append((ONE_GAIN, "cable_gain (all alike)"))
-    return result
-
-
-def _plausible(effect: Effect, p: Parameter, robot: Robot, ranges: FloatArray) -> float:
-    if effect.name == "gravity":
-        return 1.0 if np.any(robot.body.gravity) else STANDARD_GRAVITY / np.sqrt(3.0)
-    if effect.name == "base_compliance":
-        return CLAMP_SHARE[p.key] * p.high
-    if effect.name == "cable_offset":
-        return OFFSET_PLAUSIBLE * float(ranges[robot.body.cable_names.index(str(p.part))])
-    return PLAUSIBLE.get((effect.name, p.key), 0.05 * (p.high - p.low))
-
-
-# Blocks
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Gram:
-    """Products of whitened columns: own ones of the recording (w of them) and shared ones (e)."""
-
-    own: FloatArray
-    """Shape (w, w)."""
-    cross: FloatArray
-    """Shape (w, e)."""
-    shared: FloatArray
-    """Shape (e, e)."""
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Block:
-    """One part of an experiment."""
-
-    recording: str
-    """Blocks of one recording share its pose."""
-    gram: Gram
-    rested: Gram | None
-    """The same with rest.csv; None where it was not asked for."""
-    placements: Gram
-    """What rest.csv says, once a recording."""
-    states: int
-    """Distinct states of markers."""
-    rows: int
-
-
-def make_block(
-    trial: Trial,
-    robot: Robot,
-    forms: Sequence[Form],
-    *,
-    recording: str,
-    noise: float,
-    turns: FloatArray | None = None,
-    see: bool = False,
-    measured: bool = False,
-    with_rest: bool = False,
-) -> Block:
-    """Return a block.
-
-    Arguments:
-        trial: inputs, loads and camera; unless `measured`, its marker positions are replaced by those of the robot.
-        robot: the declared robot.
-        forms: whose columns are wanted.
-        recording: its key.
-        noise: standard deviation of a marker's coordinate [m].
-        turns: rotation of the base in each frame, shape (F, 3, 3): gravity in the frame is that times gravity as declared.
-        see: leave out markers that the camera does not see.
-        measured: the trial's markers are real.
-        with_rest: also with rest.csv.
-
-    Raises:
-        DataError: a frame has no equilibrium.
-    """
-    trial = trial if measured else _as_expected(trial, robot)
-    jet = _jet(trial, robot)
-    rows = _seen(trial, robot, jet) if see else np.ones(len(jet.residual), dtype=bool)
-    columns, rest_columns = _columns(trial, robot, jet, forms, turns, width=max((f.columns.stop for f in forms), default=0))
-    states = len(np.unique(trial.groups.state[rows]))
-    gram, placements = _gram(_own(jet)[rows], columns[rows], noise), _placements(jet, rest_columns, noise)
-    if not with_rest:
-        return Block(recording, gram, None, placements, states, int(rows.sum()))
-    placed = _with_rest(trial, robot)
-    jet = _jet(placed, robot)
-    moved = [f for f in forms if f.name in ("geometry", "depth_scale")]  # the others leave the measured seats where they are
-    fresh, rest_columns = _columns(placed, robot, jet, moved, turns, width=columns.shape[2])
-    for f in moved:
-        columns[:, :, f.columns] = fresh[:, :, f.columns]
-    rested = _gram(_own(jet)[rows], columns[rows], noise)
-    return Block(recording, gram, rested, _placements(jet, rest_columns, noise), states, int(rows.sum()))
-
-
-def _own(jet: SceneJet) -> FloatArray:
-    return np.concatenate([jet.by_pose, jet.by_initial], axis=2)
-
-
-def _jet(trial: Trial, robot: Robot) -> SceneJet:
-    probe = JointProblem(Hypothesis(robot), Prior(np.zeros(0), np.zeros(0)), [trial], [], 1.0)
-    return probe.jet(trial, _start(trial), np.zeros(0), True)
-
-
-def _start(trial: Trial) -> FloatArray:
-    return np.concatenate([np.zeros(6 * len(trial.poses)), np.zeros(0) if trial.initial is None else trial.initial])
-
-
-def _as_expected(trial: Trial, robot: Robot) -> Trial:
-    """Return the trial with its markers where the declared robot would have the camera measure them."""
-    probe = JointProblem(Hypothesis(robot), Prior(np.zeros(0), np.zeros(0)), [trial], [], 1.0)
-    states = probe.jet(trial, _start(trial), np.zeros(0), False).states
-    places = {k: robot.markers.positions(state.positions) for k, state in states.items()}
-    scene = trial.scene
-    true = np.array([places[int(f)][m] for f, m in zip(scene.frame, scene.marker)])
-    return replace(trial, scene=replace(scene, points=measured_points(trial.poses[0], true, robot.observation)))
-
-
-def _with_rest(trial: Trial, robot: Robot) -> Trial:
-    every = np.arange(len(robot.marker_points))
-    points = measured_points(trial.poses[0], robot.marker_points, robot.observation)
-    return replace(trial, scene=replace(trial.scene, rest_marker=every, rest_view=np.zeros_like(every), rest_points=points))
-
-
-def _seen(trial: Trial, robot: Robot, jet: SceneJet) -> BoolArray:
-    """Return which rows the camera sees, shape (k,)."""
-    camera, table, scene = trial.scene.recording.cameras[0], SceneTable.model_validate({}), trial.scene
-    assert camera is not None
-    visible = {}
-    for k, state in jet.states.items():
-        shapes = [body_shape(robot, state.positions, table)]
-        visible[k] = visible_points(camera, trial.poses[0], shapes, robot.markers.positions(state.positions))
-    return np.array([visible[int(f)][m] for f, m in zip(scene.frame, scene.marker)], dtype=bool)
-
-
-def _columns(
-    trial: Trial, robot: Robot, jet: SceneJet, forms: Sequence[Form], turns: FloatArray | None, *, width: int
-) -> tuple[FloatArray, FloatArray]:
-    """Return the columns of forms at their places [m], of markers (k, c, e) and of measured seats (r, 3, e); zero where a form cannot
-    act or finds no equilibrium."""
-    result, rest = np.zeros((*jet.residual.shape, width)), np.zeros((len(jet.rest), 3, width))
-    if not forms:
-        return result, rest
-    theta = _start(trial)
-    fit = FitResult(theta, np.zeros((0, 0)), np.zeros(0), np.zeros((0, 0)), (), "")
-    base = JointFit(Hypothesis(robot), Prior(np.zeros(0), np.zeros(0)), fit, len(theta), 0.0, [jet])
-    fields = effect_fields(base, [trial], [(f.effect, f.seed, f.parameters) for f in forms])
-    where = {(id(f.effect), id(f.seed)): f for f in forms}
-    for i, (effect, seed, _) in enumerate(fields.todo):
-        form = where[id(effect), id(seed)]
-        (own,), (placements,) = fields.of(i)
-        if form.effect is WEIGHT and turns is not None:
-            own = np.einsum("kci,kij->kcj", own, turns[trial.scene.frame])
-        result[:, :, form.columns], rest[:, :, form.columns] = own, placements
-    return result, rest
-
-
-def _gram(own: FloatArray, shared: FloatArray, noise: float) -> Gram:
-    A, B = own.reshape(-1, own.shape[2]) / noise, shared.reshape(-1, shared.shape[2]) / noise
-    return Gram(A.T @ A, A.T @ B, B.T @ B)
-
-
-def _placements(jet: SceneJet, shared: FloatArray, noise: float) -> Gram:
-    """Return what measured seats say; they are trusted as markers are, but not better than 0.1 mm."""
-    r = len(jet.rest)
-    own = np.concatenate(
-        [jet.rest_by_pose.reshape(r, 3, jet.by_pose.shape[2]), np.zeros((r, 3, jet.by_initial.shape[2]))], axis=2
-    )
-    return _gram(own, shared, max(noise, 1e-4))
-
-
-def turns_of(gravity: FloatArray | None, declared: FloatArray) -> FloatArray | None:
-    """Return the smallest rotations that turn gravity as declared into that of each frame, shape (F, 3, 3); None without turns."""
-    if gravity is None:
-        return None
-    first = declared if np.any(declared) else gravity[0]
-    a = first / np.linalg.norm(first)
-    result = []
-    for g in gravity:
-        b = g / max(float(np.linalg.norm(g)), 1e-300)
-        axis = np.cross(a, b)
-        size = float(np.linalg.norm(axis))
-        spare = np.cross(a, np.eye(3)[int(np.argmin(np.abs(a)))])
-        unit = axis / size if size > 1e-9 else spare / np.linalg.norm(spare)
-        result.append(rotation_from_vector(unit * np.arctan2(size, float(a @ b))))
-    return np.array(result)
-
-
-# Judging
+"""Share of its χ² below which a direction counts as absorbed whole."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -375,7 +59,7 @@ class Identifiability:
 
     rows: tuple[Row, ...]
     confounding: FloatArray
-    """How much of effect i (row) effect j can imitate, calibration refitted, shape (r, r)."""
+    """How much of effect i (row) is collinear with effect j, calibration refitted, shape (r, r)."""
     gap: FloatArray
     """Expected dBIC of i over j where i is the truth at plausible size, shape (r, r); inf between forms of one effect."""
 
@@ -389,12 +73,12 @@ class Identifiability:
         ]
 
     def confused(self) -> list[tuple[int, int, float, float]]:
-        """Return pairs of effects that would both be seen and cannot be told apart."""
+        """Return pairs of effects that would both be seen and cannot be distinguished."""
         seen = [r.seen for r in self.rows]
         return [p for p in self.pairs() if seen[p[0]] and seen[p[1]] and (p[2] > ALIKE or p[3] < EVIDENCE)]
 
     def distinguished(self) -> tuple[int, int]:
-        """Return the number of pairs of effects that would both be seen and told apart, and of all pairs."""
+        """Return the number of pairs of effects that would both be seen and distinguished, and of all pairs."""
         pairs = self.pairs()
         seen = sum(self.rows[i].seen and self.rows[j].seen for i, j, *_ in pairs)
         return seen - len(self.confused()), len(pairs)
@@ -424,8 +108,6 @@ class Judge:
     """Judges experiments made of blocks."""
 
     forms: list[Form]
-    ranges: FloatArray
-    """Of the cables [N] or [m]; the prior of their zeros."""
     calibrated: tuple[str, ...] = NUISANCE
     _by_label: dict[str, list[int]] = field(default_factory=dict)
 
@@ -442,7 +124,7 @@ class Judge:
         """
         seen, whole = self._shared(blocks, rest)
         count = max(3.0 * sum(b.states for b in blocks), 2.0)
-        labels = [label for label in self._by_label if not (rest and label == "marker_offset")]
+        labels = [label for label, own in self._by_label.items() if not (rest and self.forms[own[0]].effect.places_markers)]
         names = len({f.name for f in self.forms if f.name not in self.calibrated})
         scale = np.sqrt(np.maximum(np.diag(whole), 1e-300))
         free = {drop: _Left(self, seen, scale, self._kept(drop), count, names) for drop in self._drops(labels)}
@@ -452,7 +134,7 @@ class Judge:
             for j, b in enumerate(rows):
                 if a.name != b.name:
                     left = free[self._dropped(a.label) | self._dropped(b.label)]
-                    confounding[i, j], gap[i, j] = left.rival(self.forms.index(a.form), self._by_label[b.label])
+                    confounding[i, j], gap[i, j] = left.alternative(self.forms.index(a.form), self._by_label[b.label])
         return Identifiability(tuple(rows), confounding, gap)
 
     def _dropped(self, label: str) -> frozenset[str]:
@@ -494,7 +176,7 @@ class _Left:
     def __init__(self, judge: Judge, shared: FloatArray, scale: FloatArray, kept: list[Form], count: float, names: int) -> None:
         self.forms, self.count, self.names = judge.forms, count, names
         N = np.concatenate([np.arange(f.at, f.at + len(f.size)) for f in kept]) if kept else np.zeros(0, dtype=np.int64)
-        prior = np.concatenate([_prior(f, judge.ranges) for f in kept]) if kept else np.zeros(0)
+        prior = np.concatenate([f.known for f in kept]) if kept else np.zeros(0)
         G = shared[np.ix_(N, N)] + np.diag(1.0 / prior**2)
         self.S = shared - shared[:, N] @ _inverse(G) @ shared[N] if len(N) else shared
         self.size = np.concatenate([f.size for f in self.forms])
@@ -509,8 +191,8 @@ class _Left:
     def dbic(self, i: int) -> float:
         return float(self.gain[i]) - self._price(self.forms[i])
 
-    def rival(self, i: int, others: list[int]) -> tuple[float, float]:
-        """Return how much of a form the best of others imitates, and the expected dBIC over it."""
+    def alternative(self, i: int, others: list[int]) -> tuple[float, float]:
+        """Return how much of a form is collinear with the best of others, and the expected dBIC over it."""
         a, gain = self.forms[i], float(self.gain[i])
         if gain <= 1e-12:
             return 0.0, 0.0
@@ -520,12 +202,6 @@ class _Left:
 
     def _price(self, f: Form) -> float:
         return penalty(len(f.parameters), f.seed, 1, self.names, self.count)
-
-
-def _prior(f: Form, ranges: FloatArray) -> FloatArray:
-    if f.name == "stiffness":
-        return np.full(len(f.size), MODULUS_STD)
-    return np.maximum(OFFSET_SHARE * np.asarray(ranges, dtype=float), 1e-9)
 
 
 def _inverse(matrix: FloatArray) -> FloatArray:
@@ -538,7 +214,7 @@ def _inverse(matrix: FloatArray) -> FloatArray:
 
 
 def _root(matrix: FloatArray, scale: FloatArray) -> FloatArray:
-    """Return R with R Rᵀ the pseudo-inverse of a block; directions that calibration imitates whole are left out."""
+    """Return R with R Rᵀ the pseudo-inverse of a block; directions that calibration absorbs whole are left out."""
     values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
     good = values > ABSORBED
     return np.asarray(vectors / scale[:, None] * np.where(good, 1.0 / np.sqrt(np.where(good, values, 1.0)), 0.0))

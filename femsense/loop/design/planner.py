@@ -1,6 +1,6 @@
 """The experiment advisor: which recording makes effects distinguishable, with the predicted confusion before and after.
 
-Columns of every item of the menu are computed once (`identifiability`); the search over experiments is linear algebra only. It starts from
+Columns of every candidate experiment are computed once (`identifiability`); the search over experiments is linear algebra only. It starts from
 the least that is worth recording, or from a recording that exists, and adds what lowers the confusion most, as long as anything
 does and the frames suffice.
 """
@@ -20,18 +20,9 @@ from femsense.core.errors import FemsenseError, InputError
 from femsense.loop.data.dataset import groups_of, marked_frames
 from femsense.loop.data.trial import Trial
 from femsense.loop.design.candidate_experiments import Element, Setup, candidate_experiments, minimal, script_of, setup_for
-from femsense.loop.design.identifiability import (
-    ALIKE,
-    EVIDENCE,
-    Block,
-    Form,
-    Identifiability,
-    Judge,
-    Row,
-    forms_of,
-    make_block,
-    turns_of,
-)
+from femsense.loop.design.experiment_blocks import Block, Form, forms_of, make_block, turns_of
+from femsense.loop.design.identifiability import ALIKE, EVIDENCE, Identifiability, Judge
+from femsense.model.effects import OF_INPUTS
 from femsense.model.observation import make_scene
 from femsense.model.recording import Recording, check_against, make_recording
 from femsense.model.robot import Robot
@@ -131,7 +122,7 @@ def plan_experiment(
         raise InputError(
             "no equilibrium on the way up", where="robot", found="; ".join(left_out), expected="a robot that its cables can bend"
         )
-    judge = Judge(forms, ranges)
+    judge = Judge(forms)
     have = [blocks[e.key] for e in start] if given is None else [_given_block(robot, given, forms, noise)]
     before = judge.judge(have)
     steps, after = _grow(
@@ -169,7 +160,7 @@ def identifiability_of_script(
         see=script.markers.occlusion,
         with_rest=script.markers.rest_file,
     )
-    return Judge(forms, ranges).judge([block], rest=script.markers.rest_file)
+    return Judge(forms).judge([block], rest=script.markers.rest_file)
 
 
 def _check(robot: Robot, noise: float) -> None:
@@ -184,14 +175,14 @@ def _forms(robot: Robot, control: str, zero: str, ranges: FloatArray) -> list[Fo
     if zero == "absolute":
         return forms
     kept, at = [], 0
-    for f in forms:  # unknown zeros are fitted with the pose
-        if f.name != "cable_offset":
+    for f in forms:  # unknown offsets are fitted with the pose
+        if f.name not in OF_INPUTS:
             kept.append(replace(f, at=at))
             at += len(f.size)
     return kept
 
 
-# Blocks of the menu
+# Blocks of the candidates
 
 
 def _blocks(
@@ -316,91 +307,23 @@ def _better(before: Identifiability, after: Identifiability) -> list[str]:
             words.append(f"{r.label} becomes testable ({100 * r.retained:.1f} → {100 * new.retained:.0f} % left by calibration)")
         elif new.seen and not r.seen:
             words.append(f"{r.label} becomes visible (dBIC {r.dbic:.0f} → {new.dbic:.0f})")
-    old = {_names(before, p): p for p in before.pairs()}
+    old = {pair_labels(before, p): p for p in before.pairs()}
     for p in after.pairs():
-        was = old.get(_names(after, p))
+        was = old.get(pair_labels(after, p))
         if (
             was is not None
             and _alike(was)
             and not _alike(p)
-            and then[_names(after, p)[0]].seen
-            and then[_names(after, p)[1]].seen
+            and then[pair_labels(after, p)[0]].seen
+            and then[pair_labels(after, p)[1]].seen
         ):
-            words.append(f"{' and '.join(_names(after, p))} come apart (dBIC gap {was[3]:.0f} → {p[3]:.0f})")
+            words.append(f"{' and '.join(pair_labels(after, p))} come apart (dBIC gap {was[3]:.0f} → {p[3]:.0f})")
     return words
 
 
-def _names(identifiability: Identifiability, pair: tuple[int, int, float, float]) -> tuple[str, str]:
+def pair_labels(identifiability: Identifiability, pair: tuple[int, int, float, float]) -> tuple[str, str]:
     return identifiability.rows[pair[0]].label, identifiability.rows[pair[1]].label
 
 
 def _alike(pair: tuple[int, int, float, float]) -> bool:
     return pair[2] > ALIKE or pair[3] < EVIDENCE
-
-
-# Documents
-
-
-def identifiability_document(identifiability: Identifiability) -> dict[str, Any]:
-    """Return what an experiment could show as plain tables."""
-    return {
-        "effects": [_row_document(r) for r in identifiability.rows],
-        "not_testable": identifiability.untestable,
-        "not_seen": identifiability.unseen,
-        "confounded": [
-            {"pair": list(_names(identifiability, p)), "cosine": p[2], "dbic_gap": p[3]} for p in identifiability.confused()
-        ],
-        "confusion": identifiability.confusion,
-        "names": [r.label for r in identifiability.rows],
-        "confounding": identifiability.confounding,
-        "dbic_gap": identifiability.gap,
-    }
-
-
-def _row_document(r: Row) -> dict[str, Any]:
-    f = r.form
-    return {
-        "name": r.label,
-        "seed": f.seed,
-        "retained_share": r.retained,
-        "dbic": r.dbic,
-        "would_be_seen": r.seen,
-        "plausible": {
-            p.label: {"change": _change(p, s), "unit": _unit(p)} for p, s in zip(f.parameters, f.size) if not f.effect.discrete
-        },
-        "smallest": {
-            p.label: {"change": _change(p, s), "unit": _unit(p)}
-            for p, s in zip(f.parameters, r.smallest)
-            if not f.effect.discrete
-        },
-    }
-
-
-def _change(p: Any, coordinate: float) -> float | None:
-    """Return a size in the effect's own unit: a relative change for scales, the stiffness itself for compliances."""
-    if not np.isfinite(coordinate):
-        return None
-    if p.scale == "log":
-        return float(np.expm1(min(coordinate, 50.0)))
-    return 1.0 / float(coordinate) if p.scale == "reciprocal" else float(coordinate)
-
-
-def _unit(p: Any) -> str:
-    return f"{p.unit} or softer" if p.scale == "reciprocal" else "share" if p.scale == "log" else str(p.unit)
-
-
-def proposal_document(proposal: Proposal) -> dict[str, Any]:
-    """Return a proposal as plain tables."""
-    brings = {s.element.key: list(s.better) for s in proposal.steps}
-    return {
-        "noise_m": proposal.noise,
-        "frames": sum(e.frames for e in proposal.elements),
-        "seconds": sum(e.seconds for e in proposal.elements),
-        "do": [
-            {"key": e.key, "words": e.words, "frames": e.frames, "seconds": e.seconds, "brings": brings.get(e.key, [])}
-            for e in proposal.elements
-        ],
-        "left_out": list(proposal.left_out),
-        "before": identifiability_document(proposal.before),
-        "after": identifiability_document(proposal.after),
-    }

@@ -21,9 +21,9 @@ from femsense.loop.data.dataset import Data
 from femsense.loop.data.trial import Trial
 from femsense.loop.fit.cross_validation import half_inverse, sweep_rows
 from femsense.loop.fit.fitted_model import FittedModel
-from femsense.loop.fit.joint_fit import GRAVITY_STD, JointFit, JointProblem, Prior
+from femsense.loop.fit.joint_fit import JointFit, JointProblem, Prior
 from femsense.loop.fit.noise_components import Noise
-from femsense.model.effects.loads import STANDARD_GRAVITY
+from femsense.model.effects.base import KnownLength, known_length
 
 RINGS, SPOKES = 160, 48
 """Directions that are looked at: rings about the estimate, close to each other near it, and places on each ring."""
@@ -38,8 +38,8 @@ def parameter_std(data: Data, fitted: FittedModel, noise: Noise, seed_std: dict[
     """Return the standard deviations of the coordinates of each effect.
 
     Arguments:
-        data, stage, noise: of the final fit.
-        seed_spread: effect → scatter of its coordinates over seeds that explain as much.
+        data, fitted, noise: of the final fit.
+        seed_std: effect → scatter of its coordinates over seeds that explain as much.
     """
     own = fitted.fit.own
     std = np.maximum.reduce(
@@ -60,10 +60,11 @@ def coordinate_std(fit: JointFit, trials: list[Trial], noise: Noise) -> FloatArr
     """Return standard deviations of the coordinates of a hypothesis about their estimates, shape (p,)."""
     growth = misfit(fit, trials, noise)
     std = growth * fit.std
-    mask = np.array([p.key == "vector_m_s2" for p in fit.hypothesis.parameters], dtype=bool)
-    if mask.sum() != 3 or np.linalg.norm(fit.coordinates[mask]) < 1e-3:
+    vector = known_length(fit.hypothesis.parameters)
+    if vector is None or vector[0].sum() != 3 or np.linalg.norm(fit.coordinates[vector[0]]) < 1e-3:
         return std
-    sphere = _over_the_sphere(fit, np.flatnonzero(mask), growth)
+    mask, length = vector
+    sphere = _over_the_sphere(fit, np.flatnonzero(mask), length, growth)
     return np.where(mask, sphere, np.maximum(std, sphere))
 
 
@@ -92,9 +93,9 @@ def _variance(std: dict[str, float]) -> float:
     return sum(v**2 for name, v in std.items() if name != "white")
 
 
-def _over_the_sphere(fit: JointFit, at: IntArray, growth: float) -> FloatArray:
-    """Return root mean squares about the estimate when gravity roams the sphere and all else follows, shape (p,)."""
-    rows = np.asarray(fit.fit.jacobian)[:-1] / growth  # the last row is what is known of gravity's size
+def _over_the_sphere(fit: JointFit, at: IntArray, length: KnownLength, growth: float) -> FloatArray:
+    """Return root mean squares about the estimate when a vector of known length roams its sphere and all else follows, shape (p,)."""
+    rows = np.asarray(fit.fit.jacobian)[:-1] / growth  # the last row is what is known of its length
     residual = np.asarray(fit.fit.residual)[:-1] / growth
     normal, slope = rows.T @ rows, rows.T @ residual
     own = np.asarray(at) + fit.own
@@ -104,9 +105,9 @@ def _over_the_sphere(fit: JointFit, at: IntArray, growth: float) -> FloatArray:
     inner = normal[np.ix_(own, own)] - normal[np.ix_(own, rest)] @ gain
     pull = slope[own] - gain.T @ slope[rest]
     towards, area = _directions(np.asarray(fit.coordinates)[at])
-    moves = STANDARD_GRAVITY * towards - np.asarray(fit.coordinates)[at]
+    moves = length.value * towards - np.asarray(fit.coordinates)[at]
     # along each direction the size is Gaussian: curvature, slope, and χ² at its best
-    curve = np.einsum("ki,ij,kj->k", towards, inner, towards) + 1.0 / GRAVITY_STD**2
+    curve = np.einsum("ki,ij,kj->k", towards, inner, towards) + 1.0 / length.std**2
     rise = np.einsum("ki,ki->k", towards, moves @ inner + pull)
     chi2 = np.einsum("ki,ki->k", moves @ inner + 2.0 * pull, moves) - rise**2 / curve
     weight = area * np.exp(-0.5 * (chi2 - chi2.min())) / np.sqrt(curve)

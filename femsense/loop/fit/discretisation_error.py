@@ -1,4 +1,4 @@
-"""What the mesh itself costs: how far a mesh of half the size would move the markers, in every state; where it is linear, quadratic elements.
+"""Discretisation error: how far a mesh of half the size would move the markers, in every state; where it is linear, quadratic elements.
 
 A residual of that shape says nothing of the robot, whatever its size: how much of it a body shows is not known (a cable that is tied to points
 sinks the deeper the finer the mesh is), but it is the same share in all sweeps, but for what directions and sweeps differ by. So it counts as
@@ -20,7 +20,7 @@ from femsense.core.errors import DataError, FemsenseError
 from femsense.core.parallel import each
 from femsense.fem.body import BodyModel
 from femsense.fem.mesh import Embedding, TetMesh, embed_points
-from femsense.loop.data.dataset import Data
+from femsense.loop.data.dataset import MESH, Data
 from femsense.loop.data.representative_states import between, representatives, state_vectors
 from femsense.loop.data.trial import Trial, normals_of, rms_of
 from femsense.loop.fit.fitted_model import FittedModel, poses_and_inputs, some_terms
@@ -51,7 +51,7 @@ PULLING = "cables", "cable_slots"
 
 
 def with_mesh_errors(data: Data, fitted: FittedModel, tried: Sequence[str]) -> Data:
-    """Return the data with the error of the mesh at a stage; without it where the mesh is huge, or linear and `discretisation` among the
+    """Return the data with the error of the mesh at a fitted model; without it where the mesh is huge, or linear and `discretisation` among the
     effects that are tried."""
     robot = fitted.fit.hypothesis.robot_at(fitted.fit.coordinates)
     train, held, known = list(data.train), list(data.held), poses_and_inputs(data, fitted.fit)
@@ -110,11 +110,11 @@ def _on_its_clamp(robot: Robot, fine: Robot) -> Robot:
 
 
 def _finer(mesh: TetMesh, tried: Sequence[str]) -> TetMesh | None:
-    """Return the mesh that tells what a mesh costs: one of half the size, or of quadratic elements where it is linear. None where that takes
+    """Return the mesh that tells the discretisation error of a mesh: one of half the size, or of quadratic elements where it is linear. None where that takes
     too long, or where a linear mesh is asked about as an effect."""
     if mesh.is_quadratic:
         return finer_mesh(mesh, None, 1) if 8 * len(mesh.tets) <= MOST_TETS else None
-    return finer_mesh(mesh, "tet10", 0) if "discretisation" not in tried and len(mesh.tets) <= MOST_TETS else None
+    return finer_mesh(mesh, "tet10", 0) if MESH.name not in tried and len(mesh.tets) <= MOST_TETS else None
 
 
 def make_finer(robot: Robot, tried: Sequence[str]) -> None:
@@ -170,7 +170,7 @@ def mesh_errors(data: Data) -> list[FloatArray]:
     return known if len(known) == len(data.train) else []
 
 
-def few_states(trial: Trial, tets: int) -> IntArray:
+def representative_frames(trial: Trial, tets: int) -> IntArray:
     """Return the frames of a trial in which the error of a mesh of so many elements would be computed, ascending."""
     frames = trial.scene.frames
     return np.asarray(frames[np.sort(_chosen(state_vectors(trial.scene.recording, frames), 8 * tets))])
@@ -189,8 +189,8 @@ def _moves(
     frames = np.unique(np.concatenate([t.scene.frames for t in trials]))
     vectors = state_vectors(recording, frames)
     chosen = _chosen(vectors, len(fine.body.mesh.tets))
-    walked = solve_path(coarse_driven, frames[chosen].tolist(), lambda r: r.markers[:0], starts=starts)
-    states = {k: state for k, state, _, _ in walked}
+    path = solve_path(coarse_driven, frames[chosen].tolist(), lambda r: r.markers[:0], starts=starts)
+    states = {k: state for k, state, _, _ in path}
     known, settled = [], []
 
     def finer_at(i: int) -> FloatArray | None:
@@ -215,7 +215,7 @@ def _chosen(vectors: FloatArray, tets: int) -> list[int]:
 
 
 def without_mesh_error(trial: Trial, residual: FloatArray, noise: Noise, *, nor_placements: bool = False) -> FloatArray:
-    """Return the residual [m], (k, c), less what of it is likeliest to be the mesh's own error; `nor_placements`: nor that of seats that turn."""
+    """Return the residual [m], (k, c), less what of it is likeliest to be the mesh's own error; `nor_placements`: nor that of placements that turn."""
     placements = noise.placements(trial.groups)
     mesh = np.zeros((*residual.shape, 0)) if trial.mesh_error is None else trial.mesh_error
     fields = np.concatenate([mesh, placements], axis=2)

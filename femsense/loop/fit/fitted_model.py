@@ -1,4 +1,4 @@
-"""Stages: a model, fitted jointly, with its error on held-out data, its noise and the fields of what it may lack."""
+"""Fitted models: a model, fitted jointly, with its error on held-out data, its noise and the fields of what it may lack."""
 
 from __future__ import annotations
 
@@ -14,13 +14,9 @@ from femsense.loop.data.trial import Trial, rms_of, spans_of
 from femsense.loop.fit.joint_fit import GAIN, JointFit, JointProblem, Prior, fit_jointly
 from femsense.loop.fit.noise_components import Noise, whiten
 from femsense.model.effects import Effect, Entry, Parameter, find_effect
+from femsense.model.effects.base import range_units
 from femsense.model.observation import Hypothesis, SceneJet, evaluate_scene
 from femsense.model.robot import Robot
-
-MODULUS_STD = 0.5
-"""How well the modulus is known beforehand, in its logarithm: a soft region in a stiff body and a stiff one in a soft body act nearly alike."""
-OFFSET_STD = 0.1
-"""How well the zero of a cable is known beforehand, as a share of its range in the recording."""
 
 ROUGHLY = 3
 """Steps of a fit that only has to come near."""
@@ -52,17 +48,19 @@ class FittedModel:
 
 
 def with_nuisance(data: Data, robot: Robot | None = None) -> tuple[Hypothesis, Prior]:
-    """Return a robot, by default that of the data, with what is always fitted along: the modulus and, where inputs are absolute, the cables' zeros."""
+    """Return a robot, by default that of the data, with what is always fitted along: the modulus and, where inputs are absolute, the input offsets."""
     terms: list[tuple[Effect, Entry, tuple[Parameter, ...]]] = []
     std: list[float] = []
     for name in NUISANCE:
         effect = find_effect(name)
         parameters = effect.parameters(data.robot, data.control)
         unknown_zero = any(t.initial is not None for t in data.train)
-        if not parameters or (name == "cable_offset" and unknown_zero):
+        if effect.calibrated is None or not parameters or (effect.calibrated.of_inputs and unknown_zero):
             continue
         terms.append((effect, {}, parameters))
-        std += [MODULUS_STD] if name == "stiffness" else [max(OFFSET_STD * float(s), 1e-9) for s in data.input_scale]
+        std += [
+            max(effect.calibrated.std * u, 1e-9) for u in range_units(parameters, data.robot.body.cable_names, data.input_scale)
+        ]
     body = data.robot if robot is None else robot
     settled = data.settled if body is data.robot else ()
     return Hypothesis(body, tuple(terms), settled), Prior(np.zeros(len(std)), np.array(std))
@@ -102,14 +100,14 @@ def fit_model(
 
 
 def jets_without(fitted: FittedModel, keep: BoolArray) -> list[SceneJet]:
-    """Return the jets of a stage with the columns of some coordinates only."""
+    """Return the jets of a fitted model with the columns of some coordinates only."""
     return [replace(j, by_effect=j.by_effect[:, :, keep], rest_by_effect=j.rest_by_effect[:, :, keep]) for j in fitted.fit.jets]
 
 
 def keeping(
     data: Data, fitted: FittedModel, names: Sequence[str], noise: Noise, *, max_iterations: int = 12, worth: float = np.inf
 ) -> FittedModel:
-    """Return a stage with some of its terms only, fitted again (roughly where χ² stays above `worth`). Raises DataError."""
+    """Return a fitted model with some of its terms only, fitted again (roughly where χ² stays above `worth`). Raises DataError."""
     hypothesis, prior, mask = some_terms(fitted, names)
     return fit_model(
         data,
@@ -125,7 +123,7 @@ def keeping(
 
 
 def with_sizes_still(data: Data, fitted: FittedModel, names: Sequence[str], noise: Noise) -> FittedModel:
-    """Return a stage with some of its terms only, which keep the sizes that they have beside all of them; poses are fitted again, to where little
+    """Return a fitted model with some of its terms only, which keep the sizes that they have beside all of them; poses are fitted again, to where little
     is left to gain. Raises DataError."""
     hypothesis, _, mask = some_terms(fitted, names)
     sizes = fitted.fit.coordinates[mask]
@@ -134,7 +132,7 @@ def with_sizes_still(data: Data, fitted: FittedModel, names: Sequence[str], nois
 
 
 def with_seeds_still(data: Data, fitted: FittedModel) -> FittedModel:
-    """Return a stage whose places and times, which were fitted along at last, are part of the seeds, as they are there.
+    """Return a fitted model whose places and times, which were fitted along at last, are part of the seeds, as they are there.
 
     A time that data see the beginning of only runs off to the end of its range where the rest is fitted again.
     """
@@ -159,7 +157,7 @@ def with_seeds_still(data: Data, fitted: FittedModel) -> FittedModel:
 
 
 def some_terms(fitted: FittedModel, names: Sequence[str]) -> tuple[Hypothesis, Prior, BoolArray]:
-    """Return the hypothesis and prior of a stage with some of its terms only, and which coordinates these have."""
+    """Return the hypothesis and prior of a fitted model with some of its terms only, and which coordinates these have."""
     terms = fitted.fit.hypothesis.terms
     mask = np.concatenate([np.full(len(p), e.name in names) for e, _, p in terms]) if terms else np.zeros(0, dtype=bool)
     hypothesis = replace(fitted.fit.hypothesis, terms=tuple(t for t in terms if t[0].name in names))
@@ -169,7 +167,7 @@ def some_terms(fitted: FittedModel, names: Sequence[str]) -> tuple[Hypothesis, P
 def roughly_keeping(
     data: Data, fitted: FittedModel, names: Sequence[str], noise: Noise, frames: Sequence[IntArray]
 ) -> FittedModel:
-    """Return a stage with some of its terms only, fitted in a few steps to some frames of each trial; nothing is held out. Raises DataError."""
+    """Return a fitted model with some of its terms only, fitted in a few steps to some frames of each trial; nothing is held out. Raises DataError."""
     hypothesis, prior, mask = some_terms(fitted, names)
     trials = [t.part(f) for t, f in zip(data.train, frames)]
     fit = fit_jointly(
@@ -186,7 +184,7 @@ def roughly_keeping(
 
 
 def found_in(fitted: FittedModel) -> list[str]:
-    """Return the effects of a stage beside what calibration may move and quadratic elements."""
+    """Return the effects of a fitted model beside what calibration may move and quadratic elements."""
     return [name for name in fitted.fit.hypothesis.names if name not in (*NUISANCE, MESH.name)]
 
 
@@ -262,7 +260,7 @@ def poses_and_inputs(data: Data, fit: JointFit) -> list[PosesAndInputs]:
 
 
 def rematched(data: Data, fitted: FittedModel, noise: Noise, *, anew: bool = False) -> Data:
-    """Return the data with what clouds round off counted anew where a stage has the surface; with `anew` it is asked again which rows there are."""
+    """Return the data with what clouds round off counted anew where a fitted model has the surface; with `anew` it is asked again which rows there are."""
     if "clouds" not in data.measured:
         return data
     robot = fitted.fit.hypothesis.robot_at(fitted.fit.coordinates)
@@ -305,7 +303,7 @@ def problem_of(data: Data, fit: JointFit, noise: Noise) -> JointProblem:
 
 
 def weighed(data: Data, fit: JointFit, noise: Noise, jets: list[SceneJet]) -> JointFit:
-    """Return a fit, from where it is, with other weights or rows (kinks are left as they are); jets: those of the rows."""
+    """Return a fit, from where it is, with other weights or rows (nonsmoothness is left as they are); jets: those of the rows."""
     residual, jacobian = problem_of(data, fit, noise).rows_of(jets, fit.fit.theta, True)
     assert jacobian is not None
     return replace(fit, fit=replace(fit.fit, residual=residual, jacobian=jacobian), chi2=float(residual @ residual), jets=jets)

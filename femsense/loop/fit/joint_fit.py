@@ -1,4 +1,4 @@
-"""The joint fit of poses, initial inputs, modulus, cable zeros and effects over several recordings."""
+"""The joint fit of poses, initial inputs, modulus, input offsets and effects over several recordings."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from femsense.core.arrays import BoolArray, FloatArray
+from femsense.core.arrays import FloatArray
 from femsense.core.errors import DataError
 from femsense.core.least_squares import FitResult, gauss_newton
 from femsense.core.local_model import Nonsmoothness
@@ -16,7 +16,7 @@ from femsense.fem.equilibrium import Equilibrium
 from femsense.loop.data.trial import States, Trial, normal_rms_of, rms_of, spans_of
 from femsense.loop.fit.noise_components import Noise, Whitener, whiten
 from femsense.loop.fit.slack_nonsmoothness import Part, joined, trial_nonsmoothness
-from femsense.model.effects.loads import STANDARD_GRAVITY
+from femsense.model.effects.base import known_length
 from femsense.model.observation import Hypothesis, SceneJet, evaluate_scene
 from femsense.model.quasi_static_path import has_given
 from femsense.model.variants import AtPoints
@@ -27,9 +27,7 @@ if TYPE_CHECKING:
 DECLARED_POSE_STD = np.array([2e-3] * 3 + [3e-4] * 3)
 """How far a declared pose is trusted [rad, m] where there are clouds alone …"""
 BESIDE_MARKERS = np.array([1e-2] * 3 + [1e-3] * 3)
-"""… and where there are markers, which tell the pose much better: with the same trust a pose that is 1 mm and ½° off would bend zeros of cables."""
-GRAVITY_STD = 0.1
-"""How far the size of gravity is known to be 9.80665 m/s² on an unknown site [m/s²]."""
+"""… and where there are markers, which tell the pose much better: with the same trust a pose that is 1 mm and ½° off would bend input offsets."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -127,7 +125,7 @@ class JointProblem:
         return np.concatenate([*low, [p.low for p in parameters]]), np.concatenate([*high, [p.high for p in parameters]])
 
     def evaluate(self, theta: FloatArray, derivative: bool) -> tuple[FloatArray, FloatArray | None]:
-        """Return whitened residual (N,) and Jacobian (N, p): markers, seats, declared poses, priors.
+        """Return whitened residual (N,) and Jacobian (N, p): markers, placements, declared poses, priors.
 
         What is asked without a derivative, once one is known, is a step that is tried: its states are solved roughly and kept only if
         the fit goes there.
@@ -272,19 +270,15 @@ class JointProblem:
         r = (coordinates - self.prior.mean)[known] / self.prior.std[known]
         J = np.zeros((len(r), width))
         J[np.arange(len(r)), self.own + np.flatnonzero(known)] = 1.0 / self.prior.std[known]
-        gravity = self.gravity_at()
-        if gravity is None or np.linalg.norm(coordinates[gravity]) < 1e-3:
+        known_vector = known_length(self.hypothesis.parameters)
+        if known_vector is None or np.linalg.norm(coordinates[known_vector[0]]) < 1e-3:
             return r, J
-        vector = coordinates[gravity]
+        at, length = known_vector
+        vector = coordinates[at]
         size = float(np.linalg.norm(vector))
         row = np.zeros((1, width))
-        row[0, self.own + np.flatnonzero(gravity)] = vector / size / GRAVITY_STD
-        return np.append(r, (size - STANDARD_GRAVITY) / GRAVITY_STD), np.vstack([J, row])
-
-    def gravity_at(self) -> BoolArray | None:
-        """Return which coordinates are the components of gravity, or None."""
-        mask = np.array([p.key == "vector_m_s2" for p in self.hypothesis.parameters], dtype=bool)
-        return mask if mask.any() else None
+        row[0, self.own + np.flatnonzero(at)] = vector / size / length.std
+        return np.append(r, (size - length.value) / length.std), np.vstack([J, row])
 
 
 def _as_near(kept: States, near: States, body: BodyModel) -> States:
@@ -338,14 +332,14 @@ def fit_jointly(
         hypothesis, prior: what is fitted, and what is known of it beforehand.
         trials: the recordings.
         noise: weights of the residuals.
-        seat_std: of seats measured by rest.csv against their declared places [m].
+        placement_std: of placements measured by rest.csv against their declared places [m].
         coordinates: start of the hypothesis, shape (p,).
         own: start of the recordings' own parameters; by default where the trials start.
         max_iterations: Gauss–Newton steps.
         known: residuals and derivatives at the start, one jet a trial, where they are known.
         near: derivatives from near the start, to begin with.
         worth: χ² above which the fit is not worth derivatives of its own at the end.
-        spare: the fit ends where a step promises to lower χ² by less than this.
+        spare: the fit ends where the predicted decrease of χ² of a step is less than this.
 
     Raises:
         DataError: no equilibrium at the start.

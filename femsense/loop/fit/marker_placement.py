@@ -1,4 +1,4 @@
-"""Seats: a marker that is glued elsewhere than declared, or a dot that is found a little beside its middle, turns with the body.
+"""Marker placement: a marker that is glued elsewhere than declared, or a dot that is found a little beside its middle, turns with the body.
 
 Where a body bends by 60°, the error of a place turns by as much: what is the same vector in all frames on the body is none in space. Taken for one, it
 leaves residuals that go with the bending, and these look like a marker that is far off, or like anything else.
@@ -22,7 +22,7 @@ from femsense.model.robot import Robot
 
 
 def with_turning_placements(data: Data, fitted: FittedModel) -> Data:
-    """Return the data with how the seats of markers turn where a stage has the body; nothing is solved."""
+    """Return the data with how the places of markers turn where a fitted model has the body; nothing is solved."""
     robot = fitted.fit.hypothesis.robot_at(fitted.fit.coordinates)
     train = [
         _turned(robot, t, poses, j.states)
@@ -33,7 +33,7 @@ def with_turning_placements(data: Data, fitted: FittedModel) -> Data:
 
 
 def _turned(robot: Robot, trial: Trial, poses: Sequence[FloatArray], states: Mapping[int, Equilibrium]) -> Trial:
-    """Return the markers of a trial with how their seats turn; clouds as they are."""
+    """Return the markers of a trial with how their places turn; clouds as they are."""
     if trial.scene.crossings is not None:
         return trial
     places = placements(robot, trial.scene, poses)

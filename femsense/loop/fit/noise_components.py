@@ -63,7 +63,7 @@ class Noise:
         return float(np.sqrt(sum(v**2 for v in self.components(groups).values())))
 
     def covariance(self, groups: Groups) -> FloatArray:
-        """Return the covariance of the rows of one axis [m²], shape (k, k), but for seats that turn."""
+        """Return the covariance of the rows of one axis [m²], shape (k, k), but for placements that turn."""
         std = self.components(groups)
         sigma = np.eye(len(groups.marker)) * std["white"] ** 2
         for name in COMPONENTS[1:]:
@@ -78,7 +78,7 @@ class Noise:
         return none if fields is None or not self.std.get("marker", 0.0) else self.std["marker"] * fields
 
     def plain_whitener(self, groups: Groups) -> Whitener:
-        """Return what whitens rows with these groups, but for seats that turn."""
+        """Return what whitens rows with these groups, but for placements that turn."""
         return Whitener(_lower(self, groups), np.zeros((0, 0)), np.zeros(0))
 
     def whitener(self, groups: Groups, error: FloatArray | None = None) -> Whitener:
@@ -217,7 +217,7 @@ class _Likelihood:
     """Minus the restricted log-likelihood of log standard deviations, with its gradient.
 
     2 L = log|V| + log|XᵀV⁻¹X| + rᵀPr,  ∂(2 L)/∂v_i = tr(P V_i) − rᵀP V_i P r,  P = V⁻¹ − V⁻¹X(XᵀV⁻¹X)⁻¹XᵀV⁻¹,  V = Σ v_i V_i, the
-    same for each axis and block-diagonal over recordings. Seats that turn are random effects u beside the fixed ones (Henderson 1975): with
+    same for each axis and block-diagonal over recordings. Placements that turn are random effects u beside the fixed ones (Henderson 1975): with
     X extended by their fields and 1/m² added to their part of the normal matrix N, all of this holds as it stands, but for n log m², and
     ∂(2 L)/∂m² = n/m² − (tr N⁻¹ᵤᵤ + |û|²)/m⁴.
     """

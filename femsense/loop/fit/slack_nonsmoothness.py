@@ -1,6 +1,6 @@
-"""Where residuals bend because a cable cannot push: tensions that zero, gain and log let come out below 0.
+"""Where residuals bend because a cable cannot push: tensions that offset, gain and log let come out below 0.
 
-Where a log says 0 for every cable that is not used, all these frames bend at once as its zero goes through 0, and a fit that believes
+Where a log says 0 for every cable that is not used, all these frames bend at once as its offset goes through 0, and a fit that believes
 in straight lines overshoots again and again. What makes them bend is known without solving anything: the tension that drives each frame.
 """
 
@@ -21,8 +21,6 @@ from femsense.model.observation import Hypothesis, SceneJet
 if TYPE_CHECKING:
     from femsense.loop.data.trial import Trial
 
-DRIVING = ("cable_offset", "cable_gain", "creep")
-"""Effects that change the tension that drives a frame, and leave the body as it is."""
 NEAR_ZERO = 0.25
 """Tensions below this share of the largest one may come to 0 in a step."""
 ALIKE = 0.01
@@ -30,7 +28,7 @@ ALIKE = 0.01
 
 
 Part = tuple[slice, IntArray, Nonsmoothness]
-"""Rows of a trial, which parameters its slopes are by, and its kinks."""
+"""Rows of a trial, which parameters its slopes are by, and its nonsmoothness."""
 
 
 def trial_nonsmoothness(
@@ -61,7 +59,7 @@ def trial_nonsmoothness(
 
 
 def joined(parts: Sequence[Part], rows: int, width: int) -> Nonsmoothness:
-    """Return the kinks of several trials together, for so many rows and parameters."""
+    """Return the nonsmoothness of several trials together, for so many rows and parameters."""
     columns, slopes = list[FloatArray](), list[FloatArray]()
     for own, by, part in parts:
         columns.append(np.zeros((rows, len(part.value))))
@@ -80,8 +78,8 @@ def _wanted(
     recording = trial.scene.recording
     poses = 6 * len(trial.poses)
     initial = None if trial.initial is None else own[poses:]
-    chosen = np.concatenate([np.full(len(p), e.name in DRIVING) for e, _, p in hypothesis.terms] or [np.zeros(0, bool)])
-    driving = replace(hypothesis, terms=tuple(t for t in hypothesis.terms if t[0].name in DRIVING))
+    chosen = np.concatenate([np.full(len(p), e.drives) for e, _, p in hypothesis.terms] or [np.zeros(0, bool)])
+    driving = replace(hypothesis, terms=tuple(t for t in hypothesis.terms if t[0].drives))
     at = coordinates[chosen]
     robot = driving.robot_at(at)
     value = inputs_wanted(robot, recording, initial)

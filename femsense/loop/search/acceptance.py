@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,9 +15,11 @@ from femsense.loop.fit.discretisation_error import mesh_errors
 from femsense.loop.fit.fitted_model import FittedModel, held_chi2, held_shift, span_of
 from femsense.loop.fit.joint_fit import JointFit
 from femsense.loop.fit.noise_components import Noise
+from femsense.loop.result.records import PASSES, RefitRecord
 from femsense.loop.search.refit import EVIDENCE, evidence
 from femsense.loop.search.screening import Candidate
 from femsense.loop.search.search_state import Refit
+from femsense.model.effects import Effect
 from femsense.model.robot import Robot
 
 ENOUGH_SPREAD = 0.5
@@ -29,7 +31,7 @@ PREDICTS = 0.25
 
 
 ABOVE_MESH = 0.5
-"""An effect must move the markers by this much of what the mesh itself costs (beyond what calibration absorbs) …"""
+"""An effect must move the markers by this much of the discretisation error (beyond what calibration absorbs) …"""
 
 
 ABOVE_MESH_IF_SURE = 0.25
@@ -37,11 +39,7 @@ ABOVE_MESH_IF_SURE = 0.25
 
 
 NOT_PLAINLY_WORSE = 1.25
-"""No effect may leave so many times the plain error where fitted: it would live on a larger share of what the mesh costs."""
-
-
-MOUNTED = np.radians(5.0)
-"""A base is mounted as it is declared to about this angle, and a declared gravity is believed as much [rad]."""
+"""No effect may leave so many times the plain error where fitted: it would live on a larger share of the discretisation error."""
 
 
 SURE = 2.5
@@ -53,36 +51,47 @@ def acceptance_test(
     fitted: FittedModel,
     candidate: Candidate,
     made: FittedModel,
-    record: dict[str, Any],
+    record: RefitRecord,
     noise: Noise,
 ) -> Refit:
+    """Return a refit with its evidence and its verdict: PASSES, or what speaks against it."""
     gain = evidence(fitted.fit, made.fit)
-    score = gain - candidate.cost - tilt_penalty(data.declared, candidate, made.fit)
-    better, spread = sweeps_predicted(data.train, fitted.fit, made.fit)
-    record |= {"dchi2": gain, "dbic": score, "validation_rms_m": made.held_rms, "cv_gain": better, "cv_std": spread}
+    score = gain - candidate.cost - prior_cost(data.declared, candidate.effect, made.fit)
+    better, std_error = sweeps_predicted(data.train, fitted.fit, made.fit)
     held = held_chi2(data, fitted, noise) - held_chi2(data, made, noise)
     acts = held_shift(
         data, fitted, made, noise
     )  # what `held` is on average for the true effect, with a variance of four times that
     wanted = min(PREDICTS * gain * held_share(data), acts - 5.0 * float(np.sqrt(acts)))
     moved, mesh = moved_by(fitted, made), discretisation_rms(data, fitted)
-    record |= {"held_dchi2": held, "moved_m": moved, "mesh_cost_m": mesh, "takes_over": _taken_over(fitted, made)}
-    surely = better > SURE * spread
+    surely = better > SURE * std_error
     if surely:
         wanted = min(wanted, 0.0)
     fit_objection = _objection(made, candidate, score)
-    if fit_objection is None and np.isfinite(spread) and better <= ENOUGH_SPREAD * spread:
-        fit_objection = f"sweeps that are left out do not speak for it ({better:+.1f} ± {spread:.1f})"
+    if fit_objection is None and np.isfinite(std_error) and better <= ENOUGH_SPREAD * std_error:
+        fit_objection = f"sweeps that are left out do not speak for it ({better:+.1f} ± {std_error:.1f})"
     if fit_objection is None and held < wanted:
         fit_objection = f"it does not predict the held-out data (χ² {_moves(held)} there, and falls by {gain:.1f} where fitted)"
     if fit_objection is None and score + held <= EVIDENCE:  # what was not fitted speaks against it
         fit_objection = f"too little evidence (dBIC {score:.1f}) where held-out data speak against it (χ² {_moves(held)} there)"
-    least = ABOVE_MESH_IF_SURE if sure_beyond_mesh(better, spread, held, gain * held_share(data)) else ABOVE_MESH
+    least = ABOVE_MESH_IF_SURE if sure_beyond_mesh(better, std_error, held, gain * held_share(data)) else ABOVE_MESH
     if fit_objection is None and moved < least * mesh:
         fit_objection = f"it moves the markers by {1e3 * moved:.3f} mm, the mesh itself by {1e3 * mesh:.3f} mm"
-    if fit_objection is None and _plainly_worse(fitted, made):
+    if fit_objection is None and plainly_worse(fitted, made):
         fit_objection = f"the plain error grows where fitted ({1e3 * fitted.fit.rms:.3f} mm, then {1e3 * made.fit.rms:.3f} mm)"
-    record["verdict"] = fit_objection or "passes"
+    record = replace(
+        record,
+        verdict=fit_objection or PASSES,
+        dchi2=gain,
+        dbic=score,
+        validation_rms_m=made.held_rms,
+        cv_gain=better,
+        cv_std=std_error,
+        held_dchi2=held,
+        moved_m=moved,
+        mesh_cost_m=mesh,
+        takes_over=_taken_over(fitted, made),
+    )
     return Refit(candidate, made, score, fitted.fit.chi2 - made.fit.chi2 - candidate.cost, record)
 
 
@@ -90,41 +99,36 @@ def _moves(decrease: float) -> str:
     return f"{'falls' if decrease >= 0.0 else 'rises'} by {abs(decrease):.1f}"
 
 
-def _plainly_worse(before: FittedModel, after: FittedModel) -> bool:
+def plainly_worse(before: FittedModel, after: FittedModel) -> bool:
     """Return whether an effect makes the plain error larger where fitted, without a smaller one on held-out data."""
     return after.fit.rms > NOT_PLAINLY_WORSE * before.fit.rms and after.held_rms > before.held_rms
 
 
-def tilt_penalty(declared: Robot, candidate: Candidate, fit: JointFit) -> float:
-    """Return −2 log of how likely it is that a declared gravity is off by the angle of the fitted one: a Student's t with four degrees."""
-    own = declared.body.gravity
-    mask = np.array([p.key == "vector_m_s2" for p in fit.hypothesis.parameters], dtype=bool)
-    if candidate.effect.name != "gravity" or not np.any(own) or mask.sum() != 3:
-        return 0.0
-    vector = fit.coordinates[mask]
-    angle = np.arctan2(np.linalg.norm(np.cross(own, vector)), own @ vector)
-    return float(5.0 * np.log1p((angle / MOUNTED) ** 2 / 4.0))
+def prior_cost(declared: Robot, effect: Effect, fit: JointFit) -> float:
+    """Return −2 log of how likely the fitted values of an effect are beforehand."""
+    return effect.prior_cost(declared, fit.coordinates[span_of(fit, effect.name)])
 
 
-def _predicts(refitted: Refit) -> float:
+def surely_predicts(refitted: Refit) -> float:
     """Return the gain on left-out sweeps less its standard error, where that is known."""
-    spread = refitted.record["cv_std"]
-    return float(refitted.record["cv_gain"] - (spread if np.isfinite(spread) else 0.0))
+    gain, std = refitted.record.cv_gain, refitted.record.cv_std
+    assert gain is not None and std is not None
+    return gain - (std if np.isfinite(std) else 0.0)
 
 
-def prior_evidence(data: Data, name: str) -> float:
-    """Return by how much dBIC an effect is ahead of its rivals beforehand: every body has weight, though the robot does not declare it."""
-    return EVIDENCE if name == "gravity" and not np.any(data.declared.body.gravity) else 0.0
+def prior_evidence(data: Data, effect: Effect) -> float:
+    """Return by how much dBIC an effect is ahead of others beforehand: every body has weight, though the robot does not declare it."""
+    return EVIDENCE if effect.expected(data.declared) else 0.0
 
 
-def sure_beyond_mesh(better: float, spread: float, held: float, expected: float) -> bool:
-    """Return whether left-out sweeps (gain ± spread) and held-out data (gain, against what is expected of them) are sure together."""
-    return better > SURE * spread and held * better > 2.0 * SURE * spread * expected
+def sure_beyond_mesh(better: float, std_error: float, held: float, expected: float) -> bool:
+    """Return whether left-out sweeps (gain ± std_error) and held-out data (gain, against what is expected of them) are sure together."""
+    return better > SURE * std_error and held * better > 2.0 * SURE * std_error * expected
 
 
-def _taken_over(before: FittedModel, after: FittedModel) -> list[str]:
+def _taken_over(before: FittedModel, after: FittedModel) -> tuple[str, ...]:
     """Return the nuisances that are significant before an effect is added, and not after."""
-    return [n for n in NUISANCE if _z(before, n) > 3.0 and _z(after, n) < 3.0]
+    return tuple(n for n in NUISANCE if _z(before, n) > 3.0 and _z(after, n) < 3.0)
 
 
 def _z(fitted: FittedModel, name: str) -> float:
@@ -144,7 +148,7 @@ def moved_by(before: FittedModel, after: FittedModel) -> float:
 
 
 def discretisation_rms(data: Data, fitted: FittedModel, *, whole: bool = False) -> float:
-    """Return what the mesh costs beyond what calibration absorbs [m], root mean square as `rms_of` has it; 0 where it is not known.
+    """Return the discretisation error beyond what calibration absorbs [m], root mean square as `rms_of` has it; 0 where it is not known.
 
     Not whole: beyond the share of it that all sweeps have in common, too, where there are several: what it may turn by and what sweeps add.
     """
@@ -168,7 +172,7 @@ def _objection(made: FittedModel, candidate: Candidate, score: float) -> str | N
     q = len(candidate.parameters)
     std = made.fit.std[len(made.fit.std) - q :]
     if score <= EVIDENCE and made.fit.fit.status == STOPPED_EARLY:
-        return "stopped early: a step promised too little"
+        return "stopped early: the predicted gain of a step was too small"
     if score <= EVIDENCE:
         return f"too little evidence (dBIC {score:.1f})"
     if not np.isfinite(std).all():

@@ -33,19 +33,19 @@ def candidates_for(
     robot = base.hypothesis.robot_at(base.coordinates)
     result = []
     for effect in forms:
-        if effect.name not in names or effect.name in present or (effect.name == "marker_offset" and has_placements):
+        if effect.name not in names or effect.name in present or (effect.places_markers and has_placements):
             continue
         for seed in effect.seeds(robot):
             parameters = effect.parameters(robot, control)
             if parameters or effect.discrete:
                 result.append((effect, seed, parameters))
-            parts = _parts(parameters)
+            parts = parts_of(parameters)
             if len(parts) > 1:
                 result += [(effect, seed, part) for part in parts]
     return result
 
 
-def _parts(parameters: tuple[Parameter, ...]) -> list[tuple[Parameter, ...]]:
+def parts_of(parameters: tuple[Parameter, ...]) -> list[tuple[Parameter, ...]]:
     """Return the parameters of each cable or marker, or of each key, by itself: an effect may be that of one of them alone."""
     parts: dict[str, list[Parameter]] = {}
     for p in parameters:
@@ -63,7 +63,7 @@ class Fields:
     raw: list[FloatArray]
     """Columns [m], one array (k, 3, Σq) a trial; a discrete alternative has one column, its whole change."""
     rest: list[FloatArray]
-    """The same of the seats that rest.csv measures [m], (r, 3, Σq) a trial."""
+    """The same of the places that rest.csv measures [m], (r, 3, Σq) a trial."""
     model: Hypothesis
     """The fitted model."""
 
@@ -83,7 +83,7 @@ class Fields:
         return Fields([self.todo[i] for i in keep], raw, rest, self.model)
 
     def of(self, i: int) -> tuple[list[FloatArray], list[FloatArray]]:
-        """Return the columns of one effect in markers and seats, one array (k, c, q) and (r, 3, q) a trial."""
+        """Return the columns of one effect in markers and placements, one array (k, c, q) and (r, 3, q) a trial."""
         spans = self._spans()
         part = slice(spans[i], spans[i + 1])
         return [block[:, :, part] for block in self.raw], [block[:, :, part] for block in self.rest]
@@ -100,7 +100,7 @@ def effect_fields(
     answers: list[Answers] | None = None,
 ) -> Fields:
     """Return what each effect does to the markers: those with parameters to first order, all of them with one factorisation a frame, or none where
-    the `answers` of each trial are known from an earlier call for this fit; discrete alternatives as a whole, each with a walk of its own."""
+    the `answers` of each trial are known from an earlier call for this fit; discrete alternatives as a whole, each with a quasi-static path of its own."""
     fixed = base.hypothesis.robot_at(base.coordinates)
     smooth = [t for t in todo if not t[0].discrete and _can_act(fixed, t)]
     every = Hypothesis(fixed, tuple(smooth))
@@ -198,8 +198,8 @@ def _starts_of(trial: Trial, fixed: Robot, robot: Robot, states: States) -> Stat
 
 def fields_of(data: Data, fitted: FittedModel, names: Sequence[str]) -> Fields:
     """Return what each effect that is not in the model yet would do to the markers."""
-    seated = any(len(t.scene.rest_marker) for t in data.train)
+    placed_at_rest = any(len(t.scene.rest_marker) for t in data.train)
     todo = candidates_for(
-        fitted.fit, data.control, forms=data.forms, names=[n for n in names if n not in NUISANCE], has_placements=seated
+        fitted.fit, data.control, forms=data.forms, names=[n for n in names if n not in NUISANCE], has_placements=placed_at_rest
     )
     return effect_fields(fitted.fit, data.train, todo)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -17,10 +16,11 @@ from femsense.core.errors import FemsenseError
 from femsense.loop.data.dataset import MESH, NUISANCE, QUADRATIC, Data
 from femsense.loop.fit.fitted_model import FittedModel, fit_model, span_of
 from femsense.loop.fit.noise_components import Noise
+from femsense.loop.result.records import NAMED, PASSES, RefitRecord
 from femsense.loop.search.acceptance import acceptance_test
 from femsense.loop.search.refit import EVIDENCE, FORGONE, beyond
 from femsense.loop.search.screening import Candidate, penalty
-from femsense.loop.search.search_state import Search
+from femsense.loop.search.search_state import Search, no_equilibrium
 from femsense.loop.search.subsampling import representative_cases
 from femsense.model.effects import Entry
 from femsense.model.robot import Robot
@@ -39,7 +39,7 @@ def with_quadratic(robot: Robot) -> Robot:
     return MESH.apply(robot, QUADRATIC)
 
 
-def need_quadratic(data: Data, search: Search, names: Sequence[str]) -> tuple[bool, list[dict[str, Any]]]:
+def need_quadratic(data: Data, search: Search, names: Sequence[str]) -> tuple[bool, list[RefitRecord]]:
     """Return whether the data miss quadratic elements where the whole model has linear ones, and what became of both kinds of mesh that were tried.
 
     Arguments:
@@ -48,17 +48,16 @@ def need_quadratic(data: Data, search: Search, names: Sequence[str]) -> tuple[bo
         names: effects that are tried.
     """
     candidate = _candidate(names, search.n_effective)
-    record: dict[str, Any] = {"name": MESH.name, "seed": QUADRATIC, "step": 1}
+    record = RefitRecord(MESH.name, QUADRATIC, step=1)
     worth = beyond(search.final.fit, FORGONE[1] * (candidate.cost + EVIDENCE) + FORGONE[0])
     try:
         without = _on(data, data.robot_as_declared, search.history[0][1], search.final, search.noise, worth=worth)
-        acceptance_test(data, without, candidate, search.final, record, search.noise)
+        record = acceptance_test(data, without, candidate, search.final, record, search.noise).record
     except FemsenseError:
-        record["verdict"] = "passes"  # without them it has no equilibrium
-    passes = record["verdict"] == "passes"
-    if passes:
-        record["verdict"] = "named"
-    return passes, [record, *(_refined(data, search, seed) for seed in MESH.seeds(data.robot_as_declared) if seed != QUADRATIC)]
+        record = replace(record, verdict=PASSES)  # without them it has no equilibrium
+    needed = record.passes
+    record = replace(record, verdict=NAMED) if needed else record
+    return needed, [record, *(_refined(data, search, seed) for seed in MESH.seeds(data.robot_as_declared) if seed != QUADRATIC)]
 
 
 def _candidate(names: Sequence[str], n_effective: float) -> Candidate:
@@ -86,17 +85,14 @@ def _on(
     return fit_model(data, hypothesis, fit.prior, noise, start, own=own, worth=worth, max_iterations=steps)
 
 
-def _refined(data: Data, search: Search, seed: Entry) -> dict[str, Any]:
+def _refined(data: Data, search: Search, seed: Entry) -> RefitRecord:
     """Return what became of refined linear elements, tried in some states."""
-    record: dict[str, Any] = {"name": MESH.name, "seed": seed, "step": 1}
     cases = representative_cases(data, search.final, search.noise)
     try:
         made = _on(
             cases.data, MESH.apply(data.robot_as_declared, seed), search.history[0][1], cases.fitted, search.noise, steps=STEPS
         )
-        record["verdict"] = (
-            f"in some of the states χ² is {made.fit.chi2:.0f}, with quadratic elements {cases.fitted.fit.chi2:.0f}"
-        )
+        verdict = f"in some of the states χ² is {made.fit.chi2:.0f}, with quadratic elements {cases.fitted.fit.chi2:.0f}"
     except FemsenseError as error:
-        record["verdict"] = f"no equilibrium: {error}"
-    return record
+        verdict = no_equilibrium(error)
+    return RefitRecord(MESH.name, seed, verdict, step=1)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -19,27 +18,31 @@ from femsense.loop.fit.fitted_model import (
 )
 from femsense.loop.fit.joint_fit import JointFit, Prior
 from femsense.loop.fit.noise_components import Noise
-from femsense.loop.search.acceptance import _predicts, acceptance_test, prior_evidence
+from femsense.loop.result.records import NAMED, RefitRecord
+from femsense.loop.search.acceptance import acceptance_test, prior_evidence, surely_predicts
 from femsense.loop.search.location_search import POLISHED, climbed, located
 from femsense.loop.search.refit import EVIDENCE, FORGONE, evidence, explains, refit, tried, with_term, within, worth_of
 from femsense.loop.search.screening import Candidate, joined, linear_gain
-from femsense.loop.search.search_state import Progress, Refit
+from femsense.loop.search.search_state import Progress, Refit, no_equilibrium
 from femsense.loop.search.subsampling import RepresentativeCases, representative_cases
 
 REFITS = 6
 """Candidates that are refitted in full nonlinearity at the first step; half as many later."""
 REFITTABLE = 0.04
-"""A candidate of which calibration leaves less than this is not refitted, unless it promises more than any other."""
+"""A candidate of which calibration leaves less than this is not refitted, unless its predicted gain is larger than any other's."""
 ALIKE = 0.95
-"""Candidates that promise this share of what the best does are refitted in the order of their cost: to the first refit all others are held up."""
+"""Candidates whose predicted gain is this share of the best's are refitted in the order of their cost: to the first refit all others are held up."""
 ALTERNATIVES = 0.5
-"""Those that promise this share are all fitted to some of the states first, where these spare time, and to all in the order of what they explain there."""
+"""Those with this share are all fitted to some of the states first, where these spare time, and to all in the order of what they explain there."""
 PREDICTED_MUCH = 8.0
 """Linear dBIC that a candidate needs to be refitted: what is small is nearly linear, so that a refit finds about as much."""
 HINTED = 0.5
-"""A richer form is tried where fields of the model without the effect promise this share of what it needs."""
+"""A richer form is tried where its predicted gain, by fields of the model without the effect, is this share of what it needs."""
 WITHIN_REACH = 0.4
 """What has this share of the best's dBIC at its seed may be ahead of it where its place is."""
+
+BEHIND = "stopped early: in some of the states another one explains more by far"
+"""Verdict on a candidate that is not refitted to all states."""
 
 MORE_STEPS = 30
 """Steps for a refit that could win and is still on its way after the first ones."""
@@ -47,32 +50,52 @@ MORE_STEPS = 30
 
 def select_next(
     data: Data, fitted: FittedModel, table: list[Candidate], noise: Noise, say: Progress
-) -> tuple[Refit | None, list[Refit], list[dict[str, Any]]]:
+) -> tuple[Refit | None, list[Refit], list[RefitRecord]]:
     """Return the effect that comes next, or None where nothing passes; others that are as good; and what became of each candidate that was
     refitted."""
-    refits: list[Refit] = []
-    records: list[dict[str, Any]] = []
     listed = shortlist(table, first=not found_in(fitted))
     if not listed:
         return None, [], []
+    refits, records = _refitted(data, fitted, listed, noise, say)
+    best = max((r.score for r in refits.values() if r.record.passes), default=np.inf)
+    refits = {i: _to_the_end(data, fitted, r, noise) if r.score > 0.5 * best - EVIDENCE else r for i, r in refits.items()}
+    if not any(r.record.passes for r in refits.values()):
+        refits = {i: _elsewhere(data, fitted, r, noise, say) for i, r in refits.items()}
+    passing = {i: r for i, r in refits.items() if r.record.passes}
+    if not passing:
+        return None, [], _updated(records, refits)
+    leading, improved = leaders(data, fitted, passing, noise, say)
+    # where evidence is close, what surely predicts better
+    first = max(leading, key=lambda i: leading[i].score + surely_predicts(leading[i]) + _ahead_beforehand(data, leading[i]))
+    close = [r for r in leading.values() if r.score > leading[first].score - EVIDENCE]
+    winner = _enriched(data, fitted, leading[first], table, noise, say).saying(NAMED)
+    ties = [r for r in close if r.candidate.effect.name != winner.candidate.effect.name]
+    records = _updated(records, refits | improved | {first: winner})
+    return winner, sorted(ties, key=lambda r: -r.score), records
+
+
+def _refitted(
+    data: Data, fitted: FittedModel, listed: Sequence[Candidate], noise: Noise, say: Progress
+) -> tuple[dict[int, Refit], list[RefitRecord]]:
+    """Return the refits of a shortlist, and what became of each candidate that was refitted: the number of a refit is that of its record."""
+    refits: dict[int, Refit] = {}
+    records: list[RefitRecord] = []
     cases = representative_cases(data, fitted, noise)
     scouts = _scouted(data, cases, listed, noise, say)
     for candidate in sorted(listed, key=lambda c: -scouts[id(c)][1] if id(c) in scouts else np.inf):
-        ahead = [r for r in refits if r.record["verdict"] == "passes" and explains(r.fitted)]
+        ahead = [r for r in refits.values() if r.record.passes and explains(r.fitted)]
         behind = candidate.score < max((0.5 * _bar(r, candidate) for r in ahead), default=-np.inf) - EVIDENCE
-        if behind and not prior_evidence(data, candidate.effect.name):
+        if behind and not prior_evidence(data, candidate.effect):
             continue  # where little is left to explain, a refit seldom gains that much on its linear score, but for a weight that cables lift
         say(f"refitting with {candidate.effect.name}")
-        record: dict[str, Any] = {"name": candidate.effect.name, "seed": candidate.seed}
-        records.append(record)
+        record = RefitRecord(candidate.effect.name, candidate.seed)
         settled = _settled(data, candidate, ahead)
         try:
             scout, _ = scouts.get(id(candidate), (None, 0.0))
-            behind, begin = _in_some_states(
-                cases, candidate, max(ahead, key=lambda r: r.score, default=None), noise, settled, scout
-            )
+            lead = max(ahead, key=lambda r: r.score, default=None)
+            behind, begin = _in_some_states(cases, candidate, lead, noise, settled, scout)
             if behind:
-                record["verdict"] = "stopped early: in some of the states another one explains more by far"
+                records.append(replace(record, verdict=BEHIND))
                 continue
             others = [
                 r.score for r in ahead if r.candidate.effect.name != candidate.effect.name
@@ -80,34 +103,39 @@ def select_next(
             wanted = max([EVIDENCE, *(score - 2.0 * EVIDENCE for score in others)])
             made = refit(data, fitted, candidate, noise, wanted=wanted, settled=settled, begin=begin)
         except FemsenseError as error:
-            record["verdict"] = f"no equilibrium: {error}"
+            records.append(replace(record, verdict=no_equilibrium(error)))
             continue
-        refits.append(acceptance_test(data, fitted, candidate, made, record, noise))
-    best = max((r.score for r in refits if r.record["verdict"] == "passes"), default=np.inf)
-    refits = [_to_the_end(data, fitted, r, noise) if r.score > 0.5 * best - EVIDENCE else r for r in refits]
-    if not any(r.record["verdict"] == "passes" for r in refits):
-        refits = [_elsewhere(data, fitted, r, noise, say) for r in refits]
-    passing = [r for r in refits if r.record["verdict"] == "passes"]
-    if not passing:
-        return None, [], records
-    leaders = _leaders(data, fitted, passing, noise, say)
-    # where evidence is close, what surely predicts better
-    winner = max(leaders, key=lambda r: r.score + _predicts(r) + prior_evidence(data, r.candidate.effect.name))
-    close = [r for r in leaders if r.score > winner.score - EVIDENCE]
-    winner = _enriched(data, fitted, winner, table, noise, say)
-    winner.record["verdict"] = "named"
-    ties = [r for r in close if r.candidate.effect.name != winner.candidate.effect.name]
-    return winner, sorted(ties, key=lambda r: -r.score), records
+        refits[len(records)] = acceptance_test(data, fitted, candidate, made, record, noise)
+        records.append(record)
+    return refits, records
 
 
-def _leaders(data: Data, fitted: FittedModel, passing: Sequence[Refit], noise: Noise, say: Progress) -> list[Refit]:
-    """Return the refits that are as good as the best but for EVIDENCE, and those that their places bring ahead of these, each with its seed improved."""
-    best = max(r.score for r in passing)
-    near = [r if "seed_std" in r.record else polished(data, fitted, r, noise, say) for r in passing if r.score > best - EVIDENCE]
-    behind = [_with_climbs(data, fitted, r, noise) for r in passing if best - EVIDENCE >= r.score > WITHIN_REACH * best]
-    moved = [polished(data, fitted, r, noise, say) for r in behind if _in_sight(r) > best]
-    ahead = max(r.score for r in near)
-    return near + [r for r in moved if r.score > ahead]
+def _updated(records: Sequence[RefitRecord], refits: Mapping[int, Refit]) -> list[RefitRecord]:
+    """Return records with those of refits in their places."""
+    return [refits[i].record if i in refits else record for i, record in enumerate(records)]
+
+
+def leaders(
+    data: Data, fitted: FittedModel, passing: Mapping[int, Refit], noise: Noise, say: Progress
+) -> tuple[dict[int, Refit], dict[int, Refit]]:
+    """Return the refits that are as good as the best but for EVIDENCE with those that their places bring ahead of these, each with its seed improved;
+    and all whose seeds were improved."""
+    best = max(r.score for r in passing.values())
+    near = {
+        i: r if r.record.seed_std is not None else polished(data, fitted, r, noise, say)
+        for i, r in passing.items()
+        if r.score > best - EVIDENCE
+    }
+    behind = {
+        i: _with_climbs(data, fitted, r, noise) for i, r in passing.items() if best - EVIDENCE >= r.score > WITHIN_REACH * best
+    }
+    moved = {i: polished(data, fitted, r, noise, say) for i, r in behind.items() if _in_sight(r) > best}
+    ahead = max(r.score for r in near.values())
+    return near | {i: r for i, r in moved.items() if r.score > ahead}, near | moved
+
+
+def _ahead_beforehand(data: Data, refitted: Refit) -> float:
+    return prior_evidence(data, refitted.candidate.effect)
 
 
 def _with_climbs(data: Data, fitted: FittedModel, refitted: Refit, noise: Noise) -> Refit:
@@ -117,7 +145,7 @@ def _with_climbs(data: Data, fitted: FittedModel, refitted: Refit, noise: Noise)
 
 
 def _in_sight(refitted: Refit) -> float:
-    """Return the dBIC of a refit where its place promises the most."""
+    """Return the dBIC of a refit at the place of the largest predicted gain."""
     more = 0.0 if refitted.climbs is None else refitted.climbs.more - 1.0
     return refitted.score + more * (refitted.score + refitted.candidate.cost)
 
@@ -148,7 +176,7 @@ def _scouted(
         made = tried(cases.data, cases.fitted, own, noise, max(EVIDENCE, lead - 2.0 * EVIDENCE))
         if made is None:  # where it does not fit, all states decide
             continue
-        score = evidence(cases.fitted.fit, made.fit) - own.cost + prior_evidence(data, candidate.effect.name)
+        score = evidence(cases.fitted.fit, made.fit) - own.cost + prior_evidence(data, candidate.effect)
         scouts[id(candidate)] = made.fit, score
         lead = max(lead, score) if explains(made) else lead
     return scouts
@@ -181,8 +209,8 @@ def _bar(ahead: Refit, candidate: Candidate) -> float:
 
 
 def _to_the_end(data: Data, fitted: FittedModel, refitted: Refit, noise: Noise) -> Refit:
-    """Return a refit that ran out of steps on its way down with more of them: rivals are compared where each of them ends, or were when a held-out
-    state does not come to rest there."""
+    """Return a refit that ran out of steps on its way down with more of them: alternatives are compared where each of them ends, or were when a held-out
+    state does not converge there."""
     fit = refitted.fitted.fit
     if fit.fit.status != "iterations":
         return refitted
@@ -207,17 +235,19 @@ def _elsewhere(data: Data, fitted: FittedModel, refitted: Refit, noise: Noise, s
     if refitted.score <= EVIDENCE or not refitted.candidate.effect.nearby(data.robot, refitted.candidate.seed):
         return refitted
     better = polished(data, fitted, refitted, noise, say)
-    return better if better is refitted else acceptance_test(data, fitted, better.candidate, better.fitted, better.record, noise)
+    if better.fitted is refitted.fitted:
+        return better
+    return acceptance_test(data, fitted, better.candidate, better.fitted, better.record, noise)
 
 
 def polished(data: Data, fitted: FittedModel, refitted: Refit, noise: Noise, say: Progress) -> Refit:
-    """Return a refit with its seed improved."""
-    made = _polish(data, fitted, refitted, noise, say)
+    """Return a refit with its seed improved, and with the scatter of its coordinates over seeds that explain as much."""
+    made, scatter = _polish(data, fitted, refitted, noise, say)
+    record = replace(refitted.record, seed_std=tuple(scatter))
     if made is refitted.fitted:
-        return refitted
+        return replace(refitted, record=record)
     score = refitted.score - evidence(fitted.fit, refitted.fitted.fit) + evidence(fitted.fit, made.fit)
-    refitted.record.update({"dbic": score, "validation_rms_m": made.held_rms})
-    return replace(refitted, fitted=made, score=score)
+    return replace(refitted, fitted=made, score=score, record=replace(record, dbic=score, validation_rms_m=made.held_rms))
 
 
 def _enriched(data: Data, fitted: FittedModel, winner: Refit, table: list[Candidate], noise: Noise, say: Progress) -> Refit:
@@ -231,13 +261,12 @@ def _enriched(data: Data, fitted: FittedModel, winner: Refit, table: list[Candid
         made = _richer(data, fitted, winner, form, noise)
         if made is None:
             continue
-        rich = acceptance_test(data, fitted, form, made, dict(winner.record), noise)
-        if rich.record["verdict"] == "passes":
+        rich = acceptance_test(data, fitted, form, made, winner.record, noise)
+        if rich.record.passes:
             rich = polished(data, fitted, rich, noise, say)
         more = evidence(winner.fitted.fit, rich.fitted.fit) - (rich.candidate.cost - winner.candidate.cost)
-        if rich.record["verdict"] == "passes" and more > EVIDENCE:
-            winner.record.update(rich.record | {"seed": form.seed})
-            winner = replace(rich, record=winner.record)
+        if rich.record.passes and more > EVIDENCE:
+            winner = replace(rich, record=replace(rich.record, seed=form.seed))
     return winner
 
 
@@ -246,7 +275,7 @@ def _with_more_markers(
 ) -> Refit:
     """Return offsets of markers with those of further markers, one after the other, as long as each has EVIDENCE: all of them at once cost too much.
     Other effects are returned as they are."""
-    alone = [c for c in table if c.effect is winner.candidate.effect] if winner.candidate.effect.name == "marker_offset" else []
+    alone = [c for c in table if c.effect is winner.candidate.effect] if winner.candidate.effect.places_markers else []
     while others := [c for c in alone if not set(c.parameters) & set(winner.candidate.parameters)]:
         problem = problem_of(data, winner.fitted.fit, noise)
         gains = [linear_gain(winner.fitted.fit, problem, c.raw, c.placements) - c.cost for c in others]
@@ -257,12 +286,11 @@ def _with_more_markers(
         made = _richer(data, fitted, winner, form, noise)
         if made is None:
             break
-        more = acceptance_test(data, fitted, form, made, dict(winner.record), noise)
+        more = acceptance_test(data, fitted, form, made, winner.record, noise)
         gain = evidence(winner.fitted.fit, made.fit)
-        if more.record["verdict"] != "passes" or gain <= form.cost - winner.candidate.cost + EVIDENCE:
+        if not more.record.passes or gain <= form.cost - winner.candidate.cost + EVIDENCE:
             break
-        winner.record.update(more.record)
-        winner = replace(more, record=winner.record)
+        winner = more
     return winner
 
 
@@ -288,8 +316,8 @@ def _richer(data: Data, fitted: FittedModel, winner: Refit, form: Candidate, noi
 
 
 def shortlist(table: list[Candidate], *, first: bool) -> list[Candidate]:
-    """Return the best candidate of each name, in its simplest form (or forms, if several are equally simple), the best first; of those that promise
-    as much, the simplest."""
+    """Return the best candidate of each name, in its simplest form (or forms, if several are equally simple), the best first; of those with
+    as large a predicted gain, the simplest."""
     most = max((c.score for c in table if c.retained >= REFITTABLE), default=np.inf)
     table = [c for c in table if c.retained >= REFITTABLE or c.score > most]
     names = list(dict.fromkeys(c.effect.name for c in table if c.score > PREDICTED_MUCH))
@@ -314,18 +342,19 @@ def _forms(table: list[Candidate], name: str) -> list[Candidate]:
 # --- polishing -------------------------------------------------------------------------------------------------------------
 
 
-def _polish(data: Data, fitted: FittedModel, winner: Refit, noise: Noise, say: Progress) -> FittedModel:
-    """Return the winner with its seed (place, radius, time) improved: first seeds near by, then fitted along."""
-    best, effect = winner.fitted, winner.candidate.effect
+def _polish(data: Data, fitted: FittedModel, winner: Refit, noise: Noise, say: Progress) -> tuple[FittedModel, Sequence[float]]:
+    """Return the winner with its seed (place, radius, time) improved, first seeds near by, then fitted along; and the scatter over the seeds."""
+    best, scatter, effect = winner.fitted, [0.0] * len(winner.candidate.parameters), winner.candidate.effect
     if effect.nearby(data.robot, winner.candidate.seed):
         say(f"looking near by for {effect.name}")
         climbs = winner.climbs or climbed(data, fitted, winner.candidate, noise)
-        best, winner.record["seed_std"] = located(data, fitted, winner.candidate, winner.fitted, climbs, noise)
-    else:
-        winner.record["seed_std"] = [0.0] * len(winner.candidate.parameters)
-    if not winner.candidate.parameters:
-        return best
-    *others, (_, seed, parameters) = best.fit.hypothesis.terms
+        best, scatter = located(data, fitted, winner.candidate, winner.fitted, climbs, noise)
+    return (_with_seed_fitted(data, best, noise, say) if winner.candidate.parameters else best), scatter
+
+
+def _with_seed_fitted(data: Data, best: FittedModel, noise: Noise, say: Progress) -> FittedModel:
+    """Return a model whose last effect has its seed fitted along, where that explains more and stays inside the bounds."""
+    *others, (effect, seed, parameters) = best.fit.hypothesis.terms
     more = effect.polish(data.robot, data.control, seed)
     if not more:
         return best

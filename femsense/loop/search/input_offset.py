@@ -1,14 +1,13 @@
-"""Cable zeros that moved, and whether an effect says better what they took.
+"""Input offsets that moved, and whether an effect says better what they took.
 
-The zeros are fitted along with everything, so that an effect competes with them only for what they leave. A camera whose distances
-are off, a load or a weight can look much like a wrong zero: the zeros then swallow it, and would be named. So the model is fitted
+The offsets are fitted along with everything, so that an effect competes with them only for what they leave. A camera whose distances
+are off, a load or a weight can look much like a wrong offset: the offsets then swallow it, and would be named. So the model is fitted
 without them, and every effect is asked what it would explain in their place.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -18,6 +17,7 @@ from femsense.loop.fit.cross_validation import sweeps_predicted
 from femsense.loop.fit.discretisation_error import beyond_mesh
 from femsense.loop.fit.fitted_model import FittedModel, held_chi2, keeping, span_of
 from femsense.loop.fit.noise_components import Noise
+from femsense.loop.result.records import NAMED, RefitRecord
 from femsense.loop.search.acceptance import (
     ABOVE_MESH_IF_SURE,
     acceptance_test,
@@ -31,15 +31,18 @@ from femsense.loop.search.forward_selection import polished, shortlist
 from femsense.loop.search.refit import EVIDENCE, evidence, refit
 from femsense.loop.search.screening import screen_model
 from femsense.loop.search.search_state import OffsetAlternative, Progress, Refit
+from femsense.model.effects import OF_INPUTS
+from femsense.model.effects.base import range_units
 
-OFFSETS = "cable_offset"
+(OFFSETS,) = OF_INPUTS
+"""The input offsets."""
 SIGNIFICANT = 3.0
 RELEVANT = 0.02
 """A nuisance that moved by more than three standard deviations and 2 % is named as an effect."""
 ABOVE_MESH = 0.75
-"""Zeros must move the markers by this much of what the mesh itself costs, which they imitate best (less where sweeps are sure, as of any effect)."""
+"""Offsets must move the markers by this much of the discretisation error (less where sweeps are sure, as of any effect)."""
 BETTER = 2.0
-"""dBIC by which an effect must be better than the zeros to take their place."""
+"""dBIC by which an effect must be better than the offsets to take their place."""
 
 
 def moved_nuisance(data: Data, fitted: FittedModel, name: str, *, relevant: float = RELEVANT) -> int:
@@ -48,18 +51,19 @@ def moved_nuisance(data: Data, fitted: FittedModel, name: str, *, relevant: floa
     values, std = fitted.fit.coordinates[part], fitted.fit.std[part]
     if not len(values):
         return 0
-    size = np.abs(values) / (1.0 if name == "stiffness" else np.maximum(data.input_scale, 1e-12))
+    parameters = next(own for effect, _, own in fitted.fit.hypothesis.terms if effect.name == name)
+    size = np.abs(values) / np.maximum(range_units(parameters, data.robot.body.cable_names, data.input_scale), 1e-12)
     return int(((np.abs(values) > SIGNIFICANT * std) & (size > relevant)).sum())
 
 
 def evidence_for_offsets(data: Data, fitted: FittedModel, without: FittedModel, n_effective: float) -> float:
-    """Return the dBIC of the zeros that moved: the others, as good as declared, cost nothing."""
+    """Return the dBIC of the offsets that moved: the others, as good as declared, cost nothing."""
     moved, count = moved_nuisance(data, fitted, OFFSETS), len(data.robot.body.cables)
     return evidence(without.fit, fitted.fit) - moved * float(np.log(n_effective)) - 2.0 * float(np.log(max(count, 1)))
 
 
 def offsets_are_evident(data: Data, fitted: FittedModel, noise: Noise, n_effective: float) -> FittedModel | None:
-    """Return the model without the zeros if it misses them, else None."""
+    """Return the model without the offsets if it misses them, else None."""
     if not moved_nuisance(data, fitted, OFFSETS):
         return None
     try:
@@ -71,9 +75,9 @@ def offsets_are_evident(data: Data, fitted: FittedModel, noise: Noise, n_effecti
     moved, declared = (beyond_mesh(data.held, s.held_residuals, noise) for s in (fitted, without))
     if moved >= declared:
         return None
-    better, spread = sweeps_predicted(data.train, without.fit, fitted.fit)
+    better, std_error = sweeps_predicted(data.train, without.fit, fitted.fit)
     held = held_chi2(data, without, noise) - held_chi2(data, fitted, noise)
-    sure = sure_beyond_mesh(better, spread, held, held_share(data) * evidence(without.fit, fitted.fit))
+    sure = sure_beyond_mesh(better, std_error, held, held_share(data) * evidence(without.fit, fitted.fit))
     return (
         without
         if moved_by(without, fitted) > (ABOVE_MESH_IF_SURE if sure else ABOVE_MESH) * discretisation_rms(data, without)
@@ -84,39 +88,39 @@ def offsets_are_evident(data: Data, fitted: FittedModel, noise: Noise, n_effecti
 def instead_of_offsets(
     data: Data, fitted: FittedModel, names: Sequence[str], noise: Noise, n_effective: float, say: Progress
 ) -> OffsetAlternative | None:
-    """Ask which effect explains what the zeros of a model explain; None where they explain nothing.
+    """Ask which effect explains what the input offsets of a model explain; None where they explain nothing.
 
-    Play of held cables does what zeros below those declared do. Of the two it is named where no zero is above: zeros err both ways.
+    Play of held cables does what offsets below those declared do. Of the two it is named where no offset is above: offsets err both ways.
     """
     without = offsets_are_evident(data, fitted, noise, n_effective)
     if without is None:
         return None
-    say("asking what else might be in the place of the cable zeros")
+    say("asking what else might be in the place of the input offsets")
     worth = evidence_for_offsets(data, fitted, without, n_effective)
     table = screen_model(data, without.fit, noise, fields_of(data, without, names), n_effective)
-    best: Refit | None = None
-    records: list[dict[str, Any]] = []
+    passing: dict[int, Refit] = {}
+    records: list[RefitRecord] = []
     for candidate in shortlist(table, first=False):
         if candidate.score < 0.5 * worth - EVIDENCE:
             continue
-        record: dict[str, Any] = {"name": candidate.effect.name, "seed": candidate.seed, "in_place_of": OFFSETS}
+        record = RefitRecord(candidate.effect.name, candidate.seed, in_place_of=OFFSETS)
         try:
             made = refit(data, without, candidate, noise)
         except FemsenseError:
             continue
         tried = acceptance_test(data, without, candidate, made, record, noise)
-        records.append(record)
-        if record["verdict"] == "passes" and (best is None or tried.score > best.score):
-            best = tried
-    if best is None:
+        passing |= {len(records): tried} if tried.record.passes else {}
+        records.append(tried.record)
+    if not passing:
         return OffsetAlternative(None, "", -np.inf, records)
-    best = polished(data, without, best, noise, say)
+    at = max(passing, key=lambda i: passing[i].score)
+    best = polished(data, without, passing[at], noise, say)
     ahead = best.score - worth
-    predicts = best.record["cv_gain"] - sweeps_predicted(data.train, without.fit, fitted.fit)[0]
+    assert best.record.cv_gain is not None
+    predicts = best.record.cv_gain - sweeps_predicted(data.train, without.fit, fitted.fit)[0]
     takes = ahead > BETTER or (ahead > -EVIDENCE and ahead + predicts > BETTER)  # where evidence is close, what predicts better
     takes = takes or (
-        best.candidate.effect.name == "cable_slack" and best.fitted.fit.chi2 < fitted.fit.chi2 + EVIDENCE
+        best.candidate.effect.mirrors(OFFSETS) and best.fitted.fit.chi2 < fitted.fit.chi2 + EVIDENCE
     )  # its mirror image
-    if takes:
-        best.record["verdict"] = "named"
+    records[at] = best.saying(NAMED).record if takes else best.record
     return OffsetAlternative(best.fitted if takes else None, best.candidate.effect.name, ahead, records)

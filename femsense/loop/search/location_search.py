@@ -119,7 +119,7 @@ def _scatter(seen: Sequence[Candidate], best: Candidate, share: float) -> list[f
 
 
 def closer(data: Data, fitted: FittedModel, noise: Noise) -> tuple[FittedModel, list[float]]:
-    """Return a stage whose last effect has moved to neighbours of its seed as long as these explain more where the body is as the effect
+    """Return a fitted model whose last effect has moved to neighbours of its seed as long as these explain more where the body is as the effect
     has bent it (what a seed does to the body before that ranks neighbours of a large effect wrongly), and by how much the step of each of
     its parameters scatters over the seeds that explain as much but for NEARLY. Some of the states show which neighbour it may be."""
     while True:
@@ -143,7 +143,7 @@ def closer(data: Data, fitted: FittedModel, noise: Noise) -> tuple[FittedModel, 
 
 
 def _seeds_instead(data: Data, fitted: FittedModel, noise: Noise, seeds: Sequence[Entry]) -> list[Candidate]:
-    """Return the last effect of a stage at other seeds as candidates in its place, to first order where the body is."""
+    """Return the last effect of a fitted model at other seeds as candidates in its place, to first order where the body is."""
     *_, (effect, _, parameters) = fitted.fit.hypothesis.terms
     fields = effect_fields(fitted.fit, data.train, [(effect, s, parameters) for s in seeds])
     return screen(without_last(fitted.fit), problem_of(data, fitted.fit, noise), fields, 100.0)
@@ -166,7 +166,7 @@ def _without(fit: JointFit, i: int) -> JointFit:
 
 
 def may_lie_elsewhere(data: Data, fitted: FittedModel, name: str, noise: Noise) -> bool:
-    """Return whether an effect of a stage, but for its place, may explain more at one of its other seeds: to first order, with the body as it is
+    """Return whether an effect of a fitted model, but for its place, may explain more at one of its other seeds: to first order, with the body as it is
     bent, as `closer` asks. Of one whose seed is no place nothing is known."""
     fit, terms = fitted.fit, fitted.fit.hypothesis.terms
     i = [effect.name for effect, _, _ in terms].index(name)
@@ -183,7 +183,7 @@ def may_lie_elsewhere(data: Data, fitted: FittedModel, name: str, noise: Noise) 
 
 
 def _moved(data: Data, fitted: FittedModel, candidate: Candidate, noise: Noise) -> FittedModel | None:
-    """Return a stage with the seed of its last effect exchanged for that of a candidate beside it, fitted again; None where that does not fit."""
+    """Return a fitted model with the seed of its last effect swapped for that of a candidate beside it, fitted again; None where that does not fit."""
     fit, q = fitted.fit, len(candidate.parameters)
     *terms, _ = fit.hypothesis.terms
     hypothesis = replace(fit.hypothesis, terms=(*terms, (candidate.effect, candidate.seed, candidate.parameters)))

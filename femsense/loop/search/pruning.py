@@ -16,7 +16,7 @@ from femsense.loop.search.search_state import Progress
 
 
 def prune(data: Data, fitted: FittedModel, noise: Noise, n_effective: float, say: Progress) -> FittedModel:
-    """Return the stage without effects that those added later have made needless (dBIC for keeping them not above 0); the place of the last one,
+    """Return the fitted model without effects that those added later have made needless (dBIC for keeping them not above 0); the place of the last one,
     which was found beside them, then moves on."""
     whole, added = fitted, found_in(fitted)
     for name in added[:-1]:

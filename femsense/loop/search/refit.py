@@ -15,7 +15,7 @@ from femsense.loop.fit.joint_fit import JointFit, Prior
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.search.screening import Candidate, jets_with
 from femsense.model.effects import Effect, Entry, Parameter
-from femsense.model.effects.loads import STANDARD_GRAVITY
+from femsense.model.effects.base import known_length
 from femsense.model.observation import Hypothesis
 
 EVIDENCE = 10.0
@@ -71,8 +71,8 @@ def refit(
     low, high = np.array([p.low for p in candidate.parameters]), np.array([p.high for p in candidate.parameters])
     start = null if candidate.effect.discrete else np.clip(_first_guess(candidate, null), low, high)
     hypothesis, prior = with_term(fitted.fit, candidate.effect, candidate.seed, candidate.parameters)
-    gravity = candidate.effect.name == "gravity"
-    free = not candidate.effect.discrete and not gravity  # for these the null is no start
+    directed = known_length(candidate.parameters) is not None
+    free = not candidate.effect.discrete and not directed  # for these the null is no start
     answer = 0.0 if candidate.effect.discrete else candidate.response @ (start - null)  # of what is fitted already
     worth = worth_of(fitted.fit, candidate, wanted, settled)
 
@@ -111,7 +111,7 @@ def refit(
             break
         if best is not None and not (free and share == 0.0 and fitted.fit.chi2 - best.fit.chi2 <= PREDICTED * candidate.gain):
             break
-    if gravity and _has_drifted(fitted) and not explains(best):
+    if directed and _has_drifted(fitted) and not explains(best):
         made = started_at(DECLARED)
         best = made if made is not None and (best is None or made.fit.chi2 <= best.fit.chi2) else best
     found = best or stopped_early
@@ -183,10 +183,11 @@ def with_term(fit: JointFit, effect: Effect, seed: Entry, parameters: tuple[Para
 
 
 def _first_guess(candidate: Candidate, null: FloatArray) -> FloatArray:
-    """Return the linear step; for gravity its direction with the size that is known."""
+    """Return the linear step; of a vector of known length its direction with that length."""
     start = null + candidate.step
-    if candidate.effect.name == "gravity":
-        start = start / max(float(np.linalg.norm(start)), 1e-9) * STANDARD_GRAVITY
+    vector = known_length(candidate.parameters)
+    if vector is not None:
+        start = start / max(float(np.linalg.norm(start)), 1e-9) * vector[1].value
     return np.asarray(start)
 
 

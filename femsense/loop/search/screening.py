@@ -1,6 +1,6 @@
-"""Screening: how much of the residual each effect explains beyond what calibration can imitate.
+"""Screening: how much of the residual each effect explains beyond what calibration can absorb.
 
-With z the whitened nuisance columns (poses, initial inputs, modulus, zeros, and the effects that are in the model already) and P the
+With z the whitened nuisance columns (poses, initial inputs, modulus, input offsets, and the effects that are in the model already) and P the
 projector on their orthogonal complement, an effect's field s is judged by P s alone (Frisch–Waugh–Lovell): it is as if every nuisance were
 refitted with it. ρ = |P s| / |s| is the share that calibration leaves.
 """
@@ -24,7 +24,7 @@ from femsense.model.effects import Effect, Entry, Parameter
 from femsense.model.observation import SceneJet
 
 TESTABLE = 0.1
-"""An effect of which calibration imitates more than 90 % cannot be tested."""
+"""An effect of which calibration absorbs more than 90 % cannot be tested."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -37,7 +37,7 @@ class Candidate:
     raw: list[FloatArray]
     """Columns in metres, one array (k, c, q) a trial."""
     placements: list[FloatArray]
-    """The same of the seats that rest.csv measures [m], (r, 3, q) a trial."""
+    """The same of the places that rest.csv measures [m], (r, 3, q) a trial."""
     columns: FloatArray
     """Whitened, nuisance projected out, shape (N, q)."""
     response: FloatArray
@@ -119,7 +119,7 @@ def screen(base: JointFit, problem: JointProblem, fields: Fields, n_effective: f
 
 
 def linear_gain(base: JointFit, problem: JointProblem, raw: list[FloatArray], placements: list[FloatArray]) -> float:
-    """Return the decrease of χ² that columns of markers and seats (see `Candidate`) promise beside a fit, without bounds."""
+    """Return the decrease of χ² that is predicted of columns of markers and placements (see `Candidate`) beside a fit, without bounds."""
     Q = _orthonormal(np.asarray(base.fit.jacobian))
     whole = _whitened(base, problem, raw, placements)
     more = _orthonormal(whole - Q @ (Q.T @ whole))
@@ -127,7 +127,7 @@ def linear_gain(base: JointFit, problem: JointProblem, raw: list[FloatArray], pl
 
 
 def _whitened(base: JointFit, problem: JointProblem, own: list[FloatArray], rest: list[FloatArray]) -> FloatArray:
-    """Return columns of markers and seats, whitened, with zeros for the other rows of the fit (declared poses and priors)."""
+    """Return columns of markers and placements, whitened, with zeros for the other rows of the fit (declared poses and priors)."""
     q = own[0].shape[2]
     result = np.zeros((len(base.fit.residual), q))
     at = 0
@@ -189,7 +189,7 @@ def one_each(table: list[Candidate]) -> list[Candidate]:
 
 
 def confounding(a: Candidate, b: Candidate) -> float:
-    """Return how much of a's field b can imitate once nuisance is projected out (the largest canonical correlation)."""
+    """Return how much of a's field is collinear with b once nuisance is projected out (the largest canonical correlation)."""
     A, B = _orthonormal(a.columns), _orthonormal(b.columns)
     if not A.size or not B.size:
         return 0.0
@@ -198,11 +198,11 @@ def confounding(a: Candidate, b: Candidate) -> float:
 
 
 APART = 3.0
-"""A marker stands apart that sits elsewhere by so many times the median of all: of seats that scatter alike one in ten thousand does."""
+"""A marker stands apart that sits elsewhere by so many times the median of all: of placements that scatter alike one in ten thousand does."""
 
 
 def jets_with(fitted: FittedModel, candidate: Candidate) -> list[SceneJet]:
-    """Return the jets of a stage with the columns of a candidate behind the others."""
+    """Return the jets of a fitted model with the columns of a candidate behind the others."""
     return [
         replace(
             jet,
@@ -227,7 +227,7 @@ def noise_of(data: Data, fitted: FittedModel, fields: Fields, before: Noise | No
         if error is not None:
             block[:, :, own : own + error.shape[2]] = error
         columns.append(np.concatenate([block, jet.by_effect], axis=2))
-        others = [c.raw[i] for c in (*apart, *(c for c in one_each(table) if c.effect.name != "marker_offset"))]
+        others = [c.raw[i] for c in (*apart, *(c for c in one_each(table) if not c.effect.places_markers))]
         extra.append(np.concatenate([np.zeros((*shape, 0)), *others], axis=2))
     groups = [t.groups for t in data.train]
     noise = Noise({}, "")
@@ -248,7 +248,7 @@ def noise_of(data: Data, fitted: FittedModel, fields: Fields, before: Noise | No
 
 def _apart(table: list[Candidate]) -> list[Candidate]:
     """Return the offsets of single markers that are much larger than most: one that sits elsewhere does not tell how well the others sit."""
-    alone = [c for c in table if c.effect.name == "marker_offset" and len({_marker(p) for p in c.parameters}) == 1]
+    alone = [c for c in table if c.effect.places_markers and len({_marker(p) for p in c.parameters}) == 1]
     size = np.array([np.linalg.norm(c.step) for c in alone])
     return [c for c, s in zip(alone, size) if s > APART * np.median(size)]
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
 
 from femsense.core.errors import FemsenseError
 from femsense.loop.data.dataset import Data
 from femsense.loop.fit.fitted_model import FittedModel
 from femsense.loop.fit.noise_components import Noise
+from femsense.loop.result.records import RefitRecord
 from femsense.loop.search.effect_fields import Fields
 from femsense.loop.search.location_search import Climbs
 from femsense.loop.search.screening import Candidate
@@ -36,7 +36,7 @@ class SearchProgress:
     """Effects that are tried."""
     quadratic: bool
     """Whether it goes on quadratic elements though linear ones are declared."""
-    refits: list[dict[str, Any]]
+    refits: list[RefitRecord]
     """What became of candidates that were refitted."""
     ties: list[Refit] = field(default_factory=list)
     """What was as good as the last effect."""
@@ -54,9 +54,9 @@ class SearchProgress:
         return len(self.history) - self.given
 
     def take_back(self, error: FemsenseError) -> None:
-        """End without the last effect, whose states do not come to rest when they are asked for again."""
-        step, back = len(self.history) - 1, {"verdict": f"no equilibrium: {error}"}
-        self.refits = [{**r, **back} if r["step"] == step and r["verdict"] == "named" else r for r in self.refits]
+        """End without the last effect, whose states do not converge when they are solved again."""
+        step, back = len(self.history) - 1, no_equilibrium(error)
+        self.refits = [replace(r, verdict=back) if r.step == step and r.is_named else r for r in self.refits]
         self.data, self.history, self.over = self.earlier, self.history[:-1], True
         self.fitted = self.history[-1][1]
 
@@ -68,7 +68,7 @@ class Search:
     before: FittedModel
     """The declared model, calibrated."""
     history: list[tuple[str, FittedModel]]
-    """("", the model with what calibration may move on the declared mesh), then each effect with the stage that added it."""
+    """("", the model with what calibration may move on the declared mesh), then each effect with the model that added it."""
     base: FittedModel
     """The model of the first screening: with what calibration may move, on quadratic elements if effects were sought with these."""
     final: FittedModel
@@ -78,12 +78,23 @@ class Search:
     """The first screening."""
     last: list[Candidate]
     """The last one."""
-    refits: list[dict[str, Any]]
+    refits: list[RefitRecord]
     in_place: OffsetAlternative | None
-    """What might be in the place of the cable zeros."""
+    """What might be in the place of the input offsets."""
 
 
 Progress = Callable[[str], None]
+"""Told in words what is going on."""
+
+
+def no_equilibrium(error: FemsenseError) -> str:
+    """Return the verdict on a refit that fails."""
+    return f"no equilibrium: {error}"
+
+
+def at_step(records: Iterable[RefitRecord], step: int) -> list[RefitRecord]:
+    """Return records of what was tried on the model of a step."""
+    return [replace(record, step=step) for record in records]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -96,10 +107,14 @@ class Refit:
     """dBIC of the nonlinear fit."""
     gain: float
     """Decrease of χ² less the cost: as linear scores are."""
-    record: dict[str, Any]
+    record: RefitRecord
     """What the report says of it."""
     climbs: Climbs | None = None
     """Where its place may lie instead, once that is asked."""
+
+    def saying(self, verdict: str) -> Refit:
+        """Return it with another verdict in its record."""
+        return replace(self, record=replace(self.record, verdict=verdict))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -107,9 +122,9 @@ class OffsetAlternative:
     """What became of the question."""
 
     fitted: FittedModel | None
-    """A model with an effect in the place of the zeros, where that is better."""
+    """A model with an effect in the place of the input offsets, where that is better."""
     name: str
     """The effect that is best in their place; empty: none passes."""
     ahead: float
-    """dBIC of that effect less that of the zeros."""
-    records: list[dict[str, Any]]
+    """dBIC of that effect less that of the input offsets."""
+    records: list[RefitRecord]

@@ -1,4 +1,4 @@
-"""Some states that speak for all: where meshes are large, they show the way to places, and which rivals cannot win."""
+"""Some states that speak for all: where meshes are large, they show the way to places, and which alternatives cannot win."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from femsense.model.observation import Hypothesis
 from femsense.model.robot import Robot
 
 SPARED = 0.6
-"""They are no more than this share of all, or rivals are fitted on all at once."""
+"""They are no more than this share of all, or alternatives are fitted on all at once."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RepresentativeCases:
-    """What a stage makes of some of its states."""
+    """What a fitted model makes of some of its states."""
 
     data: Data
     """Nothing is held out."""
@@ -75,7 +75,7 @@ def _chosen(data: Data, robot: Robot) -> tuple[list[IntArray], float]:
 
 
 def representative_cases(data: Data, fitted: FittedModel, noise: Noise) -> RepresentativeCases:
-    """Return some states of a stage that differ as much as they can, or all of them where these are not too much work."""
+    """Return some states of a fitted model that differ as much as they can, or all of them where these are not too much work."""
     robot = fitted.fit.hypothesis.robot_at(fitted.fit.coordinates)
     frames, share = _chosen(data, robot)
     rows = [np.isin(t.scene.frame, cases) for t, cases in zip(data.train, frames)]

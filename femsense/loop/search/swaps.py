@@ -1,80 +1,79 @@
-"""Ask of each effect, when another one was found, whether a rival of it, or it itself elsewhere, is better now.
+"""Ask of each effect, when another one was found, whether an alternative to it, or it itself elsewhere, is better now.
 
 What is named first is chosen while the others are still missing, and may have won by what it took of theirs: a tilted gravity instead
 of a payload as long as a scale of depth is missing, say, or a soft region in the wrong place as long as friction is. A step that
-exchanges one is what growing and pruning alone lack.
+swaps one is what selection and pruning alone lack.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import replace
 
 from femsense.core.errors import FemsenseError
 from femsense.loop.data.dataset import NUISANCE, Data
 from femsense.loop.fit.fitted_model import FittedModel, keeping
 from femsense.loop.fit.noise_components import Noise
-from femsense.loop.search.acceptance import acceptance_test, prior_evidence, tilt_penalty
+from femsense.loop.result.records import NAMED, PASSES, RefitRecord
+from femsense.loop.search.acceptance import acceptance_test, prior_cost, prior_evidence
 from femsense.loop.search.effect_fields import fields_of
 from femsense.loop.search.forward_selection import polished, shortlist
 from femsense.loop.search.location_search import may_lie_elsewhere
 from femsense.loop.search.refit import EVIDENCE, evidence, refit
 from femsense.loop.search.screening import Candidate, screen_model
-from femsense.loop.search.search_state import Progress, Refit
+from femsense.loop.search.search_state import Progress, Refit, at_step
 
 ALTERNATIVES = 2
-"""So many rivals of an effect are asked."""
+"""So many alternatives to an effect are tried."""
 NEAR = 0.75
-"""A rival had this share of the evidence of the effect at least when that was named."""
+"""An alternative had this share of the evidence of the effect at least when that was named."""
 BETTER = 2.0
-"""dBIC by which a rival must be better; it takes EVIDENCE in the place of gravity where none is declared, since every body has weight."""
+"""dBIC by which an alternative must be better; it takes EVIDENCE in the place of gravity where none is declared, since every body has weight."""
 
 History = list[tuple[str, FittedModel]]
-Records = list[dict[str, Any]]
 
 
 def swapped(
-    data: Data, history: History, refits: Records, noise: Noise, n_effective: float, say: Progress
-) -> tuple[History, Records]:
-    """Return the history with rivals in the places of effects, but for the last one, that they beat in the whole model, and the
+    data: Data, history: History, refits: list[RefitRecord], noise: Noise, n_effective: float, say: Progress
+) -> tuple[History, list[RefitRecord]]:
+    """Return the history with alternatives in the places of effects, but for the last one, that they beat in the whole model, and the
     refits with what became of those that were asked."""
     for name in [name for name, _ in history[1:-1]]:
         fitted = history[-1][1]
-        rivals = _rivals(fitted, refits, name)
-        if not rivals or (rivals == [name] and not may_lie_elsewhere(data, fitted, name, noise)):
+        alternatives = _alternatives(fitted, refits, name)
+        if not alternatives or (alternatives == [name] and not may_lie_elsewhere(data, fitted, name, noise)):
             continue
-        say(f"refitting {' or '.join(rivals)} in the place of {name}")
+        say(f"refitting {' or '.join(alternatives)} in the place of {name}")
         try:
             without = keeping(data, fitted, [n for n in fitted.fit.hypothesis.names if n != name], noise)
-            best, records = _best(data, fitted, without, name, rivals, noise, n_effective, say)
+            best, records = _best(data, fitted, without, name, alternatives, noise, n_effective, say)
             if best is not None:
                 history = [*_without(data, history, without, name, noise), (best.candidate.effect.name, best.fitted)]
         except FemsenseError:
             continue
         if best is not None:
-            refits = [{**r, "verdict": "passes"} if r["name"] == name and r["verdict"] == "named" else r for r in refits]
-            best.record["verdict"] = "named"
-        refits = [*refits, *({**r, "step": len(history) - 1} for r in records)]
+            refits = [replace(r, verdict=PASSES) if r.name == name and r.is_named else r for r in refits]
+            records = [replace(r, verdict=NAMED) if r is best.record else r for r in records]
+        refits = [*refits, *at_step(records, len(history) - 1)]
     return history, refits
 
 
-def _rivals(fitted: FittedModel, refits: Records, name: str) -> list[str]:
+def _alternatives(fitted: FittedModel, refits: Sequence[RefitRecord], name: str) -> list[str]:
     """Return the effects that were nearly as good when one was named, the best first; the effect itself if its seed was chosen from many."""
     seeds = {effect.name: seed for effect, seed, parameters in fitted.fit.hypothesis.terms if parameters}
-    named = [r for r in refits if r["name"] == name and r["verdict"] == "named"]
+    named = [r for r in refits if r.name == name and r.is_named]
     if name not in seeds or not named:
         return []
     own = named[-1]
     near = [
         r
         for r in refits
-        if r["step"] == own["step"]
-        and r["verdict"] == "passes"
-        and r.get("in_place_of") == own.get("in_place_of")
-        and r["dbic"] > NEAR * own["dbic"] - EVIDENCE
-        and r["name"] not in fitted.fit.hypothesis.names
+        if r.answers_as(own)
+        and r.passes
+        and r.evidence > NEAR * own.evidence - EVIDENCE
+        and r.name not in fitted.fit.hypothesis.names
     ]
-    others = list(dict.fromkeys(r["name"] for r in sorted(near, key=lambda r: -r["dbic"])))
+    others = list(dict.fromkeys(r.name for r in sorted(near, key=lambda r: -r.evidence)))
     return [name] * bool(seeds[name]) + others[:ALTERNATIVES]
 
 
@@ -83,31 +82,32 @@ def _best(
     fitted: FittedModel,
     without: FittedModel,
     name: str,
-    rivals: list[str],
+    alternatives: list[str],
     noise: Noise,
     n_effective: float,
     say: Progress,
-) -> tuple[Refit | None, Records]:
-    """Return the best rival if it is better than what is named, and what became of each."""
-    table = screen_model(data, without.fit, noise, fields_of(data, without, [name, *rivals]), n_effective)
+) -> tuple[Refit | None, list[RefitRecord]]:
+    """Return the best alternative if it is better than what is named, and what became of each."""
+    table = screen_model(data, without.fit, noise, fields_of(data, without, [name, *alternatives]), n_effective)
     own = _same(table, fitted, name)
     if own is None:
         return None, []
-    worth = evidence(without.fit, fitted.fit) - own.cost - tilt_penalty(data.declared, own, fitted.fit)
-    records: Records = [{"name": name, "seed": own.seed, "in_place_of": name, "dbic": worth, "verdict": "passes"}]
-    margin = max(BETTER, prior_evidence(data, name))
+    worth = evidence(without.fit, fitted.fit) - own.cost - prior_cost(data.declared, own.effect, fitted.fit)
+    records = [RefitRecord(name, own.seed, PASSES, in_place_of=name, dbic=worth)]
+    margin = max(BETTER, prior_evidence(data, own.effect))
     best: Refit | None = None
-    for candidate in shortlist([c for c in table if c.effect.name in rivals], first=True):
-        record: dict[str, Any] = {"name": candidate.effect.name, "seed": candidate.seed, "in_place_of": name}
+    for candidate in shortlist([c for c in table if c.effect.name in alternatives], first=True):
+        record = RefitRecord(candidate.effect.name, candidate.seed, in_place_of=name)
         try:
             made = refit(data, without, candidate, noise)
         except FemsenseError:
             continue
         tried = acceptance_test(data, without, candidate, made, record, noise)
-        if record["verdict"] == "passes":
-            tried = polished(data, without, tried, noise, say)
-            records.append(record)
-        if record["verdict"] == "passes" and tried.score > (worth + margin if best is None else best.score):
+        if not tried.record.passes:
+            continue
+        tried = polished(data, without, tried, noise, say)
+        records.append(tried.record)
+        if tried.score > (worth + margin if best is None else best.score):
             best = tried
     return best, records
 

@@ -1,1 +1,1 @@
-"""What the search shows: the verdict, what is handed back, what cannot be told apart."""
+"""What the search shows: the verdict, what is handed back, what cannot be distinguished."""

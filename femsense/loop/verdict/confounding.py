@@ -1,89 +1,91 @@
-"""What these data cannot tell apart: refits with as much evidence, fields that agree, and effects that a named nuisance imitates."""
+"""What these data cannot distinguish: refits with as much evidence, fields that agree, and effects that are collinear with a named nuisance."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
 
 from femsense.loop.data.dataset import NUISANCE
 from femsense.loop.fit.fitted_model import span_of
+from femsense.loop.result.records import ConfoundedPair, RefitRecord
+from femsense.loop.search.input_offset import OFFSETS
 from femsense.loop.search.refit import EVIDENCE
 from femsense.loop.search.screening import TESTABLE, confounding, one_each
 from femsense.loop.search.search_state import Search
 
 MOSTLY = 0.9
-"""Share of an effect's field, beyond poses, that a named nuisance imitates on its own where the two are said together."""
+"""Share of an effect's field, beyond poses, that is collinear with a named nuisance alone where the two are said together."""
 ALIKE = 0.95
 """Fields that agree so well are said to be alike …"""
 REFUTED = 0.5
-"""… unless a refit in the place of the named one brought less than this share of its evidence (what bends may tell them apart) …"""
+"""… unless a refit in the place of the named one brought less than this share of its evidence (what bends may distinguish them) …"""
 NEXT_TO_NOTHING = 0.05
 """… or one explains less than this share of what the other does, to first order (it would need a sign that it cannot have)."""
 MOST_NUMBERS = 6
-"""An effect with more parameters imitates much, which says little."""
+"""An effect with more parameters is collinear with much, which says little."""
 
 
-def confounded(search: Search, names: Sequence[str]) -> list[dict[str, Any]]:
-    """Return pairs that these data cannot tell apart, those of what is named first: {pair, and what is known of dbic_gap, absorbed_share, cosine}."""
-    found: dict[frozenset[str], dict[str, Any]] = {}
-    for a, b, what, value in (
-        *_as_evident(search, names),
-        *_imitated(search, names),
-        *_gain_of_all(search, names),
-        *_alike(search, names),
-    ):
-        pair = found.setdefault(frozenset((a, b)), {"pair": [a, b]})
-        pair[what] = min(value, pair.get(what, value)) if what == "dbic_gap" else max(value, pair.get(what, value))
-    return sorted(found.values(), key=lambda pair: not set(pair["pair"]) & set(names))
+def confounded(search: Search, names: Sequence[str]) -> list[ConfoundedPair]:
+    """Return pairs that these data cannot distinguish, those of what is named first."""
+    found: dict[frozenset[str], ConfoundedPair] = {}
+    for pair in (*_as_evident(search, names), *_absorbed(search, names), *_in_common(search, names), *_alike(search, names)):
+        key = frozenset(pair.pair)
+        found[key] = _merged(found[key], pair) if key in found else pair
+    return sorted(found.values(), key=lambda pair: not set(pair.pair) & set(names))
 
 
-def in_words(pairs: Iterable[dict[str, Any]], names: Sequence[str]) -> str:
-    """Return a sentence on what might be in the place of what is named, by refits or by what calibration imitates; nothing where there is nothing."""
+def _merged(a: ConfoundedPair, b: ConfoundedPair) -> ConfoundedPair:
+    """Return what two findings say of a pair: the smaller gap, and the larger shares."""
+
+    def chosen(of: Callable[[Iterable[float]], float], *values: float | None) -> float | None:
+        known = [v for v in values if v is not None]
+        return of(known) if known else None
+
+    return ConfoundedPair(
+        a.pair,
+        chosen(min, a.dbic_gap, b.dbic_gap),
+        chosen(max, a.absorbed_share, b.absorbed_share),
+        chosen(max, a.cosine, b.cosine),
+    )
+
+
+def in_words(pairs: Iterable[ConfoundedPair], names: Sequence[str]) -> str:
+    """Return a sentence on what might be in the place of what is named, by refits or by what calibration absorbs; nothing where there is nothing."""
     instead: dict[str, list[str]] = {}
-    for pair in pairs:
-        for own, other in (pair["pair"], pair["pair"][::-1]):
-            if own in names and other not in names and ("dbic_gap" in pair or "absorbed_share" in pair):
+    for pair in (p for p in pairs if p.dbic_gap is not None or p.absorbed_share is not None):
+        for own, other in (pair.pair, pair.pair[::-1]):
+            if own in names and other not in names:
                 instead.setdefault(own, []).append(other)
     said = [f"{own} from {' or '.join(others)}" for own, others in instead.items()]
     return f" These data do not tell {', nor '.join(said)}." if said else ""
 
 
-Alike = tuple[str, str, str, float]
-"""Two effects, what is known of them, and its value."""
-
-
-def _as_evident(search: Search, names: Sequence[str]) -> Iterator[Alike]:
+def _as_evident(search: Search, names: Sequence[str]) -> Iterator[ConfoundedPair]:
     """Yield the effects whose refits are within EVIDENCE of a named one's, or make a named nuisance needless with as much evidence."""
-    for own in _named(search, names):
+    ours = _named(search, names)
+    for own in ours:
         for r in search.refits:
-            passes = r["name"] not in names and r.get("verdict") == "passes"
-            if passes and _same_question(own, r) and r["dbic"] > own["dbic"] - EVIDENCE:
-                yield own["name"], r["name"], "dbic_gap", float(own["dbic"] - r["dbic"])
+            if r.name not in names and r.passes and r.answers_as(own) and r.evidence > own.evidence - EVIDENCE:
+                yield ConfoundedPair((own.name, r.name), dbic_gap=own.evidence - r.evidence)
     for name in (n for n in names if n in NUISANCE):
-        for r in (r for r in search.refits if name in r.get("takes_over", []) and r["name"] not in names):
-            ahead = max((own["dbic"] for own in _named(search, names) if _same_question(own, r)), default=0.0)
-            if r["dbic"] > max(EVIDENCE, ahead - EVIDENCE):
-                yield name, r["name"], "dbic_gap", float(max(ahead - r["dbic"], 0.0))
+        for r in (r for r in search.refits if name in (r.takes_over or ()) and r.name not in names):
+            ahead = max((own.evidence for own in ours if own.answers_as(r)), default=0.0)
+            if r.evidence > max(EVIDENCE, ahead - EVIDENCE):
+                yield ConfoundedPair((name, r.name), dbic_gap=max(ahead - r.evidence, 0.0))
     swap = search.in_place
-    if swap is not None and abs(swap.ahead) < EVIDENCE and {"cable_offset", swap.name} & set(names):
-        yield "cable_offset", swap.name, "dbic_gap", abs(swap.ahead)
+    if swap is not None and abs(swap.ahead) < EVIDENCE and {OFFSETS, swap.name} & set(names):
+        yield ConfoundedPair((OFFSETS, swap.name), dbic_gap=abs(swap.ahead))
 
 
-def _named(search: Search, names: Sequence[str]) -> list[dict[str, Any]]:
-    """Return the refits of what is named, but for a mesh without which nothing comes to rest: that has no dBIC."""
-    ours = [r for r in search.refits if r["name"] in names and "dbic" in r]
-    return [r for r in ours if r.get("verdict") == "named" or r.get("in_place_of") == r["name"]]
+def _named(search: Search, names: Sequence[str]) -> list[RefitRecord]:
+    """Return the refits of what is named, but for a mesh without which nothing converges: that has no dBIC."""
+    ours = [r for r in search.refits if r.name in names and r.dbic is not None]
+    return [r for r in ours if r.is_named or r.in_place_of == r.name]
 
 
-def _same_question(a: dict[str, Any], b: dict[str, Any]) -> bool:
-    """Return whether two refits were made on top of the same model."""
-    return (a["step"], a.get("in_place_of")) == (b["step"], b.get("in_place_of"))
-
-
-def _imitated(search: Search, names: Sequence[str]) -> Iterator[Alike]:
-    """Yield the effects that this recording cannot test because one named nuisance imitates most of each, with the share that calibration absorbs."""
+def _absorbed(search: Search, names: Sequence[str]) -> Iterator[ConfoundedPair]:
+    """Yield the effects that this recording cannot test because most of each is collinear with one named nuisance, with the share that calibration absorbs."""
     fit = search.base.fit
     J = np.asarray(fit.fit.jacobian)
     poses = np.linalg.qr(J[:, : fit.own])[0]
@@ -97,28 +99,37 @@ def _imitated(search: Search, names: Sequence[str]) -> Iterator[Alike]:
             whole = whole - poses @ (poses.T @ whole)
             left = whole - own @ np.linalg.lstsq(own, whole, rcond=None)[0]
             if np.linalg.norm(left) < (1.0 - MOSTLY**2) ** 0.5 * np.linalg.norm(whole):
-                yield name, c.effect.name, "absorbed_share", float(np.sqrt(1.0 - c.retained**2))
+                yield ConfoundedPair((name, c.effect.name), absorbed_share=float(np.sqrt(1.0 - c.retained**2)))
 
 
-def _gain_of_all(search: Search, names: Sequence[str]) -> Iterator[Alike]:
-    """Yield a named modulus and the gain that all cables may have in common, where calibration imitates that: a gain of one cable alone it does not."""
-    gains = [c for c in search.first if c.effect.name == "cable_gain" and len(c.parameters) > 1]
-    if "stiffness" not in names or "cable_gain" in search.final.fit.hypothesis.names or not gains:
-        return
-    fit, widest = search.base.fit, max(gains, key=lambda c: len(c.parameters))
+def _in_common(search: Search, names: Sequence[str]) -> Iterator[ConfoundedPair]:
+    """Yield a named nuisance and what looks like it where all its parameters move alike (a modulus, and a gain that all cables have in common), where
+    calibration absorbs that: one parameter alone, as the gain of one cable, it does not."""
+    for effect in {c.effect.name: c.effect for c in search.first if len(c.parameters) > 1}.values():
+        for alias in effect.aliases if effect.name not in search.final.fit.hypothesis.names else ():
+            if alias.common and alias.name in names:
+                yield from _common(search, alias.name, effect.name)
+
+
+def _common(search: Search, own: str, other: str) -> Iterator[ConfoundedPair]:
+    """Yield a named nuisance with an effect whose parameters move alike, if calibration absorbs that."""
+    forms = [c for c in search.first if c.effect.name == other and len(c.parameters) > 1]
+    fit, widest = search.base.fit, max(forms, key=lambda c: len(c.parameters))
     poses = np.linalg.qr(np.asarray(fit.fit.jacobian)[:, : fit.own])[0]
     left = widest.columns.sum(axis=1)
     whole = left - np.asarray(fit.fit.jacobian) @ widest.response.sum(axis=1)
     size = float(np.linalg.norm(whole - poses @ (poses.T @ whole)))
     retained = float(np.linalg.norm(left)) / size if size > 0.0 else 1.0
     if retained < TESTABLE:
-        yield "stiffness", "cable_gain", "absorbed_share", float(np.sqrt(1.0 - retained**2))
+        yield ConfoundedPair((own, other), absorbed_share=float(np.sqrt(1.0 - retained**2)))
 
 
-def _alike(search: Search, names: Sequence[str]) -> Iterator[Alike]:
+def _alike(search: Search, names: Sequence[str]) -> Iterator[ConfoundedPair]:
     """Yield the effects whose fields agree, once what calibration may move is projected out."""
-    if {"cable_offset", "cable_slack"} & set(names) and any(c.effect.name == "cable_slack" for c in search.first):
-        yield "cable_offset", "cable_slack", "cosine", 1.0  # play is a negative zero of the displacement
+    for effect in (c.effect for c in one_each(search.first)):  # play is a negative offset of the displacement
+        for alias in effect.aliases:
+            if effect.mirrors(alias.name) and {alias.name, effect.name} & set(names):
+                yield ConfoundedPair((alias.name, effect.name), cosine=1.0)
     ones = [c for c in one_each(search.first) if c.retained >= TESTABLE and len(c.parameters) <= MOST_NUMBERS]
     for i, a in enumerate(ones):
         for b in ones[i + 1 :]:
@@ -126,14 +137,14 @@ def _alike(search: Search, names: Sequence[str]) -> Iterator[Alike]:
             pair = a.effect.name, b.effect.name
             apart = min(a.gain, b.gain) < NEXT_TO_NOTHING * max(a.gain, b.gain) and max(a.gain, b.gain) > EVIDENCE
             if share > ALIKE and not (apart or _is_refuted(search, names, *pair) or _is_refuted(search, names, *pair[::-1])):
-                yield *pair, "cosine", share
+                yield ConfoundedPair(pair, cosine=share)
 
 
 def _is_refuted(search: Search, names: Sequence[str], own: str, other: str) -> bool:
     """Return whether refits of another effect in the place of a named one brought much less."""
-    for named in (r for r in _named(search, names) if r["name"] == own and r.get("verdict") == "named"):
-        there = [r for r in search.refits if r["name"] == other and _same_question(named, r)]
-        tried = [r["dbic"] for r in there if np.isfinite(r.get("dbic", np.nan))]  # one that was stopped early early has none
-        if tried and max(tried) < REFUTED * named["dbic"]:
+    for named in (r for r in _named(search, names) if r.name == own and r.is_named):
+        there = [r.evidence for r in search.refits if r.name == other and r.answers_as(named)]
+        tried = [dbic for dbic in there if np.isfinite(dbic)]  # one that was stopped early has none
+        if tried and max(tried) < REFUTED * named.evidence:
             return True
     return False

@@ -8,7 +8,6 @@ forces at the place of the load, r the residual with the declared load; sensed =
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -22,6 +21,7 @@ from femsense.loop.data.dataset import Data
 from femsense.loop.data.trial import Trial, heads_of, normals_of, numbers_of, vectors_of
 from femsense.loop.fit.fitted_model import FittedModel, poses_and_inputs
 from femsense.loop.fit.noise_components import Noise
+from femsense.loop.result.evidence import Compliance, ForceField, ForceImpact, LoadRow, Softer
 from femsense.model.observation import SceneJet, in_robot_frame, placements
 from femsense.model.robot import Robot, spread_features
 
@@ -83,7 +83,7 @@ class View:
 
 
 def views_of(data: Data, fitted: FittedModel) -> list[View]:
-    """Return one trial of each recording as a stage has it: the fitted ones, then those that are held out. Markers come before clouds."""
+    """Return one trial of each recording as a fitted model has it: the fitted ones, then those that are held out. Markers come before clouds."""
     robot = fitted.fit.hypothesis.robot_at(fitted.fit.coordinates)
     poses, numbers = poses_and_inputs(data, fitted.fit), numbers_of(data.train)
     known = [View(robot, data.train[i], fitted.fit.jets[i], list(poses[i][0]), numbers[i], False) for i in heads_of(data.train)]
@@ -95,8 +95,8 @@ def views_of(data: Data, fitted: FittedModel) -> list[View]:
     return known + held
 
 
-def force_consequence(before: list[View], after: list[View], noise: Noise) -> dict[str, Any]:
-    """Return what both models make of forces: {"loads": …} where loads are declared, else {"compliance": …}; {} where neither can be had."""
+def force_consequence(before: list[View], after: list[View], noise: Noise) -> ForceImpact:
+    """Return what both models make of forces: at loads where these are declared, else by compliance; nothing where neither can be had."""
     pairs = list(zip(before, after))
     loaded = [(a, b, k) for a, b in pairs if a.held_out for k in _loaded_frames(a)]
     loaded = loaded or [(a, b, k) for a, b in pairs for k in _loaded_frames(a)]
@@ -104,10 +104,10 @@ def force_consequence(before: list[View], after: list[View], noise: Noise) -> di
         if loaded:
             chosen = np.unique(np.linspace(0, len(loaded) - 1, LOADED_FRAMES).round().astype(int))
             rows = each(lambda at: _at_loads(at[0], at[1], at[2], noise), [loaded[i] for i in chosen])
-            return {"loads": [row for row in rows if row is not None]}
-        return {"compliance": _compliances(*pairs[0])}
+            return ForceImpact(loads=tuple(row for row in rows if row is not None))
+        return ForceImpact(compliance=_compliances(*pairs[0]))
     except FemsenseError:
-        return {}
+        return ForceImpact()
 
 
 def _loaded_frames(view: View) -> list[int]:
@@ -116,32 +116,25 @@ def _loaded_frames(view: View) -> list[int]:
     return [int(k) for k in view.trial.scene.frames if k in recording.load_frame[heavy] and k in view.jet.states]
 
 
-def _at_loads(before: View, after: View, frame: int, noise: Noise) -> dict[str, Any] | None:
+def _at_loads(before: View, after: View, frame: int, noise: Noise) -> LoadRow | None:
     """Return the strongest declared load of a frame next to what either model senses there."""
     recording = before.trial.scene.recording
     own = np.flatnonzero(recording.load_frame == frame)
+    if any(len(view.rows(frame)) < len(own) for view in (before, after)):
+        return None
     size = np.linalg.norm(recording.load_forces[own], axis=1)
     places, main = recording.load_points[own], int(size.argmax())
     direction = recording.load_forces[own][main] / size[main]
-    row: dict[str, Any] = {
-        "recording": before.recording,
-        "frame": before.number(frame),
-        "held_out": before.held_out,
-        "declared_n": float(size[main]),
-    }
-    for name, view in (("before", before), ("after", after)):
-        rows = view.rows(frame)
-        if len(rows) < len(own):
-            return None
+    part = slice(3 * main, 3 * main + 3)
+    sensed = []
+    for view in (before, after):
         C = view.answers(view.tangent(frame), frame, places)
-        change, spread = _solved(C, view.jet.residual[rows].ravel(), noise.row_std(view.trial.groups))
-        part = slice(3 * main, 3 * main + 3)
-        row[f"{name}_n"] = float(size[main] + change[part] @ direction)
-        row[f"{name}_std_n"] = float(np.sqrt(direction @ spread[part, part] @ direction))
-    return row
+        change, covariance = forces_from(C, view.jet.residual[view.rows(frame)].ravel(), noise.row_std(view.trial.groups))
+        sensed += [float(size[main] + change[part] @ direction), float(np.sqrt(direction @ covariance[part, part] @ direction))]
+    return LoadRow(before.recording, before.number(frame), before.held_out, float(size[main]), *sensed)
 
 
-def _solved(C: FloatArray, residual: FloatArray, std: float) -> tuple[FloatArray, FloatArray]:
+def forces_from(C: FloatArray, residual: FloatArray, std: float) -> tuple[FloatArray, FloatArray]:
     """Return the forces that explain a residual best, and their covariance; directions that the markers hardly see stay at zero."""
     U, s, Vt = np.linalg.svd(C, full_matrices=False)
     keep = s > WEAKEST * s[0]
@@ -149,7 +142,7 @@ def _solved(C: FloatArray, residual: FloatArray, std: float) -> tuple[FloatArray
     return inverse @ (U[:, keep].T @ residual), std**2 * inverse @ inverse.T
 
 
-def _compliances(before: View, after: View) -> dict[str, Any]:
+def _compliances(before: View, after: View) -> Compliance:
     """Return how much a sensed force changes from model to model where no load is declared.
 
     A dent d along the normal is sensed as d / W, so that forces change by W_before / W_after. `phantom` is the force at the free end
@@ -161,23 +154,20 @@ def _compliances(before: View, after: View) -> dict[str, Any]:
     normals = vertex_normals(declared.nodes, surface_triangles(declared))[nodes]
     rows = []
     for title, k in frames:
-        ends: dict[str, Any] = {}
-        for name, view in (("before", before), ("after", after)):
+        ends = list[tuple[FloatArray, float]]()
+        for view in (before, after):
             tangent = view.tangent(k)
             W = compliance(view.robot.body, view.jet.states[k], points=declared.nodes[nodes], directions=normals, tangent=tangent)
             C = view.answers(tangent, k, declared.nodes[nodes[:1]])
-            phantom = _solved(C, view.jet.residual[view.rows(k)].ravel(), 1.0)[0]
-            ends[name] = (np.diag(W)[: len(nodes)], float(np.linalg.norm(phantom)))
-        rows.append(
-            {
-                "title": title,
-                "frame": before.number(k),
-                "ratio": (ends["before"][0] / ends["after"][0]).tolist(),
-                "phantom_before_n": ends["before"][1],
-                "phantom_after_n": ends["after"][1],
-            }
-        )
-    return {"points_m": declared.nodes[nodes].tolist(), "frames": rows}
+            phantom = forces_from(C, view.jet.residual[view.rows(k)].ravel(), 1.0)[0]
+            ends.append((np.diag(W)[: len(nodes)], float(np.linalg.norm(phantom))))
+        (first, phantom_before), (second, phantom_after) = ends
+        rows.append(Softer(title, before.number(k), tuple((first / second).tolist()), phantom_before, phantom_after))
+    return Compliance(_tuples(declared.nodes[nodes]), tuple(rows))
+
+
+def _tuples(rows: FloatArray) -> tuple[tuple[float, ...], ...]:
+    return tuple(tuple(row) for row in rows.tolist())
 
 
 def chosen_frames(view: View) -> list[tuple[str, int]]:
@@ -195,42 +185,42 @@ def chosen_frames(view: View) -> list[tuple[str, int]]:
     return [(title, k) for k, title in found.items()]
 
 
-def equivalent_forces(views: list[View], noise: Noise) -> dict[str, Any]:
+def equivalent_forces(views: list[View], noise: Noise) -> ForceField | None:
     """Return forces on the surface that would explain the frame with the largest residual; a picture, no evidence.
 
     Any residual is some field of forces. The field is the smallest one (Tikhonov) that leaves the noise: |C f − r|² = 3 k σ².
-    {} where that frame holds no more than noise.
+    None where that frame holds no more than noise.
     """
     worst = max(((v, int(k)) for v in views for k in v.trial.scene.frames), key=lambda at: _mean_square(*at))
     view, frame = worst
     r = view.jet.residual[view.rows(frame)].ravel()
     goal = len(r) * noise.row_std(view.trial.groups) ** 2
     if float(r @ r) <= goal:
-        return {}
+        return None
     body = view.robot.body
     nodes = spread_features(body, FIELD_POINTS)
     places = body.mesh.nodes[nodes]
     try:
         C = view.answers(view.tangent(frame), frame, places)
     except FemsenseError:
-        return {}
-    forces = _smallest_field(C, r, goal).reshape(-1, 3)
+        return None
+    forces = smallest_field(C, r, goal).reshape(-1, 3)
     left = r - C @ forces.ravel()
-    return {
-        "recording": view.recording,
-        "frame": view.number(frame),
-        "points_m": places.tolist(),
-        "forces_n": forces.tolist(),
-        "total_n": forces.sum(axis=0).tolist(),
-        "explained_share": float(1.0 - left @ left / (r @ r)),
-    }
+    return ForceField(
+        recording=view.recording,
+        frame=view.number(frame),
+        points_m=_tuples(places),
+        forces_n=_tuples(forces),
+        total_n=tuple(forces.sum(axis=0).tolist()),
+        explained_share=float(1.0 - left @ left / (r @ r)),
+    )
 
 
 def _mean_square(view: View, frame: int) -> float:
     return float((view.jet.residual[view.rows(frame)] ** 2).sum(axis=1).mean())
 
 
-def _smallest_field(C: FloatArray, r: FloatArray, goal: float) -> FloatArray:
+def smallest_field(C: FloatArray, r: FloatArray, goal: float) -> FloatArray:
     """Return the smallest f with |C f − r|² ≤ goal, or where none comes so near the least regular one that still is stable."""
     U, s, Vt = np.linalg.svd(C, full_matrices=False)
     b = U.T @ r

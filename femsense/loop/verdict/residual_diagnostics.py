@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
-
 import numpy as np
 
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.loop.data.covariates import covariates_of, rank_with, stacked
 from femsense.loop.data.trial import Trial, heads_of, vectors_of
+from femsense.loop.result.records import FrameError, LeftOver, Structure, WorstMarker
 from femsense.model.recording import state_key
 from femsense.model.robot import Robot
 
@@ -21,30 +19,13 @@ LEVEL = 0.01
 """Probability, over all tests together (Holm 1979), of calling mere noise structure."""
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class StructureTests:
-    """Tests for structure in a residual; p-values as they are, not adjusted."""
-
-    lag_one: float
-    p: dict[str, float]
-    """Test → p-value: neighbouring states alike, one pattern in many states, one sweep apart, one marker apart."""
-
-    @property
-    def significant(self) -> bool:
-        """Whether any test stands after Holm's adjustment."""
-        return min(self.p.values(), default=1.0) * len(self.p) <= LEVEL
-
-    def document(self) -> dict[str, Any]:
-        """Return the tests as plain tables."""
-        return {
-            "lag_one": self.lag_one,
-            "p_value": min(self.p.values(), default=1.0),
-            "tests": dict(self.p),
-            "significant": self.significant,
-        }
+def _structure(lag_one: float, p: dict[str, float]) -> Structure:
+    """Return tests with the verdict on all of them together."""
+    least = min(p.values(), default=1.0)
+    return Structure(lag_one, least, p, least * len(p) <= LEVEL)
 
 
-def structure_tests(trials: list[Trial], residuals: list[FloatArray], *, rng: np.random.Generator) -> StructureTests:
+def structure_tests(trials: list[Trial], residuals: list[FloatArray], *, rng: np.random.Generator) -> Structure:
     """Return tests for structure in residuals [m], (k, c) a trial.
 
     * `neighbours`: marker means and frame means removed; T = Σ r_k·r_{k+1} / Σ |r_k|² over neighbouring states of a sweep, against
@@ -65,23 +46,23 @@ def structure_tests(trials: list[Trial], residuals: list[FloatArray], *, rng: np
     seen = np.array([_largest(fields, None)])
     null = np.array([_largest(fields, rng) for _ in range(PERMUTATIONS)])
     p |= {name: _share(null[:, i], float(seen[0, i])) for i, name in enumerate(("pattern", "sweep"))}
-    return StructureTests(observed if np.isfinite(observed) else 0.0, p)
+    return _structure(observed if np.isfinite(observed) else 0.0, p)
 
 
-def _cloud_tests(trials: list[Trial], residuals: list[FloatArray], rng: np.random.Generator) -> StructureTests:
+def _cloud_tests(trials: list[Trial], residuals: list[FloatArray], rng: np.random.Generator) -> Structure:
     """Return the tests of clouds, with those of the markers beside them where there are some."""
     pairs = list(zip(trials, residuals))
     marked = [(t, r) for t, r in pairs if t.scene.crossings is None]
     markers = structure_tests([t for t, _ in marked], [r for _, r in marked], rng=rng) if marked else None
     fields = [_field(t, r) for t, r in pairs if t.scene.crossings is not None]
-    p = {} if markers is None else dict(markers.p)
+    p = {} if markers is None else dict(markers.tests)
     observed = _lag_one(fields, None)
     if np.isfinite(observed):
         p["cloud neighbours"] = _share(np.array([_lag_one(fields, rng) for _ in range(PERMUTATIONS)]), observed)
     whole = [_largest(_shuffled(fields, rng), None)[1] for _ in range(PERMUTATIONS)]
     p["cloud sweep"] = _share(np.array(whole), _largest(fields, None)[1])
     lag = observed if np.isfinite(observed) else 0.0
-    return StructureTests(lag if markers is None else markers.lag_one, p)
+    return _structure(lag if markers is None else markers.lag_one, p)
 
 
 def _shuffled(fields: list[tuple[FloatArray, IntArray]], rng: np.random.Generator) -> list[tuple[FloatArray, IntArray]]:
@@ -155,7 +136,7 @@ def _lag_one(fields: list[tuple[FloatArray, IntArray]], rng: np.random.Generator
     return above / below if below > 0 and pairs >= 4 else float("nan")
 
 
-def describe_left(robot: Robot, trials: list[Trial], residuals: list[FloatArray]) -> dict[str, Any]:
+def describe_left(robot: Robot, trials: list[Trial], residuals: list[FloatArray]) -> LeftOver:
     """Return what the remaining residual looks like: how large, where on the body, in which frames, which way, and what it goes with.
 
     The direction is the one that holds most of the mean square of the worst marker (its sign: that of the mean); `share` says how much.
@@ -171,23 +152,22 @@ def describe_left(robot: Robot, trials: list[Trial], residuals: list[FloatArray]
     rms, numbers, recordings = _frame_sizes(trials, residuals)
     order = np.argsort(-rms, kind="stable")
     direction, share = _direction(own)
-    return {
-        "rms_m": float(np.sqrt((size**2).mean())),
-        "marker_rms_m": per_marker,
-        "where": {
-            "marker": worst,
-            "position_m": robot.marker_points[robot.marker_names.index(worst)].tolist(),
-            "mean_residual_m": own.mean(axis=0).tolist(),
-            "direction": direction.tolist(),
-            "direction_share": share,
-        },
-        "worst_frame": {"recording": int(recordings[order[0]]), "frame": int(numbers[order[0]]), "rms_m": float(rms[order[0]])},
-        "worst_frames": [
-            {"recording": int(recordings[i]), "frame": int(numbers[i]), "rms_m": float(rms[i])} for i in order[:WORST_FRAMES]
-        ],
-        "half_in_frames": _share_of_half(rms[order]),
-        "goes_with": rank_with(rms, stacked([covariates_of(t.scene) for t in trials]))[:GOES_WITH],
-    }
+    frames = [FrameError(int(recordings[i]), int(numbers[i]), float(rms[i])) for i in order[:WORST_FRAMES]]
+    return LeftOver(
+        rms_m=float(np.sqrt((size**2).mean())),
+        marker_rms_m=per_marker,
+        where=WorstMarker(
+            marker=worst,
+            position_m=tuple(robot.marker_points[robot.marker_names.index(worst)].tolist()),
+            mean_residual_m=tuple(own.mean(axis=0).tolist()),
+            direction=tuple(direction.tolist()),
+            direction_share=share,
+        ),
+        worst_frame=frames[0],
+        worst_frames=tuple(frames),
+        half_in_frames=_share_of_half(rms[order]),
+        goes_with=tuple(rank_with(rms, stacked([covariates_of(t.scene) for t in trials]))[:GOES_WITH]),
+    )
 
 
 def _frame_sizes(trials: list[Trial], residuals: list[FloatArray]) -> tuple[FloatArray, IntArray, IntArray]:

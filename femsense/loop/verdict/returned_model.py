@@ -14,10 +14,13 @@ from femsense.loop.fit.discretisation_error import beyond_mesh
 from femsense.loop.fit.fitted_model import FittedModel, held_chi2, keeping, span_of, with_seeds_still, with_sizes_still
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.search.acceptance import at_edge
-from femsense.loop.search.input_offset import SIGNIFICANT, moved_nuisance, offsets_are_evident
+from femsense.loop.search.input_offset import OFFSETS, SIGNIFICANT, moved_nuisance, offsets_are_evident
 from femsense.loop.search.refit import EVIDENCE
 from femsense.loop.search.search_state import Search
-from femsense.model.effects import Entry
+from femsense.model.effects import OF_BODY, Entry
+
+(MODULUS,) = OF_BODY
+"""What calibration may move of the body."""
 
 NOT_WORSE = 1.02
 """What is handed back may not have a larger held-out error than the declared model, but for this factor …"""
@@ -32,18 +35,18 @@ FAR_BETTER = 50.0
 """… or, where the mesh's own error is what is larger, if χ² of the held-out data falls by so much."""
 
 
-def _promoted(data: Data, search: Search) -> list[str]:
-    """Return the nuisances that the data moved significantly away from what is declared; of the zeros, those that are missed."""
+def promoted_nuisances(data: Data, search: Search) -> list[str]:
+    """Return the nuisances that the data moved significantly away from what is declared; of the input offsets, those that are missed."""
     names = [n for n in search.final.fit.hypothesis.names if n in NUISANCE and moved_nuisance(data, search.final, n)]
-    return [n for n in names if n == "stiffness" or offsets_are_evident(data, search.final, search.noise, search.n_effective)]
+    return [n for n in names if n in OF_BODY or offsets_are_evident(data, search.final, search.noise, search.n_effective)]
 
 
-def _is_sure(fitted: FittedModel, name: str, std: FloatArray) -> bool:
+def is_sure(fitted: FittedModel, name: str, std: FloatArray) -> bool:
     """Return whether a value of a nuisance differs from what is declared by more than SIGNIFICANT of the standard deviations that are reported."""
     return bool((np.abs(fitted.fit.coordinates[span_of(fitted.fit, name)]) > SIGNIFICANT * std).any())
 
 
-def _worth_handing_back(data: Data, search: Search, promoted: list[str], names: list[str]) -> tuple[list[str], FittedModel]:
+def worth_handing_back(data: Data, search: Search, promoted: list[str], names: list[str]) -> tuple[list[str], FittedModel]:
     """Return the names that are handed back with the model of just these: with the sizes that they have beside all nuisances where held-out data
     do not miss those, else fitted again. Nuisances that stay as declared are taken out, too if they only do so here, and so is, from the last one
     on, what would make the error on held-out data larger than it was, or goes to the edge of what is plausible."""
@@ -71,49 +74,49 @@ def _misses(data: Data, search: Search, back: FittedModel) -> bool:
 
 
 def _may_be_handed_back(data: Data, search: Search, back: FittedModel) -> bool:
-    return not at_edge(back.fit) and "stiffness" not in at_edge(back.fit, nuisance=True) and _holds_out(data, search, back)
+    return not at_edge(back.fit) and not set(OF_BODY) & set(at_edge(back.fit, nuisance=True)) and holds_out(data, search, back)
 
 
 def _with_modulus(data: Data, search: Search, names: list[str], *, sizes_still: bool) -> tuple[list[str], FittedModel | None]:
-    """Return names with the model of just these; with the modulus beside effects if it moved significantly there, by whatever share (zeros that are
+    """Return names with the model of just these; with the modulus beside effects if it moved significantly there, by whatever share (offsets that are
     not named may have moved in its place), and held-out data miss it."""
     back = _handed_back(data, search.final, names, search.noise, sizes_still=sizes_still)
-    if back is None or "stiffness" in names or not _has_effects(names):
+    if back is None or MODULUS in names or not has_effects(names):
         return names, back
-    if sizes_still and not moved_nuisance(data, search.final, "stiffness", relevant=0.0):
+    if sizes_still and not moved_nuisance(data, search.final, MODULUS, relevant=0.0):
         return names, back
-    along = _handed_back(data, search.final, ["stiffness", *names], search.noise, sizes_still=sizes_still)
-    if along is None or not moved_nuisance(data, search.final if sizes_still else along, "stiffness", relevant=0.0):
+    along = _handed_back(data, search.final, [MODULUS, *names], search.noise, sizes_still=sizes_still)
+    if along is None or not moved_nuisance(data, search.final if sizes_still else along, MODULUS, relevant=0.0):
         return names, back
     missed = held_chi2(data, back, search.noise) - held_chi2(data, along, search.noise) > EVIDENCE
-    return (["stiffness", *names], along) if missed else (names, back)
+    return ([MODULUS, *names], along) if missed else (names, back)
 
 
-def _has_effects(names: Iterable[str]) -> bool:
+def has_effects(names: Iterable[str]) -> bool:
     return any(name not in NUISANCE for name in names)
 
 
-def _holds_out(data: Data, search: Search, back: FittedModel) -> bool:
+def holds_out(data: Data, search: Search, back: FittedModel) -> bool:
     """Return whether a model is no worse on held-out data in millimetres; or else better by the noise that these data have, where it is calibrated
     only and within reason, or where the mesh's own error is all that is larger: then it must be no worse beyond that, nor in millimetres than
-    the model with all that calibration may move, and not be zeros of cables alone, unless it is far better by the noise and within reason."""
+    the model with all that calibration may move, and not be input offsets alone, unless it is far better by the noise and within reason."""
     worse = back.held_rms / search.before.held_rms
     if worse <= NOT_WORSE:
         return True
-    only_calibrated = not _has_effects(back.fit.hypothesis.names)
+    only_calibrated = not has_effects(back.fit.hypothesis.names)
     gain = held_chi2(data, search.before, search.noise) - held_chi2(data, back, search.noise)
     if gain <= (EVIDENCE if only_calibrated else 0.0):  # effects have been judged by held-out data before
         return False
     if only_calibrated and worse <= NOISY:
         return True
-    before, after = _held_beyond_mesh(data, search, back)
-    zeros = only_calibrated and "cable_offset" in back.fit.hypothesis.names  # much else looks like them
-    shown = not zeros and back.held_rms <= NOT_WORSE * search.base.held_rms
+    before, after = held_beyond_mesh(data, search, back)
+    only_offsets = only_calibrated and OFFSETS in back.fit.hypothesis.names  # much else looks like them
+    shown = not only_offsets and back.held_rms <= NOT_WORSE * search.base.held_rms
     return after <= NOT_WORSE * before and (shown or (gain > FAR_BETTER and worse <= NOISY))
 
 
-def _held_beyond_mesh(data: Data, search: Search, back: FittedModel) -> tuple[float, float]:
-    """Return the held-out errors before and after [m] less the likeliest share of what the mesh itself costs."""
+def held_beyond_mesh(data: Data, search: Search, back: FittedModel) -> tuple[float, float]:
+    """Return the held-out errors before and after [m] less the likeliest share of the discretisation error."""
     before, after = (beyond_mesh(data.held, s.held_residuals, search.noise) for s in (search.before, back))
     return before, after
 
@@ -126,7 +129,7 @@ def _handed_back(
     present = {effect.name for effect, _, _ in final.fit.hypothesis.terms}
     if present <= set(names):
         return final
-    if sizes_still and not (_has_effects(names) and present <= {*names, *NUISANCE}):
+    if sizes_still and not (has_effects(names) and present <= {*names, *NUISANCE}):
         return None
     try:
         return (with_sizes_still if sizes_still else keeping)(data, final, names, noise)
@@ -134,7 +137,7 @@ def _handed_back(
         return None
 
 
-def _entries(fitted: FittedModel, names: list[str]) -> list[Entry]:
+def entries_of(fitted: FittedModel, names: list[str]) -> list[Entry]:
     """Return the tables of `[[effects]]`: those that change the mesh or the law first, then in the order in which they were found."""
     settled = [{"name": effect.name, **seed} for effect, seed in fitted.fit.hypothesis.settled]
     tables = {e["name"]: e for e in fitted.fit.hypothesis.entries(fitted.fit.coordinates)}

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from femsense.loop.data.dataset import Data
+from femsense.loop.data.dataset import MESH, Data
 from femsense.loop.data.trial import rms_of
 from femsense.loop.fit.discretisation_error import mesh_errors
 from femsense.loop.fit.fitted_model import FittedModel
 from femsense.loop.fit.noise_components import Noise
+from femsense.loop.result import EFFECTS, NONE, UNEXPLAINED
+from femsense.loop.result.records import NamedEffect, Value
 from femsense.loop.search.search_state import Search
-from femsense.loop.verdict.returned_model import NOT_WORSE, _has_effects, _held_beyond_mesh
+from femsense.loop.verdict.returned_model import NOT_WORSE, has_effects, held_beyond_mesh
 
 ROUNDED = 1e-6
 """What is so small beside the largest component of a vector is said as 0."""
@@ -26,65 +29,65 @@ GROSS = 0.03
 """Noise of more than this share of the body's reach is said to be suspicious."""
 
 
-def _sentence(
+def verdict_in_words(
     verdict: str,
-    effects: list[dict[str, Any]],
+    effects: Sequence[NamedEffect],
     found: list[str],
     before: FittedModel,
     after: FittedModel,
     noise: Noise,
     mesh: float | None,
 ) -> str:
-    """Return the sentence on top; `mesh` is what the mesh itself costs [m], where that is known."""
+    """Return the sentence on top; `mesh` is the discretisation error [m], where that is known."""
     error = f"held-out error {1e3 * before.held_rms:.2f} mm"
     if not noise.std:
         error += " along the normals of the surface"
-    if verdict == "none" and before.held_rms > BEYOND_NOISE * np.hypot(noise.total, mesh or 0.0):
-        costs = f", and its mesh costs {1e3 * mesh:.2f} mm" if mesh else ""
+    if verdict == NONE and before.held_rms > BEYOND_NOISE * np.hypot(noise.total, mesh or 0.0):
+        costs = f"; the discretisation error is {1e3 * mesh:.2f} mm" if mesh else ""
         return f"Nothing that was tried explains more of the data: {error}; their noise is {1e3 * noise.total:.2f} mm{costs}."
-    if verdict == "none":
+    if verdict == NONE:
         known = f"to their noise ({1e3 * noise.total:.2f} mm)"
         if mesh and before.held_rms > BEYOND_NOISE * noise.total:
-            known += f" and to what its mesh costs ({1e3 * mesh:.2f} mm; a finer one would show more)"
+            known += f" and to its discretisation error ({1e3 * mesh:.2f} mm; a finer mesh would show more)"
         return f"The model explains the data {known}: {error}."
-    if verdict == "unexplained" and not effects:
+    if verdict == UNEXPLAINED and not effects:
         explains = "nothing that may be handed back" if found else "no effect of the list"
         small = ", though it is no larger than the noise" if before.held_rms <= noise.total else ""
         return f"A residual is left that {explains} explains{small}: {error}, noise {1e3 * noise.total:.2f} mm."
-    what = ", ".join(f"{e['name']} ({_short(e['parameters'])})" for e in effects)
-    tail = "" if verdict == "effects" else " A residual is left that no effect explains."
+    what = ", ".join(f"{e.name} ({values_in_words(e.parameters)})" for e in effects)
+    tail = "" if verdict == EFFECTS else " A residual is left that no effect explains."
     where = "" if noise.std else " along the normals of the surface"
     return f"The model lacks {what}; held-out error{where} {1e3 * before.held_rms:.2f} mm before, {1e3 * after.held_rms:.2f} mm after.{tail}"
 
 
-def _by_mesh(data: Data, search: Search, back: FittedModel) -> str:
+def by_mesh(data: Data, search: Search, back: FittedModel) -> str:
     """Return a sentence on what the held-out error is beyond the mesh's own, where that is what makes it larger; nothing where it is not larger."""
     if back.held_rms <= NOT_WORSE * search.before.held_rms or not mesh_errors(data):
         return ""
-    before, after = _held_beyond_mesh(data, search, back)
-    return f" Less the likeliest share of what the mesh itself costs, that is {1e3 * before:.2f} mm before, {1e3 * after:.2f} mm after."
+    before, after = held_beyond_mesh(data, search, back)
+    return f" Less the likeliest share of the discretisation error, that is {1e3 * before:.2f} mm before, {1e3 * after:.2f} mm after."
 
 
-def _on_linear(data: Data, back: FittedModel) -> str:
+def on_linear(data: Data, back: FittedModel) -> str:
     """Return a sentence on what effects that are named on a linear mesh may stand for; nothing elsewhere, or where that is an effect itself."""
-    mesh = _mesh_error(data)
-    if not mesh or back.fit.hypothesis.robot.body.mesh.is_quadratic or not _has_effects(back.fit.hypothesis.names):
+    mesh = mesh_error_rms(data)
+    if not mesh or back.fit.hypothesis.robot.body.mesh.is_quadratic or not has_effects(back.fit.hypothesis.names):
         return ""
-    return f" Linear elements cost {1e3 * mesh:.2f} mm themselves, which other effects may stand for: try discretisation too."
+    return f" Linear elements have a discretisation error of {1e3 * mesh:.2f} mm, which other effects may stand for: try {MESH.name} too."
 
 
-def _evidence_for(data: Data, found: list[str]) -> str:
+def evidence_for(data: Data, found: list[str]) -> str:
     """Return a sentence on effects that were found and are not handed back; nothing where there are none."""
     if not found:
         return ""
-    mesh = _mesh_error(data)
-    finer = f"; the mesh itself costs {1e3 * mesh:.2f} mm, and a finer one may tell" if mesh else ""
+    mesh = mesh_error_rms(data)
+    finer = f"; the discretisation error is {1e3 * mesh:.2f} mm, and a finer mesh may tell" if mesh else ""
     return (
         f" There is evidence for {', '.join(found)}, but the held-out error would grow with it or a value be implausible{finer}."
     )
 
 
-def _by_noise(data: Data, noise: Noise) -> str:
+def by_noise(data: Data, noise: Noise) -> str:
     """Return in words that the noise is beyond what cameras have."""
     reach = data.robot.body.reach
     if noise.total < GROSS * reach:
@@ -95,7 +98,7 @@ def _by_noise(data: Data, noise: Noise) -> str:
     )
 
 
-def _short(parameters: dict[str, Any]) -> str:
+def values_in_words(parameters: Mapping[str, Value]) -> str:
     def show(value: Any) -> str:
         if isinstance(value, float):
             return f"{value:.3g}"
@@ -105,10 +108,10 @@ def _short(parameters: dict[str, Any]) -> str:
         return ", ".join(f"{k} {show(v)}" for k, v in value.items()) if isinstance(value, dict) else str(value)
 
     said = {k: p for k, p in parameters.items() if k != "file"}
-    return ", ".join(f"{k} {show(p['value'])}" + ("" if p["unit"] == "1" else f" {p['unit']}") for k, p in said.items())
+    return ", ".join(f"{k} {show(p.value)}" + ("" if p.unit == "1" else f" {p.unit}") for k, p in said.items())
 
 
-def _mesh_error(data: Data) -> float | None:
+def mesh_error_rms(data: Data) -> float | None:
     """Return how far a finer mesh would move the markers, root mean square [m]; None where it was not computed."""
     errors = mesh_errors(data)
     return rms_of(errors) if errors else None

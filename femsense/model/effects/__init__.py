@@ -7,7 +7,7 @@ from difflib import get_close_matches
 from typing import Any
 
 from femsense.core.errors import InputError
-from femsense.model.effects.base import Effect, Entry, Parameter, build_entry
+from femsense.model.effects.base import Alias, Calibrated, Effect, Entry, Experiment, Parameter, build_entry
 from femsense.model.effects.cables import CABLE_FRICTION, CABLE_FRICTIONS, CABLE_GAIN, CABLE_OFFSET, CABLE_SLACK, CABLE_STRETCH
 from femsense.model.effects.loads import GRAVITY, PAYLOAD
 from femsense.model.effects.material import CREEP, CREEP_TWICE, GENT, HYPERELASTIC, POISSON, SOFT_REGION, STIFFNESS
@@ -40,6 +40,13 @@ EFFECTS: tuple[Effect, ...] = (
 """Each name once."""
 FORMS: tuple[Effect, ...] = (*EFFECTS, GENT, CREEP_TWICE, BASE_ROTATION, CABLE_FRICTIONS)
 """Every way in which an effect can be fitted: some have further parameters, under the same name."""
+EFFECT_NAMES: tuple[str, ...] = tuple(effect.name for effect in EFFECTS)
+CALIBRATED: tuple[str, ...] = tuple(effect.name for effect in EFFECTS if effect.calibrated is not None)
+"""Effects that are fitted along with everything: those of the inputs, and those of the body."""
+OF_INPUTS: tuple[str, ...] = tuple(
+    effect.name for effect in EFFECTS if effect.calibrated is not None and effect.calibrated.of_inputs
+)
+OF_BODY: tuple[str, ...] = tuple(name for name in CALIBRATED if name not in OF_INPUTS)
 
 
 def find_effect(name: str) -> Effect:
@@ -47,13 +54,12 @@ def find_effect(name: str) -> Effect:
     for effect in EFFECTS:
         if effect.name == name:
             return effect
-    names = [effect.name for effect in EFFECTS]
-    near = get_close_matches(name, names, 1)
+    near = get_close_matches(name, EFFECT_NAMES, 1)
     raise InputError(
         "unknown effect",
         where="effects.name",
         found=name,
-        expected=", ".join(names),
+        expected=", ".join(EFFECT_NAMES),
         hint=f"did you mean {near[0]}?" if near else "an effect of your own comes with its file (docs/effects/own.md)",
     )
 
@@ -80,10 +86,17 @@ def _own(entry: Mapping[str, Any], robot: Robot) -> Effect:
 
 
 __all__ = [
+    "CALIBRATED",
     "EFFECTS",
+    "EFFECT_NAMES",
     "FORMS",
+    "OF_BODY",
+    "OF_INPUTS",
+    "Alias",
+    "Calibrated",
     "Effect",
     "Entry",
+    "Experiment",
     "Parameter",
     "apply_effects",
     "build_entry",

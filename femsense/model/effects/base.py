@@ -4,15 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from enum import Enum
 from typing import Any
 
 import numpy as np
 
+from femsense.core.arrays import BoolArray, FloatArray
 from femsense.core.errors import InputError
 from femsense.model.robot import Robot
 
 Entry = dict[str, Any]
 """One table of `[[effects]]`, without its name."""
+
+
+@dataclass(frozen=True, slots=True)
+class KnownLength:
+    """What is known beforehand of the length of a vector."""
+
+    value: float
+    """In the unit of its components."""
+    std: float
+    """Its standard deviation, in the same unit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +48,17 @@ class Parameter:
     """How the coordinate u gives the value: "linear" (u), "log" (exp u) or "reciprocal" (1/u)."""
     known: float = float("inf")
     """Standard deviation to which the coordinate is known to be at `null` beforehand."""
+    plausible: float | None = None
+    """Usual size of its distance from `null`, in the coordinate; None: `USUAL` of the range between the bounds."""
+    of_range: bool = False
+    """Whether sizes (`plausible`, what calibration knows) are shares of the range of the input of its cable."""
+    length: KnownLength | None = None
+    """What is known of the length of the vector that it is a component of."""
+
+    @property
+    def usual_size(self) -> float:
+        """Return the plausible distance from `null`, in the coordinate; a share of the cable's range where it is `of_range`."""
+        return USUAL * (self.high - self.low) if self.plausible is None else self.plausible
 
     def value(self, coordinate: float) -> float:
         """Return the value in robot.toml's unit."""
@@ -68,6 +91,44 @@ class Parameter:
         return self.key if self.part is None else f"{self.key}[{self.part}]"
 
 
+USUAL = 0.05
+"""Usual size of a parameter of which nothing else is said, as a share of the range between its bounds."""
+
+
+class Experiment(Enum):
+    """What may be recorded to tell an effect from others, in the order in which it is proposed."""
+
+    TURN_THE_BASE = 1
+    LOAD_UNLOAD_AND_HOLD = 2
+    KNOWN_WEIGHT = 3
+    MORE_MARKERS = 4
+    MOVE_THE_CAMERA = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Calibrated:
+    """How an effect is fitted along with everything, as part of calibration."""
+
+    std: float
+    """Standard deviation of its coordinates beforehand, while a model is fitted to data."""
+    planned_std: float
+    """The same while an experiment is planned."""
+    of_inputs: bool
+    """Whether it says where the inputs begin, not what the body is. Many effects look like it, so that it is named only where the model misses it;
+    initial inputs that are unknown stand for it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Alias:
+    """An effect that another one is confused with whatever the data are."""
+
+    name: str
+    common: bool = False
+    """Whether that is so where all parameters move alike; else it is its mirror image."""
+    told_by: str = ""
+    """What to record to tell the two apart, in words."""
+
+
 @dataclass(frozen=True, slots=True)
 class Effect:
     """A named thing that a plain model may lack."""
@@ -83,8 +144,8 @@ class Effect:
     """(robot) → starting points for what is not in `parameters` (places, radii); each is tried."""
     keys: tuple[str, ...] = ()
     """All keys that an entry may have."""
-    history: bool = False
-    """Whether the state depends on what was before."""
+    path_dependent: bool = False
+    """Whether the equilibrium depends on those before, so that all frames from the first on are solved."""
     discrete: bool = False
     """Whether a seed changes the model by itself, by no small amount: it is then tried as a whole. Its parameters, if it has any,
     start at their `null`, which is a plausible value and leaves no plain model."""
@@ -93,6 +154,45 @@ class Effect:
     is the seed's own value."""
     nearby: Callable[[Robot, Entry], Sequence[Entry]] = lambda robot, seed: ()
     """(robot, seed) → seeds between this one and its neighbours; tried once this one is known to be the best."""
+    calibrated: Calibrated | None = None
+    """How it is fitted along with everything; None: it is sought."""
+    aliases: tuple[Alias, ...] = ()
+    """What it is confused with whatever the data are."""
+    told_by: Experiment | None = None
+    """What to record to tell it from others."""
+    planned: Callable[[Robot], Sequence[tuple[str, Effect]]] | None = None
+    """(robot) → forms in which an experiment is planned for it, each with what distinguishes its label; None: itself."""
+    drives: bool = False
+    """Whether it changes the tensions that drive a frame, and leaves the body as it is."""
+    remeshes: bool = False
+    """Whether it changes the mesh."""
+    places_markers: bool = False
+    """Whether it says where single markers sit: rest.csv measures that, and markers are added to it one by one."""
+    moves_rest: bool = False
+    """Whether it changes where markers are measured at rest."""
+    turns_with_base: bool = False
+    """Whether its columns turn with the base, as a change of gravity does."""
+    expected: Callable[[Robot], bool] = lambda robot: False
+    """(declared robot) → whether every such body has it, though the robot does not declare it."""
+    prior_cost: Callable[[Robot, FloatArray], float] = lambda robot, coordinates: 0.0
+    """(declared robot, its coordinates) → −2 log of how likely they are beforehand, 0 at best."""
+
+    def mirrors(self, name: str) -> bool:
+        """Return whether it is the mirror image of another effect."""
+        return any(alias.name == name and not alias.common for alias in self.aliases)
+
+
+def known_length(parameters: Sequence[Parameter]) -> tuple[BoolArray, KnownLength] | None:
+    """Return which coordinates are the components of a vector of known length, shape (p,), and that length; None where there is none."""
+    for parameter in parameters:
+        if parameter.length is not None:
+            return np.array([p.length is parameter.length for p in parameters], dtype=bool), parameter.length
+    return None
+
+
+def range_units(parameters: Sequence[Parameter], cables: Sequence[str], ranges: FloatArray) -> FloatArray:
+    """Return the unit that sizes of parameters are shares of, shape (p,): the range of the cable's input [N] or [m], or 1."""
+    return np.array([float(ranges[cables.index(str(p.part))]) if p.of_range else 1.0 for p in parameters])
 
 
 def build_entry(parameters: Sequence[Parameter], coordinates: Sequence[float], seed: Mapping[str, Any]) -> Entry:

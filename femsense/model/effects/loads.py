@@ -4,27 +4,54 @@ from __future__ import annotations
 
 import numpy as np
 
+from femsense.core.arrays import FloatArray
 from femsense.fem.mesh import embed_points, surface_triangles
-from femsense.model.effects.base import Effect, Entry, Parameter, vector
+from femsense.model.effects.base import Effect, Entry, Experiment, KnownLength, Parameter, vector
 from femsense.model.robot import Robot, spread_features, spread_points
 
 STANDARD_GRAVITY = 9.80665
 """[m/s²]."""
+SIZE = KnownLength(STANDARD_GRAVITY, 0.1)
+"""Size of gravity on an unknown site [m/s²]."""
+MOUNTED = np.radians(5.0)
+"""A base is mounted as it is declared to about this angle, and a declared gravity is believed as much [rad]."""
 
 
 def _gravity_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
     if robot.body.material.density <= 0:
         return ()
     now = robot.body.gravity
-    return tuple(Parameter("vector_m_s2", i, "m/s²", float(now[i]), -12.0, 12.0, 0.05) for i in range(3))
+    return tuple(Parameter("vector_m_s2", i, "m/s²", float(now[i]), -12.0, 12.0, 0.05, length=SIZE) for i in range(3))
 
 
 def _apply_gravity(robot: Robot, entry: Entry) -> Robot:
     return robot.with_body(robot.body.with_gravity(vector(entry, "vector_m_s2", "gravity")))
 
 
+def _tilt_cost(declared: Robot, fitted: FloatArray) -> float:
+    """Return −2 log of how likely it is that a declared gravity is off by the angle of the fitted one: a Student's t with four degrees."""
+    own = declared.body.gravity
+    if not np.any(own):
+        return 0.0
+    angle = np.arctan2(np.linalg.norm(np.cross(own, fitted)), own @ fitted)
+    return float(5.0 * np.log1p((angle / MOUNTED) ** 2 / 4.0))
+
+
+def _weight_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
+    if robot.body.material.density <= 0:
+        return ()
+    usual = 1.0 if np.any(robot.body.gravity) else STANDARD_GRAVITY / float(np.sqrt(3.0))
+    return tuple(Parameter("vector_m_s2", i, "m/s²", 0.0, -12.0, 12.0, 0.05, plausible=usual) for i in range(3))
+
+
+def _apply_weight(robot: Robot, entry: Entry) -> Robot:
+    body = robot.body
+    more = body.with_gravity(vector(entry, "vector_m_s2", "gravity")).weight()
+    return robot.with_body(body.with_dead_forces(body.dead_forces + more))
+
+
 def _payload_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
-    return tuple(Parameter("force_n", i, "N", 0.0, -20.0, 20.0, 1e-3) for i in range(3))
+    return tuple(Parameter("force_n", i, "N", 0.0, -20.0, 20.0, 1e-3, plausible=0.05) for i in range(3))
 
 
 def _payload_places(robot: Robot) -> tuple[Entry, ...]:
@@ -76,8 +103,18 @@ def _apply_payload(robot: Robot, entry: Entry) -> Robot:
 
 
 GRAVITY = Effect(
-    "gravity", "its own weight, or weight in another direction", _gravity_parameters, _apply_gravity, keys=("vector_m_s2",)
+    "gravity",
+    "its own weight, or weight in another direction",
+    _gravity_parameters,
+    _apply_gravity,
+    keys=("vector_m_s2",),
+    told_by=Experiment.TURN_THE_BASE,
+    planned=lambda robot: (("", WEIGHT),),
+    expected=lambda robot: not np.any(robot.body.gravity),
+    prior_cost=_tilt_cost,
 )
+WEIGHT: Effect = Effect("gravity", "", _weight_parameters, _apply_weight, turns_with_base=True)
+"""A change of gravity as a dead force, which acts where frames say their own gravity too; it turns with the base."""
 PAYLOAD = Effect(
     "payload",
     "a load that was not declared",
@@ -87,4 +124,5 @@ PAYLOAD = Effect(
     keys=("point_m", "force_n"),
     polish=_place_polish,
     nearby=_places_nearby,
+    told_by=Experiment.TURN_THE_BASE,
 )

@@ -9,12 +9,15 @@ import numpy as np
 from femsense.core.arrays import FloatArray, freeze
 from femsense.core.errors import InputError
 from femsense.fem.mesh import element_volumes
-from femsense.model.effects.base import Effect, Entry, Parameter, number, vector
+from femsense.model.effects.base import Calibrated, Effect, Entry, Experiment, Parameter, number, vector
 from femsense.model.robot import Robot, spread_features
+
+MODULUS_STD = 0.5
+"""How well the modulus is known beforehand, in its logarithm: a soft region in a stiff body and a stiff one in a soft body act nearly alike."""
 
 
 def _stiffness_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
-    return (Parameter("scale", None, "1", 0.0, float(np.log(0.1)), float(np.log(10.0)), 1e-5, "log"),)
+    return (Parameter("scale", None, "1", 0.0, float(np.log(0.1)), float(np.log(10.0)), 1e-5, "log", plausible=0.2),)
 
 
 def _apply_stiffness(robot: Robot, entry: Entry) -> Robot:
@@ -23,7 +26,7 @@ def _apply_stiffness(robot: Robot, entry: Entry) -> Robot:
 
 def _poisson_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
     declared = float(np.median(robot.body.material.poisson_ratio))
-    return (Parameter("poisson_ratio", None, "1", declared, 0.05, 0.4995, 1e-6),)
+    return (Parameter("poisson_ratio", None, "1", declared, 0.05, 0.4995, 1e-6, plausible=0.03),)
 
 
 def _apply_poisson(robot: Robot, entry: Entry) -> Robot:
@@ -35,7 +38,7 @@ def _apply_poisson(robot: Robot, entry: Entry) -> Robot:
 
 
 def _region_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
-    return (Parameter("scale", None, "1", 0.0, float(np.log(0.1)), float(np.log(5.0)), 1e-5, "log"),)
+    return (Parameter("scale", None, "1", 0.0, float(np.log(0.1)), float(np.log(5.0)), 1e-5, "log", plausible=0.4),)
 
 
 RADII = 0.12, 0.25
@@ -130,10 +133,12 @@ def _no_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
 
 MOST_CREEP = 0.5
 """Share of the stress of a cast silicone that may relax in one term; what acts like more is something else (0.05–0.3 are usual)."""
+USUAL_CREEP = 0.15
+"""Share that one term of a cast silicone relaxes."""
 
 
 def _creep_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
-    return (Parameter("fraction", None, "1", 0.0, 0.0, MOST_CREEP, 1e-3),) if control == "tension" else ()
+    return (Parameter("fraction", None, "1", 0.0, 0.0, MOST_CREEP, 1e-3, plausible=USUAL_CREEP),) if control == "tension" else ()
 
 
 def _creep_seeds(robot: Robot) -> tuple[Entry, ...]:
@@ -146,7 +151,9 @@ def _creep_polish(robot: Robot, control: str, seed: Entry) -> tuple[Parameter, .
 
 
 def _creep_twice_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
-    return tuple(Parameter("fraction", i, "1", 0.0, 0.0, MOST_CREEP, 1e-3) for i in range(2)) if control == "tension" else ()
+    if control != "tension":
+        return ()
+    return tuple(Parameter("fraction", i, "1", 0.0, 0.0, MOST_CREEP, 1e-3, plausible=USUAL_CREEP) for i in range(2))
 
 
 def _creep_twice_seeds(robot: Robot) -> tuple[Entry, ...]:
@@ -171,8 +178,23 @@ def _apply_creep(robot: Robot, entry: Entry) -> Robot:
     return replace(robot, creep=robot.creep + terms)
 
 
-STIFFNESS = Effect("stiffness", "the right modulus everywhere", _stiffness_parameters, _apply_stiffness, keys=("scale",))
-POISSON = Effect("poisson", "the right Poisson ratio", _poisson_parameters, _apply_poisson, keys=("poisson_ratio",))
+STIFFNESS = Effect(
+    "stiffness",
+    "the right modulus everywhere",
+    _stiffness_parameters,
+    _apply_stiffness,
+    keys=("scale",),
+    calibrated=Calibrated(MODULUS_STD, MODULUS_STD, of_inputs=False),
+    told_by=Experiment.KNOWN_WEIGHT,
+)
+POISSON = Effect(
+    "poisson",
+    "the right Poisson ratio",
+    _poisson_parameters,
+    _apply_poisson,
+    keys=("poisson_ratio",),
+    told_by=Experiment.MORE_MARKERS,
+)
 SOFT_REGION = Effect(
     "soft_region",
     "a part of another stiffness",
@@ -181,8 +203,9 @@ SOFT_REGION = Effect(
     _region_places,
     keys=("center_m", "radius_m", "scale"),
     nearby=_regions_nearby,
+    told_by=Experiment.MORE_MARKERS,
 )
-HYPERELASTIC = Effect(
+HYPERELASTIC: Effect = Effect(
     "hyperelastic",
     "stiffening or softening with stretch",
     _no_parameters,
@@ -190,8 +213,10 @@ HYPERELASTIC = Effect(
     _law_seeds,
     keys=("law", "jm"),
     discrete=True,
+    told_by=Experiment.MORE_MARKERS,
+    planned=lambda robot: (("", GENT if robot.body.material.law == "neo_hookean" else HYPERELASTIC),),
 )
-GENT = Effect(
+GENT: Effect = Effect(
     "hyperelastic",
     "stiffening or softening with stretch",
     _gent_parameters,
@@ -199,6 +224,7 @@ GENT = Effect(
     _gent_seeds,
     keys=("law", "jm"),
     discrete=True,
+    told_by=Experiment.MORE_MARKERS,
 )
 CREEP = Effect(
     "creep",
@@ -207,8 +233,9 @@ CREEP = Effect(
     _apply_creep,
     _creep_seeds,
     keys=("fraction", "time_s"),
-    history=True,
     polish=_creep_polish,
+    told_by=Experiment.LOAD_UNLOAD_AND_HOLD,
+    drives=True,
 )
 CREEP_TWICE = Effect(
     "creep",
@@ -217,6 +244,7 @@ CREEP_TWICE = Effect(
     _apply_creep,
     _creep_twice_seeds,
     keys=("fraction", "time_s"),
-    history=True,
     polish=_creep_twice_polish,
+    told_by=Experiment.LOAD_UNLOAD_AND_HOLD,
+    drives=True,
 )

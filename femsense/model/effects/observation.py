@@ -9,7 +9,7 @@ import numpy as np
 
 from femsense.core.arrays import freeze
 from femsense.core.errors import InputError
-from femsense.model.effects.base import Effect, Entry, Parameter, number, vector
+from femsense.model.effects.base import Effect, Entry, Experiment, Parameter, number, vector
 from femsense.model.robot import Robot
 
 NEAR_CLAMP = 0.25
@@ -18,8 +18,8 @@ NEAR_CLAMP = 0.25
 
 def _depth_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
     return (
-        Parameter("scale", None, "1", 0.0, float(np.log(0.9)), float(np.log(1.1)), 1e-6, "log"),
-        Parameter("offset_m", None, "m", 0.0, -0.03, 0.03, 1e-5),
+        Parameter("scale", None, "1", 0.0, float(np.log(0.9)), float(np.log(1.1)), 1e-6, "log", plausible=0.01),
+        Parameter("offset_m", None, "m", 0.0, -0.03, 0.03, 1e-5, plausible=2e-3),
     )
 
 
@@ -33,7 +33,8 @@ def _apply_depth(robot: Robot, entry: Entry) -> Robot:
 
 
 def _marker_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
-    return tuple(Parameter("offset_m", (name, i), "m", 0.0, -0.02, 0.02, 1e-6) for name in robot.glued_names for i in range(3))
+    parts = [(name, i) for name in robot.glued_names for i in range(3)]
+    return tuple(Parameter("offset_m", part, "m", 0.0, -0.02, 0.02, 1e-6, plausible=5e-4) for part in parts)
 
 
 def _apply_marker(robot: Robot, entry: Entry) -> Robot:
@@ -49,7 +50,7 @@ def _apply_marker(robot: Robot, entry: Entry) -> Robot:
 
 
 def _share_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
-    return (Parameter("share", None, "1", 1.0, -0.3, 1.3, 1e-3),) if _beside_the_clamp(robot) else ()
+    return (Parameter("share", None, "1", 1.0, -0.3, 1.3, 1e-3, plausible=1.0),) if _beside_the_clamp(robot) else ()
 
 
 def _markers_by_the_clamp(robot: Robot) -> tuple[Entry, ...]:
@@ -82,10 +83,22 @@ def _apply_share(robot: Robot, entry: Entry) -> Robot:
 
 
 DEPTH_SCALE = Effect(
-    "depth_scale", "a camera whose distances are off", _depth_parameters, _apply_depth, keys=("scale", "offset_m")
+    "depth_scale",
+    "a camera whose distances are off",
+    _depth_parameters,
+    _apply_depth,
+    keys=("scale", "offset_m"),
+    told_by=Experiment.MOVE_THE_CAMERA,
+    moves_rest=True,
 )
 MARKER_OFFSET = Effect(
-    "marker_offset", "markers that sit elsewhere than declared", _marker_parameters, _apply_marker, keys=("offset_m",)
+    "marker_offset",
+    "markers that sit elsewhere than declared",
+    _marker_parameters,
+    _apply_marker,
+    keys=("offset_m",),
+    told_by=Experiment.MOVE_THE_CAMERA,
+    places_markers=True,
 )
 CLAMPED_MARKER = Effect(
     "clamped_marker",

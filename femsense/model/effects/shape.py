@@ -16,7 +16,7 @@ MOST_TETS = 60000
 
 
 def _size_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
-    return (Parameter("scale", None, "1", 0.0, float(np.log(0.8)), float(np.log(1.25)), 1e-6, "log"),)
+    return (Parameter("scale", None, "1", 0.0, float(np.log(0.8)), float(np.log(1.25)), 1e-6, "log", plausible=0.02),)
 
 
 def _apply_size(robot: Robot, entry: Entry) -> Robot:
@@ -66,5 +66,13 @@ DISCRETISATION = Effect(
     _mesh_seeds,
     keys=("element", "refinements"),
     discrete=True,
+    remeshes=True,
 )
-GEOMETRY = Effect("geometry", "a body made or swollen to another size", _size_parameters, _apply_size, keys=("scale",))
+GEOMETRY = Effect(
+    "geometry",
+    "a body made or swollen to another size",
+    _size_parameters,
+    _apply_size,
+    keys=("scale",),
+    moves_rest=True,
+)

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from femsense.core.errors import InputError
-from femsense.model.effects.base import Effect, Entry, Parameter, number
+from femsense.model.effects.base import Effect, Entry, Experiment, Parameter, number
 from femsense.model.robot import Robot
 
 KEYS = ("stiffness_n_m", "rotation_stiffness_nm_rad")
 SOFTEST = 150.0
 """The softest clamp: its springs give together so many times what a cube of the material and of the body's reach does. Clamps in which soft bodies hang by
 tens of millimetres are at a third of that; with 50 they lay beyond what was plausible, and nothing else came near."""
+USUAL_SPRING, USUAL_PLATE = 0.01, 0.02
+"""Plausible compliance of a clamp, of its springs and of its plate, as a share of the largest that is tried."""
 
 
 def _spring_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
@@ -20,7 +24,9 @@ def _spring_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
     if not count:
         return ()
     compliance = count / (float(robot.body.material.young_modulus.mean()) * robot.body.reach)
-    return (Parameter(KEYS[0], None, "N/m", 0.0, 0.0, SOFTEST * compliance, 1e-6 * compliance, "reciprocal"),)
+    softest = SOFTEST * compliance
+    usual = USUAL_SPRING * softest
+    return (Parameter(KEYS[0], None, "N/m", 0.0, 0.0, softest, 1e-6 * compliance, "reciprocal", plausible=usual),)
 
 
 def _plate_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
@@ -32,7 +38,9 @@ def _plate_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
         np.sort(np.ptp(nodes, axis=0))[-2]
     )  # of the clamped face; a bar of that width bends by reach/(E w⁴/12) a moment
     bending = 12.0 * robot.body.reach / (float(robot.body.material.young_modulus.mean()) * max(width, 1e-3) ** 4)
-    return (Parameter(KEYS[1], None, "N m/rad", 0.0, 0.0, 2.0 * bending, 1e-6 * bending, "reciprocal"),)
+    softest = 2.0 * bending
+    usual = USUAL_PLATE * softest
+    return (Parameter(KEYS[1], None, "N m/rad", 0.0, 0.0, softest, 1e-6 * bending, "reciprocal", plausible=usual),)
 
 
 def _apply_clamp(robot: Robot, entry: Entry) -> Robot:
@@ -47,6 +55,14 @@ def _apply_clamp(robot: Robot, entry: Entry) -> Robot:
     return robot.with_body(robot.body.with_clamp_stiffness(spring, turn=plate))
 
 
-BASE_COMPLIANCE = Effect("base_compliance", "a clamp that gives", _spring_parameters, _apply_clamp, keys=KEYS)
-BASE_ROTATION = Effect("base_compliance", "a clamp that gives", _plate_parameters, _apply_clamp, keys=KEYS)
+BASE_COMPLIANCE: Effect = Effect(
+    "base_compliance",
+    "a clamp that gives",
+    _spring_parameters,
+    _apply_clamp,
+    keys=KEYS,
+    told_by=Experiment.MORE_MARKERS,
+    planned=lambda robot: (("", BASE_COMPLIANCE), ("plate", BASE_ROTATION)),
+)
+BASE_ROTATION: Effect = replace(BASE_COMPLIANCE, parameters=_plate_parameters, planned=None)
 """The same effect with the other key: the loop tries both."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -32,7 +31,9 @@ from femsense.loop.data.trial import Groups, SurfaceRows, normals_of, spans_of, 
 from femsense.loop.design.advice import next_element
 from femsense.loop.fit.fitted_model import fit_model, own_of, rematched, with_nuisance
 from femsense.loop.fit.noise_components import Noise, whiten
-from femsense.loop.improve import MATCHINGS, _matched, improve
+from femsense.loop.improve import improve
+from femsense.loop.search import calibration
+from femsense.loop.search.calibration import MATCHINGS, matched
 from femsense.model.effects import find_effect
 from femsense.model.observation import Hypothesis, evaluate_scene
 from femsense.model.recording import Camera, Recording
@@ -237,8 +238,8 @@ def test_rows_are_made_again_until_the_fit_stays_where_it_is(rubbing: Recording,
         nothing, own = np.zeros(len(prior.mean)), np.r_[off, np.zeros(data.train[0].size - 6)]
         start = fit_model(data, hypothesis, prior, noise, nothing, own=own, max_iterations=0)
         data = rematched(data, start, noise, anew=True)  # rows as they are found from there
-        monkeypatch.setattr(sys.modules[improve.__module__], "MATCHINGS", rounds)
-        found, fitted = _matched(data, start, noise, anew=True)
+        monkeypatch.setattr(calibration, "MATCHINGS", rounds)
+        found, fitted = matched(data, start, noise, anew=True)
         again = fit_model(rematched(found, fitted, noise), hypothesis, prior, noise, fitted.fit.coordinates, own=own_of(fitted))
         return again.fit.fit.cost[0] - again.fit.chi2
 
@@ -348,20 +349,20 @@ def test_noise_of_clouds_is_shared_by_neighbours_along_their_normals():
 
 def check_friction(loop: Any) -> None:
     assert loop.verdict == "effects"
-    effect = next(e for e in loop.effects if e["name"] == "cable_friction")
-    value = effect["parameters"]["coefficient"]["value"]
+    effect = next(e for e in loop.effects if e.name == "cable_friction")
+    value = effect.parameters["coefficient"].value
     value = value if isinstance(value, float) else float(np.mean(list(value.values())))
     assert value == pytest.approx(0.25, rel=0.2)
-    assert {e["name"] for e in loop.effects} <= {"cable_friction", "stiffness", "cable_offset"}
-    assert loop.after["validation_normal_rms_m"] < 0.6 * loop.before["validation_normal_rms_m"]
+    assert {e.name for e in loop.effects} <= {"cable_friction", "stiffness", "cable_offset"}
+    assert loop.after.validation_normal_rms_m < 0.6 * loop.before.validation_normal_rms_m
 
 
 def test_friction_is_found_from_clouds_alone(rubbing: Recording):
     none = {f"marker_{n}": getattr(rubbing, f"marker_{n}")[:0] for n in ("frame", "index", "view", "xyz")}
     loop = improve(arm(COARSE), [replace(rubbing, marker_names=(), **none)], effects=FEW)
     check_friction(loop)
-    assert loop.data["measured"] == ["clouds"]
-    assert loop.after["validation_rms_m"] == loop.after["validation_normal_rms_m"]
+    assert loop.data.measured == ("clouds",)
+    assert loop.after.validation_rms_m == loop.after.validation_normal_rms_m
     assert loop.robot.marker_names == arm(COARSE).marker_names
     assert "along the normals" in loop.sentence
 
@@ -369,8 +370,8 @@ def test_friction_is_found_from_clouds_alone(rubbing: Recording):
 def test_friction_is_found_from_markers_and_clouds_together(rubbing: Recording):
     loop = improve(arm(COARSE), [rubbing], effects=FEW, measured="both")
     check_friction(loop)
-    assert loop.after["validation_rms_m"] != loop.after["validation_normal_rms_m"]
-    assert loop.after["validation_rms_m"] < 0.6 * loop.before["validation_rms_m"]
+    assert loop.after.validation_rms_m != loop.after.validation_normal_rms_m
+    assert loop.after.validation_rms_m < 0.6 * loop.before.validation_rms_m
 
 
 def test_a_model_that_lacks_nothing_is_told_so_from_clouds(tmp_path: Path):

@@ -14,13 +14,15 @@ from femsense.io.recording_folder import load_recording
 from femsense.loop.data.dataset import prepare
 from femsense.loop.design.advice import proposal_text
 from femsense.loop.design.candidate_experiments import candidate_experiments, minimal, script_of, setup_for
-from femsense.loop.design.identifiability import Block, Form, Gram, Judge, forms_of, turns_of
+from femsense.loop.design.experiment_blocks import Block, Form, Gram, forms_of, turns_of
+from femsense.loop.design.identifiability import Judge
 from femsense.loop.design.planner import element_block, identifiability_of_script, plan_experiment
-from femsense.loop.fit.fitted_model import MODULUS_STD, fit_model, with_nuisance
+from femsense.loop.fit.fitted_model import fit_model, with_nuisance
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.search.effect_fields import fields_of
 from femsense.loop.search.screening import screen_model
 from femsense.model.effects import find_effect
+from femsense.model.effects.material import MODULUS_STD
 from femsense.rig.script import check_script, plan_script
 from femsense.rig.simulate import simulate
 
@@ -43,7 +45,7 @@ def outlook_with(setup, names, *keys, start=True):
     more = {e.key: e for e in candidate_experiments(setup)}
     elements = [*(minimal(setup) if start else []), *(more[k] for k in keys)]
     blocks = [element_block(setup, forms, e, NOISE, with_rest=False) for e in elements]
-    return Judge(forms, ranges).judge(blocks)
+    return Judge(forms).judge(blocks)
 
 
 def row(identifiability, label):
@@ -53,7 +55,16 @@ def row(identifiability, label):
 def form(name, at, count, size=1.0):
     effect = find_effect(name)
     parameters = effect.parameters(tiny(), "tension")[:1] * count
-    return Form(name, name, effect, {}, parameters, np.full(count, size), at)
+    return Form(
+        name,
+        name,
+        effect,
+        {},
+        parameters,
+        np.full(count, size),
+        at,
+        np.full(count, effect.calibrated.planned_std) if effect.calibrated else np.zeros(0),
+    )
 
 
 def nothing(own, shared):
@@ -66,7 +77,7 @@ def test_gram_matrices_say_what_projections_of_the_columns_say():
     shared[:, 4] = shared[:, 1] + 0.3 * shared[:, 4]
     forms = [form("stiffness", 0, 1), form("poisson", 1, 1), form("gravity", 2, 2), form("geometry", 4, 1)]
     gram = Gram(own.T @ own, own.T @ shared, shared.T @ shared)
-    identifiability = Judge(forms, np.ones(4)).judge([Block("a", gram, None, nothing(3, 5), 40, 40)])
+    identifiability = Judge(forms).judge([Block("a", gram, None, nothing(3, 5), 40, 40)])
     prior = np.zeros((1, 4))
     prior[0, 3] = 1 / MODULUS_STD
     N = np.vstack([np.hstack([own, shared[:, :1]]), prior])
@@ -96,7 +107,7 @@ def test_two_recordings_have_two_poses_and_one_has_one():
 
     def acceptance_test(keys):
         blocks = [Block(k, Gram(o.T @ o, o.T @ s, s.T @ s), None, nothing(3, 1), 15, 15) for k, (o, s) in zip(keys, halves)]
-        return Judge(forms, np.ones(4)).judge(blocks).rows[0].retained
+        return Judge(forms).judge(blocks).rows[0].retained
 
     assert acceptance_test("aa") > 0.5
     assert acceptance_test("ab") < 1e-4
@@ -174,7 +185,7 @@ def test_a_proposal_lowers_the_confusion_within_its_frames(monkeypatch):
     monkeypatch.setattr(
         "femsense.loop.design.planner.candidate_experiments", lambda s: [e for e in candidate_experiments(s) if e.key in cases]
     )
-    monkeypatch.setattr("femsense.loop.design.identifiability.MOST_SEEDS", 1)
+    monkeypatch.setattr("femsense.loop.design.experiment_blocks.MOST_SEEDS", 1)
     proposal = plan_experiment(tiny(), noise=NOISE, frames=20)
     assert sum(e.frames for e in proposal.elements) <= 20
     assert proposal.steps

@@ -13,19 +13,19 @@ from femsense.core.least_squares import covariance_of
 from femsense.loop.data.dataset import prepare
 from femsense.loop.fit.covariance import _by_sweeps, coordinate_std, misfit, parameter_std
 from femsense.loop.fit.fitted_model import fit_model
-from femsense.loop.fit.joint_fit import GRAVITY_STD, Prior
+from femsense.loop.fit.joint_fit import Prior
 from femsense.loop.fit.noise_components import Noise
 from femsense.model.effects import find_effect
-from femsense.model.effects.loads import STANDARD_GRAVITY
+from femsense.model.effects.loads import SIZE, STANDARD_GRAVITY
 from femsense.model.observation import Hypothesis
 
 
 def linear_fit(rows: np.ndarray, gravity: np.ndarray, residual: np.ndarray | None = None) -> Any:
     """Return a fit of gravity alone with whitened rows (k, 3), at its optimum: the size of gravity is known besides."""
-    prior = gravity / np.linalg.norm(gravity) / GRAVITY_STD
+    prior = gravity / np.linalg.norm(gravity) / SIZE.std
     J = np.vstack([rows, prior])
     r = np.zeros(len(J)) if residual is None else residual
-    parameters = [SimpleNamespace(key="vector_m_s2")] * 3
+    parameters = [SimpleNamespace(length=SIZE)] * 3
     return SimpleNamespace(
         own=0,
         coordinates=gravity,
@@ -53,8 +53,8 @@ def test_gravity_seen_along_one_axis_may_point_anywhere_on_a_circle() -> None:
 def test_gravity_seen_along_all_axes_has_the_usual_spread(size: float) -> None:
     towards, std = np.array([0.6, 0.0, -0.8]), 0.05
     # the data say `size`, what is known says 9.80665: the optimum lies between them
-    best = (size / std**2 + STANDARD_GRAVITY / GRAVITY_STD**2) / (1 / std**2 + 1 / GRAVITY_STD**2)
-    residual = np.append((best - size) * towards / std, (best - STANDARD_GRAVITY) / GRAVITY_STD)
+    best = (size / std**2 + STANDARD_GRAVITY / SIZE.std**2) / (1 / std**2 + 1 / SIZE.std**2)
+    residual = np.append((best - size) * towards / std, (best - STANDARD_GRAVITY) / SIZE.std)
     fit = linear_fit(np.eye(3) / std, best * towards, residual)
     np.testing.assert_allclose(coordinate_std(fit, [], NOISE), fit.std, rtol=0.05)
 

@@ -137,7 +137,7 @@ def test_seats_that_scatter_on_an_arm_that_bends_are_no_effect():
     recording, _ = record(inputs, labels=labels, truth=arm((8, 3, 3)), noise=1e-4, placements=placements)
     loop = improve(arm(), [recording])
     assert loop.verdict == "none" and not loop.effects
-    assert loop.data["noise_components_m"]["marker"] == pytest.approx(4e-4, rel=0.4)
+    assert loop.data.noise_components_m["marker"] == pytest.approx(4e-4, rel=0.4)
 
 
 def test_several_markers_that_sit_elsewhere_are_named_and_are_no_noise():
@@ -147,9 +147,9 @@ def test_several_markers_that_sit_elsewhere_are_named_and_are_no_noise():
     placements[7] += [0.0, 0.0, 2.5e-3]
     recording, _ = record(inputs, labels=labels, truth=arm((8, 3, 3)), noise=1e-4, placements=placements)
     loop = improve(arm(), [recording])
-    effect = next(e for e in loop.effects if e["name"] == "marker_offset")
-    offsets = effect["parameters"]["offset_m"]["value"]
+    effect = next(e for e in loop.effects if e.name == "marker_offset")
+    offsets = effect.parameters["offset_m"].value
     assert set(offsets) == {"m7", "m10"}
     for name, placement in (("m7", placements[7]), ("m10", placements[10])):
         np.testing.assert_allclose(offsets[name], placement, atol=5e-4)
-    assert loop.data["noise_components_m"]["marker"] < 3e-4
+    assert loop.data.noise_components_m["marker"] < 3e-4

@@ -19,6 +19,7 @@ from femsense.loop.fit.discretisation_error import with_mesh_errors
 from femsense.loop.fit.fitted_model import FittedModel, fit_model, own_of, problem_of, with_nuisance
 from femsense.loop.fit.joint_fit import Prior
 from femsense.loop.fit.noise_components import Noise
+from femsense.loop.result.records import NAMED, RefitRecord
 from femsense.loop.search import acceptance, forward_selection, location_search, pruning, subsampling
 from femsense.loop.search import effect_fields as effect_fields_module
 from femsense.loop.search import refit as refits
@@ -34,6 +35,7 @@ from femsense.loop.search.swaps import swapped
 from femsense.model.effects import apply_effects, find_effect
 from femsense.model.observation import Hypothesis
 
+RECORD = RefitRecord("", {})
 NOISE = Noise({"white": 1e-4}, "")
 COUNT = 300.0
 HIDDEN: list[dict[str, Any]] = [
@@ -101,7 +103,7 @@ def test_a_candidate_is_the_same_to_some_states(started: tuple[Data, FittedModel
 
 def searched(
     started: tuple[Data, FittedModel], monkeypatch: pytest.MonkeyPatch, *names: str, alike: bool = False
-) -> tuple[list[tuple[str, bool]], list[dict[str, Any]]]:
+) -> tuple[list[tuple[str, bool]], list[RefitRecord]]:
     """Return what growth has refitted of a shortlist, whose scores may be alike, each with whether to all states, and its records."""
     data, fitted = started
     table = screen_model(data, fitted.fit, NOISE, fields_of(data, fitted, names), COUNT)
@@ -132,7 +134,7 @@ def test_rivals_that_stay_far_behind_in_some_states_are_not_fitted_to_all(
 ):
     fitted, records = searched(started, monkeypatch, "payload", "cable_gain", "poisson")
     assert [f for f in fitted if f[0] != "payload"] == [("cable_gain", False), ("poisson", False)]
-    assert all(r["verdict"].startswith("stopped early: in some of the states") for r in records[1:])
+    assert all(r.verdict.startswith("stopped early: in some of the states") for r in records[1:])
 
 
 @pytest.mark.usefixtures("some")
@@ -142,9 +144,7 @@ def test_what_promises_as_much_is_fitted_to_all_states_in_the_order_of_what_it_e
     fitted, records = searched(started, monkeypatch, "cable_gain", "payload", alike=True)
     assert fitted[:3] == [("cable_gain", False), ("payload", False), ("payload", True)]
     assert ("cable_gain", True) not in fitted
-    assert [r["name"] for r in records] == ["payload", "cable_gain"] and records[1]["verdict"].startswith(
-        "stopped early: in some"
-    )
+    assert [r.name for r in records] == ["payload", "cable_gain"] and records[1].verdict.startswith("stopped early: in some")
 
 
 def test_rivals_are_fitted_to_all_states_where_these_are_little_work(
@@ -152,7 +152,7 @@ def test_rivals_are_fitted_to_all_states_where_these_are_little_work(
 ):
     fitted, records = searched(started, monkeypatch, "payload", "cable_gain", "poisson")
     assert [f for f in fitted if f[0] != "payload"] == [("cable_gain", True), ("poisson", True)]
-    assert not any("some of the states" in r["verdict"] for r in records)
+    assert not any("some of the states" in r.verdict for r in records)
 
 
 def test_another_form_of_an_effect_is_held_against_other_effects_alone(
@@ -281,17 +281,18 @@ def test_a_rival_that_its_place_brings_ahead_goes_there_before_one_is_named(
 ):
     data, fitted = started
     far = max(payloads(data, fitted)[:6], key=off)
-    rival = forward_selection.acceptance_test(data, fitted, far, refit(data, fitted, far, NOISE), {}, NOISE)
+    rival = forward_selection.acceptance_test(data, fitted, far, refit(data, fitted, far, NOISE), RECORD, NOISE)
     there = polished(data, fitted, rival, NOISE, lambda text: None)
     gains = screen_model(data, fitted.fit, NOISE, fields_of(data, fitted, ["cable_gain"]), COUNT)
-    other = forward_selection.acceptance_test(data, fitted, gains[0], refit(data, fitted, gains[0], NOISE), {}, NOISE)
+    other = forward_selection.acceptance_test(data, fitted, gains[0], refit(data, fitted, gains[0], NOISE), RECORD, NOISE)
     monkeypatch.setattr(forward_selection, "WITHIN_REACH", rival.score / there.score / 2.0)
 
     def leaders(lead: float) -> list[Refit]:
         """Of both, the other one ahead of the rival by this share of what the rival gains where it is."""
         first = replace(other, score=rival.score + lead * (there.score - rival.score))
         assert first.score - EVIDENCE > rival.score
-        return forward_selection._leaders(data, fitted, [first, rival], NOISE, lambda text: None)[1:]
+        leading, _ = forward_selection.leaders(data, fitted, {0: first, 1: rival}, NOISE, lambda text: None)
+        return [leading[i] for i in leading if i > 0]
 
     (moved,) = leaders(0.2)
     assert moved.candidate.effect.name == "payload" and moved.score == pytest.approx(there.score)
@@ -327,7 +328,7 @@ def test_an_effect_in_its_place_is_not_sought_elsewhere_and_one_that_is_not_is()
     assert may_lie_elsewhere(data, right, "cable_gain", NOISE)  # it has no place: nothing is known
     assert not may_lie_elsewhere(data, right, "payload", NOISE)
     history = [("", base), ("payload", wrong), ("cable_gain", right)]
-    named, said = {"name": "payload", "step": 1, "dbic": 1000.0, "verdict": "named"}, list[str]()
+    named, said = RefitRecord("payload", {}, NAMED, step=1, dbic=1000.0), list[str]()
     assert swapped(data, history, [named], NOISE, COUNT, said.append) == (history, [named]) and not said
 
 
@@ -342,7 +343,7 @@ def test_a_refit_with_nowhere_to_go_is_given_up_where_a_rival_explains_more(star
     for settled in (True, False):
         rival = refit(data, fitted, one, NOISE, wanted=1.1 * score, settled=settled)
         assert (rival.fit.fit.status == STOPPED_EARLY) == settled
-    ahead = [Refit(one, made, 0.0, 0.0, {})]
+    ahead = [Refit(one, made, 0.0, 0.0, RECORD)]
     assert [_settled(data, first[name], ahead) for name in first] == [True, False, False]
     assert not _settled(data, first["cable_gain"], [])
 
@@ -475,5 +476,5 @@ def test_held_out_data_that_speak_against_an_effect_count(
     dear = replace(one, cost=evidence(fitted.fit, made.fit) - score)
     monkeypatch.setattr(acceptance, "held_shift", lambda *given: 6.25)  # it acts little there, so that chance may have it
     monkeypatch.setattr(acceptance, "held_chi2", lambda data, at, noise: 5.0 * (at is made))
-    verdict = forward_selection.acceptance_test(data, fitted, dear, made, {}, NOISE).record["verdict"]
+    verdict = forward_selection.acceptance_test(data, fitted, dear, made, RECORD, NOISE).record.verdict
     assert verdict == "passes" if passes else "held-out data speak against it" in verdict

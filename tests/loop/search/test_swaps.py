@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from typing import Any
 
@@ -16,9 +15,12 @@ from femsense.loop.fit.covariance import parameter_std
 from femsense.loop.fit.fitted_model import FittedModel, fit_model, own_of, with_nuisance
 from femsense.loop.fit.joint_fit import Prior
 from femsense.loop.fit.noise_components import Noise, whiten
+from femsense.loop.result.records import NAMED, PASSES, RefitRecord
 from femsense.loop.search import forward_selection
 from femsense.loop.search import refit as refits
+from femsense.loop.search import search as searching
 from femsense.loop.search.acceptance import acceptance_test
+from femsense.loop.search.calibration import fitted_again
 from femsense.loop.search.effect_fields import fields_of
 from femsense.loop.search.forward_selection import polished, shortlist
 from femsense.loop.search.location_search import closer, without_last
@@ -29,8 +31,8 @@ from femsense.loop.search.swaps import swapped
 from femsense.model.effects import find_effect
 from femsense.model.observation import Hypothesis
 
-improving = sys.modules["femsense.loop.improve"]
-beside_a_tie = improving._beside_a_tie
+beside_a_tie = searching.beside_a_tie
+RECORD = RefitRecord("", {})
 NOISE = Noise({"white": 1e-4}, "")
 COUNT = 300.0
 HIDDEN = [
@@ -48,27 +50,27 @@ def started() -> tuple[Data, FittedModel]:
     return data, fit_model(data, hypothesis, prior, NOISE, np.zeros(len(prior.mean)))
 
 
-def added(data: Data, fitted: FittedModel, name: str, step: int) -> tuple[FittedModel, dict[str, Any]]:
+def added(data: Data, fitted: FittedModel, name: str, step: int) -> tuple[FittedModel, RefitRecord]:
     """Return a stage with one more effect, rightly or not, and its record."""
     table = screen_model(data, fitted.fit, NOISE, fields_of(data, fitted, [name]), COUNT)
-    record: dict[str, Any] = {"name": name, "seed": {}, "step": step}
+    record = RefitRecord(name, {}, step=step)
     candidate = max(shortlist(table, first=True) or table, key=lambda c: c.score)
     made = acceptance_test(data, fitted, candidate, refit(data, fitted, candidate, NOISE), record, NOISE)
-    return made.fitted, {**record, "verdict": "named"}
+    return made.fitted, made.saying(NAMED).record
 
 
 def test_a_rival_that_is_right_takes_the_place_of_what_was_named_first():
     data, base = started()
     first, wrong = added(data, base, "gravity", 1)
     second, right = added(data, first, "cable_gain", 2)
-    rival = {**wrong, "name": "payload", "verdict": "passes"}
+    rival = replace(wrong, name="payload", verdict=PASSES)
     history, refits = swapped(
         data, [("", base), ("gravity", first), ("cable_gain", second)], [wrong, rival, right], NOISE, COUNT, lambda text: None
     )
     assert [name for name, _ in history] == ["", "cable_gain", "payload"]
     assert history[-1][1].fit.chi2 < second.fit.chi2
     assert set(history[1][1].fit.hypothesis.names) == {"stiffness", "cable_offset", "cable_gain"}
-    said = {(r["name"], r["step"]): r["verdict"] for r in refits}
+    said = {(r.name, r.step): r.verdict for r in refits}
     assert said["gravity", 1] == "passes" and said["payload", 2] == "named"
 
 
@@ -76,20 +78,20 @@ def test_what_is_right_keeps_its_place():
     data, base = started()
     first, right = added(data, base, "payload", 1)
     second, other = added(data, first, "cable_gain", 2)
-    rival = {**right, "name": "gravity", "verdict": "passes"}
+    rival = replace(right, name="gravity", verdict=PASSES)
     before = [("", base), ("payload", first), ("cable_gain", second)]
     history, refits = swapped(data, before, [right, rival, other], NOISE, COUNT, lambda text: None)
     assert {name for name, _ in history} == {"", "payload", "cable_gain"}  # perhaps at a better place
     assert history[-1][1].fit.chi2 <= second.fit.chi2
-    assert not any(r["verdict"] == "named" for r in refits if r["name"] == "gravity")
+    assert not any(r.is_named for r in refits if r.name == "gravity")
 
 
 def test_polishing_counts_as_the_evidence_that_it_brings_where_noise_is_larger_than_thought(monkeypatch: pytest.MonkeyPatch):
     data, base = started()
     better, _ = added(data, base, "payload", 1)
     table = screen_model(data, base.fit, NOISE, fields_of(data, base, ["payload"]), COUNT)
-    rough = Refit(shortlist(table, first=True)[0], base, 100.0, 100.0, {})
-    monkeypatch.setattr(forward_selection, "_polish", lambda *_: better)
+    rough = Refit(shortlist(table, first=True)[0], base, 100.0, 100.0, RECORD)
+    monkeypatch.setattr(forward_selection, "_polish", lambda *_: (better, []))
     gained = polished(data, base, rough, NOISE, lambda text: None).score - 100.0
     assert gained == pytest.approx(evidence(base.fit, better.fit)) and gained < 0.9 * (base.fit.chi2 - better.fit.chi2)
 
@@ -100,15 +102,15 @@ def test_a_polished_refit_is_weighed_against_the_model_without_it_as_its_rivals_
     table = screen_model(data, base.fit, NOISE, fields_of(data, base, ["payload"]), COUNT)
     half = replace(base, fit=replace(base.fit, chi2=0.4 * base.fit.chi2))
     ahead = evidence(base.fit, half.fit)
-    rough = Refit(shortlist(table, first=True)[0], half, ahead - 20.0, 100.0, {})
-    monkeypatch.setattr(forward_selection, "_polish", lambda *_: better)
+    rough = Refit(shortlist(table, first=True)[0], half, ahead - 20.0, 100.0, RECORD)
+    monkeypatch.setattr(forward_selection, "_polish", lambda *_: (better, []))
     assert polished(data, base, rough, NOISE, lambda text: None).score == pytest.approx(evidence(base.fit, better.fit) - 20.0)
     assert abs(evidence(base.fit, better.fit) - ahead - evidence(half.fit, better.fit)) > 1.0  # two steps are not one
 
 
 def test_what_predicts_surely_goes_before_what_may_predict():
     def predicts(gain: float, spread: float) -> float:
-        return forward_selection._predicts(Refit(None, None, 0.0, 0.0, {"cv_gain": gain, "cv_std": spread}))
+        return forward_selection.surely_predicts(Refit(None, None, 0.0, 0.0, replace(RECORD, cv_gain=gain, cv_std=spread)))
 
     assert predicts(44.0, 14.0) > predicts(48.0, 45.0)
     assert predicts(44.0, np.inf) == 44.0
@@ -116,11 +118,9 @@ def test_what_predicts_surely_goes_before_what_may_predict():
 
 def test_weight_that_nobody_declared_is_refitted_however_far_behind_it_looks(monkeypatch: pytest.MonkeyPatch):
     def lenient(
-        data: Data, fitted: FittedModel, candidate: Candidate, made: FittedModel, record: dict[str, Any], noise: Noise
+        data: Data, fitted: FittedModel, candidate: Candidate, made: FittedModel, record: RefitRecord, noise: Noise
     ) -> Refit:
-        own = acceptance_test(data, fitted, candidate, made, record, noise)
-        record["verdict"] = "passes"
-        return own
+        return acceptance_test(data, fitted, candidate, made, record, noise).saying(PASSES)
 
     monkeypatch.setattr(forward_selection, "acceptance_test", lenient)
     monkeypatch.setattr(forward_selection, "explains", lambda fitted: True)
@@ -133,7 +133,7 @@ def test_weight_that_nobody_declared_is_refitted_however_far_behind_it_looks(mon
     looks = [replace(c, score=forward_selection.PREDICTED_MUCH + 1.0 if c.effect.name == "gravity" else c.score) for c in table]
     table = sorted(looks, key=lambda c: -c.score)
     winner, _, records = forward_selection.select_next(data, base, table, NOISE, lambda text: None)
-    assert {r["name"] for r in records} == {"gravity", "payload"}
+    assert {r.name for r in records} == {"gravity", "payload"}
     assert winner is not None and winner.candidate.effect.name == "gravity"
 
 
@@ -146,9 +146,7 @@ def test_until_an_effect_explains_the_data_rivals_are_refitted_to_the_end(monkey
         return refit(data, fitted, candidate, noise)
 
     def lenient(*given: Any) -> Refit:
-        own = acceptance_test(*given)
-        own.record["verdict"] = "passes"
-        return own
+        return acceptance_test(*given).saying(PASSES)
 
     data, base = started()
     table = screen_model(data, base.fit, NOISE, fields_of(data, base, ["payload", "cable_gain"]), COUNT)
@@ -173,19 +171,15 @@ def test_another_form_of_what_leads_is_held_against_what_that_one_promised(monke
     asked = list[str]()
 
     def lenient(
-        data: Data, fitted: FittedModel, candidate: Candidate, made: FittedModel, record: dict[str, Any], noise: Noise
+        data: Data, fitted: FittedModel, candidate: Candidate, made: FittedModel, record: RefitRecord, noise: Noise
     ) -> Refit:
         asked.append(candidate.effect.name)
-        return replace(
-            acceptance_test(data, fitted, candidate, made, record | {"verdict": "passes"}, noise),
-            record={**record, "verdict": "passes"},
-            gain=800.0,
-        )
+        return replace(acceptance_test(data, fitted, candidate, made, record, noise).saying(PASSES), gain=800.0)
 
     monkeypatch.setattr(forward_selection, "acceptance_test", lenient)
     monkeypatch.setattr(forward_selection, "polished", lambda data, fitted, refitted, *_: refitted)
     monkeypatch.setattr(forward_selection, "explains", lambda fitted: True)
-    monkeypatch.setattr(forward_selection, "_predicts", lambda refitted: 0.0)
+    monkeypatch.setattr(forward_selection, "surely_predicts", lambda refitted: 0.0)
     forms = [replace(payload, score=100.0), replace(rival, score=60.0)]
     forward_selection.select_next(data, base, forms, NOISE, lambda text: None)
     assert asked == ["payload", "payload"] if form else asked == ["payload"]
@@ -243,7 +237,7 @@ def test_a_refit_that_could_win_goes_to_its_end(monkeypatch: pytest.MonkeyPatch)
     winner, _, records = forward_selection.select_next(data, base, table, NOISE, lambda text: None)
     assert winner is not None and winner.fitted.fit.fit.status == "converged"
     assert winner.fitted.fit.chi2 == pytest.approx(whole.fit.chi2, rel=0.02)
-    assert records[0]["dchi2"] == pytest.approx(evidence(base.fit, winner.fitted.fit))
+    assert records[0].dchi2 == pytest.approx(evidence(base.fit, winner.fitted.fit))
 
 
 def test_a_refit_that_cannot_go_further_is_compared_as_it_is(monkeypatch: pytest.MonkeyPatch):
@@ -266,9 +260,9 @@ def test_what_goes_with_an_effect_that_was_as_good_is_found_beside_it():
     wrong, _ = added(data, base, "gravity", 1)
     table = screen_model(data, base.fit, NOISE, fields_of(data, base, ["cable_gain"]), COUNT)
     candidate = (shortlist(table, first=True) or table)[0]
-    tie = Refit(candidate, refit(data, base, candidate, NOISE), 0.0, 0.0, {})
+    tie = Refit(candidate, refit(data, base, candidate, NOISE), 0.0, 0.0, RECORD)
     instead, both, tried = beside_a_tie(data, wrong, tie, None, NOISE, ["cable_gain", "payload"], COUNT, lambda text: None)
-    assert both is not None and both.candidate.effect.name == "payload" and tried[-1]["verdict"] == "named"
+    assert both is not None and both.candidate.effect.name == "payload" and tried[-1].is_named
     assert instead.fit.hypothesis.names[-1] == "cable_gain"
     assert both.fitted.fit.hypothesis.names[-2:] == ("cable_gain", "payload")
     assert beside_a_tie(data, both.fitted, tie, None, NOISE, ["cable_gain", "payload"], COUNT, lambda text: None)[1] is None
@@ -299,10 +293,10 @@ def test_fields_are_computed_anew_where_those_of_the_model_before_promise_someth
     fitted, _ = added(data, base, "cable_gain" if promises else "payload", 1)
     hints = fields_of(data, base, ["payload", "poisson"]).beside(fitted.fit)
     asked = list[str]()
-    monkeypatch.setattr(improving, "fields_of", lambda *given: asked.append("anew") or fields_of(*given))
+    monkeypatch.setattr(searching, "fields_of", lambda *given: asked.append("anew") or fields_of(*given))
     if not promises:
         monkeypatch.setattr(forward_selection, "PREDICTED_MUCH", 1e3)
-    fields, table = improving._scored(data, fitted, hints, NOISE, ["payload", "poisson"], COUNT)
+    fields, table = searching.scored(data, fitted, hints, NOISE, ["payload", "poisson"], COUNT)
     assert asked == ["anew"] * promises and (fields is hints) != promises
     assert {c.effect.name for c in table} <= {"payload", "poisson"}
 
@@ -314,7 +308,7 @@ def test_a_richer_form_is_tried_only_where_fields_promise_something(monkeypatch:
     forms = sorted(forward_selection._forms(table, "cable_gain"), key=lambda c: len(c.parameters))
     one, all_of_them = forms[0], forms[-1]
     made = refit(data, base, one, NOISE)
-    winner = Refit(one, made, evidence(base.fit, made.fit) - one.cost, 0.0, {})
+    winner = Refit(one, made, evidence(base.fit, made.fit) - one.cost, 0.0, RECORD)
     J, r = np.asarray(made.fit.fit.jacobian), made.fit.fit.residual
     problem = forward_selection.problem_of(data, made.fit, NOISE)
     predicted_sum = linear_gain(made.fit, problem, all_of_them.raw, all_of_them.placements)
@@ -342,17 +336,17 @@ def test_a_place_is_improved_before_a_refit_is_turned_down_for_what_it_predicts(
     asked = list[str]()
 
     def strict(
-        data: Data, fitted: FittedModel, candidate: Candidate, made: FittedModel, record: dict[str, Any], noise: Noise
+        data: Data, fitted: FittedModel, candidate: Candidate, made: FittedModel, record: RefitRecord, noise: Noise
     ) -> Refit:
         own = acceptance_test(data, fitted, candidate, made, record, noise)
-        record["verdict"] = "passes" if asked else "it does not predict"
+        own = own.saying(PASSES if asked else "it does not predict")
         asked.append(candidate.effect.name)
         return own
 
     monkeypatch.setattr(forward_selection, "acceptance_test", strict)
     monkeypatch.setattr(forward_selection, "_polish", lambda data, fitted, winner, *_: replace(winner.fitted))
     winner, _, records = forward_selection.select_next(data, base, table, NOISE, lambda text: None)
-    assert winner is not None and asked[:2] == ["payload", "payload"] and records[0]["verdict"] == "named"
+    assert winner is not None and asked[:2] == ["payload", "payload"] and records[0].is_named
 
 
 def test_a_place_moves_on_where_the_body_is_as_the_load_has_bent_it():
@@ -373,7 +367,7 @@ def test_a_place_moves_on_where_the_body_is_as_the_load_has_bent_it():
     moved, scatter = closer(data, fitted, NOISE)
     assert np.linalg.norm(np.subtract(moved.fit.hypothesis.terms[-1][1]["point_m"], hidden["point_m"])) < 0.004
     assert moved.fit.chi2 < 0.5 * fitted.fit.chi2 and np.all(np.array(scatter) < 0.2)
-    whole = polished(data, base, Refit(candidate, fitted, 0.0, 0.0, {}), NOISE, lambda text: None).fitted
+    whole = polished(data, base, Refit(candidate, fitted, 0.0, 0.0, RECORD), NOISE, lambda text: None).fitted
     found, std = whole.fit.coordinates[-6:], parameter_std(data, whole, NOISE, {})["payload"]
     assert whole.fit.hypothesis.entries(whole.fit.coordinates)[-1]["point_m"] == found[3:].tolist()
     off = np.abs(found - [*hidden["force_n"], *hidden["point_m"]])
@@ -387,13 +381,13 @@ def test_a_model_on_top_of_which_much_is_promised_need_not_be_fitted_to_the_end(
     )
     fields = fields_of(data, rough, ["payload", "cable_gain"])
     best = max(c.gain for c in screen_model(data, rough.fit, NOISE, fields, COUNT))
-    assert improving._spared(data, rough, fields, NOISE, COUNT) == 0.0  # all states are little work
-    monkeypatch.setattr(improving, "spares", lambda data, robot: True)
-    spare = improving._spared(data, rough, fields, NOISE, COUNT)
-    assert spare == pytest.approx(improving.SPARED * best)
+    assert searching.spared_gain(data, rough, fields, NOISE, COUNT) == 0.0  # all states are little work
+    monkeypatch.setattr(searching, "spares", lambda data, robot: True)
+    spare = searching.spared_gain(data, rough, fields, NOISE, COUNT)
+    assert spare == pytest.approx(searching.SPARED * best)
     finer = replace(NOISE, std={"white": 1e-5})
-    assert improving._spared(data, rough, fields, finer, COUNT) > 50.0 * spare  # by the noise that is known now
+    assert searching.spared_gain(data, rough, fields, finer, COUNT) > 50.0 * spare  # by the noise that is known now
     known = rough.fit.jets
-    whole, part = (improving._again(data, rough, NOISE, known=known, spare=s) for s in (0.0, 100.0 * spare))
+    whole, part = (fitted_again(data, rough, NOISE, known=known, spare=s) for s in (0.0, 100.0 * spare))
     assert len(part.fit.fit.cost) < len(whole.fit.fit.cost) and part.fit.chi2 < whole.fit.chi2 + 100.0 * spare
     assert part.fit.fit.status == "converged"

@@ -6,24 +6,27 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
+from femsense.loop.result.records import ConfoundedPair, RefitRecord
+from femsense.loop.result.tables import table_of
 from femsense.loop.search.search_state import Search
 from femsense.loop.verdict.confounding import confounded, in_words
+from femsense.model.effects import find_effect
 
 
-def refit(name: str, dbic: float, verdict: str = "passes", **more: Any) -> dict[str, Any]:
-    return {"name": name, "dbic": dbic, "verdict": verdict, "step": 1, **more}
+def refit(name: str, dbic: float, verdict: str = "passes", **more: Any) -> RefitRecord:
+    return RefitRecord(name, {}, verdict, dbic=dbic, step=1, **more)
 
 
 def candidate(name: str, *field: float) -> SimpleNamespace:
     """Return what screening found of an effect with one parameter."""
     columns = np.array(field)[:, None]
-    effect = SimpleNamespace(name=name)
+    effect = find_effect(name)
     return SimpleNamespace(
         effect=effect, retained=1.0, parameters=(None,), columns=columns, step=np.ones(1), score=0.0, gain=100.0
     )
 
 
-def searched(refits: list[dict[str, Any]], first: list[SimpleNamespace] | None = None) -> Search:
+def searched(refits: list[RefitRecord], first: list[SimpleNamespace] | None = None) -> Search:
     """Return a search that went so, with a modulus fitted along."""
     hypothesis = SimpleNamespace(terms=((SimpleNamespace(name="stiffness"), {}, (None,)),), names=("stiffness",))
     jacobian = np.array([[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]])
@@ -39,7 +42,11 @@ def test_a_rival_with_nearly_as_much_evidence_is_said_once_with_all_that_is_know
     fields = [candidate("cable_friction", 1, 1, 0), candidate("cable_gain", 1, 1, 0.1), candidate("geometry", 0, 0, 1)]
     pairs = confounded(searched(refits, fields), ["cable_friction"])
     (pair,) = pairs
-    assert pair == {"pair": ["cable_friction", "cable_gain"], "dbic_gap": 3.0, "cosine": pytest.approx(0.9975, abs=1e-4)}
+    assert table_of(pair) == {
+        "pair": ["cable_friction", "cable_gain"],
+        "dbic_gap": 3.0,
+        "cosine": pytest.approx(0.9975, abs=1e-4),
+    }
     assert in_words(pairs, ["cable_friction"]) == " These data do not tell cable_friction from cable_gain."
 
 
@@ -49,15 +56,15 @@ def test_pairs_of_what_is_named_come_first_and_only_these_are_said() -> None:
         for name, f in {"gravity": (1, 0, 0), "payload": (1, 0.1, 0), "creep": (0, 0, 1), "cable_gain": (0, 0.1, 1)}.items()
     ]
     pairs = confounded(searched([refit("creep", 30.0, "named")], fields), ["creep"])
-    assert [p["pair"] for p in pairs] == [["creep", "cable_gain"], ["gravity", "payload"]]
+    assert [p.pair for p in pairs] == [("creep", "cable_gain"), ("gravity", "payload")]
     assert in_words(pairs, ["creep"]) == ""  # fields alone: no refit says so
 
 
 def test_an_effect_that_makes_the_modulus_needless_is_its_rival_unless_another_one_is_far_ahead() -> None:
-    payload = refit("payload", 40.0, takes_over=["stiffness"])
-    assert confounded(searched([payload]), ["stiffness"]) == [{"pair": ["stiffness", "payload"], "dbic_gap": 0.0}]
+    payload = refit("payload", 40.0, takes_over=("stiffness",))
+    assert table_of(confounded(searched([payload]), ["stiffness"])) == [{"pair": ["stiffness", "payload"], "dbic_gap": 0.0}]
     near = [refit("gravity", 45.0, "named"), payload]
-    assert {"pair": ["stiffness", "payload"], "dbic_gap": 5.0} in confounded(searched(near), ["stiffness", "gravity"])
+    assert {"pair": ["stiffness", "payload"], "dbic_gap": 5.0} in table_of(confounded(searched(near), ["stiffness", "gravity"]))
     far = [refit("gravity", 90.0, "named"), payload]
     assert confounded(searched(far), ["stiffness", "gravity"]) == []
 
@@ -75,13 +82,13 @@ def test_fields_that_agree_are_no_rivals_where_a_refit_tells_them_apart() -> Non
 )
 def test_a_refit_that_was_given_up_before_it_had_a_dbic_refutes_nothing(verdict: str) -> None:
     fields = [candidate("cable_friction", 1, 1, 0), candidate("creep", 1, 1, 0.1)]
-    early = {"name": "creep", "verdict": verdict, "step": 1}
+    early = RefitRecord("creep", {}, verdict, step=1)
     (pair,) = confounded(searched([refit("cable_friction", 100.0, "named"), early], fields), ["cable_friction"])
-    assert pair["pair"] == ["cable_friction", "creep"]
+    assert pair.pair == ("cable_friction", "creep")
 
 
 def test_a_mesh_without_which_nothing_comes_to_rest_has_no_rivals() -> None:
-    alone = {"name": "discretisation", "verdict": "named", "step": 1}
+    alone = RefitRecord("discretisation", {}, "named", step=1)
     assert confounded(searched([alone, refit("creep", 20.0)]), ["discretisation"]) == []
 
 
@@ -96,7 +103,7 @@ def test_what_calibration_imitates_is_said_with_the_nuisance_that_does() -> None
     hidden = candidate("cable_friction", 0, 1, 0.02)
     hidden.retained, hidden.response = 0.02, np.zeros((2, 1))
     pairs = confounded(searched([], [hidden]), ["stiffness"])
-    assert pairs == [{"pair": ["stiffness", "cable_friction"], "absorbed_share": pytest.approx(0.9998)}]
-    assert in_words([*pairs, {"pair": ["gravity", "cable_offset"], "dbic_gap": 1.0}], ["stiffness", "gravity"]) == (
+    assert table_of(pairs) == [{"pair": ["stiffness", "cable_friction"], "absorbed_share": pytest.approx(0.9998)}]
+    assert in_words([*pairs, ConfoundedPair(("gravity", "cable_offset"), dbic_gap=1.0)], ["stiffness", "gravity"]) == (
         " These data do not tell stiffness from cable_friction, nor gravity from cable_offset."
     )

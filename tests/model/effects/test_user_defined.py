@@ -186,8 +186,8 @@ def test_an_effect_of_ones_own_competes_and_the_better_robot_can_be_written(tmp_
     hidden = {"name": "magnet", "file": str(MAGNET), "center_m": [0.1, 0.0, 0.0], "force_n": [0.0, 0.16, 0.1]}
     recording, _ = record(inputs[:9], effects=[hidden], labels=labels[:9], truth=arm((3, 1, 1)))
     loop = improve(arm((3, 1, 1)), [recording], effects=["magnet", "cable_friction"], user_effects=[MAGNET])
-    tried = next(row for row in loop.candidates if row["name"] == "magnet")
-    assert tried["dchi2"] > 100.0 and tried["seed"]["file"] == str(MAGNET)
+    tried = next(row for row in loop.candidates if row.name == "magnet")
+    assert tried.dchi2 > 100.0 and tried.seed["file"] == str(MAGNET)
     save_robot(arm((3, 1, 1)), tmp_path, effects=[hidden])
     assert (tmp_path / "magnet.py").is_file()
     np.testing.assert_allclose(load_robot(tmp_path).body.dead_forces.sum(axis=0), hidden["force_n"], atol=1e-9)

@@ -1,0 +1,266 @@
+"""The parts that experiments are made of: forms of effects, and the Gram matrices of the columns that a block of frames gives.
+
+Columns of a block belong to its recording alone (pose, initial inputs), or are shared by all recordings (calibration and effects).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from femsense.core.arrays import BoolArray, FloatArray
+from femsense.core.least_squares import FitResult
+from femsense.core.pose import rotation_from_vector
+from femsense.loop.data.trial import Trial
+from femsense.loop.fit.joint_fit import JointFit, JointProblem, Prior
+from femsense.loop.search.effect_fields import effect_fields
+from femsense.model.effects import EFFECTS, Effect, Entry, Parameter
+from femsense.model.effects.base import range_units
+from femsense.model.observation import Hypothesis, SceneJet
+from femsense.model.robot import Robot
+from femsense.rig.camera import measured_points, visible_points
+from femsense.rig.scene import body_shape
+from femsense.rig.script import SceneTable
+
+MOST_SEEDS = 6
+"""Places and times of one effect that are tried; the most spread ones come first."""
+
+
+# Forms
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Form:
+    """An effect with a seed and its columns."""
+
+    label: str
+    """What the table calls it: the effect's name, and which form where there are two."""
+    name: str
+    effect: Effect
+    seed: Entry
+    parameters: tuple[Parameter, ...]
+    size: FloatArray
+    """Plausible size of each column, in coordinates."""
+    at: int
+    """Where its columns start."""
+    known: FloatArray
+    """How well calibration knows each column beforehand, in coordinates, shape (q,); empty for what is sought."""
+
+    @property
+    def columns(self) -> slice:
+        return slice(self.at, self.at + len(self.size))
+
+
+def forms_of(robot: Robot, control: str, ranges: FloatArray, *, names: Sequence[str] | None = None) -> list[Form]:
+    """Return the forms to judge.
+
+    Arguments:
+        robot: the declared robot.
+        control: "tension" or "displacement".
+        ranges: of the cables [N] or [m], shape (a,).
+        names: effects to take; by default all.
+    """
+    result: list[Form] = []
+    at = 0
+    for effect, label in _kinds(robot):
+        seeds = effect.seeds(robot)[:MOST_SEEDS]
+        for seed in seeds if names is None or effect.name in names else []:
+            parameters = effect.parameters(robot, control)
+            if not parameters and not effect.discrete:
+                continue
+            size = np.ones(1) if effect.discrete else _plausible(parameters, robot, ranges)
+            result.append(Form(label, effect.name, effect, seed, parameters, size, at, _known(effect, parameters, robot, ranges)))
+            at += len(size)
+    return result
+
+
+def _kinds(robot: Robot) -> list[tuple[Effect, str]]:
+    """Return the forms of the effects in which experiments are planned for them, with their labels."""
+    result = []
+    for effect in EFFECTS:
+        forms = [("", effect)] if effect.planned is None else effect.planned(robot)
+        result += [(form, f"{effect.name} ({which})" if which else effect.name) for which, form in forms]
+    return result
+
+
+def _known(effect: Effect, parameters: Sequence[Parameter], robot: Robot, ranges: FloatArray) -> FloatArray:
+    if effect.calibrated is None:
+        return np.zeros(0)
+    return np.maximum(effect.calibrated.planned_std * range_units(parameters, robot.body.cable_names, ranges), 1e-9)
+
+
+def _plausible(parameters: Sequence[Parameter], robot: Robot, ranges: FloatArray) -> FloatArray:
+    """Return plausible sizes of parameters, in coordinates, shape (q,)."""
+    return np.array([p.usual_size for p in parameters]) * range_units(parameters, robot.body.cable_names, ranges)
+
+
+# Blocks
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Gram:
+    """Products of whitened columns: own ones of the recording (w of them) and shared ones (e)."""
+
+    own: FloatArray
+    """Shape (w, w)."""
+    cross: FloatArray
+    """Shape (w, e)."""
+    shared: FloatArray
+    """Shape (e, e)."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Block:
+    """One part of an experiment."""
+
+    recording: str
+    """Blocks of one recording share its pose."""
+    gram: Gram
+    rested: Gram | None
+    """The same with rest.csv; None where it was not asked for."""
+    placements: Gram
+    """What rest.csv says, once a recording."""
+    states: int
+    """Distinct states of markers."""
+    rows: int
+
+
+def make_block(
+    trial: Trial,
+    robot: Robot,
+    forms: Sequence[Form],
+    *,
+    recording: str,
+    noise: float,
+    turns: FloatArray | None = None,
+    see: bool = False,
+    measured: bool = False,
+    with_rest: bool = False,
+) -> Block:
+    """Return a block.
+
+    Arguments:
+        trial: inputs, loads and camera; unless `measured`, its marker positions are replaced by those of the robot.
+        robot: the declared robot.
+        forms: whose columns are wanted.
+        recording: its key.
+        noise: standard deviation of a marker's coordinate [m].
+        turns: rotation of the base in each frame, shape (F, 3, 3): gravity in the frame is that times gravity as declared.
+        see: leave out markers that the camera does not see.
+        measured: the trial's markers are real.
+        with_rest: also with rest.csv.
+
+    Raises:
+        DataError: a frame has no equilibrium.
+    """
+    trial = trial if measured else _as_expected(trial, robot)
+    jet = _jet(trial, robot)
+    rows = _seen(trial, robot, jet) if see else np.ones(len(jet.residual), dtype=bool)
+    columns, rest_columns = _columns(trial, robot, jet, forms, turns, width=max((f.columns.stop for f in forms), default=0))
+    states = len(np.unique(trial.groups.state[rows]))
+    gram, placements = _gram(_own(jet)[rows], columns[rows], noise), _placements(jet, rest_columns, noise)
+    if not with_rest:
+        return Block(recording, gram, None, placements, states, int(rows.sum()))
+    placed = _with_rest(trial, robot)
+    jet = _jet(placed, robot)
+    moved = [f for f in forms if f.effect.moves_rest]  # the others leave the measured placements where they are
+    fresh, rest_columns = _columns(placed, robot, jet, moved, turns, width=columns.shape[2])
+    for f in moved:
+        columns[:, :, f.columns] = fresh[:, :, f.columns]
+    rested = _gram(_own(jet)[rows], columns[rows], noise)
+    return Block(recording, gram, rested, _placements(jet, rest_columns, noise), states, int(rows.sum()))
+
+
+def _own(jet: SceneJet) -> FloatArray:
+    return np.concatenate([jet.by_pose, jet.by_initial], axis=2)
+
+
+def _jet(trial: Trial, robot: Robot) -> SceneJet:
+    probe = JointProblem(Hypothesis(robot), Prior(np.zeros(0), np.zeros(0)), [trial], [], 1.0)
+    return probe.jet(trial, _start(trial), np.zeros(0), True)
+
+
+def _start(trial: Trial) -> FloatArray:
+    return np.concatenate([np.zeros(6 * len(trial.poses)), np.zeros(0) if trial.initial is None else trial.initial])
+
+
+def _as_expected(trial: Trial, robot: Robot) -> Trial:
+    """Return the trial with its markers where the declared robot would have the camera measure them."""
+    probe = JointProblem(Hypothesis(robot), Prior(np.zeros(0), np.zeros(0)), [trial], [], 1.0)
+    states = probe.jet(trial, _start(trial), np.zeros(0), False).states
+    places = {k: robot.markers.positions(state.positions) for k, state in states.items()}
+    scene = trial.scene
+    true = np.array([places[int(f)][m] for f, m in zip(scene.frame, scene.marker)])
+    return replace(trial, scene=replace(scene, points=measured_points(trial.poses[0], true, robot.observation)))
+
+
+def _with_rest(trial: Trial, robot: Robot) -> Trial:
+    every = np.arange(len(robot.marker_points))
+    points = measured_points(trial.poses[0], robot.marker_points, robot.observation)
+    return replace(trial, scene=replace(trial.scene, rest_marker=every, rest_view=np.zeros_like(every), rest_points=points))
+
+
+def _seen(trial: Trial, robot: Robot, jet: SceneJet) -> BoolArray:
+    """Return which rows the camera sees, shape (k,)."""
+    camera, table, scene = trial.scene.recording.cameras[0], SceneTable.model_validate({}), trial.scene
+    assert camera is not None
+    visible = {}
+    for k, state in jet.states.items():
+        shapes = [body_shape(robot, state.positions, table)]
+        visible[k] = visible_points(camera, trial.poses[0], shapes, robot.markers.positions(state.positions))
+    return np.array([visible[int(f)][m] for f, m in zip(scene.frame, scene.marker)], dtype=bool)
+
+
+def _columns(
+    trial: Trial, robot: Robot, jet: SceneJet, forms: Sequence[Form], turns: FloatArray | None, *, width: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return the columns of forms at their places [m], of markers (k, c, e) and of measured placements (r, 3, e); zero where a form cannot
+    act or finds no equilibrium."""
+    result, rest = np.zeros((*jet.residual.shape, width)), np.zeros((len(jet.rest), 3, width))
+    if not forms:
+        return result, rest
+    theta = _start(trial)
+    fit = FitResult(theta, np.zeros((0, 0)), np.zeros(0), np.zeros((0, 0)), (), "")
+    base = JointFit(Hypothesis(robot), Prior(np.zeros(0), np.zeros(0)), fit, len(theta), 0.0, [jet])
+    fields = effect_fields(base, [trial], [(f.effect, f.seed, f.parameters) for f in forms])
+    where = {(id(f.effect), id(f.seed)): f for f in forms}
+    for i, (effect, seed, _) in enumerate(fields.todo):
+        form = where[id(effect), id(seed)]
+        (own,), (placements,) = fields.of(i)
+        if form.effect.turns_with_base and turns is not None:
+            own = np.einsum("kci,kij->kcj", own, turns[trial.scene.frame])
+        result[:, :, form.columns], rest[:, :, form.columns] = own, placements
+    return result, rest
+
+
+def _gram(own: FloatArray, shared: FloatArray, noise: float) -> Gram:
+    A, B = own.reshape(-1, own.shape[2]) / noise, shared.reshape(-1, shared.shape[2]) / noise
+    return Gram(A.T @ A, A.T @ B, B.T @ B)
+
+
+def _placements(jet: SceneJet, shared: FloatArray, noise: float) -> Gram:
+    """Return what measured placements say; they are trusted as markers are, but not better than 0.1 mm."""
+    r = len(jet.rest)
+    own = np.concatenate(
+        [jet.rest_by_pose.reshape(r, 3, jet.by_pose.shape[2]), np.zeros((r, 3, jet.by_initial.shape[2]))], axis=2
+    )
+    return _gram(own, shared, max(noise, 1e-4))
+
+
+def turns_of(gravity: FloatArray | None, declared: FloatArray) -> FloatArray | None:
+    """Return the smallest rotations that turn gravity as declared into that of each frame, shape (F, 3, 3); None without turns."""
+    if gravity is None:
+        return None
+    first = declared if np.any(declared) else gravity[0]
+    a = first / np.linalg.norm(first)
+    result = []
+    for g in gravity:
+        b = g / max(float(np.linalg.norm(g)), 1e-300)
+        axis = np.cross(a, b)
+        size = float(np.linalg.norm(axis))
+        spare = np.cross(a, np.eye(3)[int(np.argmin(np.abs(a)))])
+        unit = axis / size if size > 1e-9 else spare / np.linalg.norm(spare)
+        result.append(rotation_from_vector(unit * np.arctan2(size, float(a @ b))))
+    return np.array(result)

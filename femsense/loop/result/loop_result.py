@@ -1,0 +1,86 @@
+"""What closing the loop returns."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from femsense.loop.result.evidence import Evidence
+from femsense.loop.result.records import (
+    ConfoundedPair,
+    DataCard,
+    Detectable,
+    Errors,
+    Left,
+    NamedEffect,
+    Residuals,
+    TriedEffect,
+    Untestable,
+)
+from femsense.loop.result.tables import AS_EMPTY, table_of
+from femsense.model.effects import Entry
+from femsense.model.robot import Robot
+
+FORMAT = "femsense-loop-1"
+EFFECTS, NONE, UNEXPLAINED = "effects", "none", "unexplained"
+"""Verdicts: the model lacks effects; it explains the data to their noise; a residual is left that no effect explains."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class LoopResult:
+    """The verdict, the effects with their errors before and after, and what the data cannot say."""
+
+    verdict: str
+    """EFFECTS, NONE or UNEXPLAINED."""
+    sentence: str
+    """The verdict in words."""
+    noise_m: float
+    """Noise of the data [m]."""
+    before: Errors
+    """Of the declared model, calibrated."""
+    after: Errors
+    """Of the model that is handed back."""
+    effects: tuple[NamedEffect, ...]
+    """In the order in which they were added."""
+    entries: tuple[Entry, ...]
+    """The effects as tables of `[[effects]]`."""
+    candidates: tuple[TriedEffect, ...]
+    """Every effect that was tried."""
+    confounded: tuple[ConfoundedPair, ...]
+    """Pairs that the data cannot distinguish."""
+    next_experiment: str
+    """What to record to distinguish them, in words."""
+    not_testable: tuple[Untestable, ...]
+    """Effects that the data cannot show."""
+    detectable: Mapping[str, Detectable]
+    """Effect that was not found → the smallest size that would have been seen."""
+    left: Left
+    """What the remaining residual looks like."""
+    robot: Robot
+    """The improved robot."""
+    declared: Robot
+    """The robot that came in."""
+    data: DataCard
+    residuals: Residuals | None = field(default=None, metadata=AS_EMPTY)
+    """Held-out residuals before and after, for figures."""
+    evidence: Evidence | None = field(default=None, metadata=AS_EMPTY)
+    """What the report draws and tabulates besides."""
+
+    def document(self) -> dict[str, Any]:
+        """Return the content of loop.json."""
+        tables = table_of(self, without=("entries", "robot", "declared"))
+        return {"format": FORMAT, **tables, "evidence": rounded(tables["evidence"])}
+
+
+def rounded(value: Any) -> Any:
+    """Return plain tables with seven digits, NaN and infinity as null."""
+    if isinstance(value, dict):
+        return {key: rounded(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [rounded(item) for item in value]
+    if isinstance(value, float | np.floating):
+        return float(f"{value:.7g}") if np.isfinite(value) else None
+    return value.item() if isinstance(value, np.generic) else value

@@ -1,0 +1,300 @@
+"""What a closed loop says, piece by piece: errors, effects, candidates, and what the data cannot tell."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from femsense.loop.result.tables import LEFT_OUT
+from femsense.model.effects import Entry
+
+NAMED, PASSES = "named", "passes"
+"""What becomes of a refit that is added to the model, and of one that passes the acceptance test though another one is added."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Errors:
+    """Errors of a model: of the markers, of clouds along their normals beside them; where there are no markers, twice those."""
+
+    train_rms_m: float
+    """Where it is fitted [m]."""
+    validation_rms_m: float
+    """On held-out data [m]."""
+    validation_ci_m: tuple[float, float]
+    """Its 95 % interval [m]."""
+    validation_ci_by: str
+    """What was drawn again for that: "sweeps" or "frames"."""
+    train_normal_rms_m: float | None = field(default=None, metadata=LEFT_OUT)
+    """Along the normals of clouds [m]; None without clouds."""
+    validation_normal_rms_m: float | None = field(default=None, metadata=LEFT_OUT)
+    validation_normal_ci_m: tuple[float, float] | None = field(default=None, metadata=LEFT_OUT)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Value:
+    """One key of an effect. Vectors and tables keep their shape."""
+
+    value: Any
+    """In `unit`."""
+    std: Any
+    """Standard deviation of each number in the same shape; None: not fitted."""
+    unit: str
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class NamedEffect:
+    """An effect that the model lacks."""
+
+    name: str
+    parameters: Mapping[str, Value]
+    """Key of robot.toml → value."""
+    validation_rms_before_m: float
+    """Held-out error without it [m]."""
+    validation_rms_after_m: float
+    """Held-out error with it [m]."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class RefitRecord:
+    """What became of a candidate that was refitted together with all that the model has."""
+
+    name: str
+    seed: Entry
+    """What was not fitted of it: a place, a radius, a time."""
+    verdict: str = ""
+    """NAMED, PASSES, or why not, in words."""
+    step: int | None = field(default=None, metadata=LEFT_OUT)
+    """Number of the model that it was tried on."""
+    in_place_of: str | None = field(default=None, metadata=LEFT_OUT)
+    """The effect that was taken out for it; None: it was added."""
+    dchi2: float | None = field(default=None, metadata=LEFT_OUT)
+    """Decrease of χ²."""
+    dbic: float | None = field(default=None, metadata=LEFT_OUT)
+    """That less the cost of its freedom."""
+    validation_rms_m: float | None = field(default=None, metadata=LEFT_OUT)
+    """Held-out error with it [m]."""
+    cv_gain: float | None = field(default=None, metadata=LEFT_OUT)
+    """By how much left-out sweeps are predicted better."""
+    cv_std: float | None = field(default=None, metadata=LEFT_OUT)
+    """Standard error of that."""
+    held_dchi2: float | None = field(default=None, metadata=LEFT_OUT)
+    """Decrease of χ² on held-out data."""
+    moved_m: float | None = field(default=None, metadata=LEFT_OUT)
+    """How far it moves the markers beyond what calibration does [m]."""
+    mesh_cost_m: float | None = field(default=None, metadata=LEFT_OUT)
+    """Discretisation error that calibration leaves [m]."""
+    takes_over: tuple[str, ...] | None = field(default=None, metadata=LEFT_OUT)
+    """Nuisances that are significant without it, and not with it."""
+    seed_std: tuple[float, ...] | None = field(default=None, metadata=LEFT_OUT)
+    """Scatter of its coordinates over seeds that explain as much."""
+
+    @property
+    def passes(self) -> bool:
+        """Whether it passes the acceptance test, and another one was added instead."""
+        return self.verdict == PASSES
+
+    @property
+    def is_named(self) -> bool:
+        """Whether it was added."""
+        return self.verdict == NAMED
+
+    @property
+    def evidence(self) -> float:
+        """Its dBIC; NaN where it was stopped before it had one."""
+        return float("nan") if self.dbic is None else self.dbic
+
+    def answers_as(self, other: RefitRecord) -> bool:
+        """Return whether both were made on top of the same model."""
+        return (self.step, self.in_place_of) == (other.step, other.in_place_of)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class TriedEffect:
+    """An effect that was tried, with its linear scores at the start and its refits."""
+
+    name: str
+    seed: Entry
+    dchi2: float | None
+    """Decrease of χ² by its linear step."""
+    dbic: float | None
+    retained_share: float | None
+    """Share of its field that calibration leaves; None: not screened."""
+    dbic_at_end: float | None
+    """Linear dBIC beside all that is named."""
+    refits: tuple[RefitRecord, ...]
+    verdict: str
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ConfoundedPair:
+    """Two effects that these data cannot distinguish, and what is known of that."""
+
+    pair: tuple[str, str]
+    dbic_gap: float | None = field(default=None, metadata=LEFT_OUT)
+    """How far apart their refits are."""
+    absorbed_share: float | None = field(default=None, metadata=LEFT_OUT)
+    """How much of the one calibration absorbs, where the other is a nuisance."""
+    cosine: float | None = field(default=None, metadata=LEFT_OUT)
+    """How much their fields agree, calibration projected out."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Untestable:
+    """An effect that these data cannot show."""
+
+    name: str
+    absorbed_share: float
+    """Share of its field that is absorbed by calibration."""
+    retained_share: float
+    """Share that is left; the squares of the two add up to 1."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Detectable:
+    """The smallest size of an effect that would have been seen."""
+
+    smallest: Mapping[str, float | None]
+    """Label of a parameter → size in `unit`, as `kind` says; empty where the effect is there as a whole or not."""
+    would_be_seen: bool
+    """Whether any plausible size would be."""
+    kind: str | None = field(default=None, metadata=LEFT_OUT)
+    """"change", "factor" or "softer_than"."""
+    unit: str | None = field(default=None, metadata=LEFT_OUT)
+    share_seen: float | None = field(default=None, metadata=LEFT_OUT)
+    """Share of the whole that would be seen."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Correlation:
+    """Spearman's correlation of a number a frame with a covariate."""
+
+    covariate: str
+    rank_correlation: float
+    p_value: float
+    p_holm: float
+    """Adjusted after Holm (1979)."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class FrameError:
+    """A frame and what is left in it."""
+
+    recording: int
+    frame: int
+    rms_m: float
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class WorstMarker:
+    """The marker with most of what is left."""
+
+    marker: str
+    position_m: tuple[float, ...]
+    """On the body at rest [m], (3,)."""
+    mean_residual_m: tuple[float, ...]
+    """[m], (3,)."""
+    direction: tuple[float, ...]
+    """The direction that holds most of its mean square, (3,); its sign is that of the mean."""
+    direction_share: float
+    """How much it holds."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Structure:
+    """Tests for structure in a residual; p-values as they are, not adjusted."""
+
+    lag_one: float
+    """Correlation of neighbouring states."""
+    p_value: float
+    """The smallest of all tests."""
+    tests: Mapping[str, float]
+    """Test → p-value: neighbouring states alike, one pattern in many states, one sweep apart, one marker apart."""
+    significant: bool
+    """Whether any test stands after Holm's adjustment."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class LeftOver:
+    """What a residual looks like: how large, where on the body, in which frames, which way, and what it goes with."""
+
+    rms_m: float
+    marker_rms_m: Mapping[str, float]
+    where: WorstMarker
+    worst_frame: FrameError
+    worst_frames: tuple[FrameError, ...]
+    half_in_frames: float
+    """Share of the frames, the worst first, that hold half of the mean square."""
+    goes_with: tuple[Correlation, ...]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Left(LeftOver):
+    """What is left of the residual at the end."""
+
+    held_out: bool
+    """Whether it is that of held-out data, which alone show it."""
+    structure: Structure
+    explained_share: float
+    """Share of the mean square beyond the noise that the effects took away."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class CloudCard:
+    """What was used of clouds."""
+
+    frames: tuple[int, ...]
+    """Frames of each recording."""
+    rows: tuple[int, ...]
+    """Rows of each recording."""
+    points_m: Mapping[str, tuple[float, ...]]
+    """Name of a point of the surface → its place at rest [m], (3,)."""
+    noise_components_m: Mapping[str, float]
+    noise_m: float
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Outlier:
+    """A marker in a frame that is left out."""
+
+    frame: int
+    marker: str
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class DataCard:
+    """What the data are and how they were split."""
+
+    recordings: tuple[str, ...]
+    split: tuple[str, ...]
+    """How each recording was split, in words."""
+    frames_fitted: tuple[tuple[int, ...], ...]
+    frames_held_out: tuple[tuple[int, ...], ...]
+    measured: tuple[str, ...]
+    """"markers", "clouds" or both."""
+    clouds: CloudCard | None
+    noise_components_m: Mapping[str, float]
+    noise_source: str
+    mesh_error_m: float | None
+    """Discretisation error [m], root mean square; None where it is not known."""
+    outliers: tuple[Outlier, ...]
+    effective_observations: float
+    nuisance_after: Mapping[str, Mapping[str, Value]]
+    """What calibration moves → its values beside all effects."""
+    placement_std_m: float
+    """How well markers are placed [m]."""
+    seed: int | None = field(default=None, metadata=LEFT_OUT)
+    """Of the random numbers."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Residuals:
+    """Held-out residuals, one row for each measured point, as columns of equal length."""
+
+    recording: tuple[int, ...]
+    frame: tuple[int, ...]
+    marker: tuple[str, ...]
+    before_m: tuple[tuple[float, ...], ...]
+    """Of the declared model, calibrated [m], (k, 3)."""
+    after_m: tuple[tuple[float, ...], ...]
+    """Of the model that is handed back [m], (k, 3)."""

@@ -1,0 +1,29 @@
+"""From the types of a result to the plain tables of loop.json."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, is_dataclass
+from typing import Any
+
+NONE_AS = "none_as"
+ABSENT = object()
+LEFT_OUT = {NONE_AS: ABSENT}
+"""Metadata of a field that is no key of the table where it is None …"""
+AS_EMPTY = {NONE_AS: dict[str, Any]()}
+"""… and of one that is an empty table then."""
+
+
+def table_of(value: Any, *, without: Sequence[str] = ()) -> Any:
+    """Return dataclasses as tables under the names of their fields, but for some, tuples as lists; all else as it is."""
+    if is_dataclass(value) and not isinstance(value, type):
+        own = {f.name: _own(f, getattr(value, f.name)) for f in fields(value) if f.name not in without}
+        return {name: table_of(item) for name, item in own.items() if item is not ABSENT}
+    if isinstance(value, Mapping):
+        return {key: table_of(item) for key, item in value.items()}
+    return [table_of(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+def _own(f: Any, value: Any) -> Any:
+    """Return what a field says in the table: itself, or what stands for None."""
+    return f.metadata.get(NONE_AS) if value is None else value

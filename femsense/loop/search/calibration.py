@@ -1,0 +1,130 @@
+"""Calibration of a model within the loop: on the declared robot, with all that it may move, and again as rows, weights and models change."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from femsense.core.errors import DataError, FemsenseError
+from femsense.loop.data.dataset import MESH, Data
+from femsense.loop.data.outliers import without_outliers
+from femsense.loop.fit.discretisation_error import representative_frames, with_mesh_errors
+from femsense.loop.fit.fitted_model import FittedModel, fit_model, own_of, rematched, roughly_keeping, with_nuisance
+from femsense.loop.fit.joint_fit import Prior
+from femsense.loop.fit.marker_placement import with_turning_placements
+from femsense.loop.fit.noise_components import Noise
+from femsense.loop.search.refit import EVIDENCE
+from femsense.loop.search.search_state import Progress
+from femsense.loop.search.swaps import History
+from femsense.model.effects import OF_BODY
+from femsense.model.observation import Hypothesis, SceneJet
+from femsense.model.robot import Robot
+
+START = Noise({"white": 5e-4}, "start")
+"""The noise until it is estimated."""
+MATCHINGS = 6
+"""Times that the rows of clouds are made again, at most: from a camera that is 20 mrad off, four left a gain of 0 to 27, as rounding had it."""
+ROUGHLY, STEPS = 4, 12
+"""Steps of the fit whose residual tells the noise; and at most with that, to the end, or, on large meshes, to where what is left to gain is spared."""
+Ready = tuple[Data, FittedModel, History]
+"""Data, the declared model with its camera calibrated, and the models that effects are sought on top of."""
+
+
+def calibrated(data: Data, say: Progress) -> Ready:
+    """Return the data without outliers, the declared model calibrated, and the model with all that calibration may move; before that the same on the
+    declared mesh, where it is another one."""
+    placed = calibrated_pose(data, data.robot, START)
+    while (fewer := without_outliers(data, [jet.residual for jet in placed.fit.jets], placed.held_residuals)) is not data:
+        data, placed = fewer, calibrated_pose(fewer, data.robot, START)
+    say("fitting what calibration may move")
+    base = calibrated_on(data, data.robot, placed)
+    if "clouds" in data.measured:
+        say("matching the clouds again")
+        rough = base.fit.normal_rms
+        data, base = matched(data, base, START if rough is None else replace(START, surface={"white": rough}), anew=True)
+        placed = calibrated_pose(data, data.robot, START, placed)
+    if not data.settled:
+        return data, placed, [("", base)]
+    declared = data.robot_as_declared
+    before = calibrated_pose(data, declared, START)
+    return data, before, [("", calibrated_on(data, declared, before)), (MESH.name, base)]
+
+
+def calibrated_pose(data: Data, robot: Robot, noise: Noise, start: FittedModel | None = None) -> FittedModel:
+    """Return a robot with its camera calibrated."""
+    nothing = Prior(np.zeros(0), np.zeros(0))
+    own = None if start is None else own_of(start)
+    return fit_model(data, Hypothesis(robot), nothing, noise, np.zeros(0), own=own)
+
+
+def calibrated_on(data: Data, robot: Robot, placed: FittedModel) -> FittedModel:
+    """Return a robot with all that calibration may move, fitted roughly. To begin with some of the states leads elsewhere: what the model lacks pulls
+    offsets and modulus further where fewer states hold them."""
+    hypothesis, prior = with_nuisance(data, robot)
+    nothing = np.zeros(len(prior.mean))
+    return as_far_as_held_out_states_converge(
+        lambda steps: fit_model(data, hypothesis, prior, START, nothing, own=own_of(placed), max_iterations=steps), ROUGHLY
+    )
+
+
+def with_discretisation_error(data: Data, base: FittedModel, names: Sequence[str], say: Progress) -> Data:
+    """Return the data with the discretisation error, and placements that turn with the body."""
+    say("estimating the discretisation error")
+    try:  # offsets may have gone far, for an effect's sake
+        frames = [representative_frames(t, len(base.fit.hypothesis.robot.body.mesh.tets)) for t in data.train]
+        plain = roughly_keeping(data, base, OF_BODY, START, frames)
+    except FemsenseError:
+        plain = base
+    return with_turning_placements(with_mesh_errors(data, plain, names), base)
+
+
+def as_far_as_held_out_states_converge(fit: Callable[[int], FittedModel], steps: int) -> FittedModel:
+    """Return a fit of so many steps, or of fewer where a held-out state collapses beyond: what calibration may move is no reason to fail, since it
+    may go far for the sake of an effect that is not found yet. Raises DataError where the start has no equilibrium either."""
+    for most in (steps, 2, 1):
+        with contextlib.suppress(DataError):
+            return fit(most)
+    return fit(0)
+
+
+def matched(data: Data, fitted: FittedModel, noise: Noise, *, anew: bool = False) -> tuple[Data, FittedModel]:
+    """Return the data with the rows of clouds as a fitted model has them, and the fitted model fitted to these, time and again until neither changes much: what is
+    rounded off where the model was draws it back there. With `anew` it is asked again which rows there are."""
+    for _ in range(MATCHINGS):
+        data = rematched(data, fitted, noise, anew=anew)
+        fitted = fitted_again(data, fitted, noise, near=None if anew else fitted.fit.jets)
+        if fitted.fit.fit.cost[0] - fitted.fit.chi2 <= EVIDENCE / 2.0:
+            break
+    return data, fitted
+
+
+def fitted_again(
+    data: Data,
+    fitted: FittedModel,
+    noise: Noise,
+    *,
+    known: list[SceneJet] | None = None,
+    near: list[SceneJet] | None = None,
+    spare: float = 0.0,
+) -> FittedModel:
+    """Return a fitted model fitted to other weights or rows, from where it is: with derivatives that are known there, or that are near."""
+    fit, own = fitted.fit, own_of(fitted)
+
+    def refitted(steps: int) -> FittedModel:
+        return fit_model(
+            data,
+            fit.hypothesis,
+            fit.prior,
+            noise,
+            fit.coordinates,
+            own=own,
+            max_iterations=steps,
+            known=known,
+            near=near,
+            spare=spare,
+        )
+
+    return as_far_as_held_out_states_converge(refitted, STEPS)

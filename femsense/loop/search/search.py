@@ -1,0 +1,193 @@
+"""The search for effects: screen, refit, add the best, prune, and start again from the better model until nothing passes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from femsense.core.errors import FemsenseError
+from femsense.io.checkpoint import Checkpoint
+from femsense.loop.data.dataset import Data
+from femsense.loop.fit.discretisation_error import errs_alike, with_mesh_errors
+from femsense.loop.fit.fitted_model import FittedModel, weighed
+from femsense.loop.fit.marker_placement import with_turning_placements
+from femsense.loop.fit.noise_components import Noise
+from femsense.loop.result.records import NAMED, PASSES, RefitRecord
+from femsense.loop.search.acceptance import discretisation_rms, moved_by
+from femsense.loop.search.calibration import Ready, calibrated_pose, fitted_again, matched
+from femsense.loop.search.effect_fields import Fields, fields_of
+from femsense.loop.search.forward_selection import select_next, shortlist
+from femsense.loop.search.input_offset import instead_of_offsets
+from femsense.loop.search.pruning import prune
+from femsense.loop.search.refit import evidence
+from femsense.loop.search.screening import Candidate, noise_of, screen_model
+from femsense.loop.search.search_state import Progress, Refit, Search, SearchProgress, at_step
+from femsense.loop.search.subsampling import spares
+from femsense.loop.search.swaps import BETTER, swapped
+from femsense.model.recording import state_key
+
+MAX_EFFECTS = 3
+"""Effects that are added at most."""
+STATES = 5
+"""So many different states can distinguish effects though what is held out only repeats them."""
+SPARED = 0.01
+"""On large meshes a model is fitted until what is left to gain is less than this share of the predicted gain of an effect on top."""
+
+
+def search_begun(ready: Ready, names: Sequence[str], refits: list[RefitRecord], *, quadratic: bool) -> SearchProgress:
+    """Return a search on top of the last model of a history that has found nothing yet."""
+    data, before, history = ready
+    last = history[-1][1]
+    return SearchProgress(data, data, before, list(history), len(history), last, last, list(names), quadratic, refits)
+
+
+def search_effects(course: SearchProgress, checkpoint: Checkpoint, say: Progress) -> tuple[Data, Search]:
+    """Screen, refit and add effects until none passes; return the data as the last model has them, and the search."""
+    while not course.over:
+        checkpoint.keep(course)
+        say(f"screening effects ({course.found} found so far)")
+        _take_step(course, say)
+    checkpoint.keep(course)
+    data, history, noise = course.data, course.history, course.noise
+    assert noise is not None
+    fitted, refits, before = course.fitted, course.refits, course.before
+    most = _most_effects(data)
+    swap = instead_of_offsets(data, fitted, course.names, noise, course.n_effective, say) if most else None
+    if swap is not None:
+        refits = [*refits, *at_step(swap.records, len(history))]
+        if swap.fitted is not None:
+            fitted, history = swap.fitted, [*history, (swap.name, swap.fitted)]
+    if len(history) > 1 and "clouds" in data.measured:
+        before = calibrated_pose(data, data.robot_as_declared, noise, before)  # before and after on the same rows
+    found = Search(before, history, course.base, fitted, noise, course.n_effective, course.first, course.table, refits, swap)
+    return data, found
+
+
+def _most_effects(data: Data) -> int:
+    return MAX_EFFECTS if distinguishes_effects(data) else 0
+
+
+def _take_step(course: SearchProgress, say: Progress) -> None:
+    """Screen what a model may lack and add the effect that comes next; where none does, the search is over."""
+    names, found = course.names, course.found
+    data, fitted, noise, fields = course.data, course.fitted, course.noise, course.fields
+    if found and "clouds" in data.measured:
+        assert noise is not None
+        fields = None
+        data, fitted = matched(data, fitted, noise)
+    try:
+        fitted, noise, n_effective, fields, table = _screened(data, fitted, fields, noise, names)
+    except FemsenseError as error:
+        if not found:
+            raise
+        course.take_back(error)
+        return
+    history, refits, ties = [*course.history[:-1], (course.history[-1][0], fitted)], course.refits, course.ties
+    course.data, course.fitted, course.noise, course.n_effective = data, fitted, noise, n_effective
+    course.fields, course.table, course.history = fields, table, history
+    if not found:
+        course.base, course.first = fitted, table
+    if found >= _most_effects(data):
+        course.over = True
+        return
+    next_one, others, tried = select_next(data, fitted, table, noise, say)
+    refits = [*refits, *at_step(tried, len(history))]
+    if next_one is None and ties:
+        instead, next_one, tried = beside_a_tie(data, fitted, ties[0], fields, noise, names, n_effective, say)
+        if next_one is not None:
+            history[-1] = (ties[0].candidate.effect.name, instead)
+            refits = [
+                *_renamed(refits, len(history) - 1, history[-1][0]),
+                *at_step(tried, len(history)),
+            ]
+            fitted, others = instead, []
+    course.refits = refits
+    if next_one is None:
+        course.over = True
+        return
+    course.earlier = data
+    name, winner, course.ties = next_one.candidate.effect.name, next_one.fitted, others
+    anew = moved_by(fitted, winner) > discretisation_rms(data, fitted, whole=True) and not errs_alike(fitted, winner)
+    fitted = prune(data, winner, noise, n_effective, say)
+    history = [*history, (name, fitted)]
+    data = with_turning_placements(with_mesh_errors(data, fitted, names) if anew else data, fitted)
+    found_so = history
+    history, refits = swapped(data, history, refits, noise, n_effective, say)
+    if history is not found_so:
+        history[-1] = (history[-1][0], prune(data, history[-1][1], noise, n_effective, say))
+    course.data, course.history, course.refits, course.fitted = data, history, refits, history[-1][1]
+
+
+def _screened(
+    data: Data, fitted: FittedModel, before: Fields | None, noise: Noise | None, names: Sequence[str]
+) -> tuple[FittedModel, Noise, float, Fields, list[Candidate]]:
+    """Return a fitted model fitted with the noise that its residual tells, that noise, the effective number of observations, and the fields and scores
+    of what may come next: by the fields of the model before, as long as these predict no gain."""
+    fields = _fields(data, fitted, before, names)
+    noise, n_effective = noise_of(data, fitted, fields, noise)
+    fitted = fitted_again(data, fitted, noise, known=fitted.fit.jets, spare=spared_gain(data, fitted, fields, noise, n_effective))
+    return fitted, noise, n_effective, *scored(data, fitted, fields, noise, names, n_effective)
+
+
+def spared_gain(data: Data, fitted: FittedModel, fields: Fields, noise: Noise, n_effective: float) -> float:
+    """Return what a fitted model need not gain any more before effects are tried on top of it, since the predicted gain of one of these is so much larger; nothing where all
+    states are little work."""
+    if not spares(data, fitted.fit.hypothesis.robot_at(fitted.fit.coordinates)):
+        return 0.0
+    fit = weighed(data, fitted.fit, noise, fitted.fit.jets)
+    return SPARED * max((c.gain for c in screen_model(data, fit, noise, fields, n_effective)), default=0.0)
+
+
+def _fields(data: Data, fitted: FittedModel, before: Fields | None, names: Sequence[str]) -> Fields:
+    """Return the fields of the model before where they tell what may come next, else those of the fitted model itself."""
+    hints = None if before is None else before.beside(fitted.fit)
+    return fields_of(data, fitted, names) if hints is None else hints
+
+
+def scored(
+    data: Data, fitted: FittedModel, fields: Fields, noise: Noise, names: Sequence[str], n_effective: float
+) -> tuple[Fields, list[Candidate]]:
+    """Return fields and the scores by them: those of the fitted model itself where others predict a gain."""
+    table = screen_model(data, fitted.fit, noise, fields, n_effective)
+    if fields.model is fitted.fit.hypothesis or not shortlist(table, first=False):
+        return fields, table
+    fields = fields_of(data, fitted, names)
+    return fields, screen_model(data, fitted.fit, noise, fields, n_effective)
+
+
+def beside_a_tie(
+    data: Data,
+    fitted: FittedModel,
+    tie: Refit,
+    fields: Fields | None,
+    noise: Noise,
+    names: Sequence[str],
+    n_effective: float,
+    say: Progress,
+) -> tuple[FittedModel, Refit | None, list[RefitRecord]]:
+    """Return the model with what was as good as the last effect in its place, and what comes next there, or None: the two together must be
+    better than the fitted model. What hides behind a wrong one of two that look alike shows beside the right one."""
+    say(f"trying {tie.candidate.effect.name} in the place of the last one, and what goes with it")
+    jets = tie.fitted.fit.jets
+    same = "clouds" not in data.measured
+    instead = fitted_again(data, tie.fitted, noise, known=jets if same else None, near=None if same else jets)
+    _, table = scored(data, instead, _fields(data, instead, fields, names), noise, names, n_effective)
+    both, _, tried = select_next(data, instead, table, noise, say)
+    if both is None or evidence(fitted.fit, both.fitted.fit) - both.candidate.cost <= BETTER:
+        return instead, None, []
+    return instead, both, tried
+
+
+def _renamed(refits: list[RefitRecord], step: int, name: str) -> list[RefitRecord]:
+    """Return what became of candidates where another one is named at a step."""
+    return [
+        replace(r, verdict=NAMED if r.name == name else PASSES) if r.step == step and (r.passes or r.is_named) else r
+        for r in refits
+    ]
+
+
+def distinguishes_effects(data: Data) -> bool:
+    """Return whether these data can distinguish effects: a state that is not fitted is held out, or STATES different ones are fitted."""
+    fitted = {state_key(t.scene.recording, int(k)) for t in data.train for k in t.scene.frames}
+    fresh = any(state_key(t.scene.recording, int(k)) not in fitted for t in data.held for k in t.scene.frames)
+    return fresh or len(fitted) >= STATES

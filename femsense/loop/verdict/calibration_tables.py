@@ -1,0 +1,94 @@
+"""What the report shows of calibration: how poses, initial inputs and nuisances move from model to model, and which frames are not used."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from femsense.calib.calibrate import usable_frames
+from femsense.loop.data.dataset import NUISANCE, Data
+from femsense.loop.data.surface_rows import cloud_frames
+from femsense.loop.data.trial import heads_of
+from femsense.loop.fit.fitted_model import FittedModel
+from femsense.loop.fit.joint_fit import JointFit
+from femsense.loop.result.evidence import CalibrationShift, InputShift, PoseShift, TermShift
+from femsense.model.recording import Recording
+
+Vector = tuple[float, ...]
+
+
+def calibration_shift(data: Data, models: Mapping[str, FittedModel]) -> CalibrationShift:
+    """Return poses, initial inputs, modulus and input offsets of each model; poses as they moved from the first of them."""
+    poses, inputs, at = list[PoseShift](), list[InputShift](), 0
+    for i, trial in enumerate(data.train[j] for j in heads_of(data.train)):
+        poses += [_pose_shift(models, i, v, at + 6 * v) for v in range(len(trial.poses))]
+        cables = data.robot.body.cable_names if trial.initial is not None else ()
+        unit = "N" if data.control == "tension" else "m"
+        for j, cable in enumerate(cables):
+            inputs.append(InputShift(i, cable, unit, _input_values(models, at + 6 * len(trial.poses) + j)))
+        at += trial.size
+    return CalibrationShift(tuple(poses), tuple(inputs), tuple(_terms(models)))
+
+
+def _pose_shift(models: Mapping[str, FittedModel], recording: int, camera: int, at: int) -> PoseShift:
+    """Return how a pose moved, whose six numbers begin at a place of the parameters."""
+    first, *others = models
+    part = slice(at, at + 6)
+    zero = models[first].fit.fit.theta[part]
+    moved = {name: tuple((models[name].fit.fit.theta[part] - zero).tolist()) for name in others}
+    std = {name: _deviations(fitted.fit, part) for name, fitted in models.items()}
+    return PoseShift(
+        recording,
+        camera,
+        turn_rad={name: m[:3] for name, m in moved.items()},
+        shift_m={name: m[3:] for name, m in moved.items()},
+        turn_std_rad={name: d[:3] for name, d in std.items()},
+        shift_std_m={name: d[3:] for name, d in std.items()},
+    )
+
+
+def _input_values(models: Mapping[str, FittedModel], at: int) -> dict[str, Vector]:
+    return {name: (float(s.fit.fit.theta[at]), *_deviations(s.fit, slice(at, at + 1))) for name, s in models.items()}
+
+
+def _terms(models: Mapping[str, FittedModel]) -> list[TermShift]:
+    """Return the values that calibration moves, by model."""
+    terms: dict[str, TermShift] = {}
+    for name, fitted in models.items():
+        for term in _nuisances(fitted.fit, name):
+            before = terms[term.label].values if term.label in terms else {}
+            first = terms.get(term.label, term)
+            terms[term.label] = TermShift(term.label, first.unit, first.declared, {**before, **term.values})
+    return list(terms.values())
+
+
+def _nuisances(fit: JointFit, model: str) -> list[TermShift]:
+    result, at = list[TermShift](), 0
+    for effect, _, parameters in fit.hypothesis.terms:
+        for p in parameters:
+            value, std = float(fit.coordinates[at]), float(fit.std[at])
+            at += 1
+            if effect.name in NUISANCE:
+                own = {model: (p.value(value), p.value_std(value, std))}
+                result.append(TermShift(f"{effect.name}: {p.label}", p.unit, p.value(p.null), own))
+    return result
+
+
+def _deviations(fit: JointFit, part: slice) -> Vector:
+    return tuple(float(v) for v in np.sqrt(np.maximum(np.diag(fit.fit.covariance)[part], 0.0)))
+
+
+def excluded(recording: Recording, data: Data) -> dict[str, tuple[int, ...]]:
+    """Return the frames of a recording that are neither fitted nor held out, by reason."""
+    used = {int(k) for t in [*data.train, *data.held] if t.scene.recording is recording for k in t.scene.frames}
+    usable, marked = set(usable_frames(recording).tolist()), set(recording.marker_frame.tolist())
+    if "clouds" in data.measured:
+        marked |= set(cloud_frames(recording).tolist())
+    reasons: dict[str, list[int]] = {}
+    for k in range(len(recording.time_s)):
+        if k in used:
+            continue
+        why = "touched, load not declared" if k not in usable else "no markers" if k not in marked else "thinned out"
+        reasons.setdefault(why, []).append(int(recording.frame_numbers[k]))
+    return {why: tuple(frames) for why, frames in reasons.items()}

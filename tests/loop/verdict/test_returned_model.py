@@ -1,0 +1,151 @@
+"""Which effects are handed back, and with which sizes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from arm import arm, record, sweeps
+from fitted_arm import NOISE, fitted_arm
+
+from femsense.core.errors import DataError
+from femsense.loop.data.dataset import Data, prepare
+from femsense.loop.fit.fitted_model import FittedModel, fit_model, with_nuisance
+from femsense.loop.fit.joint_fit import Prior
+from femsense.loop.fit.noise_components import Noise
+from femsense.loop.search.refit import with_term
+from femsense.loop.search.search_state import Search
+from femsense.loop.verdict import returned_model, summary
+from femsense.model.effects import apply_effects, find_effect
+from femsense.model.observation import Hypothesis
+
+
+def test_a_model_without_equilibrium_is_not_handed_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    def collapses(*_: object, **__: object) -> FittedModel:
+        raise DataError("no equilibrium in frame 3")
+
+    data, fitted = fitted_arm(arm((4, 2, 2)), 1.0)
+    search = Search(fitted, [("", fitted)], fitted, fitted, NOISE, 10.0, [], [], [], None)
+    monkeypatch.setattr(returned_model, "keeping", collapses)
+    assert returned_model.worth_handing_back(data, search, ["stiffness"], ["stiffness"]) == ([], fitted)
+    chain = summary.chain_of_effects(data, search, ["stiffness"], ["stiffness"], fitted, {})
+    assert [c.validation_rms_after_m for c in chain] == [fitted.held_rms]
+
+
+def test_a_model_may_have_a_larger_error_on_held_out_data_where_that_is_the_mesh_s_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    data, fitted = fitted_arm(arm((4, 2, 2)), 1.0)
+    before, base, back = (replace(fitted, held_rms=v) for v in (1.0, 1.5, 1.4))
+    back = replace(
+        back, fit=replace(fitted.fit, hypothesis=replace(fitted.fit.hypothesis, settled=((find_effect("hyperelastic"), {}),)))
+    )
+    search = Search(before, [("", base)], base, back, NOISE, 10.0, [], [], [], None)
+
+    def holds(error: float, *, chi2: float = 50.0, beyond: float = 0.5) -> bool:
+        model = replace(back, held_rms=error)
+        monkeypatch.setattr(returned_model, "held_chi2", lambda _, s, noise: chi2 if s is model else 100.0)
+        sizes = iter([0.8, beyond])
+        monkeypatch.setattr(returned_model, "beyond_mesh", lambda *_: next(sizes))
+        return returned_model.holds_out(data, search, model)
+
+    assert holds(1.4) and holds(1.0, chi2=200.0)
+    assert not holds(1.6)  # more than all that calibration may move
+    search = replace(search, before=replace(fitted, held_rms=1.4))
+    assert holds(1.56, chi2=49.0) and not holds(1.56, chi2=51.0) and not holds(1.65, chi2=49.0)  # a fall by 50 is far better
+    search = replace(search, before=before)
+    assert not holds(1.4, chi2=105.0) and holds(1.4, chi2=95.0)
+    assert not holds(1.4, beyond=0.9)
+
+
+@pytest.mark.parametrize("names, held", [(["stiffness"], True), (["stiffness", "cable_offset"], False)])
+def test_a_larger_error_is_not_for_zeros_of_cables_which_much_else_looks_like(
+    monkeypatch: pytest.MonkeyPatch, names: list[str], held: bool
+) -> None:
+    data, fitted = fitted_arm(arm((4, 2, 2)), 1.0)
+    terms = tuple(t for t in fitted.fit.hypothesis.terms if t[0].name in names)
+    back = replace(fitted, held_rms=1.4, fit=replace(fitted.fit, hypothesis=replace(fitted.fit.hypothesis, terms=terms)))
+    search = Search(replace(fitted, held_rms=1.0), [("", back)], back, back, NOISE, 10.0, [], [], [], None)
+    monkeypatch.setattr(returned_model, "held_chi2", lambda _, s, noise: 40.0 if s is back else 80.0)
+    monkeypatch.setattr(returned_model, "beyond_mesh", lambda *_: 0.5)
+    assert returned_model.holds_out(data, search, back) == held
+
+
+def test_a_modulus_that_is_as_declared_once_zeros_stay_is_not_handed_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    data, softer = fitted_arm(arm((4, 2, 2), modulus=250e3))
+    as_declared = replace(
+        softer.fit, fit=replace(softer.fit.fit, theta=np.append(softer.fit.fit.theta[: softer.fit.own], [0.0] * 5))
+    )
+    search = Search(softer, [("", softer)], softer, softer, NOISE, 10.0, [], [], [], None)
+    assert returned_model.worth_handing_back(data, search, ["stiffness"], ["stiffness"])[0] == ["stiffness"]
+    monkeypatch.setattr(returned_model, "keeping", lambda *_, **__: replace(softer, fit=as_declared))
+    assert returned_model.worth_handing_back(data, search, ["stiffness"], ["stiffness"])[0] == []
+
+
+def with_gain(modulus: float) -> tuple[Data, Search]:
+    """Return the search that found a cable's gain in a body whose modulus is off, too."""
+    declared = arm((4, 2, 2))
+    truth = apply_effects(arm((4, 2, 2), modulus=modulus), [{"name": "cable_gain", "scale": {"left": 0.92}}])
+    inputs, labels = sweeps(3.0)
+    recording, _ = record(inputs, labels=labels, truth=truth, noise=5e-5)
+    data = prepare(declared, [recording], [])
+    noise = Noise({"white": 5e-5}, "")
+    hypothesis, prior = with_nuisance(data)
+    base = fit_model(data, hypothesis, prior, noise, np.zeros(len(prior.mean)))
+    before = fit_model(data, Hypothesis(declared), Prior(np.zeros(0), np.zeros(0)), noise, np.zeros(0))
+    gain = find_effect("cable_gain")
+    parameters = tuple(p for p in gain.parameters(declared, "tension") if p.part == "left")
+    final = fit_model(data, *with_term(base.fit, gain, {}, parameters), noise, np.append(base.fit.coordinates, 0.0))
+    return data, Search(before, [("", base), ("cable_gain", final)], base, final, noise, 100.0, [], [], [], None)
+
+
+def handed_back(data: Data, search: Search) -> tuple[list[str], float]:
+    """Return the names that are handed back, and the gain."""
+    names, back = returned_model.worth_handing_back(data, search, [], ["cable_gain"])
+    (entry,) = [e for e in back.fit.hypothesis.entries(back.fit.coordinates) if e["name"] == "cable_gain"]
+    return names, entry["scale"]["left"]
+
+
+def test_a_modulus_that_is_off_by_little_goes_along_with_an_effect_that_would_make_up_for_it() -> None:
+    data, search = with_gain(300e3 * 0.982)
+    assert not returned_model.promoted_nuisances(data, search)
+    names, gain = handed_back(data, search)
+    assert names == ["stiffness", "cable_gain"]
+    alone = returned_model.keeping(data, search.final, ["cable_gain"], search.noise)
+    by_itself = float(np.exp(alone.fit.coordinates[0]))
+    assert abs(gain - 0.92) < 0.4 * abs(by_itself - 0.92)
+
+
+def test_a_modulus_that_zeros_hide_goes_along_where_it_is_plain_without_them() -> None:
+    data, search = with_gain(300e3 * 0.982)
+    fit, covariance = search.final.fit, np.array(search.final.fit.fit.covariance)
+    covariance[fit.own, fit.own] *= 1e4
+    vague = replace(search.final, fit=replace(fit, fit=replace(fit.fit, covariance=covariance)))
+    search = replace(search, final=vague, history=[search.history[0], ("cable_gain", vague)])
+    assert not returned_model.moved_nuisance(data, vague, "stiffness", relevant=0.0)
+    names, gain = handed_back(data, search)
+    assert names == ["stiffness", "cable_gain"] and abs(gain - 0.92) < 2e-3
+
+
+def test_a_modulus_that_moved_too_little_to_be_named_by_itself_goes_along_where_held_out_data_miss_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def folds(*_: object) -> FittedModel:
+        raise DataError("no equilibrium in frame 3")
+
+    data, search = with_gain(300e3 * 0.982)
+    monkeypatch.setattr(returned_model, "with_sizes_still", folds)
+    names, _ = returned_model.worth_handing_back(data, search, ["stiffness"], ["stiffness", "cable_gain"])
+    assert names == ["stiffness", "cable_gain"]
+
+
+@pytest.mark.parametrize("tolerated, more, kept", [(1.02, 0.0, False), (1.2, 0.0, True), (1.2, 20.0, False)])
+def test_what_is_handed_back_keeps_the_size_that_it_has_beside_all_nuisances_unless_held_out_data_miss_those(
+    monkeypatch: pytest.MonkeyPatch, tolerated: float, more: float, kept: bool
+) -> None:
+    data, search = with_gain(300e3)
+    beside = float(np.exp(search.final.fit.coordinates[-1]))
+    alone = float(np.exp(returned_model.keeping(data, search.final, ["cable_gain"], search.noise).fit.coordinates[0]))
+    assert abs(alone - beside) > 1e-3
+    monkeypatch.setattr(returned_model, "NOT_WORSE", tolerated)
+    monkeypatch.setattr(returned_model, "held_chi2", lambda _, fitted, noise: 100.0 + more * (fitted is not search.final))
+    assert handed_back(data, search) == (["cable_gain"], pytest.approx(beside if kept else alone, abs=1e-5))

@@ -1,0 +1,102 @@
+"""The equilibrium on a finer mesh against a solution there."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from arm import NAMES, arm
+
+from femsense.core.errors import FemsenseError
+from femsense.fem.equilibrium import Equilibrium
+from femsense.fem.linalg import refinement
+from femsense.fem.mesh import Embedding, embed_points
+from femsense.model import finer_mesh as finer_path
+from femsense.model.drive import DrivenRobot, drive_of
+from femsense.model.effects import apply_effects
+from femsense.model.finer_mesh import finer_state
+from femsense.model.recording import make_recording
+from femsense.model.remeshing import finer_mesh, robot_on_mesh
+from femsense.model.variants import solve_frame
+
+
+def on_both_meshes(
+    inputs: list[float], actuation: str = "tension", effects: Sequence[dict[str, Any]] = ()
+) -> tuple[DrivenRobot, DrivenRobot, int, Equilibrium, Embedding]:
+    """Return what `finer_state` is asked with: an arm whose cables are driven so."""
+    robot = apply_effects(arm((4, 2, 2)), effects)
+    fine = robot_on_mesh(robot, finer_mesh(robot.body.mesh, None, 1))
+    recording = make_recording(time_s=[0.0], cable_names=NAMES, inputs=[inputs], actuation=actuation)
+    driven, fine_driven = (DrivenRobot(r, drive_of(r, recording)) for r in (robot, fine))
+    return driven, fine_driven, 0, solve_frame(driven, 0), embed_points(robot.body.mesh, fine.body.mesh.nodes)
+
+
+def beyond(asked: tuple[DrivenRobot, DrivenRobot, int, Equilibrium, Embedding], x: np.ndarray | None) -> np.ndarray:
+    """Return how far nodes of the finer mesh lie from the state of the declared one [m]."""
+    assert x is not None
+    return x - asked[4].positions(asked[3].positions)
+
+
+def test_a_finer_state_that_runs_away_says_nothing_though_its_forces_look_small(monkeypatch: pytest.MonkeyPatch):
+    asked = on_both_meshes([2.0, 0.0, 0.0, 0.0])
+    assert finer_state(*asked) is not None
+    sizes = itertools.cycle([1.0, 1e-6])
+    pulling = finer_path._pulling
+    monkeypatch.setattr(finer_path, "_pulling", lambda *given: (*pulling(*given)[:2], next(sizes)))
+    monkeypatch.setattr(finer_path, "rotated_step", lambda body, x, move: 1e3 * x)
+    assert finer_state(*asked) is None
+
+
+def test_a_finer_state_that_folds_is_sought_in_shorter_steps(monkeypatch: pytest.MonkeyPatch):
+    asked = on_both_meshes([2.0, 0.0, 0.0, 0.0])
+    whole, steps = beyond(asked, finer_state(*asked)), finer_path._stepped
+
+    def folding(*given: Any) -> Any:
+        if given[-1] == 1.0:
+            raise FemsenseError("not positive definite")
+        return steps(*given)
+
+    monkeypatch.setattr(finer_path, "_stepped", folding)
+    np.testing.assert_allclose(beyond(asked, finer_state(*asked)), whole, atol=0.06 * np.abs(whole).max())
+    monkeypatch.setattr(finer_path, "PACES", (1.0,))
+    with pytest.raises(FemsenseError):
+        finer_state(*asked)
+
+
+def test_held_cables_stretch_as_far_as_they_pull_on_the_finer_mesh():
+    asked = on_both_meshes([0.004, 0.002, 0.0, 0.0], "displacement", [{"name": "cable_stretch", "stiffness_n_m": 300.0}])
+    wanted = beyond(asked, solve_frame(asked[1], 0).positions)
+    np.testing.assert_allclose(beyond(asked, finer_state(*asked)), wanted, atol=0.02 * np.abs(wanted).max())
+
+
+def test_a_slack_cable_that_is_too_long_on_the_finer_mesh_goes_taut():
+    asked = on_both_meshes([0.0045, 0.0064, 0.0029, 0.0051], "displacement")
+    exact, base = solve_frame(asked[1], 0), asked[3]
+    assert exact.held[2] and not base.held[2]
+    wanted = beyond(asked, exact.positions)
+    np.testing.assert_allclose(beyond(asked, finer_state(*asked)), wanted, atol=0.03 * np.abs(wanted).max())
+
+
+def test_a_held_cable_that_would_push_on_the_finer_mesh_goes_slack():
+    _, fine, frame, base, ties = on_both_meshes([0.004, 0.0, 0.002, 0.0], "displacement")
+    x = ties.positions(base.positions)
+    for push, slack in ((-2e-3, True), (-5e-4, False)):
+        pushing = replace(base, held=np.ones(4, bool), tension={**dict.fromkeys(NAMES, 0.1), NAMES[2]: push})
+        now = finer_path._retaut(fine, frame, pushing, x, 1e-4)
+        assert now.held.tolist() == [True, True, not slack, True]
+        assert now.tension[NAMES[2]] == (0.0 if slack else push)
+
+
+@pytest.mark.parametrize("rough_from", [0, 10**6], ids=["conjugate gradients", "factor"])
+def test_a_finer_state_that_is_bent_much_by_held_cables_settles_where_it_belongs(
+    monkeypatch: pytest.MonkeyPatch, rough_from: int
+):
+    asked = on_both_meshes([0.012, 0.0, 0.0, 0.0], "displacement")
+    exact = beyond(asked, solve_frame(asked[1], 0).positions)
+    monkeypatch.setattr(refinement, "ROUGH_FROM", rough_from)
+    monkeypatch.setattr(finer_path, "FINER_ENOUGH", 1e-3)  # what is solved roughly must not keep the steps from getting there
+    np.testing.assert_allclose(beyond(asked, finer_state(*asked)), exact, atol=0.25 * np.abs(exact).max())
