@@ -10,20 +10,17 @@ One thread, processor time, median of the runs, all in one process in turn. The 
 from __future__ import annotations
 
 import argparse
-import os
-
-for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ.setdefault(_name, "1")
-
 import ctypes
 import importlib.util
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
+from threadpoolctl import threadpool_limits
 
 from femsense.core.arrays import FloatArray
 from femsense.fem.assembly import internal, reduced_matrix
@@ -213,13 +210,13 @@ def main() -> None:
             answer = solver.solve(right)
             true = answer if true is None else true
             assert np.abs(answer - true).max() < (1e-2 if "single" in solver_name else 1e-6) * np.abs(true).max(), solver_name
-            row = [
+            calls = [
                 solver.factor,
-                lambda s=solver, b=right[:, 0].copy(): s.solve(b),
-                lambda s=solver, b=right: s.solve(b),
-                lambda s=solver, b=columns: s.gram(b),
+                *(partial(solver.solve, b) for b in (right[:, 0].copy(), right)),
+                partial(solver.gram, columns),
             ]
-            cells = " | ".join(f"{median_ms(call):.2f}" for call in row)
+            with threadpool_limits(1):
+                cells = " | ".join(f"{median_ms(call):.2f}" for call in calls)
             print(f"| {name}, {matrix.shape[0]} unknowns | {solver_name} | {cells} |", flush=True)
 
 
