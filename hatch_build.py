@@ -11,7 +11,9 @@ isolation), from the machine. FEMSENSE_SKIP_VIEWER=1 builds a wheel without the 
 from __future__ import annotations
 
 import hashlib
+import importlib.metadata
 import os
+import platform
 import shutil
 import subprocess
 import sys
@@ -36,19 +38,16 @@ class BuildHook(BuildHookInterface[Any]):
     PLUGIN_NAME = "custom"
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
-        self.scratch = tempfile.TemporaryDirectory(prefix="femsense-kernels-")
         if version != "editable" and os.environ.get("FEMSENSE_SKIP_KERNELS") != "1":
             self.app.display_waiting("compiling kernels (a minute)")
             try:
-                build_data["force_include"].update(compiled_kernels(Path(self.root), Path(self.scratch.name)))
-            except (OSError, RuntimeError) as error:
+                build_data["force_include"].update(compiled_kernels(Path(self.root)))
+            except (OSError, RuntimeError, importlib.metadata.PackageNotFoundError) as error:
                 self.app.display_warning(f"the wheel goes without compiled kernels, numba makes them at first use: {error}")
         self.build_viewer(build_data)
 
-    def finalize(self, version: str, build_data: dict[str, Any], artifact_path: str) -> None:
-        self.scratch.cleanup()
-
     def build_viewer(self, build_data: dict[str, Any]) -> None:
+        """Put the page in place and name it as a part of the wheel."""
         viewer = Path(self.root, "femsense", "xr", "viewer")
         build_data["artifacts"].append("femsense/xr/viewer/dist/*")
         if os.environ.get("FEMSENSE_SKIP_VIEWER") == "1":
@@ -62,32 +61,38 @@ class BuildHook(BuildHookInterface[Any]):
         build_page(viewer, digest)
 
 
-def compiled_kernels(root: Path, scratch: Path) -> dict[str, str]:
-    """Return files with the machine code of kernels, and where they belong in the wheel. Raises RuntimeError."""
-    caches = scratch / "caches"
-    environment = os.environ | {"NUMBA_CACHE_DIR": str(caches), "PYTHONPATH": str(root), "FEMSENSE_WORKERS": "1"}
-    robot, recording = DEMO
-    for command in (
-        ["calibrate", robot, str(root / recording), "-o", str(scratch / "calibration.json")],
-        ["estimate", robot, str(root / recording), "-c", str(scratch / "calibration.json"), "-o", str(scratch / "run")],
-    ):
-        done = subprocess.run(
-            [sys.executable, "-m", "femsense", *command],
-            cwd=scratch,
-            env=environment,
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        if done.returncode:
-            raise RuntimeError(f"femsense {command[0]} failed (exit {done.returncode}): {done.stderr.strip()[-300:]}")
-    folders = {path.parent for path in (root / "femsense").rglob("*.py")}
+def compiled_kernels(root: Path) -> dict[str, str]:
+    """Return files with the machine code of kernels, and where they belong in the wheel; they are kept in build/. Raises RuntimeError."""
+    digest = hashlib.sha256(f"{sys.version} {importlib.metadata.version('numba')} {platform.machine()}".encode())
+    for path in sorted((root / "femsense").rglob("*.py")):
+        digest.update(path.read_bytes())
+    kept = root / "build" / f"kernels-{digest.hexdigest()[:16]}"
+    if not kept.is_dir():
+        for old in kept.parent.glob("kernels-*"):
+            shutil.rmtree(old, ignore_errors=True)
+        with tempfile.TemporaryDirectory(prefix="femsense-kernels-") as scratch:
+            compile_kernels(root, Path(scratch))
+            shutil.copytree(Path(scratch, "caches"), kept)
     found = {}
-    for folder in folders:  # named as numba names them: the last part of the path, and a digest of the whole
-        cache = caches / f"{folder.name}_{hashlib.sha1(str(folder).encode()).hexdigest()}"
+    for folder in {path.parent for path in (root / "femsense").rglob("*.py")}:
+        cache = kept / f"{folder.name}_{hashlib.sha1(str(folder).encode()).hexdigest()}"  # as numba names it
         for file in cache.glob("*.nb[ci]"):
             found[str(file)] = f"{folder.relative_to(root).as_posix()}/__pycache__/{file.name}"
     return found
+
+
+def compile_kernels(root: Path, scratch: Path) -> None:
+    """Run a calibration and an estimate; what numba compiles for them is left in scratch/caches. Raises RuntimeError."""
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(scratch / "caches"), "PYTHONPATH": str(root), "FEMSENSE_WORKERS": "1"}
+    robot, recording, calibration = DEMO[0], str(root / DEMO[1]), str(scratch / "calibration.json")
+    for command in (
+        ["calibrate", robot, recording, "-o", calibration],
+        ["estimate", robot, recording, "-c", calibration, "-o", str(scratch / "run")],
+    ):
+        call = [sys.executable, "-m", "femsense", *command]
+        done = subprocess.run(call, cwd=scratch, env=environment, capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise RuntimeError(f"femsense {command[0]} failed (exit {done.returncode}): {done.stderr.strip()[-300:]}")
 
 
 def digest_of(viewer: Path) -> str:
