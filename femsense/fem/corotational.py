@@ -23,81 +23,8 @@ import numpy as np
 from numba import njit
 
 from femsense.core.arrays import FloatArray
-from femsense.fem.linalg.simd_kernels import LANES, add_divergence, add_gradient, add_run, fetch_ahead, subtract_product
-
-FAST = {"contract", "reassoc", "nsz", "arcp"}
-"""Rounding may differ; infinities and NaN are kept."""
-
-
-@njit(cache=True, fastmath=FAST)
-def determinant(F: FloatArray, q: int) -> float:
-    """Return det F_q, the matrix of a point being a column of F, row by row, shape (9, quad)."""
-    return float(
-        F[0, q] * (F[4, q] * F[8, q] - F[5, q] * F[7, q])
-        - F[1, q] * (F[3, q] * F[8, q] - F[5, q] * F[6, q])
-        + F[2, q] * (F[3, q] * F[7, q] - F[4, q] * F[6, q])
-    )
-
-
-@njit(cache=True, fastmath=FAST)
-def closest_rotation(F: FloatArray, R: FloatArray, q: int) -> None:
-    """Write the rotation (det +1) that is closest to F_q (Newton of Higham 1986; the SVD where F_q is flat or inverted).
-
-    Matrices are columns, row by row, shape (9, quad).
-    """
-    size = 0.0
-    for k in range(9):
-        size += F[k, q] * F[k, q]
-    if not determinant(F, q) > 0.02 * (size / 3.0) ** 1.5:
-        closest_rotation_by_svd(F, R, q)
-        return
-    a, b, c, d, e, f, g, h, i = F[0, q], F[1, q], F[2, q], F[3, q], F[4, q], F[5, q], F[6, q], F[7, q], F[8, q]
-    for _ in range(30):
-        u, v, w = e * i - f * h, f * g - d * i, d * h - e * g
-        s = 0.5 / (a * u + b * v + c * w)
-        A, B, C = 0.5 * a + s * u, 0.5 * b + s * v, 0.5 * c + s * w
-        D, E, H = 0.5 * d + s * (c * h - b * i), 0.5 * e + s * (a * i - c * g), 0.5 * f + s * (b * g - a * h)
-        J, K, L = 0.5 * g + s * (b * f - c * e), 0.5 * h + s * (c * d - a * f), 0.5 * i + s * (a * e - b * d)
-        change = (A - a) ** 2 + (B - b) ** 2 + (C - c) ** 2 + (D - d) ** 2 + (E - e) ** 2
-        change += (H - f) ** 2 + (J - g) ** 2 + (K - h) ** 2 + (L - i) ** 2
-        a, b, c, d, e, f, g, h, i = A, B, C, D, E, H, J, K, L
-        if change < 1e-17:  # quadratic: the next change is below 1e-16
-            break
-    else:
-        closest_rotation_by_svd(F, R, q)
-        return
-    R[0, q], R[1, q], R[2, q], R[3, q], R[4, q], R[5, q], R[6, q], R[7, q], R[8, q] = a, b, c, d, e, f, g, h, i
-
-
-@njit(cache=True)
-def closest_rotation_by_svd(F: FloatArray, R: FloatArray, q: int) -> None:
-    """Write the rotation that is closest to F_q, flat or inverted as it may be."""
-    U, _, Vt = np.linalg.svd(np.ascontiguousarray(F[:, q]).reshape(3, 3))
-    if np.linalg.det(U) * np.linalg.det(Vt) < 0.0:
-        U[:, 2] *= -1.0
-    R[:, q] = (U @ Vt).ravel()
-
-
-@njit(cache=True, fastmath=FAST)
-def turning_compliance(F: FloatArray, R: FloatArray, q: int, out: FloatArray) -> None:
-    """Write the six entries 00 01 02 11 12 22 of D_q⁻¹; a singular D_q (a body shrunk to a point) gets a small shift."""
-    a = F[3, q] * R[3, q] + F[4, q] * R[4, q] + F[5, q] * R[5, q]
-    b = F[6, q] * R[6, q] + F[7, q] * R[7, q] + F[8, q] * R[8, q]
-    c = F[0, q] * R[0, q] + F[1, q] * R[1, q] + F[2, q] * R[2, q]
-    d00, d11, d22 = a + b, b + c, c + a
-    d01 = -(F[0, q] * R[3, q] + F[1, q] * R[4, q] + F[2, q] * R[5, q])
-    d02 = -(F[0, q] * R[6, q] + F[1, q] * R[7, q] + F[2, q] * R[8, q])
-    d12 = -(F[3, q] * R[6, q] + F[4, q] * R[7, q] + F[5, q] * R[8, q])
-    size = abs(d00) + abs(d11) + abs(d22) + 1e-12
-    for _ in range(2):
-        c00, c01, c02 = d11 * d22 - d12 * d12, d02 * d12 - d01 * d22, d01 * d12 - d02 * d11
-        det = d00 * c00 + d01 * c01 + d02 * c02
-        if abs(det) >= 1e-9 * size**3:
-            break
-        d00, d11, d22 = d00 + 1e-3 * size, d11 + 1e-3 * size, d22 + 1e-3 * size
-    out[0], out[1], out[2] = c00 / det, c01 / det, c02 / det
-    out[3], out[4], out[5] = (d00 * d22 - d02 * d02) / det, (d01 * d02 - d00 * d12) / det, (d00 * d11 - d01 * d01) / det
-
+from femsense.fem.linalg.simd_kernels import add_run, fetch_ahead, subtract_product
+from femsense.fem.rotation import FAST, closest_rotation, closest_rotation_anyhow, determinant, turning_compliance
 
 LOCAL = 0.75
 """λ up to this share of μ acts at each quadrature point, the rest on the mean dilatation of an element."""
@@ -132,7 +59,8 @@ def _four_rotations(F: FloatArray, R: FloatArray, flat_F: FloatArray, flat_R: Fl
             closest_rotation(F, R, q)
         return
     r = flat_R
-    r[:] = flat_F
+    for k in range(36):
+        r[k] = flat_F[k]
     for _ in range(30):
         for q in range(4):
             a, b, c, d, e, f, g, h, i = r[q], r[4 + q], r[8 + q], r[12 + q], r[16 + q], r[20 + q], r[24 + q], r[28 + q], r[32 + q]
@@ -147,7 +75,7 @@ def _four_rotations(F: FloatArray, R: FloatArray, flat_F: FloatArray, flat_R: Fl
         if max(change[0], change[1], change[2], change[3]) < 1e-17:
             return
     for q in range(4):
-        closest_rotation_by_svd(F, R, q)
+        closest_rotation_anyhow(F, R, q)
 
 
 STEP = 112
@@ -344,6 +272,7 @@ def corotational_tet4(x, tets, gradients, volumes, mu, lam, limit, tangent, slot
     twice as fast as the kernel of ten nodes would be. For these see `corotational_tet10`.
     """
     F, R, P, H, D = np.empty((9, 1)), np.empty((9, 1)), np.empty(9), np.empty((4, 3)), np.empty(6)
+    first = np.int64(0)  # a number that is written here would compile the rotations a second time
     energy = 0.0
     for e in range(len(tets)):
         n0, n1, n2, n3, G = tets[e, 0], tets[e, 1], tets[e, 2], tets[e, 3], gradients[e, 0]
@@ -351,7 +280,7 @@ def corotational_tet4(x, tets, gradients, volumes, mu, lam, limit, tangent, slot
             x0, x1, x2, x3 = x[n0, i], x[n1, i], x[n2, i], x[n3, i]
             for j in range(3):
                 F[3 * i + j, 0] = x0 * G[j, 0] + x1 * G[j, 1] + x2 * G[j, 2] + x3 * G[j, 3]
-        closest_rotation(F, R, 0)
+        closest_rotation(F, R, first)
         trace = -3.0
         for k in range(9):
             trace += F[k, 0] * R[k, 0]
@@ -363,7 +292,7 @@ def corotational_tet4(x, tets, gradients, volumes, mu, lam, limit, tangent, slot
         energy += 0.5 * (shear * norm + bulk * trace * trace)
         _linear_forces(tets[e], G, R, P, H, forces)
         if tangent:
-            turning_compliance(F, R, 0, D)
+            turning_compliance(F, R, first, D)
             _linear_stiffness(H, D, shear, bulk, turn, slots[e], blocks)
     return energy
 
@@ -382,136 +311,3 @@ def stretched_tet10(x, tets, gradients, volumes, mu, lam, tangent, slots, forces
     stretches that stand there, as if F were R times these (forces and energy are those of x).
     """
     return _tet10(x, tets, gradients, volumes, mu, lam, tangent, slots, forces, blocks, stretch)
-
-
-DEFORMATION, VOLUME, TRACE, SHEAR, PULL, ROOM = (row * LANES for row in (9, 18, 19, 20, 21, 22))
-"""Where the rows of LANES numbers of a point begin, after nine of its rotations: one array, so that a compiler sees rows apart from each other."""
-ROWS = 23
-
-
-@njit(cache=True, fastmath=FAST, error_model="numpy")
-def _begin_rotations(v):  # type: ignore[no-untyped-def]
-    """Write the deformations of a point, shape (ROWS LANES,), to where rotations go, and to ROOM by how much they are from being too flat for that."""
-    for q in range(LANES):
-        a, b, c = v[DEFORMATION + q], v[DEFORMATION + LANES + q], v[DEFORMATION + 2 * LANES + q]
-        d, e, f = v[DEFORMATION + 3 * LANES + q], v[DEFORMATION + 4 * LANES + q], v[DEFORMATION + 5 * LANES + q]
-        g, h, i = v[DEFORMATION + 6 * LANES + q], v[DEFORMATION + 7 * LANES + q], v[DEFORMATION + 8 * LANES + q]
-        v[q], v[LANES + q], v[2 * LANES + q] = a, b, c
-        v[3 * LANES + q], v[4 * LANES + q], v[5 * LANES + q] = d, e, f
-        v[6 * LANES + q], v[7 * LANES + q], v[8 * LANES + q] = g, h, i
-        third = (a * a + b * b + c * c + d * d + e * e + f * f + g * g + h * h + i * i) / 3.0
-        v[ROOM + q] = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) - 0.02 * third * np.sqrt(third)
-
-
-@njit(cache=True, fastmath=FAST, error_model="numpy")
-def _turn_on(v):  # type: ignore[no-untyped-def]
-    """Take a Newton step of `closest_rotation` at a point; write the squares of the steps to ROOM."""
-    for q in range(LANES):
-        a, b, c = v[q], v[LANES + q], v[2 * LANES + q]
-        d, e, f = v[3 * LANES + q], v[4 * LANES + q], v[5 * LANES + q]
-        g, h, i = v[6 * LANES + q], v[7 * LANES + q], v[8 * LANES + q]
-        s, t, u = e * i - f * h, f * g - d * i, d * h - e * g
-        w = 0.5 / (a * s + b * t + c * u)
-        A, B, C = w * s - 0.5 * a, w * t - 0.5 * b, w * u - 0.5 * c
-        D, E, H = w * (c * h - b * i) - 0.5 * d, w * (a * i - c * g) - 0.5 * e, w * (b * g - a * h) - 0.5 * f
-        J, K, L = w * (b * f - c * e) - 0.5 * g, w * (c * d - a * f) - 0.5 * h, w * (a * e - b * d) - 0.5 * i
-        v[ROOM + q] = A * A + B * B + C * C + D * D + E * E + H * H + J * J + K * K + L * L
-        v[q], v[LANES + q], v[2 * LANES + q] = a + A, b + B, c + C
-        v[3 * LANES + q], v[4 * LANES + q], v[5 * LANES + q] = d + D, e + E, f + H
-        v[6 * LANES + q], v[7 * LANES + q], v[8 * LANES + q] = g + J, h + K, i + L
-
-
-@njit(cache=True, fastmath=FAST, error_model="numpy")
-def _rotations(v):  # type: ignore[no-untyped-def]
-    """Write the closest rotations at the points of LANES elements, shape (q, ROWS LANES), see `closest_rotation`."""
-    points, least = len(v), np.inf
-    for p in range(points):
-        _begin_rotations(v[p])
-        for q in range(ROOM, ROOM + LANES):
-            least = min(least, v[p, q])
-    for _ in range(30 if least > 0.0 else 0):
-        largest = 0.0
-        for p in range(points):
-            _turn_on(v[p])
-            for q in range(ROOM, ROOM + LANES):
-                largest = max(largest, v[p, q])
-        if largest < 1e-17:
-            return
-    for p in range(points):
-        matrices = v[p].reshape(ROWS, LANES)
-        for q in range(LANES):
-            closest_rotation(matrices[9:18], matrices[:9], q)
-
-
-@njit(cache=True, fastmath=FAST, error_model="numpy")
-def _dilate(v):  # type: ignore[no-untyped-def]
-    """Write TRACE, tr(RᵀF) − 3, of a point."""
-    for q in range(LANES):
-        trace = -3.0
-        for k in range(9):
-            trace += v[k * LANES + q] * v[DEFORMATION + k * LANES + q]
-        v[TRACE + q] = trace
-
-
-@njit(cache=True, fastmath=FAST, error_model="numpy")
-def _stress(v):  # type: ignore[no-untyped-def]
-    """Write SHEAR (F − R) + PULL R over the deformations of a point, and |F − R|² to ROOM."""
-    for q in range(LANES):
-        norm, shear, pull = 0.0, v[SHEAR + q], v[PULL + q]
-        for k in range(9):
-            r = v[k * LANES + q]
-            u = v[DEFORMATION + k * LANES + q] - r
-            norm += u * u
-            v[DEFORMATION + k * LANES + q] = shear * u + pull * r
-        v[ROOM + q] = norm
-
-
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def corotational_forces(x, nodes, gradients, volumes, mu, lam, forces):  # type: ignore[no-untyped-def]
-    """Add internal forces [N] to those of the body, LANES elements at a time; return the energy [J]. Arrays are those of `Lanes` and `Stencil`."""
-    points, count, wide = volumes.shape[1], nodes.shape[1], 3 * nodes.shape[1] * LANES
-    v, X = np.empty((points, ROWS * LANES)), np.empty(wide)
-    local, rest, theta, whole = np.empty(LANES), np.empty(LANES), np.empty(LANES), np.empty(LANES)
-    first, energy = gradients.ctypes.data, 0.0
-    for e in range(len(nodes)):
-        if e + 1 < len(nodes):  # while this group is worked on
-            fetch_ahead(first + 8 * (e + 1) * points * wide, 8 * points * wide)
-        for a in range(count):
-            for q in range(LANES):
-                n, to = nodes[e, a, q], 3 * a * LANES + q
-                X[to], X[to + LANES], X[to + 2 * LANES] = x[n, 0], x[n, 1], x[n, 2]
-        v[:, DEFORMATION : DEFORMATION + 9 * LANES] = 0.0
-        for p in range(points):
-            at = v[p].ctypes.data + 8 * DEFORMATION
-            add_gradient(gradients, at, X.ctypes.data, first + 8 * (e * points + p) * wide, count)
-        _rotations(v)
-        theta[:], whole[:], X[:] = 0.0, 0.0, 0.0
-        for p in range(points):
-            _dilate(v[p])
-            for q in range(LANES):
-                element = LANES * e + q
-                w = volumes[element, p] if element < len(volumes) else 1e-300
-                v[p, VOLUME + q] = w
-                theta[q] += w * v[p, TRACE + q]
-                whole[q] += w
-        for q in range(LANES):
-            element = LANES * e + q if LANES * e + q < len(volumes) else 0
-            local[q] = min(lam[element], LOCAL * mu[element])
-            rest[q], theta[q] = lam[element] - local[q], theta[q] / whole[q]
-            energy += 0.5 * rest[q] * whole[q] * theta[q] * theta[q]
-            for p in range(points):
-                w = v[p, VOLUME + q]
-                v[p, SHEAR + q], v[p, PULL + q] = 2.0 * w * mu[element], w * (local[q] * v[p, TRACE + q] + rest[q] * theta[q])
-        for p in range(points):
-            _stress(v[p])
-            for q in range(LANES):
-                energy += 0.5 * (v[p, SHEAR + q] * v[p, ROOM + q] + v[p, VOLUME + q] * local[q] * v[p, TRACE + q] ** 2)
-            at = v[p].ctypes.data + 8 * DEFORMATION
-            add_divergence(gradients, X.ctypes.data, at, first + 8 * (e * points + p) * wide, count)
-        for a in range(count):
-            for q in range(LANES):
-                n, to = nodes[e, a, q], 3 * a * LANES + q
-                forces[n, 0] += X[to]
-                forces[n, 1] += X[to + LANES]
-                forces[n, 2] += X[to + 2 * LANES]
-    return energy

@@ -17,50 +17,18 @@ import numpy.typing as npt
 
 from femsense.core.arrays import BoolArray, FloatArray, as_points, freeze
 from femsense.core.errors import InputError
-from femsense.fem.assembly import Internal, internal, reduced_values
+from femsense.fem.assembly import internal
 from femsense.fem.body import BodyModel
-from femsense.fem.body_parts import Cable
-from femsense.fem.cables import add_cable_stiffness, bend_angles, cable_forces, rub, segments, shortening
-from femsense.fem.chambers import add_pressure_stiffness, chamber_volume, volume_changes, volume_gradient
-from femsense.fem.clamp import with_turning_plate
-from femsense.fem.linalg.factorization import Factorization, Pattern, factorize, factorize_definite, least_shift
-from femsense.fem.rotated_step import rotated_step
+from femsense.fem.chambers import volume_gradient
+from femsense.fem.linalg.factorization import Factorization
+from femsense.fem.newton import MOST_STEPS, settle
+from femsense.fem.newton_state import CONVERGED, Loads, State, drive_compliance, drive_rows, travel_of, unbalanced_force
+from femsense.fem.stability import can_fall, holds_itself, is_doubtful
 
-CONVERGED = "converged"
-TRIES, INDEFINITE_TRIES = 30, 6
-"""Newton steps of a state that is only tried, and stiffnesses of it that are indefinite: it is too far off where they do not do. Bodies that fold
-meet 8 to 11 of these in their 30 steps, those that come to rest 4 at most (a trial on bars of `benchmarks/improve.py`)."""
-MOST_STEPS = 1500
-"""Newton steps in all, load steps included."""
+TRIES = 30
+"""Newton steps of a state that is only tried."""
 SMALLEST_PART = 2e-3
 """Load steps smaller than this share of the load are stopped early."""
-CHORD = 1e-2
-"""A stiffness serves for another step where the last one left less than this share of the residual, or where two more such steps are enough
-(unless it was factorised so far off that another one is needed at the end)."""
-SURE = 0.1
-"""Where a step left less than this share, the next one is likely to leave less than CHORD: no tangent is made for the state it leads to."""
-LENT = 0.1
-"""So does one that was lent by a state near by."""
-RUBS = 0.3
-"""So does any where tensions along cables follow the bends, which converge no faster with a stiffness of their own."""
-PATIENCE, PATIENCE_TRIED = 5, 8
-"""In single precision one serves, too, where so many more steps are enough if each leaves the share that the last one left; the latter, about what a
-factor takes, for states that are only tried: others end the farther below their tolerance the better these steps shrink.
-Of a first step nothing is known yet: states that are only tried take a second one."""
-PAIRS = 8
-"""Steps since the last factor that are remembered (`_Secants`)."""
-ARRIVED = 5e-7
-"""A state that is only tried is there when a step was shorter than this share of the body's size."""
-FAR = 1e6
-"""A stiffness factorised where the residual was more than this times its tolerance says nothing of the stability of the end."""
-CLOSED = 1e-12
-"""How far a held cable may miss its length [m]."""
-FALL_ITERATIONS = 30
-"""Inverse iterations towards the softest motion of a state that may be unstable."""
-CURVED = 1e-3
-"""Steps longer than this share of the body are tried with elements that turn before they are tried straight."""
-FOLLOW_FRICTION = 25
-"""Newton steps at most in which the tensions along the cables follow the bends; then they stand still until Newton rests."""
 ADVICE = {
     CONVERGED: "the unbalanced force is below its tolerance",
     "unstable": "the forces balance, but the slightest disturbance makes the body buckle: (a) add a small force to the side to which it should go; (b) reduce the load",
@@ -113,49 +81,6 @@ class Equilibrium:
     def advice(self) -> str:
         """Cause of the status and what to try."""
         return ADVICE[self.status]
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class _Loads:
-    """What drives the body (cables, then chambers: a + c drives)."""
-
-    forces: FloatArray  # dead nodal forces [N], (n, 3)
-    effort: FloatArray  # tensions [N] and pressures [Pa] that are given, (a + c,)
-    target: FloatArray  # shortening [m] or growth [m³] of what is held, (a + c,)
-    controlled: BoolArray  # what is held, (a + c,)
-    lever: FloatArray  # effort × lever is a force, travel / lever a length: 1, or the surface of a chamber [m²], (a + c,)
-    bilateral: bool
-    before: tuple[FloatArray, ...]  # tensions along the cables until now [N]
-    tolerance: float  # of the residual [N]
-
-    def part_way(self, first: _Loads, part: float) -> _Loads:
-        """Return the loads on the straight way from the first ones (part 0) to these (part 1)."""
-        mixed = {
-            name: (1.0 - part) * getattr(first, name) + part * getattr(self, name) for name in ("forces", "effort", "target")
-        }
-        return replace(self, **mixed)
-
-
-@dataclass(eq=False, slots=True)
-class _State:
-    """Where the iteration stands."""
-
-    x: FloatArray  # (n, 3)
-    T: FloatArray  # motor tensions [N], then pressures [Pa], (a + c,)
-    taut: BoolArray  # held cables that carry load, and held chambers, (a + c,)
-    shares: list[FloatArray]  # segment tension / motor tension
-    factor: Factorization | None = None
-    borrowed: bool = False  # the factor belongs to another state; it serves as long as the residual falls fast
-    iterations: int = 0
-    residual: float = np.inf
-    shifted: bool = False  # the stiffness was not positive definite where it was last factorised
-    shift: float = 0.0  # what made the stiffness positive definite there [N/m]
-    single: bool = False  # factors in single precision
-    rough: bool = False  # the state is only tried
-    indefinite_steps: int = 0
-    factored_at: float = 0.0  # residual where the stiffness was last factorised [N]
-    here: Internal | None = None  # what Newton saw last, at x
-    serves: bool = False  # the factor is likely to serve for the step after this one
 
 
 def solve_equilibrium(
@@ -213,7 +138,7 @@ def solve_equilibrium(
     rough = rough and start is not None
     state.single, state.rough = rough or single, rough
     shares = [s.copy() for s in state.shares]
-    status, reached = _settle(body, loads, state, min(max_iterations, TRIES) if rough else max_iterations), 1.0
+    status, reached = settle(body, loads, state, min(max_iterations, TRIES) if rough else max_iterations), 1.0
     if not rough and status not in (CONVERGED, "singular") and start is not None and start.converged and body.is_held():
         first = _loads_of(body, start, loads)
         state, status, reached = _step_loads(
@@ -221,15 +146,15 @@ def solve_equilibrium(
         )
     if not rough and status not in (CONVERGED, "singular") and body.is_held():
         nothing = replace(loads, forces=0.0 * loads.forces, effort=0.0 * loads.effort, target=0.0 * loads.target)
-        rest = _State(body.mesh.nodes.copy(), nothing.effort.copy(), _first_taut(body, loads), shares)
+        rest = State(body.mesh.nodes.copy(), nothing.effort.copy(), _first_taut(body, loads), shares)
         state, status, reached = _step_loads(body, nothing, loads, rest, state, max_iterations)
     if status != CONVERGED or any(c.friction > 0 for c in body.cables):  # friction has moved since Newton looked
         state.residual = _residual(body, loads, state)
     if status != CONVERGED:
         status = status if body.is_held() else "singular"
-    elif not body.is_held() and not _holds_itself(body, state):
+    elif not body.is_held() and not holds_itself(body, state):
         status = "singular"
-    elif _is_doubtful(loads, state, start) and _can_fall(body, loads, state):
+    elif is_doubtful(loads, state, start is not None and start.converged) and can_fall(body, loads, state):
         status = "unstable"
     extra = np.zeros_like(body.mesh.nodes) if nodal_forces is None else np.asarray(nodal_forces, dtype=np.float64)
     return _result(body, state, status, reached, extra)
@@ -243,7 +168,7 @@ def _collect_loads(
     before: tuple[FloatArray, ...] | None,
     bilateral: bool,
     relative_tolerance: float,
-) -> _Loads:
+) -> Loads:
     n = len(body.mesh.nodes)
     T, d, pulled = _drive_values(body.cable_names, "a cable", "tension", "shortening", given)
     p, grown, filled = _drive_values(body.chamber_names, "a chamber", "pressure", "volume", given)
@@ -273,7 +198,7 @@ def _collect_loads(
     stiffness = float(np.median(body.material.young_modulus)) * reach
     scale = np.linalg.norm(forces, axis=1).sum() + np.abs(effort) @ lever + (np.abs(target) / lever).sum() * stiffness * 1e-2
     tolerance = relative_tolerance * max(scale, 1e-6 * stiffness * reach * 1e-2) + 1e-13 * stiffness * reach
-    return _Loads(forces, effort, target, np.concatenate([pulled, filled]), lever, bilateral, before, float(tolerance))
+    return Loads(forces, effort, target, np.concatenate([pulled, filled]), lever, bilateral, before, float(tolerance))
 
 
 def _drive_values(
@@ -315,10 +240,10 @@ def _check_start(body: BodyModel, start: Equilibrium) -> None:
         )
 
 
-def _loads_of(body: BodyModel, start: Equilibrium, loads: _Loads) -> _Loads:
+def _loads_of(body: BodyModel, start: Equilibrium, loads: Loads) -> Loads:
     """Return the loads under which a start was in equilibrium, for drives that are held where these are."""
     effort = np.array([*start.tension.values(), *start.pressure.values()])
-    travel = _travel(body, start.positions) + _stretch(body) * effort
+    travel = travel_of(body, start.positions) + drive_compliance(body) * effort
     free = ~loads.controlled
     return replace(
         loads,
@@ -328,18 +253,18 @@ def _loads_of(body: BodyModel, start: Equilibrium, loads: _Loads) -> _Loads:
     )
 
 
-def _first_taut(body: BodyModel, loads: _Loads) -> BoolArray:
+def _first_taut(body: BodyModel, loads: Loads) -> BoolArray:
     """Return which drives are held at first where nothing is known: cables that are paid out are slack at rest."""
     cable = np.arange(len(loads.effort)) < len(body.cables)
     return loads.controlled & (~cable | (loads.target >= 0.0) | loads.bilateral)
 
 
 def _initial_state(
-    body: BodyModel, loads: _Loads, start: Equilibrium | None, reuse_factor: bool, along: tuple[FloatArray, ...] | None
-) -> _State:
+    body: BodyModel, loads: Loads, start: Equilibrium | None, reuse_factor: bool, along: tuple[FloatArray, ...] | None
+) -> State:
     shares = [np.ones(len(c.path)) for c in body.cables] if along is None else [np.array(share) for share in along]
     if start is None:
-        return _State(body.mesh.nodes.copy(), loads.effort.copy(), _first_taut(body, loads), shares)
+        return State(body.mesh.nodes.copy(), loads.effort.copy(), _first_taut(body, loads), shares)
     x = start.positions.copy()
     clamped = _clamped(body)
     x[clamped] = body.mesh.nodes[clamped]
@@ -356,7 +281,7 @@ def _initial_state(
             shares[i] = tensions / motor
     far = np.inf if start.status == "unstable" else 0.0  # where nothing moves, stability is looked at all the same
     usable = reuse_factor and start.factor is not None and start.factor.size == len(body.free_map.dofs)
-    return _State(x, np.asarray(T, dtype=float), taut, shares, start.factor if usable else None, usable, factored_at=far)
+    return State(x, np.asarray(T, dtype=float), taut, shares, start.factor if usable else None, usable, factored_at=far)
 
 
 def _clamped(body: BodyModel) -> BoolArray:
@@ -365,421 +290,17 @@ def _clamped(body: BodyModel) -> BoolArray:
     return ~free.reshape(-1, 3)[:, 0]
 
 
-def _settle(body: BodyModel, loads: _Loads, state: _State, max_iterations: int) -> str:
-    """Newton, which held cables are slack, and friction, until all three rest."""
-    frictional = any(c.friction > 0 for c in body.cables)
-    seen: set[bytes] = set()
-    for _ in range(60):
-        status = _newton(body, loads, state, max_iterations)
-        if status == "cables" and _let_go(body, loads, state) and state.taut.tobytes() not in seen:
-            seen.add(state.taut.tobytes())
-            continue
-        if status != CONVERGED or state.iterations > MOST_STEPS:
-            return status if status != CONVERGED else "iterations"
-        changed = _update_slack(body, loads, state)
-        if changed:
-            key = state.taut.tobytes()
-            if key in seen:
-                return "cables"
-            seen.add(key)
-            continue
-        if not frictional or _update_friction(body, loads, state):
-            return CONVERGED
-        state.borrowed = True  # the tensions move by little: the factor at hand serves
-    return "iterations"
-
-
-def _let_go(body: BodyModel, loads: _Loads, state: _State) -> bool:
-    """Let go the held cable that is shortest against its command, where held cables contradict each other; False where none may go."""
-    cable = np.arange(len(state.T)) < len(body.cables)
-    candidates = np.flatnonzero(state.taut & cable)
-    if loads.bilateral or not len(candidates):
-        return False
-    over = (_travel(body, state.x) - loads.target)[candidates]
-    worst = candidates[np.argmax(over)]
-    state.taut[worst], state.T[state.taut | (np.arange(len(state.T)) == worst)] = False, 0.0
-    return True
-
-
-def _update_slack(body: BodyModel, loads: _Loads, state: _State) -> bool:
-    """Let go what would push and tighten what became too long; return whether anything changed."""
-    if loads.bilateral or not loads.controlled.any():
-        return False
-    cable = np.arange(len(state.T)) < len(body.cables)
-    push = state.taut & cable & (state.T < -1e-12)
-    if push.any():
-        worst = np.flatnonzero(push)[np.argmin(state.T[push])]
-        state.taut[worst], state.T[worst] = False, 0.0
-        return True
-    gap = _travel(body, state.x) - loads.target
-    loose = loads.controlled & cable & ~state.taut & (gap < -1e-9)
-    if loose.any():
-        state.taut[np.flatnonzero(loose)[np.argmin(gap[loose])]] = True
-        return True
-    return False
-
-
-def _update_friction(body: BodyModel, loads: _Loads, state: _State) -> bool:
-    """Move the tensions along the cables to where friction lets them rest; return whether they rested already."""
-    still = True
-    for i, cable in enumerate(body.cables):
-        if cable.friction == 0:
-            continue
-        T = max(state.T[i], 0.0)
-        tensions = rub(cable, bend_angles(cable, state.x), loads.before[i], T)
-        share = tensions / T if T > 0 else np.zeros_like(tensions)
-        if np.abs(share - state.shares[i]).max() * T > 1e-8 * max(1.0, T):
-            still = False
-        state.shares[i] = share
-    return still
-
-
-def _newton(body: BodyModel, loads: _Loads, state: _State, max_iterations: int) -> str:
-    """Newton at fixed shares and a fixed set of taut cables."""
-    free = body.free_map.dofs
-    held = np.flatnonzero(state.taut)
-    stretch = _stretch(body)[held]
-    here = state.here = internal(body, state.x, tangent=not state.borrowed)
-    last, length, shrinking = np.inf, np.inf, np.inf
-    frictional = any(c.friction > 0 for c in body.cables)
-    secants = _Secants()
-    for iteration in range(max_iterations):
-        follows = frictional and not len(held) and iteration < FOLLOW_FRICTION
-        if follows and (iteration or state.borrowed):  # from a state near by at once: its bends are nearly those of the end
-            _update_friction(body, loads, state)
-        rows = _rows(body, state)
-        H = _kinematic_rows(body, state, rows)[held][:, free] if len(held) else np.zeros((0, len(free)))
-        C = rows[held][:, free] if len(held) else H
-        force = _unbalanced(loads, state, here, rows)[free]
-        gap = loads.target[held] - _travel(body, state.x)[held] - stretch * state.T[held] if len(held) else np.zeros(0)
-        state.residual = float(np.linalg.norm(force.reshape(-1, 3), axis=1).max(initial=0.0))
-        sound = bool(np.isfinite(state.residual) and np.isfinite(here.energy))
-        closed = bool((np.abs(gap) / loads.lever[held]).max(initial=0.0) <= CLOSED)
-        arrived = state.rough and not frictional and length <= ARRIVED * body.reach
-        if sound and closed and (arrived or state.residual <= loads.tolerance):
-            return CONVERGED
-        if not sound:
-            return "stalled"
-        left = state.residual / last if last > 0.0 else np.inf
-        enough = RUBS if follows else LENT if state.borrowed else CHORD
-        sound_to_the_end = state.factored_at <= FAR * loads.tolerance and state.residual * min(left, 1.0) ** 2 <= loads.tolerance
-        patience = PATIENCE_TRIED if state.rough else PATIENCE
-        in_sight = state.residual * min(left, 1.0) ** patience <= loads.tolerance
-        in_sight |= state.rough and length * min(shrinking, 1.0) ** patience <= ARRIVED * body.reach
-        serves = left <= enough or sound_to_the_end or (state.single and in_sight)
-        if not frictional and not len(held):
-            secants.learn(state.x.ravel()[free], force)
-        if state.factor is None or not serves:
-            state.factor, state.borrowed = _factor_here(body, here, state, H, C, stretch, loads.lever[held]), False
-            if state.factor is None:
-                return "singular"
-            if state.rough and state.indefinite_steps > INDEFINITE_TRIES:
-                return "iterations"
-            state.factored_at = state.residual
-            secants.pairs.clear()
-        last, state.serves = state.residual, state.borrowed or 0.0 < left <= SURE
-        if secants.pairs:
-            du, dT = secants.step(state.factor, force), gap
-        else:
-            du, dT = _bordered_step(state.factor, force, gap, H, C, stretch, loads.lever[held])
-        longer, length = length, float(np.abs(du).max(initial=0.0))
-        shrinking = length / longer if longer > 0.0 else np.inf
-        if not closed and _contradicts(H @ du + stretch * dT, gap, loads.lever[held]):
-            return "cables"
-        if not (np.isfinite(du).all() and np.isfinite(dT).all()):
-            return "stalled"
-        state.iterations += 1
-        moved = _line_search(body, loads, state, held, here, du, dT, gap, force)
-        if moved is None and state.borrowed:
-            state.factor = None
-            continue
-        if moved is None:
-            return CONVERGED if closed and state.residual <= 1e3 * loads.tolerance else "stalled"
-        here = state.here = moved
-    return "iterations"
-
-
-class _Secants:
-    """What steps since the last factor have shown of the stiffness, where nothing is held: BFGS updates of its inverse (Matthies & Strang 1979)."""
-
-    def __init__(self) -> None:
-        self.pairs: list[tuple[FloatArray, FloatArray, float]] = []
-        """Steps [m], what they took away from the unbalanced force [N], and one over their product."""
-        self.last: tuple[FloatArray, FloatArray] | None = None
-
-    def learn(self, x: FloatArray, force: FloatArray) -> None:
-        """See the free positions [m] and the unbalanced force there [N], each (f,)."""
-        if self.last is not None:
-            step, fell = x - self.last[0], self.last[1] - force
-            work = float(step @ fell)
-            if work > 0.0:
-                self.pairs = [*self.pairs[1 - PAIRS :], (step, fell, 1.0 / work)]
-        self.last = x, force
-
-    def step(self, factor: Factorization, force: FloatArray) -> FloatArray:
-        """Return the step that an unbalanced force asks for [m], shape (f,)."""
-        shares = []
-        for step, fell, weight in reversed(self.pairs):
-            shares.append(weight * float(step @ force))
-            force = force - shares[-1] * fell
-        answer = factor.solve(force)
-        for (step, fell, weight), share in zip(self.pairs, reversed(shares)):
-            answer = answer + (share - weight * float(fell @ answer)) * step
-        return answer
-
-
-def _unbalanced(loads: _Loads, state: _State, here: Internal, rows: FloatArray) -> FloatArray:
-    """Return the unbalanced force of every unknown [N], shape (3n,)."""
-    pull = state.T @ rows if len(rows) else 0.0
-    return np.asarray(loads.forces.ravel() - here.forces.ravel() + pull)
-
-
-def _residual(body: BodyModel, loads: _Loads, state: _State) -> float:
+def _residual(body: BodyModel, loads: Loads, state: State) -> float:
     """Return the largest unbalanced nodal force [N]; inf where an element is turned inside out."""
     here = internal(body, state.x, tangent=False) if state.here is None else state.here
-    force = _unbalanced(loads, state, here, _rows(body, state))[body.free_map.dofs]
+    force = unbalanced_force(loads, state, here, drive_rows(body, state))[body.free_map.dofs]
     size = float(np.linalg.norm(force.reshape(-1, 3), axis=1).max(initial=0.0))
     return size if np.isfinite(here.energy) and np.isfinite(size) else np.inf
 
 
-def _factor_here(
-    body: BodyModel, here: Internal, state: _State, H: FloatArray, C: FloatArray, stretch: FloatArray, lever: FloatArray
-) -> Factorization | None:
-    """Factorise the stiffness, made positive definite where it is not: then steps lead downhill. Held cables and chambers hold too:
-    a stiffness that is indefinite only where they do not let the body go stays as it is."""
-    values = reduced_values(body, _stiffness_blocks(body, here, state))
-    plain = _definite_factor(body.free_map.pattern, values, state)
-    whole = with_turning_plate(body, state.x, plain)
-    state.shifted = state.shift > 0.0 or whole is None or whole.negative > 0
-    if state.shifted and len(H):
-        exact = with_turning_plate(body, state.x, factorize(body.free_map.pattern, values))
-        state.shifted = exact is None or not _held_definite(exact, H, C, stretch, lever)
-        whole = whole if state.shifted else exact
-    state.indefinite_steps += state.shifted
-    # the plate only ever softens, so that the factor without it leads downhill
-    return plain if state.shifted and whole is not None and whole.negative > 0 else whole
-
-
-def _definite_factor(pattern: Pattern, values: FloatArray, state: _State) -> Factorization | None:
-    """Factorise a stiffness with the shift that makes it positive definite, which is near that which served last. Where it is indefinite in single
-    precision alone, as a body about to buckle may be, no other factor of this state is."""
-    first, plain = state.shift / 4.0, None
-    if state.single:
-        plain, state.shift = factorize_definite(pattern, values, single=True, tries=0)
-    if plain is None and state.single and first < least_shift(pattern, values):
-        plain = factorize_definite(pattern, values, tries=0)[0]
-        state.single = plain is None
-    if plain is None:
-        plain, state.shift = factorize_definite(pattern, values, first=first, single=state.single, indefinite=state.single)
-    return plain
-
-
-def _stiffness_blocks(body: BodyModel, here: Internal, state: _State) -> FloatArray:
-    blocks = internal(body, state.x).blocks if here.blocks is None else here.blocks.copy()
-    assert blocks is not None
-    a = len(body.cables)
-    add_cable_stiffness(body, state.x, tuple(T * s for T, s in zip(state.T[:a], state.shares)), blocks)
-    add_pressure_stiffness(body, state.x, state.T[a:], blocks)
-    return blocks
-
-
-def _held_definite(factor: Factorization, H: FloatArray, C: FloatArray, stretch: FloatArray, lever: FloatArray) -> bool:
-    """Return whether a stiffness is positive definite on all motions that held cables and chambers allow.
-
-    Inertia is additive (Haynsworth 1968): it is so where S = H K⁻¹ Cᵀ + 1/k has as many negative eigenvalues as K.
-    """
-    S = (H @ factor.solve(C.T) + np.diag(stretch)) / np.outer(lever, lever)
-    if not np.isfinite(S).all():
-        return False
-    return int((np.linalg.eigvalsh((S + S.T) / 2.0) < 0).sum()) == factor.negative
-
-
-def _holds_itself(body: BodyModel, state: _State) -> bool:
-    """Return whether a balanced body whose clamp does not hold it stands all the same (cables may hold it)."""
-    blocks = _stiffness_blocks(body, internal(body, state.x), state)
-    factor = with_turning_plate(body, state.x, factorize(body.free_map.pattern, reduced_values(body, blocks)))
-    return factor is not None and factor.negative == 0
-
-
-def _is_doubtful(loads: _Loads, state: _State, start: Equilibrium | None) -> bool:
-    """Return whether the stiffness at hand leaves open if a balanced state is stable.
-
-    It does where it was not positive definite, and where it was factorised far from the end. A walk from one state to the next is
-    spared the latter: the next step, which starts with the stiffness of this state, sees it.
-    """
-    walks = start is not None and start.converged
-    return state.shifted or (not walks and state.factored_at > FAR * loads.tolerance)
-
-
-def _can_fall(body: BodyModel, loads: _Loads, state: _State) -> bool:
-    """Return whether a balanced state has a motion along which its energy falls: the softest one, by inverse iteration.
-
-    The curvature along it is a difference of forces, so that a false alarm needs more than a factor's perturbed pivot.
-    """
-    held = np.flatnonzero(state.taut)
-    rows, free = _rows(body, state), body.free_map.dofs
-    H, stretch, lever = rows[held][:, free], _stretch(body)[held], loads.lever[held]
-    factor = _factor_here(body, internal(body, state.x), state, H, H, stretch, lever)
-    if factor is None or not state.shifted:
-        return False
-    motion = np.random.default_rng(0).standard_normal(len(free))
-    for _ in range(FALL_ITERATIONS):
-        motion, _ = _bordered_step(factor, motion, np.zeros(len(held)), H, H, stretch, lever)
-        motion /= np.abs(motion).max()
-    step = np.zeros(state.x.size)
-    step[free] = 1e-6 * body.reach * motion
-    forces = []
-    for sign in (1.0, -1.0):
-        there = replace(state, x=state.x + sign * step.reshape(-1, 3))
-        forces.append(_unbalanced(loads, there, internal(body, there.x, tangent=False), _rows(body, there)))
-    curvature = float((forces[1] - forces[0]) @ step)
-    scale = float(np.abs((forces[1] - forces[0]) * step).sum())
-    return curvature < -1e-6 * scale
-
-
-def _rows(body: BodyModel, state: _State) -> FloatArray:
-    """Return the nodal forces of unit motor tensions, with the loss along each cable, and of unit pressures, shape (a + c, 3n)."""
-    n = len(body.mesh.nodes)
-    rows = [cable_forces(c, state.x, s, n).ravel() for c, s in zip(body.cables, state.shares)]
-    rows += [volume_gradient(c, state.x).ravel() for c in body.chambers]
-    return np.array(rows) if rows else np.zeros((0, 3 * n))
-
-
-def _kinematic_rows(body: BodyModel, state: _State, rows: FloatArray) -> FloatArray:
-    """Return dδ/dx and dV/dx, shape (a + c, 3n): the rows without the loss along the cables."""
-    n = len(body.mesh.nodes)
-    result = rows.copy()
-    for i, cable in enumerate(body.cables):
-        if (state.shares[i] != 1.0).any():
-            result[i] = cable_forces(cable, state.x, np.ones(len(cable.path)), n).ravel()
-    return result
-
-
-def _travel(body: BodyModel, positions: FloatArray) -> FloatArray:
-    """Return the shortening of each cable [m] and the growth of each chamber [m³] since rest, shape (a + c,)."""
-    return np.concatenate([shortening(body, positions), volume_changes(body, positions)])
-
-
-def _stretch(body: BodyModel) -> FloatArray:
-    """Return the compliance of each cable itself [m/N], and 0 for each chamber, shape (a + c,)."""
-    return np.array([1.0 / c.stretch_stiffness for c in body.cables] + [0.0] * len(body.chambers))
-
-
-def _bordered_step(
-    factor: Factorization,
-    force: FloatArray,
-    gap: FloatArray,
-    H: FloatArray,
-    C: FloatArray,
-    stretch: FloatArray,
-    lever: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
-    """Solve K du − Cᵀ dT = force, H du + stretch dT = gap."""
-    if not len(gap):
-        return factor.solve(force), gap
-    columns = factor.solve(np.column_stack([force, C.T]))
-    free, compliance = columns[:, 0], columns[:, 1:]
-    matrix = (H @ compliance + np.diag(stretch)) / np.outer(lever, lever)  # all in m/N
-    dT = np.linalg.lstsq(matrix, (gap - H @ free) / lever, rcond=None)[0] / lever
-    return free + compliance @ dT, np.asarray(dT, dtype=np.float64)
-
-
-def _contradicts(reached: FloatArray, gap: FloatArray, lever: FloatArray) -> bool:
-    """Return whether a step cannot close the gaps of what is held: their rows depend on each other."""
-    return bool((np.abs(reached - gap) / lever).max() > 1e-3 * (np.abs(gap) / lever).max() + CLOSED)
-
-
-def _line_search(
-    body: BodyModel,
-    loads: _Loads,
-    state: _State,
-    held: npt.NDArray[np.intp],
-    here: Internal,
-    du: FloatArray,
-    dT: FloatArray,
-    gap: FloatArray,
-    force: FloatArray,
-) -> Internal | None:
-    """Go along a Newton step as far as the potential allows (Armijo); return the internal state there, None if nowhere.
-
-    Held cables enter the merit as an exact penalty ρ |gap| with ρ above their tensions.
-    """
-    free = body.free_map.dofs
-    x0, T0 = state.x, state.T
-    step = np.zeros(x0.shape)
-    step.reshape(-1)[free] = du
-    penalty = 2.0 * np.abs(T0[held] + dT) + 1e-3 / loads.lever[held]
-    lost = np.zeros(len(T0))  # a held cable with friction is no pure constraint: what its bends take away is a given force
-    rubs = np.array([(s != 1.0).any() for s in state.shares] + [False] * len(body.chambers), dtype=bool)
-    lost[held] = np.where(rubs[held], T0[held] + dT, 0.0)
-    base = _merit(body, loads, state, held, here, penalty, lost)
-    slope = -float(force @ du)
-    if len(held):
-        slope = _slope(body, loads, state, held, here, step, lost) - float(penalty @ np.abs(gap))
-    noise = 1e-12 * (abs(here.energy) + abs(float((loads.forces * x0).sum())) + float(np.abs(T0) @ loads.lever) * 1e-2 + 1e-12)
-    reach, longest = body.reach, float(np.abs(step).max(initial=1e-300))
-    length = min(1.0, 0.5 * reach / longest)
-    turned = rotated_step(body, x0, length * step) if longest > CURVED * reach else None
-    for trial in range(25):
-        state.x = x0 + length * step if turned is None else turned
-        state.T = T0.copy()
-        state.T[held] = T0[held] + length * dT
-        there = internal(body, state.x, tangent=trial == 0 and not state.serves)
-        if np.isfinite(there.energy):
-            merit = _merit(body, loads, state, held, there, penalty, lost)
-            if merit <= base + 1e-4 * length * slope + noise:
-                return there
-        length, turned = (0.5 * length if turned is None else length), None
-    state.x, state.T = x0, T0
-    return None
-
-
-def _merit(
-    body: BodyModel,
-    loads: _Loads,
-    state: _State,
-    held: npt.NDArray[np.intp],
-    here: Internal,
-    penalty: FloatArray,
-    lost: FloatArray,
-) -> float:
-    value = here.energy - float((loads.forces * (state.x - body.mesh.nodes)).sum())
-    for i, cable in enumerate(body.cables):
-        if not state.taut[i] and state.T[i] != 0.0:
-            value += state.T[i] * _weighted_length(cable, state.x, state.shares[i])
-        if lost[i] != 0.0:
-            value += lost[i] * _weighted_length(cable, state.x, state.shares[i] - 1.0)
-    for i, chamber in enumerate(body.chambers, len(body.cables)):
-        if not state.taut[i] and state.T[i] != 0.0:
-            value -= state.T[i] * (chamber_volume(chamber, state.x) - chamber_volume(chamber, body.mesh.nodes))
-    if len(held):
-        stretch = _stretch(body)[held]
-        gap = loads.target[held] - _travel(body, state.x)[held] - stretch * state.T[held]
-        value += float(penalty @ np.abs(gap)) + 0.5 * float(stretch @ state.T[held] ** 2)
-    return value
-
-
-def _weighted_length(cable: Cable, x: FloatArray, share: FloatArray) -> float:
-    return float(share @ segments(cable, x)[1])
-
-
-def _slope(
-    body: BodyModel, loads: _Loads, state: _State, held: npt.NDArray[np.intp], here: Internal, step: FloatArray, lost: FloatArray
-) -> float:
-    """Return the derivative of the potential (of held cables only what friction takes away) along a step."""
-    gradient = here.forces - loads.forces
-    rows = _rows(body, state)
-    loose = state.T.copy()
-    loose[held] = 0.0
-    if not len(rows):
-        return float((gradient * step).sum())
-    pull = loose @ rows + lost @ (rows - _kinematic_rows(body, state, rows))
-    return float((gradient * step).sum() - pull @ step.ravel())
-
-
 def _step_loads(
-    body: BodyModel, first: _Loads, loads: _Loads, good: _State, failed: _State, max_iterations: int
-) -> tuple[_State, str, float]:
+    body: BodyModel, first: Loads, loads: Loads, good: State, failed: State, max_iterations: int
+) -> tuple[State, str, float]:
     """Go from the first loads to the wanted ones bit by bit; the steps shrink where Newton fails and grow where it succeeds.
 
     Returns:
@@ -787,12 +308,12 @@ def _step_loads(
     """
     done, step = 0.0, 0.25
     spent, good.indefinite_steps = failed.iterations, failed.indefinite_steps
-    status = _settle(body, first, good, max_iterations)
+    status = settle(body, first, good, max_iterations)
     while status == CONVERGED and done < 1.0:
         part = min(1.0, done + step)
         there, state = loads.part_way(first, part), _copied(good)
         state.T = np.where(loads.controlled, good.T, there.effort)
-        status = _settle(body, there, state, max_iterations)
+        status = settle(body, there, state, max_iterations)
         spent += state.iterations - good.iterations
         if status == CONVERGED:
             good, done, step = state, part, 1.5 * step
@@ -804,15 +325,15 @@ def _step_loads(
     return good, status, done
 
 
-def _copied(state: _State) -> _State:
+def _copied(state: State) -> State:
     """Return a copy that can be moved on without harm to the original, with a factor to come."""
     shares, x = [s.copy() for s in state.shares], state.x.copy()
     return replace(state, x=x, T=state.T.copy(), taut=state.taut.copy(), shares=shares, factor=None, borrowed=False, here=None)
 
 
-def _result(body: BodyModel, state: _State, status: str, reached: float, nodal_forces: FloatArray) -> Equilibrium:
+def _result(body: BodyModel, state: State, status: str, reached: float, nodal_forces: FloatArray) -> Equilibrium:
     names, a = body.cable_names, len(body.cables)
-    travel = _travel(body, state.x)
+    travel = travel_of(body, state.x)
     return Equilibrium(
         positions=freeze(state.x),
         tension={name: float(T) for name, T in zip(names, state.T)},

@@ -21,8 +21,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from femsense.fem.corotational import FAST, LOCAL, add_blocks, determinant
+from femsense.fem.corotational import LOCAL, add_blocks
 from femsense.fem.linalg.simd_kernels import LANES
+from femsense.fem.rotation import FAST, determinant
 
 
 @njit(inline="always")

@@ -21,13 +21,12 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 from numba import njit
+from scipy.sparse.linalg import SuperLU, splu
 
-from femsense.core.arrays import FloatArray, IntArray
+from femsense.core.arrays import FloatArray, IntArray, read_only
 from femsense.fem.body import BodyModel
-from femsense.fem.corotational import FAST, closest_rotation, turning_compliance
-from femsense.fem.linalg.cholesky import Cholesky, cholesky
-from femsense.fem.linalg.symbolic import analyse
 from femsense.fem.mesh import EDGES
+from femsense.fem.rotation import FAST, closest_rotation, turning_compliance
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -44,7 +43,7 @@ class Corners:
     """Corners that are not clamped, shape (k,)."""
     middles: IntArray
     """Free nodes in the middle of edges and the ends of these, shape (e, 3)."""
-    factor: Cholesky
+    factor: SuperLU
     """Of Σ w ∇N_a·∇N_b over the free corners."""
 
 
@@ -57,8 +56,7 @@ def rotated_step(body: BodyModel, positions: FloatArray, step: FloatArray) -> Fl
     if corners is None:
         return None
     excess, further = np.zeros_like(step), np.zeros_like(step)
-    x = np.ascontiguousarray(positions).view()
-    x.flags.writeable = False
+    x = read_only(positions)
     _excess(x, step, corners.tets, corners.gradients, corners.volumes, excess)
     further[corners.free] = corners.factor.solve(excess[corners.free])
     middle, one, other = corners.middles.T
@@ -82,9 +80,7 @@ def corners_of(body: BodyModel) -> Corners:
     is_corner[tets] = True
     free = nodes[is_corner[nodes]]
     part = sp.csc_matrix(whole[free][:, free])
-    part.sort_indices()
-    factor = cholesky(analyse(part.indptr.astype(np.int64), part.indices.astype(np.int64)), part.data)
-    assert factor is not None
+    factor = splu(part, permc_spec="NATURAL", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
     middles = np.zeros((0, 3), dtype=np.int64)
     if mesh.is_quadratic:
         triples = np.concatenate([mesh.tets[:, 4:, None], tets[:, EDGES]], axis=2).reshape(-1, 3)
@@ -96,6 +92,7 @@ def corners_of(body: BodyModel) -> Corners:
 def _excess(x: FloatArray, step: FloatArray, tets: IntArray, gradients: FloatArray, volumes: FloatArray, out: FloatArray) -> None:
     """Add Σ w (F' − F − dF) ∇N_a to out, shape (n, 3)."""
     F, R, D, A, P = np.empty((9, 1)), np.empty((9, 1)), np.empty(6), np.empty((3, 3)), np.empty((3, 3))
+    first = np.int64(0)  # as in `corotational_tet4`
     V, dF, W, Q = np.empty((3, 3)), np.empty((3, 3)), np.zeros((3, 3)), np.empty((3, 3))
     for e in range(len(tets)):
         G = gradients[e]
@@ -106,8 +103,8 @@ def _excess(x: FloatArray, step: FloatArray, tets: IntArray, gradients: FloatArr
                     s += x[tets[e, a], i] * G[j, a]
                     d += step[tets[e, a], i] * G[j, a]
                 F[3 * i + j, 0], dF[i, j] = s, d
-        closest_rotation(F, R, 0)
-        turning_compliance(F, R, 0, D)
+        closest_rotation(F, R, first)
+        turning_compliance(F, R, first, D)
         for i in range(3):
             for j in range(3):
                 r0, r1, r2 = R[3 * j, 0], R[3 * j + 1, 0], R[3 * j + 2, 0]
@@ -117,14 +114,14 @@ def _excess(x: FloatArray, step: FloatArray, tets: IntArray, gradients: FloatArr
         ox, oy, oz = D[0] * u + D[1] * v + D[2] * w, D[1] * u + D[3] * v + D[4] * w, D[2] * u + D[4] * v + D[5] * w
         square = ox * ox + oy * oy + oz * oz
         angle = np.sqrt(square)
-        first, second = -square / 6.0, 0.5 - square / 24.0
+        one, two = -square / 6.0, 0.5 - square / 24.0
         if angle > 1e-3:
-            first, second = np.sin(angle) / angle - 1.0, (1.0 - np.cos(angle)) / square
+            one, two = np.sin(angle) / angle - 1.0, (1.0 - np.cos(angle)) / square
         W[0, 1], W[0, 2], W[1, 2], W[1, 0], W[2, 0], W[2, 1] = -oz, oy, -ox, oz, -oy, ox
         for i in range(3):  # A becomes the strain E
             for j in range(3):
                 A[i, j] -= W[i, 0] * V[0, j] + W[i, 1] * V[1, j] + W[i, 2] * V[2, j]
-                Q[i, j] = first * W[i, j] + second * (W[i, 0] * W[0, j] + W[i, 1] * W[1, j] + W[i, 2] * W[2, j])
+                Q[i, j] = one * W[i, j] + two * (W[i, 0] * W[0, j] + W[i, 1] * W[1, j] + W[i, 2] * W[2, j])
         for i in range(3):
             for j in range(3):
                 s = 0.0

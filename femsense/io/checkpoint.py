@@ -19,6 +19,7 @@ from femsense.core.errors import FemsenseError
 from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.linalg.factorization import Pattern
 from femsense.fem.linalg.symbolic import Analysis
+from femsense.fem.stencil import FreeMap
 from femsense.io.files import json_text, write_beside
 from femsense.model.effects import Effect
 
@@ -33,6 +34,7 @@ NEEDLESS: dict[type, tuple[str, Callable[[], Any]]] = {
     Equilibrium: ("factor", lambda: None),
     Analysis: ("idle", dict),
     Pattern: ("idle", list),
+    FreeMap: ("laplacian", list),
 }
 """What is large and soon made again: factors that later ones start from, and memory that waits for use."""
 UNREADABLE = (OSError, EOFError, ValueError, TypeError, LookupError, AttributeError, ImportError, pickle.UnpicklingError)

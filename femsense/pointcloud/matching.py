@@ -279,7 +279,7 @@ def _fit(layer: FloatArray, across: float, order: int, out: FloatArray) -> int:
         terms = 3 if terms == 6 else 1
     if terms > 1:
         residual = np.abs(layer[:, 2] - _heights(layer, across, coefficients))
-        keep = residual <= 4.0 * 1.4826 * np.median(residual) + 1e-12
+        keep = residual <= 4.0 * 1.4826 * _median(residual) + 1e-12
         if keep.sum() < len(layer) and keep.sum() > terms + 3:
             kept = layer[keep]
             again, better, weight = _least_squares(kept, across, terms)
@@ -291,6 +291,22 @@ def _fit(layer: FloatArray, across: float, order: int, out: FloatArray) -> int:
     out[2] = (rest**2).sum()
     out[3] = leverage
     return terms
+
+
+@njit(cache=True)
+def _median(values: FloatArray) -> float:
+    """Return the median (shell sort: NumPy's would take longer to compile than all else here)."""
+    ordered, gap = values.copy(), len(values) // 2
+    while gap > 0:
+        for i in range(gap, len(ordered)):
+            value, j = ordered[i], i
+            while j >= gap and ordered[j - gap] > value:
+                ordered[j] = ordered[j - gap]
+                j -= gap
+            ordered[j] = value
+        gap //= 2
+    middle = len(ordered) // 2
+    return float(ordered[middle] if len(ordered) % 2 else 0.5 * (ordered[middle - 1] + ordered[middle]))
 
 
 @njit(cache=True)

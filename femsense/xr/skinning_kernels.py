@@ -11,6 +11,7 @@ import numpy as np
 from numba import njit
 
 from femsense.core.arrays import BoolArray, FloatArray, IntArray
+from femsense.fem.rotation import rotation_of
 
 INFLUENCES = 4
 CANDIDATES = 10
@@ -18,73 +19,6 @@ CANDIDATES = 10
 
 
 # ---- poses ------------------------------------------------------------------------------------------------------------
-
-
-@njit(cache=True)
-def rotation_of(covariance: FloatArray, R: FloatArray) -> None:
-    """Write the rotation R (3, 3) with the largest trace(R C), for C = Σ w p qᵀ: it turns p to q.
-
-    Horn 1987: its quaternion is the eigenvector of the largest eigenvalue of a symmetric 4 × 4 matrix, found by Jacobi
-    rotations. Always proper, also for flat and mirrored clouds.
-    """
-    C = covariance
-    K, V = np.zeros((4, 4)), np.eye(4)
-    K[0, 0] = C[0, 0] + C[1, 1] + C[2, 2]
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        K[0, i + 1] = K[i + 1, 0] = C[j, k] - C[k, j]
-        K[i + 1, i + 1] = C[i, i] - C[j, j] - C[k, k]
-        K[j + 1, k + 1] = K[k + 1, j + 1] = C[j, k] + C[k, j]
-    diagonalise(K, V)
-    best = 0
-    for i in range(1, 4):
-        if K[i, i] > K[best, best]:
-            best = i
-    w, x, y, z = V[0, best], V[1, best], V[2, best], V[3, best]
-    n = w * w + x * x + y * y + z * z
-    R[0, 0], R[0, 1], R[0, 2] = 1.0 - 2.0 * (y * y + z * z) / n, 2.0 * (x * y - z * w) / n, 2.0 * (x * z + y * w) / n
-    R[1, 0], R[1, 1], R[1, 2] = 2.0 * (x * y + z * w) / n, 1.0 - 2.0 * (x * x + z * z) / n, 2.0 * (y * z - x * w) / n
-    R[2, 0], R[2, 1], R[2, 2] = 2.0 * (x * z - y * w) / n, 2.0 * (y * z + x * w) / n, 1.0 - 2.0 * (x * x + y * y) / n
-
-
-@njit(cache=True)
-def diagonalise(K: FloatArray, V: FloatArray) -> None:
-    """Turn a symmetric 4 × 4 matrix into its eigenvalues on the diagonal, V (identity before) into its eigenvectors.
-
-    Cyclic Jacobi rotations (Golub and Van Loan, Matrix Computations, 8.5).
-    """
-    for _ in range(20):
-        off, size = 0.0, 0.0
-        for i in range(4):
-            size += K[i, i] * K[i, i]
-            for j in range(i):
-                off += K[i, j] * K[i, j]
-        if off <= 1e-32 * size or off == 0.0:
-            return
-        for p in range(3):
-            for q in range(p + 1, 4):
-                if K[p, q] != 0.0:
-                    jacobi_rotation(K, V, p, q)
-
-
-@njit(cache=True)
-def jacobi_rotation(K: FloatArray, V: FloatArray, p: int, q: int) -> None:
-    """Turn K in the plane p, q so that K[p, q] vanishes, and V along."""
-    ratio = (K[q, q] - K[p, p]) / (2.0 * K[p, q])
-    t = 1.0 / (abs(ratio) + np.sqrt(1.0 + ratio * ratio))
-    if ratio < 0.0:
-        t = -t
-    c = 1.0 / np.sqrt(1.0 + t * t)
-    s = t * c
-    for i in range(4):
-        a, b = K[i, p], K[i, q]
-        K[i, p], K[i, q] = c * a - s * b, s * a + c * b
-    for i in range(4):
-        a, b = K[p, i], K[q, i]
-        K[p, i], K[q, i] = c * a - s * b, s * a + c * b
-    for i in range(4):
-        a, b = V[i, p], V[i, q]
-        V[i, p], V[i, q] = c * a - s * b, s * a + c * b
 
 
 @njit(cache=True)

@@ -13,7 +13,7 @@ from helpers import block_mesh
 from hollow_bar_cable import hollow
 
 from femsense.core.errors import InputError
-from femsense.fem import equilibrium
+from femsense.fem import equilibrium, line_search, newton, newton_state
 from femsense.fem.assembly import internal, reduced_matrix
 from femsense.fem.body import BodyModel, make_body, tie_cable
 from femsense.fem.cables import bend_angles
@@ -31,7 +31,7 @@ EULER = np.pi**2 * E * WIDTH * SIDE**3 / 12 / (4 * LENGTH**2)
 def residuals(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """The unbalanced force of every Newton iterate, in turn [N]."""
     seen: list[float] = []
-    plain = equilibrium._unbalanced
+    plain = newton_state.unbalanced_force
     free: dict[str, Any] = {}
 
     def watched(loads: Any, state: Any, here: Any, rows: Any) -> np.ndarray:
@@ -40,7 +40,7 @@ def residuals(monkeypatch: pytest.MonkeyPatch) -> list[float]:
         return force
 
     watched.free = free  # type: ignore[attr-defined]
-    monkeypatch.setattr(equilibrium, "_unbalanced", watched)
+    monkeypatch.setattr(newton, "unbalanced_force", watched)
     return seen
 
 
@@ -63,9 +63,9 @@ def test_newton_is_quadratic_near_the_solution(
     body = hollow(law)
     if law == "gent":
         body = body.with_material(replace(body.material, stretch_limit=2.0))
-    equilibrium._unbalanced.free["dofs"] = body.free_map.dofs  # type: ignore[attr-defined]
-    monkeypatch.setattr(equilibrium, "CHORD", 0.0)  # every step with a stiffness of its own
-    monkeypatch.setattr(equilibrium, "CURVED", np.inf)  # straight: where elements turn, too few steps are left to see an order
+    newton.unbalanced_force.free["dofs"] = body.free_map.dofs  # type: ignore[attr-defined]
+    monkeypatch.setattr(newton, "CHORD", 0.0)  # every step with a stiffness of its own
+    monkeypatch.setattr(line_search, "CURVED", np.inf)  # straight: where elements turn, too few steps are left to see an order
     state = solve_equilibrium(body, **given, relative_tolerance=1e-13)
     assert state.converged and state.indefinite_steps == 0
     near = [r for r in residuals if r > 1e-8]
@@ -189,13 +189,13 @@ def test_load_steps_keep_the_given_losses_along_a_cable(monkeypatch: pytest.Monk
     along = (np.ones_like(start.segment_tensions[0]), np.array([0.4, 1.0]))
     wanted = solve_equilibrium(body, tension={"side": 4.0}, start=start, along=along)
     assert wanted.segment_tensions[1].tolist() == [1.6, 4.0]
-    plain, calls = equilibrium._settle, []
+    plain, calls = equilibrium.settle, []
 
     def fails_at_first(*arguments: Any) -> str:
         calls.append(0)
         return "stalled" if len(calls) in (1, 4) else plain(*arguments)
 
-    monkeypatch.setattr(equilibrium, "_settle", fails_at_first)
+    monkeypatch.setattr(equilibrium, "settle", fails_at_first)
     stepped = solve_equilibrium(body, tension={"side": 4.0}, start=start, along=along)
     assert len(calls) > 4 and stepped.converged
     np.testing.assert_allclose(stepped.segment_tensions[1], [1.6, 4.0])
@@ -207,13 +207,13 @@ def test_load_steps_go_on_from_the_start(monkeypatch: pytest.MonkeyPatch) -> Non
     body = arch()
     snapped = solve_equilibrium(body, shortening={"down": 0.02})
     let = solve_equilibrium(body, tension={"down": 0.0}, start=snapped)
-    plain, calls = equilibrium._settle, []
+    plain, calls = equilibrium.settle, []
 
     def fails_at_first(*arguments: Any) -> str:
         calls.append(0)
         return "stalled" if len(calls) == 1 else plain(*arguments)
 
-    monkeypatch.setattr(equilibrium, "_settle", fails_at_first)
+    monkeypatch.setattr(equilibrium, "settle", fails_at_first)
     again = solve_equilibrium(body, tension={"down": 0.0}, start=snapped)
     assert again.converged and len(calls) > 2
     np.testing.assert_allclose(again.positions, let.positions, atol=1e-7)
@@ -340,8 +340,8 @@ def test_a_state_that_is_only_tried_is_given_up_where_its_stiffness_stays_indefi
     x = rest.positions * [1.0, 1.0, 0.1]  # pressed flat
     flat = replace(rest, positions=np.where(body.mesh.nodes[:, :1] < 1e-9, body.mesh.nodes, x))
     back = solve_equilibrium(body, start=flat, rough=True)
-    assert back.converged and 1 <= back.indefinite_steps <= equilibrium.INDEFINITE_TRIES
-    monkeypatch.setattr(equilibrium, "INDEFINITE_TRIES", back.indefinite_steps - 1)
+    assert back.converged and 1 <= back.indefinite_steps <= newton.INDEFINITE_TRIES
+    monkeypatch.setattr(newton, "INDEFINITE_TRIES", back.indefinite_steps - 1)
     tried = solve_equilibrium(body, start=flat, rough=True)
     assert tried.status == "iterations" and tried.iterations < back.iterations
     assert solve_equilibrium(body, start=flat).converged  # what is not only tried goes on
@@ -352,20 +352,18 @@ def test_a_stiffness_is_shifted_in_single_precision_where_it_is_indefinite_in_do
     pattern, K = body.free_map.pattern, reduced_matrix(body, internal(body, body.mesh.nodes).blocks)
     lowest = float(np.linalg.eigvalsh(K.toarray())[0])
 
-    def factored(share: float, shift: float = 0.0) -> tuple[Any, equilibrium._State]:
-        state = equilibrium._State(body.mesh.nodes, np.zeros(0), np.zeros(0, dtype=bool), [], single=True, shift=shift)
+    def factored(share: float, shift: float = 0.0) -> tuple[Any, newton_state.State]:
+        state = newton_state.State(body.mesh.nodes, np.zeros(0), np.zeros(0, dtype=bool), [], single=True, shift=shift)
         values = K.data - share * lowest * (pattern.indices == np.repeat(np.arange(pattern.size), np.diff(pattern.indptr)))
-        return equilibrium._definite_factor(pattern, values, state), state
+        return newton.definite_factor(pattern, values, state), state
 
     for share, shift in ((1.5, 0.0), (1.5, 2.2 * lowest), (30.0, 0.0)):
         factor, state = factored(share, shift)
         assert state.single and factor._L.dtype == np.float32 and (share - 1.0) * lowest < state.shift
     factor, state = factored(0.5, 30.0 * lowest)
     assert state.single and factor._L.dtype == np.float32 and state.shift == 0.0
-    plain = equilibrium.factorize_definite
-    monkeypatch.setattr(
-        equilibrium, "factorize_definite", lambda *a, single=False, **k: (None, 0.0) if single else plain(*a, **k)
-    )
+    plain = newton.factorize_definite
+    monkeypatch.setattr(newton, "factorize_definite", lambda *a, single=False, **k: (None, 0.0) if single else plain(*a, **k))
     factor, state = factored(1.0 - 1e-9)  # definite, but not with seven digits
     assert not state.single and factor._L.dtype == np.float64 and state.shift == 0.0
 
@@ -387,7 +385,7 @@ def test_a_stiffness_learns_from_the_steps_since_it_was_factorised() -> None:
     factor: Any = _Known(true + 0.4 * turned[:, :3] @ turned[:, :3].T)  # too stiff along three motions
     load, ends = rng.standard_normal(20), list[float]()
     for learns in (False, True):
-        secants, x = equilibrium._Secants(), np.zeros(20)
+        secants, x = newton.Secants(), np.zeros(20)
         for _ in range(7):
             force = load - true @ x
             if learns:
@@ -406,15 +404,15 @@ def test_a_state_that_is_only_tried_takes_a_lent_factor_as_far_as_it_goes(monkey
     pull = {"top": 0.3}
     start = solve_equilibrium(body, tension=pull)
     start = replace(start, factor=tangent_at(body, start).factor)
-    factors, plain = list[int](), equilibrium._factor_here
-    monkeypatch.setattr(equilibrium, "_factor_here", lambda *a: (factors.append(1), plain(*a))[1])
+    factors, plain = list[int](), newton.factor_here
+    monkeypatch.setattr(newton, "factor_here", lambda *a: (factors.append(1), plain(*a))[1])
     soft = body.with_stiffness_scale(0.97)
     there = solve_equilibrium(soft, tension=pull, start=start)
     assert np.abs(there.positions - start.positions).max() > 1e-3 * body.reach
     factors.clear()
     tried = solve_equilibrium(soft, tension=pull, start=start, reuse_factor=True, rough=True)
     assert tried.converged and not factors
-    assert np.abs(tried.positions - there.positions).max() < 2 * equilibrium.ARRIVED * body.reach
-    monkeypatch.setattr(equilibrium, "PATIENCE_TRIED", 0)
+    assert np.abs(tried.positions - there.positions).max() < 2 * newton.ARRIVED * body.reach
+    monkeypatch.setattr(newton, "PATIENCE_TRIED", 0)
     solve_equilibrium(soft, tension=pull, start=start, reuse_factor=True, rough=True)
     assert factors

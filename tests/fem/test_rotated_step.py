@@ -7,7 +7,7 @@ import pytest
 from helpers import block_mesh
 
 from femsense.core.pose import rotation_from_vector
-from femsense.fem import equilibrium
+from femsense.fem import line_search
 from femsense.fem.assembly import internal
 from femsense.fem.body import BodyModel, make_body
 from femsense.fem.equilibrium import solve_equilibrium
@@ -62,7 +62,7 @@ def test_fewer_newton_steps_lead_to_the_same_state(monkeypatch: pytest.MonkeyPat
     body, forces = bar(True), np.zeros((len(bar(True).mesh.nodes), 3))
     forces[body.mesh.nodes[:, 0] > 0.0399, 2] = -0.02
     turned = solve_equilibrium(body, nodal_forces=forces)
-    monkeypatch.setattr(equilibrium, "CURVED", np.inf)
+    monkeypatch.setattr(line_search, "CURVED", np.inf)
     straight = solve_equilibrium(body, nodal_forces=forces)
     assert turned.converged and straight.converged
     np.testing.assert_allclose(turned.positions, straight.positions, atol=1e-9)

@@ -12,9 +12,10 @@ from xr_bar import bar_surface
 
 from femsense.core.errors import InputError
 from femsense.core.pose import make_pose
+from femsense.fem.rotation import rotation_of
 from femsense.xr.skeleton import Skeleton, farthest_points, skeleton_at
 from femsense.xr.skinning import Skin, fit_poses, fit_skin, prepare_poses, rms, skin_rms, skin_vertices
-from femsense.xr.skinning_kernels import rotation_of, simplex_least_squares
+from femsense.xr.skinning_kernels import simplex_least_squares
 
 
 @pytest.fixture(scope="module")

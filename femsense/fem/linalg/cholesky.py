@@ -290,8 +290,11 @@ def _solve_sides(
     for s in range(len(firsts) - 1):
         c0, columns = unit * firsts[s], unit * (firsts[s + 1] - firsts[s])
         height = columns + unit * (begin[s + 1] - begin[s])
-        half[:, : SIDES * columns] = x[:, SIDES * c0 : SIDES * (c0 + columns)]
-        half[:, SIDES * columns : SIDES * height] = 0.0
+        for g in range(groups):
+            for i in range(SIDES * columns):
+                half[g, i] = x[g, SIDES * c0 + i]
+            for i in range(SIDES * columns, SIDES * height):
+                half[g, i] = 0.0
         j = 0
         while j < columns:
             size = 6 if columns - j >= 6 else 3
@@ -302,18 +305,22 @@ def _solve_sides(
                 else:
                     down_three_sides(L, at, height, half[g].ctypes.data + line * j, left, ahead)
             j += size
-        x[:, SIDES * c0 : SIDES * (c0 + columns)] = half[:, : SIDES * columns]
         for g in range(groups):
+            for i in range(SIDES * columns):
+                x[g, SIDES * c0 + i] = half[g, i]
             to, y = x[g].ctypes.data, half[g].ctypes.data
             for q in range(begin[s + 1] - begin[s]):
                 add_run(L, to + width * block * below[begin[s] + q], y + line * (columns + unit * q), block)
     for s in range(len(firsts) - 2, -1, -1):
         c0, columns = unit * firsts[s], unit * (firsts[s + 1] - firsts[s])
         height = columns + unit * (begin[s + 1] - begin[s])
-        half[:, : SIDES * columns] = x[:, SIDES * c0 : SIDES * (c0 + columns)]
-        for q in range(begin[s + 1] - begin[s]):
-            source, to = block * below[begin[s] + q], SIDES * (columns + unit * q)
-            half[:, to : to + block] = x[:, source : source + block]
+        for g in range(groups):
+            for i in range(SIDES * columns):
+                half[g, i] = x[g, SIDES * c0 + i]
+            for q in range(begin[s + 1] - begin[s]):
+                source, to = block * below[begin[s] + q], SIDES * (columns + unit * q)
+                for i in range(block):
+                    half[g, to + i] = x[g, source + i]
         j = columns
         while j > 0:
             size = 6 if j >= 6 else 3
@@ -324,7 +331,9 @@ def _solve_sides(
                     up_six_sides(L, at, height, half[g].ctypes.data + line * j, left, ahead)
                 else:
                     up_three_sides(L, at, height, half[g].ctypes.data + line * j, left, ahead)
-        x[:, SIDES * c0 : SIDES * (c0 + columns)] = half[:, : SIDES * columns]
+        for g in range(groups):
+            for i in range(SIDES * columns):
+                x[g, SIDES * c0 + i] = half[g, i]
 
 
 @njit(cache=True, nogil=True)
@@ -369,7 +378,8 @@ def _solve_many(
         panel, here = L.ctypes.data + width * offset[s], X.ctypes.data + width * c0 * k
         for q in range(rows):
             for a in range(unit):
-                work[(unit * q + a) * k : (unit * q + a + 1) * k] = X[unit * below[begin[s] + q] + a]
+                for r in range(k):
+                    work[(unit * q + a) * k + r] = X[unit * below[begin[s] + q] + a, r]
         if rows > 0:
             _call(
                 blas[0],
@@ -388,7 +398,8 @@ def _reach(parent: IntArray, owner: IntArray, indptr: IntArray, rows: IntArray) 
         mark[:] = -1
         if fill == 1:
             start = np.zeros(count + 1, np.int64)
-            start[1:] = np.cumsum(size[:count])
+            for s in range(count):
+                start[s + 1] = start[s] + size[s]
             active = np.empty(start[count], np.int64)
             size[:] = 0
         for r in range(columns):

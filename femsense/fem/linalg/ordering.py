@@ -41,9 +41,9 @@ def _structures(indptr: IntArray, indices: IntArray, parent: IntArray) -> tuple[
     for j in range(n):
         if end + n - j > len(rows):
             more = np.empty(2 * len(rows) + n, np.int64)
-            more[:end] = rows[:end]
+            for p in range(end):
+                more[p] = rows[p]
             rows = more
-        first = end
         mark[j] = j
         for p in range(indptr[j], indptr[j + 1]):
             i = indices[p]
@@ -60,12 +60,33 @@ def _structures(indptr: IntArray, indices: IntArray, parent: IntArray) -> tuple[
                     rows[end] = i
                     end += 1
             child = follow[child]
-        rows[first:end].sort()
         start[j + 1] = end
         if parent[j] != -1:
             follow[j] = head[parent[j]]
             head[parent[j]] = j
-    return start, rows[:end].copy()
+    return start, _sorted(start, rows, n)
+
+
+@njit(cache=True)
+def _sorted(start: IntArray, rows: IntArray, n: int) -> IntArray:
+    """Return the rows of each column in rising order: column by column to their rows, then row by row back to their columns."""
+    end = start[n]
+    begin, columns, ordered = np.zeros(n + 1, np.int64), np.empty(end, np.int64), np.empty(end, np.int64)
+    for p in range(end):
+        begin[rows[p] + 1] += 1
+    for i in range(n):
+        begin[i + 1] += begin[i]
+    place = begin.copy()
+    for j in range(n):
+        for p in range(start[j], start[j + 1]):
+            columns[place[rows[p]]] = j
+            place[rows[p]] += 1
+    place = start.copy()
+    for i in range(n):
+        for p in range(begin[i], begin[i + 1]):
+            ordered[place[columns[p]]] = i
+            place[columns[p]] += 1
+    return ordered
 
 
 WORTH_PEELING = 10_000

@@ -16,11 +16,11 @@ from femsense.fem.linalg.simd_kernels import PADDING
 
 
 @njit(cache=True)
-def _postorder(parent: IntArray, weight: IntArray) -> IntArray:
-    """Return the nodes of a forest, children before parents, the heaviest child last."""
+def _postorder(parent: IntArray, by_weight: IntArray) -> IntArray:
+    """Return the nodes of a forest, children before parents, the heaviest child last; `by_weight` are its nodes, the lightest first."""
     n = len(parent)
     head, follow = np.full(n, -1, np.int64), np.full(n, -1, np.int64)
-    for j in np.argsort(weight):  # lists are filled from the front: the heaviest comes first in a list, last in the order
+    for j in by_weight:  # lists are filled from the front: the heaviest comes first in a list, last in the order
         if parent[j] != -1:
             follow[j] = head[parent[j]]
             head[parent[j]] = j
@@ -41,7 +41,10 @@ def _postorder(parent: IntArray, weight: IntArray) -> IntArray:
                 top += 1
                 stack[top] = light
                 light = follow[light]
-            stack[first : top + 1] = stack[first : top + 1][::-1].copy()
+            low, high = first, top
+            while low < high:
+                stack[low], stack[high] = stack[high], stack[low]
+                low, high = low + 1, high - 1
     return order
 
 
@@ -105,7 +108,8 @@ def _relations(firsts: IntArray, start: IntArray, rows: IntArray) -> tuple[IntAr
     parent = np.full(count, -1, np.int64)
     for s in range(count):
         last = firsts[s + 1] - 1
-        below[begin[s] : begin[s + 1]] = rows[start[last] : start[last + 1]]
+        for q in range(begin[s + 1] - begin[s]):
+            below[begin[s] + q] = rows[start[last] + q]
         if begin[s + 1] > begin[s]:
             parent[s] = owner[below[begin[s]]]
     where = np.empty(n, np.int64)
@@ -195,7 +199,8 @@ def _rooms(parent: IntArray, begin: IntArray, unit: int) -> tuple[IntArray, int]
             at += 1
         room[s] = end
         most = max(most, end + size)
-        alive[at + 1 : kept + 1] = alive[at:kept].copy()
+        for k in range(kept, at, -1):
+            alive[k] = alive[k - 1]
         alive[at] = s
         kept += 1
         left = 0
@@ -277,7 +282,7 @@ def analyse(indptr: IntArray, indices: IntArray) -> Analysis:
     rows = np.concatenate([[0], np.cumsum(counts)])
     columns = entries[_ranges(heads[:-1:unit], counts, unit)] // unit
     parent = _elimination_tree(rows, columns)
-    order = _postorder(parent, np.diff(_structures(rows, columns, parent)[0]))
+    order = _postorder(parent, np.argsort(np.diff(_structures(rows, columns, parent)[0])))
     inverse = np.empty_like(order)
     inverse[order] = np.arange(len(order))
     columns = inverse[columns[_ranges(rows[:-1][order], counts[order], 1)]]

@@ -34,9 +34,10 @@ from femsense.core.arrays import FloatArray, IntArray
 from femsense.fem.assembly import internal
 from femsense.fem.body import BodyModel
 from femsense.fem.cables import add_cable_stiffness, pull_rows
-from femsense.fem.corotational import FAST, LOCAL, closest_rotation
+from femsense.fem.corotational import LOCAL
 from femsense.fem.linalg.cholesky import Cholesky, cholesky
 from femsense.fem.linalg.simd_kernels import LANES, add_divergence, add_gradient
+from femsense.fem.rotation import FAST, closest_rotation
 from femsense.fem.stencil import in_lanes, lanes_of
 
 ROWS = 54

@@ -11,7 +11,7 @@ from helpers import DATA
 
 from femsense.core.errors import InputError
 from femsense.io.clouds.cloud_files import read_cloud, write_cloud
-from femsense.io.clouds.pcd import _unpack_lzf, read_pcd_fields
+from femsense.io.clouds.pcd import read_pcd_fields
 from femsense.pointcloud import PointCloud, cloud_from_depth
 
 
@@ -20,7 +20,7 @@ def some_cloud(count: int = 50, *, colors: bool = True, seed: int = 0) -> PointC
     return PointCloud(rng.normal(size=(count, 3)), rng.integers(0, 256, size=(count, 3)) / 255.0 if colors else None)
 
 
-def pcd_text(rows: str = "0 0 1 7\n1 2 3 8\n", *, points: int = 2, kind: str = "F F F U", data: str = "ascii") -> str:
+def pcd_text(rows: str = "0 0 1 7\n1 2 3 8\n", *, points: object = 2, kind: str = "F F F U", data: str = "ascii") -> str:
     head = f"# .PCD v0.7\nVERSION 0.7\nFIELDS x y z label\nSIZE 4 4 4 4\nTYPE {kind}\nCOUNT 1 1 1 1\nWIDTH {points}\nHEIGHT 1\n"
     return head + f"VIEWPOINT 0 0 0 1 0 0 0\nPOINTS {points}\nDATA {data}\n" + rows
 
@@ -73,15 +73,25 @@ def test_compressed_pcd_of_another_writer(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_cloud(path).points, points.astype(np.float32))
 
 
-def test_lzf_against_streams_written_by_hand() -> None:
-    target = np.zeros(9, dtype=np.uint8)
-    # copy 2 bytes "ab", then length 1 + 2 at distance 2 ("aba"), then length 7 + 0 … would overflow: stop at 5
-    assert _unpack_lzf(np.array([1, 97, 98, 0x20, 1], dtype=np.uint8), target) == 5
-    assert bytes(target[:5]) == b"ababa"
-    # long form: length 7 + 0 + 2 = 9 bytes would not fit behind one literal
-    assert _unpack_lzf(np.array([0, 97, 0xE0, 0, 0], dtype=np.uint8), target) == -1
-    assert _unpack_lzf(np.array([0, 97, 0xE0, 0, 0], dtype=np.uint8), np.zeros(10, dtype=np.uint8)) == 10
-    assert _unpack_lzf(np.array([0x20, 0], dtype=np.uint8), target) == -1  # refers to before the beginning
+def test_a_field_of_several_values_in_a_compressed_pcd(tmp_path: Path) -> None:
+    path = tmp_path / "signature.pcd"
+    values = np.concatenate([np.arange(6), 10.0 * np.arange(1, 7)]).astype("<f4").tobytes()  # x y z of two points, then h of each
+    stream = b"".join(bytes([len(part) - 1]) + part for part in (values[:32], values[32:]))  # LZF: up to 32 bytes as they are
+    head = pcd_text("", data="binary_compressed", kind="F F F F").replace("COUNT 1 1 1 1", "COUNT 1 1 1 3")
+    path.write_bytes(head.encode() + np.array([len(stream), 48], "<u4").tobytes() + stream)
+    fields = read_pcd_fields(path)
+    assert fields["y"].tolist() == [2.0, 3.0]
+    assert fields["label"].tolist() == [[10.0, 20.0, 30.0], [40.0, 50.0, 60.0]]
+
+
+def test_pcd_of_older_writers(tmp_path: Path) -> None:
+    path = tmp_path / "old.pcd"
+    path.write_text(
+        "# .PCD v.5\nFIELDS x y z _\nSIZE 4 4 4 1\nTYPE F F F U\nWIDTH 2\nHEIGHT 1\nDATA ascii\n 0  0 1 9 \n1 2\t3 9\n\n"
+    )
+    fields = read_pcd_fields(path)
+    assert list(fields) == ["x", "y", "z"]
+    assert fields["z"].tolist() == [1.0, 3.0]
 
 
 def test_all_fields_of_a_pcd_are_kept(tmp_path: Path) -> None:
@@ -105,8 +115,10 @@ def test_points_that_are_not_finite_are_dropped(tmp_path: Path) -> None:
     [
         ("nothing", "not a PCD file"),
         (pcd_text(points=3), r"(?s)broken or shortened.*2 rows.*3 rows of 4 numbers"),
-        (pcd_text(kind="F F F Q"), r"(?s)unknown field types.*F F F Q"),
-        (pcd_text(data="zipped"), r"(?s)unknown storage.*DATA zipped.*binary_compressed"),
+        (pcd_text(kind="F F F Q"), r"(?s)broken PCD header.*TYPE F F F Q.*'F', 'U' or 'I'"),
+        (pcd_text(kind="F F F"), r"(?s)unknown field types.*TYPE F F F,.*4 of F"),
+        (pcd_text(data="zipped"), r"(?s)broken PCD header.*DATA zipped.*'binary_compressed'"),
+        (pcd_text(points="many"), r"(?s)broken PCD header.*many"),
         (pcd_text("1 2 3 4", data="binary"), r"(?s)broken or shortened.*7 bytes of data.*32 bytes"),
         (pcd_text("12345678", data="binary_compressed"), r"(?s)broken or shortened.*unpack"),
         (pcd_text("0 0 1 7\n1 2 x 8\n"), r"(?s)broken or shortened.*numbers"),

@@ -1,0 +1,106 @@
+"""How far a Newton step may go: as long as the potential falls (Armijo), along elements that turn where the step is long."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from femsense.core.arrays import FloatArray
+from femsense.fem.assembly import Internal, internal
+from femsense.fem.body import BodyModel
+from femsense.fem.body_parts import Cable
+from femsense.fem.cables import segments
+from femsense.fem.chambers import chamber_volume
+from femsense.fem.newton_state import Loads, State, drive_compliance, drive_rows, kinematic_rows, travel_of
+from femsense.fem.rotated_step import rotated_step
+
+CURVED = 1e-3
+"""Steps longer than this share of the body are tried with elements that turn before they are tried straight."""
+
+
+def line_search(
+    body: BodyModel,
+    loads: Loads,
+    state: State,
+    held: npt.NDArray[np.intp],
+    here: Internal,
+    du: FloatArray,
+    dT: FloatArray,
+    gap: FloatArray,
+    force: FloatArray,
+) -> Internal | None:
+    """Go along a Newton step as far as the potential allows (Armijo); return the internal state there, None if nowhere.
+
+    Held cables enter the merit as an exact penalty ρ |gap| with ρ above their tensions.
+    """
+    free = body.free_map.dofs
+    x0, T0 = state.x, state.T
+    step = np.zeros(x0.shape)
+    step.reshape(-1)[free] = du
+    penalty = 2.0 * np.abs(T0[held] + dT) + 1e-3 / loads.lever[held]
+    lost = np.zeros(len(T0))  # a held cable with friction is no pure constraint: what its bends take away is a given force
+    rubs = np.array([(s != 1.0).any() for s in state.shares] + [False] * len(body.chambers), dtype=bool)
+    lost[held] = np.where(rubs[held], T0[held] + dT, 0.0)
+    base = _merit(body, loads, state, held, here, penalty, lost)
+    slope = -float(force @ du)
+    if len(held):
+        slope = _slope(body, loads, state, held, here, step, lost) - float(penalty @ np.abs(gap))
+    noise = 1e-12 * (abs(here.energy) + abs(float((loads.forces * x0).sum())) + float(np.abs(T0) @ loads.lever) * 1e-2 + 1e-12)
+    reach, longest = body.reach, float(np.abs(step).max(initial=1e-300))
+    length = min(1.0, 0.5 * reach / longest)
+    turned = rotated_step(body, x0, length * step) if longest > CURVED * reach else None
+    for trial in range(25):
+        state.x = x0 + length * step if turned is None else turned
+        state.T = T0.copy()
+        state.T[held] = T0[held] + length * dT
+        there = internal(body, state.x, tangent=trial == 0 and not state.serves)
+        if np.isfinite(there.energy):
+            merit = _merit(body, loads, state, held, there, penalty, lost)
+            if merit <= base + 1e-4 * length * slope + noise:
+                return there
+        length, turned = (0.5 * length if turned is None else length), None
+    state.x, state.T = x0, T0
+    return None
+
+
+def _merit(
+    body: BodyModel,
+    loads: Loads,
+    state: State,
+    held: npt.NDArray[np.intp],
+    here: Internal,
+    penalty: FloatArray,
+    lost: FloatArray,
+) -> float:
+    value = here.energy - float((loads.forces * (state.x - body.mesh.nodes)).sum())
+    for i, cable in enumerate(body.cables):
+        if not state.taut[i] and state.T[i] != 0.0:
+            value += state.T[i] * _weighted_length(cable, state.x, state.shares[i])
+        if lost[i] != 0.0:
+            value += lost[i] * _weighted_length(cable, state.x, state.shares[i] - 1.0)
+    for i, chamber in enumerate(body.chambers, len(body.cables)):
+        if not state.taut[i] and state.T[i] != 0.0:
+            value -= state.T[i] * (chamber_volume(chamber, state.x) - chamber_volume(chamber, body.mesh.nodes))
+    if len(held):
+        stretch = drive_compliance(body)[held]
+        gap = loads.target[held] - travel_of(body, state.x)[held] - stretch * state.T[held]
+        value += float(penalty @ np.abs(gap)) + 0.5 * float(stretch @ state.T[held] ** 2)
+    return value
+
+
+def _weighted_length(cable: Cable, x: FloatArray, share: FloatArray) -> float:
+    return float(share @ segments(cable, x)[1])
+
+
+def _slope(
+    body: BodyModel, loads: Loads, state: State, held: npt.NDArray[np.intp], here: Internal, step: FloatArray, lost: FloatArray
+) -> float:
+    """Return the derivative of the potential (of held cables only what friction takes away) along a step."""
+    gradient = here.forces - loads.forces
+    rows = drive_rows(body, state)
+    loose = state.T.copy()
+    loose[held] = 0.0
+    if not len(rows):
+        return float((gradient * step).sum())
+    pull = loose @ rows + lost @ (rows - kinematic_rows(body, state, rows))
+    return float((gradient * step).sum() - pull @ step.ravel())

@@ -1,0 +1,93 @@
+"""What drives a body, where the iteration towards its equilibrium stands, and the forces and travels of its drives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from femsense.core.arrays import BoolArray, FloatArray
+from femsense.fem.assembly import Internal
+from femsense.fem.body import BodyModel
+from femsense.fem.cables import cable_forces, shortening
+from femsense.fem.chambers import volume_changes, volume_gradient
+from femsense.fem.linalg.factorization import Factorization
+
+CONVERGED = "converged"
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Loads:
+    """What drives the body (cables, then chambers: a + c drives)."""
+
+    forces: FloatArray  # dead nodal forces [N], (n, 3)
+    effort: FloatArray  # tensions [N] and pressures [Pa] that are given, (a + c,)
+    target: FloatArray  # shortening [m] or growth [m³] of what is held, (a + c,)
+    controlled: BoolArray  # what is held, (a + c,)
+    lever: FloatArray  # effort × lever is a force, travel / lever a length: 1, or the surface of a chamber [m²], (a + c,)
+    bilateral: bool
+    before: tuple[FloatArray, ...]  # tensions along the cables until now [N]
+    tolerance: float  # of the residual [N]
+
+    def part_way(self, first: Loads, part: float) -> Loads:
+        """Return the loads on the straight way from the first ones (part 0) to these (part 1)."""
+        mixed = {
+            name: (1.0 - part) * getattr(first, name) + part * getattr(self, name) for name in ("forces", "effort", "target")
+        }
+        return replace(self, **mixed)
+
+
+@dataclass(eq=False, slots=True)
+class State:
+    """Where the iteration stands."""
+
+    x: FloatArray  # (n, 3)
+    T: FloatArray  # motor tensions [N], then pressures [Pa], (a + c,)
+    taut: BoolArray  # held cables that carry load, and held chambers, (a + c,)
+    shares: list[FloatArray]  # segment tension / motor tension
+    factor: Factorization | None = None
+    borrowed: bool = False  # the factor belongs to another state; it serves as long as the residual falls fast
+    iterations: int = 0
+    residual: float = np.inf
+    shifted: bool = False  # the stiffness was not positive definite where it was last factorised
+    shift: float = 0.0  # what made the stiffness positive definite there [N/m]
+    single: bool = False  # factors in single precision
+    rough: bool = False  # the state is only tried
+    indefinite_steps: int = 0
+    factored_at: float = 0.0  # residual where the stiffness was last factorised [N]
+    here: Internal | None = None  # what Newton saw last, at x
+    serves: bool = False  # the factor is likely to serve for the step after this one
+
+
+def unbalanced_force(loads: Loads, state: State, here: Internal, rows: FloatArray) -> FloatArray:
+    """Return the unbalanced force of every unknown [N], shape (3n,)."""
+    pull = state.T @ rows if len(rows) else 0.0
+    return np.asarray(loads.forces.ravel() - here.forces.ravel() + pull)
+
+
+def drive_rows(body: BodyModel, state: State) -> FloatArray:
+    """Return the nodal forces of unit motor tensions, with the loss along each cable, and of unit pressures, shape (a + c, 3n)."""
+    n = len(body.mesh.nodes)
+    rows = [cable_forces(c, state.x, s, n).ravel() for c, s in zip(body.cables, state.shares)]
+    rows += [volume_gradient(c, state.x).ravel() for c in body.chambers]
+    return np.array(rows) if rows else np.zeros((0, 3 * n))
+
+
+def kinematic_rows(body: BodyModel, state: State, rows: FloatArray) -> FloatArray:
+    """Return dδ/dx and dV/dx, shape (a + c, 3n): the rows without the loss along the cables."""
+    n = len(body.mesh.nodes)
+    result = rows.copy()
+    for i, cable in enumerate(body.cables):
+        if (state.shares[i] != 1.0).any():
+            result[i] = cable_forces(cable, state.x, np.ones(len(cable.path)), n).ravel()
+    return result
+
+
+def travel_of(body: BodyModel, positions: FloatArray) -> FloatArray:
+    """Return the shortening of each cable [m] and the growth of each chamber [m³] since rest, shape (a + c,)."""
+    return np.concatenate([shortening(body, positions), volume_changes(body, positions)])
+
+
+def drive_compliance(body: BodyModel) -> FloatArray:
+    """Return the compliance of each cable itself [m/N], and 0 for each chamber, shape (a + c,)."""
+    return np.array([1.0 / c.stretch_stiffness for c in body.cables] + [0.0] * len(body.chambers))

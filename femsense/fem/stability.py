@@ -1,0 +1,59 @@
+"""Whether a balanced state is stable."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from femsense.fem.assembly import internal, reduced_values
+from femsense.fem.body import BodyModel
+from femsense.fem.clamp import with_turning_plate
+from femsense.fem.linalg.factorization import factorize
+from femsense.fem.newton import FAR, bordered_step, factor_here, stiffness_blocks
+from femsense.fem.newton_state import Loads, State, drive_compliance, drive_rows, unbalanced_force
+
+FALL_ITERATIONS = 30
+"""Inverse iterations towards the softest motion of a state that may be unstable."""
+
+
+def holds_itself(body: BodyModel, state: State) -> bool:
+    """Return whether a balanced body whose clamp does not hold it stands all the same (cables may hold it)."""
+    blocks = stiffness_blocks(body, internal(body, state.x), state)
+    factor = with_turning_plate(body, state.x, factorize(body.free_map.pattern, reduced_values(body, blocks)))
+    return factor is not None and factor.negative == 0
+
+
+def is_doubtful(loads: Loads, state: State, walks: bool) -> bool:
+    """Return whether the stiffness at hand leaves open if a balanced state is stable.
+
+    It does where it was not positive definite, and where it was factorised far from the end. A walk from one state to the next is
+    spared the latter (`walks`): the next step, which starts with the stiffness of this state, sees it.
+    """
+    return state.shifted or (not walks and state.factored_at > FAR * loads.tolerance)
+
+
+def can_fall(body: BodyModel, loads: Loads, state: State) -> bool:
+    """Return whether a balanced state has a motion along which its energy falls: the softest one, by inverse iteration.
+
+    The curvature along it is a difference of forces, so that a false alarm needs more than a factor's perturbed pivot.
+    """
+    held = np.flatnonzero(state.taut)
+    rows, free = drive_rows(body, state), body.free_map.dofs
+    H, stretch, lever = rows[held][:, free], drive_compliance(body)[held], loads.lever[held]
+    factor = factor_here(body, internal(body, state.x), state, H, H, stretch, lever)
+    if factor is None or not state.shifted:
+        return False
+    motion = np.random.default_rng(0).standard_normal(len(free))
+    for _ in range(FALL_ITERATIONS):
+        motion, _ = bordered_step(factor, motion, np.zeros(len(held)), H, H, stretch, lever)
+        motion /= np.abs(motion).max()
+    step = np.zeros(state.x.size)
+    step[free] = 1e-6 * body.reach * motion
+    forces = []
+    for sign in (1.0, -1.0):
+        there = replace(state, x=state.x + sign * step.reshape(-1, 3))
+        forces.append(unbalanced_force(loads, there, internal(body, there.x, tangent=False), drive_rows(body, there)))
+    curvature = float((forces[1] - forces[0]) @ step)
+    scale = float(np.abs((forces[1] - forces[0]) * step).sum())
+    return curvature < -1e-6 * scale
