@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.optimize import lsq_linear
@@ -48,7 +48,7 @@ class FitResult:
     cost: tuple[float, ...]
     """Sum of squares after each iteration, the start first."""
     status: str
-    """"converged", "iterations", or "stopped early" (see `worth` of `gauss_newton`)."""
+    """"converged", "iterations", or "stopped early" (see `worth` of `GaussNewtonOptions`)."""
     own: bool = True
     """Whether the Jacobian is that at θ; else that of a step before."""
 
@@ -93,24 +93,42 @@ class Learning:
     """Makes what knows of second derivatives."""
 
 
+@dataclass(frozen=True, slots=True)
+class GaussNewtonOptions:
+    """When a step and a Jacobian serve, and when a fit ends."""
+
+    max_iterations: int = 30
+    """Gauss–Newton steps at most."""
+    tolerance: float = 1e-10
+    """Relative decrease at which it stops [1]."""
+    still: float = STILL
+    """Length of a step in whitened residual at which it stops, in units of the misfit where that is more than noise."""
+    serves: float = 0.0
+    """A Jacobian serves for another step where it missed the change of the residual by less than this share of it, or by less than what counts
+    as a gain."""
+    worth: float = np.inf
+    """A fit whose sum of squares stays above this is stopped early: where the predicted gain of a step is less than half of what is missing, or a
+    borrowed Jacobian says that nothing is left to gain."""
+    trusted: float = 0.0
+    """A Jacobian that missed less than this share of every step since it was made is believed, too, that nothing is left to gain."""
+    enough: float = 0.0
+    """What counts as a gain in the sum of squares, in units of the misfit where that is more than noise; 0: all that `tolerance` says."""
+    spare: float = 0.0
+    """A fit ends where the predicted gain of a whole step is less than this: what is asked next is worth more."""
+    learning: Learning = field(default_factory=Learning)
+    """How it learns from its own steps."""
+
+
 def gauss_newton(
     evaluate: Evaluate,
     theta: FloatArray,
     *,
     low: FloatArray | None = None,
     high: FloatArray | None = None,
-    max_iterations: int = 30,
-    tolerance: float = 1e-10,
-    still: float = STILL,
     known: tuple[FloatArray, FloatArray | None] | None = None,
     borrowed: FloatArray | None = None,
-    serves: float = 0.0,
-    worth: float = np.inf,
-    trusted: float = 0.0,
-    enough: float = 0.0,
-    spare: float = 0.0,
     nonsmooth: Callable[[FloatArray], Nonsmoothness | None] | None = None,
-    learning: Learning | None = None,
+    options: GaussNewtonOptions | None = None,
 ) -> FitResult:
     """Minimise ‖r(θ)‖² within bounds (Levenberg's damping where a plain step does not pay; how the residual bends, as far as its Jacobians have
     shown it, counts while that foretells steps no worse than straight lines do: `core.local_model`).
@@ -125,20 +143,10 @@ def gauss_newton(
         evaluate: residual and Jacobian; priors are rows of them.
         theta: the start, shape (p,).
         low, high: bounds, shape (p,).
-        max_iterations: Gauss–Newton steps.
-        tolerance: relative decrease at which it stops.
-        still: length of a step in whitened residual at which it stops, in units of the misfit where that is more than noise.
         known: residual and Jacobian at the start, where they are known.
         borrowed: a Jacobian from near the start to begin with.
-        serves: a Jacobian serves for another step where it missed the change of the residual by less than this share of it, or by less than what
-            counts as a gain.
-        worth: a fit whose sum of squares stays above this is stopped early: where the predicted gain of a step is less than half of what is missing, or a
-            borrowed Jacobian says that nothing is left to gain.
-        trusted: a Jacobian that missed less than this share of every step since it was made is believed, too, that nothing is left to gain.
-        enough: what counts as a gain in the sum of squares, in units of the misfit where that is more than noise; 0: all that `tolerance` says.
-        spare: a fit ends where a whole step promises less than this, by its own Jacobian or one that foretold a step: what is asked next is worth more.
         nonsmooth: θ → where the residual bends near by, for the Jacobian that was computed last.
-        learning: how it learns from its own steps; None: as the defaults of `Learning` say.
+        options: when a step serves, and when to end.
     """
     p = len(theta)
     low = np.full(p, -np.inf) if low is None else low
@@ -148,11 +156,12 @@ def gauss_newton(
     theta = clipped
     residual, slope = _first(evaluate, theta, known, borrowed)
     costs = [float(residual @ residual)]
-    learning = learning or Learning()
+    rule = options or GaussNewtonOptions()
+    learning = rule.learning
     damping, status, steps, pace = 0.0, "iterations", 0, learning.pace()
     idle = 0  # idle steps in turn
     curvature = learning.curvature()
-    while steps < max_iterations or not slope.own:
+    while steps < rule.max_iterations or not slope.own:
         bends = None if nonsmooth is None else nonsmooth(theta)
         if slope.own:
             curvature.learn(theta, residual, slope.J, bends)
@@ -160,17 +169,17 @@ def gauss_newton(
         step = near.step(damping)
         change, predicted_sum = near.change(step), near.predicted_gain(step)
         whole = predicted_sum if damping == 0.0 else near.predicted_gain(near.step(0.0))
-        error = max(1.0, costs[-1] / max(len(residual), 1)) ** 0.5  # what a standard error is worth where the model misfits
-        gain = enough * error**2
-        small = predicted_sum <= tolerance * costs[-1] or np.linalg.norm(change) <= still * error
-        at_end = not slope.own and (small or steps >= max_iterations)
-        if costs[-1] > worth and (at_end or costs[-1] - 2.0 * whole > worth):
+        error = max(1.0, costs[-1] / max(len(residual), 1)) ** 0.5  # what a standard error is rule.worth where the model misfits
+        gain = rule.enough * error**2
+        small = predicted_sum <= rule.tolerance * costs[-1] or np.linalg.norm(change) <= rule.still * error
+        at_end = not slope.own and (small or steps >= rule.max_iterations)
+        if costs[-1] > rule.worth and (at_end or costs[-1] - 2.0 * whole > rule.worth):
             status = STOPPED_EARLY
             break
-        expected_residual = not slope.own and error == 1.0 and pace.next <= still
+        expected_residual = not slope.own and error == 1.0 and pace.next <= rule.still
         if (
             expected_residual
-            or (whole < spare and slope.sure is not None)
+            or (whole < rule.spare and slope.sure is not None)
             or idle > 1
             or (small and (slope.own or slope.sure or idle))
         ):
@@ -183,7 +192,7 @@ def gauss_newton(
         tried = _tried(evaluate, theta + step)
         cost = np.inf if tried is None else float(tried @ tried)
         idle = idle + 1 if whole < NEARLY * gain and not costs[-1] - cost >= gain else 0
-        last = slope.own and whole < LITTLE * enough
+        last = slope.own and whole < LITTLE * rule.enough
         if tried is None or not cost <= costs[-1] - 1e-4 * predicted_sum:
             if not slope.own and idle < 2:
                 residual, slope = _both(evaluate, theta)
@@ -203,9 +212,11 @@ def gauss_newton(
         missed = tried - residual - change
         off, way = float(np.linalg.norm(missed)), float(np.linalg.norm(change))
         theta, residual = theta + step, tried
-        slope = _Slope(learning.update(slope.J, step, near.scale, missed), False, off < trusted * way and slope.sure is not False)
-        ends = idle or last or (error == 1.0 and pace.next <= still)
-        if off > max(serves * way, gain**0.5) and not ends:
+        slope = _Slope(
+            learning.update(slope.J, step, near.scale, missed), False, off < rule.trusted * way and slope.sure is not False
+        )
+        ends = idle or last or (error == 1.0 and pace.next <= rule.still)
+        if off > max(rule.serves * way, gain**0.5) and not ends:
             residual, slope = _both(evaluate, theta)
         costs.append(float(residual @ residual))
         if last:

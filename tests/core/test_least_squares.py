@@ -9,7 +9,7 @@ from scipy.optimize import least_squares
 
 from femsense.calib.rigid import fit_rigid, fit_rigid_robust
 from femsense.core.errors import DataError, InputError
-from femsense.core.least_squares import NEARLY, Learning, Pace, broyden_update, covariance_of, gauss_newton
+from femsense.core.least_squares import NEARLY, GaussNewtonOptions, Learning, Pace, broyden_update, covariance_of, gauss_newton
 from femsense.core.pose import invert_pose, make_pose, move_pose, transform_points
 
 
@@ -195,7 +195,11 @@ def test_a_jacobian_that_serves_again_ends_at_the_same_place_with_fewer_of_them(
     results, jacobians = [], []
     for serves in (0.0, 0.3):
         evaluate, asked = counted(1.0)
-        results.append(gauss_newton(evaluate, np.array([0.6, 0.2, 0.1]), serves=serves, still=1e-12, tolerance=1e-14))
+        results.append(
+            gauss_newton(
+                evaluate, np.array([0.6, 0.2, 0.1]), options=GaussNewtonOptions(serves=serves, still=1e-12, tolerance=1e-14)
+            )
+        )
         jacobians.append(sum(asked))
     np.testing.assert_allclose(results[1].theta, results[0].theta, atol=1e-7)
     assert results[1].status == "converged" and jacobians[1] < jacobians[0]
@@ -211,7 +215,9 @@ def test_a_jacobian_that_serves_again_learns_from_the_steps_it_predicted() -> No
     for learning in (Learning(), Learning(update=lambda J, *_: J)):
         evaluate, asked = counted(1.0)
         start = np.array([0.6, 0.2, 0.1])
-        results.append(gauss_newton(evaluate, start, serves=0.5, still=1e-9, tolerance=1e-14, learning=learning))
+        results.append(
+            gauss_newton(evaluate, start, options=GaussNewtonOptions(serves=0.5, still=1e-09, tolerance=1e-14, learning=learning))
+        )
         costs.append((len(asked), sum(asked)))
     np.testing.assert_allclose(results[0].theta, results[1].theta, atol=1e-6)
     assert costs[0][0] < costs[1][0] and costs[0][1] <= costs[1][1]
@@ -228,7 +234,11 @@ def test_steps_that_shrink_foretell_the_end() -> None:
     results, jacobians = [], []
     for learning in (Learning(), Learning(pace=NoPace)):
         evaluate, asked = counted(1.0)
-        results.append(gauss_newton(evaluate, np.array([0.9, 1.0, 0.4]), serves=0.3, still=1e-2, learning=learning))
+        results.append(
+            gauss_newton(
+                evaluate, np.array([0.9, 1.0, 0.4]), options=GaussNewtonOptions(serves=0.3, still=0.01, learning=learning)
+            )
+        )
         jacobians.append(sum(asked))
     np.testing.assert_allclose(results[0].theta, results[1].theta, atol=1e-5)
     assert jacobians[0] == jacobians[1] - 1 and results[0].status == "converged"
@@ -239,7 +249,9 @@ def test_where_the_end_is_foretold_a_step_that_was_missed_asks_for_no_jacobian()
     results, jacobians = [], []
     for learning in (Learning(), Learning(pace=NoPace)):
         evaluate, asked = counted(1.0)
-        fit = gauss_newton(evaluate, np.array([0.9, 1.0, 0.4]), still=1e-2, learning=learning)  # every step is missed
+        fit = gauss_newton(
+            evaluate, np.array([0.9, 1.0, 0.4]), options=GaussNewtonOptions(still=0.01, learning=learning)
+        )  # every step is missed
         results.append(fit)
         jacobians.append(sum(asked))
     np.testing.assert_allclose(results[0].theta, results[1].theta, atol=1e-4)
@@ -275,7 +287,9 @@ def test_a_jacobian_that_missed_next_to_nothing_of_a_step_is_believed_at_the_end
         evaluate, asked = counted(0.05)  # nearly linear
         J = evaluate(start, True)[1] * (1.0 + off) if borrows else None
         asked.clear()
-        results.append(gauss_newton(evaluate, start, borrowed=J, serves=0.5, trusted=trusted, still=1e-3))
+        results.append(
+            gauss_newton(evaluate, start, borrowed=J, options=GaussNewtonOptions(serves=0.5, trusted=trusted, still=0.001))
+        )
         jacobians.append(sum(asked))
     assert jacobians[1] == jacobians[0] - 1 and not results[1].own and results[0].own
     if borrows:
@@ -301,7 +315,7 @@ def test_idle_steps_end_a_fit() -> None:
             seen.append(derivative)
             return rough_valley(theta, derivative)
 
-        fit = gauss_newton(evaluate, start, borrowed=borrowed, enough=enough, still=1e-6)
+        fit = gauss_newton(evaluate, start, borrowed=borrowed, options=GaussNewtonOptions(enough=enough, still=1e-06))
         costs.append(fit.cost[-1])
         asked.append(len(seen))
         assert fit.status == "converged"
@@ -315,7 +329,7 @@ def test_what_is_little_is_not_told_by_the_misfit() -> None:
         r, slope = (30.0 - 18.0 * x, -18.0) if x < 1.0 else (24.0 - 12.0 * x, -12.0)  # the first step falls short
         return np.array([40.0, r]), np.array([[0.0], [slope]]) if derivative else None
 
-    fit = gauss_newton(evaluate, np.zeros(1), enough=0.5)
+    fit = gauss_newton(evaluate, np.zeros(1), options=GaussNewtonOptions(enough=0.5))
     assert fit.cost[-1] == pytest.approx(1600.0)
 
 
@@ -332,7 +346,7 @@ def test_a_step_that_promises_little_by_its_own_jacobian_is_the_last(pays: bool)
             r, slope = np.array([theta[0] - 0.9, bend * np.sin(u) ** 2, 0.3]), 4.0 * bend * np.sin(u) * np.cos(u)
             return r, np.array([[1.0], [slope], [0.0]]) if derivative else None
 
-        ends.append(gauss_newton(evaluate, np.zeros(1), enough=enough, still=1e-6))
+        ends.append(gauss_newton(evaluate, np.zeros(1), options=GaussNewtonOptions(enough=enough, still=1e-06)))
         asked.append(seen)
     assert asked[1] == [True, False] and len(asked[0]) > 4 and ends[1].status == "converged"
     assert (ends[1].theta[0] != 0.0) == (ends[1].cost[-1] < ends[1].cost[0]) == pays
@@ -343,7 +357,7 @@ def test_a_step_that_struggles_far_from_the_end_is_not_idle() -> None:
         x, y = theta
         return np.array([10.0 * (y - x**2), 1.0 - x]), np.array([[-20.0 * x, 10.0], [-1.0, 0.0]]) if derivative else None
 
-    fit = gauss_newton(evaluate, np.array([-1.2, 1.0]), enough=0.3, max_iterations=200)
+    fit = gauss_newton(evaluate, np.array([-1.2, 1.0]), options=GaussNewtonOptions(enough=0.3, max_iterations=200))
     assert fit.cost[-1] < NEARLY * 0.3  # short steps along the valley bring little, a whole one promised more
 
 
@@ -358,7 +372,7 @@ def test_a_fit_that_is_not_worth_it_is_given_up_before_its_own_jacobian() -> Non
     start = np.zeros(2)
     for worth, status in ((8.0, "stopped early"), (10.0, "converged")):
         asked.clear()
-        fit = gauss_newton(evaluate, start, borrowed=J, serves=0.25, worth=worth)
+        fit = gauss_newton(evaluate, start, borrowed=J, options=GaussNewtonOptions(serves=0.25, worth=worth))
         assert fit.status == status and any(asked) == (status == "converged")
         assert fit.cost[-1] == pytest.approx(9.0, abs=0.01)
 
@@ -372,23 +386,25 @@ def test_a_fit_whose_steps_promise_less_than_half_of_what_is_missing_is_given_up
         return J @ theta + np.array([1.0, 1.0, 3.0]), J if derivative else None
 
     start = np.zeros(2)  # 11, of which a step takes 2
-    fit = gauss_newton(evaluate, start, worth=6.9)
+    fit = gauss_newton(evaluate, start, options=GaussNewtonOptions(worth=6.9))
     assert fit.status == "stopped early" and asked == [True] and fit.cost == (11.0,)
-    assert gauss_newton(evaluate, start, worth=7.1).status == "stopped early"  # tried, and no better than that
-    assert gauss_newton(evaluate, start, worth=9.1).cost[-1] == pytest.approx(9.0)
+    assert (
+        gauss_newton(evaluate, start, options=GaussNewtonOptions(worth=7.1)).status == "stopped early"
+    )  # tried, and no better than that
+    assert gauss_newton(evaluate, start, options=GaussNewtonOptions(worth=9.1)).cost[-1] == pytest.approx(9.0)
 
 
 def test_a_fit_with_something_better_to_do_ends_where_steps_promise_less_than_that() -> None:
     start, ends, asked = np.array([0.6, 0.2, 0.1]), [], []
     for spare in (0.0, 1e-3, 1e3):
         evaluate, seen = counted(1.0)
-        ends.append(gauss_newton(evaluate, start, spare=spare))
+        ends.append(gauss_newton(evaluate, start, options=GaussNewtonOptions(spare=spare)))
         asked.append(len(seen))
     least = ends[0].cost[-1]
     assert asked[2] == 1 < asked[1] < asked[0] and all(fit.status == "converged" for fit in ends)
     assert least < ends[1].cost[-1] <= least + 1e-3
     evaluate, seen = counted(1.0)
     fit = gauss_newton(
-        evaluate, start, borrowed=np.zeros((30, 3)), spare=1e-3
+        evaluate, start, borrowed=np.zeros((30, 3)), options=GaussNewtonOptions(spare=0.001)
     )  # what was borrowed says that nothing can be gained
     assert seen[:2] == [False, True] and fit.cost[-1] <= least + 1e-3

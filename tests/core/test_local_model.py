@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from femsense.core.least_squares import Learning, gauss_newton
+from femsense.core.least_squares import GaussNewtonOptions, Learning, gauss_newton
 from femsense.core.local_model import LEAST, Curvature, LocalModel, Nonsmoothness, with_curvature
 
 
@@ -53,7 +53,11 @@ def given(S: np.ndarray | None, noted: list[bool] | None = None) -> Learning:
 def test_where_much_is_left_a_bent_way_takes_few_steps() -> None:
     steps = []
     for learning in (Learning(), given(None)):
-        fit = gauss_newton(circle, np.array([-0.5, 0.0]), max_iterations=100, still=1e-6, tolerance=1e-14, learning=learning)
+        fit = gauss_newton(
+            circle,
+            np.array([-0.5, 0.0]),
+            options=GaussNewtonOptions(max_iterations=100, still=1e-06, tolerance=1e-14, learning=learning),
+        )
         assert fit.status == "converged" and fit.theta[0] == pytest.approx(np.arctan2(0.2, 0.1), abs=1e-4)
         steps.append(len(fit.cost))
     assert steps[0] < 0.2 * steps[1]
@@ -75,7 +79,11 @@ def test_it_is_exact_along_the_last_step_and_symmetric() -> None:
 def test_it_is_believed_until_straight_lines_foretell_a_step_better() -> None:
     noted: list[bool] = []
     learning = given(np.array([[1.0]]), noted)
-    gauss_newton(lambda x, d: (2.0 * (x - 1.0), np.array([[2.0]]) if d else None), np.zeros(1), serves=1.0, learning=learning)
+    gauss_newton(
+        lambda x, d: (2.0 * (x - 1.0), np.array([[2.0]]) if d else None),
+        np.zeros(1),
+        options=GaussNewtonOptions(serves=1.0, learning=learning),
+    )
     assert noted[0] is False  # the line is straight
     x = np.array([0.4, -0.3])
     near = LocalModel(*circle(x, True), None, np.full(2, -9.0), np.full(2, 9.0), np.diag([-50.0, 0.0]))
@@ -92,7 +100,7 @@ def test_where_a_bent_step_fails_a_straight_one_is_tried() -> None:
         tried.append(float(x[0]))
         return 2.0 * (x - 1.0), np.array([[2.0]]) if derivative else None
 
-    gauss_newton(evaluate, np.zeros(1), learning=given(np.array([[-0.8 * 4.0]])))  # wrong
+    gauss_newton(evaluate, np.zeros(1), options=GaussNewtonOptions(learning=given(np.array([[-0.8 * 4.0]]))))  # wrong
     assert tried[1:3] == pytest.approx([5.0, 1.0])
 
 

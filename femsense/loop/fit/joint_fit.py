@@ -9,7 +9,7 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import DataError
-from femsense.core.least_squares import FitResult, gauss_newton
+from femsense.core.least_squares import FitResult, GaussNewtonOptions, gauss_newton
 from femsense.core.local_model import Nonsmoothness
 from femsense.fem.body import BodyModel
 from femsense.fem.equilibrium import Equilibrium
@@ -358,17 +358,19 @@ def fit_jointly(
         theta,
         low=low,
         high=high,
-        max_iterations=max_iterations,
-        tolerance=1e-6,
-        still=0.2,
         known=begin,
         borrowed=None if near is None else problem.rows_of(near, theta, True)[1],
-        serves=SERVES,
-        worth=worth,
-        trusted=TRUSTED,
-        enough=GAIN,
-        spare=spare,
         nonsmooth=problem.nonsmooth,
+        options=GaussNewtonOptions(
+            max_iterations=max_iterations,
+            tolerance=1e-06,
+            still=0.2,
+            serves=SERVES,
+            worth=worth,
+            trusted=TRUSTED,
+            enough=GAIN,
+            spare=spare,
+        ),
     )
     if problem.last is None or not np.array_equal(problem.last.theta, fit.theta):
         if not fit.own:
