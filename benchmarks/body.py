@@ -33,7 +33,7 @@ from femsense.fem.assembly import internal, reduced_values
 from femsense.fem.body import BodyModel, make_body, tie_cable
 from femsense.fem.cables import pull_rows
 from femsense.fem.compliance import compliance, direction_rows, tangent_at
-from femsense.fem.equilibrium import solve_equilibrium
+from femsense.fem.equilibrium import SolveOptions, solve_equilibrium
 from femsense.fem.linalg.cholesky import cholesky
 from femsense.fem.linalg.factorization import factorize, pardiso_library
 from femsense.fem.linalg.ordering import _nested_dissection, elimination_work, minimum_degree
@@ -223,7 +223,7 @@ def ride(body: BodyModel, inputs: list[dict[str, float]], features: np.ndarray) 
 def missed(body: BodyModel, features: np.ndarray, seen: Seen) -> list[float]:
     """Return error and reported error as shares of the motion, that of W, the motion [m], and true over reported error."""
     tension, frame, normals, W = seen
-    full = solve_equilibrium(body, tension=tension, relative_tolerance=1e-10)
+    full = solve_equilibrium(body, tension=tension, options=SolveOptions(relative_tolerance=1e-10))
     exact = compliance(body, full, points=features, directions=normals)
     off = float(np.abs(full.positions - frame.positions).max())
     wrong = float(np.linalg.norm(W - exact) / np.linalg.norm(exact))
@@ -249,7 +249,11 @@ def terms(data: Path) -> None:
         inputs = [along_the_way(k, len(body.cables)) + noise[k] for k in range(40)]
         for T in inputs:
             given = dict(zip(body.cable_names, T))
-            states.append(solve_equilibrium(body, tension=given, start=states[-1] if states else None, relative_tolerance=1e-10))
+            states.append(
+                solve_equilibrium(
+                    body, tension=given, start=states[-1] if states else None, options=SolveOptions(relative_tolerance=1e-10)
+                )
+            )
         for k in range(6, 36, 3):
             start.learn(states[k].positions)
             start.move(states[k].positions, inputs[k])

@@ -22,7 +22,7 @@ from femsense.core.errors import DataError
 from femsense.core.least_squares import FitResult, covariance_of
 from femsense.core.parallel import one_blas_thread
 from femsense.core.pose import move_pose
-from femsense.fem.equilibrium import Equilibrium
+from femsense.fem.equilibrium import Equilibrium, SolveOptions
 from femsense.model.drive import DrivenRobot, drive_of
 from femsense.model.observation import Hypothesis, Scene, SceneJet, evaluate_scene, in_robot_frame, make_scene, rest_residual
 from femsense.model.recording import Recording, check_against
@@ -139,7 +139,7 @@ def _pose_from_frame(robot: Robot, scene: Scene, view: int, name: str) -> FloatA
         rows = (scene.frame == k) & (scene.view == view)
         most = max(most, int(rows.sum()))
         if rows.sum() >= 3:
-            state = solve_frame(driven, int(k), single=True)
+            state = solve_frame(driven, int(k), options=SolveOptions(single=True))
             shape = state.positions if state.converged else robot.body.mesh.nodes
             return fit_rigid(robot.markers.positions(shape)[scene.marker[rows]], scene.points[rows])
     raise DataError(

@@ -30,7 +30,7 @@ from femsense.core.errors import InputError
 from femsense.fem.body import BodyModel
 from femsense.fem.cables import pull_rows
 from femsense.fem.compliance import drive_rows, tangent_at
-from femsense.fem.equilibrium import Equilibrium, solve_equilibrium
+from femsense.fem.equilibrium import Equilibrium, SolveOptions, solve_equilibrium
 from femsense.model.robot import Robot
 from femsense.qp.problem import Problem
 from femsense.qp.solve import solve
@@ -229,10 +229,8 @@ def _solved(
         pressure=dict(zip(body.chamber_names, effort[a:].tolist())),
         nodal_forces=goal.nodal_forces,
         start=start,
-        before=before,
         bilateral=True,
-        relative_tolerance=FINE if fine else COARSE,
-        rough=tried,
+        options=SolveOptions(before=before, relative_tolerance=FINE if fine else COARSE, rough=tried),
     )
 
 

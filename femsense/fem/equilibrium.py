@@ -83,6 +83,27 @@ class Equilibrium:
         return ADVICE[self.status]
 
 
+@dataclass(frozen=True, eq=False, slots=True)
+class SolveOptions:
+    """How an equilibrium is solved, and what friction remembers."""
+
+    before: tuple[FloatArray, ...] | None = None
+    """Tensions along the cables until now [N], one array (s,) a cable; None: those of the start, without one none."""
+    along: tuple[FloatArray, ...] | None = None
+    """Tension of each segment of each cable for a tension of 1 at its motor [1], held still: for laws of friction of one's own. Cables with
+    friction of theirs move on from it. None: 1 without friction, and with it as the start left it."""
+    reuse_factor: bool = False
+    """Begin with the factor of the start, for changes so small that its stiffness still serves."""
+    max_iterations: int = 60
+    """Newton steps at each load level."""
+    relative_tolerance: float = 1e-9
+    """Of the unbalanced force against the sum of all loads [1]."""
+    rough: bool = False
+    """The state is only tried: factors in single precision, and no way to the loads bit by bit where Newton fails from the start."""
+    single: bool = False
+    """Factors in single precision wherever these are positive definite; the residual and its tolerance are as ever."""
+
+
 def solve_equilibrium(
     body: BodyModel,
     *,
@@ -92,14 +113,8 @@ def solve_equilibrium(
     volume: Mapping[str, float] | None = None,
     nodal_forces: npt.ArrayLike | None = None,
     start: Equilibrium | None = None,
-    before: tuple[FloatArray, ...] | None = None,
     bilateral: bool = False,
-    reuse_factor: bool = False,
-    along: tuple[FloatArray, ...] | None = None,
-    max_iterations: int = 60,
-    relative_tolerance: float = 1e-9,
-    rough: bool = False,
-    single: bool = False,
+    options: SolveOptions | None = None,
 ) -> Equilibrium:
     """Find the static equilibrium of a body.
 
@@ -111,15 +126,8 @@ def solve_equilibrium(
         volume: name → growth of a chamber since rest [m³] that it is held at, as a pump of liquid does; it may suck.
         nodal_forces: further nodal forces [N], shape (n, 3).
         start: an equilibrium to start from (its positions, tensions and factor).
-        before: tensions along the cables until now [N], for friction; by default those of `start`, else none.
         bilateral: held cables may push.
-        reuse_factor: begin with the factor of `start` (for changes so small that its stiffness still serves).
-        along: tension of each segment of each cable for a tension of 1 at its motor [1], held still: for laws of friction of one's
-            own; cables with friction of theirs move on from it. By default 1 without friction, and with it as `start` left it.
-        max_iterations: Newton steps at each load level.
-        relative_tolerance: of the unbalanced force against the sum of all loads.
-        rough: the state is only tried: factors in single precision, and no way to the loads bit by bit where Newton fails from `start`.
-        single: factors in single precision wherever these are positive definite; the residual and its tolerance are as ever.
+        options: how it is solved, and what friction remembers.
 
     Returns:
         the state; `status` says whether it is an equilibrium, `advice` what to do if not.
@@ -128,26 +136,27 @@ def solve_equilibrium(
         InputError: unknown cable or chamber, one named twice, wrong shapes or values.
     """
     given = {"tension": tension, "shortening": shortening, "pressure": pressure, "volume": volume}
-    if not (max_iterations >= 1 and 0 < relative_tolerance < 1):
-        found = f"{max_iterations}, {relative_tolerance:g}"
+    how = options or SolveOptions()
+    if not (how.max_iterations >= 1 and 0 < how.relative_tolerance < 1):
+        found = f"{how.max_iterations}, {how.relative_tolerance:g}"
         raise InputError("out of range", where="max_iterations, relative_tolerance", found=found, expected="≥ 1, between 0 and 1")
     if start is not None:
         _check_start(body, start)
-    loads = _collect_loads(body, given, nodal_forces, start, before, bilateral, relative_tolerance)
-    state = _initial_state(body, loads, start, reuse_factor, along)
-    rough = rough and start is not None
-    state.single, state.rough = rough or single, rough
+    loads = _collect_loads(body, given, nodal_forces, start, how.before, bilateral, how.relative_tolerance)
+    state = _initial_state(body, loads, start, how.reuse_factor, how.along)
+    rough = how.rough and start is not None
+    state.single, state.rough = rough or how.single, rough
     shares = [s.copy() for s in state.shares]
-    status, reached = settle(body, loads, state, min(max_iterations, TRIES) if rough else max_iterations), 1.0
+    status, reached = settle(body, loads, state, min(how.max_iterations, TRIES) if rough else how.max_iterations), 1.0
     if not rough and status not in (CONVERGED, "singular") and start is not None and start.converged and body.is_held():
         first = _loads_of(body, start, loads)
         state, status, reached = _step_loads(
-            body, first, loads, _initial_state(body, first, start, False, along), state, max_iterations
+            body, first, loads, _initial_state(body, first, start, False, how.along), state, how.max_iterations
         )
     if not rough and status not in (CONVERGED, "singular") and body.is_held():
         nothing = replace(loads, forces=0.0 * loads.forces, effort=0.0 * loads.effort, target=0.0 * loads.target)
         rest = State(body.mesh.nodes.copy(), nothing.effort.copy(), _first_taut(body, loads), shares)
-        state, status, reached = _step_loads(body, nothing, loads, rest, state, max_iterations)
+        state, status, reached = _step_loads(body, nothing, loads, rest, state, how.max_iterations)
     if status != CONVERGED or any(c.friction > 0 for c in body.cables):  # friction has moved since Newton looked
         state.residual = _residual(body, loads, state)
     if status != CONVERGED:

@@ -18,7 +18,7 @@ from femsense.core.parallel import each
 from femsense.fem.body import BodyModel
 from femsense.fem.cables import bend_angles, rub
 from femsense.fem.clamp import rigid_give
-from femsense.fem.equilibrium import Equilibrium
+from femsense.fem.equilibrium import Equilibrium, SolveOptions
 from femsense.fem.linalg.refinement import Refined
 from femsense.fem.mesh import Embedding
 from femsense.model.drive import DrivenRobot, _key, has_history
@@ -127,11 +127,9 @@ def _base_states(
                 driven,
                 k,
                 start=start,
-                before=before,
-                reuse_factor=True,
-                relative_tolerance=TRIED if tried else 1e-9,
-                rough=tried,
-                single=True,
+                options=SolveOptions(
+                    before=before, reuse_factor=True, relative_tolerance=TRIED if tried else 1e-09, rough=tried, single=True
+                ),
             ),
             k,
         )
@@ -147,7 +145,9 @@ def _base_states(
         for k in part:
             last = states[-1] if states else None
             before = last.segment_tensions if past and last is not None else None
-            states.append(keep(k, _require(solve_frame(driven, k, start=last, before=before, single=True), k)))
+            states.append(
+                keep(k, _require(solve_frame(driven, k, start=last, options=SolveOptions(before=before, single=True)), k))
+            )
         return states
 
     for states in each(along, [frames] if past else _parts(frames)):

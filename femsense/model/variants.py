@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
@@ -18,7 +18,7 @@ from femsense.fem.cables import bend_angles, cable_forces, rub, shortening
 from femsense.fem.chambers import volume_gradient
 from femsense.fem.clamp import first_give
 from femsense.fem.compliance import Tangent, tangent_at
-from femsense.fem.equilibrium import Equilibrium, solve_equilibrium
+from femsense.fem.equilibrium import Equilibrium, SolveOptions, solve_equilibrium
 from femsense.fem.linalg.factorization import Factorization, available_memory, factorize
 from femsense.fem.linalg.refinement import refined
 from femsense.fem.mesh import Embedding
@@ -56,12 +56,8 @@ def solve_frame(
     frame: int,
     *,
     start: Equilibrium | None = None,
-    before: tuple[FloatArray, ...] | None = None,
-    reuse_factor: bool = False,
     nodal_forces: FloatArray | None = None,
-    relative_tolerance: float = 1e-9,
-    rough: bool = False,
-    single: bool = False,
+    options: SolveOptions | None = None,
 ) -> Equilibrium:
     """Return the equilibrium of one frame.
 
@@ -69,12 +65,8 @@ def solve_frame(
         driven: robot and drive.
         frame: index of the frame.
         start: a state to start from.
-        before: tensions along the cables until now (friction); by default none.
-        reuse_factor: whether the start's factor serves.
         nodal_forces: forces beside the known loads [N], shape (n, 3).
-        relative_tolerance: of the unbalanced force against the sum of all loads.
-        rough: the state is only tried (see `solve_equilibrium`).
-        single: factors in single precision, which the true residual makes up for.
+        options: as of `solve_equilibrium`; friction remembers nothing where they do not say.
     """
     drive, body = driven.drive, driven.robot.body
     if drive.gravity is not None:
@@ -83,8 +75,9 @@ def solve_frame(
     if nodal_forces is not None:
         loads = nodal_forces if loads is None else loads + nodal_forces
     values = {name: float(v) for name, v in zip(body.cable_names, drive.inputs[frame])}
-    if before is None:
-        before = tuple(np.zeros(len(c.path)) for c in body.cables)
+    how = options or SolveOptions()
+    if how.before is None:
+        how = replace(how, before=tuple(np.zeros(len(c.path)) for c in body.cables))
     tension, held = (values, None) if drive.control == "tension" else (None, values)
     return solve_equilibrium(
         body,
@@ -93,11 +86,7 @@ def solve_frame(
         pressure=dict(zip(body.chamber_names, drive.pressures[frame].tolist())),
         nodal_forces=loads,
         start=start,
-        before=before,
-        reuse_factor=reuse_factor,
-        relative_tolerance=relative_tolerance,
-        rough=rough,
-        single=single,
+        options=how,
     )
 
 
@@ -267,7 +256,7 @@ class _Variants:
         variant = self.variants[i]
         memory: Tensions | None = None
         for k in self.bases if has_history(variant.robot) else self.others:
-            state = _require(solve_frame(variant, k, start=self.bases[k], before=memory), k)
+            state = _require(solve_frame(variant, k, start=self.bases[k], options=SolveOptions(before=memory)), k)
             memory = state.segment_tensions if has_history(variant.robot) else None
             if k in self.others:
                 self.others[k][i] = self.ties[i].positions(state.positions)

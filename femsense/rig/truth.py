@@ -12,7 +12,7 @@ from femsense.core.arrays import FloatArray, IntArray, freeze
 from femsense.core.errors import DataError, InputError
 from femsense.fem.body import BodyModel
 from femsense.fem.cables import bend_angles
-from femsense.fem.equilibrium import Equilibrium, solve_equilibrium
+from femsense.fem.equilibrium import Equilibrium, SolveOptions, solve_equilibrium
 from femsense.fem.mesh import TetMesh, embed_points, refined, surface_triangles, to_linear, to_quadratic, triangle_normals
 from femsense.model.effects import apply_effects
 from femsense.model.remeshing import body_on_mesh
@@ -308,8 +308,7 @@ class _TruePath:
             pressure=pressure,
             nodal_forces=forces,
             start=start,
-            along=shares,
-            reuse_factor=True,
+            options=SolveOptions(along=shares, reuse_factor=True),
         )
         if not state.converged:
             raise DataError(f"the truth has no equilibrium in frame {frame}: {state.status}: {state.advice}")

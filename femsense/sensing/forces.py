@@ -11,7 +11,7 @@ from femsense.core.arrays import FloatArray, freeze
 from femsense.core.errors import DataError
 from femsense.fem.assembly import internal
 from femsense.fem.compliance import Tangent, tangent_at
-from femsense.fem.equilibrium import Equilibrium
+from femsense.fem.equilibrium import Equilibrium, SolveOptions
 from femsense.fem.mesh import vertex_normals
 from femsense.model.contact_patch import ContactPatch, patch_at
 from femsense.model.variants import solve_frame
@@ -258,10 +258,8 @@ def _solve(
         sensor.driven,
         k,
         start=start,
-        before=before,
         nodal_forces=nodal_forces,
-        reuse_factor=start is not None,
-        relative_tolerance=tolerance,
+        options=SolveOptions(before=before, reuse_factor=start is not None, relative_tolerance=tolerance),
     )
     if not state.converged:
         raise DataError(f"no equilibrium: {state.status}: {state.advice}")

@@ -24,7 +24,7 @@ from scipy.sparse.linalg import spsolve
 
 from femsense.fem.assembly import internal, reduced_matrix
 from femsense.fem.body import BodyModel, make_body
-from femsense.fem.equilibrium import solve_equilibrium
+from femsense.fem.equilibrium import SolveOptions, solve_equilibrium
 from femsense.fem.mesh import TetMesh, to_quadratic
 
 QUADRATIC = pytest.mark.parametrize("quadratic", [False, True])
@@ -176,5 +176,8 @@ def test_the_work_of_the_loads_is_the_energy(law: str, quadratic: bool) -> None:
 def test_two_loads_do_the_same_work_on_each_others_displacements(quadratic: bool) -> None:
     body, rng = bar("corotational", quadratic, 0.499), np.random.default_rng(3)
     loads = 1e-6 * rng.normal(size=(2, *body.mesh.nodes.shape))
-    u = [solve_equilibrium(body, nodal_forces=load, relative_tolerance=1e-12).positions - body.mesh.nodes for load in loads]
+    u = [
+        solve_equilibrium(body, nodal_forces=load, options=SolveOptions(relative_tolerance=1e-12)).positions - body.mesh.nodes
+        for load in loads
+    ]
     assert relative_error(np.array([(loads[0] * u[1]).sum()]), np.array([(loads[1] * u[0]).sum()])) < 1e-4

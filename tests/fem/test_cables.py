@@ -22,7 +22,7 @@ from femsense.fem.cables import (
     segments,
     shortening,
 )
-from femsense.fem.equilibrium import solve_equilibrium
+from femsense.fem.equilibrium import SolveOptions, solve_equilibrium
 from femsense.fem.mesh import TetMesh, to_quadratic
 
 PATH = [[0.1, 0.03, 0.02], [0.08, 0.012, 0.028], [0.05, 0.02, 0.01], [0.03, 0.005, 0.02]]  # through several elements
@@ -175,7 +175,9 @@ def test_friction_remembers_the_direction_of_motion() -> None:
     down = solve_equilibrium(body, tension={"bent": 1.0}, start=high)
     assert up.converged and high.converged and down.converged
     assert (down.segment_tensions[0] > up.segment_tensions[0] * 1.1).all()
-    again = solve_equilibrium(body, tension={"bent": 1.0}, before=tuple(np.zeros(len(c.path)) for c in body.cables), start=down)
+    again = solve_equilibrium(
+        body, tension={"bent": 1.0}, start=down, options=SolveOptions(before=tuple(np.zeros(len(c.path)) for c in body.cables))
+    )
     np.testing.assert_allclose(again.positions, up.positions, atol=1e-8)
 
 
@@ -196,7 +198,7 @@ def test_a_body_without_friction_forgets_the_losses_of_its_start() -> None:
     warm = solve_equilibrium(cable_body(False), tension={"bent": 2.0}, start=rubbing)
     np.testing.assert_allclose(warm.positions, cold.positions, atol=1e-9)
     held_still = solve_equilibrium(
-        cable_body(False), tension={"bent": 2.0}, along=tuple(t / 2.0 for t in rubbing.segment_tensions)
+        cable_body(False), tension={"bent": 2.0}, options=SolveOptions(along=tuple(t / 2.0 for t in rubbing.segment_tensions))
     )
     np.testing.assert_allclose(held_still.segment_tensions[0], rubbing.segment_tensions[0], rtol=1e-9)
 

@@ -17,7 +17,7 @@ from femsense.fem.body import BodyModel, make_body
 from femsense.fem.cavities import find_chamber
 from femsense.fem.chambers import add_pressure_stiffness, chamber_volume, volume_gradient
 from femsense.fem.compliance import compliance, tangent_at
-from femsense.fem.equilibrium import Equilibrium, solve_equilibrium
+from femsense.fem.equilibrium import Equilibrium, SolveOptions, solve_equilibrium
 from femsense.fem.mesh import TetMesh
 
 SIZE = (0.1, 0.03, 0.03)
@@ -207,7 +207,7 @@ def test_pressure_and_cable_are_reciprocal() -> None:
     body = hollow("neo_hookean")
 
     def solve(T: float, p: float) -> Equilibrium:
-        return solve_equilibrium(body, tension={"top": T}, pressure={"core": p}, relative_tolerance=1e-12)
+        return solve_equilibrium(body, tension={"top": T}, pressure={"core": p}, options=SolveOptions(relative_tolerance=1e-12))
 
     state = solve(1.0, P)
     W = compliance(body, state)

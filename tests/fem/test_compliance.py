@@ -12,7 +12,7 @@ from helpers import block_mesh
 from femsense.core.errors import FemsenseError, InputError
 from femsense.fem.body import BodyModel
 from femsense.fem.compliance import compliance, direction_rows, tangent_at
-from femsense.fem.equilibrium import Equilibrium, solve_equilibrium
+from femsense.fem.equilibrium import Equilibrium, SolveOptions, solve_equilibrium
 from femsense.fem.mesh import embed_points
 
 MESH = block_mesh((4, 1, 1))
@@ -33,7 +33,9 @@ def moved(body: BodyModel, state: Equilibrium) -> np.ndarray:
 
 
 def solved(body: BodyModel, start: Equilibrium, tension: dict[str, float], force: np.ndarray | None = None) -> Equilibrium:
-    state = solve_equilibrium(body, tension=tension, nodal_forces=force, start=start, relative_tolerance=1e-13)
+    state = solve_equilibrium(
+        body, tension=tension, nodal_forces=force, start=start, options=SolveOptions(relative_tolerance=1e-13)
+    )
     assert state.converged
     return state
 
@@ -95,12 +97,14 @@ def test_compliance_of_a_soft_clamp_at_rest_is_that_of_its_springs() -> None:
 def test_held_cables_keep_their_length_in_the_response() -> None:
     body, h = bar(), 1e-3
     wanted = solve_equilibrium(body, tension=TENSION).shortening
-    state = solve_equilibrium(body, shortening=wanted, relative_tolerance=1e-13)
+    state = solve_equilibrium(body, shortening=wanted, options=SolveOptions(relative_tolerance=1e-13))
     force = embed_points(body.mesh, POINTS[:1]).spread(DIRECTIONS[:1], len(MESH.nodes))
     tangent = tangent_at(body, state)
     u = tangent.respond(force[None])[0]
     ahead, behind = (
-        solve_equilibrium(body, shortening=wanted, nodal_forces=s * h * force, start=state, relative_tolerance=1e-13).positions
+        solve_equilibrium(
+            body, shortening=wanted, nodal_forces=s * h * force, start=state, options=SolveOptions(relative_tolerance=1e-13)
+        ).positions
         for s in (1, -1)
     )
     assert relative_error(u, (ahead - behind) / (2 * h)) < 1e-5
@@ -113,7 +117,7 @@ def test_the_response_to_a_held_cable_is_the_derivative_of_equilibria_solved_ane
     body, h = bar_body(MESH, gravity=(0, 0, -9.81), friction=friction), 1e-6
     body = body.with_cables(tuple(replace(c, stretch_stiffness=stretch) for c in body.cables))
     wanted = {"top": 0.004, "side": 0.003}
-    state = solve_equilibrium(body, shortening=wanted, relative_tolerance=1e-13)
+    state = solve_equilibrium(body, shortening=wanted, options=SolveOptions(relative_tolerance=1e-13))
     assert state.held.all()
     answer = tangent_at(body, state).respond_to_held()
     for j, name in enumerate(wanted):
@@ -122,8 +126,7 @@ def test_the_response_to_a_held_cable_is_the_derivative_of_equilibria_solved_ane
                 body,
                 shortening={**wanted, name: wanted[name] + s * h},
                 start=state,
-                before=tuple(np.zeros(len(c.path)) for c in body.cables),
-                relative_tolerance=1e-13,
+                options=SolveOptions(before=tuple(np.zeros(len(c.path)) for c in body.cables), relative_tolerance=1e-13),
             ).positions
             for s in (1, -1)
         )

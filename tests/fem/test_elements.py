@@ -25,7 +25,7 @@ from femsense.core.errors import InputError
 from femsense.fem.assembly import add_elements, diagonal_slots, element_forces, internal, reduced_matrix
 from femsense.fem.body import BodyModel, make_body
 from femsense.fem.body_parts import Material
-from femsense.fem.equilibrium import solve_equilibrium
+from femsense.fem.equilibrium import SolveOptions, solve_equilibrium
 from femsense.fem.mesh import TetMesh, shape_values, to_quadratic
 
 LAWS = ("corotational", "neo_hookean", "gent")
@@ -308,7 +308,7 @@ def manufactured_error(cells: int, quadratic: bool, lam: float) -> float:
     forces = np.zeros_like(mesh.nodes)
     np.add.at(forces, mesh.tets, np.einsum("m,q,qa,mqc->mac", volume, w, N, load))
     small = 1e-7
-    state = solve_equilibrium(body, nodal_forces=small * forces, relative_tolerance=1e-12)
+    state = solve_equilibrium(body, nodal_forces=small * forces, options=SolveOptions(relative_tolerance=1e-12))
     u = (state.positions - mesh.nodes) / small
     error = np.einsum("qa,mac->mqc", N, u[mesh.tets]) - exact
     return float(np.sqrt(np.einsum("m,q,mqc->", volume, w, error**2)))

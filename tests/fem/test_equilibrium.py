@@ -13,7 +13,7 @@ from femsense.core.errors import InputError
 from femsense.fem.assembly import internal
 from femsense.fem.body import BodyModel, make_body, tie_cable
 from femsense.fem.cables import cable_forces
-from femsense.fem.equilibrium import ADVICE, Equilibrium, solve_equilibrium
+from femsense.fem.equilibrium import ADVICE, Equilibrium, SolveOptions, solve_equilibrium
 from femsense.fem.mesh import TetMesh
 
 MESH = block_mesh((4, 1, 1))
@@ -55,7 +55,10 @@ def test_forces_balance_and_the_clamp_holds(law: str, quadratic: bool) -> None:
 def test_with_friction_the_reported_residual_is_that_of_the_state() -> None:
     body = bar_body(MESH, friction=0.4)
     first = solve_equilibrium(body, tension={"side": 1.0})
-    for state in (first, solve_equilibrium(body, tension={"top": 0.5, "side": 1.5}, start=first, reuse_factor=True)):
+    for state in (
+        first,
+        solve_equilibrium(body, tension={"top": 0.5, "side": 1.5}, start=first, options=SolveOptions(reuse_factor=True)),
+    ):
         assert state.residual_n < 1e-7
         assert unbalanced(body, state) == pytest.approx(state.residual_n, abs=1e-12)
 
@@ -66,7 +69,7 @@ def test_warm_and_cold_starts_meet(law: str) -> None:
     cold = solve_equilibrium(body, tension={"top": 2.0, "side": 1.0})
     other = solve_equilibrium(body, tension={"side": 3.0})
     for reuse in (False, True):
-        warm = solve_equilibrium(body, tension={"top": 2.0, "side": 1.0}, start=other, reuse_factor=reuse)
+        warm = solve_equilibrium(body, tension={"top": 2.0, "side": 1.0}, start=other, options=SolveOptions(reuse_factor=reuse))
         np.testing.assert_allclose(warm.positions, cold.positions, atol=1e-9)
     again = solve_equilibrium(body, tension={"top": 2.0, "side": 1.0}, start=cold)
     assert again.iterations <= 1
@@ -103,7 +106,11 @@ def test_small_loads_superpose_and_double() -> None:
     body = bar(gravity=(0, 0, 0))
     rng = np.random.default_rng(0)
     a, b = 1e-5 * rng.normal(0, 1, (2, *MESH.nodes.shape))
-    move = lambda f: solve_equilibrium(body, nodal_forces=f, relative_tolerance=1e-13).positions - MESH.nodes  # noqa: E731
+
+    def move(forces: np.ndarray) -> np.ndarray:
+        options = SolveOptions(relative_tolerance=1e-13)
+        return solve_equilibrium(body, nodal_forces=forces, options=options).positions - MESH.nodes
+
     np.testing.assert_allclose(move(a + b), move(a) + move(b), atol=1e-4 * np.abs(move(a)).max())
     np.testing.assert_allclose(move(2 * a), 2 * move(a), atol=1e-4 * np.abs(move(a)).max())
 

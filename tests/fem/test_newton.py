@@ -19,7 +19,7 @@ from femsense.fem.body import BodyModel, make_body, tie_cable
 from femsense.fem.cables import bend_angles
 from femsense.fem.cavities import find_chamber
 from femsense.fem.compliance import tangent_at
-from femsense.fem.equilibrium import Equilibrium, solve_equilibrium
+from femsense.fem.equilibrium import Equilibrium, SolveOptions, solve_equilibrium
 from femsense.fem.mesh import TetMesh, to_quadratic
 
 E, LENGTH, WIDTH, SIDE = 200e3, 0.1, 0.013, 0.01
@@ -66,7 +66,7 @@ def test_newton_is_quadratic_near_the_solution(
     newton.unbalanced_force.free["dofs"] = body.free_map.dofs  # type: ignore[attr-defined]
     monkeypatch.setattr(newton, "CHORD", 0.0)  # every step with a stiffness of its own
     monkeypatch.setattr(line_search, "CURVED", np.inf)  # straight: where elements turn, too few steps are left to see an order
-    state = solve_equilibrium(body, **given, relative_tolerance=1e-13)
+    state = solve_equilibrium(body, options=SolveOptions(relative_tolerance=1e-13), **given)
     assert state.converged and state.indefinite_steps == 0
     near = [r for r in residuals if r > 1e-8]
     order = np.log(near[-1] / near[-2]) / np.log(near[-2] / near[-3])
@@ -187,7 +187,7 @@ def test_load_steps_keep_the_given_losses_along_a_cable(monkeypatch: pytest.Monk
     body = bar_body(block_mesh((4, 1, 1)))
     start = solve_equilibrium(body, tension={"side": 1.0})
     along = (np.ones_like(start.segment_tensions[0]), np.array([0.4, 1.0]))
-    wanted = solve_equilibrium(body, tension={"side": 4.0}, start=start, along=along)
+    wanted = solve_equilibrium(body, tension={"side": 4.0}, start=start, options=SolveOptions(along=along))
     assert wanted.segment_tensions[1].tolist() == [1.6, 4.0]
     plain, calls = equilibrium.settle, []
 
@@ -196,7 +196,7 @@ def test_load_steps_keep_the_given_losses_along_a_cable(monkeypatch: pytest.Monk
         return "stalled" if len(calls) in (1, 4) else plain(*arguments)
 
     monkeypatch.setattr(equilibrium, "settle", fails_at_first)
-    stepped = solve_equilibrium(body, tension={"side": 4.0}, start=start, along=along)
+    stepped = solve_equilibrium(body, tension={"side": 4.0}, start=start, options=SolveOptions(along=along))
     assert len(calls) > 4 and stepped.converged
     np.testing.assert_allclose(stepped.segment_tensions[1], [1.6, 4.0])
     np.testing.assert_allclose(stepped.positions, wanted.positions, atol=1e-8)
@@ -283,7 +283,7 @@ def test_a_loose_part_beside_a_clamped_one_is_singular() -> None:
 )
 def test_settings_that_cannot_be(given: dict[str, Any]) -> None:
     with pytest.raises(InputError):
-        solve_equilibrium(bar_body(block_mesh((2, 1, 1))), **given)
+        solve_equilibrium(bar_body(block_mesh((2, 1, 1))), options=SolveOptions(**given))
 
 
 def test_a_start_of_a_body_with_other_drives_is_refused() -> None:
@@ -327,9 +327,9 @@ def test_a_state_that_is_only_tried_is_given_up_after_some_steps(monkeypatch: py
     body = bar_body(block_mesh((5, 2, 2), (LENGTH, WIDTH, SIDE)))
     rest = solve_equilibrium(body)
     pull = dict.fromkeys(body.cable_names, 0.5)
-    assert solve_equilibrium(body, tension=pull, start=rest, rough=True).converged
+    assert solve_equilibrium(body, tension=pull, start=rest, options=SolveOptions(rough=True)).converged
     monkeypatch.setattr(equilibrium, "TRIES", 1)
-    tried = solve_equilibrium(body, tension=pull, start=rest, rough=True)
+    tried = solve_equilibrium(body, tension=pull, start=rest, options=SolveOptions(rough=True))
     assert tried.status == "iterations" and tried.iterations == 1
     assert solve_equilibrium(body, tension=pull, start=rest).converged  # what is not only tried goes on
 
@@ -339,10 +339,10 @@ def test_a_state_that_is_only_tried_is_given_up_where_its_stiffness_stays_indefi
     rest = solve_equilibrium(body)
     x = rest.positions * [1.0, 1.0, 0.1]  # pressed flat
     flat = replace(rest, positions=np.where(body.mesh.nodes[:, :1] < 1e-9, body.mesh.nodes, x))
-    back = solve_equilibrium(body, start=flat, rough=True)
+    back = solve_equilibrium(body, start=flat, options=SolveOptions(rough=True))
     assert back.converged and 1 <= back.indefinite_steps <= newton.INDEFINITE_TRIES
     monkeypatch.setattr(newton, "INDEFINITE_TRIES", back.indefinite_steps - 1)
-    tried = solve_equilibrium(body, start=flat, rough=True)
+    tried = solve_equilibrium(body, start=flat, options=SolveOptions(rough=True))
     assert tried.status == "iterations" and tried.iterations < back.iterations
     assert solve_equilibrium(body, start=flat).converged  # what is not only tried goes on
 
@@ -410,9 +410,9 @@ def test_a_state_that_is_only_tried_takes_a_lent_factor_as_far_as_it_goes(monkey
     there = solve_equilibrium(soft, tension=pull, start=start)
     assert np.abs(there.positions - start.positions).max() > 1e-3 * body.reach
     factors.clear()
-    tried = solve_equilibrium(soft, tension=pull, start=start, reuse_factor=True, rough=True)
+    tried = solve_equilibrium(soft, tension=pull, start=start, options=SolveOptions(reuse_factor=True, rough=True))
     assert tried.converged and not factors
     assert np.abs(tried.positions - there.positions).max() < 2 * newton.ARRIVED * body.reach
     monkeypatch.setattr(newton, "PATIENCE_TRIED", 0)
-    solve_equilibrium(soft, tension=pull, start=start, reuse_factor=True, rough=True)
+    solve_equilibrium(soft, tension=pull, start=start, options=SolveOptions(reuse_factor=True, rough=True))
     assert factors

@@ -19,7 +19,7 @@ from helpers import block_mesh
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import DataError
 from femsense.fem.compliance import Tangent
-from femsense.fem.equilibrium import Equilibrium, solve_equilibrium
+from femsense.fem.equilibrium import Equilibrium, SolveOptions, solve_equilibrium
 from femsense.fem.mesh import embed_points
 from femsense.model import quasi_static_path, variants
 from femsense.model.drive import DrivenRobot, drive_of, has_history
@@ -253,7 +253,7 @@ def test_variants_give_the_derivative_of_frames_solved_anew() -> None:
             alone = [
                 r.markers.positions(
                     solve_equilibrium(
-                        r.body, tension=dict(zip(("top", "side"), rec.inputs[k])), relative_tolerance=1e-12
+                        r.body, tension=dict(zip(("top", "side"), rec.inputs[k])), options=SolveOptions(relative_tolerance=1e-12)
                     ).positions
                 )
                 for r in (ahead, back)
@@ -274,7 +274,11 @@ def test_another_modulus_of_some_elements_moves_a_frame_as_if_it_were_solved_ane
             DrivenRobot(base, drive_of(base, rec)), [0], attrgetter("markers"), [DrivenRobot(ahead, drive_of(ahead, rec))]
         )
         alone = [
-            r.markers.positions(solve_equilibrium(r.body, tension={"top": 1.0, "side": 0.3}, relative_tolerance=1e-12).positions)
+            r.markers.positions(
+                solve_equilibrium(
+                    r.body, tension={"top": 1.0, "side": 0.3}, options=SolveOptions(relative_tolerance=1e-12)
+                ).positions
+            )
             for r in (ahead, back)
         ]
         central = (alone[0] - alone[1]) / (2 * h)

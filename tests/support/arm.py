@@ -11,6 +11,7 @@ from helpers import block_mesh
 from femsense.core.arrays import freeze
 from femsense.core.pose import invert_pose, make_pose, rotation_from_vector, transform_points
 from femsense.fem.body import make_body, tie_cable
+from femsense.fem.equilibrium import SolveOptions
 from femsense.fem.mesh import embed_points, to_quadratic
 from femsense.model.drive import DrivenRobot, drive_of, frame_loads
 from femsense.model.effects import apply_effects
@@ -112,7 +113,13 @@ def record(
         if forces and k in forces:
             place, force = forces[k]
             extra = embed_points(true.body.mesh, np.atleast_2d(place)).spread(np.atleast_2d(force), len(true.body.mesh.nodes))
-        state = solve_frame(driven, k, start=state, before=None if state is None else state.segment_tensions, nodal_forces=extra)
+        state = solve_frame(
+            driven,
+            k,
+            start=state,
+            nodal_forces=extra,
+            options=SolveOptions(before=None if state is None else state.segment_tensions),
+        )
         assert state.converged
         states.append(state.positions)
         points.append(ties.positions(state.positions))

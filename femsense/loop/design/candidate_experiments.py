@@ -16,7 +16,7 @@ import numpy as np
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import DataError
 from femsense.core.parallel import each
-from femsense.fem.equilibrium import Equilibrium
+from femsense.fem.equilibrium import Equilibrium, SolveOptions
 from femsense.model.drive import DrivenRobot, drive_of
 from femsense.model.effects.loads import STANDARD_GRAVITY
 from femsense.model.recording import make_recording
@@ -327,7 +327,7 @@ def _moves(robot: Robot, control: str, small: FloatArray, tip: FloatArray, gravi
     driven = _still(robot, control, inputs, loads)
 
     def place(k: int, start: Equilibrium | None) -> tuple[Equilibrium, FloatArray]:
-        state = solve_frame(driven, k, start=start, single=True)
+        state = solve_frame(driven, k, start=start, options=SolveOptions(single=True))
         if not state.converged:
             raise DataError(f"the declared robot has no equilibrium near rest: {state.status}: {state.advice}")
         return state, robot.markers.positions(state.positions)
@@ -344,7 +344,7 @@ def _bearable(robot: Robot, control: str, count: int, i: int, height: float) -> 
     for _ in range(5):
         inputs = np.zeros((1, count))
         inputs[0, i] = height
-        if solve_frame(_still(robot, control, inputs), 0, single=True).converged:
+        if solve_frame(_still(robot, control, inputs), 0, options=SolveOptions(single=True)).converged:
             return height
         height = float(f"{0.6 * height:.2g}")
     raise DataError(f"no equilibrium at {height:g} of pull {i}: the declared robot is too soft for its cables")

@@ -11,7 +11,7 @@ from femsense.core.errors import FemsenseError, InputError
 from femsense.fem.assembly import internal
 from femsense.fem.body import BodyModel
 from femsense.fem.compliance import compliance
-from femsense.fem.equilibrium import solve_equilibrium
+from femsense.fem.equilibrium import SolveOptions, solve_equilibrium
 from femsense.fem.realtime.power_series import Expansion, combination
 from femsense.fem.realtime.tracker import Tracker
 
@@ -94,12 +94,15 @@ def test_each_term_of_a_series_raises_the_order_of_its_error(quadratic: bool) ->
     names, push = body.cable_names, np.zeros_like(body.mesh.nodes)
     push[np.argmax(body.mesh.nodes[:, 0])] = [0.0, 0.05, 0.02]
     start = Expansion(body, single=False)
-    state = solve_equilibrium(body, tension=dict(zip(names, before)), relative_tolerance=1e-12)
+    state = solve_equilibrium(body, tension=dict(zip(names, before)), options=SolveOptions(relative_tolerance=1e-12))
     assert start.move(state.positions, before)
     errors = []
     for share in (1.0, 0.5):
         there = solve_equilibrium(
-            body, tension=dict(zip(names, before + share * more)), nodal_forces=share * push, relative_tolerance=1e-12
+            body,
+            tension=dict(zip(names, before + share * more)),
+            nodal_forces=share * push,
+            options=SolveOptions(relative_tolerance=1e-12),
         )
         sums = state.positions + np.cumsum(list(start.terms(before + share * more, body.dead_load() + share * push)), axis=0)
         errors.append(np.abs(sums - there.positions).max(axis=(1, 2)))

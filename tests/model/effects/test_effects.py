@@ -14,7 +14,7 @@ from analytic import bar_body
 from helpers import block_mesh, write_block_robot
 
 from femsense.core.errors import InputError
-from femsense.fem.equilibrium import solve_equilibrium
+from femsense.fem.equilibrium import SolveOptions, solve_equilibrium
 from femsense.fem.mesh import embed_points
 from femsense.io.robot_toml import EFFECT_NAMES, load_robot
 from femsense.model.drive import DrivenRobot, drive_of
@@ -51,7 +51,7 @@ def measured(r: Robot, control: str) -> np.ndarray:
     rec = make_recording(time_s=[0.0, 1.0, 2.0], cable_names=("top", "side"), inputs=inputs, actuation=control)
     driven, before, seen = DrivenRobot(r, drive_of(r, rec)), None, []
     for k in range(3):
-        state = solve_frame(driven, k, before=before)
+        state = solve_frame(driven, k, options=SolveOptions(before=before))
         assert state.converged
         before = state.segment_tensions
         y = r.markers.positions(state.positions) + np.array([0, 0, 0.5])
