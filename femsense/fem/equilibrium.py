@@ -48,7 +48,7 @@ PATIENCE, PATIENCE_TRIED = 5, 8
 factor takes, for states that are only tried: others end the farther below their tolerance the better these steps shrink.
 Of a first step nothing is known yet: states that are only tried take a second one."""
 PAIRS = 8
-"""Steps since the last factor that are remembered (`_Secants`)."""
+"""Steps since the last factor that are remembered (`Secants`)."""
 ARRIVED = 5e-7
 """A state that is only tried is there when a step was shorter than this share of the body's size."""
 FAR = 1e6
@@ -442,7 +442,7 @@ def _newton(body: BodyModel, loads: _Loads, state: _State, max_iterations: int) 
     here = state.here = internal(body, state.x, tangent=not state.borrowed)
     last, length, shrinking = np.inf, np.inf, np.inf
     frictional = any(c.friction > 0 for c in body.cables)
-    secants = _Secants()
+    secants = Secants()
     for iteration in range(max_iterations):
         follows = frictional and not len(held) and iteration < FOLLOW_FRICTION
         if follows and (iteration or state.borrowed):  # from a state near by at once: its bends are nearly those of the end
@@ -499,7 +499,7 @@ def _newton(body: BodyModel, loads: _Loads, state: _State, max_iterations: int) 
     return "iterations"
 
 
-class _Secants:
+class Secants:
     """What steps since the last factor have shown of the stiffness, where nothing is held: BFGS updates of its inverse (Matthies & Strang 1979)."""
 
     def __init__(self) -> None:

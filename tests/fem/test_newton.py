@@ -387,7 +387,7 @@ def test_a_stiffness_learns_from_the_steps_since_it_was_factorised() -> None:
     factor: Any = _Known(true + 0.4 * turned[:, :3] @ turned[:, :3].T)  # too stiff along three motions
     load, ends = rng.standard_normal(20), list[float]()
     for learns in (False, True):
-        secants, x = equilibrium._Secants(), np.zeros(20)
+        secants, x = equilibrium.Secants(), np.zeros(20)
         for _ in range(7):
             force = load - true @ x
             if learns:
