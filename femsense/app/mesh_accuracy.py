@@ -30,10 +30,6 @@ from femsense.model.robot import Robot
 
 ORDER = 2.0
 """p, see above."""
-MOST_UNKNOWNS = 400_000
-"""A finer space with more unknowns is not solved …"""
-MOST_SECONDS = 400.0
-"""… nor one that would take all spaces together beyond this processor time, judged by the steps of the space before [s]."""
 STEPS = 8
 """Factorisations that a state and its start take, about."""
 MOST_INPUTS = 4
@@ -49,12 +45,24 @@ USUAL_MOTION = 0.1
 MOST_PILOT_UNKNOWNS = 40_000
 """Inputs are sized on quadratic elements if these have no more unknowns; linear ones move too little."""
 PATCH = 0.06
-"""Radius of the contact patch, over the diagonal; one and a half edges of the surface at least."""
-GOOD_MOTION, GOOD_FORCE = 0.03, 0.05
-"""A space is fine enough where motions are off by less than the first share and forces by less than the second."""
+"""Radius of the patch that carries a contact force, over the diagonal; one and a half edges of the surface at least."""
 SPACES = (("tet4", 0), ("tet10", 0), ("tet4", 1), ("tet10", 1))
 """Element and refinements, the cheapest first."""
 Progress = Callable[..., None]
+
+
+@dataclass(frozen=True, slots=True)
+class AccuracyOptions:
+    """How far finer spaces are looked at, and what is fine enough."""
+
+    most_unknowns: int = 400_000
+    """A finer space with more unknowns is not solved …"""
+    most_seconds: float = 400.0
+    """… nor one that would take all spaces together beyond this processor time, judged by the steps of the space before [s]."""
+    good_motion: float = 0.03
+    """A space is fine enough where motions are off by less than this share …"""
+    good_force: float = 0.05
+    """… and forces by less than this one."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -88,7 +96,7 @@ class Answer:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class _Patches:
+class Patches:
     """Contact forces that are the same on every mesh of the body."""
 
     centres: FloatArray  # features that they act at, (k, 3)
@@ -104,16 +112,18 @@ class _Solved:
     states: tuple[Equilibrium, ...]  # at rest under the weight, then under each input
 
 
-def expected_duration() -> str:
+def expected_duration(options: AccuracyOptions | None = None) -> str:
     """Return how long `assess_accuracy` may take, in words."""
-    return f"at most about {MOST_SECONDS / 60:.0f} minutes of processor time: finer spaces that would take longer are left out"
+    seconds = (options or AccuracyOptions()).most_seconds
+    return f"at most about {seconds / 60:.0f} minutes of processor time: finer spaces that would take longer are left out"
 
 
-def assess_accuracy(robot: Robot, *, progress: Progress | None = None) -> dict[str, Any]:
+def assess_accuracy(robot: Robot, *, options: AccuracyOptions | None = None, progress: Progress | None = None) -> dict[str, Any]:
     """Return what the mesh of a robot costs in motion and in force, and what would be better, as plain tables.
 
     Arguments:
         robot: as it is declared.
+        options: how far finer spaces are looked at, and what is fine enough.
         progress: called with what is being done.
 
     Returns:
@@ -123,15 +133,15 @@ def assess_accuracy(robot: Robot, *, progress: Progress | None = None) -> dict[s
     Raises:
         DataError: where the declared model itself does not converge.
     """
-    tell = progress or (lambda *_: None)
+    tell, options = progress or (lambda *_: None), options or AccuracyOptions()
     tell("the declared mesh")
-    places = _observed(robot)
+    places = observed_points(robot)
     coarse = "tet10" if robot.body.mesh.is_quadratic else "tet4"
     loads, solved = _feasible(robot.body)
-    chosen = [space for space in SPACES if space == (coarse, 0) or _affordable(robot.body, space)]
+    chosen = [space for space in SPACES if space == (coarse, 0) or _affordable(robot.body, space, options.most_unknowns)]
     meshes = {space: finer_mesh(robot.body.mesh, space[0], space[1]) for space in chosen}
     finest = max(meshes.values(), key=lambda mesh: len(mesh.nodes))
-    patches = _patches(robot, finest, _felt(robot, solved.states[0], places))
+    patches = contact_patches(robot, finest, felt_features(robot, solved.states[0], places))
     answers: list[Answer] = []
     began = time.process_time()
     left_out = [f"{_space_name(*space)} (too many unknowns)" for space in SPACES if space not in chosen]
@@ -139,7 +149,7 @@ def assess_accuracy(robot: Robot, *, progress: Progress | None = None) -> dict[s
         unknowns = 3 * len(meshes[element, refinements].nodes)
         seconds = _expected_seconds(answers, unknowns, len(solved.states))
         spent = time.process_time() - began
-        if seconds and spent + seconds > MOST_SECONDS and (element, refinements) != (coarse, 0):
+        if seconds and spent + seconds > options.most_seconds and (element, refinements) != (coarse, 0):
             left_out.append(f"{_space_name(element, refinements)} ({unknowns} unknowns, about {seconds / 60:.0f} min)")
             continue
         tell(f"{_space_name(element, refinements)}: {unknowns} unknowns" + (f", about {seconds:.0f} s" if seconds >= 10 else ""))
@@ -150,7 +160,7 @@ def assess_accuracy(robot: Robot, *, progress: Progress | None = None) -> dict[s
             continue
         answers.append(answer)
         solved = states
-    return _report(patches, coarse, loads, answers, left_out)
+    return _report(patches, coarse, loads, answers, left_out, options)
 
 
 def _space_name(element: str, refinements: int) -> str:
@@ -169,13 +179,13 @@ def _on(body: BodyModel, mesh: TetMesh) -> BodyModel:
     return body if mesh is body.mesh else body_on_mesh(body, mesh)
 
 
-def _affordable(body: BodyModel, space: tuple[str, int]) -> bool:
-    if space[1] and 3 * len(body.mesh.tets) > MOST_UNKNOWNS:  # each adds a node at least
+def _affordable(body: BodyModel, space: tuple[str, int], most_unknowns: int) -> bool:
+    if space[1] and 3 * len(body.mesh.tets) > most_unknowns:  # each adds a node at least
         return False
-    return 3 * len(finer_mesh(body.mesh, *space).nodes) <= MOST_UNKNOWNS
+    return 3 * len(finer_mesh(body.mesh, *space).nodes) <= most_unknowns
 
 
-def _observed(robot: Robot) -> FloatArray:
+def observed_points(robot: Robot) -> FloatArray:
     """Return the points whose motion counts: features and markers at rest [m], shape (p, 3)."""
     points = np.vstack([robot.body.mesh.nodes[robot.features], robot.markers.positions(robot.body.mesh.nodes)])
     if not len(points):
@@ -196,7 +206,7 @@ def _rest(body: BodyModel) -> Equilibrium:
 
 def _feasible(body: BodyModel) -> tuple[list[Load], _Solved]:
     """Return loads under which the declared model converges, and its states. Raises DataError where there are none."""
-    loads, start = _loads(body), _Solved(body.mesh, (_rest(body),))
+    loads, start = sized_loads(body), _Solved(body.mesh, (_rest(body),))
     for _ in range(4):
         states = _states(body, loads, start)
         if states is not None:
@@ -205,7 +215,7 @@ def _feasible(body: BodyModel) -> tuple[list[Load], _Solved]:
     raise DataError("the declared model does not converge under its cables and chambers, even by an eighth of their usual inputs")
 
 
-def _loads(body: BodyModel) -> list[Load]:
+def sized_loads(body: BodyModel) -> list[Load]:
     """Return the weight and the inputs, each a part of its largest value but no larger than moves the body a good deal.
 
     How far an input moves the body is taken from the stiffness at rest of quadratic elements.
@@ -235,10 +245,10 @@ def _row(body: BodyModel, load: Load) -> int:
 def _inputs(body: BodyModel) -> list[Load]:
     cables = [Load("cable", cable.name, PART_OF_LARGEST * cable.max_tension, "N") for cable in body.cables]
     chambers = [Load("chamber", chamber.name, PART_OF_LARGEST * chamber.max_pressure, "Pa") for chamber in body.chambers]
-    return [(cables + chambers)[i] for i in _spread(len(cables) + len(chambers), MOST_INPUTS)]
+    return [(cables + chambers)[i] for i in spread_evenly(len(cables) + len(chambers), MOST_INPUTS)]
 
 
-def _spread(count: int, most: int) -> list[int]:
+def spread_evenly(count: int, most: int) -> list[int]:
     return sorted({int(i) for i in np.linspace(0, count - 1, min(count, most))}) if count else []
 
 
@@ -246,7 +256,7 @@ def _drive(load: Load) -> dict[str, Any]:
     return {"tension" if load.kind == "cable" else "pressure": {load.name: load.size}}
 
 
-def _felt(robot: Robot, rest: Equilibrium, places: FloatArray) -> IntArray:
+def felt_features(robot: Robot, rest: Equilibrium, places: FloatArray) -> IntArray:
     """Return the features that contact forces are tried at: far from each other, and such that a force there moves the body."""
     body = robot.body
     normals = vertex_normals(body.mesh.nodes, surface_triangles(body.mesh))[robot.features]
@@ -259,8 +269,8 @@ def _felt(robot: Robot, rest: Equilibrium, places: FloatArray) -> IntArray:
     return np.asarray(robot.features[moved > FELT * moved.max(initial=0.0)][:FORCE_POINTS])
 
 
-def _patches(robot: Robot, finest: TetMesh, features: IntArray) -> _Patches:
-    """Return contact forces of one newton into the surface, as a cone over a contact patch, at some features."""
+def contact_patches(robot: Robot, finest: TetMesh, features: IntArray) -> Patches:
+    """Return contact forces of one newton into the surface, as a cone over a patch, at some features."""
     body = robot.body
     surface, radius = body_surface(finest), _patch_radius(body)
     corners = finest.nodes[surface.triangles]
@@ -274,7 +284,7 @@ def _patches(robot: Robot, finest: TetMesh, features: IntArray) -> _Patches:
         share = size * np.maximum(1.0 - np.linalg.norm(middles - centre, axis=1) / radius, 0.0) * (area @ facing > 0.35 * size)
         forces[k] = -share[:, None] / share.sum() * facing
     used = forces.any(axis=(0, 2))
-    return _Patches(centres, middles[used], forces[:, used])
+    return Patches(centres, middles[used], forces[:, used])
 
 
 def _patch_radius(body: BodyModel) -> float:
@@ -295,7 +305,7 @@ def _facing(middles: FloatArray, area: FloatArray, centre: FloatArray, radius: f
 
 
 def _answer(
-    body: BodyModel, space: tuple[str, int], loads: Sequence[Load], places: FloatArray, patches: _Patches, before: _Solved
+    body: BodyModel, space: tuple[str, int], loads: Sequence[Load], places: FloatArray, patches: Patches, before: _Solved
 ) -> tuple[Answer | None, _Solved | None]:
     """Return how a space answers to the loads, and its states; None where it does not converge."""
     states = _states(body, loads, before)
@@ -345,13 +355,17 @@ def _carried(known: Equilibrium, ties: Embedding) -> Equilibrium:
 
 
 def _report(
-    patches: _Patches, coarse: str, loads: Sequence[Load], answers: Sequence[Answer], left_out: Sequence[str]
+    patches: Patches,
+    coarse: str,
+    loads: Sequence[Load],
+    answers: Sequence[Answer],
+    left_out: Sequence[str],
+    options: AccuracyOptions,
 ) -> dict[str, Any]:
     declared = next(answer for answer in answers if answer.is_space(coarse, 0))
-    reference = _reference(answers)
-    errors = [_errors(answer, reference) for answer in answers]
+    reference = reference_of(answers)
+    errors = [errors_of(answer, reference) for answer in answers]
     spaces = [_space(answer, error, answer is declared) for answer, error in zip(answers, errors)]
-    best = _best(spaces)
     own = errors[[answer is declared for answer in answers].index(True)]
     report = {
         "declared": {"element": coarse, "tetrahedra": declared.tetrahedra, "unknowns": declared.unknowns},
@@ -360,12 +374,13 @@ def _report(
         "forces": _force_table(own, patches, declared),
         "spaces": spaces,
     }
-    report["advice"] = _advice(report, best)
+    report["good_enough"] = {"motion_percent": 100.0 * options.good_motion, "force_percent": 100.0 * options.good_force}
+    report["advice"] = advice_on(report, options)
     return report
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class _Reference:
+class Reference:
     motions: FloatArray
     per_newton: FloatArray
     motion_doubt: FloatArray
@@ -375,7 +390,7 @@ class _Reference:
     is_limit: bool
 
 
-def _reference(answers: Sequence[Answer]) -> _Reference:
+def reference_of(answers: Sequence[Answer]) -> Reference:
     """Return the limit of finer meshes where two of the same element are known, else the finest quadratic answer."""
     pairs = [(a, b) for a in answers for b in answers if b.is_space("tet10", a.refinements + 1) and a.element == "tet10"]
     if pairs:
@@ -385,15 +400,15 @@ def _reference(answers: Sequence[Answer]) -> _Reference:
         text = f"the limit of tet10 meshes, extrapolated from {coarse.tetrahedra} and {fine.tetrahedra} tetrahedra"
         description = {"text": text, "unknowns": fine.unknowns, "extrapolated": True}
         doubt = np.linalg.norm(motions - fine.motions, axis=2)
-        return _Reference(motions, fine.per_newton + step * (fine.per_newton - coarse.per_newton), doubt, description, fine, True)
+        return Reference(motions, fine.per_newton + step * (fine.per_newton - coarse.per_newton), doubt, description, fine, True)
     fine = max(answers, key=lambda answer: (answer.element == "tet10", answer.unknowns))
     text = f"{fine.element} with {fine.tetrahedra} tetrahedra, the finest space that is affordable; its own error is not known"
     description = {"text": text, "unknowns": fine.unknowns, "extrapolated": False}
-    return _Reference(fine.motions, fine.per_newton, np.full(fine.motions.shape[:2], np.nan), description, fine, False)
+    return Reference(fine.motions, fine.per_newton, np.full(fine.motions.shape[:2], np.nan), description, fine, False)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class _Errors:
+class Errors:
     known: bool
     motion: FloatArray  # largest motion under each load [m], (l,)
     largest: FloatArray  # largest error [m], (l,)
@@ -403,13 +418,13 @@ class _Errors:
     force: FloatArray  # sensed over true force − 1, (k,)
 
 
-def _errors(answer: Answer, reference: _Reference) -> _Errors:
+def errors_of(answer: Answer, reference: Reference) -> Errors:
     off, true = answer.motions - reference.motions, reference.motions
     distance, moved = np.linalg.norm(off, axis=2), np.linalg.norm(true, axis=2)
     rms, size = np.sqrt((distance**2).mean(axis=1)), np.sqrt((moved**2).mean(axis=1))
     known = reference.is_limit or answer is not reference.answer
     share = np.divide(rms, size, out=np.zeros_like(rms), where=size > 0)
-    return _Errors(
+    return Errors(
         known,
         moved.max(axis=1),
         distance.max(axis=1),
@@ -420,7 +435,7 @@ def _errors(answer: Answer, reference: _Reference) -> _Errors:
     )
 
 
-def _force_errors(answer: Answer, reference: _Reference) -> FloatArray:
+def _force_errors(answer: Answer, reference: Reference) -> FloatArray:
     """Return sensed force / true force − 1 at each contact, shape (k,).
 
     The force that a camera's points call for on a model is the one whose displacement field U comes nearest to the true field U*:
@@ -430,7 +445,7 @@ def _force_errors(answer: Answer, reference: _Reference) -> FloatArray:
     return np.asarray((own * true).sum(axis=(1, 2)) / (own**2).sum(axis=(1, 2)) - 1.0)
 
 
-def _space(answer: Answer, error: _Errors, is_declared: bool) -> dict[str, Any]:
+def _space(answer: Answer, error: Errors, is_declared: bool) -> dict[str, Any]:
     known = error.known
     return {
         "element": answer.element,
@@ -445,16 +460,16 @@ def _space(answer: Answer, error: _Errors, is_declared: bool) -> dict[str, Any]:
     }
 
 
-def _best(spaces: list[dict[str, Any]]) -> dict[str, Any] | None:
+def _best(spaces: list[dict[str, Any]], options: AccuracyOptions) -> dict[str, Any] | None:
     """Return the cheapest space that is good enough, None where none is known to be; the spaces get a mark."""
     for space in spaces:
         known = space["motion_percent"] is not None or space["force_percent"] is not None
-        space["good_enough"] = known and _lack(space) <= 1.0
+        space["good_enough"] = known and _lack(space, options) <= 1.0
     good = [space for space in spaces if space["good_enough"]]
     return min(good, key=lambda space: space["unknowns"]) if good else None
 
 
-def _load_row(load: Load, error: _Errors, i: int) -> dict[str, Any]:
+def _load_row(load: Load, error: Errors, i: int) -> dict[str, Any]:
     return {
         "kind": load.kind,
         "name": load.name,
@@ -468,7 +483,7 @@ def _load_row(load: Load, error: _Errors, i: int) -> dict[str, Any]:
     }
 
 
-def _force_table(error: _Errors, patches: _Patches, declared: Answer) -> dict[str, Any]:
+def _force_table(error: Errors, patches: Patches, declared: Answer) -> dict[str, Any]:
     known = error.known and len(error.force) > 0
     return {
         "places_mm": 1e3 * patches.centres,
@@ -478,7 +493,9 @@ def _force_table(error: _Errors, patches: _Patches, declared: Answer) -> dict[st
     }
 
 
-def _advice(report: Mapping[str, Any], best: Mapping[str, Any] | None) -> str:
+def advice_on(report: Mapping[str, Any], options: AccuracyOptions) -> str:
+    """Return which space would serve, in words; the spaces of the report get a mark where they do."""
+    best = _best(report["spaces"], options)
     declared = next(space for space in report["spaces"] if space["declared"])
     plain = next((space for space in report["spaces"] if space["element"] == "tet10" and not space["refinements"]), None)
     if declared["force_percent"] is None and declared["motion_percent"] is None:
@@ -487,9 +504,9 @@ def _advice(report: Mapping[str, Any], best: Mapping[str, Any] | None) -> str:
         return "the declared mesh is fine enough"
     if best is not None and not best["refinements"]:
         return f"better: {_change(best, declared)}"
-    if plain is None or _lack(plain) == 0.0:
+    if plain is None or _lack(plain, options) == 0.0:
         return f"no space that was tried is known to be fine enough; the nearest is {_change(plain or declared, declared)}"
-    factor = 1.1 * _lack(plain) ** 1.5
+    factor = 1.1 * _lack(plain, options) ** 1.5
     wanted, unknowns = (int(float(f"{factor * plain[key]:.2g}")) for key in ("tetrahedra", "unknowns"))
     changes = ['element = "tet10"'] * (declared["element"] != "tet10") + [
         f"a mesh of about {wanted} tetrahedra (femsense mesh --max-tets {wanted})"
@@ -497,9 +514,10 @@ def _advice(report: Mapping[str, Any], best: Mapping[str, Any] | None) -> str:
     return f"better: {' and '.join(changes)}: about {unknowns} unknowns instead of {declared['unknowns']}, judged by errors that fall with the square of the edges"
 
 
-def _lack(space: Mapping[str, Any]) -> float:
+def _lack(space: Mapping[str, Any], options: AccuracyOptions) -> float:
     """Return the error of a space over what is fine enough; 0 where it is not known."""
-    return max((space["motion_percent"] or 0.0) / (100 * GOOD_MOTION), (space["force_percent"] or 0.0) / (100 * GOOD_FORCE))
+    motion, force = space["motion_percent"] or 0.0, space["force_percent"] or 0.0
+    return max(motion / (100 * options.good_motion), force / (100 * options.good_force))
 
 
 def _change(space: Mapping[str, Any], declared: Mapping[str, Any]) -> str:
@@ -509,7 +527,7 @@ def _change(space: Mapping[str, Any], declared: Mapping[str, Any]) -> str:
 
 def accuracy_text(report: Mapping[str, Any]) -> str:
     """Return a report of `assess_accuracy` as tables."""
-    d = report["declared"]
+    d, good = report["declared"], report["good_enough"]
     lines = [
         f"the declared mesh: {d['element']}, {d['tetrahedra']} tetrahedra, {d['unknowns']} unknowns",
         f"compared with: {report['reference']['text']}",
@@ -530,7 +548,7 @@ def accuracy_text(report: Mapping[str, Any]) -> str:
             f"  {name:<24}{space['tetrahedra']:>10}{space['unknowns']:>10}{space['step_ms']:>11.0f}{_percent(space['motion_percent']):>9}{_percent(space['force_percent']):>9}"
         )
     lines += [
-        f"  * declared; errors are the worst of all loads and places; fine enough: {100 * GOOD_MOTION:.0f} % of motion, {100 * GOOD_FORCE:.0f} % of force"
+        f"  * declared; errors are the worst of all loads and places; fine enough: {good['motion_percent']:.0f} % of motion, {good['force_percent']:.0f} % of force"
     ]
     if report["reference"]["left_out"]:
         lines.append(f"  left out: {'; '.join(report['reference']['left_out'])}")

@@ -10,7 +10,7 @@ import scipy.sparse as sp
 
 from femsense.core.arrays import BoolArray, FloatArray, IntArray, as_indices, as_points, freeze
 from femsense.core.errors import InputError
-from femsense.fem.body_parts import LAWS, Cable, Chamber, Material, segment_ties
+from femsense.fem.body_parts import LAWS, Cable, Chamber, Material, segment_nodes
 from femsense.fem.mesh import TetMesh, body_parts, element_volumes, embed_points
 from femsense.fem.stencil import FreeMap, Stencil, make_free_map, make_stencil
 
@@ -206,7 +206,7 @@ def make_body(
             "inverted or flat tetrahedra", where="mesh", expected="positive volumes", hint="see femsense.fem.mesh.check_mesh"
         )
     check_chambers(chambers)
-    ties = [segment_ties(cable.path)[0] for cable in cables]
+    ties = [segment_nodes(cable.path) for cable in cables]
     stencil, slots = make_stencil(mesh, [*ties, *(chamber.faces for chamber in chambers)])
     cable_slots = slots[: len(cables)]
     curvature = tuple(curvature_map(c, s, len(stencil.block_columns), n) for c, s in zip(chambers, slots[len(cables) :]))

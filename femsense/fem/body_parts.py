@@ -67,11 +67,9 @@ class Chamber:
     """[Pa]."""
 
 
-def segment_ties(path: Embedding) -> tuple[IntArray, FloatArray]:
-    """Return the nodes that move each segment of a cable and their weights in the difference of its ends, shapes (s, 2k).
+def segment_nodes(path: Embedding) -> IntArray:
+    """Return the nodes that move each segment of a cable, those of its near end first, shape (s, 2k).
 
-    The last segment ends at the pull point, which no node moves: its second half has weight 0.
+    The last segment ends at the pull point, which no node moves: its own nodes fill the second half.
     """
-    ahead = np.vstack([path.nodes[1:], path.nodes[-1:]])
-    weight = np.vstack([path.weights[1:], np.zeros((1, path.weights.shape[1]))])
-    return np.hstack([path.nodes, ahead]), np.hstack([-path.weights, weight])
+    return np.hstack([path.nodes, np.vstack([path.nodes[1:], path.nodes[-1:]])])

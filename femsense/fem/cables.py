@@ -97,7 +97,7 @@ def add_cable_stiffness(body: BodyModel, positions: FloatArray, tensions: tuple[
 @njit(cache=True)
 def _add_segments(weights: FloatArray, d: FloatArray, stiffness: FloatArray, slots: IntArray, blocks: FloatArray) -> None:
     count, k = weights.shape
-    ends = np.empty(2 * k)  # weights of the nodes in the difference of the ends of a segment, as in `segment_ties`
+    ends = np.empty(2 * k)  # weights of the nodes in the difference of the ends of a segment, ordered as by `segment_nodes`
     for s in range(count):
         for a in range(k):
             ends[a] = -weights[s, a]

@@ -46,7 +46,7 @@ PATIENCE, PATIENCE_TRIED = 5, 8
 factor takes, for states that are only tried: others end the farther below their tolerance the better these steps shrink.
 Of a first step nothing is known yet: states that are only tried take a second one."""
 PAIRS = 8
-"""Steps since the last factor that are remembered (`_Secants`)."""
+"""Steps since the last factor that are remembered (`Secants`)."""
 ARRIVED = 5e-7
 """A state that is only tried is there when a step was shorter than this share of the body's size."""
 FAR = 1e6

@@ -10,8 +10,22 @@ import numpy as np
 import pytest
 from helpers import write_block_robot
 
-from femsense.app import cli, mesh_accuracy
-from femsense.app.mesh_accuracy import Answer, accuracy_text, assess_accuracy
+from femsense.app import cli
+from femsense.app.mesh_accuracy import (
+    SPACES,
+    AccuracyOptions,
+    Answer,
+    accuracy_text,
+    advice_on,
+    assess_accuracy,
+    contact_patches,
+    errors_of,
+    felt_features,
+    observed_points,
+    reference_of,
+    sized_loads,
+    spread_evenly,
+)
 from femsense.core.errors import DataError
 from femsense.fem.body import BodyModel
 from femsense.fem.equilibrium import solve_equilibrium
@@ -80,9 +94,9 @@ def test_a_model_that_moves_half_as_far_senses_twice_the_force() -> None:
         moves = scale * np.arange(12.0).reshape(1, 4, 3)
         return Answer("tet10", 0 if scale < 1 else 1, 1, 1, 1.0, moves, moves)
 
-    reference = mesh_accuracy._reference([answer(0.5), answer(1.25)])
+    reference = reference_of([answer(0.5), answer(1.25)])
     np.testing.assert_allclose(reference.motions, 1.5 * np.arange(12.0).reshape(1, 4, 3))  # 1.25 + (1.25 − 0.5) / 3
-    error = mesh_accuracy._errors(answer(0.75), reference)
+    error = errors_of(answer(0.75), reference)
     np.testing.assert_allclose(error.force, 1.0)
     np.testing.assert_allclose(error.share, 0.5)
     np.testing.assert_allclose(error.doubt, np.linalg.norm([9, 10, 11]) / 4)
@@ -90,12 +104,12 @@ def test_a_model_that_moves_half_as_far_senses_twice_the_force() -> None:
 
 def test_contact_forces_are_one_newton_into_the_body_on_every_mesh(tmp_path: Path) -> None:
     robot = block(tmp_path, cells=(4, 2, 2))
-    patches = mesh_accuracy._patches(robot, finer_mesh(robot.body.mesh, "tet10", 1), robot.features[:6])
+    patches = contact_patches(robot, finer_mesh(robot.body.mesh, "tet10", 1), robot.features[:6])
     total = patches.forces.sum(axis=1)
     np.testing.assert_allclose(np.linalg.norm(total, axis=1), 1.0)
     inward = robot.body.mesh.nodes.mean(axis=0) - robot.body.mesh.nodes[robot.features[: len(total)]]
     assert (np.einsum("kc,kc->k", total, inward) > 0).all()
-    for element, refinements in mesh_accuracy.SPACES[:3]:
+    for element, refinements in SPACES[:3]:
         mesh = finer_mesh(robot.body.mesh, element, refinements)
         carried = embed_points(mesh, patches.places)
         assert carried.outside.max() < 1e-9
@@ -107,7 +121,7 @@ def test_contact_forces_are_one_newton_into_the_body_on_every_mesh(tmp_path: Pat
 
 def test_contact_forces_are_tried_where_they_are_felt(tmp_path: Path) -> None:
     robot = block(tmp_path, cells=(8, 2, 2))
-    chosen = mesh_accuracy._felt(robot, solve_equilibrium(robot.body), mesh_accuracy._observed(robot))
+    chosen = felt_features(robot, solve_equilibrium(robot.body), observed_points(robot))
     x = robot.body.mesh.nodes[:, 0]
     assert len(chosen) == 6 and x[robot.features].min() < 0.01 and x[chosen].min() > 0.02  # nothing is felt next to the clamp
     assert list(chosen) == [node for node in robot.features if node in chosen]
@@ -121,26 +135,23 @@ def test_a_robot_without_loads_is_judged_by_forces(tmp_path: Path) -> None:
     assert "none: the robot has neither weight nor cables nor chambers" in text and "mm/N" in text
 
 
-def test_what_is_too_large_is_left_out_and_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_too_large_is_left_out_and_said(tmp_path: Path) -> None:
     robot = block(tmp_path, "tet4", cables=SIDE)
-    monkeypatch.setattr(mesh_accuracy, "MOST_UNKNOWNS", 300)
-    report = assess_accuracy(robot)
+    report = assess_accuracy(robot, options=AccuracyOptions(most_unknowns=300))
     assert report["reference"]["extrapolated"] is False and report["reference"]["spaces_left_out"] == 1
     assert "its own error is not known" in accuracy_text(report)
     assert [s["motion_percent"] is None for s in report["spaces"]] == [False, True, False] and not np.isfinite(
         report["loads"][0]["doubt_mm"]
     )
     assert report["advice"].startswith('no space that was tried is known to be fine enough; the nearest is element = "tet10": ')
-    monkeypatch.setattr(mesh_accuracy, "MOST_UNKNOWNS", 1)
-    alone = assess_accuracy(robot)
+    alone = assess_accuracy(robot, options=AccuracyOptions(most_unknowns=1))
     assert "nothing to compare it with" in alone["advice"] and alone["loads"][0]["error_mm"] is None
     assert "?" in accuracy_text(alone)
 
 
-def test_what_would_take_too_long_is_left_out_and_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_would_take_too_long_is_left_out_and_said(tmp_path: Path) -> None:
     robot, told = block(tmp_path, "tet10"), list[str]()
-    monkeypatch.setattr(mesh_accuracy, "MOST_SECONDS", 0.0)
-    report = assess_accuracy(robot, progress=told.append)
+    report = assess_accuracy(robot, options=AccuracyOptions(most_seconds=0.0), progress=told.append)
     assert [(s["element"], s["refinements"]) for s in report["spaces"]] == [("tet4", 0), ("tet10", 0)]
     split = finer_mesh(robot.body.mesh, "tet10", 1)
     assert report["reference"]["left_out"][-1].startswith(f"tet10, split into eight ({3 * len(split.nodes)} unknowns, about ")
@@ -151,7 +162,7 @@ def test_what_would_take_too_long_is_left_out_and_said(tmp_path: Path, monkeypat
     ]
 
 
-def test_the_advice_takes_the_cheapest_that_serves(reports: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_advice_takes_the_cheapest_that_serves(reports: Any) -> None:
     _, report = reports["tet4"]
     worst = {(s["element"], s["refinements"]): max(s["motion_percent"], s["force_percent"]) / 100 for s in report["spaces"]}
     for limit, text in (
@@ -163,22 +174,16 @@ def test_the_advice_takes_the_cheapest_that_serves(reports: Any, monkeypatch: py
         (10.0, "fine enough"),
     ):
         spaces = [dict(space) for space in report["spaces"]]
-        monkeypatch.setattr(mesh_accuracy, "GOOD_MOTION", 1.001 * limit)
-        monkeypatch.setattr(mesh_accuracy, "GOOD_FORCE", 1.001 * limit)
-        best = mesh_accuracy._best(spaces)
-        assert text in mesh_accuracy._advice(report | {"spaces": spaces}, best)
+        options = AccuracyOptions(good_motion=1.001 * limit, good_force=1.001 * limit)
+        assert text in advice_on(report | {"spaces": spaces}, options)
 
 
 def test_inputs_move_the_body_neither_too_far_nor_beyond_their_limit(tmp_path: Path) -> None:
-    loads = mesh_accuracy._loads(block(tmp_path, cells=(4, 2, 2)).body)
+    loads = sized_loads(block(tmp_path, cells=(4, 2, 2)).body)
     assert [load.name for load in loads] == ["own weight", "top", "side"] and loads[1].size <= 2.5 and np.isfinite(loads[2].size)
-    small = mesh_accuracy._loads(block(tmp_path / "b", cables__0__max_tension_n=0.02).body)
+    small = sized_loads(block(tmp_path / "b", cables__0__max_tension_n=0.02).body)
     assert small[1].size == 0.01
-    assert (
-        mesh_accuracy._spread(10, 4) == [0, 3, 6, 9]
-        and mesh_accuracy._spread(2, 4) == [0, 1]
-        and mesh_accuracy._spread(0, 4) == []
-    )
+    assert spread_evenly(10, 4) == [0, 3, 6, 9] and spread_evenly(2, 4) == [0, 1] and spread_evenly(0, 4) == []
 
 
 def test_a_body_without_an_equilibrium_is_said(tmp_path: Path) -> None:

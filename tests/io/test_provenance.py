@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -62,14 +63,15 @@ def test_the_same_input_elsewhere_is_the_same_and_truth_does_not_count(
     assert finished(tmp_path / "run", run_inputs(robot, load_recording(other), None))
 
 
-def test_an_incomplete_run_or_one_of_another_version_is_not_finished(
-    tmp_path: Path, robot: Robot, recording: Recording, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_incomplete_run_or_one_of_another_version_is_not_finished(tmp_path: Path, robot: Robot, recording: Recording) -> None:
     inputs = run_inputs(robot, recording, None)
     folder = write_run(make_run(robot), tmp_path / "run", inputs=inputs)
-    monkeypatch.setattr("femsense.__version__", "0.0.0")
+    written = (folder / "run.json").read_text(encoding="utf-8")
+    document = json.loads(written)
+    document["versions"]["femsense"] = "0.0.0"
+    (folder / "run.json").write_text(json.dumps(document), encoding="utf-8")
     assert not finished(folder, inputs)
-    monkeypatch.undo()
+    (folder / "run.json").write_text(written, encoding="utf-8")
     assert finished(folder, inputs)
     (folder / "frames.csv").unlink()
     assert not finished(folder, inputs)

@@ -74,7 +74,15 @@ class Tracked:
 class Tracker:
     """A body without friction and held cables whose tensions and nodal forces change by little from frame to frame."""
 
-    def __init__(self, body: BodyModel, *, tolerance: float = 0.01, floor_m: float = 1e-7, single: bool | None = None) -> None:
+    def __init__(
+        self,
+        body: BodyModel,
+        *,
+        tolerance: float = 0.01,
+        floor_m: float = 1e-7,
+        single: bool | None = None,
+        most_factorisations: int = MOST,
+    ) -> None:
         """Prepare to track.
 
         Arguments:
@@ -82,6 +90,7 @@ class Tracker:
             tolerance: largest error of a frame, as a share of its motion.
             floor_m: an error that is always small enough, and never undercut by what is reported [m].
             single: keep the factor in single precision; by default from SINGLE_FROM unknowns on.
+            most_factorisations: so many a frame, before the full solver takes over.
 
         Raises:
             InputError: the body has what a tracker does not know.
@@ -95,7 +104,7 @@ class Tracker:
                 hint="solve_equilibrium with start=… knows them",
             )
         self.body = body
-        self._tolerance, self._floor = tolerance, floor_m
+        self._tolerance, self._floor, self._most = tolerance, floor_m, most_factorisations
         self.expansion = Expansion(body, single=len(body.free_map.dofs) >= SINGLE_FROM if single is None else single)
         self._past: list[FloatArray] = []
         self._tension = np.zeros(len(body.cables))
@@ -192,7 +201,7 @@ class Tracker:
         last, carried, anew = self._past[-1], self._carried(), not self.expansion.is_series
         begins = [carried] if anew and self._smooth and carried is not None else []
         expected = np.inf
-        for count in range(MOST + 1):
+        for count in range(self._most + 1):
             if begins and not self._begin(begins[-1], T):
                 return None
             x, first, error = self._summed(T, loads, last, 1 if anew and not begins else 3)
