@@ -26,6 +26,7 @@ def main() -> int:
     ask.add_argument("--seed", type=int, default=1)
     ask.add_argument("--case", action="append", default=[], metavar="NAME", help="one of the cases; may be repeated; else all")
     ask.add_argument("--diamond", type=Path, default=DIAMOND, help="folder with diamond.vtu")
+    ask.add_argument("--plain", action="store_true", help="declare neither noise nor tools in recording.toml")
     ask.add_argument("--run", action="store_true", help="run femsense on each case and grade it")
     ask.add_argument("--at", action="store_true", help="with --run: give the true places at rest")
     ask.add_argument("--timeout", type=float, default=900.0, help="of one femsense command [s]")
@@ -46,7 +47,7 @@ def main() -> int:
             print(f"{case.name}: left out, no diamond.vtu in {given.diamond}")
             continue
         if not (folder / "truth.json").exists():
-            truth = make(case, folder, given.seed, diamond=given.diamond)
+            truth = make(case, folder, given.seed, diamond=given.diamond, plain=given.plain)
             print(
                 f"{case.name}: made in {truth['made_in_s']} s, {truth['mesh']}, ",
                 f"residual {truth['certificate']['worst_residual_n']:.1e} N",

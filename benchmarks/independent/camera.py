@@ -161,7 +161,7 @@ def camera_table(camera: Camera, *, unit: float, noise: bool) -> list[str]:
         f"cx = {WIDTH / 2}",
         f"cy = {HEIGHT / 2}",
     ]
-    lines += ["distortion = [0, 0, 0, 0, 0]", 'distortion_model = "brown_conrady"', f"depth_unit_m = {unit}"]
+    lines += ["distortion = [0, 0, 0, 0, 0]", f"depth_unit_m = {unit}"]
     if noise and camera.kind == "stereo":
         lines += ["", "[camera.noise]", 'kind = "stereo"', f"at_1m_m = {camera.amount[0]}"]
     elif noise:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 import zlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -36,8 +36,9 @@ class Take:
     marker_rows: list[str] = field(default_factory=list)
 
 
-def make(case: Case, folder: Path, seed: int, *, diamond: Path | None = None) -> dict[str, object]:
-    """Write one case below a folder and return its truth."""
+def make(case: Case, folder: Path, seed: int, *, diamond: Path | None = None, plain: bool = False) -> dict[str, object]:
+    """Write one case below a folder and return its truth; `plain`: without the optional tables on noise and tools."""
+    case = replace(case, declared_noise=False, tool=False) if plain else case
     begin = time.perf_counter()
     rng = np.random.default_rng([seed, zlib.crc32(case.name.encode())])
     body = bodies.diamond(rng, _needed(diamond)) if case.robot == "diamond" else getattr(bodies, case.robot)(rng)

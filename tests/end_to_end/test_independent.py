@@ -12,7 +12,7 @@ from helpers import ROOT
 skfem = pytest.importorskip("skfem")
 sys.path.insert(0, str(ROOT / "benchmarks"))
 
-from independent.cases import CASES  # noqa: E402
+from independent.cases import Case, Touch  # noqa: E402
 from independent.equilibrium import Problem  # noqa: E402
 from independent.grade import grade  # noqa: E402
 from independent.make import make  # noqa: E402
@@ -81,7 +81,7 @@ def test_forces_and_stiffness_are_derivatives_of_the_energy() -> None:
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> tuple:
     folder = tmp_path_factory.mktemp("independent")
-    case = next(c for c in CASES if c.name == "arm-slide")
+    case = Case("slide", "arm", (Touch(tangent=0.3, slide_m=0.02),), camera="tof", images=True)
     return folder, make(case, folder, 5)
 
 
@@ -110,20 +110,23 @@ def test_what_it_says_of_a_case_is_whole(made: tuple) -> None:
     assert np.dot(first["force"], first["normal"]) < 0
 
 
-def test_the_grader_sees_an_error_a_miss_and_a_false_contact(made: tuple, tmp_path) -> None:
-    truth = made[1]
+def test_the_grader_sees_an_error_a_miss_and_a_false_contact(tmp_path) -> None:
+    true = [{"frame": 6 + k, "point": [0, 0, 0.01 * k], "force": [0, 0, -0.1 - 0.1 * k], "bound_rel": 0.05} for k in range(6)]
+    true[5]["bound_rel"] = 0.5
+    (tmp_path / "truth.json").write_text(json.dumps({"case": "made up", "frames": 14, "contacts": true}))
     head = "frame,time_s,contact,x_m,y_m,z_m,fx_n,fy_n,fz_n,force_n,std_n"
-    rows = []
-    for contact in truth["contacts"][1:]:
-        force = 1.1 * np.array(contact["force"])
-        values = [*np.add(contact["point"], [0.002, 0, 0]), *force, np.linalg.norm(force), 1.0]
-        rows.append(",".join(map(str, [contact["frame"], 0.0, 0, *values])))
-    rows.append("2,0.4,0,0,0,0.1,0,0,-0.5,0.5,0.1")
+    rows = ["2,0.4,0,0,0,0.1,0,0,-0.5,0.5,0.1", "6,0.0,0,0,0.2,0.1,0,0,-0.5,0.5,0.1"]
+    for contact in true[1:]:
+        x, y, z = contact["point"]
+        size = -1.1 * contact["force"][2]
+        rows.append(f"{contact['frame']},0,1,{x + 0.002},{y},{z},0,0,{-size},{size},{0.03 if contact['frame'] < 9 else 0.001}")
     (tmp_path / "contacts.csv").write_text("\n".join([head, *rows]) + "\n")
-    (tmp_path / "frames.csv").write_text("\n".join(["frame,status", *(f"{k},ok" for k in range(truth["frames"]))]) + "\n")
-    row = grade(tmp_path, made[0] / "truth.json")
-    assert (row.true, row.false, row.calm, row.extra) == (10, 1, 8, 0)
-    assert row.missed == row.missed_quietly == (truth["contacts"][0]["bound_rel"] < 0.2)
-    assert row.size_error == pytest.approx([0.1] * len(row.size_error))
-    assert row.place_m == pytest.approx([0.002] * len(row.place_m))
-    assert all(row.covered)
+    (tmp_path / "frames.csv").write_text("\n".join(["frame,status", *(f"{k},ok" for k in range(14))]) + "\n")
+    row = grade(tmp_path, tmp_path / "truth.json")
+    assert (row.true, row.resolvable, row.false, row.calm, row.extra) == (6, 5, 1, 8, 1)
+    assert (row.missed, row.missed_quietly, row.largest_false_n) == (1, 1, 0.5)
+    assert row.size_error == pytest.approx([0.1] * 4)
+    assert row.vector_error == pytest.approx([0.1] * 4)
+    assert row.place_m == pytest.approx([0.002] * 4)
+    assert row.over_bound == pytest.approx([2.0] * 4)
+    assert row.covered == [True, True, False, False]
