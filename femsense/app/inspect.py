@@ -92,7 +92,7 @@ def inspect_path(path: str | Path, *, robot: str | Path | None = None) -> Report
         if robot is not None:
             _compare(target, report, robot)
     report["problems"] = problems
-    report["warnings"] = list(dict.fromkeys(notes))
+    report["warnings"] = [note for note in dict.fromkeys(notes) if note not in problems]
     checked: Report = plain(report)
     return checked
 
