@@ -18,7 +18,7 @@ import femsense
 from femsense.core.arrays import FloatArray, IntArray, freeze
 from femsense.core.errors import FemsenseError, InputError
 from femsense.fem.mesh import TetMesh, check_mesh, element_volumes, hinged_parts, surface_triangles
-from femsense.io.files import file_hash, write_json, write_text
+from femsense.io.files import check_target, file_hash, write_json, write_text
 from femsense.io.mesh_files import (
     FILL_SECONDS,
     SURFACE_ENDINGS,
@@ -400,6 +400,7 @@ def _check_target(target: Path) -> None:
             expected="a new folder, or one with robot.toml",
             hint="another -o",
         )
+    check_target(target, folder=True)
 
 
 def _finished(target: Path, inputs: dict[str, Any]) -> dict[str, Any] | None:
