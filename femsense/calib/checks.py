@@ -224,29 +224,40 @@ def relabelled(robot: Robot, scene: Scene, pairs: Sequence[Pairs], noise: float)
     Returns:
         the recording, and whether anything changed.
     """
-    said: list[str] = []
-    marker, kept, groups, renamed = scene.marker.copy(), np.ones(len(scene.marker), dtype=np.bool_), 0, 0
+    marker, far = scene.marker.copy(), np.zeros(len(scene.marker), dtype=np.bool_)
     for view, one in enumerate(pairs):
         rows = np.flatnonzero(scene.view == view)
         for group in np.unique(one.group):
             mine = one.group == group
-            name, named = f"frame {int(scene.recording.frame_numbers[group])}", one.marker[mine]
-            new = true_labels(_all_places(robot, one, mine), one.measured[mine], named, noise=noise)
-            off = np.linalg.norm(one.measured[mine] - one.modelled[mine], axis=1)
-            far = _strays(off, one.spread) & (new == named)
-            if (new != named).any():
-                exchanged = " and ".join(robot.marker_names[m] for m in named[new != named])
-                said.append(f"{name}: the labels {exchanged} are exchanged, put right")
-            said += [
-                f"{name}: marker {robot.marker_names[m]} is {1e3 * d:.3g} mm off, left out" for m, d in zip(named[far], off[far])
-            ]
-            marker[rows[mine]], kept[rows[mine]] = new, ~far
-            groups, renamed = groups + 1, renamed + int((new != named).any())
-    if not said or renamed > 0.5 * groups:  # an exchange in most frames is one of the whole recording
+            marker[rows[mine]] = true_labels(_all_places(robot, one, mine), one.measured[mine], one.marker[mine], noise=noise)
+            far[rows[mine]] = _strays(np.linalg.norm(one.measured[mine] - one.modelled[mine], axis=1), one.spread)
+    renamed = marker != scene.marker
+    if len(np.unique(scene.frame[renamed])) > 0.5 * len(scene.frames):  # an exchange in most frames is one of the whole recording
         return scene.recording, False
-    text = "; ".join(said[:6]) + (f"; and {len(said) - 6} more" if len(said) > 6 else "")
-    warnings.warn(f"{scene.recording.folder or 'the recording'}: {text}", stacklevel=4)
-    return _rewritten(robot, scene, marker, kept), True
+    far &= ~renamed & ~_mostly(far, scene.marker)
+    if not (far | renamed).any():
+        return scene.recording, False
+    _say(robot, scene, renamed, far)
+    return _rewritten(robot, scene, marker, ~far), True
+
+
+def _mostly(far: BoolArray, marker: IntArray) -> BoolArray:
+    """Return which rows are of a marker that is far in most frames, shape (k,): it sits elsewhere than declared, which is no stray."""
+    total = np.bincount(marker, minlength=int(marker.max(initial=0)) + 1)
+    return np.asarray((np.bincount(marker[far], minlength=len(total)) > 0.5 * total)[marker])
+
+
+def _say(robot: Robot, scene: Scene, renamed: BoolArray, far: BoolArray) -> None:
+    """Warn of what was put right and left out, frame by frame."""
+    texts = []
+    for k in np.unique(scene.frame[renamed | far]):
+        parts = []
+        for rows, what in ((renamed, "labels are exchanged, put right"), (far, "strays, left out")):
+            names = ", ".join(robot.marker_names[m] for m in scene.marker[rows & (scene.frame == k)])
+            parts += [f"{names} ({what})"] if names else []
+        texts.append(f"frame {int(scene.recording.frame_numbers[k])}: {', '.join(parts)}")
+    text = "; ".join(texts[:6]) + (f"; and {len(texts) - 6} frames more" if len(texts) > 6 else "")
+    warnings.warn(f"{scene.recording.folder or 'the recording'}: {text}", stacklevel=5)
 
 
 def _all_places(robot: Robot, pairs: Pairs, mine: BoolArray) -> FloatArray:
