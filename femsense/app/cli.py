@@ -100,6 +100,9 @@ def inspect(
     accuracy: Annotated[
         bool, typer.Option("--accuracy", help="Of a robot: its discretisation error in motion and in force.")
     ] = False,
+    robot: Annotated[
+        str | None, typer.Option("--robot", metavar="ROBOT", help="Compare a recording with this robot.", show_default=False)
+    ] = None,
     json: Json = False,
 ) -> Answer:
     """Say what a file or folder is and what is wrong with it."""
@@ -112,7 +115,7 @@ def inspect(
         with _progress("accuracy") as progress:
             report = inspect_accuracy(path, progress=progress)
     else:
-        report = inspect_path(path)
+        report = inspect_path(path, robot=robot)
     return Answer(report, describe(report), exit_status=2 if report["problems"] else 0)
 
 
@@ -186,7 +189,8 @@ def import_(
 @app.command()
 def mesh(
     surface: Annotated[
-        Path, typer.Argument(metavar="SURFACE", help="STL, OBJ, PLY or OFF: triangles around the body.", show_default=False)
+        Path,
+        typer.Argument(metavar="SURFACE", help="STL, OBJ, PLY or OFF: triangles around the body; or STEP.", show_default=False),
     ],
     output: Annotated[
         Path,
@@ -199,7 +203,13 @@ def mesh(
         ),
     ],
     unit: Annotated[
-        str | None, typer.Option("--unit", metavar="m|cm|mm", help="Unit of the surface file; required.", show_default=False)
+        str | None,
+        typer.Option(
+            "--unit",
+            metavar="m|cm|mm",
+            help="Unit of the surface file; required but for STEP, which says it.",
+            show_default=False,
+        ),
     ] = None,
     size: Annotated[float | None, typer.Option("--size", metavar="MM", help="Wanted edge length.", show_default=False)] = None,
     most: Annotated[int, typer.Option("--max-tets", metavar="N", min=6, help="Not more tetrahedra than this.")] = 2000,

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import femsense
+from femsense.app.input_checks import warn_of_clouds
 from femsense.calib.files import read_calibration
 from femsense.core.errors import FemsenseError, InputError
 from femsense.core.parallel import beside
@@ -58,6 +59,7 @@ def estimate_into(
 
     check_run_folder(folder)
     body, frames = load_robot(robot), load_recording(recording)
+    warn_of_clouds(body, frames)
     given = None if calibration is None else read_calibration(calibration)
     inputs = run_inputs(body, frames, given, at=at)
     if not again and finished(folder, inputs):

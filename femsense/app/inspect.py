@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from femsense.app.input_checks import cloud_problems
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import FemsenseError, InputError
 from femsense.core.pose import check_pose
@@ -21,8 +22,8 @@ from femsense.fem.body_parts import Cable, Chamber
 from femsense.fem.chambers import chamber_volume
 from femsense.fem.mesh import TetMesh, check_mesh, element_volumes, surface_triangles, triangle_normals
 from femsense.io.checkpoint import UNFINISHED
-from femsense.io.clouds.frame_clouds import numbered_files, read_frame_cloud
-from femsense.io.clouds.images import read_png
+from femsense.io.clouds.frame_clouds import FOLDERS, numbered_files, read_frame_cloud
+from femsense.io.clouds.images import read_color, read_png
 from femsense.io.files import plain
 from femsense.io.mesh_files import (
     SURFACE_ENDINGS,
@@ -37,7 +38,7 @@ from femsense.io.recording_folder import TOO_FAR, load_recording
 from femsense.io.recording_toml import recording_problems
 from femsense.io.robot_toml import RobotTable, load_robot, read_declared_mesh, robot_names, robot_problems
 from femsense.io.tables import read_toml
-from femsense.model.recording import Recording
+from femsense.model.recording import Recording, check_against, warn_of_values
 from femsense.model.robot import Robot
 from femsense.rig.script import read_script
 
@@ -66,8 +67,12 @@ POOR_QUALITY = 0.05
 """A radius ratio below this is worth a warning."""
 
 
-def inspect_path(path: str | Path) -> Report:
+def inspect_path(path: str | Path, *, robot: str | Path | None = None) -> Report:
     """Return what a file or folder is and holds, and what is wrong with it.
+
+    Arguments:
+        path: a file, a folder, or the name of a robot.
+        robot: a recording is compared with this robot.
 
     Returns:
         plain tables: `path`, `kind` (robot, recording, script, mesh, surface, cloud, image, calibration, run, loop, capture, table or
@@ -84,10 +89,24 @@ def inspect_path(path: str | Path) -> Report:
         kind, inspect = _kind(target)
         report["kind"] = kind
         inspect(target, report, problems)
+        if robot is not None:
+            _compare(target, report, robot)
     report["problems"] = problems
-    report["warnings"] = list(dict.fromkeys(notes))
+    report["warnings"] = [note for note in dict.fromkeys(notes) if note not in problems]
     checked: Report = plain(report)
     return checked
+
+
+def _compare(target: Path, report: Report, robot: str | Path) -> None:
+    """Compare a recording with a robot. Raises InputError where it does not fit."""
+    from femsense.app.input_checks import warn_of_clouds
+
+    if report["kind"] != "recording":
+        raise InputError("--robot is about recordings", where=target, found=report["kind"], expected="a recording")
+    loaded, body = load_recording(target), load_robot(robot)
+    check_against(body, loaded)
+    warn_of_clouds(body, loaded)
+    report["robot"] = body.name
 
 
 def inspect_accuracy(path: str | Path, *, progress: Callable[..., None] | None = None) -> Report:
@@ -137,6 +156,7 @@ TITLES = {
     "mesh": "a mesh of tetrahedra",
     "surface": "a surface",
     "cloud": "a point cloud",
+    "scene": "a glTF scene",
     "image": "an image",
     "calibration": "a calibration",
     "run": "the results of an estimate",
@@ -194,15 +214,22 @@ def _kind_of_file(file: Path) -> tuple[str, Inspector]:
         return _kind_of_toml(file)
     if ending == ".json":
         return _kind_of_json(file)
-    if ending == ".pcd" or (ending == ".ply" and not _has_faces(file)):
+    if ending in (".pcd", ".xyz") or (ending == ".ply" and not _has_faces(file)):
         return "cloud", _cloud
     if ending in SURFACE_ENDINGS:
         return "surface", _surface
+    if ending in (".glb", ".gltf") or _starts_with(file, b"glTF"):
+        return "scene", _scene
     if ending in MESH_ENDINGS or file_format(file):
         return "mesh", _mesh
     if ending in CAPTURE_ENDINGS:
         return "capture", _capture
-    others: dict[str, tuple[str, Inspector]] = {".png": ("image", _image), ".csv": ("table", _table_file)}
+    others: dict[str, tuple[str, Inspector]] = {
+        ".jpg": ("image", _jpeg),
+        ".jpeg": ("image", _jpeg),
+        ".png": ("image", _image),
+        ".csv": ("table", _table_file),
+    }
     return others.get(ending, ("unknown", _unknown))
 
 
@@ -227,6 +254,11 @@ def _format(file: Path) -> str:
         return str(read_toml(file).get("format", ""))
     except InputError:
         return ""
+
+
+def _starts_with(file: Path, magic: bytes) -> bool:
+    with file.open("rb") as stream:
+        return stream.read(len(magic)) == magic
 
 
 def _has_faces(file: Path) -> bool:
@@ -260,7 +292,7 @@ def _robot(path: Path, report: Report, problems: list[str]) -> None:
     problems += [str(problem) for problem in found]
     if found:
         return
-    loaded = _attempt(lambda: load_robot(file, effects=False), problems)
+    loaded = _attempt(lambda: load_robot(path, effects=False), problems)
     if loaded is None:
         table = RobotTable.model_validate(document).mesh
         mesh = _attempt(lambda: read_declared_mesh(table, file), [])
@@ -383,6 +415,21 @@ def _without_unit(report: Report) -> Report:
     }
 
 
+def _scene(file: Path, report: Report, problems: list[str]) -> None:
+    """A .glb is what `femsense export` writes; its header is checked, its content is for viewers."""
+    with file.open("rb") as stream:
+        head = stream.read(12)
+    report["bytes"] = file.stat().st_size
+    report["next"] = "viewers and engines show it; femsense writes it and does not read it"
+    if file.suffix.lower() == ".gltf":
+        report["version"] = str(_json(file).get("asset", {}).get("version", "not said"))
+        return
+    announced = int.from_bytes(head[8:12], "little")
+    if head[:4] != b"glTF" or announced != report["bytes"]:
+        found = f"{announced} bytes announced, {report['bytes']} there" if head[:4] == b"glTF" else repr(head[:4])
+        problems.append(str(InputError("not a whole .glb file", where=file, found=found, expected="glTF and its length")))
+
+
 def _surface(file: Path, report: Report, problems: list[str]) -> None:
     points, triangles = read_triangles(file)
     _surface_report(points, triangles, report)
@@ -416,9 +463,11 @@ def _recording(path: Path, report: Report, problems: list[str]) -> None:
             return
     loaded = load_recording(folder)
     report.update(_recording_report(loaded))
-    if not loaded.has_clouds and not loaded.has_markers:
+    warn_of_values(loaded)
+    if not loaded.has_clouds and not loaded.has_markers and not len(loaded.unnamed_frame):
         problems.append(f"{folder}: neither markers nor clouds: nothing was measured")
     _check_clouds(loaded, report, problems)
+    problems += cloud_problems(loaded)
     _warn_of_unmatched(loaded, folder)
 
 
@@ -438,6 +487,9 @@ def _recording_report(r: Recording) -> Report:
         "gravity": "as the robot declares" if r.gravity is None else "given for each frame",
         "cameras": [_camera_report(r, v) for v in range(len(r.camera_names))],
         "markers": _marker_report(r),
+        "markers_without_names": len(r.unnamed_frame) or None,
+        "tools": [{"name": tool.name, "kind": tool.kind} for tool in r.tools],
+        "session": r.session,
         "rest_markers": None if r.rest is None else len(r.rest.names),
         "loads": _load_report(r),
     }
@@ -530,7 +582,7 @@ def _warn_of_gaps(r: Recording, steps: FloatArray) -> None:
 def _warn_of_unmatched(r: Recording, folder: Path) -> None:
     """Warn of clouds and images whose number is no frame."""
     numbers = set(r.frame_numbers.tolist())
-    for kind, endings in (("clouds", (".ply", ".pcd")), ("depth", (".png",)), ("color", (".png",))):
+    for kind, endings in FOLDERS.items():
         for name in r.camera_names:
             outliers = sorted(set(numbered_files(folder / kind / name, endings)) - numbers)
             if outliers:
@@ -584,6 +636,11 @@ def _image(file: Path, report: Report, problems: list[str]) -> None:
         )
         if not valid.size:
             problems.append(f"{file}: no pixel has a depth")
+
+
+def _jpeg(file: Path, report: Report, problems: list[str]) -> None:
+    image = read_color(file)
+    report.update({"width": image.shape[1], "height": image.shape[0], "channels": 3, "bits": 8, "content": "colour"})
 
 
 # Results

@@ -7,11 +7,11 @@ where it takes most of the residual away.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 
 from femsense.core.arrays import BoolArray, FloatArray, IntArray
 from femsense.core.errors import DataError
@@ -96,7 +96,7 @@ def check_reading(robot: Robot, pairs: Sequence[Pairs], *, strict: bool = True) 
         plain = _rigid(one.modelled, one.measured)
         if plain < SUSPICIOUS * one.spread:
             continue
-        found = f"the markers do not fit the robot: {100 * plain / one.spread:.3g} % of their spread of {1e3 * one.spread:.3g} mm is left"
+        found = f"the markers do not fit the robot: {100 * plain / one.spread:.0f} % of their spread of {1e3 * one.spread:.3g} mm is left"
         scale, _ = similarity(one.modelled, one.measured)
         if max(scale, 1 / scale) > 1.5 and _rigid(one.modelled, one.measured, scale=scale) * EXPLAINED < plain:
             raise DataError(f"{found}. They are {scale:.4g} times too large: {_unit(scale)}. The files hold metres")
@@ -106,8 +106,7 @@ def check_reading(robot: Robot, pairs: Sequence[Pairs], *, strict: bool = True) 
             )
         exchanged = _exchanged(one, plain)
         if exchanged:
-            names = "; ".join(f"{robot.marker_names[a]} and {robot.marker_names[b]}" for a, b in exchanged)
-            raise DataError(f"{found}. The labels seem exchanged: {names}. Exchange them in markers.csv")
+            raise DataError(f"{found}. The labels seem exchanged: {_cycles(robot, exchanged)}. Exchange them in markers.csv")
         if strict and plain > HOPELESS * one.spread:
             raise DataError(f"{found}. Are these the markers of {robot.name!r}, in metres, under their names?")
 
@@ -117,24 +116,69 @@ def _unit(scale: float) -> str:
     return f"are they in {UNITS[nearest]}?" if abs(np.log(scale / nearest)) < 0.25 else "is the robot's mesh.unit right?"
 
 
-def _exchanged(pairs: Pairs, plain: float) -> list[tuple[int, int]]:
-    """Return the exchanges of two markers each that take most of the residual away; empty where none do."""
-    model = {int(m): pairs.modelled[pairs.marker == m].mean(axis=0) for m in np.unique(pairs.marker)}
-    named, result, left = pairs.marker.copy(), list[tuple[int, int]](), plain
-    for _ in range(len(model)):
-        best, chosen = left, None
-        for a, b in combinations(model, 2):
-            rms = _rigid(_modelled(pairs, model, _swapped(named, a, b)), pairs.measured)
-            best, chosen = (rms, (a, b)) if rms < 0.9 * best else (best, chosen)
-        if chosen is None:
-            break
-        named, left = _swapped(named, *chosen), best
-        result.append(chosen)
-    return result if left * EXPLAINED < plain else []
+def _exchanged(pairs: Pairs, plain: float) -> dict[int, int]:
+    """Return which marker each named one is, where other names take most of the residual away; empty where none do.
+
+    In the frame with most markers three of them, far apart, are tried as every three of the model that are as far apart; the other names
+    follow by assignment (Kuhn 1955).
+    """
+    numbers, counts = np.unique(pairs.group, return_counts=True)
+    mine = pairs.group == numbers[counts.argmax()]
+    named, model, seen = pairs.marker[mine], pairs.modelled[mine], pairs.measured[mine]
+    best, names = np.inf, np.arange(len(named))
+    corners = _far_apart(seen)
+    for triple in _alike(model, seen[corners], 0.15 * pairs.spread):
+        placed = _moved(seen, seen[corners], model[list(triple)])
+        squares = ((placed[:, None] - model[None]) ** 2).sum(axis=2)
+        columns = linear_sum_assignment(squares)[1]
+        left = float(squares[np.arange(len(seen)), columns].sum())
+        best, names = (left, columns) if left < best else (best, names)
+    truth = {int(a): int(b) for a, b in zip(named, named[names])}
+    average = {int(m): pairs.modelled[pairs.marker == m].mean(axis=0) for m in np.unique(pairs.marker)}
+    renamed = np.array([truth.get(int(m), int(m)) for m in pairs.marker])
+    explained = _rigid(_modelled(pairs, average, renamed), pairs.measured) * EXPLAINED < plain
+    return {a: b for a, b in truth.items() if a != b} if explained else {}
 
 
-def _swapped(named: IntArray, a: int, b: int) -> IntArray:
-    return np.where(named == a, b, np.where(named == b, a, named))
+def _far_apart(points: FloatArray) -> IntArray:
+    """Return three of the points (k, 3) that span a wide triangle."""
+    first = int(((points - points.mean(axis=0)) ** 2).sum(axis=1).argmax())
+    second = int(((points - points[first]) ** 2).sum(axis=1).argmax())
+    area = np.linalg.norm(np.cross(points - points[first], points[second] - points[first]), axis=1)
+    return np.array([first, second, int(area.argmax())])
+
+
+def _alike(model: FloatArray, triangle: FloatArray, tolerance: float) -> Iterator[tuple[int, int, int]]:
+    """Yield the threes of model points (k, 3) whose distances are those of a triangle (3, 3), up to a tolerance [m]."""
+    distance = np.linalg.norm(model[:, None] - model[None], axis=2)
+    ab, ac, bc = (float(np.linalg.norm(triangle[i] - triangle[j])) for i, j in ((0, 1), (0, 2), (1, 2)))
+    for i, j in np.argwhere(np.abs(distance - ab) < tolerance).tolist():
+        third = (np.abs(distance[i] - ac) < tolerance) & (np.abs(distance[j] - bc) < tolerance)
+        third[[i, j]] = False
+        yield from ((i, j, k) for k in np.flatnonzero(third).tolist())
+
+
+def _moved(points: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return points (k, 3), turned and shifted as takes a to b, both (3, 3), best."""
+    U, _, Vt = np.linalg.svd((b - b.mean(axis=0)).T @ (a - a.mean(axis=0)))
+    R = U * [1.0, 1.0, np.sign(np.linalg.det(U @ Vt))] @ Vt
+    return np.asarray((points - a.mean(axis=0)) @ R.T + b.mean(axis=0))
+
+
+def _cycles(robot: Robot, truth: dict[int, int]) -> str:
+    """Return exchanges as text: "a and b" for two, "a is b, b is c, c is a" for more."""
+    left, texts = dict(truth), []
+    while left:
+        chain = [next(iter(left))]
+        while left.get(chain[-1], chain[0]) != chain[0]:
+            chain.append(left[chain[-1]])
+        names = [robot.marker_names[m] for m in chain]
+        texts.append(
+            " and ".join(names) if len(names) == 2 else ", ".join(f"{a} is {b}" for a, b in zip(names, [*names[1:], names[0]]))
+        )
+        for m in chain:
+            left.pop(m, None)
+    return "; ".join(texts)
 
 
 def _modelled(pairs: Pairs, model: dict[int, FloatArray], named: IntArray) -> FloatArray:
@@ -154,8 +198,6 @@ def true_labels(places: FloatArray, measured: FloatArray, marker: IntArray, *, n
         marker: as named, shape (k,).
         noise: one standard deviation of a marker along an axis [m].
     """
-    from scipy.optimize import linear_sum_assignment
-
     if len(marker) < 2:
         return marker
     squares = ((measured[:, None] - places[None]) ** 2).sum(axis=2)
@@ -182,29 +224,40 @@ def relabelled(robot: Robot, scene: Scene, pairs: Sequence[Pairs], noise: float)
     Returns:
         the recording, and whether anything changed.
     """
-    said: list[str] = []
-    marker, kept, groups, renamed = scene.marker.copy(), np.ones(len(scene.marker), dtype=np.bool_), 0, 0
+    marker, far = scene.marker.copy(), np.zeros(len(scene.marker), dtype=np.bool_)
     for view, one in enumerate(pairs):
         rows = np.flatnonzero(scene.view == view)
         for group in np.unique(one.group):
             mine = one.group == group
-            name, named = f"frame {int(scene.recording.frame_numbers[group])}", one.marker[mine]
-            new = true_labels(_all_places(robot, one, mine), one.measured[mine], named, noise=noise)
-            off = np.linalg.norm(one.measured[mine] - one.modelled[mine], axis=1)
-            far = _strays(off, one.spread) & (new == named)
-            if (new != named).any():
-                exchanged = " and ".join(robot.marker_names[m] for m in named[new != named])
-                said.append(f"{name}: the labels {exchanged} are exchanged, put right")
-            said += [
-                f"{name}: marker {robot.marker_names[m]} is {1e3 * d:.3g} mm off, left out" for m, d in zip(named[far], off[far])
-            ]
-            marker[rows[mine]], kept[rows[mine]] = new, ~far
-            groups, renamed = groups + 1, renamed + int((new != named).any())
-    if not said or renamed > 0.5 * groups:  # an exchange in most frames is one of the whole recording
+            marker[rows[mine]] = true_labels(_all_places(robot, one, mine), one.measured[mine], one.marker[mine], noise=noise)
+            far[rows[mine]] = _strays(np.linalg.norm(one.measured[mine] - one.modelled[mine], axis=1), one.spread)
+    renamed = marker != scene.marker
+    if len(np.unique(scene.frame[renamed])) > 0.5 * len(scene.frames):  # an exchange in most frames is one of the whole recording
         return scene.recording, False
-    text = "; ".join(said[:6]) + (f"; and {len(said) - 6} more" if len(said) > 6 else "")
-    warnings.warn(f"{scene.recording.folder or 'the recording'}: {text}", stacklevel=4)
-    return _rewritten(robot, scene, marker, kept), True
+    far &= ~renamed & ~_mostly(far, scene.marker)
+    if not (far | renamed).any():
+        return scene.recording, False
+    _say(robot, scene, renamed, far)
+    return _rewritten(robot, scene, marker, ~far), True
+
+
+def _mostly(far: BoolArray, marker: IntArray) -> BoolArray:
+    """Return which rows are of a marker that is far in most frames, shape (k,): it sits elsewhere than declared, which is no stray."""
+    total = np.bincount(marker, minlength=int(marker.max(initial=0)) + 1)
+    return np.asarray((np.bincount(marker[far], minlength=len(total)) > 0.5 * total)[marker])
+
+
+def _say(robot: Robot, scene: Scene, renamed: BoolArray, far: BoolArray) -> None:
+    """Warn of what was put right and left out, frame by frame."""
+    texts = []
+    for k in np.unique(scene.frame[renamed | far]):
+        parts = []
+        for rows, what in ((renamed, "labels are exchanged, put right"), (far, "strays, left out")):
+            names = ", ".join(robot.marker_names[m] for m in scene.marker[rows & (scene.frame == k)])
+            parts += [f"{names} ({what})"] if names else []
+        texts.append(f"frame {int(scene.recording.frame_numbers[k])}: {', '.join(parts)}")
+    text = "; ".join(texts[:6]) + (f"; and {len(texts) - 6} frames more" if len(texts) > 6 else "")
+    warnings.warn(f"{scene.recording.folder or 'the recording'}: {text}", stacklevel=5)
 
 
 def _all_places(robot: Robot, pairs: Pairs, mine: BoolArray) -> FloatArray:

@@ -17,6 +17,7 @@ from femsense.core.text import did_you_mean
 from femsense.io.clouds.frame_clouds import find_clouds
 from femsense.io.clouds.images import check_image_size, png_header
 from femsense.io.files import check_target, write_beside, write_csv, write_toml
+from femsense.io.recording_columns import columns
 from femsense.io.recording_toml import (
     LENS_KEYS,
     PER_METRE,
@@ -99,6 +100,11 @@ def _recording_folder(path: Path) -> Path:
     return folder
 
 
+def _table(path: Path) -> Table:
+    required, optional, prefixes = columns(path.name)
+    return read_csv(path, required=required, optional=optional, prefixes=prefixes)
+
+
 def _read_frames(path: Path, actuation: str) -> dict[str, Any]:
     """Return the parts of a recording that stand in frames.csv."""
     if not path.is_file():
@@ -108,9 +114,7 @@ def _read_frames(path: Path, actuation: str) -> dict[str, Any]:
             found="no such file",
             expected="a table frame,time_s,cable_<name>… with one row a frame",
         )
-    table = read_csv(
-        path, required=("frame", "time_s"), optional=("free", "sweep", *GRAVITY_COLUMNS), prefixes=("cable_", "chamber_")
-    )
+    table = _table(path)
     if not len(table):
         raise InputError("no frames", where=path, found="a header without rows", expected="one row a frame")
     numbers, time_s = table.integers("frame"), table.numbers(["time_s"])[:, 0]
@@ -192,7 +196,7 @@ def _read_markers(path: Path, views: tuple[str, ...], numbers: IntArray) -> dict
     """Return the parts of a recording that stand in markers.csv."""
     if not path.is_file():
         return {}
-    table = read_csv(path, required=("frame", "marker", *PLACE_COLUMNS), optional=("camera",))
+    table = _table(path)
     frame = _frame_indices(table, numbers)
     view = _view_indices(table, views)
     xyz = table.numbers(PLACE_COLUMNS)
@@ -256,7 +260,7 @@ def _unnamed(table: Table, frame: IntArray, numbers: IntArray) -> BoolArray:
 def _read_rest(path: Path, views: tuple[str, ...]) -> RestMarkers | None:
     if not path.is_file():
         return None
-    table = read_csv(path, required=("marker", *PLACE_COLUMNS), optional=("std_m", "camera"))
+    table = _table(path)
     xyz, view = table.numbers(PLACE_COLUMNS), _view_indices(table, views)
     _check_metres(table, xyz)
     std = table.numbers(["std_m"], empty_is_nan=True)[:, 0] if "std_m" in table.columns else np.full(len(table), np.nan)
@@ -280,7 +284,7 @@ def _read_loads(path: Path, numbers: IntArray) -> dict[str, Any]:
     """Return the parts of a recording that stand in loads.csv."""
     if not path.is_file():
         return {}
-    table = read_csv(path, required=("frame", *PLACE_COLUMNS, *FORCE_COLUMNS))
+    table = _table(path)
     return {
         "load_frame": _frame_indices(table, numbers),
         "load_points": table.numbers(PLACE_COLUMNS),

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from femsense.core.errors import InputError
-from femsense.io.files import PART_PREFIX, write_beside
+from femsense.io.files import PART_PREFIX, check_target, write_beside
 
 # Parts
 
@@ -48,6 +48,7 @@ def _check_folder(root: Path, not_beside: Sequence[str]) -> None:
         )
     if root.exists() and not root.is_dir():
         raise InputError("a file stands where the folder should be written", where=root, expected="a folder", hint="another -o")
+    check_target(root, folder=True)
 
 
 def _read_document(file: Path, expected: str) -> dict[str, Any]:

@@ -47,11 +47,32 @@ def read_text(path: Path) -> str:
     try:
         return path.read_bytes().decode("utf-8-sig")
     except UnicodeDecodeError as error:
+        if kind := _known_binary(path):
+            raise InputError("not a text file", where=path, found=kind, expected="a text file in UTF-8") from None
         raise InputError(
             "not a UTF-8 text file", where=path, found=f"byte {error.start}", expected="UTF-8", hint="save it as UTF-8"
         ) from None
     except OSError as error:
         raise InputError("cannot be read", where=path, found=error.strerror) from None
+
+
+def _known_binary(path: Path) -> str | None:
+    """Return what a file is that begins as no text does."""
+    with path.open("rb") as stream:
+        head = stream.read(16)
+    starts = {
+        b"glTF": "a glTF scene (.glb), which femsense writes and does not read",
+        b"PK\x03\x04": "a ZIP archive",
+        b"\x89PNG": "a PNG image",
+        b"\xff\xd8\xff": "a JPEG image",
+        b"#ROSBAG": "a bag of ROS: femsense import reads it",
+        b"SQLite f": "a database, perhaps a bag of ROS 2: femsense import reads it",
+        b"\x89MCAP": "an MCAP file: femsense import reads it",
+        b"\x1f\x8b": "a gzip archive",
+        b"%PDF": "a PDF document",
+    }
+    found = next((name for start, name in starts.items() if head.startswith(start)), None)
+    return found or ("bytes that are no text" if b"\0" in head else None)
 
 
 def validated(schema: type[SchemaType], document: dict[str, Any], path: Path) -> SchemaType:

@@ -459,6 +459,7 @@ def check_against(robot: Robot, recording: Recording) -> Recording:
     """
     fitted = _without_strangers(robot, _with_chamber_order(robot, _with_cable_order(robot, recording)))
     _check_loads(robot, fitted)
+    _check_displacements(robot, fitted)
     _warn_of_inputs(robot, fitted)
     warn_of_values(fitted)
     return fitted
@@ -559,6 +560,24 @@ def _check_loads(robot: Robot, recording: Recording) -> None:
             if looks
             else "loads are in the robot frame, not the camera's",
         )
+
+
+def _check_displacements(robot: Robot, recording: Recording) -> None:
+    """Refuse a cable that is shortened by more than its length. Raises InputError."""
+    if recording.actuation != "displacement":
+        return
+    for cable, pulled in zip(robot.body.cables, recording.inputs.T):
+        points = np.vstack([cable.path.positions(robot.body.mesh.nodes), cable.pull_point])
+        length = float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+        span = float(np.ptp(pulled)) if recording.actuation_zero == "unknown" else float(pulled.max(initial=0.0))
+        if span > max(length, 1e-3):
+            raise InputError(
+                f"cable {cable.name!r} is shortened by more than its length",
+                where=_place(recording, "frames.csv"),
+                found=f"{span:.4g} m",
+                expected=f"less than {length:.4g} m from its far end to its pull point",
+                hint="this looks like millimetres: displacements are in metres" if span > 5 * length else None,
+            )
 
 
 def _warn_of_inputs(robot: Robot, recording: Recording) -> None:

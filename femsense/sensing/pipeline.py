@@ -193,7 +193,7 @@ def sense_frame(sensor: Sensor, k: int, previous: SensedFrame | None) -> SensedF
     return SensedFrame(state, free_state, forces, report, contacts)
 
 
-PREDICTED = "nothing was measured: the model's prediction under the inputs"
+PREDICTED = "no marker and no cloud: the model's prediction under the inputs"
 """Status of a frame without markers and cloud."""
 
 

@@ -273,8 +273,8 @@ def test_nothing_at_a_path_is_the_only_error(tmp_path: Path) -> None:
 
 
 def test_what_is_not_known(tmp_path: Path) -> None:
-    (tmp_path / "a.abc").write_text("x")
-    assert inspect(tmp_path / "a.abc")["kind"] == "unknown"
+    (tmp_path / "a.dat").write_text("x")
+    assert inspect(tmp_path / "a.dat")["kind"] == "unknown"
     report = inspect(tmp_path)
     assert report["kind"] == "unknown" and "femsense import" in report["problems"][0]
 
@@ -357,3 +357,66 @@ def test_the_real_diamond_warns_of_its_cables() -> None:
     report = inspect(DATA / "diamond")
     assert sum("nearest centre" in text for text in report["warnings"]) == 4
     np.testing.assert_allclose([c["outside_mm"] for c in report["cables"]], [0.0011, 0.317, 0.172, 0.267], atol=1e-3)
+
+
+# What cannot be meant
+
+
+def cloud_recording(folder: Path, factor: float, *, count: int = 30, markers: bool = True) -> Path:
+    """Write a recording with clouds half a metre away, in metres times a factor."""
+    rng = np.random.default_rng(2)
+    write_small_recording(folder, **({} if markers else {"markers_csv": None}))
+    (folder / "clouds").mkdir()
+    for number in (0, 1, 4):
+        points = factor * (rng.normal(scale=0.05, size=(count, 3)) + np.array([0.0, 0.0, 0.5]))
+        header = f"ply\nformat ascii 1.0\nelement vertex {count}\n" + "".join(f"property double {c}\n" for c in "xyz")
+        rows = "".join(f"{x!r} {y!r} {z!r}\n" for x, y, z in points.tolist())
+        (folder / "clouds" / f"{number:06d}.ply").write_text(header + "end_header\n" + rows)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("factor", "markers", "text"),
+    [
+        (1000.0, True, "are they in millimetres?"),
+        (100.0, True, "are they in centimetres?"),
+        (39.37, True, "are they in inches?"),
+        (1000.0, False, "are they in millimetres?"),
+        (100.0, False, "not what a depth camera sees"),
+    ],
+)
+def test_clouds_in_another_unit(tmp_path: Path, factor: float, markers: bool, text: str) -> None:
+    assert not inspect(cloud_recording(tmp_path / "good", 1.0, markers=markers))["problems"]
+    report = inspect(cloud_recording(tmp_path / "bad", factor, markers=markers))
+    assert any(text in problem for problem in report["problems"])
+
+
+def test_empty_clouds_are_a_problem(tmp_path: Path) -> None:
+    report = inspect(cloud_recording(tmp_path, 1.0, count=0))
+    assert any("have no points" in problem for problem in report["problems"])
+
+
+def test_a_recording_against_a_robot(tmp_path: Path) -> None:
+    robot = write_block_robot(tmp_path / "robot")
+    report = inspect_path(cloud_recording(tmp_path / "r", 1.0), robot=robot)
+    assert report["problems"] == [] and any("the clouds have none" in note for note in report["warnings"])
+    report = inspect_path(cloud_recording(tmp_path / "small", 0.01, markers=False), robot=robot)
+    assert any("are they in metres?" in note for note in report["warnings"])
+    report = inspect_path(robot, robot=robot)
+    assert any("--robot is about recordings" in problem for problem in report["problems"])
+
+
+def test_a_scene_of_gltf_is_not_a_robot(tmp_path: Path) -> None:
+    whole = b"glTF" + (2).to_bytes(4, "little") + (12).to_bytes(4, "little")
+    (tmp_path / "a.glb").write_bytes(whole)
+    assert inspect(tmp_path / "a.glb")["kind"] == "scene" and not inspect(tmp_path / "a.glb")["problems"]
+    (tmp_path / "b.glb").write_bytes(whole + b"more")
+    assert "not a whole .glb file" in inspect(tmp_path / "b.glb")["problems"][0]
+    with pytest.raises(InputError, match="not a text file") as error:
+        load_robot(write_bytes(tmp_path / "c.glb", b"glTF\x02\xff\xfe"))
+    assert "a glTF scene" in str(error.value) and "UTF-8" in str(error.value)
+
+
+def write_bytes(path: Path, content: bytes) -> Path:
+    path.write_bytes(content)
+    return path

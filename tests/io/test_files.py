@@ -13,7 +13,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from femsense.io.files import file_hash, folder_hash, write_beside, write_csv, write_json, write_toml
+from femsense.core.errors import InputError
+from femsense.io.files import (
+    check_target,
+    file_hash,
+    folder_hash,
+    write_beside,
+    write_csv,
+    write_json,
+    write_toml,
+    writes_through,
+)
 
 finite = st.floats(allow_nan=False, allow_infinity=False)
 
@@ -86,3 +96,66 @@ def test_the_hash_of_a_folder_sees_content_and_names_only(tmp_path: Path) -> Non
     (tmp_path / "two" / "c").rename(tmp_path / "two" / "a")
     (tmp_path / "two" / "a").write_text("A")
     assert folder_hash(tmp_path / "one") != folder_hash(tmp_path / "two")
+
+
+# Devices, links, protected places
+
+
+def test_links_are_followed(tmp_path: Path) -> None:
+    (tmp_path / "real").mkdir()
+    for name in ("there.json", "new.json"):
+        (tmp_path / name).symlink_to(tmp_path / "real" / name)
+    (tmp_path / "real" / "there.json").write_text("old")
+    for name in ("there.json", "new.json"):
+        write_json(tmp_path / name, [1])
+        assert (tmp_path / name).is_symlink() and json.loads((tmp_path / "real" / name).read_text()) == [1]
+
+
+def test_devices_are_written_through(tmp_path: Path) -> None:
+    assert writes_through("/dev/null") and writes_through("/dev/stdout") and not writes_through(tmp_path / "a")
+    write_json("/dev/null", [1])
+    assert Path("/dev/null").is_char_device()
+    with pytest.raises(InputError, match="a device or a pipe stands where a folder is to be written"):
+        check_target("/dev/null", folder=True)
+    with pytest.raises(InputError, match="a device or a pipe"), write_beside("/dev/null") as part:
+        part.mkdir()
+
+
+def test_a_pipe_is_written_through(tmp_path: Path) -> None:
+    import os
+    import threading
+
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    got: list[str] = []
+    reader = threading.Thread(target=lambda: got.append(pipe.read_text()), daemon=True)
+    reader.start()
+    write_json(pipe, [1, 2])
+    reader.join(timeout=20)
+    assert json.loads(got[0]) == [1, 2] and pipe.is_fifo()
+
+
+def test_what_is_protected_is_refused_by_its_own_name(tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text("old")
+    (tmp_path / "a.json").chmod(0o444)
+    for attempt in (lambda: write_json(tmp_path / "a.json", 1), lambda: check_target(tmp_path / "a.json", folder=False)):
+        with pytest.raises(InputError, match="read-only") as error:
+            attempt()
+        assert "a.json" in str(error.value) and ".part-" not in str(error.value)
+    assert (tmp_path / "a.json").read_text() == "old"
+
+
+def test_a_folder_is_not_replaced_by_a_file_nor_the_other_way(tmp_path: Path) -> None:
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(InputError, match="a folder stands where a file is to be written") as error:
+        write_json(tmp_path / "folder", 1)
+    assert ".part-" not in str(error.value)
+    with pytest.raises(InputError, match="a file stands where a folder"), write_beside(tmp_path / "file") as part:
+        part.mkdir()
+    for place in (tmp_path / "file", tmp_path / "file" / "below"):
+        with pytest.raises(InputError, match="a file stands where a folder"):
+            check_target(place, folder=True)
+    assert left_over(tmp_path) == ["file", "folder"]
+    check_target(tmp_path / "new" / "deep", folder=True)
+    assert not (tmp_path / "new").exists()

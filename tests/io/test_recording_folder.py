@@ -30,6 +30,7 @@ from femsense.model.recording import (
     make_recording,
     marker_grid,
     select_frames,
+    warn_of_values,
     with_marker_table,
 )
 
@@ -589,6 +590,29 @@ def test_files_that_are_not_read_are_named(tmp_path: Path) -> None:
         r = load_recording(folder)
     cloud = read_frame_cloud(r, 1)
     assert cloud is not None and len(cloud) == 1
+
+
+@pytest.mark.parametrize(
+    ("frames", "actuation", "text"),
+    [
+        ("0,0,0,0\n1,33,1,0\n2,67,1,0\n", "tension", r"one frame every 33\.5 s .* milliseconds"),
+        ("0,0,0,0\n1,1,2.0,0\n2,2,1,0\n", "displacement", "moves by up to 2 m; are displacements in millimetres"),
+        ("0,0,0,0\n1,1,-0.01,0\n2,2,-0.02,0\n", "displacement", r"slack in 3 of 3 frames.* is the sign right\?"),
+    ],
+)
+def test_values_that_are_hardly_meant(tmp_path: Path, frames: str, actuation: str, text: str) -> None:
+    toml = TOML.replace("tension", actuation)
+    r = load_recording(write_small_recording(tmp_path, recording_toml=toml, frames_csv=FRAMES + frames, markers_csv=None))
+    with pytest.warns(UserWarning, match=text):
+        warn_of_values(r)
+
+
+def test_a_cable_is_not_shortened_by_more_than_its_length(tmp_path: Path, robot: Any) -> None:
+    toml, frames = TOML.replace("tension", "displacement"), FRAMES + "0,0,0,0\n1,1,2.0,0\n"
+    r = load_recording(write_small_recording(tmp_path / "r", recording_toml=toml, frames_csv=frames, markers_csv=None))
+    with pytest.raises(InputError, match="shortened by more than its length") as error:
+        check_against(robot, r)
+    assert "2 m" in str(error.value) and "millimetres" in str(error.value)
 
 
 # What is wrong

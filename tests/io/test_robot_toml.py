@@ -23,7 +23,7 @@ from femsense.core.errors import InputError
 from femsense.fem.body import make_body, tie_cable
 from femsense.fem.mesh import TetMesh, element_volumes, embed_points, oriented, to_quadratic
 from femsense.io.mesh_files import radius_ratio, read_tets, tetrahedralise
-from femsense.io.robot_toml import load_robot, robot_document, save_robot
+from femsense.io.robot_toml import find_robot, load_robot, robot_document, robot_names, save_robot
 from femsense.model.robot import Observation, Robot, plain_actuation, spread_features
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*outside the mesh.*:UserWarning")
@@ -181,6 +181,32 @@ def test_cable_points_slightly_outside_warn_with_distance_and_rule(tmp_path: Pat
 def test_a_modulus_in_kpa_warns(tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match=r"material\.young_modulus_pa: 150 Pa is softer than any silicone"):
         load_robot(write_block_robot(tmp_path, material__young_modulus_pa=150.0))
+
+
+def test_a_density_in_grams_per_cubic_centimetre_warns(tmp_path: Path) -> None:
+    with pytest.warns(UserWarning, match=r"1\.07 kg/m³ is lighter than any foam; is it in g/cm³"):
+        load_robot(write_block_robot(tmp_path, material__density_kg_m3=1.07))
+
+
+def test_an_own_folder_with_the_name_of_a_robot_that_comes_along(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    name = sorted(robot_names())[0]
+    write_block_robot(tmp_path / name)
+    with pytest.warns(UserWarning, match="is used; the robot of that name that comes along"):
+        assert find_robot(name) == Path(name) / "robot.toml"
+    (tmp_path / name / "robot.toml").unlink()
+    with pytest.warns(UserWarning, match=r"comes along is used; the folder .* has no robot\.toml"):
+        assert find_robot(name) == robot_names()[name] / "robot.toml"
+
+
+def test_a_doubled_element_weighs_once(tmp_path: Path) -> None:
+    block = block_mesh((4, 2, 2))
+    folder = write_block_robot(tmp_path)
+    mesh = meshio.Mesh(np.asarray(block.nodes) * 1e3, [("tetra", np.vstack([block.tets, block.tets[::2]]))])
+    mesh.write(folder / "block.vtu")
+    with pytest.warns(UserWarning, match="48 of 144 tetrahedra stand there twice"):
+        body = load_robot(folder).body
+    assert body.stencil.volumes.sum() == pytest.approx(0.1 * 0.03 * 0.03)
 
 
 def test_effects_act_on_the_robot_and_can_be_left_out(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from arm import NAMES, T_ROBOT_CAMERA, arm, record
 from femsense.calib.calibrate import calibrate
 from femsense.core.errors import InputError
 from femsense.core.pose import invert_pose, transform_points
+from femsense.fem.equilibrium import solve_equilibrium
 from femsense.fem.mesh import surface_triangles, triangle_normals
 from femsense.io.clouds.cloud_files import write_cloud
 from femsense.model.recording import Recording
@@ -82,7 +83,10 @@ def test_a_broken_frame_is_reported_and_the_rest_goes_on(touched):
         marker_xyz=recording.marker_xyz[keep],
     )
     run = estimate(arm(), gap, calibrate(arm(), recording), at=TIP)
-    assert "no marker" in run.frames[2].status
+    assert "no marker" in run.frames[2].status and "prediction under the inputs" in run.frames[2].status
+    inputs = dict(zip(recording.cable_names, recording.inputs[2].tolist()))
+    expected = solve_equilibrium(arm().body, tension=inputs).positions
+    np.testing.assert_allclose(run.states.nodes_m[2], expected, atol=1e-6)
     assert run.frames[3].status == "ok"
 
 

@@ -18,7 +18,7 @@ import femsense
 from femsense.core.arrays import FloatArray, IntArray, freeze
 from femsense.core.errors import FemsenseError, InputError
 from femsense.fem.mesh import TetMesh, check_mesh, element_volumes, hinged_parts, surface_triangles
-from femsense.io.files import file_hash, write_json, write_text
+from femsense.io.files import check_target, file_hash, write_json, write_text
 from femsense.io.mesh_files import (
     FILL_SECONDS,
     SURFACE_ENDINGS,
@@ -28,6 +28,7 @@ from femsense.io.mesh_files import (
     write_mesh,
 )
 from femsense.io.meshes.reading import read_content
+from femsense.io.meshing.cad import CAD_READ, read_cad
 from femsense.io.meshing.quality import quality_report, quality_text
 from femsense.io.meshing.surface import (
     ClosedSurface,
@@ -48,7 +49,7 @@ ENVELOPE_OF_EDGE = 0.04
 """The mesh may leave the surface by this share of an edge, if nothing else is asked for …"""
 LARGEST_ENVELOPE = 0.01
 """… and by this share of the diagonal at most."""
-CAD_ENDINGS = (".step", ".stp", ".iges", ".igs", ".brep", ".x_t", ".x_b", ".sldprt", ".sldasm", ".ipt", ".f3d", ".fcstd", ".3dm")
+CAD_ENDINGS = (".x_t", ".x_b", ".sldprt", ".sldasm", ".ipt", ".f3d", ".fcstd", ".3dm")
 TRIES = 5
 MOST_SECONDS = 600.0
 """All fillings together take no longer than this."""
@@ -105,7 +106,7 @@ def mesh_into(
 
     Arguments:
         folder: of the robot.
-        surface: STL, OBJ, PLY, OFF, or triangles in a format that meshio reads.
+        surface: STL, OBJ, PLY, OFF, STEP, IGES, BREP, or triangles in a format that meshio reads.
         options: unit, size and repairs.
         say: told in one line what happens beside.
         again: fill even where the folder holds this result.
@@ -117,7 +118,9 @@ def mesh_into(
     """
     source, target = Path(surface).expanduser(), Path(folder).expanduser()
     _check_target(target)
-    points, triangles = read_any_surface(source)
+    if source.suffix.lower() in CAD_READ and options.unit is None:
+        options = replace(options, unit="mm")  # the file says its unit: it is read in this one
+    points, triangles = read_any_surface(source, unit=options.unit or "mm")
     check_unit(points, options.unit, source)
     inputs = {"surface": source.name, "sha256": file_hash(source), "options": asdict(options)}
     if not again and (known := _finished(target, inputs)):
@@ -134,21 +137,25 @@ def mesh_into(
 # The surface
 
 
-def read_any_surface(path: Path) -> tuple[FloatArray, IntArray]:
-    """Return points and triangles of a surface file in its unit, as they are. Raises InputError."""
+def read_any_surface(path: Path, *, unit: str = "mm") -> tuple[FloatArray, IntArray]:
+    """Return points and triangles of a surface file in its unit, as they are; of a CAD file in the given one. Raises InputError."""
     if not path.is_file():
         raise InputError("no such surface", where=path, expected="an STL, OBJ, PLY or OFF file")
     if not path.stat().st_size:
         raise InputError("the file is empty", where=path, found="0 bytes", expected="an STL, OBJ, PLY or OFF file")
     if path.suffix.lower() in SURFACE_ENDINGS:
         return read_triangles(path)
+    if path.suffix.lower() in CAD_READ:
+        if unit not in PER_METRE:
+            raise InputError("unknown unit", where="--unit", found=unit, expected=" | ".join(PER_METRE))
+        return read_cad(path, unit)
     if path.suffix.lower() in CAD_ENDINGS:
         raise InputError(
-            "a CAD file, not triangles",
+            "a CAD file of a format that is not read",
             where=path,
             found=path.suffix,
-            expected="an STL, OBJ, PLY or OFF file",
-            hint="export it as STL from the CAD program, in mm",
+            expected="STEP, IGES, BREP, STL, OBJ, PLY or OFF",
+            hint="export it as STEP or STL from the CAD program",
         )
     content = read_content(path, str(path))
     points, cells = content.points, content.cells
@@ -393,6 +400,7 @@ def _check_target(target: Path) -> None:
             expected="a new folder, or one with robot.toml",
             hint="another -o",
         )
+    check_target(target, folder=True)
 
 
 def _finished(target: Path, inputs: dict[str, Any]) -> dict[str, Any] | None:

@@ -19,7 +19,8 @@ from femsense.fem.equilibrium import solve_equilibrium
 from femsense.fem.mesh import TetMesh, element_volumes, surface_triangles, to_linear
 from femsense.io import mesh_files
 from femsense.io.meshing import robot_from_surface
-from femsense.io.meshing.robot_from_surface import MeshOptions, fill, mesh_into, starter_text
+from femsense.io.meshing.robot_from_surface import MeshOptions, fill, mesh_into, read_any_surface, starter_text
+from femsense.io.meshing.surface import repaired
 from femsense.io.robot_toml import load_robot
 
 MM = MeshOptions(unit="mm", most_tets=1200)
@@ -291,7 +292,7 @@ def test_what_takes_too_long_is_stopped() -> None:
             stl_bytes(np.where(np.arange(108).reshape(12, 3, 3) == 40, np.nan, BOX.triangles)),
             "1 points, the first is number 13: [50",
         ),
-        ("part.step", b"ISO-10303-21;", "a CAD file, not triangles"),
+        ("part.x_t", b"**ABC", "a CAD file of a format that is not read"),
         ("other.xyz", b"1 2 3\n", "not readable as a mesh"),
     ],
 )
@@ -348,3 +349,31 @@ def test_other_folders_are_left_alone(tmp_path: Path) -> None:
 def test_formats(tmp_path: Path, ending: str) -> None:
     points, triangles = robot_from_surface.read_any_surface(write_box(tmp_path / f"block.{ending}"))
     assert np.ptp(points, axis=0).tolist() == [100, 30, 30] and len(triangles) == 12
+
+
+def write_step(path: Path) -> None:
+    """Write a plate of 60 × 20 × 10 mm with a hole of 8 mm, in a process of its own: Gmsh keeps state."""
+    import subprocess
+    import sys
+
+    text = f"""
+import gmsh
+gmsh.initialize(); gmsh.option.setNumber("General.Terminal", 0)
+box, hole = gmsh.model.occ.addBox(0, 0, 0, 60, 20, 10), gmsh.model.occ.addCylinder(30, 10, -5, 0, 0, 30, 4)
+gmsh.model.occ.cut([(3, box)], [(3, hole)]); gmsh.model.occ.synchronize(); gmsh.write({str(path)!r}); gmsh.finalize()
+"""
+    subprocess.run([sys.executable, "-c", text], check=True, capture_output=True, timeout=300)
+
+
+def test_a_step_file_says_its_unit(tmp_path: Path) -> None:
+    pytest.importorskip("gmsh")
+    write_step(tmp_path / "plate.step")
+    volume = 60 * 20 * 10 - np.pi * 16 * 10
+    for unit, scale in (("mm", 1.0), ("cm", 0.1)):
+        points, triangles = read_any_surface(tmp_path / "plate.step", unit=unit)
+        np.testing.assert_allclose(np.ptp(points, axis=0), scale * np.array([60.0, 20.0, 10.0]), rtol=1e-6)
+        surface = repaired(points, triangles, where="plate")
+        assert surface.volume == pytest.approx(scale**3 * volume, rel=2e-3) and not surface.done
+    (tmp_path / "cut.step").write_bytes((tmp_path / "plate.step").read_bytes()[:2000])
+    with pytest.raises(InputError, match="not readable as a CAD file"):
+        read_any_surface(tmp_path / "cut.step")

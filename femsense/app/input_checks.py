@@ -1,0 +1,85 @@
+"""Whether a recording can be one of a robot, before anything is computed: colours, extents and units of its clouds."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+
+from femsense.core.errors import FemsenseError
+from femsense.io.clouds.frame_clouds import read_frame_cloud
+from femsense.model.recording import Recording
+from femsense.model.robot import Robot
+from femsense.pointcloud.cloud import PointCloud
+
+CLOUDS_READ = 3
+"""So many clouds of a recording are looked at."""
+FAR_CLOUD = 10.0
+"""Clouds that are farther away than this [m] in the median are more likely in centimetres or millimetres: depth cameras see less far."""
+OTHER_UNIT = 5.0
+"""Clouds whose distance is so many times that of the markers of the same frame are in another unit."""
+
+
+def some_clouds(recording: Recording, *, most: int = CLOUDS_READ) -> list[tuple[int, int, PointCloud]]:
+    """Return frame, view and cloud of some frames that have one and whose file can be read."""
+    r = recording
+    having = [(k, v) for k in range(r.frame_count) for v in range(len(r.camera_names)) if r.cloud_files[k][v] is not None]
+    chosen = [having[i] for i in np.unique(np.linspace(0, len(having) - 1, most).astype(int))] if having else []
+    found = []
+    for k, v in chosen:
+        try:
+            cloud = read_frame_cloud(r, k, view=v)
+        except FemsenseError:
+            continue
+        found += [(k, v, cloud)] if cloud is not None else []
+    return found
+
+
+def cloud_problems(recording: Recording, *, robot: Robot | None = None) -> list[str]:
+    """Return what is wrong with the extents of a recording's clouds, against its markers and the robot."""
+    clouds = some_clouds(recording)
+    where = f"{recording.folder / 'clouds' if recording.folder else 'clouds'}"
+    if not clouds:
+        return []
+    full = [(k, v, cloud) for k, v, cloud in clouds if len(cloud)]
+    if not full:
+        return [f"{where}: the clouds of {len(clouds)} frames that were read have no points"]
+    distance = float(np.median([np.median(np.linalg.norm(cloud.points, axis=1)) for _, _, cloud in full]))
+    seen = [_marker_distance(recording, k, v) for k, v, _ in full]
+    markers = float(np.median([d for d in seen if d is not None])) if any(d is not None for d in seen) else None
+    if markers is not None and not 1 / OTHER_UNIT < distance / markers < OTHER_UNIT:
+        return [
+            f"{where}: clouds {distance:.4g} m away, markers {markers:.4g} m: {_likely(distance / markers)}; clouds are in metres"
+        ]
+    if distance > FAR_CLOUD:
+        return [
+            f"{where}: clouds {distance:.4g} m away are not what a depth camera sees: {_likely(distance / 0.5)}; clouds are in metres"
+        ]
+    extent = max(float(np.ptp(cloud.points, axis=0).max()) for _, _, cloud in full)
+    if robot is not None:
+        size = float(np.ptp(robot.body.mesh.nodes, axis=0).max())
+        if extent < 0.1 * size:
+            return [f"{where}: the clouds are {1e3 * extent:.4g} mm across, the robot {1e3 * size:.4g} mm: are they in metres?"]
+    return []
+
+
+def warn_of_clouds(robot: Robot, recording: Recording) -> None:
+    """Warn of clouds that cannot be the robot's as they are, and of colours that are missing."""
+    for text in cloud_problems(recording, robot=robot):
+        warnings.warn(text, stacklevel=3)
+    clouds = some_clouds(recording)
+    if robot.color_rgb is not None and clouds and all(cloud.colors is None for _, _, cloud in clouds):
+        where = recording.folder or "the recording"
+        text = "the robot declares a colour, but the clouds have none: the robot is told from what touches it by its shape alone"
+        warnings.warn(f"{where}: {text}, and contacts found by clouds are doubtful", stacklevel=3)
+
+
+def _marker_distance(recording: Recording, k: int, view: int) -> float | None:
+    mine = (recording.marker_frame == k) & (recording.marker_view == view)
+    return float(np.median(np.linalg.norm(recording.marker_xyz[mine], axis=1))) if mine.any() else None
+
+
+def _likely(ratio: float) -> str:
+    names = {1e3: "are they in millimetres?", 1e2: "are they in centimetres?", 39.37: "are they in inches?"}
+    nearest = min(names, key=lambda factor: abs(np.log(ratio / factor)))
+    return names[nearest] if abs(np.log(ratio / nearest)) < 0.8 else "are they in another unit?"
