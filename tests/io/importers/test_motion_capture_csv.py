@@ -212,9 +212,11 @@ def test_an_offset_that_is_given(tmp_path: Path) -> None:
         imported(moving, tmp_path / "far", Options(unit="m"), log=log, offset=0.0, actuation="tension")
 
 
-def test_motion_that_tells_no_offset_is_said(tmp_path: Path) -> None:
+@pytest.mark.parametrize("motion", [0.0, 0.02])
+def test_motion_that_tells_no_offset_is_said(motion: float, tmp_path: Path) -> None:
+    """Noise alone; and 5 mm of noise on 20 mm of motion, whose best correlation is right and only 0.45."""
     rng = np.random.default_rng(0)
-    rows = [f"{0.01 * k},{x},0,1" for k, x in enumerate(rng.normal(size=800) * 0.001)]
+    rows = [f"{1 + 0.01 * k},{motion * drive(1 + 0.01 * k) + x},0,1" for k, x in enumerate(rng.normal(size=800) * 0.005)]
     (tmp_path / "a.csv").write_text("\n".join(["time,tip_x,tip_y,tip_z", *rows]))
     log = read_actuation_log(log_file(tmp_path / "log.csv", 0.0), Options())
     with pytest.raises(InputError, match="does not tell the offset") as caught:

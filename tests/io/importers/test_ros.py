@@ -160,8 +160,9 @@ def test_the_points_of_a_fisheye_depth_camera(tmp_path: Path) -> None:
 
 def test_the_points_of_a_depth_camera_with_the_sdks_inverse_lens(tmp_path: Path) -> None:
     """Two pixels at 1 m as `rs2_deproject_pixel_to_point` of pyrealsense2 2.57.7 and 2.59.1 gives them."""
-    d = (0.12, -0.2, 0.003, -0.002, 0.05)
+    d = (0.12, -0.2, 0.03, -0.02, 0.05)
     depth = np.zeros((HEIGHT, WIDTH), dtype=np.uint16)
+    depth[0, 0] = 65535
     depth[7, 5] = depth[40, 60] = 1000
     with BagWriter(tmp_path / "take", "mcap") as bag:
         bag.write("/depth/image_raw", START_NS, bag.image(depth, "16UC1", START_NS))
@@ -169,7 +170,7 @@ def test_the_points_of_a_depth_camera_with_the_sdks_inverse_lens(tmp_path: Path)
     recording, _ = imported(tmp_path / "take", tmp_path)
     cloud = read_frame_cloud(recording, 0)
     assert cloud is not None
-    np.testing.assert_allclose(cloud.points, [[-0.51902, -0.31836, 1], [0.56041, 0.31641, 1]], atol=2e-5)
+    np.testing.assert_allclose(cloud.points, [[-0.512157, -0.327936, 1], [0.570252, 0.306582, 1]], atol=2e-6)
 
 
 def test_colours_of_another_camera_by_static_transforms(tmp_path: Path) -> None:
@@ -222,6 +223,18 @@ def test_stamps_that_are_no_clock_are_not_used(tmp_path: Path) -> None:
     recording, found = imported(tmp_path / "take.bag", tmp_path)
     assert found["clock"] == "record"
     np.testing.assert_allclose(recording.time_s, 1e-9 * STEP_NS * np.arange(FRAMES), atol=1e-6)
+
+
+def test_stamps_of_another_clock_are_not_used(tmp_path: Path) -> None:
+    """A driver that counts from its start, and commands without stamps: one clock serves both."""
+    with BagWriter(tmp_path / "take", "mcap") as bag:
+        for k in range(FRAMES):
+            at = START_NS + k * STEP_NS
+            bag.write("/points", at, bag.cloud(np.ones((4, 3)), None, 10**9 + k * STEP_NS))
+            bag.write("/commands", at, bag.array([float(k)]))
+    recording, found = imported(tmp_path / "take", tmp_path, actuation="tension")
+    assert found["clock"] == "record"
+    np.testing.assert_allclose(recording.inputs[:, 0], np.arange(FRAMES), atol=1e-4)
 
 
 def test_header_stamps_win_over_the_jitter_of_recording(tmp_path: Path) -> None:
