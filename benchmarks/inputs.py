@@ -2,7 +2,7 @@
 
     python benchmarks/inputs.py [--frames 120] [--size 640x480] [--formats rosbag1,mcap,…] [--folder DIR]
 
-Each file is written by the format's own writer, then imported twice in a process of its own: as it is, and four times as long. The
+Seconds are of processor time. Each file is written by the format's own writer, then imported twice in a process of its own: as it is, and four times as long. The
 peak memory of both says whether it grows with the length. "Other" is the time in which another reader decodes the same frames into
 arrays without writing anything: rosbags for bags, ezc3d for C3D, Open3D for clouds and images.
 """
@@ -157,7 +157,7 @@ def size_of(path: Path) -> int:
 
 
 def import_alone(path: Path, output: Path, options: dict[str, str]) -> dict[str, float]:
-    """Import in a process of its own; return frames, seconds and peak memory [MB] beyond what the imports alone take."""
+    """Import in a process of its own; return frames, seconds of processor time and peak memory [MB] beyond what the imports alone take."""
     command = [sys.executable, __file__, "--import", str(path), str(output), json.dumps(options)]
     done = subprocess.run(command, check=True, capture_output=True, text=True)
     return json.loads(done.stdout.splitlines()[-1])
@@ -169,9 +169,9 @@ def run_import(path: str, output: str, options: str) -> None:
     from femsense.io.importers.writer import write_recording
 
     base = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    began = time.perf_counter()
+    began = time.process_time()
     found = write_recording(open_source(path, Options(**json.loads(options))), output, identity={})
-    seconds = time.perf_counter() - began
+    seconds = time.process_time() - began
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - base
     print(json.dumps({"frames": found["frames"], "seconds": seconds, "peak_mb": peak / 1024}))
 
@@ -188,9 +188,9 @@ def row_of(name: str, frames: int, size: tuple[int, int], folder: Path) -> str:
     long = results[1]
     beside = "–"
     if other is not None:
-        began = time.perf_counter()
+        began = time.process_time()
         count = other(path)
-        beside = f"{count / (time.perf_counter() - began):.0f}"
+        beside = f"{count / (time.process_time() - began):.0f}"
     speed, rate = long["frames"] / long["seconds"], 1e-6 * stored / long["seconds"]
     memory = f"{results[0]['peak_mb']:.0f} / {long['peak_mb']:.0f}"
     return f"| {name} | {writer} | {1e-6 * stored:.1f} | {long['frames']} | {speed:.0f} | {rate:.1f} | {memory} | {beside} |"

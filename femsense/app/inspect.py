@@ -415,7 +415,7 @@ def _recording(path: Path, report: Report, problems: list[str]) -> None:
             return
     loaded = load_recording(folder)
     report.update(_recording_report(loaded))
-    if not loaded.has_clouds and not loaded.has_markers:
+    if not loaded.has_clouds and not loaded.has_markers and not len(loaded.unnamed_frame):
         problems.append(f"{folder}: neither markers nor clouds: nothing was measured")
     _check_clouds(loaded, report, problems)
     _warn_of_unmatched(loaded, folder)

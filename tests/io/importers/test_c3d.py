@@ -68,7 +68,7 @@ def test_a_genuine_file_becomes_a_recording_with_its_gaps(tmp_path: Path) -> Non
     recording = load_recording(tmp_path / "out")
     assert recording.frame_count == 3361 and len(recording.marker_names) == 12
     assert found["rate_hz"] == pytest.approx(160, rel=1e-6) and found["unit"] == "mm"
-    assert max(found["missing_share"].values()) > 0
+    assert max(row["share"] for row in found["missing"]) > 0
     assert 0.5 < np.ptp(recording.marker_xyz, axis=0).max() < 20
 
 

@@ -82,7 +82,7 @@ def test_nexus(tmp_path: Path) -> None:
     assert recording.marker_names == ("base", "tip") and recording.frame_count == 3
     np.testing.assert_allclose(marker_grid(recording)[:, 1], [[0.1, 0.2, 0.3], [np.nan] * 3, [0.1, 0.2, 0.31]])
     np.testing.assert_allclose(recording.time_s, [0, 0.01, 0.02])
-    assert found["missing_share"] == {"tip": pytest.approx(1 / 3)}
+    assert found["missing"] == [{"marker": "tip", "share": pytest.approx(1 / 3)}]
 
 
 def test_a_header_by_mapping_names_and_units(tmp_path: Path) -> None:
