@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from femsense.core.errors import InputError
 from femsense.io.importers.actuation import read_actuation_log
 from femsense.io.importers.frames import UNITS, Options
 from femsense.io.importers.guess import open_source
+from femsense.io.importers.plain_csv import header_of
 from femsense.io.importers.writer import RECORD, write_recording
 
 Progress = Callable[..., None]
@@ -87,8 +88,8 @@ def import_into(
     if known is not None:
         say(f"{final} holds this import already (--again makes it anew)")
         return known
-    source = open_source(source_path, options)
     log = None if actuation is None else read_actuation_log(actuation, options)
+    source = open_source(source_path, options if actuation is None else _without_log(options, Path(actuation)))
     found = write_recording(
         source,
         final,
@@ -112,6 +113,12 @@ def import_text(folder: str | Path, document: Mapping[str, Any]) -> str:
     lines = [f"{folder}: a recording of {document['frames']} frames", "", *section_text(shown)]
     lines += ["", *(f"note: {note}" for note in notes)] if notes else []
     return "\n".join(lines)
+
+
+def _without_log(options: Options, log: Path) -> Options:
+    """Return the options without the mappings that are about columns of the log of actuation."""
+    of_log, _ = header_of(log)
+    return replace(options, columns={old: new for old, new in options.columns.items() if old not in of_log})
 
 
 def _identity(

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -94,6 +97,52 @@ def test_what_is_no_import_is_never_replaced(table: Path, tmp_path: Path, capsys
 def test_wrong_words(words: tuple[str, ...], said: str, table: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     status, document = answer(capsys, "import", table, "-o", tmp_path / "out", *words)
     assert status == 2 and said in document["error"]
+
+
+def test_a_missing_package_gives_the_line_that_installs_it(
+    tmp_path: Path, table: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("rosbags", "rosbags.highlevel", "rosbags.typesys", "mcap", "mcap.stream_reader"):
+        monkeypatch.setitem(sys.modules, name, None)
+    (tmp_path / "a.bag").write_bytes(b"#ROSBAG V2.0\n" + bytes(100))
+    status, document = answer(capsys, "import", tmp_path / "a.bag", "-o", tmp_path / "bag")
+    assert status == 2 and "pip install 'femsense[ros]'" in document["error"]
+    assert answer(capsys, "import", table, "-o", tmp_path / "out", "--unit", "mm", "--inputs", "tension")[0] == 0
+
+
+def test_a_log_beside_a_table_with_mappings_for_both(tmp_path: Path, table: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "log.csv").write_text("time_s,m1\n" + "".join(f"{0.05 * k},{k}\n" for k in range(20)))
+    words = (
+        "--map",
+        "m1=cable_south*2",
+        "cable_north=tip2.x",
+        "tip_y=tip2.y",
+        "tip_z=tip2.z",
+        "--actuation",
+        tmp_path / "log.csv",
+        "--offset",
+        "0",
+    )
+    status, document = answer(capsys, "import", table, "-o", tmp_path / "out", "--unit", "mm", "--inputs", "tension", *words)
+    assert status == 0 and document["inputs"] == ["cable_south"] and document["markers"] == ["tip2"]
+    np.testing.assert_allclose(load_recording(tmp_path / "out").inputs[:, 0], 4 * np.arange(5), atol=1e-9)
+
+
+def test_a_run_that_is_killed_goes_on(tmp_path: Path) -> None:
+    """`kill -9` in the middle: nothing at the final place, and the same command ends with the same files."""
+    rows = "".join(f"{0.01 * k},{k % 50},0,1000\n" for k in range(200_000))
+    (tmp_path / "long.csv").write_text("time,tip_x,tip_y,tip_z\n" + rows)
+    command = [sys.executable, "-m", "femsense", "import", str(tmp_path / "long.csv"), "--unit", "mm", "-o"]
+    process = subprocess.Popen([*command, str(tmp_path / "out")], stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+    journal = tmp_path / ".part-import-out/.import-journal"
+    while process.poll() is None and not (journal.is_file() and journal.stat().st_size > 200_000):
+        time.sleep(0.01)
+    process.kill()
+    assert process.wait() == -9 and not (tmp_path / "out").exists()
+    for name in ("out", "whole"):
+        subprocess.run([*command, str(tmp_path / name)], check=True, capture_output=True)
+    assert (tmp_path / "out/markers.csv").read_bytes() == (tmp_path / "whole/markers.csv").read_bytes()
+    assert json.loads((tmp_path / "out/import.json").read_text())["found"]["resumed"] > 0
 
 
 def test_inspect_says_what_is_in_a_capture_and_never_that_nothing_is_wrong(

@@ -21,11 +21,13 @@ LENS = (50.0, 51.0, 31.5, 23.5)
 class BagWriter:
     """Writes messages of one kind of bag: "1" (.bag), "sqlite3" or "mcap" (folders of ROS 2)."""
 
-    def __init__(self, path: Path, kind: str) -> None:
+    def __init__(self, path: Path, kind: str, *, chunk: int | None = None) -> None:
         self.kind = kind
         self.store = get_typestore(Stores.ROS1_NOETIC if kind == "1" else Stores.ROS2_HUMBLE)
         plugins = {"sqlite3": StoragePlugin.SQLITE3, "mcap": StoragePlugin.MCAP}
         self.writer: Any = Writer1(path) if kind == "1" else Writer2(path, version=8, storage_plugin=plugins[kind])
+        if chunk is not None and kind == "1":
+            self.writer.chunk_threshold = chunk
         self.connections: dict[str, Any] = {}
 
     def __enter__(self) -> BagWriter:

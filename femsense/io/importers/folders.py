@@ -16,7 +16,7 @@ from femsense.core.errors import InputError
 from femsense.io.clouds.cloud_files import read_cloud
 from femsense.io.clouds.images import png_header, read_png
 from femsense.io.importers.frames import Frame, Images, Lens, Options, Source, unit_of
-from femsense.io.importers.pictures import NO_DEPTH, decoded_image
+from femsense.io.importers.pictures import decoded_image
 from femsense.pointcloud.cloud import PointCloud
 
 CLOUDS = (".ply", ".pcd", ".xyz", ".npy", ".npz")
@@ -143,7 +143,6 @@ def _images(depth: Path, color: Path | None) -> Images:
         raise InputError(
             "not a depth image", where=depth, found=f"{image.dtype}, shape {image.shape}", expected="one channel of 16 bits"
         )
-    image = np.where(image == NO_DEPTH, 0, image).astype(np.uint16)
     if color is None or not color.is_file():
         return Images(image)
     pixels = decoded_image(color.read_bytes(), color)

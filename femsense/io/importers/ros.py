@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,19 +16,25 @@ from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.io.importers.frames import Frame, Images, Options, Source, upright
 from femsense.io.importers.lens import depth_points, pixel_rays, registered_color
-from femsense.io.importers.pictures import FINE_UNIT, depth_of_metres
-from femsense.io.importers.plain_csv import split_factor
+from femsense.io.importers.pictures import depth_of_metres
 from femsense.io.importers.ros_bag import Bag, Message, open_bag
-from femsense.io.importers.ros_messages import cloud_of, compressed_image, markers_of, place, raw_image, red_first, stamp_of
-from femsense.io.importers.ros_topics import Choice, Stream, choose, streams_of, transform_between, transforms_of
+from femsense.io.importers.ros_messages import cloud_of, compressed_image, markers_of, place, raw_image, red_first
+from femsense.io.importers.ros_plan import (
+    LAG_S,
+    Plan,
+    chosen_streams,
+    clock_of,
+    device_time,
+    header_time,
+    is_sdk,
+    named_values,
+    plan_of,
+)
+from femsense.io.importers.ros_topics import choose, streams_of
 from femsense.pointcloud.cloud import PointCloud
 
-LAG_S = 0.5
-"""A message is written at most this much later than others of its moment."""
 NEAR_S = 0.05
 """A picture or a marker belongs to a frame if it is at most this far from it in time."""
-PEEKED = 50
-"""So many first messages of a topic say whether its header stamps are a clock."""
 
 
 def open_ros(path: Path, options: Options) -> Source:
@@ -40,19 +46,19 @@ def open_ros(path: Path, options: Options) -> Source:
     with open_bag(path) as bag:
         streams = streams_of(bag)
         choice = choose(bag, streams, options)
-        clock = _clock(bag, choice, options)
-        plan = _plan(bag, choice, options, clock)
+        clock = clock_of(bag, choice, options)
+        plan = plan_of(bag, choice, options, clock)
     choice = plan.choice
     found = {
         "clock": clock,
-        "topics": [{"topic": s.topic.name, "messages": s.topic.count} for s in _chosen(choice)],
-        "not_taken": [s.topic.name for s in streams if s.kind != "other" and s not in _chosen(choice)] or None,
+        "topics": [{"topic": s.topic.name, "messages": s.topic.count} for s in chosen_streams(choice)],
+        "not_taken": [s.topic.name for s in streams if s.kind != "other" and s not in chosen_streams(choice)] or None,
         "depth_unit_m": plan.unit if choice.lens else None,
         "lens": None if choice.lens is None else f"{choice.lens.width} × {choice.lens.height}, {choice.lens.model}",
         "camera_frame": choice.primary.frame or None,
     }
     return Source(
-        "realsense" if _is_sdk(choice.primary.topic.name) else "ros",
+        "realsense" if is_sdk(choice.primary.topic.name) else "ros",
         path,
         partial(_frames, path, plan),
         found={key: value for key, value in found.items() if value is not None},
@@ -73,22 +79,6 @@ def list_ros(path: Path) -> dict[str, Any]:
             if s.kind != "other"
         ]
         return {"topics": rows, "other_topics": sum(t.count > 0 for t in bag.topics) - len(rows)}
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class _Plan:
-    choice: Choice
-    clock: str
-    unit: float
-    actuation: str | None
-    columns: dict[str, dict[str, tuple[str, str, float]]]
-    """Topic → name of a value → (column, field, factor)."""
-    load_points: dict[str, list[float]]
-    T_camera_markers: dict[str, FloatArray]
-    metadata: dict[str, str]
-    """Topic of a stream's metadata → its images, where the SDK keeps the device's times there."""
-    up: str | None
-    notes: tuple[str, ...]
 
 
 @dataclass(eq=False, slots=True)
@@ -136,13 +126,15 @@ class _Track:
         return (1 - share) * np.asarray(self.values[after - 1]) + share * np.asarray(self.values[after])
 
 
-def _frames(path: Path, plan: _Plan) -> Iterator[Frame]:
+def _frames(path: Path, plan: Plan) -> Iterator[Frame]:
     """Read the bag once, in the order in which it was written; hold back what is younger than LAG_S."""
     choice, rays = plan.choice, None
     if choice.lens is not None:
         rays = pixel_rays(choice.lens)
     primary = choice.primary.topic.name
-    tracks: dict[str, _Track] = {s.topic.name: _Track() for s in _chosen(choice) if plan.metadata or s is not choice.primary}
+    tracks: dict[str, _Track] = {
+        s.topic.name: _Track() for s in chosen_streams(choice) if plan.metadata or s is not choice.primary
+    }
     waiting: deque[tuple[float, Message, Any]] = deque()
     with open_bag(path) as bag:
         for message in bag.messages([primary, *tracks, *plan.metadata]):
@@ -158,29 +150,29 @@ def _frames(path: Path, plan: _Plan) -> Iterator[Frame]:
 
 
 def _take(
-    bag: Bag, plan: _Plan, message: Message, primary: str, tracks: dict[str, _Track], waiting: deque[tuple[float, Message, Any]]
+    bag: Bag, plan: Plan, message: Message, primary: str, tracks: dict[str, _Track], waiting: deque[tuple[float, Message, Any]]
 ) -> None:
     lazy = plan.choice.lens is not None or plan.choice.primary.kind == "cloud"
     if message.topic in plan.metadata:
-        tracks[plan.metadata[message.topic]].stamp(message.record, _device_time(bag.decode(message)))
+        tracks[plan.metadata[message.topic]].stamp(message.record, device_time(bag.decode(message)))
         return
     if message.topic == primary:
         needed = None if lazy and plan.clock != "header" else bag.decode(message)
-        time = message.record if needed is None or plan.clock != "header" else _header_time(needed, message)
+        time = message.record if needed is None or plan.clock != "header" else header_time(needed, message)
         waiting.append((time, message, None if lazy else needed))
         return
     if plan.choice.color is not None and message.topic == plan.choice.color.topic.name:
-        time = message.record if plan.clock != "header" else _header_time(bag.decode(message), message)
+        time = message.record if plan.clock != "header" else header_time(bag.decode(message), message)
         tracks[message.topic].add(time, message)
         return
     decoded = bag.decode(message)
-    time = message.record if plan.clock != "header" else _header_time(decoded, message)
+    time = message.record if plan.clock != "header" else header_time(decoded, message)
     value = decoded if message.topic in plan.T_camera_markers else _values(plan, message, decoded)
     tracks[message.topic].add(time, value)
 
 
 def _frame(
-    bag: Bag, plan: _Plan, time: float, message: Message, decoded: Any, tracks: dict[str, _Track], rays: FloatArray | None
+    bag: Bag, plan: Plan, time: float, message: Message, decoded: Any, tracks: dict[str, _Track], rays: FloatArray | None
 ) -> Frame:
     choice = plan.choice
     for track in tracks.values():
@@ -202,7 +194,7 @@ def _frame(
     return Frame(time if device is None else device, picture, markers=named, unlabelled=unnamed, inputs=inputs, loads=loads)
 
 
-def _images(bag: Bag, plan: _Plan, message: Message, color: Message | None, rays: FloatArray | None) -> Images | PointCloud:
+def _images(bag: Bag, plan: Plan, message: Message, color: Message | None, rays: FloatArray | None) -> Images | PointCloud:
     choice = plan.choice
     where = f"{bag.path}, topic {message.topic}"
     image, encoding = _pixels(bag, message)
@@ -240,7 +232,7 @@ def _cloud(bag: Bag, message: Message) -> PointCloud:
 
 
 def _markers(
-    plan: _Plan, time: float, message: Message, decoded: Any, tracks: dict[str, _Track]
+    plan: Plan, time: float, message: Message, decoded: Any, tracks: dict[str, _Track]
 ) -> tuple[dict[str, Any], list[Any]]:
     named: dict[str, Any] = {}
     unnamed: list[Any] = []
@@ -257,7 +249,7 @@ def _markers(
     return named, unnamed
 
 
-def _inputs(plan: _Plan, time: float, message: Message, decoded: Any, tracks: dict[str, _Track]) -> dict[str, float]:
+def _inputs(plan: Plan, time: float, message: Message, decoded: Any, tracks: dict[str, _Track]) -> dict[str, float]:
     found: dict[str, float] = {}
     for stream in plan.choice.inputs:
         name = stream.topic.name
@@ -267,168 +259,10 @@ def _inputs(plan: _Plan, time: float, message: Message, decoded: Any, tracks: di
     return found
 
 
-def _values(plan: _Plan, message: Message, decoded: Any) -> FloatArray:
+def _values(plan: Plan, message: Message, decoded: Any) -> FloatArray:
     """Return the inputs of a message in the order of its columns, or the force of a wrench [N]."""
     if message.type.endswith("WrenchStamped"):
         return np.array(place(decoded.wrench.force))
     columns = plan.columns[message.topic]
-    given = _named_values(decoded, message.type)
+    given = named_values(decoded, message.type)
     return np.array([factor * given.get((name, fld), np.nan) for name, (_, fld, factor) in columns.items()])
-
-
-def _named_values(decoded: Any, kind: str) -> dict[tuple[str, str], float]:
-    """Return (name, field) → value of a message of inputs."""
-    if kind.endswith("FluidPressure"):
-        return {("pressure", ""): float(decoded.fluid_pressure)}
-    if not kind.endswith("JointState"):
-        return {(str(i), ""): float(value) for i, value in enumerate(decoded.data)}
-    return {
-        (name, fld): float(values[i])
-        for fld in ("position", "velocity", "effort")
-        for values in [getattr(decoded, fld)]
-        for i, name in enumerate(decoded.name)
-        if i < len(values)
-    }
-
-
-# What is planned before the frames are read
-
-
-def _plan(bag: Bag, choice: Choice, options: Options, clock: str) -> _Plan:
-    notes = list(choice.notes)
-    columns, fields = {}, set[str]()
-    for stream in choice.inputs:
-        columns[stream.topic.name], taken = _input_columns(bag, stream, options)
-        fields |= taken
-    actuation = {frozenset({"effort"}): "tension", frozenset({"position"}): "displacement"}.get(frozenset(fields - {""}))
-    points = {}
-    for stream in choice.loads:
-        target = options.columns.get(stream.topic.name, "")
-        if target.startswith("load@"):
-            points[stream.topic.name] = _load_point(target)
-            notes.append(f"the forces of {stream.topic.name} (frame {stream.frame or '–'}) are taken in the robot's axes")
-        else:
-            notes.append(
-                f"the wrenches of {stream.topic.name} are left out: --map {stream.topic.name}=load@X,Y,Z says where they act"
-            )
-    poses = _marker_poses(bag, choice, notes)
-    used = [s for s in choice.markers if s.topic.name in poses]
-    choice = replace(choice, markers=tuple(used), loads=tuple(s for s in choice.loads if s.topic.name in points))
-    unit = FINE_UNIT if choice.primary.encoding.startswith("32FC1") else choice.depth_unit_m
-    return _Plan(choice, clock, unit, actuation, columns, points, poses, _metadata(bag, choice, clock), options.up, tuple(notes))
-
-
-def _input_columns(bag: Bag, stream: Stream, options: Options) -> tuple[dict[str, tuple[str, str, float]], set[str]]:
-    """Return name in the message → (column, field, factor), and the fields that are used."""
-    topic = stream.topic.name
-    first = next(bag.messages([topic]), None)
-    given = {} if first is None else _named_values(bag.decode(first), stream.topic.type)
-    names = list(dict.fromkeys(name for name, _ in given))
-    columns: dict[str, tuple[str, str, float]] = {}
-    for name in names:
-        available = [fld for n, fld in given if n == name]
-        usual = next(
-            (fld for fld in ("effort", "position", "") if fld in available and (fld != "effort" or given[name, fld] != 0.0)),
-            available[0],
-        )
-        for key in (f"{name}.{usual}", name, f"{topic}.{name}", *(f"{name}.{fld}" for fld in available)):
-            if key in options.columns:
-                column, factor = split_factor(options.columns[key])
-                fld = key.rpartition(".")[2] if key.rpartition(".")[2] in available else usual
-                columns[name] = (column, fld, factor)
-    if not columns and not any(key in options.columns for key in names):
-        prefix = "chamber_" if stream.topic.type.endswith("FluidPressure") else "cable_"
-        for name in names:
-            usual = "effort" if any(given.get((n, "effort"), 0.0) for n in names) else "position"
-            fld = usual if (name, usual) in given else next(f for n, f in given if n == name)
-            columns[name] = (name if name.startswith(("cable_", "chamber_")) else prefix + name, fld, 1.0)
-    return columns, {fld for _, fld, _ in columns.values()}
-
-
-def _load_point(target: str) -> list[float]:
-    try:
-        values = [float(part) for part in target.removeprefix("load@").split(",")]
-    except ValueError:
-        values = []
-    if len(values) != 3:
-        raise InputError(
-            "not a place of a load", where="--map", found=target, expected="load@X,Y,Z: metres on the body at rest, robot frame"
-        )
-    return values
-
-
-def _marker_poses(bag: Bag, choice: Choice, notes: list[str]) -> dict[str, FloatArray]:
-    """Return T_camera_markers of the topics of markers that can be had in the camera's frame."""
-    target, poses = choice.primary.frame, {}
-    tree = transforms_of(bag) if choice.markers else {}
-    for stream in choice.markers:
-        T = np.eye(4) if stream.frame == target else transform_between(tree, target, stream.frame)
-        if T is None:
-            notes.append(
-                f"the markers of {stream.topic.name} are left out: no static transform joins {stream.frame!r} and {target!r}"
-            )
-        else:
-            poses[stream.topic.name] = T
-    return poses
-
-
-def _clock(bag: Bag, choice: Choice, options: Options) -> str:
-    """Return whose time stamps are used.
-
-    "metadata" where the RealSense SDK keeps the device's time there; "header" where the stamps of all streams with a header go on
-    like the time of recording (those of the SDK may count from elsewhere); else "record".
-    """
-    if options.clock in ("header", "record"):
-        return options.clock
-    sdk = _is_sdk(choice.primary.topic.name)
-    if sdk and _metadata(bag, choice, "metadata"):
-        return "metadata"
-    for stream in _chosen(choice):
-        if stream.topic.type.endswith("MultiArray"):
-            continue
-        shifts, last = [], -np.inf
-        for message, _ in zip(bag.messages([stream.topic.name]), range(PEEKED)):
-            try:
-                time, _ = stamp_of(bag.decode(message))
-            except InputError:
-                continue  # told when the frames are read
-            if time <= 0.0 or time < last:
-                return "record"
-            last = time
-            shifts.append(message.record - time)
-        if shifts and not sdk and (np.ptp(shifts) > LAG_S or abs(float(np.median(shifts))) > LAG_S):
-            return "record"
-    return "header"
-
-
-def _metadata(bag: Bag, choice: Choice, clock: str) -> dict[str, str]:
-    """Return topic of metadata → topic of images where the first of them holds a time of the device."""
-    if clock != "metadata":
-        return {}
-    names = {t.name: t.type for t in bag.topics}
-    pictures = [s.topic.name for s in (choice.primary, choice.color) if s is not None]
-    found = {f"{name.split('/image/')[0]}/image/metadata": name for name in pictures}
-    firsts = [next(bag.messages([topic]), None) for topic in found if names.get(topic) == "std_msgs/msg/String"]
-    told = [first is not None and _device_time(bag.decode(first)) is not None for first in firsts]
-    return found if told and len(told) == len(found) and all(told) else {}
-
-
-def _device_time(decoded: Any) -> float | None:
-    """Return the device's time [s] in the text of an image's metadata; None where it holds none."""
-    parts = dict(part.split("=", 1) for part in str(decoded.data).split(";") if "=" in part)
-    return 1e-3 * float(parts["timestamp"]) if "timestamp" in parts else None
-
-
-def _header_time(decoded: Any, message: Message) -> float:
-    time, _ = stamp_of(decoded)
-    return time if time > 0.0 else message.record
-
-
-def _chosen(choice: Choice) -> list[Stream]:
-    chosen = [choice.primary, *choice.markers, *choice.inputs, *choice.loads]
-    chosen += [choice.color] if choice.color is not None else []
-    return list({s.topic.name: s for s in chosen}.values())
-
-
-def _is_sdk(name: str) -> bool:
-    return name.startswith("/device_") and "/sensor_" in name

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import struct
 import warnings
 from collections.abc import Collection, Iterator
@@ -13,6 +14,7 @@ from typing import Any
 
 from femsense.core.errors import InputError
 from femsense.io.importers.frames import need
+from femsense.io.importers.ros_recovery import RecoveredReader
 
 ENDINGS = (".bag", ".db3", ".mcap")
 IMAGE = "sensor_msgs/msg/Image"
@@ -95,11 +97,29 @@ def open_bag(path: Path) -> Iterator[Bag]:
     except InputError:
         raise
     except Exception as error:  # rosbags raises what zlib, sqlite, YAML and struct raise, beside its own
-        raise _unreadable(path, error) from None
+        reader = _recovered(path, error)
     try:
         yield Bag(path, reader)
     finally:
         reader.close()
+
+
+def _recovered(path: Path, error: Exception) -> RecoveredReader:
+    """Return a reader of what comes before the break, with a warning; InputError where there is nothing."""
+    single = path if path.is_file() else None
+    with path.open("rb") if single else contextlib.nullcontext() as stream:
+        head = stream.read(12) if stream is not None else b""
+    if not head.startswith((b"#ROSBAG V2.0", b"\x89MCAP0")):
+        raise _unreadable(path, error) from None
+    try:
+        reader = RecoveredReader(path)
+    except InputError:
+        raise _unreadable(path, error) from None
+    warnings.warn(
+        f"{path}: the file is broken or was not closed ({_line(error)}); {reader.count} messages before the break are read",
+        stacklevel=3,
+    )
+    return reader
 
 
 def _files(path: Path) -> list[Path]:

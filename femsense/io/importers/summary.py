@@ -33,6 +33,7 @@ def summary(source: Source, journal: Journal, counts: Mapping[str, int]) -> dict
         "longest_gap_s": float(gaps.max()) if len(gaps) else None,
         "frames_missing": int(np.rint(gaps / usual - 1).sum()) if usual else 0,
         "dropped_out_of_order": counts["out_of_order"],
+        "resumed": counts["resumed"] or None,
         **_pictures(journal),
         **_markers(journal),
         **source.found,
@@ -75,7 +76,8 @@ def _markers(journal: Journal) -> dict[str, Any]:
     return {
         "markers": sorted(seen),
         "unlabelled_markers": most or None,
-        "missing_share": {name: 1 - count / frames for name, count in sorted(seen.items()) if count < frames},
+        "missing": [{"marker": name, "share": 1 - count / frames} for name, count in sorted(seen.items()) if count < frames]
+        or None,
         "span_m": (high - low).tolist(),
         "label_exchanges": len(swaps.found),
         "loads": loads or None,

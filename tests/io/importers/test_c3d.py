@@ -68,7 +68,7 @@ def test_a_genuine_file_becomes_a_recording_with_its_gaps(tmp_path: Path) -> Non
     recording = load_recording(tmp_path / "out")
     assert recording.frame_count == 3361 and len(recording.marker_names) == 12
     assert found["rate_hz"] == pytest.approx(160, rel=1e-6) and found["unit"] == "mm"
-    assert max(found["missing_share"].values()) > 0
+    assert max(row["share"] for row in found["missing"]) > 0
     assert 0.5 < np.ptp(recording.marker_xyz, axis=0).max() < 20
 
 
@@ -152,5 +152,5 @@ def _by_hand(processor: int) -> bytes:
     block = bytes([1, 0x50, 1, processor])
     block += bytes([5, 255]) + b"POINT" + word(3) + b"\0"
     block += parameter(1, "LABELS", -1, (2, 1), b"AB") + parameter(1, "UNITS", -1, (2,), b"mm") + b"\0\0"
-    frames = b"".join(map(real, (100.0, 200.0, -300.0, 0.0))) + b"".join(map(real, (0.0, 0.0, 0.0, -1.0)))
+    frames = b"".join(map(real, (100.0, 200.0, -300.0, 0.0))) + b"".join(map(real, (1.0, 2.0, 3.0, -1.0)))
     return head.ljust(512, b"\0") + block.ljust(512, b"\0") + frames.ljust(512, b"\0")

@@ -1,0 +1,195 @@
+"""What is settled before the frames of a bag are read: columns, clock, loads, where markers stand."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from femsense.core.arrays import FloatArray
+from femsense.core.errors import InputError
+from femsense.io.importers.frames import Options
+from femsense.io.importers.pictures import FINE_UNIT
+from femsense.io.importers.plain_csv import split_factor
+from femsense.io.importers.ros_bag import Bag, Message
+from femsense.io.importers.ros_messages import stamp_of
+from femsense.io.importers.ros_topics import Choice, Stream, transform_between, transforms_of
+
+LAG_S = 0.5
+"""A message is written at most this much later than others of its moment."""
+PEEKED = 50
+"""So many first messages of a topic say whether its header stamps are a clock."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Plan:
+    """How the messages of a bag become frames."""
+
+    choice: Choice
+    clock: str
+    unit: float
+    actuation: str | None
+    columns: dict[str, dict[str, tuple[str, str, float]]]
+    """Topic → name of a value → (column, field, factor)."""
+    load_points: dict[str, list[float]]
+    T_camera_markers: dict[str, FloatArray]
+    metadata: dict[str, str]
+    """Topic of a stream's metadata → its images, where the SDK keeps the device's times there."""
+    up: str | None
+    notes: tuple[str, ...]
+
+
+def plan_of(bag: Bag, choice: Choice, options: Options, clock: str) -> Plan:
+    notes = list(choice.notes)
+    columns, fields = {}, set[str]()
+    for stream in choice.inputs:
+        columns[stream.topic.name], taken = _input_columns(bag, stream, options)
+        fields |= taken
+    actuation = {frozenset({"effort"}): "tension", frozenset({"position"}): "displacement"}.get(frozenset(fields - {""}))
+    points = {}
+    for stream in choice.loads:
+        target = options.columns.get(stream.topic.name, "")
+        if target.startswith("load@"):
+            points[stream.topic.name] = _load_point(target)
+            notes.append(f"the forces of {stream.topic.name} (frame {stream.frame or '–'}) are taken in the robot's axes")
+        else:
+            notes.append(
+                f"the wrenches of {stream.topic.name} are left out: --map {stream.topic.name}=load@X,Y,Z says where they act"
+            )
+    poses = _marker_poses(bag, choice, notes)
+    used = [s for s in choice.markers if s.topic.name in poses]
+    choice = replace(choice, markers=tuple(used), loads=tuple(s for s in choice.loads if s.topic.name in points))
+    unit = FINE_UNIT if choice.primary.encoding.startswith("32FC1") else choice.depth_unit_m
+    return Plan(choice, clock, unit, actuation, columns, points, poses, _metadata(bag, choice, clock), options.up, tuple(notes))
+
+
+def _input_columns(bag: Bag, stream: Stream, options: Options) -> tuple[dict[str, tuple[str, str, float]], set[str]]:
+    """Return name in the message → (column, field, factor), and the fields that are used."""
+    topic = stream.topic.name
+    first = next(bag.messages([topic]), None)
+    given = {} if first is None else named_values(bag.decode(first), stream.topic.type)
+    names = list(dict.fromkeys(name for name, _ in given))
+    columns: dict[str, tuple[str, str, float]] = {}
+    for name in names:
+        available = [fld for n, fld in given if n == name]
+        usual = next(
+            (fld for fld in ("effort", "position", "") if fld in available and (fld != "effort" or given[name, fld] != 0.0)),
+            available[0],
+        )
+        for key in (f"{name}.{usual}", name, f"{topic}.{name}", *(f"{name}.{fld}" for fld in available)):
+            if key in options.columns:
+                column, factor = split_factor(options.columns[key])
+                fld = key.rpartition(".")[2] if key.rpartition(".")[2] in available else usual
+                columns[name] = (column, fld, factor)
+    if not columns and not any(key in options.columns for key in names):
+        prefix = "chamber_" if stream.topic.type.endswith("FluidPressure") else "cable_"
+        for name in names:
+            usual = "effort" if any(given.get((n, "effort"), 0.0) for n in names) else "position"
+            fld = usual if (name, usual) in given else next(f for n, f in given if n == name)
+            columns[name] = (name if name.startswith(("cable_", "chamber_")) else prefix + name, fld, 1.0)
+    return columns, {fld for _, fld, _ in columns.values()}
+
+
+def _load_point(target: str) -> list[float]:
+    try:
+        values = [float(part) for part in target.removeprefix("load@").split(",")]
+    except ValueError:
+        values = []
+    if len(values) != 3:
+        raise InputError(
+            "not a place of a load", where="--map", found=target, expected="load@X,Y,Z: metres on the body at rest, robot frame"
+        )
+    return values
+
+
+def _marker_poses(bag: Bag, choice: Choice, notes: list[str]) -> dict[str, FloatArray]:
+    """Return T_camera_markers of the topics of markers that can be had in the camera's frame."""
+    target, poses = choice.primary.frame, {}
+    tree = transforms_of(bag) if choice.markers else {}
+    for stream in choice.markers:
+        T = np.eye(4) if stream.frame == target else transform_between(tree, target, stream.frame)
+        if T is None:
+            notes.append(
+                f"the markers of {stream.topic.name} are left out: no static transform joins {stream.frame!r} and {target!r}"
+            )
+        else:
+            poses[stream.topic.name] = T
+    return poses
+
+
+def clock_of(bag: Bag, choice: Choice, options: Options) -> str:
+    """Return whose time stamps are used.
+
+    "metadata" where the RealSense SDK keeps the device's time there; "header" where the stamps of all streams with a header go on
+    like the time of recording (those of the SDK may count from elsewhere); else "record".
+    """
+    if options.clock in ("header", "record"):
+        return options.clock
+    sdk = is_sdk(choice.primary.topic.name)
+    if sdk and _metadata(bag, choice, "metadata"):
+        return "metadata"
+    for stream in chosen_streams(choice):
+        if stream.topic.type.endswith("MultiArray"):
+            continue
+        shifts, last = [], -np.inf
+        for message, _ in zip(bag.messages([stream.topic.name]), range(PEEKED)):
+            try:
+                time, _ = stamp_of(bag.decode(message))
+            except InputError:
+                continue  # told when the frames are read
+            if time <= 0.0 or time < last:
+                return "record"
+            last = time
+            shifts.append(message.record - time)
+        if shifts and not sdk and (np.ptp(shifts) > LAG_S or abs(float(np.median(shifts))) > LAG_S):
+            return "record"
+    return "header"
+
+
+def _metadata(bag: Bag, choice: Choice, clock: str) -> dict[str, str]:
+    """Return topic of metadata → topic of images where the first of them holds a time of the device."""
+    if clock != "metadata":
+        return {}
+    names = {t.name: t.type for t in bag.topics}
+    pictures = [s.topic.name for s in (choice.primary, choice.color) if s is not None]
+    found = {f"{name.split('/image/')[0]}/image/metadata": name for name in pictures}
+    firsts = [next(bag.messages([topic]), None) for topic in found if names.get(topic) == "std_msgs/msg/String"]
+    told = [first is not None and device_time(bag.decode(first)) is not None for first in firsts]
+    return found if told and len(told) == len(found) and all(told) else {}
+
+
+def device_time(decoded: Any) -> float | None:
+    """Return the device's time [s] in the text of an image's metadata; None where it holds none."""
+    parts = dict(part.split("=", 1) for part in str(decoded.data).split(";") if "=" in part)
+    return 1e-3 * float(parts["timestamp"]) if "timestamp" in parts else None
+
+
+def header_time(decoded: Any, message: Message) -> float:
+    time, _ = stamp_of(decoded)
+    return time if time > 0.0 else message.record
+
+
+def chosen_streams(choice: Choice) -> list[Stream]:
+    chosen = [choice.primary, *choice.markers, *choice.inputs, *choice.loads]
+    chosen += [choice.color] if choice.color is not None else []
+    return list({s.topic.name: s for s in chosen}.values())
+
+
+def is_sdk(name: str) -> bool:
+    return name.startswith("/device_") and "/sensor_" in name
+
+
+def named_values(decoded: Any, kind: str) -> dict[tuple[str, str], float]:
+    """Return (name, field) → value of a message of inputs."""
+    if kind.endswith("FluidPressure"):
+        return {("pressure", ""): float(decoded.fluid_pressure)}
+    if not kind.endswith("JointState"):
+        return {(str(i), ""): float(value) for i, value in enumerate(decoded.data)}
+    return {
+        (name, fld): float(values[i])
+        for fld in ("position", "velocity", "effort")
+        for values in [getattr(decoded, fld)]
+        for i, name in enumerate(decoded.name)
+        if i < len(values)
+    }

@@ -1,0 +1,38 @@
+"""Both ways of reading one bag give the same messages."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rosbags")
+from ros_writers import BagWriter, write_camera
+
+from femsense.core.errors import InputError
+from femsense.io.importers.ros_bag import open_bag
+from femsense.io.importers.ros_recovery import RecoveredReader
+
+
+@pytest.mark.parametrize("kind", ["1", "mcap"])
+def test_a_whole_bag_read_without_its_index(kind: str, tmp_path: Path) -> None:
+    path = tmp_path / ("take.bag" if kind == "1" else "take")
+    with BagWriter(path, kind) as bag:
+        write_camera(bag, 20)
+    file = path if kind == "1" else path / "take.mcap"
+    recovered = RecoveredReader(file)
+    with open_bag(file) as whole:
+        topics = {t.name: (t.type, t.count) for t in whole.topics}
+        assert {c.topic: (c.msgtype, c.msgcount) for c in recovered.connections} == topics
+        mine = sorted((at, c.topic, raw) for c, at, raw in recovered.messages(recovered.connections))
+        theirs = sorted((round(1e9 * m.record), m.topic, m.raw) for m in whole.messages(list(topics)))
+        assert [(t, r) for _, t, r in mine] == [(t, r) for _, t, r in theirs]
+        image = next(raw for _, topic, raw in mine if topic == "/camera/color/image_raw")
+        assert recovered.deserialize(image, "sensor_msgs/msg/Image").encoding == "rgb8"
+
+
+def test_nothing_whole_is_an_error(tmp_path: Path) -> None:
+    for name, data in (("a.bag", b"#ROSBAG V2.0\n" + bytes(100)), ("a.mcap", b"\x89MCAP0\r\n" + bytes(100))):
+        (tmp_path / name).write_bytes(data)
+        with pytest.raises(InputError, match="without a whole message"):
+            RecoveredReader(tmp_path / name)
