@@ -12,6 +12,7 @@ import numpy as np
 from femsense.core.arrays import FloatArray
 from femsense.io.robot_toml import load_robot
 from femsense.loop.files import LOOP_FORMAT
+from femsense.loop.result import EFFECTS, NONE, UNEXPLAINED
 from femsense.model.robot import Robot
 from femsense.report import words
 from femsense.report.documents import Confounded, Evidence, Frames, Left, Loop, Residuals, Structure, read_document
@@ -54,9 +55,9 @@ from femsense.report.loop_tables import (
 from femsense.report.page import Chapter, Html, bullets, code, element, panels, paragraph, section, table, tiles, together
 
 VERDICTS = {
-    "effects": "The data name what the model lacks.",
-    "none": "The model explains the data to their noise.",
-    "unexplained": "A residual is left that no effect explains.",
+    EFFECTS: "The data name what the model lacks.",
+    NONE: "The model explains the data to their noise.",
+    UNEXPLAINED: "A residual is left that no effect explains.",
 }
 OLDER = (
     "This loop.json holds no figures of the residual, of calibration, of confounding and of forces: it was written by an earlier femsense. "
@@ -421,7 +422,7 @@ def _left(loop: Loop, evidence: Evidence, surface: DrawnSurface | None) -> Html 
     ]
     headers = ("Goes with", "Rank correlation", "p", "p (Holm)")
     goes = table(headers, rows, caption="What the size of the residual of a frame goes with.", numeric=(1, 2, 3))
-    structured = left.structure.significant or (loop.verdict == "unexplained" and not left.held_out)
+    structured = left.structure.significant or (loop.verdict == UNEXPLAINED and not left.held_out)
     field = force_field(evidence.equivalent_forces, surface) if structured else None
     return (
         together(bullets(_left_facts(left, effects=bool(loop.effects))), panels(goes, _marker_bars(left.marker_rms_m), field))

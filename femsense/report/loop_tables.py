@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from femsense.loop.result.records import NAMED, PASSES
 from femsense.model.effects import EFFECTS
 from femsense.report import words
 from femsense.report.documents import (
@@ -34,8 +35,8 @@ from femsense.report.documents import (
 from femsense.report.page import Cell, Html, code, element, escape, paragraph, table, together
 
 OUTCOMES = {
-    "named": "named: part of the improved model",
-    "passes": "alternative: passes all tests too, with less evidence than the one that was named",
+    NAMED: "named: part of the improved model",
+    PASSES: "alternative: passes all tests too, with less evidence than the one that was named",
 }
 LISTED = 6
 COMPONENTS = {
@@ -119,7 +120,7 @@ def ranking_table(candidates: Sequence[Candidate], ranked: Mapping[str, Ranked],
         rows,
         caption="Every effect that was tried, by what the first screening says of it.",
         numeric=(2, 3, 4, 5, 6),
-        strong=[i for i, c in enumerate(candidates) if c.verdict == "named"],
+        strong=[i for i, c in enumerate(candidates) if c.verdict == NAMED],
         dense=True,
     )
     text = paragraph(

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from femsense.calib.calibration import Calibration
+from femsense.loop.result import EFFECTS, NONE, UNEXPLAINED
 
 if TYPE_CHECKING:
     from femsense.sensing.types import ContactForce, FrameReport, Run
@@ -19,9 +20,9 @@ LITTLE = 1e-4
 LISTED = 6
 """So many frames are listed one by one."""
 VERDICTS = {
-    "effects": "the data name what the model lacks",
-    "none": "the model explains the data to their noise",
-    "unexplained": "a residual is left that no effect explains",
+    EFFECTS: "the data name what the model lacks",
+    NONE: "the model explains the data to their noise",
+    UNEXPLAINED: "a residual is left that no effect explains",
 }
 
 
@@ -147,7 +148,7 @@ def loop_text(document: Mapping[str, Any]) -> str:
     for title, said in (
         ("cannot be distinguished", ", ".join(" / ".join(pair) for pair in _open_pairs(document))),
         ("not testable", ", ".join(map(_untestable, document.get("not_testable") or ()))),
-        ("would have been seen", _seen(document) if verdict == "none" else ""),
+        ("would have been seen", _seen(document) if verdict == NONE else ""),
         ("next experiment", document.get("next_experiment")),
     ):
         if said:

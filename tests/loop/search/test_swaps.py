@@ -156,7 +156,7 @@ def test_until_an_effect_explains_the_data_rivals_are_refitted_to_the_end(monkey
     ]
     monkeypatch.setattr(forward_selection, "refit", seen)
     monkeypatch.setattr(forward_selection, "acceptance_test", lenient)
-    monkeypatch.setattr(forward_selection, "_polish", lambda data, fitted, winner, *_: winner.fitted)
+    monkeypatch.setattr(forward_selection, "_polish", lambda data, fitted, winner, *_: (winner.fitted, [0.0]))
     monkeypatch.setattr(forward_selection, "explains", lambda fitted: explains)
     forward_selection.select_next(data, base, sorted(looks, key=lambda c: -c.score), NOISE, lambda text: None)
     assert asked == [("payload", forward_selection.EVIDENCE)] + [("cable_gain", forward_selection.EVIDENCE)] * (not explains)
@@ -216,7 +216,7 @@ def test_effects_without_near_rivals_are_not_asked_again():
     data, base = started()
     first, own = added(data, base, "gravity", 1)
     second, other = added(data, first, "cable_gain", 2)
-    rival = {**own, "name": "payload", "verdict": "passes", "dbic": 0.1 * own["dbic"] - 20.0}
+    rival = replace(own, name="payload", verdict=PASSES, dbic=0.1 * own.evidence - 20.0)
     before = [("", base), ("gravity", first), ("cable_gain", second)]
     history, refits = swapped(data, before, [own, rival, other], NOISE, COUNT, lambda text: None)
     assert history is before and len(refits) == 3
@@ -233,7 +233,7 @@ def test_a_refit_that_could_win_goes_to_its_end(monkeypatch: pytest.MonkeyPatch)
         return fit_model(data, hypothesis, prior, noise, start, own=own_of(fitted), max_iterations=2)
 
     monkeypatch.setattr(forward_selection, "refit", cut_short)
-    monkeypatch.setattr(forward_selection, "_polish", lambda data, fitted, winner, *_: winner.fitted)
+    monkeypatch.setattr(forward_selection, "_polish", lambda data, fitted, winner, *_: (winner.fitted, [0.0]))
     winner, _, records = forward_selection.select_next(data, base, table, NOISE, lambda text: None)
     assert winner is not None and winner.fitted.fit.fit.status == "converged"
     assert winner.fitted.fit.chi2 == pytest.approx(whole.fit.chi2, rel=0.02)
@@ -249,7 +249,7 @@ def test_a_refit_that_cannot_go_further_is_compared_as_it_is(monkeypatch: pytest
     hypothesis, prior = forward_selection.with_term(base.fit, candidate.effect, candidate.seed, candidate.parameters)
     begun = np.concatenate([base.fit.coordinates, [p.null for p in candidate.parameters]])
     made = fit_model(data, hypothesis, prior, NOISE, begun, own=own_of(base), max_iterations=1)
-    cut = acceptance_test(data, base, candidate, made, {}, NOISE)
+    cut = acceptance_test(data, base, candidate, made, RECORD, NOISE)
     assert made.fit.fit.status == "iterations"
     monkeypatch.setattr(forward_selection, "fit_model", collapses)
     assert forward_selection._to_the_end(data, base, cut, NOISE) is cut
@@ -344,7 +344,7 @@ def test_a_place_is_improved_before_a_refit_is_turned_down_for_what_it_predicts(
         return own
 
     monkeypatch.setattr(forward_selection, "acceptance_test", strict)
-    monkeypatch.setattr(forward_selection, "_polish", lambda data, fitted, winner, *_: replace(winner.fitted))
+    monkeypatch.setattr(forward_selection, "_polish", lambda data, fitted, winner, *_: (replace(winner.fitted), [0.0]))
     winner, _, records = forward_selection.select_next(data, base, table, NOISE, lambda text: None)
     assert winner is not None and asked[:2] == ["payload", "payload"] and records[0].is_named
 
