@@ -40,7 +40,7 @@ def read_pcd_fields(path: str | Path) -> dict[str, Column]:
     if header.data == "ascii":
         body = b"\n".join(b" ".join(line.split()) for line in body.splitlines() if line.strip())
     _check_size(body, header, file)
-    stream = io.BufferedReader(io.BytesIO(header.compose_header().encode() + body))  # type: ignore[arg-type]
+    stream = io.BufferedReader(io.BytesIO(header.compose_header().encode() + body))
     try:
         rows = np.atleast_1d(PointCloud.from_fileobj(stream).pc_data)
     except (ValueError, TypeError, RuntimeError) as error:
