@@ -31,7 +31,7 @@ from femsense.loop.fit.fitted_model import FittedModel, fit_model, poses_and_inp
 from femsense.loop.fit.joint_fit import Prior
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.improve import improve
-from femsense.loop.result import LoopResult
+from femsense.loop.result.loop_result import LoopResult
 from femsense.loop.result.tables import table_of
 from femsense.model.effects import FORMS, Effect, Entry, apply_effects
 from femsense.model.observation import Hypothesis, in_robot_frame

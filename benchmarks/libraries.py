@@ -1,4 +1,4 @@
-"""Own sparse factors beside those of libraries, on the stiffness matrices that `estimate` and `improve` meet.
+"""Own sparse factors and own search for neighbours beside those of libraries, on what `estimate` and `improve` meet.
 
     pip install cvxopt sksparse-minimal
     python benchmarks/libraries.py [--data DATA]
@@ -20,6 +20,8 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 from threadpoolctl import threadpool_limits
 
 from femsense.core.arrays import FloatArray
@@ -30,7 +32,9 @@ from femsense.fem.compliance import direction_rows
 from femsense.fem.linalg.cholesky import cholesky
 from femsense.fem.linalg.factorization import pardiso_library
 from femsense.fem.mesh import embed_points, surface_triangles, to_quadratic
+from femsense.io.clouds.cloud_files import read_cloud
 from femsense.io.robot_toml import load_robot
+from femsense.pointcloud.grid import build_grid, connected_labels, count_neighbors, count_within
 
 DATA = Path(__file__).resolve().parents[1].parent / "shared" / "data"
 MANY = 24
@@ -196,6 +200,37 @@ def median_ms(call: Callable[[], Any], count: int = 9) -> float:
     return float(np.median(times))
 
 
+def neighbours(robot: str = "four-leg") -> None:
+    """Print what the grid of cells takes beside SciPy's tree, building included."""
+    frame = Path(__file__).resolve().parents[1] / "meshes" / robot / "recordings" / "demo" / "clouds" / "000041.ply"
+    plain = np.array(read_cloud(frame).points)
+    dense = np.repeat(plain, 20, axis=0) + np.random.default_rng(0).normal(0.0, 5e-4, (20 * len(plain), 3))
+    print("\n| ms | | count all neighbours | is one near | connected parts |\n|---|---|---|---|---|")
+    for name, points, radius in (("a frame of the demo", plain, 0.006), ("20 times as dense", dense, 0.003)):
+        queries, feature = points[::7], np.zeros((len(points), 1))
+
+        def parts(points: FloatArray = points, radius: float = radius) -> Any:
+            pairs = cKDTree(points).query_pairs(radius, output_type="ndarray")
+            graph = sp.coo_matrix((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(len(points),) * 2)
+            return connected_components(graph, directed=False)
+
+        rows: dict[str, list[Callable[[], Any]]] = {
+            "own grid": [
+                lambda p=points, r=radius: count_neighbors(build_grid(p, r), r),
+                lambda p=points, r=radius, q=queries: count_within(build_grid(p, r), q, r, enough=1),
+                lambda p=points, r=radius, f=feature: connected_labels(build_grid(p, r), r, f, 1.0),
+            ],
+            "cKDTree": [
+                lambda p=points, r=radius: cKDTree(p).query_ball_point(p, r, return_length=True),
+                lambda p=points, r=radius, q=queries: cKDTree(p).query(q, distance_upper_bound=r),
+                parts,
+            ],
+        }
+        for kind, calls in rows.items():
+            cells = " | ".join(f"{median_ms(call, 3):.1f}" for call in calls)
+            print(f"| {name}, {len(points)} points | {kind} | {cells} |", flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, default=DATA)
@@ -218,6 +253,7 @@ def main() -> None:
             with threadpool_limits(1):
                 cells = " | ".join(f"{median_ms(call):.2f}" for call in calls)
             print(f"| {name}, {matrix.shape[0]} unknowns | {solver_name} | {cells} |", flush=True)
+    neighbours()
 
 
 if __name__ == "__main__":

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from femsense.io.robot_toml import load_robot, robot_names, save_robot
     from femsense.loop.files import read_loop, write_loop
     from femsense.loop.improve import improve
-    from femsense.loop.result import LoopResult
+    from femsense.loop.result.loop_result import LoopResult
     from femsense.model.effects import EFFECTS, Effect, apply_effects, find_effect
     from femsense.model.recording import Camera, Recording, RestMarkers, make_recording, select_frames
     from femsense.model.robot import Robot

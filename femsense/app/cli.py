@@ -22,6 +22,7 @@ import typer
 from typer.exceptions import TyperException
 
 import femsense
+from femsense.app.compiling import announced_compiling
 from femsense.core.errors import FemsenseError, InputError
 
 T = TypeVar("T")
@@ -546,7 +547,7 @@ def run(arguments: Sequence[str]) -> int:
     words = repeat_options(list(arguments)) or ["--help"]
     with _calm_warnings(notes, as_json):
         try:
-            with _clean_stdout(as_json), _announced_compiling(words):
+            with _clean_stdout(as_json), announced_compiling(words, _say):
                 answer = app(args=words, prog_name="femsense", standalone_mode=False)
             if isinstance(answer, Answer):
                 return _print(answer, as_json, notes)
@@ -635,36 +636,6 @@ def _calm_warnings(notes: list[str], as_json: bool) -> Iterator[None]:
             warnings.simplefilter("always", UserWarning)
             warnings.showwarning = show
         yield
-
-
-COMPILING = {"demo", "mesh", "simulate", "calibrate", "estimate", "improve", "export"}
-"""Commands that use compiled kernels."""
-
-
-@contextlib.contextmanager
-def _announced_compiling(words: list[str]) -> Iterator[None]:
-    """Say once, in one line on standard error, that kernels are being compiled when they are."""
-    if words[0] not in COMPILING or {"-h", "--help"} & set(words):
-        yield
-        return
-    from numba.core import event
-
-    class Announcement(event.Listener):  # type: ignore[misc]
-        said = False
-
-        def on_start(self, _: object) -> None:
-            if not self.said:
-                _say(COMPILING_TEXT)
-                self.said = True
-
-        def on_end(self, _: object) -> None:
-            pass
-
-    with event.install_listener("numba:compile", Announcement()):
-        yield
-
-
-COMPILING_TEXT = "compiling kernels, once after an installation: up to a minute"
 
 
 @contextlib.contextmanager

@@ -11,7 +11,8 @@ import scipy.sparse as sp
 from femsense.core.arrays import FloatArray, IntArray, as_points, freeze
 from femsense.core.errors import InputError
 from femsense.fem.body_parts import Chamber
-from femsense.fem.mesh import FACE_EDGES, FACES, TetMesh
+from femsense.fem.closest_point import FACES
+from femsense.fem.mesh import FACE_EDGES, TetMesh
 
 _A, _B, _C, _D = 0.816847572980459, 0.091576213509771, 0.108103018168070, 0.445948490915965
 

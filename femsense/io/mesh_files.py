@@ -21,7 +21,8 @@ import numpy.typing as npt
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import InputError, MissingDependency
 from femsense.core.text import did_you_mean
-from femsense.fem.mesh import EDGES, FACES, TetMesh, element_volumes, oriented
+from femsense.fem.closest_point import FACES
+from femsense.fem.mesh import EDGES, TetMesh, element_volumes, oriented
 from femsense.io.files import PART_PREFIX, write_beside
 from femsense.io.meshes.content import distinct_cells, gathered
 from femsense.io.meshes.reading import read_content, reason

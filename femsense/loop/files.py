@@ -11,7 +11,7 @@ from femsense.io.provenance import recording_input, robot_input, versions
 from femsense.io.result_folder import _check_folder, _read_document, _results_folder
 
 if TYPE_CHECKING:
-    from femsense.loop.result import LoopResult
+    from femsense.loop.result.loop_result import LoopResult
     from femsense.model.recording import Recording
     from femsense.model.robot import Robot
 

@@ -23,7 +23,7 @@ from femsense.io.checkpoint import Checkpoint
 from femsense.loop.data.dataset import MESH, Data, prepare
 from femsense.loop.design.next_experiment import next_experiment
 from femsense.loop.fit.discretisation_error import make_finer
-from femsense.loop.result import LoopResult
+from femsense.loop.result.loop_result import LoopResult
 from femsense.loop.result.records import RefitRecord
 from femsense.loop.search.calibration import Ready, calibrated, with_discretisation_error
 from femsense.loop.search.element_order import need_quadratic, seeks_with_quadratic, with_quadratic

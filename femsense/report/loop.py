@@ -12,7 +12,7 @@ import numpy as np
 from femsense.core.arrays import FloatArray
 from femsense.io.robot_toml import load_robot
 from femsense.loop.files import LOOP_FORMAT
-from femsense.loop.result import EFFECTS, NONE, UNEXPLAINED
+from femsense.loop.result.loop_result import EFFECTS, NONE, UNEXPLAINED
 from femsense.model.robot import Robot
 from femsense.report import words
 from femsense.report.documents import Confounded, Evidence, Frames, Left, Loop, Residuals, Structure, read_document

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from femsense.calib.calibration import Calibration
-from femsense.loop.result import EFFECTS, NONE, UNEXPLAINED
+from femsense.loop.result.loop_result import EFFECTS, NONE, UNEXPLAINED
 
 if TYPE_CHECKING:
     from femsense.sensing.types import ContactForce, FrameReport, Run

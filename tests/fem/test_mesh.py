@@ -11,9 +11,9 @@ from analytic import monomials, random_rotation
 from helpers import block_mesh
 
 from femsense.core.errors import InputError
+from femsense.fem.closest_point import FACES
 from femsense.fem.mesh import (
     EDGES,
-    FACES,
     Embedding,
     TetMesh,
     barycentric,

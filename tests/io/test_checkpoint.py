@@ -18,7 +18,7 @@ from femsense.calib.calibrate import calibrate
 from femsense.core.errors import DataError
 from femsense.io.checkpoint import DIGEST, Checkpoint
 from femsense.loop.improve import improve
-from femsense.loop.result import LoopResult
+from femsense.loop.result.loop_result import LoopResult
 from femsense.loop.search.search_state import SearchProgress
 from femsense.model.effects import FORMS, apply_effects
 from femsense.sensing import pipeline

@@ -12,7 +12,7 @@ from changed import in_unit, log_permuted, renumbered, reordered, sweeps_shuffle
 
 from femsense.core.pose import make_pose, rotation_from_vector
 from femsense.loop.improve import improve
-from femsense.loop.result import LoopResult
+from femsense.loop.result.loop_result import LoopResult
 from femsense.model.recording import Recording
 from femsense.model.robot import Robot
 

@@ -13,7 +13,7 @@ from helpers import write_block_robot
 from femsense.calib.calibration import Calibration
 from femsense.io.files import PART_PREFIX
 from femsense.io.robot_toml import load_robot
-from femsense.loop.result import LoopResult
+from femsense.loop.result.loop_result import LoopResult
 from femsense.loop.result.records import DataCard, Errors, FrameError, Left, NamedEffect, Structure, Value, WorstMarker
 from femsense.model.robot import Robot
 

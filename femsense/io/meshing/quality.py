@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from femsense.core.arrays import FloatArray
-from femsense.fem.mesh import EDGES, FACES, TetMesh, element_volumes, surface_triangles, to_linear, to_quadratic, triangle_normals
+from femsense.fem.closest_point import FACES
+from femsense.fem.mesh import EDGES, TetMesh, element_volumes, surface_triangles, to_linear, to_quadratic, triangle_normals
 from femsense.io.mesh_files import radius_ratio
 from femsense.io.meshing.surface import wall_thickness
 

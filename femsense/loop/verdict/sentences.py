@@ -12,7 +12,7 @@ from femsense.loop.data.trial import rms_of
 from femsense.loop.fit.discretisation_error import mesh_errors
 from femsense.loop.fit.fitted_model import FittedModel
 from femsense.loop.fit.noise_components import Noise
-from femsense.loop.result import EFFECTS, NONE, UNEXPLAINED
+from femsense.loop.result.loop_result import EFFECTS, NONE, UNEXPLAINED
 from femsense.loop.result.records import NamedEffect, Value
 from femsense.loop.search.search_state import Search
 from femsense.loop.verdict.returned_model import NOT_WORSE, has_effects, held_beyond_mesh

@@ -15,7 +15,7 @@ from femsense.loop.fit.fitted_model import (
     FittedModel,
 )
 from femsense.loop.fit.noise_components import Noise, whiten
-from femsense.loop.result import EFFECTS, NONE, UNEXPLAINED, LoopResult
+from femsense.loop.result.loop_result import EFFECTS, NONE, UNEXPLAINED, LoopResult
 from femsense.loop.result.records import Left, Structure
 from femsense.loop.search.search_state import Search
 from femsense.loop.verdict.confounding import confounded, in_words

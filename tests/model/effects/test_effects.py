@@ -16,9 +16,9 @@ from helpers import block_mesh, write_block_robot
 from femsense.core.errors import InputError
 from femsense.fem.equilibrium import SolveOptions, solve_equilibrium
 from femsense.fem.mesh import embed_points
-from femsense.io.robot_toml import EFFECT_NAMES, load_robot
+from femsense.io.robot_toml import load_robot
 from femsense.model.drive import DrivenRobot, drive_of
-from femsense.model.effects import EFFECTS, FORMS, Effect, Entry, Parameter, apply_effects, build_entry, find_effect
+from femsense.model.effects import EFFECT_NAMES, EFFECTS, FORMS, Effect, Entry, Parameter, apply_effects, build_entry, find_effect
 from femsense.model.observation import undo_depth
 from femsense.model.recording import make_recording
 from femsense.model.robot import Observation, Robot, plain_actuation

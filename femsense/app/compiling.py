@@ -1,0 +1,38 @@
+"""What a command says while it waits for kernels to be compiled."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
+
+COMPILING = frozenset({"demo", "mesh", "simulate", "calibrate", "estimate", "improve", "export"})
+"""Commands that use compiled kernels."""
+COMPILING_TEXT = "compiling kernels, once after an installation: up to a minute"
+
+
+@contextlib.contextmanager
+def announced_compiling(words: Sequence[str], say: Callable[[str], None]) -> Iterator[None]:
+    """Say once that kernels are compiled, when the first one is.
+
+    Arguments:
+        words: the command and its arguments; others than those that use kernels are left alone, so that they need not load numba.
+        say: takes the line.
+    """
+    if words[0] not in COMPILING or {"-h", "--help"} & set(words):
+        yield
+        return
+    from numba.core import event
+
+    class Announcement(event.Listener):  # type: ignore[misc]
+        said = False
+
+        def on_start(self, event: object) -> None:
+            if not self.said:
+                self.said = True
+                say(COMPILING_TEXT)
+
+        def on_end(self, event: object) -> None:
+            pass
+
+    with event.install_listener("numba:compile", Announcement()):
+        yield
