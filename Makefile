@@ -24,7 +24,7 @@ demo: $(VENV)/.installed
 
 test: lint
 	$(RUN)/python -m pytest -n $(JOBS)
-	$(RUN)/python scripts/sabotage.py --green --sample 64 --seconds 330 --jobs $(JOBS)
+	$(RUN)/python scripts/sabotage.py --green --sample 64 --seed 20411 --seconds 330 --jobs $(JOBS)
 
 sabotage: $(VENV)/.installed-dev
 	$(RUN)/python scripts/sabotage.py --jobs $(JOBS)
