@@ -34,7 +34,8 @@ from femsense.io.mesh_files import (
     read_tets,
     read_triangles,
 )
-from femsense.io.recording_folder import TOO_FAR, load_recording, recording_problems
+from femsense.io.recording_folder import TOO_FAR, load_recording
+from femsense.io.recording_toml import recording_problems
 from femsense.io.robot_toml import RobotTable, load_robot, read_declared_mesh, robot_names, robot_problems
 from femsense.io.tables import read_toml
 from femsense.model.recording import Recording

@@ -1,85 +1,41 @@
-"""A recording folder ↔ Recording. The types are in `frames`, the clouds in `frame_clouds`; this is the door to all three."""
+"""A recording folder ↔ Recording. The tables of recording.toml are in `recording_toml`, the clouds in `frame_clouds`."""
 
 from __future__ import annotations
 
-import re
 import shutil
 from collections.abc import Callable, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import numpy as np
-from pydantic import Field, model_validator
 
 from femsense.core.arrays import BoolArray, FloatArray, IntArray, freeze
 from femsense.core.errors import InputError
-from femsense.core.pose import check_pose
-from femsense.core.text import did_you_mean, key_path
+from femsense.core.text import did_you_mean
 from femsense.io.clouds.frame_clouds import find_clouds
 from femsense.io.clouds.images import check_image_size, png_header
 from femsense.io.files import write_beside, write_csv, write_toml
-from femsense.io.tables import Schema, Table, read_csv, read_toml, schema_problems, validated
-from femsense.model.recording import (
-    Camera,
-    Recording,
-    RestMarkers,
-    make_recording,
+from femsense.io.recording_toml import (
+    LENS_KEYS,
+    PER_METRE,
+    RecordingTable,
+    recording_document,
+    table_problems,
+    tool_file,
+    tools_of,
+    views_of,
 )
+from femsense.io.tables import Table, read_csv, read_toml, validated
+from femsense.model.recording import Camera, Recording, RestMarkers, Tool, make_recording
 
-FORMAT = "femsense-recording-1"
 GRAVITY_COLUMNS = ("gravity_x_m_s2", "gravity_y_m_s2", "gravity_z_m_s2")
 PLACE_COLUMNS = ("x_m", "y_m", "z_m")
 FORCE_COLUMNS = ("fx_n", "fy_n", "fz_n")
-LENS_KEYS = ("width", "height", "fx", "fy", "cx", "cy")
 TOO_FAR = 50.0
 """A marker farther from its camera than this [m] is in another unit."""
 TOO_LONG = 5.0
 """A cable displacement beyond this [m] is in another unit."""
-
-
-# The tables of recording.toml
-
-Matrix = Annotated[list[Annotated[list[float], Field(min_length=4, max_length=4)]], Field(min_length=4, max_length=4)]
-POSE = "4 rows of 4 numbers: maps camera coordinates to robot coordinates, translation in metres"
-Pixels = Annotated[int, Field(gt=0)]
-
-
-class CameraTable(Schema):
-    width: Pixels | None = Field(None, description="pixels, > 0")
-    height: Pixels | None = Field(None, description="pixels, > 0")
-    fx: Annotated[float, Field(gt=0)] | None = Field(None, description="focal length in pixels, > 0")
-    fy: Annotated[float, Field(gt=0)] | None = Field(None, description="focal length in pixels, > 0")
-    cx: float | None = Field(None, description="principal point in pixels")
-    cy: float | None = Field(None, description="principal point in pixels")
-    distortion: Annotated[list[float], Field(min_length=5, max_length=5)] = Field(
-        default_factory=lambda: [0.0] * 5, description="five numbers in OpenCV's order: k1, k2, p1, p2, k3"
-    )
-    depth_unit_m: Annotated[float, Field(gt=0, lt=1)] | None = Field(
-        None, description="metres in one unit of a depth image, such as 0.001"
-    )
-    T_robot_camera: Matrix | None = Field(None, description=POSE)
-
-    @model_validator(mode="after")
-    def _lens_is_complete(self) -> CameraTable:
-        missing = [key for key in LENS_KEYS if getattr(self, key) is None]
-        if missing and len(missing) < len(LENS_KEYS):
-            raise ValueError(f"the camera lacks {', '.join(missing)}")
-        return self
-
-
-class RecordingTable(Schema):
-    """recording.toml, version femsense-recording-1."""
-
-    format: Literal["femsense-recording-1"] = Field(description=f'format = "{FORMAT}"')
-    actuation: Literal["tension", "displacement"] = Field(
-        description='actuation = "tension" (cable columns in N) or "displacement" (in m, > 0 shortens)'
-    )
-    actuation_zero: Literal["absolute", "unknown"] = Field(
-        description='actuation_zero = "absolute" (the values are the true inputs) or "unknown"'
-    )
-    T_robot_camera: Matrix | None = Field(None, description=POSE)
-    camera: CameraTable | None = Field(None, description="a table [camera] with width, height, fx, fy, cx, cy")
-    cameras: Annotated[dict[str, CameraTable], Field(min_length=1)] | None = Field(None, description="tables [cameras.NAME]")
 
 
 # Loading
@@ -97,7 +53,7 @@ def load_recording(path: str | Path) -> Recording:
     table = validated(RecordingTable, document, toml)
     for problem in table_problems(table, toml):
         raise problem
-    names, cameras, poses = _views(table, toml)
+    names, cameras, poses = views_of(table, toml)
     frames = _read_frames(folder / "frames.csv", table.actuation)
     numbers = frames["frame_numbers"]
     clouds, colors = find_clouds(folder, names, numbers)
@@ -115,50 +71,10 @@ def load_recording(path: str | Path) -> Recording:
         **_read_loads(folder / "loads.csv", numbers),
         cloud_files=clouds,
         color_files=colors,
+        marker_noise_m=table.marker_noise_m,
+        session=table.session,
+        tools=tools_of(table, toml),
     )
-
-
-def recording_problems(document: dict[str, Any], path: Path) -> list[InputError]:
-    """Return everything that is wrong with the tables of a recording.toml."""
-    problems = schema_problems(RecordingTable, document, path)
-    return problems or table_problems(RecordingTable.model_validate(document), path)
-
-
-def table_problems(table: RecordingTable, path: Path) -> list[InputError]:
-    """Return what single keys cannot show: one camera and several, a pose given twice, a pose that is no rotation."""
-    problems: list[InputError] = []
-    if table.camera is not None and table.cameras is not None:
-        problems.append(
-            InputError(
-                "both [camera] and [cameras.NAME]", where=path, expected="[camera] for one camera, [cameras.NAME] for several"
-            )
-        )
-    if table.T_robot_camera is not None and table.cameras is not None:
-        problems.append(
-            InputError(
-                "one pose for several cameras", where=f"{path}: T_robot_camera", expected="T_robot_camera in each [cameras.NAME]"
-            )
-        )
-    if table.T_robot_camera is not None and table.camera is not None and table.camera.T_robot_camera is not None:
-        problems.append(
-            InputError("the pose stands twice", where=f"{path}: camera.T_robot_camera", expected="T_robot_camera above [camera]")
-        )
-    for name in table.cameras or {}:
-        if not re.fullmatch(r'[^/\\,;"\s.][^/\\,;"\s]*', name):
-            problems.append(
-                InputError(
-                    "not a name for a camera, which is also the name of its folder",
-                    where=f"{path}: cameras",
-                    found=repr(name),
-                    expected="a name without blanks, slashes, commas and a point at its start",
-                )
-            )
-    for location, pose in _declared_poses(table):
-        try:
-            check_pose(pose, f"{path}: {key_path(location)}")
-        except InputError as problem:
-            problems.append(problem)
-    return problems
 
 
 def _recording_folder(path: Path) -> Path:
@@ -180,39 +96,6 @@ def _recording_folder(path: Path) -> Path:
             hint="femsense import makes a recording of other formats",
         )
     return folder
-
-
-def _declared_poses(table: RecordingTable) -> list[tuple[tuple[str, ...], Any]]:
-    poses: list[tuple[tuple[str, ...], Any]] = [(("T_robot_camera",), table.T_robot_camera)]
-    poses += [(("camera", "T_robot_camera"), table.camera.T_robot_camera)] if table.camera else []
-    poses += [(("cameras", name, "T_robot_camera"), camera.T_robot_camera) for name, camera in (table.cameras or {}).items()]
-    return [(location, pose) for location, pose in poses if pose is not None]
-
-
-def _views(table: RecordingTable, path: Path) -> tuple[tuple[str, ...], tuple[Camera | None, ...], tuple[Any, ...]]:
-    """Return names, cameras and poses of the views."""
-    if table.cameras is not None:
-        items = table.cameras
-        return tuple(items), tuple(_camera(n, c) for n, c in items.items()), tuple(c.T_robot_camera for c in items.values())
-    if table.camera is None:
-        return ("",), (None,), (table.T_robot_camera,)
-    pose = table.T_robot_camera if table.T_robot_camera is not None else table.camera.T_robot_camera
-    camera = _camera("", table.camera)
-    if camera is None:
-        raise InputError(
-            "the camera lacks its lens",
-            where=f"{path}: camera",
-            found="no width, height, fx, fy, cx, cy",
-            expected=", ".join(LENS_KEYS),
-        )
-    return ("",), (camera,), (pose,)
-
-
-def _camera(name: str, table: CameraTable) -> Camera | None:
-    w, h, fx, fy, cx, cy = table.width, table.height, table.fx, table.fy, table.cx, table.cy
-    if w is None or h is None or fx is None or fy is None or cx is None or cy is None:
-        return None
-    return Camera(name, w, h, fx, fy, cx, cy, freeze(table.distortion), table.depth_unit_m or 0.001)
 
 
 def _read_frames(path: Path, actuation: str) -> dict[str, Any]:
@@ -310,10 +193,13 @@ def _read_markers(path: Path, views: tuple[str, ...], numbers: IntArray) -> dict
         return {}
     table = read_csv(path, required=("frame", "marker", *PLACE_COLUMNS), optional=("camera",))
     frame = _frame_indices(table, numbers)
-    names, index = _named(table)
     view = _view_indices(table, views)
     xyz = table.numbers(PLACE_COLUMNS)
     _check_metres(table, xyz)
+    unnamed = _unnamed(table, frame, numbers)
+    parts = {"unnamed_frame": frame[unnamed], "unnamed_view": view[unnamed], "unnamed_xyz": xyz[unnamed]}
+    table, frame, view, xyz = table.without(unnamed), frame[~unnamed], view[~unnamed], xyz[~unnamed]
+    names, index = _named(table)
     keys = np.stack([frame, index, view], axis=1)
     _, first = np.unique(keys, axis=0, return_index=True)
     if len(first) < len(keys):
@@ -324,7 +210,22 @@ def _read_markers(path: Path, views: tuple[str, ...], numbers: IntArray) -> dict
             found=f"frame {numbers[frame[row]]}, marker {names[index[row]]!r}",
             expected="one row a frame and marker",
         )
-    return {"marker_names": names, "marker_frame": frame, "marker_index": index, "marker_view": view, "marker_xyz": xyz}
+    named = {"marker_names": names, "marker_frame": frame, "marker_index": index, "marker_view": view, "marker_xyz": xyz}
+    return {**named, **parts}
+
+
+def _unnamed(table: Table, frame: IntArray, numbers: IntArray) -> BoolArray:
+    """Return which rows name no marker, shape (rows,). Raises InputError where a frame has both kinds."""
+    empty = np.array([not cell for cell in table.text("marker")], dtype=bool)
+    mixed = np.flatnonzero(empty & np.isin(frame, frame[~empty]))
+    if len(mixed):
+        raise InputError(
+            "a marker without a name beside markers with names",
+            where=table.place(int(mixed[0]), "marker"),
+            found=f"an empty cell in frame {numbers[frame[mixed[0]]]}",
+            expected="a name, or empty cells in all rows of the frame, where nobody knows which marker is which",
+        )
+    return empty
 
 
 def _read_rest(path: Path, views: tuple[str, ...]) -> RestMarkers | None:
@@ -483,32 +384,10 @@ def save_recording(recording: Recording, folder: str | Path, *, fill: Callable[[
         _write_rest(recording, part / "rest.csv")
         _write_loads(recording, part / "loads.csv")
         _copy_clouds(recording, part)
+        _copy_tools(recording, part)
         if fill is not None:
             fill(part)
     return final
-
-
-def recording_document(recording: Recording) -> dict[str, Any]:
-    """Return the plain tables of recording.toml."""
-    document: dict[str, Any] = {"format": FORMAT, "actuation": recording.actuation, "actuation_zero": recording.actuation_zero}
-    tables = [_camera_document(camera) for camera in recording.cameras]
-    poses = [None if pose is None else pose.tolist() for pose in recording.T_robot_camera]
-    if recording.camera_names == ("",):
-        if poses[0] is not None:
-            document["T_robot_camera"] = poses[0]
-        return document | ({"camera": tables[0]} if tables[0] else {})
-    document["cameras"] = {
-        name: table | ({} if pose is None else {"T_robot_camera": pose})
-        for name, table, pose in zip(recording.camera_names, tables, poses)
-    }
-    return document
-
-
-def _camera_document(camera: Camera | None) -> dict[str, Any]:
-    if camera is None:
-        return {}
-    table: dict[str, Any] = {key: getattr(camera, key) for key in LENS_KEYS}
-    return table | {"distortion": camera.distortion.tolist(), "depth_unit_m": camera.depth_unit}
 
 
 def _write_frames(recording: Recording, path: Path) -> None:
@@ -526,14 +405,18 @@ def _write_frames(recording: Recording, path: Path) -> None:
 
 
 def _write_markers(recording: Recording, path: Path) -> None:
-    if not recording.has_markers:
+    if not recording.has_markers and not len(recording.unnamed_frame):
         return
     r, named = recording, recording.camera_names != ("",)
     rows = (
         [r.frame_numbers[f], *([r.camera_names[v]] if named else []), r.marker_names[i], *xyz]
         for f, i, v, xyz in zip(r.marker_frame, r.marker_index, r.marker_view, r.marker_xyz.tolist())
     )
-    write_csv(path, ["frame", *(["camera"] if named else []), "marker", *PLACE_COLUMNS], rows)
+    unnamed = (
+        [r.frame_numbers[f], *([r.camera_names[v]] if named else []), "", *xyz]
+        for f, v, xyz in zip(r.unnamed_frame, r.unnamed_view, r.unnamed_xyz.tolist())
+    )
+    write_csv(path, ["frame", *(["camera"] if named else []), "marker", *PLACE_COLUMNS], chain(rows, unnamed))
 
 
 def _write_rest(recording: Recording, path: Path) -> None:
@@ -567,6 +450,21 @@ def _copy_clouds(recording: Recording, folder: Path) -> None:
                 _copy(file, folder / kind / name / f"{number:06d}{file.suffix.lower()}")
             if color is not None:
                 _copy(color, folder / "color" / name / f"{number:06d}{color.suffix.lower()}")
+
+
+def _copy_tools(recording: Recording, folder: Path) -> None:
+    for tool in recording.tools:
+        if tool.mesh_file is not None:
+            _copy(tool.mesh_file, folder / tool_file(tool))
+        elif tool.kind == "mesh":
+            _write_off(tool, folder / tool_file(tool))
+
+
+def _write_off(tool: Tool, path: Path) -> None:
+    """Write a mesh as OFF, which keeps all digits, in the tool's unit."""
+    rows = [" ".join(map(repr, row)) for row in (tool.points * PER_METRE[tool.mesh_unit]).tolist()]
+    rows += [f"3 {a} {b} {c}" for a, b, c in tool.triangles.tolist()]
+    path.write_text("\n".join(["OFF", f"{len(tool.points)} {len(tool.triangles)} 0", *rows, ""]), encoding="utf-8")
 
 
 def _copy(source: Path, target: Path) -> None:

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from femsense.core.arrays import FloatArray, IntArray
+from femsense.core.arrays import BoolArray, FloatArray, IntArray
 from femsense.core.errors import InputError
 from femsense.core.text import did_you_mean, key_path, short
 
@@ -155,6 +155,11 @@ class Table:
     def place(self, row: int, column: str | None = None) -> str:
         """Return where a cell stands, for messages."""
         return f"{self.path}, line {self.lines[row]}" + (f", column {column}" if column else "")
+
+    def without(self, rows: BoolArray) -> Table:
+        """Return the table without the rows that a mask, shape (rows,), chooses."""
+        kept = np.flatnonzero(~rows).tolist()
+        return Table(self.path, self.columns, tuple(self.cells[i] for i in kept), tuple(self.lines[i] for i in kept))
 
     def text(self, column: str) -> tuple[str, ...]:
         """Return a column as text without blanks at the ends."""

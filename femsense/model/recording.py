@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +21,54 @@ if TYPE_CHECKING:
 
 FAR_LOAD = 0.25
 """A known load farther from the body than this times the mesh's diagonal is an error."""
+
+
+def _no_indices() -> IntArray:
+    return freeze(np.zeros(0), np.int64)
+
+
+def _no_points() -> FloatArray:
+    return freeze(np.zeros((0, 3)))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class CameraNoise:
+    """What a single depth is off by, as one standard deviation over the distance z."""
+
+    kind: str
+    """"stereo": at_1m · z²;  "tof": floor + slope · z."""
+    at_1m: float = 0.0
+    """[m] at z = 1 m; 0 where the kind is "tof"."""
+    floor: float = 0.0
+    """[m]; 0 where the kind is "stereo"."""
+    slope: float = 0.0
+    """[m/m]; 0 where the kind is "stereo"."""
+
+    def std(self, depth: npt.ArrayLike) -> FloatArray:
+        """Return one standard deviation [m] of depths z [m], of the same shape."""
+        z = np.asarray(depth, dtype=np.float64)
+        return self.at_1m * z**2 if self.kind == "stereo" else self.floor + self.slope * z
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Tool:
+    """A body of known shape that may touch the robot. Its frame: a ball's centre; a cylinder's centre and axis z; the mesh's own."""
+
+    name: str
+    kind: str
+    """"ball", "cylinder" or "mesh"."""
+    radius: float = 0.0
+    """Of a ball or a cylinder [m]; 0 for a mesh."""
+    length: float = 0.0
+    """Of a cylinder [m]; 0 for others."""
+    points: FloatArray = field(default_factory=_no_points)
+    """Of a mesh [m], shape (n, 3)."""
+    triangles: IntArray = field(default_factory=lambda: freeze(np.zeros((0, 3)), np.int64))
+    """Of a mesh, a closed surface, outward, shape (t, 3)."""
+    mesh_file: Path | None = None
+    """Where the mesh was read; None where it was made in Python."""
+    mesh_unit: str = "m"
+    """Unit of the coordinates in that file."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -42,9 +90,13 @@ class Camera:
     cy: float
     """[px]."""
     distortion: FloatArray
-    """OpenCV's k1, k2, p1, p2, k3, shape (5,)."""
+    """OpenCV's k1, k2, p1, p2, k3, shape (5,), with k4, k5, k6 shape (8,); k1 … k4 and 0 where the model is "kannala_brandt"."""
     depth_unit: float
     """Metres in one unit of a depth image."""
+    distortion_model: str = "brown_conrady"
+    """"brown_conrady", "inverse_brown_conrady" (the same polynomial takes bent rays to straight ones) or "kannala_brandt"."""
+    noise: CameraNoise | None = None
+    """What a single depth is off by; None where not known."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -113,6 +165,18 @@ class Recording:
     """Cloud or depth image of each frame and view; None where there is none."""
     color_files: tuple[tuple[Path | None, ...], ...]
     """Colour image that goes with a depth image, the same shape."""
+    marker_noise_m: float | None = None
+    """What a marker repeats to along each axis [m]; None where not given."""
+    session: str | None = None
+    """Recordings of one session share what a session shares; None where not given."""
+    tools: tuple[Tool, ...] = ()
+    """What may touch the robot, where it is known."""
+    unnamed_frame: IntArray = field(default_factory=_no_indices)
+    """Frame of each marker that nobody named, an index 0 … F − 1, shape (U,); such rows are not among marker_xyz."""
+    unnamed_view: IntArray = field(default_factory=_no_indices)
+    """Its camera, an index into camera_names, shape (U,)."""
+    unnamed_xyz: FloatArray = field(default_factory=_no_points)
+    """Its place in that camera's frame [m], shape (U, 3)."""
 
     @property
     def frame_count(self) -> int:
@@ -125,6 +189,7 @@ class Recording:
 
     @property
     def has_markers(self) -> bool:
+        """Whether any frame has a marker with a name."""
         return len(self.marker_frame) > 0
 
 
@@ -159,6 +224,12 @@ def make_recording(
     load_forces: npt.ArrayLike = (),
     cloud_files: Sequence[Sequence[Path | None]] | None = None,
     color_files: Sequence[Sequence[Path | None]] | None = None,
+    marker_noise_m: float | None = None,
+    session: str | None = None,
+    tools: Sequence[Tool] = (),
+    unnamed_frame: npt.ArrayLike = (),
+    unnamed_view: npt.ArrayLike | None = None,
+    unnamed_xyz: npt.ArrayLike = (),
 ) -> Recording:
     """Return a recording made of its parts; see `Recording` for shapes and units. What is left out is empty or unknown.
 
@@ -168,7 +239,7 @@ def make_recording(
     times = freeze(np.asarray(time_s, dtype=np.float64).reshape(-1))
     F, V = len(times), len(camera_names)
     K = np.asarray(marker_frame).size
-    L = np.asarray(load_frame).size
+    L, U = np.asarray(load_frame).size, np.asarray(unnamed_frame).size
     none_files = ((None,) * V,) * F
     recording = Recording(
         folder=folder,
@@ -197,6 +268,12 @@ def make_recording(
         load_forces=_shaped(load_forces, (L, 3), "load_forces"),
         cloud_files=none_files if cloud_files is None else tuple(tuple(files) for files in cloud_files),
         color_files=none_files if color_files is None else tuple(tuple(files) for files in color_files),
+        marker_noise_m=marker_noise_m,
+        session=session,
+        tools=tuple(tools),
+        unnamed_frame=_indices(unnamed_frame, U, F, "unnamed_frame"),
+        unnamed_view=_indices(np.zeros(U) if unnamed_view is None else unnamed_view, U, V, "unnamed_view"),
+        unnamed_xyz=_shaped(unnamed_xyz, (U, 3), "unnamed_xyz"),
     )
     _check_parts(recording)
     return recording
@@ -221,6 +298,7 @@ def select_frames(recording: Recording, which: npt.ArrayLike) -> Recording:
     new[kept] = np.arange(len(kept))
     seen = new[recording.marker_frame] >= 0
     loaded = new[recording.load_frame] >= 0
+    unnamed = new[recording.unnamed_frame] >= 0
     r = recording
     return replace(
         r,
@@ -240,6 +318,9 @@ def select_frames(recording: Recording, which: npt.ArrayLike) -> Recording:
         load_forces=freeze(r.load_forces[loaded]),
         cloud_files=tuple(r.cloud_files[k] for k in kept),
         color_files=tuple(r.color_files[k] for k in kept),
+        unnamed_frame=freeze(new[r.unnamed_frame[unnamed]], np.int64),
+        unnamed_view=freeze(r.unnamed_view[unnamed], np.int64),
+        unnamed_xyz=freeze(r.unnamed_xyz[unnamed]),
     )
 
 

@@ -1,8 +1,5 @@
-"""Clouds of points: files, filters, segmentation, objects, contacts, matching. Plain arrays and small frozen objects in and out."""
+"""Clouds of points: filters, segmentation, objects, contacts, matching. Plain arrays and small frozen objects in and out."""
 
-from femsense.io.clouds.cloud_files import read_cloud, write_cloud
-from femsense.io.clouds.pcd import read_pcd_fields
-from femsense.io.clouds.ply import read_ply_vertices
 from femsense.pointcloud.cloud import PointCloud, cloud_from_depth
 from femsense.pointcloud.contact import Contacts, detect_contacts, map_to_features
 from femsense.pointcloud.filters import pass_through, remove_radius_outliers, voxel_grid
@@ -26,9 +23,6 @@ __all__ = [
     "match_along_normals",
     "objects_on_plane",
     "pass_through",
-    "read_cloud",
-    "read_pcd_fields",
-    "read_ply_vertices",
     "region_growing",
     "remove_plane",
     "remove_radius_outliers",
@@ -36,5 +30,4 @@ __all__ = [
     "segment_robot",
     "shading_features",
     "voxel_grid",
-    "write_cloud",
 ]

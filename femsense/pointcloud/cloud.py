@@ -52,6 +52,7 @@ def cloud_from_depth(
     depth_unit_m: float = 0.001,
     *,
     color: npt.ArrayLike | None = None,
+    distortion_model: str = "brown_conrady",
 ) -> PointCloud:
     """Return the points of a depth image in the camera frame (OpenCV: x right, y down, z forward).
 
@@ -60,9 +61,11 @@ def cloud_from_depth(
     Arguments:
         depth: distances along z in units of depth_unit_m, shape (H, W); 0 where there is none.
         fx, fy, cx, cy: focal lengths and principal point [px]; the centre of the first pixel is (0, 0).
-        distortion: OpenCV's k1, k2, p1, p2, k3, shape (5,).
+        distortion: OpenCV's k1, k2, p1, p2, k3, shape (5,) or with k4, k5, k6 (8,); of a fisheye k1, k2, k3, k4 and zeros.
         depth_unit_m: metres per unit of depth.
         color: bytes 0 … 255 or floats 0 … 1, shape (H, W, 3), registered to the depth image.
+        distortion_model: "brown_conrady" (straight rays to bent ones), "inverse_brown_conrady" (the same polynomial takes bent rays to
+            straight ones, as in RealSense's SDK) or "kannala_brandt" (OpenCV's fisheye).
     Returns:
         The cloud in row-major order of the pixels, pixels without depth left out.
     Raises:
@@ -77,10 +80,49 @@ def cloud_from_depth(
     rays = (np.stack([column, row], axis=1) - [cx, cy]) / focal
     lens = np.asarray(distortion, dtype=np.float64).ravel()
     if np.any(lens != 0.0):
-        rays = _undistort(rays, lens)
+        rays = _straight(rays, lens, distortion_model)
     z = image[row, column].astype(np.float64) * unit
     colors = None if color is None else _pixel_colors(color, image.shape)[row, column]
     return PointCloud(np.column_stack([rays * z[:, None], z]), colors)
+
+
+def _straight(rays: FloatArray, distortion: FloatArray, model: str) -> FloatArray:
+    """Return straight rays (n, 2) of bent ones (n, 2)."""
+    if model == "inverse_brown_conrady":
+        return _bent(rays, distortion)
+    if model == "kannala_brandt":
+        return _unfished(rays, distortion[:4])
+    if model != "brown_conrady":
+        known = "brown_conrady | inverse_brown_conrady | kannala_brandt"
+        raise InputError("unknown lens model", where="distortion_model", found=model, expected=known)
+    return _undistort(rays, distortion)
+
+
+def _unfished(rays: FloatArray, k: FloatArray) -> FloatArray:
+    """Return straight rays (n, 2): θ from |ray| = θ (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸) by Newton, then tan θ (Kannala and Brandt 2006)."""
+    bent = np.linalg.norm(rays, axis=1)
+    theta = bent.copy()
+    powers = np.arange(3, 10, 2)
+    for _ in range(30):
+        value = theta + (k * theta[:, None] ** powers).sum(axis=1) - bent
+        step = value / (1.0 + (k * powers * theta[:, None] ** (powers - 1)).sum(axis=1))
+        theta = theta - step
+        if np.abs(step).max(initial=0.0) < 1e-14:
+            break
+    scale = np.divide(np.tan(theta), bent, out=np.ones_like(bent), where=bent > 0)
+    return np.asarray(rays * scale[:, None])
+
+
+def _bent(rays: FloatArray, distortion: FloatArray) -> FloatArray:
+    """Return OpenCV's forward model of rays (n, 2)."""
+    import cv2
+
+    if len(rays) == 0:
+        return rays
+    spatial = np.column_stack([rays, np.ones(len(rays))])
+    return np.asarray(cv2.projectPoints(spatial, np.zeros(3), np.zeros(3), np.eye(3), distortion)[0], dtype=np.float64).reshape(
+        -1, 2
+    )
 
 
 def _undistort(rays: FloatArray, distortion: FloatArray) -> FloatArray:
@@ -92,9 +134,7 @@ def _undistort(rays: FloatArray, distortion: FloatArray) -> FloatArray:
     straight = np.asarray(cv2.undistortPoints(rays[:, None, :], np.eye(3), distortion), dtype=np.float64).reshape(-1, 2)
     smallest = np.inf
     for _ in range(30):
-        spatial = np.column_stack([straight, np.ones(len(straight))])
-        bent = cv2.projectPoints(spatial, np.zeros(3), np.zeros(3), np.eye(3), distortion)[0]
-        error = rays - np.asarray(bent).reshape(-1, 2)
+        error = rays - _bent(straight, distortion)
         size = float(np.abs(error).max())
         if size < 1e-12 or size >= smallest:
             break

@@ -22,8 +22,10 @@ from femsense.io.recording_folder import load_recording, save_recording
 from femsense.io.robot_toml import load_robot
 from femsense.model.recording import (
     Camera,
+    CameraNoise,
     Recording,
     RestMarkers,
+    Tool,
     check_against,
     make_recording,
     marker_grid,
@@ -52,8 +54,10 @@ def assert_same(x: Any, y: Any, name: str) -> None:
     if isinstance(x, np.ndarray):
         np.testing.assert_array_equal(x, y, err_msg=name)
         assert x.dtype == y.dtype and not y.flags.writeable, name
-    elif isinstance(x, Camera | RestMarkers):
+    elif isinstance(x, Camera | CameraNoise | RestMarkers | Tool):
         for field in fields(x):
+            if field.name == "mesh_file":
+                continue
             assert_same(getattr(x, field.name), getattr(y, field.name), f"{name}.{field.name}")
     elif isinstance(x, tuple):
         assert len(x) == len(y), name
@@ -278,6 +282,76 @@ def test_round_trip_with_everything(tmp_path: Path) -> None:
     save_recording(second, tmp_path / "c")
     assert folder_hash(tmp_path / "b") == folder_hash(tmp_path / "c")
     assert (tmp_path / "b" / "depth" / "000004.png").read_bytes() == (folder / "depth" / "000004.png").read_bytes()
+
+
+TOOLS = """
+[[tools]]
+name = "ball"
+radius_m = 0.010
+
+[[tools]]
+name = "rod"
+cylinder = { radius_m = 0.004, length_m = 0.15 }
+
+[[tools]]
+name = "block"
+mesh = "a block.stl"
+unit = "mm"
+"""
+
+
+def write_block_tool(folder: Path) -> None:
+    import trimesh
+
+    trimesh.creation.box(extents=(10.0, 20.0, 30.0)).export(folder / "a block.stl")
+
+
+def test_noise_lens_model_tools_and_labels_come_back(tmp_path: Path) -> None:
+    folder = tmp_path / "a"
+    lens = CAMERA + 'distortion = [0.1, 0.01, 0.0, 0.0]\ndistortion_model = "kannala_brandt"\n'
+    noise = '[camera.noise]\nkind = "stereo"\nat_1m_m = 0.002\n'
+    write_small_recording(folder, recording_toml=TOML + 'marker_noise_m = 0.0002\nsession = "A"\n' + lens + noise + TOOLS)
+    write_block_tool(folder)
+    r = load_recording(folder)
+    camera = r.cameras[0]
+    assert camera is not None and camera.noise is not None and camera.distortion_model == "kannala_brandt"
+    np.testing.assert_allclose(camera.noise.std([1.0, 0.5]), [0.002, 0.0005], rtol=1e-12)
+    np.testing.assert_array_equal(camera.distortion, [0.1, 0.01, 0.0, 0.0, 0.0])
+    assert (r.marker_noise_m, r.session) == (0.0002, "A")
+    assert [(t.name, t.kind, t.radius, t.length) for t in r.tools[:2]] == [
+        ("ball", "ball", 0.01, 0.0),
+        ("rod", "cylinder", 0.004, 0.15),
+    ]
+    np.testing.assert_allclose(np.ptp(r.tools[2].points, axis=0), [0.01, 0.02, 0.03], rtol=1e-6)
+    assert r.tools[2].triangles.shape == (12, 3)
+    save_recording(r, tmp_path / "b")
+    same_recording(r, load_recording(tmp_path / "b"))
+    save_recording(load_recording(tmp_path / "b"), tmp_path / "c")
+    assert folder_hash(tmp_path / "b") == folder_hash(tmp_path / "c")
+
+
+def test_a_tool_made_in_python_keeps_all_digits(tmp_path: Path) -> None:
+    points = np.array([[0, 0, 0], [1 / 3, 0, 0], [0, 0.1, 0], [0, 0, 0.7]])
+    triangles = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
+    noise = CameraNoise("tof", floor=0.001, slope=0.002)
+    camera = Camera("", 8, 6, 10.0, 10.0, 3.5, 2.5, np.zeros(5), 0.001, "inverse_brown_conrady", noise)
+    r = make_recording(
+        time_s=[0.0], cameras=[camera], tools=[Tool("wedge", "mesh", points=points, triangles=triangles)], session="b"
+    )
+    back = load_recording(save_recording(r, tmp_path / "a"))
+    corners = lambda t: np.sort(t.points[t.triangles].reshape(-1, 9), axis=0)  # noqa: E731
+    np.testing.assert_array_equal(corners(back.tools[0]), corners(r.tools[0]))
+    assert back.cameras[0] is not None and back.cameras[0].noise is not None
+    np.testing.assert_allclose(back.cameras[0].noise.std([0.0, 2.0]), [0.001, 0.005], rtol=1e-12)
+
+
+def test_markers_without_names_come_back(tmp_path: Path) -> None:
+    rows = "0,,0.1,0,0.5\n0,,0.2,0,0.5\n1,tip,0.1,0,0.5\n4,,0.3,0,0.5\n"
+    r = load_recording(write_small_recording(tmp_path / "a", markers_csv="frame,marker,x_m,y_m,z_m\n" + rows))
+    assert r.unnamed_frame.tolist() == [0, 0, 2] and r.marker_names == ("tip",) and r.marker_frame.tolist() == [1]
+    np.testing.assert_array_equal(r.unnamed_xyz[:, 0], [0.1, 0.2, 0.3])
+    same_recording(r, load_recording(save_recording(r, tmp_path / "b")))
+    assert select_frames(r, [1, 2]).unnamed_frame.tolist() == [1]
 
 
 def test_saving_over_its_own_folder(tmp_path: Path) -> None:
@@ -565,7 +639,50 @@ BAD: list[tuple[dict[str, str | None], str, list[str]]] = [
         "markers.csv, line 2, column frame",
         ["a frame that frames.csv does not have", "2", "(0 … 4)"],
     ),
-    ({"markers_csv": MARKERS + "0,,0,0,0\n"}, "markers.csv, line 2, column marker", ["a marker without a name"]),
+    (
+        {"markers_csv": MARKERS + "0,tip,0,0,0\n0,,0,0,0\n"},
+        "markers.csv, line 3, column marker",
+        ["a marker without a name beside markers with names", "frame 0"],
+    ),
+    ({"rest_csv": "marker,x_m,y_m,z_m\n,0,0,0\n"}, "rest.csv, line 2, column marker", ["a marker without a name"]),
+    (
+        {"recording_toml": TOML + CAMERA + '[camera.noise]\nkind = "stereo"\nfloor_m = 0.1\n'},
+        "recording.toml: camera.noise",
+        ['"stereo" has at_1m_m'],
+    ),
+    (
+        {"recording_toml": TOML + CAMERA + '[camera.noise]\nkind = "radar"\n'},
+        "recording.toml: camera.noise.kind",
+        ["radar", "tof"],
+    ),
+    (
+        {"recording_toml": TOML + CAMERA + 'distortion_model = "brown"\n'},
+        "recording.toml: camera.distortion_model",
+        ["'brown'", "kannala_brandt"],
+    ),
+    (
+        {"recording_toml": TOML + CAMERA + 'distortion = [1, 0, 0, 0, 1]\ndistortion_model = "kannala_brandt"\n'},
+        "recording.toml: camera",
+        ["kannala_brandt has four numbers"],
+    ),
+    ({"recording_toml": TOML + CAMERA + "distortion = [1, 0, 0, 0, 1, 2]\n"}, "recording.toml: camera", ["6 numbers"]),
+    ({"recording_toml": TOML + '[[tools]]\nname = "a"\n'}, "recording.toml: tools[0]", ["a tool is a ball with radius_m"]),
+    (
+        {"recording_toml": TOML + '[[tools]]\nname = "a"\nmesh = "rod.stl"\n'},
+        "recording.toml: tools[0]",
+        ["a mesh with its unit"],
+    ),
+    (
+        {"recording_toml": TOML + '[[tools]]\nname = "a"\nmesh = "rod.stl"\nunit = "mm"\n'},
+        "recording.toml: tools[0].mesh",
+        ["no such mesh file"],
+    ),
+    (
+        {"recording_toml": TOML + '[[tools]]\nname = "a"\nradius_m = 0.01\n' * 2},
+        "recording.toml: tools[1].name",
+        ["a name stands twice"],
+    ),
+    ({"recording_toml": TOML + "marker_noise_m = 0\n"}, "recording.toml: marker_noise_m", ["greater than 0"]),
     (
         {"markers_csv": MARKERS + "0,tip,0,0,0\n0,tip,0,0,1\n"},
         "markers.csv, line 3",

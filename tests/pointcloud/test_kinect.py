@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from helpers import DATA
 
+from femsense.io.clouds.cloud_files import read_cloud
+from femsense.io.clouds.pcd import read_pcd_fields
 from femsense.pointcloud import (
     PointCloud,
     find_plane,
     objects_on_plane,
     pass_through,
-    read_cloud,
-    read_pcd_fields,
     region_growing,
     voxel_grid,
 )

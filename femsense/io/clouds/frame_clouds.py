@@ -62,7 +62,8 @@ def _cloud_of_images(depth_file: Path, color_file: Path | None, camera: Camera |
         check_image_size(image.shape[1], image.shape[0], camera, color_file)
         color = np.stack([image] * 3, axis=2) if image.ndim == 2 else image[:, :, 2::-1]
     c = camera
-    return cloud_from_depth(depth, c.fx, c.fy, c.cx, c.cy, c.distortion, c.depth_unit, color=color)
+    lens = (c.fx, c.fy, c.cx, c.cy, c.distortion, c.depth_unit)
+    return cloud_from_depth(depth, *lens, color=color, distortion_model=c.distortion_model)
 
 
 def find_clouds(folder: Path, views: tuple[str, ...], numbers: IntArray) -> tuple[Any, Any]:

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from femsense.core.errors import InputError
-from femsense.io.clouds.pcd import _unpack_lzf
-from femsense.pointcloud import PointCloud, cloud_from_depth, read_cloud, read_pcd_fields, write_cloud
+from femsense.io.clouds.cloud_files import read_cloud, write_cloud
+from femsense.io.clouds.pcd import _unpack_lzf, read_pcd_fields
+from femsense.pointcloud import PointCloud, cloud_from_depth
 
 
 def some_cloud(count: int = 50, *, colors: bool = True, seed: int = 0) -> PointCloud:
@@ -214,6 +215,33 @@ def test_depth_image_is_projected_back_to_its_pixels_through_the_lens() -> None:
     pixels = cv2.projectPoints(cloud.points, np.zeros(3), np.zeros(3), K, lens)[0].reshape(-1, 2)
     v, u = np.mgrid[0:40, 0:60]
     np.testing.assert_allclose(pixels, np.stack([u.ravel(), v.ravel()], axis=1), atol=1e-6)
+
+
+def test_a_fisheye_is_undone() -> None:
+    import cv2
+
+    depth, _, _ = depth_of_plane(25.0, 27.0, 31.0, 18.0)
+    k = np.array([-0.05, 0.02, -0.003, 0.001])
+    cloud = cloud_from_depth(depth, 25.0, 27.0, 31.0, 18.0, [*k, 0.0], 1e-4, distortion_model="kannala_brandt")
+    K = np.array([[25.0, 0, 31.0], [0, 27.0, 18.0], [0, 0, 1]])
+    pixels = cv2.fisheye.projectPoints(cloud.points[:, None], np.zeros(3), np.zeros(3), K, k)[0].reshape(-1, 2)
+    v, u = np.mgrid[0:40, 0:60]
+    np.testing.assert_allclose(pixels, np.stack([u.ravel(), v.ravel()], axis=1), atol=1e-6)
+
+
+def test_the_inverse_model_takes_bent_rays_to_straight_ones() -> None:
+    """The formula of rs2_deproject_pixel_to_point in librealsense."""
+    k1, k2, p1, p2, k3 = lens = (-0.2, 0.05, 0.001, -0.002, 0.01)
+    depth = np.full((3, 4), 2, dtype=np.uint16)
+    cloud = cloud_from_depth(depth, 5.0, 6.0, 1.5, 1.0, lens, 0.5, distortion_model="inverse_brown_conrady")
+    v, u = np.mgrid[0:3, 0:4].reshape(2, -1)
+    x, y = (u - 1.5) / 5.0, (v - 1.0) / 6.0
+    r2 = x * x + y * y
+    f = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+    straight = [x * f + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * f + 2 * p2 * x * y + p1 * (r2 + 2 * y * y), 1.0 + 0 * x]
+    np.testing.assert_allclose(cloud.points, np.stack(straight, axis=1), rtol=1e-12)
+    with pytest.raises(InputError, match="unknown lens model"):
+        cloud_from_depth(depth, 5.0, 6.0, 1.5, 1.0, lens, distortion_model="pinhole")
 
 
 def test_colours_of_a_depth_image_belong_to_their_pixels() -> None:
