@@ -11,7 +11,7 @@ import scipy.sparse as sp
 from femsense.core.arrays import BoolArray, FloatArray, IntArray
 from femsense.io.clouds.frame_clouds import read_frame_cloud
 from femsense.model.observation import undo_depth
-from femsense.model.recording import Recording
+from femsense.model.recording import CameraNoise, Recording
 from femsense.model.robot import Robot
 from femsense.pointcloud.cloud import PointCloud
 from femsense.pointcloud.rays import Surface, SurfaceHits, together
@@ -21,22 +21,6 @@ REACH = 0.04
 """A point farther from the surface than this share of the body's diagonal is not of the robot as it stands (12 mm of the diamond, METHODS section 3)."""
 MARGIN = 0.25
 """Points farther from the body than this share of its diagonal are left out."""
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class DepthNoise:
-    """What a single depth costs: std(z) = floor + slope z + stereo z²."""
-
-    floor: float = 0.0
-    """[m]."""
-    slope: float = 0.0
-    """[1]."""
-    stereo: float = 0.002
-    """[1/m]: of a stereo camera at one metre."""
-
-    def std(self, z: FloatArray) -> FloatArray:
-        """Return the standard deviation of depths z [m], shape (k,)."""
-        return np.asarray(self.floor + self.slope * z + self.stereo * z**2)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -64,7 +48,7 @@ class Scan:
         """Return where each ray begins in the robot frame [m], shape (k, 3)."""
         return np.array([T[:3, 3] for T in poses])[self.view]
 
-    def ray_std(self, noises: Sequence[DepthNoise]) -> FloatArray:
+    def ray_std(self, noises: Sequence[CameraNoise]) -> FloatArray:
         """Return the noise of each point along its ray [m], shape (k,)."""
         z = self.camera_points[:, 2]
         std = np.empty(len(z))
@@ -140,7 +124,7 @@ def ray_rows(
     scan: Scan,
     surface: Surface,
     poses: Sequence[FloatArray],
-    noises: Sequence[DepthNoise],
+    noises: Sequence[CameraNoise],
     *,
     reach: float,
     catch: float = 0.0,

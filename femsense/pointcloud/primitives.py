@@ -1,0 +1,206 @@
+"""Objects that are seen from one side, completed: a sphere, a cylinder or a plate fitted to their points.
+
+The closest visible points of an object that touches are not where it touches: they lie towards the camera, 5 to 7 mm off for a ball of 10 mm. Where the
+completed object comes closest to a surface is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial import cKDTree
+
+from femsense.core.arrays import FloatArray, IntArray
+from femsense.pointcloud.objects import euclidean_clusters
+
+FITS = 4.0
+"""Median of squared whitened residuals, relative to noise alone, up to which a shape is believed."""
+SIMPLER = 1.15
+"""A shape with more parameters has to leave so much less to be taken."""
+ROUGH_STD = 0.006
+"""How far the closest visible points are off where no shape fits [m] (METHODS section 3)."""
+FEWEST = 12
+"""Fewer points make no shape."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Shape:
+    """A completed object."""
+
+    kind: str
+    """"sphere", "cylinder", "plate" or "points"."""
+    center: FloatArray
+    """Of the sphere; a point of the axis; middle of the plate [m], shape (3,)."""
+    axes: FloatArray
+    """Rows: axis of the cylinder first; sides of the plate, then its normal, shape (3, 3)."""
+    half: FloatArray
+    """Half extents along the axes [m], shape (3,)."""
+    radius: float
+    """Of curvature at its surface [m]; inf: flat; 0: not known."""
+    std_m: float
+    """How well its surface is known [m]."""
+    points: FloatArray
+    """What was seen of it [m], shape (k, 3)."""
+    tree: cKDTree | None = field(default=None, repr=False)
+
+    def distance(self, places: FloatArray) -> FloatArray:
+        """Return the signed distance of places (k, 3) from its surface [m], > 0 outside, shape (k,)."""
+        if self.kind == "points":
+            assert self.tree is not None
+            return np.asarray(self.tree.query(places)[0])
+        local = (places - self.center) @ self.axes.T
+        if self.kind == "sphere":
+            return np.asarray(np.linalg.norm(local, axis=1) - self.radius)
+        if self.kind == "cylinder":
+            across = np.linalg.norm(local[:, 1:], axis=1) - self.radius
+            beyond = np.abs(local[:, 0]) - self.half[0]
+            return np.asarray(np.where(beyond > 0, np.hypot(np.maximum(across, 0.0), np.maximum(beyond, 0.0)), across))
+        beyond = np.maximum(np.abs(local[:, :2]) - self.half[:2], 0.0)
+        return np.asarray(np.sign(local[:, 2]) * np.sqrt((beyond**2).sum(axis=1) + local[:, 2] ** 2))
+
+
+def find_shapes(
+    points: FloatArray, std: FloatArray, origins: FloatArray, near: FloatArray, *, local_m: float, radius_m: float | None = None
+) -> list[Shape]:
+    """Return the objects among points as shapes, each fitted to what lies near a surface.
+
+    Arguments:
+        points: of the surroundings [m], shape (o, 3).
+        std: noise of each along its ray [m], shape (o,).
+        origins: where its ray begins [m], shape (o, 3).
+        near: distance of each from the surface that may be touched [m], shape (o,).
+        local_m: how much of an object counts: points up to so far beyond its nearest one [m].
+        radius_m: known radius of the objects, if they are known balls.
+    """
+    result = []
+    for group in _groups(points, std):
+        own = near[group]
+        close = group[own <= own.min() + local_m]
+        if len(close) < 3:
+            continue
+        result.append(fit_shape(points[close], std[close], origins[close], radius_m=radius_m))
+    return result
+
+
+def fit_shape(points: FloatArray, std: FloatArray, origins: FloatArray, *, radius_m: float | None = None) -> Shape:
+    """Return the simplest shape that explains points with their noise; "points" where none does. Arguments as for `find_shapes`."""
+    ray = points - origins
+    ray = ray / np.linalg.norm(ray, axis=1, keepdims=True)
+    if len(points) < FEWEST:
+        return _raw(points, std)
+    tried = [_sphere(points, std, ray, radius_m)]
+    if radius_m is None:
+        tried += [_plate(points, std, ray), _cylinder(points, std, ray)]
+    good = [(cost, shape) for cost, shape in tried if shape is not None and cost < FITS]
+    if not good:
+        return _raw(points, std)
+    least = min(cost for cost, _ in good)
+    order = ("plate", "sphere", "cylinder")
+    fitting = [shape for cost, shape in good if cost <= SIMPLER * least + 0.02]
+    return min(fitting, key=lambda shape: order.index(shape.kind))
+
+
+# --- fits -------------------------------------------------------------------------------------------------------------
+
+
+def _groups(points: FloatArray, std: FloatArray) -> list[IntArray]:
+    """Return points that hang together, the largest group first."""
+    if len(points) < 3:
+        return []
+    spacing = np.median(cKDTree(points).query(points, k=min(4, len(points)))[0][:, -1])
+    label = euclidean_clusters(points, float(max(2.5 * spacing, 3.0 * np.median(std))), 5)
+    return [np.flatnonzero(label == i) for i in range(int(label.max(initial=-1)) + 1)]
+
+
+def _score(residual: FloatArray) -> float:
+    """Return the robust mean square of whitened residuals: 1 for noise alone."""
+    return float((1.483 * np.median(np.abs(residual))) ** 2)
+
+
+def _sphere(points: FloatArray, std: FloatArray, ray: FloatArray, radius: float | None) -> tuple[float, Shape | None]:
+    middle, look = points.mean(axis=0), ray.mean(axis=0)
+
+    def residual(x: FloatArray) -> FloatArray:
+        away = points - x[:3]
+        length = np.linalg.norm(away, axis=1)
+        r = radius if radius is not None else np.exp(x[3])
+        slope = np.maximum(np.abs(np.einsum("pc,pc->p", away, ray)) / np.maximum(length, 1e-9), 0.2)
+        return np.asarray((length - r) / (std * slope))
+
+    best = None
+    for r in [radius] if radius is not None else (0.004, 0.01, 0.025):
+        start = np.append(middle + 0.7 * r * look, [] if radius is not None else [np.log(r)])
+        found = least_squares(residual, start, loss="soft_l1", x_scale=np.append(np.full(3, 1e-2), [1.0] * (len(start) - 3)), max_nfev=40)
+        best = found if best is None or found.cost < best.cost else best
+    assert best is not None
+    size = float(radius if radius is not None else np.exp(best.x[3]))
+    seen_from_outside = float(np.mean(np.einsum("pc,pc->p", points - best.x[:3], ray) < 0))
+    if size > 0.1 or seen_from_outside < 0.7:
+        return np.inf, None
+    curve = best.jac.T @ best.jac + 1e-12 * np.eye(best.jac.shape[1])
+    spread = float(np.sqrt(np.trace(np.linalg.inv(curve)[:3, :3]) / 3.0))
+    shape = Shape("sphere", best.x[:3], np.eye(3), np.full(3, size), size, spread, points)
+    return _score(residual(best.x)), shape
+
+
+def _cylinder(points: FloatArray, std: FloatArray, ray: FloatArray) -> tuple[float, Shape | None]:
+    middle, look = points.mean(axis=0), ray.mean(axis=0)
+    main = np.linalg.svd(points - middle, full_matrices=False)[2]
+
+    def parts(x: FloatArray, frame: FloatArray) -> tuple[FloatArray, FloatArray]:
+        axis = frame[0] + x[3] * frame[1] + x[4] * frame[2]
+        axis = axis / np.linalg.norm(axis)
+        away = points - middle - x[0] * frame[1] - x[1] * frame[2]
+        return axis, away - np.outer(away @ axis, axis)
+
+    def residual(x: FloatArray, frame: FloatArray) -> FloatArray:
+        _, away = parts(x, frame)
+        length = np.linalg.norm(away, axis=1)
+        slope = np.maximum(np.abs(np.einsum("pc,pc->p", away, ray)) / np.maximum(length, 1e-9), 0.2)
+        return np.asarray((length - np.exp(x[2])) / (std * slope))
+
+    best = None
+    for frame in (main, main[[1, 2, 0]]):
+        for r in (0.003, 0.01):
+            start = np.array([0.7 * r * look @ frame[1], 0.7 * r * look @ frame[2], np.log(r), 0.0, 0.0])
+            found = least_squares(residual, start, args=(frame,), loss="soft_l1", x_scale=[1e-2, 1e-2, 1, 0.3, 0.3], max_nfev=40)
+            best = (found, frame) if best is None or found.cost < best[0].cost else best
+    assert best is not None
+    x, frame = best[0].x, best[1]
+    axis, away = parts(x, frame)
+    size = float(np.exp(x[2]))
+    if size > 0.1 or np.mean(np.einsum("pc,pc->p", away, ray) < 0) < 0.7:
+        return np.inf, None
+    center = middle + x[0] * frame[1] + x[1] * frame[2]
+    along = (points - center) @ axis
+    low, high = np.quantile(along, [0.01, 0.99])
+    side = np.linalg.svd(axis[None])[2][1:]
+    curve = best[0].jac.T @ best[0].jac + 1e-12 * np.eye(5)
+    spread = float(np.sqrt(np.trace(np.linalg.inv(curve)[:2, :2]) / 2.0))
+    shape = Shape(
+        "cylinder", center + 0.5 * (low + high) * axis, np.vstack([axis, side]), np.array([0.5 * (high - low), size, size]), size, spread, points
+    )
+    return _score(residual(x, frame)), shape
+
+
+def _plate(points: FloatArray, std: FloatArray, ray: FloatArray) -> tuple[float, Shape | None]:
+    keep = np.ones(len(points), dtype=bool)
+    for _ in range(4):
+        middle = points[keep].mean(axis=0)
+        axes = np.linalg.svd(points[keep] - middle, full_matrices=False)[2]
+        normal = axes[2] * -np.sign(axes[2] @ ray.mean(axis=0))
+        residual = (points - middle) @ normal / (std * np.maximum(np.abs(ray @ normal), 0.2))
+        keep = np.abs(residual) < 3.0 * max(1.483 * float(np.median(np.abs(residual))), 1.0)
+        if keep.sum() < FEWEST:
+            return np.inf, None
+    low, high = np.quantile((points[keep] - middle) @ axes[:2].T, [0.01, 0.99], axis=0)
+    center = middle + 0.5 * (low + high) @ axes[:2]
+    half = np.append(0.5 * (high - low), 0.0)
+    spread = float(np.median(std) / np.sqrt(keep.sum()))
+    return _score(residual), Shape("plate", center, np.vstack([axes[:2], normal]), half, np.inf, spread, points)
+
+
+def _raw(points: FloatArray, std: FloatArray) -> Shape:
+    return Shape("points", points.mean(axis=0), np.eye(3), np.zeros(3), 0.0, ROUGH_STD, points, cKDTree(points))

@@ -1,0 +1,172 @@
+"""Which contacts explain a frame: what objects touch, then what the shape alone betrays, one after the other, until nothing is left to explain."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from femsense.calib.scan import Scan
+from femsense.core.arrays import FloatArray
+from femsense.core.errors import DataError
+from femsense.fem.compliance import tangent_at
+from femsense.fem.mesh import vertex_normals
+from femsense.sensing.forces import fit_forces, make_touch
+from femsense.sensing.nuisance import nuisance_columns, robust_std, sag_at
+from femsense.sensing.places import object_touches, said_free, seen_objects
+from femsense.sensing.types import Fit, SensedFrame, Sensor, Touch
+
+ACROSS = 0.3
+"""Size of forces along the surface that is expected of a contact whose place is searched, relative to those along the normal."""
+MOST = 4
+"""Contacts a frame at most."""
+SURE = 16.3
+"""χ² with three degrees of freedom that noise alone gives once in 1000: a force below it is none."""
+ROUNDS = 2
+"""How often a place is looked for again with the state that its force makes."""
+THIN = 4000
+"""Rows that the search uses at most."""
+
+
+def explain(
+    sensor: Sensor,
+    k: int,
+    scan: Scan | None,
+    touches: Sequence[Touch],
+    free: Fit,
+    previous: SensedFrame | None,
+    before: tuple[FloatArray, ...] | None,
+) -> Fit:
+    """Return the contacts and forces that explain frame k; those that do not make the misfit smaller are left out."""
+    if scan is None or len(sensor.places):
+        return _better(free, fit_forces(sensor, k, scan, touches, free, start=_start(previous, touches), before=before))
+    if said_free(sensor, k):
+        return free
+    fit = _with_objects(sensor, k, scan, touches, free, previous, before)
+    for _ in range(MOST - len(fit.touches)):
+        found = find_hidden(sensor, fit)
+        if found is None:
+            break
+        start = (fit.state, np.vstack([fit.forces, np.zeros((1, 3))]))
+        more = _significant(sensor, k, scan, _try(sensor, k, scan, [*fit.touches, found], free, start, before) or fit, free, before)
+        if more.cost > fit.cost - 2.0 * sensor.knowledge.gain_limit:
+            break
+        fit = more
+    return fit
+
+
+def find_hidden(sensor: Sensor, fit: Fit) -> Touch | None:
+    """Return the touch that would explain most of what a fit leaves, None where that is no more than noise can do.
+
+    One linear solve answers for all candidates: the gain in log evidence of a force there with a Gaussian prior, pushing inwards. Its place is
+    the mean over candidates, weighted by their evidence, and as uncertain as they are spread.
+    """
+    gain, force = evidence(sensor, fit)
+    nodes = sensor.robot.body.mesh.nodes[sensor.candidates]
+    if not len(gain) or gain.max() < sensor.knowledge.gain_limit:
+        return None
+    weight = np.exp(gain - gain.max())
+    best = int(np.argmax(gain))
+    around = weight * (np.linalg.norm(nodes - nodes[best], axis=1) < 0.25 * sensor.size)
+    spread = float(np.sqrt(around @ ((nodes - nodes[best]) ** 2).sum(axis=1) / around.sum()))
+    least = 0.5 * sensor.size / np.sqrt(len(nodes))
+    return make_touch(sensor, nodes[best], source="shape", std_m=max(spread, least))
+
+
+def evidence(sensor: Sensor, fit: Fit) -> tuple[FloatArray, FloatArray]:
+    """Return the gain in log evidence of one more contact at each candidate, shape (c,), and its force (c, 3) [N]."""
+    body, n, rows = sensor.robot.body, len(fit.state.positions), fit.rows
+    tangent = tangent_at(body, fit.state)
+    normals = vertex_normals(fit.state.positions, sensor.surface.triangles)[sensor.candidates]
+    frames = np.array([np.vstack([m, np.linalg.svd(m[None])[2][1:]]) for m in normals])  # rows: normal, tangents
+    loads = np.zeros((len(frames), 3, n, 3))
+    loads[np.arange(len(frames)), :, sensor.candidates] = frames
+    moves = tangent.respond(loads.reshape(-1, n, 3))
+    columns, known = nuisance_columns(sensor.knowledge, rows, sag_at(sensor, fit.state, tangent))
+    residual = rows.residual - known
+    other = [rows.functional(tangent.respond(np.array([t.patch.spread(a, n) for t in fit.touches for a in np.eye(3)])))] if fit.touches else []
+    columns = np.hstack([columns, *(sensor.options.force_std_n * o for o in other)])
+    std = robust_std(rows, residual)
+    thin = np.arange(0, len(std), max(1, len(std) // THIN))
+    share = len(std) / len(thin)
+    N, z = columns[thin] / std[thin, None], residual[thin] / std[thin]
+    W = rows.functional(moves)[thin] / std[thin, None]
+    inner = np.linalg.inv(N.T @ N + np.eye(N.shape[1]) / share)
+    Nz, NW = N.T @ z, N.T @ W
+    g = share * (W.T @ z - NW.T @ (inner @ Nz)).reshape(-1, 3)
+    W3, NW3 = W.reshape(len(z), -1, 3), NW.reshape(len(Nz), -1, 3)
+    M = share * (np.einsum("rci,rcj->cij", W3, W3) - np.einsum("qci,qp,pcj->cij", NW3, inner, NW3, optimize=True))
+    prior = np.diag([1.0, ACROSS**-2, ACROSS**-2]) / sensor.options.force_std_n**2
+    H = M + prior
+    f = np.linalg.solve(H, g[:, :, None])[:, :, 0]
+    gain = 0.5 * (g * f).sum(axis=1) - 0.5 * (np.linalg.slogdet(H)[1] - np.linalg.slogdet(prior)[1])
+    return np.where(f[:, 0] < 0, gain, -np.inf), np.einsum("ci,cij->cj", f, frames)
+
+
+# --- helpers ----------------------------------------------------------------------------------------------------------
+
+
+def _with_objects(
+    sensor: Sensor, k: int, scan: Scan, touches: Sequence[Touch], free: Fit, previous: SensedFrame | None, before: tuple[FloatArray, ...] | None
+) -> Fit:
+    """Return the fit with what objects touch, their places found again in the state that the forces make."""
+    fit = free
+    if previous is not None and previous.fit.touches:  # what held in the frame before is a start
+        again = _try(sensor, k, scan, previous.fit.touches, free, (previous.fit.state, previous.fit.forces), before)
+        fit = _better(fit, again)
+    shapes = seen_objects(sensor, scan, fit.state)
+    for _ in range(ROUNDS if shapes else 0):
+        found = object_touches(sensor, shapes, fit.state)
+        start = _start_of(fit, found)
+        own = [t for t in fit.touches if t.source == "shape" and all(np.linalg.norm(t.place - o.place) > 0.15 * sensor.size for o in found)]
+        fit = _better(free, _try(sensor, k, scan, [*found, *own], free, start, before) if found or own else None)
+    return _significant(sensor, k, scan, fit, free, before)
+
+
+def _significant(sensor: Sensor, k: int, scan: Scan, fit: Fit, free: Fit, before: tuple[FloatArray, ...] | None) -> Fit:
+    """Return the fit without contacts whose force may be noise, or that pull."""
+    while fit.touches:
+        value = [
+            float(f @ np.linalg.solve(fit.covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3], f)) for i, f in enumerate(fit.forces)
+        ]
+        weakest = int(np.argmin(value))
+        if value[weakest] >= SURE:
+            return fit
+        kept = [t for i, t in enumerate(fit.touches) if i != weakest]
+        if not kept:
+            return free
+        start = (fit.state, np.delete(fit.forces, weakest, axis=0))
+        fit = _better(free, _try(sensor, k, scan, kept, free, start, before))
+    return fit
+
+
+def _try(
+    sensor: Sensor,
+    k: int,
+    scan: Scan,
+    touches: Sequence[Touch],
+    free: Fit,
+    start: tuple,  # type: ignore[type-arg]
+    before: tuple[FloatArray, ...] | None,
+) -> Fit | None:
+    try:
+        return fit_forces(sensor, k, scan, touches, free, start=start, before=before)
+    except DataError:
+        return None
+
+
+def _better(free: Fit, fit: Fit | None) -> Fit:
+    """Return the fit, unless it explains no more than no contact at all."""
+    return free if fit is None or fit.cost >= free.cost else fit
+
+
+def _start(previous: SensedFrame | None, touches: Sequence[Touch]) -> tuple | None:  # type: ignore[type-arg]
+    if previous is None or len(previous.fit.touches) != len(touches):
+        return None
+    return previous.fit.state, previous.fit.forces
+
+
+def _start_of(fit: Fit, touches: Sequence[Touch]) -> tuple | None:  # type: ignore[type-arg]
+    """Return the state and forces of a fit as a start for as many touches."""
+    return (fit.state, fit.forces) if len(fit.touches) == len(touches) and touches else None
