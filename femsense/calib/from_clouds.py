@@ -13,7 +13,7 @@ import numpy as np
 from femsense.calib.calibration import Calibration
 from femsense.calib.scan import REACH, RayRows, Scan, ray_rows, read_scan
 from femsense.core.arrays import FloatArray, freeze
-from femsense.core.errors import DataError, FemsenseError
+from femsense.core.errors import FemsenseError
 from femsense.core.pose import moved_poses
 from femsense.fem.equilibrium import Equilibrium
 from femsense.model.contact_patch import BodySurface, body_surface
@@ -172,15 +172,17 @@ def _measured_noise(robot: Robot, frames: list[_Seen], poses: tuple[FloatArray, 
     unit = (CameraNoise("stereo", at_1m=1.0),) * len(poses)
     size = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
     spread = [
-        _smooth_rest(rows)[0] for seen in frames for rows in [ray_rows(seen.scan, seen.surface, poses, unit, reach=REACH * size)]
+        _smooth_rest(rows)
+        for seen in frames
+        for rows in [ray_rows(seen.scan, seen.surface, poses, unit, reach=REACH * size)]
         if len(rows.residual)
     ]
     every = np.concatenate(spread) if spread else np.zeros(0)
     return CameraNoise("stereo", at_1m=1.483 * float(np.median(np.abs(every)))) if len(every) >= 100 else USUAL
 
 
-def _smooth_rest(rows: RayRows) -> tuple[FloatArray, FloatArray]:
-    """Return whitened residuals without the mean of their triangle's neighbourhood, and the cells' sizes."""
+def _smooth_rest(rows: RayRows) -> FloatArray:
+    """Return whitened residuals without the mean of those around them."""
     cell = np.ptp(rows.points, axis=0).max() / 30.0 + 1e-12
     z = rows.residual / rows.std
     _, group = np.unique(np.floor(rows.points / cell).astype(np.int64), axis=0, return_inverse=True)
@@ -189,4 +191,4 @@ def _smooth_rest(rows: RayRows) -> tuple[FloatArray, FloatArray]:
     mean = np.bincount(group, z) / count
     many = count[group] >= 5
     scale = np.sqrt(count / np.maximum(count - 1.0, 1.0))
-    return np.asarray(((z - mean[group]) * scale[group])[many]), count
+    return np.asarray(((z - mean[group]) * scale[group])[many])

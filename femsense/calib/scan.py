@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse as sp
+from scipy.spatial import cKDTree
 
 from femsense.core.arrays import BoolArray, FloatArray, IntArray
 from femsense.io.clouds.frame_clouds import read_frame_cloud
@@ -19,6 +20,10 @@ from femsense.pointcloud.segmentation import color_mask
 
 REACH = 0.04
 """A point farther from the surface than this share of the body's diagonal is not of the robot as it stands (12 mm of the diamond, METHODS section 3)."""
+OFF = 4.0
+"""A point farther from the surface than so many standard deviations is not on it."""
+AROUND = 9
+"""Points of which more than half have to lie on the surface, its own included."""
 MARGIN = 0.25
 """Points farther from the body than this share of its diagonal are left out."""
 
@@ -35,6 +40,8 @@ class Scan:
     """Points of everything else, in the frame of their camera [m], shape (o, 3)."""
     others_view: IntArray
     """Camera of each, shape (o,)."""
+    told: bool = True
+    """Whether colour told the robot from the rest; else all points stand among those that may be of the robot."""
 
     def points(self, poses: Sequence[FloatArray]) -> FloatArray:
         """Return the robot's points in the robot frame [m], shape (k, 3)."""
@@ -102,6 +109,7 @@ def read_scan(robot: Robot, recording: Recording, k: int, poses: Sequence[FloatA
     size = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
     low, high = positions.min(axis=0) - MARGIN * size, positions.max(axis=0) + MARGIN * size
     own, own_view, rest, rest_view = [], [], [], []
+    told = True
     for view, T in enumerate(poses):
         cloud = read_frame_cloud(recording, k, view=view)
         if cloud is None:
@@ -110,6 +118,7 @@ def read_scan(robot: Robot, recording: Recording, k: int, poses: Sequence[FloatA
         placed = points @ T[:3, :3].T + T[:3, 3]
         inside = ((placed >= low) & (placed <= high)).all(axis=1) & (points[:, 2] > 0)
         points, kept = points[inside], cloud.select(inside)
+        told = told and kept.colors is not None and robot.color_rgb is not None
         mine = _of_robot(robot, kept)
         own.append(points[mine])
         rest.append(points[~mine])
@@ -117,7 +126,7 @@ def read_scan(robot: Robot, recording: Recording, k: int, poses: Sequence[FloatA
         rest_view.append(np.full(int((~mine).sum()), view))
     if not own:
         return None
-    return Scan(np.vstack(own), np.concatenate(own_view), np.vstack(rest), np.concatenate(rest_view))
+    return Scan(np.vstack(own), np.concatenate(own_view), np.vstack(rest), np.concatenate(rest_view), told)
 
 
 def ray_rows(
@@ -146,6 +155,32 @@ def ray_rows(
         hits = together(hits, SurfaceHits(missed[near.index], near.nodes, near.weights, near.normal, near.distance, near.cosine))
     std = scan.ray_std(noises)[hits.index] * np.maximum(hits.cosine, 1e-3)
     return RayRows(hits, points[hits.index], scan.view[hits.index], hits.distance, std)
+
+
+def parted(scan: Scan, surface: Surface, poses: Sequence[FloatArray], noises: Sequence[CameraNoise], *, reach: float) -> Scan:
+    """Return the scan with its points told apart by a state: of the robot is what lies on the surface, and whose neighbours do too.
+
+    Arguments:
+        scan: what was seen, colourless.
+        surface: the deformed surface.
+        poses, noises: of the cameras.
+        reach: see `Surface.cast` [m].
+    """
+    rows = ray_rows(scan, surface, poses, noises, reach=reach)
+    on = np.zeros(len(scan.view), dtype=bool)
+    on[rows.hits.index] = np.abs(rows.residual) < OFF * rows.std
+    if not on.any():
+        return scan
+    tree = cKDTree(scan.points(poses))
+    around = tree.query(tree.data, k=min(AROUND, len(on)))[1].reshape(len(on), -1)
+    mine = on & (on[around].mean(axis=1) > 0.5)
+    return replace(
+        scan,
+        camera_points=scan.camera_points[mine],
+        view=scan.view[mine],
+        others=scan.camera_points[~mine],
+        others_view=scan.view[~mine],
+    )
 
 
 def _of_robot(robot: Robot, cloud: PointCloud) -> BoolArray:

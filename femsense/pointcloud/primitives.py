@@ -109,8 +109,9 @@ def _groups(points: FloatArray, std: FloatArray) -> list[IntArray]:
     """Return points that hang together, the largest group first."""
     if len(points) < 3:
         return []
-    spacing = np.median(cKDTree(points).query(points, k=min(4, len(points)))[0][:, -1])
-    label = euclidean_clusters(points, float(max(2.5 * spacing, 3.0 * np.median(std))), 5)
+    gaps = np.asarray(cKDTree(points).query(points, k=min(4, len(points)))[0])
+    spacing = float(np.median(gaps[:, -1]))
+    label = euclidean_clusters(points, max(2.5 * spacing, 3.0 * float(np.median(std))), 5)
     return [np.flatnonzero(label == i) for i in range(int(label.max(initial=-1)) + 1)]
 
 
@@ -132,14 +133,17 @@ def _sphere(points: FloatArray, std: FloatArray, ray: FloatArray, radius: float 
     best = None
     for r in [radius] if radius is not None else (0.004, 0.01, 0.025):
         start = np.append(middle + 0.7 * r * look, [] if radius is not None else [np.log(r)])
-        found = least_squares(residual, start, loss="soft_l1", x_scale=np.append(np.full(3, 1e-2), [1.0] * (len(start) - 3)), max_nfev=40)
+        found = least_squares(
+            residual, start, loss="soft_l1", x_scale=np.append(np.full(3, 1e-2), [1.0] * (len(start) - 3)), max_nfev=40
+        )
         best = found if best is None or found.cost < best.cost else best
     assert best is not None
     size = float(radius if radius is not None else np.exp(best.x[3]))
     seen_from_outside = float(np.mean(np.einsum("pc,pc->p", points - best.x[:3], ray) < 0))
     if size > 0.1 or seen_from_outside < 0.7:
         return np.inf, None
-    curve = best.jac.T @ best.jac + 1e-12 * np.eye(best.jac.shape[1])
+    jac = np.asarray(best.jac)
+    curve = jac.T @ jac + 1e-12 * np.eye(jac.shape[1])
     spread = float(np.sqrt(np.trace(np.linalg.inv(curve)[:3, :3]) / 3.0))
     shape = Shape("sphere", best.x[:3], np.eye(3), np.full(3, size), size, spread, points)
     return _score(residual(best.x)), shape
@@ -177,10 +181,17 @@ def _cylinder(points: FloatArray, std: FloatArray, ray: FloatArray) -> tuple[flo
     along = (points - center) @ axis
     low, high = np.quantile(along, [0.01, 0.99])
     side = np.linalg.svd(axis[None])[2][1:]
-    curve = best[0].jac.T @ best[0].jac + 1e-12 * np.eye(5)
+    jac = np.asarray(best[0].jac)
+    curve = jac.T @ jac + 1e-12 * np.eye(5)
     spread = float(np.sqrt(np.trace(np.linalg.inv(curve)[:2, :2]) / 2.0))
     shape = Shape(
-        "cylinder", center + 0.5 * (low + high) * axis, np.vstack([axis, side]), np.array([0.5 * (high - low), size, size]), size, spread, points
+        "cylinder",
+        center + 0.5 * (low + high) * axis,
+        np.vstack([axis, side]),
+        np.array([0.5 * (high - low), size, size]),
+        size,
+        spread,
+        points,
     )
     return _score(residual(x, frame)), shape
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from femsense.core.arrays import FloatArray, IntArray, freeze
+from femsense.core.arrays import BoolArray, FloatArray, IntArray, freeze
 
 GRAZING = 0.25
 """Rays that meet the surface at a smaller |cos| say little and err at silhouettes: one pixel beside it they miss (METHODS section 3)."""
@@ -31,7 +31,7 @@ class SurfaceHits:
 
     def place(self, positions: FloatArray) -> FloatArray:
         """Return where the rays meet the surface when its nodes are at `positions` (n, 3) [m], shape (r, 3)."""
-        return np.einsum("ri,ric->rc", self.weights, positions[self.nodes])
+        return np.asarray(np.einsum("ri,ric->rc", self.weights, positions[self.nodes]))
 
 
 class Surface:
@@ -107,7 +107,7 @@ def together(first: SurfaceHits, second: SurfaceHits) -> SurfaceHits:
     )
 
 
-def _select(hits: SurfaceHits, which: FloatArray) -> SurfaceHits:
+def _select(hits: SurfaceHits, which: BoolArray) -> SurfaceHits:
     return SurfaceHits(
         hits.index[which], hits.nodes[which], hits.weights[which], hits.normal[which], hits.distance[which], hits.cosine[which]
     )

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from femsense.calib.scan import Scan
 from femsense.core.arrays import FloatArray, freeze
 from femsense.core.errors import DataError
 from femsense.fem.compliance import Tangent, tangent_at
@@ -20,13 +21,14 @@ from femsense.model.contact_patch import ContactPatch, closest_surface_point, pa
 from femsense.model.variants import solve_frame
 from femsense.qp.forces import estimate_forces
 from femsense.qp.problem import FrictionCone
-from femsense.calib.scan import Scan
 from femsense.sensing.measure import rows_at
-from femsense.sensing.nuisance import cut_of, misfit_of, nuisance_columns, robust_std, sag_at
+from femsense.sensing.nuisance import misfit_of, nuisance_columns, robust_std, sag_at
 from femsense.sensing.types import Fit, Rows, Sensor, Touch
 
 ROUGH = 1e-6
 """Unbalanced force, relative to all loads, of the states on the way to the forces; the last one is exact."""
+SIZINGS = 8
+"""How often the size of the forces is estimated anew in one linear problem."""
 PATCH = 1.05
 """Radius over which a point force is spread, in edges of the surface: the least that has a few nodes everywhere."""
 LOST = 9.0
@@ -34,7 +36,13 @@ LOST = 9.0
 
 
 def make_touch(
-    sensor: Sensor, place: FloatArray, *, source: str, std_m: float = 0.0, normal: FloatArray | None = None, radius: float = np.inf
+    sensor: Sensor,
+    place: FloatArray,
+    *,
+    source: str,
+    std_m: float = 0.0,
+    normal: FloatArray | None = None,
+    radius: float = np.inf,
 ) -> Touch:
     """Return a touch at the point of the surface at rest that is closest to a place at rest [m], shape (3,)."""
     nodes = sensor.robot.body.mesh.nodes
@@ -81,7 +89,8 @@ def fit_forces(
     Raises:
         DataError: nothing is seen, or the force problem has no answer.
     """
-    here = _Here(tuple(touches), np.zeros((len(touches), 3)), free.state, free.rows)
+    m = len(touches)
+    here = _Here(tuple(touches), np.zeros((m, 3)), free.state, free.rows, np.full(m, sensor.options.force_std_n))
     linear = _linearise(sensor, here)
     cost = linear.cost(here)
     if start is not None and len(start[1]) == len(touches):
@@ -92,12 +101,14 @@ def fit_forces(
     answer = linear.solve(sensor, here)
     still = False
     for _ in range(sensor.options.iterations):
+        here = replace(here, sizes=answer.sizes)
+        cost = linear.cost(here)
         force_step, shift = answer.forces - here.forces, answer.shift
         small = 0.05 * answer.force_std + 2e-3 * max(float(np.abs(answer.forces).max()), 1e-3)
         if (np.abs(force_step) < small[:, None]).all() and (np.abs(shift) < 0.1 * sensor.surface.edge).all():
             still = True
             break
-        better = None
+        better: tuple[_Here, _Linear] | None = None
         for share in (1.0, 0.4, 0.1):  # large deflections: a full step may lead too far
             near = _tried(sensor, k, scan, _moved(sensor, here, linear, share * force_step, share * shift), before)
             if near is None:
@@ -115,8 +126,16 @@ def fit_forces(
             still = True
             break
     state = _solve(sensor, k, _nodal(sensor, here), here.state, before)
+    cost = linear.cost(replace(here, sizes=np.full(m, sensor.options.force_std_n)))
     return Fit(
-        here.touches, state, freeze(here.forces), freeze(answer.covariance), freeze(answer.place_covariance), here.rows, cost, still
+        here.touches,
+        state,
+        freeze(here.forces),
+        freeze(answer.covariance),
+        freeze(answer.place_covariance),
+        here.rows,
+        cost,
+        still,
     )
 
 
@@ -131,6 +150,7 @@ class _Here:
     forces: FloatArray  # (m, 3) [N]
     state: Equilibrium
     rows: Rows
+    sizes: FloatArray  # expected size of each force along each axis, (m,) [N]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -142,6 +162,7 @@ class _Answer:
     covariance: FloatArray  # (3m, 3m)
     place_covariance: FloatArray  # (m, 3, 3)
     force_std: FloatArray  # (m,)
+    sizes: FloatArray  # (m,) [N]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -156,19 +177,20 @@ class _Linear:
     residual: FloatArray  # (r,), without what the free frames say
     normals: FloatArray  # outward, deformed, (m, 3)
     moves: FloatArray  # of the nodes by unit forces, (3m, n, 3)
-    force_std_n: float
 
     def cost(self, here: _Here) -> float:
         """Return the misfit of the state, priors included."""
-        off = sum(
-            float(((t.place - t.expected) ** 2).sum()) / t.std_m**2 for t in here.touches if t.std_m > 0
-        )
-        prior = float((here.forces**2).sum()) / self.force_std_n**2
+        off = sum(float(((t.place - t.expected) ** 2).sum()) / t.std_m**2 for t in here.touches if t.std_m > 0)
+        prior = float(((here.forces / here.sizes[:, None]) ** 2).sum())
         return misfit_of(self.residual, self.nuisance, here.rows)[0] + LOST * here.rows.lost + off + prior
 
     def solve(self, sensor: Sensor, here: _Here) -> _Answer:
-        """Return forces and shifts of the places that explain the rows best."""
-        m, force_std = len(here.touches), self.force_std_n
+        """Return forces and shifts of the places that explain the rows best.
+
+        Three components of one force are seldom all determined: a beam hardly yields along its axis. They share a Gaussian prior whose size the
+        data choose (MacKay 1992), so that what the data do not see shrinks and does not inflate the force.
+        """
+        m = len(here.touches)
         std = robust_std(here.rows, self.residual)
         place_std = np.repeat([t.std_m for t in here.touches], 2)
         free = np.repeat([t.std_m > 0 and float(np.linalg.norm(f)) > 0 for t, f in zip(here.touches, here.forces)], 2)
@@ -176,34 +198,31 @@ class _Linear:
         by_shift = self.by_shift * (free * place_std)
         rest = self.residual + self.by_force @ here.forces.ravel() - self.by_shift @ (free * wanted)
         A = np.hstack([self.by_force, by_shift, self.nuisance, rest[:, None]]) / std[:, None]
-        R = np.linalg.qr(A, mode="r")
-        F, N, z = R[:, : 3 * m], R[:, 3 * m : -1], R[:, -1]
-        estimate = estimate_forces(
-            np.vstack([F, np.eye(3 * m) / force_std]),
-            None,
-            np.zeros(len(R) + 3 * m),
-            np.concatenate([z, np.zeros(3 * m)]),
-            std=1.0,
-            nuisance=np.vstack([N, np.zeros((3 * m, N.shape[1]))]),
-            nuisance_std=np.ones(N.shape[1]),
-            friction_cone=_cone(sensor, here, self.normals),
-        )
-        if not np.isfinite(estimate.forces).all():
-            raise DataError(f"the force problem has no answer: {estimate.status}")
-        shift = free * (wanted + place_std * estimate.nuisance[: 2 * m])
-        spread = max(1.0, 1.483 * float(np.median(np.abs(self.residual / here.rows.std))))
-        covariance = spread**2 * _force_covariance(F, N, m, force_std)
-        place = self._place_covariance(F, N, m, place_std) * spread**2
+        R = np.asarray(np.linalg.qr(A, mode="r"))
+        spread = max(1.0, 1.483 * float(np.median(np.abs(self.residual / here.rows.std)))) ** 2
+        sizes = here.sizes
+        for _ in range(SIZINGS):
+            covariance = _posterior(R, sizes, m)
+            forces, others = _bounded(R, sizes, m, _cone(sensor, here, self.normals))
+            variance = np.array([np.trace(covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3]) for i in range(m)])
+            new = np.sqrt(((forces**2).sum(axis=1) + variance) / 3.0)
+            new = np.clip(new, 1e-6, sensor.options.force_std_n)
+            settled = bool((np.abs(new - sizes) < 0.02 * new).all())
+            sizes = new
+            if settled:
+                break
+        shift = free * (wanted + place_std * others[: 2 * m])
+        place = covariance[3 * m : 5 * m, 3 * m : 5 * m] * np.outer(place_std, place_std)
+        places = np.array([e.T @ place[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] @ e for i, e in enumerate(self.frames)])
         limit = sensor.surface.edge
-        size = np.sqrt(np.maximum(np.array([np.trace(covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3]) for i in range(m)]) / 3, 0))
-        return _Answer(estimate.forces.reshape(m, 3), np.clip(shift, -limit, limit).reshape(m, 2), covariance, place, size)
-
-    def _place_covariance(self, F: FloatArray, N: FloatArray, m: int, place_std: FloatArray) -> FloatArray:
-        A = np.hstack([F, N])
-        prior = np.concatenate([np.full(3 * m, self.force_std_n**-2.0), np.ones(N.shape[1])])
-        inverse = np.linalg.inv(A.T @ A + np.diag(prior))
-        part = inverse[3 * m : 5 * m, 3 * m : 5 * m] * np.outer(place_std, place_std)
-        return np.array([e.T @ part[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] @ e for i, e in enumerate(self.frames)]).reshape(m, 3, 3)
+        return _Answer(
+            forces,
+            np.clip(shift, -limit, limit).reshape(m, 2),
+            spread * covariance[: 3 * m, : 3 * m],
+            spread * places.reshape(m, 3, 3),
+            np.sqrt(spread * variance / 3.0),
+            sizes,
+        )
 
 
 def _linearise(sensor: Sensor, here: _Here) -> _Linear:
@@ -225,15 +244,32 @@ def _linearise(sensor: Sensor, here: _Here) -> _Linear:
         here.rows.residual - known,
         np.array([touch_normal(sensor, t, here.state) for t in here.touches]),
         moves[: 3 * m],
-        sensor.options.force_std_n,
     )
 
 
-def _force_covariance(F: FloatArray, N: FloatArray, m: int, force_std: float) -> FloatArray:
-    """Return the covariance of the forces, places and nuisance marginalised; the cone, where it acts, would only make it smaller."""
-    A = np.hstack([F, N])
-    prior = np.concatenate([np.full(3 * m, force_std**-2.0), np.ones(N.shape[1])])
-    return np.asarray(np.linalg.inv(A.T @ A + np.diag(prior))[: 3 * m, : 3 * m])
+def _posterior(R: FloatArray, sizes: FloatArray, m: int) -> FloatArray:
+    """Return the covariance of forces, shifts and nuisance; the cone, where it acts, would only make it smaller."""
+    A = R[:, :-1]
+    prior = np.concatenate([np.repeat(sizes, 3) ** -2.0, np.ones(A.shape[1] - 3 * m)])
+    return np.asarray(np.linalg.inv(A.T @ A + np.diag(prior)))
+
+
+def _bounded(R: FloatArray, sizes: FloatArray, m: int, cone: FrictionCone | None) -> tuple[FloatArray, FloatArray]:
+    """Return forces (m, 3) within the cone and the nuisance. Raises DataError."""
+    F, N, z = R[:, : 3 * m], R[:, 3 * m : -1], R[:, -1]
+    estimate = estimate_forces(
+        np.vstack([F, np.diag(np.repeat(1.0 / sizes, 3))]),
+        None,
+        np.zeros(len(R) + 3 * m),
+        np.concatenate([z, np.zeros(3 * m)]),
+        std=1.0,
+        nuisance=np.vstack([N, np.zeros((3 * m, N.shape[1]))]),
+        nuisance_std=np.ones(N.shape[1]),
+        friction_cone=cone,
+    )
+    if not np.isfinite(estimate.forces).all():
+        raise DataError(f"the force problem has no answer: {estimate.status}")
+    return estimate.forces.reshape(m, 3), estimate.nuisance
 
 
 def _cone(sensor: Sensor, here: _Here, normals: FloatArray) -> FrictionCone | None:
@@ -266,18 +302,18 @@ def _moved(sensor: Sensor, here: _Here, linear: _Linear, force_step: FloatArray,
     touches = []
     for touch, frame, way in zip(here.touches, linear.frames, shift):
         if way.any():
-            moved = make_touch(sensor, touch.place + way @ frame, source=touch.source, std_m=touch.std_m, radius=touch.object_radius_m)
+            moved = make_touch(
+                sensor, touch.place + way @ frame, source=touch.source, std_m=touch.std_m, radius=touch.object_radius_m
+            )
             touch = replace(moved, expected=touch.expected)
         touches.append(touch)
     move = np.tensordot(force_step.ravel(), linear.moves, axes=1)
     factor = linear.tangent.factor if linear.tangent.factor.negative == 0 else None
     state = replace(here.state, positions=here.state.positions + move, factor=factor)
-    return _Here(tuple(touches), here.forces + force_step, state, here.rows)
+    return _Here(tuple(touches), here.forces + force_step, state, here.rows, here.sizes)
 
 
-def _tried(
-    sensor: Sensor, k: int, scan: Scan | None, there: _Here, before: tuple[FloatArray, ...] | None
-) -> _Here | None:
+def _tried(sensor: Sensor, k: int, scan: Scan | None, there: _Here, before: tuple[FloatArray, ...] | None) -> _Here | None:
     """Return it with its equilibrium and rows; None where it has none."""
     try:
         state = _solve(sensor, k, _nodal(sensor, there), there.state, before, ROUGH)
@@ -321,4 +357,6 @@ def free_state(sensor: Sensor, k: int, start: Equilibrium | None, before: tuple[
 def solve_with(sensor: Sensor, k: int, touches: Sequence[Touch], forces: FloatArray, start: Equilibrium) -> Equilibrium:
     """Return the state of frame k under forces (m, 3) [N] at some places. Raises DataError."""
     n = len(start.positions)
-    return _solve(sensor, k, np.asarray(sum((t.patch.spread(f, n) for t, f in zip(touches, forces)), np.zeros((n, 3)))), start, None)
+    return _solve(
+        sensor, k, np.asarray(sum((t.patch.spread(f, n) for t, f in zip(touches, forces)), np.zeros((n, 3)))), start, None
+    )

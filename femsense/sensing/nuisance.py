@@ -27,8 +27,9 @@ LIKELY_GAIN = 13.5
 """Log-evidence gain that noise alone gives once in 1000 frames: χ² with three degrees at some 50 places that differ."""
 
 
-def first_knowledge(noises: tuple[CameraNoise, ...], surface_nodes: FloatArray, size: float, modulus_std: float,
-                    pose_covariance: FloatArray) -> Knowledge:
+def first_knowledge(
+    noises: tuple[CameraNoise, ...], surface_nodes: FloatArray, size: float, modulus_std: float, pose_covariance: FloatArray
+) -> Knowledge:
     """Return what is known before a free frame is seen.
 
     Arguments:
@@ -121,7 +122,7 @@ def misfit_of(residual: FloatArray, columns: FloatArray, rows: Rows) -> tuple[fl
     fitted = np.linalg.solve(A.T @ A + np.eye(columns.shape[1]), A.T @ (residual / std))
     z = np.abs(residual - columns @ fitted) / rows.std
     cut = cut_of(residual / rows.std)
-    return float(np.where(z <= cut, z**2, cut * (2.0 * z - cut)).sum() + fitted @ fitted), fitted
+    return float(np.where(z <= cut, z**2, cut * (2.0 * z - cut)).sum() + fitted @ fitted), np.asarray(fitted, dtype=np.float64)
 
 
 # --- helpers ----------------------------------------------------------------------------------------------------------

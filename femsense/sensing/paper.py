@@ -43,14 +43,14 @@ def sense_as_published(sensor: Sensor, k: int, previous: SensedFrame | None) -> 
         raise InputError("the published method needs clouds", where=sensor.recording.folder, expected="clouds/ or depth/")
     free = free_state(sensor, k, None if previous is None else previous.free_state, None)
     robot, others = _segmented(sensor, k, free)
-    rows, directions = _matches(sensor, robot, free)
+    rows = _matches(sensor, robot, free)
     touches = _touches(sensor, robot, others, free, k)
     forces, covariance = _one_step(sensor, rows, touches, free)
     state = solve_with(sensor, k, touches, forces, free)
     m = len(touches)
     fit = Fit(tuple(touches), state, forces, covariance, np.zeros((m, 3, 3)), rows, 0.0)
     contacts = contacts_of(sensor, k, fit, previous)
-    after = _matches(sensor, robot, state)[0]
+    after = _matches(sensor, robot, state)
     number, stamp = int(sensor.recording.frame_numbers[k]), float(sensor.recording.time_s[k])
     ms = 1e3 * (time.perf_counter() - began)
     report = FrameReport(
@@ -85,8 +85,8 @@ def _segmented(sensor: Sensor, k: int, state: Equilibrium) -> tuple[PointCloud, 
     return robot, others
 
 
-def _matches(sensor: Sensor, robot: PointCloud, state: Equilibrium) -> tuple[Rows, FloatArray]:
-    """Return feature points matched along their normals (Algorithm 3), and the normals."""
+def _matches(sensor: Sensor, robot: PointCloud, state: Equilibrium) -> Rows:
+    """Return feature points matched along their normals (Algorithm 3)."""
     flat = flat_nodes(sensor.surface, sensor.robot.body.mesh.nodes)
     features = spread_features(sensor.robot.body, max(len(sensor.robot.features), 50), among=flat)
     normals = vertex_normals(state.positions, sensor.surface.triangles)[features]
@@ -115,7 +115,7 @@ def _matches(sensor: Sensor, robot: PointCloud, state: Equilibrium) -> tuple[Row
         count=len(at),
         rms=float(np.sqrt((distance**2).mean())),
     )
-    return rows, n
+    return rows
 
 
 def _touches(sensor: Sensor, robot: PointCloud, others: PointCloud, state: Equilibrium, k: int) -> list[Touch]:
@@ -126,7 +126,12 @@ def _touches(sensor: Sensor, robot: PointCloud, others: PointCloud, state: Equil
         return []
     voxel = VOXEL * sensor.size
     found = detect_contacts(
-        others.points, robot.points, search_radius_m=3.0 * voxel, min_neighbors=NEIGHBORS, cluster_distance_m=4.0 * voxel, min_points=3
+        others.points,
+        robot.points,
+        search_radius_m=3.0 * voxel,
+        min_neighbors=NEIGHBORS,
+        cluster_distance_m=4.0 * voxel,
+        min_points=3,
     )
     nodes, x = sensor.surface.nodes, state.positions
     nearest = [int(nodes[np.argmin(np.linalg.norm(x[nodes] - place, axis=1))]) for place in found.positions]

@@ -28,7 +28,7 @@ from femsense.sensing.judge import status_of, trusted
 from femsense.sensing.paper import sense_as_published
 from femsense.sensing.places import find_touches, near_places
 from femsense.sensing.prepare import make_sensor, scan_of
-from femsense.sensing.search import explain
+from femsense.sensing.search import explain, told_apart
 from femsense.sensing.tracks import contacts_of, smoothed
 from femsense.sensing.types import ContactForce, Done, FrameReport, Run, SensedFrame, SensingOptions, Sensor, States
 
@@ -102,6 +102,7 @@ def sense_frame(sensor: Sensor, k: int, previous: SensedFrame | None) -> SensedF
     scan = scan_of(sensor, k, alone if previous is None else previous.state)
     clock.lap("scan")
     free = no_forces(sensor, k, scan, alone)
+    scan, free = told_apart(sensor, k, scan, free, previous, before)
     clock.lap("rows")
     touches = find_touches(sensor, k, scan, free)
     clock.lap("places")
@@ -147,7 +148,8 @@ def _sense_into(done: Done, sense: Callable[..., SensedFrame], sensor: Sensor, k
         done.reports.append(frame.report)
         done.contacts.extend(_named(done, frame.contacts))
         done.states.append(frame.state.positions)
-        done.last = replace(frame, contacts=tuple(done.contacts[len(done.contacts) - len(frame.contacts) :])) if trusted(frame) else None
+        named = tuple(done.contacts[len(done.contacts) - len(frame.contacts) :])
+        done.last = replace(frame, contacts=named) if trusted(frame) else done.last
     except FemsenseError as error:
         done.reports.append(_failed(sensor, k, error))
         done.states.append(sensor.robot.body.mesh.nodes if done.last is None else done.last.free_state.positions)

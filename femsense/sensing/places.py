@@ -83,14 +83,20 @@ def _touch(sensor: Sensor, shape: Shape, state: Equilibrium) -> Touch | None:
     normals = np.cross(*(state.positions[closest[:, i]] - state.positions[closest[:, 0]] for i in (1, 2)))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     own = best // len(weights)
-    alike = np.repeat(normals @ normals[own] > 0.5, len(weights)) & (np.linalg.norm(places - places[best], axis=1) < 3.0 * sensor.surface.edge)
+    alike = np.repeat(normals @ normals[own] > 0.5, len(weights)) & (
+        np.linalg.norm(places - places[best], axis=1) < 3.0 * sensor.surface.edge
+    )
     weight = alike * np.exp(-(distance - distance[best]) / max(std, 2e-4))
     middle = weight @ rest / weight.sum()
     radius = float(np.sqrt(weight @ ((rest - middle) ** 2).sum(axis=1) / weight.sum()))
     if _on_clamp(sensor, middle):
         return None
     return make_touch(
-        sensor, middle, source="cloud", std_m=float(np.hypot(std, 0.5 * radius)), radius=shape.radius if shape.radius > 0 else np.inf
+        sensor,
+        middle,
+        source="cloud",
+        std_m=float(np.hypot(std, 0.5 * radius)),
+        radius=shape.radius if shape.radius > 0 else np.inf,
     )
 
 

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from femsense.calib.calibration import Calibration
 from femsense.calib.from_clouds import measured_noises, pose_pivot
-from femsense.calib.scan import Scan, read_scan
+from femsense.calib.scan import REACH, Scan, parted, read_scan
 from femsense.core.arrays import FloatArray, as_points
 from femsense.core.errors import FemsenseError, InputError
 from femsense.fem.compliance import tangent_at
@@ -18,6 +18,7 @@ from femsense.model.contact_patch import body_surface, flat_nodes
 from femsense.model.drive import DrivenRobot, drive_of
 from femsense.model.recording import Recording, check_against
 from femsense.model.robot import Robot, spread_features
+from femsense.pointcloud.rays import Surface
 from femsense.sensing.forces import free_state
 from femsense.sensing.measure import rows_at
 from femsense.sensing.nuisance import FREE_FRAMES, first_knowledge, learn, sag_at
@@ -51,7 +52,9 @@ def make_sensor(
         )
     robot = _with_placements(robot, calibration)
     noises = measured_noises(robot, recording, calibration)
-    knowledge = first_knowledge(noises, robot.body.mesh.nodes[surface.nodes], size, options.modulus_std, calibration.joint_covariance)
+    knowledge = first_knowledge(
+        noises, robot.body.mesh.nodes[surface.nodes], size, options.modulus_std, calibration.joint_covariance
+    )
     sensor = Sensor(
         robot,
         recording,
@@ -114,6 +117,9 @@ def _free_rows(sensor: Sensor) -> list[tuple[Rows, FloatArray]]:
         try:
             state = free_state(sensor, k, state, None)
             scan = scan_of(sensor, k, state)
+            if scan is not None and not scan.told:
+                shape = Surface(state.positions, sensor.surface.triangles)
+                scan = parted(scan, shape, sensor.calibration.poses, sensor.knowledge.noises, reach=REACH * sensor.size)
             rows = None if scan is None else rows_at(sensor, k, scan, state)
         except FemsenseError:
             continue

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
-from femsense.calib.scan import Scan
+from femsense.calib.scan import REACH, Scan, parted
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import DataError
 from femsense.fem.compliance import tangent_at
+from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.mesh import vertex_normals
-from femsense.sensing.forces import fit_forces, make_touch
+from femsense.pointcloud.rays import Surface
+from femsense.sensing.forces import fit_forces, make_touch, no_forces
 from femsense.sensing.nuisance import nuisance_columns, robust_std, sag_at
 from femsense.sensing.places import object_touches, said_free, seen_objects
 from femsense.sensing.types import Fit, SensedFrame, Sensor, Touch
@@ -43,13 +44,40 @@ def explain(
         return _better(free, fit_forces(sensor, k, scan, touches, free, start=_start(previous, touches), before=before))
     if said_free(sensor, k):
         return free
-    fit = _with_objects(sensor, k, scan, touches, free, previous, before)
+    return _with_hidden(sensor, k, scan, _with_objects(sensor, k, scan, touches, free, previous, before), free, before)
+
+
+def told_apart(
+    sensor: Sensor, k: int, scan: Scan | None, free: Fit, previous: SensedFrame | None, before: tuple[FloatArray, ...] | None
+) -> tuple[Scan | None, Fit]:
+    """Return the scan with robot and surroundings apart, and the fit without forces to what is the robot's.
+
+    Where colour has not told them apart, the shape is explained first, with all points; what then lies off the surface is something else.
+    """
+    if scan is None or scan.told:
+        return scan, free
+    fit = free
+    if not said_free(sensor, k) and not len(sensor.places):
+        if previous is not None and previous.fit.touches:
+            fit = _better(
+                free, _try(sensor, k, scan, previous.fit.touches, free, (previous.fit.state, previous.fit.forces), before)
+            )
+        fit = _with_hidden(sensor, k, scan, fit, free, before)
+    surface = Surface(fit.state.positions, sensor.surface.triangles)
+    scan = parted(scan, surface, sensor.calibration.poses, sensor.knowledge.noises, reach=REACH * sensor.size)
+    return scan, no_forces(sensor, k, scan, free.state)
+
+
+def _with_hidden(sensor: Sensor, k: int, scan: Scan, fit: Fit, free: Fit, before: tuple[FloatArray, ...] | None) -> Fit:
+    """Return the fit with contacts that the shape alone betrays, one after the other."""
     for _ in range(MOST - len(fit.touches)):
         found = find_hidden(sensor, fit)
         if found is None:
             break
         start = (fit.state, np.vstack([fit.forces, np.zeros((1, 3))]))
-        more = _significant(sensor, k, scan, _try(sensor, k, scan, [*fit.touches, found], free, start, before) or fit, free, before)
+        more = _significant(
+            sensor, k, scan, _try(sensor, k, scan, [*fit.touches, found], free, start, before) or fit, free, before
+        )
         if more.cost > fit.cost - 2.0 * sensor.knowledge.gain_limit:
             break
         fit = more
@@ -62,7 +90,7 @@ def find_hidden(sensor: Sensor, fit: Fit) -> Touch | None:
     One linear solve answers for all candidates: the gain in log evidence of a force there with a Gaussian prior, pushing inwards. Its place is
     the mean over candidates, weighted by their evidence, and as uncertain as they are spread.
     """
-    gain, force = evidence(sensor, fit)
+    gain, _ = evidence(sensor, fit)
     nodes = sensor.robot.body.mesh.nodes[sensor.candidates]
     if not len(gain) or gain.max() < sensor.knowledge.gain_limit:
         return None
@@ -85,7 +113,11 @@ def evidence(sensor: Sensor, fit: Fit) -> tuple[FloatArray, FloatArray]:
     moves = tangent.respond(loads.reshape(-1, n, 3))
     columns, known = nuisance_columns(sensor.knowledge, rows, sag_at(sensor, fit.state, tangent))
     residual = rows.residual - known
-    other = [rows.functional(tangent.respond(np.array([t.patch.spread(a, n) for t in fit.touches for a in np.eye(3)])))] if fit.touches else []
+    other = (
+        [rows.functional(tangent.respond(np.array([t.patch.spread(a, n) for t in fit.touches for a in np.eye(3)])))]
+        if fit.touches
+        else []
+    )
     columns = np.hstack([columns, *(sensor.options.force_std_n * o for o in other)])
     std = robust_std(rows, residual)
     thin = np.arange(0, len(std), max(1, len(std) // THIN))
@@ -108,7 +140,13 @@ def evidence(sensor: Sensor, fit: Fit) -> tuple[FloatArray, FloatArray]:
 
 
 def _with_objects(
-    sensor: Sensor, k: int, scan: Scan, touches: Sequence[Touch], free: Fit, previous: SensedFrame | None, before: tuple[FloatArray, ...] | None
+    sensor: Sensor,
+    k: int,
+    scan: Scan,
+    touches: Sequence[Touch],
+    free: Fit,
+    previous: SensedFrame | None,
+    before: tuple[FloatArray, ...] | None,
 ) -> Fit:
     """Return the fit with what objects touch, their places found again in the state that the forces make."""
     fit = free
@@ -119,7 +157,11 @@ def _with_objects(
     for _ in range(ROUNDS if shapes else 0):
         found = object_touches(sensor, shapes, fit.state)
         start = _start_of(fit, found)
-        own = [t for t in fit.touches if t.source == "shape" and all(np.linalg.norm(t.place - o.place) > 0.15 * sensor.size for o in found)]
+        own = [
+            t
+            for t in fit.touches
+            if t.source == "shape" and all(np.linalg.norm(t.place - o.place) > 0.15 * sensor.size for o in found)
+        ]
         fit = _better(free, _try(sensor, k, scan, [*found, *own], free, start, before) if found or own else None)
     return _significant(sensor, k, scan, fit, free, before)
 
@@ -147,7 +189,7 @@ def _try(
     scan: Scan,
     touches: Sequence[Touch],
     free: Fit,
-    start: tuple,  # type: ignore[type-arg]
+    start: tuple[Equilibrium, FloatArray] | None,
     before: tuple[FloatArray, ...] | None,
 ) -> Fit | None:
     try:
@@ -161,12 +203,12 @@ def _better(free: Fit, fit: Fit | None) -> Fit:
     return free if fit is None or fit.cost >= free.cost else fit
 
 
-def _start(previous: SensedFrame | None, touches: Sequence[Touch]) -> tuple | None:  # type: ignore[type-arg]
+def _start(previous: SensedFrame | None, touches: Sequence[Touch]) -> tuple[Equilibrium, FloatArray] | None:
     if previous is None or len(previous.fit.touches) != len(touches):
         return None
     return previous.fit.state, previous.fit.forces
 
 
-def _start_of(fit: Fit, touches: Sequence[Touch]) -> tuple | None:  # type: ignore[type-arg]
+def _start_of(fit: Fit, touches: Sequence[Touch]) -> tuple[Equilibrium, FloatArray] | None:
     """Return the state and forces of a fit as a start for as many touches."""
     return (fit.state, fit.forces) if len(fit.touches) == len(touches) and touches else None

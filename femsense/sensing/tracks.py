@@ -18,7 +18,7 @@ SAME = 0.15
 def contacts_of(sensor: Sensor, k: int, fit: Fit, previous: SensedFrame | None) -> tuple[ContactForce, ...]:
     """Return the contacts of a fit; those that begin a track have track −1."""
     number, stamp = int(sensor.recording.frame_numbers[k]), float(sensor.recording.time_s[k])
-    contacts = []
+    contacts: list[ContactForce] = []
     for i, (touch, force) in enumerate(zip(fit.touches, fit.forces)):
         size, normal = float(np.linalg.norm(force)), touch_normal(sensor, touch, fit.state)
         if size == 0.0 and touch.source != "given":
