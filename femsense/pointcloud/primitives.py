@@ -6,10 +6,10 @@ completed object comes closest to a surface is.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 
 from femsense.core.arrays import FloatArray, IntArray
@@ -21,6 +21,12 @@ SIMPLER = 1.15
 """A shape with more parameters has to leave so much less to be taken."""
 ROUGH_STD = 0.006
 """How far the closest visible points are off where no shape fits [m] (METHODS section 3)."""
+LARGEST = 0.1
+"""A larger radius is a plate [m]."""
+FIT_STEPS = 25
+"""Steps of a fit at most."""
+MOST_POINTS = 400
+"""More points than this are thinned out: the shape of an object is known well enough."""
 FEWEST = 12
 """Fewer points make no shape."""
 
@@ -90,6 +96,8 @@ def fit_shape(points: FloatArray, std: FloatArray, origins: FloatArray, *, radiu
     ray = ray / np.linalg.norm(ray, axis=1, keepdims=True)
     if len(points) < FEWEST:
         return _raw(points, std)
+    thin = slice(None, None, max(1, len(points) // MOST_POINTS))
+    points, std, ray = points[thin], std[thin], ray[thin]
     tried = [_sphere(points, std, ray, radius_m)]
     if radius_m is None:
         tried += [_plate(points, std, ray), _cylinder(points, std, ray)]
@@ -123,77 +131,96 @@ def _score(residual: FloatArray) -> float:
 def _sphere(points: FloatArray, std: FloatArray, ray: FloatArray, radius: float | None) -> tuple[float, Shape | None]:
     middle, look = points.mean(axis=0), ray.mean(axis=0)
 
-    def residual(x: FloatArray) -> FloatArray:
+    def evaluate(x: FloatArray) -> tuple[FloatArray, FloatArray]:
         away = points - x[:3]
-        length = np.linalg.norm(away, axis=1)
-        r = radius if radius is not None else np.exp(x[3])
-        slope = np.maximum(np.abs(np.einsum("pc,pc->p", away, ray)) / np.maximum(length, 1e-9), 0.2)
-        return np.asarray((length - r) / (std * slope))
+        length = np.maximum(np.linalg.norm(away, axis=1), 1e-9)
+        size = radius if radius is not None else float(np.exp(x[3]))
+        unit = away / length[:, None]
+        scale = std * np.maximum(np.abs(np.einsum("pc,pc->p", unit, ray)), 0.2)
+        J = -unit if radius is not None else np.hstack([-unit, np.full((len(unit), 1), -size)])
+        return (length - size) / scale, J / scale[:, None]
 
-    best = None
-    for r in [radius] if radius is not None else (0.004, 0.01, 0.025):
-        start = np.append(middle + 0.7 * r * look, [] if radius is not None else [np.log(r)])
-        found = least_squares(
-            residual, start, loss="soft_l1", x_scale=np.append(np.full(3, 1e-2), [1.0] * (len(start) - 3)), max_nfev=40
-        )
-        best = found if best is None or found.cost < best.cost else best
-    assert best is not None
-    size = float(radius if radius is not None else np.exp(best.x[3]))
-    seen_from_outside = float(np.mean(np.einsum("pc,pc->p", points - best.x[:3], ray) < 0))
-    if size > 0.1 or seen_from_outside < 0.7:
+    starts = [np.append(middle + 0.7 * r * look, np.log(r)) for r in ([radius] if radius is not None else (0.004, 0.01, 0.025))]
+    x, curve, residual = min((_least(evaluate, s[:3] if radius is not None else s) for s in starts), key=_typical)
+    size = radius if radius is not None else float(np.exp(x[3]))
+    seen_from_outside = float(np.mean(np.einsum("pc,pc->p", points - x[:3], ray) < 0))
+    if size > LARGEST or seen_from_outside < 0.7:
         return np.inf, None
-    jac = np.asarray(best.jac)
-    curve = jac.T @ jac + 1e-12 * np.eye(jac.shape[1])
-    spread = float(np.sqrt(np.trace(np.linalg.inv(curve)[:3, :3]) / 3.0))
-    shape = Shape("sphere", best.x[:3], np.eye(3), np.full(3, size), size, spread, points)
-    return _score(residual(best.x)), shape
+    return _score(residual), Shape("sphere", x[:3], np.eye(3), np.full(3, size), size, _spread(curve, 3), points)
 
 
 def _cylinder(points: FloatArray, std: FloatArray, ray: FloatArray) -> tuple[float, Shape | None]:
     middle, look = points.mean(axis=0), ray.mean(axis=0)
     main = np.linalg.svd(points - middle, full_matrices=False)[2]
 
-    def parts(x: FloatArray, frame: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def parts(x: FloatArray, frame: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         axis = frame[0] + x[3] * frame[1] + x[4] * frame[2]
         axis = axis / np.linalg.norm(axis)
         away = points - middle - x[0] * frame[1] - x[1] * frame[2]
-        return axis, away - np.outer(away @ axis, axis)
+        along = away @ axis
+        return axis, along, away - np.outer(along, axis)
 
-    def residual(x: FloatArray, frame: FloatArray) -> FloatArray:
-        _, away = parts(x, frame)
-        length = np.linalg.norm(away, axis=1)
-        slope = np.maximum(np.abs(np.einsum("pc,pc->p", away, ray)) / np.maximum(length, 1e-9), 0.2)
-        return np.asarray((length - np.exp(x[2])) / (std * slope))
+    def evaluator(frame: FloatArray) -> Callable[[FloatArray], tuple[FloatArray, FloatArray]]:
+        def evaluate(x: FloatArray) -> tuple[FloatArray, FloatArray]:
+            _, along, away = parts(x, frame)
+            length = np.maximum(np.linalg.norm(away, axis=1), 1e-9)
+            unit, size = away / length[:, None], float(np.exp(x[2]))
+            scale = std * np.maximum(np.abs(np.einsum("pc,pc->p", unit, ray)), 0.2)
+            across = unit @ frame[1:].T
+            tilt = -along[:, None] * across / np.sqrt(1.0 + x[3] ** 2 + x[4] ** 2)
+            J = np.hstack([-across, np.full((len(unit), 1), -size), tilt])
+            return (length - size) / scale, J / scale[:, None]
 
-    best = None
+        return evaluate
+
+    tried = []
     for frame in (main, main[[1, 2, 0]]):
         for r in (0.003, 0.01):
             start = np.array([0.7 * r * look @ frame[1], 0.7 * r * look @ frame[2], np.log(r), 0.0, 0.0])
-            found = least_squares(residual, start, args=(frame,), loss="soft_l1", x_scale=[1e-2, 1e-2, 1, 0.3, 0.3], max_nfev=40)
-            best = (found, frame) if best is None or found.cost < best[0].cost else best
-    assert best is not None
-    x, frame = best[0].x, best[1]
-    axis, away = parts(x, frame)
+            tried.append((*_least(evaluator(frame), start), frame))
+    x, curve, residual, frame = min(tried, key=lambda t: _typical(t[:3]))
+    axis, _, away = parts(x, frame)
     size = float(np.exp(x[2]))
-    if size > 0.1 or np.mean(np.einsum("pc,pc->p", away, ray) < 0) < 0.7:
+    if size > LARGEST or np.mean(np.einsum("pc,pc->p", away, ray) < 0) < 0.7:
         return np.inf, None
     center = middle + x[0] * frame[1] + x[1] * frame[2]
-    along = (points - center) @ axis
-    low, high = np.quantile(along, [0.01, 0.99])
-    side = np.linalg.svd(axis[None])[2][1:]
-    jac = np.asarray(best[0].jac)
-    curve = jac.T @ jac + 1e-12 * np.eye(5)
-    spread = float(np.sqrt(np.trace(np.linalg.inv(curve)[:2, :2]) / 2.0))
-    shape = Shape(
-        "cylinder",
-        center + 0.5 * (low + high) * axis,
-        np.vstack([axis, side]),
-        np.array([0.5 * (high - low), size, size]),
-        size,
-        spread,
-        points,
-    )
-    return _score(residual(x, frame)), shape
+    low, high = np.quantile((points - center) @ axis, [0.01, 0.99])
+    axes = np.vstack([axis, np.linalg.svd(axis[None])[2][1:]])
+    half = np.array([0.5 * (high - low), size, size])
+    shape = Shape("cylinder", center + 0.5 * (low + high) * axis, axes, half, size, _spread(curve, 2), points)
+    return _score(residual), shape
+
+
+def _least(
+    evaluate: Callable[[FloatArray], tuple[FloatArray, FloatArray]], x: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return parameters, curvature and whitened residual of a robust fit (Huber, Levenberg's damping)."""
+    damping = 1e-3
+    residual, J = evaluate(x)
+    cost = _huber(residual)
+    for _ in range(FIT_STEPS):
+        weight = np.minimum(1.0, 2.0 / np.maximum(np.abs(residual), 1e-12))
+        curve = J.T @ (weight[:, None] * J)
+        step = -np.linalg.solve(curve + damping * np.diag(np.diag(curve) + 1e-12), J.T @ (weight * residual))
+        there, slope = evaluate(x + np.clip(step, -1.0, 1.0))
+        new = _huber(there)
+        if new < cost:
+            done = cost - new < 1e-4 * cost
+            x, residual, J, cost, damping = x + np.clip(step, -1.0, 1.0), there, slope, new, 0.2 * damping
+            if done:
+                break
+        else:
+            damping *= 10.0
+    return x, np.asarray(J.T @ J), residual
+
+
+def _huber(residual: FloatArray) -> float:
+    size = np.abs(residual)
+    return float(np.where(size <= 2.0, size**2, 2.0 * (2.0 * size - 2.0)).sum())
+
+
+def _typical(fit: tuple[FloatArray, FloatArray, FloatArray]) -> float:
+    return _huber(fit[2])
 
 
 def _plate(points: FloatArray, std: FloatArray, ray: FloatArray) -> tuple[float, Shape | None]:
@@ -211,6 +238,12 @@ def _plate(points: FloatArray, std: FloatArray, ray: FloatArray) -> tuple[float,
     half = np.append(0.5 * (high - low), 0.0)
     spread = float(np.median(std) / np.sqrt(keep.sum()))
     return _score(residual), Shape("plate", center, np.vstack([axes[:2], normal]), half, np.inf, spread, points)
+
+
+def _spread(curve: FloatArray, count: int) -> float:
+    """Return the standard deviation of the first parameters from the curvature of the misfit [m]; ROUGH_STD where they are not determined."""
+    variance = float(np.trace(np.linalg.pinv(curve)[:count, :count])) / count
+    return min(float(np.sqrt(variance)), ROUGH_STD) if variance > 0 else ROUGH_STD
 
 
 def _raw(points: FloatArray, std: FloatArray) -> Shape:

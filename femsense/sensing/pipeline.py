@@ -26,7 +26,7 @@ from femsense.model.robot import Robot
 from femsense.sensing.forces import free_state, no_forces
 from femsense.sensing.judge import status_of, trusted
 from femsense.sensing.paper import sense_as_published
-from femsense.sensing.places import find_touches, near_places
+from femsense.sensing.places import find_touches, near_places, seen_objects
 from femsense.sensing.prepare import make_sensor, scan_of
 from femsense.sensing.search import explain, told_apart
 from femsense.sensing.tracks import contacts_of, smoothed
@@ -104,9 +104,10 @@ def sense_frame(sensor: Sensor, k: int, previous: SensedFrame | None) -> SensedF
     free = no_forces(sensor, k, scan, alone)
     scan, free = told_apart(sensor, k, scan, free, previous, before)
     clock.lap("rows")
-    touches = find_touches(sensor, k, scan, free)
+    shapes = seen_objects(sensor, k, scan, free.state)
+    touches = find_touches(sensor, shapes, free)
     clock.lap("places")
-    fit = explain(sensor, k, scan, touches, free, previous, before)
+    fit = explain(sensor, k, scan, shapes, touches, free, previous, before)
     clock.lap("forces")
     contacts = contacts_of(sensor, k, fit, previous)
     number, stamp = int(sensor.recording.frame_numbers[k]), float(sensor.recording.time_s[k])

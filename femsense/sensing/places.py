@@ -26,13 +26,11 @@ FLOOR_STD = 0.0007
 """The surface between nodes is flat in the model: no place is known better [m]."""
 
 
-def find_touches(sensor: Sensor, k: int, scan: Scan | None, free: Fit) -> list[Touch]:
-    """Return where forces may act in frame k before the shape is asked: the given places, else where objects touch the state."""
+def find_touches(sensor: Sensor, shapes: list[Shape], free: Fit) -> list[Touch]:
+    """Return where forces may act before the shape is asked: the given places, else where objects touch the state."""
     if len(sensor.places):
         return [make_touch(sensor, place, source="given") for place in sensor.places]
-    if scan is None or said_free(sensor, k):
-        return []
-    return object_touches(sensor, seen_objects(sensor, scan, free.state), free.state)
+    return object_touches(sensor, shapes, free.state)
 
 
 def said_free(sensor: Sensor, k: int) -> bool:
@@ -40,8 +38,10 @@ def said_free(sensor: Sensor, k: int) -> bool:
     return sensor.recording.free is not None and bool(sensor.recording.free[k])
 
 
-def seen_objects(sensor: Sensor, scan: Scan, state: Equilibrium) -> list[Shape]:
-    """Return what is seen near the body, completed."""
+def seen_objects(sensor: Sensor, k: int, scan: Scan | None, state: Equilibrium) -> list[Shape]:
+    """Return what is seen near the body in frame k, completed; nothing where the places are given or nothing is said to touch."""
+    if scan is None or len(sensor.places) or said_free(sensor, k):
+        return []
     poses = sensor.calibration.poses
     points = scan.surroundings(poses)
     if len(points) < 3:

@@ -23,7 +23,7 @@ from femsense.sensing.forces import free_state
 from femsense.sensing.measure import rows_at
 from femsense.sensing.nuisance import FREE_FRAMES, first_knowledge, learn, sag_at
 from femsense.sensing.places import check_places, near_places
-from femsense.sensing.types import Rows, SensingOptions, Sensor
+from femsense.sensing.types import Answers, Rows, SensingOptions, Sensor
 
 CANDIDATES = 120
 """Places at which hidden contacts are searched (METHODS section 3)."""
@@ -67,6 +67,7 @@ def make_sensor(
         pose_pivot(robot),
         size,
         knowledge,
+        Answers(),
     )
     return replace(sensor, knowledge=learn(knowledge, _free_rows(sensor)))
 

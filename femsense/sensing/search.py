@@ -9,13 +9,14 @@ import numpy as np
 from femsense.calib.scan import REACH, Scan, parted
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import DataError
-from femsense.fem.compliance import tangent_at
+from femsense.fem.compliance import Tangent, tangent_at
 from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.mesh import vertex_normals
+from femsense.pointcloud.primitives import Shape
 from femsense.pointcloud.rays import Surface
 from femsense.sensing.forces import fit_forces, make_touch, no_forces
 from femsense.sensing.nuisance import nuisance_columns, robust_std, sag_at
-from femsense.sensing.places import object_touches, said_free, seen_objects
+from femsense.sensing.places import object_touches, said_free
 from femsense.sensing.types import Fit, SensedFrame, Sensor, Touch
 
 ACROSS = 0.3
@@ -26,7 +27,9 @@ SURE = 16.3
 """χ² with three degrees of freedom that noise alone gives once in 1000: a force below it is none."""
 ROUNDS = 2
 """How often a place is looked for again with the state that its force makes."""
-THIN = 4000
+NEARBY = 0.03
+"""The search takes the answers of a state whose nodes are nearer than this share of the body's diagonal: they rank places, and do not weigh forces."""
+THIN = 2000
 """Rows that the search uses at most."""
 
 
@@ -34,6 +37,7 @@ def explain(
     sensor: Sensor,
     k: int,
     scan: Scan | None,
+    shapes: list[Shape],
     touches: Sequence[Touch],
     free: Fit,
     previous: SensedFrame | None,
@@ -44,7 +48,7 @@ def explain(
         return _better(free, fit_forces(sensor, k, scan, touches, free, start=_start(previous, touches), before=before))
     if said_free(sensor, k):
         return free
-    return _with_hidden(sensor, k, scan, _with_objects(sensor, k, scan, touches, free, previous, before), free, before)
+    return _with_hidden(sensor, k, scan, _with_objects(sensor, k, scan, shapes, free, previous, before), free, before)
 
 
 def told_apart(
@@ -108,9 +112,7 @@ def evidence(sensor: Sensor, fit: Fit) -> tuple[FloatArray, FloatArray]:
     tangent = tangent_at(body, fit.state)
     normals = vertex_normals(fit.state.positions, sensor.surface.triangles)[sensor.candidates]
     frames = np.array([np.vstack([m, np.linalg.svd(m[None])[2][1:]]) for m in normals])  # rows: normal, tangents
-    loads = np.zeros((len(frames), 3, n, 3))
-    loads[np.arange(len(frames)), :, sensor.candidates] = frames
-    moves = tangent.respond(loads.reshape(-1, n, 3))
+    answers = _answers(sensor, fit.state, tangent)
     columns, known = nuisance_columns(sensor.knowledge, rows, sag_at(sensor, fit.state, tangent))
     residual = rows.residual - known
     other = (
@@ -123,7 +125,8 @@ def evidence(sensor: Sensor, fit: Fit) -> tuple[FloatArray, FloatArray]:
     thin = np.arange(0, len(std), max(1, len(std) // THIN))
     share = len(std) / len(thin)
     N, z = columns[thin] / std[thin, None], residual[thin] / std[thin]
-    W = rows.functional(moves)[thin] / std[thin, None]
+    W = (rows.functional(answers)[thin] / std[thin, None]).reshape(len(thin), -1, 3)
+    W = np.einsum("rcj,cij->rci", W, frames).reshape(len(thin), -1)
     inner = np.linalg.inv(N.T @ N + np.eye(N.shape[1]) / share)
     Nz, NW = N.T @ z, N.T @ W
     g = share * (W.T @ z - NW.T @ (inner @ Nz)).reshape(-1, 3)
@@ -136,6 +139,17 @@ def evidence(sensor: Sensor, fit: Fit) -> tuple[FloatArray, FloatArray]:
     return np.where(f[:, 0] < 0, gain, -np.inf), np.einsum("ci,cij->cj", f, frames)
 
 
+def _answers(sensor: Sensor, state: Equilibrium, tangent: Tangent) -> FloatArray:
+    """Return how the nodes answer to unit forces at the candidates near a state [m/N], shape (3c, n, 3)."""
+    kept = sensor.answers
+    if kept.positions is None or kept.moves is None or np.abs(kept.positions - state.positions).max() > NEARBY * sensor.size:
+        n, c = len(state.positions), len(sensor.candidates)
+        loads = np.zeros((c, 3, n, 3))
+        loads[np.arange(c), :, sensor.candidates] = np.eye(3)
+        kept.positions, kept.moves = state.positions, tangent.respond(loads.reshape(-1, n, 3))
+    return kept.moves
+
+
 # --- helpers ----------------------------------------------------------------------------------------------------------
 
 
@@ -143,7 +157,7 @@ def _with_objects(
     sensor: Sensor,
     k: int,
     scan: Scan,
-    touches: Sequence[Touch],
+    shapes: list[Shape],
     free: Fit,
     previous: SensedFrame | None,
     before: tuple[FloatArray, ...] | None,
@@ -153,9 +167,10 @@ def _with_objects(
     if previous is not None and previous.fit.touches:  # what held in the frame before is a start
         again = _try(sensor, k, scan, previous.fit.touches, free, (previous.fit.state, previous.fit.forces), before)
         fit = _better(fit, again)
-    shapes = seen_objects(sensor, scan, fit.state)
     for _ in range(ROUNDS if shapes else 0):
         found = object_touches(sensor, shapes, fit.state)
+        if _same(sensor, found, fit.touches):
+            break
         start = _start_of(fit, found)
         own = [
             t
@@ -164,6 +179,13 @@ def _with_objects(
         ]
         fit = _better(free, _try(sensor, k, scan, [*found, *own], free, start, before) if found or own else None)
     return _significant(sensor, k, scan, fit, free, before)
+
+
+def _same(sensor: Sensor, found: Sequence[Touch], touches: Sequence[Touch]) -> bool:
+    """Return whether objects touch where the fit has contacts already."""
+    if len(found) != len(touches) or any(t.source != "cloud" for t in touches):
+        return False
+    return all(min(float(np.linalg.norm(f.place - t.expected)) for t in touches) < 0.3 * sensor.surface.edge for f in found)
 
 
 def _significant(sensor: Sensor, k: int, scan: Scan, fit: Fit, free: Fit, before: tuple[FloatArray, ...] | None) -> Fit:

@@ -10,7 +10,6 @@ import numpy as np
 import numpy.typing as npt
 
 from femsense.calib.calibration import Calibration
-from femsense.calib.scan import Scan
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.fem.equilibrium import Equilibrium
 from femsense.model.contact_patch import BodySurface, ContactPatch
@@ -236,6 +235,16 @@ class Knowledge:
     """Misfit per row above which a frame is not explained."""
 
 
+@dataclass(eq=False, slots=True)
+class Answers:
+    """How the body answers to unit forces at the candidates near one state; made anew when the body has moved far from it."""
+
+    positions: FloatArray | None = None
+    """Nodes of that state [m], shape (n, 3)."""
+    moves: FloatArray | None = None
+    """Of the surface nodes by unit forces along x, y, z at each candidate [m/N], shape (3c, n, 3)."""
+
+
 @dataclass(frozen=True, eq=False, slots=True)
 class Sensor:
     """Everything that stays the same from frame to frame."""
@@ -255,12 +264,5 @@ class Sensor:
     size: float
     """Diagonal of the body at rest [m]."""
     knowledge: Knowledge
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class FrameData:
-    """What is measured in one frame."""
-
-    index: int
-    scan: Scan | None
-    """None where there are only markers."""
+    answers: Answers
+    """How the body answers to forces at the candidates, kept from frame to frame."""
