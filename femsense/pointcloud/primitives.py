@@ -7,7 +7,7 @@ completed object comes closest to a surface is.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -66,6 +66,13 @@ class Shape:
         beyond = np.maximum(np.abs(local[:, :2]) - self.half[:2], 0.0)
         return np.asarray(np.sign(local[:, 2]) * np.sqrt((beyond**2).sum(axis=1) + local[:, 2] ** 2))
 
+    def holds(self, points: FloatArray, std: FloatArray) -> bool:
+        """Return whether points (k, 3) lie on its surface, or on that of a rod that is longer than what was seen of it."""
+        if self.kind != "cylinder":
+            return self.kind == "sphere" and bool((np.abs(self.distance(points)) < 3.0 * std).mean() > 0.8)
+        longer = replace(self, half=np.array([np.inf, self.radius, self.radius]))
+        return bool((np.abs(longer.distance(points)) < 3.0 * std + self.std_m).mean() > 0.8)
+
 
 def find_shapes(
     points: FloatArray, std: FloatArray, origins: FloatArray, near: FloatArray, *, local_m: float, radius_m: float | None = None
@@ -80,13 +87,21 @@ def find_shapes(
         local_m: how much of an object counts: points up to so far beyond its nearest one [m].
         radius_m: known radius of the objects, if they are known balls.
     """
-    result = []
-    for group in _groups(points, std):
+    result: list[Shape] = []
+    left = _groups(points, std)
+    while left:
+        group, left = left[0], left[1:]
         own = near[group]
         close = group[own <= own.min() + local_m]
         if len(close) < 3:
             continue
-        result.append(fit_shape(points[close], std[close], origins[close], radius_m=radius_m))
+        shape = fit_shape(points[close], std[close], origins[close], radius_m=radius_m)
+        more = [g for g in left if shape.holds(points[g], std[g])]  # the other end of a rod that passes behind
+        if more:
+            left = [g for g in left if not any(g is m for m in more)]
+            close = np.concatenate([close, *more])
+            shape = fit_shape(points[close], std[close], origins[close], radius_m=radius_m)
+        result.append(shape)
     return result
 
 

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from femsense.calib.scan import Scan
 from femsense.core.arrays import FloatArray, freeze
@@ -27,6 +28,8 @@ from femsense.sensing.types import Fit, Rows, Sensor, Touch
 
 ROUGH = 1e-6
 """Unbalanced force, relative to all loads, of the states on the way to the forces; the last one is exact."""
+ACROSS = 0.5
+"""Forces along the surface are expected to be so much smaller than those along the normal: rubber on plastic or skin slides at 0.5 to 1, and few slide."""
 SIZINGS = 8
 """How often the size of the forces is estimated anew in one linear problem."""
 PATCH = 1.05
@@ -94,7 +97,8 @@ def fit_forces(
     linear = _linearise(sensor, here)
     cost = linear.cost(here)
     if start is not None and len(start[1]) == len(touches):
-        near = _tried(sensor, k, scan, replace(here, forces=start[1], state=start[0]), before)
+        forces = _within_cones(sensor, here.touches, start[1], start[0])
+        near = _tried(sensor, k, scan, replace(here, forces=forces, state=start[0]), before)
         there = None if near is None else _linearise(sensor, near)
         if near is not None and there is not None and there.cost(near) < cost:
             here, linear, cost = near, there, there.cost(near)
@@ -181,7 +185,9 @@ class _Linear:
     def cost(self, here: _Here) -> float:
         """Return the misfit of the state, priors included."""
         off = sum(float(((t.place - t.expected) ** 2).sum()) / t.std_m**2 for t in here.touches if t.std_m > 0)
-        prior = float(((here.forces / here.sizes[:, None]) ** 2).sum())
+        prior = sum(
+            float(((root @ f) ** 2).sum()) for root, f in zip(_priors(here.touches, self.normals, here.sizes), here.forces)
+        )
         return misfit_of(self.residual, self.nuisance, here.rows)[0] + LOST * here.rows.lost + off + prior
 
     def solve(self, sensor: Sensor, here: _Here) -> _Answer:
@@ -202,11 +208,12 @@ class _Linear:
         spread = max(1.0, 1.483 * float(np.median(np.abs(self.residual / here.rows.std)))) ** 2
         sizes = here.sizes
         for _ in range(SIZINGS):
-            covariance = _posterior(R, sizes, m)
-            forces, others = _bounded(R, sizes, m, _cone(sensor, here, self.normals))
-            variance = np.array([np.trace(covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3]) for i in range(m)])
-            new = np.sqrt(((forces**2).sum(axis=1) + variance) / 3.0)
-            new = np.clip(new, 1e-6, sensor.options.force_std_n)
+            prior = block_diag(*_priors(here.touches, self.normals, sizes))
+            covariance = _posterior(R, prior)
+            forces, others = _bounded(R, prior, _cone(sensor, here, self.normals))
+            spreads = prior @ covariance[: 3 * m, : 3 * m] @ prior.T
+            share = ((prior @ forces.ravel()) ** 2 + np.diag(spreads)).reshape(m, 3).sum(axis=1) / 3.0
+            new = np.clip(sizes * np.sqrt(share), 1e-6, sensor.options.force_std_n)
             settled = bool((np.abs(new - sizes) < 0.02 * new).all())
             sizes = new
             if settled:
@@ -220,7 +227,7 @@ class _Linear:
             np.clip(shift, -limit, limit).reshape(m, 2),
             spread * covariance[: 3 * m, : 3 * m],
             spread * places.reshape(m, 3, 3),
-            np.sqrt(spread * variance / 3.0),
+            np.sqrt(spread * np.diag(covariance)[: 3 * m].reshape(m, 3).mean(axis=1)),
             sizes,
         )
 
@@ -247,29 +254,40 @@ def _linearise(sensor: Sensor, here: _Here) -> _Linear:
     )
 
 
-def _posterior(R: FloatArray, sizes: FloatArray, m: int) -> FloatArray:
+def _priors(touches: Sequence[Touch], normals: FloatArray, sizes: FloatArray) -> list[FloatArray]:
+    """Return what whitens each force, shape (3, 3): of one size along all axes where the place is given, smaller across the normal of a contact."""
+    result = []
+    for touch, normal, size in zip(touches, normals, sizes):
+        across = 1.0 if touch.source == "given" else ACROSS
+        result.append(np.vstack([normal, _tangents(normal) / across]) / size)
+    return result
+
+
+def _posterior(R: FloatArray, prior: FloatArray) -> FloatArray:
     """Return the covariance of forces, shifts and nuisance; the cone, where it acts, would only make it smaller."""
-    A = R[:, :-1]
-    prior = np.concatenate([np.repeat(sizes, 3) ** -2.0, np.ones(A.shape[1] - 3 * m)])
-    return np.asarray(np.linalg.inv(A.T @ A + np.diag(prior)))
+    A, f = R[:, :-1], len(prior)
+    precision = A.T @ A + np.eye(A.shape[1])
+    precision[:f, :f] += prior.T @ prior - np.eye(f)
+    return np.asarray(np.linalg.inv(precision))
 
 
-def _bounded(R: FloatArray, sizes: FloatArray, m: int, cone: FrictionCone | None) -> tuple[FloatArray, FloatArray]:
+def _bounded(R: FloatArray, prior: FloatArray, cone: FrictionCone | None) -> tuple[FloatArray, FloatArray]:
     """Return forces (m, 3) within the cone and the nuisance. Raises DataError."""
-    F, N, z = R[:, : 3 * m], R[:, 3 * m : -1], R[:, -1]
+    f = len(prior)
+    F, N, z = R[:, :f], R[:, f:-1], R[:, -1]
     estimate = estimate_forces(
-        np.vstack([F, np.diag(np.repeat(1.0 / sizes, 3))]),
+        np.vstack([F, prior]),
         None,
-        np.zeros(len(R) + 3 * m),
-        np.concatenate([z, np.zeros(3 * m)]),
+        np.zeros(len(R) + f),
+        np.concatenate([z, np.zeros(f)]),
         std=1.0,
-        nuisance=np.vstack([N, np.zeros((3 * m, N.shape[1]))]),
+        nuisance=np.vstack([N, np.zeros((f, N.shape[1]))]),
         nuisance_std=np.ones(N.shape[1]),
         friction_cone=cone,
     )
     if not np.isfinite(estimate.forces).all():
         raise DataError(f"the force problem has no answer: {estimate.status}")
-    return estimate.forces.reshape(m, 3), estimate.nuisance
+    return estimate.forces.reshape(-1, 3), estimate.nuisance
 
 
 def _cone(sensor: Sensor, here: _Here, normals: FloatArray) -> FrictionCone | None:
@@ -277,6 +295,23 @@ def _cone(sensor: Sensor, here: _Here, normals: FloatArray) -> FrictionCone | No
     if sensor.options.friction is None or any(given):
         return None
     return FrictionCone(normals=normals, mu=sensor.options.friction)
+
+
+def _within_cones(sensor: Sensor, touches: tuple[Touch, ...], forces: FloatArray, state: Equilibrium) -> FloatArray:
+    """Return forces (m, 3) moved to the nearest ones within their friction cones; given places push and pull as they like."""
+    mu, result = sensor.options.friction, np.array(forces, dtype=np.float64)
+    if mu is None:
+        return result
+    for i, touch in enumerate(touches):
+        inward = -touch_normal(sensor, touch, state)
+        along = float(result[i] @ inward)
+        across = result[i] - along * inward
+        size = float(np.linalg.norm(across))
+        if touch.source == "given" or size <= mu * along:
+            continue
+        kept = max(along + mu * size, 0.0) / (1.0 + mu**2)
+        result[i] = kept * (inward + mu * across / max(size, 1e-12))
+    return result
 
 
 def _tangents(normal: FloatArray) -> FloatArray:
@@ -307,10 +342,11 @@ def _moved(sensor: Sensor, here: _Here, linear: _Linear, force_step: FloatArray,
             )
             touch = replace(moved, expected=touch.expected)
         touches.append(touch)
-    move = np.tensordot(force_step.ravel(), linear.moves, axes=1)
+    forces = _within_cones(sensor, tuple(touches), here.forces + force_step, here.state)
+    move = np.tensordot((forces - here.forces).ravel(), linear.moves, axes=1)
     factor = linear.tangent.factor if linear.tangent.factor.negative == 0 else None
     state = replace(here.state, positions=here.state.positions + move, factor=factor)
-    return _Here(tuple(touches), here.forces + force_step, state, here.rows, here.sizes)
+    return _Here(tuple(touches), forces, state, here.rows, here.sizes)
 
 
 def _tried(sensor: Sensor, k: int, scan: Scan | None, there: _Here, before: tuple[FloatArray, ...] | None) -> _Here | None:

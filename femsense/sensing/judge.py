@@ -19,7 +19,7 @@ def status_of(sensor: Sensor, fit: Fit, free: Fit) -> str:
     """
     if fit.cost > free.cost:
         return "the residual is larger with the forces than without them"
-    left = misfit(sensor.knowledge, fit.rows, sag_at(sensor, fit.state, tangent_at(sensor.robot.body, fit.state)))
+    left = left_over(sensor, fit)
     if left > sensor.knowledge.misfit_limit:
         what = "with the contacts found" if fit.touches else "and no contact explains it"
         return f"not explained: {1e3 * fit.rows.rms:.2f} mm are left, {np.sqrt(left / sensor.knowledge.misfit_limit):.1f} times what free frames leave, {what}"
@@ -27,6 +27,11 @@ def status_of(sensor: Sensor, fit: Fit, free: Fit) -> str:
     if unsure and fit.touches[unsure[0]].source != "given":
         return "a contact whose force is less than its standard deviation"
     return OK
+
+
+def left_over(sensor: Sensor, fit: Fit) -> float:
+    """Return the misfit per row that a fit leaves, about 1 where all is explained."""
+    return misfit(sensor.knowledge, fit.rows, sag_at(sensor, fit.state, tangent_at(sensor.robot.body, fit.state)))
 
 
 def trusted(frame: SensedFrame) -> bool:

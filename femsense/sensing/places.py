@@ -22,6 +22,10 @@ NEAR = 0.08
 """An object whose visible points all lie farther from the body than this share of its diagonal touches nothing."""
 SLACK = 2.0
 """A completed object touches where its gap is less than this many standard deviations."""
+TILT = 1.5e-4
+"""Gaps along a contact that differ by less than this are alike: a rod along a face touches anywhere on its length [m]."""
+ZONE = 0.15
+"""Largest extent of a contact about its nearest point, relative to the body's diagonal."""
 FLOOR_STD = 0.0007
 """The surface between nodes is flat in the model: no place is known better [m]."""
 
@@ -71,7 +75,7 @@ def _touch(sensor: Sensor, shape: Shape, state: Equilibrium) -> Touch | None:
         return None
     by_node = np.full(len(state.positions), np.inf)
     by_node[sensor.surface.nodes] = corner
-    closest = triangles[by_node[triangles].min(axis=1) <= corner.min() + 2.0 * sensor.surface.edge]
+    closest = triangles[by_node[triangles].min(axis=1) <= corner.min() + sensor.surface.edge]
     weights = _lattice(6)
     places = np.einsum("wi,tic->twc", weights, state.positions[closest]).reshape(-1, 3)
     distance = shape.distance(places)
@@ -84,9 +88,9 @@ def _touch(sensor: Sensor, shape: Shape, state: Equilibrium) -> Touch | None:
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     own = best // len(weights)
     alike = np.repeat(normals @ normals[own] > 0.5, len(weights)) & (
-        np.linalg.norm(places - places[best], axis=1) < 3.0 * sensor.surface.edge
+        np.linalg.norm(places - places[best], axis=1) < ZONE * sensor.size
     )
-    weight = alike * np.exp(-(distance - distance[best]) / max(std, 2e-4))
+    weight = alike * np.exp(-(distance - distance[best]) / max(0.5 * min(shape.std_m, FLOOR_STD), TILT))
     middle = weight @ rest / weight.sum()
     radius = float(np.sqrt(weight @ ((rest - middle) ** 2).sum(axis=1) / weight.sum()))
     if _on_clamp(sensor, middle):
@@ -95,7 +99,7 @@ def _touch(sensor: Sensor, shape: Shape, state: Equilibrium) -> Touch | None:
         sensor,
         middle,
         source="cloud",
-        std_m=float(np.hypot(std, 0.5 * radius)),
+        std_m=float(np.hypot(std, radius)),
         radius=shape.radius if shape.radius > 0 else np.inf,
     )
 

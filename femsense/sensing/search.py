@@ -15,10 +15,13 @@ from femsense.fem.mesh import vertex_normals
 from femsense.pointcloud.primitives import Shape
 from femsense.pointcloud.rays import Surface
 from femsense.sensing.forces import fit_forces, make_touch, no_forces
+from femsense.sensing.judge import left_over
 from femsense.sensing.nuisance import nuisance_columns, robust_std, sag_at
 from femsense.sensing.places import object_touches, said_free
 from femsense.sensing.types import Fit, SensedFrame, Sensor, Touch
 
+ANYWHERE = 0.2
+"""How well the place of a contact that only the shape shows is known beforehand, relative to the body's diagonal."""
 ACROSS = 0.3
 """Size of forces along the surface that is expected of a contact whose place is searched, relative to those along the normal."""
 MOST = 4
@@ -91,19 +94,15 @@ def _with_hidden(sensor: Sensor, k: int, scan: Scan, fit: Fit, free: Fit, before
 def find_hidden(sensor: Sensor, fit: Fit) -> Touch | None:
     """Return the touch that would explain most of what a fit leaves, None where that is no more than noise can do.
 
-    One linear solve answers for all candidates: the gain in log evidence of a force there with a Gaussian prior, pushing inwards. Its place is
-    the mean over candidates, weighted by their evidence, and as uncertain as they are spread.
+    One linear solve answers for all candidates: the gain in log evidence of a force there with a Gaussian prior, pushing inwards. The best one is
+    where the fit begins; its place moves with the forces, and nothing but the rows says where to.
     """
     gain, _ = evidence(sensor, fit)
     nodes = sensor.robot.body.mesh.nodes[sensor.candidates]
     if not len(gain) or gain.max() < sensor.knowledge.gain_limit:
         return None
-    weight = np.exp(gain - gain.max())
-    best = int(np.argmax(gain))
-    around = weight * (np.linalg.norm(nodes - nodes[best], axis=1) < 0.25 * sensor.size)
-    spread = float(np.sqrt(around @ ((nodes - nodes[best]) ** 2).sum(axis=1) / around.sum()))
-    least = 0.5 * sensor.size / np.sqrt(len(nodes))
-    return make_touch(sensor, nodes[best], source="shape", std_m=max(spread, least))
+    best = nodes[int(np.argmax(gain))]
+    return make_touch(sensor, best, source="shape", std_m=ANYWHERE * sensor.size)
 
 
 def evidence(sensor: Sensor, fit: Fit) -> tuple[FloatArray, FloatArray]:
@@ -166,7 +165,7 @@ def _with_objects(
     fit = free
     if previous is not None and previous.fit.touches:  # what held in the frame before is a start
         again = _try(sensor, k, scan, previous.fit.touches, free, (previous.fit.state, previous.fit.forces), before)
-        fit = _better(fit, again)
+        fit = fit if again is None or left_over(sensor, again) > sensor.knowledge.misfit_limit else _better(fit, again)
     for _ in range(ROUNDS if shapes else 0):
         found = object_touches(sensor, shapes, fit.state)
         if _same(sensor, found, fit.touches):
