@@ -30,6 +30,8 @@ ROUGH = 1e-6
 """Unbalanced force, relative to all loads, of the states on the way to the forces; the last one is exact."""
 ACROSS = 0.5
 """Forces along the surface are expected to be so much smaller than those along the normal: rubber on plastic or skin slides at 0.5 to 1, and few slide."""
+TRIES = 4
+"""How often a step is made shorter where it leads too far: first along what the rows hardly determine."""
 SIZINGS = 8
 """How often the size of the forces is estimated anew in one linear problem."""
 PATCH = 1.05
@@ -103,7 +105,7 @@ def fit_forces(
         if near is not None and there is not None and there.cost(near) < cost:
             here, linear, cost = near, there, there.cost(near)
     answer = linear.solve(sensor, here)
-    still = False
+    still, trust = False, 1.0
     for _ in range(sensor.options.iterations):
         here = replace(here, sizes=answer.sizes)
         cost = linear.cost(here)
@@ -113,14 +115,14 @@ def fit_forces(
             still = True
             break
         better: tuple[_Here, _Linear] | None = None
-        for share in (1.0, 0.4, 0.1):  # large deflections: a full step may lead too far
-            near = _tried(sensor, k, scan, _moved(sensor, here, linear, share * force_step, share * shift), before)
-            if near is None:
-                continue
-            there = _linearise(sensor, near)
-            if there.cost(near) < cost:
-                better = near, there
+        for _ in range(TRIES):
+            step = answer if trust >= 1.0 else linear.solve(sensor, here, trust)
+            near = _tried(sensor, k, scan, _moved(sensor, here, linear, step.forces - here.forces, step.shift), before)
+            there = None if near is None else _linearise(sensor, near)
+            if near is not None and there is not None and there.cost(near) < cost:
+                better, trust = (near, there), min(4.0 * trust, 1.0)
                 break
+            trust *= 0.2
         if better is None:
             break
         gain = cost - better[1].cost(better[0])
@@ -190,13 +192,13 @@ class _Linear:
         )
         return misfit_of(self.residual, self.nuisance, here.rows)[0] + LOST * here.rows.lost + off + prior
 
-    def solve(self, sensor: Sensor, here: _Here) -> _Answer:
-        """Return forces and shifts of the places that explain the rows best.
+    def solve(self, sensor: Sensor, here: _Here, trust: float = 1.0) -> _Answer:
+        """Return forces and shifts of the places that explain the rows best; where `trust` is below 1, near those that are here.
 
         Three components of one force are seldom all determined: a beam hardly yields along its axis. They share a Gaussian prior whose size the
         data choose (MacKay 1992), so that what the data do not see shrinks and does not inflate the force.
         """
-        m = len(here.touches)
+        m, edge = len(here.touches), sensor.surface.edge
         std = robust_std(here.rows, self.residual)
         place_std = np.repeat([t.std_m for t in here.touches], 2)
         free = np.repeat([t.std_m > 0 and float(np.linalg.norm(f)) > 0 for t, f in zip(here.touches, here.forces)], 2)
@@ -206,11 +208,22 @@ class _Linear:
         A = np.hstack([self.by_force, by_shift, self.nuisance, rest[:, None]]) / std[:, None]
         R = np.asarray(np.linalg.qr(A, mode="r"))
         spread = max(1.0, 1.483 * float(np.median(np.abs(self.residual / here.rows.std)))) ** 2
+        near = np.zeros((0, R.shape[1] - 1)), np.zeros(0)
+        if trust < 1.0:
+            far = max(
+                float(np.abs(_bounded(R, block_diag(*_priors(here.touches, self.normals, here.sizes)), None, near)[0]).max()),
+                1e-6,
+            )
+            weight = np.concatenate([np.full(3 * m, 1.0 / far), place_std / edge]) / trust
+            near = (
+                np.diag(np.append(weight, np.zeros(R.shape[1] - 1 - 5 * m)))[: 5 * m],
+                np.append(here.forces.ravel() / far, -wanted * free / edge) / trust,
+            )
         sizes = here.sizes
         for _ in range(SIZINGS):
             prior = block_diag(*_priors(here.touches, self.normals, sizes))
             covariance = _posterior(R, prior)
-            forces, others = _bounded(R, prior, _cone(sensor, here, self.normals))
+            forces, others = _bounded(R, prior, _cone(sensor, here, self.normals), near)
             spreads = prior @ covariance[: 3 * m, : 3 * m] @ prior.T
             share = ((prior @ forces.ravel()) ** 2 + np.diag(spreads)).reshape(m, 3).sum(axis=1) / 3.0
             new = np.clip(sizes * np.sqrt(share), 1e-6, sensor.options.force_std_n)
@@ -271,19 +284,15 @@ def _posterior(R: FloatArray, prior: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.inv(precision))
 
 
-def _bounded(R: FloatArray, prior: FloatArray, cone: FrictionCone | None) -> tuple[FloatArray, FloatArray]:
-    """Return forces (m, 3) within the cone and the nuisance. Raises DataError."""
+def _bounded(
+    R: FloatArray, prior: FloatArray, cone: FrictionCone | None, near: tuple[FloatArray, FloatArray]
+) -> tuple[FloatArray, FloatArray]:
+    """Return forces (m, 3) within the cone and the nuisance; `near` are rows and values that hold them. Raises DataError."""
     f = len(prior)
-    F, N, z = R[:, :f], R[:, f:-1], R[:, -1]
+    A = np.vstack([R[:, :-1], np.hstack([prior, np.zeros((f, R.shape[1] - 1 - f))]), near[0]])
+    b = np.concatenate([R[:, -1], np.zeros(f), near[1]])
     estimate = estimate_forces(
-        np.vstack([F, prior]),
-        None,
-        np.zeros(len(R) + f),
-        np.concatenate([z, np.zeros(f)]),
-        std=1.0,
-        nuisance=np.vstack([N, np.zeros((f, N.shape[1]))]),
-        nuisance_std=np.ones(N.shape[1]),
-        friction_cone=cone,
+        A[:, :f], None, np.zeros(len(A)), b, std=1.0, nuisance=A[:, f:], nuisance_std=np.ones(A.shape[1] - f), friction_cone=cone
     )
     if not np.isfinite(estimate.forces).all():
         raise DataError(f"the force problem has no answer: {estimate.status}")

@@ -22,6 +22,8 @@ from femsense.sensing.types import Fit, SensedFrame, Sensor, Touch
 
 ANYWHERE = 0.2
 """How well the place of a contact that only the shape shows is known beforehand, relative to the body's diagonal."""
+STARTS, APART = 3, 0.12
+"""From how many candidates a search begins at most, and how far apart they are, relative to the body's diagonal."""
 ACROSS = 0.3
 """Size of forces along the surface that is expected of a contact whose place is searched, relative to those along the normal."""
 MOST = 4
@@ -78,21 +80,21 @@ def told_apart(
 def _with_hidden(sensor: Sensor, k: int, scan: Scan, fit: Fit, free: Fit, before: tuple[FloatArray, ...] | None) -> Fit:
     """Return the fit with contacts that the shape alone betrays, one after the other."""
     for _ in range(MOST - len(fit.touches)):
-        found = find_hidden(sensor, fit)
-        if found is None:
-            break
         start = (fit.state, np.vstack([fit.forces, np.zeros((1, 3))]))
-        more = _significant(
-            sensor, k, scan, _try(sensor, k, scan, [*fit.touches, found], free, start, before) or fit, free, before
-        )
+        more = fit
+        for found in find_hidden(sensor, fit):
+            more = _better(more, _try(sensor, k, scan, [*fit.touches, found], free, start, before))
+            if more is not fit and left_over(sensor, more) <= sensor.knowledge.misfit_limit:
+                break
+        more = _significant(sensor, k, scan, more, free, before)
         if more.cost > fit.cost - 2.0 * sensor.knowledge.gain_limit:
             break
         fit = more
     return fit
 
 
-def find_hidden(sensor: Sensor, fit: Fit) -> Touch | None:
-    """Return the touch that would explain most of what a fit leaves, None where that is no more than noise can do.
+def find_hidden(sensor: Sensor, fit: Fit) -> list[Touch]:
+    """Return touches that would explain most of what a fit leaves, the best first; none where that is no more than noise can do.
 
     One linear solve answers for all candidates: the gain in log evidence of a force there with a Gaussian prior, pushing inwards. The best one is
     where the fit begins; its place moves with the forces, and nothing but the rows says where to.
@@ -100,9 +102,14 @@ def find_hidden(sensor: Sensor, fit: Fit) -> Touch | None:
     gain, _ = evidence(sensor, fit)
     nodes = sensor.robot.body.mesh.nodes[sensor.candidates]
     if not len(gain) or gain.max() < sensor.knowledge.gain_limit:
-        return None
-    best = nodes[int(np.argmax(gain))]
-    return make_touch(sensor, best, source="shape", std_m=ANYWHERE * sensor.size)
+        return []
+    found: list[Touch] = []
+    for i in np.argsort(-gain):
+        if len(found) == STARTS or gain[i] < max(sensor.knowledge.gain_limit, 0.5 * gain.max()):
+            break
+        if all(np.linalg.norm(nodes[i] - t.place) > APART * sensor.size for t in found):
+            found.append(make_touch(sensor, nodes[i], source="shape", std_m=ANYWHERE * sensor.size))
+    return found
 
 
 def evidence(sensor: Sensor, fit: Fit) -> tuple[FloatArray, FloatArray]:
@@ -135,7 +142,12 @@ def evidence(sensor: Sensor, fit: Fit) -> tuple[FloatArray, FloatArray]:
     H = M + prior
     f = np.linalg.solve(H, g[:, :, None])[:, :, 0]
     gain = 0.5 * (g * f).sum(axis=1) - 0.5 * (np.linalg.slogdet(H)[1] - np.linalg.slogdet(prior)[1])
-    return np.where(f[:, 0] < 0, gain, -np.inf), np.einsum("ci,cij->cj", f, frames)
+    along = g[:, 0] / H[:, 0, 0]
+    alone = 0.5 * (g[:, 0] * along - np.log(H[:, 0, 0] / prior[0, 0]))
+    mu = np.inf if sensor.options.friction is None else sensor.options.friction
+    slides = np.linalg.norm(f[:, 1:], axis=1) > -mu * f[:, 0]  # beyond its cone: then along the normal only
+    f = np.where(slides[:, None], along[:, None] * np.array([1.0, 0.0, 0.0]), f)
+    return np.where(f[:, 0] < 0, np.where(slides, alone, gain), -np.inf), np.einsum("ci,cij->cj", f, frames)
 
 
 def _answers(sensor: Sensor, state: Equilibrium, tangent: Tangent) -> FloatArray:

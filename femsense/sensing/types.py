@@ -36,7 +36,7 @@ class SensingOptions:
     """Noise of a marker along each axis [m]; None: from the residual of the calibration."""
     marker_model_std: float = 0.015
     """Where there are only markers: error of the modelled motion of a point, relative to its way from rest."""
-    iterations: int = 6
+    iterations: int = 10
     """Gauss–Newton steps a frame at most."""
 
 
