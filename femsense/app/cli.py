@@ -15,6 +15,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any, NoReturn, TypeVar
 
@@ -31,6 +32,13 @@ STOPPED_TEXT = "stopped; nothing half-written is left, and the same command goes
 """Exit status after Ctrl-C, as shells have it."""
 SEVERAL = ("--at", "--validation", "--effects", "--without", "--target", "--force", "--topic", "--map")
 """Options that take several values after one another."""
+
+
+class SensingMethod(StrEnum):
+    """How forces are found."""
+
+    rays = "rays"
+    paper = "paper"
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -304,16 +312,40 @@ def estimate(
         list[str] | None,
         typer.Option("--at", metavar="X,Y,Z …", help="Where forces act, in metres on the body at rest.", show_default=False),
     ] = None,
+    method: Annotated[
+        SensingMethod,
+        typer.Option(
+            "--method", help="rays: every point a measurement; paper: feature points and normal forces, one linear step."
+        ),
+    ] = SensingMethod.rays,
+    friction: Annotated[
+        float, typer.Option("--friction", metavar="MU", help="The cone about the normal in which contact forces lie.")
+    ] = 1.0,
+    smooth: Annotated[
+        float, typer.Option("--smooth", metavar="SECONDS", help="Average forces over so long; they lag by as much.")
+    ] = 0.0,
     again: Annotated[bool, typer.Option("--again", help="Compute even where RUN holds this result already.")] = False,
     json: Json = False,
 ) -> Answer:
     """Find contacts and forces in every frame."""
     from femsense.app.commands import estimate_into
     from femsense.report.text import run_document, run_text
+    from femsense.sensing.types import SensingOptions
 
+    options = SensingOptions(method=method.value, friction=friction, smooth_s=smooth)
+    if smooth > 0:
+        _say(f"forces are averaged over {smooth:g} s and lag by as much")
     with _progress("estimate") as progress:
         run = estimate_into(
-            output, robot, recording, calibration=calibration, at=_places(at or []), again=again, say=_say, progress=progress
+            output,
+            robot,
+            recording,
+            calibration=calibration,
+            at=_places(at or []),
+            options=options,
+            again=again,
+            say=_say,
+            progress=progress,
         )
     return Answer(
         {"run": str(output), **run_document(run)}, f"{run_text(run)}\n\nwritten: {output}\nlook at it: femsense view {output}"

@@ -23,7 +23,7 @@ from femsense.loop.files import check_loop_folder, loop_inputs, read_loop, write
 from femsense.sensing.run_files import check_run_folder, read_run, run_inputs, write_run
 
 if TYPE_CHECKING:
-    from femsense.sensing.types import Run
+    from femsense.sensing.types import Run, SensingOptions
 
 Progress = Callable[..., None]
 Say = Callable[[str], None]
@@ -37,6 +37,7 @@ def estimate_into(
     say: Say,
     calibration: str | Path | None = None,
     at: Sequence[Sequence[float]] | None = None,
+    options: SensingOptions | None = None,
     again: bool = False,
     progress: Progress | None = None,
 ) -> Run:
@@ -48,6 +49,7 @@ def estimate_into(
         say: told in one line what happens beside the estimate.
         calibration: calibration.json; None calibrates first.
         at: places of contact at rest [m], shape (k, 3).
+        options: of `estimate`.
         again: compute even where the result is there.
         progress: called with (frames done, frames in all).
 
@@ -61,7 +63,7 @@ def estimate_into(
     body, frames = load_robot(robot), load_recording(recording)
     warn_of_clouds(body, frames)
     given = None if calibration is None else read_calibration(calibration)
-    inputs = run_inputs(body, frames, given, at=at)
+    inputs = run_inputs(body, frames, given, at=at, options=options)
     if not again and finished(folder, inputs):
         say(f"{folder} holds this result already (--again computes it anew)")
         return read_run(folder, robot=body)
@@ -69,7 +71,7 @@ def estimate_into(
         say(f"no calibration given: calibrating first, into {Path(folder) / 'calibration.json'}")
     used = calibrate(body, frames) if given is None else given
     began = time.perf_counter()
-    run = estimate(body, frames, used, at=at, progress=progress, keep=_kept(folder, inputs))
+    run = estimate(body, frames, used, at=at, options=options, progress=progress, keep=_kept(folder, inputs))
     write_run(run, folder, inputs=inputs, seconds=time.perf_counter() - began, calibration=used)
     return run
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from femsense.calib.calibration import Calibration
 from femsense.calib.checks import check_reading, pairs_of, relabelled
+from femsense.calib.from_clouds import pose_pivot, refine_poses
 from femsense.calib.inputs import _initial_displacement, _input_std, _largest_input, first_inputs, input_bounds
 from femsense.calib.joint import PLACEMENT_STD_FLOOR, _rms, fit_joint
 from femsense.calib.rigid import fit_rigid, fit_rigid_robust
@@ -68,7 +69,8 @@ def calibrate(robot: Robot, recording: Recording, *, frames: Sequence[int] | Non
     if not len(recording.marker_frame):
         return _declared(robot, recording, chosen)
     history: list[float] = []
-    return _result(robot, *_fitted(robot, recording, chosen, history), history)
+    by_markers = _result(robot, *_fitted(robot, recording, chosen, history), history)
+    return _with_clouds(robot, recording, by_markers)
 
 
 def calibrated_start(
@@ -204,7 +206,10 @@ def _result(
     recording, names = scene.recording, robot.body.cable_names
     state = _initial_state(robot, recording, initial)
     moving = [v for v, T in enumerate(recording.T_robot_camera) if T is None]
-    pose_covariance = fit.covariance[:6, :6] if 0 in moving else np.zeros((6, 6))
+    joint = np.zeros((6 * len(poses),) * 2)
+    free = [c for v in moving for c in range(6 * v, 6 * v + 6)]
+    joint[np.ix_(free, free)] = fit.covariance[: len(free), : len(free)]
+    pose_covariance = joint[:6, :6]
     pose_std = _pose_std(poses[0], pose_covariance, robot.marker_points.mean(axis=0))
     a = len(names) if initial is not None else 0
     input_covariance = fit.covariance[6 * len(moving) :, 6 * len(moving) :] if a else np.zeros((0, 0))
@@ -230,7 +235,17 @@ def _result(
         status=_status(fit, robot, own, recording),
         placements_m={robot.marker_names[m]: p.tolist() for m, p in zip(scene.rest_marker, places)},
         frames=tuple(int(recording.frame_numbers[k]) for k in scene.frames),
+        joint_covariance=joint,
     )
+
+
+def _with_clouds(robot: Robot, recording: Recording, by_markers: Calibration) -> Calibration:
+    """Return the calibration with poses to which the clouds of free frames have their say."""
+    fitted = refine_poses(robot, recording, by_markers)
+    if fitted is by_markers:
+        return by_markers
+    pivot = pose_pivot(robot)
+    return replace(fitted, pose_std=_pose_std(fitted.poses[0], fitted.pose_covariance, pivot))
 
 
 def _pose_std(T: FloatArray, covariance: FloatArray, pivot: FloatArray) -> FloatArray:

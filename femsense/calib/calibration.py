@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from femsense.core.arrays import FloatArray
 
 
@@ -38,3 +40,13 @@ class Calibration:
     """Where rest.csv shows the markers to sit [m], robot frame."""
     frames: tuple[int, ...] = ()
     """Numbers of the frames that were used."""
+    normal_rms_m: float = float("nan")
+    """Root mean square distance of the points of free frames' clouds from the surface [m]; nan where none were used."""
+    joint_covariance: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+    """Of (rotation [rad], shift [m]) of all cameras together, shape (6 v, 6 v); not given: that of the first camera alone is known."""
+
+    def __post_init__(self) -> None:
+        if self.joint_covariance.size == 0:
+            joint = np.zeros((6 * len(self.poses),) * 2)
+            joint[:6, :6] = self.pose_covariance
+            object.__setattr__(self, "joint_covariance", joint)

@@ -34,6 +34,8 @@ def calibration_document(calibration: Calibration) -> dict[str, Any]:
         "history": c.history,
         "std": {"T_robot_camera": c.pose_std, "cable_tension_n": c.tension_std_n, "cable_displacement_m": c.displacement_std_m},
         "pose_covariance": c.pose_covariance,
+        "joint_covariance": c.joint_covariance,
+        "normal_rms_m": c.normal_rms_m,
         "placements_m": c.placements_m,
         "frames": c.frames,
         "cameras": [{"name": name, "T_robot_camera": T} for name, T in zip(c.camera_names, c.poses)],
@@ -82,6 +84,8 @@ def read_calibration(path: str | Path) -> Calibration:
             status=str(document.get("status", "")),
             placements_m={name: [float(x) for x in point] for name, point in document.get("placements_m", {}).items()},
             frames=tuple(int(frame) for frame in document.get("frames", [])),
+            normal_rms_m=_number(document.get("normal_rms_m")),
+            joint_covariance=_matrix(document.get("joint_covariance"), 6 * len(cameras)),
         )
     except (TypeError, ValueError, KeyError, AttributeError) as error:
         raise InputError(

@@ -1,88 +1,124 @@
-"""Where forces may act: given places, or where surroundings touch the robot (Algorithm 2)."""
+"""Where forces may act: given places, or where an object that is seen comes closest to the deformed surface."""
 
 from __future__ import annotations
-
-from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
 
+from femsense.calib.scan import Scan
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.fem.equilibrium import Equilibrium
-from femsense.model.contact_patch import BodySurface, ContactPatch, patch_at
+from femsense.model.contact_patch import BodySurface, closest_surface_point
 from femsense.model.robot import Robot
-from femsense.pointcloud.contact import detect_contacts
-from femsense.sensing.measurement import _voxel
-from femsense.sensing.types import SeenPoints, SensedFrame, Sensor
+from femsense.pointcloud.primitives import Shape, find_shapes
+from femsense.pointcloud.rays import Surface
+from femsense.sensing.forces import make_touch
+from femsense.sensing.types import Fit, Sensor, Touch
+
+LOCAL = 0.06
+"""How much of an object counts for its shape, beyond its nearest point, relative to the body's diagonal."""
+NEAR = 0.08
+"""An object whose visible points all lie farther from the body than this share of its diagonal touches nothing."""
+SLACK = 2.0
+"""A completed object touches where its gap is less than this many standard deviations."""
+TILT = 1.5e-4
+"""Gaps along a contact that differ by less than this are alike: a rod along a face touches anywhere on its length [m]."""
+ZONE = 0.15
+"""Largest extent of a contact about its nearest point, relative to the body's diagonal."""
+FLOOR_STD = 0.0007
+"""The surface between nodes is flat in the model: no place is known better [m]."""
 
 
-def _wandered(patches: Sequence[ContactPatch], again: Sequence[ContactPatch], state: Equilibrium) -> float:
-    """Return how far the farthest patch has moved [m]."""
-    return max(float(np.linalg.norm(a.mean(state.positions) - b.mean(state.positions))) for a, b in zip(patches, again))
-
-
-def _same_places(previous: SensedFrame, patches: Sequence[ContactPatch], state: Equilibrium) -> bool:
-    """Return whether the contacts are those of the frame before, so that its forces are a start."""
-    if len(previous.contacts) != len(patches):
-        return False
-    moved = [np.linalg.norm(p.mean(state.positions) - c.position_m) for p, c in zip(patches, previous.contacts)]
-    return bool(max(moved) < 0.05 * np.linalg.norm(np.ptp(state.positions, axis=0)))
-
-
-# --- places ------------------------------------------------------------------------------------------------------------
-
-
-def _find_contacts(sensor: Sensor, k: int, clouds: SeenPoints | None, state: Equilibrium) -> tuple[list[ContactPatch], str]:
-    """Return where forces may act: the given places, else where surroundings touch the robot (Algorithm 2)."""
-    mesh, clamped, radius = sensor.robot.body.mesh, sensor.robot.body.clamped, 1.5 * sensor.surface.edge
+def find_touches(sensor: Sensor, shapes: list[Shape], free: Fit) -> list[Touch]:
+    """Return where forces may act before the shape is asked: the given places, else where objects touch the state."""
     if len(sensor.places):
-        return [patch_at(sensor.surface, mesh.nodes, p, radius, clamped) for p in sensor.places], "given"
-    said_free = sensor.recording.free is not None and bool(sensor.recording.free[k])
-    if clouds is None or said_free:
-        return [], "cloud"
-    voxel = _voxel(sensor)
-    reach = sensor.options.contact_radius_m or 3.0 * voxel
-    found = detect_contacts(
-        clouds.others,
-        clouds.robot,
-        search_radius_m=reach,
-        min_neighbors=sensor.options.contact_neighbors,
-        cluster_distance_m=4.0 * voxel,
-        min_points=3,
-    )
-    near_clamp = _clamp_mask(sensor, found.positions, reach)
-    patches = [
-        patch_at(sensor.surface, state.positions, p, max(radius, r), clamped, facing=_seen_normal(clouds, p, 2.0 * reach))
-        for p, r, skip in zip(found.positions, found.radius, near_clamp)
-        if not skip
-    ]
-    return patches, "cloud"
+        return [make_touch(sensor, place, source="given") for place in sensor.places]
+    return object_touches(sensor, shapes, free.state)
 
 
-def _seen_normal(clouds: SeenPoints, place: FloatArray, radius: float) -> FloatArray | None:
-    """Return the mean outward normal of the robot as it is seen around a place, shape (3,); None where it is not known."""
-    if clouds.normals is None:
+def said_free(sensor: Sensor, k: int) -> bool:
+    """Return whether the recording says that nothing touches in frame k."""
+    return sensor.recording.free is not None and bool(sensor.recording.free[k])
+
+
+def seen_objects(sensor: Sensor, k: int, scan: Scan | None, state: Equilibrium) -> list[Shape]:
+    """Return what is seen near the body in frame k, completed; nothing where the places are given or nothing is said to touch."""
+    if scan is None or len(sensor.places) or said_free(sensor, k):
+        return []
+    poses = sensor.calibration.poses
+    points = scan.surroundings(poses)
+    if len(points) < 3:
+        return []
+    gap = Surface(state.positions, sensor.surface.triangles).closest(points)[1]
+    near = np.flatnonzero(gap < (NEAR + LOCAL) * sensor.size)
+    if len(near) < 3:
+        return []
+    origins = np.array([T[:3, 3] for T in poses])[scan.others_view]
+    depth = np.linalg.norm(points - origins, axis=1)
+    std = np.array([float(sensor.knowledge.noises[v].std(d)) for v, d in zip(scan.others_view[near], depth[near])])
+    balls = [tool.radius for tool in sensor.recording.tools if tool.kind == "ball"]
+    only = balls[0] if len(balls) == len(sensor.recording.tools) == 1 else None
+    return find_shapes(points[near], std, origins[near], gap[near], local_m=LOCAL * sensor.size, radius_m=only)
+
+
+def object_touches(sensor: Sensor, shapes: list[Shape], state: Equilibrium) -> list[Touch]:
+    """Return where completed objects touch a state, the nearest part of each."""
+    found = [_touch(sensor, shape, state) for shape in shapes]
+    return [touch for touch in found if touch is not None]
+
+
+def _touch(sensor: Sensor, shape: Shape, state: Equilibrium) -> Touch | None:
+    triangles = sensor.surface.triangles
+    corner = shape.distance(state.positions[sensor.surface.nodes])
+    if corner.min() > NEAR * sensor.size:
         return None
-    near = np.linalg.norm(clouds.robot - place, axis=1) < radius
-    mean = clouds.normals[near].sum(axis=0)
-    length = float(np.linalg.norm(mean))
-    return mean / length if length > 0.3 * max(int(near.sum()), 1) else None
+    by_node = np.full(len(state.positions), np.inf)
+    by_node[sensor.surface.nodes] = corner
+    closest = triangles[by_node[triangles].min(axis=1) <= corner.min() + sensor.surface.edge]
+    weights = _lattice(6)
+    places = np.einsum("wi,tic->twc", weights, state.positions[closest]).reshape(-1, 3)
+    distance = shape.distance(places)
+    std = float(np.hypot(shape.std_m, FLOOR_STD))
+    if distance.min() > SLACK * std + (0.0 if shape.kind != "points" else 2.0 * shape.std_m):
+        return None
+    rest = np.einsum("wi,tic->twc", weights, sensor.robot.body.mesh.nodes[closest]).reshape(-1, 3)
+    best = int(np.argmin(distance))
+    normals = np.cross(*(state.positions[closest[:, i]] - state.positions[closest[:, 0]] for i in (1, 2)))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    own = best // len(weights)
+    alike = np.repeat(normals @ normals[own] > 0.5, len(weights)) & (
+        np.linalg.norm(places - places[best], axis=1) < ZONE * sensor.size
+    )
+    weight = alike * np.exp(-(distance - distance[best]) / max(0.5 * min(shape.std_m, FLOOR_STD), TILT))
+    middle = weight @ rest / weight.sum()
+    radius = float(np.sqrt(weight @ ((rest - middle) ** 2).sum(axis=1) / weight.sum()))
+    if _on_clamp(sensor, middle):
+        return None
+    return make_touch(
+        sensor,
+        middle,
+        source="cloud",
+        std_m=float(np.hypot(std, radius)),
+        radius=shape.radius if shape.radius > 0 else np.inf,
+    )
 
 
-def _clamp_mask(sensor: Sensor, places: FloatArray, reach: float) -> npt.NDArray[np.bool_]:
-    """Return places that touch the clamp: a force there does not move the body, and a holder always touches it."""
+def _lattice(parts: int) -> FloatArray:
+    """Return barycentric coordinates of a lattice in a triangle, shape (w, 3)."""
+    i, j = np.meshgrid(np.arange(parts + 1), np.arange(parts + 1), indexing="ij")
+    keep = i + j <= parts
+    return np.column_stack([i[keep], j[keep], parts - i[keep] - j[keep]]) / parts
+
+
+def _on_clamp(sensor: Sensor, place: FloatArray) -> bool:
+    """Return whether a place touches the clamp: a force there does not move the body, and a holder always touches it."""
     clamped = sensor.robot.body.mesh.nodes[sensor.robot.body.clamped]
-    if not len(clamped) or not len(places):
-        return np.zeros(len(places), dtype=bool)
-    from scipy.spatial import cKDTree
-
-    return np.asarray(cKDTree(clamped).query(places)[0] < reach)
+    return bool(len(clamped)) and bool(np.linalg.norm(clamped - place, axis=1).min() < sensor.surface.edge)
 
 
-def _check_places(places: FloatArray, surface: BodySurface, robot: Robot, size: float) -> None:
-    from femsense.model.contact_patch import closest_surface_point
-
+def check_places(places: FloatArray, surface: BodySurface, robot: Robot, size: float) -> None:
+    """Raise InputError where a given place lies far from the surface."""
     nodes = robot.body.mesh.nodes
     for i, place in enumerate(places):
         distance = float(np.linalg.norm(closest_surface_point(surface, nodes, place) - place))
@@ -96,7 +132,7 @@ def _check_places(places: FloatArray, surface: BodySurface, robot: Robot, size: 
             )
 
 
-def _near_places(points: FloatArray, places: FloatArray, size: float) -> npt.NDArray[np.bool_]:
+def near_places(points: FloatArray, places: FloatArray, size: float) -> npt.NDArray[np.bool_]:
     """Return which known loads act near a given place."""
     if not len(places) or not len(points):
         return np.zeros(len(points), dtype=bool)

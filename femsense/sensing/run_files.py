@@ -7,6 +7,7 @@ so that a folder that has them is complete; they hold what it was made from, so 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +22,7 @@ from femsense.io.files import json_text, write_beside, write_csv, write_json
 from femsense.io.provenance import _text_hash, recording_input, robot_input, versions
 from femsense.io.result_folder import RUN_FILES, _check_folder, _read_document, _results_folder, _table
 from femsense.io.tables import read_csv
+from femsense.sensing.types import SensingOptions
 
 if TYPE_CHECKING:
     from femsense.model.recording import Recording
@@ -44,6 +46,14 @@ CONTACT_COLUMNS = (
     "force_n",
     "std_n",
     "source",
+    "track",
+    "x_std_m",
+    "y_std_m",
+    "z_std_m",
+    "radius_m",
+    "fx_std_n",
+    "fy_std_n",
+    "fz_std_n",
 )
 FRAME_COLUMNS = ("frame", "time_s", "status", "contacts", "matched", "rms_before_m", "rms_after_m", "ms")
 
@@ -52,7 +62,12 @@ FRAME_COLUMNS = ("frame", "time_s", "status", "contacts", "matched", "rms_before
 
 
 def run_inputs(
-    robot: Robot, recording: Recording, calibration: Calibration | None, *, at: npt.ArrayLike | None = None
+    robot: Robot,
+    recording: Recording,
+    calibration: Calibration | None,
+    *,
+    at: npt.ArrayLike | None = None,
+    options: SensingOptions | None = None,
 ) -> dict[str, Any]:
     """Return what a run is made from: name or place and SHA-256 of each input, and the options.
 
@@ -60,10 +75,12 @@ def run_inputs(
         robot, recording: as loaded.
         calibration: None where the run calibrates by itself.
         at: declared places of contact [m], shape (k, 3).
+        options: of the estimate.
     """
     own = None if calibration is None else {"sha256": _text_hash(json_text(calibration_document(calibration)))}
-    options = {"at": None if at is None else np.asarray(at, dtype=np.float64).reshape(-1, 3).tolist()}
-    return {"robot": robot_input(robot), "recording": recording_input(recording), "calibration": own, "options": options}
+    places = None if at is None else np.asarray(at, dtype=np.float64).reshape(-1, 3).tolist()
+    said = {"at": places, **asdict(options or SensingOptions())}
+    return {"robot": robot_input(robot), "recording": recording_input(recording), "calibration": own, "options": said}
 
 
 # Runs
@@ -165,7 +182,8 @@ def read_states(path: str | Path) -> States:
 
 def _contact_row(contact: ContactForce) -> list[object]:
     c = contact
-    return [c.frame, c.time_s, c.contact, *c.position_m, *c.normal, *c.force_n_xyz, c.force_n, c.std_n, c.source]
+    own = [c.frame, c.time_s, c.contact, *c.position_m, *c.normal, *c.force_n_xyz, c.force_n, c.std_n, c.source]
+    return [*own, c.track, *c.position_std_m, c.radius_m, *c.force_std_n_xyz]
 
 
 def _frame_row(frame: FrameReport, cables: Sequence[str], chambers: Sequence[str]) -> list[object]:
@@ -219,8 +237,9 @@ def _read_contacts(file: Path) -> tuple[ContactForce, ...]:
     from femsense.sensing.types import ContactForce
 
     table = read_csv(file, required=CONTACT_COLUMNS)
-    frames, contacts = table.integers("frame"), table.integers("contact")
-    values, sources = table.numbers(("time_s", *CONTACT_COLUMNS[3:14]), empty_is_nan=True), table.text("source")
+    frames, contacts, tracks = (table.integers(name) for name in ("frame", "contact", "track"))
+    numbers = ("time_s", *CONTACT_COLUMNS[3:14], *CONTACT_COLUMNS[16:])
+    values, sources = table.numbers(numbers, empty_is_nan=True), table.text("source")
     return tuple(
         ContactForce(
             frame=int(frames[i]),
@@ -232,6 +251,10 @@ def _read_contacts(file: Path) -> tuple[ContactForce, ...]:
             force_n=float(row[10]),
             std_n=float(row[11]),
             source=sources[i],
+            track=int(tracks[i]),
+            position_std_m=freeze(row[12:15]),
+            radius_m=float(row[15]),
+            force_std_n_xyz=freeze(row[16:19]),
         )
         for i, row in enumerate(values)
     )

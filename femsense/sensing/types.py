@@ -10,47 +10,34 @@ import numpy as np
 import numpy.typing as npt
 
 from femsense.calib.calibration import Calibration
-from femsense.core.arrays import FloatArray
+from femsense.core.arrays import FloatArray, IntArray
 from femsense.fem.equilibrium import Equilibrium
-from femsense.model.contact_patch import BodySurface
+from femsense.model.contact_patch import BodySurface, ContactPatch
 from femsense.model.drive import DrivenRobot
-from femsense.model.recording import Recording
+from femsense.model.recording import CameraNoise, Recording
 from femsense.model.robot import Robot
 
 
 @dataclass(frozen=True, slots=True)
 class SensingOptions:
-    """Thresholds; those left None follow from the size of the robot."""
+    """What the data cannot say."""
 
-    voxel_m: float | None = None
-    """Edge of the voxel grid [m]; None: 1 % of the robot's diagonal."""
-    match_line_m: float | None = None
-    """d_m: largest distance of a match from the normal line [m]; None: 3 voxels."""
-    match_reach_m: float | None = None
-    """d_l: largest distance along the normal [m]; None: 20 % of the diagonal."""
-    contact_radius_m: float | None = None
-    """Search radius of Algorithm 2 [m]; None: 3 voxels."""
-    contact_neighbors: int = 3
-    """Robot points that make a contact."""
-    friction: float | None = None
-    """Coulomb coefficient of a contact that was found: its force lies within that cone about the inward normal, with 0 along it. None: the
-    data say where the force points; beside an edge the normal that the camera sees may be that of another side than the one that is touched."""
-    match_points: int = 200
-    """Points of the surface that are matched, spread evenly off sharp edges; at least as many as the robot has features."""
+    method: str = "rays"
+    """"rays": every point a measurement; "paper": feature points, Algorithms 2 and 3, normals only, one linear step."""
+    friction: float | None = 1.0
+    """Coulomb coefficient of a contact: its force lies within that cone about the inward normal. None: the data alone say where it points."""
+    smooth_s: float = 0.0
+    """Time constant over which the forces of one track are averaged [s]; they lag by so much. 0: each frame speaks for itself."""
     modulus_std: float = 0.03
-    """What is not known of the modulus, relative; it enters the standard deviation of every force."""
-    model_std: float = 0.015
-    """What is not known of the modelled motion of a point, relative to its way from rest (mesh, law, boundary)."""
-    cloud_force_std: float = 0.15
-    """Relative error of a force from clouds beside noise, pose, modulus and place: occlusion, edges, one view (see docs/forces.md)."""
-    correlation_m: float | None = None
-    """Length over which errors of model and depth go together [m]; None: 12 % of the diagonal. Matches within it count once."""
-    cloud_std_m: float = 5e-4
-    """What averaging cannot remove from a cloud [m]."""
+    """What is not known of the modulus before the free frames are seen, relative."""
+    force_std_n: float = 2.0
+    """Size of forces that is expected, along each axis [N]: a weak prior that keeps what the data do not see near zero."""
     marker_std_m: float | None = None
     """Noise of a marker along each axis [m]; None: from the residual of the calibration."""
-    iterations: int = 6
-    """Linearisations a frame at most."""
+    marker_model_std: float = 0.015
+    """Where there are only markers: error of the modelled motion of a point, relative to its way from rest."""
+    iterations: int = 10
+    """Gauss–Newton steps a frame at most."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -73,7 +60,15 @@ class ContactForce:
     std_n: float
     """One standard deviation of the force along its direction [N]."""
     source: str
-    """"cloud" or "given"."""
+    """"cloud", "shape" or "given"."""
+    track: int = 0
+    """Its identity over the frames."""
+    position_std_m: FloatArray = field(default_factory=lambda: np.zeros(3))
+    """One standard deviation of its place along each axis [m], shape (3,)."""
+    radius_m: float = 0.0
+    """Radius of its patch [m]."""
+    force_std_n_xyz: FloatArray = field(default_factory=lambda: np.zeros(3))
+    """One standard deviation of each component of the force [N], shape (3,)."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -83,16 +78,18 @@ class FrameReport:
     frame: int
     time_s: float
     status: str
-    """"ok", or why there is no result."""
+    """"ok", or what is wrong with the result or why there is none."""
     contacts: int
     matched: int
-    """Features or markers that were found."""
+    """Points or markers that were used."""
     rms_before_m: float
     """Residual of the model without contact forces: normal distance for clouds, 3-D for markers."""
     rms_after_m: float
     ms: float
     tension_n: dict[str, float]
     pressure_pa: dict[str, float] = field(default_factory=dict)
+    stages_ms: dict[str, float] = field(default_factory=dict)
+    """Time of each stage [ms]."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -122,17 +119,58 @@ class Run:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
+class Touch:
+    """A place where a force may act, and what is known of it before the shape is asked."""
+
+    place: FloatArray
+    """On the surface at rest [m], shape (3,)."""
+    normal: FloatArray
+    """Outward unit normal of the surface at rest there, shape (3,)."""
+    patch: ContactPatch
+    """What carries the force."""
+    expected: FloatArray
+    """Where it is expected, on the surface at rest [m], shape (3,)."""
+    std_m: float
+    """How well that is known along the surface [m]; 0: exactly."""
+    source: str
+    """"cloud", "shape" or "given"."""
+    object_radius_m: float = np.inf
+    """Radius of curvature of what touches [m]; inf: flat or not known."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Fit:
+    """Forces at some places that explain a frame."""
+
+    touches: tuple[Touch, ...]
+    state: Equilibrium
+    """With the forces."""
+    forces: FloatArray
+    """[N], shape (m, 3)."""
+    covariance: FloatArray
+    """Of all components [N²], shape (3m, 3m)."""
+    place_covariance: FloatArray
+    """Of each place [m²], shape (m, 3, 3)."""
+    rows: Rows
+    cost: float
+    """Misfit: Huber's function of the whitened residual with nuisance fitted, and the priors."""
+    still: bool = True
+    """Whether the forces had stopped changing."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
 class SensedFrame:
     """One frame, sensed."""
 
-    state: Equilibrium
-    """With the forces found."""
+    fit: Fit
     free_state: Equilibrium
     """Under the inputs alone."""
-    forces: FloatArray
-    """Components of all contact forces [N], shape (3k,)."""
     report: FrameReport
     contacts: tuple[ContactForce, ...]
+
+    @property
+    def state(self) -> Equilibrium:
+        return self.fit.state
 
 
 @dataclass(eq=False, slots=True)
@@ -144,24 +182,14 @@ class Done:
     states: list[FloatArray] = field(default_factory=list)
     """Node positions [m], shape (n, 3), one array a frame."""
     last: SensedFrame | None = None
-    """The last frame that gave a result."""
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class SeenPoints:
-    """What the cameras see in one frame, robot frame."""
-
-    robot: FloatArray
-    """Points of the robot [m], shape (r, 3)."""
-    normals: FloatArray | None
-    """Their normals towards the camera, shape (r, 3); None with several cameras."""
-    others: FloatArray
-    """Points of everything else [m], shape (o, 3)."""
+    """The last frame that gave a result to start from."""
+    tracks: int = 0
+    """Contacts told apart so far."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Rows:
-    """Linearised measurements: `functional` maps node displacements to them."""
+    """Linearised measurements of one frame at one state: `functional` maps node displacements to them."""
 
     functional: Callable[[FloatArray], FloatArray]
     """Node displacements (k, n, 3) → rows (r, k)."""
@@ -170,15 +198,51 @@ class Rows:
     std: FloatArray
     """[m], shape (r,)."""
     by_pose: FloatArray
-    """d residual / d (pose in units of its standard deviation), shape (r, ≤ 6)."""
+    """How the measured side moves with (rotation about the pivot [rad], shift [m]) of each camera, shape (r, 6 v)."""
+    place: FloatArray
+    """Where on the body at rest each row is taken [m], shape (r, 3)."""
+    way: FloatArray
+    """How far that place has moved from rest [m], shape (r,)."""
     count: int
-    """Features or markers."""
+    """Points or markers."""
     rms: float
     """[m]."""
-    sharp: FloatArray
-    """The same before residuals that stand out got more [m], shape (r,)."""
-    crowding: float = 1.0
-    """By how much errors that neighbours share widen standard deviations [1]."""
+    lost: int = 0
+    """Points of the scan that found no surface."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Knowledge:
+    """What free frames teach: noise of the cameras, pose and modulus, and the errors that neighbouring rows share."""
+
+    noises: tuple[CameraNoise, ...]
+    """One a camera."""
+    centres: FloatArray
+    """Centres of the field of shared errors on the body at rest [m], shape (p, 3)."""
+    length: float
+    """Over which errors go together [m]."""
+    bias_m: float
+    """Size of the shared error that does not depend on motion (camera) [m]."""
+    model_share: float
+    """Size of the shared error relative to the way from rest (model) [1]."""
+    common_mean: FloatArray
+    """Of pose steps (6 v) and modulus (1) as the free frames show them, shape (6 v + 1,)."""
+    common_root: FloatArray
+    """Square root of their covariance, shape (6 v + 1, j)."""
+    gain_limit: float
+    """Gain in log evidence from which on a contact that only the shape shows is believed: one false in 1000 free frames."""
+    misfit_limit: float
+    """Misfit per row above which a frame is not explained."""
+
+
+@dataclass(eq=False, slots=True)
+class Answers:
+    """How the body answers to unit forces at the candidates near one state; made anew when the body has moved far from it."""
+
+    positions: FloatArray | None = None
+    """Nodes of that state [m], shape (n, 3)."""
+    moves: FloatArray | None = None
+    """Of the surface nodes by unit forces along x, y, z at each candidate [m/N], shape (3c, n, 3)."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -193,9 +257,12 @@ class Sensor:
     options: SensingOptions
     places: FloatArray
     """Given places of contact at rest [m], shape (g, 3)."""
-    probes: npt.NDArray[np.int64]
-    """Surface nodes that are matched with clouds, shape (e,)."""
-    pose_root: FloatArray
-    """Square root of the pose covariance (rotation about the pivot, shift), shape (6, ≤ 6)."""
-    size: float = field(default=0.0)
+    candidates: IntArray
+    """Surface nodes at which hidden contacts are searched, shape (c,)."""
+    pivot: FloatArray
+    """Point about which pose steps turn [m], shape (3,)."""
+    size: float
     """Diagonal of the body at rest [m]."""
+    knowledge: Knowledge
+    answers: Answers
+    """How the body answers to forces at the candidates, kept from frame to frame."""

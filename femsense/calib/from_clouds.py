@@ -1,0 +1,194 @@
+"""Pose of the cameras and noise of their depth from the clouds of free frames, together with what markers say.
+
+The residual of every point along the normal of the surface that its ray meets moves the poses (and unknown inputs) in a Gauss–Newton fit; the fit to the
+markers enters as a Gaussian. Neighbouring residuals err together (mesh, law), so the covariance is that of sums over cells of the surface.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from femsense.calib.calibration import Calibration
+from femsense.calib.scan import REACH, RayRows, Scan, ray_rows, read_scan
+from femsense.core.arrays import FloatArray, freeze
+from femsense.core.errors import FemsenseError
+from femsense.core.pose import moved_poses
+from femsense.fem.equilibrium import Equilibrium
+from femsense.model.contact_patch import BodySurface, body_surface
+from femsense.model.drive import DrivenRobot, drive_of
+from femsense.model.recording import CameraNoise, Recording
+from femsense.model.robot import Robot
+from femsense.model.variants import solve_frame
+from femsense.pointcloud.rays import Surface
+
+FRAMES = 12
+"""More free frames than this are thinned out evenly."""
+STEPS = 6
+"""Gauss–Newton steps at most; rays and weights are new in each."""
+HUBER = 2.5
+"""Whitened residuals beyond this count linearly."""
+CELLS = 12.0
+"""Cells of the surface along the body's diagonal whose points err together."""
+USUAL = CameraNoise("stereo", at_1m=0.002)
+"""A camera of which nothing is known: the D415 at its default setting."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Seen:
+    """A free frame."""
+
+    scan: Scan
+    state: Equilibrium
+    surface: Surface
+
+
+def pose_pivot(robot: Robot) -> FloatArray:
+    """Return the point about which pose steps turn [m], shape (3,): the markers' mean, the body's where there are none."""
+    return np.asarray(robot.marker_points.mean(axis=0) if len(robot.marker_points) else robot.body.mesh.nodes.mean(axis=0))
+
+
+def measured_noises(robot: Robot, recording: Recording, calibration: Calibration) -> tuple[CameraNoise, ...]:
+    """Return the noise of each camera: declared, else as the free frames' clouds scatter about their own smooth part.
+
+    Arguments:
+        robot, recording: as loaded.
+        calibration: with the poses.
+    """
+    declared = [camera.noise if camera is not None else None for camera in recording.cameras]
+    if not recording.has_clouds or all(noise is not None for noise in declared):
+        return tuple(noise or USUAL for noise in declared)
+    frames = _free_frames(robot, recording, calibration.poses, calibration)
+    return tuple(noise or _measured_noise(robot, frames, calibration.poses, view) for view, noise in enumerate(declared))
+
+
+def refine_poses(robot: Robot, recording: Recording, calibration: Calibration) -> Calibration:
+    """Return the calibration with its undeclared poses moved to where the clouds of free frames see the body.
+
+    Arguments:
+        robot, recording: as loaded.
+        calibration: of the markers, or a start for the poses; its covariance is the prior (zero: nothing is known but the start).
+
+    Returns:
+        the calibration with poses, their covariance, and `normal_rms_m`; as it was where no free frame has a cloud.
+    """
+    moving = [v for v, T in enumerate(recording.T_robot_camera) if T is None]
+    frames = _free_frames(robot, recording, calibration.poses, calibration)
+    if not frames or not moving:
+        return calibration
+    noises = measured_noises(robot, recording, calibration)
+    pivot, poses, surface = pose_pivot(robot), list(calibration.poses), body_surface(robot.body.mesh)
+    size = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
+    which = np.concatenate([np.arange(6 * v, 6 * v + 6) for v in moving])
+    prior = _prior(calibration.joint_covariance, which)
+    gone = np.zeros(len(which))
+    normal, scores = np.zeros((len(which),) * 2), np.zeros((0, len(which)))
+    rms = float("nan")
+    for _ in range(STEPS):
+        normal, right, scores, rms = _normal_equations(frames, poses, noises, pivot, surface, size, which)
+        step = -np.linalg.solve(normal + prior, right + prior @ gone)
+        full = np.zeros(6 * len(poses))
+        full[which] = step
+        poses, gone = moved_poses(poses, full, pivot), gone + step
+        if np.abs(step[3:]).max() < 1e-7 and np.abs(step[:3]).max() < 1e-6:
+            break
+    covariance = np.zeros((6 * len(poses),) * 2)
+    inverse = np.linalg.inv(normal + prior)
+    covariance[np.ix_(which, which)] = inverse @ (scores.T @ scores + prior) @ inverse
+    return replace(
+        calibration,
+        T_robot_camera=freeze(poses[0]),
+        poses=tuple(freeze(T) for T in poses),
+        pose_covariance=freeze(covariance[:6, :6]),
+        joint_covariance=freeze(covariance),
+        normal_rms_m=rms,
+    )
+
+
+def _normal_equations(
+    frames: list[_Seen],
+    poses: list[FloatArray],
+    noises: tuple[CameraNoise, ...],
+    pivot: FloatArray,
+    surface: BodySurface,
+    size: float,
+    which: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+    """Return JᵀJ, Jᵀr, the sums of Jᵀr over cells of the surface (g, p), and the residual's root mean square [m]."""
+    p = len(which)
+    normal, right, squares, count = np.zeros((p, p)), np.zeros(p), 0.0, 0
+    sums: dict[tuple[int, ...], FloatArray] = {}
+    for seen in frames:
+        rows = ray_rows(seen.scan, seen.surface, poses, noises, reach=REACH * size)
+        J = rows.by_pose(pivot, len(poses))[:, which] / rows.std[:, None]
+        z = rows.residual / rows.std
+        weight = np.minimum(1.0, HUBER * max(1.0, 1.483 * float(np.median(np.abs(z)))) / np.maximum(np.abs(z), 1e-12))
+        normal += J.T @ (weight[:, None] * J)
+        right += J.T @ (weight * z)
+        squares, count = squares + float((rows.residual**2).sum()), count + len(z)
+        cell, group = np.unique(np.floor(rows.points / (size / CELLS)).astype(np.int64), axis=0, return_inverse=True)
+        part = np.zeros((len(cell), p))
+        np.add.at(part, group.ravel(), J * (weight * z)[:, None])
+        for key, value in zip(map(tuple, cell.tolist()), part):
+            sums[key] = sums.get(key, np.zeros(p)) + value
+    return normal, right, np.array(list(sums.values())).reshape(-1, p), float(np.sqrt(squares / max(count, 1)))
+
+
+def _prior(covariance: FloatArray, which: FloatArray) -> FloatArray:
+    """Return the precision that the markers leave to the clouds; zero where they say nothing."""
+    own = covariance[np.ix_(which, which)] if covariance.size else np.zeros((len(which),) * 2)
+    if not np.isfinite(own).all() or not (np.diag(own) > 0).all():
+        return np.zeros_like(own)
+    return np.asarray(np.linalg.inv(own))
+
+
+def _free_frames(robot: Robot, recording: Recording, poses: tuple[FloatArray, ...], calibration: Calibration) -> list[_Seen]:
+    """Return what is seen in the free frames that have clouds."""
+    if recording.free is None or not recording.has_clouds:
+        return []
+    free = [int(k) for k in np.flatnonzero(recording.free) if any(file is not None for file in recording.cloud_files[k])]
+    if len(free) > FRAMES:
+        free = [free[i] for i in np.unique(np.linspace(0, len(free) - 1, FRAMES).round().astype(int))]
+    initial = None
+    if recording.actuation_zero == "unknown":
+        table = calibration.cable_tension_n if recording.actuation == "tension" else calibration.cable_displacement_m
+        initial = np.array([table[name] for name in robot.body.cable_names])
+    driven, triangles = DrivenRobot(robot, drive_of(robot, recording, initial=initial)), body_surface(robot.body.mesh).triangles
+    result, state = [], None
+    for k in free:
+        try:
+            state = solve_frame(driven, k, start=state)
+            scan = read_scan(robot, recording, k, poses, state.positions) if state.converged else None
+        except FemsenseError:
+            continue
+        if scan is not None:
+            result.append(_Seen(scan, state, Surface(state.positions, triangles)))
+    return result
+
+
+def _measured_noise(robot: Robot, frames: list[_Seen], poses: tuple[FloatArray, ...], view: int) -> CameraNoise:
+    """Return stereo noise that makes the residuals about their smooth part as large as they are."""
+    unit = (CameraNoise("stereo", at_1m=1.0),) * len(poses)
+    size = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
+    spread = [
+        _smooth_rest(rows)
+        for seen in frames
+        for rows in [ray_rows(seen.scan, seen.surface, poses, unit, reach=REACH * size)]
+        if len(rows.residual)
+    ]
+    every = np.concatenate(spread) if spread else np.zeros(0)
+    return CameraNoise("stereo", at_1m=1.483 * float(np.median(np.abs(every)))) if len(every) >= 100 else USUAL
+
+
+def _smooth_rest(rows: RayRows) -> FloatArray:
+    """Return whitened residuals without the mean of those around them."""
+    cell = np.ptp(rows.points, axis=0).max() / 30.0 + 1e-12
+    z = rows.residual / rows.std
+    _, group = np.unique(np.floor(rows.points / cell).astype(np.int64), axis=0, return_inverse=True)
+    group = group.ravel()
+    count = np.bincount(group)
+    mean = np.bincount(group, z) / count
+    many = count[group] >= 5
+    scale = np.sqrt(count / np.maximum(count - 1.0, 1.0))
+    return np.asarray(((z - mean[group]) * scale[group])[many])

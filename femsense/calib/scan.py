@@ -1,0 +1,197 @@
+"""What the cameras see in one frame, as measurements: each point of the robot with its ray and the noise of its depth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.spatial import cKDTree
+
+from femsense.core.arrays import BoolArray, FloatArray, IntArray
+from femsense.io.clouds.frame_clouds import read_frame_cloud
+from femsense.model.observation import undo_depth
+from femsense.model.recording import CameraNoise, Recording
+from femsense.model.robot import Robot
+from femsense.pointcloud.cloud import PointCloud
+from femsense.pointcloud.rays import Surface, SurfaceHits, together
+from femsense.pointcloud.segmentation import color_mask
+
+REACH = 0.04
+"""A point farther from the surface than this share of the body's diagonal is not of the robot as it stands (12 mm of the diamond, METHODS section 3)."""
+OFF = 4.0
+"""A point farther from the surface than so many standard deviations is not on it."""
+AROUND = 9
+"""Points of which more than half have to lie on the surface, its own included."""
+MARGIN = 0.25
+"""Points farther from the body than this share of its diagonal are left out."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Scan:
+    """The points of one frame."""
+
+    camera_points: FloatArray
+    """Points that may be of the robot, each in the frame of its camera [m], shape (k, 3)."""
+    view: IntArray
+    """Camera of each, shape (k,)."""
+    others: FloatArray
+    """Points of everything else, in the frame of their camera [m], shape (o, 3)."""
+    others_view: IntArray
+    """Camera of each, shape (o,)."""
+    told: bool = True
+    """Whether colour told the robot from the rest; else all points stand among those that may be of the robot."""
+
+    def points(self, poses: Sequence[FloatArray]) -> FloatArray:
+        """Return the robot's points in the robot frame [m], shape (k, 3)."""
+        return _placed(self.camera_points, self.view, poses)
+
+    def surroundings(self, poses: Sequence[FloatArray]) -> FloatArray:
+        """Return the points of everything else in the robot frame [m], shape (o, 3)."""
+        return _placed(self.others, self.others_view, poses)
+
+    def origins(self, poses: Sequence[FloatArray]) -> FloatArray:
+        """Return where each ray begins in the robot frame [m], shape (k, 3)."""
+        return np.array([T[:3, 3] for T in poses])[self.view]
+
+    def ray_std(self, noises: Sequence[CameraNoise]) -> FloatArray:
+        """Return the noise of each point along its ray [m], shape (k,)."""
+        z = self.camera_points[:, 2]
+        std = np.empty(len(z))
+        for view, noise in enumerate(noises):
+            of = self.view == view
+            std[of] = noise.std(z[of])
+        return np.asarray(std * np.linalg.norm(self.camera_points, axis=1) / np.maximum(z, 1e-9))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class RayRows:
+    """Rays of one frame on the surface of one state: measured minus modelled along the surface's normal."""
+
+    hits: SurfaceHits
+    points: FloatArray
+    """Measured points of the rows, robot frame [m], shape (r, 3)."""
+    view: IntArray
+    """Camera of each row, shape (r,)."""
+    residual: FloatArray
+    """[m], shape (r,)."""
+    std: FloatArray
+    """[m], shape (r,)."""
+
+    def operator(self, node_count: int) -> sp.csr_array:
+        """Return what maps node displacements to the rows, shape (r, 3n)."""
+        r = len(self.residual)
+        columns = (3 * self.hits.nodes[:, :, None] + np.arange(3)).reshape(r, 9)
+        values = (self.hits.weights[:, :, None] * self.hits.normal[:, None, :]).reshape(r, 9)
+        return sp.csr_array((values.ravel(), columns.ravel(), 9 * np.arange(r + 1)), shape=(r, 3 * node_count))
+
+    def by_pose(self, pivot: FloatArray, view_count: int) -> FloatArray:
+        """Return how the residual moves with (rotation about the pivot [rad], shift [m]) of each camera, shape (r, 6 v)."""
+        arm = np.cross(self.points - pivot, self.hits.normal)
+        own = np.hstack([arm, self.hits.normal])
+        result = np.zeros((len(own), view_count, 6))
+        result[np.arange(len(own)), self.view] = own
+        return result.reshape(len(own), 6 * view_count)
+
+
+def read_scan(robot: Robot, recording: Recording, k: int, poses: Sequence[FloatArray], positions: FloatArray) -> Scan | None:
+    """Return what the cameras see in frame k near the body; None where the frame has no cloud.
+
+    By colour where the robot declares one and the cloud has them; else all points may be of the robot, and the residuals tell.
+
+    Arguments:
+        robot, recording: as loaded.
+        k: index of the frame.
+        poses: of the cameras, each (4, 4).
+        positions: nodes of the body about as they stand [m], shape (n, 3).
+    """
+    size = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
+    low, high = positions.min(axis=0) - MARGIN * size, positions.max(axis=0) + MARGIN * size
+    own, own_view, rest, rest_view = [], [], [], []
+    told = True
+    for view, T in enumerate(poses):
+        cloud = read_frame_cloud(recording, k, view=view)
+        if cloud is None:
+            continue
+        points = undo_depth(cloud.points, robot.observation)
+        placed = points @ T[:3, :3].T + T[:3, 3]
+        inside = ((placed >= low) & (placed <= high)).all(axis=1) & (points[:, 2] > 0)
+        points, kept = points[inside], cloud.select(inside)
+        told = told and kept.colors is not None and robot.color_rgb is not None
+        mine = _of_robot(robot, kept)
+        own.append(points[mine])
+        rest.append(points[~mine])
+        own_view.append(np.full(int(mine.sum()), view))
+        rest_view.append(np.full(int((~mine).sum()), view))
+    if not own:
+        return None
+    return Scan(np.vstack(own), np.concatenate(own_view), np.vstack(rest), np.concatenate(rest_view), told)
+
+
+def ray_rows(
+    scan: Scan,
+    surface: Surface,
+    poses: Sequence[FloatArray],
+    noises: Sequence[CameraNoise],
+    *,
+    reach: float,
+    catch: float = 0.0,
+) -> RayRows:
+    """Return the rows of a scan on the surface of a state.
+
+    Arguments:
+        scan: what was seen.
+        surface: the deformed surface.
+        poses, noises: of the cameras.
+        reach: see `Surface.cast` [m].
+        catch: points whose ray misses count by the closest face instead, up to this distance [m]: for states that are still far off.
+    """
+    points, origins = scan.points(poses), scan.origins(poses)
+    hits = surface.cast(points, origins, reach=reach)
+    if catch > 0.0:
+        missed = np.setdiff1d(np.arange(len(points)), hits.index)
+        near = surface.near(points[missed], origins[missed], reach=catch)
+        hits = together(hits, SurfaceHits(missed[near.index], near.nodes, near.weights, near.normal, near.distance, near.cosine))
+    std = scan.ray_std(noises)[hits.index] * np.maximum(hits.cosine, 1e-3)
+    return RayRows(hits, points[hits.index], scan.view[hits.index], hits.distance, std)
+
+
+def parted(scan: Scan, surface: Surface, poses: Sequence[FloatArray], noises: Sequence[CameraNoise], *, reach: float) -> Scan:
+    """Return the scan with its points told apart by a state: of the robot is what lies on the surface, and whose neighbours do too.
+
+    Arguments:
+        scan: what was seen, colourless.
+        surface: the deformed surface.
+        poses, noises: of the cameras.
+        reach: see `Surface.cast` [m].
+    """
+    rows = ray_rows(scan, surface, poses, noises, reach=reach)
+    on = np.zeros(len(scan.view), dtype=bool)
+    on[rows.hits.index] = np.abs(rows.residual) < OFF * rows.std
+    if not on.any():
+        return scan
+    tree = cKDTree(scan.points(poses))
+    around = tree.query(tree.data, k=min(AROUND, len(on)))[1].reshape(len(on), -1)
+    mine = on & (on[around].mean(axis=1) > 0.5)
+    return replace(
+        scan,
+        camera_points=scan.camera_points[mine],
+        view=scan.view[mine],
+        others=scan.camera_points[~mine],
+        others_view=scan.view[~mine],
+    )
+
+
+def _of_robot(robot: Robot, cloud: PointCloud) -> BoolArray:
+    if cloud.colors is None or robot.color_rgb is None:
+        return np.ones(len(cloud.points), dtype=bool)
+    return color_mask(cloud.colors, robot.color_rgb)
+
+
+def _placed(points: FloatArray, view: IntArray, poses: Sequence[FloatArray]) -> FloatArray:
+    result = np.empty_like(points)
+    for v, T in enumerate(poses):
+        of = view == v
+        result[of] = points[of] @ T[:3, :3].T + T[:3, 3]
+    return result

@@ -1,0 +1,265 @@
+"""Objects that are seen from one side, completed: a sphere, a cylinder or a plate fitted to their points.
+
+The closest visible points of an object that touches are not where it touches: they lie towards the camera, 5 to 7 mm off for a ball of 10 mm. Where the
+completed object comes closest to a surface is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from femsense.core.arrays import FloatArray, IntArray
+from femsense.pointcloud.objects import euclidean_clusters
+
+FITS = 4.0
+"""Median of squared whitened residuals, relative to noise alone, up to which a shape is believed."""
+SIMPLER = 1.15
+"""A shape with more parameters has to leave so much less to be taken."""
+ROUGH_STD = 0.006
+"""How far the closest visible points are off where no shape fits [m] (METHODS section 3)."""
+LARGEST = 0.1
+"""A larger radius is a plate [m]."""
+FIT_STEPS = 25
+"""Steps of a fit at most."""
+MOST_POINTS = 400
+"""More points than this are thinned out: the shape of an object is known well enough."""
+FEWEST = 12
+"""Fewer points make no shape."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Shape:
+    """A completed object."""
+
+    kind: str
+    """"sphere", "cylinder", "plate" or "points"."""
+    center: FloatArray
+    """Of the sphere; a point of the axis; middle of the plate [m], shape (3,)."""
+    axes: FloatArray
+    """Rows: axis of the cylinder first; sides of the plate, then its normal, shape (3, 3)."""
+    half: FloatArray
+    """Half extents along the axes [m], shape (3,)."""
+    radius: float
+    """Of curvature at its surface [m]; inf: flat; 0: not known."""
+    std_m: float
+    """How well its surface is known [m]."""
+    points: FloatArray
+    """What was seen of it [m], shape (k, 3)."""
+    tree: cKDTree | None = field(default=None, repr=False)
+
+    def distance(self, places: FloatArray) -> FloatArray:
+        """Return the signed distance of places (k, 3) from its surface [m], > 0 outside, shape (k,)."""
+        if self.kind == "points":
+            assert self.tree is not None
+            return np.asarray(self.tree.query(places)[0])
+        local = (places - self.center) @ self.axes.T
+        if self.kind == "sphere":
+            return np.asarray(np.linalg.norm(local, axis=1) - self.radius)
+        if self.kind == "cylinder":
+            across = np.linalg.norm(local[:, 1:], axis=1) - self.radius
+            beyond = np.abs(local[:, 0]) - self.half[0]
+            return np.asarray(np.where(beyond > 0, np.hypot(np.maximum(across, 0.0), np.maximum(beyond, 0.0)), across))
+        beyond = np.maximum(np.abs(local[:, :2]) - self.half[:2], 0.0)
+        return np.asarray(np.sign(local[:, 2]) * np.sqrt((beyond**2).sum(axis=1) + local[:, 2] ** 2))
+
+    def holds(self, points: FloatArray, std: FloatArray) -> bool:
+        """Return whether points (k, 3) lie on its surface, or on that of a rod that is longer than what was seen of it."""
+        if self.kind != "cylinder":
+            return self.kind == "sphere" and bool((np.abs(self.distance(points)) < 3.0 * std).mean() > 0.8)
+        longer = replace(self, half=np.array([np.inf, self.radius, self.radius]))
+        return bool((np.abs(longer.distance(points)) < 3.0 * std + self.std_m).mean() > 0.8)
+
+
+def find_shapes(
+    points: FloatArray, std: FloatArray, origins: FloatArray, near: FloatArray, *, local_m: float, radius_m: float | None = None
+) -> list[Shape]:
+    """Return the objects among points as shapes, each fitted to what lies near a surface.
+
+    Arguments:
+        points: of the surroundings [m], shape (o, 3).
+        std: noise of each along its ray [m], shape (o,).
+        origins: where its ray begins [m], shape (o, 3).
+        near: distance of each from the surface that may be touched [m], shape (o,).
+        local_m: how much of an object counts: points up to so far beyond its nearest one [m].
+        radius_m: known radius of the objects, if they are known balls.
+    """
+    result: list[Shape] = []
+    left = _groups(points, std)
+    while left:
+        group, left = left[0], left[1:]
+        own = near[group]
+        close = group[own <= own.min() + local_m]
+        if len(close) < 3:
+            continue
+        shape = fit_shape(points[close], std[close], origins[close], radius_m=radius_m)
+        more = [g for g in left if shape.holds(points[g], std[g])]  # the other end of a rod that passes behind
+        if more:
+            left = [g for g in left if not any(g is m for m in more)]
+            close = np.concatenate([close, *more])
+            shape = fit_shape(points[close], std[close], origins[close], radius_m=radius_m)
+        result.append(shape)
+    return result
+
+
+def fit_shape(points: FloatArray, std: FloatArray, origins: FloatArray, *, radius_m: float | None = None) -> Shape:
+    """Return the simplest shape that explains points with their noise; "points" where none does. Arguments as for `find_shapes`."""
+    ray = points - origins
+    ray = ray / np.linalg.norm(ray, axis=1, keepdims=True)
+    if len(points) < FEWEST:
+        return _raw(points, std)
+    thin = slice(None, None, max(1, len(points) // MOST_POINTS))
+    points, std, ray = points[thin], std[thin], ray[thin]
+    tried = [_sphere(points, std, ray, radius_m)]
+    if radius_m is None:
+        tried += [_plate(points, std, ray), _cylinder(points, std, ray)]
+    good = [(cost, shape) for cost, shape in tried if shape is not None and cost < FITS]
+    if not good:
+        return _raw(points, std)
+    least = min(cost for cost, _ in good)
+    order = ("plate", "sphere", "cylinder")
+    fitting = [shape for cost, shape in good if cost <= SIMPLER * least + 0.02]
+    return min(fitting, key=lambda shape: order.index(shape.kind))
+
+
+# --- fits -------------------------------------------------------------------------------------------------------------
+
+
+def _groups(points: FloatArray, std: FloatArray) -> list[IntArray]:
+    """Return points that hang together, the largest group first."""
+    if len(points) < 3:
+        return []
+    gaps = np.asarray(cKDTree(points).query(points, k=min(4, len(points)))[0])
+    spacing = float(np.median(gaps[:, -1]))
+    label = euclidean_clusters(points, max(2.5 * spacing, 3.0 * float(np.median(std))), 5)
+    return [np.flatnonzero(label == i) for i in range(int(label.max(initial=-1)) + 1)]
+
+
+def _score(residual: FloatArray) -> float:
+    """Return the robust mean square of whitened residuals: 1 for noise alone."""
+    return float((1.483 * np.median(np.abs(residual))) ** 2)
+
+
+def _sphere(points: FloatArray, std: FloatArray, ray: FloatArray, radius: float | None) -> tuple[float, Shape | None]:
+    middle, look = points.mean(axis=0), ray.mean(axis=0)
+
+    def evaluate(x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        away = points - x[:3]
+        length = np.maximum(np.linalg.norm(away, axis=1), 1e-9)
+        size = radius if radius is not None else float(np.exp(x[3]))
+        unit = away / length[:, None]
+        scale = std * np.maximum(np.abs(np.einsum("pc,pc->p", unit, ray)), 0.2)
+        J = -unit if radius is not None else np.hstack([-unit, np.full((len(unit), 1), -size)])
+        return (length - size) / scale, J / scale[:, None]
+
+    starts = [np.append(middle + 0.7 * r * look, np.log(r)) for r in ([radius] if radius is not None else (0.004, 0.01, 0.025))]
+    x, curve, residual = min((_least(evaluate, s[:3] if radius is not None else s) for s in starts), key=_typical)
+    size = radius if radius is not None else float(np.exp(x[3]))
+    seen_from_outside = float(np.mean(np.einsum("pc,pc->p", points - x[:3], ray) < 0))
+    if size > LARGEST or seen_from_outside < 0.7:
+        return np.inf, None
+    return _score(residual), Shape("sphere", x[:3], np.eye(3), np.full(3, size), size, _spread(curve, 3), points)
+
+
+def _cylinder(points: FloatArray, std: FloatArray, ray: FloatArray) -> tuple[float, Shape | None]:
+    middle, look = points.mean(axis=0), ray.mean(axis=0)
+    main = np.linalg.svd(points - middle, full_matrices=False)[2]
+
+    def parts(x: FloatArray, frame: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        axis = frame[0] + x[3] * frame[1] + x[4] * frame[2]
+        axis = axis / np.linalg.norm(axis)
+        away = points - middle - x[0] * frame[1] - x[1] * frame[2]
+        along = away @ axis
+        return axis, along, away - np.outer(along, axis)
+
+    def evaluator(frame: FloatArray) -> Callable[[FloatArray], tuple[FloatArray, FloatArray]]:
+        def evaluate(x: FloatArray) -> tuple[FloatArray, FloatArray]:
+            _, along, away = parts(x, frame)
+            length = np.maximum(np.linalg.norm(away, axis=1), 1e-9)
+            unit, size = away / length[:, None], float(np.exp(x[2]))
+            scale = std * np.maximum(np.abs(np.einsum("pc,pc->p", unit, ray)), 0.2)
+            across = unit @ frame[1:].T
+            tilt = -along[:, None] * across / np.sqrt(1.0 + x[3] ** 2 + x[4] ** 2)
+            J = np.hstack([-across, np.full((len(unit), 1), -size), tilt])
+            return (length - size) / scale, J / scale[:, None]
+
+        return evaluate
+
+    tried = []
+    for frame in (main, main[[1, 2, 0]]):
+        for r in (0.003, 0.01):
+            start = np.array([0.7 * r * look @ frame[1], 0.7 * r * look @ frame[2], np.log(r), 0.0, 0.0])
+            tried.append((*_least(evaluator(frame), start), frame))
+    x, curve, residual, frame = min(tried, key=lambda t: _typical(t[:3]))
+    axis, _, away = parts(x, frame)
+    size = float(np.exp(x[2]))
+    if size > LARGEST or np.mean(np.einsum("pc,pc->p", away, ray) < 0) < 0.7:
+        return np.inf, None
+    center = middle + x[0] * frame[1] + x[1] * frame[2]
+    low, high = np.quantile((points - center) @ axis, [0.01, 0.99])
+    axes = np.vstack([axis, np.linalg.svd(axis[None])[2][1:]])
+    half = np.array([0.5 * (high - low), size, size])
+    shape = Shape("cylinder", center + 0.5 * (low + high) * axis, axes, half, size, _spread(curve, 2), points)
+    return _score(residual), shape
+
+
+def _least(
+    evaluate: Callable[[FloatArray], tuple[FloatArray, FloatArray]], x: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return parameters, curvature and whitened residual of a robust fit (Huber, Levenberg's damping)."""
+    damping = 1e-3
+    residual, J = evaluate(x)
+    cost = _huber(residual)
+    for _ in range(FIT_STEPS):
+        weight = np.minimum(1.0, 2.0 / np.maximum(np.abs(residual), 1e-12))
+        curve = J.T @ (weight[:, None] * J)
+        step = -np.linalg.solve(curve + damping * np.diag(np.diag(curve) + 1e-12), J.T @ (weight * residual))
+        there, slope = evaluate(x + np.clip(step, -1.0, 1.0))
+        new = _huber(there)
+        if new < cost:
+            done = cost - new < 1e-4 * cost
+            x, residual, J, cost, damping = x + np.clip(step, -1.0, 1.0), there, slope, new, 0.2 * damping
+            if done:
+                break
+        else:
+            damping *= 10.0
+    return x, np.asarray(J.T @ J), residual
+
+
+def _huber(residual: FloatArray) -> float:
+    size = np.abs(residual)
+    return float(np.where(size <= 2.0, size**2, 2.0 * (2.0 * size - 2.0)).sum())
+
+
+def _typical(fit: tuple[FloatArray, FloatArray, FloatArray]) -> float:
+    return _huber(fit[2])
+
+
+def _plate(points: FloatArray, std: FloatArray, ray: FloatArray) -> tuple[float, Shape | None]:
+    keep = np.ones(len(points), dtype=bool)
+    for _ in range(4):
+        middle = points[keep].mean(axis=0)
+        axes = np.linalg.svd(points[keep] - middle, full_matrices=False)[2]
+        normal = axes[2] * -np.sign(axes[2] @ ray.mean(axis=0))
+        residual = (points - middle) @ normal / (std * np.maximum(np.abs(ray @ normal), 0.2))
+        keep = np.abs(residual) < 3.0 * max(1.483 * float(np.median(np.abs(residual))), 1.0)
+        if keep.sum() < FEWEST:
+            return np.inf, None
+    low, high = np.quantile((points[keep] - middle) @ axes[:2].T, [0.01, 0.99], axis=0)
+    center = middle + 0.5 * (low + high) @ axes[:2]
+    half = np.append(0.5 * (high - low), 0.0)
+    spread = float(np.median(std) / np.sqrt(keep.sum()))
+    return _score(residual), Shape("plate", center, np.vstack([axes[:2], normal]), half, np.inf, spread, points)
+
+
+def _spread(curve: FloatArray, count: int) -> float:
+    """Return the standard deviation of the first parameters from the curvature of the misfit [m]; ROUGH_STD where they are not determined."""
+    variance = float(np.trace(np.linalg.pinv(curve)[:count, :count])) / count
+    return min(float(np.sqrt(variance)), ROUGH_STD) if variance > 0 else ROUGH_STD
+
+
+def _raw(points: FloatArray, std: FloatArray) -> Shape:
+    return Shape("points", points.mean(axis=0), np.eye(3), np.zeros(3), 0.0, ROUGH_STD, points, cKDTree(points))

@@ -1,0 +1,119 @@
+"""Rays of a camera cast onto a surface: how far a measured point lies from the surface that its own ray meets."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from femsense.core.arrays import BoolArray, FloatArray, IntArray, freeze
+
+GRAZING = 0.25
+"""Rays that meet the surface at a smaller |cos| say little and err at silhouettes: one pixel beside it they miss (METHODS section 3)."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class SurfaceHits:
+    """Where rays meet a surface, and how far the measured points lie from it."""
+
+    index: IntArray
+    """Which of the measured points, ascending, shape (r,)."""
+    nodes: IntArray
+    """Nodes of the triangle that is met, shape (r, 3)."""
+    weights: FloatArray
+    """Barycentric coordinates there, shape (r, 3)."""
+    normal: FloatArray
+    """Outward unit normal of the triangle, shape (r, 3)."""
+    distance: FloatArray
+    """Of the measured point from the triangle's plane, > 0 outside [m], shape (r,)."""
+    cosine: FloatArray
+    """|cos| between ray and normal, shape (r,)."""
+
+    def place(self, positions: FloatArray) -> FloatArray:
+        """Return where the rays meet the surface when its nodes are at `positions` (n, 3) [m], shape (r, 3)."""
+        return np.asarray(np.einsum("ri,ric->rc", self.weights, positions[self.nodes]))
+
+
+class Surface:
+    """A triangulated surface that rays can be cast on and closest points be found of."""
+
+    def __init__(self, positions: FloatArray, triangles: IntArray) -> None:
+        """positions: nodes [m], shape (n, 3); triangles: outward, shape (t, 3)."""
+        import open3d as o3d
+
+        self.positions, self.triangles = positions, triangles
+        self._scene = o3d.t.geometry.RaycastingScene(nthreads=1)
+        self._scene.add_triangles(
+            o3d.core.Tensor(np.ascontiguousarray(positions, dtype=np.float32)),
+            o3d.core.Tensor(np.ascontiguousarray(triangles, dtype=np.uint32)),
+        )
+
+    def cast(self, points: FloatArray, origins: FloatArray, *, reach: float) -> SurfaceHits:
+        """Return how measured points lie to what their rays meet.
+
+        Arguments:
+            points: measured [m], shape (k, 3).
+            origins: where the ray of each begins (its camera) [m], shape (k, 3).
+            reach: points farther from the surface than this along its normal belong to something else [m]; so do grazing rays.
+        """
+        rays = points - origins
+        ray = rays / np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
+        answer = self._scene.cast_rays(_tensor(np.hstack([origins, ray])))
+        hit = np.flatnonzero(np.isfinite(answer["t_hit"].numpy()))
+        triangle, uv = answer["primitive_ids"].numpy()[hit], answer["primitive_uvs"].numpy()[hit].astype(np.float64)
+        hits = self._hits(hit, triangle.astype(np.int64), uv, points, ray)
+        return _select(hits, (np.abs(hits.distance) <= reach) & (hits.cosine >= GRAZING))
+
+    def near(self, points: FloatArray, origins: FloatArray, *, reach: float) -> SurfaceHits:
+        """Return how measured points lie to the closest faces that look at their camera; arguments as for `cast`."""
+        rays = points - origins
+        ray = rays / np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
+        answer = self._scene.compute_closest_points(_tensor(points))
+        triangle, uv = answer["primitive_ids"].numpy().astype(np.int64), answer["primitive_uvs"].numpy().astype(np.float64)
+        hits = self._hits(np.arange(len(points)), triangle, uv, points, ray)
+        gap = np.linalg.norm(points - hits.place(self.positions), axis=1)
+        looking = np.einsum("rc,rc->r", hits.normal, ray) < -GRAZING
+        return _select(hits, (gap <= reach) & looking)
+
+    def closest(self, points: FloatArray) -> tuple[FloatArray, FloatArray, IntArray, FloatArray]:
+        """Return the closest points (k, 3) [m], signed distances (k,) > 0 outside [m], their triangles (k,) and barycentric weights (k, 3)."""
+        answer = self._scene.compute_closest_points(_tensor(points))
+        triangle, uv = answer["primitive_ids"].numpy().astype(np.int64), answer["primitive_uvs"].numpy().astype(np.float64)
+        weights = np.column_stack([1.0 - uv.sum(axis=1), uv])
+        place = np.einsum("ri,ric->rc", weights, self.positions[self.triangles[triangle]])
+        inside = self._scene.compute_occupancy(_tensor(points)).numpy() > 0.5
+        gap = np.linalg.norm(points - place, axis=1)
+        return place, np.where(inside, -gap, gap), triangle, weights
+
+    def _hits(self, index: IntArray, triangle: IntArray, uv: FloatArray, points: FloatArray, ray: FloatArray) -> SurfaceHits:
+        nodes = self.triangles[triangle]
+        a, b, c = (self.positions[nodes[:, i]] for i in range(3))
+        normal = np.cross(b - a, c - a)
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+        distance = np.einsum("rc,rc->r", points[index] - a, normal)
+        cosine = np.abs(np.einsum("rc,rc->r", ray[index], normal))
+        weights = np.column_stack([1.0 - uv.sum(axis=1), uv])
+        return SurfaceHits(index, nodes, weights, normal, distance, cosine)
+
+
+def together(first: SurfaceHits, second: SurfaceHits) -> SurfaceHits:
+    """Return the hits of both, ordered by the points that they belong to."""
+    order = np.argsort(np.concatenate([first.index, second.index]), kind="stable")
+    return SurfaceHits(
+        *(
+            freeze(np.concatenate([getattr(first, name), getattr(second, name)])[order], getattr(first, name).dtype)
+            for name in ("index", "nodes", "weights", "normal", "distance", "cosine")
+        )
+    )
+
+
+def _select(hits: SurfaceHits, which: BoolArray) -> SurfaceHits:
+    return SurfaceHits(
+        hits.index[which], hits.nodes[which], hits.weights[which], hits.normal[which], hits.distance[which], hits.cosine[which]
+    )
+
+
+def _tensor(values: FloatArray):  # type: ignore[no-untyped-def]
+    import open3d as o3d
+
+    return o3d.core.Tensor(np.ascontiguousarray(values, dtype=np.float32))

@@ -1,0 +1,45 @@
+"""What is to be thought of a frame: its residual against what free frames leave, its forces against their uncertainty."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from femsense.fem.compliance import tangent_at
+from femsense.sensing.nuisance import misfit, sag_at
+from femsense.sensing.types import Fit, SensedFrame, Sensor
+
+OK = "ok"
+
+
+def status_of(sensor: Sensor, fit: Fit, free: Fit) -> str:
+    """Return "ok", or in words why the result of a frame is not to be trusted.
+
+    Not to be trusted is a residual far above what the free frames leave, with or without contacts; a force that is less than its standard
+    deviation while the frame is not explained; and forces that were still changing.
+    """
+    if fit.cost > free.cost:
+        return "the residual is larger with the forces than without them"
+    left = left_over(sensor, fit)
+    if left > sensor.knowledge.misfit_limit:
+        what = "with the contacts found" if fit.touches else "and no contact explains it"
+        return f"not explained: {1e3 * fit.rows.rms:.2f} mm are left, {np.sqrt(left / sensor.knowledge.misfit_limit):.1f} times what free frames leave, {what}"
+    unsure = [i for i, f in enumerate(fit.forces) if np.linalg.norm(f) < _std_along(fit, i)]
+    if unsure and fit.touches[unsure[0]].source != "given":
+        return "a contact whose force is less than its standard deviation"
+    return OK
+
+
+def left_over(sensor: Sensor, fit: Fit) -> float:
+    """Return the misfit per row that a fit leaves, about 1 where all is explained."""
+    return misfit(sensor.knowledge, fit.rows, sag_at(sensor, fit.state, tangent_at(sensor.robot.body, fit.state)))
+
+
+def trusted(frame: SensedFrame) -> bool:
+    """Return whether a frame may be the start of the next one."""
+    return frame.report.status == OK
+
+
+def _std_along(fit: Fit, i: int) -> float:
+    force = fit.forces[i]
+    along = force / max(float(np.linalg.norm(force)), 1e-12)
+    return float(np.sqrt(max(float(along @ fit.covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] @ along), 0.0)))

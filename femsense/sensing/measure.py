@@ -1,0 +1,123 @@
+"""From the points and markers of a frame to linearised rows."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+
+from femsense.calib.calibration import Calibration
+from femsense.calib.checks import true_labels
+from femsense.calib.scan import REACH, Scan, ray_rows
+from femsense.core.arrays import FloatArray, IntArray
+from femsense.core.errors import DataError
+from femsense.fem.equilibrium import Equilibrium
+from femsense.model.observation import in_robot_frame
+from femsense.pointcloud.rays import Surface
+from femsense.sensing.types import Rows, Sensor
+
+FEWEST = 30
+"""Fewer points of the robot than this tell nothing of its shape."""
+CATCH = 0.2
+"""Where most rays miss a state that is still far off, points count by the closest face within this share of the body's diagonal."""
+MANY = 0.7
+"""Share of the points that have to be met before their rays alone are asked."""
+
+
+def rows_at(sensor: Sensor, k: int, scan: Scan | None, state: Equilibrium) -> Rows:
+    """Return the rows of frame k at a state. Raises DataError where nothing is seen."""
+    return _marker_rows(sensor, k, state) if scan is None else _ray_rows(sensor, scan, state)
+
+
+def _ray_rows(sensor: Sensor, scan: Scan, state: Equilibrium) -> Rows:
+    surface = Surface(state.positions, sensor.surface.triangles)
+    poses, noises, reach = sensor.calibration.poses, sensor.knowledge.noises, REACH * sensor.size
+    rows = ray_rows(scan, surface, poses, noises, reach=reach)
+    if len(rows.residual) < MANY * len(scan.view):
+        rows = ray_rows(scan, surface, poses, noises, reach=reach, catch=CATCH * sensor.size)
+    if len(rows.residual) < FEWEST:
+        raise DataError(
+            f"only {len(rows.residual)} points of the robot in view: check the pose, appearance.color_rgb, and what the camera sees"
+        )
+    nodes = sensor.robot.body.mesh.nodes
+    move = rows.operator(len(nodes))
+    rest = rows.hits.place(nodes)
+    return Rows(
+        functional=lambda u: np.asarray(move @ u.reshape(len(u), -1).T),
+        residual=rows.residual,
+        std=rows.std,
+        by_pose=rows.by_pose(sensor.pivot, len(poses)),
+        place=rest,
+        way=np.linalg.norm(rows.hits.place(state.positions) - rest, axis=1),
+        count=len(rows.residual),
+        rms=float(np.sqrt((rows.residual**2).mean())),
+        lost=len(scan.view) - len(rows.residual),
+    )
+
+
+def _marker_rows(sensor: Sensor, k: int, state: Equilibrium) -> Rows:
+    """Markers, three rows each."""
+    recording, robot = sensor.recording, sensor.robot
+    known = {name: i for i, name in enumerate(robot.marker_names)}
+    rows = np.flatnonzero(recording.marker_frame == k)
+    marker = np.array([known.get(recording.marker_names[i], -1) for i in recording.marker_index[rows]], dtype=np.int64)
+    rows, marker = rows[marker >= 0], marker[marker >= 0]
+    if not len(rows):
+        raise DataError("no marker is seen in this frame")
+    view = recording.marker_view[rows]
+    measured = in_robot_frame(recording.marker_xyz[rows], view, sensor.calibration.poses, robot.observation)
+    marker = _as_seen(sensor, k, state, measured, marker, view)
+    tie = robot.markers[marker]
+    residual = measured - tie.positions(state.positions)
+    way = np.linalg.norm(tie.positions(state.positions) - robot.marker_points[marker], axis=1)
+    noise = sensor.options.marker_std_m or _marker_std(sensor.calibration)
+    std = np.repeat(np.hypot(noise, sensor.options.marker_model_std * way), 3)
+    seated = np.array([robot.marker_names[m] in sensor.calibration.placements_m for m in marker])
+    # a seat that rest.csv measured moves with the pose: only the marker's motion since then is left to turn
+    turned = _pose_columns(measured, sensor.pivot)
+    turned = turned - seated[:, None, None] * _pose_columns(robot.marker_points[marker], sensor.pivot)
+    by_pose = np.zeros((len(rows), 3, len(sensor.calibration.poses), 6))
+    by_pose[np.arange(len(rows)), :, view] = turned
+
+    def functional(u: FloatArray) -> FloatArray:
+        return np.array([tie.moves(v).ravel() for v in u]).reshape(len(u), -1).T
+
+    return Rows(
+        functional=functional,
+        residual=residual.ravel(),
+        std=std,
+        by_pose=by_pose.reshape(residual.size, -1),
+        place=np.repeat(robot.marker_points[marker], 3, axis=0),
+        way=np.repeat(way, 3),
+        count=len(rows),
+        rms=float(np.sqrt((residual**2).sum(axis=1).mean())),
+    )
+
+
+def _as_seen(sensor: Sensor, k: int, state: Equilibrium, measured: FloatArray, marker: IntArray, view: IntArray) -> IntArray:
+    """Return which markers were seen, shape (r,): as named, or put right where labels are exchanged, with a warning."""
+    places, best = sensor.robot.markers.positions(state.positions), marker.copy()
+    for v in np.unique(view):
+        mine = view == v
+        best[mine] = true_labels(places, measured[mine], marker[mine], noise=_marker_std(sensor.calibration))
+    if (best != marker).any():
+        names = " and ".join(sensor.robot.marker_names[m] for m in marker[best != marker])
+        number = int(sensor.recording.frame_numbers[k])
+        warnings.warn(f"{sensor.recording.folder}: frame {number}: the labels {names} are exchanged, put right", stacklevel=4)
+    return best
+
+
+def _marker_std(calibration: Calibration) -> float:
+    """Return the noise of a marker along each axis [m]: what the calibration left, or half a millimetre where it had none."""
+    return max(calibration.rms_m / np.sqrt(3.0), 2e-5) if np.isfinite(calibration.rms_m) else 5e-4
+
+
+def _pose_columns(points: FloatArray, pivot: FloatArray) -> FloatArray:
+    """Return how points move with (rotation about the pivot [rad], shift [m]), shape (p, 3, 6)."""
+    arm = points - pivot
+    J = np.zeros((len(points), 3, 6))
+    J[:, 0, 1], J[:, 0, 2] = arm[:, 2], -arm[:, 1]
+    J[:, 1, 0], J[:, 1, 2] = -arm[:, 2], arm[:, 0]
+    J[:, 2, 0], J[:, 2, 1] = arm[:, 1], -arm[:, 0]
+    J[:, :, 3:] = np.eye(3)
+    return J

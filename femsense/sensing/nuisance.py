@@ -1,0 +1,188 @@
+"""What moves the rows beside contact forces: pose, modulus, and errors that neighbours share; and what free frames teach of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from femsense.core.arrays import FloatArray, freeze
+from femsense.fem.assembly import internal
+from femsense.fem.compliance import Tangent
+from femsense.fem.equilibrium import Equilibrium
+from femsense.model.recording import CameraNoise
+from femsense.model.robot import spread_points
+from femsense.sensing.types import Knowledge, Rows, Sensor
+
+CENTRES = 24
+"""Centres of the field of shared errors: as many degrees of freedom as its error may have along the body."""
+HUBER = 2.5
+"""Whitened residuals beyond this count linearly."""
+FREE_FRAMES = 12
+"""More free frames than this are thinned out evenly."""
+BIAS_STEPS = np.concatenate([[0.0], 1e-5 * 2.0 ** np.arange(9)])
+SHARE_STEPS = np.concatenate([[0.0], 0.00125 * 2.0 ** np.arange(7)])
+"""Sizes of the shared errors that are tried: 0.01 … 2.6 mm, and 0.1 … 8 % of the way."""
+LIKELY_GAIN = 13.5
+"""Log-evidence gain that noise alone gives once in 1000 frames: χ² with three degrees at some 50 places that differ."""
+
+
+def first_knowledge(
+    noises: tuple[CameraNoise, ...], surface_nodes: FloatArray, size: float, modulus_std: float, pose_covariance: FloatArray
+) -> Knowledge:
+    """Return what is known before a free frame is seen.
+
+    Arguments:
+        noises: of each camera.
+        surface_nodes: nodes of the surface at rest [m], shape (s, 3).
+        size: diagonal of the body [m].
+        modulus_std: relative.
+        pose_covariance: of all cameras' (rotation, shift), shape (6 v, 6 v).
+    """
+    centres = surface_nodes[spread_points(surface_nodes, CENTRES)]
+    v = len(pose_covariance)
+    root = np.zeros((v + 1, v + 1))
+    root[:v, :v] = _root(pose_covariance)
+    root[v, v] = modulus_std
+    return Knowledge(
+        noises=noises,
+        centres=freeze(centres),
+        length=0.7 * _spacing(centres, size),
+        bias_m=1e-4,
+        model_share=0.01,
+        common_mean=freeze(np.zeros(v + 1)),
+        common_root=freeze(root),
+        gain_limit=LIKELY_GAIN,
+        misfit_limit=np.inf,
+    )
+
+
+def sag_at(sensor: Sensor, state: Equilibrium, tangent: Tangent) -> FloatArray:
+    """Return how the nodes move when the body becomes so much stiffer, per relative change [m], shape (1, n, 3)."""
+    load = internal(sensor.robot.body, state.positions, tangent=False).forces
+    return np.asarray(tangent.respond(load[None]))
+
+
+def nuisance_columns(knowledge: Knowledge, rows: Rows, sag: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the columns of unit nuisance (r, q) [m] and what the free frames say that they add to the residual (r,) [m]."""
+    common = common_columns(rows, sag)
+    field = _kernel(knowledge, rows.place)
+    own = [common @ knowledge.common_root]
+    own += [knowledge.bias_m * field] if knowledge.bias_m > 0 else []
+    own += [knowledge.model_share * rows.way[:, None] * field] if knowledge.model_share > 0 else []
+    return np.hstack(own), common @ knowledge.common_mean
+
+
+def common_columns(rows: Rows, sag: FloatArray) -> FloatArray:
+    """Return how the residual changes with pose steps and the modulus, shape (r, 6 v + 1)."""
+    return np.hstack([rows.by_pose, rows.functional(sag)])
+
+
+def robust_std(rows: Rows, residual: FloatArray) -> FloatArray:
+    """Return standard deviations that are larger where residuals stand out (Huber) [m], shape (r,)."""
+    return np.asarray(rows.std * np.sqrt(np.maximum(np.abs(residual / rows.std) / cut_of(residual / rows.std), 1.0)))
+
+
+def cut_of(z: FloatArray) -> float:
+    """Return from which size on a whitened residual stands out [1]."""
+    return HUBER * max(1.483 * float(np.median(np.abs(z))), 1.0)
+
+
+def learn(knowledge: Knowledge, frames: list[tuple[Rows, FloatArray]]) -> Knowledge:
+    """Return what free frames teach.
+
+    Pose and modulus together with the sizes of the two shared errors, by maximum likelihood over a grid; then how large the misfit is that free
+    frames leave.
+
+    Arguments:
+        knowledge: what was known before.
+        frames: rows and sag of each free frame.
+    """
+    if not frames:
+        return knowledge
+    first, grams = knowledge, [_gram(knowledge, rows, sag) for rows, sag in frames]
+    knowledge = _fit_common(first, grams, first)
+    for _ in range(2):
+        knowledge = _fit_field(knowledge, grams)
+        knowledge = _fit_common(knowledge, grams, first)
+    misfits = np.array([misfit(knowledge, rows, sag) for rows, sag in frames])
+    return replace(knowledge, misfit_limit=float(misfits.max() + 3.0 * max(misfits.std(), 0.05)))
+
+
+def misfit(knowledge: Knowledge, rows: Rows, sag: FloatArray) -> float:
+    """Return the mean of Huber's function of the whitened residual with nuisance fitted: about 1 where all is explained."""
+    columns, known = nuisance_columns(knowledge, rows, sag)
+    return misfit_of(rows.residual - known, columns, rows)[0] / max(len(rows.residual), 1)
+
+
+def misfit_of(residual: FloatArray, columns: FloatArray, rows: Rows) -> tuple[float, FloatArray]:
+    """Return Huber's function of the whitened residual with unit nuisance fitted, summed, and the nuisance."""
+    std = robust_std(rows, residual)
+    A = columns / std[:, None]
+    fitted = np.linalg.solve(A.T @ A + np.eye(columns.shape[1]), A.T @ (residual / std))
+    z = np.abs(residual - columns @ fitted) / rows.std
+    cut = cut_of(residual / rows.std)
+    return float(np.where(z <= cut, z**2, cut * (2.0 * z - cut)).sum() + fitted @ fitted), np.asarray(fitted, dtype=np.float64)
+
+
+# --- helpers ----------------------------------------------------------------------------------------------------------
+
+
+def _kernel(knowledge: Knowledge, places: FloatArray) -> FloatArray:
+    """Return smooth weights of each place to each centre, squares summing to 1, shape (r, p)."""
+    squared = ((places[:, None, :] - knowledge.centres[None]) ** 2).sum(axis=2)
+    weight = np.exp(-0.5 * (squared - squared.min(axis=1, keepdims=True)) / knowledge.length**2)
+    return np.asarray(weight / np.sqrt((weight**2).sum(axis=1, keepdims=True)))
+
+
+def _gram(knowledge: Knowledge, rows: Rows, sag: FloatArray) -> FloatArray:
+    """Return all inner products of (field, way × field, common, residual) in whitened rows, shape (2p + c + 1,) squared."""
+    std = robust_std(rows, rows.residual)
+    field = _kernel(knowledge, rows.place)
+    A = np.hstack([field, rows.way[:, None] * field, common_columns(rows, sag), rows.residual[:, None]]) / std[:, None]
+    return np.asarray(A.T @ A)
+
+
+def _projected(knowledge: Knowledge, gram: FloatArray) -> tuple[FloatArray, float]:
+    """Return the inner products of (common, residual) with the field as correlated noise, and log det of its covariance."""
+    p = 2 * len(knowledge.centres)
+    scale = np.concatenate([np.full(p // 2, knowledge.bias_m), np.full(p // 2, knowledge.model_share)])
+    core = np.eye(p) + scale[:, None] * gram[:p, :p] * scale
+    side = scale[:, None] * gram[:p, p:]
+    return gram[p:, p:] - side.T @ np.linalg.solve(core, side), float(np.linalg.slogdet(core)[1])
+
+
+def _fit_common(knowledge: Knowledge, grams: list[FloatArray], first: Knowledge) -> Knowledge:
+    """Return pose steps and modulus with their covariance, from their first prior and the free frames together."""
+    total = np.asarray(sum(_projected(knowledge, gram)[0] for gram in grams))
+    normal, right, root = total[:-1, :-1], total[:-1, -1], first.common_root
+    inner = np.eye(root.shape[1]) + root.T @ normal @ root
+    mean = root @ np.linalg.solve(inner, root.T @ right)
+    return replace(knowledge, common_mean=freeze(mean), common_root=freeze(root @ _root(np.linalg.inv(inner))))
+
+
+def _fit_field(knowledge: Knowledge, grams: list[FloatArray]) -> Knowledge:
+    """Return the sizes of the shared errors that are likeliest for these frames."""
+    x = np.append(-knowledge.common_mean, 1.0)
+    best, chosen = np.inf, knowledge
+    for bias in BIAS_STEPS:
+        for share in SHARE_STEPS:
+            tried = replace(knowledge, bias_m=float(bias), model_share=float(share))
+            parts = [_projected(tried, gram) for gram in grams]
+            value = sum(float(x @ left @ x) + logdet for left, logdet in parts)
+            if value < best:
+                best, chosen = value, tried
+    return chosen
+
+
+def _spacing(points: FloatArray, size: float) -> float:
+    if len(points) < 2:
+        return size
+    distance = np.linalg.norm(points[:, None] - points[None], axis=2) + size * np.eye(len(points))
+    return float(np.median(distance.min(axis=1)))
+
+
+def _root(covariance: FloatArray) -> FloatArray:
+    """Return a square root of a covariance, of the same shape."""
+    values, vectors = np.linalg.eigh(covariance) if covariance.size else (np.zeros(0), np.zeros((0, 0)))
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))

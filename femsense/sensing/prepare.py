@@ -1,0 +1,129 @@
+"""What stays the same from frame to frame, and what the free frames teach before the first frame is sensed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from femsense.calib.calibration import Calibration
+from femsense.calib.from_clouds import measured_noises, pose_pivot
+from femsense.calib.scan import REACH, Scan, parted, read_scan
+from femsense.core.arrays import FloatArray, as_points
+from femsense.core.errors import FemsenseError, InputError
+from femsense.fem.compliance import tangent_at
+from femsense.fem.equilibrium import Equilibrium
+from femsense.model.contact_patch import body_surface, flat_nodes
+from femsense.model.drive import DrivenRobot, drive_of
+from femsense.model.recording import Recording, check_against
+from femsense.model.robot import Robot, spread_features
+from femsense.pointcloud.rays import Surface
+from femsense.sensing.forces import free_state
+from femsense.sensing.measure import rows_at
+from femsense.sensing.nuisance import FREE_FRAMES, first_knowledge, learn, sag_at
+from femsense.sensing.places import check_places, near_places
+from femsense.sensing.types import Answers, Rows, SensingOptions, Sensor
+
+CANDIDATES = 120
+"""Places at which hidden contacts are searched (METHODS section 3)."""
+
+
+def make_sensor(
+    robot: Robot,
+    recording: Recording,
+    calibration: Calibration,
+    *,
+    at: npt.ArrayLike | None = None,
+    options: SensingOptions | None = None,
+) -> Sensor:
+    """Prepare what stays the same from frame to frame. Raises InputError where nothing says where to look for forces."""
+    recording, options = check_against(robot, recording), options or SensingOptions()
+    places = as_points(at if at is not None else np.zeros((0, 3)), "at")
+    size = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
+    surface = body_surface(robot.body.mesh)
+    check_places(places, surface, robot, size)
+    if not recording.has_clouds and not len(places):
+        raise InputError(
+            "no clouds, and no place of contact is given",
+            where=recording.folder,
+            expected="clouds/, depth/, or --at X,Y,Z",
+            hint="name the place at rest in metres, robot frame: --at 0.1,0,0.015",
+        )
+    robot = _with_placements(robot, calibration)
+    noises = measured_noises(robot, recording, calibration)
+    knowledge = first_knowledge(
+        noises, robot.body.mesh.nodes[surface.nodes], size, options.modulus_std, calibration.joint_covariance
+    )
+    sensor = Sensor(
+        robot,
+        recording,
+        calibration,
+        _driven(robot, recording, calibration, places, size),
+        surface,
+        options,
+        places,
+        spread_features(robot.body, CANDIDATES, among=flat_nodes(surface, robot.body.mesh.nodes)),
+        pose_pivot(robot),
+        size,
+        knowledge,
+        Answers(),
+    )
+    return replace(sensor, knowledge=learn(knowledge, _free_rows(sensor)))
+
+
+def scan_of(sensor: Sensor, k: int, state: Equilibrium) -> Scan | None:
+    """Return what cameras see in frame k near a state; None where the recording has no clouds at all."""
+    if not sensor.recording.has_clouds:
+        return None
+    return read_scan(sensor.robot, sensor.recording, k, sensor.calibration.poses, state.positions)
+
+
+def _with_placements(robot: Robot, calibration: Calibration) -> Robot:
+    if not calibration.placements_m:
+        return robot
+    points = robot.marker_points.copy()
+    for name, placement in calibration.placements_m.items():
+        if name in robot.marker_names:
+            points[robot.marker_names.index(name)] = placement
+    return robot.with_marker_points(points)
+
+
+def _driven(robot: Robot, recording: Recording, calibration: Calibration, places: FloatArray, size: float) -> DrivenRobot:
+    """Return what drives the robot, without the known loads that are to be sensed."""
+    initial = None
+    if recording.actuation_zero == "unknown":
+        table = calibration.cable_tension_n if recording.actuation == "tension" else calibration.cable_displacement_m
+        initial = np.array([table[name] for name in robot.body.cable_names])
+    drive = drive_of(robot, recording, initial=initial)
+    sensed_here = near_places(drive.load_points, places, size)
+    drive = replace(
+        drive,
+        load_frame=drive.load_frame[~sensed_here],
+        load_points=drive.load_points[~sensed_here],
+        load_forces=drive.load_forces[~sensed_here],
+        load_ties=drive.load_ties[~sensed_here],
+    )
+    return DrivenRobot(robot, drive)
+
+
+def _free_rows(sensor: Sensor) -> list[tuple[Rows, FloatArray]]:
+    """Return rows and sag of the free frames with clouds; a frame that gives nothing is left out."""
+    recording, result, state = sensor.recording, [], None
+    if recording.free is None or not recording.has_clouds:
+        return []
+    frames = np.flatnonzero(recording.free)
+    frames = frames[np.unique(np.linspace(0, len(frames) - 1, FREE_FRAMES).round().astype(int))] if len(frames) else frames
+    for k in frames.tolist():
+        try:
+            state = free_state(sensor, k, state, None)
+            scan = scan_of(sensor, k, state)
+            if scan is not None and not scan.told:
+                shape = Surface(state.positions, sensor.surface.triangles)
+                scan = parted(scan, shape, sensor.calibration.poses, sensor.knowledge.noises, reach=REACH * sensor.size)
+            rows = None if scan is None else rows_at(sensor, k, scan, state)
+        except FemsenseError:
+            continue
+        if rows is not None:
+            result.append((rows, sag_at(sensor, state, tangent_at(sensor.robot.body, state))))
+    return result

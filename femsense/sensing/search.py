@@ -1,0 +1,247 @@
+"""Which contacts explain a frame: what objects touch, then what the shape alone betrays, one after the other, until nothing is left to explain."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from femsense.calib.scan import REACH, Scan, parted
+from femsense.core.arrays import FloatArray
+from femsense.core.errors import DataError
+from femsense.fem.compliance import Tangent, tangent_at
+from femsense.fem.equilibrium import Equilibrium
+from femsense.fem.mesh import vertex_normals
+from femsense.pointcloud.primitives import Shape
+from femsense.pointcloud.rays import Surface
+from femsense.sensing.forces import fit_forces, make_touch, no_forces
+from femsense.sensing.judge import left_over
+from femsense.sensing.nuisance import nuisance_columns, robust_std, sag_at
+from femsense.sensing.places import object_touches, said_free
+from femsense.sensing.types import Fit, SensedFrame, Sensor, Touch
+
+ANYWHERE = 0.2
+"""How well the place of a contact that only the shape shows is known beforehand, relative to the body's diagonal."""
+STARTS, APART = 3, 0.12
+"""From how many candidates a search begins at most, and how far apart they are, relative to the body's diagonal."""
+ACROSS = 0.3
+"""Size of forces along the surface that is expected of a contact whose place is searched, relative to those along the normal."""
+MOST = 4
+"""Contacts a frame at most."""
+SURE = 16.3
+"""χ² with three degrees of freedom that noise alone gives once in 1000: a force below it is none."""
+ROUNDS = 2
+"""How often a place is looked for again with the state that its force makes."""
+NEARBY = 0.03
+"""The search takes the answers of a state whose nodes are nearer than this share of the body's diagonal: they rank places, and do not weigh forces."""
+THIN = 2000
+"""Rows that the search uses at most."""
+
+
+def explain(
+    sensor: Sensor,
+    k: int,
+    scan: Scan | None,
+    shapes: list[Shape],
+    touches: Sequence[Touch],
+    free: Fit,
+    previous: SensedFrame | None,
+    before: tuple[FloatArray, ...] | None,
+) -> Fit:
+    """Return the contacts and forces that explain frame k; those that do not make the misfit smaller are left out."""
+    if scan is None or len(sensor.places):
+        return _better(free, fit_forces(sensor, k, scan, touches, free, start=_start(previous, touches), before=before))
+    if said_free(sensor, k):
+        return free
+    return _with_hidden(sensor, k, scan, _with_objects(sensor, k, scan, shapes, free, previous, before), free, before)
+
+
+def told_apart(
+    sensor: Sensor, k: int, scan: Scan | None, free: Fit, previous: SensedFrame | None, before: tuple[FloatArray, ...] | None
+) -> tuple[Scan | None, Fit]:
+    """Return the scan with robot and surroundings apart, and the fit without forces to what is the robot's.
+
+    Where colour has not told them apart, the shape is explained first, with all points; what then lies off the surface is something else.
+    """
+    if scan is None or scan.told:
+        return scan, free
+    fit = free
+    if not said_free(sensor, k) and not len(sensor.places):
+        if previous is not None and previous.fit.touches:
+            fit = _better(
+                free, _try(sensor, k, scan, previous.fit.touches, free, (previous.fit.state, previous.fit.forces), before)
+            )
+        fit = _with_hidden(sensor, k, scan, fit, free, before)
+    surface = Surface(fit.state.positions, sensor.surface.triangles)
+    scan = parted(scan, surface, sensor.calibration.poses, sensor.knowledge.noises, reach=REACH * sensor.size)
+    return scan, no_forces(sensor, k, scan, free.state)
+
+
+def _with_hidden(sensor: Sensor, k: int, scan: Scan, fit: Fit, free: Fit, before: tuple[FloatArray, ...] | None) -> Fit:
+    """Return the fit with contacts that the shape alone betrays, one after the other."""
+    for _ in range(MOST - len(fit.touches)):
+        start = (fit.state, np.vstack([fit.forces, np.zeros((1, 3))]))
+        more = fit
+        for found in find_hidden(sensor, fit):
+            more = _better(more, _try(sensor, k, scan, [*fit.touches, found], free, start, before))
+            if more is not fit and left_over(sensor, more) <= sensor.knowledge.misfit_limit:
+                break
+        more = _significant(sensor, k, scan, more, free, before)
+        if more.cost > fit.cost - 2.0 * sensor.knowledge.gain_limit:
+            break
+        fit = more
+    return fit
+
+
+def find_hidden(sensor: Sensor, fit: Fit) -> list[Touch]:
+    """Return touches that would explain most of what a fit leaves, the best first; none where that is no more than noise can do.
+
+    One linear solve answers for all candidates: the gain in log evidence of a force there with a Gaussian prior, pushing inwards. The best one is
+    where the fit begins; its place moves with the forces, and nothing but the rows says where to.
+    """
+    gain, _ = evidence(sensor, fit)
+    nodes = sensor.robot.body.mesh.nodes[sensor.candidates]
+    if not len(gain) or gain.max() < sensor.knowledge.gain_limit:
+        return []
+    found: list[Touch] = []
+    for i in np.argsort(-gain):
+        if len(found) == STARTS or gain[i] < max(sensor.knowledge.gain_limit, 0.5 * gain.max()):
+            break
+        if all(np.linalg.norm(nodes[i] - t.place) > APART * sensor.size for t in found):
+            found.append(make_touch(sensor, nodes[i], source="shape", std_m=ANYWHERE * sensor.size))
+    return found
+
+
+def evidence(sensor: Sensor, fit: Fit) -> tuple[FloatArray, FloatArray]:
+    """Return the gain in log evidence of one more contact at each candidate, shape (c,), and its force (c, 3) [N]."""
+    body, n, rows = sensor.robot.body, len(fit.state.positions), fit.rows
+    tangent = tangent_at(body, fit.state)
+    normals = vertex_normals(fit.state.positions, sensor.surface.triangles)[sensor.candidates]
+    frames = np.array([np.vstack([m, np.linalg.svd(m[None])[2][1:]]) for m in normals])  # rows: normal, tangents
+    answers = _answers(sensor, fit.state, tangent)
+    columns, known = nuisance_columns(sensor.knowledge, rows, sag_at(sensor, fit.state, tangent))
+    residual = rows.residual - known
+    other = (
+        [rows.functional(tangent.respond(np.array([t.patch.spread(a, n) for t in fit.touches for a in np.eye(3)])))]
+        if fit.touches
+        else []
+    )
+    columns = np.hstack([columns, *(sensor.options.force_std_n * o for o in other)])
+    std = robust_std(rows, residual)
+    thin = np.arange(0, len(std), max(1, len(std) // THIN))
+    share = len(std) / len(thin)
+    N, z = columns[thin] / std[thin, None], residual[thin] / std[thin]
+    W = (rows.functional(answers)[thin] / std[thin, None]).reshape(len(thin), -1, 3)
+    W = np.einsum("rcj,cij->rci", W, frames).reshape(len(thin), -1)
+    inner = np.linalg.inv(N.T @ N + np.eye(N.shape[1]) / share)
+    Nz, NW = N.T @ z, N.T @ W
+    g = share * (W.T @ z - NW.T @ (inner @ Nz)).reshape(-1, 3)
+    W3, NW3 = W.reshape(len(z), -1, 3), NW.reshape(len(Nz), -1, 3)
+    M = share * (np.einsum("rci,rcj->cij", W3, W3) - np.einsum("qci,qp,pcj->cij", NW3, inner, NW3, optimize=True))
+    prior = np.diag([1.0, ACROSS**-2, ACROSS**-2]) / sensor.options.force_std_n**2
+    H = M + prior
+    f = np.linalg.solve(H, g[:, :, None])[:, :, 0]
+    gain = 0.5 * (g * f).sum(axis=1) - 0.5 * (np.linalg.slogdet(H)[1] - np.linalg.slogdet(prior)[1])
+    along = g[:, 0] / H[:, 0, 0]
+    alone = 0.5 * (g[:, 0] * along - np.log(H[:, 0, 0] / prior[0, 0]))
+    mu = np.inf if sensor.options.friction is None else sensor.options.friction
+    slides = np.linalg.norm(f[:, 1:], axis=1) > -mu * f[:, 0]  # beyond its cone: then along the normal only
+    f = np.where(slides[:, None], along[:, None] * np.array([1.0, 0.0, 0.0]), f)
+    return np.where(f[:, 0] < 0, np.where(slides, alone, gain), -np.inf), np.einsum("ci,cij->cj", f, frames)
+
+
+def _answers(sensor: Sensor, state: Equilibrium, tangent: Tangent) -> FloatArray:
+    """Return how the nodes answer to unit forces at the candidates near a state [m/N], shape (3c, n, 3)."""
+    kept = sensor.answers
+    if kept.positions is None or kept.moves is None or np.abs(kept.positions - state.positions).max() > NEARBY * sensor.size:
+        n, c = len(state.positions), len(sensor.candidates)
+        loads = np.zeros((c, 3, n, 3))
+        loads[np.arange(c), :, sensor.candidates] = np.eye(3)
+        kept.positions, kept.moves = state.positions, tangent.respond(loads.reshape(-1, n, 3))
+    return kept.moves
+
+
+# --- helpers ----------------------------------------------------------------------------------------------------------
+
+
+def _with_objects(
+    sensor: Sensor,
+    k: int,
+    scan: Scan,
+    shapes: list[Shape],
+    free: Fit,
+    previous: SensedFrame | None,
+    before: tuple[FloatArray, ...] | None,
+) -> Fit:
+    """Return the fit with what objects touch, their places found again in the state that the forces make."""
+    fit = free
+    if previous is not None and previous.fit.touches:  # what held in the frame before is a start
+        again = _try(sensor, k, scan, previous.fit.touches, free, (previous.fit.state, previous.fit.forces), before)
+        fit = fit if again is None or left_over(sensor, again) > sensor.knowledge.misfit_limit else _better(fit, again)
+    for _ in range(ROUNDS if shapes else 0):
+        found = object_touches(sensor, shapes, fit.state)
+        if _same(sensor, found, fit.touches):
+            break
+        start = _start_of(fit, found)
+        own = [
+            t
+            for t in fit.touches
+            if t.source == "shape" and all(np.linalg.norm(t.place - o.place) > 0.15 * sensor.size for o in found)
+        ]
+        fit = _better(free, _try(sensor, k, scan, [*found, *own], free, start, before) if found or own else None)
+    return _significant(sensor, k, scan, fit, free, before)
+
+
+def _same(sensor: Sensor, found: Sequence[Touch], touches: Sequence[Touch]) -> bool:
+    """Return whether objects touch where the fit has contacts already."""
+    if len(found) != len(touches) or any(t.source != "cloud" for t in touches):
+        return False
+    return all(min(float(np.linalg.norm(f.place - t.expected)) for t in touches) < 0.3 * sensor.surface.edge for f in found)
+
+
+def _significant(sensor: Sensor, k: int, scan: Scan, fit: Fit, free: Fit, before: tuple[FloatArray, ...] | None) -> Fit:
+    """Return the fit without contacts whose force may be noise, or that pull."""
+    while fit.touches:
+        value = [
+            float(f @ np.linalg.solve(fit.covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3], f)) for i, f in enumerate(fit.forces)
+        ]
+        weakest = int(np.argmin(value))
+        if value[weakest] >= SURE:
+            return fit
+        kept = [t for i, t in enumerate(fit.touches) if i != weakest]
+        if not kept:
+            return free
+        start = (fit.state, np.delete(fit.forces, weakest, axis=0))
+        fit = _better(free, _try(sensor, k, scan, kept, free, start, before))
+    return fit
+
+
+def _try(
+    sensor: Sensor,
+    k: int,
+    scan: Scan,
+    touches: Sequence[Touch],
+    free: Fit,
+    start: tuple[Equilibrium, FloatArray] | None,
+    before: tuple[FloatArray, ...] | None,
+) -> Fit | None:
+    try:
+        return fit_forces(sensor, k, scan, touches, free, start=start, before=before)
+    except DataError:
+        return None
+
+
+def _better(free: Fit, fit: Fit | None) -> Fit:
+    """Return the fit, unless it explains no more than no contact at all."""
+    return free if fit is None or fit.cost >= free.cost else fit
+
+
+def _start(previous: SensedFrame | None, touches: Sequence[Touch]) -> tuple[Equilibrium, FloatArray] | None:
+    if previous is None or len(previous.fit.touches) != len(touches):
+        return None
+    return previous.fit.state, previous.fit.forces
+
+
+def _start_of(fit: Fit, touches: Sequence[Touch]) -> tuple[Equilibrium, FloatArray] | None:
+    """Return the state and forces of a fit as a start for as many touches."""
+    return (fit.state, fit.forces) if len(fit.touches) == len(touches) and touches else None

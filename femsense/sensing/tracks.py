@@ -1,0 +1,84 @@
+"""Contacts of a frame, who they were in the frame before, and their forces averaged over time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from femsense.core.arrays import freeze
+from femsense.sensing.forces import touch_normal
+from femsense.sensing.types import ContactForce, Fit, SensedFrame, Sensor
+
+SAME = 0.15
+"""A contact nearer than this share of the body's diagonal to one of the frame before is the same one: it slid."""
+
+
+def contacts_of(sensor: Sensor, k: int, fit: Fit, previous: SensedFrame | None) -> tuple[ContactForce, ...]:
+    """Return the contacts of a fit; those that begin a track have track −1."""
+    number, stamp = int(sensor.recording.frame_numbers[k]), float(sensor.recording.time_s[k])
+    contacts: list[ContactForce] = []
+    for i, (touch, force) in enumerate(zip(fit.touches, fit.forces)):
+        size, normal = float(np.linalg.norm(force)), touch_normal(sensor, touch, fit.state)
+        if size == 0.0 and touch.source != "given":
+            continue
+        along = force / size if size > 0 else -normal
+        own = fit.covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3]
+        contacts.append(
+            ContactForce(
+                frame=number,
+                time_s=stamp,
+                contact=len(contacts),
+                position_m=touch.patch.mean(fit.state.positions),
+                normal=normal,
+                force_n_xyz=force,
+                force_n=size,
+                std_n=float(np.sqrt(max(float(along @ own @ along), 0.0))),
+                source=touch.source,
+                track=-1,
+                position_std_m=freeze(np.sqrt(np.maximum(np.diag(fit.place_covariance[i]), 0.0))),
+                radius_m=_patch_radius(sensor, touch.object_radius_m, size),
+                force_std_n_xyz=freeze(np.sqrt(np.maximum(np.diag(own), 0.0))),
+            )
+        )
+    return tuple(_tracked(contacts, () if previous is None else previous.contacts, SAME * sensor.size))
+
+
+def smoothed(contacts: Sequence[ContactForce], time_constant_s: float) -> list[ContactForce]:
+    """Return contacts whose forces are averaged over their track (first order, lagging by the time constant) [s]; 0 leaves them as they are."""
+    if time_constant_s <= 0.0:
+        return list(contacts)
+    last: dict[int, ContactForce] = {}
+    result = []
+    for contact in contacts:
+        before = last.get(contact.track)
+        if before is not None:
+            share = 1.0 - np.exp(-(contact.time_s - before.time_s) / time_constant_s)
+            force = before.force_n_xyz + share * (contact.force_n_xyz - before.force_n_xyz)
+            contact = replace(contact, force_n_xyz=force, force_n=float(np.linalg.norm(force)))
+        last[contact.track] = contact
+        result.append(contact)
+    return result
+
+
+def _tracked(contacts: list[ContactForce], before: Sequence[ContactForce], reach: float) -> list[ContactForce]:
+    """Return contacts with the tracks of the nearest ones of the frame before, each taken once."""
+    pairs = sorted(
+        (float(np.linalg.norm(c.position_m - b.position_m)), i, j) for i, c in enumerate(contacts) for j, b in enumerate(before)
+    )
+    taken: set[int] = set()
+    for distance, i, j in pairs:
+        if distance <= reach and contacts[i].track < 0 and j not in taken:
+            contacts[i] = replace(contacts[i], track=before[j].track)
+            taken.add(j)
+    return contacts
+
+
+def _patch_radius(sensor: Sensor, radius: float, force: float) -> float:
+    """Return the radius of the patch by Hertz: a³ = 3 F R (1 − ν²) / (4 E), of a rigid ball on a flat; half an edge where R is not known."""
+    material = sensor.robot.body.material
+    if not np.isfinite(radius):
+        return 0.5 * sensor.surface.edge
+    modulus, poisson = float(np.median(material.young_modulus)), float(np.median(material.poisson_ratio))
+    return float(np.cbrt(0.75 * force * radius * (1.0 - poisson**2) / modulus))
