@@ -67,7 +67,7 @@ class FreeMap:
     source: IntArray
     """For each entry of the reduced matrix, its place in the flat block array, shape (nnz,)."""
     laplacian: list[Any] = field(default_factory=list)
-    """The factor that `turning.turned_step` needs, once it was needed (None where there is none)."""
+    """The factor that `rotated_step.rotated_step` needs, once it was needed (None where there is none)."""
 
 
 def make_stencil(mesh: TetMesh, cliques: list[IntArray] | None = None) -> tuple[Stencil, tuple[IntArray, ...]]:

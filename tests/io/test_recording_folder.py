@@ -556,7 +556,7 @@ def test_inputs_beyond_the_limits_warn(tmp_path: Path, robot: Any, value: str, t
         check_against(robot, r)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        check_against(robot, replace(r, actuation="displacement"))
+        check_against(robot, replace(r, actuation="displacement", inputs=1e-5 * np.abs(r.inputs)))
 
 
 def test_colour_of_16_bits_or_as_jpeg_goes_with_its_depth(tmp_path: Path) -> None:
@@ -697,7 +697,7 @@ BAD: list[tuple[dict[str, str | None], str, list[str]]] = [
         ["a frame that frames.csv does not have", "2", "(0 … 4)"],
     ),
     (
-        {"markers_csv": MARKERS + "0,tip,0,0,0\n0,,0,0,0\n"},
+        {"markers_csv": MARKERS + "0,tip,0,0,1\n0,,0,0,2\n"},
         "markers.csv, line 3, column marker",
         ["a marker without a name beside markers with names", "frame 0"],
     ),
@@ -741,7 +741,7 @@ BAD: list[tuple[dict[str, str | None], str, list[str]]] = [
     ),
     ({"recording_toml": TOML + "marker_noise_m = 0\n"}, "recording.toml: marker_noise_m", ["greater than 0"]),
     (
-        {"markers_csv": MARKERS + "0,tip,0,0,0\n0,tip,0,0,1\n"},
+        {"markers_csv": MARKERS + "0,tip,0,0,1\n0,tip,0,0,2\n"},
         "markers.csv, line 3",
         ["a marker stands twice in one frame", "frame 0, marker 'tip'"],
     ),

@@ -576,7 +576,7 @@ def test_a_loop_shows_its_sentence_and_its_ten_items_with_their_numbers(tmp_path
         "touched, load not declared: 4–6 (3)",
         "no markers: 9 (1)",
         "Frames left out, 2 none",
-        "Outlying markers left out tip in frame 4, stalk in frame 9",
+        "Outliers left out tip in frame 4, stalk in frame 9",
         "reached again the same way) 2",
         "each measurement by itself 0.080 mm",
         "restricted maximum likelihood, with repeats",

@@ -120,7 +120,7 @@ def _optitrack(head: list[list[str]], path: Path) -> Export:
         markers.setdefault(("" if unnamed else _at(names, j), group), {})[axes[j].strip().lower()] = j
     found = tuple((name, (a["x"], a["y"], a["z"])) for (name, _), a in markers.items() if set(a) == set("xyz"))
     rate = pairs.get("Export Frame Rate") or pairs.get("Capture Frame Rate")
-    return Export("optitrack", _distinct(found, kinds), pairs.get("Length Units"), 1, float(rate) if rate else None, axes_row + 1)
+    return Export("optitrack", _distinct(found, kinds), pairs.get("Length Units"), 1, _rate(rate or ""), axes_row + 1)
 
 
 def _vicon(path: Path) -> Export:
@@ -143,7 +143,7 @@ def _vicon(path: Path) -> Export:
             bare = label.rpartition(":")[2]
             found.append(("" if bare.startswith("*") or not bare else bare, (j, j + 1, j + 2)))
     unit = next((cell.strip() for cell in units if cell.strip()), None)
-    return Export("vicon", tuple(found), unit, None, float(section[1][0]), (start or 0) + 5)
+    return Export("vicon", tuple(found), unit, None, _rate(section[1][0]), (start or 0) + 5)
 
 
 def _distinct(
@@ -163,6 +163,12 @@ def _extent(path: Path, export: Export) -> float:
     values = np.array([_cell(row, j) for row in rows for _, axes in export.markers for j in axes])
     finite = values[np.isfinite(values)]
     return float(np.ptp(finite)) if finite.size else 0.0
+
+
+def _rate(cell: str) -> float | None:
+    """Return frames a second; None where the header does not say it."""
+    value = _cell([cell], 0)
+    return value if np.isfinite(value) and value > 0 else None
 
 
 def _at(row: list[str], j: int) -> str:

@@ -74,10 +74,13 @@ class RecoveredReader:
     def _types(self) -> Any:
         typesys = need("rosbags.typesys", "ros", "reading ROS bags")
         types: dict[str, Any] = {}
-        for connection in self.connections:
-            types.update(typesys.get_types_from_msg(connection.definition, connection.msgtype))
         store = typesys.get_typestore(typesys.Stores.EMPTY)
-        store.register(types)
+        try:
+            for connection in self.connections:
+                types.update(typesys.get_types_from_msg(connection.definition, connection.msgtype))
+            store.register(types)
+        except Exception as error:  # the parser raises what its grammar raises
+            raise InputError("broken definitions of messages", where=self.path, found=type(error).__name__) from None
         return store
 
 
@@ -125,7 +128,9 @@ def _fields(data: bytes) -> dict[str, bytes]:
 
 
 def _bag_item(header: dict[str, bytes], data: bytes) -> Connection | tuple[int, int, bytes] | None:
-    kind = header.get("op", b"\0")[0]
+    kind = (header.get("op") or b"\0")[0]
+    if "conn" not in header:
+        return None
     if kind == MESSAGE and len(header.get("time", b"")) == 8:
         seconds, nanoseconds = struct.unpack("<II", header["time"])
         return int.from_bytes(header["conn"], "little"), seconds * 10**9 + nanoseconds, data
@@ -167,7 +172,7 @@ def _mcap_records(stream: BinaryIO) -> Iterator[Connection | tuple[int, int, byt
                 yield Connection(record.id, record.topic, schema.name, schema.data.decode("utf-8", "replace"))
             elif kind == "Message":
                 yield record.channel_id, record.log_time, record.data
-    except (exceptions.McapError, struct.error, ValueError, EOFError, OSError):
+    except (exceptions.McapError, struct.error, ValueError, EOFError, OSError, OverflowError, MemoryError):
         return
     except Exception as error:  # what the decompressors raise at a break has no common base
         if type(error).__module__.split(".")[0] not in ("zstandard", "lz4", "_lz4"):

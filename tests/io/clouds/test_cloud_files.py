@@ -288,6 +288,12 @@ def test_colours_under_their_names_and_types(tmp_path: Path, names: Sequence[str
     np.testing.assert_allclose(cloud.colors, [[1, 0, 1], [0, 1, 0]], atol=1e-12)
 
 
+def test_dark_colours_of_16_bits_stay_dark(tmp_path: Path) -> None:
+    values = np.array([[100, 0, 0], [0, 200, 0]])
+    cloud = read_cloud(ply_file(tmp_path / "a.ply", ("red", "green", "blue"), "ushort", values))
+    np.testing.assert_allclose(cloud.colors, values / 65535.0)
+
+
 def test_colours_that_are_not_understood_name_the_file(tmp_path: Path) -> None:
     file = ply_file(tmp_path / "a.ply", ("red", "green", "blue"), "float", np.array([[-1.0, 0, 0], [0, 0, 0]]))
     with pytest.raises(InputError, match="colours that are not understood") as error:

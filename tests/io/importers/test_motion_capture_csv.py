@@ -85,6 +85,14 @@ def test_nexus(tmp_path: Path) -> None:
     assert found["missing"] == [{"marker": "tip", "share": pytest.approx(1 / 3)}]
 
 
+def test_a_rate_that_is_not_readable_is_asked(tmp_path: Path) -> None:
+    (tmp_path / "trial.csv").write_text(NEXUS.replace("\n100\n", "\n1o0\n", 1))
+    with pytest.raises(InputError, match="--rate"):
+        open_source(tmp_path / "trial.csv")
+    recording, _ = imported(tmp_path / "trial.csv", tmp_path / "out", Options(rate=50.0))
+    np.testing.assert_allclose(recording.time_s, [0, 0.02, 0.04])
+
+
 def test_a_header_by_mapping_names_and_units(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("t;px;py;pz;motor\n0;1;2;3;4\n0.1;1;2;;5\n")
     mapping = {"px": "tip.x", "py": "tip.y", "pz": "tip.z", "motor": "cable_north*0.5"}

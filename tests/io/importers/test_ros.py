@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-import warnings
 from pathlib import Path
 
 import cv2
@@ -11,17 +10,16 @@ import numpy as np
 import pytest
 
 pytest.importorskip("rosbags")
+from imported import imported, without_invalid
 from ros_writers import HEIGHT, LENS, START_NS, STEP_NS, WIDTH, BagWriter, color_of, depth_of, write_camera
 
 from femsense.core.errors import InputError
-from femsense.io.clouds.cloud_files import read_cloud
 from femsense.io.clouds.frame_clouds import read_frame_cloud
 from femsense.io.clouds.images import read_png
 from femsense.io.importers.frames import Options
 from femsense.io.importers.guess import open_source
 from femsense.io.importers.writer import write_recording
-from femsense.io.recording_folder import load_recording
-from femsense.model.recording import Recording, marker_grid
+from femsense.model.recording import marker_grid
 
 FRAMES = 8
 KINDS = ("1", "sqlite3", "mcap")
@@ -29,15 +27,6 @@ KINDS = ("1", "sqlite3", "mcap")
 
 def bag_path(folder: Path, kind: str) -> Path:
     return folder / ("take.bag" if kind == "1" else "take")
-
-
-def imported(path: Path, folder: Path, options: Options | None = None, **more: object) -> tuple[Recording, dict]:
-    found = write_recording(open_source(path, options), folder / "recording", identity={"test": str(path)}, **more)
-    return load_recording(folder / "recording"), found
-
-
-def without_invalid(image: np.ndarray) -> np.ndarray:
-    return np.where(image == 65535, 0, image)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -105,6 +94,66 @@ def test_floating_depth_compressed_by_its_inverse(tmp_path: Path) -> None:
     assert depth[5, 5] == 0
     depth[5, 5] = metres[5, 5]
     np.testing.assert_allclose(depth, metres, atol=1.2e-4)
+
+
+def packed_rvl(depth: np.ndarray) -> bytes:
+    """Pack a depth image as A. D. Wilson, "Fast Lossless Depth Image Compression" (2017), describes it."""
+    nibbles: list[int] = []
+
+    def put(value: int) -> None:
+        while True:
+            low, value = value & 7, value >> 3
+            nibbles.append(low | (8 if value else 0))
+            if not value:
+                return
+
+    values, at, last = depth.ravel().tolist(), 0, 0
+    while at < len(values):
+        start = at
+        while at < len(values) and not values[at]:
+            at += 1
+        put(at - start)
+        start = at
+        while at < len(values) and values[at]:
+            at += 1
+        put(at - start)
+        for value in values[start:at]:
+            step, last = value - last, value
+            put(2 * step if step >= 0 else -2 * step - 1)
+    nibbles += [0] * (-len(nibbles) % 8)
+    words = [int("".join(f"{n:x}" for n in nibbles[i : i + 8]), 16) for i in range(0, len(nibbles), 8)]
+    return np.array(words, dtype="<u4").tobytes()
+
+
+def test_depth_packed_by_rvl(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "take", "mcap") as bag:
+        for k in range(3):
+            at = START_NS + k * STEP_NS
+            data = bytes(12) + struct.pack("<II", WIDTH, HEIGHT) + packed_rvl(depth_of(k))
+            bag.write("/depth/image_raw/compressedDepth", at, bag.compressed(data, "16UC1; compressedDepth rvl", at))
+            bag.write("/depth/camera_info", at, bag.info(at))
+    imported(tmp_path / "take", tmp_path)
+    for k in range(3):
+        np.testing.assert_array_equal(read_png(tmp_path / f"recording/depth/{k:06d}.png"), without_invalid(depth_of(k)))
+
+
+def test_the_points_of_a_lens_with_eight_numbers(tmp_path: Path) -> None:
+    """Time-of-flight cameras have the rational polynomial; the points are those that OpenCV finds."""
+    d = (0.5, -0.3, 0.001, -0.0005, 0.02, 0.45, -0.28, 0.01)
+    with BagWriter(tmp_path / "take", "mcap") as bag:
+        bag.write("/depth/image_raw", START_NS, bag.image(depth_of(0), "16UC1", START_NS))
+        bag.write("/depth/camera_info", START_NS, bag.info(START_NS, model="rational_polynomial", d=d))
+    recording, _ = imported(tmp_path / "take", tmp_path)
+    cloud = read_frame_cloud(recording, 0)
+    assert cloud is not None
+    depth = without_invalid(depth_of(0))
+    row, column = np.nonzero(depth)
+    fx, fy, cx, cy = LENS
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    z = 1e-3 * depth[row, column]
+    pixels = cv2.projectPoints(cloud.points, np.zeros(3), np.zeros(3), K, np.array(d))[0][:, 0]
+    np.testing.assert_allclose(pixels, np.stack([column, row], axis=1), atol=1e-5)
+    np.testing.assert_allclose(cloud.points[:, 2], z)
 
 
 @pytest.mark.parametrize("big", [False, True])
@@ -340,74 +389,3 @@ def test_markers_and_bodies_of_mocap4r2(tmp_path: Path) -> None:
     grid = dict(zip(recording.marker_names, marker_grid(recording).transpose(1, 0, 2)))
     np.testing.assert_allclose(grid["tip"], [[0.1, 0.2, 0.01 * k] for k in range(3)])
     np.testing.assert_allclose(grid["base"], [[1.0, 2.0, 3.0]] * 3)
-
-
-# Broken ones
-
-
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("share", [0.0, 0.01, 0.5, 0.98])
-def test_what_is_cut_off_is_said_or_read_up_to_the_break(kind: str, share: float, tmp_path: Path) -> None:
-    path = bag_path(tmp_path, kind)
-    with BagWriter(path, kind, chunk=100_000) as bag:
-        write_camera(bag, 300, motors=False)
-    file = path if kind == "1" else next(f for f in path.iterdir() if f.suffix in (".db3", ".mcap"))
-    data = file.read_bytes()
-    file.write_bytes(data[: int(share * len(data))])
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        try:
-            recording, _ = imported(file, tmp_path)
-        except InputError as problem:
-            assert str(file) in str(problem)
-            assert kind == "sqlite3" or share < 0.1
-        else:
-            # all but the last unfinished chunk, which MCAP's writer makes of a megabyte (70 frames)
-            assert 300 * share - 80 < recording.frame_count <= 300
-            assert any("broken" in str(w.message) for w in caught)
-            np.testing.assert_array_equal(read_png(tmp_path / "recording/depth/000000.png"), without_invalid(depth_of(0)))
-
-
-def test_a_bag_that_was_never_closed(tmp_path: Path) -> None:
-    """Its header holds no place of an index, as while it is recorded."""
-    with BagWriter(tmp_path / "take.bag", "1") as bag:
-        write_camera(bag, 5)
-    data = bytearray((tmp_path / "take.bag").read_bytes())
-    at = data.index(b"index_pos=") + len(b"index_pos=")
-    data[at : at + 8] = bytes(8)
-    (tmp_path / "take.bag").write_bytes(data)
-    with pytest.warns(UserWarning, match=r"not indexed.* messages before the break are read"):
-        recording, _ = imported(tmp_path / "take.bag", tmp_path)
-    assert recording.frame_count == 5 and recording.cable_names == ("north", "south")
-
-
-def test_garbage_with_the_ending_of_a_bag(tmp_path: Path) -> None:
-    for name in ("a.bag", "a.db3", "a.mcap"):
-        (tmp_path / name).write_bytes(np.random.default_rng(0).bytes(5000))
-        with pytest.raises(InputError, match="not readable as a ROS bag"):
-            open_source(tmp_path / name)
-
-
-def test_messages_of_another_type_store_cost_themselves_only(tmp_path: Path) -> None:
-    with BagWriter(tmp_path / "take", "mcap") as bag:
-        write_camera(bag, 4, motors=False)
-        bag.writer.write(bag.connections["/camera/depth/image_raw"], START_NS + 10**9, b"\x00\x01\x00\x00garbage")
-    with pytest.warns(UserWarning, match="a message that its type does not describe"):
-        recording, _ = imported(tmp_path / "take", tmp_path)
-    assert recording.frame_count == 4
-
-
-def test_an_image_of_another_size_than_its_lens(tmp_path: Path) -> None:
-    with BagWriter(tmp_path / "take", "mcap") as bag:
-        bag.write("/depth/image_raw", START_NS, bag.image(depth_of(0), "16UC1", START_NS))
-        bag.write("/depth/camera_info", START_NS, bag.info(START_NS, size=(32, 24)))
-    with pytest.raises(InputError, match="another size than its CameraInfo"):
-        imported(tmp_path / "take", tmp_path)
-
-
-def test_a_million_points(tmp_path: Path) -> None:
-    points = np.random.default_rng(0).random((1_000_000, 3)).astype(np.float32) + 0.1
-    with BagWriter(tmp_path / "take", "mcap") as bag:
-        bag.write("/points", START_NS, bag.cloud(points, None, START_NS))
-    imported(tmp_path / "take", tmp_path)
-    np.testing.assert_array_equal(read_cloud(tmp_path / "recording/clouds/000000.ply").points, points.astype(float))

@@ -141,6 +141,7 @@ def test_a_vtu_of_several_pieces_is_read_whole(tmp_path: Path) -> None:
     empty = piece(np.zeros((0, 3)), np.zeros((0, 4), dtype=int))
     (tmp_path / "a.vtu").write_text(vtu(*halves(), empty))
     same_body(tmp_path / "a.vtu")
+    assert len(read_tets(tmp_path / "a.vtu").nodes) == len(NODES)
     assert tet_values(tmp_path / "a.vtu", "part", "here").shape == (len(TETS), 1)
 
 

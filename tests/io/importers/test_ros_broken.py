@@ -1,0 +1,86 @@
+"""Bags that are broken: cut off, never closed, garbage, of another type store, of another size, and one that is merely large."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rosbags")
+from imported import imported, without_invalid
+from ros_writers import START_NS, BagWriter, depth_of, write_camera
+
+from femsense.core.errors import InputError
+from femsense.io.clouds.cloud_files import read_cloud
+from femsense.io.clouds.images import read_png
+from femsense.io.importers.guess import open_source
+
+
+@pytest.mark.parametrize("kind", ["1", "sqlite3", "mcap"])
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.5, 0.98])
+def test_what_is_cut_off_is_said_or_read_up_to_the_break(kind: str, share: float, tmp_path: Path) -> None:
+    path = tmp_path / ("take.bag" if kind == "1" else "take")
+    with BagWriter(path, kind, chunk=100_000) as bag:
+        write_camera(bag, 300, motors=False)
+    file = path if kind == "1" else next(f for f in path.iterdir() if f.suffix in (".db3", ".mcap"))
+    data = file.read_bytes()
+    file.write_bytes(data[: int(share * len(data))])
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            recording, _ = imported(file, tmp_path)
+        except InputError as problem:
+            assert str(file) in str(problem)
+            assert kind == "sqlite3" or share < 0.1
+        else:
+            # all but the last unfinished chunk, which MCAP's writer makes of a megabyte (70 frames)
+            assert 300 * share - 80 < recording.frame_count <= 300
+            assert any("broken" in str(w.message) for w in caught)
+            np.testing.assert_array_equal(read_png(tmp_path / "recording/depth/000000.png"), without_invalid(depth_of(0)))
+
+
+def test_a_bag_that_was_never_closed(tmp_path: Path) -> None:
+    """Its header holds no place of an index, as while it is recorded."""
+    with BagWriter(tmp_path / "take.bag", "1") as bag:
+        write_camera(bag, 5)
+    data = bytearray((tmp_path / "take.bag").read_bytes())
+    at = data.index(b"index_pos=") + len(b"index_pos=")
+    data[at : at + 8] = bytes(8)
+    (tmp_path / "take.bag").write_bytes(data)
+    with pytest.warns(UserWarning, match=r"not indexed.* messages before the break are read"):
+        recording, _ = imported(tmp_path / "take.bag", tmp_path)
+    assert recording.frame_count == 5 and recording.cable_names == ("north", "south")
+
+
+def test_garbage_with_the_ending_of_a_bag(tmp_path: Path) -> None:
+    for name in ("a.bag", "a.db3", "a.mcap"):
+        (tmp_path / name).write_bytes(np.random.default_rng(0).bytes(5000))
+        with pytest.raises(InputError, match="not readable as a ROS bag"):
+            open_source(tmp_path / name)
+
+
+def test_messages_of_another_type_store_cost_themselves_only(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "take", "mcap") as bag:
+        write_camera(bag, 4, motors=False)
+        bag.writer.write(bag.connections["/camera/depth/image_raw"], START_NS + 10**9, b"\x00\x01\x00\x00garbage")
+    with pytest.warns(UserWarning, match="a message that its type does not describe"):
+        recording, _ = imported(tmp_path / "take", tmp_path)
+    assert recording.frame_count == 4
+
+
+def test_an_image_of_another_size_than_its_lens(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "take", "mcap") as bag:
+        bag.write("/depth/image_raw", START_NS, bag.image(depth_of(0), "16UC1", START_NS))
+        bag.write("/depth/camera_info", START_NS, bag.info(START_NS, size=(32, 24)))
+    with pytest.raises(InputError, match="another size than its CameraInfo"):
+        imported(tmp_path / "take", tmp_path)
+
+
+def test_a_million_points(tmp_path: Path) -> None:
+    points = np.random.default_rng(0).random((1_000_000, 3)).astype(np.float32) + 0.1
+    with BagWriter(tmp_path / "take", "mcap") as bag:
+        bag.write("/points", START_NS, bag.cloud(points, None, START_NS))
+    imported(tmp_path / "take", tmp_path)
+    np.testing.assert_array_equal(read_cloud(tmp_path / "recording/clouds/000000.ply").points, points.astype(float))
