@@ -30,6 +30,8 @@ ROUGH = 1e-6
 """Unbalanced force, relative to all loads, of the states on the way to the forces; the last one is exact."""
 ACROSS = 0.5
 """Forces along the surface are expected to be so much smaller than those along the normal: rubber on plastic or skin slides at 0.5 to 1, and few slide."""
+WIDER = 2.0
+"""The size of the forces is itself uncertain: standard deviations are those of a prior so much wider than the likeliest."""
 TRIES = 4
 """How often a step is made shorter where it leads too far: first along what the rows hardly determine."""
 SIZINGS = 8
@@ -231,6 +233,7 @@ class _Linear:
             sizes = new
             if settled:
                 break
+        covariance = _posterior(R, block_diag(*_priors(here.touches, self.normals, WIDER * sizes)))
         shift = free * (wanted + place_std * others[: 2 * m])
         place = covariance[3 * m : 5 * m, 3 * m : 5 * m] * np.outer(place_std, place_std)
         places = np.array([e.T @ place[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] @ e for i, e in enumerate(self.frames)])

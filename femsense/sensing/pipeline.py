@@ -102,7 +102,7 @@ def sense_frame(sensor: Sensor, k: int, previous: SensedFrame | None) -> SensedF
     scan = scan_of(sensor, k, alone if previous is None else previous.state)
     clock.lap("scan")
     free = no_forces(sensor, k, scan, alone)
-    scan, free = told_apart(sensor, k, scan, free, previous, before)
+    scan, free = told_apart(sensor, k, scan, free, before)
     clock.lap("rows")
     shapes = seen_objects(sensor, k, scan, free.state)
     touches = find_touches(sensor, shapes, free)

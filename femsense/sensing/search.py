@@ -57,7 +57,7 @@ def explain(
 
 
 def told_apart(
-    sensor: Sensor, k: int, scan: Scan | None, free: Fit, previous: SensedFrame | None, before: tuple[FloatArray, ...] | None
+    sensor: Sensor, k: int, scan: Scan | None, free: Fit, before: tuple[FloatArray, ...] | None
 ) -> tuple[Scan | None, Fit]:
     """Return the scan with robot and surroundings apart, and the fit without forces to what is the robot's.
 
@@ -65,16 +65,22 @@ def told_apart(
     """
     if scan is None or scan.told:
         return scan, free
-    fit = free
-    if not said_free(sensor, k) and not len(sensor.places):
-        if previous is not None and previous.fit.touches:
-            fit = _better(
-                free, _try(sensor, k, scan, previous.fit.touches, free, (previous.fit.state, previous.fit.forces), before)
-            )
-        fit = _with_hidden(sensor, k, scan, fit, free, before)
-    surface = Surface(fit.state.positions, sensor.surface.triangles)
-    scan = parted(scan, surface, sensor.calibration.poses, sensor.knowledge.noises, reach=REACH * sensor.size)
+    every, state = scan, free.state
+    touched = not said_free(sensor, k) and not len(sensor.places)
+    for _ in range(ROUNDS if touched else 0):  # what is taken for the robot at first still holds some of what touches it
+        fit = _with_hidden(sensor, k, scan, free, free, before)
+        state = fit.state
+        if not fit.touches:
+            break
+        scan = _parted(sensor, every, state)
+        free = no_forces(sensor, k, scan, free.state)
+    scan = _parted(sensor, every, state)
     return scan, no_forces(sensor, k, scan, free.state)
+
+
+def _parted(sensor: Sensor, scan: Scan, state: Equilibrium) -> Scan:
+    surface = Surface(state.positions, sensor.surface.triangles)
+    return parted(scan, surface, sensor.calibration.poses, sensor.knowledge.noises, reach=REACH * sensor.size)
 
 
 def _with_hidden(sensor: Sensor, k: int, scan: Scan, fit: Fit, free: Fit, before: tuple[FloatArray, ...] | None) -> Fit:

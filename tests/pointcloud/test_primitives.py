@@ -1,0 +1,70 @@
+"""Objects seen from one side are completed, and touch where the completed one does."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from femsense.pointcloud.primitives import find_shapes, fit_shape
+
+CAMERA = np.array([0.0, 0.0, 0.5])
+NOISE = 5e-4
+
+
+def seen(points: np.ndarray, normals: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the points that look at the camera with noise along their rays, its standard deviation and their origins."""
+    facing = np.einsum("pc,pc->p", normals, CAMERA - points) > 0
+    ray = points[facing] - CAMERA
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    noisy = points[facing] + NOISE * rng.normal(size=(len(ray), 1)) * ray
+    return noisy, np.full(len(noisy), NOISE), np.tile(CAMERA, (len(noisy), 1))
+
+
+def ball(radius: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    normals = rng.normal(size=(600, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return radius * normals, normals
+
+
+def rod(radius: float, half: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    angle, along = rng.uniform(0, 2 * np.pi, 900), rng.uniform(-half, half, 900)
+    normals = np.column_stack([np.zeros(900), np.cos(angle), np.sin(angle)])
+    return radius * normals + along[:, None] * [1.0, 0, 0], normals
+
+
+def test_a_ball_is_completed_from_the_half_that_is_seen():
+    points, std, origins = seen(*ball(0.01, np.random.default_rng(1)), np.random.default_rng(2))
+    shape = fit_shape(points, std, origins)
+    assert shape.kind == "sphere"
+    assert np.linalg.norm(shape.center) < 5e-4
+    assert abs(shape.radius - 0.01) < 5e-4
+    wall = np.column_stack([np.full(41, 0.01), np.zeros(41), np.linspace(-0.01, 0.01, 41)])  # touched at the side, at z = 0
+    assert abs(wall[np.argmin(shape.distance(wall)), 2]) < 1e-3
+    visible = np.linalg.norm(wall[:, None] - points[None], axis=2).min(axis=1)
+    assert wall[np.argmin(visible), 2] > 1e-3  # the closest visible points lie towards the camera
+
+
+def test_a_rod_is_a_cylinder_whose_ends_are_where_it_was_seen():
+    points, std, origins = seen(*rod(0.004, 0.03, np.random.default_rng(3)), np.random.default_rng(4))
+    shape = fit_shape(points, std, origins)
+    assert shape.kind == "cylinder"
+    assert abs(shape.radius - 0.004) < 6e-4
+    assert abs(abs(shape.axes[0] @ [1.0, 0, 0]) - 1.0) < 1e-2
+    assert shape.distance(np.array([[0.05, 0.0, 0.0]]))[0] > 0.015
+
+
+def test_a_plate_is_flat_and_ends():
+    rng = np.random.default_rng(5)
+    points = np.column_stack([rng.uniform(-0.02, 0.02, (400, 2)), np.zeros(400)])
+    shape = fit_shape(*seen(points, np.tile([0.0, 0, 1], (400, 1)), rng))
+    assert shape.kind == "plate"
+    below, beside = shape.distance(np.array([[0.0, 0, -0.01], [0.06, 0, 0]]))
+    assert abs(below + 0.01) < 1e-3
+    assert 0.025 < beside < 0.045
+
+
+def test_a_rod_that_passes_behind_something_is_one_object():
+    points, std, origins = seen(*rod(0.004, 0.03, np.random.default_rng(6)), np.random.default_rng(7))
+    apart = np.abs(points[:, 0]) > 0.012
+    shapes = find_shapes(points[apart], std[apart], origins[apart], np.abs(points[apart, 0]), local_m=0.05)
+    assert len(shapes) == 1
+    assert shapes[0].kind == "cylinder"
