@@ -82,7 +82,9 @@ def run_inputs(
     """
     own = None if calibration is None else {"sha256": _text_hash(json_text(calibration_document(calibration)))}
     places = None if at is None else np.asarray(at, dtype=np.float64).reshape(-1, 3).tolist()
-    said = {"at": places, **asdict(options or SensingOptions())}
+    usual = asdict(SensingOptions())
+    chosen = {name: value for name, value in asdict(options or SensingOptions()).items() if value != usual[name]}
+    said = {"at": places, **chosen}
     return {"robot": robot_input(robot), "recording": recording_input(recording), "calibration": own, "options": said}
 
 
