@@ -169,6 +169,9 @@ def parted(scan: Scan, surface: Surface, poses: Sequence[FloatArray], noises: Se
     rows = ray_rows(scan, surface, poses, noises, reach=reach)
     on = np.zeros(len(scan.view), dtype=bool)
     on[rows.hits.index] = np.abs(rows.residual) < OFF * rows.std
+    missed = np.setdiff1d(np.arange(len(on)), rows.hits.index)  # grazing rays, and those beside a silhouette
+    gap = np.abs(surface.closest(scan.points(poses)[missed])[1])
+    on[missed] = gap < 0.5 * OFF * scan.ray_std(noises)[missed]
     if not on.any():
         return scan
     tree = cKDTree(scan.points(poses))

@@ -37,7 +37,7 @@ from femsense.report.drawing import (
     whole_numbers,
 )
 from femsense.report.page import Chapter, Html, panels, paragraph, section, table, tiles, together
-from femsense.sensing.run_files import CONTACT_COLUMNS, FRAME_COLUMNS, RUN_FORMAT, read_states
+from femsense.sensing.run_files import CONTACT_COLUMNS, FRAME_COLUMNS, MORE_CONTACT_COLUMNS, RUN_FORMAT, read_states
 
 ROWS = 150
 """So many contacts are listed one by one."""
@@ -114,7 +114,7 @@ def run_chapter(file: Path, title: str) -> Chapter:
 
 
 def _contacts(file: Path) -> ContactTable:
-    table_ = read_csv(file, required=CONTACT_COLUMNS)
+    table_ = read_csv(file, required=CONTACT_COLUMNS, optional=MORE_CONTACT_COLUMNS)
     values = table_.numbers(("time_s", *CONTACT_COLUMNS[3:14]), empty_is_nan=True)
     return ContactTable(
         table_.integers("frame"),

@@ -9,6 +9,8 @@ from femsense.sensing.nuisance import misfit, sag_at
 from femsense.sensing.types import Fit, SensedFrame, Sensor
 
 OK = "ok"
+UNSETTLED = 0.5
+"""Forces that were still changing are not believed where more than this share of the residual is left, unless that is noise."""
 
 
 def status_of(sensor: Sensor, fit: Fit, free: Fit) -> str:
@@ -17,7 +19,9 @@ def status_of(sensor: Sensor, fit: Fit, free: Fit) -> str:
     Not to be trusted is a residual far above what the free frames leave, with or without contacts; a force that is less than its standard
     deviation while the frame is not explained; and forces that were still changing.
     """
-    if fit.cost > free.cost:
+    if fit.touches and not fit.still and fit.rows.rms > UNSETTLED * free.rows.rms + 3.0 * float(np.median(free.rows.std)):
+        return f"the forces have not settled: {1e3 * fit.rows.rms:.2f} mm are left of {1e3 * free.rows.rms:.2f}"
+    if fit.cost > free.cost or (fit.touches and fit.rows.rms > 1.05 * free.rows.rms + 2.0 * float(np.median(free.rows.std))):
         return "the residual is larger with the forces than without them"
     left = left_over(sensor, fit)
     if left > sensor.knowledge.misfit_limit:

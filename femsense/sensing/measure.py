@@ -69,7 +69,9 @@ def _marker_rows(sensor: Sensor, k: int, state: Equilibrium) -> Rows:
     marker = _as_seen(sensor, k, state, measured, marker, view)
     tie = robot.markers[marker]
     residual = measured - tie.positions(state.positions)
-    way = np.linalg.norm(tie.positions(state.positions) - robot.marker_points[marker], axis=1)
+    way = np.linalg.norm(
+        measured - robot.marker_points[marker], axis=1
+    )  # of the marker, so that a state that runs away gains nothing
     noise = sensor.options.marker_std_m or _marker_std(sensor.calibration)
     std = np.repeat(np.hypot(noise, sensor.options.marker_model_std * way), 3)
     seated = np.array([robot.marker_names[m] in sensor.calibration.placements_m for m in marker])

@@ -23,6 +23,8 @@ FREE_FRAMES = 12
 BIAS_STEPS = np.concatenate([[0.0], 1e-5 * 2.0 ** np.arange(9)])
 SHARE_STEPS = np.concatenate([[0.0], 0.00125 * 2.0 ** np.arange(7)])
 """Sizes of the shared errors that are tried: 0.01 … 2.6 mm, and 0.1 … 8 % of the way."""
+FAR_OFF = 9.0
+"""Misfit per row that says that a frame is not explained where no free frame tells more: three standard deviations everywhere."""
 LIKELY_GAIN = 13.5
 """Log-evidence gain that noise alone gives once in 1000 frames: χ² with three degrees at some 50 places that differ."""
 
@@ -53,7 +55,7 @@ def first_knowledge(
         common_mean=freeze(np.zeros(v + 1)),
         common_root=freeze(root),
         gain_limit=LIKELY_GAIN,
-        misfit_limit=np.inf,
+        misfit_limit=FAR_OFF,
     )
 
 

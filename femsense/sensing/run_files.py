@@ -46,6 +46,9 @@ CONTACT_COLUMNS = (
     "force_n",
     "std_n",
     "source",
+)
+"""What every run says of a contact."""
+MORE_CONTACT_COLUMNS = (
     "track",
     "x_std_m",
     "y_std_m",
@@ -79,7 +82,9 @@ def run_inputs(
     """
     own = None if calibration is None else {"sha256": _text_hash(json_text(calibration_document(calibration)))}
     places = None if at is None else np.asarray(at, dtype=np.float64).reshape(-1, 3).tolist()
-    said = {"at": places, **asdict(options or SensingOptions())}
+    usual = asdict(SensingOptions())
+    chosen = {name: value for name, value in asdict(options or SensingOptions()).items() if value != usual[name]}
+    said = {"at": places, **chosen}
     return {"robot": robot_input(robot), "recording": recording_input(recording), "calibration": own, "options": said}
 
 
@@ -113,7 +118,9 @@ def write_run(
     with _results_folder(folder, "run.json") as part:
         if calibration is not None:
             write_calibration(calibration, part / "calibration.json")
-        write_csv(part / "contacts.csv", CONTACT_COLUMNS, [_contact_row(contact) for contact in run.contacts])
+        write_csv(
+            part / "contacts.csv", CONTACT_COLUMNS + MORE_CONTACT_COLUMNS, [_contact_row(contact) for contact in run.contacts]
+        )
         cables, chambers = run.robot.body.cable_names, run.robot.body.chamber_names
         columns = [*FRAME_COLUMNS, *(f"tension_{name}_n" for name in cables), *(f"pressure_{name}_pa" for name in chambers)]
         write_csv(part / "frames.csv", columns, [_frame_row(frame, cables, chambers) for frame in run.frames])
@@ -236,10 +243,12 @@ def _robot_of_run(document: Mapping[str, Any], root: Path) -> Robot:
 def _read_contacts(file: Path) -> tuple[ContactForce, ...]:
     from femsense.sensing.types import ContactForce
 
-    table = read_csv(file, required=CONTACT_COLUMNS)
-    frames, contacts, tracks = (table.integers(name) for name in ("frame", "contact", "track"))
-    numbers = ("time_s", *CONTACT_COLUMNS[3:14], *CONTACT_COLUMNS[16:])
-    values, sources = table.numbers(numbers, empty_is_nan=True), table.text("source")
+    table = read_csv(file, required=CONTACT_COLUMNS, optional=MORE_CONTACT_COLUMNS)
+    more = all(name in table.columns for name in MORE_CONTACT_COLUMNS)
+    frames, contacts = table.integers("frame"), table.integers("contact")
+    tracks = table.integers("track") if more else contacts
+    values, sources = table.numbers(("time_s", *CONTACT_COLUMNS[3:14]), empty_is_nan=True), table.text("source")
+    spread = table.numbers(MORE_CONTACT_COLUMNS[1:], empty_is_nan=True) if more else np.full((len(values), 7), np.nan)
     return tuple(
         ContactForce(
             frame=int(frames[i]),
@@ -252,11 +261,11 @@ def _read_contacts(file: Path) -> tuple[ContactForce, ...]:
             std_n=float(row[11]),
             source=sources[i],
             track=int(tracks[i]),
-            position_std_m=freeze(row[12:15]),
-            radius_m=float(row[15]),
-            force_std_n_xyz=freeze(row[16:19]),
+            position_std_m=freeze(std[:3]),
+            radius_m=float(std[3]),
+            force_std_n_xyz=freeze(std[4:]),
         )
-        for i, row in enumerate(values)
+        for i, (row, std) in enumerate(zip(values, spread))
     )
 
 
