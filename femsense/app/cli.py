@@ -506,7 +506,7 @@ def reach(
     ] = None,
     json: Json = False,
 ) -> Answer:
-    """Find the cable inputs or pressures that bring points of the body to places."""
+    """Find the inputs that bring points of the body to places."""
     from femsense.app.reach_command import reach_targets
 
     document, text, reached = reach_targets(

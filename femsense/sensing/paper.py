@@ -56,7 +56,7 @@ def sense_as_published(sensor: Sensor, k: int, previous: SensedFrame | None) -> 
     report = FrameReport(
         number, stamp, "ok", len(contacts), rows.count, rows.rms, after.rms, ms, dict(state.tension), dict(state.pressure)
     )
-    return SensedFrame(fit, free, report, contacts)
+    return SensedFrame(fit.touches, fit.state, fit.forces, free, report, contacts)
 
 
 def _segmented(sensor: Sensor, k: int, state: Equilibrium) -> tuple[PointCloud, PointCloud]:

@@ -124,7 +124,7 @@ def sense_frame(sensor: Sensor, k: int, previous: SensedFrame | None) -> SensedF
         dict(fit.state.pressure),
         clock.stages,
     )
-    return SensedFrame(fit, alone, report, contacts)
+    return SensedFrame(fit.touches, fit.state, fit.forces, alone, report, contacts)
 
 
 class _Clock:

@@ -49,6 +49,8 @@ def explain(
     before: tuple[FloatArray, ...] | None,
 ) -> Fit:
     """Return the contacts and forces that explain frame k; those that do not make the misfit smaller are left out."""
+    if not touches and (scan is None or len(sensor.places)):
+        return free
     if scan is None or len(sensor.places):
         return _better(free, fit_forces(sensor, k, scan, touches, free, start=_start(previous, touches), before=before))
     if said_free(sensor, k):
@@ -181,8 +183,8 @@ def _with_objects(
 ) -> Fit:
     """Return the fit with what objects touch, their places found again in the state that the forces make."""
     fit = free
-    if previous is not None and previous.fit.touches:  # what held in the frame before is a start
-        again = _try(sensor, k, scan, previous.fit.touches, free, (previous.fit.state, previous.fit.forces), before)
+    if previous is not None and previous.touches:  # what held in the frame before is a start
+        again = _try(sensor, k, scan, previous.touches, free, (previous.state, previous.forces), before)
         fit = fit if again is None or left_over(sensor, again) > sensor.knowledge.misfit_limit else _better(fit, again)
     for _ in range(ROUNDS if shapes else 0):
         found = object_touches(sensor, shapes, fit.state)
@@ -243,9 +245,9 @@ def _better(free: Fit, fit: Fit | None) -> Fit:
 
 
 def _start(previous: SensedFrame | None, touches: Sequence[Touch]) -> tuple[Equilibrium, FloatArray] | None:
-    if previous is None or len(previous.fit.touches) != len(touches):
+    if previous is None or len(previous.touches) != len(touches):
         return None
-    return previous.fit.state, previous.fit.forces
+    return previous.state, previous.forces
 
 
 def _start_of(fit: Fit, touches: Sequence[Touch]) -> tuple[Equilibrium, FloatArray] | None:

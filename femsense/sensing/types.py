@@ -160,17 +160,17 @@ class Fit:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SensedFrame:
-    """One frame, sensed."""
+    """One frame, sensed, as the next one starts from it."""
 
-    fit: Fit
+    touches: tuple[Touch, ...]
+    state: Equilibrium
+    """With the forces."""
+    forces: FloatArray
+    """[N], shape (m, 3)."""
     free_state: Equilibrium
     """Under the inputs alone."""
     report: FrameReport
     contacts: tuple[ContactForce, ...]
-
-    @property
-    def state(self) -> Equilibrium:
-        return self.fit.state
 
 
 @dataclass(eq=False, slots=True)

@@ -73,8 +73,8 @@ def test_blas_takes_one_thread_while_ours_work_and_has_its_own_back_afterwards(c
 def test_a_factor_is_made_with_one_thread_of_blas(monkeypatch):
     """Two of them wait for each other: twice as long where another program keeps a core busy."""
     seen = []
-    whole = cholesky._factorise
-    monkeypatch.setattr(cholesky, "_factorise", lambda *given: seen.append(blas_threads()) or whole(*given))
+    whole = cholesky.factorise
+    monkeypatch.setattr(cholesky, "factorise", lambda *given: seen.append(blas_threads()) or whole(*given))
     body = robot().body
     assert solve_equilibrium(body, tension={body.cable_names[0]: 1.0}).converged
     assert set(seen) == {1} and blas_threads() == 2

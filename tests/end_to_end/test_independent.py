@@ -10,7 +10,7 @@ import pytest
 from helpers import ROOT
 
 skfem = pytest.importorskip("skfem")
-sys.path.insert(0, str(ROOT / "benchmarks"))
+sys.path.append(str(ROOT / "benchmarks"))
 
 from independent.cases import Case, Touch  # noqa: E402
 from independent.equilibrium import Problem  # noqa: E402

@@ -153,7 +153,7 @@ def test_a_model_that_lacks_nothing_is_told_so():
         ("N/m", "stiffness_n_m"),
         ("N m/rad", "rotation_stiffness_nm_rad"),
     }
-    assert all(1e-3 < value < 1e6 for value in clamp["smallest"].values())
+    assert all(1e-3 < value < 1e6 for value in clamp.smallest.values())
 
 
 def test_a_second_round_on_the_improved_robot_finds_nothing():

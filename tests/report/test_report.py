@@ -356,6 +356,7 @@ def write_loop_folder(folder: Path, *, robot: bool = True, **overrides: Any) -> 
 
 
 CONTACT_HEADER = "frame,time_s,contact,x_m,y_m,z_m,nx,ny,nz,fx_n,fy_n,fz_n,force_n,std_n,source"
+CONTACT_HEADER += ",track,x_std_m,y_std_m,z_std_m,radius_m,fx_std_n,fy_std_n,fz_std_n"
 FRAME_HEADER = "frame,time_s,status,contacts,matched,rms_before_m,rms_after_m,ms,tension_top_n,tension_side_n"
 
 
@@ -372,7 +373,7 @@ def write_run_folder(
         touched = [] if lost else [0] if k < 8 else [0, 1] if k < 20 or k == 25 else []
         for c in touched:
             contacts.append(
-                f"{k},{0.1 * k},{c},{0.09 - 0.04 * c},0.015,0.03,0,0,1,0.02,0,{-force / (c + 1)},{force / (c + 1)},{'' if k in (12, 25) else 0.05 * scale},cloud"
+                f"{k},{0.1 * k},{c},{0.09 - 0.04 * c},0.015,0.03,0,0,1,0.02,0,{-force / (c + 1)},{force / (c + 1)},{'' if k in (12, 25) else 0.05 * scale},cloud,{c},1e-3,1e-3,1e-3,5e-3,0.02,0.02,0.05"
             )
         lines.append(
             f'{k},{0.1 * k},"{reason if lost else "ok"}",{len(touched)},{0 if lost else 12},'
@@ -793,7 +794,7 @@ def test_a_run_without_contacts(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("force", "pictures"), [("0,0,0,0,", 4), (",,,,", 3)], ids=["zero", "unknown"])
 def test_a_force_that_is_nothing(tmp_path: Path, force: str, pictures: int) -> None:
     (write_run_folder(tmp_path, frames=2) / "contacts.csv").write_text(
-        f"{CONTACT_HEADER}\n0,0,0,0,0,0,0,0,1,{force},given\n", encoding="utf-8"
+        f"{CONTACT_HEADER}\n0,0,0,0,0,0,0,0,1,{force},given,0,1e-3,1e-3,1e-3,5e-3,0.02,0.02,0.05\n", encoding="utf-8"
     )
     assert len(report(tmp_path).all("img")) == pictures
 
@@ -809,7 +810,10 @@ def test_a_run_in_which_every_frame_failed(tmp_path: Path) -> None:
 def test_a_long_run_stays_small(tmp_path: Path) -> None:
     page = report(write_run_folder(tmp_path, frames=5000))
     assert "5000 frames" in page.text
-    rows = "".join(f"{k},{0.1 * k},{k % 12},0,0,0,0,0,1,0,0,1,{1 + k % 12},0.1,cloud\n" for k in range(5000))
+    rows = "".join(
+        f"{k},{0.1 * k},{k % 12},0,0,0,0,0,1,0,0,1,{1 + k % 12},0.1,cloud,0,1e-3,1e-3,1e-3,5e-3,0.02,0.02,0.05\n"
+        for k in range(5000)
+    )
     (tmp_path / "contacts.csv").write_text(f"{CONTACT_HEADER}\n{rows}", encoding="utf-8")
     page = report(tmp_path)
     assert "The first 150 of 5000; all of them are in contacts.csv." in page.text and "The 8 strongest of 12." in page.text

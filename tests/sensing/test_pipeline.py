@@ -35,10 +35,12 @@ def touched() -> tuple[Recording, list[np.ndarray]]:
 def test_a_force_at_a_given_place_comes_out_of_markers(touched):
     recording, _ = touched
     run = estimate(arm(), recording, calibrate(arm(), recording), at=TIP)
-    for contact, true in zip(run.contacts, (0 * FORCE, 0 * FORCE, FORCE, 2 * FORCE)):
+    assert {2, 3} <= {contact.frame for contact in run.contacts}
+    for contact in run.contacts:
+        true = (0 * FORCE, 0 * FORCE, FORCE, 2 * FORCE)[contact.frame]
         off = contact.force_n_xyz - true
         assert np.linalg.norm(off[1:]) < 0.01 + 0.05 * np.linalg.norm(true)
-        assert abs(off[0]) < 0.05  # along itself the arm is stiff: its markers tell less of this part
+        assert abs(off[0]) < 3 * contact.force_std_n_xyz[0]  # along itself the arm is stiff: its markers tell less of this part
         assert np.linalg.norm(off) < 3 * contact.std_n
         assert contact.source == "given"
     assert all(report.status == "ok" for report in run.frames)
@@ -50,7 +52,7 @@ def test_a_force_along_the_arm_has_its_size_and_its_sign(along: float):
     true = np.array([along, 0.1, -0.2])
     recording, _ = record(INPUTS, noise=2e-5, forces={3: (TIP, true)})
     recording = replace(recording, free=np.array([True, True, True, False]))
-    contact = estimate(arm(), recording, calibrate(arm(), recording), at=TIP).contacts[3]
+    contact = estimate(arm(), recording, calibrate(arm(), recording), at=TIP).contacts[-1]
     off = contact.force_n_xyz - true
     assert abs(off[0]) < 0.25 * abs(along) and np.linalg.norm(off[1:]) < 0.02
     assert np.linalg.norm(off) < 3 * contact.std_n
@@ -59,7 +61,7 @@ def test_a_force_along_the_arm_has_its_size_and_its_sign(along: float):
 def test_three_standard_deviations_hold_the_truth(touched):
     recording, _ = touched
     run = estimate(arm(), recording, calibrate(arm(), recording), at=TIP)
-    for contact, true in zip(run.contacts[2:], (FORCE, 2 * FORCE)):
+    for contact, true in zip(run.contacts[-2:], (FORCE, 2 * FORCE)):
         assert abs(contact.force_n - np.linalg.norm(true)) < 3 * contact.std_n
         assert contact.std_n < 0.15 * np.linalg.norm(true)
 

@@ -48,7 +48,8 @@ def test_the_files_of_a_run_are_those_of_the_contract(tmp_path: Path, robot: Rob
     folder = write_run(make_run(robot), tmp_path / "run", inputs=run_inputs(robot, recording, None, at=[0.1, 0, 0]))
     with (folder / "contacts.csv").open(newline="") as stream:
         rows = list(csv.reader(stream))
-    assert ",".join(rows[0]) == "frame,time_s,contact,x_m,y_m,z_m,nx,ny,nz,fx_n,fy_n,fz_n,force_n,std_n,source"
+    first = "frame,time_s,contact,x_m,y_m,z_m,nx,ny,nz,fx_n,fy_n,fz_n,force_n,std_n,source"
+    assert ",".join(rows[0]) == first + ",track,x_std_m,y_std_m,z_std_m,radius_m,fx_std_n,fy_std_n,fz_std_n"
     assert [row[13] for row in rows[1:]] == ["0.1", "", "0.3"]
     with (folder / "frames.csv").open(newline="") as stream:
         rows = list(csv.reader(stream))

@@ -20,7 +20,7 @@ from femsense.fem.body_parts import Cable
 from femsense.fem.cables import bend_angles, cable_forces, cable_length, rub
 from femsense.fem.cavities import find_chamber
 from femsense.fem.chambers import chamber_volume, volume_gradient
-from femsense.fem.equilibrium import ADVICE, Equilibrium, solve_equilibrium
+from femsense.fem.equilibrium import ADVICE, Equilibrium, SolveOptions, solve_equilibrium
 from femsense.fem.mesh import TetMesh, to_quadratic
 
 SIZE = np.array([0.1, 0.03, 0.03])
@@ -140,7 +140,9 @@ def _maker(kind: str, number: int, small: bool) -> Solve:
     def solve() -> tuple[BodyModel, Equilibrium]:
         rng = np.random.default_rng([number, 7])
         body, given = KINDS[kind](rng, small)
-        state = solve_equilibrium(body, **given)
+        memory = {key: given[key] for key in ("before", "reuse_factor") if key in given}
+        drive = {key: value for key, value in given.items() if key not in memory}
+        state = solve_equilibrium(body, **drive, options=SolveOptions(**memory))
         if state.converged:
             check_cables(given, Outcome(state.status, state, body))
         return body, state

@@ -75,7 +75,7 @@ def test_a_fit_that_ends_on_its_way_has_the_residual_of_its_end(monkeypatch: pyt
     plain = joint_fit.gauss_newton
 
     def tries_further(evaluate: Any, theta: np.ndarray, **more: Any) -> Any:
-        fit = plain(evaluate, theta, **{**more, "trusted": 1e9})
+        fit = plain(evaluate, theta, **{**more, "options": replace(more["options"], trusted=1e9)})
         evaluate(fit.theta + 1e-3, False)  # a step that is not taken
         return replace(fit, own=False)
 
