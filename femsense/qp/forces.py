@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from femsense.core.arrays import BoolArray, FloatArray, freeze
 from femsense.core.errors import InputError
-from femsense.qp.problem import FrictionCone, Problem, build_force_problem, prior_precision
+from femsense.qp.problem import ForceOptions, Problem, build_force_problem, prior_precision
 from femsense.qp.solve import Solution, solve
 
 _BLIND = 1e-12  # share of the largest curvature below which a direction counts as unseen
@@ -55,19 +55,7 @@ def estimate_forces(
     target: npt.ArrayLike,
     *,
     std: npt.ArrayLike | None = None,
-    cable_inputs: npt.ArrayLike | None = None,
-    cable_displacements: npt.ArrayLike | None = None,
-    W_aa: npt.ArrayLike | None = None,
-    W_af: npt.ArrayLike | None = None,
-    delta_a_free: npt.ArrayLike | None = None,
-    force_lower: npt.ArrayLike | None = None,
-    force_upper: npt.ArrayLike | None = None,
-    tension_lower: npt.ArrayLike | None = None,
-    tension_upper: npt.ArrayLike | None = None,
-    friction_cone: FrictionCone | None = None,
-    ridge: float = 0.0,
-    nuisance: npt.ArrayLike | None = None,
-    nuisance_std: npt.ArrayLike | None = None,
+    options: ForceOptions | None = None,
     inflate: bool = False,
     solver: str = "daqp",
     tolerance: float = 1e-7,
@@ -83,7 +71,7 @@ def estimate_forces(
         W_forces, W_cables, free, target: see `build_force_problem`.
         std: standard deviation of each row [m]: a number or (r,), > 0; inf leaves a row out. Where it is not given, all rows
             count alike and their scatter is estimated from the residual.
-        cable_inputs … nuisance_std: see `build_force_problem`; ridge in 1/N² with std given.
+        options: inputs, bounds and priors; ridge in 1/N² with std given.
         inflate: multiply the covariance by reduced_chi2 where that is above 1 (std too small by an unknown common factor).
         solver, tolerance: see `solve`.
     Returns:
@@ -91,39 +79,21 @@ def estimate_forces(
     Raises:
         InputError: shapes that do not fit, or standard deviations that are not positive.
     """
+    known = options or ForceOptions()
     rows = np.shape(np.asarray(free))[0] if np.ndim(free) else 0
-    if std is None and (nuisance is not None or ridge > 0.0):
+    if std is None and (known.nuisance is not None or known.ridge > 0.0):
         raise InputError("priors need the scale of the noise", where="std", found="nuisance or ridge without std", expected="std")
     weights = _row_weights(std, rows)
-    problem = build_force_problem(
-        W_forces,
-        W_cables,
-        free,
-        target,
-        weights=weights,
-        cable_inputs=cable_inputs,
-        cable_displacements=cable_displacements,
-        W_aa=W_aa,
-        W_af=W_af,
-        delta_a_free=delta_a_free,
-        force_lower=force_lower,
-        force_upper=force_upper,
-        tension_lower=tension_lower,
-        tension_upper=tension_upper,
-        friction_cone=friction_cone,
-        ridge=ridge,
-        nuisance=nuisance,
-        nuisance_std=nuisance_std,
-    )
+    problem = build_force_problem(W_forces, W_cables, free, target, weights=weights, options=known)
     solution = solve(problem, solver=solver, tolerance=tolerance)
-    blocks = [np.asarray(block, dtype=np.float64) for block in (W_cables, W_forces, nuisance) if block is not None]
+    blocks = [np.asarray(block, dtype=np.float64) for block in (W_cables, W_forces, known.nuisance) if block is not None]
     W = np.hstack(blocks)
     tensions = 0 if W_cables is None else np.shape(W_cables)[1]
     forces = slice(tensions, tensions + np.shape(W_forces)[1])
     if solution.x is None:
         return _no_estimate(solution, problem.size, forces, len(W))
     residual = W @ solution.x + np.asarray(free, dtype=np.float64) - np.asarray(target, dtype=np.float64)
-    prior = np.concatenate([np.zeros(forces.stop), prior_precision(nuisance_std, problem.size - forces.stop)])
+    prior = np.concatenate([np.zeros(forces.stop), prior_precision(known.nuisance_std, problem.size - forces.stop)])
     Z = _free_directions(problem, solution)
     chi2 = _reduced_chi2(W, weights, residual, prior, solution.x, Z)
     factor = chi2 if std is None else max(chi2, 1.0) if inflate and np.isfinite(chi2) else 1.0

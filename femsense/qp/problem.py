@@ -115,6 +115,36 @@ class FrictionCone:
         object.__setattr__(self, "normals", freeze(normals / np.linalg.norm(normals, axis=1, keepdims=True)))
 
 
+@dataclass(frozen=True, eq=False, slots=True)
+class ForceOptions:
+    """What is known of the unknowns of the force problem: inputs, bounds and priors."""
+
+    cable_inputs: npt.ArrayLike | None = None
+    """Measured tensions [N], shape (a,); with neither these nor displacements the tensions are unknowns."""
+    cable_displacements: npt.ArrayLike | None = None
+    """Measured displacements [m], shape (a,); they need W_aa, W_af and delta_a_free."""
+    W_aa: npt.ArrayLike | None = None
+    """Displacement of the cables per tension [m/N], shape (a, a)."""
+    W_af: npt.ArrayLike | None = None
+    """Displacement of the cables per force [m/N], shape (a, f)."""
+    delta_a_free: npt.ArrayLike | None = None
+    """Displacement of the cables without these forces [m], shape (a,)."""
+    force_lower: npt.ArrayLike | None = None
+    """Bounds of the forces [N]: a number, (f,), or (f/3, 3)."""
+    force_upper: npt.ArrayLike | None = None
+    tension_lower: npt.ArrayLike | None = None
+    """Bounds of the tensions [N]: a number or (a,)."""
+    tension_upper: npt.ArrayLike | None = None
+    friction_cone: FrictionCone | None = None
+    """For forces in three components (f = 3 n): the pyramid of each of the n contacts."""
+    ridge: float = 0.0
+    """Price of force [objective / N²]: 1/σ² for forces expected to be about σ."""
+    nuisance: npt.ArrayLike | None = None
+    """Further columns that may move the rows, shape (r, k); their factors are unknowns."""
+    nuisance_std: npt.ArrayLike | None = None
+    """Standard deviations of these factors, shape (k,); inf leaves them free; 1 where not given."""
+
+
 def build_force_problem(
     W_forces: npt.ArrayLike,
     W_cables: npt.ArrayLike | None,
@@ -122,19 +152,7 @@ def build_force_problem(
     target: npt.ArrayLike,
     *,
     weights: npt.ArrayLike | None = None,
-    cable_inputs: npt.ArrayLike | None = None,
-    cable_displacements: npt.ArrayLike | None = None,
-    W_aa: npt.ArrayLike | None = None,
-    W_af: npt.ArrayLike | None = None,
-    delta_a_free: npt.ArrayLike | None = None,
-    force_lower: npt.ArrayLike | None = None,
-    force_upper: npt.ArrayLike | None = None,
-    tension_lower: npt.ArrayLike | None = None,
-    tension_upper: npt.ArrayLike | None = None,
-    friction_cone: FrictionCone | None = None,
-    ridge: float = 0.0,
-    nuisance: npt.ArrayLike | None = None,
-    nuisance_std: npt.ArrayLike | None = None,
+    options: ForceOptions | None = None,
 ) -> Problem:
     """Return the problem whose answer x = (tensions, forces, nuisance) moves the features to their targets.
 
@@ -147,32 +165,28 @@ def build_force_problem(
         W_cables: the same per cable tension [m/N], shape (r, a); None without cables.
         free, target: displacement or position of each row without these forces, and as observed [m], shape (r,).
         weights: 1 / variance of each row [1/m²], shape (r,); 1 where not given; 0 leaves a row out.
-        cable_inputs: measured tensions [N], shape (a,); with neither these nor displacements the tensions are unknowns.
-        cable_displacements: measured displacements [m], shape (a,); needs W_aa (a, a), W_af (a, f) [m/N], delta_a_free (a,) [m].
-        force_lower, force_upper: bounds of the forces [N]: a number, (f,), or (f/3, 3).
-        tension_lower, tension_upper: bounds of the tensions [N]: a number or (a,).
-        friction_cone: for forces in three components (f = 3 n): the pyramid of each of the n contacts.
-        ridge: price of force [objective / N²]: 1/σ² for forces expected to be about σ.
-        nuisance: further columns that may move the rows, shape (r, k); their factors are unknowns.
-        nuisance_std: their standard deviations, shape (k,); inf leaves them free; 1 where not given.
+        options: inputs, bounds and priors.
     Returns:
         The Problem, in a + f + k unknowns.
     Raises:
         InputError: shapes that do not fit, or (13) and (14) together.
     """
+    o = options or ForceOptions()
     forces = _columns(W_forces, None, "W_forces")
     rows, f = forces.shape
     cables = np.zeros((rows, 0)) if W_cables is None else _columns(W_cables, rows, "W_cables")
-    extra = np.zeros((rows, 0)) if nuisance is None else _columns(nuisance, rows, "nuisance")
+    extra = np.zeros((rows, 0)) if o.nuisance is None else _columns(o.nuisance, rows, "nuisance")
     a, k = cables.shape[1], extra.shape[1]
     W = np.hstack([cables, forces, extra])
     scale = _weights(weights, rows)
     misfit = _sized(free, rows, "free") - _sized(target, rows, "target")
-    prior = np.concatenate([np.zeros(a), np.full(f, _not_negative(ridge, "ridge")), prior_precision(nuisance_std, k)])
-    A, b = _actuation(cable_inputs, cable_displacements, W_aa, W_af, delta_a_free, a, f, k)
-    G = None if friction_cone is None else _pyramid(friction_cone, a, f, k)
-    lower = np.concatenate([_limit(tension_lower, -np.inf, a, "tension_lower"), _limit(force_lower, -np.inf, f, "force_lower")])
-    upper = np.concatenate([_limit(tension_upper, np.inf, a, "tension_upper"), _limit(force_upper, np.inf, f, "force_upper")])
+    prior = np.concatenate([np.zeros(a), np.full(f, _not_negative(o.ridge, "ridge")), prior_precision(o.nuisance_std, k)])
+    A, b = _actuation(o.cable_inputs, o.cable_displacements, o.W_aa, o.W_af, o.delta_a_free, a, f, k)
+    G = None if o.friction_cone is None else _pyramid(o.friction_cone, a, f, k)
+    lower = np.concatenate(
+        [_limit(o.tension_lower, -np.inf, a, "tension_lower"), _limit(o.force_lower, -np.inf, f, "force_lower")]
+    )
+    upper = np.concatenate([_limit(o.tension_upper, np.inf, a, "tension_upper"), _limit(o.force_upper, np.inf, f, "force_upper")])
     return Problem(
         P=W.T @ (scale[:, None] * W) + np.diag(prior),
         q=W.T @ (scale * misfit),

@@ -21,7 +21,7 @@ from femsense.fem.mesh import vertex_normals
 from femsense.model.contact_patch import ContactPatch, closest_surface_point, patch_at
 from femsense.model.variants import solve_frame
 from femsense.qp.forces import estimate_forces
-from femsense.qp.problem import FrictionCone
+from femsense.qp.problem import ForceOptions, FrictionCone
 from femsense.sensing.measure import rows_at
 from femsense.sensing.nuisance import misfit_of, nuisance_columns, robust_std, sag_at
 from femsense.sensing.types import Fit, Rows, Sensor, Touch
@@ -295,7 +295,12 @@ def _bounded(
     A = np.vstack([R[:, :-1], np.hstack([prior, np.zeros((f, R.shape[1] - 1 - f))]), near[0]])
     b = np.concatenate([R[:, -1], np.zeros(f), near[1]])
     estimate = estimate_forces(
-        A[:, :f], None, np.zeros(len(A)), b, std=1.0, nuisance=A[:, f:], nuisance_std=np.ones(A.shape[1] - f), friction_cone=cone
+        A[:, :f],
+        None,
+        np.zeros(len(A)),
+        b,
+        std=1.0,
+        options=ForceOptions(nuisance=A[:, f:], nuisance_std=np.ones(A.shape[1] - f), friction_cone=cone),
     )
     if not np.isfinite(estimate.forces).all():
         raise DataError(f"the force problem has no answer: {estimate.status}")

@@ -24,6 +24,7 @@ from femsense.pointcloud.filters import pass_through, remove_radius_outliers, vo
 from femsense.pointcloud.matching import match_along_normals
 from femsense.pointcloud.segmentation import segment_by_model, segment_robot
 from femsense.qp.forces import estimate_forces
+from femsense.qp.problem import ForceOptions
 from femsense.sensing.forces import free_state, make_touch, solve_with
 from femsense.sensing.tracks import contacts_of
 from femsense.sensing.types import Fit, FrameReport, Rows, SensedFrame, Sensor, Touch
@@ -147,7 +148,9 @@ def _one_step(sensor: Sensor, rows: Rows, touches: list[Touch], state: Equilibri
     inward /= np.maximum(np.linalg.norm(inward, axis=1, keepdims=True), 1e-12)
     basis = np.array([t.patch.spread(d, n) for t, d in zip(touches, inward)])
     W = rows.functional(tangent_at(sensor.robot.body, state).respond(basis))
-    estimate = estimate_forces(W, None, np.zeros(len(W)), rows.residual, std=rows.std, force_lower=np.zeros(m))
+    estimate = estimate_forces(
+        W, None, np.zeros(len(W)), rows.residual, std=rows.std, options=ForceOptions(force_lower=np.zeros(m))
+    )
     if not np.isfinite(estimate.forces).all():
         raise DataError(f"the force problem has no answer: {estimate.status}")
     spread = np.zeros((3 * m, m))

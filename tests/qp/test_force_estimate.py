@@ -8,6 +8,7 @@ from scipy.stats import binom
 
 from femsense.core.errors import InputError
 from femsense.qp import FrictionCone, estimate_forces
+from femsense.qp.problem import ForceOptions
 
 STD = np.array([1e-4, 2e-4, 5e-5])
 
@@ -28,7 +29,9 @@ def body(
 def test_exact_data_give_the_exact_forces() -> None:
     W, W_c, free, std = body()
     force, tension = np.array([1.0, -0.3, 2.0]), np.array([3.0, 4.0])
-    estimate = estimate_forces(W, W_c, free, free + W @ force + W_c @ tension, std=std, cable_inputs=tension)
+    estimate = estimate_forces(
+        W, W_c, free, free + W @ force + W_c @ tension, std=std, options=ForceOptions(cable_inputs=tension)
+    )
     np.testing.assert_allclose(estimate.forces, force, rtol=1e-8)
     np.testing.assert_allclose(estimate.cable_tensions, tension, rtol=1e-12)
     assert estimate.status == "solved" and np.abs(estimate.residual).max() < 1e-10 and estimate.certificate.certificate < 1e-7
@@ -47,11 +50,8 @@ def test_measured_displacements_give_forces_and_tensions() -> None:
         W_c,
         np.zeros(30),
         W @ force + W_c @ tension,
-        std=1e-4,
-        cable_displacements=shift,
-        W_aa=W_aa,
-        W_af=W_af,
-        delta_a_free=start,
+        std=0.0001,
+        options=ForceOptions(cable_displacements=shift, W_aa=W_aa, W_af=W_af, delta_a_free=start),
     )
     np.testing.assert_allclose(estimate.forces, force, atol=1e-7)
     np.testing.assert_allclose(estimate.cable_tensions, tension, atol=1e-7)
@@ -67,11 +67,11 @@ def test_covariance_is_that_of_weighted_least_squares() -> None:
 def test_cables_that_are_measured_leave_their_directions() -> None:
     """(13) takes the columns of the cables out; (14) makes the tensions follow the forces: λ_a = W_aa⁻¹ (… − W_af λ_f)."""
     W, W_c, free, std = body()
-    fixed = estimate_forces(W, W_c, free, free, std=std, cable_inputs=[0.0, 0.0])
+    fixed = estimate_forces(W, W_c, free, free, std=std, options=ForceOptions(cable_inputs=[0.0, 0.0]))
     np.testing.assert_allclose(fixed.covariance, estimate_forces(W, None, free, free, std=std).covariance, rtol=1e-8)
     W_aa, W_af = 1e-3 * np.array([[2.0, 0.5], [0.5, 1.0]]), 1e-3 * np.random.default_rng(7).normal(size=(2, 3))
     parts = {"W_aa": W_aa, "W_af": W_af, "delta_a_free": np.zeros(2)}
-    moved = estimate_forces(W, W_c, free, free, std=std, cable_displacements=[0.0, 0.0], **parts)
+    moved = estimate_forces(W, W_c, free, free, std=std, options=ForceOptions(cable_displacements=[0.0, 0.0], **parts))
     stiffer = W - W_c @ np.linalg.solve(W_aa, W_af)
     np.testing.assert_allclose(moved.covariance, estimate_forces(stiffer, None, free, free, std=std).covariance, rtol=1e-7)
 
@@ -81,13 +81,13 @@ def test_unknown_tensions_and_nuisance_are_marginalised() -> None:
     W, W_c, free, std = body()
     B, tau = 1e-4 * np.random.default_rng(3).normal(size=(30, 2)), np.array([0.5, 2.0])
     target = free + W @ [1.0, 2.0, 3.0] + B @ [0.3, -1.0] + std * np.random.default_rng(4).normal(size=30)
-    estimate = estimate_forces(W, W_c, free, target, std=std, nuisance=B, nuisance_std=tau)
+    estimate = estimate_forces(W, W_c, free, target, std=std, options=ForceOptions(nuisance=B, nuisance_std=tau))
     weight = np.linalg.inv(np.diag(std**2) + B @ np.diag(tau**2) @ B.T)
     both = np.hstack([W_c, W])
     covariance = np.linalg.inv(both.T @ weight @ both)
     np.testing.assert_allclose(estimate.covariance, covariance[2:, 2:], rtol=1e-7)
     np.testing.assert_allclose(estimate.forces, (covariance @ both.T @ weight @ (target - free))[2:], rtol=1e-6)
-    free_one = estimate_forces(W, None, free, target, std=std, nuisance=W_c, nuisance_std=np.inf)
+    free_one = estimate_forces(W, None, free, target, std=std, options=ForceOptions(nuisance=W_c, nuisance_std=np.inf))
     np.testing.assert_allclose(free_one.covariance, estimate_forces(W, W_c, free, target, std=std).covariance, rtol=1e-7)
 
 
@@ -101,7 +101,8 @@ def coverage(width: float, trials: int, **change: object) -> tuple[int, int]:
         noise = std * rng.normal(size=30) + (B @ rng.normal(size=1) if change.get("model_error") else 0.0)
         options = {"nuisance": B, "nuisance_std": 1.0} if change.get("model_error") else {}
         target = free + W @ force + W_c @ tension + noise
-        estimate = estimate_forces(W, W_c, free, target, std=std, cable_inputs=tension, force_lower=0.0, **options)
+        known = ForceOptions(cable_inputs=tension, force_lower=0.0, **options)
+        estimate = estimate_forces(W, W_c, free, target, std=std, options=known)
         hits += abs(estimate.forces[trial % 3] - force[trial % 3]) < width * estimate.std[trial % 3]
     return hits, trials
 
@@ -117,7 +118,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(width: float, share: floa
 def test_a_force_held_by_its_bound_has_no_spread_and_frees_the_others() -> None:
     W, _, free, std = body()
     target = free + W @ np.array([1.0, -0.5, 2.0])
-    estimate = estimate_forces(W, None, free, target, std=std, force_lower=0.0)
+    estimate = estimate_forces(W, None, free, target, std=std, options=ForceOptions(force_lower=0.0))
     assert estimate.held.tolist() == [False, True, False]
     assert estimate.std[1] == 0.0 and estimate.forces[1] == pytest.approx(0.0, abs=1e-12)
     others = estimate_forces(W[:, [0, 2]], None, free, target, std=std)
@@ -128,10 +129,12 @@ def test_a_force_held_by_its_bound_has_no_spread_and_frees_the_others() -> None:
 def test_forces_that_no_row_sees_are_uncertain_without_limit() -> None:
     W, _, free, std = body()
     W[:, 2] = W[:, 1]  # two contacts that look alike
-    estimate = estimate_forces(W, None, free, free + W @ np.array([1.0, 1.0, 1.0]), std=std, force_lower=0.0, force_upper=5.0)
+    estimate = estimate_forces(
+        W, None, free, free + W @ np.array([1.0, 1.0, 1.0]), std=std, options=ForceOptions(force_lower=0.0, force_upper=5.0)
+    )
     assert np.isinf(estimate.std[1:]).all() and np.isfinite(estimate.std[0])
     assert estimate.forces[1:].sum() == pytest.approx(2.0, abs=1e-6)
-    ridged = estimate_forces(W, None, free, free + W @ np.array([1.0, 1.0, 1.0]), std=std, ridge=1.0)
+    ridged = estimate_forces(W, None, free, free + W @ np.array([1.0, 1.0, 1.0]), std=std, options=ForceOptions(ridge=1.0))
     np.testing.assert_allclose(ridged.forces, 1.0, atol=0.02)
     assert np.isfinite(ridged.std).all()
 
@@ -140,7 +143,7 @@ def test_ridge_shrinks_and_its_spread_is_that_of_the_estimator() -> None:
     W, _, free, std = body()
     H = W.T @ np.diag(std**-2.0) @ W
     ridge = float(np.trace(H)) / 3
-    estimate = estimate_forces(W, None, free, free + W @ np.ones(3), std=std, ridge=ridge)
+    estimate = estimate_forces(W, None, free, free + W @ np.ones(3), std=std, options=ForceOptions(ridge=ridge))
     inverse = np.linalg.inv(H + ridge * np.eye(3))
     np.testing.assert_allclose(estimate.covariance, inverse @ H @ inverse, rtol=1e-8)
     assert (np.abs(estimate.forces) < 0.9).all()
@@ -178,7 +181,9 @@ def test_friction_keeps_the_force_in_its_cone() -> None:
     normal, mu = np.array([0.0, 0.0, 1.0]), 0.3
     inside, outside = np.array([0.1, 0.0, -1.0]), np.array([1.0, 0.0, -1.0])
     for force in (inside, outside):
-        estimate = estimate_forces(W, None, free, free + W @ force, std=std, friction_cone=FrictionCone(normal, mu))
+        estimate = estimate_forces(
+            W, None, free, free + W @ force, std=std, options=ForceOptions(friction_cone=FrictionCone(normal, mu))
+        )
         tangential = np.linalg.norm(estimate.forces[:2])
         assert tangential <= -mu * estimate.forces[2] + 1e-9
         if force is inside:
@@ -189,7 +194,7 @@ def test_friction_keeps_the_force_in_its_cone() -> None:
 
 def test_an_infeasible_problem_is_a_status() -> None:
     W, W_c, free, std = body()
-    estimate = estimate_forces(W, W_c, free, free, std=std, cable_inputs=[-1.0, 0.0], tension_lower=0.0)
+    estimate = estimate_forces(W, W_c, free, free, std=std, options=ForceOptions(cable_inputs=[-1.0, 0.0], tension_lower=0.0))
     assert estimate.status == "infeasible" and np.isnan(estimate.forces).all() and np.isinf(estimate.std).all()
     assert np.isnan(estimate.cable_tensions).all() and estimate.residual.shape == (30,)
 
@@ -200,8 +205,10 @@ def test_order_of_rows_and_forces_does_not_matter(seed: int) -> None:
     rng = np.random.default_rng(seed)
     target = free + W @ [1.0, 0.0, -2.0] + std * rng.normal(size=30)
     rows, columns = rng.permutation(30), rng.permutation(3)
-    one = estimate_forces(W, W_c, free, target, std=std, force_lower=0.0)
-    other = estimate_forces(W[rows][:, columns], W_c[rows], free[rows], target[rows], std=std[rows], force_lower=0.0)
+    one = estimate_forces(W, W_c, free, target, std=std, options=ForceOptions(force_lower=0.0))
+    other = estimate_forces(
+        W[rows][:, columns], W_c[rows], free[rows], target[rows], std=std[rows], options=ForceOptions(force_lower=0.0)
+    )
     np.testing.assert_allclose(other.forces, one.forces[columns], atol=1e-8)
     np.testing.assert_allclose(other.covariance, one.covariance[np.ix_(columns, columns)], rtol=1e-6, atol=1e-15)
 
@@ -211,7 +218,7 @@ def test_order_of_rows_and_forces_does_not_matter(seed: int) -> None:
     [
         ({"std": 0.0}, "standard deviations that do not fit"),
         ({"std": np.ones(4)}, "standard deviations that do not fit"),
-        ({"std": None, "ridge": 1.0}, "priors need the scale of the noise"),
+        ({"std": None, "options": ForceOptions(ridge=1.0)}, "priors need the scale of the noise"),
     ],
 )
 def test_bad_arguments_say_so(change: dict[str, object], text: str) -> None:

@@ -7,6 +7,7 @@ import pytest
 
 from femsense.core.errors import InputError
 from femsense.qp import FrictionCone, Multipliers, Problem, build_force_problem, kkt_residuals
+from femsense.qp.problem import ForceOptions
 
 
 def nobody(n: int, m: int = 0, k: int = 0) -> Multipliers:
@@ -26,7 +27,7 @@ def random_parts(seed: int = 0) -> dict[str, np.ndarray]:
 def test_objective_is_the_weighted_misfit_with_its_priors() -> None:
     parts, rng = random_parts(), np.random.default_rng(1)
     weights, extra, tau = rng.uniform(0.5, 2, 12), rng.normal(size=(12, 2)), np.array([0.3, np.inf])
-    problem = build_force_problem(**parts, weights=weights, ridge=0.7, nuisance=extra, nuisance_std=tau)
+    problem = build_force_problem(weights=weights, options=ForceOptions(ridge=0.7, nuisance=extra, nuisance_std=tau), **parts)
 
     def cost(x: np.ndarray) -> float:
         gap = parts["W_cables"] @ x[:2] + parts["W_forces"] @ x[2:5] + extra @ x[5:] + parts["free"] - parts["target"]
@@ -39,18 +40,21 @@ def test_objective_is_the_weighted_misfit_with_its_priors() -> None:
 
 def test_actuator_constraints_are_equations_13_and_14() -> None:
     parts, rng = random_parts(), np.random.default_rng(2)
-    held = build_force_problem(**parts, cable_inputs=[1.0, 2.0])
+    held = build_force_problem(options=ForceOptions(cable_inputs=[1.0, 2.0]), **parts)
     np.testing.assert_array_equal(held.A, np.eye(2, 5))
     np.testing.assert_array_equal(held.b, [1.0, 2.0])
     W_aa, W_af, start = rng.normal(size=(2, 2)), rng.normal(size=(2, 3)), rng.normal(size=2)
-    moved = build_force_problem(**parts, cable_displacements=[0.1, 0.2], W_aa=W_aa, W_af=W_af, delta_a_free=start)
+    moved = build_force_problem(
+        options=ForceOptions(cable_displacements=[0.1, 0.2], W_aa=W_aa, W_af=W_af, delta_a_free=start), **parts
+    )
     x = rng.normal(size=5)
     np.testing.assert_allclose(moved.A @ x - moved.b, W_aa @ x[:2] + W_af @ x[2:] + start - [0.1, 0.2], rtol=1e-12)
 
 
 def test_bounds_reach_their_unknowns() -> None:
     problem = build_force_problem(
-        **random_parts(), force_lower=0.0, force_upper=[[1, 2, 3]], tension_upper=[8, 9], nuisance=np.ones((12, 1))
+        options=ForceOptions(force_lower=0.0, force_upper=[[1, 2, 3]], tension_upper=[8, 9], nuisance=np.ones((12, 1))),
+        **random_parts(),
     )
     np.testing.assert_array_equal(problem.lb, [-np.inf, -np.inf, 0, 0, 0, -np.inf])
     np.testing.assert_array_equal(problem.ub, [8, 9, 1, 2, 3, np.inf])
@@ -62,7 +66,7 @@ def test_the_pyramid_lies_inside_the_cone_and_touches_it(sides: int) -> None:
     normal, mu = np.array([0.3, -0.5, 0.8]), 0.4
     unit = normal / np.linalg.norm(normal)
     parts = random_parts()
-    G = build_force_problem(**parts, friction_cone=FrictionCone(normal, mu, sides)).G[:, 2:]
+    G = build_force_problem(options=ForceOptions(friction_cone=FrictionCone(normal, mu, sides)), **parts).G[:, 2:]
     forces = rng.normal(size=(4000, 3)) - 3 * unit
     pressing = -forces @ unit
     sliding = np.linalg.norm(forces + pressing[:, None] * unit, axis=1)
@@ -73,7 +77,7 @@ def test_the_pyramid_lies_inside_the_cone_and_touches_it(sides: int) -> None:
 
 
 def test_without_friction_only_a_push_along_the_normal_is_left() -> None:
-    G = build_force_problem(**random_parts(), friction_cone=FrictionCone([[0, 0, 1.0]], 0.0)).G[:, 2:]
+    G = build_force_problem(options=ForceOptions(friction_cone=FrictionCone([[0, 0, 1.0]], 0.0)), **random_parts()).G[:, 2:]
     assert (G @ [0, 0, -1.0] <= 1e-15).all()
     for force in ([0, 0, 1.0], [0.1, 0, -1.0], [0, -0.1, -1.0]):
         assert (G @ force > 1e-3).any()
@@ -148,7 +152,9 @@ def test_problems_that_do_not_fit(change: dict[str, object], text: str) -> None:
 )
 def test_force_problems_that_do_not_fit(change: dict[str, object], text: str) -> None:
     with pytest.raises(InputError, match=text):
-        build_force_problem(**{**random_parts(), **change})
+        given = {**random_parts(), **change}
+        known = {name: given.pop(name) for name in set(given) - {"W_forces", "W_cables", "free", "target", "weights"}}
+        build_force_problem(**given, options=ForceOptions(**known))
 
 
 @pytest.mark.parametrize("values", [{"normals": np.zeros((1, 3)), "mu": 0.1}, {"normals": np.eye(3), "mu": -0.1}])
