@@ -82,20 +82,24 @@ def refine_poses(robot: Robot, recording: Recording, calibration: Calibration) -
     size = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
     which = np.concatenate([np.arange(6 * v, 6 * v + 6) for v in moving])
     prior = _prior(calibration.joint_covariance, which)
-    gone = np.zeros(len(which))
-    normal, scores = np.zeros((len(which),) * 2), np.zeros((0, len(which)))
-    rms = float("nan")
-    for _ in range(STEPS):
-        normal, right, scores, rms = _normal_equations(frames, poses, noises, pivot, surface, size, which)
-        step = -np.linalg.solve(normal + prior, right + prior @ gone)
-        full = np.zeros(6 * len(poses))
-        full[which] = step
-        poses, gone = moved_poses(poses, full, pivot), gone + step
-        if np.abs(step[3:]).max() < 1e-7 and np.abs(step[:3]).max() < 1e-6:
+    share = 1.0
+    for _ in range(2):  # the second time with what the clouds are worth beside the markers
+        poses, gone = list(calibration.poses), np.zeros(len(which))
+        for _ in range(STEPS):
+            normal, right, scores, rms = _normal_equations(frames, poses, noises, pivot, surface, size, which)
+            step = -np.linalg.solve(share * normal + prior, share * right + prior @ gone)
+            full = np.zeros(6 * len(poses))
+            full[which] = step
+            poses, gone = moved_poses(poses, full, pivot), gone + step
+            if np.abs(step[3:]).max() < 1e-7 and np.abs(step[:3]).max() < 1e-6:
+                break
+        worth = _worth(normal, scores, prior, gone - np.linalg.solve(normal, right))
+        if worth >= 0.9 * share:
             break
+        share = worth
     covariance = np.zeros((6 * len(poses),) * 2)
-    inverse = np.linalg.inv(normal + prior)
-    covariance[np.ix_(which, which)] = inverse @ (scores.T @ scores + prior) @ inverse
+    inverse = np.linalg.inv(share * normal + prior)
+    covariance[np.ix_(which, which)] = inverse @ (share * normal + prior if prior.any() else scores.T @ scores) @ inverse
     return replace(
         calibration,
         T_robot_camera=freeze(poses[0]),
@@ -104,6 +108,37 @@ def refine_poses(robot: Robot, recording: Recording, calibration: Calibration) -
         joint_covariance=freeze(covariance),
         normal_rms_m=rms,
     )
+
+
+def _worth(normal: FloatArray, scores: FloatArray, prior: FloatArray, apart: FloatArray) -> float:
+    """Return by which share the clouds count beside the markers [1].
+
+    Points of one cell err together, which the scatter of the cells' scores shows. Where clouds and markers are farther apart than both deviations
+    say, the clouds err by more still (model, lens), and count by so much less that the difference is one that is to be expected.
+    Source: Mandel and Paule, "Interlaboratory evaluation of a material with unequal numbers of replicates" (1970).
+
+    Arguments:
+        normal: information of the clouds, points counted as independent, shape (p, p).
+        scores: sums of the gradient over cells, shape (g, p).
+        prior: information of the markers, shape (p, p).
+        apart: pose of the clouds alone less that of the markers, shape (p,).
+    """
+    p = len(normal)
+    share = min(1.0, p / max(float(np.trace(np.linalg.solve(normal, scores.T @ scores))), 1e-300))
+    if not prior.any():
+        return share
+    markers, clouds = np.linalg.inv(prior), np.linalg.inv(normal)
+
+    def distance(worth: float) -> float:
+        return float(apart @ np.linalg.solve(markers + clouds / worth, apart))
+
+    if distance(share) <= p:
+        return share
+    low, high = 1e-12 * share, share
+    for _ in range(60):
+        middle = float(np.sqrt(low * high))
+        low, high = (middle, high) if distance(middle) < p else (low, middle)
+    return low
 
 
 def _normal_equations(

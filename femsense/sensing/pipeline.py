@@ -153,10 +153,15 @@ def _sense_into(done: Done, sense: Callable[..., SensedFrame], sensor: Sensor, k
         done.contacts.extend(_named(done, frame.contacts))
         done.states.append(frame.state.positions)
         named = tuple(done.contacts[len(done.contacts) - len(frame.contacts) :])
-        done.last = replace(frame, contacts=named) if trusted(frame) else done.last
+        done.last = replace(frame, contacts=named) if trusted(frame) else _under_inputs(frame)
     except FemsenseError as error:
         done.reports.append(_failed(sensor, k, error))
         done.states.append(sensor.robot.body.mesh.nodes if done.last is None else done.last.free_state.positions)
+
+
+def _under_inputs(frame: SensedFrame) -> SensedFrame:
+    """Return a frame as the inputs alone have it: what the next one starts from where its forces are not trusted (friction remembers it)."""
+    return replace(frame, touches=(), state=frame.free_state, forces=np.zeros((0, 3)), contacts=())
 
 
 PREDICTED = "no marker and no cloud: the model's prediction under the inputs"
