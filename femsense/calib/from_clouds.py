@@ -99,7 +99,7 @@ def refine_poses(robot: Robot, recording: Recording, calibration: Calibration) -
         share = worth
     covariance = np.zeros((6 * len(poses),) * 2)
     inverse = np.linalg.inv(share * normal + prior)
-    covariance[np.ix_(which, which)] = inverse @ (share * normal + prior if prior.any() else scores.T @ scores) @ inverse
+    covariance[np.ix_(which, which)] = inverse @ (share**2 * scores.T @ scores + prior) @ inverse
     return replace(
         calibration,
         T_robot_camera=freeze(poses[0]),
@@ -113,8 +113,9 @@ def refine_poses(robot: Robot, recording: Recording, calibration: Calibration) -
 def _worth(normal: FloatArray, scores: FloatArray, prior: FloatArray, apart: FloatArray) -> float:
     """Return by which share the clouds count beside the markers [1].
 
-    Points of one cell err together, which the scatter of the cells' scores shows. Where clouds and markers are farther apart than both deviations
-    say, the clouds err by more still (model, lens), and count by so much less that the difference is one that is to be expected.
+    Points of one cell err together; the scatter of the cells' scores tells how far the pose of the clouds is known. Where clouds and markers are
+    farther apart than both deviations say, the clouds err by more still (model, lens). They then count by so much less that the difference is one
+    that is to be expected.
     Source: Mandel and Paule, "Interlaboratory evaluation of a material with unequal numbers of replicates" (1970).
 
     Arguments:
@@ -123,22 +124,23 @@ def _worth(normal: FloatArray, scores: FloatArray, prior: FloatArray, apart: Flo
         prior: information of the markers, shape (p, p).
         apart: pose of the clouds alone less that of the markers, shape (p,).
     """
-    p = len(normal)
-    share = min(1.0, p / max(float(np.trace(np.linalg.solve(normal, scores.T @ scores))), 1e-300))
     if not prior.any():
-        return share
-    markers, clouds = np.linalg.inv(prior), np.linalg.inv(normal)
+        return 1.0
+    p, markers = len(normal), np.linalg.inv(prior)
+    inverse = np.linalg.inv(normal)
+    clouds = inverse @ scores.T @ scores @ inverse
 
     def distance(worth: float) -> float:
         return float(apart @ np.linalg.solve(markers + clouds / worth, apart))
 
-    if distance(share) <= p:
-        return share
-    low, high = 1e-12 * share, share
+    if distance(1.0) <= p:
+        return 1.0
+    low, high = 1e-12, 1.0
     for _ in range(60):
         middle = float(np.sqrt(low * high))
         low, high = (middle, high) if distance(middle) < p else (low, middle)
-    return low
+    counted = max(1.0, float(np.trace(np.linalg.solve(normal, scores.T @ scores))) / p)  # so many points of a cell count as one
+    return low / counted
 
 
 def _normal_equations(
