@@ -89,8 +89,9 @@ class Own:
 
 
 class _WithoutGram:
-    def solve(self, right: FloatArray) -> FloatArray:
-        raise NotImplementedError
+    """Makes W of solves; its heirs say how these are made."""
+
+    solve: Callable[[FloatArray], FloatArray]
 
     def gram(self, columns: sp.csc_matrix) -> FloatArray:
         return np.asarray(columns.T @ self.solve(columns.toarray()))
