@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypeVar
 
 import typer
 from typer.exceptions import TyperException
@@ -25,6 +25,9 @@ from typer.exceptions import TyperException
 import femsense
 from femsense.app.compiling import announced_compiling
 from femsense.core.errors import FemsenseError, InputError
+
+if TYPE_CHECKING:
+    from femsense.app.stream_command import LiveStream
 
 T = TypeVar("T")
 STOPPED = 130
@@ -517,7 +520,13 @@ def reach(
 
 @app.command()
 def view(
-    run: RunPath,
+    run: Annotated[
+        Path | None, typer.Argument(metavar="RUN", help="A folder that femsense estimate wrote.", show_default=False)
+    ] = None,
+    stream: Annotated[
+        str | None,
+        typer.Option("--stream", metavar="URL", help="Show what streams there instead: http:// or mqtt://.", show_default=False),
+    ] = None,
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0 takes a free one.")] = 0,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the default browser.")] = True,
     output: Annotated[
@@ -526,9 +535,16 @@ def view(
     ] = None,
     json: Json = False,
 ) -> Answer:
-    """Show a run on a page for browsers and headsets."""
+    """Show a run, or what streams, on a page for browsers and headsets."""
+    if stream is not None:
+        from femsense.app.stream_command import need_one, show_stream
+
+        need_one([] if run is None else [run], stream)
+        return _live(show_stream(stream, port=port), browser)
     from femsense.xr.view import serve, write_static_page
 
+    if run is None:
+        raise InputError("nothing to show", where="femsense view", expected="RUN, or --stream URL")
     if output is not None:
         page = write_static_page(run, output)
         return Answer({"page": str(page)}, f"written: {page}")
@@ -539,6 +555,64 @@ def view(
             server.wait()
 
     return Answer({"url": server.url}, f"{server.url}\nCtrl-C ends it", then=wait)
+
+
+@app.command()
+def stream(
+    runs: Annotated[list[Path] | None, typer.Argument(metavar="RUN", help="Runs to play.", show_default=False)] = None,
+    host: Annotated[str, typer.Option("--host", help="0.0.0.0 lets other machines watch; needs a password.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Of the page and its WebSocket; 0: a free one.")] = 8010,
+    mqtt: Annotated[
+        str | None,
+        typer.Option("--mqtt", metavar="HOST[:PORT]", help="Send to this broker; mqtts:// encrypts.", show_default=False),
+    ] = None,
+    broker: Annotated[bool, typer.Option("--broker", help="Serve a broker for this machine.")] = False,
+    broker_port: Annotated[int, typer.Option("--broker-port", min=0, max=65535, help="Of --broker; 0: a free one.")] = 1883,
+    json_mirror: Annotated[bool, typer.Option("--json-mirror", help="Send pose_json too, for Unity's JsonUtility.")] = False,
+    rate: Annotated[float, typer.Option("--rate", min=0.1, max=1000.0, help="Most poses a second.")] = 60.0,
+    once: Annotated[bool, typer.Option("--once", help="Play once and end.")] = False,
+    password_file: Annotated[
+        Path | None, typer.Option("--password-file", metavar="FILE", help="Or variable FEMSENSE_PASSWORD.", show_default=False)
+    ] = None,
+    certificate: Annotated[
+        Path | None, typer.Option("--certificate", metavar="PEM", help="Encrypt with this.", show_default=False)
+    ] = None,
+    key: Annotated[Path | None, typer.Option("--key", metavar="PEM", help="Of the certificate.", show_default=False)] = None,
+    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the default browser.")] = False,
+    json: Json = False,
+) -> Answer:
+    """Send bone poses and forces over MQTT and WebSocket."""
+    from femsense.app.stream_command import StreamOptions, need_one, stream_runs
+
+    need_one(runs or [], None)
+    options = StreamOptions(
+        host=host,
+        port=port,
+        mqtt=mqtt,
+        broker_port=broker_port if broker else None,
+        json_mirror=json_mirror,
+        password_file=password_file,
+        certificate=certificate,
+        key=key,
+        rate_hz=rate,
+    )
+    return _live(stream_runs(runs or [], options, loop=not once), browser)
+
+
+def _live(live: LiveStream, browser: bool) -> Answer:
+    """Return the answer that goes on until the stream ends."""
+    from femsense.app.stream_command import stream_document, stream_text
+
+    if browser:
+        import webbrowser
+
+        webbrowser.open(live.url)
+
+    def wait() -> None:
+        with contextlib.suppress(KeyboardInterrupt), live:
+            live.wait()
+
+    return Answer(stream_document(live), stream_text(live), then=wait)
 
 
 @app.command()

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.model.robot import Robot
 from femsense.xr.gltf import ExportReport, export_states
-from femsense.xr.view import export_run
+from femsense.xr.run_contents import export_run
 
 
 class _States(Protocol):

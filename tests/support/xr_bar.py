@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from femsense.fem.mesh import TetMesh, oriented, surface_triangles
+from femsense.xr.run_contents import export_run
 
 SIZE = np.array([0.03, 0.03, 0.2])
 
@@ -65,6 +66,13 @@ def bar_surface(frames: int = 24, cells: tuple[int, int, int] = (3, 3, 20)) -> t
     used, triangles = np.unique(surface_triangles(mesh), return_inverse=True)
     _, states = bar_states(mesh.nodes, frames)
     return mesh.nodes[used], states[:, used], triangles.reshape(-1, 3)
+
+
+def write_run_with_mesh(folder: Path, *, bones: int = 6) -> Path:
+    """Write a run folder of the bar with a mesh of few bones: the search for the best number of bones takes seconds."""
+    run = write_run(folder)
+    export_run(run, run / "robot.glb", bones=bones)
+    return run
 
 
 def write_run(folder: Path, *, contacts: bool = True, frames: int = 24) -> Path:

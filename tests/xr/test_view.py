@@ -19,7 +19,7 @@ from glb import ROOT, Glb, build_hook, npm_folder
 from xr_bar import START, write_run
 
 from femsense.core.errors import InputError, MissingDependency
-from femsense.xr import view
+from femsense.xr import run_contents, view
 
 VIEWER = ROOT / "femsense" / "xr" / "viewer"
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -138,7 +138,7 @@ def test_refusals_name_the_file(tmp_path: Path) -> None:
         view.contacts_of_run(run)
     np.savez(run / "states.npz", time_s=[0.0])
     with pytest.raises(InputError, match="nodes_m, tets"):
-        view.export_run(run, tmp_path / "x.glb")
+        run_contents.export_run(run, tmp_path / "x.glb")
 
 
 # ---- the sources of the page ----------------------------------------------------------------------------------------------------
@@ -186,7 +186,7 @@ const args = ['--no-sandbox', '--use-gl=angle', '--use-angle=swiftshader', '--en
     await page.keyboard.press('Home');
     result.home = await clock();
     await page.keyboard.press(' ');
-    await page.waitForTimeout(700);
+    await page.waitForFunction(() => !document.querySelector('#clock').textContent.startsWith('0.00'), null, { timeout: 60000 });
     result.later = await clock();
     result.button = await page.getAttribute('#play', 'aria-label');
     await page.keyboard.press('f');

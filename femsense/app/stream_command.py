@@ -1,0 +1,185 @@
+"""`femsense stream` and `femsense view --stream`: servers, brokers and sources put together."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from threading import Event, Thread
+from typing import Any
+
+from femsense.core.errors import InputError
+from femsense.xr.stream.access import Access, read_password
+from femsense.xr.stream.bridge import Bridge
+from femsense.xr.stream.hub import Hub
+from femsense.xr.stream.mqtt import EmbeddedBroker, MqttSink, broker_address
+from femsense.xr.stream.payloads import Twin, TwinFrame, topic
+from femsense.xr.stream.publisher import Publisher, PublishOptions, play
+from femsense.xr.stream.websocket import ServerOptions, WebSocketServer
+from femsense.xr.view import PAGE, page_files
+
+PASSWORD = "FEMSENSE_PASSWORD"
+
+
+@dataclass(frozen=True, slots=True)
+class StreamOptions:
+    """Where a stream goes and who may see it."""
+
+    host: str = "127.0.0.1"
+    port: int = 0
+    mqtt: str | None = None
+    """Address of a broker."""
+    broker_port: int | None = None
+    """Serve a broker of our own here; 0 takes a free port."""
+    json_mirror: bool = False
+    password_file: Path | None = None
+    certificate: Path | None = None
+    key: Path | None = None
+    authority: Path | None = None
+    """Certificate that a broker's own is checked against."""
+    rate_hz: float = 60.0
+    page: Path = PAGE
+
+
+@dataclass(eq=False, slots=True)
+class LiveStream:
+    """Streams that run in the background; a context manager."""
+
+    hub: Hub
+    server: WebSocketServer
+    broker: EmbeddedBroker | None = None
+    publishers: list[Publisher] = field(default_factory=list)
+    threads: list[Thread] = field(default_factory=list)
+    stop: Event = field(default_factory=Event)
+    closers: list[Callable[[], None]] = field(default_factory=list)
+
+    @property
+    def url(self) -> str:
+        """Where the page is."""
+        return self.server.url
+
+    def wait(self) -> None:
+        """Return when all sources have ended."""
+        for thread in self.threads:
+            while thread.is_alive():
+                thread.join(0.5)
+        while not self.threads and not self.stop.wait(0.5):
+            pass
+
+    def close(self) -> None:
+        """End the sources, say so, and free the ports."""
+        self.stop.set()
+        for thread in self.threads:
+            thread.join(2.0)
+        for publisher in self.publishers:
+            publisher.end()
+        for closer in self.closers:
+            closer()
+        self.hub.close()
+
+    def __enter__(self) -> LiveStream:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def stream_runs(runs: Sequence[Path], options: StreamOptions, *, loop: bool = True, clouds: bool = True) -> LiveStream:
+    """Play runs at their own times to whoever watches; return at once.
+
+    Raises:
+        InputError: a folder without states, or an address that cannot be used.
+        MissingDependency: the extra `xr` is not installed, or the page was not built.
+    """
+    from femsense.xr.stream.run_source import frames_of, open_run
+
+    opened = [open_run(run, clouds=clouds) for run in runs]
+    names = _distinct([one.twin.name for one in opened])
+    live = _serve(options, names[0])
+    for one, name in zip(opened, names):
+        _play(live, replace(one.twin, name=name), frames_of(one, rate_hz=options.rate_hz, loop=loop), options)
+    return live
+
+
+def show_stream(url: str, *, port: int = 0, page: Path = PAGE, password_file: Path | None = None) -> LiveStream:
+    """Serve the page on this machine with what streams at a URL; return at once. Raises as `Bridge` and `WebSocketServer`."""
+    files = page_files(page)
+    hub = Hub()
+    bridge = Bridge(hub, url, password=read_password(password_file, os.environ.get(PASSWORD)))
+    try:
+        server = WebSocketServer(hub, dict(files), options=ServerOptions(port=port))
+    except BaseException:
+        bridge.close()
+        raise
+    return LiveStream(hub, server, closers=[bridge.close])
+
+
+def stream_document(live: LiveStream) -> dict[str, Any]:
+    """Return what runs where, for `--json`."""
+    return {
+        "url": live.url,
+        "robots": [publisher.twin.name for publisher in live.publishers],
+        "topics": [topic(publisher.twin.name, "#") for publisher in live.publishers],
+        "broker_port": None if live.broker is None else live.broker.port,
+    }
+
+
+def stream_text(live: LiveStream) -> str:
+    """Return the same for people."""
+    lines = [live.url]
+    if live.broker is not None:
+        lines.append(f"MQTT: 127.0.0.1, port {live.broker.port}")
+    lines += [f"topics: {topic(publisher.twin.name, '…')}" for publisher in live.publishers]
+    if live.server.access.password and live.server.access.certificate is None:
+        lines.append("the password travels unencrypted: --certificate and --key encrypt")
+    return "\n".join([*lines, "Ctrl-C ends it"])
+
+
+def _distinct(names: Sequence[str]) -> list[str]:
+    """Number names that come again."""
+    found: list[str] = []
+    for name in names:
+        number, chosen = 1, name
+        while topic(chosen, "") in {topic(other, "") for other in found}:
+            number += 1
+            chosen = f"{name}-{number}"
+        found.append(chosen)
+    return found
+
+
+def _serve(options: StreamOptions, first: str) -> LiveStream:
+    """Start the server, and a broker or a client of one where it is asked for."""
+    password = read_password(options.password_file, os.environ.get(PASSWORD))
+    access = Access(options.host, password, options.certificate, options.key)
+    hub = Hub()
+    with contextlib.ExitStack() as undo:
+        files = page_files(options.page)
+        server = WebSocketServer(hub, dict(files), access=access, options=ServerOptions(port=options.port))
+        undo.callback(hub.close)
+        broker = None if options.broker_port is None else EmbeddedBroker(hub, port=options.broker_port)
+        if options.mqtt is not None:
+            MqttSink(hub, broker_address(options.mqtt, password=password, authority=options.authority), first)
+        undo.pop_all()
+    return LiveStream(hub, server, broker)
+
+
+def _play(live: LiveStream, twin: Twin, frames: Iterator[TwinFrame], options: StreamOptions) -> None:
+    """Send frames from a thread of their own."""
+    publisher = Publisher(live.hub, twin, PublishOptions(rate_hz=options.rate_hz, json_mirror=options.json_mirror))
+    live.publishers.append(publisher)
+
+    def run() -> None:
+        play(publisher, frames, live.stop)
+        publisher.end()
+
+    thread = Thread(target=run, daemon=True, name=f"femsense-{twin.name}")
+    live.threads.append(thread)
+    thread.start()
+
+
+def need_one(runs: Sequence[Path], sensors: str | None) -> None:
+    """Raise InputError unless there are runs or sensors, and not both."""
+    if bool(runs) == (sensors is not None):
+        raise InputError("one of both is needed", where="femsense stream", expected="RUN …, or --sensors SOURCE --model MODEL")

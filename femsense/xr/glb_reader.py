@@ -1,0 +1,82 @@
+"""Reads back the skinned, animated mesh that `gltf.write_glb` writes: bones, weights, and the bones' poses over time."""
+
+from __future__ import annotations
+
+import json
+import struct
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from femsense.core.arrays import FloatArray, freeze
+from femsense.core.errors import InputError
+from femsense.xr.gltf import T_GLTF_ROBOT
+from femsense.xr.skeleton import Skeleton
+from femsense.xr.skinning import Skin
+
+COMPONENTS = {5121: "u1", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class AnimatedSkin:
+    """A skinned mesh and how its bones move, robot frame."""
+
+    skin: Skin
+    time_s: FloatArray
+    """Times of the poses, from the first, shape (F,)."""
+    bones: npt.NDArray[np.float32]
+    """x y z [m] qx qy qz qw of each bone, shape (F, B, 7)."""
+
+
+def read_glb(data: bytes) -> AnimatedSkin:
+    """Return the skin and animation in the content of a file that femsense wrote. Raises InputError for any other."""
+    try:
+        return _read(data)
+    except (KeyError, IndexError, ValueError, StopIteration, struct.error) as error:
+        raise InputError(
+            "not a mesh of femsense", where="glb", found=f"{type(error).__name__}: {error}", expected="femsense export RUN"
+        ) from None
+
+
+def _read(data: bytes) -> AnimatedSkin:
+    magic, _, length, size, kind = struct.unpack_from("<4sIII4s", data)
+    if magic != b"glTF" or kind != b"JSON" or length != len(data):
+        raise ValueError("not binary glTF")
+    document = json.loads(data[20 : 20 + size])
+    binary = data[20 + size + 8 :]
+    joints = document["skins"][0]["joints"]
+    nodes = [document["nodes"][joint] for joint in joints]
+    origins = np.array([node["translation"] for node in nodes], dtype=np.float64)
+    T_robot_bone = np.tile(np.eye(4), (len(nodes), 1, 1))
+    T_robot_bone[:, :3, 3] = origins
+    attributes = document["meshes"][0]["primitives"][0]["attributes"]
+    part = {name: _array(document, binary, index) for name, index in attributes.items()}
+    rest = part["POSITION"].astype(np.float64) @ T_GLTF_ROBOT[:3, :3]
+    skin = Skin(
+        Skeleton(T_robot_bone, tuple(node["name"] for node in nodes)),
+        rest,
+        part["JOINTS_0"],
+        part["WEIGHTS_0"].astype(np.float64),
+    )
+    animation = document["animations"][0]
+    times = _array(document, binary, animation["samplers"][0]["input"])[:, 0]
+    rows = np.zeros((len(times), len(nodes), 7), dtype=np.float32)
+    place = {"translation": slice(0, 3), "rotation": slice(3, 7)}
+    for channel in animation["channels"]:
+        bone = joints.index(channel["target"]["node"])
+        rows[:, bone, place[channel["target"]["path"]]] = _array(
+            document, binary, animation["samplers"][channel["sampler"]]["output"]
+        )
+    return AnimatedSkin(skin, freeze(times.astype(np.float64)), freeze(rows, np.float32))
+
+
+def _array(document: dict[str, Any], binary: bytes, index: int) -> npt.NDArray[Any]:
+    """Return an accessor's values, shape (count, width)."""
+    accessor = document["accessors"][index]
+    view = document["bufferViews"][accessor["bufferView"]]
+    width = WIDTHS[accessor["type"]]
+    kind = COMPONENTS[accessor["componentType"]]
+    return np.frombuffer(binary, kind, accessor["count"] * width, view["byteOffset"]).reshape(-1, width)

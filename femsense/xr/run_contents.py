@@ -1,0 +1,199 @@
+"""What a run folder holds for those who show it: states, contacts, inputs, the skinned mesh."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from femsense.core.arrays import FloatArray
+from femsense.core.errors import InputError
+from femsense.xr.gltf import ExportReport, export_states
+
+FORMAT = "femsense-contacts-1"
+CONTACT_COLUMNS = ("frame", "time_s", "contact", "x_m", "y_m", "z_m", "fx_n", "fy_n", "fz_n", "force_n", "std_n", "source")
+
+
+def export_run(folder: str | Path, path: str | Path, *, bones: int | None = None, color_rgb: Any = None) -> ExportReport:
+    """Write the skinned, animated mesh of a run folder (see `gltf.export_states`).
+
+    Raises InputError where `states.npz` is missing, unreadable or lacks a part.
+    """
+    run = run_folder(folder)
+    states = load_states(run)
+    return export_states(
+        states.get("rest_nodes_m"),
+        states["tets"],
+        states["time_s"],
+        states["nodes_m"],
+        path,
+        bones=bones,
+        color_rgb=color_rgb,
+        name=name_of_run(run),
+    )
+
+
+def contacts_of_run(folder: str | Path) -> dict[str, Any]:
+    """Return what the page shows beside the mesh, ready for JSON; everything in the robot frame, SI.
+
+    Returns:
+        `format`, `name`, `frame` ("robot"), and `frames`: for each state its time from the first [s], the frame's
+        number, status, residual and inputs where `frames.csv` has them, and the contacts of `contacts.csv`. `inputs` names
+        the inputs, with their units and the range that the run has.
+
+    Raises:
+        InputError: a column is missing, or a value is not a number.
+    """
+    run = run_folder(folder)
+    times = np.atleast_1d(np.asarray(load_states(run)["time_s"], dtype=np.float64))
+    frames: list[dict[str, Any]] = [
+        {"time_s": float(t - times[0]), "frame": None, "status": None, "rms_after_m": None, "inputs": None, "contacts": []}
+        for t in times
+    ]
+    told = _rows(run / "frames.csv", ("frame", "time_s"))
+    columns = _input_columns(told)
+    for row in told:
+        state = frames[_nearest(times, row.number("time_s"))]
+        state.update(frame=row.integer("frame"), status=row.values.get("status") or None, rms_after_m=row.optional("rms_after_m"))
+        state["inputs"] = [row.optional(column) for column in columns] or None
+    for row in _rows(run / "contacts.csv", CONTACT_COLUMNS):
+        state = frames[_nearest(times, row.number("time_s"))]
+        state["frame"] = row.integer("frame") if state["frame"] is None else state["frame"]
+        state["contacts"].append(_contact(row))
+    inputs = [_input(column, told) for column in columns]
+    return {"format": FORMAT, "name": name_of_run(run), "frame": "robot", "inputs": inputs, "frames": frames}
+
+
+def current_glb(run: Path, scratch: Path) -> Path:
+    """Return the mesh of the run, made anew where it is missing or older than the states."""
+    glb, states = run / "robot.glb", run / "states.npz"
+    if glb.is_file() and glb.stat().st_mtime >= states.stat().st_mtime:
+        return glb
+    target = glb if os.access(run, os.W_OK) else scratch / "robot.glb"
+    export_run(run, target)
+    return target
+
+
+class _Row:
+    """One row of a table, which knows where it stands."""
+
+    def __init__(self, values: dict[str, str], where: str) -> None:
+        self.values, self.where = values, where
+
+    def number(self, key: str) -> float:
+        value = self.optional(key)
+        if value is None:
+            raise InputError(
+                "a number is missing", where=f"{self.where}, {key}", found=self.values.get(key), expected="a finite number"
+            )
+        return value
+
+    def optional(self, key: str) -> float | None:
+        """Return the number, or None where the cell is empty or says nan."""
+        text = (self.values.get(key) or "").strip()
+        if not text:
+            return None
+        try:
+            value = float(text)
+        except ValueError:
+            raise InputError("not a number", where=f"{self.where}, {key}", found=text, expected="a number") from None
+        return value if math.isfinite(value) else None
+
+    def integer(self, key: str) -> int:
+        return int(self.number(key))
+
+    def vector(self, *keys: str) -> list[float] | None:
+        values = [self.optional(k) for k in keys]
+        return None if any(v is None for v in values) else [float(v) for v in values if v is not None]
+
+
+def _contact(row: _Row) -> dict[str, Any]:
+    return {
+        "contact": row.integer("contact"),
+        "point_m": row.vector("x_m", "y_m", "z_m"),
+        "force_vector_n": row.vector("fx_n", "fy_n", "fz_n"),
+        "force_n": row.optional("force_n"),
+        "std_n": row.optional("std_n"),
+        "source": row.values.get("source") or "",
+        "track": int(row.optional("track") or 0),
+        "point_std_m": row.vector("x_std_m", "y_std_m", "z_std_m"),
+        "force_std_n": row.vector("fx_std_n", "fy_std_n", "fz_std_n"),
+        "radius_m": row.optional("radius_m"),
+    }
+
+
+INPUT_COLUMNS = (("tension_", "_n", "N"), ("pressure_", "_pa", "Pa"))
+"""How frames.csv names what drives the robot: before and after the name, and its unit."""
+
+
+def _input_columns(rows: list[_Row]) -> list[str]:
+    names = rows[0].values if rows else {}
+    return [name for before, after, _ in INPUT_COLUMNS for name in names if name.startswith(before) and name.endswith(after)]
+
+
+def _input(column: str, rows: list[_Row]) -> dict[str, Any]:
+    """Return name, unit and range of an input; the range reaches from 0 to the largest value."""
+    before, after, unit = next(kind for kind in INPUT_COLUMNS if column.startswith(kind[0]))
+    values = [value for value in (row.optional(column) for row in rows) if value is not None]
+    name = column[len(before) : -len(after)]
+    return {"name": name, "unit": unit, "low": min(0.0, *values, 0.0), "high": max(0.0, *values, 0.0)}
+
+
+def _rows(path: Path, columns: Iterable[str]) -> list[_Row]:
+    """Return the rows of a CSV file; none where there is no file."""
+    if not path.is_file():
+        return []
+    with path.open(newline="", encoding="utf-8") as file:
+        reader = csv.DictReader(file)
+        missing = [c for c in columns if c not in (reader.fieldnames or [])]
+        if missing:
+            raise InputError(
+                "columns are missing", where=path, found=", ".join(reader.fieldnames or []), expected=", ".join(missing)
+            )
+        return [_Row(row, f"{path}:{i}") for i, row in enumerate(reader, start=2)]
+
+
+def _nearest(times: FloatArray, time: float) -> int:
+    return int(np.abs(times - time).argmin())
+
+
+def run_folder(folder: str | Path) -> Path:
+    run = Path(folder)
+    if not (run / "states.npz").is_file():
+        raise InputError(
+            "not a run: no states.npz",
+            where=run,
+            expected="a folder that femsense estimate wrote",
+            hint="femsense estimate … -o RUN",
+        )
+    return run
+
+
+def load_states(run: Path) -> dict[str, Any]:
+    path = run / "states.npz"
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            states = {key: file[key] for key in file.files if key in ("time_s", "nodes_m", "tets", "rest_nodes_m")}
+    except Exception as error:  # whatever the archive reader meets in a broken file
+        raise InputError("not readable", where=path, found=error, expected="arrays time_s, nodes_m, tets") from None
+    missing = [key for key in ("time_s", "nodes_m", "tets") if key not in states]
+    if missing:
+        raise InputError("arrays are missing", where=path, found=", ".join(states), expected=", ".join(missing))
+    return states
+
+
+def name_of_run(run: Path) -> str:
+    """Return the robot's name where run.json tells it, else the folder's."""
+    try:
+        known = json.loads((run / "run.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        known = {}
+    robot = known.get("robot") if isinstance(known, dict) else None
+    name = robot.get("name") if isinstance(robot, dict) else robot
+    return Path(name).name if isinstance(name, str) and name else run.resolve().name

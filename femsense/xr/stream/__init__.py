@@ -1,0 +1,1 @@
+"""Live streams: what is sent, to whom, and what comes back."""

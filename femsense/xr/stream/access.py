@@ -1,0 +1,119 @@
+"""Who may watch: this machine alone, or whoever knows the password."""
+
+from __future__ import annotations
+
+import base64
+import hmac
+import ipaddress
+import secrets
+import ssl
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from femsense.core.errors import InputError
+
+LOOPBACK_NAMES = ("localhost", "127.0.0.1", "::1")
+COOKIE = "femsense"
+
+
+@dataclass(frozen=True, slots=True)
+class Access:
+    """Where a server listens and whom it answers."""
+
+    host: str = "127.0.0.1"
+    password: str | None = field(default=None, repr=False)
+    certificate: Path | None = None
+    """PEM file; with it all traffic is encrypted."""
+    key: Path | None = None
+    ticket: str = field(default_factory=lambda: secrets.token_urlsafe(24), repr=False)
+    """What the page's cookie holds once the password was given; made anew for each server."""
+
+    def __post_init__(self) -> None:
+        if not is_loopback(self.host) and not self.password:
+            raise InputError(
+                "other machines may watch only with a password",
+                where="--host",
+                found=self.host,
+                expected="a password, or 127.0.0.1",
+                hint="--password-file FILE, or the variable FEMSENSE_PASSWORD",
+            )
+        if self.key is not None and self.certificate is None:
+            raise InputError("a key without its certificate", where="--key", hint="--certificate FILE")
+
+    @property
+    def scheme(self) -> str:
+        """What the page's address begins with."""
+        return "https" if self.certificate is not None else "http"
+
+    def tls(self) -> ssl.SSLContext | None:
+        """Return what encrypts, or None. Raises InputError."""
+        if self.certificate is None:
+            return None
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        context.minimum_version = ssl.TLSVersion.TLSv1_2
+        try:
+            context.load_cert_chain(self.certificate, self.key)
+        except (OSError, ssl.SSLError) as error:
+            raise InputError(
+                "not a certificate with its key", where=self.certificate, found=error, expected="PEM files"
+            ) from None
+        return context
+
+    def allows(self, authorization: str | None, cookie: str | None) -> bool:
+        """Return whether a request may be answered, from its two headers."""
+        if self.password is None:
+            return True
+        for part in (cookie or "").split(";"):
+            name, _, value = part.strip().partition("=")
+            if name == COOKIE and _same(value, self.ticket):
+                return True
+        return _same(_password_of(authorization), self.password)
+
+    def knows_host(self, header: str | None) -> bool:
+        """Return whether a Host header may be ours; without a password only names of this machine, so that no foreign page reaches us under its own name."""
+        return self.password is not None or _name_of(header or "") in LOOPBACK_NAMES
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether an address is this machine's own."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def same_origin(origin: str | None, host: str | None) -> bool:
+    """Return whether a browser's page comes from the server itself; programs send no origin."""
+    return origin is None or origin.partition("://")[2] == (host or "")
+
+
+def read_password(file: Path | None, environment: str | None) -> str | None:
+    """Return the first line of a file, else the variable's value, else None. Raises InputError."""
+    if file is None:
+        return environment or None
+    try:
+        password = file.read_text(encoding="utf-8").partition("\n")[0].strip()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError("the password cannot be read", where=file, found=error) from None
+    if not password:
+        raise InputError("the password is empty", where=file, expected="one line")
+    return password
+
+
+def _password_of(authorization: str | None) -> str:
+    scheme, _, value = (authorization or "").partition(" ")
+    if scheme.lower() != "basic":
+        return ""
+    try:
+        return base64.b64decode(value, validate=True).decode().partition(":")[2]
+    except ValueError:
+        return ""
+
+
+def _same(given: str, wanted: str) -> bool:
+    return hmac.compare_digest(given.encode(), wanted.encode())
+
+
+def _name_of(host: str) -> str:
+    """Return the name in a Host header without its port."""
+    return host.partition("]")[0].lstrip("[") if host.startswith("[") else host.partition(":")[0]

@@ -1,0 +1,155 @@
+"""Brings a stream from elsewhere into a hub of this machine: from a WebSocket of femsense, or from a broker."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import ssl
+import urllib.request
+from collections.abc import Callable
+from pathlib import Path
+from threading import Event, Thread
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
+
+from femsense.core.errors import InputError
+from femsense.xr.stream.hub import Hub, Message
+from femsense.xr.stream.mqtt import MqttSource, broker_address
+from femsense.xr.stream.payloads import DRAG, GLB, MODEL, STATUS, read_document, split_topic, status_bytes, topic
+from femsense.xr.stream.websocket import pack, require_websockets, unpack
+
+if TYPE_CHECKING:
+    from websockets.sync.connection import Connection
+
+LARGEST_MESH = 64 << 20
+"""Bytes of a mesh that is taken from elsewhere."""
+AGAIN_S = (0.2, 0.5, 1.0, 2.0)
+"""How long to wait before the next attempt to connect [s]; the last for all further ones."""
+
+
+class Bridge:
+    """Keeps a hub supplied from a URL, for as long as it takes; what viewers send goes the other way."""
+
+    def __init__(self, hub: Hub, url: str, *, password: str | None = None, authority: Path | None = None) -> None:
+        """Connect in the background.
+
+        Arguments:
+            hub: that is supplied.
+            url: http(s):// or ws(s):// of `femsense stream`, or mqtt(s)://HOST[:PORT] of a broker.
+            password: of the server or the broker.
+            authority: certificate that theirs is checked against, PEM; None: those that the machine trusts.
+
+        Raises:
+            InputError: not such a URL.
+            MissingDependency: the package for it is not installed.
+        """
+        self.hub = hub
+        self._stop = Event()
+        scheme = urlsplit(url).scheme
+        if scheme in ("mqtt", "mqtts"):
+            source = MqttSource(broker_address(url, password=password, authority=authority), self._from_broker)
+            self._send: Callable[[Message], None] = source.send
+            self._close: Callable[[], None] = source.close
+        elif scheme in ("http", "https", "ws", "wss"):
+            viewer = _Viewer(self, url, password, authority)
+            self._send, self._close = viewer.send, viewer.close
+        else:
+            raise InputError("not a stream", where="--stream", found=url, expected="http://…, ws://…, mqtt://…, or with s")
+        hub.listen(self._back)
+
+    def close(self) -> None:
+        """Leave."""
+        self._stop.set()
+        self._close()
+
+    def _back(self, message: Message, _who: str) -> None:
+        known = split_topic(message.topic)
+        if known is not None and known[1] == DRAG:
+            self._send(message)
+
+    def _from_broker(self, message: Message) -> None:
+        known = split_topic(message.topic)
+        if known is not None and known[1] != DRAG:
+            self.hub.publish([message])
+
+
+class _Viewer:
+    """A viewer of another femsense: reads its WebSocket, fetches its meshes, comes back when it was gone."""
+
+    def __init__(self, bridge: Bridge, url: str, password: str | None, authority: Path | None) -> None:
+        require_websockets()
+        parts = urlsplit(url)
+        secure = parts.scheme in ("https", "wss")
+        self._bridge, self._at = bridge, parts.netloc
+        self._secure = secure
+        self._tls = ssl.create_default_context(cafile=authority) if secure else None
+        self._headers = {}
+        if password:
+            word = base64.b64encode(f"femsense:{password}".encode()).decode()
+            self._headers["Authorization"] = f"Basic {word}"
+        self._connection: Connection | None = None
+        self._stop = Event()
+        self._known: dict[str, str] = {}
+        Thread(target=self._run, daemon=True, name="femsense-bridge").start()
+
+    def send(self, message: Message) -> None:
+        connection = self._connection
+        if connection is not None:
+            with contextlib.suppress(Exception):  # gone meanwhile: what is old is not sent again
+                connection.send(pack([message]))
+
+    def close(self) -> None:
+        self._stop.set()
+        connection = self._connection
+        if connection is not None:
+            Thread(target=connection.close, daemon=True).start()
+
+    def _run(self) -> None:
+        from websockets.exceptions import WebSocketException
+
+        attempt = 0
+        while not self._stop.is_set():
+            with contextlib.suppress(OSError, WebSocketException, EOFError, InputError):
+                self._read()
+                attempt = 0
+            self._connection = None
+            self._lost()
+            self._stop.wait(AGAIN_S[min(attempt, len(AGAIN_S) - 1)])
+            attempt += 1
+
+    def _read(self) -> None:
+        from websockets.sync.client import connect
+
+        address = f"{'wss' if self._secure else 'ws'}://{self._at}/ws"
+        more: dict[str, Any] = {"ssl": self._tls} if self._secure else {}
+        with connect(
+            address, additional_headers=self._headers, compression=None, max_size=LARGEST_MESH, open_timeout=5, proxy=None, **more
+        ) as connection:
+            self._connection = connection
+            for frame in connection:
+                if isinstance(frame, bytes):
+                    self._take(list(unpack(frame)))
+
+    def _take(self, messages: list[Message]) -> None:
+        meshes = []
+        for message in messages:
+            known = split_topic(message.topic)
+            if known is not None and known[1] == MODEL:
+                meshes += self._mesh(known[0], message)
+        self._bridge.hub.publish([*meshes, *messages])
+
+    def _mesh(self, robot: str, model: Message) -> list[Message]:
+        """Return the mesh of a model unless it is there already."""
+        digest = str((read_document(model.payload) or {}).get("glb_sha256", ""))
+        if self._known.get(robot) == digest and digest:
+            return []
+        address = f"{'https' if self._secure else 'http'}://{self._at}/robots/{robot}.glb"
+        request = urllib.request.Request(address, headers=self._headers)
+        with urllib.request.urlopen(request, timeout=10, context=self._tls) as answer:
+            glb = answer.read(LARGEST_MESH)
+        self._known[robot] = digest
+        return [Message(topic(robot, GLB), glb)]
+
+    def _lost(self) -> None:
+        robots = list(self._known)
+        self._bridge.hub.publish([Message(topic(robot, STATUS), status_bytes("lost", self._at)) for robot in robots])

@@ -1,0 +1,82 @@
+"""Where messages meet who wants them: the newest of each topic is kept, and handed to sinks as it comes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from threading import Lock
+from typing import Protocol
+
+from femsense.xr.stream.payloads import RETAINED, split_topic
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Message:
+    """A payload for a topic."""
+
+    topic: str
+    payload: bytes
+
+    @property
+    def retained(self) -> bool:
+        """Whether who comes late is to have it at once."""
+        known = split_topic(self.topic)
+        return known is not None and known[1] in RETAINED
+
+
+class Sink(Protocol):
+    """Takes messages to somewhere else. `send` is called from any thread and never waits."""
+
+    def send(self, messages: tuple[Message, ...]) -> None: ...
+    def close(self) -> None: ...
+
+
+class Hub:
+    """The newest message of each topic, and the sinks that want each; safe for threads."""
+
+    def __init__(self) -> None:
+        self._lock = Lock()
+        self._newest: dict[str, Message] = {}
+        self._sinks: list[Sink] = []
+        self._listeners: list[Callable[[Message, str], None]] = []
+
+    def attach(self, sink: Sink) -> None:
+        """Add a sink; it is told at once what is known."""
+        with self._lock:
+            self._sinks.append(sink)
+            known = tuple(self._newest.values())
+        if known:
+            sink.send(known)
+
+    def publish(self, messages: Iterable[Message]) -> None:
+        """Hand messages on; those of one moment go together."""
+        batch = tuple(messages)
+        with self._lock:
+            self._newest.update((message.topic, message) for message in batch)
+            sinks = tuple(self._sinks)
+        for sink in sinks:
+            sink.send(batch)
+
+    def newest(self) -> dict[str, Message]:
+        """Return the newest message of each topic."""
+        with self._lock:
+            return dict(self._newest)
+
+    def listen(self, listener: Callable[[Message, str], None]) -> None:
+        """Call listener(message, who) for what viewers send; in their thread, so it must not wait."""
+        with self._lock:
+            self._listeners.append(listener)
+
+    def received(self, message: Message, who: str) -> None:
+        """Pass on what a viewer sent."""
+        with self._lock:
+            listeners = tuple(self._listeners)
+        for listener in listeners:
+            listener(message, who)
+
+    def close(self) -> None:
+        """Close all sinks."""
+        with self._lock:
+            sinks, self._sinks = tuple(self._sinks), []
+        for sink in sinks:
+            sink.close()

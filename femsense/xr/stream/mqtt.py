@@ -1,0 +1,232 @@
+"""MQTT: a client that sends to any broker, and a broker for this machine alone."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import socket
+import ssl
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from threading import Event, Thread
+from typing import TYPE_CHECKING, Any
+from urllib.parse import unquote, urlsplit
+
+from femsense.core.errors import InputError, MissingDependency
+from femsense.xr.stream.hub import Hub, Message
+from femsense.xr.stream.payloads import PREFIX, STATUS, status_bytes, topic
+
+if TYPE_CHECKING:
+    from paho.mqtt.client import Client
+
+PLAIN_PORT, TLS_PORT = 1883, 8883
+
+
+@dataclass(frozen=True, slots=True)
+class BrokerAddress:
+    """A broker and how to be let in."""
+
+    host: str
+    port: int = PLAIN_PORT
+    user: str | None = None
+    password: str | None = field(default=None, repr=False)
+    tls: bool = False
+    authority: Path | None = None
+    """Certificate that the broker's own is checked against, PEM; None: those that the machine trusts."""
+
+
+def broker_address(text: str, *, password: str | None = None, authority: Path | None = None) -> BrokerAddress:
+    """Return what `HOST`, `HOST:PORT` or `mqtt[s]://[USER[:PASSWORD]@]HOST[:PORT]` says. Raises InputError."""
+    parts = urlsplit(text if "://" in text else f"mqtt://{text}")
+    try:
+        port = parts.port
+    except ValueError:
+        port = 0
+    tls = parts.scheme == "mqtts"
+    if parts.scheme not in ("mqtt", "mqtts") or not parts.hostname or port == 0:
+        raise InputError("not a broker", where="--mqtt", found=text, expected="HOST:PORT, mqtt://… or mqtts://…")
+    user = unquote(parts.username) if parts.username else ("femsense" if password else None)
+    known = unquote(parts.password) if parts.password else password
+    return BrokerAddress(parts.hostname, port or (TLS_PORT if tls else PLAIN_PORT), user, known, tls, authority)
+
+
+class MqttSink:
+    """Sends a hub's messages to a broker; comes back by itself where the broker goes away.
+
+    While there is no broker nothing is kept: what is retained is sent again when it is back, all else is old by then. Where the
+    program ends without a word, the broker says for the first robot that it is lost (the last will).
+    """
+
+    def __init__(self, hub: Hub, address: BrokerAddress, robot: str) -> None:
+        """Connect in the background, for the robot whose loss the broker is to announce. Raises MissingDependency."""
+        self.hub = hub
+        self._status = topic(robot, STATUS)
+        self._client = make_client(address)
+        self._client.will_set(self._status, status_bytes("lost"), qos=0, retain=True)
+        self._client.on_connect = self._greet
+        self.connected = Event()
+        self._client.on_disconnect = lambda *_: self.connected.clear()
+        self._client.connect_async(address.host, address.port, keepalive=5)
+        self._client.loop_start()
+        hub.attach(self)
+
+    def send(self, messages: tuple[Message, ...]) -> None:
+        """Hand messages to the broker if there is one; returns at once."""
+        if not self.connected.is_set():
+            return
+        for message in messages:
+            self._client.publish(message.topic, message.payload, qos=0, retain=message.retained)
+
+    def close(self) -> None:
+        """Take leave, so that the will is not executed."""
+        self._client.disconnect()
+        self._client.loop_stop()
+
+    def _greet(self, client: Client, _data: Any, _flags: Any, reason: Any, _more: Any) -> None:
+        if reason.is_failure:
+            return
+        self.connected.set()
+        self.send(tuple(message for message in self.hub.newest().values() if message.retained))
+
+
+class MqttSource:
+    """Receives from a broker what streams there."""
+
+    def __init__(self, address: BrokerAddress, receive: Callable[[Message], None], *, topics: str = f"{PREFIX}/#") -> None:
+        """Call receive(message) in a thread of its own, for the topics that a filter names. Raises MissingDependency."""
+        self._client = make_client(address)
+        self._client.on_connect = lambda client, *_: client.subscribe(topics)
+        self._client.on_message = lambda _c, _d, got: receive(Message(got.topic, bytes(got.payload)))
+        self._client.connect_async(address.host, address.port, keepalive=5)
+        self._client.loop_start()
+
+    def send(self, message: Message) -> None:
+        """Publish a message."""
+        self._client.publish(message.topic, message.payload, qos=0)
+
+    def close(self) -> None:
+        """Leave the broker."""
+        self._client.disconnect()
+        self._client.loop_stop()
+
+
+def make_client(address: BrokerAddress) -> Client:
+    """Return a client that is not connected yet. Raises MissingDependency, InputError."""
+    try:
+        from paho.mqtt.client import Client
+        from paho.mqtt.enums import CallbackAPIVersion
+    except ImportError:
+        raise MissingDependency("MQTT needs the package paho-mqtt\n  try:      pip install 'femsense[xr]'") from None
+    client = Client(CallbackAPIVersion.VERSION2)
+    client.reconnect_delay_set(0.2, 5.0)  # type: ignore[arg-type]
+    client.on_socket_open = _without_delay
+    if address.user is not None:
+        client.username_pw_set(address.user, address.password)
+    if address.tls:
+        try:
+            client.tls_set_context(ssl.create_default_context(cafile=address.authority))
+        except (OSError, ssl.SSLError) as error:
+            raise InputError("not a certificate", where=address.authority, found=error, expected="a PEM file") from None
+    return client
+
+
+def _without_delay(_client: Any, _data: Any, endpoint: Any) -> None:
+    """Send small messages at once (Nagle's rule would hold them up to 40 ms)."""
+    with contextlib.suppress(OSError, AttributeError):
+        endpoint.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+
+class EmbeddedBroker:
+    """A broker in this program, for clients on this machine; a sink of a hub, so that messages reach clients in one step."""
+
+    def __init__(self, hub: Hub, *, port: int = PLAIN_PORT) -> None:
+        """Start to serve on 127.0.0.1. Raises MissingDependency, InputError where the port is taken."""
+        try:
+            import amqtt.broker  # noqa: F401
+        except ImportError:
+            raise MissingDependency("a broker needs the package amqtt\n  try:      pip install 'femsense[xr]'") from None
+        self.port = port or _free_port()
+        self._loop = asyncio.new_event_loop()
+        self._broker: Any = None
+        self._waiting: dict[str, Message] = {}
+        self._failed: BaseException | None = None
+        self._finish = asyncio.Event()
+        ready = Event()
+        self._thread = Thread(target=self._run, args=(ready,), daemon=True, name="femsense-broker")
+        self._thread.start()
+        ready.wait()
+        if self._failed is not None:
+            raise InputError(
+                "the broker cannot be served", where=f"port {port}", found=self._failed, hint="--mqtt HOST, if one runs there"
+            ) from None
+        hub.attach(self)
+
+    def send(self, messages: tuple[Message, ...]) -> None:
+        """Hand messages to clients; returns at once."""
+        with contextlib.suppress(RuntimeError):  # the loop was closed meanwhile
+            self._loop.call_soon_threadsafe(self._take, messages)
+
+    def close(self) -> None:
+        """Let clients go and free the port."""
+        with contextlib.suppress(RuntimeError):
+            self._loop.call_soon_threadsafe(self._finish.set)
+        self._thread.join(5.0)
+
+    # ---- in the thread of the broker
+
+    def _run(self, ready: Event) -> None:
+        asyncio.set_event_loop(self._loop)
+        try:
+            self._loop.run_until_complete(self._serve(ready))
+        finally:
+            self._loop.close()
+
+    async def _serve(self, ready: Event) -> None:
+        from amqtt.broker import Broker
+
+        for name in ("amqtt", "transitions"):
+            logging.getLogger(name).setLevel(logging.CRITICAL)
+        plugins: dict[str, Any] = {"amqtt.plugins.authentication.AnonymousAuthPlugin": {"allow_anonymous": True}}
+        settings: dict[str, Any] = {
+            "listeners": {"default": {"type": "tcp", "bind": f"127.0.0.1:{self.port}", "max_connections": 64}},
+            "plugins": plugins,
+        }
+        try:
+            self._broker = Broker(settings)
+            await self._broker.start()
+        except Exception as error:  # amqtt wraps what the system says in errors of its own
+            self._failed = error.__cause__ or error
+            ready.set()
+            return
+        ready.set()
+        await self._finish.wait()
+        with contextlib.suppress(Exception):
+            await asyncio.wait_for(self._broker.shutdown(), 3.0)
+        for task in asyncio.all_tasks() - {asyncio.current_task()}:
+            task.cancel()
+
+    def _take(self, messages: tuple[Message, ...]) -> None:
+        """Start to deliver, unless the last delivery is still going on: then the newest of each topic waits."""
+        idle = not self._waiting
+        self._waiting.update((message.topic, message) for message in messages)
+        if idle and self._waiting:
+            self._task = self._loop.create_task(self._deliver())
+
+    async def _deliver(self) -> None:
+        while self._waiting:
+            messages = list(self._waiting.values())
+            for message in messages:
+                if message.retained:
+                    await self._broker.retain_message(None, message.topic, message.payload, 0)
+                await self._broker.internal_message_broadcast(message.topic, message.payload, 0)
+            for message in messages:
+                if self._waiting.get(message.topic) is message:
+                    del self._waiting[message.topic]
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])

@@ -1,0 +1,292 @@
+"""What is sent about a robot: topics, and the bytes of each.
+
+A pose is a header of 20 bytes and seven numbers a bone, little-endian:
+
+    "FSP1" · seq uint32 · time float64 [s] · bones uint16 · 0 uint16 · (x y z qx qy qz qw) float32 each, robot frame [m]
+
+A cloud is the same header with "FSC1" and a count uint32, then (x y z residual) float32 of each point [m]. All else is JSON that
+Unity's JsonUtility reads: objects at the top, no dictionaries, unknown numbers left out.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from femsense.core.arrays import FloatArray, freeze
+from femsense.core.errors import InputError
+
+PREFIX = "femsense"
+MODEL, GLB, POSE, POSE_JSON, FORCE, INPUTS, CLOUD, STATUS = (
+    "model",
+    "glb",
+    "pose",
+    "pose_json",
+    "force",
+    "inputs",
+    "cloud",
+    "status",
+)
+DRAG, GHOST, REACH, COMMAND = "drag", "ghost", "reach", "command"
+RETAINED = (MODEL, GLB, STATUS)
+"""Kept by the broker, so that who comes late has them at once."""
+SCHEMA = "femsense-model-1"
+POSE_HEAD = struct.Struct("<4sIdHH")
+CLOUD_HEAD = struct.Struct("<4sIdI")
+POSE_MAGIC, CLOUD_MAGIC = b"FSP1", b"FSC1"
+MOST_BONES, MOST_POINTS = 255, 20_000
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Pose:
+    """The bones of a robot at one time."""
+
+    seq: int
+    time_s: float
+    bones: npt.NDArray[np.float32]
+    """x y z [m] and the quaternion x y z w of each bone, robot frame, shape (B, 7)."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Input:
+    """What drives a robot, and how far it may go."""
+
+    name: str
+    unit: str
+    """"N", "m" or "Pa"; for sensors the unit of their file, or ""."""
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Handle:
+    """A point of the body that may be dragged."""
+
+    name: str
+    position_m: FloatArray
+    """At rest, robot frame, shape (3,)."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Twin:
+    """What stays the same of a robot that streams."""
+
+    name: str
+    glb: bytes
+    """Its skinned mesh; its bones are those of the poses."""
+    bone_names: tuple[str, ...]
+    T_robot_bone: FloatArray
+    """Bones at rest [m], shape (B, 4, 4)."""
+    inputs: tuple[Input, ...] = ()
+    handles: tuple[Handle, ...] = ()
+    commands: bool = False
+    """Whether commands may be published once a viewer arms them."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Contact:
+    """One contact as it is sent; nan where something is not known."""
+
+    contact: int
+    point_m: FloatArray
+    """shape (3,)."""
+    force_n: FloatArray
+    """On the body, shape (3,)."""
+    std_n: float = float("nan")
+    force_std_n: FloatArray = field(default_factory=lambda: np.full(3, np.nan))
+    """Of each component, shape (3,)."""
+    point_std_m: FloatArray = field(default_factory=lambda: np.full(3, np.nan))
+    """shape (3,)."""
+    radius_m: float = float("nan")
+    source: str = ""
+    track: int = 0
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class TwinFrame:
+    """What is sent of one moment."""
+
+    time_s: float
+    bones: npt.NDArray[np.float32]
+    """As in `Pose`, shape (B, 7)."""
+    contacts: tuple[Contact, ...] = ()
+    inputs: tuple[float, ...] = ()
+    """One value for each of the twin's inputs."""
+    residual_m: float = float("nan")
+    status: str = ""
+    frame: int = -1
+    """Number in the recording; -1: none."""
+    cloud: npt.NDArray[np.float32] | None = None
+    """Measured points and their distance from the surface [m], shape (n, 4)."""
+
+
+def topic(robot: str, kind: str) -> str:
+    """Return `femsense/<robot>/<kind>`; characters that topics give a meaning to become "_"."""
+    return f"{PREFIX}/{re.sub(r'[^A-Za-z0-9._-]', '_', robot) or '_'}/{kind}"
+
+
+def split_topic(text: str) -> tuple[str, str] | None:
+    """Return (robot, kind) of a topic of ours, else None."""
+    parts = text.split("/")
+    return (parts[1], parts[2]) if len(parts) == 3 and parts[0] == PREFIX and parts[1] and parts[2] else None
+
+
+# Poses and clouds
+
+
+def bone_rows(T_robot_bone: npt.ArrayLike) -> npt.NDArray[np.float32]:
+    """Return x y z qx qy qz qw of poses, shape (…, B, 7), of matrices, shape (…, B, 4, 4)."""
+    from scipy.spatial.transform import Rotation
+
+    T = np.asarray(T_robot_bone, dtype=np.float64)
+    flat = T.reshape(-1, 4, 4)
+    rows = np.concatenate([flat[:, :3, 3], Rotation.from_matrix(flat[:, :3, :3]).as_quat()], axis=1)
+    return rows.reshape(*T.shape[:-2], 7).astype(np.float32)
+
+
+def pose_bytes(seq: int, time_s: float, bones: npt.NDArray[np.float32]) -> bytes:
+    """Return a pose message of bones, shape (B, 7)."""
+    head = POSE_HEAD.pack(POSE_MAGIC, seq & 0xFFFFFFFF, time_s, len(bones), 0)
+    return head + np.ascontiguousarray(bones, dtype="<f4").tobytes()
+
+
+def read_pose(payload: bytes) -> Pose:
+    """Return the pose in a message. Raises InputError."""
+    if len(payload) < POSE_HEAD.size:
+        raise InputError("not a pose", where="payload", found=f"{len(payload)} bytes", expected="a header of 20 bytes")
+    magic, seq, time_s, count, _ = POSE_HEAD.unpack_from(payload)
+    size = POSE_HEAD.size + 28 * count
+    if magic != POSE_MAGIC or len(payload) != size or count > MOST_BONES:
+        raise InputError(
+            "not a pose", where="payload", found=f"{magic!r}, {count} bones, {len(payload)} bytes", expected=f"FSP1, {size} bytes"
+        )
+    bones = np.frombuffer(payload, "<f4", 7 * count, POSE_HEAD.size).reshape(count, 7)
+    return Pose(seq, time_s, freeze(bones, np.float32))
+
+
+def cloud_bytes(seq: int, time_s: float, points: npt.ArrayLike) -> bytes:
+    """Return a message of measured points and residuals [m], shape (n, 4)."""
+    rows = np.ascontiguousarray(points, dtype="<f4").reshape(-1, 4)[:MOST_POINTS]
+    return CLOUD_HEAD.pack(CLOUD_MAGIC, seq & 0xFFFFFFFF, time_s, len(rows)) + rows.tobytes()
+
+
+# Documents
+
+
+def header(seq: int, time_s: float, frame_id: str) -> dict[str, Any]:
+    """Return a header as ROS 1 has it, and Unity's messages after it."""
+    secs = int(np.floor(time_s))
+    return {"seq": seq, "stamp": {"secs": secs, "nsecs": round(1e9 * (time_s - secs))}, "frame_id": frame_id}
+
+
+def model_bytes(twin: Twin, glb_url: str) -> bytes:
+    """Return the retained description of a twin."""
+    import hashlib
+
+    bones = [{"name": name, **_pose_table(row)} for name, row in zip(twin.bone_names, bone_rows(twin.T_robot_bone))]
+    return _json(
+        {
+            "schema": SCHEMA,
+            "name": twin.name,
+            "glb": glb_url,
+            "glb_sha256": hashlib.sha256(twin.glb).hexdigest(),
+            "frame": "robot: right-handed, Z up",
+            "length_unit": "m",
+            "force_unit": "N",
+            "pose": "FSP1",
+            "bones": bones,
+            "inputs": [_known({"name": i.name, "unit": i.unit, "low": i.low, "high": i.high}) for i in twin.inputs],
+            "handles": [{"name": h.name, "position_m": _vector(h.position_m)} for h in twin.handles],
+            "commands": twin.commands,
+        }
+    )
+
+
+def force_bytes(seq: int, frame: TwinFrame) -> bytes:
+    """Return contacts and forces of a moment, robot frame, with standard deviations."""
+    document = {
+        "header": header(seq, frame.time_s, "robot"),
+        "frame": frame.frame,
+        "status": frame.status,
+        "residual_m": frame.residual_m,
+        "contacts": [_contact_table(contact) for contact in frame.contacts],
+    }
+    return _json(_known(document))
+
+
+def inputs_bytes(seq: int, time_s: float, inputs: Sequence[Input], values: Sequence[float]) -> bytes:
+    """Return what drives the robot at a moment."""
+    rows = [_known({"name": i.name, "unit": i.unit, "value": float(v)}) for i, v in zip(inputs, values)]
+    return _json({"header": header(seq, time_s, "robot"), "inputs": rows})
+
+
+def pose_json_bytes(seq: int, time_s: float, bones: npt.NDArray[np.float32]) -> bytes:
+    """Return the pose for Unity's JsonUtility, in Unity's own left-handed frame.
+
+    x changes its sign, as glTF importers for Unity do it; so do y and z of the quaternion. These are local poses of the bones under
+    the node `robot_frame` of the GLB file, or under any transform that is turned by −90° about x.
+    """
+    return _json({"header": header(seq, time_s, "unity"), "poses": [_pose_table(row) for row in in_unity(bones)]})
+
+
+def in_unity(bones: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """Return rows x y z qx qy qz qw, shape (…, 7), mirrored at the plane x = 0: from right-handed to left-handed."""
+    return bones * np.array([-1.0, 1.0, 1.0, 1.0, -1.0, -1.0, 1.0], dtype=np.float32)
+
+
+def status_bytes(state: str, detail: str = "") -> bytes:
+    """Return a status: "live", "ended" (by us) or "lost" (said by the broker in our place)."""
+    return _json({"state": state, "detail": detail})
+
+
+def read_document(payload: bytes, *, most: int = 1 << 20) -> dict[str, Any] | None:
+    """Return a JSON object, or None for anything else: too long, not UTF-8, not JSON, not an object."""
+    if len(payload) > most:
+        return None
+    try:
+        value = json.loads(payload)
+    except (ValueError, RecursionError):
+        return None
+    return value if isinstance(value, dict) else None
+
+
+def _contact_table(contact: Contact) -> dict[str, Any]:
+    c = contact
+    known = _known({"std_n": c.std_n, "radius_m": c.radius_m})
+    vectors = {"force_std_n": c.force_std_n, "point_std_m": c.point_std_m}
+    known |= {name: _vector(value) for name, value in vectors.items() if np.isfinite(value).all()}
+    return {
+        "contact": c.contact,
+        "track": c.track,
+        "source": c.source,
+        "point_m": _vector(c.point_m),
+        "force_n": _vector(c.force_n),
+        "size_n": float(np.linalg.norm(c.force_n)),
+        **known,
+    }
+
+
+def _pose_table(row: npt.NDArray[np.float32]) -> dict[str, Any]:
+    x, y, z, qx, qy, qz, qw = (round(float(v), 9) for v in row)
+    return {"position": {"x": x, "y": y, "z": z}, "orientation": {"x": qx, "y": qy, "z": qz, "w": qw}}
+
+
+def _vector(values: npt.ArrayLike) -> dict[str, float]:
+    x, y, z = (float(v) for v in np.asarray(values))
+    return {"x": x, "y": y, "z": z}
+
+
+def _known(table: Mapping[str, Any]) -> dict[str, Any]:
+    """Leave out numbers that are not finite: JSON has none."""
+    return {key: value for key, value in table.items() if not (isinstance(value, float) and not np.isfinite(value))}
+
+
+def _json(value: Mapping[str, Any]) -> bytes:
+    return json.dumps(value, allow_nan=False, separators=(",", ":")).encode()

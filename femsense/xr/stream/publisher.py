@@ -1,0 +1,129 @@
+"""From frames of a twin to messages, at a limited rate."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from threading import Event
+
+from femsense.xr.stream.hub import Hub, Message
+from femsense.xr.stream.payloads import (
+    CLOUD,
+    FORCE,
+    GLB,
+    INPUTS,
+    MODEL,
+    POSE,
+    POSE_JSON,
+    STATUS,
+    Twin,
+    TwinFrame,
+    cloud_bytes,
+    force_bytes,
+    inputs_bytes,
+    model_bytes,
+    pose_bytes,
+    pose_json_bytes,
+    status_bytes,
+    topic,
+)
+
+EARLY = 0.2
+"""A frame may come early by this share of the shortest interval: clocks of sources jitter, and 60 Hz should not become 30."""
+
+
+@dataclass(frozen=True, slots=True)
+class PublishOptions:
+    """What is sent, and how often at most."""
+
+    rate_hz: float = 60.0
+    """Of poses and forces."""
+    cloud_rate_hz: float = 10.0
+    """Of clouds: they are large."""
+    json_mirror: bool = False
+    """Also `pose_json`, for clients that read only text."""
+    glb_url: str = ""
+    """Where the mesh can be loaded; by default beside the page."""
+
+
+class RateLimit:
+    """Says whether something may go out now; what comes too early is dropped, since newer is on its way."""
+
+    def __init__(self, rate_hz: float) -> None:
+        self._interval = 1.0 / rate_hz
+        self._next = float("-inf")
+
+    def allows(self, now: float) -> bool:
+        """Return whether a message at this time [s] may go out."""
+        if now < self._next - EARLY * self._interval:
+            return False
+        self._next = max(self._next, now - EARLY * self._interval) + self._interval
+        return True
+
+
+class Publisher:
+    """Sends one twin's frames into a hub."""
+
+    def __init__(self, hub: Hub, twin: Twin, options: PublishOptions | None = None) -> None:
+        """Announce the twin: its mesh, its description, and that it is live."""
+        self.hub, self.twin = hub, twin
+        self.options = options or PublishOptions()
+        self.sent = 0
+        self._pose_limit, self._cloud_limit = RateLimit(self.options.rate_hz), RateLimit(self.options.cloud_rate_hz)
+        glb = topic(twin.name, GLB)
+        url = self.options.glb_url or f"robots/{glb.split('/')[1]}.glb"
+        self.hub.publish(
+            [
+                Message(glb, twin.glb),
+                Message(topic(twin.name, MODEL), model_bytes(twin, url)),
+                Message(topic(twin.name, STATUS), status_bytes("live")),
+            ]
+        )
+
+    def publish(self, frame: TwinFrame, *, now: float | None = None) -> bool:
+        """Send a frame unless the rate forbids it; return whether it was sent."""
+        moment = time.monotonic() if now is None else now
+        if not self._pose_limit.allows(moment):
+            return False
+        seq, name, t = self.sent, self.twin.name, frame.time_s
+        messages = [
+            Message(topic(name, POSE), pose_bytes(seq, t, frame.bones)),
+            Message(topic(name, FORCE), force_bytes(seq, frame)),
+        ]
+        if frame.inputs:
+            messages.append(Message(topic(name, INPUTS), inputs_bytes(seq, t, self.twin.inputs, frame.inputs)))
+        if self.options.json_mirror:
+            messages.append(Message(topic(name, POSE_JSON), pose_json_bytes(seq, t, frame.bones)))
+        if frame.cloud is not None and self._cloud_limit.allows(moment):
+            messages.append(Message(topic(name, CLOUD), cloud_bytes(seq, t, frame.cloud)))
+        self.hub.publish(messages)
+        self.sent += 1
+        return True
+
+    def end(self, detail: str = "") -> None:
+        """Say that nothing more comes."""
+        self.hub.publish([Message(topic(self.twin.name, STATUS), status_bytes("ended", detail))])
+
+
+def play(
+    publisher: Publisher,
+    frames: Iterable[TwinFrame],
+    stop: Event,
+    *,
+    clock: Callable[[], float] = time.monotonic,
+) -> None:
+    """Send frames at their own times, the first at once, until they end or `stop` is set.
+
+    Arguments:
+        publisher: of the twin that the frames are of.
+        frames: in order of time.
+        stop: ends it.
+        clock: [s].
+    """
+    begun: float | None = None
+    for frame in frames:
+        begun = clock() - frame.time_s if begun is None else begun
+        if stop.wait(max(0.0, begun + frame.time_s - clock())):
+            return
+        publisher.publish(frame)

@@ -1,0 +1,194 @@
+"""A run as a stream: its bones, forces and inputs at its own times, over and over."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from femsense.core.arrays import FloatArray, freeze
+from femsense.core.errors import FemsenseError
+from femsense.xr.glb_reader import AnimatedSkin, read_glb
+from femsense.xr.run_contents import contacts_of_run, current_glb, run_folder
+from femsense.xr.stream.payloads import Contact, Input, Twin, TwinFrame
+
+CLOUD_POINTS = 3000
+"""Of a measured cloud that are shown."""
+CLOUD_REACH = 0.1
+"""Points farther from the surface than this share of the body's size are its surroundings."""
+PAUSE_S = 0.5
+"""Between the end of a run and its next beginning."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class RunStream:
+    """A run that can be streamed."""
+
+    twin: Twin
+    skin: AnimatedSkin
+    frames: tuple[Mapping[str, Any], ...]
+    """As `contacts_of_run` has them, one for each pose."""
+    clouds: tuple[npt.NDArray[np.float32] | None, ...]
+    """Measured points and residuals [m], shape (n, 4), of each pose."""
+
+    @property
+    def duration_s(self) -> float:
+        """From the first frame to the last."""
+        return float(self.skin.time_s[-1])
+
+
+def open_run(folder: str | Path, *, name: str | None = None, clouds: bool = True) -> RunStream:
+    """Read a run folder; its mesh is made where it is missing.
+
+    Arguments:
+        folder: of `femsense estimate`.
+        name: of the robot in topics; by default the run's own.
+        clouds: read the recording's clouds too, where they are still there.
+
+    Raises:
+        InputError: no readable states, or a broken table.
+    """
+    run = run_folder(folder)
+    told = contacts_of_run(run)
+    with tempfile.TemporaryDirectory(prefix="femsense-stream-") as scratch:
+        glb = current_glb(run, Path(scratch)).read_bytes()
+    skin = read_glb(glb)
+    skeleton = skin.skin.skeleton
+    twin = Twin(
+        name=name or str(told["name"]),
+        glb=glb,
+        bone_names=skeleton.names,
+        T_robot_bone=skeleton.T_robot_bone,
+        inputs=tuple(Input(**entry) for entry in told["inputs"]),
+    )
+    frames = tuple(told["frames"])
+    measured = _clouds(run, frames) if clouds else None
+    return RunStream(twin, skin, frames, measured or (None,) * len(frames))
+
+
+def frames_of(stream: RunStream, *, rate_hz: float = 60.0, loop: bool = True) -> Iterator[TwinFrame]:
+    """Yield frames at a rate; bones are interpolated between those of the run, all else is that of the nearest.
+
+    Arguments:
+        stream: of `open_run`.
+        rate_hz: frames a second.
+        loop: begin again after a short pause, for ever.
+    """
+    times = stream.skin.time_s
+    count = max(1, int(np.floor(stream.duration_s * rate_hz)) + 1)
+    offset = 0.0
+    while True:
+        for k in range(count):
+            t = min(k / rate_hz, stream.duration_s)
+            yield _frame(stream, t, offset + t, int(np.abs(times - t).argmin()))
+        if not loop:
+            return
+        waiting = int(PAUSE_S * rate_hz)
+        for k in range(waiting):
+            yield _frame(stream, stream.duration_s, offset + stream.duration_s + (k + 1) / rate_hz, len(times) - 1)
+        offset += stream.duration_s + (waiting + 1) / rate_hz
+
+
+def between(times: FloatArray, bones: npt.NDArray[np.float32], t: float) -> npt.NDArray[np.float32]:
+    """Return bones (B, 7) at a time [s]: linear between two frames (F, B, 7), quaternions made unit again."""
+    k = int(np.clip(np.searchsorted(times, t, side="right") - 1, 0, max(len(times) - 2, 0)))
+    if len(times) == 1:
+        return np.asarray(bones[0])
+    share = np.float32(np.clip((t - times[k]) / (times[k + 1] - times[k]), 0.0, 1.0))
+    rows = (1 - share) * bones[k] + share * bones[k + 1]
+    rows[:, 3:] /= np.linalg.norm(rows[:, 3:], axis=1, keepdims=True)
+    return np.asarray(rows)
+
+
+def _frame(stream: RunStream, t: float, sent_at: float, nearest: int) -> TwinFrame:
+    told = stream.frames[nearest]
+    inputs = told["inputs"] or ()
+    return TwinFrame(
+        time_s=sent_at,
+        bones=between(stream.skin.time_s, stream.skin.bones, t),
+        contacts=tuple(_contact(c) for c in told["contacts"] if c["point_m"] and c["force_vector_n"]),
+        inputs=tuple(_or_nan(value) for value in inputs),
+        residual_m=_or_nan(told["rms_after_m"]),
+        status=told["status"] or "",
+        frame=-1 if told["frame"] is None else told["frame"],
+        cloud=stream.clouds[nearest],
+    )
+
+
+def _contact(told: Mapping[str, Any]) -> Contact:
+    unknown = np.full(3, np.nan)
+    return Contact(
+        contact=told["contact"],
+        point_m=np.array(told["point_m"]),
+        force_n=np.array(told["force_vector_n"]),
+        std_n=_or_nan(told["std_n"]),
+        force_std_n=unknown if told["force_std_n"] is None else np.array(told["force_std_n"]),
+        point_std_m=unknown if told["point_std_m"] is None else np.array(told["point_std_m"]),
+        radius_m=_or_nan(told["radius_m"]),
+        source=told["source"],
+        track=told["track"],
+    )
+
+
+def _or_nan(value: float | None) -> float:
+    return float("nan") if value is None else value
+
+
+# Clouds of the recording
+
+
+def _clouds(run: Path, frames: tuple[Mapping[str, Any], ...]) -> tuple[npt.NDArray[np.float32] | None, ...] | None:
+    """Return the clouds of all frames; None where the recording or the calibration is no longer there."""
+    from femsense.calib.files import read_calibration
+    from femsense.io.clouds.frame_clouds import read_frame_cloud
+    from femsense.io.recording_folder import load_recording
+    from femsense.sensing.run_files import read_states
+
+    try:
+        document = json.loads((run / "run.json").read_text(encoding="utf-8"))
+        recording = load_recording(document["inputs"]["recording"]["path"])
+        poses = read_calibration(run / "calibration.json").poses
+        states = read_states(run / "states.npz")
+    except (OSError, ValueError, KeyError, TypeError, FemsenseError):
+        return None
+    numbers = {int(number): k for k, number in enumerate(recording.frame_numbers)}
+    found: list[npt.NDArray[np.float32] | None] = []
+    for told, nodes in zip(frames, states.nodes_m):
+        k = numbers.get(told["frame"], -1)
+        try:
+            clouds = [read_frame_cloud(recording, k, view=v) for v in range(len(poses))] if k >= 0 else []
+        except FemsenseError:
+            clouds = []
+        points = [cloud.points @ T[:3, :3].T + T[:3, 3] for cloud, T in zip(clouds, poses) if cloud is not None]
+        found.append(with_residuals(np.vstack(points), nodes, states.tets) if points else None)
+    return tuple(found)
+
+
+def with_residuals(points: FloatArray, nodes: npt.ArrayLike, tets: npt.ArrayLike) -> npt.NDArray[np.float32]:
+    """Return the points near a body with their signed distance from its surface, shape (k, 4) [m], > 0 outside.
+
+    Arguments:
+        points: measured, robot frame [m], shape (n, 3); an even choice of them is kept.
+        nodes: of the body [m], shape (m, 3).
+        tets: its tetrahedra, shape (t, 4) or (t, 10).
+    """
+    from femsense.fem.mesh import TetMesh, surface_triangles
+    from femsense.pointcloud.rays import Surface
+
+    mesh = TetMesh(np.asarray(nodes, dtype=np.float64), np.asarray(tets))
+    size = float(np.linalg.norm(np.ptp(mesh.nodes, axis=0)))
+    reach = CLOUD_REACH * size
+    inside = ((points > mesh.nodes.min(axis=0) - reach) & (points < mesh.nodes.max(axis=0) + reach)).all(axis=1)
+    some = points[inside]
+    some = some[:: max(1, -(-len(some) // CLOUD_POINTS))]
+    if not len(some):
+        return np.zeros((0, 4), dtype=np.float32)
+    _, distance, _, _ = Surface(mesh.nodes, surface_triangles(mesh)).closest(some)
+    rows = np.column_stack([some, distance])[np.abs(distance) <= reach]
+    return freeze(rows, np.float32)

@@ -1,0 +1,330 @@
+"""The page and its WebSocket: one port, one thread, the newest message of each topic to every viewer.
+
+A frame of the WebSocket holds one or more messages: topic length uint16, payload length uint32 (little-endian), topic, payload.
+Each viewer has its own set of messages that wait, one a topic: a slow one misses some and holds up nobody.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import logging
+import socket
+import struct
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from http import HTTPStatus
+from pathlib import Path
+from threading import Event, Lock, Thread
+from typing import TYPE_CHECKING
+
+from femsense.core.errors import InputError, MissingDependency
+from femsense.xr.stream.access import COOKIE, Access, same_origin
+from femsense.xr.stream.hub import Hub, Message
+from femsense.xr.stream.payloads import DRAG, GLB, split_topic, topic
+
+if TYPE_CHECKING:
+    from websockets.asyncio.server import Server, ServerConnection
+    from websockets.http11 import Request, Response
+
+ENTRY = struct.Struct("<HI")
+SMALLEST_BUFFER = 1 << 16
+"""Of a socket that sends [bytes]: what waits there is old when it arrives."""
+LARGEST_FRAME, MOST_FRAMES = 4096, 240
+"""Of what a viewer sends: bytes a frame, and frames a second."""
+TYPES = {
+    ".html": "text/html; charset=utf-8",
+    ".css": "text/css; charset=utf-8",
+    ".js": "text/javascript; charset=utf-8",
+    ".json": "application/json",
+    ".glb": "model/gltf-binary",
+    ".txt": "text/plain; charset=utf-8",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class ServerOptions:
+    """Limits of the server."""
+
+    port: int = 0
+    """0 takes a free one."""
+    most_viewers: int = 64
+    ping_s: float = 10.0
+    """A viewer that does not answer within this time twice is let go."""
+
+
+def pack(messages: Iterable[Message]) -> bytes:
+    """Return messages as one frame."""
+    parts = []
+    for message in messages:
+        name = message.topic.encode()
+        parts += [ENTRY.pack(len(name), len(message.payload)), name, message.payload]
+    return b"".join(parts)
+
+
+def unpack(frame: bytes) -> Iterator[Message]:
+    """Yield the messages of a frame. Raises InputError where it is cut off."""
+    at = 0
+    while at < len(frame):
+        try:
+            name, size = ENTRY.unpack_from(frame, at)
+            body = at + ENTRY.size + name
+            if body + size > len(frame):
+                raise ValueError
+            yield Message(frame[at + ENTRY.size : body].decode(), frame[body : body + size])
+        except (struct.error, ValueError):
+            raise InputError("not a frame of messages", where=f"byte {at}", found=f"{len(frame)} bytes") from None
+        at = body + size
+
+
+class _Viewer:
+    """What waits for one viewer."""
+
+    def __init__(self) -> None:
+        self.waiting: dict[str, Message] = {}
+        self.wake = asyncio.Event()
+        self.gone = False
+
+    def offer(self, messages: Mapping[str, Message]) -> None:
+        self.waiting.update(messages)
+        self.wake.set()
+
+    def leave(self) -> None:
+        self.gone = True
+        self.wake.set()
+
+    def take(self) -> list[Message]:
+        taken, self.waiting = list(self.waiting.values()), {}
+        self.wake.clear()
+        return taken
+
+
+class WebSocketServer:
+    """Serves the page, the meshes and `/ws` from a thread of its own; a sink of a hub."""
+
+    def __init__(
+        self, hub: Hub, page: Mapping[str, bytes | Path], *, access: Access | None = None, options: ServerOptions | None = None
+    ) -> None:
+        """Start to serve.
+
+        Arguments:
+            hub: whose messages viewers get.
+            page: name → content of the files of the page.
+            access: who may watch.
+            options: port and limits.
+
+        Raises:
+            InputError: the address cannot be used.
+            MissingDependency: the package websockets is not installed.
+        """
+        require_websockets()
+        self.hub, self.page = hub, page
+        self.access, self.options = access or Access(), options or ServerOptions()
+        self.port = 0
+        self._viewers: set[_Viewer] = set()
+        self._fresh: dict[str, Message] = {}
+        self._lock = Lock()
+        self._loop = asyncio.new_event_loop()
+        self._finish: asyncio.Event | None = None
+        self._failed: BaseException | None = None
+        ready = Event()
+        self._thread = Thread(target=self._run, args=(self.access.tls(), ready), daemon=True, name="femsense-websocket")
+        self._thread.start()
+        ready.wait()
+        if self._failed is not None:
+            raise InputError(
+                "the stream cannot be served",
+                where=f"{self.access.host}, port {self.options.port}",
+                found=self._failed,
+                hint="port 0 takes a free one",
+            ) from None
+        hub.attach(self)
+
+    @property
+    def url(self) -> str:
+        """Where the page is."""
+        host = "127.0.0.1" if self.access.host in ("0.0.0.0", "::", "localhost") else self.access.host
+        return f"{self.access.scheme}://{f'[{host}]' if ':' in host else host}:{self.port}/"
+
+    @property
+    def viewers(self) -> int:
+        """How many watch now."""
+        return len(self._viewers)
+
+    def send(self, messages: tuple[Message, ...]) -> None:
+        """Hand messages to all viewers; returns at once."""
+        with self._lock:
+            first = not self._fresh
+            self._fresh.update((message.topic, message) for message in messages if not message.topic.endswith(f"/{GLB}"))
+            first = first and bool(self._fresh)
+        if first:
+            with contextlib.suppress(RuntimeError):  # the loop was closed meanwhile
+                self._loop.call_soon_threadsafe(self._hand_out)
+
+    def close(self) -> None:
+        """Let all viewers go and free the port."""
+        with contextlib.suppress(RuntimeError):
+            self._loop.call_soon_threadsafe(lambda: self._finish.set() if self._finish is not None else None)
+        self._thread.join(5.0)
+
+    # ---- in the thread of the server
+
+    def _run(self, tls: object, ready: Event) -> None:
+        asyncio.set_event_loop(self._loop)
+        try:
+            self._loop.run_until_complete(self._serve(tls, ready))
+        finally:
+            self._loop.close()
+
+    async def _serve(self, tls: object, ready: Event) -> None:
+        from websockets.asyncio.server import serve
+
+        quiet = logging.getLogger("femsense.stream")
+        quiet.addHandler(logging.NullHandler())
+        quiet.propagate = False
+        self._finish = asyncio.Event()
+        try:
+            server: Server = await serve(
+                self._attend,
+                self.access.host,
+                self.options.port,
+                ssl=tls,
+                process_request=self._answer,
+                compression=None,
+                max_size=LARGEST_FRAME,
+                max_queue=8,
+                write_limit=SMALLEST_BUFFER,
+                ping_interval=self.options.ping_s,
+                ping_timeout=self.options.ping_s,
+                close_timeout=1.0,
+                server_header=None,
+                logger=quiet,
+            )
+        except OSError as error:
+            self._failed = error
+            ready.set()
+            return
+        self.port = next(iter(server.sockets)).getsockname()[1]
+        ready.set()
+        await self._finish.wait()
+        server.close()
+        with contextlib.suppress(asyncio.TimeoutError):
+            await asyncio.wait_for(server.wait_closed(), 3.0)
+
+    def _hand_out(self) -> None:
+        with self._lock:
+            fresh, self._fresh = self._fresh, {}
+        for viewer in self._viewers:
+            viewer.offer(fresh)
+
+    async def _attend(self, connection: ServerConnection) -> None:
+        """Send to one viewer until it leaves; what it sends is read beside."""
+        from websockets.exceptions import ConnectionClosed
+
+        endpoint = connection.transport.get_extra_info("socket")
+        if endpoint is not None:
+            endpoint.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            endpoint.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SMALLEST_BUFFER)
+        viewer = _Viewer()
+        viewer.offer({name: message for name, message in self.hub.newest().items() if not name.endswith(f"/{GLB}")})
+        self._viewers.add(viewer)
+        listening = asyncio.create_task(self._listen(connection))
+        listening.add_done_callback(lambda _: viewer.leave())
+        try:
+            while not viewer.gone:
+                await viewer.wake.wait()
+                waiting = viewer.take()
+                if waiting:
+                    await connection.send(pack(waiting))
+        except ConnectionClosed:
+            pass
+        finally:
+            self._viewers.discard(viewer)
+            listening.cancel()
+
+    async def _listen(self, connection: ServerConnection) -> None:
+        """Pass on what a viewer wants of the robot; garbage and floods end the connection."""
+        from websockets.exceptions import ConnectionClosed
+
+        second, count = 0, 0
+        with contextlib.suppress(ConnectionClosed):
+            async for frame in connection:
+                now = int(self._loop.time())
+                second, count = (now, 1) if now != second else (second, count + 1)
+                wanted = _wanted(frame) if count <= MOST_FRAMES else None
+                if wanted is None:
+                    await connection.close(1008, "not understood" if count <= MOST_FRAMES else "too much")
+                    return
+                self.hub.received(wanted, str(connection.id))
+
+    async def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
+        """Answer a request for a file; None lets a viewer in."""
+        headers, path = request.headers, request.path.partition("?")[0]
+        host = headers.get("Host")
+        if not self.access.knows_host(host) or not same_origin(headers.get("Origin"), host):
+            return _response(HTTPStatus.FORBIDDEN, b"not from there\n")
+        if not self.access.allows(headers.get("Authorization"), headers.get("Cookie")):
+            await asyncio.sleep(0.3)  # who guesses waits
+            return _response(HTTPStatus.UNAUTHORIZED, b"a password is needed\n", {"WWW-Authenticate": 'Basic realm="femsense"'})
+        if path == "/ws":
+            full = len(self._viewers) >= self.options.most_viewers
+            return _response(HTTPStatus.SERVICE_UNAVAILABLE, b"too many viewers\n") if full else None
+        content = self._content(path.lstrip("/") or "index.html")
+        if content is None:
+            return _response(HTTPStatus.NOT_FOUND, b"not here\n")
+        more = {"Content-Type": TYPES.get(Path(path if path != "/" else "index.html").suffix, "application/octet-stream")}
+        if self.access.password is not None:
+            secure = "; Secure" if self.access.scheme == "https" else ""
+            more["Set-Cookie"] = f"{COOKIE}={self.access.ticket}; HttpOnly; SameSite=Strict; Path=/{secure}"
+        return _response(HTTPStatus.OK, content, more)
+
+    def _content(self, name: str) -> bytes | None:
+        """Return a file of the page, or the mesh of a robot; nothing else is ever read."""
+        if name.startswith("robots/") and name.endswith(".glb"):
+            message = self.hub.newest().get(topic(name[len("robots/") : -len(".glb")], GLB))
+            return None if message is None else message.payload
+        if name == "stream.json":
+            return json.dumps({"format": "femsense-stream-1"}).encode()
+        content = self.page.get(name)
+        try:
+            return content.read_bytes() if isinstance(content, Path) else content
+        except OSError:
+            return None
+
+
+def _wanted(frame: str | bytes) -> Message | None:
+    """Return what a viewer sent if it is a message that viewers may send."""
+    if isinstance(frame, str):
+        return None
+    try:
+        messages = list(unpack(frame))
+    except InputError:
+        return None
+    known = split_topic(messages[0].topic) if len(messages) == 1 else None
+    return messages[0] if known is not None and known[1] == DRAG else None
+
+
+def _response(status: HTTPStatus, body: bytes, more: Mapping[str, str] | None = None) -> Response:
+    from websockets.datastructures import Headers
+    from websockets.http11 import Response
+
+    headers = Headers(
+        {
+            "Content-Type": "text/plain; charset=utf-8",
+            "Content-Length": str(len(body)),
+            "Connection": "close",
+            "Cache-Control": "no-store",
+            "X-Content-Type-Options": "nosniff",
+            **(more or {}),
+        }
+    )
+    return Response(status.value, status.phrase, headers, body)
+
+
+def require_websockets() -> None:
+    """Raise MissingDependency where the package is not installed."""
+    try:
+        import websockets  # noqa: F401
+    except ImportError:
+        raise MissingDependency("streams need the package websockets\n  try:      pip install 'femsense[xr]'") from None

@@ -1,0 +1,183 @@
+"""Brokers: embedded and mosquitto; retained models, the last will, brokers that die and come back, bridges."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from streams import GLB, PAGE, closing, moment, twin, within, x_of
+
+from femsense.core.errors import InputError
+from femsense.xr.stream.bridge import Bridge
+from femsense.xr.stream.hub import Hub, Message
+from femsense.xr.stream.mqtt import BrokerAddress, EmbeddedBroker, MqttSink, MqttSource, broker_address
+from femsense.xr.stream.publisher import Publisher, PublishOptions
+from femsense.xr.stream.websocket import ServerOptions, WebSocketServer
+
+pytest.importorskip("paho.mqtt.client")
+pytest.importorskip("amqtt")
+MOSQUITTO = shutil.which("mosquitto") or shutil.which("mosquitto", path="/usr/sbin")
+needs_mosquitto = pytest.mark.skipif(MOSQUITTO is None, reason="no mosquitto on this machine")
+
+
+class Heard:
+    """What an MQTT client hears."""
+
+    def __init__(self, port: int) -> None:
+        self.messages: dict[str, bytes] = {}
+        self.source = MqttSource(BrokerAddress("127.0.0.1", port), self.take)
+
+    def take(self, message: Message) -> None:
+        self.messages[message.topic.rpartition("/")[2]] = message.payload
+
+    def state(self) -> str:
+        return str(json.loads(self.messages.get("status", b"{}")).get("state"))
+
+    def close(self) -> None:
+        self.source.close()
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+@contextmanager
+def mosquitto(folder: Path, port: int) -> Iterator[subprocess.Popen[bytes]]:
+    settings = folder / "mosquitto.conf"
+    settings.write_text(f"listener {port} 127.0.0.1\nallow_anonymous true\nset_tcp_nodelay true\n", encoding="utf-8")
+    with subprocess.Popen([str(MOSQUITTO), "-c", str(settings)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        assert within(5.0, lambda: answers(port))
+        yield process
+        process.terminate()
+
+
+def answers(port: int) -> bool:
+    try:
+        socket.create_connection(("127.0.0.1", port), 0.2).close()
+    except OSError:
+        return False
+    return True
+
+
+def test_the_embedded_broker_has_the_model_for_who_comes_late_and_the_pose_for_all() -> None:
+    hub = Hub()
+    publisher = Publisher(hub, twin(), PublishOptions(json_mirror=True))
+    broker = EmbeddedBroker(hub, port=0)
+    heard = Heard(broker.port)
+    with closing(heard, hub):
+        assert within(5.0, lambda: {"glb", "model", "status"} <= heard.messages.keys())
+        assert heard.messages["glb"] == GLB and heard.state() == "live"
+        publisher.publish(moment(0.0, x=0.5))
+        assert within(5.0, lambda: {"pose", "force", "inputs", "pose_json"} <= heard.messages.keys())
+        assert x_of(heard.messages["pose"]) == 0.5
+        publisher.end()
+        assert within(5.0, lambda: heard.state() == "ended")
+
+
+def test_a_taken_port_is_said() -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        with pytest.raises(InputError, match="broker cannot be served"):
+            EmbeddedBroker(Hub(), port=taken.getsockname()[1])
+
+
+@needs_mosquitto
+def test_a_broker_that_dies_and_comes_back_gets_all_again(tmp_path: Path) -> None:
+    hub, port = Hub(), free_port()
+    publisher = Publisher(hub, twin())
+    sink = MqttSink(hub, BrokerAddress("127.0.0.1", port), "arm")  # there is no broker yet
+    with closing(hub):
+        with mosquitto(tmp_path, port):
+            assert sink.connected.wait(10.0)
+        assert within(5.0, lambda: not sink.connected.is_set())
+        publisher.publish(moment(0.0))  # nobody hears it, nothing breaks
+        with mosquitto(tmp_path, port):
+            heard = Heard(port)
+            with closing(heard):
+                assert within(10.0, lambda: heard.state() == "live" and heard.messages.get("glb") == GLB)
+                time.sleep(0.02)
+                publisher.publish(moment(1.0, x=0.75))
+                assert within(5.0, lambda: x_of(heard.messages.get("pose", bytes(80))) == 0.75)
+
+
+@needs_mosquitto
+def test_a_program_that_is_killed_is_announced_as_lost(tmp_path: Path) -> None:
+    port = free_port()
+    code = (
+        "import sys, time; from streams import twin; from femsense.xr.stream.hub import Hub\n"
+        "from femsense.xr.stream.mqtt import BrokerAddress, MqttSink; from femsense.xr.stream.publisher import Publisher\n"
+        f"hub = Hub(); Publisher(hub, twin()); MqttSink(hub, BrokerAddress('127.0.0.1', {port}), 'arm'); time.sleep(60)"
+    )
+    with mosquitto(tmp_path, port):
+        heard = Heard(port)
+        paths = f"import sys; sys.path[:0] = {sys.path!r}\n"
+        with subprocess.Popen([sys.executable, "-c", paths + code]) as program, closing(heard):
+            assert within(20.0, lambda: heard.state() == "live")
+            program.send_signal(signal.SIGKILL)
+            assert within(10.0, lambda: heard.state() == "lost")
+
+
+def test_a_bridge_brings_a_broker_to_the_page() -> None:
+    there, here = Hub(), Hub()
+    broker = EmbeddedBroker(there, port=0)
+    publisher = Publisher(there, twin())
+    bridge = Bridge(here, f"mqtt://127.0.0.1:{broker.port}")
+    with closing(bridge, there):
+        assert within(5.0, lambda: "femsense/arm/glb" in here.newest() and "femsense/arm/model" in here.newest())
+        publisher.publish(moment(0.0, x=0.5))
+        assert within(5.0, lambda: "femsense/arm/pose" in here.newest())
+
+
+def test_a_bridge_brings_another_page_s_stream_comes_back_and_takes_wishes_along() -> None:
+    there, here, wishes = Hub(), Hub(), []
+    publisher = Publisher(there, twin())
+    there.listen(lambda message, _: wishes.append(message.payload))
+    server = WebSocketServer(there, PAGE)
+    bridge = Bridge(here, server.url)
+    with closing(bridge, there):
+        assert within(5.0, lambda: "femsense/arm/model" in here.newest())
+        assert here.newest()["femsense/arm/glb"].payload == GLB
+        here.received(Message("femsense/arm/drag", b"{}"), "me")
+        assert within(5.0, lambda: wishes == [b"{}"])
+        server.close()
+        assert within(5.0, lambda: b"lost" in here.newest()["femsense/arm/status"].payload)
+        again = WebSocketServer(there, PAGE, options=ServerOptions(port=server.port))
+        with closing(again):
+            assert within(5.0, lambda: b"live" in here.newest()["femsense/arm/status"].payload)
+            publisher.publish(moment(1.0, x=0.5))
+            assert within(5.0, lambda: "femsense/arm/pose" in here.newest())
+            assert x_of(here.newest()["femsense/arm/pose"].payload) == 0.5
+
+
+@pytest.mark.parametrize(
+    ("text", "wanted"),
+    [
+        ("box", ("box", 1883, None, False)),
+        ("box:1999", ("box", 1999, None, False)),
+        ("mqtts://me:pa%20ss@box", ("box", 8883, "me", True)),
+    ],
+)
+def test_addresses_of_brokers(text: str, wanted: tuple[object, ...]) -> None:
+    address = broker_address(text)
+    assert (address.host, address.port, address.user, address.tls) == wanted
+    assert address.password == ("pa ss" if address.user else None) and "pa ss" not in repr(address)
+
+
+@pytest.mark.parametrize("text", ["", "box:port", "http://box", "box:99999"])
+def test_what_is_no_broker_is_refused(text: str) -> None:
+    with pytest.raises(InputError, match="not a broker"):
+        broker_address(text)
+    with pytest.raises(InputError, match="not a stream"):
+        Bridge(Hub(), "ftp://x")

@@ -1,0 +1,70 @@
+"""Rates, order, and what a hub tells whom."""
+
+from __future__ import annotations
+
+import threading
+
+from streams import moment, twin
+
+from femsense.xr.stream.hub import Hub, Message
+from femsense.xr.stream.publisher import Publisher, PublishOptions, RateLimit, play
+
+
+class Kept:
+    """A sink that keeps what it is given."""
+
+    def __init__(self) -> None:
+        self.batches: list[tuple[Message, ...]] = []
+
+    def send(self, messages: tuple[Message, ...]) -> None:
+        self.batches.append(messages)
+
+    def close(self) -> None:
+        self.batches.clear()
+
+    def topics(self) -> list[str]:
+        return [message.topic.rpartition("/")[2] for batch in self.batches for message in batch]
+
+
+def test_a_source_of_the_wanted_rate_passes_with_its_jitter_and_a_faster_one_is_thinned() -> None:
+    limit = RateLimit(60.0)
+    assert sum(limit.allows(k / 60 + (0.002 if k % 2 else 0.0)) for k in range(600)) == 600
+    limit = RateLimit(60.0)
+    assert 595 <= sum(limit.allows(k / 1000) for k in range(10_000)) <= 606
+
+
+def test_who_comes_late_is_told_the_model_and_the_newest() -> None:
+    hub, late = Hub(), Kept()
+    publisher = Publisher(hub, twin(), PublishOptions(json_mirror=True))
+    publisher.publish(moment(0.0), now=0.0)
+    publisher.publish(moment(1.0, x=0.5), now=1.0)
+    hub.attach(late)
+    assert late.topics() == ["glb", "model", "status", "pose", "force", "inputs", "pose_json"]
+    assert {m.topic for m in late.batches[0] if m.retained} == {f"femsense/arm/{k}" for k in ("glb", "model", "status")}
+
+
+def test_messages_of_a_moment_go_together_and_too_many_do_not_go() -> None:
+    hub, sink = Hub(), Kept()
+    publisher = Publisher(hub, twin())
+    hub.attach(sink)
+    sink.batches.clear()
+    assert publisher.publish(moment(0.0), now=0.0) and not publisher.publish(moment(0.001), now=0.001)
+    assert sink.topics() == ["pose", "force", "inputs"] and len(sink.batches) == 1
+    publisher.end()
+    assert b"ended" in hub.newest()["femsense/arm/status"].payload
+
+
+def test_frames_are_played_at_their_times() -> None:
+    hub, sink = Hub(), Kept()
+    publisher, now = Publisher(hub, twin()), [100.0]
+
+    class Waiting(threading.Event):
+        def wait(self, timeout: float | None = None) -> bool:
+            now[0] += timeout or 0.0
+            times.append(now[0] - 100.0)
+            return False
+
+    times: list[float] = []
+    play(publisher, [moment(t) for t in (2.0, 2.5, 4.0)], Waiting(), clock=lambda: now[0])
+    hub.attach(sink)
+    assert times == [0.0, 0.5, 2.0] and publisher.sent >= 1
