@@ -1,0 +1,1 @@
+"""From proprioceptive sensors to markers to bones: the networks of the XR paper, and better ones."""

@@ -1,0 +1,166 @@
+"""A learnt model of a robot's own sensors: readings in, markers and bones out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from femsense.core.arrays import FloatArray
+from femsense.core.errors import InputError
+from femsense.xr.armature import Armature, BonePoses, poses_from_matrices
+from femsense.xr.proprioception.domain import Domain, Outside
+from femsense.xr.proprioception.memory import step_memory, with_memory
+from femsense.xr.proprioception.network import Network
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ProprioceptiveModel:
+    """From readings to markers (`markers`) and bones (`armature`), with a check of what comes in (`check`)."""
+
+    channels: tuple[str, ...]
+    """Names of the readings, in the order of a row."""
+    marker_names: tuple[str, ...]
+    network: Network
+    """From readings and their filters to the coordinates of the markers [m]."""
+    memory_s: tuple[float, ...]
+    """Time constants of the filters [s]; none: the readings of one moment are enough."""
+    domain: Domain
+    """Of what was learnt."""
+    chain: Armature | None
+    """Bones on the curve through the markers; None where there is a single marker."""
+    bones: Network | None = None
+    """The end-to-end network, from readings to 9 numbers a bone (place, x axis, z axis); None: bones from the markers."""
+    report: dict[str, Any] = field(default_factory=dict)
+    """How it was learnt, and its errors on what was held out."""
+
+    def __repr__(self) -> str:
+        error = self.report.get("error_mm")
+        stated = f", {error:.2g} mm on held-out blocks" if isinstance(error, float) else ""
+        return (
+            f"ProprioceptiveModel({len(self.channels)} channels → {len(self.marker_names)} markers, {self.network.kind}{stated})"
+        )
+
+    def markers(self, rows: npt.ArrayLike, time_s: npt.ArrayLike | None = None) -> FloatArray:
+        """Return the markers [m], shape (m, 3) for one row of readings, shape (c,), or (n, m, 3) for several, shape (n, c).
+
+        Arguments:
+            rows: readings. One row is taken as steady; of a stream, `live` remembers what came before.
+            time_s: when several rows were read [s], shape (n,); needed where the model has a memory.
+
+        Raises:
+            InputError: another number of channels, or no times for a model with memory.
+        """
+        x, single = self._rows(rows)
+        y = self.network(self._inputs(x, single, time_s)).reshape(len(x), -1, 3)
+        return np.asarray(y[0] if single else y)
+
+    def armature(self, row: npt.ArrayLike) -> BonePoses:
+        """Return the bones of one steady row of readings, shape (c,). Raises InputError as `markers`, and where there is no chain."""
+        x, _ = self._rows(row)
+        return self.bones_of(self._inputs(x[:1], True, None))
+
+    def bones_of(self, inputs: FloatArray) -> BonePoses:
+        """Return the bones of one row of readings with their filters, shape (1, d)."""
+        if self.bones is not None:
+            return bones_from_numbers(self.bones(inputs)[0])
+        return self._chain()(self.network(inputs).reshape(-1, 3))
+
+    def check(self, row: npt.ArrayLike) -> tuple[Outside, ...]:
+        """Return the channels of a row, shape (c,), that read what was never learnt, the farthest first; empty where all is well."""
+        return self.domain.check(self._rows(row)[0][0], self.channels)
+
+    @property
+    def bone_names(self) -> tuple[str, ...]:
+        """Name of each bone."""
+        return self._chain().names
+
+    @property
+    def rest_bones(self) -> BonePoses:
+        """The bones at rest."""
+        return self._chain().rest
+
+    def live(self) -> LiveModel:
+        """Return a follower of a stream of readings."""
+        return LiveModel(self)
+
+    def _chain(self) -> Armature:
+        if self.chain is None:
+            raise InputError(
+                "one marker makes no chain of bones", where="markers", found=self.marker_names, expected="two or more"
+            )
+        return self.chain
+
+    def _rows(self, rows: npt.ArrayLike) -> tuple[FloatArray, bool]:
+        x = np.asarray(rows, dtype=np.float64)
+        if x.ndim not in (1, 2) or x.shape[-1] != len(self.channels):
+            expected = f"{len(self.channels)} channels: {', '.join(self.channels)}"
+            raise InputError("another number of channels", where="rows", found=x.shape, expected=expected)
+        return np.atleast_2d(x), x.ndim == 1
+
+    def _inputs(self, x: FloatArray, steady: bool, time_s: npt.ArrayLike | None) -> FloatArray:
+        if steady or not self.memory_s:
+            return np.tile(x, (1, 1 + len(self.memory_s)))
+        if time_s is None:
+            raise InputError("this model has a memory", where="time_s", found=None, expected="the time of each row [s]")
+        return with_memory(np.asarray(time_s, dtype=np.float64), x, self.memory_s)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class LivePose:
+    """What one row of a stream says."""
+
+    markers: FloatArray
+    """[m], shape (m, 3)."""
+    bones: BonePoses | None
+    """None where the model has no chain."""
+    outside: tuple[Outside, ...]
+    """Channels that read what was never learnt."""
+
+
+class LiveModel:
+    """Follows a stream of readings, row by row; keeps what the model's memory needs."""
+
+    def __init__(self, model: ProprioceptiveModel) -> None:
+        self.model = model
+        self._memory: FloatArray | None = None
+        self._time_s = 0.0
+
+    def step(self, row: npt.ArrayLike, time_s: float) -> LivePose:
+        """Return markers and bones of a row, shape (c,), read at `time_s` [s].
+
+        Where a reading is no finite number, the pose is nan and `outside` says which: keep showing the last good one.
+        """
+        model = self.model
+        x = model._rows(row)[0][0]
+        outside = model.domain.check(x, model.channels)
+        if not np.isfinite(x).all():
+            return LivePose(np.full((len(model.marker_names), 3), np.nan), None, outside)
+        taus = np.asarray(model.memory_s)
+        past = np.tile(x, (len(taus), 1)) if self._memory is None else step_memory(self._memory, x, time_s - self._time_s, taus)
+        self._memory, self._time_s = past, time_s
+        inputs = np.concatenate([x, past.ravel()])[None]
+        markers = model.network(inputs).reshape(-1, 3)
+        bones = None
+        if model.chain is not None:
+            bones = model.chain(markers) if model.bones is None else model.bones_of(inputs)
+        return LivePose(markers, bones, outside)
+
+
+def bone_numbers(poses: BonePoses) -> FloatArray:
+    """Return what an end-to-end network learns of bones: place [m], x axis and z axis of each, shape (9 b,)."""
+    T = poses.T_robot_bone
+    return np.concatenate([T[:, :3, 3], T[:, :3, 0], T[:, :3, 2]], axis=1).ravel()
+
+
+def bones_from_numbers(numbers: FloatArray) -> BonePoses:
+    """Return bones from 9 numbers each, the axes made orthogonal (z first, then x; Zhou et al. 2019)."""
+    place, x, z = np.split(numbers.reshape(-1, 9), 3, axis=1)
+    z = z / np.maximum(np.linalg.norm(z, axis=1, keepdims=True), 1e-12)
+    x = x - (x * z).sum(axis=1, keepdims=True) * z
+    x = x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-12)
+    T = np.tile(np.eye(4), (len(place), 1, 1))
+    T[:, :3, 0], T[:, :3, 1], T[:, :3, 2], T[:, :3, 3] = x, np.cross(z, x), z, place
+    return poses_from_matrices(T)

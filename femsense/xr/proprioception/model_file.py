@@ -1,0 +1,116 @@
+"""A model as one ONNX file: its networks as a graph that any runtime computes, and what else it knows as metadata.
+
+Inputs of the graph: `readings` (rows, c) and, where the model has a memory, `filtered` (rows, k c). Outputs: `markers` (rows, 3 m)
+and, of an end-to-end network, `bones` (rows, 9 b). Metadata: the key `femsense` holds JSON.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from femsense.core.arrays import FloatArray, freeze
+from femsense.core.errors import InputError
+from femsense.io.files import json_text
+from femsense.xr.armature import Armature
+from femsense.xr.proprioception.domain import Domain
+from femsense.xr.proprioception.model import ProprioceptiveModel
+from femsense.xr.proprioception.network import KINDS, Network
+from femsense.xr.proprioception.onnx_file import Graph, Node, network_nodes, read_onnx, write_onnx
+
+FORMAT = "femsense-proprioception-1"
+KEY = "femsense"
+NUMBERS = ("centre", "scale", "B", "b", "A", "C", "d")
+TURNED = ("B", "A", "C")
+"""Stored so that rows of inputs are multiplied from the left."""
+DOMAIN = ("low", "high", "centre", "scale", "precision", "limit")
+CHAIN = ("rest_points", "knots", "at", "normal")
+
+
+def save_model(model: ProprioceptiveModel, path: str | Path) -> Path:
+    """Write a model as an ONNX file and return its path."""
+    width = len(model.channels)
+    inputs = {"readings": width}
+    nodes = []
+    source = "readings"
+    if model.memory_s:
+        inputs["filtered"] = width * len(model.memory_s)
+        nodes.append(Node("Concat", ("readings", "filtered"), "inputs", {"axis": 1}))
+        source = "inputs"
+    networks = {"markers": model.network} | ({"bones": model.bones} if model.bones is not None else {})
+    numbers: dict[str, npt.NDArray[np.float32]] = {}
+    for name, network in networks.items():
+        found, constants = network_nodes(name, network.kind, source)
+        nodes += found
+        stored = _stored(network)
+        numbers |= {f"{name}.{key}": stored[key] for key in constants}
+    outputs = {name: len(network.d) for name, network in networks.items()}
+    target = Path(path)
+    write_onnx(target, Graph(tuple(nodes), inputs, outputs, numbers), {KEY: json_text(_document(model, networks), indent=None)})
+    return target
+
+
+def load_model(path: str | Path) -> ProprioceptiveModel:
+    """Return the model of an ONNX file that `save_model` or `femsense learn` wrote; needs no runtime.
+
+    Raises:
+        InputError: no such file, or one of another kind.
+    """
+    numbers, text = read_onnx(path)
+    document = json.loads(text.get(KEY, "{}"))
+    if document.get("format") != FORMAT:
+        raise InputError("not a model of femsense learn", where=path, found=document.get("format"), expected=FORMAT)
+    chain = document["chain"]
+    return ProprioceptiveModel(
+        tuple(document["channels"]),
+        tuple(document["markers"]),
+        _network("markers", document["networks"]["markers"], numbers),
+        tuple(document["memory_s"]),
+        Domain(*(freeze(document["domain"][key]) for key in DOMAIN)),
+        None if chain is None else Armature(*(freeze(chain[key]) for key in CHAIN), chain["planar"], chain["inextensible"]),
+        _network("bones", document["networks"]["bones"], numbers) if "bones" in document["networks"] else None,
+        document["report"],
+    )
+
+
+def _document(model: ProprioceptiveModel, networks: dict[str, Network]) -> dict[str, Any]:
+    chain = model.chain
+    return {
+        "format": FORMAT,
+        "channels": model.channels,
+        "markers": model.marker_names,
+        "memory_s": model.memory_s,
+        "networks": {name: network.kind for name, network in networks.items()},
+        "domain": {key: getattr(model.domain, key) for key in DOMAIN},
+        "chain": None
+        if chain is None
+        else {key: getattr(chain, key) for key in CHAIN} | {"planar": chain.planar, "inextensible": chain.inextensible},
+        "report": model.report,
+    }
+
+
+def _stored(network: Network) -> dict[str, npt.NDArray[np.float32]]:
+    """Return the constants of a graph. Of radial units: −½ |z − B|² = z·B − ½ |B|² − ½ |z|²."""
+    numbers = {key: getattr(network, key) for key in NUMBERS}
+    if network.kind == "radial":
+        numbers |= {"b": -0.5 * (network.B**2).sum(axis=1), "half": np.full((len(network.centre), 1), -0.5)}
+    return {key: np.asarray(array.T if key in TURNED else array, dtype=np.float32) for key, array in numbers.items()}
+
+
+def _network(name: str, kind: str, numbers: dict[str, npt.NDArray[np.float32]]) -> Network:
+    if kind not in KINDS:
+        raise InputError("unknown kind of network", where=name, found=kind, expected=" | ".join(KINDS))
+    wide, high = len(numbers[f"{name}.centre"]), len(numbers[f"{name}.d"])
+    none = {"B": np.zeros((wide, 0)), "b": np.zeros(0), "A": np.zeros((0, high))}
+
+    def array(key: str) -> FloatArray:
+        stored = numbers.get(f"{name}.{key}", none.get(key))
+        if stored is None:
+            raise InputError("a constant is missing", where=f"{name}.{key}")
+        return freeze(stored.T if key in TURNED else stored)
+
+    return Network(kind, *(array(key) for key in NUMBERS))

@@ -1,0 +1,90 @@
+"""One layer of hidden units with a linear path beside it: the form of every map that is learnt here.
+
+y = A φ(z) + C z + d,   z = scale · (x − centre)
+φ_j = 1 / (1 + exp(−(B z + b)_j))   "sigmoid"      φ_j = exp(−½ |z − B_j|²)   "radial"      no φ   "linear"
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from femsense.core.arrays import FloatArray
+
+KINDS = ("linear", "sigmoid", "radial")
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Network:
+    """A map from inputs, shape (n, d), to outputs, shape (n, o)."""
+
+    kind: str
+    """One of `KINDS`."""
+    centre: FloatArray
+    """shape (d,), in the units of the inputs."""
+    scale: FloatArray
+    """shape (d,), one over those units."""
+    B: FloatArray
+    """Weights of the hidden units, or their centres, shape (h, d); h = 0 where there are none."""
+    b: FloatArray
+    """shape (h,)."""
+    A: FloatArray
+    """shape (o, h)."""
+    C: FloatArray
+    """shape (o, d)."""
+    d: FloatArray
+    """shape (o,)."""
+
+    def __call__(self, x: FloatArray) -> FloatArray:
+        """Return the outputs, shape (n, o), of inputs, shape (n, d)."""
+        z = self.normalised(x)
+        return np.asarray(self.hidden(z) @ self.A.T + z @ self.C.T + self.d)
+
+    def normalised(self, x: FloatArray) -> FloatArray:
+        """Return the inputs without their units, shape (n, d)."""
+        return np.asarray((x - self.centre) * self.scale)
+
+    def hidden(self, z: FloatArray) -> FloatArray:
+        """Return the hidden units of normalised inputs, shape (n, h)."""
+        if self.kind == "radial":
+            return np.asarray(np.exp(-0.5 * squared_distances(z, self.B)))
+        return sigmoid(z @ self.B.T + self.b)
+
+    def followed_by(self, M: FloatArray, shift: FloatArray) -> Network:
+        """Return the network whose outputs are M y + shift, M of shape (o, o)."""
+        return replace(self, A=M @ self.A, C=M @ self.C, d=M @ self.d + shift)
+
+    def with_linear(self, C: FloatArray, d: FloatArray) -> Network:
+        """Return the network with a linear map of the normalised inputs added, C of shape (o, d), d of shape (o,)."""
+        return replace(self, C=self.C + C, d=self.d + d)
+
+
+def linear_network(centre: FloatArray, scale: FloatArray, C: FloatArray, d: FloatArray) -> Network:
+    """Return a network without hidden units."""
+    return Network("linear", centre, scale, np.zeros((0, C.shape[1])), np.zeros(0), np.zeros((len(C), 0)), C, d)
+
+
+def mean_network(networks: list[Network]) -> Network:
+    """Return one network that answers the mean of several of one kind and normalisation."""
+    first, share = networks[0], 1.0 / len(networks)
+    return Network(
+        first.kind,
+        first.centre,
+        first.scale,
+        np.concatenate([net.B for net in networks]),
+        np.concatenate([net.b for net in networks]),
+        share * np.concatenate([net.A for net in networks], axis=1),
+        np.asarray(share * sum(net.C for net in networks)),
+        np.asarray(share * sum(net.d for net in networks)),
+    )
+
+
+def sigmoid(x: FloatArray) -> FloatArray:
+    """Return 1 / (1 + exp(−x)) without overflow."""
+    return np.asarray(0.5 * (1.0 + np.tanh(0.5 * x)))
+
+
+def squared_distances(x: FloatArray, y: FloatArray) -> FloatArray:
+    """Return |x_i − y_j|², shape (n, k), of points (n, d) and (k, d)."""
+    return np.maximum(0.0, (x**2).sum(axis=1)[:, None] + (y**2).sum(axis=1) - 2.0 * x @ y.T)

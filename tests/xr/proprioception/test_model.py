@@ -1,0 +1,146 @@
+"""A model, its file, and what it says of readings that it never saw."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from femsense.core.errors import InputError
+from femsense.xr.armature import ArmatureOptions, make_armature
+from femsense.xr.proprioception.domain import learn_domain
+from femsense.xr.proprioception.memory import with_memory
+from femsense.xr.proprioception.model import ProprioceptiveModel, bone_numbers, bones_from_numbers
+from femsense.xr.proprioception.model_file import load_model, save_model
+from femsense.xr.proprioception.network import KINDS, Network, mean_network
+
+CHANNELS = ("red", "green", "blue")
+REST = np.outer(np.linspace(0, 0.1, 4), [0, 0, 1.0])
+
+
+def some_network(kind: str, inputs: int, outputs: int, rng: np.random.Generator) -> Network:
+    hidden = 0 if kind == "linear" else 7
+    numbers = [(hidden, inputs), (hidden,), (outputs, hidden), (outputs, inputs), (outputs,)]
+    return Network(kind, rng.normal(size=inputs), rng.uniform(0.5, 2.0, inputs), *(0.3 * rng.normal(size=n) for n in numbers))
+
+
+def some_model(kind: str, *, memory: tuple[float, ...] = (), end_to_end: bool = False) -> ProprioceptiveModel:
+    rng = np.random.default_rng(4)
+    inputs = 3 * (1 + len(memory))
+    network = some_network(kind, inputs, 12, rng).followed_by(0.05 * np.eye(12), REST.ravel())
+    chain = make_armature(REST, ArmatureOptions(bones=5))
+    bones = some_network("sigmoid", inputs, 45, rng) if end_to_end else None
+    domain = learn_domain(rng.normal(size=(400, 3)) @ [[1, 0.9, 0], [0, 0.3, 0], [0, 0, 2.0]])
+    return ProprioceptiveModel(CHANNELS, tuple("abcd"), network, memory, domain, chain, bones, {"error_mm": 1.5})
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("memory", [(), (0.1, 1.0)])
+def test_a_model_comes_back_from_its_file(kind: str, memory: tuple[float, ...], tmp_path: Path) -> None:
+    model = some_model(kind, memory=memory, end_to_end=True)
+    back = load_model(save_model(model, tmp_path / "model.onnx"))
+    row = np.array([0.3, -0.8, 1.1])
+    np.testing.assert_allclose(back.markers(row), model.markers(row), atol=1e-6)
+    np.testing.assert_allclose(back.armature(row).T_robot_bone, model.armature(row).T_robot_bone, atol=1e-5)
+    assert (back.channels, back.marker_names, back.memory_s, back.bone_names) == (
+        CHANNELS,
+        tuple("abcd"),
+        memory,
+        model.bone_names,
+    )
+    assert back.report == {"error_mm": 1.5} and "3 channels → 4 markers" in repr(back) and "1.5 mm" in repr(back)
+    np.testing.assert_array_equal(back.domain.low, model.domain.low)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_another_runtime_computes_the_same(kind: str, tmp_path: Path) -> None:
+    onnx, runtime = pytest.importorskip("onnx"), pytest.importorskip("onnxruntime")
+    model = some_model(kind, memory=(0.5,), end_to_end=True)
+    path = save_model(model, tmp_path / "model.onnx")
+    onnx.checker.check_model(onnx.load(path), full_check=True)
+    rng = np.random.default_rng(1)
+    rows, past = rng.normal(size=(2, 5, 3)).astype(np.float32)
+    markers, bones = runtime.InferenceSession(path).run(["markers", "bones"], {"readings": rows, "filtered": past})
+    inputs = np.concatenate([rows, past], axis=1).astype(float)
+    np.testing.assert_allclose(markers, model.network(inputs), atol=1e-5)
+    np.testing.assert_allclose(bones, model.bones(inputs), atol=1e-5)
+
+
+def test_a_stream_gives_what_the_whole_series_gives() -> None:
+    model = some_model("sigmoid", memory=(0.05, 2.0))
+    rng = np.random.default_rng(2)
+    time, rows = np.cumsum(rng.uniform(0.01, 0.03, 30)), rng.normal(size=(30, 3))
+    live = model.live()
+    poses = [live.step(row, t) for row, t in zip(rows, time)]
+    np.testing.assert_allclose([pose.markers for pose in poses], model.markers(rows, time), atol=1e-12)
+    np.testing.assert_allclose(poses[0].markers, model.markers(rows[0]), atol=1e-12)
+    np.testing.assert_allclose(poses[7].bones.T_robot_bone, model.chain(poses[7].markers).T_robot_bone, atol=1e-12)
+    lost = live.step([0.0, np.nan, 1.0], time[-1] + 0.01)
+    assert lost.bones is None and np.isnan(lost.markers).all() and lost.outside[0].text == "green: no number"
+    assert np.isfinite(live.step(rows[0], time[-1] + 0.02).markers).all()
+
+
+def test_filters_follow_a_step_with_their_time_constant() -> None:
+    time = np.array([0.0, 0.1, 0.4, 1.0])
+    inputs = with_memory(time, np.array([[0.0], [1.0], [1.0], [1.0]]), (0.5,))
+    np.testing.assert_allclose(inputs[:, 1], 1.0 - np.exp(-time / 0.5), atol=1e-12)
+
+
+def test_a_reading_outside_what_was_learnt_names_its_channel_and_how_far() -> None:
+    model = some_model("linear")
+    domain = model.domain
+    middle = domain.centre
+    assert model.check(middle) == ()
+    far = middle.copy()
+    far[2] = domain.high[2] + 0.5 * (domain.high[2] - domain.low[2])
+    (found,) = model.check(far)
+    assert (found.channel, found.kind) == ("blue", "range") and found.far == pytest.approx(0.5)
+    assert f"blue = {far[2]:.4g} is outside" in found.text
+    rng = np.random.default_rng(4)
+    together = middle + np.array([1.5, -1.0, 0.0])  # each in its range, but red and green go together
+    assert {item.channel for item in model.check(together)} == {"red", "green"}
+    assert all(item.kind == "joint" and item.far > 0 for item in model.check(together))
+    fresh = rng.normal(size=(400, 3)) @ [[1, 0.9, 0], [0, 0.3, 0], [0, 0, 2.0]]
+    assert domain.inside(fresh).mean() > 0.98 and domain.inside(np.array([middle, far, together])).tolist() == [
+        True,
+        False,
+        False,
+    ]
+
+
+def test_bones_and_their_numbers() -> None:
+    poses = make_armature([[0, 0, 0], [0, 0.01, 0.05], [0.02, 0.02, 0.09]]).rest
+    numbers = bone_numbers(poses)
+    np.testing.assert_allclose(bones_from_numbers(numbers).T_robot_bone, poses.T_robot_bone, atol=1e-12)
+    R = bones_from_numbers(numbers + 0.1 * np.random.default_rng(0).normal(size=numbers.shape)).T_robot_bone[:, :3, :3]
+    np.testing.assert_allclose(R @ np.swapaxes(R, 1, 2), np.tile(np.eye(3), (8, 1, 1)), atol=1e-12)
+
+
+def test_the_mean_of_networks_is_one_network() -> None:
+    rng = np.random.default_rng(3)
+    one, two = (some_network("sigmoid", 4, 6, np.random.default_rng(3)), some_network("sigmoid", 4, 6, rng))
+    two = Network(
+        "sigmoid", one.centre, one.scale, *(0.5 * rng.normal(size=x.shape) for x in (one.B, one.b, one.A, one.C, one.d))
+    )
+    x = rng.normal(size=(5, 4))
+    np.testing.assert_allclose(mean_network([one, two])(x), (one(x) + two(x)) / 2, atol=1e-12)
+
+
+def test_what_is_no_model_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="cannot be read"):
+        load_model(tmp_path / "no.onnx")
+    for content in (
+        b"",
+        b"hello, this is text\n",
+        b"\x08\x08",
+        save_model(some_model("linear"), tmp_path / "m.onnx").read_bytes()[:-900],
+    ):
+        (tmp_path / "bad.onnx").write_bytes(content)
+        with pytest.raises(InputError, match=r"not an ONNX model|not a model of femsense"):
+            load_model(tmp_path / "bad.onnx")
+    model = some_model("sigmoid", memory=(1.0,))
+    with pytest.raises(InputError, match="another number of channels"):
+        model.markers([1.0, 2.0])
+    with pytest.raises(InputError, match="has a memory"):
+        model.markers(np.zeros((4, 3)))
