@@ -202,7 +202,7 @@ def import_(
 def mesh(
     surface: Annotated[
         Path,
-        typer.Argument(metavar="SURFACE", help="STL, OBJ, PLY or OFF: triangles around the body; or STEP.", show_default=False),
+        typer.Argument(metavar="SURFACE", help="Triangles around the body (STL, OBJ, PLY, OFF), STEP, or a line with radii (TOML).", show_default=False),
     ],
     output: Annotated[
         Path,
@@ -242,11 +242,22 @@ def mesh(
     """Fill a surface with tetrahedra; start a robot."""
     from femsense.io.meshing.robot_from_surface import MeshOptions, mesh_into, mesh_text
 
+    if surface.suffix.lower() == ".toml":
+        return _line_mesh(surface, output, size=size, most=most, again=again)
     options = MeshOptions(unit, size, most, tolerance, element, close_holes, fill_cavities, part)
     with _progress("mesh") as progress:
         document = mesh_into(output, surface, options, say=_say, again=again, progress=progress)
     text = f"{mesh_text(document)}\n\nwritten: {output}\nlook at it: femsense inspect {output}"
     return Answer(document, text)
+
+
+def _line_mesh(source: Path, output: Path, *, size: float | None, most: int, again: bool) -> Answer:
+    """Make a robot of a line with radii."""
+    from femsense.io.meshing.robot_from_line import line_into, line_text
+
+    with _progress("mesh") as progress:
+        document = line_into(output, source, most_tets=most, along_mm=size, say=_say, again=again, progress=progress)
+    return Answer(document, f"{line_text(document)}\n\nwritten: {output}\nlook at it: femsense inspect {output}")
 
 
 @app.command()

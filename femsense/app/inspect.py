@@ -39,6 +39,7 @@ from femsense.io.recording_toml import recording_problems
 from femsense.io.robot_toml import RobotTable, load_robot, read_declared_mesh, robot_names, robot_problems
 from femsense.io.tables import read_toml
 from femsense.model.recording import Recording, check_against, warn_of_values
+from femsense.model.tie_spacing import warn_of_tie_spacing
 from femsense.model.robot import Robot
 from femsense.rig.script import read_script
 
@@ -319,6 +320,7 @@ def _robot_report(loaded: Robot, document: Mapping[str, Any]) -> Report:
     volume = float(element_volumes(body.mesh).sum())
     mesh = {"file": document["mesh"]["file"], "unit": document["mesh"]["unit"]} | _mesh_report(body.mesh, 1e3)
     _warn_of_quality(mesh["radius_ratio_min"], document["mesh"]["file"])
+    warn_of_tie_spacing(body)
     return {
         "mesh": mesh,
         "material": document["material"],
