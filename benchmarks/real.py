@@ -127,7 +127,16 @@ def row(asked: Asked, minutes: float, loop: bool) -> list[str]:
     """Return the cells of a row."""
     own = asked.robot.parent
     if not loop:
-        return [asked.name, "calibrated", "–", calibrated_rms(asked.robot, asked.train), calibrated_rms(asked.robot, asked.held), "", "", ""]
+        return [
+            asked.name,
+            "calibrated",
+            "–",
+            calibrated_rms(asked.robot, asked.train),
+            calibrated_rms(asked.robot, asked.held),
+            "",
+            "",
+            "",
+        ]
     document = improved(asked, minutes)
     if isinstance(document, str):
         return [asked.name, document, *[""] * (len(HEADING) - 2)]

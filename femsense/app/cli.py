@@ -202,7 +202,11 @@ def import_(
 def mesh(
     surface: Annotated[
         Path,
-        typer.Argument(metavar="SURFACE", help="Triangles around the body (STL, OBJ, PLY, OFF), STEP, or a line with radii (TOML).", show_default=False),
+        typer.Argument(
+            metavar="SURFACE",
+            help="Triangles around the body (STL, OBJ, PLY, OFF), STEP, or a line with radii (TOML).",
+            show_default=False,
+        ),
     ],
     output: Annotated[
         Path,

@@ -39,8 +39,8 @@ from femsense.io.recording_toml import recording_problems
 from femsense.io.robot_toml import RobotTable, load_robot, read_declared_mesh, robot_names, robot_problems
 from femsense.io.tables import read_toml
 from femsense.model.recording import Recording, check_against, warn_of_values
-from femsense.model.tie_spacing import warn_of_tie_spacing
 from femsense.model.robot import Robot
+from femsense.model.tie_spacing import warn_of_tie_spacing
 from femsense.rig.script import read_script
 
 Report = dict[str, Any]

@@ -16,8 +16,8 @@ from femsense.fem.body_parts import Cable
 from femsense.fem.sections import cut_section
 
 HELD = 0.15
-"""Share of Euler's load that a tension may be [1]. The tentacle of docs/bodies.md answers 20 % wrong where it is 0.40, 5 % at 0.24,
-2.8 % at 0.10, 0.9 % at 0.06 and 0.2 % at 0.015."""
+"""Share of Euler's load that a tension may be [1]. The tentacle of docs/bodies.md answers 85 % wrong where it is 0.90, 6.4 % at 0.24,
+1.0 % at 0.06 and 0.2 % at 0.02 (benchmarks/bodies.py)."""
 ONE_TURN = 1.0
 """Where no largest tension is declared, it is taken as the one that bends the body along the path by so much [rad]."""
 

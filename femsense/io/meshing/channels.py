@@ -20,11 +20,12 @@ SEARCHED_WITH, MOST_TRIES = 64, 12
 """Points with which a tension that bends the body is looked for, and how many are tried."""
 STILL = 0.005
 """A path is fine enough where twice the points change the motion by less than this share of it [1]. The tentacle of docs/bodies.md moves
-by 5 % from 16 to 32 points at 4.6 N, by 0.8 % from 32 to 64, and by 0.2 % from 64 to 128."""
+by 6 % from 16 to 32 points at 4.6 N, by 0.8 % from 32 to 64, and by 0.2 % from 64 to 128."""
 GAP = 0.01
 """A pull point that is not given lies so far before the channel [m], straight on."""
-BEND = 0.25
-"""Where the largest tension is not given, paths are tried at one that moves the body by this share of its length [1]."""
+BEND = 0.4
+"""Paths are tried at a tension that moves the body by this share of its length [1], or at the largest one if that is smaller: beyond, bodies
+curl up and answer anything."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -102,8 +103,9 @@ def subdivided(
         return Subdivision(channel.name, channel.points, np.nan, np.nan, np.nan)
     rest = solve_equilibrium(body).positions
     pulled = _Pulled(body, line, channel, rest)
-    tension = channel.max_tension if np.isfinite(channel.max_tension) else pulled.tension_that_moves(BEND * line.length)
-    count, change, moved = points_that_hold(body, line, channel, tension), np.inf, 0.0
+    tension = pulled.tension_that_moves(BEND * line.length)
+    most = channel.max_tension if np.isfinite(channel.max_tension) else tension
+    count, change, moved = points_that_hold(body, line, channel, most), np.inf, 0.0
     before = pulled.at(tension, count)
     while count < MOST and change >= STILL:
         tell(f"{channel.name}: {2 * count} points of its channel at {tension:.3g} N")
@@ -139,16 +141,17 @@ class _Pulled:
         return state.positions if state.converged else None
 
     def tension_that_moves(self, distance: float) -> float:
-        """Return a tension [N] that moves the body so far [m], or half of it where it is lost on the way."""
-        tension = 1e-3
+        """Return a tension [N] that moves the body about so far [m], at most the largest; half of it where the body is lost on the way."""
+        most = self.channel.max_tension
+        tension = min(1e-3, most)
         for _ in range(MOST_TRIES):
             state = self.at(tension, SEARCHED_WITH)
             if state is None:
                 return 0.5 * tension
             moved = _farthest(state, self.rest)
-            if moved > 0.5 * distance:
+            if moved > 0.7 * distance or tension >= most:
                 break
-            tension *= float(np.clip(0.8 * distance / max(moved, 1e-12), 1.5, 10.0))
+            tension = min(most, tension * float(np.clip(distance / max(moved, 1e-12), 1.2, 10.0)))
         return tension
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -289,14 +290,14 @@ def layer_places(line: LineBody, *, most_layers: float, along: float | None = No
                 hint="a larger --max-tets",
             )
     places = [0.0]
-    for low, high in zip(marks[:-1], marks[1:]):
+    for low, high in itertools.pairwise(marks):
         first, last = np.interp([low, high], fine, counted)
         count = max(1, round((last - first) / thickness), _least_layers(line, low, high))
         places += np.interp(np.linspace(first, last, count + 1)[1:], counted, fine).tolist()
-    places = np.array(places)
+    exact = np.array(places)
     for mark in marks:
-        places[np.abs(places - mark).argmin()] = mark
-    return places
+        exact[np.abs(exact - mark).argmin()] = mark
+    return exact
 
 
 def _least_layers(line: LineBody, low: float, high: float) -> int:

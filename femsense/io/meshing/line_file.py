@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -37,7 +37,7 @@ class SectionTable(Schema):
 
     @model_validator(mode="after")
     def _is_one_shape(self) -> SectionTable:
-        pairs = {"width_mm and height_mm": (self.width_mm, self.height_mm)}
+        pairs: dict[str, tuple[object, object]] = {"width_mm and height_mm": (self.width_mm, self.height_mm)}
         pairs["area_mm2 and second_moment_mm4"] = (self.area_mm2, self.second_moment_mm4)
         for names, values in pairs.items():
             if (values[0] is None) != (values[1] is None):
@@ -67,7 +67,9 @@ class ChamberTable(Schema):
     to_mm: Length = Field(description="length along the line where it ends, in millimetres")
     radius_mm: Length | None = Field(None, description="radius of a round chamber in millimetres")
     wall_mm: Length | None = Field(None, description="around the axis: thickness of what is left outside, in millimetres")
-    distance_mm: Annotated[float, Field(ge=0)] = Field(0.0, description="of its middle from the axis in millimetres; 0: around it")
+    distance_mm: Annotated[float, Field(ge=0)] = Field(
+        0.0, description="of its middle from the axis in millimetres; 0: around it"
+    )
     angle_deg: float = Field(0.0, description="angle of its middle about the axis in degrees")
     inner_mm: Length | None = Field(None, description="a sector of a ring: its least distance from the axis, in millimetres")
     outer_mm: Length | None = Field(None, description="a sector of a ring: its largest distance from the axis")
@@ -143,9 +145,10 @@ def line_of(table: LineTable, path: Path) -> LineBody:
         cavities=tuple(cavity_of(chamber) for chamber in table.chambers),
         rings=table.rings,
     )
-    for kind, items in (("chambers", table.chambers), ("bellows", table.bellows)):
-        for i, item in enumerate(items):
-            _require_on_line(item.to_mm, line, f"{path}: {key_path((kind, i, 'to_mm'))}")
+    ends = {"chambers": [c.to_mm for c in table.chambers], "bellows": [b.to_mm for b in table.bellows]}
+    for kind, places in ends.items():
+        for i, end in enumerate(places):
+            _require_on_line(end, line, f"{path}: {key_path((kind, i, 'to_mm'))}")
     return line
 
 
@@ -235,7 +238,10 @@ def _check_steps(points: FloatArray, sections: tuple[Section, ...], path: Path) 
         where = f"{path}: {key_path(('sections', i + 1))}"
         if leg == 0 and (a.half_width, a.half_height) != (b.half_width, b.half_height):
             raise InputError(
-                "a step of the outline", where=where, expected="another at_mm", hint="leave a millimetre between the two: a short cone"
+                "a step of the outline",
+                where=where,
+                expected="another at_mm",
+                hint="leave a millimetre between the two: a short cone",
             )
         if leg > 0 and (a.hole_width > 0) != (b.hole_width > 0):
             raise InputError(
@@ -253,7 +259,9 @@ def _zero(table: LineTable, points: FloatArray, path: Path) -> FloatArray:
     legs = np.diff(points, axis=0)
     first = legs[np.linalg.norm(legs, axis=1) > 0][0]
     tangent = first / np.linalg.norm(first)
-    wanted = np.array(table.angle_zero if table.angle_zero is not None else [1.0, 0.0, 0.0] if abs(tangent[0]) < 0.9 else [0, 0, 1.0])
+    wanted = np.array(
+        table.angle_zero if table.angle_zero is not None else [1.0, 0.0, 0.0] if abs(tangent[0]) < 0.9 else [0, 0, 1.0]
+    )
     across = wanted - (wanted @ tangent) * tangent
     if np.linalg.norm(across) < 1e-6 * max(float(np.linalg.norm(wanted)), 1e-300):
         raise InputError(
@@ -267,8 +275,3 @@ def _require_on_line(along_mm: float, line: LineBody, where: str) -> None:
         raise InputError(
             "is beyond the end of the line", where=where, found=along_mm, expected=f"at most {PER_METRE * line.length:g} mm"
         )
-
-
-def document_of(path: Path) -> dict[str, Any]:
-    """Return the raw tables, for what robot.toml takes over as it is."""
-    return read_toml(path)

@@ -206,7 +206,10 @@ def _point(point: FloatArray) -> list[float]:
 
 def line_text(report: dict[str, Any]) -> str:
     """Return a report as a table."""
-    lines = [quality_text(report["quality"]), f"  {'volume':<19}{1e-3 * report['volume_mm3']:.4g} cm³ along {report['length_mm']:.4g} mm"]
+    lines = [
+        quality_text(report["quality"]),
+        f"  {'volume':<19}{1e-3 * report['volume_mm3']:.4g} cm³ along {report['length_mm']:.4g} mm",
+    ]
     for tendon in report["tendons"]:
         text = f"{tendon['points']} points in its channel"
         if tendon["tension"] is not None and tendon["moved"]:
@@ -216,5 +219,3 @@ def line_text(report: dict[str, Any]) -> str:
             )
         lines.append(f"  {tendon['name']:<19}{text}")
     return "\n".join(lines)
-
-

@@ -55,7 +55,9 @@ def test_volume_and_second_moment(tmp_path: Path, sections: tuple[Any, ...], vol
     assert radius_ratio(mesh).min() > 0.09
 
 
-@pytest.mark.parametrize("sections", [(TUBE, TUBE), CONE, ({"width_mm": 8.0, "height_mm": 6.0},) * 2], ids=["tube", "cone", "bar"])
+@pytest.mark.parametrize(
+    "sections", [(TUBE, TUBE), CONE, ({"width_mm": 8.0, "height_mm": 6.0},) * 2], ids=["tube", "cone", "bar"]
+)
 def test_bends_as_beam_theory_says(tmp_path: Path, sections: tuple[Any, ...]) -> None:
     body_line = line(tmp_path, *sections)
     mesh, along = mesh_line(body_line, most_tets=1500)
@@ -67,7 +69,8 @@ def test_bends_as_beam_theory_says(tmp_path: Path, sections: tuple[Any, ...]) ->
     moved = solve_equilibrium(body, nodal_forces=forces).positions - fine.nodes
     s = np.linspace(0.0, 0.1, 4001)
     where = [
-        cut_section(mesh, np.full(len(mesh.tets), 200e3), np.array([0, 0, -a]), np.array([0, 0, 1.0])) for a in np.linspace(0.001, 0.099, 25)
+        cut_section(mesh, np.full(len(mesh.tets), 200e3), np.array([0, 0, -a]), np.array([0, 0, 1.0]))
+        for a in np.linspace(0.001, 0.099, 25)
     ]
     stiff = np.interp(s, np.linspace(0.001, 0.099, 25), [cut.bending[0] for cut in where if cut])
     expected = 1e-5 * np.trapezoid((0.1 - s) ** 2 / stiff, s)
@@ -75,7 +78,7 @@ def test_bends_as_beam_theory_says(tmp_path: Path, sections: tuple[Any, ...]) ->
 
 
 def test_a_channel_is_subdivided_until_the_answer_stands_still(tmp_path: Path) -> None:
-    tendon = {"name": "t", "distance_mm": [4.0, 2.0], "angle_deg": -90.0, "max_tension_n": 0.3}
+    tendon = {"name": "t", "distance_mm": [4.0, 2.0], "angle_deg": -90.0, "max_tension_n": 0.2}
     source = written(tmp_path, *CONE, tendons=[tendon, tendon | {"name": "u", "angle_deg": 90.0}])
     report = line_into(tmp_path / "robot", source, most_tets=700)
     tried, other = report["tendons"]
@@ -86,13 +89,14 @@ def test_a_channel_is_subdivided_until_the_answer_stands_still(tmp_path: Path) -
     path = robot.body.cables[0].path
     assert len(path) == tried["points"] and path.outside.max() < 1e-9
     np.testing.assert_allclose(path.positions(robot.body.mesh.nodes)[[0, -1]], [[0, 2e-3, -0.1], [0, 4e-3, 0]], atol=1e-9)
-    state = solve_equilibrium(robot.body, tension={"t": 0.3})
-    assert state.positions[:, 1].max() > 0.02 and state.positions[:, 1].min() > -0.01  # towards the tendon
+    state = solve_equilibrium(robot.body, tension={"t": 0.2})
+    assert state.positions[:, 1].max() > 0.01 and state.positions[:, 1].min() > -0.01  # towards the tendon
 
 
 def test_chambers_have_the_volume_that_was_asked_for(tmp_path: Path) -> None:
     beside = [
-        {"name": f"c{i}", "from_mm": 10.0, "to_mm": 90.0, "radius_mm": 1.2, "distance_mm": 3.5, "angle_deg": 120.0 * i} for i in range(3)
+        {"name": f"c{i}", "from_mm": 10.0, "to_mm": 90.0, "radius_mm": 1.2, "distance_mm": 3.5, "angle_deg": 120.0 * i}
+        for i in range(3)
     ]
     line_into(tmp_path / "three", written(tmp_path, {"radius_mm": 6.0}, {"radius_mm": 6.0}, chambers=beside), most_tets=4000)
     robot = load_robot(tmp_path / "three")
@@ -115,7 +119,12 @@ def test_bellows_around_a_chamber(tmp_path: Path) -> None:
     robot = load_robot(tmp_path / "robot")
     inside = 20 * 8**2 + 60 * (6**2 + 0.5 * 2**2)  # radius 8 mm, and 6 + 2 cos where it is folded
     assert chamber_volume(robot.body.chambers[0], robot.body.mesh.nodes) * 1e9 == pytest.approx(np.pi * inside, rel=0.04)
-    straight = line(tmp_path, {"radius_mm": 10.0}, {"radius_mm": 10.0}, chambers=[{"name": "c", "from_mm": 10.0, "to_mm": 90.0, "wall_mm": 2.0}])
+    straight = line(
+        tmp_path,
+        {"radius_mm": 10.0},
+        {"radius_mm": 10.0},
+        chambers=[{"name": "c", "from_mm": 10.0, "to_mm": 90.0, "wall_mm": 2.0}],
+    )
     lengths = []
     for body_line in (straight, line_of(read_line(source), source)):
         mesh = to_quadratic(mesh_line(body_line, most_tets=3000)[0])
@@ -142,7 +151,10 @@ def test_a_curved_line_carries_its_sections_and_channels(tmp_path: Path) -> None
         ({"tendons": [{"name": "t", "distance_mm": 1.0, "end_mm": 300.0}]}, "beyond the end of the line"),
         ({"tendons": [{"name": "t", "distance_mm": 1.0, "end_mm": 20.0, "start_mm": 40.0}]}, "begins behind its end"),
         ({"chambers": [{"name": "c", "from_mm": 10.0, "to_mm": 90.0, "radius_mm": 7.0}]}, "the hole leaves no wall"),
-        ({"chambers": [{"name": "c", "from_mm": 10.0, "to_mm": 90.0, "radius_mm": 2.0, "distance_mm": 5.0}]}, "chambers leave no wall"),
+        (
+            {"chambers": [{"name": "c", "from_mm": 10.0, "to_mm": 90.0, "radius_mm": 2.0, "distance_mm": 5.0}]},
+            "chambers leave no wall",
+        ),
         ({"chambers": [{"name": "c", "from_mm": 10.0, "to_mm": 90.0, "radius_mm": 3.0, "distance_mm": 2.0}]}, "reaches over it"),
         ({"angle_zero": [0.0, 0.0, 1.0]}, "points along the line"),
         ({"radius": 3.0}, "unknown key"),
@@ -168,9 +180,11 @@ def test_sections_that_no_body_can_have(tmp_path: Path) -> None:
 
 
 def test_the_command_makes_a_robot_and_inspect_warns_of_few_points(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    tendon = {"name": "t", "distance_mm": [4.0, 2.0], "points": 4, "max_tension_n": 0.3}
+    tendon = {"name": "t", "distance_mm": [4.0, 2.0], "points": 4, "max_tension_n": 0.2}
     marker = {"name": "tip", "along_mm": 110.0}
-    source = written(tmp_path, *CONE, tendons=[tendon], markers=[marker], clamp={"ends": "both"}, gravity={"vector_m_s2": [0.0, 0.0, -9.81]})
+    source = written(
+        tmp_path, *CONE, tendons=[tendon], markers=[marker], clamp={"ends": "both"}, gravity={"vector_m_s2": [0.0, 0.0, -9.81]}
+    )
     assert run(["mesh", str(source), "-o", str(tmp_path / "robot"), "--max-tets", "700"]) == 0
     robot = load_robot(tmp_path / "robot")
     assert robot.marker_points.tolist() == [[0.0, 0.0, -0.11]]
