@@ -1,0 +1,131 @@
+"""The trunk of StanfordASL/trunk-stack: a hanging vacuum hose, six motors with two tendons each, and the same run with 100 g at its tip.
+
+The hose is taken as an equivalent tube; motor angles become the displacements of two tendons that face each other, one drawn and one paid out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from femsense.core.arrays import BoolArray, FloatArray, IntArray
+from femsense.io.files import write_csv, write_toml
+from femsense.io.meshing.robot_from_line import line_into
+
+R_ROBOT_MOCAP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+"""The world has y up; the robot hangs along −z."""
+BASE_MOCAP_M = np.array([0.101, 0.0, 0.105])
+"""Where the trunk begins, above the discs at rest: nobody says it, so that the pose is fitted."""
+DISCS_MM = (104.6, 196.9, 313.0)
+"""Lengths along the trunk of the discs, from the first frame."""
+RATE_HZ = 100.0
+WEIGHT_N = 0.1 * 9.81
+MOTORS = {"u1": (1, 45.0), "u2": (2, 107.0), "u3": (0, 180.0), "u4": (2, 197.0), "u5": (0, 248.0), "u6": (1, -45.0)}
+"""Disc at which the tendons of a motor end, and the direction [°, x to y] to which it bends: from a linear map of angles to discs."""
+PULLEY_M, DISTANCE_MM = 0.010, 25.0
+"""Radius of a pulley (unknown: `cable_gain` finds its ratio) and distance of the tendons from the axis."""
+MODULUS_PA, DENSITY = 200e3, 500.0
+RADIUS_MM, BORE_MM = 30.0, 20.0
+
+
+def description() -> dict[str, object]:
+    """Return the text of `femsense mesh`: a tube with twelve channels."""
+    tendons = []
+    for name, (disc, angle) in MOTORS.items():
+        for side, turn in (("a", 0.0), ("b", 180.0)):
+            tendons.append(
+                {
+                    "name": name + side,
+                    "distance_mm": DISTANCE_MM,
+                    "angle_deg": -(angle + turn),
+                    "end_mm": DISCS_MM[disc],
+                    "points": 10 + 6 * disc,
+                }
+            )
+    return {
+        "format": "femsense-line-1",
+        "name": "trunk",
+        "rings": 2,
+        "material": {"young_modulus_pa": MODULUS_PA, "poisson_ratio": 0.3, "density_kg_m3": DENSITY},
+        "gravity": {"vector_m_s2": [0.0, 0.0, -9.81]},
+        "sections": [{"at_mm": [0.0, 0.0, -s], "radius_mm": RADIUS_MM, "bore_mm": BORE_MM} for s in (0.0, DISCS_MM[-1] + 5.0)],
+        "tendons": tendons,
+        "markers": [{"name": f"disc{i}", "along_mm": s} for i, s in enumerate(DISCS_MM, 1)],
+    }
+
+
+def make_robot(folder: Path, *, most_tets: int = 700) -> Path:
+    """Write the robot."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    text = folder.with_suffix(".toml")
+    write_toml(text, description())
+    line_into(folder, text, most_tets=most_tets)
+    return folder
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run of the motors."""
+
+    angles: FloatArray
+    """Measured motor angles [rad], shape (n, 6)."""
+    discs: FloatArray
+    """[m], motion-capture frame, shape (n, 3, 3)."""
+
+
+def read_run(data: Path, *, loaded: bool) -> Run:
+    """Return the run with nothing, or with 100 g, at the tip."""
+    rows = np.loadtxt(data / f"observations_controlled_1{'_100g' if loaded else ''}.csv.gz", delimiter=",", skiprows=1)
+    return Run(np.radians(rows[:, 10:]), rows[:, 1:10].reshape(-1, 3, 3))
+
+
+def still_frames(runs: list[Run], count: int) -> IntArray:
+    """Return frames at which the discs hardly move in all runs, spread over the angles, in order."""
+    slow = np.ones(len(runs[0].discs), dtype=bool)
+    for run in runs:
+        slow &= _slow(run)
+    candidates = np.flatnonzero(slow)
+    angles = runs[0].angles[candidates]
+    chosen, distance = [0], np.full(len(candidates), np.inf)
+    while len(chosen) < count:  # each next one is the farthest from those that are there
+        distance = np.minimum(distance, np.linalg.norm(angles - angles[chosen[-1]], axis=1))
+        chosen.append(int(distance.argmax()))
+    return np.sort(candidates[chosen])
+
+
+def _slow(run: Run, *, share: float = 0.08) -> BoolArray:
+    speed = np.linalg.norm(np.gradient(run.discs[:, 2], axis=0), axis=1) * RATE_HZ
+    smooth = np.convolve(speed, np.ones(11) / 11, mode="same")
+    return np.asarray(smooth <= np.quantile(smooth, share))
+
+
+def write_recording(folder: Path, run: Run, frames: IntArray, *, pose: FloatArray | None = None) -> Path:
+    """Write frames of a run: displacements of the tendons, discs in the motion-capture frame."""
+    document: dict[str, object] = {
+        "format": "femsense-recording-1",
+        "actuation": "displacement",
+        "actuation_zero": "absolute",
+        "session": "trunk",
+    }
+    document |= {} if pose is None else {"T_robot_camera": pose.tolist()}
+    folder.mkdir(parents=True, exist_ok=True)
+    write_toml(folder / "recording.toml", document)
+    names = [name + side for name in MOTORS for side in "ab"]
+    rows, markers = [], []
+    for i, k in enumerate(frames):
+        drawn = PULLEY_M * run.angles[k]
+        both = np.stack([drawn, -drawn], axis=1).ravel()
+        rows.append([i, k / RATE_HZ, *both.tolist(), f"s{i // 4}"])
+        markers += [[i, f"disc{j}", *point.tolist()] for j, point in enumerate(run.discs[k], 1)]
+    write_csv(folder / "frames.csv", ["frame", "time_s", *(f"cable_{n}" for n in names), "sweep"], rows)
+    write_csv(folder / "markers.csv", ["frame", "marker", "x_m", "y_m", "z_m"], markers)
+    return folder
+
+
+def first_pose() -> FloatArray:
+    """Return T_robot_camera as far as the axes and the first frame say it, shape (4, 4)."""
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R_ROBOT_MOCAP, -R_ROBOT_MOCAP @ BASE_MOCAP_M
+    return T
