@@ -35,6 +35,7 @@ COMMANDS = (
     "improve",
     "export",
     "reach",
+    "learn",
     "view",
     "report",
     "doctor",

@@ -71,10 +71,15 @@ def load_model(path: str | Path) -> ProprioceptiveModel:
         _network("markers", document["networks"]["markers"], numbers),
         tuple(document["memory_s"]),
         Domain(*(freeze(document["domain"][key]) for key in DOMAIN)),
-        None if chain is None else Armature(*(freeze(chain[key]) for key in CHAIN), chain["planar"], chain["inextensible"]),
+        None if chain is None else _chain(chain),
         _network("bones", document["networks"]["bones"], numbers) if "bones" in document["networks"] else None,
         document["report"],
     )
+
+
+def _chain(chain: dict[str, Any]) -> Armature:
+    points, knots, at, normal = (freeze(chain[key]) for key in CHAIN)
+    return Armature(points, knots, at, normal, chain["planar"], chain["inextensible"])
 
 
 def _document(model: ProprioceptiveModel, networks: dict[str, Network]) -> dict[str, Any]:

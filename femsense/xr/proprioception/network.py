@@ -12,7 +12,7 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray
 
-KINDS = ("linear", "sigmoid", "radial")
+KINDS = ("linear", "sigmoid", "relu", "radial")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -49,7 +49,8 @@ class Network:
         """Return the hidden units of normalised inputs, shape (n, h)."""
         if self.kind == "radial":
             return np.asarray(np.exp(-0.5 * squared_distances(z, self.B)))
-        return sigmoid(z @ self.B.T + self.b)
+        a = z @ self.B.T + self.b
+        return np.maximum(a, 0.0) if self.kind == "relu" else sigmoid(a)
 
     def followed_by(self, M: FloatArray, shift: FloatArray) -> Network:
         """Return the network whose outputs are M y + shift, M of shape (o, o)."""
@@ -87,4 +88,4 @@ def sigmoid(x: FloatArray) -> FloatArray:
 
 def squared_distances(x: FloatArray, y: FloatArray) -> FloatArray:
     """Return |x_i − y_j|², shape (n, k), of points (n, d) and (k, d)."""
-    return np.maximum(0.0, (x**2).sum(axis=1)[:, None] + (y**2).sum(axis=1) - 2.0 * x @ y.T)
+    return np.asarray(np.maximum(0.0, (x**2).sum(axis=1)[:, None] + (y**2).sum(axis=1) - 2.0 * x @ y.T))

@@ -170,7 +170,7 @@ def _read_tensor(tensor: bytes) -> tuple[str, npt.NDArray[np.float32]]:
             shape.append(value)
         content[number] = value
     if content[TENSOR_TYPE] != FLOAT:
-        raise ValueError(f"numbers of type {content[TENSOR_TYPE]} (expected 1, float)")
+        raise ValueError(f"numbers of type {content[TENSOR_TYPE]!r} (expected 1, float)")
     array = np.frombuffer(_as_bytes(content[TENSOR_RAW]), dtype="<f4").reshape(shape)
     return _as_bytes(content[TENSOR_NAME]).decode(), array
 
@@ -192,6 +192,6 @@ def network_nodes(name: str, kind: str, source: str) -> tuple[Sequence[Node], Se
         nodes += [Node("Add", (f"{n}.a", f"{n}.own"), f"{n}.exponent"), Node("Exp", (f"{n}.exponent",), f"{n}.phi")]
         constants.append("half")
     else:
-        nodes.append(Node("Sigmoid", (f"{n}.a",), f"{n}.phi"))
+        nodes.append(Node("Relu" if kind == "relu" else "Sigmoid", (f"{n}.a",), f"{n}.phi"))
     nodes += [Node("MatMul", (f"{n}.phi", f"{n}.A"), f"{n}.curved"), Node("Add", (f"{n}.curved", f"{n}.straight"), n)]
     return nodes, [*constants, "A", "B", "b"]

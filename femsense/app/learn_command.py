@@ -1,0 +1,103 @@
+"""`femsense learn`: from CSV files to a model, to a verdict on another day, and to a corrected model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from femsense.core.errors import InputError
+from femsense.io.files import check_target
+
+Pair = tuple[Path, Path]
+
+
+def learn_into(
+    files: Pair,
+    output: Path,
+    *,
+    test: Pair | None = None,
+    adapt: Path | None = None,
+    end_to_end: bool = False,
+    bones: int = 8,
+    plane: str | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[dict[str, Any], str]:
+    """Learn from SENSORS.csv and MARKERS.csv, or correct a model by them; write it and return plain tables and text.
+
+    Arguments:
+        files: SENSORS.csv and MARKERS.csv.
+        output: the ONNX file.
+        test: two more files, of another recording: the error is stated on them.
+        adapt: a model to correct by `files`, instead of learning anew.
+        end_to_end, bones, plane: as in `LearnOptions` and `ArmatureOptions`; `plane` is the normal X,Y,Z.
+
+    Raises:
+        InputError, DataError: files that do not fit, too few rows.
+    """
+    from femsense.xr.armature import ArmatureOptions
+    from femsense.xr.proprioception.drift import adapt as adapted
+    from femsense.xr.proprioception.drift import drift
+    from femsense.xr.proprioception.files import read_labelled
+    from femsense.xr.proprioception.learn import LearnOptions, learn
+    from femsense.xr.proprioception.model_file import load_model, save_model
+
+    check_target(output, folder=False)
+    data = read_labelled(*files)
+    other = None if test is None else read_labelled(*test)
+    if adapt is not None:
+        before = load_model(adapt)
+        found = drift(before, data)
+        model = adapted(before, data)
+        text = f"{found.text}\n\n{_adapted_text(model.report['adapted'])}"
+        document = {"verdict": found.verdict, "rigid_mm": found.rigid_mm, "outside": found.channels}
+    else:
+        options = LearnOptions(end_to_end=end_to_end, bones=ArmatureOptions(bones=bones, plane_normal=_normal(plane)))
+        model = learn(data, test=other, options=options, progress=progress)
+        text, document = report_text(model.report), {}
+    save_model(model, output)
+    return {"path": str(output), **document, **model.report}, f"{text}\n\nwritten: {output}"
+
+
+def report_text(report: dict[str, Any]) -> str:
+    """Return the report of a model in words."""
+    low, high = report["error_ci_mm"]
+    lines = [
+        f"{report['kind']}: {report['error_mm']:.2f} mm on {report['test_rows']} rows that were held out"
+        f" (95 % interval {low:.2f} … {high:.2f}); learnt from {report['rows']}",
+        "",
+        "  map        error    held-out blocks   memory",
+    ]
+    for name, row in report["compared"].items():
+        memory = ", ".join(f"{tau:g} s" for tau in row["memory_s"]) or "none"
+        lines.append(f"  {name:<8} {row['error_mm']:6.2f} mm        {row['blocks_mm']:6.2f} mm   {memory}")
+    lines += ["", "  the error grows by, when a channel is taken from another time:"]
+    ranked = sorted(report["importance_mm"].items(), key=lambda item: -item[1])
+    lines += [f"  {name:<12} {grown:6.2f} mm" for name, grown in ranked]
+    for key, words in (("dead", "never changes"), ("saturated", "stands at the end of its range"), ("unused", "not used")):
+        if report[key]:
+            lines.append(f"  {words}: {', '.join(report[key])}")
+    if report.get("bones_mm") is not None:
+        lines.append(f"  bones straight from the readings: {report['bones_mm']:.2f} mm")
+    if report["test_outside"] > 0.02:
+        lines.append(f"  {100 * report['test_outside']:.0f} % of the held-out rows are outside what was learnt")
+    return "\n".join(lines)
+
+
+def _adapted_text(found: dict[str, Any]) -> str:
+    if found["by"] == "none":
+        return f"no correction helps: {found['before_mm']:.2f} mm on {found['rows']} rows"
+    return (
+        f"corrected by {found['by']}: {found['before_mm']:.2f} → {found['error_mm']:.2f} mm on blocks of the {found['rows']} rows"
+        " that the correction did not see"
+    )
+
+
+def _normal(text: str | None) -> tuple[float, float, float] | None:
+    if text is None:
+        return None
+    try:
+        x, y, z = (float(part) for part in text.split(","))
+    except ValueError:
+        raise InputError("not a direction", where="--plane", found=text, expected="X,Y,Z") from None
+    return x, y, z

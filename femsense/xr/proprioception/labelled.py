@@ -1,0 +1,105 @@
+"""Readings of sensors with the markers that were seen at the same moments."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from femsense.core.arrays import FloatArray, IntArray, freeze
+from femsense.core.errors import InputError
+from femsense.xr.proprioception.memory import with_memory
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Labelled:
+    """Rows of readings, in order of time, each with all markers."""
+
+    time_s: FloatArray
+    """shape (n,)."""
+    readings: FloatArray
+    """In the units of the sensors, shape (n, c)."""
+    markers: FloatArray
+    """[m], shape (n, m, 3)."""
+    channels: tuple[str, ...]
+    marker_names: tuple[str, ...]
+    part: IntArray
+    """Which recording each row is from, shape (n,)."""
+
+    def __len__(self) -> int:
+        return len(self.time_s)
+
+    @property
+    def targets(self) -> FloatArray:
+        """Coordinates of the markers [m], shape (n, 3 m)."""
+        return self.markers.reshape(len(self), -1)
+
+    def select(self, rows: npt.NDArray[np.bool_] | IntArray) -> Labelled:
+        """Return some of the rows."""
+        t, x, y = freeze(self.time_s[rows]), freeze(self.readings[rows]), freeze(self.markers[rows])
+        return Labelled(t, x, y, self.channels, self.marker_names, freeze(self.part[rows], np.int64))
+
+    def inputs(self, taus: tuple[float, ...]) -> FloatArray:
+        """Return readings with their filters, shape (n, (1 + k) c); filters start anew with each recording."""
+        parts = [self.part == number for number in np.unique(self.part)]
+        return np.concatenate([with_memory(self.time_s[rows], self.readings[rows], taus) for rows in parts])
+
+
+def labelled(
+    time_s: npt.ArrayLike,
+    readings: npt.ArrayLike,
+    markers: npt.ArrayLike,
+    *,
+    channels: Sequence[str] | None = None,
+    marker_names: Sequence[str] | None = None,
+) -> Labelled:
+    """Return readings with markers from arrays; rows without a finite marker or reading are left out.
+
+    Arguments:
+        time_s: when each row was read [s], not decreasing, shape (n,).
+        readings: shape (n, c).
+        markers: [m], shape (n, m, 3).
+        channels, marker_names: names; numbers by default.
+
+    Raises:
+        InputError: shapes that do not belong together, or times that decrease.
+    """
+    t, x, y = (np.asarray(array, dtype=np.float64) for array in (time_s, readings, markers))
+    if t.ndim != 1 or x.ndim != 2 or y.ndim != 3 or y.shape[2] != 3 or not len(t) == len(x) == len(y):
+        expected = "(n,), (n, channels), (n, markers, 3)"
+        raise InputError(
+            "arrays that do not belong together",
+            where="time_s, readings, markers",
+            found=(t.shape, x.shape, y.shape),
+            expected=expected,
+        )
+    if not (np.diff(t) >= 0).all():
+        row = int(np.argmin(np.diff(t))) + 1
+        raise InputError(
+            "time runs backwards", where=f"time_s[{row}]", found=float(t[row]), expected=f"at least {t[row - 1]:.6g}"
+        )
+    good = np.isfinite(x).all(axis=1) & np.isfinite(y).all(axis=(1, 2)) & np.isfinite(t)
+    names = tuple(channels) if channels is not None else tuple(f"channel_{i}" for i in range(x.shape[1]))
+    points = tuple(marker_names) if marker_names is not None else tuple(f"marker_{i}" for i in range(y.shape[1]))
+    if len(names) != x.shape[1] or len(points) != y.shape[1]:
+        raise InputError(
+            "one name a column",
+            where="channels, marker_names",
+            found=(len(names), len(points)),
+            expected=x.shape[1:] + y.shape[1:2],
+        )
+    return Labelled(freeze(t[good]), freeze(x[good]), freeze(y[good]), names, points, freeze(np.zeros(good.sum()), np.int64))
+
+
+def joined(parts: Sequence[Labelled]) -> Labelled:
+    """Return several recordings as one. Raises InputError where channels or markers differ."""
+    first = parts[0]
+    for other in parts[1:]:
+        if (other.channels, other.marker_names) != (first.channels, first.marker_names):
+            found, expected = (*other.channels, *other.marker_names), (*first.channels, *first.marker_names)
+            raise InputError("recordings of other channels or markers", where="parts", found=found, expected=expected)
+    t, x, y = (freeze(np.concatenate([getattr(part, name) for part in parts])) for name in ("time_s", "readings", "markers"))
+    number = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+    return Labelled(t, x, y, first.channels, first.marker_names, freeze(number, np.int64))

@@ -1,0 +1,204 @@
+"""`learn`: from readings with markers beside them to a model, with its error on what it did not see."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+
+from femsense.core.arrays import FloatArray
+from femsense.core.errors import DataError
+from femsense.xr.armature import Armature, ArmatureOptions, make_armature
+from femsense.xr.proprioception.bayes import train_bayesian
+from femsense.xr.proprioception.domain import learn_domain
+from femsense.xr.proprioception.labelled import Labelled
+from femsense.xr.proprioception.model import ProprioceptiveModel, bone_numbers
+from femsense.xr.proprioception.selection import (
+    MEMORIES,
+    Progress,
+    compare_plans,
+    marker_rms,
+    rows_kept,
+    simplest_good,
+    thinned_rows,
+    train,
+)
+
+KINDS = ("ridge", "radial", "network", "mlp")
+"""In the order of simplicity."""
+NEEDED = {"mlp": "sklearn"}
+"""Kinds that need a package of the extra `learn`."""
+FEWEST_ROWS = 60
+TRAINED_ROWS = 3000
+"""Rows on which the chosen map is trained at most, thinned evenly."""
+BONE_ROWS = 1000
+"""The same for the end-to-end network."""
+RESAMPLES = 1000
+ERROR_BLOCKS = 12
+"""Blocks in time that are drawn again and again for the interval of an error."""
+CLIPPED = 0.05
+"""Share of rows at one end of a channel's range from which on it is said to be saturated."""
+DISTINCT = 20
+"""A channel with fewer values is a switch: its ends mean nothing."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class LearnOptions:
+    """What the data cannot say."""
+
+    kinds: tuple[str, ...] = KINDS
+    """Maps that are tried, simple ones first."""
+    memories: tuple[tuple[float, ...], ...] = MEMORIES
+    """Time constants [s] of filters that are tried beside the readings; ((),): none."""
+    end_to_end: bool = False
+    """Whether a second network gives the bones straight from the readings, as in the paper."""
+    bones: ArmatureOptions = field(default_factory=ArmatureOptions)
+    rest_row: int = 0
+    """Row in which the robot is at rest: its bones are the skin's."""
+    seed: int = 0
+
+
+def learn(
+    data: Labelled, *, test: Labelled | None = None, options: LearnOptions | None = None, progress: Progress | None = None
+) -> ProprioceptiveModel:
+    """Return a model of readings.
+
+    The kind of map, its memory and its channels are those with the smallest error on blocks in time that were held out. The
+    error that the report states is on rows that neither training nor choice saw.
+
+    Arguments:
+        data: readings with markers.
+        test: rows for the stated error, of another recording; default: three blocks of twenty of `data`.
+        options: which maps are tried, and the bones.
+        progress: called with what is done and how much there is.
+
+    Raises:
+        DataError: too few rows, or readings that never change.
+    """
+    options = options or LearnOptions()
+    _check(data)
+    held = rows_kept(len(data)) if test is None else np.zeros(len(data), dtype=bool)
+    work, test = data.select(~held), data.select(held) if test is None else test
+    kinds = tuple(kind for kind in options.kinds if kind not in NEEDED or find_spec(NEEDED[kind]) is not None)
+    compared = compare_plans(work, kinds, options.memories, seed=options.seed, progress=progress)
+    chosen = simplest_good(compared)
+    chain = _chain(data.markers[options.rest_row], options.bones)
+    rows = thinned_rows(len(work), TRAINED_ROWS)
+    networks = {
+        item.plan.kind: train(item.plan, work.inputs(item.plan.memory_s)[rows], work.targets[rows], options.seed)
+        for item in compared
+    }
+    table = {}
+    for item in compared:
+        errors = networks[item.plan.kind](_test_inputs(data, test, held, item.plan.memory_s)) - test.targets
+        table[item.plan.kind] = _row(errors) | {
+            "blocks_mm": 1e3 * item.rms,
+            "median_block_mm": 1e3 * item.typical,
+            "memory_s": list(item.plan.memory_s),
+            "channels": int(item.plan.used.sum()),
+        }
+    network, plan = networks[chosen.plan.kind], chosen.plan
+    inputs = _test_inputs(data, test, held, plan.memory_s)
+    report = {
+        "kind": plan.kind,
+        **{key: table[plan.kind][key] for key in ("error_mm", "error_ci_mm")},
+        "marker_error_mm": _by_marker(network(inputs) - test.targets, data.marker_names),
+        "rows": len(work),
+        "test_rows": len(test),
+        "compared": table,
+        "importance_mm": importance(network, inputs, test.targets, data.channels, len(plan.memory_s)),
+        "unused": [name for name, used in zip(data.channels, plan.used) if not used],
+        "dead": dead_channels(data.readings, data.channels),
+        "saturated": saturated_channels(data.readings, data.channels),
+    }
+    bones = None
+    if options.end_to_end and chain is not None:
+        some = thinned_rows(len(work), BONE_ROWS)
+        wanted = np.array([bone_numbers(chain(markers)) for markers in work.markers[some]])
+        bones = train_bayesian(work.inputs(plan.memory_s)[some], wanted, rng=np.random.default_rng(options.seed))
+        report["bones_mm"] = _bone_error(bones(inputs), chain, test)
+    domain = learn_domain(work.readings)
+    report["test_outside"] = float(1.0 - domain.inside(test.readings).mean())
+    return ProprioceptiveModel(data.channels, data.marker_names, network, plan.memory_s, domain, chain, bones, report)
+
+
+def error_interval(errors: FloatArray, *, seed: int = 0) -> tuple[float, float]:
+    """Return the 95 % interval of the root mean square distance [m] of errors, shape (n, 3 m).
+
+    Blocks in time are drawn again and again, since neighbours are alike (Künsch 1989).
+    """
+    square = (errors.reshape(len(errors), -1, 3) ** 2).sum(axis=2).mean(axis=1)
+    parts = np.array_split(square, min(ERROR_BLOCKS, len(square)))
+    sums, counts = np.array([part.sum() for part in parts]), np.array([len(part) for part in parts])
+    drawn = np.random.default_rng(seed).integers(len(parts), size=(RESAMPLES, len(parts)))
+    rms = np.sqrt(sums[drawn].sum(axis=1) / counts[drawn].sum(axis=1))
+    low, high = np.quantile(rms, [0.025, 0.975])
+    return float(low), float(high)
+
+
+def importance(
+    network: Any, inputs: FloatArray, targets: FloatArray, channels: tuple[str, ...], filters: int
+) -> dict[str, float]:
+    """Return by how much the error grows when a channel is taken from another time [mm], by channel.
+
+    The channel and its filters are shifted by half the rows, so that it keeps its own course (permutation importance, Breiman 2001).
+    """
+    base, half, width = marker_rms(network(inputs) - targets), len(inputs) // 2, len(channels)
+    grown = {}
+    for i, name in enumerate(channels):
+        moved = inputs.copy()
+        columns = i + width * np.arange(1 + filters)
+        moved[:, columns] = np.roll(inputs[:, columns], half, axis=0)
+        grown[name] = 1e3 * (marker_rms(network(moved) - targets) - base)
+    return grown
+
+
+def dead_channels(readings: FloatArray, channels: tuple[str, ...]) -> list[str]:
+    """Return the channels that never change."""
+    return [name for name, x in zip(channels, readings.T) if np.ptp(x) <= 1e-12 * (1.0 + np.abs(x).max())]
+
+
+def saturated_channels(readings: FloatArray, channels: tuple[str, ...]) -> list[str]:
+    """Return the channels that stand at an end of their range too often to be by chance."""
+    found = []
+    for name, x in zip(channels, readings.T):
+        at_end = max((x == x.max()).mean(), (x == x.min()).mean())
+        if len(np.unique(x)) > DISTINCT and at_end > CLIPPED:
+            found.append(name)
+    return found
+
+
+def _check(data: Labelled) -> None:
+    if len(data) < FEWEST_ROWS:
+        raise DataError(
+            f"{len(data)} rows have readings and all markers; at least {FEWEST_ROWS} are needed to learn and to hold some out"
+        )
+    if len(dead_channels(data.readings, data.channels)) == len(data.channels):
+        raise DataError("no channel ever changes: " + ", ".join(data.channels))
+
+
+def _test_inputs(data: Labelled, test: Labelled, held: np.ndarray, taus: tuple[float, ...]) -> FloatArray:
+    """Return the inputs of the test rows; filters run over the whole recording where the test is a part of it."""
+    return data.inputs(taus)[held] if held.any() else test.inputs(taus)
+
+
+def _chain(rest: FloatArray, options: ArmatureOptions) -> Armature | None:
+    apart = np.linalg.norm(np.diff(rest, axis=0), axis=1)
+    return make_armature(rest, options) if len(rest) > 1 and (apart > 0).all() else None
+
+
+def _row(errors: FloatArray) -> dict[str, Any]:
+    return {"error_mm": 1e3 * marker_rms(errors), "error_ci_mm": [1e3 * x for x in error_interval(errors)]}
+
+
+def _by_marker(errors: FloatArray, names: tuple[str, ...]) -> dict[str, float]:
+    return {name: 1e3 * marker_rms(errors[:, 3 * i : 3 * i + 3]) for i, name in enumerate(names)}
+
+
+def _bone_error(numbers: FloatArray, chain: Armature, test: Labelled) -> float:
+    """Return the error of the places of bones that come straight from the readings [mm], against those from the measured markers."""
+    places = numbers.reshape(len(test), -1, 9)[:, :, :3]
+    wanted = np.array([chain(markers).positions for markers in test.markers])
+    return 1e3 * marker_rms((places - wanted).reshape(len(test), -1))

@@ -1,0 +1,234 @@
+"""Which map is learnt: chosen on blocks of time that it was not trained on.
+
+Rows that follow each other are nearly the same, so a row held out at random says nothing of the next excursion. Six blocks in time
+are held out in turn; of the rest of the recording, blocks spread over it are kept for the error that is stated (70 / 15 / 15 %).
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from itertools import product
+
+import numpy as np
+
+from femsense.core.arrays import BoolArray, FloatArray, IntArray
+from femsense.xr.proprioception.bayes import train_bayesian
+from femsense.xr.proprioception.labelled import Labelled
+from femsense.xr.proprioception.linear import train_radial, train_ridge
+from femsense.xr.proprioception.network import Network
+
+FOLDS = 6
+TEST_BLOCKS, TEST_EVERY, TEST_FIRST = 20, 7, 3
+"""Three blocks of twenty are for the stated error."""
+MOST_ROWS = 600
+"""Rows on which maps are compared; thinned evenly, since neighbours are nearly the same."""
+GAIN = 0.05
+"""Relative fall of the held-out error that a less simple map, or a channel, must bring."""
+MEMORIES: tuple[tuple[float, ...], ...] = ((), (0.1,), (0.3,), (1.0,), (0.3, 1.0, 3.0))
+PENALTIES = (1e-6, 1e-4, 1e-3, 1e-2)
+LENGTHS, NOISES = (1.0, 2.0), (1e-3, 1e-2)
+MLP_UNITS = 32
+Progress = Callable[[int, int], None]
+"""Called with what is done, and how much there is."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Plan:
+    """One map before it is trained."""
+
+    kind: str
+    """"ridge", "radial", "network" (the paper's) or "mlp"."""
+    memory_s: tuple[float, ...]
+    used: BoolArray
+    """Channels that it takes, shape (c,)."""
+    numbers: dict[str, float] = field(default_factory=dict)
+    """Penalty, length, noise."""
+
+    @property
+    def columns(self) -> BoolArray:
+        """The same for inputs with filters, shape ((1 + k) c,)."""
+        return np.tile(self.used, 1 + len(self.memory_s))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Compared:
+    """A map and its error on the blocks that were held out in turn."""
+
+    plan: Plan
+    rms: float
+    """Root mean square distance over all markers [m]."""
+    typical: float
+    """The same of the median block [m]."""
+
+
+def rows_kept(count: int) -> BoolArray:
+    """Return which of `count` rows are kept for the stated error, shape (count,)."""
+    block = np.arange(count) * TEST_BLOCKS // max(count, 1)
+    return np.asarray(block % TEST_EVERY == TEST_FIRST)
+
+
+def folds(count: int) -> Iterator[BoolArray]:
+    """Yield which rows are held out, one block in time after the other, shape (count,)."""
+    block = np.arange(count) * FOLDS // max(count, 1)
+    for number in range(FOLDS):
+        yield block == number
+
+
+def thinned_rows(count: int, most: int) -> IntArray:
+    """Return at most `most` rows, spread evenly."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))
+
+
+def compare_plans(
+    data: Labelled,
+    kinds: tuple[str, ...],
+    memories: tuple[tuple[float, ...], ...],
+    *,
+    seed: int,
+    progress: Progress | None = None,
+) -> list[Compared]:
+    """Return the best map of each kind, in the order of `kinds`, each with its error on held-out blocks.
+
+    Memory and channels are chosen with ridge and radial maps, which cost little; the networks follow their choice.
+    """
+    rows = thinned_rows(len(data), MOST_ROWS)
+    targets = data.targets[rows]
+    inputs = {taus: data.inputs(taus)[rows] for taus in ((), *memories)}
+    everything = np.ones(len(data.channels), dtype=bool)
+    sets = {tuple(used): used for used in (everything, _needed(inputs[()], targets))}
+    best: dict[str, Compared] = {}
+    jobs = list(product(memories, sets.values()))
+    for done, (taus, used) in enumerate(jobs):
+        if progress is not None:
+            progress(done, len(jobs))
+        for plan in _cheap_plans(taus, used, kinds):
+            _keep(best, compare_plan(plan, inputs[taus], targets, seed))
+    if best:
+        _keep_networks(best, kinds, lambda plan: compare_plan(plan, inputs[plan.memory_s], targets, seed), progress)
+    return [best[kind] for kind in kinds if kind in best]
+
+
+def simplest_good(found: list[Compared]) -> Compared:
+    """Return the first map that no later one betters by more than `GAIN`; the list is in the order of simplicity."""
+    chosen = found[0]
+    for other in found[1:]:
+        if other.rms < (1.0 - GAIN) * chosen.rms:
+            chosen = other
+    return chosen
+
+
+def compare_plan(plan: Plan, inputs: FloatArray, targets: FloatArray, seed: int) -> Compared:
+    """Return a map's error on blocks that were held out in turn."""
+    blocks = []
+    for held in folds(len(targets)):
+        blocks.append(marker_rms(train(plan, inputs[~held], targets[~held], seed)(inputs[held]) - targets[held]))
+    return Compared(plan, float(np.sqrt(np.mean(np.square(blocks)))), float(np.median(blocks)))
+
+
+def train(plan: Plan, inputs: FloatArray, targets: FloatArray, seed: int) -> Network:
+    """Return the map of a plan, trained on inputs with filters, shape (n, (1 + k) c); it takes all of them, also those it does not use."""
+    columns, rng, numbers = plan.columns, np.random.default_rng(seed), plan.numbers
+    x = inputs[:, columns]
+    if plan.kind == "ridge":
+        network = train_ridge(x, targets, penalty=numbers["penalty"])
+    elif plan.kind == "radial":
+        network = train_radial(x, targets, penalty=numbers["penalty"], length=numbers["length"], noise=numbers["noise"])
+    elif plan.kind == "network":
+        network = train_bayesian(x, targets, rng=rng)
+    else:
+        network = train_mlp(x, targets, seed=seed)
+    return _widened(network, columns)
+
+
+def train_mlp(x: FloatArray, y: FloatArray, *, seed: int) -> Network:
+    """Return a small network of rectified units on what ridge leaves, trained by scikit-learn (Adam, stopped early)."""
+    from sklearn.neural_network import MLPRegressor
+
+    line = train_ridge(x, y, penalty=PENALTIES[1])
+    left = y - line(x)
+    size = max(float(left.std()), 1e-12)
+    learner = MLPRegressor(hidden_layer_sizes=(MLP_UNITS,), alpha=1e-2, learning_rate_init=5e-3, max_iter=300, random_state=seed)
+    with warnings.catch_warnings():  # that it has not converged is the rule with so few steps, and held-out blocks decide
+        warnings.simplefilter("ignore")
+        learner.fit(line.normalised(x), left / size if left.shape[1] > 1 else left[:, 0] / size)
+    (first, second), (b, d) = learner.coefs_, learner.intercepts_
+    return Network("relu", line.centre, line.scale, first.T, b, size * second.T, line.C, line.d + size * d)
+
+
+def marker_rms(errors: FloatArray) -> float:
+    """Return the root mean square distance of markers [m] of errors, shape (n, 3 m)."""
+    return float(np.sqrt((errors.reshape(len(errors), -1, 3) ** 2).sum(axis=2).mean()))
+
+
+def _cheap_plans(taus: tuple[float, ...], used: BoolArray, kinds: tuple[str, ...]) -> Iterator[Plan]:
+    if "ridge" in kinds:
+        for penalty in PENALTIES:
+            yield Plan("ridge", taus, used, {"penalty": penalty})
+    if "radial" in kinds:
+        for length, noise in product(LENGTHS, NOISES):
+            yield Plan("radial", taus, used, {"penalty": PENALTIES[1], "length": length, "noise": noise})
+
+
+def _keep(best: dict[str, Compared], found: Compared) -> None:
+    """Keep the better one of a kind; a memory or another set of channels must bring `GAIN`."""
+    before = best.get(found.plan.kind)
+    if before is None:
+        best[found.plan.kind] = found
+        return
+    alike = before.plan.memory_s == found.plan.memory_s and (before.plan.used == found.plan.used).all()
+    if found.rms < (1.0 if alike else 1.0 - GAIN) * before.rms:
+        best[found.plan.kind] = found
+
+
+def _keep_networks(
+    best: dict[str, Compared], kinds: tuple[str, ...], compare: Callable[[Plan], Compared], progress: Progress | None
+) -> None:
+    leader = min(best.values(), key=lambda item: item.rms).plan
+    settings = {(leader.memory_s, tuple(leader.used)): leader, ((), tuple(leader.used)): Plan("", (), leader.used)}
+    jobs = list(product((kind for kind in kinds if kind in ("network", "mlp")), settings.values()))
+    for done, (kind, like) in enumerate(jobs):
+        if progress is not None:
+            progress(done, len(jobs))
+        plan = Plan(kind, like.memory_s, like.used)
+        _keep(best, compare(plan))
+
+
+def _needed(x: FloatArray, targets: FloatArray) -> BoolArray:
+    """Return the channels with which held-out blocks are predicted best: all but those that go, or those that come, one by one.
+
+    Arguments:
+        x: readings, shape (n, c).
+        targets: coordinates [m], shape (n, o).
+    """
+
+    def error(used: BoolArray) -> float:
+        return compare_plan(Plan("ridge", (), used, {"penalty": PENALTIES[1]}), x, targets, 0).rms
+
+    starts = (np.ones(x.shape[1], dtype=bool), np.zeros(x.shape[1], dtype=bool))
+    return min((_one_by_one(used, error) for used in starts), key=error)
+
+
+def _one_by_one(used: BoolArray, error: Callable[[BoolArray], float]) -> BoolArray:
+    """Return the best channels on the way from all to one, or from one to all, when each time the best change of one is made."""
+    towards = not used.all()
+    best, least = used, error(used) if used.any() else np.inf
+    while (trials := [used ^ (np.arange(len(used)) == i) for i in np.flatnonzero(used != towards)]) and trials[0].any():
+        errors = [error(trial) for trial in trials]
+        used = trials[int(np.argmin(errors))]
+        if min(errors) < (1.0 - GAIN) * least:
+            best, least = used, min(errors)
+    return best
+
+
+def _widened(network: Network, columns: BoolArray) -> Network:
+    """Return a network that takes all inputs and looks at some."""
+    if columns.all():
+        return network
+    wide = len(columns)
+    centre, scale = np.zeros(wide), np.zeros(wide)
+    centre[columns], scale[columns] = network.centre, network.scale
+    B, C = np.zeros((len(network.B), wide)), np.zeros((len(network.d), wide))
+    B[:, columns], C[:, columns] = network.B, network.C
+    return Network(network.kind, centre, scale, B, network.b, network.A, C, network.d)

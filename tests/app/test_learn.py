@@ -1,0 +1,58 @@
+"""`femsense learn`: from two files to a model, to another day, and to a corrected model."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from femsense.app.cli import run
+from femsense.xr.proprioception.model_file import load_model
+
+
+def write_day(folder: Path, seed: int, shift: float = 0.0, rows: int = 160) -> list[str]:
+    """Write readings and markers of a finger that bends in a plane, and return the two paths."""
+    folder.mkdir()
+    rng = np.random.default_rng(seed)
+    phase = rng.uniform(0, 6)
+    bend = 1.2 * np.sin(0.11 * np.arange(rows) + phase) * np.sin(0.023 * np.arange(rows) + 1)
+    s = np.array([0.02, 0.04, 0.06])
+    with (folder / "s.csv").open("w") as sensors, (folder / "m.csv").open("w") as markers:
+        sensors.write("frame,time_s,light,dark\n")
+        markers.write("frame,marker,x_m,y_m,z_m\n")
+        for i, turn in enumerate(bend):
+            sensors.write(f"{i},{0.05 * i:.3f},{np.tanh(turn) + 0.002 * rng.normal():.6f},1.5\n")
+            angle = turn * s / s[-1] + 1e-9
+            for name, x, z in zip("abc", s * (1 - np.cos(angle)) / angle + shift, s * np.sin(angle) / angle):
+                noise = 1e-4 * rng.normal(size=3)
+                markers.write(f"{i},{name},{x + noise[0]:.7f},{noise[1]:.7f},{z + noise[2]:.7f}\n")
+    return [str(folder / "s.csv"), str(folder / "m.csv")]
+
+
+def test_learn_then_another_day(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    files, other = write_day(tmp_path / "one", 1), write_day(tmp_path / "two", 2, shift=0.01, rows=40)
+    model, mended = tmp_path / "finger.onnx", tmp_path / "mended.onnx"
+    assert run(["learn", *files, "-o", str(model), "--bones", "4", "--plane", "0,1,0", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["path"] == str(model) and document["error_mm"] < 0.6 and document["dead"] == ["dark"]
+    assert len(load_model(model).bone_names) == 4
+    assert run(["learn", *other, "-o", str(mended), "--adapt", str(model)]) == 0
+    said = capsys.readouterr().out
+    assert "base moved: " in said and "corrected by base: " in said and "written: " in said
+    row = [0.4, 1.5]
+    moved = load_model(mended).markers(row) - load_model(model).markers(row)
+    np.testing.assert_allclose(moved, np.tile([0.01, 0, 0], (3, 1)), atol=5e-4)
+    assert run(["learn", *files, "--test", *other, "-o", str(model)]) == 0
+    said = capsys.readouterr().out
+    assert "40 rows that were held out" in said and "never changes: dark" in said and "light" in said
+
+
+def test_what_is_wrong_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    files = write_day(tmp_path / "few", 1, rows=30)
+    assert run(["learn", *files, "-o", str(tmp_path / "m.onnx")]) == 1
+    assert "at least 60 are needed" in capsys.readouterr().err and not (tmp_path / "m.onnx").exists()
+    assert run(["learn", files[0], files[0], "-o", str(tmp_path / "m.onnx")]) == 2
+    assert run(["learn", *files, "-o", str(tmp_path / "m.onnx"), "--plane", "up"]) == 2
+    assert "not a direction" in capsys.readouterr().err

@@ -1,0 +1,222 @@
+"""Learning from readings: laws of the training, errors that hold on new data, and what is said of bad channels and other days."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from femsense.core.errors import DataError, InputError
+from femsense.xr.armature import ArmatureOptions
+from femsense.xr.proprioception.bayes import train_bayesian
+from femsense.xr.proprioception.drift import adapt, drift
+from femsense.xr.proprioception.files import read_labelled
+from femsense.xr.proprioception.labelled import Labelled, joined, labelled
+from femsense.xr.proprioception.learn import KINDS, LearnOptions, error_interval, learn
+from femsense.xr.proprioception.linear import train_radial, train_ridge
+from femsense.xr.proprioception.selection import folds, marker_rms, rows_kept
+
+CHANNELS = ("left", "right", "noise", "stuck", "clipped")
+LENGTH = 0.1
+
+
+def bent(curvature: np.ndarray, lean: np.ndarray) -> np.ndarray:
+    """Return four markers on an arm of constant curvature [1/m] that also leans [rad], shape (n, 4, 3)."""
+    s = np.linspace(0.25, 1.0, 4) * LENGTH
+    turn = curvature[:, None] * s + 1e-9
+    x, z = s * (1.0 - np.cos(turn)) / turn, s * np.sin(turn) / turn
+    return np.stack([x * np.cos(lean)[:, None], x * np.sin(lean)[:, None], z], axis=2)
+
+
+def session(seed: int, *, rows: int = 900, lag_s: float = 0.0, zero: float = 0.0) -> Labelled:
+    """Return a recording of an arm that bends as it likes: two curved and noisy sensors, and three that say little."""
+    rng = np.random.default_rng(seed)
+    time = 0.05 * np.arange(rows)
+    smooth = np.exp(-0.5 * (np.arange(-40, 41) / 12) ** 2)
+    a, b = (np.convolve(rng.normal(size=rows + 80), smooth, mode="valid") for _ in range(2))
+    a, b = (2.0 * (x - x.mean()) / np.abs(x - x.mean()).max() for x in (a, b))
+    seen_a, seen_b = (_delayed(x, time, lag_s) for x in (a, b))
+    readings = np.stack(
+        [np.tanh(0.6 * a) + zero, b + 0.2 * b**2, rng.normal(size=rows), np.full(rows, 3.0), np.minimum(a + b, 0.5)], axis=1
+    )
+    readings[:, :2] += 0.003 * rng.normal(size=(rows, 2))
+    markers = bent(10.0 + 6.0 * seen_a, 0.4 * seen_b) + 2e-4 * rng.normal(size=(rows, 4, 3))
+    return labelled(time, readings, markers, channels=CHANNELS)
+
+
+def _delayed(x: np.ndarray, time: np.ndarray, tau: float) -> np.ndarray:
+    if not tau:
+        return x
+    y = x.copy()
+    for i in range(1, len(x)):
+        y[i] = y[i - 1] + (1.0 - np.exp(-(time[i] - time[i - 1]) / tau)) * (x[i] - y[i - 1])
+    return y
+
+
+def test_the_papers_network_finds_a_curved_map_and_is_not_misled_by_noise() -> None:
+    rng = np.random.default_rng(0)
+    x = rng.uniform(-2, 2, size=(300, 3))
+    clean = lambda x: np.stack([np.sin(x[:, 0]), x[:, 0] * x[:, 1]], axis=1)  # noqa: E731
+    network = train_bayesian(x, clean(x) + 0.1 * rng.normal(size=(300, 2)), rng=rng)
+    fresh = rng.uniform(-2, 2, size=(500, 3))
+    assert np.sqrt(((network(fresh) - clean(fresh)) ** 2).mean()) < 0.06
+    # of pure noise almost nothing is learnt, where least squares with 62 weights would follow it
+    noise = train_bayesian(x, rng.normal(size=(300, 1)), rng=rng)
+    assert noise(fresh).std() < 0.25
+
+
+def test_training_does_not_care_for_units() -> None:
+    rng = np.random.default_rng(1)
+    x, fresh = rng.normal(size=(2, 150, 2))
+    y = np.stack([np.tanh(x[:, 0]), x[:, 1]], axis=1)
+    scale, shift = np.array([1e3, 1e-3]), np.array([7.0, -2.0])
+    for train in (
+        lambda x, y: train_bayesian(x, y, rng=np.random.default_rng(5), steps=30),
+        lambda x, y: train_ridge(x, y, penalty=1e-3),
+        lambda x, y: train_radial(x, y, penalty=1e-3, length=1.0, noise=1e-2),
+    ):
+        plain, other = train(x, y), train(scale * x + shift, 0.001 * y + 5.0)
+        np.testing.assert_allclose(other(scale * fresh + shift), 0.001 * plain(fresh) + 5.0, atol=2e-6)
+
+
+def test_held_out_blocks_are_blocks_in_time_and_cover_everything_once() -> None:
+    held = rows_kept(400)
+    assert held.sum() == 60 and np.abs(np.diff(held.astype(int))).sum() == 6  # 15 %, in three blocks
+    masks = np.array(list(folds(90)))
+    assert (masks.sum(axis=0) == 1).all() and all(np.abs(np.diff(mask.astype(int))).sum() <= 2 for mask in masks)
+
+
+@pytest.fixture(scope="module")
+def model():
+    return learn(session(1), options=LearnOptions(kinds=KINDS[:2], end_to_end=True, bones=ArmatureOptions(bones=3)))
+
+
+def test_the_stated_error_holds_on_a_fresh_recording(model) -> None:
+    fresh = session(2)
+    inside = model.domain.inside(fresh.readings)
+    error = 1e3 * marker_rms((model.network(fresh.inputs(model.memory_s)) - fresh.targets)[inside])
+    low, high = model.report["error_ci_mm"]
+    assert 0.3 < model.report["error_mm"] < 1.0  # the noise of the markers alone is 0.35 mm
+    assert low < model.report["error_mm"] < high and error < 1.5 * high
+    assert model.report["kind"] != "ridge" and model.report["compared"]["ridge"]["error_mm"] > 2 * model.report["error_mm"]
+
+
+def test_bones_from_the_end_to_end_network_are_those_of_the_markers(model) -> None:
+    row = session(2).readings[200]
+    direct, through = model.armature(row), model.chain(model.markers(row))
+    assert np.abs(direct.positions - through.positions).max() < 2e-3
+    assert np.abs(direct.T_robot_bone - through.T_robot_bone).max() < 0.1
+    assert model.report["bones_mm"] < 1.0
+
+
+def test_channels_that_say_little_are_named(model) -> None:
+    report = model.report
+    assert report["dead"] == ["stuck"] and report["saturated"] == ["clipped"]
+    importance = report["importance_mm"]
+    assert max(importance, key=importance.get) in ("left", "right") and importance["stuck"] == 0.0
+    assert abs(importance["noise"]) < 0.1 * importance["left"]
+
+
+def test_a_lag_is_met_by_a_memory() -> None:
+    data = session(3, lag_s=0.4)
+    late = learn(data, options=LearnOptions(kinds=("radial",)))
+    blind = learn(data, options=LearnOptions(kinds=("radial",), memories=((),)))
+    assert late.memory_s and blind.memory_s == ()
+    assert late.report["error_mm"] < 0.4 * blind.report["error_mm"]
+    assert learn(session(3), options=LearnOptions(kinds=("radial",))).memory_s == ()
+
+
+def test_another_day_is_told_apart_and_a_few_frames_correct_it(model) -> None:
+    same = session(5)
+    assert drift(model, same).verdict == "holds"
+    T, shift = Rotation.from_rotvec([0.0, 0.1, 0.2]).as_matrix(), np.array([0.004, -0.003, 0.0])
+    moved = labelled(same.time_s, same.readings, same.markers @ T.T + shift, channels=CHANNELS)
+    found = drift(model, moved)
+    assert found.verdict == "base moved" and "base moved" in found.text
+    assert found.turn_deg == pytest.approx(np.degrees(np.hypot(0.1, 0.2)), abs=0.7)
+    zeroed = session(5, zero=0.15)
+    assert "map changed" in drift(model, zeroed).verdict
+    few = np.zeros(len(same), dtype=bool)
+    few[::15] = True
+    for day, by in ((same, "none"), (moved, "base"), (zeroed, "zeros")):
+        mended = adapt(model, day.select(few))
+        rest = day.select(~few & mended.domain.inside(day.readings))
+        error = 1e3 * marker_rms(mended.network(rest.inputs(mended.memory_s)) - rest.targets)
+        assert mended.report["adapted"]["by"] == by and error < 2.0 * model.report["error_mm"]
+
+
+def test_an_interval_of_an_error_covers_it_and_knows_that_neighbours_are_alike() -> None:
+    rng = np.random.default_rng(0)
+    alone = 1e-3 * rng.normal(size=(600, 3))
+    low, high = error_interval(alone)
+    assert low < 1e-3 * np.sqrt(3) < high and high - low < 0.2e-3
+    alike = np.repeat(1e-3 * rng.normal(size=(12, 3)), 50, axis=0)
+    low, high = error_interval(alike)
+    assert high - low > 0.5e-3
+
+
+def test_recordings_are_joined_and_their_filters_start_anew() -> None:
+    one, two = session(1, rows=60), session(2, rows=70)
+    both = joined([one, two])
+    np.testing.assert_allclose(both.inputs((0.5,))[60:], two.inputs((0.5,)))
+    assert len(both) == 130 and both.select(np.arange(60, 130)).part.tolist() == [1] * 70
+    other = labelled(two.time_s, two.readings[:, :2], two.markers)
+    with pytest.raises(InputError, match="other channels or markers"):
+        joined([one, other])
+
+
+def test_what_cannot_be_learnt_is_said() -> None:
+    with pytest.raises(DataError, match="40 rows"):
+        learn(session(1, rows=40))
+    still = session(1)
+    with pytest.raises(DataError, match="no channel ever changes"):
+        learn(labelled(still.time_s, np.ones((len(still), 2)), still.markers))
+    with pytest.raises(InputError, match="do not belong together"):
+        labelled([0.0, 1.0], np.zeros((2, 3)), np.zeros((3, 1, 3)))
+    with pytest.raises(InputError, match="time runs backwards"):
+        labelled([0.0, -1.0], np.zeros((2, 3)), np.zeros((2, 1, 3)))
+
+
+def write_session(folder: Path, data: Labelled) -> tuple[Path, Path]:
+    """Write SENSORS.csv and MARKERS.csv of a session and return their paths."""
+    sensors, markers = folder / "sensors.csv", folder / "markers.csv"
+    rows = [f"{7 + i},{t:.4f}," + ",".join(f"{x:.8g}" for x in row) for i, (t, row) in enumerate(zip(data.time_s, data.readings))]
+    sensors.write_text("\n".join(["frame,time_s," + ",".join(data.channels), *rows]) + "\n")
+    places = [
+        f"{7 + i},{name},{p[0]:.9g},{p[1]:.9g},{p[2]:.9g}"
+        for i, x in enumerate(data.markers)
+        for name, p in zip(data.marker_names, x)
+    ]
+    markers.write_text("\n".join(["frame,marker,x_m,y_m,z_m", *places]) + "\n")
+    return sensors, markers
+
+
+def test_files_are_read_and_rows_with_hidden_markers_are_left_out(tmp_path: Path) -> None:
+    data = session(1, rows=20)
+    sensors, markers = write_session(tmp_path, data)
+    back = read_labelled(sensors, markers)
+    np.testing.assert_allclose(back.readings, data.readings, rtol=1e-7)
+    np.testing.assert_allclose(back.markers, data.markers, atol=1e-9)
+    assert (back.channels, back.marker_names) == (CHANNELS, data.marker_names)
+    lines = markers.read_text().splitlines()
+    markers.write_text("\n".join(lines[:5] + lines[6:]))
+    assert len(read_labelled(sensors, markers)) == 19
+
+
+@pytest.mark.parametrize(
+    ("sensors", "markers", "message"),
+    [
+        ("time_s\n0\n", "frame,marker,x_m,y_m,z_m\n0,a,0,0,0\n", "no channel"),
+        ("time_s,red\n0,1\n", "frame,marker,x_m,y_m,z_m\n5,a,0,0,0\n", "no frame is in both files"),
+        ("time_s,red\n0,1\n", "frame,marker,x_m,y_m,z_m\n0,,0,0,0\n", "a marker without a name"),
+        ("frame,time_s,red\n0,0,1\n0,1,2\n", "frame,marker,x_m,y_m,z_m\n0,a,0,0,0\n", "a frame stands twice"),
+        ("time_s,red\n0,x\n", "frame,marker,x_m,y_m,z_m\n0,a,0,0,0\n", "not a number"),
+    ],
+)
+def test_files_that_do_not_fit_are_refused(sensors: str, markers: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "s.csv").write_text(sensors)
+    (tmp_path / "m.csv").write_text(markers)
+    with pytest.raises(InputError, match=message):
+        read_labelled(tmp_path / "s.csv", tmp_path / "m.csv")
