@@ -18,9 +18,9 @@ from femsense.core.pose import moved_poses
 from femsense.fem.equilibrium import Equilibrium
 from femsense.model.contact_patch import BodySurface, body_surface
 from femsense.model.drive import DrivenRobot, drive_of
+from femsense.model.quasi_static_path import free_path
 from femsense.model.recording import CameraNoise, Recording
 from femsense.model.robot import Robot
-from femsense.model.variants import solve_frame
 from femsense.pointcloud.rays import Surface
 
 FRAMES = 12
@@ -182,26 +182,29 @@ def _prior(covariance: FloatArray, which: FloatArray) -> FloatArray:
 
 def _free_frames(robot: Robot, recording: Recording, poses: tuple[FloatArray, ...], calibration: Calibration) -> list[_Seen]:
     """Return what is seen in the free frames that have clouds."""
-    if recording.free is None or not recording.has_clouds:
-        return []
-    free = [int(k) for k in np.flatnonzero(recording.free) if any(file is not None for file in recording.cloud_files[k])]
-    if len(free) > FRAMES:
-        free = [free[i] for i in np.unique(np.linspace(0, len(free) - 1, FRAMES).round().astype(int))]
+    free = free_clouds(recording)
     initial = None
     if recording.actuation_zero == "unknown":
         table = calibration.cable_tension_n if recording.actuation == "tension" else calibration.cable_displacement_m
         initial = np.array([table[name] for name in robot.body.cable_names])
     driven, triangles = DrivenRobot(robot, drive_of(robot, recording, initial=initial)), body_surface(robot.body.mesh).triangles
-    result, state = [], None
-    for k in free:
+    result = []
+    for k, state in free_path(driven, free):
         try:
-            state = solve_frame(driven, k, start=state)
-            scan = read_scan(robot, recording, k, poses, state.positions) if state.converged else None
+            scan = read_scan(robot, recording, k, poses, state.positions)
         except FemsenseError:
             continue
         if scan is not None:
             result.append(_Seen(scan, state, Surface(state.positions, triangles)))
     return result
+
+
+def free_clouds(recording: Recording) -> list[int]:
+    """Return the frames that are free and have a cloud, evenly thinned out to FRAMES."""
+    if recording.free is None or not recording.has_clouds:
+        return []
+    free = [int(k) for k in np.flatnonzero(recording.free) if any(file is not None for file in recording.cloud_files[k])]
+    return [free[i] for i in np.unique(np.linspace(0, len(free) - 1, FRAMES).round().astype(int))] if free else []
 
 
 def _measured_noise(robot: Robot, frames: list[_Seen], poses: tuple[FloatArray, ...], view: int) -> CameraNoise:

@@ -82,6 +82,28 @@ def solve_path(
         yield k, bases[alike[k]], seen[alike[k]], others[k]
 
 
+def free_path(driven: DrivenRobot, frames: Sequence[int]) -> Iterator[tuple[int, Equilibrium]]:
+    """Yield frames with their states under inputs and known loads alone, in order; a frame without an equilibrium is left out.
+
+    Where the robot has a history all frames before them are passed through: friction remembers them.
+
+    Arguments:
+        driven: robot and drive.
+        frames: indices.
+    """
+    wanted = sorted(set(int(k) for k in frames))
+    past = has_history(driven.robot)
+    state: Equilibrium | None = None
+    for k in range(wanted[-1] + 1) if past and wanted else wanted:
+        before = state.segment_tensions if past and state is not None else None
+        found = solve_frame(driven, k, start=state, options=SolveOptions(before=before, reuse_factor=state is not None))
+        if not found.converged:
+            continue
+        state = found
+        if k in wanted:
+            yield k, state
+
+
 def _alike(driven: DrivenRobot, frames: list[int], past: bool) -> dict[int, int]:
     """Return for each frame the first one with the same state: the same inputs and loads, with a past the frames just before."""
     first: dict[bytes, int] = {}

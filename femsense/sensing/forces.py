@@ -71,7 +71,7 @@ def no_forces(sensor: Sensor, k: int, scan: Scan | None, state: Equilibrium) -> 
     rows = rows_at(sensor, k, scan, state)
     sag = sag_at(sensor, state, tangent_at(sensor.robot.body, state))
     columns, known = nuisance_columns(sensor.knowledge, rows, sag)
-    cost = misfit_of(rows.residual - known, columns, rows)[0] + LOST * rows.lost
+    cost = misfit_of(rows.residual - known, columns, rows)[0] + LOST * rows.lost / rows.together
     return Fit((), state, np.zeros((0, 3)), np.zeros((0, 0)), np.zeros((0, 3, 3)), rows, cost)
 
 
@@ -192,7 +192,7 @@ class _Linear:
         prior = sum(
             float(((root @ f) ** 2).sum()) for root, f in zip(_priors(here.touches, self.normals, here.sizes), here.forces)
         )
-        return misfit_of(self.residual, self.nuisance, here.rows)[0] + LOST * here.rows.lost + off + prior
+        return misfit_of(self.residual, self.nuisance, here.rows)[0] + LOST * here.rows.lost / here.rows.together + off + prior
 
     def solve(self, sensor: Sensor, here: _Here, trust: float = 1.0) -> _Answer:
         """Return forces and shifts of the places that explain the rows best; where `trust` is below 1, near those that are here.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from femsense.fem.compliance import tangent_at
-from femsense.sensing.nuisance import misfit, sag_at
+from femsense.sensing.nuisance import FAR_OFF, misfit, sag_at
 from femsense.sensing.types import Fit, SensedFrame, Sensor
 
 OK = "ok"
@@ -24,9 +24,9 @@ def status_of(sensor: Sensor, fit: Fit, free: Fit) -> str:
     if fit.cost > free.cost or (fit.touches and fit.rows.rms > 1.05 * free.rows.rms + 2.0 * float(np.median(free.rows.std))):
         return "the residual is larger with the forces than without them"
     left = left_over(sensor, fit)
-    if left > sensor.knowledge.misfit_limit:
+    if left > limit_of(sensor, fit):
         what = "with the contacts found" if fit.touches else "and no contact explains it"
-        return f"not explained: {1e3 * fit.rows.rms:.2f} mm are left, {np.sqrt(left / sensor.knowledge.misfit_limit):.1f} times what free frames leave, {what}"
+        return f"not explained: {1e3 * fit.rows.rms:.2f} mm are left, {np.sqrt(left / limit_of(sensor, fit)):.1f} times what free frames leave, {what}"
     unsure = [i for i, f in enumerate(fit.forces) if np.linalg.norm(f) < _std_along(fit, i)]
     if unsure and fit.touches[unsure[0]].source != "given":
         return "a contact whose force is less than its standard deviation"
@@ -36,6 +36,11 @@ def status_of(sensor: Sensor, fit: Fit, free: Fit) -> str:
 def left_over(sensor: Sensor, fit: Fit) -> float:
     """Return the misfit per row that a fit leaves, about 1 where all is explained."""
     return misfit(sensor.knowledge, fit.rows, sag_at(sensor, fit.state, tangent_at(sensor.robot.body, fit.state)))
+
+
+def limit_of(sensor: Sensor, fit: Fit) -> float:
+    """Return the misfit per row above which a fit does not explain its rows; free frames tell it of clouds only."""
+    return sensor.knowledge.misfit_limit if fit.rows.of_clouds else FAR_OFF
 
 
 def trusted(frame: SensedFrame) -> bool:

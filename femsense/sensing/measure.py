@@ -52,6 +52,8 @@ def _ray_rows(sensor: Sensor, scan: Scan, state: Equilibrium) -> Rows:
         count=len(rows.residual),
         rms=float(np.sqrt((rows.residual**2).mean())),
         lost=len(scan.view) - len(rows.residual),
+        of_clouds=True,
+        together=sensor.knowledge.together,
     )
 
 

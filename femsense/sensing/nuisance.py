@@ -18,8 +18,10 @@ CENTRES = 24
 """Centres of the field of shared errors: as many degrees of freedom as its error may have along the body."""
 HUBER = 2.5
 """Whitened residuals beyond this count linearly."""
-FREE_FRAMES = 12
-"""More free frames than this are thinned out evenly."""
+CELL = 0.5
+"""Points within this share of the length of shared errors may err together."""
+OUTLIER = 5.0
+"""Where a frame is judged, whitened residuals beyond this count as this."""
 BIAS_STEPS = np.concatenate([[0.0], 1e-5 * 2.0 ** np.arange(9)])
 SHARE_STEPS = np.concatenate([[0.0], 0.00125 * 2.0 ** np.arange(7)])
 """Sizes of the shared errors that are tried: 0.01 … 2.6 mm, and 0.1 … 8 % of the way."""
@@ -81,8 +83,9 @@ def common_columns(rows: Rows, sag: FloatArray) -> FloatArray:
 
 
 def robust_std(rows: Rows, residual: FloatArray) -> FloatArray:
-    """Return standard deviations that are larger where residuals stand out (Huber) [m], shape (r,)."""
-    return np.asarray(rows.std * np.sqrt(np.maximum(np.abs(residual / rows.std) / cut_of(residual / rows.std), 1.0)))
+    """Return standard deviations that are larger where residuals stand out (Huber), and for rows that err together [m], shape (r,)."""
+    std = rows.std * np.sqrt(rows.together)
+    return np.asarray(std * np.sqrt(np.maximum(np.abs(residual / rows.std) / cut_of(residual / rows.std), 1.0)))
 
 
 def cut_of(z: FloatArray) -> float:
@@ -93,8 +96,8 @@ def cut_of(z: FloatArray) -> float:
 def learn(knowledge: Knowledge, frames: list[tuple[Rows, FloatArray]]) -> Knowledge:
     """Return what free frames teach.
 
-    Pose and modulus together with the sizes of the two shared errors, by maximum likelihood over a grid; then how large the misfit is that free
-    frames leave.
+    How many neighbouring points err together; pose and modulus with the sizes of the two shared errors, by maximum likelihood over a grid; then how
+    large the misfit is that free frames leave.
 
     Arguments:
         knowledge: what was known before.
@@ -102,19 +105,38 @@ def learn(knowledge: Knowledge, frames: list[tuple[Rows, FloatArray]]) -> Knowle
     """
     if not frames:
         return knowledge
-    first, grams = knowledge, [_gram(knowledge, rows, sag) for rows, sag in frames]
-    knowledge = _fit_common(first, grams, first)
-    for _ in range(2):
-        knowledge = _fit_field(knowledge, grams)
+    first = knowledge
+    for _ in range(2):  # the second time with what the first left
+        frames = [(replace(rows, together=knowledge.together), sag) for rows, sag in frames]
+        grams = [_gram(knowledge, rows, sag) for rows, sag in frames]
         knowledge = _fit_common(knowledge, grams, first)
+        for _ in range(2):
+            knowledge = _fit_field(knowledge, grams)
+            knowledge = _fit_common(knowledge, grams, first)
+        knowledge = replace(knowledge, together=_together(knowledge, frames))
     misfits = np.array([misfit(knowledge, rows, sag) for rows, sag in frames])
     return replace(knowledge, misfit_limit=float(misfits.max() + 3.0 * max(misfits.std(), 0.05)))
 
 
 def misfit(knowledge: Knowledge, rows: Rows, sag: FloatArray) -> float:
-    """Return the mean of Huber's function of the whitened residual with nuisance fitted: about 1 where all is explained."""
+    """Return the mean of Huber's function of the whitened residual with nuisance fitted: about 1 where all is explained.
+
+    A row counts as OUTLIER at most: flying pixels, which are many standard deviations off, would else say what a frame leaves.
+    """
+    left = np.abs(whitened_rest(knowledge, rows, sag))
+    return float(huber(np.minimum(left, OUTLIER), HUBER).sum() / max(len(left), 1))
+
+
+def whitened_rest(knowledge: Knowledge, rows: Rows, sag: FloatArray) -> FloatArray:
+    """Return what the fitted nuisance leaves of the residual, in standard deviations, shape (r,)."""
     columns, known = nuisance_columns(knowledge, rows, sag)
-    return misfit_of(rows.residual - known, columns, rows)[0] / max(len(rows.residual), 1)
+    residual = rows.residual - known
+    return np.asarray((residual - columns @ misfit_of(residual, columns, rows)[1]) / rows.std)
+
+
+def huber(z: FloatArray, cut: float) -> FloatArray:
+    """Return Huber's function of sizes (r,) ≥ 0: their squares, linear beyond the cut."""
+    return np.asarray(np.where(z <= cut, z**2, cut * (2.0 * z - cut)))
 
 
 def misfit_of(residual: FloatArray, columns: FloatArray, rows: Rows) -> tuple[float, FloatArray]:
@@ -124,10 +146,22 @@ def misfit_of(residual: FloatArray, columns: FloatArray, rows: Rows) -> tuple[fl
     fitted = np.linalg.solve(A.T @ A + np.eye(columns.shape[1]), A.T @ (residual / std))
     z = np.abs(residual - columns @ fitted) / rows.std
     cut = cut_of(residual / rows.std)
-    return float(np.where(z <= cut, z**2, cut * (2.0 * z - cut)).sum() + fitted @ fitted), np.asarray(fitted, dtype=np.float64)
+    return float(huber(z, cut).sum() / rows.together + fitted @ fitted), np.asarray(fitted, dtype=np.float64)
 
 
 # --- helpers ----------------------------------------------------------------------------------------------------------
+
+
+def _together(knowledge: Knowledge, frames: list[tuple[Rows, FloatArray]]) -> float:
+    """Return how many points count as one, since a camera matches windows: variance of sums over cells beside that of points that err alone."""
+    sums, squares = 0.0, 0.0
+    for rows, sag in frames:
+        z = np.clip(whitened_rest(knowledge, rows, sag), -HUBER, HUBER)
+        cells = np.floor(rows.place / (CELL * knowledge.length)).astype(np.int64)
+        _, group = np.unique(cells, axis=0, return_inverse=True)
+        sums += float((np.bincount(group.ravel(), z) ** 2).sum())
+        squares += float((z**2).sum())
+    return max(1.0, sums / max(squares, 1e-12))
 
 
 def _kernel(knowledge: Knowledge, places: FloatArray) -> FloatArray:

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from femsense.calib.calibration import Calibration
-from femsense.calib.from_clouds import measured_noises, pose_pivot
+from femsense.calib.from_clouds import free_clouds, measured_noises, pose_pivot
 from femsense.calib.scan import REACH, Scan, parted, read_scan
 from femsense.core.arrays import FloatArray, as_points
 from femsense.core.errors import FemsenseError, InputError
@@ -16,12 +16,12 @@ from femsense.fem.compliance import tangent_at
 from femsense.fem.equilibrium import Equilibrium
 from femsense.model.contact_patch import body_surface, flat_nodes
 from femsense.model.drive import DrivenRobot, drive_of
+from femsense.model.quasi_static_path import free_path
 from femsense.model.recording import Recording, check_against
 from femsense.model.robot import Robot, spread_features
 from femsense.pointcloud.rays import Surface
-from femsense.sensing.forces import free_state
 from femsense.sensing.measure import rows_at
-from femsense.sensing.nuisance import FREE_FRAMES, first_knowledge, learn, sag_at
+from femsense.sensing.nuisance import first_knowledge, learn, sag_at
 from femsense.sensing.places import check_places, near_places
 from femsense.sensing.types import Answers, Rows, SensingOptions, Sensor
 
@@ -109,14 +109,9 @@ def _driven(robot: Robot, recording: Recording, calibration: Calibration, places
 
 def _free_rows(sensor: Sensor) -> list[tuple[Rows, FloatArray]]:
     """Return rows and sag of the free frames with clouds; a frame that gives nothing is left out."""
-    recording, result, state = sensor.recording, [], None
-    if recording.free is None or not recording.has_clouds:
-        return []
-    frames = np.flatnonzero(recording.free)
-    frames = frames[np.unique(np.linspace(0, len(frames) - 1, FREE_FRAMES).round().astype(int))] if len(frames) else frames
-    for k in frames.tolist():
+    result = []
+    for k, state in free_path(sensor.driven, free_clouds(sensor.recording)):
         try:
-            state = free_state(sensor, k, state, None)
             scan = scan_of(sensor, k, state)
             if scan is not None and not scan.told:
                 shape = Surface(state.positions, sensor.surface.triangles)

@@ -209,6 +209,10 @@ class Rows:
     """[m]."""
     lost: int = 0
     """Points of the scan that found no surface."""
+    of_clouds: bool = False
+    """Whether the rows are points of clouds, and not markers."""
+    together: float = 1.0
+    """How many rows count as one, since neighbours err together."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -233,6 +237,8 @@ class Knowledge:
     """Gain in log evidence from which on a contact that only the shape shows is believed: one false in 1000 free frames."""
     misfit_limit: float
     """Misfit per row above which a frame is not explained."""
+    together: float = 1.0
+    """How many points of a cloud count as one, since neighbours err together."""
 
 
 @dataclass(eq=False, slots=True)

@@ -1,0 +1,104 @@
+"""What free frames teach: how many points err together, what flying pixels do not say, and states that remember friction."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from arm import T_ROBOT_CAMERA, arm, record
+
+from femsense.calib.calibrate import calibrate
+from femsense.core.pose import invert_pose, transform_points
+from femsense.fem.mesh import surface_triangles, triangle_normals
+from femsense.io.clouds.cloud_files import write_cloud
+from femsense.model.effects import apply_effects
+from femsense.model.recording import CameraNoise, Recording
+from femsense.pointcloud.cloud import PointCloud
+from femsense.sensing.nuisance import first_knowledge, learn, misfit
+from femsense.sensing.pipeline import estimate
+from femsense.sensing.prepare import make_sensor
+from femsense.sensing.types import Knowledge, Rows
+
+STD = 3e-4
+SAG = np.zeros((1, 4, 3))
+FRICTION = [{"name": "cable_friction", "coefficient": 0.5}]
+
+
+def knowledge() -> Knowledge:
+    """Return what is known of a plate of 200 × 100 mm before a free frame is seen."""
+    x, y = np.meshgrid(np.linspace(0, 0.2, 21), np.linspace(0, 0.1, 11))
+    nodes = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
+    return first_knowledge((CameraNoise("stereo", at_1m=0.002),), nodes, 0.22, 0.03, 1e-8 * np.eye(6))
+
+
+def plate_rows(window: int, seed: int = 0) -> Rows:
+    """Return rows of a camera of 200 × 100 pixels whose noise is one number in each window of so many pixels a side."""
+    rng = np.random.default_rng(seed)
+    i, j = np.meshgrid(np.arange(200), np.arange(100), indexing="ij")
+    noise = np.repeat(np.repeat(rng.normal(size=(200 // window, 100 // window)), window, axis=0), window, axis=1)
+    r = noise.size
+    return Rows(
+        functional=lambda u: np.zeros((r, len(u))),
+        residual=STD * noise.ravel(),
+        std=np.full(r, STD),
+        by_pose=np.zeros((r, 6)),
+        place=np.column_stack([1e-3 * i.ravel(), 1e-3 * j.ravel(), np.zeros(r)]),
+        way=np.zeros(r),
+        count=r,
+        rms=STD,
+        of_clouds=True,
+    )
+
+
+@pytest.mark.parametrize("window", [1, 2])
+def test_points_of_one_window_count_as_one(window):
+    learned = learn(knowledge(), [(plate_rows(window, seed), SAG) for seed in range(3)])
+    assert learned.together == pytest.approx(window**2, rel=0.25)
+
+
+def test_flying_pixels_do_not_say_that_a_frame_is_not_explained():
+    rows = plate_rows(1)
+    learned = learn(knowledge(), [(rows, SAG), (plate_rows(1, 1), SAG)])
+    flying = np.where(np.arange(len(rows.residual)) % 200 == 0, 70.0 * STD, rows.residual)
+    assert misfit(learned, replace(rows, residual=flying), SAG) < learned.misfit_limit
+    assert misfit(learned, replace(rows, residual=3.0 * rows.residual), SAG) > learned.misfit_limit
+
+
+def pulled_and_let_go(folder: Path) -> Recording:
+    """Return free frames of an arm whose cable rubs, the only cloud on the way back; then a frame with markers alone."""
+    inputs = np.array([[0.0, 0, 0, 0], [1.5, 0, 0, 0], [3.0, 0, 0, 0], [1.2, 0, 0, 0], [1.2, 0, 0, 0]])
+    recording, states = record(inputs, noise=1e-4, effects=FRICTION)
+    true, rng = arm((8, 3, 3), law="neo_hookean"), np.random.default_rng(5)
+    triangles = surface_triangles(true.body.mesh)
+    x = states[3]
+    corners = x[triangles]
+    looks = np.einsum("tc,tc->t", triangle_normals(x, triangles), T_ROBOT_CAMERA[:3, 3] - corners.mean(axis=1)) > 0
+    points = np.einsum("tsi,tic->tsc", rng.dirichlet(np.ones(3), size=(int(looks.sum()), 12)), corners[looks]).reshape(-1, 3)
+    ray = points - T_ROBOT_CAMERA[:3, 3]
+    points = points + 3e-4 * rng.normal(size=(len(points), 1)) * ray / np.linalg.norm(ray, axis=1, keepdims=True)
+    write_cloud(
+        folder / "3.ply",
+        PointCloud(transform_points(invert_pose(T_ROBOT_CAMERA), points), np.tile([0.2, 0.4, 0.8], (len(points), 1))),
+    )
+    files = tuple((folder / "3.ply" if k == 3 else None,) for k in range(5))
+    return replace(recording, free=np.array([True] * 4 + [False]), cloud_files=files, color_files=((None,),) * 5)
+
+
+def test_free_frames_remember_friction(tmp_path):
+    recording, robot = pulled_and_let_go(tmp_path), apply_effects(arm(), FRICTION)
+    calibration = calibrate(robot, recording)
+    assert calibration.normal_rms_m == pytest.approx(2e-4, abs=1e-4)
+    known = make_sensor(robot, recording, calibration).knowledge
+    assert abs(known.common_mean[-1]) < 0.05 and known.bias_m < 3e-4
+
+
+def test_what_clouds_leave_does_not_judge_frames_with_markers_alone(tmp_path):
+    """The markers of the last frame shake twice as much as in the others."""
+    recording, robot = pulled_and_let_go(tmp_path), apply_effects(arm(), FRICTION)
+    shaken = recording.marker_xyz + 1.7e-4 * np.random.default_rng(3).normal(size=recording.marker_xyz.shape) * (
+        recording.marker_frame == 4
+    ).reshape(-1, 1)
+    run = estimate(robot, replace(recording, marker_xyz=shaken), calibrate(robot, recording))
+    assert [frame.status for frame in run.frames] == ["ok"] * 5
