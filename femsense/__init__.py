@@ -35,29 +35,42 @@ if TYPE_CHECKING:
     from femsense.model.effects import EFFECTS, Effect, apply_effects, find_effect
     from femsense.model.recording import Camera, Recording, RestMarkers, make_recording, select_frames
     from femsense.model.robot import Robot
+    from femsense.report.plot_run import plot_run
     from femsense.report.write import write_report
     from femsense.rig.simulate import simulate
+    from femsense.sensing.comparison import Comparison, compare
     from femsense.sensing.pipeline import estimate
     from femsense.sensing.run_files import read_run, run_inputs, write_run
     from femsense.sensing.types import ContactForce, Run, SensingOptions
+    from femsense.xr.armature import Armature, ArmatureOptions, make_armature
     from femsense.xr.export import export_glb
+    from femsense.xr.notebook import show_run
+    from femsense.xr.proprioception.labelled import labelled
+    from femsense.xr.proprioception.learn import LearnOptions, learn
+    from femsense.xr.proprioception.model import ProprioceptiveModel
+    from femsense.xr.proprioception.model_file import load_model, save_model
 
 __version__ = "0.1.0"
 
 __all__ = [
     "EFFECTS",
+    "Armature",
+    "ArmatureOptions",
     "BodyModel",
     "Calibration",
     "Camera",
+    "Comparison",
     "ContactForce",
     "DataError",
     "Effect",
     "Equilibrium",
     "FemsenseError",
     "InputError",
+    "LearnOptions",
     "LoopResult",
     "MissingDependency",
     "Motion",
+    "ProprioceptiveModel",
     "ReachOptions",
     "Recording",
     "RestMarkers",
@@ -71,25 +84,33 @@ __all__ = [
     "apply_effects",
     "block_mesh",
     "calibrate",
+    "compare",
     "compliance",
     "embed_points",
     "estimate",
     "export_glb",
     "find_effect",
     "improve",
+    "labelled",
+    "learn",
+    "load_model",
     "load_recording",
     "load_robot",
+    "make_armature",
     "make_body",
     "make_recording",
+    "plot_run",
     "reach",
     "read_calibration",
     "read_loop",
     "read_run",
     "robot_names",
     "run_inputs",
+    "save_model",
     "save_recording",
     "save_robot",
     "select_frames",
+    "show_run",
     "simulate",
     "solve_equilibrium",
     "tie_cable",
@@ -167,8 +188,10 @@ _HOMES = {
         "select_frames",
     ),
     "model.robot": ("Robot",),
+    "report.plot_run": ("plot_run",),
     "report.write": ("write_report",),
     "rig.simulate": ("simulate",),
+    "sensing.comparison": ("Comparison", "compare"),
     "sensing.pipeline": ("estimate",),
     "sensing.run_files": (
         "read_run",
@@ -180,7 +203,13 @@ _HOMES = {
         "Run",
         "SensingOptions",
     ),
+    "xr.armature": ("Armature", "ArmatureOptions", "make_armature"),
     "xr.export": ("export_glb",),
+    "xr.notebook": ("show_run",),
+    "xr.proprioception.labelled": ("labelled",),
+    "xr.proprioception.learn": ("LearnOptions", "learn"),
+    "xr.proprioception.model": ("ProprioceptiveModel",),
+    "xr.proprioception.model_file": ("load_model", "save_model"),
 }
 _MODULE_OF = {name: f"femsense.{module}" for module, names in _HOMES.items() for name in names}
 

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+import femsense
 from femsense.calib.calibration import Calibration
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.fem.equilibrium import Equilibrium
@@ -16,6 +18,7 @@ from femsense.model.contact_patch import BodySurface, ContactPatch
 from femsense.model.drive import DrivenRobot
 from femsense.model.recording import CameraNoise, Recording
 from femsense.model.robot import Robot
+from femsense.sensing import run_arrays
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,6 +119,31 @@ class Run:
     recording_folder: Path | None
     known_loads: tuple[dict[str, float], ...] = ()
     """Declared loads at the given places next to what was sensed: {frame, declared_n, sensed_n, error_percent}."""
+
+    def __repr__(self) -> str:
+        return run_arrays.describe_run(self)
+
+    @property
+    def forces(self) -> FloatArray:
+        """Forces [N], shape (frames, contacts, 3); nan where a contact is not there."""
+        return run_arrays.forces_of(self)
+
+    @property
+    def positions(self) -> FloatArray:
+        """Their places on the deformed body [m], shape (frames, contacts, 3); nan where a contact is not there."""
+        return run_arrays.positions_of(self)
+
+    def to_dataframe(self) -> Any:
+        """Return the contacts as a pandas DataFrame with the columns of contacts.csv. Raises MissingDependency."""
+        return run_arrays.data_frame_of(self)
+
+    def plot(self) -> Any:
+        """Return a matplotlib figure of the forces over time."""
+        return femsense.plot_run(self)
+
+    def show(self, *, height: int = 480) -> Any:
+        """Return the viewer's page in a frame of so many pixels, for a notebook. Raises MissingDependency."""
+        return femsense.show_run(self, height=height)
 
 
 @dataclass(frozen=True, eq=False, slots=True)

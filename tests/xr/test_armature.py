@@ -48,6 +48,13 @@ def test_a_circle_has_its_bones_on_it_with_tangents_along_it() -> None:
     assert (rates[:, 0] > 3.5).all() and (rates[:, 1] > 2.5).all()  # cubic: fourth order in place, third in direction
 
 
+def test_bones_are_evenly_spaced_along_the_curve_where_the_points_are_not() -> None:
+    points, _, _ = helix(np.array([0.0, 0.3, 1.4, 1.7, 3.0]))
+    bones = make_armature(points, ArmatureOptions(bones=200)).rest
+    steps = np.linalg.norm(np.diff(bones.positions, axis=0), axis=1)
+    np.testing.assert_allclose(steps, steps.mean(), rtol=1e-3)
+
+
 @pytest.mark.parametrize("planar", [True, False])
 def test_in_a_plane_the_normal_is_the_tangent_turned(planar: bool) -> None:
     options = ArmatureOptions(bones=4, plane_normal=(0, 1, 0) if planar else None, start_normal=None if planar else (1, 0, 0))

@@ -1,0 +1,102 @@
+"""A run beside the truth that the virtual rig leaves with a recording."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from femsense.core.arrays import FloatArray
+from femsense.core.errors import InputError
+from femsense.io.tables import read_csv
+from femsense.sensing.types import ContactForce, Run
+
+SAME_PLACE = 0.1
+"""A contact is the true one if it is closer than this times the robot's size."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class TrueContact:
+    """A contact as it was."""
+
+    frame: int
+    position_m: FloatArray
+    force_n_xyz: FloatArray
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Comparison:
+    """How far a run is from the truth."""
+
+    pairs: tuple[tuple[TrueContact, ContactForce], ...]
+    """True contacts with those that were found in their place."""
+    contacts_true: int
+    contacts_false: int
+    """Contacts that are none."""
+
+    @property
+    def contacts_found(self) -> int:
+        """True contacts that were found."""
+        return len(self.pairs)
+
+    @property
+    def force_errors_n(self) -> FloatArray:
+        """Size of the error of each force that was found [N], shape (k,)."""
+        return np.array([float(np.linalg.norm(found.force_n_xyz - true.force_n_xyz)) for true, found in self.pairs])
+
+    @property
+    def place_errors_m(self) -> FloatArray:
+        """Distance of each place that was found from the true one [m], shape (k,)."""
+        return np.array([float(np.linalg.norm(found.position_m - true.position_m)) for true, found in self.pairs])
+
+    @property
+    def force_shares(self) -> FloatArray:
+        """Errors of the forces relative to their size, shape (k,)."""
+        return np.asarray(self.force_errors_n / np.array([float(np.linalg.norm(true.force_n_xyz)) for true, _ in self.pairs]))
+
+    def __repr__(self) -> str:
+        found = f"Comparison({self.contacts_found} of {self.contacts_true} contacts found, {self.contacts_false} that are none"
+        if not self.pairs:
+            return found + ")"
+        force, share, place = (float(np.median(x)) for x in (self.force_errors_n, self.force_shares, self.place_errors_m))
+        return f"{found}; median errors {force:.3g} N ({100 * share:.1f} %), {1e3 * place:.2g} mm)"
+
+
+def compare(run: Run, truth: str | Path | Sequence[TrueContact]) -> Comparison:
+    """Return how far a run is from the truth.
+
+    Arguments:
+        run: of `estimate`.
+        truth: the folder of a recording of the virtual rig, or true contacts.
+
+    Raises:
+        InputError: a recording without a truth.
+    """
+    if isinstance(truth, str | Path):
+        if not (Path(truth) / "truth" / "contacts.csv").is_file():
+            raise InputError("no truth beside the recording", where=truth, expected="a folder that femsense simulate wrote")
+        truth = read_truth(Path(truth))
+    size = float(np.linalg.norm(np.ptp(run.states.rest_nodes_m, axis=0)))
+    pairs = [(true, found) for true in truth if (found := _nearest(run.contacts, true, SAME_PLACE * size)) is not None]
+    return Comparison(tuple(pairs), len(truth), len(run.contacts) - len({id(found) for _, found in pairs}))
+
+
+def read_truth(recording: Path) -> tuple[TrueContact, ...]:
+    """Return the true contacts of a recording of the virtual rig; none where it has no truth beside it."""
+    file = recording / "truth" / "contacts.csv"
+    if not file.is_file():
+        return ()
+    columns_used = ("x_m", "y_m", "z_m", "fx_n", "fy_n", "fz_n")
+    table = read_csv(
+        file, required=("frame", *columns_used), optional=("time_s", "contact", "nx", "ny", "nz", "force_n"), prefixes=("rest_",)
+    )
+    frames, values = table.integers("frame"), table.numbers(columns_used)
+    return tuple(TrueContact(int(frame), row[:3], row[3:]) for frame, row in zip(frames, values))
+
+
+def _nearest(contacts: Sequence[ContactForce], true: TrueContact, reach: float) -> ContactForce | None:
+    near = [contact for contact in contacts if contact.frame == true.frame]
+    best = min(near, key=lambda contact: float(np.linalg.norm(contact.position_m - true.position_m)), default=None)
+    return best if best is not None and np.linalg.norm(best.position_m - true.position_m) < reach else None

@@ -1,0 +1,89 @@
+"""A run as arrays and as a table, for notebooks and scripts."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+
+from femsense.core.arrays import FloatArray
+from femsense.core.errors import MissingDependency
+
+AXES = "xyz"
+
+
+class RunLike(Protocol):
+    """A run, as far as it is looked at here."""
+
+    @property
+    def contacts(self) -> tuple[Any, ...]: ...
+    @property
+    def frames(self) -> tuple[Any, ...]: ...
+    @property
+    def robot(self) -> Any: ...
+
+
+def forces_of(run: RunLike) -> FloatArray:
+    """Return the forces of the tracks [N], shape (frames, tracks, 3), nan where a track is not there."""
+    return _filled(run, "force_n_xyz")
+
+
+def positions_of(run: RunLike) -> FloatArray:
+    """Return the places of the tracks on the deformed body [m], shape (frames, tracks, 3), nan where a track is not there."""
+    return _filled(run, "position_m")
+
+
+def tracks_of(run: RunLike) -> tuple[int, ...]:
+    """Return the identities of the contacts, in the order of the second axis of `forces_of`.
+
+    These are their tracks; their numbers in the frame where two of a frame have one track.
+    """
+    return tuple(sorted(set(_identities(run))))
+
+
+def data_frame_of(run: RunLike) -> Any:
+    """Return the contacts as a pandas DataFrame, one row a contact and frame, columns as in contacts.csv.
+
+    Raises:
+        MissingDependency: without pandas.
+    """
+    try:
+        import pandas
+    except ImportError:
+        raise MissingDependency('a table needs pandas: pip install "femsense[pandas]"') from None
+    return pandas.DataFrame([_row(contact) for contact in run.contacts], columns=list(_columns()))
+
+
+def describe_run(run: RunLike) -> str:
+    """Return a run in one line."""
+    ok = sum(frame.status == "ok" for frame in run.frames)
+    sizes = [contact.force_n for contact in run.contacts]
+    forces = f"{len(tracks_of(run))} contacts, up to {max(sizes):.3g} N" if sizes else "no contact"
+    return f"Run({run.robot.name}: {len(run.frames)} frames, {ok} ok; {forces})"
+
+
+def _filled(run: RunLike, field: str) -> FloatArray:
+    rows = {frame.frame: i for i, frame in enumerate(run.frames)}
+    columns = {track: j for j, track in enumerate(tracks_of(run))}
+    values = np.full((len(rows), len(columns), 3), np.nan)
+    for contact, track in zip(run.contacts, _identities(run)):
+        values[rows[contact.frame], columns[track]] = getattr(contact, field)
+    return values
+
+
+def _identities(run: RunLike) -> list[int]:
+    """Return the identity of each contact of a run."""
+    distinct = len({(contact.frame, contact.track) for contact in run.contacts}) == len(run.contacts)
+    return [contact.track if distinct else contact.contact for contact in run.contacts]
+
+
+def _columns() -> tuple[str, ...]:
+    vectors = [f"{name}{axis}{unit}" for name, unit in (("", "_m"), ("n", ""), ("f", "_n")) for axis in AXES]
+    spreads = [f"{axis}_std_m" for axis in AXES], [f"f{axis}_std_n" for axis in AXES]
+    return ("frame", "time_s", "contact", *vectors, "force_n", "std_n", "source", "track", *spreads[0], "radius_m", *spreads[1])
+
+
+def _row(c: Any) -> list[Any]:
+    vectors = np.concatenate([c.position_m, c.normal, c.force_n_xyz]).tolist()
+    known = [c.force_n, c.std_n, c.source, c.track]
+    return [c.frame, c.time_s, c.contact, *vectors, *known, *c.position_std_m.tolist(), c.radius_m, *c.force_std_n_xyz.tolist()]

@@ -1,0 +1,89 @@
+"""A run as arrays, as a table, as a figure, as a page, and beside the truth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from results import bar_robot
+from small_run import make_run
+
+import femsense as fs
+from femsense.core.errors import InputError
+from femsense.sensing.comparison import TrueContact
+from femsense.sensing.run_arrays import tracks_of
+from femsense.sensing.types import Run
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Run:
+    return make_run(bar_robot(tmp_path))
+
+
+def test_forces_and_places_stand_frame_by_frame_and_nan_where_none_is(run: Run) -> None:
+    assert run.forces.shape == run.positions.shape == (3, 2, 3)
+    for row, contact in ((1, run.contacts[0]), (2, run.contacts[2])):
+        np.testing.assert_array_equal(run.forces[row, 0], contact.force_n_xyz)
+        np.testing.assert_array_equal(run.positions[row, 0], contact.position_m)
+    np.testing.assert_array_equal(run.forces[1, 1], run.contacts[1].force_n_xyz)
+    assert np.isnan(run.forces[0]).all() and np.isnan(run.forces[2, 1]).all()
+
+
+def test_a_contact_keeps_its_column_by_its_track(run: Run) -> None:
+    first, second, third = (replace(c, track=track) for c, track in zip(run.contacts, (7, 3, 7)))
+    tracked = replace(run, contacts=(first, second, third))
+    assert tracks_of(tracked) == (3, 7)
+    np.testing.assert_array_equal(tracked.forces[2, 1], third.force_n_xyz)
+    assert np.isnan(tracked.forces[2, 0]).all()
+
+
+def test_a_run_as_a_table(run: Run, tmp_path: Path) -> None:
+    pytest.importorskip("pandas")
+    table = run.to_dataframe()
+    fs.write_run(run, tmp_path / "run", inputs={})
+    header = (tmp_path / "run" / "contacts.csv").read_text().splitlines()[0]
+    assert list(table.columns) == header.split(",")
+    assert table.frame.tolist() == [1, 1, 4]
+    np.testing.assert_array_equal(table[["fx_n", "fy_n", "fz_n"]].to_numpy()[2], run.contacts[2].force_n_xyz)
+
+
+def test_short_words(run: Run) -> None:
+    assert repr(run).startswith("Run(") and "3 frames, 2 ok; 2 contacts, up to" in repr(run)
+    assert "no contact" in repr(replace(run, contacts=()))
+
+
+def test_a_figure_of_the_forces(run: Run) -> None:
+    (axes,) = run.plot().axes
+    assert axes.get_ylabel().startswith("force") and axes.get_xlabel() == "time [s]"
+    (axes,) = replace(run, contacts=()).plot().axes
+    assert axes.get_ylabel() == "residual [mm]" and len(axes.lines) == 2
+
+
+def test_a_run_beside_the_truth(run: Run, tmp_path: Path) -> None:
+    near = replace(run.contacts[2], position_m=np.array([0.05, 0.0, 0.03]), force_n_xyz=np.array([0.0, 0.0, -1.1]))
+    sensed = replace(run, contacts=(run.contacts[0], near))
+    truth = (TrueContact(4, np.array([0.05, 0.002, 0.03]), np.array([0, 0, -1.0])), TrueContact(0, np.zeros(3), np.ones(3)))
+    found = fs.compare(sensed, truth)
+    assert (found.contacts_found, found.contacts_true, found.contacts_false) == (1, 2, 1)
+    np.testing.assert_allclose([found.force_errors_n[0], found.force_shares[0], found.place_errors_m[0]], [0.1, 0.1, 0.002])
+    assert repr(found) == "Comparison(1 of 2 contacts found, 1 that are none; median errors 0.1 N (10.0 %), 2 mm)"
+    assert "0 of 0 contacts" in repr(fs.compare(sensed, ()))
+    with pytest.raises(InputError, match="no truth beside the recording"):
+        fs.compare(sensed, tmp_path)
+
+
+def test_the_page_in_a_notebook(run: Run, tmp_path: Path) -> None:
+    from urllib.request import urlopen
+
+    page = tmp_path / "dist"
+    page.mkdir()
+    (page / "index.html").write_text("<title>a page</title>")
+    shown = fs.show_run(run, height=300, page=page)
+    try:
+        frame = shown._repr_html_()
+        assert f'<iframe src="{shown.url}"' in frame and "height:300px" in frame
+        assert b"a page" in urlopen(shown.url).read() and urlopen(shown.url + "robot.glb").read()[:4] == b"glTF"
+    finally:
+        shown.stop()
