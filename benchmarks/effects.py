@@ -61,6 +61,15 @@ HIDDEN: tuple[tuple[str, dict[str, Any]], ...] = (
     ("displacement", {"name": "geometry", "scale": 0.97}),
     ("tension", {"name": "depth_scale", "scale": 1.02}),
     ("tension", {"name": "marker_offset", "offset_m": {"m10": [0.002, -0.001, 0.001]}}),
+    ("tension", {"name": "density", "scale": 1.2}),
+    ("displacement", {"name": "density", "scale": 0.8}),
+    ("tension", {"name": "tip_mass", "point_m": [0.095, 0.0, 0.01], "mass_kg": 0.008}),
+    ("tension", {"name": "cable_path", "offset_m": {"b": [0.0, 0.001, 0.0015]}}),
+    ("tension", {"name": "cable_path", "radius_scale": 1.0, "angle_rad": 0.1}),
+    ("tension", {"name": "stiffness_gradient", "axis_m": [[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]], "per_m": -6.0}),
+    ("tension", {"name": "rest_shape", "axis_m": [[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]], "curvature_1_m": [1.0, 0.0]}),
+    ("tension", {"name": "cable_coupling", "from": "a", "to": "b", "share": 0.12}),
+    ("displacement", {"name": "cable_coupling", "from": "a", "to": "b", "share": 0.12}),
 )
 SEED, FRESH_SEED = 7, 1007
 ALWAYS_OFF = ("stiffness",)

@@ -59,6 +59,7 @@ def calibrate(robot: Robot, recording: Recording, *, frames: Sequence[int] | Non
         DataError: no markers and no pose, too few markers, or no equilibrium.
     """
     recording = check_against(robot, recording)
+    robot = robot.in_recording(recording.label)
     chosen = usable_frames(recording) if frames is None else np.asarray(frames, dtype=np.int64)
     if recording.rest is not None and not np.isin(recording.marker_frame, chosen).any():
         return _from_rest(robot, recording)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -11,8 +12,8 @@ import scipy.sparse as sp
 from femsense.core.arrays import BoolArray, FloatArray, IntArray, as_indices, as_points, freeze
 from femsense.core.errors import InputError
 from femsense.fem.body_parts import LAWS, Cable, Chamber, Material, segment_nodes
-from femsense.fem.mesh import TetMesh, body_parts, element_volumes, embed_points
-from femsense.fem.stencil import FreeMap, Stencil, make_free_map, make_stencil
+from femsense.fem.mesh import TetMesh, body_parts, element_volumes, embed_points, tie_to_elements
+from femsense.fem.stencil import FreeMap, Stencil, make_free_map, make_stencil, reshaped
 
 FLAT = 1e-12
 """Tetrahedra smaller than this times the median one are flat but for rounding."""
@@ -65,6 +66,8 @@ class BodyModel:
     chambers: tuple[Chamber, ...] = ()
     chamber_curvature: tuple[sp.csr_matrix, ...] = ()
     """Second derivatives of the volume of each chamber (see `chambers.curvature_map`), each (nb, n)."""
+    carried_mass: FloatArray | None = None
+    """Masses of the nodes beside that of the body itself [kg], shape (n,); None: it carries none."""
 
     @property
     def cable_names(self) -> tuple[str, ...]:
@@ -75,8 +78,14 @@ class BodyModel:
         return tuple(chamber.name for chamber in self.chambers)
 
     def weight(self) -> FloatArray:
-        """Return the nodal forces of gravity [N], shape (n, 3) (consistent: ρ ∫ N dV g)."""
-        return self.material.density * self.stencil.node_volume[:, None] * self.gravity
+        """Return the nodal forces of gravity [N], shape (n, 3) (consistent: ρ ∫ N dV g), on what the body carries too."""
+        mass = self.material.density * self.stencil.node_volume
+        return (mass if self.carried_mass is None else mass + self.carried_mass)[:, None] * self.gravity
+
+    @property
+    def mass(self) -> float:
+        """Mass of the body without what it carries [kg]."""
+        return float(self.material.density * self.stencil.node_volume.sum())
 
     def dead_load(self) -> FloatArray:
         """Return weight plus other dead forces [N], shape (n, 3)."""
@@ -98,6 +107,13 @@ class BodyModel:
             raise InputError("wrong shape", where="dead_forces", found=wanted.shape, expected=self.mesh.nodes.shape)
         return replace(self, dead_forces=freeze(wanted))
 
+    def with_carried_mass(self, mass: npt.ArrayLike) -> BodyModel:
+        """Return the body with other masses of its nodes beside its own [kg], shape (n,): weights that turn with gravity. Raises InputError."""
+        wanted = np.asarray(mass, dtype=float)
+        if wanted.shape != (len(self.mesh.nodes),) or not np.isfinite(wanted).all():
+            raise InputError("wrong shape", where="carried_mass", found=wanted.shape, expected=(len(self.mesh.nodes),))
+        return replace(self, carried_mass=freeze(wanted))
+
     def with_material(self, material: Material) -> BodyModel:
         """Return the body made of another material."""
         return replace(self, material=material)
@@ -113,6 +129,27 @@ class BodyModel:
         if [c.path for c in cables] != [c.path for c in self.cables]:
             raise InputError("the paths of the cables must stay", where="cables", hint="make_body builds a body with other paths")
         return replace(self, cables=cables)
+
+    def with_cable_places(self, places: Mapping[str, FloatArray]) -> BodyModel:
+        """Return the body with points of some cables' paths elsewhere at rest, name → [m], shape (p, 3); each keeps the element that carries it."""
+        paths = {c.name: tie_to_elements(self.mesh, places[c.name], c.path.element) for c in self.cables if c.name in places}
+        return replace(self, cables=tuple(replace(c, path=paths.get(c.name, c.path)) for c in self.cables))
+
+    def with_rest_nodes(self, nodes: FloatArray) -> BodyModel:
+        """Return the body of another shape at rest: its nodes elsewhere [m], shape (n, 3), free of stress there; ties and patterns stay.
+
+        Raises:
+            InputError: where an element would fold over.
+        """
+        mesh = TetMesh(nodes, self.mesh.tets)
+        stencil = reshaped(self.stencil, mesh)
+        if (stencil.volumes <= 0).any():
+            raise InputError(
+                "elements fold over", where="rest shape", expected="positive volumes", hint="a smaller change of shape"
+            )
+        seeds = [tie_to_elements(self.mesh, c.seed[None], _nearest_element(self.mesh, c.seed)) for c in self.chambers]
+        chambers = tuple(replace(c, seed=freeze(tie.positions(nodes)[0])) for c, tie in zip(self.chambers, seeds))
+        return replace(self, mesh=mesh, stencil=stencil, chambers=chambers)
 
     def with_clamp_stiffness(self, stiffness: float = np.inf, *, turn: float = np.inf) -> BodyModel:
         """Return the body on a clamp that gives (see `femsense.fem.clamp`).
@@ -227,6 +264,12 @@ def make_body(
         chambers=chambers,
         chamber_curvature=curvature,
     )
+
+
+def _nearest_element(mesh: TetMesh, point: FloatArray) -> IntArray:
+    """Return the element with its centre nearest to a point [m], shape (1,)."""
+    centres = mesh.nodes[mesh.tets[:, :4]].mean(axis=1)
+    return np.array([int(np.linalg.norm(centres - point, axis=1).argmin())])
 
 
 def _spread_out(points: FloatArray) -> bool:

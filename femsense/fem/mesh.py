@@ -354,9 +354,20 @@ def embed_points(mesh: TetMesh, points: FloatArray, *, outside_rule: str = "near
         if len(free):
             carrier, outside[free] = _carriers_of_outsiders(elements, points[free], centre_distance[free] + elements.reach)
             element[free] = carrier if outside_rule == "nearest_element" else element[free]
+    return _tied(mesh, element, points, outside)
+
+
+def tie_to_elements(mesh: TetMesh, points: FloatArray, element: IntArray) -> Embedding:
+    """Tie points [m], shape (p, 3), to given elements, shape (p,), by the rule of `embed_points` for points inside and outside of them."""
+    corners = mesh.nodes[mesh.tets[element, :4]]
+    nearest = np.einsum("pl,plc->pc", closest_in_tet(corners, points), corners)
+    return _tied(mesh, element, points, np.linalg.norm(points - nearest, axis=1))
+
+
+def _tied(mesh: TetMesh, element: IntArray, points: FloatArray, outside: FloatArray) -> Embedding:
     coordinates = barycentric(mesh, element, points)
     at = coordinates.copy()
-    drawn_to_faces(freeze(elements.corners[element]), freeze(points), at)
+    drawn_to_faces(freeze(mesh.nodes[mesh.tets[element, :4]]), freeze(points), at)
     weights = shape_values(at, quadratic=mesh.is_quadratic)
     if (at != coordinates).any():
         weights += np.einsum("pkl,pl->pk", shape_slopes(at, quadratic=mesh.is_quadratic), coordinates - at)

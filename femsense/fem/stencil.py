@@ -80,6 +80,29 @@ def make_stencil(mesh: TetMesh, cliques: list[IntArray] | None = None) -> tuple[
     Returns:
         the stencil, and for each clique array the slots of its node pairs, shape (s, k, k).
     """
+    tets, gradients, volumes, node_volume = _geometry(mesh)
+    rows, columns, slots = _block_pattern(len(mesh.nodes), [tets, *(cliques or [])])
+    first, second = np.triu_indices(tets.shape[1])
+    stencil = Stencil(
+        freeze(tets, np.int32),
+        freeze(gradients),
+        freeze(volumes),
+        freeze(node_volume),
+        freeze(slots[0][:, first, second], np.int32),
+        freeze(rows, np.int64),
+        freeze(columns, np.int64),
+    )
+    return stencil, slots[1:]
+
+
+def reshaped(stencil: Stencil, mesh: TetMesh) -> Stencil:
+    """Return the stencil of the same elements with their nodes elsewhere at rest; patterns stay."""
+    _, gradients, volumes, node_volume = _geometry(mesh)
+    return replace(stencil, gradients=freeze(gradients), volumes=freeze(volumes), node_volume=freeze(node_volume), lanes=[])
+
+
+def _geometry(mesh: TetMesh) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
+    """Return the sorted nodes of the elements (m, a), gradients, volumes of their quadrature points, and volumes of the nodes (n,)."""
     quadratic = mesh.is_quadratic
     points = QUADRATURE if quadratic else np.full((1, 4), 0.25)
     slopes = shape_slopes(points, quadratic=quadratic)  # (q, a, 4)
@@ -94,18 +117,7 @@ def make_stencil(mesh: TetMesh, cliques: list[IntArray] | None = None) -> tuple[
     node_volume = np.zeros(len(mesh.nodes))
     values = _moments(mesh, volumes)
     np.add.at(node_volume, mesh.tets, values)
-    rows, columns, slots = _block_pattern(len(mesh.nodes), [tets, *(cliques or [])])
-    first, second = np.triu_indices(tets.shape[1])
-    stencil = Stencil(
-        freeze(tets, np.int32),
-        freeze(gradients),
-        freeze(volumes),
-        freeze(node_volume),
-        freeze(slots[0][:, first, second], np.int32),
-        freeze(rows, np.int64),
-        freeze(columns, np.int64),
-    )
-    return stencil, slots[1:]
+    return tets, gradients, volumes, node_volume
 
 
 def in_lanes(values: npt.NDArray[Any]) -> npt.NDArray[Any]:

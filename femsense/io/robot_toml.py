@@ -644,7 +644,7 @@ def _check_plain(robot: Robot) -> None:
     """Refuse to write a robot made in Python whose model is not the plain one."""
     body, material = robot.body, robot.body.material
     plain_inputs = plain_actuation(len(body.cables))
-    same_inputs = all(
+    same_inputs = not robot.by_recording and all(
         np.array_equal(getattr(robot.actuation, name), getattr(plain_inputs, name)) for name in plain_inputs.__slots__
     )
     beyond = {
@@ -652,6 +652,7 @@ def _check_plain(robot: Robot) -> None:
         f"the law {material.law}": material.law != "corotational",
         "a clamp that gives": np.isfinite(body.clamp_stiffness),
         "dead forces": body.dead_forces.any(),
+        "masses that it carries": body.carried_mass is not None,
         "cable friction": any(cable.friction for cable in body.cables),
         "actuation that is not plain": not same_inputs,
         "observation that is not plain": (robot.observation.depth_scale, robot.observation.depth_offset) != (1.0, 0.0),

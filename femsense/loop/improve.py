@@ -30,7 +30,7 @@ from femsense.loop.search.element_order import need_quadratic, seeks_with_quadra
 from femsense.loop.search.search import distinguishes_effects, search_begun, search_effects
 from femsense.loop.search.search_state import Progress, Search, SearchProgress
 from femsense.loop.verdict.verdict import conclude
-from femsense.model.effects import EFFECTS, FORMS, Effect, find_effect, load_own_effect, try_own_effect
+from femsense.model.effects import EFFECTS, FORMS, Effect, find_effect, forms_by_recording, load_own_effect, try_own_effect
 from femsense.model.recording import Recording
 from femsense.model.robot import Robot
 
@@ -76,16 +76,17 @@ def improve(
         raise InputError("no effect is left to try", where="effects, without", expected="at least one of docs/effects/")
     _require_one_that_acts(names if effects else [], own, robot, recordings)
     rng = np.random.default_rng(seed)
+    forms = (*FORMS, *forms_by_recording(FORMS, recordings), *own)
 
     def ready(body: Robot, names: Sequence[str]) -> Ready:
         say("reading and calibrating")
         with beside(lambda: _get_ready(body, names)) as finer_is_made:
             data = prepare(body, recordings, validation, measured)
-            data, before, start = calibrated(replace(data, forms=(*FORMS, *own), declared=robot), say)
+            data, before, start = calibrated(replace(data, forms=forms, declared=robot), say)
             finer_is_made()
         return with_discretisation_error(data, start[-1][1], names, say), before, start
 
-    with Checkpoint(keep, (*FORMS, *own)) as checkpoint:
+    with Checkpoint(keep, forms) as checkpoint:
         data, search = _searched(robot, names, ready, checkpoint, say)
         say("testing what is left")
         result = conclude(data, search, rng)

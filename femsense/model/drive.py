@@ -46,26 +46,28 @@ def drive_of(robot: Robot, recording: Recording, *, initial: FloatArray | None =
     Returns:
         the drive.
     """
+    robot = robot.in_recording(recording.label)
     inputs = inputs_wanted(robot, recording, initial)
     if recording.actuation == "tension":
         inputs = _creep(np.maximum(inputs, 0.0), recording.time_s, robot.creep)
     frame, points, forces = _creep_loads(recording, robot.creep)
     order = [recording.chamber_names.index(name) for name in robot.body.chamber_names] if recording.chamber_names else []
     pressures = recording.pressures[:, order] if order else np.zeros((len(recording.time_s), len(robot.body.chambers)))
-    pressures = _creep(pressures, recording.time_s, robot.creep)
+    act = robot.actuation
+    pressures = _creep(act.pressure_gain * pressures + act.pressure_offset, recording.time_s, robot.creep)
     ties = _load_ties(robot.body.mesh, points)
     return Drive(recording.actuation, freeze(inputs), recording.gravity, frame, points, forces, freeze(pressures), ties)
 
 
 def inputs_wanted(robot: Robot, recording: Recording, initial: FloatArray | None = None) -> FloatArray:
     """Return recorded inputs after zero, gain and play [N] or [m], shape (F, a); a tension below zero pulls like none."""
-    names, act = robot.body.cable_names, robot.actuation
+    names, act = robot.body.cable_names, robot.in_recording(recording.label).actuation
     order = [recording.cable_names.index(name) for name in names] if recording.cable_names else []
     recorded = recording.inputs[:, order] if order else np.zeros((len(recording.time_s), len(names)))
     recorded = recorded + (0.0 if initial is None else initial)
     if recording.actuation == "tension":
-        return np.asarray(act.gain * recorded + act.tension_offset)
-    return np.asarray(act.gain * recorded + act.displacement_offset - act.slack)
+        return np.asarray(act.scaled(recorded) + act.tension_offset)
+    return np.asarray(act.scaled(recorded) + act.displacement_offset - act.slack)
 
 
 def creep_response(robot: Robot, recording: Recording) -> FloatArray:

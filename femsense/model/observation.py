@@ -18,7 +18,8 @@ from femsense.core.pose import invert_pose, moved_poses, transform_points
 from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.mesh import Embedding
 from femsense.model.drive import DrivenRobot, drive_of, has_history, inputs_wanted
-from femsense.model.effects import Effect, Entry, Parameter, build_entry
+from femsense.model.effects import Effect, Entry, InRecording, Parameter, build_entry
+from femsense.model.effects.base import part_in
 from femsense.model.quasi_static_path import solve_path
 from femsense.model.recording import Recording
 from femsense.model.robot import Observation, Robot
@@ -289,13 +290,13 @@ def evaluate_scene(
     Raises:
         DataError: a frame has no equilibrium.
     """
-    robot = hypothesis.robot_at(coordinates)
+    robot = hypothesis.robot_at(coordinates).in_recording(scene.recording.label)
     begun, moves = poses, np.zeros(6 * len(poses)) if moves is None else moves
     poses = moved_poses(begun, moves, pivot)
     base = DrivenRobot(robot, drive_of(robot, scene.recording, initial=initial))
     steps, variants = _variants(hypothesis, scene, coordinates, initial, base, vary_initial) if derivative else ([], [])
     split, last = len(hypothesis.parameters) if derivative else 0, len(variants)
-    pulling = _pulling(hypothesis, base, steps, variants) if derivative and vary_inputs else []
+    pulling = _pulling(hypothesis, base, steps, variants, scene.recording.label) if derivative and vary_inputs else []
     places = {id(robot): _ties(robot, scene, poses)}
     for v in variants:
         if id(v.robot) not in places:
@@ -353,13 +354,16 @@ def _variants(
     vary_initial: bool,
 ) -> tuple[list[float], list[DrivenRobot]]:
     """Return steps and variants: first one for each coordinate, then one for each initial input if they vary."""
-    steps, variants = [], []
+    steps, variants, label = [], [], scene.recording.label
     for j, parameter in enumerate(hypothesis.parameters):
         h = parameter.step if coordinates[j] + parameter.step <= parameter.high else -parameter.step
+        steps.append(h)
+        if isinstance(parameter.part, InRecording) and parameter.part.recording != label:
+            variants.append(base)
+            continue
         moved = coordinates.copy()
         moved[j] += h
-        robot = hypothesis.robot_at(moved)
-        steps.append(h)
+        robot = hypothesis.robot_at(moved).in_recording(label)
         variants.append(DrivenRobot(robot, drive_of(robot, scene.recording, initial=initial)))
     names = base.robot.body.cable_names if vary_initial else ()
     start = np.zeros(len(names)) if initial is None else initial
@@ -372,7 +376,7 @@ def _variants(
     return steps, variants
 
 
-def _pulling(hypothesis: Hypothesis, base: DrivenRobot, steps: list[float], variants: list[DrivenRobot]) -> list[int]:
+def _pulling(hypothesis: Hypothesis, base: DrivenRobot, steps: list[float], variants: list[DrivenRobot], label: str) -> list[int]:
     """Return which variants pull a little more at each cable in every frame; none where nothing moves tensions.
 
     They are added; where nothing depends on other frames, they are put in the place of those of the cables' zeros, whose derivative is
@@ -383,7 +387,8 @@ def _pulling(hypothesis: Hypothesis, base: DrivenRobot, steps: list[float], vari
     if base.drive.control != "tension" or not driving:
         return []
     past = bool(base.robot.creep) or any(has_history(w.robot) for w in (base, *variants))
-    zeros = {} if past else {p.part: j for j, p in enumerate(hypothesis.parameters) if p.key == "tension_n"}
+    own = ((j, p) for j, p in enumerate(hypothesis.parameters) if p.key == "tension_n")
+    zeros = {} if past else {part_in(p, label): j for j, p in own}
     chosen = []
     for i, name in enumerate(base.robot.body.cable_names):
         inputs = base.drive.inputs.copy()

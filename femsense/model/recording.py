@@ -183,6 +183,11 @@ class Recording:
     """Its place in that camera's frame [m], shape (U, 3)."""
 
     @property
+    def label(self) -> str:
+        """What values of their own in each recording go by: its session, else the name of its folder; "" where it has neither."""
+        return self.session or (self.folder.name if self.folder is not None else "")
+
+    @property
     def frame_count(self) -> int:
         return len(self.time_s)
 

@@ -83,10 +83,18 @@ def body_on_mesh(body: BodyModel, mesh: TetMesh, *, clamped: IntArray | None = N
     made = made.with_gravity(body.gravity)
     if not body.clamp_is_rigid:
         made = made.with_clamp_stiffness(body.clamp_stiffness, turn=body.clamp_turn_stiffness)
-    loaded = np.flatnonzero(body.dead_forces.any(axis=1))
-    if not len(loaded):
+    if body.carried_mass is not None:
+        made = made.with_carried_mass(_spread_over(mesh, body.mesh.nodes, body.carried_mass[:, None])[:, 0])
+    if not body.dead_forces.any():
         return made
-    return made.with_dead_forces(embed_points(mesh, body.mesh.nodes[loaded]).spread(body.dead_forces[loaded], len(mesh.nodes)))
+    return made.with_dead_forces(_spread_over(mesh, body.mesh.nodes, body.dead_forces))
+
+
+def _spread_over(mesh: TetMesh, places: FloatArray, values: FloatArray) -> FloatArray:
+    """Return what nodes at places (p, 3) hold, shape (p, c), spread over the nodes of another mesh, shape (n, c)."""
+    held = np.flatnonzero(values.any(axis=1))
+    ties = embed_points(mesh, places[held])
+    return np.asarray(ties.matrix(len(mesh.nodes)).T @ values[held])
 
 
 @functools.lru_cache(maxsize=2)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from femsense.fem.mesh import Embedding, embed_points, surface_triangles
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Actuation:
-    """From recorded cable inputs to true ones, one value a cable, in the order of the body's cables."""
+    """From recorded inputs to true ones, one value a cable, in the order of the body's cables, and a chamber."""
 
     gain: FloatArray
     """true = gain × recorded [1], shape (a,)."""
@@ -28,6 +28,17 @@ class Actuation:
     """Play that is taken up before a cable pulls [m], shape (a,)."""
     stretch_stiffness: FloatArray
     """Cable stiffness [N/m], shape (a,); inf: does not stretch."""
+    coupling: FloatArray | None = None
+    """Share of the scaled input of each cable (column) that goes to each (row) beside its own [1], shape (a, a); None: no share."""
+    pressure_gain: FloatArray = field(default_factory=lambda: freeze(np.ones(())))
+    """true = gain × recorded + offset [1], shape (c,) in the order of the body's chambers, or () for all."""
+    pressure_offset: FloatArray = field(default_factory=lambda: freeze(np.zeros(())))
+    """[Pa], of the same shape; at rest too."""
+
+    def scaled(self, recorded: FloatArray) -> FloatArray:
+        """Return recorded inputs of the cables, (F, a), after gain and coupling."""
+        inputs = self.gain * recorded
+        return np.asarray(inputs if self.coupling is None else inputs + inputs @ self.coupling.T)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -67,12 +78,21 @@ class Robot:
     """Where robot.toml and the mesh stand."""
     marker_share: FloatArray | None = None
     """By which share each marker follows the body, shape (k,): 1 sits on it, 0 sits on what holds it; None: all sit on it."""
+    by_recording: tuple[Callable[[Robot, str], Robot], ...] = ()
+    """What differs from recording to recording: (robot, label of a recording) → the robot there, one after the other."""
     surface_points: int = 0
     """So many of the markers, the last ones, are points of the surface that clouds are measured at; nobody glued them on."""
 
     def with_body(self, body: BodyModel) -> Robot:
         """Return the robot with another body on the same mesh."""
         return replace(self, body=body)
+
+    def in_recording(self, label: str) -> Robot:
+        """Return the robot as it is in a recording with this label (`Recording.label`)."""
+        robot = replace(self, by_recording=()) if self.by_recording else self
+        for change in self.by_recording:
+            robot = change(robot, label)
+        return robot
 
     @property
     def glued_names(self) -> tuple[str, ...]:

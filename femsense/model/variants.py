@@ -506,6 +506,7 @@ class _Balance:
             if not _same_weight(body, own):
                 force += body.weight() - own.weight()
             self._add_inner(body, force)
+            self._add_paths(body, force)
         if drive.load_forces is not self.driven.drive.load_forces:
             force += self._loads(variant) - self._loads(self.driven)
         for i, chamber in enumerate(body.chambers):
@@ -513,6 +514,13 @@ class _Balance:
             if more != 0.0:
                 force += more * volume_gradient(chamber, x)
         return force
+
+    def _add_paths(self, body: BodyModel, force: FloatArray) -> None:
+        """Add what the tensions of the base state do along the paths of another body, where these run elsewhere, to a force [N], (n, 3)."""
+        x = self.base.positions
+        for cable, own, along in zip(body.cables, self.body.cables, self.base.segment_tensions):
+            if cable.path is not own.path and along.any():
+                force += cable_forces(cable, x, along, len(x)) - cable_forces(own, x, along, len(x))
 
     def _add_inner(self, body: BodyModel, force: FloatArray) -> None:
         """Add by how much less another body resists to a force [N], (n, 3)."""
@@ -534,6 +542,8 @@ class _Balance:
             for b, c in zip(cables, body.cables)
         ]
         pulled = variant.drive.inputs[self.frame] - self.driven.drive.inputs[self.frame] + np.array(stretch)
+        if x is None and any(b.path is not c.path for b, c in zip(body.cables, cables)):
+            x = self.base.positions
         if x is not None:
             pulled = pulled - shortening(body, x) + shortening(self.body, self.base.positions)
         return np.asarray(pulled)
@@ -551,6 +561,7 @@ def _same_weight(body: BodyModel, other: BodyModel) -> bool:
     volume, others = body.stencil.node_volume, other.stencil.node_volume
     return (
         (volume is others or np.array_equal(volume, others))
+        and body.carried_mass is other.carried_mass
         and body.material.density == other.material.density
         and np.array_equal(body.gravity, other.gravity)
     )

@@ -164,6 +164,8 @@ def true_inputs(robot: Robot, plan: Plan) -> FloatArray:
     """Return what the motors truly do in each frame [N] or [m], shape (F, a): gain, zero, play and creep of the truth."""
     act = robot.actuation
     inputs = act.gain * (plan.commanded + plan.initial)
+    if act.coupling is not None:
+        inputs = inputs @ (np.eye(inputs.shape[1]) + act.coupling).T
     if plan.control == "displacement":
         return np.asarray(inputs + act.displacement_offset - act.slack)
     pulled = np.where(inputs + act.tension_offset > 0, inputs + act.tension_offset, 0.0)
@@ -223,6 +225,7 @@ class _TruePath:
         self.plan = plan
         self.friction = [cable.friction for cable in robot.body.cables]
         self.creep = robot.creep
+        self.pressures = robot.actuation.pressure_gain * plan.pressures + robot.actuation.pressure_offset
         self.body = robot.body.with_cables(tuple(replace(cable, friction=0.0) for cable in robot.body.cables))
         self.patches = [contact_patch(robot.body.mesh, c.table.point_m, c.table.radius_m) for c in plan.contacts]
         self.grips = [new_grip(len(cable.path)) for cable in robot.body.cables]
@@ -247,7 +250,7 @@ class _TruePath:
         known = _known_loads(self.body.mesh, plan, creep)
         gravity = np.tile(self.body.gravity, (F, 1)) if plan.gravity is None else plan.gravity
         contact = np.stack([c.force for c in plan.contacts], axis=1) if plan.contacts else np.zeros((F, 0))
-        pressures = creep @ plan.pressures
+        pressures = creep @ self.pressures
         return [_Load(inputs[k], known.get(k, np.zeros((n, 3))), contact[k], gravity[k], pressures[k]) for k in range(F)]
 
     def go(self, load: _Load, frame: int) -> None:

@@ -39,6 +39,7 @@ def make_sensor(
 ) -> Sensor:
     """Prepare what stays the same from frame to frame. Raises InputError where nothing says where to look for forces."""
     recording, options = check_against(robot, recording), options or SensingOptions()
+    robot = robot.in_recording(recording.label)
     places = as_points(at if at is not None else np.zeros((0, 3)), "at")
     size = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
     surface = body_surface(robot.body.mesh)

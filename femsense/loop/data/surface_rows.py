@@ -207,7 +207,7 @@ def make_rows(
     Raises:
         DataError: too few points are found.
     """
-    every: list[tuple[IntArray, IntArray, IntArray, FloatArray, Crossings]] = []
+    robot, every = robot.in_recording(scene.recording.label), list[tuple[IntArray, IntArray, IntArray, FloatArray, Crossings]]()
     for i, (k, v) in enumerate(seen.points):
         if k not in states:
             continue
@@ -317,7 +317,7 @@ def renewed_rows(
 ) -> Scene:
     """Return the same rows with what the model rounds off counted anew where it now has the surface."""
     assert scene.crossings is not None
-    rounded = scene.crossings.rounded.copy()
+    robot, rounded = robot.in_recording(scene.recording.label), scene.crossings.rounded.copy()
     for i, (k, v) in enumerate(seen.points):
         rows = np.flatnonzero((scene.frame == k) & (scene.view == v))
         if k not in states or not len(rows):

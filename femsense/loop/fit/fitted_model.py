@@ -13,7 +13,7 @@ from femsense.loop.data.surface_rows import make_rows, renewed_rows, states_of
 from femsense.loop.data.trial import Trial, rms_of, spans_of
 from femsense.loop.fit.joint_fit import GAIN, JointFit, JointProblem, Prior, fit_jointly
 from femsense.loop.fit.noise_components import Noise, whiten
-from femsense.model.effects import Effect, Entry, Parameter, find_effect
+from femsense.model.effects import Effect, Entry, Parameter, by_session, find_effect
 from femsense.model.effects.base import range_units
 from femsense.model.observation import Hypothesis, SceneJet, evaluate_scene
 from femsense.model.robot import Robot
@@ -52,12 +52,12 @@ def with_nuisance(data: Data, robot: Robot | None = None) -> tuple[Hypothesis, P
     terms: list[tuple[Effect, Entry, tuple[Parameter, ...]]] = []
     std: list[float] = []
     for name in NUISANCE:
-        effect = find_effect(name)
+        effect, seed = by_session(find_effect(name), [t.scene.recording for t in data.train])
         parameters = effect.parameters(data.robot, data.control)
         unknown_zero = any(t.initial is not None for t in data.train)
         if effect.calibrated is None or not parameters or (effect.calibrated.of_inputs and unknown_zero):
             continue
-        terms.append((effect, {}, parameters))
+        terms.append((effect, seed, parameters))
         std += [
             max(effect.calibrated.std * u, 1e-9) for u in range_units(parameters, data.robot.body.cable_names, data.input_scale)
         ]

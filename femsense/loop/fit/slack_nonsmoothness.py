@@ -85,7 +85,7 @@ def _wanted(
     value = inputs_wanted(robot, recording, initial)
     slope = np.zeros((*value.shape, len(own) + len(coordinates)))
     for i in range(0 if initial is None else len(initial)):
-        slope[:, i, poses + i] = robot.actuation.gain[i]
+        slope[:, i, poses + i] = robot.in_recording(recording.label).actuation.gain[i]
     for j, parameter, k in zip(range(len(at)), driving.parameters, len(own) + np.flatnonzero(chosen)):
         moved = at.copy()
         moved[j] += parameter.step

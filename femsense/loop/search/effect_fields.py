@@ -16,7 +16,7 @@ from femsense.loop.data.trial import States, Trial, spans_of
 from femsense.loop.fit.fitted_model import FittedModel
 from femsense.loop.fit.joint_fit import JointFit, JointProblem, Prior
 from femsense.model.drive import has_history
-from femsense.model.effects import Effect, Entry, Parameter
+from femsense.model.effects import Effect, Entry, InRecording, Parameter
 from femsense.model.observation import Hypothesis
 from femsense.model.robot import Robot
 from femsense.model.variants import AtPoints
@@ -46,10 +46,10 @@ def candidates_for(
 
 
 def parts_of(parameters: tuple[Parameter, ...]) -> list[tuple[Parameter, ...]]:
-    """Return the parameters of each cable or marker, or of each key, by itself: an effect may be that of one of them alone."""
+    """Return the parameters of each recording, cable or marker, or of each key, by itself: an effect may be that of one of them alone."""
     parts: dict[str, list[Parameter]] = {}
     for p in parameters:
-        owner = p.part[0] if isinstance(p.part, tuple) else p.part
+        owner = p.part.recording if isinstance(p.part, InRecording) else p.part[0] if isinstance(p.part, tuple) else p.part
         parts.setdefault(owner if isinstance(owner, str) else p.key, []).append(p)
     return [tuple(part) for part in parts.values()]
 

@@ -79,7 +79,7 @@ class View:
     def measured(self) -> FloatArray:
         """Measured points [m], shape (k, 3), robot frame; of clouds where the normals cross the measured surface."""
         scene = self.trial.scene
-        return in_robot_frame(scene.points, scene.view, self.poses, self.robot.observation)
+        return in_robot_frame(scene.points, scene.view, self.poses, self.robot.in_recording(scene.recording.label).observation)
 
 
 def views_of(data: Data, fitted: FittedModel) -> list[View]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -35,6 +34,7 @@ from femsense.loop.search.screening import TESTABLE, Candidate, one_each
 from femsense.loop.search.search_state import Search
 from femsense.loop.verdict.candidate_tables import KINDS, own_size
 from femsense.loop.verdict.sentences import mesh_error_rms
+from femsense.model.effects.base import placed
 
 MIN_SWEEPS = 4
 """With fewer held-out sweeps the interval of the held-out error resamples frames."""
@@ -90,8 +90,8 @@ def values_of(full_std: dict[str, FloatArray], back: FittedModel, name: str) -> 
             std = np.maximum(std, full)
         for p, value, deviation in zip(parameters, values, std):
             known = result.get(p.key, Value(None, None, p.unit))
-            own = _placed(known.value, p.part, _finite(p.value(value)))
-            result[p.key] = Value(own, _placed(known.std, p.part, _finite(p.value_std(value, deviation))), known.unit)
+            own = placed(known.value, p.part, _finite(p.value(value)))
+            result[p.key] = Value(own, placed(known.std, p.part, _finite(p.value_std(value, deviation))), known.unit)
         result |= {k: Value(v, None, _unit(k)) for k, v in seed.items() if k not in result}
     return result
 
@@ -102,18 +102,6 @@ def _finite(number: float) -> float | None:
 
 def _unit(key: str) -> str:
     return "m" if key.endswith("_m") else "s" if key.endswith("_s") else "1"
-
-
-def _placed(slot: Any, part: Any, number: float | None) -> Any:
-    if part is None:
-        return number
-    if isinstance(part, int):
-        return [*(slot or []), number]
-    if isinstance(part, tuple):
-        table = dict(slot or {})
-        table[part[0]] = [*table.get(part[0], []), number]
-        return table
-    return {**(slot or {}), part: number}
 
 
 # Errors

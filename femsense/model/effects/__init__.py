@@ -7,14 +7,20 @@ from difflib import get_close_matches
 from typing import Any
 
 from femsense.core.errors import InputError
-from femsense.model.effects.base import Alias, Calibrated, Effect, Entry, Experiment, Parameter, build_entry
+from femsense.model.effects.along import REST_SHAPE, STIFFNESS_GRADIENT
+from femsense.model.effects.base import Alias, Calibrated, Effect, Entry, Experiment, InRecording, Parameter, build_entry
+from femsense.model.effects.cable_path import CABLE_PATH, CABLE_TURN
 from femsense.model.effects.cables import CABLE_FRICTION, CABLE_FRICTIONS, CABLE_GAIN, CABLE_OFFSET, CABLE_SLACK, CABLE_STRETCH
+from femsense.model.effects.chambers import CHAMBER_GAIN, CHAMBER_OFFSET
+from femsense.model.effects.coupling import CABLE_COUPLING
 from femsense.model.effects.loads import GRAVITY, PAYLOAD
 from femsense.model.effects.material import CREEP, CREEP_TWICE, GENT, HYPERELASTIC, POISSON, SOFT_REGION, STIFFNESS
 from femsense.model.effects.observation import CLAMPED_MARKER, DEPTH_SCALE, MARKER_OFFSET
+from femsense.model.effects.per_recording import PER, by_session, checked, forms_by_recording, per_recording
 from femsense.model.effects.shape import DISCRETISATION, GEOMETRY
 from femsense.model.effects.support import BASE_COMPLIANCE, BASE_ROTATION
 from femsense.model.effects.user_defined import find_own_file, load_own_effect, try_own_effect
+from femsense.model.effects.weight import DENSITY, TIP_MASS
 from femsense.model.robot import Robot
 
 EFFECTS: tuple[Effect, ...] = (
@@ -36,9 +42,17 @@ EFFECTS: tuple[Effect, ...] = (
     DEPTH_SCALE,
     MARKER_OFFSET,
     CLAMPED_MARKER,
+    DENSITY,
+    TIP_MASS,
+    CHAMBER_OFFSET,
+    CHAMBER_GAIN,
+    CABLE_PATH,
+    STIFFNESS_GRADIENT,
+    REST_SHAPE,
+    CABLE_COUPLING,
 )
 """Each name once."""
-FORMS: tuple[Effect, ...] = (*EFFECTS, GENT, CREEP_TWICE, BASE_ROTATION, CABLE_FRICTIONS)
+FORMS: tuple[Effect, ...] = (*EFFECTS, GENT, CREEP_TWICE, BASE_ROTATION, CABLE_FRICTIONS, CABLE_TURN)
 """Every way in which an effect can be fitted: some have further parameters, under the same name."""
 EFFECT_NAMES: tuple[str, ...] = tuple(effect.name for effect in EFFECTS)
 CALIBRATED: tuple[str, ...] = tuple(effect.name for effect in EFFECTS if effect.calibrated is not None)
@@ -69,10 +83,11 @@ def apply_effects(robot: Robot, entries: Sequence[Mapping[str, Any]]) -> Robot:
     for entry in entries:
         rest = {key: value for key, value in entry.items() if key != "name"}
         effect = find_effect(str(entry.get("name"))) if "file" not in entry else _own(entry, robot)
-        unknown = sorted(set(rest) - set(effect.keys))
+        keys = (*effect.keys, PER) if effect.may_differ else effect.keys
+        unknown = sorted(set(rest) - set(keys))
         if unknown:
-            raise InputError("unknown key", where=f"effects.{effect.name}", found=unknown[0], expected=", ".join(effect.keys))
-        robot = effect.apply(robot, rest)
+            raise InputError("unknown key", where=f"effects.{effect.name}", found=unknown[0], expected=", ".join(keys))
+        robot = effect.apply(robot, rest) if PER not in rest else checked(per_recording(effect).apply(robot, rest), rest)
     return robot
 
 
@@ -97,10 +112,14 @@ __all__ = [
     "Effect",
     "Entry",
     "Experiment",
+    "InRecording",
     "Parameter",
     "apply_effects",
     "build_entry",
+    "by_session",
     "find_effect",
+    "forms_by_recording",
     "load_own_effect",
+    "per_recording",
     "try_own_effect",
 ]

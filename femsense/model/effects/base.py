@@ -28,13 +28,23 @@ class KnownLength:
 
 
 @dataclass(frozen=True, slots=True)
+class InRecording:
+    """The part of a parameter that a recording has for itself."""
+
+    part: int | str | tuple[str, int] | None
+    """As of `Parameter.part`."""
+    recording: str
+    """Label of the recording or its session."""
+
+
+@dataclass(frozen=True, slots=True)
 class Parameter:
     """One number of an effect, as the fit sees it."""
 
     key: str
     """The key in robot.toml."""
-    part: int | str | tuple[str, int] | None
-    """Component of a vector, name of a cable, (marker, component), or None for a single number."""
+    part: int | str | tuple[str, int] | InRecording | None
+    """Component of a vector, name of a cable, (marker, component), or None for a single number; any of them in one recording."""
     unit: str
     null: float
     """The fit's coordinate at which the effect vanishes."""
@@ -86,9 +96,26 @@ class Parameter:
 
     @property
     def label(self) -> str:
-        if isinstance(self.part, tuple):
-            return f"{self.key}[{self.part[0]}][{self.part[1]}]"
-        return self.key if self.part is None else f"{self.key}[{self.part}]"
+        return self.key + "".join(f"[{step}]" for step in path_of(self.part))
+
+
+def path_of(part: int | str | tuple[str, int] | InRecording | None) -> tuple[str | int, ...]:
+    """Return the keys and numbers that lead from a key of an entry to the value of a part; components of a vector come last."""
+    if isinstance(part, InRecording):
+        own = path_of(part.part)
+        at = len(own) - 1 if own and isinstance(own[-1], int) else len(own)
+        return (*own[:at], part.recording, *own[at:])
+    if part is None:
+        return ()
+    return part if isinstance(part, tuple) else (part,)
+
+
+def part_in(parameter: Parameter, label: str) -> int | str | tuple[str, int] | None:
+    """Return the part of a parameter as it is in a recording with this label; None where it belongs to another."""
+    part = parameter.part
+    if not isinstance(part, InRecording):
+        return part
+    return part.part if part.recording == label else None
 
 
 USUAL = 0.05
@@ -176,6 +203,10 @@ class Effect:
     """(declared robot) → whether every such body has it, though the robot does not declare it."""
     prior_cost: Callable[[Robot, FloatArray], float] = lambda robot, coordinates: 0.0
     """(declared robot, its coordinates) → −2 log of how likely they are beforehand, 0 at best."""
+    may_differ: bool = False
+    """Whether its values may differ from recording to recording (`per = "recording"`)."""
+    sought_by_recording: bool = True
+    """Whether it is sought so; else it only is if robot.toml declares it."""
 
     def mirrors(self, name: str) -> bool:
         """Return whether it is the mirror image of another effect."""
@@ -192,7 +223,7 @@ def known_length(parameters: Sequence[Parameter]) -> tuple[BoolArray, KnownLengt
 
 def range_units(parameters: Sequence[Parameter], cables: Sequence[str], ranges: FloatArray) -> FloatArray:
     """Return the unit that sizes of parameters are shares of, shape (p,): the range of the cable's input [N] or [m], or 1."""
-    return np.array([float(ranges[cables.index(str(p.part))]) if p.of_range else 1.0 for p in parameters])
+    return np.array([float(ranges[cables.index(str(path_of(p.part)[0]))]) if p.of_range else 1.0 for p in parameters])
 
 
 def build_entry(parameters: Sequence[Parameter], coordinates: Sequence[float], seed: Mapping[str, Any]) -> Entry:
@@ -200,16 +231,22 @@ def build_entry(parameters: Sequence[Parameter], coordinates: Sequence[float], s
     fitted = {p.key for p in parameters}
     entry: Entry = {key: value for key, value in seed.items() if key not in fitted}
     for parameter, coordinate in zip(parameters, coordinates):
-        value = parameter.value(float(coordinate))
-        if parameter.part is None:
-            entry[parameter.key] = value
-        elif isinstance(parameter.part, int):
-            entry.setdefault(parameter.key, []).append(value)
-        elif isinstance(parameter.part, tuple):
-            entry.setdefault(parameter.key, {}).setdefault(parameter.part[0], []).append(value)
-        else:
-            entry.setdefault(parameter.key, {})[parameter.part] = value
+        entry[parameter.key] = placed(entry.get(parameter.key), parameter.part, parameter.value(float(coordinate)))
     return entry
+
+
+def placed(slot: Any, part: int | str | tuple[str, int] | InRecording | None, value: Any) -> Any:
+    """Return what stands under a key of an entry with the value of one more part; components of a vector come in their order."""
+    return _placed(slot, path_of(part), value)
+
+
+def _placed(slot: Any, path: tuple[str | int, ...], value: Any) -> Any:
+    if not path:
+        return value
+    if isinstance(path[0], int):
+        return [*(slot or []), value]
+    table = dict(slot or {})
+    return {**table, path[0]: _placed(table.get(path[0]), path[1:], value)}
 
 
 def number(
@@ -236,11 +273,17 @@ def vector(entry: Entry, key: str, where: str) -> np.ndarray[Any, np.dtype[np.fl
 
 def per_cable(entry: Entry, key: str, where: str, robot: Robot, default: float) -> np.ndarray[Any, np.dtype[np.float64]]:
     """Return one value a cable from a number or a table name → value. Raises InputError."""
-    names = robot.body.cable_names
+    return per_name(entry, key, where, robot.body.cable_names, default, kind="cable")
+
+
+def per_name(
+    entry: Entry, key: str, where: str, names: Sequence[str], default: float, *, kind: str
+) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """Return one value for each of some names (of cables, or another kind) from a number or a table name → value. Raises InputError."""
     value = entry.get(key, default)
     if not isinstance(value, Mapping):
         return np.full(len(names), number({key: value}, key, where))
     unknown = sorted(set(value) - set(names))
     if unknown:
-        raise InputError("unknown cable", where=f"{where}.{key}", found=unknown[0], expected=", ".join(names))
+        raise InputError(f"unknown {kind}", where=f"{where}.{key}", found=unknown[0], expected=", ".join(names))
     return np.array([number(dict(value), name, f"{where}.{key}", default=default) for name in names])

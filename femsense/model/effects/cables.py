@@ -155,6 +155,7 @@ CABLE_FRICTION = Effect(
     keys=("coefficient",),
     path_dependent=True,
     told_by=Experiment.LOAD_UNLOAD_AND_HOLD,
+    may_differ=True,
 )
 CABLE_FRICTIONS = replace(CABLE_FRICTION, parameters=_friction_parameters_each)
 CABLE_OFFSET = Effect(
@@ -166,6 +167,7 @@ CABLE_OFFSET = Effect(
     calibrated=Calibrated(OFFSET_STD, PLANNED_OFFSET_STD, of_inputs=True),
     told_by=Experiment.KNOWN_WEIGHT,
     drives=True,
+    may_differ=True,
 )
 CABLE_GAIN: Effect = Effect(
     "cable_gain",
@@ -177,6 +179,7 @@ CABLE_GAIN: Effect = Effect(
     told_by=Experiment.KNOWN_WEIGHT,
     planned=_gains_planned,
     drives=True,
+    may_differ=True,
 )
 ONE_GAIN: Effect = Effect("cable_gain", "", _one_gain, _apply_one_gain)
 """The scales of all cables wrong by the same factor, which no per-cable difference gives away."""
@@ -187,6 +190,7 @@ CABLE_STRETCH = Effect(
     _apply_stretch,
     keys=("stiffness_n_m",),
     told_by=Experiment.KNOWN_WEIGHT,
+    may_differ=True,
 )
 CABLE_SLACK = Effect(
     "cable_slack",
@@ -196,4 +200,5 @@ CABLE_SLACK = Effect(
     keys=("displacement_m",),
     aliases=(Alias(CABLE_OFFSET.name),),
     told_by=Experiment.LOAD_UNLOAD_AND_HOLD,
+    may_differ=True,
 )

@@ -66,7 +66,7 @@ LATTICE = np.array([(i, j, 4 - i - j) for i in range(5) for j in range(5 - i)]) 
 """Points of a triangle (barycentric) that may be such a place."""
 
 
-def _places_nearby(robot: Robot, seed: Entry) -> tuple[Entry, ...]:
+def places_nearby(robot: Robot, seed: Entry) -> tuple[Entry, ...]:
     """Places of the surface around one, far and near, not only at nodes: the force that is found goes with its lever."""
     body, center = robot.body, np.asarray(seed["point_m"])
     triangles = surface_triangles(body.mesh)
@@ -85,11 +85,11 @@ PLACED = 0.05
 """How well a place is known beforehand, in shares of the body's reach: a force acts the same all along its line."""
 
 
-def _place_polish(robot: Robot, control: str, seed: Entry) -> tuple[Parameter, ...]:
+def place_polish(robot: Robot, control: str, seed: Entry) -> tuple[Parameter, ...]:
     reach = robot.body.reach
     return tuple(
         Parameter(
-            "point_m", i, "m", float(v), float(v) - 0.25 * reach, float(v) + 0.25 * reach, 1e-4 * reach, known=PLACED * reach
+            "point_m", i, "m", float(v), float(v) - 0.25 * reach, float(v) + 0.25 * reach, 2e-5 * reach, known=PLACED * reach
         )
         for i, v in enumerate(seed["point_m"])
     )
@@ -122,7 +122,7 @@ PAYLOAD = Effect(
     _apply_payload,
     _payload_places,
     keys=("point_m", "force_n"),
-    polish=_place_polish,
-    nearby=_places_nearby,
+    polish=place_polish,
+    nearby=places_nearby,
     told_by=Experiment.TURN_THE_BASE,
 )

@@ -90,6 +90,7 @@ DEPTH_SCALE = Effect(
     keys=("scale", "offset_m"),
     told_by=Experiment.MOVE_THE_CAMERA,
     moves_rest=True,
+    may_differ=True,
 )
 MARKER_OFFSET = Effect(
     "marker_offset",
@@ -99,6 +100,8 @@ MARKER_OFFSET = Effect(
     keys=("offset_m",),
     told_by=Experiment.MOVE_THE_CAMERA,
     places_markers=True,
+    may_differ=True,
+    sought_by_recording=False,
 )
 CLAMPED_MARKER = Effect(
     "clamped_marker",

@@ -82,6 +82,8 @@ def slope(residual, p, here, at):
     h = (4e-4 if at == "null" else 1e-3) * (p.high - p.low)
     if p.key == "stiffness_n_m" and p.high > 1e-3:  # a clamp's range is wide
         h *= 0.2
+    if p.key == "point_m":  # states are solved to nanometres
+        h *= 4.0
     if at == "null" or p.key == "tension_n":
         weights = {0: -25 / 12, 1: 4, 2: -3, 3: 4 / 3, 4: -1 / 4}
         if p.key == "rotation_stiffness_nm_rad":  # there the plate's ties are missing
@@ -95,7 +97,8 @@ def slope(residual, p, here, at):
 def test_the_sensitivity_to_an_effect_is_that_of_marches_solved_anew(case):
     form, control, at = case
     robot, scene = SCENES[control]
-    seed, starts = dict(form.seeds(robot)[0]), dict(STARTS[control])
+    seeds = form.seeds(robot)
+    seed, starts = dict(seeds[1 if form.name == "cable_coupling" else 0]), dict(STARTS[control])  # two cables that pull
     parameters = (*form.parameters(robot, control), *(form.polish(robot, control, seed) if at == "away" else ()))
     hypothesis = Hypothesis(robot, ((form, seed, parameters),))
     away = [0.05 * (p.high - p.null) if at == "away" else 0.0 for p in parameters]

@@ -103,6 +103,14 @@ def test_the_names_are_those_of_the_format() -> None:
         "depth_scale",
         "marker_offset",
         "clamped_marker",
+        "density",
+        "tip_mass",
+        "chamber_offset",
+        "chamber_gain",
+        "cable_path",
+        "stiffness_gradient",
+        "rest_shape",
+        "cable_coupling",
     }
     assert all(e.lacks and e.keys for e in EFFECTS)
 

@@ -15,9 +15,12 @@ from femsense.model.effects import CALIBRATED, EFFECT_NAMES, EFFECTS, OF_BODY, O
 ROOT = Path(femsense.__file__).parent
 OTHER_MEANINGS = {
     ("fem", "gravity"),  # an argument of a body
+    ("fem", "density"),
+    ("xr/stream", "payload"),  # the bytes of a message
     ("fem", "hyperelastic"),  # a kind of element
     ("io/robot_toml.py", "gravity"),  # a table of robot.toml
     ("io/robot_toml.py", "creep"),  # a property of the material
+    ("io/meshing", "gravity"),  # a table of robot.toml
     ("io/recording_folder.py", "gravity"),  # columns of frames.csv
     ("model/recording.py", "gravity"),
     ("rig", "gravity"),
