@@ -657,6 +657,7 @@ def _check_plain(robot: Robot) -> None:
         "actuation that is not plain": not same_inputs,
         "observation that is not plain": (robot.observation.depth_scale, robot.observation.depth_offset) != (1.0, 0.0),
         "creep": robot.creep,
+        "softness of what was loaded": robot.softening,
     }
     found = [name for name, holds in beyond.items() if holds]
     if found:

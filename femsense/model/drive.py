@@ -8,6 +8,7 @@ from functools import lru_cache
 import numpy as np
 
 from femsense.core.arrays import FloatArray, IntArray, freeze
+from femsense.fem.body import BodyModel
 from femsense.fem.mesh import Embedding, TetMesh, embed_points
 from femsense.model.recording import Recording
 from femsense.model.robot import Robot
@@ -33,6 +34,8 @@ class Drive:
     """[Pa], shape (F, c), in the order of the body's chambers, creep included."""
     load_ties: Embedding
     """Where the mesh carries each known load."""
+    softness: FloatArray | None = None
+    """Share of its modulus that each element has in each frame [1], shape (F, m); None: all of it."""
 
 
 def drive_of(robot: Robot, recording: Recording, *, initial: FloatArray | None = None) -> Drive:
@@ -121,6 +124,13 @@ class DrivenRobot:
     drive: Drive
 
 
+def body_in(driven: DrivenRobot, frame: int) -> BodyModel:
+    """Return the body as it is in a frame: under its gravity there, and softened by what it has been through."""
+    body, drive = driven.robot.body, driven.drive
+    body = body if drive.gravity is None else body.with_gravity(drive.gravity[frame])
+    return body if drive.softness is None else body.with_stiffness_scale(drive.softness[frame])
+
+
 def has_history(robot: Robot) -> bool:
     """Return whether the state depends on what was before (friction along a cable)."""
     return any(cable.friction > 0 for cable in robot.body.cables)
@@ -139,6 +149,5 @@ def _key(driven: DrivenRobot, frame: int) -> bytes:
     drive = driven.drive
     rows = drive.load_frame == frame
     parts = [drive.inputs[frame], drive.pressures[frame], drive.load_points[rows].ravel(), drive.load_forces[rows].ravel()]
-    if drive.gravity is not None:
-        parts.append(drive.gravity[frame])
+    parts += [table[frame] for table in (drive.gravity, drive.softness) if table is not None]
     return np.concatenate([np.asarray(p, dtype=float) for p in parts]).tobytes()

@@ -23,6 +23,7 @@ from femsense.model.effects.base import part_in
 from femsense.model.quasi_static_path import solve_path
 from femsense.model.recording import Recording
 from femsense.model.robot import Observation, Robot
+from femsense.model.softening import path_energies, softened
 from femsense.model.variants import AtPoints
 from femsense.pointcloud.sheets import Crossings
 
@@ -297,6 +298,9 @@ def evaluate_scene(
     steps, variants = _variants(hypothesis, scene, coordinates, initial, base, vary_initial) if derivative else ([], [])
     split, last = len(hypothesis.parameters) if derivative else 0, len(variants)
     pulling = _pulling(hypothesis, base, steps, variants, scene.recording.label) if derivative and vary_inputs else []
+    if any(d.robot.softening for d in (base, *variants)):
+        energies = path_energies(base, int(scene.frames.max(initial=0)), starts)
+        base, variants = softened(base, energies), [softened(v, energies) for v in variants]
     places = {id(robot): _ties(robot, scene, poses)}
     for v in variants:
         if id(v.robot) not in places:

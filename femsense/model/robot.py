@@ -78,6 +78,8 @@ class Robot:
     """Where robot.toml and the mesh stand."""
     marker_share: FloatArray | None = None
     """By which share each marker follows the body, shape (k,): 1 sits on it, 0 sits on what holds it; None: all sit on it."""
+    softening: tuple[tuple[float, float], ...] = ()
+    """Terms (share [1], energy [J/m³]) by which elements soften that have been loaded before (see `model/softening.py`)."""
     by_recording: tuple[Callable[[Robot, str], Robot], ...] = ()
     """What differs from recording to recording: (robot, label of a recording) → the robot there, one after the other."""
     surface_points: int = 0

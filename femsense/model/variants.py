@@ -22,7 +22,7 @@ from femsense.fem.equilibrium import Equilibrium, SolveOptions, solve_equilibriu
 from femsense.fem.linalg.factorization import Factorization, available_memory, factorize
 from femsense.fem.linalg.refinement import refined
 from femsense.fem.mesh import Embedding
-from femsense.model.drive import DrivenRobot, _key, frame_loads, has_history
+from femsense.model.drive import DrivenRobot, _key, body_in, frame_loads, has_history
 from femsense.model.robot import Robot
 
 FACTOR_MEMORY = 2e9
@@ -68,9 +68,7 @@ def solve_frame(
         nodal_forces: forces beside the known loads [N], shape (n, 3).
         options: as of `solve_equilibrium`; friction remembers nothing where they do not say.
     """
-    drive, body = driven.drive, driven.robot.body
-    if drive.gravity is not None:
-        body = body.with_gravity(drive.gravity[frame])
+    drive, body = driven.drive, body_in(driven, frame)
     loads = frame_loads(driven, frame)
     if nodal_forces is not None:
         loads = nodal_forces if loads is None else loads + nodal_forces
@@ -286,7 +284,7 @@ class _Variants:
         columns, at_points = len(self.plain) + len(self.rubbing), 3 * len(self.own_ties)
         few = (at_points if self.known is not None else min(columns, at_points)) <= FEW_COLUMNS
         solver = partial(refined, lent=self.lent.get(k)) if few else factorize
-        return _Answers(partial(tangent_at, self.driven.robot.body, self.bases[k], solver), 2 if self.rubbing else 1)
+        return _Answers(partial(tangent_at, body_in(self.driven, k), self.bases[k], solver), 2 if self.rubbing else 1)
 
     def _jobs(self, group: list[int], which: Sequence[int]) -> list[Job]:
         """Return what is to be computed of some variants in frames with one base state."""
@@ -450,8 +448,7 @@ class _Balance:
         return element_forces(self.body, self.base.positions)
 
     def _body(self, driven: DrivenRobot) -> BodyModel:
-        body, gravity = driven.robot.body, driven.drive.gravity
-        return body if gravity is None else body.with_gravity(gravity[self.frame])
+        return body_in(driven, self.frame)
 
     def _loads(self, driven: DrivenRobot) -> FloatArray:
         loads = frame_loads(driven, self.frame)
@@ -574,6 +571,7 @@ def _same_mechanics(driven: DrivenRobot, variant: DrivenRobot) -> bool:
         and np.array_equal(a.inputs, b.inputs)
         and np.array_equal(a.pressures, b.pressures)
         and np.array_equal(a.load_forces, b.load_forces)
+        and a.softness is b.softness
     )
 
 

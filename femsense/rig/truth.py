@@ -12,11 +12,13 @@ from femsense.core.arrays import FloatArray, IntArray, freeze
 from femsense.core.errors import DataError, InputError
 from femsense.fem.body import BodyModel
 from femsense.fem.cables import bend_angles
+from femsense.fem.energy import energy_density
 from femsense.fem.equilibrium import Equilibrium, SolveOptions, solve_equilibrium
 from femsense.fem.mesh import TetMesh, embed_points, refined, surface_triangles, to_linear, to_quadratic, triangle_normals
 from femsense.model.effects import apply_effects
 from femsense.model.remeshing import body_on_mesh
 from femsense.model.robot import Robot
+from femsense.model.softening import softened_share
 from femsense.rig.friction import Grip, new_grip, pull
 from femsense.rig.script import Plan, TruthTable
 
@@ -25,6 +27,8 @@ SETTLED = 1e-8
 SETTLED_HELD = 1e-6
 """The same where cables are held: their tensions come from the balance of the body, to its tolerance [N]."""
 PASSES = 200
+SOFT = 1e-5
+"""Shares of the moduli rest when a pass moves them by less than this."""
 SLOW = 0.9
 """Share of the pass before from which on passes of a held cable are summed beforehand."""
 FAR, NEARER = float(np.log(2.0)), 0.7
@@ -230,6 +234,8 @@ class _TruePath:
         self.patches = [contact_patch(robot.body.mesh, c.table.point_m, c.table.radius_m) for c in plan.contacts]
         self.grips = [new_grip(len(cable.path)) for cable in robot.body.cables]
         self.state = solve_equilibrium(self.body)
+        self.softening = robot.softening
+        self.most = energy_density(self.body, self.state.positions)
 
     def nothing(self) -> _Load:
         """Return the load of the body at rest: its own weight."""
@@ -255,21 +261,33 @@ class _TruePath:
 
     def go(self, load: _Load, frame: int) -> None:
         """Move on to a load: the state, the tensions along the cables and the contact forces agree at the end."""
-        body = self.body if self.plan.gravity is None else self.body.with_gravity(load.gravity)
+        whole = self.body if self.plan.gravity is None else self.body.with_gravity(load.gravity)
         passes, far = [self._motors(load)], FAR
         for _ in range(PASSES):
             ahead = _ahead(passes, far)
             motors = passes[-1] if ahead is None else ahead
             passes, far = (passes, far) if ahead is None else ([], NEARER * far)
             along, _ = self._along(motors)
+            shares = self._shares()
+            body = whole if shares is None else whole.with_stiffness_scale(shares)
             forces = load.forces + self._contact_forces(load)
             self.state = self._solve(body, load, motors, along, forces, frame)
-            if self._settled(load, along, forces):
+            soft = self._shares()
+            same = soft is None or shares is None or bool(np.abs(soft - shares).max() < SOFT)
+            if same and self._settled(load, along, forces):
+                self.most = np.maximum(self.most, energy_density(self.body, self.state.positions))
                 # of where it converged: while bends slide, any tension at the motor gives the same shares
                 self.grips = self._along(self._motors(load))[1]
                 return
             passes.append(self._motors(load))
         raise DataError(f"the truth of frame {frame} does not settle: friction and contact keep moving; use more substeps")
+
+    def _shares(self) -> FloatArray | None:
+        """Return the share of its modulus that each element has by all it has been through, (m,); None: all of it."""
+        if not self.softening:
+            return None
+        now = energy_density(self.body, self.state.positions)
+        return softened_share(self.softening, np.maximum(self.most, now), now)
 
     def contacts_now(self, load: _Load) -> tuple[TrueContact, ...]:
         """Return the contacts that press."""

@@ -18,6 +18,7 @@ from femsense.model.effects.material import CREEP, CREEP_TWICE, GENT, HYPERELAST
 from femsense.model.effects.observation import CLAMPED_MARKER, DEPTH_SCALE, MARKER_OFFSET
 from femsense.model.effects.per_recording import PER, by_session, checked, forms_by_recording, per_recording
 from femsense.model.effects.shape import DISCRETISATION, GEOMETRY
+from femsense.model.effects.softening import SOFTENING
 from femsense.model.effects.support import BASE_COMPLIANCE, BASE_ROTATION
 from femsense.model.effects.user_defined import find_own_file, load_own_effect, try_own_effect
 from femsense.model.effects.weight import DENSITY, TIP_MASS
@@ -50,6 +51,7 @@ EFFECTS: tuple[Effect, ...] = (
     STIFFNESS_GRADIENT,
     REST_SHAPE,
     CABLE_COUPLING,
+    SOFTENING,
 )
 """Each name once."""
 FORMS: tuple[Effect, ...] = (*EFFECTS, GENT, CREEP_TWICE, BASE_ROTATION, CABLE_FRICTIONS, CABLE_TURN)

@@ -98,7 +98,8 @@ def test_the_sensitivity_to_an_effect_is_that_of_marches_solved_anew(case):
     form, control, at = case
     robot, scene = SCENES[control]
     seeds = form.seeds(robot)
-    seed, starts = dict(seeds[1 if form.name == "cable_coupling" else 0]), dict(STARTS[control])  # two cables that pull
+    telling = {"cable_coupling": 1, "softening": -1}.get(form.name, 0)  # two cables that pull; an energy that matters here
+    seed, starts = dict(seeds[telling]), dict(STARTS[control])
     parameters = (*form.parameters(robot, control), *(form.polish(robot, control, seed) if at == "away" else ()))
     hypothesis = Hypothesis(robot, ((form, seed, parameters),))
     away = [0.05 * (p.high - p.null) if at == "away" else 0.0 for p in parameters]
@@ -118,7 +119,8 @@ def test_the_sensitivity_to_an_effect_is_that_of_marches_solved_anew(case):
         exact = slope(residual, parameter, coordinates[j], at)
         error = here.by_effect[:, :, j] - exact
         size = max(np.linalg.norm(here.by_effect[:, :, i]) for i, p in enumerate(parameters) if p.key == key)
-        assert np.linalg.norm(error) < (1e-2 if form.name == "cable_friction" else 1e-4) * size, parameter.label
+        floor = 5e-8 if form.name == "softening" else 0.0  # it hardly moves what is held; states are solved to nanometres
+        assert np.linalg.norm(error) < (1e-2 if form.name == "cable_friction" else 1e-4) * size + floor, parameter.label
         left = np.linalg.norm(
             nuisance(exact)
         )  # of what calibration leaves, where that is more than the noise of these differences

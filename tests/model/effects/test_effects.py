@@ -111,6 +111,7 @@ def test_the_names_are_those_of_the_format() -> None:
         "stiffness_gradient",
         "rest_shape",
         "cable_coupling",
+        "softening",
     }
     assert all(e.lacks and e.keys for e in EFFECTS)
 
