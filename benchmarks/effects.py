@@ -70,6 +70,7 @@ HIDDEN: tuple[tuple[str, dict[str, Any]], ...] = (
     ("tension", {"name": "rest_shape", "axis_m": [[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]], "curvature_1_m": [1.0, 0.0]}),
     ("tension", {"name": "cable_coupling", "from": "a", "to": "b", "share": 0.12}),
     ("displacement", {"name": "cable_coupling", "from": "a", "to": "b", "share": 0.12}),
+    ("tension", {"name": "softening", "share": 0.25, "energy_j_m3": 300.0}),
 )
 SEED, FRESH_SEED = 7, 1007
 ALWAYS_OFF = ("stiffness",)

@@ -10,7 +10,6 @@ from arm import arm
 from helpers import write_block_robot
 
 from femsense.fem.energy import energy_density
-from femsense.fem.equilibrium import solve_equilibrium
 from femsense.io.robot_toml import load_robot, robot_document
 from femsense.model.drive import DrivenRobot, body_in, drive_of
 from femsense.model.effects import Entry, apply_effects, find_effect
