@@ -10,20 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from femsense.calib.files import read_calibration
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
-from femsense.fem.mesh import TetMesh, surface_triangles
 from femsense.io.files import write_beside
 from femsense.model.recording import Recording
 from femsense.sensing.run_files import read_run
 from femsense.sensing.types import ContactForce, Run
 from femsense.xr.ros_definitions import MESSAGES, definition
+from femsense.xr.run_scene import BODY, FORCE, arrow_of, body_surface, camera_pose, cloud_of, recording_of
 
-METRES_PER_NEWTON = 0.05
-"""Length of a force's arrow."""
-BODY = (0.35, 0.55, 0.85, 0.9)
-FORCE = (0.9, 0.25, 0.15, 1.0)
 NOBODY: dict[str, list[Any]] = {
     name: [] for name in ("metadata", "arrows", "cubes", "spheres", "cylinders", "lines", "triangles", "texts", "models")
 }
@@ -56,9 +51,7 @@ def export_mcap(folder: str | Path, path: str | Path) -> McapReport:
     """
     run = read_run(folder)
     writer_module = _need()
-    calibration = Path(folder).expanduser() / "calibration.json"
-    pose = np.asarray(read_calibration(calibration).T_robot_camera, dtype=float) if calibration.is_file() else None
-    clouds, recording = 0, _recording(run.recording_folder)
+    pose, recording, clouds = camera_pose(folder), recording_of(run), 0
     with write_beside(path) as part, part.open("wb") as stream:
         writer = writer_module.Writer(stream)
         out = _Topics(writer)
@@ -113,9 +106,7 @@ def _write_frame(out: _Topics, run: Run, index: int, contacts: list[ContactForce
 
 def _entities(run: Run, index: int, contacts: list[ContactForce], at: int) -> list[Any]:
     """Return the deformed surface and the arrows of the forces; arrows of an earlier frame go with their entity."""
-    triangles = surface_triangles(TetMesh(run.states.rest_nodes_m, run.states.tets))
-    used, corners = np.unique(triangles, return_inverse=True)
-    nodes = np.asarray(run.states.nodes_m[index], dtype=float)[used]
+    nodes, corners = body_surface(run, index)
     entities = []
     if np.isfinite(nodes).all():
         mesh = {
@@ -131,9 +122,8 @@ def _entities(run: Run, index: int, contacts: list[ContactForce], at: int) -> li
 
 def _arrow(contact: ContactForce) -> dict[str, Any]:
     """Return an arrow that ends where the force acts."""
-    size = float(np.linalg.norm(contact.force_n_xyz))
-    length = max(METRES_PER_NEWTON * size, 1e-4)
-    start = contact.position_m - contact.force_n_xyz / max(size, 1e-12) * length
+    start, along = arrow_of(contact)
+    length = float(np.linalg.norm(along))
     return {
         "pose": {"position": _xyz(start), "orientation": _towards(contact.force_n_xyz, axis=0)},
         "shaft_length": 0.75 * length,
@@ -146,12 +136,7 @@ def _arrow(contact: ContactForce) -> dict[str, Any]:
 
 def _write_cloud(out: _Topics, recording: Recording | None, frame: int, at: int) -> int:
     """Write the cloud of a frame, if there is one; return how many were written."""
-    cloud = None
-    if recording is not None:
-        from femsense.io.clouds.frame_clouds import read_frame_cloud
-
-        k = int(np.flatnonzero(recording.frame_numbers == frame)[0]) if (recording.frame_numbers == frame).any() else -1
-        cloud = read_frame_cloud(recording, k) if k >= 0 else None
+    cloud = cloud_of(recording, frame)
     if cloud is None:
         return 0
     kind = [(axis, "<f4") for axis in "xyz"] + ([] if cloud.colors is None else [("rgb", "<u4")])
@@ -175,14 +160,6 @@ def _write_cloud(out: _Topics, recording: Recording | None, frame: int, at: int)
     }
     out.write("/femsense/cloud", "sensor_msgs/msg/PointCloud2", message, at)
     return 1
-
-
-def _recording(folder: Path | None) -> Recording | None:
-    from femsense.io.recording_folder import load_recording
-
-    if folder is None or not (folder / "recording.toml").is_file():
-        return None
-    return load_recording(folder)
 
 
 # Parts of messages

@@ -252,12 +252,12 @@ def fill(
             f"{walls} edges have more than two triangles (walls inside, or bodies that touch there): what lies inside was filled"
         )
         surface = replace(surface, done=(*surface.done, note))
-    edge, began = _first_edge(surface, options), time.monotonic()
+    edge, began, thin = _first_edge(surface, options), time.monotonic(), surface
     for attempt in range(TRIES):
         left = MOST_SECONDS - (time.monotonic() - began)
         seconds = min(left, FILL_SECONDS)
         tell(f"filling, edges of {1e3 * edge:.2g} mm, try {attempt + 1}, {seconds / 60:.0f} min at most")
-        filled = _fill_once(surface, edge, options, where, crosses=crossing + walls > 0, seconds=seconds)
+        filled, thin = _fill_once(surface, thin, edge, options, where, crosses=crossing + walls > 0, seconds=seconds)
         count = len(filled.mesh.tets)
         poor = radius_ratio(filled.mesh).min() < POOR
         slow = time.monotonic() - began > 0.5 * MOST_SECONDS  # another try might not come to an end
@@ -294,23 +294,50 @@ def _first_edge(surface: ClosedSurface, options: MeshOptions) -> float:
     return float(np.cbrt(6.0 * np.sqrt(2.0) * surface.volume / (0.6 * options.most_tets)))
 
 
-def _fill_once(surface: ClosedSurface, edge: float, options: MeshOptions, where: str, *, crosses: bool, seconds: float) -> Filled:
+def _fill_once(
+    surface: ClosedSurface,
+    thinner: ClosedSurface,
+    edge: float,
+    options: MeshOptions,
+    where: str,
+    *,
+    crosses: bool,
+    seconds: float,
+) -> tuple[Filled, ClosedSurface]:
+    """Return what was filled, and the thinned surface that the next try goes on from."""
     diagonal = surface.diagonal
     given = options.tolerance_mm
     tolerance = 1e-3 * given if given is not None else min(ENVELOPE_OF_EDGE * edge, LARGEST_ENVELOPE * diagonal)
-    thin, drifted = thinned(surface, tolerance=0.5 * tolerance)
+    thin, drifted = thinned(surface, tolerance=0.5 * tolerance, start=thinner)
     made = tetrahedralise(
         np.array(thin.points),
         np.array(thin.triangles),
         edge_fraction=edge / diagonal,
-        envelope=(tolerance - drifted) / diagonal,
+        envelope=_envelope(drifted, tolerance, diagonal, given is not None) / diagonal,
         where=where,
         check_volume=not crosses,
         seconds=seconds,
     )
     mesh, notes = _one_body(made, where)
     outliers = _strays(mesh, surface, crosses)
-    return Filled(mesh, 1e3 * edge, 1e3 * tolerance, 1e3 * outliers, (*thin.done, *notes))
+    return Filled(mesh, 1e3 * edge, 1e3 * tolerance, 1e3 * outliers, (*thin.done, *_rougher(drifted, tolerance), *notes)), thin
+
+
+def _envelope(drifted: float, tolerance: float, diagonal: float, asked: bool) -> float:
+    """Return how far the mesh may leave the thinned surface [m]: what is left, or the roughness where that is larger and nobody asked."""
+    if not asked and drifted > 0.5 * tolerance:
+        return min(drifted, LARGEST_ENVELOPE * diagonal)
+    return max(tolerance - drifted, 0.5 * tolerance)
+
+
+def _rougher(drifted: float, tolerance: float) -> tuple[str, ...]:
+    """Return what is said where the surface is too rough to be followed within the tolerance [m]."""
+    if drifted <= 0.5 * tolerance:
+        return ()
+    return (
+        f"the surface is rougher than the tolerance: the thinned one is up to {1e3 * drifted:.2g} mm away, "
+        f"where {1e3 * tolerance:.2g} mm were allowed",
+    )
 
 
 def _strays(mesh: TetMesh, surface: ClosedSurface, crosses: bool) -> float:

@@ -29,8 +29,12 @@ TOUCHING = 1e-4
 """Shells closer than this, over the diagonal, are one body."""
 MOST_SHELLS = 3000
 """Surfaces in more pieces are refused: all of them would be compared with each other."""
+SIDES_AT_ONCE = 200_000
+"""So many sides of triangles are looked at together for where they go through others (memory)."""
 MANY_TRIANGLES = 6000
-"""Surfaces with more triangles than this are thinned out before they are filled."""
+"""Surfaces with more triangles than this are thinned out before they are filled …"""
+MOST_TRIANGLES = 30_000
+"""… and no more than this are filled, whatever the tolerance: with 250 000 triangles of a noisy scan fTetWild takes minutes."""
 Progress = Callable[..., None]
 
 
@@ -496,13 +500,17 @@ def crossing_triangles(points: FloatArray, triangles: IntArray) -> IntArray:
 
     scaled, scene = _scene(points, triangles)
     edges = _directed_edges(triangles)
-    start, along = scaled[edges[:, 0]], scaled[edges[:, 1]] - scaled[edges[:, 0]]
-    hits = scene.list_intersections(o3d.core.Tensor(np.hstack([start, along]).astype(np.float32)))
-    ray, other, t = (hits[key].numpy() for key in ("ray_ids", "primitive_ids", "t_hit"))
-    ray, other = ray.astype(np.int64), other.astype(np.int64)
-    shares = (triangles[other][:, :, None] == edges[ray][:, None, :]).any(axis=(1, 2))
-    real = ~shares & (t > 1e-3) & (t < 1 - 1e-3)
-    return np.asarray(np.unique(np.stack([ray[real] // 3, other[real]], axis=1), axis=0).reshape(-1, 2))
+    rays = np.hstack([scaled[edges[:, 0]], scaled[edges[:, 1]] - scaled[edges[:, 0]]]).astype(np.float32)
+    met = np.flatnonzero(scene.test_occlusions(o3d.core.Tensor(rays), tnear=1e-3, tfar=1.0 - 1e-3).numpy())
+    pairs = [np.empty((0, 2), dtype=np.int64)]
+    for some in np.array_split(met, len(met) // SIDES_AT_ONCE + 1):
+        hits = scene.list_intersections(o3d.core.Tensor(rays[some]))
+        ray, other, t = (hits[key].numpy() for key in ("ray_ids", "primitive_ids", "t_hit"))
+        ray, other = some[ray.astype(np.int64)], other.astype(np.int64)
+        shares = (triangles[other][:, :, None] == edges[ray][:, None, :]).any(axis=(1, 2))
+        real = ~shares & (t > 1e-3) & (t < 1 - 1e-3)
+        pairs.append(np.stack([ray[real] // 3, other[real]], axis=1))
+    return np.asarray(np.unique(np.vstack(pairs), axis=0).reshape(-1, 2))
 
 
 def distance_to(points: FloatArray, triangles: IntArray, places: FloatArray) -> FloatArray:
@@ -548,33 +556,43 @@ def _scene(points: FloatArray, triangles: IntArray) -> tuple[FloatArray, Any]:
 # Fewer triangles
 
 
-def thinned(surface: ClosedSurface, *, tolerance: float, most: int = MANY_TRIANGLES) -> tuple[ClosedSurface, float]:
+def thinned(
+    surface: ClosedSurface, *, tolerance: float, start: ClosedSurface | None = None, enough: int = MANY_TRIANGLES
+) -> tuple[ClosedSurface, float]:
     """Return a surface with fewer triangles that stays near, and how far it strays [unit of the file].
 
-    Edges are drawn together where that costs least (quadric error metrics, Garland and Heckbert 1997, as Open3D has them); the
-    number of triangles is doubled until no point of one surface is farther than the tolerance from the other.
+    Edges are drawn together where that costs least (quadric error metrics, Garland and Heckbert 1997, as Open3D has them). The
+    number of triangles is halved as long as no point of one surface is farther than the tolerance from the other, and, however
+    far, until at most MOST_TRIANGLES are left (a scan whose noise is larger than the tolerance). Each surface is made from the
+    one before it, so that the whole costs about as much as one reduction.
 
     Arguments:
         surface: closed.
         tolerance: allowed distance in the unit of the file.
-        most: so many triangles are fine; fewer are not asked for.
+        start: what was returned for a smaller tolerance, to go on from.
+        enough: so many triangles are fine; fewer are not asked for.
     """
+    kept = start or surface
+    away = 0.0 if kept is surface else _strays(surface, kept.points, kept.triangles)
+    while len(kept.triangles) > enough:
+        points, triangles = _simplified(kept.points, kept.triangles, max(enough, len(kept.triangles) // 2))
+        strays = _strays(surface, points, triangles)
+        stuck = len(_open_edges(triangles)) or len(triangles) > 0.9 * len(kept.triangles)
+        if stuck or (strays > tolerance and len(kept.triangles) <= MOST_TRIANGLES):
+            break
+        done = (*surface.done, f"thinned out from {len(surface.triangles)} to {len(triangles)} triangles")
+        kept, away = ClosedSurface(freeze(points), freeze(triangles, np.int64), surface.cavities, done), strays
+    return kept, away
+
+
+def _simplified(points: FloatArray, triangles: IntArray, wanted: int) -> tuple[FloatArray, IntArray]:
     import open3d as o3d
 
-    if len(surface.triangles) <= most:
-        return surface, 0.0
-    vectors = o3d.utility.Vector3dVector(surface.points.copy()), o3d.utility.Vector3iVector(surface.triangles.astype(np.int32))
-    whole = o3d.geometry.TriangleMesh(*vectors)
-    wanted = most
-    while wanted < 0.7 * len(surface.triangles):
-        thin = whole.simplify_quadric_decimation(wanted)
-        points, triangles = np.asarray(thin.vertices), np.asarray(thin.triangles, dtype=np.int64)
-        outliers = _strays(surface, points, triangles)
-        if outliers <= tolerance and not len(_open_edges(triangles)):
-            done = (*surface.done, f"thinned out from {len(surface.triangles)} to {len(triangles)} triangles")
-            return ClosedSurface(freeze(points), freeze(triangles, np.int64), surface.cavities, done), outliers
-        wanted *= 2
-    return surface, 0.0
+    mesh = o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(points.copy()), o3d.utility.Vector3iVector(triangles.astype(np.int32))
+    )
+    thin = mesh.simplify_quadric_decimation(wanted)
+    return np.asarray(thin.vertices), np.asarray(thin.triangles, dtype=np.int64)
 
 
 def _strays(surface: ClosedSurface, points: FloatArray, triangles: IntArray) -> float:

@@ -10,6 +10,7 @@ import trimesh
 
 from femsense.core.errors import InputError
 from femsense.io.meshing.surface import (
+    MOST_TRIANGLES,
     ClosedSurface,
     crossing_triangles,
     distance_to,
@@ -193,10 +194,21 @@ def test_distances_and_walls() -> None:
 def test_a_fine_surface_is_thinned_within_its_tolerance() -> None:
     ball = trimesh.creation.icosphere(subdivisions=5, radius=30.0)
     surface = mended(ball)
-    thin, outliers = thinned(surface, tolerance=0.2, most=1000)
+    thin, outliers = thinned(surface, tolerance=0.2, enough=1000)
     assert len(thin.triangles) <= 2000 and 0 < outliers <= 0.2
     assert thin.volume == pytest.approx(surface.volume, rel=0.01)
     assert f"thinned out from 20480 to {len(thin.triangles)} triangles" in thin.done
     distances = np.abs(np.linalg.norm(thin.points, axis=1) - 30.0)
     assert distances.max() <= 0.2
-    assert thinned(surface, tolerance=1e-6, most=1000) == (surface, 0.0)
+    assert thinned(surface, tolerance=1e-6, enough=1000) == (surface, 0.0)
+    again, same = thinned(surface, tolerance=0.2, start=thin, enough=1000)
+    assert again is thin and same == outliers
+
+
+def test_a_scan_rougher_than_the_tolerance_is_thinned_all_the_same() -> None:
+    ball = trimesh.creation.icosphere(subdivisions=6, radius=30.0)
+    rough = np.array(ball.vertices) * (1.0 + 0.01 * np.random.default_rng(3).normal(size=(len(ball.vertices), 1)))
+    surface = repaired(rough, np.array(ball.faces))
+    thin, away = thinned(surface, tolerance=1e-3)
+    assert len(surface.triangles) > 80_000 and len(thin.triangles) <= MOST_TRIANGLES and away > 1e-3
+    assert thin.volume == pytest.approx(surface.volume, rel=0.01)
