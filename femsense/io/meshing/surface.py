@@ -503,7 +503,7 @@ def crossing_triangles(points: FloatArray, triangles: IntArray) -> IntArray:
     rays = np.hstack([scaled[edges[:, 0]], scaled[edges[:, 1]] - scaled[edges[:, 0]]]).astype(np.float32)
     met = np.flatnonzero(scene.test_occlusions(o3d.core.Tensor(rays), tnear=1e-3, tfar=1.0 - 1e-3).numpy())
     pairs = [np.empty((0, 2), dtype=np.int64)]
-    for some in np.array_split(met, len(met) // SIDES_AT_ONCE + 1):
+    for some in (met[i : i + SIDES_AT_ONCE] for i in range(0, len(met), SIDES_AT_ONCE)):
         hits = scene.list_intersections(o3d.core.Tensor(rays[some]))
         ray, other, t = (hits[key].numpy() for key in ("ray_ids", "primitive_ids", "t_hit"))
         ray, other = some[ray.astype(np.int64)], other.astype(np.int64)
