@@ -478,6 +478,10 @@ def export(
         Path | None,
         typer.Option("--mcap", metavar="FILE", help="Write messages of ROS 2 for Foxglove instead.", show_default=False),
     ] = None,
+    rerun: Annotated[
+        Path | None,
+        typer.Option("--rerun", metavar="FILE", help="Write a recording for the Rerun viewer instead.", show_default=False),
+    ] = None,
     bones: Annotated[
         int | None,
         typer.Option("--bones", min=1, max=255, help="How many bones; chosen by itself if not given.", show_default=False),
@@ -493,6 +497,14 @@ def export(
         written = export_mcap(run, mcap)
         text = f"{written.frames} frames, {written.clouds} clouds, {written.contacts} contacts on {len(written.topics)} topics"
         return Answer({"path": str(mcap), **asdict(written)}, f"{text}\n\nwritten: {mcap}")
+    if rerun is not None:
+        from dataclasses import asdict
+
+        from femsense.xr.rerun_export import export_rerun
+
+        shown = export_rerun(run, rerun)
+        text = f"{shown.frames} frames, {shown.clouds} clouds, {shown.contacts} contacts"
+        return Answer({"path": str(rerun), **asdict(shown)}, f"{text}\n\nwritten: {rerun}")
     from femsense.xr.export import export_glb
 
     report = export_glb(run, output, bones=bones)

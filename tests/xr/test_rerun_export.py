@@ -14,7 +14,7 @@ from femsense.fem.mesh import surface_triangles
 from femsense.sensing.types import Run
 from femsense.xr.rerun_export import export_rerun
 
-pytest.importorskip("rerun")
+pytest.importorskip("rerun.chunk")
 CALIBRATION = """{"format": "femsense-calibration-1", "status": "converged", "rms_m": 0.0, "history": [],
 "T_robot_camera": [[0, -1, 0, 0.1], [1, 0, 0, 0.2], [0, 0, 1, 0.3], [0, 0, 0, 1]],
 "cable_tension_n": {}, "cable_displacement_m": {}, "marker_rms_m": {}, "std": {}}"""
