@@ -18,7 +18,7 @@ from femsense.xr.stream.mqtt import EmbeddedBroker, MqttSink, broker_address
 from femsense.xr.stream.payloads import Twin, TwinFrame, topic
 from femsense.xr.stream.publisher import Publisher, PublishOptions, play
 from femsense.xr.stream.websocket import ServerOptions, WebSocketServer
-from femsense.xr.view import PAGE, page_files
+from femsense.xr.view import PAGE, live_page_files
 
 PASSWORD = "FEMSENSE_PASSWORD"
 
@@ -105,11 +105,11 @@ def stream_runs(runs: Sequence[Path], options: StreamOptions, *, loop: bool = Tr
 
 def show_stream(url: str, *, port: int = 0, page: Path = PAGE, password_file: Path | None = None) -> LiveStream:
     """Serve the page on this machine with what streams at a URL; return at once. Raises as `Bridge` and `WebSocketServer`."""
-    files = page_files(page)
+    files = live_page_files(page)
     hub = Hub()
     bridge = Bridge(hub, url, password=read_password(password_file, os.environ.get(PASSWORD)))
     try:
-        server = WebSocketServer(hub, dict(files), options=ServerOptions(port=port))
+        server = WebSocketServer(hub, files, options=ServerOptions(port=port))
     except BaseException:
         bridge.close()
         raise
@@ -155,8 +155,8 @@ def _serve(options: StreamOptions, first: str) -> LiveStream:
     access = Access(options.host, password, options.certificate, options.key)
     hub = Hub()
     with contextlib.ExitStack() as undo:
-        files = page_files(options.page)
-        server = WebSocketServer(hub, dict(files), access=access, options=ServerOptions(port=options.port))
+        files = live_page_files(options.page)
+        server = WebSocketServer(hub, files, access=access, options=ServerOptions(port=options.port))
         undo.callback(hub.close)
         broker = None if options.broker_port is None else EmbeddedBroker(hub, port=options.broker_port)
         if options.mqtt is not None:

@@ -126,6 +126,14 @@ def page_files(page: Path) -> dict[str, Path]:
     return {path.name: path for path in sorted(page.iterdir()) if path.is_file() and not path.name.startswith(".")}
 
 
+def live_page_files(page: Path) -> dict[str, Path | bytes]:
+    """Return the same for a page that shows what streams beside it. Raises MissingDependency."""
+    files: dict[str, Path | bytes] = {**page_files(page)}
+    index = (page / "index.html").read_text(encoding="utf-8")
+    files["index.html"] = index.replace("<html ", '<html data-mode="live" ', 1).encode()
+    return files
+
+
 def _json(value: dict[str, Any]) -> bytes:
     return json.dumps(value, allow_nan=False, separators=(",", ":")).encode()
 

@@ -5,9 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
-import shutil
 import struct
-import subprocess
 import urllib.error
 import urllib.request
 import zlib
@@ -15,14 +13,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from glb import ROOT, Glb, build_hook, npm_folder
+from browser import CHROMIUM, VIEWER, run_in_browser
+from glb import Glb
 from xr_bar import START, write_run
 
 from femsense.core.errors import InputError, MissingDependency
 from femsense.xr import run_contents, view
-
-VIEWER = ROOT / "femsense" / "xr" / "viewer"
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
 
 @pytest.fixture
@@ -161,12 +157,8 @@ def test_page_speaks_of_no_other_host() -> None:
 # ---- in a browser ------------------------------------------------------------------------------------------------------------------
 
 LOOK = """
-const { chromium } = require('playwright-core');
-const [browser, url, shot, phone] = process.argv.slice(2);
-const args = ['--no-sandbox', '--use-gl=angle', '--use-angle=swiftshader', '--enable-unsafe-swiftshader', '--disable-quic',
-  '--no-first-run', '--disable-background-networking', '--disable-component-update', '--disable-sync'];
+const [url, shot, phone] = given;
 (async () => {
-  const opened = await chromium.launch({ executablePath: browser, args });
   const page = await opened.newPage({ viewport: { width: 900, height: 600 } });
   const problems = [], hosts = new Set();
   page.on('console', (m) => { if (m.type() === 'error') problems.push(m.text()); });
@@ -202,34 +194,9 @@ const args = ['--no-sandbox', '--use-gl=angle', '--use-angle=swiftshader', '--en
 """
 
 
-@pytest.fixture(scope="module")
-def built_page(request: pytest.FixtureRequest) -> Path:
-    """The bundle as the build hook makes it, kept between runs for the same sources."""
-    hook = build_hook()
-    digest = hook.digest_of(VIEWER)
-    kept = request.config.cache.mkdir("viewer-page")
-    stamp = kept / "dist" / ".sources"
-    if not (stamp.is_file() and stamp.read_text() == digest):
-        for name in hook.SOURCES:
-            source = VIEWER / name
-            shutil.copytree(source, kept / name, dirs_exist_ok=True) if source.is_dir() else shutil.copy(source, kept / name)
-        try:
-            hook.build_page(kept, digest)
-        except RuntimeError as error:
-            pytest.skip(f"the page cannot be built here: {error}")
-    return kept / "dist"
-
-
 def look(request: pytest.FixtureRequest, url: str, folder: Path) -> dict[str, object]:
     """What a browser finds at the page."""
-    packages = npm_folder(request.config.cache.mkdir("playwright"), "playwright-core@1.65.1")
-    script = packages / "look.cjs"
-    script.write_text(LOOK, encoding="utf-8")
-    command = [*build_hook().node_command(), str(script), str(CHROMIUM), url, str(folder / "desk.png"), str(folder / "phone.png")]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
-    assert done.returncode == 0, done.stderr
-    found: dict[str, object] = json.loads(done.stdout)
-    return found
+    return run_in_browser(request.config, LOOK, url, str(folder / "desk.png"), str(folder / "phone.png"))
 
 
 def pixels(path: Path) -> np.ndarray:

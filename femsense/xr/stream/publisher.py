@@ -70,6 +70,7 @@ class Publisher:
         self.hub, self.twin = hub, twin
         self.options = options or PublishOptions()
         self.sent = 0
+        self._has_cloud = False
         self._pose_limit, self._cloud_limit = RateLimit(self.options.rate_hz), RateLimit(self.options.cloud_rate_hz)
         glb = topic(twin.name, GLB)
         url = self.options.glb_url or f"robots/{glb.split('/')[1]}.glb"
@@ -95,8 +96,12 @@ class Publisher:
             messages.append(Message(topic(name, INPUTS), inputs_bytes(seq, t, self.twin.inputs, frame.inputs)))
         if self.options.json_mirror:
             messages.append(Message(topic(name, POSE_JSON), pose_json_bytes(seq, t, frame.bones)))
-        if frame.cloud is not None and self._cloud_limit.allows(moment):
+        if self._has_cloud and frame.cloud is None:
+            messages.append(Message(topic(name, CLOUD), cloud_bytes(seq, t, [])))  # what was seen before is not seen now
+            self._has_cloud = False
+        elif frame.cloud is not None and self._cloud_limit.allows(moment):
             messages.append(Message(topic(name, CLOUD), cloud_bytes(seq, t, frame.cloud)))
+            self._has_cloud = True
         self.hub.publish(messages)
         self.sent += 1
         return True

@@ -1,9 +1,11 @@
-// Contact forces as arrows whose tip is the place of contact; a pale collar at the tail shows one standard deviation.
+// Contact forces as arrows whose tip is the place of contact. What is not known of them is pale: a collar at the tail (size), a cone
+// about the shaft (direction), a spheroid at the tip (place); each shows one standard deviation to either side.
 
 import {
   CanvasTexture,
   ConeGeometry,
   CylinderGeometry,
+  DoubleSide,
   GreaterDepth,
   Group,
   Mesh,
@@ -17,7 +19,7 @@ import {
   Vector3,
   type Camera,
 } from "three";
-import { newtons, type Contact } from "./data";
+import { newtons, type Contact, type Vector } from "./data";
 
 const COLOR = 0xff9c33;
 const UP = new Vector3(0, 1, 0);
@@ -26,18 +28,25 @@ const LABEL_HEIGHT = 0.046; // of the distance to the viewer
 export class ForceArrows {
   /** To be placed in the robot's frame. */
   readonly group = new Group();
+  /** The force that gets the longest arrow [N]; grows with what is shown. */
+  largest = 1e-9;
   private arrows: Arrow[] = [];
+  private stale = false;
 
-  /** size: of the body [m]; largest: the force that gets the longest arrow [N]. */
-  constructor(
-    private readonly size: number,
-    private readonly largest: number,
-  ) {}
+  /** size: of the body [m]. */
+  constructor(private readonly size: number) {}
+
+  setStale(stale: boolean): void {
+    this.stale = stale;
+    for (const arrow of this.arrows) arrow.setStale(stale);
+  }
 
   show(contacts: Contact[]): void {
+    for (const c of contacts) this.largest = Math.max(this.largest, c.force_n ?? 0);
     const placed = contacts.filter((c) => c.point_m && c.force_vector_n && c.force_n !== null && c.force_n > 0);
     while (this.arrows.length < placed.length) {
       const arrow = new Arrow(this.size);
+      arrow.setStale(this.stale);
       this.arrows.push(arrow);
       this.group.add(arrow.group);
     }
@@ -55,23 +64,34 @@ class Arrow {
   private readonly shaft: Mesh;
   private readonly head: Mesh;
   private readonly collar: Mesh;
+  private readonly cone: Mesh;
+  private readonly place: Mesh;
   private readonly label = new Label();
   private readonly radius: number;
+  private readonly paints: (MeshStandardMaterial | MeshBasicMaterial)[];
 
   constructor(size: number) {
     this.radius = 0.0085 * size;
     const paint = new MeshStandardMaterial({ color: COLOR, roughness: 0.55, envMapIntensity: 0.3 });
     const behind = new MeshBasicMaterial({ color: COLOR, transparent: true, opacity: 0.3, depthFunc: GreaterDepth, depthWrite: false });
     const pale = new MeshBasicMaterial({ color: COLOR, transparent: true, opacity: 0.35, depthWrite: false });
+    const paler = new MeshBasicMaterial({ color: COLOR, transparent: true, opacity: 0.16, depthWrite: false, side: DoubleSide });
+    this.paints = [paint, behind, pale, paler];
     this.shaft = new Mesh(new CylinderGeometry(1, 1, 1, 20).translate(0, -0.5, 0), paint);
     this.head = new Mesh(new ConeGeometry(1, 1, 24).translate(0, -0.5, 0), paint);
     this.collar = new Mesh(new CylinderGeometry(1, 1, 1, 20), pale);
+    this.cone = new Mesh(new ConeGeometry(1, 1, 32, 1, true).translate(0, -0.5, 0), paler); // its tip is that of the arrow
+    this.place = new Mesh(new SphereGeometry(1, 20, 14), paler);
     for (const part of [this.shaft, this.head]) {
       part.castShadow = true;
       part.add(new Mesh(part.geometry, behind)); // shows through the body
     }
     const point = new Mesh(new SphereGeometry(0.6 * this.radius, 16, 12), new MeshBasicMaterial({ color: 0xffffff }));
-    this.group.add(this.shaft, this.head, this.collar, point, this.label.sprite);
+    this.group.add(this.shaft, this.head, this.collar, this.cone, this.place, point, this.label.sprite);
+  }
+
+  setStale(stale: boolean): void {
+    for (const paint of this.paints) paint.color.set(stale ? 0x7d838c : COLOR);
   }
 
   set(contact: Contact | undefined, metresPerNewton: number): void {
@@ -89,6 +109,13 @@ class Arrow {
     this.collar.visible = spread > 0;
     this.collar.position.y = -length;
     this.collar.scale.set(1.9 * this.radius, Math.max(spread, 1e-6), 1.9 * this.radius);
+    const aside = sideways(force, contact.force_std_n) * metresPerNewton;
+    this.cone.visible = aside > 0.2 * this.radius;
+    this.cone.scale.set(aside, length, aside);
+    const [x, y, z] = contact.point_std_m ?? [0, 0, 0];
+    this.place.visible = Math.max(x, y, z) > 0.3 * this.radius;
+    this.place.quaternion.copy(this.group.quaternion).invert(); // its axes are the robot's
+    this.place.scale.set(Math.max(x, 1e-6), Math.max(y, 1e-6), Math.max(z, 1e-6));
     this.label.sprite.position.y = -length;
     this.label.write(newtons(contact.force_n, contact.std_n));
   }
@@ -96,6 +123,15 @@ class Arrow {
   face(camera: Camera, height: number): void {
     this.label.scaleTo(camera, height);
   }
+}
+
+/** Standard deviation of a force across its direction [N]: the root mean square of the two. */
+function sideways(force: Vector3, std: Vector | null): number {
+  if (!std) return 0;
+  const along = force.clone().normalize();
+  const total = std[0] ** 2 + std[1] ** 2 + std[2] ** 2;
+  const inLine = (std[0] * along.x) ** 2 + (std[1] * along.y) ** 2 + (std[2] * along.z) ** 2;
+  return Math.sqrt(Math.max(0, total - inLine) / 2);
 }
 
 class Label {

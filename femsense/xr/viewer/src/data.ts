@@ -1,26 +1,38 @@
-// What the page is served next to the mesh: the frames of the run and the contacts of each.
+// What the page shows of a moment, from the files of a run or from a stream.
 
 export type Vector = [number, number, number];
 
+export interface Input {
+  name: string;
+  unit: string; // "N", "m", "Pa", or what a sensor's file says
+  low: number;
+  high: number;
+}
+
 export interface Contact {
   contact: number;
+  track: number;
   point_m: Vector | null;
   force_vector_n: Vector | null;
   force_n: number | null;
   std_n: number | null;
   source: string;
+  point_std_m: Vector | null;
+  force_std_n: Vector | null;
 }
 
 export interface Frame {
-  time_s: number; // from the first frame, as in the animation
+  time_s: number; // from the first frame, as in the animation; in a stream on the source's clock
   frame: number | null; // number in the recording
   status: string | null;
   rms_after_m: number | null;
+  inputs: (number | null)[] | null;
   contacts: Contact[];
 }
 
 export interface Run {
   name: string;
+  inputs: Input[];
   frames: Frame[];
 }
 
@@ -31,11 +43,11 @@ export async function loadRun(url: string): Promise<Run | null> {
   if (!answer.ok) throw new Error(`${url} could not be loaded (${answer.status}).`);
   const run = (await answer.json()) as Run & { format?: string };
   if (run.format !== "femsense-contacts-1") throw new Error(`${url} is not a list of contacts that this page knows.`);
-  return run;
+  return { ...run, inputs: run.inputs ?? [] };
 }
 
 /** Returns the index of the frame whose time is nearest. */
-export function frameAt(frames: Frame[], time: number): number {
+export function frameAt(frames: { time_s: number }[], time: number): number {
   let low = 0;
   let high = frames.length - 1;
   while (high - low > 1) {
@@ -60,4 +72,12 @@ export function newtons(force: number | null, std: number | null): string {
   if (force === null) return "–";
   const digits = Math.abs(force) >= 10 ? 1 : 2;
   return std === null ? `${force.toFixed(digits)} N` : `${force.toFixed(digits)} ± ${std.toFixed(digits)} N`;
+}
+
+/** A value with a unit that people read: kPa for pressures, mm for lengths. */
+export function amount(value: number | null, unit: string): string {
+  if (value === null || !Number.isFinite(value)) return "–";
+  if (unit === "Pa") return `${(value / 1000).toFixed(1)} kPa`;
+  if (unit === "m") return `${(1000 * value).toFixed(1)} mm`;
+  return `${Math.abs(value) >= 100 ? value.toFixed(0) : value.toFixed(2)} ${unit}`.trim();
 }

@@ -1,6 +1,6 @@
-// The panel beside the robot and the curve above the time line.
+// The panel beside the robot: contacts, what drives it, and what is known of the frame.
 
-import { newtons, totalForce, totalStd, type Frame } from "./data";
+import { amount, newtons, totalForce, totalStd, type Contact, type Frame, type Input } from "./data";
 
 export function element<T extends Element = HTMLElement>(id: string): T {
   const found = document.getElementById(id);
@@ -8,46 +8,88 @@ export function element<T extends Element = HTMLElement>(id: string): T {
   return found as unknown as T;
 }
 
-export function showFrame(frame: Frame, largest: number): void {
+export function showFrame(frame: Frame, inputs: Input[], largest: number): void {
   element("sum").textContent = frame.contacts.length ? newtons(totalForce(frame), totalStd(frame)) : "no contact";
   element("sum-label").textContent = frame.contacts.length > 1 ? `Sum of ${frame.contacts.length}` : "Contact force";
-  element("contacts").replaceChildren(...frame.contacts.map((contact) => row(contact, largest)));
+  fill(element("contacts"), frame.contacts, (contact, row) => showContact(contact, row, largest));
+  const driven = frame.inputs ? inputs : [];
+  element("inputs").hidden = driven.length === 0;
+  fill(element("input-list"), driven, (input, row, i) => showInput(input, frame.inputs?.[i] ?? null, row));
   const facts: [string, string][] = [];
   if (frame.frame !== null) facts.push(["Frame", String(frame.frame)]);
   if (frame.status) facts.push(["Status", frame.status]);
   if (frame.rms_after_m !== null) facts.push(["Residual, rms", `${(1e3 * frame.rms_after_m).toFixed(2)} mm`]);
-  element("frame-facts").replaceChildren(...facts.flatMap(([name, value]) => [text("dt", name), text("dd", value)]));
+  fill(element("frame-facts"), facts, ([name, value], row) => {
+    part(row, "dt").textContent = name;
+    part(row, "dd").textContent = value;
+  }, "div");
 }
 
 /** Draws the sum of forces over time above the time line. */
-export function drawCurve(frames: Frame[], duration: number): void {
+export function drawCurve(frames: Frame[], from: number, to: number): void {
   const total = frames.map(totalForce);
   const largest = Math.max(...total, 1e-12);
-  const points = frames.map((f, i) => `${((1000 * f.time_s) / (duration || 1)).toFixed(2)},${(96 - (92 * total[i]!) / largest).toFixed(2)}`);
+  const x = (time: number): string => ((1000 * (time - from)) / (to - from || 1)).toFixed(1);
+  const points = frames.map((f, i) => `${x(f.time_s)},${(96 - (92 * total[i]!) / largest).toFixed(1)}`);
+  const svg = element("curve");
+  if (points.length < 2) {
+    svg.replaceChildren();
+    return;
+  }
   const line = `M${points.join("L")}`;
-  element("curve").innerHTML = `<path class="area" d="${line}L1000,100L0,100Z"/><path class="edge" d="${line}"/>`;
+  const ends = `L${x(frames[frames.length - 1]!.time_s)},100L${x(frames[0]!.time_s)},100Z`;
+  svg.innerHTML = `<path class="area" d="${line}${ends}"/><path class="edge" d="${line}"/>`;
 }
 
-function row(contact: Frame["contacts"][number], largest: number): HTMLElement {
-  const item = document.createElement("li");
-  const source = text("span", contact.source);
-  source.className = "source";
-  const bar = document.createElement("div");
-  bar.className = "bar";
+function showContact(contact: Contact, row: HTMLElement, largest: number): void {
+  const name = part(row, "span", "name");
+  name.textContent = `Contact ${contact.contact}`;
+  part(row, "span", "value").textContent = newtons(contact.force_n, contact.std_n);
   const share = (value: number): string => `${Math.min(100, (100 * Math.max(0, value)) / largest).toFixed(1)}%`;
-  const upper = document.createElement("b");
-  upper.style.width = share((contact.force_n ?? 0) + (contact.std_n ?? 0));
-  const fill = document.createElement("i");
-  fill.style.width = share(contact.force_n ?? 0);
-  bar.append(upper, fill);
-  const name = text("span", `Contact ${contact.contact} `);
-  name.append(source);
-  item.append(name, text("span", newtons(contact.force_n, contact.std_n)), bar);
-  return item;
+  const bar = part(row, "div", "bar");
+  part(bar, "b").style.width = share((contact.force_n ?? 0) + (contact.std_n ?? 0));
+  part(bar, "i").style.width = share((contact.force_n ?? 0) - (contact.std_n ?? 0));
+  part(bar, "u").style.left = share(contact.force_n ?? 0);
+  part(row, "span", "detail").textContent = place(contact);
 }
 
-function text(tag: string, content: string): HTMLElement {
+/** Where a contact is and how well that is known, in words. */
+function place(contact: Contact): string {
+  const said = [{ cloud: "seen", shape: "from the shape", given: "given" }[contact.source] ?? contact.source];
+  if (contact.point_m) said.push(`at ${contact.point_m.map((v) => (1000 * v).toFixed(0)).join(", ")} mm`);
+  if (contact.point_std_m) said.push(`± ${(1000 * Math.max(...contact.point_std_m)).toFixed(1)} mm`);
+  return said.filter(Boolean).join(" ");
+}
+
+function showInput(input: Input, value: number | null, row: HTMLElement): void {
+  part(row, "span", "name").textContent = input.name;
+  part(row, "span", "value").textContent = amount(value, input.unit);
+  const bar = part(row, "div", "bar");
+  const span = input.high - input.low || 1;
+  const share = Math.max(0, Math.min(1, ((value ?? input.low) - input.low) / span));
+  bar.setAttribute("role", "meter");
+  bar.setAttribute("aria-label", input.name);
+  bar.setAttribute("aria-valuemin", String(input.low));
+  bar.setAttribute("aria-valuemax", String(input.high));
+  bar.setAttribute("aria-valuenow", String(value ?? input.low));
+  bar.setAttribute("aria-valuetext", amount(value, input.unit));
+  bar.dataset.kind = input.unit;
+  part(bar, "i").style.width = `${(100 * share).toFixed(1)}%`;
+}
+
+/** Makes as many rows as there are items and fills each; rows that are there are used again, so that nothing flickers. */
+function fill<T>(list: Element, items: T[], show: (item: T, row: HTMLElement, index: number) => void, tag = "li"): void {
+  while (list.children.length > items.length) list.lastElementChild!.remove();
+  while (list.children.length < items.length) list.append(document.createElement(tag));
+  items.forEach((item, i) => show(item, list.children[i] as HTMLElement, i));
+}
+
+/** Returns the child of a kind, made where it is missing. */
+function part(parent: Element, tag: string, name = ""): HTMLElement {
+  const found = parent.querySelector<HTMLElement>(`:scope > ${tag}${name ? `.${name}` : ""}`);
+  if (found) return found;
   const made = document.createElement(tag);
-  made.textContent = content;
+  if (name) made.className = name;
+  parent.append(made);
   return made;
 }

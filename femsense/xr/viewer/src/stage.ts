@@ -9,11 +9,14 @@ import {
   Group,
   HemisphereLight,
   LineBasicMaterial,
+  Matrix4,
   Mesh,
+  MeshBasicMaterial,
   PCFShadowMap,
   PerspectiveCamera,
   PlaneGeometry,
   PMREMGenerator,
+  RingGeometry,
   Scene,
   ShadowMaterial,
   Vector3,
@@ -35,6 +38,12 @@ export class Stage {
   readonly robot = new Group();
   private readonly ground = new Group();
   private readonly sun = new DirectionalLight(0xfff2e0, 2.6);
+  private readonly reticle = new Mesh(
+    new RingGeometry(0.06, 0.075, 40).rotateX(-Math.PI / 2),
+    new MeshBasicMaterial({ color: 0x5aa9ff, transparent: true, opacity: 0.9 }),
+  );
+  private hits: XRHitTestSource | null = null;
+  private anchor: XRAnchor | null = null;
   private dirty = true;
   private box = new Box3();
 
@@ -54,7 +63,9 @@ export class Stage {
     this.sun.shadow.radius = 4;
     this.sun.shadow.bias = -0.0004;
     this.robot.add(this.sun, this.sun.target, this.ground);
-    this.scene.add(this.robot, new HemisphereLight(0xbfd8ff, 0x1a1f28, 0.7));
+    this.reticle.matrixAutoUpdate = false;
+    this.reticle.visible = false;
+    this.scene.add(this.reticle, this.robot, new HemisphereLight(0xbfd8ff, 0x1a1f28, 0.7));
     this.renderer.xr.addEventListener("sessionend", () => this.leave());
     this.controls = new OrbitControls(this.camera, canvas);
     this.controls.enableDamping = true;
@@ -111,10 +122,11 @@ export class Stage {
   /** Calls step(seconds) before every picture; draws only where something has changed. */
   run(step: (seconds: number) => void): void {
     let before = performance.now();
-    this.renderer.setAnimationLoop((now: number) => {
+    this.renderer.setAnimationLoop((now: number, frame?: XRFrame) => {
       const seconds = Math.min(0.1, Math.max(0, (now - before) / 1000));
       before = now;
       step(seconds);
+      if (frame) this.lookAround(frame);
       if (!this.renderer.xr.isPresenting) this.controls.update();
       if (!this.dirty && !this.renderer.xr.isPresenting) return;
       this.dirty = false;
@@ -122,16 +134,57 @@ export class Stage {
     });
   }
 
-  /** Enters a headset; the robot stands in its true size on a table in front of the person until the session ends. */
+  /** Enters a headset. In VR the robot stands in its true size on a table; in AR it goes where the person points and selects. */
   async enter(mode: XRSessionMode): Promise<void> {
     const xr = navigator.xr;
     if (!xr) return;
-    const session = await xr.requestSession(mode, { optionalFeatures: ["local-floor", "hand-tracking"] });
+    const session = await xr.requestSession(mode, { optionalFeatures: ["local-floor", "hand-tracking", "hit-test", "anchors"] });
     this.renderer.xr.setReferenceSpaceType(session.enabledFeatures?.includes("local-floor") === false ? "local" : "local-floor");
-    const middle = this.box.getCenter(new Vector3());
-    this.robot.position.copy(TABLE).sub(new Vector3(middle.x, this.box.min.y, middle.z));
+    this.stand(new Matrix4().setPosition(TABLE));
     this.scene.fog = null;
     await this.renderer.xr.setSession(session);
+    if (mode === "immersive-ar") await this.seekSurfaces(session);
+  }
+
+  /** Puts the middle of the robot's ground at a pose of the room. */
+  private stand(pose: Matrix4): void {
+    const middle = this.box.getCenter(new Vector3());
+    pose.decompose(this.robot.position, this.robot.quaternion, this.robot.scale);
+    this.robot.position.sub(new Vector3(middle.x, this.box.min.y, middle.z).applyQuaternion(this.robot.quaternion));
+  }
+
+  /** Follows the surfaces that the device sees; a selection puts the robot there and keeps it there. */
+  private async seekSurfaces(session: XRSession): Promise<void> {
+    const space = await session.requestReferenceSpace("viewer");
+    this.hits = (await session.requestHitTestSource?.({ space })) ?? null;
+    session.addEventListener("select", (event) => {
+      if (!this.reticle.visible) return;
+      this.stand(this.reticle.matrix);
+      this.keep(event.frame);
+    });
+  }
+
+  private lookAround(frame: XRFrame): void {
+    const space = this.renderer.xr.getReferenceSpace();
+    if (!space) return;
+    const kept = this.anchor && frame.trackedAnchors?.has(this.anchor) ? frame.getPose(this.anchor.anchorSpace, space) : null;
+    if (kept) this.stand(new Matrix4().fromArray(kept.transform.matrix));
+    const seen = this.hits ? frame.getHitTestResults(this.hits)[0]?.getPose(space) : null;
+    this.reticle.visible = Boolean(seen);
+    if (seen) this.reticle.matrix.fromArray(seen.transform.matrix);
+  }
+
+  /** Asks the device to hold the place even where it corrects its own position; devices without anchors go on as they are. */
+  private keep(frame: XRFrame): void {
+    const space = this.renderer.xr.getReferenceSpace();
+    const seen = this.hits ? frame.getHitTestResults(this.hits)[0] : null;
+    if (!space || !seen?.createAnchor) return;
+    this.anchor?.delete();
+    this.anchor = null;
+    seen.createAnchor()?.then(
+      (anchor) => (this.anchor = anchor),
+      () => undefined,
+    );
   }
 
   /** Height of the view in pixels; 0 in a headset. */
@@ -141,6 +194,9 @@ export class Stage {
 
   private leave(): void {
     this.robot.position.set(0, 0, 0);
+    this.robot.quaternion.identity();
+    this.reticle.visible = false;
+    this.hits = this.anchor = null;
     this.camera.fov = FIELD_OF_VIEW; // the session left the headset's
     this.camera.zoom = 1;
     this.resize();
@@ -176,6 +232,8 @@ export class Stage {
     const { clientWidth: width, clientHeight: height } = this.canvas;
     if (!width || !height) return;
     this.camera.aspect = width / height;
+    if (width < 700 && height > width) this.camera.setViewOffset(width, height, 0, Math.round(-0.07 * height), width, height);
+    else this.camera.clearViewOffset(); // on a phone the panel takes the upper part
     this.camera.updateProjectionMatrix();
     this.renderer.setSize(width, height, false);
     this.touch();

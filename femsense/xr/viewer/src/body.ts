@@ -1,0 +1,203 @@
+// One robot in the scene: its skinned mesh, what it is at rest, what was measured, and the forces on it.
+
+import {
+  Bone,
+  Box3,
+  BufferAttribute,
+  BufferGeometry,
+  Color,
+  Group,
+  Mesh,
+  MeshBasicMaterial,
+  MeshStandardMaterial,
+  Points,
+  PointsMaterial,
+  SkinnedMesh,
+  Vector3,
+  type Object3D,
+} from "three";
+import { GLTFLoader, type GLTF } from "three/addons/loaders/GLTFLoader.js";
+import { ForceArrows } from "./arrows";
+import type { Contact } from "./data";
+
+const STALE = new Color(0x6b727c);
+const FAR = 4; // residuals beyond so many times the scale belong to the surroundings
+
+export async function loadMesh(url: string): Promise<GLTF> {
+  const answer = await fetch(url);
+  if (!answer.ok) throw new Error(`${url} could not be loaded (${answer.status}).\nIs the run complete? femsense export RUN -o robot.glb writes it.`);
+  return await new GLTFLoader().parseAsync(await answer.arrayBuffer(), "");
+}
+
+export class Body {
+  /** All of the robot, in glTF's frame (Y up). */
+  readonly group = new Group();
+  /** For what is given in the robot frame (Z up). */
+  readonly robotFrame = new Group();
+  readonly skins: SkinnedMesh[];
+  readonly bones: Bone[];
+  readonly size: number;
+  readonly arrows: ForceArrows;
+  /** Residual that has the full colour [m]. */
+  readonly residualScale: number;
+  private readonly ghost = new Group();
+  private readonly cloud = new Points(new BufferGeometry(), new PointsMaterial({ size: 3, sizeAttenuation: false, vertexColors: true }));
+  private readonly colors = new Map<MeshStandardMaterial, Color>();
+  private readonly move = { value: 0 };
+  private stale = false;
+  private cloudSeen = false;
+
+  constructor(readonly gltf: GLTF) {
+    this.skins = skinned(gltf.scene);
+    this.bones = this.skins.flatMap((skin) => skin.skeleton.bones);
+    const rest = new Box3().setFromObject(gltf.scene);
+    this.size = rest.getSize(new Vector3()).length() || 1;
+    this.residualScale = niceLength(0.004 * this.size);
+    this.arrows = new ForceArrows(this.size);
+    this.robotFrame.rotation.x = -Math.PI / 2;
+    this.robotFrame.add(this.arrows.group, this.cloud);
+    this.cloud.frustumCulled = false;
+    this.cloud.visible = false;
+    this.ghost.visible = false;
+    this.group.add(gltf.scene, this.robotFrame, this.ghost);
+    for (const skin of this.skins) this.prepare(skin);
+  }
+
+  /** Places the bones: x y z qx qy qz qw of each, robot frame. */
+  pose(rows: Float32Array): void {
+    poseBones(this.bones, rows);
+  }
+
+  /** Returns the space that the body takes now, in glTF's frame. */
+  space(): Box3 {
+    const box = new Box3();
+    this.gltf.scene.updateMatrixWorld(true);
+    for (const skin of this.skins) {
+      skin.computeBoundingBox();
+      if (skin.boundingBox) box.union(skin.boundingBox);
+    }
+    return box;
+  }
+
+  show(contacts: Contact[]): void {
+    this.arrows.show(contacts);
+  }
+
+  /** Greys the body out: what it shows is old. */
+  setStale(stale: boolean): void {
+    if (stale === this.stale) return;
+    this.stale = stale;
+    for (const [material, color] of this.colors) {
+      material.color.copy(stale ? STALE : color);
+      material.opacity = stale ? 0.5 : 1;
+      material.transparent = stale;
+      material.needsUpdate = true;
+    }
+    this.arrows.setStale(stale);
+  }
+
+  get isStale(): boolean {
+    return this.stale;
+  }
+
+  showGhost(visible: boolean): void {
+    this.ghost.visible = visible;
+  }
+
+  /** Colours the body by how far each point has moved from rest; 0 switches it off. */
+  colorByMotion(largest: number): void {
+    this.move.value = largest;
+  }
+
+  showCloud(visible: boolean): void {
+    this.cloud.visible = visible && this.cloud.geometry.getAttribute("position") !== undefined;
+  }
+
+  get hasCloud(): boolean {
+    return this.cloudSeen;
+  }
+
+  /** Shows measured points, coloured by their distance from the surface: blue inside, red outside, grey where they belong to something else. */
+  setCloud(rows: Float32Array): void {
+    const count = rows.length / 4;
+    this.cloudSeen ||= count > 0;
+    const places = new Float32Array(3 * count);
+    const colors = new Float32Array(3 * count);
+    const color = new Color();
+    for (let i = 0; i < count; i++) {
+      places.set(rows.subarray(4 * i, 4 * i + 3), 3 * i);
+      residualColor(rows[4 * i + 3]! / this.residualScale, color);
+      color.toArray(colors, 3 * i);
+    }
+    const geometry = new BufferGeometry();
+    geometry.setAttribute("position", new BufferAttribute(places, 3));
+    geometry.setAttribute("color", new BufferAttribute(colors, 3));
+    this.cloud.geometry.dispose();
+    this.cloud.geometry = geometry;
+  }
+
+  private prepare(skin: SkinnedMesh): void {
+    const material = (skin.material as MeshStandardMaterial).clone();
+    skin.material = material;
+    this.colors.set(material, material.color.clone());
+    colorMotion(material, this.move);
+    const pale = new MeshBasicMaterial({ color: 0xb8c7db, transparent: true, opacity: 0.16, depthWrite: false });
+    this.ghost.add(new Mesh(skin.geometry, pale));
+  }
+}
+
+/** Places bones by rows x y z qx qy qz qw in the robot frame, which is that of their parent. */
+export function poseBones(bones: Bone[], rows: Float32Array): void {
+  const count = Math.min(bones.length, rows.length / 7);
+  for (let b = 0; b < count; b++) {
+    bones[b]!.position.fromArray(rows, 7 * b);
+    bones[b]!.quaternion.fromArray(rows, 7 * b + 3);
+  }
+}
+
+/** Blue where a point lies inside the surface, white on it, red outside; grey far away. */
+export function residualColor(share: number, into: Color): Color {
+  if (!Number.isFinite(share) || Math.abs(share) > FAR) return into.setRGB(0.32, 0.35, 0.4);
+  const s = Math.max(-1, Math.min(1, share));
+  return s > 0 ? into.setRGB(1, 1 - 0.75 * s, 1 - 0.85 * s) : into.setRGB(1 + 0.8 * s, 1 + 0.5 * s, 1);
+}
+
+/** 1, 2 or 5 times a power of ten. */
+export function niceLength(length: number): number {
+  const ten = 10 ** Math.floor(Math.log10(length));
+  return ([1, 2, 5].find((f) => f * ten >= length) ?? 10) * ten;
+}
+
+/** Lets a material take its colour from the way that skinning moves each point. */
+function colorMotion(material: MeshStandardMaterial, largest: { value: number }): void {
+  material.onBeforeCompile = (shader) => {
+    shader.uniforms.largestMotion = largest;
+    shader.vertexShader = shader.vertexShader
+      .replace("#include <common>", "#include <common>\nvarying float vMotion;")
+      .replace("#include <skinning_vertex>", "#include <skinning_vertex>\nvMotion = length(transformed - position);");
+    shader.fragmentShader = shader.fragmentShader
+      .replace("#include <common>", "#include <common>\nvarying float vMotion;\nuniform float largestMotion;")
+      .replace(
+        "#include <color_fragment>",
+        `#include <color_fragment>
+        if (largestMotion > 0.0) {
+          float s = clamp(vMotion / largestMotion, 0.0, 1.0);
+          vec3 low = vec3(0.03, 0.02, 0.20), middle = vec3(0.10, 0.42, 0.42), high = vec3(0.95, 0.80, 0.10);
+          diffuseColor.rgb = s < 0.5 ? mix(low, middle, 2.0 * s) : mix(middle, high, 2.0 * s - 1.0);
+        }`,
+      );
+  };
+}
+
+function skinned(scene: Object3D): SkinnedMesh[] {
+  const found: SkinnedMesh[] = [];
+  scene.traverse((node) => {
+    if (!(node instanceof Mesh)) return;
+    node.castShadow = true;
+    node.receiveShadow = true;
+    node.frustumCulled = false;
+    if (node instanceof SkinnedMesh) found.push(node);
+  });
+  if (!found.length) throw new Error("robot.glb holds no skinned mesh.");
+  return found;
+}

@@ -1,0 +1,44 @@
+// The WebSocket of a stream: comes back by itself when it was gone.
+
+import { unpack, type Message } from "./messages";
+
+const AGAIN_MS = [200, 500, 1000, 2000];
+
+export class Connection {
+  private socket: WebSocket | null = null;
+  private attempt = 0;
+
+  constructor(
+    private readonly url: string,
+    private readonly take: (messages: Message[]) => void,
+    private readonly change: (open: boolean) => void,
+  ) {
+    this.open();
+  }
+
+  send(frame: Uint8Array<ArrayBuffer>): void {
+    if (this.socket?.readyState === WebSocket.OPEN && this.socket.bufferedAmount < 8192) this.socket.send(frame);
+  }
+
+  private open(): void {
+    const socket = new WebSocket(this.url);
+    socket.binaryType = "arraybuffer";
+    socket.addEventListener("open", () => {
+      this.attempt = 0;
+      this.change(true);
+    });
+    socket.addEventListener("message", (event) => {
+      if (event.data instanceof ArrayBuffer) this.take(unpack(event.data));
+    });
+    socket.addEventListener("close", () => {
+      this.change(false);
+      setTimeout(() => this.open(), AGAIN_MS[Math.min(this.attempt++, AGAIN_MS.length - 1)]);
+    });
+    this.socket = socket;
+  }
+}
+
+/** The address of the stream beside this page. */
+export function streamUrl(): string {
+  return new URL("ws", location.href.replace(/^http/, "ws").replace(/[?#].*$/, "")).href;
+}

@@ -1,0 +1,271 @@
+// Back to the robot: a point of the twin is dragged, the server answers how near the robot can bring it, and commands go out while armed and held.
+
+import {
+  BufferGeometry,
+  Color,
+  Line,
+  LineBasicMaterial,
+  Mesh,
+  MeshBasicMaterial,
+  MeshStandardMaterial,
+  Plane,
+  Raycaster,
+  SkinnedMesh,
+  SphereGeometry,
+  Vector2,
+  Vector3,
+  type Bone,
+} from "three";
+import { clone } from "three/addons/utils/SkeletonUtils.js";
+import { poseBones, type Body } from "./body";
+import { amount } from "./data";
+import type { Handle, Reach } from "./messages";
+import { element } from "./readout";
+import type { Stage } from "./stage";
+
+const EVERY_MS = 33; // wishes are sent so often while held: the robot stops when they stop
+const STEP = 0.01; // of the body's size, for a key
+
+interface Subject {
+  id: string;
+  body: Body;
+  handles: Handle[];
+  commands: boolean;
+}
+
+export class Dragging {
+  private subject: Subject | null = null;
+  private readonly balls: Mesh[] = [];
+  private readonly line = new Line(new BufferGeometry(), new LineBasicMaterial({ color: 0x7df0c0 }));
+  private readonly target = new Mesh(new SphereGeometry(1, 20, 14), new MeshBasicMaterial({ color: 0x7df0c0, transparent: true, opacity: 0.85 }));
+  private twin: { root: ReturnType<typeof clone>; bones: Bone[] } | null = null;
+  private held: number | null = null;
+  private chosen = 0;
+  private enabled = false;
+  private armed = false;
+  private sent = 0;
+  private seq = 0;
+  private readonly plane = new Plane();
+  private readonly ray = new Raycaster();
+  private readonly wish = new Vector3(); // in the world
+  private anchors: { vertex: number; skin: SkinnedMesh; offset: Vector3 }[] = [];
+
+  constructor(
+    private readonly stage: Stage,
+    private readonly send: (robot: string, wish: object) => void,
+  ) {
+    stage.scene.add(this.line, this.target);
+    this.line.visible = this.target.visible = false;
+    this.line.frustumCulled = false;
+    const canvas = stage.renderer.domElement;
+    canvas.addEventListener("pointerdown", (e) => this.grab(e), { capture: true });
+    canvas.addEventListener("pointermove", (e) => this.move(e));
+    for (const end of ["pointerup", "pointercancel", "lostpointercapture"] as const) canvas.addEventListener(end, () => this.release());
+    window.addEventListener("blur", () => this.release());
+    window.addEventListener("keydown", (e) => this.key(e));
+    window.addEventListener("keyup", (e) => e.key.startsWith("Arrow") && this.release());
+    element("arm").addEventListener("click", () => this.arm(!this.armed));
+  }
+
+  /** Takes another robot as the one that is dragged. */
+  attend(subject: Subject | null): void {
+    if (subject?.body === this.subject?.body) return;
+    this.release();
+    for (const ball of this.balls.splice(0)) ball.removeFromParent();
+    this.twin?.root.removeFromParent();
+    this.twin = null;
+    this.subject = subject;
+    this.arm(false);
+    element("arm").hidden = !subject?.commands;
+    if (!subject) return;
+    for (const handle of subject.handles) {
+      const ball = new Mesh(
+        new SphereGeometry(0.022 * subject.body.size, 20, 14),
+        new MeshBasicMaterial({ color: 0x7df0c0, transparent: true, opacity: 0.9, depthTest: false }),
+      );
+      ball.name = handle.name;
+      ball.renderOrder = 5;
+      ball.visible = this.enabled;
+      subject.body.group.add(ball);
+      this.balls.push(ball);
+    }
+    this.anchors = subject.handles.map((handle) => anchor(subject.body, handle));
+    this.choices();
+  }
+
+  enable(on: boolean): void {
+    this.enabled = on;
+    this.release();
+    if (!on) this.arm(false);
+    for (const ball of this.balls) ball.visible = on;
+    if (this.twin) this.twin.root.visible = on;
+    this.line.visible = this.target.visible = false;
+    element("dragging").hidden = !on;
+    this.stage.touch();
+  }
+
+  /** Places the handles on the body, and repeats the wish while it is held. */
+  step(): void {
+    if (!this.enabled || !this.subject) return;
+    this.balls.forEach((ball, i) => {
+      ball.position.copy(this.place(i));
+      ball.scale.setScalar(i === (this.held ?? this.chosen) ? 1.25 : 1);
+    });
+    if (this.held !== null && performance.now() - this.sent >= EVERY_MS) this.say();
+  }
+
+  /** Sends where the held point is wanted. */
+  private say(): void {
+    if (this.held === null || !this.subject) return;
+    this.sent = performance.now();
+    const local = this.subject.body.robotFrame.worldToLocal(this.wish.clone());
+    const wish = { handle: this.subject.handles[this.held]!.name, target_m: { x: local.x, y: local.y, z: local.z }, held: true, armed: this.armed, seq: this.seq++ };
+    this.send(this.subject.id, wish);
+    this.draw();
+  }
+
+  /** Shows what the server found, and where the robot would be. */
+  answered(reach: Reach, ghost: Float32Array | null = null): void {
+    const said = element("reach");
+    said.textContent = reach.text;
+    said.dataset.status = reach.status;
+    element("reach-inputs").textContent = reach.inputs.map((i) => `${i.name} ${amount(i.value, i.unit)}`).join(" · ");
+    element("arm").dataset.moving = String(reach.armed);
+    if (ghost && this.enabled && this.subject) poseBones(this.reachable().bones, ghost);
+    this.stage.touch();
+  }
+
+  private reachable(): { root: ReturnType<typeof clone>; bones: Bone[] } {
+    if (this.twin) return this.twin;
+    const root = clone(this.subject!.body.gltf.scene);
+    const bones: Bone[] = [];
+    root.traverse((node) => {
+      if (!(node instanceof SkinnedMesh)) return;
+      node.material = new MeshStandardMaterial({ color: new Color(0x7df0c0), transparent: true, opacity: 0.32, depthWrite: false, roughness: 0.6 });
+      node.castShadow = node.receiveShadow = false;
+      node.frustumCulled = false;
+      bones.push(...node.skeleton.bones);
+    });
+    this.subject!.body.group.add(root);
+    this.twin = { root, bones };
+    return this.twin;
+  }
+
+  private arm(on: boolean): void {
+    this.armed = on && this.subject?.commands === true;
+    const button = element("arm");
+    button.setAttribute("aria-pressed", String(this.armed));
+    button.textContent = this.armed ? "Armed: the robot follows while you hold" : "Arm the robot";
+  }
+
+  private grab(event: PointerEvent): void {
+    if (!this.enabled || !this.subject || event.button !== 0) return;
+    const canvas = this.stage.renderer.domElement;
+    this.aim(event);
+    const [hit] = this.ray.intersectObjects(this.balls, false);
+    if (!hit) return;
+    event.stopImmediatePropagation();
+    canvas.setPointerCapture(event.pointerId);
+    this.stage.controls.enabled = false;
+    this.begin(this.balls.indexOf(hit.object as Mesh));
+  }
+
+  private begin(index: number): void {
+    this.held = this.chosen = index;
+    this.balls[index]!.getWorldPosition(this.wish);
+    this.plane.setFromNormalAndCoplanarPoint(this.stage.camera.getWorldDirection(new Vector3()).negate(), this.wish);
+    this.target.visible = this.line.visible = true;
+    this.choices();
+  }
+
+  private move(event: PointerEvent): void {
+    if (this.held === null || !this.stage.renderer.domElement.hasPointerCapture(event.pointerId)) return;
+    this.aim(event);
+    this.ray.ray.intersectPlane(this.plane, this.wish);
+    this.stage.touch();
+  }
+
+  private release(): void {
+    if (this.held === null) return;
+    const subject = this.subject;
+    if (subject) this.send(subject.id, { handle: subject.handles[this.held]?.name ?? "", held: false, armed: false, seq: this.seq++ });
+    this.held = null;
+    this.stage.controls.enabled = true;
+    this.line.visible = this.target.visible = false;
+    this.stage.touch();
+  }
+
+  /** Shift and arrows move the chosen point without a mouse, in the plane of the picture. */
+  private key(event: KeyboardEvent): void {
+    const way = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[event.key];
+    if (!this.enabled || !this.subject || !event.shiftKey || !way) return;
+    event.preventDefault();
+    event.stopImmediatePropagation();
+    if (this.held === null) this.begin(this.chosen);
+    const step = STEP * this.subject.body.size;
+    const right = new Vector3().setFromMatrixColumn(this.stage.camera.matrixWorld, 0);
+    const up = new Vector3().setFromMatrixColumn(this.stage.camera.matrixWorld, 1);
+    this.wish.addScaledVector(right, step * way[0]!).addScaledVector(up, step * way[1]!);
+    this.say();
+  }
+
+  private aim(event: PointerEvent): void {
+    const { left, top, width, height } = this.stage.renderer.domElement.getBoundingClientRect();
+    const at = new Vector2((2 * (event.clientX - left)) / width - 1, 1 - (2 * (event.clientY - top)) / height);
+    this.ray.setFromCamera(at, this.stage.camera);
+  }
+
+  /** Returns where a handle is now, in the frame of the body's group. */
+  private place(index: number): Vector3 {
+    const { skin, vertex, offset } = this.anchors[index]!;
+    const at = new Vector3();
+    skin.getVertexPosition(vertex, at);
+    const bone = skin.skeleton.bones[skin.geometry.getAttribute("skinIndex")!.getX(vertex)]!;
+    return at.add(offset.clone().applyQuaternion(bone.quaternion).applyEuler(this.subject!.body.robotFrame.rotation));
+  }
+
+  private draw(): void {
+    const from = this.balls[this.held!]!.getWorldPosition(new Vector3());
+    this.line.geometry.setFromPoints([from, this.wish]);
+    this.target.position.copy(this.wish);
+    this.target.scale.setScalar(0.012 * this.subject!.body.size);
+    this.stage.touch();
+  }
+
+  private choices(): void {
+    const list = element("handles");
+    list.hidden = (this.subject?.handles.length ?? 0) < 2;
+    list.replaceChildren(
+      ...(this.subject?.handles ?? []).map((handle, i) => {
+        const choice = document.createElement("button");
+        choice.className = "chip";
+        choice.textContent = handle.name;
+        choice.setAttribute("aria-pressed", String(i === this.chosen));
+        choice.addEventListener("click", () => {
+          this.chosen = i;
+          this.choices();
+        });
+        return choice;
+      }),
+    );
+  }
+}
+
+/** Ties a handle to the vertex at rest that is nearest to it; what lies between turns with the vertex's first bone. */
+function anchor(body: Body, handle: Handle): { vertex: number; skin: SkinnedMesh; offset: Vector3 } {
+  const at = new Vector3(...handle.position);
+  const seen = new Vector3(at.x, at.z, -at.y); // glTF's frame
+  let best = { vertex: 0, skin: body.skins[0]!, offset: new Vector3() };
+  let least = Infinity;
+  const point = new Vector3();
+  for (const skin of body.skins) {
+    const places = skin.geometry.getAttribute("position");
+    for (let v = 0; v < places.count; v++) {
+      const distance = point.fromBufferAttribute(places, v).distanceToSquared(seen);
+      if (distance >= least) continue;
+      least = distance;
+      best = { vertex: v, skin, offset: new Vector3(at.x - point.x, at.y + point.z, at.z - point.y) };
+    }
+  }
+  return best;
+}

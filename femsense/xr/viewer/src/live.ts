@@ -1,0 +1,328 @@
+// Robots that stream: the newest of each, how old it is, and the last minute of it.
+
+import { Box3 } from "three";
+import { Body, loadMesh } from "./body";
+import { Connection, streamUrl } from "./connection";
+import { connectTools, notice, toggle } from "./controls";
+import { frameAt, type Frame } from "./data";
+import { Dragging } from "./dragging";
+import { pack, readCloud, readForces, readInputs, readModel, readPose, readReach, readStatus, type Message, type Model } from "./messages";
+import { Plot } from "./plot";
+import { drawCurve, element, showFrame } from "./readout";
+import { showPlaying } from "./recorded";
+import type { Stage } from "./stage";
+
+const STALE_S = 0.4; // what is older is greyed out: within half a second, the picture included
+const KEPT_S = 60;
+const PLOTTED_S = 30;
+const RATE_MS = 2000; // over which the rate is counted
+
+interface Moment extends Frame {
+  bones: Float32Array;
+}
+
+/** Shows all robots of the stream beside this page; returns what programs may look at. */
+export function showStreams(stage: Stage): Streams {
+  return new Streams(stage);
+}
+
+class Streams {
+  readonly robots = new Map<string, Robot>();
+  private readonly connection: Connection;
+  private readonly plot = new Plot(element<HTMLCanvasElement>("plot"));
+  private readonly dragging: Dragging;
+  private chosen: Robot | null = null;
+  private open = false;
+  private paused = false;
+  private at = 0; // time that is shown while paused [s]
+  private drawn = 0;
+
+  constructor(private readonly stage: Stage) {
+    this.connection = new Connection(streamUrl(), (messages) => this.take(messages), (open) => this.connected(open));
+    this.dragging = new Dragging(stage, (robot, wish) => this.connection.send(pack(robot, "drag", wish)));
+    element("panel").hidden = element("dock").hidden = false;
+    element("about").textContent = "waiting for a robot …";
+    element("cloud").hidden = element("drag").hidden = true;
+    this.connect();
+    showPlaying(true);
+    stage.run(() => this.step());
+  }
+
+  private take(messages: Message[]): void {
+    for (const { robot, kind, payload } of messages) {
+      if (kind === "model") this.announce(robot, readModel(payload));
+      else this.robots.get(robot)?.take(kind, payload);
+    }
+  }
+
+  private announce(id: string, model: Model | null): void {
+    if (!model) return;
+    const known = this.robots.get(id);
+    if (known?.model.digest === model.digest && known.model.commands === model.commands) return;
+    known?.remove();
+    const robot = new Robot(id, model, this.stage);
+    this.robots.set(id, robot);
+    if (!this.chosen || this.chosen === known) this.choose(robot);
+    robot.load().then(
+      () => this.arrange(),
+      (reason: Error) => notice(reason.message),
+    );
+    this.tabs();
+  }
+
+  /** Puts robots side by side, in the order of their names. */
+  private arrange(): void {
+    const bodies = [...this.robots.entries()].sort(([a], [b]) => a.localeCompare(b)).flatMap(([, r]) => (r.body ? [r.body] : []));
+    const width = 0.8 * Math.max(...bodies.map((b) => b.size));
+    const all = new Box3();
+    bodies.forEach((body, i) => {
+      body.group.position.x = (i - (bodies.length - 1) / 2) * width;
+      all.union(body.space().expandByScalar(0.08 * body.size).translate(body.group.position));
+    });
+    this.stage.fit(all);
+    this.choose(this.chosen);
+  }
+
+  private choose(robot: Robot | null): void {
+    this.chosen = robot;
+    if (!robot) return;
+    document.title = `${robot.model.name} – femsense live`;
+    element("name").textContent = robot.model.name;
+    const { handles, commands } = robot.model;
+    element("drag").hidden = handles.length === 0;
+    this.dragging.attend(robot.body ? { id: robot.id, body: robot.body, handles, commands } : null);
+    this.tabs();
+  }
+
+  private tabs(): void {
+    const list = element("robots");
+    list.hidden = this.robots.size < 2;
+    list.replaceChildren(
+      ...[...this.robots.values()].map((robot) => {
+        const tab = document.createElement("button");
+        tab.className = "chip";
+        tab.textContent = robot.model.name;
+        tab.setAttribute("aria-pressed", String(robot === this.chosen));
+        tab.addEventListener("click", () => this.choose(robot));
+        return tab;
+      }),
+    );
+  }
+
+  private connected(open: boolean): void {
+    this.open = open;
+    this.stage.touch();
+  }
+
+  private step(): void {
+    const now = performance.now();
+    for (const robot of this.robots.values()) robot.step(now, this.paused ? this.at : null, this.stage);
+    this.dragging.step();
+    if (now - this.drawn < 100) return;
+    this.drawn = now;
+    this.read(now);
+  }
+
+  /** Brings the panel, the badge and the time line up to date. */
+  private read(now: number): void {
+    const robot = this.chosen;
+    const badge = element("badge");
+    const [state, said] = robot ? robot.state(now, this.open) : [this.open ? "waiting" : "lost", this.open ? "no robot yet" : "no connection"];
+    document.documentElement.dataset.stream = state;
+    badge.dataset.state = this.paused && state === "live" ? "paused" : state;
+    if (badge.textContent !== said) badge.textContent = said;
+    if (!robot) return;
+    element("about").textContent = robot.about();
+    element("cloud").hidden = !robot.body?.hasCloud;
+    element("legend").hidden = !robot.body?.hasCloud || element("cloud").getAttribute("aria-pressed") !== "true";
+    if (robot.body) element("legend-scale").textContent = `${(1000 * robot.body.residualScale).toPrecision(1)} mm`;
+    const shown = robot.shown;
+    if (!shown) return;
+    showFrame(shown, robot.model.inputs, Math.max(robot.body?.arrows.largest ?? 0, 1e-9));
+    element("panel").dataset.stale = String(state !== "live" && !this.paused);
+    const newest = robot.newest?.time_s ?? 0;
+    const end = this.paused ? Math.max(this.at, newest - KEPT_S + PLOTTED_S) : newest;
+    this.plot.draw(robot.history, end - PLOTTED_S, end, shown.time_s);
+    this.timeline(robot, newest, shown.time_s);
+    if (robot.reach) this.dragging.answered(robot.reach, robot.ghost);
+  }
+
+  private timeline(robot: Robot, newest: number, shown: number): void {
+    const scrub = element<HTMLInputElement>("scrub");
+    const oldest = robot.history[0]?.time_s ?? newest;
+    scrub.min = String(oldest);
+    scrub.max = String(Math.max(newest, oldest + 1e-3));
+    scrub.value = String(shown);
+    scrub.style.setProperty("--done", `${(100 * (shown - oldest)) / Math.max(newest - oldest, 1e-3)}%`);
+    scrub.setAttribute("aria-valuetext", this.paused ? `${(newest - shown).toFixed(1)} seconds ago` : "live");
+    const every = Math.max(1, Math.floor(robot.history.length / 300));
+    drawCurve(robot.history.filter((_, i) => i % every === 0), oldest, newest);
+    element("clock").textContent = this.paused ? `${(shown - newest).toFixed(1)} s` : `${shown.toFixed(1)} s`;
+    element("live").setAttribute("aria-pressed", String(!this.paused));
+  }
+
+  private pause(on: boolean, at?: number): void {
+    this.paused = on;
+    this.at = at ?? this.chosen?.newest?.time_s ?? 0;
+    showPlaying(!on);
+    this.drawn = 0;
+    this.stage.touch();
+  }
+
+  private jump(moments: number): void {
+    const robot = this.chosen;
+    if (!robot?.history.length) return;
+    const from = frameAt(robot.history, this.paused ? this.at : robot.newest!.time_s);
+    this.pause(true, robot.history[Math.max(0, Math.min(robot.history.length - 1, from + moments))]!.time_s);
+  }
+
+  private connect(): void {
+    const scrub = element<HTMLInputElement>("scrub");
+    const bodies = (act: (body: Body) => void): void => {
+      for (const robot of this.robots.values()) if (robot.body) act(robot.body);
+      this.stage.touch();
+    };
+    element("speed").hidden = true;
+    element("play").addEventListener("click", () => this.pause(!this.paused));
+    element("live").addEventListener("click", () => this.pause(false));
+    scrub.addEventListener("input", () => this.pause(true, Number(scrub.value)));
+    const pressed = (id: string): boolean => element(id).getAttribute("aria-pressed") === "true";
+    Robot.dress = (body) => {
+      body.showGhost(pressed("ghost"));
+      body.showCloud(pressed("cloud"));
+      body.colorByMotion(pressed("motion") ? 0.15 * body.size : 0);
+      body.arrows.group.visible = pressed("forces");
+    };
+    const [ghost, cloud, motion, forces] = ["ghost", "cloud", "motion", "forces"].map((id) => toggle(id, () => bodies(Robot.dress)));
+    const drag = toggle("drag", (on) => this.dragging.enable(on));
+    const flip = (): void => this.pause(!this.paused);
+    connectTools(this.stage, {
+      " ": flip,
+      k: flip,
+      ArrowLeft: () => this.jump(-6),
+      ArrowRight: () => this.jump(6),
+      End: () => this.pause(false),
+      f: forces!,
+      b: ghost!,
+      c: cloud!,
+      m: motion!,
+      d: drag,
+    });
+  }
+}
+
+/** One robot of the stream. */
+class Robot {
+  /** Dresses a body as the buttons say. */
+  static dress: (body: Body) => void = () => undefined;
+
+  body: Body | null = null;
+  readonly history: Moment[] = [];
+  newest: Moment | null = null;
+  shown: Moment | null = null;
+  reach: ReturnType<typeof readReach> = null;
+  ghost: Float32Array | null = null;
+  private forces: ReturnType<typeof readForces> = null;
+  private inputs: (number | null)[] | null = null;
+  private arrived = -Infinity; // when the newest pose came [ms of the page]
+  private told = { state: "", detail: "" };
+  private readonly arrivals: number[] = []; // when poses of the last seconds came [ms of the page]
+  private gone = false;
+
+  constructor(
+    readonly id: string,
+    readonly model: Model,
+    private readonly stage: Stage,
+  ) {}
+
+  async load(): Promise<void> {
+    const body = new Body(await loadMesh(this.model.glb || `robots/${this.id}.glb`));
+    if (this.gone) return;
+    this.body = body;
+    this.stage.robot.add(body.group);
+    Robot.dress(body);
+    if (this.newest) this.put(this.newest);
+  }
+
+  remove(): void {
+    this.gone = true;
+    if (this.body) this.stage.robot.remove(this.body.group);
+  }
+
+  take(kind: string, payload: Uint8Array): void {
+    if (kind === "pose") this.moved(readPose(payload));
+    else if (kind === "force") this.forces = readForces(payload);
+    else if (kind === "inputs") this.inputs = readInputs(payload);
+    else if (kind === "status") this.told = readStatus(payload) ?? this.told;
+    else if (kind === "reach") this.reach = readReach(payload);
+    else if (kind === "ghost") this.ghost = readPose(payload)?.bones ?? null;
+    else if (kind === "cloud") this.seen(readCloud(payload));
+    this.join();
+  }
+
+  /** Shows the newest moment, or that of a time while paused. */
+  step(now: number, at: number | null, stage: Stage): void {
+    const body = this.body;
+    if (!body) return;
+    const wanted = at === null ? this.newest : (this.history[frameAt(this.history, at)] ?? null);
+    if (wanted && wanted !== this.shown) {
+      this.put(wanted);
+      stage.touch();
+    }
+    const stale = at === null && this.state(now, true)[0] !== "live";
+    if (stale !== body.isStale) {
+      body.setStale(stale);
+      stage.touch();
+    }
+    body.arrows.face(stage.camera, stage.pixelHeight);
+  }
+
+  /** Returns whether it is live, and that in words. */
+  state(now: number, open: boolean): [string, string] {
+    const age = (now - this.arrived) / 1000;
+    if (!open) return ["lost", "no connection"];
+    if (this.told.state === "ended") return ["ended", "ended"];
+    if (this.told.state === "lost") return ["lost", "source lost"];
+    if (!Number.isFinite(age)) return ["waiting", "no pose yet"];
+    if (age > STALE_S) return ["stale", `stale, ${age < 10 ? age.toFixed(1) : age.toFixed(0)} s old`];
+    const span = Math.max(now - this.arrivals[0]!, 500);
+    return ["live", `live, ${Math.round((1000 * this.arrivals.length) / span)} Hz`];
+  }
+
+  about(): string {
+    const vertices = this.body?.skins.reduce((sum, s) => sum + (s.geometry.getAttribute("position")?.count ?? 0), 0) ?? 0;
+    return `${this.model.bones.length} bones · ${vertices.toLocaleString("en")} vertices`;
+  }
+
+  private moved(pose: ReturnType<typeof readPose>): void {
+    if (!pose) return;
+    const now = performance.now();
+    this.arrived = now;
+    this.arrivals.push(now);
+    while (this.arrivals[0]! < now - RATE_MS) this.arrivals.shift();
+    if (this.newest && pose.time < this.newest.time_s - 1) this.history.length = 0; // the source began anew
+    this.newest = { time_s: pose.time, bones: pose.bones, frame: null, status: null, rms_after_m: null, inputs: null, contacts: [] };
+    this.join();
+    this.history.push(this.newest);
+    while (this.history.length && this.history[0]!.time_s < pose.time - KEPT_S) this.history.shift();
+  }
+
+  private join(): void {
+    if (this.newest) Object.assign(this.newest, this.forces ?? {}, { inputs: this.inputs });
+  }
+
+  private put(moment: Moment): void {
+    this.shown = moment;
+    this.body?.pose(moment.bones);
+    this.body?.show(moment.contacts);
+  }
+
+  private seen(points: Float32Array | null): void {
+    if (!points || !this.body) return;
+    this.body.setCloud(points);
+    if (!points.length) this.body.showCloud(false);
+    else Robot.dress(this.body);
+    this.stage.touch();
+  }
+}
+
