@@ -22,8 +22,9 @@ from femsense.core.parallel import beside, one_blas_thread
 from femsense.io.checkpoint import Checkpoint
 from femsense.loop.data.dataset import MESH, Data, prepare
 from femsense.loop.design.next_experiment import next_experiment
+from femsense.loop.design.next_steps import next_steps
 from femsense.loop.fit.discretisation_error import make_finer
-from femsense.loop.result.loop_result import LoopResult
+from femsense.loop.result.loop_result import UNEXPLAINED, LoopResult
 from femsense.loop.result.records import RefitRecord
 from femsense.loop.search.calibration import Ready, calibrated, with_discretisation_error
 from femsense.loop.search.element_order import need_quadratic, seeks_with_quadratic, with_quadratic
@@ -33,6 +34,9 @@ from femsense.loop.verdict.verdict import conclude
 from femsense.model.effects import EFFECTS, FORMS, Effect, find_effect, forms_by_recording, load_own_effect, try_own_effect
 from femsense.model.recording import Recording
 from femsense.model.robot import Robot
+
+MOST_STEPS = 3
+"""So many things to do next are said where an error is left."""
 
 
 @one_blas_thread()
@@ -91,6 +95,10 @@ def improve(
         say("testing what is left")
         result = conclude(data, search, rng)
         record = next_experiment(data, search.final, search.noise, result.confounded, result.not_testable)
+        measured = result.model_error is None or result.model_error.noise_is_measured
+        if result.verdict == UNEXPLAINED or (result.confounded and not record):
+            steps = next_steps(data, search.final, search.noise, noise_is_measured=measured)
+            record = "; or ".join(t for t in (*steps[:MOST_STEPS], record) if t)
     result = replace(result, next_experiment=record, data=replace(result.data, seed=seed))
     if distinguishes_effects(data):
         return result

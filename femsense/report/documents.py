@@ -381,6 +381,17 @@ class LoopInputs(Document):
     validation: list[Input] = Field(default_factory=list)
 
 
+class ModelError(Document):
+    fitted_m: Number = None
+    held_out_m: Number = None
+    noise_m: Number = None
+    noise_is_measured: bool = True
+    noise_source: str = ""
+    placement_m: Number = None
+    discretisation_m: Number = None
+    discretisation_note: str = ""
+
+
 class Loop(Document):
     """loop.json."""
 
@@ -396,6 +407,7 @@ class Loop(Document):
     not_testable: list[Untestable] = Field(default_factory=list)
     detectable: dict[str, Detectable] = Field(default_factory=dict)
     left: Left = Left()
+    model_error: ModelError = ModelError()
     data: Card = Card()
     residuals: Residuals = Residuals()
     evidence: Evidence | None = None

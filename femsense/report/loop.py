@@ -140,10 +140,13 @@ def _summary(loop: Loop) -> Html | None:
     if marked and words.known(before.validation_normal_rms_m) and words.known(after.validation_normal_rms_m):
         ends = f"{words.length(before.validation_normal_rms_m)} → {words.length(after.validation_normal_rms_m)}"
         items.append(("Held-out error of the clouds", ends, "rms along the normals"))
+    own = loop.model_error
     if words.known(loop.noise_m):
-        items.append(
-            ("Noise of a marker" if marked else "Noise of a cloud", words.length(loop.noise_m), f"{kind}, from the data")
-        )
+        source = own.noise_source or "from the data"
+        items.append(("Noise of a marker" if marked else "Noise of a cloud", words.length(loop.noise_m), f"{kind}, {source}"))
+    if words.known(own.held_out_m):
+        note = f"{kind}, held out, beyond noise and discretisation; {words.length(own.fitted_m)} where fitted"
+        items.append(("Error of the model", words.length(own.held_out_m), note))
     share = recovered(before.validation_rms_m, after.validation_rms_m, loop.noise_m)
     if share is not None:
         items.append(("Recovered", words.percent(share), "of the excess over the noise (squares)"))

@@ -484,7 +484,7 @@ def data_card(loop: Loop) -> Html | None:
         )
     rows += [["Outliers left out", _outlier_list(card.outliers)]] if card.outliers else []
     rows += [["Repeats (a state reached again the same way)", str(evidence.repeats)]] if evidence.repeats is not None else []
-    rows += _noise_rows(card)
+    rows += _noise_rows(card, loop.model_error.discretisation_note)
     for name, parameters in card.nuisance_after.items():
         rows.append([element("span", "Fitted along: ", code(name)), together(*_nuisance_lines(parameters))])
     rows += [["Seed", str(card.seed)]] if card.seed is not None else []
@@ -493,16 +493,18 @@ def data_card(loop: Loop) -> Html | None:
     return table(("Item", "Value"), rows, caption="What the result rests on; loop.json beside this file holds all of it.")
 
 
-def _noise_rows(card: Card) -> list[list[object]]:
+def _noise_rows(card: Card, no_mesh: str) -> list[list[object]]:
+    """Return rows on noise and weights; `no_mesh` says why the discretisation error is not known."""
     noise = [f"{COMPONENTS.get(name, name)} {words.length(std)}" for name, std in card.noise_components_m.items()]
-    rows: list[list[object]] = [["Noise, each axis", "; ".join(noise)]] if noise else []
+    rows: list[list[object]] = [["Weights of the fit, each axis", "; ".join(noise)]] if noise else []
     rows += [["Source of the noise level", card.noise_source]] if card.noise_source else []
     rows += (
         [["Independent observations", words.number(card.effective_observations)]]
         if words.known(card.effective_observations)
         else []
     )
-    rows += [["Error of the mesh, at the markers", words.length(card.mesh_error_m, 2)]] if words.known(card.mesh_error_m) else []
+    mesh = words.length(card.mesh_error_m, 2) if words.known(card.mesh_error_m) else no_mesh
+    rows += [["Error of the mesh, at the markers", mesh]] if mesh else []
     if card.clouds is not None:
         clouds = card.clouds
         rows.append(["Clouds", f"{sum(clouds.rows)} rows along normals in {sum(clouds.frames)} fitted frames"])

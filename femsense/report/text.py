@@ -231,6 +231,10 @@ def _loop_rows(document: Mapping[str, Any]) -> list[list[str]]:
             rows.append([name, f"{1e3 * before[key]:.3f} → {1e3 * after[key]:.3f} mm rms"])
     if document.get("noise_m") is not None:
         rows.append(["noise", f"{1e3 * document['noise_m']:.3f} mm"])
+    own = document.get("model_error") or {}
+    if own.get("held_out_m") is not None:
+        said = f"{1e3 * own['held_out_m']:.3f} mm held out, beyond noise and discretisation; noise: {own.get('noise_source')}"
+        rows.append(["error of the model", said])
     return rows
 
 

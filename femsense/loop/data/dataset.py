@@ -65,6 +65,8 @@ class Data:
     """What may be tried, a user's effects among it."""
     outliers: tuple[tuple[int, str], ...] = ()
     """Frame numbers and names of markers that are left out because they are far from where others let expect them."""
+    mesh_note: str = ""
+    """Why the discretisation error is not known; empty where it is."""
 
     @property
     def measured(self) -> tuple[str, ...]:

@@ -160,7 +160,7 @@ def next_element(
         return []
     judge, left = Judge(forms), min(MOST_WORK // tets, MOST_FRAMES)
     now = _open(judge.judge(have), confounded, not_testable)
-    questions = [*(f"{a} or {b}" for a, b in confounded), *not_testable]
+    questions = [*(f"tell {a} from {b}" for a, b in confounded), *(f"show {name}" for name in not_testable)]
     chosen = []
     for element in _one_of_each_first(candidate_experiments(setup)):
         if element.sweeps and element.frames < left:

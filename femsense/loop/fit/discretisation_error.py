@@ -51,14 +51,14 @@ PULLING = "cables", "cable_slots"
 
 
 def with_mesh_errors(data: Data, fitted: FittedModel, tried: Sequence[str]) -> Data:
-    """Return the data with the error of the mesh at a fitted model; without it where the mesh is huge, or linear and `discretisation` among the
-    effects that are tried."""
+    """Return the data with the error of the mesh at a fitted model; with a note why not where the mesh is huge, or linear and `discretisation` among
+    the effects that are tried, or where no state settles on a finer one."""
     robot = fitted.fit.hypothesis.robot_at(fitted.fit.coordinates)
     train, held, known = list(data.train), list(data.held), poses_and_inputs(data, fitted.fit)
     try:
         finer = _finer(robot.body.mesh, tried)
         if finer is None:
-            return data
+            return replace(data, mesh_note=_why_not(robot.body.mesh, tried))
         fine = _on_its_clamp(robot, robot_on_mesh(_on_firm_clamp(robot), finer))
         for i, (trial, (poses, initial)) in enumerate(zip(data.train, known)):
             own = [j for j, of in enumerate(data.held_of) if of == i]
@@ -67,9 +67,10 @@ def with_mesh_errors(data: Data, fitted: FittedModel, tried: Sequence[str]) -> D
                 held[j] = one
         for j in (j for j, of in enumerate(data.held_of) if of is None):
             held[j] = _with_errors(robot, fine, [held[j]], held[j].poses, held[j].initial)[0]
-    except FemsenseError:
-        return data
-    return replace(data, train=train, held=held)
+    except FemsenseError as error:
+        known_before = bool(mesh_errors(data))
+        return data if known_before else replace(data, mesh_note=f"no state settles on a finer mesh ({error})")
+    return replace(data, train=train, held=held, mesh_note="")
 
 
 def errs_alike(before: FittedModel, after: FittedModel) -> bool:
@@ -115,6 +116,13 @@ def _finer(mesh: TetMesh, tried: Sequence[str]) -> TetMesh | None:
     if mesh.is_quadratic:
         return finer_mesh(mesh, None, 1) if 8 * len(mesh.tets) <= MOST_TETS else None
     return finer_mesh(mesh, "tet10", 0) if MESH.name not in tried and len(mesh.tets) <= MOST_TETS else None
+
+
+def _why_not(mesh: TetMesh, tried: Sequence[str]) -> str:
+    """Return in words why a finer mesh is not asked."""
+    if not mesh.is_quadratic and MESH.name in tried:
+        return f"linear elements were compared with quadratic ones ({MESH.name})"
+    return f"a mesh of half the size has more than {MOST_TETS} elements"
 
 
 def make_finer(robot: Robot, tried: Sequence[str]) -> None:

@@ -15,6 +15,7 @@ from femsense.loop.result.records import (
     Detectable,
     Errors,
     Left,
+    ModelError,
     NamedEffect,
     Residuals,
     TriedEffect,
@@ -38,7 +39,7 @@ class LoopResult:
     sentence: str
     """The verdict in words."""
     noise_m: float
-    """Noise of the data [m]."""
+    """Noise of the data [m]: what repeats of a state differ by."""
     before: Errors
     """Of the declared model, calibrated."""
     after: Errors
@@ -64,6 +65,8 @@ class LoopResult:
     declared: Robot
     """The robot that came in."""
     data: DataCard
+    model_error: ModelError | None = field(default=None, metadata=AS_EMPTY)
+    """What is left that is no noise."""
     residuals: Residuals | None = field(default=None, metadata=AS_EMPTY)
     """Held-out residuals before and after, for figures."""
     evidence: Evidence | None = field(default=None, metadata=AS_EMPTY)

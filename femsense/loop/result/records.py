@@ -240,6 +240,31 @@ class Left(LeftOver):
 
 
 @dataclass(frozen=True, eq=False, slots=True)
+class ModelError:
+    """What the held-out error consists of: the model's own error is what is left beyond noise, placements and discretisation, in squares.
+
+    Root mean squares [m] over all axes of a marker; where there are only clouds, along their normals.
+    """
+
+    fitted_m: float
+    """The model's own error where it is fitted, with all that was found."""
+    held_out_m: float
+    """That of the model that is handed back, on held-out data."""
+    noise_m: float
+    """What a point repeats to."""
+    noise_is_measured: bool
+    """Whether that is declared or measured, not assumed."""
+    noise_source: str
+    """Where it comes from, in words."""
+    placement_m: float
+    """How far markers are likely to sit from where they are declared."""
+    discretisation_m: float | None
+    """Discretisation error; None where it is not known."""
+    discretisation_note: str
+    """Why it is not known; empty where it is."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
 class CloudCard:
     """What was used of clouds."""
 

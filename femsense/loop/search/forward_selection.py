@@ -20,7 +20,7 @@ from femsense.loop.fit.joint_fit import JointFit, Prior
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.result.records import NAMED, RefitRecord
 from femsense.loop.search.acceptance import acceptance_test, prior_evidence, surely_predicts
-from femsense.loop.search.location_search import POLISHED, climbed, located
+from femsense.loop.search.location_search import POLISHED, climbed, lies_on_body, located
 from femsense.loop.search.refit import EVIDENCE, FORGONE, evidence, explains, refit, tried, with_term, within, worth_of
 from femsense.loop.search.screening import Candidate, joined, linear_gain
 from femsense.loop.search.search_state import Progress, Refit, no_equilibrium
@@ -366,5 +366,6 @@ def _with_seed_fitted(data: Data, best: FittedModel, noise: Noise, say: Progress
         made = fit_model(data, hypothesis, prior, noise, np.concatenate([best.fit.coordinates, null]), own=own_of(best))
     except FemsenseError:
         return best
-    inside = all(p.low + 1e-9 < v < p.high - 1e-9 for p, v in zip(more, made.fit.coordinates[-len(more) :]))
+    values = made.fit.coordinates[-len(more) :]
+    inside = all(p.low + 1e-9 < v < p.high - 1e-9 for p, v in zip(more, values)) and lies_on_body(data.robot, more, values)
     return made if made.fit.chi2 < best.fit.chi2 - POLISHED * len(more) and inside else best

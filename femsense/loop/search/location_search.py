@@ -7,8 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from femsense.core.arrays import FloatArray
 from femsense.core.errors import FemsenseError
 from femsense.core.least_squares import STOPPED_EARLY
+from femsense.fem.mesh import embed_points
 from femsense.loop.data.dataset import Data
 from femsense.loop.fit.fitted_model import FittedModel, fit_model, jets_without, own_of, problem_of
 from femsense.loop.fit.joint_fit import JointFit
@@ -17,7 +19,8 @@ from femsense.loop.search.effect_fields import Answers, effect_fields
 from femsense.loop.search.refit import EVIDENCE, refit_from, tried
 from femsense.loop.search.screening import Candidate, confounding, jets_with, screen
 from femsense.loop.search.subsampling import representative_cases
-from femsense.model.effects import Entry
+from femsense.model.effects import Entry, Parameter
+from femsense.model.robot import Robot
 
 NEARLY = 0.05
 """Seeds whose gain is less by this share are as good."""
@@ -29,6 +32,10 @@ ALIKE = 0.98, 0.1
 """Two places count as one where this share of what an effect does in one can be had in the other, with parameters that differ by no more than that share."""
 POLISHED = 2.0
 """Decrease of χ² that each further parameter of a polished effect must bring."""
+
+
+BESIDE = 0.01
+"""A place lies on the body if it is no farther outside than this share of the body's reach: on a stalk, or on what the mesh rounds off."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -202,3 +209,14 @@ def _screen_seeds(
 ) -> list[Candidate]:
     fields = effect_fields(fitted.fit, data.train, [(start.effect, seed, start.parameters) for seed in seeds], answers)
     return screen(fitted.fit, problem_of(data, fitted.fit, noise), fields, 100.0)
+
+
+def lies_on_body(robot: Robot, parameters: Sequence[Parameter], coordinates: Sequence[float] | FloatArray) -> bool:
+    """Return whether each place among parameters lies in the body at rest, or beside it by no more than a share of its reach. A force acts the same
+    all along its line, so that a fit may take it anywhere."""
+    places: dict[str, list[float]] = {}
+    for p, v in zip(parameters, coordinates):
+        if p.unit == "m" and isinstance(p.part, int):
+            places.setdefault(p.key, []).append(p.value(float(v)))
+    points = np.array([place for place in places.values() if len(place) == 3]).reshape(-1, 3)
+    return not len(points) or bool((embed_points(robot.body.mesh, points).outside <= BESIDE * robot.body.reach).all())

@@ -11,6 +11,7 @@ from femsense.fem.mesh import surface_triangles, to_linear
 from femsense.loop.data.covariates import actuation_of, covariates_of, load_of, rank_with, stacked, unloading
 from femsense.loop.data.dataset import Data
 from femsense.loop.data.holdout import sweeps_of
+from femsense.loop.data.repeats import count_repeats
 from femsense.loop.data.trial import heads_of
 from femsense.loop.fit.discretisation_error import without_mesh_error
 from femsense.loop.fit.fitted_model import FittedModel
@@ -21,7 +22,7 @@ from femsense.loop.search.screening import Candidate
 from femsense.loop.verdict.calibration_tables import calibration_shift, excluded
 from femsense.loop.verdict.candidate_tables import confounding_map, power, ranking
 from femsense.loop.verdict.force_impact import View, chosen_frames, equivalent_forces, force_consequence, views_of
-from femsense.loop.verdict.lack_of_fit import repeats, tested
+from femsense.loop.verdict.lack_of_fit import tested
 from femsense.loop.verdict.residual_diagnostics import frame_rms, structure_tests
 
 MOST_NODES = 4000
@@ -74,7 +75,7 @@ def gather(
         ),
         power=power(last),
         excluded=tuple(excluded(trial.scene.recording, data) for trial in heads),
-        repeats=sum(repeats(trial) for trial in heads),
+        repeats=sum(count_repeats(trial) for trial in heads),
         forces=force_consequence(old, new, noise),
         equivalent_forces=equivalent_forces([v for v in views_of(data, shown) if not v.held_out], noise),
     )

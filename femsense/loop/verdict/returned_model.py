@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,14 +10,25 @@ import numpy as np
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import FemsenseError
 from femsense.loop.data.dataset import NUISANCE, Data
+from femsense.loop.data.trial import rms_of
 from femsense.loop.fit.discretisation_error import beyond_mesh
-from femsense.loop.fit.fitted_model import FittedModel, held_chi2, keeping, span_of, with_seeds_still, with_sizes_still
+from femsense.loop.fit.fitted_model import (
+    FittedModel,
+    held_chi2,
+    held_poses_and_inputs,
+    keeping,
+    span_of,
+    with_seeds_still,
+    with_sizes_still,
+)
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.search.acceptance import at_edge
 from femsense.loop.search.input_offset import OFFSETS, SIGNIFICANT, moved_nuisance, offsets_are_evident
 from femsense.loop.search.refit import EVIDENCE
 from femsense.loop.search.search_state import Search
-from femsense.model.effects import OF_BODY, Entry
+from femsense.model.effects import OF_BODY, Effect, Entry, Parameter
+from femsense.model.observation import Hypothesis, evaluate_scene
+from femsense.model.robot import Robot
 
 (MODULUS,) = OF_BODY
 """What calibration may move of the body."""
@@ -35,6 +46,10 @@ FAR_BETTER = 50.0
 """… or, where the mesh's own error is what is larger, if χ² of the held-out data falls by so much."""
 
 
+COMPARED = 3
+"""Frames of each held-out recording in which the robot that is handed back is asked for what the fitted model says."""
+
+
 def promoted_nuisances(data: Data, search: Search) -> list[str]:
     """Return the nuisances that the data moved significantly away from what is declared; of the input offsets, those that are missed."""
     names = [n for n in search.final.fit.hypothesis.names if n in NUISANCE and moved_nuisance(data, search.final, n)]
@@ -46,11 +61,33 @@ def is_sure(fitted: FittedModel, name: str, std: FloatArray) -> bool:
     return bool((np.abs(fitted.fit.coordinates[span_of(fitted.fit, name)]) > SIGNIFICANT * std).any())
 
 
+def sure_effects(data: Data, fitted: FittedModel, names: Iterable[str], std: Mapping[str, FloatArray]) -> list[str]:
+    """Return the effects with a value of their own that is away from what is declared by more than SIGNIFICANT of the standard deviations that are
+    reported, and those that have none (a law, a mesh). Places and times are no such values, nor is a weight that no robot can be without."""
+    terms = {effect.name: (effect, parameters) for effect, _, parameters in fitted.fit.hypothesis.terms}
+    return [name for name in names if name not in terms or _is_away(data, fitted, *terms[name], std[name])]
+
+
+def _is_away(data: Data, fitted: FittedModel, effect: Effect, parameters: Sequence[Parameter], std: FloatArray) -> bool:
+    own = {p.key for p in effect.parameters(data.robot, data.control)}
+    sized = np.array([p.key in own for p in parameters], dtype=bool)
+    if effect.discrete or effect.expected(data.declared) or not sized.any():
+        return True
+    off = np.abs(fitted.fit.coordinates[span_of(fitted.fit, effect.name)] - np.array([p.null for p in parameters]))
+    return bool((off > SIGNIFICANT * std)[sized].any())
+
+
 def worth_handing_back(data: Data, search: Search, promoted: list[str], names: list[str]) -> tuple[list[str], FittedModel]:
-    """Return the names that are handed back with the model of just these: with the sizes that they have beside all nuisances where held-out data
-    do not miss those, else fitted again. Nuisances that stay as declared are taken out, too if they only do so here, and so is, from the last one
-    on, what would make the error on held-out data larger than it was, or goes to the edge of what is plausible."""
+    """Return the names that are handed back with their model.
+
+    First with all that was fitted along, then with the sizes that they have beside all nuisances where held-out data do not miss those, else fitted
+    again. Nuisances that stay as declared are taken out, too if they only do so here, and so is, from the last one on, what would make the error on
+    held-out data larger than it was, or goes to the edge of what is plausible.
+    """
     while names:
+        along = _handed_back(data, search.final, [*NUISANCE, *names], search.noise)
+        if along is not None and _may_be_handed_back(data, search, along):
+            return names, along
         kept, back = _with_modulus(data, search, names, sizes_still=True)
         if back is not None and not _misses(data, search, back) and _may_be_handed_back(data, search, back):
             return kept, back
@@ -138,10 +175,48 @@ def _handed_back(
 
 
 def entries_of(fitted: FittedModel, names: list[str]) -> list[Entry]:
-    """Return the tables of `[[effects]]`: those that change the mesh or the law first, then in the order in which they were found."""
+    """Return the tables of `[[effects]]`: those that change the mesh or the law first, then in the order in which they were found, then what was
+    fitted along and is not named."""
     settled = [{"name": effect.name, **seed} for effect, seed in fitted.fit.hypothesis.settled]
     tables = {e["name"]: e for e in fitted.fit.hypothesis.entries(fitted.fit.coordinates)}
-    return [_rounded(e) for e in settled] + [_rounded(tables[name]) for name in names if name in tables]
+    order = [*(name for name in names if name in tables), *(name for name in tables if name not in names)]
+    return [_rounded(e) for e in settled] + [_rounded(tables[name]) for name in order]
+
+
+def prediction_gap(data: Data, robot: Robot, back: FittedModel, noise: Noise) -> float:
+    """Return how far markers are between a robot and the fitted model that it should be [m], root mean square, in some of the held-out states.
+
+    Arguments:
+        data: what was held out; clouds are not asked.
+        robot: the declared robot with the effects that are handed back, as whoever loads its file has it.
+        back: the fitted model.
+        noise: with which poses of other recordings are fitted.
+
+    Raises:
+        DataError: the robot has no equilibrium there.
+    """
+    unknown = any(t.initial is not None for t in data.held)
+    inputs = [initial for _, initial in held_poses_and_inputs(data, back.fit, noise)] if unknown else [None] * len(data.held)
+    gaps, pivot = list[FloatArray](), data.robot.marker_points.mean(axis=0)
+    for trial, held, initial in zip(data.held, back.held, inputs):
+        if trial.scene.crossings is not None:
+            continue
+        frames = trial.scene.frames
+        some = frames[np.unique(np.linspace(0, len(frames) - 1, COMPARED).round().astype(int))]
+        scene, starts = trial.scene.pick(some), dict(held.jet.states)
+        jet = evaluate_scene(
+            Hypothesis(robot),
+            scene,
+            np.zeros(0),
+            held.poses,
+            initial,
+            derivative=False,
+            vary_initial=False,
+            pivot=pivot,
+            starts=starts,
+        )
+        gaps.append(jet.residual - held.jet.residual[np.isin(trial.scene.frame, some)])
+    return rms_of(gaps) if gaps else 0.0
 
 
 def _rounded(entry: Entry) -> Entry:

@@ -11,9 +11,9 @@ from femsense.loop.data.dataset import MESH, Data
 from femsense.loop.data.trial import rms_of
 from femsense.loop.fit.discretisation_error import mesh_errors
 from femsense.loop.fit.fitted_model import FittedModel
-from femsense.loop.fit.noise_components import Noise
+from femsense.loop.fit.repeatability import Repeatability
 from femsense.loop.result.loop_result import EFFECTS, NONE, UNEXPLAINED
-from femsense.loop.result.records import NamedEffect, Value
+from femsense.loop.result.records import ModelError, NamedEffect, Value
 from femsense.loop.search.search_state import Search
 from femsense.loop.verdict.returned_model import NOT_WORSE, has_effects, held_beyond_mesh
 
@@ -30,34 +30,39 @@ GROSS = 0.03
 
 
 def verdict_in_words(
-    verdict: str,
-    effects: Sequence[NamedEffect],
-    found: list[str],
-    before: FittedModel,
-    after: FittedModel,
-    noise: Noise,
-    mesh: float | None,
+    verdict: str, effects: Sequence[NamedEffect], found: list[str], before: FittedModel, after: FittedModel, budget: ModelError
 ) -> str:
-    """Return the sentence on top; `mesh` is the discretisation error [m], where that is known."""
+    """Return the sentence on top: the verdict, the held-out error, and how much of that is an error of the model."""
     error = f"held-out error {1e3 * before.held_rms:.2f} mm"
-    if not noise.std:
-        error += " along the normals of the surface"
-    if verdict == NONE and before.held_rms > BEYOND_NOISE * np.hypot(noise.total, mesh or 0.0):
-        costs = f"; the discretisation error is {1e3 * mesh:.2f} mm" if mesh else ""
-        return f"Nothing that was tried explains more of the data: {error}; their noise is {1e3 * noise.total:.2f} mm{costs}."
+    known = float(np.hypot(budget.noise_m, budget.placement_m))
+    mesh = budget.discretisation_m or 0.0
+    if verdict == NONE and before.held_rms <= BEYOND_NOISE * np.hypot(known, mesh):
+        finer = f" and to its discretisation error ({1e3 * mesh:.2f} mm; a finer mesh would show more)"
+        own = finer if mesh and before.held_rms > BEYOND_NOISE * known else ""
+        return f"The model explains the data to their noise ({_noise_in_words(budget)}){own}: {error}." + _mesh_in_words(budget)
+    of_it = f"of it {1e3 * budget.held_out_m:.2f} mm is an error of the model, {_noise_in_words(budget)} noise"
     if verdict == NONE:
-        known = f"to their noise ({1e3 * noise.total:.2f} mm)"
-        if mesh and before.held_rms > BEYOND_NOISE * noise.total:
-            known += f" and to its discretisation error ({1e3 * mesh:.2f} mm; a finer mesh would show more)"
-        return f"The model explains the data {known}: {error}."
+        costs = f"; the discretisation error is {1e3 * mesh:.2f} mm" if mesh else ""
+        return f"Nothing that was tried explains more of the data: {error}, {of_it}{costs}." + _mesh_in_words(budget)
+    where = "" if after.held_residuals and after.held_residuals[0].shape[1] == 3 else " along the normals of the surface"
     if verdict == UNEXPLAINED and not effects:
         explains = "nothing that may be handed back" if found else "no effect of the list"
-        small = ", though it is no larger than the noise" if before.held_rms <= noise.total else ""
-        return f"A residual is left that {explains} explains{small}: {error}, noise {1e3 * noise.total:.2f} mm."
+        return f"A residual is left that {explains} explains: {error}{where}, {of_it}." + _mesh_in_words(budget)
     what = ", ".join(f"{e.name} ({values_in_words(e.parameters)})" for e in effects)
     tail = "" if verdict == EFFECTS else " A residual is left that no effect explains."
-    where = "" if noise.std else " along the normals of the surface"
-    return f"The model lacks {what}; held-out error{where} {1e3 * before.held_rms:.2f} mm before, {1e3 * after.held_rms:.2f} mm after.{tail}"
+    fell = f"held-out error{where} {1e3 * before.held_rms:.2f} mm before, {1e3 * after.held_rms:.2f} mm after"
+    return f"The model lacks {what}; {fell}, {of_it}.{tail}" + _mesh_in_words(budget)
+
+
+def _noise_in_words(budget: ModelError) -> str:
+    """Return the size of the noise, and whether it is measured."""
+    size = f"{1e3 * budget.noise_m:.2f} mm"
+    return size if budget.noise_is_measured else f"perhaps {size} (no state repeats)"
+
+
+def _mesh_in_words(budget: ModelError) -> str:
+    """Return a sentence on why the discretisation error is not known; nothing where it is."""
+    return f" The discretisation error is not known: {budget.discretisation_note}." if budget.discretisation_note else ""
 
 
 def by_mesh(data: Data, search: Search, back: FittedModel) -> str:
@@ -76,24 +81,29 @@ def on_linear(data: Data, back: FittedModel) -> str:
     return f" Linear elements have a discretisation error of {1e3 * mesh:.2f} mm, which other effects may stand for: try {MESH.name} too."
 
 
-def evidence_for(data: Data, found: list[str]) -> str:
-    """Return a sentence on effects that were found and are not handed back; nothing where there are none."""
-    if not found:
-        return ""
+def evidence_for(data: Data, found: list[str], unsure: list[str]) -> str:
+    """Return a sentence on effects that were found and are not handed back; of `unsure` ones no value is away from none. Nothing where there are none."""
+    said = ""
+    others = [n for n in found if n not in unsure]
+    if unsure:
+        said = f" {', '.join(unsure)} would explain more, but with values no surer than three deviations."
+    if not others:
+        return said
     mesh = mesh_error_rms(data)
     finer = f"; the discretisation error is {1e3 * mesh:.2f} mm, and a finer mesh may tell" if mesh else ""
     return (
-        f" There is evidence for {', '.join(found)}, but the held-out error would grow with it or a value be implausible{finer}."
+        said
+        + f" There is evidence for {', '.join(others)}, but the held-out error would grow with it or a value be implausible{finer}."
     )
 
 
-def by_noise(data: Data, noise: Noise) -> str:
-    """Return in words that the noise is beyond what cameras have."""
+def by_noise(data: Data, measured: Repeatability) -> str:
+    """Return in words that what a state repeats to is beyond what cameras have; nothing where it is not."""
     reach = data.robot.body.reach
-    if noise.total < GROSS * reach:
+    if measured.total < GROSS * reach:
         return ""
     return (
-        f" Noise of {1e3 * noise.total:.1f} mm on a body of {1e3 * reach:.0f} mm is no camera's: frames that should be alike are not."
+        f" Noise of {1e3 * measured.total:.1f} mm on a body of {1e3 * reach:.0f} mm is no camera's: frames that should be alike are not."
         " Look whether inputs belong to their frames and names to their markers and cables."
     )
 

@@ -196,7 +196,9 @@ def _smallest_seen(c: Candidate) -> Detectable:
 # Data
 
 
-def data_card(data: Data, final: FittedModel, full_std: dict[str, FloatArray], noise: Noise, n_effective: float) -> DataCard:
+def data_card(
+    data: Data, final: FittedModel, full_std: dict[str, FloatArray], noise: Noise, noise_source: str, n_effective: float
+) -> DataCard:
     """Return what the data are, how they were split, and what calibration moves beside all effects."""
     moved = {effect.name for effect, _, _ in final.fit.hypothesis.terms}
     heads = [data.train[i] for i in heads_of(data.train)]
@@ -208,7 +210,7 @@ def data_card(data: Data, final: FittedModel, full_std: dict[str, FloatArray], n
         measured=data.measured,
         clouds=_cloud_card(data, noise),
         noise_components_m=noise.std or noise.surface,
-        noise_source=noise.source,
+        noise_source=noise_source,
         mesh_error_m=mesh_error_rms(data),
         outliers=tuple(Outlier(number, name) for number, name in data.outliers),
         effective_observations=n_effective,

@@ -2,27 +2,37 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from collections.abc import Sequence
+from dataclasses import fields, replace
 
 import numpy as np
 
 from femsense.core.arrays import FloatArray
+from femsense.core.errors import FemsenseError
 from femsense.loop.data.dataset import NUISANCE, Data
 from femsense.loop.data.trial import Trial
 from femsense.loop.fit.covariance import parameter_std
-from femsense.loop.fit.discretisation_error import beyond_mesh, without_mesh_error
-from femsense.loop.fit.fitted_model import (
-    FittedModel,
-)
+from femsense.loop.fit.discretisation_error import without_mesh_error
+from femsense.loop.fit.fitted_model import FittedModel
 from femsense.loop.fit.noise_components import Noise, whiten
+from femsense.loop.fit.repeatability import repeatability
 from femsense.loop.result.loop_result import EFFECTS, NONE, UNEXPLAINED, LoopResult
 from femsense.loop.result.records import Left, Structure
 from femsense.loop.search.search_state import Search
 from femsense.loop.verdict.confounding import confounded, in_words
+from femsense.loop.verdict.model_error import Excess, excess_of, model_error
 from femsense.loop.verdict.report_data import gather
 from femsense.loop.verdict.residual_diagnostics import describe_left, structure_tests
-from femsense.loop.verdict.returned_model import MODULUS, entries_of, is_sure, promoted_nuisances, worth_handing_back
-from femsense.loop.verdict.sentences import by_mesh, by_noise, evidence_for, mesh_error_rms, on_linear, verdict_in_words
+from femsense.loop.verdict.returned_model import (
+    MODULUS,
+    entries_of,
+    is_sure,
+    prediction_gap,
+    promoted_nuisances,
+    sure_effects,
+    worth_handing_back,
+)
+from femsense.loop.verdict.sentences import by_mesh, by_noise, evidence_for, on_linear, verdict_in_words
 from femsense.loop.verdict.summary import (
     chain_of_effects,
     data_card,
@@ -32,52 +42,57 @@ from femsense.loop.verdict.summary import (
     tried_effects,
     untestable,
 )
-from femsense.model.effects import apply_effects
+from femsense.model.effects import Entry, apply_effects
+from femsense.model.robot import Robot
 
 EXPLAINED = 0.8
-"""Share of the excess over the noise that effects must take away where structure is left."""
+"""Share of the excess over the noise that effects must take away where structure is left that is no larger than the noise or the mesh's error."""
 LACKS = 2.0
 """A model that is handed back may leave so many times the mean square, in units of all noise, that calibration of all nuisances leaves."""
+SAME = 0.01, 1e-5
+"""The robot that is handed back may differ from the fitted model by this share of what that leaves, or by this [m]."""
 
 
 def conclude(data: Data, search: Search, rng: np.random.Generator) -> LoopResult:
     """Return the verdict with all that the report shows."""
     before, final, noise = search.before, search.final, search.noise
     std = parameter_std(data, final, noise, _seed_std(search))
+    measured = repeatability(data, final, noise)
     promoted = [n for n in promoted_nuisances(data, search) if is_sure(final, n, std[n])]
-    names = [*promoted, *(n for n, _ in search.history[1:] if n in final.fit.hypothesis.names)]
-    names, back = worth_handing_back(data, search, promoted, names)
+    added = [n for n, _ in search.history[1:] if n in final.fit.hypothesis.names]
+    sure = sure_effects(data, final, added, std)
+    names, back = worth_handing_back(data, search, promoted, [*promoted, *sure])
     drifted = MODULUS in promoted and MODULUS not in names  # what a modulus beyond all bounds takes away is not explained
     promoted = [n for n in names if n in NUISANCE]
-    entries = entries_of(back, names)
+    entries = entries_of(back, names) if names else []
     effects = chain_of_effects(data, search, promoted, names, back, std)
     lacks = lacks_much(data, back, final, noise)
     shown = back if lacks else final  # what nuisances take away unnamed is left, too
     surprise = _surprise(data, back, noise)
     plain = [without_mesh_error(t, jet.residual, noise, nor_placements=True) for t, jet in zip(data.train, shown.fit.jets)]
     tests = structure_tests(data.train, plain, rng=rng)
-    excess = excess_of(data, before, final, back, noise)
+    excess = excess_of(data, before, final, back, noise, measured)
     found = _not_handed_back(search, names)
-    structured = tests.significant and excess.left > excess.tolerated
-    unexplained = lacks or (found and not effects) or ((structured or surprise) and (drifted or excess.explained < EXPLAINED))
+    structured = tests.significant and not excess.is_small
+    open_to_doubt = (structured or surprise) and (drifted or excess.explained < EXPLAINED)
+    unexplained = lacks or (found and not effects) or open_to_doubt or excess.is_large
     verdict = UNEXPLAINED if unexplained else EFFECTS if effects else NONE
     pairs = confounded(search, names)
-    robot = apply_effects(data.declared, entries) if entries else data.declared
-    if data.declared.document is not None and entries:
-        written = [*data.declared.document.get("effects", []), *entries]
-        robot = replace(robot, document={**data.declared.document, "effects": written})
+    robot = _handed_back(data, entries)
     only_held = bool(surprise) and not structured and not lacks
     left = _left(data, back if only_held else shown, noise, tests, excess, held=only_held)
+    budget = model_error(data, excess, noise, measured)
     return LoopResult(
         verdict=verdict,
-        sentence=verdict_in_words(verdict, effects, found, before, back, noise, mesh_error_rms(data))
+        sentence=verdict_in_words(verdict, effects, found, before, back, budget)
         + in_words(pairs, names)
-        + by_noise(data, noise)
+        + by_noise(data, measured)
         + by_mesh(data, search, back)
         + on_linear(data, back)
-        + evidence_for(data, found)
-        + surprise,
-        noise_m=noise.total,
+        + evidence_for(data, found, [n for n in added if n not in sure])
+        + surprise
+        + _by_prediction(data, robot, back, noise),
+        noise_m=measured.total,
         before=errors_of(data, before, rng),
         after=errors_of(data, back, rng),
         effects=tuple(effects),
@@ -90,35 +105,38 @@ def conclude(data: Data, search: Search, rng: np.random.Generator) -> LoopResult
         left=left,
         robot=robot,
         declared=data.declared,
-        data=data_card(data, final, std, noise, search.n_effective),
+        data=data_card(data, final, std, noise, measured.source, search.n_effective),
+        model_error=budget,
         residuals=residual_table(data, before, back),
         evidence=gather(data, before, search.base, final, back, shown, noise, search.first, search.last, tests, rng),
     )
 
 
+def _handed_back(data: Data, entries: Sequence[Entry]) -> Robot:
+    """Return the declared robot with effects, in its document too."""
+    if not entries:
+        return data.declared
+    robot = apply_effects(data.declared, entries)
+    if data.declared.document is None:
+        return robot
+    written = [*data.declared.document.get("effects", []), *entries]
+    return replace(robot, document={**data.declared.document, "effects": written})
+
+
+def _by_prediction(data: Data, robot: Robot, back: FittedModel, noise: Noise) -> str:
+    """Return a sentence on by how much the robot that is handed back differs from the fitted model; nothing where it does not."""
+    share, least = SAME
+    try:
+        gap = prediction_gap(data, robot, back, noise)
+    except FemsenseError as error:
+        return f" The robot that is handed back does not predict what the fitted model does: {error}."
+    if gap <= max(share * back.held_rms, least):
+        return ""
+    return f" The robot that is handed back predicts markers {1e3 * gap:.2f} mm from where the fitted model has them."
+
+
 def _seed_std(search: Search) -> dict[str, FloatArray]:
     return {r.name: np.array(r.seed_std) for r in search.refits if r.is_named and r.seed_std is not None}
-
-
-@dataclass(frozen=True, slots=True)
-class Excess:
-    """Root mean squares [m] over what is measured again and again alike, less the likeliest share of the mesh's error."""
-
-    left: float
-    """What the final model leaves beyond the noise of repetition."""
-    tolerated: float
-    explained: float
-    """Share of the mean square beyond the noise that the effects took away: where fitted by all that was found, on held-out data by what is
-    handed back; the smaller one."""
-
-
-def excess_of(data: Data, before: FittedModel, final: FittedModel, back: FittedModel, noise: Noise) -> Excess:
-    axes, std = (3.0, noise.std) if noise.std else (1.0, noise.surface)
-    floor = float(np.sqrt(axes * sum(v**2 for k, v in std.items() if k != "state")))
-    fitted = [beyond_mesh(data.train, [j.residual for j in s.fit.jets], noise) for s in (before, final)]
-    held = [beyond_mesh(data.held, s.held_residuals, noise) for s in (before, back)]
-    left = float(np.sqrt(max(fitted[1] ** 2 - floor**2, 0.0)))
-    return Excess(left, 0.25 * floor, min(_taken_away(fitted[0], fitted[1], floor), _taken_away(held[0], held[1], floor)))
 
 
 def lacks_much(data: Data, back: FittedModel, final: FittedModel, noise: Noise) -> bool:
@@ -157,11 +175,6 @@ def _mean_square(trials: list[Trial], residuals: list[FloatArray], noise: Noise)
     """Return the mean square of whitened residuals; 1 is noise."""
     rows = [whiten(noise.whitener(t.groups, t.mesh_error), r) for t, r in zip(trials, residuals)]
     return float(np.mean(np.concatenate(rows, axis=None) ** 2)) if rows else 0.0
-
-
-def _taken_away(before: float, after: float, floor: float) -> float:
-    """Return the share of the mean square beyond the floor that is gone; all of it where nothing is left beyond."""
-    return 1.0 if after <= floor else float((before**2 - after**2) / max(before**2 - floor**2, 1e-18))
 
 
 def _not_handed_back(search: Search, names: list[str]) -> list[str]:

@@ -149,3 +149,39 @@ def test_what_is_handed_back_keeps_the_size_that_it_has_beside_all_nuisances_unl
     monkeypatch.setattr(returned_model, "NOT_WORSE", tolerated)
     monkeypatch.setattr(returned_model, "held_chi2", lambda _, fitted, noise: 100.0 + more * (fitted is not search.final))
     assert handed_back(data, search) == (["cable_gain"], pytest.approx(beside if kept else alone, abs=1e-5))
+
+
+@pytest.mark.parametrize("std, sure", [(0.025, True), (0.031, False)])
+def test_an_effect_is_named_only_where_its_own_value_is_away_from_none_by_three_deviations(std: float, sure: bool) -> None:
+    data, search = with_gain(300e3)
+    assert search.final.fit.coordinates[-1] == pytest.approx(np.log(0.92), abs=0.004)
+    names = returned_model.sure_effects(data, search.final, ["cable_gain"], {"cable_gain": np.array([std])})
+    assert names == (["cable_gain"] if sure else [])
+
+
+def test_where_a_load_hangs_is_not_what_makes_it_sure() -> None:
+    data, fitted = fitted_arm(arm((4, 2, 2)), 1.0)
+    payload = find_effect("payload")
+    seed = {"point_m": [0.095, 0.0, 0.01]}
+    place = tuple(replace(p, null=0.0) for p in payload.polish(data.robot, "tension", seed))
+    parameters = (*payload.parameters(data.robot, "tension"), *place)
+    hypothesis = replace(fitted.fit.hypothesis, terms=(*fitted.fit.hypothesis.terms, (payload, seed, parameters)))
+    theta = np.concatenate([fitted.fit.fit.theta, [0.0, 0.0, 0.02], [0.09, 0.0, 0.01]])
+    loaded = replace(fitted, fit=replace(fitted.fit, hypothesis=hypothesis, fit=replace(fitted.fit.fit, theta=theta)))
+
+    def sure(force_std: float) -> bool:
+        std = {"payload": np.array([force_std] * 3 + [1e-4] * 3)}
+        return bool(returned_model.sure_effects(data, loaded, ["payload"], std))
+
+    assert sure(0.005) and not sure(0.01)
+
+
+def test_the_robot_that_is_handed_back_predicts_what_the_fitted_model_does() -> None:
+    data, search = with_gain(300e3 * 0.9)
+    names, back = returned_model.worth_handing_back(data, search, [], ["cable_gain"])
+    entries = returned_model.entries_of(back, names)
+    assert [e["name"] for e in entries] == [*names, *(n for n in ("stiffness", "cable_offset") if n not in names)]
+    whole = apply_effects(data.declared, entries)
+    assert returned_model.prediction_gap(data, whole, back, search.noise) < 1e-6
+    named = apply_effects(data.declared, [e for e in entries if e["name"] == "cable_gain"])
+    assert returned_model.prediction_gap(data, named, back, search.noise) > 5e-4
