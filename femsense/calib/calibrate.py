@@ -27,6 +27,7 @@ from femsense.fem.equilibrium import Equilibrium, SolveOptions
 from femsense.model.drive import DrivenRobot, drive_of
 from femsense.model.observation import Hypothesis, Scene, SceneJet, evaluate_scene, in_robot_frame, make_scene, rest_residual
 from femsense.model.recording import Recording, check_against
+from femsense.model.repeats import marker_repeatability
 from femsense.model.robot import Robot
 from femsense.model.variants import solve_frame
 
@@ -236,6 +237,7 @@ def _result(
         status=_status(fit, robot, own, recording),
         placements_m={robot.marker_names[m]: p.tolist() for m, p in zip(scene.rest_marker, places)},
         frames=tuple(int(recording.frame_numbers[k]) for k in scene.frames),
+        noise_m=float(np.sqrt(3.0)) * marker_repeatability(recording),
         joint_covariance=joint,
     )
 

@@ -42,6 +42,8 @@ class Calibration:
     """Numbers of the frames that were used."""
     normal_rms_m: float = float("nan")
     """Root mean square distance of the points of free frames' clouds from the surface [m]; nan where none were used."""
+    noise_m: float = float("nan")
+    """What markers repeat to [m], root mean square in space; nan where nothing tells it."""
     joint_covariance: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
     """Of (rotation [rad], shift [m]) of all cameras together, shape (6 v, 6 v); not given: that of the first camera alone is known."""
 

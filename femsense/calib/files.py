@@ -36,6 +36,7 @@ def calibration_document(calibration: Calibration) -> dict[str, Any]:
         "pose_covariance": c.pose_covariance,
         "joint_covariance": c.joint_covariance,
         "normal_rms_m": c.normal_rms_m,
+        "noise_m": c.noise_m,
         "placements_m": c.placements_m,
         "frames": c.frames,
         "cameras": [{"name": name, "T_robot_camera": T} for name, T in zip(c.camera_names, c.poses)],
@@ -85,6 +86,7 @@ def read_calibration(path: str | Path) -> Calibration:
             placements_m={name: [float(x) for x in point] for name, point in document.get("placements_m", {}).items()},
             frames=tuple(int(frame) for frame in document.get("frames", [])),
             normal_rms_m=_number(document.get("normal_rms_m")),
+            noise_m=_number(document.get("noise_m")),
             joint_covariance=_matrix(document.get("joint_covariance"), 6 * len(cameras)),
         )
     except (TypeError, ValueError, KeyError, AttributeError) as error:

@@ -8,27 +8,15 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray
 from femsense.loop.data.trial import Trial
-from femsense.model.recording import state_key
+from femsense.model.repeats import State, squares_about_mean, stays_of
 
-Cell = tuple[tuple[bytes, bytes], int]
+Cell = tuple[State, int]
 """A state with the one before it, and a marker."""
-
-
-def stays_of(trial: Trial) -> dict[int, tuple[int, tuple[bytes, bytes]]]:
-    """Return for each frame the number of its stay, and what distinguishes states: the state and the one before it."""
-    recording = trial.scene.recording
-    keys = [state_key(recording, k) for k in range(len(recording.time_s))]
-    result, stay, past = {}, 0, b""
-    for k, key in enumerate(keys):
-        if k > 0 and key != keys[k - 1]:
-            stay, past = stay + 1, keys[k - 1]
-        result[k] = (stay, (key, past))
-    return result
 
 
 def rows_of_stays(trial: Trial, residual: FloatArray) -> dict[Cell, dict[int, FloatArray]]:
     """Return for each state and marker the residuals of each stay [m], (frames, c)."""
-    stays = stays_of(trial)
+    stays = stays_of(trial.scene.recording)
     rows: dict[Cell, dict[int, list[FloatArray]]] = {}
     for k, m, r in zip(trial.scene.frame, trial.scene.marker, residual):
         stay, state = stays[int(k)]
@@ -43,7 +31,7 @@ def repeated_means(trial: Trial, residual: FloatArray) -> list[FloatArray]:
 
 def count_repeats(trial: Trial) -> int:
     """Return how many stays repeat an earlier one."""
-    stays = stays_of(trial)
+    stays = stays_of(trial.scene.recording)
     seen = {stays[int(k)] for k in trial.scene.frames}
     return len(seen) - len({state for _, state in seen})
 
@@ -56,12 +44,7 @@ def scatter_of_repeats(trials: Sequence[Trial], residuals: Sequence[FloatArray])
     within, between = np.zeros(2), np.zeros(2)
     for trial, residual in zip(trials, residuals):
         for of in rows_of_stays(trial, residual).values():
-            within += _squares(np.concatenate(list(of.values())))
-            between += _squares(np.array([own.mean(axis=0) for own in of.values()]))
+            within += squares_about_mean(np.concatenate(list(of.values())))
+            between += squares_about_mean(np.array([own.mean(axis=0) for own in of.values()]))
     known = [(float(np.sqrt(square / count)), int(count)) for square, count in (within, between) if count]
     return max(known, default=(0.0, 0))
-
-
-def _squares(values: FloatArray) -> FloatArray:
-    """Return the sum of squares of values (n, c) about their mean, and its degrees of freedom."""
-    return np.array([((values - values.mean(axis=0)) ** 2).sum(), values.shape[1] * (len(values) - 1)])

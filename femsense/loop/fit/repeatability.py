@@ -13,9 +13,7 @@ from femsense.loop.data.repeats import scatter_of_repeats
 from femsense.loop.data.trial import Trial
 from femsense.loop.fit.fitted_model import FittedModel
 from femsense.loop.fit.noise_components import Noise
-
-LEAST_REPEATS = 6
-"""Degrees of freedom from which on repeats tell the noise: its size is then known to 30 %."""
+from femsense.model.repeats import LEAST_REPEATS
 
 
 @dataclass(frozen=True, eq=False, slots=True)
