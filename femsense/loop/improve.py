@@ -95,9 +95,9 @@ def improve(
         say("testing what is left")
         result = conclude(data, search, rng)
         record = next_experiment(data, search.final, search.noise, result.confounded, result.not_testable)
-        measured = result.model_error is None or result.model_error.noise_is_measured
+        noise_is_measured = result.model_error is None or result.model_error.noise_is_measured
         if result.verdict == UNEXPLAINED or (result.confounded and not record):
-            steps = next_steps(data, search.final, search.noise, noise_is_measured=measured)
+            steps = next_steps(data, search.final, search.noise, noise_is_measured=noise_is_measured)
             record = "; or ".join(t for t in (*steps[:MOST_STEPS], record) if t)
     result = replace(result, next_experiment=record, data=replace(result.data, seed=seed))
     if distinguishes_effects(data):

@@ -154,19 +154,21 @@ def _rows(data: Data, fitted: FittedModel, noise: Noise, open_model: Hypothesis,
     """Return the whitened rows of a state that is reached HOLDS times, by all parameters of the fit, shape (3 m, p)."""
     robot, fit, head = data.declared, fitted.fit, heads_of(data.train)[0]
     names = robot.glued_names
-    place = {} if step.load is None else {"load_frame": [0], "load_points": [step.load[0]], "load_forces": [step.load[1]]}
+    loads = [] if step.load is None else [step.load]
     recording = make_recording(
         time_s=[0.0],
         actuation=data.control,
         actuation_zero=data.train[head].scene.recording.actuation_zero,
         cable_names=robot.body.cable_names,
-        inputs=[step.inputs],
+        inputs=np.array([step.inputs]),
         marker_names=names,
         marker_frame=np.zeros(len(names)),
         marker_index=np.arange(len(names)),
         marker_xyz=np.zeros((len(names), 3)),
         free=[True],
-        **place,
+        load_frame=np.zeros(len(loads)),
+        load_points=np.array([place for place, _ in loads]).reshape(-1, 3),
+        load_forces=np.array([force for _, force in loads]).reshape(-1, 3),
     )
     scene = make_scene(data.robot, recording, np.array([0]))
     poses, initial = poses_and_inputs(data, fit)[head]

@@ -11,7 +11,7 @@ from femsense.core.arrays import BoolArray, FloatArray, IntArray
 from femsense.loop.data.dataset import MESH, NUISANCE, Data, groups_of, surface_of
 from femsense.loop.data.surface_rows import make_rows, renewed_rows, states_of
 from femsense.loop.data.trial import Trial, rms_of, spans_of
-from femsense.loop.fit.joint_fit import GAIN, JointFit, JointProblem, Prior, fit_jointly
+from femsense.loop.fit.joint_fit import JointFit, JointProblem, Prior, fit_jointly
 from femsense.loop.fit.noise_components import Noise, whiten
 from femsense.model.effects import Effect, Entry, Parameter, by_session, find_effect
 from femsense.model.effects.base import range_units
@@ -20,8 +20,6 @@ from femsense.model.robot import Robot
 
 ROUGHLY = 3
 """Steps of a fit that only has to come near."""
-STILL = 1e-3
-"""Freedom of a size that is held still, as a share of its standard deviation."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -120,15 +118,6 @@ def keeping(
         near=jets_without(fitted, mask),
         worth=worth,
     )
-
-
-def with_sizes_still(data: Data, fitted: FittedModel, names: Sequence[str], noise: Noise) -> FittedModel:
-    """Return a fitted model with some of its terms only, which keep the sizes that they have beside all of them; poses are fitted again, to where little
-    is left to gain. Raises DataError."""
-    hypothesis, _, mask = some_terms(fitted, names)
-    sizes = fitted.fit.coordinates[mask]
-    still = Prior(sizes, STILL * fitted.fit.std[mask])
-    return fit_model(data, hypothesis, still, noise, sizes, own=own_of(fitted), near=jets_without(fitted, mask), spare=GAIN)
 
 
 def with_seeds_still(data: Data, fitted: FittedModel) -> FittedModel:

@@ -19,7 +19,6 @@ from femsense.loop.fit.fitted_model import (
     keeping,
     span_of,
     with_seeds_still,
-    with_sizes_still,
 )
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.search.acceptance import at_edge
@@ -78,55 +77,29 @@ def _is_away(data: Data, fitted: FittedModel, effect: Effect, parameters: Sequen
 
 
 def worth_handing_back(data: Data, search: Search, promoted: list[str], names: list[str]) -> tuple[list[str], FittedModel]:
-    """Return the names that are handed back with their model.
-
-    First with all that was fitted along, then with the sizes that they have beside all nuisances where held-out data do not miss those, else fitted
-    again. Nuisances that stay as declared are taken out, too if they only do so here, and so is, from the last one on, what would make the error on
-    held-out data larger than it was, or goes to the edge of what is plausible.
-    """
+    """Return the names that are handed back with their model: with all that was fitted along or, where held-out data speak against that, fitted again
+    without the nuisances that are not named. Nuisances that are as declared there are not named, and from the last one on neither is what would make
+    the error on held-out data larger than it was, or goes to the edge of what is plausible."""
     while names:
-        along = _handed_back(data, search.final, [*NUISANCE, *names], search.noise)
-        if along is not None and _may_be_handed_back(data, search, along):
-            return names, along
-        kept, back = _with_modulus(data, search, names, sizes_still=True)
-        if back is not None and not _misses(data, search, back) and _may_be_handed_back(data, search, back):
-            return kept, back
-        kept, back = _with_modulus(data, search, names, sizes_still=False)
-        idle = [n for n in promoted if n in names and back is not None and not moved_nuisance(data, back, n)]
-        if idle:
-            names = [n for n in names if n not in idle]
-            continue
-        if back is not None and at_edge(back.fit):
-            back = _handed_back(data, with_seeds_still(data, search.final), kept, search.noise)
-        if back is not None and _may_be_handed_back(data, search, back):
-            return kept, back
-        names = names[:-1]
+        models = [_inside(data, search, kept) for kept in ([*NUISANCE, *names], names)]
+        back = next((m for m in models if m is not None and _may_be_handed_back(data, search, m)), None)
+        idle = [] if back is None else [n for n in promoted if n in names and not moved_nuisance(data, back, n)]
+        if back is not None and not idle:
+            return names, back
+        names = [n for n in names if n not in idle] if idle else names[:-1]
     return [], search.before
 
 
-def _misses(data: Data, search: Search, back: FittedModel) -> bool:
-    """Return whether held-out data miss what the final model moves and this one does not."""
-    more = held_chi2(data, back, search.noise) - held_chi2(data, search.final, search.noise)
-    return back.held_rms > NOT_WORSE * search.final.held_rms or more > EVIDENCE
+def _inside(data: Data, search: Search, names: Sequence[str]) -> FittedModel | None:
+    """Return the model of some names, with places and times still where one of them would go to the edge of its range; None where it has no equilibrium."""
+    back = _handed_back(data, search.final, names, search.noise)
+    if back is None or not at_edge(back.fit):
+        return back
+    return _handed_back(data, with_seeds_still(data, search.final), names, search.noise)
 
 
 def _may_be_handed_back(data: Data, search: Search, back: FittedModel) -> bool:
     return not at_edge(back.fit) and not set(OF_BODY) & set(at_edge(back.fit, nuisance=True)) and holds_out(data, search, back)
-
-
-def _with_modulus(data: Data, search: Search, names: list[str], *, sizes_still: bool) -> tuple[list[str], FittedModel | None]:
-    """Return names with the model of just these; with the modulus beside effects if it moved significantly there, by whatever share (offsets that are
-    not named may have moved in its place), and held-out data miss it."""
-    back = _handed_back(data, search.final, names, search.noise, sizes_still=sizes_still)
-    if back is None or MODULUS in names or not has_effects(names):
-        return names, back
-    if sizes_still and not moved_nuisance(data, search.final, MODULUS, relevant=0.0):
-        return names, back
-    along = _handed_back(data, search.final, [MODULUS, *names], search.noise, sizes_still=sizes_still)
-    if along is None or not moved_nuisance(data, search.final if sizes_still else along, MODULUS, relevant=0.0):
-        return names, back
-    missed = held_chi2(data, back, search.noise) - held_chi2(data, along, search.noise) > EVIDENCE
-    return ([MODULUS, *names], along) if missed else (names, back)
 
 
 def has_effects(names: Iterable[str]) -> bool:
@@ -158,18 +131,12 @@ def held_beyond_mesh(data: Data, search: Search, back: FittedModel) -> tuple[flo
     return before, after
 
 
-def _handed_back(
-    data: Data, final: FittedModel, names: list[str], noise: Noise, *, sizes_still: bool = False
-) -> FittedModel | None:
-    """Return the model of some names alone, fitted again, or with the sizes that they have beside all that calibration may move: whoever
-    calibrates what is handed back moves that too. None where it has no equilibrium, or where another effect that they were found beside is gone."""
-    present = {effect.name for effect, _, _ in final.fit.hypothesis.terms}
-    if present <= set(names):
+def _handed_back(data: Data, final: FittedModel, names: Sequence[str], noise: Noise) -> FittedModel | None:
+    """Return the model of some names alone, fitted again where others are gone; None where it has no equilibrium."""
+    if {effect.name for effect, _, _ in final.fit.hypothesis.terms} <= set(names):
         return final
-    if sizes_still and not (has_effects(names) and present <= {*names, *NUISANCE}):
-        return None
     try:
-        return (with_sizes_still if sizes_still else keeping)(data, final, names, noise)
+        return keeping(data, final, names, noise)
     except FemsenseError:
         return None
 
