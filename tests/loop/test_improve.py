@@ -16,6 +16,7 @@ from femsense.loop.data.holdout import hold_out, sweeps_of
 from femsense.loop.data.trial import Groups
 from femsense.loop.fit import noise_components as noise_module
 from femsense.loop.fit.noise_components import Noise, estimate_noise, whiten
+from femsense.loop.fit.repeatability import Repeatability
 from femsense.loop.improve import improve
 from femsense.loop.search.search import distinguishes_effects
 from femsense.loop.verdict.returned_model import is_sure
@@ -312,8 +313,8 @@ def test_what_one_pull_without_unloading_cannot_tell_from_a_modulus_is_said_with
 
 def test_noise_that_no_camera_has_is_said():
     data = SimpleNamespace(robot=arm((4, 1, 1)))
-    assert by_noise(data, Noise({"white": 1e-3}, "")) == ""
-    assert "Noise of 3.5 mm on a body of 100 mm is no camera's" in by_noise(data, Noise({"white": 2e-3}, ""))
+    assert by_noise(data, Repeatability(1e-3, 3, True, "")) == ""
+    assert "Noise of 3.5 mm on a body of 100 mm is no camera's" in by_noise(data, Repeatability(2e-3, 3, True, ""))
 
 
 def test_a_nuisance_is_named_only_beyond_the_deviations_that_are_reported():
