@@ -45,8 +45,10 @@ def with_error_of_the_mesh(
 
 def test_a_linear_mesh_has_no_error_where_it_is_asked_about_as_an_effect():
     noise = Noise({"white": 1e-4}, "")
-    assert mesh_errors(with_error_of_the_mesh(noise, linear=True, tried=("cable_friction", "discretisation"))[2]) == []
-    assert mesh_errors(with_error_of_the_mesh(noise, linear=True, tried=("cable_friction",))[2])
+    asked = with_error_of_the_mesh(noise, linear=True, tried=("cable_friction", "discretisation"))[2]
+    assert mesh_errors(asked) == [] and "compared with quadratic ones" in asked.mesh_note  # and it is said why
+    other = with_error_of_the_mesh(noise, linear=True, tried=("cable_friction",))[2]
+    assert mesh_errors(other) and other.mesh_note == ""
 
 
 def test_what_is_made_of_the_finer_mesh_beforehand_serves_the_fitted_robot():
