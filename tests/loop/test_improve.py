@@ -44,7 +44,7 @@ def test_a_wrong_modulus_is_named_stiffness_and_nothing_else():
     recording, _ = record(inputs, effects=[{"name": "stiffness", "scale": 1.25}], labels=labels, truth=arm((8, 3, 3)))
     loop = improve(arm(), [recording])
     assert [e.name for e in loop.effects] == ["stiffness"]
-    assert loop.sentence.endswith("mm after.")  # weight tells it from a gain of all cables
+    assert "do not tell" not in loop.sentence  # weight tells it from a gain of all cables
     assert found(loop, "stiffness").parameters["scale"].value == pytest.approx(1.25, rel=0.06)
     assert loop.robot.body.material.young_modulus[0] == pytest.approx(1.25 * 300e3, rel=0.06)
 
