@@ -626,6 +626,15 @@ def view(
 @app.command()
 def stream(
     runs: Annotated[list[Path] | None, typer.Argument(metavar="RUN", help="Runs to play.", show_default=False)] = None,
+    sensors: Annotated[
+        str | None,
+        typer.Option("--sensors", metavar="SOURCE", help="A CSV file, udp://, mqtt:// or serial: instead.", show_default=False),
+    ] = None,
+    model: Annotated[
+        Path | None, typer.Option("--model", metavar="MODEL", help="Of femsense learn, for --sensors.", show_default=False)
+    ] = None,
+    drag: Annotated[bool, typer.Option("--drag", help="Let viewers drag the robot of the first run.")] = False,
+    commands: Annotated[bool, typer.Option("--commands", help="With --drag: publish commands once a viewer arms them.")] = False,
     host: Annotated[str, typer.Option("--host", help="0.0.0.0 lets other machines watch; needs a password.")] = "127.0.0.1",
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Of the page and its WebSocket; 0: a free one.")] = 8010,
     mqtt: Annotated[
@@ -648,9 +657,10 @@ def stream(
     json: Json = False,
 ) -> Answer:
     """Send bone poses and forces over MQTT and WebSocket."""
-    from femsense.app.stream_command import StreamOptions, need_one, stream_runs
+    from femsense.app.stream_command import StreamOptions, let_drag, need_model, need_one, stream_runs, stream_sensors
 
-    need_one(runs or [], None)
+    need_one(runs or [], sensors)
+    need_model(sensors, model)
     options = StreamOptions(
         host=host,
         port=port,
@@ -662,7 +672,15 @@ def stream(
         key=key,
         rate_hz=rate,
     )
-    return _live(stream_runs(runs or [], options, loop=not once), browser)
+    if sensors is not None and model is not None:
+        return _live(stream_sensors(sensors, model, options), browser)
+    live = stream_runs(runs or [], options, loop=not once)
+    if drag or commands:
+        from femsense.xr.stream.command_gate import GateOptions
+        from femsense.xr.stream.drag_server import DragOptions
+
+        let_drag(live, (runs or [])[0], DragOptions(gate=GateOptions(allowed=commands)))
+    return _live(live, browser)
 
 
 def _live(live: LiveStream, browser: bool) -> Answer:

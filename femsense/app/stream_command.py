@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from threading import Event, Thread
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from femsense.core.errors import InputError
 from femsense.xr.stream.access import Access, read_password
@@ -19,6 +19,9 @@ from femsense.xr.stream.payloads import Twin, TwinFrame, topic
 from femsense.xr.stream.publisher import Publisher, PublishOptions, play
 from femsense.xr.stream.websocket import ServerOptions, WebSocketServer
 from femsense.xr.view import PAGE, live_page_files
+
+if TYPE_CHECKING:
+    from femsense.xr.stream.drag_server import DragOptions, DragServer
 
 PASSWORD = "FEMSENSE_PASSWORD"
 
@@ -103,6 +106,40 @@ def stream_runs(runs: Sequence[Path], options: StreamOptions, *, loop: bool = Tr
     return live
 
 
+def stream_sensors(source: str, model_file: Path, options: StreamOptions, *, name: str | None = None) -> LiveStream:
+    """Send what a learnt model makes of sensors while they are read; return at once.
+
+    Raises:
+        InputError: no model, no such source, or an address that cannot be used.
+        MissingDependency: the extra `xr` is not installed, or the page was not built.
+    """
+    from femsense.xr.proprioception.model_file import load_model
+    from femsense.xr.stream.readings import readings_of
+    from femsense.xr.stream.sensor_source import frames_of_sensors, sensor_twin
+
+    model = load_model(model_file)
+    twin = sensor_twin(model, name or model_file.stem)
+    readings_of(source, model.channels, Event())  # says at once what is wrong with a source
+    live = _serve(options, twin.name)
+    _play(live, twin, frames_of_sensors(source, model, live.stop), options, at_once=True)
+    return live
+
+
+def let_drag(live: LiveStream, run: Path, options: DragOptions) -> DragServer:
+    """Let viewers drag the robot of a run that streams; the first that `live` plays."""
+    from femsense.sensing.run_files import read_run
+    from femsense.xr.glb_reader import read_glb
+    from femsense.xr.stream.drag_server import DragServer, handles_of
+
+    publisher = live.publishers[0]
+    robot = read_run(run).robot
+    skin = read_glb(publisher.twin.glb).skin
+    server = DragServer(live.hub, robot, skin, name=publisher.twin.name, options=options)
+    publisher.announce(replace(publisher.twin, handles=handles_of(robot), commands=options.gate.allowed))
+    live.closers.append(server.close)
+    return server
+
+
 def show_stream(url: str, *, port: int = 0, page: Path = PAGE, password_file: Path | None = None) -> LiveStream:
     """Serve the page on this machine with what streams at a URL; return at once. Raises as `Bridge` and `WebSocketServer`."""
     files = live_page_files(page)
@@ -165,13 +202,17 @@ def _serve(options: StreamOptions, first: str) -> LiveStream:
     return LiveStream(hub, server, broker)
 
 
-def _play(live: LiveStream, twin: Twin, frames: Iterator[TwinFrame], options: StreamOptions) -> None:
+def _play(live: LiveStream, twin: Twin, frames: Iterator[TwinFrame], options: StreamOptions, *, at_once: bool = False) -> None:
     """Send frames from a thread of their own."""
     publisher = Publisher(live.hub, twin, PublishOptions(rate_hz=options.rate_hz, json_mirror=options.json_mirror))
     live.publishers.append(publisher)
 
     def run() -> None:
-        play(publisher, frames, live.stop)
+        if at_once:
+            for frame in frames:
+                publisher.publish(frame)
+        else:
+            play(publisher, frames, live.stop)
         publisher.end()
 
     thread = Thread(target=run, daemon=True, name=f"femsense-{twin.name}")
@@ -179,7 +220,13 @@ def _play(live: LiveStream, twin: Twin, frames: Iterator[TwinFrame], options: St
     thread.start()
 
 
-def need_one(runs: Sequence[Path], sensors: str | None) -> None:
-    """Raise InputError unless there are runs or sensors, and not both."""
-    if bool(runs) == (sensors is not None):
-        raise InputError("one of both is needed", where="femsense stream", expected="RUN …, or --sensors SOURCE --model MODEL")
+def need_one(runs: Sequence[Path], source: str | None) -> None:
+    """Raise InputError unless there are runs or a live source, and not both."""
+    if bool(runs) == (source is not None):
+        raise InputError("one of both is needed", where="femsense", expected="RUN, or a live source (--sensors, --stream)")
+
+
+def need_model(sensors: str | None, model: Path | None) -> None:
+    """Raise InputError where sensors come without a model, or a model without sensors."""
+    if (sensors is None) != (model is None):
+        raise InputError("sensors go with a model", where="femsense stream", expected="--sensors SOURCE --model MODEL")

@@ -38,7 +38,7 @@ def cloud_of(recording: Recording | None, frame: int) -> PointCloud | None:
     """Return the cloud of a frame [m, camera frame], or None where there is none."""
     from femsense.io.clouds.frame_clouds import read_frame_cloud
 
-    at = np.flatnonzero(recording.frame_numbers == frame) if recording is not None else ()
+    at = np.flatnonzero(recording.frame_numbers == frame) if recording is not None else np.zeros(0, dtype=np.int64)
     return read_frame_cloud(recording, int(at[0])) if recording is not None and len(at) else None
 
 

@@ -72,6 +72,11 @@ class Publisher:
         self.sent = 0
         self._has_cloud = False
         self._pose_limit, self._cloud_limit = RateLimit(self.options.rate_hz), RateLimit(self.options.cloud_rate_hz)
+        self.announce(twin)
+
+    def announce(self, twin: Twin) -> None:
+        """Say what streams; also later, where something about it has changed."""
+        self.twin = twin
         glb = topic(twin.name, GLB)
         url = self.options.glb_url or f"robots/{glb.split('/')[1]}.glb"
         self.hub.publish(

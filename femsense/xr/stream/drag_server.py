@@ -1,0 +1,248 @@
+"""Answers a dragged point: inputs by `fs.reach`, the shape that the robot can take, and commands while armed and held."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from threading import Event, Lock, Thread
+from typing import Any
+
+import numpy as np
+
+from femsense.calib.calibration import Calibration
+from femsense.control.motion import Motion
+from femsense.control.reach import ReachOptions, reach
+from femsense.core.arrays import FloatArray
+from femsense.fem.mesh import embed_points
+from femsense.model.robot import Robot
+from femsense.xr.skinning import Skin, prepare_poses
+from femsense.xr.stream.command_gate import CommandGate, GateOptions
+from femsense.xr.stream.hub import Hub, Message
+from femsense.xr.stream.payloads import (
+    COMMAND,
+    DRAG,
+    GHOST,
+    INPUTS,
+    REACH,
+    Handle,
+    Input,
+    bone_rows,
+    header,
+    pose_bytes,
+    read_document,
+    split_topic,
+    topic,
+)
+
+LARGEST_RANGE = {"N": 5.0, "m": 0.05, "Pa": 50e3}
+"""Of an input for which the robot declares no limit."""
+FAR = 2.0
+"""A wish farther from the body than this many times its size is no wish."""
+
+
+@dataclass(frozen=True, slots=True)
+class DragOptions:
+    """How wishes are answered."""
+
+    gate: GateOptions = field(default_factory=GateOptions)
+    tolerance_m: float = 1e-4
+    """A target is reached that is missed by less [m]: finer than a hand drags."""
+    equilibria: int = 8
+    """At most so many for one answer; the next wish goes on from there."""
+    command_hz: float = 50.0
+
+
+@dataclass(frozen=True, slots=True)
+class Wish:
+    """Where someone wants a point."""
+
+    who: str
+    handle: str
+    target_m: tuple[float, float, float] | None
+    held: bool
+    armed: bool
+
+
+def drive_inputs(robot: Robot) -> tuple[Input, ...]:
+    """Return what drives a robot with its limits: tensions [N] of cables, pressures [Pa] of chambers."""
+    body = robot.body
+    cables = [Input(c.name, "N", c.min_tension, _top(c.max_tension, "N")) for c in body.cables]
+    return (*cables, *(Input(c.name, "Pa", 0.0, _top(c.max_pressure, "Pa")) for c in body.chambers))
+
+
+def handles_of(robot: Robot) -> tuple[Handle, ...]:
+    """Return the markers of a robot as points that may be dragged."""
+    return tuple(Handle(name, point) for name, point in zip(robot.glued_names, robot.marker_points))
+
+
+class DragServer:
+    """Listens to a hub for wishes about one robot, and answers the newest."""
+
+    def __init__(
+        self,
+        hub: Hub,
+        robot: Robot,
+        skin: Skin,
+        *,
+        name: str | None = None,
+        calibration: Calibration | None = None,
+        options: DragOptions | None = None,
+    ) -> None:
+        """Start to answer.
+
+        Arguments:
+            hub: wishes come from there, answers go there.
+            robot: its limits hold.
+            skin: whose bones show the shape that is reachable; vertices at rest are points of the robot.
+            name: of the robot in topics.
+            calibration: its initial inputs are taken off the commands.
+            options: of answers and commands.
+        """
+        self.hub, self.robot, self.options = hub, robot, options or DragOptions()
+        self.name, self.calibration = name or robot.name, calibration
+        self.gate = CommandGate(drive_inputs(robot), self.options.gate)
+        self._skin, self._fit = embed_points(robot.body.mesh, skin.rest), prepare_poses(skin)
+        self._bones: FloatArray | None = None
+        self._motion: Motion | None = None
+        self._wish: Wish | None = None
+        self._driver, self._driver_at = "", float("-inf")
+        self._fresh, self._stop, self._lock = Event(), Event(), Lock()
+        self._seq = 0
+        hub.listen(self._hear)
+        self._threads = [Thread(target=run, daemon=True, name="femsense-drag") for run in (self._answer_all, self._command_all)]
+        for thread in self._threads:
+            thread.start()
+
+    def close(self) -> None:
+        """Stop; commands end."""
+        self._stop.set()
+        self._fresh.set()
+        for thread in self._threads:
+            thread.join(2.0)
+
+    # ---- wishes
+
+    def _hear(self, message: Message, who: str) -> None:
+        known = split_topic(message.topic)
+        if known is None or topic(known[0], DRAG) != topic(self.name, DRAG):
+            return
+        wish = self._read(message.payload, who)
+        now = time.monotonic()
+        with self._lock:
+            if wish is None or (who != self._driver and now - self._driver_at < 4.0 * self.options.gate.hold_s):
+                return  # one hand at a time
+            self._driver, self._driver_at = (who, now) if wish.held else ("", float("-inf"))
+            self.gate.hold(now, armed=wish.armed and wish.held)
+            self._wish = wish if wish.held else None
+        self._fresh.set()
+
+    def _read(self, payload: bytes, who: str) -> Wish | None:
+        """Return a wish, or None where it is none or wants something that cannot be meant."""
+        told = read_document(payload, most=4096)
+        if told is None:
+            return None
+        handle, held = told.get("handle"), told.get("held") is True
+        target = _place(told.get("target_m"))
+        if handle not in self.robot.glued_names or (held and target is None):
+            return None
+        nodes = self.robot.body.mesh.nodes
+        size = float(np.linalg.norm(np.ptp(nodes, axis=0)))
+        if target is not None and np.linalg.norm(np.subtract(target, nodes.mean(axis=0))) > FAR * size:
+            return None
+        return Wish(who, str(handle), target, held, told.get("armed") is True)
+
+    # ---- answers
+
+    def _answer_all(self) -> None:
+        while not self._stop.is_set():
+            self._fresh.wait()
+            self._fresh.clear()
+            with self._lock:
+                wish, self._wish = self._wish, None
+            if wish is not None and wish.target_m is not None:
+                self.answer(wish.handle, wish.target_m)
+
+    def answer(self, handle: str, target_m: tuple[float, float, float]) -> Motion:
+        """Find inputs for one wish, publish what was found, and set it as what the gate moves to."""
+        begun = time.perf_counter()
+        own = ReachOptions(tolerance_m=self.options.tolerance_m, max_iterations=self.options.equilibria)
+        motion = reach(
+            self.robot,
+            {handle: np.array(target_m)},
+            limits={one.name: (one.low, one.high) for one in self.gate.inputs},
+            start=self._motion,
+            calibration=self.calibration,
+            options=own,
+        )
+        if motion.equilibrium.converged:
+            self._motion = motion
+            with self._lock:
+                self.gate.want(motion.inputs)
+        self._bones = self._fit(self._skin.positions(motion.positions), start=self._bones)
+        self._seq += 1
+        found = self._document(motion, 1e3 * (time.perf_counter() - begun))
+        ghost = pose_bytes(self._seq, time.time(), bone_rows(self._bones))
+        self.hub.publish([Message(topic(self.name, GHOST), ghost), Message(topic(self.name, REACH), found)])
+        return motion
+
+    def _document(self, motion: Motion, ms: float) -> bytes:
+        units = {one.name: one.unit for one in self.gate.inputs}
+        return json.dumps(
+            {
+                "header": header(self._seq, time.time(), "robot"),
+                "status": motion.status,
+                "text": motion.text,
+                "error_m": motion.error_m,
+                "ms": ms,
+                "armed": self.gate.moving,
+                "inputs": [{"name": name, "unit": units[name], "value": value} for name, value in motion.inputs.items()],
+            }
+        ).encode()
+
+    # ---- commands
+
+    def _command_all(self) -> None:
+        """Send commands for as long as the gate lets them out; when it closes, say so once."""
+        was_moving = False
+        while not self._stop.wait(1.0 / self.options.command_hz):
+            with self._lock:
+                inputs = self.gate.step(time.monotonic(), self._current())
+                moving = self.gate.moving
+            if inputs is not None:
+                self._command(inputs, armed=True)
+            elif was_moving and not moving:
+                self._command({}, armed=False)
+            was_moving = moving
+        if was_moving:
+            self._command({}, armed=False)
+
+    def _command(self, inputs: Mapping[str, float], *, armed: bool) -> None:
+        units = {one.name: one.unit for one in self.gate.inputs}
+        document = {
+            "header": header(self._seq, time.time(), "robot"),
+            "armed": armed,
+            "expires_s": self.options.gate.hold_s,
+            "inputs": [{"name": name, "unit": units[name], "value": value} for name, value in inputs.items()],
+        }
+        self.hub.publish([Message(topic(self.name, COMMAND), json.dumps(document).encode())])
+
+    def _current(self) -> dict[str, float]:
+        """Return the inputs that the robot has now, as far as it says so."""
+        message = self.hub.newest().get(topic(self.name, INPUTS))
+        told = None if message is None else read_document(message.payload)
+        rows: list[dict[str, Any]] = [] if told is None else told.get("inputs", [])
+        return {row["name"]: float(row["value"]) for row in rows if "value" in row}
+
+
+def _place(told: object) -> tuple[float, float, float] | None:
+    """Return x, y, z of an object, or None."""
+    if not isinstance(told, dict):
+        return None
+    values = [float(v) for v in (told.get(axis) for axis in "xyz") if isinstance(v, int | float) and np.isfinite(v)]
+    return (values[0], values[1], values[2]) if len(values) == 3 else None
+
+
+def _top(limit: float | None, unit: str) -> float:
+    return float(limit) if limit is not None and np.isfinite(limit) else LARGEST_RANGE[unit]

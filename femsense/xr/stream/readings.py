@@ -1,0 +1,186 @@
+"""Readings of sensors as they come: from a CSV file that grows, UDP, MQTT, or a serial line."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import queue
+import socket
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import closing, suppress
+from pathlib import Path
+from threading import Event
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+import numpy as np
+
+from femsense.core.arrays import FloatArray
+from femsense.core.errors import InputError, MissingDependency
+from femsense.xr.stream.mqtt import MqttSource, broker_address
+
+LONGEST_LINE = 65_536
+POLL_S = 0.002
+"""How often a file is asked whether it has grown."""
+WAIT_S = 0.1
+
+Reading = tuple[float, FloatArray]
+"""Time [s], and one value for each channel, nan where there is none."""
+
+
+def readings_of(source: str, channels: Sequence[str], stop: Event) -> Iterator[Reading]:
+    """Yield readings until `stop` is set; lines that are none are passed over.
+
+    Arguments:
+        source: a CSV file, `udp://HOST:PORT`, `mqtt://HOST/TOPIC`, or `serial:PORT?baud=115200`. What comes by UDP, MQTT or a serial line
+            is a JSON object channel → number, or numbers with commas between in the order of the channels; `time_s` is optional.
+        channels: names, in the order of the values that are yielded.
+        stop: ends it.
+
+    Raises:
+        InputError: no such source, a CSV file without a channel.
+        MissingDependency: the package for it is not installed.
+    """
+    parts = urlsplit(source)
+    if parts.scheme == "udp":
+        return _parsed(_datagrams(source, stop), channels)
+    if parts.scheme in ("mqtt", "mqtts"):
+        return _parsed(_topic(source, stop), channels)
+    if parts.scheme == "serial":
+        return _parsed(_serial(source, stop), channels)
+    if not Path(source).is_file():
+        raise InputError(
+            "no such source",
+            where="--sensors",
+            found=source,
+            expected="a CSV file, udp://HOST:PORT, mqtt://HOST/TOPIC or serial:PORT?baud=115200",
+        )
+    return _grown(Path(source), channels, stop)
+
+
+def _parsed(lines: Iterator[bytes], channels: Sequence[str]) -> Iterator[Reading]:
+    for line in lines:
+        found = read_line(line, channels)
+        if found is not None:
+            yield found
+
+
+def read_line(line: bytes, channels: Sequence[str]) -> Reading | None:
+    """Return the reading in a line or message, or None where there is none."""
+    text = line[:LONGEST_LINE].decode("utf-8", "replace").strip()
+    if not text:
+        return None
+    if text.startswith("{"):
+        with suppress(ValueError, RecursionError):
+            return _of_object(json.loads(text), channels)
+        return None
+    values = [_number(part) for part in text.replace(";", ",").split(",")]
+    if not np.isfinite(values).any():
+        return None
+    if len(values) == len(channels) + 1:
+        return (values[0], np.array(values[1:])) if np.isfinite(values[0]) else None
+    return (time.monotonic(), np.array(values)) if len(values) == len(channels) else None
+
+
+def _of_object(told: Any, channels: Sequence[str]) -> Reading | None:
+    if not isinstance(told, dict) or not any(name in told for name in channels):
+        return None
+    when = _number(told.get("time_s"))
+    return when if np.isfinite(when) else time.monotonic(), np.array([_number(told.get(name)) for name in channels])
+
+
+def _number(value: Any) -> float:
+    try:
+        return float(value)
+    except (TypeError, ValueError, OverflowError):
+        return float("nan")
+
+
+# Sources
+
+
+def _grown(file: Path, channels: Sequence[str], stop: Event) -> Iterator[Reading]:
+    """Yield the rows of a CSV file: the last one there is, then those that are written to it. A file that starts anew is read anew."""
+    with file.open(newline="", encoding="utf-8") as stream:
+        columns = next(csv.reader(io.StringIO(stream.readline())), [])
+        missing = [name for name in channels if name not in columns]
+        if missing:
+            raise InputError("channels are missing", where=file, found=", ".join(columns), expected=", ".join(missing))
+        newest, rest = "", ""
+        while not stop.is_set():
+            text = rest + stream.read(1 << 20)
+            *lines, rest = text.split("\n")
+            if not newest and lines:
+                lines = lines[-1:]  # what is old is not shown
+            for line in lines:
+                newest = line
+                row = dict(zip(columns, next(csv.reader([line]), [])))
+                found = _of_object(row, channels)
+                if found is not None:
+                    yield found
+            if not lines:
+                stop.wait(POLL_S)
+                if file.stat().st_size < stream.tell():
+                    stream.seek(0)
+                    stream.readline()
+                    rest = ""
+
+
+def _datagrams(source: str, stop: Event) -> Iterator[bytes]:
+    parts = urlsplit(source)
+    try:
+        endpoint = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        endpoint.bind((parts.hostname or "127.0.0.1", parts.port or 0))
+    except (OSError, ValueError) as error:
+        raise InputError(
+            "the address cannot be used", where=source, found=error, expected="udp://HOST:PORT of this machine"
+        ) from None
+    with closing(endpoint):
+        endpoint.settimeout(WAIT_S)
+        while not stop.is_set():
+            with suppress(TimeoutError):
+                yield endpoint.recv(LONGEST_LINE)
+
+
+def _topic(source: str, stop: Event) -> Iterator[bytes]:
+    """Yield messages of a topic; while one is being worked on only the newest waits."""
+    parts = urlsplit(source)
+    name = parts.path.lstrip("/")
+    if not name:
+        raise InputError("a topic is missing", where=source, expected="mqtt://HOST/TOPIC")
+    waiting: queue.Queue[bytes] = queue.Queue(1)
+
+    def take(payload: bytes) -> None:
+        with suppress(queue.Empty):
+            waiting.get_nowait()
+        with suppress(queue.Full):
+            waiting.put_nowait(payload)
+
+    address = broker_address(f"{parts.scheme}://{parts.netloc}")
+    with closing(MqttSource(address, lambda message: take(message.payload), topics=name)):
+        while not stop.is_set():
+            with suppress(queue.Empty):
+                yield waiting.get(timeout=WAIT_S)
+
+
+def _serial(source: str, stop: Event) -> Iterator[bytes]:
+    try:
+        import serial
+    except ImportError:
+        raise MissingDependency("a serial line needs the package pyserial\n  try:      pip install 'femsense[xr]'") from None
+    port, _, more = source.removeprefix("serial:").partition("?")
+    baud = parse_qs(more).get("baud", ["115200"])[0]
+    try:
+        line = serial.serial_for_url(port, baudrate=int(baud), timeout=WAIT_S)
+    except (OSError, ValueError) as error:
+        raise InputError(
+            "the serial line cannot be opened", where=source, found=error, expected="serial:PORT?baud=115200"
+        ) from None
+    with closing(line):
+        held = b""
+        while not stop.is_set():
+            held += line.read(max(1, min(line.in_waiting, LONGEST_LINE)))
+            *whole, held = held[-LONGEST_LINE:].split(b"\n")
+            yield from whole

@@ -1,0 +1,160 @@
+"""From a dragged point to the robot: off until armed, slow, within limits, gone when nobody holds; and the tip arrives."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from analytic import bar_body
+from helpers import block_mesh
+from obedient import ObedientRobot
+from streams import within
+
+import femsense as fs
+from femsense.fem.mesh import embed_points, surface_triangles, to_quadratic
+from femsense.model.robot import Observation, Robot, plain_actuation
+from femsense.xr.skinning import fit_skin
+from femsense.xr.stream.command_gate import CommandGate, GateOptions
+from femsense.xr.stream.drag_server import DragOptions, DragServer, drive_inputs, handles_of
+from femsense.xr.stream.hub import Hub, Message
+from femsense.xr.stream.payloads import Input, read_pose
+
+TIP = np.array([[0.1, 0.015, 0.03], [0.1, 0.0, 0.015]])
+INPUTS = (Input("top", "N", 0.0, 4.0), Input("side", "N", 0.5, 2.5))
+
+
+def bar(cells: tuple[int, int, int]) -> Robot:
+    """A bar with two cables, pulled up and aside, and two markers at its end."""
+    body = bar_body(to_quadratic(block_mesh(cells)))
+    ties = embed_points(body.mesh, TIP)
+    none = np.zeros(0, np.int64)
+    return Robot("bar", body, ("tip", "side"), TIP, ties, none, None, plain_actuation(2), Observation())
+
+
+# ---- the gate
+
+
+def test_nothing_goes_out_unless_it_is_allowed_armed_and_held() -> None:
+    for allowed, armed in ((False, True), (True, False), (False, False)):
+        gate = CommandGate(INPUTS, GateOptions(allowed=allowed))
+        gate.hold(0.0, armed=armed)
+        gate.want({"top": 1.0, "side": 1.0})
+        assert gate.step(0.1, {}) is None and not gate.moving
+
+
+def test_inputs_move_slowly_from_where_they_are_and_stay_within_their_range() -> None:
+    gate = CommandGate(INPUTS, GateOptions(allowed=True, range_per_s=0.25))
+    gate.want({"top": 99.0, "side": -99.0})
+    seen = []
+    for k in range(500):
+        gate.hold(0.02 * k, armed=True)
+        seen.append(gate.step(0.02 * k, {"top": 1.0, "side": 2.0}))
+    top, side = (np.array([s[name] for s in seen if s]) for name in ("top", "side"))
+    assert top[0] == 1.0 and side[0] == 2.0
+    assert np.abs(np.diff(top)).max() <= 0.25 * 4.0 * 0.02 + 1e-12 and np.abs(np.diff(side)).max() <= 0.25 * 2.0 * 0.02 + 1e-12
+    assert top[-1] == 4.0 and side[-1] == 0.5
+
+
+def test_commands_end_when_nobody_holds_on_and_begin_where_the_robot_is() -> None:
+    gate = CommandGate(INPUTS, GateOptions(allowed=True, hold_s=0.25))
+    gate.hold(0.0, armed=True)
+    gate.want({"top": 4.0, "side": 0.5})
+    assert gate.step(0.2, {"top": 1.0}) is not None and gate.step(0.26, {}) is None and not gate.moving
+    gate.hold(5.0, armed=True)
+    again = gate.step(5.0, {"top": 0.3})
+    assert again is not None and again["top"] == 0.3
+    gate.release()
+    assert gate.step(5.01, {}) is None and not gate.moving
+
+
+# ---- the server
+
+
+@pytest.fixture
+def served() -> Iterator[tuple[Hub, DragServer, ObedientRobot]]:
+    """A model of few elements, and a robot of others that obeys it."""
+    robot, hub = bar((4, 1, 1)), Hub()
+    mesh = robot.body.mesh
+    used = np.unique(surface_triangles(mesh))
+    skin = fit_skin(mesh.nodes[used], mesh.nodes[used][None], bones=4)
+    gate = GateOptions(allowed=True, range_per_s=1.0, hold_s=0.3)
+    server = DragServer(hub, robot, skin, name="bar", options=DragOptions(gate=gate))
+    there = ObedientRobot(hub, bar((6, 2, 2)), "bar", drive_inputs(robot))
+    yield hub, server, there
+    server.close()
+
+
+def drag(hub: Hub, target: Any, *, armed: bool = True, held: bool = True, who: str = "me", handle: str = "tip") -> None:
+    place = dict(zip("xyz", map(float, target)))
+    wish = {"handle": handle, "target_m": place, "held": held, "armed": armed}
+    hub.received(Message("femsense/bar/drag", json.dumps(wish).encode()), who)
+
+
+def reach_of(hub: Hub) -> dict[str, Any]:
+    message = hub.newest().get("femsense/bar/reach")
+    return {} if message is None else json.loads(message.payload)
+
+
+def target_of(robot: Robot, tension: dict[str, float]) -> np.ndarray:
+    return robot.markers.positions(fs.solve_equilibrium(robot.body, tension=tension).positions)[0]
+
+
+def test_the_tip_of_another_mesh_arrives_and_stops_when_let_go(served: tuple[Hub, DragServer, ObedientRobot]) -> None:
+    hub, server, there = served
+    names = server.robot.body.cable_names
+    wanted = target_of(server.robot, dict(zip(names, (1.5, 0.6))))
+    end = time.monotonic() + 4.0
+    while time.monotonic() < end and abs(there.inputs[names[0]] - 1.5) > 2e-2:
+        drag(hub, wanted)
+        time.sleep(0.03)
+    away = np.linalg.norm(wanted - server.robot.markers.positions(server.robot.body.mesh.nodes)[0])
+    missed = np.linalg.norm(there.place(0) - wanted)
+    assert away > 0.02 and missed < 0.15 * away  # its mesh has other elements, and the model is not told
+    told = reach_of(hub)
+    assert told["status"] == "reached" and told["error_m"] <= 1e-4
+    ghost = read_pose(hub.newest()["femsense/bar/ghost"].payload)
+    assert len(ghost.bones) == 4
+    assert within(2.0, lambda: not there.armed)  # nobody holds on any more
+    count = len(there.heard)
+    time.sleep(0.2)
+    assert len(there.heard) == count
+
+
+def test_without_arming_the_ghost_moves_and_the_robot_does_not(served: tuple[Hub, DragServer, ObedientRobot]) -> None:
+    hub, server, there = served
+    wanted = target_of(server.robot, {server.robot.body.cable_names[0]: 0.4})
+    drag(hub, wanted, armed=False)
+    assert within(5.0, lambda: reach_of(hub).get("status") == "reached")
+    drag(hub, np.add(wanted, [0.0, 0.0, 0.05]), armed=False)
+    assert within(5.0, lambda: reach_of(hub).get("status") != "reached")
+    assert "mm off" in reach_of(hub)["text"] and not there.heard
+
+
+def test_one_hand_at_a_time_and_wishes_that_cannot_be_meant_do_nothing(served: tuple[Hub, DragServer, ObedientRobot]) -> None:
+    hub, server, there = served
+    wanted = target_of(server.robot, {server.robot.body.cable_names[0]: 0.4})
+    drag(hub, wanted, armed=False, who="first")
+    drag(hub, wanted, armed=True, who="second")
+    for bad in (
+        b"",
+        b"[]",
+        b'{"handle": "tip", "held": true}',
+        b'{"handle": "no", "held": true, "target_m": {"x": 0, "y": 0, "z": 0}}',
+    ):
+        hub.received(Message("femsense/bar/drag", bad), "first")
+    drag(hub, [0.0, 0.0, 99.0], who="first")
+    drag(hub, [float("nan"), 0.0, 0.0], who="first")
+    time.sleep(0.2)
+    assert not there.heard and not there.armed
+
+
+def test_inputs_and_handles_are_those_of_the_robot() -> None:
+    robot = bar((4, 1, 1))
+    assert [(i.name, i.unit, i.low) for i in drive_inputs(robot)] == [(name, "N", 0.0) for name in robot.body.cable_names]
+    assert all(np.isfinite(i.high) for i in drive_inputs(robot))
+    assert [h.name for h in handles_of(robot)] == ["tip", "side"]
+    np.testing.assert_array_equal(handles_of(robot)[0].position_m, TIP[0])

@@ -1,0 +1,177 @@
+"""From readings to bones, live: a file that grows, UDP, MQTT, a serial line; and the tube that shows them."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from threading import Event, Thread
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from femsense.core.errors import InputError
+from femsense.xr.armature import ArmatureOptions, make_armature
+from femsense.xr.glb_reader import read_glb
+from femsense.xr.proprioception.domain import learn_domain
+from femsense.xr.proprioception.model import ProprioceptiveModel
+from femsense.xr.proprioception.network import linear_network
+from femsense.xr.skinning import skin_vertices
+from femsense.xr.stream.readings import Reading, read_line, readings_of
+from femsense.xr.stream.sensor_source import frames_of_sensors, sensor_twin
+
+CHANNELS = ("bend", "sway")
+REST = np.outer(np.linspace(0, 0.1, 5), [0, 0, 1.0])
+
+
+@pytest.fixture(scope="module")
+def model() -> ProprioceptiveModel:
+    """Markers on a line; the readings shift each by its height times the reading, along x and y."""
+    C = np.zeros((15, 2))
+    C[0::3, 0], C[1::3, 1] = REST[:, 2], REST[:, 2]
+    domain = learn_domain(np.random.default_rng(0).uniform(-0.5, 0.5, (300, 2)))
+    network = linear_network(np.zeros(2), np.ones(2), C, REST.ravel())
+    return ProprioceptiveModel(CHANNELS, tuple("abcde"), network, (), domain, make_armature(REST, ArmatureOptions(bones=6)))
+
+
+def take(source: str, count: int, send: object) -> list[Reading]:
+    """The first readings of a source while something is sent to it again and again."""
+    stop, found = Event(), []
+    readings = readings_of(source, CHANNELS, stop)
+
+    def keep_sending() -> None:
+        while not stop.wait(0.02):
+            send()  # type: ignore[operator]
+
+    Thread(target=keep_sending, daemon=True).start()
+    for reading in readings:
+        found.append(reading)
+        if len(found) == count:
+            stop.set()
+            break
+    return found
+
+
+@pytest.mark.parametrize(
+    ("line", "wanted"),
+    [
+        (b'{"time_s": 2.5, "sway": 2, "bend": 1}\r\n', (2.5, [1, 2])),
+        (b"2.5,1,2", (2.5, [1, 2])),
+        (b'{"bend": "x", "sway": 2, "time_s": 2.5}', (2.5, [np.nan, 2])),
+        (b"1;2", (None, [1, 2])),
+        (b"", None),
+        (b"1,2,3,4", None),
+        (b"{broken", None),
+        (b"[1, 2]", None),
+        (b'{"other": 1}', None),
+        (b"\xff\xfe", None),
+    ],
+)
+def test_lines_are_readings_or_nothing(line: bytes, wanted: tuple[float | None, list[float]] | None) -> None:
+    found = read_line(line, CHANNELS)
+    if wanted is None:
+        assert found is None
+        return
+    assert found is not None
+    np.testing.assert_array_equal(found[1], wanted[1])
+    assert found[0] == wanted[0] or wanted[0] is None
+
+
+def test_a_file_that_grows_is_followed_from_its_end_and_again_when_it_starts_anew(tmp_path: Path) -> None:
+    file = tmp_path / "sensors.csv"
+    head = "time_s,frame,sway,bend\n"
+    file.write_text(head + "0,0,1,2\n1,1,3,4\n", encoding="utf-8")
+    stop = Event()
+    readings = readings_of(str(file), CHANNELS, stop)
+    assert next(readings)[1].tolist() == [4, 3]
+    with file.open("a", encoding="utf-8") as stream:
+        stream.write("2,2,5,")
+        stream.flush()
+        Thread(target=lambda: (time.sleep(0.05), stream.write("6\n"), stream.flush())).start()
+        assert next(readings)[1].tolist() == [6, 5]
+        time.sleep(0.05)
+    file.write_text(head + "9,0,7,8\n", encoding="utf-8")
+    assert next(readings)[0] == 9.0
+    stop.set()
+    (tmp_path / "other.csv").write_text("time_s,bend\n", encoding="utf-8")
+    with pytest.raises(InputError, match=r"channels are missing[\s\S]*sway"):
+        next(readings_of(str(tmp_path / "other.csv"), CHANNELS, Event()))
+
+
+def test_datagrams_are_readings() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
+        found = take(f"udp://127.0.0.1:{port}", 2, lambda: out.sendto(b'{"bend": 1, "sway": 2}', ("127.0.0.1", port)))
+    assert [row.tolist() for _, row in found] == [[1, 2], [1, 2]] and found[1][0] > found[0][0]
+
+
+def test_messages_of_a_broker_are_readings() -> None:
+    pytest.importorskip("amqtt")
+    from femsense.xr.stream.hub import Hub, Message
+    from femsense.xr.stream.mqtt import EmbeddedBroker
+
+    hub = Hub()
+    broker = EmbeddedBroker(hub, port=0)
+    message = Message("lab/arm/sensors", json.dumps({"bend": 1, "sway": 2, "time_s": 7}).encode())
+    found = take(f"mqtt://127.0.0.1:{broker.port}/lab/arm/sensors", 1, lambda: hub.publish([message]))
+    hub.close()
+    assert found[0][0] == 7.0 and found[0][1].tolist() == [1, 2]
+
+
+def test_a_serial_line_is_read_line_by_line() -> None:
+    pytest.importorskip("serial")
+    pty = pytest.importorskip("pty")
+    ours, theirs = pty.openpty()
+    parts: Iterator[bytes] = iter([b"garb", b"age\n1,", b"2\n", *[b"3,4\n"] * 100])
+    found = take(f"serial:{os.ttyname(theirs)}?baud=9600", 2, lambda: os.write(ours, next(parts)))
+    assert [row.tolist() for _, row in found] == [[1, 2], [3, 4]]
+
+
+@pytest.mark.parametrize("source", ["no-such.csv", "udp://127.0.0.1:99999", "mqtt://host", "serial:/dev/no-such-port", "ftp://x"])
+def test_what_is_no_source_is_refused(source: str) -> None:
+    with pytest.raises(InputError):
+        next(readings_of(source, CHANNELS, Event()))
+
+
+def test_the_tube_bends_as_the_markers_do(model: ProprioceptiveModel, tmp_path: Path) -> None:
+    twin = sensor_twin(model, "arm")
+    mesh = read_glb(twin.glb)
+    radius = np.linalg.norm(mesh.skin.rest[:-2, :2], axis=1)
+    assert np.ptp(radius) < 1e-6 and mesh.skin.rest[:, 2].min() == pytest.approx(0.0, abs=1e-6)
+    assert mesh.skin.rest[:, 2].max() == pytest.approx(0.1, abs=1e-6)
+    file = tmp_path / "sensors.csv"
+    file.write_text("time_s,bend,sway\n0,0,0\n", encoding="utf-8")
+    with file.open("a", encoding="utf-8") as stream:
+        frames = frames_of_sensors(str(file), model, Event())
+        still = next(frames)
+        stream.write("1,0.4,-0.2\n")
+        stream.flush()
+        bent = next(frames)
+        stream.write("2,9,0\n3,,0\n")
+        stream.flush()
+        odd, blind = next(frames), next(frames)
+    np.testing.assert_allclose(still.bones[:, :3], twin.T_robot_bone[:, :3, 3], atol=1e-7)
+    np.testing.assert_allclose(still.bones[:, 3:], np.tile([0, 0, 0, 1.0], (6, 1)), atol=1e-6)
+    T = np.tile(np.eye(4), (6, 1, 1))
+    T[:, :3, :3], T[:, :3, 3] = Rotation.from_quat(bent.bones[:, 3:]).as_matrix(), bent.bones[:, :3]
+    ends = skin_vertices(mesh.skin, T[None])[0][-1]  # the middle of the upper end
+    np.testing.assert_allclose(ends[:2] / ends[2], [0.4, -0.2], atol=1e-3)  # on the line that the markers are on
+    assert bent.status == "ok" and "bend = 9" in odd.status and "no number" in blind.status
+    np.testing.assert_array_equal(blind.bones, odd.bones)
+
+
+def test_triangles_of_the_tube_look_outward(model: ProprioceptiveModel) -> None:
+    from femsense.xr.stream.sensor_source import tube_around
+
+    rest = model.rest_bones
+    skin, triangles = tube_around(rest.positions, rest.T_robot_bone[:, :3, :2])
+    a, b, c = (skin.rest[triangles[:, k]] for k in range(3))
+    volume = np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6.0
+    n = 20
+    assert volume == pytest.approx(0.5 * n * np.sin(2 * np.pi / n) * np.linalg.norm(skin.rest[0, :2]) ** 2 * 0.1, rel=1e-6)
