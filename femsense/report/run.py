@@ -110,7 +110,7 @@ def run_chapter(file: Path, title: str) -> Chapter:
         section("Frames", _statuses(frames), _frame_panels(frames)),
         section("Made from", _origin(facts)),
     )
-    return Chapter(title, body, _headline(facts, contacts), facts.robot)
+    return Chapter(title, body, _headline(facts, contacts, frames), facts.robot)
 
 
 def _contacts(file: Path) -> ContactTable:
@@ -152,21 +152,27 @@ def _frames(file: Path) -> FrameTable:
 # On top
 
 
-def _headline(facts: RunFacts, contacts: ContactTable | None) -> str:
-    lost = facts.frames - facts.frames_ok
+def _headline(facts: RunFacts, contacts: ContactTable | None, frames: FrameTable | None) -> str:
     base = f"{words.counted(facts.contacts, 'contact')} in {words.counted(facts.frames, 'frame')}"
+    doubted = 0 if frames is None else int((~frames.good & np.isfinite(frames.after_m)).sum())
+    lost = facts.frames - facts.frames_ok - doubted
     if lost:
         base += f", {lost} of them without a result"
-    strongest = _strongest(contacts)
+    if doubted:
+        base += f", {doubted} of them not to be trusted"
+    strongest = _strongest(contacts, frames)
     if contacts is None or strongest is None:
         return f"{base}."
     return f"{base}; largest force {_force(contacts.size_n[strongest], contacts.std_n[strongest])} in frame {contacts.frame[strongest]}."
 
 
-def _strongest(contacts: ContactTable | None) -> int | None:
-    if contacts is None or not np.isfinite(contacts.size_n).any():
+def _strongest(contacts: ContactTable | None, frames: FrameTable | None) -> int | None:
+    """Return the row of the largest force of the frames that are ok; None where there is none."""
+    if contacts is None:
         return None
-    return int(np.nanargmax(contacts.size_n))
+    bad = [] if frames is None else frames.frame[~frames.good].tolist()
+    size = np.where(np.isin(contacts.frame, bad), np.nan, contacts.size_n)
+    return None if not np.isfinite(size).any() else int(np.nanargmax(size))
 
 
 def _force(size: float, std: float) -> str:
@@ -175,7 +181,7 @@ def _force(size: float, std: float) -> str:
 
 
 def _summary(facts: RunFacts, contacts: ContactTable | None, frames: FrameTable | None) -> Html:
-    items = [("Frames with a result", f"{facts.frames_ok} of {facts.frames}", "")]
+    items = [("Frames ok", f"{facts.frames_ok} of {facts.frames}", "")]
     touched = 0 if contacts is None else len(set(contacts.frame.tolist()))
     items.append(("Contacts", str(facts.contacts), f"in {words.counted(touched, 'frame')}" if contacts is not None else ""))
     if frames is not None and len(frames):
@@ -202,7 +208,7 @@ def _forces(contacts: ContactTable | None, frames: FrameTable | None, folder: Pa
     times = contacts.time_s if frames is None or not len(frames) else frames.time_s
     more = len(set(contacts.contact.tolist())) - len(numbers)
     rest = f" The {len(numbers)} strongest of {len(numbers) + more}." if more > 0 else ""
-    strongest = _strongest(contacts) or 0
+    strongest = _strongest(contacts, frames) or 0
     over_time = as_image(
         _force_figure(contacts, frames, numbers, (float(times.min()), float(times.max()))),
         alt=f"Force of {words.counted(len(numbers), 'contact')} over time; the largest {_force(contacts.size_n[strongest], contacts.std_n[strongest])}.",

@@ -103,8 +103,10 @@ def _unexplained(frames: Sequence[FrameReport]) -> list[FrameReport]:
 def run_text(run: Run) -> str:
     """Return a run in a few lines."""
     facts, strongest = run_document(run), _strongest(run)
-    rows = [["frames", f"{facts['frames_ok']} of {facts['frames']}"]]
-    rows.append(["contacts", f"{facts['contacts']} in {facts['frames_with_contact']} frames"])
+    rows = [["frames", f"{facts['frames_ok']} of {facts['frames']} ok"]]
+    touched = f"{facts['contacts']} in {facts['frames_with_contact']} frames"
+    doubted = len({c.frame for c in run.contacts} - {frame.frame for frame in run.frames if frame.status == "ok"})
+    rows.append(["contacts", f"{touched}, {doubted} of them not ok" if doubted else touched])
     if facts["rms_after_m"] is not None:
         rows.append(
             [
@@ -142,10 +144,11 @@ def run_text(run: Run) -> str:
         )
     if len(run.known_loads) > LISTED:
         rows.append(["known loads", f"{len(run.known_loads) - LISTED} frames more: see run.json"])
+    doubtful = {frame.frame for frame in run.frames if np.isfinite(frame.rms_after_m)}
     for frame in facts["failed"][:LISTED]:
-        rows.append([f"no result, frame {frame['frame']}", frame["status"]])
+        rows.append([f"{'not ok' if frame['frame'] in doubtful else 'no result'}, frame {frame['frame']}", frame["status"]])
     if len(facts["failed"]) > LISTED:
-        rows.append(["no result", f"in {len(facts['failed']) - LISTED} frames more: see frames.csv"])
+        rows.append(["not ok", f"in {len(facts['failed']) - LISTED} frames more: see frames.csv"])
     return f"run of {run.robot.name}\n{columns(rows)}"
 
 
@@ -274,7 +277,9 @@ def _words(value: Any) -> str:
 
 
 def _strongest(run: Run) -> ContactForce | None:
-    return max(run.contacts, key=lambda contact: contact.force_n, default=None)
+    """Return the contact with the largest force of the frames that are ok; None where there is none."""
+    good = {frame.frame for frame in run.frames if frame.status == "ok"}
+    return max((c for c in run.contacts if c.frame in good), key=lambda contact: contact.force_n, default=None)
 
 
 def _median(values: Sequence[float]) -> float | None:

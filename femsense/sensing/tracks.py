@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from femsense.core.arrays import freeze
+from femsense.core.arrays import FloatArray, freeze
 from femsense.sensing.forces import touch_normal
 from femsense.sensing.types import ContactForce, Fit, SensedFrame, Sensor
 
@@ -34,7 +34,7 @@ def contacts_of(sensor: Sensor, k: int, fit: Fit, previous: SensedFrame | None) 
                 normal=normal,
                 force_n_xyz=force,
                 force_n=size,
-                std_n=float(np.sqrt(max(float(along @ own @ along), 0.0))),
+                std_n=size_std(force, own) if size > 0 else float(np.sqrt(max(float(along @ own @ along), 0.0))),
                 source=touch.source,
                 track=-1,
                 position_std_m=freeze(np.sqrt(np.maximum(np.diag(fit.place_covariance[i]), 0.0))),
@@ -43,6 +43,25 @@ def contacts_of(sensor: Sensor, k: int, fit: Fit, previous: SensedFrame | None) 
             )
         )
     return tuple(_tracked(contacts, () if previous is None else previous.contacts, SAME * sensor.size))
+
+
+def size_std(force: FloatArray, covariance: FloatArray) -> float:
+    """Return the root mean square by which the size of a force may be off [N], to second order in its components.
+
+    Its variance along the force, and what the components across add: one that the shape hardly shows shrinks to zero in the fit, so that it
+    can only make the force larger. With C across and f the size: (2 tr C² + (tr C)²) / 4f².
+
+    Arguments:
+        force: [N], shape (3,), not zero.
+        covariance: of its components [N²], shape (3, 3).
+    """
+    size = float(np.linalg.norm(force))
+    along = force / size
+    project = np.eye(3) - np.outer(along, along)
+    across = project @ covariance @ project
+    second = (2.0 * float((across**2).sum()) + float(np.trace(across)) ** 2) / (4.0 * size**2)
+    second = min(second, float(np.trace(across)))  # a force that is little beside its deviation: no more than that
+    return float(np.sqrt(max(float(along @ covariance @ along), 0.0) + second))
 
 
 def smoothed(contacts: Sequence[ContactForce], time_constant_s: float) -> list[ContactForce]:

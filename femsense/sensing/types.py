@@ -61,7 +61,7 @@ class ContactForce:
     force_n: float
     """Its size [N]."""
     std_n: float
-    """One standard deviation of the force along its direction [N]."""
+    """By how much its size may be off, one standard deviation; what is not known across the force counts to second order [N]."""
     source: str
     """"cloud", "shape" or "given"."""
     track: int = 0

@@ -773,6 +773,15 @@ def test_a_run_shows_forces_contacts_frames_and_known_loads(tmp_path: Path) -> N
     assert len(page.all("img")) == 5
 
 
+def test_a_frame_that_is_not_ok_is_counted_and_gives_no_largest_force(tmp_path: Path) -> None:
+    folder = write_run_folder(tmp_path / "run", frames_ok=27)
+    table = (folder / "frames.csv").read_text(encoding="utf-8")
+    (folder / "frames.csv").write_text(table.replace('\n5,0.5,"ok"', '\n5,0.5,"not explained"'), encoding="utf-8")
+    headline = "32 contacts in 30 frames, 2 of them without a result, 1 of them not to be trusted; largest force"
+    page = report(folder)
+    assert headline in page.text and f"{headline} 0.697" not in page.text
+
+
 def test_small_forces_are_in_millinewton(tmp_path: Path) -> None:
     page = report(write_run_folder(tmp_path, scale=0.01))
     assert "largest force 6.97 ± 0.50 mN" in page.text and "Force [mN]" in page.text
