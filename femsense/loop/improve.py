@@ -30,6 +30,7 @@ from femsense.loop.search.calibration import Ready, calibrated, with_discretisat
 from femsense.loop.search.element_order import need_quadratic, seeks_with_quadratic, with_quadratic
 from femsense.loop.search.search import distinguishes_effects, search_begun, search_effects
 from femsense.loop.search.search_state import Progress, Search, SearchProgress
+from femsense.loop.verdict.empirical import judged_correction
 from femsense.loop.verdict.verdict import conclude
 from femsense.model.effects import EFFECTS, FORMS, Effect, find_effect, forms_by_recording, load_own_effect, try_own_effect
 from femsense.model.recording import Recording
@@ -49,6 +50,7 @@ def improve(
     without: Sequence[str] | None = None,
     user_effects: Sequence[str | Path] = (),
     measured: str = "auto",
+    correct: bool = False,
     progress: Progress | None = None,
     seed: int = 0,
     keep: tuple[str | Path, Mapping[str, Any]] | None = None,
@@ -63,6 +65,7 @@ def improve(
         without: names to leave out.
         user_effects: Python files of effects that are tried too (docs/effects/own.md); they belong to "all".
         measured: "markers", "clouds" or "both": what is used of a recording; "auto": its markers, or its clouds where it has none.
+        correct: also learn an empirical correction of what is left, judged on held-out data; it is no cause, and no effect.
         progress: told what is going on.
         seed: of the permutation test and the bootstrap.
         keep: a file that holds how far the search has come, so that one that is killed goes on there, and what it is made from: a file that says
@@ -99,7 +102,8 @@ def improve(
         if result.verdict == UNEXPLAINED or (result.confounded and not record):
             steps = next_steps(data, search.final, search.noise, noise_is_measured=noise_is_measured)
             record = "; or ".join(t for t in (*steps[:MOST_STEPS], record) if t)
-    result = replace(result, next_experiment=record, data=replace(result.data, seed=seed))
+        correction = judged_correction(data, search.final) if correct else None
+    result = replace(result, next_experiment=record, data=replace(result.data, seed=seed), correction=correction)
     if distinguishes_effects(data):
         return result
     only = "record another state (other inputs, load or direction of gravity): these data repeat too few states, which cannot distinguish effects"

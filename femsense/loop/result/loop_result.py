@@ -11,6 +11,7 @@ import numpy as np
 from femsense.loop.result.evidence import Evidence
 from femsense.loop.result.records import (
     ConfoundedPair,
+    CorrectionRecord,
     DataCard,
     Detectable,
     Errors,
@@ -21,7 +22,7 @@ from femsense.loop.result.records import (
     TriedEffect,
     Untestable,
 )
-from femsense.loop.result.tables import AS_EMPTY, table_of
+from femsense.loop.result.tables import AS_EMPTY, LEFT_OUT, table_of
 from femsense.model.effects import Entry
 from femsense.model.robot import Robot
 
@@ -67,6 +68,8 @@ class LoopResult:
     data: DataCard
     model_error: ModelError | None = field(default=None, metadata=AS_EMPTY)
     """What is left that is no noise."""
+    correction: CorrectionRecord | None = field(default=None, metadata=LEFT_OUT)
+    """An empirical correction of what is left, where one was asked for."""
     residuals: Residuals | None = field(default=None, metadata=AS_EMPTY)
     """Held-out residuals before and after, for figures."""
     evidence: Evidence | None = field(default=None, metadata=AS_EMPTY)

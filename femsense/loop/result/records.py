@@ -265,6 +265,38 @@ class ModelError:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
+class CorrectionRecord:
+    """An empirical correction: how far markers are from the model as a function of the inputs. It is no cause."""
+
+    accepted: bool
+    """Whether held-out markers are predicted better with it."""
+    verdict: str
+    """Why, in words."""
+    validation_rms_before_m: float | None = None
+    """Error of the markers on held-out data without it [m]."""
+    validation_rms_after_m: float | None = None
+    """The same with it [m]."""
+    largest_input: float | None = None
+    """Largest input of held-out data, in its range where the correction was learned."""
+    kernel: str | None = None
+    length: float | None = None
+    """Of the kernel, in ranges of an input."""
+    inputs: tuple[str, ...] = ()
+    """Cables."""
+    ranges: tuple[float, ...] = ()
+    """Of their inputs [N] or [m]."""
+    markers: tuple[str, ...] = ()
+    states: tuple[tuple[float, ...], ...] = ()
+    """Inputs that it was learned from, in their ranges, (n, a)."""
+    basis: tuple[tuple[float, ...], ...] = ()
+    """From the kernel to the terms, (n, q)."""
+    weights_m: tuple[tuple[tuple[float, ...], ...], ...] = ()
+    """Of the terms, robot frame [m], (q, m, 3)."""
+    covariance_m2: tuple[tuple[float, ...], ...] = ()
+    """Of the weights of one axis of a marker [m²], (q, q)."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
 class CloudCard:
     """What was used of clouds."""
 

@@ -1,0 +1,203 @@
+"""An empirical correction of what no effect explains: how far markers are from the model, as a smooth function of the inputs. It is never a cause.
+
+    r = J β + g(u) + ε,  g ~ GP(0, s² k(u, u′)),  ε ~ N(0, σ²)
+
+r is the residual, u the inputs in units of their ranges, J what calibration and the named effects can move. J is fitted along and not predicted, so that g is
+orthogonal to it (Kennedy & O'Hagan 2001; Plumlee 2017). k is a sum of one kernel an input, which carries over from single inputs to several at once, or
+one of all inputs together; which of them, its length and s/σ come by restricted maximum likelihood. g has as many terms as stand above σ (Nyström).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from femsense.core.arrays import FloatArray, IntArray
+from femsense.loop.data.dataset import Data
+from femsense.loop.data.trial import Trial
+from femsense.loop.fit.fitted_model import FittedModel
+
+KERNELS = "each input by itself", "all inputs together"
+LENGTHS = 0.3, 0.6, 1.2, 2.4
+"""Lengths of the kernel that are tried, in ranges of an input."""
+RATIOS = 1.0, 3.0, 10.0, 30.0, 100.0, 300.0
+"""Ratios s²/σ² that are tried."""
+LIKELIER = 3.0
+"""A correction must be likelier by this log-likelihood than none, since its length and ratio are chosen, and one of all inputs together than one of each by
+itself, which carries over to inputs that were not pulled together."""
+LEAST_STATES = 6
+"""Fewer states tell no function of the inputs."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Correction:
+    """A function of the inputs: how far each marker is from the model."""
+
+    kernel: str
+    """One of KERNELS."""
+    length: float
+    """In ranges of an input."""
+    input_names: tuple[str, ...]
+    ranges: FloatArray
+    """Of the inputs [N] or [m], shape (a,)."""
+    marker_names: tuple[str, ...]
+    states: FloatArray
+    """Inputs of the states that it was learned from, in their ranges, shape (n, a)."""
+    basis: FloatArray
+    """From the kernel to the terms, shape (n, q)."""
+    weights: FloatArray
+    """Of the terms, robot frame [m], shape (q, m, 3)."""
+    covariance: FloatArray
+    """Of the weights of one axis of a marker [m²], shape (q, q)."""
+
+    @property
+    def terms(self) -> int:
+        """Return how many terms it has."""
+        return self.basis.shape[1]
+
+
+def shifts_at(correction: Correction, inputs: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return by how much markers are beyond the model, robot frame [m], shape (f, m, 3), for inputs [N] or [m], shape (f, a); and one standard deviation
+    along each axis [m], shape (f,)."""
+    terms = _kernel(correction.kernel, correction.length, inputs / correction.ranges, correction.states) @ correction.basis
+    variance = np.einsum("fq,qr,fr->f", terms, correction.covariance, terms)
+    return np.einsum("fq,qmc->fmc", terms, correction.weights), np.sqrt(np.maximum(variance, 0.0))
+
+
+def learn_correction(data: Data, fitted: FittedModel) -> Correction | None:
+    """Return the correction that is likeliest for what a model leaves of the markers where it is fitted; None where none is likelier than chance, or where
+    there are too few states."""
+    rows = _rows_of(data, fitted)
+    states, number = np.unique(np.round(rows.inputs, 9), axis=0, return_inverse=True)
+    if len(states) < LEAST_STATES:
+        return None
+    number = np.asarray(number).reshape(-1)
+    plain = _Model(rows, np.zeros((len(number), 0)))
+    best, chosen = plain.likelihood(1.0)[0], None
+    for kernel, length in product(KERNELS if states.shape[1] > 1 else KERNELS[1:], LENGTHS):
+        gram = _kernel(kernel, length, states, states)
+        values, vectors = np.linalg.eigh(gram)
+        for ratio in RATIOS:
+            kept = values * ratio > 1.0
+            if not kept.any():
+                continue
+            basis = vectors[:, kept] / np.sqrt(values[kept])
+            found = _Model(rows, (gram @ basis)[number])
+            value = found.likelihood(ratio)[0]
+            if value > best + (LIKELIER if chosen is None or chosen[0] != kernel else 0.0):
+                best, chosen = value, (kernel, length, ratio, basis, found)
+    if chosen is None:
+        return None
+    kernel, length, ratio, basis, found = chosen
+    weights, covariance = found.weights(ratio)
+    names = data.robot.glued_names
+    whole = np.zeros((basis.shape[1], len(names), 3))
+    whole[:, rows.markers] = weights
+    recording = data.train[0].scene.recording
+    return Correction(kernel, length, recording.cable_names, _ranges(data), names, states, basis, whole, covariance)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Rows:
+    """Residuals of markers, one row for each marker in a frame."""
+
+    inputs: FloatArray
+    """In their ranges, shape (k, a)."""
+    marker: IntArray
+    """A number 0 … m − 1, shape (k,)."""
+    markers: IntArray
+    """Index of each of these among the robot's markers, shape (m,)."""
+    residual: FloatArray
+    """[m], shape (k, 3)."""
+    columns: FloatArray
+    """What is fitted along, shape (k, 3, p)."""
+
+
+def _rows_of(data: Data, fitted: FittedModel) -> _Rows:
+    pairs = [(t, j) for t, j in zip(data.train, fitted.fit.jets) if t.scene.crossings is None]
+    own = [np.concatenate([j.by_pose, j.by_initial], axis=2) for _, j in pairs]
+    ends = np.cumsum([0, *(o.shape[2] for o in own)])
+    beside = [np.pad(o, ((0, 0), (0, 0), (a, ends[-1] - a - o.shape[2]))) for o, a in zip(own, ends)]
+    columns = np.concatenate([np.concatenate([o, j.by_effect], axis=2) for o, (_, j) in zip(beside, pairs)])
+    marker = np.concatenate([t.scene.marker for t, _ in pairs])
+    markers, number = np.unique(marker, return_inverse=True)
+    inputs = np.concatenate([inputs_of(t) for t, _ in pairs]) / _ranges(data)
+    return _Rows(inputs, number, markers, np.concatenate([j.residual for _, j in pairs]), columns)
+
+
+def _ranges(data: Data) -> FloatArray:
+    """Return the ranges of the inputs [N] or [m], shape (a,); of those that rest in all frames the largest of the others."""
+    return np.where(data.input_scale > 0, data.input_scale, data.input_scale.max())
+
+
+def inputs_of(trial: Trial) -> FloatArray:
+    """Return the inputs of each row of a trial [N] or [m], shape (k, a)."""
+    return trial.scene.recording.inputs[trial.scene.frame]
+
+
+class _Model:
+    """The likelihood of a residual with some terms for each axis of each marker, and what is fitted along."""
+
+    def __init__(self, rows: _Rows, terms: FloatArray) -> None:
+        self.rows, self.terms, self.q = rows, terms, terms.shape[1]
+        flat = rows.columns.reshape(-1, rows.columns.shape[2])
+        U, s, _ = np.linalg.svd(flat / np.maximum(np.linalg.norm(flat, axis=0), 1e-300), full_matrices=False)
+        self.along = U[:, s > 1e-9 * s[0]].reshape(*rows.columns.shape[:2], -1)
+
+    def _groups(self) -> Iterator[tuple[FloatArray, FloatArray, FloatArray]]:
+        """Yield terms, residuals and columns for each axis of each marker: independent of each other but for the columns."""
+        for m in range(len(self.rows.markers)):
+            own = self.rows.marker == m
+            for axis in range(3):
+                yield self.terms[own], self.rows.residual[own, axis], self.along[own, axis]
+
+    def _solved(self, ratio: float) -> tuple[float, FloatArray, FloatArray, list[tuple[FloatArray, FloatArray, FloatArray]]]:
+        """Return log|V|, XᵀV⁻¹X, XᵀV⁻¹r and (V⁻¹X, V⁻¹r, terms) of each group, V = 1 + ratio · terms termsᵀ."""
+        p = self.along.shape[2]
+        log_det, normal, right, parts = 0.0, np.zeros((p, p)), np.zeros(p), []
+        for F, r, X in self._groups():
+            inner = np.eye(self.q) / ratio + F.T @ F
+            log_det += float(np.linalg.slogdet(ratio * inner)[1]) if self.q else 0.0
+            both = np.column_stack([X, r])
+            solved = both - F @ np.linalg.solve(inner, F.T @ both) if self.q else both
+            normal += X.T @ solved[:, :-1]
+            right += X.T @ solved[:, -1]
+            parts.append((solved[:, :-1], solved[:, -1], F))
+        return log_det, normal, right, parts
+
+    def likelihood(self, ratio: float) -> tuple[float, float]:
+        """Return the restricted log-likelihood at its best σ², and that [m²]."""
+        log_det, normal, right, parts = self._solved(ratio)
+        beta = np.linalg.solve(normal, right)
+        residuals = [r for _, r, _ in self._groups()]
+        square = float(sum(r @ v for r, (_, v, _) in zip(residuals, parts)) - right @ beta)
+        freedom = self.rows.residual.size - len(beta)
+        variance = max(square, 1e-30) / freedom
+        return -0.5 * (log_det + float(np.linalg.slogdet(normal)[1]) + freedom * float(np.log(variance))), variance
+
+    def weights(self, ratio: float) -> tuple[FloatArray, FloatArray]:
+        """Return the weights [m], shape (q, m, 3), and the largest covariance of those of one axis [m²], shape (q, q)."""
+        _, normal, right, parts = self._solved(ratio)
+        beta, variance = np.linalg.solve(normal, right), self.likelihood(ratio)[1]
+        values = [ratio * F.T @ (v - X @ beta) for X, v, F in parts]
+        covariances = [np.linalg.inv(np.eye(self.q) / ratio + F.T @ F) for _, _, F in parts]
+        largest = covariances[int(np.argmax([np.trace(c) for c in covariances]))]
+        return np.array(values).reshape(len(self.rows.markers), 3, self.q).transpose(2, 0, 1), variance * largest
+
+
+def _kernel(kind: str, length: float, a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return the kernel between inputs (n, a) and (k, a) in their ranges, shape (n, k). That of each input by itself is none at rest."""
+    own = np.exp(-0.5 * (a[:, None, :] - b[None, :, :]) ** 2 / length**2)
+    if kind == KERNELS[1]:
+        return np.asarray(own.prod(axis=2))
+    at_rest = [np.exp(-0.5 * values**2 / length**2) for values in (a, b)]
+    return np.asarray((own - at_rest[0][:, None, :] * at_rest[1][None, :, :]).sum(axis=2))
+
+
+def rows_of(correction: Correction, trial: Trial) -> tuple[FloatArray, FloatArray]:
+    """Return what a correction says of the rows of a trial, robot frame [m], shape (k, 3), and its standard deviation, shape (k,)."""
+    shifts, std = shifts_at(correction, inputs_of(trial))
+    return shifts[np.arange(len(shifts)), trial.scene.marker], std
