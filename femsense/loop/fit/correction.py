@@ -56,7 +56,7 @@ class Correction:
     @property
     def terms(self) -> int:
         """Return how many terms it has."""
-        return self.basis.shape[1]
+        return int(self.basis.shape[1])
 
 
 def shifts_at(correction: Correction, inputs: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -185,7 +185,8 @@ class _Model:
         values = [ratio * F.T @ (v - X @ beta) for X, v, F in parts]
         covariances = [np.linalg.inv(np.eye(self.q) / ratio + F.T @ F) for _, _, F in parts]
         largest = covariances[int(np.argmax([np.trace(c) for c in covariances]))]
-        return np.array(values).reshape(len(self.rows.markers), 3, self.q).transpose(2, 0, 1), variance * largest
+        weights = np.array(values).reshape(len(self.rows.markers), 3, self.q).transpose(2, 0, 1)
+        return np.asarray(weights), np.asarray(variance * largest, dtype=np.float64)
 
 
 def _kernel(kind: str, length: float, a: FloatArray, b: FloatArray) -> FloatArray:

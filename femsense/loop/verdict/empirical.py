@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from femsense.core.arrays import FloatArray
+from femsense.core.arrays import FloatArray, IntArray
 from femsense.loop.data.dataset import Data
 from femsense.loop.data.trial import rms_of
 from femsense.loop.fit.correction import Correction, inputs_of, learn_correction, rows_of
@@ -32,7 +32,7 @@ def judged_correction(data: Data, fitted: FittedModel) -> CorrectionRecord:
     return _record(learned, helps, words, rms_of([r for _, r in pairs]), rms_of(after), far)
 
 
-def _by_frame(frame: FloatArray, before: FloatArray, after: FloatArray) -> FloatArray:
+def _by_frame(frame: IntArray, before: FloatArray, after: FloatArray) -> FloatArray:
     """Return by how much the mean square of each frame falls [m²]."""
     number = np.unique(frame, return_inverse=True)[1]
     fall = (before**2).sum(axis=1) - (after**2).sum(axis=1)
