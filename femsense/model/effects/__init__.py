@@ -9,7 +9,7 @@ from typing import Any
 from femsense.core.errors import InputError
 from femsense.model.effects.along import REST_SHAPE, STIFFNESS_GRADIENT
 from femsense.model.effects.base import Alias, Calibrated, Effect, Entry, Experiment, InRecording, Parameter, build_entry
-from femsense.model.effects.cable_path import CABLE_PATH, CABLE_TURN
+from femsense.model.effects.cable_path import CABLE_PATH
 from femsense.model.effects.cables import CABLE_FRICTION, CABLE_FRICTIONS, CABLE_GAIN, CABLE_OFFSET, CABLE_SLACK, CABLE_STRETCH
 from femsense.model.effects.chambers import CHAMBER_GAIN, CHAMBER_OFFSET
 from femsense.model.effects.coupling import CABLE_COUPLING
@@ -54,7 +54,7 @@ EFFECTS: tuple[Effect, ...] = (
     SOFTENING,
 )
 """Each name once."""
-FORMS: tuple[Effect, ...] = (*EFFECTS, GENT, CREEP_TWICE, BASE_ROTATION, CABLE_FRICTIONS, CABLE_TURN)
+FORMS: tuple[Effect, ...] = (*EFFECTS, GENT, CREEP_TWICE, BASE_ROTATION, CABLE_FRICTIONS)
 """Every way in which an effect can be fitted: some have further parameters, under the same name."""
 EFFECT_NAMES: tuple[str, ...] = tuple(effect.name for effect in EFFECTS)
 CALIBRATED: tuple[str, ...] = tuple(effect.name for effect in EFFECTS if effect.calibrated is not None)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
 
@@ -12,38 +11,42 @@ from femsense.core.errors import InputError
 from femsense.core.pose import rotation_from_vector
 from femsense.model.effects.axes import across_axis, along_axis, axis_of
 from femsense.model.effects.base import Alias, Effect, Entry, Experiment, Parameter, per_cable, vector
-from femsense.model.effects.cables import CABLE_GAIN, GAINS
+from femsense.model.effects.cables import CABLE_GAIN
 from femsense.model.robot import Robot
 
 NAME = "cable_path"
 FARTHEST, USUAL_WAY = 0.2, 0.01
 """Largest and usual distance of a path from where it is declared, in shares of the body's reach."""
+SCALES = float(np.log(0.3)), float(np.log(2.0))
+"""Logarithms of the smallest and the largest distance from the axis, against the declared one."""
+NEAR_AXIS = 0.02
+"""A cable that is nearer to the axis than this share of the reach has no angle about it."""
 LARGEST_TURN, USUAL_TURN = 0.6, 0.03
-"""Largest and usual angle by which paths are turned about the body's axis [rad]."""
+"""Largest and usual angle by which a path is turned about the body's axis [rad]."""
 
 
-def _offset_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
+def _parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
+    """Two numbers a cable, its distance from the body's axis and its angle about it; three where a cable runs along that axis."""
+    names = robot.body.cable_names
+    if names and _way_from_axis(robot) > NEAR_AXIS * robot.body.reach:
+        turns = (
+            (
+                Parameter("radius_scale", name, "1", 0.0, *SCALES, 1e-4, "log", plausible=0.05),
+                Parameter("angle_rad", name, "rad", 0.0, -LARGEST_TURN, LARGEST_TURN, 1e-4, plausible=USUAL_TURN),
+            )
+            for name in names
+        )
+        return tuple(p for pair in turns for p in pair)
     reach = robot.body.reach
     far, usual = FARTHEST * reach, USUAL_WAY * reach
-    parts = [(name, i) for name in robot.body.cable_names for i in range(3)]
+    parts = [(name, i) for name in names for i in range(3)]
     return tuple(Parameter("offset_m", part, "m", 0.0, -far, far, 1e-4 * reach, plausible=usual) for part in parts)
 
 
-def _turn_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
-    """Of all cables alike: holes on another circle than drawn, or a body that was put in turned."""
-    if not robot.body.cables or _near_axis(robot):
-        return ()
-    return (
-        Parameter("radius_scale", None, "1", 0.0, *GAINS, 1e-4, "log", plausible=0.05),
-        Parameter("angle_rad", None, "rad", 0.0, -LARGEST_TURN, LARGEST_TURN, 1e-4, plausible=USUAL_TURN),
-    )
-
-
-def _near_axis(robot: Robot) -> bool:
-    """Return whether all cables run along the body's axis, which no turn moves."""
+def _way_from_axis(robot: Robot) -> float:
+    """Return how far from the body's axis that cable runs which is nearest to it [m]."""
     axis, nodes = axis_of(robot.body), robot.body.mesh.nodes
-    across = [_from_axis(axis, c.path.positions(nodes)) for c in robot.body.cables]
-    return max(float(np.linalg.norm(a, axis=1).max()) for a in across) < 1e-3 * robot.body.reach
+    return min(float(np.linalg.norm(_from_axis(axis, c.path.positions(nodes)), axis=1).max()) for c in robot.body.cables)
 
 
 def _from_axis(axis: FloatArray, points: FloatArray) -> FloatArray:
@@ -81,17 +84,14 @@ def _offsets(entry: Entry, names: tuple[str, ...]) -> dict[str, FloatArray]:
     return {n: vector({"offset_m": value.get(n, [0.0, 0.0, 0.0])}, "offset_m", f"{NAME}.{n}") for n in names}
 
 
-CABLE_PATH: Effect = Effect(
+CABLE_PATH = Effect(
     NAME,
     "where a cable truly runs",
-    _offset_parameters,
+    _parameters,
     _apply,
     keys=("offset_m", "radius_scale", "angle_rad"),
     aliases=(Alias(CABLE_GAIN.name, common=True),),
     told_by=Experiment.MORE_MARKERS,
-    planned=lambda robot: (("", CABLE_PATH), ("turned", CABLE_TURN)),
     may_differ=True,
     sought_by_recording=False,
 )
-CABLE_TURN: Effect = replace(CABLE_PATH, parameters=_turn_parameters, planned=None)
-"""The same with the other keys, of all cables alike: the loop tries both."""

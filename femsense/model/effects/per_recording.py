@@ -91,6 +91,12 @@ def _parameters(effect: Effect, labels: tuple[str, ...], robot: Robot, control: 
     return tuple(replace(p, part=InRecording(part, label)) for label in labels for p, part in parts)
 
 
+def _alike(effect: Effect, labels: tuple[str, ...], robot: Robot, control: str) -> tuple[Parameter, ...]:
+    """Return a scale that all cables or chambers have in common in each recording; none where an effect has no scale of each."""
+    scales = [p for p in effect.parameters(robot, control) if isinstance(p.part, str) and p.scale == "log"]
+    return tuple(replace(p, part=InRecording(None, label)) for label in labels for p in scales[:1] if len(scales) > 1)
+
+
 def _apply(effect: Effect, robot: Robot, entry: Entry) -> Robot:
     if entry.get(PER) != RECORDING:
         raise InputError("unknown value", where=f"{effect.name}.{PER}", found=entry.get(PER), expected=f'"{RECORDING}"')
@@ -119,7 +125,14 @@ def forms_by_recording(forms: Iterable[Effect], recordings: Sequence[Recording])
     labels = tuple(dict.fromkeys(r.label for r in recordings))
     if len(labels) < 2 or "" in labels:
         return ()
-    return tuple(per_recording(form, labels) for form in forms if form.may_differ and form.sought_by_recording)
+    sought = [form for form in forms if form.may_differ and form.sought_by_recording]
+    return (*(per_recording(form, labels) for form in sought), *(alike_per_recording(form, labels) for form in sought))
+
+
+@lru_cache(maxsize=64)
+def alike_per_recording(effect: Effect, labels: tuple[str, ...]) -> Effect:
+    """Return the form of an effect in which all cables, or all chambers, have the same scale, another one in each recording."""
+    return replace(per_recording(effect, labels), parameters=partial(_alike, effect, labels))
 
 
 def by_session(effect: Effect, recordings: Sequence[Recording]) -> tuple[Effect, Entry]:

@@ -93,8 +93,13 @@ def test_parameters_build_the_entry_that_is_applied() -> None:
 
 def test_it_is_sought_only_where_recordings_were_made_in_several_sessions() -> None:
     effects = [find_effect(name) for name in ("cable_gain", "gravity", "chamber_gain")]
-    names = [form.name for form in forms_by_recording(effects, [recording("A"), recording(None, "b")])]
-    assert names == ["cable_gain", "chamber_gain"]
+    forms = forms_by_recording(effects, [recording("A"), recording(None, "b")])
+    names = ["cable_gain", "chamber_gain"]
+    assert [form.name for form in forms] == names * 2  # of each alone, and of all alike
+    alike = forms[2].parameters(arm((3, 1, 1)), "tension")
+    assert [p.label for p in alike] == ["scale[A]", "scale[b]"] and not forms[3].parameters(arm((3, 1, 1)), "tension")
+    entry = build_entry(alike, [0.0, np.log(2.0)], *forms[2].seeds(arm((3, 1, 1))))
+    assert tensions(forms[2].apply(arm((3, 1, 1)), entry), "b") == pytest.approx([2.0] * 4)
     assert not forms_by_recording(effects, [recording("A"), recording("A", "other")])
     assert not forms_by_recording(effects, [recording("A"), recording()])
     assert forms_by_recording(effects, [recording("A"), recording("B")])[0] is per_recording(effects[0], ("A", "B"))
