@@ -1,6 +1,6 @@
 """Robots that others built and recorded: what calibration leaves, what the loop names, and how far it is on runs that were not fitted.
 
-    python benchmarks/real.py OUT [--data FOLDER] [--only tentacle …] [--ways 1 2 …] [--minutes M] [--calibrated]
+    python benchmarks/real.py OUT [--data FOLDER] [--only tentacle …] [--ways 1 2 …] [--minutes M] [--calibrated | --weights | --by-hand]
 
 Robots and recordings are made below OUT from the files of `shared/data`; nothing of these is copied. A row that stands in OUT already is
 read, not computed again, and one that takes longer than M minutes says so. `--calibrated` leaves the loop out. docs/real-robots.md tells
@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shutil
 import subprocess
 import sys
 import time
@@ -20,12 +21,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from real import tentacle
+from real import arm, tentacle, trunk
 
 from femsense.calib.calibrate import calibrate
 from femsense.core.errors import FemsenseError
+from femsense.core.pose import transform_points
+from femsense.fem.equilibrium import solve_equilibrium
 from femsense.io.recording_folder import load_recording
 from femsense.io.robot_toml import load_robot
+from femsense.model.effects import EFFECT_NAMES
+from femsense.sensing.pipeline import estimate
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 HEADING = (
@@ -58,13 +63,105 @@ def tentacle_rows(out: Path, data: Path, ways: list[int]) -> list[Asked]:
     return [Asked(way.name, *tentacle.make(out / f"way-{i}", data, way)) for i, way in chosen]
 
 
+def trunk_rows(out: Path, data: Path, ways: list[int]) -> list[Asked]:
+    """Return the trunk without a weight, with one, and the run with it judged by what the run without it taught."""
+    robot, made = trunk.make(out, data)
+    free = ["cable_gain", "cable_offset", "cable_stretch", "density", "stiffness"]
+    rows = [
+        ("nothing hung on", [made["none"]], [made["none-held"]], free),
+        ("100 g hung on", [made["load"]], [made["load-held"]], [*free, "payload", "tip_mass"]),
+        ("nothing hung on, payload offered", [made["none"]], [made["none-held"]], [*free, "payload", "tip_mass"]),
+    ]
+    asked = []
+    for i, (name, train, held, effects) in enumerate(rows, 1):
+        if ways and i not in ways:
+            continue
+        known = [e for e in effects if e in EFFECT_NAMES]
+        own = out / f"way-{i}" / "robot"
+        shutil.copytree(robot, own, dirs_exist_ok=True)
+        asked.append(Asked(name, own, train, held, ["--effects", *known]))
+    return asked
+
+
+def beam_rows(out: Path, data: Path, ways: list[int]) -> list[Asked]:
+    """Return the beam without and with declared gravity, fitted on 0 and 0.51 N, judged on 1.00 N."""
+    train, held = [data / "recordings" / n for n in ("gravity_a", "load52_a")], [data / "recordings" / "load101_a"]
+    rows = []
+    for i, (name, robot) in enumerate((("weightless", "robot"), ("gravity declared", "robot_gravity")), 1):
+        if not ways or i in ways:
+            own = out / f"way-{i}" / "robot"
+            shutil.copytree(data / robot, own, dirs_exist_ok=True)
+            rows.append(Asked(name, own, train, held))
+    return rows
+
+
+def arm_rows(out: Path, data: Path, ways: list[int]) -> list[Asked]:
+    """Return the two days of the arm."""
+    days = [(i, day) for i, day in enumerate(arm.MIDDLES_MM, 1) if not ways or i in ways]
+    return [Asked(day, *arm.make(out / f"way-{i}", data, day)) for i, day in days]
+
+
 SETS: Mapping[str, tuple[Callable[[Path, Path, list[int]], list[Asked]], str]] = {
     "tentacle": (
         tentacle_rows,
         "authors, mean marker error: prior 36.8 mm, fitted 15.8, a residual fitted to each pose 6.1. By hand with this model, mean marker error of single | "
         "two tendons: prior 26.5 | 32.2, modulus 10.8 | 11.8, markers and a pose a session 7.4 | 10.2, gain and zero a session 5.9 | 9.0",
     ),
+    "trunk": (
+        trunk_rows,
+        "a linear map of the motor angles to the tip leaves 18.4 mm rms; the weight of 0.98 N shifts it by 10.6 mm rms",
+    ),
+    "beam": (
+        beam_rows,
+        "a repeat of the run at 1.00 N differs by 0.59 mm rms; an independent solver leaves 0.83 mm there (docs/beam-study.md)",
+    ),
+    "arm": (
+        arm_rows,
+        "linear maps leave 5.4 mm (encoders) and 36.8 mm (pressures) of the tip; see docs/real-robots.md for what stops the model",
+    ),
 }
+
+
+def print_by_hand(out: Path, data: Path) -> None:
+    """Print the mean marker error of the tentacle with the authors' pose and a modulus that is given: the base marker is left out."""
+    runs = tentacle.read_runs(data)
+    poses = {s: tentacle.declared_pose([r for r in runs if r.session == s]) for s in "AB"}
+    print("| density [kg/m³] | modulus [kPa] | one tendon [mm] | two tendons [mm] |\n|---|---|---|---|")
+    for density, modulus in ((1500.0, 505e3), (1100.0, 505e3), (1100.0, 424e3), (1100.0, 384e3), (1100.0, 349e3)):
+        robot = load_robot(tentacle.make_robot(out / f"by-hand-{density:g}", density))
+        body = robot.body.with_stiffness_scale(modulus / tentacle.MODULUS_PA)
+        errors: dict[bool, list[float]] = {False: [], True: []}
+        for run in runs:
+            state = solve_equilibrium(body, tension=dict(zip(body.cable_names, run.tensions)))
+            measured = transform_points(poses[run.session], run.parts.mean(axis=0))
+            off = np.linalg.norm(robot.markers.positions(state.positions) - measured, axis=1)[1:]
+            errors[bool(run.tensions.all())] += off.tolist()
+        print(
+            f"| {density:g} | {modulus / 1e3:.0f} | {1e3 * np.mean(errors[False]):.1f} | {1e3 * np.mean(errors[True]):.1f} |",
+            flush=True,
+        )
+
+
+def print_weights(out: Path, data: Path) -> None:
+    """Print the force at the tip of the trunk that markers show, with and without the weight."""
+    robot, made = trunk.make(out, data)
+    better = out / "way-1" / "loop"
+    for name, body in (("as declared", robot), ("as the run without the weight taught it", better)):
+        if not (body / "robot.toml").is_file():
+            continue
+        model = load_robot(body)
+        known = calibrate(model, load_recording(made["none"]))
+        for recording in ("none-held", "load-held"):
+            run = estimate(model, load_recording(made[recording]), known, at=[[0.0, 0.0, -1e-3 * trunk.DISCS_MM[-1]]])
+            force = np.array([c.force_n_xyz for c in run.contacts])
+            std = np.array([c.force_std_n_xyz for c in run.contacts])
+            seen = ", ".join(f"{m:+.2f}" for m in force.mean(axis=0))
+            spread = ", ".join(f"{s:.2f}" for s in force.std(axis=0))
+            print(
+                f"| {name} | {recording} | [{seen}] N | over frames [{spread}] N | stated {np.median(std, axis=0).round(2).tolist()} N | "
+                f"true [0, 0, {-trunk.WEIGHT_N if recording.startswith('load') else 0:.2f}] N |",
+                flush=True,
+            )
 
 
 def calibrated_rms(robot: Path, recordings: list[Path]) -> str:
@@ -165,7 +262,15 @@ def main() -> None:
     ask.add_argument("--ways", nargs="*", type=int, default=[])
     ask.add_argument("--minutes", type=float, default=60.0)
     ask.add_argument("--calibrated", action="store_true")
+    ask.add_argument("--weights", action="store_true", help="the force at the tip of the trunk, instead")
+    ask.add_argument("--by-hand", action="store_true", help="the tentacle with the authors' pose and given moduli, instead")
     given = ask.parse_args()
+    if given.weights:
+        print_weights(given.out / "trunk", given.data / "trunk")
+        return
+    if given.by_hand:
+        print_by_hand(given.out / "tentacle", given.data / "tentacle")
+        return
     for name in given.only:
         make, note = SETS[name]
         print(f"\n## {name}\n\n{note}\n")

@@ -129,3 +129,14 @@ def first_pose() -> FloatArray:
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = R_ROBOT_MOCAP, -R_ROBOT_MOCAP @ BASE_MOCAP_M
     return T
+
+
+def make(folder: Path, data: Path, *, count: int = 48) -> tuple[Path, dict[str, Path]]:
+    """Write the robot and four recordings: without and with the weight, frames to fit and frames that are held out."""
+    runs = {"none": read_run(data, loaded=False), "load": read_run(data, loaded=True)}
+    frames = still_frames(list(runs.values()), count)
+    parts = {"": frames[::2], "-held": frames[1::2]}
+    made = {
+        name + end: write_recording(folder / (name + end), run, some) for name, run in runs.items() for end, some in parts.items()
+    }
+    return make_robot(folder / "robot"), made
