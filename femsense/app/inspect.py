@@ -34,6 +34,7 @@ from femsense.io.mesh_files import (
     read_triangles,
 )
 from femsense.io.meshes.reading import file_format, read_content
+from femsense.io.meshing.robot_from_line import line_report
 from femsense.io.recording_folder import TOO_FAR, load_recording
 from femsense.io.recording_toml import recording_problems
 from femsense.io.robot_toml import RobotTable, load_robot, read_declared_mesh, robot_names, robot_problems
@@ -152,6 +153,7 @@ def describe(report: Mapping[str, Any]) -> str:
 
 
 TITLES = {
+    "line": "a body along a line (docs/bodies.md)",
     "robot": "a robot",
     "recording": "a recording",
     "mesh": "a mesh of tetrahedra",
@@ -238,6 +240,8 @@ def _kind_of_toml(file: Path) -> tuple[str, Inspector]:
     own = _format(file)
     if file.name == "recording.toml" or own.startswith("femsense-recording"):
         return "recording", _recording
+    if own.startswith("femsense-line"):
+        return "line", _line
     return ("script", _script) if own.startswith("femsense-script") else ("robot", _robot)
 
 
@@ -682,6 +686,10 @@ def _script(file: Path, report: Report, problems: list[str]) -> None:
     report["contacts"], report["loads"] = len(script.contacts), len(script.loads)
     report["camera"] = f"{script.camera.width} × {script.camera.height}"
     report["clouds"] = script.clouds.kind
+
+
+def _line(file: Path, report: Report, problems: list[str]) -> None:
+    report.update(line_report(file))
 
 
 def _unfinished(folder: Path, report: Report, problems: list[str]) -> None:

@@ -204,6 +204,22 @@ def _point(point: FloatArray) -> list[float]:
     return [round(float(value), 8) + 0.0 for value in point]
 
 
+def line_report(path: Path) -> dict[str, Any]:
+    """Return what a description holds, as plain values. Raises InputError where it makes no body."""
+    table = read_line(path)
+    line = line_of(table, path)
+    channels = channels_of(table, line, path)
+    return {
+        "name": table.name,
+        "length_mm": 1e3 * line.length,
+        "sections": len(table.sections),
+        "tendons": [{"name": c.name, "channel_mm": 1e3 * (c.end - c.start), "max_tension_n": c.max_tension} for c in channels],
+        "chambers": [{"name": c.name, "length_mm": 1e3 * (c.end - c.start)} for c in line.cavities],
+        "markers": [marker.name for marker in table.markers],
+        "next": f"femsense mesh {path.name} -o ROBOT",
+    }
+
+
 def line_text(report: dict[str, Any]) -> str:
     """Return a report as a table."""
     lines = [

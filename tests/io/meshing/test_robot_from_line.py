@@ -78,7 +78,7 @@ def test_bends_as_beam_theory_says(tmp_path: Path, sections: tuple[Any, ...]) ->
 
 
 def test_a_channel_is_subdivided_until_the_answer_stands_still(tmp_path: Path) -> None:
-    tendon = {"name": "t", "distance_mm": [4.0, 2.0], "angle_deg": -90.0, "max_tension_n": 0.2}
+    tendon = {"name": "t", "distance_mm": [4.0, 2.0], "angle_deg": -90.0, "max_tension_n": 0.15}
     source = written(tmp_path, *CONE, tendons=[tendon, tendon | {"name": "u", "angle_deg": 90.0}])
     report = line_into(tmp_path / "robot", source, most_tets=700)
     tried, other = report["tendons"]
@@ -89,7 +89,7 @@ def test_a_channel_is_subdivided_until_the_answer_stands_still(tmp_path: Path) -
     path = robot.body.cables[0].path
     assert len(path) == tried["points"] and path.outside.max() < 1e-9
     np.testing.assert_allclose(path.positions(robot.body.mesh.nodes)[[0, -1]], [[0, 2e-3, -0.1], [0, 4e-3, 0]], atol=1e-9)
-    state = solve_equilibrium(robot.body, tension={"t": 0.2})
+    state = solve_equilibrium(robot.body, tension={"t": 0.15})
     assert state.positions[:, 1].max() > 0.01 and state.positions[:, 1].min() > -0.01  # towards the tendon
 
 
@@ -180,11 +180,13 @@ def test_sections_that_no_body_can_have(tmp_path: Path) -> None:
 
 
 def test_the_command_makes_a_robot_and_inspect_warns_of_few_points(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    tendon = {"name": "t", "distance_mm": [4.0, 2.0], "points": 4, "max_tension_n": 0.2}
+    tendon = {"name": "t", "distance_mm": [4.0, 2.0], "points": 4, "max_tension_n": 0.15}
     marker = {"name": "tip", "along_mm": 110.0}
     source = written(
         tmp_path, *CONE, tendons=[tendon], markers=[marker], clamp={"ends": "both"}, gravity={"vector_m_s2": [0.0, 0.0, -9.81]}
     )
+    assert run(["inspect", str(source)]) == 0
+    assert "a body along a line" in capsys.readouterr().out
     assert run(["mesh", str(source), "-o", str(tmp_path / "robot"), "--max-tets", "700"]) == 0
     robot = load_robot(tmp_path / "robot")
     assert robot.marker_points.tolist() == [[0.0, 0.0, -0.11]]
