@@ -164,6 +164,25 @@ def print_weights(out: Path, data: Path) -> None:
             )
 
 
+def print_pairs(out: Path, data: Path) -> None:
+    """Print the force at the tip of the trunk by pairs: two moments at the same command, and what tells them apart but the inputs.
+
+    In the pair with the weight it is looked for; in a pair of two runs without it (the same frames, the second half a second later) nothing is.
+    """
+    robot, _ = trunk.make(out, data)
+    model = load_robot(robot)
+    bare, heavy = (trunk.read_run(data, loaded=loaded) for loaded in (False, True))
+    frames = trunk.still_frames([bare, heavy], 48)[1::2]
+    later = trunk.Run(np.roll(bare.angles, -50, axis=0), np.roll(bare.discs, -50, axis=0))
+    for name, other, true in (("with the weight", heavy, -trunk.WEIGHT_N), ("half a second later", later, 0.0)):
+        force, std, frame_std = trunk.force_between(model, bare, other, frames)
+        seen = ", ".join(f"{f:+.2f} ± {s:.2f}" for f, s in zip(force, std))
+        print(
+            f"| by pairs | {name} | [{seen}] N | over frames {frame_std.round(2).tolist()} N | true [0, 0, {true:.2f}] N |",
+            flush=True,
+        )
+
+
 def calibrated_rms(robot: Path, recordings: list[Path]) -> str:
     """Return the rms of what calibration leaves in recordings, each with its own pose [mm]."""
     body = load_robot(robot)
@@ -266,6 +285,7 @@ def main() -> None:
     ask.add_argument("--by-hand", action="store_true", help="the tentacle with the authors' pose and given moduli, instead")
     given = ask.parse_args()
     if given.weights:
+        print_pairs(given.out / "trunk", given.data / "trunk")
         print_weights(given.out / "trunk", given.data / "trunk")
         return
     if given.by_hand:

@@ -11,8 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from femsense.core.arrays import BoolArray, FloatArray, IntArray
+from femsense.fem.equilibrium import solve_equilibrium
 from femsense.io.files import write_csv, write_toml
 from femsense.io.meshing.robot_from_line import line_into
+from femsense.model.robot import Robot
 
 R_ROBOT_MOCAP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 """The world has y up; the robot hangs along −z."""
@@ -24,8 +26,9 @@ RATE_HZ = 100.0
 WEIGHT_N = 0.1 * 9.81
 MOTORS = {"u1": (1, 45.0), "u2": (2, 107.0), "u3": (0, 180.0), "u4": (2, 197.0), "u5": (0, 248.0), "u6": (1, -45.0)}
 """Disc at which the tendons of a motor end, and the direction [°, x to y] to which it bends: from a linear map of angles to discs."""
-PULLEY_M, DISTANCE_MM = 0.010, 25.0
-"""Radius of a pulley (unknown: `cable_gain` finds its ratio) and distance of the tendons from the axis."""
+PULLEY_M, DISTANCE_MM = 0.040, 25.0
+"""Radius of a pulley and distance of the tendons from the axis. Neither is known. Their ratio is such that the equivalent tube bends nearly
+as far as the trunk does (10 mm leave 0.2 of it); `cable_gain` finds the rest of each motor's own."""
 MODULUS_PA, DENSITY = 200e3, 500.0
 RADIUS_MM, BORE_MM = 30.0, 20.0
 
@@ -129,6 +132,47 @@ def first_pose() -> FloatArray:
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = R_ROBOT_MOCAP, -R_ROBOT_MOCAP @ BASE_MOCAP_M
     return T
+
+
+def force_between(
+    robot: Robot, first: Run, second: Run, frames: IntArray, *, step: float = 0.1
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the force at the tip [N] that acts in one run and not in another, with the std of its mean over frames, and over frames, each (3,).
+
+    Differences between the runs at the same frame are compared with those of the model under the inputs of both: what is common to both, errors of
+    the model and of the pose too, drops out. A force in each direction has its response in each frame; least squares over the discs.
+    """
+    tip = np.flatnonzero(robot.body.mesh.nodes[:, 2] < robot.body.mesh.nodes[:, 2].min() + 1e-6)
+    responses, differences = [], []
+    for k in frames:
+        states = [solve_equilibrium(robot.body, shortening=drawn(robot, run.angles[k])) for run in (first, second)]
+        at_rest = robot.markers.positions(states[1].positions)
+        columns = []
+        for axis in range(3):
+            forces = np.zeros_like(robot.body.mesh.nodes)
+            forces[tip, axis] = step / len(tip)
+            pushed = solve_equilibrium(
+                robot.body, shortening=drawn(robot, second.angles[k]), nodal_forces=forces, start=states[1]
+            )
+            columns.append((robot.markers.positions(pushed.positions) - at_rest).ravel() / step)
+        measured = (second.discs[k] - first.discs[k]) @ R_ROBOT_MOCAP.T
+        differences.append((measured - (at_rest - robot.markers.positions(states[0].positions))).ravel())
+        responses.append(np.stack(columns, axis=1))
+    J, d = np.array(responses), np.array(differences)
+    blocks = np.array_split(np.arange(len(frames)), 8)
+
+    def fit(some: IntArray) -> FloatArray:
+        return np.asarray(np.linalg.lstsq(J[some].reshape(-1, 3), d[some].ravel(), rcond=None)[0])
+
+    left_out = np.array([fit(np.setdiff1d(np.arange(len(frames)), block)) for block in blocks])
+    std = np.sqrt(len(blocks) - 1.0) * left_out.std(axis=0)  # jackknife
+    each = np.array([fit(np.array([i])) for i in range(len(frames))])
+    return fit(np.arange(len(frames))), std, each.std(axis=0)
+
+
+def drawn(robot: Robot, angles: FloatArray) -> dict[str, float]:
+    """Return the displacement of each tendon [m] for motor angles [rad], shape (6,)."""
+    return {name + side: sign * PULLEY_M * a for name, a in zip(MOTORS, angles) for side, sign in (("a", 1.0), ("b", -1.0))}
 
 
 def make(folder: Path, data: Path, *, count: int = 48) -> tuple[Path, dict[str, Path]]:
