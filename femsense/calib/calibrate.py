@@ -16,7 +16,8 @@ from femsense.calib.calibration import Calibration
 from femsense.calib.checks import check_reading, pairs_of, relabelled
 from femsense.calib.from_clouds import pose_pivot, refine_poses
 from femsense.calib.inputs import _initial_displacement, _input_std, _largest_input, first_inputs, input_bounds
-from femsense.calib.joint import PLACEMENT_STD_FLOOR, _rms, fit_joint
+from femsense.calib.joint import PLACEMENT_STD_FLOOR, fit_joint, root_mean_square
+from femsense.calib.marker_assignment import name_markers
 from femsense.calib.rigid import fit_rigid, fit_rigid_robust
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import DataError
@@ -68,6 +69,7 @@ def calibrate(robot: Robot, recording: Recording, *, frames: Sequence[int] | Non
         raise DataError(
             "no frame is free of undeclared contact: mark free frames with 1 in the column free of frames.csv, or declare loads.csv"
         )
+    recording = name_markers(robot, recording, _thinned(np.intersect1d(chosen, recording.unnamed_frame)))
     if not len(recording.marker_frame):
         return _declared(robot, recording, chosen)
     history: list[float] = []
@@ -93,7 +95,7 @@ def _fitted(
     """
     scene, fit, poses, initial, jet = _fitted_as_named(robot, recording, chosen, history)
     pairs = pairs_of(robot, scene, poses, jet.residual)
-    better, changed = relabelled(robot, scene, pairs, _rms(jet.residual) / 60.0)
+    better, changed = relabelled(robot, scene, pairs, root_mean_square(jet.residual) / 60.0)
     if changed:
         scene, fit, poses, initial, jet = _fitted_as_named(robot, better, chosen, history)
         pairs = pairs_of(robot, scene, poses, jet.residual)
@@ -104,9 +106,7 @@ def _fitted(
 def _fitted_as_named(
     robot: Robot, recording: Recording, chosen: IntArray, history: list[float]
 ) -> tuple[Scene, FitResult, list[FloatArray], FloatArray | None, SceneJet]:
-    seen = chosen[np.isin(chosen, recording.marker_frame)]
-    if len(seen) > MAX_FRAMES:
-        seen = seen[np.unique(np.linspace(0, len(seen) - 1, MAX_FRAMES).round().astype(int))]
+    seen = _thinned(chosen[np.isin(chosen, recording.marker_frame)])
     scene = make_scene(robot, recording, seen)
     poses = first_poses(robot, scene)
     initial = first_inputs(robot, recording)
@@ -114,6 +114,13 @@ def _fitted_as_named(
         few = seen[np.unique(np.linspace(0, len(seen) - 1, START_FRAMES).round().astype(int))]
         poses, initial = _alternate(robot, make_scene(robot, recording, few), poses, initial, history)
     return scene, *fit_joint(robot, scene, poses, initial, history)
+
+
+def _thinned(frames: IntArray) -> IntArray:
+    """Return at most MAX_FRAMES of the frames, spread evenly."""
+    if len(frames) <= MAX_FRAMES:
+        return frames
+    return np.asarray(frames[np.unique(np.linspace(0, len(frames) - 1, MAX_FRAMES).round().astype(int))])
 
 
 def first_poses(robot: Robot, scene: Scene) -> list[FloatArray]:
@@ -163,7 +170,7 @@ def _alternate(
     empty, pivot = np.zeros(0), robot.marker_points.mean(axis=0)
     for _ in range(rounds):
         jet = evaluate_scene(plain, scene, empty, poses, initial, derivative=True, vary_initial=True, pivot=pivot, starts=starts)
-        history.append(_rms(jet.residual))
+        history.append(root_mean_square(jet.residual))
         W_ea = -jet.by_initial.reshape(-1, len(initial))  # residual = measured − modelled
         ridge = (
             PLACEMENT_STD_FLOOR / _largest_input(robot, scene.recording.actuation) * np.eye(len(initial))
@@ -217,7 +224,9 @@ def _result(
     input_covariance = fit.covariance[6 * len(moving) :, 6 * len(moving) :] if a else np.zeros((0, 0))
     own, other = _input_std(robot, recording, state, input_covariance)
     per_marker = {
-        name: _rms(jet.residual[scene.marker == i]) for i, name in enumerate(robot.marker_names) if (scene.marker == i).any()
+        name: root_mean_square(jet.residual[scene.marker == i])
+        for i, name in enumerate(robot.marker_names)
+        if (scene.marker == i).any()
     }
     places = in_robot_frame(scene.rest_points, scene.rest_view, poses, robot.observation)
     tension, displacement = (own, other) if recording.actuation == "tension" else (other, own)
@@ -227,7 +236,7 @@ def _result(
         camera_names=recording.camera_names,
         cable_tension_n=dict(state.tension),
         cable_displacement_m=_initial_displacement(state, recording, names, initial),
-        rms_m=_rms(jet.residual),
+        rms_m=root_mean_square(jet.residual),
         marker_rms_m=per_marker,
         history=tuple({"iteration": i, "rms_m": r} for i, r in enumerate(history)),
         pose_std=pose_std,
@@ -305,7 +314,7 @@ def _from_rest(robot: Robot, recording: Recording) -> Calibration:
         recording.camera_names,
         dict(state.tension),
         dict(state.shortening),
-        _rms(left),
+        root_mean_square(left),
         per_marker,
         (),
         _pose_std(poses[0], covariance, robot.marker_points.mean(axis=0)),

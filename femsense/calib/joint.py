@@ -95,7 +95,7 @@ def fit_joint(
         theta = fit.theta
         evaluate(theta, True)
         assert jet is not None
-        history.append(_rms(jet.residual))
+        history.append(root_mean_square(jet.residual))
         before, huber = huber, _huber_weights(jet.residual)
         if again and np.abs(huber - before).max() < 0.1:
             break
@@ -147,5 +147,6 @@ def _spread(weighted: FloatArray, rows: float, parameters: int) -> float:
     return max(float(np.sqrt((weighted**2).sum() / freedom)), NOISE_FLOOR)
 
 
-def _rms(residual: FloatArray) -> float:
+def root_mean_square(residual: FloatArray) -> float:
+    """Return the root mean square length of rows (k, c)."""
     return float(np.sqrt((residual**2).sum(axis=1).mean()))
