@@ -14,7 +14,9 @@ import numpy as np
 
 from femsense.calib.calibration import Calibration
 from femsense.calib.checks import check_reading, pairs_of, relabelled
+from femsense.calib.clouds_alone import placed_by_clouds, views_without_markers
 from femsense.calib.from_clouds import pose_pivot, refine_poses
+from femsense.calib.from_images import has_image_markers, with_image_markers
 from femsense.calib.inputs import _initial_displacement, _input_std, _largest_input, first_inputs, input_bounds
 from femsense.calib.joint import PLACEMENT_STD_FLOOR, fit_joint, root_mean_square
 from femsense.calib.marker_assignment import name_markers
@@ -69,12 +71,26 @@ def calibrate(robot: Robot, recording: Recording, *, frames: Sequence[int] | Non
         raise DataError(
             "no frame is free of undeclared contact: mark free frames with 1 in the column free of frames.csv, or declare loads.csv"
         )
-    recording = name_markers(robot, recording, _thinned(np.intersect1d(chosen, recording.unnamed_frame)))
-    if not len(recording.marker_frame):
-        return _declared(robot, recording, chosen)
-    history: list[float] = []
-    by_markers = _result(robot, *_fitted(robot, recording, chosen, history), history)
-    return _with_clouds(robot, recording, by_markers)
+    allowed = None
+    if has_image_markers(robot, recording):
+        recording, allowed = with_image_markers(robot, recording, _thinned(chosen))
+    by_clouds = views_without_markers(recording)
+    seen = _as_declared(recording, by_clouds)
+    seen = name_markers(robot, seen, _thinned(np.intersect1d(chosen, seen.unnamed_frame)), allowed=allowed)
+    if len(seen.marker_frame):
+        history: list[float] = []
+        by_markers = _result(robot, *_fitted(robot, seen, chosen, history), history)
+    else:
+        by_markers = _declared(robot, seen, chosen)
+    if by_clouds:
+        return _with_std(robot, placed_by_clouds(robot, recording, by_markers, by_clouds))
+    return _with_clouds(robot, recording, by_markers) if len(seen.marker_frame) else by_markers
+
+
+def _as_declared(recording: Recording, views: Sequence[int]) -> Recording:
+    """Return the recording with some pose for cameras whose pose is found later; no marker is seen by them."""
+    poses = tuple(np.eye(4) if v in views else T for v, T in enumerate(recording.T_robot_camera))
+    return replace(recording, T_robot_camera=poses)
 
 
 def calibrated_start(
@@ -254,10 +270,11 @@ def _result(
 def _with_clouds(robot: Robot, recording: Recording, by_markers: Calibration) -> Calibration:
     """Return the calibration with poses to which the clouds of free frames have their say."""
     fitted = refine_poses(robot, recording, by_markers)
-    if fitted is by_markers:
-        return by_markers
-    pivot = pose_pivot(robot)
-    return replace(fitted, pose_std=_pose_std(fitted.poses[0], fitted.pose_covariance, pivot))
+    return by_markers if fitted is by_markers else _with_std(robot, fitted)
+
+
+def _with_std(robot: Robot, fitted: Calibration) -> Calibration:
+    return replace(fitted, pose_std=_pose_std(fitted.poses[0], fitted.pose_covariance, pose_pivot(robot)))
 
 
 def _pose_std(T: FloatArray, covariance: FloatArray, pivot: FloatArray) -> FloatArray:
@@ -335,7 +352,7 @@ def _declared(robot: Robot, recording: Recording, frames: IntArray) -> Calibrati
     missing = [name or "(only one)" for name, T in zip(recording.camera_names, recording.T_robot_camera) if T is None]
     if missing:
         raise DataError(
-            f"no markers and no T_robot_camera: the pose of camera {', '.join(missing)} is not known. Record markers, or write T_robot_camera in recording.toml"
+            f"no markers, no clouds and no T_robot_camera: the pose of camera {', '.join(missing)} is not known. Record markers or clouds, or write T_robot_camera in recording.toml"
         )
     if recording.actuation_zero == "unknown" and robot.body.cables:
         raise DataError("initial inputs cannot be found without markers: record markers, or absolute inputs")

@@ -28,7 +28,7 @@ from femsense.io.mesh_files import mesh_companions, read_tets, write_mesh
 from femsense.io.regions import RegionTable, regional
 from femsense.io.tables import Schema, read_toml, schema_problems, validated
 from femsense.model.effects import EFFECT_NAMES
-from femsense.model.robot import Observation, Robot, plain_actuation, spread_features
+from femsense.model.robot import MarkerLook, Observation, Robot, plain_actuation, spread_features
 
 FORMAT = "femsense-robot-1"
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
@@ -112,22 +112,31 @@ class ChamberTable(Schema):
     max_pressure_pa: float = Field(gt=0, description="largest pressure in pascal, > 0")
 
 
+Share = Annotated[float, Field(ge=0, le=1)]
+Colour = Annotated[list[Share], Field(min_length=3, max_length=3)]
+
+
 class MarkerTable(Schema):
     name: Name = Field(description=NAME)
     position_m: Vector = Field(description=POINT)
+    aruco_id: int | None = Field(
+        None,
+        ge=0,
+        description="number of the ArUco tag whose middle the marker is; read from colour images with registered depth",
+    )
+    color_rgb: Colour | None = Field(
+        None,
+        description="colour of the dot whose middle the marker is: [red, green, blue] from 0 to 1; several markers may share one",
+    )
 
 
 class FeaturesTable(Schema):
     count: int = Field(51, ge=1, description="number of feature points, ≥ 1")
 
 
-Share = Annotated[float, Field(ge=0, le=1)]
-
-
 class AppearanceTable(Schema):
-    color_rgb: Annotated[list[Share], Field(min_length=3, max_length=3)] | None = Field(
-        None, description="three numbers from 0 to 1: [red, green, blue]"
-    )
+    color_rgb: Colour | None = Field(None, description="three numbers from 0 to 1: [red, green, blue]")
+    aruco_dictionary: str = Field("4X4_50", description="dictionary of the ArUco tags, as OpenCV names it without DICT_")
 
 
 class RobotTable(Schema):
@@ -147,7 +156,8 @@ class RobotTable(Schema):
     markers: list[MarkerTable] = Field([], description="tables [[markers]]")
     features: FeaturesTable = Field(default_factory=lambda: FeaturesTable(count=51), description="a table [features] with count")
     appearance: AppearanceTable = Field(
-        default_factory=lambda: AppearanceTable(color_rgb=None), description="a table [appearance] with color_rgb"
+        default_factory=lambda: AppearanceTable(color_rgb=None, aruco_dictionary="4X4_50"),
+        description="a table [appearance] with color_rgb and aruco_dictionary",
     )
     effects: list[dict[str, Any]] = Field([], description="tables [[effects]] with a name")
 
@@ -242,6 +252,18 @@ def table_problems(table: RobotTable, path: Path) -> list[InputError]:
                     where=_at(path, "fixed", i, "box_m"),
                     found=box.box_m,
                     expected="[smallest x, y, z], then [largest x, y, z]",
+                )
+            )
+    tags = [marker.aruco_id for marker in table.markers]
+    for i, tag in enumerate(tags):
+        if tag is not None and tag in tags[:i]:
+            problems.append(
+                InputError(
+                    "a tag stands twice",
+                    where=_at(path, "markers", i, "aruco_id"),
+                    found=tag,
+                    expected="each tag once",
+                    hint=f"markers[{tags.index(tag)}] has it too",
                 )
             )
     for i, cable in enumerate(table.cables):
@@ -357,6 +379,15 @@ def build_robot(table: RobotTable, document: dict[str, Any], path: Path) -> Robo
         observation=Observation(),
         document=copy.deepcopy(document),
         folder=path.parent.absolute(),
+        marker_looks=_marker_looks(table.markers),
+        aruco_dictionary=table.appearance.aruco_dictionary,
+    )
+
+
+def _marker_looks(markers: Sequence[MarkerTable]) -> tuple[MarkerLook, ...]:
+    seen = [marker for marker in markers if marker.aruco_id is not None or marker.color_rgb is not None]
+    return tuple(
+        MarkerLook(m.name, m.aruco_id, None if m.color_rgb is None else freeze(np.array(m.color_rgb, dtype=float))) for m in seen
     )
 
 
@@ -633,11 +664,24 @@ def _declared(robot: Robot) -> dict[str, Any]:
     document["fixed"] = [{"box_m": box} for box in _clamp_boxes(body)]
     document["cables"] = [_cable_document(cable, body.mesh) for cable in body.cables]
     document["chambers"] = [{"name": c.name, "seed_m": c.seed.tolist(), "max_pressure_pa": c.max_pressure} for c in body.chambers]
-    document["markers"] = [{"name": n, "position_m": p.tolist()} for n, p in zip(robot.marker_names, robot.marker_points)]
+    looks = {look.name: look for look in robot.marker_looks}
+    document["markers"] = [
+        {"name": n, "position_m": p.tolist(), **_look_document(looks.get(n))}
+        for n, p in zip(robot.marker_names, robot.marker_points)
+    ]
     document["features"] = {"count": max(len(robot.features), 1)}
     if robot.color_rgb is not None:
         document["appearance"] = {"color_rgb": robot.color_rgb.tolist()}
+    if any(look.aruco_id is not None for look in robot.marker_looks):
+        document.setdefault("appearance", {})["aruco_dictionary"] = robot.aruco_dictionary
     return {key: value for key, value in document.items() if value != []}
+
+
+def _look_document(look: MarkerLook | None) -> dict[str, Any]:
+    if look is None:
+        return {}
+    tag = {} if look.aruco_id is None else {"aruco_id": look.aruco_id}
+    return tag if look.color_rgb is None else {**tag, "color_rgb": look.color_rgb.tolist()}
 
 
 def _check_plain(robot: Robot) -> None:

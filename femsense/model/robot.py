@@ -54,6 +54,17 @@ class Observation:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
+class MarkerLook:
+    """How a marker looks in a colour image."""
+
+    name: str
+    aruco_id: int | None = None
+    """Number of the ArUco tag whose middle it is; None where it is none."""
+    color_rgb: FloatArray | None = None
+    """Colour of the dot whose middle it is, each in [0, 1], shape (3,); None where it is none."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
 class Robot:
     """A robot: a body with markers, features and the effects that its model holds."""
 
@@ -82,6 +93,10 @@ class Robot:
     """Terms (share [1], energy [J/m³]) by which elements soften that have been loaded before (see `model/softening.py`)."""
     by_recording: tuple[Callable[[Robot, str], Robot], ...] = ()
     """What differs from recording to recording: (robot, label of a recording) → the robot there, one after the other."""
+    marker_looks: tuple[MarkerLook, ...] = ()
+    """Markers that colour images show, by name."""
+    aruco_dictionary: str = "4X4_50"
+    """Of the tags, as OpenCV names it."""
     surface_points: int = 0
     """So many of the markers, the last ones, are points of the surface that clouds are measured at; nobody glued them on."""
 

@@ -79,15 +79,16 @@ def cloud_from_depth(
     row, column = np.nonzero(np.isfinite(image) & (image > 0))
     rays = (np.stack([column, row], axis=1) - [cx, cy]) / focal
     lens = np.asarray(distortion, dtype=np.float64).ravel()
-    if np.any(lens != 0.0):
-        rays = _straight(rays, lens, distortion_model)
+    rays = straight_rays(rays, lens, distortion_model)
     z = image[row, column].astype(np.float64) * unit
     colors = None if color is None else _pixel_colors(color, image.shape)[row, column]
     return PointCloud(np.column_stack([rays * z[:, None], z]), colors)
 
 
-def _straight(rays: FloatArray, distortion: FloatArray, model: str) -> FloatArray:
-    """Return straight rays (n, 2) of bent ones (n, 2)."""
+def straight_rays(rays: FloatArray, distortion: FloatArray, model: str) -> FloatArray:
+    """Return straight rays (n, 2) of bent ones (n, 2); distortion and model as of `cloud_from_depth`. Raises InputError."""
+    if not np.any(distortion != 0.0):
+        return rays
     if model == "inverse_brown_conrady":
         return _bent(rays, distortion)
     if model == "kannala_brandt":

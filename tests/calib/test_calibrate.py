@@ -418,7 +418,7 @@ def test_a_frame_with_declared_loads_can_be_used() -> None:
 
 def test_no_markers_and_no_pose() -> None:
     rec = make_recording(time_s=[0.0], cable_names=("top", "side"), inputs=[[0.0, 0.0]])
-    with pytest.raises(DataError, match="no markers and no T_robot_camera"):
+    with pytest.raises(DataError, match="no markers, no clouds and no T_robot_camera"):
         calibrate(bar_robot(), rec)
 
 

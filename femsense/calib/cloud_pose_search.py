@@ -1,0 +1,338 @@
+"""The pose of a camera from clouds alone, from nowhere: the body's visible side is laid everywhere into what the camera saw.
+
+Poses on a grid of rotations and places are judged by a map of distances to the measured points (Fitzgibbon, "Robust registration of 2D and 3D point
+sets", 2003); the best are refined by closest points (Besl and McKay 1992), from the visible side to what was measured: a silhouette holds the body in its plane.
+In the end each part of the visible side was measured or not, and each ray that meets the body ends there, or behind it, which speaks against the pose.
+Planes that are larger than the body are taken out before: a flat side fits everywhere into a table.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from femsense.calib.scan import REACH
+from femsense.core.arrays import BoolArray, FloatArray, IntArray
+from femsense.core.errors import DataError
+from femsense.core.pose import invert_pose, transform_points
+from femsense.pointcloud.cloud import PointCloud
+from femsense.pointcloud.filters import voxel_grid
+from femsense.pointcloud.objects import find_plane
+from femsense.pointcloud.rays import Surface
+
+ROTATIONS = 800
+"""Rotations of the grid: neighbours are 20° apart, and closest points find their way from there."""
+SEEDS = 150
+"""Places of the grid at most."""
+SAMPLES = 80
+"""Points of the visible side by which a pose is judged."""
+CLOSER = 300
+"""Poses that closest points refine."""
+FINAL = 16
+"""Poses that are refined with finer points."""
+FINE, FINE_STEPS = 1200, 25
+"""Samples and steps of that."""
+RAYS = 10000
+"""Rays of a view that judge at most."""
+MOST_CELLS = 4e6
+"""Cells of the map of distances: 16 MB; a wider scene gets larger ones."""
+LEAST = 0.25
+"""A pose needs this gain: right ones of benchmarks/calibration.py have 0.5 and more, wrong ones 0 and less where the robot is in sight."""
+CAP = 0.1
+"""Distances beyond this share of the body's diagonal count alike."""
+PLANE_SHARE = 0.3
+"""A plane has this share of the points at least."""
+ALIKE = 1.2
+"""Another pose fits as well where what it leaves is below this times what the best leaves: a body with a symmetry leaves 1.0."""
+TURNED, SHIFTED = 0.3, 0.1
+"""Poses are different where they are turned by this [rad], or shift the body by this share of its diagonal."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class View:
+    """What one camera saw in one free frame, and how the body then stands."""
+
+    points: FloatArray
+    """[m], camera frame, shape (k, 3)."""
+    mine: BoolArray
+    """Points that may be of the robot by their colour; all where colour does not tell, shape (k,)."""
+    surface: Surface
+    """Of the body in that frame, robot frame."""
+    colored: bool = False
+    """Whether colour told the robot from the rest."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class CloudPose:
+    """A pose and how it fits."""
+
+    T_robot_camera: FloatArray
+    """shape (4, 4)."""
+    error_m: float
+    """Root mean square distance of the visible side from measured points, cut off at REACH of the diagonal; rays through the body count as that far [m]."""
+    gain: float
+    """Share of the visible side that was measured less the share that was not, and less rays that go through [1]; 1 is perfect, below 0 is no fit."""
+
+
+def find_cloud_pose(views: Sequence[View]) -> CloudPose:
+    """Return the pose of a camera that saw a body in some free frames.
+
+    Arguments:
+        views: one a frame; the first is searched, all judge.
+
+    Raises:
+        DataError: nothing fits, or two poses fit alike (a body with a symmetry).
+    """
+    poses = search_cloud_poses(views)
+    size = _size(views[0].surface)
+    if not poses or poses[0].gain < LEAST:
+        raise DataError(
+            "no pose was found at which the clouds of the free frames show the robot. Record markers, write T_robot_camera in recording.toml, or declare the robot's colour"
+        )
+    best = poses[0]
+    for other in poses[1:]:
+        turn, shift = difference(best.T_robot_camera, other.T_robot_camera, views[0].surface)
+        apart = turn > TURNED or shift > SHIFTED * size
+        if apart and other.error_m < ALIKE * best.error_m:
+            raise DataError(
+                f"two poses fit the clouds alike: {1e3 * best.error_m:.3g} and {1e3 * other.error_m:.3g} mm are left, turned by {np.degrees(turn):.0f}° and "
+                f"{1e3 * shift:.0f} mm apart. Has the robot a symmetry? Record markers, pull cables in free frames, or write T_robot_camera in recording.toml"
+            )
+    return best
+
+
+def difference(T: FloatArray, other: FloatArray, surface: Surface) -> tuple[float, float]:
+    """Return by which angle [rad] two poses are turned, and how far apart they place the body's middle [m]."""
+    D = T @ invert_pose(other)
+    middle = surface.positions.mean(axis=0)
+    angle = float(np.arccos(np.clip((np.trace(D[:3, :3]) - 1.0) / 2.0, -1.0, 1.0)))
+    return angle, float(np.linalg.norm(D[:3, :3] @ middle + D[:3, 3] - middle))
+
+
+def search_cloud_poses(views: Sequence[View]) -> list[CloudPose]:
+    """Return poses of a camera under which the clouds show the body, best first, each different from those before."""
+    first, size = views[0], _size(views[0].surface)
+    scene = _scene(first, size)
+    if len(scene) < 50:
+        return []
+    samples, normals = _samples(first.surface, 3 * SAMPLES)
+    starts = _on_the_grid(scene, samples, normals, size)
+    closer = _closest_points(scene, samples, normals, starts, size)
+    fine = [_Fine(view, size) for view in views]
+    fitted = [_settled(fine, T, size) for T in closer]
+    found: list[CloudPose] = []
+    for pose in sorted(fitted, key=lambda pose: pose.error_m):
+        if all(_different(pose, other, first.surface, size) for other in found):
+            found.append(pose)
+    return found
+
+
+def _different(one: CloudPose, other: CloudPose, surface: Surface, size: float) -> bool:
+    turn, shift = difference(one.T_robot_camera, other.T_robot_camera, surface)
+    return turn > TURNED or shift > SHIFTED * size
+
+
+def _size(surface: Surface) -> float:
+    return float(np.linalg.norm(np.ptp(surface.positions[np.unique(surface.triangles)], axis=0)))
+
+
+def _scene(view: View, size: float) -> FloatArray:
+    """Return the points among which the body is sought [m], thinned, without planes larger than the body, shape (s, 3)."""
+    points = voxel_grid(PointCloud(view.points[view.mine]), 0.02 * size).points
+    if view.colored:
+        return points
+    while len(points) > 200:
+        plane = find_plane(points, 0.02 * size, rng=np.random.default_rng(0))
+        on = np.abs(plane.distance(points)) < 0.02 * size
+        width = np.linalg.norm(np.ptp(points[on], axis=0)) if on.any() else 0.0
+        if on.mean() < PLANE_SHARE or width < 1.5 * size:
+            break
+        points = points[~on]
+    return points
+
+
+def _samples(surface: Surface, count: int) -> tuple[FloatArray, FloatArray]:
+    """Return points spread over the surface (by area) and their outward normals, each (p, 3)."""
+    a, b, c = (surface.positions[surface.triangles[:, i]] for i in range(3))
+    cross = np.cross(b - a, c - a)
+    area = np.linalg.norm(cross, axis=1)
+    rng = np.random.default_rng(0)
+    chosen = rng.choice(len(area), count, p=area / area.sum())
+    w = rng.dirichlet(np.ones(3), size=len(chosen))[:, :, None]
+    places = w[:, 0] * a[chosen] + w[:, 1] * b[chosen] + w[:, 2] * c[chosen]
+    return places, cross[chosen] / area[chosen][:, None]
+
+
+def _rotations() -> FloatArray:
+    """Return rotations spread evenly over all, shape (ROTATIONS, 3, 3) (Alexa, "Super-Fibonacci spirals", 2022)."""
+    from scipy.spatial.transform import Rotation
+
+    s = np.arange(ROTATIONS) + 0.5
+    r, q = np.sqrt(s / ROTATIONS), np.sqrt(1.0 - s / ROTATIONS)
+    alpha, beta = 2.0 * np.pi * s / np.sqrt(2.0), 2.0 * np.pi * s / 1.533751168755204288118041
+    return np.asarray(
+        Rotation.from_quat(np.stack([r * np.sin(alpha), r * np.cos(alpha), q * np.sin(beta), q * np.cos(beta)], 1)).as_matrix()
+    )
+
+
+def _on_the_grid(scene: FloatArray, samples: FloatArray, normals: FloatArray, size: float) -> list[FloatArray]:
+    """Return T_camera_robot of the best poses of the grid, each (4, 4)."""
+    near = _DistanceMap(scene, 0.02 * size, CAP * size)
+    seeds = scene[_spread(scene, 0.15 * size)]
+    scored: list[tuple[float, int, FloatArray]] = []
+    rotations = _rotations()
+    for i, R in enumerate(rotations):
+        turned, facing = samples @ R.T, normals @ R.T
+        looking = np.einsum("pc,c->p", facing, seeds.mean(axis=0)) < -0.2 * np.linalg.norm(seeds.mean(axis=0))
+        side = turned[looking][:SAMPLES]
+        if len(side) < 10:
+            continue
+        middle = side[np.argmin(((side - side.mean(axis=0)) ** 2).sum(axis=1))]  # a visible point comes to lie on a seed
+        shifts = seeds - middle
+        score = near(side[None] + shifts[:, None]).mean(axis=1)
+        for j in np.argsort(score)[:6]:
+            scored.append((float(score[j]), i, shifts[j]))
+    result = []
+    for _, i, t in sorted(scored, key=lambda s: s[0])[:CLOSER]:
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = rotations[i], t
+        result.append(T)
+    return result
+
+
+def _spread(points: FloatArray, spacing: float) -> IntArray:
+    """Return one point of each cube of an edge [m], SEEDS of them at most."""
+    _, first = np.unique(np.floor(points / spacing).astype(np.int64), axis=0, return_index=True)
+    return first if len(first) <= SEEDS else np.random.default_rng(0).choice(first, SEEDS, replace=False)
+
+
+class _DistanceMap:
+    """Distances to the nearest measured point on a grid, cut off."""
+
+    def __init__(self, points: FloatArray, cell: float, cap: float) -> None:
+        from scipy.ndimage import distance_transform_edt
+
+        self.low = points.min(axis=0) - cap
+        volume = float(np.prod(points.max(axis=0) + cap - self.low))
+        self.cell, self.cap = (cell := max(cell, (volume / MOST_CELLS) ** (1 / 3))), cap
+        shape = np.ceil((points.max(axis=0) + cap - self.low) / cell).astype(int) + 1
+        empty = np.ones(shape, dtype=bool)
+        empty[tuple(((points - self.low) / cell).astype(int).T)] = False
+        self.map = np.minimum(distance_transform_edt(empty) * cell, cap).astype(np.float32)
+
+    def __call__(self, points: FloatArray) -> FloatArray:
+        """Return distances [m], shape (…,), of points (…, 3)."""
+        at = np.floor((points - self.low) / self.cell).astype(np.int64)
+        inside = ((at >= 0) & (at < self.map.shape)).all(axis=-1)
+        at = np.where(inside[..., None], at, 0)
+        return np.asarray(np.where(inside, self.map[at[..., 0], at[..., 1], at[..., 2]], self.cap))
+
+
+def _closest_points(
+    scene: FloatArray, samples: FloatArray, normals: FloatArray, starts: Sequence[FloatArray], size: float
+) -> list[FloatArray]:
+    """Return T_robot_camera of the poses to which closest points lead, best first, FINAL at most, each (4, 4)."""
+    tree = cKDTree(scene)
+    done: list[tuple[float, FloatArray]] = []
+    for T in starts:
+        score = np.inf
+        for step in range(12):
+            placed, facing = samples @ T[:3, :3].T + T[:3, 3], normals @ T[:3, :3].T
+            side = np.einsum("pc,pc->p", facing, placed) < -0.1 * np.linalg.norm(placed, axis=1)
+            distance, index = (np.asarray(found) for found in tree.query(placed[side]))
+            score = float(np.minimum(distance, CAP * size).mean())
+            limit = max(np.quantile(distance, 0.7), 1e-9)
+            good = distance <= limit
+            T = _rigid(scene[index[good]], placed[side][good]) @ T
+            if step == 4 and len(done) >= FINAL and score > 2.0 * sorted(s for s, _ in done)[FINAL - 1]:
+                break
+        done.append((score, T))
+    result: list[FloatArray] = []
+    for _, T in sorted(done, key=lambda d: d[0]):
+        T_robot_camera = invert_pose(T)
+        if all(_apart(T_robot_camera, other, samples) > 0.05 * size for other in result):
+            result.append(T_robot_camera)
+        if len(result) == FINAL:
+            break
+    return result
+
+
+def _apart(T: FloatArray, other: FloatArray, samples: FloatArray) -> float:
+    D = T @ invert_pose(other)
+    return float(np.linalg.norm(transform_points(D, samples) - samples, axis=1).mean())
+
+
+def _rigid(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return the pose that takes b (n, 3) best onto a (n, 3) (Kabsch 1976)."""
+    mean_a, mean_b = a.mean(axis=0), b.mean(axis=0)
+    U, _, Vt = np.linalg.svd((a - mean_a).T @ (b - mean_b))
+    R = U * [1.0, 1.0, np.sign(np.linalg.det(U @ Vt))] @ Vt
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, mean_a - R @ mean_b
+    return T
+
+
+class _Fine:
+    """A view with finer samples of the body and thinned points."""
+
+    def __init__(self, view: View, size: float) -> None:
+        self.surface = view.surface
+        self.samples, self.normals = _samples(view.surface, FINE)
+        self.points = voxel_grid(PointCloud(view.points[view.mine]), 0.01 * size).points
+        self.rays = view.points[:: max(1, len(view.points) // RAYS)]
+
+    def near(self, T: FloatArray, size: float) -> Any:
+        """Return a tree of the points about the body under a pose."""
+        placed = transform_points(T, self.points)
+        low, high = self.surface.positions.min(axis=0) - 0.3 * size, self.surface.positions.max(axis=0) + 0.3 * size
+        inside = ((placed >= low) & (placed <= high)).all(axis=1)
+        return cKDTree(self.points[inside] if inside.any() else np.full((1, 3), 1e3))
+
+
+def _settled(views: Sequence[_Fine], T_robot_camera: FloatArray, size: float) -> CloudPose:
+    """Return the pose to which closest points of all views lead, with finer points and a reach that shrinks, and how it fits."""
+    T, trees = invert_pose(T_robot_camera), [view.near(T_robot_camera, size) for view in views]
+    for reach in size * np.geomspace(CAP, REACH, FINE_STEPS):
+        a, b = [], []
+        for view, tree in zip(views, trees):
+            placed, looking = _visible(view.samples, view.normals, T)
+            distance, index = tree.query(placed[looking], distance_upper_bound=reach)
+            good = np.isfinite(distance)
+            a.append(tree.data[index[good]])
+            b.append(placed[looking][good])
+        if sum(len(part) for part in b) < 10:
+            break
+        T = _rigid(np.vstack(a), np.vstack(b)) @ T
+    return _judged(views, trees, invert_pose(T), size)
+
+
+def _visible(samples: FloatArray, normals: FloatArray, T_camera_robot: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Return samples in the camera's frame [m], and which of them look at it."""
+    placed, facing = transform_points(T_camera_robot, samples), normals @ T_camera_robot[:3, :3].T
+    return placed, np.einsum("pc,pc->p", facing, placed) < -0.1 * np.linalg.norm(placed, axis=1)
+
+
+def _judged(views: Sequence[_Fine], trees: Sequence[Any], T: FloatArray, size: float) -> CloudPose:
+    """Return how a pose fits: each visible sample has a measured point beside it or not, each ray ends on the body or behind it."""
+    limit, squares = REACH * size, []
+    for view, tree in zip(views, trees):
+        placed, looking = _visible(view.samples, view.normals, invert_pose(T))
+        squares.append(np.minimum(tree.query(placed[looking])[0] / limit, 1.0) ** 2)
+    bare = float(np.concatenate(squares).mean())
+    through = float(np.mean([_seen_through(view, T, limit) for view in views]))
+    return CloudPose(T, limit * float(np.sqrt(bare + through)), 1.0 - 2.0 * bare - 2.0 * through)
+
+
+def _seen_through(view: _Fine, T: FloatArray, limit: float) -> float:
+    """Return which share of the rays that meet the body end behind it [1]."""
+    points = transform_points(T, view.rays)
+    met = view.surface.cast(points, np.broadcast_to(T[:3, 3], points.shape), reach=np.inf)
+    if not len(met.index):
+        return 1.0
+    ray = np.linalg.norm(points[met.index] - T[:3, 3], axis=1)
+    far = np.linalg.norm(met.place(view.surface.positions) - T[:3, 3], axis=1)
+    return float((ray - far > 2.0 * limit).mean())

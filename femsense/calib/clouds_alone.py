@@ -1,0 +1,141 @@
+"""Cameras that no marker places: their poses from the clouds of free frames, from nowhere."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from femsense.calib.calibration import Calibration
+from femsense.calib.cloud_pose_search import View, find_cloud_pose
+from femsense.calib.from_clouds import refine_poses
+from femsense.core.arrays import FloatArray, freeze
+from femsense.core.errors import DataError
+from femsense.fem.equilibrium import Equilibrium
+from femsense.io.clouds.frame_clouds import read_frame_cloud
+from femsense.model.contact_patch import body_surface
+from femsense.model.drive import DrivenRobot, drive_of
+from femsense.model.observation import undo_depth
+from femsense.model.recording import Recording
+from femsense.model.robot import Robot
+from femsense.model.variants import solve_frame
+from femsense.pointcloud.rays import Surface
+from femsense.pointcloud.segmentation import color_mask
+
+FRAMES = 3
+"""Free frames in which a pose is sought, those under the most different inputs."""
+START_STD = (0.1, 0.03)
+"""What the search is off by at most: [rad], and as a share of the body's diagonal; three times what benchmarks/calibration.py finds."""
+UNDETERMINED = 0.5
+"""A direction is not determined where the clouds leave this share of START_STD."""
+
+
+def views_without_markers(recording: Recording) -> list[int]:
+    """Return cameras whose pose is not declared and that see clouds but no marker."""
+    seen = set(recording.marker_view.tolist()) | set(recording.unnamed_view.tolist())
+    if recording.rest is not None:
+        seen |= set(recording.rest.view.tolist())
+    return [
+        v
+        for v, T in enumerate(recording.T_robot_camera)
+        if T is None and v not in seen and any(files[v] is not None for files in recording.cloud_files)
+    ]
+
+
+def placed_by_clouds(robot: Robot, recording: Recording, calibration: Calibration, views: Sequence[int]) -> Calibration:
+    """Return the calibration with poses for cameras that no marker places.
+
+    Arguments:
+        robot, recording: as loaded.
+        calibration: what the other cameras say; the poses of `views` are replaced.
+        views: the cameras to place.
+
+    Raises:
+        DataError: no free frame with a cloud, nothing that fits, or a body with a symmetry.
+    """
+    states = _states(robot, recording, calibration, views)
+    poses, covariance = list(calibration.poses), np.array(calibration.joint_covariance)
+    turn, shift = START_STD[0], START_STD[1] * float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
+    for v in views:
+        poses[v] = freeze(find_cloud_pose(_seen(robot, recording, states, v)).T_robot_camera)
+        own = slice(6 * v, 6 * v + 6)
+        covariance[own, :], covariance[:, own] = 0.0, 0.0
+        covariance[own, own] = np.diag([turn**2] * 3 + [shift**2] * 3)
+    start = replace(
+        calibration,
+        T_robot_camera=poses[0],
+        poses=tuple(poses),
+        pose_covariance=freeze(covariance[:6, :6]),
+        joint_covariance=freeze(covariance),
+    )
+    fitted = refine_poses(robot, recording, start)
+    return replace(fitted, status=_status(recording, start, fitted, views))
+
+
+def _states(robot: Robot, recording: Recording, calibration: Calibration, views: Sequence[int]) -> dict[int, Equilibrium]:
+    """Return the equilibria of free frames in which a pose is sought."""
+    free = np.zeros(recording.frame_count, dtype=bool) if recording.free is None else recording.free
+    frames = [int(k) for k in np.flatnonzero(free) if all(recording.cloud_files[k][v] is not None for v in views)]
+    if not frames:
+        raise DataError(
+            "the pose of a camera without markers needs a cloud of a free frame: mark frames in which nothing touches the robot with 1 in the column free of frames.csv"
+        )
+    initial = None
+    if recording.actuation_zero == "unknown":
+        table = calibration.cable_tension_n if recording.actuation == "tension" else calibration.cable_displacement_m
+        initial = np.array([table[name] for name in robot.body.cable_names])
+    driven = DrivenRobot(robot, drive_of(robot, recording, initial=initial))
+    states = {k: solve_frame(driven, k) for k in _different(recording, frames)}
+    still = {k: state for k, state in states.items() if state.converged}
+    if not still:
+        raise DataError("no equilibrium in the free frames: are the inputs those of this robot?")
+    return still
+
+
+def _different(recording: Recording, frames: list[int]) -> list[int]:
+    """Return FRAMES of the frames at most, the first under the largest inputs, each next one as far from the others as can be."""
+    rows = np.hstack([recording.inputs, recording.pressures])[frames]
+    rows = rows / np.maximum(np.abs(rows).max(axis=0), 1e-12)
+    chosen = [int(np.abs(rows).sum(axis=1).argmax())]
+    while len(chosen) < min(FRAMES, len(frames)):
+        distance = np.linalg.norm(rows[:, None] - rows[chosen], axis=2).min(axis=1)
+        distance[chosen] = -1.0
+        chosen.append(int(distance.argmax()))
+    return [frames[i] for i in chosen]
+
+
+def _seen(robot: Robot, recording: Recording, states: dict[int, Equilibrium], view: int) -> list[View]:
+    triangles, seen = body_surface(robot.body.mesh).triangles, []
+    for k, state in states.items():
+        cloud = read_frame_cloud(recording, k, view=view)
+        if cloud is None:
+            continue
+        points = undo_depth(cloud.points, robot.observation)
+        mine, colored = np.ones(len(points), dtype=bool), cloud.colors is not None and robot.color_rgb is not None
+        if cloud.colors is not None and robot.color_rgb is not None:
+            mine = color_mask(cloud.colors, robot.color_rgb)
+        ahead = points[:, 2] > 0
+        seen.append(View(points[ahead], mine[ahead], Surface(state.positions, triangles), colored))
+    return seen
+
+
+def _status(recording: Recording, start: Calibration, fitted: Calibration, views: Sequence[int]) -> str:
+    """Return the status of the calibration, with the directions that the clouds leave open."""
+    texts = []
+    for v in views:
+        own = slice(6 * v, 6 * v + 6)
+        scale = 1.0 / np.sqrt(np.diag(start.joint_covariance)[own])
+        values, vectors = np.linalg.eigh(scale[:, None] * fitted.joint_covariance[own, own] * scale)
+        if values[-1] > UNDETERMINED**2:
+            texts.append(f"{recording.camera_names[v] or '(only one)'} {_direction(vectors[:, -1])}")
+    found = "converged (cameras placed by clouds alone)"
+    return found + (f", but the clouds hardly determine the pose of camera {'; '.join(texts)}" if texts else "")
+
+
+def _direction(vector: FloatArray) -> str:
+    """Return in words what a direction of (rotation, shift) is."""
+    turn, shift = np.linalg.norm(vector[:3]), np.linalg.norm(vector[3:])
+    axis = vector[:3] / turn if turn > shift else vector[3:] / shift
+    about = ", ".join(format(a, "g") for a in np.round(axis, 1).tolist())
+    return f"as it turns about [{about}]" if turn > shift else f"along [{about}]"

@@ -1,0 +1,128 @@
+"""A camera's pose from clouds alone, from nowhere: rendered depth of another mesh and law, with noise, a table and things on it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from arm import T_ROBOT_CAMERA, arm, record
+
+from femsense.calib.calibrate import calibrate
+from femsense.calib.cloud_pose_search import difference
+from femsense.core.arrays import FloatArray
+from femsense.core.errors import DataError
+from femsense.core.pose import invert_pose
+from femsense.fem.mesh import surface_triangles
+from femsense.io.clouds.cloud_files import write_cloud
+from femsense.model.recording import Recording
+from femsense.pointcloud.cloud import PointCloud
+from femsense.pointcloud.rays import Surface
+from femsense.rig.camera import Shape, camera_of, cloud_of, look_at, render
+from femsense.rig.scene import floor_shape
+from femsense.rig.script import NoiseTable, ViewTable
+
+INPUTS = np.array([[2.0, 0, 0, 0], [0, 0, 2.0, 0]])
+EYES = ([0.25, 0.2, 0.2], [-0.05, -0.25, 0.25])
+
+
+def block(size: list[float], middle: list[float], color: list[float]) -> Shape:
+    box = trimesh.creation.box(extents=size)
+    return Shape(np.array(box.vertices) + middle, np.array(box.faces), np.array(color))
+
+
+def with_clouds(
+    folder: Path, recording: Recording, states: list[FloatArray], eyes: tuple[list[float], ...], *, clutter: bool, colored: bool
+) -> tuple[Recording, list[FloatArray]]:
+    """Return the recording with a cloud of each frame and camera, and the true poses."""
+    truth, rng = arm((8, 3, 3), law="neo_hookean"), np.random.default_rng(5)
+    poses = [look_at(eye, [0.05, 0.0, 0.0], roll=0.4 + i) for i, eye in enumerate(eyes)]
+    things = [floor_shape(-0.06, np.array([0.7, 0.6, 0.5])), block([0.08, 0.06, 0.05], [0.12, 0.1, -0.035], [0.8, 0.2, 0.2])]
+    things.append(block([0.04, 0.06, 0.06], [-0.021, 0.0, 0.0], [0.5, 0.5, 0.5]))
+    files = []
+    for k, state in enumerate(states):
+        body = Shape(state, surface_triangles(truth.body.mesh), np.array([0.2, 0.4, 0.8]))
+        row = []
+        for v, T in enumerate(poses):
+            camera = camera_of(ViewTable(eye_m=[0, 0, 1], target_m=[0, 0, 0]))
+            cloud = cloud_of(render(camera, T, [body, *(things if clutter else [])], noise=NoiseTable(), rng=rng), camera)
+            path = folder / f"{v}-{k}.ply"
+            write_cloud(path, cloud if colored else PointCloud(cloud.points))
+            row.append(path)
+        files.append(tuple(row))
+    V, none = len(eyes), np.zeros(0, np.int64)
+    bare = replace(
+        recording,
+        camera_names=tuple("ab"[:V]),
+        cameras=(None,) * V,
+        T_robot_camera=(None,) * V,
+        cloud_files=tuple(files),
+        color_files=((None,) * V,) * len(files),
+        marker_frame=none,
+        marker_index=none,
+        marker_view=none,
+        marker_xyz=np.zeros((0, 3)),
+    )
+    return bare, poses
+
+
+def off(T: FloatArray, true: FloatArray) -> tuple[float, float]:
+    """Return by how much a pose is turned [deg] and shifted at the body's middle [m]."""
+    mesh = arm().body.mesh
+    turn, shift = difference(T, true, Surface(mesh.nodes, surface_triangles(mesh)))
+    return float(np.degrees(turn)), shift
+
+
+def test_colourless_clouds_with_a_table_and_clutter_place_the_camera(tmp_path: Path) -> None:
+    recording, states = record(INPUTS)
+    bare, poses = with_clouds(tmp_path, recording, states, EYES[:1], clutter=True, colored=False)
+    calibration = calibrate(arm(), bare)
+    turn, shift = off(calibration.poses[0], poses[0])
+    assert turn < 1.5
+    assert shift < 1.5e-3
+    assert calibration.status.startswith("converged (cameras placed by clouds alone)")
+    assert np.isfinite(calibration.normal_rms_m)
+    assert (np.diag(calibration.pose_covariance) > 0).all()
+
+
+def test_one_camera_sees_markers_and_the_other_only_clouds(tmp_path: Path) -> None:
+    recording, states = record(INPUTS)
+    bare, poses = with_clouds(tmp_path, recording, states, EYES, clutter=False, colored=True)
+    both = replace(
+        bare,
+        marker_frame=recording.marker_frame,
+        marker_index=recording.marker_index,
+        marker_view=recording.marker_view,
+        marker_xyz=recording.marker_xyz @ (invert_pose(poses[0]) @ T_ROBOT_CAMERA)[:3, :3].T
+        + (invert_pose(poses[0]) @ T_ROBOT_CAMERA)[:3, 3],
+    )
+    calibration = calibrate(arm(), both)
+    for v, limit in ((0, 5e-4), (1, 1.5e-3)):
+        turn, shift = off(calibration.poses[v], poses[v])
+        assert turn < 1.5
+        assert shift < limit
+    assert np.isfinite(calibration.rms_m)
+
+
+def test_a_body_with_a_symmetry_is_refused(tmp_path: Path) -> None:
+    straight, states = record(np.zeros((1, 4)), truth=arm((8, 3, 3), gravity=(0.0, 0.0, 0.0)))
+    bare, _ = with_clouds(tmp_path, straight, states, EYES[:1], clutter=False, colored=True)
+    with pytest.raises(DataError, match=r"two poses fit the clouds alike: .* symmetry"):
+        calibrate(arm(gravity=(0.0, 0.0, 0.0)), bare)
+
+
+def test_a_scene_without_the_robot_is_refused(tmp_path: Path) -> None:
+    recording, states = record(INPUTS[:1])
+    away = [state + np.array([0.0, 0.0, 5.0]) for state in states]
+    bare, _ = with_clouds(tmp_path, recording, away, EYES[:1], clutter=True, colored=False)
+    with pytest.raises(DataError, match="no pose was found at which the clouds"):
+        calibrate(arm(), bare)
+
+
+def test_clouds_need_a_free_frame(tmp_path: Path) -> None:
+    recording, states = record(INPUTS[:1])
+    bare, _ = with_clouds(tmp_path, recording, states, EYES[:1], clutter=False, colored=True)
+    with pytest.raises(DataError, match="free"):
+        calibrate(arm(), replace(bare, free=np.zeros(1, dtype=bool)))
