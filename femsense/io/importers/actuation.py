@@ -20,6 +20,8 @@ APART = 0.1
 """The best correlation must lie this much above the next peak."""
 SMOOTH_S = 0.1
 """Both signals are averaged over this time before their speed is taken: noise of a tenth of the motion leaves 0.84 of correlation, not 0.41."""
+FLAT = 1e-9
+"""A signal whose variance over the overlap is below this share of its energy is constant (rounding of the transform)."""
 GRID = 4000
 """Samples of the common clock on which motion and inputs are compared, at most."""
 
@@ -136,7 +138,10 @@ def _activity(times: FloatArray, values: FloatArray, step: float) -> FloatArray:
 
 
 def _correlations(motion: FloatArray, drive: FloatArray) -> FloatArray:
-    """Return Pearson's correlation over the overlap for each lag −(len(drive) − 1) … len(motion) − 1; 0 below half an overlap."""
+    """Return Pearson's correlation over the overlap for each lag −(len(drive) − 1) … len(motion) − 1.
+
+    It is 0 below half an overlap, and where one of both stands still in it: nothing correlates with a constant.
+    """
     from scipy.signal import fftconvolve
 
     ones_m, ones_d = np.ones_like(motion), np.ones_like(drive)
@@ -148,10 +153,11 @@ def _correlations(motion: FloatArray, drive: FloatArray) -> FloatArray:
     sum_m, sum_d = over(motion, ones_d), over(ones_m, drive)
     with np.errstate(divide="ignore", invalid="ignore"):
         covariance = over(motion, drive) - sum_m * sum_d / n
-        spread = (over(motion**2, ones_d) - sum_m**2 / n) * (over(ones_m, drive**2) - sum_d**2 / n)
-        score = covariance / np.sqrt(np.maximum(spread, 1e-300))
+        of_m, of_d = over(motion**2, ones_d) - sum_m**2 / n, over(ones_m, drive**2) - sum_d**2 / n
+        score = covariance / np.sqrt(of_m * of_d)
+    varies = (of_m > FLAT * np.sum(motion**2)) & (of_d > FLAT * np.sum(drive**2))
     enough = n >= max(8, min(len(motion), len(drive)) // 2)
-    return np.where(enough & np.isfinite(score), np.clip(score, -1.0, 1.0), 0.0)
+    return np.where(enough & varies & np.isfinite(score), np.clip(score, -1.0, 1.0), 0.0)
 
 
 def _unsure(log: ActuationLog, found: str) -> InputError:

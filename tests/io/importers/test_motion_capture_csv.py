@@ -220,6 +220,18 @@ def test_an_offset_that_is_given(tmp_path: Path) -> None:
         imported(moving, tmp_path / "far", Options(unit="m"), log=log, offset=0.0, actuation="tension")
 
 
+def test_inputs_that_change_at_one_speed_tell_no_offset(tmp_path: Path) -> None:
+    """Where one signal is constant over the overlap, rounding alone is correlated with it."""
+    rng = np.random.default_rng(0)
+    rows = [f"{5 + 0.5 * k},{x},0,1" for k, x in enumerate(0.001 * rng.normal(size=22).cumsum())]
+    (tmp_path / "a.csv").write_text("\n".join(["time,tip_x,tip_y,tip_z", *rows]))
+    ramps = [*(2 - abs((k % 6) - 3) * 2 / 3 for k in range(13)), 0.2, 0.4, 0.6, 0.6, 0.6, 0.6, 0.4, 0.2, 0.0]
+    (tmp_path / "log.csv").write_text("\n".join(["time,cable_a", *(f"{100 + 0.5 * k},{v}" for k, v in enumerate(ramps))]))
+    log = read_actuation_log(tmp_path / "log.csv", Options())
+    with pytest.raises(InputError, match="does not tell the offset"):
+        imported(tmp_path / "a.csv", tmp_path / "out", Options(unit="m"), log=log, actuation="tension")
+
+
 @pytest.mark.parametrize("motion", [0.0, 0.02])
 def test_motion_that_tells_no_offset_is_said(motion: float, tmp_path: Path) -> None:
     """Noise alone; and 5 mm of noise on 20 mm of motion, whose best correlation is right and only 0.45."""
