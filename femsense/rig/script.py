@@ -16,6 +16,7 @@ from femsense.core.text import did_you_mean, key_path
 from femsense.io.robot_toml import Matrix, Share, Vector
 from femsense.io.tables import Schema, read_toml, validated
 from femsense.model.robot import Robot
+from femsense.rig.sensors import SensorTable
 
 FORMAT = "femsense-script-1"
 COLOR = "three numbers from 0 to 1: [red, green, blue]"
@@ -186,6 +187,7 @@ class ScriptTable(Schema):
     loads: list[LoadTable] = Field([], description="tables [[loads]]")
     truth: TruthTable = Field(default_factory=lambda: TruthTable.model_validate({}), description="a table [truth]")
     effects: list[dict[str, Any]] = Field([], description="tables [[effects]] that only the truth has")
+    sensors: list[SensorTable] = Field([], description="tables [[sensors]]: sensors in the body, written to sensors.csv")
     camera: ViewTable = Field(description="a table [camera] with eye_m and target_m, or T_robot_camera")
     markers: MarkersTable = Field(default_factory=lambda: MarkersTable.model_validate({}), description="a table [markers]")
     clouds: CloudsTable = Field(default_factory=lambda: CloudsTable.model_validate({}), description="a table [clouds]")

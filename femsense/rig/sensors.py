@@ -24,8 +24,6 @@ from femsense.io.robot_toml import Vector
 from femsense.io.tables import Schema
 
 COLOURS = ("red", "green", "blue")
-STREAM = 6
-"""Of random numbers; the recording's own noises have 1 to 5."""
 DIGITS = 9
 
 

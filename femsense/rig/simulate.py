@@ -32,6 +32,7 @@ from femsense.rig.camera import (
 )
 from femsense.rig.scene import frame_shapes
 from femsense.rig.script import Plan, ScriptTable, check_script, plan_script, read_script
+from femsense.rig.sensors import sensor_readings, write_sensors
 from femsense.rig.truth import TrueFrame, true_path, true_robot
 
 TRUTH_FORMAT = "femsense-truth-1"
@@ -39,7 +40,7 @@ CONTACT_COLUMNS = ("frame", "time_s", "contact", "x_m", "y_m", "z_m", "nx", "ny"
 REST_COLUMNS = ("rest_x_m", "rest_y_m", "rest_z_m")
 DIGITS = 9
 """Places are written to the nanometre, so that the last bits of a solver do not change a file."""
-STREAMS = {"placement": 1, "markers": 2, "inputs": 3, "rest": 4, "clouds": 5}
+STREAMS = {"placement": 1, "markers": 2, "inputs": 3, "rest": 4, "clouds": 5, "sensors": 6}
 """Each kind of noise has its own stream of random numbers, so that switching one off leaves the others alone."""
 
 
@@ -108,6 +109,8 @@ def write_experiment(experiment: Experiment, out_folder: str | Path) -> Path:
 
     def fill(folder: Path) -> None:
         _write_clouds(experiment, folder)
+        if experiment.script.sensors:
+            _write_sensors(experiment, folder)
         _write_truth(experiment, folder / "truth")
 
     return save_recording(recording_of(experiment), out_folder, fill=fill)
@@ -245,6 +248,13 @@ def _image(experiment: Experiment, shapes: list[Shape], k: int) -> DepthImage:
         observation=experiment.robot.observation,
         rng=_rng(script, "clouds", k),
     )
+
+
+def _write_sensors(experiment: Experiment, folder: Path) -> None:
+    script, time_s = experiment.script, experiment.plan.time_s
+    states = [frame.state.positions for frame in experiment.frames]
+    readings = sensor_readings(script.sensors, experiment.robot.body.mesh, states, time_s, rng=_rng(script, "sensors"))
+    write_sensors(folder / "sensors.csv", script.sensors, time_s, readings)
 
 
 # The truth

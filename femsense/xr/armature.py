@@ -98,6 +98,8 @@ class Armature:
     """Arc length of each bone at rest [m], shape (b,)."""
     normal: FloatArray
     """The x axis at the first point at rest, or the plane's normal; unit, shape (3,)."""
+    tangent: FloatArray
+    """Along the chain at the first point at rest; unit, shape (3,)."""
     planar: bool
     inextensible: bool
 
@@ -132,19 +134,18 @@ class Armature:
         positions, tangents = _along(x, self.knots, stations)
         if self.inextensible:
             positions = _with_length(x, self.knots, stations)
-        normals = self._normals(x, positions, tangents)
+        normals = self._normals(positions, tangents)
         T = np.tile(np.eye(4), (len(own), 1, 1))
         T[:, :3, 2], T[:, :3, 0] = tangents[own], normals[own]
         T[:, :3, 1] = np.cross(tangents[own], normals[own])
         T[:, :3, 3] = positions[own]
         return poses_from_matrices(T)
 
-    def _normals(self, x: FloatArray, positions: FloatArray, tangents: FloatArray) -> FloatArray:
+    def _normals(self, positions: FloatArray, tangents: FloatArray) -> FloatArray:
         """Return the x axis at each station, shape (k, 3)."""
         if self.planar:
             return _unit(np.cross(self.normal, tangents))
-        start = _along(self.rest_points, self.knots, np.zeros(1))[1][0]
-        return rotation_minimising(positions, tangents, _turned(self.normal, start, tangents[0]))
+        return rotation_minimising(positions, tangents, _turned(self.normal, self.tangent, tangents[0]))
 
 
 def make_armature(rest_points: npt.ArrayLike, options: ArmatureOptions | None = None) -> Armature:
@@ -167,7 +168,7 @@ def make_armature(rest_points: npt.ArrayLike, options: ArmatureOptions | None = 
     tangent = _along(x, knots, np.zeros(1))[1][0]
     planar = options.plane_normal is not None
     normal = _unit(np.asarray(options.plane_normal, dtype=np.float64)) if planar else _across(tangent, options.start_normal)
-    return Armature(freeze(x), freeze(knots), freeze(at), freeze(normal), planar, options.inextensible)
+    return Armature(freeze(x), freeze(knots), freeze(at), freeze(normal), freeze(tangent), planar, options.inextensible)
 
 
 def rotation_minimising(positions: FloatArray, tangents: FloatArray, start: FloatArray) -> FloatArray:

@@ -7,10 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import block_mesh
+from helpers import block_mesh, changed, write_block_robot
+from rig_scripts import SCRIPT
 
 from femsense.core.errors import InputError
+from femsense.io.recording_folder import load_recording
+from femsense.io.robot_toml import load_robot
 from femsense.rig.sensors import SensorTable, sensor_readings, write_sensors
+from femsense.rig.simulate import simulate
+from femsense.xr.proprioception.files import read_sensors
 
 MESH = block_mesh((4, 2, 2), (0.1, 0.03, 0.03))
 ALONG = {"from_m": [0.0, 0.015, 0.02], "to_m": [0.1, 0.015, 0.02]}
@@ -57,6 +62,21 @@ def test_the_file_is_what_learn_reads(tmp_path: Path) -> None:
     write_sensors(tmp_path / "sensors.csv", sensors, TIME[:2], readings)
     rows = list(csv.reader((tmp_path / "sensors.csv").open()))
     assert rows[0] == ["frame", "time_s", "a", "b_red", "b_green", "b_blue"] and [float(x) for x in rows[2][:2]] == [1, 0.1]
+
+
+def test_a_recording_of_the_rig_has_them_beside_its_markers(tmp_path: Path) -> None:
+    robot = load_robot(write_block_robot(tmp_path / "robot"))
+    table = {"name": "back", "from_m": [0.01, 0.015, 0.03], "to_m": [0.09, 0.015, 0.03], "noise_std": 1e-5}
+    script = changed(SCRIPT, {"markers__occlusion": False})
+    plain, with_sensors = (
+        simulate(robot, script | more, tmp_path / name) for name, more in (("a", {}), ("b", {"sensors": [table]}))
+    )
+    assert not (plain / "sensors.csv").exists()
+    assert (plain / "markers.csv").read_bytes() == (with_sensors / "markers.csv").read_bytes()
+    frames, time, channels, readings = read_sensors(with_sensors / "sensors.csv")
+    assert channels == ("back",) and len(frames) == 9 and time[6] == 4.5
+    assert np.abs(readings[3] - readings[0]).max() > 1e-4  # where the cable pulls most
+    load_recording(with_sensors)
 
 
 def test_a_line_without_length_is_refused() -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from femsense.core.arrays import FloatArray
-from femsense.core.errors import DataError
+from femsense.core.errors import DataError, InputError
 from femsense.xr.armature import Armature, ArmatureOptions, make_armature
 from femsense.xr.proprioception.bayes import train_bayesian
 from femsense.xr.proprioception.domain import learn_domain
@@ -75,10 +75,10 @@ def learn(
         progress: called with what is done and how much there is.
 
     Raises:
-        DataError: too few rows, or readings that never change.
+        InputError: a kind of map that there is not. DataError: too few rows, or readings that never change.
     """
     options = options or LearnOptions()
-    _check(data)
+    _check(data, options)
     held = rows_kept(len(data)) if test is None else np.zeros(len(data), dtype=bool)
     work, test = data.select(~held), data.select(held) if test is None else test
     kinds = tuple(kind for kind in options.kinds if kind not in NEEDED or find_spec(NEEDED[kind]) is not None)
@@ -170,7 +170,9 @@ def saturated_channels(readings: FloatArray, channels: tuple[str, ...]) -> list[
     return found
 
 
-def _check(data: Labelled) -> None:
+def _check(data: Labelled, options: LearnOptions) -> None:
+    if not options.kinds or not set(options.kinds) <= set(KINDS):
+        raise InputError("unknown kind of map", where="kinds", found=options.kinds, expected=" | ".join(KINDS))
     if len(data) < FEWEST_ROWS:
         raise DataError(
             f"{len(data)} rows have readings and all markers; at least {FEWEST_ROWS} are needed to learn and to hold some out"

@@ -28,7 +28,7 @@ NUMBERS = ("centre", "scale", "B", "b", "A", "C", "d")
 TURNED = ("B", "A", "C")
 """Stored so that rows of inputs are multiplied from the left."""
 DOMAIN = ("low", "high", "centre", "scale", "precision", "limit")
-CHAIN = ("rest_points", "knots", "at", "normal")
+CHAIN = ("rest_points", "knots", "at", "normal", "tangent")
 
 
 def save_model(model: ProprioceptiveModel, path: str | Path) -> Path:
@@ -78,8 +78,8 @@ def load_model(path: str | Path) -> ProprioceptiveModel:
 
 
 def _chain(chain: dict[str, Any]) -> Armature:
-    points, knots, at, normal = (freeze(chain[key]) for key in CHAIN)
-    return Armature(points, knots, at, normal, chain["planar"], chain["inextensible"])
+    points, knots, at, normal, tangent = (freeze(chain[key]) for key in CHAIN)
+    return Armature(points, knots, at, normal, tangent, chain["planar"], chain["inextensible"])
 
 
 def _document(model: ProprioceptiveModel, networks: dict[str, Network]) -> dict[str, Any]:

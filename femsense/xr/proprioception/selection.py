@@ -30,6 +30,7 @@ MEMORIES: tuple[tuple[float, ...], ...] = ((), (0.1,), (0.3,), (1.0,), (0.3, 1.0
 PENALTIES = (1e-6, 1e-4, 1e-3, 1e-2)
 LENGTHS, NOISES = (1.0, 2.0), (1e-3, 1e-2)
 MLP_UNITS = 32
+CHEAP = {"ridge", "radial"}
 Progress = Callable[[int, int], None]
 """Called with what is done, and how much there is."""
 
@@ -103,9 +104,9 @@ def compare_plans(
     for done, (taus, used) in enumerate(jobs):
         if progress is not None:
             progress(done, len(jobs))
-        for plan in _cheap_plans(taus, used, kinds):
+        for plan in _cheap_plans(taus, used, kinds if CHEAP & set(kinds) else ("ridge",)):
             _keep(best, compare_plan(plan, inputs[taus], targets, seed))
-    if best:
+    if not set(kinds) <= CHEAP:
         _keep_networks(best, kinds, lambda plan: compare_plan(plan, inputs[plan.memory_s], targets, seed), progress)
     return [best[kind] for kind in kinds if kind in best]
 

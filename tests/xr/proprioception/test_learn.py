@@ -170,6 +170,8 @@ def test_recordings_are_joined_and_their_filters_start_anew() -> None:
 def test_what_cannot_be_learnt_is_said() -> None:
     with pytest.raises(DataError, match="40 rows"):
         learn(session(1, rows=40))
+    with pytest.raises(InputError, match="unknown kind of map"):
+        learn(session(1), options=LearnOptions(kinds=("forest",)))
     still = session(1)
     with pytest.raises(DataError, match="no channel ever changes"):
         learn(labelled(still.time_s, np.ones((len(still), 2)), still.markers))
