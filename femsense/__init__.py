@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from femsense.loop.result.loop_result import LoopResult
     from femsense.model.effects import EFFECTS, Effect, apply_effects, find_effect
     from femsense.model.recording import Camera, Recording, RestMarkers, make_recording, select_frames
+    from femsense.model.recording_arrays import recording_from_arrays
     from femsense.model.robot import Robot
     from femsense.report.plot_run import plot_run
     from femsense.report.write import write_report
@@ -104,6 +105,7 @@ __all__ = [
     "read_calibration",
     "read_loop",
     "read_run",
+    "recording_from_arrays",
     "robot_names",
     "run_inputs",
     "save_model",
@@ -187,6 +189,7 @@ _HOMES = {
         "make_recording",
         "select_frames",
     ),
+    "model.recording_arrays": ("recording_from_arrays",),
     "model.robot": ("Robot",),
     "report.plot_run": ("plot_run",),
     "report.write": ("write_report",),

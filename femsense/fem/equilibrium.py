@@ -73,6 +73,11 @@ class Equilibrium:
     factor: Factorization | None
     """The last factorised stiffness (of the last Newton step but one); a start for nearby solves."""
 
+    def __repr__(self) -> str:
+        return (
+            f"Equilibrium({self.status}: {len(self.positions)} nodes, residual {self.residual_n:.1e} N, {self.iterations} steps)"
+        )
+
     @property
     def converged(self) -> bool:
         return self.status == CONVERGED

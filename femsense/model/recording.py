@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+import femsense
 from femsense.core.arrays import BoolArray, FloatArray, IntArray, freeze
 from femsense.core.errors import InputError
 from femsense.core.pose import check_pose
@@ -186,6 +187,19 @@ class Recording:
     def label(self) -> str:
         """What values of their own in each recording go by: its session, else the name of its folder; "" where it has neither."""
         return self.session or (self.folder.name if self.folder is not None else "")
+
+    @classmethod
+    def from_arrays(cls, time_s: npt.ArrayLike, **parts: Any) -> Recording:
+        """Return a recording of one camera from arrays; see `recording_from_arrays` for its parts, shapes and units."""
+        return femsense.recording_from_arrays(time_s, **parts)
+
+    def __repr__(self) -> str:
+        seconds = float(self.time_s[-1] - self.time_s[0]) if len(self.time_s) else 0.0
+        drives = [f"{', '.join(self.cable_names)} [{self.actuation}]"] if self.cable_names else []
+        drives += [f"chambers {', '.join(self.chamber_names)}"] if self.chamber_names else []
+        seen = [f"{len(self.marker_names)} markers"] if self.has_markers else []
+        seen += ["clouds"] if self.has_clouds else []
+        return f"Recording({'; '.join([f'{self.frame_count} frames, {seconds:.4g} s', *drives, *seen])})"
 
     @property
     def frame_count(self) -> int:

@@ -100,6 +100,10 @@ class Robot:
     surface_points: int = 0
     """So many of the markers, the last ones, are points of the surface that clouds are measured at; nobody glued them on."""
 
+    def __repr__(self) -> str:
+        mesh, drives = self.body.mesh, [*self.body.cable_names, *self.body.chamber_names]
+        return f"Robot({self.name}: {len(mesh.tets)} tetrahedra; {', '.join(drives) or 'no input'}; {len(self.marker_names)} markers)"
+
     def with_body(self, body: BodyModel) -> Robot:
         """Return the robot with another body on the same mesh."""
         return replace(self, body=body)

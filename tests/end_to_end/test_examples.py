@@ -58,6 +58,15 @@ def test_reach() -> None:
     assert example.far.status == "nearest" and example.far.limits and example.far.error_m > 0.1
 
 
+def test_proprioception() -> None:
+    example = load("proprioception")
+    assert example.model.report["error_mm"] < 0.5 and len(example.pose.bones) == 6
+    assert {item.channel for item in example.strange.outside} <= {"outer", "inner"} and example.strange.outside
+    assert not example.pose.outside and example.found.verdict == "base moved"
+    assert example.found.shift_mm == pytest.approx(np.hypot(5.0, 2.0), abs=0.5)
+    assert example.mended.report["adapted"]["by"] == "base" and example.mended.report["adapted"]["error_mm"] < 0.6
+
+
 def test_magnet() -> None:
     effect = load_own_effect(EXAMPLES / "magnet.py")
     robot = fs.load_robot("four-leg")

@@ -1,0 +1,66 @@
+"""A recording from arrays that a program already has."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import numpy.typing as npt
+
+from femsense.core.errors import InputError
+from femsense.model.recording import Recording, make_recording
+
+
+def recording_from_arrays(
+    time_s: npt.ArrayLike,
+    *,
+    inputs: Mapping[str, npt.ArrayLike] | None = None,
+    actuation: str = "tension",
+    pressures: Mapping[str, npt.ArrayLike] | None = None,
+    markers: Mapping[str, npt.ArrayLike] | None = None,
+    T_robot_camera: npt.ArrayLike | None = None,
+    free: npt.ArrayLike | None = None,
+) -> Recording:
+    """Return a recording of one camera made of arrays.
+
+    Arguments:
+        time_s: of each frame [s], increasing, shape (F,).
+        inputs: cable → its input [N or m], shape (F,); the true ones, not counted from an unknown zero.
+        actuation: what they are: "tension" or "displacement".
+        pressures: chamber → its pressure [Pa], shape (F,).
+        markers: marker → its places in the camera's frame [m], shape (F, 3), nan where it is hidden.
+        T_robot_camera: pose of the camera, shape (4, 4); None: not known. The identity where markers are in the robot frame.
+        free: frames in which nothing undeclared touches, shape (F,); None: not known.
+
+    Raises:
+        InputError: shapes that do not fit, times that do not increase.
+    """
+    frames = np.asarray(time_s, dtype=np.float64).size
+    places = {name: np.asarray(x, dtype=np.float64) for name, x in (markers or {}).items()}
+    for name, x in places.items():
+        if x.shape != (frames, 3):
+            raise InputError("places of another shape", where=f"markers[{name!r}]", found=x.shape, expected=(frames, 3))
+    grid = np.stack(list(places.values()), axis=1) if places else np.zeros((frames, 0, 3))
+    frame, index = np.nonzero(np.isfinite(grid).all(axis=2))
+    return make_recording(
+        time_s=time_s,
+        actuation=actuation,
+        cable_names=tuple(inputs or ()),
+        inputs=_columns(inputs, frames, "inputs"),
+        chamber_names=tuple(pressures or ()),
+        pressures=_columns(pressures, frames, "pressures"),
+        T_robot_camera=[T_robot_camera],
+        free=free,
+        marker_names=tuple(places),
+        marker_frame=frame,
+        marker_index=index,
+        marker_xyz=grid[frame, index],
+    )
+
+
+def _columns(series: Mapping[str, npt.ArrayLike] | None, frames: int, what: str) -> npt.NDArray[np.float64]:
+    columns = {name: np.asarray(values, dtype=np.float64) for name, values in (series or {}).items()}
+    for name, values in columns.items():
+        if values.shape != (frames,):
+            raise InputError("a series of another length", where=f"{what}[{name!r}]", found=values.shape, expected=(frames,))
+    return np.stack(list(columns.values()), axis=1) if columns else np.zeros((frames, 0))

@@ -1,0 +1,44 @@
+"""A recording from arrays, and short words for what a notebook shows."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers import write_block_robot
+
+import femsense as fs
+from femsense.core.errors import InputError
+from femsense.model.recording import marker_grid
+
+TIME = np.array([0.0, 0.5, 1.0])
+PLACES = {"tip": np.arange(9.0).reshape(3, 3), "back": np.array([[1.0, 2, 3], [np.nan] * 3, [4, 5, 6]])}
+
+
+def test_arrays_become_a_recording_that_a_folder_gives_back(tmp_path: Path) -> None:
+    made = fs.Recording.from_arrays(
+        TIME, inputs={"top": [0.0, 1.0, 2.0]}, pressures={"air": [0.0, 5.0, 9.0]}, markers=PLACES, T_robot_camera=np.eye(4)
+    )
+    fs.save_recording(made, tmp_path / "out")
+    for recording in (made, fs.load_recording(tmp_path / "out")):
+        assert (recording.cable_names, recording.chamber_names, recording.actuation) == (("top",), ("air",), "tension")
+        np.testing.assert_array_equal(recording.inputs[:, 0], [0.0, 1.0, 2.0])
+        np.testing.assert_array_equal(recording.pressures[:, 0], [0.0, 5.0, 9.0])
+        np.testing.assert_array_equal(marker_grid(recording), np.stack([PLACES["tip"], PLACES["back"]], axis=1))
+        np.testing.assert_array_equal(recording.T_robot_camera[0], np.eye(4))
+    assert repr(made) == "Recording(3 frames, 1 s; top [tension]; chambers air; 2 markers)"
+
+
+def test_arrays_that_do_not_fit_are_refused() -> None:
+    with pytest.raises(InputError, match="a series of another length"):
+        fs.Recording.from_arrays(TIME, inputs={"top": [1.0, 2.0]})
+    with pytest.raises(InputError, match="places of another shape"):
+        fs.Recording.from_arrays(TIME, markers={"tip": np.zeros((3, 2))})
+
+
+def test_a_robot_and_a_state_say_what_they_are_in_one_line(tmp_path: Path) -> None:
+    robot = fs.load_robot(write_block_robot(tmp_path))
+    state = fs.solve_equilibrium(robot.body)
+    assert repr(robot).startswith(f"Robot({robot.name}: ") and f"{len(robot.body.mesh.tets)} tetrahedra" in repr(robot)
+    assert repr(state).startswith("Equilibrium(converged") and len(repr(state)) < 200
