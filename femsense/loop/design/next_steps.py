@@ -142,7 +142,7 @@ def _gain(data: Data, fitted: FittedModel, noise: Noise, J: FloatArray, open_mod
     best = int(np.argmin(share))
     if share[best] > BRINGS:
         return float(share[best]), ""
-    names = [f"{e.name}" + ("" if len(own_p) == 1 else f" {p.part}") for e, _, own_p in open_model.terms for p in own_p]
+    names = [e.name if len(own_p) == 1 else f"{e.name} {p.label}" for e, _, own_p in open_model.terms for p in own_p]
     p = open_model.parameters[best]
     unit, size = (" %", 100.0) if p.scale == "log" else ("" if p.unit == "1" else f" {p.unit}", 1.0)
     return float(
