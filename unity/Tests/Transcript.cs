@@ -1,0 +1,65 @@
+// Checks Messages.cs against a transcript that Python wrote: each line is bytes in hexadecimal and the numbers that are in them.
+// Without Unity: mcs -out:transcript.exe unity/Runtime/Messages.cs unity/Tests/Transcript.cs && mono transcript.exe unity/Tests/transcript.txt
+using System;
+using System.Globalization;
+using System.IO;
+using System.Linq;
+
+namespace Femsense
+{
+    public static class Transcript
+    {
+        public static int Main(string[] arguments)
+        {
+            int checkedLines = 0;
+            foreach (var line in File.ReadAllLines(arguments[0]))
+            {
+                var parts = line.Split(' ');
+                var frame = Enumerable.Range(0, parts[0].Length / 2).Select(i => Convert.ToByte(parts[0].Substring(2 * i, 2), 16)).ToArray();
+                var wanted = parts.Skip(2).Select(p => double.Parse(p, CultureInfo.InvariantCulture)).ToArray();
+                var messages = Frames.Read(frame, frame.Length);
+                if (messages.Count != 1 || messages[0].Topic != parts[1]) return Fail(line, "topic");
+                var pose = Pose.Read(messages[0].Payload);
+                if (wanted.Length == 0)
+                {
+                    if (pose != null) return Fail(line, "no pose");
+                }
+                else if (pose == null || !Same(Numbers(pose), wanted)) return Fail(line, "numbers");
+                checkedLines++;
+            }
+            Console.WriteLine(checkedLines + " lines agree");
+            return 0;
+        }
+
+        /// <summary>seq, time, then the bones in Unity's frame.</summary>
+        private static double[] Numbers(Pose pose)
+        {
+            var found = new double[2 + pose.Bones.Length];
+            found[0] = pose.Seq;
+            found[1] = pose.TimeS;
+            var place = new float[3];
+            var turn = new float[4];
+            for (int b = 0; b < pose.Count; b++)
+            {
+                var v = pose.Bones;
+                int i = 7 * b;
+                Frame.Place(v[i], v[i + 1], v[i + 2], place);
+                Frame.Turn(v[i + 3], v[i + 4], v[i + 5], v[i + 6], turn);
+                for (int k = 0; k < 3; k++) found[2 + i + k] = place[k];
+                for (int k = 0; k < 4; k++) found[5 + i + k] = turn[k];
+            }
+            return found;
+        }
+
+        private static bool Same(double[] a, double[] b)
+        {
+            return a.Length == b.Length && Enumerable.Range(0, a.Length).All(i => Math.Abs(a[i] - b[i]) < 1e-6);
+        }
+
+        private static int Fail(string line, string what)
+        {
+            Console.WriteLine(what + ": " + line);
+            return 1;
+        }
+    }
+}
