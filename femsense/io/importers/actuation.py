@@ -16,6 +16,8 @@ from femsense.io.importers.plain_csv import named_columns, read_numbers, time_co
 
 SURE = 0.6
 """A correlation below this does not tell the offset."""
+DEVIATIONS = 5.0
+"""So many standard deviations it must be away from none (Fisher's z): of 40 random walks of 22 frames, 6 had more than 0.6."""
 APART = 0.1
 """The best correlation must lie this much above the next peak."""
 SMOOTH_S = 0.1
@@ -121,9 +123,12 @@ def _offset_of_motion(log: ActuationLog, journal: Journal, times: FloatArray) ->
     width = max(3, len(motion) // 50)
     others = np.delete(score, np.arange(max(best - width, 0), min(best + width + 1, len(score))))
     next_best = float(others.max(initial=0.0))
-    if score[best] < SURE or score[best] - next_best < APART:
-        raise _unsure(log, f"the best correlation is {score[best]:.2f}, the next {next_best:.2f}")
     lag = best - (len(drive) - 1)
+    overlap = min(len(motion), len(drive) + lag) - max(lag, 0)
+    chance = np.arctanh(min(score[best], 1.0 - 1e-12)) * np.sqrt(max(overlap - 3, 0))
+    if score[best] < SURE or score[best] - next_best < APART or chance < DEVIATIONS:
+        found = f"the best correlation is {score[best]:.2f} over {overlap} samples, the next {next_best:.2f}"
+        raise _unsure(log, found)
     return float(times[kept][0] - log.time_s[0] + lag * step), float(score[best]), next_best
 
 
