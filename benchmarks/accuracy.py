@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from femsense.app.mesh_accuracy import assess_accuracy
+from femsense.app.accuracy.assess import assess_accuracy
 from femsense.fem.blocks import block_mesh
 from femsense.fem.equilibrium import solve_equilibrium
 from femsense.fem.mesh import embed_points

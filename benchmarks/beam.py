@@ -33,8 +33,9 @@ from femsense.loop.fit.noise_components import Noise
 from femsense.loop.improve import improve
 from femsense.loop.result.loop_result import LoopResult
 from femsense.loop.result.tables import table_of
+from femsense.model.camera_frame import in_robot_frame
 from femsense.model.effects import FORMS, Effect, Entry, apply_effects
-from femsense.model.observation import Hypothesis, in_robot_frame
+from femsense.model.observation import Hypothesis
 from femsense.model.recording import Recording
 from femsense.model.remeshing import robot_on_mesh
 from femsense.model.robot import Robot

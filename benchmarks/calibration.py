@@ -36,10 +36,11 @@ from femsense.core.pose import invert_pose, make_pose, rotation_from_vector, tra
 from femsense.fem.mesh import surface_triangles  # noqa: E402
 from femsense.model.contact_patch import body_surface  # noqa: E402
 from femsense.model.drive import DrivenRobot, drive_of  # noqa: E402
+from femsense.model.frame_state import solve_frame  # noqa: E402
 from femsense.model.observation import Hypothesis, evaluate_scene, make_scene  # noqa: E402
 from femsense.model.recording import Recording, with_marker_table  # noqa: E402
+from femsense.model.recording_parts import Drives, Timeline
 from femsense.model.robot import Robot  # noqa: E402
-from femsense.model.variants import solve_frame  # noqa: E402
 from femsense.pointcloud.rays import Surface  # noqa: E402
 from femsense.pointcloud.segmentation import color_mask  # noqa: E402
 from femsense.rig.camera import Shape, camera_of, cloud_of, look_at, render  # noqa: E402
@@ -395,9 +396,7 @@ def _seen(robot: Robot) -> tuple[Recording, FloatArray]:
     from femsense.model.recording import make_recording
 
     count, a = len(robot.marker_names), len(robot.body.cables)
-    plain = make_recording(
-        time_s=[0.0], cable_names=robot.body.cable_names, inputs=np.full((1, a), 0.1), actuation_zero="unknown"
-    )
+    plain = make_recording(Timeline([0.0]), drives=Drives(robot.body.cable_names, np.full((1, a), 0.1), actuation_zero="unknown"))
     model = robot.marker_points + 1e-4 * np.random.default_rng(0).normal(size=(count, 3))
     seen = transform_points(invert_pose(T_ROBOT_CAMERA), model)
     return with_marker_table(plain, robot.marker_names, np.zeros(count, np.int64), np.arange(count), seen), seen

@@ -23,7 +23,7 @@ import numpy as np
 from femsense.core.pose import move_pose
 from femsense.io.recording_folder import load_recording
 from femsense.io.robot_toml import load_robot
-from femsense.loop.improve import improve
+from femsense.loop.improve import ImproveOptions, improve
 from femsense.loop.result.records import Value
 from femsense.model.recording import Recording
 from femsense.model.robot import Robot
@@ -181,7 +181,7 @@ def main() -> None:
             recording = replace(recording, color_files=tuple((None,) * len(files) for files in recording.color_files))
         for kind in options.kinds.split(","):
             began = time.process_time()
-            loop = improve(declared_robot(options.robot, case), [recording], measured=kind)
+            loop = improve(declared_robot(options.robot, case), [recording], options=ImproveOptions(measured=kind))
             print(row(case, CASES[options.robot][case], kind, loop, time.process_time() - began), flush=True)
 
 

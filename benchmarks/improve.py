@@ -38,7 +38,7 @@ from femsense.io.files import write_text
 from femsense.io.recording_folder import save_recording
 from femsense.io.robot_toml import load_robot, save_robot
 from femsense.model.effects import apply_effects
-from femsense.rig.script import Plan
+from femsense.rig.plan import Plan
 from femsense.rig.truth import true_path
 
 STAGES = (
@@ -185,6 +185,7 @@ def _on_clamp(entry: dict[str, Any], declared: int, true: int) -> dict[str, Any]
 def one_run(folder: Path, element: str, without: list[str]) -> None:
     """Close the loop as the command does, and print what each stage took."""
     from femsense.app.commands import improve_into
+    from femsense.loop.improve import ImproveOptions
     from femsense.report import write_report
 
     warnings.simplefilter("ignore")
@@ -200,8 +201,8 @@ def one_run(folder: Path, element: str, without: list[str]) -> None:
             Path(out) / "loop",
             folder / f"robot-{element}",
             [folder / "recording"],
-            user_effects=[folder / f"{n}.py" for n in OWN],
             without=without or None,
+            options=ImproveOptions(user_effects=[folder / f"{n}.py" for n in OWN]),
             say=lambda text: None,
             progress=mark,
         )

@@ -19,9 +19,11 @@ from femsense.fem.body import make_body, tie_cable
 from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.mesh import TetMesh, embed_points, to_quadratic
 from femsense.model.effects import apply_effects
-from femsense.model.recording import Recording, RestMarkers, make_recording
+from femsense.model.recording import Recording, make_recording
+from femsense.model.recording_parts import About, Drives, LoadRows, MarkerRows, RestMarkers, Timeline
 from femsense.model.robot import Observation, Robot, plain_actuation, spread_features
-from femsense.rig.script import ContactTable, Plan, PlannedContact
+from femsense.rig.plan import Plan, PlannedContact
+from femsense.rig.script import ContactTable
 from femsense.rig.truth import true_path
 
 CUBE_TETS = np.array([[0, 1, 3, 7], [0, 3, 2, 7], [0, 2, 6, 7], [0, 6, 4, 7], [0, 4, 5, 7], [0, 5, 1, 7]])
@@ -91,10 +93,9 @@ class Design:
             density=1070.0,
             law=law,
             clamped=clamped,
-            clamp_nodes=clamped if fine else corners,  # as a file has it that declares corners, whatever the elements
             cables=cables,
             gravity=gravity,
-        )
+        ).with_clamp_nodes(clamped if fine else corners)  # as a file has it that declares corners, whatever the elements
         corners = [self.shape(np.array([[s, *c]]))[0] for s in self.marker_stations for c in ((0, 1), (0, -1), (1, 0), (-1, 0))]
         points = np.array(corners)
         names = tuple(f"m{i:02d}" for i in range(len(points)))
@@ -497,20 +498,11 @@ def _measure(
         points = _through(T, true.marker_points + placement, true.observation) + case.white_m * rng.normal(size=(k, 3))
         rest = RestMarkers(true.marker_names, freeze(points), freeze(np.full(k, case.white_m)), freeze(np.zeros(k), np.int64))
     recording = make_recording(
-        time_s=plan.time_s,
-        actuation=case.control,
-        cable_names=declared.body.cable_names,
-        inputs=recorded,
-        sweep=list(plan.sweep),
-        free=np.ones(F, bool),
-        marker_names=declared.marker_names,
-        marker_frame=np.repeat(np.arange(F), k),
-        marker_index=np.tile(np.arange(k), F),
-        marker_xyz=seen,
-        rest=rest,
-        load_frame=plan.load_frame,
-        load_points=plan.load_points,
-        load_forces=plan.load_forces,
+        Timeline(plan.time_s, sweep=list(plan.sweep), free=np.ones(F, bool)),
+        drives=Drives(actuation=case.control, cable_names=declared.body.cable_names, inputs=recorded),
+        markers=MarkerRows(declared.marker_names, np.repeat(np.arange(F), k), np.tile(np.arange(k), F), seen),
+        loads=LoadRows(plan.load_frame, plan.load_points, plan.load_forces),
+        about=About(rest=rest),
     )
     return recording, T, noise
 

@@ -30,11 +30,23 @@ if TYPE_CHECKING:
     from femsense.io.recording_folder import load_recording, save_recording
     from femsense.io.robot_toml import load_robot, robot_names, save_robot
     from femsense.loop.files import read_loop, write_loop
-    from femsense.loop.improve import improve
+    from femsense.loop.improve import ImproveOptions, improve
     from femsense.loop.result.loop_result import LoopResult
+    from femsense.model.camera import Camera
     from femsense.model.effects import EFFECTS, Effect, apply_effects, find_effect
-    from femsense.model.recording import Camera, Recording, RestMarkers, make_recording, select_frames
+    from femsense.model.recording import Recording, make_recording, select_frames
     from femsense.model.recording_arrays import recording_from_arrays
+    from femsense.model.recording_parts import (
+        About,
+        Drives,
+        LoadRows,
+        MarkerRows,
+        RestMarkers,
+        Timeline,
+        Tool,
+        UnnamedRows,
+        Views,
+    )
     from femsense.model.robot import Robot
     from femsense.report.plot_run import plot_run
     from femsense.report.write import write_report
@@ -55,6 +67,7 @@ __version__ = "0.1.0"
 
 __all__ = [
     "EFFECTS",
+    "About",
     "Armature",
     "ArmatureOptions",
     "BodyModel",
@@ -63,12 +76,16 @@ __all__ = [
     "Comparison",
     "ContactForce",
     "DataError",
+    "Drives",
     "Effect",
     "Equilibrium",
     "FemsenseError",
+    "ImproveOptions",
     "InputError",
     "LearnOptions",
+    "LoadRows",
     "LoopResult",
+    "MarkerRows",
     "MissingDependency",
     "Motion",
     "ProprioceptiveModel",
@@ -79,7 +96,11 @@ __all__ = [
     "Run",
     "SensingOptions",
     "TetMesh",
+    "Timeline",
+    "Tool",
     "Tracker",
+    "UnnamedRows",
+    "Views",
     "WallContact",
     "__version__",
     "apply_effects",
@@ -174,7 +195,10 @@ _HOMES = {
         "read_loop",
         "write_loop",
     ),
-    "loop.improve": ("improve",),
+    "loop.improve": (
+        "ImproveOptions",
+        "improve",
+    ),
     "loop.result": ("LoopResult",),
     "model.effects": (
         "EFFECTS",
@@ -182,14 +206,24 @@ _HOMES = {
         "apply_effects",
         "find_effect",
     ),
+    "model.camera": ("Camera",),
     "model.recording": (
-        "Camera",
         "Recording",
-        "RestMarkers",
         "make_recording",
         "select_frames",
     ),
     "model.recording_arrays": ("recording_from_arrays",),
+    "model.recording_parts": (
+        "About",
+        "Drives",
+        "LoadRows",
+        "MarkerRows",
+        "RestMarkers",
+        "Timeline",
+        "Tool",
+        "UnnamedRows",
+        "Views",
+    ),
     "model.robot": ("Robot",),
     "report.plot_run": ("plot_run",),
     "report.write": ("write_report",),

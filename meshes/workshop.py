@@ -17,7 +17,8 @@ import numpy as np
 from femsense.core.arrays import FloatArray
 from femsense.core.pose import invert_pose, transform_points
 from femsense.fem.equilibrium import solve_equilibrium
-from femsense.fem.mesh import TetMesh, check_mesh
+from femsense.fem.mesh import TetMesh
+from femsense.fem.mesh_checks import check_mesh
 from femsense.io.files import write_toml
 from femsense.io.mesh_files import write_mesh
 from femsense.io.robot_toml import load_robot

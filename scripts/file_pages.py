@@ -19,7 +19,7 @@ from pydantic.fields import FieldInfo
 from femsense.io.clouds.frame_clouds import BESIDE, FOLDERS
 from femsense.io.recording_columns import COLUMNS, MEANS
 from femsense.io.recording_toml import RecordingTable
-from femsense.io.robot_toml import RobotTable
+from femsense.io.robot_tables import RobotTable
 from femsense.model.effects import EFFECT_NAMES
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "files.md"

@@ -175,6 +175,45 @@ def test_help_and_the_bare_import_load_nothing_heavy(code: str) -> None:
     assert not modules_after(code) & ({"numpy", "scipy", "numba", "rich"} | HEAVY)
 
 
+# How functions are called
+
+MOST_DEFAULTS = 6
+"""Beside `options`: a frozen type holds what else may be left out."""
+FIXED_BY_CONTRACT = {"solve_equilibrium"}
+"""Promised as it is: two drives of cables and two of chambers, loads, a start, and whether held cables push."""
+
+
+def is_a_command(function: ast.FunctionDef) -> bool:
+    """Return whether Typer calls a function: a command declares one parameter an option, and returns an `Answer`."""
+    return function.returns is not None and ast.unparse(function.returns) == "Answer"
+
+
+def defaulted(function: ast.FunctionDef) -> list[str]:
+    """Return the names of the arguments that may be left out, beside `options`."""
+    arguments = function.args
+    plain = [a.arg for a in (*arguments.posonlyargs, *arguments.args)]
+    named = [a.arg for a, default in zip(arguments.kwonlyargs, arguments.kw_defaults) if default is not None]
+    return [name for name in (*plain[len(plain) - len(arguments.defaults) :], *named) if name != "options"]
+
+
+def crowded_functions(tree: ast.AST) -> list[str]:
+    """Return the names of functions with more defaulted arguments than one reads."""
+    functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef) and not is_a_command(node)]
+    return [f.name for f in functions if len(defaulted(f)) > MOST_DEFAULTS and f.name not in FIXED_BY_CONTRACT]
+
+
+@pytest.mark.parametrize("file", FILES, ids=NAMES)
+def test_beyond_six_defaults_there_is_an_options_type(file: Path) -> None:
+    assert not crowded_functions(parse(file))
+
+
+def test_a_crowded_function_is_seen() -> None:
+    seven = "def f(x, *, a=1, b=2, c=3, d=4, e=5, f=6, g=7): ..."
+    assert crowded_functions(ast.parse(seven)) == ["f"] and crowded_functions(ast.parse(seven.replace("*,", ""))) == ["f"]
+    assert not crowded_functions(ast.parse(seven.replace("g=7", "options=None")))
+    assert not crowded_functions(ast.parse(seven.replace(": ...", " -> Answer: ...")))
+
+
 # The public names
 
 

@@ -6,6 +6,7 @@ import contextlib
 import importlib
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +24,7 @@ from femsense.loop.files import check_loop_folder, loop_inputs, read_loop, write
 from femsense.sensing.run_files import check_run_folder, read_run, run_inputs, write_run
 
 if TYPE_CHECKING:
+    from femsense.loop.improve import ImproveOptions
     from femsense.sensing.types import Run, SensingOptions
 
 Progress = Callable[..., None]
@@ -85,8 +87,7 @@ def improve_into(
     validation: Sequence[str | Path] = (),
     effects: Sequence[str] | None = None,
     without: Sequence[str] | None = None,
-    user_effects: Sequence[str | Path] = (),
-    measured: str = "auto",
+    options: ImproveOptions | None = None,
     again: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
@@ -98,8 +99,7 @@ def improve_into(
         recordings: what effects are found on; validation: what they are tested on.
         say: told in one line what happens beside the loop.
         effects, without: names of effects to try, or not to try.
-        user_effects: Python files of effects that are tried too.
-        measured: "markers", "clouds" or "both": what is used of a recording; "auto": its markers, or its clouds where it has none.
+        options: of `improve`; what it keeps is set here.
         again: compute even where the result is there.
         progress: as of `improve`.
 
@@ -109,9 +109,10 @@ def improve_into(
     Raises:
         FemsenseError: bad input, a folder that holds something else, or data that allow no result.
     """
-    from femsense.loop.improve import improve
+    from femsense.loop.improve import ImproveOptions, improve
 
     check_loop_folder(folder)
+    how = options or ImproveOptions()
     twice = {Path(path).resolve() for path in recordings} & {Path(path).resolve() for path in validation}
     if twice:
         raise InputError(
@@ -123,8 +124,8 @@ def improve_into(
         )
     body = load_robot(robot)
     train, test = [load_recording(path) for path in recordings], [load_recording(path) for path in validation]
-    own = {str(file): file_hash(Path(file)) for file in user_effects if Path(file).is_file()}
-    inputs = loop_inputs(body, train, test, effects=effects, without=without, user_effects=own, measured=measured)
+    own = {str(file): file_hash(Path(file)) for file in how.user_effects if Path(file).is_file()}
+    inputs = loop_inputs(body, train, test, effects=effects, without=without, user_effects=own, measured=how.measured)
     _require_different([*inputs["recordings"], *inputs["validation"]])
     if not again and finished(folder, inputs):
         say(f"{folder} holds this result already (--again computes it anew)")
@@ -136,10 +137,8 @@ def improve_into(
             validation=test,
             effects=effects,
             without=without,
-            user_effects=user_effects,
-            measured=measured,
             progress=progress,
-            keep=_kept(folder, inputs),
+            options=replace(how, keep=_kept(folder, inputs)),
         )
     write_loop(loop, folder, inputs=inputs)
     return read_loop(folder)

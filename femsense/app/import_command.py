@@ -20,33 +20,15 @@ Progress = Callable[..., None]
 Say = Callable[[str], None]
 
 
-def import_options(
-    *,
-    format: str | None = None,
-    topics: Sequence[str] = (),
-    columns: Sequence[str] = (),
-    unit: str | None = None,
-    up: str | None = None,
-    clock: str = "auto",
-    rate: float | None = None,
-) -> Options:
-    """Return the options of the command line, checked. Raises InputError."""
-    for name, value, allowed in (
-        ("--unit", unit, tuple(UNITS)),
-        ("--up", up, ("x", "y", "z")),
-        ("--clock", clock, ("auto", "header", "record")),
-    ):
-        if value is not None and value not in allowed:
-            raise InputError(f"not a value of {name}", where=name, found=value, expected="|".join(allowed))
+def columns_named(columns: Sequence[str]) -> dict[str, str]:
+    """Return the mappings NAME=TARGET of `--map` as name in the source → name in the recording. Raises InputError."""
     pairs = [text.rpartition("=") if "@" not in text else text.partition("=") for text in columns]
     for text, (old, mark, new) in zip(columns, pairs):
         if not (old and mark and new):
             raise InputError(
                 "not a mapping", where="--map", found=text, expected="NAME=TARGET, such as motor1=cable_north or 3=tip.x"
             )
-    if rate is not None and rate <= 0:
-        raise InputError("not a rate", where="--rate", found=rate, expected="frames a second, > 0")
-    return Options(format, tuple(topics), {old: new for old, _, new in pairs}, unit, up, clock, rate)
+    return {old: new for old, _, new in pairs}
 
 
 def import_into(
@@ -79,9 +61,7 @@ def import_into(
     Raises:
         InputError: whatever is wrong with the capture, or another thing at this place.
     """
-    for name, value, allowed in (("--inputs", inputs, ("tension", "displacement")), ("--zero", zero, ("absolute", "unknown"))):
-        if value is not None and value not in allowed:
-            raise InputError(f"not a value of {name}", where=name, found=value, expected="|".join(allowed))
+    _check_options(options, inputs, zero)
     final, source_path = Path(folder), Path(path).expanduser()
     identity = _identity(source_path, options, inputs, zero, actuation, offset)
     known = _standing(final, identity, again)
@@ -106,13 +86,27 @@ def import_into(
 
 def import_text(folder: str | Path, document: Mapping[str, Any]) -> str:
     """Return what was imported as plain text."""
-    from femsense.app.inspect import section_text
+    from femsense.app.inspection.text import section_text
 
     notes = document.get("notes", [])
     shown = {key: value for key, value in document.items() if key not in ("notes",)}
     lines = [f"{folder}: a recording of {document['frames']} frames", "", *section_text(shown)]
     lines += ["", *(f"note: {note}" for note in notes)] if notes else []
     return "\n".join(lines)
+
+
+def _check_options(options: Options, inputs: str | None, zero: str | None) -> None:
+    for name, value, allowed in (
+        ("--unit", options.unit, tuple(UNITS)),
+        ("--up", options.up, ("x", "y", "z")),
+        ("--clock", options.clock, ("auto", "header", "record")),
+        ("--inputs", inputs, ("tension", "displacement")),
+        ("--zero", zero, ("absolute", "unknown")),
+    ):
+        if value is not None and value not in allowed:
+            raise InputError(f"not a value of {name}", where=name, found=value, expected="|".join(allowed))
+    if options.rate is not None and options.rate <= 0:
+        raise InputError("not a rate", where="--rate", found=options.rate, expected="frames a second, > 0")
 
 
 def _without_log(options: Options, log: Path) -> Options:

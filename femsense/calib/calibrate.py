@@ -27,12 +27,14 @@ from femsense.core.least_squares import FitResult, covariance_of
 from femsense.core.parallel import one_blas_thread
 from femsense.core.pose import move_pose
 from femsense.fem.equilibrium import Equilibrium, SolveOptions
+from femsense.model.camera_frame import in_robot_frame
 from femsense.model.drive import DrivenRobot, drive_of
-from femsense.model.observation import Hypothesis, Scene, SceneJet, evaluate_scene, in_robot_frame, make_scene, rest_residual
-from femsense.model.recording import Recording, check_against
+from femsense.model.frame_state import solve_frame
+from femsense.model.observation import Hypothesis, Scene, SceneJet, evaluate_scene, make_scene, rest_residual
+from femsense.model.recording import Recording
+from femsense.model.recording_checks import check_against
 from femsense.model.repeats import marker_repeatability
 from femsense.model.robot import Robot
-from femsense.model.variants import solve_frame
 
 MAX_FRAMES = 16
 """More frames than this are thinned out evenly; they would add time and hardly any accuracy."""

@@ -15,7 +15,8 @@ from scipy.optimize import linear_sum_assignment
 
 from femsense.core.arrays import BoolArray, FloatArray, IntArray
 from femsense.core.errors import DataError
-from femsense.model.observation import Scene, in_robot_frame
+from femsense.model.camera_frame import in_robot_frame
+from femsense.model.observation import Scene
 from femsense.model.recording import Recording, with_marker_table
 from femsense.model.robot import Robot
 

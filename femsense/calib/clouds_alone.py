@@ -14,12 +14,12 @@ from femsense.core.arrays import FloatArray, freeze
 from femsense.core.errors import DataError
 from femsense.fem.equilibrium import Equilibrium
 from femsense.io.clouds.frame_clouds import read_frame_cloud
+from femsense.model.camera_frame import undo_depth
 from femsense.model.contact_patch import body_surface
 from femsense.model.drive import DrivenRobot, drive_of
-from femsense.model.observation import undo_depth
+from femsense.model.frame_state import solve_frame
 from femsense.model.recording import Recording
 from femsense.model.robot import Robot
-from femsense.model.variants import solve_frame
 from femsense.pointcloud.rays import Surface
 from femsense.pointcloud.segmentation import color_mask
 

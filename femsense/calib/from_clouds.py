@@ -16,10 +16,11 @@ from femsense.core.arrays import FloatArray, freeze
 from femsense.core.errors import FemsenseError
 from femsense.core.pose import moved_poses
 from femsense.fem.equilibrium import Equilibrium
+from femsense.model.camera import CameraNoise
 from femsense.model.contact_patch import BodySurface, body_surface
 from femsense.model.drive import DrivenRobot, drive_of
 from femsense.model.quasi_static_path import free_path
-from femsense.model.recording import CameraNoise, Recording
+from femsense.model.recording import Recording
 from femsense.model.robot import Robot
 from femsense.pointcloud.rays import Surface
 

@@ -16,7 +16,8 @@ import numpy.typing as npt
 from femsense.core.arrays import BoolArray, FloatArray, IntArray
 from femsense.core.errors import InputError
 from femsense.io.clouds.images import check_image_size, read_color, read_png
-from femsense.model.recording import Camera, Recording
+from femsense.model.camera import Camera
+from femsense.model.recording import Recording
 from femsense.model.robot import Robot
 from femsense.pointcloud.cloud import straight_rays
 from femsense.pointcloud.segmentation import color_mask

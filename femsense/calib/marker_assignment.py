@@ -20,8 +20,9 @@ from femsense.calib.pose_search import PosedNames, apart, refine_names, search_p
 from femsense.core.arrays import BoolArray, FloatArray, IntArray
 from femsense.core.errors import DataError
 from femsense.core.pose import transform_points
+from femsense.model.camera_frame import undo_depth
 from femsense.model.drive import DrivenRobot, drive_of
-from femsense.model.observation import make_scene, undo_depth
+from femsense.model.observation import make_scene
 from femsense.model.quasi_static_path import solve_path
 from femsense.model.recording import Recording, state_key, with_marker_table
 from femsense.model.robot import Robot

@@ -11,8 +11,9 @@ from scipy.spatial import cKDTree
 
 from femsense.core.arrays import BoolArray, FloatArray, IntArray
 from femsense.io.clouds.frame_clouds import read_frame_cloud
-from femsense.model.observation import undo_depth
-from femsense.model.recording import CameraNoise, Recording
+from femsense.model.camera import CameraNoise
+from femsense.model.camera_frame import undo_depth
+from femsense.model.recording import Recording
 from femsense.model.robot import Robot
 from femsense.pointcloud.cloud import PointCloud
 from femsense.pointcloud.rays import Surface, SurfaceHits, together

@@ -62,7 +62,7 @@ class BodyModel:
         return self.mesh.reach
 
     parts: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    """The connected part that each node belongs to, shape (n,); a robot has one (see `mesh.check_mesh`)."""
+    """The connected part that each node belongs to, shape (n,); a robot has one (see `mesh_checks.check_mesh`)."""
     chambers: tuple[Chamber, ...] = ()
     chamber_curvature: tuple[sp.csr_matrix, ...] = ()
     """Second derivatives of the volume of each chamber (see `chambers.curvature_map`), each (nb, n)."""
@@ -151,6 +151,10 @@ class BodyModel:
         chambers = tuple(replace(c, seed=freeze(tie.positions(nodes)[0])) for c, tie in zip(self.chambers, seeds))
         return replace(self, mesh=mesh, stencil=stencil, chambers=chambers)
 
+    def with_clamp_nodes(self, nodes: npt.ArrayLike) -> BodyModel:
+        """Return the body with other nodes that springs replace where the clamp gives, shape (s,); all that are clamped do at first."""
+        return replace(self, clamp_nodes=freeze(as_indices(nodes, len(self.mesh.nodes), "clamp_nodes"), np.int64))
+
     def with_clamp_stiffness(self, stiffness: float = np.inf, *, turn: float = np.inf) -> BodyModel:
         """Return the body on a clamp that gives (see `femsense.fem.clamp`).
 
@@ -192,7 +196,6 @@ def make_body(
     density: float = 0.0,
     law: str = "corotational",
     clamped: npt.ArrayLike | BoolArray = (),
-    clamp_nodes: npt.ArrayLike | None = None,
     cables: tuple[Cable, ...] = (),
     chambers: tuple[Chamber, ...] = (),
     gravity: npt.ArrayLike = (0.0, 0.0, 0.0),
@@ -205,8 +208,7 @@ def make_body(
         poisson_ratio: [1], one or one an element.
         density: [kg/m³].
         law: "corotational", "neo_hookean" or "gent".
-        clamped: indices of the clamped nodes, or a mask (n,).
-        clamp_nodes: those of them that springs replace where the clamp gives; by default all.
+        clamped: indices of the clamped nodes, or a mask (n,); see also `BodyModel.with_clamp_nodes`.
         cables: see `tie_cable`.
         chambers: see `chambers.find_chamber`.
         gravity: [m/s²], shape (3,).
@@ -234,13 +236,15 @@ def make_body(
         if mask.size
         else np.zeros(0, np.int64)
     )
-    springs = indices if clamp_nodes is None else as_indices(clamp_nodes, n, "clamp_nodes")
     if not (np.isfinite(density) and density >= 0):
         raise InputError("out of range", where="density", found=density, expected="≥ 0 kg/m³")
     volumes = element_volumes(mesh)
     if (volumes <= FLAT * np.median(np.abs(volumes))).any():
         raise InputError(
-            "inverted or flat tetrahedra", where="mesh", expected="positive volumes", hint="see femsense.fem.mesh.check_mesh"
+            "inverted or flat tetrahedra",
+            where="mesh",
+            expected="positive volumes",
+            hint="see femsense.fem.mesh_checks.check_mesh",
         )
     check_chambers(chambers)
     ties = [segment_nodes(cable.path) for cable in cables]
@@ -253,7 +257,7 @@ def make_body(
         material,
         freeze(np.unique(indices), np.int64),
         np.inf,
-        freeze(springs, np.int64),
+        freeze(indices, np.int64),
         cables,
         _finite_vector(gravity, "gravity"),
         freeze(np.zeros((n, 3))),

@@ -1,16 +1,8 @@
-"""Mesh files: tetrahedra in any format that meshio reads, closed surfaces through fTetWild (cached), and element quality."""
+"""Mesh files: tetrahedra in any format that meshio reads, closed surfaces (which `meshing/tetrahedra` fills), element quality."""
 
 from __future__ import annotations
 
-import contextlib
-import hashlib
-import importlib.util
-import os
 import re
-import secrets
-import subprocess
-import sys
-import tempfile
 import warnings
 from pathlib import Path
 from typing import Any
@@ -19,37 +11,19 @@ import numpy as np
 import numpy.typing as npt
 
 from femsense.core.arrays import FloatArray, IntArray
-from femsense.core.errors import InputError, MissingDependency
+from femsense.core.errors import InputError
 from femsense.core.text import did_you_mean
 from femsense.fem.closest_point import FACES
 from femsense.fem.mesh import EDGES, TetMesh, element_volumes, oriented
-from femsense.io.files import PART_PREFIX, write_beside
+from femsense.io.files import write_beside
 from femsense.io.meshes.content import distinct_cells, gathered
 from femsense.io.meshes.reading import read_content, reason
 from femsense.io.meshing.surface import check_finite, merged, repaired
+from femsense.io.meshing.tetrahedra import compact, kept_tets, tets_of_surface
 
 SURFACE_ENDINGS = (".ply", ".stl", ".obj", ".off")
 SOLID_KINDS = ("tetra", "hexahedron", "wedge", "pyramid", "voxel", "polyhedron", "C3D", "type ")
 """How the names of solid elements begin."""
-FTETWILD = """
-import importlib.util, sys, types
-import numpy as np
-if importlib.util.find_spec("pyvista") is None:  # some versions import it for an accessor that is not used here
-    sys.modules["pytetwild._accessor"] = types.ModuleType("pytetwild._accessor")
-import pytetwild
-data = np.load("surface.npz")
-nodes, tets = pytetwild.tetrahedralize(
-    data["points"], data["triangles"], edge_length_fac=float(data["edge"]), epsilon=float(data["envelope"]), vtk_ordering=True,
-    quiet=True,
-)
-np.savez("tets.npz", nodes=nodes, tets=tets)
-"""
-EDGE_FRACTION = 0.05
-"""Edge length of a mesh made from a surface, over the diagonal of its bounding box."""
-FILL_SECONDS = 300.0
-"""fTetWild is stopped early after this time."""
-ENVELOPE = 1e-3
-"""How far a mesh made from a surface may leave it, over the diagonal of its bounding box."""
 
 
 def read_tets(path: Path, *, where: str | None = None) -> TetMesh:
@@ -68,7 +42,7 @@ def read_tets(path: Path, *, where: str | None = None) -> TetMesh:
     where = where or str(path)
     _check_exists(path, where)
     if path.suffix.lower() in SURFACE_ENDINGS:
-        return _tets_of_surface(path, *read_surface(path, where=where), where)
+        return tets_of_surface(path, *read_surface(path, where=where), where)
     content = read_content(path, where)
     points, cells = content.points, content.cells
     kinds = [kind for kind in ("tetra", "tetra10") if kind in cells]
@@ -84,7 +58,7 @@ def read_tets(path: Path, *, where: str | None = None) -> TetMesh:
     if kinds:
         return ordered_tets(points, cells[kinds[0]], where)
     if "triangle" in cells:
-        return _tets_of_surface(path, *closed_surface(points, cells["triangle"], where), where)
+        return tets_of_surface(path, *closed_surface(points, cells["triangle"], where), where)
     raise InputError(
         "the mesh has no tetrahedra",
         where=where,
@@ -155,51 +129,6 @@ def _no_triangles(path: Path, where: str) -> InputError:
     )
 
 
-def tetrahedralise(
-    points: FloatArray,
-    triangles: IntArray,
-    *,
-    edge_fraction: float = EDGE_FRACTION,
-    envelope: float = ENVELOPE,
-    where: str = "surface",
-    check_volume: bool = True,
-    seconds: float = FILL_SECONDS,
-    program: str = FTETWILD,
-) -> TetMesh:
-    """Return tetrahedra that fill a closed surface (fTetWild; another mesh each time, see `_tets_of_surface`).
-
-    Arguments:
-        points: shape (n, 3), any unit.
-        triangles: shape (t, 3), outward; a cavity's surface points into the cavity.
-        edge_fraction: wanted edge length over the diagonal of the bounding box [1].
-        envelope: how far the mesh may leave the surface, over that diagonal [1].
-        where: what a message names.
-        check_volume: warn where the tetrahedra hold more or less than the surface (which may where shells cross).
-        seconds: it is stopped early after so long [s].
-        program: Python that fills `surface.npz` and writes `tets.npz` where it runs.
-
-    Raises:
-        InputError: where nothing came out, or not in time. MissingDependency: without pytetwild.
-    """
-    nodes, tets = _run_ftetwild(points, triangles, edge_fraction, envelope, where, seconds, program)
-    if not len(tets):
-        raise InputError(
-            "no tetrahedra came out of this surface",
-            where=where,
-            found=f"{len(triangles)} triangles",
-            expected="a closed surface around a volume",
-        )
-    mesh = oriented(_compact(nodes, tets))
-    corners = points[triangles]
-    inside = float(np.linalg.det(corners).sum() / 6.0)  # Σ a · (b × c) / 6 over outward triangles
-    filled = float(element_volumes(mesh).sum()) / inside if inside else np.nan
-    if check_volume and not 0.95 < filled < 1.05:
-        warnings.warn(
-            f"{where}: the tetrahedra fill {100 * filled:.3g} % of the surface's volume; are its walls thin?", stacklevel=4
-        )
-    return mesh
-
-
 def write_mesh(mesh: TetMesh, path: Path) -> None:
     """Write a mesh in metres, in the format that the ending names (.vtu keeps all digits)."""
     import meshio
@@ -235,13 +164,6 @@ def radius_ratio(mesh: TetMesh) -> FloatArray:
     )
 
 
-def cache_folder() -> Path:
-    """Return where meshes made from surfaces are kept: $FEMSENSE_CACHE, else femsense in the user's cache folder."""
-    if chosen := os.environ.get("FEMSENSE_CACHE"):
-        return Path(chosen)
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "femsense"
-
-
 def _check_exists(path: Path, where: str) -> None:
     if path.is_file():
         return
@@ -261,7 +183,7 @@ def ordered_tets(points: FloatArray, tets: IntArray, where: str) -> TetMesh:
             f"{where}: {len(tets) - len(kept)} of {len(tets)} tetrahedra stand there twice (once for each physical group?): each is used once",
             stacklevel=4,
         )
-    mesh = _compact(points, tets[kept])
+    mesh = compact(points, tets[kept])
     _check_faces(mesh, where)
     if mesh.is_quadratic:
         _check_middles(mesh, where)
@@ -325,15 +247,6 @@ def _check_faces(mesh: TetMesh, where: str) -> None:
         raise InputError("the mesh has no surface", where=where, found="no face of one tetrahedron only", expected="a body")
 
 
-def _compact(points: FloatArray, tets: IntArray) -> TetMesh:
-    """Return the mesh of the used nodes: corners in their order, then the nodes that are only middles of edges."""
-    corners = np.unique(tets[:, :4])
-    order = np.concatenate([corners, np.setdiff1d(tets, corners)])
-    number = np.full(len(points), -1)
-    number[order] = np.arange(len(order))
-    return TetMesh(points[order], number[tets])
-
-
 def _check_middles(mesh: TetMesh, where: str) -> None:
     ends = mesh.nodes[mesh.tets[:, EDGES]]
     off = np.linalg.norm(mesh.nodes[mesh.tets[:, 4:]] - ends.mean(axis=2), axis=2)
@@ -363,97 +276,3 @@ def closed_surface(points: FloatArray, triangles: IntArray, where: str) -> tuple
         )
     made = repaired(points, triangles, where=where)
     return np.array(made.points), np.array(made.triangles)
-
-
-def kept_tets(surface: Path, points: FloatArray, triangles: IntArray) -> tuple[Path, Path]:
-    """Return where the tetrahedra of a surface file are kept: beside it, or in the cache where that cannot be written."""
-    content = points.tobytes() + triangles.tobytes() + f"1 {EDGE_FRACTION}".encode()
-    name = f"{surface.stem}-{hashlib.sha256(content).hexdigest()[:16]}.tets.npz"
-    return surface.with_name(name), cache_folder() / "tetrahedra" / name
-
-
-def _tets_of_surface(file: Path, points: FloatArray, triangles: IntArray, where: str) -> TetMesh:
-    """Return the tetrahedra of a surface as they are kept, or made and kept.
-
-    fTetWild shuffles with a seed of its own, so that only the kept mesh makes two runs equal: the first one written counts.
-    """
-    places = kept_tets(file, points, triangles)
-    for place in places:
-        kept = _read_kept(place)
-        if kept is not None:
-            return kept
-    mesh = tetrahedralise(points, triangles, edge_fraction=EDGE_FRACTION, where=where)
-    for place in places:
-        if _keep(mesh, place):
-            return _read_kept(place) or mesh
-    warnings.warn(
-        f"{where}: the tetrahedra cannot be kept, so that each run makes another mesh; femsense mesh writes one", stacklevel=4
-    )
-    return mesh
-
-
-def _keep(mesh: TetMesh, place: Path) -> bool:
-    """Write the mesh where none stands yet (two processes may come here at once); False where that is not possible."""
-    part = place.with_name(f"{PART_PREFIX}{secrets.token_hex(4)}-{place.name}")
-    try:
-        place.parent.mkdir(parents=True, exist_ok=True)
-        np.savez_compressed(part, nodes=mesh.nodes, tets=mesh.tets)
-        if _read_kept(place) is None:
-            place.unlink(missing_ok=True)
-        with contextlib.suppress(FileExistsError):
-            os.link(part, place)
-    except OSError:
-        return False
-    finally:
-        with contextlib.suppress(OSError):
-            part.unlink(missing_ok=True)
-    return True
-
-
-def _read_kept(place: Path) -> TetMesh | None:
-    """Return a kept mesh; None where there is none or it cannot be read."""
-    try:
-        with np.load(place) as data:
-            return TetMesh(data["nodes"], data["tets"])
-    except Exception:
-        return None
-
-
-def _run_ftetwild(
-    points: FloatArray, triangles: IntArray, edge_fraction: float, envelope: float, where: str, seconds: float, program: str
-) -> tuple[FloatArray, IntArray]:
-    """Return nodes and tetrahedra from a process of its own: fTetWild writes files where it runs, and it may crash."""
-    if importlib.util.find_spec("pytetwild") is None:
-        raise MissingDependency("a surface becomes tetrahedra through pytetwild: pip install pytetwild")
-    with tempfile.TemporaryDirectory(prefix="femsense-") as folder:
-        np.savez(
-            Path(folder) / "surface.npz",
-            points=points,
-            triangles=triangles.astype(np.int32),
-            edge=edge_fraction,
-            envelope=envelope,
-        )
-        try:
-            result = subprocess.run(
-                [sys.executable, "-c", program], cwd=folder, capture_output=True, text=True, errors="replace", timeout=seconds
-            )
-        except subprocess.TimeoutExpired:
-            raise InputError(
-                "fTetWild did not come to an end",
-                where=where,
-                found=f"{len(triangles)} triangles, stopped early after {seconds:.0f} s",
-                expected="tetrahedra",
-                hint="surfaces that nearly coincide and walls thinner than the tolerance are what takes long: mend them, or femsense mesh with another --tolerance or a larger --size",
-            ) from None
-        made = Path(folder) / "tets.npz"
-        if result.returncode or not made.is_file():
-            last = (result.stderr.strip().splitlines() or [f"exit status {result.returncode}"])[-1]
-            raise InputError(
-                "fTetWild failed on this surface",
-                where=where,
-                found=last[:200],
-                expected="tetrahedra",
-                hint="mend the surface (self-intersections, thin walls), or give tetrahedra",
-            )
-        with np.load(made) as data:
-            return np.asarray(data["nodes"], dtype=np.float64), np.asarray(data["tets"], dtype=np.int64)

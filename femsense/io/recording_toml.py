@@ -15,7 +15,9 @@ from femsense.core.pose import check_pose
 from femsense.core.text import key_path
 from femsense.io.mesh_files import read_surface
 from femsense.io.tables import Schema, schema_problems
-from femsense.model.recording import Camera, CameraNoise, Recording, Tool
+from femsense.model.camera import Camera, CameraNoise
+from femsense.model.recording import Recording
+from femsense.model.recording_parts import Tool
 
 FORMAT = "femsense-recording-1"
 PER_METRE = {"m": 1.0, "cm": 100.0, "mm": 1000.0}

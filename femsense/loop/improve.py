@@ -11,7 +11,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +40,23 @@ MOST_STEPS = 3
 """So many things to do next are said where an error is left."""
 
 
+@dataclass(frozen=True, eq=False, slots=True)
+class ImproveOptions:
+    """What the loop tries beside the effects of the list, what it uses of a recording, and how it computes."""
+
+    user_effects: Sequence[str | Path] = ()
+    """Python files of effects that are tried too (docs/effects/own.md); they belong to "all"."""
+    measured: str = "auto"
+    """"markers", "clouds" or "both": what is used of a recording; "auto": its markers, or its clouds where it has none."""
+    correct: bool = False
+    """Also learn an empirical correction of what is left, judged on held-out data; it is no cause, and no effect."""
+    seed: int = 0
+    """Of the permutation test and the bootstrap."""
+    keep: tuple[str | Path, Mapping[str, Any]] | None = None
+    """A file that holds how far the search has come, so that one that is killed goes on there, and what it is made from: a file that says
+    something else is not used. It is removed at the end."""
+
+
 @one_blas_thread()
 def improve(
     robot: Robot,
@@ -48,12 +65,8 @@ def improve(
     validation: Sequence[Recording] = (),
     effects: Sequence[str] | None = None,
     without: Sequence[str] | None = None,
-    user_effects: Sequence[str | Path] = (),
-    measured: str = "auto",
-    correct: bool = False,
     progress: Progress | None = None,
-    seed: int = 0,
-    keep: tuple[str | Path, Mapping[str, Any]] | None = None,
+    options: ImproveOptions | None = None,
 ) -> LoopResult:
     """Find what the model lacks, add it, and report the error on held-out data before and after.
 
@@ -63,37 +76,32 @@ def improve(
         validation: data to judge on; by default whole sweeps of the recordings are held out.
         effects: names to try; by default all.
         without: names to leave out.
-        user_effects: Python files of effects that are tried too (docs/effects/own.md); they belong to "all".
-        measured: "markers", "clouds" or "both": what is used of a recording; "auto": its markers, or its clouds where it has none.
-        correct: also learn an empirical correction of what is left, judged on held-out data; it is no cause, and no effect.
         progress: told what is going on.
-        seed: of the permutation test and the bootstrap.
-        keep: a file that holds how far the search has come, so that one that is killed goes on there, and what it is made from: a file that says
-            something else is not used. It is removed at the end.
+        options: effects of one's own, what is used of a recording, and how it is computed.
 
     Raises:
         InputError: unknown names, no recording; DataError: the data do not allow a fit.
     """
-    say = progress or (lambda text: None)
-    own = tuple(load_own_effect(file) for file in user_effects)
+    say, how = progress or (lambda text: None), options or ImproveOptions()
+    own = tuple(load_own_effect(file) for file in how.user_effects)
     for effect in own:
         try_own_effect(effect, robot)
     names = _names(effects, without, own)
     if not names:
         raise InputError("no effect is left to try", where="effects, without", expected="at least one of docs/effects/")
     _require_one_that_acts(names if effects else [], own, robot, recordings)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(how.seed)
     forms = (*FORMS, *forms_by_recording(FORMS, recordings), *own)
 
     def ready(body: Robot, names: Sequence[str]) -> Ready:
         say("reading and calibrating")
         with beside(lambda: _get_ready(body, names)) as finer_is_made:
-            data = prepare(body, recordings, validation, measured)
+            data = prepare(body, recordings, validation, how.measured)
             data, before, start = calibrated(replace(data, forms=forms, declared=robot), say)
             finer_is_made()
         return with_discretisation_error(data, start[-1][1], names, say), before, start
 
-    with Checkpoint(keep, forms) as checkpoint:
+    with Checkpoint(how.keep, forms) as checkpoint:
         data, search = _searched(robot, names, ready, checkpoint, say)
         say("testing what is left")
         result = conclude(data, search, rng)
@@ -102,8 +110,8 @@ def improve(
         if result.verdict == UNEXPLAINED or (result.confounded and not record):
             steps = next_steps(data, search.final, search.noise, noise_is_measured=noise_is_measured)
             record = "; or ".join(t for t in (*steps[:MOST_STEPS], record) if t)
-        correction = judged_correction(data, search.final) if correct else None
-    result = replace(result, next_experiment=record, data=replace(result.data, seed=seed), correction=correction)
+        correction = judged_correction(data, search.final) if how.correct else None
+    result = replace(result, next_experiment=record, data=replace(result.data, seed=how.seed), correction=correction)
     if distinguishes_effects(data):
         return result
     only = "record another state (other inputs, load or direction of gravity): these data repeat too few states, which cannot distinguish effects"

@@ -144,7 +144,7 @@ def frame_loads(driven: DrivenRobot, frame: int) -> FloatArray | None:
     return driven.drive.load_ties[rows].spread(driven.drive.load_forces[rows], len(driven.robot.body.mesh.nodes))
 
 
-def _key(driven: DrivenRobot, frame: int) -> bytes:
+def frame_key(driven: DrivenRobot, frame: int) -> bytes:
     """Return what tells the drive of two frames apart."""
     drive = driven.drive
     rows = drive.load_frame == frame

@@ -16,8 +16,8 @@ from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.linalg.refinement import ROUGH, prepare_roughly, roughly
 from femsense.fem.mesh import Embedding
 from femsense.fem.rotated_step import rotated_step
+from femsense.model.balance import Balance, rubbed
 from femsense.model.drive import DrivenRobot
-from femsense.model.variants import _Balance, _rubbed
 
 FINER_STEPS = 8
 
@@ -86,7 +86,7 @@ def _stepped(
     driven: DrivenRobot, fine: DrivenRobot, frame: int, base: Equilibrium, ties: Embedding, pace: float
 ) -> FloatArray | None:
     """Return what `finer_state` is after; the first steps go so far of the way."""
-    body, balance = fine.robot.body, _Balance(driven, frame, base)
+    body, balance = fine.robot.body, Balance(driven, frame, base)
     x = coarse = ties.positions(base.positions)
     at, force, first = _pulling(fine, balance, base, x)
     size, share = first, 1.0
@@ -113,11 +113,11 @@ def _stepped(
     return x if size <= FINER_ENOUGH * first else None
 
 
-def _pulling(fine: DrivenRobot, balance: _Balance, at: Equilibrium, x: FloatArray) -> tuple[Equilibrium, FloatArray, float]:
+def _pulling(fine: DrivenRobot, balance: Balance, at: Equilibrium, x: FloatArray) -> tuple[Equilibrium, FloatArray, float]:
     """Return a state with the tensions of its held cables that balance best at x, what they leave of the nodal forces there [N], (n, 3), and its
     size [N]."""
     body, dofs = fine.robot.body, fine.robot.body.free_map.dofs
-    force = balance.whole(fine, _rubbed(fine, balance.frame, at, x), x)
+    force = balance.whole(fine, rubbed(fine, balance.frame, at, x), x)
     rest, held = force.ravel()[dofs], np.flatnonzero(at.held[: len(body.cables)])
     if len(held):
         pulls = drive_rows(body, x)[held][:, dofs].T

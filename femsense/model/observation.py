@@ -14,17 +14,18 @@ import numpy as np
 
 from femsense.core.arrays import BoolArray, FloatArray, IntArray, freeze
 from femsense.core.errors import DataError
-from femsense.core.pose import invert_pose, moved_poses, transform_points
+from femsense.core.pose import moved_poses
 from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.mesh import Embedding
+from femsense.model.camera_frame import as_measured, in_robot_frame
 from femsense.model.drive import DrivenRobot, drive_of, has_history, inputs_wanted
 from femsense.model.effects import Effect, Entry, InRecording, Parameter, build_entry
 from femsense.model.effects.base import part_in
+from femsense.model.linear_answers import AtPoints
 from femsense.model.quasi_static_path import solve_path
 from femsense.model.recording import Recording
-from femsense.model.robot import Observation, Robot
+from femsense.model.robot import Robot
 from femsense.model.softening import path_energies, softened
-from femsense.model.variants import AtPoints
 from femsense.pointcloud.sheets import Crossings
 
 POSE_STEP = np.array([1e-5, 1e-5, 1e-5, 1e-6, 1e-6, 1e-6])
@@ -143,45 +144,6 @@ def with_rest_markers(robot: Robot, scene: Scene) -> Scene:
     every = np.array([known.get(name, -1) for name in rest.names], dtype=np.int64)
     own = every >= 0
     return replace(scene, rest_marker=every[own], rest_view=rest.view[own], rest_points=rest.positions[own])
-
-
-def undo_depth(points: FloatArray, seen: Observation) -> FloatArray:
-    """Return true camera points [m] from measured ones: measured distance = scale × true distance + offset."""
-    if seen.depth_scale != 1.0 or seen.depth_offset != 0.0:
-        distance = np.linalg.norm(points, axis=1, keepdims=True)
-        points = np.asarray(points * (distance - seen.depth_offset) / seen.depth_scale / distance)
-    for correct in seen.corrections:
-        points = correct(points)
-    return points
-
-
-def redo_depth(points: FloatArray, seen: Observation) -> FloatArray:
-    """Return what the camera measures of true camera points [m]; the inverse of `undo_depth` (corrections by fixed point)."""
-    if seen.depth_scale == 1.0 and seen.depth_offset == 0.0 and not seen.corrections:
-        return points
-    for correct in reversed(seen.corrections):
-        target = points
-        for _ in range(20):
-            points = points + (target - correct(points))
-    distance = np.linalg.norm(points, axis=1, keepdims=True)
-    return np.asarray(points * (seen.depth_scale * distance + seen.depth_offset) / distance)
-
-
-def in_robot_frame(points: FloatArray, view: IntArray, poses: Sequence[FloatArray], seen: Observation) -> FloatArray:
-    """Return measured points in the robot frame [m], each through the pose of its camera."""
-    corrected = undo_depth(points, seen)
-    result = np.empty_like(corrected)
-    for v, T in enumerate(poses):
-        result[view == v] = transform_points(T, corrected[view == v])
-    return result
-
-
-def as_measured(points: FloatArray, view: IntArray, poses: Sequence[FloatArray], seen: Observation) -> FloatArray:
-    """Return where each camera measures points of the robot frame [m], camera frame; the inverse of `in_robot_frame`."""
-    result = np.empty_like(points)
-    for v, T in enumerate(poses):
-        result[view == v] = transform_points(invert_pose(T), points[view == v])
-    return redo_depth(result, seen)
 
 
 def placements(robot: Robot, scene: Scene, poses: Sequence[FloatArray]) -> FloatArray:

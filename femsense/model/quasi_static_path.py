@@ -21,9 +21,12 @@ from femsense.fem.clamp import rigid_give
 from femsense.fem.equilibrium import Equilibrium, SolveOptions
 from femsense.fem.linalg.refinement import Refined
 from femsense.fem.mesh import Embedding
-from femsense.model.drive import DrivenRobot, _key, has_history
+from femsense.model.balance import Balance
+from femsense.model.drive import DrivenRobot, frame_key, has_history
+from femsense.model.frame_state import require_converged, solve_frame
+from femsense.model.linear_answers import AtPoints
 from femsense.model.robot import Robot
-from femsense.model.variants import AtPoints, _Balance, _require, _room, _Variants, solve_frame
+from femsense.model.variants import Variants, room_for_factor
 
 TRIED = 1e-8
 """Relative tolerance of states that are only tried: below a thousandth of a millimetre, where derivatives want a tenth of it."""
@@ -72,8 +75,8 @@ def solve_path(
     seen = {k: ties(driven.robot).positions(bases[k].positions) for k in {alike[k]: None for k in wanted}}
     others = {k: np.zeros((len(variants), *seen[alike[k]].shape)) for k in wanted}
     lent = {k: s.factor for k, s in (starts or {}).items() if k in bases and s.positions is bases[k].positions}
-    observed = _Variants(driven, variants, {k: bases[alike[k]] for k in todo}, alike, others, ties, lent, answers)
-    room = _room(len(unique))
+    observed = Variants(driven, variants, {k: bases[alike[k]] for k in todo}, alike, others, ties, lent, answers)
+    room = room_for_factor(len(unique))
     for k, factor in observed.write():
         plain = factor.plain if isinstance(factor, Refined) else factor
         if plain is not None and starts is not None and plain.bytes < _most_lent(starts[k], room):
@@ -110,7 +113,7 @@ def _alike(driven: DrivenRobot, frames: list[int], past: bool) -> dict[int, int]
     result: dict[int, int] = {}
     last = b""
     for k in frames:
-        key = _key(driven, k)
+        key = frame_key(driven, k)
         if past and key != last:
             first[key] = k
         result[k] = first.setdefault(key, k)
@@ -127,7 +130,7 @@ def _base_states(
     driven: DrivenRobot, frames: list[int], starts: dict[int, Equilibrium] | None, past: bool, rough: bool
 ) -> Iterator[Equilibrium]:
     """Yield the states of frames, without their factors; `starts` gets them with these where they fit into memory."""
-    room = _room(len(frames))
+    room = room_for_factor(len(frames))
     near = {k: state for k, state in sorted((starts or {}).items()) if _clamp_fits(driven.robot.body, state)}
 
     def keep(k: int, state: Equilibrium) -> Equilibrium:
@@ -144,7 +147,7 @@ def _base_states(
 
     def again(k: int, before: tuple[FloatArray, ...] | None = None, start: Equilibrium | None = None) -> Equilibrium:
         start, tried = near[k] if start is None else start, rough and k in known
-        return _require(
+        return require_converged(
             solve_frame(
                 driven,
                 k,
@@ -168,7 +171,9 @@ def _base_states(
             last = states[-1] if states else None
             before = last.segment_tensions if past and last is not None else None
             states.append(
-                keep(k, _require(solve_frame(driven, k, start=last, options=SolveOptions(before=before, single=True)), k))
+                keep(
+                    k, require_converged(solve_frame(driven, k, start=last, options=SolveOptions(before=before, single=True)), k)
+                )
             )
         return states
 
@@ -253,7 +258,7 @@ def _clamp_fits(body: BodyModel, state: Equilibrium) -> bool:
 
 def _taken_along(driven: DrivenRobot, frame: int, state: Equilibrium) -> Equilibrium | None:
     """Return a state with a rigid clamp as a start for a clamp that gives, the whole body taken along; None where that is no start."""
-    balance = _Balance(driven, frame, state)
+    balance = Balance(driven, frame, state)
     moved = rigid_give(driven.robot.body, state.positions, balance.whole(driven, balance.along(driven), state.positions))
     return None if moved is None else replace(state, positions=moved)
 

@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from femsense.core.errors import InputError
 from femsense.model.recording import Recording, make_recording
+from femsense.model.recording_parts import Drives, MarkerRows, Timeline, Views
 
 
 def recording_from_arrays(
@@ -43,18 +44,16 @@ def recording_from_arrays(
     grid = np.stack(list(places.values()), axis=1) if places else np.zeros((frames, 0, 3))
     frame, index = np.nonzero(np.isfinite(grid).all(axis=2))
     return make_recording(
-        time_s=time_s,
-        actuation=actuation,
-        cable_names=tuple(inputs or ()),
-        inputs=_columns(inputs, frames, "inputs"),
-        chamber_names=tuple(pressures or ()),
-        pressures=_columns(pressures, frames, "pressures"),
-        T_robot_camera=[T_robot_camera],
-        free=free,
-        marker_names=tuple(places),
-        marker_frame=frame,
-        marker_index=index,
-        marker_xyz=grid[frame, index],
+        Timeline(time_s, free=free),
+        drives=Drives(
+            actuation=actuation,
+            cable_names=tuple(inputs or ()),
+            inputs=_columns(inputs, frames, "inputs"),
+            chamber_names=tuple(pressures or ()),
+            pressures=_columns(pressures, frames, "pressures"),
+        ),
+        markers=MarkerRows(tuple(places), frame, index, grid[frame, index]),
+        views=Views(T_robot_camera=[T_robot_camera]),
     )
 
 

@@ -119,8 +119,8 @@ def _plain_body(
         young_modulus=1.0,
         poisson_ratio=0.3,
         clamped=np.frombuffer(clamped, np.int64),
-        clamp_nodes=cKDTree(mesh.nodes).query(held)[1] if len(held) else np.zeros(0, np.int64),
         cables=tuple(tie_cable(mesh, name, path.positions(old.nodes), np.zeros(3)) for name, path in paths),
         chambers=tuple(find_chamber(mesh, c.name, c.seed, max_pressure=c.max_pressure) for c in chambers),
     )
-    return made, parent
+    springs_on_new = cKDTree(mesh.nodes).query(held)[1] if len(held) else np.zeros(0, np.int64)
+    return made.with_clamp_nodes(springs_on_new), parent

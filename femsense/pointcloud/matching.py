@@ -47,6 +47,21 @@ class Matches:
         return np.asarray(features + self.distance[:, None] * normals)
 
 
+@dataclass(frozen=True, slots=True)
+class MatchingOptions:
+    """How a match is made of its candidates."""
+
+    average: bool = False
+    """Use the local fit in place of the nearest point."""
+    order: int = 2
+    """Of the fit: 2 follows the curvature of the body, 1 is quieter but off by about d_m²/(4 · radius of curvature). Fewer than 10 (order 2)
+    or 5 (order 1) candidates lower it."""
+    min_facing: float = 0.15
+    """Smallest cosine between a normal and the direction to a camera [1]; below it the feature is hidden."""
+    std_floor_m: float = 0.0
+    """What averaging cannot remove (correlated noise, calibration) [m]; added to every std in squares."""
+
+
 def match_along_normals(
     features: npt.ArrayLike,
     normals: npt.ArrayLike,
@@ -54,13 +69,10 @@ def match_along_normals(
     *,
     d_m: float,
     d_l: float,
-    average: bool = False,
-    order: int = 2,
     camera_position: npt.ArrayLike | None = None,
     view_direction: npt.ArrayLike | None = None,
-    min_facing: float = 0.15,
     robot_normals: npt.ArrayLike | None = None,
-    std_floor_m: float = 0.0,
+    options: MatchingOptions | None = None,
 ) -> Matches:
     """Return where the observed robot crosses the normal line of each feature point (Algorithm 3).
 
@@ -69,7 +81,7 @@ def match_along_normals(
 
         offset(u, v) = c₀ + c₁ u + c₂ v + c₃ u² + c₄ u v + c₅ v²        (order 2; the first 3 terms for order 1, c₀ for 0)
 
-    after points far from the nearest layer are set aside. With average=True the distance is c₀, the value on the line, with
+    after points far from the nearest layer are set aside. With `average` the distance is c₀, the value on the line, with
     std² = s² (AᵀA)⁻¹₀₀; without, it is the offset of the nearest point, with std² = s² + (slope · line_distance)². The scatter s is
     that of the feature's own residuals, drawn to the median of all features with the weight of four points.
 
@@ -79,15 +91,11 @@ def match_along_normals(
         robot_points: observed points of the robot [m], shape (r, 3).
         d_m: largest distance from the normal line [m]; farther: the feature is hidden.
         d_l: largest distance along the normal [m]; farther: the point belongs to something else.
-        average: use the local fit in place of the nearest point.
-        order: order of the fit; 2 follows the curvature of the body, 1 is quieter but off by about d_m²/(4 · radius of curvature).
-            Fewer than 10 (order 2) or 5 (order 1) candidates lower it.
         camera_position: of one camera [m], shape (3,), or of several, shape (c, 3).
         view_direction: instead, for a camera far away: where it looks, shape (3,) or (c, 3).
-        min_facing: smallest cosine between a normal and the direction to a camera; below it the feature is hidden.
         robot_normals: normals of the robot points, shape (r, 3); points that face away from the feature's normal are left
             out. Needed for thin bodies in clouds of several cameras.
-        std_floor_m: what averaging cannot remove (correlated noise, calibration) [m]; added to every std in squares.
+        options: how a match is made of its candidates.
     Returns:
         Matches.
     Raises:
@@ -96,13 +104,14 @@ def match_along_normals(
     places, directions = surface_pair(features, normals, "features", "normals")
     cloud = as_points(robot_points, "robot_points")
     across, along = positive(d_m, "d_m"), positive(d_l, "d_l")
-    if order not in (0, 1, 2):
-        raise InputError("no such order", where="order", found=order, expected="0, 1 or 2")
+    how = options or MatchingOptions()
+    if how.order not in (0, 1, 2):
+        raise InputError("no such order", where="order", found=how.order, expected="0, 1 or 2")
     facing = _facing(cloud, robot_normals)
-    visible = _visible(places, directions, camera_position, view_direction, float(min_facing))
+    visible = _visible(places, directions, camera_position, view_direction, float(how.min_facing))
     grid = build_grid(cloud, float(np.hypot(across, along)))
-    raw = _match(*_sorted(grid, facing), np.array(places), directions, visible, across, along, order)
-    return _matches(raw, grid, visible, average, float(std_floor_m))
+    raw = _match(*_sorted(grid, facing), np.array(places), directions, visible, across, along, how.order)
+    return _matches(raw, grid, visible, how.average, float(how.std_floor_m))
 
 
 # --- helpers ----------------------------------------------------------------------------------------------------------

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from femsense.core.arrays import BoolArray, FloatArray, IntArray, freeze
 from femsense.core.errors import InputError
 from femsense.core.pose import check_pose, invert_pose, make_pose, rotation_from_vector, transform_points
-from femsense.model.recording import Camera
+from femsense.model.camera import Camera
 from femsense.model.robot import Observation
 from femsense.pointcloud.cloud import PointCloud
 from femsense.rig.script import NoiseTable, ViewTable

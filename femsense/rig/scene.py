@@ -10,7 +10,8 @@ from femsense.core.arrays import FloatArray
 from femsense.fem.mesh import surface_triangles
 from femsense.model.robot import Robot
 from femsense.rig.camera import Shape
-from femsense.rig.script import Plan, SceneTable
+from femsense.rig.plan import Plan
+from femsense.rig.script import SceneTable
 from femsense.rig.truth import TrueContact, TrueFrame
 
 PLAIN_RGB = (0.6, 0.6, 0.6)

@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import numpy as np
 from pydantic import Field, model_validator
 
-from femsense.core.arrays import BoolArray, FloatArray, IntArray, freeze
 from femsense.core.errors import InputError
 from femsense.core.text import did_you_mean, key_path
-from femsense.io.robot_toml import Matrix, Share, Vector
+from femsense.io.robot_tables import Matrix, Share, Vector
 from femsense.io.tables import Schema, read_toml, validated
-from femsense.model.robot import Robot
 from femsense.rig.sensors import SensorTable
 
 FORMAT = "femsense-script-1"
@@ -194,43 +190,6 @@ class ScriptTable(Schema):
     scene: SceneTable = Field(default_factory=lambda: SceneTable.model_validate({}), description="a table [scene]")
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class PlannedContact:
-    """A contact along the frames."""
-
-    table: ContactTable
-    force: FloatArray
-    """[N], shape (F,); 0 where it does not touch."""
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Plan:
-    """A script frame by frame, for the cables of one robot."""
-
-    control: str
-    """"tension" or "displacement"."""
-    time_s: FloatArray
-    """[s], shape (F,)."""
-    sweep: tuple[str, ...]
-    free: BoolArray
-    """Shape (F,)."""
-    commanded: FloatArray
-    """Inputs counted from the initial ones [N] or [m], shape (F, a), in the order of the body's cables."""
-    initial: FloatArray
-    """True inputs before the first sweep [N] or [m], shape (a,)."""
-    pressures: FloatArray
-    """[Pa], shape (F, c), in the order of the body's chambers."""
-    gravity: FloatArray | None
-    """[m/s²], shape (F, 3); None: that of the body."""
-    load_frame: IntArray
-    """Frame index of each known load, shape (L,)."""
-    load_points: FloatArray
-    """[m], shape (L, 3)."""
-    load_forces: FloatArray
-    """[N], shape (L, 3)."""
-    contacts: tuple[PlannedContact, ...]
-
-
 def read_script(path: str | Path) -> ScriptTable:
     """Return a script after checking it. Raises InputError with file, key, what was found and what was expected."""
     file = Path(path)
@@ -245,12 +204,12 @@ def check_script(document: dict[str, Any], where: Path = Path("script")) -> Scri
     labels = [sweep.label for sweep in script.sweeps]
     for i, label in enumerate(labels):
         if label in labels[:i]:
-            raise _problem("a label stands twice", where, ("sweeps", i, "label"), repr(label), "each sweep its own label")
+            raise script_problem("a label stands twice", where, ("sweeps", i, "label"), repr(label), "each sweep its own label")
     named = [("contacts", i, table.sweep) for i, table in enumerate(script.contacts)]
     named += [("loads", i, table.sweep) for i, table in enumerate(script.loads)]
     for kind, i, label in named:
         if label not in labels:
-            raise _problem(
+            raise script_problem(
                 "no such sweep", where, (kind, i, "sweep"), repr(label), ", ".join(labels), did_you_mean(label, labels)
             )
     for i, sweep in enumerate(script.sweeps):
@@ -258,168 +217,18 @@ def check_script(document: dict[str, Any], where: Path = Path("script")) -> Scri
     return script
 
 
-def plan_script(script: ScriptTable, robot: Robot, where: Path = Path("script")) -> Plan:
-    """Return a script frame by frame.
-
-    Arguments:
-        script: the script.
-        robot: whose cables and markers it names.
-        where: what messages name.
-
-    Raises:
-        InputError: unknown cables or markers, negative tensions, lists of another length than their sweep, frames that are not there.
-    """
-    names, chambers = robot.body.cable_names, robot.body.chamber_names
-    _check_names(script, robot, where)
-    counts = [len(sweep.profile()) for sweep in script.sweeps]
-    first = dict(zip((s.label for s in script.sweeps), np.r_[0, np.cumsum(counts)[:-1]].tolist()))
-    count = dict(zip(first, counts))
-    steps = np.concatenate([np.full(n, s.dt_s or script.dt_s) for s, n in zip(script.sweeps, counts)])
-    contacts = tuple(_planned_contact(script, i, first, count, int(steps.size), where) for i in range(len(script.contacts)))
-    touched = {c.table.sweep for c in contacts if c.force.any()}
-    initial = np.array([script.initial.get(name, 0.0) for name in names])
-    commanded = np.vstack([_sweep_inputs(sweep, sweep.cables, names) for sweep in script.sweeps])
-    pressures = np.vstack([_sweep_inputs(sweep, sweep.chambers, chambers) for sweep in script.sweeps])
-    _check_pressures(pressures, robot, where)
-    if script.actuation == "tension" and (commanded + initial < -1e-12).any():
-        raise InputError(
-            "a tension below zero",
-            where=f"{where}: sweeps",
-            found=f"{(commanded + initial).min():g} N",
-            expected="initial + sweep ≥ 0 N",
-        )
-    _check_cloud_frames(script, int(steps.size), where)
-    frames, points, forces = _planned_loads(script, first, count, where)
-    return Plan(
-        control=script.actuation,
-        time_s=freeze(np.cumsum(steps) - steps[0]),
-        sweep=tuple(s.label for s, n in zip(script.sweeps, counts) for _ in range(n)),
-        free=freeze(
-            np.concatenate(
-                [np.full(n, s.label not in touched if s.free is None else s.free) for s, n in zip(script.sweeps, counts)]
-            ),
-            bool,
-        ),
-        commanded=freeze(commanded),
-        initial=freeze(initial),
-        pressures=freeze(pressures),
-        gravity=_planned_gravity(script, robot, counts),
-        load_frame=freeze(frames, np.int64),
-        load_points=freeze(points),
-        load_forces=freeze(forces),
-        contacts=contacts,
-    )
-
-
 def _check_sweep(sweep: SweepTable, i: int, where: Path) -> None:
     count = len(sweep.profile())
     if not count:
-        raise _problem("a sweep without frames", where, ("sweeps", i), repr(sweep.label), "rest, up, hold, down or levels")
+        raise script_problem("a sweep without frames", where, ("sweeps", i), repr(sweep.label), "rest, up, hold, down or levels")
     for kind, table in (("cables", sweep.cables), ("chambers", sweep.chambers)):
         for name, values in table.items():
             if isinstance(values, list) and len(values) != count:
                 found, expected = f"{len(values)} values", f"{count} values, or one number"
-                raise _problem("another number of values than frames", where, ("sweeps", i, kind, name), found, expected)
+                raise script_problem("another number of values than frames", where, ("sweeps", i, kind, name), found, expected)
 
 
-def _check_pressures(pressures: FloatArray, robot: Robot, where: Path) -> None:
-    for chamber, column in zip(robot.body.chambers, pressures.T):
-        if column.max() > chamber.max_pressure * (1 + 1e-9):
-            found, limit = f"{column.max():g} Pa", f"at most max_pressure_pa = {chamber.max_pressure:g} Pa"
-            raise InputError(
-                "more pressure than the chamber bears",
-                where=f"{where}: sweeps, chamber {chamber.name}",
-                found=found,
-                expected=limit,
-            )
-
-
-def _check_names(script: ScriptTable, robot: Robot, where: Path) -> None:
-    used: list[tuple[str, str, tuple[int | str, ...]]] = [("cable", name, ("initial", name)) for name in script.initial]
-    for i, sweep in enumerate(script.sweeps):
-        used += [("cable", name, ("sweeps", i, "cables", name)) for name in sweep.cables]
-        used += [("chamber", name, ("sweeps", i, "chambers", name)) for name in sweep.chambers]
-    for kind, name, place in used:
-        known = robot.body.cable_names if kind == "cable" else robot.body.chamber_names
-        if name not in known:
-            expected = ", ".join(known) or f"a robot with {kind}s"
-            raise _problem(f"unknown {kind}", where, place, repr(name), expected, did_you_mean(name, known))
-    for i, name in enumerate(script.markers.names or ()):
-        if name not in robot.marker_names:
-            raise _problem(
-                "unknown marker",
-                where,
-                ("markers", "names", i),
-                repr(name),
-                ", ".join(robot.marker_names),
-                did_you_mean(name, robot.marker_names),
-            )
-
-
-def _check_cloud_frames(script: ScriptTable, count: int, where: Path) -> None:
-    for i, frame in enumerate(script.clouds.extra_frames):
-        if frame >= count:
-            raise _problem("no such frame", where, ("clouds", "extra_frames", i), frame, f"0 … {count - 1}")
-
-
-def _sweep_inputs(sweep: SweepTable, values: dict[str, float | list[float]], names: Sequence[str]) -> FloatArray:
-    """Return the inputs of cables or chambers in a sweep, shape (frames, names)."""
-    profile = np.array(sweep.profile())
-    table = np.zeros((len(profile), len(names)))
-    for name, value in values.items():
-        table[:, names.index(name)] = np.asarray(value) if isinstance(value, list) else value * profile
-    return table
-
-
-def _planned_contact(
-    script: ScriptTable, i: int, first: dict[str, int], count: dict[str, int], total: int, where: Path
-) -> PlannedContact:
-    table = script.contacts[i]
-    n, start = count[table.sweep], first[table.sweep]
-    values = np.full(n, table.force_n) if isinstance(table.force_n, float | int) else np.array(table.force_n, dtype=float)
-    if len(values) != n:
-        raise _problem(
-            "another number of values than frames",
-            where,
-            ("contacts", i, "force_n"),
-            f"{len(values)} values",
-            f"{n} values, or one number",
-        )
-    force = np.zeros(total)
-    force[start : start + n] = values
-    return PlannedContact(table, freeze(force))
-
-
-def _planned_loads(
-    script: ScriptTable, first: dict[str, int], count: dict[str, int], where: Path
-) -> tuple[IntArray, FloatArray, FloatArray]:
-    frames, points, forces = [], [], []
-    for i, table in enumerate(script.loads):
-        n = count[table.sweep]
-        values = np.asarray(table.force_n, dtype=float)
-        values = np.tile(values, (n, 1)) if values.ndim == 1 else values
-        if len(values) != n:
-            raise _problem(
-                "another number of vectors than frames",
-                where,
-                ("loads", i, "force_n"),
-                f"{len(values)} vectors",
-                f"{n} vectors, or one",
-            )
-        frames += [first[table.sweep] + k for k in range(n)]
-        points += [table.point_m] * n
-        forces += values.tolist()
-    return np.array(frames, dtype=np.int64), np.array(points).reshape(-1, 3), np.array(forces).reshape(-1, 3)
-
-
-def _planned_gravity(script: ScriptTable, robot: Robot, counts: Sequence[int]) -> FloatArray | None:
-    if all(sweep.gravity_m_s2 is None for sweep in script.sweeps):
-        return None
-    rows = [robot.body.gravity if s.gravity_m_s2 is None else np.array(s.gravity_m_s2) for s in script.sweeps]
-    return freeze(np.repeat(rows, counts, axis=0))
-
-
-def _problem(
+def script_problem(
     what: str, where: Path, location: Sequence[int | str], found: object, expected: str, hint: str | None = None
 ) -> InputError:
     return InputError(what, where=f"{where}: {key_path(location)}", found=found, expected=expected, hint=hint)

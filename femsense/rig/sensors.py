@@ -20,7 +20,7 @@ from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.fem.mesh import TetMesh, embed_points
 from femsense.io.files import write_csv
-from femsense.io.robot_toml import Vector
+from femsense.io.robot_tables import Vector
 from femsense.io.tables import Schema
 
 COLOURS = ("red", "green", "blue")

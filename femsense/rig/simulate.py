@@ -15,7 +15,9 @@ from femsense.core.pose import transform_points
 from femsense.fem.mesh import embed_points, to_linear
 from femsense.io.files import write_csv, write_json
 from femsense.io.recording_folder import save_recording
-from femsense.model.recording import Camera, Recording, RestMarkers, make_recording
+from femsense.model.camera import Camera
+from femsense.model.recording import Recording, make_recording
+from femsense.model.recording_parts import About, Drives, LoadRows, MarkerRows, RestMarkers, Timeline, Views
 from femsense.model.robot import Robot
 from femsense.rig.camera import (
     DepthImage,
@@ -30,8 +32,9 @@ from femsense.rig.camera import (
     write_images,
     write_ply,
 )
+from femsense.rig.plan import Plan, plan_script
 from femsense.rig.scene import frame_shapes
-from femsense.rig.script import Plan, ScriptTable, check_script, plan_script, read_script
+from femsense.rig.script import ScriptTable, check_script, read_script
 from femsense.rig.sensors import sensor_readings, write_sensors
 from femsense.rig.truth import TrueFrame, true_path, true_robot
 
@@ -123,26 +126,23 @@ def recording_of(experiment: Experiment) -> Recording:
     recorded = recorded + script.input_std * _rng(script, "inputs").standard_normal(recorded.shape)
     frame, index = np.nonzero(experiment.visible)
     return make_recording(
-        time_s=np.round(plan.time_s, DIGITS),
-        actuation=script.actuation,
-        actuation_zero=script.actuation_zero,
-        cameras=[experiment.camera],
-        T_robot_camera=[experiment.T_robot_camera] if script.camera.declare_pose else None,
-        cable_names=experiment.declared.body.cable_names,
-        inputs=np.round(recorded, DIGITS),
-        chamber_names=experiment.declared.body.chamber_names,
-        pressures=plan.pressures,
-        free=plan.free,
-        sweep=plan.sweep,
-        gravity=plan.gravity,
-        marker_names=experiment.robot.marker_names,
-        marker_frame=frame,
-        marker_index=index,
-        marker_xyz=np.round(_measured_markers(experiment)[frame, index], DIGITS),
-        rest=_measured_rest(experiment) if script.markers.rest_file else None,
-        load_frame=plan.load_frame,
-        load_points=plan.load_points,
-        load_forces=plan.load_forces,
+        Timeline(np.round(plan.time_s, DIGITS), free=plan.free, sweep=plan.sweep, gravity=plan.gravity),
+        drives=Drives(
+            actuation=script.actuation,
+            actuation_zero=script.actuation_zero,
+            cable_names=experiment.declared.body.cable_names,
+            inputs=np.round(recorded, DIGITS),
+            chamber_names=experiment.declared.body.chamber_names,
+            pressures=plan.pressures,
+        ),
+        markers=MarkerRows(
+            experiment.robot.marker_names, frame, index, np.round(_measured_markers(experiment)[frame, index], DIGITS)
+        ),
+        loads=LoadRows(plan.load_frame, plan.load_points, plan.load_forces),
+        views=Views(
+            cameras=[experiment.camera], T_robot_camera=[experiment.T_robot_camera] if script.camera.declare_pose else None
+        ),
+        about=About(rest=_measured_rest(experiment) if script.markers.rest_file else None),
     )
 
 

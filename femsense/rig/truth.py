@@ -20,7 +20,8 @@ from femsense.model.remeshing import body_on_mesh
 from femsense.model.robot import Robot
 from femsense.model.softening import softened_share
 from femsense.rig.friction import Grip, new_grip, pull
-from femsense.rig.script import Plan, TruthTable
+from femsense.rig.plan import Plan
+from femsense.rig.script import TruthTable
 
 SETTLED = 1e-8
 """Tensions along the cables and contact forces rest when a pass moves them by less than this [N]."""

@@ -19,7 +19,7 @@ from femsense.fem.compliance import Tangent, tangent_at
 from femsense.fem.equilibrium import Equilibrium, SolveOptions
 from femsense.fem.mesh import vertex_normals
 from femsense.model.contact_patch import ContactPatch, closest_surface_point, patch_at
-from femsense.model.variants import solve_frame
+from femsense.model.frame_state import solve_frame
 from femsense.qp.forces import estimate_forces
 from femsense.qp.problem import ForceOptions, FrictionCone
 from femsense.sensing.measure import rows_at

@@ -12,7 +12,7 @@ from femsense.calib.scan import REACH, Scan, ray_rows
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import DataError
 from femsense.fem.equilibrium import Equilibrium
-from femsense.model.observation import in_robot_frame
+from femsense.model.camera_frame import in_robot_frame
 from femsense.pointcloud.rays import Surface
 from femsense.sensing.types import Rows, Sensor
 

@@ -10,7 +10,7 @@ from femsense.core.arrays import FloatArray, freeze
 from femsense.fem.assembly import internal
 from femsense.fem.compliance import Tangent
 from femsense.fem.equilibrium import Equilibrium
-from femsense.model.recording import CameraNoise
+from femsense.model.camera import CameraNoise
 from femsense.model.robot import spread_points
 from femsense.sensing.types import Knowledge, Rows, Sensor
 

@@ -15,13 +15,13 @@ from femsense.fem.compliance import tangent_at
 from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.mesh import vertex_normals
 from femsense.io.clouds.frame_clouds import read_frame_cloud
+from femsense.model.camera_frame import in_robot_frame
 from femsense.model.contact_patch import flat_nodes
-from femsense.model.observation import in_robot_frame
 from femsense.model.robot import spread_features
 from femsense.pointcloud.cloud import PointCloud
 from femsense.pointcloud.contact import detect_contacts
 from femsense.pointcloud.filters import pass_through, remove_radius_outliers, voxel_grid
-from femsense.pointcloud.matching import match_along_normals
+from femsense.pointcloud.matching import MatchingOptions, match_along_normals
 from femsense.pointcloud.segmentation import segment_by_model, segment_robot
 from femsense.qp.forces import estimate_forces
 from femsense.qp.problem import ForceOptions
@@ -97,9 +97,8 @@ def _matches(sensor: Sensor, robot: PointCloud, state: Equilibrium) -> Rows:
         robot.points,
         d_m=LINE * sensor.size,
         d_l=REACH * sensor.size,
-        average=True,
         camera_position=np.array([T[:3, 3] for T in sensor.calibration.poses]),
-        std_floor_m=5e-4,
+        options=MatchingOptions(average=True, std_floor_m=5e-4),
     )
     use = matches.found & np.isfinite(matches.std)
     if use.sum() < 3:

@@ -17,7 +17,8 @@ from femsense.fem.equilibrium import Equilibrium
 from femsense.model.contact_patch import body_surface, flat_nodes
 from femsense.model.drive import DrivenRobot, drive_of
 from femsense.model.quasi_static_path import free_path
-from femsense.model.recording import Recording, check_against
+from femsense.model.recording import Recording
+from femsense.model.recording_checks import check_against
 from femsense.model.robot import Robot, spread_features
 from femsense.pointcloud.rays import Surface
 from femsense.sensing.measure import rows_at

@@ -14,9 +14,10 @@ import femsense
 from femsense.calib.calibration import Calibration
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.fem.equilibrium import Equilibrium
+from femsense.model.camera import CameraNoise
 from femsense.model.contact_patch import BodySurface, ContactPatch
 from femsense.model.drive import DrivenRobot
-from femsense.model.recording import CameraNoise, Recording
+from femsense.model.recording import Recording
 from femsense.model.robot import Robot
 from femsense.sensing import run_arrays
 

@@ -20,9 +20,11 @@ import trimesh
 
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
-from femsense.fem.mesh import TetMesh, check_mesh, to_quadratic
+from femsense.fem.mesh import TetMesh, to_quadratic
+from femsense.fem.mesh_checks import check_mesh
 from femsense.io.files import write_toml
-from femsense.io.mesh_files import radius_ratio, tetrahedralise, write_mesh
+from femsense.io.mesh_files import radius_ratio, write_mesh
+from femsense.io.meshing.tetrahedra import tetrahedralise
 
 HERE = Path(__file__).resolve().parent
 LEGS = {"east": 0, "north": 1, "west": 2, "south": 3}

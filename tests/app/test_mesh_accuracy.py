@@ -11,21 +11,10 @@ import pytest
 from helpers import write_block_robot
 
 from femsense.app import cli
-from femsense.app.mesh_accuracy import (
-    SPACES,
-    AccuracyOptions,
-    Answer,
-    accuracy_text,
-    advice_on,
-    assess_accuracy,
-    contact_patches,
-    errors_of,
-    felt_features,
-    observed_points,
-    reference_of,
-    sized_loads,
-    spread_evenly,
-)
+from femsense.app.accuracy.assess import SPACES, assess_accuracy, observed_points
+from femsense.app.accuracy.errors import Answer, errors_of, reference_of
+from femsense.app.accuracy.loads import contact_patches, felt_features, sized_loads, spread_evenly
+from femsense.app.accuracy.report import AccuracyOptions, accuracy_text, advice_on
 from femsense.core.errors import DataError
 from femsense.fem.body import BodyModel
 from femsense.fem.equilibrium import solve_equilibrium

@@ -17,6 +17,7 @@ from femsense.core.pose import make_pose, transform_points
 from femsense.io.recording_folder import load_recording
 from femsense.io.robot_toml import load_robot
 from femsense.model.recording import Recording, make_recording, with_marker_table
+from femsense.model.recording_parts import Drives, Timeline
 from femsense.model.robot import Robot
 
 TRIALS = DATA / "trials"
@@ -42,7 +43,7 @@ def seen(robot: Robot, *, noise: float = 5e-5) -> FloatArray:
 def recorded(robot: Robot, xyz: FloatArray) -> Recording:
     count = len(robot.marker_names)
     r = make_recording(
-        time_s=0.1 * np.arange(FRAMES), cable_names=robot.body.cable_names, inputs=np.zeros((FRAMES, len(robot.body.cables)))
+        Timeline(0.1 * np.arange(FRAMES)), drives=Drives(robot.body.cable_names, np.zeros((FRAMES, len(robot.body.cables))))
     )
     return with_marker_table(
         r, robot.marker_names, np.repeat(np.arange(FRAMES), count), np.tile(np.arange(count), FRAMES), xyz.reshape(-1, 3)

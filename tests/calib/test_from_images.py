@@ -15,7 +15,9 @@ from femsense.calib.from_images import find_spots
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.core.pose import invert_pose, make_pose, rotation_from_vector, transform_points
-from femsense.model.recording import Camera, make_recording
+from femsense.model.camera import Camera
+from femsense.model.recording import make_recording
+from femsense.model.recording_parts import Drives, Timeline, Views
 from femsense.model.robot import MarkerLook, Robot
 
 W, H = 640, 480
@@ -130,13 +132,9 @@ def test_calibrate_reads_images_where_there_are_no_markers(tmp_path: Path) -> No
     cv2.imwrite(str(files[0]), np.rint(depth / 1e-4).astype(np.uint16))
     cv2.imwrite(str(files[1]), np.rint(255 * color[..., ::-1]).astype(np.uint8))
     bare = make_recording(
-        time_s=recording.time_s,
-        cable_names=recording.cable_names,
-        inputs=recording.inputs,
-        free=[False],
-        cameras=[camera()],
-        cloud_files=((files[0],),),
-        color_files=((files[1],),),
+        Timeline(recording.time_s, free=[False]),
+        drives=Drives(recording.cable_names, recording.inputs),
+        views=Views(cameras=[camera()], cloud_files=((files[0],),), color_files=((files[1],),)),
     )
     calibration = calibrate(robot, bare, frames=[0])
     expected = front(np.zeros((1, 3)), np.eye(3))

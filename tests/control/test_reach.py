@@ -144,10 +144,10 @@ def test_commands_are_those_of_the_motors(control: str, effects: list[dict[str, 
     motion = fs.reach(robot, {"tip": wanted}, control=control)
     assert motion.status == "reached"
     recording = fs.make_recording(
-        time_s=[0.0], cable_names=robot.body.cable_names, inputs=[list(motion.inputs.values())], actuation=control
+        fs.Timeline([0.0]), drives=fs.Drives(robot.body.cable_names, [list(motion.inputs.values())], actuation=control)
     )
     from femsense.model.drive import DrivenRobot, drive_of
-    from femsense.model.variants import solve_frame
+    from femsense.model.frame_state import solve_frame
 
     state = solve_frame(DrivenRobot(robot, drive_of(robot, recording)), 0)
     np.testing.assert_allclose(robot.markers.positions(state.positions)[0], wanted, atol=1e-6)

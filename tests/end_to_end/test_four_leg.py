@@ -17,14 +17,17 @@ from femsense.core.errors import InputError
 from femsense.core.pose import transform_points
 from femsense.fem.cables import bend_angles
 from femsense.fem.equilibrium import Equilibrium, solve_equilibrium
-from femsense.fem.mesh import TetMesh, check_mesh, element_volumes, refined, surface_triangles, to_linear
+from femsense.fem.mesh import TetMesh, element_volumes, refined, surface_triangles, to_linear
+from femsense.fem.mesh_checks import check_mesh
 from femsense.io.clouds.frame_clouds import read_frame_cloud
 from femsense.io.mesh_files import radius_ratio
 from femsense.io.recording_folder import load_recording
 from femsense.io.robot_toml import load_robot
-from femsense.model.recording import Recording, check_against, marker_grid
+from femsense.model.recording import Recording, marker_grid
+from femsense.model.recording_checks import check_against
 from femsense.model.robot import Robot
-from femsense.rig.script import plan_script, read_script
+from femsense.rig.plan import plan_script
+from femsense.rig.script import read_script
 
 FOLDER = ROOT / "meshes" / "four-leg"
 DEMO = FOLDER / "recordings" / "demo"

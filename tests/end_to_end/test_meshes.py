@@ -14,7 +14,8 @@ from triangles import distances
 
 from femsense.app import cli
 from femsense.fem.equilibrium import Equilibrium, solve_equilibrium
-from femsense.fem.mesh import check_mesh, element_volumes, surface_triangles, to_linear
+from femsense.fem.mesh import element_volumes, surface_triangles, to_linear
+from femsense.fem.mesh_checks import check_mesh
 from femsense.io.mesh_files import radius_ratio
 from femsense.io.robot_toml import load_robot, robot_names
 from femsense.model.robot import Robot

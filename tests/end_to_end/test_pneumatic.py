@@ -20,10 +20,13 @@ from femsense.io.robot_toml import load_robot, robot_document, save_robot
 from femsense.loop.data.holdout import sweeps_of
 from femsense.model.drive import DrivenRobot, drive_of
 from femsense.model.finer_mesh import finer_state
-from femsense.model.recording import check_against, make_recording, state_key
+from femsense.model.frame_state import solve_frame
+from femsense.model.recording import make_recording, state_key
+from femsense.model.recording_checks import check_against
+from femsense.model.recording_parts import Drives, Timeline
 from femsense.model.remeshing import finer_mesh, robot_on_mesh
-from femsense.model.variants import solve_frame
-from femsense.rig.script import check_script, plan_script
+from femsense.rig.plan import plan_script
+from femsense.rig.script import check_script
 from femsense.sensing.run_files import read_run
 
 CHAMBER = {"name": "core", "seed_m": [0.05, 0.015, 0.018], "max_pressure_pa": 12e3}
@@ -98,18 +101,18 @@ def test_the_script_rises_and_refuses_what_bursts(folder: Path) -> None:
 
 def test_columns_are_matched_by_name_and_pressures_beyond_the_limit_warn(folder: Path) -> None:
     robot = load_robot(folder)
-    fits = make_recording(time_s=[0.0, 1.0], chamber_names=["core"], pressures=[[0.0], [13e3]])
+    fits = make_recording(Timeline([0.0, 1.0]), drives=Drives(chamber_names=["core"], pressures=[[0.0], [13e3]]))
     with pytest.warns(UserWarning, match="'core' reaches 1.3e\\+04 Pa, more than its max_pressure_pa"):
         check_against(robot, fits)
     assert state_key(fits, 0) != state_key(fits, 1)
     for names, values in ((["other"], [[0.0]]), ([], None)):
         with pytest.raises(InputError, match=r"(?s)other chambers than those.*chamber_core"):
-            check_against(robot, make_recording(time_s=[0.0], chamber_names=names, pressures=values))
+            check_against(robot, make_recording(Timeline([0.0]), drives=Drives(chamber_names=names, pressures=values)))
 
 
 def test_excursions_of_the_pressure_are_sweeps() -> None:
     pressures = np.array([[0, 1, 2, 0, 1, 2, 0]], dtype=float).T * 1e3
-    recording = make_recording(time_s=np.arange(7.0), chamber_names=["core"], pressures=pressures)
+    recording = make_recording(Timeline(np.arange(7.0)), drives=Drives(chamber_names=["core"], pressures=pressures))
     assert sweeps_of(recording, np.arange(7)).tolist() == [0, 0, 0, 1, 1, 1, 2]
 
 
@@ -117,7 +120,7 @@ def test_pressure_pushes_on_the_finer_mesh_too(folder: Path) -> None:
     """A few steps from the state of the declared mesh end where the finer mesh comes to rest when it is solved for itself."""
     coarse = load_robot(folder)
     fine = robot_on_mesh(coarse, finer_mesh(coarse.body.mesh, None, 1))
-    recording = make_recording(time_s=[0.0], chamber_names=["core"], pressures=[[10e3]])
+    recording = make_recording(Timeline([0.0]), drives=Drives(chamber_names=["core"], pressures=[[10e3]]))
     driven, fine_driven = (DrivenRobot(r, drive_of(r, recording)) for r in (coarse, fine))
     state, ties = solve_frame(driven, 0), embed_points(coarse.body.mesh, fine.body.mesh.nodes)
     found, wanted = finer_state(driven, fine_driven, 0, state, ties), solve_frame(fine_driven, 0).positions

@@ -8,7 +8,8 @@ from scipy.spatial import cKDTree
 
 from femsense.core.errors import InputError
 from femsense.fem.blocks import block_mesh, rounded_square
-from femsense.fem.mesh import check_mesh, element_volumes, surface_triangles
+from femsense.fem.mesh import element_volumes, surface_triangles
+from femsense.fem.mesh_checks import check_mesh
 
 LEVELS = ([0.0, 1.0, 3.0], [0.0, 0.5, 1.0, 2.0], [-1.0, 1.0])
 

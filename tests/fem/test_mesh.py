@@ -18,12 +18,10 @@ from femsense.fem.mesh import (
     TetMesh,
     barycentric,
     body_parts,
-    check_mesh,
     closest_in_tet,
     closest_in_triangle,
     element_volumes,
     embed_points,
-    hinged_parts,
     oriented,
     refined,
     shape_slopes,
@@ -34,6 +32,7 @@ from femsense.fem.mesh import (
     triangle_normals,
     vertex_normals,
 )
+from femsense.fem.mesh_checks import check_mesh, hinged_parts
 from femsense.fem.stencil import block_row_numbers, make_free_map, make_stencil
 
 SIZE = (0.1, 0.03, 0.03)

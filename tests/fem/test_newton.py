@@ -158,7 +158,7 @@ def test_an_arch_snaps_through_under_tension_and_is_led_through_by_a_held_cable(
     tensions, negative = [], []
     for depth in depths:
         state = solve_equilibrium(body, shortening={"down": depth}, start=state)
-        assert state.converged, (depth, state.status)
+        assert state.converged and state.indefinite_steps == 0, (depth, state.status)  # the held cable bears what is soft
         tensions.append(state.tension["down"])
         negative.append(tangent_at(body, state).factor.negative)
     peak = int(np.argmax(tensions))
@@ -168,6 +168,18 @@ def test_an_arch_snaps_through_under_tension_and_is_led_through_by_a_held_cable(
     above = solve_equilibrium(body, tension={"down": 1.1 * tensions[peak]})
     assert below.converged and below.shortening["down"] < depths[peak] + 1e-4
     assert above.converged and above.shortening["down"] > 0.014 and above.indefinite_steps > 0
+
+
+def test_a_column_that_a_held_cable_shortens_buckles_all_the_same() -> None:
+    """The cable holds the way along the axis alone: the column goes to its side at nearly the same tension however far it is shortened."""
+    mesh = to_quadratic(block_mesh((8, 2, 2), (LENGTH, WIDTH, SIDE)))
+    axis = tie_cable(mesh, "axis", [[LENGTH, WIDTH / 2, SIDE / 2]], [0.0, WIDTH / 2, SIDE / 2])
+    body = make_body(mesh, young_modulus=E, poisson_ratio=0.0, clamped=mesh.nodes[:, 0] < 1e-9, cables=(axis,))
+    straight, bent, further = (solve_equilibrium(body, shortening={"axis": d}) for d in (0.0005, 0.0015, 0.002))
+    assert straight.converged and straight.indefinite_steps == 0 and abs(tip(body, straight)) < 1e-4
+    assert bent.converged and bent.indefinite_steps > 0
+    assert bent.tension["axis"] < 1.1 * 4 * EULER  # pulled towards the clamp, it buckles at four times Euler's load
+    assert further.tension["axis"] == pytest.approx(bent.tension["axis"], rel=0.02)
 
 
 # Load steps

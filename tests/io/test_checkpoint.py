@@ -17,7 +17,7 @@ from femsense.app.inspect import inspect_path
 from femsense.calib.calibrate import calibrate
 from femsense.core.errors import DataError
 from femsense.io.checkpoint import DIGEST, Checkpoint
-from femsense.loop.improve import improve
+from femsense.loop.improve import ImproveOptions, improve
 from femsense.loop.result.loop_result import LoopResult
 from femsense.loop.search.search_state import SearchProgress
 from femsense.model.effects import FORMS, apply_effects
@@ -33,7 +33,9 @@ def search(file: Path | None, progress: Callable[[str], None]) -> LoopResult:
     inputs, labels = sweeps(each=6)
     recording, _ = record(inputs, labels=labels, truth=arm((4, 1, 1)), effects=HIDDEN)
     keep = None if file is None else (file, MADE_FROM)
-    return improve(arm((4, 1, 1)), [recording], effects=["cable_friction", "gravity"], keep=keep, progress=progress)
+    return improve(
+        arm((4, 1, 1)), [recording], effects=["cable_friction", "gravity"], progress=progress, options=ImproveOptions(keep=keep)
+    )
 
 
 def stop_at(what: str) -> Callable[[str], None]:

@@ -20,19 +20,10 @@ from femsense.io.clouds.frame_clouds import read_frame_cloud
 from femsense.io.files import folder_hash
 from femsense.io.recording_folder import load_recording, save_recording
 from femsense.io.robot_toml import load_robot
-from femsense.model.recording import (
-    Camera,
-    CameraNoise,
-    Recording,
-    RestMarkers,
-    Tool,
-    check_against,
-    make_recording,
-    marker_grid,
-    select_frames,
-    warn_of_values,
-    with_marker_table,
-)
+from femsense.model.camera import Camera, CameraNoise
+from femsense.model.recording import Recording, make_recording, marker_grid, select_frames, with_marker_table
+from femsense.model.recording_checks import check_against, warn_of_values
+from femsense.model.recording_parts import About, Drives, LoadRows, MarkerRows, RestMarkers, Timeline, Tool, Views
 
 TOML = RECORDING_FILES["recording.toml"]
 CAMERA = "[camera]\nwidth = 8\nheight = 6\nfx = 10.0\nfy = 10.0\ncx = 3.5\ncy = 2.5\ndepth_unit_m = 0.001\n"
@@ -337,7 +328,9 @@ def test_a_tool_made_in_python_keeps_all_digits(tmp_path: Path) -> None:
     noise = CameraNoise("tof", floor=0.001, slope=0.002)
     camera = Camera("", 8, 6, 10.0, 10.0, 3.5, 2.5, np.zeros(5), 0.001, "inverse_brown_conrady", noise)
     r = make_recording(
-        time_s=[0.0], cameras=[camera], tools=[Tool("wedge", "mesh", points=points, triangles=triangles)], session="b"
+        Timeline([0.0]),
+        views=Views(cameras=[camera]),
+        about=About(tools=[Tool("wedge", "mesh", points=points, triangles=triangles)], session="b"),
     )
     back = load_recording(save_recording(r, tmp_path / "a"))
     corners = lambda t: np.sort(t.points[t.triangles].reshape(-1, 9), axis=0)  # noqa: E731
@@ -396,23 +389,24 @@ def recordings(draw: st.DrawFn) -> Recording:
     used = list(dict.fromkeys(m for _, m in seen))
     cables = draw(st.integers(0, 2))
     grid = lambda rows, columns: np.array([[draw(numbers) for _ in range(columns)] for _ in range(rows)]).reshape(rows, columns)  # noqa: E731
+    places = grid(len(seen), 3)
+    places[(places == 0.0).all(axis=1)] = [0.0, 0.0, 1.0]  # the middle of the lens is how a lost marker is written
     return make_recording(
-        time_s=np.cumsum([draw(st.floats(1e-3, 10.0)) for _ in range(F)]),
-        frame_numbers=np.cumsum([draw(st.integers(1, 9)) for _ in range(F)]),
-        actuation=draw(st.sampled_from(["tension", "displacement"])),
-        actuation_zero=draw(st.sampled_from(["absolute", "unknown"])),
-        cable_names=[f"c{j}" for j in range(cables)],
-        inputs=grid(F, cables),
-        free=draw(st.none() | st.lists(st.booleans(), min_size=F, max_size=F)),
-        sweep=draw(st.none() | st.lists(st.sampled_from(["", "up", "a b"]), min_size=F, max_size=F)),
-        gravity=draw(st.none() | st.just(grid(F, 3))),
-        marker_names=[names[m] for m in used],
-        marker_frame=[f for f, _ in seen],
-        marker_index=[used.index(m) for _, m in seen],
-        marker_xyz=grid(len(seen), 3),
-        load_frame=[0] * 2,
-        load_points=grid(2, 3),
-        load_forces=grid(2, 3),
+        Timeline(
+            np.cumsum([draw(st.floats(1e-3, 10.0)) for _ in range(F)]),
+            frame_numbers=np.cumsum([draw(st.integers(1, 9)) for _ in range(F)]),
+            free=draw(st.none() | st.lists(st.booleans(), min_size=F, max_size=F)),
+            sweep=draw(st.none() | st.lists(st.sampled_from(["", "up", "a b"]), min_size=F, max_size=F)),
+            gravity=draw(st.none() | st.just(grid(F, 3))),
+        ),
+        drives=Drives(
+            actuation=draw(st.sampled_from(["tension", "displacement"])),
+            actuation_zero=draw(st.sampled_from(["absolute", "unknown"])),
+            cable_names=[f"c{j}" for j in range(cables)],
+            inputs=grid(F, cables),
+        ),
+        markers=MarkerRows([names[m] for m in used], [f for f, _ in seen], [used.index(m) for _, m in seen], places),
+        loads=LoadRows([0] * 2, grid(2, 3), grid(2, 3)),
     )
 
 
@@ -450,18 +444,18 @@ def test_another_marker_table(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("parts", "text"),
     [
-        ({"time_s": [0.0, 0.0]}, "time does not increase"),
-        ({"frame_numbers": [1, 1]}, "a frame stands twice"),
-        ({"actuation": "force"}, "unknown actuation"),
-        ({"inputs": [[1.0]]}, "inputs has the wrong shape"),
-        ({"marker_frame": [0], "marker_index": [0], "marker_xyz": [[0, 0, 0]]}, "marker_index out of range"),
-        ({"sweep": ["a"]}, "sweep has the wrong length"),
-        ({"gravity": [[0, 0, np.nan]] * 2}, "gravity must be finite"),
+        ({"timeline": Timeline([0.0, 0.0])}, "time does not increase"),
+        ({"timeline": Timeline([0.0, 1.0], [1, 1])}, "a frame stands twice"),
+        ({"drives": Drives(actuation="force")}, "unknown actuation"),
+        ({"drives": Drives(inputs=[[1.0]])}, "inputs has the wrong shape"),
+        ({"markers": MarkerRows([], [0], [0], [[0, 0, 0]])}, "marker_index out of range"),
+        ({"timeline": Timeline([0.0, 1.0], sweep=["a"])}, "sweep has the wrong length"),
+        ({"timeline": Timeline([0.0, 1.0], gravity=[[0, 0, np.nan]] * 2)}, "gravity must be finite"),
     ],
 )
 def test_parts_that_do_not_fit(parts: dict[str, Any], text: str) -> None:
     with pytest.raises(InputError, match=text):
-        make_recording(**{"time_s": [0.0, 1.0], **parts})
+        make_recording(**{"timeline": Timeline([0.0, 1.0]), **parts})
 
 
 # Against a robot

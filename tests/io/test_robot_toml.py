@@ -22,7 +22,8 @@ import femsense
 from femsense.core.errors import InputError
 from femsense.fem.body import make_body, tie_cable
 from femsense.fem.mesh import TetMesh, element_volumes, embed_points, oriented, to_quadratic
-from femsense.io.mesh_files import radius_ratio, read_tets, tetrahedralise
+from femsense.io.mesh_files import radius_ratio, read_tets
+from femsense.io.meshing.tetrahedra import tetrahedralise
 from femsense.io.robot_toml import find_robot, load_robot, robot_document, robot_names, save_robot
 from femsense.model.robot import Observation, Robot, plain_actuation, spread_features
 
@@ -360,7 +361,7 @@ def test_any_declared_robot_round_trips(
 def surface_robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     pytest.importorskip("trimesh")
     monkeypatch.setenv("FEMSENSE_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr("femsense.io.mesh_files.EDGE_FRACTION", 0.2)
+    monkeypatch.setattr("femsense.io.meshing.tetrahedra.EDGE_FRACTION", 0.2)
     folder = write_block_robot(tmp_path / "robot", mesh__file="block.stl", cables=None)
     points, triangles = block_surface((100.0, 30.0, 30.0))
     meshio.Mesh(points, [("triangle", triangles)]).write(folder / "block.stl")

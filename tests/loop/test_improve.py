@@ -22,6 +22,7 @@ from femsense.loop.search.search import distinguishes_effects
 from femsense.loop.verdict.returned_model import is_sure
 from femsense.loop.verdict.sentences import by_noise
 from femsense.model.recording import make_recording
+from femsense.model.recording_parts import Drives, LoadRows, Timeline
 
 
 def found(loop, name):
@@ -178,7 +179,7 @@ def test_data_without_free_markers_say_so():
 
 def test_whole_sweeps_are_held_out_and_the_last_is_among_them():
     inputs, labels = sweeps()
-    recording = make_recording(time_s=np.arange(len(inputs)), cable_names=list("abcd"), inputs=inputs, sweep=labels)
+    recording = make_recording(Timeline(np.arange(len(inputs)), sweep=labels), drives=Drives(list("abcd"), inputs))
     fit, held, _ = hold_out(recording, np.arange(len(inputs)))
     assert not {labels[k] for k in fit} & {labels[k] for k in held}
     assert labels[-1] in {labels[k] for k in held}
@@ -189,7 +190,7 @@ def test_what_is_held_out_does_not_depend_on_the_order_of_sweeps():
 
     def held(order: np.ndarray) -> set[str]:
         recording = make_recording(
-            time_s=np.arange(len(inputs)), cable_names=list("abcd"), inputs=inputs[order], sweep=[labels[k] for k in order]
+            Timeline(np.arange(len(inputs)), sweep=[labels[k] for k in order]), drives=Drives(list("abcd"), inputs[order])
         )
         return {labels[order[k]] for k in hold_out(recording, np.arange(len(inputs)))[1]}
 
@@ -201,7 +202,7 @@ def test_a_sweep_that_is_a_repetition_is_not_held_out_where_another_can_be_spare
     def held(*sweeps: list[list[float]]) -> set[int]:
         names = [str(i) for i, rows in enumerate(sweeps) for _ in rows]
         inputs = np.concatenate([np.asarray(rows) for rows in sweeps])
-        recording = make_recording(time_s=np.arange(len(inputs)), cable_names=["a", "b"], inputs=inputs, sweep=names)
+        recording = make_recording(Timeline(np.arange(len(inputs)), sweep=names), drives=Drives(["a", "b"], inputs))
         return {int(names[k]) for k in hold_out(recording, np.arange(len(inputs)))[1]}
 
     one, both, other = ([[0.0, 0.0], x, [0.0, 0.0]] for x in ([2.0, 0.0], [2.0, 2.0], [0.0, 2.0]))
@@ -214,19 +215,14 @@ def test_what_only_one_sweep_shows_is_not_held_out_where_another_can_be_spared()
     """A gain of a cable that is driven far in held-out sweeps alone would not be seen."""
     tops = [[2.0, 0.0], [0.5, 1.0], [0.0, 2.0], [1.0, 0.5], [2.0, 0.1], [0.0, 2.0]]
     inputs = np.array([row for top in tops for row in ([0.0, 0.0], top)])
-    parts: dict[str, Any] = {
-        "time_s": np.arange(12),
-        "cable_names": ["a", "b"],
-        "inputs": inputs,
-        "sweep": [str(k // 2) for k in range(12)],
-    }
 
-    def held(**more: Any) -> set[int]:
-        return {k // 2 for k in hold_out(make_recording(**parts, **more), np.arange(12))[1].tolist()}
+    def held(loads: LoadRows | None = None, gravity: np.ndarray | None = None) -> set[int]:
+        timeline = Timeline(np.arange(12), sweep=[str(k // 2) for k in range(12)], gravity=gravity)
+        recording = make_recording(timeline, drives=Drives(["a", "b"], inputs), loads=loads)
+        return {k // 2 for k in hold_out(recording, np.arange(12))[1].tolist()}
 
     assert held() == {3, 4}  # evenly spread: 2 and 5, which are the same
-    weights = {"load_frame": [3, 7], "load_points": np.zeros((2, 3))}
-    assert held(**weights, load_forces=[[0, 0, -0.5], [0, 0, -1.0]]) == {1, 4}
+    assert held(LoadRows([3, 7], np.zeros((2, 3)), [[0, 0, -0.5], [0, 0, -1.0]])) == {1, 4}
     turned = np.tile([0.0, 0.0, -9.81], (12, 1))
     turned[6:8] = [0.0, -9.81, 0.0]
     assert held(gravity=turned) == {1, 4}
@@ -237,7 +233,7 @@ def test_what_only_one_sweep_shows_is_not_held_out_where_another_can_be_spared()
 def test_repeated_sweeps_of_many_states_tell_effects_apart():
     def data(levels: list[float]) -> SimpleNamespace:
         inputs = np.array([[v] for v in levels * 2])
-        recording = make_recording(time_s=np.arange(len(inputs)), cable_names=["a"], inputs=inputs)
+        recording = make_recording(Timeline(np.arange(len(inputs))), drives=Drives(["a"], inputs))
         fitted, held = np.split(np.arange(len(inputs)), 2)
         return SimpleNamespace(
             **{
@@ -253,7 +249,7 @@ def test_repeated_sweeps_of_many_states_tell_effects_apart():
 
 def test_without_labels_a_sweep_is_an_excursion_from_rest():
     inputs = np.array([[0.0], [1.0], [0.0], [2.0], [1.0], [0.0], [1.0]])
-    recording = make_recording(time_s=np.arange(7), cable_names=["a"], inputs=inputs)
+    recording = make_recording(Timeline(np.arange(7)), drives=Drives(["a"], inputs))
     assert sweeps_of(recording, np.arange(7)).tolist() == [0, 0, 1, 1, 1, 2, 2]
 
 

@@ -19,9 +19,10 @@ from femsense.model import finer_mesh as finer_path
 from femsense.model.drive import DrivenRobot, drive_of
 from femsense.model.effects import apply_effects
 from femsense.model.finer_mesh import finer_state
+from femsense.model.frame_state import solve_frame
 from femsense.model.recording import make_recording
+from femsense.model.recording_parts import Drives, Timeline
 from femsense.model.remeshing import finer_mesh, robot_on_mesh
-from femsense.model.variants import solve_frame
 
 
 def on_both_meshes(
@@ -30,7 +31,7 @@ def on_both_meshes(
     """Return what `finer_state` is asked with: an arm whose cables are driven so."""
     robot = apply_effects(arm((4, 2, 2)), effects)
     fine = robot_on_mesh(robot, finer_mesh(robot.body.mesh, None, 1))
-    recording = make_recording(time_s=[0.0], cable_names=NAMES, inputs=[inputs], actuation=actuation)
+    recording = make_recording(Timeline([0.0]), drives=Drives(NAMES, [inputs], actuation=actuation))
     driven, fine_driven = (DrivenRobot(r, drive_of(r, recording)) for r in (robot, fine))
     return driven, fine_driven, 0, solve_frame(driven, 0), embed_points(robot.body.mesh, fine.body.mesh.nodes)
 

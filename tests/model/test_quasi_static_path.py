@@ -24,10 +24,11 @@ from femsense.fem.mesh import embed_points
 from femsense.model import quasi_static_path, variants
 from femsense.model.drive import DrivenRobot, drive_of, has_history
 from femsense.model.effects import apply_effects
+from femsense.model.frame_state import solve_frame
 from femsense.model.quasi_static_path import solve_path
 from femsense.model.recording import Recording, make_recording
+from femsense.model.recording_parts import Drives, LoadRows, Timeline
 from femsense.model.robot import Robot
-from femsense.model.variants import solve_frame
 
 
 def walked(r: Robot, rec: Recording, frames: Sequence[int] | None = None, **options: Any) -> dict[int, np.ndarray]:
@@ -73,12 +74,12 @@ def test_slack_lets_a_held_cable_do_nothing_until_it_is_taken_up() -> None:
 
 def test_initial_inputs_are_added_before_gain() -> None:
     r = robot([{"name": "cable_gain", "scale": 0.5}])
-    drive = drive_of(r, recording([[1.0, 2.0]], actuation_zero="unknown"), initial=np.array([0.2, 0.4]))
+    drive = drive_of(r, recording([[1.0, 2.0]], zero="unknown"), initial=np.array([0.2, 0.4]))
     np.testing.assert_allclose(drive.inputs, [[0.6, 1.2]])
 
 
 def test_columns_are_taken_by_name() -> None:
-    rec = make_recording(time_s=[0.0], cable_names=("side", "top"), inputs=[[1.0, 2.0]])
+    rec = make_recording(Timeline([0.0]), drives=Drives(("side", "top"), [[1.0, 2.0]]))
     np.testing.assert_array_equal(drive_of(robot(), rec).inputs, [[2.0, 1.0]])
 
 
@@ -125,7 +126,7 @@ def test_creep_terms_add_up() -> None:
 def test_known_loads_creep_too_and_two_at_one_place_are_one() -> None:
     r = robot([{"name": "creep", "fraction": 0.5, "time_s": 1.0}])
     place, t = [0.1, 0.015, 0.015], [0.0, 1.0, 2.0, 3.0]
-    once = recording([[0, 0]] * 4, time_s=t, load_frame=[1, 2, 3], load_points=[place] * 3, load_forces=[[0, 0, -1.0]] * 3)
+    once = recording([[0, 0]] * 4, time_s=t, loads=LoadRows([1, 2, 3], [place] * 3, [[0, 0, -1.0]] * 3))
     halves = recording(
         [[0, 0]] * 4, time_s=t, load_frame=[1, 1, 2, 2, 3, 3], load_points=[place] * 6, load_forces=[[0, 0, -0.5]] * 6
     )
@@ -168,7 +169,7 @@ def test_frames_with_other_loads_or_gravity_are_not_the_same() -> None:
 
 
 def test_a_known_load_acts_where_it_stands() -> None:
-    rec = recording([[0, 0]], load_frame=[0], load_points=[MARKERS[0]], load_forces=[[0, 0.2, 0]])
+    rec = recording([[0, 0]], loads=LoadRows([0], [MARKERS[0]], [[0, 0.2, 0]]))
     body = robot().body
     forces = embed_points(body.mesh, MARKERS[:1]).spread(np.array([[0, 0.2, 0]]), len(body.mesh.nodes))
     np.testing.assert_allclose(

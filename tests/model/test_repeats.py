@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from femsense.model.recording import Recording, make_recording
+from femsense.model.recording_parts import Drives, MarkerRows, Timeline
 from femsense.model.repeats import marker_repeatability, stays_of
 
 
@@ -16,13 +17,14 @@ def walked(levels: list[float], noise: float) -> Recording:
     rng, count = np.random.default_rng(2), 5
     moved = np.repeat(np.array(levels), count)[:, None] * [1.0, 2.0, 3.0]
     return make_recording(
-        time_s=np.arange(len(levels)),
-        cable_names=["a"],
-        inputs=np.array(levels)[:, None],
-        marker_names=[f"m{i}" for i in range(count)],
-        marker_frame=np.repeat(np.arange(len(levels)), count),
-        marker_index=np.tile(np.arange(count), len(levels)),
-        marker_xyz=moved + noise * rng.normal(size=(len(levels) * count, 3)),
+        Timeline(np.arange(len(levels))),
+        drives=Drives(["a"], np.array(levels)[:, None]),
+        markers=MarkerRows(
+            [f"m{i}" for i in range(count)],
+            np.repeat(np.arange(len(levels)), count),
+            np.tile(np.arange(count), len(levels)),
+            moved + noise * rng.normal(size=(len(levels) * count, 3)),
+        ),
     )
 
 

@@ -10,8 +10,9 @@ from scipy.stats import binom
 
 from femsense.core.errors import InputError
 from femsense.core.pose import rotation_from_vector
-from femsense.pointcloud import match_along_normals
+from femsense.pointcloud import MatchingOptions, match_along_normals
 
+AVERAGE = MatchingOptions(average=True)
 SEEDS = st.integers(0, 2**32 - 1)
 
 
@@ -61,7 +62,7 @@ def test_matches_move_with_the_scene_and_not_with_the_order(average: bool) -> No
     rng = np.random.default_rng(1)
     features, normals = front(40)
     points = cap(rng, 3000, noise=2e-4)
-    options = {"d_m": 0.005, "d_l": 0.01, "average": average}
+    options = {"d_m": 0.005, "d_l": 0.01, "options": MatchingOptions(average=average)}
     matches = match_along_normals(features, normals, points, camera_position=[0, 0, 0], **options)
     R, shift, order = rotation_from_vector([0.4, -2.0, 0.3]), np.array([1.0, -2.0, 0.5]), rng.permutation(len(points))
     turned = match_along_normals(
@@ -77,7 +78,9 @@ def test_distance_is_positive_outwards() -> None:
     x, y = np.meshgrid(np.linspace(-0.01, 0.01, 21), np.linspace(-0.01, 0.01, 21))
     points = np.stack([x.ravel(), y.ravel(), np.full(x.size, 0.003)], axis=1)
     for average in (False, True):
-        matches = match_along_normals([[0, 0, 0]] * 2, [[0, 0, 1.0], [0, 0, -5.0]], points, d_m=0.005, d_l=0.01, average=average)
+        matches = match_along_normals(
+            [[0, 0, 0]] * 2, [[0, 0, 1.0], [0, 0, -5.0]], points, d_m=0.005, d_l=0.01, options=MatchingOptions(average=average)
+        )
         np.testing.assert_allclose(matches.distance, [0.003, -0.003], atol=1e-12)
         np.testing.assert_allclose(
             matches.positions(np.zeros((2, 3)), np.array([[0, 0, 1.0], [0, 0, -1.0]])), [[0, 0, 0.003]] * 2, atol=1e-12
@@ -89,7 +92,9 @@ def test_a_slanted_surface_is_met_on_the_line_and_not_beside_it() -> None:
     flat = rng.uniform(-0.01, 0.01, size=(500, 2))
     points = np.column_stack([flat, 0.002 + 0.5 * flat[:, 0] - 0.3 * flat[:, 1]])
     for order in (1, 2):
-        matches = match_along_normals([[0, 0, 0]], [[0, 0, 1]], points, d_m=0.004, d_l=0.02, average=True, order=order)
+        matches = match_along_normals(
+            [[0, 0, 0]], [[0, 0, 1]], points, d_m=0.004, d_l=0.02, options=MatchingOptions(average=True, order=order)
+        )
         np.testing.assert_allclose(matches.distance, 0.002, atol=1e-12)
 
 
@@ -104,7 +109,11 @@ def test_second_order_follows_curvature_and_first_order_is_off_as_stated() -> No
     features, normals = front(60)
     points = cap(np.random.default_rng(0), 40000)
     off = {
-        order: np.nanmean(match_along_normals(features, normals, points, d_m=0.005, d_l=0.01, average=True, order=order).distance)
+        order: np.nanmean(
+            match_along_normals(
+                features, normals, points, d_m=0.005, d_l=0.01, options=MatchingOptions(average=True, order=order)
+            ).distance
+        )
         for order in (0, 1, 2)
     }
     np.testing.assert_allclose(off[1], -(0.005**2) / (4 * 0.04), rtol=0.05)
@@ -119,7 +128,9 @@ def test_standard_deviations_hold_the_truth_as_often_as_they_say(average: bool) 
     rng = np.random.default_rng(5)
     errors = []
     for _ in range(25):
-        matches = match_along_normals(features, normals, cap(rng, 5000, noise=3e-4), d_m=0.004, d_l=0.01, average=average)
+        matches = match_along_normals(
+            features, normals, cap(rng, 5000, noise=3e-4), d_m=0.004, d_l=0.01, options=MatchingOptions(average=average)
+        )
         errors.append((matches.distance / matches.std)[matches.found])
     ratio = np.abs(np.concatenate(errors))
     for width, share in ((1.0, 0.6827), (1.96, 0.95)):
@@ -131,7 +142,7 @@ def test_averaging_beats_the_noise() -> None:
     features, normals = front(60)
     points = cap(np.random.default_rng(0), 6000, noise=3e-4)
     single = match_along_normals(features, normals, points, d_m=0.005, d_l=0.01)
-    mean = match_along_normals(features, normals, points, d_m=0.005, d_l=0.01, average=True)
+    mean = match_along_normals(features, normals, points, d_m=0.005, d_l=0.01, options=AVERAGE)
     assert np.nanstd(mean.distance) < 0.5 * np.nanstd(single.distance)
     assert np.nanmedian(mean.std) < 0.5 * np.nanmedian(single.std)
     assert mean.count[mean.found].min() > 10 and (single.count[single.found] == 1).all()
@@ -143,7 +154,7 @@ def test_stray_points_are_set_aside() -> None:
     points = cap(rng, 6000, noise=1e-4)
     stray = rng.random(len(points)) < 0.05
     points[stray] = cap(rng, int(stray.sum()), radius=0.045)
-    matches = match_along_normals(features, normals, points, d_m=0.005, d_l=0.01, average=True)
+    matches = match_along_normals(features, normals, points, d_m=0.005, d_l=0.01, options=AVERAGE)
     assert np.median(np.abs(matches.distance)) < 5e-5
 
 
@@ -168,22 +179,24 @@ def test_normals_of_the_points_part_the_two_sides_of_a_thin_body() -> None:
     height = np.repeat([0.002, 0.0], 1000)
     points, sides = np.column_stack([flat, height]), np.column_stack([np.zeros((2000, 2)), np.repeat([1.0, -1.0], 1000)])
     features, normals = np.tile([[0.001, 0.002, 0.0025]], (2, 1)), np.array([[0, 0, 1.0], [0, 0, -1.0]])
-    matches = match_along_normals(features, normals, points, d_m=0.003, d_l=0.01, average=True, robot_normals=sides)
+    matches = match_along_normals(features, normals, points, d_m=0.003, d_l=0.01, robot_normals=sides, options=AVERAGE)
     np.testing.assert_allclose(matches.distance, [-0.0005, 0.0025], atol=1e-12)
 
 
 def test_few_points_are_uncertain() -> None:
-    one = match_along_normals([[0, 0, 0]], [[0, 0, 1]], [[0, 0, 0.001]], d_m=0.01, d_l=0.01, average=True)
+    one = match_along_normals([[0, 0, 0]], [[0, 0, 1]], [[0, 0, 0.001]], d_m=0.01, d_l=0.01, options=AVERAGE)
     assert one.found[0] and np.isinf(one.std[0])
-    none = match_along_normals([[0, 0, 0]], [[0, 0, 1]], np.zeros((0, 3)), d_m=0.01, d_l=0.01, average=True)
+    none = match_along_normals([[0, 0, 0]], [[0, 0, 1]], np.zeros((0, 3)), d_m=0.01, d_l=0.01, options=AVERAGE)
     assert not none.found[0] and np.isnan(none.std[0])
 
 
 def test_the_floor_adds_in_squares() -> None:
     features, normals = front(10)
     points = cap(np.random.default_rng(0), 4000, noise=2e-4)
-    plain = match_along_normals(features, normals, points, d_m=0.005, d_l=0.01, average=True)
-    floor = match_along_normals(features, normals, points, d_m=0.005, d_l=0.01, average=True, std_floor_m=3e-4)
+    plain = match_along_normals(features, normals, points, d_m=0.005, d_l=0.01, options=AVERAGE)
+    floor = match_along_normals(
+        features, normals, points, d_m=0.005, d_l=0.01, options=MatchingOptions(average=True, std_floor_m=3e-4)
+    )
     np.testing.assert_allclose(floor.std**2, plain.std**2 + 9e-8, rtol=1e-9)
 
 
@@ -191,7 +204,7 @@ def test_the_floor_adds_in_squares() -> None:
     "change, text",
     [
         ({"d_m": 0.0}, "d_m must be positive"),
-        ({"order": 3}, "no such order"),
+        ({"options": MatchingOptions(order=3)}, "no such order"),
         ({"camera_position": [0, 0, 0], "view_direction": [0, 0, 1]}, "two statements of the view"),
         ({"robot_normals": [[0, 0, 1]]}, "one normal per row of robot_points"),
     ],

@@ -11,7 +11,7 @@ from femsense.core.errors import InputError
 from femsense.core.pose import invert_pose, make_pose, rotation_from_vector, transform_points
 from femsense.io.clouds.cloud_files import read_cloud
 from femsense.io.clouds.images import read_png
-from femsense.model.recording import Camera
+from femsense.model.camera import Camera
 from femsense.model.robot import Observation
 from femsense.pointcloud.cloud import cloud_from_depth
 from femsense.rig.camera import (

@@ -14,7 +14,8 @@ from rig_scripts import SCRIPT
 from femsense.core.errors import InputError
 from femsense.io.robot_toml import load_robot
 from femsense.rig import script as script_module
-from femsense.rig.script import check_script, plan_script, read_script
+from femsense.rig.plan import plan_script
+from femsense.rig.script import check_script, read_script
 
 
 @pytest.fixture(scope="module")

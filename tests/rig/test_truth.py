@@ -23,10 +23,12 @@ from femsense.model.drive import DrivenRobot, drive_of
 from femsense.model.effects import apply_effects
 from femsense.model.quasi_static_path import solve_path
 from femsense.model.recording import make_recording
+from femsense.model.recording_parts import Drives, Timeline
 from femsense.model.robot import Robot
 from femsense.rig import truth
+from femsense.rig.plan import Plan, plan_script
 from femsense.rig.scene import probe_shape
-from femsense.rig.script import Plan, TruthTable, check_script, plan_script
+from femsense.rig.script import TruthTable, check_script
 from femsense.rig.simulate import recording_of, run_experiment, simulate
 from femsense.rig.truth import TrueContact, contact_patch, creep_matrix, true_path, true_robot
 
@@ -106,7 +108,7 @@ def test_bends_remember_the_tensions_at_which_a_held_cable_came_to_rest() -> Non
 def test_held_cables_that_rub_come_to_rest_when_they_are_let_out() -> None:
     """Tensions at their motors then creep, pass by pass, as long as their bends hold."""
     rubbing, plan, inputs = let_out()
-    recording = make_recording(time_s=plan.time_s, cable_names=NAMES, inputs=inputs, actuation="displacement")
+    recording = make_recording(Timeline(plan.time_s), drives=Drives(NAMES, inputs, actuation="displacement"))
 
     def markers(declared: Robot) -> np.ndarray:
         driven = DrivenRobot(declared, drive_of(declared, recording))

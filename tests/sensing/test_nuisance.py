@@ -13,8 +13,9 @@ from femsense.calib.calibrate import calibrate
 from femsense.core.pose import invert_pose, transform_points
 from femsense.fem.mesh import surface_triangles, triangle_normals
 from femsense.io.clouds.cloud_files import write_cloud
+from femsense.model.camera import CameraNoise
 from femsense.model.effects import apply_effects
-from femsense.model.recording import CameraNoise, Recording
+from femsense.model.recording import Recording
 from femsense.pointcloud.cloud import PointCloud
 from femsense.sensing.nuisance import first_knowledge, learn, misfit
 from femsense.sensing.pipeline import estimate

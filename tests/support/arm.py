@@ -15,9 +15,10 @@ from femsense.fem.equilibrium import SolveOptions
 from femsense.fem.mesh import embed_points, to_quadratic
 from femsense.model.drive import DrivenRobot, drive_of, frame_loads
 from femsense.model.effects import apply_effects
+from femsense.model.frame_state import solve_frame
 from femsense.model.recording import Recording, make_recording
+from femsense.model.recording_parts import Drives, MarkerRows, Timeline
 from femsense.model.robot import Observation, Robot, plain_actuation, spread_features
-from femsense.model.variants import solve_frame
 
 LENGTH, WIDTH = 0.1, 0.02
 NAMES = ("up", "down", "left", "right")
@@ -105,7 +106,9 @@ def record(
     rng = np.random.default_rng(seed)
     true = apply_effects(truth or arm((8, 3, 3), law="neo_hookean"), effects)
     ties = true.markers if placements is None else true.tie_markers(true.marker_points + placements)
-    plain = make_recording(time_s=np.arange(len(inputs)) * 1.0, actuation=actuation, cable_names=NAMES, inputs=inputs)
+    plain = make_recording(
+        Timeline(np.arange(len(inputs)) * 1.0), drives=Drives(actuation=actuation, cable_names=NAMES, inputs=inputs)
+    )
     driven = DrivenRobot(true, drive_of(true, plain, initial=initial))
     points, states, state = [], [], None
     for k in range(len(inputs)):
@@ -128,17 +131,11 @@ def record(
     )
     count = len(true.marker_names)
     recording = make_recording(
-        time_s=np.arange(len(inputs)) * 1.0,
-        actuation=actuation,
-        actuation_zero=zero,
-        cable_names=NAMES,
-        inputs=inputs,
-        sweep=labels,
-        free=np.full(len(inputs), free),
-        marker_names=true.marker_names,
-        marker_frame=np.repeat(np.arange(len(inputs)), count),
-        marker_index=np.tile(np.arange(count), len(inputs)),
-        marker_xyz=measured,
+        Timeline(np.arange(len(inputs)) * 1.0, sweep=labels, free=np.full(len(inputs), free)),
+        drives=Drives(actuation=actuation, actuation_zero=zero, cable_names=NAMES, inputs=inputs),
+        markers=MarkerRows(
+            true.marker_names, np.repeat(np.arange(len(inputs)), count), np.tile(np.arange(count), len(inputs)), measured
+        ),
     )
     return recording, states
 

@@ -12,6 +12,7 @@ from helpers import block_mesh
 from femsense.fem.mesh import embed_points
 from femsense.model.effects import apply_effects
 from femsense.model.recording import Recording, make_recording
+from femsense.model.recording_parts import Drives, LoadRows, Timeline
 from femsense.model.robot import Observation, Robot, plain_actuation
 
 MARKERS = np.array([[0.1, 0.015, 0.03], [0.06, 0.0, 0.0], [0.1, 0.03, 0.015]])
@@ -35,7 +36,16 @@ def robot(
     return apply_effects(plain, effects)
 
 
-def recording(inputs: Sequence[Sequence[float]], **parts: Any) -> Recording:
-    return make_recording(
-        **{"time_s": np.arange(len(inputs), dtype=float), "cable_names": ("top", "side"), "inputs": inputs, **parts}
-    )
+def recording(
+    inputs: Sequence[Sequence[float]],
+    *,
+    actuation: str = "tension",
+    zero: str = "absolute",
+    time_s: Sequence[float] | None = None,
+    gravity: Sequence[Sequence[float]] | None = None,
+    loads: LoadRows | None = None,
+) -> Recording:
+    """Return a recording of the bar of this file, a frame a second where no times are given."""
+    times = np.arange(len(inputs), dtype=float) if time_s is None else time_s
+    drives = Drives(("top", "side"), inputs, actuation, zero)
+    return make_recording(Timeline(times, gravity=gravity), drives=drives, loads=loads)

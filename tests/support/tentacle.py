@@ -12,6 +12,7 @@ from femsense.core.arrays import freeze
 from femsense.fem.body import make_body, tie_cable
 from femsense.fem.mesh import TetMesh, embed_points, oriented, to_quadratic
 from femsense.model.recording import Recording, make_recording
+from femsense.model.recording_parts import Drives, Timeline, UnnamedRows
 from femsense.model.robot import Observation, Robot, plain_actuation, spread_features
 
 FOLDER = DATA / "tentacle"
@@ -106,11 +107,8 @@ def recording_of(chosen: list[Run], *, frames: int = 3, rng: np.random.Generator
             frame.append(np.full(5, len(inputs)))
             inputs.append(run.tension)
     recording = make_recording(
-        time_s=0.1 * np.arange(len(inputs)),
-        cable_names=tuple(SIDES),
-        inputs=np.array(inputs),
-        free=np.ones(len(inputs), dtype=bool),
-        unnamed_frame=np.concatenate(frame),
-        unnamed_xyz=np.vstack(rows),
+        Timeline(0.1 * np.arange(len(inputs)), free=np.ones(len(inputs), dtype=bool)),
+        drives=Drives(tuple(SIDES), np.array(inputs)),
+        unnamed=UnnamedRows(frame=np.concatenate(frame), xyz=np.vstack(rows)),
     )
     return recording, np.concatenate(names)

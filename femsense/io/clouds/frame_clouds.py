@@ -13,7 +13,8 @@ import numpy as np
 from femsense.core.arrays import IntArray
 from femsense.core.errors import InputError
 from femsense.io.clouds.images import check_image_size, read_color, read_png
-from femsense.model.recording import Camera, Recording
+from femsense.model.camera import Camera
+from femsense.model.recording import Recording
 
 if TYPE_CHECKING:
     from femsense.pointcloud.cloud import PointCloud

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
-from femsense.model.recording import Camera
+from femsense.model.camera import Camera
 
 
 def read_png(path: Path) -> npt.NDArray[Any]:

@@ -18,7 +18,7 @@ from femsense.io.importers.frames import Frame, Images, Lens, Source
 from femsense.io.importers.journal import JOURNAL, Entry, Journal
 from femsense.io.importers.pictures import write_cloud_file, write_color, write_depth
 from femsense.io.importers.summary import summary
-from femsense.io.recording_folder import FORCE_COLUMNS, PLACE_COLUMNS
+from femsense.io.recording_tables import FORCE_COLUMNS, PLACE_COLUMNS
 from femsense.io.recording_toml import FORMAT
 from femsense.pointcloud.cloud import PointCloud
 

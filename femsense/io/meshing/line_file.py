@@ -14,7 +14,7 @@ from femsense.core.text import key_path
 from femsense.io.meshing.channels import Channel
 from femsense.io.meshing.line_body import Cavity, Fold, LineBody
 from femsense.io.meshing.line_sections import Section, equal_section
-from femsense.io.robot_toml import GravityTable, MaterialTable, Name, Vector
+from femsense.io.robot_tables import GravityTable, MaterialTable, Name, Vector
 from femsense.io.tables import Schema, read_toml, validated
 
 FORMAT = "femsense-line-1"

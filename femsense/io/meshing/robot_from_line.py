@@ -13,7 +13,8 @@ import femsense
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import InputError
 from femsense.fem.body import BodyModel, make_body
-from femsense.fem.mesh import TetMesh, check_mesh, element_volumes, to_quadratic
+from femsense.fem.mesh import TetMesh, element_volumes, to_quadratic
+from femsense.fem.mesh_checks import check_mesh
 from femsense.io.files import check_target, file_hash, plain, write_json, write_toml
 from femsense.io.mesh_files import write_mesh
 from femsense.io.meshing.channels import Channel, Subdivision, channel_path, pull_point, subdivided

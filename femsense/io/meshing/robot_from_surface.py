@@ -17,16 +17,10 @@ import numpy as np
 import femsense
 from femsense.core.arrays import FloatArray, IntArray, freeze
 from femsense.core.errors import FemsenseError, InputError
-from femsense.fem.mesh import TetMesh, check_mesh, element_volumes, hinged_parts, surface_triangles
+from femsense.fem.mesh import TetMesh, element_volumes, surface_triangles
+from femsense.fem.mesh_checks import check_mesh, hinged_parts
 from femsense.io.files import check_target, file_hash, write_json, write_text
-from femsense.io.mesh_files import (
-    FILL_SECONDS,
-    SURFACE_ENDINGS,
-    radius_ratio,
-    read_triangles,
-    tetrahedralise,
-    write_mesh,
-)
+from femsense.io.mesh_files import SURFACE_ENDINGS, radius_ratio, read_triangles, write_mesh
 from femsense.io.meshes.reading import read_content
 from femsense.io.meshing.cad import CAD_READ, read_cad
 from femsense.io.meshing.quality import quality_report, quality_text
@@ -39,7 +33,9 @@ from femsense.io.meshing.surface import (
     shared_edges,
     thinned,
 )
-from femsense.io.robot_toml import LARGEST_BODY, PER_METRE, SMALLEST_BODY, likely_unit, load_robot
+from femsense.io.meshing.tetrahedra import FILL_SECONDS, tetrahedralise
+from femsense.io.robot_body import LARGEST_BODY, PER_METRE, SMALLEST_BODY, likely_unit
+from femsense.io.robot_toml import load_robot
 
 MESH_FILE, REPORT_FILE = "mesh.vtu", "mesh.json"
 USUAL = (5e-3, 2.0)

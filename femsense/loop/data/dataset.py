@@ -26,7 +26,8 @@ from femsense.loop.data.surface_rows import (
 from femsense.loop.data.trial import Groups, States, SurfaceRows, Trial, normals_of
 from femsense.model.effects import CALIBRATED, EFFECTS, FORMS, Effect, Entry
 from femsense.model.observation import Scene, make_scene, rest_residual, with_rest_markers
-from femsense.model.recording import Recording, check_against, state_key
+from femsense.model.recording import Recording, state_key
+from femsense.model.recording_checks import check_against
 from femsense.model.remeshing import robot_on_mesh
 from femsense.model.robot import Robot
 

@@ -23,8 +23,9 @@ from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.mesh import surface_triangles, triangle_normals, vertex_normals
 from femsense.io.clouds.frame_clouds import read_frame_cloud
 from femsense.io.meshing.surface import nearest_on
+from femsense.model.camera_frame import as_measured, in_robot_frame
 from femsense.model.contact_patch import body_surface, flat_nodes
-from femsense.model.observation import Hypothesis, Scene, as_measured, evaluate_scene, in_robot_frame
+from femsense.model.observation import Hypothesis, Scene, evaluate_scene
 from femsense.model.recording import Recording
 from femsense.model.robot import Robot, spread_features
 from femsense.pointcloud.cloud import PointCloud

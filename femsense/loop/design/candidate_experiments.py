@@ -19,9 +19,10 @@ from femsense.core.parallel import each
 from femsense.fem.equilibrium import Equilibrium, SolveOptions
 from femsense.model.drive import DrivenRobot, drive_of
 from femsense.model.effects.loads import STANDARD_GRAVITY
+from femsense.model.frame_state import solve_frame
 from femsense.model.recording import make_recording
+from femsense.model.recording_parts import Drives, LoadRows, Timeline
 from femsense.model.robot import Robot, spread_features
-from femsense.model.variants import solve_frame
 from femsense.rig.camera import camera_of, look_at, visible_points
 from femsense.rig.scene import body_shape
 from femsense.rig.script import FORMAT, SceneTable, ViewTable
@@ -304,17 +305,19 @@ def _small_step(robot: Robot, control: str, kind: str, top: float) -> float:
     return 0.01 * top if np.isfinite(top) else scale
 
 
-def _still(robot: Robot, control: str, inputs: FloatArray, loads: dict[str, Any] | None = None) -> DrivenRobot:
+def _still(robot: Robot, control: str, inputs: FloatArray, loads: LoadRows | None = None) -> DrivenRobot:
     """Return a quasi-static path over inputs of cables and chambers (F, a + c)."""
     a = len(robot.body.cables)
     recording = make_recording(
-        time_s=np.arange(len(inputs)),
-        actuation=control,
-        cable_names=robot.body.cable_names,
-        inputs=inputs[:, :a],
-        chamber_names=robot.body.chamber_names,
-        pressures=inputs[:, a:],
-        **(loads or {}),
+        Timeline(np.arange(len(inputs))),
+        drives=Drives(
+            robot.body.cable_names,
+            inputs[:, :a],
+            control,
+            chamber_names=robot.body.chamber_names,
+            pressures=inputs[:, a:],
+        ),
+        loads=loads,
     )
     return DrivenRobot(robot, drive_of(robot, recording))
 
@@ -323,7 +326,7 @@ def _moves(robot: Robot, control: str, small: FloatArray, tip: FloatArray, gravi
     """Return how small steps of each pull move the marker that moves most (d, 3), and how far 1 N at the tip does, to first order."""
     push = 1e-3 * gravity / np.linalg.norm(gravity)
     inputs = np.vstack([np.zeros(len(small)), np.diag(small), np.zeros(len(small))])
-    loads = {"load_frame": [len(inputs) - 1], "load_points": tip[None], "load_forces": push[None]}
+    loads = LoadRows([len(inputs) - 1], tip[None], push[None])
     driven = _still(robot, control, inputs, loads)
 
     def place(k: int, start: Equilibrium | None) -> tuple[Equilibrium, FloatArray]:

@@ -25,6 +25,7 @@ from femsense.model.effects import Effect, Entry, Parameter
 from femsense.model.effects.base import number
 from femsense.model.observation import Hypothesis, evaluate_scene, make_scene
 from femsense.model.recording import make_recording
+from femsense.model.recording_parts import Drives, LoadRows, MarkerRows, Timeline
 from femsense.model.robot import Robot
 
 WEIGHED = 0.1
@@ -156,19 +157,19 @@ def _rows(data: Data, fitted: FittedModel, noise: Noise, open_model: Hypothesis,
     names = robot.glued_names
     loads = [] if step.load is None else [step.load]
     recording = make_recording(
-        time_s=[0.0],
-        actuation=data.control,
-        actuation_zero=data.train[head].scene.recording.actuation_zero,
-        cable_names=robot.body.cable_names,
-        inputs=np.array([step.inputs]),
-        marker_names=names,
-        marker_frame=np.zeros(len(names)),
-        marker_index=np.arange(len(names)),
-        marker_xyz=np.zeros((len(names), 3)),
-        free=[True],
-        load_frame=np.zeros(len(loads)),
-        load_points=np.array([place for place, _ in loads]).reshape(-1, 3),
-        load_forces=np.array([force for _, force in loads]).reshape(-1, 3),
+        Timeline([0.0], free=[True]),
+        drives=Drives(
+            actuation=data.control,
+            actuation_zero=data.train[head].scene.recording.actuation_zero,
+            cable_names=robot.body.cable_names,
+            inputs=np.array([step.inputs]),
+        ),
+        markers=MarkerRows(names, np.zeros(len(names)), np.arange(len(names)), np.zeros((len(names), 3))),
+        loads=LoadRows(
+            np.zeros(len(loads)),
+            np.array([place for place, _ in loads]).reshape(-1, 3),
+            np.array([force for _, force in loads]).reshape(-1, 3),
+        ),
     )
     scene = make_scene(data.robot, recording, np.array([0]))
     poses, initial = poses_and_inputs(data, fit)[head]

@@ -24,10 +24,13 @@ from femsense.loop.design.experiment_blocks import Block, Form, forms_of, make_b
 from femsense.loop.design.identifiability import ALIKE, EVIDENCE, Identifiability, Judge
 from femsense.model.effects import OF_INPUTS
 from femsense.model.observation import make_scene
-from femsense.model.recording import Recording, check_against, make_recording
+from femsense.model.recording import Recording, make_recording
+from femsense.model.recording_checks import check_against
+from femsense.model.recording_parts import Drives, LoadRows, MarkerRows, Timeline, Views
 from femsense.model.robot import Robot
 from femsense.rig.camera import camera_of, pose_of
-from femsense.rig.script import Plan, ScriptTable, check_script, plan_script
+from femsense.rig.plan import Plan, plan_script
+from femsense.rig.script import ScriptTable, check_script
 
 NOISE_M = 2e-4
 """Standard deviation of each coordinate of a marker, if nothing else is known: a depth camera at half a metre [m]."""
@@ -231,23 +234,27 @@ def trial_of(robot: Robot, script: ScriptTable, plan: Plan, *, lead: bool = Fals
     names = script.markers.names or robot.marker_names
     count = len(names)
     recording = make_recording(
-        time_s=np.concatenate([[0.0], plan.time_s + dt]) if lead else plan.time_s,
-        actuation=script.actuation,
-        actuation_zero=script.actuation_zero,
-        cameras=[camera_of(script.camera)],
-        cable_names=robot.body.cable_names,
-        inputs=np.vstack([at_rest, recorded]) if lead else recorded,
-        chamber_names=robot.body.chamber_names,
-        pressures=np.vstack([0.0 * plan.pressures[:1], plan.pressures]) if lead else plan.pressures,
-        sweep=[*plan.sweep[:head], *plan.sweep],
-        gravity=None if plan.gravity is None else np.vstack([plan.gravity[:head], plan.gravity]),
-        marker_names=names,
-        marker_frame=np.repeat(frames, count),
-        marker_index=np.tile(np.arange(count), len(frames)),
-        marker_xyz=np.tile([0.0, 0.0, 1.0], (count * len(frames), 1)),
-        load_frame=plan.load_frame + head,
-        load_points=plan.load_points,
-        load_forces=plan.load_forces,
+        Timeline(
+            np.concatenate([[0.0], plan.time_s + dt]) if lead else plan.time_s,
+            sweep=[*plan.sweep[:head], *plan.sweep],
+            gravity=None if plan.gravity is None else np.vstack([plan.gravity[:head], plan.gravity]),
+        ),
+        drives=Drives(
+            actuation=script.actuation,
+            actuation_zero=script.actuation_zero,
+            cable_names=robot.body.cable_names,
+            inputs=np.vstack([at_rest, recorded]) if lead else recorded,
+            chamber_names=robot.body.chamber_names,
+            pressures=np.vstack([0.0 * plan.pressures[:1], plan.pressures]) if lead else plan.pressures,
+        ),
+        markers=MarkerRows(
+            names,
+            np.repeat(frames, count),
+            np.tile(np.arange(count), len(frames)),
+            np.tile([0.0, 0.0, 1.0], (count * len(frames), 1)),
+        ),
+        loads=LoadRows(plan.load_frame + head, plan.load_points, plan.load_forces),
+        views=Views(cameras=[camera_of(script.camera)]),
     )
     scene = make_scene(robot, recording, frames)
     free = np.full(len(robot.body.cables), np.inf)

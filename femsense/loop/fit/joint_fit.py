@@ -17,9 +17,9 @@ from femsense.loop.data.trial import States, Trial, normal_rms_of, rms_of, spans
 from femsense.loop.fit.noise_components import Noise, Whitener, whiten
 from femsense.loop.fit.slack_nonsmoothness import Part, joined, trial_nonsmoothness
 from femsense.model.effects.base import known_length
+from femsense.model.linear_answers import AtPoints
 from femsense.model.observation import Hypothesis, SceneJet, evaluate_scene
 from femsense.model.quasi_static_path import has_given
-from femsense.model.variants import AtPoints
 
 if TYPE_CHECKING:
     pass

@@ -17,9 +17,9 @@ from femsense.loop.fit.fitted_model import FittedModel
 from femsense.loop.fit.joint_fit import JointFit, JointProblem, Prior
 from femsense.model.drive import has_history
 from femsense.model.effects import Effect, Entry, InRecording, Parameter
+from femsense.model.linear_answers import AtPoints
 from femsense.model.observation import Hypothesis
 from femsense.model.robot import Robot
-from femsense.model.variants import AtPoints
 
 Answers = dict[int, AtPoints]
 """Frame → what the points of its state answer to."""

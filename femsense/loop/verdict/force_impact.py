@@ -22,7 +22,8 @@ from femsense.loop.data.trial import Trial, heads_of, normals_of, numbers_of, ve
 from femsense.loop.fit.fitted_model import FittedModel, poses_and_inputs
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.result.evidence import Compliance, ForceField, ForceImpact, LoadRow, Softer
-from femsense.model.observation import SceneJet, in_robot_frame, placements
+from femsense.model.camera_frame import in_robot_frame
+from femsense.model.observation import SceneJet, placements
 from femsense.model.robot import Robot, spread_features
 
 LOADED_FRAMES = 8

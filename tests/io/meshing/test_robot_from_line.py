@@ -14,7 +14,8 @@ from femsense.core.errors import InputError
 from femsense.fem.body import make_body
 from femsense.fem.chambers import chamber_volume
 from femsense.fem.equilibrium import solve_equilibrium
-from femsense.fem.mesh import check_mesh, element_volumes, embed_points, to_quadratic
+from femsense.fem.mesh import element_volumes, embed_points, to_quadratic
+from femsense.fem.mesh_checks import check_mesh
 from femsense.fem.sections import cut_section
 from femsense.io.mesh_files import radius_ratio
 from femsense.io.meshing.line_body import LineBody, mesh_line, place

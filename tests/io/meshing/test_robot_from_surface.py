@@ -17,8 +17,7 @@ from femsense.app import cli
 from femsense.core.errors import InputError
 from femsense.fem.equilibrium import solve_equilibrium
 from femsense.fem.mesh import TetMesh, element_volumes, surface_triangles, to_linear
-from femsense.io import mesh_files
-from femsense.io.meshing import robot_from_surface
+from femsense.io.meshing import robot_from_surface, tetrahedra
 from femsense.io.meshing.robot_from_surface import MeshOptions, fill, mesh_into, read_any_surface, starter_text
 from femsense.io.meshing.surface import repaired
 from femsense.io.robot_toml import load_robot
@@ -266,7 +265,7 @@ def test_bodies_that_touch_along_an_edge_are_no_body(monkeypatch: pytest.MonkeyP
 
 def test_what_takes_too_long_is_stopped() -> None:
     with pytest.raises(InputError, match="did not come to an end"):
-        mesh_files.tetrahedralise(np.array(BOX.vertices), np.array(BOX.faces), seconds=0.2, program="import time; time.sleep(60)")
+        tetrahedra.tetrahedralise(np.array(BOX.vertices), np.array(BOX.faces), seconds=0.2, program="import time; time.sleep(60)")
 
 
 # What is refused

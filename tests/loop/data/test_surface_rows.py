@@ -31,12 +31,13 @@ from femsense.loop.data.trial import Groups, SurfaceRows, normals_of, spans_of, 
 from femsense.loop.design.advice import next_element
 from femsense.loop.fit.fitted_model import fit_model, own_of, rematched, with_nuisance
 from femsense.loop.fit.noise_components import Noise, whiten
-from femsense.loop.improve import improve
+from femsense.loop.improve import ImproveOptions, improve
 from femsense.loop.search import calibration
 from femsense.loop.search.calibration import MATCHINGS, matched
+from femsense.model.camera import Camera
 from femsense.model.effects import find_effect
 from femsense.model.observation import Hypothesis, evaluate_scene
-from femsense.model.recording import Camera, Recording
+from femsense.model.recording import Recording
 from femsense.model.robot import Robot
 from femsense.pointcloud.sheets import Sheets, fit_sheet, joined
 from femsense.rig.camera import Shape, cloud_of, render, write_ply
@@ -368,7 +369,7 @@ def test_friction_is_found_from_clouds_alone(rubbing: Recording):
 
 
 def test_friction_is_found_from_markers_and_clouds_together(rubbing: Recording):
-    loop = improve(arm(COARSE), [rubbing], effects=FEW, measured="both")
+    loop = improve(arm(COARSE), [rubbing], effects=FEW, options=ImproveOptions(measured="both"))
     check_friction(loop)
     assert loop.after.validation_rms_m != loop.after.validation_normal_rms_m
     assert loop.after.validation_rms_m < 0.6 * loop.before.validation_rms_m

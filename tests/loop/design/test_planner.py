@@ -23,7 +23,8 @@ from femsense.loop.search.effect_fields import fields_of
 from femsense.loop.search.screening import screen_model
 from femsense.model.effects import find_effect
 from femsense.model.effects.material import MODULUS_STD
-from femsense.rig.script import check_script, plan_script
+from femsense.rig.plan import plan_script
+from femsense.rig.script import check_script
 from femsense.rig.simulate import simulate
 
 NOISE = 2e-4

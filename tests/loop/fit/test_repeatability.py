@@ -12,7 +12,8 @@ from femsense.loop.data.dataset import Data, prepare
 from femsense.loop.fit.fitted_model import FittedModel, fit_model, with_nuisance
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.fit.repeatability import Repeatability, repeatability
-from femsense.model.recording import Recording, RestMarkers
+from femsense.model.recording import Recording
+from femsense.model.recording_parts import RestMarkers
 
 WIDE = Noise({"white": 2e-3, "state": 3e-3, "sweep": 3e-3}, "")
 

@@ -13,12 +13,13 @@ from femsense.loop.verdict.candidate_tables import own_size, without_first
 from femsense.loop.verdict.force_impact import forces_from, smallest_field
 from femsense.loop.verdict.lack_of_fit import lack_of_fit
 from femsense.model.recording import make_recording
+from femsense.model.recording_parts import Drives, Timeline
 
 LEVELS = [0.0, 1.0, 2.0, 2.0, 1.0, 0.0, 0.0, 1.0, 2.0, 2.0, 1.0, 0.0]
 
 
 def ramp(levels=LEVELS):
-    return make_recording(time_s=np.arange(len(levels)) * 1.0, cable_names=("top",), inputs=np.array(levels)[:, None])
+    return make_recording(Timeline(np.arange(len(levels)) * 1.0), drives=Drives(("top",), np.array(levels)[:, None]))
 
 
 def trial(levels=LEVELS, markers=4):

@@ -11,6 +11,7 @@ from arm import NAMES
 from femsense.loop.data.trial import Groups
 from femsense.loop.verdict.residual_diagnostics import structure_tests
 from femsense.model.recording import make_recording
+from femsense.model.recording_parts import Drives, Timeline
 
 RNG = np.random.default_rng(11)
 
@@ -20,7 +21,7 @@ def structure_of(values: np.ndarray) -> Mapping[str, float]:
     frames, markers, _ = values.shape
     labels = np.arange(frames) // (frames // 4)
     frame, marker = np.repeat(np.arange(frames), markers), np.tile(np.arange(markers), frames)
-    recording = make_recording(time_s=np.arange(frames) * 1.0, cable_names=NAMES, inputs=RNG.uniform(0.1, 1.0, size=(frames, 4)))
+    recording = make_recording(Timeline(np.arange(frames) * 1.0), drives=Drives(NAMES, RNG.uniform(0.1, 1.0, size=(frames, 4))))
     trial = SimpleNamespace(
         scene=SimpleNamespace(frame=frame, recording=recording, crossings=None),
         groups=Groups(marker, frame, labels[frame], frame),

@@ -17,7 +17,8 @@ from femsense.model.effects import Entry, apply_effects
 from femsense.model.effects.along import curved
 from femsense.model.effects.axes import across_axis, axis_of
 from femsense.model.remeshing import finer_mesh, robot_on_mesh
-from femsense.rig.script import check_script, plan_script
+from femsense.rig.plan import plan_script
+from femsense.rig.script import check_script
 from femsense.rig.truth import true_inputs
 
 AXIS = [[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]]
@@ -158,7 +159,7 @@ def test_a_share_of_one_input_goes_to_another_after_its_gain() -> None:
             {"name": "cable_offset", "tension_n": {"left": 0.5}},
         ],
     )
-    recording = make_recording(time_s=[0.0], cable_names=("up", "down", "left", "right"), inputs=[[1.0, 2.0, 3.0, 4.0]])
+    recording = make_recording(Timeline([0.0]), drives=Drives(("up", "down", "left", "right"), [[1.0, 2.0, 3.0, 4.0]]))
     np.testing.assert_allclose(drive_of(robot, recording).inputs, [[2.0, 2.0, 3.7, 4.0]])
     script = check_script(
         {

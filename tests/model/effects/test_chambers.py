@@ -12,8 +12,10 @@ from femsense.model.drive import DrivenRobot, drive_of
 from femsense.model.effects import Entry, apply_effects, build_entry, find_effect
 from femsense.model.quasi_static_path import solve_path
 from femsense.model.recording import make_recording
+from femsense.model.recording_parts import Drives, Timeline
 from femsense.model.robot import Observation, Robot, plain_actuation
-from femsense.rig.script import check_script, plan_script
+from femsense.rig.plan import plan_script
+from femsense.rig.script import check_script
 from femsense.rig.truth import true_path
 
 MARKERS = np.array([[0.1, 0.015, 0.03], [0.05, 0.0, 0.015]])
@@ -28,7 +30,7 @@ def robot() -> Robot:
 
 def driven(r: Robot) -> DrivenRobot:
     recording = make_recording(
-        time_s=[0.0, 1.0, 2.0], cable_names=("top",), inputs=np.ones((3, 1)), chamber_names=("core",), pressures=PRESSURES
+        Timeline([0.0, 1.0, 2.0]), drives=Drives(("top",), np.ones((3, 1)), chamber_names=("core",), pressures=PRESSURES)
     )
     return DrivenRobot(r, drive_of(r, recording))
 

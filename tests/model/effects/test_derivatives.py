@@ -15,6 +15,7 @@ from femsense.model.effects import FORMS, find_effect
 from femsense.model.observation import Hypothesis, evaluate_scene, make_scene
 from femsense.model.quasi_static_path import solve_path
 from femsense.model.recording import make_recording
+from femsense.model.recording_parts import Drives, MarkerRows, Timeline
 
 INPUTS = {"tension": [[0.3, 0.2], [1.5, 0.4], [0.9, 1.2]], "displacement": [[1.0, 1.0], [5.0, 1.5], [3.0, 4.0]]}
 """Of two neighbouring cables [N] or [mm]; the others are slack."""
@@ -26,17 +27,17 @@ def scene_of(control):
     frames = range(len(INPUTS[control]))
     inputs = np.full((len(frames), 4), 0.0 if control == "tension" else -0.05)
     inputs[:, [0, 2]] = np.array(INPUTS[control]) * (1.0 if control == "tension" else 1e-3)
-    options = {"time_s": np.arange(len(frames)) * 1.7, "cable_names": NAMES, "inputs": inputs, "actuation": control}
-    driven = DrivenRobot(robot, drive_of(robot, make_recording(**options)))
+    timeline, drives = Timeline(np.arange(len(frames)) * 1.7), Drives(NAMES, inputs, control)
+    driven = DrivenRobot(robot, drive_of(robot, make_recording(timeline, drives=drives)))
     seen = [points for *_, points, _ in solve_path(driven, frames, attrgetter("markers"))]
     markers = transform_points(invert_pose(T_ROBOT_CAMERA), np.vstack(seen))
     count = len(robot.marker_names)
     recording = make_recording(
-        **options,
-        marker_names=robot.marker_names,
-        marker_frame=np.repeat(np.arange(len(frames)), count),
-        marker_index=np.tile(np.arange(count), len(frames)),
-        marker_xyz=markers,
+        timeline,
+        drives=drives,
+        markers=MarkerRows(
+            robot.marker_names, np.repeat(np.arange(len(frames)), count), np.tile(np.arange(count), len(frames)), markers
+        ),
     )
     return robot, make_scene(robot, recording, np.arange(len(frames)))
 

@@ -17,12 +17,13 @@ from femsense.core.errors import InputError
 from femsense.fem.equilibrium import SolveOptions, solve_equilibrium
 from femsense.fem.mesh import embed_points
 from femsense.io.robot_toml import load_robot
+from femsense.model.camera_frame import undo_depth
 from femsense.model.drive import DrivenRobot, drive_of
 from femsense.model.effects import EFFECT_NAMES, EFFECTS, FORMS, Effect, Entry, Parameter, apply_effects, build_entry, find_effect
-from femsense.model.observation import undo_depth
+from femsense.model.frame_state import solve_frame
 from femsense.model.recording import make_recording
+from femsense.model.recording_parts import Drives, Timeline
 from femsense.model.robot import Observation, Robot, plain_actuation
-from femsense.model.variants import solve_frame
 
 MARKERS = np.array([[0.1, 0.015, 0.03], [0.06, 0.0, 0.0], [0.1, 0.03, 0.015]])
 CENTER = [0.05, 0.015, 0.015]
@@ -48,7 +49,7 @@ def measured(r: Robot, control: str) -> np.ndarray:
     inputs = {"tension": [[0.5, 0.2], [1.5, 0.6], [0.7, 0.2]], "displacement": [[0.002, 0.002], [0.006, 0.001], [0.003, 0.002]]}[
         control
     ]
-    rec = make_recording(time_s=[0.0, 1.0, 2.0], cable_names=("top", "side"), inputs=inputs, actuation=control)
+    rec = make_recording(Timeline([0.0, 1.0, 2.0]), drives=Drives(("top", "side"), inputs, actuation=control))
     driven, before, seen = DrivenRobot(r, drive_of(r, rec)), None, []
     for k in range(3):
         state = solve_frame(driven, k, options=SolveOptions(before=before))

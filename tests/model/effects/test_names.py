@@ -19,12 +19,14 @@ OTHER_MEANINGS = {
     ("xr/stream", "payload"),  # the bytes of a message
     ("fem", "hyperelastic"),  # a kind of element
     ("io/robot_toml.py", "gravity"),  # a table of robot.toml
+    ("io/robot_body.py", "gravity"),
     ("io/robot_toml.py", "creep"),  # a property of the material
     ("io/meshing", "gravity"),  # a table of robot.toml
-    ("io/recording_folder.py", "gravity"),  # columns of frames.csv
     ("model/recording.py", "gravity"),
     ("rig", "gravity"),
     ("app", "gravity"),  # what the declared model has
+    ("io/meshing/robot_from_line.py", "gravity"),
+    ("xr/stream", "payload"),  # of a message
     ("app/demo/truth.py", "hyperelastic"),  # what the demo's truth is made with
 }
 """(where, word): plain words that say something else there."""

@@ -15,9 +15,11 @@ from femsense.model.drive import DrivenRobot, body_in, drive_of
 from femsense.model.effects import Entry, apply_effects, find_effect
 from femsense.model.quasi_static_path import solve_path
 from femsense.model.recording import Recording, make_recording
+from femsense.model.recording_parts import Drives, Timeline
 from femsense.model.robot import Robot
 from femsense.model.softening import softened_share, with_softening
-from femsense.rig.script import check_script, plan_script
+from femsense.rig.plan import plan_script
+from femsense.rig.script import check_script
 from femsense.rig.truth import true_path
 
 ENTRY: Entry = {"name": "softening", "share": 0.4, "energy_j_m3": 20.0}
@@ -26,7 +28,7 @@ LEVELS = [0.0, 1.0, 2.0, 1.0, 0.0, 1.0, 2.0, 3.0]
 
 def pulled(levels: list[float]) -> Recording:
     inputs = np.outer(levels, [1.0, 0.0, 0.0, 0.0])
-    return make_recording(time_s=np.arange(len(levels)), cable_names=("up", "down", "left", "right"), inputs=inputs)
+    return make_recording(Timeline(np.arange(len(levels))), drives=Drives(("up", "down", "left", "right"), inputs))
 
 
 def tips(robot: Robot, levels: list[float]) -> np.ndarray:

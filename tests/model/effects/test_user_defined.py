@@ -11,9 +11,9 @@ from helpers import ROOT, write_block_robot
 
 from femsense.core.errors import InputError
 from femsense.io.robot_toml import load_robot, save_robot
-from femsense.loop.improve import improve
+from femsense.loop.improve import ImproveOptions, improve
+from femsense.model.camera_frame import redo_depth, undo_depth
 from femsense.model.effects import apply_effects, build_entry, load_own_effect, try_own_effect
-from femsense.model.observation import redo_depth, undo_depth
 
 MAGNET = ROOT / "examples" / "magnet.py"
 OUTSIDE = "ignore:.*outside the mesh.*:UserWarning"
@@ -185,7 +185,9 @@ def test_an_effect_of_ones_own_competes_and_the_better_robot_can_be_written(tmp_
     inputs, labels = sweeps(each=1)
     hidden = {"name": "magnet", "file": str(MAGNET), "center_m": [0.1, 0.0, 0.0], "force_n": [0.0, 0.16, 0.1]}
     recording, _ = record(inputs[:9], effects=[hidden], labels=labels[:9], truth=arm((3, 1, 1)))
-    loop = improve(arm((3, 1, 1)), [recording], effects=["magnet", "cable_friction"], user_effects=[MAGNET])
+    loop = improve(
+        arm((3, 1, 1)), [recording], effects=["magnet", "cable_friction"], options=ImproveOptions(user_effects=[MAGNET])
+    )
     tried = next(row for row in loop.candidates if row.name == "magnet")
     assert tried.dchi2 > 100.0 and tried.seed["file"] == str(MAGNET)
     save_robot(arm((3, 1, 1)), tmp_path, effects=[hidden])

@@ -1,0 +1,53 @@
+"""What a command says: its answer, its progress, and lines beside."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import typer
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Answer:
+    """What a command has to say."""
+
+    document: dict[str, Any]
+    """For `--json`."""
+    text: str
+    """For people."""
+    exit_status: int = 0
+    then: Callable[[], None] | None = field(default=None)
+    """What goes on after it was said, until Ctrl-C."""
+
+
+@contextlib.contextmanager
+def progress_bar(title: str) -> Iterator[Callable[..., None] | None]:
+    """Yield what a library function reports its progress to: a bar on a terminal, else None."""
+    if not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[count]}"), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(title, total=None, count="")
+
+        def advance(done: int | str, total: int | None = None) -> None:
+            nonlocal task
+            if isinstance(done, int):
+                bar.update(task, completed=done, total=total, description=title, count=f"{done}/{total}")
+                return
+            bar.remove_task(task)  # an update cannot take a total away
+            task = bar.add_task(done, total=None, count="")
+
+        yield advance
+
+
+def say(text: str) -> None:
+    """Tell people what happens, on standard error."""
+    typer.echo(text, err=True)

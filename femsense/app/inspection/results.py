@@ -1,0 +1,190 @@
+"""Scripts, results of commands, captures of other programs, and what is none of these, looked into."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from femsense.app.inspection.reports import Report, attempt, read_object
+from femsense.app.inspection.robots import inspect_robot
+from femsense.core.errors import InputError
+from femsense.core.pose import check_pose
+from femsense.io.checkpoint import UNFINISHED
+from femsense.io.meshing.robot_from_line import line_report
+from femsense.rig.script import read_script
+
+
+def inspect_script(file: Path, report: Report, problems: list[str]) -> None:
+    script = read_script(file)
+    report["actuation"] = script.actuation
+    report["sweeps"] = [
+        {"label": s.label, "frames": len(s.profile()), "drives": ", ".join([*s.cables, *s.chambers])} for s in script.sweeps
+    ]
+    report["frames"] = sum(len(s.profile()) for s in script.sweeps)
+    report["effects"] = [str(entry.get("name", "")) for entry in script.effects]
+    report["contacts"], report["loads"] = len(script.contacts), len(script.loads)
+    report["camera"] = f"{script.camera.width} × {script.camera.height}"
+    report["clouds"] = script.clouds.kind
+
+
+def inspect_line(file: Path, report: Report, problems: list[str]) -> None:
+    report.update(line_report(file))
+
+
+def inspect_unfinished(folder: Path, report: Report, problems: list[str]) -> None:
+    report["holds"] = f"{(folder / UNFINISHED).stat().st_size / 1e6:.0f} MB of work that is done"
+    problems.append(
+        str(
+            InputError("a command was stopped here", where=folder, hint="run the same command again: it goes on where it stopped")
+        )
+    )
+
+
+def inspect_calibration(file: Path, report: Report, problems: list[str]) -> None:
+    data = read_object(file)
+    problems += _expect(data, "femsense-calibration-1", ("T_robot_camera", "rms_m", "status"), file)
+    for key in ("status", "rms_m", "T_robot_camera", "cable_tension_n", "cable_displacement_m", "marker_rms_m"):
+        if key in data:
+            report[key] = data[key]
+    report["iterations"] = len(data.get("history") or [])
+    pose = data.get("T_robot_camera")
+    if isinstance(pose, list):
+        attempt(lambda: check_pose(pose, f"{file}: T_robot_camera"), problems)
+
+
+def inspect_loop(path: Path, report: Report, problems: list[str]) -> None:
+    file = path / "loop.json" if path.is_dir() else path
+    data = read_object(file)
+    problems += _expect(data, "femsense-loop-1", ("verdict", "before", "after", "effects"), file)
+    for key in ("verdict", "noise_m", "before", "after", "left", "next_experiment"):
+        if key in data:
+            report[key] = data[key]
+    effects = data.get("effects")
+    names = [entry.get("name", "?") if isinstance(entry, dict) else str(entry) for entry in effects or []]
+    report["effects"] = names
+    report["candidates"] = len(data.get("candidates") or [])
+    improved = file.parent / "robot.toml"
+    if path.is_dir() and improved.is_file():
+        inner: Report = {}
+        inspect_robot(improved, inner, problems)
+        report["robot"] = inner
+
+
+def inspect_run(path: Path, report: Report, problems: list[str]) -> None:
+    folder = path if path.is_dir() else path.parent
+    expected = ("contacts.csv", "frames.csv", "states.npz", "run.json")
+    missing = [name for name in expected if not (folder / name).is_file()]
+    if missing:
+        problems.append(
+            str(
+                InputError(
+                    "files are missing",
+                    where=folder,
+                    found=", ".join(sorted(p.name for p in folder.iterdir())),
+                    expected=", ".join(missing),
+                    hint="run femsense estimate again: it goes on where it stopped",
+                )
+            )
+        )
+    if (folder / "run.json").is_file():
+        data = attempt(lambda: read_object(folder / "run.json"), problems) or {}
+        report["run"] = {key: value for key, value in data.items() if isinstance(value, str | int | float | bool)}
+    for name in ("frames.csv", "contacts.csv"):
+        if (folder / name).is_file():
+            report[name.removesuffix(".csv")] = attempt(partial(_csv_report, folder / name), problems)
+    if (folder / "states.npz").is_file():
+        report["states"] = attempt(lambda: _npz_report(folder / "states.npz"), problems)
+
+
+def inspect_table(file: Path, report: Report, problems: list[str]) -> None:
+    from femsense.io.importers.guess import guess_format
+
+    if guess_format(file) in ("optitrack", "vicon"):
+        report["kind"] = "capture"
+        inspect_capture(file, report, problems)
+        return
+    report.update(_csv_report(file))
+
+
+def inspect_capture(path: Path, report: Report, problems: list[str]) -> None:
+    """Ask the importer what is in it; frames are not read here."""
+    from femsense.io.importers.guess import contents
+
+    report["bytes"] = path.stat().st_size if path.is_file() else None
+    found = attempt(lambda: contents(path), problems)
+    if found is not None:
+        report.update({**found, "next": "femsense import reads its frames and makes a recording of it"})
+
+
+def inspect_folder(folder: Path, report: Report, problems: list[str]) -> None:
+    from femsense.io.importers.guess import guess_format
+
+    if guess_format(folder) is not None:
+        report["kind"] = "capture"
+        inspect_capture(folder, report, problems)
+        return
+    endings = Counter(item.suffix.lower() or "(none)" for item in folder.iterdir() if item.is_file())
+    report.update({"files": dict(endings), "folders": sorted(item.name for item in folder.iterdir() if item.is_dir())})
+    problems.append(
+        str(
+            InputError(
+                "nothing that femsense knows",
+                where=folder,
+                found=", ".join(f"{n} {e}" for e, n in endings.items()) or "no files",
+                expected="robot.toml, recording.toml, run.json or loop.json",
+                hint="femsense import makes a recording of folders of clouds or images",
+            )
+        )
+    )
+
+
+def inspect_unknown(file: Path, report: Report, problems: list[str]) -> None:
+    report["bytes"] = file.stat().st_size
+    problems.append(
+        str(
+            InputError(
+                "not a kind of file that femsense knows",
+                where=file,
+                found=file.suffix or "no ending",
+                expected="a robot, a recording, a mesh, a surface, a cloud, an image or a result",
+            )
+        )
+    )
+
+
+def _expect(data: Mapping[str, Any], name: str, keys: Sequence[str], file: Path) -> list[str]:
+    """Return the texts of a wrong format and of missing keys."""
+    texts = []
+    if data.get("format") != name:
+        texts.append(
+            str(InputError("another format", where=f"{file}: format", found=repr(data.get("format")), expected=repr(name)))
+        )
+    missing = [key for key in keys if key not in data]
+    if missing:
+        texts.append(str(InputError("keys are missing", where=file, found=", ".join(data), expected=", ".join(missing))))
+    return texts
+
+
+def _csv_report(file: Path) -> Report:
+    import csv
+
+    with file.open(encoding="utf-8-sig", newline="") as stream:
+        reader = csv.reader(stream)
+        columns = next(reader, [])
+        rows = [row for row in reader if any(row)]
+    report: Report = {"rows": len(rows), "columns": len(columns)}
+    if "status" in columns:
+        report["status"] = dict(Counter(row[columns.index("status")] for row in rows if len(row) == len(columns)))
+    if "force_n" in columns and rows:
+        report["largest_force_n"] = max(float(row[columns.index("force_n")] or 0.0) for row in rows)
+    return report
+
+
+def _npz_report(file: Path) -> Report:
+    with np.load(file) as data:
+        return {name: " × ".join(str(n) for n in data[name].shape) for name in data.files}

@@ -1,0 +1,57 @@
+"""A depth camera: its lens, and what a single depth is off by."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from femsense.core.arrays import FloatArray
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class CameraNoise:
+    """What a single depth is off by, as one standard deviation over the distance z."""
+
+    kind: str
+    """"stereo": at_1m · z²;  "tof": floor + slope · z."""
+    at_1m: float = 0.0
+    """[m] at z = 1 m; 0 where the kind is "tof"."""
+    floor: float = 0.0
+    """[m]; 0 where the kind is "stereo"."""
+    slope: float = 0.0
+    """[m/m]; 0 where the kind is "stereo"."""
+
+    def std(self, depth: npt.ArrayLike) -> FloatArray:
+        """Return one standard deviation [m] of depths z [m], of the same shape."""
+        z = np.asarray(depth, dtype=np.float64)
+        return self.at_1m * z**2 if self.kind == "stereo" else self.floor + self.slope * z
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Camera:
+    """A pinhole camera; the centre of the first pixel is (0, 0)."""
+
+    name: str
+    """"" where there is one camera."""
+    width: int
+    """[px]."""
+    height: int
+    """[px]."""
+    fx: float
+    """[px]."""
+    fy: float
+    """[px]."""
+    cx: float
+    """[px]."""
+    cy: float
+    """[px]."""
+    distortion: FloatArray
+    """OpenCV's k1, k2, p1, p2, k3, shape (5,), with k4, k5, k6 shape (8,); k1 … k4 and 0 where the model is "kannala_brandt"."""
+    depth_unit: float
+    """Metres in one unit of a depth image."""
+    distortion_model: str = "brown_conrady"
+    """"brown_conrady", "inverse_brown_conrady" (the same polynomial takes bent rays to straight ones) or "kannala_brandt"."""
+    noise: CameraNoise | None = None
+    """What a single depth is off by; None where not known."""

@@ -1,0 +1,208 @@
+"""Whether a recording fits a robot, and whether its numbers can be meant."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+
+import numpy as np
+
+from femsense.core.arrays import freeze
+from femsense.core.errors import InputError
+from femsense.core.text import did_you_mean
+from femsense.fem.mesh import embed_points
+from femsense.model.recording import Recording, with_marker_table
+from femsense.model.recording_parts import RestMarkers
+from femsense.model.robot import Robot
+
+SLOW = 5.0
+"""Frames that are farther apart than this [s] are more likely counted in milliseconds: cameras take 5 to 90 a second."""
+LONG_PULL = 0.5
+"""A cable that moves farther than this [m] is more likely given in millimetres or centimetres."""
+FAR_LOAD = 0.25
+"""A known load farther from the body than this times the mesh's diagonal is an error."""
+
+
+def check_against(robot: Robot, recording: Recording) -> Recording:
+    """Return the recording as this robot needs it: cables and chambers in the robot's order, without markers that the robot lacks.
+
+    Warns of markers that are dropped, of inputs beyond the limits of cables and chambers, and of numbers that are hardly meant.
+
+    Raises:
+        InputError: other cables or chambers than the robot's, no marker in common, a known load far from the body.
+    """
+    fitted = _without_strangers(robot, _with_chamber_order(robot, _with_cable_order(robot, recording)))
+    _check_loads(robot, fitted)
+    _check_displacements(robot, fitted)
+    _warn_of_inputs(robot, fitted)
+    warn_of_values(fitted)
+    return fitted
+
+
+def warn_of_values(recording: Recording) -> None:
+    """Warn of times, displacements and signs that can be computed with but are hardly meant."""
+    r, where = recording, _place(recording, "frames.csv")
+    steps = np.diff(r.time_s)
+    if len(steps) and np.median(steps) > SLOW:
+        text = f"one frame every {np.median(steps):.4g} s by the column time_s; is it in milliseconds?"
+        warnings.warn(f"{where}: {text}", stacklevel=3)
+    if r.actuation != "displacement":
+        return
+    for name, pulled in zip(r.cable_names, r.inputs.T):
+        longest = float(np.abs(pulled).max(initial=0.0))
+        if longest > LONG_PULL:
+            text = f"cable {name!r} moves by up to {longest:.4g} m; are displacements in millimetres?"
+            warnings.warn(f"{where}: {text}", stacklevel=3)
+        back, forth = int((pulled < 0).sum()), int((pulled > 0).sum())
+        if r.actuation_zero == "absolute" and back > forth:
+            text = (
+                f"cable {name!r} is slack in {len(pulled) - forth} of {len(pulled)} frames, its displacement below zero in {back}"
+            )
+            warnings.warn(f"{where}: {text}; is the sign right? > 0 shortens", stacklevel=3)
+
+
+def _place(recording: Recording, file: str) -> str:
+    return str(recording.folder / file) if recording.folder else file
+
+
+def _with_cable_order(robot: Robot, recording: Recording) -> Recording:
+    wanted = robot.body.cable_names
+    order = _drive_order(robot, recording, "cable", wanted, recording.cable_names)
+    return replace(recording, cable_names=wanted, inputs=freeze(recording.inputs[:, order]))
+
+
+def _with_chamber_order(robot: Robot, recording: Recording) -> Recording:
+    wanted = robot.body.chamber_names
+    order = _drive_order(robot, recording, "chamber", wanted, recording.chamber_names)
+    return replace(recording, chamber_names=wanted, pressures=freeze(recording.pressures[:, order]))
+
+
+def _drive_order(robot: Robot, recording: Recording, kind: str, wanted: tuple[str, ...], given: tuple[str, ...]) -> list[int]:
+    """Return where the robot's cables or chambers stand among the columns."""
+    if set(wanted) != set(given):
+        lacking = [name for name in wanted if name not in given]
+        extra = [name for name in given if name not in wanted]
+        parts = [f"lacks {', '.join(lacking)}"] if lacking else []
+        parts += [f"has {', '.join(extra)} that the robot has not"] if extra else []
+        idle = "a cable that was slack" if kind == "cable" else "a chamber without pressure"
+        raise InputError(
+            f"other {kind}s than those of the robot {robot.name!r}: the recording {' and '.join(parts)}",
+            where=_place(recording, "frames.csv"),
+            found=", ".join(f"{kind}_{name}" for name in given) or f"no {kind} columns",
+            expected=", ".join(f"{kind}_{name}" for name in wanted) or f"no {kind} columns",
+            hint=did_you_mean(extra[0], wanted) if extra else f"{idle} has a column of zeros",
+        )
+    return [given.index(name) for name in wanted]
+
+
+def _without_strangers(robot: Robot, recording: Recording) -> Recording:
+    """Return the recording without the markers that the robot lacks."""
+    known = set(robot.marker_names)
+    strangers = [name for name in recording.marker_names if name not in known]
+    if recording.has_markers and len(strangers) == len(recording.marker_names):
+        raise InputError(
+            f"no marker that the robot {robot.name!r} has",
+            where=_place(recording, "markers.csv"),
+            found=", ".join(recording.marker_names),
+            expected=", ".join(robot.marker_names) or "the robot declares no [[markers]]",
+            hint=did_you_mean(strangers[0], robot.marker_names),
+        )
+    result = _without_rest_strangers(known, recording)
+    if not strangers:
+        return result
+    warnings.warn(
+        f"{_place(recording, 'markers.csv')}: markers that the robot {robot.name!r} lacks are left out: {', '.join(strangers)}",
+        stacklevel=3,
+    )
+    names = [name for name in recording.marker_names if name in known]
+    kept = np.array([recording.marker_names[i] in known for i in recording.marker_index], dtype=bool)
+    index = [names.index(recording.marker_names[i]) for i in recording.marker_index[kept]]
+    r = recording
+    return with_marker_table(
+        result, names, r.marker_frame[kept], np.array(index, dtype=np.int64), r.marker_xyz[kept], view=r.marker_view[kept]
+    )
+
+
+def _without_rest_strangers(known: set[str], recording: Recording) -> Recording:
+    rest = recording.rest
+    if rest is None or known.issuperset(rest.names):
+        return recording
+    lost = sorted(set(rest.names) - known)
+    warnings.warn(f"{_place(recording, 'rest.csv')}: markers that the robot lacks are left out: {', '.join(lost)}", stacklevel=4)
+    kept = np.array([name in known for name in rest.names], dtype=bool)
+    names = tuple(name for name in rest.names if name in known)
+    left = RestMarkers(names, freeze(rest.positions[kept]), freeze(rest.std[kept]), freeze(rest.view[kept], np.int64))
+    return replace(recording, rest=left if names else None)
+
+
+def _check_loads(robot: Robot, recording: Recording) -> None:
+
+    if not len(recording.load_points):
+        return
+    places = np.unique(recording.load_points, axis=0)
+    outside = embed_points(robot.body.mesh, places).outside
+    diagonal = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
+    worst = int(outside.argmax())
+    if outside[worst] > FAR_LOAD * diagonal:
+        k = int(recording.load_frame[(recording.load_points == places[worst]).all(axis=1)][0])
+        looks = np.abs(places[worst]).max() > 20 * np.abs(robot.body.mesh.nodes).max()
+        raise InputError(
+            "a known load is far from the body",
+            where=f"{_place(recording, 'loads.csv')}, frame {recording.frame_numbers[k]}",
+            found=f"{places[worst].tolist()} m, {1e3 * outside[worst]:.4g} mm outside",
+            expected=f"a place on the body at rest, robot frame, at most {250 * diagonal:.4g} mm outside",
+            hint="this looks like millimetres: places are in metres"
+            if looks
+            else "loads are in the robot frame, not the camera's",
+        )
+
+
+def _check_displacements(robot: Robot, recording: Recording) -> None:
+    """Refuse a cable that is shortened by more than its length. Raises InputError."""
+    if recording.actuation != "displacement":
+        return
+    for cable, pulled in zip(robot.body.cables, recording.inputs.T):
+        points = np.vstack([cable.path.positions(robot.body.mesh.nodes), cable.pull_point])
+        length = float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+        span = float(np.ptp(pulled)) if recording.actuation_zero == "unknown" else float(pulled.max(initial=0.0))
+        if span > max(length, 1e-3):
+            raise InputError(
+                f"cable {cable.name!r} is shortened by more than its length",
+                where=_place(recording, "frames.csv"),
+                found=f"{span:.4g} m",
+                expected=f"less than {length:.4g} m from its far end to its pull point",
+                hint="this looks like millimetres: displacements are in metres" if span > 5 * length else None,
+            )
+
+
+def _warn_of_inputs(robot: Robot, recording: Recording) -> None:
+    """Warn of pressures and tensions beyond what chambers and cables are declared for."""
+    for j, chamber in enumerate(robot.body.chambers):
+        highest = recording.pressures[:, j].max(initial=-np.inf)
+        if highest > chamber.max_pressure * (1 + 1e-9):
+            warnings.warn(
+                f"{_place(recording, 'frames.csv')}: chamber {chamber.name!r} reaches {highest:.4g} Pa, more than its max_pressure_pa of {chamber.max_pressure:.4g} Pa",
+                stacklevel=3,
+            )
+    if recording.actuation != "tension":
+        return
+    for j, cable in enumerate(robot.body.cables):
+        tension = recording.inputs[:, j]
+        if recording.actuation_zero != "absolute":
+            span = max(float(tension.max(initial=0.0)), 0.0) - min(float(tension.min(initial=0.0)), 0.0)
+            if span > (cable.max_tension - cable.min_tension) * (1 + 1e-9):
+                warnings.warn(
+                    f"{_place(recording, 'frames.csv')}: the tensions of cable {cable.name!r} span {span:.4g} N, more than from its min_tension_n to its max_tension_n",
+                    stacklevel=3,
+                )
+            continue
+        if tension.max(initial=-np.inf) > cable.max_tension * (1 + 1e-9):
+            warnings.warn(
+                f"{_place(recording, 'frames.csv')}: cable {cable.name!r} reaches {tension.max():.4g} N, more than its max_tension_n of {cable.max_tension:.4g} N",
+                stacklevel=3,
+            )
+        if tension.min(initial=np.inf) < 0:
+            warnings.warn(
+                f"{_place(recording, 'frames.csv')}: cable {cable.name!r} goes down to {tension.min():.4g} N; a cable cannot push",
+                stacklevel=3,
+            )

@@ -1,0 +1,153 @@
+"""The parts of a recording: what `make_recording` puts together (arrays are whatever NumPy takes), tools, and markers at rest."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from femsense.core.arrays import FloatArray, IntArray, freeze
+from femsense.model.camera import Camera
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Timeline:
+    """The frames, in order of time, and what is known of each beside its inputs."""
+
+    time_s: npt.ArrayLike
+    """[s], increasing, shape (F,)."""
+    frame_numbers: npt.ArrayLike | None = None
+    """As in frames.csv, shape (F,); None: 0 … F − 1."""
+    free: npt.ArrayLike | None = None
+    """Frames in which nothing undeclared touches the robot, shape (F,); None where not known."""
+    sweep: Sequence[str] | None = None
+    """A label for each frame: what is held out together; None where not given."""
+    gravity: npt.ArrayLike | None = None
+    """In the robot frame [m/s²], shape (F, 3); None: as the robot declares."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Drives:
+    """What drives the robot."""
+
+    cable_names: Sequence[str] = ()
+    inputs: npt.ArrayLike | None = None
+    """Of the cables [N] or [m, > 0 shortens], shape (F, a)."""
+    actuation: str = "tension"
+    """What `inputs` holds: "tension" or "displacement"."""
+    actuation_zero: str = "absolute"
+    """"absolute": the values are the true inputs; "unknown": they count from an unknown initial input."""
+    chamber_names: Sequence[str] = ()
+    pressures: npt.ArrayLike | None = None
+    """[Pa], shape (F, c)."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class MarkerRows:
+    """K observations of markers that have names."""
+
+    names: Sequence[str]
+    frame: npt.ArrayLike
+    """An index 0 … F − 1, shape (K,)."""
+    index: npt.ArrayLike
+    """Into the names, shape (K,)."""
+    xyz: npt.ArrayLike
+    """In the frame of the camera that sees it [m], shape (K, 3)."""
+    view: npt.ArrayLike | None = None
+    """That camera, an index into the views, shape (K,); None: the first."""
+    noise_m: float | None = None
+    """What a marker repeats to along each axis [m]; None where not known."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class UnnamedRows:
+    """U observations of markers that nobody named."""
+
+    frame: npt.ArrayLike = ()
+    """An index 0 … F − 1, shape (U,)."""
+    xyz: npt.ArrayLike = ()
+    """In the frame of the camera that sees it [m], shape (U, 3)."""
+    view: npt.ArrayLike | None = None
+    """That camera, an index into the views, shape (U,); None: the first."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class LoadRows:
+    """L known loads."""
+
+    frame: npt.ArrayLike = ()
+    """An index 0 … F − 1, shape (L,)."""
+    points: npt.ArrayLike = ()
+    """The place on the body at rest, robot frame [m], shape (L, 3)."""
+    forces: npt.ArrayLike = ()
+    """Robot frame [N], shape (L, 3)."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Views:
+    """V cameras, and the files of what they saw."""
+
+    names: Sequence[str] = ("",)
+    cameras: Sequence[Camera | None] | None = None
+    """One a view; None where the lens is not known."""
+    T_robot_camera: Sequence[npt.ArrayLike | None] | None = None
+    """One a view, shape (4, 4); None where the pose is not known."""
+    cloud_files: Sequence[Sequence[Path | None]] | None = None
+    """Cloud or depth image of each frame and view; None where there is none."""
+    color_files: Sequence[Sequence[Path | None]] | None = None
+    """Colour image that goes with a depth image, the same shape."""
+
+
+def _no_points() -> FloatArray:
+    return freeze(np.zeros((0, 3)))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Tool:
+    """A body of known shape that may touch the robot. Its frame: a ball's centre; a cylinder's centre and axis z; the mesh's own."""
+
+    name: str
+    kind: str
+    """"ball", "cylinder" or "mesh"."""
+    radius: float = 0.0
+    """Of a ball or a cylinder [m]; 0 for a mesh."""
+    length: float = 0.0
+    """Of a cylinder [m]; 0 for others."""
+    points: FloatArray = field(default_factory=_no_points)
+    """Of a mesh [m], shape (n, 3)."""
+    triangles: IntArray = field(default_factory=lambda: freeze(np.zeros((0, 3)), np.int64))
+    """Of a mesh, a closed surface, outward, shape (t, 3)."""
+    mesh_file: Path | None = None
+    """Where the mesh was read; None where it was made in Python."""
+    mesh_unit: str = "m"
+    """Unit of the coordinates in that file."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class RestMarkers:
+    """Markers measured with the body unloaded, camera frame."""
+
+    names: tuple[str, ...]
+    positions: FloatArray
+    """[m], shape (r, 3)."""
+    std: FloatArray
+    """One standard deviation [m], shape (r,); NaN where it is not given."""
+    view: IntArray
+    """Index of the camera, shape (r,)."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class About:
+    """What is known of a recording beside its frames."""
+
+    folder: Path | None = None
+    """Where it was read; None where it was made in Python."""
+    session: str | None = None
+    """Recordings of one session share what a session shares; None where not given."""
+    rest: RestMarkers | None = None
+    """Markers of the unloaded body."""
+    tools: Sequence[Tool] = ()
+    """What may touch the robot."""
