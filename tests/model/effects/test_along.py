@@ -150,6 +150,7 @@ def test_a_moved_cable_bends_the_arm_as_one_that_was_tied_there() -> None:
 def test_a_share_of_one_input_goes_to_another_after_its_gain() -> None:
     from femsense.model.drive import drive_of
     from femsense.model.recording import make_recording
+    from femsense.model.recording_parts import Drives, Timeline
 
     robot = apply_effects(
         arm((3, 1, 1)),
