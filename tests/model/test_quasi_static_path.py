@@ -127,9 +127,7 @@ def test_known_loads_creep_too_and_two_at_one_place_are_one() -> None:
     r = robot([{"name": "creep", "fraction": 0.5, "time_s": 1.0}])
     place, t = [0.1, 0.015, 0.015], [0.0, 1.0, 2.0, 3.0]
     once = recording([[0, 0]] * 4, time_s=t, loads=LoadRows([1, 2, 3], [place] * 3, [[0, 0, -1.0]] * 3))
-    halves = recording(
-        [[0, 0]] * 4, time_s=t, load_frame=[1, 1, 2, 2, 3, 3], load_points=[place] * 6, load_forces=[[0, 0, -0.5]] * 6
-    )
+    halves = recording([[0, 0]] * 4, time_s=t, loads=LoadRows([1, 1, 2, 2, 3, 3], [place] * 6, [[0, 0, -0.5]] * 6))
     drive = drive_of(r, once)
     ramp = 0.5 * (1 - (1 - np.exp(-1.0)))  # after the ramp over the first second
     flow = np.array([ramp, 0.5 - (0.5 - ramp) * np.exp(-1), 0.5 - (0.5 - ramp) * np.exp(-2)])
