@@ -155,9 +155,7 @@ def test_equal_frames_share_one_solve_and_come_out_the_same(monkeypatch: pytest.
 def test_frames_with_other_loads_or_gravity_are_not_the_same() -> None:
     rec = recording(
         [[1.0, 0]] * 4,
-        load_frame=[1, 2],
-        load_points=[[0.1, 0.015, 0.03]] * 2,
-        load_forces=[[0, 0, -0.1], [0, 0, 0.1]],
+        loads=LoadRows([1, 2], [[0.1, 0.015, 0.03]] * 2, [[0, 0, -0.1], [0, 0, 0.1]]),
         gravity=[[0, 0, -9.81], [0, 0, -9.81], [0, 0, -9.81], [0, 9.81, 0]],
     )
     seen = walked(robot(), rec)
