@@ -39,7 +39,7 @@ from femsense.model.drive import DrivenRobot, drive_of  # noqa: E402
 from femsense.model.frame_state import solve_frame  # noqa: E402
 from femsense.model.observation import Hypothesis, evaluate_scene, make_scene  # noqa: E402
 from femsense.model.recording import Recording, with_marker_table  # noqa: E402
-from femsense.model.recording_parts import Drives, Timeline
+from femsense.model.recording_parts import Drives, Timeline  # noqa: E402
 from femsense.model.robot import Robot  # noqa: E402
 from femsense.pointcloud.rays import Surface  # noqa: E402
 from femsense.pointcloud.segmentation import color_mask  # noqa: E402
