@@ -37,7 +37,7 @@ ALTERNATIVES = 0.5
 PREDICTED_MUCH = 8.0
 """Linear dBIC that a candidate needs to be refitted: what is small is nearly linear, so that a refit finds about as much."""
 HINTED = 0.5
-"""A richer form is tried where its predicted gain, by fields of the model without the effect, is this share of what it needs."""
+"""What fields of another model predict is looked into where it is this share of the gain that is needed: they may be wrong by a factor of two."""
 WITHIN_REACH = 0.4
 """What has this share of the best's dBIC at its seed may be ahead of it where its place is."""
 
@@ -328,6 +328,11 @@ def shortlist(table: list[Candidate], *, first: bool) -> list[Candidate]:
         chosen += [c for c in forms if len(c.parameters) == simple]
     best = max((c.score for c in chosen), default=0.0)
     return sorted(chosen, key=lambda c: c.cost if c.score >= ALIKE * best else np.inf)
+
+
+def hinted(table: list[Candidate]) -> bool:
+    """Return whether candidates by fields of the model before may be worth a refit by fields of their own, since these may predict more gain."""
+    return bool(shortlist([replace(c, score=c.gain / HINTED - c.cost) for c in table], first=False))
 
 
 def _forms(table: list[Candidate], name: str) -> list[Candidate]:

@@ -16,7 +16,7 @@ from femsense.loop.result.records import NAMED, PASSES, RefitRecord
 from femsense.loop.search.acceptance import discretisation_rms, moved_by
 from femsense.loop.search.calibration import Ready, calibrated_pose, fitted_again, matched
 from femsense.loop.search.effect_fields import Fields, fields_of
-from femsense.loop.search.forward_selection import select_next, shortlist
+from femsense.loop.search.forward_selection import hinted, select_next
 from femsense.loop.search.input_offset import instead_of_offsets
 from femsense.loop.search.pruning import prune
 from femsense.loop.search.refit import evidence
@@ -149,7 +149,7 @@ def scored(
 ) -> tuple[Fields, list[Candidate]]:
     """Return fields and the scores by them: those of the fitted model itself where others predict a gain."""
     table = screen_model(data, fitted.fit, noise, fields, n_effective)
-    if fields.model is fitted.fit.hypothesis or not shortlist(table, first=False):
+    if fields.model is fitted.fit.hypothesis or not hinted(table):
         return fields, table
     fields = fields_of(data, fitted, names)
     return fields, screen_model(data, fitted.fit, noise, fields, n_effective)

@@ -301,6 +301,19 @@ def test_fields_are_computed_anew_where_those_of_the_model_before_promise_someth
     assert {c.effect.name for c in table} <= {"payload", "poisson"}
 
 
+def test_fields_of_the_model_before_that_nearly_suffice_are_computed_anew(monkeypatch: pytest.MonkeyPatch):
+    data, base = started()
+    fitted, _ = added(data, base, "cable_gain", 1)
+    hints = fields_of(data, base, ["payload"]).beside(fitted.fit)
+    assert hints is not None
+    best = screen_model(data, fitted.fit, NOISE, hints, COUNT)[0]
+    for share, anew in ((1.5, True), (2.5, False)):
+        monkeypatch.setattr(forward_selection, "PREDICTED_MUCH", share * best.gain - best.cost)
+        assert not shortlist([best], first=False)
+        fields, _ = searching.scored(data, fitted, hints, NOISE, ["payload"], COUNT)
+        assert (fields is not hints) == anew
+
+
 def test_a_richer_form_is_tried_only_where_fields_promise_something(monkeypatch: pytest.MonkeyPatch):
     data, base = started()
     fields = fields_of(data, base, ["cable_gain"])
