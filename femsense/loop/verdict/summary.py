@@ -34,7 +34,7 @@ from femsense.loop.search.screening import TESTABLE, Candidate, one_each
 from femsense.loop.search.search_state import Search
 from femsense.loop.verdict.candidate_tables import KINDS, own_size
 from femsense.loop.verdict.sentences import mesh_error_rms
-from femsense.model.effects.base import placed
+from femsense.model.effects.base import absent_elsewhere, placed
 
 MIN_SWEEPS = 4
 """With fewer held-out sweeps the interval of the held-out error resamples frames."""
@@ -88,6 +88,9 @@ def values_of(full_std: dict[str, FloatArray], back: FittedModel, name: str) -> 
             continue
         if full is not None and len(full) == len(std):
             std = np.maximum(std, full)
+        for p in absent_elsewhere(parameters):
+            known = result.get(p.key, Value(None, None, p.unit))
+            result[p.key] = Value(placed(known.value, p.part, p.value(p.null)), placed(known.std, p.part, None), known.unit)
         for p, value, deviation in zip(parameters, values, std):
             known = result.get(p.key, Value(None, None, p.unit))
             own = placed(known.value, p.part, _finite(p.value(value)))

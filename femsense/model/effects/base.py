@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any
 
@@ -35,6 +35,8 @@ class InRecording:
     """As of `Parameter.part`."""
     recording: str
     """Label of the recording or its session."""
+    labels: tuple[str, ...] = field(default=(), compare=False)
+    """Labels of all recordings: where one has no parameter of its own, the effect is absent."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,9 +232,22 @@ def build_entry(parameters: Sequence[Parameter], coordinates: Sequence[float], s
     """Return the table of `[[effects]]` for coordinates of the fit."""
     fitted = {p.key for p in parameters}
     entry: Entry = {key: value for key, value in seed.items() if key not in fitted}
-    for parameter, coordinate in zip(parameters, coordinates):
+    absent = absent_elsewhere(parameters)
+    for parameter, coordinate in zip((*absent, *parameters), (*(p.null for p in absent), *coordinates)):
         entry[parameter.key] = placed(entry.get(parameter.key), parameter.part, parameter.value(float(coordinate)))
     return entry
+
+
+def absent_elsewhere(parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
+    """Return the parameters of recordings in which an effect is absent, where it is that of others alone: there they stay at their null."""
+    given = {(p.key, p.part) for p in parameters}
+    result = dict[tuple[str, Any], Parameter]()
+    for p in parameters:
+        for label in p.part.labels if isinstance(p.part, InRecording) else ():
+            part = replace(p.part, recording=label)
+            if (p.key, part) not in given:
+                result.setdefault((p.key, part), replace(p, part=part))
+    return tuple(result.values())
 
 
 def placed(slot: Any, part: int | str | tuple[str, int] | InRecording | None, value: Any) -> Any:

@@ -88,13 +88,13 @@ def per_recording(effect: Effect, labels: tuple[str, ...] = ()) -> Effect:
 
 def _parameters(effect: Effect, labels: tuple[str, ...], robot: Robot, control: str) -> tuple[Parameter, ...]:
     parts = [(p, p.part) for p in effect.parameters(robot, control) if not isinstance(p.part, InRecording)]
-    return tuple(replace(p, part=InRecording(part, label)) for label in labels for p, part in parts)
+    return tuple(replace(p, part=InRecording(part, label, labels)) for label in labels for p, part in parts)
 
 
 def _alike(effect: Effect, labels: tuple[str, ...], robot: Robot, control: str) -> tuple[Parameter, ...]:
     """Return a scale that all cables or chambers have in common in each recording; none where an effect has no scale of each."""
     scales = [p for p in effect.parameters(robot, control) if isinstance(p.part, str) and p.scale == "log"]
-    return tuple(replace(p, part=InRecording(None, label)) for label in labels for p in scales[:1] if len(scales) > 1)
+    return tuple(replace(p, part=InRecording(None, label, labels)) for label in labels for p in scales[:1] if len(scales) > 1)
 
 
 def _apply(effect: Effect, robot: Robot, entry: Entry) -> Robot:

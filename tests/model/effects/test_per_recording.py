@@ -19,14 +19,16 @@ from femsense.model.drive import drive_of
 from femsense.model.effects import Entry, apply_effects, build_entry, by_session, find_effect, forms_by_recording, per_recording
 from femsense.model.observation import Hypothesis, evaluate_scene, make_scene
 from femsense.model.recording import Recording, make_recording
+from femsense.model.recording_parts import Drives, MarkerRows, Timeline
 from femsense.model.robot import Robot
 
 GAIN: Entry = {"name": "cable_gain", "per": "recording", "scale": {"up": {"A": 0.5, "B": 2.0}, "left": 1.5}}
 
 
-def recording(session: str | None = None, folder: str | None = None, **options: Any) -> Recording:
-    own = {"time_s": [0.0, 1.0], "cable_names": NAMES, "inputs": [[0.0] * 4, [1.0] * 4], **options}
-    return make_recording(**own, session=session, folder=None if folder is None else Path(folder))
+def recording(session: str | None = None, folder: str | None = None, inputs: Any = None, **parts: Any) -> Recording:
+    drives = Drives(NAMES, [[0.0] * 4, [1.0] * 4] if inputs is None else inputs)
+    made = make_recording(Timeline([0.0, 1.0]), drives=drives, **parts)
+    return replace(made, session=session, folder=None if folder is None else Path(folder))
 
 
 def tensions(robot: Robot, session: str) -> list[float]:
@@ -91,6 +93,26 @@ def test_parameters_build_the_entry_that_is_applied() -> None:
     assert points["m1"] == {"A": [3, 4, 5], "B": [39, 40, 41]}
 
 
+@pytest.mark.parametrize(
+    ("name", "at", "absent", "there"),
+    [("cable_gain", np.log(2.0), 1.0, 2.0), ("cable_offset", 0.3, 0.0, 0.3), ("marker_offset", 1e-3, [0.0] * 3, [1e-3] * 3)],
+)
+def test_what_one_recording_has_alone_is_absent_in_the_others(name: str, at: float, absent: Any, there: Any) -> None:
+    robot = arm((3, 1, 1))
+    form = per_recording(find_effect(name), ("A", "B"))
+    (seed,) = form.seeds(robot)
+    own = [
+        p
+        for p in form.parameters(robot, "tension")
+        if p.part.recording == "B" and p.part.part in ("up", *(("m1", i) for i in range(3)))
+    ]
+    (table,) = (v for k, v in build_entry(own, [at] * len(own), seed).items() if k != "per")
+    (values,) = table.values()
+    assert values["A"] == absent and values["B"] == pytest.approx(there)
+    whole = form.apply(robot, build_entry(own, [at] * len(own), seed))
+    np.testing.assert_array_equal(tensions(whole, "A"), tensions(robot, "A"))
+
+
 def test_it_is_sought_only_where_recordings_were_made_in_several_sessions() -> None:
     effects = [find_effect(name) for name in ("cable_gain", "gravity", "chamber_gain")]
     forms = forms_by_recording(effects, [recording("A"), recording(None, "b")])
@@ -112,10 +134,9 @@ def test_the_sensitivity_is_that_of_the_recording_alone() -> None:
     seen = recording(
         "B",
         inputs=inputs,
-        marker_names=robot.marker_names,
-        marker_frame=np.repeat([0, 1], count),
-        marker_index=np.tile(np.arange(count), 2),
-        marker_xyz=np.tile(robot.marker_points, (2, 1)),
+        markers=MarkerRows(
+            robot.marker_names, np.repeat([0, 1], count), np.tile(np.arange(count), 2), np.tile(robot.marker_points, (2, 1))
+        ),
     )
     scene = make_scene(robot, seen, np.arange(2))
 
