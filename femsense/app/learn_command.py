@@ -55,6 +55,8 @@ def learn_into(
         options = LearnOptions(end_to_end=end_to_end, bones=ArmatureOptions(bones=bones, plane_normal=_normal(plane)))
         model = learn(data, test=other, options=options, progress=progress)
         text, document = report_text(model.report), {}
+        if model.chain is not None:
+            text += f"\n\n  {len(model.bone_names)} bones along {', '.join(model.marker_names)}, in this order"
     save_model(model, output)
     return {"path": str(output), **document, **model.report}, f"{text}\n\nwritten: {output}"
 

@@ -137,7 +137,9 @@ class ViewTable(Schema):
 class MarkersTable(Schema):
     """How well markers are seen."""
 
-    names: list[str] | None = Field(None, description="the markers that there are; by default all of the robot")
+    names: list[str] | None = Field(
+        None, description="the markers that there are, in their order in markers.csv; by default all of the robot"
+    )
     std_m: NotNegative = Field(0.0, description="noise of each coordinate of each marker in each frame [m], ≥ 0")
     frame_std_m: NotNegative = Field(
         0.0, description="noise of each coordinate that all markers of a frame have in common [m], ≥ 0"

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from femsense.core.arrays import BoolArray, FloatArray, freeze
+from femsense.core.arrays import BoolArray, FloatArray, IntArray, freeze
 from femsense.core.errors import InputError
 from femsense.core.pose import transform_points
 from femsense.fem.mesh import embed_points, to_linear
@@ -124,7 +124,7 @@ def recording_of(experiment: Experiment) -> Recording:
     script, plan = experiment.script, experiment.plan
     recorded = plan.commanded + (plan.initial if script.actuation_zero == "absolute" else 0.0)
     recorded = recorded + script.input_std * _rng(script, "inputs").standard_normal(recorded.shape)
-    frame, index = np.nonzero(experiment.visible)
+    frame, index = _seen_markers(experiment)
     return make_recording(
         Timeline(np.round(plan.time_s, DIGITS), free=plan.free, sweep=plan.sweep, gravity=plan.gravity),
         drives=Drives(
@@ -184,6 +184,16 @@ def _with_placement(robot: Robot, script: ScriptTable) -> Robot:
 def _chosen_markers(robot: Robot, script: ScriptTable) -> BoolArray:
     names = script.markers.names
     return np.array([names is None or name in names for name in robot.marker_names], dtype=bool)
+
+
+def _seen_markers(experiment: Experiment) -> tuple[IntArray, IntArray]:
+    """Return frame and marker of each row of markers.csv: in a frame as the script names them, else as the robot does."""
+    frame, index = np.nonzero(experiment.visible)
+    known = experiment.robot.marker_names
+    names = experiment.script.markers.names or known
+    rank = np.array([names.index(name) if name in names else len(names) for name in known], dtype=np.int64)
+    order = np.lexsort((rank[index], frame))
+    return frame[order], index[order]
 
 
 def _measured_markers(experiment: Experiment) -> FloatArray:

@@ -46,6 +46,7 @@ def test_learn_then_another_day(tmp_path: Path, capsys: pytest.CaptureFixture[st
     np.testing.assert_allclose(moved, np.tile([0.01, 0, 0], (3, 1)), atol=5e-4)
     assert run(["learn", *files, "--test", *other, "-o", str(model)]) == 0
     said = capsys.readouterr().out
+    assert "8 bones along a, b, c, in this order" in said
     assert "40 rows that were held out" in said and "never changes: dark" in said and "light" in said
 
 

@@ -79,6 +79,16 @@ def test_a_recording_of_the_rig_has_them_beside_its_markers(tmp_path: Path) -> N
     load_recording(with_sensors)
 
 
+def test_markers_stand_in_the_order_in_which_a_script_names_them(tmp_path: Path) -> None:
+    robot = load_robot(write_block_robot(tmp_path / "robot"))
+    names = list(reversed(robot.marker_names))[:2]
+    assert len(names) == 2
+    script = changed(SCRIPT, {"markers__occlusion": False, "markers__names": names})
+    with (simulate(robot, script, tmp_path / "a") / "markers.csv").open() as file:
+        rows = [(row["frame"], row["marker"]) for row in csv.DictReader(file)]
+    assert rows[:4] == [("0", names[0]), ("0", names[1]), ("1", names[0]), ("1", names[1])]
+
+
 def test_a_line_without_length_is_refused() -> None:
     with pytest.raises(InputError, match="the two points of a sensor coincide"):
         read([MESH.nodes], to_m=ALONG["from_m"])
