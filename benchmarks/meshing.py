@@ -14,8 +14,8 @@ import numpy as np
 import trimesh
 
 from femsense.core.errors import InputError
+from femsense.io.meshing.filling import MeshOptions, fill
 from femsense.io.meshing.quality import quality_report
-from femsense.io.meshing.robot_from_surface import MeshOptions, fill
 
 
 def main() -> None:

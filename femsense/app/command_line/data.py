@@ -123,7 +123,8 @@ def mesh(
     json: Json = False,
 ) -> Answer:
     """Fill a surface with tetrahedra; start a robot."""
-    from femsense.io.meshing.robot_from_surface import MeshOptions, mesh_into, mesh_text
+    from femsense.io.meshing.filling import MeshOptions
+    from femsense.io.meshing.robot_from_surface import mesh_into, mesh_text
 
     if surface.suffix.lower() == ".toml":
         return _line_mesh(surface, output, size=size, most=most, again=again)

@@ -10,7 +10,7 @@ from femsense.core.arrays import FloatArray
 from femsense.fem.closest_point import FACES
 from femsense.fem.mesh import EDGES, TetMesh, element_volumes, surface_triangles, to_linear, to_quadratic, triangle_normals
 from femsense.io.mesh_files import radius_ratio
-from femsense.io.meshing.surface import wall_thickness
+from femsense.io.meshing.surface_queries import wall_thickness
 
 WORST = 5
 """So many of the worst elements are named."""

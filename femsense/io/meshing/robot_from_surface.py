@@ -4,87 +4,33 @@ from __future__ import annotations
 
 import re
 import tempfile
-import time
 import tomllib
 import warnings
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import femsense
-from femsense.core.arrays import FloatArray, IntArray, freeze
+from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import FemsenseError, InputError
-from femsense.fem.mesh import TetMesh, element_volumes, surface_triangles
-from femsense.fem.mesh_checks import check_mesh, hinged_parts
+from femsense.fem.mesh import TetMesh
 from femsense.io.files import check_target, file_hash, write_json, write_text
-from femsense.io.mesh_files import SURFACE_ENDINGS, radius_ratio, read_triangles, write_mesh
+from femsense.io.mesh_files import SURFACE_ENDINGS, read_triangles, write_mesh
 from femsense.io.meshes.reading import read_content
 from femsense.io.meshing.cad import CAD_READ, read_cad
+from femsense.io.meshing.filling import POOR, Filled, MeshOptions, Progress, fill
 from femsense.io.meshing.quality import quality_report, quality_text
-from femsense.io.meshing.surface import (
-    ClosedSurface,
-    check_finite,
-    crossing_triangles,
-    distance_to,
-    repaired,
-    shared_edges,
-    thinned,
-)
-from femsense.io.meshing.tetrahedra import FILL_SECONDS, tetrahedralise
+from femsense.io.meshing.surface import check_finite
 from femsense.io.robot_body import LARGEST_BODY, PER_METRE, SMALLEST_BODY, likely_unit
 from femsense.io.robot_toml import load_robot
 
 MESH_FILE, REPORT_FILE = "mesh.vtu", "mesh.json"
 USUAL = (5e-3, 2.0)
 """Bodies smaller or larger than this [m] make one ask whether the unit is right."""
-MOST_TETS = 2000
-ENVELOPE_OF_EDGE = 0.04
-"""The mesh may leave the surface by this share of an edge, if nothing else is asked for …"""
-LARGEST_ENVELOPE = 0.01
-"""… and by this share of the diagonal at most."""
 CAD_ENDINGS = (".x_t", ".x_b", ".sldprt", ".sldasm", ".ipt", ".f3d", ".fcstd", ".3dm")
-TRIES = 5
-MOST_SECONDS = 600.0
-"""All fillings together take no longer than this."""
-POOR = 0.05
-"""A worst radius ratio below this has the surface filled anew (fTetWild shuffles)."""
-LOOSE = 1e-3
-"""Tetrahedra that hang loose and hold less than this share of the volume are left out."""
-Progress = Callable[..., None]
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class MeshOptions:
-    """What a user asks of a mesh."""
-
-    unit: str | None = None
-    """Of the surface file: "m", "cm" or "mm"; required."""
-    size_mm: float | None = None
-    """Wanted edge length; by default from `most_tets`."""
-    most_tets: int = MOST_TETS
-    """Not more tetrahedra than this."""
-    tolerance_mm: float | None = None
-    """How far the mesh may leave the surface; by default a share of the edge length."""
-    element: str = "tet10"
-    close_holes: bool = False
-    fill_cavities: bool = False
-    part: int | None = None
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Filled:
-    """A surface filled with tetrahedra."""
-
-    mesh: TetMesh
-    """In metres."""
-    edge_mm: float
-    tolerance_mm: float
-    strays_mm: float
-    """Largest distance of a point of one surface from the other."""
-    done: tuple[str, ...]
 
 
 def mesh_into(
@@ -201,171 +147,6 @@ def check_unit(points: FloatArray, unit: str | None, path: Path) -> None:
 
 def _length(metres: float) -> str:
     return f"{metres:.3g} m" if metres >= 1 else f"{1e3 * metres:.3g} mm"
-
-
-# Filling
-
-
-def fill(
-    points: FloatArray,
-    triangles: IntArray,
-    options: MeshOptions,
-    *,
-    where: str = "surface",
-    progress: Progress | None = None,
-) -> Filled:
-    """Mend a surface and fill it with tetrahedra of the wanted size.
-
-    Arguments:
-        points, triangles: of the file, in `options.unit`, shapes (n, 3) and (t, 3).
-        options: size and repairs.
-        where: what a message names.
-        progress: called with what is being done.
-
-    Raises:
-        InputError: see `repaired` and `tetrahedralise`; or no mesh that is small enough.
-    """
-    tell = progress or (lambda *_: None)
-    tell("mending the surface")
-    unit = options.unit or "m"
-    surface = repaired(
-        points,
-        triangles,
-        where=where,
-        close_holes=options.close_holes,
-        fill_cavities=options.fill_cavities,
-        part=options.part,
-        unit=unit,
-    )
-    surface = replace(surface, points=freeze(surface.points / PER_METRE[unit]))
-    crossing = len(np.unique(crossing_triangles(surface.points, surface.triangles)))
-    if crossing:
-        note = f"{crossing} triangles cross others: what lies inside any of them was filled"
-        surface = replace(surface, done=(*surface.done, note))
-    walls = len(shared_edges(surface.triangles))
-    if walls:
-        note = (
-            f"{walls} edges have more than two triangles (walls inside, or bodies that touch there): what lies inside was filled"
-        )
-        surface = replace(surface, done=(*surface.done, note))
-    edge, began, thin = _first_edge(surface, options), time.monotonic(), surface
-    for attempt in range(TRIES):
-        left = MOST_SECONDS - (time.monotonic() - began)
-        seconds = min(left, FILL_SECONDS)
-        tell(f"filling, edges of {1e3 * edge:.2g} mm, try {attempt + 1}, {seconds / 60:.0f} min at most")
-        filled, thin = _fill_once(surface, thin, edge, options, where, crosses=crossing + walls > 0, seconds=seconds)
-        count = len(filled.mesh.tets)
-        poor = radius_ratio(filled.mesh).min() < POOR
-        slow = time.monotonic() - began > 0.5 * MOST_SECONDS  # another try might not come to an end
-        if count <= options.most_tets and (not poor or slow or attempt == TRIES - 1):
-            return filled
-        if slow:
-            break
-        if count > options.most_tets:
-            if options.size_mm is not None:
-                raise _too_many(
-                    count,
-                    options,
-                    where,
-                    f"--size {1e3 * edge * (count / options.most_tets) ** (1 / 3):.3g}, or --max-tets {count}",
-                )
-            edge = min(edge * 1.08 * (count / options.most_tets) ** (1.0 / 3.0), 0.5 * surface.diagonal)
-    raise _too_many(count, options, where, f"--max-tets {count}, or a larger --tolerance")
-
-
-def _too_many(count: int, options: MeshOptions, where: str, hint: str) -> InputError:
-    return InputError(
-        "more tetrahedra than wanted",
-        where=where,
-        found=f"{count}",
-        expected=f"--max-tets {options.most_tets} at most",
-        hint=hint,
-    )
-
-
-def _first_edge(surface: ClosedSurface, options: MeshOptions) -> float:
-    """Return the edge length to begin with [m]: as wanted, or such that regular tetrahedra fill the volume."""
-    if options.size_mm is not None:
-        return 1e-3 * options.size_mm
-    return float(np.cbrt(6.0 * np.sqrt(2.0) * surface.volume / (0.6 * options.most_tets)))
-
-
-def _fill_once(
-    surface: ClosedSurface,
-    thinner: ClosedSurface,
-    edge: float,
-    options: MeshOptions,
-    where: str,
-    *,
-    crosses: bool,
-    seconds: float,
-) -> tuple[Filled, ClosedSurface]:
-    """Return what was filled, and the thinned surface that the next try goes on from."""
-    diagonal = surface.diagonal
-    given = options.tolerance_mm
-    tolerance = 1e-3 * given if given is not None else min(ENVELOPE_OF_EDGE * edge, LARGEST_ENVELOPE * diagonal)
-    thin, drifted = thinned(surface, tolerance=0.5 * tolerance, start=thinner)
-    made = tetrahedralise(
-        np.array(thin.points),
-        np.array(thin.triangles),
-        edge_fraction=edge / diagonal,
-        envelope=_envelope(drifted, tolerance, diagonal, given is not None) / diagonal,
-        where=where,
-        check_volume=not crosses,
-        seconds=seconds,
-    )
-    mesh, notes = _one_body(made, where)
-    outliers = _strays(mesh, surface, crosses)
-    return Filled(mesh, 1e3 * edge, 1e3 * tolerance, 1e3 * outliers, (*thin.done, *_rougher(drifted, tolerance), *notes)), thin
-
-
-def _envelope(drifted: float, tolerance: float, diagonal: float, asked: bool) -> float:
-    """Return how far the mesh may leave the thinned surface [m]: what is left, or the roughness where that is larger and nobody asked."""
-    if not asked and drifted > 0.5 * tolerance:
-        return min(drifted, LARGEST_ENVELOPE * diagonal)
-    return max(tolerance - drifted, 0.5 * tolerance)
-
-
-def _rougher(drifted: float, tolerance: float) -> tuple[str, ...]:
-    """Return what is said where the surface is too rough to be followed within the tolerance [m]."""
-    if drifted <= 0.5 * tolerance:
-        return ()
-    return (
-        f"the surface is rougher than the tolerance: the thinned one is up to {1e3 * drifted:.2g} mm away, "
-        f"where {1e3 * tolerance:.2g} mm were allowed",
-    )
-
-
-def _strays(mesh: TetMesh, surface: ClosedSurface, crosses: bool) -> float:
-    """Return the largest distance of a point of one surface from the other [m]; where shells cross, of the mesh from the surface."""
-    skin, numbers = np.unique(surface_triangles(mesh), return_inverse=True)
-    out = float(distance_to(surface.points, surface.triangles, mesh.nodes[skin]).max())
-    if crosses:  # what lies inside another shell has no counterpart
-        return out
-    return max(out, float(distance_to(mesh.nodes[skin], numbers.reshape(-1, 3), surface.points).max()))
-
-
-def _one_body(mesh: TetMesh, where: str) -> tuple[TetMesh, tuple[str, ...]]:
-    """Return the mesh without loose crumbs. Raises InputError where larger parts hang loose."""
-    parts = hinged_parts(mesh)
-    volume = np.bincount(parts, element_volumes(mesh))
-    if len(volume) == 1:
-        check_mesh(mesh, where)
-        return mesh, ()
-    main = int(volume.argmax())
-    loose = 1.0 - volume[main] / volume.sum()
-    if loose > LOOSE:
-        raise InputError(
-            "the tetrahedra fall into parts that no face joins",
-            where=where,
-            found=f"{len(volume)} parts; all but the largest hold {100 * loose:.3g} % of the volume",
-            expected="one connected body (an edge or a corner alone is a hinge)",
-            hint="a larger --max-tets or a smaller --size keeps thin bridges; bodies that only touch: let them overlap in the CAD program",
-        )
-    nodes, tets = np.unique(mesh.tets[parts == main], return_inverse=True)
-    kept = TetMesh(mesh.nodes[nodes], tets.reshape(-1, mesh.tets.shape[1]))
-    check_mesh(kept, where)
-    return kept, (f"{len(volume) - 1} loose crumbs were left out",)
 
 
 # The report

@@ -22,7 +22,7 @@ from femsense.core.errors import DataError
 from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.mesh import surface_triangles, triangle_normals, vertex_normals
 from femsense.io.clouds.frame_clouds import read_frame_cloud
-from femsense.io.meshing.surface import nearest_on
+from femsense.io.meshing.surface_queries import nearest_on
 from femsense.model.camera_frame import as_measured, in_robot_frame
 from femsense.model.contact_patch import body_surface, flat_nodes
 from femsense.model.observation import Hypothesis, Scene, evaluate_scene

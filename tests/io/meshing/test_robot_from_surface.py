@@ -18,7 +18,8 @@ from femsense.core.errors import InputError
 from femsense.fem.equilibrium import solve_equilibrium
 from femsense.fem.mesh import TetMesh, element_volumes, surface_triangles, to_linear
 from femsense.io.meshing import robot_from_surface, tetrahedra
-from femsense.io.meshing.robot_from_surface import MeshOptions, fill, mesh_into, read_any_surface, starter_text
+from femsense.io.meshing.filling import MeshOptions, fill
+from femsense.io.meshing.robot_from_surface import mesh_into, read_any_surface, starter_text
 from femsense.io.meshing.surface import repaired
 from femsense.io.robot_toml import load_robot
 

@@ -9,16 +9,9 @@ import pytest
 import trimesh
 
 from femsense.core.errors import InputError
-from femsense.io.meshing.surface import (
-    MOST_TRIANGLES,
-    ClosedSurface,
-    crossing_triangles,
-    distance_to,
-    repaired,
-    thinned,
-    wall_thickness,
-    winding_number,
-)
+from femsense.io.meshing.surface import ClosedSurface, repaired
+from femsense.io.meshing.surface_queries import crossing_triangles, distance_to, wall_thickness, winding_number
+from femsense.io.meshing.thinning import MOST_TRIANGLES, thinned
 
 BOX = trimesh.creation.box((100, 30, 30))
 TUBE = trimesh.creation.cylinder(10, 100, sections=32)
