@@ -17,7 +17,7 @@ from femsense.app import cli
 from femsense.core.errors import InputError
 from femsense.fem.equilibrium import solve_equilibrium
 from femsense.fem.mesh import TetMesh, element_volumes, surface_triangles, to_linear
-from femsense.io.meshing import robot_from_surface, tetrahedra
+from femsense.io.meshing import filling, tetrahedra
 from femsense.io.meshing.filling import MeshOptions, fill
 from femsense.io.meshing.robot_from_surface import mesh_into, read_any_surface, starter_text
 from femsense.io.meshing.surface import repaired
@@ -52,7 +52,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
         cells = np.maximum(np.round(np.ptp(points, axis=0) / edge), 1).astype(int)
         return block_mesh(cells, np.ptp(points, axis=0), start=points.min(axis=0))
 
-    monkeypatch.setattr(robot_from_surface, "tetrahedralise", block)
+    monkeypatch.setattr(filling, "tetrahedralise", block)
     return calls
 
 
@@ -219,7 +219,7 @@ def test_a_flat_element_has_the_surface_filled_anew(monkeypatch: pytest.MonkeyPa
     tet = good.tets[(good.tets == inner).any(axis=1)][0]
     nodes[inner] += 0.99 * (nodes[tet[tet != inner]].mean(axis=0) - nodes[inner])
     fillings = iter([TetMesh(nodes, good.tets), good])
-    monkeypatch.setattr(robot_from_surface, "tetrahedralise", lambda *_, **__: next(fillings))
+    monkeypatch.setattr(filling, "tetrahedralise", lambda *_, **__: next(fillings))
     box = trimesh.creation.box((100, 30, 30))
     assert fill(np.array(box.vertices), np.array(box.faces), MM).mesh is good
 
@@ -230,7 +230,7 @@ def test_crumbs_are_left_out_and_parts_are_refused(monkeypatch: pytest.MonkeyPat
     for size, fits in ((0.001, True), (0.01, False)):
         crumb = block_mesh((1, 1, 1), (size,) * 3, start=(0.06, 0.0, 0.0))
         both = TetMesh(np.vstack([body.nodes, crumb.nodes]), np.vstack([body.tets, crumb.tets + len(body.nodes)]))
-        monkeypatch.setattr(robot_from_surface, "tetrahedralise", lambda *_, both=both, **__: both)
+        monkeypatch.setattr(filling, "tetrahedralise", lambda *_, both=both, **__: both)
         if fits:
             filled = fill(np.array(box.vertices), np.array(box.faces), MM)
             assert len(filled.mesh.tets) == len(body.tets) and filled.done == ("1 loose crumbs were left out",)
@@ -255,7 +255,7 @@ def test_bodies_that_touch_along_an_edge_are_no_body(monkeypatch: pytest.MonkeyP
     one, other = (block_mesh((2, 2, 2), (0.03,) * 3, start=(x, x, 0.0)) for x in (0.0, 0.03))
     points, same = np.unique(np.vstack([one.nodes, other.nodes]), axis=0, return_inverse=True)
     both = TetMesh(points, same.reshape(-1)[np.vstack([one.tets, other.tets + len(one.nodes)])])
-    monkeypatch.setattr(robot_from_surface, "tetrahedralise", lambda *_, **__: both)
+    monkeypatch.setattr(filling, "tetrahedralise", lambda *_, **__: both)
     boxes = trimesh.util.concatenate(
         [trimesh.creation.box((30, 30, 30), trimesh.transformations.translation_matrix((x, x, 0))) for x in (15, 45)]
     )
@@ -347,7 +347,7 @@ def test_other_folders_are_left_alone(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("ending", ["stl", "obj", "ply", "off"])
 def test_formats(tmp_path: Path, ending: str) -> None:
-    points, triangles = robot_from_surface.read_any_surface(write_box(tmp_path / f"block.{ending}"))
+    points, triangles = read_any_surface(write_box(tmp_path / f"block.{ending}"))
     assert np.ptp(points, axis=0).tolist() == [100, 30, 30] and len(triangles) == 12
 
 
