@@ -7,6 +7,7 @@ places ─► equilibrium ─ rays ─ compliance ─ QP, until the forces stop 
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -65,6 +66,11 @@ def estimate(
     Raises:
         InputError: no clouds and no places; DataError: not one frame gave a result.
     """
+    if robot.softening:
+        warnings.warn(
+            "the effect `softening` is not used in sensing: frames after a larger load come out as if nothing had softened",
+            stacklevel=2,
+        )
     sensor = make_sensor(robot, recording, calibration, at=at, options=options)
     sense = sense_as_published if sensor.options.method == "paper" else sense_frame
     count = len(recording.time_s)

@@ -20,6 +20,7 @@ from helpers import write_block_robot, write_small_recording
 
 import femsense
 from femsense.app import cli
+from femsense.app.command_line.parameters import split_names
 from femsense.app.commands import loop_page
 from femsense.core.errors import DataError, InputError
 from femsense.io.files import PART_PREFIX
@@ -365,7 +366,7 @@ def test_an_effect_of_ones_own_that_is_not_there_is_said(run: Any, robot: Path, 
 
 @pytest.mark.parametrize(("names", "parsed"), [(None, None), (["a,b"], ["a", "b"]), (["a", " b ,"], ["a", "b"])])
 def test_names(names: list[str] | None, parsed: list[str] | None) -> None:
-    assert cli.split_names(names) == parsed
+    assert split_names(names) == parsed
 
 
 def test_view_says_where_and_ends(run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -63,7 +63,9 @@ def test_three_standard_deviations_hold_the_truth(touched):
     run = estimate(arm(), recording, calibrate(arm(), recording), at=TIP)
     for contact, true in zip(run.contacts[-2:], (FORCE, 2 * FORCE)):
         assert abs(contact.force_n - np.linalg.norm(true)) < 3 * contact.std_n
-        assert contact.std_n < 0.15 * np.linalg.norm(true)
+        along = true / np.linalg.norm(true)
+        assert np.linalg.norm(contact.force_std_n_xyz * along) < 0.15 * np.linalg.norm(true)
+        assert contact.std_n < contact.force_std_n_xyz[0]  # along the arm the force is hardly known, and its size holds that part
 
 
 def test_a_known_load_at_the_place_is_sensed_and_compared(touched):

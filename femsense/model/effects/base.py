@@ -243,8 +243,11 @@ def absent_elsewhere(parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
     given = {(p.key, p.part) for p in parameters}
     result = dict[tuple[str, Any], Parameter]()
     for p in parameters:
-        for label in p.part.labels if isinstance(p.part, InRecording) else ():
-            part = replace(p.part, recording=label)
+        own = p.part
+        if not isinstance(own, InRecording):
+            continue
+        for label in own.labels:
+            part = replace(own, recording=label)
             if (p.key, part) not in given:
                 result.setdefault((p.key, part), replace(p, part=part))
     return tuple(result.values())

@@ -24,6 +24,7 @@ from femsense.model.frame_state import solve_frame
 from femsense.model.recording import make_recording
 from femsense.model.recording_parts import Drives, Timeline
 from femsense.model.robot import Observation, Robot, plain_actuation
+from femsense.model.softening import with_softening
 
 MARKERS = np.array([[0.1, 0.015, 0.03], [0.06, 0.0, 0.0], [0.1, 0.03, 0.015]])
 CENTER = [0.05, 0.015, 0.015]
@@ -45,12 +46,12 @@ def robot(**options: Any) -> Robot:
 
 
 def measured(r: Robot, control: str) -> np.ndarray:
-    """Return markers of three frames as a camera half a metre above would measure them, friction and creep included."""
+    """Return markers of three frames as a camera half a metre above would measure them, friction, creep and softening included."""
     inputs = {"tension": [[0.5, 0.2], [1.5, 0.6], [0.7, 0.2]], "displacement": [[0.002, 0.002], [0.006, 0.001], [0.003, 0.002]]}[
         control
     ]
     rec = make_recording(Timeline([0.0, 1.0, 2.0]), drives=Drives(("top", "side"), inputs, actuation=control))
-    driven, before, seen = DrivenRobot(r, drive_of(r, rec)), None, []
+    driven, before, seen = with_softening(DrivenRobot(r, drive_of(r, rec)), 2), None, []
     for k in range(3):
         state = solve_frame(driven, k, options=SolveOptions(before=before))
         assert state.converged
