@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from femsense.core.arrays import FloatArray, IntArray
 from femsense.fem.compliance import tangent_at
+from femsense.fem.mesh import TetMesh
 from femsense.sensing.nuisance import FAR_OFF, misfit, sag_at
 from femsense.sensing.types import Fit, SensedFrame, Sensor
 
@@ -12,17 +14,24 @@ OK = "ok"
 UNSETTLED = 0.5
 """Forces that were still changing are not believed where more than this share of the residual is left, unless that is noise."""
 
+SQUEEZED = 0.6
+"""Elements under a contact that are shorter than this share of their length are beyond the corotational law, and mostly beyond their mesh."""
+
 
 def status_of(sensor: Sensor, fit: Fit, free: Fit) -> str:
     """Return "ok", or in words why the result of a frame is not to be trusted.
 
     Not to be trusted is a residual far above what the free frames leave, with or without contacts; a force that is less than its standard
-    deviation while the frame is not explained; and forces that were still changing.
+    deviation while the frame is not explained; forces that were still changing; and a body squeezed beyond what its model holds for.
     """
     if fit.touches and not fit.still and fit.rows.rms > UNSETTLED * free.rows.rms + 3.0 * float(np.median(free.rows.std)):
         return f"the forces have not settled: {1e3 * fit.rows.rms:.2f} mm are left of {1e3 * free.rows.rms:.2f}"
     if fit.cost > free.cost or (fit.touches and fit.rows.rms > 1.05 * free.rows.rms + 2.0 * float(np.median(free.rows.std))):
         return "the residual is larger with the forces than without them"
+    carrying = np.unique([node for touch in fit.touches for node in touch.patch.nodes])
+    squeezed = least_stretch(sensor.robot.body.mesh, fit.state.positions, carrying)
+    if squeezed < SQUEEZED:
+        return f"squeezed to {100 * max(squeezed, 0.0):.0f} % under a contact, beyond what law and mesh hold: finer mesh, effect hyperelastic"
     left = left_over(sensor, fit)
     if left > limit_of(sensor, fit):
         what = "with the contacts found" if fit.touches else "and no contact explains it"
@@ -36,6 +45,22 @@ def status_of(sensor: Sensor, fit: Fit, free: Fit) -> str:
 def left_over(sensor: Sensor, fit: Fit) -> float:
     """Return the misfit per row that a fit leaves, about 1 where all is explained."""
     return misfit(sensor.knowledge, fit.rows, sag_at(sensor, fit.state, tangent_at(sensor.robot.body, fit.state)))
+
+
+def least_stretch(mesh: TetMesh, positions: FloatArray, carrying: IntArray) -> float:
+    """Return the least principal stretch of the elements that have one of some nodes [1]; negative where one is inside out, 1 without nodes.
+
+    Arguments:
+        mesh: at rest.
+        positions: of its nodes [m], shape (n, 3).
+        carrying: nodes that carry contacts, shape (k,).
+    """
+    tets = mesh.tets[np.isin(mesh.tets, carrying).any(axis=1), :4]
+    if not len(tets):
+        return 1.0
+    rest, now = (np.swapaxes(x[tets[:, 1:]] - x[tets[:, :1]], 1, 2) for x in (mesh.nodes, positions))
+    gradient = now @ np.linalg.inv(rest)
+    return float((np.linalg.svd(gradient, compute_uv=False)[:, 2] * np.sign(np.linalg.det(gradient))).min())
 
 
 def limit_of(sensor: Sensor, fit: Fit) -> float:
