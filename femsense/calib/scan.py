@@ -28,13 +28,6 @@ AROUND = 9
 MARGIN = 0.25
 """Points farther from the body than this share of its diagonal are left out."""
 
-RIM = 1.6
-"""Points of the robot so many pixels or fewer beside something nearer are left out: a pixel on an edge mixes the depths of both sides."""
-STEP = 4.0
-"""Nearer by so many pixels is a step; where an object lies on the robot there is none, and nothing to mix."""
-PITCH = 5.0
-"""Percentile of the distances to the nearest neighbour that is one pixel, in thinned clouds too."""
-
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Scan:
@@ -128,28 +121,13 @@ def read_scan(robot: Robot, recording: Recording, k: int, poses: Sequence[FloatA
         points, kept = points[inside], cloud.select(inside)
         told = told and kept.colors is not None and robot.color_rgb is not None
         mine = _of_robot(robot, kept)
-        clear = points[mine][clear_of(points[mine], points[~mine])]
-        own.append(clear)
+        own.append(points[mine])
         rest.append(points[~mine])
-        own_view.append(np.full(len(clear), view))
+        own_view.append(np.full(int(mine.sum()), view))
         rest_view.append(np.full(int((~mine).sum()), view))
     if not own:
         return None
     return Scan(np.vstack(own), np.concatenate(own_view), np.vstack(rest), np.concatenate(rest_view), told)
-
-
-def clear_of(points: FloatArray, others: FloatArray) -> BoolArray:
-    """Return which points of one camera (k, 3) do not stand beside a step to others (o, 3) that are nearer to it, shape (k,)."""
-    clear = np.ones(len(points), dtype=bool)
-    if len(points) < 2 or not len(others):
-        return clear
-    here, there = (p[:, :2] / p[:, 2:] for p in (points, others))
-    apart = np.asarray(cKDTree(here).query(here, k=[2])[0])
-    pixel = float(np.percentile(apart, PITCH))
-    depths = others[:, 2]
-    for i, beside in enumerate(cKDTree(there).query_ball_point(here, RIM * pixel)):
-        clear[i] = not beside or bool(depths[beside].min() >= points[i, 2] * (1.0 - STEP * pixel))
-    return clear
 
 
 def ray_rows(

@@ -23,7 +23,6 @@ from femsense.model.frame_state import solve_frame
 from femsense.qp.forces import estimate_forces
 from femsense.qp.problem import ForceOptions, FrictionCone
 from femsense.sensing.measure import rows_at
-from femsense.sensing.model_error import model_columns
 from femsense.sensing.nuisance import misfit_of, nuisance_columns, robust_std, sag_at
 from femsense.sensing.types import Fit, Rows, Sensor, Touch
 
@@ -70,10 +69,9 @@ def touch_normal(sensor: Sensor, touch: Touch, state: Equilibrium) -> FloatArray
 def no_forces(sensor: Sensor, k: int, scan: Scan | None, state: Equilibrium) -> Fit:
     """Return the fit of a frame without contacts."""
     rows = rows_at(sensor, k, scan, state)
-    tangent = tangent_at(sensor.robot.body, state)
-    columns, known = nuisance_columns(sensor.knowledge, rows, sag_at(sensor, state, tangent))
-    model = model_columns(sensor, rows, state, tangent, (), np.zeros((0, 3)))
-    cost = misfit_of(rows.residual - known, np.hstack([columns, model]), rows)[0] + LOST * rows.lost / rows.together
+    sag = sag_at(sensor, state, tangent_at(sensor.robot.body, state))
+    columns, known = nuisance_columns(sensor.knowledge, rows, sag)
+    cost = misfit_of(rows.residual - known, columns, rows)[0] + LOST * rows.lost / rows.together
     return Fit((), state, np.zeros((0, 3)), np.zeros((0, 0)), np.zeros((0, 3, 3)), rows, cost)
 
 
@@ -260,13 +258,12 @@ def _linearise(sensor: Sensor, here: _Here) -> _Linear:
     moves = tangent.respond(np.concatenate([basis, shifts]))
     answers = here.rows.functional(moves)
     columns, known = nuisance_columns(sensor.knowledge, here.rows, sag)
-    model = model_columns(sensor, here.rows, here.state, tangent, here.touches, here.forces)
     return _Linear(
         tangent,
         answers[:, : 3 * m],
         answers[:, 3 * m :],
         frames,
-        np.hstack([columns, model]),
+        columns,
         here.rows.residual - known,
         np.array([touch_normal(sensor, t, here.state) for t in here.touches]),
         moves[: 3 * m],

@@ -15,7 +15,8 @@ UNSETTLED = 0.5
 """Forces that were still changing are not believed where more than this share of the residual is left, unless that is noise."""
 
 SQUEEZED = 0.6
-"""Elements under a contact that are shorter than this share of their length are beyond the corotational law, and mostly beyond their mesh."""
+"""Elements under a contact that are shorter than this share of their length are beyond the corotational law, and mostly beyond their mesh:
+under a plate on a soft dome elements fall to 0 and the force is half of the true one; on bars and arms the least is 0.91."""
 
 
 def status_of(sensor: Sensor, fit: Fit, free: Fit) -> str:
