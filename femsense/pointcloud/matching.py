@@ -19,7 +19,6 @@ from femsense.core.errors import InputError
 from femsense.pointcloud.grid import VoxelGrid, build_grid, key_of, positive, runs_around
 from femsense.pointcloud.segmentation import surface_pair
 
-_TERMS = (1, 3, 6)  # of a height field of order 0, 1, 2
 _PRIOR_DOF = 4.0  # weight of the scatter that all features share, in degrees of freedom
 
 

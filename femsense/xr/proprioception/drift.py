@@ -35,7 +35,6 @@ BETTER = 0.9
 ZERO_STD = 0.1
 """Of a sensor's zero, in spreads of its channel."""
 ZERO_STEPS = 3
-LINE_PENALTIES = (0.01, 0.1, 1.0)
 CORRECTIONS = ("none", "base", "zeros", "base, zeros", "base, line 0.01", "base, line 0.1", "base, line 1.0")
 
 
