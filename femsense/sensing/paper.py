@@ -25,7 +25,8 @@ from femsense.pointcloud.matching import MatchingOptions, match_along_normals
 from femsense.pointcloud.segmentation import segment_by_model, segment_robot
 from femsense.qp.forces import estimate_forces
 from femsense.qp.problem import ForceOptions
-from femsense.sensing.forces import free_state, make_touch, solve_with
+from femsense.sensing.states import free_state, solve_with
+from femsense.sensing.touches import make_touch
 from femsense.sensing.tracks import contacts_of
 from femsense.sensing.types import Fit, FrameReport, Rows, SensedFrame, Sensor, Touch
 

@@ -24,12 +24,13 @@ from femsense.io.checkpoint import Checkpoint
 from femsense.model.drive import has_history
 from femsense.model.recording import Recording
 from femsense.model.robot import Robot
-from femsense.sensing.forces import free_state, no_forces
+from femsense.sensing.forces import no_forces
 from femsense.sensing.judge import status_of, trusted
 from femsense.sensing.paper import sense_as_published
 from femsense.sensing.places import find_touches, near_places, seen_objects
 from femsense.sensing.prepare import make_sensor, scan_of
 from femsense.sensing.search import explain, told_apart
+from femsense.sensing.states import free_state
 from femsense.sensing.tracks import contacts_of, smoothed
 from femsense.sensing.types import ContactForce, Done, FrameReport, Run, SensedFrame, SensingOptions, Sensor, States
 

@@ -13,7 +13,7 @@ from femsense.model.contact_patch import BodySurface, closest_surface_point
 from femsense.model.robot import Robot
 from femsense.pointcloud.primitives import Shape, find_shapes
 from femsense.pointcloud.rays import Surface
-from femsense.sensing.forces import make_touch
+from femsense.sensing.touches import make_touch
 from femsense.sensing.types import Fit, Sensor, Touch
 
 LOCAL = 0.06

@@ -14,10 +14,11 @@ from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.mesh import vertex_normals
 from femsense.pointcloud.primitives import Shape
 from femsense.pointcloud.rays import Surface
-from femsense.sensing.forces import fit_forces, make_touch, no_forces
+from femsense.sensing.forces import fit_forces, no_forces
 from femsense.sensing.judge import left_over
 from femsense.sensing.nuisance import nuisance_columns, robust_std, sag_at
 from femsense.sensing.places import object_touches, said_free
+from femsense.sensing.touches import make_touch
 from femsense.sensing.types import Fit, SensedFrame, Sensor, Touch
 
 ANYWHERE = 0.2

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from femsense.core.arrays import FloatArray, freeze
-from femsense.sensing.forces import touch_normal
+from femsense.sensing.touches import touch_normal
 from femsense.sensing.types import ContactForce, Fit, SensedFrame, Sensor
 
 SAME = 0.15

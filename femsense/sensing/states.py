@@ -1,0 +1,57 @@
+"""The equilibrium of a frame under its inputs, alone or with forces at some places."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from femsense.core.arrays import FloatArray
+from femsense.core.errors import DataError
+from femsense.fem.equilibrium import Equilibrium, SolveOptions
+from femsense.model.frame_state import solve_frame
+from femsense.sensing.touches import nodal_forces
+from femsense.sensing.types import Sensor, Touch
+
+EXACT = 1e-9
+"""Unbalanced force, relative to all loads, of a state that is a result."""
+ROUGH = 1e-6
+"""The same of the states on the way to the forces."""
+
+
+def free_state(sensor: Sensor, k: int, start: Equilibrium | None, before: tuple[FloatArray, ...] | None) -> Equilibrium:
+    """Return the state under the inputs alone. Raises DataError."""
+    return _solve(sensor, k, None, start, before, EXACT)
+
+
+def solve_with(
+    sensor: Sensor,
+    k: int,
+    touches: Sequence[Touch],
+    forces: FloatArray,
+    start: Equilibrium,
+    *,
+    before: tuple[FloatArray, ...] | None = None,
+    tolerance: float = EXACT,
+) -> Equilibrium:
+    """Return the state of frame k under forces (m, 3) [N] at some places. Raises DataError.
+
+    Arguments:
+        start: a state near by.
+        before: tensions along the cables until now (friction).
+        tolerance: unbalanced force relative to all loads.
+    """
+    return _solve(sensor, k, nodal_forces(touches, forces, len(start.positions)), start, before, tolerance)
+
+
+def _solve(
+    sensor: Sensor,
+    k: int,
+    loads: FloatArray | None,
+    start: Equilibrium | None,
+    before: tuple[FloatArray, ...] | None,
+    tolerance: float,
+) -> Equilibrium:
+    options = SolveOptions(before=before, reuse_factor=start is not None, relative_tolerance=tolerance)
+    state = solve_frame(sensor.driven, k, start=start, nodal_forces=loads, options=options)
+    if not state.converged:
+        raise DataError(f"no equilibrium: {state.status}: {state.advice}")
+    return state

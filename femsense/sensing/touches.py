@@ -1,0 +1,89 @@
+"""Where a force may act: its contact patch, its normal, its friction cone, and the nodal forces it stands for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from femsense.core.arrays import FloatArray
+from femsense.fem.equilibrium import Equilibrium
+from femsense.fem.mesh import vertex_normals
+from femsense.model.contact_patch import ContactPatch, closest_surface_point, patch_at
+from femsense.qp.problem import FrictionCone
+from femsense.sensing.types import Sensor, Touch
+
+PATCH = 1.05
+"""Radius over which a point force is spread, in edges of the surface: the least that has a few nodes everywhere."""
+
+
+def make_touch(
+    sensor: Sensor,
+    place: FloatArray,
+    *,
+    source: str,
+    std_m: float = 0.0,
+    normal: FloatArray | None = None,
+    radius: float = np.inf,
+) -> Touch:
+    """Return a touch at the point of the surface at rest that is closest to a place at rest [m], shape (3,)."""
+    nodes = sensor.robot.body.mesh.nodes
+    at = closest_surface_point(sensor.surface, nodes, place, facing=normal)
+    patch = _patch(sensor, at, normal)
+    outward = patch.mean(vertex_normals(nodes, sensor.surface.triangles))
+    outward = outward / max(float(np.linalg.norm(outward)), 1e-12) if normal is None else normal
+    return Touch(at, outward, patch, at, std_m, source, radius)
+
+
+def _patch(sensor: Sensor, place: FloatArray, normal: FloatArray | None) -> ContactPatch:
+    body = sensor.robot.body
+    return patch_at(sensor.surface, body.mesh.nodes, place, PATCH * sensor.surface.edge, body.clamped, facing=normal)
+
+
+def touch_normal(sensor: Sensor, touch: Touch, state: Equilibrium) -> FloatArray:
+    """Return the outward unit normal of the deformed surface at a touch, shape (3,)."""
+    mean = touch.patch.mean(vertex_normals(state.positions, sensor.surface.triangles))
+    return np.asarray(mean / max(float(np.linalg.norm(mean)), 1e-12))
+
+
+def tangents_of(normal: FloatArray) -> FloatArray:
+    """Return two unit vectors across a normal, shape (2, 3)."""
+    return np.asarray(np.linalg.svd(normal[None])[2][1:])
+
+
+def nodal_forces(touches: Sequence[Touch], forces: FloatArray, nodes: int) -> FloatArray:
+    """Return the forces on so many nodes that forces (m, 3) at some touches stand for [N], shape (nodes, 3)."""
+    return np.asarray(sum((t.patch.spread(f, nodes) for t, f in zip(touches, forces)), np.zeros((nodes, 3))))
+
+
+def nodal_forces_by_shift(sensor: Sensor, touch: Touch, tangent: FloatArray, force: FloatArray) -> FloatArray:
+    """Return how nodal forces change when the place moves along a tangent, per metre [N/m], shape (n, 3)."""
+    n, step = len(sensor.robot.body.mesh.nodes), 0.5 * sensor.surface.edge
+    if touch.std_m == 0 or not force.any():
+        return np.zeros((n, 3))
+    ahead, behind = (_patch(sensor, touch.place + s * step * tangent, touch.normal) for s in (1.0, -1.0))
+    return np.asarray((ahead.spread(force, n) - behind.spread(force, n)) / (2.0 * step))
+
+
+def friction_cone(sensor: Sensor, touches: Sequence[Touch], normals: FloatArray) -> FrictionCone | None:
+    """Return the cone about normals (m, 3) that holds the forces; None where nothing does: given places push and pull as they like."""
+    if sensor.options.friction is None or any(touch.source == "given" for touch in touches):
+        return None
+    return FrictionCone(normals=normals, mu=sensor.options.friction)
+
+
+def within_cones(sensor: Sensor, touches: Sequence[Touch], forces: FloatArray, state: Equilibrium) -> FloatArray:
+    """Return forces (m, 3) moved to the nearest ones within their friction cones; given places push and pull as they like."""
+    mu, result = sensor.options.friction, np.array(forces, dtype=np.float64)
+    if mu is None:
+        return result
+    for i, touch in enumerate(touches):
+        inward = -touch_normal(sensor, touch, state)
+        along = float(result[i] @ inward)
+        across = result[i] - along * inward
+        size = float(np.linalg.norm(across))
+        if touch.source == "given" or size <= mu * along:
+            continue
+        kept = max(along + mu * size, 0.0) / (1.0 + mu**2)
+        result[i] = kept * (inward + mu * across / max(size, 1e-12))
+    return result
