@@ -9,8 +9,9 @@ import numpy as np
 
 from femsense.io.tables import validated
 from femsense.report import words
-from femsense.report.documents import Demo, DemoRun, KnownLoad, RunFacts, read_document, read_json
+from femsense.report.documents import read_document, read_json
 from femsense.report.page import Chapter, Html, image, section, table, together
+from femsense.report.run.document import Demo, DemoRun, KnownLoad, RunFacts
 from femsense.sensing.run_files import RUN_FORMAT
 
 PICTURE = 1_500_000

@@ -10,9 +10,9 @@ from femsense.io.files import write_text
 from femsense.report.calibration import calibration_chapter
 from femsense.report.compare import comparison_chapter
 from femsense.report.found import Found, find_results
-from femsense.report.loop import loop_chapter
+from femsense.report.loop.chapter import loop_chapter
 from femsense.report.page import Chapter, page
-from femsense.report.run import run_chapter
+from femsense.report.run.chapter import run_chapter
 
 CHAPTERS: dict[str, Callable[[Path, str], Chapter]] = {
     "loop": loop_chapter,

@@ -16,12 +16,18 @@ from matplotlib.text import Text
 
 from femsense.app import commands
 from femsense.core.errors import InputError
-from femsense.report import loop, loop_figures, words, write_report
+from femsense.io.robot_toml import load_robot
+from femsense.loop.files import LOOP_FORMAT
+from femsense.report import words, write_report
 from femsense.report.compare import load_error
-from femsense.report.documents import KnownLoad
+from femsense.report.documents import read_document
 from femsense.report.drawing import VIEWS, Key, best_view, body_height, frame_body, new_axes, new_panels, nice, skin
-from femsense.report.loop import recovered
-from femsense.report.loop_tables import is_beyond, smallest_words
+from femsense.report.loop.chapter import recovered
+from femsense.report.loop.document import Loop
+from femsense.report.loop.residual_at_rest import draw_mean_residual, mean_residual
+from femsense.report.loop.residual_in_frames import draw_frame_residuals, frame_residuals
+from femsense.report.loop.smallest_effects import is_beyond, smallest_words
+from femsense.report.run.document import KnownLoad
 
 MARKERS = {"tip": [0.1, 0.015, 0.03], "middle": [0.05, 0.015, 0.03], "stalk": [0.1, 0.015, 0.05]}
 SENTENCE = "The model lacks gravity (vector_m_s2 [0.1, 0.02, -9.7] m/s²); held-out error 2.04 mm before, 0.17 mm after."
@@ -1123,12 +1129,15 @@ def test_keys_below_a_body_stand_apart(high: tuple[float, float], cameras: int, 
     check_apart(figure)
 
 
-def test_pictures_of_residuals_have_one_scale_and_texts_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    figures: list[Any] = []
-    for module in (loop_figures, loop):
-        monkeypatch.setattr(module, "as_image", lambda figure, **_: figures.append(figure))
-    write_report(write_loop_folder(tmp_path))
-    bodies = [figure for figure in figures if any("residual" in t.get_text() for t in figure.axes[0].texts)]
+def test_pictures_of_residuals_have_one_scale_and_texts_apart(tmp_path: Path) -> None:
+    folder = write_loop_folder(tmp_path)
+    loop, robot = read_document(folder / "loop.json", Loop, LOOP_FORMAT), load_robot(folder, effects=False)
+    rest = skin(robot.body.mesh.nodes, robot.body.mesh.tets)
+    assert loop.evidence is not None
+    cameras = loop.evidence.pictures.camera_axes()
+    mean, frames = mean_residual(loop, robot, rest), frame_residuals(loop.evidence.pictures, rest)
+    assert mean is not None and frames is not None
+    bodies = [*(draw_mean_residual(mean, title, cameras) for title in mean.means), draw_frame_residuals(frames, cameras)]
     assert [len(figure.axes) for figure in bodies] == [1, 1, 6]
     for figure in bodies:
         check_apart(figure)

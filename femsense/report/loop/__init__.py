@@ -1,0 +1,1 @@
+"""The chapter on a closed loop: one file a section."""

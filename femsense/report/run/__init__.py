@@ -1,0 +1,1 @@
+"""The chapter on a run: one file a section."""

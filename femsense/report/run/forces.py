@@ -1,0 +1,205 @@
+"""Contact forces of a run: over time, on the body, beside declared loads, one by one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from femsense.core.arrays import FloatArray
+from femsense.report import words
+from femsense.report.compare import load_error
+from femsense.report.drawing import (
+    MANY,
+    SERIES,
+    Key,
+    add_legend,
+    as_image,
+    best_view,
+    body_height,
+    draw_body,
+    frame_body,
+    name_axes,
+    new_axes,
+    nice,
+    skin,
+)
+from femsense.report.page import Html, panels, paragraph, table, together
+from femsense.report.run.document import KnownLoad
+from femsense.report.run.tables import ContactTable, FrameTable, first_of, strongest_contact
+from femsense.sensing.run_files import read_states
+
+ROWS = 150
+"""So many contacts are listed one by one."""
+SHOWN = len(SERIES)
+ARROW_SHARE = 0.3
+
+
+def force_text(size: float, std: float) -> str:
+    factor, unit = words.force_unit(abs(size))
+    return words.joined(words.with_std(factor * float(size), factor * float(std)), unit)
+
+
+def force_panels(contacts: ContactTable | None, frames: FrameTable | None, folder: Path) -> Html | None:
+    if contacts is None or not np.isfinite(contacts.size_n).any():
+        return None
+    numbers = _largest_series(contacts)
+    times = contacts.time_s if frames is None or not len(frames) else frames.time_s
+    more = len(set(contacts.contact.tolist())) - len(numbers)
+    rest = f" The {len(numbers)} strongest of {len(numbers) + more}." if more > 0 else ""
+    strongest = strongest_contact(contacts, frames) or 0
+    over_time = as_image(
+        _force_figure(contacts, frames, numbers, (float(times.min()), float(times.max()))),
+        alt=f"Force of {words.counted(len(numbers), 'contact')} over time; the largest {force_text(contacts.size_n[strongest], contacts.std_n[strongest])}.",
+        caption=f"Size of each force; the bands are ± 1 and ± 2 standard deviations.{rest}",
+    )
+    return panels(over_time, _force_on_body(contacts, frames, folder, contacts.frame[strongest]))
+
+
+def _largest_series(contacts: ContactTable) -> list[int]:
+    """Return the numbers of the contacts to draw: those with the largest forces, in order."""
+    largest = {int(c): float(np.nanmax(contacts.size_n[contacts.contact == c], initial=0.0)) for c in np.unique(contacts.contact)}
+    return sorted(sorted(largest, key=lambda c: -largest[c])[:SHOWN])
+
+
+def _force_figure(contacts: ContactTable, frames: FrameTable | None, numbers: Sequence[int], span: tuple[float, float]) -> Any:
+    figure, axes = new_axes()
+    factor, unit = words.force_unit(float(np.nanmax(contacts.size_n)))
+    order = contacts.frame if frames is None else frames.frame
+    place = {int(frame): i for i, frame in enumerate(np.unique(order))}
+    for color, number in zip(SERIES, numbers):
+        rows = np.flatnonzero((contacts.contact == number) & np.isfinite(contacts.size_n))
+        rows = rows[np.argsort(contacts.frame[rows], kind="stable")]
+        at = np.array([place.get(int(f), -1) for f in contacts.frame[rows]])
+        for run in np.split(rows, np.flatnonzero(np.diff(at) != 1) + 1):
+            _draw_run(axes, contacts.time_s[run], factor * contacts.size_n[run], factor * contacts.std_n[run], color)
+        many = len(rows) > MANY
+        axes.plot(
+            contacts.time_s[rows],
+            factor * contacts.size_n[rows],
+            "o",
+            color=color,
+            markersize=2.0 if len(rows) > 150 else 3.8,
+            markeredgewidth=0,
+            label=f"contact {number}",
+            rasterized=many,
+            zorder=4,
+        )
+    size, std = factor * contacts.size_n, factor * np.nan_to_num(contacts.std_n)
+    top = min(float(np.nanmax(size + 2 * std)), 2.5 * float(np.nanmax(size)))
+    margin = 0.03 * (span[1] - span[0]) or 1.0
+    axes.set(ylim=(0.0, 1.06 * max(top, 1e-3)), xlim=(span[0] - margin, span[1] + margin))
+    name_axes(axes, "time [s]", f"force [{unit}]")
+    add_legend(axes)
+    return figure
+
+
+def _draw_run(axes: Any, time: FloatArray, size: FloatArray, std: FloatArray, color: str) -> None:
+    """Draw the bands of frames that follow each other; of a single frame as bars."""
+    if len(time) == 1:
+        axes.vlines(time, size - 2 * std, size + 2 * std, color=color, alpha=0.35, linewidth=1.6)
+        axes.vlines(time, size - std, size + std, color=color, alpha=0.6, linewidth=3.2)
+        return
+    many = len(time) > MANY
+    axes.fill_between(time, size - 2 * std, size + 2 * std, color=color, alpha=0.14, linewidth=0, rasterized=many)
+    axes.fill_between(time, size - std, size + std, color=color, alpha=0.26, linewidth=0, rasterized=many)
+    axes.plot(time, size, color=color, linewidth=1.3, rasterized=many)
+
+
+def _force_on_body(contacts: ContactTable, frames: FrameTable | None, folder: Path, number: int) -> Html | None:
+    """Draw the body in the frame of the strongest force, with the forces on it."""
+    file = folder / "states.npz"
+    if not file.is_file() or frames is None:
+        return None
+    states = read_states(file)
+    index = np.flatnonzero(frames.frame == number)
+    if not len(index) or index[0] >= len(states.nodes_m) or not np.isfinite(states.nodes_m[index[0]]).all():
+        return None
+    surface = skin(np.asarray(states.nodes_m[index[0]], dtype=np.float64), states.tets)
+    rows = np.flatnonzero(
+        (contacts.frame == number) & np.isfinite(contacts.force_n).all(axis=1) & np.isfinite(contacts.place_m).all(axis=1)
+    )
+    if not len(rows) or not contacts.size_n[rows].max() > 0:
+        return None
+    view = best_view(surface.nodes, contacts.force_n[rows])
+    largest = float(contacts.size_n[rows].max())
+    scale = ARROW_SHARE * float(np.linalg.norm(np.ptp(surface.nodes, axis=0))) / max(largest, 1e-12)
+    tips = contacts.place_m[rows]
+    tails = tips - scale * contacts.force_n[rows]
+    flat = 1e3 * view.flat(np.vstack([surface.nodes, tips, tails]))
+    low, high = flat.min(axis=0), flat.max(axis=0)
+    figure, axes = new_axes(height=body_height(low, high))
+    draw_body(axes, surface, view)
+    for i, tail, tip in zip(rows, 1e3 * view.flat(tails), 1e3 * view.flat(tips)):
+        color = SERIES[int(contacts.contact[i]) % len(SERIES)]
+        axes.annotate(
+            "",
+            xy=tuple(tip),
+            xytext=tuple(tail),
+            arrowprops={
+                "arrowstyle": "-|>,head_length=0.55,head_width=0.28",
+                "color": color,
+                "linewidth": 2.2,
+                "shrinkA": 0,
+                "shrinkB": 0,
+            },
+            zorder=6,
+        )
+    factor, unit = words.force_unit(largest)
+    bar = nice(largest)
+    frame_body(axes, view, low, high, key=Key(1e3 * scale * bar, f"{factor * bar:g} {unit}", SERIES[0], None))
+    text = "; ".join(f"contact {contacts.contact[i]} {force_text(contacts.size_n[i], contacts.std_n[i])}" for i in rows)
+    return as_image(
+        figure,
+        alt=f"The deformed body in frame {number} with the forces on it: {text}.",
+        caption=f"Frame {number}, with the strongest force: {text}.",
+    )
+
+
+def known_loads_table(loads: Sequence[KnownLoad]) -> Html | None:
+    rows = [
+        [str(load.frame), words.number(load.declared_n), words.number(load.sensed_n), _signed(load.error_percent)]
+        for load in loads[:ROWS]
+    ]
+    error = load_error(loads)
+    text = paragraph(f"The median size of the error is {error}.") if error != words.NOTHING else None
+    caption = "Declared loads at the given places next to the forces that were sensed there." + first_of(
+        len(loads), ROWS, "run.json"
+    )
+    return (
+        together(text, table(("Frame", "Declared [N]", "Sensed [N]", "Error [%]"), rows, caption=caption, numeric=(1, 2, 3)))
+        or None
+    )
+
+
+def _signed(value: float | None) -> str:
+    return words.NOTHING if value is None or not words.known(value) else f"{value:+.1f}".replace("-", "−")
+
+
+def contacts_table(contacts: ContactTable | None) -> Html | None:
+    if contacts is None or not len(contacts):
+        return None
+    factor, unit = words.force_unit(float(np.nanmax(contacts.size_n, initial=0.0)))
+    rows = [
+        [
+            str(contacts.frame[i]),
+            words.number(float(contacts.time_s[i])),
+            str(contacts.contact[i]),
+            words.with_std(factor * float(contacts.size_n[i]), factor * float(contacts.std_n[i])),
+            _vector(factor * contacts.force_n[i]),
+            _vector(1e3 * contacts.place_m[i], 1),
+            contacts.source[i] or words.NOTHING,
+        ]
+        for i in range(min(len(contacts), ROWS))
+    ]
+    headers = ("Frame", "Time [s]", "Contact", f"Force [{unit}]", f"Components x, y, z [{unit}]", "Place x, y, z [mm]", "Source")
+    caption = "Force on the body and its place on the deformed body, robot frame." + first_of(len(contacts), ROWS, "contacts.csv")
+    return table(headers, rows, caption=caption, numeric=(1, 2, 3, 4, 5))
+
+
+def _vector(values: FloatArray, decimals: int | None = None) -> str:
+    if decimals is None:
+        return ", ".join(words.number(float(v), 2) for v in values)
+    return ", ".join(f"{v:.{decimals}f}".replace("-", "−") if np.isfinite(v) else words.NOTHING for v in values)

@@ -1,0 +1,111 @@
+"""What became of each frame of a run: status, residual, time, tensions and pressures."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+import numpy as np
+
+from femsense.core.arrays import FloatArray
+from femsense.report import words
+from femsense.report.drawing import (
+    AFTER,
+    BEFORE,
+    MANY,
+    SERIES,
+    SOFT,
+    add_legend,
+    as_image,
+    clipped,
+    name_axes,
+    new_axes,
+    whole_numbers,
+)
+from femsense.report.page import Html, panels, table
+from femsense.report.run.forces import SHOWN
+from femsense.report.run.tables import FrameTable, first_of, median_of
+
+LISTED = 40
+
+
+def status_table(frames: FrameTable | None) -> Html | None:
+    """Return the table of frames without a result by their reason."""
+    if frames is None or not len(frames):
+        return None
+    counts = Counter(frames.status)
+    reasons = sorted(counts, key=lambda status: (status != "ok", -counts[status]))
+    rows = []
+    for status in reasons[:LISTED]:
+        members = [int(f) for f, s in zip(frames.frame, frames.status) if s == status]
+        rows.append(["with a result" if status == "ok" else f"none: {status}", str(counts[status]), words.frame_list(members)])
+    caption = "What became of the frames." + first_of(len(reasons), LISTED, "frames.csv")
+    return table(("Result", "Frames", "Which"), rows, caption=caption, numeric=(1,))
+
+
+def frame_panels(frames: FrameTable | None) -> Html | None:
+    if frames is None or not frames.good.any():
+        return None
+    return panels(_residual_panel(frames), _time_panel(frames), _tension_panel(frames), _pressure_panel(frames))
+
+
+def _residual_panel(frames: FrameTable) -> Html | None:
+    if not np.isfinite(frames.before_m).any():
+        return None
+    figure, axes = new_axes()
+    for values, color, name in ((frames.before_m, BEFORE, "without forces"), (frames.after_m, AFTER, "with the forces")):
+        _dots(axes, frames, 1e3 * values, color, name)
+    axes.set_ylim(0.0, 1.08 * max(1e3 * float(np.nanmax([frames.before_m, frames.after_m])), 1e-9))
+    whole_numbers(axes)
+    name_axes(axes, "frame", "rms residual [mm]")
+    add_legend(axes)
+    before, after = (words.length(median_of(values)) for values in (frames.before_m, frames.after_m))
+    return as_image(
+        figure,
+        alt=f"Residual of each frame without and with the contact forces; medians {before} and {after}.",
+        caption=f"Residual of the model; median {before} without forces, {after} with them.",
+    )
+
+
+def _dots(axes: Any, frames: FrameTable, values: FloatArray, color: str, name: str) -> None:
+    size = 3.8 if len(frames) <= 150 else 2.0
+    axes.plot(
+        frames.frame, values, "o", color=color, markersize=size, markeredgewidth=0, label=name, rasterized=len(frames) > MANY
+    )
+
+
+def _time_panel(frames: FrameTable) -> Html | None:
+    times = frames.ms[np.isfinite(frames.ms)]
+    if not len(times):
+        return None
+    figure, axes = new_axes()
+    _dots(axes, frames, frames.ms, SERIES[0], "one frame")
+    median = float(np.median(times))
+    axes.axhline(median, color=SOFT, linewidth=1.2, linestyle=(0, (4, 3)), label="median")
+    axes.set_ylim(0.0, 1.08 * float(times.max()))
+    whole_numbers(axes)
+    name_axes(axes, "frame", "time [ms]")
+    add_legend(axes)
+    span = f"median {words.number(median)} ms, {words.number(float(times.min()))} to {words.number(float(times.max()))} ms"
+    return as_image(figure, alt=f"Computing time of each frame: {span}.", caption=f"Computing time of each frame; {span}.")
+
+
+def _tension_panel(frames: FrameTable) -> Html | None:
+    return _drive_panel(frames, frames.tension_n, "tension [N]", "Tension of the cables")
+
+
+def _pressure_panel(frames: FrameTable) -> Html | None:
+    return _drive_panel(frames, frames.pressure_pa, "pressure [Pa]", "Pressure in the chambers")
+
+
+def _drive_panel(frames: FrameTable, drives: dict[str, FloatArray], label: str, title: str) -> Html | None:
+    shown = [(name, values) for name, values in drives.items() if np.isfinite(values).any()][:SHOWN]
+    if not shown:
+        return None
+    figure, axes = new_axes()
+    for color, (name, values) in zip(SERIES, shown):
+        axes.plot(frames.frame, values, color=color, linewidth=1.5, label=clipped(name, 14), rasterized=len(frames) > MANY)
+    whole_numbers(axes)
+    name_axes(axes, "frame", label)
+    add_legend(axes, columns=min(len(shown), 4))
+    return as_image(figure, alt=f"{title} {', '.join(name for name, _ in shown)} over the frames.", caption=f"{title}.")

@@ -1,0 +1,109 @@
+"""contacts.csv and frames.csv of a run, as columns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from femsense.core.arrays import FloatArray, IntArray
+from femsense.io.tables import read_csv
+from femsense.sensing.run_files import CONTACT_COLUMNS, FRAME_COLUMNS, MORE_CONTACT_COLUMNS
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ContactTable:
+    """contacts.csv."""
+
+    frame: IntArray
+    contact: IntArray
+    time_s: FloatArray
+    place_m: FloatArray
+    """shape (k, 3)."""
+    force_n: FloatArray
+    """shape (k, 3)."""
+    size_n: FloatArray
+    std_n: FloatArray
+    source: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class FrameTable:
+    """frames.csv."""
+
+    frame: IntArray
+    time_s: FloatArray
+    status: tuple[str, ...]
+    contacts: IntArray
+    matched: IntArray
+    before_m: FloatArray
+    after_m: FloatArray
+    ms: FloatArray
+    tension_n: dict[str, FloatArray]
+    pressure_pa: dict[str, FloatArray]
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    @property
+    def good(self) -> npt.NDArray[np.bool_]:
+        return np.array([status == "ok" for status in self.status], dtype=bool)
+
+
+def read_contacts(file: Path) -> ContactTable:
+    table_ = read_csv(file, required=CONTACT_COLUMNS, optional=MORE_CONTACT_COLUMNS)
+    values = table_.numbers(("time_s", *CONTACT_COLUMNS[3:14]), empty_is_nan=True)
+    return ContactTable(
+        table_.integers("frame"),
+        table_.integers("contact"),
+        values[:, 0],
+        values[:, 1:4],
+        values[:, 7:10],
+        values[:, 10],
+        values[:, 11],
+        table_.text("source"),
+    )
+
+
+def read_frames(file: Path) -> FrameTable:
+    table_ = read_csv(file, required=FRAME_COLUMNS, prefixes=("tension_", "pressure_"))
+    cables = [c for c in table_.columns if c.startswith("tension_")]
+    chambers = [c for c in table_.columns if c.startswith("pressure_")]
+    values = table_.numbers(("time_s", "rms_before_m", "rms_after_m", "ms", *cables, *chambers), empty_is_nan=True)
+    tension = {c.removeprefix("tension_").removesuffix("_n"): values[:, 4 + j] for j, c in enumerate(cables)}
+    pressure = {c.removeprefix("pressure_").removesuffix("_pa"): values[:, 4 + len(cables) + j] for j, c in enumerate(chambers)}
+    return FrameTable(
+        table_.integers("frame"),
+        values[:, 0],
+        table_.text("status"),
+        table_.integers("contacts"),
+        table_.integers("matched"),
+        values[:, 1],
+        values[:, 2],
+        values[:, 3],
+        tension,
+        pressure,
+    )
+
+
+def strongest_contact(contacts: ContactTable | None, frames: FrameTable | None) -> int | None:
+    """Return the row of the largest force of the frames that are ok; None where there is none."""
+    if contacts is None:
+        return None
+    bad = [] if frames is None else frames.frame[~frames.good].tolist()
+    size = np.where(np.isin(contacts.frame, bad), np.nan, contacts.size_n)
+    return None if not np.isfinite(size).any() else int(np.nanargmax(size))
+
+
+def median_of(values: FloatArray) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else float("nan")
+
+
+def first_of(count: int, shown: int, file: str) -> str:
+    return f" The first {shown} of {count}; all of them are in {file}." if count > shown else ""
