@@ -124,11 +124,11 @@ STIFF = Term(0, "stiffness", [0.5])
 FREE = Term(0, "gravity", [0.0, 0.0, -9.8])
 
 
-def values(data: Data, stage: FittedModel) -> dict[str, list[tuple[float, float]]]:
+def values(data: Data, model: FittedModel) -> dict[str, list[tuple[float, float]]]:
     """Return (value, standard deviation) of each parameter of each term."""
-    std, at, table = coordinate_std(stage.fit, data.train, NOISE), 0, dict[str, list[tuple[float, float]]]()
-    for effect, _, parameters in stage.fit.hypothesis.terms:
-        u, s = stage.fit.coordinates[at : at + len(parameters)], std[at : at + len(parameters)]
+    std, at, table = coordinate_std(model.fit, data.train, NOISE), 0, dict[str, list[tuple[float, float]]]()
+    for effect, _, parameters in model.fit.hypothesis.terms:
+        u, s = model.fit.coordinates[at : at + len(parameters)], std[at : at + len(parameters)]
         table[effect.name] = [(p.value(a), p.value_std(a, b)) for p, a, b in zip(parameters, u, s)]
         at += len(parameters)
     return table
@@ -170,31 +170,33 @@ def print_models(beam: Beam) -> dict[str, tuple[FittedModel, list[tuple[float, f
     print(
         "| model | fitted | held out | ratio | modulus | sensed at 0.510 N | at 1.001 N | further |\n|---|---|---|---|---|---|---|---|"
     )
-    stages: dict[str, tuple[FittedModel, list[tuple[float, float]]]] = {}
+    results: dict[str, tuple[FittedModel, list[tuple[float, float]]]] = {}
     for name, robot, terms in models:
-        stage = fitted(beam.data, robot, terms)
-        forces = sensed(beam, stage.fit.hypothesis.robot_at(stage.fit.coordinates))
-        stages[name] = (stage, forces)
-        first = stages[models[0][0]][0].held_rms
-        table = values(beam.data, stage)
+        model = fitted(beam.data, robot, terms)
+        forces = sensed(beam, model.fit.hypothesis.robot_at(model.fit.coordinates))
+        results[name] = (model, forces)
+        first = results[models[0][0]][0].held_rms
+        table = values(beam.data, model)
         scale = table.pop("stiffness", [(1.0, 0.0)])[0]
         modulus = f"{150 * scale[0]:.0f} ± {150 * scale[1]:.0f} kPa" if scale[1] else "150 kPa"
         more = "; ".join(f"{k} {shown(v)}" for k, v in table.items())
         weights = " | ".join(f"{v:.3f} ± {s:.3f} N" for v, s in forces)
         print(
-            f"| {name} | {1e3 * stage.fit.rms:.2f} mm | {1e3 * stage.held_rms:.2f} mm | {stage.held_rms / first:.2f} | {modulus} | {weights} | {more} |",
+            f"| {name} | {1e3 * model.fit.rms:.2f} mm | {1e3 * model.held_rms:.2f} mm | {model.held_rms / first:.2f} | {modulus} | {weights} | {more} |",
             flush=True,
         )
-    return stages
+    return results
 
 
-def print_residuals(beam: Beam, stages: dict[str, tuple[FittedModel, Any]]) -> None:
+def print_residuals(beam: Beam, results: dict[str, tuple[FittedModel, Any]]) -> None:
     """Print what three models leave at each marker at 0.51 N."""
     print("\nWhat is left at 0.51 N, measured minus model [mm], along x, y, z")
-    chosen = [n for n in stages if n.startswith(("modulus alone", "gravity straight", "straight down, modulus, base markers on"))]
+    chosen = [
+        n for n in results if n.startswith(("modulus alone", "gravity straight", "straight down, modulus, base markers on"))
+    ]
     print("| marker | " + " | ".join(chosen) + " |\n" + "|---" * (len(chosen) + 1) + "|")
     for m, name in enumerate(beam.robot.marker_names):
-        cells = [1e3 * stages[n][0].fit.jets[1].residual[beam.data.train[1].scene.marker == m].mean(axis=0) for n in chosen]
+        cells = [1e3 * results[n][0].fit.jets[1].residual[beam.data.train[1].scene.marker == m].mean(axis=0) for n in chosen]
         print(f"| {name} | " + " | ".join(", ".join(f"{v:+.2f}" for v in c) for c in cells) + " |")
 
 
@@ -229,12 +231,12 @@ def print_causes(beam: Beam) -> None:
         print_cause(f"without {robot.marker_names[left_out]}", data, fitted(data, robot, [STIFF, FREE]))
 
 
-def print_cause(name: str, data: Data, stage: FittedModel) -> None:
-    table = values(data, stage)
+def print_cause(name: str, data: Data, model: FittedModel) -> None:
+    table = values(data, model)
     scale, gravity = table.pop("stiffness")[0], table.pop("gravity")
     own = "; ".join(shown(v) for v in table.values())
     print(
-        f"| {name} | {1e3 * stage.fit.rms:.2f} mm | {1e3 * stage.held_rms:.2f} mm | {stage.fit.chi2:.1f} | {shown(gravity)} | {150 * scale[0]:.0f} ± {150 * scale[1]:.0f} kPa | {own} |",
+        f"| {name} | {1e3 * model.fit.rms:.2f} mm | {1e3 * model.held_rms:.2f} mm | {model.fit.chi2:.1f} | {shown(gravity)} | {150 * scale[0]:.0f} ± {150 * scale[1]:.0f} kPa | {own} |",
         flush=True,
     )
 
@@ -298,8 +300,8 @@ def profile(beam: Beam, data: Data, more: Sequence[Entry]) -> FloatArray:
     rows = []
     for a in np.deg2rad(TILTS):
         gravity = {"name": "gravity", "vector_m_s2": [9.80665 * np.sin(a), 0.0, -9.80665 * np.cos(a)]}
-        stage = fitted(data, apply_effects(beam.robot, [gravity, *more]), [STIFF])
-        rows.append([stage.fit.chi2, 1e3 * stage.held_rms, 150 * np.exp(stage.fit.coordinates[0])])
+        model = fitted(data, apply_effects(beam.robot, [gravity, *more]), [STIFF])
+        rows.append([model.fit.chi2, 1e3 * model.held_rms, 150 * np.exp(model.fit.coordinates[0])])
     return np.array(rows)
 
 
@@ -354,10 +356,10 @@ def print_meshes(beam: Beam, folder: Path) -> None:
     declared = load_robot(folder / "robot")
     for cells in ((5, 2, 2), (8, 3, 3), (12, 4, 4), (20, 6, 6)):
         robot = apply_effects(in_cells(declared, cells), [DOWN])
-        stage = fitted(beam.data, robot, [STIFF])
-        scale = values(beam.data, stage)["stiffness"][0][0]
+        model = fitted(beam.data, robot, [STIFF])
+        scale = values(beam.data, model)["stiffness"][0][0]
         print(
-            f"| {' × '.join(map(str, cells))} | {3 * len(robot.body.mesh.nodes)} | {1e3 * stage.fit.rms:.2f} mm | {1e3 * stage.held_rms:.2f} mm | {150 * scale:.0f} kPa |",
+            f"| {' × '.join(map(str, cells))} | {3 * len(robot.body.mesh.nodes)} | {1e3 * model.fit.rms:.2f} mm | {1e3 * model.held_rms:.2f} mm | {150 * scale:.0f} kPa |",
             flush=True,
         )
 
@@ -395,7 +397,7 @@ def print_loops(beam: Beam, folder: Path, declared_mesh: bool, cells: Sequence[i
 # The pictures
 
 
-def draw_states(beam: Beam, stages: dict[str, tuple[FittedModel, Any]]) -> None:
+def draw_states(beam: Beam, results: dict[str, tuple[FittedModel, Any]]) -> None:
     """Draw the beam from its side in the three states, before and after, residuals three times as long."""
     from matplotlib import pyplot as plt
 
@@ -405,10 +407,10 @@ def draw_states(beam: Beam, stages: dict[str, tuple[FittedModel, Any]]) -> None:
     ]
     figure, axes = plt.subplots(1, 2, figsize=(9.0, 3.6), sharey=True)
     for axis, (name, title) in zip(axes, chosen):
-        stage = stages[name][0]
-        robot = stage.fit.hypothesis.robot_at(stage.fit.coordinates)
-        draws = [(jet, t, p[0]) for jet, t, p in zip(stage.fit.jets, beam.data.train, poses_and_inputs(beam.data, stage.fit))]
-        draws += [(h.jet, t, h.poses) for h, t in zip(stage.held, beam.data.held)]
+        model = results[name][0]
+        robot = model.fit.hypothesis.robot_at(model.fit.coordinates)
+        draws = [(jet, t, p[0]) for jet, t, p in zip(model.fit.jets, beam.data.train, poses_and_inputs(beam.data, model.fit))]
+        draws += [(h.jet, t, h.poses) for h, t in zip(model.held, beam.data.held)]
         for color, label, (jet, trial, poses) in zip(
             ("tab:blue", "tab:orange", "tab:red"), ("0 N", "0.51 N", "1.00 N, not fitted"), draws
         ):
@@ -424,7 +426,7 @@ def draw_states(beam: Beam, stages: dict[str, tuple[FittedModel, Any]]) -> None:
             axis.quiver(
                 seen[:, 0], seen[:, 2], -way[:, 0], -way[:, 2], angles="xy", scale_units="xy", scale=1, width=0.004, color=color
             )
-        axis.set_title(f"{title}\nheld out {1e3 * stage.held_rms:.2f} mm", fontsize=9)
+        axis.set_title(f"{title}\nheld out {1e3 * model.held_rms:.2f} mm", fontsize=9)
         axis.set_xlabel("x [mm]")
         axis.set_aspect("equal")
         axis.set_xlim(-5, 115)
@@ -450,20 +452,20 @@ def draw_profile(tables: list[FloatArray]) -> None:
     save(figure, "beam-tilt")
 
 
-def draw_forces(stages: dict[str, tuple[FittedModel, list[tuple[float, float]]]]) -> None:
+def draw_forces(results: dict[str, tuple[FittedModel, list[tuple[float, float]]]]) -> None:
     """Draw what each model leaves beside the weights that it senses."""
     from matplotlib import pyplot as plt
 
     figure, (left, right) = plt.subplots(1, 2, figsize=(8.6, 3.4), sharey=True)
-    rows = -np.arange(len(stages))
-    left.plot([1e3 * s.fit.rms for s, _ in stages.values()], rows, "o", ms=5, label="0 and 0.51 N, fitted")
-    left.plot([1e3 * s.held_rms for s, _ in stages.values()], rows, "s", ms=5, label="1.00 N, held out")
+    rows = -np.arange(len(results))
+    left.plot([1e3 * s.fit.rms for s, _ in results.values()], rows, "o", ms=5, label="0 and 0.51 N, fitted")
+    left.plot([1e3 * s.held_rms for s, _ in results.values()], rows, "s", ms=5, label="1.00 N, held out")
     left.axvline(REPEAT_MM, color="gray", lw=0.8, ls="--", label="a repeat at 1.00 N")
-    left.set_yticks(rows, list(stages), fontsize=7)
+    left.set_yticks(rows, list(results), fontsize=7)
     left.set_xlabel("what the model leaves [mm]")
     left.legend(fontsize=6)
     for i, (weight, marker) in enumerate(((0.51012, "o"), (1.00062, "s"))):
-        percent = np.array([[100 * (f[i][0] / weight - 1), 100 * f[i][1] / weight] for _, f in stages.values()])
+        percent = np.array([[100 * (f[i][0] / weight - 1), 100 * f[i][1] / weight] for _, f in results.values()])
         right.errorbar(
             percent[:, 0], rows + 0.12 - 0.24 * i, xerr=percent[:, 1], fmt=marker, ms=4, lw=0.8, label=f"{weight:.2f} N"
         )
@@ -504,14 +506,14 @@ def main() -> None:
 def print_tables(beam: Beam, folder: Path) -> None:
     """Print all tables and write the pictures."""
     began = time.process_time()
-    stages = print_models(beam)
-    print_residuals(beam, stages)
+    results = print_models(beam)
+    print_residuals(beam, results)
     tables = print_profile(beam)
     print_causes(beam)
     print_meshes(beam, folder)
-    draw_states(beam, stages)
+    draw_states(beam, results)
     draw_profile(tables)
-    draw_forces(stages)
+    draw_forces(results)
     print(f"tables and pictures: {time.process_time() - began:.0f} s of processor time", flush=True)
 
 

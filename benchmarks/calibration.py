@@ -137,18 +137,18 @@ def lopsided() -> Robot:
     return replace(robot, marker_names=tuple(robot.marker_names[i] for i in KEPT)).with_marker_points(robot.marker_points[KEPT])
 
 
-def nameless(recording: Recording, rng: np.random.Generator, *, strays: int, missing: int) -> tuple[Recording, IntArray]:
-    """Return the recording without names, shuffled, in another camera frame, and which marker (−1: stray) each row is."""
+def nameless(recording: Recording, rng: np.random.Generator, *, outliers: int, missing: int) -> tuple[Recording, IntArray]:
+    """Return the recording without names, shuffled, in another camera frame, and which marker (−1: outlier) each row is."""
     T = make_pose(rotation_from_vector(2.0 * rng.normal(size=3)), rng.normal(size=3))
     frame, xyz, truth = [], [], []
     for k in range(recording.frame_count):
         of = np.flatnonzero((recording.marker_frame == k) & np.isin(recording.marker_index, KEPT))
         of = rng.permutation(of)[missing:]
         points = recording.marker_xyz[of]
-        wild = points.mean(axis=0) + rng.uniform(-0.08, 0.08, size=(strays, 3))
-        order = rng.permutation(len(of) + strays)
+        wild = points.mean(axis=0) + rng.uniform(-0.08, 0.08, size=(outliers, 3))
+        order = rng.permutation(len(of) + outliers)
         xyz.append(transform_points(T, np.vstack([points, wild])[order]))
-        truth.append(np.concatenate([np.searchsorted(KEPT, recording.marker_index[of]), np.full(strays, -1)])[order])
+        truth.append(np.concatenate([np.searchsorted(KEPT, recording.marker_index[of]), np.full(outliers, -1)])[order])
         frame.append(np.full(len(order), k))
     none = np.zeros(0, dtype=np.int64)
     bare = replace(recording, marker_frame=none, marker_index=none, marker_view=none, marker_xyz=np.zeros((0, 3)))
@@ -167,14 +167,14 @@ def given_names(robot: Robot, bare: Recording, named: Recording) -> IntArray:
 def nowhere(seeds: int) -> None:
     print("\n## Markers without names, from nowhere: 8 markers, 6 frames\n")
     print(
-        "| strays, missing a frame | runs | right | refused | rows named right | wrong | left out | strays taken |\n|---|---|---|---|---|---|---|---|"
+        "| outliers, missing a frame | runs | right | refused | rows named right | wrong | left out | outliers taken |\n|---|---|---|---|---|---|---|---|"
     )
     robot = lopsided()
-    for strays, missing in ((0, 0), (1, 1), (2, 2), (3, 3)):
+    for outliers, missing in ((0, 0), (1, 1), (2, 2), (3, 3)):
         rows = Counter()
         for seed in range(seeds):
             rng = np.random.default_rng(seed)
-            bare, truth = nameless(record(INPUTS, noise=2e-4, seed=seed)[0], rng, strays=strays, missing=missing)
+            bare, truth = nameless(record(INPUTS, noise=2e-4, seed=seed)[0], rng, outliers=outliers, missing=missing)
             try:
                 given = given_names(robot, bare, name_markers(robot, bare, np.arange(len(INPUTS))))
             except DataError:
@@ -184,7 +184,7 @@ def nowhere(seeds: int) -> None:
             rows += Counter(right=int(wrong == 0), wrong=wrong, named=((given == truth) & (truth >= 0)).sum())
             rows += Counter(out=((given < 0) & (truth >= 0)).sum(), taken=((given >= 0) & (truth < 0)).sum())
         print(
-            f"| {strays}, {missing} | {seeds} | {rows['right']} | {rows['refused']} | {rows['named']} | {rows['wrong']} | {rows['out']} | {rows['taken']} |",
+            f"| {outliers}, {missing} | {seeds} | {rows['right']} | {rows['refused']} | {rows['named']} | {rows['wrong']} | {rows['out']} | {rows['taken']} |",
             flush=True,
         )
 
@@ -252,13 +252,13 @@ def _scene(
 
 
 def labels(seeds: int) -> None:
-    print("\n## Wrong labels and strays among named markers: 12 markers, 6 frames\n")
+    print("\n## Wrong labels and outliers among named markers: 12 markers, 6 frames\n")
     print("| what is wrong | runs | said | clean runs accused | pose, median [mm] |\n|---|---|---|---|---|")
     for kind in (
         "nothing",
-        "two labels exchanged in one frame",
-        "a stray in one frame",
-        "two labels exchanged in all frames",
+        "two labels swapped in one frame",
+        "an outlier in one frame",
+        "two labels swapped in all frames",
         "mirrored",
         "inches",
     ):
@@ -285,9 +285,9 @@ def _spoiled(recording: Recording, kind: str, rng: np.random.Generator) -> Recor
     frame = recording.marker_frame == rng.integers(recording.frame_count)
     a, b = rng.choice(12, 2, replace=False)
     where = frame if "one frame" in kind else np.ones(len(frame), dtype=bool)
-    if "exchanged" in kind:
+    if "swapped" in kind:
         index[where & (recording.marker_index == a)], index[where & (recording.marker_index == b)] = b, a
-    elif "stray" in kind:
+    elif "outlier" in kind:
         xyz[frame & (index == a)] += rng.uniform(0.015, 0.04) * rng.choice([-1, 1], 3)
     elif kind == "mirrored":
         xyz[:, rng.integers(3)] *= -1.0

@@ -191,8 +191,8 @@ def outcome(record: dict[str, Any]) -> str:
     others = [n for n in names if n != name and n not in ALWAYS_OFF]
     if name in names:
         return "named" + (f" with {', '.join(others)}" if others else "")
-    rivals = {n for pair in record["confounded"] if set(pair["pair"]) & set(names) for n in pair["pair"]}
-    said = "in the set" if name in rivals else "not testable" if name in record["not_testable"] else "MISSED"
+    confounded = {n for pair in record["confounded"] if set(pair["pair"]) & set(names) for n in pair["pair"]}
+    said = "in the set" if name in confounded else "not testable" if name in record["not_testable"] else "MISSED"
     return said + (f", named {', '.join(others)}" if others else f" ({record['verdict']})")
 
 
@@ -239,7 +239,9 @@ def size_text(record: dict[str, Any]) -> str:
 def print_tables(records: list[dict[str, Any]]) -> None:
     """Print recovery, then what becomes of the improved robots."""
     wide = max([len(outcome(r)) for r in records if not r["error"]] + [10]) + 2
-    print(f"{'control':<13}{'hidden':<17}{'outcome':<{wide}}{'held-out [mm]':<17}{'CPU [s]':<9}{'not told apart from':<30}size")
+    print(
+        f"{'control':<13}{'hidden':<17}{'outcome':<{wide}}{'held-out [mm]':<17}{'CPU [s]':<9}{'not distinguishable from':<30}size"
+    )
     held = count = named = 0
     for r in records:
         name = r["truth"]["name"]

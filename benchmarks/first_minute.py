@@ -1,7 +1,7 @@
 """Processor time of a new installation's first commands, and of a process to its first equilibrium.
 
     python benchmarks/first_minute.py              # what is installed beside this script, kernels compiled (a folder of its own for them) and warm
-    python benchmarks/first_minute.py --kernels    # which kernels are compiled, the dearest first
+    python benchmarks/first_minute.py --kernels    # which kernels are compiled, the costliest first
 
 Each command is a process of its own with one thread; user and system time, median of the runs (compiling: one run).
 """

@@ -60,7 +60,7 @@ def run_case(job: tuple[str, Case]) -> dict[str, Any]:
         "label": case.label,
         "hidden": list(case.hidden),
         "white_m": case.white_m,
-        "seats": case.placements,
+        "placements": case.placements,
         "element": case.element,
     }
     try:
@@ -299,7 +299,7 @@ def table(records: Sequence[dict[str, Any]]) -> None:
     unsaid = [r for r in poor if r["label"] in named(r) and not r["not_testable"]]
     row("what the recording cannot show is not named", wilson(len(poor) - len(unsaid), len(poor)), ">= 90 % | 100 %")
     sure = [r for r in unsaid if len(answer_set(r)) == len(set(named(r)))]
-    row("  as before, or named as one of a set that is not told apart", wilson(len(poor) - len(sure), len(poor)), "")
+    row("  as before, or named as one of a set that is not distinguishable", wilson(len(poor) - len(sure), len(poor)), "")
     times = [r["cpu_s"] for r in done]
     row("time of improve, CPU, median / longest", f"{np.median(times):.0f} s / {np.max(times):.0f} s", "")
     power_curve(single)

@@ -1,7 +1,7 @@
 """Blind cases for the loop: three robots, both control modes, one hidden thing or none, made by another path than the fitter's.
 
 The truth lives on a finer mesh than the declared robot, under a law that the declared robot states (or not: then the law is what is
-hidden), with the rig's own integrators of friction and creep, walked in small steps. Every case has a modulus that is off by up to 20 %,
+hidden), with the rig's own integrators of friction and creep, followed in small steps. Every case has a modulus that is off by up to 20 %,
 an unknown camera pose, and markers with noise of their own, of the frame, of the sweep, and of the place where they are glued.
 """
 
@@ -184,7 +184,7 @@ class Case:
     outside: str = ""
     size: float = 1.0
     placements: bool = False
-    """Whether rest.csv measures the seats of the markers."""
+    """Whether rest.csv measures the placement of the markers."""
     poor: bool = False
     """One sweep up only."""
     hyperelastic: bool = True
@@ -354,7 +354,7 @@ class Made:
 
 
 def make_data(case: Case, seed: int) -> Made:
-    """Walk the truth of a case and measure it."""
+    """Follow the true path of a case and measure it."""
     rng = np.random.default_rng([seed, case.number])
     design = case.design
     law = "neo_hookean" if case.hyperelastic else "corotational"

@@ -69,11 +69,11 @@ def come_true(robot: Robot, script: dict[str, Any], hidden: dict[str, Any]) -> d
         except FemsenseError as error:
             return {"verdict": f"refused: {error}", "named": [], "set": [], "frames": recording.frame_count}
     named = [e.name for e in loop.effects]
-    rivals = sorted({n for p in loop.confounded if set(p.pair) & set(named) for n in p.pair} - set(named))
+    confounded = sorted({n for p in loop.confounded if set(p.pair) & set(named) for n in p.pair} - set(named))
     return {
         "verdict": loop.verdict,
         "named": named,
-        "set": rivals,
+        "set": confounded,
         "frames": recording.frame_count,
         "not_testable": [n.name for n in loop.not_testable],
     }

@@ -165,7 +165,7 @@ def print_weights(out: Path, data: Path) -> None:
 
 
 def print_pairs(out: Path, data: Path) -> None:
-    """Print the force at the tip of the trunk by pairs: two moments at the same command, and what tells them apart but the inputs.
+    """Print the force at the tip of the trunk by pairs: two moments at the same command, and what distinguishes them but the inputs.
 
     In the pair with the weight it is looked for; in a pair of two runs without it (the same frames, the second half a second later) nothing is.
     """

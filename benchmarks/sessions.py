@@ -75,7 +75,7 @@ def of_chambers(name: str) -> LoopResult:
 
 
 def main() -> None:
-    """Print one line a case: verdict, what is named with its values, and what these data do not tell apart from it."""
+    """Print one line a case: verdict, what is named with its values, and what these data do not distinguish from it."""
     warnings.simplefilter("ignore")
     sys.path[:0] = [str(TESTS / part) for part in ("support", "end_to_end")]
     for name in sys.argv[1:] or [*CABLES, *CHAMBERS]:

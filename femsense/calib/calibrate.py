@@ -106,7 +106,7 @@ def calibrated_start(
 def _fitted(
     robot: Robot, recording: Recording, chosen: IntArray, history: list[float], *, strict: bool = True
 ) -> tuple[Scene, FitResult, list[FloatArray], FloatArray | None, SceneJet]:
-    """Return the scene of the frames that are used, and the fit to it; labels put right, strays left out.
+    """Return the scene of the frames that are used, and the fit to it; labels put right, outliers left out.
 
     Raises:
         DataError: markers that cannot be the robot's as they are written (`check_reading`).

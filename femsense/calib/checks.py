@@ -1,6 +1,6 @@
-"""Whether measured markers can be those of the robot: unit, handedness, exchanged labels, strays.
+"""Whether measured markers can be those of the robot: unit, handedness, swapped labels, outliers.
 
-All is judged against the fitted model, by what another reading of the same numbers would leave: a scale, a mirror or an exchange counts
+All is judged against the fitted model, by what another reading of the same numbers would leave: a scale, a mirror or a swap counts
 where it takes most of the residual away.
 """
 
@@ -29,8 +29,8 @@ HOPELESS = 0.5
 """A residual above this share of the markers' spread is no fit, whatever the reason."""
 UNITS = {1e3: "millimetres", 1e2: "centimetres", 39.37: "inches", 3.281: "feet", 1e6: "micrometres", 1e-3: "kilometres"}
 """Numbers so many times too large are in this unit."""
-STRAY = 0.1
-"""A stray is off by this share of the markers' spread at least. No measurement set it; on a real tendon robot one marker was
+OUTLIER = 0.1
+"""An outlier is off by this share of the markers' spread at least. No measurement set it; on a real tendon robot one marker was
 named for it, which may be the model's error."""
 
 
@@ -83,7 +83,7 @@ def pairs_of(robot: Robot, scene: Scene, poses: Sequence[FloatArray], residual: 
 
 
 def check_reading(robot: Robot, pairs: Sequence[Pairs], *, strict: bool = True) -> None:
-    """Refuse markers that are in another unit, mirrored, or have exchanged labels in all frames.
+    """Refuse markers that are in another unit, mirrored, or have swapped labels in all frames.
 
     Arguments:
         robot: for the names of its markers.
@@ -107,9 +107,9 @@ def check_reading(robot: Robot, pairs: Sequence[Pairs], *, strict: bool = True) 
             raise DataError(
                 f"{found}. Mirrored they fit: are the axes left-handed? Camera frames are right-handed (x right, y down, z forward): change the sign of one axis"
             )
-        exchanged = _exchanged(one, plain)
-        if exchanged:
-            raise DataError(f"{found}. The labels seem exchanged: {_cycles(robot, exchanged)}. Exchange them in markers.csv")
+        swapped = _swapped(one, plain)
+        if swapped:
+            raise DataError(f"{found}. The labels seem swapped: {_cycles(robot, swapped)}. Swap them in markers.csv")
         if strict and plain > HOPELESS * one.spread:
             raise DataError(f"{found}. Are these the markers of {robot.name!r}, in metres, under their names?")
 
@@ -119,7 +119,7 @@ def _unit(scale: float) -> str:
     return f"are they in {UNITS[nearest]}?" if abs(np.log(scale / nearest)) < 0.25 else "is the robot's mesh.unit right?"
 
 
-def _exchanged(pairs: Pairs, plain: float) -> dict[int, int]:
+def _swapped(pairs: Pairs, plain: float) -> dict[int, int]:
     """Return which marker each named one is, where other names take most of the residual away; empty where none do.
 
     In the frame with most markers three of them, far apart, are tried as every three of the model that are as far apart; the other names
@@ -169,7 +169,7 @@ def _moved(points: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def _cycles(robot: Robot, truth: dict[int, int]) -> str:
-    """Return exchanges as text: "a and b" for two, "a is b, b is c, c is a" for more."""
+    """Return swaps as text: "a and b" for two, "a is b, b is c, c is a" for more."""
     left, texts = dict(truth), []
     while left:
         chain = [next(iter(left))]
@@ -190,7 +190,7 @@ def _modelled(pairs: Pairs, model: dict[int, FloatArray], named: IntArray) -> Fl
 
 
 def true_labels(places: FloatArray, measured: FloatArray, marker: IntArray, *, noise: float) -> IntArray:
-    """Return which marker each measured point is: as named, or exchanged where the names cannot be right.
+    """Return which marker each measured point is: as named, or swapped where the names cannot be right.
 
     The assignment with the least sum of squared distances (Kuhn 1955) counts where it takes EXPLAINED of the distance away of those that it
     renames, and that distance was far above the noise.
@@ -216,7 +216,7 @@ def true_labels(places: FloatArray, measured: FloatArray, marker: IntArray, *, n
 
 
 def relabelled(robot: Robot, scene: Scene, pairs: Sequence[Pairs], noise: float) -> tuple[Recording, bool]:
-    """Return the recording with exchanged labels put right and strays left out in the scene's frames, each named in a warning.
+    """Return the recording with swapped labels put right and outliers left out in the scene's frames, each named in a warning.
 
     Arguments:
         robot: the robot.
@@ -233,9 +233,9 @@ def relabelled(robot: Robot, scene: Scene, pairs: Sequence[Pairs], noise: float)
         for group in np.unique(one.group):
             mine = one.group == group
             marker[rows[mine]] = true_labels(_all_places(robot, one, mine), one.measured[mine], one.marker[mine], noise=noise)
-            far[rows[mine]] = _strays(np.linalg.norm(one.measured[mine] - one.modelled[mine], axis=1), one.spread)
+            far[rows[mine]] = _outliers(np.linalg.norm(one.measured[mine] - one.modelled[mine], axis=1), one.spread)
     renamed = marker != scene.marker
-    if len(np.unique(scene.frame[renamed])) > 0.5 * len(scene.frames):  # an exchange in most frames is one of the whole recording
+    if len(np.unique(scene.frame[renamed])) > 0.5 * len(scene.frames):  # a swap in most frames is one of the whole recording
         return scene.recording, False
     far &= ~renamed & ~_mostly(far, scene.marker)
     if not (far | renamed).any():
@@ -245,7 +245,7 @@ def relabelled(robot: Robot, scene: Scene, pairs: Sequence[Pairs], noise: float)
 
 
 def _mostly(far: BoolArray, marker: IntArray) -> BoolArray:
-    """Return which rows are of a marker that is far in most frames, shape (k,): it sits elsewhere than declared, which is no stray."""
+    """Return which rows are of a marker that is far in most frames, shape (k,): it sits elsewhere than declared, which is no outlier."""
     total = np.bincount(marker, minlength=int(marker.max(initial=0)) + 1)
     return np.asarray((np.bincount(marker[far], minlength=len(total)) > 0.5 * total)[marker])
 
@@ -255,7 +255,7 @@ def _say(robot: Robot, scene: Scene, renamed: BoolArray, far: BoolArray) -> None
     texts = []
     for k in np.unique(scene.frame[renamed | far]):
         parts = []
-        for rows, what in ((renamed, "labels are exchanged, put right"), (far, "strays, left out")):
+        for rows, what in ((renamed, "labels are swapped, put right"), (far, "outliers, left out")):
             names = ", ".join(robot.marker_names[m] for m in scene.marker[rows & (scene.frame == k)])
             parts += [f"{names} ({what})"] if names else []
         texts.append(f"frame {int(scene.recording.frame_numbers[k])}: {', '.join(parts)}")
@@ -270,15 +270,15 @@ def _all_places(robot: Robot, pairs: Pairs, mine: BoolArray) -> FloatArray:
     return places
 
 
-def _strays(off: FloatArray, spread: float) -> BoolArray:
+def _outliers(off: FloatArray, spread: float) -> BoolArray:
     """Return which markers of one frame [m], shape (k,), are far from where the model has them while most others are near.
 
-    Sorted by distance, strays stand behind a jump by the factor EXPLAINED in the upper two fifths: errors of a model grow along the body
+    Sorted by distance, outliers stand behind a jump by the factor EXPLAINED in the upper two fifths: errors of a model grow along the body
     without one.
     """
     order = np.argsort(off)
     first = max(int(np.ceil(0.6 * len(off))), 3)
-    jumps = [i for i in range(first, len(off)) if off[order[i]] > max(EXPLAINED * off[order[i - 1]], STRAY * spread)]
+    jumps = [i for i in range(first, len(off)) if off[order[i]] > max(EXPLAINED * off[order[i - 1]], OUTLIER * spread)]
     far = np.zeros(len(off), dtype=np.bool_)
     far[order[jumps[0] :] if jumps else []] = True
     return far

@@ -63,7 +63,7 @@ class View:
     surface: Surface
     """Of the body in that frame, robot frame."""
     colored: bool = False
-    """Whether colour told the robot from the rest."""
+    """Whether colour separated the robot from the rest."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -1,4 +1,4 @@
-"""Names for markers that nobody named, by the model: they may stand in another order in each frame, with strays among them and others missing.
+"""Names for markers that nobody named, by the model: they may stand in another order in each frame, with outliers among them and others missing.
 
 `search_poses` finds poses from nowhere for the model's states; the joint fit (pose and unknown inputs) of each likely one moves the states, the
 names follow by assignment, and so in turns until no name changes.
@@ -27,7 +27,7 @@ from femsense.model.quasi_static_path import solve_path
 from femsense.model.recording import Recording, state_key, with_marker_table
 from femsense.model.robot import Robot
 
-RIVAL = 1.2
+AS_GOOD = 1.2
 """Another pose is as good where what it leaves is below this times what the best leaves, however many points there are: errors of a model are common to
 points. Wrong poses of data/tentacle leave 1.2 times as much and more, those of layouts with a symmetry 1.0."""
 ELSEWHERE = 0.1
@@ -35,7 +35,7 @@ ELSEWHERE = 0.1
 ROUNDS = 4
 """Fits and assignments in turn, at most."""
 SURE = 3.0
-"""Readings whose log-likelihoods differ by less than this (odds of 20) cannot be told apart."""
+"""Readings whose log-likelihoods differ by less than this (odds of 20) cannot be distinguished."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -60,12 +60,12 @@ class Named:
     """A reading of the unnamed markers."""
 
     marker: IntArray
-    """Which marker each unnamed row of the recording is, shape (U,): −1 none of the robot's, or not told apart."""
+    """Which marker each unnamed row of the recording is, shape (U,): −1 none of the robot's, or not distinguishable."""
     error_m: float
     """By how much the points are off after the fit, see `typical_error` [m]."""
     poses: tuple[FloatArray, ...]
     doubtful: tuple[tuple[int, int, int], ...] = ()
-    """(frame, marker, marker) that cannot be told apart there."""
+    """(frame, marker, marker) that cannot be distinguished there."""
 
 
 def name_markers(
@@ -158,7 +158,7 @@ def _fitted(robot: Robot, recording: Recording, seen: Sequence[Nameless], named:
 
 
 def _settled(robot: Robot, recording: Recording, seen: Sequence[Nameless], named: Named, model: dict[int, FloatArray]) -> Named:
-    """Return the reading under given poses and states: names by assignment, without strays and without pairs that cannot be told apart."""
+    """Return the reading under given poses and states: names by assignment, without outliers and without pairs that cannot be distinguished."""
     marker = np.full(len(recording.unnamed_frame), -1, dtype=np.int64)
     left: list[FloatArray] = []
     errors: list[float] = []
@@ -177,7 +177,7 @@ def _settled(robot: Robot, recording: Recording, seen: Sequence[Nameless], named
 
 
 def _without_doubt(robot: Robot, seen: Sequence[Nameless], named: Named, model: dict[int, FloatArray], noise: float) -> Named:
-    """Return the reading without names that could as well be exchanged, or be those of a point beside that got none."""
+    """Return the reading without names that could as well be swapped, or be those of a point beside that got none."""
     marker, doubtful = named.marker.copy(), []
     for one in seen:
         for k, rows, points, may in zip(one.frames.tolist(), one.rows, one.points, one.allowed):
@@ -190,7 +190,7 @@ def _without_doubt(robot: Robot, seen: Sequence[Nameless], named: Named, model: 
 
 
 def _alike(names: IntArray, squares: FloatArray, least: float) -> list[tuple[int, int]]:
-    """Return pairs of points of one frame whose exchange costs less than `least` [m²]; the first of a pair has a name."""
+    """Return pairs of points of one frame whose swap costs less than `least` [m²]; the first of a pair has a name."""
     pairs = []
     for i in np.flatnonzero(names >= 0):
         for j in range(len(names)):
@@ -219,17 +219,17 @@ def _require_one(
         others = [r for r in likely if apart(r, chosen, robot.marker_points) > ELSEWHERE * spread]
         for other in others[:3]:
             first = [other if j == i else r[0] for j, r in enumerate(readings)]
-            rival = _fitted(robot, recording, seen, _combined(recording, seen, first))
-            away = apart(PosedNames(rival.poses[one.view], (), 0.0), chosen, robot.marker_points)
-            both = (rival.marker >= 0) & (best.marker >= 0)
+            other_fit = _fitted(robot, recording, seen, _combined(recording, seen, first))
+            away = apart(PosedNames(other_fit.poses[one.view], (), 0.0), chosen, robot.marker_points)
+            both = (other_fit.marker >= 0) & (best.marker >= 0)
             if (
-                (rival.marker != best.marker)[both].any()
+                (other_fit.marker != best.marker)[both].any()
                 and away > ELSEWHERE * spread
-                and rival.error_m < _margin(one) * best.error_m
+                and other_fit.error_m < _margin(one) * best.error_m
             ):
                 name = recording.camera_names[one.view] or "(only one)"
                 raise DataError(
-                    f"the markers of camera {name} have no names, and two poses fit them alike: {1e3 * best.error_m:.3g} and {1e3 * rival.error_m:.3g} mm are left, "
+                    f"the markers of camera {name} have no names, and two poses fit them alike: {1e3 * best.error_m:.3g} and {1e3 * other_fit.error_m:.3g} mm are left, "
                     f"and they place the markers {1e3 * away:.3g} mm apart. Name the markers, place one more where it breaks the symmetry, pull cables in free frames, or declare T_robot_camera"
                 )
 
@@ -237,7 +237,7 @@ def _require_one(
 def _margin(seen: Nameless) -> float:
     """Return how many times as much a wrong pose leaves at least [1]: few points are soon explained by chance."""
     freedom = 3.0 * sum(len(points) for points in seen.points) / seen.repeats - 6.0
-    return max(RIVAL, float(np.exp(SURE / max(freedom, 1.0))))
+    return max(AS_GOOD, float(np.exp(SURE / max(freedom, 1.0))))
 
 
 def _with_names(robot: Robot, recording: Recording, frames: IntArray, marker: IntArray) -> Recording:
@@ -273,7 +273,7 @@ def _say(robot: Robot, recording: Recording, frames: IntArray, named: Named) -> 
         none = int(((recording.unnamed_frame == k) & (named.marker < 0)).sum())
         what = f"{none} point{'s' if none > 1 else ''} without a marker"
         texts += (
-            [f"frame {int(recording.frame_numbers[k])}: {what}" + (f" ({', '.join(alike)} not told apart)" if alike else "")]
+            [f"frame {int(recording.frame_numbers[k])}: {what}" + (f" ({', '.join(alike)} not distinguishable)" if alike else "")]
             if none
             else []
         )

@@ -1,7 +1,7 @@
 """The pose of a camera from points whose names nobody knows: congruent triangles, then assignment and rigid fit in turns.
 
 Every triangle of measured points is laid onto the triangles of the model whose sides are most alike; the poses that bring most points near the
-model are refined in all frames at once. A pose is judged by a likelihood in which every point is a marker or a stray.
+model are refined in all frames at once. A pose is judged by a likelihood in which every point is a marker or an outlier.
 Sources: Fischler and Bolles, "Random sample consensus" (1981); Kuhn (1955) for the assignment.
 """
 
@@ -19,7 +19,7 @@ from femsense.core.errors import DataError
 from femsense.core.pose import invert_pose, transform_points
 
 TRIANGLES = 30
-"""Measured triangles that are tried: with a third of strays, 30 % of them have none; none of 30 is clean once in 2e5 times."""
+"""Measured triangles that are tried: with a third of outliers, 30 % of them have none; none of 30 is clean once in 2e5 times."""
 ALIKE = 300
 """Triangles of the model that each is laid onto, those whose sides are most alike: 5 markers have 60, 12 have 1320."""
 REFINED = 40
@@ -92,7 +92,7 @@ def refine_names(
 ) -> PosedNames:
     """Return the pose and the names to which assignment and rigid fit lead in turns from a pose.
 
-    A point is a stray where that is likelier than an error of its marker, by the likelihood of `typical_error`:  d² > 6 σ² log(room / σ).
+    A point is an outlier where that is likelier than an error of its marker, by the likelihood of `typical_error`:  d² > 6 σ² log(room / σ).
 
     Arguments:
         model, seen, allowed: as of `search_poses`.
@@ -139,7 +139,7 @@ def assigned(model: FloatArray, points: FloatArray, allowed: BoolArray, *, reach
         model: markers [m], shape (m, 3).
         points: in the same frame [m], shape (n, 3).
         allowed: which marker each point may be, shape (n, m).
-        reach: a point farther from its marker is a stray, and costs that much [m].
+        reach: a point farther from its marker is an outlier, and costs that much [m].
     """
     from scipy.optimize import linear_sum_assignment
 
@@ -158,14 +158,14 @@ def squared(points: FloatArray, model: FloatArray) -> FloatArray:
 
 
 def typical_error(squares: FloatArray, room: float, *, repeats: float = 1.0) -> FloatArray:
-    """Return by how much points are off [m], shape (…,), strays counted for what they cost.
+    """Return by how much points are off [m], shape (…,), outliers counted for what they cost.
 
     The nearer h points are the model's, with one noise; the others lie anywhere in the room. Of all h the likeliest counts, and the answer is the noise
     that would make N points all of the model's as likely:  log e = min_h (h log σ_h + (N − h) log room) / N,  σ_h² = Σ_h d² / (3 h − 6 r).
 
     Arguments:
         squares: squared distances of the points from their markers [m²], shape (…, N).
-        room: side of the cube in which a stray may lie [m].
+        room: side of the cube in which an outlier may lie [m].
         repeats: r, frames a state: such frames repeat the same error of the model.
     """
     return _likeliest(squares, room, repeats)[1]
@@ -184,9 +184,9 @@ def _likeliest(squares: FloatArray, room: float, repeats: float) -> tuple[FloatA
 
 
 def room_of(model: FloatArray) -> float:
-    """Return the side of the cube in which a stray is as likely as an error of a marker [m].
+    """Return the side of the cube in which an outlier is as likely as an error of a marker [m].
 
-    Strays lie in a cube twice as wide as the markers (m, 3), and a point in ten is one: the cube root of 9 counts for that.
+    Outliers lie in a cube twice as wide as the markers (m, 3), and a point in ten is one: the cube root of 9 counts for that.
     """
     return 4.16 * float(np.ptp(model, axis=0).max())
 
@@ -194,7 +194,7 @@ def room_of(model: FloatArray) -> float:
 def _squares(
     model: Sequence[FloatArray], seen: Sequence[FloatArray], T: FloatArray, marker: Sequence[IntArray], room: float
 ) -> FloatArray:
-    """Return the squared distances of all points from their markers [m²], shape (N,); those of strays are the room's."""
+    """Return the squared distances of all points from their markers [m²], shape (N,); those of outliers are the room's."""
     each = [np.where(m >= 0, ((transform_points(T, s) - p[m]) ** 2).sum(axis=1), room**2) for p, s, m in zip(model, seen, marker)]
     return np.concatenate(each)
 

@@ -41,8 +41,8 @@ class Scan:
     """Points of everything else, in the frame of their camera [m], shape (o, 3)."""
     others_view: IntArray
     """Camera of each, shape (o,)."""
-    told: bool = True
-    """Whether colour told the robot from the rest; else all points stand among those that may be of the robot."""
+    segmented: bool = True
+    """Whether colour separated the robot from the rest; else all points stand among those that may be of the robot."""
 
     def points(self, poses: Sequence[FloatArray]) -> FloatArray:
         """Return the robot's points in the robot frame [m], shape (k, 3)."""
@@ -110,7 +110,7 @@ def read_scan(robot: Robot, recording: Recording, k: int, poses: Sequence[FloatA
     size = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
     low, high = positions.min(axis=0) - MARGIN * size, positions.max(axis=0) + MARGIN * size
     own, own_view, rest, rest_view = [], [], [], []
-    told = True
+    segmented = True
     for view, T in enumerate(poses):
         cloud = read_frame_cloud(recording, k, view=view)
         if cloud is None:
@@ -119,7 +119,7 @@ def read_scan(robot: Robot, recording: Recording, k: int, poses: Sequence[FloatA
         placed = points @ T[:3, :3].T + T[:3, 3]
         inside = ((placed >= low) & (placed <= high)).all(axis=1) & (points[:, 2] > 0)
         points, kept = points[inside], cloud.select(inside)
-        told = told and kept.colors is not None and robot.color_rgb is not None
+        segmented = segmented and kept.colors is not None and robot.color_rgb is not None
         mine = _of_robot(robot, kept)
         own.append(points[mine])
         rest.append(points[~mine])
@@ -127,7 +127,7 @@ def read_scan(robot: Robot, recording: Recording, k: int, poses: Sequence[FloatA
         rest_view.append(np.full(int((~mine).sum()), view))
     if not own:
         return None
-    return Scan(np.vstack(own), np.concatenate(own_view), np.vstack(rest), np.concatenate(rest_view), told)
+    return Scan(np.vstack(own), np.concatenate(own_view), np.vstack(rest), np.concatenate(rest_view), segmented)
 
 
 def ray_rows(
@@ -159,7 +159,7 @@ def ray_rows(
 
 
 def parted(scan: Scan, surface: Surface, poses: Sequence[FloatArray], noises: Sequence[CameraNoise], *, reach: float) -> Scan:
-    """Return the scan with its points told apart by a state: of the robot is what lies on the surface, and whose neighbours do too.
+    """Return the scan with its points separated by a state: of the robot is what lies on the surface, and whose neighbours do too.
 
     Arguments:
         scan: what was seen, colourless.

@@ -43,9 +43,9 @@ class Motion:
     inputs: dict[str, float]
     """What to command: tension [N] or shortening [m] of each cable, pressure [Pa] of each chamber."""
     positions: FloatArray
-    """Where the nodes come to rest [m], shape (n, 3)."""
+    """Where the nodes end up at equilibrium [m], shape (n, 3)."""
     reached_m: dict[str, FloatArray]
-    """Target → where its point comes to rest, robot frame [m], shape (3,)."""
+    """Target → where its point ends up at equilibrium, robot frame [m], shape (3,)."""
     error_m: float
     """Largest distance of a point from its target, along the directions that are wanted [m]."""
     status: str

@@ -56,7 +56,7 @@ class ReachOptions:
     max_iterations: int = 60
     """Equilibria at most."""
     least_gain: float = 1e-9
-    """The search ends where a step promises less than this share of the squared error."""
+    """The search ends where the predicted gain of a step is below this share of the squared error."""
     damping: float = 1e-10
     """λ, in units of the largest eigenvalue of W_paᵀ W_pa; actuators that do the same share their work by it."""
 

@@ -24,13 +24,13 @@ def holds_itself(body: BodyModel, state: State) -> bool:
     return factor is not None and factor.negative == 0
 
 
-def is_doubtful(loads: Loads, state: State, walks: bool) -> bool:
+def is_doubtful(loads: Loads, state: State, follows_path: bool) -> bool:
     """Return whether the stiffness at hand leaves open if a balanced state is stable.
 
-    It does where it was not positive definite, and where it was factorised far from the end. A walk from one state to the next is
-    spared the latter (`walks`): the next step, which starts with the stiffness of this state, sees it.
+    It does where it was not positive definite, and where it was factorised far from the end. A path from one state to the next is
+    spared the latter (`follows_path`): the next step, which starts with the stiffness of this state, sees it.
     """
-    return state.shifted or (not walks and state.factored_at > FAR * loads.tolerance)
+    return state.shifted or (not follows_path and state.factored_at > FAR * loads.tolerance)
 
 
 def can_fall(body: BodyModel, loads: Loads, state: State) -> bool:

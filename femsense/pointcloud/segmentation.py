@@ -102,7 +102,7 @@ def color_mask(
     Arguments:
         colors: red, green, blue in [0, 1], shape (n, 3).
         color_rgb: the colour looked for, shape (3,).
-        tolerance_deg: largest angle [deg]; 10 tells saturated colours apart, a grey robot needs less.
+        tolerance_deg: largest angle [deg]; 10 separates saturated colours, a grey robot needs less.
         shade: smallest and largest brightness as a multiple of that of color_rgb.
     Raises:
         InputError: color_rgb is not a colour in [0, 1], or too dark to have a hue.

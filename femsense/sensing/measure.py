@@ -76,10 +76,10 @@ def _marker_rows(sensor: Sensor, k: int, state: Equilibrium) -> Rows:
     )  # of the marker, so that a state that runs away gains nothing
     noise = sensor.options.marker_std_m or _marker_std(sensor.calibration)
     std = np.repeat(np.hypot(noise, sensor.options.marker_model_std * way), 3)
-    seated = np.array([robot.marker_names[m] in sensor.calibration.placements_m for m in marker])
-    # a seat that rest.csv measured moves with the pose: only the marker's motion since then is left to turn
+    placed = np.array([robot.marker_names[m] in sensor.calibration.placements_m for m in marker])
+    # a placement that rest.csv measured moves with the pose: only the marker's motion since then is left to turn
     turned = _pose_columns(measured, sensor.pivot)
-    turned = turned - seated[:, None, None] * _pose_columns(robot.marker_points[marker], sensor.pivot)
+    turned = turned - placed[:, None, None] * _pose_columns(robot.marker_points[marker], sensor.pivot)
     by_pose = np.zeros((len(rows), 3, len(sensor.calibration.poses), 6))
     by_pose[np.arange(len(rows)), :, view] = turned
 
@@ -99,7 +99,7 @@ def _marker_rows(sensor: Sensor, k: int, state: Equilibrium) -> Rows:
 
 
 def _as_seen(sensor: Sensor, k: int, state: Equilibrium, measured: FloatArray, marker: IntArray, view: IntArray) -> IntArray:
-    """Return which markers were seen, shape (r,): as named, or put right where labels are exchanged, with a warning."""
+    """Return which markers were seen, shape (r,): as named, or put right where labels are swapped, with a warning."""
     places, best = sensor.robot.markers.positions(state.positions), marker.copy()
     for v in np.unique(view):
         mine = view == v
@@ -107,7 +107,7 @@ def _as_seen(sensor: Sensor, k: int, state: Equilibrium, measured: FloatArray, m
     if (best != marker).any():
         names = " and ".join(sensor.robot.marker_names[m] for m in marker[best != marker])
         number = int(sensor.recording.frame_numbers[k])
-        warnings.warn(f"{sensor.recording.folder}: frame {number}: the labels {names} are exchanged, put right", stacklevel=4)
+        warnings.warn(f"{sensor.recording.folder}: frame {number}: the labels {names} are swapped, put right", stacklevel=4)
     return best
 
 

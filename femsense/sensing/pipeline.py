@@ -29,7 +29,7 @@ from femsense.sensing.judge import status_of, trusted
 from femsense.sensing.paper import sense_as_published
 from femsense.sensing.places import find_touches, near_places, seen_objects
 from femsense.sensing.prepare import make_sensor, scan_of
-from femsense.sensing.search import explain, told_apart
+from femsense.sensing.search import explain, segmented
 from femsense.sensing.states import free_state
 from femsense.sensing.tracks import contacts_of, smoothed
 from femsense.sensing.types import ContactForce, Done, FrameReport, Run, SensedFrame, SensingOptions, Sensor, States
@@ -109,7 +109,7 @@ def sense_frame(sensor: Sensor, k: int, previous: SensedFrame | None) -> SensedF
     scan = scan_of(sensor, k, alone if previous is None else previous.state)
     clock.lap("scan")
     free = no_forces(sensor, k, scan, alone)
-    scan, free = told_apart(sensor, k, scan, free, before)
+    scan, free = segmented(sensor, k, scan, free, before)
     clock.lap("rows")
     shapes = seen_objects(sensor, k, scan, free.state)
     touches = find_touches(sensor, shapes, free)

@@ -115,7 +115,7 @@ def _free_rows(sensor: Sensor) -> list[tuple[Rows, FloatArray]]:
     for k, state in free_path(sensor.driven, free_clouds(sensor.recording)):
         try:
             scan = scan_of(sensor, k, state)
-            if scan is not None and not scan.told:
+            if scan is not None and not scan.segmented:
                 shape = Surface(state.positions, sensor.surface.triangles)
                 scan = parted(scan, shape, sensor.calibration.poses, sensor.knowledge.noises, reach=REACH * sensor.size)
             rows = None if scan is None else rows_at(sensor, k, scan, state)

@@ -59,14 +59,14 @@ def explain(
     return _with_hidden(sensor, k, scan, _with_objects(sensor, k, scan, shapes, free, previous, before), free, before)
 
 
-def told_apart(
+def segmented(
     sensor: Sensor, k: int, scan: Scan | None, free: Fit, before: tuple[FloatArray, ...] | None
 ) -> tuple[Scan | None, Fit]:
     """Return the scan with robot and surroundings apart, and the fit without forces to what is the robot's.
 
-    Where colour has not told them apart, the shape is explained first, with all points; what then lies off the surface is something else.
+    Where colour has not separated them, the shape is explained first, with all points; what then lies off the surface is something else.
     """
-    if scan is None or scan.told:
+    if scan is None or scan.segmented:
         return scan, free
     every, state = scan, free.state
     touched = not said_free(sensor, k) and not len(sensor.places)

@@ -213,7 +213,7 @@ class Done:
     last: SensedFrame | None = None
     """The last frame that gave a result to start from."""
     tracks: int = 0
-    """Contacts told apart so far."""
+    """Contacts distinguished so far."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -143,7 +143,7 @@ def test_a_recording_without_recording_toml_is_still_a_recording(tmp_path: Path)
     assert report["kind"] == "recording" and "recording.toml is missing" in report["problems"][0]
 
 
-def test_nothing_measured_strays_and_gaps(tmp_path: Path) -> None:
+def test_nothing_measured_outliers_and_gaps(tmp_path: Path) -> None:
     frames = "frame,time_s\n" + "".join(f"{k},{k if k < 5 else k + 90}\n" for k in range(9))
     folder = write_small_recording(tmp_path, markers_csv=None, frames_csv=frames)
     (folder / "clouds").mkdir()

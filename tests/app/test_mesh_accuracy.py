@@ -1,4 +1,4 @@
-"""What a mesh costs: the estimate against a converged solution, its signs, its limits, its words."""
+"""Discretisation error: the estimate against a converged solution, its signs, its limits, its words."""
 
 from __future__ import annotations
 

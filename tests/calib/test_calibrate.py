@@ -1,4 +1,4 @@
-"""Calibration from markers: exact data, noise against its bound, outliers, frames, held cables, seats, and what cannot be."""
+"""Calibration from markers: exact data, noise against its bound, outliers, frames, held cables, marker placement, and what cannot be."""
 
 from __future__ import annotations
 
@@ -318,7 +318,7 @@ def test_no_frame_leaves_the_limits_of_its_cable() -> None:
     assert input_bounds(robot.with_body(body), wide)[1][0] == 2.0
 
 
-# Seats
+# Marker placement
 
 
 def rest_of(points: np.ndarray, noise: float = 0.0) -> RestMarkers:

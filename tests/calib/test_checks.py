@@ -1,4 +1,4 @@
-"""Markers that cannot be the robot's as they are written: unit, mirror, labels, strays."""
+"""Markers that cannot be the robot's as they are written: unit, mirror, labels, outliers."""
 
 from __future__ import annotations
 
@@ -72,28 +72,28 @@ def test_left_handed_axes_are_named(robot: Robot) -> None:
             calibrate(robot, recorded(robot, seen(robot) * (1 - 2 * axis)))
 
 
-def test_labels_exchanged_in_all_frames_are_named(robot: Robot) -> None:
-    with pytest.raises(DataError, match="labels seem exchanged: m0 and m3"):
+def test_labels_swapped_in_all_frames_are_named(robot: Robot) -> None:
+    with pytest.raises(DataError, match="labels seem swapped: m0 and m3"):
         calibrate(robot, recorded(robot, seen(robot)[:, [3, 1, 2, 0, 4, 5]]))
-    with pytest.raises(DataError, match="labels seem exchanged") as error:
+    with pytest.raises(DataError, match="labels seem swapped") as error:
         calibrate(robot, recorded(robot, seen(robot)[:, [3, 4, 2, 0, 1, 5]]))
     assert "m0 and m3" in str(error.value) and "m1 and m4" in str(error.value)
 
 
-def test_labels_exchanged_in_one_frame_are_put_right(robot: Robot) -> None:
+def test_labels_swapped_in_one_frame_are_put_right(robot: Robot) -> None:
     xyz = seen(robot)
     clean = calibrate(robot, recorded(robot, xyz))
     xyz[2] = xyz[2][[0, 4, 2, 3, 1, 5]]
-    with pytest.warns(UserWarning, match=r"frame 2: m1, m4 \(labels are exchanged, put right\)"):
+    with pytest.warns(UserWarning, match=r"frame 2: m1, m4 \(labels are swapped, put right\)"):
         found = calibrate(robot, recorded(robot, xyz))
     np.testing.assert_allclose(found.T_robot_camera, clean.T_robot_camera, atol=1e-9)
 
 
-def test_a_stray_is_named_and_left_out(robot: Robot) -> None:
+def test_an_outlier_is_named_and_left_out(robot: Robot) -> None:
     xyz = seen(robot)
     clean = calibrate(robot, recorded(robot, xyz))
     xyz[3, 2] += [0.02, -0.03, 0.01]
-    with pytest.warns(UserWarning, match=r"frame 3: m2 \(strays, left out\)"):
+    with pytest.warns(UserWarning, match=r"frame 3: m2 \(outliers, left out\)"):
         found = calibrate(robot, recorded(robot, xyz))
     np.testing.assert_allclose(found.T_robot_camera, clean.T_robot_camera, atol=2e-4)
     assert found.rms_m < 2e-4
@@ -112,7 +112,7 @@ def test_other_markers_than_the_robots(robot: Robot) -> None:
         calibrate(robot, recorded(robot, np.tile(rng.normal(size=(6, 3)), (FRAMES, 1, 1))))
 
 
-def test_exchanges_need_a_reason() -> None:
+def test_swaps_need_a_reason() -> None:
     places = np.array([[0.0, 0, 0], [0.01, 0, 0], [0.05, 0, 0]])
     as_named = np.arange(3)
     bent = places + np.array([[0.004, 0, 0], [0.004, 0, 0], [0.02, 0, 0]])
@@ -126,7 +126,7 @@ def test_exchanges_need_a_reason() -> None:
     ("name", "text"),
     [
         ("v_inch", "39.38 times too large: are they in inches"),
-        ("v_swapall", "exchanged: mid and tip"),
+        ("v_swapall", "swapped: mid and tip"),
         ("v_zeros_all", "left: these"),
     ],
 )

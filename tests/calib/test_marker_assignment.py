@@ -29,19 +29,19 @@ def lopsided(robot: Robot) -> Robot:
 
 
 def nameless(
-    recording: Recording, kept: IntArray, *, seed: int = 0, strays: int = 0, missing: int = 0, T: FloatArray | None = None
+    recording: Recording, kept: IntArray, *, seed: int = 0, outliers: int = 0, missing: int = 0, T: FloatArray | None = None
 ) -> tuple[Recording, IntArray]:
-    """Return the recording without names, rows shuffled in each frame, and which marker (−1: stray) each row is."""
+    """Return the recording without names, rows shuffled in each frame, and which marker (−1: outlier) each row is."""
     rng = np.random.default_rng(seed)
     frame, xyz, truth = [], [], []
     for k in range(recording.frame_count):
         of = np.flatnonzero((recording.marker_frame == k) & np.isin(recording.marker_index, kept))
         of = rng.permutation(of)[: len(of) - missing]
         points = recording.marker_xyz[of]
-        wild = points.mean(axis=0) + rng.uniform(-0.08, 0.08, size=(strays, 3))
-        order = rng.permutation(len(of) + strays)
+        wild = points.mean(axis=0) + rng.uniform(-0.08, 0.08, size=(outliers, 3))
+        order = rng.permutation(len(of) + outliers)
         xyz.append(np.vstack([points, wild])[order])
-        truth.append(np.concatenate([np.searchsorted(kept, recording.marker_index[of]), np.full(strays, -1)])[order])
+        truth.append(np.concatenate([np.searchsorted(kept, recording.marker_index[of]), np.full(outliers, -1)])[order])
         frame.append(np.full(len(order), k))
     none = np.zeros(0, dtype=np.int64)
     points = np.vstack(xyz) if T is None else transform_points(T, np.vstack(xyz))
@@ -67,10 +67,10 @@ def off(T: FloatArray, true: FloatArray = T_ROBOT_CAMERA) -> float:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_names_and_pose_from_nowhere_in_spite_of_strays_and_gaps(seed: int) -> None:
+def test_names_and_pose_from_nowhere_in_spite_of_outliers_and_gaps(seed: int) -> None:
     robot, (recording, _) = lopsided(arm()), record(INPUTS, noise=2e-4, seed=seed)
     turn = make_pose(rotation_from_vector(np.random.default_rng(seed).normal(size=3)), [0.3, -0.2, 1.0])
-    bare, truth = nameless(recording, KEPT, seed=seed, strays=2, missing=2, T=turn)
+    bare, truth = nameless(recording, KEPT, seed=seed, outliers=2, missing=2, T=turn)
     with pytest.warns(UserWarning, match="markers named by the model"):
         named = name_markers(robot, bare, np.arange(4))
     given = names_given(robot, bare, named)
@@ -133,7 +133,7 @@ def test_neighbours_that_noise_confuses_get_no_name() -> None:
     robot = robot.with_marker_points(close)
     recording, _ = record(INPUTS, noise=4e-4, placements=shifts(robot))
     bare, truth = nameless(recording, KEPT)
-    with pytest.warns(UserWarning, match="m5 and m7 not told apart"):
+    with pytest.warns(UserWarning, match="m5 and m7 not distinguishable"):
         named = name_markers(robot, bare, np.arange(4))
     given = names_given(robot, bare, named)
     assert not ((given != truth) & (given >= 0)).any()
@@ -156,7 +156,7 @@ def test_too_few_points() -> None:
 def test_two_cameras_and_one_that_is_declared() -> None:
     recording, _ = record(INPUTS, noise=2e-4)
     robot, other = lopsided(arm()), make_pose(rotation_from_vector([0.3, -1.0, 0.4]), [0.1, 0.2, -0.6])
-    first, _ = nameless(recording, KEPT, strays=1)
+    first, _ = nameless(recording, KEPT, outliers=1)
     second, _ = nameless(recording, KEPT, seed=1, T=other)
     n = len(first.unnamed_frame), len(second.unnamed_frame)
     both = replace(
@@ -191,7 +191,7 @@ def test_the_search_needs_no_start_and_no_order() -> None:
         np.testing.assert_array_equal(best.marker[0][:7], order)
 
 
-def test_an_error_is_that_of_the_model_s_points_and_strays_cost() -> None:
+def test_an_error_is_that_of_the_model_s_points_and_outliers_cost() -> None:
     rng = np.random.default_rng(6)
     squares = (1e-3 * rng.normal(size=(400, 3)) ** 2 * 1e-3).sum(axis=1)
     clean = float(typical_error(squares, 0.1))

@@ -37,7 +37,7 @@ def bar(*, friction: float = 0.0) -> Robot:
 
 
 def place(robot: Robot, tension: dict[str, float], marker: int = 0, **more: object) -> np.ndarray:
-    """Where a marker comes to rest under tensions [m]."""
+    """Where a marker is at equilibrium under tensions [m]."""
     return robot.markers.positions(fs.solve_equilibrium(robot.body, tension=tension, **more).positions)[marker]
 
 

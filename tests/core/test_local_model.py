@@ -1,4 +1,4 @@
-"""What a sum of squares is near a point: curvature that steps have shown, with kinks and bounds."""
+"""What a sum of squares is near a point: curvature that steps have shown, with nonsmooth lines and bounds."""
 
 from __future__ import annotations
 

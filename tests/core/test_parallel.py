@@ -1,4 +1,4 @@
-"""Threads over independent work: order, number, errors, and that a walk does not depend on how many there are."""
+"""Threads over independent work: order, number, errors, and that a quasi-static path does not depend on how many there are."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def test_how_many_work_is_chosen_by_hand_then_by_the_environment_then_by_the_mac
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.2])
-def test_a_walk_does_not_depend_on_how_many_work(friction):
+def test_a_path_does_not_depend_on_how_many_work(friction):
     rec = recording([[0.5, 0.3], [1.0, 0.1], [1.5, 0.0], [1.0, 0.1], [0.2, 0.4]])
     base = robot(friction=friction)
     variants = [
@@ -125,8 +125,8 @@ def test_a_walk_does_not_depend_on_how_many_work(friction):
     for count in (1, 3):
         set_workers(count)
         starts: dict = {}
-        walks = [DrivenRobot(r, drive_of(r, rec)) for r in (base, *variants)]
-        rows = [list(solve_path(walks[0], range(5), attrgetter("markers"), walks[1:], starts=starts)) for _ in range(2)]
+        paths = [DrivenRobot(r, drive_of(r, rec)) for r in (base, *variants)]
+        rows = [list(solve_path(paths[0], range(5), attrgetter("markers"), paths[1:], starts=starts)) for _ in range(2)]
         found.append([np.vstack([seen[None], others]) for again in rows for _, _, seen, others in again])
     np.testing.assert_array_equal(found[0], found[1])
 

@@ -117,7 +117,7 @@ def test_excursions_of_the_pressure_are_sweeps() -> None:
 
 
 def test_pressure_pushes_on_the_finer_mesh_too(folder: Path) -> None:
-    """A few steps from the state of the declared mesh end where the finer mesh comes to rest when it is solved for itself."""
+    """A few steps from the state of the declared mesh end where the finer mesh converges when it is solved for itself."""
     coarse = load_robot(folder)
     fine = robot_on_mesh(coarse, finer_mesh(coarse.body.mesh, None, 1))
     recording = make_recording(Timeline([0.0]), drives=Drives(chamber_names=["core"], pressures=[[10e3]]))

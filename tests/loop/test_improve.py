@@ -121,7 +121,7 @@ def test_what_has_evidence_and_makes_the_held_out_error_larger_is_said_and_not_h
     assert loop.verdict == "unexplained" and "nothing that may be handed back explains" in loop.sentence
 
 
-def test_an_effect_whose_states_do_not_come_to_rest_again_is_taken_back(monkeypatch: pytest.MonkeyPatch):
+def test_an_effect_whose_states_do_not_converge_again_is_taken_back(monkeypatch: pytest.MonkeyPatch):
     inputs, labels = sweeps()
     recording, _ = record(inputs, effects=[{"name": "cable_friction", "coefficient": 0.25}], labels=labels, truth=arm((4, 1, 1)))
     module = sys.modules["femsense.loop.search.search"]
@@ -253,7 +253,7 @@ def test_without_labels_a_sweep_is_an_excursion_from_rest():
     assert sweeps_of(recording, np.arange(7)).tolist() == [0, 0, 1, 1, 1, 2, 2]
 
 
-def test_the_components_of_the_noise_are_told_apart():
+def test_the_components_of_the_noise_are_distinguished():
     rng = np.random.default_rng(3)
     frames, markers = 40, 12
     frame, marker = np.repeat(np.arange(frames), markers), np.tile(np.arange(markers), frames)

@@ -1,4 +1,4 @@
-"""The walk along a recording: from recorded to true inputs, sharing of equal frames, history, derivatives by variants."""
+"""The quasi-static path along a recording: from recorded to true inputs, sharing of equal frames, history, derivatives by variants."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ from femsense.model.recording_parts import Drives, LoadRows, Timeline
 from femsense.model.robot import Robot
 
 
-def walked(r: Robot, rec: Recording, frames: Sequence[int] | None = None, **options: Any) -> dict[int, np.ndarray]:
+def states_along(r: Robot, rec: Recording, frames: Sequence[int] | None = None, **options: Any) -> dict[int, np.ndarray]:
     frames = range(rec.frame_count) if frames is None else frames
     return {k: seen for k, _, seen, _ in solve_path(DrivenRobot(r, drive_of(r, rec)), frames, attrgetter("markers"), **options)}
 
 
-def walk_states(r: Robot, rec: Recording) -> list[Equilibrium]:
+def equilibria_along(r: Robot, rec: Recording) -> list[Equilibrium]:
     starts: dict[int, Equilibrium] = {}
     deque(solve_path(DrivenRobot(r, drive_of(r, rec)), range(rec.frame_count), attrgetter("markers"), starts=starts), maxlen=0)
     return list(starts.values())
@@ -65,10 +65,10 @@ def test_true_displacement_is_gain_times_recorded_plus_offset_less_slack() -> No
 
 def test_slack_lets_a_held_cable_do_nothing_until_it_is_taken_up() -> None:
     r = robot([{"name": "cable_slack", "displacement_m": {"top": 0.005}}], gravity=(0, 0, 0))
-    seen = walked(r, recording([[0.0, 0], [0.004, 0], [0.008, 0]], actuation="displacement"))
+    seen = states_along(r, recording([[0.0, 0], [0.004, 0], [0.008, 0]], actuation="displacement"))
     np.testing.assert_allclose(seen[1], seen[0], atol=1e-10)
     np.testing.assert_allclose(
-        seen[2], walked(robot(gravity=(0, 0, 0)), recording([[0.003, 0]], actuation="displacement"))[0], atol=1e-9
+        seen[2], states_along(robot(gravity=(0, 0, 0)), recording([[0.003, 0]], actuation="displacement"))[0], atol=1e-9
     )
 
 
@@ -137,7 +137,7 @@ def test_known_loads_creep_too_and_two_at_one_place_are_one() -> None:
         np.testing.assert_allclose(other.load_forces[other.load_frame == k].sum(axis=0), drive.load_forces[k - 1], atol=1e-12)
 
 
-# Walking
+# Along the path
 
 
 def test_equal_frames_share_one_solve_and_come_out_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -145,7 +145,7 @@ def test_equal_frames_share_one_solve_and_come_out_the_same(monkeypatch: pytest.
     calls: list[int] = []
     plain = quasi_static_path.solve_frame
     monkeypatch.setattr(quasi_static_path, "solve_frame", lambda *a, **k: calls.append(a[1]) or plain(*a, **k))
-    seen = walked(robot(), rec)
+    seen = states_along(robot(), rec)
     assert calls == [0, 1]
     for k in range(5):
         alone = solve_frame(DrivenRobot(robot(), drive_of(robot(), rec)), k)
@@ -158,7 +158,7 @@ def test_frames_with_other_loads_or_gravity_are_not_the_same() -> None:
         loads=LoadRows([1, 2], [[0.1, 0.015, 0.03]] * 2, [[0, 0, -0.1], [0, 0, 0.1]]),
         gravity=[[0, 0, -9.81], [0, 0, -9.81], [0, 0, -9.81], [0, 9.81, 0]],
     )
-    seen = walked(robot(), rec)
+    seen = states_along(robot(), rec)
     for a in range(4):
         for b in range(a):
             assert np.abs(seen[a] - seen[b]).max() > 1e-5
@@ -169,42 +169,44 @@ def test_a_known_load_acts_where_it_stands() -> None:
     body = robot().body
     forces = embed_points(body.mesh, MARKERS[:1]).spread(np.array([[0, 0.2, 0]]), len(body.mesh.nodes))
     np.testing.assert_allclose(
-        walked(robot(), rec)[0], robot().markers.positions(solve_equilibrium(body, nodal_forces=forces).positions), atol=1e-9
+        states_along(robot(), rec)[0],
+        robot().markers.positions(solve_equilibrium(body, nodal_forces=forces).positions),
+        atol=1e-9,
     )
 
 
 def test_gravity_of_a_frame_replaces_that_of_the_body() -> None:
     rec = recording([[0, 0]], gravity=[[0.0, 3.0, 1.0]])
     np.testing.assert_allclose(
-        walked(robot(), rec)[0], walked(robot(gravity=(0.0, 3.0, 1.0)), recording([[0, 0]]))[0], atol=1e-12
+        states_along(robot(), rec)[0], states_along(robot(gravity=(0.0, 3.0, 1.0)), recording([[0, 0]]))[0], atol=1e-12
     )
 
 
-def test_with_friction_the_past_matters_and_unwanted_frames_are_walked_too() -> None:
+def test_with_friction_the_past_matters_and_unwanted_frames_are_solved_too() -> None:
     up_down = recording([[0.5, 0], [1.5, 0], [0.5, 0]])
     r = robot(friction=0.5)
     assert has_history(r) and not has_history(robot())
-    seen = walked(r, up_down)
+    seen = states_along(r, up_down)
     assert np.abs(seen[2] - seen[0]).max() > 1e-5
-    np.testing.assert_allclose(walked(r, up_down, [2])[2], seen[2], atol=1e-9)
-    plain = walked(robot(), up_down)
+    np.testing.assert_allclose(states_along(r, up_down, [2])[2], seen[2], atol=1e-9)
+    plain = states_along(robot(), up_down)
     np.testing.assert_array_equal(plain[2], plain[0])
 
 
-def test_parts_of_a_walk_with_a_past_join_to_the_walk_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_parts_of_a_path_with_a_past_join_to_the_path_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
     levels = np.array([0.4, 1.0, 1.6, 1.6, 1.0, 0.5])
     rec = recording(np.vstack([np.outer(levels, mix) + 0.05 for mix in ([1, 0], [0, 1], [0.6, 0.6], [0.2, 0.8], [1, 0.3])]))
     starts: dict[int, Any] = {}
-    walked(robot(friction=0.4), rec, starts=starts)
+    states_along(robot(friction=0.4), rec, starts=starts)
     for friction in (0.4, 0.6):
-        joined = walked(robot(friction=friction), rec, starts=dict(starts))
-        in_order = walked(robot(friction=friction), rec)
+        joined = states_along(robot(friction=friction), rec, starts=dict(starts))
+        in_order = states_along(robot(friction=friction), rec)
         for k, seen in in_order.items():
             np.testing.assert_allclose(joined[k], seen, atol=1e-9)
     monkeypatch.setattr(
         quasi_static_path, "_as_before", lambda now, then, slack: True
     )  # where the past is only guessed, it shows
-    guessed = walked(robot(friction=0.6), rec, starts=dict(starts))
+    guessed = states_along(robot(friction=0.6), rec, starts=dict(starts))
     assert max(np.abs(guessed[k] - in_order[k]).max() for k in guessed) > 1e-8
 
 
@@ -213,7 +215,7 @@ def test_with_friction_a_hold_is_solved_once_and_a_return_is_not_the_same(monkey
     monkeypatch.setattr(
         quasi_static_path, "solve_frame", lambda driven, k, **more: (solved.append(k), solve(driven, k, **more))[1]
     )
-    seen = walked(robot(friction=0.5), recording([[0.5, 0], [1.5, 0], [1.5, 0], [0.5, 0]]))
+    seen = states_along(robot(friction=0.5), recording([[0.5, 0], [1.5, 0], [1.5, 0], [0.5, 0]]))
     assert solved == [0, 1, 3]
     np.testing.assert_array_equal(seen[1], seen[2])
     assert np.abs(seen[3] - seen[0]).max() > 1e-5
@@ -222,7 +224,7 @@ def test_with_friction_a_hold_is_solved_once_and_a_return_is_not_the_same(monkey
 def test_a_frame_starts_from_the_state_whose_inputs_are_most_like_its_own() -> None:
     rec = recording([[0.0, 0], [1.0, 0], [0.1, 0], [0.9, 0]])
     starts: dict[int, Any] = {}
-    walked(robot(), rec, [0, 1], starts=starts)
+    states_along(robot(), rec, [0, 1], starts=starts)
     found = quasi_static_path._nearest(DrivenRobot(robot(), drive_of(robot(), rec)), starts, [2, 3])
     assert found[2] is starts[0] and found[3] is starts[1]
 
@@ -299,7 +301,7 @@ def test_many_forces_are_answered_by_the_points_that_are_observed(control: str, 
     ]
     moved = {"name": "marker_offset", "offset_m": {"a": [1e-4, 0.0, 0.0]}}
     robots = [*(apply_effects(base, [entry]) for entry in entries), apply_effects(base, [payloads[0], moved])]
-    walks = [DrivenRobot(r, drive_of(r, rec)) for r in robots]
+    paths = [DrivenRobot(r, drive_of(r, rec)) for r in robots]
     solved, plain = list[int](), Tangent.respond
     monkeypatch.setattr(Tangent, "respond", lambda self, forces: solved.append(len(forces)) or plain(self, forces))
 
@@ -307,16 +309,16 @@ def test_many_forces_are_answered_by_the_points_that_are_observed(control: str, 
         driven = DrivenRobot(base, drive_of(base, rec))
         return np.array([others for *_, others in solve_path(driven, [0, 1], attrgetter("markers"), variants, answers=known)])
 
-    together = seen(walks)
+    together = seen(paths)
     assert solved and max(solved) == 3 * len(MARKERS)  # one a point and axis, none a payload
-    alone = np.concatenate([seen([driven]) for driven in walks], axis=1)
+    alone = np.concatenate([seen([driven]) for driven in paths], axis=1)
     still = next(iter(solve_path(DrivenRobot(base, drive_of(base, rec)), [0], attrgetter("markers"))))[2]
     np.testing.assert_allclose(together, alone, atol=1e-6 * np.abs(alone - still).max())
     known = dict[int, quasi_static_path.AtPoints]()
-    np.testing.assert_allclose(seen(walks[:1], known), alone[:, :1], atol=1e-6 * np.abs(alone - still).max())
+    np.testing.assert_allclose(seen(paths[:1], known), alone[:, :1], atol=1e-6 * np.abs(alone - still).max())
     solved.clear()
     monkeypatch.setattr(variants, "tangent_at", lambda *given: pytest.fail("a tangent is made though the answers are known"))
-    kept = seen(walks[1 : len(payloads) + 2], known)
+    kept = seen(paths[1 : len(payloads) + 2], known)
     np.testing.assert_allclose(kept, alone[:, 1 : len(payloads) + 2], atol=1e-6 * np.abs(alone - still).max())
     assert known.keys() == {0, 1} and not solved
 
@@ -339,18 +341,18 @@ def test_variants_that_rub_are_answered_twice_with_one_factor_a_state(monkeypatc
     others = [apply_effects(base, [{"name": "stiffness", "scale": scale}]) for scale in (0.9, 1.1)]
     made, plain = list[Any](), variants.tangent_at
     monkeypatch.setattr(variants, "tangent_at", lambda *given: made.append(given) or plain(*given))
-    walks = [DrivenRobot(r, drive_of(r, rec)) for r in (*rubs, *others)]
-    seen = list(solve_path(DrivenRobot(base, drive_of(base, rec)), range(4), attrgetter("markers"), walks))
+    paths = [DrivenRobot(r, drive_of(r, rec)) for r in (*rubs, *others)]
+    seen = list(solve_path(DrivenRobot(base, drive_of(base, rec)), range(4), attrgetter("markers"), paths))
     assert len(made) == 2  # frames of two states
     monkeypatch.setattr(variants, "FACTOR_MEMORY", 0.0)
     for (_, _, _, kept), (_, _, _, again) in zip(
-        seen, solve_path(DrivenRobot(base, drive_of(base, rec)), range(4), attrgetter("markers"), walks)
+        seen, solve_path(DrivenRobot(base, drive_of(base, rec)), range(4), attrgetter("markers"), paths)
     ):
         np.testing.assert_allclose(kept, again, atol=1e-12)
     assert len(made) == 6
 
 
-def test_factors_of_a_walk_with_friction_are_gone_with_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_factors_of_a_path_with_friction_are_gone_with_it(monkeypatch: pytest.MonkeyPatch) -> None:
     base, rec = robot(), recording([[0.5, 0.0], [1.0, 0.2], [1.5, 0.4]])
     rubs = apply_effects(base, [{"name": "cable_friction", "coefficient": 0.2}])
     made, plain = list[weakref.ref[Any]](), variants.tangent_at
@@ -375,7 +377,7 @@ def test_factors_of_a_walk_with_friction_are_gone_with_it(monkeypatch: pytest.Mo
 
 
 def test_a_factor_takes_the_place_of_no_smaller_one() -> None:
-    state = walk_states(robot(), recording([[0.5, 0.0]]))[0]
+    state = equilibria_along(robot(), recording([[0.5, 0.0]]))[0]
     bare = replace(state, factor=None)
     size = state.factor.bytes
     assert quasi_static_path._most_lent(bare, 1e9) == 1e9 and size < quasi_static_path._most_lent(state, 1e9) < 2 * size
@@ -397,11 +399,11 @@ def test_a_variant_in_gravity_is_solved() -> None:
 
 def test_earlier_states_are_starts_and_are_brought_up_to_date() -> None:
     base, starts = robot(), {}
-    cold = walked(base, recording([[1.0, 0.3], [2.0, 0.3]]), starts=starts)
+    cold = states_along(base, recording([[1.0, 0.3], [2.0, 0.3]]), starts=starts)
     assert set(starts) == {0, 1}
-    warm = walked(base, recording([[1.001, 0.3], [2.0, 0.3]]), starts=starts)
+    warm = states_along(base, recording([[1.001, 0.3], [2.0, 0.3]]), starts=starts)
     assert np.abs(warm[0] - cold[0]).max() > 1e-9
-    np.testing.assert_allclose(warm[0], walked(base, recording([[1.001, 0.3]]))[0], atol=1e-9)
+    np.testing.assert_allclose(warm[0], states_along(base, recording([[1.001, 0.3]]))[0], atol=1e-9)
     np.testing.assert_allclose(warm[1], cold[1], atol=1e-9)
 
 
@@ -409,7 +411,7 @@ def test_a_frame_without_equilibrium_names_itself() -> None:
     base = robot()
     loose = replace(base, body=bar_body(block_mesh((4, 1, 1)), clamped=False, gravity=(0, 0, -9.81)))
     with pytest.raises(DataError, match="no equilibrium in frame 0: singular: nothing holds the body"):
-        walked(loose, recording([[0.0, 0]]))
+        states_along(loose, recording([[0.0, 0]]))
 
 
 @pytest.mark.parametrize(
@@ -423,9 +425,9 @@ def test_a_frame_without_equilibrium_names_itself() -> None:
 def test_a_clamp_that_gives_takes_the_body_along_first(entry: dict[str, float], monkeypatch: pytest.MonkeyPatch) -> None:
     rec = recording([[1.0, 0.0], [2.0, 0.5]])
     rigid, starts, begun = robot(), {}, dict[int, Equilibrium]()
-    walked(rigid, rec, starts=starts)
+    states_along(rigid, rec, starts=starts)
     soft = robot([{"name": "base_compliance", **entry}])
-    alone = walk_states(soft, rec)
+    alone = equilibria_along(soft, rec)
     plain = quasi_static_path.solve_frame
 
     def solve(driven: DrivenRobot, k: int, **given: Any) -> Equilibrium:
@@ -433,7 +435,7 @@ def test_a_clamp_that_gives_takes_the_body_along_first(entry: dict[str, float], 
         return plain(driven, k, **given)
 
     monkeypatch.setattr(quasi_static_path, "solve_frame", solve)
-    there = walked(soft, rec, starts=dict(starts))
+    there = states_along(soft, rec, starts=dict(starts))
     for k, state in enumerate(alone):
         np.testing.assert_allclose(there[k], soft.markers.positions(state.positions), atol=1e-8)
         way = np.abs(state.positions - starts[k].positions).max()
@@ -441,24 +443,24 @@ def test_a_clamp_that_gives_takes_the_body_along_first(entry: dict[str, float], 
 
 
 @pytest.mark.parametrize("entry", [{"stiffness_n_m": 1.0}, {"rotation_stiffness_nm_rad": 1e-3}])
-def test_a_clamp_that_cannot_hold_the_body_is_walked_from_rest(entry: dict[str, float]) -> None:
+def test_a_clamp_that_cannot_hold_the_body_is_solved_from_rest(entry: dict[str, float]) -> None:
     rec = recording([[1.0, 0.0]])
-    starts = walk_states(robot(), rec)
+    starts = equilibria_along(robot(), rec)
     soft = robot([{"name": "base_compliance", **entry}])
     assert quasi_static_path._taken_along(DrivenRobot(soft, drive_of(soft, rec)), 0, starts[0]) is None
 
 
-def test_where_a_body_that_was_taken_along_does_not_come_to_rest_it_is_walked_from_rest(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_a_body_that_was_taken_along_does_not_converge_it_is_solved_from_rest(monkeypatch: pytest.MonkeyPatch) -> None:
     rec, starts = recording([[1.0, 0.0], [2.0, 0.5]]), {}
-    walked(robot(), rec, starts=starts)
+    states_along(robot(), rec, starts=starts)
     soft = robot([{"name": "base_compliance", "stiffness_n_m": 300.0}])
-    alone, plain = walked(soft, rec), quasi_static_path.solve_frame
+    alone, plain = states_along(soft, rec), quasi_static_path.solve_frame
 
     def solve(driven: DrivenRobot, k: int, **given: Any) -> Equilibrium:
         state = plain(driven, k, **given)
         return replace(state, status="overload") if given.get("reuse_factor") else state
 
     monkeypatch.setattr(quasi_static_path, "solve_frame", solve)
-    there = walked(soft, rec, starts=starts)
+    there = states_along(soft, rec, starts=starts)
     for k, seen in alone.items():
         np.testing.assert_allclose(there[k], seen, atol=1e-9)

@@ -12,7 +12,7 @@ from femsense.model.recording_parts import Drives, MarkerRows, Timeline
 from femsense.model.repeats import marker_repeatability, stays_of
 
 
-def walked(levels: list[float], noise: float) -> Recording:
+def holds_at(levels: list[float], noise: float) -> Recording:
     """Return a recording of five markers that go with the input, and scatter about that."""
     rng, count = np.random.default_rng(2), 5
     moved = np.repeat(np.array(levels), count)[:, None] * [1.0, 2.0, 3.0]
@@ -29,17 +29,17 @@ def walked(levels: list[float], noise: float) -> Recording:
 
 
 def test_repeats_tell_what_markers_scatter_by_however_far_they_move() -> None:
-    assert marker_repeatability(walked([0.0, 0.0, 1.0, 1.0, 2.0, 2.0] * 4, 3e-4)) == pytest.approx(3e-4, rel=0.15)
-    assert marker_repeatability(walked([0.0, 1.0, 2.0] * 8, 3e-4)) == pytest.approx(3e-4, rel=0.15)
+    assert marker_repeatability(holds_at([0.0, 0.0, 1.0, 1.0, 2.0, 2.0] * 4, 3e-4)) == pytest.approx(3e-4, rel=0.15)
+    assert marker_repeatability(holds_at([0.0, 1.0, 2.0] * 8, 3e-4)) == pytest.approx(3e-4, rel=0.15)
 
 
 def test_what_is_declared_comes_first_and_without_repeats_nothing_is_known() -> None:
-    recording = walked([0.0, 1.0, 2.0, 3.0], 3e-4)
+    recording = holds_at([0.0, 1.0, 2.0, 3.0], 3e-4)
     assert np.isnan(marker_repeatability(recording))
     assert marker_repeatability(replace(recording, marker_noise_m=1e-4)) == 1e-4
 
 
 def test_a_state_that_is_reached_from_above_is_another_one_than_from_below() -> None:
-    stays = stays_of(walked([0.0, 1.0, 2.0, 1.0, 1.0, 2.0, 1.0], 0.0))
+    stays = stays_of(holds_at([0.0, 1.0, 2.0, 1.0, 1.0, 2.0, 1.0], 0.0))
     assert [stays[k][0] for k in range(7)] == [0, 1, 2, 3, 3, 4, 5]
     assert stays[1][1] != stays[3][1] == stays[6][1]

@@ -148,12 +148,12 @@ def test_averaging_beats_the_noise() -> None:
     assert mean.count[mean.found].min() > 10 and (single.count[single.found] == 1).all()
 
 
-def test_stray_points_are_set_aside() -> None:
+def test_outlying_points_are_set_aside() -> None:
     features, normals = front(60)
     rng = np.random.default_rng(0)
     points = cap(rng, 6000, noise=1e-4)
-    stray = rng.random(len(points)) < 0.05
-    points[stray] = cap(rng, int(stray.sum()), radius=0.045)
+    outlier = rng.random(len(points)) < 0.05
+    points[outlier] = cap(rng, int(outlier.sum()), radius=0.045)
     matches = match_along_normals(features, normals, points, d_m=0.005, d_l=0.01, options=AVERAGE)
     assert np.median(np.abs(matches.distance)) < 5e-5
 

@@ -42,7 +42,7 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Robot:
 
 
 def _estimators_markers(robot: Robot, script: dict[str, Any]) -> np.ndarray:
-    """Return the markers of the estimator's own walk [m], shape (F, k, 3)."""
+    """Return the markers along the estimator's own quasi-static path [m], shape (F, k, 3)."""
     checked = check_script(script)
     recording = recording_of(run_experiment(robot, checked))
     driven = DrivenRobot(robot, drive_of(robot, recording))
@@ -105,7 +105,7 @@ def test_bends_remember_the_tensions_at_which_a_held_cable_came_to_rest() -> Non
         assert max(pulled) > 0.5
 
 
-def test_held_cables_that_rub_come_to_rest_when_they_are_let_out() -> None:
+def test_held_cables_that_rub_converge_when_they_are_let_out() -> None:
     """Tensions at their motors then creep, pass by pass, as long as their bends hold."""
     rubbing, plan, inputs = let_out()
     recording = make_recording(Timeline(plan.time_s), drives=Drives(NAMES, inputs, actuation="displacement"))

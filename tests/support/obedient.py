@@ -1,4 +1,4 @@
-"""A robot that does what it is told: it listens to commands, stops when they stop, and comes to rest under its inputs."""
+"""A robot that does what it is told: it listens to commands, stops when they stop, and takes the equilibrium of its inputs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What was found in a source, counted over its frames: rate, gaps, lost and exchanged markers, span."""
+"""What was found in a source, counted over its frames: rate, gaps, lost and swapped markers, span."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from femsense.io.importers.journal import Journal
 GAP = 1.5
 """A step in time longer than this times the usual one lacks frames."""
 JUMP = 5.0
-"""Two markers that each jump farther than this times their usual step, and land where the other was, are called exchanged."""
+"""Two markers that each jump farther than this times their usual step, and land where the other was, are called swapped."""
 
 
 def summary(source: Source, journal: Journal, counts: Mapping[str, int]) -> dict[str, Any]:
-    """Return what was found, with units in the names; warns of exchanged labels and of lost frames."""
+    """Return what was found, with units in the names; warns of swapped labels and of lost frames."""
     times = journal.times()
     step = np.diff(times)
     usual = float(np.median(step)) if len(step) else None
@@ -68,7 +68,7 @@ def _markers(journal: Journal) -> dict[str, Any]:
         return {"loads": loads} if loads else {}
     if swaps.found:
         warnings.warn(
-            "labels of markers seem exchanged: "
+            "labels of markers seem swapped: "
             + "; ".join(f"{a} and {b} at frame {k}" for k, a, b in swaps.found[:5])
             + (f" and {len(swaps.found) - 5} more" if len(swaps.found) > 5 else ""),
             stacklevel=3,
@@ -79,7 +79,7 @@ def _markers(journal: Journal) -> dict[str, Any]:
         "missing": [{"marker": name, "share": 1 - count / frames} for name, count in sorted(seen.items()) if count < frames]
         or None,
         "span_m": (high - low).tolist(),
-        "label_exchanges": len(swaps.found),
+        "label_swaps": len(swaps.found),
         "loads": loads or None,
     }
 

@@ -60,7 +60,7 @@ class Filled:
     """In metres."""
     edge_mm: float
     tolerance_mm: float
-    strays_mm: float
+    deviation_mm: float
     """Largest distance of a point of one surface from the other."""
     done: tuple[str, ...]
 
@@ -174,8 +174,8 @@ def _fill_once(
         seconds=seconds,
     )
     mesh, notes = _one_body(made, where)
-    outliers = _strays(mesh, surface, crosses)
-    return Filled(mesh, 1e3 * edge, 1e3 * tolerance, 1e3 * outliers, (*thin.done, *_rougher(drifted, tolerance), *notes)), thin
+    deviation = _deviation(mesh, surface, crosses)
+    return Filled(mesh, 1e3 * edge, 1e3 * tolerance, 1e3 * deviation, (*thin.done, *_rougher(drifted, tolerance), *notes)), thin
 
 
 def _envelope(drifted: float, tolerance: float, diagonal: float, asked: bool) -> float:
@@ -195,7 +195,7 @@ def _rougher(drifted: float, tolerance: float) -> tuple[str, ...]:
     )
 
 
-def _strays(mesh: TetMesh, surface: ClosedSurface, crosses: bool) -> float:
+def _deviation(mesh: TetMesh, surface: ClosedSurface, crosses: bool) -> float:
     """Return the largest distance of a point of one surface from the other [m]; where shells cross, of the mesh from the surface."""
     skin, numbers = np.unique(surface_triangles(mesh), return_inverse=True)
     out = float(distance_to(surface.points, surface.triangles, mesh.nodes[skin]).max())

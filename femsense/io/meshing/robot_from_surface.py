@@ -158,7 +158,7 @@ def mesh_report(filled: Filled, options: MeshOptions) -> dict[str, Any]:
     return {
         "edge_wanted_mm": filled.edge_mm,
         "tolerance_mm": filled.tolerance_mm,
-        "strays_mm": filled.strays_mm,
+        "deviation_mm": filled.deviation_mm,
         "done": list(filled.done),
         "quality": quality,
         "advice": _advice(quality, options),
@@ -183,7 +183,7 @@ def mesh_text(report: dict[str, Any]) -> str:
     """Return a report as a table."""
     lines = [
         quality_text(report["quality"]),
-        f"  {'from the surface':<19}at most {report['strays_mm']:.3g} mm (allowed: {report['tolerance_mm']:.3g} mm)",
+        f"  {'from the surface':<19}at most {report['deviation_mm']:.3g} mm (allowed: {report['tolerance_mm']:.3g} mm)",
     ]
     for title, texts in (("done to the surface", report["done"]), ("advice", report["advice"])):
         if texts:
@@ -271,7 +271,7 @@ def _with_mesh(text: str, toml: Path) -> tuple[str, str, str]:
     named = re.compile(r"^(\s*file\s*=\s*)([\"'])" + re.escape(file) + r"\2", re.MULTILINE)
     if len(named.findall(text)) != 1:
         raise InputError(
-            "the mesh file cannot be exchanged",
+            "the mesh file cannot be replaced",
             where=f"{toml}: mesh.file",
             found=file,
             expected=f'file = "{MESH_FILE}"',

@@ -17,7 +17,7 @@ MOST_TRIANGLES = 30_000
 def thinned(
     surface: ClosedSurface, *, tolerance: float, start: ClosedSurface | None = None, enough: int = MANY_TRIANGLES
 ) -> tuple[ClosedSurface, float]:
-    """Return a surface with fewer triangles that stays near, and how far it strays [unit of the file].
+    """Return a surface with fewer triangles that stays near, and how far it deviates [unit of the file].
 
     Edges are drawn together where that costs least (quadric error metrics, Garland and Heckbert 1997, as Open3D has them). The
     number of triangles is halved as long as no point of one surface is farther than the tolerance from the other, and, however
@@ -31,15 +31,15 @@ def thinned(
         enough: so many triangles are fine; fewer are not asked for.
     """
     kept = start or surface
-    away = 0.0 if kept is surface else _strays(surface, kept.points, kept.triangles)
+    away = 0.0 if kept is surface else _deviation(surface, kept.points, kept.triangles)
     while len(kept.triangles) > enough:
         points, triangles = _simplified(kept.points, kept.triangles, max(enough, len(kept.triangles) // 2))
-        strays = _strays(surface, points, triangles)
+        deviation = _deviation(surface, points, triangles)
         stuck = len(open_edges(triangles)) or len(triangles) > 0.9 * len(kept.triangles)
-        if stuck or (strays > tolerance and len(kept.triangles) <= MOST_TRIANGLES):
+        if stuck or (deviation > tolerance and len(kept.triangles) <= MOST_TRIANGLES):
             break
         done = (*surface.done, f"thinned out from {len(surface.triangles)} to {len(triangles)} triangles")
-        kept, away = ClosedSurface(freeze(points), freeze(triangles, np.int64), surface.cavities, done), strays
+        kept, away = ClosedSurface(freeze(points), freeze(triangles, np.int64), surface.cavities, done), deviation
     return kept, away
 
 
@@ -53,7 +53,7 @@ def _simplified(points: FloatArray, triangles: IntArray, wanted: int) -> tuple[F
     return np.asarray(thin.vertices), np.asarray(thin.triangles, dtype=np.int64)
 
 
-def _strays(surface: ClosedSurface, points: FloatArray, triangles: IntArray) -> float:
+def _deviation(surface: ClosedSurface, points: FloatArray, triangles: IntArray) -> float:
     """Return the largest distance of points and middles of either surface from the other."""
     middles = points[triangles].mean(axis=1)
     out = distance_to(surface.points, surface.triangles, np.vstack([points, middles])).max()

@@ -155,7 +155,7 @@ class Alias:
     common: bool = False
     """Whether that is so where all parameters move alike; else it is its mirror image."""
     told_by: str = ""
-    """What to record to tell the two apart, in words."""
+    """What to record to distinguish the two, in words."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -93,6 +93,6 @@ def confounding_map(confounding: Confounding) -> Html | None:
     return as_image(
         figure,
         alt=f"Map of {n} effects: how much of the trace of one is collinear with another one; the most {top[0]:.0%} of {top[1]} by {top[2]}.",
-        caption="How much of the trace of the effect on the left is collinear with that of the effect below [%], with all that calibration can absorb taken off. Above 95 (bold) these data cannot tell the two apart.",
+        caption="How much of the trace of the effect on the left is collinear with that of the effect below [%], with all that calibration can absorb taken off. Above 95 (bold) these data cannot distinguish the two.",
         wide=wide,
     )

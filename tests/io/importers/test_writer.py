@@ -96,7 +96,7 @@ def test_a_picture_that_is_broken_costs_itself_only(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_png(tmp_path / "out/depth/000002.png"), image(2))
 
 
-def test_exchanged_labels_are_named(tmp_path: Path) -> None:
+def test_swapped_labels_are_named(tmp_path: Path) -> None:
     def items() -> Iterator[Frame]:
         for k in range(40):
             a, b = (0.001 * k, 0.0, 1.0), (0.001 * k, 0.05, 1.0)
@@ -104,7 +104,7 @@ def test_exchanged_labels_are_named(tmp_path: Path) -> None:
 
     with pytest.warns(UserWarning, match="a and b at frame 20"):
         found = write_recording(Source("test", Path("x"), items), tmp_path / "out", identity={})
-    assert found["label_exchanges"] == 1
+    assert found["label_swaps"] == 1
 
 
 def test_an_input_that_comes_later_is_zero_before_and_held_after(tmp_path: Path) -> None:

@@ -92,7 +92,7 @@ def test_a_chamber_stays_hollow_and_the_robot_bends(tmp_path: Path, capfd: pytes
     assert inner.any()  # the walls of the chamber
     edges = len(np.unique(np.sort(surface_triangles(mesh)[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0))
     assert len(np.unique(surface_triangles(mesh))) - edges + len(surface_triangles(mesh)) == 4  # two spheres (Euler)
-    assert report["quality"]["tetrahedra"] == len(mesh.tets) <= 1500 and report["strays_mm"] < report["tolerance_mm"] * 1.5
+    assert report["quality"]["tetrahedra"] == len(mesh.tets) <= 1500 and report["deviation_mm"] < report["tolerance_mm"] * 1.5
     assert solve_equilibrium(robot.body).converged
 
 

@@ -149,7 +149,7 @@ def test_crumbs_are_left_out() -> None:
     assert len(surface.triangles) == 12 and surface.done == ("1 shells that enclose next to nothing were left out",)
 
 
-def test_many_bubbles_are_told_apart_and_too_many_pieces_are_refused() -> None:
+def test_many_bubbles_are_separated_and_too_many_pieces_are_refused() -> None:
     places = np.stack(np.meshgrid(np.linspace(-45, 45, 10), [-10, 0, 10], [-10, 0, 10]), axis=-1).reshape(-1, 3)
     surface = mended(BOX, *(box((2, 2, 2), at=tuple(place)) for place in places))
     assert surface.cavities == 90 and surface.volume == pytest.approx(9e4 - 90 * 8)

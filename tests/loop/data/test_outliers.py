@@ -28,7 +28,7 @@ def test_a_marker_that_is_far_off_in_one_frame_is_a_stray():
     assert not outliers(values, frame, marker, 9e-3).any()
 
 
-def test_two_markers_that_exchange_their_names_are_strays_and_neighbours_that_are_off_alike_are_not():
+def test_two_markers_that_swap_their_names_are_outliers_and_neighbours_that_are_off_alike_are_not():
     values, frame, marker = rows()
     first, second = np.flatnonzero((frame == 9) & np.isin(marker, (2, 5)))
     values[first] += [0.0, 9e-3, 0.0]
@@ -46,7 +46,7 @@ def test_a_marker_that_slips_or_a_frame_that_is_off_is_none():
 
 
 @pytest.mark.parametrize("k", [2, -2])
-def test_the_loop_leaves_strays_out_whether_they_are_fitted_or_held_out(k: int):
+def test_the_loop_leaves_outliers_out_whether_they_are_fitted_or_held_out(k: int):
     """One marker a metre away, in the first sweep or in the last one, which is held out."""
     inputs, labels = sweeps()
     plain, _ = record(inputs, effects=[{"name": "stiffness", "scale": 1.25}], labels=labels, truth=arm((8, 3, 3)))

@@ -79,7 +79,7 @@ def test_parameters_leave_less_to_judge_the_noise_by() -> None:
 
 
 def sweeps_fit(values: np.ndarray, rows: int) -> tuple[Any, Any]:
-    """Return data and a stage: one parameter, the mean of whitened rows; `values` are what each sweep has it be."""
+    """Return data and a fitted model: one parameter, the mean of whitened rows; `values` are what each sweep has it be."""
     residual = np.concatenate([np.full(3 * rows, v) for v in values - values.mean()])
     jet = SimpleNamespace(residual=residual.reshape(-1, 3), rest=np.zeros((0, 3)))
     J = np.ones((len(residual), 1))

@@ -32,7 +32,7 @@ from femsense.model.remeshing import finer_mesh, robot_on_mesh
 def with_error_of_the_mesh(
     noise: Noise, *, linear: bool = False, tried: tuple[str, ...] = ()
 ) -> tuple[Recording, FittedModel, Data]:
-    """Return a recording of a small arm, its calibrated stage, and the data with what the mesh costs there."""
+    """Return a recording of a small arm, its calibrated model, and the data with the discretisation error there."""
     inputs, labels = sweeps(each=1)
     robot = arm((4, 2, 2))
     robot = robot_on_mesh(robot, to_linear(robot.body.mesh)) if linear else robot

@@ -1,4 +1,4 @@
-"""Tensions end at 0: a fit that knows where goes through these kinks in one step, and its model of the residual is right beyond them."""
+"""Tensions end at 0: a fit that knows where goes through these nonsmooth lines in one step, and its model of the residual is right beyond them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ NOISE = Noise({"white": 1e-4}, "")
 
 
 def bent(seed: int):
-    """Return an evaluation of a residual with six kinks in three parameters, their description, and the smallest sum of squares."""
+    """Return an evaluation of a residual with six nonsmooth lines in three parameters, their description, and the smallest sum of squares."""
     rng = np.random.default_rng(seed)
     A, W, U, v = rng.normal(size=(40, 3)), 3.0 * rng.normal(size=(40, 6)), rng.normal(size=(6, 3)), 0.3 * rng.normal(size=6)
     b = rng.normal(size=40) + A @ [1.0, -2.0, 0.5] + W @ np.maximum(v + U @ [1.0, -2.0, 0.5], 0.0)

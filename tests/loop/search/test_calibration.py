@@ -8,7 +8,7 @@ from femsense.core.errors import DataError
 from femsense.loop.search.calibration import as_far_as_held_out_states_converge
 
 
-def test_calibration_goes_as_far_as_held_out_states_come_to_rest():
+def test_calibration_goes_as_far_as_held_out_states_converge():
     def collapses_beyond(most: int):
         def fit(steps: int) -> int:
             if steps > most:

@@ -473,8 +473,8 @@ def test_held_out_data_that_speak_against_an_effect_count(
     data, fitted = started
     one = payloads(data, fitted)[0]
     made = refit(data, fitted, one, NOISE)
-    dear = replace(one, cost=evidence(fitted.fit, made.fit) - score)
+    expensive = replace(one, cost=evidence(fitted.fit, made.fit) - score)
     monkeypatch.setattr(acceptance, "held_shift", lambda *given: 6.25)  # it acts little there, so that chance may have it
     monkeypatch.setattr(acceptance, "held_chi2", lambda data, at, noise: 5.0 * (at is made))
-    verdict = forward_selection.acceptance_test(data, fitted, dear, made, RECORD, NOISE).record.verdict
+    verdict = forward_selection.acceptance_test(data, fitted, expensive, made, RECORD, NOISE).record.verdict
     assert verdict == "passes" if passes else "held-out data speak against it" in verdict

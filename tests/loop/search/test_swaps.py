@@ -51,7 +51,7 @@ def started() -> tuple[Data, FittedModel]:
 
 
 def added(data: Data, fitted: FittedModel, name: str, step: int) -> tuple[FittedModel, RefitRecord]:
-    """Return a stage with one more effect, rightly or not, and its record."""
+    """Return a fitted model with one more effect, rightly or not, and its record."""
     table = screen_model(data, fitted.fit, NOISE, fields_of(data, fitted, [name]), COUNT)
     record = RefitRecord(name, {}, step=step)
     candidate = max(shortlist(table, first=True) or table, key=lambda c: c.score)

@@ -1,4 +1,4 @@
-"""What a loop says that its data cannot tell apart."""
+"""What a loop says that its data cannot distinguish."""
 
 from types import SimpleNamespace
 from typing import Any, cast
@@ -87,12 +87,12 @@ def test_a_refit_that_was_given_up_before_it_had_a_dbic_refutes_nothing(verdict:
     assert pair.pair == ("cable_friction", "creep")
 
 
-def test_a_mesh_without_which_nothing_comes_to_rest_has_no_rivals() -> None:
+def test_a_mesh_without_which_nothing_converges_is_confounded_with_nothing() -> None:
     alone = RefitRecord("discretisation", {}, "named", step=1)
     assert confounded(searched([alone, refit("creep", 20.0)]), ["discretisation"]) == []
 
 
-def test_fields_that_agree_are_told_apart_by_a_sign() -> None:
+def test_fields_that_agree_are_distinguished_by_a_sign() -> None:
     fields = [candidate("gravity", 1, 1, 0), candidate("creep", 1, 1, 0.1)]
     for gain, alike in ((6.0, True), (4.0, False)):
         fields[1].gain = gain

@@ -22,7 +22,7 @@ def some_groups(frames: int = 12, markers: int = 5) -> Groups:
 
 
 def leaving(train: float, held: float) -> SimpleNamespace:
-    """Return what the verdict asks of a stage that leaves residuals of such sizes [m] at 5 markers in 12 frames."""
+    """Return what the verdict asks of a fitted model that leaves residuals of such sizes [m] at 5 markers in 12 frames."""
     values = [size * np.sign(RNG.normal(size=(60, 3))) for size in (train, held)]
     return SimpleNamespace(fit=SimpleNamespace(jets=[SimpleNamespace(residual=values[0])]), held_residuals=[values[1]])
 

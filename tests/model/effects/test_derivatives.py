@@ -1,4 +1,4 @@
-"""The sensitivity of the markers to every effect, as the loop uses it, against marches that are solved anew."""
+"""The sensitivity of the markers to every effect, as the loop uses it, against paths that are solved anew."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ def test_the_sensitivity_to_an_effect_is_that_of_marches_solved_anew(case):
 
 
 def projector(scene, robot, starts):
-    """Return the map that takes out what pose, inputs and modulus can imitate."""
+    """Return the map that takes out what pose, inputs and modulus can absorb."""
     stiffness = find_effect("stiffness")
     here = jet(
         Hypothesis(robot, ((stiffness, {}, stiffness.parameters(robot, "")),)), scene, np.zeros(1), starts, derivative=True

@@ -125,7 +125,7 @@ def test_a_robot_file_names_the_file_and_takes_it_along(tmp_path):
         (DRAUGHT + "seeds = []", ["not a list of tables"]),
     ],
 )
-def test_a_wrong_file_is_told_apart(tmp_path, text, texts):
+def test_a_wrong_file_is_explained(tmp_path, text, texts):
     with pytest.raises(InputError) as error:
         load_own_effect(written(tmp_path, text))
     for part in texts:

@@ -128,7 +128,7 @@ def test_a_lag_is_met_by_a_memory() -> None:
     assert learn(session(3), options=LearnOptions(kinds=("radial",))).memory_s == ()
 
 
-def test_another_day_is_told_apart_and_a_few_frames_correct_it(model) -> None:
+def test_another_day_is_recognised_and_a_few_frames_correct_it(model) -> None:
     same = session(5)
     assert drift(model, same).verdict == "holds"
     T, shift = Rotation.from_rotvec([0.0, 0.1, 0.2]).as_matrix(), np.array([0.004, -0.003, 0.0])
