@@ -39,10 +39,12 @@ clean:
 	find . -name __pycache__ -type d -not -path './.git/*' -prune -exec rm -rf {} +
 
 $(VENV)/.installed: $(VENV)/.python $(SOURCES)
+	@echo "installing femsense: what it depends on, the viewer page, and its kernels, which compile for a minute"
 	$(RUN)/python -m pip install --disable-pip-version-check --quiet --editable .
 	touch $@
 
 $(VENV)/.installed-dev: $(VENV)/.python $(SOURCES)
+	@echo "installing femsense: what it depends on, the viewer page, and its kernels, which compile for a minute"
 	$(RUN)/python -m pip install --disable-pip-version-check --quiet --editable '.[dev]'
 	touch $(VENV)/.installed $@
 

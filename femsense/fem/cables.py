@@ -9,9 +9,9 @@ A cable of length ℓ has shortened by δ = ℓ(rest) − ℓ(x). Tensions t_j a
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from femsense.core.arrays import FloatArray, IntArray, freeze, read_only
+from femsense.core.kernels import njit
 from femsense.fem.body import BodyModel
 from femsense.fem.body_parts import Cable
 

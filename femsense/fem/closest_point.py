@@ -4,9 +4,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from femsense.core.arrays import BoolArray, FloatArray, IntArray
+from femsense.core.kernels import njit
 
 FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])  # outward where the volume is positive
 ALIKE, ALIKE_CENTRES = 1e-9, 1e-4
@@ -100,7 +100,7 @@ def _drawn_to_face(corners: FloatArray, point: Vector, best: FloatArray) -> None
 def drawn_to_faces(corners: FloatArray, points: FloatArray, best: FloatArray) -> None:
     """Put the closest points on the faces in the place of barycentric coordinates (p, 4) of points outside of their tetrahedra."""
     for i in range(len(points)):
-        if not best[i].min() >= 0:
+        if not min(best[i, 0], best[i, 1], best[i, 2], best[i, 3]) >= 0:
             _drawn_to_face(corners[i], _vector(points, i), best[i])
 
 
@@ -143,7 +143,10 @@ def carry(
         p = _vector(points, i)
         for k in range(start[i], start[i + 1]):
             off[k] = _length(_minus(_vector(centres, candidate[k]), p))
-        first = start[i] + off[start[i] : start[i + 1]].argmin()
+        first = start[i]
+        for k in range(start[i], start[i + 1]):
+            if off[k] < off[first]:
+                first = k
         least = _distance(corners[candidate[first]], p)
         for k in range(start[i], start[i + 1]):
             distance[k] = np.inf

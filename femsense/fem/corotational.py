@@ -20,9 +20,9 @@ which is the full second derivative, rotation included. References: Müller & Gr
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from femsense.core.arrays import FloatArray
+from femsense.core.kernels import njit
 from femsense.fem.linalg.simd_kernels import add_run, fetch_ahead, subtract_product
 from femsense.fem.rotation import FAST, closest_rotation, closest_rotation_anyhow, determinant, turning_compliance
 

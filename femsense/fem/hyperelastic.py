@@ -19,8 +19,8 @@ back from.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from femsense.core.kernels import njit
 from femsense.fem.corotational import LOCAL, add_blocks
 from femsense.fem.linalg.simd_kernels import LANES
 from femsense.fem.rotation import FAST, determinant

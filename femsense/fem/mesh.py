@@ -7,13 +7,12 @@ Nodes of an element are ordered as in VTK: corners 0 1 2 3, then the middles of 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from itertools import chain
 from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
-from scipy.spatial import cKDTree
 
 from femsense.core.arrays import FloatArray, IntArray, as_points, freeze
 from femsense.core.errors import InputError
@@ -276,9 +275,7 @@ def embed_points(mesh: TetMesh, points: FloatArray, *, outside_rule: str = "near
     """
     points = as_points(points)
     elements = _by_centre(mesh)
-    near = elements.tree.query(points, k=1)
-    centre_distance = np.asarray(near[0], dtype=np.float64).reshape(len(points))
-    element = np.asarray(near[1], dtype=np.int64).reshape(len(points))
+    centre_distance, element = _nearest_centres(elements, points)
     outside = np.zeros(len(points))
     for first in range(0, len(points), AT_ONCE):
         part = slice(first, first + AT_ONCE)
@@ -321,11 +318,13 @@ def weight_slopes(mesh: TetMesh, ties: Embedding, points: FloatArray) -> FloatAr
 ROUNDING = 1e-12
 """Weights below this are rounding. Their products, in the stiffness of cables, would be numbers so small that processors take many times as long
 for them: factors in single precision took twice the time."""
+ONE_BY_ONE = 16
+"""So many points are compared with every centre: importing SciPy's tree takes longer."""
 AT_ONCE = 4096
 """Points that are looked for together."""
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class _Elements:
     """The elements of a mesh, to look up by their centres."""
 
@@ -337,8 +336,13 @@ class _Elements:
     """How far the farthest corner is from its element's centre [m]."""
     size: float
     """Length of the longest side of the box around the mesh [m]."""
-    tree: cKDTree
-    """The centres."""
+
+    @cached_property
+    def tree(self) -> Any:
+        """The centres, to look up by place."""
+        from scipy.spatial import cKDTree
+
+        return cKDTree(self.centres)
 
 
 @lru_cache(maxsize=4)
@@ -346,12 +350,12 @@ def _by_centre(mesh: TetMesh) -> _Elements:
     corners = mesh.nodes[mesh.tets[:, :4]]
     centres = corners.mean(axis=1)
     reach = np.linalg.norm(corners - centres[:, None], axis=2).max()
-    return _Elements(freeze(corners), freeze(centres), float(reach), float(np.ptp(corners, axis=(0, 1)).max()), cKDTree(centres))
+    return _Elements(freeze(corners), freeze(centres), float(reach), float(np.ptp(corners, axis=(0, 1)).max()))
 
 
 def _find_holders(mesh: TetMesh, elements: _Elements, points: FloatArray, element: IntArray) -> IntArray:
     """Write the element that holds each point; return the points that none holds."""
-    point, candidate, _ = _pairs(elements.tree.query_ball_point(points, elements.reach * (1 + 1e-9), return_sorted=False))
+    point, candidate, _ = _pairs(_centres_within(elements, points, np.full(len(points), elements.reach * (1 + 1e-9))))
     may = np.empty(len(point), dtype=bool)
     may_hold(elements.corners, freeze(points), point, candidate, may)
     point, candidate = point[may], candidate[may]
@@ -362,10 +366,28 @@ def _find_holders(mesh: TetMesh, elements: _Elements, points: FloatArray, elemen
 
 def _carriers_of_outsiders(elements: _Elements, points: FloatArray, radius: FloatArray) -> tuple[IntArray, FloatArray]:
     """Return the element nearest to each point outside of the mesh, of those that are as near the one with the nearest centre, and the distance to it [m]."""
-    _, candidate, start = _pairs(elements.tree.query_ball_point(points, radius, return_sorted=False))
+    _, candidate, start = _pairs(_centres_within(elements, points, radius))
     carrier, outside = np.empty(len(points), dtype=np.int64), np.empty(len(points))
     carry(elements.corners, elements.centres, elements.reach, elements.size, freeze(points), candidate, start, carrier, outside)
     return carrier, outside
+
+
+def _nearest_centres(elements: _Elements, points: FloatArray) -> tuple[FloatArray, IntArray]:
+    """Return how far the nearest centre is from each point [m], shape (p,), and of which element, shape (p,)."""
+    if len(points) <= ONE_BY_ONE:
+        square = [((elements.centres - point) ** 2).sum(axis=1) for point in points]
+        nearest = np.array([one.argmin() for one in square], dtype=np.int64)
+        return np.sqrt(np.array([one[k] for one, k in zip(square, nearest)], dtype=np.float64)), nearest
+    distance, nearest = elements.tree.query(points, k=1)
+    return np.asarray(distance, dtype=np.float64), np.asarray(nearest, dtype=np.int64)
+
+
+def _centres_within(elements: _Elements, points: FloatArray, radius: FloatArray) -> Any:
+    """Return for each point the elements whose centres are within its radius [m], shape (p,)."""
+    if len(points) <= ONE_BY_ONE:
+        square = (((elements.centres - point) ** 2).sum(axis=1) for point in points)
+        return [np.flatnonzero(one <= limit**2) for one, limit in zip(square, radius)]
+    return elements.tree.query_ball_point(points, radius, return_sorted=False)
 
 
 def _pairs(found: Any) -> tuple[IntArray, IntArray, IntArray]:

@@ -20,10 +20,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
-from numba import njit
 from scipy.sparse.linalg import SuperLU, splu
 
 from femsense.core.arrays import FloatArray, IntArray, read_only
+from femsense.core.kernels import njit
 from femsense.fem.body import BodyModel
 from femsense.fem.mesh import EDGES
 from femsense.fem.rotation import FAST, closest_rotation, turning_compliance

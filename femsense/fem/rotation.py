@@ -7,9 +7,9 @@ Plain loops over small arrays, which compile in a moment and need no linear-alge
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from femsense.core.arrays import FloatArray
+from femsense.core.kernels import njit
 
 FAST = {"contract", "reassoc", "nsz", "arcp"}
 """Rounding may differ; infinities and NaN are kept."""

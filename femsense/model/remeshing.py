@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from femsense.core.arrays import FloatArray, IntArray, freeze
 from femsense.fem.body import BodyModel, make_body, tie_cable
@@ -38,6 +37,8 @@ def robot_on_mesh(robot: Robot, mesh: TetMesh) -> Robot:
 
     The last ones are kept: what the stiffness of a fine mesh needs beforehand takes as long as some states.
     """
+    from scipy.spatial import cKDTree
+
     old = robot.body.mesh
     boxes = declared_boxes(robot)
     clamped = None if boxes is None else np.flatnonzero(_inside(mesh.nodes, boxes))
@@ -112,6 +113,8 @@ def _plain_body(
     The last ones are kept: pattern, order and ties take as long as some states, and neither material nor friction changes them. Nodes are
     bytes of int64: those that are clamped on the new mesh, and those of the old one that carry springs where the clamp gives.
     """
+    from scipy.spatial import cKDTree
+
     parent = embed_points(old, mesh.nodes[mesh.tets[:, :4]].mean(axis=1)).element
     held = old.nodes[np.frombuffer(springs, np.int64)]
     made = make_body(

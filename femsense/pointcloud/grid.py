@@ -10,10 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import InputError
+from femsense.core.kernels import njit
 
 
 @dataclass(frozen=True, eq=False, slots=True)

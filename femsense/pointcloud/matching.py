@@ -12,10 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from femsense.core.arrays import BoolArray, FloatArray, IntArray, as_points, freeze
 from femsense.core.errors import InputError
+from femsense.core.kernels import njit
 from femsense.pointcloud.grid import VoxelGrid, build_grid, key_of, positive, runs_around
 from femsense.pointcloud.segmentation import surface_pair
 

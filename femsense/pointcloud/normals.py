@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from femsense.core.arrays import FloatArray, IntArray, as_points
+from femsense.core.kernels import njit
 from femsense.pointcloud.grid import build_grid, positive, runs_around, squared_distance
 
 

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from femsense.core.arrays import BoolArray, FloatArray, IntArray, as_points
 from femsense.core.errors import InputError
+from femsense.core.kernels import njit
 from femsense.pointcloud.cloud import PointCloud
 from femsense.pointcloud.grid import (
     adjacent_labels,

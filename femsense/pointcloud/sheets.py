@@ -23,9 +23,9 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from femsense.core.arrays import FloatArray, IntArray, as_points
+from femsense.core.kernels import njit
 from femsense.pointcloud.grid import build_grid, key_of, positive, runs_around
 from femsense.pointcloud.segmentation import surface_pair
 

@@ -8,9 +8,9 @@ Plain loops over small arrays, which compile in a moment and need no linear-alge
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from femsense.core.arrays import BoolArray, FloatArray, IntArray
+from femsense.core.kernels import njit
 from femsense.fem.rotation import rotation_of
 
 INFLUENCES = 4

@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 from numba.extending import intrinsic
 
 from femsense.core.arrays import FloatArray, IntArray
+from femsense.core.kernels import njit
 from femsense.fem.linalg.simd_kernels import (
     WIDE,
     add_run,

@@ -5,10 +5,10 @@ from __future__ import annotations
 
 import numpy as np
 import scipy.sparse as sp
-from numba import njit
 from scipy.sparse.linalg import splu
 
 from femsense.core.arrays import BoolArray, IntArray
+from femsense.core.kernels import njit
 
 # --- analysis ------------------------------------------------------------------------------------------------------------
 

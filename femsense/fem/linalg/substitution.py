@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from femsense.core.arrays import FloatArray, IntArray
+from femsense.core.kernels import njit
 from femsense.fem.linalg.multifrontal import call_blas
 from femsense.fem.linalg.simd_kernels import (
     SIDES,

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from femsense.core.arrays import FloatArray, IntArray
+from femsense.core.kernels import njit
 
 SingleArray = npt.NDArray[np.float32]
 ShortArray = npt.NDArray[np.int32]

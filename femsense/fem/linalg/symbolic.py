@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from femsense.core.arrays import IntArray
+from femsense.core.kernels import njit
 from femsense.fem.linalg.ordering import _elimination_tree, _structures
 from femsense.fem.linalg.simd_kernels import PADDING
 
@@ -189,13 +189,15 @@ def _rooms(parent: IntArray, begin: IntArray, unit: int) -> tuple[IntArray, int]
     count = len(parent)
     room, alive, kept, most = np.zeros(count, np.int64), np.empty(count, np.int64), 0, 0
     for s in range(count):
-        size = (unit * (begin[s + 1] - begin[s])) ** 2
+        height = unit * (begin[s + 1] - begin[s])
+        size = height * height
         at, end = 0, 0
         while at < kept:
             other = alive[at]
             if room[other] - end >= size:
                 break
-            end = room[other] + (unit * (begin[other + 1] - begin[other])) ** 2
+            height = unit * (begin[other + 1] - begin[other])
+            end = room[other] + height * height
             at += 1
         room[s] = end
         most = max(most, end + size)
@@ -225,7 +227,10 @@ def _layout(
 ) -> Any:
     """Return the fields of an `Analysis` from `firsts` on, as far as they follow from the order: one kernel to load instead of six."""
     start, structure = _structures(rows, columns, parent)
-    firsts = _supernodes(start[1:] - start[:-1], parent, unit)
+    count = np.empty(len(parent), np.int64)
+    for j in range(len(parent)):
+        count[j] = start[j + 1] - start[j]
+    firsts = _supernodes(count, parent, unit)
     above, begin, below, place = _relations(firsts, start, structure)
     offset = np.zeros(len(firsts), np.int64)
     for s in range(len(above)):

@@ -13,7 +13,7 @@ from femsense.core.errors import InputError
 from femsense.io.meshes.abaqus import read_abaqus
 from femsense.io.meshes.content import MeshContent, joined
 from femsense.io.meshes.gmsh import read_gmsh
-from femsense.io.meshes.vtu import listed_files, split_pieces
+from femsense.io.meshes.vtu import listed_files, read_own, split_pieces
 
 
 def file_format(path: Path) -> str | None:
@@ -66,6 +66,9 @@ def _read(path: Path, where: str) -> MeshContent:
         return read_abaqus(path, where)
     if kind == "pvtu":
         return joined(read_content(file, str(file)) for file in listed_files(path, where))
+    own = read_own(path.read_bytes()) if kind == "vtu" else None
+    if own is not None:
+        return own
     if kind == "vtu":
         folder = tempfile.TemporaryDirectory(prefix="femsense-")
         with folder:
