@@ -9,7 +9,6 @@ import zlib
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from femsense.core.errors import InputError
 from femsense.io.meshes.content import MeshContent
@@ -32,22 +31,24 @@ def read_own(data: bytes) -> MeshContent | None:
     plain = data.count(b"<Piece ") == 1 and data.count(b"<DataArray") == len(arrays) == 4
     if OWN_HEAD not in data[:200] or not plain or set(arrays) != {b"Points", b"connectivity", b"offsets", b"types"}:
         return None
-    values = {name: _unpacked(text, "<f8" if kind == b"Float64" else "<i8") for name, (kind, text) in arrays.items()}
-    types, nodes = np.unique(values[b"types"]), values[b"connectivity"]
-    kind, width = OWN_KINDS.get(int(types[0]), ("", 0)) if len(types) == 1 else ("", 0)
-    if not width or not np.array_equal(values[b"offsets"], width * np.arange(1, len(values[b"types"]) + 1)):
+    if [arrays[name][0] for name in (b"Points", b"connectivity", b"offsets", b"types")] != [b"Float64", *[b"Int64"] * 3]:
         return None
-    return MeshContent(values[b"Points"].reshape(-1, 3), {kind: nodes.reshape(-1, width)})
+    nodes, offsets, kinds = (np.frombuffer(_unpacked(arrays[name][1]), "<i8") for name in (b"connectivity", b"offsets", b"types"))
+    kind, width = OWN_KINDS.get(int(kinds[0]), ("", 0)) if len(kinds) else ("", 0)
+    if not width or (kinds != kinds[0]).any() or not np.array_equal(offsets, width * np.arange(1, len(kinds) + 1)):
+        return None
+    points = np.frombuffer(_unpacked(arrays[b"Points"][1]), "<f8")
+    return MeshContent(points.reshape(-1, 3).astype(np.float64), {kind: nodes.reshape(-1, width).astype(np.int64)})
 
 
-def _unpacked(text: bytes, kind: str) -> npt.NDArray[np.generic]:
-    """Return the numbers of VTK's compressed blocks: how many, their size, that of the last, then how long each is compressed; each part is base64."""
+def _unpacked(text: bytes) -> bytes:
+    """Return what VTK's compressed blocks hold: how many, their size, that of the last, then how long each is compressed; each part is base64."""
     count = int.from_bytes(base64.b64decode(text[:8])[:4], "little")
     letters = 4 * -(-4 * (3 + count) // 3)
     sizes = np.frombuffer(base64.b64decode(text[:letters]), "<u4")[3:]
     ends, packed = np.cumsum(sizes), base64.b64decode(text[letters:])
     blocks = [zlib.decompress(packed[end - size : end]) for size, end in zip(sizes.tolist(), ends.tolist())]
-    return np.frombuffer(b"".join(blocks), kind)
+    return b"".join(blocks)
 
 
 def pieces_of(data: bytes) -> list[bytes]:
