@@ -56,7 +56,8 @@ print(f"{sum(row[0] for row in recorder.found):6.2f} s in {len(recorder.found)} 
 def seconds(command: list[str], cache: Path | None = None, *, shown: bool = False) -> float:
     """Return user and system time of a command [s]."""
     one = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "FEMSENSE_WORKERS"), "1")
-    environment = os.environ | one | {"PYTHONPATH": str(ROOT)} | ({"NUMBA_CACHE_DIR": str(cache)} if cache else {})
+    kept = {"PYTHONPATH": str(ROOT), "PYTHONDONTWRITEBYTECODE": ""}  # modules are compiled once, as in use
+    environment = os.environ | one | kept | ({"NUMBA_CACHE_DIR": str(cache)} if cache else {})
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     subprocess.run(
         [sys.executable, *command],
