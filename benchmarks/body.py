@@ -28,12 +28,11 @@ import numpy as np
 import scipy.sparse as sp
 from threadpoolctl import ThreadpoolController
 
-from femsense.fem import line_search
 from femsense.fem.assembly import internal, reduced_values
 from femsense.fem.body import BodyModel, make_body, tie_cable
 from femsense.fem.cables import pull_rows
 from femsense.fem.compliance import compliance, direction_rows, tangent_at
-from femsense.fem.equilibrium import SolveOptions, solve_equilibrium
+from femsense.fem.equilibrium import NewtonOptions, SolveOptions, solve_equilibrium
 from femsense.fem.linalg.cholesky import cholesky
 from femsense.fem.linalg.factorization import factorize, pardiso_library
 from femsense.fem.linalg.ordering import _nested_dissection, elimination_work, minimum_degree
@@ -83,8 +82,10 @@ def cold(data: Path) -> None:
             held = document["held_cables"]
             tension = {name: value for name, value in document["tension_n"].items() if name not in held}
 
-            def solve(lawful: BodyModel = lawful, tension: Any = tension, held: Any = held, forces: Any = forces) -> Any:
-                return solve_equilibrium(lawful, tension=tension, shortening=held, nodal_forces=forces)
+            def solve(
+                lawful: BodyModel = lawful, tension: Any = tension, held: Any = held, forces: Any = forces, **given: Any
+            ) -> Any:
+                return solve_equilibrium(lawful, tension=tension, shortening=held, nodal_forces=forces, **given)
 
             (ms, median), sofa = least_and_median_ms(solve), document["newton_steps"] * document["ms_per_step"]
             print(
@@ -93,12 +94,9 @@ def cold(data: Path) -> None:
             )
 
 
-def straight_steps(solve: Callable[[], Any]) -> int:
+def straight_steps(solve: Callable[..., Any]) -> int:
     """Return how many Newton steps a solve takes where no step lets the elements turn."""
-    curved, line_search.CURVED = line_search.CURVED, np.inf
-    count = int(solve().iterations)
-    line_search.CURVED = curved
-    return count
+    return int(solve(options=SolveOptions(newton=NewtonOptions(curved=np.inf))).iterations)
 
 
 def diamond(data: Path, quadratic: bool) -> tuple[BodyModel, np.ndarray]:

@@ -85,15 +85,15 @@ def main() -> NoReturn:
     sys.exit(run(sys.argv[1:]))
 
 
-def run(arguments: Sequence[str]) -> int:
-    """Run a command, print its answer or its error, and return the exit status."""
+def run(arguments: Sequence[str], *, program: typer.Typer = app) -> int:
+    """Run a command of a program, print its answer or its error, and return the exit status."""
     notes: list[str] = []
     as_json = "--json" in arguments
     words = repeat_options(list(arguments)) or ["--help"]
     with _calm_warnings(notes, as_json):
         try:
             with _clean_stdout(as_json), announced_compiling(words, say):
-                answer = app(args=words, prog_name="femsense", standalone_mode=False)
+                answer = program(args=words, prog_name="femsense", standalone_mode=False)
             if isinstance(answer, Answer):
                 return _print(answer, as_json, notes)
             return _fail(STOPPED_TEXT, STOPPED, as_json, notes) if answer == STOPPED else int(answer or 0)

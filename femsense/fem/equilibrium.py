@@ -10,7 +10,7 @@ Friction moves the tensions along a cable (see `cables.rub`); they are updated b
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -22,11 +22,18 @@ from femsense.fem.body import BodyModel
 from femsense.fem.chambers import volume_gradient
 from femsense.fem.linalg.factorization import Factorization
 from femsense.fem.newton import MOST_STEPS, settle
-from femsense.fem.newton_state import CONVERGED, Loads, State, drive_compliance, drive_rows, travel_of, unbalanced_force
+from femsense.fem.newton_state import (
+    CONVERGED,
+    Loads,
+    NewtonOptions,
+    State,
+    drive_compliance,
+    drive_rows,
+    travel_of,
+    unbalanced_force,
+)
 from femsense.fem.stability import can_fall, holds_itself, is_doubtful
 
-TRIES = 30
-"""Newton steps of a state that is only tried."""
 SMALLEST_PART = 2e-3
 """Load steps smaller than this share of the load are stopped early."""
 ADVICE = {
@@ -107,6 +114,8 @@ class SolveOptions:
     """The state is only tried: factors in single precision, and no way to the loads bit by bit where Newton fails from the start."""
     single: bool = False
     """Factors in single precision wherever these are positive definite; the residual and its tolerance are as ever."""
+    newton: NewtonOptions = field(default_factory=NewtonOptions)
+    """When Newton takes a new stiffness, turns elements, or leaves a state that is only tried."""
 
 
 def solve_equilibrium(
@@ -150,9 +159,12 @@ def solve_equilibrium(
     loads = _collect_loads(body, given, nodal_forces, start, how.before, bilateral, how.relative_tolerance)
     state = _initial_state(body, loads, start, how.reuse_factor, how.along)
     rough = how.rough and start is not None
-    state.single, state.rough = rough or how.single, rough
+    state.single, state.rough, state.options = rough or how.single, rough, how.newton
     shares = [s.copy() for s in state.shares]
-    status, reached = settle(body, loads, state, min(how.max_iterations, TRIES) if rough else how.max_iterations), 1.0
+    status, reached = (
+        settle(body, loads, state, min(how.max_iterations, how.newton.steps_tried) if rough else how.max_iterations),
+        1.0,
+    )
     if not rough and status not in (CONVERGED, "singular") and start is not None and start.converged and body.is_held():
         first = _loads_of(body, start, loads)
         state, status, reached = _step_loads(
@@ -321,7 +333,7 @@ def _step_loads(
         the last equilibrium on the way, its status, and which share of the way it is.
     """
     done, step = 0.0, 0.25
-    spent, good.indefinite_steps = failed.iterations, failed.indefinite_steps
+    spent, good.indefinite_steps, good.options = failed.iterations, failed.indefinite_steps, failed.options
     status = settle(body, first, good, max_iterations)
     while status == CONVERGED and done < 1.0:
         part = min(1.0, done + step)

@@ -14,9 +14,6 @@ from femsense.fem.chambers import chamber_volume
 from femsense.fem.newton_state import Loads, State, drive_compliance, drive_rows, kinematic_rows, travel_of
 from femsense.fem.rotated_step import rotated_step
 
-CURVED = 1e-3
-"""Steps longer than this share of the body are tried with elements that turn before they are tried straight."""
-
 
 def line_search(
     body: BodyModel,
@@ -48,7 +45,7 @@ def line_search(
     noise = 1e-12 * (abs(here.energy) + abs(float((loads.forces * x0).sum())) + float(np.abs(T0) @ loads.lever) * 1e-2 + 1e-12)
     reach, longest = body.reach, float(np.abs(step).max(initial=1e-300))
     length = min(1.0, 0.5 * reach / longest)
-    turned = rotated_step(body, x0, length * step) if longest > CURVED * reach else None
+    turned = rotated_step(body, x0, length * step) if longest > state.options.curved * reach else None
     for trial in range(25):
         state.x = x0 + length * step if turned is None else turned
         state.T = T0.copy()

@@ -27,23 +27,17 @@ from femsense.fem.newton_state import (
 )
 from femsense.fem.slack_and_friction import let_go, update_friction, update_slack
 
-INDEFINITE_TRIES = 6
-"""Stiffnesses of such a state that are indefinite: it is too far off where it meets more. Bodies that fold meet 8 to 11 of these in their 30 steps,
-those that converge 4 at most (a trial on bars of `benchmarks/improve.py`)."""
 MOST_STEPS = 1500
 """Newton steps in all, load steps included."""
-CHORD = 1e-2
-"""A stiffness serves for another step where the last one left less than this share of the residual, or where two more such steps are enough
-(unless it was factorised so far off that another one is needed at the end)."""
 SURE = 0.1
-"""Where a step left less than this share, the next one is likely to leave less than CHORD: no tangent is made for the state it leads to."""
+"""Where a step left less than this share, the next one is likely to leave less than `NewtonOptions.chord`: no tangent is made for the state it leads to."""
 LENT = 0.1
 """So does one that was lent by a state near by."""
 RUBS = 0.3
 """So does any where tensions along cables follow the bends, which converge no faster with a stiffness of their own."""
-PATIENCE, PATIENCE_TRIED = 5, 8
-"""In single precision one serves, too, where so many more steps are enough if each leaves the share that the last one left; the latter, about what a
-factor takes, for states that are only tried: others end the farther below their tolerance the better these steps shrink.
+PATIENCE = 5
+"""In single precision one serves, too, where so many more steps are enough if each leaves the share that the last one left. States that are only
+tried have more of it (`NewtonOptions.patience_tried`): others end the farther below their tolerance the better these steps shrink.
 Of a first step nothing is known yet: states that are only tried take a second one."""
 PAIRS = 8
 """Steps since the last factor that are remembered (`Secants`)."""
@@ -100,6 +94,8 @@ def newton(body: BodyModel, loads: Loads, state: State, max_iterations: int) -> 
         force = unbalanced_force(loads, state, here, rows)[free]
         gap = loads.target[held] - travel_of(body, state.x)[held] - stretch * state.T[held] if len(held) else np.zeros(0)
         state.residual = float(np.linalg.norm(force.reshape(-1, 3), axis=1).max(initial=0.0))
+        if state.options.watch is not None:
+            state.options.watch(state.residual)
         sound = bool(np.isfinite(state.residual) and np.isfinite(here.energy))
         closed = bool((np.abs(gap) / loads.lever[held]).max(initial=0.0) <= CLOSED)
         arrived = state.rough and not frictional and length <= ARRIVED * body.reach
@@ -108,9 +104,9 @@ def newton(body: BodyModel, loads: Loads, state: State, max_iterations: int) -> 
         if not sound:
             return "stalled"
         left = state.residual / last if last > 0.0 else np.inf
-        enough = RUBS if follows else LENT if state.borrowed else CHORD
+        enough = RUBS if follows else LENT if state.borrowed else state.options.chord
         sound_to_the_end = state.factored_at <= FAR * loads.tolerance and state.residual * min(left, 1.0) ** 2 <= loads.tolerance
-        patience = PATIENCE_TRIED if state.rough else PATIENCE
+        patience = state.options.patience_tried if state.rough else PATIENCE
         in_sight = state.residual * min(left, 1.0) ** patience <= loads.tolerance
         in_sight |= state.rough and length * min(shrinking, 1.0) ** patience <= ARRIVED * body.reach
         serves = left <= enough or sound_to_the_end or (state.single and in_sight)
@@ -120,7 +116,7 @@ def newton(body: BodyModel, loads: Loads, state: State, max_iterations: int) -> 
             state.factor, state.borrowed = factor_here(body, here, state, H, C, stretch, loads.lever[held]), False
             if state.factor is None:
                 return "singular"
-            if state.rough and state.indefinite_steps > INDEFINITE_TRIES:
+            if state.rough and state.indefinite_steps > state.options.indefinite_tried:
                 return "iterations"
             state.factored_at = state.residual
             secants.pairs.clear()
@@ -200,7 +196,7 @@ def definite_factor(pattern: Pattern, values: FloatArray, state: State) -> Facto
     if state.single:
         plain, state.shift = factorize_definite(pattern, values, single=True, tries=0)
     if plain is None and state.single and first < least_shift(pattern, values):
-        plain = factorize_definite(pattern, values, tries=0)[0]
+        plain, state.shift = factorize_definite(pattern, values, tries=0)
         state.single = plain is None
     if plain is None:
         plain, state.shift = factorize_definite(pattern, values, first=first, single=state.single, indefinite=state.single)

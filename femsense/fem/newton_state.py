@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -14,6 +15,27 @@ from femsense.fem.chambers import volume_changes, volume_gradient
 from femsense.fem.linalg.factorization import Factorization
 
 CONVERGED = "converged"
+
+
+@dataclass(frozen=True, slots=True)
+class NewtonOptions:
+    """When Newton takes a new stiffness, when it turns elements, and when it leaves a state that is only tried."""
+
+    chord: float = 1e-2
+    """A stiffness serves for another step where the last one left less than this share of the residual, or where two more such steps are enough
+    (unless it was factorised so far off that another one is needed at the end)."""
+    curved: float = 1e-3
+    """Steps longer than this share of the body are tried with elements that turn before they are tried straight."""
+    patience_tried: int = 8
+    """In single precision a stiffness of a state that is only tried serves where so many more steps are enough if each leaves the share that the last
+    one left: about what a factor takes."""
+    steps_tried: int = 30
+    """Newton steps of a state that is only tried."""
+    indefinite_tried: int = 6
+    """Stiffnesses of such a state that are indefinite: it is too far off where it meets more. Bodies that fold meet 8 to 11 of these in their 30 steps,
+    those that converge 4 at most (a trial on bars of `benchmarks/improve.py`)."""
+    watch: Callable[[float], None] | None = None
+    """Called with the largest unbalanced nodal force of every iterate [N]."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -57,6 +79,7 @@ class State:
     factored_at: float = 0.0  # residual where the stiffness was last factorised [N]
     here: Internal | None = None  # what Newton saw last, at x
     serves: bool = False  # the factor is likely to serve for the step after this one
+    options: NewtonOptions = field(default_factory=NewtonOptions)
 
 
 def unbalanced_force(loads: Loads, state: State, here: Internal, rows: FloatArray) -> FloatArray:

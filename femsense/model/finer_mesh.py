@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -13,7 +13,7 @@ from femsense.fem.body import BodyModel
 from femsense.fem.cables import shortening
 from femsense.fem.compliance import drive_rows, tangent_at
 from femsense.fem.equilibrium import Equilibrium
-from femsense.fem.linalg.refinement import ROUGH, prepare_roughly, roughly
+from femsense.fem.linalg.refinement import ROUGH, ROUGH_FROM, prepare_roughly, roughly
 from femsense.fem.mesh import Embedding
 from femsense.fem.rotated_step import rotated_step
 from femsense.model.balance import Balance, rubbed
@@ -22,20 +22,24 @@ from femsense.model.drive import DrivenRobot
 FINER_STEPS = 8
 
 
-FINER_ENOUGH = 5e-3
-"""Newton steps on the finer mesh end when the unbalanced force has fallen to this share …"""
-
-
 LAST_STEP = 0.2
-"""… and the last one was no more than this share of the whole way: what bends easily may be far off and leave little force."""
+"""Newton steps end when the last one was no more than this share of the whole way: what bends easily may be far off and leave little force."""
 
 
-PACES = (1.0, 0.5)
-"""Shares of the first steps that are gone, tried in turn: whole ones fold elements where a body is bent much …"""
+@dataclass(frozen=True, slots=True)
+class FinerOptions:
+    """How far the steps on the finer mesh go."""
+
+    enough: float = 5e-3
+    """Newton steps end when the unbalanced force has fallen to this share …"""
+    paces: tuple[float, ...] = (1.0, 0.5)
+    """Shares of the first steps that are gone, tried in turn: whole ones fold elements where a body is bent much, until the force has fallen to NEAR."""
+    rough_from: int = ROUGH_FROM
+    """Unknowns from which on conjugate gradients take the place of a factor."""
 
 
 NEAR = 0.1
-"""… until the unbalanced force has fallen to this share."""
+"""Steps are whole once the unbalanced force has fallen to this share."""
 
 
 LET_BE = 0.01
@@ -52,14 +56,22 @@ def share_on_finer(body: BodyModel) -> None:
     rotated_step(body, body.mesh.nodes, np.zeros_like(body.mesh.nodes))
 
 
-def finer_state(driven: DrivenRobot, fine: DrivenRobot, frame: int, base: Equilibrium, ties: Embedding) -> FloatArray | None:
+def finer_state(
+    driven: DrivenRobot,
+    fine: DrivenRobot,
+    frame: int,
+    base: Equilibrium,
+    ties: Embedding,
+    *,
+    options: FinerOptions | None = None,
+) -> FloatArray | None:
     """Return the equilibrium on a finer mesh [m], shape (n, 3), nearly: Newton steps from a state of a coarser one.
 
     The finer mesh holds the coarse state exactly, but what it softens are single elements, so that two to four steps are needed, with
     elements that turn along each of them. None where the steps do not settle, or run away: far off, forces look small again.
 
     Tried on the bar of `benchmarks/improve.py`, without use: a preconditioner kept from the first step of a state takes as much time in
-    further iterations as it saves, one of another state takes several times as long, and `FINER_ENOUGH` = 0.02 moves the error by a sixth.
+    further iterations as it saves, one of another state takes several times as long, and `FinerOptions.enough` = 0.02 moves the error by a sixth.
     To begin where the finer mesh lay beside another model saves a step of three, but elements that do not fit there may fold: the state was
     then missing, and the error of the mesh a third too small in that frame.
 
@@ -69,12 +81,14 @@ def finer_state(driven: DrivenRobot, fine: DrivenRobot, frame: int, base: Equili
         frame: index of the frame.
         base: the coarse state of that frame.
         ties: of the fine nodes to the coarse mesh.
+        options: how far the steps go.
     """
-    for pace in PACES:
+    how = options or FinerOptions()
+    for pace in how.paces:
         try:
-            x = _stepped(driven, fine, frame, base, ties, pace)
+            x = _stepped(driven, fine, frame, base, ties, pace, how)
         except FemsenseError:
-            if pace == PACES[-1]:
+            if pace == how.paces[-1]:
                 raise
             continue
         if x is not None:
@@ -83,7 +97,13 @@ def finer_state(driven: DrivenRobot, fine: DrivenRobot, frame: int, base: Equili
 
 
 def _stepped(
-    driven: DrivenRobot, fine: DrivenRobot, frame: int, base: Equilibrium, ties: Embedding, pace: float
+    driven: DrivenRobot,
+    fine: DrivenRobot,
+    frame: int,
+    base: Equilibrium,
+    ties: Embedding,
+    pace: float,
+    how: FinerOptions,
 ) -> FloatArray | None:
     """Return what `finer_state` is after; the first steps go so far of the way."""
     body, balance = fine.robot.body, Balance(driven, frame, base)
@@ -91,13 +111,13 @@ def _stepped(
     at, force, first = _pulling(fine, balance, base, x)
     size, share = first, 1.0
     for _ in range(FINER_STEPS):
-        if size <= FINER_ENOUGH * first and share <= LAST_STEP:
-            held, at = at.held, _retaut(fine, frame, at, x, LET_BE * np.abs(x - coarse).max())
+        if size <= how.enough * first and share <= LAST_STEP:
+            held, at = at.held, retaut(fine, frame, at, x, LET_BE * np.abs(x - coarse).max())
             if (at.held == held).all():
                 return x
         enough = min(EARLY, ROUGH * first / size) if size < first else EARLY
         here = replace(base, positions=x, factor=None, held=at.held)
-        tangent = tangent_at(body, here, partial(roughly, tolerance=enough))
+        tangent = tangent_at(body, here, partial(roughly, tolerance=enough, pays_from=how.rough_from))
         move = tangent.respond(force[None])[0]
         if at.held.any():
             missing = _missing(fine, frame, at, x)[at.held[: len(body.cables)]]
@@ -110,7 +130,7 @@ def _stepped(
             return None
         share = np.abs(move).max() / max(way, 1e-300)
         at, force, size = _pulling(fine, balance, at, x)
-    return x if size <= FINER_ENOUGH * first else None
+    return x if size <= how.enough * first else None
 
 
 def _pulling(fine: DrivenRobot, balance: Balance, at: Equilibrium, x: FloatArray) -> tuple[Equilibrium, FloatArray, float]:
@@ -137,7 +157,7 @@ def _missing(fine: DrivenRobot, frame: int, at: Equilibrium, x: FloatArray) -> F
     return np.asarray(fine.drive.inputs[frame] - stretch - shortening(body, x))
 
 
-def _retaut(fine: DrivenRobot, frame: int, at: Equilibrium, x: FloatArray, least: float) -> Equilibrium:
+def retaut(fine: DrivenRobot, frame: int, at: Equilibrium, x: FloatArray, least: float) -> Equilibrium:
     """Return a state at x with the held cables slack that would push there, and those taut that are too long by more than a length [m]."""
     if fine.drive.control != "displacement":
         return at

@@ -25,8 +25,9 @@ from femsense.model.balance import Balance
 from femsense.model.drive import DrivenRobot, frame_key, has_history
 from femsense.model.frame_state import require_converged, solve_frame
 from femsense.model.linear_answers import AtPoints
+from femsense.model.path_solver import PathSolver
 from femsense.model.robot import Robot
-from femsense.model.variants import Variants, room_for_factor
+from femsense.model.variants import Variants, most_lent, room_for_factor
 
 TRIED = 1e-8
 """Relative tolerance of states that are only tried: below a thousandth of a millimetre, where derivatives want a tenth of it."""
@@ -45,6 +46,7 @@ def solve_path(
     starts: dict[int, Equilibrium] | None = None,
     rough: bool = False,
     answers: dict[int, AtPoints] | None = None,
+    solver: PathSolver | None = None,
 ) -> Iterator[tuple[int, Equilibrium, FloatArray, FloatArray]]:
     """Solve frames in order, and with each the same frame of variants that differ from it by little.
 
@@ -62,24 +64,25 @@ def solve_path(
         rough: states are only tried, where one near by is known.
         answers: frame → what its points answer to, from an earlier path along these very states with other variants; what is missing is
             added where the points are few.
+        solver: what it is solved with.
 
     Yields:
         frame index, equilibrium, where the points are [m], shape (p, 3), and where those of the variants are, shape (v, p, 3).
     """
-    wanted = sorted(set(int(f) for f in frames))
+    wanted, solver = sorted(set(int(f) for f in frames)), solver or PathSolver()
     past = has_history(driven.robot)
     todo = list(range(max(wanted) + 1)) if wanted and any(has_history(w.robot) for w in (driven, *variants)) else wanted
     alike = _alike(driven, todo, past)
     unique = [k for k in todo if alike[k] == k]
-    bases = dict(zip(unique, _base_states(driven, unique, starts, past, rough)))
+    bases = dict(zip(unique, _base_states(driven, unique, starts, past, rough, solver.equilibrium)))
     seen = {k: ties(driven.robot).positions(bases[k].positions) for k in {alike[k]: None for k in wanted}}
     others = {k: np.zeros((len(variants), *seen[alike[k]].shape)) for k in wanted}
     lent = {k: s.factor for k, s in (starts or {}).items() if k in bases and s.positions is bases[k].positions}
-    observed = Variants(driven, variants, {k: bases[alike[k]] for k in todo}, alike, others, ties, lent, answers)
+    observed = Variants(driven, variants, {k: bases[alike[k]] for k in todo}, alike, others, ties, lent, answers, solver)
     room = room_for_factor(len(unique))
     for k, factor in observed.write():
         plain = factor.plain if isinstance(factor, Refined) else factor
-        if plain is not None and starts is not None and plain.bytes < _most_lent(starts[k], room):
+        if plain is not None and starts is not None and plain.bytes < most_lent(starts[k], room):
             starts[k] = replace(starts[k], factor=plain)
     for k in wanted:
         yield k, bases[alike[k]], seen[alike[k]], others[k]
@@ -121,13 +124,13 @@ def _alike(driven: DrivenRobot, frames: list[int], past: bool) -> dict[int, int]
     return result
 
 
-def _most_lent(state: Equilibrium, room: float) -> float:
-    """Return how many bytes a factor may take to be kept with a state: no more than the one it takes the place of, which is near enough."""
-    return room if state.factor is None else min(room, state.factor.bytes + 1)
-
-
 def _base_states(
-    driven: DrivenRobot, frames: list[int], starts: dict[int, Equilibrium] | None, past: bool, rough: bool
+    driven: DrivenRobot,
+    frames: list[int],
+    starts: dict[int, Equilibrium] | None,
+    past: bool,
+    rough: bool,
+    solve: Callable[..., Equilibrium],
 ) -> Iterator[Equilibrium]:
     """Yield the states of frames, without their factors; `starts` gets them with these where they fit into memory."""
     room = room_for_factor(len(frames))
@@ -148,7 +151,7 @@ def _base_states(
     def again(k: int, before: tuple[FloatArray, ...] | None = None, start: Equilibrium | None = None) -> Equilibrium:
         start, tried = near[k] if start is None else start, rough and k in known
         return require_converged(
-            solve_frame(
+            solve(
                 driven,
                 k,
                 start=start,
@@ -171,9 +174,7 @@ def _base_states(
             last = states[-1] if states else None
             before = last.segment_tensions if past and last is not None else None
             states.append(
-                keep(
-                    k, require_converged(solve_frame(driven, k, start=last, options=SolveOptions(before=before, single=True)), k)
-                )
+                keep(k, require_converged(solve(driven, k, start=last, options=SolveOptions(before=before, single=True)), k))
             )
         return states
 

@@ -11,15 +11,15 @@ import numpy as np
 from femsense.core.arrays import FloatArray
 from femsense.core.parallel import each
 from femsense.fem.cables import bend_angles, rub
-from femsense.fem.compliance import tangent_at
 from femsense.fem.equilibrium import Equilibrium, SolveOptions
 from femsense.fem.linalg.factorization import Factorization, available_memory, factorize
 from femsense.fem.linalg.refinement import refined
 from femsense.fem.mesh import Embedding
 from femsense.model.balance import Balance, Tensions, motor_tensions
 from femsense.model.drive import DrivenRobot, body_in, frame_key, has_history
-from femsense.model.frame_state import require_converged, solve_frame
+from femsense.model.frame_state import require_converged
 from femsense.model.linear_answers import Answers, AtPoints, Upset, segment_forces
+from femsense.model.path_solver import PathSolver
 from femsense.model.robot import Robot
 
 FACTOR_MEMORY = 2e9
@@ -34,6 +34,11 @@ MANY_POINTS = 40
 def room_for_factor(count: int) -> float:
     """Return how much memory a factor may take where so many are kept [bytes]."""
     return min(FACTOR_MEMORY, MEMORY_SHARE * available_memory()) / max(count, 1)
+
+
+def most_lent(state: Equilibrium, room: float) -> float:
+    """Return how many bytes a factor may take to be kept with a state: no more than the one it takes the place of, which is near enough."""
+    return room if state.factor is None else min(room, state.factor.bytes + 1)
 
 
 Job = tuple[int, int, list[int]]
@@ -53,7 +58,9 @@ class Variants:
         ties: Callable[[Robot], Embedding],
         lent: dict[int, Factorization | None],
         known: dict[int, AtPoints] | None,
+        solver: PathSolver,
     ) -> None:
+        self.solver = solver
         self.driven, self.variants, self.bases, self.alike, self.others, self.lent = driven, variants, bases, alike, others, lent
         self.ties = [ties(v.robot) for v in variants]
         self.own_ties = ties(driven.robot)
@@ -96,7 +103,9 @@ class Variants:
         variant = self.variants[i]
         memory: Tensions | None = None
         for k in self.bases if has_history(variant.robot) else self.others:
-            state = require_converged(solve_frame(variant, k, start=self.bases[k], options=SolveOptions(before=memory)), k)
+            state = require_converged(
+                self.solver.equilibrium(variant, k, start=self.bases[k], options=SolveOptions(before=memory)), k
+            )
             memory = state.segment_tensions if has_history(variant.robot) else None
             if k in self.others:
                 self.others[k][i] = self.ties[i].positions(state.positions)
@@ -126,7 +135,7 @@ class Variants:
         columns, at_points = len(self.plain) + len(self.rubbing), 3 * len(self.own_ties)
         few = (at_points if self.known is not None else min(columns, at_points)) <= FEW_COLUMNS
         solver = partial(refined, lent=self.lent.get(k)) if few else factorize
-        return Answers(partial(tangent_at, body_in(self.driven, k), self.bases[k], solver), 2 if self.rubbing else 1)
+        return Answers(partial(self.solver.tangent, body_in(self.driven, k), self.bases[k], solver), 2 if self.rubbing else 1)
 
     def _jobs(self, group: list[int], which: Sequence[int]) -> list[Job]:
         """Return what is to be computed of some variants in frames with one base state."""

@@ -211,7 +211,7 @@ def true_path(robot: Robot, plan: Plan, *, substeps: int = 3) -> list[TrueFrame]
         DataError: where there is no equilibrium.
     """
     inputs = true_inputs(robot, plan)
-    path = _TruePath(robot, plan)
+    path = TruePath(robot, plan)
     frames, last = [], path.nothing()
     loads = path.frame_loads(inputs)
     for k, load in enumerate(loads):
@@ -222,7 +222,7 @@ def true_path(robot: Robot, plan: Plan, *, substeps: int = 3) -> list[TrueFrame]
     return frames
 
 
-class _TruePath:
+class TruePath:
     """The state of the truth, moved on step by step; bodies without friction carry given tensions along their cables."""
 
     def __init__(self, robot: Robot, plan: Plan) -> None:

@@ -35,7 +35,7 @@ from femsense.sensing.tracks import contacts_of, smoothed
 from femsense.sensing.types import ContactForce, Done, FrameReport, Run, SensedFrame, SensingOptions, Sensor, States
 
 CHECKPOINT_S = 10.0
-"""Seconds of work that a killed estimate may lose."""
+"""Seconds of work that a killed estimate may lose, if nothing else is asked for."""
 
 
 @one_blas_thread()
@@ -48,6 +48,7 @@ def estimate(
     options: SensingOptions | None = None,
     progress: Callable[[int, int], None] | None = None,
     keep: tuple[str | Path, Mapping[str, Any]] | None = None,
+    keep_every_s: float = CHECKPOINT_S,
 ) -> Run:
     """Find contacts and forces in every frame: from clouds, or from markers where there are none.
 
@@ -63,6 +64,7 @@ def estimate(
         progress: called with (frames done, frames in all).
         keep: a file that holds the frames that are done, so that an estimate that is killed goes on there, and what it is made from: a file that
             says something else is not used. It is removed at the end.
+        keep_every_s: seconds of work that a killed estimate may lose.
 
     Raises:
         InputError: no clouds and no places; DataError: not one frame gave a result.
@@ -81,7 +83,7 @@ def estimate(
             _sense_into(done, sense, sensor, k)
             if progress is not None:
                 progress(k + 1, count)
-            checkpoint.keep(done, every=CHECKPOINT_S)
+            checkpoint.keep(done, every=keep_every_s)
     if all(np.isnan(report.rms_before_m) for report in done.reports):
         raise DataError(f"not one of {count} frames gave a result; the first: {done.reports[0].status}")
     mesh = robot.body.mesh

@@ -47,7 +47,7 @@ class ViewServer(ThreadingHTTPServer):
 
     def stop(self) -> None:
         """Stop answering, free the port, remove temporary files."""
-        if self._thread.is_alive():
+        if self._thread.ident is not None:  # an interrupted `wait` leaves a thread that says it is not alive
             self.shutdown()
         self.server_close()
         self.scratch.cleanup()

@@ -12,6 +12,7 @@ shuffles, and gives another mesh each time: the script makes a few and keeps the
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -167,12 +168,14 @@ def turned(points: FloatArray, turns: int) -> FloatArray:
 # The tetrahedra
 
 
-def best_mesh(surface: Any, legs: dict[str, FloatArray], tries: int = TRIES) -> TetMesh:
+def best_mesh(
+    surface: Any, legs: dict[str, FloatArray], tries: int = TRIES, fill: Callable[..., TetMesh] = tetrahedralise
+) -> TetMesh:
     """Return, of a few fillings of the surface that are small enough, the one whose flattest tetrahedron is the least flat."""
     points, triangles = np.array(surface.vertices), np.array(surface.faces)
     best, score = None, 0.0
     for attempt in range(tries):
-        mesh = tetrahedralise(points, triangles, edge_fraction=EDGE_FRACTION, where="four-leg")
+        mesh = fill(points, triangles, edge_fraction=EDGE_FRACTION, where="four-leg")
         check_mesh(mesh, "four-leg")
         quality, count = radius_ratio(mesh), unknowns(mesh, legs)
         worst, usual = quality.min(), np.median(quality)

@@ -2,28 +2,38 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
 import signal
+import socket
 import subprocess
 import sys
+import threading
 import time
+import urllib.request
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import pytest
+import typer
 from helpers import write_block_robot, write_small_recording
+from small_run import make_run
 
 import femsense
 from femsense.app import cli
+from femsense.app.command_line.answer import Answer
 from femsense.app.command_line.parameters import split_names
 from femsense.app.commands import loop_page
 from femsense.core.errors import DataError, InputError
 from femsense.io.files import PART_PREFIX
+from femsense.io.robot_toml import load_robot
+from femsense.sensing.run_files import write_run
+from femsense.xr.view import PAGE
 
 COMMANDS = tuple(cli.COMMANDS)
 ROOT = Path(femsense.__file__).parents[1]
@@ -71,8 +81,8 @@ def run(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> A
     """Run a command in this process."""
     monkeypatch.delenv("FEMSENSE_DEBUG", raising=False)
 
-    def run_command(*arguments: object) -> Spoken:
-        status = cli.run([str(argument) for argument in arguments])
+    def run_command(*arguments: object, **given: Any) -> Spoken:
+        status = cli.run([str(argument) for argument in arguments], **given)
         said = capfd.readouterr()
         assert "Traceback" not in said.out + said.err
         return Spoken(status, said.out, said.err)
@@ -86,13 +96,24 @@ def command(*arguments: object, **options: Any) -> subprocess.CompletedProcess[s
     return subprocess.run(words, capture_output=True, text=True, cwd=ROOT, check=False, **options)
 
 
-def fail_with(monkeypatch: pytest.MonkeyPatch, error: BaseException) -> None:
-    """Let `femsense inspect` meet an error."""
+def program_of(work: Callable[[], Any]) -> typer.Typer:
+    """Return a program whose command `work` does this."""
+    program = typer.Typer(callback=lambda: None, pretty_exceptions_enable=False)
 
-    def inspect_path(path: str, **_: Any) -> None:
+    @program.command("work")
+    def command_of(json: Annotated[bool, typer.Option("--json")] = False) -> Any:
+        return work()
+
+    return program
+
+
+def failing(error: BaseException) -> typer.Typer:
+    """Return a program whose command `work` meets an error."""
+
+    def fail() -> None:
         raise error
 
-    monkeypatch.setattr("femsense.app.inspect.inspect_path", inspect_path)
+    return program_of(fail)
 
 
 # Help and usage
@@ -192,16 +213,16 @@ def test_warnings_are_one_line_each_and_stand_in_the_json(run: Any, tmp_path: Pa
     assert len(lines) == 1 and lines[0].startswith("warning: ") and "stacklevel" not in said.err
 
 
-def test_warnings_of_libraries_that_mean_nothing_to_users_are_not_shown(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    def inspect_path(path: str, **_: Any) -> dict[str, Any]:
+def test_warnings_of_libraries_that_mean_nothing_to_users_are_not_shown(run: Any) -> None:
+    def warned() -> Answer:
         warnings.warn("dividing by zero", RuntimeWarning, stacklevel=2)
         warnings.warn("old", DeprecationWarning, stacklevel=2)
         for _ in range(2):
             warnings.warn("look\n  here", UserWarning, stacklevel=2)
-        return {"path": "x", "kind": "unknown", "problems": [], "warnings": []}
+        return Answer({}, "done")
 
-    monkeypatch.setattr("femsense.app.inspect.inspect_path", inspect_path)
-    assert run("inspect", "x").err == "warning: look here\n"
+    said = run("work", program=program_of(warned))
+    assert said.err == "warning: look here\n" and said.out == "done\n"
 
 
 # Errors
@@ -227,16 +248,14 @@ def test_every_error_is_a_message_and_an_exit_status(
     run: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, error: BaseException, status: int, text: str
 ) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    fail_with(monkeypatch, error)
-    said = run("inspect", "x")
+    said = run("work", program=failing(error))
     assert said.status == status and said.out == "" and text in said.err
-    assert run("inspect", "x", "--json").json["exit_status"] == status
+    assert run("work", "--json", program=failing(error)).json["exit_status"] == status
 
 
 def test_details_of_an_internal_error_stand_in_a_file(run: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    fail_with(monkeypatch, ZeroDivisionError("oh"))
-    said = run("inspect", "x")
+    said = run("work", program=failing(ZeroDivisionError("oh")))
     (file,) = tmp_path.glob("femsense-error-*.txt")
     assert str(file) in said.err and said.err.count("\n") == 1
     assert "Traceback" in file.read_text() and "ZeroDivisionError: oh" in file.read_text()
@@ -244,9 +263,8 @@ def test_details_of_an_internal_error_stand_in_a_file(run: Any, monkeypatch: pyt
 
 def test_debugging_raises(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FEMSENSE_DEBUG", "1")
-    fail_with(monkeypatch, ZeroDivisionError("oh"))
     with pytest.raises(ZeroDivisionError):
-        cli.run(["inspect", "x"])
+        cli.run(["work"], program=failing(ZeroDivisionError("oh")))
 
 
 @pytest.mark.parametrize("name", ["robot.toml", "recording.toml", "frames.csv", "markers.csv", "block.vtu"])
@@ -369,24 +387,30 @@ def test_names(names: list[str] | None, parsed: list[str] | None) -> None:
     assert split_names(names) == parsed
 
 
-def test_view_says_where_and_ends(run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    class Server:
-        url = "http://127.0.0.1:1/"
-        stopped = False
+@pytest.mark.skipif(not (PAGE / "index.html").is_file(), reason="the page is not built")
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
+def test_view_says_where_and_ends(run: Any, robot: Path, tmp_path: Path) -> None:
+    write_run(make_run(load_robot(robot)), tmp_path / "run", inputs={})
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    url, answered = f"http://127.0.0.1:{port}/", list[int]()
 
-        def wait(self) -> None:
-            raise KeyboardInterrupt
+    def look_and_stop() -> None:
+        for _ in range(200):
+            with contextlib.suppress(OSError), urllib.request.urlopen(url) as page:
+                answered.append(page.status)
+                break
+            time.sleep(0.05)
+        os.kill(os.getpid(), signal.SIGINT)
 
-        def __enter__(self) -> Server:
-            return self
-
-        def __exit__(self, *_: object) -> None:
-            self.stopped = True
-
-    server = Server()
-    monkeypatch.setattr("femsense.xr.view.serve", lambda *_, **__: server)
-    said = run("view", tmp_path, "--no-browser", "--json")
-    assert said.status == 0 and said.json["url"] == server.url and server.stopped
+    looking = threading.Thread(target=look_and_stop)
+    looking.start()
+    said = run("view", tmp_path / "run", "--port", port, "--no-browser", "--json")
+    looking.join()
+    assert said.status == 0 and said.json["url"] == url and answered == [200]
+    with socket.socket() as free:
+        assert free.connect_ex(("127.0.0.1", port)) != 0  # nobody answers any more
 
 
 # Being stopped
@@ -396,28 +420,36 @@ def test_view_says_where_and_ends(run: Any, tmp_path: Path, monkeypatch: pytest.
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_stopping_leaves_nothing_half_written(tmp_path: Path, robot: Path, recording: Path, number: int) -> None:
     code = (
-        "import femsense.calib.calibrate as c, sys, time\nfrom femsense.sensing.run_files import _write_states\nimport femsense.sensing.run_files as r\n"
-        "def slow(*arguments):\n    _write_states(*arguments)\n    print('writing', file=sys.stderr, flush=True)\n    time.sleep(60)\n"
-        "r._write_states = slow\nimport signal\n"
+        "import signal\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background inherits that it is ignored\n"
         "from femsense.app.cli import main\nmain()"
     )
     words: Sequence[str] = ["estimate", str(robot), str(recording), "-o", str(tmp_path / "run"), "--at", "0.1,0.015,0.015"]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    with subprocess.Popen(
-        [sys.executable, "-c", code, *words], stderr=subprocess.PIPE, text=True, env=environment, cwd=tmp_path
-    ) as process:
-        assert process.stderr is not None
-        said = ""
-        while "writing" not in said:
-            line = process.stderr.readline()
-            assert line, said
-            said += line
-        time.sleep(0.1)
-        process.send_signal(number)
-        rest = process.stderr.read()
-    assert process.returncode == 130 and rest == "femsense: stopped; nothing half-written is left, and the same command goes on\n"
-    assert not (tmp_path / "run").exists() and not [p for p in tmp_path.iterdir() if PART_PREFIX in p.name]
+
+    def half_written() -> list[Path]:
+        return [path for path in tmp_path.iterdir() if PART_PREFIX in path.name]
+
+    for _ in range(5):  # it writes for a few milliseconds, and may be done before it is halted
+        with subprocess.Popen(
+            [sys.executable, "-c", code, *words], stderr=subprocess.PIPE, text=True, env=environment, cwd=tmp_path
+        ) as process:
+            assert process.stderr is not None
+            while not half_written() and process.poll() is None:
+                time.sleep(1e-4)
+            process.send_signal(signal.SIGSTOP)
+            time.sleep(0.02)
+            caught = bool(half_written())
+            process.send_signal(number)
+            process.send_signal(signal.SIGCONT)
+            said = process.stderr.read()
+        if caught:
+            break
+        shutil.rmtree(tmp_path / "run", ignore_errors=True)
+    assert caught, said
+    assert process.returncode == 130
+    assert said.endswith("femsense: stopped; nothing half-written is left, and the same command goes on\n")
+    assert not (tmp_path / "run").exists() and not half_written()
 
 
 @pytest.mark.skipif(shutil.which("head") is None, reason="no head")

@@ -16,7 +16,7 @@ from femsense.app.demo.picture import draw_demo
 from femsense.app.demo.truth import TrueContact, force_errors, read_truth, true_effects
 from femsense.core.errors import InputError
 from femsense.io.clouds.images import read_png
-from femsense.io.robot_toml import load_robot
+from femsense.io.robot_toml import load_robot, robot_names
 from femsense.model.robot import Robot
 from femsense.report.text import columns, effect_text, loop_text, run_text
 from femsense.sensing.types import Run
@@ -157,20 +157,21 @@ def test_the_closing_table_and_the_picture(run: Run, tmp_path: Path) -> None:
         assert image.shape[1] > 1000 and 0.02 < float((image[..., :3].min(axis=2) < 200).mean()) < 0.6
 
 
-def test_the_chain(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_chain(run: Run, tmp_path: Path) -> None:
     calls: list[tuple[str, str]] = []
-    monkeypatch.setattr(demo, "demo_recording", lambda: tmp_path / "recording")
-    monkeypatch.setattr(demo, "estimate_into", lambda folder, robot, *_, **__: (calls.append((folder.name, str(robot))), run)[1])
-    monkeypatch.setattr(demo, "improve_into", lambda folder, robot, *_, **__: (calls.append((folder.name, str(robot))), LOOP)[1])
+    steps = demo.DemoSteps(
+        estimate=lambda folder, robot, *_, **__: (calls.append((folder.name, str(robot))), run)[1],
+        improve=lambda folder, robot, *_, **__: (calls.append((folder.name, str(robot))), LOOP)[1],
+    )
     said: list[str] = []
-    document = demo.run_demo(tmp_path / "out", say=said.append)
+    document = demo.run_demo(tmp_path / "out", say=said.append, steps=steps)
     assert calls == [("declared", "four-leg"), ("loop", "four-leg"), ("run", str(tmp_path / "out" / "loop"))]
     assert [line[:3] for line in said[:4]] == ["1/4", "2/4", "3/4", "4/4"]
     assert {"robot.glb", "picture.png", "demo.json"} <= {path.name for path in (tmp_path / "out").iterdir()}
-    assert document["declared"]["contacts_true"] == 0
+    assert document["declared"]["contacts_true"] == len(read_truth(demo.demo_recording(robot_names()))) > 0
 
 
-def test_a_missing_recording_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(demo, "robot_names", lambda: {"four-leg": tmp_path})
+@pytest.mark.parametrize("name", ["four-leg", "other"])
+def test_a_missing_recording_is_named(tmp_path: Path, name: str) -> None:
     with pytest.raises(InputError, match="the demo's recording is not in this installation"):
-        demo.run_demo(tmp_path, say=lambda text: None)
+        demo.demo_recording({name: tmp_path})

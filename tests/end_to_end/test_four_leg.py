@@ -117,7 +117,7 @@ def test_the_script_makes_the_table_that_is_there() -> None:
     assert build.robot_document(build.build_surface()[1]) == load_robot("four-leg").document
 
 
-def test_the_script_keeps_the_best_mesh_that_is_small_enough(monkeypatch: pytest.MonkeyPatch, robot: Robot) -> None:
+def test_the_script_keeps_the_best_mesh_that_is_small_enough(robot: Robot) -> None:
     build = _build()
     surface, legs = build.build_surface()
     good = to_linear(robot.body.mesh)
@@ -125,11 +125,9 @@ def test_the_script_keeps_the_best_mesh_that_is_small_enough(monkeypatch: pytest
     fine = refined(good)
     assert build.unknowns(good, legs) == len(robot.body.free_map.dofs)
     meshes = iter([worse, good, fine, worse])
-    monkeypatch.setattr(build, "tetrahedralise", lambda *_, **__: next(meshes))
-    assert build.best_mesh(surface, legs, tries=4) is good
-    monkeypatch.setattr(build, "tetrahedralise", lambda *_, **__: fine)
+    assert build.best_mesh(surface, legs, tries=4, fill=lambda *_, **__: next(meshes)) is good
     with pytest.raises(InputError, match="small enough"):
-        build.best_mesh(surface, legs, tries=1)
+        build.best_mesh(surface, legs, tries=1, fill=lambda *_, **__: fine)
 
 
 def test_the_clamps_hold_the_feet_alone(robot: Robot) -> None:

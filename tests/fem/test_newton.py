@@ -12,36 +12,21 @@ from analytic import bar_body
 from helpers import block_mesh
 from hollow_bar_cable import hollow
 
+from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
-from femsense.fem import equilibrium, line_search, newton, newton_state
+from femsense.fem import newton, newton_state
 from femsense.fem.assembly import internal, reduced_matrix
 from femsense.fem.body import BodyModel, make_body, tie_cable
 from femsense.fem.cables import bend_angles
 from femsense.fem.cavities import find_chamber
 from femsense.fem.compliance import tangent_at
-from femsense.fem.equilibrium import Equilibrium, SolveOptions, solve_equilibrium
+from femsense.fem.equilibrium import Equilibrium, NewtonOptions, SolveOptions, solve_equilibrium
+from femsense.fem.linalg.factorization import factorize, factorize_definite
 from femsense.fem.mesh import TetMesh, to_quadratic
 
 E, LENGTH, WIDTH, SIDE = 200e3, 0.1, 0.013, 0.01
 EULER = np.pi**2 * E * WIDTH * SIDE**3 / 12 / (4 * LENGTH**2)
 """Load at which a clamped column with a free end buckles [N]."""
-
-
-@pytest.fixture
-def residuals(monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    """The unbalanced force of every Newton iterate, in turn [N]."""
-    seen: list[float] = []
-    plain = newton_state.unbalanced_force
-    free: dict[str, Any] = {}
-
-    def watched(loads: Any, state: Any, here: Any, rows: Any) -> np.ndarray:
-        force = plain(loads, state, here, rows)
-        seen.append(float(np.linalg.norm(force[free["dofs"]])))
-        return force
-
-    watched.free = free  # type: ignore[attr-defined]
-    monkeypatch.setattr(newton, "unbalanced_force", watched)
-    return seen
 
 
 # Order
@@ -56,17 +41,17 @@ def residuals(monkeypatch: pytest.MonkeyPatch) -> list[float]:
         {"tension": {"top": 2.0}, "volume": {"core": 8e-7}},
     ],
 )
-def test_newton_is_quadratic_near_the_solution(
-    law: str, given: dict[str, Any], residuals: list[float], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The last steps above rounding: log r₂/r₁ over log r₁/r₀ is 2, at least 1.6."""
+def test_newton_is_quadratic_near_the_solution(law: str, given: dict[str, Any]) -> None:
+    """The last steps above rounding: log r₂/r₁ over log r₁/r₀ is 2, at least 1.6.
+
+    Every step has a stiffness of its own and is straight: where elements turn, too few steps are left to see an order.
+    """
     body = hollow(law)
     if law == "gent":
         body = body.with_material(replace(body.material, stretch_limit=2.0))
-    newton.unbalanced_force.free["dofs"] = body.free_map.dofs  # type: ignore[attr-defined]
-    monkeypatch.setattr(newton, "CHORD", 0.0)  # every step with a stiffness of its own
-    monkeypatch.setattr(line_search, "CURVED", np.inf)  # straight: where elements turn, too few steps are left to see an order
-    state = solve_equilibrium(body, options=SolveOptions(relative_tolerance=1e-13), **given)
+    residuals = list[float]()
+    how = NewtonOptions(chord=0.0, curved=np.inf, watch=residuals.append)
+    state = solve_equilibrium(body, options=SolveOptions(relative_tolerance=1e-13, newton=how), **given)
     assert state.converged and state.indefinite_steps == 0
     near = [r for r in residuals if r > 1e-8]
     order = np.log(near[-1] / near[-2]) / np.log(near[-2] / near[-3])
@@ -194,40 +179,27 @@ def test_a_load_that_cannot_be_borne_is_reported_with_the_share_that_was() -> No
     assert part.converged and part.reached == 1.0
 
 
-def test_load_steps_keep_the_given_losses_along_a_cable(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_load_steps_keep_the_given_losses_along_a_cable() -> None:
     """A cable without friction of its own carries the shares that are given along it, also where load steps are needed."""
     body = bar_body(block_mesh((4, 1, 1)))
     start = solve_equilibrium(body, tension={"side": 1.0})
     along = (np.ones_like(start.segment_tensions[0]), np.array([0.4, 1.0]))
     wanted = solve_equilibrium(body, tension={"side": 4.0}, start=start, options=SolveOptions(along=along))
     assert wanted.segment_tensions[1].tolist() == [1.6, 4.0]
-    plain, calls = equilibrium.settle, []
-
-    def fails_at_first(*arguments: Any) -> str:
-        calls.append(0)
-        return "stalled" if len(calls) in (1, 4) else plain(*arguments)
-
-    monkeypatch.setattr(equilibrium, "settle", fails_at_first)
-    stepped = solve_equilibrium(body, tension={"side": 4.0}, start=start, options=SolveOptions(along=along))
-    assert len(calls) > 4 and stepped.converged
+    stepped = solve_equilibrium(body, tension={"side": 4.0}, start=start, options=SolveOptions(along=along, max_iterations=4))
+    assert stepped.converged and stepped.iterations > 3 * 4  # more than the first try, and a step or two: these failed
     np.testing.assert_allclose(stepped.segment_tensions[1], [1.6, 4.0])
     np.testing.assert_allclose(stepped.positions, wanted.positions, atol=1e-8)
 
 
-def test_load_steps_go_on_from_the_start(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_load_steps_go_on_from_the_start() -> None:
     """Past a snap the way back leads along the other branch, not from rest."""
     body = arch()
     snapped = solve_equilibrium(body, shortening={"down": 0.02})
     let = solve_equilibrium(body, tension={"down": 0.0}, start=snapped)
-    plain, calls = equilibrium.settle, []
-
-    def fails_at_first(*arguments: Any) -> str:
-        calls.append(0)
-        return "stalled" if len(calls) == 1 else plain(*arguments)
-
-    monkeypatch.setattr(equilibrium, "settle", fails_at_first)
-    again = solve_equilibrium(body, tension={"down": 0.0}, start=snapped)
-    assert again.converged and len(calls) > 2
+    most = let.iterations - 1
+    again = solve_equilibrium(body, tension={"down": 0.0}, start=snapped, options=SolveOptions(max_iterations=most))
+    assert again.converged and again.iterations > most
     np.testing.assert_allclose(again.positions, let.positions, atol=1e-7)
 
 
@@ -335,49 +307,55 @@ def test_a_held_cable_moves_a_body_on_which_nothing_at_all_acts_at_rest(law: str
     assert state.converged and state.tension["c"] > 1.0 and abs(state.shortening["c"] - 0.01) < 1e-9
 
 
-def test_a_state_that_is_only_tried_is_given_up_after_some_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_state_that_is_only_tried_is_given_up_after_some_steps() -> None:
     body = bar_body(block_mesh((5, 2, 2), (LENGTH, WIDTH, SIDE)))
     rest = solve_equilibrium(body)
     pull = dict.fromkeys(body.cable_names, 0.5)
     assert solve_equilibrium(body, tension=pull, start=rest, options=SolveOptions(rough=True)).converged
-    monkeypatch.setattr(equilibrium, "TRIES", 1)
-    tried = solve_equilibrium(body, tension=pull, start=rest, options=SolveOptions(rough=True))
+    once = NewtonOptions(steps_tried=1)
+    tried = solve_equilibrium(body, tension=pull, start=rest, options=SolveOptions(rough=True, newton=once))
     assert tried.status == "iterations" and tried.iterations == 1
-    assert solve_equilibrium(body, tension=pull, start=rest).converged  # what is not only tried goes on
+    wanted = solve_equilibrium(body, tension=pull, start=rest, options=SolveOptions(newton=once))
+    assert wanted.converged  # what is not only tried goes on
 
 
-def test_a_state_that_is_only_tried_is_given_up_where_its_stiffness_stays_indefinite(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_state_that_is_only_tried_is_given_up_where_its_stiffness_stays_indefinite() -> None:
     body = bar_body(block_mesh((5, 2, 2), (LENGTH, WIDTH, SIDE)))
     rest = solve_equilibrium(body)
     x = rest.positions * [1.0, 1.0, 0.1]  # pressed flat
     flat = replace(rest, positions=np.where(body.mesh.nodes[:, :1] < 1e-9, body.mesh.nodes, x))
     back = solve_equilibrium(body, start=flat, options=SolveOptions(rough=True))
-    assert back.converged and 1 <= back.indefinite_steps <= newton.INDEFINITE_TRIES
-    monkeypatch.setattr(newton, "INDEFINITE_TRIES", back.indefinite_steps - 1)
-    tried = solve_equilibrium(body, start=flat, options=SolveOptions(rough=True))
+    assert back.converged and 1 <= back.indefinite_steps <= NewtonOptions().indefinite_tried
+    fewer = NewtonOptions(indefinite_tried=back.indefinite_steps - 1)
+    tried = solve_equilibrium(body, start=flat, options=SolveOptions(rough=True, newton=fewer))
     assert tried.status == "iterations" and tried.iterations < back.iterations
-    assert solve_equilibrium(body, start=flat).converged  # what is not only tried goes on
+    wanted = solve_equilibrium(body, start=flat, options=SolveOptions(newton=fewer))
+    assert wanted.converged  # what is not only tried goes on
 
 
-def test_a_stiffness_is_shifted_in_single_precision_where_it_is_indefinite_in_double_too(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stiffness_is_shifted_in_single_precision_where_it_is_indefinite_in_double_too() -> None:
     body = bar_body(block_mesh((5, 2, 2), (LENGTH, WIDTH, SIDE)))
     pattern, K = body.free_map.pattern, reduced_matrix(body, internal(body, body.mesh.nodes).blocks)
     lowest = float(np.linalg.eigvalsh(K.toarray())[0])
 
+    whole = factorize(pattern, K.data).bytes
+
+    def lowered(share: float) -> FloatArray:
+        return K.data - share * lowest * (pattern.indices == np.repeat(np.arange(pattern.size), np.diff(pattern.indptr)))
+
     def factored(share: float, shift: float = 0.0) -> tuple[Any, newton_state.State]:
         state = newton_state.State(body.mesh.nodes, np.zeros(0), np.zeros(0, dtype=bool), [], single=True, shift=shift)
-        values = K.data - share * lowest * (pattern.indices == np.repeat(np.arange(pattern.size), np.diff(pattern.indptr)))
-        return newton.definite_factor(pattern, values, state), state
+        return newton.definite_factor(pattern, lowered(share), state), state
 
     for share, shift in ((1.5, 0.0), (1.5, 2.2 * lowest), (30.0, 0.0)):
         factor, state = factored(share, shift)
-        assert state.single and factor._L.dtype == np.float32 and (share - 1.0) * lowest < state.shift
+        assert state.single and factor.bytes == whole / 2 and (share - 1.0) * lowest < state.shift
     factor, state = factored(0.5, 30.0 * lowest)
-    assert state.single and factor._L.dtype == np.float32 and state.shift == 0.0
-    plain = newton.factorize_definite
-    monkeypatch.setattr(newton, "factorize_definite", lambda *a, single=False, **k: (None, 0.0) if single else plain(*a, **k))
-    factor, state = factored(1.0 - 1e-9)  # definite, but not with seven digits
-    assert not state.single and factor._L.dtype == np.float64 and state.shift == 0.0
+    assert state.single and factor.bytes == whole / 2 and state.shift == 0.0
+    shares = 1.0 - np.geomspace(1e-9, 1e-7, 20)  # definite, but not with seven digits: rounding says which of them fails there
+    share = next(s for s in shares if factorize_definite(pattern, lowered(s), single=True, tries=0)[0] is None)
+    factor, state = factored(share)
+    assert not state.single and factor.bytes == whole and state.shift == 0.0
 
 
 class _Known:
@@ -411,20 +389,17 @@ def test_a_stiffness_learns_from_the_steps_since_it_was_factorised() -> None:
     np.testing.assert_allclose(inverse, inverse.T, atol=1e-9 * np.abs(inverse).max())
 
 
-def test_a_state_that_is_only_tried_takes_a_lent_factor_as_far_as_it_goes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_state_that_is_only_tried_takes_a_lent_factor_as_far_as_it_goes() -> None:
     body = bar_body(block_mesh((5, 2, 2), (LENGTH, WIDTH, SIDE)))
     pull = {"top": 0.3}
     start = solve_equilibrium(body, tension=pull)
     start = replace(start, factor=tangent_at(body, start).factor)
-    factors, plain = list[int](), newton.factor_here
-    monkeypatch.setattr(newton, "factor_here", lambda *a: (factors.append(1), plain(*a))[1])
     soft = body.with_stiffness_scale(0.97)
     there = solve_equilibrium(soft, tension=pull, start=start)
     assert np.abs(there.positions - start.positions).max() > 1e-3 * body.reach
-    factors.clear()
-    tried = solve_equilibrium(soft, tension=pull, start=start, options=SolveOptions(reuse_factor=True, rough=True))
-    assert tried.converged and not factors
+    lent = SolveOptions(reuse_factor=True, rough=True)
+    tried = solve_equilibrium(soft, tension=pull, start=start, options=lent)
+    assert tried.converged and tried.factor is start.factor
     assert np.abs(tried.positions - there.positions).max() < 2 * newton.ARRIVED * body.reach
-    monkeypatch.setattr(newton, "PATIENCE_TRIED", 0)
-    solve_equilibrium(soft, tension=pull, start=start, options=SolveOptions(reuse_factor=True, rough=True))
-    assert factors
+    impatient = replace(lent, newton=NewtonOptions(patience_tried=0))
+    assert solve_equilibrium(soft, tension=pull, start=start, options=impatient).factor is not start.factor

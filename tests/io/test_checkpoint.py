@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import pickle
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -98,13 +97,17 @@ def test_a_file_from_elsewhere_runs_nothing(tmp_path: Path, call: Callable[..., 
     assert made.exists()  # anyone else would have run it
 
 
-def test_an_error_that_would_come_again_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    def fail(*given: Any) -> None:
-        raise DataError("no equilibrium")
+def test_an_error_that_would_come_again_leaves_nothing(tmp_path: Path):
+    file, there = tmp_path / "loop" / ".unfinished", list[bool]()
 
-    monkeypatch.setattr(sys.modules["femsense.loop.improve"], "conclude", fail)
+    def fail(text: str) -> None:
+        there.append(file.exists())
+        if there[-1]:
+            raise DataError("no equilibrium")
+
     with pytest.raises(DataError):
-        search(tmp_path / "loop" / ".unfinished", lambda text: None)
+        search(file, fail)
+    assert there[-1]
     assert not (tmp_path / "loop").exists()
 
 
@@ -113,7 +116,7 @@ def test_a_folder_that_holds_unfinished_work_says_so(stopped: Path):
     assert report["kind"] == "unfinished" and "run the same command again: it goes on" in report["problems"][0]
 
 
-def test_an_estimate_that_was_stopped_goes_on_at_the_next_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_an_estimate_that_was_stopped_goes_on_at_the_next_frame(tmp_path: Path):
     rubbing = apply_effects(arm((4, 1, 1)), HIDDEN)  # each state needs the one before
     recording, _ = record(INPUTS, noise=1e-4, forces={2: (TIP, FORCE), 3: (TIP, 2 * FORCE)}, truth=rubbing)
     calibration, keep = calibrate(rubbing, recording), (tmp_path / "run" / ".unfinished", MADE_FROM)
@@ -123,9 +126,8 @@ def test_an_estimate_that_was_stopped_goes_on_at_the_next_frame(tmp_path: Path, 
         if done == 4:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(pipeline, "CHECKPOINT_S", 0.0)
     with pytest.raises(KeyboardInterrupt):
-        pipeline.estimate(rubbing, recording, calibration, at=TIP, keep=keep, progress=stop)
+        pipeline.estimate(rubbing, recording, calibration, at=TIP, keep=keep, keep_every_s=0.0, progress=stop)
     run = pipeline.estimate(rubbing, recording, calibration, at=TIP, keep=keep, progress=lambda done, count: asked.append(done))
     whole = pipeline.estimate(rubbing, recording, calibration, at=TIP)
     assert asked == [4] and not keep[0].exists() and [f.status for f in run.frames] == [f.status for f in whole.frames]

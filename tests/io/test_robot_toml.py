@@ -227,14 +227,15 @@ def test_a_wrong_parameter_of_an_effect_names_the_file(tmp_path: Path) -> None:
     np.testing.assert_allclose(load_robot(folder).body.material.young_modulus, 300e3)
 
 
-def test_names_of_the_project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_block_robot(tmp_path / "meshes" / "block")
-    write_block_robot(tmp_path / "meshes" / "blob")
-    monkeypatch.setattr(femsense, "__file__", str(tmp_path / "femsense" / "__init__.py"))
-    assert load_robot("block").name == "block"
+def test_names_of_the_project() -> None:
+    meshes = Path(__file__).parents[2] / "meshes"
+    names = sorted(folder.parent.name for folder in meshes.glob("*/robot.toml"))
+    assert len(names) > 1 and robot_names() == {name: meshes / name for name in names}
+    for name in names:
+        assert find_robot(name) == meshes / name / "robot.toml"
     with pytest.raises(InputError) as error:
-        load_robot("blokc")
-    assert "one of: blob, block" in str(error.value) and "did you mean" in str(error.value) and "'block'" in str(error.value)
+        load_robot("four-lge")
+    assert f"one of: {', '.join(names)}" in str(error.value) and "did you mean 'four-leg'?" in str(error.value)
 
 
 # What comes back
@@ -361,7 +362,6 @@ def test_any_declared_robot_round_trips(
 def surface_robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     pytest.importorskip("trimesh")
     monkeypatch.setenv("FEMSENSE_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr("femsense.io.meshing.tetrahedra.EDGE_FRACTION", 0.2)
     folder = write_block_robot(tmp_path / "robot", mesh__file="block.stl", cables=None)
     points, triangles = block_surface((100.0, 30.0, 30.0))
     meshio.Mesh(points, [("triangle", triangles)]).write(folder / "block.stl")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from operator import attrgetter
 from pathlib import Path
@@ -97,7 +98,7 @@ def let_out() -> tuple[Robot, Plan, np.ndarray]:
 
 def test_bends_remember_the_tensions_at_which_a_held_cable_came_to_rest() -> None:
     rubbing, plan, inputs = let_out()
-    walker = truth._TruePath(rubbing, plan)
+    walker = truth.TruePath(rubbing, plan)
     for k, load in enumerate(walker.frame_loads(inputs)):
         walker.go(load, k)
         pulled = list(walker.state.tension.values())
@@ -296,14 +297,20 @@ def test_marker_noise_has_its_parts(robot: Robot) -> None:
     np.testing.assert_allclose(experiment.marker_positions.std(axis=0), 0.0, atol=1e-12)  # glued once, not in each frame
 
 
-def test_nothing_half_written_is_left(robot: Robot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*_: object) -> None:
-        raise OSError("no space left")
+@pytest.mark.skipif(sys.platform == "win32", reason="limits of POSIX")
+def test_nothing_half_written_is_left(robot: Robot, tmp_path: Path) -> None:
+    import resource
 
-    monkeypatch.setattr("femsense.rig.simulate.write_ply", fail)
-    with pytest.raises(OSError, match="no space"):
-        simulate(robot, SEEN, tmp_path / "out")
-    assert list(tmp_path.iterdir()) == []
+    simulate(robot, SEEN, tmp_path / "whole")
+    largest = max(file.stat().st_size for file in (tmp_path / "whole").rglob("*") if file.is_file())
+    others = resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:  # no file may become as large as the largest one of them
+        resource.setrlimit(resource.RLIMIT_FSIZE, (largest - 1, others[1]))
+        with pytest.raises(OSError, match="File too large"):
+            simulate(robot, SEEN, tmp_path / "out")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, others)
+    assert [path.name for path in tmp_path.iterdir()] == ["whole"]
 
 
 @pytest.mark.parametrize("kind", ["sphere", "cylinder"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +21,21 @@ if TYPE_CHECKING:
 ROBOT = "four-leg"
 
 
-def run_demo(folder: str | Path, *, say: Callable[[str], None], progress: Callable[..., None] | None = None) -> dict[str, Any]:
+@dataclass(frozen=True, slots=True)
+class DemoSteps:
+    """What the chain is made of."""
+
+    estimate: Callable[..., Run] = estimate_into
+    improve: Callable[..., dict[str, Any]] = improve_into
+
+
+def run_demo(
+    folder: str | Path,
+    *,
+    say: Callable[[str], None],
+    progress: Callable[..., None] | None = None,
+    steps: DemoSteps | None = None,
+) -> dict[str, Any]:
     """Estimate with the declared robot, improve it, estimate again; export the result and measure both against the truth.
 
     Steps that the folder holds already are not done again.
@@ -29,6 +44,7 @@ def run_demo(folder: str | Path, *, say: Callable[[str], None], progress: Callab
         folder: gets `declared/`, `loop/`, `run/`, robot.glb, picture.png, report.html and demo.json.
         say: told in one line what happens.
         progress: called with what is done and how much there is.
+        steps: other ways to estimate and to improve.
 
     Returns:
         the content of demo.json.
@@ -39,13 +55,13 @@ def run_demo(folder: str | Path, *, say: Callable[[str], None], progress: Callab
     from femsense.app.demo.picture import draw_demo
     from femsense.xr.export import export_glb
 
-    out, recording = Path(folder), demo_recording()
+    how, out, recording = steps or DemoSteps(), Path(folder), demo_recording(robot_names())
     say(f"1/4  forces with the robot as it is declared → {out / 'declared'}")
-    before = estimate_into(out / "declared", ROBOT, recording, say=say, progress=progress)
+    before = how.estimate(out / "declared", ROBOT, recording, say=say, progress=progress)
     say(f"2/4  what does its model lack? → {out / 'loop'}")
-    loop = improve_into(out / "loop", ROBOT, [recording], say=say, progress=progress)
+    loop = how.improve(out / "loop", ROBOT, [recording], say=say, progress=progress)
     say(f"3/4  forces with the improved robot → {out / 'run'}")
-    after = estimate_into(out / "run", out / "loop", recording, say=say, progress=progress)
+    after = how.estimate(out / "run", out / "loop", recording, say=say, progress=progress)
     say(f"4/4  mesh, picture and report → {out}")
     truth = read_truth(recording)
     document = demo_document(out, before, loop, after, truth, true_effects(recording))
@@ -57,9 +73,9 @@ def run_demo(folder: str | Path, *, say: Callable[[str], None], progress: Callab
     return document
 
 
-def demo_recording() -> Path:
-    """Return the folder of the recording that comes along. Raises InputError."""
-    folder = robot_names().get(ROBOT)
+def demo_recording(robots: Mapping[str, Path]) -> Path:
+    """Return the folder of the recording that comes along with a robot, of name → folder. Raises InputError."""
+    folder = robots.get(ROBOT)
     recording = None if folder is None else folder / "recordings" / "demo"
     if recording is None or not (recording / "recording.toml").is_file():
         raise InputError(

@@ -3,7 +3,8 @@
 A stiffness that is positive definite goes to `femsense.fem.linalg.cholesky`, with its analysis kept for a sparsity pattern. One that
 is not goes to PARDISO of the MKL (through pypardiso) where it is installed, and to SuperLU of SciPy elsewhere. Where the factor
 would not fit into memory, conjugate gradients take its place (see `femsense.fem.linalg.iterative`).
-FEMSENSE_SOLVER chooses by hand: `direct` or `iterative`; `pardiso` or `superlu` send all of them there.
+FEMSENSE_SOLVER chooses by hand: `direct` or `iterative`; `pardiso` or `superlu` send all of them there. FEMSENSE_MEMORY_GB says how much memory
+there is for factors, where the machine's own figure is not the one to go by (a container, a shared machine).
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
 from femsense.core.arrays import FloatArray, IntArray
-from femsense.core.errors import FemsenseError
+from femsense.core.errors import FemsenseError, InputError
 from femsense.fem.linalg.cholesky import cholesky
 from femsense.fem.linalg.iterative import Level, Levels, UnsettledError, iterative, make_levels
 from femsense.fem.linalg.symbolic import Analysis, analyse
@@ -117,7 +118,7 @@ def factorize(pattern: Pattern, values: FloatArray) -> Factorization | None:
     """
     if not np.isfinite(values).all():
         return None
-    if _iterates(pattern):
+    if iterates(pattern):
         found = _iterate(pattern, values)
         if found is not None:
             return found
@@ -173,14 +174,19 @@ def _wanted() -> str:
     return "cholesky" if chosen in ("", "direct", "iterative") else chosen
 
 
-def _iterates(pattern: Pattern) -> bool:
-    """Return whether a pattern is one for conjugate gradients: by choice, or because its factor does not fit into memory."""
+def iterates(pattern: Pattern, *, asked_from: int = ITERATIVE_FROM) -> bool:
+    """Return whether a pattern is one for conjugate gradients: by choice, or because its factor does not fit into memory.
+
+    Arguments:
+        pattern: the sparsity pattern.
+        asked_from: unknowns from which on memory is looked at.
+    """
     chosen = os.environ.get("FEMSENSE_SOLVER", "").lower()
     if pattern.grid is None or pattern.size < ITERATIVE_LEAST:
         return False
     if chosen:
         return chosen == "iterative"
-    if pattern.size < ITERATIVE_FROM:
+    if pattern.size < asked_from:
         return False
     if not pattern.fits:  # decided once: the memory of a factor that is made is no longer free, but it is used again
         pattern.fits.append(direct_bytes(pattern) <= MEMORY_SHARE * available_memory())
@@ -212,7 +218,14 @@ def direct_bytes(pattern: Pattern) -> int:
 
 
 def available_memory() -> float:
-    """Return the free memory of the machine [bytes]; inf where it is unknown."""
+    """Return the memory for factors [bytes]: what FEMSENSE_MEMORY_GB says, else what is free on the machine; inf where it is unknown.
+
+    Raises:
+        InputError: FEMSENSE_MEMORY_GB is not a number ≥ 0.
+    """
+    said = os.environ.get("FEMSENSE_MEMORY_GB", "")
+    if said:
+        return 1e9 * _gigabytes(said)
     try:
         with open("/proc/meminfo", encoding="ascii") as lines:
             return next(1024.0 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable"))
@@ -224,13 +237,23 @@ def available_memory() -> float:
         return float("inf")
 
 
+def _gigabytes(said: str) -> float:
+    try:
+        size = float(said)
+    except ValueError:
+        size = -1.0
+    if not size >= 0.0:
+        raise InputError("not an amount of memory", where="FEMSENSE_MEMORY_GB", found=said, expected="gigabytes, 0 or more")
+    return size
+
+
 def _cholesky(pattern: Pattern, values: FloatArray, single: bool = False) -> Factorization | None:
     return cholesky(pattern.analysis(), values, single=single)
 
 
 def _definite(pattern: Pattern, values: FloatArray, single: bool = False) -> Factorization | None:
     """Return the factor of a matrix that is positive definite, None where it is not."""
-    if _iterates(pattern):
+    if iterates(pattern):
         try:
             return iterative(pattern.levels(), values)
         except UnsettledError:

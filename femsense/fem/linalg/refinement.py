@@ -99,9 +99,11 @@ def prepare_roughly(pattern: Pattern) -> None:
         pattern.levels()
 
 
-def roughly(pattern: Pattern, values: FloatArray, tolerance: float = ROUGH) -> Factorization | None:
-    """Return a stiffness that is solved to a tolerance, by conjugate gradients where these are faster than a factor."""
-    if pattern.size < ROUGH_FROM or pattern.grid is None or not np.isfinite(values).all():
+def roughly(
+    pattern: Pattern, values: FloatArray, tolerance: float = ROUGH, *, pays_from: int = ROUGH_FROM
+) -> Factorization | None:
+    """Return a stiffness that is solved to a tolerance, by conjugate gradients where these are faster than a factor: from `pays_from` unknowns on."""
+    if pattern.size < pays_from or pattern.grid is None or not np.isfinite(values).all():
         return factorize(pattern, values)
     try:
         return iterative(pattern.levels(), values, tolerance=tolerance) or factorize(pattern, values)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
@@ -32,6 +33,24 @@ POOR = 0.05
 LOOSE = 1e-3
 """Tetrahedra that hang loose and hold less than this share of the volume are left out."""
 Progress = Callable[..., None]
+
+
+class Mesher(Protocol):
+    """What fills a closed surface: `tetrahedralise`, or another program's work with the same arguments."""
+
+    def __call__(
+        self,
+        points: FloatArray,
+        triangles: IntArray,
+        *,
+        edge_fraction: float,
+        envelope: float,
+        where: str,
+        check_volume: bool,
+        seconds: float,
+    ) -> TetMesh:
+        """Return the tetrahedra of a surface [m]; arguments as those of `tetrahedralise`."""
+        ...
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -72,6 +91,7 @@ def fill(
     *,
     where: str = "surface",
     progress: Progress | None = None,
+    mesher: Mesher = tetrahedralise,
 ) -> Filled:
     """Mend a surface and fill it with tetrahedra of the wanted size.
 
@@ -80,6 +100,7 @@ def fill(
         options: size and repairs.
         where: what a message names.
         progress: called with what is being done.
+        mesher: what fills the mended surface.
 
     Raises:
         InputError: see `repaired` and `tetrahedralise`; or no mesh that is small enough.
@@ -112,7 +133,9 @@ def fill(
         left = MOST_SECONDS - (time.monotonic() - began)
         seconds = min(left, FILL_SECONDS)
         tell(f"filling, edges of {1e3 * edge:.2g} mm, try {attempt + 1}, {seconds / 60:.0f} min at most")
-        filled, thin = _fill_once(surface, thin, edge, options, where, crosses=crossing + walls > 0, seconds=seconds)
+        filled, thin = _fill_once(
+            surface, thin, edge, options, where, crosses=crossing + walls > 0, seconds=seconds, mesher=mesher
+        )
         count = len(filled.mesh.tets)
         poor = radius_ratio(filled.mesh).min() < POOR
         slow = time.monotonic() - began > 0.5 * MOST_SECONDS  # another try might not come to an end
@@ -158,13 +181,14 @@ def _fill_once(
     *,
     crosses: bool,
     seconds: float,
+    mesher: Mesher,
 ) -> tuple[Filled, ClosedSurface]:
     """Return what was filled, and the thinned surface that the next try goes on from."""
     diagonal = surface.diagonal
     given = options.tolerance_mm
     tolerance = 1e-3 * given if given is not None else min(ENVELOPE_OF_EDGE * edge, LARGEST_ENVELOPE * diagonal)
     thin, drifted = thinned(surface, tolerance=0.5 * tolerance, start=thinner)
-    made = tetrahedralise(
+    made = mesher(
         np.array(thin.points),
         np.array(thin.triangles),
         edge_fraction=edge / diagonal,

@@ -21,9 +21,10 @@ from femsense.io.files import check_target, file_hash, write_json, write_text
 from femsense.io.mesh_files import SURFACE_ENDINGS, read_triangles, write_mesh
 from femsense.io.meshes.reading import read_content
 from femsense.io.meshing.cad import CAD_READ, read_cad
-from femsense.io.meshing.filling import POOR, Filled, MeshOptions, Progress, fill
+from femsense.io.meshing.filling import POOR, Filled, Mesher, MeshOptions, Progress, fill
 from femsense.io.meshing.quality import quality_report, quality_text
 from femsense.io.meshing.surface import check_finite
+from femsense.io.meshing.tetrahedra import tetrahedralise
 from femsense.io.robot_body import LARGEST_BODY, PER_METRE, SMALLEST_BODY, likely_unit
 from femsense.io.robot_toml import load_robot
 
@@ -41,6 +42,7 @@ def mesh_into(
     say: Callable[[str], None],
     again: bool = False,
     progress: Progress | None = None,
+    mesher: Mesher = tetrahedralise,
 ) -> dict[str, Any]:
     """Fill a surface with tetrahedra and write them into a robot's folder; return the report that mesh.json holds.
 
@@ -53,6 +55,7 @@ def mesh_into(
         say: told in one line what happens beside.
         again: fill even where the folder holds this result.
         progress: called with what is being done.
+        mesher: what fills the mended surface.
 
     Raises:
         InputError: a surface that cannot be filled, with what, where, found, expected and a hint; a robot.toml that the new mesh
@@ -68,7 +71,7 @@ def mesh_into(
     if not again and (known := _finished(target, inputs)):
         say(f"{target} holds this mesh already (--again fills the surface anew)")
         return known
-    filled = fill(points, triangles, options, where=str(source), progress=progress)
+    filled = fill(points, triangles, options, where=str(source), progress=progress, mesher=mesher)
     report = mesh_report(filled, options) | {"inputs": inputs, "femsense": femsense.__version__}
     report["robot"] = _write_robot(target, filled.mesh, options, source)
     report["mesh_sha256"] = file_hash(target / report["robot"]["mesh_file"])

@@ -9,14 +9,13 @@ from analytic import bar_body, relative_error
 from helpers import block_mesh
 from hollow import hollow_bar
 
-from femsense.core.errors import FemsenseError
+from femsense.core.errors import FemsenseError, InputError
 from femsense.fem.assembly import internal, reduced_values
 from femsense.fem.body import BodyModel, make_body, tie_cable
 from femsense.fem.cavities import find_chamber
 from femsense.fem.compliance import compliance
 from femsense.fem.equilibrium import solve_equilibrium
-from femsense.fem.linalg import factorization
-from femsense.fem.linalg.factorization import factorize, factorize_definite
+from femsense.fem.linalg.factorization import available_memory, factorize, factorize_definite, iterates
 from femsense.fem.linalg.iterative import Iterative, coarse_factor, iterative
 
 both = pytest.mark.parametrize("quadratic", [False, True], ids=["tet4", "tet10"])
@@ -146,21 +145,26 @@ def test_an_equilibrium_with_cables_and_a_chamber_is_that_of_the_direct_path(
 
 
 def test_memory_chooses(monkeypatch: pytest.MonkeyPatch) -> None:
-    def chosen(free: float, size_from: int = 0) -> type:
-        body = bar_body(block_mesh((4, 2, 2)), cables=False)
-        monkeypatch.setattr(factorization, "available_memory", lambda: free)
-        monkeypatch.setattr(factorization, "ITERATIVE_FROM", size_from)
-        blocks = internal(body, np.array(body.mesh.nodes)).blocks
-        assert blocks is not None
-        return type(factorize(body.free_map.pattern, reduced_values(body, blocks)))
+    def chosen(free_gb: str, asked_from: int = 0) -> bool:
+        monkeypatch.setenv("FEMSENSE_MEMORY_GB", free_gb)
+        return iterates(bar_body(block_mesh((4, 2, 2)), cables=False).free_map.pattern, asked_from=asked_from)
 
     monkeypatch.delenv("FEMSENSE_SOLVER", raising=False)
-    assert factorization.available_memory() > 1e6
-    assert chosen(1e3) is Iterative
-    assert chosen(1e12) is not Iterative
-    assert chosen(1e3, 10**6) is not Iterative  # small bodies do not ask
+    monkeypatch.delenv("FEMSENSE_MEMORY_GB", raising=False)
+    assert available_memory() > 1e6
+    assert chosen("1e-6") and not chosen("1000")
+    assert not chosen("1e-6", 10**6)  # small bodies do not ask
     monkeypatch.setenv("FEMSENSE_SOLVER", "direct")
-    assert chosen(1e3) is not Iterative
+    assert not chosen("1e-6")
+    monkeypatch.setenv("FEMSENSE_SOLVER", "iterative")
+    assert chosen("1000")
+
+
+@pytest.mark.parametrize("said", ["much", "-1", "nan"])
+def test_memory_that_is_no_number_is_an_error(monkeypatch: pytest.MonkeyPatch, said: str) -> None:
+    monkeypatch.setenv("FEMSENSE_MEMORY_GB", said)
+    with pytest.raises(InputError, match="FEMSENSE_MEMORY_GB"):
+        available_memory()
 
 
 def test_an_indefinite_stiffness_without_memory_for_its_factor_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -168,6 +172,6 @@ def test_an_indefinite_stiffness_without_memory_for_its_factor_says_so(monkeypat
     blocks = internal(body, body.mesh.nodes * [0.55, 1.0, 1.0]).blocks
     assert blocks is not None
     monkeypatch.setenv("FEMSENSE_SOLVER", "iterative")
-    monkeypatch.setattr(factorization, "available_memory", lambda: 1e3)
+    monkeypatch.setenv("FEMSENSE_MEMORY_GB", "1e-6")
     with pytest.raises(FemsenseError, match=r"its factor needs .* GB where"):
         factorize(body.free_map.pattern, reduced_values(body, blocks))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import tomllib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from femsense.app import cli
 from femsense.core.errors import InputError
 from femsense.fem.equilibrium import solve_equilibrium
 from femsense.fem.mesh import TetMesh, element_volumes, surface_triangles, to_linear
-from femsense.io.meshing import filling, tetrahedra
+from femsense.io.meshing import tetrahedra
 from femsense.io.meshing.filling import MeshOptions, fill
 from femsense.io.meshing.robot_from_surface import mesh_into, read_any_surface, starter_text
 from femsense.io.meshing.surface import repaired
@@ -41,19 +42,28 @@ def write_box(path: Path, extents: tuple[float, float, float] = (100, 30, 30)) -
     return path
 
 
-@pytest.fixture
-def quick(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
-    """Blocks in place of fTetWild; the calls are listed."""
-    calls: list[dict[str, Any]] = []
+class Blocks:
+    """A mesher in place of fTetWild that fills a box with blocks; its calls are listed."""
 
-    def block(points: np.ndarray, triangles: np.ndarray, **options: Any) -> TetMesh:
-        calls.append(options)
+    def __init__(self) -> None:
+        self.calls: list[dict[str, Any]] = []
+
+    def __call__(self, points: np.ndarray, triangles: np.ndarray, **options: Any) -> TetMesh:
+        self.calls.append(options)
         edge = options["edge_fraction"] * np.linalg.norm(np.ptp(points, axis=0))
         cells = np.maximum(np.round(np.ptp(points, axis=0) / edge), 1).astype(int)
         return block_mesh(cells, np.ptp(points, axis=0), start=points.min(axis=0))
 
-    monkeypatch.setattr(filling, "tetrahedralise", block)
-    return calls
+
+@pytest.fixture
+def quick() -> Blocks:
+    return Blocks()
+
+
+def made_before(*meshes: TetMesh) -> Callable[..., TetMesh]:
+    """Return a mesher that gives these, one after the other."""
+    left = iter(meshes)
+    return lambda *_, **__: next(left)
 
 
 def quiet(_: str) -> None: ...
@@ -108,8 +118,8 @@ def test_shells_that_cross_are_filled_as_one(tmp_path: Path) -> None:
 # The folder
 
 
-def test_the_new_robot_loads_and_says_what_is_guessed(tmp_path: Path, quick: list[dict[str, Any]]) -> None:
-    report = mesh_into(tmp_path / "my robot", write_box(tmp_path / "block.stl"), MM, say=quiet)
+def test_the_new_robot_loads_and_says_what_is_guessed(tmp_path: Path, quick: Blocks) -> None:
+    report = mesh_into(tmp_path / "my robot", write_box(tmp_path / "block.stl"), MM, say=quiet, mesher=quick)
     robot = load_robot(tmp_path / "my robot")
     text = (tmp_path / "my robot" / "robot.toml").read_text()
     assert robot.name == "my-robot" and robot.body.mesh.is_quadratic and "block.stl" in text and "GUESSED" in text
@@ -125,8 +135,8 @@ def test_the_new_robot_loads_and_says_what_is_guessed(tmp_path: Path, quick: lis
     assert json.loads((tmp_path / "my robot" / "mesh.json").read_text()) == json.loads(json.dumps(report))
 
 
-def test_the_examples_in_the_new_robot_work_once_they_are_uncommented(tmp_path: Path, quick: list[dict[str, Any]]) -> None:
-    mesh_into(tmp_path / "robot", write_box(tmp_path / "block.stl"), MM, say=quiet)
+def test_the_examples_in_the_new_robot_work_once_they_are_uncommented(tmp_path: Path, quick: Blocks) -> None:
+    mesh_into(tmp_path / "robot", write_box(tmp_path / "block.stl"), MM, say=quiet, mesher=quick)
     file = tmp_path / "robot" / "robot.toml"
     file.write_text(re.sub(r"^# (?=\[|\w+ = )", "", file.read_text(), flags=re.MULTILINE))
     robot = load_robot(tmp_path / "robot")
@@ -145,122 +155,124 @@ def test_the_lowest_slab_holds_a_body_that_stands_on_a_tip() -> None:
     assert held.sum() >= 6 and np.linalg.matrix_rank(0.1 * nodes[held] - 0.1 * nodes[held].mean(axis=0), tol=1e-4) >= 2
 
 
-def test_a_robot_that_is_there_keeps_its_table(tmp_path: Path, quick: list[dict[str, Any]]) -> None:
+def test_a_robot_that_is_there_keeps_its_table(tmp_path: Path, quick: Blocks) -> None:
     robot = write_block_robot(tmp_path / "robot", cells=(3, 1, 1), cables=None)
     before = (robot / "robot.toml").read_bytes()
-    report = mesh_into(robot, write_box(tmp_path / "block.stl", (0.1, 0.03, 0.03)), MeshOptions(unit="m"), say=quiet)
+    report = mesh_into(
+        robot, write_box(tmp_path / "block.stl", (0.1, 0.03, 0.03)), MeshOptions(unit="m"), say=quiet, mesher=quick
+    )
     assert (robot / "robot.toml").read_bytes() == before
     assert report["robot"]["mesh_file"] == "block.vtu" and report["robot"]["unit"] == "mm"
     assert len(load_robot(robot).body.mesh.tets) == report["quality"]["tetrahedra"] > 3 * 6
     np.testing.assert_allclose(np.ptp(load_robot(robot).body.mesh.nodes, axis=0), [0.1, 0.03, 0.03])
 
 
-def test_a_surface_named_in_the_table_gives_way_to_the_mesh(tmp_path: Path, quick: list[dict[str, Any]]) -> None:
+def test_a_surface_named_in_the_table_gives_way_to_the_mesh(tmp_path: Path, quick: Blocks) -> None:
     robot = write_block_robot(tmp_path / "robot", mesh__file="block.stl", cables=None)
     write_box(robot / "block.stl")
-    mesh_into(robot, robot / "block.stl", MM, say=quiet)
+    mesh_into(robot, robot / "block.stl", MM, say=quiet, mesher=quick)
     assert load_robot(robot).document["mesh"]["file"] == "mesh.vtu"
 
 
-def test_a_table_that_the_mesh_does_not_fit_stays_with_its_mesh(tmp_path: Path, quick: list[dict[str, Any]]) -> None:
+def test_a_table_that_the_mesh_does_not_fit_stays_with_its_mesh(tmp_path: Path, quick: Blocks) -> None:
     robot = write_block_robot(tmp_path / "robot", cells=(3, 1, 1), fixed=[{"box_m": [[0.5, 0, 0], [0.6, 1, 1]]}], cables=None)
     before = {file.name: file.read_bytes() for file in robot.iterdir()}
     with pytest.raises(InputError, match="does not fit the new mesh; nothing was written") as error:
-        mesh_into(robot, write_box(tmp_path / "block.stl"), MM, say=quiet)
+        mesh_into(robot, write_box(tmp_path / "block.stl"), MM, say=quiet, mesher=quick)
     assert "no node of the mesh is inside the box" in str(error.value) and str(robot) in str(error.value)
     assert {file.name: file.read_bytes() for file in robot.iterdir()} == before
 
 
-def test_it_is_not_made_twice(tmp_path: Path, quick: list[dict[str, Any]]) -> None:
+def test_it_is_not_made_twice(tmp_path: Path, quick: Blocks) -> None:
     said: list[str] = []
     file = write_box(tmp_path / "block.stl")
-    first = mesh_into(tmp_path / "robot", file, MM, say=said.append)
-    assert mesh_into(tmp_path / "robot", file, MM, say=said.append) == json.loads(json.dumps(first)) and len(quick) == 1
+    first = mesh_into(tmp_path / "robot", file, MM, say=said.append, mesher=quick)
+    assert (
+        mesh_into(tmp_path / "robot", file, MM, say=said.append, mesher=quick) == json.loads(json.dumps(first))
+        and len(quick.calls) == 1
+    )
     assert "holds this mesh already" in said[0]
-    mesh_into(tmp_path / "robot", file, MM, say=said.append, again=True)
-    mesh_into(tmp_path / "robot", file, MeshOptions(unit="mm", size_mm=12.0), say=said.append)
-    assert len(quick) == 3 and len(said) == 1
+    mesh_into(tmp_path / "robot", file, MM, say=said.append, mesher=quick, again=True)
+    mesh_into(tmp_path / "robot", file, MeshOptions(unit="mm", size_mm=12.0), say=said.append, mesher=quick)
+    assert len(quick.calls) == 3 and len(said) == 1
     (tmp_path / "robot" / "mesh.vtu").write_text("broken")
-    mesh_into(tmp_path / "robot", file, MeshOptions(unit="mm", size_mm=12.0), say=said.append)
-    assert len(quick) == 4
+    mesh_into(tmp_path / "robot", file, MeshOptions(unit="mm", size_mm=12.0), say=said.append, mesher=quick)
+    assert len(quick.calls) == 4
 
 
 # Size
 
 
-def test_the_number_of_tetrahedra_is_kept(quick: list[dict[str, Any]]) -> None:
+def test_the_number_of_tetrahedra_is_kept(quick: Blocks) -> None:
     box = trimesh.creation.box((100, 30, 30))
     for most in (200, 600, 3000):
-        filled = fill(np.array(box.vertices), np.array(box.faces), MeshOptions(unit="mm", most_tets=most))
+        filled = fill(np.array(box.vertices), np.array(box.faces), MeshOptions(unit="mm", most_tets=most), mesher=quick)
         assert 0.1 * most < len(filled.mesh.tets) <= most
-    edges = [call["edge_fraction"] for call in quick]
+    edges = [call["edge_fraction"] for call in quick.calls]
     assert edges[-1] < edges[0]
 
 
-def test_a_wanted_size_that_gives_too_many_says_what_would_do(quick: list[dict[str, Any]]) -> None:
+def test_a_wanted_size_that_gives_too_many_says_what_would_do(quick: Blocks) -> None:
     box = trimesh.creation.box((100, 30, 30))
     with pytest.raises(InputError, match="more tetrahedra than wanted") as error:
-        fill(np.array(box.vertices), np.array(box.faces), MeshOptions(unit="mm", size_mm=2.0))
-    assert "--size 6.46" in str(error.value) and len(quick) == 1 and "--max-tets 67500" in str(error.value)
+        fill(np.array(box.vertices), np.array(box.faces), MeshOptions(unit="mm", size_mm=2.0), mesher=quick)
+    assert "--size 6.46" in str(error.value) and len(quick.calls) == 1 and "--max-tets 67500" in str(error.value)
 
 
-def test_the_envelope_follows_the_size_or_is_given(quick: list[dict[str, Any]]) -> None:
+def test_the_envelope_follows_the_size_or_is_given(quick: Blocks) -> None:
     box = trimesh.creation.box((100, 30, 30))
     for options in (MeshOptions(unit="mm", size_mm=10.0), MeshOptions(unit="mm", size_mm=10.0, tolerance_mm=0.2)):
-        fill(np.array(box.vertices), np.array(box.faces), options)
+        fill(np.array(box.vertices), np.array(box.faces), options, mesher=quick)
     diagonal = np.linalg.norm([100, 30, 30])
-    np.testing.assert_allclose([call["envelope"] * diagonal for call in quick], [0.4, 0.2])
+    np.testing.assert_allclose([call["envelope"] * diagonal for call in quick.calls], [0.4, 0.2])
 
 
-def test_a_flat_element_has_the_surface_filled_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_flat_element_has_the_surface_filled_anew() -> None:
     good = block_mesh((3, 2, 2), (0.1, 0.03, 0.03), start=(-0.05, -0.015, -0.015))
     nodes = np.array(good.nodes)
     inner = np.flatnonzero((np.abs(nodes) < [0.049, 0.0149, 0.0149]).all(axis=1))[0]
     tet = good.tets[(good.tets == inner).any(axis=1)][0]
     nodes[inner] += 0.99 * (nodes[tet[tet != inner]].mean(axis=0) - nodes[inner])
-    fillings = iter([TetMesh(nodes, good.tets), good])
-    monkeypatch.setattr(filling, "tetrahedralise", lambda *_, **__: next(fillings))
-    box = trimesh.creation.box((100, 30, 30))
-    assert fill(np.array(box.vertices), np.array(box.faces), MM).mesh is good
+    box, mesher = trimesh.creation.box((100, 30, 30)), made_before(TetMesh(nodes, good.tets), good)
+    assert fill(np.array(box.vertices), np.array(box.faces), MM, mesher=mesher).mesh is good
 
 
-def test_crumbs_are_left_out_and_parts_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_crumbs_are_left_out_and_parts_are_refused() -> None:
     box = trimesh.creation.box((100, 30, 30))
     body = block_mesh((3, 2, 2), (0.1, 0.03, 0.03), start=(-0.05, -0.015, -0.015))
     for size, fits in ((0.001, True), (0.01, False)):
         crumb = block_mesh((1, 1, 1), (size,) * 3, start=(0.06, 0.0, 0.0))
         both = TetMesh(np.vstack([body.nodes, crumb.nodes]), np.vstack([body.tets, crumb.tets + len(body.nodes)]))
-        monkeypatch.setattr(filling, "tetrahedralise", lambda *_, both=both, **__: both)
+        mesher = made_before(*[both] * 5)
         if fits:
-            filled = fill(np.array(box.vertices), np.array(box.faces), MM)
+            filled = fill(np.array(box.vertices), np.array(box.faces), MM, mesher=mesher)
             assert len(filled.mesh.tets) == len(body.tets) and filled.done == ("1 loose crumbs were left out",)
             continue
         with pytest.raises(InputError, match="fall into parts that no face joins"):
-            fill(np.array(box.vertices), np.array(box.faces), MM)
+            fill(np.array(box.vertices), np.array(box.faces), MM, mesher=mesher)
 
 
-def test_a_wall_inside_is_said_and_filled(quick: list[dict[str, Any]]) -> None:
+def test_a_wall_inside_is_said_and_filled(quick: Blocks) -> None:
     """A box cut by a wall that shares its edges with it."""
     left, right = (
         trimesh.creation.box((size, 30, 30), trimesh.transformations.translation_matrix((x, 0, 0)))
         for size, x in ((60, -30), (40, 20))
     )
     faces = np.vstack([left.triangles, right.triangles[(right.triangles[:, :, 0] > 1).any(axis=1)]])
-    filled = fill(faces.reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3), MM)
+    filled = fill(faces.reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3), MM, mesher=quick)
     assert any(note.startswith("4 edges have more than two triangles (walls inside") for note in filled.done)
-    assert quick[0]["check_volume"] is False
+    assert quick.calls[0]["check_volume"] is False
 
 
-def test_bodies_that_touch_along_an_edge_are_no_body(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bodies_that_touch_along_an_edge_are_no_body() -> None:
     one, other = (block_mesh((2, 2, 2), (0.03,) * 3, start=(x, x, 0.0)) for x in (0.0, 0.03))
     points, same = np.unique(np.vstack([one.nodes, other.nodes]), axis=0, return_inverse=True)
     both = TetMesh(points, same.reshape(-1)[np.vstack([one.tets, other.tets + len(one.nodes)])])
-    monkeypatch.setattr(filling, "tetrahedralise", lambda *_, **__: both)
     boxes = trimesh.util.concatenate(
         [trimesh.creation.box((30, 30, 30), trimesh.transformations.translation_matrix((x, x, 0))) for x in (15, 45)]
     )
     with pytest.raises(InputError, match="no face joins") as error:
-        fill(np.array(boxes.vertices), np.array(boxes.faces), MM)
+        fill(np.array(boxes.vertices), np.array(boxes.faces), MM, mesher=made_before(*[both] * 5))
     assert "let them overlap" in str(error.value)
 
 
@@ -327,9 +339,11 @@ def test_units(tmp_path: Path, unit: str | None, extent: float, text: str, hint:
     assert hint in str(error.value)
 
 
-def test_a_doubtful_unit_is_questioned(tmp_path: Path, quick: list[dict[str, Any]]) -> None:
+def test_a_doubtful_unit_is_questioned(tmp_path: Path, quick: Blocks) -> None:
     with pytest.warns(UserWarning, match=r"the body is 12 m across with --unit m; --unit cm makes it 120 mm long"):
-        mesh_into(tmp_path / "robot", write_box(tmp_path / "block.stl", (12, 4, 4)), MeshOptions(unit="m"), say=quiet)
+        mesh_into(
+            tmp_path / "robot", write_box(tmp_path / "block.stl", (12, 4, 4)), MeshOptions(unit="m"), say=quiet, mesher=quick
+        )
 
 
 def test_other_folders_are_left_alone(tmp_path: Path) -> None:
