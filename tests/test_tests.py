@@ -9,7 +9,9 @@ from pathlib import Path
 import pytest
 
 TESTS = Path(__file__).parent
-FILES = sorted(TESTS.rglob("*.py"))
+FILES = sorted(file for file in TESTS.rglob("*.py") if "loop" not in file.relative_to(TESTS).parts)
+OURS = {"femsense", *(file.stem for file in FILES)}
+"""What a test may not patch: the package, and what stands beside the tests."""
 NAMES = [file.relative_to(TESTS).as_posix() for file in FILES]
 
 
@@ -29,14 +31,8 @@ def imported_from_the_package(tree: ast.AST) -> set[str]:
     return found
 
 
-def stands_for_the_package(node: ast.expr, ours: set[str], names: set[str] | None = None) -> bool:
-    """Return whether an expression is a module, class or function of femsense: a name, what hangs on it, its path, or what `sys.modules` has."""
-    if isinstance(node, ast.Constant):
-        return isinstance(node.value, str) and node.value.split(".")[0] == "femsense"
-    if isinstance(node, ast.Subscript):
-        return ast.unparse(node.value) == "sys.modules" and stands_for_the_package(node.slice, ours)
-    if isinstance(node, ast.Call):
-        return ast.unparse(node.func).endswith("import_module") and stands_for_the_package(node.args[0], ours)
+def stands_for_the_package(node: ast.expr, ours: set[str]) -> bool:
+    """Return whether an expression is a module, class or function of femsense, or hangs on one."""
     while isinstance(node, ast.Attribute):
         node = node.value
     return isinstance(node, ast.Name) and node.id in ours
@@ -57,24 +53,35 @@ def private_names(tree: ast.AST) -> Iterator[str]:
                 yield f"line {node.lineno}: {ast.unparse(node)}"
 
 
-def replaced_parts(tree: ast.AST) -> Iterator[str]:
-    """Yield what a file puts in the place of something of femsense."""
-    ours = imported_from_the_package(tree)
-    ours |= {
-        target.id
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Assign) and not isinstance(node.value, (ast.Name, ast.Attribute, ast.Constant))
-        for target in node.targets
-        if isinstance(target, ast.Name) and stands_for_the_package(node.value, ours)
-    }
+def imported_from_elsewhere(tree: ast.AST) -> set[str]:
+    """Return the names in a file that an import of something else binds: Python, pytest, other libraries."""
+    found = set()
     for node in ast.walk(tree):
-        if isinstance(node, ast.Call):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] not in OURS:
+            found |= {alias.asname or alias.name for alias in node.names}
+        elif isinstance(node, ast.Import):
+            found |= {alias.asname or alias.name.split(".")[0] for alias in node.names if alias.name.split(".")[0] not in OURS}
+    return found
+
+
+def is_foreign(node: ast.expr, others: set[str]) -> bool:
+    """Return whether an expression is a part of another library: by its name, or by its path as a text."""
+    if isinstance(node, ast.Constant):
+        return str(node.value).split(".")[0] not in OURS
+    while isinstance(node, ast.Attribute):
+        node = node.value
+    return isinstance(node, ast.Name) and node.id in others
+
+
+def replaced_parts(tree: ast.AST) -> Iterator[str]:
+    """Yield where a file puts something in the place of what is not known to be another library's."""
+    others, ours = imported_from_elsewhere(tree), imported_from_the_package(tree)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and node.args:
             how = ast.unparse(node.func)
-            setting = how == "setattr" or how.endswith(
-                (".setattr", ".setitem", ".delattr", "patch", "patch.object", "patch.dict")
-            )
-            if setting and node.args and stands_for_the_package(node.args[0], ours):
-                yield f"line {node.lineno}: {how}({ast.unparse(node.args[0])}, …)"
+            if how == "setattr" or how.endswith((".setattr", ".delattr", "patch", "patch.object")):
+                if not is_foreign(node.args[0], others):
+                    yield f"line {node.lineno}: {how}({ast.unparse(node.args[0])}, …)"
         targets = node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AugAssign) else []
         for target in targets:
             if isinstance(target, ast.Attribute) and stands_for_the_package(target, ours):
@@ -86,3 +93,30 @@ def test_tests_use_public_names_and_replace_nothing(file: Path) -> None:
     tree = ast.parse(file.read_text(encoding="utf-8"))
     found = [*private_names(tree), *replaced_parts(tree)]
     assert not found, "\n".join(["reach into the package:", *found])
+
+
+REACHING = (
+    "from femsense.fem import newton\nnewton._step(1)",
+    "from femsense.fem.newton import _step",
+    "from femsense._own import step",
+    "import femsense\ngetattr(femsense.fem, '_step')",
+    "from femsense.fem import newton\ndef test(monkeypatch):\n    monkeypatch.setattr(newton, 'CHORD', 0)",
+    "def test(monkeypatch):\n    monkeypatch.setattr('femsense.fem.newton.CHORD', 0)",
+    "import sys\ndef test(monkeypatch):\n    monkeypatch.setattr(sys.modules['femsense.fem'], 'CHORD', 0)",
+    "from femsense.fem import newton\nfor module in (newton,):\n    setattr(module, 'CHORD', 0)",
+    "from femsense.fem import newton\nnewton.CHORD = 0",
+)
+HARMLESS = (
+    "import sys\ndef test(monkeypatch):\n    monkeypatch.setattr(sys, 'argv', [])",
+    "def test(monkeypatch):\n    monkeypatch.setattr('tempfile.tempdir', 'x')",
+    "from pathlib import Path\ndef test(monkeypatch):\n    monkeypatch.setattr(Path, 'home', None)",
+    "class Own:\n    def __init__(self):\n        self._kept = 1",
+    "run._repr_html_()",
+)
+
+
+@pytest.mark.parametrize(("texts", "are_found"), [(REACHING, True), (HARMLESS, False)])
+def test_what_reaches_in_is_found(texts: tuple[str, ...], are_found: bool) -> None:
+    for text in texts:
+        tree = ast.parse(text)
+        assert bool([*private_names(tree), *replaced_parts(tree)]) == are_found, text

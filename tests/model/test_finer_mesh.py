@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -12,13 +11,12 @@ import pytest
 from arm import NAMES, arm
 
 from femsense.core.errors import FemsenseError
+from femsense.fem.body import make_body
 from femsense.fem.equilibrium import Equilibrium
-from femsense.fem.linalg import refinement
 from femsense.fem.mesh import Embedding, embed_points
-from femsense.model import finer_mesh as finer_path
 from femsense.model.drive import DrivenRobot, drive_of
 from femsense.model.effects import apply_effects
-from femsense.model.finer_mesh import finer_state
+from femsense.model.finer_mesh import FinerOptions, finer_state, retaut
 from femsense.model.frame_state import solve_frame
 from femsense.model.recording import make_recording
 from femsense.model.recording_parts import Drives, Timeline
@@ -42,30 +40,27 @@ def beyond(asked: tuple[DrivenRobot, DrivenRobot, int, Equilibrium, Embedding], 
     return x - asked[4].positions(asked[3].positions)
 
 
-def test_a_finer_state_that_runs_away_says_nothing_though_its_forces_look_small(monkeypatch: pytest.MonkeyPatch):
-    asked = on_both_meshes([2.0, 0.0, 0.0, 0.0])
-    assert finer_state(*asked) is not None
-    sizes = itertools.cycle([1.0, 1e-6])
-    pulling = finer_path._pulling
-    monkeypatch.setattr(finer_path, "_pulling", lambda *given: (*pulling(*given)[:2], next(sizes)))
-    monkeypatch.setattr(finer_path, "rotated_step", lambda body, x, move: 1e3 * x)
-    assert finer_state(*asked) is None
+def test_a_finer_state_that_runs_away_says_nothing_though_its_forces_look_small():
+    forces_are_small = FinerOptions(enough=np.inf)
+    assert finer_state(*on_both_meshes([2.0, 0.0, 0.0, 0.0]), options=forces_are_small) is not None
+    assert finer_state(*on_both_meshes([12.0, 0.0, 0.0, 0.0]), options=forces_are_small) is None
 
 
-def test_a_finer_state_that_folds_is_sought_in_shorter_steps(monkeypatch: pytest.MonkeyPatch):
-    asked = on_both_meshes([2.0, 0.0, 0.0, 0.0])
-    whole, steps = beyond(asked, finer_state(*asked)), finer_path._stepped
+def test_a_finer_state_that_folds_is_sought_in_shorter_steps():
+    asked = on_both_meshes([0.024, 0.0, 0.0, 0.0], "displacement", [{"name": "hyperelastic", "law": "neo_hookean"}])
+    assert finer_state(*asked, options=FinerOptions(paces=(1.0,))) is None
+    exact = beyond(asked, solve_frame(asked[1], 0).positions)
+    assert (
+        np.abs(beyond(asked, finer_state(*asked)) - exact).max() < 0.5 * np.abs(exact).max()
+    )  # nearer than the declared mesh is
 
-    def folding(*given: Any) -> Any:
-        if given[-1] == 1.0:
-            raise FemsenseError("not positive definite")
-        return steps(*given)
 
-    monkeypatch.setattr(finer_path, "_stepped", folding)
-    np.testing.assert_allclose(beyond(asked, finer_state(*asked)), whole, atol=0.06 * np.abs(whole).max())
-    monkeypatch.setattr(finer_path, "PACES", (1.0,))
-    with pytest.raises(FemsenseError):
-        finer_state(*asked)
+def test_a_finer_body_that_nothing_holds_is_an_error():
+    driven, fine, *rest = on_both_meshes([2.0, 0.0, 0.0, 0.0])
+    body = fine.robot.body
+    loose = make_body(body.mesh, young_modulus=1e5, poisson_ratio=0.4, clamped=np.zeros(0, dtype=int), cables=body.cables)
+    with pytest.raises(FemsenseError, match="nothing holds the body"):
+        finer_state(driven, replace(fine, robot=replace(fine.robot, body=loose)), *rest)
 
 
 def test_held_cables_stretch_as_far_as_they_pull_on_the_finer_mesh():
@@ -87,17 +82,17 @@ def test_a_held_cable_that_would_push_on_the_finer_mesh_goes_slack():
     x = ties.positions(base.positions)
     for push, slack in ((-2e-3, True), (-5e-4, False)):
         pushing = replace(base, held=np.ones(4, bool), tension={**dict.fromkeys(NAMES, 0.1), NAMES[2]: push})
-        now = finer_path._retaut(fine, frame, pushing, x, 1e-4)
+        now = retaut(fine, frame, pushing, x, 1e-4)
         assert now.held.tolist() == [True, True, not slack, True]
         assert now.tension[NAMES[2]] == (0.0 if slack else push)
 
 
 @pytest.mark.parametrize("rough_from", [0, 10**6], ids=["conjugate gradients", "factor"])
-def test_a_finer_state_that_is_bent_much_by_held_cables_settles_where_it_belongs(
-    monkeypatch: pytest.MonkeyPatch, rough_from: int
-):
+def test_a_finer_state_that_is_bent_much_by_held_cables_settles_where_it_belongs(rough_from: int):
     asked = on_both_meshes([0.012, 0.0, 0.0, 0.0], "displacement")
     exact = beyond(asked, solve_frame(asked[1], 0).positions)
-    monkeypatch.setattr(refinement, "ROUGH_FROM", rough_from)
-    monkeypatch.setattr(finer_path, "FINER_ENOUGH", 1e-3)  # what is solved roughly must not keep the steps from getting there
-    np.testing.assert_allclose(beyond(asked, finer_state(*asked)), exact, atol=0.25 * np.abs(exact).max())
+    options = FinerOptions(
+        enough=1e-3, rough_from=rough_from
+    )  # what is solved roughly must not keep the steps from getting there
+    found = finer_state(*asked, options=options)
+    np.testing.assert_allclose(beyond(asked, found), exact, atol=0.25 * np.abs(exact).max())
