@@ -79,9 +79,9 @@ def replaced_parts(tree: ast.AST) -> Iterator[str]:
     for node in ast.walk(tree):
         if isinstance(node, ast.Call) and node.args:
             how = ast.unparse(node.func)
-            if how == "setattr" or how.endswith((".setattr", ".delattr", "patch", "patch.object")):
-                if not is_foreign(node.args[0], others):
-                    yield f"line {node.lineno}: {how}({ast.unparse(node.args[0])}, …)"
+            replaces = how == "setattr" or how.endswith((".setattr", ".delattr", "mock.patch", "patch.object"))
+            if replaces and not is_foreign(node.args[0], others):
+                yield f"line {node.lineno}: {how}({ast.unparse(node.args[0])}, …)"
         targets = node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AugAssign) else []
         for target in targets:
             if isinstance(target, ast.Attribute) and stands_for_the_package(target, ours):
