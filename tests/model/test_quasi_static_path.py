@@ -186,7 +186,9 @@ def test_a_known_load_acts_where_it_stands() -> None:
     body = robot().body
     forces = embed_points(body.mesh, MARKERS[:1]).spread(np.array([[0, 0.2, 0]]), len(body.mesh.nodes))
     np.testing.assert_allclose(
-        states_along(robot(), rec)[0], robot().markers.positions(solve_equilibrium(body, nodal_forces=forces).positions), atol=1e-9
+        states_along(robot(), rec)[0],
+        robot().markers.positions(solve_equilibrium(body, nodal_forces=forces).positions),
+        atol=1e-9,
     )
 
 
