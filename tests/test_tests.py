@@ -9,7 +9,14 @@ from pathlib import Path
 import pytest
 
 TESTS = Path(__file__).parent
-FILES = sorted(file for file in TESTS.rglob("*.py") if "loop" not in file.relative_to(TESTS).parts)
+LEFT = (
+    "loop/data/test_surface_rows",
+    "loop/search/test_location_search",
+    "loop/search/test_swaps",
+    "loop/test_improve",
+    "loop/verdict/test_returned_model",
+)
+FILES = sorted(file for file in TESTS.rglob("*.py") if file.relative_to(TESTS).with_suffix("").as_posix() not in LEFT)
 OURS = {"femsense", *(file.stem for file in FILES)}
 """What a test may not patch: the package, and what stands beside the tests."""
 NAMES = [file.relative_to(TESTS).as_posix() for file in FILES]

@@ -265,7 +265,7 @@ class TruePath:
         whole = self.body if self.plan.gravity is None else self.body.with_gravity(load.gravity)
         passes, far = [self._motors(load)], FAR
         for _ in range(PASSES):
-            ahead = _ahead(passes, far)
+            ahead = creep_ahead(passes, far)
             motors = passes[-1] if ahead is None else ahead
             passes, far = (passes, far) if ahead is None else ([], NEARER * far)
             along, _ = self._along(motors)
@@ -360,7 +360,7 @@ class TruePath:
         return total
 
 
-def _ahead(passes: list[FloatArray], far: float) -> FloatArray | None:
+def creep_ahead(passes: list[FloatArray], far: float) -> FloatArray | None:
     """Return the tensions at the motors that passes creep towards [N], (a,); None where they do not creep.
 
     While the bends of a held cable hold, what is behind them stays, and the tension at the motor moves by nearly the same small share in every
@@ -373,7 +373,7 @@ def _ahead(passes: list[FloatArray], far: float) -> FloatArray | None:
     before, step = second - first, last - second
     ratio = np.divide(step, before, out=np.zeros_like(step), where=before != 0.0)
     slow = (ratio > SLOW) & (ratio < 1.0 / SLOW)
-    whole = np.clip(step / np.maximum(1.0 - ratio, TINY), -far, far)
+    whole = np.clip(step * ratio / np.maximum(1.0 - ratio, TINY), -far, far)
     return passes[-1] * np.exp(np.where(slow, whole, 0.0)) if slow.any() else None
 
 

@@ -398,16 +398,20 @@ def test_view_says_where_and_ends(run: Any, robot: Path, tmp_path: Path) -> None
 
     def look_and_stop() -> None:
         for _ in range(200):
-            with contextlib.suppress(OSError), urllib.request.urlopen(url) as page:
+            with contextlib.suppress(OSError), urllib.request.urlopen(url, timeout=5.0) as page:
                 answered.append(page.status)
                 break
             time.sleep(0.05)
         os.kill(os.getpid(), signal.SIGINT)
 
     looking = threading.Thread(target=look_and_stop)
-    looking.start()
-    said = run("view", tmp_path / "run", "--port", port, "--no-browser", "--json")
-    looking.join()
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background inherits that it is ignored
+    try:
+        looking.start()
+        said = run("view", tmp_path / "run", "--port", port, "--no-browser", "--json")
+        looking.join()
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert said.status == 0 and said.json["url"] == url and answered == [200]
     with socket.socket() as free:
         assert free.connect_ex(("127.0.0.1", port)) != 0  # nobody answers any more

@@ -92,6 +92,19 @@ def test_limits_of_length_are_kept() -> None:
     assert any(limit.startswith(f"{name} wound up by no more than") for limit in motion.limits)
 
 
+def test_limits_of_length_hold_what_a_cable_stretches_by_too() -> None:
+    robot = apply_effects(bar(), [{"name": "cable_stretch", "stiffness_n_m": 20.0}])  # most of what is wound up stretches it
+    name = robot.body.cable_names[0]
+    wanted = place(robot, {name: 0.6})
+    free = fs.reach(robot, {"tip": wanted})
+    wound = fs.solve_equilibrium(robot.body, tension=free.inputs).shortening[name] + free.inputs[name] / 20.0
+    motion = fs.reach(robot, {"tip": wanted}, control="displacement", limits={name: (-1.0, 0.5 * wound)})
+    assert motion.status == "nearest" and motion.inputs[name] == pytest.approx(0.5 * wound, abs=1e-9)
+    held = fs.solve_equilibrium(robot.body, shortening=motion.inputs)
+    np.testing.assert_allclose(robot.markers.positions(held.positions)[0], motion.reached_m["tip"], atol=2e-7)
+    assert motion.iterations <= 8 and motion.certificate.violation < 1e-9
+
+
 def test_a_cable_that_cannot_push_is_said_to_be_what_limits() -> None:
     robot = bar()
     motion = fs.reach(robot, {"tip": np.subtract(place(robot, {}), [0.0, 0.0, 0.01])})

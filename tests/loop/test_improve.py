@@ -14,8 +14,7 @@ from arm import arm, record, sweeps
 from femsense.core.errors import DataError, InputError
 from femsense.loop.data.holdout import hold_out, sweeps_of
 from femsense.loop.data.trial import Groups
-from femsense.loop.fit import noise_components as noise_module
-from femsense.loop.fit.noise_components import Noise, estimate_noise, whiten
+from femsense.loop.fit.noise_components import Noise, estimate_noise, starting_points, whiten
 from femsense.loop.fit.repeatability import Repeatability
 from femsense.loop.improve import improve
 from femsense.loop.search.search import distinguishes_effects
@@ -272,7 +271,7 @@ def test_the_components_of_the_noise_are_distinguished():
     assert white.std() == pytest.approx(1.0, rel=0.1)
 
 
-def test_a_later_estimate_of_the_noise_begins_at_the_one_before(monkeypatch: pytest.MonkeyPatch):
+def test_a_later_estimate_of_the_noise_begins_at_the_one_before():
     rng = np.random.default_rng(3)
     frames, markers = 20, 6
     frame, marker = np.repeat(np.arange(frames), markers), np.tile(np.arange(markers), frames)
@@ -280,10 +279,13 @@ def test_a_later_estimate_of_the_noise_begins_at_the_one_before(monkeypatch: pyt
     residual = 1e-4 * rng.normal(size=(frames * markers, 3)) + 2e-4 * rng.normal(size=(frames, 3))[frame]
     given = [residual], [np.full((frames * markers, 3, 1), 1e-6)], [np.zeros((frames * markers, 3, 0))], [groups]
     first = estimate_noise(*given)
-    starts, plain = list[np.ndarray](), noise_module.minimize
-    monkeypatch.setattr(noise_module, "minimize", lambda f, x, **more: starts.append(x) or plain(f, x, **more))
+    near = np.log([first.std[name] for name in ("white", "frame")])
+    begun = starting_points(("white", "frame"), 2.2e-4, 0.0, near)
+    np.testing.assert_allclose(begun[0], near)
+    assert (begun[1] >= near).all() and not any(
+        np.allclose(s, near) for s in starting_points(("white", "frame"), 2.2e-4, 0.0, None)
+    )
     again = estimate_noise(*given, before=first.std)
-    assert np.exp(starts[0][0]) == pytest.approx(first.std["white"])
     for name in ("white", "frame"):
         assert again.std[name] == pytest.approx(first.std[name], rel=0.05)
 

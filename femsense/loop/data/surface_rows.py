@@ -140,10 +140,10 @@ def read_clouds(
         raise DataError(
             "no camera sees the robot in any frame that can be used: check T_robot_camera, appearance.color_rgb, and that the clouds are in metres"
         )
-    return MeasuredSurface(points, joined([_sheet_of(own, RADIUS * voxel) for own in points.values()]), voxel)
+    return MeasuredSurface(points, joined([sheet_of(own, RADIUS * voxel) for own in points.values()]), voxel)
 
 
-def _sheet_of(points: FloatArray, radius: float) -> Sheets:
+def sheet_of(points: FloatArray, radius: float) -> Sheets:
     """Return the measured surface of one cloud: height fields at points that are evenly thinned out."""
     thin = voxel_grid(PointCloud(points), SPACING * radius).points
     chosen = np.unique(np.asarray(cKDTree(points).query(thin)[1]))
@@ -212,7 +212,7 @@ def make_rows(
     for i, (k, v) in enumerate(seen.points):
         if k not in states:
             continue
-        numbers, heights, own = _crossings_of(robot, seen, i, states[k], poses[v])
+        numbers, heights, own = crossings_of(robot, seen, i, states[k], poses[v])
         if len(numbers) >= FEWEST_ROWS:
             every.append((np.full(len(numbers), k), len(robot.glued_names) + numbers, np.full(len(numbers), v), heights, own))
     if not every:
@@ -227,12 +227,12 @@ def make_rows(
     return _without_outliers(robot, rows, heights)
 
 
-def _crossings_of(
+def crossings_of(
     robot: Robot, seen: MeasuredSurface, sheet: int, state: Equilibrium, pose: FloatArray
 ) -> tuple[IntArray, FloatArray, Crossings]:
     """Return the numbers of the surface points whose normals one measured surface crosses amid measured points, how far outside of the model
     [m], and where."""
-    at = _in_camera(robot, robot.markers.positions(state.positions)[len(robot.glued_names) :], pose)
+    at = in_camera(robot, robot.markers.positions(state.positions)[len(robot.glued_names) :], pose)
     sides = surface_normals(robot, state.positions) @ pose[:3, :3]
     rays = -at / np.linalg.norm(at, axis=1, keepdims=True)
     distance, normals = seen.sheets.distance(at, np.full(len(at), sheet), sides)
@@ -263,7 +263,7 @@ def _rounded(
 ) -> FloatArray:
     """Return how far places on the model lie outside of its own surface as it would be measured [m], shape (k,); NaN: not measured there."""
     points, (centres, normals) = seen.cloud(sheet), seen.sheets.fields_of(sheet)
-    modelled = _on_model(robot, np.concatenate([points, centres]), state, pose)
+    modelled = on_model(robot, np.concatenate([points, centres]), state, pose)
     if not len(modelled):
         return np.full(len(at), np.nan)
     own = fit_sheet(modelled[: len(points)], modelled[len(points) :], normals, seen.sheets.radius)
@@ -271,14 +271,14 @@ def _rounded(
     return np.where(np.abs(distance) <= ROUNDS * seen.sheets.radius, distance, np.nan)
 
 
-def _on_model(robot: Robot, points: FloatArray, state: Equilibrium, pose: FloatArray) -> FloatArray:
+def on_model(robot: Robot, points: FloatArray, state: Equilibrium, pose: FloatArray) -> FloatArray:
     """Return the places on the model's surface nearest to measured points (r, 3) [m], frame of the camera; only sides that face it count."""
-    nodes, triangles = _in_camera(robot, state.positions, pose), surface_triangles(robot.body.mesh)
+    nodes, triangles = in_camera(robot, state.positions, pose), surface_triangles(robot.body.mesh)
     faces = np.einsum("tc,tc->t", triangle_normals(nodes, triangles), nodes[triangles[:, 0]]) < 0.0
     return nearest_on(nodes, triangles[faces], points) if faces.any() else points[:0]
 
 
-def _in_camera(robot: Robot, points: FloatArray, pose: FloatArray) -> FloatArray:
+def in_camera(robot: Robot, points: FloatArray, pose: FloatArray) -> FloatArray:
     """Return points of the robot frame as one camera measures them [m], frame of the camera."""
     return as_measured(points, np.zeros(len(points), dtype=np.int64), [pose], robot.observation)
 
@@ -323,7 +323,7 @@ def renewed_rows(
         rows = np.flatnonzero((scene.frame == k) & (scene.view == v))
         if k not in states or not len(rows):
             continue
-        at = _in_camera(robot, robot.markers.positions(states[k].positions)[scene.marker[rows]], poses[v])
+        at = in_camera(robot, robot.markers.positions(states[k].positions)[scene.marker[rows]], poses[v])
         fresh = _rounded(robot, seen, i, states[k], poses[v], at, scene.crossings.sides[rows])
         rounded[rows] = np.where(np.isfinite(fresh), fresh, rounded[rows])
     return replace(scene, crossings=replace(scene.crossings, rounded=rounded))

@@ -7,7 +7,7 @@ does and the frames suffice.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -87,6 +87,7 @@ def plan_experiment(
     frames: int = FRAMES,
     given: Recording | None = None,
     progress: Progress | None = None,
+    only: Collection[str] | None = None,
 ) -> Proposal:
     """Return the recording that makes the effects distinguishable, on the declared robot and to first order.
 
@@ -97,6 +98,7 @@ def plan_experiment(
         frames: budget of new frames.
         given: a recording that exists; without it the proposal starts from the least that is worth recording.
         progress: told (items done, items in all).
+        only: keys of the candidate experiments that can be done; by default all.
 
     Raises:
         InputError: no markers, no budget. DataError: the declared robot has no equilibrium.
@@ -108,11 +110,8 @@ def plan_experiment(
     setup = setup_for(robot, control if given is None else given.actuation, zero, most=most)
     ranges = np.array([p.height for p in setup.pulls if p.kind == "cables"])
     forms = _forms(robot, setup.control, zero, ranges)
-    start, extras = (
-        ([], [*minimal(setup)[:1], *candidate_experiments(setup)])
-        if given is not None
-        else (minimal(setup), candidate_experiments(setup))
-    )
+    candidates = [e for e in candidate_experiments(setup) if only is None or e.key in only]
+    start, extras = ([], [*minimal(setup)[:1], *candidates]) if given is not None else (minimal(setup), candidates)
     if sum(e.frames for e in start) > frames:
         raise InputError(
             "too few frames",

@@ -43,7 +43,7 @@ def parameter_std(data: Data, fitted: FittedModel, noise: Noise, seed_std: dict[
     """
     own = fitted.fit.own
     std = np.maximum.reduce(
-        [coordinate_std(fitted.fit, data.train, noise), _by_sweeps(data, fitted)[own:], _with_open_seeds(data, fitted, noise)]
+        [coordinate_std(fitted.fit, data.train, noise), std_by_sweeps(data, fitted)[own:], _with_open_seeds(data, fitted, noise)]
     )
     result, at = dict[str, FloatArray](), 0
     for effect, _, parameters in fitted.fit.hypothesis.terms:
@@ -131,7 +131,7 @@ def _directions(estimate: FloatArray) -> tuple[FloatArray, FloatArray]:
     return directions.reshape(-1, 3), np.repeat(np.sin(ring) * np.diff(edge), SPOKES)
 
 
-def _by_sweeps(data: Data, fitted: FittedModel) -> FloatArray:
+def std_by_sweeps(data: Data, fitted: FittedModel) -> FloatArray:
     """Return the standard deviations of all parameters that the disagreement of sweeps shows, shape (p,)."""
     J, r = np.asarray(fitted.fit.fit.jacobian), np.asarray(fitted.fit.fit.residual)
     sweeps = sweep_rows(data.train, fitted.fit)

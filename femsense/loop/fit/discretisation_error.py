@@ -59,7 +59,7 @@ def with_mesh_errors(data: Data, fitted: FittedModel, tried: Sequence[str]) -> D
         finer = _finer(robot.body.mesh, tried)
         if finer is None:
             return replace(data, mesh_note=_why_not(robot.body.mesh, tried))
-        fine = _on_its_clamp(robot, robot_on_mesh(_on_firm_clamp(robot), finer))
+        fine = on_its_clamp(robot, robot_on_mesh(_on_firm_clamp(robot), finer))
         for i, (trial, (poses, initial)) in enumerate(zip(data.train, known)):
             own = [j for j, of in enumerate(data.held_of) if of == i]
             train[i], *later = _with_errors(robot, fine, [trial, *(held[j] for j in own)], poses, initial)
@@ -95,7 +95,7 @@ def _on_firm_clamp(robot: Robot) -> Robot:
     return robot if body.clamp_is_rigid else robot.with_body(body.with_clamp_stiffness())
 
 
-def _on_its_clamp(robot: Robot, fine: Robot) -> Robot:
+def on_its_clamp(robot: Robot, fine: Robot) -> Robot:
     """Return the robot on the finer mesh with the springs of its clamp, where it has them, shared out over all clamped nodes, so that they resist turning
     alike: between the springs of few nodes a body bulges as none does that is held by a face."""
     body, finer = robot.body, fine.body

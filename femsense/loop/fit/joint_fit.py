@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,9 +19,6 @@ from femsense.model.effects.base import known_length
 from femsense.model.linear_answers import AtPoints
 from femsense.model.observation import Hypothesis, SceneJet, evaluate_scene
 from femsense.model.quasi_static_path import has_given
-
-if TYPE_CHECKING:
-    pass
 
 DECLARED_POSE_STD = np.array([2e-3] * 3 + [3e-4] * 3)
 """How far a declared pose is trusted [rad, m] where there are clouds alone …"""
@@ -150,7 +146,7 @@ class JointProblem:
 
     def _jets(self, theta: FloatArray, derivative: bool, rough: bool) -> tuple[list[States], list[SceneJet]]:
         """Return the states and the jets of all trials at θ."""
-        starts, spans, before = self._starts(theta, rough), spans_of(self.trials), self.last or self.seen
+        starts, spans, before = self.starts(theta, rough), spans_of(self.trials), self.last or self.seen
         jets = []
         for i, (trial, span) in enumerate(zip(self.trials, spans)):
             still = before is not None and not self.hypothesis.parameters and trial.initial is None
@@ -172,14 +168,23 @@ class JointProblem:
         rows = at + len(self._prior_rows(theta[self.own :], len(theta))[0])
         return joined(parts, rows, len(theta)) if parts else None
 
-    def settle_for(self, near: list[SceneJet] | None) -> list[SceneJet]:
+    def outcome(self, fit: FitResult) -> JointFit:
+        """Return the joint fit that ends where a fit of this problem did: with derivatives of its end, or of before where these are believed."""
+        at_end = self.last is not None and np.array_equal(self.last.theta, fit.theta)
+        was_seen = self.seen is not None and np.array_equal(self.seen.theta, fit.theta)  # otherwise a step further was tried
+        if not at_end and (fit.own or not was_seen):
+            self.evaluate(fit.theta, fit.own)
+        jets = self.last.jets if self.last is not None and (at_end or fit.own) else self._settled()
+        return JointFit(self.hypothesis, self.prior, fit, self.own, float(fit.residual @ fit.residual), jets)
+
+    def _settled(self) -> list[SceneJet]:
         """Return the residuals that were seen last, with the derivatives from before; their states serve as starts from now on."""
-        derivatives = near if self.last is None else self.last.jets
+        derivatives = self.near if self.last is None else self.last.jets
         assert self.seen is not None and derivatives is not None
-        self._starts(self.seen.theta, False)
+        self.starts(self.seen.theta, False)
         return [replace(d, residual=s.residual, rest=s.rest, states=s.states) for d, s in zip(derivatives, self.seen.jets)]
 
-    def _starts(self, theta: FloatArray, rough: bool) -> list[States]:
+    def starts(self, theta: FloatArray, rough: bool) -> list[States]:
         """Return the states to start from, of each trial: those of the step that was tried last where it is nearer."""
         kept = [t.starts_on(self.hypothesis.robot.body.mesh) for t in self.trials]
         if not rough:
@@ -287,10 +292,10 @@ def _as_near(kept: States, near: States, body: BodyModel) -> States:
     shape = next(iter(near.values())).positions.shape
     if any(state.positions.shape != shape for state in kept.values()):
         return dict(kept)
-    return {**kept, **{k: _lent(kept.get(k), state, body) for k, state in near.items()}}
+    return {**kept, **{k: lent_start(kept.get(k), state, body) for k, state in near.items()}}
 
 
-def _lent(kept: Equilibrium | None, state: Equilibrium, body: BodyModel) -> Equilibrium:
+def lent_start(kept: Equilibrium | None, state: Equilibrium, body: BodyModel) -> Equilibrium:
     """Return the state that a frame starts from, of one that is kept and one of a fit near by."""
     if kept is None or kept.positions is state.positions:  # such states have their factors
         return state if kept is None else kept
@@ -372,12 +377,4 @@ def fit_jointly(
             spare=spare,
         ),
     )
-    if problem.last is None or not np.array_equal(problem.last.theta, fit.theta):
-        if not fit.own:
-            if problem.seen is None or not np.array_equal(problem.seen.theta, fit.theta):  # a step further was tried
-                problem.evaluate(fit.theta, False)
-            jets = problem.settle_for(near)
-            return JointFit(hypothesis, prior, fit, problem.own, float(fit.residual @ fit.residual), jets)
-        problem.evaluate(fit.theta, True)
-    assert problem.last is not None
-    return JointFit(hypothesis, prior, fit, problem.own, float(fit.residual @ fit.residual), problem.last.jets)
+    return problem.outcome(fit)

@@ -16,6 +16,7 @@ that is measured five times repeats its error five times, and the term h² says 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import pairwise
@@ -195,25 +196,36 @@ def estimate_noise(
     lowest, highest = np.log(np.maximum(1e-3 * scale, FLOOR)), np.log(3.0 * scale)
     bounds = [(float(np.log(max(JITTER * jitter, np.exp(lowest)))) if n == "white" else lowest, highest) for n in names]
     near = None if before is None else np.log([max(before.get(n, 0.0), np.exp(lowest)) for n in names])
-    likelihood = _Likelihood(names, residuals, basis, groups, near)
+    likelihood = Likelihood(names, residuals, basis, groups, near)
 
     def from_start(start: FloatArray) -> Any:
         return minimize(
             likelihood, np.clip(start, lowest, highest), jac=True, method="L-BFGS-B", bounds=bounds, options={"ftol": FLAT}
         )
 
-    whites = {max(jitter, FLOOR), 0.3 * scale, 0.7 * scale}
-    starts = [np.log([w if n == "white" else 0.3 * scale for n in names]) for w in whites]
-    if near is not None:  # what was none before would stay none, since its logarithm has no slope there: it is lifted once
-        starts = [near, np.maximum(near, np.log(0.3 * scale))]
-    best = min(each(from_start, starts), key=lambda answer: answer.fun)
+    best = min(each(from_start, starting_points(names, scale, jitter, near)), key=lambda answer: answer.fun)
     std = {name: float(v) for name, v in zip(names, np.exp(best.x))}
     std = {name: max(v, FLOOR) if name == "white" else v if v > 2e-2 * scale else 0.0 for name, v in std.items()}
     how = "with states that are reached again" if "state" in names else "no repeated state: assumed from the residual"
     return Noise(std, f"restricted maximum likelihood, {how}")
 
 
-class _Likelihood:
+def starting_points(names: Sequence[str], scale: float, jitter: float, near: FloatArray | None) -> list[FloatArray]:
+    """Return logarithms of standard deviations [m] that the likelihood is climbed from.
+
+    Arguments:
+        names: of the components.
+        scale: rms of the residuals [m].
+        jitter: scatter of repeated states [m], 0 where there are none.
+        near: logarithms of an earlier estimate; it is begun there.
+    """
+    if near is not None:  # what was none before would stay none, since its logarithm has no slope there: it is lifted once
+        return [near, np.maximum(near, np.log(0.3 * scale))]
+    whites = {max(jitter, FLOOR), 0.3 * scale, 0.7 * scale}
+    return [np.log([w if n == "white" else 0.3 * scale for n in names]) for w in whites]
+
+
+class Likelihood:
     """Minus the restricted log-likelihood of log standard deviations, with its gradient.
 
     2 L = log|V| + log|XᵀV⁻¹X| + rᵀPr,  ∂(2 L)/∂v_i = tr(P V_i) − rᵀP V_i P r,  P = V⁻¹ − V⁻¹X(XᵀV⁻¹X)⁻¹XᵀV⁻¹,  V = Σ v_i V_i, the

@@ -238,6 +238,29 @@ def test_colours_of_another_camera_by_static_transforms(tmp_path: Path) -> None:
     assert not color[:, :2].any()
 
 
+def test_colours_of_a_camera_that_is_turned(tmp_path: Path) -> None:
+    """The same wall, seen by a colour camera that is turned by 90° about its axis, to the right and upwards."""
+    wall, place = np.full((HEIGHT, WIDTH), 500, dtype=np.uint16), np.array([0.03, -0.01, 0.0])
+    quarter = (0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5))
+    with BagWriter(tmp_path / "take", "mcap") as bag:
+        bag.write("/tf_static", START_NS, bag.static_transform("depth_optical", "color_optical", place, quarter))
+        bag.write("/depth/image_raw", START_NS, bag.image(wall, "16UC1", START_NS, "depth_optical"))
+        bag.write("/depth/camera_info", START_NS, bag.info(START_NS, "depth_optical"))
+        bag.write("/color/image_raw", START_NS, bag.image(color_of(0), "rgb8", START_NS, "color_optical"))
+        bag.write("/color/camera_info", START_NS, bag.info(START_NS, "color_optical"))
+    imported(tmp_path / "take", tmp_path)
+    color = read_png(tmp_path / "recording/color/000000.png")[:, :, ::-1]
+    fx, fy, cx, cy = LENS
+    row, column = np.indices((HEIGHT, WIDTH)).reshape(2, -1)
+    points = 0.5 * np.column_stack([(column - cx) / fx, (row - cy) / fy, np.ones(row.size)]) - place
+    x, y = points[:, 1], -points[:, 0]  # the camera's x points down, its y to the left
+    u, v = np.rint(fx * x / 0.5 + cx).astype(int), np.rint(fy * y / 0.5 + cy).astype(int)
+    inside = (u >= 0) & (u < WIDTH) & (v >= 0) & (v < HEIGHT)
+    assert inside.sum() > 300
+    same = (color[row[inside], column[inside]] == color_of(0)[v[inside], u[inside]]).all(axis=1)
+    assert same.mean() > 0.99 and not color[row[~inside], column[~inside]].any()
+
+
 def test_colours_without_a_known_place_are_left_out_and_named(tmp_path: Path) -> None:
     with BagWriter(tmp_path / "take", "mcap") as bag:
         bag.write("/depth/image_raw", START_NS, bag.image(depth_of(0), "16UC1", START_NS, "a"))

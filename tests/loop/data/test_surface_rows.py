@@ -19,11 +19,11 @@ from femsense.loop.data.dataset import Data, prepare
 from femsense.loop.data.surface_rows import (
     ROUNDS,
     MeasuredSurface,
-    _crossings_of,
-    _in_camera,
-    _on_model,
-    _sheet_of,
+    crossings_of,
+    in_camera,
+    on_model,
     renewed_rows,
+    sheet_of,
     surface_normals,
     with_surface,
 )
@@ -192,7 +192,7 @@ def on_sides(robot: Robot, facing: tuple[float, ...]) -> np.ndarray:
 
 
 def seen_as(points: np.ndarray) -> MeasuredSurface:
-    return MeasuredSurface({(0, 0): points}, joined([_sheet_of(points, 6e-3)]), 2e-3)
+    return MeasuredSurface({(0, 0): points}, joined([sheet_of(points, 6e-3)]), 2e-3)
 
 
 def test_what_a_measured_surface_rounds_off_is_no_residual():
@@ -204,14 +204,14 @@ def test_what_a_measured_surface_rounds_off_is_no_residual():
     points = on_sides(robot, (0.0, 0.2, 0.3)) - pose[:3, 3]
     state = rest_state(robot)
     seen = seen_as(points)
-    numbers, heights, crossings = _crossings_of(robot, seen, 0, state, pose)
+    numbers, heights, crossings = crossings_of(robot, seen, 0, state, pose)
     assert len(numbers) > 8
     np.testing.assert_allclose(heights, 0.0, atol=1e-9)
-    at = _in_camera(robot, robot.marker_points[len(robot.glued_names) :][numbers], pose)
+    at = in_camera(robot, robot.marker_points[len(robot.glued_names) :][numbers], pose)
     np.testing.assert_allclose(crossings.distance(at), 0.0, atol=1e-9)
     plain, _ = seen.sheets.distance(at, crossings.sheet, crossings.sides)
     assert np.abs(plain).max() > 5e-4
-    again, higher, _ = _crossings_of(robot, seen_as(points + 1e-3 * np.array([0.0, 0.0, 1.0])), 0, state, pose)
+    again, higher, _ = crossings_of(robot, seen_as(points + 1e-3 * np.array([0.0, 0.0, 1.0])), 0, state, pose)
     top = surface_normals(robot, state.positions)[again][:, 2] > 0.99
     assert top.sum() > 2
     np.testing.assert_allclose(higher[top], 1e-3, atol=2e-4)
@@ -225,7 +225,7 @@ def test_a_place_that_the_models_own_fields_do_not_cover_is_no_row():
     pose[:3, 3] = 0.05, 0.2, 0.3
     seen = seen_as(on_sides(robot, (0.0, 0.2, 0.3)) - pose[:3, 3])
     for off in ([0.0, 0.0, 0.0], [5e-3, 0.0, 0.0]):  # there, beyond the end, fields are of points along its edge alone
-        numbers, _, crossings = _crossings_of(robot, seen, 0, state, move_pose(pose, np.r_[np.zeros(3), off]))
+        numbers, _, crossings = crossings_of(robot, seen, 0, state, move_pose(pose, np.r_[np.zeros(3), off]))
         assert len(numbers) > 50
         assert np.abs(crossings.rounded).max() < ROUNDS * seen.sheets.radius
 
@@ -262,7 +262,7 @@ def test_rows_hardly_change_when_they_are_made_anew_elsewhere(both: Data):
     change = rows.crossings.rounded - scene.crossings.rounded
     assert np.sqrt((change**2).mean()) < 1e-4  # where the model went 3.5 mm
     first = np.flatnonzero(scene.frame == frames[0])
-    numbers, _, made = _crossings_of(robot, trial.seen, 0, states[int(frames[0])], moved[0])
+    numbers, _, made = crossings_of(robot, trial.seen, 0, states[int(frames[0])], moved[0])
     _, i, j = np.intersect1d(scene.marker[first] - len(robot.glued_names), numbers, return_indices=True)
     assert len(i) > 12
     np.testing.assert_allclose(rows.crossings.rounded[first][i], made.rounded[j], atol=2e-6)  # as rows made there have it
@@ -273,7 +273,7 @@ def test_only_sides_that_face_the_camera_stand_for_what_it_measured():
     pose = np.eye(4)
     pose[:3, 3] = 0.05, 0.0, 0.4
     deep = np.array([[0.05, 0.002, -0.009], [0.03, 0.001, -0.02]]) - pose[:3, 3]  # nearer to the side below
-    np.testing.assert_allclose(_on_model(robot, deep, rest_state(robot), pose)[:, 2], 0.01 - 0.4, atol=1e-9)
+    np.testing.assert_allclose(on_model(robot, deep, rest_state(robot), pose)[:, 2], 0.01 - 0.4, atol=1e-9)
 
 
 def test_derivatives_of_cloud_rows_are_those_of_finite_differences(both: Data):

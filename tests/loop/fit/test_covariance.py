@@ -11,7 +11,7 @@ from arm import arm, record, sweeps
 
 from femsense.core.least_squares import covariance_of
 from femsense.loop.data.dataset import prepare
-from femsense.loop.fit.covariance import _by_sweeps, coordinate_std, misfit, parameter_std
+from femsense.loop.fit.covariance import coordinate_std, misfit, parameter_std, std_by_sweeps
 from femsense.loop.fit.fitted_model import fit_model
 from femsense.loop.fit.joint_fit import Prior
 from femsense.loop.fit.noise_components import Noise
@@ -95,9 +95,9 @@ def test_sweeps_that_disagree_say_by_how_much() -> None:
     data, fitted = sweeps_fit(values, 4)
     # of equal sweeps: the variance of a mean of five; half leverage gives each its share back, 1 / (1 − 1/5)
     expected = np.sqrt(np.sum((values - values.mean()) ** 2) / 5 / 4)
-    np.testing.assert_allclose(_by_sweeps(data, fitted), expected, rtol=1e-6)
+    np.testing.assert_allclose(std_by_sweeps(data, fitted), expected, rtol=1e-6)
     two, fitted = sweeps_fit(values[:2], 4)
-    assert not _by_sweeps(two, fitted).any()
+    assert not std_by_sweeps(two, fitted).any()
 
 
 def test_a_time_that_a_seed_holds_still_leaves_the_fraction_open() -> None:

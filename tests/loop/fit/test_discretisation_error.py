@@ -13,10 +13,10 @@ from femsense.loop.fit.discretisation_error import (
     SHARE,
     TURNS,
     VARIES,
-    _on_its_clamp,
     errs_alike,
     make_finer,
     mesh_errors,
+    on_its_clamp,
     with_mesh_errors,
     without_mesh_error,
 )
@@ -85,7 +85,7 @@ def test_springs_of_a_clamp_are_shared_out_over_the_finer_face():
     soft = arm((4, 2, 2))
     soft = soft.with_body(soft.body.with_clamp_stiffness(40.0))
     finer = robot_on_mesh(soft.with_body(soft.body.with_clamp_stiffness()), finer_mesh(soft.body.mesh, None, 1))
-    body = _on_its_clamp(soft, finer).body
+    body = on_its_clamp(soft, finer).body
     moments = [b.clamp_stiffness * ((b.mesh.nodes[b.clamp_nodes] - soft.body.clamp_center) ** 2).sum() for b in (soft.body, body)]
     assert len(body.clamp_nodes) == len(body.clamped) > 2 * len(soft.body.clamp_nodes)
     assert moments[1] == pytest.approx(moments[0])

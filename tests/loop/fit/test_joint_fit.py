@@ -11,26 +11,32 @@ from arm import arm
 from fitted_arm import NOISE, fitted_arm
 
 from femsense.core.errors import DataError
-from femsense.loop.fit import joint_fit
-from femsense.loop.fit.joint_fit import Jets, JointProblem
+from femsense.core.least_squares import GaussNewtonOptions, gauss_newton
+from femsense.loop.data.trial import Trial
+from femsense.loop.fit.joint_fit import Jets, JointProblem, lent_start
 from femsense.loop.fit.noise_components import whiten
 from femsense.loop.search.refit import with_term
 from femsense.model.effects import find_effect
+from femsense.model.observation import SceneJet
 
 
-def test_a_step_that_goes_too_far_is_refused_and_not_solved_by_all_means(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_step_that_goes_too_far_is_refused_and_not_solved_by_all_means() -> None:
     data, fitted = fitted_arm(arm((4, 2, 2)))
-    problem = JointProblem(fitted.fit.hypothesis, fitted.fit.prior, data.train, [NOISE.whitener(data.train[0].groups, None)], 1.0)
+    rough_only = list[bool]()
+
+    class TooFar(JointProblem):
+        """A problem in which no state that is only tried converges."""
+
+        def jet(
+            self, trial: Trial, own: Any, coordinates: Any, derivative: bool, starts: Any, rough: bool, *rest: Any
+        ) -> SceneJet:
+            rough_only.append(rough)
+            if rough:
+                raise DataError("no equilibrium")
+            return JointProblem.jet(self, trial, own, coordinates, derivative, starts, rough, *rest)
+
+    problem = TooFar(fitted.fit.hypothesis, fitted.fit.prior, data.train, [NOISE.whitener(data.train[0].groups, None)], 1.0)
     problem.near = fitted.fit.jets
-    rough_only, plain = list[bool](), JointProblem._jets
-
-    def too_far(self: JointProblem, theta: np.ndarray, derivative: bool, rough: bool) -> object:
-        rough_only.append(rough)
-        if rough:
-            raise DataError("no equilibrium")
-        return plain(self, theta, derivative, rough)
-
-    monkeypatch.setattr(JointProblem, "_jets", too_far)
     theta = np.array(fitted.fit.fit.theta)
     problem.evaluate(theta, False)  # the start is solved by all means
     with pytest.raises(DataError):
@@ -56,7 +62,7 @@ def test_a_fit_begins_at_the_states_of_the_model_before_unless_their_clamp_is_an
     begins = JointProblem(hypothesis, prior, [trial], problem.factors, 1.0)
     begins.last = Jets(fitted.fit.jets, theta)
     wanted = kept if clamp else fitted.fit.jets[0].states
-    (starts,) = begins._starts(theta, True)
+    (starts,) = begins.starts(theta, True)
     assert wanted and all(starts[k].positions is state.positions for k, state in wanted.items())
 
 
@@ -66,24 +72,22 @@ def test_states_that_are_far_apart_lend_each_other_no_factors() -> None:
     k = next(k for k, state in kept.items() if state.factor is not None)
     free = ~np.isin(np.arange(len(body.mesh.nodes)), body.clamped)[:, None]
     beside, far = (replace(kept[k], positions=kept[k].positions + by * body.reach * free, factor=None) for by in (0.005, 0.02))
-    assert joint_fit._lent(kept[k], beside, body).factor is kept[k].factor and joint_fit._lent(kept[k], far, body).factor is None
-    assert all(joint_fit._lent(kept[k], state, body).positions is state.positions for state in (beside, far))
+    assert lent_start(kept[k], beside, body).factor is kept[k].factor and lent_start(kept[k], far, body).factor is None
+    assert all(lent_start(kept[k], state, body).positions is state.positions for state in (beside, far))
 
 
-def test_a_fit_that_ends_on_its_way_has_the_residual_of_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("own", [False, True])
+def test_a_fit_that_ends_on_its_way_has_the_residual_of_its_end(own: bool) -> None:
     data, fitted = fitted_arm(arm((4, 2, 2)))
-    plain = joint_fit.gauss_newton
-
-    def tries_further(evaluate: Any, theta: np.ndarray, **more: Any) -> Any:
-        fit = plain(evaluate, theta, **{**more, "options": replace(more["options"], trusted=1e9)})
-        evaluate(fit.theta + 1e-3, False)  # a step that is not taken
-        return replace(fit, own=False)
-
-    monkeypatch.setattr(joint_fit, "gauss_newton", tries_further)
     trial = replace(data.train[0], initial=None)
-    start = fitted.fit.coordinates + 0.02
-    fit = joint_fit.fit_jointly(fitted.fit.hypothesis, fitted.fit.prior, [trial], NOISE, 1.0, start, near=fitted.fit.jets)
-    white = whiten(NOISE.whitener(trial.groups, None), fit.jets[0].residual)
+    problem = JointProblem(fitted.fit.hypothesis, fitted.fit.prior, [trial], [NOISE.whitener(trial.groups, None)], 1.0)
+    problem.near = fitted.fit.jets
+    theta = problem.start(fitted.fit.coordinates + 0.02)
+    fit = gauss_newton(problem.evaluate, theta, options=GaussNewtonOptions(max_iterations=3))
+    problem.evaluate(fit.theta + 1e-3, False)  # a step that is not taken
+    problem.last = None
+    fit = problem.outcome(replace(fit, own=own))
+    white = whiten(problem.factors[0], fit.jets[0].residual)
     np.testing.assert_allclose(white, fit.fit.residual[: white.size], atol=1e-3)
 
 

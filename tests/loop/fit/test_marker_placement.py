@@ -14,7 +14,7 @@ from femsense.loop.data.dataset import prepare
 from femsense.loop.data.trial import Groups
 from femsense.loop.fit.fitted_model import fit_model, problem_of, with_nuisance
 from femsense.loop.fit.marker_placement import placement_turns, with_turning_placements
-from femsense.loop.fit.noise_components import Noise, _Likelihood, estimate_noise, whiten
+from femsense.loop.fit.noise_components import Likelihood, Noise, estimate_noise, whiten
 from femsense.loop.improve import improve
 from femsense.model.effects import apply_effects
 
@@ -72,7 +72,7 @@ def test_the_likelihood_of_seats_that_turn_is_that_of_their_covariance():
     names, k = ["white", "frame", "marker", "sweep"], 24
     basis = np.linalg.qr(rng.normal(size=(3 * k, 4)))[0]
     residual = rng.normal(size=(k, 3))
-    likelihood = _Likelihood(names, [residual], [basis.reshape(k, 3, 4)], [groups])
+    likelihood = Likelihood(names, [residual], [basis.reshape(k, 3, 4)], [groups])
 
     def slowly(log_std: np.ndarray) -> float:
         inverse = np.linalg.inv(covariance(Noise(dict(zip(names, np.exp(log_std))), ""), groups))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from femsense.loop.data.trial import Groups
-from femsense.loop.fit.noise_components import Noise, _Likelihood, whiten
+from femsense.loop.fit.noise_components import Likelihood, Noise, whiten
 
 RNG = np.random.default_rng(11)
 
@@ -19,7 +19,7 @@ def some_groups(frames: int = 12, markers: int = 5) -> Groups:
 def test_the_gradient_of_the_likelihood_is_its_difference():
     groups = some_groups()
     k = len(groups.marker)
-    likelihood = _Likelihood(
+    likelihood = Likelihood(
         ["white", "frame", "marker", "sweep"], [RNG.normal(size=(k, 3))], [RNG.normal(size=(k, 3, 4))], [groups]
     )
     at = np.log([1.0, 0.6, 0.4, 0.3])
