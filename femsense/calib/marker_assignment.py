@@ -148,8 +148,10 @@ def _fitted(robot: Robot, recording: Recording, seen: Sequence[Nameless], named:
     for _ in range(ROUNDS):
         frames = np.unique(np.concatenate([one.frames for one in seen]))
         scene = make_scene(robot, _with_names(robot, recording, frames, named.marker), frames)
-        _, poses, _, jet = fit_joint(robot, scene, list(named.poses), first_inputs(robot, recording), [])
+        _, poses, initial, jet = fit_joint(robot, scene, list(named.poses), first_inputs(robot, recording), [])
         model = {k: robot.markers.positions(state.positions) for k, state in jet.states.items()}
+        nameless = np.setdiff1d(frames, list(model))  # frames in which no point got a name are not in the fit
+        model |= _modelled(robot, recording, nameless, initial)
         again = _settled(robot, recording, seen, replace(named, poses=tuple(poses)), model)
         named, before = again, named
         if np.array_equal(before.marker, named.marker):

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from arm import arm, record
 from helpers import DATA, write_block_robot
 
 from femsense.calib.calibrate import calibrate
@@ -155,3 +156,13 @@ def test_a_lost_marker_written_as_zeros(tmp_path: Path) -> None:
     assert r.marker_frame.tolist() == [0, 2]
     with pytest.raises(DataError, match="0, 0, 0 in every row of side"), contextlib.suppress(UserWarning):
         load_recording(write_small_recording(tmp_path / "b", markers_csv=rows + "0,side,0,0,0\n"))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_left_handed_axes_of_a_symmetric_body_are_not_taken_for_exchanged_labels(seed: int) -> None:
+    inputs = np.array([[0.0, 0, 0, 0], [0.5, 0, 0, 0], [0.5, 0, 0.4, 0], [0, 0, 0.6, 0]])
+    recording, _ = record(inputs, noise=2e-4, seed=seed)
+    xyz = recording.marker_xyz * np.where(np.arange(3) == seed, -1.0, 1.0)
+    table = (recording.marker_names, recording.marker_frame, recording.marker_index, xyz)
+    with pytest.raises(DataError, match="Mirrored they fit: are the axes left-handed"):
+        calibrate(arm(), with_marker_table(recording, *table))

@@ -198,3 +198,19 @@ def test_an_error_is_that_of_the_model_s_points_and_outliers_cost() -> None:
     assert clean == pytest.approx(1e-3, rel=0.1)
     squares[:40] = 0.05**2
     assert clean < float(typical_error(squares, 0.1)) < 3.0 * clean
+
+
+def test_a_frame_of_strays_alone_costs_only_itself() -> None:
+    robot = lopsided(arm())
+    bare, truth = nameless(record(INPUTS, noise=2e-4)[0], KEPT)
+    strays = bare.unnamed_frame == 2
+    xyz = bare.unnamed_xyz + strays[:, None] * np.array([0.3, -0.2, 0.1])
+    bare = replace(bare, unnamed_xyz=xyz[~strays | (np.cumsum(strays) <= 2)])
+    kept = ~strays | (np.cumsum(strays) <= 2)
+    bare = replace(bare, unnamed_frame=bare.unnamed_frame[kept], unnamed_view=bare.unnamed_view[kept])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        named = name_markers(robot, bare, np.arange(bare.frame_count))
+    given = names_given(robot, bare, named)
+    assert (given[bare.unnamed_frame == 2] == -1).all()
+    assert (given == np.where(bare.unnamed_frame == 2, -1, truth[kept])).all()
