@@ -12,7 +12,7 @@ import femsense
 from femsense.core.errors import InputError
 from femsense.io.importers.actuation import read_actuation_log
 from femsense.io.importers.frames import UNITS, Options
-from femsense.io.importers.guess import open_source
+from femsense.io.importers.guess import open_sources, split_name
 from femsense.io.importers.plain_csv import header_of
 from femsense.io.importers.writer import RECORD, write_recording
 
@@ -31,9 +31,23 @@ def columns_named(columns: Sequence[str]) -> dict[str, str]:
     return {old: new for old, _, new in pairs}
 
 
+def shifts_named(shifts: Sequence[str]) -> dict[str, float]:
+    """Return the seconds CAMERA=S of `--shift` as camera → seconds. Raises InputError."""
+    found: dict[str, float] = {}
+    for text in shifts:
+        name, _, value = text.rpartition("=")
+        try:
+            found[name] = float(value)
+        except ValueError:
+            name = ""
+        if not name:
+            raise InputError("not a shift of a camera's times", where="--shift", found=text, expected="CAMERA=SECONDS")
+    return found
+
+
 def import_into(
     folder: str | Path,
-    path: str | Path,
+    paths: Sequence[str | Path],
     options: Options,
     *,
     say: Say,
@@ -48,7 +62,7 @@ def import_into(
 
     Arguments:
         folder: of the recording.
-        path: the capture.
+        paths: the captures, one a camera; NAME=PATH names it.
         options: what a person says about it.
         say: told in one line what happens beside.
         inputs: what cables' values are, "tension" or "displacement", where the capture does not say.
@@ -62,14 +76,14 @@ def import_into(
         InputError: whatever is wrong with the capture, or another thing at this place.
     """
     _check_options(options, inputs, zero)
-    final, source_path = Path(folder), Path(path).expanduser()
-    identity = _identity(source_path, options, inputs, zero, actuation, offset)
+    final = Path(folder)
+    identity = _identity(paths, options, inputs, zero, actuation, offset)
     known = _standing(final, identity, again)
     if known is not None:
         say(f"{final} holds this import already (--again makes it anew)")
         return known
     log = None if actuation is None else read_actuation_log(actuation, options)
-    source = open_source(source_path, options if actuation is None else _without_log(options, Path(actuation)))
+    source = open_sources(paths, options if actuation is None else _without_log(options, Path(actuation)))
     found = write_recording(
         source,
         final,
@@ -116,11 +130,17 @@ def _without_log(options: Options, log: Path) -> Options:
 
 
 def _identity(
-    path: Path, options: Options, inputs: str | None, zero: str | None, actuation: str | Path | None, offset: float | None
+    paths: Sequence[str | Path],
+    options: Options,
+    inputs: str | None,
+    zero: str | None,
+    actuation: str | Path | None,
+    offset: float | None,
 ) -> dict[str, Any]:
     """Return what an import is made from: another file, another time of its change or another option is another import."""
+    states = [_state(split_name(path)[1]) for path in paths]
     return {
-        "source": _state(path),
+        "source": states[0] if len(states) == 1 else [*states, list(map(str, paths))],
         "options": asdict(options),
         "inputs": inputs,
         "zero": zero,

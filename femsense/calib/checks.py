@@ -137,9 +137,8 @@ def _swapped(pairs: Pairs, plain: float) -> dict[int, int]:
         left = float(squares[np.arange(len(seen)), columns].sum())
         best, names = (left, columns) if left < best else (best, names)
     truth = {int(a): int(b) for a, b in zip(named, named[names])}
-    average = {int(m): pairs.modelled[pairs.marker == m].mean(axis=0) for m in np.unique(pairs.marker)}
     renamed = np.array([truth.get(int(m), int(m)) for m in pairs.marker])
-    explained = _rigid(_modelled(pairs, average, renamed), pairs.measured) * EXPLAINED < plain
+    explained = _rigid(_modelled(pairs, renamed), pairs.measured) * EXPLAINED < plain
     return {a: b for a, b in truth.items() if a != b} if explained else {}
 
 
@@ -184,9 +183,11 @@ def _cycles(robot: Robot, truth: dict[int, int]) -> str:
     return "; ".join(texts)
 
 
-def _modelled(pairs: Pairs, model: dict[int, FloatArray], named: IntArray) -> FloatArray:
-    """Return where the model has the markers under other names; each keeps its motion from frame to frame only roughly."""
-    return np.where((named == pairs.marker)[:, None], pairs.modelled, np.array([model[int(m)] for m in named]))
+def _modelled(pairs: Pairs, named: IntArray) -> FloatArray:
+    """Return where the model has the markers under other names; one that its frame lacks is where it is on average."""
+    there = {(int(g), int(m)): place for g, m, place in zip(pairs.group, pairs.marker, pairs.modelled)}
+    average = {int(m): pairs.modelled[pairs.marker == m].mean(axis=0) for m in np.unique(pairs.marker)}
+    return np.array([there.get((int(g), int(m)), average[int(m)]) for g, m in zip(pairs.group, named)])
 
 
 def true_labels(places: FloatArray, measured: FloatArray, marker: IntArray, *, noise: float) -> IntArray:

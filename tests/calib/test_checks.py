@@ -166,3 +166,13 @@ def test_left_handed_axes_of_a_symmetric_body_are_not_taken_for_exchanged_labels
     table = (recording.marker_names, recording.marker_frame, recording.marker_index, xyz)
     with pytest.raises(DataError, match="Mirrored they fit: are the axes left-handed"):
         calibrate(arm(), with_marker_table(recording, *table))
+
+
+def test_labels_exchanged_in_all_frames_are_named_where_the_body_moves() -> None:
+    inputs = np.array([[0.0, 0, 0, 0], [0.5, 0, 0, 0], [0.5, 0, 0.4, 0], [0, 0, 0.6, 0], [0, 0.5, 0, 0], [0, 0, 0, 0.5]])
+    recording, _ = record(inputs, noise=2e-4)
+    index = recording.marker_index.copy()
+    index[recording.marker_index == 9], index[recording.marker_index == 11] = 11, 9
+    table = (recording.marker_names, recording.marker_frame, index, recording.marker_xyz)
+    with pytest.raises(DataError, match="labels seem exchanged: (m9 and m11|m11 and m9)"):
+        calibrate(arm(), with_marker_table(recording, *table))

@@ -13,7 +13,12 @@ from femsense.app.command_line.parameters import Json, RobotPath, required
 
 def import_(
     source: Annotated[
-        Path, typer.Argument(metavar="SOURCE", help="A bag, a motion capture, a folder of images or clouds.", show_default=False)
+        list[str],
+        typer.Argument(
+            metavar="SOURCE…",
+            help="A bag, a motion capture, a folder of images or clouds; several (or NAME=SOURCE) are cameras.",
+            show_default=False,
+        ),
     ],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="RECORDING", help="The folder to write.", show_default=False)],
     format: Annotated[
@@ -38,6 +43,14 @@ def import_(
     rate: Annotated[
         float | None, typer.Option("--rate", metavar="HZ", help="Where the source has no times.", show_default=False)
     ] = None,
+    base: Annotated[
+        str | None,
+        typer.Option("--base", metavar="FRAME", help="Frame of a bag's transforms that is the robot's.", show_default=False),
+    ] = None,
+    shift: Annotated[
+        list[str] | None,
+        typer.Option("--shift", metavar="CAMERA=S", help="Seconds to add to a camera's times.", show_default=False),
+    ] = None,
     inputs: Annotated[
         str | None,
         typer.Option("--inputs", metavar="tension|displacement", help="What the cables' values are.", show_default=False),
@@ -57,10 +70,12 @@ def import_(
     json: Json = False,
 ) -> Answer:
     """Make a recording of what other programs recorded."""
-    from femsense.app.import_command import columns_named, import_into, import_text
+    from femsense.app.import_command import columns_named, import_into, import_text, shifts_named
     from femsense.io.importers.frames import Options
 
-    options = Options(format, tuple(topic or ()), columns_named(map_ or []), unit, up, clock, rate)
+    options = Options(
+        format, tuple(topic or ()), columns_named(map_ or []), unit, up, clock, rate, base, shifts_named(shift or [])
+    )
     with progress_bar("import") as progress:
         document = import_into(
             output,

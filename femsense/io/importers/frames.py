@@ -78,6 +78,8 @@ class Frame:
     """Column of frames.csv (cable_…, chamber_…) → value [N], [m] or [Pa]."""
     loads: Sequence[tuple[npt.ArrayLike, npt.ArrayLike]] = ()
     """Place [m] and force [N], robot frame, each of shape (3,)."""
+    views: Mapping[str, Frame] = field(default_factory=dict)
+    """Camera → what it alone gave at this moment; where there is one, picture and markers stand here and not above."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -100,6 +102,10 @@ class Source:
     """Frames that are expected, where it is known."""
     notes: Sequence[str] = ()
     """What a person should know before trusting it."""
+    T_robot_camera: FloatArray | None = None
+    """Shape (4, 4), translation [m], where the source says it."""
+    views: Mapping[str, Source] = field(default_factory=dict)
+    """Camera → its own source, where several look; see `several.joined`."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -119,6 +125,10 @@ class Options:
     """"header", "record" or "auto"."""
     rate: float | None = None
     """Frames a second where a source has no times."""
+    base: str | None = None
+    """Coordinate frame of a bag's static transforms that is the robot's: poses of cameras are taken from them."""
+    shifts: Mapping[str, float] = field(default_factory=dict)
+    """Camera → seconds to add to its times, where clocks differ."""
 
 
 def unit_of(options: Options, declared: str | None, where: str | Path | None, extent: float) -> float:

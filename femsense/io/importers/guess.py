@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +18,7 @@ from femsense.io.importers.mocap_csv import is_mocap_csv, open_mocap_csv, read_e
 from femsense.io.importers.plain_csv import header_of, open_plain_csv
 from femsense.io.importers.ros import list_ros, open_ros
 from femsense.io.importers.ros_bag import ENDINGS
+from femsense.io.importers.several import camera_names, joined
 
 FORMATS: dict[str, Callable[[Path, Options], Source]] = {
     "ros": open_ros,
@@ -52,6 +56,8 @@ def open_source(path: str | Path, options: Options | None = None) -> Source:
         names = [item.name for item in source.parent.iterdir()] if source.parent.is_dir() else []
         raise InputError("nothing there", where=source, expected="a file or a folder", hint=did_you_mean(source.name, names))
     name = said.format or guess_format(source)
+    if said.base is not None and name not in ("ros", "realsense"):
+        raise InputError("frames of coordinates stand in bags only", where=f"--base {said.base}", found=source)
     if name not in FORMATS:
         found = f"{source.suffix or 'no ending'}" if name is None else name
         raise InputError(
@@ -62,6 +68,62 @@ def open_source(path: str | Path, options: Options | None = None) -> Source:
             hint=None if name is None else did_you_mean(name, FORMATS),
         )
     return FORMATS[name](source, said)
+
+
+def open_sources(paths: Sequence[str | Path], options: Options | None = None) -> Source:
+    """Return what one or several captures hold; of several each is a camera (or a motion capture) of one recording.
+
+    Arguments:
+        paths: files or folders; NAME=PATH names the camera.
+        options: what a person says about all of them; a topic that one bag does not hold is another's.
+
+    Raises:
+        InputError: as `open_source`; names that stand twice; clocks that do not overlap, also by time of recording.
+    """
+    said = options or Options()
+    if len(paths) == 1:
+        source = open_source(paths[0], said)
+        return source if source.views or not said.shifts else joined({"": source}, source.path, said)
+    given = [split_name(path) for path in paths]
+    guessed = camera_names([str(path) for _, path in given])
+    names = [name or other for (name, _), other in zip(given, guessed)]
+    if len(set(names)) < len(names):
+        raise InputError(
+            "a name of a camera stands twice", where="SOURCE", found=", ".join(names), expected="NAME=PATH with names"
+        )
+    files = [path for _, path in given]
+    try:
+        return joined({name: _one_of(file, said) for name, file in zip(names, files)}, files[0], said)
+    except InputError:
+        if said.clock != "auto":
+            raise
+        by_record = replace(said, clock="record")
+        sources = {name: _one_of(file, by_record) for name, file in zip(names, files)}
+        with contextlib.suppress(InputError):
+            source = joined(sources, files[0], said)
+            return replace(source, notes=[*source.notes, "the devices' clocks differ: times are those of recording"])
+        raise
+
+
+def _one_of(path: Path, options: Options) -> Source:
+    """Return one of several captures, a camera of its own."""
+    if options.topics and path.exists() and (options.format or guess_format(path)) in ("ros", "realsense"):
+        held = {row["topic"] for row in list_ros(path)["topics"]}
+        options = replace(options, topics=[topic for topic in options.topics if topic in held])
+    source = open_source(path, options)
+    if source.views:
+        raise InputError(
+            "a capture with several cameras beside others", where=path, found=", ".join(source.views), expected="one"
+        )
+    return source
+
+
+def split_name(text: str | Path) -> tuple[str, Path]:
+    """Return the name, empty where none is given, and the path of NAME=PATH."""
+    name, mark, path = str(text).partition("=")
+    if Path(text).expanduser().exists() or not mark or not re.fullmatch(r"\w[\w-]*", name):
+        return "", Path(text).expanduser()
+    return name, Path(path).expanduser()
 
 
 def guess_format(path: Path) -> str | None:

@@ -18,20 +18,33 @@ JOURNAL = ".import-journal"
 
 
 @dataclass(frozen=True, eq=False, slots=True)
+class Seen:
+    """What one camera gave in a frame."""
+
+    markers: Mapping[str, list[float]]
+    unlabelled: list[list[float]]
+    picture: str
+    """ "depth", "cloud", "broken" or ""."""
+    center: list[float] | None
+    """Mean of the points that were seen [m]; None where none were."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
 class Entry:
     """One written frame."""
 
     time: float
     """[s] on the source's clock."""
     inputs: Mapping[str, float]
-    markers: Mapping[str, list[float]]
-    unlabelled: list[list[float]]
     loads: list[list[float]]
     """Six numbers each: place [m], force [N]."""
-    picture: str
-    """ "depth", "cloud", "broken" or ""."""
-    center: list[float] | None
-    """Mean of the points that were seen [m]; None where none were."""
+    seen: Mapping[str, Seen]
+    """Camera → what it gave; the name is empty where there is one camera."""
+
+    @property
+    def center(self) -> list[float] | None:
+        """Mean of what the first camera sees [m], to follow motion."""
+        return next((seen.center for seen in self.seen.values()), None)
 
 
 class Journal:
@@ -64,7 +77,8 @@ class Journal:
         """Append a frame whose files are written."""
         if self.stream is None:
             raise RuntimeError("the journal is not open")
-        line = [entry.time, entry.inputs, entry.markers, entry.unlabelled, entry.loads, entry.picture, entry.center]
+        seen = {name: [s.markers, s.unlabelled, s.picture, s.center] for name, s in entry.seen.items()}
+        line = [entry.time, entry.inputs, entry.loads, seen]
         self.stream.write(json.dumps(line) + "\n")
         self.stream.flush()
 
@@ -73,7 +87,8 @@ class Journal:
         with self.file.open(encoding="utf-8") as stream:
             next(stream)
             for line in stream:
-                yield Entry(*json.loads(line))
+                *common, seen = json.loads(line)
+                yield Entry(*common, {name: Seen(*one) for name, one in seen.items()})
 
     def times(self) -> FloatArray:
         """Return the times of all frames [s], shape (F,)."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,8 @@ from femsense.io.importers.ros_plan import (
     named_values,
     plan_of,
 )
-from femsense.io.importers.ros_topics import choose, streams_of
+from femsense.io.importers.ros_topics import Stream, cameras_of, choose, robot_pose, streams_of
+from femsense.io.importers.several import camera_names, joined
 from femsense.pointcloud.cloud import PointCloud
 
 NEAR_S = 0.05
@@ -38,35 +39,53 @@ NEAR_S = 0.05
 
 
 def open_ros(path: Path, options: Options) -> Source:
-    """Return a bag as a source.
+    """Return a bag as a source; of several cameras where several topics of pictures are named.
 
     Raises:
         InputError: not readable, nothing in it that can be taken, or several topics that could be meant.
     """
     with open_bag(path) as bag:
         streams = streams_of(bag)
-        choice = choose(bag, streams, options)
-        clock = clock_of(bag, choice, options)
-        plan = plan_of(bag, choice, options, clock)
+        cameras = cameras_of(streams, options)
+        if not cameras:
+            return _source(bag, streams, options)
+        others = tuple(topic for topic in options.topics if topic not in cameras)
+        sources: dict[str, Source] = {}
+        taken: set[str] = set()
+        for name, topic in zip(camera_names(cameras), cameras):
+            left = [s for s in streams if s.topic.name not in taken]  # a marker is measured once, whoever sees it
+            source = _source(bag, left, replace(options, topics=(topic, *(t for t in others if t not in taken))))
+            taken |= set(source.found.get("marker_topics", ()))
+            sources[name] = source
+    return joined(sources, path, options)
+
+
+def _source(bag: Bag, streams: Sequence[Stream], options: Options) -> Source:
+    """Return what the chosen topics of a bag hold, seen by one camera."""
+    choice = choose(bag, streams, options)
+    clock = clock_of(bag, choice, options)
+    plan = plan_of(bag, choice, options, clock)
     choice = plan.choice
     found = {
         "clock": clock,
         "topics": [{"topic": s.topic.name, "messages": s.topic.count} for s in chosen_streams(choice)],
         "not_taken": [s.topic.name for s in streams if s.kind != "other" and s not in chosen_streams(choice)] or None,
+        "marker_topics": [s.topic.name for s in choice.markers] or None,
         "depth_unit_m": plan.unit if choice.lens else None,
         "lens": None if choice.lens is None else f"{choice.lens.width} × {choice.lens.height}, {choice.lens.model}",
         "camera_frame": choice.primary.frame or None,
     }
     return Source(
         "realsense" if is_sdk(choice.primary.topic.name) else "ros",
-        path,
-        partial(_frames, path, plan),
+        bag.path,
+        partial(_frames, bag.path, plan),
         found={key: value for key, value in found.items() if value is not None},
         lens=choice.lens,
         depth_unit_m=plan.unit,
         actuation=plan.actuation,
         count=choice.primary.topic.count,
         notes=plan.notes,
+        T_robot_camera=robot_pose(bag, choice.primary, options.base),
     )
 
 

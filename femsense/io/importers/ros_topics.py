@@ -95,6 +95,15 @@ def choose(bag: Bag, streams: Sequence[Stream], options: Options) -> Choice:
     return _with_color(bag, replace(choice, notes=notes), of["color"])
 
 
+def cameras_of(streams: Sequence[Stream], options: Options) -> list[str]:
+    """Return the topics of pictures that a person named, where those are several cameras; else none."""
+    for kind in ("depth", "cloud"):
+        named = [s.topic.name for s in streams if s.kind == kind and s.topic.name in options.topics]
+        if named:
+            return named if len({_base(name) for name in named}) > 1 else []
+    return []
+
+
 def transforms_of(bag: Bag) -> dict[str, tuple[str, FloatArray]]:
     """Return the static transforms: child frame → (parent frame, T_parent_child)."""
     found: dict[str, tuple[str, FloatArray]] = {}
@@ -112,6 +121,28 @@ def transform_between(tree: dict[str, tuple[str, FloatArray]], target: str, sour
     up_source, up_target = _to_root(tree, source.lstrip("/")), _to_root(tree, target.lstrip("/"))
     common = next((frame for frame in up_source if frame in up_target), None)
     return None if common is None else np.linalg.inv(up_target[common]) @ up_source[common]
+
+
+def robot_pose(bag: Bag, stream: Stream, base: str | None) -> FloatArray | None:
+    """Return T_robot_camera of a stream where `base` is the robot's frame, shape (4, 4); None where no base is named.
+
+    Raises:
+        InputError: the static transforms do not join the two.
+    """
+    if base is None:
+        return None
+    tree = transforms_of(bag)
+    T = transform_between(tree, base, stream.frame)
+    if T is None:
+        names = sorted({*tree, *(parent for parent, _ in tree.values())})
+        raise InputError(
+            f"no static transform joins the robot's frame and {stream.frame!r}, the frame of {stream.topic.name}",
+            where=f"--base {base}",
+            found=", ".join(names) or "no tf_static",
+            expected="a frame of tf_static",
+            hint=did_you_mean(base, names),
+        )
+    return T
 
 
 def _to_root(tree: dict[str, tuple[str, FloatArray]], frame: str) -> dict[str, FloatArray]:
@@ -184,7 +215,7 @@ def _one(bag: Bag, streams: Sequence[Stream], what: str) -> Stream | None:
             f"several topics of {what}: which one?",
             where=bag.path,
             found="; ".join(f"{s.topic.name} ({s.topic.count} messages, frame {s.frame or '–'})" for s in bases.values()),
-            expected=f"--topic {next(iter(bases.values())).topic.name}",
+            expected=f"--topic {next(iter(bases.values())).topic.name}, or a --topic for each: then each is a camera",
         )
     return next(iter(bases.values()), None)
 
@@ -231,7 +262,8 @@ def _depth_unit(bag: Bag, stream: Stream) -> float:
 def _with_color(bag: Bag, choice: Choice, streams: Sequence[Stream]) -> Choice:
     depth = choice.primary
     same = [s for s in streams if s.frame == depth.frame] or [s for s in streams if _shared(s.topic.name, depth.topic.name) > 1]
-    color = _one(bag, same or streams, "colour images")
+    near = max((_shared(s.topic.name, depth.topic.name) for s in same or streams), default=0)
+    color = _one(bag, [s for s in same or streams if _shared(s.topic.name, depth.topic.name) == near], "colour images")
     if color is None:
         return choice
     lens = _lens(bag, color)

@@ -36,6 +36,7 @@ def summary(source: Source, journal: Journal, counts: Mapping[str, int]) -> dict
         "resumed": counts["resumed"] or None,
         **_pictures(journal),
         **_markers(journal),
+        "cameras": _cameras(source, journal) or None,
         **source.found,
     }
     if found["broken_pictures"]:
@@ -46,8 +47,22 @@ def summary(source: Source, journal: Journal, counts: Mapping[str, int]) -> dict
 def _pictures(journal: Journal) -> dict[str, int]:
     kinds = {"depth": 0, "cloud": 0, "broken": 0, "": 0}
     for entry in journal.entries():
-        kinds[entry.picture] += 1
+        for seen in entry.seen.values():
+            kinds[seen.picture] += 1
     return {"depth_images": kinds["depth"], "clouds": kinds["cloud"], "broken_pictures": kinds["broken"]}
+
+
+def _cameras(source: Source, journal: Journal) -> list[dict[str, Any]]:
+    """Return for each of several cameras what it gave."""
+    pictures, markers = dict.fromkeys(source.views, 0), dict.fromkeys(source.views, 0)
+    for entry in journal.entries():
+        for name, seen in entry.seen.items() if source.views else ():
+            pictures[name] += seen.picture in ("depth", "cloud")
+            markers[name] += bool(seen.markers or seen.unlabelled)
+    return [
+        {"camera": name, "format": one.format, "pictures": pictures[name], "frames_with_markers": markers[name], **one.found}
+        for name, one in source.views.items()
+    ]
 
 
 def _markers(journal: Journal) -> dict[str, Any]:
@@ -55,22 +70,25 @@ def _markers(journal: Journal) -> dict[str, Any]:
     seen: dict[str, int] = {}
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     most, loads, frames = 0, 0, 0
-    swaps = _Exchanges()
+    swaps: dict[str, _Exchanges] = {}
     for number, entry in enumerate(journal.entries()):
-        frames, loads, most = number + 1, loads + len(entry.loads), max(most, len(entry.unlabelled))
-        places = np.array([*entry.markers.values(), *entry.unlabelled], dtype=float).reshape(-1, 3)
-        if len(places):
-            low, high = np.minimum(low, places.min(axis=0)), np.maximum(high, places.max(axis=0))
-        for name in entry.markers:
+        frames, loads = number + 1, loads + len(entry.loads)
+        for camera, one in entry.seen.items():
+            most = max(most, len(one.unlabelled))
+            places = np.array([*one.markers.values(), *one.unlabelled], dtype=float).reshape(-1, 3)
+            if len(places):
+                low, high = np.minimum(low, places.min(axis=0)), np.maximum(high, places.max(axis=0))
+            swaps.setdefault(camera, _Exchanges()).look(number, one.markers)
+        for name in {name for one in entry.seen.values() for name in one.markers}:
             seen[name] = seen.get(name, 0) + 1
-        swaps.look(number, entry.markers)
+    swapped = [item for one in swaps.values() for item in one.found]
     if not seen and not most:
         return {"loads": loads} if loads else {}
-    if swaps.found:
+    if swapped:
         warnings.warn(
             "labels of markers seem swapped: "
-            + "; ".join(f"{a} and {b} at frame {k}" for k, a, b in swaps.found[:5])
-            + (f" and {len(swaps.found) - 5} more" if len(swaps.found) > 5 else ""),
+            + "; ".join(f"{a} and {b} at frame {k}" for k, a, b in swapped[:5])
+            + (f" and {len(swapped) - 5} more" if len(swapped) > 5 else ""),
             stacklevel=3,
         )
     return {
@@ -79,7 +97,7 @@ def _markers(journal: Journal) -> dict[str, Any]:
         "missing": [{"marker": name, "share": 1 - count / frames} for name, count in sorted(seen.items()) if count < frames]
         or None,
         "span_m": (high - low).tolist(),
-        "label_swaps": len(swaps.found),
+        "label_swaps": len(swapped),
         "loads": loads or None,
     }
 

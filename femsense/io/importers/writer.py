@@ -15,7 +15,7 @@ from femsense.core.errors import InputError
 from femsense.io.files import PART_PREFIX, write_csv, write_json, write_toml
 from femsense.io.importers.actuation import ActuationLog, align
 from femsense.io.importers.frames import Frame, Images, Lens, Source
-from femsense.io.importers.journal import JOURNAL, Entry, Journal
+from femsense.io.importers.journal import JOURNAL, Entry, Journal, Seen
 from femsense.io.importers.pictures import write_cloud_file, write_color, write_depth
 from femsense.io.importers.summary import summary
 from femsense.io.recording_tables import FORCE_COLUMNS, PLACE_COLUMNS
@@ -118,10 +118,19 @@ def _after(frames: Iterator[Frame], done: int, counts: dict[str, int]) -> Iterat
 
 
 def _write_frame(source: Source, frame: Frame, part: Path, number: int) -> Entry:
+    looking = [(name, source.views[name], one) for name, one in frame.views.items()] or [("", source, frame)]
+    seen = {name: _write_view(own, one, part, name, number) for name, own, one in looking}
+    loads = [[*np.asarray(p, dtype=float).tolist(), *np.asarray(f, dtype=float).tolist()] for p, f in frame.loads]
+    inputs = {name: float(value) for name, value in frame.inputs.items()}
+    return Entry(float(frame.time), inputs, loads, seen)
+
+
+def _write_view(source: Source, frame: Frame, part: Path, view: str, number: int) -> Seen:
+    """Write what one camera gives in a frame; its name, if there are several, is that of its folders."""
     kind, center = "", None
     if frame.picture is not None:
         try:
-            kind, center = _write_picture(source, frame.picture(), part, number)
+            kind, center = _write_picture(source, frame.picture(), part, Path(view) / f"{number:06d}")
         except InputError as problem:
             if number == 0:
                 raise
@@ -133,18 +142,16 @@ def _write_frame(source: Source, frame: Frame, part: Path, number: int) -> Entry
         strangers = strangers[:0]  # a recording has named markers or unnamed ones in a frame
     if center is None and (markers or len(strangers)):
         center = np.mean([*markers.values(), *strangers.tolist()], axis=0).tolist()
-    loads = [[*np.asarray(p, dtype=float).tolist(), *np.asarray(f, dtype=float).tolist()] for p, f in frame.loads]
-    inputs = {name: float(value) for name, value in frame.inputs.items()}
-    return Entry(float(frame.time), inputs, markers, strangers.tolist(), loads, kind, center)
+    return Seen(markers, strangers.tolist(), kind, center)
 
 
-def _write_picture(source: Source, picture: Images | PointCloud, part: Path, number: int) -> tuple[str, list[float] | None]:
+def _write_picture(source: Source, picture: Images | PointCloud, part: Path, name: Path) -> tuple[str, list[float] | None]:
     if isinstance(picture, PointCloud):
-        write_cloud_file(part / "clouds" / f"{number:06d}.ply", picture)
+        write_cloud_file(part / "clouds" / f"{name}.ply", picture)
         return "cloud", picture.points.mean(axis=0).tolist() if len(picture) else None
-    write_depth(part / "depth" / f"{number:06d}.png", picture.depth)
+    write_depth(part / "depth" / f"{name}.png", picture.depth)
     if picture.color is not None:
-        write_color(part / "color" / f"{number:06d}.png", picture.color)
+        write_color(part / "color" / f"{name}.png", picture.color)
     return "depth", _center(picture, source.lens, source.depth_unit_m)
 
 
@@ -185,7 +192,8 @@ def _finish(
     write_toml(part / "recording.toml", _document(source, kind, zero_kind, part))
     rows = _frame_rows(journal, times[0], columns, {} if applied is None else applied.at(times))
     write_csv(part / "frames.csv", ["frame", "time_s", *columns], rows)
-    _write_rows(part / "markers.csv", ["frame", "marker", *PLACE_COLUMNS], _marker_rows(journal))
+    camera = ["camera"] if source.views else []
+    _write_rows(part / "markers.csv", ["frame", *camera, "marker", *PLACE_COLUMNS], _marker_rows(journal))
     _write_rows(part / "loads.csv", ["frame", *PLACE_COLUMNS, *FORCE_COLUMNS], _load_rows(journal))
     return {
         **summary(source, journal, counts),
@@ -219,14 +227,26 @@ def _actuation(source: Source, columns: list[str], said: str | None) -> str:
 
 def _document(source: Source, actuation: str, zero: str, part: Path) -> dict[str, Any]:
     document: dict[str, Any] = {"format": FORMAT, "actuation": actuation, "actuation_zero": zero}
+    if source.views:
+        return document | {"cameras": {n: _lens(s, part / "depth" / n) | _pose(s) for n, s in source.views.items()}}
+    lens = _lens(source, part / "depth")
+    return document | _pose(source) | ({"camera": lens} if lens else {})
+
+
+def _pose(source: Source) -> dict[str, Any]:
+    return {} if source.T_robot_camera is None else {"T_robot_camera": source.T_robot_camera.tolist()}
+
+
+def _lens(source: Source, images: Path) -> dict[str, Any]:
+    """Return the table of a camera's lens; empty where it has no depth images."""
     lens = source.lens
-    if lens is None or not (part / "depth").is_dir():
-        return document
+    if lens is None or not images.is_dir():
+        return {}
     table = {key: getattr(lens, key) for key in ("width", "height", "fx", "fy", "cx", "cy")}
     count = 5 if not np.any(lens.distortion[5:] != 0.0) else 8
     distortion = np.concatenate([lens.distortion, np.zeros(8)])[:count].tolist()
     model = {"distortion_model": lens.model} if lens.model != "brown_conrady" else {}
-    return document | {"camera": {**table, "distortion": distortion, **model, "depth_unit_m": source.depth_unit_m}}
+    return {**table, "distortion": distortion, **model, "depth_unit_m": source.depth_unit_m}
 
 
 def _frame_rows(journal: Journal, start: float, columns: list[str], applied: Mapping[str, Any]) -> Iterator[Sequence[object]]:
@@ -239,8 +259,10 @@ def _frame_rows(journal: Journal, start: float, columns: list[str], applied: Map
 
 def _marker_rows(journal: Journal) -> Iterator[Sequence[object]]:
     for number, entry in enumerate(journal.entries()):
-        yield from ([number, name, *place] for name, place in entry.markers.items())
-        yield from ([number, "", *place] for place in entry.unlabelled)
+        for camera, seen in entry.seen.items():
+            begin = [number, camera] if camera else [number]
+            yield from ([*begin, name, *place] for name, place in seen.markers.items())
+            yield from ([*begin, "", *place] for place in seen.unlabelled)
 
 
 def _load_rows(journal: Journal) -> Iterator[Sequence[object]]:
