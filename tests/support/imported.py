@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from femsense.io.importers.frames import Options
-from femsense.io.importers.guess import open_source
+from femsense.io.importers.guess import open_sources
 from femsense.io.importers.writer import write_recording
 from femsense.io.recording_folder import load_recording
 from femsense.model.recording import Recording
@@ -16,7 +16,7 @@ from femsense.model.recording import Recording
 
 def imported(path: Path, folder: Path, options: Options | None = None, **more: Any) -> tuple[Recording, dict[str, Any]]:
     """Import into FOLDER/recording; return the recording and what was found."""
-    found = write_recording(open_source(path, options), folder / "recording", identity={"test": str(path)}, **more)
+    found = write_recording(open_sources([path], options), folder / "recording", identity={"test": str(path)}, **more)
     return load_recording(folder / "recording"), found
 
 

@@ -67,7 +67,7 @@ def choose(bag: Bag, streams: Sequence[Stream], options: Options) -> Choice:
     _check_topics(streams, options)
     wanted = [s for s in streams if not options.topics or s.topic.name in options.topics]
     of = {kind: [s for s in wanted if s.kind == kind] for kind in KINDS}
-    for kind in ("inputs", "loads", "color"):
+    for kind in ("inputs", "loads", "color", "markers"):
         of[kind] = of[kind] or [s for s in streams if s.kind == kind]
     depth, cloud = _one(bag, of["depth"], "depth images"), None
     if depth is None:
