@@ -174,5 +174,5 @@ def test_labels_exchanged_in_all_frames_are_named_where_the_body_moves() -> None
     index = recording.marker_index.copy()
     index[recording.marker_index == 9], index[recording.marker_index == 11] = 11, 9
     table = (recording.marker_names, recording.marker_frame, index, recording.marker_xyz)
-    with pytest.raises(DataError, match="labels seem exchanged: (m9 and m11|m11 and m9)"):
+    with pytest.raises(DataError, match=r"labels seem exchanged: (m9 and m11|m11 and m9)"):
         calibrate(arm(), with_marker_table(recording, *table))

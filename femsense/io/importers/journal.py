@@ -87,8 +87,8 @@ class Journal:
         with self.file.open(encoding="utf-8") as stream:
             next(stream)
             for line in stream:
-                *common, seen = json.loads(line)
-                yield Entry(*common, {name: Seen(*one) for name, one in seen.items()})
+                time, inputs, loads, seen = json.loads(line)
+                yield Entry(time, inputs, loads, {name: Seen(*one) for name, one in seen.items()})
 
     def times(self) -> FloatArray:
         """Return the times of all frames [s], shape (F,)."""

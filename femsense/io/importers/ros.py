@@ -49,15 +49,22 @@ def open_ros(path: Path, options: Options) -> Source:
         cameras = cameras_of(streams, options)
         if not cameras:
             return _source(bag, streams, options)
-        others = tuple(topic for topic in options.topics if topic not in cameras)
-        sources: dict[str, Source] = {}
-        taken: set[str] = set()
-        for name, topic in zip(camera_names(cameras), cameras):
-            left = [s for s in streams if s.topic.name not in taken]  # a marker is measured once, whoever sees it
-            source = _source(bag, left, replace(options, topics=(topic, *(t for t in others if t not in taken))))
-            taken |= set(source.found.get("marker_topics", ()))
-            sources[name] = source
+        sources = _sources(bag, streams, cameras, options)
+        if len({source.found["clock"] for source in sources.values()}) > 1:
+            sources = _sources(bag, streams, cameras, replace(options, clock="record"))
     return joined(sources, path, options)
+
+
+def _sources(bag: Bag, streams: Sequence[Stream], cameras: Sequence[str], options: Options) -> dict[str, Source]:
+    """Return a source a camera; a topic of markers is the first camera's that is joined to it: what is measured once stands once."""
+    others = tuple(topic for topic in options.topics if topic not in cameras)
+    sources: dict[str, Source] = {}
+    taken: set[str] = set()
+    for name, topic in zip(camera_names(list(cameras)), cameras):
+        left = [s for s in streams if s.topic.name not in taken]
+        sources[name] = _source(bag, left, replace(options, topics=(topic, *(t for t in others if t not in taken))))
+        taken |= set(sources[name].found.get("marker_topics", ()))
+    return sources
 
 
 def _source(bag: Bag, streams: Sequence[Stream], options: Options) -> Source:
@@ -261,6 +268,7 @@ def _markers(
         T = plan.T_camera_markers[name]
         for label, point in [] if value is None else markers_of(value, stream.topic.type):
             xyz = upright(T[:3, :3] @ point + T[:3, 3], plan.up)[0]
+            label = plan.marker_names.get(label or name, label)
             if label:
                 named[label] = xyz
             else:

@@ -54,9 +54,15 @@ MODELS = {
 """Names of distortion models, in small letters."""
 
 
+def header_of(message: Any) -> Any:
+    """Return the header of a message, or that of the first marker of a MarkerArray; None where there is none."""
+    first = next(iter(getattr(message, "markers", ())), None)
+    return getattr(message, "header", getattr(first, "header", None))
+
+
 def stamp_of(message: Any) -> tuple[float, str]:
     """Return the stamp [s] of a message's header and its frame; 0 and "" where it has none."""
-    header = getattr(message, "header", None)
+    header = header_of(message)
     if header is None:
         return 0.0, ""
     return header.stamp.sec + 1e-9 * header.stamp.nanosec, header.frame_id
@@ -171,7 +177,8 @@ def markers_of(message: Any, kind: str) -> Iterator[tuple[str, list[float]]]:
     elif short == "MarkerArray":
         for item in message.markers:
             if item.action == 0:
-                yield f"{item.ns}_{item.id}" if item.ns else str(item.id), place(item.pose.position)
+                name = f"{item.ns}_{item.id}" if item.ns and item.id else item.ns or str(item.id)
+                yield name, place(item.pose.position)
     elif short == "Markers":
         for item in message.markers:
             yield item.marker_name or (str(item.marker_index) if item.id_type == 1 else ""), place(item.translation)

@@ -13,13 +13,16 @@ from femsense.io.importers.frames import Options
 from femsense.io.importers.pictures import FINE_UNIT
 from femsense.io.importers.plain_csv import split_factor
 from femsense.io.importers.ros_bag import Bag, Message
-from femsense.io.importers.ros_messages import stamp_of
+from femsense.io.importers.ros_messages import header_of, stamp_of
 from femsense.io.importers.ros_topics import Choice, Stream, transform_between, transforms_of
 
 LAG_S = 0.5
 """A message is written at most this much later than others of its moment."""
 PEEKED = 50
 """So many first messages of a topic say whether its header stamps are a clock."""
+
+SCANNED = 5000
+"""So many first messages of motors say which of their fields is used."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -38,6 +41,8 @@ class Plan:
     """Topic of a stream's metadata → its images, where the SDK keeps the device's times there."""
     up: str | None
     notes: tuple[str, ...]
+    marker_names: dict[str, str]
+    """Name of a marker, or topic of one without a name → its name in the recording."""
 
 
 def plan_of(bag: Bag, choice: Choice, options: Options, clock: str) -> Plan:
@@ -60,15 +65,17 @@ def plan_of(bag: Bag, choice: Choice, options: Options, clock: str) -> Plan:
     poses = _marker_poses(bag, choice, notes)
     used = [s for s in choice.markers if s.topic.name in poses]
     choice = replace(choice, markers=tuple(used), loads=tuple(s for s in choice.loads if s.topic.name in points))
+    renamed = {old: new.removeprefix("marker.") for old, new in options.columns.items() if new.startswith("marker.")}
     unit = FINE_UNIT if choice.primary.encoding.startswith("32FC1") else choice.depth_unit_m
-    return Plan(choice, clock, unit, actuation, columns, points, poses, _metadata(bag, choice, clock), options.up, tuple(notes))
+    return Plan(
+        choice, clock, unit, actuation, columns, points, poses, _metadata(bag, choice, clock), options.up, tuple(notes), renamed
+    )
 
 
 def _input_columns(bag: Bag, stream: Stream, options: Options) -> tuple[dict[str, tuple[str, str, float]], set[str]]:
     """Return name in the message → (column, field, factor), and the fields that are used."""
     topic = stream.topic.name
-    first = next(bag.messages([topic]), None)
-    given = {} if first is None else named_values(bag.decode(first), stream.topic.type)
+    given = _largest_values(bag, stream)
     names = list(dict.fromkeys(name for name, _ in given))
     columns: dict[str, tuple[str, str, float]] = {}
     for name in names:
@@ -89,6 +96,19 @@ def _input_columns(bag: Bag, stream: Stream, options: Options) -> tuple[dict[str
             fld = usual if (name, usual) in given else next(f for n, f in given if n == name)
             columns[name] = (name if name.startswith(("cable_", "chamber_")) else prefix + name, fld, 1.0)
     return columns, {fld for _, fld, _ in columns.values()}
+
+
+def _largest_values(bag: Bag, stream: Stream) -> dict[tuple[str, str], float]:
+    """Return (name, field) → the largest magnitude in the first messages: efforts are often zero until something moves."""
+    largest: dict[tuple[str, str], float] = {}
+    for message, _ in zip(bag.messages([stream.topic.name]), range(SCANNED)):
+        try:
+            values = named_values(bag.decode(message), stream.topic.type)
+        except InputError:
+            continue  # told when the frames are read
+        for key, value in values.items():
+            largest[key] = max(largest.get(key, 0.0), abs(value))
+    return largest
 
 
 def _load_point(target: str) -> list[float]:
@@ -130,14 +150,15 @@ def clock_of(bag: Bag, choice: Choice, options: Options) -> str:
     if sdk and _metadata(bag, choice, "metadata"):
         return "metadata"
     for stream in chosen_streams(choice):
-        if stream.topic.type.endswith("MultiArray"):
-            continue
         shifts, last = [], -np.inf
         for message, _ in zip(bag.messages([stream.topic.name]), range(PEEKED)):
             try:
-                time, _ = stamp_of(bag.decode(message))
+                decoded = bag.decode(message)
             except InputError:
                 continue  # told when the frames are read
+            if header_of(decoded) is None:
+                continue
+            time, _ = stamp_of(decoded)
             if time <= 0.0 or time < last:
                 return "record"
             last = time

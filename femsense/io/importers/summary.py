@@ -60,7 +60,8 @@ def _cameras(source: Source, journal: Journal) -> list[dict[str, Any]]:
             pictures[name] += seen.picture in ("depth", "cloud")
             markers[name] += bool(seen.markers or seen.unlabelled)
     return [
-        {"camera": name, "format": one.format, "pictures": pictures[name], "frames_with_markers": markers[name], **one.found}
+        {"camera": name, "format": one.format, "pictures": pictures[name], "frames_with_markers": markers[name]}
+        | {key: one.found[key] for key in ("clock", "lens", "depth_unit_m", "camera_frame", "unit") if key in one.found}
         for name, one in source.views.items()
     ]
 

@@ -368,7 +368,7 @@ def test_named_markers_in_a_frame_that_static_transforms_join(tmp_path: Path) ->
             bag.write("/points", at, bag.cloud(np.ones((4, 3)), None, at))
             bag.write("/markers", at, bag.marker_array({"tip": (0.1, 0.2, 0.01 * k)}, at, "mocap"))
     recording, _ = imported(tmp_path / "take", tmp_path)
-    assert recording.marker_names == ("tip_0",)
+    assert recording.marker_names == ("tip",)
     np.testing.assert_allclose(marker_grid(recording)[:, 0], [[-0.2, 0.1, 1 + 0.01 * k] for k in range(4)], atol=1e-12)
 
 
@@ -412,3 +412,18 @@ def test_markers_and_bodies_of_mocap4r2(tmp_path: Path) -> None:
     grid = dict(zip(recording.marker_names, marker_grid(recording).transpose(1, 0, 2)))
     np.testing.assert_allclose(grid["tip"], [[0.1, 0.2, 0.01 * k] for k in range(3)])
     np.testing.assert_allclose(grid["base"], [[1.0, 2.0, 3.0]] * 3)
+
+
+def test_efforts_that_begin_at_zero_are_tensions_and_arrays_of_markers_keep_the_clock(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "take", "mcap") as bag:
+        for k in range(4):
+            stamp = START_NS + k * STEP_NS
+            bag.write("/camera/depth/image_raw", stamp + 9_000_000, bag.image(depth_of(k), "16UC1", stamp))
+            bag.write("/camera/depth/camera_info", stamp, bag.info(stamp))
+            bag.write("/motors", stamp, bag.joints(["a"], stamp, position=[0.0], effort=[0.5 * k]))
+            bag.write("/markers", stamp, bag.marker_array({"tip": (0.0, 0.0, 0.3), "m": (0.1, 0.0, 0.3)}, stamp))
+            bag.write("/base", stamp, bag.poses([(0.2, 0.0, 0.3)], stamp))
+    recording, found = imported(tmp_path / "take", tmp_path, Options(columns={"m": "marker.left", "/base": "marker.base"}))
+    assert set(recording.marker_names) == {"tip", "left", "base"}
+    assert found["clock"] == "header" and found["actuation"] == "tension"
+    np.testing.assert_allclose(recording.inputs[:, 0], 0.5 * np.arange(4))
