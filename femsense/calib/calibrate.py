@@ -17,7 +17,8 @@ from femsense.calib.checks import check_reading, pairs_of, relabelled
 from femsense.calib.clouds_alone import placed_by_clouds, views_without_markers
 from femsense.calib.from_clouds import pose_pivot, refine_poses
 from femsense.calib.from_images import has_image_markers, with_image_markers
-from femsense.calib.inputs import _initial_displacement, _input_std, _largest_input, first_inputs, input_bounds
+from femsense.calib.inputs import first_inputs, initial_state, input_bounds, input_tables, largest_input, weak_inputs
+from femsense.calib.inputs_from_clouds import with_initial_inputs
 from femsense.calib.joint import PLACEMENT_STD_FLOOR, fit_joint, root_mean_square
 from femsense.calib.marker_assignment import name_markers
 from femsense.calib.rigid import fit_rigid, fit_rigid_robust
@@ -85,7 +86,11 @@ def calibrate(robot: Robot, recording: Recording, *, frames: Sequence[int] | Non
     else:
         by_markers = _declared(robot, seen, chosen)
     if by_clouds:
-        return _with_std(robot, placed_by_clouds(robot, recording, by_markers, by_clouds))
+        by_markers = placed_by_clouds(robot, recording, by_markers, by_clouds)
+    if not len(seen.marker_frame) and recording.actuation_zero == "unknown" and robot.body.cables:
+        return _with_std(robot, with_initial_inputs(robot, recording, by_markers))
+    if by_clouds:
+        return _with_std(robot, by_markers)
     return _with_clouds(robot, recording, by_markers) if len(seen.marker_frame) else by_markers
 
 
@@ -192,7 +197,7 @@ def _alternate(
         history.append(root_mean_square(jet.residual))
         W_ea = -jet.by_initial.reshape(-1, len(initial))  # residual = measured − modelled
         ridge = (
-            PLACEMENT_STD_FLOOR / _largest_input(robot, scene.recording.actuation) * np.eye(len(initial))
+            PLACEMENT_STD_FLOOR / largest_input(robot, scene.recording.actuation) * np.eye(len(initial))
         )  # what no marker feels stays
         right = np.concatenate([jet.residual.ravel(), np.zeros(len(initial))])
         step = lsq_linear(np.vstack([W_ea, ridge]), right, bounds=(low - initial - 1e-12, high - initial + 1e-12)).x
@@ -215,13 +220,6 @@ def _rigid_again(robot: Robot, scene: Scene, jet: SceneJet) -> list[FloatArray]:
     ]
 
 
-def _initial_state(robot: Robot, recording: Recording, initial: FloatArray | None) -> Equilibrium:
-    """Return the state under the initial inputs alone (where they are unknown), else under those of the first frame."""
-    if initial is not None:
-        recording = replace(recording, inputs=np.zeros_like(recording.inputs), pressures=np.zeros_like(recording.pressures))
-    return solve_frame(DrivenRobot(robot, drive_of(robot, recording, initial=initial)), 0)
-
-
 def _result(
     robot: Robot,
     scene: Scene,
@@ -231,38 +229,37 @@ def _result(
     jet: SceneJet,
     history: list[float],
 ) -> Calibration:
-    recording, names = scene.recording, robot.body.cable_names
-    state = _initial_state(robot, recording, initial)
+    recording = scene.recording
     moving = [v for v, T in enumerate(recording.T_robot_camera) if T is None]
     joint = np.zeros((6 * len(poses),) * 2)
     free = [c for v in moving for c in range(6 * v, 6 * v + 6)]
     joint[np.ix_(free, free)] = fit.covariance[: len(free), : len(free)]
     pose_covariance = joint[:6, :6]
     pose_std = _pose_std(poses[0], pose_covariance, robot.marker_points.mean(axis=0))
-    a = len(names) if initial is not None else 0
+    a = len(robot.body.cables) if initial is not None else 0
     input_covariance = fit.covariance[6 * len(moving) :, 6 * len(moving) :] if a else np.zeros((0, 0))
-    own, other = _input_std(robot, recording, state, input_covariance)
+    tables = input_tables(robot, recording, initial, input_covariance)
+    own = tables.tension_std if recording.actuation == "tension" else tables.displacement_std
     per_marker = {
         name: root_mean_square(jet.residual[scene.marker == i])
         for i, name in enumerate(robot.marker_names)
         if (scene.marker == i).any()
     }
     places = in_robot_frame(scene.rest_points, scene.rest_view, poses, robot.observation)
-    tension, displacement = (own, other) if recording.actuation == "tension" else (other, own)
     return Calibration(
         T_robot_camera=poses[0],
         poses=tuple(poses),
         camera_names=recording.camera_names,
-        cable_tension_n=dict(state.tension),
-        cable_displacement_m=_initial_displacement(state, recording, names, initial),
+        cable_tension_n=tables.tension,
+        cable_displacement_m=tables.displacement,
         rms_m=root_mean_square(jet.residual),
         marker_rms_m=per_marker,
         history=tuple({"iteration": i, "rms_m": r} for i, r in enumerate(history)),
         pose_std=pose_std,
         pose_covariance=pose_covariance,
-        tension_std_n=tension,
-        displacement_std_m=displacement,
-        status=_status(fit, robot, own, recording),
+        tension_std_n=tables.tension_std,
+        displacement_std_m=tables.displacement_std,
+        status=_status(fit, own, recording),
         placements_m={robot.marker_names[m]: p.tolist() for m, p in zip(scene.rest_marker, places)},
         frames=tuple(int(recording.frame_numbers[k]) for k in scene.frames),
         noise_m=float(np.sqrt(3.0)) * marker_repeatability(recording),
@@ -292,17 +289,13 @@ def _pose_std(T: FloatArray, covariance: FloatArray, pivot: FloatArray) -> Float
     return std
 
 
-def _status(fit: FitResult, robot: Robot, own: dict[str, float | None], recording: Recording) -> str:
+def _status(fit: FitResult, own: dict[str, float | None], recording: Recording) -> str:
     if fit.status != "converged":
         return "not settled after the last iteration: look at the history of the residual"
     if recording.actuation_zero == "absolute":
         return "converged"
-    scale = 0.25 if recording.actuation == "tension" else 0.005
-    unit = "N" if recording.actuation == "tension" else "m"
-    weak = [f"{n} (± {'∞' if v is None else format(v, '.2g')} {unit})" for n, v in own.items() if v is None or v > scale]
-    if weak:
-        return "converged, but these data hardly determine the initial input of " + ", ".join(weak)
-    return "converged"
+    weak = weak_inputs(recording, own)
+    return f"converged, but these data hardly determine the initial input of {weak}" if weak else "converged"
 
 
 def _from_rest(robot: Robot, recording: Recording) -> Calibration:
@@ -323,7 +316,7 @@ def _from_rest(robot: Robot, recording: Recording) -> Calibration:
     arm = robot.marker_points[scene.rest_marker] - robot.marker_points.mean(axis=0)
     J = np.concatenate([np.hstack([-_cross(a), np.eye(3)]) for a in arm])
     covariance = covariance_of(J / sigma)
-    state = _initial_state(robot, recording, None)
+    state = initial_state(robot, recording, None)
     none: dict[str, float | None] = {n: 0.0 for n in robot.body.cable_names}
     per_marker = {robot.marker_names[m]: float(np.linalg.norm(r)) for m, r in zip(scene.rest_marker, left)}
     places = in_robot_frame(scene.rest_points, scene.rest_view, poses, robot.observation)
@@ -357,10 +350,11 @@ def _declared(robot: Robot, recording: Recording, frames: IntArray) -> Calibrati
         raise DataError(
             f"no markers, no clouds and no T_robot_camera: the pose of camera {', '.join(missing)} is not known. Record markers or clouds, or write T_robot_camera in recording.toml"
         )
-    if recording.actuation_zero == "unknown" and robot.body.cables:
-        raise DataError("initial inputs cannot be found without markers: record markers, or absolute inputs")
+    unknown = recording.actuation_zero == "unknown" and bool(robot.body.cables)
+    if unknown and not recording.has_clouds:
+        raise DataError("initial inputs need markers or clouds of free frames: record those, or absolute inputs")
     poses = tuple(T for T in recording.T_robot_camera if T is not None)
-    state = _initial_state(robot, recording, None)
+    state = initial_state(robot, recording, first_inputs(robot, recording))
     none: dict[str, float | None] = {n: 0.0 for n in robot.body.cable_names}
     return Calibration(
         poses[0],

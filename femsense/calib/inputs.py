@@ -2,12 +2,52 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 
 from femsense.core.arrays import FloatArray
 from femsense.fem.equilibrium import Equilibrium
+from femsense.model.drive import DrivenRobot, drive_of
+from femsense.model.frame_state import solve_frame
 from femsense.model.recording import Recording
 from femsense.model.robot import Robot
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class InputTables:
+    """Initial inputs with their standard deviations, by cable."""
+
+    tension: dict[str, float]
+    """[N]."""
+    displacement: dict[str, float]
+    """[m]."""
+    tension_std: dict[str, float | None]
+    """[N]; None where the data say nothing."""
+    displacement_std: dict[str, float | None]
+    """[m]."""
+
+
+def input_tables(robot: Robot, recording: Recording, initial: FloatArray | None, covariance: FloatArray) -> InputTables:
+    """Return the initial inputs as tables.
+
+    Arguments:
+        robot, recording: as loaded.
+        initial: [N] or [m], shape (a,); None where they are known.
+        covariance: of `initial`, shape (a, a); empty where they are known.
+    """
+    state = initial_state(robot, recording, initial)
+    own, other = _input_std(robot, recording, state, covariance)
+    tension, displacement = (own, other) if recording.actuation == "tension" else (other, own)
+    shortening = _initial_displacement(state, recording, robot.body.cable_names, initial)
+    return InputTables(dict(state.tension), shortening, tension, displacement)
+
+
+def initial_state(robot: Robot, recording: Recording, initial: FloatArray | None) -> Equilibrium:
+    """Return the state under the initial inputs alone (where they are unknown), else under those of the first frame."""
+    if initial is not None:
+        recording = replace(recording, inputs=np.zeros_like(recording.inputs), pressures=np.zeros_like(recording.pressures))
+    return solve_frame(DrivenRobot(robot, drive_of(robot, recording, initial=initial)), 0)
 
 
 def first_inputs(robot: Robot, recording: Recording) -> FloatArray | None:
@@ -18,7 +58,7 @@ def first_inputs(robot: Robot, recording: Recording) -> FloatArray | None:
     return np.maximum(0.0, -lowest) if recording.actuation == "tension" else np.zeros(len(robot.body.cables))
 
 
-def _largest_input(robot: Robot, actuation: str) -> float:
+def largest_input(robot: Robot, actuation: str) -> float:
     """Return the size of an input that would crush the body: a tenth of E × reach² [N], or of its reach [m]."""
     body = robot.body
     return 0.1 * body.reach * (float(np.median(body.material.young_modulus)) * body.reach if actuation == "tension" else 1.0)
@@ -68,3 +108,10 @@ def _input_std(
         return {n: float(v) if np.isfinite(v) else None for n, v in zip(names, values)}
 
     return table(own), table(derived)
+
+
+def weak_inputs(recording: Recording, std: dict[str, float | None]) -> str:
+    """Return the cables whose initial input is hardly determined, with how well, as text; empty where there are none."""
+    scale, unit = (0.25, "N") if recording.actuation == "tension" else (0.005, "m")
+    weak = [f"{n} (± {'∞' if v is None else format(v, '.2g')} {unit})" for n, v in std.items() if v is None or v > scale]
+    return ", ".join(weak)

@@ -441,7 +441,7 @@ def test_no_markers_but_a_pose_is_as_declared() -> None:
     found = calibrate(bar_robot(), rec)
     np.testing.assert_array_equal(found.T_robot_camera, POSE)
     assert found.cable_tension_n == {"top": 1.0, "side": 0.5} and np.isnan(found.rms_m) and "as declared" in found.status
-    with pytest.raises(DataError, match="cannot be found without markers"):
+    with pytest.raises(DataError, match="initial inputs need markers or clouds"):
         calibrate(bar_robot(), replace(rec, actuation_zero="unknown"))
 
 

@@ -126,3 +126,24 @@ def test_clouds_need_a_free_frame(tmp_path: Path) -> None:
     bare, _ = with_clouds(tmp_path, recording, states, EYES[:1], clutter=False, colored=True)
     with pytest.raises(DataError, match="free"):
         calibrate(arm(), replace(bare, free=np.zeros(1, dtype=bool)))
+
+
+@pytest.mark.parametrize("declared", [False, True])
+def test_initial_inputs_are_found_with_the_pose(tmp_path: Path, declared: bool) -> None:
+    inputs = np.array([[1.5, 0, 0, 0], [0, 1.5, 0, 0], [0, 0, 1.5, 0], [0, 0, 0, 1.5]])
+    initial = np.array([0.6, 0.3, 0.2, 0.4])
+    recording, states = record(inputs, zero="unknown", initial=initial)
+    bare, poses = with_clouds(tmp_path, recording, states, EYES, clutter=False, colored=True)
+    bare = replace(bare, T_robot_camera=tuple(poses)) if declared else bare
+    found = calibrate(arm(), bare)
+    for T, true in zip(found.poses, poses):
+        turn, shift = off(T, true)
+        assert turn < 1.0 and shift < 1e-3
+    error = np.array(list(found.cable_tension_n.values())) - initial
+    std = np.array([found.tension_std_n[name] for name in found.cable_tension_n], dtype=float)
+    assert np.abs(error).max() < 0.25, (
+        error
+    )  # what all cables have in common compresses the body: the law tells it from nothing else
+    assert np.abs(error - error.mean()).max() < 0.08, error
+    assert (std < 0.1).all()
+    assert "initial inputs by clouds alone" in found.status

@@ -71,7 +71,7 @@ def _markers(journal: Journal) -> dict[str, Any]:
     seen: dict[str, int] = {}
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     most, loads, frames = 0, 0, 0
-    swaps: dict[str, _Exchanges] = {}
+    swaps: dict[str, _Swaps] = {}
     for number, entry in enumerate(journal.entries()):
         frames, loads = number + 1, loads + len(entry.loads)
         for camera, one in entry.seen.items():
@@ -79,7 +79,7 @@ def _markers(journal: Journal) -> dict[str, Any]:
             places = np.array([*one.markers.values(), *one.unlabelled], dtype=float).reshape(-1, 3)
             if len(places):
                 low, high = np.minimum(low, places.min(axis=0)), np.maximum(high, places.max(axis=0))
-            swaps.setdefault(camera, _Exchanges()).look(number, one.markers)
+            swaps.setdefault(camera, _Swaps()).look(number, one.markers)
         for name in {name for one in entry.seen.values() for name in one.markers}:
             seen[name] = seen.get(name, 0) + 1
     swapped = [item for one in swaps.values() for item in one.found]
@@ -103,7 +103,7 @@ def _markers(journal: Journal) -> dict[str, Any]:
     }
 
 
-class _Exchanges:
+class _Swaps:
     """Watches named markers for two that jump to each other's place."""
 
     def __init__(self) -> None:

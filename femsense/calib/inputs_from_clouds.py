@@ -1,0 +1,208 @@
+"""Initial inputs of cables, and the poses of cameras with them, from the clouds of free frames where no marker tells them.
+
+Gauss–Newton over poses and inputs: the residual of each point is that along its ray onto the body under the inputs. A cable moves the whole body, so
+that a change of input looks like no change of pose in more than one frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import lsq_linear
+
+from femsense.calib.calibration import Calibration
+from femsense.calib.from_clouds import CELLS, HUBER, measured_noises, pose_pivot
+from femsense.calib.inputs import first_inputs, input_bounds, input_tables, largest_input, weak_inputs
+from femsense.calib.scan import REACH, Scan, ray_rows, read_scan
+from femsense.core.arrays import FloatArray, IntArray, freeze
+from femsense.core.errors import DataError, FemsenseError
+from femsense.core.pose import moved_poses
+from femsense.model.camera import CameraNoise
+from femsense.model.contact_patch import body_surface
+from femsense.model.drive import DrivenRobot, drive_of
+from femsense.model.quasi_static_path import free_path
+from femsense.model.recording import Recording
+from femsense.model.robot import Robot
+from femsense.pointcloud.rays import Surface
+
+FRAMES = 6
+"""Free frames that are used at most, spread over the recording."""
+STEPS = 8
+DERIVATIVES = 3
+"""In so many first steps the derivative by the inputs is new."""
+START_STD = (0.1, 0.03)
+"""What the poses are off by before: [rad], and as a share of the body's diagonal; as in `clouds_alone`."""
+STEP = {"tension": 1e-2, "displacement": 1e-4}
+"""Difference for the derivative by an input [N] or [m]."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Sums:
+    """Normal equations of all rows over (poses that move, inputs)."""
+
+    normal: FloatArray  # (p, p)
+    right: FloatArray  # (p,)
+    cells: FloatArray  # sums of the gradient over cells of the surface, (g, p)
+    rms: float  # [m]
+
+
+def with_initial_inputs(robot: Robot, recording: Recording, calibration: Calibration) -> Calibration:
+    """Return the calibration with undeclared poses and the initial inputs moved to where the clouds of free frames see the body.
+
+    Arguments:
+        robot, recording: as loaded; the recording's zero is unknown.
+        calibration: with poses near the true ones.
+
+    Raises:
+        DataError: no free frame has a cloud, or the body is found in none.
+    """
+    moving = [v for v, T in enumerate(recording.T_robot_camera) if T is None]
+    which = np.concatenate([np.arange(6 * v, 6 * v + 6) for v in moving]) if moving else np.zeros(0, dtype=np.int64)
+    poses, pivot, p = list(calibration.poses), pose_pivot(robot), len(which)
+    initial = first_inputs(robot, recording)
+    assert initial is not None
+    noises = measured_noises(robot, recording, calibration)
+    low, high = input_bounds(robot, recording)
+    prior = _prior(robot, recording, p)
+    gone, start = np.zeros(p), initial.copy()
+    scans: dict[int, Scan] = {}
+    moves: dict[int, FloatArray] = {}
+    for step in range(STEPS):
+        states = _states(robot, recording, initial)
+        if step < 2:
+            scans = _scans(robot, recording, poses, states)
+        if step < DERIVATIVES:
+            moves = _moves(robot, recording, initial, states)
+        sums = _sums(robot, scans, states, moves, poses, noises, which)
+        change = _bounded(sums, prior, np.append(gone, initial - start), low - initial, high - initial)
+        full = np.zeros(6 * len(poses))
+        full[which] = change[:p]
+        poses, gone, initial = moved_poses(poses, full, pivot), gone + change[:p], initial + change[p:]
+        if np.abs(change[p:]).max() < 1e-3 * STEP[recording.actuation] and np.abs(change[:p]).max(initial=0.0) < 1e-6:
+            break
+    return _answer(robot, recording, calibration, poses, initial, sums, prior, which)
+
+
+def _prior(robot: Robot, recording: Recording, poses: int) -> FloatArray:
+    """Return the precision of what is known before, shape (p + a,): hardly anything."""
+    size = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
+    pose = np.tile([START_STD[0]] * 3 + [START_STD[1] * size] * 3, poses // 6)
+    return np.append(pose, np.full(len(robot.body.cables), largest_input(robot, recording.actuation))) ** -2.0
+
+
+def _frames(recording: Recording) -> list[int]:
+    free = np.zeros(recording.frame_count, dtype=bool) if recording.free is None else recording.free
+    frames = [int(k) for k in np.flatnonzero(free) if any(file is not None for file in recording.cloud_files[k])]
+    if not frames:
+        raise DataError(
+            "initial inputs without markers need clouds of free frames: mark frames in which nothing touches the robot with 1 in the column free of frames.csv"
+        )
+    return [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, FRAMES).round().astype(int))]
+
+
+def _states(robot: Robot, recording: Recording, initial: FloatArray) -> dict[int, FloatArray]:
+    """Return the nodes of the free frames under initial inputs [m]; a frame without an equilibrium is left out."""
+    driven = DrivenRobot(robot, drive_of(robot, recording, initial=initial))
+    states = {k: state.positions for k, state in free_path(driven, _frames(recording))}
+    if not states:
+        raise DataError("no equilibrium in the free frames: are the inputs those of this robot?")
+    return states
+
+
+def _scans(robot: Robot, recording: Recording, poses: list[FloatArray], states: dict[int, FloatArray]) -> dict[int, Scan]:
+    scans: dict[int, Scan] = {}
+    for k, positions in states.items():
+        try:
+            scan = read_scan(robot, recording, k, poses, positions)
+        except FemsenseError:
+            continue
+        if scan is not None:
+            scans[k] = scan
+    if not scans:
+        raise DataError("the clouds of the free frames do not show the body")
+    return scans
+
+
+def _moves(robot: Robot, recording: Recording, initial: FloatArray, states: dict[int, FloatArray]) -> dict[int, FloatArray]:
+    """Return how the nodes of each frame move with each input, shape (3n, a)."""
+    h, columns = STEP[recording.actuation], dict[int, list[FloatArray]]()
+    for i in range(len(initial)):
+        more = _states(robot, recording, initial + h * np.eye(len(initial))[i])
+        for k, positions in states.items():
+            columns.setdefault(k, []).append(((more.get(k, positions) - positions) / h).ravel())
+    return {k: np.stack(of, axis=1) for k, of in columns.items()}
+
+
+def _sums(
+    robot: Robot,
+    scans: dict[int, Scan],
+    states: dict[int, FloatArray],
+    moves: dict[int, FloatArray],
+    poses: list[FloatArray],
+    noises: tuple[CameraNoise, ...],
+    which: IntArray,
+) -> _Sums:
+    surface, pivot = body_surface(robot.body.mesh), pose_pivot(robot)
+    size = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
+    p = len(which) + len(robot.body.cables)
+    normal, right, squares, count, cells = np.zeros((p, p)), np.zeros(p), 0.0, 0, dict[tuple[int, ...], FloatArray]()
+    for k in scans.keys() & states.keys() & moves.keys():
+        rows = ray_rows(scans[k], Surface(states[k], surface.triangles), poses, noises, reach=REACH * size)
+        by_input = -(rows.operator(len(states[k])) @ moves[k])
+        J = np.hstack([rows.by_pose(pivot, len(poses))[:, which], by_input]) / rows.std[:, None]
+        z = rows.residual / rows.std
+        weight = np.minimum(1.0, HUBER * max(1.0, 1.483 * float(np.median(np.abs(z)))) / np.maximum(np.abs(z), 1e-12))
+        normal += J.T @ (weight[:, None] * J)
+        right += J.T @ (weight * z)
+        squares, count = squares + float((rows.residual**2).sum()), count + len(z)
+        cell, group = np.unique(np.floor(rows.points / (size / CELLS)).astype(np.int64), axis=0, return_inverse=True)
+        part = np.zeros((len(cell), p))
+        np.add.at(part, group.ravel(), J * (weight * z)[:, None])
+        for key, value in zip(map(tuple, cell.tolist()), part):
+            cells[key] = cells.get(key, np.zeros(p)) + value
+    return _Sums(normal, right, np.array(list(cells.values())).reshape(-1, p), float(np.sqrt(squares / max(count, 1))))
+
+
+def _bounded(sums: _Sums, prior: FloatArray, gone: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
+    """Return the step of least squares, shape (p + a,), that keeps inputs within their bounds."""
+    P = sums.normal + np.diag(prior)
+    root = np.linalg.cholesky(P).T
+    wanted = -np.linalg.solve(root.T, sums.right + prior * gone)
+    free = np.full(len(gone) - len(low), np.inf)
+    box = (np.append(-free, low - 1e-12), np.append(free, high + 1e-12))
+    return np.asarray(lsq_linear(root, wanted, bounds=box).x)
+
+
+def _answer(
+    robot: Robot,
+    recording: Recording,
+    calibration: Calibration,
+    poses: list[FloatArray],
+    initial: FloatArray,
+    sums: _Sums,
+    prior: FloatArray,
+    which: IntArray,
+) -> Calibration:
+    p = len(which)
+    inverse = np.linalg.inv(sums.normal + np.diag(prior))
+    covariance = inverse @ (sums.cells.T @ sums.cells + np.diag(prior)) @ inverse
+    joint = np.zeros((6 * len(poses),) * 2)
+    joint[np.ix_(which, which)] = covariance[:p, :p]
+    tables = input_tables(robot, recording, initial, covariance[p:, p:])
+    weak = weak_inputs(recording, tables.tension_std if recording.actuation == "tension" else tables.displacement_std)
+    found = "converged (initial inputs by clouds alone)"
+    return replace(
+        calibration,
+        status=f"{found}, but the clouds hardly determine the initial input of {weak}" if weak else found,
+        T_robot_camera=freeze(poses[0]),
+        poses=tuple(freeze(T) for T in poses),
+        pose_covariance=freeze(joint[:6, :6]),
+        joint_covariance=freeze(joint),
+        normal_rms_m=sums.rms,
+        cable_tension_n=tables.tension,
+        cable_displacement_m=tables.displacement,
+        tension_std_n=tables.tension_std,
+        displacement_std_m=tables.displacement_std,
+        frames=tuple(int(recording.frame_numbers[k]) for k in _frames(recording)),
+    )
