@@ -159,7 +159,7 @@ def test_a_lost_marker_written_as_zeros(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_left_handed_axes_of_a_symmetric_body_are_not_taken_for_exchanged_labels(seed: int) -> None:
+def test_left_handed_axes_of_a_symmetric_body_are_not_taken_for_swapped_labels(seed: int) -> None:
     inputs = np.array([[0.0, 0, 0, 0], [0.5, 0, 0, 0], [0.5, 0, 0.4, 0], [0, 0, 0.6, 0]])
     recording, _ = record(inputs, noise=2e-4, seed=seed)
     xyz = recording.marker_xyz * np.where(np.arange(3) == seed, -1.0, 1.0)
@@ -168,11 +168,11 @@ def test_left_handed_axes_of_a_symmetric_body_are_not_taken_for_exchanged_labels
         calibrate(arm(), with_marker_table(recording, *table))
 
 
-def test_labels_exchanged_in_all_frames_are_named_where_the_body_moves() -> None:
+def test_labels_swapped_in_all_frames_are_named_where_the_body_moves() -> None:
     inputs = np.array([[0.0, 0, 0, 0], [0.5, 0, 0, 0], [0.5, 0, 0.4, 0], [0, 0, 0.6, 0], [0, 0.5, 0, 0], [0, 0, 0, 0.5]])
     recording, _ = record(inputs, noise=2e-4)
     index = recording.marker_index.copy()
     index[recording.marker_index == 9], index[recording.marker_index == 11] = 11, 9
     table = (recording.marker_names, recording.marker_frame, index, recording.marker_xyz)
-    with pytest.raises(DataError, match=r"labels seem exchanged: (m9 and m11|m11 and m9)"):
+    with pytest.raises(DataError, match=r"labels seem swapped: (m9 and m11|m11 and m9)"):
         calibrate(arm(), with_marker_table(recording, *table))
