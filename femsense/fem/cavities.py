@@ -102,6 +102,24 @@ def find_chamber(
     raise _not_a_cavity(mesh, faces, point, float(turns.sum()), where)
 
 
+def cavity_seeds(mesh: TetMesh) -> list[FloatArray]:
+    """Return a point inside each cavity of a mesh that is closed [m], each (3,), the largest cavity first."""
+    faces = _boundary_faces(mesh)
+    part, seeds = _surface_parts(faces), list[tuple[float, FloatArray]]()
+    corners = mesh.nodes[faces[:, :3]]
+    volumes = np.bincount(part, weights=np.einsum("ti,ti->t", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6.0)
+    for p in np.flatnonzero(volumes < 0.0):  # seen from the material its faces look inwards
+        of = corners[part == p]
+        normal = np.cross(of[:, 1] - of[:, 0], of[:, 2] - of[:, 0])
+        edge = np.sqrt(np.linalg.norm(normal, axis=1, keepdims=True))
+        beside = of.mean(axis=1) + 0.1 * normal / np.maximum(edge, 1e-300)
+        for point in [of.reshape(-1, 3).mean(axis=0), *beside[:20]]:
+            if abs(_solid_angles(mesh.nodes, faces[part == p], point).sum() / (4.0 * np.pi) + 1.0) < 0.01:
+                seeds.append((float(volumes[p]), point))
+                break
+    return [point for _, point in sorted(seeds, key=lambda seed: seed[0])]
+
+
 def check_chambers(chambers: tuple[Chamber, ...], where: str = "chambers") -> None:
     """Refuse two chambers that are the same cavity. Raises InputError."""
     seen: dict[int, str] = {}

@@ -16,6 +16,7 @@ import numpy as np
 import femsense
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import FemsenseError, InputError
+from femsense.fem.cavities import cavity_seeds
 from femsense.fem.mesh import TetMesh
 from femsense.io.files import check_target, file_hash, write_json, write_text
 from femsense.io.mesh_files import SURFACE_ENDINGS, read_triangles, write_mesh
@@ -303,9 +304,22 @@ def starter_text(mesh: TetMesh, options: MeshOptions, name: str, source: str) ->
         "path": _triple(upper),
         "pull": _triple([upper[0], upper[1], low[2] - 0.1 * (high[2] - low[2])]),
         "marker": _triple(top),
+        "chambers": _chambers_text(mesh),
     }
     template = (Path(__file__).parent / "starter.toml").read_text(encoding="utf-8")
     return re.sub(r"<(\w+)>", lambda found: values[found[1]], template)
+
+
+def _chambers_text(mesh: TetMesh) -> str:
+    """Return tables for the cavities that were kept, to be filled in; empty where there are none."""
+    seeds = cavity_seeds(mesh)
+    if not seeds:
+        return ""
+    tables = [
+        f'# [[chambers]]\n# name = "chamber-{i + 1}"\n# seed_m = {_triple(seed)}\n# max_pressure_pa = 40e3\n'
+        for i, seed in enumerate(seeds)
+    ]
+    return "\n# YOURS: the cavities that were kept; with these lines one is a chamber under pressure.\n" + "".join(tables)
 
 
 def _triple(point: FloatArray | list[float]) -> str:

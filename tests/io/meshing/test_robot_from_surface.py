@@ -16,6 +16,7 @@ from helpers import block_mesh, write_block_robot
 
 from femsense.app import cli
 from femsense.core.errors import InputError
+from femsense.fem.chambers import chamber_volume
 from femsense.fem.equilibrium import solve_equilibrium
 from femsense.fem.mesh import TetMesh, element_volumes, surface_triangles, to_linear
 from femsense.io.meshing import tetrahedra
@@ -104,6 +105,11 @@ def test_a_chamber_stays_hollow_and_the_robot_bends(tmp_path: Path, capfd: pytes
     assert len(np.unique(surface_triangles(mesh))) - edges + len(surface_triangles(mesh)) == 4  # two spheres (Euler)
     assert report["quality"]["tetrahedra"] == len(mesh.tets) <= 1500 and report["deviation_mm"] < report["tolerance_mm"] * 1.5
     assert solve_equilibrium(robot.body).converged
+    toml = tmp_path / "robot/robot.toml"  # what it says of the chamber holds once it is no comment any more
+    text = re.sub(r"# (\[\[chambers\]\]\n)# (name.*\n)# (seed_m.*\n)# (max.*\n)", r"\1\2\3\4", toml.read_text())
+    toml.write_text(text)
+    chamber = load_robot(tmp_path / "robot").body.chambers[0]
+    assert chamber_volume(chamber, robot.body.mesh.nodes) == pytest.approx(8.64e-6, rel=0.02)
 
 
 def test_shells_that_cross_are_filled_as_one(tmp_path: Path) -> None:
