@@ -39,7 +39,7 @@ from femsense.io.recording_folder import save_recording
 from femsense.io.robot_toml import load_robot, save_robot
 from femsense.model.effects import apply_effects
 from femsense.rig.plan import Plan
-from femsense.rig.truth import true_path
+from femsense.rig.true_path import true_path
 
 STAGES = (
     ("reading", "start, reading, calibrating"),

@@ -24,7 +24,7 @@ from femsense.model.recording_parts import About, Drives, LoadRows, MarkerRows, 
 from femsense.model.robot import Observation, Robot, plain_actuation, spread_features
 from femsense.rig.plan import Plan, PlannedContact
 from femsense.rig.script import ContactTable
-from femsense.rig.truth import true_path
+from femsense.rig.true_path import true_path
 
 CUBE_TETS = np.array([[0, 1, 3, 7], [0, 3, 2, 7], [0, 2, 6, 7], [0, 6, 4, 7], [0, 4, 5, 7], [0, 5, 1, 7]])
 """Six tetrahedra of a cube with corners 4 x + 2 y + z (Kuhn)."""

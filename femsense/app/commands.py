@@ -190,23 +190,33 @@ def loop_page(folder: str | Path, *, say: Say, write: Callable[[str | Path], Pat
         return None
 
 
-def simulate_into(folder: str | Path, robot: str | Path, script: str | Path) -> Path:
-    """Write the recording of a script; return its folder.
+def simulate_into(folder: str | Path, robot: str | Path, script: str | Path, *, progress: Progress | None = None) -> Path:
+    """Write the recording of a script; return its folder. A run that was stopped goes on where it stopped.
 
     Raises:
         InputError: where the folder holds anything but a recording, which would be replaced. FemsenseError: as `simulate`.
     """
+    from femsense.io.provenance import robot_input
+    from femsense.rig.script import read_script
     from femsense.rig.simulate import simulate
 
     target = Path(folder).expanduser()
-    if target.exists() and not (target / "recording.toml").is_file() and not (target.is_dir() and not any(target.iterdir())):
+    inside = {path.name for path in target.iterdir()} if target.is_dir() else {"a file"} if target.exists() else set()
+    if inside - {UNFINISHED} and "recording.toml" not in inside:
         raise InputError(
             "something else than a recording stands there, which would be replaced",
             where=target,
             expected="a new folder",
             hint="another -o",
         )
-    return simulate(load_robot(robot), script, target)
+    body, table = load_robot(robot), read_script(script)
+    meshes = [Path(script).parent / item.mesh for item in table.objects if item.mesh is not None]
+    inputs = {
+        "robot": robot_input(body),
+        "script": table.model_dump(),
+        "meshes": [file_hash(file) for file in meshes if file.is_file()],
+    }
+    return simulate(body, script, target, progress=progress, keep=_kept(target, inputs))
 
 
 def script_identifiability(robot: str | Path, script: str | Path, *, noise: float) -> tuple[dict[str, Any], str]:

@@ -11,6 +11,7 @@ import numpy as np
 
 from femsense.core.errors import InputError
 from femsense.core.text import did_you_mean
+from femsense.io.checkpoint import UNFINISHED
 from femsense.io.clouds.frame_clouds import find_clouds
 from femsense.io.clouds.images import check_image_size, png_header
 from femsense.io.files import check_target, write_beside, write_toml
@@ -144,7 +145,8 @@ def save_recording(recording: Recording, folder: str | Path, *, fill: Callable[[
     """
     final = Path(folder)
     check_target(final, folder=True)
-    if final.is_dir() and any(final.iterdir()) and not (final / "recording.toml").is_file():
+    inside = {path.name for path in final.iterdir()} - {UNFINISHED} if final.is_dir() else set()
+    if inside and "recording.toml" not in inside:
         raise InputError(
             "something else than a recording stands there, which would be replaced",
             where=final,

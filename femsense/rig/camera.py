@@ -1,9 +1,4 @@
-"""A depth camera that looks at triangles: rays, shading, and the noise of active stereo.
-
-Depth z [m] of a pixel comes from a disparity, so that its standard deviation grows as z² · subpixel / (f · baseline)
-(Intel, "Best-known methods for tuning RealSense D400"); a part of it is common to neighbouring pixels, since disparities
-are matched over windows. Surfaces seen too obliquely, and many pixels at depth edges, give no depth or one in between.
-"""
+"""A depth camera that looks at triangles: rays, shading, and files. What its depths are off by: `rig/depth_noise.py`."""
 
 from __future__ import annotations
 
@@ -18,15 +13,15 @@ import numpy.typing as npt
 from femsense.core.arrays import BoolArray, FloatArray, IntArray, freeze
 from femsense.core.errors import InputError
 from femsense.core.pose import check_pose, invert_pose, make_pose, rotation_from_vector, transform_points
-from femsense.model.camera import Camera
+from femsense.model.camera import Camera, CameraNoise
 from femsense.model.robot import Observation
 from femsense.pointcloud.cloud import PointCloud
-from femsense.rig.script import NoiseTable, ViewTable
+from femsense.rig.camera_tables import NoiseTable, ViewTable
+from femsense.rig.depth_noise import Sight, disturbed
+from femsense.rig.lens import pixel_rays, pixels_of
 
 AMBIENT = 0.35
 """Share of the light that comes from everywhere."""
-EDGE = 0.01
-"""Neighbouring depths that differ by more than this are an edge [m]."""
 COLOR_NOISE = 0.012
 """Standard deviation of a colour channel [1]."""
 TRUE_DEPTH = Observation()
@@ -44,6 +39,10 @@ class Shape:
     """Shape (t, 3), outward."""
     color: FloatArray
     """Red, green, blue in [0, 1], shape (3,)."""
+    albedo: float = 0.6
+    """What it sends back of infrared light [1]."""
+    gloss: float = 0.0
+    """How likely a depth is lost where it gleams [1]."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -58,12 +57,14 @@ class DepthImage:
     """Index of the shape in each pixel, shape (H, W); −1 where there is none."""
 
 
-def camera_of(view: ViewTable) -> Camera:
+def camera_of(view: ViewTable, name: str = "", *, noise: CameraNoise | None = None) -> Camera:
     """Return the lens of a view."""
     fy = view.fx if view.fy is None else view.fy
     cx = (view.width - 1) / 2 if view.cx is None else view.cx
     cy = (view.height - 1) / 2 if view.cy is None else view.cy
-    return Camera("", view.width, view.height, view.fx, fy, cx, cy, freeze(np.zeros(5)), view.depth_unit_m)
+    distortion = freeze([*view.distortion, 0.0] if len(view.distortion) == 4 else view.distortion)
+    lens = (view.width, view.height, view.fx, fy, cx, cy, distortion, view.depth_unit_m, view.distortion_model)
+    return Camera(name, *lens, noise)
 
 
 def pose_of(view: ViewTable) -> FloatArray:
@@ -96,12 +97,6 @@ def look_at(eye: Sequence[float], target: Sequence[float], *, roll: float = 0.0)
     return make_pose(upright @ rotation_from_vector([0.0, 0.0, roll]), np.asarray(eye, dtype=float))
 
 
-def pixel_rays(camera: Camera) -> FloatArray:
-    """Return the ray of each pixel with z = 1, camera frame, shape (H, W, 3)."""
-    u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-    return np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
-
-
 def render(
     camera: Camera,
     T_robot_camera: FloatArray,
@@ -121,15 +116,23 @@ def render(
         observation: measured distance along the ray = depth_scale × true distance + depth_offset.
         rng: source of the noise; needed where `noise` is given.
     """
-    rays = pixel_rays(camera)
-    depth, shape, facing = _cast(rays, T_robot_camera, shapes)
-    color = _shade(shapes, shape, facing, rng)
-    seen = shape >= 0
-    measured = np.where(seen, depth, 0.0)
+    sight = look(camera, T_robot_camera, shapes)
+    color = _shade(shapes, sight.shape, sight.facing, rng)
+    seen = sight.shape >= 0
+    measured = np.where(seen, sight.depth, 0.0)
     if noise is not None and rng is not None:
-        measured = _disturbed(measured, facing, noise, camera, rng)
-    stretch = observation.depth_scale + observation.depth_offset / np.where(seen, depth * np.linalg.norm(rays, axis=-1), 1.0)
-    return DepthImage(freeze(measured * stretch), color, shape)
+        measured = disturbed(sight, noise, camera, rng)
+    distance = np.where(measured > 0, measured * np.linalg.norm(sight.rays, axis=-1), 1.0)
+    stretch = observation.depth_scale + observation.depth_offset / distance
+    return DepthImage(freeze(measured * stretch), color, sight.shape)
+
+
+def look(camera: Camera, T_robot_camera: FloatArray, shapes: Sequence[Shape]) -> Sight:
+    """Return what the rays of a camera at T_robot_camera (4, 4) meet."""
+    rays = pixel_rays(camera)
+    depth, shape, facing, normal = _cast(rays, T_robot_camera, shapes)
+    albedo, gloss = np.array([[s.albedo, s.gloss] for s in shapes] + [[0.0, 0.0]])[shape].transpose(2, 0, 1)
+    return Sight(rays, depth, shape, normal, facing, albedo, gloss)
 
 
 def cloud_of(image: DepthImage, camera: Camera, which: npt.ArrayLike | None = None) -> PointCloud:
@@ -178,11 +181,11 @@ def visible_points(camera: Camera, T_robot_camera: FloatArray, shapes: Sequence[
     """Return which points (p, 3) [m], robot frame, are inside the image and not behind anything."""
     local = transform_points(invert_pose(T_robot_camera), points)
     ahead = local[:, 2] > 1e-6
-    safe = np.where(ahead, local[:, 2], 1.0)
-    u, v = camera.fx * local[:, 0] / safe + camera.cx, camera.fy * local[:, 1] / safe + camera.cy
+    safe = np.where(ahead[:, None], local, [0.0, 0.0, 1.0])
+    u, v = pixels_of(camera, safe).T
     inside = ahead & (u >= -0.5) & (u <= camera.width - 0.5) & (v >= -0.5) & (v <= camera.height - 0.5)
-    rays = local / np.where(ahead, local[:, 2], 1.0)[:, None]
-    hit, shape, _ = _cast(rays, T_robot_camera, shapes)
+    rays = local / safe[:, 2:]
+    hit, shape, _, _ = _cast(rays, T_robot_camera, shapes)
     gap = (local[:, 2] - hit) * np.linalg.norm(rays, axis=1)
     return np.asarray(inside & ((shape < 0) | (gap < HIDDEN)))
 
@@ -197,8 +200,10 @@ def measured_points(T_robot_camera: FloatArray, points: FloatArray, observation:
 # Rays and light
 
 
-def _cast(rays: FloatArray, T_robot_camera: FloatArray, shapes: Sequence[Shape]) -> tuple[FloatArray, IntArray, FloatArray]:
-    """Return depth [m] (inf: nothing), index of the shape (−1: nothing) and cosine to the normal of each ray, shape (…,)."""
+def _cast(
+    rays: FloatArray, T_robot_camera: FloatArray, shapes: Sequence[Shape]
+) -> tuple[FloatArray, IntArray, FloatArray, FloatArray]:
+    """Return depth [m] (inf: nothing), index of the shape (−1: nothing), cosine to the normal, shape (…,), and the normal towards the camera (…, 3)."""
     import open3d as o3d
 
     scene = o3d.t.geometry.RaycastingScene(nthreads=1)
@@ -215,12 +220,14 @@ def _cast(rays: FloatArray, T_robot_camera: FloatArray, shapes: Sequence[Shape])
     number = answer["geometry_ids"].numpy().astype(np.int64)
     missed = number == int(scene.INVALID_ID)
     normals = answer["primitive_normals"].numpy().astype(np.float64)
-    facing = np.abs(np.einsum("...c,...c->...", normals, directions)) / np.linalg.norm(directions, axis=-1)
+    slope = np.einsum("...c,...c->...", normals, directions)
+    facing = np.abs(slope) / np.linalg.norm(directions, axis=-1)
+    towards = -np.sign(slope)[..., None] * normals @ T_robot_camera[:3, :3]
     depth = np.full(number.shape, np.inf)
     for i, shape in enumerate(shapes):
         mine = number == i
         depth[mine] = _exact_depth(shape, answer["primitive_ids"].numpy()[mine], start[mine], directions[mine])
-    return depth, np.where(missed, -1, number), np.where(missed, 0.0, facing)
+    return depth, np.where(missed, -1, number), np.where(missed, 0.0, facing), np.where(missed[..., None], 0.0, towards)
 
 
 def _exact_depth(shape: Shape, triangle: npt.NDArray[Any], start: FloatArray, direction: FloatArray) -> FloatArray:
@@ -239,47 +246,3 @@ def _shade(
     if rng is not None:
         color = color + COLOR_NOISE * rng.standard_normal(color.shape)
     return np.asarray(np.rint(255.0 * np.clip(color, 0.0, 1.0)), dtype=np.uint8)
-
-
-# Noise
-
-
-def depth_std(depth: FloatArray, noise: NoiseTable, camera: Camera) -> FloatArray:
-    """Return one standard deviation of depths [m]: z² · subpixel / (f · baseline)."""
-    focal = camera.fx if noise.focal_px is None else noise.focal_px
-    return np.asarray(depth**2 * noise.subpixel_px / (focal * noise.baseline_m))
-
-
-def _disturbed(depth: FloatArray, facing: FloatArray, noise: NoiseTable, camera: Camera, rng: np.random.Generator) -> FloatArray:
-    """Return depths with noise, steps and gaps."""
-    common = _smooth_noise(depth.shape, noise.correlation_px, rng)
-    own = rng.standard_normal(depth.shape)
-    share = noise.correlated_share
-    result = depth + depth_std(depth, noise, camera) * (np.sqrt(share) * common + np.sqrt(1.0 - share) * own)
-    edge, front, back = _edges(depth)
-    chance, between = rng.random(depth.shape), rng.random(depth.shape)
-    flying = edge & (chance < noise.flying_share) & (front > 0)
-    result[flying] = (front + between * (back - front))[flying]
-    step = noise.quantum_m or camera.depth_unit
-    result = np.rint(result / step) * step
-    gone = edge & ~flying & (chance < noise.flying_share + noise.edge_dropout)
-    gone |= facing < np.cos(np.radians(noise.grazing_deg))
-    return np.asarray(np.where(gone | (depth <= 0), 0.0, result))
-
-
-def _smooth_noise(shape: tuple[int, ...], width: float, rng: np.random.Generator) -> FloatArray:
-    """Return noise of unit variance that neighbours share, shape (H, W)."""
-    from scipy.ndimage import gaussian_filter
-
-    impulse = np.zeros((8 * int(np.ceil(width)) + 1,) * 2)
-    impulse[impulse.shape[0] // 2, impulse.shape[1] // 2] = 1.0
-    gain = np.sqrt((gaussian_filter(impulse, width, mode="wrap") ** 2).sum())
-    return np.asarray(gaussian_filter(rng.standard_normal(shape), width, mode="wrap") / gain)
-
-
-def _edges(depth: FloatArray) -> tuple[BoolArray, FloatArray, FloatArray]:
-    """Return where depth jumps, and the nearest and farthest depth of each pixel and its neighbours, shape (H, W)."""
-    from scipy.ndimage import maximum_filter, minimum_filter
-
-    front, back = minimum_filter(depth, 3), maximum_filter(depth, 3)
-    return back - front > EDGE, front, back

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,16 +12,12 @@ from femsense.core.arrays import BoolArray, FloatArray, IntArray, freeze
 from femsense.core.errors import InputError
 from femsense.core.text import did_you_mean
 from femsense.model.robot import Robot
-from femsense.rig.script import ContactTable, ScriptTable, SweepTable, script_problem
+from femsense.rig.planned_contact import PlannedContact, planned_contact
+from femsense.rig.script import ScriptTable, SweepTable, script_problem
 
-
-@dataclass(frozen=True, eq=False, slots=True)
-class PlannedContact:
-    """A contact along the frames."""
-
-    table: ContactTable
-    force: FloatArray
-    """[N], shape (F,); 0 where it does not touch."""
+__all__ = ["Plan", "PlannedContact", "plan_script"]
+MOTORS = 7
+"""Stream of random numbers of the motors, beside those of `rig/experiment.py`."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -50,6 +46,27 @@ class Plan:
     load_forces: FloatArray
     """[N], shape (L, 3)."""
     contacts: tuple[PlannedContact, ...]
+    motor_scale: FloatArray | None = None
+    """True input over recorded one of each cable [1], shape (a,); None: 1."""
+    backlash: float = 0.0
+    """Play of the motors [N] or [m]."""
+
+    def pick(self, frames: IntArray) -> Plan:
+        """Return the plan of some of its frames."""
+        kept = np.isin(self.load_frame, frames)
+        return replace(
+            self,
+            time_s=freeze(self.time_s[frames]),
+            sweep=tuple(self.sweep[k] for k in frames),
+            free=freeze(self.free[frames], bool),
+            commanded=freeze(self.commanded[frames]),
+            pressures=freeze(self.pressures[frames]),
+            gravity=None if self.gravity is None else freeze(self.gravity[frames]),
+            load_frame=freeze(np.searchsorted(frames, self.load_frame[kept]), np.int64),
+            load_points=freeze(self.load_points[kept]),
+            load_forces=freeze(self.load_forces[kept]),
+            contacts=tuple(contact.pick(frames) for contact in self.contacts),
+        )
 
 
 def plan_script(script: ScriptTable, robot: Robot, where: Path = Path("script")) -> Plan:
@@ -69,7 +86,11 @@ def plan_script(script: ScriptTable, robot: Robot, where: Path = Path("script"))
     first = dict(zip((s.label for s in script.sweeps), np.r_[0, np.cumsum(counts)[:-1]].tolist()))
     count = dict(zip(first, counts))
     steps = np.concatenate([np.full(n, s.dt_s or script.dt_s) for s, n in zip(script.sweeps, counts)])
-    contacts = tuple(_planned_contact(script, i, first, count, int(steps.size), where) for i in range(len(script.contacts)))
+    gravity = robot.body.gravity
+    contacts = tuple(
+        planned_contact(script, i, (first[c.sweep], count[c.sweep], int(steps.size)), gravity, where)
+        for i, c in enumerate(script.contacts)
+    )
     touched = {c.table.sweep for c in contacts if c.force.any()}
     initial = np.array([script.initial.get(name, 0.0) for name in names])
     commanded = np.vstack([_sweep_inputs(sweep, sweep.cables, names) for sweep in script.sweeps])
@@ -102,7 +123,15 @@ def plan_script(script: ScriptTable, robot: Robot, where: Path = Path("script"))
         load_points=freeze(points),
         load_forces=freeze(forces),
         contacts=contacts,
+        motor_scale=_motor_scale(script, len(names)),
+        backlash=script.motors.backlash,
     )
+
+
+def _motor_scale(script: ScriptTable, count: int) -> FloatArray | None:
+    if not script.motors.gain_std:
+        return None
+    return freeze(1.0 + script.motors.gain_std * np.random.default_rng([script.seed, MOTORS]).standard_normal(count))
 
 
 def _check_pressures(pressures: FloatArray, robot: Robot, where: Path) -> None:
@@ -152,25 +181,6 @@ def _sweep_inputs(sweep: SweepTable, values: dict[str, float | list[float]], nam
     for name, value in values.items():
         table[:, names.index(name)] = np.asarray(value) if isinstance(value, list) else value * profile
     return table
-
-
-def _planned_contact(
-    script: ScriptTable, i: int, first: dict[str, int], count: dict[str, int], total: int, where: Path
-) -> PlannedContact:
-    table = script.contacts[i]
-    n, start = count[table.sweep], first[table.sweep]
-    values = np.full(n, table.force_n) if isinstance(table.force_n, float | int) else np.array(table.force_n, dtype=float)
-    if len(values) != n:
-        raise script_problem(
-            "another number of values than frames",
-            where,
-            ("contacts", i, "force_n"),
-            f"{len(values)} values",
-            f"{n} values, or one number",
-        )
-    force = np.zeros(total)
-    force[start : start + n] = values
-    return PlannedContact(table, freeze(force))
 
 
 def _planned_loads(

@@ -1,4 +1,4 @@
-"""What stands before the camera in a frame: the deformed body, the probes that touch it, the floor."""
+"""What stands before the cameras in a frame: the deformed body, what touches it or is near, the floor."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from femsense.core.arrays import FloatArray
 from femsense.fem.mesh import surface_triangles
 from femsense.model.robot import Robot
 from femsense.rig.camera import Shape
-from femsense.rig.plan import Plan
+from femsense.rig.experiment import Experiment
+from femsense.rig.objects import object_shape, object_surface
+from femsense.rig.presses import Hovering, TrueContact
 from femsense.rig.script import SceneTable
-from femsense.rig.truth import TrueContact, TrueFrame
 
 PLAIN_RGB = (0.6, 0.6, 0.6)
 FLOOR_HALF = 1.0
@@ -21,28 +22,30 @@ ROD_LENGTH = 0.12
 """Length of what holds a probe [m]."""
 
 
-def frame_shapes(robot: Robot, frame: TrueFrame, plan: Plan, scene: SceneTable) -> list[Shape]:
-    """Return what the camera sees in a frame: the body first, then the probes, then the floor.
-
-    Arguments:
-        robot: the true robot.
-        frame: its state and contacts.
-        plan: for the probes.
-        scene: colours and floor.
-    """
+def frame_shapes(experiment: Experiment, k: int) -> list[Shape]:
+    """Return what the cameras see in the k-th frame of an experiment: the body first, then what touches it or is near, then the floor."""
+    robot, frame, scene = experiment.robot, experiment.frames[k], experiment.script.scene
     shapes = [body_shape(robot, frame.state.positions, scene)]
-    for contact in frame.contacts:
-        table = plan.contacts[contact.contact].table
-        shapes.append(probe_shape(contact, table.probe, table.probe_radius_m, np.array(scene.probe_rgb)))
+    near: list[TrueContact | Hovering] = [*frame.contacts, *frame.hovering]
+    for contact in near:
+        planned = experiment.plan.contacts[contact.contact]
+        table, T = planned.table, contact.T_robot_object
+        if not table.shown:
+            continue
+        if planned.item is not None and T is not None:
+            shapes.append(object_shape(planned.item, object_surface(planned.item, experiment.folder), T))
+        elif isinstance(contact, TrueContact):
+            shapes.append(probe_shape(contact, table.probe, table.probe_radius_m, np.array(scene.probe_rgb)))
     if scene.floor_z_m is not None:
-        shapes.append(floor_shape(scene.floor_z_m, np.array(scene.floor_rgb)))
+        shapes.append(floor_shape(scene.floor_z_m, np.array(scene.floor_rgb), scene.floor_albedo))
     return shapes
 
 
 def body_shape(robot: Robot, positions: FloatArray, scene: SceneTable) -> Shape:
     """Return the deformed surface of a body; positions [m], shape (n, 3)."""
     color = scene.robot_rgb if scene.robot_rgb is not None else robot.color_rgb if robot.color_rgb is not None else PLAIN_RGB
-    return Shape(positions, surface_triangles(robot.body.mesh), np.asarray(color, dtype=float))
+    shape = np.asarray(color, dtype=float)
+    return Shape(positions, surface_triangles(robot.body.mesh), shape, scene.robot_albedo, scene.robot_gloss)
 
 
 def probe_shape(contact: TrueContact, kind: str, radius: float, color: FloatArray) -> Shape:
@@ -61,11 +64,11 @@ def probe_shape(contact: TrueContact, kind: str, radius: float, color: FloatArra
     return Shape(np.array(both.vertices, dtype=float), np.array(both.faces, dtype=np.int64), color)
 
 
-def floor_shape(height: float, color: FloatArray) -> Shape:
+def floor_shape(height: float, color: FloatArray, albedo: float = 0.6) -> Shape:
     """Return a level square at a height [m]."""
     h = FLOOR_HALF
     corners = np.array([[-h, -h, height], [h, -h, height], [h, h, height], [-h, h, height]])
-    return Shape(corners, np.array([[0, 1, 2], [0, 2, 3]]), color)
+    return Shape(corners, np.array([[0, 1, 2], [0, 2, 3]]), color, albedo)
 
 
 def _rod(start: FloatArray, end: FloatArray, radius: float) -> Any:

@@ -10,16 +10,15 @@ from pydantic import Field, model_validator
 
 from femsense.core.errors import InputError
 from femsense.core.text import did_you_mean, key_path
-from femsense.io.robot_tables import Matrix, Share, Vector
+from femsense.io.robot_tables import Share, Vector
 from femsense.io.tables import Schema, read_toml, validated
+from femsense.rig.camera_tables import NoiseTable, ViewTable
+from femsense.rig.object_tables import COLOR, PLACE, Color, ContactTable, NotNegative, ObjectTable, Positive
 from femsense.rig.sensors import SensorTable
 
+__all__ = ["ContactTable", "NoiseTable", "ObjectTable", "ViewTable"]
+
 FORMAT = "femsense-script-1"
-COLOR = "three numbers from 0 to 1: [red, green, blue]"
-PLACE = "three numbers in metres [x, y, z], on the surface at rest, robot frame"
-Color = Annotated[list[Share], Field(min_length=3, max_length=3)]
-Positive = Annotated[float, Field(gt=0)]
-NotNegative = Annotated[float, Field(ge=0)]
 Count = Annotated[int, Field(ge=0)]
 
 
@@ -51,20 +50,6 @@ class SweepTable(Schema):
         return [0.0] * self.rest + rise + [1.0] * self.hold + fall
 
 
-class ContactTable(Schema):
-    """Something that presses on the body and is not declared in the recording."""
-
-    sweep: str = Field(description="label of the sweep in which it acts")
-    point_m: Vector = Field(description=PLACE)
-    force_n: NotNegative | list[NotNegative] = Field(
-        description="newton, one number or one a frame of the sweep, ≥ 0; at 0 it does not touch"
-    )
-    direction: Vector | None = Field(None, description="direction of the force; by default into the surface, as it turns")
-    radius_m: Positive = Field(0.006, description="the force is spread over the surface within this distance [m], > 0")
-    probe: Literal["sphere", "cylinder"] = Field("sphere", description='what the camera sees: "sphere" or "cylinder"')
-    probe_radius_m: Positive = Field(0.006, description="[m], > 0")
-
-
 class LoadTable(Schema):
     """A known load: it stands in loads.csv."""
 
@@ -93,45 +78,13 @@ class TruthTable(Schema):
         return self
 
 
-class NoiseTable(Schema):
-    """Noise of a depth image, after active stereo cameras."""
+class MotorsTable(Schema):
+    """How the motors differ from what is recorded; each cable's scale is drawn from the seed."""
 
-    subpixel_px: NotNegative = Field(0.08, description="error of the disparity [px], ≥ 0")
-    baseline_m: Positive = Field(0.055, description="distance of the two imagers [m], > 0")
-    focal_px: Positive | None = Field(None, description="focal length of the imagers [px]; by default fx")
-    correlated_share: Share = Field(0.5, description="share of the variance that neighbouring pixels have in common, 0 … 1")
-    correlation_px: Positive = Field(2.0, description="width of that common part [px], > 0")
-    grazing_deg: Annotated[float, Field(gt=0, le=90)] = Field(
-        82.0, description="surfaces seen more obliquely than this give no depth [°]"
+    gain_std: NotNegative = Field(
+        0.0, description="standard deviation of the true input over the recorded one, each cable its own, ≥ 0"
     )
-    edge_dropout: Share = Field(0.5, description="share of the pixels at depth edges that give no depth, 0 … 1")
-    flying_share: Share = Field(0.05, description="share of the pixels at depth edges that fall between front and back, 0 … 1")
-    quantum_m: NotNegative = Field(0.0, description="step of the depth values [m]; 0: the camera's depth_unit_m")
-
-
-class ViewTable(Schema):
-    """A pinhole camera and where it stands."""
-
-    width: Annotated[int, Field(gt=0)] = Field(424, description="pixels, > 0")
-    height: Annotated[int, Field(gt=0)] = Field(240, description="pixels, > 0")
-    fx: Positive = Field(306.0, description="focal length in pixels, > 0")
-    fy: Positive | None = Field(None, description="focal length in pixels, > 0; by default fx")
-    cx: float | None = Field(None, description="pixels; by default the middle")
-    cy: float | None = Field(None, description="pixels; by default the middle")
-    depth_unit_m: Positive = Field(1e-4, description="metres in one unit of a depth image, > 0")
-    T_robot_camera: Matrix | None = Field(None, description="4 rows of 4 numbers, in place of eye_m and target_m")
-    eye_m: Vector | None = Field(None, description="where the camera stands, robot frame [m]")
-    target_m: Vector | None = Field(None, description="what it looks at, robot frame [m]")
-    roll_deg: float = Field(0.0, description="turn about the line of sight [°]")
-    declare_pose: bool = Field(False, description="true: the recording says where the camera stands")
-    noise: NoiseTable | None = Field(None, description="a table [camera.noise]; without it depth is exact")
-
-    @model_validator(mode="after")
-    def _one_pose(self) -> ViewTable:
-        looks = self.eye_m is not None and self.target_m is not None
-        if looks == (self.T_robot_camera is not None):
-            raise ValueError("a camera stands either by eye_m and target_m or by T_robot_camera")
-        return self
+    backlash: NotNegative = Field(0.0, description="play: the way that a motor turns back before its cable follows [N or m], ≥ 0")
 
 
 class MarkersTable(Schema):
@@ -168,6 +121,9 @@ class SceneTable(Schema):
     floor_rgb: Color = Field([0.55, 0.53, 0.50], description=COLOR)
     probe_rgb: Color = Field([0.85, 0.30, 0.12], description=COLOR)
     robot_rgb: Color | None = Field(None, description=COLOR + "; by default the robot's appearance")
+    robot_albedo: Share = Field(0.6, description="what the robot sends back of infrared light, 0 … 1")
+    robot_gloss: Share = Field(0.0, description="how likely a depth of the robot is lost where it gleams, 0 … 1")
+    floor_albedo: Share = Field(0.6, description="what the floor sends back of infrared light, 0 … 1")
 
 
 class ScriptTable(Schema):
@@ -181,15 +137,29 @@ class ScriptTable(Schema):
     input_std: NotNegative = Field(0.0, description="noise of the recorded inputs [N or m], ≥ 0")
     dt_s: Positive = Field(0.5, description="time from frame to frame [s], > 0")
     sweeps: Annotated[list[SweepTable], Field(min_length=1)] = Field(description="at least one [[sweeps]] with label and cables")
+    objects: list[ObjectTable] = Field([], description="tables [[objects]]: what can touch the body")
     contacts: list[ContactTable] = Field([], description="tables [[contacts]]")
     loads: list[LoadTable] = Field([], description="tables [[loads]]")
     truth: TruthTable = Field(default_factory=lambda: TruthTable.model_validate({}), description="a table [truth]")
     effects: list[dict[str, Any]] = Field([], description="tables [[effects]] that only the truth has")
+    motors: MotorsTable = Field(default_factory=lambda: MotorsTable.model_validate({}), description="a table [motors]")
     sensors: list[SensorTable] = Field([], description="tables [[sensors]]: sensors in the body, written to sensors.csv")
-    camera: ViewTable = Field(description="a table [camera] with eye_m and target_m, or T_robot_camera")
+    camera: ViewTable | None = Field(None, description="a table [camera] with eye_m and target_m, or T_robot_camera")
+    cameras: dict[str, ViewTable] = Field({}, description="tables [cameras.NAME] in place of [camera], where there are several")
     markers: MarkersTable = Field(default_factory=lambda: MarkersTable.model_validate({}), description="a table [markers]")
     clouds: CloudsTable = Field(default_factory=lambda: CloudsTable.model_validate({}), description="a table [clouds]")
     scene: SceneTable = Field(default_factory=lambda: SceneTable.model_validate({}), description="a table [scene]")
+
+    @model_validator(mode="after")
+    def _one_or_several_cameras(self) -> ScriptTable:
+        if (self.camera is None) == (not self.cameras):
+            raise ValueError("either a table [camera] or tables [cameras.NAME]")
+        return self
+
+    @property
+    def views(self) -> dict[str, ViewTable]:
+        """The cameras by their names; "" where there is one."""
+        return self.cameras or ({} if self.camera is None else {"": self.camera})
 
 
 def read_script(path: str | Path) -> ScriptTable:
@@ -216,7 +186,26 @@ def check_script(document: dict[str, Any], where: Path = Path("script")) -> Scri
             )
     for i, sweep in enumerate(script.sweeps):
         _check_sweep(sweep, i, where)
+    _check_objects(script, where)
     return script
+
+
+def _check_objects(script: ScriptTable, where: Path) -> None:
+    names = [item.name for item in script.objects]
+    for i, name in enumerate(names):
+        if name in names[:i]:
+            raise script_problem("a name stands twice", where, ("objects", i, "name"), repr(name), "each object its own name")
+    for i, table in enumerate(script.contacts):
+        if table.object is not None and table.object not in names:
+            hint = did_you_mean(table.object, names)
+            raise script_problem(
+                "no such object", where, ("contacts", i, "object"), repr(table.object), ", ".join(names) or "[[objects]]", hint
+            )
+        item = next((item for item in script.objects if item.name == table.object), None)
+        if table.force_n is None and (item is None or item.kind != "weight"):
+            raise script_problem(
+                "a required key is missing", where, ("contacts", i, "force_n"), "nothing", "newton; a weight has its own"
+            )
 
 
 def _check_sweep(sweep: SweepTable, i: int, where: Path) -> None:

@@ -18,10 +18,8 @@ from femsense.rig.camera import (
     Shape,
     camera_of,
     cloud_of,
-    depth_std,
     look_at,
     measured_points,
-    pixel_rays,
     pose_of,
     render,
     thinned,
@@ -29,7 +27,9 @@ from femsense.rig.camera import (
     write_images,
     write_ply,
 )
-from femsense.rig.script import NoiseTable, ViewTable
+from femsense.rig.camera_tables import NoiseTable, ViewTable
+from femsense.rig.depth_noise import depth_std
+from femsense.rig.lens import pixel_rays
 
 CAMERA = Camera("", 160, 120, 150.0, 140.0, 79.5, 59.5, np.zeros(5), 1e-4)
 POSE = make_pose(rotation_from_vector([0.3, -0.2, 0.5]), [0.1, -0.2, 0.3])

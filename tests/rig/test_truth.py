@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from dataclasses import replace
+from itertools import islice
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -17,6 +19,7 @@ from rig_scripts import SCRIPT
 from femsense.core.arrays import freeze
 from femsense.core.errors import DataError, InputError
 from femsense.fem.mesh import element_volumes
+from femsense.io.checkpoint import Checkpoint
 from femsense.io.files import folder_hash
 from femsense.io.recording_folder import load_recording
 from femsense.io.robot_toml import load_robot
@@ -26,12 +29,15 @@ from femsense.model.quasi_static_path import solve_path
 from femsense.model.recording import make_recording
 from femsense.model.recording_parts import Drives, Timeline
 from femsense.model.robot import Robot
-from femsense.rig import truth
+from femsense.rig.patches import contact_patch
 from femsense.rig.plan import Plan, plan_script
+from femsense.rig.presses import TrueContact
+from femsense.rig.recorded import recording_of
 from femsense.rig.scene import probe_shape
 from femsense.rig.script import TruthTable, check_script
-from femsense.rig.simulate import recording_of, run_experiment, simulate
-from femsense.rig.truth import TrueContact, contact_patch, creep_matrix, true_path, true_robot
+from femsense.rig.simulate import run_experiment, simulate
+from femsense.rig.true_path import TruePath, creep_ahead, true_course, true_path
+from femsense.rig.truth import creep_matrix, true_robot
 
 LOAD = {"sweep": "b", "point_m": [0.1, 0.015, 0.015], "force_n": [0.0, 0.0, -0.05]}
 BARE = changed(SCRIPT, {"contacts": [], "loads": [*SCRIPT["loads"], LOAD]})
@@ -97,22 +103,13 @@ def let_out() -> tuple[Robot, Plan, np.ndarray]:
 
 
 def test_bends_remember_the_tensions_at_which_a_held_cable_came_to_rest() -> None:
-    rubbing, plan, inputs = let_out()
-    walker = truth.TruePath(rubbing, plan)
-    for k, load in enumerate(walker.frame_loads(inputs)):
-        walker.go(load, k)
+    rubbing, plan, _ = let_out()
+    walker = TruePath(rubbing, plan, Path())
+    for k in range(len(plan.time_s)):
+        walker.frame(k, 1)
         pulled = list(walker.state.tension.values())
         np.testing.assert_allclose([grip.inner[0] for grip in walker.grips], pulled, atol=1e-9)
         assert max(pulled) > 0.5
-
-
-def test_tensions_that_creep_as_a_geometric_series_are_summed() -> None:
-    end, first, ratio = np.array([2.0, 3.0]), np.array([0.3, 0.0]), 0.95
-    passes = [end * np.exp(-first * ratio**k) for k in range(3)]
-    assert truth.creep_ahead(passes[:2], 1.0) is None
-    np.testing.assert_allclose(truth.creep_ahead(passes, 1.0), end, rtol=1e-9)
-    np.testing.assert_allclose(truth.creep_ahead(passes, 0.05), passes[-1] * np.exp([0.05, 0.0]))  # no farther than it may
-    assert truth.creep_ahead([end, end, end], 1.0) is None
 
 
 def test_held_cables_that_rub_converge_when_they_are_let_out() -> None:
@@ -235,10 +232,39 @@ def test_a_contact_patch_is_small_and_on_one_side(robot: Robot) -> None:
     np.testing.assert_allclose(patch.spread(np.array([1.0, 2.0, 3.0]), len(mesh.nodes)).sum(axis=0), [1.0, 2.0, 3.0])
 
 
-def test_a_load_that_no_body_carries_is_refused(robot: Robot) -> None:
-    crushed = changed(BARE, {"sweeps__0__cables": {"top": 4000.0}, "sweeps__0__up": 1})
-    with pytest.raises(DataError, match="frame"):
+def test_a_load_that_no_body_carries_costs_its_frames_and_not_the_recording(robot: Robot, tmp_path: Path) -> None:
+    crushed = changed(BARE, {"sweeps__0__cables": {"top": 4000.0}, "sweeps__0__levels": [0.0, 1.0, 0.0005], "sweeps__0__up": 1})
+    with pytest.warns(UserWarning, match="1 of 6 frames do not settle and are left out: 1; the first: .* overload"):
+        folder = simulate(robot, crushed, tmp_path / "out")
+    recording = load_recording(folder)
+    assert recording.frame_numbers.tolist() == [0, 2, 3, 4, 5]
+    np.testing.assert_allclose(recording.inputs[:2, 0], [0.25, 2.25])
+    assert sorted(set(recording.load_frame.tolist())) == [0, 1, 2, 3, 4]
+    known = json.loads((folder / "truth" / "truth.json").read_text())
+    assert [(entry["frame"], "overload" in entry["why"]) for entry in known["skipped"]] == [(1, True)]
+    calm = run_experiment(robot, check_script(changed(crushed, {"sweeps__0__levels": [0.0, 0.0005, 0.0005]})))
+    np.testing.assert_allclose(recording.marker_xyz[recording.marker_frame == 1].shape, (3, 3))
+    settled = run_experiment(robot, check_script(changed(crushed, {"sweeps__0__levels": [0.0, 0.00025, 0.0005]})))
+    np.testing.assert_allclose(settled.marker_positions[2], calm.marker_positions[2], atol=1e-7)
+
+
+def test_where_no_frame_settles_there_is_no_recording(robot: Robot) -> None:
+    crushed = changed(BARE, {"initial": {"top": 4000.0}, "sweeps": [{"label": "a", "levels": [0.0]}], "loads": []})
+    with pytest.raises(DataError, match=r"none of 1 frames settles; frame 0: .*overload"):
         run_experiment(robot, check_script(crushed))
+
+
+def test_a_path_that_was_stopped_goes_on_with_the_same_result(robot: Robot, tmp_path: Path) -> None:
+    """To the last bit, with friction that remembers and a contact."""
+    script, keep = changed(SEEN, {"seed": 4}), (tmp_path / "kept", {"script": "4"})
+    whole = simulate(robot, script, tmp_path / "whole")
+    real = true_robot(robot, check_script(script).truth, script["effects"])
+    course = next(islice(true_course(real, plan_script(check_script(script), robot), substeps=1), 7, None))
+    Checkpoint(keep).keep(course)
+    done: list[int] = []
+    again = simulate(robot, script, tmp_path / "again", progress=lambda k, _: done.append(k), keep=keep)
+    assert done == [9] and not keep[0].exists()
+    assert folder_hash(whole) == folder_hash(again)
 
 
 # The recording
@@ -286,7 +312,7 @@ def test_absolute_inputs_hold_the_initial_ones_and_the_pose_may_be_declared(robo
     experiment = run_experiment(robot, check_script(changed(SCRIPT, {"camera__declare_pose": True})))
     recording = recording_of(experiment)
     np.testing.assert_allclose(recording.inputs[:3, 0], [0.25, 1.25, 2.25])
-    np.testing.assert_allclose(recording.T_robot_camera[0], experiment.T_robot_camera, atol=1e-15)
+    np.testing.assert_allclose(recording.T_robot_camera[0], experiment.views[0].T_robot_camera, atol=1e-15)
 
 
 def test_marker_noise_has_its_parts(robot: Robot) -> None:
@@ -296,7 +322,7 @@ def test_marker_noise_has_its_parts(robot: Robot) -> None:
     experiment = run_experiment(robot, check_script(many))
     recording = recording_of(experiment)
     measured = recording.marker_xyz.reshape(400, 3, 3)
-    T = experiment.T_robot_camera
+    T = experiment.views[0].T_robot_camera
     error = measured @ T[:3, :3].T + T[:3, 3] - experiment.marker_positions
     common = error.mean(axis=1, keepdims=True)
     assert (error - common).std() == pytest.approx(1e-4 * np.sqrt(2 / 3), rel=0.05)

@@ -178,5 +178,6 @@ def simulate(
     if plan:
         return Answer(*script_identifiability(robot, script, noise=1e-3 * noise))
     output = required(context, output, "'-o' / '--output'", "option")
-    simulate_into(output, robot, script)
+    with progress_bar("simulate") as progress:
+        simulate_into(output, robot, script, progress=progress)
     return Answer({"recording": str(output)}, f"recording: {output}\nlook at it: femsense inspect {output}")

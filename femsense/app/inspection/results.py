@@ -28,7 +28,7 @@ def inspect_script(file: Path, report: Report, problems: list[str]) -> None:
     report["frames"] = sum(len(s.profile()) for s in script.sweeps)
     report["effects"] = [str(entry.get("name", "")) for entry in script.effects]
     report["contacts"], report["loads"] = len(script.contacts), len(script.loads)
-    report["camera"] = f"{script.camera.width} × {script.camera.height}"
+    report["camera"] = ", ".join(f"{name} {view.width} × {view.height}".strip() for name, view in script.views.items())
     report["clouds"] = script.clouds.kind
 
 

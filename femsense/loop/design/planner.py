@@ -140,7 +140,7 @@ def identifiability_of_script(
 
     Arguments:
         robot: the declared robot; effects, mesh and law of the script's truth count for nothing.
-        script: its sweeps, loads, markers and camera are used.
+        script: its sweeps, loads, markers and first camera are used.
         where: what messages name.
         noise: standard deviation of each coordinate of each marker [m].
 
@@ -225,7 +225,7 @@ def trial_of(robot: Robot, script: ScriptTable, plan: Plan, *, lead: bool = Fals
         script, plan: the script and its frames.
         lead: whether the robot rests before the first frame, unrecorded (friction and creep start from there).
     """
-    head = 1 if lead else 0
+    head, first_view = 1 if lead else 0, next(iter(script.views.values()))
     recorded = plan.commanded + (plan.initial if script.actuation_zero == "absolute" else 0.0)
     at_rest = recorded[:1] - plan.commanded[:1]
     dt = script.sweeps[0].dt_s or script.dt_s
@@ -253,12 +253,12 @@ def trial_of(robot: Robot, script: ScriptTable, plan: Plan, *, lead: bool = Fals
             np.tile([0.0, 0.0, 1.0], (count * len(frames), 1)),
         ),
         loads=LoadRows(plan.load_frame + head, plan.load_points, plan.load_forces),
-        views=Views(cameras=[camera_of(script.camera)]),
+        views=Views(cameras=[camera_of(first_view)]),
     )
     scene = make_scene(robot, recording, frames)
     free = np.full(len(robot.body.cables), np.inf)
     initial = plan.initial if script.actuation_zero == "unknown" and len(plan.initial) else None
-    return Trial(scene, groups_of(scene), (pose_of(script.camera),), initial, -free, free, {})
+    return Trial(scene, groups_of(scene), (pose_of(first_view),), initial, -free, free, {})
 
 
 def _given_block(robot: Robot, recording: Recording, forms: list[Form], noise: float) -> Block:

@@ -16,7 +16,7 @@ from femsense.model.recording_parts import Drives, Timeline
 from femsense.model.robot import Observation, Robot, plain_actuation
 from femsense.rig.plan import plan_script
 from femsense.rig.script import check_script
-from femsense.rig.truth import true_path
+from femsense.rig.true_path import true_path
 
 MARKERS = np.array([[0.1, 0.015, 0.03], [0.05, 0.0, 0.015]])
 PRESSURES = np.array([[0.0], [3e3], [6e3]])

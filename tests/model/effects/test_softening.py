@@ -20,7 +20,7 @@ from femsense.model.robot import Robot
 from femsense.model.softening import softened_share, with_softening
 from femsense.rig.plan import plan_script
 from femsense.rig.script import check_script
-from femsense.rig.truth import true_path
+from femsense.rig.true_path import true_path
 
 ENTRY: Entry = {"name": "softening", "share": 0.4, "energy_j_m3": 20.0}
 LEVELS = [0.0, 1.0, 2.0, 1.0, 0.0, 1.0, 2.0, 3.0]

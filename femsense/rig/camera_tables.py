@@ -1,0 +1,122 @@
+"""The cameras of a script: lens, place, and what their depths are off by."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, model_validator
+
+from femsense.io.robot_tables import Matrix, Share, Vector
+from femsense.io.tables import Schema
+
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+LIKE: dict[str, dict[str, Any]] = {
+    "D415": {
+        "subpixel_px": 0.08,
+        "baseline_m": 0.055,
+        "disparity_step_px": 1 / 32,
+        "bleeding_px": 2.0,
+        "shadows": True,
+        "dark_signal": 0.03,
+        "shiny_deg": 6.0,
+    }
+}
+"""Keys that stand for a camera; what a script says itself goes before them."""
+STEREO = {
+    *("like", "subpixel_px", "baseline_m", "focal_px", "correlated_share", "correlation_px", "grazing_deg", "flying_share"),
+    *("disparity_step_px", "bleeding_px", "shadows", "dark_signal", "shiny_deg"),
+}
+FLIGHT = {"amplitude_std_m", "multipath", "mixing_px", "least_signal"}
+BOTH = {"edge_dropout", "quantum_m"}
+
+
+class NoiseTable(Schema):
+    """What depths are off by: active stereo, time of flight, or nothing."""
+
+    kind: Literal["stereo", "time-of-flight", "perfect"] = Field("stereo", description='"stereo", "time-of-flight" or "perfect"')
+    like: Literal["D415"] | None = Field(None, description='stereo: "D415" sets what stands below as that camera has it')
+    subpixel_px: NotNegative = Field(0.08, description="stereo: error of the disparity [px], ≥ 0")
+    baseline_m: Positive = Field(0.055, description="stereo: distance of the two imagers [m], > 0")
+    focal_px: Positive | None = Field(None, description="stereo: focal length of the imagers [px]; by default fx")
+    correlated_share: Share = Field(
+        0.5, description="stereo: share of the variance that neighbouring pixels have in common, 0 … 1"
+    )
+    correlation_px: Positive = Field(2.0, description="stereo: width of that common part [px], > 0")
+    disparity_step_px: NotNegative = Field(0.0, description="stereo: disparities come in such steps [px]; 0: any")
+    bleeding_px: NotNegative = Field(0.0, description="stereo: what is near grows over what is behind it by up to this [px]")
+    shadows: bool = Field(False, description="stereo: true: no depth where one of the two imagers does not see")
+    dark_signal: NotNegative = Field(
+        0.0, description="stereo: half of the surfaces that send back so little (albedo × cosine) give no depth; 0: all give"
+    )
+    shiny_deg: NotNegative = Field(
+        0.0, description="stereo: surfaces that gleam give no depth within this angle of facing the camera [°]"
+    )
+    grazing_deg: Annotated[float, Field(gt=0, le=90)] = Field(
+        82.0, description="stereo: surfaces seen more obliquely than this give no depth [°]"
+    )
+    edge_dropout: Share = Field(0.5, description="share of the pixels at depth edges that give no depth, 0 … 1")
+    flying_share: Share = Field(
+        0.05, description="stereo: share of the pixels at depth edges that fall between front and back, 0 … 1"
+    )
+    amplitude_std_m: NotNegative = Field(
+        0.0005, description="time of flight: noise at 1 m, facing, albedo 1 [m]; it grows as one over the amplitude"
+    )
+    multipath: NotNegative = Field(1.0, description="time of flight: light of one more bounce; 1: as much as there is, 0: none")
+    mixing_px: NotNegative = Field(0.7, description="time of flight: width of what a pixel mixes [px]")
+    least_signal: NotNegative = Field(
+        0.05, description="time of flight: less light than this (1: facing, albedo 1, 1 m) gives no depth"
+    )
+    quantum_m: NotNegative = Field(0.0, description="step of the depth values [m]; 0: the camera's depth_unit_m")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _as_that_camera(cls, given: Any) -> Any:
+        like = given.get("like") if isinstance(given, dict) else None
+        return {**LIKE[like], **given} if isinstance(like, str) and like in LIKE else given
+
+    @model_validator(mode="after")
+    def _keys_of_its_kind(self) -> NoiseTable:
+        known = {"kind"} | {"perfect": set(), "stereo": BOTH | STEREO, "time-of-flight": BOTH | FLIGHT}[self.kind]
+        strange = sorted(self.model_fields_set - known)
+        if strange:
+            raise ValueError(f'{", ".join(strange)}: of another kind of camera than kind = "{self.kind}"')
+        return self
+
+
+class ViewTable(Schema):
+    """A camera and where it stands."""
+
+    width: Annotated[int, Field(gt=0)] = Field(424, description="pixels, > 0")
+    height: Annotated[int, Field(gt=0)] = Field(240, description="pixels, > 0")
+    fx: Positive = Field(306.0, description="focal length in pixels, > 0")
+    fy: Positive | None = Field(None, description="focal length in pixels, > 0; by default fx")
+    cx: float | None = Field(None, description="pixels; by default the middle")
+    cy: float | None = Field(None, description="pixels; by default the middle")
+    distortion: Annotated[list[float], Field(min_length=4, max_length=8)] = Field(
+        [0.0, 0.0, 0.0, 0.0, 0.0], description="five numbers in OpenCV's order: k1, k2, p1, p2, k3 (or 4, or 8 with k4, k5, k6)"
+    )
+    distortion_model: Literal["brown_conrady", "inverse_brown_conrady", "kannala_brandt"] = Field(
+        "brown_conrady", description='"brown_conrady", "inverse_brown_conrady" or "kannala_brandt"'
+    )
+    depth_unit_m: Positive = Field(1e-4, description="metres in one unit of a depth image, > 0")
+    T_robot_camera: Matrix | None = Field(None, description="4 rows of 4 numbers, in place of eye_m and target_m")
+    eye_m: Vector | None = Field(None, description="where the camera stands, robot frame [m]")
+    target_m: Vector | None = Field(None, description="what it looks at, robot frame [m]")
+    roll_deg: float = Field(0.0, description="turn about the line of sight [°]")
+    declare_pose: bool = Field(False, description="true: the recording says where the camera stands")
+    declare_noise: bool = Field(False, description="true: the recording says how large the noise of a depth is")
+    noise: NoiseTable | None = Field(None, description="a table [camera.noise]; without it depth is exact")
+
+    @model_validator(mode="after")
+    def _one_pose(self) -> ViewTable:
+        looks = self.eye_m is not None and self.target_m is not None
+        if looks == (self.T_robot_camera is not None):
+            raise ValueError("a camera stands either by eye_m and target_m or by T_robot_camera")
+        return self
+
+    @model_validator(mode="after")
+    def _distortion_fits(self) -> ViewTable:
+        if len(self.distortion) in (6, 7) or (self.distortion_model == "kannala_brandt" and any(self.distortion[4:])):
+            raise ValueError(f"{len(self.distortion)} numbers of distortion do not fit {self.distortion_model}")
+        return self
