@@ -112,6 +112,15 @@ def test_bends_remember_the_tensions_at_which_a_held_cable_came_to_rest() -> Non
         assert max(pulled) > 0.5
 
 
+def test_tensions_that_creep_as_a_geometric_series_are_summed() -> None:
+    end, first, ratio = np.array([2.0, 3.0]), np.array([0.3, 0.0]), 0.95
+    passes = [end * np.exp(-first * ratio**k) for k in range(3)]
+    assert creep_ahead(passes[:2], 1.0) is None
+    np.testing.assert_allclose(creep_ahead(passes, 1.0), end, rtol=1e-9)
+    np.testing.assert_allclose(creep_ahead(passes, 0.05), passes[-1] * np.exp([0.05, 0.0]))  # no farther than it may
+    assert creep_ahead([end, end, end], 1.0) is None
+
+
 def test_held_cables_that_rub_converge_when_they_are_let_out() -> None:
     """Tensions at their motors then creep, pass by pass, as long as their bends hold."""
     rubbing, plan, inputs = let_out()
