@@ -26,10 +26,11 @@ from femsense.loop.design.next_steps import next_steps
 from femsense.loop.fit.discretisation_error import make_finer
 from femsense.loop.result.loop_result import UNEXPLAINED, LoopResult
 from femsense.loop.result.records import RefitRecord
-from femsense.loop.search.calibration import Ready, calibrated, with_discretisation_error
+from femsense.loop.search.calibration import calibrated, with_discretisation_error
 from femsense.loop.search.element_order import need_quadratic, seeks_with_quadratic, with_quadratic
 from femsense.loop.search.search import distinguishes_effects, search_begun, search_effects
 from femsense.loop.search.search_state import Progress, Search, SearchProgress
+from femsense.loop.search.some_states import in_all_states, some_states
 from femsense.loop.verdict.empirical import judged_correction
 from femsense.loop.verdict.verdict import conclude
 from femsense.model.effects import EFFECTS, FORMS, Effect, find_effect, forms_by_recording, load_own_effect, try_own_effect
@@ -93,13 +94,22 @@ def improve(
     rng = np.random.default_rng(how.seed)
     forms = (*FORMS, *forms_by_recording(FORMS, recordings), *own)
 
-    def ready(body: Robot, names: Sequence[str]) -> Ready:
-        say("reading and calibrating")
-        with beside(lambda: _get_ready(body, names)) as finer_is_made:
-            data = prepare(body, recordings, validation, how.measured)
-            data, before, start = calibrated(replace(data, forms=forms, declared=robot), say)
+    def begun(data: Data, names: Sequence[str], quadratic: bool, refits: list[RefitRecord]) -> SearchProgress:
+        with beside(lambda: _get_ready(data.robot, names)) as finer_is_made:
+            data, before, start = calibrated(data, say)
             finer_is_made()
-        return with_discretisation_error(data, start[-1][1], names, say), before, start
+        data = with_discretisation_error(data, start[-1][1], names, say)
+        return search_begun((data, before, start), names, refits, quadratic=quadratic)
+
+    def ready(body: Robot, names: Sequence[str], *, quadratic: bool, refits: list[RefitRecord]) -> SearchProgress:
+        say("reading and calibrating")
+        every = replace(prepare(body, recordings, validation, how.measured), forms=forms, declared=robot)
+        some = some_states(every)
+        with contextlib.suppress(FemsenseError):  # what has no equilibrium in all states is sought in all of them
+            if some is not None:
+                course = begun(some, names, quadratic, refits)
+                return in_all_states(every, course, search_effects(course, Checkpoint(None), say)[1], say)
+        return begun(every, names, quadratic, refits)
 
     with Checkpoint(how.keep, forms) as checkpoint:
         data, search = _searched(robot, names, ready, checkpoint, say)
@@ -119,7 +129,7 @@ def improve(
 
 
 def _searched(
-    robot: Robot, names: list[str], ready: Callable[[Robot, Sequence[str]], Ready], checkpoint: Checkpoint, say: Progress
+    robot: Robot, names: list[str], ready: Callable[..., SearchProgress], checkpoint: Checkpoint, say: Progress
 ) -> tuple[Data, Search]:
     """Return the data with what a search finds in them: on quadratic elements where the robot declares linear ones and the data miss those, else on what
     is declared. One that was killed goes on where it was."""
@@ -129,7 +139,7 @@ def _searched(
         say(f"going on where it stopped (effects found: {kept.found})")
     if seeks_with_quadratic(robot, names) and (kept is None or kept.quadratic):
         with contextlib.suppress(FemsenseError):  # linear elements lock, and converge where quadratic ones fold
-            course = kept or search_begun(ready(with_quadratic(robot), names), names, [], quadratic=True)
+            course = kept or ready(with_quadratic(robot), names, quadratic=True, refits=[])
             data, search = search_effects(course, checkpoint, say)
             say("asking whether quadratic elements are needed")
             needed, refits = need_quadratic(data, search, names)
@@ -137,7 +147,7 @@ def _searched(
                 return data, replace(search, refits=[*refits, *search.refits])
             names = [name for name in names if name != MESH.name]
         kept = None
-    return search_effects(kept or search_begun(ready(robot, names), names, refits, quadratic=False), checkpoint, say)
+    return search_effects(kept or ready(robot, names, quadratic=False, refits=refits), checkpoint, say)
 
 
 def _get_ready(robot: Robot, names: Sequence[str]) -> None:

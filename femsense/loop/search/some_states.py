@@ -1,0 +1,143 @@
+"""Recordings with many states that do not repeat: effects are sought in some of the states, and what is found must hold in all of them.
+
+The whole search takes states that differ as much as they can. The models that it went through are then fitted to all states, each effect has to pass
+the acceptance test there, and the search goes on in all states from the last model that does. Nothing is named, and nothing is reported, that was not
+fitted to all of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from femsense.core.errors import FemsenseError
+from femsense.loop.data.dataset import Data
+from femsense.loop.data.outliers import without_outliers
+from femsense.loop.data.representative_states import spread_states
+from femsense.loop.fit.discretisation_error import with_mesh_errors
+from femsense.loop.fit.fitted_model import FittedModel
+from femsense.loop.fit.marker_placement import with_turning_placements
+from femsense.loop.fit.noise_components import Noise
+from femsense.loop.result.records import NAMED, RefitRecord
+from femsense.loop.search.acceptance import acceptance_test
+from femsense.loop.search.calibration import START, calibrated_pose, fitted_again, with_discretisation_error
+from femsense.loop.search.screening import Candidate
+from femsense.loop.search.search_state import Progress, Search, SearchProgress, no_equilibrium
+from femsense.model.drive import has_history
+
+MOST_WORK = 30_000
+"""Tetrahedra × states of a recording in which effects are sought …"""
+FEWEST = 16
+"""… but so many states at least."""
+SPARED = 0.5
+"""They are no more than this share of all, or effects are sought in all at once."""
+
+
+def some_states(data: Data, *, most_work: int = MOST_WORK) -> Data | None:
+    """Return the data with some states of each recording, fitted and held out, which differ as much as they can; None where that spares little, where a
+    state depends on those before, and where there are clouds, whose rows go by frames already.
+
+    Arguments:
+        data: the data.
+        most_work: so many tetrahedra × states of a recording are looked at, but FEWEST states at least.
+    """
+    if "clouds" in data.measured or has_history(data.robot):
+        return None
+    most = max(FEWEST, most_work // len(data.robot.body.mesh.tets))
+    train, held = ([spread_states(t, most) for t in trials] for trials in (data.train, data.held))
+    if float(np.mean([share for _, share in train])) > SPARED:
+        return None
+    return replace(
+        data,
+        train=[t.part(frames) for t, (frames, _) in zip(data.train, train)],
+        held=[t.part(frames) for t, (frames, _) in zip(data.held, held)],
+    )
+
+
+def in_all_states(every: Data, course: SearchProgress, search: Search, say: Progress) -> SearchProgress:
+    """Return how far the search in some states has come in all of them: its models fitted to all, with the effects that pass there.
+
+    Arguments:
+        every: the data with all states, none of which is solved yet.
+        course: the search in some states, at its end.
+        search: what it found.
+        say: told what is going on.
+
+    Raises:
+        DataError: the model without effects has no equilibrium in some state.
+    """
+    say(f"fitting to all states (effects found: {len(search.history) - course.given})")
+    noise, given = search.noise, course.given
+    fitted = [fitted_again(every, model, noise) for _, model in search.history[:given]]
+    data = every
+    while (fewer := _without_outliers(data, fitted[-1])) is not data:
+        data, fitted = fewer, [fitted_again(fewer, model, noise) for model in fitted]
+    before = calibrated_pose(data, data.robot_as_declared, START)
+    data = with_discretisation_error(data, fitted[-1], course.names, say)
+    base = fitted_again(data, fitted[-1], noise, known=fitted[-1].fit.jets)
+    history = [(name, model) for (name, _), model in zip(search.history, [*fitted[:-1], base])]
+    refits, over = list(search.refits), False
+    for name, model in search.history[given:]:
+        refits, over = _added(data, history, name, model, search, noise, refits, say)
+        if over:
+            break
+    last = history[-1][1]
+    if len(history) > given:
+        data = with_turning_placements(with_mesh_errors(data, last, course.names), last)
+    return SearchProgress(
+        data,
+        data,
+        before,
+        history,
+        given,
+        last,
+        base,
+        course.names,
+        course.quadratic,
+        refits,
+        noise=noise,
+        n_effective=search.n_effective,
+        first=search.first,
+        table=search.last,
+    )
+
+
+def _without_outliers(data: Data, fitted: FittedModel) -> Data:
+    return without_outliers(data, [jet.residual for jet in fitted.fit.jets], fitted.held_residuals)
+
+
+def _added(
+    data: Data,
+    history: list[tuple[str, FittedModel]],
+    name: str,
+    model: FittedModel,
+    search: Search,
+    noise: Noise,
+    refits: Sequence[RefitRecord],
+    say: Progress,
+) -> tuple[list[RefitRecord], bool]:
+    """Append an effect's model to the history, fitted to all states, if it passes there; return the records, and whether it does not."""
+    say(f"fitting {name} to all states")
+    at = next((i for i, r in reversed(list(enumerate(refits))) if r.name == name and r.is_named), None)
+    candidate = _candidate(search, name, model)
+    if at is None or candidate is None:  # what replaces another one has no record of its own: all states are asked for it anew
+        return list(refits), True
+    try:
+        made = fitted_again(data, model, noise)
+        record = acceptance_test(data, history[-1][1], candidate, made, refits[at], noise).record
+    except FemsenseError as error:
+        return [*refits[:at], replace(refits[at], verdict=no_equilibrium(error)), *refits[at + 1 :]], True
+    if record.passes:
+        history.append((name, made))
+    return [*refits[:at], replace(record, verdict=NAMED) if record.passes else record, *refits[at + 1 :]], not record.passes
+
+
+def _candidate(search: Search, name: str, model: FittedModel) -> Candidate | None:
+    """Return an effect of a model as the candidate that it was, with the parameters that it has by now; None where none is left of that name."""
+    known = next((c for c in (*search.first, *search.last) if c.effect.name == name), None)
+    if known is None:
+        return None
+    parameters = next((p for effect, _, p in model.fit.hypothesis.terms if effect.name == name), ())
+    return replace(known, parameters=parameters)
