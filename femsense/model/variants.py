@@ -22,7 +22,7 @@ from femsense.model.linear_answers import Answers, AtPoints, Upset, segment_forc
 from femsense.model.path_solver import PathSolver
 from femsense.model.robot import Robot
 
-FACTOR_MEMORY = 2e9
+FACTOR_MEMORY = 1e9
 """Factors of several frames are kept up to this total [bytes], and up to MEMORY_SHARE of the memory that is free."""
 MEMORY_SHARE = 0.25
 FEW_COLUMNS = 40
