@@ -15,7 +15,7 @@ from femsense.loop.search.search import search_begun, search_effects
 from femsense.loop.search.search_state import Search, SearchProgress
 from femsense.loop.search.some_states import FEWEST, in_all_states, some_states
 
-GAIN = ({"name": "cable_gain", "cable": "up", "gain": 0.8},)
+GAIN = ({"name": "cable_gain", "scale": {"up": 0.8}},)
 
 
 @cache
@@ -57,8 +57,8 @@ def test_what_is_found_in_some_states_is_fitted_and_judged_in_all() -> None:
     assert whole.found == 1 and len(whole.fitted.fit.jets[0].residual) == len(every.train[0].scene.frame)
     named = [next(r for r in refits if r.is_named) for refits in (search.refits, whole.refits)]
     assert named[1].dchi2 > 1.2 * named[0].dchi2
-    gain = whole.fitted.fit.hypothesis.entries(whole.fitted.fit.coordinates)[-1]["gain"]
-    assert gain == pytest.approx(0.8, abs=0.03)
+    gain = whole.fitted.fit.hypothesis.entries(whole.fitted.fit.coordinates)[-1]["scale"]
+    assert gain == pytest.approx({"up": 0.8}, abs=0.03)
 
 
 def test_what_does_not_pass_in_all_states_is_taken_back() -> None:
