@@ -45,6 +45,20 @@ def shifts_named(shifts: Sequence[str]) -> dict[str, float]:
     return found
 
 
+def free_named(ranges: Sequence[str]) -> list[tuple[float, float]]:
+    """Return the spans FROM:TO of `--free` [s]. Raises InputError."""
+    spans = []
+    for text in ranges:
+        try:
+            first, last = (float(part) for part in text.split(":"))
+        except ValueError:
+            first, last = 1.0, 0.0
+        if first > last:
+            raise InputError("not a span of time", where="--free", found=text, expected="FROM:TO, seconds after the first frame")
+        spans.append((first, last))
+    return spans
+
+
 def import_into(
     folder: str | Path,
     paths: Sequence[str | Path],
@@ -119,6 +133,8 @@ def _check_options(options: Options, inputs: str | None, zero: str | None) -> No
     ):
         if value is not None and value not in allowed:
             raise InputError(f"not a value of {name}", where=name, found=value, expected="|".join(allowed))
+    if options.every < 1:
+        raise InputError("not a count of frames", where="--every", found=options.every, expected="1, 2, …")
     if options.rate is not None and options.rate <= 0:
         raise InputError("not a rate", where="--rate", found=options.rate, expected="frames a second, > 0")
 

@@ -51,6 +51,13 @@ def import_(
         list[str] | None,
         typer.Option("--shift", metavar="CAMERA=S", help="Seconds to add to a camera's times.", show_default=False),
     ] = None,
+    every: Annotated[int, typer.Option("--every", metavar="N", min=1, help="Take one of so many frames.")] = 1,
+    free: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--free", metavar="FROM:TO", help="Seconds after the first frame; nothing touches the robot.", show_default=False
+        ),
+    ] = None,
     inputs: Annotated[
         str | None,
         typer.Option("--inputs", metavar="tension|displacement", help="What the cables' values are.", show_default=False),

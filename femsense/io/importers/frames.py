@@ -106,6 +106,8 @@ class Source:
     """Shape (4, 4), translation [m], where the source says it."""
     views: Mapping[str, Source] = field(default_factory=dict)
     """Camera → its own source, where several look; see `several.joined`."""
+    free: Sequence[tuple[float, float]] = ()
+    """See `Options.free`."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -129,6 +131,10 @@ class Options:
     """Coordinate frame of a bag's static transforms that is the robot's: poses of cameras are taken from them."""
     shifts: Mapping[str, float] = field(default_factory=dict)
     """Camera → seconds to add to its times, where clocks differ."""
+    every: int = 1
+    """Of so many frames one is taken."""
+    free: Sequence[tuple[float, float]] = ()
+    """From and to [s] after the first frame: nothing touches the robot meanwhile."""
 
 
 def unit_of(options: Options, declared: str | None, where: str | Path | None, extent: float) -> float:

@@ -6,6 +6,7 @@ import contextlib
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -81,6 +82,12 @@ def open_sources(paths: Sequence[str | Path], options: Options | None = None) ->
         InputError: as `open_source`; names that stand twice; clocks that do not overlap, also by time of recording.
     """
     said = options or Options()
+    source = _one_or_joined(paths, said)
+    count = None if source.count is None else -(-source.count // said.every)
+    return replace(source, frames=lambda: islice(source.frames(), 0, None, said.every), count=count, free=said.free)
+
+
+def _one_or_joined(paths: Sequence[str | Path], said: Options) -> Source:
     if len(paths) == 1:
         source = open_source(paths[0], said)
         return source if source.views or not said.shifts else joined({"": source}, source.path, said)

@@ -24,6 +24,8 @@ from femsense.pointcloud.cloud import PointCloud
 
 RECORD = "import.json"
 """What a recording was made from; lies in its folder."""
+EXACT = 1e-6
+"""Times are as exact as this [s]."""
 Progress = Callable[..., None]
 
 
@@ -190,8 +192,8 @@ def _finish(
     kind = _actuation(source, columns, actuation or (log.actuation if log is not None else None))
     zero_kind = zero or ("unknown" if kind == "displacement" and columns else "absolute")
     write_toml(part / "recording.toml", _document(source, kind, zero_kind, part))
-    rows = _frame_rows(journal, times[0], columns, {} if applied is None else applied.at(times))
-    write_csv(part / "frames.csv", ["frame", "time_s", *columns], rows)
+    rows = _frame_rows(journal, times[0], columns, {} if applied is None else applied.at(times), source.free)
+    write_csv(part / "frames.csv", ["frame", "time_s", *columns, *(["free"] if source.free else [])], rows)
     camera = ["camera"] if source.views else []
     _write_rows(part / "markers.csv", ["frame", *camera, "marker", *PLACE_COLUMNS], _marker_rows(journal))
     _write_rows(part / "loads.csv", ["frame", *PLACE_COLUMNS, *FORCE_COLUMNS], _load_rows(journal))
@@ -249,12 +251,16 @@ def _lens(source: Source, images: Path) -> dict[str, Any]:
     return {**table, "distortion": distortion, **model, "depth_unit_m": source.depth_unit_m}
 
 
-def _frame_rows(journal: Journal, start: float, columns: list[str], applied: Mapping[str, Any]) -> Iterator[Sequence[object]]:
+def _frame_rows(
+    journal: Journal, start: float, columns: list[str], applied: Mapping[str, Any], free: Sequence[tuple[float, float]]
+) -> Iterator[Sequence[object]]:
     held: dict[str, float] = {}
     for number, entry in enumerate(journal.entries()):
         held.update(entry.inputs)
         values = [applied[name][number] if name in applied else held.get(name, 0.0) for name in columns]
-        yield [number, entry.time - start, *values]
+        time = entry.time - start
+        told = [int(any(first - EXACT <= time <= last + EXACT for first, last in free))] if free else []
+        yield [number, time, *values, *told]
 
 
 def _marker_rows(journal: Journal) -> Iterator[Sequence[object]]:

@@ -152,3 +152,14 @@ def test_several_files_are_cameras_and_the_same_command_does_nothing(tmp_path: P
         import_into(tmp_path / "r", [paths[0], f"third={tmp_path / 'side'}"], Options(), say=said.append)
     with pytest.raises(InputError, match="stands twice"):
         import_into(tmp_path / "s", [f"a={tmp_path / 'side'}", f"a={tmp_path / 'front'}"], Options(), say=said.append)
+
+
+def test_one_of_so_many_frames_and_spans_that_are_free(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "take", "mcap") as bag:
+        for k in range(7):
+            bag.write("/markers", START_NS + k * 10**9, bag.marker_array({"tip": (0.1 * k, 0.0, 0.3)}, START_NS + k * 10**9))
+    import_into(tmp_path / "r", [tmp_path / "take"], Options(every=2, free=[(0.0, 0.5), (4.0, 6.0)]), say=print)
+    recording = load_recording(tmp_path / "r")
+    np.testing.assert_allclose(recording.time_s, [0, 2, 4, 6])
+    np.testing.assert_allclose(recording.marker_xyz[:, 0], [0, 0.2, 0.4, 0.6])
+    assert recording.free is not None and recording.free.tolist() == [True, False, True, True]
