@@ -94,6 +94,8 @@ def refine_poses(robot: Robot, recording: Recording, calibration: Calibration) -
             poses, gone = moved_poses(poses, full, pivot), gone + step
             if np.abs(step[3:]).max() < 1e-7 and np.abs(step[:3]).max() < 1e-6:
                 break
+        if np.linalg.matrix_rank(normal) < len(normal):  # no ray meets the body there, or none holds a direction
+            return calibration
         worth = _worth(normal, scores, prior, gone - np.linalg.solve(normal, right))
         if worth >= 0.9 * share:
             break

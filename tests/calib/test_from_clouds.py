@@ -65,6 +65,14 @@ def test_a_start_is_enough_without_markers(free):
     assert off(refine_poses(robot, free, unknown).poses[0]) < 4e-4
 
 
+def test_a_start_from_which_no_ray_meets_the_body_stays(free):
+    robot = arm()
+    near = calibrate(robot, free)
+    start = move_pose(T_ROBOT_CAMERA, [0, 0, 0, 0.0, 0.045, 0.0], pivot_a=[0.05, 0, 0])
+    lost = replace(near, poses=(start,), T_robot_camera=start, joint_covariance=1e-4 * np.eye(6))
+    np.testing.assert_array_equal(refine_poses(robot, free, lost).poses[0], start)
+
+
 def test_noise_that_is_not_declared_is_measured(free):
     robot = arm()
     calibration = calibrate(robot, free)
