@@ -16,13 +16,9 @@ from typing import Any
 
 import numpy as np
 
+from femsense import block_mesh, embed_points, load_robot, robot_names, solve_equilibrium, write_mesh
 from femsense.app.accuracy.assess import assess_accuracy
-from femsense.fem.blocks import block_mesh
-from femsense.fem.equilibrium import solve_equilibrium
-from femsense.fem.mesh import embed_points
 from femsense.io.files import write_toml
-from femsense.io.mesh_files import write_mesh
-from femsense.io.robot_toml import load_robot, robot_names
 from femsense.model.remeshing import body_on_mesh, finer_mesh
 
 

@@ -19,27 +19,32 @@ from typing import Any
 
 import numpy as np
 
-from femsense.calib.calibrate import calibrate
+from femsense import (
+    Effect,
+    LoopResult,
+    Recording,
+    Robot,
+    TetMesh,
+    apply_effects,
+    calibrate,
+    estimate,
+    improve,
+    load_recording,
+    load_robot,
+)
 from femsense.core.arrays import FloatArray
-from femsense.fem.mesh import TetMesh, to_quadratic
-from femsense.io.recording_folder import load_recording
-from femsense.io.robot_toml import load_robot
+from femsense.fem.mesh import to_quadratic
 from femsense.loop.data.dataset import Data, groups_of, prepare
 from femsense.loop.data.trial import Trial
 from femsense.loop.fit.covariance import coordinate_std
 from femsense.loop.fit.fitted_model import FittedModel, fit_model, poses_and_inputs
 from femsense.loop.fit.joint_fit import Prior
 from femsense.loop.fit.noise_components import Noise
-from femsense.loop.improve import improve
-from femsense.loop.result.loop_result import LoopResult
 from femsense.loop.result.tables import table_of
 from femsense.model.camera_frame import in_robot_frame
-from femsense.model.effects import FORMS, Effect, Entry, apply_effects
+from femsense.model.effects import FORMS, Entry
 from femsense.model.observation import Hypothesis
-from femsense.model.recording import Recording
 from femsense.model.remeshing import robot_on_mesh
-from femsense.model.robot import Robot
-from femsense.sensing.pipeline import estimate
 
 EDGE = [[0.1, 0.0, 0.015]]
 """The middle of the loaded edge at rest [m]."""

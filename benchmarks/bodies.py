@@ -14,8 +14,7 @@ from pathlib import Path
 import numpy as np
 from real.tentacle import make_robot
 
-from femsense.fem.equilibrium import solve_equilibrium
-from femsense.io.robot_toml import load_robot
+from femsense import load_robot, solve_equilibrium
 from femsense.model.tie_spacing import tie_spacing
 
 

@@ -23,24 +23,22 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-import femsense.fem.cholesky as factoring
 import numpy as np
 import scipy.sparse as sp
 from threadpoolctl import ThreadpoolController
 
+from femsense import BodyModel, Tracker, compliance, embed_points, load_robot, make_body, solve_equilibrium, tie_cable
 from femsense.fem.assembly import internal, reduced_values
-from femsense.fem.body import BodyModel, make_body, tie_cable
 from femsense.fem.cables import pull_rows
-from femsense.fem.compliance import compliance, direction_rows, tangent_at
-from femsense.fem.equilibrium import NewtonOptions, SolveOptions, solve_equilibrium
+from femsense.fem.compliance import direction_rows, tangent_at
+from femsense.fem.equilibrium import NewtonOptions, SolveOptions
 from femsense.fem.linalg.cholesky import cholesky
 from femsense.fem.linalg.factorization import factorize, pardiso_library
-from femsense.fem.linalg.ordering import _nested_dissection, elimination_work, minimum_degree
-from femsense.fem.mesh import embed_points, refined, surface_triangles, to_quadratic, vertex_normals
+from femsense.fem.linalg.ordering import elimination_work, minimum_degree, nested_dissection
+from femsense.fem.mesh import refined, surface_triangles, to_quadratic, vertex_normals
 from femsense.fem.realtime.power_series import Expansion
-from femsense.fem.realtime.tracker import Tracked, Tracker
+from femsense.fem.realtime.tracker import Tracked
 from femsense.fem.rotated_step import rotated_step
-from femsense.io.robot_toml import load_robot
 
 DATA = Path(__file__).resolve().parents[1].parent / "shared" / "data"
 
@@ -168,7 +166,7 @@ def orders(data: Path) -> None:
         pairs = body.mesh.tets[:, np.array(np.triu_indices(10, 1)).T].reshape(-1, 2)
         graph = sp.coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(free), len(free))).tocsr()
         graph = (graph + graph.T)[free][:, free]
-        work = [27e-9 * elimination_work(graph, order) for order in (minimum_degree(graph), *_nested_dissection(graph))]
+        work = [27e-9 * elimination_work(graph, order) for order in (minimum_degree(graph), *nested_dissection(graph))]
         x = np.array(body.mesh.nodes)
         blocks = internal(body, x).blocks
         assert blocks is not None

@@ -26,21 +26,18 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "support")]
 from arm import NAMES, T_ROBOT_CAMERA, arm, record  # noqa: E402
 from tentacle import FOLDER, Run, recording_of, runs, tentacle  # noqa: E402
 
-from femsense.calib.calibrate import calibrate  # noqa: E402
+from femsense import DataError, Drives, Recording, Robot, Timeline, calibrate  # noqa: E402
 from femsense.calib.cloud_pose_search import View, difference, find_cloud_pose  # noqa: E402
 from femsense.calib.inputs import first_inputs  # noqa: E402
 from femsense.calib.marker_assignment import name_markers  # noqa: E402
 from femsense.core.arrays import FloatArray, IntArray  # noqa: E402
-from femsense.core.errors import DataError  # noqa: E402
 from femsense.core.pose import invert_pose, make_pose, rotation_from_vector, transform_points  # noqa: E402
 from femsense.fem.mesh import surface_triangles  # noqa: E402
 from femsense.model.contact_patch import body_surface  # noqa: E402
 from femsense.model.drive import DrivenRobot, drive_of  # noqa: E402
 from femsense.model.frame_state import solve_frame  # noqa: E402
 from femsense.model.observation import Hypothesis, evaluate_scene, make_scene  # noqa: E402
-from femsense.model.recording import Recording, with_marker_table  # noqa: E402
-from femsense.model.recording_parts import Drives, Timeline  # noqa: E402
-from femsense.model.robot import Robot  # noqa: E402
+from femsense.model.recording import with_marker_table  # noqa: E402
 from femsense.pointcloud.rays import Surface  # noqa: E402
 from femsense.pointcloud.segmentation import color_mask  # noqa: E402
 from femsense.rig.camera import Shape, camera_of, cloud_of, look_at, render  # noqa: E402

@@ -20,14 +20,9 @@ from typing import Any
 
 import numpy as np
 
+from femsense import ImproveOptions, Recording, Robot, improve, load_recording, load_robot, simulate
 from femsense.core.pose import move_pose
-from femsense.io.recording_folder import load_recording
-from femsense.io.robot_toml import load_robot
-from femsense.loop.improve import ImproveOptions, improve
 from femsense.loop.result.records import Value
-from femsense.model.recording import Recording
-from femsense.model.robot import Robot
-from femsense.rig.simulate import simulate
 
 CASES: dict[str, dict[str, list[dict[str, Any]]]] = {
     "four-leg": {

@@ -28,13 +28,11 @@ from typing import Any
 import numpy as np
 from loop_cases import ARM, EARTH, Case, Made, make_data, on_other_clamp
 
+from femsense import Robot, load_robot, save_recording, save_robot
 from femsense.app.cli import run
 from femsense.fem.mesh import to_linear
 from femsense.io.files import write_toml
-from femsense.io.recording_folder import save_recording
-from femsense.io.robot_toml import load_robot, save_robot
 from femsense.model.remeshing import robot_on_mesh
-from femsense.model.robot import Robot
 
 SMALL_ARM = replace(ARM, name="small-arm", coarse=(7, 2, 2), fine=(10, 3, 3))
 HIDDEN: tuple[tuple[str, dict[str, Any]], ...] = (

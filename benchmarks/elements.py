@@ -19,15 +19,13 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.linalg import LinearOperator, cg
 
+from femsense import BodyModel, TetMesh, load_robot, make_body, solve_equilibrium
 from femsense.core.arrays import FloatArray
 from femsense.fem.assembly import internal, reduced_matrix, reduced_values
-from femsense.fem.body import BodyModel, make_body
-from femsense.fem.equilibrium import solve_equilibrium
 from femsense.fem.linalg.cholesky import cholesky
 from femsense.fem.linalg.factorization import factorize
-from femsense.fem.mesh import EDGES, TetMesh, oriented, refined, shape_values, surface_triangles, to_quadratic
+from femsense.fem.mesh import EDGES, oriented, refined, shape_values, surface_triangles, to_quadratic
 from femsense.fem.stencil import QUADRATURE
-from femsense.io.robot_toml import load_robot
 from femsense.rig.script import TruthTable
 from femsense.rig.truth import true_robot
 

@@ -20,11 +20,10 @@ import numpy as np
 from loop import COUNTS, SEEDS
 from loop_cases import Case, make_cases, make_data
 
-from femsense.core.errors import FemsenseError
+from femsense import FemsenseError, improve
 from femsense.loop.data.dataset import Data
 from femsense.loop.fit.fitted_model import FittedModel
 from femsense.loop.fit.noise_components import Noise
-from femsense.loop.improve import improve
 from femsense.loop.search.effect_fields import Fields, fields_of
 from femsense.loop.search.forward_selection import PREDICTED_MUCH, REFITTABLE
 from femsense.loop.search.refit import EVIDENCE

@@ -31,13 +31,11 @@ from typing import Any
 import numpy as np
 from loop_cases import EARTH, Case, Design, _around, _measure
 
+from femsense import apply_effects, load_robot, save_recording, save_robot
 from femsense.core.arrays import FloatArray, freeze
 from femsense.fem.assembly import internal, reduced_values
 from femsense.fem.linalg import factorization
 from femsense.io.files import write_text
-from femsense.io.recording_folder import save_recording
-from femsense.io.robot_toml import load_robot, save_robot
-from femsense.model.effects import apply_effects
 from femsense.rig.plan import Plan
 from femsense.rig.true_path import true_path
 

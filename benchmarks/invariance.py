@@ -30,12 +30,9 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "support")]
 from arm import arm, record, sweeps  # noqa: E402 (the tests hold the arm and the ways to tell)
 from changed import in_unit, log_permuted, renumbered, reordered, sweeps_shuffled, turned_world  # noqa: E402
 
-from femsense.core.errors import FemsenseError  # noqa: E402
+from femsense import FemsenseError, Recording, Robot, improve  # noqa: E402
 from femsense.core.pose import make_pose, rotation_from_vector, transform_points  # noqa: E402
-from femsense.loop.improve import improve  # noqa: E402
 from femsense.loop.result.tables import table_of  # noqa: E402
-from femsense.model.recording import Recording  # noqa: E402
-from femsense.model.robot import Robot  # noqa: E402
 
 WORLD = make_pose(rotation_from_vector([0.7, -1.9, 0.4]), [0.3, -0.2, 0.5])
 HIDDEN: dict[str, list[dict[str, Any]]] = {

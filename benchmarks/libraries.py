@@ -24,16 +24,14 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from threadpoolctl import threadpool_limits
 
+from femsense import BodyModel, block_mesh, embed_points, load_robot, make_body
 from femsense.core.arrays import FloatArray
 from femsense.fem.assembly import internal, reduced_matrix
-from femsense.fem.blocks import block_mesh
-from femsense.fem.body import BodyModel, make_body
 from femsense.fem.compliance import direction_rows
 from femsense.fem.linalg.cholesky import cholesky
 from femsense.fem.linalg.factorization import pardiso_library
-from femsense.fem.mesh import embed_points, surface_triangles, to_quadratic
+from femsense.fem.mesh import surface_triangles, to_quadratic
 from femsense.io.clouds.cloud_files import read_cloud
-from femsense.io.robot_toml import load_robot
 from femsense.pointcloud.grid import build_grid, connected_labels, count_neighbors, count_within
 
 DATA = Path(__file__).resolve().parents[1].parent / "shared" / "data"

@@ -26,18 +26,14 @@ from typing import Any
 import numpy as np
 from loop_cases import Case, Made, make_cases, make_data
 
+from femsense import Equilibrium, FemsenseError, Robot, apply_effects, find_effect, improve
 from femsense.core.arrays import FloatArray
-from femsense.core.errors import FemsenseError
-from femsense.fem.equilibrium import Equilibrium
 from femsense.loop.data.trial import Groups
 from femsense.loop.fit.marker_placement import placement_turns
 from femsense.loop.fit.noise_components import Noise, whiten
-from femsense.loop.improve import improve
 from femsense.loop.result.tables import table_of
 from femsense.model.drive import DrivenRobot, drive_of
-from femsense.model.effects import apply_effects, find_effect
 from femsense.model.quasi_static_path import solve_path
-from femsense.model.robot import Robot
 
 SEEDS = {"tune": 1, "report": 20300}
 COUNTS = {"null": 60, "single": 104, "two": 20, "outside": 21, "poor": 10}

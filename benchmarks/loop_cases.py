@@ -13,15 +13,27 @@ from typing import Any
 
 import numpy as np
 
+from femsense import (
+    About,
+    Drives,
+    Equilibrium,
+    LoadRows,
+    MarkerRows,
+    Recording,
+    RestMarkers,
+    Robot,
+    TetMesh,
+    Timeline,
+    apply_effects,
+    embed_points,
+    make_body,
+    make_recording,
+    tie_cable,
+)
 from femsense.core.arrays import FloatArray, freeze
 from femsense.core.pose import invert_pose, make_pose, rotation_from_vector, transform_points
-from femsense.fem.body import make_body, tie_cable
-from femsense.fem.equilibrium import Equilibrium
-from femsense.fem.mesh import TetMesh, embed_points, to_quadratic
-from femsense.model.effects import apply_effects
-from femsense.model.recording import Recording, make_recording
-from femsense.model.recording_parts import About, Drives, LoadRows, MarkerRows, RestMarkers, Timeline
-from femsense.model.robot import Observation, Robot, plain_actuation, spread_features
+from femsense.fem.mesh import to_quadratic
+from femsense.model.robot import Observation, plain_actuation, spread_features
 from femsense.rig.plan import Plan, PlannedContact
 from femsense.rig.script import ContactTable
 from femsense.rig.true_path import true_path

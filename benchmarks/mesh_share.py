@@ -18,15 +18,14 @@ import numpy as np
 from loop import COUNTS, SEEDS
 from loop_cases import Case, make_cases, make_data
 
+from femsense import Robot, apply_effects
 from femsense.core.arrays import FloatArray
 from femsense.loop.data.dataset import Data, prepare
 from femsense.loop.fit.discretisation_error import mesh_errors, with_mesh_errors
 from femsense.loop.fit.fitted_model import fit_model, with_nuisance
 from femsense.loop.fit.joint_fit import JointFit, JointProblem, Prior
 from femsense.loop.fit.noise_components import Noise
-from femsense.model.effects import apply_effects
 from femsense.model.observation import Hypothesis, evaluate_scene
-from femsense.model.robot import Robot
 
 
 def rms_mm(field: FloatArray) -> float:

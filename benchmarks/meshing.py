@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from femsense.core.errors import InputError
+from femsense import InputError
 from femsense.io.meshing.filling import MeshOptions, fill
 from femsense.io.meshing.quality import quality_report
 

@@ -21,16 +21,11 @@ from typing import Any
 
 from loop_cases import ARM, EARTH
 
-from femsense.core.errors import FemsenseError
-from femsense.io.recording_folder import load_recording
-from femsense.io.robot_toml import load_robot
+from femsense import FemsenseError, Robot, improve, load_recording, load_robot, simulate
 from femsense.loop.design.advice import proposal_text
 from femsense.loop.design.candidate_experiments import script_of
 from femsense.loop.design.identifiability import EVIDENCE
 from femsense.loop.design.planner import Proposal, plan_experiment
-from femsense.loop.improve import improve
-from femsense.model.robot import Robot
-from femsense.rig.simulate import simulate
 
 TINY_ARM = replace(ARM, name="tiny-arm", coarse=(5, 2, 2))
 NOISE_M, FRAMES = 2e-4, 45

@@ -17,9 +17,7 @@ from pathlib import Path
 import numpy as np
 
 import femsense as fs
-from femsense.core.errors import FemsenseError
-from femsense.fem.mesh import embed_points
-from femsense.model.effects import apply_effects
+from femsense import FemsenseError, apply_effects, embed_points
 from femsense.model.remeshing import finer_mesh, robot_on_mesh
 
 SEED = 20411

@@ -23,14 +23,9 @@ from typing import Any
 import numpy as np
 from real import arm, tentacle, trunk
 
-from femsense.calib.calibrate import calibrate
-from femsense.core.errors import FemsenseError
+from femsense import FemsenseError, calibrate, estimate, load_recording, load_robot, solve_equilibrium
 from femsense.core.pose import transform_points
-from femsense.fem.equilibrium import solve_equilibrium
-from femsense.io.recording_folder import load_recording
-from femsense.io.robot_toml import load_robot
 from femsense.model.effects import EFFECT_NAMES
-from femsense.sensing.pipeline import estimate
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 HEADING = (

@@ -15,11 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from femsense.calib.calibrate import calibrate
-from femsense.io.recording_folder import load_recording
-from femsense.io.robot_toml import load_robot
-from femsense.sensing.pipeline import estimate
-from femsense.sensing.types import Run, SensingOptions
+from femsense import Run, SensingOptions, calibrate, estimate, load_recording, load_robot
 
 NEAR = 0.09
 """A contact farther from the truth than this is another one [m]."""

@@ -16,11 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from femsense.io.recording_folder import load_recording
-from femsense.io.robot_toml import load_robot
-from femsense.loop.improve import improve
-from femsense.loop.result.loop_result import LoopResult
-from femsense.rig.simulate import simulate
+from femsense import LoopResult, improve, load_recording, load_robot, simulate
 
 TESTS = Path(__file__).parents[1] / "tests"
 Entries = list[dict[str, Any]]

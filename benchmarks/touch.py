@@ -17,16 +17,8 @@ from typing import Any
 
 import numpy as np
 
+from femsense import Recording, Robot, SensingOptions, apply_effects, calibrate, estimate, load_recording, load_robot, simulate
 from femsense.app.demo.truth import read_truth, true_effects
-from femsense.calib.calibrate import calibrate
-from femsense.io.recording_folder import load_recording
-from femsense.io.robot_toml import load_robot
-from femsense.model.effects import apply_effects
-from femsense.model.recording import Recording
-from femsense.model.robot import Robot
-from femsense.rig.simulate import simulate
-from femsense.sensing.pipeline import estimate
-from femsense.sensing.types import SensingOptions
 
 PLACES = {
     "leg, from above": [0.0, -0.042964, 0.09057],

@@ -20,10 +20,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import femsense as fs
+from femsense import Armature, embed_points
 from femsense.core.arrays import FloatArray
-from femsense.fem.mesh import embed_points
 from femsense.rig.sensors import SensorTable, sensor_readings
-from femsense.xr.armature import Armature
 from femsense.xr.proprioception.domain import learn_domain
 from femsense.xr.proprioception.drift import adapt, drift
 from femsense.xr.proprioception.labelled import Labelled, joined

@@ -8,7 +8,6 @@ from __future__ import annotations
 import numpy as np
 
 import femsense as fs
-from femsense.xr.proprioception.drift import adapt, drift
 
 rng = np.random.default_rng(1)
 
@@ -37,8 +36,8 @@ strange = live.step([1.4, 0.95], time_s=0.03)
 
 # %% Another day: the base was moved; ten labelled frames put it right
 today = record(20.0, base_m=(0.005, 0.0, -0.002))
-found = drift(model, today)
-mended = adapt(model, today.select(np.arange(0, len(today), len(today) // 10)))
+found = fs.drift(model, today)
+mended = fs.adapt(model, today.select(np.arange(0, len(today), len(today) // 10)))
 
 if __name__ == "__main__":
     print(model)

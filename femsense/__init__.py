@@ -55,9 +55,10 @@ if TYPE_CHECKING:
     from femsense.sensing.pipeline import estimate
     from femsense.sensing.run_files import read_run, run_inputs, write_run
     from femsense.sensing.types import ContactForce, Run, SensingOptions
-    from femsense.xr.armature import Armature, ArmatureOptions, make_armature
+    from femsense.xr.armature import Armature, ArmatureOptions, local_poses, make_armature
     from femsense.xr.export import export_glb
     from femsense.xr.notebook import show_run
+    from femsense.xr.proprioception.drift import adapt, drift
     from femsense.xr.proprioception.labelled import labelled
     from femsense.xr.proprioception.learn import LearnOptions, learn
     from femsense.xr.proprioception.model import ProprioceptiveModel
@@ -103,11 +104,13 @@ __all__ = [
     "Views",
     "WallContact",
     "__version__",
+    "adapt",
     "apply_effects",
     "block_mesh",
     "calibrate",
     "compare",
     "compliance",
+    "drift",
     "embed_points",
     "estimate",
     "export_glb",
@@ -118,6 +121,7 @@ __all__ = [
     "load_model",
     "load_recording",
     "load_robot",
+    "local_poses",
     "make_armature",
     "make_body",
     "make_recording",
@@ -199,7 +203,7 @@ _HOMES = {
         "ImproveOptions",
         "improve",
     ),
-    "loop.result": ("LoopResult",),
+    "loop.result.loop_result": ("LoopResult",),
     "model.effects": (
         "EFFECTS",
         "Effect",
@@ -240,9 +244,10 @@ _HOMES = {
         "Run",
         "SensingOptions",
     ),
-    "xr.armature": ("Armature", "ArmatureOptions", "make_armature"),
+    "xr.armature": ("Armature", "ArmatureOptions", "local_poses", "make_armature"),
     "xr.export": ("export_glb",),
     "xr.notebook": ("show_run",),
+    "xr.proprioception.drift": ("adapt", "drift"),
     "xr.proprioception.labelled": ("labelled",),
     "xr.proprioception.learn": ("LearnOptions", "learn"),
     "xr.proprioception.model": ("ProprioceptiveModel",),

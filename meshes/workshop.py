@@ -14,15 +14,11 @@ from typing import Any
 
 import numpy as np
 
+from femsense import Robot, TetMesh, load_robot, solve_equilibrium, write_mesh
 from femsense.core.arrays import FloatArray
 from femsense.core.pose import invert_pose, transform_points
-from femsense.fem.equilibrium import solve_equilibrium
-from femsense.fem.mesh import TetMesh
 from femsense.fem.mesh_checks import check_mesh
 from femsense.io.files import write_toml
-from femsense.io.mesh_files import write_mesh
-from femsense.io.robot_toml import load_robot
-from femsense.model.robot import Robot
 from femsense.rig.camera import camera_of, look_at, render, visible_points
 from femsense.rig.scene import body_shape
 from femsense.rig.script import SceneTable, ViewTable

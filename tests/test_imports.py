@@ -184,6 +184,52 @@ def test_help_and_the_bare_import_load_nothing_heavy(code: str) -> None:
     assert not modules_after(code) & ({"numpy", "scipy", "numba", "rich"} | HEAVY)
 
 
+# What scripts import is there
+
+ROOT = PACKAGE.parent
+SCRIPTS = sorted(file for folder in ("benchmarks", "examples", "meshes", "scripts") for file in (ROOT / folder).rglob("*.py"))
+
+
+def file_of(module: str) -> Path | None:
+    """Return the file of a module of femsense; None where there is none."""
+    path = ROOT.joinpath(*module.split("."))
+    return next((file for file in (path.with_suffix(".py"), path / "__init__.py") if file.is_file()), None)
+
+
+def defined_names(file: Path) -> set[str]:
+    """Return the names that a module has, whichever branch or import gives them."""
+    names = set(femsense.__all__) if file == PACKAGE / "__init__.py" else set()
+    for node in ast.walk(parse(file)):
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            names.add(node.name)
+        elif isinstance(node, ast.Import | ast.ImportFrom):
+            names |= {(alias.asname or alias.name).split(".")[0] for alias in node.names}
+        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            names.add(node.id)
+    return names
+
+
+def missing_imports(tree: ast.AST) -> Iterator[str]:
+    """Yield what a tree imports of femsense that is not there."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (a.name for a in node.names if a.name.split(".")[0] == "femsense" and file_of(a.name) is None)
+        elif isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "femsense":
+            file = file_of(node.module)
+            known = defined_names(file) if file else set()
+            yield from (a.name for a in node.names if a.name not in known and file_of(f"{node.module}.{a.name}") is None)
+
+
+@pytest.mark.parametrize("file", SCRIPTS, ids=lambda file: file.relative_to(ROOT).as_posix())
+def test_scripts_import_what_is_there(file: Path) -> None:
+    assert not list(missing_imports(parse(file)))
+
+
+def test_a_missing_import_is_seen() -> None:
+    gone = "import femsense.fem.cholesky\nfrom femsense.fem.mesh import TetMesh, nonsense\nfrom femsense import improve, core"
+    assert list(missing_imports(ast.parse(gone))) == ["femsense.fem.cholesky", "nonsense"]
+
+
 # How functions are called
 
 MOST_DEFAULTS = 6

@@ -10,11 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
+from femsense import Robot, solve_equilibrium
 from femsense.core.arrays import BoolArray, FloatArray, IntArray
-from femsense.fem.equilibrium import solve_equilibrium
 from femsense.io.files import write_csv, write_toml
 from femsense.io.meshing.robot_from_line import line_into
-from femsense.model.robot import Robot
 
 R_ROBOT_MOCAP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 """The world has y up; the robot hangs along −z."""

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from femsense.calib.calibration import Calibration
-from femsense.loop.result.loop_result import EFFECTS, NONE, UNEXPLAINED
+from femsense.loop.result.loop_result import NONE
+from femsense.report.words import VERDICTS
 
 if TYPE_CHECKING:
     from femsense.sensing.types import ContactForce, FrameReport, Run
@@ -21,11 +22,6 @@ MODEL_ERRS = 3.0
 """A residual of calibration so many times the noise is said to be an error of the model."""
 LISTED = 6
 """So many frames are listed one by one."""
-VERDICTS = {
-    EFFECTS: "the data name what the model lacks",
-    NONE: "the model explains the data to their noise",
-    UNEXPLAINED: "a residual is left that no effect explains",
-}
 
 
 def columns(rows: Iterable[Sequence[str]], *, indent: int = 2) -> str:

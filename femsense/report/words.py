@@ -6,7 +6,14 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from femsense.loop.result.loop_result import FOUND, NONE, UNEXPLAINED
+
 NOTHING = "–"
+VERDICTS = {
+    FOUND: "the data name what the model lacks",
+    NONE: "the model explains the data to their noise",
+    UNEXPLAINED: "a residual is left that no effect explains",
+}
 SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 UNITS = {"m": (1e3, "mm"), "Pa": (1e-3, "kPa"), "rad": (180.0 / math.pi, "°"), "1": (1.0, "")}
 """What is shown instead of the units of files: factor and name."""
@@ -138,3 +145,8 @@ def counted(count: int, noun: str) -> str:
 
 def _minus(text: str) -> str:
     return text.replace("-", "−")
+
+
+def sentence(text: str) -> str:
+    """Return words as a sentence of their own."""
+    return f"{text[0].upper()}{text[1:]}." if text else ""

@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
+from femsense import TetMesh, block_mesh
 from femsense.core.arrays import FloatArray
-from femsense.fem.blocks import block_mesh, rounded_square
-from femsense.fem.mesh import TetMesh
+from femsense.fem.blocks import rounded_square
 
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent))

@@ -19,12 +19,12 @@ from typing import Any
 import numpy as np
 import trimesh
 
+from femsense import InputError, TetMesh, write_mesh
 from femsense.core.arrays import FloatArray
-from femsense.core.errors import InputError
-from femsense.fem.mesh import TetMesh, to_quadratic
+from femsense.fem.mesh import to_quadratic
 from femsense.fem.mesh_checks import check_mesh
 from femsense.io.files import write_toml
-from femsense.io.mesh_files import radius_ratio, write_mesh
+from femsense.io.mesh_files import radius_ratio
 from femsense.io.meshing.tetrahedra import tetrahedralise
 
 HERE = Path(__file__).resolve().parent

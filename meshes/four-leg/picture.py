@@ -9,11 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
+from femsense import Robot, load_robot, solve_equilibrium
 from femsense.core.arrays import FloatArray
 from femsense.core.pose import invert_pose, transform_points
-from femsense.fem.equilibrium import solve_equilibrium
-from femsense.io.robot_toml import load_robot
-from femsense.model.robot import Robot
 from femsense.rig.camera import camera_of, look_at, render, visible_points
 from femsense.rig.scene import body_shape
 from femsense.rig.script import SceneTable, ViewTable

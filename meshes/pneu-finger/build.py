@@ -15,9 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from femsense import TetMesh, block_mesh
 from femsense.core.arrays import BoolArray, FloatArray
-from femsense.fem.blocks import block_mesh
-from femsense.fem.mesh import TetMesh
 
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent))

@@ -665,10 +665,18 @@ def test_the_same_folder_gives_the_same_page(tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a", "first.html", "second.html"]
 
 
-def test_a_loop_of_the_verdict_alone_shows_just_that(tmp_path: Path) -> None:
-    (tmp_path / "loop.json").write_text('{"format": "femsense-loop-1", "verdict": "none"}', encoding="utf-8")
+@pytest.mark.parametrize(
+    ("verdict", "sentence"),
+    [
+        ("effects", "The data name what the model lacks."),
+        ("none", "The model explains the data to their noise."),
+        ("unexplained", "A residual is left that no effect explains."),
+    ],
+)
+def test_a_loop_of_the_verdict_alone_shows_just_that(tmp_path: Path, verdict: str, sentence: str) -> None:
+    (tmp_path / "loop.json").write_text(json.dumps({"format": "femsense-loop-1", "verdict": verdict}), encoding="utf-8")
     page = report(tmp_path)
-    assert "The model explains the data to their noise." in page.text
+    assert sentence in page.text
     assert not page.all("img") and not page.all("table") and not page.all("h3")
 
 

@@ -27,7 +27,7 @@ from femsense.model.effects import Entry
 from femsense.model.robot import Robot
 
 FORMAT = "femsense-loop-1"
-EFFECTS, NONE, UNEXPLAINED = "effects", "none", "unexplained"
+FOUND, NONE, UNEXPLAINED = "effects", "none", "unexplained"
 """Verdicts: the model lacks effects; it explains the data to their noise; a residual is left that no effect explains."""
 
 
@@ -36,7 +36,7 @@ class LoopResult:
     """The verdict, the effects with their errors before and after, and what the data cannot say."""
 
     verdict: str
-    """EFFECTS, NONE or UNEXPLAINED."""
+    """FOUND, NONE or UNEXPLAINED."""
     sentence: str
     """The verdict in words."""
     noise_m: float

@@ -12,7 +12,7 @@ from femsense.loop.data.trial import rms_of
 from femsense.loop.fit.discretisation_error import mesh_errors
 from femsense.loop.fit.fitted_model import FittedModel
 from femsense.loop.fit.repeatability import Repeatability
-from femsense.loop.result.loop_result import EFFECTS, NONE, UNEXPLAINED
+from femsense.loop.result.loop_result import FOUND, NONE, UNEXPLAINED
 from femsense.loop.result.records import ModelError, NamedEffect, Value
 from femsense.loop.search.search_state import Search
 from femsense.loop.verdict.returned_model import NOT_WORSE, has_effects, held_beyond_mesh
@@ -49,7 +49,7 @@ def verdict_in_words(
         explains = "nothing that may be handed back" if found else "no effect of the list"
         return f"A residual is left that {explains} explains: {error}{where}, {of_it}." + _mesh_in_words(budget)
     what = ", ".join(f"{e.name} ({values_in_words(e.parameters)})" for e in effects)
-    tail = "" if verdict == EFFECTS else " A residual is left that no effect explains."
+    tail = "" if verdict == FOUND else " A residual is left that no effect explains."
     fell = f"held-out error{where} {1e3 * before.held_rms:.2f} mm before, {1e3 * after.held_rms:.2f} mm after"
     return f"The model lacks {what}; {fell}, {of_it}.{tail}" + _mesh_in_words(budget)
 

@@ -16,7 +16,7 @@ from femsense.loop.fit.discretisation_error import without_mesh_error
 from femsense.loop.fit.fitted_model import FittedModel
 from femsense.loop.fit.noise_components import Noise, whiten
 from femsense.loop.fit.repeatability import repeatability
-from femsense.loop.result.loop_result import EFFECTS, NONE, UNEXPLAINED, LoopResult
+from femsense.loop.result.loop_result import FOUND, NONE, UNEXPLAINED, LoopResult
 from femsense.loop.result.records import Left, Structure
 from femsense.loop.search.search_state import Search
 from femsense.loop.verdict.confounding import confounded, in_words
@@ -76,7 +76,7 @@ def conclude(data: Data, search: Search, rng: np.random.Generator) -> LoopResult
     structured = tests.significant and not excess.is_small
     open_to_doubt = (structured or surprise) and (drifted or excess.explained < EXPLAINED)
     unexplained = lacks or (found and not effects) or open_to_doubt or excess.is_large
-    verdict = UNEXPLAINED if unexplained else EFFECTS if effects else NONE
+    verdict = UNEXPLAINED if unexplained else FOUND if effects else NONE
     pairs = confounded(search, names)
     robot = _handed_back(data, entries)
     only_held = bool(surprise) and not structured and not lacks

@@ -6,8 +6,6 @@ from pathlib import Path
 
 from femsense.io.robot_toml import load_robot
 from femsense.loop.files import LOOP_FORMAT
-from femsense.loop.result.loop_result import NONE, UNEXPLAINED
-from femsense.model.effects import EFFECTS
 from femsense.report import words
 from femsense.report.documents import read_document
 from femsense.report.drawing import skin
@@ -26,11 +24,6 @@ from femsense.report.loop.smallest_effects import power_table
 from femsense.report.loop.what_is_left import tests_table, what_is_left
 from femsense.report.page import Chapter, Html, paragraph, section, tiles, together
 
-VERDICTS = {
-    EFFECTS: "The data name what the model lacks.",
-    NONE: "The model explains the data to their noise.",
-    UNEXPLAINED: "A residual is left that no effect explains.",
-}
 OLDER = (
     "This loop.json holds no figures of the residual, of calibration, of confounding and of forces: it was written by an earlier femsense. "
     "Run femsense improve again for the whole report."
@@ -83,7 +76,9 @@ def loop_chapter(file: Path, title: str) -> Chapter:
         section("9. Data", data_card(loop)),
         section("10. What it means for forces", forces_part(evidence.forces)),
     )
-    return Chapter(title, body, loop.sentence or VERDICTS.get(loop.verdict, ""), loop.inputs.robot.name or "")
+    return Chapter(
+        title, body, loop.sentence or words.sentence(words.VERDICTS.get(loop.verdict, "")), loop.inputs.robot.name or ""
+    )
 
 
 def _is_old(loop: Loop) -> bool:
