@@ -15,12 +15,8 @@ from femsense.model.robot import Robot
 
 MAX_REWEIGHTINGS = 10
 """Fits until the outliers are set aside; without any it takes two."""
-
-
 NOISE_FLOOR = 1e-7
 """No camera measures better than this [m]."""
-
-
 PLACEMENT_STD_FLOOR = 1e-4
 """Markers are not glued better than this [m]."""
 
@@ -34,79 +30,101 @@ def fit_joint(
     *,
     free_inputs: bool = True,
 ) -> tuple[FitResult, list[FloatArray], FloatArray | None, SceneJet]:
-    """Finish over poses and initial inputs together; the noise is estimated from the residual, twice.
+    """Finish over poses and initial inputs together; noise and outliers are weighed anew from the residual until they stay.
 
     Poses that the recording declares stay as they are.
     """
-    plain, empty = Hypothesis(robot), np.zeros(0)
-    pivot = robot.marker_points.mean(axis=0)
-    moving = [v for v, T in enumerate(scene.recording.T_robot_camera) if T is None]
-    a = len(initial) if initial is not None and free_inputs else 0
-    base_poses, sigma = list(poses), 5e-4
-    placement_std = PLACEMENT_STD_FLOOR
-    repeats = _repeats(scene)
-    weights = repeats
-    jet: SceneJet | None = None
-    starts: dict[int, Equilibrium] = {}
-
-    def place(theta: FloatArray) -> tuple[list[FloatArray], FloatArray | None]:
-        moved = list(base_poses)
-        for i, v in enumerate(moving):
-            moved[v] = move_pose(base_poses[v], theta[6 * i : 6 * i + 6], pivot_a=pivot)
-        return moved, theta[6 * len(moving) :] if a else initial
-
-    def evaluate(theta: FloatArray, derivative: bool) -> tuple[FloatArray, FloatArray | None]:
-        nonlocal jet
-        moved, inputs = place(theta)
-        known = None if a or jet is None else jet.states  # a pose does not move the body
-        jet = evaluate_scene(
-            plain,
-            scene,
-            empty,
-            moved,
-            inputs,
-            derivative=derivative,
-            vary_initial=bool(a),
-            pivot=pivot,
-            starts=starts,
-            known=known,
-        )
-        row = (weights / sigma)[:, None]
-        residual = np.concatenate([(row * jet.residual).ravel(), jet.rest.ravel() / placement_std])
-        if not derivative:
-            return residual, None
-        columns = [c for v in moving for c in range(6 * v, 6 * v + 6)]
-        J_pose = np.vstack(
-            [
-                (row[:, :, None] * jet.by_pose[:, :, columns]).reshape(jet.residual.size, len(columns)),
-                jet.rest_by_pose[:, :, columns].reshape(jet.rest.size, len(columns)) / placement_std,
-            ]
-        )
-        J_in = np.vstack([(row[:, :, None] * jet.by_initial).reshape(jet.residual.size, a), np.zeros((jet.rest.size, a))])
-        return residual, np.hstack([J_pose, J_in])
-
-    low, high = input_bounds(robot, scene.recording) if a else (np.zeros(0), np.zeros(0))
-    free = np.full(6 * len(moving), np.inf)
-    bounds = np.concatenate([-free, low]), np.concatenate([free, high])
-    theta = np.concatenate([np.zeros(6 * len(moving)), initial if a and initial is not None else np.zeros(0)])
-    huber = np.ones(len(scene.points))
+    problem = _Problem(robot, scene, poses, initial, free_inputs=free_inputs)
+    low, high = problem.bounds()
+    theta, huber = problem.start(), np.ones(len(scene.points))
     for again in range(MAX_REWEIGHTINGS):
-        fit = gauss_newton(evaluate, theta, low=bounds[0], high=bounds[1])
+        fit = gauss_newton(problem.evaluate, theta, low=low, high=high)
         theta = fit.theta
-        evaluate(theta, True)
-        assert jet is not None
+        jet = problem.jet_at(theta, derivative=True)
         history.append(root_mean_square(jet.residual))
         before, huber = huber, _huber_weights(jet.residual)
         if again and np.abs(huber - before).max() < 0.1:
             break
-        weights = repeats * huber
-        winsorised = jet.residual * (repeats * huber**2)[:, None]  # an outlier counts as the largest residual that is none
-        sigma = _spread(winsorised, float(3 * (repeats**2).sum()), len(theta))
-        placement_std = max(PLACEMENT_STD_FLOOR, float(np.sqrt((jet.rest**2).mean()))) if len(jet.rest) else placement_std
-    assert jet is not None
-    moved, inputs = place(theta)
-    fit = _with_bound_inputs(fit, theta, bounds)
-    return fit, moved, inputs, jet
+        problem.weigh(jet, huber, len(theta))
+    moved, inputs = problem.place(theta)
+    return _with_bound_inputs(fit, theta, (low, high)), moved, inputs, jet
+
+
+class _Problem:
+    """Whitened residuals of markers and rest placements over moves of the free poses and the initial inputs."""
+
+    def __init__(
+        self, robot: Robot, scene: Scene, poses: list[FloatArray], initial: FloatArray | None, *, free_inputs: bool
+    ) -> None:
+        self.plain, self.scene = Hypothesis(robot), scene
+        self.base_poses, self.initial = list(poses), initial
+        self.pivot = robot.marker_points.mean(axis=0)
+        self.moving = [v for v, T in enumerate(scene.recording.T_robot_camera) if T is None]
+        self.free_inputs = len(initial) if initial is not None and free_inputs else 0
+        self.repeats = _repeats(scene)
+        self.weights, self.std, self.placement_std = self.repeats, 5e-4, PLACEMENT_STD_FLOOR
+        self.starts: dict[int, Equilibrium] = {}
+        self.jet: SceneJet | None = None
+
+    def start(self) -> FloatArray:
+        inputs = self.initial if self.free_inputs and self.initial is not None else np.zeros(0)
+        return np.concatenate([np.zeros(6 * len(self.moving)), inputs])
+
+    def bounds(self) -> tuple[FloatArray, FloatArray]:
+        robot, recording = self.plain.robot, self.scene.recording
+        low, high = input_bounds(robot, recording) if self.free_inputs else (np.zeros(0), np.zeros(0))
+        free = np.full(6 * len(self.moving), np.inf)
+        return np.concatenate([-free, low]), np.concatenate([free, high])
+
+    def place(self, theta: FloatArray) -> tuple[list[FloatArray], FloatArray | None]:
+        """Return poses and initial inputs at a point."""
+        moved = list(self.base_poses)
+        for i, v in enumerate(self.moving):
+            moved[v] = move_pose(self.base_poses[v], theta[6 * i : 6 * i + 6], pivot_a=self.pivot)
+        return moved, theta[6 * len(self.moving) :] if self.free_inputs else self.initial
+
+    def jet_at(self, theta: FloatArray, *, derivative: bool) -> SceneJet:
+        moved, inputs = self.place(theta)
+        known = None if self.free_inputs or self.jet is None else self.jet.states  # a pose does not move the body
+        self.jet = evaluate_scene(
+            self.plain,
+            self.scene,
+            np.zeros(0),
+            moved,
+            inputs,
+            derivative=derivative,
+            vary_initial=bool(self.free_inputs),
+            pivot=self.pivot,
+            starts=self.starts,
+            known=known,
+        )
+        return self.jet
+
+    def evaluate(self, theta: FloatArray, derivative: bool) -> tuple[FloatArray, FloatArray | None]:
+        jet = self.jet_at(theta, derivative=derivative)
+        row = (self.weights / self.std)[:, None]
+        residual = np.concatenate([(row * jet.residual).ravel(), jet.rest.ravel() / self.placement_std])
+        return residual, self._jacobian(jet, row[:, :, None]) if derivative else None
+
+    def _jacobian(self, jet: SceneJet, row: FloatArray) -> FloatArray:
+        columns = [c for v in self.moving for c in range(6 * v, 6 * v + 6)]
+        by_pose = np.vstack(
+            [
+                (row * jet.by_pose[:, :, columns]).reshape(jet.residual.size, len(columns)),
+                jet.rest_by_pose[:, :, columns].reshape(jet.rest.size, len(columns)) / self.placement_std,
+            ]
+        )
+        a = self.free_inputs
+        by_inputs = np.vstack([(row * jet.by_initial).reshape(jet.residual.size, a), np.zeros((jet.rest.size, a))])
+        return np.hstack([by_pose, by_inputs])
+
+    def weigh(self, jet: SceneJet, huber: FloatArray, parameters: int) -> None:
+        """Take weights and noise from a residual; an outlier counts as the largest residual that is none."""
+        self.weights = self.repeats * huber
+        winsorised = jet.residual * (self.repeats * huber**2)[:, None]
+        self.std = _noise_std(winsorised, float(3 * (self.repeats**2).sum()), parameters)
+        if len(jet.rest):
+            self.placement_std = max(PLACEMENT_STD_FLOOR, float(np.sqrt((jet.rest**2).mean())))
 
 
 def _with_bound_inputs(fit: FitResult, theta: FloatArray, bounds: tuple[FloatArray, FloatArray]) -> FitResult:
@@ -142,7 +160,7 @@ def _huber_weights(residual: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(np.minimum(1.0, 3.5 * scale / np.maximum(distance, 1e-300))))
 
 
-def _spread(weighted: FloatArray, rows: float, parameters: int) -> float:
+def _noise_std(weighted: FloatArray, rows: float, parameters: int) -> float:
     freedom = max(rows - parameters, 1.0)
     return max(float(np.sqrt((weighted**2).sum() / freedom)), NOISE_FLOOR)
 

@@ -148,12 +148,6 @@ def clamp_energy_and_forces(body: BodyModel, ties: Ties, positions: FloatArray) 
     return energy, ties.stiffness * stretch
 
 
-def clamp_turn(body: BodyModel, positions: FloatArray) -> FloatArray:
-    """Return by how much the clamp has turned about its centre [rad], a rotation vector of shape (3,)."""
-    ties = ties_of(body)
-    return np.zeros(3) if ties is None else plate_at(body, ties, positions).turn
-
-
 class TurningFactor:
     """A factorised stiffness with the rank-three part of a turning plate: K⁻¹ of K = K₀ − P J⁻¹ Pᵀ."""
 

@@ -66,21 +66,6 @@ def linear_network(centre: FloatArray, scale: FloatArray, C: FloatArray, d: Floa
     return Network("linear", centre, scale, np.zeros((0, C.shape[1])), np.zeros(0), np.zeros((len(C), 0)), C, d)
 
 
-def mean_network(networks: list[Network]) -> Network:
-    """Return one network that answers the mean of several of one kind and normalisation."""
-    first, share = networks[0], 1.0 / len(networks)
-    return Network(
-        first.kind,
-        first.centre,
-        first.scale,
-        np.concatenate([net.B for net in networks]),
-        np.concatenate([net.b for net in networks]),
-        share * np.concatenate([net.A for net in networks], axis=1),
-        np.asarray(share * sum(net.C for net in networks)),
-        np.asarray(share * sum(net.d for net in networks)),
-    )
-
-
 def sigmoid(x: FloatArray) -> FloatArray:
     """Return 1 / (1 + exp(−x)) without overflow."""
     return np.asarray(0.5 * (1.0 + np.tanh(0.5 * x)))

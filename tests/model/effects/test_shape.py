@@ -15,7 +15,7 @@ from femsense.core.errors import InputError
 from femsense.core.pose import rotation_from_vector
 from femsense.fem.assembly import internal
 from femsense.fem.body import make_body
-from femsense.fem.clamp import clamp_turn, plate_at, ties_of
+from femsense.fem.clamp import plate_at, ties_of
 from femsense.fem.compliance import compliance, tangent_at
 from femsense.fem.equilibrium import solve_equilibrium
 from femsense.fem.mesh import to_quadratic
@@ -66,7 +66,7 @@ def test_a_turning_clamp_is_a_fixed_one_in_a_turned_world():
     pull = {"up": 1.0, "left": 0.6}
     body = applied(robot, "base_compliance", rotation_stiffness_nm_rad=TURN).body
     state = solve_equilibrium(body, tension=pull)
-    turn, center = clamp_turn(body, state.positions), body.clamp_center
+    turn, center = plate_at(body, ties_of(body), state.positions).turn, body.clamp_center
     assert 0.2 < np.linalg.norm(turn) < 1.5
     back = rotation_from_vector(-turn)
     cables = tuple(replace(c, pull_point=center + back @ (c.pull_point - center)) for c in robot.body.cables)
@@ -80,7 +80,7 @@ def test_the_plate_turns_by_the_moment_of_all_loads():
     body = applied(arm((5, 2, 2)), "base_compliance", rotation_stiffness_nm_rad=TURN).body
     state = solve_equilibrium(body)
     moment = np.cross(state.positions - body.clamp_center, body.dead_load()).sum(axis=0)
-    np.testing.assert_allclose(TURN * clamp_turn(body, state.positions), moment, atol=1e-8)
+    np.testing.assert_allclose(TURN * plate_at(body, ties_of(body), state.positions).turn, moment, atol=1e-8)
     held = state.positions[body.clamped] - body.clamp_center
     rigid = plate_at(body, ties_of(body), state.positions).arms
     assert np.abs(held - rigid).max() < 1e-3 * np.abs(rigid - (body.mesh.nodes[body.clamped] - body.clamp_center)).max()

@@ -13,7 +13,7 @@ from femsense.xr.proprioception.domain import learn_domain
 from femsense.xr.proprioception.memory import with_memory
 from femsense.xr.proprioception.model import ProprioceptiveModel, bone_numbers, bones_from_numbers
 from femsense.xr.proprioception.model_file import load_model, save_model
-from femsense.xr.proprioception.network import KINDS, Network, mean_network
+from femsense.xr.proprioception.network import KINDS, Network
 
 CHANNELS = ("red", "green", "blue")
 REST = np.outer(np.linspace(0, 0.1, 4), [0, 0, 1.0])
@@ -115,16 +115,6 @@ def test_bones_and_their_numbers() -> None:
     np.testing.assert_allclose(bones_from_numbers(numbers).T_robot_bone, poses.T_robot_bone, atol=1e-12)
     R = bones_from_numbers(numbers + 0.1 * np.random.default_rng(0).normal(size=numbers.shape)).T_robot_bone[:, :3, :3]
     np.testing.assert_allclose(R @ np.swapaxes(R, 1, 2), np.tile(np.eye(3), (8, 1, 1)), atol=1e-12)
-
-
-def test_the_mean_of_networks_is_one_network() -> None:
-    rng = np.random.default_rng(3)
-    one, two = (some_network("sigmoid", 4, 6, np.random.default_rng(3)), some_network("sigmoid", 4, 6, rng))
-    two = Network(
-        "sigmoid", one.centre, one.scale, *(0.5 * rng.normal(size=x.shape) for x in (one.B, one.b, one.A, one.C, one.d))
-    )
-    x = rng.normal(size=(5, 4))
-    np.testing.assert_allclose(mean_network([one, two])(x), (one(x) + two(x)) / 2, atol=1e-12)
 
 
 def test_what_is_no_model_is_refused(tmp_path: Path) -> None:
