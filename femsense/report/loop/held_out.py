@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from femsense.core.arrays import FloatArray
+from femsense.core.arrays import BoolArray, FloatArray
 from femsense.report import words
 from femsense.report.drawing import AFTER, BEFORE, LINE, MANY, PALE, SOFT, add_legend, as_image, clipped, name_axes, new_axes
 from femsense.report.loop.document import Residuals
@@ -18,6 +18,7 @@ from femsense.report.page import Html, panels
 
 
 def held_out_errors(residuals: Residuals, table: Frames, noise_m: float | None) -> Html | None:
+    """Return the errors on held-out data: their distribution, and those of sweeps or frames."""
     if not residuals.frame:
         return sweep_dots(table, noise_m)
     before, after = (np.linalg.norm(np.asarray(values, float), axis=1) for values in (residuals.before_m, residuals.after_m))
@@ -118,45 +119,47 @@ def sweep_dots(frames: Frames, noise_m: float | None) -> Html | None:
     names = list(dict.fromkeys(zip(labels, frames.held_out)))
     if len(names) < 2:
         return None
+    rows = [np.array([key == name for key in zip(labels, frames.held_out)]) for name in names]
     figure, axes = new_axes()
-    fell = 0
-    squares = {
-        k: np.array([np.nan if v is None else (1e3 * v) ** 2 for v in c])
-        for k, c in (("before", frames.before_rms_m), ("after", frames.after_rms_m))
-    }
-    for i, name in enumerate(names):
-        rows = np.array([key == name for key in zip(labels, frames.held_out)])
-        if name[1]:
+    for i, (_, held_out) in enumerate(names):
+        if held_out:
             axes.axvspan(i - 0.5, i + 0.5, color=LINE, alpha=0.45, linewidth=0)
-        ends = {}
-        for kind, color, side in (("before", BEFORE, -0.13), ("after", AFTER, 0.13)):
-            values = squares[kind][rows]
-            ends[kind] = float(np.sqrt(np.nanmean(values))) if np.isfinite(values).any() else math.nan
-            axes.plot(
-                np.full(rows.sum(), i + side), np.sqrt(values), "o", color=color, alpha=0.5, markersize=3.2, markeredgewidth=0
-            )
-            axes.plot(
-                [i + side], [ends[kind]], "o", color=color, markersize=6.0, markeredgewidth=0, label=kind if i == 0 else None
-            )
-        fell += name[1] and ends["after"] < ends["before"]
+    before = _draw_sweeps(axes, frames.before_rms_m, rows, "before", BEFORE, -0.13)
+    after = _draw_sweeps(axes, frames.after_rms_m, rows, "after", AFTER, 0.13)
     if words.known(noise_m):
         axes.axhline(1e3 * float(noise_m or 0.0), color=SOFT, linewidth=1.2, linestyle=DASH, label="noise")
-    step = max(1, math.ceil(len(names) / 9))
-    texts = [clipped(label, 10) for label, _ in names]
-    axes.set_xticks(
-        range(0, len(names), step),
-        texts[::step],
-        rotation=30 if max(map(len, texts)) > 4 else 0,
-        ha="right" if max(map(len, texts)) > 4 else "center",
-    )
-    axes.set_xlim(-0.6, len(names) - 0.4)
-    axes.set_ylim(bottom=0.0)
-    axes.grid(False, axis="x")
+    _name_sweeps(axes, [label for label, _ in names])
     name_axes(axes, "sweep", "rms error [mm]")
     add_legend(axes)
-    held = sum(h for _, h in names)
+    held = sum(held_out for _, held_out in names)
+    fell = sum(held_out and a < b for (_, held_out), b, a in zip(names, before, after))
     return as_image(
         figure,
         alt=f"Error of each sweep before and after; it fell in {fell} of {held} held-out sweeps.",
         caption=f"Large dots: a sweep; small ones: its frames; held-out sweeps stand on grey. The error fell in {fell} of {words.counted(held, 'held-out sweep')}.",
     )
+
+
+def _draw_sweeps(
+    axes: Any, rms_m: Sequence[float | None], rows: Sequence[BoolArray], label: str, color: str, side: float
+) -> list[float]:
+    """Draw the frames of each sweep and their root mean square; return the latter [mm]."""
+    squares = np.array([np.nan if v is None else (1e3 * v) ** 2 for v in rms_m])
+    sizes = []
+    for i, members in enumerate(rows):
+        values = squares[members]
+        sizes.append(float(np.sqrt(np.nanmean(values))) if np.isfinite(values).any() else math.nan)
+        at, name = i + side, label if i == 0 else None
+        axes.plot(np.full(len(values), at), np.sqrt(values), "o", color=color, alpha=0.5, markersize=3.2, markeredgewidth=0)
+        axes.plot([at], [sizes[-1]], "o", color=color, markersize=6.0, markeredgewidth=0, label=name)
+    return sizes
+
+
+def _name_sweeps(axes: Any, labels: Sequence[str]) -> None:
+    step = max(1, math.ceil(len(labels) / 9))
+    texts = [clipped(label, 10) for label in labels]
+    long = max(map(len, texts)) > 4
+    axes.set_xticks(range(0, len(labels), step), texts[::step], rotation=30 if long else 0, ha="right" if long else "center")
+    axes.set_xlim(-0.6, len(labels) - 0.4)
+    axes.set_ylim(bottom=0.0)
+    axes.grid(False, axis="x")

@@ -91,6 +91,7 @@ def _with_unit(name: str) -> str:
 
 
 def sweep_labels(frames: Frames) -> list[str]:
+    """Return the name of the sweep of each frame, with its recording where there are several."""
     several = len(set(frames.recording)) > 1
     return [f"R{r + 1} {s}" if several else s for r, s in zip(frames.recording, frames.sweep)]
 

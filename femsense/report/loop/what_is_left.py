@@ -74,6 +74,7 @@ MARKERS = 30
 
 
 def what_is_left(loop: Loop, evidence: Evidence, surface: DrawnSurface | None) -> Html | None:
+    """Return how large the residual is after the effects, where, when, and what it goes with."""
     left = loop.left
     rows = [
         [c.covariate, words.number(c.rank_correlation, 2), words.number(c.p_value, 2), words.number(c.p_holm, 2)]

@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from femsense.core.arrays import FloatArray
+from femsense.core.arrays import FloatArray, IntArray
 from femsense.report import words
 from femsense.report.compare import load_error
 from femsense.report.drawing import (
     MANY,
     SERIES,
+    DrawnSurface,
     Key,
     add_legend,
     as_image,
@@ -35,14 +36,18 @@ ROWS = 150
 """So many contacts are listed one by one."""
 SHOWN = len(SERIES)
 ARROW_SHARE = 0.3
+"""The longest arrow, in sizes of the body."""
+ARROW: dict[str, Any] = {"arrowstyle": "-|>,head_length=0.55,head_width=0.28", "linewidth": 2.2, "shrinkA": 0, "shrinkB": 0}
 
 
 def force_text(size: float, std: float) -> str:
+    """Return a force with its deviation, in N or mN."""
     factor, unit = words.force_unit(abs(size))
     return words.joined(words.with_std(factor * float(size), factor * float(std)), unit)
 
 
 def force_panels(contacts: ContactTable | None, frames: FrameTable | None, folder: Path) -> Html | None:
+    """Return the forces over time, and on the body in the frame of the strongest."""
     if contacts is None or not np.isfinite(contacts.size_n).any():
         return None
     numbers = _largest_series(contacts)
@@ -110,19 +115,31 @@ def _draw_run(axes: Any, time: FloatArray, size: FloatArray, std: FloatArray, co
 
 def _force_on_body(contacts: ContactTable, frames: FrameTable | None, folder: Path, number: int) -> Html | None:
     """Draw the body in the frame of the strongest force, with the forces on it."""
-    file = folder / "states.npz"
-    if not file.is_file() or frames is None:
+    surface = None if frames is None else _surface_at(folder / "states.npz", frames, number)
+    whole = np.isfinite(contacts.force_n).all(axis=1) & np.isfinite(contacts.place_m).all(axis=1)
+    rows = np.flatnonzero((contacts.frame == number) & whole)
+    if surface is None or not len(rows) or not contacts.size_n[rows].max() > 0:
+        return None
+    text = "; ".join(f"contact {contacts.contact[i]} {force_text(contacts.size_n[i], contacts.std_n[i])}" for i in rows)
+    return as_image(
+        _draw_forces(surface, contacts, rows),
+        alt=f"The deformed body in frame {number} with the forces on it: {text}.",
+        caption=f"Frame {number}, with the strongest force: {text}.",
+    )
+
+
+def _surface_at(file: Path, frames: FrameTable, number: int) -> DrawnSurface | None:
+    """Return the surface of the body in a frame; None where its state is not known."""
+    index = np.flatnonzero(frames.frame == number)
+    if not file.is_file() or not len(index):
         return None
     states = read_states(file)
-    index = np.flatnonzero(frames.frame == number)
-    if not len(index) or index[0] >= len(states.nodes_m) or not np.isfinite(states.nodes_m[index[0]]).all():
+    if index[0] >= len(states.nodes_m) or not np.isfinite(states.nodes_m[index[0]]).all():
         return None
-    surface = skin(np.asarray(states.nodes_m[index[0]], dtype=np.float64), states.tets)
-    rows = np.flatnonzero(
-        (contacts.frame == number) & np.isfinite(contacts.force_n).all(axis=1) & np.isfinite(contacts.place_m).all(axis=1)
-    )
-    if not len(rows) or not contacts.size_n[rows].max() > 0:
-        return None
+    return skin(np.asarray(states.nodes_m[index[0]], dtype=np.float64), states.tets)
+
+
+def _draw_forces(surface: DrawnSurface, contacts: ContactTable, rows: IntArray) -> Any:
     view = best_view(surface.nodes, contacts.force_n[rows])
     largest = float(contacts.size_n[rows].max())
     scale = ARROW_SHARE * float(np.linalg.norm(np.ptp(surface.nodes, axis=0))) / max(largest, 1e-12)
@@ -133,32 +150,16 @@ def _force_on_body(contacts: ContactTable, frames: FrameTable | None, folder: Pa
     figure, axes = new_axes(height=body_height(low, high))
     draw_body(axes, surface, view)
     for i, tail, tip in zip(rows, 1e3 * view.flat(tails), 1e3 * view.flat(tips)):
-        color = SERIES[int(contacts.contact[i]) % len(SERIES)]
-        axes.annotate(
-            "",
-            xy=tuple(tip),
-            xytext=tuple(tail),
-            arrowprops={
-                "arrowstyle": "-|>,head_length=0.55,head_width=0.28",
-                "color": color,
-                "linewidth": 2.2,
-                "shrinkA": 0,
-                "shrinkB": 0,
-            },
-            zorder=6,
-        )
+        arrow = ARROW | {"color": SERIES[int(contacts.contact[i]) % len(SERIES)]}
+        axes.annotate("", xy=tuple(tip), xytext=tuple(tail), arrowprops=arrow, zorder=6)
     factor, unit = words.force_unit(largest)
     bar = nice(largest)
     frame_body(axes, view, low, high, key=Key(1e3 * scale * bar, f"{factor * bar:g} {unit}", SERIES[0], None))
-    text = "; ".join(f"contact {contacts.contact[i]} {force_text(contacts.size_n[i], contacts.std_n[i])}" for i in rows)
-    return as_image(
-        figure,
-        alt=f"The deformed body in frame {number} with the forces on it: {text}.",
-        caption=f"Frame {number}, with the strongest force: {text}.",
-    )
+    return figure
 
 
 def known_loads_table(loads: Sequence[KnownLoad]) -> Html | None:
+    """Return declared loads beside what was sensed there."""
     rows = [
         [str(load.frame), words.number(load.declared_n), words.number(load.sensed_n), _signed(load.error_percent)]
         for load in loads[:ROWS]
@@ -179,6 +180,7 @@ def _signed(value: float | None) -> str:
 
 
 def contacts_table(contacts: ContactTable | None) -> Html | None:
+    """Return the contacts one by one."""
     if contacts is None or not len(contacts):
         return None
     factor, unit = words.force_unit(float(np.nanmax(contacts.size_n, initial=0.0)))

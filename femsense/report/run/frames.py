@@ -44,6 +44,7 @@ def status_table(frames: FrameTable | None) -> Html | None:
 
 
 def frame_panels(frames: FrameTable | None) -> Html | None:
+    """Return residual, time, tensions and pressures over the frames."""
     if frames is None or not frames.good.any():
         return None
     return panels(_residual_panel(frames), _time_panel(frames), _tension_panel(frames), _pressure_panel(frames))

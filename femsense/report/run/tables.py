@@ -56,6 +56,7 @@ class FrameTable:
 
 
 def read_contacts(file: Path) -> ContactTable:
+    """Return contacts.csv. Raises InputError."""
     table_ = read_csv(file, required=CONTACT_COLUMNS, optional=MORE_CONTACT_COLUMNS)
     values = table_.numbers(("time_s", *CONTACT_COLUMNS[3:14]), empty_is_nan=True)
     return ContactTable(
@@ -71,6 +72,7 @@ def read_contacts(file: Path) -> ContactTable:
 
 
 def read_frames(file: Path) -> FrameTable:
+    """Return frames.csv. Raises InputError."""
     table_ = read_csv(file, required=FRAME_COLUMNS, prefixes=("tension_", "pressure_"))
     cables = [c for c in table_.columns if c.startswith("tension_")]
     chambers = [c for c in table_.columns if c.startswith("pressure_")]
@@ -101,9 +103,11 @@ def strongest_contact(contacts: ContactTable | None, frames: FrameTable | None) 
 
 
 def median_of(values: FloatArray) -> float:
+    """Return the median of what is finite; nan where nothing is."""
     known = values[np.isfinite(values)]
     return float(np.median(known)) if len(known) else float("nan")
 
 
 def first_of(count: int, shown: int, file: str) -> str:
+    """Return a note on what a table leaves out; empty where it shows all."""
     return f" The first {shown} of {count}; all of them are in {file}." if count > shown else ""
