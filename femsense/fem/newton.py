@@ -204,6 +204,7 @@ def definite_factor(pattern: Pattern, values: FloatArray, state: State) -> Facto
 
 
 def stiffness_blocks(body: BodyModel, here: Internal, state: State) -> FloatArray:
+    """Return the blocks of the tangent stiffness of body, cables and chambers at a state [N/m], as `internal` has them."""
     blocks = internal(body, state.x).blocks if here.blocks is None else here.blocks.copy()
     assert blocks is not None
     a = len(body.cables)

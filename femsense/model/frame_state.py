@@ -50,6 +50,7 @@ def solve_frame(
 
 
 def require_converged(state: Equilibrium, frame: int) -> Equilibrium:
+    """Return a state that converged. Raises DataError where it did not, with the frame and what is left unbalanced."""
     if not state.converged:
         raise DataError(f"no equilibrium in frame {frame}: {state.status}: {state.advice} (unbalanced {state.residual_n:.2g} N)")
     return state

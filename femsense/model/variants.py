@@ -261,6 +261,7 @@ def is_linear(driven: DrivenRobot, variant: DrivenRobot) -> bool:
 
 
 def same_mechanics(driven: DrivenRobot, variant: DrivenRobot) -> bool:
+    """Return whether a variant has the same body under the same loads: it differs in what is observed alone."""
     a, b = driven.drive, variant.drive
     return (
         variant.robot.body is driven.robot.body

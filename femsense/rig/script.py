@@ -222,4 +222,5 @@ def _check_sweep(sweep: SweepTable, i: int, where: Path) -> None:
 def script_problem(
     what: str, where: Path, location: Sequence[int | str], found: object, expected: str, hint: str | None = None
 ) -> InputError:
+    """Return the error of one key of a script."""
     return InputError(what, where=f"{where}: {key_path(location)}", found=found, expected=expected, hint=hint)

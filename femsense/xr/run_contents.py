@@ -164,6 +164,7 @@ def _nearest(times: FloatArray, time: float) -> int:
 
 
 def run_folder(folder: str | Path) -> Path:
+    """Return the folder of a run. Raises InputError where it holds no states."""
     run = Path(folder)
     if not (run / "states.npz").is_file():
         raise InputError(
@@ -176,6 +177,7 @@ def run_folder(folder: str | Path) -> Path:
 
 
 def load_states(run: Path) -> dict[str, Any]:
+    """Return the arrays of states.npz: times, nodes, tetrahedra, nodes at rest. Raises InputError."""
     path = run / "states.npz"
     try:
         with np.load(path, allow_pickle=False) as file:

@@ -80,6 +80,7 @@ class Errors:
 
 
 def errors_of(answer: Answer, reference: Reference) -> Errors:
+    """Return the errors of an answer against the reference, load by load."""
     off, true = answer.motions - reference.motions, reference.motions
     distance, moved = np.linalg.norm(off, axis=2), np.linalg.norm(true, axis=2)
     rms, size = np.sqrt((distance**2).mean(axis=1)), np.sqrt((moved**2).mean(axis=1))
@@ -107,4 +108,5 @@ def _force_errors(answer: Answer, reference: Reference) -> FloatArray:
 
 
 def space_name(element: str, refinements: int) -> str:
+    """Return the name of an element space in words."""
     return f"{element}, split into eight" if refinements else element

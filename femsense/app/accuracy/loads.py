@@ -115,10 +115,12 @@ def _inputs(body: BodyModel) -> list[Load]:
 
 
 def spread_evenly(count: int, most: int) -> list[int]:
+    """Return at most so many indices of a list, spread evenly."""
     return sorted({int(i) for i in np.linspace(0, count - 1, min(count, most))}) if count else []
 
 
 def drive_of_load(load: Load) -> dict[str, Any]:
+    """Return a load as an argument of `solve_equilibrium`."""
     return {"tension" if load.kind == "cable" else "pressure": {load.name: load.size}}
 
 
@@ -168,6 +170,7 @@ def _facing(middles: FloatArray, area: FloatArray, centre: FloatArray, radius: f
 
 
 def states_under(body: BodyModel, loads: Sequence[Load], before: SolvedSpace) -> tuple[Equilibrium, ...] | None:
+    """Return the equilibria without and under each load; None where one does not converge."""
     ties = None if body.mesh is before.mesh else embed_points(before.mesh, body.mesh.nodes)
     drives = [{}, *(drive_of_load(load) for load in loads if load.kind != "gravity")]
     states: list[Equilibrium] = []
@@ -187,4 +190,5 @@ def _carried(known: Equilibrium, ties: Embedding) -> Equilibrium:
 
 
 def body_on(body: BodyModel, mesh: TetMesh) -> BodyModel:
+    """Return a body on another mesh of the same shape."""
     return body if mesh is body.mesh else body_on_mesh(body, mesh)

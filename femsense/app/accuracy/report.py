@@ -34,6 +34,7 @@ def accuracy_report(
     left_out: Sequence[str],
     options: AccuracyOptions,
 ) -> dict[str, Any]:
+    """Return the report on discretisation error as it is printed and written: errors a space, loads, forces, advice."""
     declared = next(answer for answer in answers if answer.is_space(coarse, 0))
     reference = reference_of(answers)
     errors = [errors_of(answer, reference) for answer in answers]

@@ -52,6 +52,7 @@ def required(context: typer.Context, value: T | None, name: str, kind: str) -> T
 
 
 def places(texts: Sequence[str]) -> list[list[float]] | None:
+    """Return places given as x,y,z [m]; None where none is given. Raises typer.BadParameter."""
     places = []
     for text in texts:
         try:

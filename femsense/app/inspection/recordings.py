@@ -27,6 +27,7 @@ CLOUDS_READ = 8
 
 
 def inspect_recording(path: Path, report: Report, problems: list[str]) -> None:
+    """Report frames, markers, clouds and inputs of a recording."""
     folder = path if path.is_dir() else path.parent
     toml = folder / "recording.toml"
     if toml.is_file():
@@ -45,6 +46,7 @@ def inspect_recording(path: Path, report: Report, problems: list[str]) -> None:
 
 
 def inspect_cloud(file: Path, report: Report, problems: list[str]) -> None:
+    """Report points and colours of a cloud."""
     from femsense.io.clouds.cloud_files import read_cloud
 
     cloud = read_cloud(file)
@@ -67,6 +69,7 @@ def inspect_cloud(file: Path, report: Report, problems: list[str]) -> None:
 
 
 def inspect_image(file: Path, report: Report, problems: list[str]) -> None:
+    """Report size and content of a PNG image."""
     image = read_png(file)
     depth = image.ndim == 2 and image.dtype == np.uint16
     channels = 1 if image.ndim == 2 else image.shape[2]
@@ -87,6 +90,7 @@ def inspect_image(file: Path, report: Report, problems: list[str]) -> None:
 
 
 def inspect_jpeg(file: Path, report: Report, problems: list[str]) -> None:
+    """Report size of a JPEG image."""
     image = read_color(file)
     report.update({"width": image.shape[1], "height": image.shape[0], "channels": 3, "bits": 8, "content": "colour"})
 

@@ -40,6 +40,7 @@ def attempt(action: Callable[[], Any], problems: list[str]) -> Any:
 
 
 def read_object(file: Path) -> dict[str, Any]:
+    """Return a JSON object. Raises InputError."""
     try:
         data = json.loads(file.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError) as error:

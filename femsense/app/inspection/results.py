@@ -20,6 +20,7 @@ from femsense.rig.script import read_script
 
 
 def inspect_script(file: Path, report: Report, problems: list[str]) -> None:
+    """Report sweeps and frames of a script of the rig."""
     script = read_script(file)
     report["actuation"] = script.actuation
     report["sweeps"] = [
@@ -33,10 +34,12 @@ def inspect_script(file: Path, report: Report, problems: list[str]) -> None:
 
 
 def inspect_line(file: Path, report: Report, problems: list[str]) -> None:
+    """Report what the description of a body along a line holds."""
     report.update(line_report(file))
 
 
 def inspect_unfinished(folder: Path, report: Report, problems: list[str]) -> None:
+    """Report the work that a stopped command left."""
     report["holds"] = f"{(folder / UNFINISHED).stat().st_size / 1e6:.0f} MB of work that is done"
     problems.append(
         str(
@@ -46,6 +49,7 @@ def inspect_unfinished(folder: Path, report: Report, problems: list[str]) -> Non
 
 
 def inspect_calibration(file: Path, report: Report, problems: list[str]) -> None:
+    """Report poses, inputs and residuals of calibration.json."""
     data = read_object(file)
     problems += _expect(data, "femsense-calibration-1", ("T_robot_camera", "rms_m", "status"), file)
     for key in ("status", "rms_m", "T_robot_camera", "cable_tension_n", "cable_displacement_m", "marker_rms_m"):
@@ -58,6 +62,7 @@ def inspect_calibration(file: Path, report: Report, problems: list[str]) -> None
 
 
 def inspect_loop(path: Path, report: Report, problems: list[str]) -> None:
+    """Report verdict, effects and errors of loop.json."""
     file = path / "loop.json" if path.is_dir() else path
     data = read_object(file)
     problems += _expect(data, "femsense-loop-1", ("verdict", "before", "after", "effects"), file)
@@ -76,6 +81,7 @@ def inspect_loop(path: Path, report: Report, problems: list[str]) -> None:
 
 
 def inspect_run(path: Path, report: Report, problems: list[str]) -> None:
+    """Report frames, contacts and files of a run."""
     folder = path if path.is_dir() else path.parent
     expected = ("contacts.csv", "frames.csv", "states.npz", "run.json")
     missing = [name for name in expected if not (folder / name).is_file()]
@@ -102,6 +108,7 @@ def inspect_run(path: Path, report: Report, problems: list[str]) -> None:
 
 
 def inspect_table(file: Path, report: Report, problems: list[str]) -> None:
+    """Report a table by its columns, or as a capture."""
     from femsense.io.importers.guess import guess_format
 
     if guess_format(file) in ("optitrack", "vicon"):
@@ -122,6 +129,7 @@ def inspect_capture(path: Path, report: Report, problems: list[str]) -> None:
 
 
 def inspect_folder(folder: Path, report: Report, problems: list[str]) -> None:
+    """Report a folder by what it holds."""
     from femsense.io.importers.guess import guess_format
 
     if guess_format(folder) is not None:
@@ -144,6 +152,7 @@ def inspect_folder(folder: Path, report: Report, problems: list[str]) -> None:
 
 
 def inspect_unknown(file: Path, report: Report, problems: list[str]) -> None:
+    """Report a file of no known kind."""
     report["bytes"] = file.stat().st_size
     problems.append(
         str(

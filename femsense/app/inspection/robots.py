@@ -30,6 +30,7 @@ POOR_QUALITY = 0.05
 
 
 def inspect_robot(path: Path, report: Report, problems: list[str]) -> None:
+    """Report what robot.toml declares."""
     file = path / "robot.toml" if path.is_dir() else path
     document = read_toml(file)
     report["name"] = str(document.get("name", ""))
@@ -49,6 +50,7 @@ def inspect_robot(path: Path, report: Report, problems: list[str]) -> None:
 
 
 def inspect_mesh(file: Path, report: Report, problems: list[str]) -> None:
+    """Report cells, size and quality of a mesh."""
     content = read_content(file, str(file))
     points, cells = content.points, content.cells
     report["cells"] = {kind: len(data) for kind, data in cells.items()}
@@ -65,6 +67,7 @@ def inspect_mesh(file: Path, report: Report, problems: list[str]) -> None:
 
 
 def inspect_surface(file: Path, report: Report, problems: list[str]) -> None:
+    """Report size and gaps of a surface."""
     points, triangles = read_triangles(file)
     _surface_report(points, triangles, report)
     attempt(lambda: closed_surface(points, triangles, str(file)), problems)

@@ -77,5 +77,6 @@ def _value(key: str, value: Any) -> str:
 
 
 def bullet(text: str) -> str:
+    """Return a text as an item of a list, further lines indented."""
     first, *rest = text.splitlines()
     return "\n".join([f"  - {first}", *(f"  {line}" for line in rest)])

@@ -46,6 +46,7 @@ class Plan:
 
 
 def plan_of(bag: Bag, choice: Choice, options: Options, clock: str) -> Plan:
+    """Return what is read from a bag, and how: streams, columns, clock."""
     notes = list(choice.notes)
     columns, fields = {}, set[str]()
     for stream in choice.inputs:
@@ -187,17 +188,20 @@ def device_time(decoded: Any) -> float | None:
 
 
 def header_time(decoded: Any, message: Message) -> float:
+    """Return the time in the header of a message [s]; that of its record where it has none."""
     time, _ = stamp_of(decoded)
     return time if time > 0.0 else message.record
 
 
 def chosen_streams(choice: Choice) -> list[Stream]:
+    """Return the streams that are read, each once."""
     chosen = [choice.primary, *choice.markers, *choice.inputs, *choice.loads]
     chosen += [choice.color] if choice.color is not None else []
     return list({s.topic.name: s for s in chosen}.values())
 
 
 def is_sdk(name: str) -> bool:
+    """Return whether a topic is of a file of the RealSense SDK."""
     return name.startswith("/device_") and "/sensor_" in name
 
 

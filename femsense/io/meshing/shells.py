@@ -37,6 +37,7 @@ def pieces(triangles: IntArray) -> IntArray:
 
 
 def find_shells(points: FloatArray, triangles: IntArray, where: str, most: int) -> Shells:
+    """Return the closed pieces of a surface, outer ones and cavities. Raises InputError."""
     of = pieces(triangles)
     volume, count = shell_volumes(points, triangles, of), int(of.max()) + 1
     if count > most:
@@ -93,11 +94,13 @@ def shell_volumes(points: FloatArray, triangles: IntArray, of: IntArray) -> Floa
 
 
 def area_vectors(points: FloatArray, triangles: IntArray) -> FloatArray:
+    """Return the outward area vector of each triangle [unit²], shape (t, 3)."""
     a, b, c = np.moveaxis(points[triangles], 1, 0)
     return np.cross(b - a, c - a) / 2.0
 
 
 def without_dust(points: FloatArray, triangles: IntArray, where: str, done: list[str]) -> IntArray:
+    """Return the triangles without pieces of next to no volume. Raises InputError."""
     of = pieces(triangles)
     size = np.abs(shell_volumes(points, triangles, of))
     if size.max() <= 1e-9 * float(np.linalg.norm(np.ptp(points, axis=0))) ** 3:

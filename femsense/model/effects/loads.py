@@ -86,6 +86,7 @@ PLACED = 0.05
 
 
 def place_polish(robot: Robot, control: str, seed: Entry) -> tuple[Parameter, ...]:
+    """Return the parameters by which the place of a load is refined from a seed [m]."""
     reach = robot.body.reach
     return tuple(
         Parameter(
