@@ -27,6 +27,7 @@ import numpy as np
 import scipy.sparse as sp
 from threadpoolctl import ThreadpoolController
 
+import femsense.fem.linalg.cholesky as factoring
 from femsense import BodyModel, Tracker, compliance, embed_points, load_robot, make_body, solve_equilibrium, tie_cable
 from femsense.fem.assembly import internal, reduced_values
 from femsense.fem.cables import pull_rows
