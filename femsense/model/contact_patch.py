@@ -10,6 +10,20 @@ from femsense.core.arrays import FloatArray, IntArray
 from femsense.fem.mesh import TetMesh, closest_in_triangle, surface_triangles, triangle_normals
 
 
+def _lattice(parts: int) -> FloatArray:
+    """Return barycentric coordinates of the centres of the parts² equal triangles of a triangle, shape (parts², 3)."""
+    i, j = np.meshgrid(np.arange(parts), np.arange(parts), indexing="ij")
+    up, down = i + j < parts, i + j < parts - 1
+    first = np.column_stack([i[up] + 1 / 3, j[up] + 1 / 3])
+    second = np.column_stack([i[down] + 2 / 3, j[down] + 2 / 3])
+    uv = np.vstack([first, second]) / parts
+    return np.column_stack([1.0 - uv.sum(axis=1), uv])
+
+
+LATTICE = _lattice(6)
+"""Points of a face at which a pressure is taken: six to a side, so that a patch as wide as half a face still has eight."""
+
+
 @dataclass(frozen=True, eq=False, slots=True)
 class BodySurface:
     """The boundary of a body's mesh."""
@@ -22,6 +36,8 @@ class BodySurface:
     """Area at rest that belongs to each of them [m²], shape (s,)."""
     edge: float
     """Mean length of its edges at rest [m]."""
+    faces: IntArray
+    """Nodes of the faces of its elements, shape (f, 3), or (f, 6): corners, then the middles of the sides ab, bc, ca."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -31,7 +47,7 @@ class ContactPatch:
     nodes: IntArray
     """Surface nodes, shape (k,)."""
     weights: FloatArray
-    """Their shares of the force, shape (k,), sum 1."""
+    """Their shares of the force, shape (k,), sum 1; those at corners of quadratic elements may be a little below 0."""
 
     def spread(self, force: FloatArray, node_count: int) -> FloatArray:
         """Return nodal forces [N], shape (n, 3), of a force [N], shape (3,)."""
@@ -53,7 +69,7 @@ def body_surface(mesh: TetMesh) -> BodySurface:
     area = np.asarray(per_node[nodes], dtype=np.float64)
     corners = mesh.nodes[triangles]
     edge = float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean())
-    return BodySurface(triangles, nodes, area, edge)
+    return BodySurface(triangles, nodes, area, edge, _faces(triangles, quadratic=mesh.is_quadratic))
 
 
 def flat_nodes(surface: BodySurface, positions: FloatArray) -> IntArray:
@@ -78,7 +94,8 @@ def patch_at(
 ) -> ContactPatch:
     """Return the contact patch around the point of the surface that is closest to a place.
 
-    The weights fall off as a cone of the given radius, times the area of each node; clamped nodes carry nothing.
+    The pressure falls off as a cone of the given radius. Its nodal shares are those of the virtual work that it does on the element's own shape
+    functions: quadratic elements carry nothing at the corners of an evenly pressed face, and shares by area would dent them.
 
     Arguments:
         surface: the boundary.
@@ -89,16 +106,22 @@ def patch_at(
         facing: the outward normal that was seen there, shape (3,): faces that look elsewhere do not count.
     """
     centre = closest_surface_point(surface, positions, place, facing=facing)
-    distance = np.linalg.norm(positions[surface.nodes] - centre, axis=1)
-    reach = max(radius, 1.01 * float(np.sort(distance)[min(3, len(distance) - 1)]))
-    weight = surface.area * np.maximum(1.0 - distance / reach, 0.0)
-    weight[np.isin(surface.nodes, clamped)] = 0.0
-    if weight.sum() <= 0:  # a place on the clamp: its nearest free node
-        free = ~np.isin(surface.nodes, clamped)
-        weight = np.zeros(len(distance))
-        weight[np.flatnonzero(free)[np.argmin(distance[free])]] = 1.0
-    keep = weight > 0
-    return ContactPatch(surface.nodes[keep], weight[keep] / weight.sum())
+    corners = positions[surface.faces[:, :3]]
+    beyond = np.linalg.norm(corners - centre, axis=2).min(axis=1) - np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1)
+    faces = surface.faces[beyond <= max(radius, float(beyond.min()) + surface.edge)]
+    values = _shape_values(LATTICE, faces.shape[1])  # of each point of a face, (p, 3 or 6)
+    distance = np.linalg.norm(np.einsum("pa,fac->fpc", values, positions[faces]) - centre, axis=2)
+    reach = max(radius, 1.01 * float(np.partition(distance, 2, axis=None)[2]))
+    area = np.linalg.norm(triangle_normals(positions, faces[:, :3]), axis=1)
+    pressed = area[:, None] * np.maximum(1.0 - distance / reach, 0.0)
+    share = np.zeros(len(positions))
+    np.add.at(share, faces, pressed @ values)
+    share[clamped] = 0.0
+    if share.sum() <= 0.0:  # a place on the clamp: its nearest free node
+        free = np.setdiff1d(surface.nodes, clamped)
+        share[free[np.argmin(np.linalg.norm(positions[free] - centre, axis=1))]] = 1.0
+    nodes = np.flatnonzero(share)
+    return ContactPatch(nodes, share[nodes] / share.sum())
 
 
 def closest_surface_point(
@@ -114,3 +137,19 @@ def closest_surface_point(
     weights = closest_in_triangle(corners, np.broadcast_to(place, (len(corners), 3)))
     points = np.einsum("ti,tic->tc", weights, corners)
     return np.asarray(points[np.argmin(np.linalg.norm(points - place, axis=1))])
+
+
+def _faces(triangles: IntArray, *, quadratic: bool) -> IntArray:
+    """Return the faces that triangles of the boundary stand for (see `surface_triangles`), shape (f, 3) or (f, 6)."""
+    if not quadratic:
+        return triangles
+    first, second, third = triangles[0::4], triangles[1::4], triangles[2::4]
+    return np.column_stack([first[:, 0], second[:, 1], third[:, 2], first[:, 1], second[:, 2], first[:, 2]])
+
+
+def _shape_values(places: FloatArray, nodes: int) -> FloatArray:
+    """Return the shape functions of a face with 3 or 6 nodes at barycentric coordinates (p, 3), shape (p, nodes)."""
+    if nodes == 3:
+        return places
+    a, b, c = places.T
+    return np.column_stack([places * (2.0 * places - 1.0), 4.0 * a * b, 4.0 * b * c, 4.0 * c * a])
