@@ -8,7 +8,7 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray, freeze
 from femsense.fem.assembly import internal
-from femsense.fem.compliance import Tangent
+from femsense.fem.compliance import Tangent, drive_rows
 from femsense.fem.equilibrium import Equilibrium
 from femsense.model.camera import CameraNoise
 from femsense.model.robot import spread_points
@@ -27,12 +27,22 @@ SHARE_STEPS = np.concatenate([[0.0], 0.00125 * 2.0 ** np.arange(7)])
 """Sizes of the shared errors that are tried: 0.01 … 2.6 mm, and 0.1 … 8 % of the way."""
 FAR_OFF = 9.0
 """Misfit per row that says that a frame is not explained where no free frame tells more: three standard deviations everywhere."""
+DRIVE_STD = 0.05
+"""What is not known beforehand of the pull of a cable or the pressure of a chamber, relative: motor gain, and how far its ends sink into the mesh."""
+APART = 10.0
+"""The pose of the calibration knew neither modulus nor pulls: its standard deviations count so much larger where the free frames tell all of them."""
 LIKELY_GAIN = 13.5
 """Log-evidence gain that noise alone gives once in 1000 frames: χ² with three degrees at some 50 places that differ."""
 
 
 def first_knowledge(
-    noises: tuple[CameraNoise, ...], surface_nodes: FloatArray, size: float, modulus_std: float, pose_covariance: FloatArray
+    noises: tuple[CameraNoise, ...],
+    surface_nodes: FloatArray,
+    size: float,
+    modulus_std: float,
+    pose_covariance: FloatArray,
+    *,
+    drives: int = 0,
 ) -> Knowledge:
     """Return what is known before a free frame is seen.
 
@@ -42,19 +52,19 @@ def first_knowledge(
         size: diagonal of the body [m].
         modulus_std: relative.
         pose_covariance: of all cameras' (rotation, shift), shape (6 v, 6 v).
+        drives: cables and chambers.
     """
     centres = surface_nodes[spread_points(surface_nodes, CENTRES)]
     v = len(pose_covariance)
-    root = np.zeros((v + 1, v + 1))
+    root = np.diag(np.concatenate([np.zeros(v), [modulus_std], np.full(drives, DRIVE_STD)]))
     root[:v, :v] = _root(pose_covariance)
-    root[v, v] = modulus_std
     return Knowledge(
         noises=noises,
         centres=freeze(centres),
         length=0.7 * _spacing(centres, size),
         bias_m=1e-4,
         model_share=0.01,
-        common_mean=freeze(np.zeros(v + 1)),
+        common_mean=freeze(np.zeros(v + 1 + drives)),
         common_root=freeze(root),
         gain_limit=LIKELY_GAIN,
         misfit_limit=FAR_OFF,
@@ -62,9 +72,23 @@ def first_knowledge(
 
 
 def sag_at(sensor: Sensor, state: Equilibrium, tangent: Tangent) -> FloatArray:
-    """Return how the nodes move when the body becomes so much stiffer, per relative change [m], shape (1, n, 3)."""
-    load = internal(sensor.robot.body, state.positions, tangent=False).forces
-    return np.asarray(tangent.respond(load[None]))
+    """Return how the nodes move when the body becomes so much softer, and when each cable or chamber pulls so much harder.
+
+    Per relative change [m], shape (1 + a + c, n, 3). A held cable pulls harder by what shortens it.
+    """
+    body, n = sensor.robot.body, len(state.positions)
+    load = internal(body, state.positions, tangent=False).forces
+    pulls = np.array([*state.tension.values(), *state.pressure.values()])
+    if not len(pulls):
+        return np.asarray(tangent.respond(load[None]))
+    shares = [t / T if T > 0 else np.ones_like(t) for t, T in zip(state.segment_tensions, state.tension.values())]
+    rows = pulls[:, None, None] * drive_rows(body, state.positions, shares).reshape(len(pulls), n, 3)
+    moves = tangent.respond(np.concatenate([load[None], rows]))
+    held = np.flatnonzero(state.held)
+    if len(held):
+        by_length = tangent.respond_to_held()
+        moves[1 + held] = (pulls[held] * np.diag(tangent.held_compliance))[:, None, None] * by_length
+    return np.asarray(moves)
 
 
 def nuisance_columns(knowledge: Knowledge, rows: Rows, sag: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -78,7 +102,7 @@ def nuisance_columns(knowledge: Knowledge, rows: Rows, sag: FloatArray) -> tuple
 
 
 def common_columns(rows: Rows, sag: FloatArray) -> FloatArray:
-    """Return how the residual changes with pose steps and the modulus, shape (r, 6 v + 1)."""
+    """Return how the residual changes with pose steps, the modulus and the pulls, shape (r, 6 v + 1 + a + c)."""
     return np.hstack([rows.by_pose, rows.functional(sag)])
 
 
@@ -101,20 +125,21 @@ def learn(knowledge: Knowledge, frames: list[tuple[Rows, FloatArray]]) -> Knowle
 
     Arguments:
         knowledge: what was known before.
-        frames: rows and sag of each free frame.
+        frames: rows of each free frame, of its cloud and of its markers, each with the moves of `sag_at`.
     """
     if not frames:
         return knowledge
-    first = knowledge
+    v = knowledge.common_root.shape[0] - len(frames[0][1])  # pose steps
+    first = replace(knowledge, common_root=freeze(np.append(np.full(v, APART), np.ones(len(frames[0][1])))[:, None] * knowledge.common_root))
     for _ in range(2):  # the second time with what the first left
-        frames = [(replace(rows, together=knowledge.together), sag) for rows, sag in frames]
+        frames = [(replace(rows, together=knowledge.together if rows.of_clouds else 1.0), sag) for rows, sag in frames]
         grams = [_gram(knowledge, rows, sag) for rows, sag in frames]
         knowledge = _fit_common(knowledge, grams, first)
         for _ in range(2):
             knowledge = _fit_field(knowledge, grams)
             knowledge = _fit_common(knowledge, grams, first)
         knowledge = replace(knowledge, together=_together(knowledge, frames))
-    misfits = np.array([misfit(knowledge, rows, sag) for rows, sag in frames])
+    misfits = np.array([misfit(knowledge, rows, sag) for rows, sag in frames if rows.of_clouds])
     return replace(knowledge, misfit_limit=float(misfits.max() + 3.0 * max(misfits.std(), 0.05)))
 
 
@@ -155,7 +180,7 @@ def misfit_of(residual: FloatArray, columns: FloatArray, rows: Rows) -> tuple[fl
 def _together(knowledge: Knowledge, frames: list[tuple[Rows, FloatArray]]) -> float:
     """Return how many points count as one, since a camera matches windows: variance of sums over cells beside that of points that err alone."""
     sums, squares = 0.0, 0.0
-    for rows, sag in frames:
+    for rows, sag in (frame for frame in frames if frame[0].of_clouds):
         z = np.clip(whitened_rest(knowledge, rows, sag), -HUBER, HUBER)
         cells = np.floor(rows.place / (CELL * knowledge.length)).astype(np.int64)
         _, group = np.unique(cells, axis=0, return_inverse=True)
@@ -174,7 +199,7 @@ def _kernel(knowledge: Knowledge, places: FloatArray) -> FloatArray:
 def _gram(knowledge: Knowledge, rows: Rows, sag: FloatArray) -> FloatArray:
     """Return all inner products of (field, way × field, common, residual) in whitened rows, shape (2p + c + 1,) squared."""
     std = robust_std(rows, rows.residual)
-    field = _kernel(knowledge, rows.place)
+    field = rows.of_clouds * _kernel(knowledge, rows.place)  # that of a marker is in its standard deviation
     A = np.hstack([field, rows.way[:, None] * field, common_columns(rows, sag), rows.residual[:, None]]) / std[:, None]
     return np.asarray(A.T @ A)
 
@@ -193,7 +218,7 @@ def _fit_common(knowledge: Knowledge, grams: list[FloatArray], first: Knowledge)
     total = np.asarray(sum(_projected(knowledge, gram)[0] for gram in grams))
     normal, right, root = total[:-1, :-1], total[:-1, -1], first.common_root
     inner = np.eye(root.shape[1]) + root.T @ normal @ root
-    mean = root @ np.linalg.solve(inner, root.T @ right)
+    mean = first.common_mean + root @ np.linalg.solve(inner, root.T @ (right - normal @ first.common_mean))
     return replace(knowledge, common_mean=freeze(mean), common_root=freeze(root @ _root(np.linalg.inv(inner))))
 
 

@@ -10,8 +10,9 @@ import numpy.typing as npt
 from femsense.calib.calibration import Calibration
 from femsense.calib.from_clouds import free_clouds, measured_noises, pose_pivot
 from femsense.calib.scan import REACH, Scan, parted, read_scan
-from femsense.core.arrays import FloatArray, as_points
+from femsense.core.arrays import FloatArray, as_points, freeze
 from femsense.core.errors import FemsenseError, InputError
+from femsense.core.pose import moved_poses
 from femsense.fem.compliance import tangent_at
 from femsense.fem.equilibrium import Equilibrium
 from femsense.model.contact_patch import body_surface, flat_nodes
@@ -24,7 +25,7 @@ from femsense.pointcloud.rays import Surface
 from femsense.sensing.measure import rows_at
 from femsense.sensing.nuisance import first_knowledge, learn, sag_at
 from femsense.sensing.places import check_places, near_places
-from femsense.sensing.types import Answers, Rows, SensingOptions, Sensor
+from femsense.sensing.types import Answers, Knowledge, Rows, SensingOptions, Sensor
 
 CANDIDATES = 120
 """Places at which hidden contacts are searched (METHODS section 3)."""
@@ -55,7 +56,12 @@ def make_sensor(
     robot = _with_placements(robot, calibration)
     noises = measured_noises(robot, recording, calibration)
     knowledge = first_knowledge(
-        noises, robot.body.mesh.nodes[surface.nodes], size, options.modulus_std, calibration.joint_covariance
+        noises,
+        robot.body.mesh.nodes[surface.nodes],
+        size,
+        options.modulus_std,
+        calibration.joint_covariance,
+        drives=len(robot.body.cables) + len(robot.body.chambers) if recording.has_clouds else 0,
     )
     sensor = Sensor(
         robot,
@@ -71,7 +77,26 @@ def make_sensor(
         knowledge,
         Answers(),
     )
-    return replace(sensor, knowledge=learn(knowledge, _free_rows(sensor)))
+    sensor = _better_posed(sensor, learn(knowledge, _free_rows(sensor)))
+    return replace(sensor, knowledge=learn(sensor.knowledge, _free_rows(sensor)))
+
+
+def _better_posed(sensor: Sensor, learned: Knowledge) -> Sensor:
+    """Return the sensor with poses and modulus as the free frames show them: rays and states near the true ones."""
+    v = 6 * len(sensor.calibration.poses)
+    if not learned.common_mean.any():
+        return sensor
+    poses = tuple(freeze(T) for T in moved_poses(sensor.calibration.poses, -learned.common_mean[:v], sensor.pivot))
+    robot = replace(sensor.robot, body=sensor.robot.body.with_stiffness_scale(1.0 / (1.0 + learned.common_mean[v])))
+    expected = np.zeros_like(learned.common_mean)  # what was known beforehand, as it looks from there
+    expected[:v], expected[v] = -learned.common_mean[:v], 1.0 / (1.0 + learned.common_mean[v]) - 1.0
+    return replace(
+        sensor,
+        robot=robot,
+        driven=replace(sensor.driven, robot=robot),
+        calibration=replace(sensor.calibration, poses=poses, T_robot_camera=poses[0]),
+        knowledge=replace(sensor.knowledge, common_mean=freeze(expected)),
+    )
 
 
 def scan_of(sensor: Sensor, k: int, state: Equilibrium) -> Scan | None:
@@ -109,6 +134,16 @@ def _driven(robot: Robot, recording: Recording, calibration: Calibration, places
     return DrivenRobot(robot, drive)
 
 
+def _marked(sensor: Sensor, k: int, state: Equilibrium) -> list[Rows]:
+    """Return the rows of the markers of a frame, if it has some."""
+    if not (sensor.recording.marker_frame == k).any():
+        return []
+    try:
+        return [rows_at(sensor, k, None, state)]
+    except FemsenseError:
+        return []
+
+
 def _free_rows(sensor: Sensor) -> list[tuple[Rows, FloatArray]]:
     """Return rows and sag of the free frames with clouds; a frame that gives nothing is left out."""
     result = []
@@ -122,5 +157,6 @@ def _free_rows(sensor: Sensor) -> list[tuple[Rows, FloatArray]]:
         except FemsenseError:
             continue
         if rows is not None:
-            result.append((rows, sag_at(sensor, state, tangent_at(sensor.robot.body, state))))
+            moves = sag_at(sensor, state, tangent_at(sensor.robot.body, state))
+            result += [(rows, moves), *((own, moves) for own in _marked(sensor, k, state))]
     return result

@@ -259,9 +259,9 @@ class Knowledge:
     model_share: float
     """Size of the shared error relative to the way from rest (model) [1]."""
     common_mean: FloatArray
-    """Of pose steps (6 v) and modulus (1) as the free frames show them, shape (6 v + 1,)."""
+    """Of pose steps (6 v), modulus (1) and pulls of cables and chambers (a + c) as the free frames show them, shape (6 v + 1 + a + c,)."""
     common_root: FloatArray
-    """Square root of their covariance, shape (6 v + 1, j)."""
+    """Square root of their covariance, shape (6 v + 1 + a + c, j)."""
     gain_limit: float
     """Gain in log evidence from which on a contact that only the shape shows is believed: one false in 1000 free frames."""
     misfit_limit: float
