@@ -74,12 +74,12 @@ def first_knowledge(
 def sag_at(sensor: Sensor, state: Equilibrium, tangent: Tangent) -> FloatArray:
     """Return how the nodes move when the body becomes so much softer, and when each cable or chamber pulls so much harder.
 
-    Per relative change [m], shape (1 + a + c, n, 3). A held cable pulls harder by what shortens it.
+    Per relative change [m], shape (1 + a + c, n, 3), or (1, n, 3) where pulls are not asked for. A held cable pulls harder by what shortens it.
     """
     body, n = sensor.robot.body, len(state.positions)
     load = internal(body, state.positions, tangent=False).forces
     pulls = np.array([*state.tension.values(), *state.pressure.values()])
-    if not len(pulls):
+    if len(sensor.knowledge.common_mean) == 6 * len(sensor.calibration.poses) + 1:  # no drives, or markers alone
         return np.asarray(tangent.respond(load[None]))
     shares = [t / T if T > 0 else np.ones_like(t) for t, T in zip(state.segment_tensions, state.tension.values())]
     rows = pulls[:, None, None] * drive_rows(body, state.positions, shares).reshape(len(pulls), n, 3)

@@ -67,6 +67,26 @@ def test_flying_pixels_do_not_say_that_a_frame_is_not_explained():
     assert misfit(learned, replace(rows, residual=3.0 * rows.residual), SAG) > learned.misfit_limit
 
 
+def test_free_frames_tell_how_hard_a_cable_truly_pulls():
+    moves = np.zeros((2, 4, 3))
+    before = first_knowledge(knowledge().noises, knowledge().centres, 0.22, 0.03, 1e-8 * np.eye(6), drives=1)
+    frames = []
+    for seed in range(3):
+        rows = plate_rows(1, seed)
+        by_pull = 2e-3 * rows.place[:, 0] / 0.2
+        columns = np.column_stack([np.zeros_like(by_pull), by_pull])
+        frames.append((replace(rows, functional=lambda u, c=columns: c, residual=rows.residual - 0.04 * by_pull), moves))
+    learned = learn(before, frames)
+    assert learned.common_mean[-1] == pytest.approx(-0.04, abs=0.004)
+    assert np.linalg.norm(learned.common_root[-1]) < 0.01
+
+
+def test_what_free_frames_do_not_show_stays_as_it_was_expected():
+    expected = np.append(np.zeros(6), -0.02)
+    learned = learn(replace(knowledge(), common_mean=expected), [(plate_rows(1), SAG)])
+    np.testing.assert_allclose(learned.common_mean, expected, atol=1e-12)
+
+
 def pulled_and_let_go(folder: Path) -> Recording:
     """Return free frames of an arm whose cable rubs, the only cloud on the way back; then a frame with markers alone."""
     inputs = np.array([[0.0, 0, 0, 0], [1.5, 0, 0, 0], [3.0, 0, 0, 0], [1.2, 0, 0, 0], [1.2, 0, 0, 0]])

@@ -1,0 +1,48 @@
+"""Tests of contact patches: their shares do the work of a pressure on the shape functions of their elements."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from femsense.fem.mesh import TetMesh, to_quadratic
+from femsense.model.contact_patch import body_surface, patch_at
+
+NONE = np.zeros(0, dtype=np.int64)
+
+
+def slab(parts: int = 4) -> TetMesh:
+    """Return a slab of 40 × 40 × 10 mm of linear tetrahedra."""
+    i, j, k = np.meshgrid(np.arange(parts + 1), np.arange(parts + 1), np.arange(2), indexing="ij")
+    nodes = np.column_stack([i.ravel() * 0.04 / parts, j.ravel() * 0.04 / parts, k.ravel() * 0.01])
+    number = np.arange(len(nodes)).reshape(parts + 1, parts + 1, 2)
+    tets = []
+    for a in range(parts):
+        for b in range(parts):
+            c = number[a : a + 2, b : b + 2].reshape(2, 2, 2)
+            for path in ((0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0)):
+                corner, tet = [0, 0, 0], [c[0, 0, 0]]
+                for axis in path:
+                    corner[axis] = 1
+                    tet.append(c[tuple(corner)])
+                even = path in ((0, 1, 2), (1, 2, 0), (2, 0, 1))
+                tets.append(tet if even else [tet[0], tet[2], tet[1], tet[3]])
+    return TetMesh(nodes, np.array(tets))
+
+
+@pytest.mark.parametrize("quadratic", [False, True])
+def test_a_small_patch_has_its_centre_where_it_was_asked_for(quadratic):
+    mesh = to_quadratic(slab()) if quadratic else slab()
+    place = np.array([0.0183, 0.0221, 0.01])
+    patch = patch_at(body_surface(mesh), mesh.nodes, place, 0.004, NONE)
+    assert patch.weights.sum() == pytest.approx(1.0)
+    np.testing.assert_allclose(patch.mean(mesh.nodes), place, atol=2e-4)
+
+
+def test_an_even_pressure_loads_no_corner_of_a_quadratic_face():
+    mesh = to_quadratic(slab())
+    surface = body_surface(mesh)
+    patch = patch_at(surface, mesh.nodes, np.array([0.02, 0.02, 0.01]), 1.0, NONE)  # so wide that it is even
+    top = mesh.nodes[patch.nodes, 2] > 0.0099
+    corner = patch.nodes < len(slab().nodes)
+    assert np.abs(patch.weights[top & corner]).sum() < 0.02 * patch.weights[top].sum()
