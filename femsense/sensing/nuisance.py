@@ -130,7 +130,9 @@ def learn(knowledge: Knowledge, frames: list[tuple[Rows, FloatArray]]) -> Knowle
     if not frames:
         return knowledge
     v = knowledge.common_root.shape[0] - len(frames[0][1])  # pose steps
-    first = replace(knowledge, common_root=freeze(np.append(np.full(v, APART), np.ones(len(frames[0][1])))[:, None] * knowledge.common_root))
+    first = replace(
+        knowledge, common_root=freeze(np.append(np.full(v, APART), np.ones(len(frames[0][1])))[:, None] * knowledge.common_root)
+    )
     for _ in range(2):  # the second time with what the first left
         frames = [(replace(rows, together=knowledge.together if rows.of_clouds else 1.0), sag) for rows, sag in frames]
         grams = [_gram(knowledge, rows, sag) for rows, sag in frames]
