@@ -1,19 +1,24 @@
 """From sensors to bones: how fast, and how far off, on real data and on the virtual rig.
 
-    python benchmarks/xr.py [--only speed arm actuator] [--data ../shared/data/arm] [--states FILE.npz]
+    python benchmarks/xr.py [--only speed arm actuator] [--data ../shared/data/arm] [--states FILE.npz] [--keep DIR] [--pieces NAME …]
 
 speed     the steps of the paper's table (Borges et al. 2022): network, spline and bones, end-to-end network, whole pose
 arm       a two-segment pneumatic arm, real: held-out errors by sensors, other days, correction, inputs outside what was learnt
+          With --keep each piece of it is kept as it is done: a run that was cut off goes on there, and --pieces does some of them.
 actuator  a pneumatic finger with colour sensors and obstacles on the rig: surface error by how extreme the deformation is
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import gzip
+import io
 import itertools
 import time
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -98,23 +103,43 @@ def tip_only(data: Labelled) -> Labelled:
     return fs.labelled(data.time_s, data.readings, data.markers[:, 1:], channels=data.channels, marker_names=("tip",))
 
 
-def arm(folder: Path) -> None:
-    """Print the tables of the real arm."""
+def arm(folder: Path, keep: Path | None, pieces: list[str]) -> None:
+    """Print the tables of the real arm, piece after piece."""
     print("tip, first 70 % of apr_5 to its last 30 % [mm]")
     print("sensors      linear (README)  chosen       error (95 %)          ridge  radial  network  mlp     outside")
-    for name, columns in SENSORS.items():
-        data = tip_only(read_arm("apr_5_1", columns, folder))
-        cut = int(0.7 * len(data))
-        report = fs.learn(data.select(np.arange(cut)), test=data.select(np.arange(cut, len(data)))).report
-        each = "  ".join(f"{report['compared'][kind]['error_mm']:6.2f}" for kind in report["compared"])
-        low, high = report["error_ci_mm"]
-        print(
-            f"{name:<12} {README_MM[name]:7.1f}          {report['kind']:<9} {report['error_mm']:6.2f} ({low:.2f} … {high:.2f})"
-            f"     {each}   {100 * report['test_outside']:.0f} %"
-        )
-    january(folder)
-    other_days(folder)
-    inside(folder)
+    work: dict[str, Callable[[], None]] = {name: partial(sensors, name, folder) for name in SENSORS}
+    work |= {"january": partial(january, folder), "days": partial(other_days, folder), "inside": partial(inside, folder)}
+    for name, step in work.items():
+        if not pieces or name in pieces:
+            print(kept(name, step, keep), end="", flush=True)
+
+
+def kept(name: str, step: Callable[[], None], keep: Path | None) -> str:
+    """Return what a piece prints: read where it was done before, else done now and kept."""
+    file = None if keep is None else keep / f"{name.replace(' ', '_')}.txt"
+    if file is not None and file.is_file():
+        return file.read_text(encoding="utf-8")
+    said, begun = io.StringIO(), time.process_time()
+    with contextlib.redirect_stdout(said):
+        step()
+        print(f"  ({time.process_time() - begun:.0f} s of processor time)")
+    if file is not None:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(said.getvalue(), encoding="utf-8")
+    return said.getvalue()
+
+
+def sensors(name: str, folder: Path) -> None:
+    """Print the row of a choice of sensors."""
+    data = tip_only(read_arm("apr_5_1", SENSORS[name], folder))
+    cut = int(0.7 * len(data))
+    report = fs.learn(data.select(np.arange(cut)), test=data.select(np.arange(cut, len(data)))).report
+    each = "  ".join(f"{report['compared'][kind]['error_mm']:6.2f}" for kind in report["compared"])
+    low, high = report["error_ci_mm"]
+    print(
+        f"{name:<12} {README_MM[name]:7.1f}          {report['kind']:<9} {report['error_mm']:6.2f} ({low:.2f} … {high:.2f})"
+        f"     {each}   {100 * report['test_outside']:.0f} %"
+    )
 
 
 def january(folder: Path) -> None:
@@ -291,11 +316,13 @@ def main() -> None:
     parser.add_argument("--only", nargs="*", choices=("speed", "arm", "actuator"), default=("speed", "arm", "actuator"))
     parser.add_argument("--data", type=Path, default=DATA)
     parser.add_argument("--states", type=Path, help="keep the states of the finger here")
+    parser.add_argument("--keep", type=Path, help="keep the pieces of the arm here, and go on from them")
+    parser.add_argument("--pieces", nargs="*", default=[], choices=(*SENSORS, "january", "days", "inside"), help="of the arm")
     arguments = parser.parse_args()
     if "speed" in arguments.only:
         speed()
     if "arm" in arguments.only and arguments.data.is_dir():
-        arm(arguments.data)
+        arm(arguments.data, arguments.keep, arguments.pieces)
     if "actuator" in arguments.only:
         actuator(arguments.states)
 

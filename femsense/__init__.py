@@ -63,6 +63,7 @@ if TYPE_CHECKING:
     from femsense.xr.proprioception.learn import LearnOptions, learn
     from femsense.xr.proprioception.model import ProprioceptiveModel
     from femsense.xr.proprioception.model_file import load_model, save_model
+    from femsense.xr.user_skin import read_skin
 
 __version__ = "0.1.0"
 
@@ -130,6 +131,7 @@ __all__ = [
     "read_calibration",
     "read_loop",
     "read_run",
+    "read_skin",
     "recording_from_arrays",
     "robot_names",
     "run_inputs",
@@ -252,6 +254,7 @@ _HOMES = {
     "xr.proprioception.learn": ("LearnOptions", "learn"),
     "xr.proprioception.model": ("ProprioceptiveModel",),
     "xr.proprioception.model_file": ("load_model", "save_model"),
+    "xr.user_skin": ("read_skin",),
 }
 _MODULE_OF = {name: f"femsense.{module}" for module, names in _HOMES.items() for name in names}
 

@@ -140,11 +140,13 @@ def let_drag(live: LiveStream, run: Path, options: DragOptions) -> DragServer:
     return server
 
 
-def show_stream(url: str, *, port: int = 0, page: Path = PAGE, password_file: Path | None = None) -> LiveStream:
+def show_stream(
+    url: str, *, port: int = 0, page: Path = PAGE, password_file: Path | None = None, authority: Path | None = None
+) -> LiveStream:
     """Serve the page on this machine with what streams at a URL; return at once. Raises as `Bridge` and `WebSocketServer`."""
     files = live_page_files(page)
     hub = Hub()
-    bridge = Bridge(hub, url, password=read_password(password_file, os.environ.get(PASSWORD)))
+    bridge = Bridge(hub, url, password=read_password(password_file, os.environ.get(PASSWORD)), authority=authority)
     try:
         server = WebSocketServer(hub, files, options=ServerOptions(port=port))
     except BaseException:
@@ -195,7 +197,7 @@ def _serve(options: StreamOptions, first: str) -> LiveStream:
         files = live_page_files(options.page)
         server = WebSocketServer(hub, files, access=access, options=ServerOptions(port=options.port))
         undo.callback(hub.close)
-        broker = None if options.broker_port is None else EmbeddedBroker(hub, port=options.broker_port)
+        broker = None if options.broker_port is None else EmbeddedBroker(hub, port=options.broker_port, access=access)
         if options.mqtt is not None:
             MqttSink(hub, broker_address(options.mqtt, password=password, authority=options.authority), first)
         undo.pop_all()

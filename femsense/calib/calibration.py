@@ -47,6 +47,13 @@ class Calibration:
     joint_covariance: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
     """Of (rotation [rad], shift [m]) of all cameras together, shape (6 v, 6 v); not given: that of the first camera alone is known."""
 
+    def __repr__(self) -> str:
+        fits = [(self.rms_m, "markers"), (self.normal_rms_m, "clouds")]
+        said = [f"{1e3 * value:.3g} mm rms of {what}" for value, what in fits if np.isfinite(value)]
+        cables = [f"initial inputs of {', '.join(self.cable_tension_n)}"] if self.cable_tension_n else []
+        cameras = f"{len(self.poses)} camera{'s' if len(self.poses) != 1 else ''}"
+        return f"Calibration({'; '.join([cameras, *said, *cables, self.status])})"
+
     def __post_init__(self) -> None:
         if self.joint_covariance.size == 0:
             joint = np.zeros((6 * len(self.poses),) * 2)

@@ -9,9 +9,11 @@ import numpy as np
 import numpy.typing as npt
 
 from femsense.core.arrays import FloatArray, IntArray
+from femsense.fem.mesh import TetMesh
 from femsense.model.robot import Robot
 from femsense.xr.gltf import ExportReport, export_states
 from femsense.xr.run_contents import export_run
+from femsense.xr.user_skin import UserSkin, export_skin
 
 
 class _States(Protocol):
@@ -35,7 +37,12 @@ class RunLike(Protocol):
 
 
 def export_glb(
-    run: RunLike | str | Path, path: str | Path, *, bones: int | None = None, color_rgb: npt.ArrayLike | None = None
+    run: RunLike | str | Path,
+    path: str | Path,
+    *,
+    bones: int | None = None,
+    color_rgb: npt.ArrayLike | None = None,
+    skin: UserSkin | None = None,
 ) -> ExportReport:
     """Write a run as a skinned, animated mesh (binary glTF 2.0).
 
@@ -44,6 +51,7 @@ def export_glb(
         path: the `.glb` file; its folder is made where it is missing.
         bones: how many; chosen on held-out frames if None.
         color_rgb: colour of the body, sRGB in 0 … 1, shape (3,); by default the robot's where the run knows it.
+        skin: a surface of your own that the body carries (`read_skin`).
 
     Returns:
         what was written, with the distance to the finite-element surface.
@@ -54,9 +62,12 @@ def export_glb(
     target = Path(path).expanduser()
     target.parent.mkdir(parents=True, exist_ok=True)
     if isinstance(run, str | Path):
-        return export_run(run, target, bones=bones, color_rgb=color_rgb)
+        return export_run(run, target, bones=bones, color_rgb=color_rgb, skin=skin)
     states, robot = run.states, run.robot
     color = robot.color_rgb if color_rgb is None else color_rgb
+    if skin is not None:
+        mesh = TetMesh(states.rest_nodes_m, states.tets)
+        return export_skin(mesh, states.time_s, states.nodes_m, target, skin, bones=bones, color_rgb=color, name=robot.name)
     return export_states(
         states.rest_nodes_m, states.tets, states.time_s, states.nodes_m, target, bones=bones, color_rgb=color, name=robot.name
     )

@@ -27,7 +27,7 @@ T_GLTF_ROBOT = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0,
 """Maps the robot frame (Z up) to glTF's (Y up): (x, y, z) → (x, z, −y)."""
 DEFAULT_COLOR = (0.20, 0.45, 0.80)
 COMPONENT = {np.dtype(np.uint8): 5121, np.dtype(np.uint16): 5123, np.dtype(np.uint32): 5125, np.dtype(np.float32): 5126}
-SHAPE = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
+SHAPE = {(): "SCALAR", (2,): "VEC2", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
 VERTEX_DATA, INDEX_DATA = 34962, 34963
 
 
@@ -47,6 +47,16 @@ class ExportReport:
     """Root mean square distance of the skinned vertices to the finite-element surface, all frames [m]."""
     max_m: float
     """Largest such distance [m]."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Texture:
+    """An image on a surface."""
+
+    uv: FloatArray
+    """Where each vertex lies in it, 0 … 1 from its upper left corner, shape (V, 2)."""
+    png: bytes
+    """The image."""
 
 
 def export_states(
@@ -105,6 +115,7 @@ def write_glb(
     time_s: npt.ArrayLike,
     *,
     color_rgb: npt.ArrayLike | None = None,
+    texture: Texture | None = None,
     name: str = "robot",
 ) -> Path:
     """Write a skinned mesh with one animation; beside and renamed, so that no half-written file is ever seen.
@@ -117,6 +128,7 @@ def write_glb(
         poses: T_robot_bone of each frame, shape (F, B, 4, 4).
         time_s: time of each frame [s], shape (F,), strictly increasing; the file counts from the first.
         color_rgb: sRGB in 0 … 1: one colour (3,), or one a vertex (V, 3).
+        texture: an image instead.
         name: of the body.
 
     Returns:
@@ -125,7 +137,7 @@ def write_glb(
     Raises:
         InputError: shapes that do not belong together, times that do not increase, colours out of range.
     """
-    data = glb_bytes(rest, triangles, skin, poses, time_s, color_rgb=color_rgb, name=name)
+    data = glb_bytes(rest, triangles, skin, poses, time_s, color_rgb=color_rgb, texture=texture, name=name)
     target = Path(path)
     if not target.parent.is_dir():
         raise InputError("the folder does not exist", where=target.parent, hint="make it first")
@@ -146,6 +158,7 @@ def glb_bytes(
     time_s: npt.ArrayLike,
     *,
     color_rgb: npt.ArrayLike | None = None,
+    texture: Texture | None = None,
     name: str = "robot",
 ) -> bytes:
     """Return the content of the file that `write_glb` writes (same arguments)."""
@@ -162,6 +175,8 @@ def glb_bytes(
 
     buffer = _Buffer()
     primitive = _add_mesh(buffer, points, corners, skin, vertex_color)
+    paint: dict[str, Any] = {"baseColorFactor": base_color, "metallicFactor": 0.0, "roughnessFactor": 0.55}
+    images = {} if texture is None else _add_texture(buffer, primitive, texture, paint, len(points))
     bind = np.linalg.inv(T_GLTF_ROBOT @ skin.skeleton.T_robot_bone)
     inverse_bind = buffer.add(bind.transpose(0, 2, 1).astype(np.float32))  # columns first
     samplers, channels = _add_animation(buffer, times, T_robot_bone)
@@ -180,12 +195,8 @@ def glb_bytes(
             *joints,
         ],
         "meshes": [{"name": name, "primitives": [primitive]}],
-        "materials": [
-            {
-                "name": "body",
-                "pbrMetallicRoughness": {"baseColorFactor": base_color, "metallicFactor": 0.0, "roughnessFactor": 0.55},
-            }
-        ],
+        "materials": [{"name": "body", "pbrMetallicRoughness": paint}],
+        **images,
         "skins": [{"name": name, "skeleton": 1, "joints": list(range(2, 2 + bones)), "inverseBindMatrices": inverse_bind}],
         "animations": [{"name": "run", "samplers": samplers, "channels": channels}],
         **buffer.description(),
@@ -238,6 +249,13 @@ class _Buffer:
         self.accessors.append(accessor)
         return len(self.accessors) - 1
 
+    def add_bytes(self, data: bytes) -> int:
+        """Append bytes that are no numbers and return the number of their view."""
+        self.content.extend(b"\0" * (-len(self.content) % 4))
+        self.views.append({"buffer": 0, "byteOffset": len(self.content), "byteLength": len(data)})
+        self.content.extend(data)
+        return len(self.views) - 1
+
     def description(self) -> dict[str, Any]:
         return {"accessors": self.accessors, "bufferViews": self.views, "buffers": [{"byteLength": len(self.content)}]}
 
@@ -257,6 +275,22 @@ def _add_mesh(buffer: _Buffer, rest: FloatArray, triangles: IntArray, skin: Skin
         attributes["COLOR_0"] = buffer.add(colors.astype(np.float32), target=VERTEX_DATA)
     width = np.uint16 if len(rest) < 65535 else np.uint32
     return {"attributes": attributes, "indices": buffer.add(triangles.ravel().astype(width), target=INDEX_DATA), "material": 0}
+
+
+def _add_texture(
+    buffer: _Buffer, primitive: dict[str, Any], texture: Texture, paint: dict[str, Any], vertices: int
+) -> dict[str, Any]:
+    """Add an image and its places; the material shows it as it is. Returns the parts of the file that describe it."""
+    if len(texture.uv) != vertices:
+        raise InputError("the texture belongs to other vertices", where="texture", found=len(texture.uv), expected=vertices)
+    primitive["attributes"]["TEXCOORD_0"] = buffer.add(texture.uv.astype(np.float32), target=VERTEX_DATA)
+    paint.update(baseColorFactor=[1.0, 1.0, 1.0, 1.0], baseColorTexture={"index": 0})
+    view = buffer.add_bytes(texture.png)
+    return {
+        "images": [{"bufferView": view, "mimeType": "image/png"}],
+        "samplers": [{}],
+        "textures": [{"source": 0, "sampler": 0}],
+    }
 
 
 def _add_animation(buffer: _Buffer, times: FloatArray, poses: FloatArray) -> tuple[list[Any], list[Any]]:

@@ -14,19 +14,30 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
+from femsense.fem.mesh import TetMesh, surface_triangles
+from femsense.xr.glb_reader import read_glb
 from femsense.xr.gltf import ExportReport, export_states
+from femsense.xr.landmarks import landmarks_of_run, robot_table
+from femsense.xr.surface_stress import nodal_strain, stress_bytes
+from femsense.xr.user_skin import BUDGET, GLTF, UserSkin, export_skin, read_skin
 
 FORMAT = "femsense-contacts-1"
 CONTACT_COLUMNS = ("frame", "time_s", "contact", "x_m", "y_m", "z_m", "fx_n", "fy_n", "fz_n", "force_n", "std_n", "source")
 
 
-def export_run(folder: str | Path, path: str | Path, *, bones: int | None = None, color_rgb: Any = None) -> ExportReport:
-    """Write the skinned, animated mesh of a run folder (see `gltf.export_states`).
+def export_run(
+    folder: str | Path, path: str | Path, *, bones: int | None = None, color_rgb: Any = None, skin: UserSkin | None = None
+) -> ExportReport:
+    """Write the skinned, animated mesh of a run folder (see `gltf.export_states`), or a surface of the user's own instead of the body's.
 
     Raises InputError where `states.npz` is missing, unreadable or lacks a part.
     """
     run = run_folder(folder)
     states = load_states(run)
+    if skin is not None:
+        mesh = TetMesh(np.asarray(states.get("rest_nodes_m", states["nodes_m"][0]), dtype=float), states["tets"])
+        name = name_of_run(run)
+        return export_skin(mesh, states["time_s"], states["nodes_m"], path, skin, bones=bones, color_rgb=color_rgb, name=name)
     return export_states(
         states.get("rest_nodes_m"),
         states["tets"],
@@ -39,13 +50,24 @@ def export_run(folder: str | Path, path: str | Path, *, bones: int | None = None
     )
 
 
+def skin_for_run(folder: str | Path, file: str | Path, *, unit: str | None = None, budget: int = BUDGET) -> UserSkin:
+    """Return a surface of the user's own in the frame of a run's robot: `T_robot_mesh` of its robot.toml applies to all but glTF.
+
+    Arguments and errors as `user_skin.read_skin`.
+    """
+    declared = robot_table(run_folder(folder)).get("mesh", {}).get("T_robot_mesh")
+    glTF = Path(file).suffix.lower() in GLTF
+    return read_skin(file, unit=unit, T_robot_skin=None if glTF else declared, budget=budget)
+
+
 def contacts_of_run(folder: str | Path) -> dict[str, Any]:
     """Return what the page shows beside the mesh, ready for JSON; everything in the robot frame, SI.
 
     Returns:
         `format`, `name`, `frame` ("robot"), and `frames`: for each state its time from the first [s], the frame's
         number, status, residual and inputs where `frames.csv` has them, and the contacts of `contacts.csv`. `inputs` names
-        the inputs, with their units and the range that the run has.
+        the inputs, with their units and the range that the run has; `markers` and `cameras` are what the real robot shares with it;
+        `field` is what `stress_of_run` holds.
 
     Raises:
         InputError: a column is missing, or a value is not a number.
@@ -67,7 +89,42 @@ def contacts_of_run(folder: str | Path) -> dict[str, Any]:
         state["frame"] = row.integer("frame") if state["frame"] is None else state["frame"]
         state["contacts"].append(_contact(row))
     inputs = [_input(column, told) for column in columns]
-    return {"format": FORMAT, "name": name_of_run(run), "frame": "robot", "inputs": inputs, "frames": frames}
+    known = landmarks_of_run(run)
+    return {
+        "format": FORMAT,
+        "name": name_of_run(run),
+        "frame": "robot",
+        "inputs": inputs,
+        "frames": frames,
+        "markers": [{"name": one.name, "position": one.position_m.tolist()} for one in known.markers],
+        "cameras": [{"name": one.name, "position": one.position_m.tolist()} for one in known.cameras],
+        "field": {"name": "stress", "unit": "Pa"} if _stiffness(run) else {"name": "strain", "unit": "%"},
+    }
+
+
+def stress_of_run(folder: str | Path, glb: bytes) -> bytes:
+    """Return the stress at the vertices of a run's mesh (see `surface_stress.stress_bytes`); strain [%] where no material is known.
+
+    A vertex has the stress of the node of the body's surface that is nearest to it at rest.
+    """
+    from scipy.spatial import cKDTree
+
+    run = run_folder(folder)
+    states = load_states(run)
+    rest = np.asarray(states.get("rest_nodes_m", states["nodes_m"][0]), dtype=float)
+    mesh = TetMesh(rest, states["tets"])
+    used = np.unique(surface_triangles(mesh))
+    nearest = used[cKDTree(rest[used]).query(read_glb(glb).skin.rest)[1]]
+    return stress_bytes(nodal_strain(rest, mesh.tets, states["nodes_m"])[:, nearest], _stiffness(run) or 100.0)
+
+
+def _stiffness(run: Path) -> float | None:
+    """Return 3 μ of the robot's material [Pa], or None where it is not known."""
+    material = robot_table(run).get("material", {})
+    try:
+        return 1.5 * float(material["young_modulus_pa"]) / (1.0 + float(material["poisson_ratio"]))
+    except (KeyError, TypeError, ValueError):
+        return None
 
 
 def current_glb(run: Path, scratch: Path) -> Path:

@@ -183,6 +183,23 @@ def fit_skin(rest: npt.ArrayLike, states: npt.ArrayLike, *, bones: int | None = 
     return _finished(rest, origins, joints, weights)
 
 
+def weigh_points(skin: Skin, poses: FloatArray, rest: npt.ArrayLike, states: npt.ArrayLike) -> Skin:
+    """Return a skin of other points with the same bones: weights that reproduce their motion best with given poses.
+
+    Arguments:
+        skin: whose bones are used.
+        poses: T_robot_bone of each frame, shape (F, B, 4, 4).
+        rest: points at rest, robot frame [m], shape (p, 3).
+        states: the points in each frame [m], shape (F, p, 3).
+    """
+    points, frames = as_points(rest, "rest"), as_states(states, len(np.asarray(rest)))
+    origins = np.ascontiguousarray(skin.skeleton.origins)
+    parts = [slice(k, k + FIT_VERTICES) for k in range(0, len(points), FIT_VERTICES)]
+    found = [_fit_weights(points[part], frames[:, part], origins, np.asarray(poses, dtype=np.float64)) for part in parts]
+    weights = np.concatenate([each[1] for each in found])
+    return Skin(skin.skeleton, points, np.concatenate([each[0] for each in found]), weights)
+
+
 def as_states(states: npt.ArrayLike, vertices: int) -> FloatArray:
     """Return states as finite float64, shape (F, V, 3) with F ≥ 1. Raises InputError."""
     frames = np.asarray(states, dtype=np.float64)

@@ -5,16 +5,19 @@ from __future__ import annotations
 import json
 import shutil
 import tempfile
-from functools import partial
+from collections.abc import Callable
+from functools import cache, partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from threading import Thread
 from typing import Any
 
-from femsense.core.errors import InputError, MissingDependency
-from femsense.xr.run_contents import contacts_of_run, current_glb, run_folder
+from femsense.core.errors import FemsenseError, InputError, MissingDependency
+from femsense.xr.run_contents import contacts_of_run, current_glb, run_folder, stress_of_run
 
 PAGE = Path(__file__).with_name("viewer") / "dist"
+Content = Path | bytes | Callable[[], bytes]
+"""Of a file that is served: where it is, what is in it, or how that is made when it is asked for."""
 TYPES = {".glb": "model/gltf-binary", ".js": "text/javascript", ".json": "application/json"}
 
 
@@ -23,9 +26,7 @@ class ViewServer(ThreadingHTTPServer):
 
     daemon_threads = True
 
-    def __init__(
-        self, address: tuple[str, int], files: dict[str, Path | bytes], scratch: tempfile.TemporaryDirectory[str]
-    ) -> None:
+    def __init__(self, address: tuple[str, int], files: dict[str, Content], scratch: tempfile.TemporaryDirectory[str]) -> None:
         self.files = files
         self.scratch = scratch
         super().__init__(address, _Handler)
@@ -78,7 +79,8 @@ def serve(folder: str | Path, *, port: int = 0, open_browser: bool = True, page:
     scratch = tempfile.TemporaryDirectory(prefix="femsense-view-")
     try:
         glb = current_glb(run, Path(scratch.name))
-        files: dict[str, Path | bytes] = {**built, "robot.glb": glb, "contacts.json": _json(contacts_of_run(run))}
+        files: dict[str, Content] = {**built, "robot.glb": glb, "contacts.json": _json(contacts_of_run(run))}
+        files["fields.bin"] = cache(partial(_stress, run, glb))
         server = ViewServer(("127.0.0.1", port), files, scratch)
     except OSError as error:
         scratch.cleanup()
@@ -109,6 +111,7 @@ def write_static_page(folder: str | Path, out_dir: str | Path, *, page: Path = P
             shutil.copyfile(source, out / name)
         if glb.resolve() != (out / "robot.glb").resolve():
             shutil.copyfile(glb, out / "robot.glb")
+        (out / "fields.bin").write_bytes(_stress(run, glb))
     (out / "contacts.json").write_bytes(_json(contacts_of_run(run)))
     return out / "index.html"
 
@@ -134,6 +137,10 @@ def live_page_files(page: Path) -> dict[str, Path | bytes]:
     return files
 
 
+def _stress(run: Path, glb: Path) -> bytes:
+    return stress_of_run(run, glb.read_bytes())
+
+
 def _json(value: dict[str, Any]) -> bytes:
     return json.dumps(value, allow_nan=False, separators=(",", ":")).encode()
 
@@ -153,8 +160,8 @@ class _Handler(SimpleHTTPRequestHandler):
         name = self.path.split("?", 1)[0].split("#", 1)[0].lstrip("/") or "index.html"
         content = self.server.files.get(name)
         try:
-            data = content.read_bytes() if isinstance(content, Path) else content
-        except OSError:
+            data = content.read_bytes() if isinstance(content, Path) else content() if callable(content) else content
+        except (OSError, FemsenseError):
             data = None
         if data is None:
             self.send_error(404)

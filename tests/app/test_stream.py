@@ -3,16 +3,32 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from glb import ROOT
+from helpers import write_block_robot, write_small_recording
+from small_run import make_run
 from streams import within
 from xr_bar import write_run_with_mesh
 
 from femsense.app.stream_command import StreamOptions, need_one, show_stream, stream_document, stream_runs, stream_text
 from femsense.core.errors import InputError
+from femsense.io.recording_folder import load_recording
+from femsense.io.robot_toml import load_robot
+from femsense.sensing.run_files import run_inputs, write_run
+from femsense.xr.stream.hub import Message
+from femsense.xr.stream.websocket import pack, unpack
+from femsense.xr.view import PAGE
 
 pytest.importorskip("websockets")
+from websockets.sync.client import connect
+
 pytest.importorskip("amqtt")
 
 
@@ -53,6 +69,56 @@ def test_a_password_travels_encrypted_or_it_is_said(tmp_path: Path, page: Path, 
     (tmp_path / "empty").write_text("\n", encoding="utf-8")
     with pytest.raises(InputError, match="password is empty"):
         show_stream("http://127.0.0.1:1", page=page, password_file=tmp_path / "empty")
+
+
+@pytest.mark.skipif(not (PAGE / "index.html").is_file(), reason="the page was not built into this installation")
+def test_the_command_line_lets_a_viewer_drag_and_a_viewer_of_it_too(tmp_path: Path) -> None:
+    robot = write_block_robot(tmp_path / "robot")
+    made = make_run(load_robot(robot))
+    recording = load_recording(write_small_recording(tmp_path / "recording"))
+    run = write_run(made, tmp_path / "run", inputs=run_inputs(made.robot, recording, None))
+    marker = made.robot.glued_names[0]
+    place = dict(zip("xyz", map(float, made.robot.marker_points[0] + [0.0, 0.0, 0.002])))
+    wish = json.dumps({"handle": marker, "target_m": place, "held": True, "armed": True}).encode()
+    for commands in ((), ("--commands",)):
+        with (
+            command_line("stream", str(run), "--drag", *commands, "--port", "0") as url,
+            command_line("view", "--stream", url, "--no-browser") as again,
+        ):
+            heard: dict[str, dict[str, object]] = {}
+            with connect(f"{again.replace('http', 'ws')}ws", proxy=None, compression=None, max_size=None) as viewer:
+                end = time.monotonic() + 30.0
+                while time.monotonic() < end and not ("reach" in heard and heard.get("command", {}).get("armed")):
+                    if "reach" in heard and not commands:
+                        end = min(end, time.monotonic() + 0.5)
+                    viewer.send(pack([Message(f"femsense/{made.robot.name}/drag", wish)]))
+                    for message in unpack(viewer.recv(5)):
+                        if not message.topic.endswith(("/pose", "/ghost", "/cloud")):
+                            heard[message.topic.rpartition("/")[2]] = json.loads(message.payload)
+            assert heard["model"]["commands"] is bool(commands)
+            assert [handle["name"] for handle in heard["model"]["handles"]] == list(made.robot.glued_names)
+            assert heard["reach"]["status"] in ("reached", "nearest") and ("command" in heard) == bool(commands)
+            if commands:
+                assert {row["name"] for row in heard["command"]["inputs"]} == set(made.robot.body.cable_names)
+
+
+@contextmanager
+def command_line(*arguments: str) -> Iterator[str]:
+    """The address that a command says it serves; it ends when it is told to, without a traceback."""
+    call = [sys.executable, "-m", "femsense", *arguments, "--json"]
+    with subprocess.Popen(call, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT) as program:
+        assert program.stdout is not None and program.stderr is not None
+        text = ""
+        while not text.endswith("\n}\n"):
+            line = program.stdout.readline()
+            assert line, program.stderr.read()
+            text += line
+        try:
+            yield json.loads(text)["url"]
+        finally:
+            program.terminate()
+            program.wait(20)
+        assert program.returncode in (0, 130) and "Traceback" not in program.stderr.read()
 
 
 def test_commands_that_name_nothing_or_too_much_are_refused(capsys: pytest.CaptureFixture[str]) -> None:

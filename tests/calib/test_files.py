@@ -85,3 +85,8 @@ def test_a_missing_calibration_is_named(tmp_path: Path) -> None:
 def test_a_calibration_is_not_written_at_a_folder(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="a folder stands"):
         write_calibration(make_calibration(), tmp_path)
+
+
+def test_a_calibration_says_itself_in_a_line() -> None:
+    said = repr(make_calibration())
+    assert said.startswith("Calibration(1 camera; ") and "mm rms of markers" in said and len(said) < 200 and "array" not in said

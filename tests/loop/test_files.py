@@ -63,3 +63,10 @@ def test_a_loop_is_not_written_at_a_file(tmp_path: Path, robot: Robot) -> None:
     (tmp_path / "file").write_text("x", encoding="utf-8")
     with pytest.raises(InputError, match="a file stands"):
         write_loop(make_loop(robot), tmp_path / "file")
+
+
+def test_a_result_says_itself_in_a_line(tmp_path: Path) -> None:
+    loop = make_loop(bar_robot(tmp_path))
+    said = repr(loop)
+    assert said.startswith(f"LoopResult({loop.verdict}: ") and all(effect.name in said for effect in loop.effects)
+    assert f"{1e3 * loop.before.validation_rms_m:.3g} → " in said and len(said) < 200

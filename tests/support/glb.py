@@ -24,7 +24,7 @@ class Glb:
     """Just enough of glTF 2.0 to put the skinned vertices of a time where a viewer would."""
 
     TYPES: ClassVar = {5121: "u1", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-    WIDTHS: ClassVar = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+    WIDTHS: ClassVar = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 
     def __init__(self, path: Path) -> None:
         data = path.read_bytes()

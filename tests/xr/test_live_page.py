@@ -3,24 +3,20 @@
 from __future__ import annotations
 
 import json
-import time
 from dataclasses import replace
 from pathlib import Path
-from threading import Event, Thread
 from typing import Any
 
 import numpy as np
 import pytest
 from browser import CHROMIUM, start_browser
+from live_bars import Source
 from streams import read_frame
 from xr_bar import write_run_with_mesh
 
-from femsense.xr.stream.hub import Hub, Message
-from femsense.xr.stream.payloads import Handle, TwinFrame
-from femsense.xr.stream.publisher import Publisher
+from femsense.xr.stream.hub import Message
+from femsense.xr.stream.payloads import TwinFrame
 from femsense.xr.stream.run_source import RunStream, frames_of, open_run
-from femsense.xr.stream.websocket import ServerOptions, WebSocketServer
-from femsense.xr.view import live_page_files
 
 pytest.importorskip("websockets")
 
@@ -40,7 +36,7 @@ await page.waitForFunction(() => {
   return robots.length === 2 && robots.every((r) => r.body && r.shown);
 }, null, { timeout: 60000 });
 await page.waitForFunction(() => document.querySelector('#sum').textContent.includes('±'), null, { timeout: 60000 });
-say({ text: await page.evaluate(() => document.body.innerText), meters: await page.locator('[role=meter]').count() });
+say({ text: await page.evaluate(() => document.body.innerText), clock: await page.textContent('#clock'), meters: await page.locator('[role=meter]').count() });
 await told();
 await page.waitForFunction(() => femsense.shown.robots.get('bar').shown?.frame === 999, null, { timeout: 60000 });
 say(await page.evaluate(() => {
@@ -62,11 +58,19 @@ await page.evaluate(() => new Promise((done) => {
   look();
   done();
 }));
+await page.evaluate(() => {
+  const proto = femsense.shown.robots.get('bar').constructor.prototype, step = proto.step;
+  globalThis.pictures = [];
+  proto.step = function (now, at, stage) {
+    step.call(this, now, at, stage);
+    if (this.id === 'bar') pictures.push([(now - this.arrived) / 1000, this.body.isStale]);
+  };
+});
 say({ watching: true });
 await stream('stale');
 await page.waitForFunction(() => globalThis.greyAfter !== undefined);
 await page.screenshot({ path: shot });
-say({ grey: await page.evaluate(() => globalThis.greyAfter), badge: await page.textContent('#badge') });
+say({ grey: await page.evaluate(() => globalThis.greyAfter), pictures: await page.evaluate(() => globalThis.pictures), badge: await page.textContent('#badge') });
 await stream('live');
 const fresh = await page.evaluate(() => !femsense.shown.robots.get('bar').body.isStale);
 await page.keyboard.press(' ');
@@ -83,42 +87,6 @@ const overflow = await page.evaluate(() => document.documentElement.scrollWidth 
 say({ fresh, overflow, problems, hosts: [...hosts] });
 await opened.close();
 """
-
-
-class Source:
-    """Two bars that stream from a thread until they are paused."""
-
-    def __init__(self, run: RunStream, page: Path) -> None:
-        self.hub, self.run, self.flowing, self.stop = Hub(), run, Event(), Event()
-        self.last: TwinFrame | None = None
-        handle = Handle("top", np.array([0.0, 0.0, 0.2]))
-        twins = [replace(run.twin, name="bar", handles=(handle,)), replace(run.twin, name="bar-2")]
-        self.publishers = [Publisher(self.hub, twin) for twin in twins]
-        self.wishes: list[dict[str, Any]] = []
-        self.hub.listen(self.heard)
-        self.server = WebSocketServer(self.hub, live_page_files(page), options=ServerOptions(port=0))
-        self.flowing.set()
-        Thread(target=self.flow, daemon=True).start()
-
-    def flow(self) -> None:
-        begun = time.monotonic()
-        for frame in frames_of(self.run, rate_hz=30.0):
-            while not self.flowing.wait(0.1) and not self.stop.is_set():
-                pass
-            if self.stop.wait(max(0.0, begun + frame.time_s - time.monotonic())):
-                return
-            shown = frame if self.last is None else replace(self.last, time_s=frame.time_s)
-            for publisher in self.publishers:
-                publisher.publish(shown)
-
-    def heard(self, message: Message, _who: str) -> None:
-        self.wishes.append(json.loads(message.payload))
-        reach = {"status": "reached", "text": "reached to 0.01 mm", "error_m": 1e-5, "inputs": []}
-        self.hub.publish([Message("femsense/bar/reach", json.dumps(reach).encode())])
-
-    def close(self) -> None:
-        self.stop.set()
-        self.hub.close()
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
@@ -139,6 +107,8 @@ def test_what_streams_is_shown_where_it_is_and_greys_when_it_stops(
     try:
         seen = said()
         assert "Contact 1" in seen["text"] and "bar-2" in seen["text"] and "live" in seen["text"]
+        within, length = (float(word) for word in seen["clock"].removesuffix(" s").split(" / "))
+        assert length == 2.0 and 0.0 <= within <= length  # though it plays over and over
         frame = list(frames_of(run, rate_hz=23 / 2.0, loop=False))[11]
         unsure = replace(frame.contacts[0], force_std_n=np.array([0.1, 0.4, 0.4]))
         source.last = replace(frame, frame=999, contacts=(unsure,))
@@ -149,6 +119,8 @@ def test_what_streams_is_shown_where_it_is_and_greys_when_it_stops(
         source.flowing.clear()
         stale = said()
         assert stale["grey"] < 900 and "stale" in stale["badge"]  # 0.4 s and a slow picture; the machine may be busy
+        assert all(grey == (age > 0.4) for age, grey in stale["pictures"])  # each picture after 0.4 s is grey, none before
+        assert any(grey for _, grey in stale["pictures"])
         source.flowing.set()
         end = said()
         assert end["fresh"] and end["overflow"] == 0 and end["problems"] == []

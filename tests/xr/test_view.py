@@ -6,19 +6,23 @@ import json
 import os
 import re
 import struct
+import tomllib
 import urllib.error
 import urllib.request
 import zlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from browser import CHROMIUM, VIEWER, run_in_browser
-from glb import Glb
-from xr_bar import START, write_run
+from glb import Glb, in_gltf
+from helpers import write_block_robot
+from xr_bar import START, bar_mesh, write_run
 
 from femsense.core.errors import InputError, MissingDependency
 from femsense.xr import run_contents, view
+from femsense.xr.surface_stress import nodal_strain
 
 
 @pytest.fixture
@@ -88,7 +92,7 @@ def test_page_that_was_not_built_is_said(run: Path, tmp_path: Path) -> None:
 def test_static_page(run: Path, page: Path, tmp_path: Path) -> None:
     index = view.write_static_page(run, tmp_path / "out", page=page)
     assert index == tmp_path / "out" / "index.html"
-    assert sorted(p.name for p in index.parent.iterdir()) == ["app.js", "contacts.json", "index.html", "robot.glb"]
+    assert sorted(p.name for p in index.parent.iterdir()) == ["app.js", "contacts.json", "fields.bin", "index.html", "robot.glb"]
 
 
 # ---- what the page is told -----------------------------------------------------------------------------------------------------
@@ -137,6 +141,31 @@ def test_refusals_name_the_file(tmp_path: Path) -> None:
         run_contents.export_run(run, tmp_path / "x.glb")
 
 
+def test_strain_of_a_stretched_and_of_a_turned_body_is_the_textbook_s(tmp_path: Path) -> None:
+    mesh = bar_mesh((1, 1, 4))
+    stretched = mesh.nodes * [1.0, 1.0, 1.1]
+    turned = mesh.nodes @ np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]) + 0.3
+    strain = nodal_strain(mesh.nodes, mesh.tets, np.array([mesh.nodes, stretched, turned]))
+    np.testing.assert_allclose(strain[[0, 2]], 0.0, atol=1e-12)
+    np.testing.assert_allclose(strain[1], 2.0 / 3.0 * 0.5 * (1.1**2 - 1.0))  # E = diag(0, 0, e): √(2/3) |dev E| = 2/3 e
+
+
+def test_landmarks_are_markers_of_the_robot_and_the_calibrated_camera(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run")
+    assert view.contacts_of_run(run)["markers"] == [] and view.contacts_of_run(run)["field"]["name"] == "strain"
+    robot = write_block_robot(tmp_path / "robot")
+    (run / "run.json").write_text(json.dumps({"inputs": {"robot": {"path": str(robot)}}}), encoding="utf-8")
+    T = np.eye(4)
+    T[:3, 3] = [0.1, 0.2, 0.3]
+    name = tomllib.loads((robot / "robot.toml").read_text(encoding="utf-8"))["markers"][0]["name"]
+    told = {"T_robot_camera": T.tolist(), "placements_m": {name: [1.0, 2.0, 3.0], "another": [0.0, 0.0, 0.0]}}
+    (run / "calibration.json").write_text(json.dumps(told), encoding="utf-8")
+    known = view.contacts_of_run(run)
+    assert known["cameras"] == [{"name": "the camera", "position": [0.1, 0.2, 0.3]}] and known["field"]["unit"] == "Pa"
+    places = {marker["name"]: marker["position"] for marker in known["markers"]}
+    assert places[name] == [1.0, 2.0, 3.0] and "another" not in places and len(places) > 1
+
+
 # ---- the sources of the page ----------------------------------------------------------------------------------------------------
 
 
@@ -183,9 +212,36 @@ const [url, shot, phone] = given;
     result.button = await page.getAttribute('#play', 'aria-label');
     await page.keyboard.press('f');
     result.forces = await page.getAttribute('#forces', 'aria-pressed');
+    await page.keyboard.press(' ');
+    await page.keyboard.press('Home');
+    await page.selectOption('#paint', 'stress');
+    await page.waitForFunction(() => document.querySelector('#scale-top').textContent.includes('strain'), null, { timeout: 60000 });
+    const paint = () => page.evaluate(() => { const p = femsense.shown.body.painter; return { field: Math.max(...p.attributes[0].array), mode: p.mode.value }; });
+    result.rest = await paint();
+    for (let i = 0; i < 6; i++) await page.keyboard.press('ArrowRight');
+    result.bent = { ...(await paint()), said: await page.textContent('#scale-top') };
+    await page.waitForTimeout(200);
+    await page.screenshot({ path: shot.replace('desk', 'stress') });
+    await page.keyboard.press('m');
+    result.contact = { ...(await paint()), place: await page.evaluate(() => femsense.shown.body.painter.places.value[0].toArray()) };
+    await page.waitForTimeout(200);
+    await page.screenshot({ path: shot.replace('desk', 'contact') });
+    await page.selectOption('#paint', 'none');
     await page.setViewportSize({ width: 360, height: 740 });
     await page.waitForTimeout(300);
     await page.screenshot({ path: phone });
+    const panel = () => page.evaluate(() => {
+      const panel = document.querySelector('#panel');
+      return { below: panel.scrollHeight - panel.clientHeight - panel.scrollTop, said: !document.querySelector('#more').hidden };
+    });
+    result.panel = [await panel()];
+    if (result.panel[0].said) await page.click('#more');
+    await page.evaluate(() => { const p = document.querySelector('#panel'); p.scrollTop = p.scrollHeight; });
+    await page.waitForTimeout(100);
+    result.panel.push(await panel());
+    await page.evaluate(() => { document.querySelector('#panel').style.maxHeight = '60px'; document.querySelector('#panel').scrollTop = 0; });
+    await page.waitForTimeout(100);
+    result.panel.push(await panel());
     result.overflow = await page.evaluate(() => document.documentElement.scrollWidth - window.innerWidth);
   }
   await opened.close();
@@ -244,6 +300,16 @@ def test_page_in_a_browser(request: pytest.FixtureRequest, run: Path, built_page
     assert str(seen["next"]).startswith("1.04") and str(seen["home"]).startswith("0.00")
     assert not str(seen["later"]).startswith("0.00") and seen["button"] == "Pause"
     assert seen["forces"] == "false" and seen["overflow"] == 0
+    rest, bent, contact = (dict(seen[name]) for name in ("rest", "bent", "contact"))  # type: ignore[call-overload]
+    states = np.load(run / "states.npz")
+    strain = nodal_strain(states["rest_nodes_m"], states["tets"], states["nodes_m"])
+    assert rest["mode"] == bent["mode"] == 2 and rest["field"] == 0 and contact["mode"] == 3
+    assert bent["field"] == pytest.approx(255 * strain[6].max() / strain.max(), abs=1)
+    assert bent["said"] == f"{100 * strain.max():.2f} % strain"
+    (touch,) = view.contacts_of_run(run)["frames"][6]["contacts"]
+    assert contact["place"][:3] == pytest.approx(in_gltf(np.array(touch["point_m"])), abs=1e-6) and contact["place"][3] > 0
+    panels: list[dict[str, Any]] = seen["panel"]  # type: ignore[assignment]
+    assert all(one["said"] == (one["below"] > 6) for one in panels) and panels[2]["said"]
     for name in ("desk.png", "phone.png"):
         red, green, blue = np.moveaxis(pixels(tmp_path / name).astype(int), -1, 0)
         assert ((blue > 120) & (blue > red + 50)).mean() > 0.005  # the blue body

@@ -31,6 +31,14 @@ def export(
         int | None,
         typer.Option("--bones", min=1, max=255, help="How many bones; chosen by itself if not given.", show_default=False),
     ] = None,
+    skin: Annotated[
+        Path | None,
+        typer.Option("--skin", metavar="FILE", help="A surface of your own: STL, OBJ, PLY or glTF.", show_default=False),
+    ] = None,
+    skin_unit: Annotated[
+        str | None, typer.Option("--skin-unit", metavar="UNIT", help="Of its coordinates: m, cm or mm.", show_default=False)
+    ] = None,
+    vertices: Annotated[int, typer.Option("--vertices", min=100, help="Of --skin at most; more are decimated.")] = 100_000,
     json: Json = False,
 ) -> Answer:
     """Write a run as a skinned, animated mesh (glTF)."""
@@ -51,8 +59,10 @@ def export(
         text = f"{shown.frames} frames, {shown.clouds} clouds, {shown.contacts} contacts"
         return Answer({"path": str(rerun), **asdict(shown)}, f"{text}\n\nwritten: {rerun}")
     from femsense.xr.export import export_glb
+    from femsense.xr.run_contents import skin_for_run
 
-    report = export_glb(run, output, bones=bones)
+    worn = None if skin is None else skin_for_run(run, skin, unit=skin_unit, budget=vertices)
+    report = export_glb(run, output, bones=bones, skin=worn)
     document = {name: getattr(report, name) for name in ("bones", "vertices", "frames", "rms_m", "max_m")}
     text = f"{report.frames} frames, {report.bones} bones, {report.vertices} vertices; {1e3 * report.rms_m:.3f} mm rms from the finite elements"
     return Answer({"path": str(output), **document}, f"{text}\n\nwritten: {output}")
@@ -72,6 +82,12 @@ def view(
         Path | None,
         typer.Option("-o", "--output", metavar="DIR", help="Write the page for a web server instead.", show_default=False),
     ] = None,
+    password_file: Annotated[
+        Path | None, typer.Option("--password-file", metavar="FILE", help="Of the stream.", show_default=False)
+    ] = None,
+    authority: Annotated[
+        Path | None, typer.Option("--authority", metavar="PEM", help="Of the stream's certificate.", show_default=False)
+    ] = None,
     json: Json = False,
 ) -> Answer:
     """Show a run or a stream on a page for browsers and headsets."""
@@ -79,7 +95,7 @@ def view(
         from femsense.app.stream_command import need_one, show_stream
 
         need_one([] if run is None else [run], stream)
-        return _live(show_stream(stream, port=port), browser)
+        return _live(show_stream(stream, port=port, password_file=password_file, authority=authority), browser)
     from femsense.xr.view import serve, write_static_page
 
     if run is None:
@@ -125,6 +141,9 @@ def stream(
         Path | None, typer.Option("--certificate", metavar="PEM", help="Encrypt with this.", show_default=False)
     ] = None,
     key: Annotated[Path | None, typer.Option("--key", metavar="PEM", help="Of the certificate.", show_default=False)] = None,
+    authority: Annotated[
+        Path | None, typer.Option("--authority", metavar="PEM", help="Of the broker's certificate.", show_default=False)
+    ] = None,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the default browser.")] = False,
     json: Json = False,
 ) -> Answer:
@@ -142,6 +161,7 @@ def stream(
         password_file=password_file,
         certificate=certificate,
         key=key,
+        authority=authority,
         rate_hz=rate,
     )
     if sensors is not None and model is not None:

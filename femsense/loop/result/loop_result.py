@@ -75,6 +75,11 @@ class LoopResult:
     evidence: Evidence | None = field(default=None, metadata=AS_EMPTY)
     """What the report draws and tabulates besides."""
 
+    def __repr__(self) -> str:
+        named = ", ".join(effect.name for effect in self.effects) or "no effect"
+        errors = [1e3 * error.validation_rms_m for error in (self.before, self.after)]
+        return f"LoopResult({self.verdict}: {named}; held-out error {errors[0]:.3g} → {errors[1]:.3g} mm)"
+
     def document(self) -> dict[str, Any]:
         """Return the content of loop.json."""
         tables = table_of(self, without=("entries", "robot", "declared"))

@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 from femsense.core.errors import InputError
 from femsense.xr.stream.hub import Hub, Message
 from femsense.xr.stream.mqtt import MqttSource, broker_address
-from femsense.xr.stream.payloads import DRAG, GLB, MODEL, STATUS, read_document, split_topic, status_bytes, topic
+from femsense.xr.stream.payloads import GLB, MODEL, RECEIVED, STATUS, read_document, split_topic, status_bytes, topic
 from femsense.xr.stream.websocket import pack, require_websockets, unpack
 
 if TYPE_CHECKING:
@@ -64,12 +64,12 @@ class Bridge:
 
     def _back(self, message: Message, _who: str) -> None:
         known = split_topic(message.topic)
-        if known is not None and known[1] == DRAG:
+        if known is not None and known[1] in RECEIVED:
             self._send(message)
 
     def _from_broker(self, message: Message) -> None:
         known = split_topic(message.topic)
-        if known is not None and known[1] != DRAG:
+        if known is not None and known[1] not in RECEIVED:
             self.hub.publish([message])
 
 

@@ -52,6 +52,16 @@ class CommandGate:
         """Whether commands go out."""
         return bool(self.commanded)
 
+    @property
+    def arrived(self) -> bool:
+        """Whether the inputs that go out are those that are wanted: limited rates have caught up."""
+        near = 1e-3
+        return self.moving and all(
+            abs(self.commanded[one.name] - _within(one, self._wanted.get(one.name, self.commanded[one.name])))
+            <= near * (one.high - one.low)
+            for one in self.inputs
+        )
+
     def step(self, now: float, current: Mapping[str, float]) -> dict[str, float] | None:
         """Return the inputs to command at a time [s], or None where none may be.
 

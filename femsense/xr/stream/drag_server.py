@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from femsense.calib.calibration import Calibration
-from femsense.control.motion import Motion
+from femsense.control.motion import REACHED, STOPPED, Motion
 from femsense.control.reach import ReachOptions, reach
 from femsense.core.arrays import FloatArray
 from femsense.fem.mesh import embed_points
@@ -25,6 +25,7 @@ from femsense.xr.stream.payloads import (
     DRAG,
     GHOST,
     INPUTS,
+    MEASURED,
     REACH,
     Handle,
     Input,
@@ -35,6 +36,7 @@ from femsense.xr.stream.payloads import (
     split_topic,
     topic,
 )
+from femsense.xr.stream.tip_feedback import FeedbackOptions, TipFeedback
 
 LARGEST_RANGE = {"N": 5.0, "m": 0.05, "Pa": 50e3}
 """Of an input for which the robot declares no limit."""
@@ -52,6 +54,8 @@ class DragOptions:
     equilibria: int = 8
     """At most so many for one answer; the next wish goes on from there."""
     command_hz: float = 50.0
+    feedback: FeedbackOptions = field(default_factory=FeedbackOptions)
+    """How what is measured corrects the inputs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,10 +108,14 @@ class DragServer:
         self.name, self.calibration = name or robot.name, calibration
         self.gate = CommandGate(drive_inputs(robot), self.options.gate)
         self._skin, self._fit = embed_points(robot.body.mesh, skin.rest), prepare_poses(skin)
+        self._size = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
         self._bones: FloatArray | None = None
         self._motion: Motion | None = None
         self._wish: Wish | None = None
         self._driver, self._driver_at = "", float("-inf")
+        self.feedback = TipFeedback(self._size, self.options.feedback)
+        self._handle = ""
+        self._settled_since: float | None = None
         self._fresh, self._stop, self._lock = Event(), Event(), Lock()
         self._seq = 0
         hub.listen(self._hear)
@@ -128,6 +136,22 @@ class DragServer:
         known = split_topic(message.topic)
         if known is None or topic(known[0], DRAG) != topic(self.name, DRAG):
             return
+        if known[1] == MEASURED:
+            self._measure(message.payload)
+        elif known[1] == DRAG:
+            self._take(message, who)
+
+    def _measure(self, payload: bytes) -> None:
+        """Take note of where the dragged marker was measured."""
+        rows = (read_document(payload) or {}).get("markers")
+        named = [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
+        places = {row.get("name"): _place(row.get("position_m")) for row in named}
+        with self._lock:
+            place = places.get(self._handle)
+            if place is not None and self._is_near(place):
+                self.feedback.measured(time.monotonic(), np.array(place))
+
+    def _take(self, message: Message, who: str) -> None:
         wish = self._read(message.payload, who)
         now = time.monotonic()
         with self._lock:
@@ -135,6 +159,9 @@ class DragServer:
                 return  # one hand at a time
             self._driver, self._driver_at = (who, now) if wish.held else ("", float("-inf"))
             self.gate.hold(now, armed=wish.armed and wish.held)
+            if not wish.held or wish.handle != self._handle:
+                self.feedback.forget()
+            self._handle = wish.handle if wish.held else ""
             self._wish = wish if wish.held else None
         self._fresh.set()
 
@@ -147,11 +174,13 @@ class DragServer:
         target = _place(told.get("target_m"))
         if handle not in self.robot.glued_names or (held and target is None):
             return None
-        nodes = self.robot.body.mesh.nodes
-        size = float(np.linalg.norm(np.ptp(nodes, axis=0)))
-        if target is not None and np.linalg.norm(np.subtract(target, nodes.mean(axis=0))) > FAR * size:
+        if target is not None and not self._is_near(target):
             return None
         return Wish(who, str(handle), target, held, told.get("armed") is True)
+
+    def _is_near(self, place_m: tuple[float, float, float]) -> bool:
+        middle = self.robot.body.mesh.nodes.mean(axis=0)
+        return float(np.linalg.norm(np.subtract(place_m, middle))) <= FAR * self._size
 
     # ---- answers
 
@@ -165,12 +194,20 @@ class DragServer:
                 self.answer(wish.handle, wish.target_m)
 
     def answer(self, handle: str, target_m: tuple[float, float, float]) -> Motion:
-        """Find inputs for one wish, publish what was found, and set it as what the gate moves to."""
+        """Find inputs for one wish, publish what was found, and set it as what the gate moves to.
+
+        What is measured of the point while the robot stands still moves the model's target (see `tip_feedback`).
+        """
         begun = time.perf_counter()
+        with self._lock:
+            last = self._motion
+            reached = None if last is None or last.status == REACHED else last.reached_m.get(handle)
+            since = self._settled()
+            wanted = self.feedback.target(time.monotonic(), np.array(target_m), settled_since=since, reached_m=reached)
         own = ReachOptions(tolerance_m=self.options.tolerance_m, max_iterations=self.options.equilibria)
         motion = reach(
             self.robot,
-            {handle: np.array(target_m)},
+            {handle: wanted},
             limits={one.name: (one.low, one.high) for one in self.gate.inputs},
             start=self._motion,
             calibration=self.calibration,
@@ -187,14 +224,27 @@ class DragServer:
         self.hub.publish([Message(topic(self.name, GHOST), ghost), Message(topic(self.name, REACH), found)])
         return motion
 
+    def _settled(self) -> float | None:
+        """Return since when the commanded inputs are those of the newest answer, or None."""
+        if self._motion is None or self._motion.status == STOPPED or not self.gate.arrived:
+            self._settled_since = None
+        elif self._settled_since is None:
+            self._settled_since = time.monotonic()
+        return self._settled_since
+
     def _document(self, motion: Motion, ms: float) -> bytes:
         units = {one.name: one.unit for one in self.gate.inputs}
+        missed = self.feedback.missed_m
+        measured = "" if np.isnan(missed) else f"; measured {1e3 * missed:.1f} mm off"
+        known = {} if np.isnan(missed) else {"measured_error_m": missed}
         return json.dumps(
             {
                 "header": header(self._seq, time.time(), "robot"),
                 "status": motion.status,
-                "text": motion.text,
+                "text": motion.text + measured,
                 "error_m": motion.error_m,
+                **known,
+                "correction_m": float(np.linalg.norm(self.feedback.correction_m)),
                 "ms": ms,
                 "armed": self.gate.moving,
                 "inputs": [{"name": name, "unit": units[name], "value": value} for name, value in motion.inputs.items()],

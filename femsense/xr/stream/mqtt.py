@@ -7,7 +7,7 @@ import contextlib
 import logging
 import socket
 import ssl
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Event, Thread
@@ -15,13 +15,16 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote, urlsplit
 
 from femsense.core.errors import InputError, MissingDependency
+from femsense.xr.stream.access import Access
 from femsense.xr.stream.hub import Hub, Message
-from femsense.xr.stream.payloads import PREFIX, STATUS, status_bytes, topic
+from femsense.xr.stream.payloads import PREFIX, RECEIVED, STATUS, split_topic, status_bytes, topic
 
 if TYPE_CHECKING:
     from paho.mqtt.client import Client
 
 PLAIN_PORT, TLS_PORT = 1883, 8883
+WANTED = tuple(f"{PREFIX}/+/{kind}" for kind in RECEIVED)
+"""Topics that clients of a broker may send to us."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +71,7 @@ class MqttSink:
         self._client.on_connect = self._greet
         self.connected = Event()
         self._client.on_disconnect = lambda *_: self.connected.clear()
+        self._client.on_message = lambda _c, _d, got: hub.received(Message(got.topic, bytes(got.payload)), "MQTT")
         self._client.connect_async(address.host, address.port, keepalive=5)
         self._client.loop_start()
         hub.attach(self)
@@ -87,6 +91,7 @@ class MqttSink:
     def _greet(self, client: Client, _data: Any, _flags: Any, reason: Any, _more: Any) -> None:
         if reason.is_failure:
             return
+        client.subscribe([(one, 0) for one in WANTED])
         self.connected.set()
         self.send(tuple(message for message in self.hub.newest().values() if message.retained))
 
@@ -94,13 +99,23 @@ class MqttSink:
 class MqttSource:
     """Receives from a broker what streams there."""
 
-    def __init__(self, address: BrokerAddress, receive: Callable[[Message], None], *, topics: str = f"{PREFIX}/#") -> None:
-        """Call receive(message) in a thread of its own, for the topics that a filter names. Raises MissingDependency."""
+    def __init__(
+        self, address: BrokerAddress, receive: Callable[[Message], None], *, topics: Sequence[str] = (f"{PREFIX}/#",)
+    ) -> None:
+        """Call receive(message) in a thread of its own, for the topics that filters name. Raises MissingDependency."""
         self._client = make_client(address)
-        self._client.on_connect = lambda client, *_: client.subscribe(topics)
+        self.connected = Event()
+        self._topics = tuple(topics)
+        self._client.on_connect = self._greet
+        self._client.on_disconnect = lambda *_: self.connected.clear()
         self._client.on_message = lambda _c, _d, got: receive(Message(got.topic, bytes(got.payload)))
         self._client.connect_async(address.host, address.port, keepalive=5)
         self._client.loop_start()
+
+    def _greet(self, client: Client, _data: Any, _flags: Any, reason: Any, _more: Any) -> None:
+        if not reason.is_failure:
+            client.subscribe([(one, 0) for one in self._topics])
+            self.connected.set()
 
     def send(self, message: Message) -> None:
         """Publish a message."""
@@ -139,15 +154,23 @@ def _without_delay(_client: Any, _data: Any, endpoint: Any) -> None:
 
 
 class EmbeddedBroker:
-    """A broker in this program, for clients on this machine; a sink of a hub, so that messages reach clients in one step."""
+    """A broker in this program, for clients on this machine unless a password is set; a sink of a hub: messages reach clients in one step."""
 
-    def __init__(self, hub: Hub, *, port: int = PLAIN_PORT) -> None:
-        """Start to serve on 127.0.0.1. Raises MissingDependency, InputError where the port is taken."""
+    def __init__(self, hub: Hub, *, port: int = PLAIN_PORT, access: Access | None = None) -> None:
+        """Start to serve. Raises MissingDependency, InputError where the port is taken.
+
+        Arguments:
+            hub: whose messages clients get; wishes and measurements of clients go there.
+            port: 0 takes a free one.
+            access: where it listens, its password, and the certificate that encrypts; 127.0.0.1 alone and none by default.
+        """
         try:
             import amqtt.broker  # noqa: F401
         except ImportError:
             raise MissingDependency("a broker needs the package amqtt\n  try:      pip install 'femsense[xr]'") from None
         self.port = port or _free_port()
+        self._access, self._hub = access or Access(), hub
+        self._access.tls()  # says at once what is wrong with a certificate
         self._loop = asyncio.new_event_loop()
         self._broker: Any = None
         self._waiting: dict[str, Message] = {}
@@ -188,11 +211,12 @@ class EmbeddedBroker:
 
         for name in ("amqtt", "transitions"):
             logging.getLogger(name).setLevel(logging.CRITICAL)
-        plugins: dict[str, Any] = {"amqtt.plugins.authentication.AnonymousAuthPlugin": {"allow_anonymous": True}}
-        settings: dict[str, Any] = {
-            "listeners": {"default": {"type": "tcp", "bind": f"127.0.0.1:{self.port}", "max_connections": 64}},
-            "plugins": plugins,
-        }
+        guests = {"receive": self._hear, "password": self._access.password or ""}
+        listener: dict[str, Any] = {"type": "tcp", "bind": f"{self._access.host}:{self.port}", "max_connections": 64}
+        if self._access.certificate is not None:
+            key = self._access.key or self._access.certificate
+            listener |= {"ssl": True, "certfile": str(self._access.certificate), "keyfile": str(key)}
+        settings = {"listeners": {"default": listener}, "plugins": {"femsense.xr.stream.broker_guests.Guests": guests}}
         try:
             self._broker = Broker(settings)
             await self._broker.start()
@@ -206,6 +230,11 @@ class EmbeddedBroker:
             await asyncio.wait_for(self._broker.shutdown(), 3.0)
         for task in asyncio.all_tasks() - {asyncio.current_task()}:
             task.cancel()
+
+    def _hear(self, message: Message, who: str) -> None:
+        known = split_topic(message.topic)
+        if known is not None and known[1] in RECEIVED:
+            self._hub.received(message, who)
 
     def _take(self, messages: tuple[Message, ...]) -> None:
         """Start to deliver, unless the last delivery is still going on: then the newest of each topic waits."""

@@ -22,6 +22,7 @@ import numpy.typing as npt
 
 from femsense.core.arrays import FloatArray, freeze
 from femsense.core.errors import InputError
+from femsense.xr.landmarks import Landmarks
 
 PREFIX = "femsense"
 MODEL, GLB, POSE, POSE_JSON, FORCE, INPUTS, CLOUD, STATUS = (
@@ -34,7 +35,9 @@ MODEL, GLB, POSE, POSE_JSON, FORCE, INPUTS, CLOUD, STATUS = (
     "cloud",
     "status",
 )
-DRAG, GHOST, REACH, COMMAND = "drag", "ghost", "reach", "command"
+DRAG, GHOST, REACH, COMMAND, MEASURED = "drag", "ghost", "reach", "command", "measured"
+RECEIVED = (DRAG, MEASURED)
+"""What others may send: wishes, and where markers of the robot are."""
 RETAINED = (MODEL, GLB, STATUS)
 """Kept by the broker, so that who comes late has them at once."""
 SCHEMA = "femsense-model-1"
@@ -88,6 +91,10 @@ class Twin:
     handles: tuple[Handle, ...] = ()
     commands: bool = False
     """Whether commands may be published once a viewer arms them."""
+    landmarks: Landmarks = field(default_factory=Landmarks)
+    """What the real robot shares with it."""
+    duration_s: float = float("nan")
+    """Of a run that is played over and over; nan: none is."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -123,6 +130,8 @@ class TwinFrame:
     status: str = ""
     frame: int = -1
     """Number in the recording; -1: none."""
+    run_s: float = float("nan")
+    """From the beginning of a run that is played over and over."""
     cloud: npt.NDArray[np.float32] | None = None
     """Measured points and their distance from the surface [m], shape (n, 4)."""
 
@@ -191,21 +200,27 @@ def model_bytes(twin: Twin, glb_url: str) -> bytes:
     import hashlib
 
     bones = [{"name": name, **_pose_table(row)} for name, row in zip(twin.bone_names, bone_rows(twin.T_robot_bone))]
+    known = twin.landmarks
     return _json(
-        {
-            "schema": SCHEMA,
-            "name": twin.name,
-            "glb": glb_url,
-            "glb_sha256": hashlib.sha256(twin.glb).hexdigest(),
-            "frame": "robot: right-handed, Z up",
-            "length_unit": "m",
-            "force_unit": "N",
-            "pose": "FSP1",
-            "bones": bones,
-            "inputs": [_known({"name": i.name, "unit": i.unit, "low": i.low, "high": i.high}) for i in twin.inputs],
-            "handles": [{"name": h.name, "position_m": _vector(h.position_m)} for h in twin.handles],
-            "commands": twin.commands,
-        }
+        _known(
+            {
+                "schema": SCHEMA,
+                "name": twin.name,
+                "glb": glb_url,
+                "glb_sha256": hashlib.sha256(twin.glb).hexdigest(),
+                "frame": "robot: right-handed, Z up",
+                "length_unit": "m",
+                "force_unit": "N",
+                "pose": "FSP1",
+                "bones": bones,
+                "inputs": [_known({"name": i.name, "unit": i.unit, "low": i.low, "high": i.high}) for i in twin.inputs],
+                "handles": [{"name": h.name, "position_m": _vector(h.position_m)} for h in twin.handles],
+                "commands": twin.commands,
+                "markers": [{"name": m.name, "position_m": _vector(m.position_m)} for m in known.markers],
+                "cameras": [{"name": c.name, "position_m": _vector(c.position_m)} for c in known.cameras],
+                "duration_s": twin.duration_s,
+            }
+        )
     )
 
 
@@ -216,6 +231,7 @@ def force_bytes(seq: int, frame: TwinFrame) -> bytes:
         "frame": frame.frame,
         "status": frame.status,
         "residual_m": frame.residual_m,
+        "run_s": frame.run_s,
         "contacts": [_contact_table(contact) for contact in frame.contacts],
     }
     return _json(_known(document))
@@ -225,6 +241,12 @@ def inputs_bytes(seq: int, time_s: float, inputs: Sequence[Input], values: Seque
     """Return what drives the robot at a moment."""
     rows = [_known({"name": i.name, "unit": i.unit, "value": float(v)}) for i, v in zip(inputs, values)]
     return _json({"header": header(seq, time_s, "robot"), "inputs": rows})
+
+
+def measured_bytes(seq: int, time_s: float, markers: Mapping[str, npt.ArrayLike]) -> bytes:
+    """Return where markers of a robot were measured, name → place [m], robot frame, shape (3,)."""
+    rows = [{"name": name, "position_m": _vector(place)} for name, place in markers.items()]
+    return _json({"header": header(seq, time_s, "robot"), "markers": rows})
 
 
 def pose_json_bytes(seq: int, time_s: float, bones: npt.NDArray[np.float32]) -> bytes:

@@ -159,7 +159,7 @@ def _topic(source: str, stop: Event) -> Iterator[bytes]:
             waiting.put_nowait(payload)
 
     address = broker_address(f"{parts.scheme}://{parts.netloc}")
-    with closing(MqttSource(address, lambda message: take(message.payload), topics=name)):
+    with closing(MqttSource(address, lambda message: take(message.payload), topics=(name,))):
         while not stop.is_set():
             with suppress(queue.Empty):
                 yield waiting.get(timeout=WAIT_S)

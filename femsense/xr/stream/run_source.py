@@ -15,6 +15,7 @@ import numpy.typing as npt
 from femsense.core.arrays import FloatArray, freeze
 from femsense.core.errors import FemsenseError
 from femsense.xr.glb_reader import AnimatedSkin, read_glb
+from femsense.xr.landmarks import landmarks_of_run
 from femsense.xr.run_contents import contacts_of_run, current_glb, run_folder
 from femsense.xr.stream.payloads import Contact, Input, Twin, TwinFrame
 
@@ -66,6 +67,8 @@ def open_run(folder: str | Path, *, name: str | None = None, clouds: bool = True
         bone_names=skeleton.names,
         T_robot_bone=skeleton.T_robot_bone,
         inputs=tuple(Input(**entry) for entry in told["inputs"]),
+        landmarks=landmarks_of_run(run),
+        duration_s=float(skin.time_s[-1]),
     )
     frames = tuple(told["frames"])
     measured = _clouds(run, frames) if clouds else None
@@ -117,6 +120,7 @@ def _frame(stream: RunStream, t: float, sent_at: float, nearest: int) -> TwinFra
         residual_m=_or_nan(told["rms_after_m"]),
         status=told["status"] or "",
         frame=-1 if told["frame"] is None else told["frame"],
+        run_s=t,
         cloud=stream.clouds[nearest],
     )
 

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 from femsense.core.errors import InputError, MissingDependency
 from femsense.xr.stream.access import COOKIE, Access, same_origin
 from femsense.xr.stream.hub import Hub, Message
-from femsense.xr.stream.payloads import DRAG, GLB, split_topic, topic
+from femsense.xr.stream.payloads import GLB, RECEIVED, split_topic, topic
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import Server, ServerConnection
@@ -302,7 +302,7 @@ def _wanted(frame: str | bytes) -> Message | None:
     except InputError:
         return None
     known = split_topic(messages[0].topic) if len(messages) == 1 else None
-    return messages[0] if known is not None and known[1] == DRAG else None
+    return messages[0] if known is not None and known[1] in RECEIVED else None
 
 
 def _response(status: HTTPStatus, body: bytes, more: Mapping[str, str] | None = None) -> Response:

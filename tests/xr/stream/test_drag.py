@@ -16,12 +16,14 @@ from streams import within
 
 import femsense as fs
 from femsense.fem.mesh import embed_points, surface_triangles, to_quadratic
+from femsense.model.effects import apply_effects
 from femsense.model.robot import Observation, Robot, plain_actuation
 from femsense.xr.skinning import fit_skin
 from femsense.xr.stream.command_gate import CommandGate, GateOptions
 from femsense.xr.stream.drag_server import DragOptions, DragServer, drive_inputs, handles_of
 from femsense.xr.stream.hub import Hub, Message
 from femsense.xr.stream.payloads import Input, read_pose
+from femsense.xr.stream.tip_feedback import FeedbackOptions, TipFeedback
 
 TIP = np.array([[0.1, 0.015, 0.03], [0.1, 0.0, 0.015]])
 INPUTS = (Input("top", "N", 0.0, 4.0), Input("side", "N", 0.5, 2.5))
@@ -122,6 +124,49 @@ def test_the_tip_of_another_mesh_arrives_and_stops_when_let_go(served: tuple[Hub
     count = len(there.heard)
     time.sleep(0.2)
     assert len(there.heard) == count
+
+
+@pytest.mark.parametrize("post", [None, (np.array([0.05, 0.015, 0.03]), 0.0325)])
+def test_what_is_measured_brings_the_tip_home_though_law_mesh_and_contact_are_unknown(
+    served: tuple[Hub, DragServer, ObedientRobot], post: tuple[np.ndarray, float] | None
+) -> None:
+    hub, server, _ = served
+    other = apply_effects(bar((6, 2, 2)), [{"name": "hyperelastic", "law": "neo_hookean"}, {"name": "stiffness", "scale": 1.15}])
+    real = ObedientRobot(hub, other, "bar", drive_inputs(server.robot), post=post)
+    names = server.robot.body.cable_names
+    real.inputs = dict(zip(names, (1.5, 0.6)))  # somewhere that two cables can bring it, past the post too
+    wanted = real.place(0)
+    assert np.linalg.norm(wanted - target_of(server.robot, real.inputs)) > 3e-3
+    real.inputs = dict.fromkeys(names, 0.0)
+    missed: list[float] = []
+    end = time.monotonic() + 20.0
+    while time.monotonic() < end and not (len(missed) > 10 and max(missed[-3:]) < 5e-4):
+        drag(hub, wanted)
+        time.sleep(0.03)
+        real.report(("tip", "side"))
+        missed.append(float(np.linalg.norm(real.place(0) - wanted)))
+    assert max(missed[-3:]) < 1e-3 and max(missed) > 0.01
+    assert reach_of(hub)["correction_m"] > 1e-3 and reach_of(hub)["measured_error_m"] < 2e-3
+    assert (real.pushed_n > 0.02) == (post is not None)
+    assert all(one.low <= heard[one.name] <= one.high for _, heard in real.heard for one in server.gate.inputs)
+    drag(hub, wanted, held=False)
+    assert within(2.0, lambda: not real.armed) and not server.feedback.correction_m.any()
+
+
+def test_a_correction_is_bounded_waits_for_the_robot_and_forgets() -> None:
+    feedback, wanted = TipFeedback(0.1, FeedbackOptions(time_s=0.3, most_share=0.1)), np.array([0.0, 0.0, 0.2])
+    feedback.measured(1.0, np.zeros(3))
+    np.testing.assert_array_equal(feedback.target(1.0, wanted, settled_since=None), wanted)  # still on its way
+    np.testing.assert_array_equal(feedback.target(1.1, wanted, settled_since=1.05), wanted)  # measured before it stood still
+    for k in range(40):
+        feedback.measured(2.0 + 0.1 * k, np.zeros(3))
+        target = feedback.target(2.0 + 0.1 * k, wanted, settled_since=1.05)
+    assert np.linalg.norm(target - wanted) == pytest.approx(0.01) and target[2] > wanted[2]
+    assert feedback.missed_m == pytest.approx(0.2)
+    feedback.target(9.0, wanted, settled_since=1.05)
+    assert np.isnan(feedback.missed_m)  # too old to say anything
+    feedback.forget()
+    np.testing.assert_array_equal(feedback.target(9.0, wanted, settled_since=1.05), wanted)
 
 
 def test_without_arming_the_ghost_moves_and_the_robot_does_not(served: tuple[Hub, DragServer, ObedientRobot]) -> None:

@@ -14,9 +14,11 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from certificates import self_signed
 from streams import GLB, PAGE, closing, moment, twin, within, x_of
 
 from femsense.core.errors import InputError
+from femsense.xr.stream.access import Access
 from femsense.xr.stream.bridge import Bridge
 from femsense.xr.stream.hub import Hub, Message
 from femsense.xr.stream.mqtt import BrokerAddress, EmbeddedBroker, MqttSink, MqttSource, broker_address
@@ -32,9 +34,9 @@ needs_mosquitto = pytest.mark.skipif(MOSQUITTO is None, reason="no mosquitto on 
 class Heard:
     """What an MQTT client hears."""
 
-    def __init__(self, port: int) -> None:
+    def __init__(self, port: int, address: BrokerAddress | None = None) -> None:
         self.messages: dict[str, bytes] = {}
-        self.source = MqttSource(BrokerAddress("127.0.0.1", port), self.take)
+        self.source = MqttSource(address or BrokerAddress("127.0.0.1", port), self.take)
 
     def take(self, message: Message) -> None:
         self.messages[message.topic.rpartition("/")[2]] = message.payload
@@ -127,6 +129,50 @@ def test_a_program_that_is_killed_is_announced_as_lost(tmp_path: Path) -> None:
             assert within(20.0, lambda: heard.state() == "live")
             program.send_signal(signal.SIGKILL)
             assert within(10.0, lambda: heard.state() == "lost")
+
+
+def test_a_broker_with_a_password_and_a_certificate_serves_who_has_both(tmp_path: Path) -> None:
+    certificate, key = self_signed(tmp_path)
+    hub, got = Hub(), []
+    hub.listen(lambda message, _: got.append(message))
+    Publisher(hub, twin())
+    broker = EmbeddedBroker(hub, port=0, access=Access(password="secret", certificate=certificate, key=key))
+    url = f"mqtts://me:secret@127.0.0.1:{broker.port}"
+    heard = {
+        name: Heard(broker.port, broker_address(text, authority=authority))
+        for name, text, authority in (
+            ("both", url, certificate),
+            ("no certificate", url, None),
+            ("no encryption", url.replace("mqtts", "mqtt"), None),
+            ("wrong password", url.replace("secret", "guess"), certificate),
+            ("no password", url.replace("me:secret@", ""), certificate),
+        )
+    }
+    with closing(*heard.values(), hub):
+        assert within(10.0, lambda: heard["both"].messages.get("glb") == GLB)
+        heard["both"].source.send(Message("femsense/arm/measured", b"{}"))
+        assert within(5.0, lambda: [m.topic for m in got] == ["femsense/arm/measured"])
+        assert within(1.0, lambda: False) is False
+        assert [name for name, one in heard.items() if one.messages] == ["both"]
+    with pytest.raises(InputError, match="not a certificate"):
+        EmbeddedBroker(hub, port=0, access=Access(certificate=key))
+
+
+def test_wishes_and_measurements_come_in_by_a_broker() -> None:
+    hub, got = Hub(), []
+    hub.listen(lambda message, _: got.append(message.topic))
+    broker = EmbeddedBroker(hub, port=0)
+    other = Hub()
+    sink = MqttSink(other, BrokerAddress("127.0.0.1", broker.port), "arm")
+    others: list[str] = []
+    other.listen(lambda message, _: others.append(message.topic))
+    client = Heard(broker.port)
+    with closing(client, sink, hub):
+        assert sink.connected.wait(5.0) and within(5.0, lambda: client.source.connected.is_set())
+        for kind in ("drag", "pose", "measured"):
+            client.source.send(Message(f"femsense/arm/{kind}", b"{}"))
+        wanted = ["femsense/arm/drag", "femsense/arm/measured"]
+        assert within(5.0, lambda: got == wanted) and within(5.0, lambda: others == wanted)
 
 
 def test_a_bridge_brings_a_broker_to_the_page() -> None:

@@ -134,7 +134,7 @@ function sideways(force: Vector3, std: Vector | null): number {
   return Math.sqrt(Math.max(0, total - inLine) / 2);
 }
 
-class Label {
+export class Label {
   readonly sprite: Sprite;
   private readonly canvas = document.createElement("canvas");
   private readonly texture: CanvasTexture;

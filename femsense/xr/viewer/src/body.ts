@@ -19,6 +19,7 @@ import {
 import { GLTFLoader, type GLTF } from "three/addons/loaders/GLTFLoader.js";
 import { ForceArrows } from "./arrows";
 import type { Contact } from "./data";
+import { Painter, type Paint } from "./paint";
 
 const STALE = new Color(0x6b727c);
 const FAR = 4; // residuals beyond so many times the scale belong to the surroundings
@@ -38,12 +39,12 @@ export class Body {
   readonly bones: Bone[];
   readonly size: number;
   readonly arrows: ForceArrows;
+  readonly painter: Painter;
   /** Residual that has the full colour [m]. */
   readonly residualScale: number;
   private readonly ghost = new Group();
   private readonly cloud = new Points(new BufferGeometry(), new PointsMaterial({ size: 3, sizeAttenuation: false, vertexColors: true }));
   private readonly colors = new Map<MeshStandardMaterial, Color>();
-  private readonly move = { value: 0 };
   private stale = false;
   private cloudSeen = false;
 
@@ -54,6 +55,7 @@ export class Body {
     this.size = rest.getSize(new Vector3()).length() || 1;
     this.residualScale = niceLength(0.004 * this.size);
     this.arrows = new ForceArrows(this.size);
+    this.painter = new Painter(this.size);
     this.robotFrame.rotation.x = -Math.PI / 2;
     this.robotFrame.add(this.arrows.group, this.cloud);
     this.cloud.frustumCulled = false;
@@ -81,6 +83,7 @@ export class Body {
 
   show(contacts: Contact[]): void {
     this.arrows.show(contacts);
+    this.painter.contacts(contacts);
   }
 
   /** Greys the body out: what it shows is old. */
@@ -104,9 +107,14 @@ export class Body {
     this.ghost.visible = visible;
   }
 
-  /** Colours the body by how far each point has moved from rest; 0 switches it off. */
-  colorByMotion(largest: number): void {
-    this.move.value = largest;
+  /** Colours the body. */
+  paint(paint: Paint): void {
+    this.painter.show(paint, this.motionScale);
+  }
+
+  /** Motion that has the full colour [m]. */
+  get motionScale(): number {
+    return 0.15 * this.size;
   }
 
   showCloud(visible: boolean): void {
@@ -140,7 +148,7 @@ export class Body {
     const material = (skin.material as MeshStandardMaterial).clone();
     skin.material = material;
     this.colors.set(material, material.color.clone());
-    colorMotion(material, this.move);
+    this.painter.prepare(material, skin);
     const pale = new MeshBasicMaterial({ color: 0xb8c7db, transparent: true, opacity: 0.16, depthWrite: false });
     this.ghost.add(new Mesh(skin.geometry, pale));
   }
@@ -166,27 +174,6 @@ export function residualColor(share: number, into: Color): Color {
 export function niceLength(length: number): number {
   const ten = 10 ** Math.floor(Math.log10(length));
   return ([1, 2, 5].find((f) => f * ten >= length) ?? 10) * ten;
-}
-
-/** Lets a material take its colour from the way that skinning moves each point. */
-function colorMotion(material: MeshStandardMaterial, largest: { value: number }): void {
-  material.onBeforeCompile = (shader) => {
-    shader.uniforms.largestMotion = largest;
-    shader.vertexShader = shader.vertexShader
-      .replace("#include <common>", "#include <common>\nvarying float vMotion;")
-      .replace("#include <skinning_vertex>", "#include <skinning_vertex>\nvMotion = length(transformed - position);");
-    shader.fragmentShader = shader.fragmentShader
-      .replace("#include <common>", "#include <common>\nvarying float vMotion;\nuniform float largestMotion;")
-      .replace(
-        "#include <color_fragment>",
-        `#include <color_fragment>
-        if (largestMotion > 0.0) {
-          float s = clamp(vMotion / largestMotion, 0.0, 1.0);
-          vec3 low = vec3(0.03, 0.02, 0.20), middle = vec3(0.10, 0.42, 0.42), high = vec3(0.95, 0.80, 0.10);
-          diffuseColor.rgb = s < 0.5 ? mix(low, middle, 2.0 * s) : mix(middle, high, 2.0 * s - 1.0);
-        }`,
-      );
-  };
 }
 
 function skinned(scene: Object3D): SkinnedMesh[] {

@@ -18,7 +18,14 @@ export interface Contact {
   std_n: number | null;
   source: string;
   point_std_m: Vector | null;
+  radius_m?: number | null;
   force_std_n: Vector | null;
+}
+
+/** A marker at rest, or a camera, in the robot frame [m]. */
+export interface NamedPoint {
+  name: string;
+  position: Vector;
 }
 
 export interface Frame {
@@ -26,6 +33,7 @@ export interface Frame {
   frame: number | null; // number in the recording
   status: string | null;
   rms_after_m: number | null;
+  run_s?: number | null; // from the beginning of a run that is played over and over
   inputs: (number | null)[] | null;
   contacts: Contact[];
 }
@@ -34,6 +42,9 @@ export interface Run {
   name: string;
   inputs: Input[];
   frames: Frame[];
+  markers: NamedPoint[];
+  cameras: NamedPoint[];
+  field?: { name: string; unit: string } | null; // of fields.bin: the largest value, then its share at each vertex of each frame
 }
 
 /** Returns the run, or null where none is served: the mesh alone can be shown too. */
@@ -43,7 +54,7 @@ export async function loadRun(url: string): Promise<Run | null> {
   if (!answer.ok) throw new Error(`${url} could not be loaded (${answer.status}).`);
   const run = (await answer.json()) as Run & { format?: string };
   if (run.format !== "femsense-contacts-1") throw new Error(`${url} is not a list of contacts that this page knows.`);
-  return { ...run, inputs: run.inputs ?? [] };
+  return { ...run, inputs: run.inputs ?? [], markers: run.markers ?? [], cameras: run.cameras ?? [] };
 }
 
 /** Returns the index of the frame whose time is nearest. */

@@ -5,6 +5,7 @@ import {
   Color,
   Line,
   LineBasicMaterial,
+  Matrix4,
   Mesh,
   MeshBasicMaterial,
   MeshStandardMaterial,
@@ -18,18 +19,22 @@ import {
 } from "three";
 import { clone } from "three/addons/utils/SkeletonUtils.js";
 import { poseBones, type Body } from "./body";
-import { amount } from "./data";
-import type { Handle, Reach } from "./messages";
+import { amount, type NamedPoint } from "./data";
+import type { Reach } from "./messages";
+import { tied, type Hand, type Hold } from "./headset";
 import { element } from "./readout";
+import { tie } from "./ties";
 import type { Stage } from "./stage";
 
 const EVERY_MS = 33; // wishes are sent so often while held: the robot stops when they stop
 const STEP = 0.01; // of the body's size, for a key
+const TOUCH = 0.03; // a hand that is nearer to a handle touches it [m]
+const NEAR = 0.04; // of the body's size: a ray that passes a handle so closely points at it
 
 interface Subject {
   id: string;
   body: Body;
-  handles: Handle[];
+  handles: NamedPoint[];
   commands: boolean;
 }
 
@@ -48,7 +53,7 @@ export class Dragging {
   private readonly plane = new Plane();
   private readonly ray = new Raycaster();
   private readonly wish = new Vector3(); // in the world
-  private anchors: { vertex: number; skin: SkinnedMesh; offset: Vector3 }[] = [];
+  private places: (() => Vector3)[] = [];
 
   constructor(
     private readonly stage: Stage,
@@ -89,8 +94,12 @@ export class Dragging {
       subject.body.group.add(ball);
       this.balls.push(ball);
     }
-    this.anchors = subject.handles.map((handle) => anchor(subject.body, handle));
+    this.places = subject.handles.map((handle) => tie(subject.body, handle.position));
     this.choices();
+  }
+
+  get on(): boolean {
+    return this.enabled;
   }
 
   enable(on: boolean): void {
@@ -108,7 +117,7 @@ export class Dragging {
   step(): void {
     if (!this.enabled || !this.subject) return;
     this.balls.forEach((ball, i) => {
-      ball.position.copy(this.place(i));
+      ball.position.copy(this.places[i]!());
       ball.scale.setScalar(i === (this.held ?? this.chosen) ? 1.25 : 1);
     });
     if (this.held !== null && performance.now() - this.sent >= EVERY_MS) this.say();
@@ -122,6 +131,19 @@ export class Dragging {
     const wish = { handle: this.subject.handles[this.held]!.name, target_m: { x: local.x, y: local.y, z: local.z }, held: true, armed: this.armed, seq: this.seq++ };
     this.send(this.subject.id, wish);
     this.draw();
+  }
+
+  /** Takes a handle that a hand touches, or that it points at; the wish then moves with the hand. */
+  take(hand: Hand): Hold | null {
+    if (!this.enabled || !this.subject || this.held !== null) return null;
+    const places = this.balls.map((ball) => ball.getWorldPosition(new Vector3()));
+    const size = NEAR * this.subject.body.size;
+    const touched = closest(places.map((place) => place.distanceTo(hand.point)), TOUCH);
+    const index = touched ?? closest(places.map((place) => hand.ray.distanceToPoint(place)), size);
+    if (index === null) return null;
+    this.begin(index);
+    const place = tied(hand, new Matrix4().setPosition(this.wish));
+    return { follow: () => void this.wish.setFromMatrixPosition(place()), release: () => this.release() };
   }
 
   /** Shows what the server found, and where the robot would be. */
@@ -215,15 +237,6 @@ export class Dragging {
     this.ray.setFromCamera(at, this.stage.camera);
   }
 
-  /** Returns where a handle is now, in the frame of the body's group. */
-  private place(index: number): Vector3 {
-    const { skin, vertex, offset } = this.anchors[index]!;
-    const at = new Vector3();
-    skin.getVertexPosition(vertex, at);
-    const bone = skin.skeleton.bones[skin.geometry.getAttribute("skinIndex")!.getX(vertex)]!;
-    return at.add(offset.clone().applyQuaternion(bone.quaternion).applyEuler(this.subject!.body.robotFrame.rotation));
-  }
-
   private draw(): void {
     const from = this.balls[this.held!]!.getWorldPosition(new Vector3());
     this.line.geometry.setFromPoints([from, this.wish]);
@@ -251,21 +264,8 @@ export class Dragging {
   }
 }
 
-/** Ties a handle to the vertex at rest that is nearest to it; what lies between turns with the vertex's first bone. */
-function anchor(body: Body, handle: Handle): { vertex: number; skin: SkinnedMesh; offset: Vector3 } {
-  const at = new Vector3(...handle.position);
-  const seen = new Vector3(at.x, at.z, -at.y); // glTF's frame
-  let best = { vertex: 0, skin: body.skins[0]!, offset: new Vector3() };
-  let least = Infinity;
-  const point = new Vector3();
-  for (const skin of body.skins) {
-    const places = skin.geometry.getAttribute("position");
-    for (let v = 0; v < places.count; v++) {
-      const distance = point.fromBufferAttribute(places, v).distanceToSquared(seen);
-      if (distance >= least) continue;
-      least = distance;
-      best = { vertex: v, skin, offset: new Vector3(at.x - point.x, at.y + point.z, at.z - point.y) };
-    }
-  }
-  return best;
+/** Returns which of some distances is the least, or null where none is below a limit. */
+function closest(distances: number[], limit: number): number | null {
+  const best = distances.reduce((b, d, i) => (d < distances[b]! ? i : b), 0);
+  return distances.length && distances[best]! < limit ? best : null;
 }

@@ -3,14 +3,16 @@
 import { Box3 } from "three";
 import { Body, loadMesh } from "./body";
 import { Connection, streamUrl } from "./connection";
-import { connectTools, notice, toggle } from "./controls";
+import { alignWith, connectTools, notice, paintChoice, paintLegend, toggle } from "./controls";
 import { frameAt, type Frame } from "./data";
 import { Dragging } from "./dragging";
 import { pack, readCloud, readForces, readInputs, readModel, readPose, readReach, readStatus, type Message, type Model } from "./messages";
+import type { Paint } from "./paint";
 import { Plot } from "./plot";
 import { drawCurve, element, showFrame } from "./readout";
 import { showPlaying } from "./recorded";
 import type { Stage } from "./stage";
+import { landmarksOf } from "./ties";
 
 const STALE_S = 0.4; // what is older is greyed out: within half a second, the picture included
 const KEPT_S = 60;
@@ -43,6 +45,8 @@ class Streams {
     element("panel").hidden = element("dock").hidden = false;
     element("about").textContent = "waiting for a robot …";
     element("cloud").hidden = element("drag").hidden = true;
+    stage.headset.grab = (hand) => this.dragging.take(hand);
+    stage.headset.changed = (on) => this.presenting(on);
     this.connect();
     showPlaying(true);
     stage.run(() => this.step());
@@ -68,6 +72,16 @@ class Streams {
       (reason: Error) => notice(reason.message),
     );
     this.tabs();
+  }
+
+  /** In a headset points can be dragged without the button, and the twin can be laid over the real robot. */
+  private presenting(on: boolean): void {
+    const robot = this.chosen;
+    const drag = element("drag");
+    if (robot?.model.handles.length && on !== this.dragging.on) drag.click();
+    if (!on || !robot?.body) return;
+    const { markers, handles, cameras } = robot.model;
+    this.stage.headset.alignment = alignWith(this.stage, robot.body, landmarksOf(robot.body, markers.length ? markers : handles, cameras));
   }
 
   /** Puts robots side by side, in the order of their names. */
@@ -157,7 +171,7 @@ class Streams {
     scrub.setAttribute("aria-valuetext", this.paused ? `${(newest - shown).toFixed(1)} seconds ago` : "live");
     const every = Math.max(1, Math.floor(robot.history.length / 300));
     drawCurve(robot.history.filter((_, i) => i % every === 0), oldest, newest);
-    element("clock").textContent = this.paused ? `${(shown - newest).toFixed(1)} s` : `${shown.toFixed(1)} s`;
+    element("clock").textContent = this.paused ? `${(shown - newest).toFixed(1)} s` : clockText(robot, shown);
     element("live").setAttribute("aria-pressed", String(!this.paused));
   }
 
@@ -190,10 +204,14 @@ class Streams {
     Robot.dress = (body) => {
       body.showGhost(pressed("ghost"));
       body.showCloud(pressed("cloud"));
-      body.colorByMotion(pressed("motion") ? 0.15 * body.size : 0);
+      body.paint(element<HTMLSelectElement>("paint").value as Paint);
       body.arrows.group.visible = pressed("forces");
     };
-    const [ghost, cloud, motion, forces] = ["ghost", "cloud", "motion", "forces"].map((id) => toggle(id, () => bodies(Robot.dress)));
+    const paint = paintChoice((kind) => {
+      bodies(Robot.dress);
+      paintLegend(kind, this.chosen?.body ?? null);
+    });
+    const [ghost, cloud, forces] = ["ghost", "cloud", "forces"].map((id) => toggle(id, () => bodies(Robot.dress)));
     const drag = toggle("drag", (on) => this.dragging.enable(on));
     const flip = (): void => this.pause(!this.paused);
     connectTools(this.stage, {
@@ -205,10 +223,17 @@ class Streams {
       f: forces!,
       b: ghost!,
       c: cloud!,
-      m: motion!,
+      m: paint,
       d: drag,
     });
   }
+}
+
+/** The time within the run where one is played over and over, else that of the source. */
+function clockText(robot: Robot, time: number): string {
+  const within = robot.shown?.run_s ?? null;
+  const length = robot.model.duration;
+  return within === null || length === null ? `${time.toFixed(1)} s` : `${Math.min(within, length).toFixed(1)} / ${length.toFixed(1)} s`;
 }
 
 /** One robot of the stream. */

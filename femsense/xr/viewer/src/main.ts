@@ -1,7 +1,7 @@
 // The page: a recorded run, or what streams.
 
 import "./style.css";
-import { notice, offerHeadset } from "./controls";
+import { announceMore, notice, offerHeadset } from "./controls";
 import { showStreams } from "./live";
 import { element } from "./readout";
 import { showRun } from "./recorded";
@@ -12,6 +12,7 @@ main().catch((reason: unknown) => fail(reason instanceof Error ? reason.message 
 async function main(): Promise<void> {
   const stage = openStage();
   offerHeadset(stage);
+  announceMore();
   const live = document.documentElement.dataset.mode === "live";
   const shown = live ? showStreams(stage) : await showRun(stage);
   Object.assign(globalThis, { femsense: { stage, shown } }); // for the console, and for programs that look at the scene

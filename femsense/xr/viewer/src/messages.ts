@@ -1,16 +1,11 @@
 // The bytes of a stream (docs/streaming.md): frames of messages, poses, clouds, documents.
 
-import type { Contact, Frame, Input, Vector } from "./data";
+import type { Contact, Frame, Input, NamedPoint, Vector } from "./data";
 
 export interface Message {
   robot: string;
   kind: string;
   payload: Uint8Array;
-}
-
-export interface Handle {
-  name: string;
-  position: Vector; // at rest, robot frame
 }
 
 export interface Model {
@@ -19,8 +14,11 @@ export interface Model {
   digest: string;
   bones: string[];
   inputs: Input[];
-  handles: Handle[];
+  handles: NamedPoint[];
+  markers: NamedPoint[];
+  cameras: NamedPoint[];
   commands: boolean;
+  duration: number | null; // of a run that is played over and over [s]
 }
 
 export interface Pose {
@@ -93,12 +91,15 @@ export function readModel(payload: Uint8Array): Model | null {
     digest: String(told.glb_sha256 ?? ""),
     bones: list(told.bones).map((b) => String(b.name)),
     inputs: list(told.inputs).map((i) => ({ name: String(i.name), unit: String(i.unit ?? ""), low: number(i.low) ?? 0, high: number(i.high) ?? 0 })),
-    handles: list(told.handles).map((h) => ({ name: String(h.name), position: vector(h.position_m) ?? [0, 0, 0] })),
+    handles: list(told.handles).map(named),
+    markers: list(told.markers).map(named),
+    cameras: list(told.cameras).map(named),
     commands: told.commands === true,
+    duration: number(told.duration_s),
   };
 }
 
-export function readForces(payload: Uint8Array): Pick<Frame, "frame" | "status" | "rms_after_m" | "contacts"> | null {
+export function readForces(payload: Uint8Array): Pick<Frame, "frame" | "status" | "rms_after_m" | "run_s" | "contacts"> | null {
   const told = document(payload);
   if (!told) return null;
   const frame = number(told.frame);
@@ -106,6 +107,7 @@ export function readForces(payload: Uint8Array): Pick<Frame, "frame" | "status" 
     frame: frame === null || frame < 0 ? null : frame,
     status: typeof told.status === "string" ? told.status : null,
     rms_after_m: number(told.residual_m),
+    run_s: number(told.run_s),
     contacts: list(told.contacts).map(contact),
   };
 }
@@ -133,6 +135,10 @@ export function readReach(payload: Uint8Array): Reach | null {
   };
 }
 
+function named(told: Record<string, unknown>): NamedPoint {
+  return { name: String(told.name), position: vector(told.position_m) ?? [0, 0, 0] };
+}
+
 function contact(told: Record<string, unknown>): Contact {
   return {
     contact: number(told.contact) ?? 0,
@@ -143,6 +149,7 @@ function contact(told: Record<string, unknown>): Contact {
     std_n: number(told.std_n),
     source: String(told.source ?? ""),
     point_std_m: vector(told.point_std_m),
+    radius_m: number(told.radius_m),
     force_std_n: vector(told.force_std_n),
   };
 }

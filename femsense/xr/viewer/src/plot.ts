@@ -19,7 +19,7 @@ export class Plot {
     const ratio = Math.min(window.devicePixelRatio, 2);
     const { clientWidth: width, clientHeight: height } = this.canvas;
     if (!width || !height) return;
-    if (this.canvas.width !== Math.round(width * ratio)) {
+    if (this.canvas.width !== Math.round(width * ratio) || this.canvas.height !== Math.round(height * ratio)) {
       this.canvas.width = Math.round(width * ratio);
       this.canvas.height = Math.round(height * ratio);
     }

@@ -2,11 +2,13 @@
 
 import { AnimationMixer, type AnimationAction, type Box3 } from "three";
 import { Body, loadMesh } from "./body";
-import { connectTools, toggle } from "./controls";
-import { frameAt, loadRun, type Run } from "./data";
+import { alignWith, connectTools, notice, paintChoice, paintLegend, toggle } from "./controls";
+import { amount, frameAt, loadRun, type Run } from "./data";
+import type { Field, Paint } from "./paint";
 import { Plot } from "./plot";
 import { drawCurve, element, showFrame } from "./readout";
 import type { Stage } from "./stage";
+import { landmarksOf } from "./ties";
 
 const PLAY = "M8 5v14l11-7z";
 const PAUSE = "M7 5h4v14H7zM13 5h4v14h-4z";
@@ -36,6 +38,7 @@ class Player {
   private readonly times: number[];
   private readonly plot = new Plot(element<HTMLCanvasElement>("plot"));
   private shown = -1;
+  private field: Field | null = null;
 
   constructor(
     private readonly stage: Stage,
@@ -52,6 +55,14 @@ class Player {
     stage.robot.add(body.group);
     body.arrows.largest = Math.max(...(run?.frames ?? []).flatMap((f) => f.contacts.map((c) => c.force_n ?? 0)), 1e-9);
     stage.fit(box);
+    const landmarks = landmarksOf(this.body, run?.markers ?? [], run?.cameras ?? []);
+    stage.headset.changed = (on) => {
+      if (on) stage.headset.alignment = alignWith(stage, this.body, landmarks);
+    };
+    new ResizeObserver(() => {
+      this.shown = -1;
+      this.seek(this.time);
+    }).observe(element("plot"));
     this.describe();
   }
 
@@ -69,6 +80,7 @@ class Player {
     const now = frames.length ? frameAt(frames, this.time) : -1;
     if (now !== this.shown && now >= 0) {
       this.body.show(frames[now]!.contacts);
+      this.body.painter.frame(now);
       showFrame(frames[now]!, this.run!.inputs, this.body.arrows.largest);
       this.plot.draw(frames, 0, this.duration, frames[now]!.time_s);
     }
@@ -86,6 +98,22 @@ class Player {
   play(on: boolean): void {
     this.playing = on && this.duration > 0;
     showPlaying(this.playing);
+  }
+
+  /** Colours the body; the field that this needs is fetched at its first use. */
+  async paint(paint: Paint): Promise<void> {
+    const told = this.run?.field;
+    if (paint === "stress" && told && !this.field) {
+      const answer = await fetch("fields.bin");
+      if (!answer.ok) return notice(`fields.bin could not be loaded (${answer.status}).`);
+      const bytes = await answer.arrayBuffer();
+      this.field = { ...told, largest: new DataView(bytes).getFloat32(0, true), values: new Uint8Array(bytes, 4) };
+      this.body.painter.setField(this.field);
+      this.body.painter.frame(Math.max(this.shown, 0));
+    }
+    this.body.paint(paint);
+    paintLegend(paint, this.body, this.field ? `${amount(this.field.largest, this.field.unit)} ${this.field.name}` : "");
+    this.stage.touch();
   }
 
   private pose(time: number): void {
@@ -130,6 +158,7 @@ class Player {
       return;
     }
     element("panel").hidden = false;
+    element<HTMLOptionElement>("paint-stress").hidden = !this.run.field;
     drawCurve(this.run.frames, 0, this.duration);
   }
 }
@@ -151,10 +180,7 @@ function connect(stage: Stage, player: Player): void {
     player.body.showGhost(on);
     stage.touch();
   });
-  const motion = toggle("motion", (on) => {
-    player.body.colorByMotion(on ? 0.15 * player.body.size : 0);
-    stage.touch();
-  });
+  const paint = paintChoice((kind) => void player.paint(kind));
   const forces = toggle("forces", (on) => {
     player.body.arrows.group.visible = on;
     stage.touch();
@@ -169,7 +195,7 @@ function connect(stage: Stage, player: Player): void {
     End: () => player.seek(player.duration),
     f: forces,
     b: ghost,
-    m: motion,
+    m: paint,
   });
   player.seek(Number(asked.get("time") ?? 0) || 0);
   player.play(asked.get("play") === "1" || (asked.get("play") !== "0" && !calm));

@@ -1,4 +1,4 @@
-// The room around the robot: light, ground, camera, and the way into a headset.
+// The room around the robot: light, ground, camera.
 
 import {
   ACESFilmicToneMapping,
@@ -9,14 +9,11 @@ import {
   Group,
   HemisphereLight,
   LineBasicMaterial,
-  Matrix4,
   Mesh,
-  MeshBasicMaterial,
   PCFShadowMap,
   PerspectiveCamera,
   PlaneGeometry,
   PMREMGenerator,
-  RingGeometry,
   Scene,
   ShadowMaterial,
   Vector3,
@@ -24,8 +21,7 @@ import {
 } from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import { RoomEnvironment } from "three/addons/environments/RoomEnvironment.js";
-
-const TABLE = new Vector3(0, 1.1, -0.6); // where the robot's ground stands in front of a person [m]
+import { Headset } from "./headset";
 
 const FIELD_OF_VIEW = 38; // on a screen [deg]
 
@@ -34,18 +30,14 @@ export class Stage {
   readonly camera = new PerspectiveCamera(FIELD_OF_VIEW, 1, 0.001, 100);
   readonly renderer: WebGLRenderer;
   readonly controls: OrbitControls;
+  readonly headset: Headset;
   /** Everything that belongs to the robot; moves as one onto the table of a headset's room. */
   readonly robot = new Group();
   private readonly ground = new Group();
   private readonly sun = new DirectionalLight(0xfff2e0, 2.6);
-  private readonly reticle = new Mesh(
-    new RingGeometry(0.06, 0.075, 40).rotateX(-Math.PI / 2),
-    new MeshBasicMaterial({ color: 0x5aa9ff, transparent: true, opacity: 0.9 }),
-  );
-  private hits: XRHitTestSource | null = null;
-  private anchor: XRAnchor | null = null;
   private dirty = true;
   private box = new Box3();
+  private moved = false; // by the person who looks
 
   constructor(private readonly canvas: HTMLCanvasElement) {
     this.renderer = new WebGLRenderer({ canvas, antialias: true, alpha: true });
@@ -54,6 +46,7 @@ export class Stage {
     this.renderer.toneMappingExposure = 1.05;
     this.renderer.shadowMap.enabled = true;
     this.renderer.shadowMap.type = PCFShadowMap;
+    this.renderer.shadowMap.autoUpdate = false; // in a headset every picture is drawn, and few of them change the shadow
     this.renderer.xr.enabled = true;
     const room = new PMREMGenerator(this.renderer);
     this.scene.environment = room.fromScene(new RoomEnvironment(), 0.04).texture;
@@ -63,14 +56,13 @@ export class Stage {
     this.sun.shadow.radius = 4;
     this.sun.shadow.bias = -0.0004;
     this.robot.add(this.sun, this.sun.target, this.ground);
-    this.reticle.matrixAutoUpdate = false;
-    this.reticle.visible = false;
-    this.scene.add(this.reticle, this.robot, new HemisphereLight(0xbfd8ff, 0x1a1f28, 0.7));
-    this.renderer.xr.addEventListener("sessionend", () => this.leave());
+    this.scene.add(this.robot, new HemisphereLight(0xbfd8ff, 0x1a1f28, 0.7));
+    this.headset = new Headset(this);
     this.controls = new OrbitControls(this.camera, canvas);
     this.controls.enableDamping = true;
     this.controls.dampingFactor = 0.12;
     this.controls.addEventListener("change", () => this.touch());
+    this.controls.addEventListener("start", () => (this.moved = true));
     new ResizeObserver(() => this.resize()).observe(canvas);
     this.resize();
   }
@@ -78,6 +70,7 @@ export class Stage {
   /** Fits ground, light and camera to the space that the body needs during the run, in glTF's frame [m]. */
   fit(box: Box3): void {
     this.box = box.clone();
+    this.headset.fit(box);
     const size = box.getSize(new Vector3()).length() || 1;
     const middle = box.getCenter(new Vector3());
     this.layGround(size, middle, box.min.y - 0.002 * size);
@@ -94,11 +87,13 @@ export class Stage {
     this.camera.far = size * 60;
     this.controls.minDistance = 0.15 * size;
     this.controls.maxDistance = 8 * size;
-    this.scene.fog = new Fog(0x111823, 3.5 * size, 9 * size);
+    this.scene.fog = this.headset.presenting ? null : new Fog(0x111823, 3.5 * size, 9 * size);
     this.lookFromStart();
   }
 
   lookFromStart(): void {
+    this.moved = false;
+    if (this.box.isEmpty()) return;
     const size = this.box.getSize(new Vector3()).length() || 1;
     const middle = this.box.getCenter(new Vector3());
     const narrow = Math.min(1, this.camera.aspect);
@@ -125,66 +120,14 @@ export class Stage {
     this.renderer.setAnimationLoop((now: number, frame?: XRFrame) => {
       const seconds = Math.min(0.1, Math.max(0, (now - before) / 1000));
       before = now;
+      if (frame) this.headset.step(frame);
       step(seconds);
-      if (frame) this.lookAround(frame);
       if (!this.renderer.xr.isPresenting) this.controls.update();
       if (!this.dirty && !this.renderer.xr.isPresenting) return;
+      this.renderer.shadowMap.needsUpdate = this.dirty;
       this.dirty = false;
       this.renderer.render(this.scene, this.camera);
     });
-  }
-
-  /** Enters a headset. In VR the robot stands in its true size on a table; in AR it goes where the person points and selects. */
-  async enter(mode: XRSessionMode): Promise<void> {
-    const xr = navigator.xr;
-    if (!xr) return;
-    const session = await xr.requestSession(mode, { optionalFeatures: ["local-floor", "hand-tracking", "hit-test", "anchors"] });
-    this.renderer.xr.setReferenceSpaceType(session.enabledFeatures?.includes("local-floor") === false ? "local" : "local-floor");
-    this.stand(new Matrix4().setPosition(TABLE));
-    this.scene.fog = null;
-    await this.renderer.xr.setSession(session);
-    if (mode === "immersive-ar") await this.seekSurfaces(session);
-  }
-
-  /** Puts the middle of the robot's ground at a pose of the room. */
-  private stand(pose: Matrix4): void {
-    const middle = this.box.getCenter(new Vector3());
-    pose.decompose(this.robot.position, this.robot.quaternion, this.robot.scale);
-    this.robot.position.sub(new Vector3(middle.x, this.box.min.y, middle.z).applyQuaternion(this.robot.quaternion));
-  }
-
-  /** Follows the surfaces that the device sees; a selection puts the robot there and keeps it there. */
-  private async seekSurfaces(session: XRSession): Promise<void> {
-    const space = await session.requestReferenceSpace("viewer");
-    this.hits = (await session.requestHitTestSource?.({ space })) ?? null;
-    session.addEventListener("select", (event) => {
-      if (!this.reticle.visible) return;
-      this.stand(this.reticle.matrix);
-      this.keep(event.frame);
-    });
-  }
-
-  private lookAround(frame: XRFrame): void {
-    const space = this.renderer.xr.getReferenceSpace();
-    if (!space) return;
-    const kept = this.anchor && frame.trackedAnchors?.has(this.anchor) ? frame.getPose(this.anchor.anchorSpace, space) : null;
-    if (kept) this.stand(new Matrix4().fromArray(kept.transform.matrix));
-    const seen = this.hits ? frame.getHitTestResults(this.hits)[0]?.getPose(space) : null;
-    this.reticle.visible = Boolean(seen);
-    if (seen) this.reticle.matrix.fromArray(seen.transform.matrix);
-  }
-
-  /** Asks the device to hold the place even where it corrects its own position; devices without anchors go on as they are. */
-  private keep(frame: XRFrame): void {
-    const space = this.renderer.xr.getReferenceSpace();
-    const seen = this.hits ? frame.getHitTestResults(this.hits)[0] : null;
-    if (!space || !seen?.createAnchor) return;
-    this.anchor?.delete();
-    this.anchor = null;
-    seen.createAnchor()?.then(
-      (anchor) => (this.anchor = anchor),
-      () => undefined,
-    );
   }
 
   /** Height of the view in pixels; 0 in a headset. */
@@ -192,11 +135,8 @@ export class Stage {
     return this.renderer.xr.isPresenting ? 0 : this.canvas.clientHeight;
   }
 
-  private leave(): void {
-    this.robot.position.set(0, 0, 0);
-    this.robot.quaternion.identity();
-    this.reticle.visible = false;
-    this.hits = this.anchor = null;
+  /** Brings back the view of the screen after a headset had its own. */
+  restore(): void {
     this.camera.fov = FIELD_OF_VIEW; // the session left the headset's
     this.camera.zoom = 1;
     this.resize();
@@ -236,6 +176,7 @@ export class Stage {
     else this.camera.clearViewOffset(); // on a phone the panel takes the upper part
     this.camera.updateProjectionMatrix();
     this.renderer.setSize(width, height, false);
+    if (!this.moved) this.lookFromStart(); // a phone that was turned
     this.touch();
   }
 }

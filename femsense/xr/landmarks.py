@@ -1,0 +1,76 @@
+"""Points that a twin shares with the real robot: its markers, and cameras where calibration put them."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from femsense.core.arrays import FloatArray, freeze
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Landmark:
+    """A point with a name."""
+
+    name: str
+    position_m: FloatArray
+    """Of a marker at rest, of a camera always; robot frame, shape (3,)."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Landmarks:
+    """What a person can touch to lay the twin over the robot."""
+
+    markers: tuple[Landmark, ...] = ()
+    cameras: tuple[Landmark, ...] = ()
+
+
+def landmarks_of_run(run: Path) -> Landmarks:
+    """Return the markers of the run's robot and the cameras of its calibration; what is no longer there is left out."""
+    document = _document(run / "run.json")
+    calibration = _document(run / "calibration.json")
+    told = _markers(_folder(document))
+    seats = calibration.get("placements_m")
+    if isinstance(seats, dict):
+        told |= {name: seats[name] for name in told.keys() & seats.keys()}
+    pose = calibration.get("T_robot_camera")
+    cameras = () if pose is None else (Landmark("the camera", freeze(np.asarray(pose, dtype=float)[:3, 3])),)
+    return Landmarks(tuple(Landmark(name, freeze(place)) for name, place in told.items()), cameras)
+
+
+def robot_table(run: Path) -> dict[str, Any]:
+    """Return what robot.toml of the run's robot says, or nothing where it is no longer there."""
+    folder = _folder(_document(run / "run.json"))
+    try:
+        return {} if folder is None else tomllib.loads((folder / "robot.toml").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+
+
+def _markers(folder: Path | None) -> dict[str, Any]:
+    try:
+        table = {} if folder is None else tomllib.loads((folder / "robot.toml").read_text(encoding="utf-8"))
+        return {str(row["name"]): np.asarray(row["position_m"], dtype=float).reshape(3) for row in table.get("markers", [])}
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}
+
+
+def _folder(document: dict[str, Any]) -> Path | None:
+    try:
+        path = document["inputs"]["robot"]["path"]
+    except (KeyError, TypeError):
+        return None
+    return Path(path) if isinstance(path, str) else None
+
+
+def _document(path: Path) -> dict[str, Any]:
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}

@@ -1,0 +1,52 @@
+"""Von Mises stress on the surface of a body, from its states alone, for colours.
+
+    E = ½ (FᵀF − I),   S = λ tr(E) I + 2 μ E,   σ_vm = √(3/2) |dev S| = √6 μ |dev E|
+
+with F of each element's corners (St. Venant–Kirchhoff, Holzapfel 2000, section 6.5), averaged at each node over the elements around it by their
+volumes. At the strains of soft robots in use it follows the stress of the corotational law; it is a picture, no measurement.
+"""
+
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+import numpy.typing as npt
+
+from femsense.core.arrays import FloatArray, IntArray
+
+
+def nodal_strain(rest: FloatArray, tets: IntArray, nodes: npt.ArrayLike) -> FloatArray:
+    """Return the equivalent strain √(2/3) |dev E| at each node of each frame, shape (F, n).
+
+    Arguments:
+        rest: nodes at rest [m], shape (n, 3).
+        tets: node indices, shape (m, 4) or (m, 10); corners first.
+        nodes: of each frame [m], shape (F, n, 3).
+    """
+    corners = np.asarray(tets)[:, :4]
+    edges = rest[corners[:, 1:]] - rest[corners[:, :1]]
+    inverse = np.linalg.inv(edges)
+    volume = np.abs(np.linalg.det(edges)) / 6.0
+    touched = np.zeros(len(rest))
+    np.add.at(touched, corners.ravel(), np.repeat(volume, 4))
+    states = np.asarray(nodes)
+    found = np.zeros((len(states), len(rest)))
+    for row, state in zip(found, states):
+        moved = np.asarray(state, dtype=float)
+        F = inverse @ (moved[corners[:, 1:]] - moved[corners[:, :1]])  # rows: Fᵀ
+        E = 0.5 * (F @ F.transpose(0, 2, 1) - np.eye(3))
+        deviator = E - np.trace(E, axis1=1, axis2=2)[:, None, None] / 3.0 * np.eye(3)
+        strain = np.sqrt(2.0 / 3.0 * (deviator**2).sum(axis=(1, 2)))
+        np.add.at(row, corners.ravel(), np.repeat(volume * strain, 4))
+    return found / np.where(touched > 0, touched, np.inf)
+
+
+def stress_bytes(strain: FloatArray, stiffness_pa: float) -> bytes:
+    """Return largest stress (float32) and shares of it, 0 … 255, frame after frame, for strains at vertices (F, V).
+
+    stiffness_pa: 3 μ; 100 gives strains in percent where no material is known.
+    """
+    largest = float(strain.max(initial=0.0))
+    shares = np.rint(255.0 * strain / max(largest, 1e-12)).astype(np.uint8)
+    return struct.pack("<f", stiffness_pa * largest) + shares.tobytes()

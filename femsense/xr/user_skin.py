@@ -1,0 +1,211 @@
+"""A surface of the user's own (CAD, glTF) that the finite-element body carries instead of its own surface.
+
+Each vertex is tied to the element that holds it at rest, or to the nearest one, as markers are. Its weights are then fitted to the states as
+those of the body's own surface. Beyond a budget the surface is decimated by quadric errors (Garland and Heckbert 1997, as Open3D has it).
+"""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from femsense.core.arrays import FloatArray, IntArray, freeze
+from femsense.core.errors import InputError
+from femsense.fem.mesh import Embedding, TetMesh, embed_points, surface_triangles
+from femsense.xr.gltf import T_GLTF_ROBOT, ExportReport, Texture, write_glb
+from femsense.xr.skinning import as_states, fit_poses, fit_skin, rms, skin_vertices, weigh_points
+
+BUDGET = 100_000
+"""Vertices at most: what headsets draw at their rate."""
+FAR = 0.05
+"""A vertex farther from the body than this share of its size does not belong to it; half of the vertices may not."""
+SHOWN = 40
+"""Frames to which weights are fitted, spread evenly over the run."""
+UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+GLTF = (".glb", ".gltf")
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class UserSkin:
+    """A surface at rest with its colours."""
+
+    rest: FloatArray
+    """Vertices, robot frame [m], shape (V, 3)."""
+    triangles: IntArray
+    """Vertex indices, outward, shape (t, 3)."""
+    colors: FloatArray | None = None
+    """sRGB of each vertex, 0 … 1, shape (V, 3); None: the robot's."""
+    texture: Texture | None = None
+
+
+def read_skin(path: str | Path, *, unit: str | None = None, T_robot_skin: Any = None, budget: int = BUDGET) -> UserSkin:
+    """Read a surface: STL, OBJ, PLY or glTF.
+
+    Arguments:
+        path: the file.
+        unit: of its coordinates, "m", "cm" or "mm"; glTF is always in metres with Y up.
+        T_robot_skin: maps its coordinates [m] to the robot frame, shape (4, 4).
+        budget: vertices at most; a texture that is beyond it becomes colours of vertices.
+
+    Raises:
+        InputError: no such file, no surface, or no unit.
+    """
+    file = Path(path).expanduser()
+    scale = _scale(file, unit)
+    mesh = _load(file)
+    T = np.eye(4) if T_robot_skin is None else np.asarray(T_robot_skin, dtype=float)
+    if file.suffix.lower() in GLTF:
+        T = T @ np.linalg.inv(T_GLTF_ROBOT)
+    rest = scale * np.asarray(mesh.vertices, dtype=float) @ T[:3, :3].T + T[:3, 3]
+    skin = UserSkin(freeze(rest), freeze(np.asarray(mesh.faces), np.int64), _colors(mesh), _texture(mesh))
+    return skin if len(rest) <= budget else decimated(skin, budget, baked=_baked(mesh))
+
+
+def decimated(skin: UserSkin, budget: int, *, baked: FloatArray | None = None) -> UserSkin:
+    """Return a surface with at most so many vertices; colours are those of the nearest vertex of before.
+
+    baked: colours that stand for the texture, sRGB, shape (V, 3).
+    """
+    import open3d as o3d
+    from scipy.spatial import cKDTree
+
+    welded, inverse = np.unique(skin.rest.round(9), axis=0, return_inverse=True)
+    triangles = inverse.reshape(-1)[skin.triangles]
+    full = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(welded), o3d.utility.Vector3iVector(triangles))
+    target = 2.0 * budget
+    while True:
+        small = full.simplify_quadric_decimation(int(target))
+        small.remove_unreferenced_vertices()
+        rest = np.asarray(small.vertices)
+        if len(rest) <= budget:
+            break
+        target *= 0.98 * budget / len(rest)
+    nearest = cKDTree(skin.rest).query(rest)[1]
+    known = skin.colors if baked is None else baked
+    return UserSkin(
+        freeze(rest), freeze(np.asarray(small.triangles), np.int64), None if known is None else freeze(known[nearest])
+    )
+
+
+def tie_skin(skin: UserSkin, mesh: TetMesh) -> Embedding:
+    """Tie a surface to a body. Raises InputError where most of it lies elsewhere, such as in another unit or frame."""
+    ties = embed_points(mesh, skin.rest)
+    size = float(np.linalg.norm(np.ptp(mesh.nodes, axis=0)))
+    far = float(np.median(ties.outside))
+    if far > FAR * size:
+        raise InputError(
+            "the skin does not lie on the body",
+            where="--skin",
+            found=f"half of its vertices are {1e3 * far:.3g} mm or more away; it is {_extent(skin.rest)} large, the body {_extent(mesh.nodes)}",
+            expected="the same place and size at rest",
+            hint="its unit, or its axes: robot frame as in robot.toml, glTF with Y up",
+        )
+    return ties
+
+
+def export_skin(
+    mesh: TetMesh,
+    time_s: npt.ArrayLike,
+    nodes_m: npt.ArrayLike,
+    path: str | Path,
+    skin: UserSkin,
+    *,
+    bones: int | None = None,
+    color_rgb: npt.ArrayLike | None = None,
+    name: str = "robot",
+) -> ExportReport:
+    """Write the frames of a run as an animated surface of the user's own; bones are those of the body's surface.
+
+    Arguments:
+        mesh: the body at rest [m].
+        time_s, nodes_m: times [s], shape (F,), and nodes of each frame [m], shape (F, n, 3).
+        path: the `.glb` file.
+        skin: the surface.
+        bones: how many; chosen on held-out frames if None.
+        color_rgb: of a surface without colours.
+        name: of the body, in the file.
+
+    Returns:
+        what was written; its errors are distances to where the elements carry the vertices, over at most SHOWN frames.
+
+    Raises:
+        InputError: as `gltf.export_states`, and where the surface lies elsewhere.
+    """
+    ties = tie_skin(skin, mesh)
+    frames = as_states(nodes_m, len(mesh.nodes))
+    used = np.unique(surface_triangles(mesh))
+    own = fit_skin(mesh.nodes[used], frames[:, used], bones=bones)
+    poses = fit_poses(own, frames[:, used])
+    some = np.unique(np.linspace(0, len(frames) - 1, SHOWN).astype(int))
+    carried = np.array([ties.positions(frame) for frame in frames[some]])
+    worn = weigh_points(own, poses[some], skin.rest, carried)
+    look = color_rgb if skin.colors is None else skin.colors
+    written = write_glb(path, skin.rest, skin.triangles, worn, poses, time_s, color_rgb=look, texture=skin.texture, name=name)
+    off = skin_vertices(worn, poses[some]) - carried
+    farthest = float(np.sqrt((off**2).sum(axis=2).max()))
+    return ExportReport(written, len(worn.skeleton), len(skin.rest), len(frames), rms(off), farthest)
+
+
+def _extent(points: FloatArray) -> str:
+    return " × ".join(f"{1e3 * length:.3g}" for length in np.ptp(points, axis=0)) + " mm"
+
+
+def _scale(file: Path, unit: str | None) -> float:
+    if not file.is_file():
+        raise InputError("no such file", where="--skin", found=file)
+    if file.suffix.lower() in GLTF:
+        return 1.0
+    if unit not in UNITS:
+        raise InputError("the unit of the skin is not known", where="--skin-unit", found=unit, expected="m, cm or mm")
+    return UNITS[unit]
+
+
+def _load(file: Path) -> Any:
+    """Return a trimesh of the file, all of its parts in one."""
+    import trimesh
+
+    try:
+        scene = trimesh.load_scene(file, process=False)
+        mesh = scene.to_geometry()
+    except Exception as error:  # whatever the many readers raise
+        raise InputError("the skin cannot be read", where=file, found=error, expected="STL, OBJ, PLY or glTF") from None
+    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
+        raise InputError("the skin has no surface", where=file, found=type(mesh).__name__, expected="triangles")
+    return mesh
+
+
+def _colors(mesh: Any) -> FloatArray | None:
+    """Return the colours that a file gives its vertices or its one material."""
+    if mesh.visual.kind in ("vertex", "face"):
+        return freeze(np.asarray(mesh.visual.vertex_colors, dtype=float)[:, :3] / 255.0)
+    material = getattr(mesh.visual, "material", None)
+    if material is None or _texture(mesh) is not None:
+        return None
+    return freeze(np.tile(np.asarray(material.main_color, dtype=float)[:3] / 255.0, (len(mesh.vertices), 1)))
+
+
+def _texture(mesh: Any) -> Texture | None:
+    image, uv = _image(mesh), getattr(mesh.visual, "uv", None)
+    if image is None or uv is None or len(uv) != len(mesh.vertices):
+        return None
+    packed = io.BytesIO()
+    image.convert("RGB").save(packed, format="PNG")
+    flipped = np.array([0.0, 1.0]) + np.asarray(uv, dtype=float) * [1.0, -1.0]  # glTF counts from the top
+    return Texture(freeze(flipped), packed.getvalue())
+
+
+def _baked(mesh: Any) -> FloatArray | None:
+    """Return what the texture shows at each vertex, sRGB, shape (V, 3)."""
+    if _texture(mesh) is None:
+        return None
+    return freeze(np.asarray(mesh.visual.to_color().vertex_colors, dtype=float)[:, :3] / 255.0)
+
+
+def _image(mesh: Any) -> Any:
+    material = getattr(mesh.visual, "material", None)
+    return None if material is None else getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
