@@ -17,11 +17,12 @@ from small_run import make_run
 from streams import within
 from xr_bar import write_run_with_mesh
 
-from femsense.app.stream_command import StreamOptions, need_one, show_stream, stream_document, stream_runs, stream_text
+from femsense.app.stream_command import StreamOptions, let_drag, need_one, show_stream, stream_document, stream_runs, stream_text
 from femsense.core.errors import InputError
 from femsense.io.recording_folder import load_recording
 from femsense.io.robot_toml import load_robot
 from femsense.sensing.run_files import run_inputs, write_run
+from femsense.xr.stream.drag_server import DragOptions
 from femsense.xr.stream.hub import Message
 from femsense.xr.stream.websocket import pack, unpack
 from femsense.xr.view import PAGE
@@ -79,6 +80,9 @@ def test_the_command_line_lets_a_viewer_drag_and_a_viewer_of_it_too(tmp_path: Pa
     run = write_run(made, tmp_path / "run", inputs=run_inputs(made.robot, recording, None))
     marker = made.robot.glued_names[0]
     place = dict(zip("xyz", map(float, made.robot.marker_points[0] + [0.0, 0.0, 0.002])))
+    with stream_runs([run], StreamOptions()) as live:  # kernels that are compiled here are there for the command too
+        answered = let_drag(live, run, DragOptions()).answer(marker, (place["x"], place["y"], place["z"]))
+    assert answered.status in ("reached", "nearest")
     wish = json.dumps({"handle": marker, "target_m": place, "held": True, "armed": True}).encode()
     for commands in ((), ("--commands",)):
         with (
