@@ -89,4 +89,4 @@ def test_a_calibration_is_not_written_at_a_folder(tmp_path: Path) -> None:
 
 def test_a_calibration_says_itself_in_a_line() -> None:
     said = repr(make_calibration())
-    assert said.startswith("Calibration(1 camera; ") and "mm rms of markers" in said and len(said) < 200 and "array" not in said
+    assert said.startswith("Calibration(2 cameras; ") and "mm rms of markers" in said and len(said) < 200 and "array" not in said
