@@ -105,16 +105,21 @@ def _chunk_records(data: bytes) -> Iterator[Connection | tuple[int, int, bytes]]
 
 
 def _bag_record(stream: BinaryIO) -> tuple[dict[str, bytes], bytes] | None:
-    """Return header and data of the next record; None at the end or where it is cut off."""
+    """Return header and data of the next record; None at the end or where it is cut off. Of a chunk that is not compressed what is there."""
     parts = []
     for _ in range(2):
         size = stream.read(4)
         length = struct.unpack("<I", size)[0] if len(size) == 4 else LARGEST
         data = stream.read(length) if length < LARGEST else b""
-        if len(size) < 4 or len(data) < length:
+        cut = len(size) < 4 or len(data) < length
+        if cut and not (parts and data and _is_plain_chunk(_fields(parts[0]))):
             return None
         parts.append(data)
     return _fields(parts[0]), parts[1]
+
+
+def _is_plain_chunk(header: dict[str, bytes]) -> bool:
+    return header.get("op") == bytes([CHUNK]) and header.get("compression", b"none") == b"none"
 
 
 def _fields(data: bytes) -> dict[str, bytes]:

@@ -36,3 +36,14 @@ def test_nothing_whole_is_an_error(tmp_path: Path) -> None:
         (tmp_path / name).write_bytes(data)
         with pytest.raises(InputError, match="without a whole message"):
             RecoveredReader(tmp_path / name)
+
+
+def test_a_chunk_that_was_cut_off_gives_its_whole_messages(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "take.bag", "1", chunk=1 << 24) as bag:
+        write_camera(bag, 20)
+    data = (tmp_path / "take.bag").read_bytes()
+    (tmp_path / "cut.bag").write_bytes(data[: len(data) // 2])
+    whole, cut = RecoveredReader(tmp_path / "take.bag"), RecoveredReader(tmp_path / "cut.bag")
+    assert 0.4 * whole.count < cut.count < 0.6 * whole.count
+    for mine, theirs in zip(cut.messages(cut.connections), whole.messages(whole.connections)):
+        assert (mine[0].topic, mine[1], mine[2]) == (theirs[0].topic, theirs[1], theirs[2])
