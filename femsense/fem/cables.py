@@ -1,5 +1,5 @@
 # mypy: allow-untyped-decorators
-"""Cable kinematics: length, its derivatives, the forces of tensions that may differ from segment to segment, and friction.
+"""Cable kinematics: length, its derivatives, the bends, and the forces of tensions that may differ from segment to segment.
 
 Points of a path are numbered from the far end; segment j joins point j and j + 1, the last one ends at the pull point.
 A cable of length ℓ has shortened by δ = ℓ(rest) − ℓ(x). Tensions t_j along the segments load the nodes with
@@ -133,28 +133,3 @@ def _bends(nodes: IntArray, weights: FloatArray, end: FloatArray, leaves: FloatA
         if size > 0.0:
             angles[s] = 2.0 * np.arctan2(np.sqrt(apart), np.sqrt(along))
     return angles
-
-
-def rub(cable: Cable, angles: FloatArray, before: FloatArray, motor_tension: float) -> FloatArray:
-    """Return the tensions along a cable after a change of the motor's tension: capstan with stick.
-
-    Going outwards from the motor, the tension behind a bend of angle θ stays what it was unless it leaves
-    [T e^(−μθ), T e^(+μθ)] of the tension T before the bend; then it is moved to that end.
-
-    Arguments:
-        angles: the bends, as `bend_angles` gives them [rad], shape (s,).
-        before: the tensions of the segments until now [N], shape (s,).
-        motor_tension: [N].
-    """
-    return np.asarray(_rub(float(cable.friction), angles, before, float(motor_tension)))
-
-
-@njit(cache=True)
-def _rub(friction: float, angles: FloatArray, before: FloatArray, motor_tension: float) -> FloatArray:
-    tensions = np.empty_like(before)
-    inner = motor_tension
-    for j in range(len(before) - 1, -1, -1):
-        span = np.exp(friction * angles[j])
-        tensions[j] = min(max(before[j], inner / span), inner * span)
-        inner = tensions[j]
-    return tensions

@@ -4,7 +4,7 @@ The state minimises  Π(x) = W(x) − f·x + Σ t ℓ(x) − Σ p V(x)  over the
 chambers press with given pressures p; a held cable adds the constraint  δ(x) + T/k = d  with its tension T as multiplier, a held
 chamber  V(x) − V(rest) = ΔV  with its pressure. A held cable never pushes (unless asked): it goes slack where T would be
 negative, and taut again where its shortening would fall below d (complementarity). A held chamber may pull: it is full of liquid.
-Friction moves the tensions along a cable (see `cables.rub`); they are updated between Newton solves until they rest.
+Friction moves the tensions along a cable (`capstan.capstan_tensions`); they are updated between Newton solves until they rest.
 """
 
 from __future__ import annotations

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from femsense.fem.body import BodyModel
-from femsense.fem.cables import bend_angles, rub
+from femsense.fem.cables import bend_angles
+from femsense.fem.capstan import capstan_tensions
 from femsense.fem.newton_state import Loads, State, travel_of
 
 
@@ -46,7 +47,7 @@ def update_friction(body: BodyModel, loads: Loads, state: State) -> bool:
         if cable.friction == 0:
             continue
         T = max(state.T[i], 0.0)
-        tensions = rub(cable, bend_angles(cable, state.x), loads.before[i], T)
+        tensions = capstan_tensions(cable, bend_angles(cable, state.x), loads.before[i], T)
         share = tensions / T if T > 0 else np.zeros_like(tensions)
         if np.abs(share - state.shares[i]).max() * T > 1e-8 * max(1.0, T):
             still = False

@@ -9,7 +9,8 @@ import numpy as np
 from femsense.core.arrays import FloatArray
 from femsense.fem.assembly import add_elements, element_forces, internal
 from femsense.fem.body import BodyModel
-from femsense.fem.cables import bend_angles, cable_forces, rub, shortening
+from femsense.fem.cables import bend_angles, cable_forces, shortening
+from femsense.fem.capstan import capstan_tensions
 from femsense.fem.chambers import volume_gradient
 from femsense.fem.clamp import first_give
 from femsense.fem.equilibrium import Equilibrium
@@ -144,7 +145,7 @@ def rubbed(variant: DrivenRobot, frame: int, base: Equilibrium, x: FloatArray) -
     """Return the tensions along the cables of a variant at positions x if those of the base state are what was before."""
     motors = motor_tensions(variant, frame, base)
     return tuple(
-        rub(c, bend_angles(c, x), before, T) if c.friction > 0 else np.full(len(c.path), T)
+        capstan_tensions(c, bend_angles(c, x), before, T) if c.friction > 0 else np.full(len(c.path), T)
         for c, before, T in zip(variant.robot.body.cables, base.segment_tensions, motors)
     )
 

@@ -16,7 +16,8 @@ from femsense.core.arrays import FloatArray
 from femsense.core.errors import DataError
 from femsense.core.parallel import each
 from femsense.fem.body import BodyModel
-from femsense.fem.cables import bend_angles, rub
+from femsense.fem.cables import bend_angles
+from femsense.fem.capstan import capstan_tensions
 from femsense.fem.clamp import rigid_give
 from femsense.fem.equilibrium import Equilibrium, SolveOptions
 from femsense.fem.linalg.refinement import Refined
@@ -241,7 +242,9 @@ def _expected_tensions(driven: DrivenRobot, frames: list[int], near: dict[int, E
     for k in frames:
         state = near[k]
         motors = [state.tension[c.name] if held else float(T) for c, T in zip(cables, driven.drive.inputs[k])]
-        before = tuple(rub(c, bend_angles(c, state.positions), b, max(T, 0.0)) for c, b, T in zip(cables, before, motors))
+        before = tuple(
+            capstan_tensions(c, bend_angles(c, state.positions), b, max(T, 0.0)) for c, b, T in zip(cables, before, motors)
+        )
         result[k] = before
     return result
 

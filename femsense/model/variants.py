@@ -10,7 +10,8 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray
 from femsense.core.parallel import each
-from femsense.fem.cables import bend_angles, rub
+from femsense.fem.cables import bend_angles
+from femsense.fem.capstan import capstan_tensions
 from femsense.fem.equilibrium import Equilibrium, SolveOptions
 from femsense.fem.linalg.factorization import Factorization, available_memory, factorize
 from femsense.fem.linalg.refinement import refined
@@ -125,7 +126,7 @@ class Variants:
             before = tuple(np.zeros(len(c.path)) for c in cables)
             for k, base in self.bases.items():
                 motors = motor_tensions(variant, k, base)
-                before = tuple(rub(c, angle, b, T) for c, angle, b, T in zip(cables, bends[i, k], before, motors))
+                before = tuple(capstan_tensions(c, angle, b, T) for c, angle, b, T in zip(cables, bends[i, k], before, motors))
                 self.along[i, k] = before
 
     def _bends(self, i: int, x: FloatArray) -> list[FloatArray]:

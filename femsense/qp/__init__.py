@@ -1,7 +1,8 @@
 """The quadratic problem of force sensing: build it, solve it with a certificate, and say how far the forces can be trusted."""
 
 from femsense.qp.forces import ForceEstimate, estimate_forces
-from femsense.qp.problem import ForceOptions, FrictionCone, Multipliers, Problem, Residuals, build_force_problem, kkt_residuals
+from femsense.qp.friction_cone import FrictionCone
+from femsense.qp.problem import ForceOptions, Multipliers, Problem, Residuals, build_force_problem, kkt_residuals
 from femsense.qp.solve import SOLVERS, Solution, Status, solve
 
 __all__ = [

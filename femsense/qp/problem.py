@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from femsense.core.arrays import FloatArray, freeze
 from femsense.core.errors import InputError
+from femsense.qp.friction_cone import FrictionCone, pyramid_rows
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -89,33 +90,6 @@ class Residuals:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class FrictionCone:
-    """Coulomb's cone about each inward normal, replaced by a pyramid inside it.
-
-    The force f on the body obeys  f·(−n) ≥ 0  and  f·tⱼ ≤ mu cos(π/sides) f·(−n)  for tangents t₁ … t_sides, evenly spread.
-    """
-
-    normals: FloatArray
-    """Outward normals of the body, shape [n, 3]; made unit here."""
-    mu: float
-    """Coefficient of friction, ≥ 0."""
-    sides: int = 8
-    """Sides of the pyramid, at least 4."""
-
-    def __post_init__(self) -> None:
-        normals = np.atleast_2d(np.asarray(self.normals, dtype=np.float64))
-        if normals.ndim != 2 or normals.shape[1] != 3 or not (np.linalg.norm(normals, axis=1) > 0.0).all():
-            raise InputError(
-                "not normals", where="normals", found=normals.tolist(), expected="directions (n, 3), none of length zero"
-            )
-        if not self.mu >= 0.0:
-            raise InputError("a negative coefficient of friction", where="mu", found=self.mu, expected="≥ 0")
-        if self.sides < 4:
-            raise InputError("too few sides", where="sides", found=self.sides, expected="at least 4")
-        object.__setattr__(self, "normals", freeze(normals / np.linalg.norm(normals, axis=1, keepdims=True)))
-
-
-@dataclass(frozen=True, eq=False, slots=True)
 class ForceOptions:
     """What is known of the unknowns of the force problem: inputs, bounds and priors."""
 
@@ -182,7 +156,7 @@ def build_force_problem(
     misfit = _sized(free, rows, "free") - _sized(target, rows, "target")
     prior = np.concatenate([np.zeros(a), np.full(f, _not_negative(o.ridge, "ridge")), prior_precision(o.nuisance_std, k)])
     A, b = _actuation(o.cable_inputs, o.cable_displacements, o.W_aa, o.W_af, o.delta_a_free, a, f, k)
-    G = None if o.friction_cone is None else _pyramid(o.friction_cone, a, f, k)
+    G = None if o.friction_cone is None else pyramid_rows(o.friction_cone, a, f, k)
     lower = np.concatenate(
         [_limit(o.tension_lower, -np.inf, a, "tension_lower"), _limit(o.force_lower, -np.inf, f, "force_lower")]
     )
@@ -340,25 +314,6 @@ def _actuation(
     assert W_aa is not None and W_af is not None and delta_a_free is not None
     A = np.hstack([_matrix(W_aa, a, "W_aa"), _matrix(W_af, f, "W_af"), np.zeros((a, k))])
     return A, _sized(displacements, a, "cable_displacements") - _sized(delta_a_free, a, "delta_a_free")
-
-
-def _pyramid(cone: FrictionCone, a: int, f: int, k: int) -> FloatArray:
-    """Return G, shape (n (sides + 1), a + f + k), of G x ≤ 0."""
-    n = len(cone.normals)
-    if f != 3 * n:
-        raise InputError(
-            "a cone needs forces in three components", where="friction_cone", found=f"{f} columns", expected=f"{3 * n}"
-        )
-    angles = 2.0 * np.pi * np.arange(cone.sides) / cone.sides
-    G = np.zeros((n, cone.sides + 1, a + f + k))
-    for i, normal in enumerate(cone.normals):
-        first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
-        first /= np.linalg.norm(first)
-        tangents = np.cos(angles)[:, None] * first + np.sin(angles)[:, None] * np.cross(normal, first)
-        columns = slice(a + 3 * i, a + 3 * i + 3)
-        G[i, :-1, columns] = tangents + cone.mu * np.cos(np.pi / cone.sides) * normal
-        G[i, -1, columns] = normal
-    return G.reshape(-1, a + f + k)
 
 
 def _bound_work(bounds: FloatArray, multipliers: FloatArray) -> float:

@@ -39,7 +39,8 @@ class PlannedContact:
             if given is not None:
                 return np.asarray(given, dtype=float)
         if self.table.path_m is not None:
-            return np.asarray(self.table.path_m[-1], dtype=float) - np.asarray(self.table.path_m[0], dtype=float)
+            start, end = (np.asarray(point, dtype=float) for point in (self.table.path_m[0], self.table.path_m[-1]))
+            return np.asarray(end - start)
         return np.array([1.0, 0.0, 0.0])
 
     @property

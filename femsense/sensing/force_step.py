@@ -16,7 +16,8 @@ from femsense.core.errors import DataError
 from femsense.fem.compliance import Tangent, tangent_at
 from femsense.fem.equilibrium import Equilibrium
 from femsense.qp.forces import estimate_forces
-from femsense.qp.problem import ForceOptions, FrictionCone
+from femsense.qp.friction_cone import FrictionCone
+from femsense.qp.problem import ForceOptions
 from femsense.sensing.nuisance import misfit_of, nuisance_columns, robust_std, sag_at
 from femsense.sensing.touches import friction_cone, nodal_forces_by_shift, tangents_of, touch_normal
 from femsense.sensing.types import Rows, Sensor, Touch

@@ -16,7 +16,7 @@ from femsense.core.errors import DataError
 from femsense.fem.compliance import tangent_at
 from femsense.fem.equilibrium import Equilibrium
 from femsense.sensing.force_step import ForceStep, Iterate, Linearisation, linearise, misfit_with_lost
-from femsense.sensing.measure import rows_at
+from femsense.sensing.measurement_rows import rows_at
 from femsense.sensing.nuisance import nuisance_columns, sag_at
 from femsense.sensing.states import ROUGH, solve_with
 from femsense.sensing.touches import make_touch, within_cones

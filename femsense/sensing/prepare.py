@@ -22,7 +22,7 @@ from femsense.model.recording import Recording
 from femsense.model.recording_checks import check_against
 from femsense.model.robot import Robot, spread_features
 from femsense.pointcloud.rays import Surface
-from femsense.sensing.measure import rows_at
+from femsense.sensing.measurement_rows import rows_at
 from femsense.sensing.nuisance import first_knowledge, learn, sag_at
 from femsense.sensing.places import check_places, near_places
 from femsense.sensing.types import Answers, Knowledge, Rows, SensingOptions, Sensor

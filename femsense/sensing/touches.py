@@ -10,7 +10,7 @@ from femsense.core.arrays import FloatArray
 from femsense.fem.equilibrium import Equilibrium
 from femsense.fem.mesh import vertex_normals
 from femsense.model.contact_patch import ContactPatch, closest_surface_point, patch_at
-from femsense.qp.problem import FrictionCone
+from femsense.qp.friction_cone import FrictionCone
 from femsense.sensing.types import Sensor, Touch
 
 PATCH = 1.05

@@ -18,10 +18,10 @@ from femsense.fem.cables import (
     cable_forces,
     cable_length,
     pull_rows,
-    rub,
     segments,
     shortening,
 )
+from femsense.fem.capstan import capstan_tensions
 from femsense.fem.equilibrium import SolveOptions, solve_equilibrium
 from femsense.fem.mesh import TetMesh, to_quadratic
 
@@ -139,22 +139,22 @@ def test_rubbing_is_that_of_the_definition(seed: int) -> None:
     before, angles = rng.uniform(0, 3, 4), rng.uniform(0, 2, 4)
     cable, motor = spring(0.3, 4), rng.uniform(0, 3)
     np.testing.assert_allclose(
-        rub(cable, angles, before, motor), capstan(before.tolist(), angles.tolist(), 0.3, motor), rtol=1e-12
+        capstan_tensions(cable, angles, before, motor), capstan(before.tolist(), angles.tolist(), 0.3, motor), rtol=1e-12
     )
 
 
 def test_pulling_loses_sticking_keeps_letting_go_gains() -> None:
     cable, angles = spring(0.5, 1), np.array([1.2])
     loss = np.exp(-0.5 * 1.2)
-    up = rub(cable, angles, np.zeros(1), 2.0)
+    up = capstan_tensions(cable, angles, np.zeros(1), 2.0)
     assert up[0] == pytest.approx(2.0 * loss)
-    assert rub(cable, angles, up, 2.0 * loss**1.5)[0] == up[0]  # inside the band: nothing moves
-    assert rub(cable, angles, up, 0.5)[0] == pytest.approx(0.5 / loss)  # slides back
-    assert rub(cable, angles, up, 0.0)[0] == 0.0
+    assert capstan_tensions(cable, angles, up, 2.0 * loss**1.5)[0] == up[0]  # inside the band: nothing moves
+    assert capstan_tensions(cable, angles, up, 0.5)[0] == pytest.approx(0.5 / loss)  # slides back
+    assert capstan_tensions(cable, angles, up, 0.0)[0] == 0.0
 
 
 def test_without_friction_the_tension_is_the_same_everywhere() -> None:
-    np.testing.assert_array_equal(rub(spring(0.0, 4), np.full(4, 1.0), np.array([3.0, 0, 1, 9]), 2.0), 2.0)
+    np.testing.assert_array_equal(capstan_tensions(spring(0.0, 4), np.full(4, 1.0), np.array([3.0, 0, 1, 9]), 2.0), 2.0)
 
 
 def test_friction_and_shape_rest_together() -> None:

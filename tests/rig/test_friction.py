@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from femsense.fem.body import tie_cable
-from femsense.fem.cables import rub
+from femsense.fem.capstan import capstan_tensions
 from femsense.rig.friction import new_grip, pull
 
 from helpers import block_mesh  # isort: skip
@@ -70,5 +70,5 @@ def test_it_agrees_with_the_estimators_rule(path: list[float], bends: list[float
     )
     before = np.zeros(3)
     for tension, behind in zip(path, _along(path, bends, mu)):
-        before = rub(cable, np.array(bends)[::-1], before, tension)
+        before = capstan_tensions(cable, np.array(bends)[::-1], before, tension)
         assert np.array(behind) == pytest.approx(before[::-1], abs=1e-10)

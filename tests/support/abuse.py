@@ -17,7 +17,8 @@ from femsense.core.errors import InputError
 from femsense.fem.assembly import internal
 from femsense.fem.body import BodyModel, make_body, tie_cable
 from femsense.fem.body_parts import Cable
-from femsense.fem.cables import bend_angles, cable_forces, cable_length, rub
+from femsense.fem.cables import bend_angles, cable_forces, cable_length
+from femsense.fem.capstan import capstan_tensions
 from femsense.fem.cavities import find_chamber
 from femsense.fem.chambers import chamber_volume, volume_gradient
 from femsense.fem.equilibrium import ADVICE, Equilibrium, SolveOptions, solve_equilibrium
@@ -100,7 +101,7 @@ def _check_rules(body: BodyModel, state: Equilibrium) -> None:
             low, high = np.exp(-cable.friction * angles), np.exp(cable.friction * angles)
             inner = np.append(along[1:], T)
             assert (along >= inner * low * (1 - 1e-5)).all() and (along <= inner * high * (1 + 1e-5)).all()
-            np.testing.assert_allclose(rub(cable, angles, along, T), along, rtol=1e-5)
+            np.testing.assert_allclose(capstan_tensions(cable, angles, along, T), along, rtol=1e-5)
         shorter = cable_length(cable, body.mesh.nodes) - cable_length(cable, state.positions)
         assert abs(shorter - state.shortening[cable.name]) < 1e-12
 
