@@ -106,6 +106,18 @@ def common_columns(rows: Rows, sag: FloatArray) -> FloatArray:
     return np.hstack([rows.by_pose, rows.functional(sag)])
 
 
+def response_std(knowledge: Knowledge, drives: int) -> float:
+    """Return how far the model's answer to a force may be off beside its answer to gravity, relative [1].
+
+    Cables pull as declared, but the model needs other pulls to move as the body does (mesh, law, ties): what it needs of a cable, it needs of a contact.
+    The root mean square of the pulls that the free frames ask for; 0 without cables.
+    """
+    if drives == 0 or len(knowledge.common_mean) <= drives:
+        return 0.0
+    variance = (knowledge.common_root[-drives:] ** 2).sum(axis=1)
+    return float(np.sqrt((knowledge.common_mean[-drives:] ** 2 + variance).mean()))
+
+
 def robust_std(rows: Rows, residual: FloatArray) -> FloatArray:
     """Return standard deviations that are larger where residuals stand out (Huber), and for rows that err together [m], shape (r,)."""
     std = rows.std * np.sqrt(rows.together)

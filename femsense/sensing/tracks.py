@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from femsense.core.arrays import FloatArray, freeze
+from femsense.sensing.nuisance import response_std
 from femsense.sensing.touches import touch_normal
 from femsense.sensing.types import ContactForce, Fit, SensedFrame, Sensor
 
@@ -19,12 +20,14 @@ def contacts_of(sensor: Sensor, k: int, fit: Fit, previous: SensedFrame | None) 
     """Return the contacts of a fit; those that begin a track have track −1."""
     number, stamp = int(sensor.recording.frame_numbers[k]), float(sensor.recording.time_s[k])
     contacts: list[ContactForce] = []
+    body, clouds = sensor.robot.body, fit.rows.of_clouds
+    share = response_std(sensor.knowledge, len(body.cables) + len(body.chambers)) if clouds else 0.0
     for i, (touch, force) in enumerate(zip(fit.touches, fit.forces)):
         size, normal = float(np.linalg.norm(force)), touch_normal(sensor, touch, fit.state)
         if size == 0.0 and touch.source != "given":
             continue
         along = force / size if size > 0 else -normal
-        own = fit.covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3]
+        own = fit.covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] + share**2 * np.outer(force, force)
         contacts.append(
             ContactForce(
                 frame=number,

@@ -17,7 +17,7 @@ from femsense.model.camera import CameraNoise
 from femsense.model.effects import apply_effects
 from femsense.model.recording import Recording
 from femsense.pointcloud.cloud import PointCloud
-from femsense.sensing.nuisance import first_knowledge, learn, misfit
+from femsense.sensing.nuisance import first_knowledge, learn, misfit, response_std
 from femsense.sensing.pipeline import estimate
 from femsense.sensing.prepare import make_sensor
 from femsense.sensing.types import Knowledge, Rows
@@ -79,6 +79,14 @@ def test_free_frames_tell_how_hard_a_cable_truly_pulls():
     learned = learn(before, frames)
     assert learned.common_mean[-1] == pytest.approx(-0.04, abs=0.004)
     assert np.linalg.norm(learned.common_root[-1]) < 0.01
+
+
+def test_pulls_that_the_model_needs_say_how_far_its_answer_to_a_force_is_off():
+    root = np.zeros((9, 9))
+    root[7:, 7:] = 0.03 * np.eye(2)
+    learned = replace(knowledge(), common_mean=np.array([0.0] * 7 + [0.04, -0.04]), common_root=root)
+    assert response_std(learned, 2) == pytest.approx(0.05)
+    assert response_std(knowledge(), 0) == 0.0
 
 
 def test_what_free_frames_do_not_show_stays_as_it_was_expected():
