@@ -77,12 +77,11 @@ def import_(
     json: Json = False,
 ) -> Answer:
     """Make a recording of what other programs recorded."""
-    from femsense.app.import_command import columns_named, import_into, import_text, shifts_named
+    from femsense.app.import_command import columns_named, free_named, import_into, import_text, shifts_named
     from femsense.io.importers.frames import Options
 
-    options = Options(
-        format, tuple(topic or ()), columns_named(map_ or []), unit, up, clock, rate, base, shifts_named(shift or [])
-    )
+    shifts, spans = shifts_named(shift or []), free_named(free or [])
+    options = Options(format, tuple(topic or ()), columns_named(map_ or []), unit, up, clock, rate, base, shifts, every, spans)
     with progress_bar("import") as progress:
         document = import_into(
             output,

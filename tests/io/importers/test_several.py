@@ -12,6 +12,7 @@ import pytest
 from imported import imported
 from ros_writers import HEIGHT, START_NS, STEP_NS, WIDTH, BagWriter, depth_of
 
+from femsense.app import cli
 from femsense.app.import_command import import_into
 from femsense.core.errors import InputError
 from femsense.io.clouds.images import read_png
@@ -158,7 +159,8 @@ def test_one_of_so_many_frames_and_spans_that_are_free(tmp_path: Path) -> None:
     with BagWriter(tmp_path / "take", "mcap") as bag:
         for k in range(7):
             bag.write("/markers", START_NS + k * 10**9, bag.marker_array({"tip": (0.1 * k, 0.0, 0.3)}, START_NS + k * 10**9))
-    import_into(tmp_path / "r", [tmp_path / "take"], Options(every=2, free=[(0.0, 0.5), (4.0, 6.0)]), say=print)
+    said = ["--every", "2", "--free", "0:0.5", "--free", "4:6"]
+    assert cli.run(["import", str(tmp_path / "take"), "-o", str(tmp_path / "r"), *said]) == 0
     recording = load_recording(tmp_path / "r")
     np.testing.assert_allclose(recording.time_s, [0, 2, 4, 6])
     np.testing.assert_allclose(recording.marker_xyz[:, 0], [0, 0.2, 0.4, 0.6])
