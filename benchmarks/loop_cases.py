@@ -457,6 +457,10 @@ def _driven(case: Case, recorded: FloatArray, time_s: FloatArray) -> FloatArray:
         mix = np.eye(recorded.shape[1])
         mix[0, 1] = 0.12 * case.size
         return recorded @ mix.T if case.control == "tension" else recorded @ mix
+    if case.outside == "commanded":  # motors hold a tension to 2 % of itself and of the largest one, and nobody measures it
+        rng, level = np.random.default_rng([7, case.number]), recorded.max()
+        off = 0.02 * case.size * (recorded * rng.normal(size=recorded.shape) + level * rng.normal(size=recorded.shape[1]))
+        return np.maximum(recorded + np.where(recorded > 0.0, off, 0.0), 0.0)
     if case.outside == "kinked_cable":
         limit = 0.7 / case.size**0.3 * recorded[:, 0].max()
         return np.column_stack([np.minimum(recorded[:, 0], limit), recorded[:, 1:]])
@@ -501,6 +505,8 @@ def _measure(
     shown = _seen(true, states, placement)
     if case.outside == "slipped_marker":
         shown[F // 2 :, -2] += 1.5e-3 * case.size * np.array([0.6, 0.6, 0.5])
+    if case.outside == "no_name":
+        shown += _no_name(case, recorded, shown, declared.marker_points)
     if case.outside == "camera_drift":
         shown += np.linspace(0, 1, F)[:, None, None] * 6e-4 * case.size * np.array([0.5, 0.7, 0.5])
     shown = shown + noise["frame"] * rng.normal(size=(F, 1, 3)) + noise["sweep"] * rng.normal(size=(sweep.max() + 1, 1, 3))[sweep]
@@ -517,6 +523,17 @@ def _measure(
         about=About(rest=rest),
     )
     return recording, T, noise
+
+
+def _no_name(case: Case, recorded: FloatArray, shown: FloatArray, places: FloatArray) -> FloatArray:
+    """Return an error of the model without a name [m], shape (F, k, 3): smooth along the body and quadratic in the inputs, 5 % of the motion."""
+    rng = np.random.default_rng([9, case.number])
+    u = recorded / recorded.max()
+    drive = np.stack([u[:, i] * u[:, j] for i in range(u.shape[1]) for j in range(i, u.shape[1])], axis=1)
+    along = places[:, 0] / places[:, 0].max()
+    field = np.einsum("fq,qc,k->fkc", drive, rng.normal(size=(drive.shape[1], 3)), along**2)
+    motion = np.sqrt(np.mean((shown - shown[0]) ** 2))
+    return np.asarray(0.05 * case.size * motion * field / np.sqrt(np.mean(field**2)))
 
 
 def _through(T_robot_camera: FloatArray, points: FloatArray, seen: Observation) -> FloatArray:

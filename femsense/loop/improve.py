@@ -31,6 +31,7 @@ from femsense.loop.search.element_order import need_quadratic, seeks_with_quadra
 from femsense.loop.search.search import distinguishes_effects, search_begun, search_effects
 from femsense.loop.search.search_state import Progress, Search, SearchProgress
 from femsense.loop.search.some_states import in_all_states, some_states
+from femsense.loop.thresholds import DEFAULTS, EFFORT, Effort, Thresholds
 from femsense.loop.verdict.empirical import judged_correction
 from femsense.loop.verdict.verdict import conclude
 from femsense.model.effects import EFFECTS, FORMS, Effect, find_effect, forms_by_recording, load_own_effect, try_own_effect
@@ -53,6 +54,10 @@ class ImproveOptions:
     """Also learn an empirical correction of what is left, judged on held-out data; it is no cause, and no effect."""
     seed: int = 0
     """Of the permutation test and the bootstrap."""
+    thresholds: Thresholds = DEFAULTS
+    """What decides; other values than these are for experiments with the loop itself."""
+    effort: Effort = EFFORT
+    """How much is tried."""
     keep: tuple[str | Path, Mapping[str, Any]] | None = None
     """A file that holds how far the search has come, so that one that is killed goes on there, and what it is made from: a file that says
     something else is not used. It is removed at the end."""
@@ -84,35 +89,10 @@ def improve(
         InputError: unknown names, no recording; DataError: the data do not allow a fit.
     """
     say, how = progress or (lambda text: None), options or ImproveOptions()
-    own = tuple(load_own_effect(file) for file in how.user_effects)
-    for effect in own:
-        try_own_effect(effect, robot)
-    names = _names(effects, without, own)
-    if not names:
-        raise InputError("no effect is left to try", where="effects, without", expected="at least one of docs/effects/")
-    _require_one_that_acts(names if effects else [], own, robot, recordings)
+    names, forms = _asked(robot, recordings, effects, without, how)
     rng = np.random.default_rng(how.seed)
-    forms = (*FORMS, *forms_by_recording(FORMS, recordings), *own)
-
-    def begun(data: Data, names: Sequence[str], quadratic: bool, refits: list[RefitRecord]) -> SearchProgress:
-        with beside(lambda: _get_ready(data.robot, names)) as finer_is_made:
-            data, before, start = calibrated(data, say)
-            finer_is_made()
-        data = with_discretisation_error(data, start[-1][1], names, say)
-        return search_begun((data, before, start), names, refits, quadratic=quadratic)
-
-    def ready(body: Robot, names: Sequence[str], *, quadratic: bool, refits: list[RefitRecord]) -> SearchProgress:
-        say("reading and calibrating")
-        every = replace(prepare(body, recordings, validation, how.measured), forms=forms, declared=robot)
-        some = some_states(every)
-        with contextlib.suppress(FemsenseError):  # what has no equilibrium in all states is sought in all of them
-            if some is not None:
-                course = begun(some, names, quadratic, refits)
-                return in_all_states(every, course, search_effects(course, Checkpoint(None), say)[1], say)
-        return begun(every, names, quadratic, refits)
-
     with Checkpoint(how.keep, forms) as checkpoint:
-        data, search = _searched(robot, names, ready, checkpoint, say)
+        data, search = _search(robot, recordings, validation, (names, forms), how, checkpoint, say)
         say("testing what is left")
         result = conclude(data, search, rng)
         record = next_experiment(data, search.final, search.noise, result.confounded, result.not_testable)
@@ -126,6 +106,73 @@ def improve(
         return result
     only = "record another state (other inputs, load or direction of gravity): these data repeat too few states, which cannot distinguish effects"
     return replace(result, next_experiment="; ".join(t for t in (only, result.next_experiment) if t))
+
+
+@one_blas_thread()
+def search_recordings(
+    robot: Robot,
+    recordings: Sequence[Recording],
+    *,
+    validation: Sequence[Recording] = (),
+    effects: Sequence[str] | None = None,
+    without: Sequence[str] | None = None,
+    options: ImproveOptions | None = None,
+) -> tuple[Data, Search]:
+    """Return the data with what a search finds in them, before anything is concluded (`conclude`); arguments and errors as of `improve`."""
+    how = options or ImproveOptions()
+    names, forms = _asked(robot, recordings, effects, without, how)
+    with Checkpoint(how.keep, forms) as checkpoint:
+        return _search(robot, recordings, validation, (names, forms), how, checkpoint, lambda text: None)
+
+
+def _asked(
+    robot: Robot,
+    recordings: Sequence[Recording],
+    effects: Sequence[str] | None,
+    without: Sequence[str] | None,
+    how: ImproveOptions,
+) -> tuple[list[str], tuple[Effect, ...]]:
+    """Return the names of the effects that are tried, and all their forms. Raises InputError."""
+    own = tuple(load_own_effect(file) for file in how.user_effects)
+    for effect in own:
+        try_own_effect(effect, robot)
+    names = _names(effects, without, own)
+    if not names:
+        raise InputError("no effect is left to try", where="effects, without", expected="at least one of docs/effects/")
+    _require_one_that_acts(names if effects else [], own, robot, recordings)
+    return names, (*FORMS, *forms_by_recording(FORMS, recordings), *own)
+
+
+def _search(
+    robot: Robot,
+    recordings: Sequence[Recording],
+    validation: Sequence[Recording],
+    asked: tuple[list[str], tuple[Effect, ...]],
+    how: ImproveOptions,
+    checkpoint: Checkpoint,
+    say: Progress,
+) -> tuple[Data, Search]:
+    names, forms = asked
+
+    def begun(data: Data, names: Sequence[str], quadratic: bool, refits: list[RefitRecord]) -> SearchProgress:
+        with beside(lambda: _get_ready(data.robot, names)) as finer_is_made:
+            data, before, start = calibrated(data, say)
+            finer_is_made()
+        data = with_discretisation_error(data, start[-1][1], names, say)
+        return search_begun((data, before, start), names, refits, quadratic=quadratic)
+
+    def ready(body: Robot, names: Sequence[str], *, quadratic: bool, refits: list[RefitRecord]) -> SearchProgress:
+        say("reading and calibrating")
+        every = prepare(body, recordings, validation, how.measured)
+        every = replace(every, forms=forms, declared=robot, thresholds=how.thresholds, effort=how.effort)
+        some = some_states(every)
+        with contextlib.suppress(FemsenseError):  # what has no equilibrium in all states is sought in all of them
+            if some is not None:
+                course = begun(some, names, quadratic, refits)
+                return in_all_states(every, course, search_effects(course, Checkpoint(None), say)[1], say)
+        return begun(every, names, quadratic, refits)
+
+    return _searched(robot, names, ready, checkpoint, say)
 
 
 def _searched(

@@ -24,6 +24,7 @@ from femsense.loop.data.surface_rows import (
     with_surface,
 )
 from femsense.loop.data.trial import Groups, States, SurfaceRows, Trial, normals_of
+from femsense.loop.thresholds import DEFAULTS, EFFORT, Effort, Thresholds
 from femsense.model.effects import CALIBRATED, EFFECTS, FORMS, Effect, Entry
 from femsense.model.observation import Scene, make_scene, rest_residual, with_rest_markers
 from femsense.model.recording import Recording, state_key
@@ -68,6 +69,10 @@ class Data:
     """Frame numbers and names of markers that are left out because they are far from where others let expect them."""
     mesh_note: str = ""
     """Why the discretisation error is not known; empty where it is."""
+    thresholds: Thresholds = DEFAULTS
+    """What decides."""
+    effort: Effort = EFFORT
+    """How much is tried."""
 
     @property
     def measured(self) -> tuple[str, ...]:

@@ -14,13 +14,7 @@ import numpy as np
 from femsense.core.arrays import BoolArray, FloatArray, IntArray
 from femsense.loop.data.dataset import Data
 from femsense.loop.data.trial import Trial
-
-OUTLYING = 4.0
-"""An outlier is off by so many times what nine in ten are off by at most …"""
-FAR = 0.05
-"""… and by more than this share of the body's reach; nearer ones may be what is sought."""
-RARE = 0.02
-"""Where more than this share is, it is no accident."""
+from femsense.loop.thresholds import Thresholds
 
 
 def without_outliers(data: Data, fitted: Sequence[FloatArray], held_out: Sequence[FloatArray]) -> Data:
@@ -36,7 +30,9 @@ def _kept(data: Data, trial: Trial, residual: FloatArray) -> Trial:
     """Return a trial without its outliers; itself where there are none, or it is of clouds."""
     if trial.scene.crossings is not None:
         return trial
-    off = outliers(residual, trial.scene.frame, trial.scene.marker, FAR * data.robot.body.reach)
+    off = outliers(
+        residual, trial.scene.frame, trial.scene.marker, data.thresholds.far_off * data.robot.body.reach, data.thresholds
+    )
     if not off.any():
         return trial
     scene, keep = trial.scene, ~off
@@ -44,20 +40,20 @@ def _kept(data: Data, trial: Trial, residual: FloatArray) -> Trial:
     return replace(trial, scene=fewer, groups=trial.groups.of_rows(keep), mesh_error=None)
 
 
-def outliers(residual: FloatArray, frame: IntArray, marker: IntArray, far: float) -> BoolArray:
-    """Return which rows of a residual (k, 3) [m] stand out from their frame and their marker by more than `far` [m], and by OUTLYING times the 90 % quantile.
+def outliers(residual: FloatArray, frame: IntArray, marker: IntArray, far: float, decides: Thresholds) -> BoolArray:
+    """Return which rows of a residual (k, 3) [m] stand out from their frame and their marker by more than `far` [m], and by so many times the 90 % quantile.
 
     Several of a frame that are off the same way are no outliers: a part of the body is elsewhere than the model has it. Two that swapped their names
     are off opposite ways.
     """
     apart = _less_medians(_less_medians(residual, frame), marker)
     size = np.linalg.norm(apart, axis=1)
-    off = size > max(far, OUTLYING * float(np.quantile(size, 0.9)))
+    off = size > max(far, decides.outlying * float(np.quantile(size, 0.9)))
     for k in np.unique(frame[off]):
         rows = np.flatnonzero(off & (frame == k))
         if len(rows) > 1 and (apart[rows] @ apart[rows].T > 0.0).all():
             off[rows] = False
-    return off if off.sum() <= max(RARE * len(off), 1) else np.zeros(len(off), dtype=bool)
+    return off if off.sum() <= max(decides.rare * len(off), 1) else np.zeros(len(off), dtype=bool)
 
 
 def _less_medians(values: FloatArray, labels: IntArray) -> FloatArray:

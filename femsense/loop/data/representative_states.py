@@ -12,8 +12,6 @@ from femsense.core.arrays import FloatArray, IntArray
 from femsense.loop.data.trial import Trial
 from femsense.model.recording import Recording
 
-MOST_WORK = 20_000
-"""Tetrahedra × states of a recording that are looked at as they are; where there are more, some states speak for all."""
 FEWEST = 12
 """They are as many at least."""
 SAME = 1e-9

@@ -15,7 +15,7 @@ from femsense.loop.data.dataset import NUISANCE, Data
 from femsense.loop.data.trial import Trial, numbers_of
 from femsense.loop.design.candidate_experiments import Element, candidate_experiments, setup_for
 from femsense.loop.design.experiment_blocks import Block, Form, forms_of, make_block, turns_of
-from femsense.loop.design.identifiability import EVIDENCE, Identifiability, Judge, Row
+from femsense.loop.design.identifiability import Identifiability, Judge, Row
 from femsense.loop.design.planner import Proposal, element_block
 from femsense.loop.fit.joint_fit import JointFit
 from femsense.loop.fit.noise_components import Noise
@@ -136,7 +136,7 @@ def next_element(
     Returns:
         (what to do, the open question that gains most by it, the expected evidence on it before and after), the best first; empty where nothing
         brings any question towards an answer or where it would take too long. What an item is worth is the evidence between 0 and
-        `EVIDENCE` that it adds to each question: below 0 the wrong answer is expected, and less wrong is no better.
+        what decides that it adds to each question: below 0 the wrong answer is expected, and less wrong is no better.
     """
     robot = fit.hypothesis.robot_at(fit.coordinates)
     names = {n for pair in confounded for n in pair} | set(not_testable)
@@ -158,7 +158,7 @@ def next_element(
         ]
     except FemsenseError:
         return []
-    judge, left = Judge(forms), min(MOST_WORK // tets, MOST_FRAMES)
+    judge, left = Judge(forms, decides=data.thresholds), min(MOST_WORK // tets, MOST_FRAMES)
     now = _open(judge.judge(have), confounded, not_testable)
     questions = [*(f"tell {a} from {b}" for a, b in confounded), *(f"show {name}" for name in not_testable)]
     chosen = []
@@ -178,7 +178,7 @@ def next_element(
         if block is None:
             continue
         then = _open(judge.judge([*have, block]), confounded, not_testable)
-        gain = np.clip(then, 0.0, EVIDENCE) - np.clip(now, 0.0, EVIDENCE)
+        gain = np.clip(then, 0.0, data.thresholds.evidence) - np.clip(now, 0.0, data.thresholds.evidence)
         if gain.sum() > 1.0:
             most = int(np.argmax(gain))
             found.append((float(gain.sum()), (element.words, questions[most], float(now[most]), float(then[most]))))
@@ -214,6 +214,7 @@ def _open(identifiability: Identifiability, pairs: Sequence[tuple[str, str]], no
         for i, j, _, gap in reversed(identifiability.pairs())
     }
     alone = {r.name: r.dbic for r in reversed(identifiability.rows)}
-    answers: list[Any] = [of.get(frozenset(p), EVIDENCE) for p in pairs]
-    answers += [alone.get(n, EVIDENCE) for n in not_testable]
-    return np.array(answers or [EVIDENCE])
+    wanted = identifiability.decides.evidence
+    answers: list[Any] = [of.get(frozenset(p), wanted) for p in pairs]
+    answers += [alone.get(n, wanted) for n in not_testable]
+    return np.array(answers or [wanted])

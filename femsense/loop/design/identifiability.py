@@ -20,12 +20,9 @@ import numpy as np
 from femsense.core.arrays import FloatArray
 from femsense.loop.data.dataset import NUISANCE
 from femsense.loop.design.experiment_blocks import Block, Form
-from femsense.loop.search.screening import TESTABLE, penalty
+from femsense.loop.search.screening import penalty
+from femsense.loop.thresholds import DEFAULTS, Thresholds
 
-EVIDENCE = 10.0
-"""dBIC from which an effect is seen, or told from another."""
-ALIKE = 0.95
-"""Effects that are collinear by more than this share cannot be distinguished."""
 ABSORBED = 1e-9
 """Share of its χ² below which a direction counts as absorbed whole."""
 
@@ -43,14 +40,15 @@ class Row:
     form: Form
     dbic: float
     """Expected at plausible size."""
+    decides: Thresholds
 
     @property
     def testable(self) -> bool:
-        return self.retained >= TESTABLE
+        return self.retained >= self.decides.testable
 
     @property
     def seen(self) -> bool:
-        return self.testable and self.dbic >= EVIDENCE
+        return self.testable and self.dbic >= self.decides.evidence
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -62,6 +60,7 @@ class Identifiability:
     """How much of effect i (row) is collinear with effect j, calibration refitted, shape (r, r)."""
     gap: FloatArray
     """Expected dBIC of i over j where i is the truth at plausible size, shape (r, r); inf between forms of one effect."""
+    decides: Thresholds = DEFAULTS
 
     def pairs(self) -> list[tuple[int, int, float, float]]:
         """Return (i, j, confounding, gap) of all pairs of effects, the weaker direction of each."""
@@ -75,7 +74,11 @@ class Identifiability:
     def confused(self) -> list[tuple[int, int, float, float]]:
         """Return pairs of effects that would both be seen and cannot be distinguished."""
         seen = [r.seen for r in self.rows]
-        return [p for p in self.pairs() if seen[p[0]] and seen[p[1]] and (p[2] > ALIKE or p[3] < EVIDENCE)]
+        return [p for p in self.pairs() if seen[p[0]] and seen[p[1]] and self.cannot_distinguish(p)]
+
+    def cannot_distinguish(self, pair: tuple[int, int, float, float]) -> bool:
+        """Return whether a pair as of `pairs` is too collinear, or too close in evidence."""
+        return pair[2] > self.decides.alike or pair[3] < self.decides.evidence
 
     def distinguished(self) -> tuple[int, int]:
         """Return the number of pairs of effects that would both be seen and distinguished, and of all pairs."""
@@ -95,9 +98,10 @@ class Identifiability:
     @property
     def confusion(self) -> float:
         """What a plan lowers: shortfalls of pairs and of effects, each between 0 and 1; also those not counted yet because of another."""
-        missing = sum(max(0.0, 1.0 - r.retained / TESTABLE) + np.clip(1.0 - r.dbic / EVIDENCE, 0.0, 1.0) for r in self.rows)
+        least, alike, wanted = self.decides.testable, self.decides.alike, self.decides.evidence
+        missing = sum(max(0.0, 1.0 - r.retained / least) + np.clip(1.0 - r.dbic / wanted, 0.0, 1.0) for r in self.rows)
         pairs = sum(
-            np.clip(1.0 - gap / EVIDENCE, 0.0, 1.0) + np.clip((share - ALIKE) / (1 - ALIKE), 0, 1)
+            np.clip(1.0 - gap / wanted, 0.0, 1.0) + np.clip((share - alike) / (1 - alike), 0, 1)
             for *_, share, gap in self.pairs()
         )
         return float(missing + pairs)
@@ -109,6 +113,7 @@ class Judge:
 
     forms: list[Form]
     calibrated: tuple[str, ...] = NUISANCE
+    decides: Thresholds = DEFAULTS
     _by_label: dict[str, list[int]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -135,7 +140,7 @@ class Judge:
                 if a.name != b.name:
                     left = free[self._dropped(a.label) | self._dropped(b.label)]
                     confounding[i, j], gap[i, j] = left.alternative(self.forms.index(a.form), self._by_label[b.label])
-        return Identifiability(tuple(rows), confounding, gap)
+        return Identifiability(tuple(rows), confounding, gap, self.decides)
 
     def _dropped(self, label: str) -> frozenset[str]:
         return frozenset({label} & set(self.calibrated))
@@ -165,9 +170,9 @@ class Judge:
         at = f.columns
         size, total = np.diag(left.S)[at], np.diag(whole)[at]
         retained = float(np.sqrt(max(size.sum(), 0.0) / total.sum())) if total.sum() > 0 else 0.0
-        needed = np.sqrt(EVIDENCE + len(f.parameters) * np.log(count))
+        needed = np.sqrt(self.decides.evidence + len(f.parameters) * np.log(count))
         smallest = np.where(size > ABSORBED * np.maximum(total, 1e-300), needed / np.sqrt(np.maximum(size, 1e-300)), np.inf)
-        return Row(label, f.name, retained, smallest, f, left.dbic(self.forms.index(f)))
+        return Row(label, f.name, retained, smallest, f, left.dbic(self.forms.index(f)), self.decides)
 
 
 class _Left:

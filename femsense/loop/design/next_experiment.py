@@ -9,7 +9,6 @@ import numpy as np
 from femsense.loop.data.dataset import Data
 from femsense.loop.data.trial import heads_of
 from femsense.loop.design.advice import next_element
-from femsense.loop.design.identifiability import EVIDENCE
 from femsense.loop.fit.fitted_model import FittedModel
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.result.records import ConfoundedPair, Untestable
@@ -25,7 +24,7 @@ def next_experiment(
     predicted = next_element(data, final.fit, noise, pairs, [effect.name for effect in not_testable])
     if predicted:
         said = [
-            f"{words} (would {what}: dBIC {round(before)} → {round(after)}, of {EVIDENCE:.0f} that decide)"
+            f"{words} (would {what}: dBIC {round(before)} → {round(after)}, of {data.thresholds.evidence:.0f} that decide)"
             for words, what, before, after in predicted[:2]
         ]
         loaded = any(len(t.scene.recording.load_frame) for t in data.train)

@@ -21,7 +21,7 @@ from femsense.loop.data.dataset import groups_of, marked_frames
 from femsense.loop.data.trial import Trial
 from femsense.loop.design.candidate_experiments import Element, Setup, candidate_experiments, minimal, script_of, setup_for
 from femsense.loop.design.experiment_blocks import Block, Form, forms_of, make_block, turns_of
-from femsense.loop.design.identifiability import ALIKE, EVIDENCE, Identifiability, Judge
+from femsense.loop.design.identifiability import Identifiability, Judge
 from femsense.model.effects import OF_INPUTS
 from femsense.model.observation import make_scene
 from femsense.model.recording import Recording, make_recording
@@ -318,8 +318,8 @@ def _better(before: Identifiability, after: Identifiability) -> list[str]:
         was = old.get(pair_labels(after, p))
         if (
             was is not None
-            and _alike(was)
-            and not _alike(p)
+            and before.cannot_distinguish(was)
+            and not after.cannot_distinguish(p)
             and then[pair_labels(after, p)[0]].seen
             and then[pair_labels(after, p)[1]].seen
         ):
@@ -329,7 +329,3 @@ def _better(before: Identifiability, after: Identifiability) -> list[str]:
 
 def pair_labels(identifiability: Identifiability, pair: tuple[int, int, float, float]) -> tuple[str, str]:
     return identifiability.rows[pair[0]].label, identifiability.rows[pair[1]].label
-
-
-def _alike(pair: tuple[int, int, float, float]) -> bool:
-    return pair[2] > ALIKE or pair[3] < EVIDENCE

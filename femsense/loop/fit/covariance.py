@@ -30,8 +30,6 @@ RINGS, SPOKES = 160, 48
 
 LEAST_SWEEPS = 3
 """Fewer cannot disagree."""
-SEED_STD = 0.7
-"""How well a seed's own number is known beforehand, in its coordinate (the logarithm of a time: a factor of two)."""
 
 
 def parameter_std(data: Data, fitted: FittedModel, noise: Noise, seed_std: dict[str, FloatArray]) -> dict[str, FloatArray]:
@@ -158,7 +156,7 @@ def _with_open_seeds(data: Data, fitted: FittedModel, noise: Noise) -> FloatArra
         terms.append((effect, seed, (*parameters, *more)))
         null += [*fitted.fit.coordinates[at : at + len(parameters)], *(p.null for p in more)]
         moving += [True] * len(parameters) + [False] * len(more)
-        known += [min(p.known, SEED_STD) for p in (*parameters, *more)]
+        known += [min(p.known, data.thresholds.seed_std) for p in (*parameters, *more)]
         at += len(parameters)
     mask = np.array(moving, dtype=bool)
     if mask.all():

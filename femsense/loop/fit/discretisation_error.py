@@ -2,7 +2,7 @@
 
 A residual of that shape says nothing of the robot, whatever its size: how much of it a body shows is not known (a cable that is tied to points
 sinks the deeper the finer the mesh is), but it is the same share in all sweeps, but for what directions and sweeps differ by. So it counts as
-noise, once for all sweeps together (`SHARE`), once for each by itself (`VARIES`) and turned (`TURNS`), so that no effect is named for what a
+noise, once for all sweeps together (`mesh_share` of `Thresholds`), once for each by itself (`mesh_varies`) and turned (`mesh_turns`), so that no effect is named for what a
 finer mesh would explain. A few Newton steps from the state on the declared mesh, which the finer one holds exactly, give it (a hierarchical estimate: Bank & Smith 1993).
 """
 
@@ -25,6 +25,7 @@ from femsense.loop.data.representative_states import between, representatives, s
 from femsense.loop.data.trial import Trial, normals_of, rms_of
 from femsense.loop.fit.fitted_model import FittedModel, poses_and_inputs, some_terms
 from femsense.loop.fit.noise_components import Noise, whiten
+from femsense.loop.thresholds import Thresholds
 from femsense.model.drive import DrivenRobot, drive_of
 from femsense.model.finer_mesh import finer_state, share_on_finer
 from femsense.model.observation import placements
@@ -36,16 +37,6 @@ MOST_TETS = 24000
 """A finer mesh than this takes too long in every state."""
 MOST_WORK = 100_000
 """Tetrahedra × states of a recording; beyond it the errors of other states are interpolated between those that were computed."""
-SHARE = 0.7
-"""Standard deviation of the share of the error that a body shows in all sweeps (anchors that are some millimetres wide sink less than points; a body
-shows more than a mesh of half the size does) …"""
-VARIES, VARIES_HELD = 0.25, 0.12
-"""… of what each sweep adds to it, and does where cables are held: then it is mostly that they sink in, by the same share …"""
-TURNS = 0.07
-"""… and of the nine entries of a matrix that turns and stretches it in all sweeps: another mesh is not as much finer along the body as across."""
-ELSEWHERE = 0.05
-"""The mesh errs in another way in states that differ by more than this share of how far they are from rest. With 0.2 the gain of a held cable came out
-as 0.836 ± 0.006 for 0.85, with this as 0.842 (`benchmarks/effects.py`)."""
 PULLING = "cables", "cable_slots"
 """What of a body only tells how its cables pull."""
 
@@ -62,18 +53,18 @@ def with_mesh_errors(data: Data, fitted: FittedModel, tried: Sequence[str]) -> D
         fine = on_its_clamp(robot, robot_on_mesh(_on_firm_clamp(robot), finer))
         for i, (trial, (poses, initial)) in enumerate(zip(data.train, known)):
             own = [j for j, of in enumerate(data.held_of) if of == i]
-            train[i], *later = _with_errors(robot, fine, [trial, *(held[j] for j in own)], poses, initial)
+            train[i], *later = _with_errors(data, robot, fine, [trial, *(held[j] for j in own)], poses, initial)
             for j, one in zip(own, later):
                 held[j] = one
         for j in (j for j, of in enumerate(data.held_of) if of is None):
-            held[j] = _with_errors(robot, fine, [held[j]], held[j].poses, held[j].initial)[0]
+            held[j] = _with_errors(data, robot, fine, [held[j]], held[j].poses, held[j].initial)[0]
     except FemsenseError as error:
         known_before = bool(mesh_errors(data))
         return data if known_before else replace(data, mesh_note=f"no state settles on a finer mesh ({error})")
     return replace(data, train=train, held=held, mesh_note="")
 
 
-def errs_alike(before: FittedModel, after: FittedModel) -> bool:
+def errs_alike(data: Data, before: FittedModel, after: FittedModel) -> bool:
     """Return whether the mesh errs after an effect was added as it did before: where the effect changes nothing of the body but how its cables
     pull, or what the camera sees, and the states are nearly the same."""
     old = before.fit.hypothesis
@@ -85,7 +76,7 @@ def errs_alike(before: FittedModel, after: FittedModel) -> bool:
         return False
     rest = robot.body.mesh.nodes
     pairs = [(a.states[k].positions, b.states[k].positions) for a, b in zip(before.fit.jets, after.fit.jets) for k in a.states]
-    return rms_of([b - a for a, b in pairs]) <= ELSEWHERE * rms_of([a - rest for a, _ in pairs])
+    return rms_of([b - a for a, b in pairs]) <= data.thresholds.mesh_elsewhere * rms_of([a - rest for a, _ in pairs])
 
 
 def _on_firm_clamp(robot: Robot) -> Robot:
@@ -144,37 +135,35 @@ def _ties(mesh: TetMesh, fine: TetMesh) -> Embedding:
 
 
 def _with_errors(
-    robot: Robot, fine: Robot, trials: Sequence[Trial], poses: Sequence[FloatArray], initial: FloatArray | None
+    data: Data, robot: Robot, fine: Robot, trials: Sequence[Trial], poses: Sequence[FloatArray], initial: FloatArray | None
 ) -> list[Trial]:
     """Return trials of one recording with the error of the mesh in their states."""
     moves = _moves(robot, fine, trials, placements(robot, trials[0].scene, poses), initial)
-    return [replace(t, mesh_error=_by_sweep(t, moves, poses)) for t in trials]
+    return [replace(t, mesh_error=_by_sweep(t, moves, poses, data.thresholds)) for t in trials]
 
 
-def _by_sweep(trial: Trial, moves: dict[int, FloatArray], poses: Sequence[FloatArray]) -> FloatArray:
+def _by_sweep(trial: Trial, moves: dict[int, FloatArray], poses: Sequence[FloatArray], decides: Thresholds) -> FloatArray:
     """Return the fields of the error [m], shape (k, c, 1 + sweeps + 9), each of one standard deviation.
 
-    `SHARE` times the error of all sweeps together, `VARIES` (`VARIES_HELD`) times that of each sweep, `TURNS` times each of its axes along each axis.
+    Shares of the error of all sweeps together, of that of each sweep, and of each of its axes along each axis.
     """
     error = np.array([moves[int(f)][m] for f, m in zip(trial.scene.frame, trial.scene.marker)])
     along = np.broadcast_to(np.eye(3), (len(error), 3, 3))  # (k, c, axis)
     if trial.scene.crossings is not None:
         along = normals_of(trial.scene, poses)[:, None, :]
-    turned = TURNS * (along[:, :, :, None] * error[:, None, None, :]).reshape(len(error), -1, 9)
+    turned = decides.mesh_turns * (along[:, :, :, None] * error[:, None, None, :]).reshape(len(error), -1, 9)
     error = np.einsum("kca,ka->kc", along, error)
     number = np.unique(trial.groups.sweep, return_inverse=True)[1]
     by_sweep = np.zeros((*error.shape, int(number.max()) + 1))
-    by_sweep[np.arange(len(error)), :, number] = _varies(trial) * error
-    return np.concatenate([SHARE * error[:, :, None], by_sweep, turned], axis=2)
-
-
-def _varies(trial: Trial) -> float:
-    return VARIES_HELD if trial.scene.recording.actuation == "displacement" else VARIES
+    by_sweep[np.arange(len(error)), :, number] = (
+        decides.mesh_varies_held if trial.scene.recording.actuation == "displacement" else decides.mesh_varies
+    ) * error
+    return np.concatenate([decides.mesh_share * error[:, :, None], by_sweep, turned], axis=2)
 
 
 def mesh_errors(data: Data) -> list[FloatArray]:
     """Return the error of the mesh in the rows of each fitted trial [m], (k, c); none where one is not known."""
-    known = [t.mesh_error[:, :, 0] / SHARE for t in data.train if t.mesh_error is not None]
+    known = [t.mesh_error[:, :, 0] / data.thresholds.mesh_share for t in data.train if t.mesh_error is not None]
     return known if len(known) == len(data.train) else []
 
 

@@ -30,6 +30,7 @@ from scipy.optimize import minimize
 from femsense.core.arrays import BoolArray, FloatArray
 from femsense.core.parallel import each
 from femsense.loop.data.trial import COMPONENTS, Groups
+from femsense.loop.thresholds import DEFAULTS
 
 ROUNDING = 1e-12
 """Directions of fields with less of the largest square are rounding."""
@@ -161,8 +162,6 @@ def whiten(whitener: Whitener, values: FloatArray) -> FloatArray:
 
 
 NEAR_STD = float(np.log(2.0))
-JITTER = 0.4
-"""The white part of the noise is no less than this share of what repeats of a state scatter by."""
 FLAT = 1e-6
 """Relative decrease of the likelihood at which the estimate of the noise ends: a hundredth of a log-likelihood of ten thousand."""
 MAX_REML_ROWS = 700
@@ -177,6 +176,7 @@ def estimate_noise(
     extra: list[FloatArray],
     groups: list[Groups],
     before: dict[str, float] | None = None,
+    white_share: float = DEFAULTS.white_share,
 ) -> Noise:
     """Return the components of the noise by restricted maximum likelihood.
 
@@ -186,6 +186,7 @@ def estimate_noise(
         extra: columns of what might be in the data besides, shape (k, c, q), the likeliest first; these count as explained.
         groups: of each recording.
         before: components [m] of an earlier estimate with a poorer model; the new one stays near it (a factor of two, softly), where the data leave it open.
+        white_share: white noise is no less than this share of what repeats of a state scatter by.
     """
     residuals, nuisance, extra, groups = _thinned(residuals, nuisance, extra, groups)
     names = ["white", *sorted({n for g in groups for n in g.members()})]
@@ -194,7 +195,7 @@ def estimate_noise(
     scale = float(np.sqrt(np.mean(np.concatenate([r.ravel() for r in residuals]) ** 2))) + FLOOR
     jitter = _jitter(residuals, groups) if "state" in names else 0.0
     lowest, highest = np.log(np.maximum(1e-3 * scale, FLOOR)), np.log(3.0 * scale)
-    bounds = [(float(np.log(max(JITTER * jitter, np.exp(lowest)))) if n == "white" else lowest, highest) for n in names]
+    bounds = [(float(np.log(max(white_share * jitter, np.exp(lowest)))) if n == "white" else lowest, highest) for n in names]
     near = None if before is None else np.log([max(before.get(n, 0.0), np.exp(lowest)) for n in names])
     likelihood = Likelihood(names, residuals, basis, groups, near)
 

@@ -16,34 +16,12 @@ from femsense.loop.fit.fitted_model import FittedModel, held_chi2, held_shift, s
 from femsense.loop.fit.joint_fit import JointFit
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.result.records import PASSES, RefitRecord
-from femsense.loop.search.refit import EVIDENCE, evidence
+from femsense.loop.search.refit import evidence
 from femsense.loop.search.screening import Candidate
 from femsense.loop.search.search_state import Refit
+from femsense.loop.thresholds import Thresholds
 from femsense.model.effects import Effect
 from femsense.model.robot import Robot
-
-ENOUGH_SPREAD = 0.5
-"""Standard errors by which the prediction of left-out sweeps must get better."""
-
-
-PREDICTS = 0.25
-"""Share of the decrease of χ², a row, that must show on held-out rows too (unless the effect hardly acts there)."""
-
-
-ABOVE_MESH = 0.5
-"""An effect must move the markers by this much of the discretisation error (beyond what calibration absorbs) …"""
-
-
-ABOVE_MESH_IF_SURE = 0.25
-"""… or by this much, if left-out sweeps speak for it by SURE standard errors and, the more of these the less, held-out data gain too."""
-
-
-NOT_PLAINLY_WORSE = 1.25
-"""No effect may leave so many times the plain error where fitted: it would live on a larger share of the discretisation error."""
-
-
-SURE = 2.5
-"""Standard errors of the gain on left-out sweeps beyond which held-out data need only not speak against an effect."""
 
 
 def acceptance_test(
@@ -55,6 +33,7 @@ def acceptance_test(
     noise: Noise,
 ) -> Refit:
     """Return a refit with its evidence and its verdict: PASSES, or what speaks against it."""
+    decides = data.thresholds
     gain = evidence(fitted.fit, made.fit)
     score = gain - candidate.cost - prior_cost(data.declared, candidate.effect, made.fit)
     better, std_error = sweeps_predicted(data.train, fitted.fit, made.fit)
@@ -62,22 +41,23 @@ def acceptance_test(
     acts = held_shift(
         data, fitted, made, noise
     )  # what `held` is on average for the true effect, with a variance of four times that
-    wanted = min(PREDICTS * gain * held_share(data), acts - 5.0 * float(np.sqrt(acts)))
+    wanted = min(decides.held_gain * gain * held_share(data), acts - decides.held_chance * float(np.sqrt(acts)))
     moved, mesh = moved_by(fitted, made), discretisation_rms(data, fitted)
-    surely = better > SURE * std_error
+    surely = better > decides.sure * std_error
     if surely:
         wanted = min(wanted, 0.0)
-    fit_objection = _objection(made, candidate, score)
-    if fit_objection is None and np.isfinite(std_error) and better <= ENOUGH_SPREAD * std_error:
+    fit_objection = _objection(made, candidate, score, decides)
+    if fit_objection is None and np.isfinite(std_error) and better <= decides.sweeps_for * std_error:
         fit_objection = f"sweeps that are left out do not speak for it ({better:+.1f} ± {std_error:.1f})"
     if fit_objection is None and held < wanted:
         fit_objection = f"it does not predict the held-out data (χ² {_moves(held)} there, and falls by {gain:.1f} where fitted)"
-    if fit_objection is None and score + held <= EVIDENCE:  # what was not fitted speaks against it
+    if fit_objection is None and score + decides.held_counts * held <= decides.evidence:  # what was not fitted speaks against it
         fit_objection = f"too little evidence (dBIC {score:.1f}) where held-out data speak against it (χ² {_moves(held)} there)"
-    least = ABOVE_MESH_IF_SURE if sure_beyond_mesh(better, std_error, held, gain * held_share(data)) else ABOVE_MESH
+    sure = sure_beyond_mesh(better, std_error, held, gain * held_share(data), decides)
+    least = decides.above_mesh_if_sure if sure else decides.above_mesh
     if fit_objection is None and moved < least * mesh:
         fit_objection = f"it moves the markers by {1e3 * moved:.3f} mm, the mesh itself by {1e3 * mesh:.3f} mm"
-    if fit_objection is None and plainly_worse(fitted, made):
+    if fit_objection is None and plainly_worse(fitted, made, decides):
         fit_objection = f"the plain error grows where fitted ({1e3 * fitted.fit.rms:.3f} mm, then {1e3 * made.fit.rms:.3f} mm)"
     record = replace(
         record,
@@ -90,7 +70,7 @@ def acceptance_test(
         held_dchi2=held,
         moved_m=moved,
         mesh_cost_m=mesh,
-        takes_over=_taken_over(fitted, made),
+        takes_over=_taken_over(fitted, made, decides),
     )
     return Refit(candidate, made, score, fitted.fit.chi2 - made.fit.chi2 - candidate.cost, record)
 
@@ -99,9 +79,9 @@ def _moves(decrease: float) -> str:
     return f"{'falls' if decrease >= 0.0 else 'rises'} by {abs(decrease):.1f}"
 
 
-def plainly_worse(before: FittedModel, after: FittedModel) -> bool:
+def plainly_worse(before: FittedModel, after: FittedModel, decides: Thresholds) -> bool:
     """Return whether an effect makes the plain error larger where fitted, without a smaller one on held-out data."""
-    return after.fit.rms > NOT_PLAINLY_WORSE * before.fit.rms and after.held_rms > before.held_rms
+    return after.fit.rms > decides.plainly_worse * before.fit.rms and after.held_rms > before.held_rms
 
 
 def prior_cost(declared: Robot, effect: Effect, fit: JointFit) -> float:
@@ -118,17 +98,17 @@ def surely_predicts(refitted: Refit) -> float:
 
 def prior_evidence(data: Data, effect: Effect) -> float:
     """Return by how much dBIC an effect is ahead of others beforehand: every body has weight, though the robot does not declare it."""
-    return EVIDENCE if effect.expected(data.declared) else 0.0
+    return data.thresholds.expected if effect.expected(data.declared) else 0.0
 
 
-def sure_beyond_mesh(better: float, std_error: float, held: float, expected: float) -> bool:
+def sure_beyond_mesh(better: float, std_error: float, held: float, expected: float, decides: Thresholds) -> bool:
     """Return whether left-out sweeps (gain ± std_error) and held-out data (gain, against what is expected of them) are sure together."""
-    return better > SURE * std_error and held * better > 2.0 * SURE * std_error * expected
+    return better > decides.sure * std_error and held * better > 2.0 * decides.sure * std_error * expected
 
 
-def _taken_over(before: FittedModel, after: FittedModel) -> tuple[str, ...]:
+def _taken_over(before: FittedModel, after: FittedModel, decides: Thresholds) -> tuple[str, ...]:
     """Return the nuisances that are significant before an effect is added, and not after."""
-    return tuple(n for n in NUISANCE if _z(before, n) > 3.0 and _z(after, n) < 3.0)
+    return tuple(n for n in NUISANCE if _z(before, n) > decides.significant > _z(after, n))
 
 
 def _z(fitted: FittedModel, name: str) -> float:
@@ -167,13 +147,13 @@ def _rest(columns: FloatArray, values: FloatArray) -> FloatArray:
     return np.asarray(values - columns / scale @ fitted)
 
 
-def _objection(made: FittedModel, candidate: Candidate, score: float) -> str | None:
+def _objection(made: FittedModel, candidate: Candidate, score: float, decides: Thresholds) -> str | None:
     """Return why an effect is not accepted, or None."""
     q = len(candidate.parameters)
     std = made.fit.std[len(made.fit.std) - q :]
-    if score <= EVIDENCE and made.fit.fit.status == STOPPED_EARLY:
+    if score <= decides.evidence and made.fit.fit.status == STOPPED_EARLY:
         return "stopped early: the predicted gain of a step was too small"
-    if score <= EVIDENCE:
+    if score <= decides.evidence:
         return f"too little evidence (dBIC {score:.1f})"
     if not np.isfinite(std).all():
         return "not identifiable: the data leave a parameter open"

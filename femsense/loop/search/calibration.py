@@ -16,7 +16,6 @@ from femsense.loop.fit.fitted_model import FittedModel, fit_model, own_of, remat
 from femsense.loop.fit.joint_fit import Prior
 from femsense.loop.fit.marker_placement import with_turning_placements
 from femsense.loop.fit.noise_components import Noise
-from femsense.loop.search.refit import EVIDENCE
 from femsense.loop.search.search_state import Progress
 from femsense.loop.search.swaps import History
 from femsense.model.effects import OF_BODY
@@ -25,8 +24,6 @@ from femsense.model.robot import Robot
 
 START = Noise({"white": 5e-4}, "start")
 """The noise until it is estimated."""
-MATCHINGS = 6
-"""Times that the rows of clouds are made again, at most: from a camera that is 20 mrad off, four left a gain of 0 to 27, as rounding had it."""
 ROUGHLY, STEPS = 4, 12
 """Steps of the fit whose residual tells the noise; and at most with that, to the end, or, on large meshes, to where what is left to gain is spared."""
 Ready = tuple[Data, FittedModel, History]
@@ -93,10 +90,10 @@ def as_far_as_held_out_states_converge(fit: Callable[[int], FittedModel], steps:
 def matched(data: Data, fitted: FittedModel, noise: Noise, *, anew: bool = False) -> tuple[Data, FittedModel]:
     """Return the data with the rows of clouds as a fitted model has them, and the fitted model fitted to these, time and again until neither changes much: what is
     rounded off where the model was draws it back there. With `anew` it is asked again which rows there are."""
-    for _ in range(MATCHINGS):
+    for _ in range(data.effort.matchings):
         data = rematched(data, fitted, noise, anew=anew)
         fitted = fitted_again(data, fitted, noise, near=None if anew else fitted.fit.jets)
-        if fitted.fit.fit.cost[0] - fitted.fit.chi2 <= EVIDENCE / 2.0:
+        if fitted.fit.fit.cost[0] - fitted.fit.chi2 <= data.thresholds.evidence / 2.0:
             break
     return data, fitted
 

@@ -11,10 +11,11 @@ from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import DataError, FemsenseError
 from femsense.fem.mesh import embed_points
 from femsense.loop.data.dataset import NUISANCE, Data
-from femsense.loop.data.representative_states import MOST_WORK, between, representatives, spread_states, state_vectors
+from femsense.loop.data.representative_states import between, representatives, spread_states, state_vectors
 from femsense.loop.data.trial import States, Trial, spans_of
 from femsense.loop.fit.fitted_model import FittedModel
 from femsense.loop.fit.joint_fit import JointFit, JointProblem, Prior
+from femsense.loop.thresholds import EFFORT, Effort
 from femsense.model.drive import has_history
 from femsense.model.effects import Effect, Entry, InRecording, Parameter
 from femsense.model.linear_answers import AtPoints
@@ -98,6 +99,8 @@ def effect_fields(
     trials: list[Trial],
     todo: list[tuple[Effect, Entry, tuple[Parameter, ...]]],
     answers: list[Answers] | None = None,
+    *,
+    effort: Effort = EFFORT,
 ) -> Fields:
     """Return what each effect does to the markers: those with parameters to first order, all of them with one factorisation a frame, or none where
     the `answers` of each trial are known from an earlier call for this fit; discrete alternatives as a whole, each with a quasi-static path of its own."""
@@ -115,7 +118,7 @@ def effect_fields(
         rest.append(jet.rest_by_effect)
     usable, near = smooth, [jet.states for jet in base.jets]
     for one in (t for t in todo if t[0].discrete and _can_act(fixed, t)):
-        changes = _whole_change(base, trials, fixed, one, near)
+        changes = _whole_change(base, trials, fixed, one, near, effort)
         if changes is not None:
             usable = [*usable, one]
             raw = [np.concatenate([block, change[:, :, None]], axis=2) for block, change in zip(raw, changes)]
@@ -133,7 +136,12 @@ def _can_act(robot: Robot, one: tuple[Effect, Entry, tuple[Parameter, ...]]) -> 
 
 
 def _whole_change(
-    base: JointFit, trials: list[Trial], fixed: Robot, one: tuple[Effect, Entry, tuple[Parameter, ...]], near: list[States]
+    base: JointFit,
+    trials: list[Trial],
+    fixed: Robot,
+    one: tuple[Effect, Entry, tuple[Parameter, ...]],
+    near: list[States],
+    effort: Effort,
 ) -> list[FloatArray] | None:
     """Return by how much a discrete alternative changes the residual of each trial [m], (k, c); None where it has no equilibrium.
 
@@ -147,7 +155,7 @@ def _whole_change(
     try:
         for i, (trial, jet, span) in enumerate(zip(trials, base.jets, spans_of(trials))):
             own, starts = base.fit.theta[span], _starts_of(trial, fixed, robot, near[i])
-            asked = _part_that_tells(trial, robot)
+            asked = part_that_tells(trial, robot, effort)
             try:
                 moved = probe.jet(asked, own, np.zeros(0), False, starts, rough=True)
             except DataError:
@@ -160,11 +168,11 @@ def _whole_change(
     return changes
 
 
-def _part_that_tells(trial: Trial, robot: Robot) -> Trial:
+def part_that_tells(trial: Trial, robot: Robot, effort: Effort) -> Trial:
     """Return a trial with some states that tell what changes in all; the whole of it where they are few, or clouds, or depend on each other."""
     if trial.scene.crossings is not None or has_history(robot):
         return trial
-    frames, share = spread_states(trial, MOST_WORK // len(robot.body.mesh.tets))
+    frames, share = spread_states(trial, effort.work // len(robot.body.mesh.tets))
     return trial if share == 1.0 else trial.part(frames)
 
 
@@ -202,4 +210,4 @@ def fields_of(data: Data, fitted: FittedModel, names: Sequence[str]) -> Fields:
     todo = candidates_for(
         fitted.fit, data.control, forms=data.forms, names=[n for n in names if n not in NUISANCE], has_placements=placed_at_rest
     )
-    return effect_fields(fitted.fit, data.train, todo)
+    return effect_fields(fitted.fit, data.train, todo, effort=data.effort)

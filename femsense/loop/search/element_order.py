@@ -18,7 +18,7 @@ from femsense.loop.fit.fitted_model import FittedModel, fit_model, span_of
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.result.records import NAMED, PASSES, RefitRecord
 from femsense.loop.search.acceptance import acceptance_test
-from femsense.loop.search.refit import EVIDENCE, FORGONE, beyond
+from femsense.loop.search.refit import FORGONE, beyond
 from femsense.loop.search.screening import Candidate, penalty
 from femsense.loop.search.search_state import Search, no_equilibrium
 from femsense.loop.search.subsampling import representative_cases
@@ -49,7 +49,7 @@ def need_quadratic(data: Data, search: Search, names: Sequence[str]) -> tuple[bo
     """
     candidate = _candidate(names, search.n_effective)
     record = RefitRecord(MESH.name, QUADRATIC, step=1)
-    worth = beyond(search.final.fit, FORGONE[1] * (candidate.cost + EVIDENCE) + FORGONE[0])
+    worth = beyond(search.final.fit, FORGONE[1] * (candidate.cost + data.thresholds.evidence) + FORGONE[0])
     try:
         without = _on(data, data.robot_as_declared, search.history[0][1], search.final, search.noise, worth=worth)
         record = acceptance_test(data, without, candidate, search.final, record, search.noise).record

@@ -20,32 +20,15 @@ from femsense.loop.fit.joint_fit import JointFit, Prior
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.result.records import NAMED, RefitRecord
 from femsense.loop.search.acceptance import acceptance_test, prior_evidence, surely_predicts
-from femsense.loop.search.location_search import POLISHED, climbed, lies_on_body, located
-from femsense.loop.search.refit import EVIDENCE, FORGONE, evidence, explains, refit, tried, with_term, within, worth_of
+from femsense.loop.search.location_search import climbed, lies_on_body, located
+from femsense.loop.search.refit import FORGONE, evidence, explains, refit, tried, with_term, within, worth_of
 from femsense.loop.search.screening import Candidate, joined, linear_gain
 from femsense.loop.search.search_state import Progress, Refit, no_equilibrium
 from femsense.loop.search.subsampling import RepresentativeCases, representative_cases
-
-REFITS = 6
-"""Candidates that are refitted in full nonlinearity at the first step; half as many later."""
-REFITTABLE = 0.04
-"""A candidate of which calibration leaves less than this is not refitted, unless its predicted gain is larger than any other's."""
-ALIKE = 0.95
-"""Candidates whose predicted gain is this share of the best's are refitted in the order of their cost: to the first refit all others are held up."""
-ALTERNATIVES = 0.5
-"""Those with this share are all fitted to some of the states first, where these spare time, and to all in the order of what they explain there."""
-PREDICTED_MUCH = 8.0
-"""Linear dBIC that a candidate needs to be refitted: what is small is nearly linear, so that a refit finds about as much."""
-HINTED = 0.5
-"""What fields of another model predict is looked into where it is this share of the gain that is needed: they may be wrong by a factor of two."""
-WITHIN_REACH = 0.4
-"""What has this share of the best's dBIC at its seed may be ahead of it where its place is."""
+from femsense.loop.thresholds import Effort, Thresholds
 
 BEHIND = "stopped early: in some of the states another one explains more by far"
 """Verdict on a candidate that is not refitted to all states."""
-
-MORE_STEPS = 30
-"""Steps for a refit that could win and is still on its way after the first ones."""
 
 
 def select_next(
@@ -53,12 +36,15 @@ def select_next(
 ) -> tuple[Refit | None, list[Refit], list[RefitRecord]]:
     """Return the effect that comes next, or None where nothing passes; others that are as good; and what became of each candidate that was
     refitted."""
-    listed = shortlist(table, first=not found_in(fitted))
+    listed = shortlist(table, data.thresholds, data.effort, first=not found_in(fitted))
     if not listed:
         return None, [], []
     refits, records = _refitted(data, fitted, listed, noise, say)
     best = max((r.score for r in refits.values() if r.record.passes), default=np.inf)
-    refits = {i: _to_the_end(data, fitted, r, noise) if r.score > 0.5 * best - EVIDENCE else r for i, r in refits.items()}
+    refits = {
+        i: _to_the_end(data, fitted, r, noise) if r.score > 0.5 * best - data.thresholds.evidence else r
+        for i, r in refits.items()
+    }
     if not any(r.record.passes for r in refits.values()):
         refits = {i: _elsewhere(data, fitted, r, noise, say) for i, r in refits.items()}
     passing = {i: r for i, r in refits.items() if r.record.passes}
@@ -66,8 +52,8 @@ def select_next(
         return None, [], _updated(records, refits)
     leading, improved = leaders(data, fitted, passing, noise, say)
     # where evidence is close, what surely predicts better
-    first = max(leading, key=lambda i: leading[i].score + surely_predicts(leading[i]) + _ahead_beforehand(data, leading[i]))
-    close = [r for r in leading.values() if r.score > leading[first].score - EVIDENCE]
+    first = max(leading, key=lambda i: leading[i].score + _ahead(data, leading[i]))
+    close = [r for r in leading.values() if r.score > leading[first].score - data.thresholds.evidence]
     winner = _enriched(data, fitted, leading[first], table, noise, say).saying(NAMED)
     ties = [r for r in close if r.candidate.effect.name != winner.candidate.effect.name]
     records = _updated(records, refits | improved | {first: winner})
@@ -81,10 +67,12 @@ def _refitted(
     refits: dict[int, Refit] = {}
     records: list[RefitRecord] = []
     cases = representative_cases(data, fitted, noise)
-    scouts = _scouted(data, cases, listed, noise, say)
+    scouts, decides = _scouted(data, cases, listed, noise, say), data.thresholds
     for candidate in sorted(listed, key=lambda c: -scouts[id(c)][1] if id(c) in scouts else np.inf):
-        ahead = [r for r in refits.values() if r.record.passes and explains(r.fitted)]
-        behind = candidate.score < max((0.5 * _bar(r, candidate) for r in ahead), default=-np.inf) - EVIDENCE
+        ahead = [r for r in refits.values() if r.record.passes and explains(data, r.fitted)]
+        behind = (
+            candidate.score < max((decides.far_behind * _bar(r, candidate) for r in ahead), default=-np.inf) - decides.evidence
+        )
         if behind and not prior_evidence(data, candidate.effect):
             continue  # where little is left to explain, a refit seldom gains that much on its linear score, but for a weight that cables lift
         say(f"refitting with {candidate.effect.name}")
@@ -100,7 +88,7 @@ def _refitted(
             others = [
                 r.score for r in ahead if r.candidate.effect.name != candidate.effect.name
             ]  # what bends one form bends both
-            wanted = max([EVIDENCE, *(score - 2.0 * EVIDENCE for score in others)])
+            wanted = max([decides.evidence, *(score - 2.0 * decides.evidence for score in others)])
             made = refit(data, fitted, candidate, noise, wanted=wanted, settled=settled, begin=begin)
         except FemsenseError as error:
             records.append(replace(record, verdict=no_equilibrium(error)))
@@ -118,24 +106,27 @@ def _updated(records: Sequence[RefitRecord], refits: Mapping[int, Refit]) -> lis
 def leaders(
     data: Data, fitted: FittedModel, passing: Mapping[int, Refit], noise: Noise, say: Progress
 ) -> tuple[dict[int, Refit], dict[int, Refit]]:
-    """Return the refits that are as good as the best but for EVIDENCE with those that their places bring ahead of these, each with its seed improved;
+    """Return the refits that are as good as the best but for `evidence` with those that their places bring ahead of these, each with its seed improved;
     and all whose seeds were improved."""
-    best = max(r.score for r in passing.values())
+    best, decides = max(r.score for r in passing.values()), data.thresholds
     near = {
         i: r if r.record.seed_std is not None else polished(data, fitted, r, noise, say)
         for i, r in passing.items()
-        if r.score > best - EVIDENCE
+        if r.score > best - decides.evidence
     }
     behind = {
-        i: _with_climbs(data, fitted, r, noise) for i, r in passing.items() if best - EVIDENCE >= r.score > WITHIN_REACH * best
+        i: _with_climbs(data, fitted, r, noise)
+        for i, r in passing.items()
+        if best - decides.evidence >= r.score > decides.within_reach * best
     }
     moved = {i: polished(data, fitted, r, noise, say) for i, r in behind.items() if _in_sight(r) > best}
     ahead = max(r.score for r in near.values())
     return near | {i: r for i, r in moved.items() if r.score > ahead}, near | moved
 
 
-def _ahead_beforehand(data: Data, refitted: Refit) -> float:
-    return prior_evidence(data, refitted.candidate.effect)
+def _ahead(data: Data, refitted: Refit) -> float:
+    """Return by how much dBIC a refit is ahead of others for what it predicts, and beforehand."""
+    return data.thresholds.predicts * surely_predicts(refitted) + prior_evidence(data, refitted.candidate.effect)
 
 
 def _with_climbs(data: Data, fitted: FittedModel, refitted: Refit, noise: Noise) -> Refit:
@@ -165,20 +156,20 @@ def _scouted(
 ) -> dict[int, tuple[JointFit, float]]:
     """Return how the leading ones of a shortlist fit some of the states, with their dBIC there, each under its `id`; none of them where these do not
     tell it of all, or spare no time."""
-    best = max(c.score for c in listed)
-    leading = [c for c in listed if cases.spares and c.score >= ALTERNATIVES * best]
+    best, evident = max(c.score for c in listed), data.thresholds.evidence
+    leading = [c for c in listed if cases.spares and c.score >= data.effort.leading * best]
     there = [own for c in leading if (own := cases.candidate(c, noise)) is not None]
     if len(leading) < 2 or len(there) < len(leading):
         return {}
     scouts, lead = dict[int, tuple[JointFit, float]](), -np.inf
     for candidate, own in zip(leading, there):
         say(f"refitting with {candidate.effect.name} in some states")
-        made = tried(cases.data, cases.fitted, own, noise, max(EVIDENCE, lead - 2.0 * EVIDENCE))
+        made = tried(cases.data, cases.fitted, own, noise, max(evident, lead - 2.0 * evident))
         if made is None:  # where it does not fit, all states decide
             continue
         score = evidence(cases.fitted.fit, made.fit) - own.cost + prior_evidence(data, candidate.effect)
         scouts[id(candidate)] = made.fit, score
-        lead = max(lead, score) if explains(made) else lead
+        lead = max(lead, score) if explains(data, made) else lead
     return scouts
 
 
@@ -192,8 +183,8 @@ def _in_some_states(
         return False, None
     base, wanted = cases.fitted.fit, -np.inf
     if ahead is not None:
-        leading = cases.of(ahead.fitted.fit, noise)
-        wanted = max(EVIDENCE, evidence(base, leading) - ahead.candidate.cost - 2.0 * EVIDENCE)
+        leading, evident = cases.of(ahead.fitted.fit, noise), cases.data.thresholds.evidence
+        wanted = max(evident, evidence(base, leading) - ahead.candidate.cost - 2.0 * evident)
     if scout is None:
         made = tried(cases.data, cases.fitted, own, noise, wanted, settled=settled)
         scout = None if made is None else made.fit
@@ -222,7 +213,7 @@ def _to_the_end(data: Data, fitted: FittedModel, refitted: Refit, noise: Noise) 
             noise,
             fit.coordinates,
             own=own_of(refitted.fitted),
-            max_iterations=MORE_STEPS,
+            max_iterations=data.effort.more_steps,
             known=fit.jets,
         )
     except FemsenseError:
@@ -232,7 +223,7 @@ def _to_the_end(data: Data, fitted: FittedModel, refitted: Refit, noise: Noise) 
 
 def _elsewhere(data: Data, fitted: FittedModel, refitted: Refit, noise: Noise, say: Progress) -> Refit:
     """Return a refit with evidence that does not predict as it should, judged again with its seed improved: its place may be to blame."""
-    if refitted.score <= EVIDENCE or not refitted.candidate.effect.nearby(data.robot, refitted.candidate.seed):
+    if refitted.score <= data.thresholds.evidence or not refitted.candidate.effect.nearby(data.robot, refitted.candidate.seed):
         return refitted
     better = polished(data, fitted, refitted, noise, say)
     if better.fitted is refitted.fitted:
@@ -251,10 +242,14 @@ def polished(data: Data, fitted: FittedModel, refitted: Refit, noise: Noise, say
 
 
 def _enriched(data: Data, fitted: FittedModel, winner: Refit, table: list[Candidate], noise: Noise, say: Progress) -> Refit:
-    """Return the winner in a form with more parameters where that has EVIDENCE over the simple one."""
+    """Return the winner in a form with more parameters where that has `evidence` over the simple one."""
     winner = _with_more_markers(data, fitted, winner, table, noise, say)
-    least = min(REFITTABLE, winner.candidate.retained)
-    for form in _forms([c for c in table if c.retained >= least], winner.candidate.effect.name):
+    least = min(data.thresholds.refittable, winner.candidate.retained)
+    for form in (
+        []
+        if np.isinf(data.thresholds.richer)
+        else _forms([c for c in table if c.retained >= least], winner.candidate.effect.name)
+    ):
         if len(form.parameters) <= len(winner.candidate.parameters):
             continue
         say(f"trying {form.effect.name} with {len(form.parameters)} parameters")
@@ -265,7 +260,7 @@ def _enriched(data: Data, fitted: FittedModel, winner: Refit, table: list[Candid
         if rich.record.passes:
             rich = polished(data, fitted, rich, noise, say)
         more = evidence(winner.fitted.fit, rich.fitted.fit) - (rich.candidate.cost - winner.candidate.cost)
-        if rich.record.passes and more > EVIDENCE:
+        if rich.record.passes and more > data.thresholds.richer:
             winner = replace(rich, record=replace(rich.record, seed=form.seed))
     return winner
 
@@ -273,13 +268,13 @@ def _enriched(data: Data, fitted: FittedModel, winner: Refit, table: list[Candid
 def _with_more_markers(
     data: Data, fitted: FittedModel, winner: Refit, table: list[Candidate], noise: Noise, say: Progress
 ) -> Refit:
-    """Return offsets of markers with those of further markers, one after the other, as long as each has EVIDENCE: all of them at once cost too much.
+    """Return offsets of markers with those of further markers, one after the other, as long as each has `evidence`: all of them at once cost too much.
     Other effects are returned as they are."""
     alone = [c for c in table if c.effect is winner.candidate.effect] if winner.candidate.effect.places_markers else []
     while others := [c for c in alone if not set(c.parameters) & set(winner.candidate.parameters)]:
         problem = problem_of(data, winner.fitted.fit, noise)
         gains = [linear_gain(winner.fitted.fit, problem, c.raw, c.placements) - c.cost for c in others]
-        if max(gains) <= EVIDENCE:
+        if max(gains) <= data.thresholds.evidence:
             break
         form = joined(winner.candidate, others[int(np.argmax(gains))])
         say(f"trying {form.effect.name} with {len(form.parameters)} parameters")
@@ -288,7 +283,7 @@ def _with_more_markers(
             break
         more = acceptance_test(data, fitted, form, made, winner.record, noise)
         gain = evidence(winner.fitted.fit, made.fit)
-        if not more.record.passes or gain <= form.cost - winner.candidate.cost + EVIDENCE:
+        if not more.record.passes or gain <= form.cost - winner.candidate.cost + data.thresholds.evidence:
             break
         winner = more
     return winner
@@ -299,15 +294,16 @@ def _richer(data: Data, fitted: FittedModel, winner: Refit, form: Candidate, noi
     settled, terms = winner.fitted.fit.hypothesis.settled, winner.fitted.fit.hypothesis.terms
     keys = {p.key for p in form.parameters}
     if settled != fitted.fit.hypothesis.settled or not {p.key for p in terms[-1][2]} <= keys:
-        return tried(data, fitted, form, noise, winner.score + EVIDENCE)
+        return tried(data, fitted, form, noise, winner.score + data.thresholds.evidence)
     split = len(winner.fitted.fit.coordinates) - len(terms[-1][2])
     found = {(p.key, p.part): float(v) for p, v in zip(terms[-1][2], winner.fitted.fit.coordinates[split:])}
     own = [found.get((p.key, p.part), found.get((p.key, None), p.null)) for p in form.parameters]
     hypothesis, prior = with_term(fitted.fit, form.effect, form.seed, form.parameters)
     try:
         coordinates = np.concatenate([winner.fitted.fit.coordinates[:split], own])
-        price = (form.cost - winner.candidate.cost + EVIDENCE - FORGONE[0]) / FORGONE[1]
-        if linear_gain(winner.fitted.fit, problem_of(data, winner.fitted.fit, noise), form.raw, form.placements) < HINTED * price:
+        price = (form.cost - winner.candidate.cost + data.thresholds.evidence - FORGONE[0]) / FORGONE[1]
+        predicted = linear_gain(winner.fitted.fit, problem_of(data, winner.fitted.fit, noise), form.raw, form.placements)
+        if predicted < data.thresholds.hinted * price:
             return None
         worth = within(winner.fitted.fit, price)
         return fit_model(data, hypothesis, prior, noise, coordinates, own=own_of(winner.fitted), max_iterations=10, worth=worth)
@@ -315,24 +311,25 @@ def _richer(data: Data, fitted: FittedModel, winner: Refit, form: Candidate, noi
         return None
 
 
-def shortlist(table: list[Candidate], *, first: bool) -> list[Candidate]:
+def shortlist(table: list[Candidate], decides: Thresholds, effort: Effort, *, first: bool) -> list[Candidate]:
     """Return the best candidate of each name, in its simplest form (or forms, if several are equally simple), the best first; of those with
     as large a predicted gain, the simplest."""
-    most = max((c.score for c in table if c.retained >= REFITTABLE), default=np.inf)
-    table = [c for c in table if c.retained >= REFITTABLE or c.score > most]
-    names = list(dict.fromkeys(c.effect.name for c in table if c.score > PREDICTED_MUCH))
+    most = max((c.score for c in table if c.retained >= decides.refittable), default=np.inf)
+    table = [c for c in table if c.retained >= decides.refittable or c.score > most]
+    names = list(dict.fromkeys(c.effect.name for c in table if c.score > decides.promising))
     chosen: list[Candidate] = []
-    for name in names[: REFITS if first else (REFITS + 1) // 2]:
+    for name in names[: effort.refits if first else (effort.refits + 1) // 2]:
         forms = _forms(table, name)
         simple = min(len(c.parameters) for c in forms)
         chosen += [c for c in forms if len(c.parameters) == simple]
     best = max((c.score for c in chosen), default=0.0)
-    return sorted(chosen, key=lambda c: c.cost if c.score >= ALIKE * best else np.inf)
+    return sorted(chosen, key=lambda c: c.cost if c.score >= decides.as_promising * best else np.inf)
 
 
-def hinted(table: list[Candidate]) -> bool:
+def hinted(table: list[Candidate], decides: Thresholds, effort: Effort) -> bool:
     """Return whether candidates by fields of the model before may be worth a refit by fields of their own, since these may predict more gain."""
-    return bool(shortlist([replace(c, score=c.gain / HINTED - c.cost) for c in table], first=False))
+    wished = [replace(c, score=c.gain / decides.hinted - c.cost) for c in table]
+    return bool(shortlist(wished, decides, effort, first=False))
 
 
 def _forms(table: list[Candidate], name: str) -> list[Candidate]:
@@ -372,5 +369,7 @@ def _with_seed_fitted(data: Data, best: FittedModel, noise: Noise, say: Progress
     except FemsenseError:
         return best
     values = made.fit.coordinates[-len(more) :]
-    inside = all(p.low + 1e-9 < v < p.high - 1e-9 for p, v in zip(more, values)) and lies_on_body(data.robot, more, values)
-    return made if made.fit.chi2 < best.fit.chi2 - POLISHED * len(more) and inside else best
+    inside = all(p.low + 1e-9 < v < p.high - 1e-9 for p, v in zip(more, values)) and lies_on_body(
+        data.robot, more, values, data.thresholds
+    )
+    return made if made.fit.chi2 < best.fit.chi2 - data.thresholds.polished * len(more) and inside else best

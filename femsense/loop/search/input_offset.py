@@ -19,7 +19,6 @@ from femsense.loop.fit.fitted_model import FittedModel, held_chi2, keeping, span
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.result.records import NAMED, RefitRecord
 from femsense.loop.search.acceptance import (
-    ABOVE_MESH_IF_SURE,
     acceptance_test,
     discretisation_rms,
     held_share,
@@ -28,7 +27,7 @@ from femsense.loop.search.acceptance import (
 )
 from femsense.loop.search.effect_fields import fields_of
 from femsense.loop.search.forward_selection import polished, shortlist
-from femsense.loop.search.refit import EVIDENCE, evidence, refit
+from femsense.loop.search.refit import evidence, refit
 from femsense.loop.search.screening import screen_model
 from femsense.loop.search.search_state import OffsetAlternative, Progress, Refit
 from femsense.model.effects import OF_INPUTS
@@ -36,24 +35,17 @@ from femsense.model.effects.base import range_units
 
 (OFFSETS,) = OF_INPUTS
 """The input offsets."""
-SIGNIFICANT = 3.0
-RELEVANT = 0.02
-"""A nuisance that moved by more than three standard deviations and 2 % is named as an effect."""
-ABOVE_MESH = 0.75
-"""Offsets must move the markers by this much of the discretisation error (less where sweeps are sure, as of any effect)."""
-BETTER = 2.0
-"""dBIC by which an effect must be better than the offsets to take their place."""
 
 
-def moved_nuisance(data: Data, fitted: FittedModel, name: str, *, relevant: float = RELEVANT) -> int:
+def moved_nuisance(data: Data, fitted: FittedModel, name: str) -> int:
     """Return how many values of a nuisance the data moved significantly away from what is declared, and by more than a share of it."""
     part = span_of(fitted.fit, name)
-    values, std = fitted.fit.coordinates[part], fitted.fit.std[part]
+    values, std, decides = fitted.fit.coordinates[part], fitted.fit.std[part], data.thresholds
     if not len(values):
         return 0
     parameters = next(own for effect, _, own in fitted.fit.hypothesis.terms if effect.name == name)
     size = np.abs(values) / np.maximum(range_units(parameters, data.robot.body.cable_names, data.input_scale), 1e-12)
-    return int(((np.abs(values) > SIGNIFICANT * std) & (size > relevant)).sum())
+    return int(((np.abs(values) > decides.significant * std) & (size > decides.relevant)).sum())
 
 
 def evidence_for_offsets(data: Data, fitted: FittedModel, without: FittedModel, n_effective: float) -> float:
@@ -70,19 +62,17 @@ def offsets_are_evident(data: Data, fitted: FittedModel, noise: Noise, n_effecti
         without = keeping(data, fitted, [n for n in fitted.fit.hypothesis.names if n != OFFSETS], noise)
     except FemsenseError:
         return None
-    if evidence_for_offsets(data, fitted, without, n_effective) <= EVIDENCE:
+    if evidence_for_offsets(data, fitted, without, n_effective) <= data.thresholds.evidence:
         return None
     moved, declared = (beyond_mesh(data.held, s.held_residuals, noise) for s in (fitted, without))
     if moved >= declared:
         return None
     better, std_error = sweeps_predicted(data.train, without.fit, fitted.fit)
     held = held_chi2(data, without, noise) - held_chi2(data, fitted, noise)
-    sure = sure_beyond_mesh(better, std_error, held, held_share(data) * evidence(without.fit, fitted.fit))
-    return (
-        without
-        if moved_by(without, fitted) > (ABOVE_MESH_IF_SURE if sure else ABOVE_MESH) * discretisation_rms(data, without)
-        else None
-    )
+    decides, expected = data.thresholds, held_share(data) * evidence(without.fit, fitted.fit)
+    sure = sure_beyond_mesh(better, std_error, held, expected, decides)
+    least = decides.above_mesh_if_sure if sure else decides.offsets_above_mesh
+    return without if moved_by(without, fitted) > least * discretisation_rms(data, without) else None
 
 
 def instead_of_offsets(
@@ -93,15 +83,15 @@ def instead_of_offsets(
     Play of held cables does what offsets below those declared do. Of the two it is named where no offset is above: offsets err both ways.
     """
     without = offsets_are_evident(data, fitted, noise, n_effective)
-    if without is None:
+    if without is None or not np.isfinite(data.thresholds.swap_offsets):
         return None
     say("asking what else might be in the place of the input offsets")
     worth = evidence_for_offsets(data, fitted, without, n_effective)
     table = screen_model(data, without.fit, noise, fields_of(data, without, names), n_effective)
     passing: dict[int, Refit] = {}
     records: list[RefitRecord] = []
-    for candidate in shortlist(table, first=False):
-        if candidate.score < 0.5 * worth - EVIDENCE:
+    for candidate in shortlist(table, data.thresholds, data.effort, first=False):
+        if candidate.score < data.thresholds.far_behind * worth - data.thresholds.evidence:
             continue
         record = RefitRecord(candidate.effect.name, candidate.seed, in_place_of=OFFSETS)
         try:
@@ -118,9 +108,10 @@ def instead_of_offsets(
     ahead = best.score - worth
     assert best.record.cv_gain is not None
     predicts = best.record.cv_gain - sweeps_predicted(data.train, without.fit, fitted.fit)[0]
-    takes = ahead > BETTER or (ahead > -EVIDENCE and ahead + predicts > BETTER)  # where evidence is close, what predicts better
+    evident, better = data.thresholds.evidence, data.thresholds.swap_offsets
+    takes = ahead > better or (ahead > -evident and ahead + predicts > better)  # where evidence is close, what predicts better
     takes = takes or (
-        best.candidate.effect.mirrors(OFFSETS) and best.fitted.fit.chi2 < fitted.fit.chi2 + EVIDENCE
+        best.candidate.effect.mirrors(OFFSETS) and best.fitted.fit.chi2 < fitted.fit.chi2 + evident
     )  # its mirror image
     records[at] = best.saying(NAMED).record if takes else best.record
     return OffsetAlternative(best.fitted if takes else None, best.candidate.effect.name, ahead, records)

@@ -16,26 +16,12 @@ from femsense.loop.fit.fitted_model import FittedModel, fit_model, jets_without,
 from femsense.loop.fit.joint_fit import JointFit
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.search.effect_fields import Answers, effect_fields
-from femsense.loop.search.refit import EVIDENCE, refit_from, tried
+from femsense.loop.search.refit import refit_from, tried
 from femsense.loop.search.screening import Candidate, confounding, jets_with, screen
 from femsense.loop.search.subsampling import representative_cases
+from femsense.loop.thresholds import Thresholds
 from femsense.model.effects import Entry, Parameter
 from femsense.model.robot import Robot
-
-NEARLY = 0.05
-"""Seeds whose gain is less by this share are as good."""
-STARTS = 3
-"""So many seeds of an effect, the best, are improved …"""
-ROUNDS = 4
-"""… and so often moved to a neighbour that explains more."""
-ALIKE = 0.98, 0.1
-"""Two places count as one where this share of what an effect does in one can be had in the other, with parameters that differ by no more than that share."""
-POLISHED = 2.0
-"""Decrease of χ² that each further parameter of a polished effect must bring."""
-
-
-BESIDE = 0.01
-"""A place lies on the body if it is no farther outside than this share of the body's reach: on a stalk, or on what the mesh rounds off."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -53,13 +39,14 @@ def located(
 ) -> tuple[FittedModel, list[float]]:
     """Return the best of a candidate's fits, that which was `made` from its own seed or one that begins where a climb ends, its seed moved on,
     and the scatter of its parameters: that of `closer`, or that over the places that explain as much where this is larger."""
+    evident = data.thresholds.evidence
     begun = [made, *_fitted_at(data, fitted, candidate, made, climbs.ends, noise)]
     moved = list[tuple[FittedModel, list[float]]]()
     for one in sorted(begun, key=lambda s: s.fit.chi2):
-        if not moved or one.fit.chi2 < moved[0][0].fit.chi2 + 2.0 * EVIDENCE:
+        if not moved or one.fit.chi2 < moved[0][0].fit.chi2 + 2.0 * evident:
             moved.append(closer(data, one, noise))
     best, scatter = min(moved, key=lambda end: end[0].fit.chi2)
-    values = [s.fit.coordinates[-len(scatter) :] for s, _ in moved if s.fit.chi2 < best.fit.chi2 + EVIDENCE]
+    values = [s.fit.coordinates[-len(scatter) :] for s, _ in moved if s.fit.chi2 < best.fit.chi2 + evident]
     return best, np.maximum(scatter, np.std(values, axis=0)).tolist()
 
 
@@ -72,7 +59,7 @@ def _fitted_at(
     if cases.spares:
         near = [fit for end in ends if (fit := tried(cases.data, cases.fitted, end, noise)) is not None]
         least = min([cases.of(made.fit, noise).chi2, *(one.fit.chi2 for one in near)])
-        begins = [one for one in near if one.fit.chi2 < least + 2.0 * EVIDENCE]
+        begins = [one for one in near if one.fit.chi2 < least + 2.0 * data.thresholds.evidence]
         there = [refit_from(data, fitted, one.fit, noise) for one in begins]
     else:
         others = _screen_seeds(data, fitted, candidate, [end.seed for end in ends], noise) if ends else []
@@ -81,7 +68,7 @@ def _fitted_at(
 
 
 def climbed(data: Data, fitted: FittedModel, start: Candidate, noise: Noise) -> Climbs:
-    """Return where the best STARTS seeds come to when each goes from neighbour to neighbour: a soft place here and a stiff one there look alike
+    """Return where the best seeds come to when each goes from neighbour to neighbour: a soft place here and a stiff one there look alike
     when the modulus is open. Some of the states show the way."""
     cases = representative_cases(data, fitted, noise)
     asked, known = list[Entry](), list[Candidate]()
@@ -94,12 +81,12 @@ def climbed(data: Data, fitted: FittedModel, start: Candidate, noise: Noise) -> 
         return [c for c in known if c.seed in seeds]
 
     others = at([start.seed, *start.effect.seeds(data.robot)])
-    ways = sorted(others, key=lambda c: (c.seed != start.seed, -c.gain))[:STARTS]
-    for _ in range(ROUNDS):  # all of them at once, since a factor serves for all
+    ways = sorted(others, key=lambda c: (c.seed != start.seed, -c.gain))[: data.effort.starts]
+    for _ in range(data.effort.rounds):  # all of them at once, since a factor serves for all
         around = [start.effect.nearby(data.robot, here.seed) for here in ways]
         at([seed for seeds in around for seed in seeds])
         best = [max([here, *at(seeds)], key=lambda c: c.gain) for here, seeds in zip(ways, around)]
-        further = [found if found.gain >= here.gain + POLISHED else here for here, found in zip(ways, best)]
+        further = [found if found.gain >= here.gain + data.thresholds.polished else here for here, found in zip(ways, best)]
         if further == ways:
             break
         ways = further
@@ -107,28 +94,29 @@ def climbed(data: Data, fitted: FittedModel, start: Candidate, noise: Noise) -> 
     most = max((end.gain for end in ends), default=0.0)
     apart = list[Candidate]()
     for end in sorted((end for end in ends if end.gain > 0.5 * most), key=lambda c: -c.gain):
-        if not any(_alike(end, other) for other in apart):
+        if not any(same_place(end, other, data.thresholds) for other in apart):
             apart.append(end)
     begun = max((c.gain for c in others if c.seed == start.seed), default=0.0)
     return Climbs(apart, max(most / begun, 1.0) if begun > 0.0 else 1.0)
 
 
-def _alike(a: Candidate, b: Candidate) -> bool:
+def same_place(a: Candidate, b: Candidate, decides: Thresholds) -> bool:
     """Return whether two places do the same for the same: a soft one here and a stiff one there may look alike, but do not say the same."""
-    same, apart = ALIKE
-    return confounding(a, b) >= same and bool(np.linalg.norm(a.step - b.step) <= apart * np.linalg.norm(b.step))
+    near = np.linalg.norm(a.step - b.step) <= decides.same_step * np.linalg.norm(b.step)
+    return confounding(a, b) >= decides.same_field and bool(near)
 
 
-def _scatter(seen: Sequence[Candidate], best: Candidate, share: float) -> list[float]:
+def _scatter(seen: Sequence[Candidate], best: Candidate, share: float, decides: Thresholds) -> list[float]:
     """Return by how much the steps of those that explain nearly as much as the best scatter, in so large a share of the data."""
-    steps = [c.step for c in seen if c.gain >= best.gain - max(share * EVIDENCE, NEARLY * best.gain)]
+    less = max(share * decides.evidence, decides.as_good_places * best.gain)
+    steps = [c.step for c in seen if c.gain >= best.gain - less]
     return [float(v) for v in np.std(steps, axis=0)]
 
 
 def closer(data: Data, fitted: FittedModel, noise: Noise) -> tuple[FittedModel, list[float]]:
     """Return a fitted model whose last effect has moved to neighbours of its seed as long as these explain more where the body is as the effect
     has bent it (what a seed does to the body before that ranks neighbours of a large effect wrongly), and by how much the step of each of
-    its parameters scatters over the seeds that explain as much but for NEARLY. Some of the states show which neighbour it may be."""
+    its parameters scatters over the seeds that explain as much but for little. Some of the states show which neighbour it may be."""
     while True:
         *_, (effect, seed, parameters) = fitted.fit.hypothesis.terms
         cases = representative_cases(data, fitted, noise)
@@ -139,12 +127,12 @@ def closer(data: Data, fitted: FittedModel, noise: Noise) -> tuple[FittedModel, 
         if here is None:  # it does nothing to these markers
             return fitted, [0.0] * len(parameters)
         best = max(around, key=lambda c: c.gain)
-        scatter = _scatter(around, best, share)
-        if best.gain < here.gain + share * POLISHED:
+        scatter = _scatter(around, best, share, data.thresholds)
+        if best.gain < here.gain + share * data.thresholds.polished:
             return fitted, scatter
         there = _seeds_instead(data, fitted, noise, [best.seed]) if cases.spares else [best]
         made = _moved(data, fitted, there[0], noise) if there else None
-        if made is None or made.fit.chi2 > fitted.fit.chi2 - POLISHED:
+        if made is None or made.fit.chi2 > fitted.fit.chi2 - data.thresholds.polished:
             return fitted, scatter
         fitted = made
 
@@ -186,7 +174,7 @@ def may_lie_elsewhere(data: Data, fitted: FittedModel, name: str, noise: Noise) 
     fields = effect_fields(fit, data.train, [(effect, s, parameters) for s in (*effect.seeds(data.robot), *around)])
     seen = screen(_without(fit, i), problem_of(data, fit, noise), fields, 100.0)
     here = next((c for c in seen if c.seed == seed), None)
-    return here is None or max(c.gain for c in seen) > here.gain + POLISHED
+    return here is None or max(c.gain for c in seen) > here.gain + data.thresholds.polished
 
 
 def _moved(data: Data, fitted: FittedModel, candidate: Candidate, noise: Noise) -> FittedModel | None:
@@ -211,7 +199,9 @@ def _screen_seeds(
     return screen(fitted.fit, problem_of(data, fitted.fit, noise), fields, 100.0)
 
 
-def lies_on_body(robot: Robot, parameters: Sequence[Parameter], coordinates: Sequence[float] | FloatArray) -> bool:
+def lies_on_body(
+    robot: Robot, parameters: Sequence[Parameter], coordinates: Sequence[float] | FloatArray, decides: Thresholds
+) -> bool:
     """Return whether each place among parameters lies in the body at rest, or beside it by no more than a share of its reach. A force acts the same
     all along its line, so that a fit may take it anywhere."""
     places: dict[str, list[float]] = {}
@@ -219,4 +209,5 @@ def lies_on_body(robot: Robot, parameters: Sequence[Parameter], coordinates: Seq
         if p.unit == "m" and isinstance(p.part, int):
             places.setdefault(p.key, []).append(p.value(float(v)))
     points = np.array([place for place in places.values() if len(place) == 3]).reshape(-1, 3)
-    return not len(points) or bool((embed_points(robot.body.mesh, points).outside <= BESIDE * robot.body.reach).all())
+    most = decides.beside_body * robot.body.reach
+    return not len(points) or bool((embed_points(robot.body.mesh, points).outside <= most).all())

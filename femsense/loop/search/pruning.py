@@ -16,10 +16,10 @@ from femsense.loop.search.search_state import Progress
 
 
 def prune(data: Data, fitted: FittedModel, noise: Noise, n_effective: float, say: Progress) -> FittedModel:
-    """Return the fitted model without effects that those added later have made needless (dBIC for keeping them not above 0); the place of the last one,
+    """Return the fitted model without effects that those added later have made needless (dBIC for keeping them not above `needless`); the place of the last one,
     which was found beside them, then moves on."""
     whole, added = fitted, found_in(fitted)
-    for name in added[:-1]:
+    for name in added[:-1] if np.isfinite(data.thresholds.needless) else []:
         others = [n for n in fitted.fit.hypothesis.names if n != name]
         count = sum(len(p) for e, _, p in fitted.fit.hypothesis.terms if e.name == name)
         if not count:
@@ -30,7 +30,7 @@ def prune(data: Data, fitted: FittedModel, noise: Noise, n_effective: float, say
             without = keeping(data, fitted, others, noise, worth=beyond(fitted.fit, FORGONE[1] * price + FORGONE[0]))
         except FemsenseError:
             continue
-        if evidence(without.fit, fitted.fit) <= price:
+        if evidence(without.fit, fitted.fit) <= price + data.thresholds.needless:
             fitted = without
     *_, (effect, seed, parameters) = fitted.fit.hypothesis.terms
     places = (

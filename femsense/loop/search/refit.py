@@ -18,16 +18,8 @@ from femsense.model.effects import Effect, Entry, Parameter
 from femsense.model.effects.base import known_length
 from femsense.model.observation import Hypothesis
 
-EVIDENCE = 10.0
-"""dBIC that a named effect needs."""
-PREDICTED = 0.3
-"""A fit from the null that brings less than this share of the linear gain is tried from other starts too."""
 DECLARED = -1.0
-"""Start from what is declared, where a discrete alternative does not fit from where calibration has gone without it …"""
-DRIFTED = 2.0
-"""… or where this has gone so many of the standard deviations known beforehand, for the sake of what is missing …"""
-EXPLAINS = 1.25
-"""… and an effect leaves more than this mean square from there, in units of the noise. Until one leaves less, linear scores say little."""
+"""Start from what is declared, where a discrete alternative does not fit from where calibration has gone without it, or that has gone far."""
 LEFT = 0.5
 """What a refit to all states, begun where one to some of them ended, may leave to be gained in χ²: the winner is fitted to the end."""
 FORGONE = 2.0, 1.25
@@ -58,14 +50,14 @@ def refit(
     candidate: Candidate,
     noise: Noise,
     *,
-    wanted: float = EVIDENCE,
+    wanted: float | None = None,
     settled: bool = False,
     begin: JointFit | None = None,
 ) -> FittedModel:
     """Joint fit with one more effect, started where a fit to some of the states ended (`begin`), else from its linear step. Raises DataError where
     no start helps.
 
-    Where the dBIC would stay well below what is wanted, or below it at all if it is `settled`, the fit is stopped early on its way.
+    Where the dBIC would stay well below what is wanted (by default `Thresholds.evidence`), or below it at all if it is `settled`, the fit is stopped early on its way.
     """
     null = np.array([p.null for p in candidate.parameters])
     low, high = np.array([p.low for p in candidate.parameters]), np.array([p.high for p in candidate.parameters])
@@ -74,7 +66,7 @@ def refit(
     directed = known_length(candidate.parameters) is not None
     free = not candidate.effect.discrete and not directed  # for these the null is no start
     answer = 0.0 if candidate.effect.discrete else candidate.response @ (start - null)  # of what is fitted already
-    worth = worth_of(fitted.fit, candidate, wanted, settled)
+    worth = worth_of(fitted.fit, candidate, data.thresholds.evidence if wanted is None else wanted, settled)
 
     def started_at(share: float) -> FittedModel | None:
         part = share if share != DECLARED else 0.0 if free else 1.0
@@ -109,9 +101,11 @@ def refit(
         if made is not None and made.fit.fit.status == STOPPED_EARLY:
             stopped_early = made
             break
-        if best is not None and not (free and share == 0.0 and fitted.fit.chi2 - best.fit.chi2 <= PREDICTED * candidate.gain):
+        if best is not None and not (
+            free and share == 0.0 and fitted.fit.chi2 - best.fit.chi2 <= data.thresholds.poor_start * candidate.gain
+        ):
             break
-    if directed and _has_drifted(fitted) and not explains(best):
+    if directed and _has_drifted(data, fitted) and not explains(data, best):
         made = started_at(DECLARED)
         best = made if made is not None and (best is None or made.fit.chi2 <= best.fit.chi2) else best
     found = best or stopped_early
@@ -147,17 +141,20 @@ def _shares(candidate: Candidate, free: bool) -> tuple[float, ...]:
     return (0.0, 1.0, 0.3) if free else (1.0, 0.3, 0.0)
 
 
-def _has_drifted(fitted: FittedModel) -> bool:
+def _has_drifted(data: Data, fitted: FittedModel) -> bool:
     """Return whether calibration alone has gone far beyond what is known of it beforehand."""
     fit = fitted.fit
     known = np.isfinite(fit.prior.std)
-    far = np.abs(fit.coordinates - fit.prior.mean)[known] > DRIFTED * fit.prior.std[known]
+    far = np.abs(fit.coordinates - fit.prior.mean)[known] > data.thresholds.drifted * fit.prior.std[known]
     return bool(far.any()) and not found_in(fitted)
 
 
-def explains(fitted: FittedModel | None) -> bool:
+def explains(data: Data, fitted: FittedModel | None) -> bool:
     """Return whether a model leaves little more than the noise where it is fitted."""
-    return fitted is not None and fitted.fit.chi2 < EXPLAINS * max(len(fitted.fit.fit.residual) - len(fitted.fit.fit.theta), 1)
+    if fitted is None:
+        return False
+    freedom = max(len(fitted.fit.fit.residual) - len(fitted.fit.fit.theta), 1)
+    return fitted.fit.chi2 < data.thresholds.explains * freedom
 
 
 def _declared(data: Data, fitted: FittedModel, hypothesis: Hypothesis, noise: Noise) -> FloatArray:
@@ -196,7 +193,7 @@ def tried(
     fitted: FittedModel,
     candidate: Candidate,
     noise: Noise,
-    wanted: float = EVIDENCE,
+    wanted: float | None = None,
     *,
     settled: bool = False,
     begin: JointFit | None = None,

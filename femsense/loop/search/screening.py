@@ -20,11 +20,9 @@ from femsense.loop.fit.fitted_model import FittedModel, problem_of
 from femsense.loop.fit.joint_fit import JointFit, JointProblem
 from femsense.loop.fit.noise_components import Noise, estimate_noise, whiten
 from femsense.loop.search.effect_fields import Fields
+from femsense.loop.thresholds import DEFAULTS
 from femsense.model.effects import Effect, Entry, Parameter
 from femsense.model.observation import SceneJet
-
-TESTABLE = 0.1
-"""An effect of which calibration absorbs more than 90 % cannot be tested."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -84,7 +82,9 @@ def penalty(count: int, seed: Entry, alone: int, effects: int, n_effective: floa
     return float((count + chosen) * np.log(n_effective) + 2.0 * np.log(max(effects * alone, 1)))
 
 
-def screen(base: JointFit, problem: JointProblem, fields: Fields, n_effective: float) -> list[Candidate]:
+def screen(
+    base: JointFit, problem: JointProblem, fields: Fields, n_effective: float, *, wanted: float = DEFAULTS.evidence
+) -> list[Candidate]:
     """Return all candidates with their linear scores, the best first.
 
     Arguments:
@@ -92,6 +92,7 @@ def screen(base: JointFit, problem: JointProblem, fields: Fields, n_effective: f
         problem: its problem (trials and noise).
         fields: of the effects to try, at this fit or very near to it.
         n_effective: number of independent observations, for BIC.
+        wanted: dBIC at which an effect would just have been seen.
     """
     Q, inverse = _factors(np.asarray(base.fit.jacobian))
     residual = base.fit.residual - Q @ (Q.T @ base.fit.residual)
@@ -110,7 +111,7 @@ def screen(base: JointFit, problem: JointProblem, fields: Fields, n_effective: f
         cost = penalty(q, seed, alone, effects, n_effective)
         score = gain - cost
         retained = float(np.linalg.norm(left) / np.linalg.norm(whole))
-        smallest = _smallest(left, q, n_effective)
+        smallest = _smallest(left, q, n_effective, wanted)
         response = -inverse @ absorbed
         result.append(
             Candidate(effect, seed, parameters, own, rest, left, response, retained, step, gain, float(score), cost, smallest)
@@ -168,9 +169,9 @@ def _best_step(columns: FloatArray, residual: FloatArray, parameters: Sequence[P
     return np.asarray(answer.x / scale), gain
 
 
-def _smallest(columns: FloatArray, q: int, n_effective: float) -> FloatArray:
-    """Return the size of each parameter at which the expected dBIC reaches 10."""
-    needed = np.sqrt(10.0 + q * np.log(n_effective))
+def _smallest(columns: FloatArray, q: int, n_effective: float, wanted: float) -> FloatArray:
+    """Return the size of each parameter at which the expected dBIC reaches what is wanted."""
+    needed = np.sqrt(wanted + q * np.log(n_effective))
     norm = np.linalg.norm(columns, axis=0)
     return np.asarray(np.where(norm > 0, needed / np.maximum(norm, 1e-300), np.inf))
 
@@ -197,10 +198,6 @@ def confounding(a: Candidate, b: Candidate) -> float:
     return float(np.linalg.norm(B.T @ direction) / max(float(np.linalg.norm(direction)), 1e-300))
 
 
-APART = 3.0
-"""A marker stands apart that sits elsewhere by so many times the median of all: of placements that scatter alike one in ten thousand does."""
-
-
 def jets_with(fitted: FittedModel, candidate: Candidate) -> list[SceneJet]:
     """Return the jets of a fitted model with the columns of a candidate behind the others."""
     return [
@@ -216,7 +213,7 @@ def jets_with(fitted: FittedModel, candidate: Candidate) -> list[SceneJet]:
 def noise_of(data: Data, fitted: FittedModel, fields: Fields, before: Noise | None = None) -> tuple[Noise, float]:
     """Estimate the noise from what the richest linear model leaves; return it with the effective number of observations."""
     table = screen(fitted.fit, problem_of(data, fitted.fit, Noise({"white": 5e-4}, "")), fields, 100.0)
-    apart, own = _apart(table), fitted.fit.own
+    apart, own = _apart(table, data.thresholds.apart), fitted.fit.own
     errors = [t.error_by_sweep for t in data.train]
     widest = max(0 if e is None else e.shape[2] for e in errors)
     columns, extra = [], []
@@ -242,15 +239,15 @@ def noise_of(data: Data, fitted: FittedModel, fields: Fields, before: Noise | No
                 [extra[i] for i in which],
                 [groups[i] for i in which],
             )
-            noise = noise.joined(estimate_noise(*picked, known), clouds)
+            noise = noise.joined(estimate_noise(*picked, known, data.thresholds.white_share), clouds)
     return noise, float(sum(g.observations for g in groups))
 
 
-def _apart(table: list[Candidate]) -> list[Candidate]:
+def _apart(table: list[Candidate], times: float) -> list[Candidate]:
     """Return the offsets of single markers that are much larger than most: one that sits elsewhere does not tell how well the others sit."""
     alone = [c for c in table if c.effect.places_markers and len({_marker(p) for p in c.parameters}) == 1]
     size = np.array([np.linalg.norm(c.step) for c in alone])
-    return [c for c, s in zip(alone, size) if s > APART * np.median(size)]
+    return [c for c, s in zip(alone, size) if s > times * np.median(size)]
 
 
 def _marker(parameter: Parameter) -> str | None:
@@ -258,4 +255,4 @@ def _marker(parameter: Parameter) -> str | None:
 
 
 def screen_model(data: Data, fit: JointFit, noise: Noise, fields: Fields, n_effective: float) -> list[Candidate]:
-    return screen(fit, problem_of(data, fit, noise), fields, n_effective)
+    return screen(fit, problem_of(data, fit, noise), fields, n_effective, wanted=data.thresholds.evidence)

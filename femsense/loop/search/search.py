@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from femsense.core.errors import FemsenseError
 from femsense.io.checkpoint import Checkpoint
 from femsense.loop.data.dataset import Data
@@ -23,15 +25,8 @@ from femsense.loop.search.refit import evidence
 from femsense.loop.search.screening import Candidate, noise_of, screen_model
 from femsense.loop.search.search_state import Progress, Refit, Search, SearchProgress, at_step
 from femsense.loop.search.subsampling import spares
-from femsense.loop.search.swaps import BETTER, swapped
+from femsense.loop.search.swaps import swapped
 from femsense.model.recording import state_key
-
-MAX_EFFECTS = 3
-"""Effects that are added at most."""
-STATES = 5
-"""So many different states can distinguish effects though what is held out only repeats them."""
-SPARED = 0.01
-"""On large meshes a model is fitted until what is left to gain is less than this share of the predicted gain of an effect on top."""
 
 
 def search_begun(ready: Ready, names: Sequence[str], refits: list[RefitRecord], *, quadratic: bool) -> SearchProgress:
@@ -64,7 +59,7 @@ def search_effects(course: SearchProgress, checkpoint: Checkpoint, say: Progress
 
 
 def _most_effects(data: Data) -> int:
-    return MAX_EFFECTS if distinguishes_effects(data) else 0
+    return data.effort.effects if distinguishes_effects(data) else 0
 
 
 def _take_step(course: SearchProgress, say: Progress) -> None:
@@ -92,7 +87,7 @@ def _take_step(course: SearchProgress, say: Progress) -> None:
         return
     next_one, others, tried = select_next(data, fitted, table, noise, say)
     refits = [*refits, *at_step(tried, len(history))]
-    if next_one is None and ties:
+    if next_one is None and ties and np.isfinite(data.thresholds.tie):
         instead, next_one, tried = beside_a_tie(data, fitted, ties[0], fields, noise, names, n_effective, say)
         if next_one is not None:
             history[-1] = (ties[0].candidate.effect.name, instead)
@@ -107,7 +102,7 @@ def _take_step(course: SearchProgress, say: Progress) -> None:
         return
     course.earlier = data
     name, winner, course.ties = next_one.candidate.effect.name, next_one.fitted, others
-    anew = moved_by(fitted, winner) > discretisation_rms(data, fitted, whole=True) and not errs_alike(fitted, winner)
+    anew = moved_by(fitted, winner) > discretisation_rms(data, fitted, whole=True) and not errs_alike(data, fitted, winner)
     fitted = prune(data, winner, noise, n_effective, say)
     history = [*history, (name, fitted)]
     data = with_turning_placements(with_mesh_errors(data, fitted, names) if anew else data, fitted)
@@ -135,7 +130,7 @@ def spared_gain(data: Data, fitted: FittedModel, fields: Fields, noise: Noise, n
     if not spares(data, fitted.fit.hypothesis.robot_at(fitted.fit.coordinates)):
         return 0.0
     fit = weighed(data, fitted.fit, noise, fitted.fit.jets)
-    return SPARED * max((c.gain for c in screen_model(data, fit, noise, fields, n_effective)), default=0.0)
+    return data.effort.settles * max((c.gain for c in screen_model(data, fit, noise, fields, n_effective)), default=0.0)
 
 
 def _fields(data: Data, fitted: FittedModel, before: Fields | None, names: Sequence[str]) -> Fields:
@@ -149,7 +144,7 @@ def scored(
 ) -> tuple[Fields, list[Candidate]]:
     """Return fields and the scores by them: those of the fitted model itself where others predict a gain."""
     table = screen_model(data, fitted.fit, noise, fields, n_effective)
-    if fields.model is fitted.fit.hypothesis or not hinted(table):
+    if fields.model is fitted.fit.hypothesis or not hinted(table, data.thresholds, data.effort):
         return fields, table
     fields = fields_of(data, fitted, names)
     return fields, screen_model(data, fitted.fit, noise, fields, n_effective)
@@ -173,7 +168,7 @@ def beside_a_tie(
     instead = fitted_again(data, tie.fitted, noise, known=jets if same else None, near=None if same else jets)
     _, table = scored(data, instead, _fields(data, instead, fields, names), noise, names, n_effective)
     both, _, tried = select_next(data, instead, table, noise, say)
-    if both is None or evidence(fitted.fit, both.fitted.fit) - both.candidate.cost <= BETTER:
+    if both is None or evidence(fitted.fit, both.fitted.fit) - both.candidate.cost <= data.thresholds.tie:
         return instead, None, []
     return instead, both, tried
 
@@ -187,7 +182,7 @@ def _renamed(refits: list[RefitRecord], step: int, name: str) -> list[RefitRecor
 
 
 def distinguishes_effects(data: Data) -> bool:
-    """Return whether these data can distinguish effects: a state that is not fitted is held out, or STATES different ones are fitted."""
+    """Return whether these data can distinguish effects: a state that is not fitted is held out, or enough different ones are fitted."""
     fitted = {state_key(t.scene.recording, int(k)) for t in data.train for k in t.scene.frames}
     fresh = any(state_key(t.scene.recording, int(k)) not in fitted for t in data.held for k in t.scene.frames)
-    return fresh or len(fitted) >= STATES
+    return fresh or len(fitted) >= data.thresholds.states

@@ -9,7 +9,7 @@ import numpy as np
 from femsense.core.arrays import BoolArray, IntArray
 from femsense.core.errors import FemsenseError
 from femsense.loop.data.dataset import Data
-from femsense.loop.data.representative_states import MOST_WORK, spread_states
+from femsense.loop.data.representative_states import spread_states
 from femsense.loop.fit.fitted_model import FittedModel, problem_of, weighed
 from femsense.loop.fit.joint_fit import JointFit
 from femsense.loop.fit.noise_components import Noise
@@ -18,9 +18,6 @@ from femsense.loop.search.screening import Candidate, screen
 from femsense.model.drive import has_history
 from femsense.model.observation import Hypothesis
 from femsense.model.robot import Robot
-
-SPARED = 0.6
-"""They are no more than this share of all, or alternatives are fitted on all at once."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -61,16 +58,16 @@ class RepresentativeCases:
 def spares(data: Data, robot: Robot) -> bool:
     """Return whether some states of a robot, which speak for all, are few enough to spare time: where a state depends on those before, all of these
     are solved, too."""
-    return _spares(_chosen(data, robot)[1], robot)
+    return _spares(data, _chosen(data, robot)[1], robot)
 
 
-def _spares(share: float, robot: Robot) -> bool:
-    return share < SPARED and not has_history(robot)
+def _spares(data: Data, share: float, robot: Robot) -> bool:
+    return share < data.effort.some_states and not has_history(robot)
 
 
 def _chosen(data: Data, robot: Robot) -> tuple[list[IntArray], float]:
     """Return the frames of these states, of each trial, and how many of all distinct states they are."""
-    chosen = [spread_states(t, MOST_WORK // len(robot.body.mesh.tets)) for t in data.train]
+    chosen = [spread_states(t, data.effort.work // len(robot.body.mesh.tets)) for t in data.train]
     return [frames for frames, _ in chosen], float(np.mean([share for _, share in chosen]))
 
 
@@ -79,7 +76,7 @@ def representative_cases(data: Data, fitted: FittedModel, noise: Noise) -> Repre
     robot = fitted.fit.hypothesis.robot_at(fitted.fit.coordinates)
     frames, share = _chosen(data, robot)
     rows = [np.isin(t.scene.frame, cases) for t, cases in zip(data.train, frames)]
-    bare, less = replace(data, held=[], held_of=[]), _spares(share, robot)
+    bare, less = replace(data, held=[], held_of=[]), _spares(data, share, robot)
     if all(own.all() for own in rows):
         return RepresentativeCases(bare, fitted, rows, less)
     trials = [

@@ -10,6 +10,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from femsense.core.errors import FemsenseError
 from femsense.loop.data.dataset import NUISANCE, Data
 from femsense.loop.fit.fitted_model import FittedModel, keeping
@@ -19,16 +21,9 @@ from femsense.loop.search.acceptance import acceptance_test, prior_cost, prior_e
 from femsense.loop.search.effect_fields import fields_of
 from femsense.loop.search.forward_selection import polished, shortlist
 from femsense.loop.search.location_search import may_lie_elsewhere
-from femsense.loop.search.refit import EVIDENCE, evidence, refit
+from femsense.loop.search.refit import evidence, refit
 from femsense.loop.search.screening import Candidate, screen_model
 from femsense.loop.search.search_state import Progress, Refit, at_step
-
-ALTERNATIVES = 2
-"""So many alternatives to an effect are tried."""
-NEAR = 0.75
-"""An alternative had this share of the evidence of the effect at least when that was named."""
-BETTER = 2.0
-"""dBIC by which an alternative must be better; it takes EVIDENCE in the place of gravity where none is declared, since every body has weight."""
 
 History = list[tuple[str, FittedModel]]
 
@@ -38,9 +33,9 @@ def swapped(
 ) -> tuple[History, list[RefitRecord]]:
     """Return the history with alternatives in the places of effects, but for the last one, that they beat in the whole model, and the
     refits with what became of those that were asked."""
-    for name in [name for name, _ in history[1:-1]]:
+    for name in [name for name, _ in history[1:-1]] if np.isfinite(data.thresholds.swap) else []:
         fitted = history[-1][1]
-        alternatives = _alternatives(fitted, refits, name)
+        alternatives = _alternatives(data, fitted, refits, name)
         if not alternatives or (alternatives == [name] and not may_lie_elsewhere(data, fitted, name, noise)):
             continue
         say(f"refitting {' or '.join(alternatives)} in the place of {name}")
@@ -58,7 +53,7 @@ def swapped(
     return history, refits
 
 
-def _alternatives(fitted: FittedModel, refits: Sequence[RefitRecord], name: str) -> list[str]:
+def _alternatives(data: Data, fitted: FittedModel, refits: Sequence[RefitRecord], name: str) -> list[str]:
     """Return the effects that were nearly as good when one was named, the best first; the effect itself if its seed was chosen from many."""
     seeds = {effect.name: seed for effect, seed, parameters in fitted.fit.hypothesis.terms if parameters}
     named = [r for r in refits if r.name == name and r.is_named]
@@ -70,11 +65,11 @@ def _alternatives(fitted: FittedModel, refits: Sequence[RefitRecord], name: str)
         for r in refits
         if r.answers_as(own)
         and r.passes
-        and r.evidence > NEAR * own.evidence - EVIDENCE
+        and r.evidence > data.thresholds.near_as_good * own.evidence - data.thresholds.evidence
         and r.name not in fitted.fit.hypothesis.names
     ]
     others = list(dict.fromkeys(r.name for r in sorted(near, key=lambda r: -r.evidence)))
-    return [name] * bool(seeds[name]) + others[:ALTERNATIVES]
+    return [name] * bool(seeds[name]) + others[: data.effort.alternatives]
 
 
 def _best(
@@ -94,9 +89,10 @@ def _best(
         return None, []
     worth = evidence(without.fit, fitted.fit) - own.cost - prior_cost(data.declared, own.effect, fitted.fit)
     records = [RefitRecord(name, own.seed, PASSES, in_place_of=name, dbic=worth)]
-    margin = max(BETTER, prior_evidence(data, own.effect))
+    margin = max(data.thresholds.swap, prior_evidence(data, own.effect))
     best: Refit | None = None
-    for candidate in shortlist([c for c in table if c.effect.name in alternatives], first=True):
+    listed = [c for c in table if c.effect.name in alternatives]
+    for candidate in shortlist(listed, data.thresholds, data.effort, first=True):
         record = RefitRecord(candidate.effect.name, candidate.seed, in_place_of=name)
         try:
             made = refit(data, without, candidate, noise)

@@ -11,7 +11,8 @@ from femsense.loop.data.dataset import Data
 from femsense.loop.fit.cross_validation import sweep_rows
 from femsense.loop.fit.joint_fit import JointFit
 from femsense.loop.result.evidence import ConfoundingMap, Estimate, Ranked, Size
-from femsense.loop.search.screening import TESTABLE, Candidate, one_each
+from femsense.loop.search.screening import Candidate, one_each
+from femsense.loop.thresholds import Thresholds
 
 DRAWS = 200
 """Bootstrap draws of sweeps."""
@@ -19,8 +20,6 @@ LEAST_SWEEPS = 3
 """With fewer there is no such bootstrap."""
 MAP = 14
 """Effects in the map of confounding."""
-WIDE = 6
-"""Effects with more parameters than this are collinear with anything and are left out of that map."""
 KINDS = {"linear": "change", "log": "factor", "reciprocal": "softer_than"}
 """What the size of a parameter is, by how its coordinate gives its value."""
 
@@ -97,9 +96,9 @@ def _gain(G: FloatArray, a: int, b: int, c: Candidate, size: FloatArray) -> floa
     return float(-2.0 * step @ G[a:b, -1] - step @ G[a:b, a:b] @ step)
 
 
-def confounding_map(first: list[Candidate]) -> ConfoundingMap:
+def confounding_map(first: list[Candidate], decides: Thresholds) -> ConfoundingMap:
     """Return how much of each effect's field (row) is collinear with that of another one (column), nuisance projected out."""
-    shown = [c for c in one_each(first) if c.retained >= TESTABLE and c.columns.shape[1] <= WIDE][:MAP]
+    shown = [c for c in one_each(first) if c.retained >= decides.testable and c.columns.shape[1] <= decides.many_numbers][:MAP]
     bases = [np.linalg.qr(c.columns / np.maximum(np.linalg.norm(c.columns, axis=0), 1e-300))[0] for c in shown]
     fields = [c.columns @ c.step if np.linalg.norm(c.columns @ c.step) > 0 else c.columns[:, 0] for c in shown]
     share = tuple(tuple(float(np.linalg.norm(Q.T @ f) / max(float(np.linalg.norm(f)), 1e-300)) for Q in bases) for f in fields)

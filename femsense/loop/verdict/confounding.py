@@ -10,26 +10,16 @@ from femsense.loop.data.dataset import NUISANCE
 from femsense.loop.fit.fitted_model import span_of
 from femsense.loop.result.records import ConfoundedPair, RefitRecord
 from femsense.loop.search.input_offset import OFFSETS
-from femsense.loop.search.refit import EVIDENCE
-from femsense.loop.search.screening import TESTABLE, confounding, one_each
+from femsense.loop.search.screening import confounding, one_each
 from femsense.loop.search.search_state import Search
-
-MOSTLY = 0.9
-"""Share of an effect's field, beyond poses, that is collinear with a named nuisance alone where the two are said together."""
-ALIKE = 0.95
-"""Fields that agree so well are said to be alike …"""
-REFUTED = 0.5
-"""… unless a refit in the place of the named one brought less than this share of its evidence (what bends may distinguish them) …"""
-NEXT_TO_NOTHING = 0.05
-"""… or one explains less than this share of what the other does, to first order (it would need a sign that it cannot have)."""
-MOST_NUMBERS = 6
-"""An effect with more parameters is collinear with much, which says little."""
+from femsense.loop.thresholds import Thresholds
 
 
-def confounded(search: Search, names: Sequence[str]) -> list[ConfoundedPair]:
+def confounded(search: Search, names: Sequence[str], decides: Thresholds) -> list[ConfoundedPair]:
     """Return pairs that these data cannot distinguish, those of what is named first."""
     found: dict[frozenset[str], ConfoundedPair] = {}
-    for pair in (*_as_evident(search, names), *_absorbed(search, names), *_in_common(search, names), *_alike(search, names)):
+    asked = _as_evident, _absorbed, _in_common, _alike
+    for pair in (pair for ask in asked for pair in ask(search, names, decides)):
         key = frozenset(pair.pair)
         found[key] = _merged(found[key], pair) if key in found else pair
     return sorted(found.values(), key=lambda pair: not set(pair.pair) & set(names))
@@ -61,20 +51,20 @@ def in_words(pairs: Iterable[ConfoundedPair], names: Sequence[str]) -> str:
     return f" These data do not tell {', nor '.join(said)}." if said else ""
 
 
-def _as_evident(search: Search, names: Sequence[str]) -> Iterator[ConfoundedPair]:
-    """Yield the effects whose refits are within EVIDENCE of a named one's, or make a named nuisance needless with as much evidence."""
+def _as_evident(search: Search, names: Sequence[str], decides: Thresholds) -> Iterator[ConfoundedPair]:
+    """Yield the effects whose refits are within `evidence` of a named one's, or make a named nuisance needless with as much evidence."""
     ours = _named(search, names)
     for own in ours:
         for r in search.refits:
-            if r.name not in names and r.passes and r.answers_as(own) and r.evidence > own.evidence - EVIDENCE:
+            if r.name not in names and r.passes and r.answers_as(own) and r.evidence > own.evidence - decides.evidence:
                 yield ConfoundedPair((own.name, r.name), dbic_gap=own.evidence - r.evidence)
     for name in (n for n in names if n in NUISANCE):
         for r in (r for r in search.refits if name in (r.takes_over or ()) and r.name not in names):
             ahead = max((own.evidence for own in ours if own.answers_as(r)), default=0.0)
-            if r.evidence > max(EVIDENCE, ahead - EVIDENCE):
+            if r.evidence > max(decides.evidence, ahead - decides.evidence):
                 yield ConfoundedPair((name, r.name), dbic_gap=max(ahead - r.evidence, 0.0))
     swap = search.in_place
-    if swap is not None and abs(swap.ahead) < EVIDENCE and {OFFSETS, swap.name} & set(names):
+    if swap is not None and abs(swap.ahead) < decides.evidence and {OFFSETS, swap.name} & set(names):
         yield ConfoundedPair((OFFSETS, swap.name), dbic_gap=abs(swap.ahead))
 
 
@@ -84,13 +74,13 @@ def _named(search: Search, names: Sequence[str]) -> list[RefitRecord]:
     return [r for r in ours if r.is_named or r.in_place_of == r.name]
 
 
-def _absorbed(search: Search, names: Sequence[str]) -> Iterator[ConfoundedPair]:
+def _absorbed(search: Search, names: Sequence[str], decides: Thresholds) -> Iterator[ConfoundedPair]:
     """Yield the effects that this recording cannot test because most of each is collinear with one named nuisance, with the share that calibration absorbs."""
     fit = search.base.fit
     J = np.asarray(fit.fit.jacobian)
     poses = np.linalg.qr(J[:, : fit.own])[0]
     present = search.final.fit.hypothesis.names
-    hidden = [c for c in one_each(search.first) if c.retained < TESTABLE and c.effect.name not in present]
+    hidden = [c for c in one_each(search.first) if c.retained < decides.testable and c.effect.name not in present]
     for name in (n for n in names if n in NUISANCE):
         own = J[:, fit.own :][:, span_of(fit, name)]
         own = own - poses @ (poses.T @ own)
@@ -98,20 +88,20 @@ def _absorbed(search: Search, names: Sequence[str]) -> Iterator[ConfoundedPair]:
             whole = c.columns - J @ c.response
             whole = whole - poses @ (poses.T @ whole)
             left = whole - own @ np.linalg.lstsq(own, whole, rcond=None)[0]
-            if np.linalg.norm(left) < (1.0 - MOSTLY**2) ** 0.5 * np.linalg.norm(whole):
+            if np.linalg.norm(left) < (1.0 - decides.mostly**2) ** 0.5 * np.linalg.norm(whole):
                 yield ConfoundedPair((name, c.effect.name), absorbed_share=float(np.sqrt(1.0 - c.retained**2)))
 
 
-def _in_common(search: Search, names: Sequence[str]) -> Iterator[ConfoundedPair]:
+def _in_common(search: Search, names: Sequence[str], decides: Thresholds) -> Iterator[ConfoundedPair]:
     """Yield a named nuisance and what looks like it where all its parameters move alike (a modulus, and a gain that all cables have in common), where
     calibration absorbs that: one parameter alone, as the gain of one cable, it does not."""
     for effect in {c.effect.name: c.effect for c in search.first if len(c.parameters) > 1}.values():
         for alias in effect.aliases if effect.name not in search.final.fit.hypothesis.names else ():
             if alias.common and alias.name in names:
-                yield from _common(search, alias.name, effect.name)
+                yield from _common(search, alias.name, effect.name, decides)
 
 
-def _common(search: Search, own: str, other: str) -> Iterator[ConfoundedPair]:
+def _common(search: Search, own: str, other: str, decides: Thresholds) -> Iterator[ConfoundedPair]:
     """Yield a named nuisance with an effect whose parameters move alike, if calibration absorbs that."""
     forms = [c for c in search.first if c.effect.name == other and len(c.parameters) > 1]
     fit, widest = search.base.fit, max(forms, key=lambda c: len(c.parameters))
@@ -120,31 +110,32 @@ def _common(search: Search, own: str, other: str) -> Iterator[ConfoundedPair]:
     whole = left - np.asarray(fit.fit.jacobian) @ widest.response.sum(axis=1)
     size = float(np.linalg.norm(whole - poses @ (poses.T @ whole)))
     retained = float(np.linalg.norm(left)) / size if size > 0.0 else 1.0
-    if retained < TESTABLE:
+    if retained < decides.testable:
         yield ConfoundedPair((own, other), absorbed_share=float(np.sqrt(1.0 - retained**2)))
 
 
-def _alike(search: Search, names: Sequence[str]) -> Iterator[ConfoundedPair]:
+def _alike(search: Search, names: Sequence[str], decides: Thresholds) -> Iterator[ConfoundedPair]:
     """Yield the effects whose fields agree, once what calibration may move is projected out."""
     for effect in (c.effect for c in one_each(search.first)):  # play is a negative offset of the displacement
         for alias in effect.aliases:
             if effect.mirrors(alias.name) and {alias.name, effect.name} & set(names):
                 yield ConfoundedPair((alias.name, effect.name), cosine=1.0)
-    ones = [c for c in one_each(search.first) if c.retained >= TESTABLE and len(c.parameters) <= MOST_NUMBERS]
+    ones = [c for c in one_each(search.first) if c.retained >= decides.testable and len(c.parameters) <= decides.many_numbers]
     for i, a in enumerate(ones):
         for b in ones[i + 1 :]:
             share = min(confounding(a, b), confounding(b, a))
             pair = a.effect.name, b.effect.name
-            apart = min(a.gain, b.gain) < NEXT_TO_NOTHING * max(a.gain, b.gain) and max(a.gain, b.gain) > EVIDENCE
-            if share > ALIKE and not (apart or _is_refuted(search, names, *pair) or _is_refuted(search, names, *pair[::-1])):
+            least, most = sorted((a.gain, b.gain))
+            apart = least < decides.next_to_nothing * most and most > decides.evidence
+            if share > decides.alike and not (apart or any(_is_refuted(search, names, *p, decides) for p in (pair, pair[::-1]))):
                 yield ConfoundedPair(pair, cosine=share)
 
 
-def _is_refuted(search: Search, names: Sequence[str], own: str, other: str) -> bool:
+def _is_refuted(search: Search, names: Sequence[str], own: str, other: str, decides: Thresholds) -> bool:
     """Return whether refits of another effect in the place of a named one brought much less."""
     for named in (r for r in _named(search, names) if r.name == own and r.is_named):
         there = [r.evidence for r in search.refits if r.name == other and r.answers_as(named)]
         tried = [dbic for dbic in there if np.isfinite(dbic)]  # one that was stopped early has none
-        if tried and max(tried) < REFUTED * named.evidence:
+        if tried and max(tried) < decides.refuted * named.evidence:
             return True
     return False

@@ -12,12 +12,8 @@ from femsense.loop.fit.fitted_model import FittedModel
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.fit.repeatability import Repeatability
 from femsense.loop.result.records import ModelError
+from femsense.loop.thresholds import Thresholds
 from femsense.loop.verdict.sentences import mesh_error_rms
-
-SMALL = 0.25
-"""Structure that is smaller than this share of the noise is no objection."""
-LIKELY = 0.01
-"""Where nothing tells the noise, it is not believed to be more than this share of the body's reach."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,10 +34,9 @@ class Excess:
     """Share of the mean square beyond the floor that the effects took away: where fitted by all that was found, on held-out data by what is
     handed back; the smaller one."""
 
-    @property
-    def is_small(self) -> bool:
-        """Whether it is no objection, whatever structure it has."""
-        return self.left <= SMALL * self.floor
+    def is_small(self, decides: Thresholds) -> bool:
+        """Return whether it is no objection, whatever structure it has."""
+        return self.left <= decides.small * self.floor
 
     @property
     def is_large(self) -> bool:
@@ -53,7 +48,7 @@ def excess_of(
     data: Data, before: FittedModel, final: FittedModel, back: FittedModel, noise: Noise, measured: Repeatability
 ) -> Excess:
     """Return what models leave: `before`, with all that was found (`final`), and that is handed back (`back`)."""
-    believed = measured.total if measured.known else min(measured.total, LIKELY * data.robot.body.reach)
+    believed = measured.total if measured.known else min(measured.total, data.thresholds.likely_noise * data.robot.body.reach)
     floor = float(np.hypot(believed, placement_rms(data, noise)))
     fitted = [beyond_mesh(data.train, [j.residual for j in s.fit.jets], noise) for s in (before, final)]
     held = [beyond_mesh(data.held, s.held_residuals, noise) for s in (before, back)]

@@ -67,10 +67,12 @@ def gather(
         tip=_tip(data, old, new),
         pictures=_pictures(data, old, new),
         ranking=ranking(data, base.fit, first, rng),
-        confounding=confounding_map(first),
+        confounding=confounding_map(first, data.thresholds),
         calibration=calibration_shift(data, {"before": before, "nuisance": base, "after": final}),
         tests=Tests(
-            before=tested(data.train, cleaned, before.fit, structure_tests(data.train, cleaned, rng=rng)),
+            before=tested(
+                data.train, cleaned, before.fit, structure_tests(data.train, cleaned, rng=rng, level=data.thresholds.structure)
+            ),
             after=tested(data.train, left, shown.fit, after_tests),
         ),
         power=power(last),

@@ -8,6 +8,7 @@ from femsense.core.arrays import FloatArray, IntArray
 from femsense.loop.data.covariates import covariates_of, rank_with, stacked
 from femsense.loop.data.trial import Trial, heads_of, vectors_of
 from femsense.loop.result.records import FrameError, LeftOver, Structure, WorstMarker
+from femsense.loop.thresholds import DEFAULTS
 from femsense.model.recording import state_key
 from femsense.model.robot import Robot
 
@@ -15,18 +16,18 @@ PERMUTATIONS = 499
 WORST_FRAMES = 5
 GOES_WITH = 8
 """So many frames and covariates are listed."""
-LEVEL = 0.01
-"""Probability, over all tests together (Holm 1979), of calling mere noise structure."""
 
 
-def _structure(lag_one: float, p: dict[str, float]) -> Structure:
+def _structure(lag_one: float, p: dict[str, float], level: float) -> Structure:
     """Return tests with the verdict on all of them together."""
     least = min(p.values(), default=1.0)
-    return Structure(lag_one, least, p, least * len(p) <= LEVEL)
+    return Structure(lag_one, least, p, least * len(p) <= level)
 
 
-def structure_tests(trials: list[Trial], residuals: list[FloatArray], *, rng: np.random.Generator) -> Structure:
-    """Return tests for structure in residuals [m], (k, c) a trial.
+def structure_tests(
+    trials: list[Trial], residuals: list[FloatArray], *, rng: np.random.Generator, level: float = DEFAULTS.structure
+) -> Structure:
+    """Return tests for structure in residuals [m], (k, c) a trial; `level`: probability, over all tests together (Holm 1979), of calling mere noise structure.
 
     * `neighbours`: marker means and frame means removed; T = Σ r_k·r_{k+1} / Σ |r_k|² over neighbouring states of a sweep, against
       shuffles of the states within sweeps. It knows no scale, so that a wrong noise level cannot trip it.
@@ -36,7 +37,7 @@ def structure_tests(trials: list[Trial], residuals: list[FloatArray], *, rng: np
     Errors of a cloud are alike where points are near to each other, so that its states are shuffled whole, and `pattern` is not asked.
     """
     if any(t.scene.crossings is not None for t in trials):
-        return _cloud_tests(trials, residuals, rng)
+        return _cloud_tests(trials, residuals, rng, level)
     fields = [_field(t, r) for t, r in zip(trials, residuals)]
     observed = _lag_one(fields, None)
     p: dict[str, float] = {}
@@ -46,14 +47,14 @@ def structure_tests(trials: list[Trial], residuals: list[FloatArray], *, rng: np
     seen = np.array([_largest(fields, None)])
     null = np.array([_largest(fields, rng) for _ in range(PERMUTATIONS)])
     p |= {name: _share(null[:, i], float(seen[0, i])) for i, name in enumerate(("pattern", "sweep"))}
-    return _structure(observed if np.isfinite(observed) else 0.0, p)
+    return _structure(observed if np.isfinite(observed) else 0.0, p, level)
 
 
-def _cloud_tests(trials: list[Trial], residuals: list[FloatArray], rng: np.random.Generator) -> Structure:
+def _cloud_tests(trials: list[Trial], residuals: list[FloatArray], rng: np.random.Generator, level: float) -> Structure:
     """Return the tests of clouds, with those of the markers beside them where there are some."""
     pairs = list(zip(trials, residuals))
     marked = [(t, r) for t, r in pairs if t.scene.crossings is None]
-    markers = structure_tests([t for t, _ in marked], [r for _, r in marked], rng=rng) if marked else None
+    markers = structure_tests([t for t, _ in marked], [r for _, r in marked], rng=rng, level=level) if marked else None
     fields = [_field(t, r) for t, r in pairs if t.scene.crossings is not None]
     p = {} if markers is None else dict(markers.tests)
     observed = _lag_one(fields, None)
@@ -62,7 +63,7 @@ def _cloud_tests(trials: list[Trial], residuals: list[FloatArray], rng: np.rando
     whole = [_largest(_shuffled(fields, rng), None)[1] for _ in range(PERMUTATIONS)]
     p["cloud sweep"] = _share(np.array(whole), _largest(fields, None)[1])
     lag = observed if np.isfinite(observed) else 0.0
-    return _structure(lag if markers is None else markers.lag_one, p)
+    return _structure(lag if markers is None else markers.lag_one, p, level)
 
 
 def _shuffled(fields: list[tuple[FloatArray, IntArray]], rng: np.random.Generator) -> list[tuple[FloatArray, IntArray]]:

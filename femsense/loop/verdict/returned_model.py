@@ -22,27 +22,15 @@ from femsense.loop.fit.fitted_model import (
 )
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.search.acceptance import at_edge
-from femsense.loop.search.input_offset import OFFSETS, SIGNIFICANT, moved_nuisance, offsets_are_evident
-from femsense.loop.search.refit import EVIDENCE
+from femsense.loop.search.input_offset import OFFSETS, moved_nuisance, offsets_are_evident
 from femsense.loop.search.search_state import Search
+from femsense.loop.thresholds import Thresholds
 from femsense.model.effects import OF_BODY, Effect, Entry, Parameter
 from femsense.model.observation import Hypothesis, evaluate_scene
 from femsense.model.robot import Robot
 
 (MODULUS,) = OF_BODY
 """What calibration may move of the body."""
-
-NOT_WORSE = 1.02
-"""What is handed back may not have a larger held-out error than the declared model, but for this factor …"""
-
-
-NOISY = 1.15
-"""… or, where only what calibration may move is handed back, for this one, if χ² of the held-out data says that noise hides a better model.
-Three effects that were wrong would have needed it in blind cases, so that they have to do more …"""
-
-
-FAR_BETTER = 50.0
-"""… or, where the mesh's own error is what is larger, if χ² of the held-out data falls by so much."""
 
 
 COMPARED = 3
@@ -55,13 +43,13 @@ def promoted_nuisances(data: Data, search: Search) -> list[str]:
     return [n for n in names if n in OF_BODY or offsets_are_evident(data, search.final, search.noise, search.n_effective)]
 
 
-def is_sure(fitted: FittedModel, name: str, std: FloatArray) -> bool:
-    """Return whether a value of a nuisance differs from what is declared by more than SIGNIFICANT of the standard deviations that are reported."""
-    return bool((np.abs(fitted.fit.coordinates[span_of(fitted.fit, name)]) > SIGNIFICANT * std).any())
+def is_sure(fitted: FittedModel, name: str, std: FloatArray, decides: Thresholds) -> bool:
+    """Return whether a value of a nuisance differs from what is declared by more than `significant` of the standard deviations that are reported."""
+    return bool((np.abs(fitted.fit.coordinates[span_of(fitted.fit, name)]) > decides.significant * std).any())
 
 
 def sure_effects(data: Data, fitted: FittedModel, names: Iterable[str], std: Mapping[str, FloatArray]) -> list[str]:
-    """Return the effects with a value of their own that is away from what is declared by more than SIGNIFICANT of the standard deviations that are
+    """Return the effects with a value of their own that is away from what is declared by more than `significant` of the standard deviations that are
     reported, and those that have none (a law, a mesh). Places and times are no such values, nor is a weight that no robot can be without."""
     terms = {effect.name: (effect, parameters) for effect, _, parameters in fitted.fit.hypothesis.terms}
     return [name for name in names if name not in terms or _is_away(data, fitted, *terms[name], std[name])]
@@ -73,7 +61,7 @@ def _is_away(data: Data, fitted: FittedModel, effect: Effect, parameters: Sequen
     if effect.discrete or effect.expected(data.declared) or not sized.any():
         return True
     off = np.abs(fitted.fit.coordinates[span_of(fitted.fit, effect.name)] - np.array([p.null for p in parameters]))
-    return bool((off > SIGNIFICANT * std)[sized].any())
+    return bool((off > data.thresholds.significant * std)[sized].any())
 
 
 def worth_handing_back(data: Data, search: Search, promoted: list[str], names: list[str]) -> tuple[list[str], FittedModel]:
@@ -110,19 +98,19 @@ def holds_out(data: Data, search: Search, back: FittedModel) -> bool:
     """Return whether a model is no worse on held-out data in millimetres; or else better by the noise that these data have, where it is calibrated
     only and within reason, or where the mesh's own error is all that is larger: then it must be no worse beyond that, nor in millimetres than
     the model with all that calibration may move, and not be input offsets alone, unless it is far better by the noise and within reason."""
-    worse = back.held_rms / search.before.held_rms
-    if worse <= NOT_WORSE:
+    worse, decides = back.held_rms / search.before.held_rms, data.thresholds
+    if worse <= decides.not_worse:
         return True
     only_calibrated = not has_effects(back.fit.hypothesis.names)
     gain = held_chi2(data, search.before, search.noise) - held_chi2(data, back, search.noise)
-    if gain <= (EVIDENCE if only_calibrated else 0.0):  # effects have been judged by held-out data before
+    if gain <= (decides.evidence if only_calibrated else 0.0):  # effects have been judged by held-out data before
         return False
-    if only_calibrated and worse <= NOISY:
+    if only_calibrated and worse <= decides.noisy:
         return True
     before, after = held_beyond_mesh(data, search, back)
     only_offsets = only_calibrated and OFFSETS in back.fit.hypothesis.names  # much else looks like them
-    shown = not only_offsets and back.held_rms <= NOT_WORSE * search.base.held_rms
-    return after <= NOT_WORSE * before and (shown or (gain > FAR_BETTER and worse <= NOISY))
+    shown = not only_offsets and back.held_rms <= decides.not_worse * search.base.held_rms
+    return after <= decides.not_worse * before and (shown or (gain > decides.far_better and worse <= decides.noisy))
 
 
 def held_beyond_mesh(data: Data, search: Search, back: FittedModel) -> tuple[float, float]:

@@ -15,7 +15,7 @@ from femsense.loop.fit.repeatability import Repeatability
 from femsense.loop.result.loop_result import FOUND, NONE, UNEXPLAINED
 from femsense.loop.result.records import ModelError, NamedEffect, Value
 from femsense.loop.search.search_state import Search
-from femsense.loop.verdict.returned_model import NOT_WORSE, has_effects, held_beyond_mesh
+from femsense.loop.verdict.returned_model import has_effects, held_beyond_mesh
 
 ROUNDED = 1e-6
 """What is so small beside the largest component of a vector is said as 0."""
@@ -67,7 +67,7 @@ def _mesh_in_words(budget: ModelError) -> str:
 
 def by_mesh(data: Data, search: Search, back: FittedModel) -> str:
     """Return a sentence on what the held-out error is beyond the mesh's own, where that is what makes it larger; nothing where it is not larger."""
-    if back.held_rms <= NOT_WORSE * search.before.held_rms or not mesh_errors(data):
+    if back.held_rms <= data.thresholds.not_worse * search.before.held_rms or not mesh_errors(data):
         return ""
     before, after = held_beyond_mesh(data, search, back)
     return f" Less the likeliest share of the discretisation error, that is {1e3 * before:.2f} mm before, {1e3 * after:.2f} mm after."

@@ -29,9 +29,9 @@ from femsense.loop.result.records import (
     Untestable,
     Value,
 )
-from femsense.loop.search.refit import EVIDENCE
-from femsense.loop.search.screening import TESTABLE, Candidate, one_each
+from femsense.loop.search.screening import Candidate, one_each
 from femsense.loop.search.search_state import Search
+from femsense.loop.thresholds import Thresholds
 from femsense.loop.verdict.candidate_tables import KINDS, own_size
 from femsense.loop.verdict.sentences import mesh_error_rms
 from femsense.model.effects.base import absent_elsewhere, placed
@@ -136,16 +136,18 @@ def _interval(data: Data, fitted: FittedModel, kind: int, rng: np.random.Generat
 # Candidates
 
 
-def untestable(first: Sequence[Candidate], names: Collection[str]) -> list[Untestable]:
+def untestable(first: Sequence[Candidate], names: Collection[str], decides: Thresholds) -> list[Untestable]:
     """Return the effects that these data cannot show, but for those that are named."""
     return [
         Untestable(c.effect.name, float(np.sqrt(max(0.0, 1.0 - c.retained**2))), c.retained)
         for c in one_each(list(first))
-        if c.retained < TESTABLE and c.effect.name not in names
+        if c.retained < decides.testable and c.effect.name not in names
     ]
 
 
-def tried_effects(first: list[Candidate], table: list[Candidate], refits: Sequence[RefitRecord]) -> list[TriedEffect]:
+def tried_effects(
+    first: list[Candidate], table: list[Candidate], refits: Sequence[RefitRecord], decides: Thresholds
+) -> list[TriedEffect]:
     """Return every effect that was tried with its scores: linear at the start, linear at the end, and the joint refits."""
     last = {c.effect.name: c for c in one_each(table)}
     screened = {c.effect.name for c in first}
@@ -156,7 +158,7 @@ def tried_effects(first: list[Candidate], table: list[Candidate], refits: Sequen
     ]
     for c in one_each(first):
         joint, end = _refits_of(c.effect.name, refits), last.get(c.effect.name)
-        verdict = _verdict_of(joint) if joint else _why_not(c, end)
+        verdict = _verdict_of(joint) if joint else _why_not(c, end, decides)
         rows.append(TriedEffect(c.effect.name, c.seed, c.gain, c.score, c.retained, end.score if end else None, joint, verdict))
     return rows
 
@@ -171,13 +173,13 @@ def _verdict_of(joint: Sequence[RefitRecord]) -> str:
     return next((v for v in (NAMED, PASSES) if v in said), said[-1])
 
 
-def _why_not(c: Candidate, end: Candidate | None) -> str:
-    if c.retained < TESTABLE:
+def _why_not(c: Candidate, end: Candidate | None, decides: Thresholds) -> str:
+    if c.retained < decides.testable:
         share = 100.0 * np.sqrt(max(0.0, 1.0 - c.retained**2))
         return f"not testable: {'more than 99' if share > 99.0 else f'{share:.0f}'} % of it is absorbed by calibration"
-    if c.score > EVIDENCE and end is not None and end.score <= EVIDENCE:
+    if c.score > decides.evidence and end is not None and end.score <= decides.evidence:
         return f"nothing is left for it once what is named is in the model (dBIC {c.score:.0f}, then {end.score:.1f})"
-    if c.score > EVIDENCE:
+    if c.score > decides.evidence:
         return f"not refitted: far behind the best (dBIC {c.score:.0f})"
     return f"too little evidence (dBIC {c.score:.1f})"
 

@@ -45,10 +45,6 @@ from femsense.loop.verdict.summary import (
 from femsense.model.effects import Entry, apply_effects
 from femsense.model.robot import Robot
 
-EXPLAINED = 0.8
-"""Share of the excess over the noise that effects must take away where structure is left that is no larger than the noise or the mesh's error."""
-LACKS = 2.0
-"""A model that is handed back may leave so many times the mean square, in units of all noise, that calibration of all nuisances leaves."""
 SAME = 0.01, 1e-5
 """The robot that is handed back may differ from the fitted model by this share of what that leaves, or by this [m]."""
 
@@ -58,7 +54,7 @@ def conclude(data: Data, search: Search, rng: np.random.Generator) -> LoopResult
     before, final, noise = search.before, search.final, search.noise
     std = parameter_std(data, final, noise, _seed_std(search))
     measured = repeatability(data, final, noise)
-    promoted = [n for n in promoted_nuisances(data, search) if is_sure(final, n, std[n])]
+    promoted = [n for n in promoted_nuisances(data, search) if is_sure(final, n, std[n], data.thresholds)]
     added = [n for n, _ in search.history[1:] if n in final.fit.hypothesis.names]
     sure = sure_effects(data, final, added, std)
     names, back = worth_handing_back(data, search, promoted, [*promoted, *sure])
@@ -70,14 +66,14 @@ def conclude(data: Data, search: Search, rng: np.random.Generator) -> LoopResult
     shown = back if lacks else final  # what nuisances take away unnamed is left, too
     surprise = _surprise(data, back, noise)
     plain = [without_mesh_error(t, jet.residual, noise, nor_placements=True) for t, jet in zip(data.train, shown.fit.jets)]
-    tests = structure_tests(data.train, plain, rng=rng)
+    tests = structure_tests(data.train, plain, rng=rng, level=data.thresholds.structure)
     excess = excess_of(data, before, final, back, noise, measured)
     found = _not_handed_back(search, names)
-    structured = tests.significant and not excess.is_small
-    open_to_doubt = (structured or surprise) and (drifted or excess.explained < EXPLAINED)
+    structured = tests.significant and not excess.is_small(data.thresholds)
+    open_to_doubt = (structured or surprise) and (drifted or excess.explained < data.thresholds.explained)
     unexplained = lacks or (found and not effects) or open_to_doubt or excess.is_large
     verdict = UNEXPLAINED if unexplained else FOUND if effects else NONE
-    pairs = confounded(search, names)
+    pairs = confounded(search, names, data.thresholds)
     robot = _handed_back(data, entries)
     only_held = bool(surprise) and not structured and not lacks
     left = _left(data, back if only_held else shown, noise, tests, excess, held=only_held)
@@ -97,10 +93,10 @@ def conclude(data: Data, search: Search, rng: np.random.Generator) -> LoopResult
         after=errors_of(data, back, rng),
         effects=tuple(effects),
         entries=tuple(entries),
-        candidates=tuple(tried_effects(search.first, search.last, search.refits)),
+        candidates=tuple(tried_effects(search.first, search.last, search.refits, data.thresholds)),
         confounded=tuple(pairs),
         next_experiment="",
-        not_testable=tuple(untestable(search.first, names)),
+        not_testable=tuple(untestable(search.first, names, data.thresholds)),
         detectable=detectable(search.last, {effect.name for effect in effects}),
         left=left,
         robot=robot,
@@ -143,14 +139,14 @@ def lacks_much(data: Data, back: FittedModel, final: FittedModel, noise: Noise) 
     """Return whether what is handed back leaves much that the final model takes away with nuisances that are not named."""
     train = [_mean_square(data.train, [j.residual for j in s.fit.jets], noise) for s in (back, final)]
     held = [_mean_square(data.held, s.held_residuals, noise) for s in (back, final)]
-    return any(own > LACKS * max(full, 1.0) for own, full in (train, held))
+    return any(own > data.thresholds.lacks * max(full, 1.0) for own, full in (train, held))
 
 
 def _surprise(data: Data, back: FittedModel, noise: Noise) -> str:
     """Return a sentence on what held-out data show of what is handed back and fitted data do not; nothing where these are as well explained."""
     fitted = _mean_square(data.train, [j.residual for j in back.fit.jets], noise)
     held = _mean_square(data.held, back.held_residuals, noise)
-    if held <= LACKS * max(fitted, 1.0):
+    if held <= data.thresholds.lacks * max(fitted, 1.0):
         return ""
     worst = describe_left(data.robot, data.held, _beyond_mesh(data.held, back.held_residuals, noise)).worst_frame
     return (
