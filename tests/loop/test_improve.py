@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -12,12 +11,17 @@ import pytest
 from arm import arm, record, sweeps
 
 from femsense.core.errors import DataError, InputError
+from femsense.loop.data.dataset import prepare
 from femsense.loop.data.holdout import hold_out, sweeps_of
 from femsense.loop.data.trial import Groups
+from femsense.loop.fit.fitted_model import fit_model, with_nuisance
 from femsense.loop.fit.noise_components import Noise, estimate_noise, starting_points, whiten
 from femsense.loop.fit.repeatability import Repeatability
-from femsense.loop.improve import improve
+from femsense.loop.improve import ImproveOptions, improve
+from femsense.loop.result.records import NAMED, RefitRecord
 from femsense.loop.search.search import distinguishes_effects
+from femsense.loop.search.search_state import SearchProgress
+from femsense.loop.thresholds import DEFAULTS
 from femsense.loop.verdict.returned_model import is_sure
 from femsense.loop.verdict.sentences import by_noise
 from femsense.model.recording import make_recording
@@ -100,43 +104,39 @@ def test_where_each_sweep_pulls_a_cable_of_its_own_a_quarter_of_its_frames_is_he
     )
 
 
-def test_what_is_taken_away_by_what_nobody_names_is_left(monkeypatch: pytest.MonkeyPatch):
+def test_what_is_taken_away_by_what_nobody_names_is_left():
     inputs, labels = sweeps()
     recording, _ = record(inputs, effects=[{"name": "stiffness", "scale": 1.25}], labels=labels, truth=arm())
-    monkeypatch.setattr(sys.modules["femsense.loop.verdict.verdict"], "promoted_nuisances", lambda data, search: [])
-    loop = improve(arm(), [recording])
+    loop = improve(arm(), [recording], options=ImproveOptions(thresholds=replace(DEFAULTS, significant=1e9)))
     assert loop.verdict == "unexplained" and not loop.effects
     assert loop.left.rms_m > 0.8 * loop.before.train_rms_m > 5.0 * loop.noise_m  # but for the error of the mesh
     assert loop.left.structure.significant and loop.evidence.tests.after.structure.significant
 
 
-def test_what_has_evidence_and_makes_the_held_out_error_larger_is_said_and_not_handed_back(monkeypatch: pytest.MonkeyPatch):
+def test_what_has_evidence_and_makes_the_held_out_error_larger_is_said_and_not_handed_back():
     inputs, labels = sweeps()
     recording, _ = record(inputs, effects=[{"name": "cable_friction", "coefficient": 0.25}], labels=labels, truth=arm((4, 1, 1)))
-    monkeypatch.setattr(sys.modules["femsense.loop.verdict.returned_model"], "holds_out", lambda data, search, back: False)
-    loop = improve(arm((4, 1, 1)), [recording], effects=["cable_friction"])
+    strict = replace(DEFAULTS, not_worse=0.0)
+    loop = improve(arm((4, 1, 1)), [recording], effects=["cable_friction"], options=ImproveOptions(thresholds=strict))
     assert not loop.effects and loop.robot is loop.declared
     assert "evidence for cable_friction" in loop.sentence and "discretisation error is" in loop.sentence
     assert loop.verdict == "unexplained" and "nothing that may be handed back explains" in loop.sentence
 
 
-def test_an_effect_whose_states_do_not_converge_again_is_taken_back(monkeypatch: pytest.MonkeyPatch):
+def test_an_effect_whose_states_do_not_converge_again_is_taken_back():
     inputs, labels = sweeps()
     recording, _ = record(inputs, effects=[{"name": "cable_friction", "coefficient": 0.25}], labels=labels, truth=arm((4, 1, 1)))
-    module = sys.modules["femsense.loop.search.search"]
-    again, asked = module.fitted_again, list[tuple[str, ...]]()
-
-    def folds(data, fitted, noise, **given):
-        asked.append(fitted.fit.hypothesis.names)
-        if "cable_friction" in asked[-1]:
-            raise DataError("no equilibrium in frame 3")
-        return again(data, fitted, noise, **given)
-
-    monkeypatch.setattr(module, "fitted_again", folds)
-    loop = improve(arm((4, 1, 1)), [recording], effects=["cable_friction"])
-    assert "cable_friction" in asked[-1] and "cable_friction" not in {e.name for e in loop.effects}
-    refits = [q for c in loop.candidates if c.name == "cable_friction" for q in c.refits]
-    assert any("no equilibrium in frame 3" in q.verdict for q in refits)
+    data = prepare(arm((4, 1, 1)), [recording], [])
+    hypothesis, prior = with_nuisance(data)
+    base = fit_model(data, hypothesis, prior, Noise({"white": 1e-4}, ""), np.zeros(len(prior.mean)))
+    named = RefitRecord("cable_friction", {}, NAMED, step=1)
+    course = SearchProgress(
+        data, data, base, [("", base), ("cable_friction", base)], 1, base, base, ["cable_friction"], False, [named]
+    )
+    assert course.found == 1
+    course.take_back(DataError("no equilibrium in frame 3"))
+    assert course.over and not course.found and course.fitted is base and [name for name, _ in course.history] == [""]
+    assert "no equilibrium in frame 3" in course.refits[0].verdict and not course.refits[0].is_named
 
 
 def test_a_model_that_lacks_nothing_is_told_so():
@@ -320,5 +320,9 @@ def test_a_nuisance_is_named_only_beyond_the_deviations_that_are_reported():
     fitted = SimpleNamespace(
         fit=SimpleNamespace(hypothesis=SimpleNamespace(terms=terms), coordinates=np.array([0.09, 0.0, -0.4]))
     )
-    assert is_sure(fitted, "stiffness", np.array([0.029])) and not is_sure(fitted, "stiffness", np.array([0.031]))
-    assert is_sure(fitted, "cable_offset", np.array([0.1, 0.1])) and not is_sure(fitted, "cable_offset", np.array([0.1, 0.2]))
+    assert is_sure(fitted, "stiffness", np.array([0.029]), DEFAULTS) and not is_sure(
+        fitted, "stiffness", np.array([0.031]), DEFAULTS
+    )
+    assert is_sure(fitted, "cable_offset", np.array([0.1, 0.1]), DEFAULTS) and not is_sure(
+        fitted, "cable_offset", np.array([0.1, 0.2]), DEFAULTS
+    )

@@ -42,8 +42,7 @@ def select_next(
     refits, records = _refitted(data, fitted, listed, noise, say)
     best = max((r.score for r in refits.values() if r.record.passes), default=np.inf)
     refits = {
-        i: _to_the_end(data, fitted, r, noise) if r.score > 0.5 * best - data.thresholds.evidence else r
-        for i, r in refits.items()
+        i: to_the_end(data, fitted, r, noise) if r.score > 0.5 * best - data.thresholds.evidence else r for i, r in refits.items()
     }
     if not any(r.record.passes for r in refits.values()):
         refits = {i: _elsewhere(data, fitted, r, noise, say) for i, r in refits.items()}
@@ -77,7 +76,7 @@ def _refitted(
             continue  # where little is left to explain, a refit seldom gains that much on its linear score, but for a weight that cables lift
         say(f"refitting with {candidate.effect.name}")
         record = RefitRecord(candidate.effect.name, candidate.seed)
-        settled = _settled(data, candidate, ahead)
+        settled = has_settled(data, candidate, ahead)
         try:
             scout, _ = scouts.get(id(candidate), (None, 0.0))
             lead = max(ahead, key=lambda r: r.score, default=None)
@@ -141,7 +140,7 @@ def _in_sight(refitted: Refit) -> float:
     return refitted.score + more * (refitted.score + refitted.candidate.cost)
 
 
-def _settled(data: Data, candidate: Candidate, ahead: Sequence[Refit]) -> bool:
+def has_settled(data: Data, candidate: Candidate, ahead: Sequence[Refit]) -> bool:
     """Return whether what a refit ends with is the last word on it: others explain the data, and it has no place or time to move."""
     effect = candidate.effect
     return (
@@ -199,7 +198,7 @@ def _bar(ahead: Refit, candidate: Candidate) -> float:
     return min(ahead.gain, ahead.candidate.score) if candidate.effect.name == ahead.candidate.effect.name else ahead.gain
 
 
-def _to_the_end(data: Data, fitted: FittedModel, refitted: Refit, noise: Noise) -> Refit:
+def to_the_end(data: Data, fitted: FittedModel, refitted: Refit, noise: Noise) -> Refit:
     """Return a refit that ran out of steps on its way down with more of them: alternatives are compared where each of them ends, or were when a held-out
     state does not converge there."""
     fit = refitted.fitted.fit
@@ -253,7 +252,7 @@ def _enriched(data: Data, fitted: FittedModel, winner: Refit, table: list[Candid
         if len(form.parameters) <= len(winner.candidate.parameters):
             continue
         say(f"trying {form.effect.name} with {len(form.parameters)} parameters")
-        made = _richer(data, fitted, winner, form, noise)
+        made = richer_fit(data, fitted, winner, form, noise)
         if made is None:
             continue
         rich = acceptance_test(data, fitted, form, made, winner.record, noise)
@@ -278,7 +277,7 @@ def _with_more_markers(
             break
         form = joined(winner.candidate, others[int(np.argmax(gains))])
         say(f"trying {form.effect.name} with {len(form.parameters)} parameters")
-        made = _richer(data, fitted, winner, form, noise)
+        made = richer_fit(data, fitted, winner, form, noise)
         if made is None:
             break
         more = acceptance_test(data, fitted, form, made, winner.record, noise)
@@ -289,7 +288,7 @@ def _with_more_markers(
     return winner
 
 
-def _richer(data: Data, fitted: FittedModel, winner: Refit, form: Candidate, noise: Noise) -> FittedModel | None:
+def richer_fit(data: Data, fitted: FittedModel, winner: Refit, form: Candidate, noise: Noise) -> FittedModel | None:
     """Return the fit of a richer form of the winner, started from the winner itself where its parameters are among those of the form."""
     settled, terms = winner.fitted.fit.hypothesis.settled, winner.fitted.fit.hypothesis.terms
     keys = {p.key for p in form.parameters}

@@ -40,7 +40,7 @@ def located(
     """Return the best of a candidate's fits, that which was `made` from its own seed or one that begins where a climb ends, its seed moved on,
     and the scatter of its parameters: that of `closer`, or that over the places that explain as much where this is larger."""
     evident = data.thresholds.evidence
-    begun = [made, *_fitted_at(data, fitted, candidate, made, climbs.ends, noise)]
+    begun = [made, *fitted_at(data, fitted, candidate, made, climbs.ends, noise)]
     moved = list[tuple[FittedModel, list[float]]]()
     for one in sorted(begun, key=lambda s: s.fit.chi2):
         if not moved or one.fit.chi2 < moved[0][0].fit.chi2 + 2.0 * evident:
@@ -50,7 +50,7 @@ def located(
     return best, np.maximum(scatter, np.std(values, axis=0)).tolist()
 
 
-def _fitted_at(
+def fitted_at(
     data: Data, fitted: FittedModel, candidate: Candidate, made: FittedModel, ends: Sequence[Candidate], noise: Noise
 ) -> list[FittedModel]:
     """Return fits of a candidate that begin where climbs end; where some of the states spare time, of those ends only that explain as much as the
@@ -146,10 +146,10 @@ def _seeds_instead(data: Data, fitted: FittedModel, noise: Noise, seeds: Sequenc
 
 def without_last(fit: JointFit) -> JointFit:
     """Return a fit as it would be without its last effect if all were linear about where it is."""
-    return _without(fit, len(fit.hypothesis.terms) - 1)
+    return without_term(fit, len(fit.hypothesis.terms) - 1)
 
 
-def _without(fit: JointFit, i: int) -> JointFit:
+def without_term(fit: JointFit, i: int) -> JointFit:
     """Return a fit as it would be without one of its terms if all were linear about where it is."""
     terms = fit.hypothesis.terms
     at, q = sum(len(p) for _, _, p in terms[:i]), len(terms[i][2])
@@ -172,7 +172,7 @@ def may_lie_elsewhere(data: Data, fitted: FittedModel, name: str, noise: Noise) 
     own = {(p.key, p.part) for p in effect.parameters(data.robot, data.control)}
     parameters = tuple(p for p in moving if (p.key, p.part) in own)
     fields = effect_fields(fit, data.train, [(effect, s, parameters) for s in (*effect.seeds(data.robot), *around)])
-    seen = screen(_without(fit, i), problem_of(data, fit, noise), fields, 100.0)
+    seen = screen(without_term(fit, i), problem_of(data, fit, noise), fields, 100.0)
     here = next((c for c in seen if c.seed == seed), None)
     return here is None or max(c.gain for c in seen) > here.gain + data.thresholds.polished
 

@@ -105,7 +105,7 @@ def refit(
             free and share == 0.0 and fitted.fit.chi2 - best.fit.chi2 <= data.thresholds.poor_start * candidate.gain
         ):
             break
-    if directed and _has_drifted(data, fitted) and not explains(data, best):
+    if starts_declared(data, fitted, candidate, best):
         made = started_at(DECLARED)
         best = made if made is not None and (best is None or made.fit.chi2 <= best.fit.chi2) else best
     found = best or stopped_early
@@ -141,8 +141,11 @@ def _shares(candidate: Candidate, free: bool) -> tuple[float, ...]:
     return (0.0, 1.0, 0.3) if free else (1.0, 0.3, 0.0)
 
 
-def _has_drifted(data: Data, fitted: FittedModel) -> bool:
-    """Return whether calibration alone has gone far beyond what is known of it beforehand."""
+def starts_declared(data: Data, fitted: FittedModel, candidate: Candidate, best: FittedModel | None) -> bool:
+    """Return whether a refit starts from what is declared, too: an effect of known size, where calibration alone has gone far beyond what is known of it
+    beforehand, and the best fit so far leaves much."""
+    if known_length(candidate.parameters) is None or explains(data, best):
+        return False
     fit = fitted.fit
     known = np.isfinite(fit.prior.std)
     far = np.abs(fit.coordinates - fit.prior.mean)[known] > data.thresholds.drifted * fit.prior.std[known]

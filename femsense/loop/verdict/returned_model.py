@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -94,23 +95,53 @@ def has_effects(names: Iterable[str]) -> bool:
     return any(name not in NUISANCE for name in names)
 
 
+@dataclass(frozen=True, slots=True)
+class HeldOutComparison:
+    """A model beside the declared one, on held-out data."""
+
+    error: float
+    """Its error, in that of the declared model."""
+    gain: float
+    """By how much χ² falls."""
+    beyond_mesh: float
+    """Its error less the likeliest share of the discretisation error, in that of the declared model."""
+    error_to_base: float
+    """Its error, in that of the model with all that calibration may move."""
+    only_calibrated: bool
+    """Whether it has no effect but what calibration may move."""
+    with_offsets: bool = False
+    """Whether input offsets are among that."""
+
+    def holds(self, decides: Thresholds) -> bool:
+        """Return whether the model is no worse in millimetres; or else better by the noise that these data have, where it is calibrated only and
+        within reason, or where the mesh's own error is all that is larger: then it must be no worse beyond that, nor in millimetres than the model
+        with all that calibration may move, and not be input offsets alone, unless it is far better by the noise and within reason."""
+        if self.error <= decides.not_worse:
+            return True
+        if self.gain <= (decides.evidence if self.only_calibrated else 0.0):  # effects have been judged by held-out data before
+            return False
+        if self.only_calibrated and self.error <= decides.noisy:
+            return True
+        only_offsets = self.only_calibrated and self.with_offsets  # much else looks like them
+        shown = not only_offsets and self.error_to_base <= decides.not_worse
+        return self.beyond_mesh <= decides.not_worse and (
+            shown or (self.gain > decides.far_better and self.error <= decides.noisy)
+        )
+
+
 def holds_out(data: Data, search: Search, back: FittedModel) -> bool:
-    """Return whether a model is no worse on held-out data in millimetres; or else better by the noise that these data have, where it is calibrated
-    only and within reason, or where the mesh's own error is all that is larger: then it must be no worse beyond that, nor in millimetres than
-    the model with all that calibration may move, and not be input offsets alone, unless it is far better by the noise and within reason."""
-    worse, decides = back.held_rms / search.before.held_rms, data.thresholds
-    if worse <= decides.not_worse:
-        return True
-    only_calibrated = not has_effects(back.fit.hypothesis.names)
-    gain = held_chi2(data, search.before, search.noise) - held_chi2(data, back, search.noise)
-    if gain <= (decides.evidence if only_calibrated else 0.0):  # effects have been judged by held-out data before
-        return False
-    if only_calibrated and worse <= decides.noisy:
-        return True
+    """Return whether a model holds on held-out data beside the declared one."""
+    names = back.fit.hypothesis.names
     before, after = held_beyond_mesh(data, search, back)
-    only_offsets = only_calibrated and OFFSETS in back.fit.hypothesis.names  # much else looks like them
-    shown = not only_offsets and back.held_rms <= decides.not_worse * search.base.held_rms
-    return after <= decides.not_worse * before and (shown or (gain > decides.far_better and worse <= decides.noisy))
+    compared = HeldOutComparison(
+        error=back.held_rms / search.before.held_rms,
+        gain=held_chi2(data, search.before, search.noise) - held_chi2(data, back, search.noise),
+        beyond_mesh=after / before,
+        error_to_base=back.held_rms / search.base.held_rms,
+        only_calibrated=not has_effects(names),
+        with_offsets=OFFSETS in names,
+    )
+    return compared.holds(data.thresholds)
 
 
 def held_beyond_mesh(data: Data, search: Search, back: FittedModel) -> tuple[float, float]:

@@ -10,6 +10,7 @@ from arm import arm, record, sweeps
 
 from femsense.loop.data.outliers import outliers
 from femsense.loop.improve import improve
+from femsense.loop.thresholds import DEFAULTS
 from femsense.model.recording import Recording
 
 
@@ -22,10 +23,10 @@ def rows(frames: int = 30, markers: int = 10) -> tuple[np.ndarray, np.ndarray, n
 
 def test_a_marker_that_is_far_off_in_one_frame_is_a_stray():
     values, frame, marker = rows()
-    assert not outliers(values, frame, marker, 5e-3).any()
+    assert not outliers(values, frame, marker, 5e-3, DEFAULTS).any()
     values[57] += [0.0, 8e-3, 0.0]
-    assert np.flatnonzero(outliers(values, frame, marker, 5e-3)).tolist() == [57]
-    assert not outliers(values, frame, marker, 9e-3).any()
+    assert np.flatnonzero(outliers(values, frame, marker, 5e-3, DEFAULTS)).tolist() == [57]
+    assert not outliers(values, frame, marker, 9e-3, DEFAULTS).any()
 
 
 def test_two_markers_that_swap_their_names_are_outliers_and_neighbours_that_are_off_alike_are_not():
@@ -33,16 +34,16 @@ def test_two_markers_that_swap_their_names_are_outliers_and_neighbours_that_are_
     first, second = np.flatnonzero((frame == 9) & np.isin(marker, (2, 5)))
     values[first] += [0.0, 9e-3, 0.0]
     values[second] -= [0.0, 9e-3, 0.0]
-    assert np.flatnonzero(outliers(values, frame, marker, 5e-3)).tolist() == [first, second]
+    assert np.flatnonzero(outliers(values, frame, marker, 5e-3, DEFAULTS)).tolist() == [first, second]
     values[second] += [2e-3, 18e-3, 0.0]
-    assert not outliers(values, frame, marker, 5e-3).any()
+    assert not outliers(values, frame, marker, 5e-3, DEFAULTS).any()
 
 
 def test_a_marker_that_slips_or_a_frame_that_is_off_is_none():
     values, frame, marker = rows()
     values[(marker == 4) & (frame > 14)] += 9e-3
     values[frame == 7] += 20e-3
-    assert not outliers(values, frame, marker, 5e-3).any()
+    assert not outliers(values, frame, marker, 5e-3, DEFAULTS).any()
 
 
 @pytest.mark.parametrize("k", [2, -2])

@@ -32,8 +32,8 @@ from femsense.loop.design.advice import next_element
 from femsense.loop.fit.fitted_model import fit_model, own_of, rematched, with_nuisance
 from femsense.loop.fit.noise_components import Noise, whiten
 from femsense.loop.improve import ImproveOptions, improve
-from femsense.loop.search import calibration
-from femsense.loop.search.calibration import MATCHINGS, matched
+from femsense.loop.search.calibration import matched
+from femsense.loop.thresholds import EFFORT
 from femsense.model.camera import Camera
 from femsense.model.effects import find_effect
 from femsense.model.observation import Hypothesis, evaluate_scene
@@ -230,7 +230,7 @@ def test_a_place_that_the_models_own_fields_do_not_cover_is_no_row():
         assert np.abs(crossings.rounded).max() < ROUNDS * seen.sheets.radius
 
 
-def test_rows_are_made_again_until_the_fit_stays_where_it_is(rubbing: Recording, monkeypatch: pytest.MonkeyPatch):
+def test_rows_are_made_again_until_the_fit_stays_where_it_is(rubbing: Recording):
     noise, off = Noise({}, "", {"white": 1e-4}), np.array([0.02, -0.02, 0.02, 4e-3, -4e-3, 4e-3])
 
     def to_gain(rounds: int) -> float:
@@ -239,13 +239,13 @@ def test_rows_are_made_again_until_the_fit_stays_where_it_is(rubbing: Recording,
         nothing, own = np.zeros(len(prior.mean)), np.r_[off, np.zeros(data.train[0].size - 6)]
         start = fit_model(data, hypothesis, prior, noise, nothing, own=own, max_iterations=0)
         data = rematched(data, start, noise, anew=True)  # rows as they are found from there
-        monkeypatch.setattr(calibration, "MATCHINGS", rounds)
+        data = replace(data, effort=replace(EFFORT, matchings=rounds))
         found, fitted = matched(data, start, noise, anew=True)
         again = fit_model(rematched(found, fitted, noise), hypothesis, prior, noise, fitted.fit.coordinates, own=own_of(fitted))
         return again.fit.fit.cost[0] - again.fit.chi2
 
     assert to_gain(1) > 50.0  # 99 on one machine
-    assert to_gain(MATCHINGS) < 20.0  # 0 there; a row more or less is worth about ten
+    assert to_gain(EFFORT.matchings) < 20.0  # 0 there; a row more or less is worth about ten
 
 
 def test_rows_hardly_change_when_they_are_made_anew_elsewhere(both: Data):

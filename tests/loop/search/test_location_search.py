@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -11,27 +10,25 @@ import pytest
 from arm import arm, record, sweeps
 
 from femsense.core.least_squares import STOPPED_EARLY
-from femsense.fem.linalg import factorization
 from femsense.loop.data.dataset import Data, prepare
 from femsense.loop.data.representative_states import FEWEST, spread_states
-from femsense.loop.data.trial import Trial, rms_of
+from femsense.loop.data.trial import rms_of
 from femsense.loop.fit.discretisation_error import with_mesh_errors
-from femsense.loop.fit.fitted_model import FittedModel, fit_model, own_of, problem_of, with_nuisance
+from femsense.loop.fit.fitted_model import FittedModel, fit_model, held_chi2, own_of, problem_of, with_nuisance
 from femsense.loop.fit.joint_fit import Prior
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.result.records import NAMED, RefitRecord
-from femsense.loop.search import acceptance, forward_selection, location_search, pruning, subsampling
-from femsense.loop.search import effect_fields as effect_fields_module
-from femsense.loop.search import refit as refits
-from femsense.loop.search.effect_fields import effect_fields, fields_of
-from femsense.loop.search.forward_selection import _settled, polished
-from femsense.loop.search.location_search import climbed, closer, located, may_lie_elsewhere
+from femsense.loop.search.acceptance import acceptance_test
+from femsense.loop.search.effect_fields import effect_fields, fields_of, part_that_tells
+from femsense.loop.search.forward_selection import has_settled, leaders, polished, select_next, shortlist
+from femsense.loop.search.location_search import climbed, closer, fitted_at, located, may_lie_elsewhere, same_place, without_term
 from femsense.loop.search.pruning import prune
-from femsense.loop.search.refit import EVIDENCE, evidence, refit
+from femsense.loop.search.refit import evidence, refit, refit_from
 from femsense.loop.search.screening import Candidate, screen, screen_model
 from femsense.loop.search.search_state import Refit
 from femsense.loop.search.subsampling import RepresentativeCases, representative_cases
 from femsense.loop.search.swaps import swapped
+from femsense.loop.thresholds import DEFAULTS, EFFORT
 from femsense.model.effects import apply_effects, find_effect
 from femsense.model.observation import Hypothesis
 
@@ -64,11 +61,16 @@ def off(candidate: Candidate) -> float:
 
 
 @pytest.fixture
-def some(started: tuple[Data, FittedModel], monkeypatch: pytest.MonkeyPatch) -> RepresentativeCases:
-    """Some of the states, as if all of them were too much work, of data with an error of the mesh."""
+def toilsome(started: tuple[Data, FittedModel]) -> tuple[Data, FittedModel]:
+    """The same, as if all states were too much work."""
     data, fitted = started
-    tets = len(fitted.fit.hypothesis.robot.body.mesh.tets)
-    monkeypatch.setattr(subsampling, "MOST_WORK", FEWEST * tets)
+    return replace(data, effort=replace(EFFORT, work=FEWEST * len(data.robot.body.mesh.tets))), fitted
+
+
+@pytest.fixture
+def some(toilsome: tuple[Data, FittedModel]) -> RepresentativeCases:
+    """Some of the states, of data with an error of the mesh."""
+    data, fitted = toilsome
     return representative_cases(with_mesh_errors(data, fitted, []), fitted, NOISE)
 
 
@@ -101,79 +103,56 @@ def test_a_candidate_is_the_same_to_some_states(started: tuple[Data, FittedModel
     assert some.candidate(replace(rubbing, step=np.array([0.1])), NOISE) is None  # its states need those before
 
 
+IN_SOME = "stopped early: in some of the states"
+
+
 def searched(
-    started: tuple[Data, FittedModel], monkeypatch: pytest.MonkeyPatch, *names: str, alike: bool = False
-) -> tuple[list[tuple[str, bool]], list[RefitRecord]]:
-    """Return what growth has refitted of a shortlist, whose scores may be alike, each with whether to all states, and its records."""
+    started: tuple[Data, FittedModel], *names: str, alike: bool = False, each: int = 1
+) -> tuple[list[str], list[RefitRecord]]:
+    """Return what growth says that it refits of a shortlist, whose scores may be alike, and its records; what is left explains the data."""
     data, fitted = started
+    data = replace(data, thresholds=replace(DEFAULTS, explains=np.inf, far_behind=0.0, promising=-1e9, refittable=0.0))
     table = screen_model(data, fitted.fit, NOISE, fields_of(data, fitted, names), COUNT)
-    refitted = list[tuple[str, bool]]()
-
-    def counted(
-        own: Data, before: FittedModel, candidate: Candidate, noise: Noise, wanted: float = 0.0, **named: Any
-    ) -> FittedModel:
-        refitted.append((candidate.effect.name, before is fitted))
-        return refit(own, before, candidate, noise, wanted=wanted, **named)
-
-    monkeypatch.setattr(forward_selection, "refit", counted)
-    monkeypatch.setattr(forward_selection, "tried", counted)
-    monkeypatch.setattr(forward_selection, "explains", lambda fitted: True)
-    listed = [next(c for c in table if c.effect.name == n) for n in names]
-    monkeypatch.setattr(
-        forward_selection, "shortlist", lambda table, first: [replace(c, score=100.0) if alike else c for c in listed]
-    )
-    monkeypatch.setattr(forward_selection, "_bar", lambda ahead, candidate: -np.inf)
-    winner, _, records = forward_selection.select_next(data, fitted, table, NOISE, lambda text: None)
-    assert winner is not None and winner.candidate.effect.name == "payload" and ("payload", True) in refitted
-    return refitted, records
+    listed = [c for n in names for c in [c for c in table if c.effect.name == n][: each if n == "payload" else 1]]
+    said = list[str]()
+    winner, _, records = select_next(data, fitted, [replace(c, score=100.0) if alike else c for c in listed], NOISE, said.append)
+    assert winner is not None and winner.candidate.effect.name == "payload" and "refitting with payload" in said
+    return [text for text in said if text.startswith("refitting")], records
 
 
-@pytest.mark.usefixtures("some")
-def test_rivals_that_stay_far_behind_in_some_states_are_not_fitted_to_all(
-    started: tuple[Data, FittedModel], monkeypatch: pytest.MonkeyPatch
-):
-    fitted, records = searched(started, monkeypatch, "payload", "cable_gain", "poisson")
-    assert [f for f in fitted if f[0] != "payload"] == [("cable_gain", False), ("poisson", False)]
-    assert all(r.verdict.startswith("stopped early: in some of the states") for r in records[1:])
+def test_rivals_that_stay_far_behind_in_some_states_are_not_fitted_to_all(toilsome: tuple[Data, FittedModel]):
+    _, records = searched(toilsome, "payload", "cable_gain", "poisson")
+    assert [r.name for r in records] == ["payload", "cable_gain", "poisson"]
+    assert all(r.verdict.startswith(IN_SOME) for r in records[1:])
 
 
-@pytest.mark.usefixtures("some")
 def test_what_promises_as_much_is_fitted_to_all_states_in_the_order_of_what_it_explains_in_some(
-    started: tuple[Data, FittedModel], monkeypatch: pytest.MonkeyPatch
+    toilsome: tuple[Data, FittedModel],
 ):
-    fitted, records = searched(started, monkeypatch, "cable_gain", "payload", alike=True)
-    assert fitted[:3] == [("cable_gain", False), ("payload", False), ("payload", True)]
-    assert ("cable_gain", True) not in fitted
-    assert [r.name for r in records] == ["payload", "cable_gain"] and records[1].verdict.startswith("stopped early: in some")
+    said, records = searched(toilsome, "cable_gain", "payload", alike=True)
+    assert said[:3] == [
+        "refitting with cable_gain in some states",
+        "refitting with payload in some states",
+        "refitting with payload",
+    ]
+    assert [r.name for r in records] == ["payload", "cable_gain"] and records[1].verdict.startswith(IN_SOME)
 
 
-def test_rivals_are_fitted_to_all_states_where_these_are_little_work(
-    started: tuple[Data, FittedModel], monkeypatch: pytest.MonkeyPatch
-):
-    fitted, records = searched(started, monkeypatch, "payload", "cable_gain", "poisson")
-    assert [f for f in fitted if f[0] != "payload"] == [("cable_gain", True), ("poisson", True)]
+def test_rivals_are_fitted_to_all_states_where_these_are_little_work(started: tuple[Data, FittedModel]):
+    said, records = searched(started, "payload", "cable_gain", "poisson")
+    assert said == [f"refitting with {name}" for name in ("payload", "cable_gain", "poisson")]
     assert not any("some of the states" in r.verdict for r in records)
 
 
-def test_another_form_of_an_effect_is_held_against_other_effects_alone(
-    started: tuple[Data, FittedModel], monkeypatch: pytest.MonkeyPatch
-):
+def test_another_form_of_an_effect_is_held_against_other_effects_alone(started: tuple[Data, FittedModel]):
     data, fitted = started
+    data = replace(data, thresholds=replace(DEFAULTS, explains=np.inf, far_behind=0.0, promising=-1e9, refittable=0.0))
     table = screen_model(data, fitted.fit, NOISE, fields_of(data, fitted, ["payload", "cable_gain"]), COUNT)
-    listed = [*[c for c in table if c.effect.name == "payload"][:2], next(c for c in table if c.effect.name == "cable_gain")]
-    asked = list[float]()
-
-    def counted(
-        own: Data, before: FittedModel, candidate: Candidate, noise: Noise, wanted: float = 0.0, **named: Any
-    ) -> FittedModel:
-        asked.append(wanted)
-        return refit(own, before, candidate, noise, wanted=wanted, **named)
-
-    for name, value in (("refit", counted), ("explains", lambda fitted: True), ("shortlist", lambda table, first: listed)):
-        monkeypatch.setattr(forward_selection, name, value)
-    monkeypatch.setattr(forward_selection, "_bar", lambda ahead, candidate: -np.inf)
-    forward_selection.select_next(data, fitted, table, NOISE, lambda text: None)
-    assert asked[:2] == [forward_selection.EVIDENCE] * 2 and asked[2] > 3 * forward_selection.EVIDENCE
+    one, gain = (next(c for c in table if c.effect.name == name) for name in ("payload", "cable_gain"))
+    forms = [replace(one, score=100.0), replace(one, effect=replace(one.effect), score=100.0), replace(gain, score=50.0)]
+    _, _, records = select_next(data, fitted, forms, NOISE, lambda text: None)
+    assert [r.name for r in records] == ["payload", "payload", "cable_gain"]
+    assert "stopped early" not in records[1].verdict and records[2].verdict.startswith("stopped early")
 
 
 def test_some_states_are_spread_and_never_too_few(started: tuple[Data, FittedModel]):
@@ -190,7 +169,7 @@ def test_some_states_are_spread_and_never_too_few(started: tuple[Data, FittedMod
         np.testing.assert_allclose(inputs[cases].max(axis=0), inputs[frames].max(axis=0))
 
 
-def test_fields_are_those_of_the_fit_whatever_was_solved_last(started: tuple[Data, FittedModel], monkeypatch: pytest.MonkeyPatch):
+def test_fields_are_those_of_the_fit_whatever_was_solved_last(started: tuple[Data, FittedModel]):
     data, fitted = started
     fit = fitted.fit
     fitted = fit_model(data, fit.hypothesis, fit.prior, NOISE, fit.coordinates, own=own_of(fitted))  # not of a rough step
@@ -202,115 +181,83 @@ def test_fields_are_those_of_the_fit_whatever_was_solved_last(started: tuple[Dat
     fit_model(data, elsewhere, Prior(np.zeros(0), np.zeros(0)), NOISE, np.zeros(0), own=own_of(fitted))
     states = trial.starts_on(robot.body.mesh)
     assert any(not np.array_equal(states[k].positions, s.positions) for k, s in fitted.fit.jets[0].states.items())
-    factors, plain = list[int](), factorization.cholesky
-    monkeypatch.setattr(factorization, "cholesky", lambda *given, **named: (factors.append(1), plain(*given, **named))[1])
     found = effect_fields(fitted.fit, data.train, [one]).raw[0]
     np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(expected).max())
-    distinct = {s.positions.tobytes() for s in fitted.fit.jets[0].states.values()}
-    assert len(factors) < 1.5 * len(distinct)  # one for the derivatives of each state, hardly any to find it
 
 
-def test_a_few_states_lead_to_the_place_and_alike_places_are_fitted_once(
-    started: tuple[Data, FittedModel], monkeypatch: pytest.MonkeyPatch
-):
+def test_a_few_states_lead_to_the_place_and_alike_places_are_fitted_once(started: tuple[Data, FittedModel]):
     data, fitted = started
     far = max(payloads(data, fitted)[:6], key=off)
     begun = refit(data, fitted, far, NOISE)
-    refitted = list[Candidate]()
-
-    def counted(own: Data, before: FittedModel, candidate: Candidate, noise: Noise, **named: Any) -> FittedModel | None:
-        refitted.extend([candidate] if before is fitted else [])
-        return refit(own, before, candidate, noise, **named)
-
-    monkeypatch.setattr(location_search, "tried", counted)
     best, _ = located(data, fitted, far, begun, climbed(data, fitted, far, NOISE), NOISE)
     where = best.fit.hypothesis.terms[-1][1]["point_m"]
     assert off(far) > 0.012 and np.linalg.norm(np.subtract(where, HIDDEN[0]["point_m"])) < 0.004
-    monkeypatch.setattr(location_search, "ROUNDS", 0)  # climbs end where they begin
-    for alike, count in ((False, 2), (True, 1)):
-        refitted.clear()
-        monkeypatch.setattr(location_search, "_alike", lambda one, other, alike=alike: alike)
-        located(data, fitted, far, begun, climbed(data, fitted, far, NOISE), NOISE)
-        assert len(refitted) == count
+    still = replace(data, effort=replace(EFFORT, rounds=0))  # climbs end where they begin
+    for same_field, same_step, count in ((2.0, 0.0, 2), (-1.0, np.inf, 1)):
+        own = replace(still, thresholds=replace(DEFAULTS, same_field=same_field, same_step=same_step))
+        climbs = climbed(own, fitted, far, NOISE)
+        assert len(climbs.ends) == count and len(fitted_at(own, fitted, far, begun, climbs.ends, NOISE)) <= count
 
 
-def test_a_refit_begins_where_one_to_some_of_the_states_ended(
-    started: tuple[Data, FittedModel], some: RepresentativeCases, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_refit_begins_where_one_to_some_of_the_states_ended(started: tuple[Data, FittedModel], some: RepresentativeCases):
     data, fitted = started
     one = payloads(data, fitted)[0]
     own = some.candidate(one, NOISE)
     assert own is not None
-    near, plain, starts = refit(some.data, some.fitted, own, NOISE), refit(data, fitted, one, NOISE), list[np.ndarray]()
-
-    def seen(
-        data: Data, hypothesis: Hypothesis, prior: Prior, noise: Noise, coordinates: np.ndarray, **given: Any
-    ) -> FittedModel:
-        starts.append(coordinates)
-        return fit_model(data, hypothesis, prior, noise, coordinates, **given)
-
-    monkeypatch.setattr(refits, "fit_model", seen)
+    near, plain = refit(some.data, some.fitted, own, NOISE), refit(data, fitted, one, NOISE)
     made = refit(data, fitted, one, NOISE, begin=near.fit)
-    assert len(starts) == 1 and np.array_equal(starts[0], near.fit.coordinates)
+    hypothesis, prior = near.fit.hypothesis, near.fit.prior
+    there = fit_model(data, hypothesis, prior, NOISE, near.fit.coordinates, own=own_of(near), max_iterations=0)
+    assert made.fit.fit.cost[0] == pytest.approx(there.fit.chi2, rel=0.01)
+    assert made.fit.fit.cost[0] < 0.5 * plain.fit.fit.cost[0]
     assert made.fit.chi2 == pytest.approx(plain.fit.chi2, abs=1.0)
 
 
-def test_a_fit_to_all_states_starts_from_those_of_the_fit_to_some(
-    started: tuple[Data, FittedModel], some: RepresentativeCases, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_fit_to_all_states_starts_from_those_of_the_fit_to_some(started: tuple[Data, FittedModel], some: RepresentativeCases):
     data, fitted = started
     one = payloads(data, fitted)[0]
     own = some.candidate(one, NOISE)
     assert own is not None
     near = refit(some.data, some.fitted, own, NOISE).fit
     refit(data, fitted, one, NOISE)  # what else was tried has left its states since then
-    begun = list[bool]()
-
-    def seen(given: Data, hypothesis: Hypothesis, *_: Any, **__: Any) -> FittedModel:
-        starts = given.train[0].starts_on(hypothesis.robot.body.mesh)
-        begun.extend(starts[k] is state for k, state in near.jets[0].states.items())
-        return fitted
-
-    monkeypatch.setattr(refits, "fit_model", seen)
-    refits.refit_from(data, fitted, near, NOISE)
-    assert begun and all(begun)
+    theta = np.array(near.fit.theta)
+    theta[near.own] = np.log(1e-3)  # a modulus with which nothing stands: it ends where it began
+    fallen = replace(near, fit=replace(near.fit, theta=theta))
+    assert refit_from(data, fitted, fallen, NOISE) is None
+    starts = data.train[0].starts_on(near.hypothesis.robot.body.mesh)
+    assert near.jets[0].states and all(starts[k].positions is s.positions for k, s in near.jets[0].states.items())
 
 
-def test_a_rival_that_its_place_brings_ahead_goes_there_before_one_is_named(
-    started: tuple[Data, FittedModel], monkeypatch: pytest.MonkeyPatch
-):
+def test_a_rival_that_its_place_brings_ahead_goes_there_before_one_is_named(started: tuple[Data, FittedModel]):
     data, fitted = started
     far = max(payloads(data, fitted)[:6], key=off)
-    rival = forward_selection.acceptance_test(data, fitted, far, refit(data, fitted, far, NOISE), RECORD, NOISE)
+    rival = acceptance_test(data, fitted, far, refit(data, fitted, far, NOISE), RECORD, NOISE)
     there = polished(data, fitted, rival, NOISE, lambda text: None)
     gains = screen_model(data, fitted.fit, NOISE, fields_of(data, fitted, ["cable_gain"]), COUNT)
-    other = forward_selection.acceptance_test(data, fitted, gains[0], refit(data, fitted, gains[0], NOISE), RECORD, NOISE)
-    monkeypatch.setattr(forward_selection, "WITHIN_REACH", rival.score / there.score / 2.0)
+    other = acceptance_test(data, fitted, gains[0], refit(data, fitted, gains[0], NOISE), RECORD, NOISE)
 
-    def leaders(lead: float) -> list[Refit]:
+    def ahead(lead: float, within_reach: float) -> list[Refit]:
         """Of both, the other one ahead of the rival by this share of what the rival gains where it is."""
         first = replace(other, score=rival.score + lead * (there.score - rival.score))
-        assert first.score - EVIDENCE > rival.score
-        leading, _ = forward_selection.leaders(data, fitted, {0: first, 1: rival}, NOISE, lambda text: None)
+        assert first.score - DEFAULTS.evidence > rival.score
+        own = replace(data, thresholds=replace(DEFAULTS, within_reach=within_reach))
+        leading, _ = leaders(own, fitted, {0: first, 1: rival}, NOISE, lambda text: None)
         return [leading[i] for i in leading if i > 0]
 
-    (moved,) = leaders(0.2)
+    reach = rival.score / there.score / 2.0
+    (moved,) = ahead(0.2, reach)
     assert moved.candidate.effect.name == "payload" and moved.score == pytest.approx(there.score)
-    monkeypatch.setattr(
-        forward_selection, "polished", lambda data, fitted, refitted, noise, say: there if refitted.climbs else refitted
-    )
-    monkeypatch.setattr(forward_selection, "_in_sight", lambda refitted: np.inf)
-    assert leaders(0.9) and not leaders(1.2)  # it keeps less than it promised
-    assert not leaders(4.0)  # out of reach
+    assert not ahead(1.2, reach)  # it keeps less than that
+    assert not ahead(4.0, reach) and not ahead(0.2, np.inf)  # out of reach
 
 
 def test_places_are_alike_if_they_do_the_same_for_the_same(started: tuple[Data, FittedModel]):
     data, fitted = started
     one = payloads(data, fitted)[0]
     other = replace(one, step=-one.step)
-    assert location_search._alike(one, replace(one, step=1.05 * one.step)) and not location_search._alike(one, other)
+    assert same_place(one, replace(one, step=1.05 * one.step), DEFAULTS) and not same_place(one, other, DEFAULTS)
     across = replace(one, columns=np.roll(one.columns, 7, axis=0))
-    assert not location_search._alike(one, across)
+    assert not same_place(one, across, DEFAULTS)
 
 
 def test_an_effect_in_its_place_is_not_sought_elsewhere_and_one_that_is_not_is():
@@ -344,20 +291,18 @@ def test_a_refit_with_nowhere_to_go_is_given_up_where_a_rival_explains_more(star
         rival = refit(data, fitted, one, NOISE, wanted=1.1 * score, settled=settled)
         assert (rival.fit.fit.status == STOPPED_EARLY) == settled
     ahead = [Refit(one, made, 0.0, 0.0, RECORD)]
-    assert [_settled(data, first[name], ahead) for name in first] == [True, False, False]
-    assert not _settled(data, first["cable_gain"], [])
+    assert [has_settled(data, first[name], ahead) for name in first] == [True, False, False]
+    assert not has_settled(data, first["cable_gain"], [])
 
 
 @pytest.mark.parametrize("needless", [True, False])
-def test_a_place_moves_on_where_what_it_was_found_beside_is_dropped(
-    started: tuple[Data, FittedModel], monkeypatch: pytest.MonkeyPatch, needless: bool
-):
+def test_a_place_moves_on_where_what_it_was_found_beside_is_dropped(started: tuple[Data, FittedModel], needless: bool):
     data, fitted = started
+    data = replace(data, thresholds=replace(DEFAULTS, needless=1e9 if needless else -1e9))
     gains = screen_model(data, fitted.fit, NOISE, fields_of(data, fitted, ["cable_gain"]), COUNT)
     beside = refit(data, fitted, gains[0], NOISE)
     far = max((c for c in payloads(data, beside)[:6] if off(c) > 0.012), key=off)
     both = refit(data, beside, far, NOISE)
-    monkeypatch.setattr(pruning, "evidence", lambda before, after: -1.0 if needless else 1e6)
     left = prune(data, both, NOISE, COUNT, lambda text: None)
     if not needless:
         assert left is both
@@ -370,7 +315,7 @@ def test_a_term_taken_out_leaves_the_others_where_they_are(started: tuple[Data, 
     data, fitted = started
     one = payloads(data, fitted)[0]
     made = refit(data, fitted, one, NOISE)
-    less = location_search._without(made.fit, 0)
+    less = without_term(made.fit, 0)
     _, _, parameters = made.fit.hypothesis.terms[0]
     kept = [n for n in made.fit.hypothesis.names if n != made.fit.hypothesis.terms[0][0].name]
     assert list(less.hypothesis.names) == kept
@@ -384,67 +329,43 @@ def test_a_term_taken_out_leaves_the_others_where_they_are(started: tuple[Data, 
     )
 
 
-@pytest.mark.usefixtures("some")
-def test_where_a_climb_ends_a_fit_to_all_states_is_made_if_some_of_them_are_for_it(
-    started: tuple[Data, FittedModel], monkeypatch: pytest.MonkeyPatch
-):
-    data, fitted = started
+def test_where_a_climb_ends_a_fit_to_all_states_is_made_if_some_of_them_are_for_it(toilsome: tuple[Data, FittedModel]):
+    data, fitted = toilsome
     far = max(payloads(data, fitted)[:6], key=off)
     begun, climbs = refit(data, fitted, far, NOISE), climbed(data, fitted, far, NOISE)
     best, _ = located(data, fitted, far, begun, climbs, NOISE)
     assert np.linalg.norm(np.subtract(best.fit.hypothesis.terms[-1][1]["point_m"], HIDDEN[0]["point_m"])) < 0.004
     assert len(best.fit.fit.residual) == len(begun.fit.fit.residual)
-    whole = list[np.ndarray]()
-    monkeypatch.setattr(location_search, "refit_from", lambda data, fitted, fit, noise: whole.append(fit.coordinates))
-    there = location_search._fitted_at(data, fitted, far, begun, climbs.ends, NOISE)
-    assert whole and not there
-    whole.clear()
+    there = fitted_at(data, fitted, far, begun, climbs.ends, NOISE)
+    assert there and all(len(one.fit.fit.residual) == len(begun.fit.fit.residual) for one in there)
     own = representative_cases(data, fitted, NOISE).candidate(far, NOISE)
-    assert own is not None and not location_search._fitted_at(
-        data, fitted, far, best, [own], NOISE
-    )  # what was made explains more by far
-    assert not whole
+    assert own is not None and not fitted_at(data, fitted, far, best, [own], NOISE)  # what was made explains more by far
 
 
-def test_a_place_moves_on_as_some_of_the_states_have_it(
-    started: tuple[Data, FittedModel], some: RepresentativeCases, monkeypatch: pytest.MonkeyPatch
-):
-    data, fitted = started
+def test_a_place_moves_on_as_some_of_the_states_have_it(toilsome: tuple[Data, FittedModel]):
+    data, fitted = toilsome
     made = refit(data, fitted, payloads(data, fitted)[0], NOISE)
-    asked, plain = list[tuple[int, bool]](), location_search._seeds_instead
-
-    def ask(own: Data, at: FittedModel, noise: Noise, seeds: Sequence[dict[str, Any]]) -> list[Candidate]:
-        asked.append((len(seeds), len(at.fit.fit.residual) < len(made.fit.fit.residual)))
-        return plain(own, at, noise, seeds)
-
-    monkeypatch.setattr(location_search, "_seeds_instead", ask)
     moved, scatter = closer(data, made, NOISE)
-    assert all(cases == (count > 1) for count, cases in asked) and {count > 1 for count, _ in asked} == {True, False}
     begun, end = (np.array(m.fit.hypothesis.terms[-1][1]["point_m"]) for m in (made, moved))
     assert np.linalg.norm(end - HIDDEN[0]["point_m"]) < 0.6 * np.linalg.norm(begun - HIDDEN[0]["point_m"])
     assert moved.fit.chi2 < 0.75 * made.fit.chi2 and len(moved.fit.fit.residual) == len(made.fit.fit.residual)
     assert len(scatter) == 3 and all(0.0 < s < 0.3 for s in scatter)
 
 
-def test_another_law_is_told_by_some_of_the_states(started: tuple[Data, FittedModel], monkeypatch: pytest.MonkeyPatch):
+def test_another_law_is_told_by_some_of_the_states(started: tuple[Data, FittedModel]):
     data, fitted = started
     law = next(f for f in data.forms if f.name == "hyperelastic" and f.discrete)
     seed = law.seeds(data.robot)[0]
-    todo, asked, part = [(law, seed, law.parameters(data.robot, data.control))], list[int](), Trial.part
-
-    def change() -> np.ndarray:
-        return effect_fields(fitted.fit, data.train, todo).raw[0][:, :, 0]
-
-    whole, tets = change(), len(data.robot.body.mesh.tets)
-    monkeypatch.setattr(effect_fields_module, "MOST_WORK", FEWEST * tets)
-    monkeypatch.setattr(Trial, "part", lambda trial, frames: (asked.append(len(frames)), part(trial, frames))[1])
-    between = change()
-    assert asked and asked[0] < 0.6 * len(data.train[0].scene.frames)
+    todo = [(law, seed, law.parameters(data.robot, data.control))]
+    less = replace(EFFORT, work=FEWEST * len(data.robot.body.mesh.tets))
+    whole, between = (effect_fields(fitted.fit, data.train, todo, effort=e).raw[0][:, :, 0] for e in (EFFORT, less))
+    part = part_that_tells(data.train[0], data.robot, less)
+    assert len(part.scene.frames) < 0.6 * len(data.train[0].scene.frames)
     assert 0.0 < rms_of([between - whole]) < 0.25 * rms_of([whole])
     exact = np.isin(data.train[0].scene.frame, spread_states(data.train[0], FEWEST)[0])
     assert rms_of([(between - whole)[exact]]) < 0.02 * rms_of([whole])
     rubbing = apply_effects(data.robot, [{"name": "cable_friction", "coefficient": 0.2}])
-    assert effect_fields_module._part_that_tells(data.train[0], rubbing) is data.train[0]  # states there need those before
+    assert part_that_tells(data.train[0], rubbing, less) is data.train[0]  # states there need those before
 
 
 def test_what_promises_as_much_is_refitted_in_the_order_of_its_cost(started: tuple[Data, FittedModel]):
@@ -454,7 +375,7 @@ def test_what_promises_as_much_is_refitted_in_the_order_of_its_cost(started: tup
     for share, names in ((0.96, ["cable_gain", "payload"]), (0.94, ["payload", "cable_gain"])):
         second = replace(gain, score=share * one.score, retained=1.0)
         assert second.cost < one.cost
-        assert [c.effect.name for c in forward_selection.shortlist([one, second], first=True)] == names
+        assert [c.effect.name for c in shortlist([one, second], DEFAULTS, EFFORT, first=True)] == names
 
 
 def test_what_calibration_imitates_is_refitted_only_if_it_promises_more_than_all_others(started: tuple[Data, FittedModel]):
@@ -463,18 +384,16 @@ def test_what_calibration_imitates_is_refitted_only_if_it_promises_more_than_all
     gain = screen_model(data, fitted.fit, NOISE, fields_of(data, fitted, ["cable_gain"]), COUNT)[0]
     for share, names in ((1.1, {"cable_gain", "payload"}), (0.9, {"payload"})):
         second = replace(gain, score=share * one.score, retained=0.01)
-        assert {c.effect.name for c in forward_selection.shortlist([one, second], first=True)} == names
+        assert {c.effect.name for c in shortlist([one, second], DEFAULTS, EFFORT, first=True)} == names
 
 
 @pytest.mark.parametrize(("score", "passes"), [(16.0, True), (14.0, False)])
-def test_held_out_data_that_speak_against_an_effect_count(
-    started: tuple[Data, FittedModel], monkeypatch: pytest.MonkeyPatch, score: float, passes: bool
-):
+def test_held_out_data_that_speak_against_an_effect_count(started: tuple[Data, FittedModel], score: float, passes: bool):
     data, fitted = started
     one = payloads(data, fitted)[0]
     made = refit(data, fitted, one, NOISE)
     expensive = replace(one, cost=evidence(fitted.fit, made.fit) - score)
-    monkeypatch.setattr(acceptance, "held_shift", lambda *given: 6.25)  # it acts little there, so that chance may have it
-    monkeypatch.setattr(acceptance, "held_chi2", lambda data, at, noise: 5.0 * (at is made))
-    verdict = forward_selection.acceptance_test(data, fitted, expensive, made, RECORD, NOISE).record.verdict
+    better = held_chi2(data, fitted, NOISE) - held_chi2(data, made, NOISE)
+    against = replace(data, thresholds=replace(DEFAULTS, held_counts=-5.0 / better))  # as if χ² rose by 5
+    verdict = acceptance_test(against, fitted, expensive, made, RECORD, NOISE).record.verdict
     assert verdict == "passes" if passes else "held-out data speak against it" in verdict

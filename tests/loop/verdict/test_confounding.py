@@ -9,6 +9,7 @@ import pytest
 from femsense.loop.result.records import ConfoundedPair, RefitRecord
 from femsense.loop.result.tables import table_of
 from femsense.loop.search.search_state import Search
+from femsense.loop.thresholds import DEFAULTS
 from femsense.loop.verdict.confounding import confounded, in_words
 from femsense.model.effects import find_effect
 
@@ -40,7 +41,7 @@ def searched(refits: list[RefitRecord], first: list[SimpleNamespace] | None = No
 def test_a_rival_with_nearly_as_much_evidence_is_said_once_with_all_that_is_known_of_it() -> None:
     refits = [refit("cable_friction", 30.0, "named"), refit("cable_gain", 27.0), refit("cable_gain", 24.0), refit("creep", 19.0)]
     fields = [candidate("cable_friction", 1, 1, 0), candidate("cable_gain", 1, 1, 0.1), candidate("geometry", 0, 0, 1)]
-    pairs = confounded(searched(refits, fields), ["cable_friction"])
+    pairs = confounded(searched(refits, fields), ["cable_friction"], DEFAULTS)
     (pair,) = pairs
     assert table_of(pair) == {
         "pair": ["cable_friction", "cable_gain"],
@@ -55,26 +56,30 @@ def test_pairs_of_what_is_named_come_first_and_only_these_are_said() -> None:
         candidate(name, *f)
         for name, f in {"gravity": (1, 0, 0), "payload": (1, 0.1, 0), "creep": (0, 0, 1), "cable_gain": (0, 0.1, 1)}.items()
     ]
-    pairs = confounded(searched([refit("creep", 30.0, "named")], fields), ["creep"])
+    pairs = confounded(searched([refit("creep", 30.0, "named")], fields), ["creep"], DEFAULTS)
     assert [p.pair for p in pairs] == [("creep", "cable_gain"), ("gravity", "payload")]
     assert in_words(pairs, ["creep"]) == ""  # fields alone: no refit says so
 
 
 def test_an_effect_that_makes_the_modulus_needless_is_its_rival_unless_another_one_is_far_ahead() -> None:
     payload = refit("payload", 40.0, takes_over=("stiffness",))
-    assert table_of(confounded(searched([payload]), ["stiffness"])) == [{"pair": ["stiffness", "payload"], "dbic_gap": 0.0}]
+    assert table_of(confounded(searched([payload]), ["stiffness"], DEFAULTS)) == [
+        {"pair": ["stiffness", "payload"], "dbic_gap": 0.0}
+    ]
     near = [refit("gravity", 45.0, "named"), payload]
-    assert {"pair": ["stiffness", "payload"], "dbic_gap": 5.0} in table_of(confounded(searched(near), ["stiffness", "gravity"]))
+    assert {"pair": ["stiffness", "payload"], "dbic_gap": 5.0} in table_of(
+        confounded(searched(near), ["stiffness", "gravity"], DEFAULTS)
+    )
     far = [refit("gravity", 90.0, "named"), payload]
-    assert confounded(searched(far), ["stiffness", "gravity"]) == []
+    assert confounded(searched(far), ["stiffness", "gravity"], DEFAULTS) == []
 
 
 def test_fields_that_agree_are_no_rivals_where_a_refit_tells_them_apart() -> None:
     fields = [candidate("cable_friction", 1, 1, 0), candidate("creep", 1, 1, 0.1)]
     for dbic, alike in ((60.0, True), (40.0, False)):
         refits = [refit("cable_friction", 100.0, "named"), refit("creep", dbic, "too little")]
-        assert bool(confounded(searched(refits, fields), ["cable_friction"])) == alike
-        assert bool(confounded(searched(refits[:1], fields), ["cable_friction"]))
+        assert bool(confounded(searched(refits, fields), ["cable_friction"], DEFAULTS)) == alike
+        assert bool(confounded(searched(refits[:1], fields), ["cable_friction"], DEFAULTS))
 
 
 @pytest.mark.parametrize(
@@ -83,26 +88,26 @@ def test_fields_that_agree_are_no_rivals_where_a_refit_tells_them_apart() -> Non
 def test_a_refit_that_was_given_up_before_it_had_a_dbic_refutes_nothing(verdict: str) -> None:
     fields = [candidate("cable_friction", 1, 1, 0), candidate("creep", 1, 1, 0.1)]
     early = RefitRecord("creep", {}, verdict, step=1)
-    (pair,) = confounded(searched([refit("cable_friction", 100.0, "named"), early], fields), ["cable_friction"])
+    (pair,) = confounded(searched([refit("cable_friction", 100.0, "named"), early], fields), ["cable_friction"], DEFAULTS)
     assert pair.pair == ("cable_friction", "creep")
 
 
 def test_a_mesh_without_which_nothing_converges_is_confounded_with_nothing() -> None:
     alone = RefitRecord("discretisation", {}, "named", step=1)
-    assert confounded(searched([alone, refit("creep", 20.0)]), ["discretisation"]) == []
+    assert confounded(searched([alone, refit("creep", 20.0)]), ["discretisation"], DEFAULTS) == []
 
 
 def test_fields_that_agree_are_distinguished_by_a_sign() -> None:
     fields = [candidate("gravity", 1, 1, 0), candidate("creep", 1, 1, 0.1)]
     for gain, alike in ((6.0, True), (4.0, False)):
         fields[1].gain = gain
-        assert bool(confounded(searched([], fields), [])) == alike
+        assert bool(confounded(searched([], fields), [], DEFAULTS)) == alike
 
 
 def test_what_calibration_imitates_is_said_with_the_nuisance_that_does() -> None:
     hidden = candidate("cable_friction", 0, 1, 0.02)
     hidden.retained, hidden.response = 0.02, np.zeros((2, 1))
-    pairs = confounded(searched([], [hidden]), ["stiffness"])
+    pairs = confounded(searched([], [hidden]), ["stiffness"], DEFAULTS)
     assert table_of(pairs) == [{"pair": ["stiffness", "cable_friction"], "absorbed_share": pytest.approx(0.9998)}]
     assert in_words([*pairs, ConfoundedPair(("gravity", "cable_offset"), dbic_gap=1.0)], ["stiffness", "gravity"]) == (
         " These data do not tell stiffness from cable_friction, nor gravity from cable_offset."

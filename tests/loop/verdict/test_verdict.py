@@ -10,6 +10,7 @@ import pytest
 from femsense.loop.data.trial import Groups
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.fit.repeatability import Repeatability
+from femsense.loop.thresholds import DEFAULTS
 from femsense.loop.verdict.model_error import excess_of
 from femsense.loop.verdict.verdict import lacks_much
 
@@ -29,7 +30,8 @@ def leaving(train: float, held: float) -> SimpleNamespace:
 
 NOISE = Noise({"white": 1e-4}, "")
 TRIAL = SimpleNamespace(groups=some_groups(), mesh_error=None)
-DATA = SimpleNamespace(train=[TRIAL], held=[TRIAL], placement_std=1e-3, robot=SimpleNamespace(body=SimpleNamespace(reach=0.1)))
+ROBOT = SimpleNamespace(body=SimpleNamespace(reach=0.1))
+DATA = SimpleNamespace(train=[TRIAL], held=[TRIAL], placement_std=1e-3, robot=ROBOT, thresholds=DEFAULTS)
 KNOWN = Repeatability(1e-4, 3, True, "")
 
 
@@ -48,9 +50,9 @@ def test_what_varies_with_the_state_is_an_error_of_the_model_and_no_noise():
     wide = Noise({"white": 3e-3, "state": 3e-3, "frame": 3e-3, "sweep": 3e-3}, "")
     left = excess_of(DATA, leaving(2e-2, 2e-2), leaving(5e-3, 5e-3), leaving(5e-3, 6e-3), wide, KNOWN)
     assert left.left == pytest.approx(np.sqrt(3.0) * 5e-3, rel=0.01) and left.held == pytest.approx(np.sqrt(3.0) * 6e-3, rel=0.01)
-    assert left.is_large and not left.is_small
+    assert left.is_large and not left.is_small(DEFAULTS)
     small = excess_of(DATA, leaving(2e-2, 2e-2), leaving(1.02e-4, 1e-4), leaving(1e-4, 1e-4), wide, KNOWN)
-    assert small.is_small and not small.is_large
+    assert small.is_small(DEFAULTS) and not small.is_large
 
 
 @pytest.mark.parametrize("known, large", [(True, False), (False, True)])
