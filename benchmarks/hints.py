@@ -25,9 +25,8 @@ from femsense.loop.data.dataset import Data
 from femsense.loop.fit.fitted_model import FittedModel
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.search.effect_fields import Fields, fields_of
-from femsense.loop.search.forward_selection import PREDICTED_MUCH, REFITTABLE
-from femsense.loop.search.refit import EVIDENCE
 from femsense.loop.search.screening import Candidate, screen_model
+from femsense.loop.thresholds import DEFAULTS
 
 Scores = dict[str, float]
 """Effect → its best linear score [dBIC]."""
@@ -62,7 +61,7 @@ def compared(case: Case) -> list[tuple[Case, tuple[str, ...], Scores, Scores]]:
 def best_of(table: list[Candidate]) -> Scores:
     scores: Scores = {}
     for candidate in table:  # the best first
-        if candidate.retained >= REFITTABLE:
+        if candidate.retained >= DEFAULTS.refittable:
             scores.setdefault(candidate.effect.name, candidate.score)
     return scores
 
@@ -86,13 +85,17 @@ def main() -> None:
                     flush=True,
                 )
                 top = [max(scores.values(), default=-np.inf) for scores in (hinted, own)]
-                missed += top[0] <= PREDICTED_MUCH < EVIDENCE < top[1]
+                missed += top[0] <= DEFAULTS.promising < DEFAULTS.evidence < top[1]
                 far += [abs(hinted[n] - own[n]) for n in hinted.keys() & own.keys()]
-                near += [abs(hinted[n] - own[n]) for n in hinted.keys() & own.keys() if min(hinted[n], own[n]) < EVIDENCE]
+                near += [
+                    abs(hinted[n] - own[n]) for n in hinted.keys() & own.keys() if min(hinted[n], own[n]) < DEFAULTS.evidence
+                ]
     print(
         f"\n{len(cases)} cases, {models} models, {len(far)} scores: they differ by {np.median(far):.2f} in the median, by {np.percentile(far, 95):.1f} in 95 of 100;"
     )
-    print(f"where one of the two is below {EVIDENCE:.0f}, by {max(near):.1f} at most; searches ended too early: {missed}")
+    print(
+        f"where one of the two is below {DEFAULTS.evidence:.0f}, by {max(near):.1f} at most; searches ended too early: {missed}"
+    )
 
 
 if __name__ == "__main__":

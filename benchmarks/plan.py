@@ -24,8 +24,8 @@ from loop_cases import ARM, EARTH
 from femsense import FemsenseError, Robot, improve, load_recording, load_robot, simulate
 from femsense.loop.design.advice import proposal_text
 from femsense.loop.design.candidate_experiments import script_of
-from femsense.loop.design.identifiability import EVIDENCE
 from femsense.loop.design.planner import Proposal, plan_experiment
+from femsense.loop.thresholds import DEFAULTS
 
 TINY_ARM = replace(ARM, name="tiny-arm", coarse=(5, 2, 2))
 NOISE_M, FRAMES = 2e-4, 45
@@ -92,7 +92,11 @@ def print_table(proposal: Proposal, done: dict[str, dict[str, Any]]) -> None:
         for which, identifiability in (("least", proposal.before), ("proposal", proposal.after)):
             rows = [r for r in identifiability.rows if r.name == hidden["name"]]
             best = max(rows, key=lambda r: r.dbic)
-            said = "not testable" if not best.testable else f"dBIC {best.dbic:.0f}" + ("" if best.dbic > EVIDENCE else ", unseen")
+            said = (
+                "not testable"
+                if not best.testable
+                else f"dBIC {best.dbic:.0f}" + ("" if best.dbic > DEFAULTS.evidence else ", unseen")
+            )
             result = done.get(f"{hidden['name']} {which}")
             cells += [said, "–" if result is None else outcome(hidden, result)]
         print(f"{hidden['name']:<16}{cells[0]:<20}{cells[1]:<34}{cells[2]:<23}{cells[3]}")

@@ -10,9 +10,6 @@ from femsense.fem.equilibrium import solve_equilibrium
 from femsense.fem.mesh import to_linear
 from femsense.loop.data.dataset import Data, prepare
 from femsense.loop.fit.discretisation_error import (
-    SHARE,
-    TURNS,
-    VARIES,
     errs_alike,
     make_finer,
     mesh_errors,
@@ -23,6 +20,7 @@ from femsense.loop.fit.discretisation_error import (
 from femsense.loop.fit.fitted_model import FittedModel, fit_model, with_nuisance
 from femsense.loop.fit.joint_fit import Prior
 from femsense.loop.fit.noise_components import Noise, whiten
+from femsense.loop.thresholds import DEFAULTS
 from femsense.model.effects import find_effect
 from femsense.model.observation import Hypothesis
 from femsense.model.recording import Recording
@@ -75,10 +73,10 @@ def test_the_error_of_the_mesh_is_what_the_finer_mesh_adds(linear: bool, finer: 
     assert np.abs(wanted).max() > 1e-4
     by_sweep, turned = trial.mesh_error[:, :, 1:-9], trial.mesh_error[:, :, -9:]
     np.testing.assert_array_equal(trial.error_by_sweep, trial.mesh_error[:, :, :-9])  # what the noise is estimated beside
-    np.testing.assert_allclose(by_sweep.sum(axis=2), VARIES * error)
+    np.testing.assert_allclose(by_sweep.sum(axis=2), DEFAULTS.mesh_varies * error)
     assert (by_sweep != 0).any(axis=1).sum(axis=1).max() == 1  # each row has the field of its own sweep
     matrix = np.random.default_rng(0).normal(0.0, 1.0, (3, 3))
-    np.testing.assert_allclose(turned @ matrix.ravel(), TURNS * error @ matrix.T, atol=1e-12)
+    np.testing.assert_allclose(turned @ matrix.ravel(), DEFAULTS.mesh_turns * error @ matrix.T, atol=1e-12)
 
 
 def test_springs_of_a_clamp_are_shared_out_over_the_finer_face():
@@ -122,7 +120,7 @@ def test_the_mesh_errs_in_another_way_where_the_body_is_another_or_goes_elsewher
     after = fit_model(
         data, Hypothesis(data.robot, (*hypothesis.terms, (effect, {}, own))), wider, noise, coordinates, max_iterations=0
     )
-    assert errs_alike(before, after) == alike
+    assert errs_alike(data, before, after) == alike
 
 
 def test_one_share_of_the_mesh_error_in_all_sweeps_is_likelier_than_another_in_each():
@@ -131,7 +129,7 @@ def test_one_share_of_the_mesh_error_in_all_sweeps_is_likelier_than_another_in_e
     trial, error = data.train[0], mesh_errors(data)[0]
     factor = noise.whitener(trial.groups, trial.mesh_error)
     sign = np.where(trial.groups.sweep % 2, 1.0, -1.0)[:, None]
-    costs = [float((whiten(factor, r) ** 2).sum()) for r in (SHARE * error, SHARE * sign * error)]
+    costs = [float((whiten(factor, r) ** 2).sum()) for r in (DEFAULTS.mesh_share * error, DEFAULTS.mesh_share * sign * error)]
     assert costs[0] < 1.0 + 1e-6  # one standard deviation
     assert costs[1] > 5 * costs[0]
     alike = without_mesh_error(trial, 0.5 * error, noise)
@@ -145,5 +143,5 @@ def test_the_mesh_error_may_turn_a_little_in_all_sweeps_whatever_the_axes():
     factor = noise.whitener(trial.groups, trial.mesh_error)
     for axis in np.vstack([np.eye(3), [0.6, 0.0, 0.8]]):
         turned = np.cross(axis, error)  # by a radian, √2 entries of one
-        assert float((whiten(factor, TURNS * turned) ** 2).sum()) < 2.0 + 1e-6
+        assert float((whiten(factor, DEFAULTS.mesh_turns * turned) ** 2).sum()) < 2.0 + 1e-6
         assert np.linalg.norm(without_mesh_error(trial, 0.1 * turned, noise)) < 0.05 * np.linalg.norm(0.1 * turned)
