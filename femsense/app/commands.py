@@ -219,15 +219,34 @@ def simulate_into(folder: str | Path, robot: str | Path, script: str | Path, *, 
     return simulate(body, script, target, progress=progress, keep=_kept(target, inputs))
 
 
-def script_identifiability(robot: str | Path, script: str | Path, *, noise: float) -> tuple[dict[str, Any], str]:
-    """Return what the experiment of a script could show, as plain tables and as text; `noise` is of a marker's coordinate [m]."""
+def script_plan(
+    robot: str | Path, script: str | Path, *, noise: float, folder: str | Path | None = None
+) -> tuple[dict[str, Any], str]:
+    """Return what the experiment of a script could show, as plain tables and as text: effects, and forces where it has clouds.
+
+    Arguments:
+        robot, script: folder or name, and file.
+        noise: of a marker's coordinate [m].
+        folder: gets the map of forces (forces.csv, forces.glb, forces.png) where the script has clouds; None: nothing is written.
+    """
     from femsense.loop.design.advice import identifiability_text
     from femsense.loop.design.documents import identifiability_document
     from femsense.loop.design.planner import identifiability_of_script
+    from femsense.rig.camera import pose_of
+    from femsense.rig.force_map import force_map
+    from femsense.rig.force_map_files import force_document, force_text, write_force_map
     from femsense.rig.script import read_script
 
-    identifiability = identifiability_of_script(load_robot(robot), read_script(script), Path(script), noise=noise)
-    return identifiability_document(identifiability), identifiability_text(identifiability)
+    body, table = load_robot(robot), read_script(script)
+    identifiability = identifiability_of_script(body, table, Path(script), noise=noise)
+    document, text = identifiability_document(identifiability), identifiability_text(identifiability)
+    if table.clouds.kind == "none":
+        return document, text
+    found = force_map(body, table, Path(script))
+    files = [] if folder is None else write_force_map(found, Path(folder), pose_of(next(iter(table.views.values()))))
+    written = "".join(f"\nwritten: {file}" for file in files)
+    forces = {**force_document(found), "files": [str(file) for file in files]}
+    return {**document, "forces": forces}, f"{text}\n\n{force_text(found)}{written}"
 
 
 def plan_into(

@@ -67,7 +67,7 @@ def views_of(script: ScriptTable, robot: Robot) -> tuple[View, ...]:
     result = []
     for name, table in script.views.items():
         T = pose_of(table)
-        camera = camera_of(table, name, noise=_declared_noise(table, T, robot) if table.declare_noise else None)
+        camera = camera_of(table, name, noise=noise_of(table, T, robot) if table.declare_noise else None)
         result.append(View(name, table, camera, T))
     return tuple(result)
 
@@ -89,7 +89,7 @@ def cloud_frames(script: ScriptTable, plan: Plan) -> list[int]:
     return np.flatnonzero(touched).tolist()
 
 
-def _declared_noise(table: ViewTable, T_robot_camera: FloatArray, robot: Robot) -> CameraNoise | None:
+def noise_of(table: ViewTable, T_robot_camera: FloatArray, robot: Robot) -> CameraNoise | None:
     """Return what the recording says of the noise; of time of flight the size at the distance of the body."""
     noise = table.noise
     if noise is None or noise.kind == "perfect":

@@ -170,7 +170,14 @@ def simulate(
     robot: RobotPath,
     script: Annotated[Path, typer.Argument(metavar="SCRIPT", help="What the virtual rig does (TOML).", show_default=False)],
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="RECORDING", help="The recording to write.", show_default=False)
+        Path | None,
+        typer.Option(
+            "-o",
+            "--output",
+            metavar="RECORDING",
+            help="The recording to write; with --plan a folder for the map of forces.",
+            show_default=False,
+        ),
     ] = None,
     plan: Annotated[bool, typer.Option("--plan", help="Say what this experiment could show; record nothing.")] = False,
     noise: Annotated[
@@ -179,10 +186,10 @@ def simulate(
     json: Json = False,
 ) -> Answer:
     """Record on the virtual rig, with the truth beside it."""
-    from femsense.app.commands import script_identifiability, simulate_into
+    from femsense.app.commands import script_plan, simulate_into
 
     if plan:
-        return Answer(*script_identifiability(robot, script, noise=1e-3 * noise))
+        return Answer(*script_plan(robot, script, noise=1e-3 * noise, folder=output))
     output = required(context, output, "'-o' / '--output'", "option")
     with progress_bar("simulate") as progress:
         simulate_into(output, robot, script, progress=progress)

@@ -1,0 +1,218 @@
+"""Which forces at which places a camera and a robot can resolve, before anyone builds it: a bound of Cramér and Rao over the surface.
+
+Each point that a camera would measure is a row: the displacement of the surface along its normal there, with the noise of the depth along the ray times
+the cosine of incidence. A force f at a place moves the rows by A f (compliance times rows); what is not known beside it moves them by N: camera poses and the
+modulus, with prior standard deviations. The covariance of f is
+
+    (Aᵀ Q A + P)⁻¹,   Q = I − N (Nᵀ N + I)⁻¹ Nᵀ   in whitened rows, P the prior of the force,
+
+and the standard deviation of a small force along the normal is the map, in newtons.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from femsense.calib.scan import REACH, RayRows, Scan, ray_rows
+from femsense.core.arrays import BoolArray, FloatArray, IntArray, freeze
+from femsense.core.errors import DataError
+from femsense.fem.assembly import internal
+from femsense.fem.compliance import Tangent, tangent_at
+from femsense.fem.equilibrium import Equilibrium, solve_equilibrium
+from femsense.fem.mesh import vertex_normals
+from femsense.model.camera import CameraNoise
+from femsense.model.contact_patch import body_surface, patch_at
+from femsense.model.robot import Robot, spread_features
+from femsense.pointcloud.rays import Surface
+from femsense.rig.camera import Shape, render, visible_points
+from femsense.rig.camera_tables import NoiseTable
+from femsense.rig.experiment import View, noise_of, rng_of, views_of
+from femsense.rig.lens import pixel_rays
+from femsense.rig.plan import plan_script
+from femsense.rig.scene import body_shape, floor_shape
+from femsense.rig.script import ScriptTable
+
+BATCH = 20
+"""Places whose compliance is solved for at once."""
+RADIUS = 0.02
+"""Radius of the patch of a force, over the diagonal of the body."""
+
+CLEAR = 1e-4
+"""A place is looked for so far outside of the surface [m]."""
+
+
+@dataclass(frozen=True, slots=True)
+class Unknowns:
+    """What is not known beside the force, and what is expected of it, as standard deviations."""
+
+    places: int = 150
+    """At how many places of the surface the bound is computed; between them it is interpolated."""
+    turn_rad: float = 1e-3
+    """Of the pose of each camera, about each axis [rad]."""
+    shift_m: float = 2e-4
+    """Of the pose of each camera, along each axis [m]."""
+    modulus: float = 0.03
+    """Of the modulus, relative."""
+    force_n: float = 2.0
+    """Of each component of a force [N]."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ForceMap:
+    """Standard deviations of small forces over the surface of a body in one state."""
+
+    positions: FloatArray
+    """Nodes in that state [m], shape (n, 3)."""
+    triangles: IntArray
+    """Of the surface, shape (t, 3)."""
+    nodes: IntArray
+    """Nodes at which the bound is computed, shape (p,)."""
+    rest: FloatArray
+    """Where these are at rest [m], shape (p, 3)."""
+    normal_std: FloatArray
+    """Of a force along the normal [N], shape (p,)."""
+    tangent_std: FloatArray
+    """Of a force along the surface, in the worse direction [N], shape (p,)."""
+    visible: BoolArray
+    """Whether a camera sees the place, shape (p,)."""
+    points: int
+    """Points of the robot that the cameras measure in a frame."""
+
+    def over_nodes(self) -> FloatArray:
+        """Return the standard deviation along the normal at every node [N], interpolated in its logarithm, shape (n,)."""
+        from scipy.spatial import cKDTree
+
+        distance, near = cKDTree(self.positions[self.nodes]).query(self.positions, k=min(3, len(self.nodes)))
+        distance, near = distance.reshape(len(self.positions), -1), near.reshape(len(self.positions), -1)
+        weight = 1.0 / (distance + 1e-9)
+        return np.asarray(np.exp((weight * np.log(self.normal_std[near])).sum(axis=1) / weight.sum(axis=1)))
+
+
+def force_map(
+    robot: Robot, script: ScriptTable, where: Path = Path("script"), *, frame: int = 0, unknowns: Unknowns | None = None
+) -> ForceMap:
+    """Return which forces the cameras of a script resolve on the declared robot.
+
+    Arguments:
+        robot: the declared robot; effects, mesh and law of the script's truth count for nothing.
+        script: its inputs and cameras are used.
+        where: what messages name.
+        frame: the frame whose inputs hold.
+        unknowns: what is not known beside the force.
+
+    Raises:
+        InputError: the script does not fit. DataError: no equilibrium, or no camera sees the robot.
+    """
+    how, views = unknowns or Unknowns(), views_of(script, robot)
+    state = _state(robot, script, where, frame)
+    surface = body_surface(robot.body.mesh)
+    rows, std = _rows(robot, script, views, state)
+    tangent = tangent_at(robot.body, state)
+    nodes = spread_features(robot.body, how.places)
+    normals = vertex_normals(state.positions, surface.triangles)[nodes]
+    N = _nuisance(robot, rows, tangent, state, how, len(views)) / std[:, None]
+    inner = np.linalg.inv(N.T @ N + np.eye(N.shape[1]))
+    move = rows.operator(len(state.positions))
+    size = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
+    normal_std, tangent_std = [], []
+    for start in range(0, len(nodes), BATCH):
+        here = nodes[start : start + BATCH]
+        patches = [patch_at(surface, state.positions, state.positions[i], RADIUS * size, robot.body.clamped) for i in here]
+        loads = np.array([patch.spread(axis, len(state.positions)) for patch in patches for axis in np.eye(3)])
+        A = np.asarray(move @ tangent.respond(loads).reshape(len(loads), -1).T) / std[:, None]
+        NA = N.T @ A
+        for i, normal in enumerate(normals[start : start + BATCH]):
+            own = slice(3 * i, 3 * i + 3)
+            information = A[:, own].T @ A[:, own] - NA[:, own].T @ inner @ NA[:, own] + np.eye(3) / how.force_n**2
+            covariance = np.linalg.inv(information)
+            across = np.linalg.svd(normal[None])[2][1:]
+            normal_std.append(float(np.sqrt(normal @ covariance @ normal)))
+            tangent_std.append(float(np.sqrt(np.linalg.eigvalsh(across @ covariance @ across.T).max())))
+    return ForceMap(
+        state.positions,
+        surface.triangles,
+        nodes,
+        freeze(robot.body.mesh.nodes[nodes]),
+        freeze(normal_std),
+        freeze(tangent_std),
+        _seen(views, state, surface.triangles, nodes, normals),
+        len(rows.residual),
+    )
+
+
+def neighbours(noise: NoiseTable | None) -> float:
+    """Return how many pixels count as one, since neighbours err together: the sum of their correlations.
+
+    A stereo camera's common part is white noise smoothed with a Gaussian of width w; its correlation at a distance r is exp(−r²/4w²), which sums to 4πw².
+    """
+    if noise is None or noise.kind != "stereo":
+        return 1.0
+    share = noise.correlated_share
+    return float(1.0 - share + share * max(1.0, 4.0 * np.pi * noise.correlation_px**2))
+
+
+def _state(robot: Robot, script: ScriptTable, where: Path, frame: int) -> Equilibrium:
+    plan = plan_script(script, robot, where)
+    if not 0 <= frame < len(plan.time_s):
+        raise DataError(f"{where} has the frames 0 … {len(plan.time_s) - 1}, not {frame}")
+    inputs = dict(zip(robot.body.cable_names, (plan.commanded + plan.initial)[frame].tolist()))
+    pressure = dict(zip(robot.body.chamber_names, plan.pressures[frame].tolist()))
+    held = plan.control == "displacement"
+    state = solve_equilibrium(
+        robot.body, tension=None if held else inputs, shortening=inputs if held else None, pressure=pressure
+    )
+    if not state.converged:
+        raise DataError(f"no equilibrium in frame {frame}: {state.status}: {state.advice}")
+    return state
+
+
+def _rows(robot: Robot, script: ScriptTable, views: tuple[View, ...], state: Equilibrium) -> tuple[RayRows, FloatArray]:
+    """Return the rows of the points that the cameras would measure, and the standard deviation of each, neighbours counted [m], shape (r,)."""
+    shapes = [body_shape(robot, state.positions, script.scene)]
+    if script.scene.floor_z_m is not None:
+        shapes.append(floor_shape(script.scene.floor_z_m, np.array(script.scene.floor_rgb), script.scene.floor_albedo))
+    points, view_of, noises = [], [], []
+    for v, view in enumerate(views):
+        image = render(view.camera, view.T_robot_camera, shapes, noise=view.table.noise, rng=rng_of(script, "clouds", 0, v))
+        true = render(view.camera, view.T_robot_camera, shapes)
+        mine = (image.depth > 0) & (true.shape == 0)
+        points.append((pixel_rays(view.camera) * true.depth[..., None])[mine])
+        view_of.append(np.full(int(mine.sum()), v))
+        noises.append(_noise_of(view, robot))
+    if not sum(len(p) for p in points):
+        raise DataError("no camera sees the robot: check eye_m and target_m")
+    scan = Scan(np.vstack(points), np.concatenate(view_of), np.zeros((0, 3)), np.zeros(0, np.int64))
+    size = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
+    surface = Surface(state.positions, body_surface(robot.body.mesh).triangles)
+    rows = ray_rows(scan, surface, [view.T_robot_camera for view in views], noises, reach=REACH * size)
+    together = np.array([neighbours(view.table.noise) for view in views])[rows.view]
+    return rows, np.asarray(rows.std * np.sqrt(together))
+
+
+def _noise_of(view: View, robot: Robot) -> CameraNoise:
+    """Return the noise of a depth; of a perfect camera that of its steps."""
+    known = noise_of(view.table, view.T_robot_camera, robot)
+    return CameraNoise("tof", floor=view.camera.depth_unit / np.sqrt(12.0)) if known is None else known
+
+
+def _nuisance(robot: Robot, rows: RayRows, tangent: Tangent, state: Equilibrium, how: Unknowns, view_count: int) -> FloatArray:
+    """Return how the rows move with one standard deviation of each pose and of the modulus [m], shape (r, 6 v + 1)."""
+    pose = rows.by_pose(robot.body.mesh.nodes.mean(axis=0), view_count) * np.tile(
+        np.repeat([how.turn_rad, how.shift_m], 3), view_count
+    )
+    sag = tangent.respond(internal(robot.body, state.positions, tangent=False).forces[None])
+    stiffer = rows.operator(len(state.positions)) @ sag.reshape(1, -1).T
+    return np.hstack([pose, how.modulus * np.asarray(stiffer)])
+
+
+def _seen(views: tuple[View, ...], state: Equilibrium, triangles: IntArray, nodes: IntArray, normals: FloatArray) -> BoolArray:
+    """Return which places a camera sees, shape (p,)."""
+    body = Shape(state.positions, triangles, np.full(3, 0.5))
+    places, seen = state.positions[nodes] + CLEAR * normals, np.zeros(len(nodes), dtype=bool)
+    for view in views:
+        towards = np.einsum("pc,pc->p", view.T_robot_camera[:3, 3] - places, normals) > 0
+        seen |= towards & visible_points(view.camera, view.T_robot_camera, [body], places)
+    return np.asarray(seen)
