@@ -86,7 +86,7 @@ class ForceMap:
         from scipy.spatial import cKDTree
 
         distance, near = cKDTree(self.positions[self.nodes]).query(self.positions, k=min(3, len(self.nodes)))
-        distance, near = distance.reshape(len(self.positions), -1), near.reshape(len(self.positions), -1)
+        distance, near = (np.asarray(a).reshape(len(self.positions), -1) for a in (distance, near))
         weight = 1.0 / (distance + 1e-9)
         return np.asarray(np.exp((weight * np.log(self.normal_std[near])).sum(axis=1) / weight.sum(axis=1)))
 

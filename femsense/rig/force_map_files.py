@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from femsense.core.arrays import FloatArray
+from femsense.core.arrays import BoolArray, FloatArray
 from femsense.core.pose import invert_pose, transform_points
 from femsense.fem.mesh import triangle_normals
 from femsense.io.files import write_beside, write_csv
@@ -67,7 +67,7 @@ def write_force_map(found: ForceMap, folder: Path, T_robot_camera: FloatArray) -
     return [table, mesh, picture]
 
 
-def _group(found: ForceMap, which: FloatArray) -> dict[str, Any]:
+def _group(found: ForceMap, which: BoolArray) -> dict[str, Any]:
     if not which.any():
         return {"count": 0}
     normal, tangent = found.normal_std[which], found.tangent_std[which]
@@ -115,7 +115,7 @@ def _write_picture(found: ForceMap, path: Path, T_robot_camera: FloatArray) -> N
         order = np.argsort(-corners[:, :, 2].mean(axis=1))
         flat = 1e3 * corners[order][:, :, :2] * [1.0, -1.0]
         axes.add_collection(
-            PolyCollection(flat, array=values[facing][order], cmap=COLORS, norm=norm, edgecolors="face", linewidths=0.2)
+            PolyCollection(list(flat), array=values[facing][order], cmap=COLORS, norm=norm, edgecolors="face", linewidths=0.2)
         )
         axes.autoscale_view()
         axes.set(aspect="equal", title=title, xlabel="mm", ylabel="mm")

@@ -29,8 +29,9 @@ class PlannedContact:
 
     def place(self, k: int) -> FloatArray:
         """Return where it is in frame k on the surface at rest [m], shape (3,)."""
-        here: FloatArray = np.asarray(self.table.point_m if self.path is None else self.path[k], dtype=float)
-        return here
+        if self.path is not None:
+            return np.array(self.path[k], dtype=np.float64)
+        return np.asarray(self.table.point_m, dtype=np.float64)
 
     @property
     def way(self) -> FloatArray:
