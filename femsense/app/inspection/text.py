@@ -15,6 +15,8 @@ UNITS = {
     "kg_m3": "kg/m³",
     "m_s2": "m/s²",
     "cm3": "cm³",
+    "cm2": "cm²",
+    "kpa": "kPa",
     "mm": "mm",
     "hz": "1/s",
     "deg": "°",
