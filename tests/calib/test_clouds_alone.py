@@ -82,7 +82,7 @@ def test_colourless_clouds_with_a_table_and_clutter_place_the_camera(tmp_path: P
     turn, shift = off(calibration.poses[0], poses[0])
     assert turn < 1.5
     assert shift < 1.5e-3
-    assert calibration.status.startswith("converged (cameras placed by clouds alone)")
+    assert calibration.status == "converged (cameras placed by clouds alone)"  # every direction is determined
     assert np.isfinite(calibration.normal_rms_m)
     assert (np.diag(calibration.pose_covariance) > 0).all()
 

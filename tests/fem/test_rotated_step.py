@@ -12,6 +12,7 @@ from femsense.fem.body import BodyModel, make_body
 from femsense.fem.equilibrium import NewtonOptions, SolveOptions, solve_equilibrium
 from femsense.fem.mesh import to_quadratic
 from femsense.fem.rotated_step import corners_of, rotated_step
+from femsense.fem.rotation import turning_compliance
 
 
 def bar(quadratic: bool, *, on_an_edge: bool = False) -> BodyModel:
@@ -55,6 +56,14 @@ def test_a_turn_about_a_hinge_is_a_rotation_without_stretch(quadratic: bool) -> 
 def test_where_nothing_is_clamped_there_is_no_turned_step() -> None:
     body = bar(False, on_an_edge=True)
     assert rotated_step(body, body.mesh.nodes, np.zeros_like(body.mesh.nodes)) is None
+
+
+def test_an_element_that_is_shrunk_to_a_point_has_a_turning_compliance() -> None:
+    found, still = np.full(6, np.nan), np.eye(3).reshape(9, 1)
+    turning_compliance(np.zeros((9, 1)), still, 0, found)
+    assert np.isfinite(found).all() and (found[[0, 3, 5]] > 0.0).all()
+    turning_compliance(still, still, 0, found)
+    np.testing.assert_allclose(found, [0.5, 0.0, 0.0, 0.5, 0.0, 0.5])  # (tr(V) I − V)⁻¹ of V = I
 
 
 def test_fewer_newton_steps_lead_to_the_same_state() -> None:
