@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from arm import arm
@@ -12,7 +14,7 @@ from femsense.fem.mesh import to_linear
 from femsense.loop.data.dataset import Data
 from femsense.loop.fit.fitted_model import FittedModel
 from femsense.loop.search.effect_fields import effect_fields
-from femsense.loop.search.screening import penalty
+from femsense.loop.search.screening import noise_of, penalty
 from femsense.model.effects import FORMS, find_effect
 from femsense.model.observation import marker_residual, placements
 from femsense.model.remeshing import robot_on_mesh
@@ -62,3 +64,16 @@ def test_the_numbers_of_a_seed_cost_as_much_as_parameters():
     place = {"center_m": [0.0, 0.0, 0.0], "radius_m": 0.1}
     assert penalty(1, place, 1, 10, 1000.0) == pytest.approx(5 * np.log(1000.0) + 2 * np.log(10))
     assert penalty(0, {"law": "neo_hookean"}, 1, 10, 1000.0) == pytest.approx(2 * np.log(10))
+
+
+def test_only_the_large_fields_of_the_meshs_error_take_freedom_from_the_noise() -> None:
+    data, fitted = fitted_arm(arm((5, 2, 2)))
+    (form,) = [f for f in FORMS if f.name == "hyperelastic"][:1]
+    (seed,) = form.seeds(data.robot)
+    fields = effect_fields(fitted.fit, data.train, [(form, seed, form.parameters(data.robot, "tension"))])
+    (trial,) = data.train
+    size, large = fitted.fit.jets[0].residual.shape, 1 + len(np.unique(trial.groups.sweep))
+    errors = 1e-4 * np.random.default_rng(3).standard_normal((*size, large + 20))
+    few, many = (replace(data, train=[replace(trial, mesh_error=e)]) for e in (errors[:, :, :large], errors))
+    (noise, rows), (same, left) = (noise_of(d, fitted, fields) for d in (few, many))
+    assert noise.std == same.std and rows == left
