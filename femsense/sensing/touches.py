@@ -13,8 +13,9 @@ from femsense.model.contact_patch import ContactPatch, closest_surface_point, pa
 from femsense.qp.friction_cone import FrictionCone
 from femsense.sensing.types import Sensor, Touch
 
-PATCH = 1.05
-"""Radius over which a point force is spread, in edges of the surface: the least that has a few nodes everywhere."""
+PATCH = 0.525
+"""Radius over which a point force is spread, in edges of elements. A linear element's shape functions are an edge wide themselves: a patch as wide
+as the edge would press on the faces beside the one that is touched."""
 
 
 def make_touch(
@@ -37,7 +38,8 @@ def make_touch(
 
 def _patch(sensor: Sensor, place: FloatArray, normal: FloatArray | None) -> ContactPatch:
     body = sensor.robot.body
-    return patch_at(sensor.surface, body.mesh.nodes, place, PATCH * sensor.surface.edge, body.clamped, facing=normal)
+    edge = sensor.surface.edge * (2.0 if body.mesh.is_quadratic else 1.0)  # the surface halves those of quadratic elements
+    return patch_at(sensor.surface, body.mesh.nodes, place, PATCH * edge, body.clamped, facing=normal)
 
 
 def touch_normal(sensor: Sensor, touch: Touch, state: Equilibrium) -> FloatArray:
