@@ -409,6 +409,7 @@ def test_view_says_where_and_ends(run: Any, robot: Path, tmp_path: Path) -> None
                 answered.append(page.status)
                 break
             time.sleep(0.05)
+        time.sleep(1.0)  # the page answers before the command has printed where, and waits
         os.kill(os.getpid(), signal.SIGINT)
 
     looking = threading.Thread(target=look_and_stop)

@@ -238,7 +238,8 @@ def test_repeated_sweeps_of_many_states_tell_effects_apart():
             **{
                 n: [SimpleNamespace(scene=SimpleNamespace(recording=recording, frames=f))]
                 for n, f in (("train", fitted), ("held", held))
-            }
+            },
+            thresholds=DEFAULTS,
         )
 
     tells_apart = distinguishes_effects
