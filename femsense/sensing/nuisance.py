@@ -29,7 +29,7 @@ FAR_OFF = 9.0
 """Misfit per row that says that a frame is not explained where no free frame tells more: three standard deviations everywhere."""
 DRIVE_STD = 0.05
 """What is not known beforehand of the pull of a cable or the pressure of a chamber, relative: motor gain, and how far its ends sink into the mesh."""
-APART = 10.0
+APART = 2.0
 """The pose of the calibration knew neither modulus nor pulls: its standard deviations count so much larger where the free frames tell all of them."""
 LIKELY_GAIN = 13.5
 """Log-evidence gain that noise alone gives once in 1000 frames: χ² with three degrees at some 50 places that differ."""
@@ -110,9 +110,9 @@ def response_std(knowledge: Knowledge, drives: int) -> float:
     """Return how far the model's answer to a force may be off beside its answer to gravity, relative [1].
 
     Cables pull as declared, but the model needs other pulls to move as the body does (mesh, law, ties): what it needs of a cable, it needs of a contact.
-    The root mean square of the pulls that the free frames ask for; 0 without cables.
+    The root mean square of the pulls that the free frames ask for; 0 where they were not asked.
     """
-    if drives == 0 or len(knowledge.common_mean) <= drives:
+    if drives == 0:
         return 0.0
     variance = (knowledge.common_root[-drives:] ** 2).sum(axis=1)
     return float(np.sqrt((knowledge.common_mean[-drives:] ** 2 + variance).mean()))
@@ -142,9 +142,8 @@ def learn(knowledge: Knowledge, frames: list[tuple[Rows, FloatArray]]) -> Knowle
     if not frames:
         return knowledge
     v = knowledge.common_root.shape[0] - len(frames[0][1])  # pose steps
-    first = replace(
-        knowledge, common_root=freeze(np.append(np.full(v, APART), np.ones(len(frames[0][1])))[:, None] * knowledge.common_root)
-    )
+    wider = np.append(np.full(v, APART if len(frames[0][1]) > 1 else 1.0), np.ones(len(frames[0][1])))
+    first = replace(knowledge, common_root=freeze(wider[:, None] * knowledge.common_root))
     for _ in range(2):  # the second time with what the first left
         frames = [(replace(rows, together=knowledge.together if rows.of_clouds else 1.0), sag) for rows, sag in frames]
         grams = [_gram(knowledge, rows, sag) for rows, sag in frames]

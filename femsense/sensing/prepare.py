@@ -27,6 +27,8 @@ from femsense.sensing.nuisance import first_knowledge, learn, sag_at
 from femsense.sensing.places import check_places, near_places
 from femsense.sensing.types import Answers, Knowledge, Rows, SensingOptions, Sensor
 
+MODULUS_STD = 0.01
+"""Where lengths of cables are given, the shape says little of the modulus: beyond this, errors of the model pass for it (relative)."""
 CANDIDATES = 120
 """Places at which hidden contacts are searched (METHODS section 3)."""
 
@@ -55,13 +57,14 @@ def make_sensor(
         )
     robot = _with_placements(robot, calibration)
     noises = measured_noises(robot, recording, calibration)
+    pulls_are_modelled = recording.has_clouds and recording.actuation == "displacement"
     knowledge = first_knowledge(
         noises,
         robot.body.mesh.nodes[surface.nodes],
         size,
-        options.modulus_std,
+        min(options.modulus_std, MODULUS_STD) if pulls_are_modelled else options.modulus_std,
         calibration.joint_covariance,
-        drives=len(robot.body.cables) + len(robot.body.chambers) if recording.has_clouds else 0,
+        drives=len(robot.body.cables) + len(robot.body.chambers) if pulls_are_modelled else 0,
     )
     sensor = Sensor(
         robot,
@@ -77,7 +80,10 @@ def make_sensor(
         knowledge,
         Answers(),
     )
-    sensor = _better_posed(sensor, learn(knowledge, _free_rows(sensor)))
+    learned = learn(knowledge, _free_rows(sensor))
+    if not pulls_are_modelled:
+        return replace(sensor, knowledge=learned)
+    sensor = _better_posed(sensor, learned)
     return replace(sensor, knowledge=learn(sensor.knowledge, _free_rows(sensor)))
 
 
@@ -135,8 +141,8 @@ def _driven(robot: Robot, recording: Recording, calibration: Calibration, places
 
 
 def _marked(sensor: Sensor, k: int, state: Equilibrium) -> list[Rows]:
-    """Return the rows of the markers of a frame, if it has some."""
-    if not (sensor.recording.marker_frame == k).any():
+    """Return the rows of the markers of a frame, if it has some and pulls are to be told beside the pose."""
+    if sensor.recording.actuation != "displacement" or not (sensor.recording.marker_frame == k).any():
         return []
     try:
         return [rows_at(sensor, k, None, state)]

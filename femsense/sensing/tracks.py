@@ -20,8 +20,8 @@ def contacts_of(sensor: Sensor, k: int, fit: Fit, previous: SensedFrame | None) 
     """Return the contacts of a fit; those that begin a track have track −1."""
     number, stamp = int(sensor.recording.frame_numbers[k]), float(sensor.recording.time_s[k])
     contacts: list[ContactForce] = []
-    body, clouds = sensor.robot.body, fit.rows.of_clouds
-    share = response_std(sensor.knowledge, len(body.cables) + len(body.chambers)) if clouds else 0.0
+    pulls = len(sensor.knowledge.common_mean) - 6 * len(sensor.calibration.poses) - 1  # those that the free frames were asked for
+    share = response_std(sensor.knowledge, pulls) if fit.rows.of_clouds else 0.0
     for i, (touch, force) in enumerate(zip(fit.touches, fit.forces)):
         size, normal = float(np.linalg.norm(force)), touch_normal(sensor, touch, fit.state)
         if size == 0.0 and touch.source != "given":
