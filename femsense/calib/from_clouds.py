@@ -6,6 +6,7 @@ markers enters as a Gaussian. Neighbouring residuals err together (mesh, law), s
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +18,7 @@ from femsense.core.errors import FemsenseError
 from femsense.core.pose import moved_poses
 from femsense.fem.equilibrium import Equilibrium
 from femsense.model.camera import CameraNoise
-from femsense.model.contact_patch import BodySurface, body_surface
+from femsense.model.contact_patch import body_surface
 from femsense.model.drive import DrivenRobot, drive_of
 from femsense.model.quasi_static_path import free_path
 from femsense.model.recording import Recording
@@ -43,6 +44,20 @@ class _Seen:
     scan: Scan
     state: Equilibrium
     surface: Surface
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class RaySums:
+    """Normal equations of the rows of all frames."""
+
+    normal: FloatArray
+    """JᵀJ, shape (p, p)."""
+    right: FloatArray
+    """Jᵀr, shape (p,)."""
+    cells: FloatArray
+    """Sums of Jᵀr over cells of the surface, shape (g, p)."""
+    rms: float
+    """Root mean square of the residual [m]."""
 
 
 def pose_pivot(robot: Robot) -> FloatArray:
@@ -79,7 +94,7 @@ def refine_poses(robot: Robot, recording: Recording, calibration: Calibration) -
     if not frames or not moving:
         return calibration
     noises = measured_noises(robot, recording, calibration)
-    pivot, poses, surface = pose_pivot(robot), list(calibration.poses), body_surface(robot.body.mesh)
+    pivot, poses = pose_pivot(robot), list(calibration.poses)
     size = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
     which = np.concatenate([np.arange(6 * v, 6 * v + 6) for v in moving])
     prior = _prior(calibration.joint_covariance, which)
@@ -87,7 +102,8 @@ def refine_poses(robot: Robot, recording: Recording, calibration: Calibration) -
     for _ in range(2):  # the second time with what the clouds are worth beside the markers
         poses, gone = list(calibration.poses), np.zeros(len(which))
         for _ in range(STEPS):
-            normal, right, scores, rms = _normal_equations(frames, poses, noises, pivot, surface, size, which)
+            sums = _normal_equations(frames, poses, noises, pivot, size, which)
+            normal, right, scores, rms = sums.normal, sums.right, sums.cells, sums.rms
             step = -np.linalg.solve(share * normal + prior, share * right + prior @ gone)
             full = np.zeros(6 * len(poses))
             full[which] = step
@@ -151,17 +167,29 @@ def _normal_equations(
     poses: list[FloatArray],
     noises: tuple[CameraNoise, ...],
     pivot: FloatArray,
-    surface: BodySurface,
     size: float,
     which: FloatArray,
-) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-    """Return JᵀJ, Jᵀr, the sums of Jᵀr over cells of the surface (g, p), and the residual's root mean square [m]."""
-    p = len(which)
+) -> RaySums:
+    def seen_rows() -> Iterator[tuple[RayRows, FloatArray]]:
+        for seen in frames:
+            rows = ray_rows(seen.scan, seen.surface, poses, noises, reach=REACH * size)
+            yield rows, rows.by_pose(pivot, len(poses))[:, which]
+
+    return ray_sums(seen_rows(), len(which), size)
+
+
+def ray_sums(frames: Iterable[tuple[RayRows, FloatArray]], p: int, size: float) -> RaySums:
+    """Return the robust normal equations of the rows of all frames.
+
+    Arguments:
+        frames: rows of each frame, and how their residual changes with the parameters, shape (r, p).
+        p: number of parameters.
+        size: diagonal of the body [m]; cells are a share of it.
+    """
     normal, right, squares, count = np.zeros((p, p)), np.zeros(p), 0.0, 0
-    sums: dict[tuple[int, ...], FloatArray] = {}
-    for seen in frames:
-        rows = ray_rows(seen.scan, seen.surface, poses, noises, reach=REACH * size)
-        J = rows.by_pose(pivot, len(poses))[:, which] / rows.std[:, None]
+    cells: dict[tuple[int, ...], FloatArray] = {}
+    for rows, derivative in frames:
+        J = derivative / rows.std[:, None]
         z = rows.residual / rows.std
         weight = np.minimum(1.0, HUBER * max(1.0, 1.483 * float(np.median(np.abs(z)))) / np.maximum(np.abs(z), 1e-12))
         normal += J.T @ (weight[:, None] * J)
@@ -171,8 +199,8 @@ def _normal_equations(
         part = np.zeros((len(cell), p))
         np.add.at(part, group.ravel(), J * (weight * z)[:, None])
         for key, value in zip(map(tuple, cell.tolist()), part):
-            sums[key] = sums.get(key, np.zeros(p)) + value
-    return normal, right, np.array(list(sums.values())).reshape(-1, p), float(np.sqrt(squares / max(count, 1)))
+            cells[key] = cells.get(key, np.zeros(p)) + value
+    return RaySums(normal, right, np.array(list(cells.values())).reshape(-1, p), float(np.sqrt(squares / max(count, 1))))
 
 
 def _prior(covariance: FloatArray, which: FloatArray) -> FloatArray:

@@ -6,15 +6,16 @@ that a change of input looks like no change of pose in more than one frame.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from scipy.optimize import lsq_linear
 
 from femsense.calib.calibration import Calibration
-from femsense.calib.from_clouds import CELLS, HUBER, measured_noises, pose_pivot
+from femsense.calib.from_clouds import RaySums, measured_noises, pose_pivot, ray_sums
 from femsense.calib.inputs import first_inputs, input_bounds, input_tables, largest_input, weak_inputs
-from femsense.calib.scan import REACH, Scan, ray_rows, read_scan
+from femsense.calib.scan import REACH, RayRows, Scan, ray_rows, read_scan
 from femsense.core.arrays import FloatArray, IntArray, freeze
 from femsense.core.errors import DataError, FemsenseError
 from femsense.core.pose import moved_poses
@@ -35,16 +36,6 @@ START_STD = (0.1, 0.03)
 """What the poses are off by before: [rad], and as a share of the body's diagonal; as in `clouds_alone`."""
 STEP = {"tension": 1e-2, "displacement": 1e-4}
 """Difference for the derivative by an input [N] or [m]."""
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class _Sums:
-    """Normal equations of all rows over (poses that move, inputs)."""
-
-    normal: FloatArray  # (p, p)
-    right: FloatArray  # (p,)
-    cells: FloatArray  # sums of the gradient over cells of the surface, (g, p)
-    rms: float  # [m]
 
 
 def with_initial_inputs(robot: Robot, recording: Recording, calibration: Calibration) -> Calibration:
@@ -142,29 +133,20 @@ def _sums(
     poses: list[FloatArray],
     noises: tuple[CameraNoise, ...],
     which: IntArray,
-) -> _Sums:
+) -> RaySums:
     surface, pivot = body_surface(robot.body.mesh), pose_pivot(robot)
     size = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
-    p = len(which) + len(robot.body.cables)
-    normal, right, squares, count, cells = np.zeros((p, p)), np.zeros(p), 0.0, 0, dict[tuple[int, ...], FloatArray]()
-    for k in scans.keys() & states.keys() & moves.keys():
-        rows = ray_rows(scans[k], Surface(states[k], surface.triangles), poses, noises, reach=REACH * size)
-        by_input = -(rows.operator(len(states[k])) @ moves[k])
-        J = np.hstack([rows.by_pose(pivot, len(poses))[:, which], by_input]) / rows.std[:, None]
-        z = rows.residual / rows.std
-        weight = np.minimum(1.0, HUBER * max(1.0, 1.483 * float(np.median(np.abs(z)))) / np.maximum(np.abs(z), 1e-12))
-        normal += J.T @ (weight[:, None] * J)
-        right += J.T @ (weight * z)
-        squares, count = squares + float((rows.residual**2).sum()), count + len(z)
-        cell, group = np.unique(np.floor(rows.points / (size / CELLS)).astype(np.int64), axis=0, return_inverse=True)
-        part = np.zeros((len(cell), p))
-        np.add.at(part, group.ravel(), J * (weight * z)[:, None])
-        for key, value in zip(map(tuple, cell.tolist()), part):
-            cells[key] = cells.get(key, np.zeros(p)) + value
-    return _Sums(normal, right, np.array(list(cells.values())).reshape(-1, p), float(np.sqrt(squares / max(count, 1))))
+
+    def seen_rows() -> Iterator[tuple[RayRows, FloatArray]]:
+        for k in scans.keys() & states.keys() & moves.keys():
+            rows = ray_rows(scans[k], Surface(states[k], surface.triangles), poses, noises, reach=REACH * size)
+            by_input = -(rows.operator(len(states[k])) @ moves[k])
+            yield rows, np.hstack([rows.by_pose(pivot, len(poses))[:, which], by_input])
+
+    return ray_sums(seen_rows(), len(which) + len(robot.body.cables), size)
 
 
-def _bounded(sums: _Sums, prior: FloatArray, gone: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
+def _bounded(sums: RaySums, prior: FloatArray, gone: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
     """Return the step of least squares, shape (p + a,), that keeps inputs within their bounds."""
     P = sums.normal + np.diag(prior)
     root = np.linalg.cholesky(P).T
@@ -180,7 +162,7 @@ def _answer(
     calibration: Calibration,
     poses: list[FloatArray],
     initial: FloatArray,
-    sums: _Sums,
+    sums: RaySums,
     prior: FloatArray,
     which: IntArray,
 ) -> Calibration:
