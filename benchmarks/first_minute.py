@@ -1,6 +1,6 @@
 """Processor time of a new installation's first commands, and of a process to its first equilibrium.
 
-    python benchmarks/first_minute.py              # what is installed beside this script, kernels compiled (a folder of its own for them) and warm
+    python benchmarks/first_minute.py              # as it was installed (new only once), kernels compiled into a folder of their own, warm
     python benchmarks/first_minute.py --kernels    # which kernels are compiled, the costliest first
 
 Each command is a process of its own with one thread; user and system time, median of the runs (compiling: one run).
@@ -84,14 +84,14 @@ def main() -> None:
                 print(words[0])
                 seconds(["-c", KERNELS, *words], work / words[0], shown=True)
             return
-        print("| processor time [s] | kernels compiled | warm |\n|---|---|---|")
+        print("| processor time [s] | first run as installed | kernels compiled | warm |\n|---|---|---|---|")
         rows = {words[0]: ["-m", "femsense", *words] for words in (calibrate, estimate)}
         rows["equilibrium of data/diamond"] = ["-c", EQUILIBRIUM, str(options.data / "diamond")]
         for name, command in rows.items():
             cache = work / f"caches of {name}"
-            first = seconds(command, cache)
-            print(f"| {name} | {first:.1f} | {median(seconds(command, cache) for _ in range(RUNS)):.2f} |", flush=True)
-        print(f"| femsense --help | | {median(seconds(['-m', 'femsense', '--help']) for _ in range(RUNS)):.2f} |")
+            installed, compiled = seconds(command), seconds(command, cache)
+            print(f"| {name} | {installed:.1f} | {compiled:.1f} | {median(seconds(command, cache) for _ in range(RUNS)):.2f} |", flush=True)
+        print(f"| femsense --help | | | {median(seconds(['-m', 'femsense', '--help']) for _ in range(RUNS)):.2f} |")
 
 
 if __name__ == "__main__":
