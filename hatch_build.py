@@ -97,7 +97,9 @@ def compile_kernels(root: Path, scratch: Path) -> None:
     """Run a calibration and an estimate; what numba compiles for them is left in scratch/caches. Raises RuntimeError."""
     environment = os.environ | {"NUMBA_CACHE_DIR": str(scratch / "caches"), "FEMSENSE_WORKERS": "1"}
     # PYTHONPATH is pip's: what a build requires is found by it, and an editable installation that was there before is left out
-    start = f"import runpy, sys; sys.path.insert(0, {str(root)!r}); runpy.run_module('femsense', run_name='__main__', alter_sys=True)"
+    start = (
+        f"import runpy, sys; sys.path.insert(0, {str(root)!r}); runpy.run_module('femsense', run_name='__main__', alter_sys=True)"
+    )
     robot, recording, calibration = DEMO[0], str(root / DEMO[1]), str(scratch / "calibration.json")
     for command in (
         ["calibrate", robot, recording, "-o", calibration],
@@ -106,7 +108,9 @@ def compile_kernels(root: Path, scratch: Path) -> None:
         call = [sys.executable, "-c", start, *command]
         done = subprocess.run(call, cwd=scratch, env=environment, capture_output=True, text=True, check=False)
         if done.returncode:
-            raise RuntimeError(f"femsense {command[0]} failed (exit {done.returncode}): {(done.stdout + done.stderr).strip()[-600:]}")
+            raise RuntimeError(
+                f"femsense {command[0]} failed (exit {done.returncode}): {(done.stdout + done.stderr).strip()[-600:]}"
+            )
 
 
 def digest_of(viewer: Path) -> str:

@@ -90,7 +90,10 @@ def main() -> None:
         for name, command in rows.items():
             cache = work / f"caches of {name}"
             installed, compiled = seconds(command), seconds(command, cache)
-            print(f"| {name} | {installed:.1f} | {compiled:.1f} | {median(seconds(command, cache) for _ in range(RUNS)):.2f} |", flush=True)
+            print(
+                f"| {name} | {installed:.1f} | {compiled:.1f} | {median(seconds(command, cache) for _ in range(RUNS)):.2f} |",
+                flush=True,
+            )
         print(f"| femsense --help | | | {median(seconds(['-m', 'femsense', '--help']) for _ in range(RUNS)):.2f} |")
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import importlib.util
 import os
+import pickle
 import platform
 import re
 import sys
@@ -48,6 +49,8 @@ OTHER_LIBRARIES = {"libusb-1.0.so.0": "libusb-1.0-0", "libEGL.so.1": "libegl1", 
 """What other versions of it may want."""
 LITTLE_MEMORY_GB = 2.0
 SMALL_RESIDUAL_N = 1e-6
+FEW_KERNELS = 50
+"""Functions: an installation brings 59, and the tiny solve alone leaves 31."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +82,7 @@ def diagnose(packages: Mapping[str, str] = PACKAGES) -> dict[str, Any]:
         _viewer,
         _robots,
         _numba_cache,
+        _kernels,
         _tiny_solve,
         _machine,
     )
@@ -213,6 +217,31 @@ def _numba_cache() -> Check:
             "set NUMBA_CACHE_DIR to a folder of your own",
         )
     return Check("cache of compiled kernels", "ok", "can be written")
+
+
+def _kernels() -> Check:
+    """Kernels of calibrate and estimate come along compiled, if the build could run them; each is a file where numba looks for it."""
+    package = Path(femsense.__file__).parent
+    chosen = os.environ.get("NUMBA_CACHE_DIR")
+    found = [_kernel_version(file) for file in (Path(chosen) if chosen else package).rglob("*.nbi")]
+    mine = found.count(_version("numba"))
+    if mine >= FEW_KERNELS:
+        return Check("compiled kernels", "ok", f"{mine} functions are compiled")
+    other = f", and {len(found) - mine} by another version of numba" if mine < len(found) else ""
+    return Check(
+        "compiled kernels",
+        "warning",
+        f"{mine} functions are compiled{other}: the first calibrate and estimate compile for up to a minute each",
+        "NUMBA_CACHE_DIR hides those that came along"
+        if chosen
+        else "pip install --force-reinstall --no-deps -v femsense says why",
+    )
+
+
+def _kernel_version(index: Path) -> object:
+    """Return the version of numba that wrote an index of compiled code: its first entry."""
+    with index.open("rb") as file:
+        return pickle.load(file)
 
 
 def _tiny_solve() -> Check:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import pickle
+from pathlib import Path
 
+import numba
 import pytest
 
 from femsense.app import cli
@@ -36,3 +39,22 @@ def test_a_package_that_is_missing_is_an_error_with_its_install_line() -> None:
 )
 def test_a_library_of_the_system_is_named_by_its_package(message: str, hint: str) -> None:
     assert import_hint(message, "p").endswith(hint)
+
+
+@pytest.mark.parametrize(
+    ("version", "count", "level", "said"),
+    [
+        (numba.__version__, 59, "ok", "59 functions"),
+        (numba.__version__, 31, "warning", "31 functions"),
+        ("0.1", 59, "warning", "another"),
+    ],
+)
+def test_whether_compiled_kernels_came_along(
+    version: str, count: int, level: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    for number in range(count):
+        (tmp_path / f"kernel-{number}.nbi").write_bytes(pickle.dumps(version))
+    (check,) = [check for check in diagnose({})["checks"] if check["name"] == "compiled kernels"]
+    assert check["level"] == level and said in check["found"]
+    assert (check["hint"] is None) == (level == "ok")
