@@ -23,13 +23,16 @@ from femsense.xr.view import live_page_files
 class Source:
     """Two bars that stream from a thread until they are paused."""
 
-    def __init__(self, run: RunStream, page: Path, *, still: bool = False) -> None:
+    def __init__(self, run: RunStream, page: Path, *, still: bool = False, commands: bool = False) -> None:
         self.hub, self.run, self.flowing, self.stop = Hub(), run, Event(), Event()
         self.last: TwinFrame | None = next(frames_of(run)) if still else None
         handle = Handle("top", np.array([0.0, 0.0, 0.2]))
         marks = (Landmark("top", handle.position_m), Landmark("side", np.array([0.015, 0.0, 0.1])))
         known = Landmarks(marks, (Landmark("the camera", np.array([0.3, -0.4, 0.2])),))
-        twins = [replace(run.twin, name="bar", handles=(handle,), landmarks=known), replace(run.twin, name="bar-2")]
+        twins = [
+            replace(run.twin, name="bar", handles=(handle,), landmarks=known, commands=commands),
+            replace(run.twin, name="bar-2"),
+        ]
         self.publishers = [Publisher(self.hub, twin) for twin in twins]
         self.wishes: list[dict[str, Any]] = []
         self.hub.listen(self.heard)

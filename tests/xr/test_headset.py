@@ -141,6 +141,23 @@ await page.screenshot({ path: shots + '/after.png' });
 await end({ before, vr, pulled, carried, at, pinched, drawn, after });
 """
 
+BOTH_HANDS = """
+await enter('#enter-vr');
+const trigger = (which, value) => page.evaluate(([w, v]) => device.controllers[w].updateButtonValue('trigger', v), [which, value]);
+const words = () => page.evaluate(() => femsense.stage.headset.words.text);
+const [x, y, z] = (await look()).ball, said = [];
+await put('controller', x, y, z + 0.4);
+await page.evaluate(() => device.controllers.left.position.set(-0.4, 1.0, 0.3));
+for (const [which, value] of [['right', 1], ['left', 1], ['left', 0], ['left', 1], ['right', 0], ['left', 0]]) {
+  await frames();
+  await trigger(which, value);
+  await frames(6);
+  said.push(await words());
+}
+await leave();
+await end({ said });
+"""
+
 PLACE_AND_ALIGN = """
 const half = Math.SQRT1_2;
 await put('device', 0, 1.6, 0, [-Math.sin(0.4), 0, 0, Math.cos(0.4)]);   // looks down at the table
@@ -178,10 +195,12 @@ await end({ waiting, ring, placed, anchored, asked, aligned, said, after: await 
 """
 
 
-def in_the_room(request: pytest.FixtureRequest, page: Path, tmp_path: Path, script: str) -> tuple[dict[str, Any], Source]:
+def in_the_room(
+    request: pytest.FixtureRequest, page: Path, tmp_path: Path, script: str, *, commands: bool = False
+) -> tuple[dict[str, Any], Source]:
     """What a script finds in an emulated headset beside two bars that stream."""
     iwer = npm_folder(request.config.cache.mkdir("iwer"), "iwer@2.5.0") / "node_modules" / "iwer" / "build" / "iwer.min.js"
-    source = Source(open_run(write_run_with_mesh(tmp_path / "bar")), page, still=True)
+    source = Source(open_run(write_run_with_mesh(tmp_path / "bar")), page, still=True, commands=commands)
     try:
         browser = start_browser(request.config, ROOM + script, source.server.url, str(iwer), str(tmp_path))
         out, errors = browser.communicate(timeout=300)
@@ -209,6 +228,17 @@ def test_a_headset_enters_drags_carries_and_leaves(request: pytest.FixtureReques
     assert held and {wish["handle"] for wish in held} == {"top"} and not source.wishes[-1]["held"]
     moves = np.array([[wish["target_m"][axis] for axis in "xyz"] for wish in held])
     assert np.ptp(moves[:, 0]) == pytest.approx(0.05, abs=2e-3)  # x of the room is the robot's
+
+
+def test_the_robot_follows_one_hand_while_the_other_is_closed_too(
+    request: pytest.FixtureRequest, built_page: Path, tmp_path: Path
+) -> None:
+    seen, source = in_the_room(request, built_page, tmp_path, BOTH_HANDS, commands=True)
+    one, both = "close your other hand too, and the robot follows", "the robot follows"
+    assert seen["said"] == [one, both, one, both, "", ""]
+    held = [wish["armed"] for wish in source.wishes if wish["held"]]
+    turns = [now for before, now in zip([None, *held], held) if before != now]
+    assert turns == [False, True, False, True] and not source.wishes[-1]["held"] and not source.wishes[-1]["armed"]
 
 
 def test_in_ar_a_hit_surface_carries_the_robot_and_touched_markers_lay_it_over_the_real_one(

@@ -39,13 +39,17 @@ await page.waitForFunction(() => document.querySelector('#sum').textContent.incl
 say({ text: await page.evaluate(() => document.body.innerText), clock: await page.textContent('#clock'), meters: await page.locator('[role=meter]').count() });
 await told();
 await page.waitForFunction(() => femsense.shown.robots.get('bar').shown?.frame === 999, null, { timeout: 60000 });
+await page.selectOption('#paint', 'stress');
+await page.waitForTimeout(300);                                // fields come ten times a second
+await page.waitForFunction(() => document.querySelector('#scale-top').textContent.includes('strain'));
 say(await page.evaluate(() => {
   const { body, shown } = femsense.shown.robots.get('bar');
   body.gltf.scene.updateMatrixWorld(true);
   const skin = body.skins[0], at = skin.position.clone();
   const vertices = [0, 50, 200].map((i) => skin.getVertexPosition(i, at).toArray());
   const arrow = body.arrows.group.children[0];
-  return { vertices, arrow: arrow.getWorldPosition(at).toArray(), cone: arrow.children[3].visible, bones: Array.from(shown.bones) };
+  return { vertices, arrow: arrow.getWorldPosition(at).toArray(), cone: arrow.children[3].visible, bones: Array.from(shown.bones),
+    field: Array.from(skin.geometry.getAttribute('paintField').array), mode: body.painter.mode.value, scale: document.querySelector('#scale-top').textContent };
 }));
 await page.evaluate(() => new Promise((done) => {
   let last = performance.now();
@@ -114,7 +118,9 @@ def test_what_streams_is_shown_where_it_is_and_greys_when_it_stops(
         source.last = replace(frame, frame=999, contacts=(unsure,))
         browser.stdin.write("go\n")
         browser.stdin.flush()
-        check_scene(said(), run, source.last)
+        scene = said()
+        check_scene(scene, run, source.last)
+        assert scene["field"] == run.field[11].tolist() and scene["mode"] == 2 and scene["scale"].endswith("% strain")
         assert said()["watching"]
         source.flowing.clear()
         stale = said()

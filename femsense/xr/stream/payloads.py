@@ -4,7 +4,8 @@ A pose is a header of 20 bytes and seven numbers a bone, little-endian:
 
     "FSP1" · seq uint32 · time float64 [s] · bones uint16 · 0 uint16 · (x y z qx qy qz qw) float32 each, robot frame [m]
 
-A cloud is the same header with "FSC1" and a count uint32, then (x y z residual) float32 of each point [m]. All else is JSON that
+A cloud is the same header with "FSC1" and a count uint32, then (x y z residual) float32 of each point [m]. A field, stress for instance, is
+that header with "FSV1", then the largest value float32 and the share of it at each vertex of the mesh, 0 … 255. All else is JSON that
 Unity's JsonUtility reads: objects at the top, no dictionaries, unknown numbers left out.
 """
 
@@ -25,7 +26,7 @@ from femsense.core.errors import InputError
 from femsense.xr.landmarks import Landmarks
 
 PREFIX = "femsense"
-MODEL, GLB, POSE, POSE_JSON, FORCE, INPUTS, CLOUD, STATUS = (
+MODEL, GLB, POSE, POSE_JSON, FORCE, INPUTS, CLOUD, FIELD, STATUS = (
     "model",
     "glb",
     "pose",
@@ -33,6 +34,7 @@ MODEL, GLB, POSE, POSE_JSON, FORCE, INPUTS, CLOUD, STATUS = (
     "force",
     "inputs",
     "cloud",
+    "field",
     "status",
 )
 DRAG, GHOST, REACH, COMMAND, MEASURED = "drag", "ghost", "reach", "command", "measured"
@@ -43,7 +45,7 @@ RETAINED = (MODEL, GLB, STATUS)
 SCHEMA = "femsense-model-1"
 POSE_HEAD = struct.Struct("<4sIdHH")
 CLOUD_HEAD = struct.Struct("<4sIdI")
-POSE_MAGIC, CLOUD_MAGIC = b"FSP1", b"FSC1"
+POSE_MAGIC, CLOUD_MAGIC, FIELD_MAGIC = b"FSP1", b"FSC1", b"FSV1"
 MOST_BONES, MOST_POINTS = 255, 20_000
 
 
@@ -77,6 +79,16 @@ class Handle:
     """At rest, robot frame, shape (3,)."""
 
 
+@dataclass(frozen=True, slots=True)
+class FieldKind:
+    """A quantity that colours the body."""
+
+    name: str
+    unit: str
+    largest: float
+    """That has the full colour."""
+
+
 @dataclass(frozen=True, eq=False, slots=True)
 class Twin:
     """What stays the same of a robot that streams."""
@@ -95,6 +107,8 @@ class Twin:
     """What the real robot shares with it."""
     duration_s: float = float("nan")
     """Of a run that is played over and over; nan: none is."""
+    field: FieldKind | None = None
+    """What `TwinFrame.field` holds."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -134,6 +148,8 @@ class TwinFrame:
     """From the beginning of a run that is played over and over."""
     cloud: npt.NDArray[np.float32] | None = None
     """Measured points and their distance from the surface [m], shape (n, 4)."""
+    field: npt.NDArray[np.uint8] | None = None
+    """Of the twin's field, share of the largest value at each vertex of the mesh, 0 … 255, shape (v,)."""
 
 
 def topic(robot: str, kind: str) -> str:
@@ -186,6 +202,12 @@ def cloud_bytes(seq: int, time_s: float, points: npt.ArrayLike) -> bytes:
     return CLOUD_HEAD.pack(CLOUD_MAGIC, seq & 0xFFFFFFFF, time_s, len(rows)) + rows.tobytes()
 
 
+def field_bytes(seq: int, time_s: float, largest: float, shares: npt.NDArray[np.uint8]) -> bytes:
+    """Return a message of a field: shares of the largest value, 0 … 255, shape (v,)."""
+    head = CLOUD_HEAD.pack(FIELD_MAGIC, seq & 0xFFFFFFFF, time_s, len(shares))
+    return head + struct.pack("<f", largest) + shares.tobytes()
+
+
 # Documents
 
 
@@ -219,6 +241,7 @@ def model_bytes(twin: Twin, glb_url: str) -> bytes:
                 "markers": [{"name": m.name, "position_m": _vector(m.position_m)} for m in known.markers],
                 "cameras": [{"name": c.name, "position_m": _vector(c.position_m)} for c in known.cameras],
                 "duration_s": twin.duration_s,
+                **({"field": {"name": twin.field.name, "unit": twin.field.unit}} if twin.field else {}),
             }
         )
     )

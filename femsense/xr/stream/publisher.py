@@ -10,6 +10,7 @@ from threading import Event
 from femsense.xr.stream.hub import Hub, Message
 from femsense.xr.stream.payloads import (
     CLOUD,
+    FIELD,
     FORCE,
     GLB,
     INPUTS,
@@ -20,6 +21,7 @@ from femsense.xr.stream.payloads import (
     Twin,
     TwinFrame,
     cloud_bytes,
+    field_bytes,
     force_bytes,
     inputs_bytes,
     model_bytes,
@@ -40,7 +42,7 @@ class PublishOptions:
     rate_hz: float = 60.0
     """Of poses and forces."""
     cloud_rate_hz: float = 10.0
-    """Of clouds: they are large."""
+    """Of clouds and fields: they are large."""
     json_mirror: bool = False
     """Also `pose_json`, for clients that read only text."""
     glb_url: str = ""
@@ -71,7 +73,8 @@ class Publisher:
         self.options = options or PublishOptions()
         self.sent = 0
         self._has_cloud = False
-        self._pose_limit, self._cloud_limit = RateLimit(self.options.rate_hz), RateLimit(self.options.cloud_rate_hz)
+        self._pose_limit = RateLimit(self.options.rate_hz)
+        self._cloud_limit, self._field_limit = RateLimit(self.options.cloud_rate_hz), RateLimit(self.options.cloud_rate_hz)
         self.announce(twin)
 
     def announce(self, twin: Twin) -> None:
@@ -107,6 +110,8 @@ class Publisher:
         elif frame.cloud is not None and self._cloud_limit.allows(moment):
             messages.append(Message(topic(name, CLOUD), cloud_bytes(seq, t, frame.cloud)))
             self._has_cloud = True
+        if self.twin.field is not None and frame.field is not None and self._field_limit.allows(moment):
+            messages.append(Message(topic(name, FIELD), field_bytes(seq, t, self.twin.field.largest, frame.field)))
         self.hub.publish(messages)
         self.sent += 1
         return True

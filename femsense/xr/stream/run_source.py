@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -16,8 +17,8 @@ from femsense.core.arrays import FloatArray, freeze
 from femsense.core.errors import FemsenseError
 from femsense.xr.glb_reader import AnimatedSkin, read_glb
 from femsense.xr.landmarks import landmarks_of_run
-from femsense.xr.run_contents import contacts_of_run, current_glb, run_folder
-from femsense.xr.stream.payloads import Contact, Input, Twin, TwinFrame
+from femsense.xr.run_contents import contacts_of_run, current_glb, run_folder, stress_of_run
+from femsense.xr.stream.payloads import Contact, FieldKind, Input, Twin, TwinFrame
 
 CLOUD_POINTS = 3000
 """Of a measured cloud that are shown."""
@@ -37,6 +38,8 @@ class RunStream:
     """As `contacts_of_run` has them, one for each pose."""
     clouds: tuple[npt.NDArray[np.float32] | None, ...]
     """Measured points and residuals [m], shape (n, 4), of each pose."""
+    field: npt.NDArray[np.uint8]
+    """Share of the largest stress at each vertex of each pose, 0 … 255, shape (F, v)."""
 
     @property
     def duration_s(self) -> float:
@@ -61,6 +64,8 @@ def open_run(folder: str | Path, *, name: str | None = None, clouds: bool = True
         glb = current_glb(run, Path(scratch)).read_bytes()
     skin = read_glb(glb)
     skeleton = skin.skin.skeleton
+    stress = stress_of_run(run, glb)
+    (largest,) = struct.unpack_from("<f", stress)
     twin = Twin(
         name=name or str(told["name"]),
         glb=glb,
@@ -69,10 +74,12 @@ def open_run(folder: str | Path, *, name: str | None = None, clouds: bool = True
         inputs=tuple(Input(**entry) for entry in told["inputs"]),
         landmarks=landmarks_of_run(run),
         duration_s=float(skin.time_s[-1]),
+        field=FieldKind(**told["field"], largest=largest),
     )
     frames = tuple(told["frames"])
     measured = _clouds(run, frames) if clouds else None
-    return RunStream(twin, skin, frames, measured or (None,) * len(frames))
+    shares = np.frombuffer(stress, np.uint8, offset=4).reshape(len(frames), -1)
+    return RunStream(twin, skin, frames, measured or (None,) * len(frames), shares)
 
 
 def frames_of(stream: RunStream, *, rate_hz: float = 60.0, loop: bool = True) -> Iterator[TwinFrame]:
@@ -122,6 +129,7 @@ def _frame(stream: RunStream, t: float, sent_at: float, nearest: int) -> TwinFra
         frame=-1 if told["frame"] is None else told["frame"],
         run_s=t,
         cloud=stream.clouds[nearest],
+        field=stream.field[nearest],
     )
 
 

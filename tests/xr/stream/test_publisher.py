@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
+import struct
 import threading
 
+import numpy as np
 from streams import moment, twin
 
 from femsense.xr.stream.hub import Hub, Message
+from femsense.xr.stream.payloads import FieldKind
 from femsense.xr.stream.publisher import Publisher, PublishOptions, RateLimit, play
 
 
@@ -52,6 +56,20 @@ def test_messages_of_a_moment_go_together_and_too_many_do_not_go() -> None:
     assert sink.topics() == ["pose", "force", "inputs"] and len(sink.batches) == 1
     publisher.end()
     assert b"ended" in hub.newest()["femsense/arm/status"].payload
+
+
+def test_a_field_goes_out_ten_times_a_second_at_most() -> None:
+    hub, sink = Hub(), Kept()
+    coloured = dataclasses.replace(twin(), field=FieldKind("stress", "Pa", largest=2500.0))
+    publisher, shares = Publisher(hub, coloured), np.array([0, 128, 255], dtype=np.uint8)
+    hub.attach(sink)
+    for k in range(60):
+        publisher.publish(dataclasses.replace(moment(k / 60), field=shares), now=k / 60)
+    assert sink.topics().count("field") in (10, 11) and sink.topics().count("pose") >= 59
+    payload = hub.newest()["femsense/arm/field"].payload
+    magic, _, _, count, largest = struct.unpack_from("<4sIdIf", payload)
+    assert (magic, count, largest) == (b"FSV1", 3, 2500.0) and payload[24:] == shares.tobytes()
+    assert b'"field":{"name":"stress","unit":"Pa"}' in hub.newest()["femsense/arm/model"].payload.replace(b" ", b"")
 
 
 def test_frames_are_played_at_their_times() -> None:

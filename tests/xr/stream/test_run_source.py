@@ -52,6 +52,15 @@ def test_a_frame_says_what_the_run_says_of_that_moment(stream: RunStream) -> Non
     assert [(i.name, i.unit, i.high) for i in stream.twin.inputs] == [("top", "N", 2.3000000000000003), ("bellow", "Pa", 2300.0)]
 
 
+def test_the_stress_of_a_frame_is_that_of_the_page_of_a_run(stream: RunStream) -> None:
+    frames = list(frames_of(stream, rate_hz=23 / 2.0, loop=False))
+    assert stream.twin.field is not None and stream.twin.field.largest > 0
+    vertices = len(stream.skin.skin.rest)
+    fields = np.array([frame.field for frame in frames])
+    assert fields.shape == (24, vertices) and fields.max() == 255
+    assert not fields[[0, -1]].any() and fields[5].all()  # the bar is straight at both ends of its dance
+
+
 def test_time_goes_on_when_the_run_begins_again(stream: RunStream) -> None:
     frames = list(itertools.islice(frames_of(stream, rate_hz=50.0), 300))
     steps = np.diff([f.time_s for f in frames])

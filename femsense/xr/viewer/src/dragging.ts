@@ -143,7 +143,26 @@ export class Dragging {
     if (index === null) return null;
     this.begin(index);
     const place = tied(hand, new Matrix4().setPosition(this.wish));
-    return { follow: () => void this.wish.setFromMatrixPosition(place()), release: () => this.release() };
+    const follow = (): void => void this.wish.setFromMatrixPosition(place());
+    if (!this.subject.commands || this.armed) return { follow, release: () => this.release() };
+    return { follow, ...this.byBothHands() };
+  }
+
+  /** The robot follows while the other hand is closed too. */
+  private byBothHands(): Pick<Hold, "release" | "second"> {
+    const { headset } = this.stage;
+    const second = (closed: boolean): void => {
+      if (this.held === null) return;
+      this.arm(closed);
+      headset.say(this.armed ? "the robot follows" : "close your other hand too, and the robot follows");
+    };
+    const release = (): void => {
+      this.release();
+      this.arm(false);
+      headset.say("");
+    };
+    second(false);
+    return { release, second };
   }
 
   /** Shows what the server found, and where the robot would be. */

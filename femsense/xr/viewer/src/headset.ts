@@ -33,6 +33,8 @@ export class Hand {
 export interface Hold {
   follow(): void;
   release(): void;
+  /** The other hand closes or opens: both hands together let the robot follow. Without it, the other hand holds something of its own. */
+  second?: (closed: boolean) => void;
 }
 
 /** Ties a place of the world to a hand: returns what tells where it is now. */
@@ -150,6 +152,12 @@ export class Headset {
     if (this.holds[index] || this.alignment?.open) return;
     const hand = this.hands[index]!;
     hand.update();
+    const second = this.holds[1 - index]?.second;
+    if (second) {
+      second(true);
+      this.holds[index] = { follow: () => undefined, release: () => second(false) };
+      return;
+    }
     this.holds[index] = (pinch ? this.grab(hand) : null) ?? this.carry(hand);
   }
 

@@ -4,10 +4,10 @@ import { Box3 } from "three";
 import { Body, loadMesh } from "./body";
 import { Connection, streamUrl } from "./connection";
 import { alignWith, connectTools, notice, paintChoice, paintLegend, toggle } from "./controls";
-import { frameAt, type Frame } from "./data";
+import { amount, frameAt, type Frame } from "./data";
 import { Dragging } from "./dragging";
-import { pack, readCloud, readForces, readInputs, readModel, readPose, readReach, readStatus, type Message, type Model } from "./messages";
-import type { Paint } from "./paint";
+import { pack, readCloud, readField, readForces, readInputs, readModel, readPose, readReach, readStatus, type Message, type Model } from "./messages";
+import type { Field, Paint } from "./paint";
 import { Plot } from "./plot";
 import { drawCurve, element, showFrame } from "./readout";
 import { showPlaying } from "./recorded";
@@ -21,6 +21,7 @@ const RATE_MS = 2000; // over which the rate is counted
 
 interface Moment extends Frame {
   bones: Float32Array;
+  field: Field | null;
 }
 
 /** Shows all robots of the stream beside this page; returns what programs may look at. */
@@ -38,6 +39,7 @@ class Streams {
   private paused = false;
   private at = 0; // time that is shown while paused [s]
   private drawn = 0;
+  private told: number | undefined; // largest value of the field that the legend names
 
   constructor(private readonly stage: Stage) {
     this.connection = new Connection(streamUrl(), (messages) => this.take(messages), (open) => this.connected(open));
@@ -147,6 +149,9 @@ class Streams {
     if (badge.textContent !== said) badge.textContent = said;
     if (!robot) return;
     element("about").textContent = robot.about();
+    const stress = element<HTMLOptionElement>("paint-stress");
+    if (stress.hidden !== !robot.model.field) stress.hidden = !robot.model.field;
+    if (robot.newest?.field?.largest !== this.told) this.legend(element<HTMLSelectElement>("paint").value as Paint);
     element("cloud").hidden = !robot.body?.hasCloud;
     element("legend").hidden = !robot.body?.hasCloud || element("cloud").getAttribute("aria-pressed") !== "true";
     if (robot.body) element("legend-scale").textContent = `${(1000 * robot.body.residualScale).toPrecision(1)} mm`;
@@ -173,6 +178,12 @@ class Streams {
     drawCurve(robot.history.filter((_, i) => i % every === 0), oldest, newest);
     element("clock").textContent = this.paused ? `${(shown - newest).toFixed(1)} s` : clockText(robot, shown);
     element("live").setAttribute("aria-pressed", String(!this.paused));
+  }
+
+  private legend(kind: Paint): void {
+    const field = this.chosen?.newest?.field;
+    this.told = field?.largest;
+    paintLegend(kind, this.chosen?.body ?? null, field ? `${amount(field.largest, field.unit)} ${field.name}` : "");
   }
 
   private pause(on: boolean, at?: number): void {
@@ -209,7 +220,7 @@ class Streams {
     };
     const paint = paintChoice((kind) => {
       bodies(Robot.dress);
-      paintLegend(kind, this.chosen?.body ?? null);
+      this.legend(kind);
     });
     const [ghost, cloud, forces] = ["ghost", "cloud", "forces"].map((id) => toggle(id, () => bodies(Robot.dress)));
     const drag = toggle("drag", (on) => this.dragging.enable(on));
@@ -249,6 +260,8 @@ class Robot {
   ghost: Float32Array | null = null;
   private forces: ReturnType<typeof readForces> = null;
   private inputs: (number | null)[] | null = null;
+  private field: Field | null = null;
+  private painted: Field | null = null; // the field that the body has now
   private arrived = -Infinity; // when the newest pose came [ms of the page]
   private told = { state: "", detail: "" };
   private readonly arrivals: number[] = []; // when poses of the last seconds came [ms of the page]
@@ -282,6 +295,7 @@ class Robot {
     else if (kind === "reach") this.reach = readReach(payload);
     else if (kind === "ghost") this.ghost = readPose(payload)?.bones ?? null;
     else if (kind === "cloud") this.seen(readCloud(payload));
+    else if (kind === "field") this.field = this.quantity(readField(payload));
     this.join();
   }
 
@@ -326,20 +340,28 @@ class Robot {
     this.arrivals.push(now);
     while (this.arrivals[0]! < now - RATE_MS) this.arrivals.shift();
     if (this.newest && pose.time < this.newest.time_s - 1) this.history.length = 0; // the source began anew
-    this.newest = { time_s: pose.time, bones: pose.bones, frame: null, status: null, rms_after_m: null, inputs: null, contacts: [] };
+    this.newest = { time_s: pose.time, bones: pose.bones, frame: null, status: null, rms_after_m: null, inputs: null, contacts: [], field: null };
     this.join();
     this.history.push(this.newest);
     while (this.history.length && this.history[0]!.time_s < pose.time - KEPT_S) this.history.shift();
   }
 
   private join(): void {
-    if (this.newest) Object.assign(this.newest, this.forces ?? {}, { inputs: this.inputs });
+    if (this.newest) Object.assign(this.newest, this.forces ?? {}, { inputs: this.inputs, field: this.field });
   }
 
   private put(moment: Moment): void {
     this.shown = moment;
     this.body?.pose(moment.bones);
     this.body?.show(moment.contacts);
+    if (!this.body || moment.field === this.painted) return;
+    this.painted = moment.field;
+    this.body.painter.setField(moment.field);
+    this.body.painter.frame(0);
+  }
+
+  private quantity(read: ReturnType<typeof readField>): Field | null {
+    return read && this.model.field ? { ...this.model.field, ...read } : null;
   }
 
   private seen(points: Float32Array | null): void {

@@ -1,6 +1,7 @@
 // The bytes of a stream (docs/streaming.md): frames of messages, poses, clouds, documents.
 
 import type { Contact, Frame, Input, NamedPoint, Vector } from "./data";
+import type { Field } from "./paint";
 
 export interface Message {
   robot: string;
@@ -19,6 +20,7 @@ export interface Model {
   cameras: NamedPoint[];
   commands: boolean;
   duration: number | null; // of a run that is played over and over [s]
+  field: { name: string; unit: string } | null; // what colours the body
 }
 
 export interface Pose {
@@ -82,6 +84,13 @@ export function readCloud(payload: Uint8Array): Float32Array | null {
   return payload.byteLength === 20 + 16 * count ? floats(payload, 20, 4 * count) : null;
 }
 
+/** Returns the largest value, and its share at each vertex, 0 … 255. */
+export function readField(payload: Uint8Array): Pick<Field, "largest" | "values"> | null {
+  const view = new DataView(payload.buffer, payload.byteOffset, payload.byteLength);
+  if (payload.byteLength < 24 || text.decode(payload.subarray(0, 4)) !== "FSV1") return null;
+  return payload.byteLength === 24 + view.getUint32(16, true) ? { largest: view.getFloat32(20, true), values: payload.slice(24) } : null;
+}
+
 export function readModel(payload: Uint8Array): Model | null {
   const told = document(payload);
   if (!told || told.schema !== "femsense-model-1") return null;
@@ -96,6 +105,7 @@ export function readModel(payload: Uint8Array): Model | null {
     cameras: list(told.cameras).map(named),
     commands: told.commands === true,
     duration: number(told.duration_s),
+    field: told.field ? quantity(told.field as Record<string, unknown>) : null,
   };
 }
 
@@ -133,6 +143,10 @@ export function readReach(payload: Uint8Array): Reach | null {
     armed: told.armed === true,
     inputs: list(told.inputs).map((i) => ({ name: String(i.name), value: number(i.value) ?? NaN, unit: String(i.unit ?? "") })),
   };
+}
+
+function quantity(told: Record<string, unknown>): { name: string; unit: string } {
+  return { name: String(told.name ?? ""), unit: String(told.unit ?? "") };
 }
 
 function named(told: Record<string, unknown>): NamedPoint {

@@ -23,6 +23,7 @@ export class Painter {
   private readonly places = { value: Array.from({ length: CONTACTS }, () => new Vector4(0, 0, 0, 0)) };
   private readonly attributes: BufferAttribute[] = [];
   private field: Field | null = null;
+  private paint: Paint = "none";
 
   /** size: of the body [m]. */
   constructor(private readonly size: number) {}
@@ -50,23 +51,31 @@ export class Painter {
 
   /** largest: motion that has the full colour [m]. */
   show(paint: Paint, largest: number): void {
-    this.mode.value = paint === "stress" && !this.field ? 0 : PAINTS.indexOf(paint);
+    this.paint = paint;
+    this.choose();
     this.scale.value = Math.max(largest, 1e-9);
   }
 
   setField(field: Field | null): void {
     this.field = field;
+    this.choose();
   }
 
   /** Shows the field of a frame. */
   frame(index: number): void {
     if (!this.field) return;
-    let at = index * this.attributes.reduce((sum, a) => sum + a.count, 0);
+    const vertices = this.attributes.reduce((sum, a) => sum + a.count, 0);
+    if (this.field.values.length < (index + 1) * vertices) return; // of another mesh
+    let at = index * vertices;
     for (const attribute of this.attributes) {
       attribute.array.set(this.field.values.subarray(at, at + attribute.count));
       attribute.needsUpdate = true;
       at += attribute.count;
     }
+  }
+
+  private choose(): void {
+    this.mode.value = this.paint === "stress" && !this.field ? 0 : PAINTS.indexOf(this.paint);
   }
 
   /** A contact is as likely at a point as its place, known to one standard deviation, and its patch allow. */
