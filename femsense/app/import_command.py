@@ -18,6 +18,10 @@ from femsense.io.importers.writer import RECORD, write_recording
 
 Progress = Callable[..., None]
 Say = Callable[[str], None]
+MANY_FRAMES = 1000
+"""Recordings of more frames than this are told how to take fewer: what follows takes time for each …"""
+ENOUGH_FRAMES = 300
+"""… and where a robot moves slowly, so many say as much."""
 
 
 def columns_named(columns: Sequence[str]) -> dict[str, str]:
@@ -109,7 +113,7 @@ def import_into(
         replace=again,
         progress=progress,
     )
-    return {**found, "notes": list(source.notes), **_accepted(final, found)}
+    return {**found, "notes": [*source.notes, *_thinning(found, options)], **_accepted(final, found)}
 
 
 def import_text(folder: str | Path, document: Mapping[str, Any]) -> str:
@@ -121,6 +125,20 @@ def import_text(folder: str | Path, document: Mapping[str, Any]) -> str:
     lines = [f"{folder}: a recording of {document['frames']} frames", "", *section_text(shown)]
     lines += ["", *(f"note: {note}" for note in notes)] if notes else []
     return "\n".join(lines)
+
+
+def _thinning(found: Mapping[str, Any], options: Options) -> tuple[str, ...]:
+    """Return what is said of a recording of very many frames."""
+    frames = int(found["frames"])
+    if frames <= MANY_FRAMES:
+        return ()
+    step = options.every * round(frames / ENOUGH_FRAMES)
+    rate = found.get("rate_hz")
+    kept = "" if not rate else f", {rate * options.every / step:.3g} a second"
+    return (
+        f"{frames} frames: calibrate, estimate and improve take time for each; if the robot moves slowly, "
+        f"--every {step} keeps about {ENOUGH_FRAMES} of them{kept}",
+    )
 
 
 def _check_options(options: Options, inputs: str | None, zero: str | None) -> None:

@@ -50,7 +50,7 @@ MESH_ENDINGS = (
     ".med",
     ".vol",
 )
-CAPTURE_ENDINGS = (".bag", ".db3", ".mcap", ".c3d", ".xyz", ".gz")
+CAPTURE_ENDINGS = (".bag", ".db3", ".mcap", ".c3d", ".mkv", ".gz")
 
 
 def inspect_path(path: str | Path, *, robot: str | Path | None = None) -> Report:

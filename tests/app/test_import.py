@@ -164,3 +164,21 @@ def test_inspect_says_what_is_in_a_capture_and_never_that_nothing_is_wrong(
         (tmp_path / name).write_bytes(data)
         status, report = answer(capsys, "inspect", tmp_path / name)
         assert status == 2 and report["kind"] == "capture" and report["problems"]
+
+
+def test_a_recording_of_very_many_frames_is_told_how_to_take_fewer(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rows = "".join(f"{0.005 * k:.3f},{k % 50},0,1000,{k % 3}\n" for k in range(1200))
+    (tmp_path / "long.csv").write_text(ROWS.splitlines(keepends=True)[0] + rows)
+    words = ("import", tmp_path / "long.csv", "-o", tmp_path / "out", "--unit", "mm", "--inputs", "tension")
+    status, document = answer(capsys, *words)
+    assert status == 0 and any("--every 4 keeps about 300 of them, 50 a second" in note for note in document["notes"])
+    status, document = answer(capsys, *words, "--every", 4, "--again")
+    assert status == 0 and document["frames"] == 300 and not any("--every" in note for note in document["notes"])
+
+
+def test_inspect_knows_a_video_of_depth(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from kinect_writer import write_kinect
+
+    file = write_kinect(tmp_path / "take.mkv", [np.full((288, 320), 900, dtype=np.uint16)])
+    status, report = answer(capsys, "inspect", file)
+    assert status == 0 and (report["kind"], report["format"]) == ("capture", "kinect")

@@ -15,6 +15,7 @@ from femsense.core.text import did_you_mean
 from femsense.io.importers.c3d import open_c3d, read_c3d_header
 from femsense.io.importers.folders import CLOUDS, folder_kind, open_clouds, open_redwood, open_tum
 from femsense.io.importers.frames import Options, Source
+from femsense.io.importers.kinect import open_kinect
 from femsense.io.importers.mocap_csv import is_mocap_csv, open_mocap_csv, read_export
 from femsense.io.importers.plain_csv import header_of, open_plain_csv
 from femsense.io.importers.ros import list_ros, open_ros
@@ -24,6 +25,7 @@ from femsense.io.importers.several import camera_names, joined
 FORMATS: dict[str, Callable[[Path, Options], Source]] = {
     "ros": open_ros,
     "realsense": open_ros,
+    "kinect": open_kinect,
     "c3d": open_c3d,
     "optitrack": open_mocap_csv,
     "vicon": open_mocap_csv,
@@ -38,6 +40,7 @@ SIGNATURES = (
     (b"\x89MCAP0\r\n", "ros"),
     (b"SQLite format 3\x00", "ros"),
     (b"Format Version,", "optitrack"),
+    (b"\x1aE\xdf\xa3", "kinect"),
 )
 """How files begin; the ending comes second."""
 
