@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
-from femsense.io.clouds.cloud_files import read_cloud
+from femsense.io.clouds.cloud_files import CLOUD_ENDINGS, read_cloud
 from femsense.io.clouds.images import png_header, read_png
+from femsense.io.importers.array_clouds import read_array_cloud
 from femsense.io.importers.frames import Frame, Images, Lens, Options, Source, unit_of
 from femsense.io.importers.pictures import decoded_image
 from femsense.pointcloud.cloud import PointCloud
@@ -25,13 +25,15 @@ TUM_UNIT = 1 / 5000
 REDWOOD_UNIT = 1 / 1000
 TUM_LENS = (525.0, 525.0, 319.5, 239.5)
 """The lens that the TUM benchmark gives for all its sequences, 640 × 480."""
+PAIRS = ("associations.txt", "associated.txt", "associate.txt", "association.txt")
+"""Lists of pairs as `associate.py` of TUM RGB-D prints them: time file time file, depth first or second."""
 NEAR_S = 0.02
 """Images of TUM RGB-D belong together up to this time apart, as its own `associate.py` has it."""
 
 
 def folder_kind(folder: Path) -> str | None:
     """Return "tum", "redwood" or "clouds"; None where a folder is none of these."""
-    if (folder / "depth.txt").is_file() and (folder / "depth").is_dir():
+    if (folder / "depth").is_dir() and any((folder / name).is_file() for name in ("depth.txt", *PAIRS)):
         return "tum"
     if (folder / "depth").is_dir() and any((folder / "depth").glob("*.png")):
         return "redwood"
@@ -39,9 +41,8 @@ def folder_kind(folder: Path) -> str | None:
 
 
 def open_tum(folder: Path, options: Options) -> Source:
-    """Return a TUM RGB-D folder (depth.txt, rgb.txt, associated by time) as a source. Raises InputError."""
-    depth = _list(folder / "depth.txt")
-    color = _list(folder / "rgb.txt") if (folder / "rgb.txt").is_file() else []
+    """Return a TUM RGB-D folder (depth.txt and rgb.txt, associated by time, or a list of pairs) as a source. Raises InputError."""
+    depth, color = _lists(folder)
     header = png_header(folder / depth[0][1]) if (folder / depth[0][1]).is_file() else None
     if header is None:
         raise InputError("the first depth image is missing or none", where=folder / depth[0][1], expected="a PNG of 16 bits")
@@ -106,25 +107,7 @@ def open_clouds(folder: Path, options: Options) -> Source:
 def read_points(file: Path) -> PointCloud:
     """Return the cloud of a PLY, PCD, XYZ, NPY or NPZ file in the file's unit. Raises InputError."""
     ending = file.suffix.lower()
-    if ending in (".ply", ".pcd"):
-        return read_cloud(file)
-    try:
-        table = _array(file)
-    except (OSError, ValueError, EOFError, KeyError) as error:
-        raise InputError(
-            "not readable as a cloud", where=file, found=f"{type(error).__name__}: {error}", expected="rows x y z [r g b]"
-        ) from None
-    if table.ndim == 3 and table.shape[2] >= 3:
-        table = table.reshape(-1, table.shape[2])
-    if table.ndim != 2 or table.shape[1] < 3:
-        raise InputError(
-            "not a cloud", where=file, found=f"shape {table.shape}", expected="(n, 3) places, or (n, 6) with colours"
-        )
-    kept = np.isfinite(table[:, :3]).all(axis=1) & (table[:, :3] != 0).any(axis=1)
-    colors = table[kept, 3:6] if table.shape[1] == 6 else None
-    if colors is not None and colors.size and (colors.min() < 0 or colors.max() > 255):
-        colors = None  # normals, or something else
-    return PointCloud(table[kept, :3], colors if colors is None or colors.max(initial=0) <= 1 else colors / 255.0)
+    return read_cloud(file) if ending in CLOUD_ENDINGS else read_array_cloud(file)
 
 
 # Images
@@ -157,15 +140,24 @@ def _images(depth: Path, color: Path | None) -> Images:
     return Images(image, pixels)
 
 
-def _list(path: Path) -> list[tuple[float, str]]:
-    """Return (time [s], file) of each line of a list of TUM RGB-D."""
+def _lists(folder: Path) -> tuple[list[tuple[float, str]], list[tuple[float, str]]]:
+    """Return (time [s], file) of the depth images and of the colour images."""
+    pairs = next((folder / name for name in PAIRS if (folder / name).is_file()), None)
+    if (folder / "depth.txt").is_file() or pairs is None:
+        return _list(folder / "depth.txt"), _list(folder / "rgb.txt") if (folder / "rgb.txt").is_file() else []
+    first, second = _list(pairs), _list(pairs, 2)
+    return (first, second) if first[0][1].startswith("depth") else (second, first)
+
+
+def _list(path: Path, column: int = 0) -> list[tuple[float, str]]:
+    """Return (time [s], file) of each line of a list of TUM RGB-D, from a column on."""
     found = []
     for number, line in enumerate(path.read_text(encoding="utf-8-sig", errors="replace").splitlines(), start=1):
         words = line.replace(",", " ").split()
         if not words or words[0].startswith("#"):
             continue
         try:
-            found.append((float(words[0]), words[1]))
+            found.append((float(words[column]), words[column + 1]))
         except (ValueError, IndexError):
             raise InputError(
                 "not a line of a list of images", where=f"{path}, line {number}", found=line, expected="time file"
@@ -289,25 +281,6 @@ def _cloud_times(folder: Path, files: list[Path], options: Options) -> list[floa
 
 
 # Clouds
-
-
-def _array(file: Path) -> FloatArray:
-    ending = file.suffix.lower()
-    if ending == ".xyz":
-        text = file.read_text(encoding="utf-8-sig").replace(",", " ").splitlines()
-        rows = [line.split() for line in text if line.strip() and not line.lstrip().startswith(("#", "//"))]
-        if rows and len(rows[0]) == 1:
-            rows = rows[1:]  # a count at the top
-        return np.array([[float(cell) for cell in row] for row in rows], dtype=np.float64).reshape(len(rows), -1)
-    loaded = np.load(file, allow_pickle=False)
-    if ending == ".npy":
-        return np.asarray(loaded, dtype=np.float64)
-    key = next((k for k in ("points", "xyz", "cloud", "pts", "arr_0") if k in loaded), None)
-    if key is None:
-        raise KeyError(f"none of points, xyz, cloud among {', '.join(loaded.files)}")
-    points = np.asarray(loaded[key], dtype=np.float64)
-    colors = next((np.asarray(loaded[k], dtype=np.float64) for k in ("colors", "rgb") if k in loaded), None)
-    return points if colors is None or colors.shape != points.shape else np.concatenate([points, colors], axis=-1)
 
 
 def _scaled_cloud(file: Path, scale: float) -> PointCloud:

@@ -13,7 +13,7 @@ from typing import Any
 from femsense.core.errors import InputError
 from femsense.core.text import did_you_mean
 from femsense.io.importers.c3d import open_c3d, read_c3d_header
-from femsense.io.importers.folders import CLOUDS, folder_kind, open_clouds, open_redwood, open_tum
+from femsense.io.importers.folders import CLOUDS, PAIRS, folder_kind, open_clouds, open_redwood, open_tum
 from femsense.io.importers.frames import Options, Source
 from femsense.io.importers.kinect import open_kinect
 from femsense.io.importers.mocap_csv import is_mocap_csv, open_mocap_csv, read_export
@@ -43,6 +43,8 @@ SIGNATURES = (
     (b"\x1aE\xdf\xa3", "kinect"),
 )
 """How files begin; the ending comes second."""
+PACKED = (".zstd", ".zst", ".zip", ".7z", ".tar", ".tgz", ".bz2", ".xz")
+UNPACK = "unpack it first (zstd -d, unzip, tar -x); a compressed bag of ROS 2 is read by its folder, which holds metadata.yaml"
 
 
 def open_source(path: str | Path, options: Options | None = None) -> Source:
@@ -56,6 +58,8 @@ def open_source(path: str | Path, options: Options | None = None) -> Source:
         InputError: nothing there, no format that is known, or a choice that a person must make: what can be chosen is named.
     """
     source, said = Path(path).expanduser(), options or Options()
+    if source.name in ("depth.txt", *PAIRS) and folder_kind(source.parent) == "tum":
+        source = source.parent
     if not source.exists():
         names = [item.name for item in source.parent.iterdir()] if source.parent.is_dir() else []
         raise InputError("nothing there", where=source, expected="a file or a folder", hint=did_you_mean(source.name, names))
@@ -64,12 +68,13 @@ def open_source(path: str | Path, options: Options | None = None) -> Source:
         raise InputError("frames of coordinates stand in bags only", where=f"--base {said.base}", found=source)
     if name not in FORMATS:
         found = f"{source.suffix or 'no ending'}" if name is None else name
+        packed = name is None and (source.suffix in PACKED or (source.is_dir() and any(source.glob("*.zstd"))))
         raise InputError(
             "not a format that femsense imports" if name is None else "no such format",
             where=source,
             found=found,
             expected="--format " + "|".join(FORMATS),
-            hint=None if name is None else did_you_mean(name, FORMATS),
+            hint=UNPACK if packed else None if name is None else did_you_mean(name, FORMATS),
         )
     return FORMATS[name](source, said)
 

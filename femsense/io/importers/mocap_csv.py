@@ -39,7 +39,8 @@ def is_mocap_csv(path: Path) -> bool:
     """Whether a CSV file begins as an export of Motive or Nexus."""
     head = list(islice(rows_of(path), HEAD))
     first = head[0][0].strip() if head and head[0] else ""
-    return first == "Format Version" or first in ("Trajectories", "Model Outputs", "Devices")
+    sections = len(head) > 3 and [cell.strip() for cell in head[3][:2]] == ["Frame", "Sub Frame"]
+    return sections or first in ("Format Version", "Trajectories", "Model Outputs", "Devices")
 
 
 def open_mocap_csv(path: Path, options: Options) -> Source:

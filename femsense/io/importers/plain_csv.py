@@ -35,6 +35,7 @@ TIMES = {
     "sec": 1.0,
 }
 """Names of columns of time, and seconds in one unit."""
+DECIMAL_COMMA = re.compile(r"\s*[-+]?\d*,\d+(?:[eE][-+]?\d+)?\s*")
 NO_PLACES = (
     "q",
     "quat",
@@ -71,13 +72,19 @@ def open_text(path: Path) -> Iterator[io.TextIOBase]:
 
 
 def rows_of(path: Path) -> Iterator[list[str]]:
-    """Yield the rows of a CSV file as text; commas, semicolons or tabs between."""
+    """Yield the rows of a CSV file as text; commas, semicolons or tabs between, and beside these two decimal commas."""
     with open_text(path) as stream:
         head = stream.read(4096)
         stream.seek(0)
         lines = head.splitlines()[:20]
         mark = max(",;\t", key=lambda c: sum(line.count(c) for line in lines))
-        yield from csv.reader(stream, delimiter=mark)
+        rows = csv.reader(stream, delimiter=mark)
+        yield from rows if mark == "," else ([_with_point(cell) for cell in row] for row in rows)
+
+
+def _with_point(cell: str) -> str:
+    """Return a number with a decimal comma as one with a point, anything else as it is."""
+    return cell.replace(",", ".") if DECIMAL_COMMA.fullmatch(cell) else cell
 
 
 def header_of(path: Path) -> tuple[list[str], bool]:

@@ -14,7 +14,7 @@ from typing import Any
 
 from femsense.core.errors import InputError
 from femsense.io.importers.frames import need
-from femsense.io.importers.ros_recovery import RecoveredReader
+from femsense.io.importers.ros_recovery import NotRos, RecoveredReader
 
 ENDINGS = (".bag", ".db3", ".mcap")
 IMAGE = "sensor_msgs/msg/Image"
@@ -113,12 +113,15 @@ def _recovered(path: Path, error: Exception) -> RecoveredReader:
         raise _unreadable(path, error) from None
     try:
         reader = RecoveredReader(path)
+    except NotRos:
+        raise
     except InputError:
         raise _unreadable(path, error) from None
-    warnings.warn(
-        f"{path}: the file is broken or was not closed ({_line(error)}); {reader.count} messages before the break are read",
-        stacklevel=3,
-    )
+    if "Profile is not" not in str(error):  # a whole file that does not say that it is of ROS 2, or is of ROS 1
+        warnings.warn(
+            f"{path}: the file is broken or was not closed ({_line(error)}); {reader.count} messages before the break are read",
+            stacklevel=3,
+        )
     return reader
 
 

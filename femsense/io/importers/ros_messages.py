@@ -197,9 +197,7 @@ def _compressed_depth(data: bytes, form: str, where: str | Path | None) -> tuple
         raise InputError(
             "a broken depth image", where=where, found=f"{len(data)} bytes", expected="a header of 12 bytes and an image"
         )
-    if "rvl" in form.lower():
-        return _unpack_rvl(data, where), "16UC1"
-    image = decoded_image(data[12:], where)
+    image = _unpack_rvl(data, where) if "rvl" in form.lower() else decoded_image(data[12:], where)
     if image.dtype != np.uint16 or image.ndim != 2:
         raise InputError(
             "not a depth image", where=where, found=f"{image.dtype} {image.shape}", expected="one channel of 16 bits"

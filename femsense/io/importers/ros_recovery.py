@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -29,6 +29,12 @@ class Connection:
     msgtype: str
     definition: str
     msgcount: int = 0
+    encoding: str = "ros1"
+    """How its messages are packed: "ros1", "cdr", or what is not read."""
+
+
+class NotRos(InputError):
+    """An MCAP file without messages of ROS."""
 
 
 class RecoveredReader:
@@ -36,7 +42,7 @@ class RecoveredReader:
 
     def __init__(self, path: Path) -> None:
         """path: a .bag or an .mcap file. Raises InputError where not one message is whole."""
-        self.path, self.is2 = path, path.suffix != ".bag"
+        self.path, self.bare = path, path.suffix == ".bag"
         found: dict[int, Connection] = {}
         counts: dict[int, int] = {}
         for item in self._records():
@@ -44,8 +50,15 @@ class RecoveredReader:
                 found.setdefault(item.id, item)
             else:
                 counts[item[0]] = counts.get(item[0], 0) + 1
-        self.count = sum(counts.values())
-        self.connections = [Connection(c.id, c.topic, c.msgtype, c.definition, counts.get(c.id, 0)) for c in found.values()]
+        packed = {c.encoding for c in found.values()}
+        found = {i: c for i, c in found.items() if c.encoding in ("ros1", "cdr")}
+        if packed and not found:
+            raise NotRos(
+                "messages that are not of ROS", where=path, found=", ".join(sorted(packed)), expected="cdr (ROS 2) or ros1"
+            )
+        self.is2 = "cdr" in packed
+        self.count = sum(counts.get(i, 0) for i in found)
+        self.connections = [replace(c, msgcount=counts.get(i, 0)) for i, c in found.items()]
         if not self.count:
             raise InputError(
                 "a bag without a whole message", where=path, found=f"{path.stat().st_size} bytes", expected="messages"
@@ -69,7 +82,7 @@ class RecoveredReader:
 
     def _records(self) -> Iterator[Connection | tuple[int, int, bytes]]:
         with self.path.open("rb") as stream:
-            yield from _mcap_records(stream) if self.is2 else _bag_records(stream)
+            yield from _bag_records(stream) if self.bare else _mcap_records(stream)
 
     def _types(self) -> Any:
         typesys = need("rosbags.typesys", "ros", "reading ROS bags")
@@ -174,7 +187,9 @@ def _mcap_records(stream: BinaryIO) -> Iterator[Connection | tuple[int, int, byt
                 schemas[record.id] = record
             elif kind == "Channel" and record.schema_id in schemas:
                 schema = schemas[record.schema_id]
-                yield Connection(record.id, record.topic, schema.name, schema.data.decode("utf-8", "replace"))
+                name = schema.name if schema.name.count("/") != 1 else schema.name.replace("/", "/msg/")
+                text = schema.data.decode("utf-8", "replace")
+                yield Connection(record.id, record.topic, name, text, encoding=record.message_encoding)
             elif kind == "Message":
                 yield record.channel_id, record.log_time, record.data
     except (exceptions.McapError, struct.error, ValueError, EOFError, OSError, OverflowError, MemoryError):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -20,6 +21,8 @@ CLOUD = "sensor_msgs/msg/PointCloud2"
 MARKERS = ("PoseArray", "MarkerArray", "Markers", "RigidBodies", "PoseStamped", "PointStamped")
 INPUTS = ("JointState", "Float64MultiArray", "Float32MultiArray", "FluidPressure")
 TRANSPORTS = ("/compressedDepth", "/compressed", "/theora", "/ffmpeg")
+INFRARED = re.compile(r"(^|[/_])(ir|infra\d?|infrared\d?)([/_]|$)")
+"""Names of topics whose images of 16 bits are no depth."""
 KINDS = ("depth", "cloud", "color", "grey", "markers", "inputs", "loads", "other")
 
 
@@ -179,8 +182,9 @@ def _image_stream(bag: Bag, topic: Topic) -> Stream:
         return Stream(topic, "other")
     frame = stamp_of(message)[1]
     encoding = getattr(message, "encoding", None) or message.format
-    if encoding in DEPTH or "compressedDepth" in encoding:
-        return Stream(topic, "depth", frame, encoding)
+    if encoding.partition(";")[0].strip() in DEPTH or "compressedDepth" in encoding:
+        infrared = encoding != "32FC1" and INFRARED.search(topic.name) is not None
+        return Stream(topic, "grey" if infrared else "depth", frame, encoding)
     grey = encoding in ("mono8", "8UC1") or encoding.startswith("mono8")
     return Stream(topic, "grey" if grey else "color", frame, encoding)
 

@@ -14,6 +14,7 @@ from femsense.core.errors import InputError
 from femsense.io.clouds.cloud_files import write_cloud
 from femsense.io.clouds.frame_clouds import read_frame_cloud
 from femsense.io.clouds.images import read_png
+from femsense.io.importers.folders import read_points
 from femsense.io.importers.frames import Options
 from femsense.io.importers.guess import guess_format, open_source
 from femsense.io.importers.writer import write_recording
@@ -130,6 +131,66 @@ def test_clouds(ending: str, tmp_path: Path) -> None:
         np.testing.assert_array_equal(cloud.points, clouds[k])
 
 
+@pytest.mark.parametrize("order", ["depth first", "colour first"])
+def test_a_list_of_pairs_in_place_of_two_lists(order: str, tmp_path: Path) -> None:
+    folder = tum(tmp_path / "sequence")
+    depths, colors = ([line for line in (folder / f"{n}.txt").read_text().splitlines()[1:]] for n in ("depth", "rgb"))
+    pairs = zip(depths, colors) if order == "depth first" else zip(colors, depths)
+    (folder / "associations.txt").write_text("\n".join(f"{a} {b}" for a, b in pairs))
+    (folder / "calibration.txt").write_text("50 50 32 24")
+    for name in ("depth", "rgb"):
+        (folder / f"{name}.txt").unlink()
+    recording, found = imported(folder / "associations.txt", tmp_path / "out")
+    assert recording.frame_count == 4 and found["images_without_colour"] == 1
+    np.testing.assert_array_equal(read_png(tmp_path / "out/depth/000001.png"), np.where(depth(1) == 65535, 0, depth(1)))
+
+
+PLACES = np.random.default_rng(3).random((50, 3)).round(3) + 0.1
+STRUCTURED = np.zeros(50, dtype=[("rgb", "u4"), ("z", "f4"), ("y", "f8"), ("x", "f4")])
+STRUCTURED["x"], STRUCTURED["y"], STRUCTURED["z"] = PLACES.T
+
+
+@pytest.mark.parametrize(
+    "arrays",
+    [
+        {"vertices": PLACES},
+        {"a": PLACES, "stamp": np.array(1.5)},
+        {"pc": PLACES, "color": np.full((50, 3), 51, dtype=np.uint8)},
+        {"x": PLACES[:, 0], "y": PLACES[:, 1], "z": PLACES[:, 2]},
+        {"data": np.column_stack([PLACES, np.full(50, 7.0)])},
+        {"points": PLACES.T},
+        {"image": PLACES.reshape(5, 10, 3)},
+        {"": STRUCTURED},
+    ],
+)
+def test_arrays_under_any_name_and_layout(arrays: dict[str, np.ndarray], tmp_path: Path) -> None:
+    if "" in arrays:
+        np.save(tmp_path / "1.5.npy", arrays[""])
+    else:
+        np.savez(tmp_path / "1.5.npz", **arrays)
+    cloud = read_points(next(tmp_path.iterdir()))
+    np.testing.assert_allclose(cloud.points, PLACES, atol=1e-6)
+    if "color" in arrays:
+        assert cloud.colors is not None
+        np.testing.assert_allclose(cloud.colors, 0.2)
+
+
+def test_arrays_that_could_be_several_things_are_listed(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", left=PLACES, right=PLACES)
+    with pytest.raises(InputError, match=r"several arrays[\s\S]*left \(50, 3\); right"):
+        read_points(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize("mark", [" ", ",", ";", "\t"])
+def test_text_of_points_with_a_header(mark: str, tmp_path: Path) -> None:
+    lines = [mark.join(["X", "Y", "Z", "R", "G", "B"]), *(mark.join(map(str, [*p, 51, 102, 0])) for p in PLACES)]
+    (tmp_path / "a.xyz").write_text("\n".join(lines))
+    cloud = read_points(tmp_path / "a.xyz")
+    assert cloud.colors is not None
+    np.testing.assert_allclose(cloud.points, PLACES)
+    np.testing.assert_allclose(cloud.colors[0], [0.2, 0.4, 0])
+
+
 def test_clouds_in_millimetres_are_asked(tmp_path: Path) -> None:
     points = 300 * np.random.default_rng(0).random((20, 3))
     np.save(tmp_path / "1.5.npy", points)
@@ -165,10 +226,10 @@ def test_broken_files_cost_themselves(tmp_path: Path) -> None:
 
 
 def test_nothing_that_is_known(tmp_path: Path) -> None:
-    (tmp_path / "a.mkv").write_bytes(b"\x1aE\xdf\xa3")
+    (tmp_path / "a.oni").write_bytes(b"ONI10\0\0\0")
     with pytest.raises(InputError, match="not a format that femsense imports"):
-        open_source(tmp_path / "a.mkv")
+        open_source(tmp_path / "a.oni")
     with pytest.raises(InputError, match="nothing there"):
         open_source(tmp_path / "b.bag")
     with pytest.raises(InputError, match="no such format"):
-        open_source(tmp_path / "a.mkv", Options(format="rosbag"))
+        open_source(tmp_path / "a.oni", Options(format="rosbag"))

@@ -85,6 +85,22 @@ def test_nexus(tmp_path: Path) -> None:
     assert found["missing"] == [{"marker": "tip", "share": pytest.approx(1 / 3)}]
 
 
+def test_sections_before_the_trajectories_are_passed_over(tmp_path: Path) -> None:
+    devices = "1000\n,,Force 1,,,Force 2,,\nFrame,Sub Frame,Fx,Fy,Fz,Fx,Fy,Fz\n,,N,N,N,N,N,N\n11,0,1,2,3,4,5,6\n\n"
+    (tmp_path / "trial.csv").write_text(f"Joints\n{devices}Devices\n{devices}{NEXUS}")
+    assert guess_format(tmp_path / "trial.csv") == "vicon"
+    recording, _ = imported(tmp_path / "trial.csv", tmp_path / "out")
+    assert recording.marker_names == ("base", "tip") and recording.frame_count == 3
+
+
+def test_semicolons_and_decimal_commas(tmp_path: Path) -> None:
+    text = MOTIVE.format(unit="Meters").replace("1,2,5,7", "1.25,2,5,7")
+    (tmp_path / "take.csv").write_text(text.replace(",", ";").replace(".", ","))
+    recording, _ = imported(tmp_path / "take.csv", tmp_path / "out", Options(topics=["tip"]))
+    np.testing.assert_allclose(recording.marker_xyz, [[1, 2, 3], [1.25, 2, 5]])
+    np.testing.assert_allclose(recording.time_s, [0, 0.008333, 0.016667, 0.025])
+
+
 def test_a_rate_that_is_not_readable_is_asked(tmp_path: Path) -> None:
     (tmp_path / "trial.csv").write_text(NEXUS.replace("\n100\n", "\n1o0\n", 1))
     with pytest.raises(InputError, match="--rate"):

@@ -76,16 +76,17 @@ def test_png_and_depth_in_messages_that_are_compressed(tmp_path: Path) -> None:
         np.testing.assert_array_equal(read_png(tmp_path / f"recording/color/{k:06d}.png")[:, :, ::-1], color_of(k))
 
 
-def test_floating_depth_compressed_by_its_inverse(tmp_path: Path) -> None:
+@pytest.mark.parametrize("packing", ["png", "rvl"])
+def test_floating_depth_compressed_by_its_inverse(packing: str, tmp_path: Path) -> None:
     """32FC1 in compressedDepth holds a / depth + b as 16 bits (compressed_depth_image_transport)."""
     metres = np.linspace(0.3, 1.2, WIDTH * HEIGHT).reshape(HEIGHT, WIDTH)
     a, b = 1e4, 10.0
     packed = np.rint(a / metres + b).astype(np.uint16)
     packed[5, 5] = 0
     with BagWriter(tmp_path / "take", "mcap") as bag:
-        head = struct.pack("<iff", 0, a, b)
-        data = head + cv2.imencode(".png", packed)[1].tobytes()
-        bag.write("/depth/image/compressedDepth", START_NS, bag.compressed(data, "32FC1; compressedDepth png", START_NS))
+        rvl = struct.pack("<II", WIDTH, HEIGHT) + packed_rvl(packed)
+        data = struct.pack("<iff", 0, a, b) + (rvl if packing == "rvl" else cv2.imencode(".png", packed)[1].tobytes())
+        bag.write("/depth/image/compressedDepth", START_NS, bag.compressed(data, f"32FC1; compressedDepth {packing}", START_NS))
         bag.write("/depth/camera_info", START_NS, bag.info(START_NS))
     recording, _ = imported(tmp_path / "take", tmp_path)
     lens = recording.cameras[0]
