@@ -254,7 +254,7 @@ def _result(
         cable_displacement_m=tables.displacement,
         rms_m=root_mean_square(jet.residual),
         marker_rms_m=per_marker,
-        history=tuple({"iteration": i, "rms_m": r} for i, r in enumerate(history)),
+        history=tuple(history),
         pose_std=pose_std,
         pose_covariance=pose_covariance,
         tension_std_n=tables.tension_std,

@@ -25,8 +25,8 @@ class Calibration:
     rms_m: float
     """Root mean square distance between measured and modelled markers [m]; nan where there are none."""
     marker_rms_m: dict[str, float]
-    history: tuple[dict[str, float], ...]
-    """{iteration, rms_m} of each iteration."""
+    history: tuple[float, ...]
+    """rms_m of each iteration [m]."""
     pose_std: FloatArray
     """One standard deviation of the entries of T_robot_camera, shape (4, 4)."""
     pose_covariance: FloatArray

@@ -23,7 +23,8 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray
 from femsense.core.kernels import njit
-from femsense.fem.linalg.simd_kernels import add_run, fetch_ahead, subtract_product
+from femsense.fem.linalg.simd_code import fetch_ahead
+from femsense.fem.linalg.simd_tiles import add_run, subtract_product
 from femsense.fem.rotation import FAST, closest_rotation, closest_rotation_anyhow, determinant, turning_compliance
 
 LOCAL = 0.75

@@ -7,7 +7,8 @@ import numpy as np
 
 from femsense.core.kernels import njit
 from femsense.fem.corotational import LOCAL
-from femsense.fem.linalg.simd_kernels import LANES, add_divergence, add_gradient, fetch_ahead
+from femsense.fem.linalg.simd_code import fetch_ahead
+from femsense.fem.linalg.simd_lanes import LANES, add_divergence, add_gradient
 from femsense.fem.rotation import FAST, closest_rotation
 
 DEFORMATION, VOLUME, TRACE, SHEAR, PULL, ROOM = (row * LANES for row in (9, 18, 19, 20, 21, 22))

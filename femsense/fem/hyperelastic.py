@@ -22,7 +22,7 @@ import numpy as np
 
 from femsense.core.kernels import njit
 from femsense.fem.corotational import LOCAL, add_blocks
-from femsense.fem.linalg.simd_kernels import LANES
+from femsense.fem.linalg.simd_lanes import LANES
 from femsense.fem.rotation import FAST, determinant
 
 

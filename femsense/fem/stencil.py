@@ -12,7 +12,7 @@ from femsense.core.arrays import BoolArray, FloatArray, IntArray, freeze
 from femsense.fem.linalg.factorization import Pattern, make_pattern
 from femsense.fem.linalg.iterative import Level
 from femsense.fem.linalg.ordering import fill_reducing_order
-from femsense.fem.linalg.simd_kernels import LANES
+from femsense.fem.linalg.simd_lanes import LANES
 from femsense.fem.mesh import EDGES, TetMesh, shape_slopes, shape_values
 
 _A, _B = 0.5854101966249685, 0.1381966011250105

@@ -106,8 +106,7 @@ def _marker_panel(c: Calibration) -> Html | None:
 
 
 def _history_panel(c: Calibration) -> Html | None:
-    steps = [(entry.get("iteration"), entry.get("rms_m")) for entry in c.history]
-    known = [(i, 1e3 * r) for i, r in steps if i is not None and r is not None and words.known(r) and r > 0]
+    known = [(i, 1e3 * r) for i, r in enumerate(c.history) if words.known(r) and r > 0]
     if len(known) < 2:
         return None
     figure, axes = new_axes()

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from femsense.calib.calibration import Calibration
-from femsense.loop.result.loop_result import NONE
-from femsense.report.words import VERDICTS
 
 if TYPE_CHECKING:
     from femsense.sensing.types import ContactForce, FrameReport, Run
@@ -83,7 +82,7 @@ def run_document(run: Run) -> dict[str, Any]:
         "rms_before_m": _median([frame.rms_before_m for frame in touched]),
         "rms_after_m": _median([frame.rms_after_m for frame in touched]),
         "ms_per_frame": _median([frame.ms for frame in good]),
-        "known_loads": run.known_loads,
+        "known_loads": [asdict(load) for load in run.known_loads],
         "failed": [{"frame": frame.frame, "status": frame.status} for frame in run.frames if frame.status != "ok"],
         "unexplained": [{"frame": frame.frame, "rms_after_m": frame.rms_after_m} for frame in _unexplained(good)],
     }
@@ -131,13 +130,9 @@ def run_text(run: Run) -> str:
                 "something out of sight may touch it there (--at names a place), or the model lacks something (femsense improve)",
             ]
         )
-    for load in run.known_loads:
-        rows.append(
-            [
-                f"known load, frame {load['frame']}",
-                f"{load['declared_n']:.3f} N declared, {load['sensed_n']:.3f} N sensed ({load['error_percent']:+.1f} %)",
-            ]
-        )
+    for load in run.known_loads[:LISTED]:
+        said = f"{load.declared_n:.3f} N declared, {load.sensed_n:.3f} N sensed ({load.error_percent:+.1f} %)"
+        rows.append([f"known load, frame {load.frame}", said])
     if len(run.known_loads) > LISTED:
         rows.append(["known loads", f"{len(run.known_loads) - LISTED} frames more: see run.json"])
     doubtful = {frame.frame for frame in run.frames if np.isfinite(frame.rms_after_m)}
@@ -146,130 +141,6 @@ def run_text(run: Run) -> str:
     if len(facts["failed"]) > LISTED:
         rows.append(["not ok", f"in {len(facts['failed']) - LISTED} frames more: see frames.csv"])
     return f"run of {run.robot.name}\n{columns(rows)}"
-
-
-def loop_text(document: Mapping[str, Any]) -> str:
-    """Return loop.json in a few lines."""
-    verdict = str(document.get("verdict"))
-    words = document.get("sentence") or VERDICTS.get(verdict)
-    lines = [f"verdict: {verdict}" + (f" ({words})" if words else "")]
-    lines.append(columns(_loop_rows(document)))
-    for effect in document.get("effects") or []:
-        lines += ["", effect_text(effect)]
-    for title, said in (
-        ("cannot be distinguished", ", ".join(" / ".join(pair) for pair in _open_pairs(document))),
-        ("not testable", ", ".join(map(_untestable, document.get("not_testable") or ()))),
-        ("would have been seen", _seen(document) if verdict == NONE else ""),
-        ("next experiment", document.get("next_experiment")),
-    ):
-        if said:
-            lines += ["", f"{title}: {said}"]
-    left = _left(document.get("left") or {})
-    return "\n".join([*lines, "", f"what is left: {left}"] if left else lines)
-
-
-def _open_pairs(document: Mapping[str, Any]) -> list[list[str]]:
-    """Return the pairs that the data cannot distinguish: those of what is named, or all where nothing is."""
-    names = {str(effect["name"]) for effect in document.get("effects") or ()}
-    pairs = [p["pair"] for p in document.get("confounded") or ()]
-    return [pair for pair in pairs if names & set(pair) or not names]
-
-
-def _untestable(effect: Mapping[str, Any]) -> str:
-    share = effect.get("absorbed_share")
-    return str(effect["name"]) + ("" if share is None else f" ({100 * share:.1f} % of it is absorbed by calibration)")
-
-
-def _seen(document: Mapping[str, Any]) -> str:
-    """Return in one line from which size on effects that are testable, and were not found, would have been seen."""
-    hidden = {str(effect["name"]) for effect in document.get("not_testable") or ()}
-    words = []
-    for name, entry in (document.get("detectable") or {}).items():
-        sizes = list((entry.get("smallest") or {}).values())
-        if name in hidden or not sizes or entry.get("would_be_seen") is False:
-            continue
-        digits = 4 if entry.get("kind") == "factor" else 3
-        size = f"{max(sizes):.{digits}g}" + ("" if entry.get("unit") in (None, "", "1") else f" {entry['unit']}")
-        said = {"factor": f"a factor of {size}", "softer_than": f"softer than {size}"}.get(str(entry.get("kind")), size)
-        words.append(f"{name} ({said})")
-    return ", ".join(words)
-
-
-def _left(left: Mapping[str, Any]) -> str:
-    """Return in one line how large the remaining residual is, where, when, what it goes with, and whether it has structure."""
-    if left.get("rms_m") is None:
-        return ""
-    words = [f"{1e3 * left['rms_m']:.3g} mm rms" + (" in held-out data" if left.get("held_out") else "")]
-    where = left.get("where") or {}
-    if where.get("marker"):
-        words.append("most " + _place_text(where))
-    frame = (left.get("worst_frame") or {}).get("frame")
-    if frame is not None:
-        words.append(f"in frame {frame}")
-    goes = next((c for c in left.get("goes_with") or () if (c.get("p_holm") or 0.0) < 0.05), None)
-    if goes is not None:
-        words.append(f"going with {goes['covariate']}")
-    tests = left.get("structure") or {}
-    if "significant" in tests:
-        words.append("with structure" if tests["significant"] else "without structure")
-    return ", ".join(words)
-
-
-def _place_text(where: Mapping[str, Any]) -> str:
-    """Return where a residual is largest: at a marker, or at a place on the body at rest."""
-    if not str(where["marker"]).startswith("surface "):
-        return f"at marker {where['marker']}"
-    return "at ({:.0f}, {:.0f}, {:.0f}) mm on the body".format(*(1e3 * v for v in where["position_m"]))
-
-
-def effect_text(effect: Mapping[str, Any]) -> str:
-    """Return one entry of `effects` in loop.json: its name, parameters with one standard deviation, and what it changed."""
-    rows = [[key, _parameter(value)] for key, value in (effect.get("parameters") or {}).items()]
-    before, after = effect.get("validation_rms_before_m"), effect.get("validation_rms_after_m")
-    if before is not None and after is not None:
-        rows.append(["residual on held-out data", f"{1e3 * before:.3f} → {1e3 * after:.3f} mm rms"])
-    return f"{effect.get('name')}\n{columns(rows)}"
-
-
-def _loop_rows(document: Mapping[str, Any]) -> list[list[str]]:
-    rows = []
-    before, after = document.get("before") or {}, document.get("after") or {}
-    keys = [("train_rms_m", "residual"), ("validation_rms_m", "residual, held out")]
-    if before.get("validation_normal_rms_m") != before.get("validation_rms_m"):
-        keys.append(("validation_normal_rms_m", "clouds, along normals, held out"))
-    for key, name in keys:
-        if before.get(key) is not None and after.get(key) is not None:
-            rows.append([name, f"{1e3 * before[key]:.3f} → {1e3 * after[key]:.3f} mm rms"])
-    if document.get("noise_m") is not None:
-        rows.append(["noise", f"{1e3 * document['noise_m']:.3f} mm"])
-    own = document.get("model_error") or {}
-    if own.get("held_out_m") is not None:
-        said = f"{1e3 * own['held_out_m']:.3f} mm held out, beyond noise and discretisation; noise: {own.get('noise_source')}"
-        rows.append(["error of the model", said])
-    return rows
-
-
-def _parameter(value: Any) -> str:
-    if not isinstance(value, Mapping):
-        return _words(value)
-    found, std, unit = value.get("value"), value.get("std"), value.get("unit") or ""
-    if isinstance(found, Mapping):
-        stds = std if isinstance(std, Mapping) else {}
-        return ", ".join(f"{name} {_parameter({'value': v, 'std': stds.get(name), 'unit': unit})}" for name, v in found.items())
-    unit = "" if unit == "1" else f" {unit}"
-    return f"{_words(found)}{'' if std is None else f' ± {_words(std)}'}{unit}"
-
-
-def _words(value: Any) -> str:
-    """Return a value of JSON as a short text."""
-    if isinstance(value, float):
-        return f"{value:.4g}"
-    if isinstance(value, Mapping):
-        return ", ".join(f"{str(key).replace('_', ' ')} {_words(item)}" for key, item in value.items() if item is not None)
-    if isinstance(value, list | tuple):
-        simple = all(isinstance(item, int | float) for item in value)
-        return f"[{', '.join(map(_words, value))}]" if simple else "; ".join(map(_words, value))
-    return "–" if value is None else str(value)
 
 
 def _strongest(run: Run) -> ContactForce | None:

@@ -32,7 +32,17 @@ from femsense.sensing.prepare import make_sensor, scan_of
 from femsense.sensing.search import explain, segmented
 from femsense.sensing.states import free_state
 from femsense.sensing.tracks import contacts_of, smoothed
-from femsense.sensing.types import ContactForce, Done, FrameReport, Run, SensedFrame, SensingOptions, Sensor, States
+from femsense.sensing.types import (
+    ContactForce,
+    Done,
+    FrameReport,
+    LoadComparison,
+    Run,
+    SensedFrame,
+    SensingOptions,
+    Sensor,
+    States,
+)
 
 CHECKPOINT_S = 10.0
 """Seconds of work that a killed estimate may lose, if nothing else is asked for."""
@@ -226,7 +236,7 @@ def _failed(sensor: Sensor, k: int, error: FemsenseError) -> FrameReport:
 
 def _compare_loads(
     recording: Recording, places: FloatArray, contacts: Sequence[ContactForce], size: float
-) -> tuple[dict[str, float], ...]:
+) -> tuple[LoadComparison, ...]:
     """Return declared next to sensed resultants of the frames whose loads act at the given places."""
     near = near_places(recording.load_points, places, size)
     result = []
@@ -234,14 +244,7 @@ def _compare_loads(
         rows = near & (recording.load_frame == k)
         sensed = [c.force_n_xyz for c in contacts if c.frame == number]
         if rows.any() and sensed:
-            declared = np.linalg.norm(recording.load_forces[rows].sum(axis=0))
-            found = np.linalg.norm(np.sum(sensed, axis=0))
-            result.append(
-                {
-                    "frame": int(number),
-                    "declared_n": float(declared),
-                    "sensed_n": float(found),
-                    "error_percent": float(100 * (found / declared - 1)),
-                }
-            )
+            declared = float(np.linalg.norm(recording.load_forces[rows].sum(axis=0)))
+            found = float(np.linalg.norm(np.sum(sensed, axis=0)))
+            result.append(LoadComparison(int(number), declared, found, 100 * (found / declared - 1)))
     return tuple(result)

@@ -27,7 +27,7 @@ from femsense.sensing.types import SensingOptions
 if TYPE_CHECKING:
     from femsense.model.recording import Recording
     from femsense.model.robot import Robot
-    from femsense.sensing.types import ContactForce, FrameReport, Run, States
+    from femsense.sensing.types import ContactForce, FrameReport, LoadComparison, Run, States
 
 RUN_FORMAT = "femsense-run-1"
 CONTACT_COLUMNS = (
@@ -165,7 +165,7 @@ def read_run(folder: str | Path, *, robot: Robot | None = None) -> Run:
         states=read_states(root / "states.npz"),
         robot=known,
         recording_folder=None if recording is None else Path(recording),
-        known_loads=tuple(document.get("known_loads", [])),
+        known_loads=_read_known_loads(document, root / "run.json"),
     )
 
 
@@ -218,7 +218,7 @@ def _run_document(run: Run, inputs: Mapping[str, Any], seconds: float | None) ->
         "frames": len(run.frames),
         "frames_ok": good,
         "contacts": len(run.contacts),
-        "known_loads": run.known_loads,
+        "known_loads": [asdict(load) for load in run.known_loads],
         "inputs": inputs,
         "versions": versions(),
         "timing": {"seconds": seconds, "ms_per_frame_median": float(np.median(times)) if len(times) else None},
@@ -238,6 +238,16 @@ def _robot_of_run(document: Mapping[str, Any], root: Path) -> Robot:
             hint="read_run(folder, robot=…)",
         )
     return load_robot(path)
+
+
+def _read_known_loads(document: Mapping[str, Any], file: Path) -> tuple[LoadComparison, ...]:
+    from femsense.sensing.types import LoadComparison
+
+    try:
+        return tuple(LoadComparison(**row) for row in document.get("known_loads", ()))
+    except TypeError:
+        names = ", ".join(LoadComparison.__slots__)
+        raise InputError("broken known_loads", where=file, found=document["known_loads"], expected=f"tables of {names}") from None
 
 
 def _read_contacts(file: Path) -> tuple[ContactForce, ...]:

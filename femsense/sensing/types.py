@@ -109,6 +109,20 @@ class States:
     """shape (n, 3)."""
 
 
+@dataclass(frozen=True, slots=True)
+class LoadComparison:
+    """A declared load beside the force that was sensed at its place."""
+
+    frame: int
+    """Its number."""
+    declared_n: float
+    """Size of the sum of what acts there [N]."""
+    sensed_n: float
+    """Size of the sum of the forces that were sensed [N]."""
+    error_percent: float
+    """By how much the sensed one is larger [%]."""
+
+
 @dataclass(frozen=True, eq=False, slots=True)
 class Run:
     """The result of `estimate`."""
@@ -118,8 +132,8 @@ class Run:
     states: States
     robot: Robot
     recording_folder: Path | None
-    known_loads: tuple[dict[str, float], ...] = ()
-    """Declared loads at the given places next to what was sensed: {frame, declared_n, sensed_n, error_percent}."""
+    known_loads: tuple[LoadComparison, ...] = ()
+    """Declared loads at the given places beside what was sensed."""
 
     def __repr__(self) -> str:
         return run_arrays.describe_run(self)

@@ -18,7 +18,9 @@ from femsense.core.errors import InputError
 from femsense.io.clouds.images import read_png
 from femsense.io.robot_toml import load_robot, robot_names
 from femsense.model.robot import Robot
-from femsense.report.text import columns, effect_text, loop_text, run_text
+from femsense.report.loop.document import Effect, Loop
+from femsense.report.loop.text import effect_text, loop_text
+from femsense.report.text import columns, run_text
 from femsense.sensing.types import Run
 
 LOOP: dict[str, Any] = {
@@ -91,14 +93,24 @@ def test_texts_name_what_matters(run: Run) -> None:
     text = run_text(run)
     assert "2 of 3" in text and "3 in 2 frames" in text and "0.500 N declared, 0.490 N sensed (-2.0 %)" in text
     assert "no result, frame 0" in text and "1.000 ± 0.100 N in frame 1" in text
-    text = loop_text(LOOP)
+    text = loop_text(Loop.model_validate(LOOP))
     assert (
         text.startswith("verdict: effects (the cables rub)")
         and "2.000 → 0.300 mm" in text
         and "next experiment: pull slower" in text
     )
-    text = effect_text(LOOP["effects"][0])
+    text = effect_text(Effect.model_validate(LOOP["effects"][0]))
     assert "0.1234 ± 0.01\n" in text and "top 1 ± 0.5 N" in text and "2.500 → 0.400 mm" in text
+
+
+def test_known_loads_are_listed_up_to_six(run: Run) -> None:
+    loads = tuple(replace(run.known_loads[0], frame=frame) for frame in range(8))
+    text = run_text(replace(run, known_loads=loads))
+    assert text.count("N declared") == 6 and "2 frames more" in text
+
+
+def said(document: dict[str, Any]) -> str:
+    return loop_text(Loop.model_validate(document))
 
 
 def test_what_would_have_been_seen_and_what_is_left_are_said_in_a_line() -> None:
@@ -117,14 +129,14 @@ def test_what_would_have_been_seen_and_what_is_left_are_said_in_a_line() -> None
         "held_out": True,
         "goes_with": [{"covariate": "time", "p_holm": 0.2}, {"covariate": "cable north", "p_holm": 0.01}],
     }
-    text = loop_text({"verdict": "none", "detectable": sizes, "not_testable": [{"name": "gravity"}], "left": left})
+    text = said({"verdict": "none", "detectable": sizes, "not_testable": [{"name": "gravity"}], "left": left})
     assert (
         "would have been seen: cable_gain (a factor of 1.05), payload (0.012 N), base_compliance (softer than 340 N/m)\n" in text
     )
     assert text.endswith("what is left: 1 mm rms in held-out data, most at marker tip, in frame 7, going with cable north")
-    assert "would have been seen" not in loop_text({"verdict": "effects", "detectable": sizes})
+    assert "would have been seen" not in said({"verdict": "effects", "detectable": sizes})
     on_body = {"rms_m": 1e-3, "where": {"marker": "surface 103", "position_m": [0.0119, -0.02, 0.1]}}
-    assert loop_text({"verdict": "none", "left": on_body}).endswith("most at (12, -20, 100) mm on the body")
+    assert said({"verdict": "none", "left": on_body}).endswith("most at (12, -20, 100) mm on the body")
 
 
 def test_a_frame_that_no_force_explains_is_said(run: Run) -> None:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import pytest
 from results import NAN, make_calibration
 
-from femsense.report.text import calibration_text, loop_text
+from femsense.report.loop.document import Loop
+from femsense.report.loop.text import loop_text
+from femsense.report.text import calibration_text
 
 
 @pytest.mark.parametrize(("noise_m", "said"), [(3e-4, True), (1.2e-2, False), (NAN, False)])
@@ -16,6 +18,6 @@ def test_a_residual_far_above_the_noise_is_said_to_be_an_error_of_the_model(nois
 
 def test_a_loop_says_how_large_the_error_of_the_model_is() -> None:
     parts = {"held_out_m": 0.0121, "noise_source": "marker_noise_m of recording.toml"}
-    text = loop_text({"verdict": "unexplained", "model_error": parts})
+    text = loop_text(Loop.model_validate({"verdict": "unexplained", "model_error": parts}))
     assert "12.100 mm held out, beyond noise and discretisation; noise: marker_noise_m of recording.toml" in text
-    assert "error of the model" not in loop_text({"verdict": "none", "model_error": {}})
+    assert "error of the model" not in loop_text(Loop(verdict="none"))

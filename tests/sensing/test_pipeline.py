@@ -72,8 +72,8 @@ def test_a_known_load_at_the_place_is_sensed_and_compared(touched):
     recording, _ = touched
     loaded = replace(recording, load_frame=np.array([3]), load_points=TIP[None], load_forces=2 * FORCE[None])
     run = estimate(arm(), loaded, calibrate(arm(), recording), at=TIP)
-    assert run.known_loads[0]["frame"] == 3
-    assert abs(run.known_loads[0]["error_percent"]) < 15
+    assert run.known_loads[0].frame == 3
+    assert abs(run.known_loads[0].error_percent) < 15
 
 
 def test_a_broken_frame_is_reported_and_the_rest_goes_on(touched):

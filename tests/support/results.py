@@ -40,7 +40,7 @@ def make_calibration(**changes: Any) -> Calibration:
         cable_displacement_m={"top": 1e-3, "side": -2e-4},
         rms_m=1 / 3000,
         marker_rms_m={"tip": 2e-4},
-        history=({"iteration": 0, "rms_m": 0.1},),
+        history=(0.1,),
         pose_std=rng.random((4, 4)),
         pose_covariance=half @ half.T,
         tension_std_n={"top": 0.01, "side": None},

@@ -13,7 +13,7 @@ from femsense.io.robot_toml import load_robot
 from femsense.model.robot import Robot
 from femsense.pointcloud.cloud import PointCloud
 from femsense.sensing.run_files import run_inputs, write_run
-from femsense.sensing.types import ContactForce, FrameReport, Run, States
+from femsense.sensing.types import ContactForce, FrameReport, LoadComparison, Run, States
 
 NAN = float("nan")
 
@@ -40,7 +40,7 @@ def make_run(robot: Robot) -> Run:
         states,
         robot,
         Path("somewhere"),
-        ({"frame": 4, "declared_n": 0.5, "sensed_n": 0.49, "error_percent": -2.0},),
+        (LoadComparison(frame=4, declared_n=0.5, sensed_n=0.49, error_percent=-2.0),),
     )
 
 

@@ -75,7 +75,8 @@ def improve(
     from femsense.app.commands import improve_into, loop_page, plan_into
     from femsense.core.parallel import set_workers
     from femsense.loop.improve import ImproveOptions
-    from femsense.report.text import loop_text
+    from femsense.report.loop.document import Loop
+    from femsense.report.loop.text import loop_text
 
     set_workers(workers)
     if plan and recordings:
@@ -107,5 +108,7 @@ def improve(
             progress=progress,
         )
     page = loop_page(output, say=say)
-    text = f"{loop_text(document)}\n\nwritten: {output}" + (f"\nlook at it: {page}" if page is not None else "")
+    text = f"{loop_text(Loop.model_validate(document))}\n\nwritten: {output}" + (
+        f"\nlook at it: {page}" if page is not None else ""
+    )
     return Answer({"folder": str(output), **document}, text)

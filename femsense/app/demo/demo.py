@@ -13,7 +13,9 @@ from femsense.core.errors import FemsenseError, InputError
 from femsense.io.files import write_json
 from femsense.io.provenance import versions
 from femsense.io.robot_toml import robot_names
-from femsense.report.text import columns, effect_text, run_document
+from femsense.report.loop.document import Effect
+from femsense.report.loop.text import effect_text
+from femsense.report.text import columns, run_document
 
 if TYPE_CHECKING:
     from femsense.sensing.types import Run
@@ -123,9 +125,8 @@ def demo_text(document: Mapping[str, Any]) -> str:
         rows.append([title, *(_figure((loop.get(when) or {}).get(key), 1e3, "mm") for when in ("before", "after"))])
     rows.append(["time a frame", *(_figure(run["ms_per_frame"], 1.0, "ms") for run in (a, b))])
     lines = [columns(rows, indent=0), "", f"what the declared model lacks (verdict: {loop['verdict']}):"]
-    lines += ["  " + line for effect in loop.get("effects") or [] for line in effect_text(effect).splitlines()] or [
-        "  nothing that these data show"
-    ]
+    found = [effect_text(Effect.model_validate(effect)) for effect in loop.get("effects") or []]
+    lines += [f"  {line}" for text in found for line in text.splitlines()] or ["  nothing that these data show"]
     true = [[effect["name"], _entry(effect)] for effect in document["truth"]["effects"]]
     lines += ["", "what it lacks in truth:", columns(true)] if true else []
     places = [["see it", f"femsense view {out / 'run'}"], ["mesh", str(out / "robot.glb")], ["picture", str(out / "picture.png")]]

@@ -20,9 +20,7 @@ from numba.extending import get_cython_function_address
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.parallel import one_blas_thread
 from femsense.fem.linalg.multifrontal import factorise
-from femsense.fem.linalg.simd_kernels import (
-    SIDES,
-)
+from femsense.fem.linalg.simd_columns import SIDES
 from femsense.fem.linalg.substitution import add_gram, reach, solve_many, solve_one, solve_sides
 from femsense.fem.linalg.symbolic import Analysis
 

@@ -13,13 +13,7 @@ from numba.extending import intrinsic
 
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.kernels import njit
-from femsense.fem.linalg.simd_kernels import (
-    WIDE,
-    add_run,
-    subtract_and_solve,
-    subtract_product,
-    write_product,
-)
+from femsense.fem.linalg.simd_tiles import WIDE, add_run, subtract_and_solve, subtract_product, write_product
 
 LARGE = 144
 """Columns of a front from which on BLAS does as well as tiles in registers, and that tiles factorise at a time: two solid bars were slower

@@ -9,9 +9,8 @@ import numpy.typing as npt
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.kernels import njit
 from femsense.fem.linalg.multifrontal import call_blas
-from femsense.fem.linalg.simd_kernels import (
+from femsense.fem.linalg.simd_columns import (
     SIDES,
-    add_run,
     down_one,
     down_six,
     down_six_sides,
@@ -23,6 +22,7 @@ from femsense.fem.linalg.simd_kernels import (
     up_three,
     up_three_sides,
 )
+from femsense.fem.linalg.simd_tiles import add_run
 
 
 @njit(cache=True, nogil=True)

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from femsense.core.arrays import IntArray
 from femsense.core.kernels import njit
 from femsense.fem.linalg.ordering import _elimination_tree, _structures
-from femsense.fem.linalg.simd_kernels import PADDING
+from femsense.fem.linalg.simd_tiles import PADDING
 
 
 @njit(cache=True)

@@ -35,7 +35,7 @@ from femsense.fem.body import BodyModel
 from femsense.fem.cables import add_cable_stiffness, pull_rows
 from femsense.fem.corotational import LOCAL
 from femsense.fem.linalg.cholesky import Cholesky, cholesky
-from femsense.fem.linalg.simd_kernels import LANES
+from femsense.fem.linalg.simd_lanes import LANES
 from femsense.fem.realtime.series_kernels import cable_series, element_frames, series_forces
 from femsense.fem.stencil import in_lanes, lanes_of
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from femsense.core.kernels import njit
-from femsense.fem.linalg.simd_kernels import LANES, add_divergence, add_gradient
+from femsense.fem.linalg.simd_lanes import LANES, add_divergence, add_gradient
 from femsense.fem.rotation import FAST, closest_rotation
 
 ROWS = 54

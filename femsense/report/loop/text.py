@@ -1,0 +1,133 @@
+"""What a loop found, in a few lines of text."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from femsense.loop.result.loop_result import NONE
+from femsense.report.loop.document import Detectable, Effect, Left, Loop, Untestable, Where
+from femsense.report.text import columns
+from femsense.report.words import VERDICTS
+
+SURE = 0.05
+"""What remains goes with a quantity whose probability under chance, corrected for many tests (Holm), is below this."""
+
+
+def loop_text(loop: Loop) -> str:
+    """Return the content of loop.json in a few lines."""
+    words = loop.sentence or VERDICTS.get(loop.verdict)
+    lines = [f"verdict: {loop.verdict}" + (f" ({words})" if words else "")]
+    lines.append(columns(_rows(loop)))
+    for effect in loop.effects:
+        lines += ["", effect_text(effect)]
+    for title, said in (
+        ("cannot be distinguished", ", ".join(" / ".join(pair) for pair in _open_pairs(loop))),
+        ("not testable", ", ".join(map(_untestable, loop.not_testable))),
+        ("would have been seen", _seen(loop) if loop.verdict == NONE else ""),
+        ("next experiment", loop.next_experiment),
+    ):
+        if said:
+            lines += ["", f"{title}: {said}"]
+    left = _left(loop.left)
+    return "\n".join([*lines, "", f"what is left: {left}"] if left else lines)
+
+
+def effect_text(effect: Effect) -> str:
+    """Return an effect that was found: its name, parameters with one standard deviation, and what it changed."""
+    rows = [[key, _parameter(entry.value, entry.std, entry.unit)] for key, entry in effect.parameters.items()]
+    before, after = effect.validation_rms_before_m, effect.validation_rms_after_m
+    if before is not None and after is not None:
+        rows.append(["residual on held-out data", f"{1e3 * before:.3f} → {1e3 * after:.3f} mm rms"])
+    return f"{effect.name}\n{columns(rows)}"
+
+
+# --- helpers ----------------------------------------------------------------------------------------------------------
+
+
+def _open_pairs(loop: Loop) -> list[list[str]]:
+    """Return the pairs that the data cannot distinguish: those of what is named, or all where nothing is."""
+    names = {effect.name for effect in loop.effects}
+    return [row.pair for row in loop.confounded if names & set(row.pair) or not names]
+
+
+def _untestable(effect: Untestable) -> str:
+    share = effect.absorbed_share
+    return effect.name + ("" if share is None else f" ({100 * share:.1f} % of it is absorbed by calibration)")
+
+
+def _seen(loop: Loop) -> str:
+    """Return in one line from which size on effects that are testable, and were not found, would have been seen."""
+    hidden = {effect.name for effect in loop.not_testable}
+    shown = {name: entry for name, entry in loop.detectable.items() if name not in hidden and entry.would_be_seen is not False}
+    return ", ".join(f"{name} ({_size(entry)})" for name, entry in shown.items() if entry.smallest)
+
+
+def _size(entry: Detectable) -> str:
+    """Return the smallest size that would be seen in all places."""
+    largest = max((size for size in entry.smallest.values() if size is not None), default=float("nan"))
+    size = f"{largest:.{4 if entry.kind == 'factor' else 3}g}" + ("" if entry.unit in ("", "1") else f" {entry.unit}")
+    return {"factor": f"a factor of {size}", "softer_than": f"softer than {size}"}.get(entry.kind, size)
+
+
+def _left(left: Left) -> str:
+    """Return in one line how large the remaining residual is, where, when, what it goes with, and whether it has structure."""
+    if left.rms_m is None:
+        return ""
+    words = [f"{1e3 * left.rms_m:.3g} mm rms" + (" in held-out data" if left.held_out else "")]
+    if left.where.marker:
+        words.append("most " + _place_text(left.where))
+    if left.worst_frame.frame is not None:
+        words.append(f"in frame {left.worst_frame.frame}")
+    goes = next((row for row in left.goes_with if (row.p_holm or 0.0) < SURE), None)
+    if goes is not None:
+        words.append(f"going with {goes.covariate}")
+    if left.structure.significant is not None:
+        words.append("with structure" if left.structure.significant else "without structure")
+    return ", ".join(words)
+
+
+def _place_text(where: Where) -> str:
+    """Return where a residual is largest: at a marker, or at a place on the body at rest."""
+    if not where.marker.startswith("surface ") or where.position_m is None:
+        return f"at marker {where.marker}"
+    return "at ({:.0f}, {:.0f}, {:.0f}) mm on the body".format(*(1e3 * (v or 0.0) for v in where.position_m))
+
+
+def _rows(loop: Loop) -> list[list[str]]:
+    rows = []
+    keys = [("train_rms_m", "residual"), ("validation_rms_m", "residual, held out")]
+    if loop.before.validation_normal_rms_m != loop.before.validation_rms_m:
+        keys.append(("validation_normal_rms_m", "clouds, along normals, held out"))
+    for key, name in keys:
+        before, after = getattr(loop.before, key), getattr(loop.after, key)
+        if before is not None and after is not None:
+            rows.append([name, f"{1e3 * before:.3f} → {1e3 * after:.3f} mm rms"])
+    if loop.noise_m is not None:
+        rows.append(["noise", f"{1e3 * loop.noise_m:.3f} mm"])
+    own = loop.model_error
+    if own.held_out_m is not None:
+        said = f"{1e3 * own.held_out_m:.3f} mm held out, beyond noise and discretisation; noise: {own.noise_source}"
+        rows.append(["error of the model", said])
+    return rows
+
+
+def _parameter(value: Any, std: Any, unit: str | None) -> str:
+    """Return a value with its standard deviation; values of several places one after another."""
+    if isinstance(value, Mapping):
+        stds = std if isinstance(std, Mapping) else {}
+        return ", ".join(f"{name} {_parameter(v, stds.get(name), unit)}" for name, v in value.items())
+    known = "" if unit in (None, "", "1") else f" {unit}"
+    return f"{_words(value)}{'' if std is None else f' ± {_words(std)}'}{known}"
+
+
+def _words(value: Any) -> str:
+    """Return a value of JSON as a short text."""
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, Mapping):
+        return ", ".join(f"{str(key).replace('_', ' ')} {_words(item)}" for key, item in value.items() if item is not None)
+    if isinstance(value, list | tuple):
+        simple = all(isinstance(item, int | float) for item in value)
+        return f"[{', '.join(map(_words, value))}]" if simple else "; ".join(map(_words, value))
+    return "–" if value is None else str(value)
