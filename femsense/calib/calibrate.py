@@ -103,7 +103,8 @@ def _as_declared(recording: Recording, views: Sequence[int]) -> Recording:
 def calibrated_start(
     robot: Robot, recording: Recording, frames: IntArray
 ) -> tuple[tuple[FloatArray, ...], FloatArray | None, dict[int, Equilibrium]]:
-    """Return poses, initial inputs (None where they are known) and states of frames by which further fits begin; frames need markers."""
+    """Return poses, initial inputs (None where they are known) and states of frames by which further fits begin;
+    frames need markers."""
     _, _, poses, initial, jet = _fitted(robot, recording, frames, [], strict=False)
     return tuple(poses), initial, jet.states
 

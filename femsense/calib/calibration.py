@@ -45,7 +45,8 @@ class Calibration:
     noise_m: float = float("nan")
     """What markers repeat to [m], root mean square in space; nan where nothing tells it."""
     joint_covariance: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
-    """Of (rotation [rad], shift [m]) of all cameras together, shape (6 v, 6 v); not given: that of the first camera alone is known."""
+    """Of (rotation [rad], shift [m]) of all cameras together, shape (6 v, 6 v); not given:
+    that of the first camera alone is known."""
 
     def __repr__(self) -> str:
         fits = [(self.rms_m, "markers"), (self.normal_rms_m, "clouds")]

@@ -1,7 +1,7 @@
 """Whether measured markers can be those of the robot: unit, handedness, swapped labels, outliers.
 
-All is judged against the fitted model, by what another reading of the same numbers would leave: a scale, a mirror or a swap counts
-where it takes most of the residual away.
+All is judged against the fitted model, by what another reading of the same numbers would leave: a scale,
+a mirror or a swap counts where it takes most of the residual away.
 """
 
 from __future__ import annotations
@@ -21,8 +21,9 @@ from femsense.model.recording import Recording, with_marker_table
 from femsense.model.robot import Robot
 
 SUSPICIOUS = 0.02
-"""A residual below this share of the markers' spread needs no other reading. No measurement set it: recordings of the rig leave less, and a
-real tendon robot whose model lacks something leaves 0.03 to 0.26, where other readings are tried and do not explain it better."""
+"""A residual below this share of the markers' spread needs no other reading. No measurement set it:
+recordings of the rig leave less, and a real tendon robot whose model lacks something leaves 0.03 to 0.26, where other readings
+are tried and do not explain it better."""
 EXPLAINED = 4.0
 """Another reading counts where the residual falls by this factor."""
 HOPELESS = 0.5
@@ -54,7 +55,8 @@ class Pairs:
 
 
 def similarity(a: FloatArray, b: FloatArray, *, mirrored: bool = False) -> tuple[float, FloatArray]:
-    """Return the scale of b against a, and the residual [m], shape (k, 3), of the best turned, shifted and scaled b (Umeyama 1991).
+    """Return the scale of b against a, and the residual [m], shape (k, 3), of the best turned,
+    shifted and scaled b (Umeyama 1991).
 
     Arguments:
         a, b: corresponding points [m], shape (k, 3).
@@ -122,8 +124,8 @@ def _unit(scale: float) -> str:
 def _swapped(pairs: Pairs, plain: float) -> dict[int, int]:
     """Return which marker each named one is, where other names take most of the residual away; empty where none do.
 
-    In the frame with most markers three of them, far apart, are tried as every three of the model that are as far apart; the other names
-    follow by assignment (Kuhn 1955).
+    In the frame with most markers three of them, far apart, are tried as every three of the model that are as far apart;
+    the other names follow by assignment (Kuhn 1955).
     """
     numbers, counts = np.unique(pairs.group, return_counts=True)
     mine = pairs.group == numbers[counts.argmax()]
@@ -193,8 +195,8 @@ def _modelled(pairs: Pairs, named: IntArray) -> FloatArray:
 def true_labels(places: FloatArray, measured: FloatArray, marker: IntArray, *, noise: float) -> IntArray:
     """Return which marker each measured point is: as named, or swapped where the names cannot be right.
 
-    The assignment with the least sum of squared distances (Kuhn 1955) counts where it takes EXPLAINED of the distance away of those that it
-    renames, and that distance was far above the noise.
+    The assignment with the least sum of squared distances (Kuhn 1955) counts where it takes EXPLAINED of the distance away of
+    those that it renames, and that distance was far above the noise.
 
     Arguments:
         places: where the model has all markers [m], shape (m, 3).
@@ -246,7 +248,8 @@ def relabelled(robot: Robot, scene: Scene, pairs: Sequence[Pairs], noise: float)
 
 
 def _mostly(far: BoolArray, marker: IntArray) -> BoolArray:
-    """Return which rows are of a marker that is far in most frames, shape (k,): it sits elsewhere than declared, which is no outlier."""
+    """Return which rows are of a marker that is far in most frames, shape (k,): it sits elsewhere than declared,
+    which is no outlier."""
     total = np.bincount(marker, minlength=int(marker.max(initial=0)) + 1)
     return np.asarray((np.bincount(marker[far], minlength=len(total)) > 0.5 * total)[marker])
 
@@ -274,8 +277,8 @@ def _all_places(robot: Robot, pairs: Pairs, mine: BoolArray) -> FloatArray:
 def _outliers(off: FloatArray, spread: float) -> BoolArray:
     """Return which markers of one frame [m], shape (k,), are far from where the model has them while most others are near.
 
-    Sorted by distance, outliers stand behind a jump by the factor EXPLAINED in the upper two fifths: errors of a model grow along the body
-    without one.
+    Sorted by distance, outliers stand behind a jump by the factor EXPLAINED in the upper two fifths:
+    errors of a model grow along the body without one.
     """
     order = np.argsort(off)
     first = max(int(np.ceil(0.6 * len(off))), 3)

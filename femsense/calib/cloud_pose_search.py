@@ -1,9 +1,10 @@
 """The pose of a camera from clouds alone, from nowhere: the body's visible side is laid everywhere into what the camera saw.
 
-Poses on a grid of rotations and places are judged by a map of distances to the measured points (Fitzgibbon, "Robust registration of 2D and 3D point
-sets", 2003); the best are refined by closest points (Besl and McKay 1992), from the visible side to what was measured: a silhouette holds the body in its plane.
-In the end each part of the visible side was measured or not, and each ray that meets the body ends there, or behind it, which speaks against the pose.
-Planes that are larger than the body are taken out before: a flat side fits everywhere into a table.
+Poses on a grid of rotations and places are judged by a map of distances to the measured points (Fitzgibbon,
+"Robust registration of 2D and 3D point sets", 2003); the best are refined by closest points (Besl and McKay 1992), from the
+visible side to what was measured: a silhouette holds the body in its plane. In the end each part of the visible side was measured
+or not, and each ray that meets the body ends there, or behind it, which speaks against the pose. Planes that are larger than the
+body are taken out before: a flat side fits everywhere into a table.
 """
 
 from __future__ import annotations
@@ -41,7 +42,8 @@ RAYS = 10000
 MOST_CELLS = 4e6
 """Cells of the map of distances: 16 MB; a wider scene gets larger ones."""
 LEAST = 0.25
-"""A pose needs this gain: right ones of benchmarks/calibration.py have 0.5 and more, wrong ones 0 and less where the robot is in sight."""
+"""A pose needs this gain: right ones of benchmarks/calibration.py have 0.5 and more,
+wrong ones 0 and less where the robot is in sight."""
 CAP = 0.1
 """Distances beyond this share of the body's diagonal count alike."""
 PLANE_SHARE = 0.3
@@ -73,9 +75,11 @@ class CloudPose:
     T_robot_camera: FloatArray
     """shape (4, 4)."""
     error_m: float
-    """Root mean square distance of the visible side from measured points, cut off at REACH of the diagonal; rays through the body count as that far [m]."""
+    """Root mean square distance of the visible side from measured points, cut off at REACH of the diagonal;
+    rays through the body count as that far [m]."""
     gain: float
-    """Share of the visible side that was measured less the share that was not, and less rays that go through [1]; 1 is perfect, below 0 is no fit."""
+    """Share of the visible side that was measured less the share that was not, and less rays that go through [1];
+    1 is perfect, below 0 is no fit."""
 
 
 def find_cloud_pose(views: Sequence[View]) -> CloudPose:
@@ -317,7 +321,8 @@ def _visible(samples: FloatArray, normals: FloatArray, T_camera_robot: FloatArra
 
 
 def _judged(views: Sequence[_Fine], trees: Sequence[Any], T: FloatArray, size: float) -> CloudPose:
-    """Return how a pose fits: each visible sample has a measured point beside it or not, each ray ends on the body or behind it."""
+    """Return how a pose fits: each visible sample has a measured point beside it or not,
+    each ray ends on the body or behind it."""
     limit, squares = REACH * size, []
     for view, tree in zip(views, trees):
         placed, looking = _visible(view.samples, view.normals, invert_pose(T))

@@ -26,7 +26,8 @@ from femsense.pointcloud.segmentation import color_mask
 FRAMES = 3
 """Free frames in which a pose is sought, those under the most different inputs."""
 START_STD = (0.1, 0.03)
-"""What the search is off by at most: [rad], and as a share of the body's diagonal; three times what benchmarks/calibration.py finds."""
+"""What the search is off by at most: [rad], and as a share of the body's diagonal;
+three times what benchmarks/calibration.py finds."""
 UNDETERMINED = 0.5
 """A direction is not determined where the clouds leave this share of START_STD."""
 

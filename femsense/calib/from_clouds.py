@@ -1,7 +1,8 @@
 """Pose of the cameras and noise of their depth from the clouds of free frames, together with what markers say.
 
-The residual of every point along the normal of the surface that its ray meets moves the poses (and unknown inputs) in a Gauss–Newton fit; the fit to the
-markers enters as a Gaussian. Neighbouring residuals err together (mesh, law), so the covariance is that of sums over cells of the surface.
+The residual of every point along the normal of the surface that its ray meets moves the poses (and unknown inputs) in a
+Gauss–Newton fit; the fit to the markers enters as a Gaussian. Neighbouring residuals err together (mesh, law), so the covariance
+is that of sums over cells of the surface.
 """
 
 from __future__ import annotations
@@ -132,9 +133,9 @@ def refine_poses(robot: Robot, recording: Recording, calibration: Calibration) -
 def _worth(normal: FloatArray, scores: FloatArray, prior: FloatArray, apart: FloatArray) -> float:
     """Return by which share the clouds count beside the markers [1].
 
-    Points of one cell err together; the scatter of the cells' scores tells how far the pose of the clouds is known. Where clouds and markers are
-    farther apart than both deviations say, the clouds err by more still (model, lens). They then count by so much less that the difference is one
-    that is to be expected.
+    Points of one cell err together; the scatter of the cells' scores tells how far the pose of the clouds is known.
+    Where clouds and markers are farther apart than both deviations say, the clouds err by more still (model, lens). They then
+    count by so much less that the difference is one that is to be expected.
     Source: Mandel and Paule, "Interlaboratory evaluation of a material with unequal numbers of replicates" (1970).
 
     Arguments:

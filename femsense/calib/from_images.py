@@ -1,8 +1,9 @@
 """Markers from colour images lifted by registered depth: ArUco tags and coloured dots.
 
-A tag is found by OpenCV (Garrido-Jurado et al., "Automatic generation and detection of highly reliable fiducial markers under occlusion", 2014); its
-middle is where the diagonals cross. A dot is a patch of its colour, its middle the mean of its pixels. The depth there is that of a plane through the
-depths of the patch: along straight rays (x, y, 1) the inverse depth of a plane is linear in x and y.
+A tag is found by OpenCV (Garrido-Jurado et al.,
+"Automatic generation and detection of highly reliable fiducial markers under occlusion", 2014); its middle is where the diagonals
+cross. A dot is a patch of its colour, its middle the mean of its pixels. The depth there is that of a plane through the depths of
+the patch: along straight rays (x, y, 1) the inverse depth of a plane is linear in x and y.
 """
 
 from __future__ import annotations
@@ -41,13 +42,15 @@ class Spots:
 
 
 def has_image_markers(robot: Robot, recording: Recording) -> bool:
-    """Return whether markers can be read from images: none stand in files, the robot says how they look, and there are colour images."""
+    """Return whether markers can be read from images: none stand in files, the robot says how they look,
+    and there are colour images."""
     images = any(file is not None for files in recording.color_files for file in files)
     return bool(robot.marker_looks) and images and not recording.has_markers and not len(recording.unnamed_frame)
 
 
 def with_image_markers(robot: Robot, recording: Recording, frames: IntArray) -> tuple[Recording, BoolArray]:
-    """Return the recording with what the images of some frames show as markers without names, and which marker each may be, shape (U, markers).
+    """Return the recording with what the images of some frames show as markers without names, and which marker each may be,
+    shape (U, markers).
 
     Raises:
         InputError: images that are broken or do not fit the camera table.

@@ -51,7 +51,8 @@ def initial_state(robot: Robot, recording: Recording, initial: FloatArray | None
 
 
 def first_inputs(robot: Robot, recording: Recording) -> FloatArray | None:
-    """Return initial inputs to start from [N] or [m], shape (a,): the smallest that leave no cable pushing; None where they are known."""
+    """Return initial inputs to start from [N] or [m], shape (a,): the smallest that leave no cable pushing;
+    None where they are known."""
     if recording.actuation_zero == "absolute":
         return None
     lowest = recording.inputs.min(axis=0) if recording.inputs.size else np.zeros(len(robot.body.cables))
@@ -67,7 +68,8 @@ def largest_input(robot: Robot, actuation: str) -> float:
 def input_bounds(robot: Robot, recording: Recording) -> tuple[FloatArray, FloatArray]:
     """Return bounds of the initial inputs, so that no frame leaves the limits of its cable: initial + recorded stays within them.
 
-    A cable whose recorded tensions alone span more than its limits (`check_against` warns of it) keeps max_tension_n as its bound.
+    A cable whose recorded tensions alone span more than its limits (`check_against` warns of it) keeps max_tension_n as its
+    bound.
     """
     cables = robot.body.cables
     if recording.actuation == "displacement":

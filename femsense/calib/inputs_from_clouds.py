@@ -1,7 +1,7 @@
 """Initial inputs of cables, and the poses of cameras with them, from the clouds of free frames where no marker tells them.
 
-Gauss–Newton over poses and inputs: the residual of each point is that along its ray onto the body under the inputs. A cable moves the whole body, so
-that a change of input looks like no change of pose in more than one frame.
+Gauss–Newton over poses and inputs: the residual of each point is that along its ray onto the body under the inputs.
+A cable moves the whole body, so that a change of input looks like no change of pose in more than one frame.
 """
 
 from __future__ import annotations

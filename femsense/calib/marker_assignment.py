@@ -1,8 +1,9 @@
-"""Names for markers that nobody named, by the model: they may stand in another order in each frame, with outliers among them and others missing.
+"""Names for markers that nobody named, by the model: they may stand in another order in each frame,
+with outliers among them and others missing.
 
-`search_poses` finds poses from nowhere for the model's states; the joint fit (pose and unknown inputs) of each likely one moves the states, the
-names follow by assignment, and so in turns until no name changes.
-A layout that fits under two poses alike is said to do so: nothing is picked.
+`search_poses` finds poses from nowhere for the model's states;
+the joint fit (pose and unknown inputs) of each likely one moves the states, the names follow by assignment,
+and so in turns until no name changes. A layout that fits under two poses alike is said to do so: nothing is picked.
 """
 
 from __future__ import annotations
@@ -28,8 +29,9 @@ from femsense.model.recording import Recording, state_key, with_marker_table
 from femsense.model.robot import Robot
 
 AS_GOOD = 1.2
-"""Another pose is as good where what it leaves is below this times what the best leaves, however many points there are: errors of a model are common to
-points. Wrong poses of data/tentacle leave 1.2 times as much and more, those of layouts with a symmetry 1.0."""
+"""Another pose is as good where what it leaves is below this times what the best leaves, however many points there are:
+errors of a model are common to points. Wrong poses of data/tentacle leave 1.2 times as much and more,
+those of layouts with a symmetry 1.0."""
 ELSEWHERE = 0.1
 """Poses are different where they place the markers this share of their spread apart."""
 ROUNDS = 4
@@ -160,7 +162,8 @@ def _fitted(robot: Robot, recording: Recording, seen: Sequence[Nameless], named:
 
 
 def _settled(robot: Robot, recording: Recording, seen: Sequence[Nameless], named: Named, model: dict[int, FloatArray]) -> Named:
-    """Return the reading under given poses and states: names by assignment, without outliers and without pairs that cannot be distinguished."""
+    """Return the reading under given poses and states: names by assignment,
+    without outliers and without pairs that cannot be distinguished."""
     marker = np.full(len(recording.unnamed_frame), -1, dtype=np.int64)
     left: list[FloatArray] = []
     errors: list[float] = []

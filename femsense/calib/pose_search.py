@@ -1,8 +1,8 @@
 """The pose of a camera from points whose names nobody knows: congruent triangles, then assignment and rigid fit in turns.
 
-Every triangle of measured points is laid onto the triangles of the model whose sides are most alike; the poses that bring most points near the
-model are refined in all frames at once. A pose is judged by a likelihood in which every point is a marker or an outlier.
-Sources: Fischler and Bolles, "Random sample consensus" (1981); Kuhn (1955) for the assignment.
+Every triangle of measured points is laid onto the triangles of the model whose sides are most alike;
+the poses that bring most points near the model are refined in all frames at once. A pose is judged by a likelihood in which every
+point is a marker or an outlier. Sources: Fischler and Bolles, "Random sample consensus" (1981); Kuhn (1955) for the assignment.
 """
 
 from __future__ import annotations
@@ -237,7 +237,8 @@ def _sides(corner: FloatArray) -> FloatArray:
 
 
 def _laid(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return rotations (h, 3, 3) and shifts (h, 3) that take a triangle b (3, 3) best onto triangles a (h, 3, 3) (Kabsch 1976)."""
+    """Return rotations (h, 3, 3) and shifts (h, 3) that take a triangle b (3, 3) best onto triangles a (h, 3,
+    3) (Kabsch 1976)."""
     mean_a, mean_b = a.mean(axis=1), b.mean(axis=0)
     U, _, Vt = np.linalg.svd(np.einsum("hki,kj->hij", a - mean_a[:, None], b - mean_b))
     U[:, :, 2] *= np.sign(np.linalg.det(U @ Vt))[:, None]

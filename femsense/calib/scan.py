@@ -20,7 +20,8 @@ from femsense.pointcloud.rays import Surface, SurfaceHits, together
 from femsense.pointcloud.segmentation import color_mask
 
 REACH = 0.04
-"""A point farther from the surface than this share of the body's diagonal is not of the robot as it stands (12 mm of the diamond, METHODS section 3)."""
+"""A point farther from the surface than this share of the body's diagonal is not of the robot as it stands (12 mm of the diamond,
+METHODS section 3)."""
 OFF = 4.0
 """A point farther from the surface than so many standard deviations is not on it."""
 AROUND = 9
@@ -146,7 +147,8 @@ def ray_rows(
         surface: the deformed surface.
         poses, noises: of the cameras.
         reach: see `Surface.cast` [m].
-        catch: points whose ray misses count by the closest face instead, up to this distance [m]: for states that are still far off.
+        catch: points whose ray misses count by the closest face instead, up to this distance [m]:
+            for states that are still far off.
     """
     points, origins = scan.points(poses), scan.origins(poses)
     hits = surface.cast(points, origins, reach=reach)
@@ -159,7 +161,8 @@ def ray_rows(
 
 
 def parted(scan: Scan, surface: Surface, poses: Sequence[FloatArray], noises: Sequence[CameraNoise], *, reach: float) -> Scan:
-    """Return the scan with its points separated by a state: of the robot is what lies on the surface, and whose neighbours do too.
+    """Return the scan with its points separated by a state: of the robot is what lies on the surface,
+    and whose neighbours do too.
 
     Arguments:
         scan: what was seen, colourless.

@@ -18,7 +18,8 @@ from femsense.model.robot import Robot
 Forces = Sequence[tuple[npt.ArrayLike, npt.ArrayLike]]
 """Known contact forces: (place on the body at rest [m], force on the body [N]), each of shape (3,)."""
 Target = Mapping[str | tuple[float, float, float], npt.ArrayLike]
-"""A marker's name, or a point of the body at rest [m] → where it is wanted, robot frame [m], (3,); NaN leaves a direction free."""
+"""A marker's name, or a point of the body at rest [m] → where it is wanted, robot frame [m], (3,);
+NaN leaves a direction free."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -59,7 +60,10 @@ def make_goal(
     forces: Forces,
     contacts: Sequence[WallContact],
 ) -> Goal:
-    """Return the rows that are wanted: the coordinates of the targets that are not free, then the places of the walls. Raises InputError."""
+    """Return the rows that are wanted: the coordinates of the targets that are not free, then the places of the walls.
+
+    Raises InputError.
+    """
     keys, points = list(target), [_numbers(value, f"target {key}") for key, value in target.items()]
     places = [_place(robot, key) for key in keys] + [_numbers(contact.point_m, "contacts") for contact in contacts]
     if not places:

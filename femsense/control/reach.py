@@ -9,8 +9,8 @@ The unknowns are the tensions of the cables and the pressures of the chambers, u
     min ½ |p + W_pa du − p*|² + ½ λ |du|²   with  u_min ≤ u + du ≤ u_max,  s_min ≤ s + W_aa du ≤ s_max,
 
 as Duriez (2013) and Coevoet et al. (2017) pose it, within a trust region that the next equilibrium widens or narrows.
-The damping λ acts on the step, not on the input, so that it moves no answer. A wanted contact force is applied to the body, and the
-place of the wall becomes one more target: both hold where the robot presses the wall with that force.
+The damping λ acts on the step, not on the input, so that it moves no answer. A wanted contact force is applied to the body,
+and the place of the wall becomes one more target: both hold where the robot presses the wall with that force.
 """
 
 from __future__ import annotations
@@ -42,7 +42,8 @@ PENALTY = 50.0
 ACTIVE = 1e-9
 """A limit holds a step back if its multiplier is larger than this, in units of the scaled problem."""
 FIRST_RADIUS, SMALLEST_STEP, NEAR = 0.3, 1e-9, 1e-5
-"""Trust region at first and the step at which a search is over, in units of the body's reach; error from which states are solved finely [m]."""
+"""Trust region at first and the step at which a search is over, in units of the body's reach;
+error from which states are solved finely [m]."""
 COARSE, FINE = 1e-9, 1e-13
 """Relative tolerance of equilibria on the way, and within a hundredth of a millimetre of the target."""
 
@@ -82,7 +83,8 @@ def reach(
         control: what is commanded of the cables: "tension" [N] or "displacement" [m].
         limits: cable → (least, largest) command [N or m], chamber → pressure [Pa], beside those of the robot.
         forces: known or sensed contact forces: (place on the body at rest [m], force on the body [N]), each of shape (3,).
-        start: where the robot is now; by default at rest without inputs. Where no way leads on from there, one from rest is tried.
+        start: where the robot is now; by default at rest without inputs. Where no way leads on from there,
+            one from rest is tried.
         calibration: its initial inputs are taken off the commands.
         contacts: walls to press against with a wanted force.
         options: when to end.
@@ -152,7 +154,8 @@ class _Step:
     gain: float
     """By how much the squared error falls to first order [m²]."""
     active: tuple[tuple[float, int, str], ...] = ()
-    """Limits that hold it back: (multiplier, index of the effort, "least", "largest", "shortest" or "longest"), the largest first."""
+    """Limits that hold it back: (multiplier, index of the effort, "least", "largest", "shortest" or "longest"),
+    the largest first."""
 
 
 def _step(body: BodyModel, goal: Goal, bounds: Limits, state: Equilibrium, radius: float, options: ReachOptions) -> _Step:
@@ -189,7 +192,8 @@ def _step(body: BodyModel, goal: Goal, bounds: Limits, state: Equilibrium, radiu
 
 
 def _slopes(body: BodyModel, goal: Goal, state: Equilibrium) -> tuple[FloatArray, FloatArray]:
-    """Return W_pa, the rows' change by unit efforts [m/N], shape (r, a + c), and W_aa, that of what the cables wind up, shape (a, a + c)."""
+    """Return W_pa, the rows' change by unit efforts [m/N], shape (r, a + c), and W_aa, that of what the cables wind up,
+    shape (a, a + c)."""
     tangent = tangent_at(body, state)
     shares = [t / T if T > 0 else np.ones_like(t) for t, T in zip(state.segment_tensions, state.tension.values())]
     forces = drive_rows(body, state.positions, shares)
@@ -221,7 +225,8 @@ def _solved(
     fine: bool = False,
     tried: bool = False,
 ) -> Equilibrium:
-    """Return the equilibrium under efforts (a + c,); `before` are the tensions along the cables before the robot began to move."""
+    """Return the equilibrium under efforts (a + c,);
+    `before` are the tensions along the cables before the robot began to move."""
     a = len(body.cables)
     return solve_equilibrium(
         body,
@@ -242,7 +247,8 @@ def _begin(body: BodyModel, goal: Goal, bounds: Limits, start: Equilibrium | Non
 
 
 def _is_better(body: BodyModel, goal: Goal, bounds: Limits, tried: Equilibrium, state: Equilibrium) -> bool:
-    """Return whether a state is nearer, limits of length that are violated included (an exact penalty: the more is missed, the more they count)."""
+    """Return whether a state is nearer, limits of length that are violated included (an exact penalty: the more is missed,
+    the more they count)."""
     weight = PENALTY * float(np.linalg.norm(goal.miss(state.positions)))
 
     def merit(one: Equilibrium) -> float:

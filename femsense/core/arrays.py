@@ -23,7 +23,8 @@ def freeze(array: npt.ArrayLike, dtype: Any = np.float64) -> npt.NDArray[Any]:
 
 
 def read_only(array: FloatArray) -> FloatArray:
-    """Return a read-only view of an array (a copy where it is not contiguous): kernels are compiled once more for arrays that can be written to."""
+    """Return a read-only view of an array (a copy where it is not contiguous):
+    kernels are compiled once more for arrays that can be written to."""
     view = np.ascontiguousarray(array).view()
     view.setflags(write=False)
     return view

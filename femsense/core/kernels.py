@@ -1,7 +1,9 @@
-"""Kernels: functions that numba compiles once and keeps. Those that were kept are loaded without the rules by which numba compiles.
+"""Kernels: functions that numba compiles once and keeps.
+Those that were kept are loaded without the rules by which numba compiles.
 
-numba brings all its rules of typing and lowering into memory before it looks whether a kernel was kept. Those take as long as importing numba
-itself, and a kernel that was kept needs none of them. `benchmarks/first_minute.py` prints what that saves.
+numba brings all its rules of typing and lowering into memory before it looks whether a kernel was kept.
+Those take as long as importing numba itself, and a kernel that was kept needs none of them.
+`benchmarks/first_minute.py` prints what that saves.
 """
 
 from __future__ import annotations

@@ -21,10 +21,11 @@ STILL = 1e-2
 
 
 NEARLY = 4.0
-"""A step is idle that gained less than what counts as a gain where the predicted gain of a whole step was less than so many times that."""
+"""A step is idle that gained less than what counts as a gain where the predicted gain of a whole step was less than so many times
+that."""
 LITTLE = 2.0
-"""A step is the last whose predicted gain was less than so many times what counts as a gain, by a Jacobian of its own; not in units of the misfit, which
-may be large because the fit is far from its end."""
+"""A step is the last whose predicted gain was less than so many times what counts as a gain, by a Jacobian of its own;
+not in units of the misfit, which may be large because the fit is far from its end."""
 LEAST_SHRINKING = 0.25
 """No step is foretold to be shorter than this share of the one before."""
 CONVERGED, STOPPED_EARLY = "converged", "stopped early"
@@ -54,7 +55,8 @@ class FitResult:
 
 
 class Pace:
-    """How long steps with a Jacobian of their own are, and how long the next one will be if they go on shrinking; inf: not known."""
+    """How long steps with a Jacobian of their own are, and how long the next one will be if they go on shrinking; inf:
+    not known."""
 
     def __init__(self) -> None:
         self.last, self.next = np.inf, np.inf
@@ -104,15 +106,18 @@ class GaussNewtonOptions:
     still: float = STILL
     """Length of a step in whitened residual at which it stops, in units of the misfit where that is more than noise."""
     serves: float = 0.0
-    """A Jacobian serves for another step where it missed the change of the residual by less than this share of it, or by less than what counts
-    as a gain."""
+    """A Jacobian serves for another step where it missed the change of the residual by less than this share of it,
+    or by less than what counts as a gain."""
     worth: float = np.inf
-    """A fit whose sum of squares stays above this is stopped early: where the predicted gain of a step is less than half of what is missing, or a
-    borrowed Jacobian says that nothing is left to gain."""
+    """A fit whose sum of squares stays above this is stopped early:
+    where the predicted gain of a step is less than half of what is missing,
+    or a borrowed Jacobian says that nothing is left to gain."""
     trusted: float = 0.0
-    """A Jacobian that missed less than this share of every step since it was made is believed, too, that nothing is left to gain."""
+    """A Jacobian that missed less than this share of every step since it was made is believed, too,
+    that nothing is left to gain."""
     enough: float = 0.0
-    """What counts as a gain in the sum of squares, in units of the misfit where that is more than noise; 0: all that `tolerance` says."""
+    """What counts as a gain in the sum of squares, in units of the misfit where that is more than noise; 0:
+    all that `tolerance` says."""
     spare: float = 0.0
     """A fit ends where the predicted gain of a whole step is less than this: what is asked next is worth more."""
     learning: Learning = field(default_factory=Learning)
@@ -130,14 +135,15 @@ def gauss_newton(
     nonsmooth: Callable[[FloatArray], Nonsmoothness | None] | None = None,
     options: GaussNewtonOptions | None = None,
 ) -> FitResult:
-    """Minimise ‖r(θ)‖² within bounds (Levenberg's damping where a plain step does not pay; how the residual bends, as far as its Jacobians have
-    shown it, counts while that foretells steps no worse than straight lines do: `core.local_model`).
+    """Minimise ‖r(θ)‖² within bounds (Levenberg's damping where a plain step does not pay; how the residual bends,
+    as far as its Jacobians have shown it, counts while that foretells steps no worse than straight lines do: `core.local_model`).
 
-    A Jacobian that predicted the last step well serves for the next one too; the fit ends only where the Jacobian at θ itself says that
-    there is nothing left to gain (or one that is `trusted`), or, where what is left is noise, where it would: steps of a Gauss–Newton fit, each
-    with a Jacobian of its own, shrink like a geometric series, so that two of them foretell the next. It ends as well where two steps in turn
-    were idle: their predicted gain was little and they brought less (`enough`). On a bend there may always be a little to gain. And a step with next
-    to no predicted gain by a Jacobian of its own is the last (`LITTLE`), whatever it brings.
+    A Jacobian that predicted the last step well serves for the next one too;
+    the fit ends only where the Jacobian at θ itself says that there is nothing left to gain (or one that is `trusted`), or, where
+    what is left is noise, where it would: steps of a Gauss–Newton fit, each with a Jacobian of its own, shrink like a geometric
+    series, so that two of them foretell the next. It ends as well where two steps in turn were idle: their predicted gain was
+    little and they brought less (`enough`). On a bend there may always be a little to gain. And a step with next to no predicted
+    gain by a Jacobian of its own is the last (`LITTLE`), whatever it brings.
 
     Arguments:
         evaluate: residual and Jacobian; priors are rows of them.
@@ -250,9 +256,11 @@ def _shorter(near: LocalModel, damping: float, change: FloatArray) -> float:
 
 
 def _at_nonsmooth(J: FloatArray, r: FloatArray, nonsmooth: Nonsmoothness) -> FloatArray:
-    """Return the derivative that stands for both sides of the bends on which a fit converged: the mean of them that leaves no gradient.
+    """Return the derivative that stands for both sides of the bends on which a fit converged:
+    the mean of them that leaves no gradient.
 
-    Straight lines of one side alone would go on down where the other side goes up (Clarke's generalised Jacobian has 0 among its gradients).
+    Straight lines of one side alone would go on down where the other side goes up (Clarke's generalised Jacobian has 0 among its
+    gradients).
     """
     spread = np.sqrt(np.maximum(np.einsum("gp,pq,gq->g", nonsmooth.slope, _finite(covariance_of(J)), nonsmooth.slope), 0.0))
     here = np.abs(nonsmooth.value) < AT_NONSMOOTH * spread

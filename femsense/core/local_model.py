@@ -1,10 +1,13 @@
-"""A sum of squares near a point: that of a linear residual, but for known nonsmoothness and for the curvature that earlier steps showed.
+"""A sum of squares near a point: that of a linear residual,
+but for known nonsmoothness and for the curvature that earlier steps showed.
 
-Half the second derivative of ‖r‖² is JᵀJ + S with S = Σᵢ rᵢ ∇²rᵢ. Gauss–Newton takes S for 0. Along a bent valley where much residual is left S
-takes away most of JᵀJ, and each step covers a small share of the way; how J changed from one point of the fit to the next tells S along that way.
+Half the second derivative of ‖r‖² is JᵀJ + S with S = Σᵢ rᵢ ∇²rᵢ. Gauss–Newton takes S for 0.
+Along a bent valley where much residual is left S takes away most of JᵀJ, and each step covers a small share of the way; how J
+changed from one point of the fit to the next tells S along that way.
 
-Source: Dennis, Gay & Welsch, "An adaptive nonlinear least-squares algorithm" (1981). S is updated and sized as they do it; of all S that
-agree with the last step it is the nearest to the one before, measured by JᵀJ (they measure by the change of the slope, which may be next to nothing).
+Source: Dennis, Gay & Welsch, "An adaptive nonlinear least-squares algorithm" (1981). S is updated and sized as they do it;
+of all S that agree with the last step it is the nearest to the one before, measured by JᵀJ (they measure by the change of the
+slope, which may be next to nothing).
 """
 
 from __future__ import annotations
@@ -50,7 +53,8 @@ class _Point:
     nonsmooth: Nonsmoothness | None
 
     def as_counted_at(self, other: _Point) -> FloatArray | None:
-        """Return the Jacobian here with the bends counted as they are elsewhere, so that no jump is taken for curvature; None: they are others."""
+        """Return the Jacobian here with the bends counted as they are elsewhere, so that no jump is taken for curvature;
+        None: they are others."""
         here, there = self.nonsmooth, other.nonsmooth
         if here is None or there is None:
             return self.J if here is there else None

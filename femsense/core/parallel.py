@@ -1,7 +1,7 @@
 """Threads over pieces of work that do not wait for each other, such as frames without a past.
 
-Compiled kernels and BLAS let go of Python's lock while they work, so that two threads take about half the time where the factors are
-large. Results do not depend on how many there are.
+Compiled kernels and BLAS let go of Python's lock while they work,
+so that two threads take about half the time where the factors are large. Results do not depend on how many there are.
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ def set_workers(count: int | None) -> None:
 
 
 def workers() -> int:
-    """Return how many threads work: as chosen, by FEMSENSE_WORKERS, or one a core; one in a process that others were started beside."""
+    """Return how many threads work: as chosen, by FEMSENSE_WORKERS, or one a core;
+    one in a process that others were started beside."""
     if _chosen:
         return _chosen[0]
     said = os.environ.get("FEMSENSE_WORKERS", "")
@@ -50,7 +51,10 @@ def workers() -> int:
 
 
 def each(function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
-    """Yield function(item) of each item in order; no more than two a thread are worked on ahead. Meanwhile BLAS takes one thread a call."""
+    """Yield function(item) of each item in order; no more than two a thread are worked on ahead.
+
+    Meanwhile BLAS takes one thread a call.
+    """
     count = workers()
     if count < 2:
         with one_blas_thread():
@@ -74,8 +78,9 @@ def each(function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[
 def one_blas_thread() -> Iterator[None]:
     """Let BLAS take one thread a call meanwhile; a decorator, too.
 
-    The threads of a call wait for each other. On matrices as large as ours two of them gain a fifth on an idle machine; where other threads
-    are busy, ours or another program's, they take twice as long and more (`python benchmarks/body.py crowded`).
+    The threads of a call wait for each other. On matrices as large as ours two of them gain a fifth on an idle machine;
+    where other threads are busy, ours or another program's,
+    they take twice as long and more (`python benchmarks/body.py crowded`).
     """
     with _blas().limit(limits=1, user_api="blas"):
         yield

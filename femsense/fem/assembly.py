@@ -49,7 +49,8 @@ def internal(
 
     The clamp's springs, where the body has them, belong to it; of a plate that turns, the blocks hold the sparse part only
     (see `clamp.with_turning_plate`). `room`, an array (nb, 9), takes the blocks; it may be of single precision.
-    `stretch`, for corotational elements of ten nodes, keeps the stress of one state for the stiffness of another (`stretched_tet10`).
+    `stretch`, for corotational elements of ten nodes,
+    keeps the stress of one state for the stiffness of another (`stretched_tet10`).
     """
     stencil, material = body.stencil, body.material
     mu, lam = material.lame()

@@ -108,7 +108,10 @@ class BodyModel:
         return replace(self, dead_forces=freeze(wanted))
 
     def with_carried_mass(self, mass: npt.ArrayLike) -> BodyModel:
-        """Return the body with other masses of its nodes beside its own [kg], shape (n,): weights that turn with gravity. Raises InputError."""
+        """Return the body with other masses of its nodes beside its own [kg], shape (n,): weights that turn with gravity.
+
+        Raises InputError.
+        """
         wanted = np.asarray(mass, dtype=float)
         if wanted.shape != (len(self.mesh.nodes),) or not np.isfinite(wanted).all():
             raise InputError("wrong shape", where="carried_mass", found=wanted.shape, expected=(len(self.mesh.nodes),))
@@ -131,12 +134,14 @@ class BodyModel:
         return replace(self, cables=cables)
 
     def with_cable_places(self, places: Mapping[str, FloatArray]) -> BodyModel:
-        """Return the body with points of some cables' paths elsewhere at rest, name → [m], shape (p, 3); each keeps the element that carries it."""
+        """Return the body with points of some cables' paths elsewhere at rest, name → [m], shape (p, 3);
+        each keeps the element that carries it."""
         paths = {c.name: tie_to_elements(self.mesh, places[c.name], c.path.element) for c in self.cables if c.name in places}
         return replace(self, cables=tuple(replace(c, path=paths.get(c.name, c.path)) for c in self.cables))
 
     def with_rest_nodes(self, nodes: FloatArray) -> BodyModel:
-        """Return the body of another shape at rest: its nodes elsewhere [m], shape (n, 3), free of stress there; ties and patterns stay.
+        """Return the body of another shape at rest: its nodes elsewhere [m], shape (n, 3), free of stress there;
+        ties and patterns stay.
 
         Raises:
             InputError: where an element would fold over.
@@ -152,7 +157,8 @@ class BodyModel:
         return replace(self, mesh=mesh, stencil=stencil, chambers=chambers)
 
     def with_clamp_nodes(self, nodes: npt.ArrayLike) -> BodyModel:
-        """Return the body with other nodes that springs replace where the clamp gives, shape (s,); all that are clamped do at first."""
+        """Return the body with other nodes that springs replace where the clamp gives, shape (s,);
+        all that are clamped do at first."""
         return replace(self, clamp_nodes=freeze(as_indices(nodes, len(self.mesh.nodes), "clamp_nodes"), np.int64))
 
     def with_clamp_stiffness(self, stiffness: float = np.inf, *, turn: float = np.inf) -> BodyModel:
@@ -302,7 +308,8 @@ def tie_cable(
     max_tension: float = np.inf,
     friction: float = 0.0,
 ) -> Cable:
-    """Tie a cable to the body: each point of its path [m], shape (p, 3), far end first, goes with an element (see `embed_points`)."""
+    """Tie a cable to the body: each point of its path [m], shape (p, 3), far end first,
+    goes with an element (see `embed_points`)."""
     if not (np.isfinite(friction) and friction >= 0):
         raise InputError("out of range", where=f"friction of cable {name}", found=friction, expected="≥ 0")
     embedding = embed_points(mesh, as_points(path, f"path of cable {name}"), outside_rule="nearest_centre")

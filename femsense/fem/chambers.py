@@ -1,7 +1,8 @@
 """Pressure chambers: closed inner surfaces of the mesh, their volume and its derivatives.
 
 A pressure p does the work p dV, so that a chamber adds −p V(x) to the potential: forces p dV/dx that follow the surface, and the
-stiffness −p d²V/dx², symmetric because the surface is closed (Bonet & Wood, Nonlinear Continuum Mechanics, 8.5). On a closed surface
+stiffness −p d²V/dx², symmetric because the surface is closed (Bonet & Wood, Nonlinear Continuum Mechanics, 8.5).
+On a closed surface
 
     V = 1/3 ∮ x · n dA = Σ_faces Σ_abc T_abc x_a · (x_b × x_c),
 

@@ -1,7 +1,7 @@
 """A clamp that gives: springs at its nodes, and a rigid plate that turns about its centre against a spring.
 
-The plate turns by R = exp[φ]× about the centroid c of the clamped nodes of the declared mesh. Each tied node i, at rest X_i, has its
-anchor at c + b_i, b_i = R (X_i − c), and with y_i = x_i − c the clamp's energy is
+The plate turns by R = exp[φ]× about the centroid c of the clamped nodes of the declared mesh. Each tied node i, at rest X_i,
+has its anchor at c + b_i, b_i = R (X_i − c), and with y_i = x_i − c the clamp's energy is
 
     E(x) = min over φ of  ½ Σ k |y_i − b_i|² + ½ κ |φ|².
 
@@ -9,8 +9,8 @@ At the minimum κ φ = Σ k b_i × y_i; the force on a node is k (b_i − y_i), 
 J = κ J_l⁻¹(φ) + Σ k ((b·y) I − b yᵀ), J_l the left Jacobian of the rotation. The part P J⁻¹ Pᵀ has rank three and goes beside the
 sparse stiffness (Woodbury).
 
-A clamped node without a spring, in the middle of an edge whose ends a and b have some, is tied to (x_a + x_b)/2: the clamp that hardly gives is
-the clamp.
+A clamped node without a spring, in the middle of an edge whose ends a and b have some, is tied to (x_a + x_b)/2:
+the clamp that hardly gives is the clamp.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ from femsense.fem.mesh import EDGES, TetMesh
 from femsense.fem.stencil import Stencil, block_row_numbers
 
 TIE = 1e4
-"""Where the plate alone gives, its nodes are tied to it with springs that are together so many times as stiff as Young's modulus × reach."""
+"""Where the plate alone gives, its nodes are tied to it with springs that are together so many times as stiff as Young's modulus
+× reach."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -84,7 +85,8 @@ def ties_of(body: BodyModel) -> Ties | None:
 def followers_of(body: BodyModel) -> Followers | None:
     """Return the clamped nodes that follow those with springs; None where there are none.
 
-    Between springs at the corners of quadratic elements alone the middles of the edges would bulge out: an even pull on a face acts on these.
+    Between springs at the corners of quadratic elements alone the middles of the edges would bulge out:
+    an even pull on a face acts on these.
     """
     if np.isinf(body.clamp_stiffness) or body.mesh.tets.shape[1] != 10:
         return None
@@ -96,7 +98,8 @@ def followers_of(body: BodyModel) -> Followers | None:
 
 @functools.lru_cache(maxsize=4)
 def _middles(mesh: TetMesh, stencil: Stencil, clamped: bytes, springs: bytes) -> tuple[IntArray, IntArray]:
-    """Return the clamped nodes in the middle of edges whose ends have springs, with these, and the slots of their blocks; as `Followers` has them."""
+    """Return the clamped nodes in the middle of edges whose ends have springs, with these, and the slots of their blocks;
+    as `Followers` has them."""
     held, sprung = np.frombuffer(clamped, np.int64), np.frombuffer(springs, np.int64)
     edges = np.column_stack([mesh.tets[:, 4:].ravel(), mesh.tets[:, EDGES].reshape(-1, 2)]).astype(np.int64)
     edges = np.unique(edges, axis=0)
@@ -187,8 +190,9 @@ def first_give(body: BodyModel, forces: FloatArray) -> FloatArray:
 
     Arguments:
         body: with springs that are stiff.
-        forces: that the rigid clamp takes up at its nodes [N], shape (n, 3). A clamped node that has no spring (in the middle of an
-            edge) follows its neighbours: it gives its force to the nearest nodes with springs, and moves as they do.
+        forces: that the rigid clamp takes up at its nodes [N], shape (n, 3).
+            A clamped node that has no spring (in the middle of an edge) follows its neighbours: it gives its force to the nearest
+            nodes with springs, and moves as they do.
     """
     ties = ties_of(body)
     moves = np.zeros_like(forces)
@@ -206,8 +210,9 @@ def first_give(body: BodyModel, forces: FloatArray) -> FloatArray:
 
 
 def rigid_give(body: BodyModel, positions: FloatArray, forces: FloatArray) -> FloatArray | None:
-    """Return where the nodes come to [m], shape (n, 3), when the whole body moves with its clamp, which was rigid until now and gives as `body` says,
-    as one rigid piece; None where the clamp does not give, does not hold the moment, or turns by more than a radian.
+    """Return where the nodes come to [m], shape (n, 3), when the whole body moves with its clamp,
+    which was rigid until now and gives as `body` says, as one rigid piece; None where the clamp does not give, does not hold the
+    moment, or turns by more than a radian.
 
     Arguments:
         body: with the clamp that gives.
@@ -238,7 +243,8 @@ def rigid_give(body: BodyModel, positions: FloatArray, forces: FloatArray) -> Fl
 
 
 def _shares(points: FloatArray, nodes: FloatArray) -> FloatArray:
-    """Return how much of each point (p, 3) goes with each node (k, 3): all with a node that it is, half with both ends of its edge."""
+    """Return how much of each point (p, 3) goes with each node (k, 3): all with a node that it is,
+    half with both ends of its edge."""
     distance = np.linalg.norm(points[:, None] - nodes[None], axis=2)
     near = np.argsort(distance, axis=1)[:, :2]
     share = np.zeros(distance.shape)

@@ -10,8 +10,8 @@ from femsense.core.kernels import njit
 
 FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])  # outward where the volume is positive
 ALIKE, ALIKE_CENTRES = 1e-9, 1e-4
-"""Elements whose distances to a point differ by less, in units of the mesh, are as near, and so are centres of elements: the first of them carries
-it, so that neither rounding nor a step of a derivative by the body's size chooses."""
+"""Elements whose distances to a point differ by less, in units of the mesh, are as near, and so are centres of elements:
+the first of them carries it, so that neither rounding nor a step of a derivative by the body's size chooses."""
 NEARLY = 1e-6
 """Elements outside of which a point is by more, in barycentric coordinates, do not hold it, whatever the rounding."""
 Vector = tuple[float, float, float]
@@ -98,7 +98,8 @@ def _drawn_to_face(corners: FloatArray, point: Vector, best: FloatArray) -> None
 
 @njit(cache=True, nogil=True)
 def drawn_to_faces(corners: FloatArray, points: FloatArray, best: FloatArray) -> None:
-    """Put the closest points on the faces in the place of barycentric coordinates (p, 4) of points outside of their tetrahedra."""
+    """Put the closest points on the faces in the place of barycentric coordinates (p,
+    4) of points outside of their tetrahedra."""
     for i in range(len(points)):
         if not min(best[i, 0], best[i, 1], best[i, 2], best[i, 3]) >= 0:
             _drawn_to_face(corners[i], _vector(points, i), best[i])

@@ -1,8 +1,8 @@
 """Compliance W = H K⁻¹ Hᵀ between directions at points of the body, cables and chambers, from one factorisation.
 
 K is the exact tangent at the equilibrium (geometric stiffness of cables and pressures included). Cables that are pulled with a
-given tension are free to move, chambers under a given pressure too; taut held cables keep their length and held chambers their volume, so that W then holds K⁻¹ − K⁻¹Hᵀ(HK⁻¹Hᵀ + 1/k)⁻¹HK⁻¹ (Zhang et al.
-2019, equations 3–5, with the constraint eliminated).
+given tension are free to move, chambers under a given pressure too; taut held cables keep their length and held chambers their
+volume, so that W then holds K⁻¹ − K⁻¹Hᵀ(HK⁻¹Hᵀ + 1/k)⁻¹HK⁻¹ (Zhang et al. 2019, equations 3–5, with the constraint eliminated).
 """
 
 from __future__ import annotations
@@ -45,7 +45,8 @@ class Tangent:
     node_count: int
 
     def respond(self, forces: FloatArray) -> FloatArray:
-        """Return node displacements [m], shape (k, n, 3), under small nodal forces [N], shape (k, n, 3); held cables keep their length."""
+        """Return node displacements [m], shape (k, n, 3), under small nodal forces [N], shape (k, n, 3);
+        held cables keep their length."""
         right = forces.reshape(len(forces), -1)[:, self.dofs].T
         answer = self.factor.solve(right)
         if self.held_rows.size:
@@ -63,8 +64,8 @@ class Tangent:
 
 
 def tangent_at(body: BodyModel, equilibrium: Equilibrium, solver: Solver = factorize) -> Tangent:
-    """Return the exact linearisation of a body at an equilibrium, its stiffness solved by `solver`. Raises FemsenseError where it is
-    unstable there."""
+    """Return the exact linearisation of a body at an equilibrium, its stiffness solved by `solver`.
+    Raises FemsenseError where it is unstable there."""
     blocks = internal(body, equilibrium.positions).blocks
     assert blocks is not None
     add_cable_stiffness(body, equilibrium.positions, equilibrium.segment_tensions, blocks)

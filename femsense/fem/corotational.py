@@ -85,7 +85,8 @@ STEP = 112
 
 @njit(inline="always")
 def _factors(e, w, mu, pull, local, lam, F, R, H, mean, Dinv, T):  # type: ignore[no-untyped-def]
-    """Write the two sides of the stiffness of ten nodes as a product, K_ab = Σ_k t_ak h_bk with k = point and direction, then the mean.
+    """Write the two sides of the stiffness of ten nodes as a product, K_ab = Σ_k t_ak h_bk with k = point and direction,
+    then the mean.
 
     T[k, 9 a + 3 i + j] is −t, T[k, 96 + b] is h.
     """
@@ -269,7 +270,8 @@ def _linear_stiffness(H, D, shear, bulk, turn, slots, blocks):  # type: ignore[n
 def corotational_tet4(x, tets, gradients, volumes, mu, lam, limit, tangent, slots, forces, blocks):  # type: ignore[no-untyped-def]
     """Add internal forces [N] and, if asked, the stiffness blocks on and above the diagonal [N/m]; return the energy [J].
 
-    Arrays are those of `Stencil`; `limit` is not used. With one point λ' does not matter, and nothing is kept from point to point:
+    Arrays are those of `Stencil`; `limit` is not used. With one point λ' does not matter,
+    and nothing is kept from point to point:
     twice as fast as the kernel of ten nodes would be. For these see `corotational_tet10`.
     """
     F, R, P, H, D = np.empty((9, 1)), np.empty((9, 1)), np.empty(9), np.empty((4, 3)), np.empty(6)
@@ -308,7 +310,8 @@ def corotational_tet10(x, tets, gradients, volumes, mu, lam, limit, tangent, slo
 def stretched_tet10(x, tets, gradients, volumes, mu, lam, tangent, slots, forces, blocks, stretch):  # type: ignore[no-untyped-def]
     """The same with the stress of another state in its stiffness.
 
-    Without `tangent`, RᵀF is written to `stretch`, shape (m, 4, 9); with it, the stiffness is that of the rotations R at x and of the
-    stretches that stand there, as if F were R times these (forces and energy are those of x).
+    Without `tangent`, RᵀF is written to `stretch`, shape (m, 4, 9); with it,
+    the stiffness is that of the rotations R at x and of the stretches that stand there,
+    as if F were R times these (forces and energy are those of x).
     """
     return _tet10(x, tets, gradients, volumes, mu, lam, tangent, slots, forces, blocks, stretch)

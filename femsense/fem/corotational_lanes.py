@@ -1,5 +1,8 @@
 # mypy: allow-untyped-decorators
-"""Forces of corotational elements, LANES of them at a time: where no stiffness is wanted. The laws are those of `femsense.fem.corotational`."""
+"""Forces of corotational elements, LANES of them at a time: where no stiffness is wanted.
+
+The laws are those of `femsense.fem.corotational`.
+"""
 
 from __future__ import annotations
 
@@ -12,13 +15,15 @@ from femsense.fem.linalg.simd_lanes import LANES, add_divergence, add_gradient
 from femsense.fem.rotation import FAST, closest_rotation
 
 DEFORMATION, VOLUME, TRACE, SHEAR, PULL, ROOM = (row * LANES for row in (9, 18, 19, 20, 21, 22))
-"""Where the rows of LANES numbers of a point begin, after nine of its rotations: one array, so that a compiler sees rows apart from each other."""
+"""Where the rows of LANES numbers of a point begin, after nine of its rotations: one array,
+so that a compiler sees rows apart from each other."""
 ROWS = 23
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
 def _begin_rotations(v):  # type: ignore[no-untyped-def]
-    """Write the deformations of a point, shape (ROWS LANES,), to where rotations go, and to ROOM by how much they are from being too flat for that."""
+    """Write the deformations of a point, shape (ROWS LANES,), to where rotations go,
+    and to ROOM by how much they are from being too flat for that."""
     for q in range(LANES):
         a, b, c = v[DEFORMATION + q], v[DEFORMATION + LANES + q], v[DEFORMATION + 2 * LANES + q]
         d, e, f = v[DEFORMATION + 3 * LANES + q], v[DEFORMATION + 4 * LANES + q], v[DEFORMATION + 5 * LANES + q]
@@ -95,7 +100,10 @@ def _stress(v):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
 def corotational_forces(x, nodes, gradients, volumes, mu, lam, forces):  # type: ignore[no-untyped-def]
-    """Add internal forces [N] to those of the body, LANES elements at a time; return the energy [J]. Arrays are those of `Lanes` and `Stencil`."""
+    """Add internal forces [N] to those of the body, LANES elements at a time; return the energy [J].
+
+    Arrays are those of `Lanes` and `Stencil`.
+    """
     points, count, wide = volumes.shape[1], nodes.shape[1], 3 * nodes.shape[1] * LANES
     v, X = np.empty((points, ROWS * LANES)), np.empty(wide)
     local, rest, theta, whole = np.empty(LANES), np.empty(LANES), np.empty(LANES), np.empty(LANES)

@@ -11,8 +11,8 @@ from femsense.fem.body import BodyModel
 def energy_density(body: BodyModel, positions: FloatArray) -> FloatArray:
     """Return the energy density μ E:E + λ/2 (tr E)² of each element [J/m³], shape (m,), the mean over its volume.
 
-    E = (FᵀF − I)/2 is Green's strain: the density is that of St Venant and Kirchhoff, which a rigid motion does not change and to which all laws
-    of the package go at small strains.
+    E = (FᵀF − I)/2 is Green's strain: the density is that of St Venant and Kirchhoff,
+    which a rigid motion does not change and to which all laws of the package go at small strains.
 
     Arguments:
         body: its mesh at rest and its moduli.

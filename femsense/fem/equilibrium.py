@@ -1,4 +1,5 @@
-"""Static equilibrium under dead loads, cables and pressures: Newton with the exact tangent, a line search, and load steps when needed.
+"""Static equilibrium under dead loads, cables and pressures: Newton with the exact tangent, a line search,
+and load steps when needed.
 
 The state minimises  Π(x) = W(x) − f·x + Σ t ℓ(x) − Σ p V(x)  over the free nodes, where cables pull with given tensions t and
 chambers press with given pressures p; a held cable adds the constraint  δ(x) + T/k = d  with its tension T as multiplier, a held
@@ -102,8 +103,9 @@ class SolveOptions:
     before: tuple[FloatArray, ...] | None = None
     """Tensions along the cables until now [N], one array (s,) a cable; None: those of the start, without one none."""
     along: tuple[FloatArray, ...] | None = None
-    """Tension of each segment of each cable for a tension of 1 at its motor [1], held still: for laws of friction of one's own. Cables with
-    friction of theirs move on from it. None: 1 without friction, and with it as the start left it."""
+    """Tension of each segment of each cable for a tension of 1 at its motor [1], held still:
+    for laws of friction of one's own. Cables with friction of theirs move on from it. None: 1 without friction,
+    and with it as the start left it."""
     reuse_factor: bool = False
     """Begin with the factor of the start, for changes so small that its stiffness still serves."""
     max_iterations: int = 60
@@ -111,7 +113,8 @@ class SolveOptions:
     relative_tolerance: float = 1e-9
     """Of the unbalanced force against the sum of all loads [1]."""
     rough: bool = False
-    """The state is only tried: factors in single precision, and no way to the loads bit by bit where Newton fails from the start."""
+    """The state is only tried: factors in single precision,
+    and no way to the loads bit by bit where Newton fails from the start."""
     single: bool = False
     """Factors in single precision wherever these are positive definite; the residual and its tolerance are as ever."""
     newton: NewtonOptions = field(default_factory=NewtonOptions)

@@ -204,7 +204,10 @@ def vertex_normals(positions: FloatArray, triangles: IntArray) -> FloatArray:
 
 
 def barycentric(mesh: TetMesh, elements: IntArray, points: FloatArray) -> FloatArray:
-    """Return barycentric coordinates of points in the given elements at rest, shape (p, 4). Raises InputError where one is flat."""
+    """Return barycentric coordinates of points in the given elements at rest, shape (p, 4).
+
+    Raises InputError where one is flat.
+    """
     try:
         return _coordinates(mesh.nodes[mesh.tets[elements, :4]], points)
     except np.linalg.LinAlgError:
@@ -287,7 +290,8 @@ def embed_points(mesh: TetMesh, points: FloatArray, *, outside_rule: str = "near
 
 
 def tie_to_elements(mesh: TetMesh, points: FloatArray, element: IntArray) -> Embedding:
-    """Tie points [m], shape (p, 3), to given elements, shape (p,), by the rule of `embed_points` for points inside and outside of them."""
+    """Tie points [m], shape (p, 3), to given elements, shape (p,),
+    by the rule of `embed_points` for points inside and outside of them."""
     corners = mesh.nodes[mesh.tets[element, :4]]
     nearest = np.einsum("pl,plc->pc", closest_in_tet(corners, points), corners)
     return _tied(mesh, element, points, np.linalg.norm(points - nearest, axis=1))
@@ -305,7 +309,8 @@ def _tied(mesh: TetMesh, element: IntArray, points: FloatArray, outside: FloatAr
 
 
 def weight_slopes(mesh: TetMesh, ties: Embedding, points: FloatArray) -> FloatArray:
-    """Return how the weights of tied points change with their places at rest [1/m], shape (p, k, 3), each in the element that carries it."""
+    """Return how the weights of tied points change with their places at rest [1/m], shape (p, k, 3),
+    each in the element that carries it."""
     corners = mesh.nodes[mesh.tets[ties.element, :4]]
     slopes = shape_slopes(closest_in_tet(corners, points), quadratic=mesh.is_quadratic)
     by_place = np.linalg.inv(corners[:, 1:] - corners[:, :1]).transpose(
@@ -316,8 +321,8 @@ def weight_slopes(mesh: TetMesh, ties: Embedding, points: FloatArray) -> FloatAr
 
 
 ROUNDING = 1e-12
-"""Weights below this are rounding. Their products, in the stiffness of cables, would be numbers so small that processors take many times as long
-for them: factors in single precision took twice the time."""
+"""Weights below this are rounding. Their products, in the stiffness of cables,
+would be numbers so small that processors take many times as long for them: factors in single precision took twice the time."""
 ONE_BY_ONE = 16
 """So many points are compared with every centre: importing SciPy's tree takes longer."""
 AT_ONCE = 4096
@@ -365,7 +370,8 @@ def _find_holders(mesh: TetMesh, elements: _Elements, points: FloatArray, elemen
 
 
 def _carriers_of_outsiders(elements: _Elements, points: FloatArray, radius: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Return the element nearest to each point outside of the mesh, of those that are as near the one with the nearest centre, and the distance to it [m]."""
+    """Return the element nearest to each point outside of the mesh, of those that are as near the one with the nearest centre,
+    and the distance to it [m]."""
     _, candidate, start = _pairs(_centres_within(elements, points, radius))
     carrier, outside = np.empty(len(points), dtype=np.int64), np.empty(len(points))
     carry(elements.corners, elements.centres, elements.reach, elements.size, freeze(points), candidate, start, carrier, outside)

@@ -30,15 +30,17 @@ from femsense.fem.slack_and_friction import let_go, update_friction, update_slac
 MOST_STEPS = 1500
 """Newton steps in all, load steps included."""
 SURE = 0.1
-"""Where a step left less than this share, the next one is likely to leave less than `NewtonOptions.chord`: no tangent is made for the state it leads to."""
+"""Where a step left less than this share, the next one is likely to leave less than `NewtonOptions.chord`:
+no tangent is made for the state it leads to."""
 LENT = 0.1
 """So does one that was lent by a state near by."""
 RUBS = 0.3
 """So does any where tensions along cables follow the bends, which converge no faster with a stiffness of their own."""
 PATIENCE = 5
-"""In single precision one serves, too, where so many more steps are enough if each leaves the share that the last one left. States that are only
-tried have more of it (`NewtonOptions.patience_tried`): others end the farther below their tolerance the better these steps shrink.
-Of a first step nothing is known yet: states that are only tried take a second one."""
+"""In single precision one serves, too, where so many more steps are enough if each leaves the share that the last one left.
+States that are only tried have more of it (`NewtonOptions.patience_tried`):
+others end the farther below their tolerance the better these steps shrink. Of a first step nothing is known yet: states that are
+only tried take a second one."""
 PAIRS = 8
 """Steps since the last factor that are remembered (`Secants`)."""
 ARRIVED = 5e-7
@@ -143,7 +145,8 @@ def newton(body: BodyModel, loads: Loads, state: State, max_iterations: int) -> 
 
 
 class Secants:
-    """What steps since the last factor have shown of the stiffness, where nothing is held: BFGS updates of its inverse (Matthies & Strang 1979)."""
+    """What steps since the last factor have shown of the stiffness, where nothing is held:
+    BFGS updates of its inverse (Matthies & Strang 1979)."""
 
     def __init__(self) -> None:
         self.pairs: list[tuple[FloatArray, FloatArray, float]] = []
@@ -174,7 +177,8 @@ class Secants:
 def factor_here(
     body: BodyModel, here: Internal, state: State, H: FloatArray, C: FloatArray, stretch: FloatArray, lever: FloatArray
 ) -> Factorization | None:
-    """Factorise the stiffness, made positive definite where it is not: then steps lead downhill. Held cables and chambers hold too:
+    """Factorise the stiffness, made positive definite where it is not: then steps lead downhill.
+    Held cables and chambers hold too:
     a stiffness that is indefinite only where they do not let the body go stays as it is."""
     values = reduced_values(body, stiffness_blocks(body, here, state))
     plain = definite_factor(body.free_map.pattern, values, state)
@@ -190,8 +194,8 @@ def factor_here(
 
 
 def definite_factor(pattern: Pattern, values: FloatArray, state: State) -> Factorization | None:
-    """Factorise a stiffness with the shift that makes it positive definite, which is near that which served last. Where it is indefinite in single
-    precision alone, as a body about to buckle may be, no other factor of this state is."""
+    """Factorise a stiffness with the shift that makes it positive definite, which is near that which served last.
+    Where it is indefinite in single precision alone, as a body about to buckle may be, no other factor of this state is."""
     first, plain = state.shift / 4.0, None
     if state.single:
         plain, state.shift = factorize_definite(pattern, values, single=True, tries=0)

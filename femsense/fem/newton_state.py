@@ -22,17 +22,18 @@ class NewtonOptions:
     """When Newton takes a new stiffness, when it turns elements, and when it leaves a state that is only tried."""
 
     chord: float = 1e-2
-    """A stiffness serves for another step where the last one left less than this share of the residual, or where two more such steps are enough
-    (unless it was factorised so far off that another one is needed at the end)."""
+    """A stiffness serves for another step where the last one left less than this share of the residual,
+    or where two more such steps are enough (unless it was factorised so far off that another one is needed at the end)."""
     curved: float = 1e-3
     """Steps longer than this share of the body are tried with elements that turn before they are tried straight."""
     patience_tried: int = 8
-    """In single precision a stiffness of a state that is only tried serves where so many more steps are enough if each leaves the share that the last
-    one left: about what a factor takes."""
+    """In single precision a stiffness of a state that is only tried serves where so many more steps are enough if each leaves the
+    share that the last one left: about what a factor takes."""
     steps_tried: int = 30
     """Newton steps of a state that is only tried."""
     indefinite_tried: int = 6
-    """Stiffnesses of such a state that are indefinite: it is too far off where it meets more. Bodies that fold meet 8 to 11 of these in their 30 steps,
+    """Stiffnesses of such a state that are indefinite: it is too far off where it meets more.
+    Bodies that fold meet 8 to 11 of these in their 30 steps,
     those that converge 4 at most (a trial on bars of `benchmarks/improve.py`)."""
     watch: Callable[[float], None] | None = None
     """Called with the largest unbalanced nodal force of every iterate [N]."""
@@ -89,7 +90,8 @@ def unbalanced_force(loads: Loads, state: State, here: Internal, rows: FloatArra
 
 
 def drive_rows(body: BodyModel, state: State) -> FloatArray:
-    """Return the nodal forces of unit motor tensions, with the loss along each cable, and of unit pressures, shape (a + c, 3n)."""
+    """Return the nodal forces of unit motor tensions, with the loss along each cable, and of unit pressures,
+    shape (a + c, 3n)."""
     n = len(body.mesh.nodes)
     rows = [cable_forces(c, state.x, s, n).ravel() for c, s in zip(body.cables, state.shares)]
     rows += [volume_gradient(c, state.x).ravel() for c in body.chambers]

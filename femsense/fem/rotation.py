@@ -109,7 +109,8 @@ def determinant(F: FloatArray, q: int) -> float:
 
 @njit(cache=True, fastmath=FAST)
 def closest_rotation(F: FloatArray, R: FloatArray, q: int) -> None:
-    """Write the rotation (det +1) that is closest to F_q (Newton of Higham 1986; Horn's quaternion where F_q is flat or inverted).
+    """Write the rotation (det +1) that is closest to F_q (Newton of Higham 1986;
+    Horn's quaternion where F_q is flat or inverted).
 
     Matrices are columns, row by row, shape (9, quad).
     """

@@ -30,7 +30,8 @@ class CutSection:
 def cut_section(mesh: TetMesh, young_modulus: FloatArray, point: FloatArray, normal: FloatArray) -> CutSection | None:
     """Return the section of a straight-edged body through a point [m], shape (3,), across a direction, shape (3,).
 
-    Only what hangs together with the element nearest to the point counts: a body that bends back is cut once. None where nothing is cut.
+    Only what hangs together with the element nearest to the point counts: a body that bends back is cut once.
+    None where nothing is cut.
     """
     tets = mesh.tets[:, :4]
     unit = np.asarray(normal, dtype=float) / np.linalg.norm(normal)

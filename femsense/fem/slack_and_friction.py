@@ -11,7 +11,8 @@ from femsense.fem.newton_state import Loads, State, travel_of
 
 
 def let_go(body: BodyModel, loads: Loads, state: State) -> bool:
-    """Let go the held cable that is shortest against its command, where held cables contradict each other; False where none may go."""
+    """Let go the held cable that is shortest against its command, where held cables contradict each other;
+    False where none may go."""
     cable = np.arange(len(state.T)) < len(body.cables)
     candidates = np.flatnonzero(state.taut & cable)
     if loads.bilateral or not len(candidates):

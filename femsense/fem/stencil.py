@@ -102,7 +102,8 @@ def reshaped(stencil: Stencil, mesh: TetMesh) -> Stencil:
 
 
 def _geometry(mesh: TetMesh) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
-    """Return the sorted nodes of the elements (m, a), gradients, volumes of their quadrature points, and volumes of the nodes (n,)."""
+    """Return the sorted nodes of the elements (m, a), gradients, volumes of their quadrature points,
+    and volumes of the nodes (n,)."""
     quadratic = mesh.is_quadratic
     points = QUADRATURE if quadratic else np.full((1, 4), 0.25)
     slopes = shape_slopes(points, quadratic=quadratic)  # (q, a, 4)
@@ -145,7 +146,8 @@ def _moments(mesh: TetMesh, volumes: FloatArray) -> FloatArray:
 
 
 def _block_pattern(n: int, groups: list[IntArray]) -> tuple[IntArray, IntArray, tuple[IntArray, ...]]:
-    """Return indptr and indices of the pairs i ≤ j of n nodes that groups (g, k) of nodes couple, and the slots of their pairs."""
+    """Return indptr and indices of the pairs i ≤ j of n nodes that groups (g, k) of nodes couple,
+    and the slots of their pairs."""
     pairs = [(group[:, :, None] * n + group[:, None, :]) for group in groups]
     below = np.concatenate([(group[:, :, None] > group[:, None, :]).ravel() for group in groups])
     flat = np.concatenate([p.ravel() for p in pairs])

@@ -50,7 +50,8 @@ class Balance:
         return np.zeros((len(driven.robot.body.mesh.nodes), 3)) if loads is None else loads
 
     def carried(self, variant: DrivenRobot) -> FloatArray:
-        """Return where the variant's response starts [m], (n, 3): the base state, grown as its body is and with its clamp given way."""
+        """Return where the variant's response starts [m], (n, 3): the base state,
+        grown as its body is and with its clamp given way."""
         body, other, x = self.body, variant.robot.body, self.base.positions
         if other.mesh is not body.mesh:
             x = x + (other.mesh.nodes - body.mesh.nodes)
@@ -89,7 +90,8 @@ class Balance:
         return np.asarray(force)
 
     def change(self, variant: DrivenRobot) -> FloatArray:
-        """Return what a variant changes of the forces in the base state, where they sum to nothing, but for tensions along cables [N], (n, 3)."""
+        """Return what a variant changes of the forces in the base state, where they sum to nothing,
+        but for tensions along cables [N], (n, 3)."""
         body = self._body(variant)
         x, own, drive = self.base.positions, self.body, variant.drive
         force = np.zeros_like(x)
@@ -118,7 +120,8 @@ class Balance:
             add_elements(own.stencil.tets, self.by_element, softer, force)
 
     def _add_paths(self, body: BodyModel, force: FloatArray) -> None:
-        """Add what the tensions of the base state do along the paths of another body, where these run elsewhere, to a force [N], (n, 3)."""
+        """Add what the tensions of the base state do along the paths of another body, where these run elsewhere,
+        to a force [N], (n, 3)."""
         x = self.base.positions
         for cable, own, along in zip(body.cables, self.body.cables, self.base.segment_tensions):
             if cable.path is not own.path and along.any():
@@ -158,7 +161,8 @@ def motor_tensions(variant: DrivenRobot, frame: int, base: Equilibrium) -> list[
 
 
 def _same_but_modulus(body: BodyModel, other: BodyModel) -> bool:
-    """Return whether the elements of two bodies answer alike, but for their modulus, where their meshes do not differ by what moves their nodes."""
+    """Return whether the elements of two bodies answer alike, but for their modulus,
+    where their meshes do not differ by what moves their nodes."""
     a, b = body.material, other.material
     if a is b or body.mesh is not other.mesh:
         return a is b

@@ -94,7 +94,8 @@ def patch_at(
 ) -> ContactPatch:
     """Return the contact patch around the point of the surface that is closest to a place.
 
-    The pressure falls off as a cone of the given radius. Its nodal shares are those of the virtual work that it does on the element's own shape
+    The pressure falls off as a cone of the given radius.
+    Its nodal shares are those of the virtual work that it does on the element's own shape
     functions: quadratic elements carry nothing at the corners of an evenly pressed face, and shares by area would dent them.
 
     Arguments:

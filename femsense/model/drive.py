@@ -90,7 +90,8 @@ def _ties_at(mesh: TetMesh, points: bytes) -> Embedding:
 
 
 def _creep(values: FloatArray, time_s: FloatArray, terms: tuple[tuple[float, float], ...]) -> FloatArray:
-    """Return values (F, k) with J(t) = 1 + Σ f (1 − exp(−t/τ)) on every change; linear between frames, crept out before the first."""
+    """Return values (F, k) with J(t) = 1 + Σ f (1 − exp(−t/τ)) on every change; linear between frames,
+    crept out before the first."""
     result = values.copy()
     for fraction, tau in terms:
         flow = values[0].copy()
@@ -105,7 +106,8 @@ def _creep(values: FloatArray, time_s: FloatArray, terms: tuple[tuple[float, flo
 
 
 def _creep_loads(recording: Recording, terms: tuple[tuple[float, float], ...]) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Return frame, place and force of the known loads with creep; a load that is taken off goes on acting while it creeps back."""
+    """Return frame, place and force of the known loads with creep;
+    a load that is taken off goes on acting while it creeps back."""
     if not terms or not len(recording.load_frame):
         return recording.load_frame, recording.load_points, recording.load_forces
     places, number = np.unique(recording.load_points, axis=0, return_inverse=True)

@@ -23,7 +23,8 @@ FINER_STEPS = 8
 
 
 LAST_STEP = 0.2
-"""Newton steps end when the last one was no more than this share of the whole way: what bends easily may be far off and leave little force."""
+"""Newton steps end when the last one was no more than this share of the whole way:
+what bends easily may be far off and leave little force."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +34,8 @@ class FinerOptions:
     enough: float = 5e-3
     """Newton steps end when the unbalanced force has fallen to this share …"""
     paces: tuple[float, ...] = (1.0, 0.5)
-    """Shares of the first steps that are gone, tried in turn: whole ones fold elements where a body is bent much, until the force has fallen to NEAR."""
+    """Shares of the first steps that are gone, tried in turn: whole ones fold elements where a body is bent much,
+    until the force has fallen to NEAR."""
     rough_from: int = ROUGH_FROM
     """Unknowns from which on conjugate gradients take the place of a factor."""
 
@@ -43,7 +45,8 @@ NEAR = 0.1
 
 
 LET_BE = 0.01
-"""A held cable may push by this share of the largest tension, or a slack one be too long by this share of the way, before it goes slack or taut."""
+"""A held cable may push by this share of the largest tension, or a slack one be too long by this share of the way,
+before it goes slack or taut."""
 
 
 EARLY = 3e-2
@@ -67,13 +70,15 @@ def finer_state(
 ) -> FloatArray | None:
     """Return the equilibrium on a finer mesh [m], shape (n, 3), nearly: Newton steps from a state of a coarser one.
 
-    The finer mesh holds the coarse state exactly, but what it softens are single elements, so that two to four steps are needed, with
-    elements that turn along each of them. None where the steps do not settle, or run away: far off, forces look small again.
+    The finer mesh holds the coarse state exactly, but what it softens are single elements,
+    so that two to four steps are needed, with elements that turn along each of them. None where the steps do not settle, or run
+    away: far off, forces look small again.
 
-    Tried on the bar of `benchmarks/improve.py`, without use: a preconditioner kept from the first step of a state takes as much time in
-    further iterations as it saves, one of another state takes several times as long, and `FinerOptions.enough` = 0.02 moves the error by a sixth.
-    To begin where the finer mesh lay beside another model saves a step of three, but elements that do not fit there may fold: the state was
-    then missing, and the error of the mesh a third too small in that frame.
+    Tried on the bar of `benchmarks/improve.py`, without use:
+    a preconditioner kept from the first step of a state takes as much time in further iterations as it saves, one of another
+    state takes several times as long, and `FinerOptions.enough` = 0.02 moves the error by a sixth. To begin where the finer mesh
+    lay beside another model saves a step of three, but elements that do not fit there may fold: the state was then missing, and
+    the error of the mesh a third too small in that frame.
 
     Arguments:
         driven: the coarse robot and its drive.
@@ -134,8 +139,8 @@ def _stepped(
 
 
 def _pulling(fine: DrivenRobot, balance: Balance, at: Equilibrium, x: FloatArray) -> tuple[Equilibrium, FloatArray, float]:
-    """Return a state with the tensions of its held cables that balance best at x, what they leave of the nodal forces there [N], (n, 3), and its
-    size [N]."""
+    """Return a state with the tensions of its held cables that balance best at x,
+    what they leave of the nodal forces there [N], (n, 3), and its size [N]."""
     body, dofs = fine.robot.body, fine.robot.body.free_map.dofs
     force = balance.whole(fine, rubbed(fine, balance.frame, at, x), x)
     rest, held = force.ravel()[dofs], np.flatnonzero(at.held[: len(body.cables)])
@@ -158,7 +163,8 @@ def _missing(fine: DrivenRobot, frame: int, at: Equilibrium, x: FloatArray) -> F
 
 
 def retaut(fine: DrivenRobot, frame: int, at: Equilibrium, x: FloatArray, least: float) -> Equilibrium:
-    """Return a state at x with the held cables slack that would push there, and those taut that are too long by more than a length [m]."""
+    """Return a state at x with the held cables slack that would push there,
+    and those taut that are too long by more than a length [m]."""
     if fine.drive.control != "displacement":
         return at
     names, held = fine.robot.body.cable_names, at.held.copy()

@@ -21,8 +21,8 @@ class AtPoints:
     """What the observed points of a state answer to, whatever the variant."""
 
     to_forces: FloatArray
-    """Moves of the nodes under a unit force at each of p points along each axis, and so (Maxwell's reciprocity) of the points along each axis under
-    unit nodal forces [m/N], (3p, n, 3)."""
+    """Moves of the nodes under a unit force at each of p points along each axis,
+    and so (Maxwell's reciprocity) of the points along each axis under unit nodal forces [m/N], (3p, n, 3)."""
     to_held: FloatArray
     """Moves of the points for a shortening of each held cable by one metre [1], (h, p, 3)."""
 
@@ -75,8 +75,8 @@ class Answers:
         return self.tangent.respond_to_held()
 
     def keep(self, keys: Iterable[tuple[int, int]]) -> None:
-        """Let go of the answers of other variants, and of the factor if further tensions are sums of the answers of segments: it is made again
-        where it is needed after all."""
+        """Let go of the answers of other variants, and of the factor if further tensions are sums of the answers of segments:
+        it is made again where it is needed after all."""
         self.own = {key: self.own[key] for key in keys if key in self.own}
         if self.by_segment:
             self.__dict__.pop("tangent", None)
@@ -88,8 +88,8 @@ class Answers:
         return self.tangent.respond(np.einsum("pn,ac->panc", at, np.eye(3)).reshape(-1, count, 3))
 
     def moves(self, body: BodyModel, x: FloatArray, upsets: list[Upset]) -> FloatArray:
-        """Return the answers to upsets [m], (v, n, 3): to their forces, where the answer is not known yet, and to tensions along the segments of all
-        cables, sums of one answer for each segment where that takes fewer of them."""
+        """Return the answers to upsets [m], (v, n, 3): to their forces, where the answer is not known yet,
+        and to tensions along the segments of all cables, sums of one answer for each segment where that takes fewer of them."""
         asked = [u for u in upsets if u.force is not None and u.force.any()]
         tensions = np.array([u.tension for u in upsets])
         pulling, used = np.flatnonzero(tensions.any(axis=1)), np.flatnonzero(tensions.any(axis=0)).tolist()

@@ -160,7 +160,8 @@ def _ties(robot: Robot, scene: Scene, poses: Sequence[FloatArray]) -> Embedding:
 
 
 def _tied_alike(robot: Robot, other: Robot) -> bool:
-    """Return whether the markers of two robots are tied to the same nodes in the same way, as far as declared places and cameras say."""
+    """Return whether the markers of two robots are tied to the same nodes in the same way,
+    as far as declared places and cameras say."""
     same_placements = robot.marker_points is other.marker_points and robot.observation == other.observation
     return same_placements and robot.body.mesh is other.body.mesh and robot.marker_share is other.marker_share
 
@@ -168,9 +169,9 @@ def _tied_alike(robot: Robot, other: Robot) -> bool:
 def marker_residual(robot: Robot, scene: Scene, poses: Sequence[FloatArray], model: Mapping[int, FloatArray]) -> FloatArray:
     """Return measured minus modelled markers [m], shape (k, 3), along the axes of the robot; model: frame → markers (m, 3).
 
-    They are compared as the camera measures them. Measured points put right by a scale of depth would shrink with it, noise and all,
-    and a fit would take that for a better model. Of crossings of a measured surface: how far it lies outside of the model's points, along
-    its normal, shape (k, 1).
+    They are compared as the camera measures them. Measured points put right by a scale of depth would shrink with it,
+    noise and all, and a fit would take that for a better model. Of crossings of a measured surface:
+    how far it lies outside of the model's points, along its normal, shape (k, 1).
     """
     frames, number = np.unique(scene.frame, return_inverse=True)
     each_frame = [model[k] for k in frames.tolist()]
@@ -208,7 +209,8 @@ class SceneJet:
     states: dict[int, Equilibrium]
     """The equilibrium of each frame."""
     by_input: FloatArray
-    """d residual / d tension that pulls in its own frame, cut off at 0 or not, shape (k, c, a); (k, c, 0) where it was not asked."""
+    """d residual / d tension that pulls in its own frame, cut off at 0 or not, shape (k, c, a); (k, c,
+    0) where it was not asked."""
     pulled: BoolArray
     """Whether the derivatives count the tension of a frame as not cut off, shape (F, a)."""
 
@@ -243,12 +245,14 @@ def evaluate_scene(
 ) -> SceneJet:
     """Evaluate marker residuals of a scene at a point of parameter space, and their derivatives by differences.
 
-    Each pose is moved about `pivot` by its six of the `moves`, shape (6 v,), and derivatives are by these; without them by a first move.
-    `starts` holds states of earlier evaluations near by and is brought up to date; states that are only tried may be
-    `rough`: a frame that Newton does not reach from there then has no equilibrium. `known` are the states at this very point, as far as it
-    moves the body; they serve where no derivative by what moves it is wanted. `answers` of an earlier evaluation at this very point serve
-    derivatives by other parameters, and are brought up to date. With `vary_inputs` come derivatives by the tension of
-    each frame (where the robot has a past, by that of all frames).
+    Each pose is moved about `pivot` by its six of the `moves`, shape (6 v,), and derivatives are by these;
+    without them by a first move. `starts` holds states of earlier evaluations near by and is brought up to date;
+    states that are only tried may be
+    `rough`: a frame that Newton does not reach from there then has no equilibrium. `known` are the states at this very point,
+        as far as it
+    moves the body; they serve where no derivative by what moves it is wanted.
+    `answers` of an earlier evaluation at this very point serve derivatives by other parameters, and are brought up to date. With
+    `vary_inputs` come derivatives by the tension of each frame (where the robot has a past, by that of all frames).
 
     Raises:
         DataError: a frame has no equilibrium.
@@ -345,8 +349,8 @@ def _variants(
 def _pulling(hypothesis: Hypothesis, base: DrivenRobot, steps: list[float], variants: list[DrivenRobot], label: str) -> list[int]:
     """Return which variants pull a little more at each cable in every frame; none where nothing moves tensions.
 
-    They are added; where nothing depends on other frames, they are put in the place of those of the cables' zeros, whose derivative is
-    theirs wherever a tension is not cut off.
+    They are added; where nothing depends on other frames, they are put in the place of those of the cables' zeros,
+    whose derivative is theirs wherever a tension is not cut off.
     """
     offsets = any(effect.calibrated is not None and effect.calibrated.of_inputs for effect, _, _ in hypothesis.terms)
     driving = offsets or len(variants) > len(hypothesis.parameters)
@@ -374,7 +378,8 @@ def _pose_derivative(
     residual: FloatArray,
     pivot: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the derivatives of marker and placement residuals by the move of each pose; only placements that move need the states again."""
+    """Return the derivatives of marker and placement residuals by the move of each pose;
+    only placements that move need the states again."""
     columns, rest_columns = [], []
     rest = rest_residual(robot, scene, moved_poses(begun, moves, pivot))
     still = {k: robot.markers.positions(s.positions) for k, s in states.items()} if not len(scene.rest_marker) else None

@@ -35,7 +35,8 @@ TRIED = 1e-8
 PARTS, SHORTEST_PART = 4, 6
 """Parts at most in which frames are solved side by side where each starts from the one before, and frames of a part at least."""
 PAST, PAST_TRIED = 1e-8, 1e-6
-"""Tensions along a cable that agree so well [N], and as shares of the largest, are the same past; the latter for states that are only tried."""
+"""Tensions along a cable that agree so well [N], and as shares of the largest, are the same past;
+the latter for states that are only tried."""
 
 
 def solve_path(
@@ -63,8 +64,8 @@ def solve_path(
         starts: frame → a state near by, such as that of an earlier path; brought up to date as frames are solved. Their
             factors are kept as long as they fit into FACTOR_MEMORY.
         rough: states are only tried, where one near by is known.
-        answers: frame → what its points answer to, from an earlier path along these very states with other variants; what is missing is
-            added where the points are few.
+        answers: frame → what its points answer to, from an earlier path along these very states with other variants;
+            what is missing is added where the points are few.
         solver: what it is solved with.
 
     Yields:
@@ -206,8 +207,9 @@ def _solve_with_history(
 ) -> list[Equilibrium]:
     """Return the states of frames with a past, from states near by.
 
-    The frames are cut into parts that are solved side by side, each from the tensions along the cables that the states near by let
-    expect there. Then, part after part, frames are solved again until these are what the part before left.
+    The frames are cut into parts that are solved side by side,
+    each from the tensions along the cables that the states near by let expect there. Then, part after part, frames are solved
+    again until these are what the part before left.
     """
     parts = _parts(frames)
     expected = _expected_tensions(driven, frames, near)
@@ -255,13 +257,14 @@ def _as_before(now: tuple[FloatArray, ...], then: tuple[FloatArray, ...], slack:
 
 
 def _clamp_fits(body: BodyModel, state: Equilibrium) -> bool:
-    """Return whether a state can serve as a start as it is: one whose clamp gave way elsewhere would be torn back, one whose clamp has not yet would let
-    go of the whole load at once."""
+    """Return whether a state can serve as a start as it is: one whose clamp gave way elsewhere would be torn back,
+    one whose clamp has not yet would let go of the whole load at once."""
     return body.clamp_is_rigid != has_given(body, state)
 
 
 def _taken_along(driven: DrivenRobot, frame: int, state: Equilibrium) -> Equilibrium | None:
-    """Return a state with a rigid clamp as a start for a clamp that gives, the whole body taken along; None where that is no start."""
+    """Return a state with a rigid clamp as a start for a clamp that gives, the whole body taken along;
+    None where that is no start."""
     balance = Balance(driven, frame, state)
     moved = rigid_give(driven.robot.body, state.positions, balance.whole(driven, balance.along(driven), state.positions))
     return None if moved is None else replace(state, positions=moved)

@@ -24,7 +24,8 @@ FAR_LOAD = 0.25
 
 
 def check_against(robot: Robot, recording: Recording) -> Recording:
-    """Return the recording as this robot needs it: cables and chambers in the robot's order, without markers that the robot lacks.
+    """Return the recording as this robot needs it: cables and chambers in the robot's order,
+    without markers that the robot lacks.
 
     Warns of markers that are dropped, of inputs beyond the limits of cables and chambers, and of numbers that are hardly meant.
 

@@ -107,7 +107,10 @@ def _no_points() -> FloatArray:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Tool:
-    """A body of known shape that may touch the robot. Its frame: a ball's centre; a cylinder's centre and axis z; the mesh's own."""
+    """A body of known shape that may touch the robot.
+
+    Its frame: a ball's centre; a cylinder's centre and axis z; the mesh's own.
+    """
 
     name: str
     kind: str

@@ -67,7 +67,8 @@ def body_on_mesh(body: BodyModel, mesh: TetMesh, *, clamped: IntArray | None = N
 
     Arguments:
         body: the body.
-        mesh: elements take the material of the element that holds their centre; springs of the clamp and dead loads stay where they are.
+        mesh: elements take the material of the element that holds their centre;
+            springs of the clamp and dead loads stay where they are.
         clamped: nodes of the new mesh; by default those that moved with clamped nodes alone.
     """
     if clamped is None:
@@ -107,11 +108,12 @@ def _plain_body(
     clamped: bytes,
     springs: bytes,
 ) -> tuple[BodyModel, IntArray]:
-    """Return a body of any one material on a mesh with the paths of cables and the chambers of an old one, and which old element each element
-    lies in.
+    """Return a body of any one material on a mesh with the paths of cables and the chambers of an old one,
+    and which old element each element lies in.
 
-    The last ones are kept: pattern, order and ties take as long as some states, and neither material nor friction changes them. Nodes are
-    bytes of int64: those that are clamped on the new mesh, and those of the old one that carry springs where the clamp gives.
+    The last ones are kept: pattern, order and ties take as long as some states,
+    and neither material nor friction changes them. Nodes are bytes of int64: those that are clamped on the new mesh, and those of
+    the old one that carry springs where the clamp gives.
     """
     from scipy.spatial import cKDTree
 

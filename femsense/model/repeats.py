@@ -30,7 +30,8 @@ def squares_about_mean(values: FloatArray) -> FloatArray:
 
 
 def marker_repeatability(recording: Recording) -> float:
-    """Return what markers repeat to along each axis [m], camera frame: as declared, else from states that are reached again; nan where nothing tells it."""
+    """Return what markers repeat to along each axis [m], camera frame: as declared, else from states that are reached again;
+    nan where nothing tells it."""
     if recording.marker_noise_m is not None:
         return recording.marker_noise_m
     stays, groups = stays_of(recording), dict[tuple[State, int, int], list[FloatArray]]()

@@ -29,7 +29,8 @@ class Actuation:
     stretch_stiffness: FloatArray
     """Cable stiffness [N/m], shape (a,); inf: does not stretch."""
     coupling: FloatArray | None = None
-    """Share of the scaled input of each cable (column) that goes to each (row) beside its own [1], shape (a, a); None: no share."""
+    """Share of the scaled input of each cable (column) that goes to each (row) beside its own [1], shape (a, a); None:
+    no share."""
     pressure_gain: FloatArray = field(default_factory=lambda: freeze(np.ones(())))
     """true = gain × recorded + offset [1], shape (c,) in the order of the body's chambers, or () for all."""
     pressure_offset: FloatArray = field(default_factory=lambda: freeze(np.zeros(())))
@@ -161,8 +162,8 @@ def plain_actuation(cable_count: int) -> Actuation:
 def spread_features(body: BodyModel, count: int, *, among: IntArray | None = None) -> IntArray:
     """Return surface nodes spread evenly over the free surface (farthest-point sampling), shape (≤ count,).
 
-    Only nodes `among` the given ones are taken, if given. Nodes of the clamp do not count; the first is the free surface node that is farthest from the clamp, so that the
-    result is the same whatever the numbering.
+    Only nodes `among` the given ones are taken, if given. Nodes of the clamp do not count; the first is the free surface node
+    that is farthest from the clamp, so that the result is the same whatever the numbering.
     """
     surface = np.unique(surface_triangles(body.mesh)) if among is None else among
     free = np.setdiff1d(surface, body.clamped)

@@ -1,6 +1,7 @@
 """A body that softens by what it has been through (Mullins): which share of its modulus each element has in each frame.
 
-What an element has been through is taken from the path of the body that does not soften, so that frames need not wait for each other.
+What an element has been through is taken from the path of the body that does not soften,
+so that frames need not wait for each other.
 """
 
 from __future__ import annotations
@@ -18,12 +19,14 @@ from femsense.model.quasi_static_path import solve_path
 
 
 def softened_share(terms: Sequence[tuple[float, float]], most: FloatArray, now: FloatArray) -> FloatArray:
-    """Return the share of its modulus that an element has: Π 1 − share (1 − exp(−(most − now)/energy)), after Ogden and Roxburgh (1999).
+    """Return the share of its modulus that an element has: Π 1 − share (1 − exp(−(most − now)/energy)),
+    after Ogden and Roxburgh (1999).
 
     Arguments:
         terms: (share [1], energy [J/m³]).
         most: largest energy density so far [J/m³].
-        now: energy density [J/m³], of the same shape: where it is the largest so far, the loading is the first and the modulus whole.
+        now: energy density [J/m³], of the same shape: where it is the largest so far,
+            the loading is the first and the modulus whole.
     """
     beyond = np.maximum(most - now, 0.0)
     return np.asarray(np.prod([1.0 - share * (1.0 - np.exp(-beyond / energy)) for share, energy in terms], axis=0) + 0.0 * beyond)

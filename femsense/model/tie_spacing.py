@@ -1,7 +1,8 @@
 """Whether the points of a cable's path lie close enough that the body between two of them stays beside its channel.
 
-Between two points that tie it, a cable runs straight. The body there is a column under the tension T: it leaves the cable as a column
-of length ℓ that is held at its ends, by a factor 1/(1 − T/P) with Euler's P = π² EI/ℓ², and buckles at P.
+Between two points that tie it, a cable runs straight. The body there is a column under the tension T:
+it leaves the cable as a column of length ℓ that is held at its ends, by a factor 1/(1 − T/P) with Euler's P = π² EI/ℓ²,
+and buckles at P.
 """
 
 from __future__ import annotations
@@ -16,8 +17,8 @@ from femsense.fem.body_parts import Cable
 from femsense.fem.sections import cut_section
 
 HELD = 0.15
-"""Share of Euler's load that a tension may be [1]. The tentacle of docs/bodies.md answers 85 % wrong where it is 0.90, 6.4 % at 0.24,
-1.0 % at 0.06 and 0.2 % at 0.02 (benchmarks/bodies.py)."""
+"""Share of Euler's load that a tension may be [1]. The tentacle of docs/bodies.md answers 85 % wrong where it is 0.90,
+6.4 % at 0.24, 1.0 % at 0.06 and 0.2 % at 0.02 (benchmarks/bodies.py)."""
 ONE_TURN = 1.0
 """Where no largest tension is declared, it is taken as the one that bends the body along the path by so much [rad]."""
 
@@ -50,7 +51,8 @@ class TieSpacing:
 
 
 def tie_spacing(body: BodyModel, cable: Cable) -> TieSpacing | None:
-    """Return the gap of a path where the body buckles first; None for a path of one point, which is tied to it and runs through nothing."""
+    """Return the gap of a path where the body buckles first; None for a path of one point,
+    which is tied to it and runs through nothing."""
     points = cable.path.positions(body.mesh.nodes)
     gaps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     loads, bent = [], 0.0

@@ -38,7 +38,8 @@ def room_for_factor(count: int) -> float:
 
 
 def most_lent(state: Equilibrium, room: float) -> float:
-    """Return how many bytes a factor may take to be kept with a state: no more than the one it takes the place of, which is near enough."""
+    """Return how many bytes a factor may take to be kept with a state: no more than the one it takes the place of,
+    which is near enough."""
     return room if state.factor is None else min(room, state.factor.bytes + 1)
 
 
@@ -148,8 +149,8 @@ class Variants:
         return list(jobs.values())
 
     def _bent(self, group: list[int]) -> tuple[int, Factorization | None, dict[tuple[int, int], list[FloatArray]]]:
-        """Return the bends of the variants that rub, as the first response leaves them, and keep what the second one takes, where that fits into
-        memory; write what is observed of the other variants."""
+        """Return the bends of the variants that rub, as the first response leaves them, and keep what the second one takes,
+        where that fits into memory; write what is observed of the other variants."""
         first = self.alike[group[0]]
         answers, jobs = self._answers(first), self._jobs(group, self.rubbing)
         moved = list(zip(jobs, self._respond(group[0], self._upsets(group[0], jobs, answers), answers)))
@@ -181,8 +182,9 @@ class Variants:
                 self.others[frame][i] = seen
 
     def _seen(self, frame: int, jobs: list[Job], answers: Answers) -> list[FloatArray]:
-        """Return where the points of variants are [m], each (p, 3): where these have so many forces of their own that it takes fewer solves, or the
-        answers are kept, from those of the base state to forces at its points (Maxwell's reciprocity; friction of a held cable has none)."""
+        """Return where the points of variants are [m], each (p, 3):
+        where these have so many forces of their own that it takes fewer solves, or the answers are kept, from those of the base
+        state to forces at its points (Maxwell's reciprocity; friction of a held cable has none)."""
         upsets = self._upsets(frame, jobs, answers)
         alike = [self.ties[u.key[0]] is self.own_ties for u in upsets]
         pushes = sum(u.force is not None and bool(u.force.any()) for u, same in zip(upsets, alike) if same)

@@ -64,8 +64,9 @@ def cloud_from_depth(
         distortion: OpenCV's k1, k2, p1, p2, k3, shape (5,) or with k4, k5, k6 (8,); of a fisheye k1, k2, k3, k4 and zeros.
         depth_unit_m: metres per unit of depth.
         color: bytes 0 … 255 or floats 0 … 1, shape (H, W, 3), registered to the depth image.
-        distortion_model: "brown_conrady" (straight rays to bent ones), "inverse_brown_conrady" (the same polynomial takes bent rays to
-            straight ones, as in RealSense's SDK) or "kannala_brandt" (OpenCV's fisheye).
+        distortion_model: "brown_conrady" (straight rays to bent ones),
+            "inverse_brown_conrady" (the same polynomial takes bent rays to straight ones, as in RealSense's SDK) or
+            "kannala_brandt" (OpenCV's fisheye).
     Returns:
         The cloud in row-major order of the pixels, pixels without depth left out.
     Raises:
@@ -100,7 +101,8 @@ def straight_rays(rays: FloatArray, distortion: FloatArray, model: str) -> Float
 
 
 def _unfished(rays: FloatArray, k: FloatArray) -> FloatArray:
-    """Return straight rays (n, 2): θ from |ray| = θ (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸) by Newton, then tan θ (Kannala and Brandt 2006)."""
+    """Return straight rays (n, 2): θ from |ray| = θ (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸) by Newton,
+    then tan θ (Kannala and Brandt 2006)."""
     bent = np.linalg.norm(rays, axis=1)
     theta = bent.copy()
     powers = np.arange(3, 10, 2)

@@ -42,8 +42,8 @@ def detect_contacts(
 ) -> Contacts:
     """Return the places where surrounding points come close to the robot (Algorithm 2).
 
-    A surrounding point is a contact point where at least min_neighbors robot points lie within search_radius_m; contact points closer
-    than cluster_distance_m to each other form a group; a group's mean is a place of contact.
+    A surrounding point is a contact point where at least min_neighbors robot points lie within search_radius_m;
+    contact points closer than cluster_distance_m to each other form a group; a group's mean is a place of contact.
 
     Arguments:
         surroundings: points of everything but the robot [m], shape (m, 3).

@@ -1,6 +1,7 @@
 """The filters of the sensing chain: a box, a voxel grid, and the removal of lone points.
 
-Source: "Calibration and force sensing with an RGB-D camera", section V.A.1 (the filters' names are those of the Point Cloud Library).
+Source: "Calibration and force sensing with an RGB-D camera",
+section V.A.1 (the filters' names are those of the Point Cloud Library).
 """
 
 from __future__ import annotations

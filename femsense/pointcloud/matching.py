@@ -1,9 +1,9 @@
 # mypy: allow-untyped-decorators
 """Where the observed surface crosses the normal of each feature point.
 
-Source: "Calibration and force sensing with an RGB-D camera", section V.A.5, Algorithm 3. Beyond it: points are restricted to ±d_l along
-the normal before the nearest one is chosen, hidden sides are left out, and a local fit averages the camera's noise
-and says how far it can be trusted.
+Source: "Calibration and force sensing with an RGB-D camera", section V.A.5, Algorithm 3. Beyond it:
+points are restricted to ±d_l along the normal before the nearest one is chosen, hidden sides are left out,
+and a local fit averages the camera's noise and says how far it can be trusted.
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ class MatchingOptions:
     average: bool = False
     """Use the local fit in place of the nearest point."""
     order: int = 2
-    """Of the fit: 2 follows the curvature of the body, 1 is quieter but off by about d_m²/(4 · radius of curvature). Fewer than 10 (order 2)
-    or 5 (order 1) candidates lower it."""
+    """Of the fit: 2 follows the curvature of the body, 1 is quieter but off by about d_m²/(4 · radius of curvature).
+    Fewer than 10 (order 2) or 5 (order 1) candidates lower it."""
     min_facing: float = 0.15
     """Smallest cosine between a normal and the direction to a camera [1]; below it the feature is hidden."""
     std_floor_m: float = 0.0
@@ -81,8 +81,8 @@ def match_along_normals(
         offset(u, v) = c₀ + c₁ u + c₂ v + c₃ u² + c₄ u v + c₅ v²        (order 2; the first 3 terms for order 1, c₀ for 0)
 
     after points far from the nearest layer are set aside. With `average` the distance is c₀, the value on the line, with
-    std² = s² (AᵀA)⁻¹₀₀; without, it is the offset of the nearest point, with std² = s² + (slope · line_distance)². The scatter s is
-    that of the feature's own residuals, drawn to the median of all features with the weight of four points.
+    std² = s² (AᵀA)⁻¹₀₀; without, it is the offset of the nearest point, with std² = s² + (slope · line_distance)².
+    The scatter s is that of the feature's own residuals, drawn to the median of all features with the weight of four points.
 
     Arguments:
         features: predicted positions of the feature points [m], shape (e, 3).
@@ -198,7 +198,8 @@ def _match(
     along: float,
     order: int,
 ) -> tuple[FloatArray, IntArray]:
-    """Return per feature: line distance, offset, fitted value, slope, residual squares, leverage; and nearest, candidates, fitted, terms."""
+    """Return per feature: line distance, offset, fitted value, slope, residual squares, leverage; and nearest,
+    candidates, fitted, terms."""
     numbers, whole = np.zeros((len(places), 6)), np.zeros((len(places), 4), dtype=np.int64)
     starts, ends = np.zeros(9, dtype=np.int64), np.zeros(9, dtype=np.int64)
     for e in range(len(places)):
@@ -277,7 +278,8 @@ def _layer(local: FloatArray, nearest: int, across: float) -> FloatArray:
 def _fit(layer: FloatArray, across: float, order: int, out: FloatArray) -> int:
     """Write value on the line, slope, sum of residual squares and leverage; return the number of terms.
 
-    Rows beyond four scatters of a first fit (by the median) are left out of a second one; the sum of squares is scaled to all rows.
+    Rows beyond four scatters of a first fit (by the median) are left out of a second one;
+    the sum of squares is scaled to all rows.
     """
     terms = 6 if order == 2 and len(layer) >= 10 else 3 if order >= 1 and len(layer) >= 5 else 1
     while True:

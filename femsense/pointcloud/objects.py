@@ -106,8 +106,9 @@ def objects_on_plane(
 ) -> IntArray:
     """Return the object of each point, shape (n,): 0 is the largest; −1 the plane, what is behind it, and small clusters.
 
-    Objects that stand side by side are clusters above the plane. Objects that stand on one another touch; there, the faces parallel
-    to the plane are set aside, the sides cluster alone, and each face goes to the lowest sides that it meets: a lid belongs to what is under it.
+    Objects that stand side by side are clusters above the plane. Objects that stand on one another touch; there,
+    the faces parallel to the plane are set aside, the sides cluster alone, and each face goes to the lowest sides that it meets:
+    a lid belongs to what is under it.
 
     Arguments:
         points: [m], shape (n, 3), camera frame (the plane is seen from the origin).

@@ -1,7 +1,7 @@
 """Objects that are seen from one side, completed: a sphere, a cylinder or a plate fitted to their points.
 
-The closest visible points of an object that touches are not where it touches: they lie towards the camera, 5 to 7 mm off for a ball of 10 mm. Where the
-completed object comes closest to a surface is.
+The closest visible points of an object that touches are not where it touches: they lie towards the camera,
+5 to 7 mm off for a ball of 10 mm. Where the completed object comes closest to a surface is.
 """
 
 from __future__ import annotations
@@ -106,7 +106,10 @@ def find_shapes(
 
 
 def fit_shape(points: FloatArray, std: FloatArray, origins: FloatArray, *, radius_m: float | None = None) -> Shape:
-    """Return the simplest shape that explains points with their noise; "points" where none does. Arguments as for `find_shapes`."""
+    """Return the simplest shape that explains points with their noise; "points" where none does.
+
+    Arguments as for `find_shapes`.
+    """
     ray = points - origins
     ray = ray / np.linalg.norm(ray, axis=1, keepdims=True)
     if len(points) < FEWEST:
@@ -256,7 +259,8 @@ def _plate(points: FloatArray, std: FloatArray, ray: FloatArray) -> tuple[float,
 
 
 def _spread(curve: FloatArray, count: int) -> float:
-    """Return the standard deviation of the first parameters from the curvature of the misfit [m]; ROUGH_STD where they are not determined."""
+    """Return the standard deviation of the first parameters from the curvature of the misfit [m];
+    ROUGH_STD where they are not determined."""
     variance = float(np.trace(np.linalg.pinv(curve)[:count, :count])) / count
     return min(float(np.sqrt(variance)), ROUGH_STD) if variance > 0 else ROUGH_STD
 

@@ -9,7 +9,8 @@ import numpy as np
 from femsense.core.arrays import BoolArray, FloatArray, IntArray, freeze
 
 GRAZING = 0.25
-"""Rays that meet the surface at a smaller |cos| say little and err at silhouettes: one pixel beside it they miss (METHODS section 3)."""
+"""Rays that meet the surface at a smaller |cos| say little and err at silhouettes:
+one pixel beside it they miss (METHODS section 3)."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -76,7 +77,8 @@ class Surface:
         return _select(hits, (gap <= reach) & looking)
 
     def closest(self, points: FloatArray) -> tuple[FloatArray, FloatArray, IntArray, FloatArray]:
-        """Return the closest points (k, 3) [m], signed distances (k,) > 0 outside [m], their triangles (k,) and barycentric weights (k, 3)."""
+        """Return the closest points (k, 3) [m], signed distances (k,) > 0 outside [m],
+        their triangles (k,) and barycentric weights (k, 3)."""
         answer = self._scene.compute_closest_points(_tensor(points))
         triangle, uv = answer["primitive_ids"].numpy().astype(np.int64), answer["primitive_uvs"].numpy().astype(np.float64)
         weights = np.column_stack([1.0 - uv.sum(axis=1), uv])

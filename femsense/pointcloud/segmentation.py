@@ -136,8 +136,8 @@ def segment_robot(
         cloud: with colours.
         color_rgb: the robot's colour in [0, 1], shape (3,).
         tolerance_deg, shade: see `color_mask`.
-        vote_radius_m: where given, each point takes the side of the majority within this radius [m], itself included; that removes
-            speckle, dark points and glints. Keep it below the size of the smallest object that may touch the robot.
+        vote_radius_m: where given, each point takes the side of the majority within this radius [m], itself included;
+            that removes speckle, dark points and glints. Keep it below the size of the smallest object that may touch the robot.
     Raises:
         InputError: a cloud without colours, or a colour that cannot be used.
     """
@@ -166,8 +166,9 @@ def segment_by_model(
     The distance is taken to the tangent plane of the nearest surface point; sideways the spacing of the surface points counts
     as well, so that a coarse surface has no holes. Colour helps where there is some: near points whose colour is not
     color_rgb, or, without it, is more like the far points than like the near ones, are surroundings. Without colours,
-    objects closer than distance_m count as robot: search contacts with a radius above distance_m. Of a floor or wall that goes on beyond
-    that, plane_m says how far its points scatter: then those near the robot are surroundings as well.
+    objects closer than distance_m count as robot: search contacts with a radius above distance_m.
+    Of a floor or wall that goes on beyond that, plane_m says how far its points scatter:
+    then those near the robot are surroundings as well.
 
     Arguments:
         surface_points: predicted surface [m], shape (s, 3).
@@ -175,7 +176,8 @@ def segment_by_model(
         distance_m: largest distance from the surface [m]; above the expected error of the prediction.
         color_rgb, tolerance_deg: see `color_mask`; optional.
         learn_colors: without color_rgb, learn both sides' colours from this cloud.
-        plane_m: without colours, points so near to the plane that holds most of the far points are surroundings [m]; None: they are not.
+        plane_m: without colours, points so near to the plane that holds most of the far points are surroundings [m]; None:
+            they are not.
     Raises:
         InputError: wrong shapes, no surface, a distance that is not positive.
     """
@@ -247,7 +249,8 @@ def _spacing(tree: object) -> float:
 
 
 def _off_the_plane(points: FloatArray, near: BoolArray, width: float) -> BoolArray:
-    """Return the near points that do not lie in the plane of the far ones (RANSAC, as Open3D has it), if a good part of these lie in one."""
+    """Return the near points that do not lie in the plane of the far ones (RANSAC, as Open3D has it),
+    if a good part of these lie in one."""
     import open3d as o3d
 
     far = points[~near]

@@ -9,9 +9,9 @@ is fitted to these points with weights (1 − (u² + v²) / r²)², which fall t
 
     dᵢ(z) = (w − h(u, v)) / √(1 + |∇h(u, v)|²)
 
-outside of field i, which goes on as a plane beyond its radius, and d = Σ wᵢ dᵢ / Σ wᵢ outside of the surface, with wᵢ falling off with the
-distance of z from the field's centre. Nothing in d depends on a model, and it is smooth: whoever moves z has derivatives, and two models
-are compared on the same function, wherever they have the surface.
+outside of field i, which goes on as a plane beyond its radius, and d = Σ wᵢ dᵢ / Σ wᵢ outside of the surface,
+with wᵢ falling off with the distance of z from the field's centre. Nothing in d depends on a model, and it is smooth: whoever
+moves z has derivatives, and two models are compared on the same function, wherever they have the surface.
 
 Source: height fields that are blended like this are those of Ohtake et al., "Multi-level partition of unity implicits" (2003).
 """
@@ -38,7 +38,8 @@ ALONG = 0.5
 SAME_SIDE = 0.3
 """Cosine between a field's normal and that of the side in question below which the field is of another side of the body."""
 FARTHEST = 9.0
-"""Exponent of the nearest field's weight beside that of the farthest that counts; weights are less by that of the farthest, so that they begin at nothing."""
+"""Exponent of the nearest field's weight beside that of the farthest that counts; weights are less by that of the farthest, so
+that they begin at nothing."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

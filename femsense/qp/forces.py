@@ -30,7 +30,8 @@ class ForceEstimate:
     nuisance: FloatArray
     """Factors of the nuisance columns, shape [k]."""
     covariance: FloatArray
-    """Of the forces [N²], shape [f, f]: 0 for a force held by a bound, inf on the diagonal (0 beside it) for one that no row sees."""
+    """Of the forces [N²], shape [f, f]: 0 for a force held by a bound,
+    inf on the diagonal (0 beside it) for one that no row sees."""
     std: FloatArray
     """Square root of its diagonal [N], shape [f]."""
     held: BoolArray
@@ -62,8 +63,8 @@ def estimate_forces(
 ) -> ForceEstimate:
     """Return the forces that move the features to where they were seen, with their covariance (equations 10–14).
 
-    With x = (tensions, forces, nuisance), H the curvature of the data and the nuisance priors, P = H + ridge, and Z a basis of the
-    directions that equalities and acting inequalities leave free,
+    With x = (tensions, forces, nuisance), H the curvature of the data and the nuisance priors, P = H + ridge,
+    and Z a basis of the directions that equalities and acting inequalities leave free,
 
         covariance = Z (ZᵀPZ)⁻¹ ZᵀHZ (ZᵀPZ)⁻¹ Zᵀ,   restricted to the forces.
 
@@ -194,7 +195,8 @@ def _reduced_chi2(
 
 
 def _times(covariance: FloatArray, factor: float) -> FloatArray:
-    """Return the covariance times a factor; where the factor is unknown every force that is not held is uncertain without limit."""
+    """Return the covariance times a factor; where the factor is unknown every force that is not held is uncertain without
+    limit."""
     if np.isfinite(factor):
         return np.where(np.isinf(covariance), covariance, covariance * factor)
     return np.diag(np.where(np.diag(covariance) > 0.0, np.inf, 0.0))

@@ -2,7 +2,8 @@
 
     minimise   ½ xᵀ P x + qᵀ x    subject to   G x ≤ h,   A x = b,   lb ≤ x ≤ ub
 
-Source: "Calibration and force sensing with an RGB-D camera", section V.B, equations 10–14; signs of the multipliers as in qpsolvers.
+Source: "Calibration and force sensing with an RGB-D camera", section V.B, equations 10–14;
+signs of the multipliers as in qpsolvers.
 """
 
 from __future__ import annotations
@@ -19,7 +20,10 @@ from femsense.qp.friction_cone import FrictionCone, pyramid_rows
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Problem:
-    """A quadratic problem in n unknowns; parts that are absent have no rows, bounds that are absent are ±inf. Raises InputError."""
+    """A quadratic problem in n unknowns; parts that are absent have no rows, bounds that are absent are ±inf.
+
+    Raises InputError.
+    """
 
     P: FloatArray
     """Symmetric, positive semidefinite, shape [n, n]."""

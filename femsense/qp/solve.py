@@ -260,7 +260,8 @@ def _cleaned(problem: Problem, z: FloatArray | None, y: FloatArray | None, z_box
 
 
 def _first(values: FloatArray | None, length: int) -> FloatArray:
-    """Return the first entries as a new array, zeros where there are too few (solvers differ in what they give for absent parts)."""
+    """Return the first entries as a new array, zeros where there are too few (solvers differ in what they give for absent
+    parts)."""
     given = np.zeros(0) if values is None else np.asarray(values, dtype=np.float64)
     return np.array(given[:length]) if len(given) >= length else np.zeros(length)
 

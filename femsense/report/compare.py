@@ -19,7 +19,8 @@ PICTURE = 1_500_000
 
 
 def comparison_chapter(root: Path, runs: Sequence[Path], title: str) -> Chapter | None:
-    """Return the runs of a folder next to each other and, for the demo, their errors against the truth; None where neither is there.
+    """Return the runs of a folder next to each other and, for the demo, their errors against the truth;
+    None where neither is there.
 
     Arguments:
         root: the folder; `demo.json` and `picture.png` are used if the demo wrote them.

@@ -1,4 +1,7 @@
-"""JSON documents of a report: what a key may hold, and how they are read. What is missing is left out; a wrong type is an InputError."""
+"""JSON documents of a report: what a key may hold, and how they are read.
+
+What is missing is left out; a wrong type is an InputError.
+"""
 
 from __future__ import annotations
 

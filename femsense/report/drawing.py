@@ -200,8 +200,8 @@ def frame_body(
     cameras: Sequence[FloatArray] = (),
     corner: bool = True,
 ) -> None:
-    """Show a rectangle [mm] with equal scales, without axes. Below it stand, each in a line of its own, a scale bar, the key, and which way the
-    cameras look, or else (where `corner`) the axes of the robot frame."""
+    """Show a rectangle [mm] with equal scales, without axes. Below it stand, each in a line of its own, a scale bar, the key,
+    and which way the cameras look, or else (where `corner`) the axes of the robot frame."""
     margin = 0.04 * float((high - low).max())
     axes.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin))
     axes.axis("off")

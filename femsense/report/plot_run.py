@@ -17,7 +17,8 @@ SHOWN = len(SERIES)
 
 
 def plot_run(run: Run) -> Any:
-    """Return a matplotlib figure: the size of each force over time with two standard deviations, or the residual where nothing touches."""
+    """Return a matplotlib figure: the size of each force over time with two standard deviations,
+    or the residual where nothing touches."""
     figure, axes = new_axes()
     if not run.contacts:
         time = [frame.time_s for frame in run.frames]

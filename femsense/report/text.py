@@ -89,7 +89,8 @@ def run_document(run: Run) -> dict[str, Any]:
 
 
 def _unexplained(frames: Sequence[FrameReport]) -> list[FrameReport]:
-    """Return frames whose residual with the forces that were found is OFF times that of a frame that went well, the lower quartile."""
+    """Return frames whose residual with the forces that were found is OFF times that of a frame that went well,
+    the lower quartile."""
     known = [frame.rms_after_m for frame in frames if np.isfinite(frame.rms_after_m)]
     usual = max(float(np.quantile(known, 0.25)), LITTLE) if known else np.inf
     return [frame for frame in frames if frame.rms_after_m > OFF * usual]

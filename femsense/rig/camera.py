@@ -203,7 +203,8 @@ def measured_points(T_robot_camera: FloatArray, points: FloatArray, observation:
 def _cast(
     rays: FloatArray, T_robot_camera: FloatArray, shapes: Sequence[Shape]
 ) -> tuple[FloatArray, IntArray, FloatArray, FloatArray]:
-    """Return depth [m] (inf: nothing), index of the shape (−1: nothing), cosine to the normal, shape (…,), and the normal towards the camera (…, 3)."""
+    """Return depth [m] (inf: nothing), index of the shape (−1: nothing), cosine to the normal, shape (…,),
+    and the normal towards the camera (…, 3)."""
     import open3d as o3d
 
     scene = o3d.t.geometry.RaycastingScene(nthreads=1)

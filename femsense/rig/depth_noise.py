@@ -1,12 +1,14 @@
 """What a depth camera makes of what it looks at.
 
-Stereo. Depth z [m] comes from a disparity d = f b / z, so that its standard deviation grows as z² · subpixel / (f · baseline), and disparities come in
-steps (Grunnet-Jepsen, Sweetser and Woodfill, "Tuning depth cameras for best performance", Intel: a well tuned camera shows a subpixel error
-below 0.1; the D415 has a baseline of 55 mm and 65° of view). Disparities are matched over windows: neighbours err together, and what is near grows over
-what is behind it. What only one imager sees has no depth. Little light, or a gleam, gives no match.
+Stereo. Depth z [m] comes from a disparity d = f b / z,
+so that its standard deviation grows as z² · subpixel / (f · baseline), and disparities come in steps (Grunnet-Jepsen, Sweetser
+and Woodfill, "Tuning depth cameras for best performance", Intel: a well tuned camera shows a subpixel error below 0.1; the D415
+has a baseline of 55 mm and 65° of view). Disparities are matched over windows: neighbours err together, and what is near grows
+over what is behind it. What only one imager sees has no depth. Little light, or a gleam, gives no match.
 
-Time of flight. The depth of a pixel is the mean over the light that comes back, weighted by its amplitude: over the edge of two surfaces it lies between
-them, and in a corner light of a second bounce comes later. Noise goes as one over the amplitude (Frank et al. 2009, Optical Engineering 48:013602).
+Time of flight. The depth of a pixel is the mean over the light that comes back, weighted by its amplitude:
+over the edge of two surfaces it lies between them, and in a corner light of a second bounce comes later. Noise goes as one over
+the amplitude (Frank et al. 2009, Optical Engineering 48:013602).
 """
 
 from __future__ import annotations
@@ -95,7 +97,8 @@ def _stereo(sight: Sight, noise: NoiseTable, camera: Camera, rng: np.random.Gene
 def shadowed(depth: FloatArray, focal_times_baseline: float) -> BoolArray:
     """Return which pixels of the left imager the right one does not see, shape (H, W).
 
-    Column u falls on column u − d of the right imager, d = f b / z; it is hidden where a column farther right falls on it or left of it.
+    Column u falls on column u − d of the right imager, d = f b / z;
+    it is hidden where a column farther right falls on it or left of it.
     """
     disparity = np.divide(focal_times_baseline, depth, out=np.zeros_like(depth), where=depth > 0)
     column = np.arange(depth.shape[1]) - disparity
@@ -127,7 +130,8 @@ def _stepped(depth: FloatArray, noise: NoiseTable, camera: Camera) -> FloatArray
 
 
 def _unmatched(sight: Sight, noise: NoiseTable, rng: np.random.Generator) -> BoolArray:
-    """Return where too little light comes back for a match, or a gleam drowns the pattern, shape (H, W): in patches, not in single pixels."""
+    """Return where too little light comes back for a match, or a gleam drowns the pattern, shape (H, W): in patches,
+    not in single pixels."""
     chance = _uniform(_smooth_noise(sight.facing.shape, BLOB_PX, rng))
     signal = np.maximum(sight.albedo * sight.facing, 1e-9)
     dark = 1.0 / (1.0 + (signal / noise.dark_signal) ** STEEP) if noise.dark_signal else np.zeros_like(signal)
@@ -160,8 +164,9 @@ def _time_of_flight(sight: Sight, noise: NoiseTable, rng: np.random.Generator) -
 def second_bounce(sight: Sight, signal: FloatArray, rng: np.random.Generator) -> FloatArray:
     """Return by how much light of one more bounce moves the distance along each ray [m], shape (H, W).
 
-    Light goes camera → q → p → camera; surfaces are diffuse, and what stands between p and q is not looked for. For the small delays of near surfaces the
-    phase is the mean delay weighted by amplitude. With the irradiance E_q = cos_q / |q|² at q,
+    Light goes camera → q → p → camera; surfaces are diffuse, and what stands between p and q is not looked for.
+    For the small delays of near surfaces the phase is the mean delay weighted by amplitude.
+    With the irradiance E_q = cos_q / |q|² at q,
 
         a_p = albedo_q · E_q · cos_pq cos_qp / (π |p − q|²) · A_q  beside  E_p,       delay = (|q| + |p − q| − |p|) / 2.
 
@@ -192,7 +197,8 @@ def second_bounce(sight: Sight, signal: FloatArray, rng: np.random.Generator) ->
 def _delay_of(
     p: FloatArray, n: FloatArray, facing: FloatArray, q: FloatArray, m: FloatArray, sent: FloatArray, area: FloatArray
 ) -> FloatArray:
-    """Return the mean delay of points p (k, 3) with normals n by light that places q (j, 3) with normals m send on [m], shape (k,)."""
+    """Return the mean delay of points p (k, 3) with normals n by light that places q (j, 3) with normals m send on [m],
+    shape (k,)."""
     way = q[None] - p[:, None]
     squared = (way**2).sum(axis=2)
     length = np.sqrt(np.maximum(squared, 1e-18))

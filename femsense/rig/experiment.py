@@ -17,7 +17,8 @@ from femsense.rig.script import ScriptTable
 from femsense.rig.true_path import TrueFrame
 
 STREAMS = {"placement": 1, "markers": 2, "inputs": 3, "rest": 4, "clouds": 5, "sensors": 6}
-"""Each kind of noise has its own stream of random numbers, so that switching one off leaves the others alone. (7: the motors, `rig/plan.py`.)"""
+"""Each kind of noise has its own stream of random numbers, so that switching one off leaves the others alone. (7:
+the motors, `rig/plan.py`.)"""
 DIGITS = 9
 """Places are written to the nanometre, so that the last bits of a solver do not change a file."""
 MATT = 0.5

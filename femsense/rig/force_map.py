@@ -1,8 +1,10 @@
-"""Which forces at which places a camera and a robot can resolve, before anyone builds it: a bound of Cramér and Rao over the surface.
+"""Which forces at which places a camera and a robot can resolve, before anyone builds it:
+a bound of Cramér and Rao over the surface.
 
-Each point that a camera would measure is a row: the displacement of the surface along its normal there, with the noise of the depth along the ray times
-the cosine of incidence. A force f at a place moves the rows by A f (compliance times rows); what is not known beside it moves them by N: camera poses and the
-modulus, with prior standard deviations. The covariance of f is
+Each point that a camera would measure is a row: the displacement of the surface along its normal there,
+with the noise of the depth along the ray times the cosine of incidence. A force f at a place moves the rows by A f (compliance
+times rows); what is not known beside it moves them by N: camera poses and the modulus, with prior standard deviations.
+The covariance of f is
 
     (Aᵀ Q A + P)⁻¹,   Q = I − N (Nᵀ N + I)⁻¹ Nᵀ   in whitened rows, P the prior of the force,
 
@@ -146,7 +148,8 @@ def force_map(
 def neighbours(noise: NoiseTable | None) -> float:
     """Return how many pixels count as one, since neighbours err together: the sum of their correlations.
 
-    A stereo camera's common part is white noise smoothed with a Gaussian of width w; its correlation at a distance r is exp(−r²/4w²), which sums to 4πw².
+    A stereo camera's common part is white noise smoothed with a Gaussian of width w; its correlation at a distance r is
+    exp(−r²/4w²), which sums to 4πw².
     """
     if noise is None or noise.kind != "stereo":
         return 1.0
@@ -170,7 +173,8 @@ def _state(robot: Robot, script: ScriptTable, where: Path, frame: int) -> Equili
 
 
 def _rows(robot: Robot, script: ScriptTable, views: tuple[View, ...], state: Equilibrium) -> tuple[RayRows, FloatArray]:
-    """Return the rows of the points that the cameras would measure, and the standard deviation of each, neighbours counted [m], shape (r,)."""
+    """Return the rows of the points that the cameras would measure, and the standard deviation of each,
+    neighbours counted [m], shape (r,)."""
     shapes = [body_shape(robot, state.positions, script.scene)]
     if script.scene.floor_z_m is not None:
         shapes.append(floor_shape(script.scene.floor_z_m, np.array(script.scene.floor_rgb), script.scene.floor_albedo))

@@ -19,7 +19,8 @@ COLORS = "viridis_r"
 
 
 def force_document(found: ForceMap) -> dict[str, Any]:
-    """Return the map as plain tables: for each group of places the resolution of a force along the normal and along the surface."""
+    """Return the map as plain tables: for each group of places the resolution of a force along the normal and along the
+    surface."""
     best, worst = int(found.normal_std.argmin()), int(found.normal_std.argmax())
     return {
         "points": found.points,
@@ -56,7 +57,8 @@ def force_text(found: ForceMap) -> str:
 
 
 def write_force_map(found: ForceMap, folder: Path, T_robot_camera: FloatArray) -> list[Path]:
-    """Write forces.csv, forces.glb (colours at the vertices) and forces.png (from the camera and from behind); return the files."""
+    """Write forces.csv, forces.glb (colours at the vertices) and forces.png (from the camera and from behind);
+    return the files."""
     folder.mkdir(parents=True, exist_ok=True)
     table, mesh, picture = folder / "forces.csv", folder / "forces.glb", folder / "forces.png"
     columns = ("x_m", "y_m", "z_m", "normal_std_n", "tangent_std_n", "visible")

@@ -1,4 +1,5 @@
-"""Lenses of the rig: from pixels to rays and back, by OpenCV's own functions, so that they share nothing with what reads depth images."""
+"""Lenses of the rig: from pixels to rays and back, by OpenCV's own functions,
+so that they share nothing with what reads depth images."""
 
 from __future__ import annotations
 

@@ -32,7 +32,10 @@ Surface = tuple[FloatArray, IntArray]
 
 
 def object_surface(item: ObjectTable, folder: Path) -> Surface:
-    """Return points [m] and outward triangles of an object in its own frame. Raises InputError where its file is missing or broken."""
+    """Return points [m] and outward triangles of an object in its own frame.
+
+    Raises InputError where its file is missing or broken.
+    """
     if item.kind == "mesh":
         return _mesh(folder / str(item.mesh), str(item.unit))
     import trimesh

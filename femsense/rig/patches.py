@@ -1,4 +1,5 @@
-"""The part of the surface that is pressed, and how: around a place with a radius, or as an object of a form presses an elastic foundation."""
+"""The part of the surface that is pressed, and how: around a place with a radius,
+or as an object of a form presses an elastic foundation."""
 
 from __future__ import annotations
 
@@ -11,7 +12,8 @@ from femsense.core.arrays import FloatArray, IntArray
 from femsense.fem.mesh import TetMesh, closest_in_triangle, surface_triangles, triangle_normals
 
 FOUNDATION = 1.70
-"""Stiffness of a foundation that gives a ball the contact of Hertz, in E* over the radius of the contact (Johnson, Contact Mechanics, 1985, section 4.3)."""
+"""Stiffness of a foundation that gives a ball the contact of Hertz, in E* over the radius of the contact (Johnson, Contact
+Mechanics, 1985, section 4.3)."""
 FINEST = 8
 """A side of a triangle is divided into so many parts at most."""
 SAMPLES = 0.3

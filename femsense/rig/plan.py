@@ -78,7 +78,8 @@ def plan_script(script: ScriptTable, robot: Robot, where: Path = Path("script"))
         where: what messages name.
 
     Raises:
-        InputError: unknown cables or markers, negative tensions, lists of another length than their sweep, frames that are not there.
+        InputError: unknown cables or markers, negative tensions, lists of another length than their sweep,
+            frames that are not there.
     """
     names, chambers = robot.body.cable_names, robot.body.chamber_names
     _check_names(script, robot, where)

@@ -162,7 +162,8 @@ class Presses:
 
 
 def between(before: tuple[Press, ...], after: tuple[Press, ...], part: float) -> tuple[Press, ...]:
-    """Return what presses a part of the way from one frame to the next: on a patch of both the force moves, on others it comes and goes."""
+    """Return what presses a part of the way from one frame to the next: on a patch of both the force moves,
+    on others it comes and goes."""
     later = {(p.contact, id(p.patch)): p for p in after}
     result = []
     for p in before:

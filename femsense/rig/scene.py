@@ -23,7 +23,8 @@ ROD_LENGTH = 0.12
 
 
 def frame_shapes(experiment: Experiment, k: int) -> list[Shape]:
-    """Return what the cameras see in the k-th frame of an experiment: the body first, then what touches it or is near, then the floor."""
+    """Return what the cameras see in the k-th frame of an experiment: the body first, then what touches it or is near,
+    then the floor."""
     robot, frame, scene = experiment.robot, experiment.frames[k], experiment.script.scene
     shapes = [body_shape(robot, frame.state.positions, scene)]
     near: list[TrueContact | Hovering] = [*frame.contacts, *frame.hovering]

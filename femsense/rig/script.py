@@ -1,4 +1,5 @@
-"""The script of a virtual experiment (`femsense-script-1`): what is pulled when, what touches, what the truth has, what is seen."""
+"""The script of a virtual experiment (`femsense-script-1`): what is pulled when, what touches, what the truth has,
+what is seen."""
 
 from __future__ import annotations
 

@@ -3,8 +3,8 @@
     strain:  ε = |x_b − x_a| / |X_b − X_a| − 1,                      reading = zero + gain ε
     colour:  u = (x_b − x_a) · d, d across the way from a to b,      reading_k = zero + gain ½ (1 + cos 2π (u / period − k / 3))
 
-A colour sensor at a looks at a pattern of colours at b; with the shift u other colours come before it (Scharff et al. 2018). What a
-sensor follows with a lag is the body; noise and drift are its own.
+A colour sensor at a looks at a pattern of colours at b; with the shift u other colours come before it (Scharff et al. 2018).
+What a sensor follows with a lag is the body; noise and drift are its own.
 """
 
 from __future__ import annotations

@@ -49,7 +49,8 @@ def simulate(
         script: a script, its plain tables, or the path of a TOML file.
         out_folder: the recording; what stood there is replaced as a whole, and only when all is written.
         progress: called with (frames done, frames in all).
-        keep: a file that holds the frames that are done, so that a run that is stopped goes on there with the same result, and what it is made
+        keep: a file that holds the frames that are done, so that a run that is stopped goes on there with the same result,
+            and what it is made
             from: a file that says something else is not used. It is removed at the end.
 
     Returns:

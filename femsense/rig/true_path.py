@@ -115,7 +115,8 @@ def true_path(robot: Robot, plan: Plan, *, substeps: int = 3, folder: Path = Pat
 def true_course(
     robot: Robot, plan: Plan, *, substeps: int = 3, folder: Path = Path(), kept: Course | None = None
 ) -> Iterator[Course]:
-    """Yield how far the path has come after each frame; a frame that does not settle costs itself, and the path goes on from the one before.
+    """Yield how far the path has come after each frame; a frame that does not settle costs itself,
+    and the path goes on from the one before.
 
     Arguments:
         robot, plan, substeps, folder: as of `true_path`.
@@ -292,9 +293,9 @@ class TruePath:
 def creep_ahead(passes: list[FloatArray], far: float) -> FloatArray | None:
     """Return the tensions at the motors that passes creep towards [N], (a,); None where they do not creep.
 
-    While the bends of a held cable hold, what is behind them stays, and the tension at the motor moves by nearly the same small share in every
-    pass, until they slide. So where the logarithms of three passes move like a geometric series, it is summed (Aitken 1926), up to `far` in
-    the logarithm.
+    While the bends of a held cable hold, what is behind them stays,
+    and the tension at the motor moves by nearly the same small share in every pass, until they slide. So where the logarithms of
+    three passes move like a geometric series, it is summed (Aitken 1926), up to `far` in the logarithm.
     """
     if len(passes) < 3:
         return None

@@ -72,8 +72,8 @@ def true_inputs(robot: Robot, plan: Plan) -> FloatArray:
 def motor_inputs(plan: Plan) -> FloatArray:
     """Return what the motors do when they are told the plan [N] or [m], shape (F, a): their own scale, and play.
 
-    With a play of width w a cable moves only when its motor pushes on one end of the play: y_k = min(max(y_{k−1}, u_k − w/2), u_k + w/2), counted
-    from where the motors begin.
+    With a play of width w a cable moves only when its motor pushes on one end of the play: y_k = min(max(y_{k−1}, u_k − w/2),
+    u_k + w/2), counted from where the motors begin.
     """
     told = plan.commanded + plan.initial
     scaled = told if plan.motor_scale is None else told * plan.motor_scale

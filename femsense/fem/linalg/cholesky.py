@@ -27,7 +27,8 @@ from femsense.fem.linalg.symbolic import Analysis
 FEW = 4
 """Right-hand sides that are solved one by one where the matrix has no blocks; more go through BLAS together."""
 BESIDE = 40
-"""Right-hand sides that are solved beside each other in groups of SIDES; BLAS takes less time for more. For 10 to 16 of a bar it took twice as long in a trial."""
+"""Right-hand sides that are solved beside each other in groups of SIDES; BLAS takes less time for more. For 10 to 16 of a bar it
+took twice as long in a trial."""
 
 
 # --- numbers -------------------------------------------------------------------------------------------------------------

@@ -1,10 +1,11 @@
 """Factor once, solve many: the sparse symmetric systems of the body.
 
-A stiffness that is positive definite goes to `femsense.fem.linalg.cholesky`, with its analysis kept for a sparsity pattern. One that
-is not goes to PARDISO of the MKL (through pypardiso) where it is installed, and to SuperLU of SciPy elsewhere. Where the factor
-would not fit into memory, conjugate gradients take its place (see `femsense.fem.linalg.iterative`).
-FEMSENSE_SOLVER chooses by hand: `direct` or `iterative`; `pardiso` or `superlu` send all of them there. FEMSENSE_MEMORY_GB says how much memory
-there is for factors, where the machine's own figure is not the one to go by (a container, a shared machine).
+A stiffness that is positive definite goes to `femsense.fem.linalg.cholesky`, with its analysis kept for a sparsity pattern.
+One that is not goes to PARDISO of the MKL (through pypardiso) where it is installed, and to SuperLU of SciPy elsewhere.
+Where the factor would not fit into memory, conjugate gradients take its place (see `femsense.fem.linalg.iterative`).
+FEMSENSE_SOLVER chooses by hand: `direct` or `iterative`; `pardiso` or `superlu` send all of them there.
+FEMSENSE_MEMORY_GB says how much memory there is for factors,
+where the machine's own figure is not the one to go by (a container, a shared machine).
 """
 
 from __future__ import annotations
@@ -28,8 +29,9 @@ from femsense.fem.linalg.iterative import Level, Levels, UnsettledError, iterati
 from femsense.fem.linalg.symbolic import Analysis, analyse
 
 ITERATIVE_FROM = 100_000
-"""Unknowns from which on the memory of a direct factor is looked at. Up to 165 321 unknowns the direct factor was several times faster,
-linear and quadratic (docs/speed.md, `python benchmarks/body.py iterative`), so that memory alone switches."""
+"""Unknowns from which on the memory of a direct factor is looked at.
+Up to 165 321 unknowns the direct factor was several times faster, linear and quadratic (docs/speed.md, `python benchmarks/body.py
+iterative`), so that memory alone switches."""
 ITERATIVE_LEAST = 60
 """Bodies with fewer unknowns always have a direct factor: they may be too small for aggregates with rigid motions."""
 MEMORY_SHARE = 0.6
@@ -157,7 +159,8 @@ def factorize_definite(
 
 
 def least_shift(pattern: Pattern, values: FloatArray) -> float:
-    """Return the smallest shift that `factorize_definite` tries [N/m]: a matrix that needs more is indefinite, in single precision, too."""
+    """Return the smallest shift that `factorize_definite` tries [N/m]: a matrix that needs more is indefinite,
+    in single precision, too."""
     size = np.abs(values[_diagonal(pattern)])
     return LEAST_SHIFT * float(np.median(size)) if len(size) and np.isfinite(size).all() else np.inf
 
@@ -218,7 +221,8 @@ def direct_bytes(pattern: Pattern) -> int:
 
 
 def available_memory() -> float:
-    """Return the memory for factors [bytes]: what FEMSENSE_MEMORY_GB says, else what is free on the machine; inf where it is unknown.
+    """Return the memory for factors [bytes]: what FEMSENSE_MEMORY_GB says, else what is free on the machine;
+    inf where it is unknown.
 
     Raises:
         InputError: FEMSENSE_MEMORY_GB is not a number ≥ 0.

@@ -2,10 +2,11 @@
 """Conjugate gradients with a two-level preconditioner: stiffnesses whose direct factor costs too much time or memory.
 
 One step of the preconditioner is a forward sweep of block Gauss–Seidel, a correction from a coarse space whose matrix PᵀKP is
-factorised (see `femsense.fem.linalg.cholesky`), and a backward sweep; it works in single precision. The coarse space of a quadratic
-mesh are the linear functions on the same tetrahedra (p-multigrid): a node in the middle of an edge moves as the mean of its
-ends. That of a linear mesh are the rigid motions of aggregates, a node and its neighbours. References: Saad 2003 (sections 9.2
-and 13), Vaněk, Mandel & Brezina 1996 (aggregates with rigid motions), Paige, Parlett & van der Vorst 1995 (Lanczos and inertia).
+factorised (see `femsense.fem.linalg.cholesky`), and a backward sweep; it works in single precision.
+The coarse space of a quadratic mesh are the linear functions on the same tetrahedra (p-multigrid):
+a node in the middle of an edge moves as the mean of its ends. That of a linear mesh are the rigid motions of aggregates, a node
+and its neighbours. References: Saad 2003 (sections 9.2 and 13), Vaněk, Mandel & Brezina 1996 (aggregates with rigid motions),
+Paige, Parlett & van der Vorst 1995 (Lanczos and inertia).
 """
 
 from __future__ import annotations
@@ -199,8 +200,8 @@ class Iterative:
     def is_definite(self) -> bool:
         """Return whether conjugate gradients on a random right-hand side meet positive curvature alone.
 
-        Their curvatures are the pivots of Lanczos' matrix, one of which is negative as soon as it has a negative eigenvalue; and what
-        has a share of the right-hand side is not left out before they converge. Raises UnsettledError.
+        Their curvatures are the pivots of Lanczos' matrix, one of which is negative as soon as it has a negative eigenvalue;
+        and what has a share of the right-hand side is not left out before they converge. Raises UnsettledError.
         """
         right = self._levels.prolong @ np.random.default_rng(1).standard_normal(self._levels.prolong.shape[1]).astype(np.float32)
         b = np.random.default_rng(0).standard_normal(self.size) + right

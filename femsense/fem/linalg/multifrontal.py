@@ -16,8 +16,8 @@ from femsense.core.kernels import njit
 from femsense.fem.linalg.simd_tiles import WIDE, add_run, subtract_and_solve, subtract_product, write_product
 
 LARGE = 144
-"""Columns of a front from which on BLAS does as well as tiles in registers, and that tiles factorise at a time: two solid bars were slower
-by up to 2 % with 120, and with 180 by up to 5 % in double precision (in single 1–2 % faster)."""
+"""Columns of a front from which on BLAS does as well as tiles in registers, and that tiles factorise at a time:
+two solid bars were slower by up to 2 % with 120, and with 180 by up to 5 % in double precision (in single 1–2 % faster)."""
 
 
 @intrinsic
@@ -37,7 +37,8 @@ def call_blas(typing_context: Any, address: Any, arguments: Any) -> Any:
 
 @njit(cache=True)
 def _factor_corner(L: FloatArray, at: int, height: int, columns: int, corner: FloatArray) -> bool:
-    """Factorise the first columns ≤ 6 and rows of a panel that begins at `at`; write them to `corner` too, with reciprocal diagonal."""
+    """Factorise the first columns ≤ 6 and rows of a panel that begins at `at`; write them to `corner` too,
+    with reciprocal diagonal."""
     for j in range(columns):
         pivot = L[at + j * height + j]
         if not pivot > 0.0:

@@ -90,8 +90,9 @@ def _sorted(start: IntArray, rows: IntArray, n: int) -> IntArray:
 
 
 WORTH_PEELING = 10_000
-"""Free nodes from which on minimum degree is not asked where there is METIS: telling it takes SuperLU a second, and minutes on huge
-meshes. With 19 000 to 58 000 nodes cutting made half the work on a solid bar and on thin limbs alike (`body.py orders` has the latter)."""
+"""Free nodes from which on minimum degree is not asked where there is METIS: telling it takes SuperLU a second,
+and minutes on huge meshes. With 19 000 to 58 000 nodes cutting made half the work on a solid bar and on thin limbs alike
+(`body.py orders` has the latter)."""
 
 
 WORTH_CUTTING = 500
@@ -99,8 +100,9 @@ WORTH_CUTTING = 500
 
 
 def fill_reducing_order(rows: IntArray, columns: IntArray, free: BoolArray) -> IntArray:
-    """Return the free nodes in an order of little fill for the couplings rows–columns: of multiple minimum degree (by SuperLU) and
-    nested dissection (by METIS, where it is installed) the one that makes less work. Thick bodies are better cut than peeled."""
+    """Return the free nodes in an order of little fill for the couplings rows–columns:
+    of multiple minimum degree (by SuperLU) and nested dissection (by METIS, where it is installed) the one that makes less work.
+    Thick bodies are better cut than peeled."""
     n = len(free)
     upper = sp.csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(n, n))
     nodes = np.flatnonzero(free)

@@ -14,11 +14,14 @@ from femsense.fem.linalg.iterative import UnsettledError, iterative
 REFINED_FROM = 3000
 """Unknowns from which on a factor in single precision, and a solve more, take less time than one in double precision."""
 REFINED, MOST_REFINED = 1e-6, 4
-"""Share of a solution that the next correction may still bring; corrections at most before the factor is made in double precision."""
+"""Share of a solution that the next correction may still bring;
+corrections at most before the factor is made in double precision."""
 NEAR_ENOUGH = 3e-2
-"""A factor of a state near by serves where the first correction of what it makes of the loads that are asked is smaller than this share."""
+"""A factor of a state near by serves where the first correction of what it makes of the loads that are asked is smaller than this
+share."""
 ROUGH = 1e-3
-"""Share of a rough solution that may be missing, in energy. With ten times as much in the mesh's error the order of the nodes moved a fit by two percent."""
+"""Share of a rough solution that may be missing, in energy. With ten times as much in the mesh's error the order of the nodes
+moved a fit by two percent."""
 ROUGH_FROM = 9000
 """Unknowns from which on a rough solution takes conjugate gradients instead of a factor."""
 
@@ -81,8 +84,9 @@ def _share(more: FloatArray, answer: FloatArray) -> float:
 def refined(
     pattern: Pattern, values: FloatArray, lent: Factorization | None = None, *, pays_from: int = REFINED_FROM
 ) -> Factorization | None:
-    """Return a stiffness that is solved to REFINED or better, from a factor in single precision where that pays and is enough: from that which a state
-    near by has lent, as long as it serves. `pays_from`: unknowns from which single precision pays."""
+    """Return a stiffness that is solved to REFINED or better,
+    from a factor in single precision where that pays and is enough: from that which a state near by has lent, as long as it
+    serves. `pays_from`: unknowns from which single precision pays."""
     if pattern.size < pays_from or not np.isfinite(values).all():
         return factorize(pattern, values)
     if isinstance(lent, Cholesky) and lent.size == pattern.size:
@@ -102,7 +106,8 @@ def prepare_roughly(pattern: Pattern) -> None:
 def roughly(
     pattern: Pattern, values: FloatArray, tolerance: float = ROUGH, *, pays_from: int = ROUGH_FROM
 ) -> Factorization | None:
-    """Return a stiffness that is solved to a tolerance, by conjugate gradients where these are faster than a factor: from `pays_from` unknowns on."""
+    """Return a stiffness that is solved to a tolerance, by conjugate gradients where these are faster than a factor:
+    from `pays_from` unknowns on."""
     if pattern.size < pays_from or pattern.grid is None or not np.isfinite(values).all():
         return factorize(pattern, values)
     try:

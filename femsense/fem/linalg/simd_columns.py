@@ -175,7 +175,8 @@ def _column_function(module: Any, name: str, like: Any, count: int) -> Any:
 
 
 class _Elimination:
-    """What is written about the columns of a matrix at the address `a`, `step` entries apart, that begin with a lower triangle."""
+    """What is written about the columns of a matrix at the address `a`, `step` entries apart,
+    that begin with a lower triangle."""
 
     def __init__(self, builder: Any, kind: Any, vector: Any, a: Any, step: Any) -> None:
         self.builder, self.kind, self.vector, self.a, self.step = builder, kind, vector, a, step
@@ -221,8 +222,9 @@ class _Elimination:
 
 
 down_one, down_three, down_six = (_columns("down", count, _column_function) for count in (1, 3, 6))
-"""(like, a, step, x, rows, ahead): for a matrix at the address `a`, its columns `step` entries apart, that begins with a lower triangle T and goes on with
-`rows` rows A: x ← T⁻¹ x, and y −= A x for the y behind x. What lies `ahead` bytes further is brought into the cache meanwhile."""
+"""(like, a, step, x, rows, ahead): for a matrix at the address `a`, its columns `step` entries apart,
+that begins with a lower triangle T and goes on with `rows` rows A: x ← T⁻¹ x, and y −= A x for the y behind x. What lies `ahead`
+bytes further is brought into the cache meanwhile."""
 up_one, up_three, up_six = (_columns("up", count, _column_function) for count in (1, 3, 6))
 """The same with x −= Aᵀ y, and x ← T⁻ᵀ x."""
 down_three_sides, down_six_sides = (_columns("down", count, _side_function) for count in (3, 6))

@@ -17,7 +17,8 @@ LANES = 8
 
 @intrinsic
 def add_gradient(context: Any, like: Any, to: Any, x: Any, slopes: Any, count: Any) -> Any:
-    """Add Σ_a x_ai g_aj to nine rows (i, j) of eight numbers at the address `to`: x of three rows of eight a node, g too, of the precision of `like`."""
+    """Add Σ_a x_ai g_aj to nine rows (i, j) of eight numbers at the address `to`: x of three rows of eight a node, g too,
+    of the precision of `like`."""
     del context
 
     def build(target: Any, builder: Any, signature: Any, values: Any) -> Any:

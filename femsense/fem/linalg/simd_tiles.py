@@ -1,9 +1,11 @@
 # mypy: allow-untyped-decorators, allow-untyped-calls
-"""Dense work on fronts too small for a BLAS to pay: tiles that stay in the vector registers, written as LLVM code for the processor at hand.
+"""Dense work on fronts too small for a BLAS to pay: tiles that stay in the vector registers,
+written as LLVM code for the processor at hand.
 
 A tile is up to three registers of rows times six columns. Reading beyond the last row or column of a matrix is harmless (what is
-read there reaches no result). Registers are written whole, what stands beyond the last row with its old value: a store with a mask
-takes a dozen cycles where there is no AVX-512. The memory must reach PADDING entries beyond its end, and nobody else may write there.
+read there reaches no result). Registers are written whole, what stands beyond the last row with its old value:
+a store with a mask takes a dozen cycles where there is no AVX-512. The memory must reach PADDING entries beyond its end,
+and nobody else may write there.
 """
 
 from __future__ import annotations
@@ -38,7 +40,8 @@ PADDING = 4 * BYTES
 def subtract_product(
     context: Any, like: Any, a: Any, b: Any, step: Any, c: Any, step_c: Any, rows: Any, columns: Any, depth: Any
 ) -> Any:
-    """C (rows, columns ≤ 6) −= A (rows, depth) B (columns, depth)ᵀ; matrices by columns, A and B with `step`, C with `step_c` between them.
+    """C (rows, columns ≤ 6) −= A (rows, depth) B (columns, depth)ᵀ; matrices by columns, A and B with `step`,
+    C with `step_c` between them.
 
     `like` is an array of the numbers in question, matrices are given by their addresses.
     """
@@ -59,7 +62,8 @@ def write_product(
 def subtract_and_solve(
     context: Any, like: Any, a: Any, b: Any, step: Any, c: Any, step_c: Any, rows: Any, columns: Any, depth: Any, L: Any
 ) -> Any:
-    """The same, then C ← C L⁻ᵀ for a lower L (columns, columns) by rows, WIDE apart, with the reciprocals of its diagonal on it."""
+    """The same, then C ← C L⁻ᵀ for a lower L (columns, columns) by rows, WIDE apart,
+    with the reciprocals of its diagonal on it."""
     del context
     return types.void(like, *[types.int64] * 9), _builder("solve", like, solves=True)
 
@@ -211,7 +215,8 @@ def _eliminated(builder: Any, value: Any, known: list[Any], L: Any, shape: tuple
 
 
 def _run_function(module: Any, like: Any) -> Any:
-    """Return the function that adds a run of numbers, a register at a time and what is left in halves of one: the next run may begin right after."""
+    """Return the function that adds a run of numbers, a register at a time and what is left in halves of one:
+    the next run may begin right after."""
     letter, kind, lanes = kind_of(like)
     function, known = function_named(module, f"femsense_add_{letter}", 3)
     if known:

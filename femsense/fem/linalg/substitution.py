@@ -99,8 +99,8 @@ def solve_sides(
     x: FloatArray,
     half: FloatArray,
 ) -> None:
-    """Solve in place for groups of SIDES right-hand sides, x (g, f · SIDES), in the order of elimination; unit is 3 here. half (g, …) has room for the
-    tallest front. What is read of the factor for one group is in the cache for the others."""
+    """Solve in place for groups of SIDES right-hand sides, x (g, f · SIDES), in the order of elimination; unit is 3 here.
+    half (g, …) has room for the tallest front. What is read of the factor for one group is in the cache for the others."""
     width, base, groups = L.itemsize, L.ctypes.data, len(x)
     line, block = width * SIDES, SIDES * unit
     for s in range(len(firsts) - 1):

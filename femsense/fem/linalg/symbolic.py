@@ -17,7 +17,8 @@ from femsense.fem.linalg.simd_tiles import PADDING
 
 @njit(cache=True)
 def _postorder(parent: IntArray, by_weight: IntArray) -> IntArray:
-    """Return the nodes of a forest, children before parents, the heaviest child last; `by_weight` are its nodes, the lightest first."""
+    """Return the nodes of a forest, children before parents, the heaviest child last; `by_weight` are its nodes,
+    the lightest first."""
     n = len(parent)
     head, follow = np.full(n, -1, np.int64), np.full(n, -1, np.int64)
     for j in by_weight:  # lists are filled from the front: the heaviest comes first in a list, last in the order
@@ -167,7 +168,8 @@ def _targets(
 
 @njit(cache=True)
 def _runs(begin: IntArray, place: IntArray) -> tuple[IntArray, IntArray]:
-    """Return the begin of each supernode's runs of rows that follow each other in the parent's front too, and where each run begins."""
+    """Return the begin of each supernode's runs of rows that follow each other in the parent's front too,
+    and where each run begins."""
     heads = np.zeros(len(begin), np.int64)
     runs = np.empty(len(place), np.int64)
     k = 0
@@ -225,7 +227,8 @@ def _layout(
     parent: IntArray,
     unit: int,
 ) -> Any:
-    """Return the fields of an `Analysis` from `firsts` on, as far as they follow from the order: one kernel to load instead of six."""
+    """Return the fields of an `Analysis` from `firsts` on, as far as they follow from the order:
+    one kernel to load instead of six."""
     start, structure = _structures(rows, columns, parent)
     count = np.empty(len(parent), np.int64)
     for j in range(len(parent)):
@@ -278,7 +281,8 @@ class Analysis:
     owner: IntArray
     """Supernode of each unknown in the order of elimination, shape (f,)."""
     idle: dict[tuple[str, int], list[npt.NDArray[Any]]]
-    """Memory of what is gone, by kind and number of entries, taken again by what is new: pages that are fresh from the system take longer than a factor."""
+    """Memory of what is gone, by kind and number of entries, taken again by what is new:
+    pages that are fresh from the system take longer than a factor."""
     columns: dict[tuple[str, int], npt.NDArray[Any]]
     """Zeros for the columns of `Cholesky.gram`, by kind and number: it leaves them as it finds them."""
 

@@ -44,7 +44,8 @@ MEMORY = 8
 SAMPLE = 300
 """Nodes whose positions tell how far states are apart."""
 ALIKE = 0.06
-"""What is known at a state holds for others as far as this share of the body away (root of the mean square): ℓ in `combination`."""
+"""What is known at a state holds for others as far as this share of the body away (root of the mean square):
+ℓ in `combination`."""
 NOISE = 1e-5
 """Variance of what is known at a state, as a share of that of states that lie far apart."""
 TERMS = 3
@@ -53,7 +54,8 @@ TERMS = 3
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SeriesLanes:
-    """What a series needs of the elements in groups of LANES, the element being the last axis; elements of no volume fill the last group up."""
+    """What a series needs of the elements in groups of LANES, the element being the last axis;
+    elements of no volume fill the last group up."""
 
     nodes: IntArray
     """shape (g, a, LANES)."""
@@ -106,7 +108,8 @@ class Expansion:
         self._stretches = []
 
     def move(self, x: FloatArray, tension: FloatArray) -> bool:
-        """Start from node positions x [m] and tensions [N], shape (a,); return whether the stiffness is positive definite there."""
+        """Start from node positions x [m] and tensions [N], shape (a,);
+        return whether the stiffness is positive definite there."""
         body, blocks = self.body, self._blocks
         stretch = None
         if self._room is not None and self._stretches:
@@ -136,7 +139,8 @@ class Expansion:
             yield terms[n]
 
     def _first_term(self, tension: FloatArray, loads: FloatArray) -> FloatArray | None:
-        """Return x₁ of the free unknowns, shape (f,), where the dead loads stay: one block of solves a start, since it is linear in the tensions."""
+        """Return x₁ of the free unknowns, shape (f,), where the dead loads stay: one block of solves a start,
+        since it is linear in the tensions."""
         assert self.factor is not None
         free, before = self.body.free_map.dofs, self._loads
         self._loads = loads.copy()
@@ -164,10 +168,12 @@ class Expansion:
 
 
 def combination(x: FloatArray, states: list[FloatArray], length: float) -> tuple[FloatArray, float]:
-    """Return weights of sum 1, shape (k,), by which what is known at some states carries over to the state x, and how uncertain that is.
+    """Return weights of sum 1, shape (k,), by which what is known at some states carries over to the state x,
+    and how uncertain that is.
 
-    Ordinary kriging (Cressie 1993, 3.2) with the covariance exp(−d²/2ℓ²) of states at a distance d (root of the mean square [m]) and a
-    variance of NOISE of what is known; the uncertainty is the standard deviation, as a share of what states far from each other differ by.
+    Ordinary kriging (Cressie 1993, 3.2) with the covariance exp(−d²/2ℓ²) of states at a distance d (root of the mean square [m])
+    and a variance of NOISE of what is known; the uncertainty is the standard deviation,
+    as a share of what states far from each other differ by.
     """
     k, ways = len(states), (np.array([*states, x]) - x).reshape(len(states) + 1, -1)
     products = ways @ ways.T / ways.shape[1]

@@ -1,5 +1,8 @@
 # mypy: allow-untyped-decorators
-"""Terms of the series of forces of elements, LANES at a time, and of cables; compiled. See `femsense.fem.realtime.power_series`."""
+"""Terms of the series of forces of elements, LANES at a time, and of cables; compiled.
+
+See `femsense.fem.realtime.power_series`.
+"""
 
 from __future__ import annotations
 
@@ -10,8 +13,9 @@ from femsense.fem.linalg.simd_lanes import LANES, add_divergence, add_gradient
 from femsense.fem.rotation import FAST, closest_rotation
 
 ROWS = 54
-"""Rows of LANES numbers that a point takes. One array with fixed places for all of them lets a compiler see that they are apart, so that it
-takes the eight elements at once."""
+"""Rows of LANES numbers that a point takes.
+One array with fixed places for all of them lets a compiler see that they are apart,
+so that it takes the eight elements at once."""
 FIRST, SECOND = 0, 9 * LANES
 """Where F₁ (then F̂₁ + F̂₂, then a stress) and F₂ begin among them, nine rows each;"""
 TURNS, THETA, MEANS = 18 * LANES, 27 * LANES, 31 * LANES
@@ -192,7 +196,8 @@ def _stress(w, last):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
 def series_forces(terms, nodes, gradients, constants, frames, forces):  # type: ignore[no-untyped-def]
-    """Add Σ_{n=1}^{N+1} of the coefficients of the internal forces [N] for x₁ … x_N (terms, shape (N, n, 3), N = 1 or 2) and x_{N+1} = 0."""
+    """Add Σ_{n=1}^{N+1} of the coefficients of the internal forces [N] for x₁ … x_N (terms, shape (N, n, 3),
+    N = 1 or 2) and x_{N+1} = 0."""
     N, groups, points, count = len(terms), gradients.shape[0], gradients.shape[1], gradients.shape[2] // 3
     X, wide, own = points * ROWS * LANES, 3 * count * LANES, (points + 3) * LANES
     v, w, f, g = np.zeros(ROWS * LANES), np.zeros(X + 2 * wide), frames.reshape(-1), constants.reshape(-1)

@@ -1,12 +1,14 @@
-"""Follow a body from frame to frame while its inputs move: an equilibrium with a checked error, and its compliance, at camera rate.
+"""Follow a body from frame to frame while its inputs move: an equilibrium with a checked error, and its compliance,
+at camera rate.
 
 A frame follows from a state at which the stiffness was factorised some frames ago, as a power series of up to three terms
-(`femsense.fem.realtime.power_series`): two or three solves, no assembly, no factor. Where a series of terms x₁, x₂, x₃ is cut off, what is left is below
-its last term, and that is what is reported; where two terms do, it is what the third is expected to be, from the frame before. Where that
-will soon be more than a small share of the motion, or where the compliance has changed too much, a new start is made a little ahead on the
-way. Where a series fails at once, its sum becomes the start, and the first term from there is how far the old series has missed. That is
-compared with what was reported: where it was more, reports grow (`trust`). The compliance is known at the starts, and carried on from them.
-Where no series settles, `solve_equilibrium` takes over.
+(`femsense.fem.realtime.power_series`): two or three solves, no assembly, no factor. Where a series of terms x₁, x₂,
+x₃ is cut off, what is left is below its last term, and that is what is reported; where two terms do, it is what the third is
+expected to be, from the frame before. Where that will soon be more than a small share of the motion, or where the compliance has
+changed too much, a new start is made a little ahead on the way. Where a series fails at once, its sum becomes the start, and the
+first term from there is how far the old series has missed. That is compared with what was reported: where it was more, reports
+grow (`trust`). The compliance is known at the starts, and carried on from them. Where no series settles,
+`solve_equilibrium` takes over.
 """
 
 from __future__ import annotations
@@ -140,7 +142,8 @@ class Tracker:
     def compliance(self, *, points: npt.ArrayLike = (), directions: npt.ArrayLike = ()) -> FloatArray:
         """Return W as `femsense.compliance` does [m/N], carried on from the states at which it is known.
 
-        The first call with other points takes longer: the compliance is learnt there with a little more tension in each cable too.
+        The first call with other points takes longer:
+        the compliance is learnt there with a little more tension in each cable too.
         """
         if not self._past:
             raise FemsenseError("nothing is tracked yet: call step first")
@@ -162,7 +165,8 @@ class Tracker:
         return np.concatenate([columns, rows[:, 3 * k :]], axis=1)
 
     def _explore(self) -> None:
-        """Learn the compliance at the state at hand and, for each cable, at one with a little more tension: inputs may jitter all ways."""
+        """Learn the compliance at the state at hand and, for each cable, at one with a little more tension:
+        inputs may jitter all ways."""
         start, here, T = self.expansion, self._past[-1], self._tension
         self._known = Known(start.length)
         if not start.move(here, T):
@@ -245,7 +249,8 @@ class Tracker:
         return max(self._tolerance * motion, self._floor)
 
     def _summed(self, T: FloatArray, loads: FloatArray, last: FloatArray, most: int) -> tuple[FloatArray, float, float]:
-        """Return the sum of a series of so many terms at most, its first term and its error [m], inf where the terms do not shrink."""
+        """Return the sum of a series of so many terms at most, its first term and its error [m],
+        inf where the terms do not shrink."""
         x, sizes, error, self._terms = self.expansion.positions, list[float](), np.inf, list[FloatArray]()
         for term in islice(self.expansion.terms(T, loads), most):
             sizes.append(_largest(term))
@@ -290,7 +295,8 @@ class Known:
         self._length, self._scale, self._stack = length, 1.0, np.zeros((LIBRARY, 0, 0))
 
     def add(self, x: FloatArray, state: FloatArray, W: FloatArray, *, judge: bool) -> None:
-        """Keep the compliance W at positions x with a sample `state`; with `judge`, learn from it how far the others have missed."""
+        """Keep the compliance W at positions x with a sample `state`; with `judge`,
+        learn from it how far the others have missed."""
         if judge:
             weights, doubt = combination(state, self.states, self._length)
             missed = _norm(W - np.tensordot(weights, self._stack[: len(weights)], 1)) / max(_norm(W), 1e-300)

@@ -15,7 +15,8 @@ SHORTEST = 1e-6
 
 
 def axis_of(body: BodyModel) -> FloatArray:
-    """Return the axis of a body at rest [m], shape (2, 3): through its centre of volume along its longest direction, from the clamp to the far end."""
+    """Return the axis of a body at rest [m], shape (2, 3): through its centre of volume along its longest direction,
+    from the clamp to the far end."""
     nodes = body.mesh.nodes
     centre, along = _longest(nodes[body.mesh.tets[:, :4]], element_volumes(body.mesh))
     held = body.clamp_center if len(body.clamp_nodes) else centre - along
@@ -27,7 +28,8 @@ def axis_of(body: BodyModel) -> FloatArray:
 
 
 def _longest(corners: FloatArray, volumes: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the centre of volume [m] and the longest direction of tetrahedra (m, 4, 3): of the largest second moment, which is exact."""
+    """Return the centre of volume [m] and the longest direction of tetrahedra (m, 4, 3): of the largest second moment,
+    which is exact."""
     share = volumes / volumes.sum()
     centre = share @ corners.mean(axis=1)
     x = corners - centre

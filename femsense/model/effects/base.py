@@ -143,8 +143,8 @@ class Calibrated:
     planned_std: float
     """The same while an experiment is planned."""
     of_inputs: bool
-    """Whether it says where the inputs begin, not what the body is. Many effects look like it, so that it is named only where the model misses it;
-    initial inputs that are unknown stand for it."""
+    """Whether it says where the inputs begin, not what the body is. Many effects look like it,
+    so that it is named only where the model misses it; initial inputs that are unknown stand for it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -216,7 +216,8 @@ class Effect:
 
 
 def known_length(parameters: Sequence[Parameter]) -> tuple[BoolArray, KnownLength] | None:
-    """Return which coordinates are the components of a vector of known length, shape (p,), and that length; None where there is none."""
+    """Return which coordinates are the components of a vector of known length, shape (p,), and that length;
+    None where there is none."""
     for parameter in parameters:
         if parameter.length is not None:
             return np.array([p.length is parameter.length for p in parameters], dtype=bool), parameter.length
@@ -239,7 +240,8 @@ def build_entry(parameters: Sequence[Parameter], coordinates: Sequence[float], s
 
 
 def absent_elsewhere(parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
-    """Return the parameters of recordings in which an effect is absent, where it is that of others alone: there they stay at their null."""
+    """Return the parameters of recordings in which an effect is absent, where it is that of others alone:
+    there they stay at their null."""
     given = {(p.key, p.part) for p in parameters}
     result = dict[tuple[str, Any], Parameter]()
     for p in parameters:
@@ -297,7 +299,10 @@ def per_cable(entry: Entry, key: str, where: str, robot: Robot, default: float) 
 def per_name(
     entry: Entry, key: str, where: str, names: Sequence[str], default: float, *, kind: str
 ) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Return one value for each of some names (of cables, or another kind) from a number or a table name → value. Raises InputError."""
+    """Return one value for each of some names (of cables, or another kind) from a number or a table name → value.
+
+    Raises InputError.
+    """
     value = entry.get(key, default)
     if not isinstance(value, Mapping):
         return np.full(len(names), number({key: value}, key, where))

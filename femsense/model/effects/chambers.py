@@ -14,7 +14,8 @@ from femsense.model.robot import Robot
 OFTEN = 50e3
 """Largest pressure of a soft chamber that declares none [Pa]."""
 FARTHEST, USUAL_ZERO = 0.25, 0.01
-"""Largest and usual zero of a pressure sensor, as shares of the chamber's largest pressure: data sheets say 0.25 to 2 % of full scale."""
+"""Largest and usual zero of a pressure sensor, as shares of the chamber's largest pressure:
+data sheets say 0.25 to 2 % of full scale."""
 
 
 def _largest(chamber: Chamber) -> float:

@@ -29,7 +29,8 @@ def _apply_gravity(robot: Robot, entry: Entry) -> Robot:
 
 
 def _tilt_cost(declared: Robot, fitted: FloatArray) -> float:
-    """Return −2 log of how likely it is that a declared gravity is off by the angle of the fitted one: a Student's t with four degrees."""
+    """Return −2 log of how likely it is that a declared gravity is off by the angle of the fitted one:
+    a Student's t with four degrees."""
     own = declared.body.gravity
     if not np.any(own):
         return 0.0

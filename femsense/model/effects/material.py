@@ -13,7 +13,8 @@ from femsense.model.effects.base import Calibrated, Effect, Entry, Experiment, P
 from femsense.model.robot import Robot, spread_features
 
 MODULUS_STD = 0.5
-"""How well the modulus is known beforehand, in its logarithm: a soft region in a stiff body and a stiff one in a soft body act nearly alike."""
+"""How well the modulus is known beforehand, in its logarithm:
+a soft region in a stiff body and a stiff one in a soft body act nearly alike."""
 
 
 def _stiffness_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
@@ -46,7 +47,8 @@ RADII = 0.12, 0.25
 
 
 def _region_places(robot: Robot) -> tuple[Entry, ...]:
-    """Spheres around places that are spread over the surface, and around the middles of the body's parts; those that hold the centroid of an element."""
+    """Spheres around places that are spread over the surface, and around the middles of the body's parts;
+    those that hold the centroid of an element."""
     mesh = robot.body.mesh
     size = float(np.linalg.norm(np.ptp(mesh.nodes, axis=0)))
     centroids = mesh.nodes[mesh.tets[:, :4]].mean(axis=1)
@@ -132,7 +134,8 @@ def _no_parameters(robot: Robot, control: str) -> tuple[Parameter, ...]:
 
 
 MOST_CREEP = 0.5
-"""Share of the stress of a cast silicone that may relax in one term; what acts like more is something else (0.05–0.3 are usual)."""
+"""Share of the stress of a cast silicone that may relax in one term;
+what acts like more is something else (0.05–0.3 are usual)."""
 USUAL_CREEP = 0.15
 """Share that one term of a cast silicone relaxes."""
 

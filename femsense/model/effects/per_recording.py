@@ -64,7 +64,8 @@ def _value_in(value: Any, label: str, owners: frozenset[str], key: str) -> Any:
 
 @lru_cache(maxsize=64)
 def per_recording(effect: Effect, labels: tuple[str, ...] = ()) -> Effect:
-    """Return the form of an effect that has values of their own in recordings with these labels. Raises InputError where it has none.
+    """Return the form of an effect that has values of their own in recordings with these labels.
+    Raises InputError where it has none.
 
     The last ones are kept: a form is the same object wherever it is asked for again.
     """
@@ -104,7 +105,10 @@ def _apply(effect: Effect, robot: Robot, entry: Entry) -> Robot:
 
 
 def checked(robot: Robot, entry: Entry) -> Robot:
-    """Return a robot with an entry of robot.toml once its values in every recording that it names have been tried. Raises InputError."""
+    """Return a robot with an entry of robot.toml once its values in every recording that it names have been tried.
+
+    Raises InputError.
+    """
     for label in ("", *_labels(entry.values(), owners_of(robot))):
         robot.in_recording(label)
     return robot
@@ -121,7 +125,8 @@ def _labels(values: Iterable[Any], owners: frozenset[str]) -> set[str]:
 
 
 def forms_by_recording(forms: Iterable[Effect], recordings: Sequence[Recording]) -> tuple[Effect, ...]:
-    """Return the forms of effects whose values differ between recordings that were not made in one session; none where all were."""
+    """Return the forms of effects whose values differ between recordings that were not made in one session;
+    none where all were."""
     labels = tuple(dict.fromkeys(r.label for r in recordings))
     if len(labels) < 2 or "" in labels:
         return ()
@@ -136,7 +141,8 @@ def alike_per_recording(effect: Effect, labels: tuple[str, ...]) -> Effect:
 
 
 def by_session(effect: Effect, recordings: Sequence[Recording]) -> tuple[Effect, Entry]:
-    """Return an effect that is fitted along with everything, and its seed: with values of its own in each session where several are declared."""
+    """Return an effect that is fitted along with everything, and its seed:
+    with values of its own in each session where several are declared."""
     sessions = tuple(dict.fromkeys(r.session for r in recordings))
     labels = tuple(s for s in sessions if s is not None)
     if not effect.may_differ or len(labels) < 2 or len(labels) < len(sessions):

@@ -12,8 +12,9 @@ from femsense.model.robot import Robot
 
 KEYS = ("stiffness_n_m", "rotation_stiffness_nm_rad")
 SOFTEST = 150.0
-"""The softest clamp: its springs give together so many times what a cube of the material and of the body's reach does. Clamps in which soft bodies hang by
-tens of millimetres are at a third of that; with 50 they lay beyond what was plausible, and nothing else came near."""
+"""The softest clamp: its springs give together so many times what a cube of the material and of the body's reach does.
+Clamps in which soft bodies hang by tens of millimetres are at a third of that; with 50 they lay beyond what was plausible,
+and nothing else came near."""
 USUAL_SPRING, USUAL_PLATE = 0.01, 0.02
 """Plausible compliance of a clamp, of its springs and of its plate, as a share of the largest that is tried."""
 

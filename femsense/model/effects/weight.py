@@ -13,7 +13,8 @@ from femsense.model.effects.loads import PAYLOAD, place_polish, places_nearby
 from femsense.model.robot import Robot, spread_features
 
 DENSITIES = float(np.log(0.4)), float(np.log(2.5))
-"""Logarithms of the smallest and the largest density against the declared one: a foam cast too dense, a silicone with a metal filler."""
+"""Logarithms of the smallest and the largest density against the declared one: a foam cast too dense,
+a silicone with a metal filler."""
 WEIGHED = 0.1
 """A body is weighed, or its data sheet right, to about this share."""
 PLACES = 6

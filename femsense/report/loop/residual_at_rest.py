@@ -80,7 +80,8 @@ class MeanResidual:
 
 
 def mean_residual(loop: Loop, robot: Robot, surface: DrawnSurface) -> MeanResidual | None:
-    """Return the mean residual of each marker, or point of the surface, on the robot of the loop; None where nothing has a place on it."""
+    """Return the mean residual of each marker, or point of the surface, on the robot of the loop;
+    None where nothing has a place on it."""
     residuals = loop.residuals.known()
     place = {name: point for name, point in zip(robot.marker_names, robot.marker_points)} | surface_points(loop)
     rows = np.array([i for i, name in enumerate(residuals.marker) if name in place], dtype=np.int64)
