@@ -10,8 +10,8 @@ from pathlib import Path
 
 import femsense as fs
 
-FRAMES = range(36, 44)
-"""Of the demo's recording: something touches the robot in the last six."""
+FRAMES = range(36, 40)
+"""Of the demo's recording: something touches the robot in the last two."""
 
 
 def main(folder: Path) -> None:

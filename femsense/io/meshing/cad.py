@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 
@@ -12,6 +10,7 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import InputError, MissingDependency
+from femsense.io.meshing.child_process import ProgramFailed, ProgramTimeout, run_program
 
 CAD_READ = (".step", ".stp", ".iges", ".igs", ".brep")
 INSTALL = 'pip install "femsense[cad]"'
@@ -20,7 +19,6 @@ PER_CIRCLE = 24
 SECONDS = 300.0
 """Gmsh is stopped after this time."""
 GMSH = """
-import sys
 import numpy as np, gmsh
 path, unit, per_circle = sys.argv[1:]
 gmsh.initialize(interruptible=False)
@@ -57,10 +55,10 @@ def read_cad(path: Path, unit: str) -> tuple[FloatArray, IntArray]:
     if importlib.util.find_spec("gmsh") is None:
         raise MissingDependency(f"a CAD file becomes triangles through gmsh: {INSTALL}")
     with tempfile.TemporaryDirectory(prefix="femsense-") as folder:
-        command = [sys.executable, "-c", GMSH, str(path.absolute()), unit, str(PER_CIRCLE)]
+        words = (str(path.absolute()), unit, str(PER_CIRCLE))
         try:
-            result = subprocess.run(command, cwd=folder, capture_output=True, text=True, errors="replace", timeout=SECONDS)
-        except subprocess.TimeoutExpired:
+            made = run_program(GMSH, *words, folder=folder, makes="surface.npz", seconds=SECONDS)
+        except ProgramTimeout:
             raise InputError(
                 "Gmsh did not come to an end",
                 where=path,
@@ -68,17 +66,16 @@ def read_cad(path: Path, unit: str) -> tuple[FloatArray, IntArray]:
                 expected="triangles",
                 hint="export it as STL from the CAD program, in mm",
             ) from None
-        made = Path(folder) / "surface.npz"
-        if result.returncode or not made.is_file():
-            last = (result.stderr.strip().splitlines() or [f"exit status {result.returncode}"])[-1]
+        except ProgramFailed as failed:
+            last = str(failed)
             if "libGL" in last or "cannot open shared object" in last:
-                raise MissingDependency(f"gmsh needs a library of the system: {last[:160]}")
+                raise MissingDependency(f"gmsh needs a library of the system: {last[:160]}") from None
             raise InputError(
                 "not readable as a CAD file",
                 where=path,
                 found=last[:160],
                 expected="solids in STEP, IGES or BREP",
                 hint="export it as STL from the CAD program, in mm",
-            )
+            ) from None
         with np.load(made) as data:
             return np.asarray(data["points"], dtype=np.float64), np.asarray(data["triangles"], dtype=np.int64)

@@ -7,8 +7,6 @@ import hashlib
 import importlib.util
 import os
 import secrets
-import subprocess
-import sys
 import tempfile
 import warnings
 from pathlib import Path
@@ -19,6 +17,7 @@ from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import InputError, MissingDependency
 from femsense.fem.mesh import TetMesh, element_volumes, oriented
 from femsense.io.files import PART_PREFIX
+from femsense.io.meshing.child_process import ProgramFailed, ProgramTimeout, run_program
 
 FTETWILD = """
 import importlib.util, sys, types
@@ -171,10 +170,8 @@ def _run_ftetwild(
             envelope=envelope,
         )
         try:
-            result = subprocess.run(
-                [sys.executable, "-c", program], cwd=folder, capture_output=True, text=True, errors="replace", timeout=seconds
-            )
-        except subprocess.TimeoutExpired:
+            made = run_program(program, folder=folder, makes="tets.npz", seconds=seconds)
+        except ProgramTimeout:
             raise InputError(
                 "fTetWild did not come to an end",
                 where=where,
@@ -182,15 +179,13 @@ def _run_ftetwild(
                 expected="tetrahedra",
                 hint="surfaces that nearly coincide and walls thinner than the tolerance are what takes long: mend them, or femsense mesh with another --tolerance or a larger --size",
             ) from None
-        made = Path(folder) / "tets.npz"
-        if result.returncode or not made.is_file():
-            last = (result.stderr.strip().splitlines() or [f"exit status {result.returncode}"])[-1]
+        except ProgramFailed as failed:
             raise InputError(
                 "fTetWild failed on this surface",
                 where=where,
-                found=last[:200],
+                found=str(failed)[:200],
                 expected="tetrahedra",
                 hint="mend the surface (self-intersections, thin walls), or give tetrahedra",
-            )
+            ) from None
         with np.load(made) as data:
             return np.asarray(data["nodes"], dtype=np.float64), np.asarray(data["tets"], dtype=np.int64)
