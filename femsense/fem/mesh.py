@@ -204,10 +204,7 @@ def vertex_normals(positions: FloatArray, triangles: IntArray) -> FloatArray:
 
 
 def barycentric(mesh: TetMesh, elements: IntArray, points: FloatArray) -> FloatArray:
-    """Return barycentric coordinates of points in the given elements at rest, shape (p, 4).
-
-    Raises InputError where one is flat.
-    """
+    """Return barycentric coordinates of points in elements at rest, shape (p, 4). Raises InputError where one is flat."""
     try:
         return _coordinates(mesh.nodes[mesh.tets[elements, :4]], points)
     except np.linalg.LinAlgError:
