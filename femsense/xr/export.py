@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tempfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
@@ -13,6 +15,7 @@ from femsense.fem.mesh import TetMesh
 from femsense.model.robot import Robot
 from femsense.xr.gltf import ExportReport, export_states
 from femsense.xr.run_contents import export_run
+from femsense.xr.usdz_export import write_usdz
 from femsense.xr.user_skin import UserSkin, export_skin
 
 
@@ -44,11 +47,11 @@ def export_glb(
     color_rgb: npt.ArrayLike | None = None,
     skin: UserSkin | None = None,
 ) -> ExportReport:
-    """Write a run as a skinned, animated mesh (binary glTF 2.0).
+    """Write a run as a skinned, animated mesh (binary glTF 2.0), or as `.usdz` where the path ends so.
 
     Arguments:
         run: of `estimate`, or a folder that it was written to.
-        path: the `.glb` file; its folder is made where it is missing.
+        path: the `.glb` or `.usdz` file; its folder is made where it is missing.
         bones: how many; chosen on held-out frames if None.
         color_rgb: colour of the body, sRGB in 0 … 1, shape (3,); by default the robot's where the run knows it.
         skin: a surface of your own that the body carries (`read_skin`).
@@ -57,10 +60,14 @@ def export_glb(
         what was written, with the distance to the finite-element surface.
 
     Raises:
-        InputError: a folder without states, or times that do not increase.
+        InputError: a folder without states, times that do not increase, or `.usdz` without the package usd-core.
     """
     target = Path(path).expanduser()
     target.parent.mkdir(parents=True, exist_ok=True)
+    if target.suffix.lower() == ".usdz":
+        with tempfile.TemporaryDirectory(prefix="femsense-export-") as folder:
+            report = export_glb(run, Path(folder, "robot.glb"), bones=bones, color_rgb=color_rgb, skin=skin)
+            return replace(report, path=write_usdz(report.path.read_bytes(), target))
     if isinstance(run, str | Path):
         return export_run(run, target, bones=bones, color_rgb=color_rgb, skin=skin)
     states, robot = run.states, run.robot

@@ -1,16 +1,18 @@
-"""Reads back the skinned, animated mesh that `gltf.write_glb` writes: bones, weights, and the bones' poses over time."""
+"""Reads back the skinned, animated mesh that `gltf.write_glb` writes: bones, weights, the bones' poses over time, and the surface."""
 
 from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from femsense.core.arrays import FloatArray, freeze
+from femsense.core.arrays import FloatArray, IntArray, freeze
 from femsense.core.errors import InputError
 from femsense.xr.gltf import T_GLTF_ROBOT
 from femsense.xr.skeleton import Skeleton
@@ -31,22 +33,76 @@ class AnimatedSkin:
     """x y z [m] qx qy qz qw of each bone, shape (F, B, 7)."""
 
 
+@dataclass(frozen=True, eq=False, slots=True)
+class Surface:
+    """How a mesh looks, glTF's frame (Y up)."""
+
+    name: str
+    points: npt.NDArray[np.float32]
+    """At rest [m], shape (V, 3)."""
+    normals: npt.NDArray[np.float32]
+    """shape (V, 3)."""
+    triangles: IntArray
+    """shape (t, 3)."""
+    color: npt.NDArray[np.float32]
+    """Linear red, green, blue of the material, shape (3,)."""
+    colors: npt.NDArray[np.float32] | None
+    """The same of each vertex, shape (V, 3)."""
+    uv: npt.NDArray[np.float32] | None
+    """Places in the image, from its upper left corner, shape (V, 2)."""
+    png: bytes | None
+    """The image."""
+
+
 def read_glb(data: bytes) -> AnimatedSkin:
     """Return the skin and animation in the content of a file that femsense wrote. Raises InputError for any other."""
+    with _ours():
+        return _skin(*_parts(data))
+
+
+def read_surface(data: bytes) -> Surface:
+    """Return what the same content shows. Raises InputError as `read_glb`."""
+    with _ours():
+        return _surface(*_parts(data))
+
+
+@contextmanager
+def _ours() -> Iterator[None]:
     try:
-        return _read(data)
+        yield
     except (KeyError, IndexError, ValueError, StopIteration, struct.error) as error:
         raise InputError(
             "not a mesh of femsense", where="glb", found=f"{type(error).__name__}: {error}", expected="femsense export RUN"
         ) from None
 
 
-def _read(data: bytes) -> AnimatedSkin:
+def _parts(data: bytes) -> tuple[dict[str, Any], bytes]:
     magic, _, length, size, kind = struct.unpack_from("<4sIII4s", data)
     if magic != b"glTF" or kind != b"JSON" or length != len(data):
         raise ValueError("not binary glTF")
-    document = json.loads(data[20 : 20 + size])
-    binary = data[20 + size + 8 :]
+    return json.loads(data[20 : 20 + size]), data[20 + size + 8 :]
+
+
+def _surface(document: dict[str, Any], binary: bytes) -> Surface:
+    primitive = document["meshes"][0]["primitives"][0]
+    part = {name: _array(document, binary, index) for name, index in primitive["attributes"].items()}
+    png = None
+    if "images" in document:
+        view = document["bufferViews"][document["images"][0]["bufferView"]]
+        png = binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
+    return Surface(
+        document["meshes"][0]["name"],
+        part["POSITION"],
+        part["NORMAL"],
+        _array(document, binary, primitive["indices"]).reshape(-1, 3).astype(np.int64),
+        np.array(document["materials"][0]["pbrMetallicRoughness"]["baseColorFactor"][:3], dtype=np.float32),
+        part.get("COLOR_0"),
+        part.get("TEXCOORD_0"),
+        png,
+    )
+
+
+def _skin(document: dict[str, Any], binary: bytes) -> AnimatedSkin:
     joints = document["skins"][0]["joints"]
     nodes = [document["nodes"][joint] for joint in joints]
     origins = np.array([node["translation"] for node in nodes], dtype=np.float64)

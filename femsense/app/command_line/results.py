@@ -18,7 +18,9 @@ if TYPE_CHECKING:
 
 def export(
     run: RunPath,
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="The file to write.")] = Path("robot.glb"),
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="The file to write: .glb or .usdz.")] = Path(
+        "robot.glb"
+    ),
     mcap: Annotated[
         Path | None,
         typer.Option("--mcap", metavar="FILE", help="Write messages of ROS 2 for Foxglove instead.", show_default=False),
@@ -41,7 +43,7 @@ def export(
     vertices: Annotated[int, typer.Option("--vertices", min=100, help="Of --skin at most; more are decimated.")] = 100_000,
     json: Json = False,
 ) -> Answer:
-    """Write a run as a skinned, animated mesh (glTF)."""
+    """Write a run as a skinned, animated mesh (glTF, or USDZ for iPhones)."""
     if mcap is not None:
         from dataclasses import asdict
 
