@@ -44,14 +44,8 @@ class Thresholds:
     """Linear dBIC that a candidate needs to be refitted."""
     hinted: float = 0.5
     """What fields of the model before predict is looked into where it is this share of the gain that is needed; inf: fields are computed anew only then."""
-    as_promising: float = 0.95
-    """Candidates with this share of the best linear dBIC are refitted in the order of their cost; inf: in the order of their dBIC."""
-    far_behind: float = 0.5
-    """Not refitted is what promises less than this share of what a refit brought, by more than `evidence`; 0: it is."""
     within_reach: float = 0.4
     """What has this share of the best dBIC may be ahead of it where its place is; inf: it is not asked."""
-    poor_start: float = 0.3
-    """A fit from the null that brings less than this share of the linear gain is tried from other starts too; −inf: it is not."""
     drifted: float = 2.0
     """Where calibration has gone so many prior deviations, an effect of known size starts from the declared model too; inf: it does not …"""
     explains: float = 1.25
@@ -105,16 +99,12 @@ class Thresholds:
     """Standard deviations by which a value must be away from what is declared to be named."""
     relevant: float = 0.02
     """… and share of it, or of a cable's range; 0: not asked."""
-    offsets_above_mesh: float = 0.75
-    """Share of the discretisation error by which input offsets must move the markers."""
 
     # --- verdict -----------------------------------------------------------------------------------------------------------------
     explained: float = 0.8
     """Share of the excess over the noise that effects must take away where structure is left."""
     structure: float = 0.01
     """Probability, over all tests together, of calling mere noise structure."""
-    small: float = 0.25
-    """Structure that is smaller than this share of the noise is no objection."""
     lacks: float = 2.0
     """A model that is handed back may leave so many times the mean square that calibration of all nuisances leaves; inf: not asked."""
     likely_noise: float = 0.01
@@ -122,9 +112,7 @@ class Thresholds:
     not_worse: float = 1.02
     """What is handed back may not have a larger held-out error than the declared model but for this factor …"""
     noisy: float = 1.15
-    """… or, of calibration alone, for this one where χ² says that noise hides a better model …"""
-    far_better: float = 50.0
-    """… or, where the mesh's own error is what is larger, if χ² of held-out data falls by so much."""
+    """… or, of calibration alone, for this one where χ² says that noise hides a better model."""
 
     # --- what cannot be distinguished ----------------------------------------------------------------------------------------------
     alike: float = 0.95
@@ -159,8 +147,6 @@ class Effort:
     """Effects that are added at most."""
     refits: int = 6
     """Candidates that are refitted at the first step; half as many later."""
-    more_steps: int = 30
-    """Steps for a refit that could win and is still on its way after the first ones."""
     starts: int = 3
     """So many seeds of an effect, the best, are improved …"""
     rounds: int = 4

@@ -40,10 +40,6 @@ def select_next(
     if not listed:
         return None, [], []
     refits, records = _refitted(data, fitted, listed, noise, say)
-    best = max((r.score for r in refits.values() if r.record.passes), default=np.inf)
-    refits = {
-        i: to_the_end(data, fitted, r, noise) if r.score > 0.5 * best - data.thresholds.evidence else r for i, r in refits.items()
-    }
     if not any(r.record.passes for r in refits.values()):
         refits = {i: _elsewhere(data, fitted, r, noise, say) for i, r in refits.items()}
     passing = {i: r for i, r in refits.items() if r.record.passes}
@@ -69,11 +65,6 @@ def _refitted(
     scouts, decides = _scouted(data, cases, listed, noise, say), data.thresholds
     for candidate in sorted(listed, key=lambda c: -scouts[id(c)][1] if id(c) in scouts else np.inf):
         ahead = [r for r in refits.values() if r.record.passes and explains(data, r.fitted)]
-        behind = (
-            candidate.score < max((decides.far_behind * _bar(r, candidate) for r in ahead), default=-np.inf) - decides.evidence
-        )
-        if behind and not prior_evidence(data, candidate.effect):
-            continue  # where little is left to explain, a refit seldom gains that much on its linear score, but for a weight that cables lift
         say(f"refitting with {candidate.effect.name}")
         record = RefitRecord(candidate.effect.name, candidate.seed)
         settled = has_settled(data, candidate, ahead)
@@ -192,34 +183,6 @@ def _in_some_states(
     return scout.chi2 > worth_of(base, own, wanted, settled), scout
 
 
-def _bar(ahead: Refit, candidate: Candidate) -> float:
-    """Return the gain of a refit that the linear one of a candidate is held against: of another form of the same effect it is the linear one too,
-    where that is smaller, since what bends one of them bends both."""
-    return min(ahead.gain, ahead.candidate.score) if candidate.effect.name == ahead.candidate.effect.name else ahead.gain
-
-
-def to_the_end(data: Data, fitted: FittedModel, refitted: Refit, noise: Noise) -> Refit:
-    """Return a refit that ran out of steps on its way down with more of them: alternatives are compared where each of them ends, or were when a held-out
-    state does not converge there."""
-    fit = refitted.fitted.fit
-    if fit.fit.status != "iterations":
-        return refitted
-    try:
-        made = fit_model(
-            data,
-            fit.hypothesis,
-            fit.prior,
-            noise,
-            fit.coordinates,
-            own=own_of(refitted.fitted),
-            max_iterations=data.effort.more_steps,
-            known=fit.jets,
-        )
-    except FemsenseError:
-        return refitted
-    return acceptance_test(data, fitted, refitted.candidate, made, refitted.record, noise)
-
-
 def _elsewhere(data: Data, fitted: FittedModel, refitted: Refit, noise: Noise, say: Progress) -> Refit:
     """Return a refit with evidence that does not predict as it should, judged again with its seed improved: its place may be to blame."""
     if refitted.score <= data.thresholds.evidence or not refitted.candidate.effect.nearby(data.robot, refitted.candidate.seed):
@@ -311,8 +274,7 @@ def richer_fit(data: Data, fitted: FittedModel, winner: Refit, form: Candidate, 
 
 
 def shortlist(table: list[Candidate], decides: Thresholds, effort: Effort, *, first: bool) -> list[Candidate]:
-    """Return the best candidate of each name, in its simplest form (or forms, if several are equally simple), the best first; of those with
-    as large a predicted gain, the simplest."""
+    """Return the best candidate of each name, in its simplest form (or forms, if several are equally simple), the best first."""
     most = max((c.score for c in table if c.retained >= decides.refittable), default=np.inf)
     table = [c for c in table if c.retained >= decides.refittable or c.score > most]
     names = list(dict.fromkeys(c.effect.name for c in table if c.score > decides.promising))
@@ -321,8 +283,7 @@ def shortlist(table: list[Candidate], decides: Thresholds, effort: Effort, *, fi
         forms = _forms(table, name)
         simple = min(len(c.parameters) for c in forms)
         chosen += [c for c in forms if len(c.parameters) == simple]
-    best = max((c.score for c in chosen), default=0.0)
-    return sorted(chosen, key=lambda c: c.cost if c.score >= decides.as_promising * best else np.inf)
+    return sorted(chosen, key=lambda c: -c.score)
 
 
 def hinted(table: list[Candidate], decides: Thresholds, effort: Effort) -> bool:

@@ -71,7 +71,7 @@ def offsets_are_evident(data: Data, fitted: FittedModel, noise: Noise, n_effecti
     held = held_chi2(data, without, noise) - held_chi2(data, fitted, noise)
     decides, expected = data.thresholds, held_share(data) * evidence(without.fit, fitted.fit)
     sure = sure_beyond_mesh(better, std_error, held, expected, decides)
-    least = decides.above_mesh_if_sure if sure else decides.offsets_above_mesh
+    least = decides.above_mesh_if_sure if sure else decides.above_mesh
     return without if moved_by(without, fitted) > least * discretisation_rms(data, without) else None
 
 
@@ -91,8 +91,6 @@ def instead_of_offsets(
     passing: dict[int, Refit] = {}
     records: list[RefitRecord] = []
     for candidate in shortlist(table, data.thresholds, data.effort, first=False):
-        if candidate.score < data.thresholds.far_behind * worth - data.thresholds.evidence:
-            continue
         record = RefitRecord(candidate.effect.name, candidate.seed, in_place_of=OFFSETS)
         try:
             made = refit(data, without, candidate, noise)

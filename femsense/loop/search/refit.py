@@ -101,9 +101,7 @@ def refit(
         if made is not None and made.fit.fit.status == STOPPED_EARLY:
             stopped_early = made
             break
-        if best is not None and not (
-            free and share == 0.0 and fitted.fit.chi2 - best.fit.chi2 <= data.thresholds.poor_start * candidate.gain
-        ):
+        if best is not None:
             break
     if starts_declared(data, fitted, candidate, best):
         made = started_at(DECLARED)

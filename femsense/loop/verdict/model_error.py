@@ -12,7 +12,6 @@ from femsense.loop.fit.fitted_model import FittedModel
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.fit.repeatability import Repeatability
 from femsense.loop.result.records import ModelError
-from femsense.loop.thresholds import Thresholds
 from femsense.loop.verdict.sentences import mesh_error_rms
 
 
@@ -33,10 +32,6 @@ class Excess:
     explained: float
     """Share of the mean square beyond the floor that the effects took away: where fitted by all that was found, on held-out data by what is
     handed back; the smaller one."""
-
-    def is_small(self, decides: Thresholds) -> bool:
-        """Return whether it is no objection, whatever structure it has."""
-        return self.left <= decides.small * self.floor
 
     @property
     def is_large(self) -> bool:

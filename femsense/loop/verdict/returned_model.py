@@ -115,7 +115,7 @@ class HeldOutComparison:
     def holds(self, decides: Thresholds) -> bool:
         """Return whether the model is no worse in millimetres; or else better by the noise that these data have, where it is calibrated only and
         within reason, or where the mesh's own error is all that is larger: then it must be no worse beyond that, nor in millimetres than the model
-        with all that calibration may move, and not be input offsets alone, unless it is far better by the noise and within reason."""
+        with all that calibration may move, and not be input offsets alone."""
         if self.error <= decides.not_worse:
             return True
         if self.gain <= (decides.evidence if self.only_calibrated else 0.0):  # effects have been judged by held-out data before
@@ -124,9 +124,7 @@ class HeldOutComparison:
             return True
         only_offsets = self.only_calibrated and self.with_offsets  # much else looks like them
         shown = not only_offsets and self.error_to_base <= decides.not_worse
-        return self.beyond_mesh <= decides.not_worse and (
-            shown or (self.gain > decides.far_better and self.error <= decides.noisy)
-        )
+        return shown and self.beyond_mesh <= decides.not_worse
 
 
 def holds_out(data: Data, search: Search, back: FittedModel) -> bool:

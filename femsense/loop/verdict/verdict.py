@@ -69,13 +69,12 @@ def conclude(data: Data, search: Search, rng: np.random.Generator) -> LoopResult
     tests = structure_tests(data.train, plain, rng=rng, level=data.thresholds.structure)
     excess = excess_of(data, before, final, back, noise, measured)
     found = _not_handed_back(search, names)
-    structured = tests.significant and not excess.is_small(data.thresholds)
-    open_to_doubt = (structured or surprise) and (drifted or excess.explained < data.thresholds.explained)
+    open_to_doubt = (tests.significant or surprise) and (drifted or excess.explained < data.thresholds.explained)
     unexplained = lacks or (found and not effects) or open_to_doubt or excess.is_large
     verdict = UNEXPLAINED if unexplained else FOUND if effects else NONE
     pairs = confounded(search, names, data.thresholds)
     robot = _handed_back(data, entries)
-    only_held = bool(surprise) and not structured and not lacks
+    only_held = bool(surprise) and not tests.significant and not lacks
     left = _left(data, back if only_held else shown, noise, tests, excess, held=only_held)
     budget = model_error(data, excess, noise, measured)
     return LoopResult(

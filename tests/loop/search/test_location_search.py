@@ -111,7 +111,7 @@ def searched(
 ) -> tuple[list[str], list[RefitRecord]]:
     """Return what growth says that it refits of a shortlist, whose scores may be alike, and its records; what is left explains the data."""
     data, fitted = started
-    data = replace(data, thresholds=replace(DEFAULTS, explains=np.inf, far_behind=0.0, promising=-1e9, refittable=0.0))
+    data = replace(data, thresholds=replace(DEFAULTS, explains=np.inf, promising=-1e9, refittable=0.0))
     table = screen_model(data, fitted.fit, NOISE, fields_of(data, fitted, names), COUNT)
     listed = [c for n in names for c in [c for c in table if c.effect.name == n][: each if n == "payload" else 1]]
     said = list[str]()
@@ -146,7 +146,7 @@ def test_rivals_are_fitted_to_all_states_where_these_are_little_work(started: tu
 
 def test_another_form_of_an_effect_is_held_against_other_effects_alone(started: tuple[Data, FittedModel]):
     data, fitted = started
-    data = replace(data, thresholds=replace(DEFAULTS, explains=np.inf, far_behind=0.0, promising=-1e9, refittable=0.0))
+    data = replace(data, thresholds=replace(DEFAULTS, explains=np.inf, promising=-1e9, refittable=0.0))
     table = screen_model(data, fitted.fit, NOISE, fields_of(data, fitted, ["payload", "cable_gain"]), COUNT)
     one, gain = (next(c for c in table if c.effect.name == name) for name in ("payload", "cable_gain"))
     forms = [replace(one, score=100.0), replace(one, effect=replace(one.effect), score=100.0), replace(gain, score=50.0)]
@@ -366,16 +366,6 @@ def test_another_law_is_told_by_some_of_the_states(started: tuple[Data, FittedMo
     assert rms_of([(between - whole)[exact]]) < 0.02 * rms_of([whole])
     rubbing = apply_effects(data.robot, [{"name": "cable_friction", "coefficient": 0.2}])
     assert part_that_tells(data.train[0], rubbing, less) is data.train[0]  # states there need those before
-
-
-def test_what_promises_as_much_is_refitted_in_the_order_of_its_cost(started: tuple[Data, FittedModel]):
-    data, fitted = started
-    one, *_ = payloads(data, fitted)
-    gain = screen_model(data, fitted.fit, NOISE, fields_of(data, fitted, ["cable_gain"]), COUNT)[0]
-    for share, names in ((0.96, ["cable_gain", "payload"]), (0.94, ["payload", "cable_gain"])):
-        second = replace(gain, score=share * one.score, retained=1.0)
-        assert second.cost < one.cost
-        assert [c.effect.name for c in shortlist([one, second], DEFAULTS, EFFORT, first=True)] == names
 
 
 def test_what_calibration_imitates_is_refitted_only_if_it_promises_more_than_all_others(started: tuple[Data, FittedModel]):

@@ -10,16 +10,16 @@ from arm import arm, record, sweeps
 
 from femsense.loop.data.dataset import Data, prepare
 from femsense.loop.fit.covariance import parameter_std
-from femsense.loop.fit.fitted_model import FittedModel, fit_model, own_of, problem_of, with_nuisance
+from femsense.loop.fit.fitted_model import FittedModel, fit_model, problem_of, with_nuisance
 from femsense.loop.fit.joint_fit import Prior
 from femsense.loop.fit.noise_components import Noise, whiten
 from femsense.loop.result.records import NAMED, PASSES, RefitRecord
 from femsense.loop.search.acceptance import acceptance_test, surely_predicts
 from femsense.loop.search.calibration import fitted_again
 from femsense.loop.search.effect_fields import fields_of
-from femsense.loop.search.forward_selection import polished, richer_fit, select_next, shortlist, to_the_end
+from femsense.loop.search.forward_selection import polished, richer_fit, select_next, shortlist
 from femsense.loop.search.location_search import closer, without_last
-from femsense.loop.search.refit import evidence, refit, starts_declared, with_term
+from femsense.loop.search.refit import evidence, refit, starts_declared
 from femsense.loop.search.screening import linear_gain, screen_model
 from femsense.loop.search.search import beside_a_tie, scored, spared_gain
 from femsense.loop.search.search_state import Refit
@@ -118,31 +118,6 @@ def test_weight_that_nobody_declared_is_refitted_however_far_behind_it_looks():
     winner, _, records = select_next(data, base, table, NOISE, lambda text: None)
     assert {r.name for r in records} == {"gravity", "payload"}
     assert winner is not None and winner.candidate.effect.name == "gravity"
-    unexpected = replace(data, thresholds=replace(data.thresholds, expected=0.0))
-    assert {r.name for r in select_next(unexpected, base, table, NOISE, lambda text: None)[2]} == {"payload"}
-
-
-@pytest.mark.parametrize("explains", [True, False])
-def test_until_an_effect_explains_the_data_rivals_are_refitted(explains: bool):
-    data, base = started()
-    data = replace(data, thresholds=replace(LENIENT, explains=np.inf if explains else 0.0))
-    table = screen_model(data, base.fit, NOISE, fields_of(data, base, ["payload", "cable_gain"]), COUNT)
-    looks = [replace(c, score=DEFAULTS.promising + 1.0 if c.effect.name == "cable_gain" else 1e3 + c.score) for c in table]
-    _, _, records = select_next(data, base, sorted(looks, key=lambda c: -c.score), NOISE, lambda text: None)
-    assert [r.name for r in records] == ["payload"] + ["cable_gain"] * (not explains)
-
-
-@pytest.mark.parametrize("form", [True, False])
-def test_another_form_of_what_leads_is_held_against_what_that_one_promised(form: bool):
-    data, base = started()
-    data = replace(data, thresholds=replace(LENIENT, explains=np.inf))
-    table = screen_model(data, base.fit, NOISE, fields_of(data, base, ["payload", "cable_gain"]), COUNT)
-    payload, gain = (next(c for c in table if c.effect.name == name) for name in ("payload", "cable_gain"))
-    rival = replace(payload, effect=replace(payload.effect)) if form else gain
-    forms = [replace(payload, score=100.0), replace(rival, score=60.0)]
-    _, _, records = select_next(data, base, forms, NOISE, lambda text: None)
-    assert [r.name for r in records] == ["payload"] * (1 + form)
-    assert records[0].dchi2 is not None and records[0].dchi2 > 200.0  # it brought more than it promised
 
 
 @pytest.mark.parametrize(
@@ -174,28 +149,6 @@ def test_effects_without_near_rivals_are_not_asked_again():
     before = [("", base), ("gravity", first), ("cable_gain", second)]
     history, refits = swapped(data, before, [own, rival, other], NOISE, COUNT, lambda text: None)
     assert history is before and len(refits) == 3
-
-
-def test_a_refit_that_could_win_goes_to_its_end():
-    data, base = started()
-    candidate = shortlist(
-        screen_model(data, base.fit, NOISE, fields_of(data, base, ["payload"]), COUNT), DEFAULTS, EFFORT, first=True
-    )[0]
-    whole = refit(data, base, candidate, NOISE)
-    hypothesis, prior = with_term(base.fit, candidate.effect, candidate.seed, candidate.parameters)
-    begun = np.concatenate([base.fit.coordinates, [p.null for p in candidate.parameters]])
-    made = fit_model(data, hypothesis, prior, NOISE, begun, own=own_of(base), max_iterations=2)
-    cut = acceptance_test(data, base, candidate, made, RECORD, NOISE)
-    assert made.fit.fit.status == "iterations"
-    end = to_the_end(data, base, cut, NOISE)
-    assert end.fitted.fit.fit.status == "converged"
-    assert end.fitted.fit.chi2 == pytest.approx(whole.fit.chi2, rel=0.02)
-    assert end.record.dchi2 == pytest.approx(evidence(base.fit, end.fitted.fit))
-    theta = np.array(made.fit.fit.theta)
-    theta[made.fit.own] = np.log(1e-3)  # a modulus with which nothing stands
-    status = replace(made.fit.fit, theta=theta)
-    fallen = replace(cut, fitted=replace(made, fit=replace(made.fit, fit=status, jets=[])))
-    assert to_the_end(data, base, fallen, NOISE) is fallen  # one that cannot go further is compared as it is
 
 
 def test_what_goes_with_an_effect_that_was_as_good_is_found_beside_it():

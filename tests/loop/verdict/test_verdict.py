@@ -50,9 +50,9 @@ def test_what_varies_with_the_state_is_an_error_of_the_model_and_no_noise():
     wide = Noise({"white": 3e-3, "state": 3e-3, "frame": 3e-3, "sweep": 3e-3}, "")
     left = excess_of(DATA, leaving(2e-2, 2e-2), leaving(5e-3, 5e-3), leaving(5e-3, 6e-3), wide, KNOWN)
     assert left.left == pytest.approx(np.sqrt(3.0) * 5e-3, rel=0.01) and left.held == pytest.approx(np.sqrt(3.0) * 6e-3, rel=0.01)
-    assert left.is_large and not left.is_small(DEFAULTS)
+    assert left.is_large
     small = excess_of(DATA, leaving(2e-2, 2e-2), leaving(1.02e-4, 1e-4), leaving(1e-4, 1e-4), wide, KNOWN)
-    assert small.is_small(DEFAULTS) and not small.is_large
+    assert not small.is_large
 
 
 @pytest.mark.parametrize("known, large", [(True, False), (False, True)])
