@@ -2,7 +2,7 @@
 
     python benchmarks/ablation.py run --cases 40 --workers 2      # what is not in ablation.jsonl yet, by whole cases
     python benchmarks/ablation.py table                           # the table of what is there
-    python benchmarks/ablation.py run --only swap,tie --cases 200
+    python benchmarks/ablation.py run --only swap,apart --cases 200
 
 A switch is a value of `Thresholds` or `Effort`. Rules of the verdict alone share one search. One line of the file is one case under one switch.
 """
@@ -59,17 +59,9 @@ SEARCH = (
     ),
     Switch("sure", {"sure": INF}),
     Switch("held_chance", {"held_chance": 0.0}),
-    Switch("expected", {"expected": 0.0}),
-    Switch("refittable", {"refittable": 0.0}),
-    Switch("within_reach", {"within_reach": INF}),
-    Switch("drifted", {"drifted": INF}),
     Switch("predicts", {"predicts": 0.0}),
-    Switch("richer", {"richer": INF}),
     Switch("needless", {"needless": -INF}),
     Switch("swap", {"swap": INF}),
-    Switch("tie", {"tie": INF}),
-    Switch("swap_offsets", {"swap_offsets": INF}),
-    Switch("swap, tie", {"swap": INF, "tie": INF}),
     Switch("places", {}, {"starts": 1, "rounds": 0}),
     Switch("apart", {"apart": INF}),
     Switch("white_share", {"white_share": 0.0}),
@@ -81,6 +73,7 @@ SEARCH = (
 """Rules of the search, each with a search of its own."""
 VERDICT = (
     Switch("relevant", {"relevant": 0.0}),
+    Switch("offsets_above_mesh", {"offsets_above_mesh": 0.0}),
     Switch("explained", {"explained": -INF}),
     Switch("lacks", {"lacks": INF}),
     Switch("likely_noise", {"likely_noise": INF}),
@@ -88,7 +81,6 @@ VERDICT = (
     Switch("alike", {"alike": INF}),
     Switch("refuted", {"refuted": 0.0}),
     Switch("next_to_nothing", {"next_to_nothing": 0.0}),
-    Switch("mostly", {"mostly": INF}),
     Switch("many_numbers", {"many_numbers": 100}),
     Switch("significant", {"significant": 2.0}),
 )

@@ -61,8 +61,7 @@ def compared(case: Case) -> list[tuple[Case, tuple[str, ...], Scores, Scores]]:
 def best_of(table: list[Candidate]) -> Scores:
     scores: Scores = {}
     for candidate in table:  # the best first
-        if candidate.retained >= DEFAULTS.refittable:
-            scores.setdefault(candidate.effect.name, candidate.score)
+        scores.setdefault(candidate.effect.name, candidate.score)
     return scores
 
 

@@ -32,29 +32,19 @@ class Thresholds:
     """… or by this share, where left-out sweeps and held-out data are sure."""
     plainly_worse: float = 1.25
     """No effect may leave so many times the plain error where fitted; inf: not asked."""
-    expected: float = 10.0
-    """dBIC by which an effect that every body has, though the robot does not declare it, is ahead beforehand; 0: by nothing."""
 
     # --- screening and refits --------------------------------------------------------------------------------------------------
     testable: float = 0.1
     """An effect of which calibration leaves less than this share cannot be tested."""
-    refittable: float = 0.04
-    """… and of less than this is not refitted, unless its predicted gain is larger than any other's; 0: it is."""
     promising: float = 8.0
     """Linear dBIC that a candidate needs to be refitted."""
     hinted: float = 0.5
     """What fields of the model before predict is looked into where it is this share of the gain that is needed; inf: fields are computed anew only then."""
-    within_reach: float = 0.4
-    """What has this share of the best dBIC may be ahead of it where its place is; inf: it is not asked."""
-    drifted: float = 2.0
-    """Where calibration has gone so many prior deviations, an effect of known size starts from the declared model too; inf: it does not …"""
     explains: float = 1.25
-    """… unless it leaves less than this mean square, in units of the noise."""
+    """A model that leaves less than this mean square, in units of the noise, explains the data: others need not be fitted to their ends."""
 
     predicts: float = 1.0
     """Where evidence is close, so much of what left-out sweeps surely gain counts as dBIC; 0: nothing."""
-    richer: float = 10.0
-    """dBIC by which a form with more parameters must be ahead; inf: the simple one stays."""
     needless: float = 0.0
     """An effect that later ones leave so much dBIC at most is taken out; −inf: none is."""
 
@@ -72,11 +62,7 @@ class Thresholds:
     near_as_good: float = 0.75
     """An alternative to an effect had this share of its evidence at least when that was named."""
     swap: float = 2.0
-    """dBIC by which an alternative must be better to take the place of an effect; inf: none does …"""
-    tie: float = 2.0
-    """… of the last effect, together with what comes next; inf: none does …"""
-    swap_offsets: float = 2.0
-    """… or of the input offsets; inf: none does."""
+    """dBIC by which an alternative must be better to take the place of an effect or of the input offsets; inf: none does."""
 
     # --- noise and discretisation ------------------------------------------------------------------------------------------------
     apart: float = 3.0
@@ -99,6 +85,8 @@ class Thresholds:
     """Standard deviations by which a value must be away from what is declared to be named."""
     relevant: float = 0.02
     """… and share of it, or of a cable's range; 0: not asked."""
+    offsets_above_mesh: float = 0.75
+    """Share of the discretisation error by which input offsets must move the markers; `above_mesh`: no more than effects."""
 
     # --- verdict -----------------------------------------------------------------------------------------------------------------
     explained: float = 0.8
@@ -121,8 +109,6 @@ class Thresholds:
     """… unless a refit in the place of the named one brought less than this share of its evidence; 0: whatever it brought …"""
     next_to_nothing: float = 0.05
     """… or one explains less than this share of what the other does; 0: whatever it explains."""
-    mostly: float = 0.9
-    """Share of a field that is collinear with a named nuisance alone where the two are said together."""
     many_numbers: int = 6
     """An effect with more parameters is collinear with much, which says little."""
 

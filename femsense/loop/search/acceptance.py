@@ -72,7 +72,7 @@ def acceptance_test(
         mesh_cost_m=mesh,
         takes_over=_taken_over(fitted, made, decides),
     )
-    return Refit(candidate, made, score, fitted.fit.chi2 - made.fit.chi2 - candidate.cost, record)
+    return Refit(candidate, made, score, record)
 
 
 def _moves(decrease: float) -> str:
@@ -94,11 +94,6 @@ def surely_predicts(refitted: Refit) -> float:
     gain, std = refitted.record.cv_gain, refitted.record.cv_std
     assert gain is not None and std is not None
     return gain - (std if np.isfinite(std) else 0.0)
-
-
-def prior_evidence(data: Data, effect: Effect) -> float:
-    """Return by how much dBIC an effect is ahead of others beforehand: every body has weight, though the robot does not declare it."""
-    return data.thresholds.expected if effect.expected(data.declared) else 0.0
 
 
 def sure_beyond_mesh(better: float, std_error: float, held: float, expected: float, decides: Thresholds) -> bool:

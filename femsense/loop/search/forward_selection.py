@@ -19,7 +19,7 @@ from femsense.loop.fit.fitted_model import (
 from femsense.loop.fit.joint_fit import JointFit, Prior
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.result.records import NAMED, RefitRecord
-from femsense.loop.search.acceptance import acceptance_test, prior_evidence, surely_predicts
+from femsense.loop.search.acceptance import acceptance_test, surely_predicts
 from femsense.loop.search.location_search import climbed, lies_on_body, located
 from femsense.loop.search.refit import FORGONE, evidence, explains, refit, tried, with_term, within, worth_of
 from femsense.loop.search.screening import Candidate, joined, linear_gain
@@ -45,13 +45,18 @@ def select_next(
     passing = {i: r for i, r in refits.items() if r.record.passes}
     if not passing:
         return None, [], _updated(records, refits)
-    leading, improved = leaders(data, fitted, passing, noise, say)
+    best = max(r.score for r in passing.values())
+    leading = {
+        i: r if r.record.seed_std is not None else polished(data, fitted, r, noise, say)
+        for i, r in passing.items()
+        if r.score > best - data.thresholds.evidence
+    }
     # where evidence is close, what surely predicts better
-    first = max(leading, key=lambda i: leading[i].score + _ahead(data, leading[i]))
+    first = max(leading, key=lambda i: leading[i].score + data.thresholds.predicts * surely_predicts(leading[i]))
     close = [r for r in leading.values() if r.score > leading[first].score - data.thresholds.evidence]
     winner = _enriched(data, fitted, leading[first], table, noise, say).saying(NAMED)
     ties = [r for r in close if r.candidate.effect.name != winner.candidate.effect.name]
-    records = _updated(records, refits | improved | {first: winner})
+    records = _updated(records, refits | leading | {first: winner})
     return winner, sorted(ties, key=lambda r: -r.score), records
 
 
@@ -93,44 +98,6 @@ def _updated(records: Sequence[RefitRecord], refits: Mapping[int, Refit]) -> lis
     return [refits[i].record if i in refits else record for i, record in enumerate(records)]
 
 
-def leaders(
-    data: Data, fitted: FittedModel, passing: Mapping[int, Refit], noise: Noise, say: Progress
-) -> tuple[dict[int, Refit], dict[int, Refit]]:
-    """Return the refits that are as good as the best but for `evidence` with those that their places bring ahead of these, each with its seed improved;
-    and all whose seeds were improved."""
-    best, decides = max(r.score for r in passing.values()), data.thresholds
-    near = {
-        i: r if r.record.seed_std is not None else polished(data, fitted, r, noise, say)
-        for i, r in passing.items()
-        if r.score > best - decides.evidence
-    }
-    behind = {
-        i: _with_climbs(data, fitted, r, noise)
-        for i, r in passing.items()
-        if best - decides.evidence >= r.score > decides.within_reach * best
-    }
-    moved = {i: polished(data, fitted, r, noise, say) for i, r in behind.items() if _in_sight(r) > best}
-    ahead = max(r.score for r in near.values())
-    return near | {i: r for i, r in moved.items() if r.score > ahead}, near | moved
-
-
-def _ahead(data: Data, refitted: Refit) -> float:
-    """Return by how much dBIC a refit is ahead of others for what it predicts, and beforehand."""
-    return data.thresholds.predicts * surely_predicts(refitted) + prior_evidence(data, refitted.candidate.effect)
-
-
-def _with_climbs(data: Data, fitted: FittedModel, refitted: Refit, noise: Noise) -> Refit:
-    """Return a refit with where its place may lie instead, if it has one."""
-    places = refitted.candidate.effect.nearby(data.robot, refitted.candidate.seed)
-    return replace(refitted, climbs=climbed(data, fitted, refitted.candidate, noise)) if places else refitted
-
-
-def _in_sight(refitted: Refit) -> float:
-    """Return the dBIC of a refit at the place of the largest predicted gain."""
-    more = 0.0 if refitted.climbs is None else refitted.climbs.more - 1.0
-    return refitted.score + more * (refitted.score + refitted.candidate.cost)
-
-
 def has_settled(data: Data, candidate: Candidate, ahead: Sequence[Refit]) -> bool:
     """Return whether what a refit ends with is the last word on it: others explain the data, and it has no place or time to move."""
     effect = candidate.effect
@@ -157,7 +124,7 @@ def _scouted(
         made = tried(cases.data, cases.fitted, own, noise, max(evident, lead - 2.0 * evident))
         if made is None:  # where it does not fit, all states decide
             continue
-        score = evidence(cases.fitted.fit, made.fit) - own.cost + prior_evidence(data, candidate.effect)
+        score = evidence(cases.fitted.fit, made.fit) - own.cost
         scouts[id(candidate)] = made.fit, score
         lead = max(lead, score) if explains(data, made) else lead
     return scouts
@@ -206,12 +173,7 @@ def polished(data: Data, fitted: FittedModel, refitted: Refit, noise: Noise, say
 def _enriched(data: Data, fitted: FittedModel, winner: Refit, table: list[Candidate], noise: Noise, say: Progress) -> Refit:
     """Return the winner in a form with more parameters where that has `evidence` over the simple one."""
     winner = _with_more_markers(data, fitted, winner, table, noise, say)
-    least = min(data.thresholds.refittable, winner.candidate.retained)
-    for form in (
-        []
-        if np.isinf(data.thresholds.richer)
-        else _forms([c for c in table if c.retained >= least], winner.candidate.effect.name)
-    ):
+    for form in _forms(table, winner.candidate.effect.name):
         if len(form.parameters) <= len(winner.candidate.parameters):
             continue
         say(f"trying {form.effect.name} with {len(form.parameters)} parameters")
@@ -222,7 +184,7 @@ def _enriched(data: Data, fitted: FittedModel, winner: Refit, table: list[Candid
         if rich.record.passes:
             rich = polished(data, fitted, rich, noise, say)
         more = evidence(winner.fitted.fit, rich.fitted.fit) - (rich.candidate.cost - winner.candidate.cost)
-        if rich.record.passes and more > data.thresholds.richer:
+        if rich.record.passes and more > data.thresholds.evidence:
             winner = replace(rich, record=replace(rich.record, seed=form.seed))
     return winner
 
@@ -275,8 +237,6 @@ def richer_fit(data: Data, fitted: FittedModel, winner: Refit, form: Candidate, 
 
 def shortlist(table: list[Candidate], decides: Thresholds, effort: Effort, *, first: bool) -> list[Candidate]:
     """Return the best candidate of each name, in its simplest form (or forms, if several are equally simple), the best first."""
-    most = max((c.score for c in table if c.retained >= decides.refittable), default=np.inf)
-    table = [c for c in table if c.retained >= decides.refittable or c.score > most]
     names = list(dict.fromkeys(c.effect.name for c in table if c.score > decides.promising))
     chosen: list[Candidate] = []
     for name in names[: effort.refits if first else (effort.refits + 1) // 2]:
@@ -309,8 +269,8 @@ def _polish(data: Data, fitted: FittedModel, winner: Refit, noise: Noise, say: P
     best, scatter, effect = winner.fitted, [0.0] * len(winner.candidate.parameters), winner.candidate.effect
     if effect.nearby(data.robot, winner.candidate.seed):
         say(f"looking near by for {effect.name}")
-        climbs = winner.climbs or climbed(data, fitted, winner.candidate, noise)
-        best, scatter = located(data, fitted, winner.candidate, winner.fitted, climbs, noise)
+        ends = climbed(data, fitted, winner.candidate, noise)
+        best, scatter = located(data, fitted, winner.candidate, winner.fitted, ends, noise)
     return (_with_seed_fitted(data, best, noise, say) if winner.candidate.parameters else best), scatter
 
 

@@ -71,7 +71,7 @@ def offsets_are_evident(data: Data, fitted: FittedModel, noise: Noise, n_effecti
     held = held_chi2(data, without, noise) - held_chi2(data, fitted, noise)
     decides, expected = data.thresholds, held_share(data) * evidence(without.fit, fitted.fit)
     sure = sure_beyond_mesh(better, std_error, held, expected, decides)
-    least = decides.above_mesh_if_sure if sure else decides.above_mesh
+    least = decides.above_mesh_if_sure if sure else decides.offsets_above_mesh
     return without if moved_by(without, fitted) > least * discretisation_rms(data, without) else None
 
 
@@ -83,7 +83,7 @@ def instead_of_offsets(
     Play of held cables does what offsets below those declared do. Of the two it is named where no offset is above: offsets err both ways.
     """
     without = offsets_are_evident(data, fitted, noise, n_effective)
-    if without is None or not np.isfinite(data.thresholds.swap_offsets):
+    if without is None or not np.isfinite(data.thresholds.swap):
         return None
     say("asking what else might be in the place of the input offsets")
     worth = evidence_for_offsets(data, fitted, without, n_effective)
@@ -106,7 +106,7 @@ def instead_of_offsets(
     ahead = best.score - worth
     assert best.record.cv_gain is not None
     predicts = best.record.cv_gain - sweeps_predicted(data.train, without.fit, fitted.fit)[0]
-    evident, better = data.thresholds.evidence, data.thresholds.swap_offsets
+    evident, better = data.thresholds.evidence, data.thresholds.swap
     takes = ahead > better or (ahead > -evident and ahead + predicts > better)  # where evidence is close, what predicts better
     takes = takes or (
         best.candidate.effect.mirrors(OFFSETS) and best.fitted.fit.chi2 < fitted.fit.chi2 + evident

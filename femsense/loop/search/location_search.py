@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -24,23 +24,13 @@ from femsense.model.effects import Entry, Parameter
 from femsense.model.robot import Robot
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Climbs:
-    """Where climbs over the seeds of an effect end, in some of the states."""
-
-    ends: list[Candidate]
-    """The best first, none of them at the seed that was asked about."""
-    more: float
-    """How many times as much as this seed the best end explains, at least 1: a soft place is worth little beside where it is."""
-
-
 def located(
-    data: Data, fitted: FittedModel, candidate: Candidate, made: FittedModel, climbs: Climbs, noise: Noise
+    data: Data, fitted: FittedModel, candidate: Candidate, made: FittedModel, ends: Sequence[Candidate], noise: Noise
 ) -> tuple[FittedModel, list[float]]:
     """Return the best of a candidate's fits, that which was `made` from its own seed or one that begins where a climb ends, its seed moved on,
     and the scatter of its parameters: that of `closer`, or that over the places that explain as much where this is larger."""
     evident = data.thresholds.evidence
-    begun = [made, *fitted_at(data, fitted, candidate, made, climbs.ends, noise)]
+    begun = [made, *fitted_at(data, fitted, candidate, made, ends, noise)]
     moved = list[tuple[FittedModel, list[float]]]()
     for one in sorted(begun, key=lambda s: s.fit.chi2):
         if not moved or one.fit.chi2 < moved[0][0].fit.chi2 + 2.0 * evident:
@@ -67,8 +57,8 @@ def fitted_at(
     return [one for one in there if one is not None and one.fit.fit.status != STOPPED_EARLY]
 
 
-def climbed(data: Data, fitted: FittedModel, start: Candidate, noise: Noise) -> Climbs:
-    """Return where the best seeds come to when each goes from neighbour to neighbour: a soft place here and a stiff one there look alike
+def climbed(data: Data, fitted: FittedModel, start: Candidate, noise: Noise) -> list[Candidate]:
+    """Return where the best seeds come to, the best first and none of them where it starts, when each goes from neighbour to neighbour: a soft place here and a stiff one there look alike
     when the modulus is open. Some of the states show the way."""
     cases = representative_cases(data, fitted, noise)
     asked, known = list[Entry](), list[Candidate]()
@@ -96,8 +86,7 @@ def climbed(data: Data, fitted: FittedModel, start: Candidate, noise: Noise) -> 
     for end in sorted((end for end in ends if end.gain > 0.5 * most), key=lambda c: -c.gain):
         if not any(same_place(end, other, data.thresholds) for other in apart):
             apart.append(end)
-    begun = max((c.gain for c in others if c.seed == start.seed), default=0.0)
-    return Climbs(apart, max(most / begun, 1.0) if begun > 0.0 else 1.0)
+    return apart
 
 
 def same_place(a: Candidate, b: Candidate, decides: Thresholds) -> bool:

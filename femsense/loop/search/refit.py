@@ -10,7 +10,7 @@ from femsense.core.arrays import FloatArray
 from femsense.core.errors import DataError, FemsenseError
 from femsense.core.least_squares import STOPPED_EARLY
 from femsense.loop.data.dataset import Data
-from femsense.loop.fit.fitted_model import FittedModel, fit_model, found_in, own_of
+from femsense.loop.fit.fitted_model import FittedModel, fit_model, own_of
 from femsense.loop.fit.joint_fit import JointFit, Prior
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.search.screening import Candidate, jets_with
@@ -19,7 +19,7 @@ from femsense.model.effects.base import known_length
 from femsense.model.observation import Hypothesis
 
 DECLARED = -1.0
-"""Start from what is declared, where a discrete alternative does not fit from where calibration has gone without it, or that has gone far."""
+"""Start from what is declared, where a discrete alternative does not fit from where calibration has gone without it."""
 LEFT = 0.5
 """What a refit to all states, begun where one to some of them ended, may leave to be gained in χ²: the winner is fitted to the end."""
 FORGONE = 2.0, 1.25
@@ -69,7 +69,7 @@ def refit(
     worth = worth_of(fitted.fit, candidate, data.thresholds.evidence if wanted is None else wanted, settled)
 
     def started_at(share: float) -> FittedModel | None:
-        part = share if share != DECLARED else 0.0 if free else 1.0
+        part = 1.0 if share == DECLARED else share
         known = jets_with(fitted, candidate) if free and share == 0.0 else None
         near = fitted.fit.jets if not candidate.parameters and share != DECLARED else None
         try:
@@ -90,26 +90,14 @@ def refit(
         except DataError:
             return None
 
-    best = None if begin is None else refit_from(data, fitted, begin, noise, worth)
-    if best is not None:
-        return best
-    stopped_early: FittedModel | None = None
+    going_on = None if begin is None else refit_from(data, fitted, begin, noise, worth)
+    if going_on is not None:
+        return going_on
     for share in _shares(candidate, free):
         made = started_at(share)
-        if made is not None and made.fit.chi2 <= (fitted.fit.chi2 + 1.0 if best is None else best.fit.chi2):
-            best = made
-        if made is not None and made.fit.fit.status == STOPPED_EARLY:
-            stopped_early = made
-            break
-        if best is not None:
-            break
-    if starts_declared(data, fitted, candidate, best):
-        made = started_at(DECLARED)
-        best = made if made is not None and (best is None or made.fit.chi2 <= best.fit.chi2) else best
-    found = best or stopped_early
-    if found is None:
-        raise DataError("no start from which the fit improves")
-    return found
+        if made is not None and (made.fit.fit.status == STOPPED_EARLY or made.fit.chi2 <= fitted.fit.chi2 + 1.0):
+            return made
+    raise DataError("no start from which the fit improves")
 
 
 def refit_from(data: Data, fitted: FittedModel, begin: JointFit, noise: Noise, worth: float = np.inf) -> FittedModel | None:
@@ -137,17 +125,6 @@ def _shares(candidate: Candidate, free: bool) -> tuple[float, ...]:
     if candidate.effect.discrete:
         return (1.0, DECLARED) if candidate.gain < np.inf else (DECLARED, 1.0)
     return (0.0, 1.0, 0.3) if free else (1.0, 0.3, 0.0)
-
-
-def starts_declared(data: Data, fitted: FittedModel, candidate: Candidate, best: FittedModel | None) -> bool:
-    """Return whether a refit starts from what is declared, too: an effect of known size, where calibration alone has gone far beyond what is known of it
-    beforehand, and the best fit so far leaves much."""
-    if known_length(candidate.parameters) is None or explains(data, best):
-        return False
-    fit = fitted.fit
-    known = np.isfinite(fit.prior.std)
-    far = np.abs(fit.coordinates - fit.prior.mean)[known] > data.thresholds.drifted * fit.prior.std[known]
-    return bool(far.any()) and not found_in(fitted)
 
 
 def explains(data: Data, fitted: FittedModel | None) -> bool:

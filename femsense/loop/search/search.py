@@ -87,7 +87,7 @@ def _take_step(course: SearchProgress, say: Progress) -> None:
         return
     next_one, others, tried = select_next(data, fitted, table, noise, say)
     refits = [*refits, *at_step(tried, len(history))]
-    if next_one is None and ties and np.isfinite(data.thresholds.tie):
+    if next_one is None and ties and np.isfinite(data.thresholds.swap):
         instead, next_one, tried = beside_a_tie(data, fitted, ties[0], fields, noise, names, n_effective, say)
         if next_one is not None:
             history[-1] = (ties[0].candidate.effect.name, instead)
@@ -168,7 +168,7 @@ def beside_a_tie(
     instead = fitted_again(data, tie.fitted, noise, known=jets if same else None, near=None if same else jets)
     _, table = scored(data, instead, _fields(data, instead, fields, names), noise, names, n_effective)
     both, _, tried = select_next(data, instead, table, noise, say)
-    if both is None or evidence(fitted.fit, both.fitted.fit) - both.candidate.cost <= data.thresholds.tie:
+    if both is None or evidence(fitted.fit, both.fitted.fit) - both.candidate.cost <= data.thresholds.swap:
         return instead, None, []
     return instead, both, tried
 

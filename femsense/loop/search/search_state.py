@@ -11,7 +11,6 @@ from femsense.loop.fit.fitted_model import FittedModel
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.result.records import RefitRecord
 from femsense.loop.search.effect_fields import Fields
-from femsense.loop.search.location_search import Climbs
 from femsense.loop.search.screening import Candidate
 
 
@@ -105,12 +104,8 @@ class Refit:
     fitted: FittedModel
     score: float
     """dBIC of the nonlinear fit."""
-    gain: float
-    """Decrease of χ² less the cost: as linear scores are."""
     record: RefitRecord
     """What the report says of it."""
-    climbs: Climbs | None = None
-    """Where its place may lie instead, once that is asked."""
 
     def saying(self, verdict: str) -> Refit:
         """Return it with another verdict in its record."""

@@ -17,7 +17,7 @@ from femsense.loop.data.dataset import NUISANCE, Data
 from femsense.loop.fit.fitted_model import FittedModel, keeping
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.result.records import NAMED, PASSES, RefitRecord
-from femsense.loop.search.acceptance import acceptance_test, prior_cost, prior_evidence
+from femsense.loop.search.acceptance import acceptance_test, prior_cost
 from femsense.loop.search.effect_fields import fields_of
 from femsense.loop.search.forward_selection import polished, shortlist
 from femsense.loop.search.location_search import may_lie_elsewhere
@@ -89,7 +89,6 @@ def _best(
         return None, []
     worth = evidence(without.fit, fitted.fit) - own.cost - prior_cost(data.declared, own.effect, fitted.fit)
     records = [RefitRecord(name, own.seed, PASSES, in_place_of=name, dbic=worth)]
-    margin = max(data.thresholds.swap, prior_evidence(data, own.effect))
     best: Refit | None = None
     listed = [c for c in table if c.effect.name in alternatives]
     for candidate in shortlist(listed, data.thresholds, data.effort, first=True):
@@ -103,7 +102,7 @@ def _best(
             continue
         tried = polished(data, without, tried, noise, say)
         records.append(tried.record)
-        if tried.score > (worth + margin if best is None else best.score):
+        if tried.score > (worth + data.thresholds.swap if best is None else best.score):
             best = tried
     return best, records
 

@@ -88,7 +88,7 @@ def _absorbed(search: Search, names: Sequence[str], decides: Thresholds) -> Iter
             whole = c.columns - J @ c.response
             whole = whole - poses @ (poses.T @ whole)
             left = whole - own @ np.linalg.lstsq(own, whole, rcond=None)[0]
-            if np.linalg.norm(left) < (1.0 - decides.mostly**2) ** 0.5 * np.linalg.norm(whole):
+            if np.linalg.norm(left) < (1.0 - decides.alike**2) ** 0.5 * np.linalg.norm(whole):
                 yield ConfoundedPair((name, c.effect.name), absorbed_share=float(np.sqrt(1.0 - c.retained**2)))
 
 

@@ -11,7 +11,6 @@ from arm import arm, record, sweeps
 from femsense.loop.data.dataset import Data, prepare
 from femsense.loop.fit.covariance import parameter_std
 from femsense.loop.fit.fitted_model import FittedModel, fit_model, problem_of, with_nuisance
-from femsense.loop.fit.joint_fit import Prior
 from femsense.loop.fit.noise_components import Noise, whiten
 from femsense.loop.result.records import NAMED, PASSES, RefitRecord
 from femsense.loop.search.acceptance import acceptance_test, surely_predicts
@@ -19,7 +18,7 @@ from femsense.loop.search.calibration import fitted_again
 from femsense.loop.search.effect_fields import fields_of
 from femsense.loop.search.forward_selection import polished, richer_fit, select_next, shortlist
 from femsense.loop.search.location_search import closer, without_last
-from femsense.loop.search.refit import evidence, refit, starts_declared
+from femsense.loop.search.refit import evidence, refit
 from femsense.loop.search.screening import linear_gain, screen_model
 from femsense.loop.search.search import beside_a_tie, scored, spared_gain
 from femsense.loop.search.search_state import Refit
@@ -90,7 +89,7 @@ def test_a_polished_refit_is_weighed_against_the_model_without_it_as_its_rivals_
     table = screen_model(data, base.fit, NOISE, fields_of(data, base, ["payload"]), COUNT)
     far = max(table[:6], key=lambda c: np.linalg.norm(np.subtract(c.seed["point_m"], HIDDEN[0]["point_m"])))
     made = refit(data, base, far, NOISE)
-    rough = Refit(far, made, 100.0, 100.0, RECORD)
+    rough = Refit(far, made, 100.0, RECORD)
     better = polished(data, base, rough, NOISE, lambda text: None)
     gained = evidence(base.fit, better.fitted.fit) - evidence(base.fit, made.fit)
     assert better.score - 100.0 == pytest.approx(gained) and gained > 10.0
@@ -99,46 +98,10 @@ def test_a_polished_refit_is_weighed_against_the_model_without_it_as_its_rivals_
 
 def test_what_predicts_surely_goes_before_what_may_predict():
     def predicts(gain: float, spread: float) -> float:
-        return surely_predicts(Refit(None, None, 0.0, 0.0, replace(RECORD, cv_gain=gain, cv_std=spread)))
+        return surely_predicts(Refit(None, None, 0.0, replace(RECORD, cv_gain=gain, cv_std=spread)))
 
     assert predicts(44.0, 14.0) > predicts(48.0, 45.0)
     assert predicts(44.0, np.inf) == 44.0
-
-
-def test_weight_that_nobody_declared_is_refitted_however_far_behind_it_looks():
-    inputs, labels = sweeps(each=1)
-    recording, _ = record(inputs, labels=labels, truth=arm((4, 1, 1)))
-    data = prepare(arm((4, 1, 1), gravity=(0, 0, 0)), [recording], [])
-    data = replace(data, thresholds=replace(LENIENT, explains=np.inf))
-    hypothesis, prior = with_nuisance(data)
-    base = fit_model(data, hypothesis, prior, NOISE, np.zeros(len(prior.mean)))
-    table = screen_model(data, base.fit, NOISE, fields_of(data, base, ["gravity", "payload"]), COUNT)
-    looks = [replace(c, score=DEFAULTS.promising + 1.0 if c.effect.name == "gravity" else c.score) for c in table]
-    table = sorted(looks, key=lambda c: -c.score)
-    winner, _, records = select_next(data, base, table, NOISE, lambda text: None)
-    assert {r.name for r in records} == {"gravity", "payload"}
-    assert winner is not None and winner.candidate.effect.name == "gravity"
-
-
-@pytest.mark.parametrize(
-    "name, drifted, explains, expected",
-    [
-        ("gravity", False, False, False),
-        ("gravity", True, True, False),
-        ("gravity", True, False, True),
-        ("payload", True, False, False),
-    ],
-)
-def test_where_calibration_has_drifted_gravity_starts_from_what_is_declared_too(
-    name: str, drifted: bool, explains: bool, expected: bool
-):
-    data, base = started()
-    data = replace(data, thresholds=replace(DEFAULTS, explains=np.inf if explains else 0.0))
-    candidate = screen_model(data, base.fit, NOISE, fields_of(data, base, [name]), COUNT)[0]
-    tight = Prior(base.fit.prior.mean, base.fit.prior.std * (1e-3 if drifted else 1e3))
-    base = replace(base, fit=replace(base.fit, prior=tight))
-    assert starts_declared(data, base, candidate, base) == expected
-    assert starts_declared(data, base, candidate, None) == (name == "gravity" and drifted)
 
 
 def test_effects_without_near_rivals_are_not_asked_again():
@@ -156,7 +119,7 @@ def test_what_goes_with_an_effect_that_was_as_good_is_found_beside_it():
     wrong, _ = added(data, base, "gravity", 1)
     table = screen_model(data, base.fit, NOISE, fields_of(data, base, ["cable_gain"]), COUNT)
     candidate = (shortlist(table, DEFAULTS, EFFORT, first=True) or table)[0]
-    tie = Refit(candidate, refit(data, base, candidate, NOISE), 0.0, 0.0, RECORD)
+    tie = Refit(candidate, refit(data, base, candidate, NOISE), 0.0, RECORD)
     instead, both, tried = beside_a_tie(data, wrong, tie, None, NOISE, ["cable_gain", "payload"], COUNT, lambda text: None)
     assert both is not None and both.candidate.effect.name == "payload" and tried[-1].is_named
     assert instead.fit.hypothesis.names[-1] == "cable_gain"
@@ -212,7 +175,7 @@ def test_a_richer_form_is_tried_only_where_fields_promise_something():
     table = screen_model(data, base.fit, NOISE, fields, COUNT)
     one, all_of_them = (of(table, key=lambda c: len(c.parameters)) for of in (min, max))
     made = refit(data, base, one, NOISE)
-    winner = Refit(one, made, evidence(base.fit, made.fit) - one.cost, 0.0, RECORD)
+    winner = Refit(one, made, evidence(base.fit, made.fit) - one.cost, RECORD)
     J, r = np.asarray(made.fit.fit.jacobian), made.fit.fit.residual
     problem = problem_of(data, made.fit, NOISE)
     predicted_sum = linear_gain(made.fit, problem, all_of_them.raw, all_of_them.placements)
@@ -263,7 +226,7 @@ def test_a_place_moves_on_where_the_body_is_as_the_load_has_bent_it():
     moved, scatter = closer(data, fitted, NOISE)
     assert np.linalg.norm(np.subtract(moved.fit.hypothesis.terms[-1][1]["point_m"], hidden["point_m"])) < 0.004
     assert moved.fit.chi2 < 0.5 * fitted.fit.chi2 and np.all(np.array(scatter) < 0.2)
-    whole = polished(data, base, Refit(candidate, fitted, 0.0, 0.0, RECORD), NOISE, lambda text: None).fitted
+    whole = polished(data, base, Refit(candidate, fitted, 0.0, RECORD), NOISE, lambda text: None).fitted
     found, std = whole.fit.coordinates[-6:], parameter_std(data, whole, NOISE, {})["payload"]
     assert whole.fit.hypothesis.entries(whole.fit.coordinates)[-1]["point_m"] == found[3:].tolist()
     off = np.abs(found - [*hidden["force_n"], *hidden["point_m"]])
