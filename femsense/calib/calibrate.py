@@ -17,6 +17,7 @@ from femsense.calib.checks import check_reading, pairs_of, relabelled
 from femsense.calib.clouds_alone import placed_by_clouds, views_without_markers
 from femsense.calib.from_clouds import pose_pivot, refine_poses
 from femsense.calib.from_images import has_image_markers, with_image_markers
+from femsense.calib.input_checks import check_inputs
 from femsense.calib.inputs import first_inputs, initial_state, input_bounds, input_tables, largest_input, weak_inputs
 from femsense.calib.inputs_from_clouds import with_initial_inputs
 from femsense.calib.joint import PLACEMENT_STD_FLOOR, fit_joint, root_mean_square
@@ -124,6 +125,8 @@ def _fitted(
     if changed:
         scene, fit, poses, initial, jet = _fitted_as_named(robot, better, chosen, history)
         pairs = pairs_of(robot, scene, poses, jet.residual)
+    if strict:
+        check_inputs(robot, scene.recording, pairs)
     check_reading(robot, pairs, strict=strict)
     return scene, fit, poses, initial, jet
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from itertools import chain
 from pathlib import Path
@@ -11,9 +10,10 @@ from typing import Any
 import numpy as np
 
 from femsense.core.arrays import BoolArray, FloatArray, IntArray, freeze
-from femsense.core.errors import DataError, InputError
+from femsense.core.errors import InputError
 from femsense.core.text import did_you_mean
 from femsense.io.files import write_csv
+from femsense.io.lost_markers import is_a_place
 from femsense.io.recording_columns import columns
 from femsense.io.tables import Table, read_csv
 from femsense.model.recording import Recording
@@ -80,9 +80,9 @@ def read_markers(path: Path, views: tuple[str, ...], numbers: IntArray, noise_m:
     frame = _frame_indices(table, numbers)
     view = _view_indices(table, views)
     xyz = table.numbers(PLACE_COLUMNS)
-    _check_metres(table, xyz)
-    measured = _measured(table, xyz, numbers[frame])
+    measured = is_a_place(path, xyz, table.text("marker"), numbers[frame])
     table, frame, view, xyz = table.without(~measured), frame[measured], view[measured], xyz[measured]
+    _check_metres(table, xyz)
     unnamed = _unnamed(table, frame, numbers)
     nameless = UnnamedRows(frame[unnamed], xyz[unnamed], view[unnamed])
     table, frame, view, xyz = table.without(unnamed), frame[~unnamed], view[~unnamed], xyz[~unnamed]
@@ -237,28 +237,6 @@ def _gravity(table: Table) -> FloatArray | None:
             expected=", ".join(GRAVITY_COLUMNS),
         )
     return table.numbers(GRAVITY_COLUMNS) if given else None
-
-
-def _measured(table: Table, xyz: FloatArray, frame: IntArray) -> BoolArray:
-    """Return which rows are places, shape (rows,): 0, 0, 0 is the middle of the lens, and how many programs write a lost marker.
-
-    Raises:
-        DataError: a marker that has no other row.
-    """
-    lost = np.asarray((xyz == 0.0).all(axis=1))
-    if not lost.any():
-        return np.asarray(~lost)
-    cells = np.array(table.text("marker"))
-    never = sorted({str(name) for name in cells[lost]} - {str(name) for name in cells[~lost]})
-    if never:
-        names = ", ".join(name or "(without a name)" for name in never)
-        raise DataError(
-            f"{table.path}: 0, 0, 0 in every row of {names}: these markers were lost all the time. Take their rows out, or name the columns anew"
-        )
-    rows = [f"{name or '(without a name)'} in frame {number}" for name, number in zip(cells[lost], frame[lost])]
-    text = ", ".join(rows[:6]) + (f" and {len(rows) - 6} more" if len(rows) > 6 else "")
-    warnings.warn(f"{table.path}: 0, 0, 0 is how a lost marker is written; left out: {text}", stacklevel=4)
-    return np.asarray(~lost)
 
 
 def _unnamed(table: Table, frame: IntArray, numbers: IntArray) -> BoolArray:

@@ -390,7 +390,7 @@ def recordings(draw: st.DrawFn) -> Recording:
     cables = draw(st.integers(0, 2))
     grid = lambda rows, columns: np.array([[draw(numbers) for _ in range(columns)] for _ in range(rows)]).reshape(rows, columns)  # noqa: E731
     places = grid(len(seen), 3)
-    places[(places == 0.0).all(axis=1)] = [0.0, 0.0, 1.0]  # the middle of the lens is how a lost marker is written
+    places[(places == places[:, :1]).all(axis=1)] = [0.0, 0.0, 1.0]  # one number three times is how a lost marker is written
     return make_recording(
         Timeline(
             np.cumsum([draw(st.floats(1e-3, 10.0)) for _ in range(F)]),

@@ -1,0 +1,67 @@
+"""Markers that a tracker lost and wrote where they were before: noise never repeats a place to the last digit."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+
+import numpy as np
+
+from femsense.core.arrays import BoolArray, IntArray
+from femsense.model.recording import Recording, with_marker_table
+
+CHANCE = 0.05
+"""Rows that may repeat by chance in a recording whose copies are left out."""
+SHOWN = 6
+"""Rows that a warning names."""
+
+
+def without_stale_markers(recording: Recording) -> Recording:
+    """Return the recording without rows that repeat the frame before to the last digit, and warn of them.
+
+    A row counts as such a copy where its marker moves in other frames, where others of its frame move or the inputs changed, and where digits are
+    fine enough that chance explains none: p³ n < CHANCE, with p the share of single coordinates that repeat among n pairs of rows.
+
+    Arguments:
+        recording: whose rows are checked; a marker's rows in frames that follow each other are compared.
+    """
+    r = recording
+    keys = np.column_stack([r.marker_frame, r.marker_index, r.marker_view])
+    order = np.lexsort((keys[:, 0], keys[:, 1], keys[:, 2]))
+    key, same = keys[order][1:], np.diff(r.marker_xyz[order], axis=0) == 0
+    follows = (np.diff(keys[order][:, 0]) == 1) & (np.diff(keys[order][:, 1:], axis=0) == 0).all(axis=1)
+    copies = follows & same.all(axis=1)
+    moving = follows & ~copies
+    if not copies.any() or not moving.any() or float(same[moving].mean()) ** 3 * int(follows.sum()) > CHANCE:
+        return recording
+    should_move = _shared(key[:, [0, 2]], moving) | _driven(r)[key[:, 0]]
+    stale = np.zeros(len(keys), dtype=np.bool_)
+    stale[order[1:]] = copies & should_move & _shared(key[:, [1, 2]], moving)
+    if not stale.any():
+        return recording
+    rows = [f"{r.marker_names[m]} in frame {r.frame_numbers[f]}" for f, m, _ in keys[stale]]
+    text = ", ".join(rows[:SHOWN]) + (f" and {len(rows) - SHOWN} more" if len(rows) > SHOWN else "")
+    where = r.folder / "markers.csv" if r.folder else "markers"
+    warnings.warn(
+        f"{where}: to the last digit where it was in the frame before, as of a lost marker; left out: {text}", stacklevel=4
+    )
+    return _kept(r, ~stale)
+
+
+def _driven(r: Recording) -> BoolArray:
+    """Return in which frames other inputs act than in the frame before, shape (F,)."""
+    inputs = np.hstack([r.inputs, r.pressures])
+    changed = (np.abs(np.diff(inputs, axis=0)) > 1e-3 * np.ptp(inputs, axis=0)).any(axis=1)
+    return np.concatenate([[False], changed])
+
+
+def _shared(groups: IntArray, chosen: BoolArray) -> BoolArray:
+    """Return which rows (k, 2) have a chosen row in their group, shape (k,)."""
+    _, group = np.unique(groups, axis=0, return_inverse=True)
+    return np.asarray((np.bincount(group.ravel(), chosen) > 0)[group.ravel()])
+
+
+def _kept(r: Recording, kept: BoolArray) -> Recording:
+    """Return the recording with some of its rows of named markers."""
+    names: Sequence[str] = r.marker_names
+    return with_marker_table(r, names, r.marker_frame[kept], r.marker_index[kept], r.marker_xyz[kept], view=r.marker_view[kept])

@@ -1,0 +1,62 @@
+"""Inputs that cannot be those that moved the markers: unit, exchanged columns, delay."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from arm import arm, record
+
+from femsense.calib.calibrate import calibrate
+from femsense.calib.checks import Pairs
+from femsense.calib.input_checks import motions_of
+from femsense.core.arrays import freeze
+from femsense.core.errors import DataError
+from femsense.model.recording import Recording
+
+LEVELS = [(0, 0, 0, 0), (0.8, 0, 0, 0), (0.4, 0, 0, 0), (0, 0.7, 0, 0), (0, 0, 0.9, 0), (0, 0, 0, 0.5), (0, 0, 0.3, 0)]
+
+
+@cache
+def recording() -> Recording:
+    return record(np.array(LEVELS), noise=2e-4)[0]
+
+
+def with_inputs(inputs: np.ndarray) -> Recording:
+    return replace(recording(), inputs=freeze(inputs))
+
+
+@pytest.mark.parametrize(("scale", "unit"), [(1 / 9.807, "kilogram-force"), (1 / 4.448, "pounds")])
+def test_inputs_in_another_unit_are_refused(scale: float, unit: str) -> None:
+    with pytest.raises(DataError, match=rf"Are the inputs in [^?]*{unit}\?"):
+        calibrate(arm(), with_inputs(scale * recording().inputs))
+
+
+def test_exchanged_columns_are_named() -> None:
+    with pytest.raises(DataError, match=r"exchanged: up moves the robot as left should, left moves the robot as up should"):
+        calibrate(arm(), with_inputs(recording().inputs[:, [2, 1, 0, 3]]))
+
+
+@pytest.mark.parametrize(("lag", "how"), [(1, "1 frames early"), (-1, "1 frames late")])
+def test_inputs_some_frames_off_are_named(lag: int, how: str) -> None:
+    with pytest.raises(DataError, match=how):
+        calibrate(arm(), with_inputs(np.roll(recording().inputs, lag, axis=0)))
+
+
+def test_right_inputs_are_not_accused_and_a_soft_body_is_only_mentioned(recwarn: pytest.WarningsRecorder) -> None:
+    assert calibrate(arm(), recording()).rms_m < 5e-4
+    assert not recwarn
+    with pytest.warns(UserWarning, match="times as far as the model.*young_modulus_pa"):
+        calibrate(arm(modulus=600e3), recording())
+
+
+def test_only_markers_seen_in_all_frames_count() -> None:
+    places = np.arange(15.0).reshape(5, 3)
+    pairs = Pairs(places, places + 1.0, np.array([0, 1, 0, 1, 0]), np.array([0, 0, 2, 2, 3]))
+    motions = motions_of(pairs)
+    assert motions is not None and motions.modelled.shape == (3, 3)
+    np.testing.assert_allclose(motions.modelled, motions.measured, atol=1e-12)
+    np.testing.assert_allclose(motions.modelled[:, 0], [-6, 0, 6])
+    assert motions_of(Pairs(places[:2], places[:2], np.array([0, 1]), np.array([0, 0]))) is None

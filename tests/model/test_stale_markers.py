@@ -1,0 +1,52 @@
+"""Markers written where they were before are left out; what may repeat by itself is not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from femsense.model.recording import Recording, make_recording
+from femsense.model.recording_parts import Drives, MarkerRows, Timeline
+from femsense.model.stale_markers import without_stale_markers
+
+F, M = 6, 4
+
+
+def recorded(xyz: np.ndarray, inputs: np.ndarray) -> Recording:
+    rows = MarkerRows(list("abcd"), np.repeat(np.arange(F), M), np.tile(np.arange(M), F), xyz.reshape(-1, 3))
+    return make_recording(Timeline(0.1 * np.arange(F)), drives=Drives(["c"], inputs[:, None]), markers=rows)
+
+
+def noisy() -> np.ndarray:
+    return np.random.default_rng(0).normal(size=(F, M, 3)).round(6)
+
+
+def left(xyz: np.ndarray, inputs: np.ndarray) -> list[tuple[int, int]]:
+    r = without_stale_markers(recorded(xyz, inputs))
+    return list(zip(r.marker_frame.tolist(), r.marker_index.tolist()))
+
+
+def test_a_lost_marker_that_keeps_its_last_place() -> None:
+    xyz = noisy()
+    xyz[3:5, 1] = xyz[2, 1]
+    with pytest.warns(UserWarning, match="left out: b in frame 3, b in frame 4"):
+        rows = left(xyz, np.arange(F))
+    assert {(k, m) for k in range(F) for m in range(M)} - set(rows) == {(3, 1), (4, 1)}
+
+
+def test_a_tracker_that_freezes_while_inputs_change() -> None:
+    xyz = noisy()
+    xyz[4:] = xyz[3]
+    with pytest.warns(UserWarning, match="and 2 more"):
+        rows = left(xyz, np.arange(F))
+    assert max(k for k, _ in rows) == 3
+    assert len(left(xyz, np.array([0, 1, 2, 3, 3, 3]))) == F * M  # nothing should have moved
+
+
+def test_coarse_digits_and_markers_that_never_move_are_kept() -> None:
+    rng = np.random.default_rng(1)
+    coarse = 0.1 + 0.001 * rng.integers(0, 2, size=(F, M, 3))
+    assert len(left(coarse, np.arange(F))) == F * M
+    still = noisy()
+    still[:, 2] = still[0, 2]
+    assert len(left(still, np.arange(F))) == F * M
