@@ -154,6 +154,10 @@ def test_a_lost_marker_written_as_zeros(tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match="left out: tip in frame 1"):
         r = load_recording(write_small_recording(tmp_path / "a", markers_csv=rows))
     assert r.marker_frame.tolist() == [0, 2]
+    with pytest.warns(UserWarning, match="-1, -1, -1 is how a lost marker is written"):
+        load_recording(write_small_recording(tmp_path / "c", markers_csv=rows.replace("0,0,0", "-1,-1,-1")))
+    with pytest.warns(UserWarning, match="9999, 9999, 9999 is how a lost marker is written"):
+        load_recording(write_small_recording(tmp_path / "d", markers_csv=rows.replace("0,0,0", "9999,9999,9999")))
     with pytest.raises(DataError, match="0, 0, 0 in every row of side"), contextlib.suppress(UserWarning):
         load_recording(write_small_recording(tmp_path / "b", markers_csv=rows + "0,side,0,0,0\n"))
 
