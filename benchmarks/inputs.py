@@ -4,13 +4,14 @@
 
 Seconds are of processor time. Each file is written by the format's own writer, then imported twice in a process of its own: as it is, and four times as long. The
 peak memory of both says whether it grows with the length. "Other" is the time in which another reader decodes the same frames into
-arrays without writing anything: rosbags for bags, ezc3d for C3D, Open3D for clouds and images.
+arrays without writing anything: rosbags for bags, ezc3d for C3D, Open3D for clouds, images and RealSense .bag, PyAV's packets for .mkv.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import resource
 import subprocess
 import sys
@@ -35,10 +36,11 @@ def depth_image(number: int, size: tuple[int, int]) -> np.ndarray:
     return image.astype(np.uint16)
 
 
-def write_bag(kind: str, *, clouds: bool = False) -> Callable[[Path, int, tuple[int, int]], Path]:
+def write_bag(kind: str, *, clouds: bool = False, packed: bool = False) -> Callable[[Path, int, tuple[int, int]], Path]:
     """Return a writer of bags with depth images or with clouds."""
 
     def write(folder: Path, frames: int, size: tuple[int, int]) -> Path:
+        import cv2
         from ros_writers import START_NS, STEP_NS, BagWriter
 
         path = folder / ("take.bag" if kind == "1" else "take")
@@ -52,7 +54,13 @@ def write_bag(kind: str, *, clouds: bool = False) -> Callable[[Path, int, tuple[
                     z = depth[:, :, None] * 1e-3
                     bag.write("/points", at, bag.cloud(np.concatenate([rays * z, z], axis=2).reshape(-1, 3), None, at))
                     continue
-                bag.write("/camera/depth/image_raw", at, bag.image(depth, "16UC1", at))
+                if packed:
+                    png = bytes(12) + cv2.imencode(".png", depth)[1].tobytes()
+                    bag.write(
+                        "/camera/depth/image_raw/compressedDepth", at, bag.compressed(png, "16UC1; compressedDepth png", at)
+                    )
+                else:
+                    bag.write("/camera/depth/image_raw", at, bag.image(depth, "16UC1", at))
                 bag.write("/camera/depth/camera_info", at, bag.info(at, lens=lens, size=size))
         return path
 
@@ -94,21 +102,104 @@ def write_tum(folder: Path, frames: int, size: tuple[int, int]) -> Path:
     return folder
 
 
-def write_plys(folder: Path, frames: int, size: tuple[int, int]) -> Path:
-    import open3d as o3d
+def write_sdk(ending: str) -> Callable[[Path, int, tuple[int, int]], Path]:
+    """Return a writer of 64 × 48 images with the RealSense SDK's recorder; its colour images are registered on reading."""
 
-    points = np.random.default_rng(0).random((size[0] * size[1] // 4, 3))
+    def write(folder: Path, frames: int, size: tuple[int, int]) -> Path:
+        script, path = ROOT / "tests/support/realsense_writer.py", folder / f"take.{ending}"
+        environment = dict(os.environ)
+        if ending == "bag":  # only SDKs up to 2.57 write it: one goes into a folder of its own
+            old = folder.parent / "old-sdk"
+            command = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--target", old, "pyrealsense2==2.57.7.10387"]
+            if not old.is_dir():
+                subprocess.run(command, check=True, capture_output=True)
+            environment["PYTHONPATH"] = str(old)
+        subprocess.run([sys.executable, script, path, str(frames)], check=True, capture_output=True, env=environment)
+        return path
+
+    return write
+
+
+def write_clouds(ending: str) -> Callable[[Path, int, tuple[int, int]], Path]:
+    """Return a writer of clouds of a quarter of an image's pixels."""
+
+    def write(folder: Path, frames: int, size: tuple[int, int]) -> Path:
+        import open3d as o3d
+
+        points = np.random.default_rng(0).random((size[0] * size[1] // 4, 3))
+        for k in range(frames):
+            file, moved = folder / f"{k / 30:.6f}.{ending}", points + 1e-3 * k
+            if ending == "npz":
+                np.savez(file, points=moved)
+            elif ending == "xyz":
+                np.savetxt(file, moved, fmt="%.6f")
+            else:
+                o3d.io.write_point_cloud(str(file), o3d.geometry.PointCloud(o3d.utility.Vector3dVector(moved)))
+        return folder
+
+    return write
+
+
+def write_mkv(folder: Path, frames: int, size: tuple[int, int]) -> Path:
+    """Write depth of the binned wide view, 512 × 512, and colours of 1280 × 720 as an Azure Kinect records them."""
+    from kinect_writer import write_kinect
+
+    depths = [depth_image(k % 8, (512, 512)) for k in range(8)]
+    row, column = np.mgrid[:720, :1280]
+    colors = [np.stack([column // 5, row // 3, np.full(row.shape, 20 * k)], axis=2).astype(np.uint8) for k in range(8)]
+    return write_kinect(
+        folder / "take.mkv", [depths[k % 8] for k in range(frames)], [colors[k % 8] for k in range(frames)], late_ms=1
+    )
+
+
+def write_redwood(folder: Path, frames: int, size: tuple[int, int]) -> Path:
+    """Write depth/ and color/ with names that are times in microseconds."""
+    import cv2
+
+    rng = np.random.default_rng(0)
+    colors = [
+        np.kron(rng.integers(0, 255, (size[1] // 8, size[0] // 8, 3)), np.ones((8, 8, 1))).astype(np.uint8) for _ in range(4)
+    ]
+    for name in ("depth", "color"):
+        (folder / name).mkdir()
     for k in range(frames):
-        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points + 1e-3 * k))
-        o3d.io.write_point_cloud(str(folder / f"{k / 30:.6f}.ply"), cloud)
+        name = f"{k:07d}-{int(1e6 * k / 30):012d}"
+        cv2.imwrite(str(folder / f"depth/{name}.png"), depth_image(k % 8, size))
+        cv2.imwrite(str(folder / f"color/{name}.jpg"), colors[k % 4])
+    lens = {"width": size[0], "height": size[1], "intrinsic_matrix": [500, 0, 0, 0, 500, 0, size[0] / 2, size[1] / 2, 1]}
+    (folder / "camera_intrinsic.json").write_text(json.dumps(lens))
     return folder
 
 
-def write_sdk(folder: Path, frames: int, size: tuple[int, int]) -> Path:
-    """Write 64 × 48 images with the RealSense SDK's recorder; its colour images are registered on reading."""
-    script = ROOT / "tests/support/realsense_writer.py"
-    subprocess.run([sys.executable, script, folder / "take.db3", str(frames)], check=True, capture_output=True)
-    return folder / "take.db3"
+def write_export(program: str) -> Callable[[Path, int, tuple[int, int]], Path]:
+    """Return a writer of exports of twelve markers as Motive and Nexus lay them out."""
+
+    def write(folder: Path, frames: int, size: tuple[int, int]) -> Path:
+        rows = np.random.default_rng(0).normal(size=(40 * frames, 36))
+        names = [f"M{i}" for i in range(12) for _ in "xyz"]
+        axes = ["X", "Y", "Z"] * 12
+        if program == "motive":
+            about = "Format Version,1.23,Take Name,a,Capture Frame Rate,200,Export Frame Rate,200,Rotation Type,Quaternion,Length Units,Millimeters"
+            kinds = [
+                ["", *row] for row in (["Type", *["Marker"] * 36], ["Name", *names], ["ID", *names], ["", *["Position"] * 36])
+            ]
+            head = [about, "", *map(",".join, kinds), ",".join(["Frame", "Time (Seconds)", *axes])]
+            begin = [f"{k},{0.005 * k:.6f}" for k in range(len(rows))]
+        else:
+            spread = [name if j % 3 == 0 else "" for j, name in enumerate(names)]
+            head = [
+                "Trajectories",
+                "200",
+                ",".join(["", "", *spread]),
+                ",".join(["Frame", "Sub Frame", *axes]),
+                ",".join(["", "", *["mm"] * 36]),
+            ]
+            begin = [f"{k},0" for k in range(len(rows))]
+        lines = [f"{start}," + ",".join(f"{value:.6f}" for value in row) for start, row in zip(begin, rows)]
+        (folder / "take.csv").write_text("\n".join([*head, *lines]) + "\n")
+        return folder / "take.csv"
+
+    return write
 
 
 def read_rosbags(path: Path) -> int:
@@ -125,14 +216,37 @@ def read_ezc3d(path: Path) -> int:
     return int(ezc3d.c3d(str(path))["data"]["points"].shape[2])
 
 
-def read_pandas_like(path: Path) -> int:
+def read_table(path: Path) -> int:
     return len(np.loadtxt(path, delimiter=",", skiprows=1))
+
+
+def read_sdk_bag(path: Path) -> int:
+    """Read with Open3D's reader of RealSense files."""
+    import open3d as o3d
+
+    reader = o3d.t.io.RGBDVideoReader.create(str(path))
+    done = 0
+    while not reader.is_eof():
+        done += len(np.asarray(reader.next_frame().depth)) > 0
+    return done
+
+
+def read_av(path: Path) -> int:
+    import av
+
+    with av.open(str(path)) as file:
+        return sum(len(bytes(packet)) > 0 for packet in file.demux(file.streams.video[0]) if packet.size)
+
+
+def read_numpy(path: Path) -> int:
+    return sum(len(np.load(file)["points"]) > 0 for file in path.glob("*.npz"))
 
 
 def read_open3d(path: Path) -> int:
     import open3d as o3d
 
-    images, clouds = sorted(path.glob("depth/*.png")), sorted(path.glob("*.ply"))
+    images = sorted(path.glob("depth/*.png"))
+    clouds = sorted(file for file in path.iterdir() if file.suffix in (".ply", ".pcd", ".xyz"))
     done = sum(len(np.asarray(o3d.io.read_image(str(file)))) > 0 for file in images)
     return done + sum(len(o3d.io.read_point_cloud(str(file)).points) > 0 for file in clouds)
 
@@ -142,11 +256,20 @@ FORMATS: dict[str, tuple[str, Callable[..., Path], Callable[[Path], int] | None,
     "rosbag2 db3": ("rosbags", write_bag("sqlite3"), read_rosbags, {}),
     "mcap": ("rosbags", write_bag("mcap"), read_rosbags, {}),
     "mcap clouds": ("rosbags", write_bag("mcap", clouds=True), read_rosbags, {}),
-    "realsense db3": ("SDK 2.58+", write_sdk, None, {}),
+    "mcap compressedDepth": ("rosbags", write_bag("mcap", packed=True), read_rosbags, {}),
+    "realsense bag": ("SDK 2.57", write_sdk("bag"), read_sdk_bag, {}),
+    "realsense db3": ("SDK 2.58+", write_sdk("db3"), None, {}),
+    "kinect mkv": ("PyAV", write_mkv, read_av, {}),
     "tum": ("cv2", write_tum, read_open3d, {}),
-    "ply": ("Open3D", write_plys, read_open3d, {"unit": "m"}),
+    "redwood": ("cv2", write_redwood, read_open3d, {}),
+    "ply": ("Open3D", write_clouds("ply"), read_open3d, {"unit": "m"}),
+    "pcd": ("Open3D", write_clouds("pcd"), read_open3d, {"unit": "m"}),
+    "xyz": ("NumPy", write_clouds("xyz"), read_open3d, {"unit": "m"}),
+    "npz": ("NumPy", write_clouds("npz"), read_numpy, {"unit": "m"}),
     "c3d": ("ezc3d", write_c3d, read_ezc3d, {}),
-    "csv": ("NumPy", write_csv, read_pandas_like, {"unit": "mm"}),
+    "optitrack csv": ("its layout", write_export("motive"), None, {}),
+    "vicon csv": ("its layout", write_export("nexus"), None, {}),
+    "csv": ("NumPy", write_csv, read_table, {"unit": "mm"}),
 }
 """Name → writer's name, writer, another reader, options of the import."""
 

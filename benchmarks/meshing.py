@@ -1,10 +1,13 @@
 """femsense mesh on surfaces of many triangles and on spoilt ones: the table of docs/meshing.md.
 
-python benchmarks/meshing.py
+python benchmarks/meshing.py [WORD …]
+
+With words only the surfaces whose names contain one of them.
 """
 
 from __future__ import annotations
 
+import sys
 import time
 import warnings
 from collections.abc import Callable
@@ -23,6 +26,8 @@ def main() -> None:
     print("| surface | triangles | tetrahedra | radius ratio, worst / median | from the surface | s | done |")
     print("|---|---|---|---|---|---|---|")
     for name, make, options in CASES:
+        if len(sys.argv) > 1 and not any(word in name for word in sys.argv[1:]):
+            continue
         mesh = make()
         began = time.perf_counter()
         try:
@@ -78,6 +83,42 @@ def tube() -> Any:
     return trimesh.Trimesh(whole.vertices, whole.faces[np.abs(whole.face_normals[:, 2]) < 0.5], process=False)
 
 
+def thin_walled() -> Any:
+    """Return a tube of 100 mm, 20 mm across, with a wall of 0.8 mm."""
+    return trimesh.creation.annulus(9.2, 10.0, 100, sections=64)
+
+
+def threaded() -> Any:
+    """Return a rod of 50 mm, 16 mm across, with 14 turns of a thread 1.2 mm high."""
+    z, angle = np.linspace(0, 50, 281)[:, None], np.linspace(0, 2 * np.pi, 48, endpoint=False)[None]
+    turn = (14 * z / 50 - angle / (2 * np.pi)) % 1
+    radius = 8 + 1.2 * (1 - np.abs(2 * turn - 1)) * np.clip(np.minimum(z, 50 - z) / 2, 0, 1)
+    points = np.stack([radius * np.cos(angle), radius * np.sin(angle), z + 0 * radius], axis=2).reshape(-1, 3)
+    low = (48 * np.arange(280)[:, None] + np.arange(48)).ravel()
+    beside = (48 * np.arange(280)[:, None] + (np.arange(48) + 1) % 48).ravel()
+    sides = np.vstack([np.column_stack([low, beside, beside + 48]), np.column_stack([low, beside + 48, low + 48])])
+    rim, after, n = np.arange(48), (np.arange(48) + 1) % 48, len(points)
+    ends = np.vstack(
+        [np.column_stack([after, rim, np.full(48, n)]), np.column_stack([n - 48 + rim, n - 48 + after, np.full(48, n + 1)])]
+    )
+    return trimesh.Trimesh(np.vstack([points, [[0, 0, 0], [0, 0, 50]]]), np.vstack([sides, ends]), process=False)
+
+
+def lettered() -> Any:
+    """Return a block with raised bars of 0.6 mm, as letters have."""
+    bars = [
+        trimesh.creation.box((1.2, 8, 1.6), trimesh.transformations.translation_matrix((x, 0, 10))) for x in range(-20, 21, 5)
+    ]
+    return trimesh.util.concatenate([trimesh.creation.box((100, 20, 20)), *bars])
+
+
+def noisy() -> Any:
+    """Return a ring of 500 000 triangles with noise of a third of an edge, as scans have."""
+    ring = trimesh.creation.torus(60, 20, major_sections=1000, minor_sections=250)
+    noise = np.random.default_rng(1).normal(0, 0.3 * ring.edges_unique_length.mean(), (len(ring.vertices), 1))
+    return trimesh.Trimesh(ring.vertices + noise * ring.vertex_normals, ring.faces, process=False)
+
+
 CASES: tuple[tuple[str, Callable[[], Any], dict[str, Any]], ...] = (
     ("capsule", lambda: trimesh.creation.capsule(80, 12, count=[48, 48]), {}),
     ("the same, finer", lambda: trimesh.creation.capsule(80, 12, count=[48, 48]), {"most_tets": 8000}),
@@ -87,6 +128,11 @@ CASES: tuple[tuple[str, Callable[[], Any], dict[str, Any]], ...] = (
     ("open tube", tube, {}),
     ("open tube, --close-holes", tube, {"close_holes": True}),
     ("very fine", wavy, {}),
+    ("a wall of 0.8 mm", thin_walled, {}),
+    ("the same, --max-tets 2000", thin_walled, {"most_tets": 2000}),
+    ("raised letters", lettered, {}),
+    ("a thread", threaded, {}),
+    ("a noisy scan", noisy, {}),
 )
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ from typing import Any
 
 import femsense
 from femsense.core.errors import InputError
+from femsense.io.files import check_target, followed
 from femsense.io.importers.actuation import read_actuation_log
 from femsense.io.importers.frames import UNITS, Options
 from femsense.io.importers.guess import open_sources, split_name
@@ -94,7 +95,8 @@ def import_into(
         InputError: whatever is wrong with the capture, or another thing at this place.
     """
     _check_options(options, inputs, zero)
-    final = Path(folder)
+    check_target(folder, folder=True)
+    final = followed(folder)
     identity = _identity(paths, options, inputs, zero, actuation, offset)
     known = _standing(final, identity, again)
     if known is not None:
@@ -194,7 +196,7 @@ def _state(path: Path) -> list[Any]:
 
 def _standing(final: Path, identity: Mapping[str, Any], again: bool) -> dict[str, Any] | None:
     """Return what an earlier import of the same says; None where there is none. Raises InputError where something else stands."""
-    if not final.exists() and not final.is_symlink():
+    if not final.exists():
         return None
     if final.is_dir() and not any(final.iterdir()):
         return None

@@ -42,7 +42,7 @@ def write_beside(path: str | Path) -> Iterator[Path]:
         with _through(Path(path)) as part:
             yield part
         return
-    final = _followed(path)
+    final = followed(path)
     _check_writable(final)
     part = final.with_name(f"{PART_PREFIX}{secrets.token_hex(4)}-{final.name}")
     try:
@@ -63,7 +63,7 @@ def check_target(path: str | Path, *, folder: bool) -> None:
         if folder:
             raise _wrong_kind(path, "a device or a pipe", "a folder")
         return
-    final = _followed(path)
+    final = followed(path)
     nearest = next(place for place in (final, *final.parents) if place.exists())
     if nearest != final and not nearest.is_dir():
         raise _wrong_kind(nearest, "a file", "a folder")
@@ -100,7 +100,7 @@ def _through(final: Path) -> Iterator[Path]:
             raise _refusal(final, error.strerror or "an error of the system") from None
 
 
-def _followed(path: str | Path) -> Path:
+def followed(path: str | Path) -> Path:
     """Return where a path leads, links followed, with its parent made."""
     final = Path(path).absolute()
     return final.resolve() if final.is_symlink() else final

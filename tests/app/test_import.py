@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import stat
 import subprocess
 import sys
 import time
@@ -182,3 +184,19 @@ def test_inspect_knows_a_video_of_depth(tmp_path: Path, capsys: pytest.CaptureFi
     file = write_kinect(tmp_path / "take.mkv", [np.full((288, 320), 900, dtype=np.uint16)])
     status, report = answer(capsys, "inspect", file)
     assert status == 0 and (report["kind"], report["format"]) == ("capture", "kinect")
+
+
+def test_links_are_followed_and_devices_refused(table: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "real").mkdir()
+    words = ("--unit", "mm", "--inputs", "tension")
+    for name, target in (("link", "real"), ("new", "later")):
+        (tmp_path / name).symlink_to(tmp_path / target)
+        assert answer(capsys, "import", table, "-o", tmp_path / name, *words)[0] == 0
+        assert (tmp_path / name).is_symlink() and (tmp_path / target / "recording.toml").is_file()
+        assert answer(capsys, "import", table, "-o", tmp_path / name, *words, "--again")[0] == 0
+        assert (tmp_path / name).is_symlink() and not list(tmp_path.glob(".part*"))
+    os.mkfifo(tmp_path / "pipe")
+    for place in ("/dev/null", tmp_path / "pipe", table):
+        assert run(["import", str(table), "-o", str(place), *words]) == 2
+        assert "stands" in capsys.readouterr().err
+    assert stat.S_ISFIFO((tmp_path / "pipe").stat().st_mode) and table.read_text() == ROWS

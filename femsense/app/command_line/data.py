@@ -128,7 +128,16 @@ def mesh(
         ),
     ] = None,
     size: Annotated[float | None, typer.Option("--size", metavar="MM", help="Wanted edge length.", show_default=False)] = None,
-    most: Annotated[int, typer.Option("--max-tets", metavar="N", min=6, help="Not more tetrahedra than this.")] = 2000,
+    most: Annotated[
+        int | None,
+        typer.Option(
+            "--max-tets",
+            metavar="N",
+            min=6,
+            help="Not more tetrahedra than this (2000; more for thin walls).",
+            show_default=False,
+        ),
+    ] = None,
     tolerance: Annotated[
         float | None,
         typer.Option("--tolerance", metavar="MM", help="How far the mesh may leave the surface.", show_default=False),
@@ -156,12 +165,12 @@ def mesh(
     return Answer(document, text)
 
 
-def _line_mesh(source: Path, output: Path, *, size: float | None, most: int, again: bool) -> Answer:
+def _line_mesh(source: Path, output: Path, *, size: float | None, most: int | None, again: bool) -> Answer:
     """Make a robot of a line with radii."""
     from femsense.io.meshing.robot_from_line import line_into, line_text
 
     with progress_bar("mesh") as progress:
-        document = line_into(output, source, most_tets=most, along_mm=size, say=say, again=again, progress=progress)
+        document = line_into(output, source, most_tets=most or 2000, along_mm=size, say=say, again=again, progress=progress)
     return Answer(document, f"{line_text(document)}\n\nwritten: {output}\nlook at it: femsense inspect {output}")
 
 

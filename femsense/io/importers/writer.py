@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from femsense.core.errors import InputError
-from femsense.io.files import PART_PREFIX, write_csv, write_json, write_toml
+from femsense.io.files import PART_PREFIX, followed, write_csv, write_json, write_toml
 from femsense.io.importers.actuation import ActuationLog, align
 from femsense.io.importers.frames import Frame, Images, Lens, Source
 from femsense.io.importers.journal import JOURNAL, Entry, Journal, Seen
@@ -60,7 +60,7 @@ def write_recording(
     Raises:
         InputError: no frames, none of the pictures readable, columns whose meaning nobody said.
     """
-    final = Path(folder).absolute()
+    final = followed(folder)
     part = final.with_name(f"{PART_PREFIX}import-{final.name}")
     _prepare(part, identity)
     with Journal(part, identity) as journal:

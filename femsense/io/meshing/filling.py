@@ -16,11 +16,18 @@ from femsense.fem.mesh_checks import check_mesh, hinged_parts
 from femsense.io.mesh_files import radius_ratio
 from femsense.io.meshing.surface import ClosedSurface, repaired, shared_edges
 from femsense.io.meshing.surface_queries import crossing_triangles, distance_to
-from femsense.io.meshing.tetrahedra import FILL_SECONDS, tetrahedralise
+from femsense.io.meshing.tetrahedra import FILL_SECONDS, Unfinished, tetrahedralise
 from femsense.io.meshing.thinning import thinned
 from femsense.io.robot_body import PER_METRE
 
 MOST_TETS = 2000
+"""Wanted where nobody says how many …"""
+ENOUGH_TETS = 8000
+"""… and taken where a body with thin walls or fine detail cannot be filled with fewer."""
+SETTLED = 0.9
+"""Longer edges that leave more than this share of the tetrahedra will not bring fewer: walls and detail set their number."""
+COARSER = 2.0
+"""After a filling that was stopped early, the mesh may leave the surface so many times farther, with edges so much longer."""
 ENVELOPE_OF_EDGE = 0.04
 """The mesh may leave the surface by this share of an edge, if nothing else is asked for …"""
 LARGEST_ENVELOPE = 0.01
@@ -61,8 +68,8 @@ class MeshOptions:
     """Of the surface file: "m", "cm" or "mm"; required."""
     size_mm: float | None = None
     """Wanted edge length; by default from `most_tets`."""
-    most_tets: int = MOST_TETS
-    """Not more tetrahedra than this."""
+    most_tets: int | None = None
+    """Not more tetrahedra than this; where nobody says, MOST_TETS, or up to ENOUGH_TETS where the body needs them."""
     tolerance_mm: float | None = None
     """How far the mesh may leave the surface; by default a share of the edge length."""
     element: str = "tet10"
@@ -128,40 +135,65 @@ def fill(
             f"{walls} edges have more than two triangles (walls inside, or bodies that touch there): what lies inside was filled"
         )
         surface = replace(surface, done=(*surface.done, note))
-    edge, began, thin = _first_edge(surface, options), time.monotonic(), surface
+    return _of_wanted_size(surface, options, where, crosses=crossing + walls > 0, tell=tell, mesher=mesher)
+
+
+def _of_wanted_size(
+    surface: ClosedSurface, options: MeshOptions, where: str, *, crosses: bool, tell: Progress, mesher: Mesher
+) -> Filled:
+    """Fill a mended surface, with longer edges until the number of tetrahedra fits, and anew where an element is flat."""
+    wanted = options.most_tets or MOST_TETS
+    edge, began, thin, rough = _first_edge(surface, options), time.monotonic(), surface, 1.0
+    fits: Filled | None = None
+    fewest: Filled | None = None
     for attempt in range(TRIES):
-        left = MOST_SECONDS - (time.monotonic() - began)
-        seconds = min(left, FILL_SECONDS)
+        seconds = min(MOST_SECONDS - (time.monotonic() - began), FILL_SECONDS)
         tell(f"filling, edges of {1e3 * edge:.2g} mm, try {attempt + 1}, {seconds / 60:.0f} min at most")
-        filled, thin = _fill_once(
-            surface, thin, edge, options, where, crosses=crossing + walls > 0, seconds=seconds, mesher=mesher
-        )
+        try:
+            filled, thin = _fill_once(
+                surface, thin, edge, options, where, rough=rough, crosses=crosses, seconds=seconds, mesher=mesher
+            )
+        except Unfinished:
+            if fits or fewest:
+                break
+            if rough > 1.0 or options.tolerance_mm is not None:
+                raise
+            note = (
+                f"edges of {1e3 * edge:.2g} mm did not come to an end in {seconds:.0f} s: longer ones, farther from the surface"
+            )
+            edge, rough, surface = COARSER * edge, COARSER, replace(surface, done=(*surface.done, note))
+            thin = surface
+            continue
         count = len(filled.mesh.tets)
-        poor = radius_ratio(filled.mesh).min() < POOR
         slow = time.monotonic() - began > 0.5 * MOST_SECONDS  # another try might not come to an end
-        if count <= options.most_tets and (not poor or slow or attempt == TRIES - 1):
-            return filled
-        if slow:
+        if count <= wanted:
+            fits = filled
+            if slow or radius_ratio(filled.mesh).min() >= POOR:
+                break
+            continue
+        settled = fewest is not None and count > SETTLED * len(fewest.mesh.tets)
+        fewest = filled if fewest is None or count < len(fewest.mesh.tets) else fewest
+        if slow or settled or options.size_mm is not None:
             break
-        if count > options.most_tets:
-            if options.size_mm is not None:
-                raise _too_many(
-                    count,
-                    options,
-                    where,
-                    f"--size {1e3 * edge * (count / options.most_tets) ** (1 / 3):.3g}, or --max-tets {count}",
-                )
-            edge = min(edge * 1.08 * (count / options.most_tets) ** (1.0 / 3.0), 0.5 * surface.diagonal)
-    raise _too_many(count, options, where, f"--max-tets {count}, or a larger --tolerance")
+        edge = min(edge * 1.08 * (count / wanted) ** (1.0 / 3.0), 0.5 * surface.diagonal)
+    return _best(fits, fewest, options, where)
 
 
-def _too_many(count: int, options: MeshOptions, where: str, hint: str) -> InputError:
-    return InputError(
-        "more tetrahedra than wanted",
-        where=where,
-        found=f"{count}",
-        expected=f"--max-tets {options.most_tets} at most",
-        hint=hint,
+def _best(fits: Filled | None, fewest: Filled | None, options: MeshOptions, where: str) -> Filled:
+    """Return what has few enough tetrahedra, or where nobody said how many, what has as few as the body lets it. Raises InputError."""
+    if fits is not None:
+        return fits
+    assert fewest is not None
+    count, wanted = len(fewest.mesh.tets), options.most_tets or MOST_TETS
+    if options.most_tets is None and count <= ENOUGH_TETS:
+        note = f"{count} tetrahedra rather than {wanted}: thin walls or fine detail ask for them, and what follows takes longer"
+        asked = options.size_mm is not None
+        return fewest if asked else replace(fewest, done=(*fewest.done, note))
+    hint = f"--max-tets {count}, or a larger --tolerance"
+    if options.size_mm is not None:
+        hint = f"--size {options.size_mm * (count / wanted) ** (1 / 3):.3g}, or --max-tets {count}"
+    raise InputError(
+        "more tetrahedra than wanted", where=where, found=f"{count}", expected=f"--max-tets {wanted} at most", hint=hint
     )
 
 
@@ -169,7 +201,7 @@ def _first_edge(surface: ClosedSurface, options: MeshOptions) -> float:
     """Return the edge length to begin with [m]: as wanted, or such that regular tetrahedra fill the volume."""
     if options.size_mm is not None:
         return 1e-3 * options.size_mm
-    return float(np.cbrt(6.0 * np.sqrt(2.0) * surface.volume / (0.6 * options.most_tets)))
+    return float(np.cbrt(6.0 * np.sqrt(2.0) * surface.volume / (0.6 * (options.most_tets or MOST_TETS))))
 
 
 def _fill_once(
@@ -179,6 +211,7 @@ def _fill_once(
     options: MeshOptions,
     where: str,
     *,
+    rough: float,
     crosses: bool,
     seconds: float,
     mesher: Mesher,
@@ -186,7 +219,7 @@ def _fill_once(
     """Return what was filled, and the thinned surface that the next try goes on from."""
     diagonal = surface.diagonal
     given = options.tolerance_mm
-    tolerance = 1e-3 * given if given is not None else min(ENVELOPE_OF_EDGE * edge, LARGEST_ENVELOPE * diagonal)
+    tolerance = 1e-3 * given if given is not None else min(ENVELOPE_OF_EDGE * edge, rough * LARGEST_ENVELOPE * diagonal)
     thin, drifted = thinned(surface, tolerance=0.5 * tolerance, start=thinner)
     made = mesher(
         np.array(thin.points),

@@ -40,6 +40,10 @@ ENVELOPE = 1e-3
 """How far a mesh made from a surface may leave it, over the diagonal of its bounding box."""
 
 
+class Unfinished(InputError):
+    """A filling that was stopped early."""
+
+
 def tetrahedralise(
     points: FloatArray,
     triangles: IntArray,
@@ -172,7 +176,7 @@ def _run_ftetwild(
         try:
             made = run_program(program, folder=folder, makes="tets.npz", seconds=seconds)
         except ProgramTimeout:
-            raise InputError(
+            raise Unfinished(
                 "fTetWild did not come to an end",
                 where=where,
                 found=f"{len(triangles)} triangles, stopped early after {seconds:.0f} s",

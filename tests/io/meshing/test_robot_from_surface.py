@@ -225,6 +225,45 @@ def test_a_wanted_size_that_gives_too_many_says_what_would_do(quick: Blocks) -> 
     assert "--size 6.46" in str(error.value) and len(quick.calls) == 1 and "--max-tets 67500" in str(error.value)
 
 
+class Walls:
+    """A mesher of a body whose walls ask for so many tetrahedra however long the edges are."""
+
+    def __init__(self, *cells: tuple[int, int, int]) -> None:
+        self.left, self.calls = list(cells), 0
+
+    def __call__(self, points: np.ndarray, triangles: np.ndarray, **options: Any) -> TetMesh:
+        self.calls += 1
+        cells = self.left.pop(0) if len(self.left) > 1 else self.left[0]
+        return block_mesh(cells, np.ptp(points, axis=0), start=points.min(axis=0))
+
+
+def test_thin_walls_get_the_tetrahedra_that_they_ask_for_unless_somebody_says_how_many() -> None:
+    points, triangles = np.array(BOX.vertices), np.array(BOX.faces)
+    walls = Walls((12, 8, 8), (11, 8, 8))  # 4608, then 4224: longer edges bring hardly fewer
+    filled = fill(points, triangles, MeshOptions(unit="mm"), mesher=walls)
+    assert len(filled.mesh.tets) == 6 * 11 * 8 * 8 and walls.calls == 2
+    assert any("4224 tetrahedra rather than 2000" in note for note in filled.done)
+    with pytest.raises(InputError, match="more tetrahedra than wanted") as error:
+        fill(points, triangles, MeshOptions(unit="mm", most_tets=2000), mesher=Walls((12, 8, 8)))
+    assert "--max-tets 4608" in str(error.value)
+    with pytest.raises(InputError, match="more tetrahedra than wanted"):
+        fill(points, triangles, MeshOptions(unit="mm"), mesher=Walls((20, 12, 12)))
+
+
+def test_what_does_not_end_is_tried_once_more_with_longer_edges(quick: Blocks) -> None:
+    edges: list[float] = []
+
+    def endless(points: np.ndarray, triangles: np.ndarray, **options: Any) -> TetMesh:
+        edges.append(options["edge_fraction"])
+        if len(edges) < 2:
+            raise tetrahedra.Unfinished("fTetWild did not come to an end")
+        return quick(points, triangles, **options)
+
+    filled = fill(np.array(BOX.vertices), np.array(BOX.faces), MeshOptions(unit="mm"), mesher=endless)
+    assert edges[1] == pytest.approx(2.0 * edges[0])
+    assert any("did not come to an end" in note for note in filled.done)
+
+
 def test_the_envelope_follows_the_size_or_is_given(quick: Blocks) -> None:
     box = trimesh.creation.box((100, 30, 30))
     for options in (MeshOptions(unit="mm", size_mm=10.0), MeshOptions(unit="mm", size_mm=10.0, tolerance_mm=0.2)):
