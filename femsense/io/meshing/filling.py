@@ -26,6 +26,8 @@ ENOUGH_TETS = 8000
 """… and taken where a body with thin walls or fine detail cannot be filled with fewer."""
 SETTLED = 0.9
 """Longer edges that leave more than this share of the tetrahedra will not bring fewer: walls and detail set their number."""
+ASTRAY = 3.0
+"""A mesh so many times farther from the surface than it may be has lost a part of the body."""
 COARSER = 2.0
 """After a filling that was stopped early, the mesh may leave the surface so many times farther, with edges so much longer."""
 ENVELOPE_OF_EDGE = 0.04
@@ -40,6 +42,10 @@ POOR = 0.05
 LOOSE = 1e-3
 """Tetrahedra that hang loose and hold less than this share of the volume are left out."""
 Progress = Callable[..., None]
+
+
+class Lost(InputError):
+    """A filling that left a part of the body out."""
 
 
 class Mesher(Protocol):
@@ -153,10 +159,10 @@ def _of_wanted_size(
             filled, thin = _fill_once(
                 surface, thin, edge, options, where, rough=rough, crosses=crosses, seconds=seconds, mesher=mesher
             )
-        except Unfinished:
+        except (Unfinished, Lost) as problem:
             if fits or fewest:
                 break
-            if rough > 1.0 or options.tolerance_mm is not None:
+            if isinstance(problem, Lost) or rough > 1.0 or options.tolerance_mm is not None:
                 raise
             note = (
                 f"edges of {1e3 * edge:.2g} mm did not come to an end in {seconds:.0f} s: longer ones, farther from the surface"
@@ -221,17 +227,26 @@ def _fill_once(
     given = options.tolerance_mm
     tolerance = 1e-3 * given if given is not None else min(ENVELOPE_OF_EDGE * edge, rough * LARGEST_ENVELOPE * diagonal)
     thin, drifted = thinned(surface, tolerance=0.5 * tolerance, start=thinner)
+    envelope = _envelope(drifted, tolerance, diagonal, given is not None)
     made = mesher(
         np.array(thin.points),
         np.array(thin.triangles),
         edge_fraction=edge / diagonal,
-        envelope=_envelope(drifted, tolerance, diagonal, given is not None) / diagonal,
+        envelope=envelope / diagonal,
         where=where,
         check_volume=not crosses,
         seconds=seconds,
     )
     mesh, notes = _one_body(made, where)
     deviation = _deviation(mesh, surface, crosses)
+    if deviation > ASTRAY * max(tolerance, drifted + envelope):
+        raise Lost(
+            "a part of the body was lost: its walls are thinner than the mesh may leave the surface",
+            where=where,
+            found=f"{1e3 * deviation:.2g} mm from the surface",
+            expected=f"{1e3 * max(tolerance, drifted + envelope):.2g} mm at most",
+            hint="a smaller --size, or a --tolerance of a third of the wall, and a larger --max-tets",
+        )
     return Filled(mesh, 1e3 * edge, 1e3 * tolerance, 1e3 * deviation, (*thin.done, *_rougher(drifted, tolerance), *notes)), thin
 
 

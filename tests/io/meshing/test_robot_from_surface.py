@@ -250,6 +250,15 @@ def test_thin_walls_get_the_tetrahedra_that_they_ask_for_unless_somebody_says_ho
         fill(points, triangles, MeshOptions(unit="mm"), mesher=Walls((20, 12, 12)))
 
 
+def test_a_mesh_without_a_part_of_the_body_is_no_mesh_of_it() -> None:
+    whole, half = (block_mesh((12, 8, 8), (size, 0.03, 0.03), start=(-0.05, -0.015, -0.015)) for size in (0.1, 0.05))
+    points, triangles = np.array(BOX.vertices), np.array(BOX.faces)
+    with pytest.raises(InputError, match="a part of the body was lost"):
+        fill(points, triangles, MeshOptions(unit="mm"), mesher=made_before(half))
+    filled = fill(points, triangles, MeshOptions(unit="mm"), mesher=made_before(whole, half))
+    assert len(filled.mesh.tets) == len(whole.tets)
+
+
 def test_what_does_not_end_is_tried_once_more_with_longer_edges(quick: Blocks) -> None:
     edges: list[float] = []
 
