@@ -19,6 +19,7 @@ PER_CIRCLE = 24
 SECONDS = 300.0
 """Gmsh is stopped after this time."""
 GMSH = """
+import sys
 import numpy as np, gmsh
 path, unit, per_circle = sys.argv[1:]
 gmsh.initialize(interruptible=False)
