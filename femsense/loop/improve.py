@@ -27,15 +27,16 @@ from femsense.loop.fit.discretisation_error import make_finer
 from femsense.loop.result.loop_result import UNEXPLAINED, LoopResult
 from femsense.loop.result.records import RefitRecord
 from femsense.loop.search.calibration import calibrated, with_discretisation_error
-from femsense.loop.search.element_order import need_quadratic, seeks_with_quadratic, with_quadratic
+from femsense.loop.search.element_order import linear_suffice, need_quadratic, seeks_with_quadratic, with_quadratic
 from femsense.loop.search.search import distinguishes_effects, search_begun, search_effects
 from femsense.loop.search.search_state import Progress, Search, SearchProgress
 from femsense.loop.search.some_states import in_all_states, some_states
 from femsense.loop.thresholds import DEFAULTS, EFFORT, Effort, Thresholds
 from femsense.loop.verdict.empirical import judged_correction
 from femsense.loop.verdict.verdict import conclude
+from femsense.loop.work_plan import ALL_STATES, CALIBRATION, SEARCH, VERDICT, WorkPlan
 from femsense.model.effects import EFFECTS, FORMS, Effect, find_effect, forms_by_recording, load_own_effect, try_own_effect
-from femsense.model.recording import Recording
+from femsense.model.recording import Recording, state_key
 from femsense.model.robot import Robot
 
 MOST_STEPS = 3
@@ -82,17 +83,18 @@ def improve(
         validation: data to judge on; by default whole sweeps of the recordings are held out.
         effects: names to try; by default all.
         without: names to leave out.
-        progress: told what is going on.
+        progress: told what is going on, how much of the work is done, and about how long the rest takes; again every few seconds.
         options: effects of one's own, what is used of a recording, and how it is computed.
 
     Raises:
         InputError: unknown names, no recording; DataError: the data do not allow a fit.
     """
-    say, how = progress or (lambda text: None), options or ImproveOptions()
+    say, how = WorkPlan(progress or (lambda text: None)), options or ImproveOptions()
     names, forms = _asked(robot, recordings, effects, without, how)
     rng = np.random.default_rng(how.seed)
-    with Checkpoint(how.keep, forms) as checkpoint:
+    with Checkpoint(how.keep, forms) as checkpoint, say.watching():
         data, search = _search(robot, recordings, validation, (names, forms), how, checkpoint, say)
+        say.plan([VERDICT], states_of(data), quadratic=data.robot.body.mesh.is_quadratic)
         say("testing what is left")
         result = conclude(data, search, rng)
         record = next_experiment(data, search.final, search.noise, result.confounded, result.not_testable)
@@ -122,7 +124,7 @@ def search_recordings(
     how = options or ImproveOptions()
     names, forms = _asked(robot, recordings, effects, without, how)
     with Checkpoint(how.keep, forms) as checkpoint:
-        return _search(robot, recordings, validation, (names, forms), how, checkpoint, lambda text: None)
+        return _search(robot, recordings, validation, (names, forms), how, checkpoint, WorkPlan(lambda text: None))
 
 
 def _asked(
@@ -150,7 +152,7 @@ def _search(
     asked: tuple[list[str], tuple[Effect, ...]],
     how: ImproveOptions,
     checkpoint: Checkpoint,
-    say: Progress,
+    say: WorkPlan,
 ) -> tuple[Data, Search]:
     names, forms = asked
 
@@ -159,34 +161,59 @@ def _search(
             data, before, start = calibrated(data, say)
             finer_is_made()
         data = with_discretisation_error(data, start[-1][1], names, say)
+        say.next_stage()
         return search_begun((data, before, start), names, refits, quadratic=quadratic)
 
-    def ready(body: Robot, names: Sequence[str], *, quadratic: bool, refits: list[RefitRecord]) -> SearchProgress:
+    def prepared(body: Robot) -> Data:
         say("reading and calibrating")
         every = prepare(body, recordings, validation, how.measured)
-        every = replace(every, forms=forms, declared=robot, thresholds=how.thresholds, effort=how.effort)
+        return replace(every, forms=forms, declared=robot, thresholds=how.thresholds, effort=how.effort)
+
+    def ready(every: Data, names: Sequence[str], *, quadratic: bool, refits: list[RefitRecord]) -> SearchProgress:
+        elements, whole = {"quadratic": every.robot.body.mesh.is_quadratic}, states_of(every)
         some = some_states(every)
         with contextlib.suppress(FemsenseError):  # what has no equilibrium in all states is sought in all of them
             if some is not None:
+                say.plan([CALIBRATION, SEARCH, ALL_STATES, VERDICT], states_of(some), **elements)
                 course = begun(some, names, quadratic, refits)
-                return in_all_states(every, course, search_effects(course, Checkpoint(None), say)[1], say)
+                search = search_effects(course, Checkpoint(None), say)[1]
+                say.plan([ALL_STATES, SEARCH, VERDICT], whole, **elements)
+                course = in_all_states(every, course, search, say)
+                say.next_stage()
+                return course
+        say.plan([CALIBRATION, SEARCH, VERDICT], whole, **elements)
         return begun(every, names, quadratic, refits)
 
-    return _searched(robot, names, ready, checkpoint, say)
+    return _searched(robot, names, prepared, ready, checkpoint, say)
 
 
 def _searched(
-    robot: Robot, names: list[str], ready: Callable[..., SearchProgress], checkpoint: Checkpoint, say: Progress
+    robot: Robot,
+    names: list[str],
+    prepared: Callable[[Robot], Data],
+    ready: Callable[..., SearchProgress],
+    checkpoint: Checkpoint,
+    say: WorkPlan,
 ) -> tuple[Data, Search]:
     """Return the data with what a search finds in them: on quadratic elements where the robot declares linear ones and the data miss those, else on what
     is declared. One that was killed goes on where it was."""
     refits: list[RefitRecord] = []
+    asks = seeks_with_quadratic(robot, names)
     kept = checkpoint.kept(SearchProgress)
     if kept is not None:
         say(f"going on where it stopped (effects found: {kept.found})")
-    if seeks_with_quadratic(robot, names) and (kept is None or kept.quadratic):
+    if asks and kept is None:
+        data = prepared(robot)
+        say.plan([CALIBRATION, SEARCH], states_of(data), quadratic=False)
+        say("asking whether linear elements suffice")
+        record = linear_suffice(data)
+        if record is not None:
+            names = [name for name in names if name != MESH.name]
+            course = ready(replace(data, mesh_as_shown=True), names, quadratic=False, refits=[record])
+            return search_effects(course, checkpoint, say)
+    if asks and (kept is None or kept.quadratic):
         with contextlib.suppress(FemsenseError):  # linear elements lock, and converge where quadratic ones fold
-            course = kept or ready(with_quadratic(robot), names, quadratic=True, refits=[])
+            course = kept or ready(prepared(with_quadratic(robot)), names, quadratic=True, refits=[])
             data, search = search_effects(course, checkpoint, say)
             say("asking whether quadratic elements are needed")
             needed, refits = need_quadratic(data, search, names)
@@ -194,7 +221,12 @@ def _searched(
                 return data, replace(search, refits=[*refits, *search.refits])
             names = [name for name in names if name != MESH.name]
         kept = None
-    return search_effects(kept or ready(robot, names, quadratic=False, refits=refits), checkpoint, say)
+    return search_effects(kept or ready(prepared(robot), names, quadratic=False, refits=refits), checkpoint, say)
+
+
+def states_of(data: Data) -> int:
+    """Return how many different states are fitted."""
+    return len({state_key(t.scene.recording, int(k)) for t in data.train for k in t.scene.frames})
 
 
 def _get_ready(robot: Robot, names: Sequence[str]) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import DataError
 from femsense.core.parallel import each
+from femsense.core.work import count
 from femsense.fem.body import BodyModel
 from femsense.fem.cables import bend_angles
 from femsense.fem.capstan import capstan_tensions
@@ -76,13 +77,17 @@ def solve_path(
     todo = list(range(max(wanted) + 1)) if wanted and any(has_history(w.robot) for w in (driven, *variants)) else wanted
     alike = _alike(driven, todo, past)
     unique = [k for k in todo if alike[k] == k]
-    bases = dict(zip(unique, _base_states(driven, unique, starts, past, rough, solver.equilibrium)))
+    bases: dict[int, Equilibrium] = {}
+    for k, state in zip(unique, _base_states(driven, unique, starts, past, rough, solver.equilibrium)):
+        bases[k] = state
+        count(equilibria=1)
     seen = {k: ties(driven.robot).positions(bases[k].positions) for k in {alike[k]: None for k in wanted}}
     others = {k: np.zeros((len(variants), *seen[alike[k]].shape)) for k in wanted}
     lent = {k: s.factor for k, s in (starts or {}).items() if k in bases and s.positions is bases[k].positions}
     observed = Variants(driven, variants, {k: bases[alike[k]] for k in todo}, alike, others, ties, lent, answers, solver)
     room = room_for_factor(len(unique))
     for k, factor in observed.write():
+        count(responses=1)
         plain = factor.plain if isinstance(factor, Refined) else factor
         if plain is not None and starts is not None and plain.bytes < most_lent(starts[k], room):
             starts[k] = replace(starts[k], factor=plain)

@@ -42,6 +42,9 @@ def progress_bar(title: str) -> Iterator[Callable[..., None] | None]:
             if isinstance(done, int):
                 bar.update(task, completed=done, total=total, description=title, count=f"{done}/{total}")
                 return
+            if bar.tasks[-1].total is None:
+                bar.update(task, description=done)
+                return
             bar.remove_task(task)  # an update cannot take a total away
             task = bar.add_task(done, total=None, count="")
 

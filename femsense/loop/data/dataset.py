@@ -69,6 +69,8 @@ class Data:
     """Frame numbers and names of markers that are left out because they are far from where others let expect them."""
     mesh_note: str = ""
     """Why the discretisation error is not known; empty where it is."""
+    mesh_as_shown: bool = False
+    """Whether the discretisation error counts by how much of it the data show, since they have shown that the declared mesh suffices."""
     thresholds: Thresholds = DEFAULTS
     """What decides."""
     effort: Effort = EFFORT

@@ -15,6 +15,7 @@ from femsense.fem.mesh import TetMesh
 from femsense.model.observation import Scene
 
 if TYPE_CHECKING:
+    from femsense.loop.data.representative_states import Sampled
     from femsense.loop.data.surface_rows import MeasuredSurface
 
 
@@ -140,6 +141,8 @@ class Trial:
     """States of earlier evaluations, frame by frame, for each mesh."""
     mesh_error: FloatArray | None = None
     """Fields of what a finer mesh would move the markers by [m], shape (k, c, b); each counts as noise of its size (`loop.fit.discretisation_error`)."""
+    mesh_moves: Sampled | None = None
+    """By how much a finer mesh moves the robot's markers in the states in which that was computed [m], each (m, 3)."""
     together: bool = False
     """Whether these are the clouds of the recording whose markers are the trial before: pose and initial inputs are shared."""
     seen: MeasuredSurface | None = None

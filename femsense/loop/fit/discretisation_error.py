@@ -11,57 +11,144 @@ from __future__ import annotations
 import contextlib
 import functools
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import DataError, FemsenseError
 from femsense.core.parallel import each
+from femsense.core.work import count
 from femsense.fem.body import BodyModel
 from femsense.fem.mesh import Embedding, TetMesh, embed_points
 from femsense.loop.data.dataset import MESH, Data
-from femsense.loop.data.representative_states import between, representatives, state_vectors
+from femsense.loop.data.representative_states import Sampled, drive_table, ranges, representatives, state_vectors
 from femsense.loop.data.trial import Trial, normals_of, rms_of
 from femsense.loop.fit.fitted_model import FittedModel, poses_and_inputs, some_terms
 from femsense.loop.fit.noise_components import Noise, whiten
 from femsense.loop.thresholds import Thresholds
 from femsense.model.drive import DrivenRobot, drive_of
 from femsense.model.finer_mesh import finer_state, share_on_finer
-from femsense.model.observation import placements
+from femsense.model.observation import SceneJet, placements
 from femsense.model.quasi_static_path import solve_path
+from femsense.model.recording import Recording
 from femsense.model.remeshing import finer_mesh, robot_on_mesh
 from femsense.model.robot import Robot
 
 MOST_TETS = 24000
 """A finer mesh than this takes too long in every state."""
 MOST_WORK = 100_000
-"""Tetrahedra × states of a recording; beyond it the errors of other states are interpolated between those that were computed."""
+"""Tetrahedra × states; beyond it the errors of other states are interpolated between those that were computed."""
 PULLING = "cables", "cable_slots"
 """What of a body only tells how its cables pull."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Part:
+    """What is asked of one recording."""
+
+    trials: list[Trial]
+    poses: Sequence[FloatArray]
+    initial: FloatArray | None
+
+    @property
+    def recording(self) -> Recording:
+        return self.trials[0].scene.recording
+
+    @property
+    def frames(self) -> IntArray:
+        """The frames of all trials, ascending."""
+        return np.unique(np.concatenate([t.scene.frames for t in self.trials]))
+
+    @property
+    def drives(self) -> FloatArray:
+        return drive_table(self.recording, self.frames)
+
+    @property
+    def kind(self) -> int:
+        """The same for recordings whose states lie between each other's: known inputs, and as many numbers that drive them."""
+        apart = self.initial is not None or any(t.scene.crossings is not None for t in self.trials)
+        return -id(self) if apart else self.drives.shape[1]
 
 
 def with_mesh_errors(data: Data, fitted: FittedModel, tried: Sequence[str]) -> Data:
     """Return the data with the error of the mesh at a fitted model; with a note why not where the mesh is huge, or linear and `discretisation` among
     the effects that are tried, or where no state settles on a finer one."""
     robot = fitted.fit.hypothesis.robot_at(fitted.fit.coordinates)
-    train, held, known = list(data.train), list(data.held), poses_and_inputs(data, fitted.fit)
+    alike: dict[int, list[_Part]] = {}
+    for part in _parts(data, fitted):
+        alike.setdefault(part.kind, []).append(part)
     try:
         finer = _finer(robot.body.mesh, tried)
         if finer is None:
             return replace(data, mesh_note=_why_not(robot.body.mesh, tried))
         fine = on_its_clamp(robot, robot_on_mesh(_on_firm_clamp(robot), finer))
-        for i, (trial, (poses, initial)) in enumerate(zip(data.train, known)):
-            own = [j for j, of in enumerate(data.held_of) if of == i]
-            train[i], *later = _with_errors(data, robot, fine, [trial, *(held[j] for j in own)], poses, initial)
-            for j, one in zip(own, later):
-                held[j] = one
-        for j in (j for j, of in enumerate(data.held_of) if of is None):
-            held[j] = _with_errors(data, robot, fine, [held[j]], held[j].poses, held[j].initial)[0]
+        sampled = [(part, moves) for parts in alike.values() for moves in [_moves(robot, fine, parts)] for part in parts]
     except FemsenseError as error:
         known_before = bool(mesh_errors(data))
         return data if known_before else replace(data, mesh_note=f"no state settles on a finer mesh ({error})")
-    return replace(data, train=train, held=held, mesh_note="")
+    moves_of = {id(trial): moves for part, moves in sampled for trial in part.trials}
+    train, held = ([replace(t, mesh_moves=moves_of[id(t)]) for t in trials] for trials in (data.train, data.held))
+    return _by_moves(replace(data, train=train, held=held, mesh_note=""), fitted)
+
+
+def with_mesh_errors_of(data: Data, some: Data, fitted: FittedModel) -> Data:
+    """Return the data with the error of the mesh that was computed in some of their states, in between in the others."""
+    train, held = (
+        [replace(t, mesh_moves=s.mesh_moves) for t, s in zip(trials, known)]
+        for trials, known in ((data.train, some.train), (data.held, some.held))
+    )
+    return _by_moves(replace(data, train=train, held=held, mesh_note=some.mesh_note), fitted)
+
+
+def as_shown(data: Data, fitted: FittedModel) -> Data:
+    """Return the data with so much of the error of the mesh as a fitted model leaves of it, where that is asked (`Data.mesh_as_shown`): what experience says of
+    other bodies is too much where calibration has shown that the mesh errs by little."""
+    errors = mesh_errors(data)
+    if not data.mesh_as_shown or not errors:
+        return data
+    shares = np.concatenate([_shares(t, jet, error) for t, jet, error in zip(data.train, fitted.fit.jets, errors)])
+    decides = data.thresholds
+    size = max(float(abs(shares.mean())) / decides.mesh_share, float(shares.std()) / decides.mesh_varies)
+    train, held = (
+        [replace(t, mesh_error=None if t.mesh_error is None else min(size, 1.0) * t.mesh_error) for t in trials]
+        for trials in (data.train, data.held)
+    )
+    return replace(data, train=train, held=held)
+
+
+def _shares(trial: Trial, jet: SceneJet, error: FloatArray) -> FloatArray:
+    """Return how much of the mesh's error (k, c) a residual holds in each sweep beside what calibration moves, shape (s,)."""
+    moves = np.concatenate([jet.by_pose, jet.by_initial, jet.by_effect], axis=2).reshape(error.size, -1)
+    number = np.unique(trial.groups.sweep, return_inverse=True)[1]
+    own = np.zeros((*error.shape, int(number.max()) + 1))
+    own[np.arange(len(error)), :, number] = error
+    columns = np.hstack([moves, own.reshape(error.size, -1)])
+    size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    answer = np.linalg.lstsq(columns / size, jet.residual.ravel(), rcond=1e-9)[0] / size
+    return np.asarray(answer[moves.shape[1] :])
+
+
+def _parts(data: Data, fitted: FittedModel) -> list[_Part]:
+    """Return the trials, with what is held out of a recording beside what is fitted of it."""
+    parts = [
+        _Part([trial, *(h for h, of in zip(data.held, data.held_of) if of == i)], poses, initial)
+        for i, (trial, (poses, initial)) in enumerate(zip(data.train, poses_and_inputs(data, fitted.fit)))
+    ]
+    return parts + [_Part([h], h.poses, h.initial) for h, of in zip(data.held, data.held_of) if of is None]
+
+
+def _by_moves(data: Data, fitted: FittedModel) -> Data:
+    """Return the data with the fields of the mesh's error, from what its moves are in some of the states."""
+    errors = {
+        id(trial): None
+        if trial.mesh_moves is None
+        else _by_sweep(trial, trial.mesh_moves.at(part.drives), part.frames, part.poses, data.thresholds)
+        for part in _parts(data, fitted)
+        for trial in part.trials
+    }
+    train, held = ([replace(t, mesh_error=errors[id(t)]) for t in trials] for trials in (data.train, data.held))
+    return replace(data, train=train, held=held)
 
 
 def errs_alike(data: Data, before: FittedModel, after: FittedModel) -> bool:
@@ -134,20 +221,12 @@ def _ties(mesh: TetMesh, fine: TetMesh) -> Embedding:
     return embed_points(mesh, fine.nodes)
 
 
-def _with_errors(
-    data: Data, robot: Robot, fine: Robot, trials: Sequence[Trial], poses: Sequence[FloatArray], initial: FloatArray | None
-) -> list[Trial]:
-    """Return trials of one recording with the error of the mesh in their states."""
-    moves = _moves(robot, fine, trials, placements(robot, trials[0].scene, poses), initial)
-    return [replace(t, mesh_error=_by_sweep(t, moves, poses, data.thresholds)) for t in trials]
-
-
-def _by_sweep(trial: Trial, moves: dict[int, FloatArray], poses: Sequence[FloatArray], decides: Thresholds) -> FloatArray:
-    """Return the fields of the error [m], shape (k, c, 1 + sweeps + 9), each of one standard deviation.
+def _by_sweep(trial: Trial, moves: FloatArray, frames: IntArray, poses: Sequence[FloatArray], decides: Thresholds) -> FloatArray:
+    """Return the fields of the error [m], shape (k, c, 1 + sweeps + 9), each of one standard deviation; moves (f, m, 3) are those of the frames (f,).
 
     Shares of the error of all sweeps together, of that of each sweep, and of each of its axes along each axis.
     """
-    error = np.array([moves[int(f)][m] for f, m in zip(trial.scene.frame, trial.scene.marker)])
+    error = moves[np.searchsorted(frames, trial.scene.frame), trial.scene.marker]
     along = np.broadcast_to(np.eye(3), (len(error), 3, 3))  # (k, c, axis)
     if trial.scene.crossings is not None:
         along = normals_of(trial.scene, poses)[:, None, :]
@@ -173,41 +252,45 @@ def representative_frames(trial: Trial, tets: int) -> IntArray:
     return np.asarray(frames[np.sort(_chosen(state_vectors(trial.scene.recording, frames), 8 * tets))])
 
 
-def _moves(
-    robot: Robot, fine: Robot, trials: Sequence[Trial], places: FloatArray, initial: FloatArray | None
-) -> dict[int, FloatArray]:
-    """Return by how much the finer mesh moves the markers in each frame [m], (m, 3)."""
-    recording, starts = trials[0].scene.recording, trials[0].starts_on(robot.body.mesh)
-    coarse_driven = DrivenRobot(robot, drive_of(robot, recording, initial=initial))
-    fine_driven = DrivenRobot(fine, drive_of(fine, recording, initial=initial))
-    ties = _ties(robot.body.mesh, fine.body.mesh)
+def _moves(robot: Robot, fine: Robot, parts: Sequence[_Part]) -> Sampled:
+    """Return by how much the finer mesh moves the markers [m], (m, 3), in some of the states of recordings. Raises DataError."""
     share_on_finer(fine.body)
-    here, there = robot.tie_markers(places), fine.tie_markers(places)
-    frames = np.unique(np.concatenate([t.scene.frames for t in trials]))
-    vectors = state_vectors(recording, frames)
-    chosen = _chosen(vectors, len(fine.body.mesh.tets))
-    path = solve_path(coarse_driven, frames[chosen].tolist(), lambda r: r.markers[:0], starts=starts)
-    states = {k: state for k, state, _, _ in path}
-    known, settled = [], []
+    table = np.vstack([part.drives for part in parts])
+    vectors, owner = (table - table[0]) / ranges(table), np.repeat(np.arange(len(parts)), [len(part.frames) for part in parts])
+    chosen = np.zeros(len(table), dtype=bool)
+    chosen[_chosen(vectors, len(fine.body.mesh.tets))] = True
+    found = [_moves_in(robot, fine, part, part.frames[chosen[owner == i]]) for i, part in enumerate(parts)]
+    drives = np.vstack([drive_table(part.recording, frames) for part, (frames, _) in zip(parts, found)])
+    if not len(drives):
+        raise DataError("no state settles on the finer mesh")
+    return Sampled(drives, np.concatenate([moves for _, moves in found]), ranges(table))
 
-    def finer_at(i: int) -> FloatArray | None:
-        k = int(frames[i])
+
+def _moves_in(robot: Robot, fine: Robot, part: _Part, frames: IntArray) -> tuple[IntArray, FloatArray]:
+    """Return the frames, of these, that settle on the finer mesh, and by how much that moves the markers in each [m], (n, m, 3)."""
+    recording, starts = part.recording, part.trials[0].starts_on(robot.body.mesh)
+    places = placements(robot, part.trials[0].scene, part.poses)
+    coarse_driven = DrivenRobot(robot, drive_of(robot, recording, initial=part.initial))
+    fine_driven = DrivenRobot(fine, drive_of(fine, recording, initial=part.initial))
+    ties, here, there = _ties(robot.body.mesh, fine.body.mesh), robot.tie_markers(places), fine.tie_markers(places)
+    states = {k: state for k, state, _, _ in solve_path(coarse_driven, frames.tolist(), lambda r: r.markers[:0], starts=starts)}
+
+    def finer_at(k: int) -> FloatArray | None:
         try:
             return finer_state(coarse_driven, fine_driven, k, states[k], ties)
         except FemsenseError:  # it folds there
             return None
 
-    for i, finer in zip(chosen, each(finer_at, chosen)):
+    moves: dict[int, FloatArray] = {}
+    for k, finer in zip(frames.tolist(), each(finer_at, frames.tolist())):
+        count(refined=1)
         if finer is not None:
-            settled.append(i)
-            known.append(there.positions(finer) - here.positions(states[int(frames[i])].positions))
-    if not known:
-        raise DataError("no state settles on the finer mesh")
-    return dict(zip(frames.tolist(), between(vectors, settled, np.array(known))))
+            moves[k] = there.positions(finer) - here.positions(states[k].positions)
+    return np.array(list(moves), dtype=np.int64), np.array(list(moves.values())).reshape(len(moves), len(here), 3)
 
 
 def _chosen(vectors: FloatArray, tets: int) -> list[int]:
-    """Return indices of the states in which a finer mesh of so many elements is asked."""
+    """Return indices of distinct states in which a finer mesh of so many elements is asked."""
     return representatives(vectors, max(8, MOST_WORK // tets))
 
 

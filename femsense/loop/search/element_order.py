@@ -3,6 +3,9 @@
 Linear elements lock, which looks like a stiff body, a small Poisson's ratio, or a clamp that does not give: what is found beside them stands for
 their error as well. Whether quadratic elements of the same mesh err less is no question that data have to answer; whether these data show the
 difference is one, and it is asked when everything else is in the model.
+
+Where a recording was computed on the declared mesh, calibration alone shows that: linear elements then leave plainly less than quadratic ones. Effects are
+sought on the declared mesh, which is no worse than it shows itself, and takes a tenth of the time.
 """
 
 from __future__ import annotations
@@ -14,10 +17,12 @@ import numpy as np
 
 from femsense.core.errors import FemsenseError
 from femsense.loop.data.dataset import MESH, NUISANCE, QUADRATIC, Data
+from femsense.loop.data.representative_states import spread_states
 from femsense.loop.fit.fitted_model import FittedModel, fit_model, span_of
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.result.records import NAMED, PASSES, RefitRecord
 from femsense.loop.search.acceptance import acceptance_test
+from femsense.loop.search.calibration import START, calibrated_on, calibrated_pose
 from femsense.loop.search.refit import FORGONE, beyond
 from femsense.loop.search.screening import Candidate, penalty
 from femsense.loop.search.search_state import Search, no_equilibrium
@@ -27,6 +32,11 @@ from femsense.model.robot import Robot
 
 STEPS = 6
 """Steps of a fit that tries refined linear elements."""
+ASKED = 12
+"""States of a recording in which both kinds of elements are calibrated."""
+PLAINLY = 0.5
+"""Linear elements suffice where they leave less than this share of the mean square that quadratic ones leave, both calibrated. `benchmarks/distinct_states.py both`:
+0.09 and 0.11 where the truth has the declared elements, 1.1 and more where its mesh is another one."""
 
 
 def seeks_with_quadratic(robot: Robot, names: Sequence[str]) -> bool:
@@ -37,6 +47,28 @@ def seeks_with_quadratic(robot: Robot, names: Sequence[str]) -> bool:
 def with_quadratic(robot: Robot) -> Robot:
     """Return a robot with quadratic elements."""
     return MESH.apply(robot, QUADRATIC)
+
+
+def linear_suffice(data: Data) -> RefitRecord | None:
+    """Return what became of quadratic elements where linear ones, calibrated as they are, leave plainly less in some of the states; None where they do not, and
+    of clouds, whose rows depend on the mesh.
+
+    Arguments:
+        data: on the declared mesh.
+    """
+    if "clouds" in data.measured:
+        return None
+    part = replace(data, train=[t.part(spread_states(t, ASKED)[0]) for t in data.train], held=[], held_of=[])
+    try:
+        base = calibrated_on(part, data.robot, calibrated_pose(part, data.robot, START))
+    except FemsenseError:
+        return None
+    try:
+        quadratic, linear = calibrated_on(part, with_quadratic(data.robot), base).fit.rms, base.fit.rms
+    except FemsenseError as error:
+        return RefitRecord(MESH.name, QUADRATIC, no_equilibrium(error), step=1)
+    left = f"in some of the states they leave {1e3 * quadratic:.2f} mm, linear ones {1e3 * linear:.2f} mm, both calibrated"
+    return RefitRecord(MESH.name, QUADRATIC, left, step=1) if linear**2 < PLAINLY * quadratic**2 else None
 
 
 def need_quadratic(data: Data, search: Search, names: Sequence[str]) -> tuple[bool, list[RefitRecord]]:

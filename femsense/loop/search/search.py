@@ -10,7 +10,7 @@ import numpy as np
 from femsense.core.errors import FemsenseError
 from femsense.io.checkpoint import Checkpoint
 from femsense.loop.data.dataset import Data
-from femsense.loop.fit.discretisation_error import errs_alike, with_mesh_errors
+from femsense.loop.fit.discretisation_error import as_shown, errs_alike, with_mesh_errors
 from femsense.loop.fit.fitted_model import FittedModel, weighed
 from femsense.loop.fit.marker_placement import with_turning_placements
 from femsense.loop.fit.noise_components import Noise
@@ -105,7 +105,7 @@ def _take_step(course: SearchProgress, say: Progress) -> None:
     anew = moved_by(fitted, winner) > discretisation_rms(data, fitted, whole=True) and not errs_alike(data, fitted, winner)
     fitted = prune(data, winner, noise, n_effective, say)
     history = [*history, (name, fitted)]
-    data = with_turning_placements(with_mesh_errors(data, fitted, names) if anew else data, fitted)
+    data = with_turning_placements(as_shown(with_mesh_errors(data, fitted, names), fitted) if anew else data, fitted)
     found_so = history
     history, refits = swapped(data, history, refits, noise, n_effective, say)
     if history is not found_so:

@@ -16,13 +16,13 @@ from femsense.core.errors import FemsenseError
 from femsense.loop.data.dataset import Data
 from femsense.loop.data.outliers import without_outliers
 from femsense.loop.data.representative_states import spread_states
-from femsense.loop.fit.discretisation_error import with_mesh_errors
+from femsense.loop.fit.discretisation_error import as_shown, with_mesh_errors_of
 from femsense.loop.fit.fitted_model import FittedModel
 from femsense.loop.fit.marker_placement import with_turning_placements
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.result.records import NAMED, RefitRecord
 from femsense.loop.search.acceptance import acceptance_test
-from femsense.loop.search.calibration import START, calibrated_pose, fitted_again, with_discretisation_error
+from femsense.loop.search.calibration import START, calibrated_pose, fitted_again
 from femsense.loop.search.screening import Candidate
 from femsense.loop.search.search_state import Progress, Search, SearchProgress, no_equilibrium
 from femsense.model.drive import has_history
@@ -75,7 +75,7 @@ def in_all_states(every: Data, course: SearchProgress, search: Search, say: Prog
     while (fewer := _without_outliers(data, fitted[-1])) is not data:
         data, fitted = fewer, [fitted_again(fewer, model, noise) for model in fitted]
     before = calibrated_pose(data, data.robot_as_declared, START)
-    data = with_discretisation_error(data, fitted[-1], course.names, say)
+    data = with_turning_placements(as_shown(with_mesh_errors_of(data, course.data, fitted[-1]), fitted[-1]), fitted[-1])
     base = fitted_again(data, fitted[-1], noise, known=fitted[-1].fit.jets)
     history = [(name, model) for (name, _), model in zip(search.history, [*fitted[:-1], base])]
     refits, over = list(search.refits), False
@@ -85,7 +85,7 @@ def in_all_states(every: Data, course: SearchProgress, search: Search, say: Prog
             break
     last = history[-1][1]
     if len(history) > given:
-        data = with_turning_placements(with_mesh_errors(data, last, course.names), last)
+        data = with_turning_placements(data, last)
     return SearchProgress(
         data,
         data,

@@ -1,0 +1,48 @@
+"""Work that is counted as it is done: it tells how far a computation is, and does not depend on the machine."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
+
+
+@dataclass(slots=True)
+class Work:
+    """How much was done, in states."""
+
+    equilibria: int = 0
+    """Equilibria that were solved."""
+    responses: int = 0
+    """Linear responses of states to whatever was asked of them at once."""
+    refined: int = 0
+    """States that were continued on a finer mesh."""
+
+
+_counting: ContextVar[tuple[tuple[Work, Callable[[], None] | None], ...]] = ContextVar("counting", default=())
+
+
+@contextmanager
+def counting(tell: Callable[[], None] | None = None) -> Iterator[Work]:
+    """Yield what counts the work that this thread does meanwhile, that of its helpers included.
+
+    Arguments:
+        tell: called after whatever was counted.
+    """
+    work = Work()
+    token = _counting.set((*_counting.get(), (work, tell)))
+    try:
+        yield work
+    finally:
+        _counting.reset(token)
+
+
+def count(*, equilibria: int = 0, responses: int = 0, refined: int = 0) -> None:
+    """Count work that was done, wherever somebody does (`counting`)."""
+    for work, tell in _counting.get():
+        work.equilibria += equilibria
+        work.responses += responses
+        work.refined += refined
+        if tell is not None:
+            tell()
