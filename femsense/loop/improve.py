@@ -31,10 +31,10 @@ from femsense.loop.search.element_order import linear_suffice, need_quadratic, s
 from femsense.loop.search.search import distinguishes_effects, search_begun, search_effects
 from femsense.loop.search.search_state import Progress, Search, SearchProgress
 from femsense.loop.search.some_states import in_all_states, some_states
+from femsense.loop.search.work_plan import ALL_STATES, CALIBRATION, SEARCH, VERDICT, WorkPlan
 from femsense.loop.thresholds import DEFAULTS, EFFORT, Effort, Thresholds
 from femsense.loop.verdict.empirical import judged_correction
 from femsense.loop.verdict.verdict import conclude
-from femsense.loop.work_plan import ALL_STATES, CALIBRATION, SEARCH, VERDICT, WorkPlan
 from femsense.model.effects import EFFECTS, FORMS, Effect, find_effect, forms_by_recording, load_own_effect, try_own_effect
 from femsense.model.recording import Recording, state_key
 from femsense.model.robot import Robot

@@ -15,7 +15,7 @@ from femsense.fem.mesh import TetMesh
 from femsense.model.observation import Scene
 
 if TYPE_CHECKING:
-    from femsense.loop.data.representative_states import Sampled
+    from femsense.loop.data.sampled_states import Sampled
     from femsense.loop.data.surface_rows import MeasuredSurface
 
 

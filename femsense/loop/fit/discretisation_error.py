@@ -22,7 +22,8 @@ from femsense.core.work import count
 from femsense.fem.body import BodyModel
 from femsense.fem.mesh import Embedding, TetMesh, embed_points
 from femsense.loop.data.dataset import MESH, Data
-from femsense.loop.data.representative_states import Sampled, drive_table, ranges, representatives, state_vectors
+from femsense.loop.data.representative_states import representatives, state_vectors
+from femsense.loop.data.sampled_states import Sampled, drive_table, ranges
 from femsense.loop.data.trial import Trial, normals_of, rms_of
 from femsense.loop.fit.fitted_model import FittedModel, poses_and_inputs, some_terms
 from femsense.loop.fit.noise_components import Noise, whiten

@@ -11,7 +11,8 @@ from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import DataError, FemsenseError
 from femsense.fem.mesh import embed_points
 from femsense.loop.data.dataset import NUISANCE, Data
-from femsense.loop.data.representative_states import between, representatives, spread_states, state_vectors
+from femsense.loop.data.representative_states import representatives, spread_states, state_vectors
+from femsense.loop.data.sampled_states import between
 from femsense.loop.data.trial import States, Trial, spans_of
 from femsense.loop.fit.fitted_model import FittedModel
 from femsense.loop.fit.joint_fit import JointFit, JointProblem, Prior

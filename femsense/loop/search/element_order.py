@@ -35,7 +35,7 @@ STEPS = 6
 ASKED = 12
 """States of a recording in which both kinds of elements are calibrated."""
 PLAINLY = 0.5
-"""Linear elements suffice where they leave less than this share of the mean square that quadratic ones leave, both calibrated. `benchmarks/distinct_states.py both`:
+"""Linear elements suffice where they leave less than this share of the mean square that quadratic ones leave, both calibrated. `benchmarks/distinct_states.py --elements`:
 0.09 and 0.11 where the truth has the declared elements, 1.1 and more where its mesh is another one."""
 
 
@@ -50,25 +50,34 @@ def with_quadratic(robot: Robot) -> Robot:
 
 
 def linear_suffice(data: Data) -> RefitRecord | None:
-    """Return what became of quadratic elements where linear ones, calibrated as they are, leave plainly less in some of the states; None where they do not, and
-    of clouds, whose rows depend on the mesh.
+    """Return what became of quadratic elements where linear ones leave plainly less in some of the states, both calibrated; None where they do not, and of
+    clouds, whose rows depend on the mesh.
 
     Arguments:
         data: on the declared mesh.
     """
     if "clouds" in data.measured:
         return None
-    part = replace(data, train=[t.part(spread_states(t, ASKED)[0]) for t in data.train], held=[], held_of=[])
     try:
-        base = calibrated_on(part, data.robot, calibrated_pose(part, data.robot, START))
+        linear, quadratic = both_calibrated(data)
     except FemsenseError:
         return None
-    try:
-        quadratic, linear = calibrated_on(part, with_quadratic(data.robot), base).fit.rms, base.fit.rms
-    except FemsenseError as error:
-        return RefitRecord(MESH.name, QUADRATIC, no_equilibrium(error), step=1)
     left = f"in some of the states they leave {1e3 * quadratic:.2f} mm, linear ones {1e3 * linear:.2f} mm, both calibrated"
     return RefitRecord(MESH.name, QUADRATIC, left, step=1) if linear**2 < PLAINLY * quadratic**2 else None
+
+
+def both_calibrated(data: Data) -> tuple[float, float]:
+    """Return what linear and quadratic elements leave [m], root mean square, each with all that calibration may move, in some of the states.
+
+    Arguments:
+        data: on the declared mesh.
+
+    Raises:
+        DataError: a kind of elements has no equilibrium there.
+    """
+    part = replace(data, train=[t.part(spread_states(t, ASKED)[0]) for t in data.train], held=[], held_of=[])
+    linear = calibrated_on(part, data.robot, calibrated_pose(part, data.robot, START))
+    return linear.fit.rms, calibrated_on(part, with_quadratic(data.robot), linear).fit.rms
 
 
 def need_quadratic(data: Data, search: Search, names: Sequence[str]) -> tuple[bool, list[RefitRecord]]:

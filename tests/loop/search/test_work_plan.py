@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from femsense.core.work import count
-from femsense.loop.work_plan import (
+from femsense.loop.search.work_plan import (
     ALL_STATES,
     CALIBRATION,
     COSTS,

@@ -1,0 +1,48 @@
+"""What was computed in some states, and what others have in between."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import RBFInterpolator
+
+from femsense.core.arrays import FloatArray, IntArray
+from femsense.model.recording import Recording
+
+
+def drive_table(recording: Recording, frames: IntArray) -> FloatArray:
+    """Return inputs, pressures, gravity and total load of each frame, shape (f, q)."""
+    load = np.zeros((len(recording.time_s), 3))
+    np.add.at(load, recording.load_frame, recording.load_forces)
+    gravity = np.zeros((len(load), 0)) if recording.gravity is None else recording.gravity
+    return np.asarray(np.hstack([recording.inputs, recording.pressures, gravity, load])[frames])
+
+
+def ranges(table: FloatArray) -> FloatArray:
+    """Return by how much each column of a table of drives (f, q) varies, shape (q,)."""
+    return np.asarray(np.maximum(np.ptp(table, axis=0), 1e-12))
+
+
+def between(vectors: FloatArray, known: Sequence[int] | IntArray, values: FloatArray) -> FloatArray:
+    """Return values of all states, shape (f, …), from those of some of them (indices `known`), shape (k, …), by how near their vectors (f, q) are."""
+    flat = RBFInterpolator(vectors[known], values.reshape(len(known), -1), kernel="linear", degree=0)(vectors)
+    return np.asarray(flat).reshape(len(vectors), *values.shape[1:])
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Sampled:
+    """What was computed in some states, and lies in between in others."""
+
+    drives: FloatArray
+    """What drives these states, shape (n, q): rows of `drive_table`."""
+    values: FloatArray
+    """Shape (n, …)."""
+    ranges: FloatArray
+    """By how much each of the drives varies in all states, shape (q,)."""
+
+    def at(self, drives: FloatArray) -> FloatArray:
+        """Return the values of states that are driven so, shape (f, …), drives of shape (f, q)."""
+        vectors = np.vstack([self.drives, drives]) / self.ranges
+        return between(vectors, np.arange(len(self.drives)), self.values)[len(self.drives) :]
