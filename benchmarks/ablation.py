@@ -1,10 +1,12 @@
-"""Which rules of the loop earn their keep: each one switched off in turn on a fixed tuning set, with paired differences to all of them.
+"""Which rules of the loop earn their keep: each one switched off in turn on a fixed tuning set,
+with paired differences to all of them.
 
     python benchmarks/ablation.py run --cases 40 --workers 2      # what is not in ablation.jsonl yet, by whole cases
     python benchmarks/ablation.py table                           # the table of what is there
     python benchmarks/ablation.py run --only swap,apart --cases 200
 
-A switch is a value of `Thresholds` or `Effort`. Rules of the verdict alone share one search. One line of the file is one case under one switch.
+A switch is a value of `Thresholds` or `Effort`. Rules of the verdict alone share one search.
+One line of the file is one case under one switch.
 """
 
 from __future__ import annotations
@@ -216,7 +218,8 @@ SCORES: dict[str, tuple[Score, float]] = {
 
 
 def table(records: Sequence[dict[str, Any]]) -> None:
-    """Print what each rule is worth: the score without it less that with all rules, in points, with a 95 % interval of the paired differences."""
+    """Print what each rule is worth: the score without it less that with all rules, in points,
+    with a 95 % interval of the paired differences."""
     done = {(r["case"], r["switch"]): r for r in records if "failed" not in r}
     base = {case: r for (case, name), r in done.items() if name == BASE.name}
     print(f"{len(base)} cases; failed: {sum('failed' in r for r in records)} of {len(records)}")

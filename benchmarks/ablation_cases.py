@@ -1,7 +1,9 @@
-"""The fixed tuning set of the ablation: cheap robots, with truths on other meshes, as of `loop_cases`, and what real recordings have besides.
+"""The fixed tuning set of the ablation: cheap robots, with truths on other meshes, as of `loop_cases`,
+and what real recordings have besides.
 
-Beside the kinds of `loop_cases` there are: an effect outside the list next to one inside (`beside`), an error of the model of 5 % of the motion
-that has no name (`no_name`), two recordings with cameras of their own (`sessions`), and tensions that are commanded, not measured (`commanded`).
+Beside the kinds of `loop_cases` there are: an effect outside the list next to one inside (`beside`),
+an error of the model of 5 % of the motion that has no name (`no_name`), two recordings with cameras of their own (`sessions`),
+and tensions that are commanded, not measured (`commanded`).
 """
 
 from __future__ import annotations

@@ -2,8 +2,9 @@
 
     python benchmarks/abuse.py [COUNT]
 
-Prints, for each kind: how the cases ended, the worst unbalanced force of converged states over the sum of their forces, the longest
-processor time. Exit status 1 if any case hangs (more than LIMIT seconds of processor time), raises anything else, or a converged state breaks a rule.
+Prints, for each kind: how the cases ended, the worst unbalanced force of converged states over the sum of their forces,
+the longest processor time. Exit status 1 if any case hangs (more than LIMIT seconds of processor time), raises anything else, or
+a converged state breaks a rule.
 """
 
 from __future__ import annotations

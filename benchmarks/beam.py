@@ -1,9 +1,11 @@
-"""A silicone beam under known weights, in motion capture: modulus, forces, the effect that the model lacks, and what six markers cannot tell.
+"""A silicone beam under known weights, in motion capture: modulus, forces, the effect that the model lacks,
+and what six markers cannot tell.
 
     python benchmarks/beam.py [FOLDER of data/beam] [--cells NX NY NZ] [--declared-mesh] [--tables | --loops]
 
-Prints every figure of docs/beam-study.md and writes its pictures into docs/pictures. The beam is made of 8 × 3 × 3 cells unless told
-otherwise; `--declared-mesh` runs the loops on the mesh that comes with the data. Tables take one frame a state: the five repeat each other.
+Prints every figure of docs/beam-study.md and writes its pictures into docs/pictures.
+The beam is made of 8 × 3 × 3 cells unless told otherwise; `--declared-mesh` runs the loops on the mesh that comes with the data.
+Tables take one frame a state: the five repeat each other.
 """
 
 from __future__ import annotations
@@ -144,7 +146,8 @@ def shown(pairs: Sequence[tuple[float, float]]) -> str:
 
 
 def sensed(beam: Beam, robot: Robot) -> list[tuple[float, float]]:
-    """Return the weights at the edge that a robot senses from the markers at 0.51 and 1.00 N: downward force and standard deviation [N]."""
+    """Return the weights at the edge that a robot senses from the markers at 0.51 and 1.00 N:
+    downward force and standard deviation [N]."""
     result = []
     for name in ("load52_a", "load101_a"):
         recording = beam.recordings[name]
@@ -247,7 +250,8 @@ def print_cause(name: str, data: Data, model: FittedModel) -> None:
 
 
 def with_tip(data: Data, shift: Sequence[float]) -> Data:
-    """Return the data as they would be, had the hand not moved the tip by a shift [m, robot frame] while rest.csv was measured."""
+    """Return the data as they would be, had the hand not moved the tip by a shift [m,
+    robot frame] while rest.csv was measured."""
 
     def moved(trial: Trial) -> Trial:
         names = [data.robot.marker_names[m] for m in trial.scene.rest_marker]
@@ -370,7 +374,8 @@ def print_meshes(beam: Beam, folder: Path) -> None:
 
 
 def print_loops(beam: Beam, folder: Path, declared_mesh: bool, cells: Sequence[int]) -> None:
-    """Print the loop without gravity, with it, and on the unloaded run alone, with the weights that each improved robot senses."""
+    """Print the loop without gravity, with it, and on the unloaded run alone,
+    with the weights that each improved robot senses."""
     names = ("robot", "robot_gravity")
     robots = {n: load_robot(folder / n) for n in names}
     if not declared_mesh:

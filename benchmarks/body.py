@@ -1,8 +1,11 @@
-"""How fast the body is: cold equilibria beside SOFA's, parts, real time, growth with the mesh. Prints the tables of docs/speed.md.
+"""How fast the body is: cold equilibria beside SOFA's, parts, real time, growth with the mesh.
+Prints the tables of docs/speed.md.
 
-    OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 python benchmarks/body.py [cold|parts|orders|crowded|frames|terms|kept|growth|iterative …] [--data FOLDER]
+    OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 python benchmarks/body.py
+    [cold|parts|orders|crowded|frames|terms|kept|growth|iterative …] [--data FOLDER]
 
-CPU time of one thread, the least of several runs (what others do on the machine only adds); SOFA's figures are those of `reference/cases.json`, measured on a like machine.
+CPU time of one thread, the least of several runs (what others do on the machine only adds); SOFA's figures are those of
+`reference/cases.json`, measured on a like machine.
 """
 
 from __future__ import annotations
@@ -184,7 +187,8 @@ Seen = tuple[dict[str, float], Tracked, np.ndarray, np.ndarray]
 
 
 def frames(data: Path) -> None:
-    """A sensing frame: tensions move on, about 1 mm of motion, then W of 51 feature normals and the cables. The rate is that of the mean.
+    """A sensing frame: tensions move on, about 1 mm of motion, then W of 51 feature normals and the cables.
+    The rate is that of the mean.
 
     The path is gone PASSES times for the time of each frame, and what the last pass saw is compared with the full solver.
     """
@@ -238,7 +242,8 @@ def show_frames(name: str, passes: np.ndarray, worst: np.ndarray, starts: list[i
 
 
 def terms(data: Path) -> None:
-    """What series of one, two and three terms leave, frames after their start: medians over ten starts, as shares of the motion of a frame."""
+    """What series of one, two and three terms leave, frames after their start: medians over ten starts,
+    as shares of the motion of a frame."""
     body, _ = diamond(data, True)
     start = Expansion(body, single=True)
     for jitter in (0.0, 0.03):
@@ -294,7 +299,8 @@ def start_anew(body: BodyModel, features: np.ndarray, seen: Seen) -> float:
 
 
 def kept(data: Path) -> None:
-    """Corrections with the factor of an earlier frame, straight and with elements that turn: what they leave, as a share of the motion."""
+    """Corrections with the factor of an earlier frame, straight and with elements that turn: what they leave,
+    as a share of the motion."""
     for quadratic in (False, True):
         body, _ = diamond(data, quadratic)
         inputs = [along_the_way(k, len(body.cables)) for k in range(4)]
@@ -319,7 +325,8 @@ def kept(data: Path) -> None:
 
 
 def crowded(data: Path) -> None:
-    """The factor of the solid bar of `data/beam` with one and two threads of BLAS, on a machine as it is and with another program on one core."""
+    """The factor of the solid bar of `data/beam` with one and two threads of BLAS,
+    on a machine as it is and with another program on one core."""
     body = load_robot(data / "beam" / "robot").body
     state = solve_equilibrium(body)
     blocks = internal(body, state.positions).blocks

@@ -1,9 +1,10 @@
-"""Calibration from anything, against its truth: markers with and without names, clouds alone, one and two cameras, wrong labels, a real tentacle.
+"""Calibration from anything, against its truth: markers with and without names, clouds alone, one and two cameras,
+wrong labels, a real tentacle.
 
     python benchmarks/calibration.py [PART …] [--seeds N]
 
-Parts: bound, nowhere, clouds, labels, tentacle, rate; all where none is named. Recordings come from a finer mesh with another law than the one that
-calibrates. Prints every figure of docs/calibration.md.
+Parts: bound, nowhere, clouds, labels, tentacle, rate; all where none is named.
+Recordings come from a finer mesh with another law than the one that calibrates. Prints every figure of docs/calibration.md.
 """
 
 from __future__ import annotations

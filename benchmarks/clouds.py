@@ -79,7 +79,8 @@ STANDS = {
 
 
 def script_of(name: str, case: str, seed: int) -> dict[str, Any]:
-    """Return the script of a case, with a seed of its noise and a depth image in every frame; what the demo's script says of camera and markers."""
+    """Return the script of a case, with a seed of its noise and a depth image in every frame;
+    what the demo's script says of camera and markers."""
     script = tomllib.loads((_folder("four-leg") / "demo_script.toml").read_text(encoding="utf-8"))
     script |= {
         "contacts": [],

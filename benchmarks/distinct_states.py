@@ -4,11 +4,13 @@
     python benchmarks/distinct_states.py arm-1 --limit 900
     python benchmarks/distinct_states.py --elements          # what both kinds of elements leave, calibrated
 
-Cases of ../shared/data/other-program were made by another program: an arm of 24 × 24 × 120 mm, 1536 linear tetrahedra, four routed cables. The
-diamonds are made here: `../shared/data/diamond`, 4147 linear tetrahedra declared, with markers on its arms. Their truth is on those same elements
-(`diamond`, with a hidden gain `diamond-gain`), or on quadratic ones with another law (`diamond-quadratic`). Each has 60 fitted and 60 validation frames, all different.
+Cases of ../shared/data/other-program were made by another program: an arm of 24 × 24 × 120 mm, 1536 linear tetrahedra,
+four routed cables. The diamonds are made here: `../shared/data/diamond`, 4147 linear tetrahedra declared, with markers on its
+arms. Their truth is on those same elements (`diamond`, with a hidden gain `diamond-gain`), or on quadratic ones with another law
+(`diamond-quadratic`). Each has 60 fitted and 60 validation frames, all different.
 
-Each case is a process of its own, with threads as they come; its stages are printed with the time and the processor time at which they began.
+Each case is a process of its own, with threads as they come;
+its stages are printed with the time and the processor time at which they began.
 """
 
 from __future__ import annotations

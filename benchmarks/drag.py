@@ -2,8 +2,8 @@
 
     python benchmarks/drag.py
 
-The model is a bar of few elements; the robot has another mesh, a neo-Hookean law and a modulus 15 % higher. The target is where two tensions bring the
-robot. Measurements are noisy by 0.1 mm along each axis.
+The model is a bar of few elements; the robot has another mesh, a neo-Hookean law and a modulus 15 % higher.
+The target is where two tensions bring the robot. Measurements are noisy by 0.1 mm along each axis.
 """
 
 # ruff: noqa: E402

@@ -4,10 +4,11 @@
     python benchmarks/effects.py --table [NAME …]      # the tables of what is done
     options: --folder DIR   where results stand (effects-runs); --limit S   seconds a case may take (1500); --again
 
-Truth is made by the virtual rig on a finer mesh than the declared arm, with its own integrators of friction and creep in small steps,
-a modulus that is off by up to 20 %, an unknown camera pose, and markers with noise of 0.1 mm beside errors of 0.2 mm in where they are
-glued. Of each case: is what is hidden named, how far is its size off, does the 95 % interval hold the truth, what was it taken for; then
-the improved robot goes through the other commands, and `improve` is asked again, on the same recording and on a fresh one of the same arm.
+Truth is made by the virtual rig on a finer mesh than the declared arm,
+with its own integrators of friction and creep in small steps, a modulus that is off by up to 20 %, an unknown camera pose, and
+markers with noise of 0.1 mm beside errors of 0.2 mm in where they are glued. Of each case: is what is hidden named, how far is
+its size off, does the 95 % interval hold the truth, what was it taken for; then the improved robot goes through the other
+commands, and `improve` is asked again, on the same recording and on a fresh one of the same arm.
 """
 
 from __future__ import annotations

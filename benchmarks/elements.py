@@ -3,7 +3,8 @@
 Prints the tables of docs/elements.md. Small displacements, written with scipy beside the package's own elements, so that elements
 which the package does not have stand in the same table; its default is compared with its own row of them. The diamond is the
 one of the data folder beside the project (or the argument); without it only the block is done. `--fine N` sets how often the
-meshes of the converged values are refined (1: three minutes). `--only finest` refines the diamond twice (a quarter of an hour, 7 GB).
+meshes of the converged values are refined (1: three minutes). `--only finest` refines the diamond twice (a quarter of an hour,
+7 GB).
 """
 
 from __future__ import annotations
@@ -145,7 +146,8 @@ def responses(cases: list[Case], kind: str | float) -> list[float]:
 
 
 def block_cases(level: float, quadratic: bool, nu: float) -> list[Case]:
-    """Return sag, bending, torsion of a bar (100 × 30 × 30 mm) and the squeeze of a pad (30 × 30 × 15 mm) between sticky plates."""
+    """Return sag, bending, torsion of a bar (100 × 30 × 30 mm) and the squeeze of a pad (30 × 30 × 15 mm) between sticky
+    plates."""
     wide, long = round(3 * level), round(8 * level)
     bar, pad = (
         block((long, wide, wide), (0.1, 0.03, 0.03)),
@@ -237,8 +239,8 @@ def table(title: str, make: Callable[[int, bool, float], list[Case]], fine: Call
 
 
 def stiffly(body: BodyModel, loads: list[FloatArray]) -> list[float]:
-    """Return the work of loads [N], (n, 3), on their displacements [J], of the package's own element at rest: conjugate gradients with a
-    factor in single precision, which is all that a huge mesh leaves room for."""
+    """Return the work of loads [N], (n, 3), on their displacements [J], of the package's own element at rest:
+    conjugate gradients with a factor in single precision, which is all that a huge mesh leaves room for."""
     free, pattern, blocks = body.free_map.dofs, body.free_map.pattern, internal(body, np.array(body.mesh.nodes)).blocks
     assert blocks is not None
     values = reduced_values(body, blocks)
@@ -252,7 +254,8 @@ def stiffly(body: BodyModel, loads: list[FloatArray]) -> list[float]:
 
 
 def finest(folder: Path, nu: float = 0.499) -> None:
-    """Print what the default gives on the diamond as it is, refined once and twice: where elements that bracket bracket nothing."""
+    """Print what the default gives on the diamond as it is, refined once and twice:
+    where elements that bracket bracket nothing."""
     print(f"\nDiamond, ν = {nu}, the default: work of the loads, and how far it is from that on the mesh refined twice")
     rows = []
     for refinements in (0, 1, 2):
@@ -311,7 +314,8 @@ def timing(body: BodyModel, label: str) -> None:
 
 
 def pad_case(cells: tuple[int, int, int], grading: float, nu: float) -> Case:
-    """Return the squeezed pad of `block_cases`, quadratic, with cells that are smaller towards its faces (grading 0: all alike)."""
+    """Return the squeezed pad of `block_cases`, quadratic, with cells that are smaller towards its faces (grading 0:
+    all alike)."""
     mesh = block(cells, (1.0, 1.0, 1.0))
     nodes = (mesh.nodes - grading * np.sin(2.0 * np.pi * mesh.nodes) / (2.0 * np.pi)) * [0.03, 0.03, 0.015]
     mesh = to_quadratic(TetMesh(nodes, mesh.tets))

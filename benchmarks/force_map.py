@@ -2,8 +2,9 @@
 
     python benchmarks/force_map.py [ROBOT] [--places N] [--repeats R] [--seed S] [--noise PX]
 
-At places of small and of large bounds a force of ten standard deviations presses (at most 0.5 N), in R frames that differ by the noise of the depth alone; the
-truth has the declared mesh and law. What is compared is the scatter of the force along the normal over these frames.
+At places of small and of large bounds a force of ten standard deviations presses (at most 0.5 N),
+in R frames that differ by the noise of the depth alone; the truth has the declared mesh and law. What is compared is the scatter
+of the force along the normal over these frames.
 """
 
 from __future__ import annotations

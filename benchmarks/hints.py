@@ -3,9 +3,10 @@
     python benchmarks/hints.py                # every third blind case of `loop.py tune` with something hidden
     python benchmarks/hints.py --every 1
 
-For each model that the loop finds in a case (after the first effect, and after more), and each effect that it has not yet: the best linear score
-(dBIC) by the fields of the model before, which decide whether the search goes on, and by the model's own. Prints a line a model with the three
-best of each, and at the end how far they differ and how often the former would have ended a search that the latter go on with. Some minutes.
+For each model that the loop finds in a case (after the first effect, and after more), and each effect that it has not yet:
+the best linear score (dBIC) by the fields of the model before, which decide whether the search goes on, and by the model's own.
+Prints a line a model with the three best of each, and at the end how far they differ and how often the former would have ended a
+search that the latter go on with. Some minutes.
 """
 
 from __future__ import annotations

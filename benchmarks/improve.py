@@ -4,10 +4,11 @@
     python benchmarks/improve.py --case tet10/friction --case tet10/gain --runs 1
     python benchmarks/improve.py --case tet4/friction --without discretisation
 
-A bar of 120 × 24 × 24 mm with four cables (16 × 4 × 4 cells, six tetrahedra each) goes through ten sweeps of ten frames: up, held, down. Truth
-has a mesh of its own (14 × 5 × 5 cells, ten nodes each), the rig's integrators of friction, a modulus that is off, an unknown camera
-pose, and noise of markers, frames, sweeps and places. All 17 effects of the list in all their forms are tried, and three of a user's own. Each run is a
-process of its own, from starting Python to loop.json and the page of `femsense report`, with threads and BLAS as they come.
+A bar of 120 × 24 × 24 mm with four cables (16 × 4 × 4 cells, six tetrahedra each) goes through ten sweeps of ten frames:
+up, held, down. Truth has a mesh of its own (14 × 5 × 5 cells, ten nodes each), the rig's integrators of friction,
+a modulus that is off, an unknown camera pose, and noise of markers, frames, sweeps and places. All 17 effects of the list in all
+their forms are tried, and three of a user's own. Each run is a process of its own, from starting Python to loop.json and the page
+of `femsense report`, with threads and BLAS as they come.
 
 The recordings are kept (--data), so that running it again only times.
 """
@@ -228,7 +229,8 @@ def one_run(folder: Path, element: str, without: list[str]) -> None:
 
 
 def _count_factors() -> list[int]:
-    """Return a list that grows by the size of each stiffness that is factorised from now on: time depends on the machine and the hour, this does not."""
+    """Return a list that grows by the size of each stiffness that is factorised from now on:
+    time depends on the machine and the hour, this does not."""
     sizes, plain = list[int](), vars(factorization)["cholesky"]
 
     def counted(analysis: Any, *given: Any, **named: Any) -> Any:
@@ -270,8 +272,8 @@ def show(name: str, runs: list[dict[str, Any]]) -> None:
 
 
 def measure_factor(folder: Path) -> tuple[float, float]:
-    """Return how long a stiffness of the quadratic bar takes to factorise in single precision on this machine now [s], alone and with a second thread
-    at the same: what the seconds of this table are made of, whatever the machine."""
+    """Return how long a stiffness of the quadratic bar takes to factorise in single precision on this machine now [s],
+    alone and with a second thread at the same: what the seconds of this table are made of, whatever the machine."""
     body = load_robot(folder / "robot-tet10").body
     blocks = internal(body, body.mesh.nodes).blocks
     assert blocks is not None

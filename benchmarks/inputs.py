@@ -2,9 +2,10 @@
 
     python benchmarks/inputs.py [--frames 120] [--size 640x480] [--formats rosbag1,mcap,…] [--folder DIR]
 
-Seconds are of processor time. Each file is written by the format's own writer, then imported twice in a process of its own: as it is, and four times as long. The
-peak memory of both says whether it grows with the length. "Other" is the time in which another reader decodes the same frames into
-arrays without writing anything: rosbags for bags, ezc3d for C3D, Open3D for clouds, images and RealSense .bag, PyAV's packets for .mkv.
+Seconds are of processor time. Each file is written by the format's own writer, then imported twice in a process of its own: as it
+is, and four times as long. The peak memory of both says whether it grows with the length. "Other" is the time in which another
+reader decodes the same frames into arrays without writing anything: rosbags for bags, ezc3d for C3D, Open3D for clouds, images
+and RealSense .bag, PyAV's packets for .mkv.
 """
 
 from __future__ import annotations
@@ -280,7 +281,8 @@ def size_of(path: Path) -> int:
 
 
 def import_alone(path: Path, output: Path, options: dict[str, str]) -> dict[str, float]:
-    """Import in a process of its own; return frames, seconds of processor time and peak memory [MB] beyond what the imports alone take."""
+    """Import in a process of its own; return frames,
+    seconds of processor time and peak memory [MB] beyond what the imports alone take."""
     command = [sys.executable, __file__, "--import", str(path), str(output), json.dumps(options)]
     done = subprocess.run(command, check=True, capture_output=True, text=True)
     return json.loads(done.stdout.splitlines()[-1])

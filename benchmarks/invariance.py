@@ -5,9 +5,10 @@
     python benchmarks/invariance.py control       # the permuted logs alone ("same": the ways to tell alone)
     options: --draws N   permuted logs (20); --file FILE   where results stand (invariance.jsonl); --jobs N   not more this time
 
-A small arm of 24 quadratic tetrahedra with one effect hidden; every effect of the list is tried. The order of sweeps is shuffled in the
-recording where the past of a sweep does not matter (nothing, or friction and cables that end slack), and in the experiment where it does
-(creep). The negative control gives each frame the inputs of another frame: then nothing that cables do explains what was seen.
+A small arm of 24 quadratic tetrahedra with one effect hidden; every effect of the list is tried.
+The order of sweeps is shuffled in the recording where the past of a sweep does not matter (nothing, or friction and cables that
+end slack), and in the experiment where it does (creep). The negative control gives each frame the inputs of another frame: then
+nothing that cables do explains what was seen.
 """
 
 from __future__ import annotations

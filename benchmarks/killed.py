@@ -2,8 +2,8 @@
 
     python benchmarks/killed.py ROBOT SCRIPT [--after SECONDS]
 
-Each command runs once without a break, and once killed again and again after so many seconds of work until it ends. Recordings are compared byte by byte, runs by
-their contacts.
+Each command runs once without a break, and once killed again and again after so many seconds of work until it ends. Recordings
+are compared byte by byte, runs by their contacts.
 """
 
 from __future__ import annotations

@@ -3,8 +3,9 @@
     pip install cvxopt sksparse-minimal
     python benchmarks/libraries.py [--data DATA]
 
-One thread, processor time, median of the runs, all in one process in turn. The analysis is made once and kept, as it is in `estimate` and
-`improve` (sksparse-minimal cannot keep it: its factor is analysis and numbers). Every library has its own order of elimination.
+One thread, processor time, median of the runs, all in one process in turn. The analysis is made once and kept,
+as it is in `estimate` and `improve` (sksparse-minimal cannot keep it: its factor is analysis and numbers).
+Every library has its own order of elimination.
 """
 
 from __future__ import annotations

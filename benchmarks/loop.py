@@ -94,8 +94,9 @@ def run_case(job: tuple[str, Case]) -> dict[str, Any]:
 
 
 def detection_index(made: Made, hidden: dict[str, Any]) -> dict[str, float]:
-    """Return d′ = |P W Δ|: a hidden effect's field on the declared mesh, beside what else is hidden, whitened by the true noise; pose,
-    modulus, zeros and the fields of what else is hidden are projected out. Linear elements are quadratic there."""
+    """Return d′ = |P W Δ|: a hidden effect's field on the declared mesh, beside what else is hidden,
+    whitened by the true noise; pose, modulus, zeros and the fields of what else is hidden are projected out.
+    Linear elements are quadratic there."""
     case = made.case
     robot = (
         made.declared
@@ -192,7 +193,8 @@ def detectable(record: dict[str, Any]) -> bool:
 
 
 def parameter_errors(record: dict[str, Any]) -> list[tuple[float, list[bool]]]:
-    """Return the relative error of each value of a named effect, and whether the 95 % interval of each component holds the truth."""
+    """Return the relative error of each value of a named effect,
+    and whether the 95 % interval of each component holds the truth."""
     truth = record["hidden"][0]
     found = next(e for e in record["effects"] if e["name"] == truth["name"])["parameters"]
     result: list[tuple[float, list[bool]]] = []

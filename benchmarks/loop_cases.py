@@ -1,8 +1,9 @@
 """Blind cases for the loop: three robots, both control modes, one hidden thing or none, made by another path than the fitter's.
 
-The truth lives on a finer mesh than the declared robot, under a law that the declared robot states (or not: then the law is what is
-hidden), with the rig's own integrators of friction and creep, followed in small steps. Every case has a modulus that is off by up to 20 %,
-an unknown camera pose, and markers with noise of their own, of the frame, of the sweep, and of the place where they are glued.
+The truth lives on a finer mesh than the declared robot, under a law that the declared robot states (or not:
+then the law is what is hidden), with the rig's own integrators of friction and creep, followed in small steps. Every case has a
+modulus that is off by up to 20 %, an unknown camera pose, and markers with noise of their own, of the frame, of the sweep, and of
+the place where they are glued.
 """
 
 from __future__ import annotations
@@ -300,8 +301,8 @@ OUTSIDE = ("contact", "cross_talk", "slipped_marker", "draught", "kinked_cable",
 
 
 def make_cases(seed: int, counts: dict[str, int], finer: int | None = None, element: str = "tet10") -> list[Case]:
-    """Return cases of the kinds and numbers asked for; the same for the same seed. `finer`: cells of truths, in units of the declared ones; by default
-    1.3 to 1.5. `element`: of the declared meshes."""
+    """Return cases of the kinds and numbers asked for; the same for the same seed. `finer`: cells of truths,
+    in units of the declared ones; by default 1.3 to 1.5. `element`: of the declared meshes."""
     rng = np.random.default_rng(seed)
     cases: list[Case] = []
     for kind, count in counts.items():
@@ -410,13 +411,15 @@ def make_data(case: Case, seed: int) -> Made:
 
 
 def _seen(true: Robot, states: Sequence[Equilibrium], placement: FloatArray | None = None) -> FloatArray:
-    """Return the true markers [m], shape (F, k, 3), that sit elsewhere on the body at rest by `placement` (k, 3): their error turns with the body."""
+    """Return the true markers [m], shape (F, k, 3), that sit elsewhere on the body at rest by `placement` (k, 3):
+    their error turns with the body."""
     ties = true.markers if placement is None else true.tie_markers(true.marker_points + placement)
     return np.array([ties.positions(s.positions) for s in states])
 
 
 def on_other_clamp(entry: dict[str, Any], declared: Robot, other: Robot) -> dict[str, Any]:
-    """Return an entry whose springs, one a node of the declared mesh, are spread over the nodes of another one and resist turning alike."""
+    """Return an entry whose springs, one a node of the declared mesh,
+    are spread over the nodes of another one and resist turning alike."""
     if entry["name"] != "base_compliance" or "stiffness_n_m" not in entry:
         return entry
     second = [
@@ -426,7 +429,8 @@ def on_other_clamp(entry: dict[str, Any], declared: Robot, other: Robot) -> dict
 
 
 def excursions(design: Design, control: str, rng: np.random.Generator, *, poor: bool) -> tuple[FloatArray, list[str], FloatArray]:
-    """Return inputs (F, a), sweep labels and times: each cable up, held and down at two levels, then mixtures; one sweep up if poor."""
+    """Return inputs (F, a), sweep labels and times: each cable up, held and down at two levels, then mixtures;
+    one sweep up if poor."""
     count, top = len(design.cables), design.tension if control == "tension" else 6e-3
     if poor:
         rows = np.outer(np.linspace(0, 1, 8), np.eye(count)[0])
@@ -526,7 +530,8 @@ def _measure(
 
 
 def _no_name(case: Case, recorded: FloatArray, shown: FloatArray, places: FloatArray) -> FloatArray:
-    """Return an error of the model without a name [m], shape (F, k, 3): smooth along the body and quadratic in the inputs, 5 % of the motion."""
+    """Return an error of the model without a name [m], shape (F, k, 3): smooth along the body and quadratic in the inputs,
+    5 % of the motion."""
     rng = np.random.default_rng([9, case.number])
     u = recorded / recorded.max()
     drive = np.stack([u[:, i] * u[:, j] for i in range(u.shape[1]) for j in range(i, u.shape[1])], axis=1)

@@ -3,10 +3,11 @@
     python benchmarks/mesh_share.py
     python benchmarks/mesh_share.py --finer 3 --each 3   # truths with three times the declared cells along each side
 
-Of blind cases in which nothing is hidden (seeds of `loop.py tune`), with pose and modulus as in the truth: D, how far the truth's markers
-lie from the declared robot's; E, how far a mesh of half the size moves them (`femsense.loop.fit.discretisation_error`); the share a of E that is
-nearest to D in all sweeps, and in the sweeps one by one; what is left of D beside it; and what is left beyond what calibration may move (pose,
-modulus, zeros) of D alone, beside one share of E, and beside one matrix times E.
+Of blind cases in which nothing is hidden (seeds of `loop.py tune`), with pose and modulus as in the truth: D,
+how far the truth's markers lie from the declared robot's; E, how far a mesh of half the size moves them
+(`femsense.loop.fit.discretisation_error`); the share a of E that is nearest to D in all sweeps, and in the sweeps one by one;
+what is left of D beside it; and what is left beyond what calibration may move (pose, modulus, zeros) of D alone, beside one share
+of E, and beside one matrix times E.
 """
 
 from __future__ import annotations

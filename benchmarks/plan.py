@@ -103,7 +103,8 @@ def print_table(proposal: Proposal, done: dict[str, dict[str, Any]]) -> None:
 
 
 def check(names: list[str], file: Path, only_table: bool) -> None:
-    """Hide each effect in the least that is worth recording and in the proposal, and print what is predicted and what is found."""
+    """Hide each effect in the least that is worth recording and in the proposal,
+    and print what is predicted and what is found."""
     robot = TINY_ARM.robot(fine=False, law="corotational", gravity=EARTH, modulus=TINY_ARM.modulus)
     proposal = plan_experiment(robot, noise=NOISE_M, frames=FRAMES)
     print(proposal_text(proposal), "\n")

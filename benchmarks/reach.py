@@ -2,9 +2,10 @@
 
     python benchmarks/reach.py [--targets N] [--robots NAME,…] [--diamond FOLDER]
 
-Targets are where random inputs within the limits bring a point of the body; half of them are then moved out of reach. The inputs are
-checked twice: on the model itself, and on another mesh and law (each tetrahedron split into eight, neo-Hookean), as a real robot would
-differ from its model. The last column follows a path of targets 0.5 mm apart: so many are reached in a second of processor time.
+Targets are where random inputs within the limits bring a point of the body; half of them are then moved out of reach.
+The inputs are checked twice: on the model itself, and on another mesh and law (each tetrahedron split into eight,
+neo-Hookean), as a real robot would differ from its model. The last column follows a path of targets 0.5 mm apart: so many are
+reached in a second of processor time.
 """
 
 from __future__ import annotations

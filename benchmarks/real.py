@@ -118,7 +118,8 @@ SETS: Mapping[str, tuple[Callable[[Path, Path, list[int]], list[Asked]], str]] =
 
 
 def print_by_hand(out: Path, data: Path) -> None:
-    """Print the mean marker error of the tentacle with the authors' pose and a modulus that is given: the base marker is left out."""
+    """Print the mean marker error of the tentacle with the authors' pose and a modulus that is given:
+    the base marker is left out."""
     runs = tentacle.read_runs(data)
     poses = {s: tentacle.declared_pose([r for r in runs if r.session == s]) for s in "AB"}
     print("| density [kg/m³] | modulus [kPa] | one tendon [mm] | two tendons [mm] |\n|---|---|---|---|")
@@ -160,9 +161,11 @@ def print_weights(out: Path, data: Path) -> None:
 
 
 def print_pairs(out: Path, data: Path) -> None:
-    """Print the force at the tip of the trunk by pairs: two moments at the same command, and what distinguishes them but the inputs.
+    """Print the force at the tip of the trunk by pairs: two moments at the same command,
+    and what distinguishes them but the inputs.
 
-    In the pair with the weight it is looked for; in a pair of two runs without it (the same frames, the second half a second later) nothing is.
+    In the pair with the weight it is looked for; in a pair of two runs without it (the same frames,
+    the second half a second later) nothing is.
     """
     robot, _ = trunk.make(out, data)
     model = load_robot(robot)

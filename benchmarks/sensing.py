@@ -2,8 +2,8 @@
 
     python benchmarks/sensing.py FOLDER …
 
-A folder holds robot/, recording/ and truth.json: {"contacts": [{"frame", "point" [m, deformed], "force" [N], "rest" [m, where known]}, …]}, made by
-another program (`data/touches`).
+A folder holds robot/, recording/ and truth.json: {"contacts": [{"frame", "point" [m, deformed], "force" [N], "rest" [m,
+where known]}, …]}, made by another program (`data/touches`).
 """
 
 from __future__ import annotations

@@ -2,8 +2,9 @@
 
     python benchmarks/sessions.py [CASE …]        # those cases, or all; one line each
 
-Truth is made on another mesh and by another law than the estimator's, with markers that repeat to 0.2 mm. Cables: the arm of the tests, two recordings,
-sessions A and B. Chambers: the bar of `tests/end_to_end/test_pneumatic.py` by the virtual rig on a finer mesh of quadratic elements.
+Truth is made on another mesh and by another law than the estimator's, with markers that repeat to 0.2 mm. Cables:
+the arm of the tests, two recordings, sessions A and B. Chambers: the bar of `tests/end_to_end/test_pneumatic.py` by the virtual
+rig on a finer mesh of quadratic elements.
 """
 
 from __future__ import annotations

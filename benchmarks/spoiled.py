@@ -2,9 +2,10 @@
 
     python benchmarks/spoiled.py [--robot finger four-leg …] [--only KIND …] [--seed N]
 
-The clean recording comes from the virtual rig: a finer mesh, neo-Hookean, markers with 0.2 mm of noise, a force in the last sweep. Each kind of
-error is then written into its files. A row is *told* where a command ends with status 1 or 2, or names the fault in a warning while the force is right;
-*right* where the force is right without a word; *silent* where it is wrong and nothing is said. Prints a table, and the count of each.
+The clean recording comes from the virtual rig: a finer mesh, neo-Hookean, markers with 0.2 mm of noise,
+a force in the last sweep. Each kind of error is then written into its files. A row is *told* where a command ends with status 1
+or 2, or names the fault in a warning while the force is right; *right* where the force is right without a word; *silent* where it
+is wrong and nothing is said. Prints a table, and the count of each.
 """
 
 from __future__ import annotations

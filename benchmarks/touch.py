@@ -2,9 +2,9 @@
 
     python benchmarks/touch.py [--folder DIR]
 
-The truth is that of `femsense demo` (half the element size, quadratic elements, neo-Hookean, cables that rub) with other seeds; the robot
-that senses is declared with the effects that the truth has, on its own mesh. Forces are sensed where contacts are found: in any direction,
-and along the normal that is seen.
+The truth is that of `femsense demo` (half the element size, quadratic elements, neo-Hookean,
+cables that rub) with other seeds; the robot that senses is declared with the effects that the truth has, on its own mesh. Forces
+are sensed where contacts are found: in any direction, and along the normal that is seen.
 """
 
 from __future__ import annotations

@@ -2,8 +2,9 @@
 
     python benchmarks/trials.py FOLDER [--only NAME …]
 
-FOLDER holds the inputs (data/trials): robots, recordings and files, each of a kind. Every row runs the commands a user would run, in a folder of its
-own, and prints their exit status, forces and what they say. Prints the table of docs/trials.md.
+FOLDER holds the inputs (data/trials): robots, recordings and files, each of a kind.
+Every row runs the commands a user would run, in a folder of its own, and prints their exit status, forces and what they say.
+Prints the table of docs/trials.md.
 """
 
 from __future__ import annotations

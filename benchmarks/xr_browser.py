@@ -2,8 +2,9 @@
 
     python benchmarks/xr_browser.py [--seconds S] [--vertices N]
 
-A pose has 12 bones at 60 Hz and carries the moment of sending. In the page it is taken when its message arrives while nothing is drawn ("transport"),
-and when the first picture with it has been drawn ("drawn": WebGL finished; the screen comes after that). The clocks of browser and sender are compared by 200 messages to and
+A pose has 12 bones at 60 Hz and carries the moment of sending.
+In the page it is taken when its message arrives while nothing is drawn ("transport"), and when the first picture with it has been
+drawn ("drawn": WebGL finished; the screen comes after that). The clocks of browser and sender are compared by 200 messages to and
 fro, of which the fastest counts. Chromium and Node must be there; playwright-core comes by npm into a temporary folder.
 """
 

@@ -2,8 +2,9 @@
 
     python benchmarks/xr_stream.py [--seconds S] [--soak S] [--robots N] [--viewers N]
 
-Clients run in processes of their own and compare clocks of the same machine (CLOCK_MONOTONIC). A pose has 12 bones, 356 bytes, 60 Hz.
-The soak: robots at 60 Hz to viewers; one viewer more reads nothing, one sends garbage, floods, asks for files, sends oversized frames.
+Clients run in processes of their own and compare clocks of the same machine (CLOCK_MONOTONIC). A pose has 12 bones, 356 bytes,
+60 Hz. The soak: robots at 60 Hz to viewers; one viewer more reads nothing, one sends garbage, floods, asks for files,
+sends oversized frames.
 """
 
 from __future__ import annotations

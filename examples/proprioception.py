@@ -1,4 +1,5 @@
-"""From sensors in a body to bones: record with markers once, learn, then live without them; another day, corrected by a few frames.
+"""From sensors in a body to bones: record with markers once, learn, then live without them; another day,
+corrected by a few frames.
 
 python examples/proprioception.py
 """

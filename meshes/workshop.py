@@ -1,7 +1,7 @@
 """What the build scripts of the robots share: their command line, writing, and the picture of a robot that is pulled.
 
-A build script has `body_mesh()`, `robot_document()` and a `Portrait`; `build` does the rest. The surfaces of a picture are seen by
-the rig's own camera (rays into the triangles), so that it shows what a recording shows.
+A build script has `body_mesh()`, `robot_document()` and a `Portrait`; `build` does the rest.
+The surfaces of a picture are seen by the rig's own camera (rays into the triangles), so that it shows what a recording shows.
 """
 
 from __future__ import annotations

@@ -2,12 +2,13 @@
 
     python scripts/sabotage.py [WORD …] [--list] [--jobs N] [--sample N [--seed S] [--seconds T]] [--green]
 
-The lines stand in scripts/sabotages/<room>.toml. With words only those entries run whose file or tests contain one of them; `--sample`
-draws so many, spread over all files, each with the first of its tests alone. No entry begins later than `--seconds`. The work is done
-in copies of the repository, one a job. The tests must be green there first; `--green` says that they have just been seen so.
+The lines stand in scripts/sabotages/<room>.toml.
+With words only those entries run whose file or tests contain one of them; `--sample` draws so many, spread over all files, each
+with the first of its tests alone. No entry begins later than `--seconds`. The work is done in copies of the repository, one a
+job. The tests must be green there first; `--green` says that they have just been seen so.
 
-Exit status 0: every sabotage was noticed; 1: one survived, or an entry names a line or a test that is not there (all entries are looked
-at for that, whichever run).
+Exit status 0: every sabotage was noticed; 1: one survived,
+or an entry names a line or a test that is not there (all entries are looked at for that, whichever run).
 """
 
 from __future__ import annotations

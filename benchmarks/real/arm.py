@@ -1,8 +1,8 @@
 """The two-segment pneumatic arm of ASU-RISE-Lab: pressures in psi, rigid bodies at its base, middle and tip, on three days.
 
-Its inside is not described. The equivalent body is a rod with four chambers a segment; the first faces the second, and the third stands for a
-pair beside them (seen from which way the states bend). Columns 7 to 12 drive the segment at the base. Between April 4 and April 5 the arm at
-rest became 21 and 37 mm longer: each day has its own robot.
+Its inside is not described. The equivalent body is a rod with four chambers a segment; the first faces the second,
+and the third stands for a pair beside them (seen from which way the states bend). Columns 7 to 12 drive the segment at the base.
+Between April 4 and April 5 the arm at rest became 21 and 37 mm longer: each day has its own robot.
 """
 
 from __future__ import annotations

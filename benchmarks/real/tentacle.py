@@ -45,7 +45,8 @@ class Pose:
 def description(density: float = FIT_DENSITY, *, points: int | None = POINTS) -> dict[str, object]:
     """Return the text of `femsense mesh`: a cone with two channels (docs/bodies.md).
 
-    The authors' 30° and 150° are counted from the robot's y to its x, for a body that hangs along −z; ours from x, about the line.
+    The authors' 30° and 150° are counted from the robot's y to its x, for a body that hangs along −z; ours from x,
+    about the line.
     """
     radii = zip((0.0, *LENGTH_MM), (15.41, 6.42, 4.80))
     tendon = {"distance_mm": [11.4, 11.4 - 0.0295 * LENGTH_MM[0]], "end_mm": LENGTH_MM[0], "max_tension_n": 8.0}

@@ -1,6 +1,8 @@
-"""The trunk of StanfordASL/trunk-stack: a hanging vacuum hose, six motors with two tendons each, and the same run with 100 g at its tip.
+"""The trunk of StanfordASL/trunk-stack: a hanging vacuum hose, six motors with two tendons each,
+and the same run with 100 g at its tip.
 
-The hose is taken as an equivalent tube; motor angles become the displacements of two tendons that face each other, one drawn and one paid out.
+The hose is taken as an equivalent tube; motor angles become the displacements of two tendons that face each other,
+one drawn and one paid out.
 """
 
 from __future__ import annotations
@@ -24,10 +26,12 @@ DISCS_MM = (104.6, 196.9, 313.0)
 RATE_HZ = 100.0
 WEIGHT_N = 0.1 * 9.81
 MOTORS = {"u1": (1, 45.0), "u2": (2, 107.0), "u3": (0, 180.0), "u4": (2, 197.0), "u5": (0, 248.0), "u6": (1, -45.0)}
-"""Disc at which the tendons of a motor end, and the direction [°, x to y] to which it bends: from a linear map of angles to discs."""
+"""Disc at which the tendons of a motor end, and the direction [°, x to y] to which it bends:
+from a linear map of angles to discs."""
 PULLEY_M, DISTANCE_MM = 0.040, 25.0
-"""Radius of a pulley and distance of the tendons from the axis. Neither is known. Their ratio is such that the equivalent tube bends nearly
-as far as the trunk does (10 mm leave 0.2 of it); `cable_gain` finds the rest of each motor's own."""
+"""Radius of a pulley and distance of the tendons from the axis. Neither is known.
+Their ratio is such that the equivalent tube bends nearly as far as the trunk does (10 mm leave 0.2 of it);
+`cable_gain` finds the rest of each motor's own."""
 MODULUS_PA, DENSITY = 200e3, 500.0
 RADIUS_MM, BORE_MM = 30.0, 20.0
 
@@ -136,10 +140,12 @@ def first_pose() -> FloatArray:
 def force_between(
     robot: Robot, first: Run, second: Run, frames: IntArray, *, step: float = 0.1
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the force at the tip [N] that acts in one run and not in another, with the std of its mean over frames, and over frames, each (3,).
+    """Return the force at the tip [N] that acts in one run and not in another, with the std of its mean over frames,
+    and over frames, each (3,).
 
-    Differences between the runs at the same frame are compared with those of the model under the inputs of both: what is common to both, errors of
-    the model and of the pose too, drops out. A force in each direction has its response in each frame; least squares over the discs.
+    Differences between the runs at the same frame are compared with those of the model under the inputs of both:
+    what is common to both, errors of the model and of the pose too, drops out. A force in each direction has its response in each
+    frame; least squares over the discs.
     """
     tip = np.flatnonzero(robot.body.mesh.nodes[:, 2] < robot.body.mesh.nodes[:, 2].min() + 1e-6)
     responses, differences = [], []

@@ -164,7 +164,8 @@ def _kept(folder: str | Path, inputs: Mapping[str, Any]) -> tuple[Path, dict[str
 
 
 def load_pages(load: Callable[[str], object] = importlib.import_module) -> None:
-    """Load what draws pages, which takes a second; an installation without it has no pages. `load` imports a module by its name."""
+    """Load what draws pages, which takes a second; an installation without it has no pages.
+    `load` imports a module by its name."""
     with contextlib.suppress(ImportError):
         for name in ("femsense.report", "matplotlib.figure", "matplotlib.backends.backend_svg"):
             load(name)

@@ -220,7 +220,8 @@ def _numba_cache() -> Check:
 
 
 def _kernels() -> Check:
-    """Kernels of calibrate and estimate come along compiled, if the build could run them; each is a file where numba looks for it."""
+    """Kernels of calibrate and estimate come along compiled, if the build could run them;
+    each is a file where numba looks for it."""
     package = Path(femsense.__file__).parent
     chosen = os.environ.get("NUMBA_CACHE_DIR")
     found = [_kernel_version(file) for file in (Path(chosen) if chosen else package).rglob("*.nbi")]

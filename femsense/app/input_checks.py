@@ -15,7 +15,8 @@ from femsense.pointcloud.cloud import PointCloud
 CLOUDS_READ = 3
 """So many clouds of a recording are looked at."""
 FAR_CLOUD = 10.0
-"""Clouds that are farther away than this [m] in the median are more likely in centimetres or millimetres: depth cameras see less far."""
+"""Clouds that are farther away than this [m] in the median are more likely in centimetres or millimetres:
+depth cameras see less far."""
 OTHER_UNIT = 5.0
 """Clouds whose distance is so many times that of the markers of the same frame are in another unit."""
 

@@ -61,8 +61,9 @@ def inspect_path(path: str | Path, *, robot: str | Path | None = None) -> Report
         robot: a recording is compared with this robot.
 
     Returns:
-        plain tables: `path`, `kind` (robot, recording, script, mesh, surface, cloud, image, calibration, run, loop, capture, table or
-        unknown), what is in it with units in the names, and at the end `problems` and `warnings`, lists of texts.
+        plain tables: `path`, `kind` (robot, recording, script, mesh, surface, cloud, image, calibration, run, loop,
+        capture, table or unknown), what is in it with units in the names, and at the end `problems` and `warnings`,
+        lists of texts.
 
     Raises:
         InputError: where there is nothing at this path; nothing else, whatever the content is.
@@ -96,7 +97,8 @@ def _compare(target: Path, report: Report, robot: str | Path) -> None:
 
 
 def inspect_accuracy(path: str | Path, *, progress: Callable[..., None] | None = None) -> Report:
-    """Return a report of a robot with its discretisation error, under `accuracy` (see `assess_accuracy`); without where it has problems.
+    """Return a report of a robot with its discretisation error, under `accuracy` (see `assess_accuracy`);
+    without where it has problems.
 
     Raises:
         InputError: where the path is no robot. DataError: where its model has no equilibrium.

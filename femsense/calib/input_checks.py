@@ -1,7 +1,7 @@
 """Whether the inputs of a recording can be those that moved its markers: unit, order of the columns, delay.
 
-Of each marker only its motion about its mean counts, measured and modelled, so that neither pose nor placement matters. Another reading of the
-inputs counts where it takes most of the difference away.
+Of each marker only its motion about its mean counts, measured and modelled, so that neither pose nor placement matters.
+Another reading of the inputs counts where it takes most of the difference away.
 """
 
 from __future__ import annotations
@@ -57,7 +57,8 @@ class Motions:
 
 
 def motions_of(pairs: Pairs) -> Motions | None:
-    """Return the motions of those markers that one camera saw in all frames; None where there is no such marker, or one frame alone."""
+    """Return the motions of those markers that one camera saw in all frames; None where there is no such marker,
+    or one frame alone."""
     frames = np.unique(pairs.group)
     counts = np.bincount(pairs.marker)
     always = np.flatnonzero(counts == len(frames))
@@ -70,7 +71,8 @@ def motions_of(pairs: Pairs) -> Motions | None:
 
 
 def check_inputs(robot: Robot, recording: Recording, pairs: Sequence[Pairs]) -> None:
-    """Refuse inputs in another unit, in exchanged columns, or recorded some frames off; warn where motions hint at another modulus.
+    """Refuse inputs in another unit, in exchanged columns, or recorded some frames off;
+    warn where motions hint at another modulus.
 
     Arguments:
         robot, recording: as they are calibrated.
@@ -113,7 +115,8 @@ def _units(recording: Recording, scale: float) -> str:
 
 
 def _check_order(robot: Robot, recording: Recording, motions: Motions) -> None:
-    """Refuse columns that stand under each other's names: to first order each input has its own motion (least squares; Kuhn 1955)."""
+    """Refuse columns that stand under each other's names: to first order each input has its own motion (least squares;
+    Kuhn 1955)."""
     names = (*robot.body.cable_names, *robot.body.chamber_names)
     inputs = np.hstack([recording.inputs, recording.pressures])[motions.frames]
     inputs = inputs - inputs.mean(axis=0)

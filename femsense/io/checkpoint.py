@@ -1,6 +1,7 @@
 """How far a long computation has come, kept in a file: one that is killed goes on there.
 
-The file is a pickle, of which only numbers and the package's own data are read back, so that a folder from elsewhere runs nothing.
+The file is a pickle, of which only numbers and the package's own data are read back,
+so that a folder from elsewhere runs nothing.
 """
 
 from __future__ import annotations

@@ -36,7 +36,8 @@ def write_beside(path: str | Path) -> Iterator[Path]:
     pipes are written through, not replaced.
 
     Raises:
-        InputError: a place that cannot be written, or holds something of another kind. FileNotFoundError: the block wrote nothing.
+        InputError: a place that cannot be written, or holds something of another kind. FileNotFoundError:
+            the block wrote nothing.
     """
     if writes_through(path):
         with _through(Path(path)) as part:
@@ -150,7 +151,10 @@ def json_text(data: Any, *, indent: int | None = 2) -> str:
 
 
 def write_toml(path: str | Path, document: Mapping[str, Any]) -> None:
-    """Write a TOML document. Arrays become lists; numbers are written so that they read back the same; points stay on one line."""
+    """Write a TOML document.
+
+    Arrays become lists; numbers are written so that they read back the same; points stay on one line.
+    """
     import tomli_w
 
     write_text(path, _on_one_line(tomli_w.dumps(plain(document, nonfinite=True))))

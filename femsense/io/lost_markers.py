@@ -15,7 +15,8 @@ SHOWN = 6
 
 
 def is_a_place(path: object, xyz: FloatArray, names: Sequence[str], frame: IntArray) -> BoolArray:
-    """Return which rows are places, shape (rows,): 0, 0, 0 or another number three times is how many programs write a lost marker.
+    """Return which rows are places, shape (rows,): 0, 0,
+    0 or another number three times is how many programs write a lost marker.
 
     Arguments:
         path: what messages name.

@@ -29,8 +29,9 @@ SOLID_KINDS = ("tetra", "hexahedron", "wedge", "pyramid", "voxel", "polyhedron",
 def read_tets(path: Path, *, where: str | None = None) -> TetMesh:
     """Return the tetrahedra of a mesh file, in the file's unit, corner nodes first.
 
-    A closed surface is tetrahedralised on first use; the result is kept beside it (or in the cache folder). Nodes that no tetrahedron uses
-    are dropped with a warning. A mesh whose elements are all inverted has another order of nodes and is turned.
+    A closed surface is tetrahedralised on first use; the result is kept beside it (or in the cache folder).
+    Nodes that no tetrahedron uses are dropped with a warning.
+    A mesh whose elements are all inverted has another order of nodes and is turned.
 
     Arguments:
         path: the file.
@@ -98,7 +99,8 @@ def read_triangles(path: Path, *, where: str | None = None) -> tuple[FloatArray,
 
 
 def _no_triangles(path: Path, where: str) -> InputError:
-    """Return what to say of a file without triangles: points alone are a cloud; else it is something else than its ending says."""
+    """Return what to say of a file without triangles: points alone are a cloud;
+    else it is something else than its ending says."""
     with path.open("rb") as stream:
         head = stream.read(1_000_000)
     announced, size = int.from_bytes(head[80:84], "little"), path.stat().st_size
@@ -262,7 +264,10 @@ def _check_middles(mesh: TetMesh, where: str) -> None:
 
 
 def closed_surface(points: FloatArray, triangles: IntArray, where: str) -> tuple[FloatArray, IntArray]:
-    """Return the surface, outward, inner shells as cavities, as it is otherwise. Raises InputError where it is open or in parts."""
+    """Return the surface, outward, inner shells as cavities, as it is otherwise.
+
+    Raises InputError where it is open or in parts.
+    """
     points, triangles = merged(points, triangles)
     edges = np.sort(np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
     count = np.unique(edges, axis=0, return_counts=True)[1]

@@ -1,4 +1,5 @@
-"""From the tables of robot.toml to a robot: its mesh in metres, clamp, cables, chambers, markers, each checked against the mesh."""
+"""From the tables of robot.toml to a robot: its mesh in metres, clamp, cables, chambers, markers,
+each checked against the mesh."""
 
 from __future__ import annotations
 

@@ -19,8 +19,9 @@ SHOWN = 6
 def without_stale_markers(recording: Recording) -> Recording:
     """Return the recording without rows that repeat the frame before to the last digit, and warn of them.
 
-    A row counts as such a copy where its marker moves in other frames, where others of its frame move or the inputs changed, and where digits are
-    fine enough that chance explains none: p³ n < CHANCE, with p the share of single coordinates that repeat among n pairs of rows.
+    A row counts as such a copy where its marker moves in other frames, where others of its frame move or the inputs changed,
+    and where digits are fine enough that chance explains none: p³ n < CHANCE,
+    with p the share of single coordinates that repeat among n pairs of rows.
 
     Arguments:
         recording: whose rows are checked; a marker's rows in frames that follow each other are compared.

@@ -272,7 +272,8 @@ def _along(x: FloatArray, knots: FloatArray, stations: FloatArray) -> tuple[Floa
 
 
 def _with_length(x: FloatArray, knots: FloatArray, stations: FloatArray) -> FloatArray:
-    """Return positions of a line that keeps its length at rest: the integral of the tangents from the first point, shape (k, 3)."""
+    """Return positions of a line that keeps its length at rest: the integral of the tangents from the first point,
+    shape (k, 3)."""
     half = 0.5 * np.diff(stations, prepend=0.0)
     places = (stations - half)[:, None] + half[:, None] * GAUSS_POINTS
     tangents = _along(x, knots, places.ravel())[1].reshape(*places.shape, 3)

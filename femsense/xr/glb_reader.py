@@ -1,4 +1,5 @@
-"""Reads back the skinned, animated mesh that `gltf.write_glb` writes: bones, weights, the bones' poses over time, and the surface."""
+"""Reads back the skinned, animated mesh that `gltf.write_glb` writes: bones, weights, the bones' poses over time,
+and the surface."""
 
 from __future__ import annotations
 

@@ -38,9 +38,11 @@ class McapReport:
 def export_mcap(folder: str | Path, path: str | Path) -> McapReport:
     """Write a run as MCAP with messages of ROS 2.
 
-    Topics: /tf (robot → camera, contact_…), /femsense/contacts (PoseArray, z along the outward normal), /femsense/force_… (WrenchStamped
-    [N] at contact_…), /femsense/inputs (JointState; effort holds tensions [N] and pressures [Pa]), /femsense/scene (SceneUpdate: the
-    deformed surface and arrows), /femsense/cloud (PointCloud2, camera frame) where the recording has clouds and is still there.
+    Topics: /tf (robot → camera, contact_…), /femsense/contacts (PoseArray, z along the outward normal),
+        /femsense/force_… (WrenchStamped
+    [N] at contact_…), /femsense/inputs (JointState; effort holds tensions [N] and pressures [Pa]),
+    /femsense/scene (SceneUpdate: the deformed surface and arrows), /femsense/cloud (PointCloud2, camera frame) where the
+    recording has clouds and is still there.
 
     Arguments:
         folder: a run that `femsense estimate` wrote.

@@ -28,7 +28,8 @@ CONTACT_COLUMNS = ("frame", "time_s", "contact", "x_m", "y_m", "z_m", "fx_n", "f
 def export_run(
     folder: str | Path, path: str | Path, *, bones: int | None = None, color_rgb: Any = None, skin: UserSkin | None = None
 ) -> ExportReport:
-    """Write the skinned, animated mesh of a run folder (see `gltf.export_states`), or a surface of the user's own instead of the body's.
+    """Write the skinned, animated mesh of a run folder (see `gltf.export_states`),
+    or a surface of the user's own instead of the body's.
 
     Raises InputError where `states.npz` is missing, unreadable or lacks a part.
     """
@@ -66,8 +67,8 @@ def contacts_of_run(folder: str | Path) -> dict[str, Any]:
     Returns:
         `format`, `name`, `frame` ("robot"), and `frames`: for each state its time from the first [s], the frame's
         number, status, residual and inputs where `frames.csv` has them, and the contacts of `contacts.csv`. `inputs` names
-        the inputs, with their units and the range that the run has; `markers` and `cameras` are what the real robot shares with it;
-        `field` is what `stress_of_run` holds.
+        the inputs, with their units and the range that the run has;
+        `markers` and `cameras` are what the real robot shares with it; `field` is what `stress_of_run` holds.
 
     Raises:
         InputError: a column is missing, or a value is not a number.
@@ -103,7 +104,8 @@ def contacts_of_run(folder: str | Path) -> dict[str, Any]:
 
 
 def stress_of_run(folder: str | Path, glb: bytes) -> bytes:
-    """Return the stress at the vertices of a run's mesh (see `surface_stress.stress_bytes`); strain [%] where no material is known.
+    """Return the stress at the vertices of a run's mesh (see `surface_stress.stress_bytes`);
+    strain [%] where no material is known.
 
     A vertex has the stress of the node of the body's surface that is nearest to it at rest.
     """

@@ -228,7 +228,8 @@ def rms(difference: FloatArray) -> float:
 
 
 def _choose_bones(rest: FloatArray, frames: FloatArray) -> int:
-    """Return the number of bones that serves held-out frames best (the smaller one where two are within 2 % or a millionth of the body)."""
+    """Return the number of bones that serves held-out frames best (the smaller one where two are within 2 % or a millionth of the
+    body)."""
     if len(frames) < FEWEST_FRAMES_TO_CHOOSE:
         return min(DEFAULT_BONES, len(rest))
     spread = frames[np.sort(farthest_points(frames.reshape(len(frames), -1), FIT_FRAMES))]
@@ -252,7 +253,8 @@ def _choose_bones(rest: FloatArray, frames: FloatArray) -> int:
 def _find_bones(rest: FloatArray, frames: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
     """Return bone origins (B, 3) and poses (F, B, 4, 4) of groups of vertices that move almost rigidly.
 
-    Lloyd's rounds: every vertex joins the bone that predicts its motion best (near bones first), every bone is fitted to its vertices.
+    Lloyd's rounds: every vertex joins the bone that predicts its motion best (near bones first),
+    every bone is fitted to its vertices.
     """
     seeds = rest[farthest_points(rest, count)]
     size = _size(rest)
@@ -329,7 +331,8 @@ def _smooth_weights(rest: FloatArray, origins: FloatArray) -> FloatArray:
 
 
 def _finished(rest: FloatArray, origins: FloatArray, joints: IntArray, weights: FloatArray) -> Skin:
-    """Return the skin with each bone in the middle of what it carries (weights squared), and with bones that carry nothing left out."""
+    """Return the skin with each bone in the middle of what it carries (weights squared),
+    and with bones that carry nothing left out."""
     dense = np.zeros((len(origins), len(rest)))
     np.add.at(dense, (joints.ravel(), np.repeat(np.arange(len(rest)), INFLUENCES)), weights.ravel())
     used = (dense**2).sum(axis=1) > 1e-12

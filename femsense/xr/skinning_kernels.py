@@ -198,7 +198,8 @@ def weights_of_vertices(
 def misses_of_bones(
     rest: FloatArray, states: FloatArray, origins: FloatArray, poses: FloatArray, D: FloatArray, error: FloatArray
 ) -> tuple[float, float]:
-    """Write how far each bone alone misses a vertex, (B, 3 F), and its mean square (B,); return the least and the mean of these."""
+    """Write how far each bone alone misses a vertex, (B, 3 F), and its mean square (B,);
+    return the least and the mean of these."""
     frames = len(poses)
     p = np.empty(3)
     least, mean = np.inf, 0.0

@@ -2,8 +2,9 @@
 
     E = ½ (FᵀF − I),   S = λ tr(E) I + 2 μ E,   σ_vm = √(3/2) |dev S| = √6 μ |dev E|
 
-with F of each element's corners (St. Venant–Kirchhoff, Holzapfel 2000, section 6.5), averaged at each node over the elements around it by their
-volumes. At the strains of soft robots in use it follows the stress of the corotational law; it is a picture, no measurement.
+with F of each element's corners (St. Venant–Kirchhoff, Holzapfel 2000, section 6.5),
+averaged at each node over the elements around it by their volumes. At the strains of soft robots in use it follows the stress of
+the corotational law; it is a picture, no measurement.
 """
 
 from __future__ import annotations

@@ -122,7 +122,10 @@ def _reader(usd: dict[str, Any], stage: Any, path: Any, variable: str, kind: str
 
 
 def _add_bones(usd: dict[str, Any], stage: Any, root: Any, mesh: Any, animated: AnimatedSkin) -> None:
-    """Add skeleton, weights and animation. Joints have no parents, so that their poses are those of the bones in the file's frame."""
+    """Add skeleton, weights and animation.
+
+    Joints have no parents, so that their poses are those of the bones in the file's frame.
+    """
     skel, vt, skin = usd["UsdSkel"], usd["Vt"], animated.skin
     skeleton = skel.Skeleton.Define(stage, root.GetPath().AppendChild("skeleton"))
     names = [f"bone_{k}" for k in range(len(skin.skeleton))]

@@ -1,7 +1,8 @@
 """A surface of the user's own (CAD, glTF) that the finite-element body carries instead of its own surface.
 
-Each vertex is tied to the element that holds it at rest, or to the nearest one, as markers are. Its weights are then fitted to the states as
-those of the body's own surface. Beyond a budget the surface is decimated by quadric errors (Garland and Heckbert 1997, as Open3D has it).
+Each vertex is tied to the element that holds it at rest, or to the nearest one, as markers are.
+Its weights are then fitted to the states as those of the body's own surface. Beyond a budget the surface is decimated by quadric
+errors (Garland and Heckbert 1997, as Open3D has it).
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
     python meshes/arm/build.py              # arm.vtu and robot.toml
     python meshes/arm/build.py --picture    # arm.png too
 
-Each cable is tied near the tip and runs through five rings of the body to its motor above the clamp. The body is built of blocks, so
-that the script makes the same mesh each time.
+Each cable is tied near the tip and runs through five rings of the body to its motor above the clamp.
+The body is built of blocks, so that the script makes the same mesh each time.
 """
 
 from __future__ import annotations

@@ -3,8 +3,9 @@
     python meshes/gripper/build.py              # gripper.vtu and robot.toml
     python meshes/gripper/build.py --picture    # gripper.png too
 
-The palm is clamped at its top. Each cable runs down the inner side of a finger, through its ribs, and is tied to the last one: pulled, it
-closes the finger. The body is built of blocks, so that the script makes the same mesh each time.
+The palm is clamped at its top. Each cable runs down the inner side of a finger, through its ribs,
+and is tied to the last one: pulled, it closes the finger. The body is built of blocks,
+so that the script makes the same mesh each time.
 """
 
 from __future__ import annotations
@@ -54,7 +55,8 @@ def in_metres(points: FloatArray) -> FloatArray:
 
 
 def is_silicone(centre: FloatArray) -> BoolArray:
-    """Return whether cells with these centres [mm], shape (c, 3), belong to the palm, or to a finger and not to one of its notches."""
+    """Return whether cells with these centres [mm], shape (c, 3), belong to the palm,
+    or to a finger and not to one of its notches."""
     depth, inset = -centre[:, 2], HALF - np.abs(centre[:, 0])
     along = (depth - PALM) % SEGMENT
     return np.asarray((depth < PALM) | (inset < BACK) | ((inset < THICK) & (along > NOTCH)))

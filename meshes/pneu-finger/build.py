@@ -3,8 +3,9 @@
     python meshes/pneu-finger/build.py              # pneu_finger.vtu and robot.toml
     python meshes/pneu-finger/build.py --picture    # pneu_finger.png too
 
-The pockets bulge and push each other apart on their side, so that the finger bends to the other side, as the networks of pockets of
-Ilievski and others (2011) do. The body is built of blocks, so that the script makes the same mesh each time.
+The pockets bulge and push each other apart on their side, so that the finger bends to the other side,
+as the networks of pockets of Ilievski and others (2011) do. The body is built of blocks,
+so that the script makes the same mesh each time.
 """
 
 from __future__ import annotations

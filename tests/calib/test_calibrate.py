@@ -1,4 +1,5 @@
-"""Calibration from markers: exact data, noise against its bound, outliers, frames, held cables, marker placement, and what cannot be."""
+"""Calibration from markers: exact data, noise against its bound, outliers, frames, held cables, marker placement,
+and what cannot be."""
 
 from __future__ import annotations
 
@@ -267,7 +268,8 @@ def test_an_outlier_does_little_and_hardly_widens_what_is_stated() -> None:
 
 
 def test_errors_too_small_to_be_left_out_count_for_less() -> None:
-    """Three of the 24 places are 2 mm off, where noise is 0.1 mm: Huber's loss lets them move the pose by a third of what squares would."""
+    """Three of the 24 places are 2 mm off, where noise is 0.1 mm:
+    Huber's loss lets them move the pose by a third of what squares would."""
     robot, rec = bar_robot(), seen_by_camera(bar_robot(), STEPS, noise=1e-4)
     clean, moved = errors_of(calibrate(robot, rec)), []
     for seed in range(4):

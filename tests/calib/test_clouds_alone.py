@@ -1,4 +1,5 @@
-"""A camera's pose from clouds alone, from nowhere: rendered depth of another mesh and law, with noise, a table and things on it."""
+"""A camera's pose from clouds alone, from nowhere: rendered depth of another mesh and law, with noise,
+a table and things on it."""
 
 from __future__ import annotations
 

@@ -34,7 +34,8 @@ def camera(lens: FloatArray = LENS) -> Camera:
 def painted(
     poses: tuple[FloatArray, FloatArray], kinds: list[object], lens: FloatArray, *, seed: int = 0, hidden: int = -1
 ) -> tuple[FloatArray, FloatArray]:
-    """Return colour (H, W, 3) and depth (H, W) [m] of plane patches: a number is a tag, a triple a round dot; each pixel is cast by itself."""
+    """Return colour (H, W, 3) and depth (H, W) [m] of plane patches: a number is a tag, a triple a round dot;
+    each pixel is cast by itself."""
     places, normals = poses
     rng = np.random.default_rng(seed)
     u, v = np.meshgrid(np.arange(W, dtype=float), np.arange(H, dtype=float))

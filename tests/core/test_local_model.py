@@ -11,7 +11,8 @@ from femsense.core.local_model import LEAST, Curvature, LocalModel, Nonsmoothnes
 
 
 def circle(theta: np.ndarray, derivative: bool) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return how far a point on a circle, and a length, are from where they are wanted: the point inside, so that much is left."""
+    """Return how far a point on a circle, and a length, are from where they are wanted: the point inside,
+    so that much is left."""
     x, y = theta
     on, along = np.array([np.cos(x), np.sin(x)]), np.array([-np.sin(x), np.cos(x)])
     r = np.append(10.0 * ((1 + 0.02 * y) * on - [0.1, 0.2]), 3.0 * (y - 0.1))

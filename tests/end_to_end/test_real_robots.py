@@ -1,4 +1,5 @@
-"""Robots that others built, as robots and recordings: what the files say comes out in the right places (skipped where the data are absent)."""
+"""Robots that others built, as robots and recordings:
+what the files say comes out in the right places (skipped where the data are absent)."""
 
 from __future__ import annotations
 

@@ -178,7 +178,10 @@ def test_inverted_corotational_elements_are_finite_and_right() -> None:
 @pytest.mark.parametrize("folds", [False, True])
 @pytest.mark.parametrize("scale", [1.0, 1.3])
 def test_forces_side_by_side_are_those_that_come_with_the_stiffness(quadratic: bool, folds: bool, scale: float) -> None:
-    """Without a stiffness eight elements are worked on at once; 18 leave places empty in the last group. Some are inside out, or the body has grown."""
+    """Without a stiffness eight elements are worked on at once; 18 leave places empty in the last group.
+
+    Some are inside out, or the body has grown.
+    """
     rng = np.random.default_rng(11)
     mesh = block_mesh((3, 1, 1), (0.09, 0.04, 0.03))
     mesh = to_quadratic(mesh) if quadratic else mesh
@@ -329,7 +332,8 @@ def test_displacement_converges_at_the_order_of_the_element(
 
 @pytest.mark.parametrize("law", LAWS)
 def test_quadratic_elements_do_not_lock_at_the_poisson_ratio_of_silicone(law: str) -> None:
-    """A block squeezed between plates it sticks to, ν = 0.499: 3 cells across against 6 (four dilatations an element: 20 % too stiff)."""
+    """A block squeezed between plates it sticks to, ν = 0.499: 3 cells across against 6 (four dilatations an element:
+    20 % too stiff)."""
     size = (0.03, 0.03, 0.015)
     force = [plate_force(block_mesh(cells, size), law) for cells in ((3, 3, 2), (6, 6, 4))]
     assert force[0] == pytest.approx(force[1], rel=0.035)

@@ -248,7 +248,8 @@ def test_a_point_outside_follows_the_first_order_field_of_its_element(quadratic:
 
 
 def test_of_elements_that_are_as_near_rounding_does_not_choose() -> None:
-    """A body that grows by nothing to speak of carries a load beside it with the same element: derivatives by its size hold on to that."""
+    """A body that grows by nothing to speak of carries a load beside it with the same element:
+    derivatives by its size hold on to that."""
     length, half = 0.1, 0.01
     mesh = block_mesh((7, 2, 2), (length, 2 * half, 2 * half), start=(0.0, -half, -half))
     beside = np.array(

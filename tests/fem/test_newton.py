@@ -156,7 +156,8 @@ def test_an_arch_snaps_through_under_tension_and_is_led_through_by_a_held_cable(
 
 
 def test_a_column_that_a_held_cable_shortens_buckles_all_the_same() -> None:
-    """The cable holds the way along the axis alone: the column goes to its side at nearly the same tension however far it is shortened."""
+    """The cable holds the way along the axis alone:
+    the column goes to its side at nearly the same tension however far it is shortened."""
     mesh = to_quadratic(block_mesh((8, 2, 2), (LENGTH, WIDTH, SIDE)))
     axis = tie_cable(mesh, "axis", [[LENGTH, WIDTH / 2, SIDE / 2]], [0.0, WIDTH / 2, SIDE / 2])
     body = make_body(mesh, young_modulus=E, poisson_ratio=0.0, clamped=mesh.nodes[:, 0] < 1e-9, cables=(axis,))

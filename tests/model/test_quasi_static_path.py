@@ -1,4 +1,5 @@
-"""The quasi-static path along a recording: from recorded to true inputs, sharing of equal frames, history, derivatives by variants."""
+"""The quasi-static path along a recording: from recorded to true inputs, sharing of equal frames, history,
+derivatives by variants."""
 
 from __future__ import annotations
 

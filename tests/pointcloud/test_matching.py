@@ -123,7 +123,10 @@ def test_second_order_follows_curvature_and_first_order_is_off_as_stated() -> No
 
 @pytest.mark.parametrize("average", [False, True])
 def test_standard_deviations_hold_the_truth_as_often_as_they_say(average: bool) -> None:
-    """Features on the true surface: the distance is the error. One match a feature and cloud, so trials are nearly independent."""
+    """Features on the true surface: the distance is the error.
+
+    One match a feature and cloud, so trials are nearly independent.
+    """
     features, normals = front(40)
     rng = np.random.default_rng(5)
     errors = []

@@ -1,4 +1,5 @@
-"""Reports: one page that needs nothing else, shows what the files hold, leaves out what is missing, and refuses what is broken."""
+"""Reports: one page that needs nothing else, shows what the files hold, leaves out what is missing,
+and refuses what is broken."""
 
 from __future__ import annotations
 

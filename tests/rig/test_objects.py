@@ -1,4 +1,5 @@
-"""Objects that press: their patches by Hertz, where they stand on the deformed body, how they move, and what a script may not say."""
+"""Objects that press: their patches by Hertz, where they stand on the deformed body, how they move,
+and what a script may not say."""
 
 from __future__ import annotations
 

@@ -101,7 +101,8 @@ def record(
 ) -> tuple[Recording, list[np.ndarray]]:
     """Return a recording of the true arm (finer mesh, neo-Hookean) and its node positions in each frame.
 
-    `forces`: frame → (place at rest, force) of an undeclared contact. `placements`: by how much the markers sit elsewhere on the body at rest [m], (k, 3).
+    `forces`: frame → (place at rest, force) of an undeclared contact. `placements`:
+        by how much the markers sit elsewhere on the body at rest [m], (k, 3).
     """
     rng = np.random.default_rng(seed)
     true = apply_effects(truth or arm((8, 3, 3), law="neo_hookean"), effects)

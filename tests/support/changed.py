@@ -65,7 +65,8 @@ def log_permuted(recording: Recording, rng: np.random.Generator) -> Recording:
 
 
 def reordered(robot: Robot, recording: Recording, rng: np.random.Generator) -> tuple[Robot, Recording]:
-    """Return robot and recording with their markers in other orders, each in its own; the rows of a frame and the columns of cables too."""
+    """Return robot and recording with their markers in other orders, each in its own;
+    the rows of a frame and the columns of cables too."""
     r, order = recording, rng.permutation(len(robot.marker_names))
     other = replace(
         robot,

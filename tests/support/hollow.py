@@ -29,7 +29,8 @@ def hollow_bar(
 
 
 def shell(inner: float, outer: float, *, layers: int = 2, subdivisions: int = 2, quadratic: bool = False) -> TetMesh:
-    """Return a spherical shell of prisms, each split into three tetrahedra; mid-edge nodes of a quadratic one lie on their sphere."""
+    """Return a spherical shell of prisms, each split into three tetrahedra;
+    mid-edge nodes of a quadratic one lie on their sphere."""
     ball = trimesh.creation.icosphere(subdivisions=subdivisions)
     directions, triangles = np.array(ball.vertices), np.sort(np.array(ball.faces), axis=1)
     radii = np.linspace(inner, outer, layers + 1)

@@ -2,7 +2,8 @@
 
     python realsense_writer.py FILE FRAMES
 
-FILE ends in .bag (an SDK up to 2.57) or .db3 (2.58 and later). Exit status 3: this SDK does not load or does not write this format.
+FILE ends in .bag (an SDK up to 2.57) or .db3 (2.58 and later). Exit status 3:
+this SDK does not load or does not write this format.
 """
 
 from __future__ import annotations

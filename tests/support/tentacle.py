@@ -1,4 +1,5 @@
-"""The tendon-driven silicone tentacle of `data/tentacle`: its body as its README gives it, and its runs as raw motion capture without names."""
+"""The tendon-driven silicone tentacle of `data/tentacle`: its body as its README gives it,
+and its runs as raw motion capture without names."""
 
 from __future__ import annotations
 
@@ -97,7 +98,8 @@ def runs(*, every: int = 200) -> list[Run]:
 
 
 def recording_of(chosen: list[Run], *, frames: int = 3, rng: np.random.Generator | None = None) -> tuple[Recording, np.ndarray]:
-    """Return one recording of some runs without names, and which marker each row is; rows in the order of the files, or shuffled by rng."""
+    """Return one recording of some runs without names, and which marker each row is; rows in the order of the files,
+    or shuffled by rng."""
     rows, names, frame, inputs = [], [], [], []
     for run in chosen:
         for points in run.points[:frames]:

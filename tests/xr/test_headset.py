@@ -1,4 +1,5 @@
-"""The page in an emulated headset: enters VR and AR, stands where a surface was hit, is carried and dragged by controllers and hands."""
+"""The page in an emulated headset: enters VR and AR, stands where a surface was hit,
+is carried and dragged by controllers and hands."""
 
 from __future__ import annotations
 

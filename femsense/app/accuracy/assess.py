@@ -1,7 +1,8 @@
 """The discretisation error of a robot: motions and sensed forces on it against those on finer spaces of the same body.
 
-The same loads act on the declared mesh, on quadratic elements and on a mesh with each element split into eight. The clamp stays the
-piece of the body that the declared mesh clamps, and loads are the same pieces of the surface, so that the space alone differs.
+The same loads act on the declared mesh, on quadratic elements and on a mesh with each element split into eight.
+The clamp stays the piece of the body that the declared mesh clamps, and loads are the same pieces of the surface,
+so that the space alone differs.
 """
 
 from __future__ import annotations

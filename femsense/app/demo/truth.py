@@ -19,7 +19,8 @@ __all__ = ["TrueContact", "force_errors", "read_truth", "true_effects"]
 
 
 def true_effects(recording: Path) -> list[dict[str, Any]]:
-    """Return the effects that the truth has, a law other than the plain one among them, as entries of `[[effects]]`; none where nothing is known of it."""
+    """Return the effects that the truth has, a law other than the plain one among them, as entries of `[[effects]]`;
+    none where nothing is known of it."""
     try:
         known = json.loads((recording / "truth" / "truth.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):

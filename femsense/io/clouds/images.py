@@ -15,7 +15,10 @@ from femsense.model.camera import Camera
 
 
 def read_png(path: Path) -> npt.NDArray[Any]:
-    """Return a PNG image as it is: shape (H, W), or (H, W, 3) in the order blue, green, red. Raises InputError where it is broken."""
+    """Return a PNG image as it is: shape (H, W), or (H, W, 3) in the order blue, green, red.
+
+    Raises InputError where it is broken.
+    """
     import cv2
 
     try:

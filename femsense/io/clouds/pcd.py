@@ -1,7 +1,8 @@
 """PCD files with all their fields (labels too), read by pypcd4: ascii, binary and binary_compressed.
 
-pypcd4 is strict about headers and spaces, and takes fields of several values apart. What older writers leave out is filled in before it
-reads (VERSION, COUNT, WIDTH and HEIGHT), and such fields are put together after it.
+pypcd4 is strict about headers and spaces, and takes fields of several values apart.
+What older writers leave out is filled in before it reads (VERSION, COUNT, WIDTH and HEIGHT),
+and such fields are put together after it.
 """
 
 from __future__ import annotations

@@ -16,8 +16,8 @@ SKIPPED = ("#", "//")
 def read_xyz_columns(path: str | Path) -> dict[str, npt.NDArray[np.generic]]:
     """Return the columns x, y, z of a text file, and red, green, blue where it has them, each of shape (n,).
 
-    Three numbers after the place are a colour where none is negative and they are no directions of length 1. A first line with one number
-    is a count, one with words is a header.
+    Three numbers after the place are a colour where none is negative and they are no directions of length 1.
+    A first line with one number is a count, one with words is a header.
 
     Raises:
         InputError: no such file, lines of different lengths, or words that are no numbers.

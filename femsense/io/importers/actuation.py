@@ -21,7 +21,8 @@ DEVIATIONS = 5.0
 APART = 0.1
 """The best correlation must lie this much above the next peak."""
 SMOOTH_S = 0.1
-"""Both signals are averaged over this time before their speed is taken: noise of a tenth of the motion leaves 0.84 of correlation, not 0.41."""
+"""Both signals are averaged over this time before their speed is taken:
+noise of a tenth of the motion leaves 0.84 of correlation, not 0.41."""
 FLAT = 1e-9
 """A signal whose variance over the overlap is below this share of its energy is constant (rounding of the transform)."""
 GRID = 4000

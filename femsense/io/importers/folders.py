@@ -41,7 +41,10 @@ def folder_kind(folder: Path) -> str | None:
 
 
 def open_tum(folder: Path, options: Options) -> Source:
-    """Return a TUM RGB-D folder (depth.txt and rgb.txt, associated by time, or a list of pairs) as a source. Raises InputError."""
+    """Return a TUM RGB-D folder (depth.txt and rgb.txt, associated by time, or a list of pairs) as a source.
+
+    Raises InputError.
+    """
     depth, color = _lists(folder)
     header = png_header(folder / depth[0][1]) if (folder / depth[0][1]).is_file() else None
     if header is None:

@@ -118,7 +118,8 @@ class Options:
     topics: Sequence[str] = ()
     """Topics, streams, tracks or names to take."""
     columns: Mapping[str, str] = field(default_factory=dict)
-    """Name in the source → name in the recording, such as cable_north, chamber_a, marker.x or load@0.1,0,0.02; may end in *FACTOR."""
+    """Name in the source → name in the recording, such as cable_north, chamber_a, marker.x or load@0.1,0,0.02;
+    may end in *FACTOR."""
     unit: str | None = None
     """Of lengths, a key of UNITS."""
     up: str | None = None

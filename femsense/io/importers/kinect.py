@@ -1,7 +1,7 @@
 """Azure Kinect recordings (.mkv): depth bit for bit, colours registered to it, the lens from the calibration inside.
 
-What stands where: "Azure Kinect DK recording file format" of the vendor's documentation; how the calibration is scaled to a mode of the
-cameras: `mode_specific_calibration.c` of the Azure Kinect Sensor SDK.
+What stands where: "Azure Kinect DK recording file format" of the vendor's documentation;
+how the calibration is scaled to a mode of the cameras: `mode_specific_calibration.c` of the Azure Kinect Sensor SDK.
 """
 
 from __future__ import annotations

@@ -157,7 +157,8 @@ def split_factor(target: str) -> tuple[str, float]:
 def open_plain_csv(path: Path, options: Options) -> Source:
     """Return a table of positions over time as a source.
 
-    Columns: a time (or `--rate`), markers as NAME_x, NAME_y, NAME_z (also NAME.x, x1 …, NAME:X) or mapped by NAME=marker.x, inputs
+    Columns: a time (or `--rate`), markers as NAME_x, NAME_y, NAME_z (also NAME.x, x1 …,
+        NAME:X) or mapped by NAME=marker.x, inputs
     as cable_… and chamber_…. A file of bare numbers (counter, time, x, y, z, x, y, z …) holds markers without names.
 
     Raises:

@@ -56,7 +56,8 @@ def open_ros(path: Path, options: Options) -> Source:
 
 
 def _sources(bag: Bag, streams: Sequence[Stream], cameras: Sequence[str], options: Options) -> dict[str, Source]:
-    """Return a source a camera; a topic of markers is the first camera's that is joined to it: what is measured once stands once."""
+    """Return a source a camera; a topic of markers is the first camera's that is joined to it:
+    what is measured once stands once."""
     others = tuple(topic for topic in options.topics if topic not in cameras)
     sources: dict[str, Source] = {}
     taken: set[str] = set()
@@ -133,7 +134,8 @@ class _Track:
             del self.stamps[record]
 
     def nearest(self, time: float, device: float | None = None) -> Any:
-        """Return the value nearest in time (of the device, where that is given), at most NEAR_S away; None where there is none."""
+        """Return the value nearest in time (of the device, where that is given), at most NEAR_S away;
+        None where there is none."""
         if not self.times:
             return None
         apart = [abs(t - time) if device is None else abs(self.stamps.get(t, np.inf) - device) for t in self.times]

@@ -50,7 +50,8 @@ class Bag:
         self.topics = _topics(reader)
 
     def messages(self, topics: Collection[str]) -> Iterator[Message]:
-        """Yield messages of these topics in the order in which they were written; stops with a warning where the bag breaks off."""
+        """Yield messages of these topics in the order in which they were written;
+        stops with a warning where the bag breaks off."""
         wanted = [c for c in self.reader.connections if c.topic in topics]
         if not wanted:
             return

@@ -118,7 +118,10 @@ def _chunk_records(data: bytes) -> Iterator[Connection | tuple[int, int, bytes]]
 
 
 def _bag_record(stream: BinaryIO) -> tuple[dict[str, bytes], bytes] | None:
-    """Return header and data of the next record; None at the end or where it is cut off. Of a chunk that is not compressed what is there."""
+    """Return header and data of the next record; None at the end or where it is cut off.
+
+    Of a chunk that is not compressed what is there.
+    """
     parts = list[bytes]()
     for _ in range(2):
         size = stream.read(4)

@@ -292,7 +292,8 @@ def _extrinsics(bag: Bag, depth: Stream, color: Stream) -> FloatArray | None:
 
 
 def _sdk_transform(bag: Bag, name: str) -> FloatArray | None:
-    """Return T_stream_reference as the RealSense SDK stores it: a Transform (.bag), or text with the rotation by columns (.db3)."""
+    """Return T_stream_reference as the RealSense SDK stores it: a Transform (.bag),
+    or text with the rotation by columns (.db3)."""
     stream = name.split("/image/")[0]
     first = next(bag.messages([t.name for t in bag.topics if t.name.startswith(f"{stream}/tf/")]), None)
     if first is None:

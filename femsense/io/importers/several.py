@@ -32,8 +32,8 @@ class Match:
 def joined(sources: Mapping[str, Source], path: Path, options: Options) -> Source:
     """Return several sources as one whose frames hold what each gave at that moment.
 
-    The frames are those of the first source with pictures; of the others each takes the nearest in time, at most half a step of the first
-    away. Inputs and loads come from the first source that has them.
+    The frames are those of the first source with pictures; of the others each takes the nearest in time,
+    at most half a step of the first away. Inputs and loads come from the first source that has them.
 
     Arguments:
         sources: camera → its source.

@@ -55,7 +55,8 @@ def _joined_data(tables: list[dict[str, npt.NDArray[np.generic]]]) -> dict[str, 
 
 
 def distinct_cells(cells: IntArray) -> tuple[IntArray, IntArray]:
-    """Return which cells are kept when each set of corners stands once, shape (k,), and for every cell its kept one, shape (m,)."""
+    """Return which cells are kept when each set of corners stands once, shape (k,), and for every cell its kept one,
+    shape (m,)."""
     keys = np.sort(cells[:, :4], axis=1)
     _, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
     kept = np.sort(first)
@@ -65,7 +66,8 @@ def distinct_cells(cells: IntArray) -> tuple[IntArray, IntArray]:
 
 
 def gathered(values: npt.NDArray[np.generic], kept: IntArray, owner: IntArray) -> npt.NDArray[np.generic]:
-    """Return the values of the kept cells with those of their copies beside them, shape (k, p); a cell without copies repeats its own."""
+    """Return the values of the kept cells with those of their copies beside them, shape (k, p);
+    a cell without copies repeats its own."""
     table = values.reshape(len(values), -1)
     if len(kept) == len(owner):
         return table

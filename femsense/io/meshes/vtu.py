@@ -23,7 +23,8 @@ OWN_KINDS = {10: ("tetra", 4), 24: ("tetra10", 10)}
 
 
 def read_own(data: bytes) -> MeshContent | None:
-    """Return the mesh of a .vtu file as `write_mesh` makes them: one piece, tetrahedra of one kind, compressed, without data; else None.
+    """Return the mesh of a .vtu file as `write_mesh` makes them: one piece, tetrahedra of one kind, compressed,
+    without data; else None.
 
     meshio reads every other file. It takes as long to import as a small mesh takes to solve.
     """
@@ -42,7 +43,8 @@ def read_own(data: bytes) -> MeshContent | None:
 
 
 def _unpacked(text: bytes) -> bytes:
-    """Return what VTK's compressed blocks hold: how many, their size, that of the last, then how long each is compressed; each part is base64."""
+    """Return what VTK's compressed blocks hold: how many, their size, that of the last, then how long each is compressed;
+    each part is base64."""
     count = int.from_bytes(base64.b64decode(text[:8])[:4], "little")
     letters = 4 * -(-4 * (3 + count) // 3)
     sizes = np.frombuffer(base64.b64decode(text[:letters]), "<u4")[3:]

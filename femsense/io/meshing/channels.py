@@ -19,13 +19,13 @@ FEWEST, MOST = 8, 256
 SEARCHED_WITH, MOST_TRIES = 64, 12
 """Points with which a tension that bends the body is looked for, and how many are tried."""
 STILL = 0.005
-"""A path is fine enough where twice the points change the motion by less than this share of it [1]. The tentacle of docs/bodies.md moves
-by 6 % from 16 to 32 points at 4.6 N, by 0.8 % from 32 to 64, and by 0.2 % from 64 to 128."""
+"""A path is fine enough where twice the points change the motion by less than this share of it [1].
+The tentacle of docs/bodies.md moves by 6 % from 16 to 32 points at 4.6 N, by 0.8 % from 32 to 64, and by 0.2 % from 64 to 128."""
 GAP = 0.01
 """A pull point that is not given lies so far before the channel [m], straight on."""
 BEND = 0.4
-"""Paths are tried at a tension that moves the body by this share of its length [1], or at the largest one if that is smaller: beyond, bodies
-curl up and answer anything."""
+"""Paths are tried at a tension that moves the body by this share of its length [1],
+or at the largest one if that is smaller: beyond, bodies curl up and answer anything."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -141,7 +141,8 @@ class _Pulled:
         return state.positions if state.converged else None
 
     def tension_that_moves(self, distance: float) -> float:
-        """Return a tension [N] that moves the body about so far [m], at most the largest; half of it where the body is lost on the way."""
+        """Return a tension [N] that moves the body about so far [m], at most the largest;
+        half of it where the body is lost on the way."""
         most = self.channel.max_tension
         tension = min(1e-3, most)
         for _ in range(MOST_TRIES):

@@ -251,7 +251,8 @@ def _fill_once(
 
 
 def _envelope(drifted: float, tolerance: float, diagonal: float, asked: bool) -> float:
-    """Return how far the mesh may leave the thinned surface [m]: what is left, or the roughness where that is larger and nobody asked."""
+    """Return how far the mesh may leave the thinned surface [m]: what is left,
+    or the roughness where that is larger and nobody asked."""
     if not asked and drifted > 0.5 * tolerance:
         return min(drifted, LARGEST_ENVELOPE * diagonal)
     return max(tolerance - drifted, 0.5 * tolerance)
@@ -268,7 +269,8 @@ def _rougher(drifted: float, tolerance: float) -> tuple[str, ...]:
 
 
 def _deviation(mesh: TetMesh, surface: ClosedSurface, crosses: bool) -> float:
-    """Return the largest distance of a point of one surface from the other [m]; where shells cross, of the mesh from the surface."""
+    """Return the largest distance of a point of one surface from the other [m]; where shells cross,
+    of the mesh from the surface."""
     skin, numbers = np.unique(surface_triangles(mesh), return_inverse=True)
     out = float(distance_to(surface.points, surface.triangles, mesh.nodes[skin]).max())
     if crosses:  # what lies inside another shell has no counterpart

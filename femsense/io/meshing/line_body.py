@@ -101,7 +101,8 @@ class LineBody:
 
 
 def place(line: LineBody, along: float, distance: float = 0.0, angle: float = 0.0) -> FloatArray:
-    """Return a point by length along the line [m], distance from it [m] and angle [rad], shape (3,); beyond the ends it goes on straight."""
+    """Return a point by length along the line [m], distance from it [m] and angle [rad], shape (3,);
+    beyond the ends it goes on straight."""
     s = line.stations
     axes, tangent = frame_at(line, along)
     center = np.array([np.interp(along, s, line.points[:, i]) for i in range(3)])
@@ -110,7 +111,8 @@ def place(line: LineBody, along: float, distance: float = 0.0, angle: float = 0.
 
 
 def frame_at(line: LineBody, along: float) -> tuple[FloatArray, FloatArray]:
-    """Return the directions of angle 0 and of 90°, shape (2, 3), and the tangent (3,) at a length [m]: carried along without twist."""
+    """Return the directions of angle 0 and of 90°, shape (2, 3), and the tangent (3,) at a length [m]:
+    carried along without twist."""
     s = line.stations
     legs = np.diff(line.points, axis=0)
     legs = legs[np.linalg.norm(legs, axis=1) > 0]

@@ -80,7 +80,8 @@ def between(first: Section, second: Section, share: float) -> Section:
 def outline(section: Section, angles: FloatArray) -> FloatArray:
     """Return the corners of the outline [m], shape (n, 2), at angles [rad], shape (n,).
 
-    The polygon of a round section stands out so far that it has the area of the ellipse. Its second moment is then off by 0.2 % with eight corners.
+    The polygon of a round section stands out so far that it has the area of the ellipse.
+    Its second moment is then off by 0.2 % with eight corners.
     """
     around = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     square = around / np.abs(around).max(axis=1, keepdims=True)

@@ -87,7 +87,10 @@ def line_into(
 
 
 def _known(target: Path) -> dict[str, Any] | None:
-    """Return the report of a folder that was made from a line; None where it is new. Raises InputError where something else stands there."""
+    """Return the report of a folder that was made from a line; None where it is new.
+
+    Raises InputError where something else stands there.
+    """
     import json
 
     check_target(target, folder=True)

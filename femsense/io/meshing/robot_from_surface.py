@@ -84,7 +84,10 @@ def mesh_into(
 
 
 def read_any_surface(path: Path, *, unit: str = "mm") -> tuple[FloatArray, IntArray]:
-    """Return points and triangles of a surface file in its unit, as they are; of a CAD file in the given one. Raises InputError."""
+    """Return points and triangles of a surface file in its unit, as they are; of a CAD file in the given one.
+
+    Raises InputError.
+    """
     if not path.is_file():
         raise InputError("no such surface", where=path, expected="an STL, OBJ, PLY or OFF file")
     if not path.stat().st_size:

@@ -1,7 +1,8 @@
 """Surfaces as CAD programs and scanners write them, made fit to be filled with tetrahedra, and what was done to them.
 
-The order is: weld, drop what repeats, turn neighbours the same way, close holes, find which shells lie inside which, choose the body.
-A shell inside another one is a cavity (a chamber), whichever way its triangles face. Shells that cross each other become one body:
+The order is: weld, drop what repeats, turn neighbours the same way, close holes, find which shells lie inside which,
+choose the body. A shell inside another one is a cavity (a chamber), whichever way its triangles face.
+Shells that cross each other become one body:
 the filling takes what lies inside any of them.
 """
 
@@ -165,8 +166,8 @@ def shared_edges(triangles: IntArray) -> IntArray:
 def _turned_alike(points: FloatArray, triangles: IntArray, where: str, done: list[str]) -> IntArray:
     """Turn triangles so that neighbours go round the same way.
 
-    Each triangle stands in a graph twice, as it is and turned; sides join what goes together. The two halves of a surface with two
-    sides are not connected, and the half that turns fewer triangles is taken.
+    Each triangle stands in a graph twice, as it is and turned; sides join what goes together.
+    The two halves of a surface with two sides are not connected, and the half that turns fewer triangles is taken.
     """
     t = len(triangles)
     first, second, alike = neighbours(triangles)
@@ -235,7 +236,10 @@ def _closed(
 
 
 def _without_sheets(points: FloatArray, triangles: IntArray, loose: IntArray, where: str, done: list[str]) -> IntArray:
-    """Leave out sheets that hang on the rest: open edges that do not come round bound them. Raises InputError where that is the most."""
+    """Leave out sheets that hang on the rest: open edges that do not come round bound them.
+
+    Raises InputError where that is the most.
+    """
     edges, labels = np.sort(directed_edges(triangles), axis=1), pieces(triangles)
     bounds = (edges[:, None] == np.sort(loose, axis=1)[None]).all(axis=2).any(axis=1)
     hangs = np.isin(labels, labels[np.flatnonzero(bounds) // 3])
@@ -253,7 +257,8 @@ def _without_sheets(points: FloatArray, triangles: IntArray, loose: IntArray, wh
 
 
 def _holes(triangles: IntArray) -> tuple[list[IntArray], IntArray]:
-    """Return the borders of the holes, each as its points in the order in which a closing triangle goes round, and open edges of none."""
+    """Return the borders of the holes, each as its points in the order in which a closing triangle goes round,
+    and open edges of none."""
     after: dict[int, list[int]] = {}
     for a, b in open_edges(triangles).tolist():
         after.setdefault(b, []).append(a)

@@ -71,7 +71,8 @@ def nearest_on(points: FloatArray, triangles: IntArray, places: FloatArray) -> F
 
 
 def wall_thickness(points: FloatArray, triangles: IntArray, places: FloatArray, inward: FloatArray) -> FloatArray:
-    """Return how far it is from places just inside of the surface, along unit vectors, to the next wall, shape (p,); inf: none."""
+    """Return how far it is from places just inside of the surface, along unit vectors, to the next wall, shape (p,);
+    inf: none."""
     import open3d as o3d
 
     centre, size = points.mean(axis=0), float(np.ptp(points, axis=0).max())

@@ -1,7 +1,8 @@
 """Tetrahedra of a body along a line: rings around an axis in layers, each cell a prism of three tetrahedra.
 
-A layer is a polar grid: a fan of triangles around the axis, then rings of quadrilaterals of two triangles. Cavities are cells that are
-left out. Prisms are split by the order of their nodes, turned over in every second layer, so that neighbours fit and no side is preferred.
+A layer is a polar grid: a fan of triangles around the axis, then rings of quadrilaterals of two triangles.
+Cavities are cells that are left out. Prisms are split by the order of their nodes, turned over in every second layer, so that
+neighbours fit and no side is preferred.
 """
 
 from __future__ import annotations

@@ -35,7 +35,10 @@ def read_labelled(sensors: str | Path, markers: str | Path) -> Labelled:
 
 
 def read_sensors(path: str | Path) -> tuple[IntArray, FloatArray, tuple[str, ...], FloatArray]:
-    """Return frames (n,), times [s] (n,), names of channels and readings (n, c) of SENSORS.csv; an empty cell is nan. Raises InputError."""
+    """Return frames (n,), times [s] (n,), names of channels and readings (n, c) of SENSORS.csv; an empty cell is nan.
+
+    Raises InputError.
+    """
     file = Path(path)
     header = next(csv.reader(io.StringIO(read_text(file))), [])
     columns = tuple(cell.strip() for cell in header)

@@ -143,7 +143,8 @@ def importance(
 ) -> dict[str, float]:
     """Return by how much the error grows when a channel is taken from another time [mm], by channel.
 
-    The channel and its filters are shifted by half the rows, so that it keeps its own course (permutation importance, Breiman 2001).
+    The channel and its filters are shifted by half the rows, so that it keeps its own course (permutation importance,
+    Breiman 2001).
     """
     base, half, width = marker_rms(network(inputs) - targets), len(inputs) // 2, len(channels)
     grown = {}
@@ -200,7 +201,8 @@ def _by_marker(errors: FloatArray, names: tuple[str, ...]) -> dict[str, float]:
 
 
 def _bone_error(numbers: FloatArray, chain: Armature, test: Labelled) -> float:
-    """Return the error of the places of bones that come straight from the readings [mm], against those from the measured markers."""
+    """Return the error of the places of bones that come straight from the readings [mm],
+    against those from the measured markers."""
     places = numbers.reshape(len(test), -1, 9)[:, :, :3]
     wanted = np.array([chain(markers).positions for markers in test.markers])
     return 1e3 * marker_rms((places - wanted).reshape(len(test), -1))

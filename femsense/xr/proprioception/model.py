@@ -58,7 +58,10 @@ class ProprioceptiveModel:
         return np.asarray(y[0] if single else y)
 
     def armature(self, row: npt.ArrayLike) -> BonePoses:
-        """Return the bones of one steady row of readings, shape (c,). Raises InputError as `markers`, and where there is no chain."""
+        """Return the bones of one steady row of readings, shape (c,).
+
+        Raises InputError as `markers`, and where there is no chain.
+        """
         x, _ = self._rows(row)
         return self.bones_of(self._inputs(x[:1], True, None))
 
@@ -69,7 +72,8 @@ class ProprioceptiveModel:
         return self._chain()(self.network(inputs).reshape(-1, 3))
 
     def check(self, row: npt.ArrayLike) -> tuple[Outside, ...]:
-        """Return the channels of a row, shape (c,), that read what was never learnt, the farthest first; empty where all is well."""
+        """Return the channels of a row, shape (c,), that read what was never learnt, the farthest first;
+        empty where all is well."""
         return self.domain.check(self._rows(row)[0][0], self.channels)
 
     @property

@@ -1,7 +1,7 @@
 """A model as one ONNX file: its networks as a graph that any runtime computes, and what else it knows as metadata.
 
-Inputs of the graph: `readings` (rows, c) and, where the model has a memory, `filtered` (rows, k c). Outputs: `markers` (rows, 3 m)
-and, of an end-to-end network, `bones` (rows, 9 b). Metadata: the key `femsense` holds JSON.
+Inputs of the graph: `readings` (rows, c) and, where the model has a memory, `filtered` (rows, k c). Outputs: `markers` (rows,
+3 m) and, of an end-to-end network, `bones` (rows, 9 b). Metadata: the key `femsense` holds JSON.
 """
 
 from __future__ import annotations

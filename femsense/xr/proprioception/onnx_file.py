@@ -1,6 +1,7 @@
 """A small part of ONNX, written and read without a library: a graph of a few operators, its numbers, and text beside it.
 
-The fields are those of onnx/onnx.proto, in the wire format of Protocol Buffers (a key of field · 8 + type, then a varint or bytes).
+The fields are those of onnx/onnx.proto, in the wire format of Protocol Buffers (a key of field · 8 + type,
+then a varint or bytes).
 """
 
 from __future__ import annotations

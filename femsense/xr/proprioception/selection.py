@@ -1,7 +1,8 @@
 """Which map is learnt: chosen on blocks of time that it was not trained on.
 
-Rows that follow each other are nearly the same, so a row held out at random says nothing of the next excursion. Six blocks in time
-are held out in turn; of the rest of the recording, blocks spread over it are kept for the error that is stated (70 / 15 / 15 %).
+Rows that follow each other are nearly the same, so a row held out at random says nothing of the next excursion.
+Six blocks in time are held out in turn; of the rest of the recording,
+blocks spread over it are kept for the error that is stated (70 / 15 / 15 %).
 """
 
 from __future__ import annotations
@@ -129,7 +130,8 @@ def compare_plan(plan: Plan, inputs: FloatArray, targets: FloatArray, seed: int)
 
 
 def train(plan: Plan, inputs: FloatArray, targets: FloatArray, seed: int) -> Network:
-    """Return the map of a plan, trained on inputs with filters, shape (n, (1 + k) c); it takes all of them, also those it does not use."""
+    """Return the map of a plan, trained on inputs with filters, shape (n, (1 + k) c); it takes all of them,
+    also those it does not use."""
     columns, rng, numbers = plan.columns, np.random.default_rng(seed), plan.numbers
     x = inputs[:, columns]
     if plan.kind == "ridge":

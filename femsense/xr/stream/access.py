@@ -70,7 +70,8 @@ class Access:
         return _same(_password_of(authorization), self.password)
 
     def knows_host(self, header: str | None) -> bool:
-        """Return whether a Host header may be ours; without a password only names of this machine, so that no foreign page reaches us under its own name."""
+        """Return whether a Host header may be ours; without a password only names of this machine, so that no foreign page
+        reaches us under its own name."""
         return self.password is not None or _name_of(header or "") in LOOPBACK_NAMES
 
 

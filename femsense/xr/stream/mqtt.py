@@ -154,7 +154,8 @@ def _without_delay(_client: Any, _data: Any, endpoint: Any) -> None:
 
 
 class EmbeddedBroker:
-    """A broker in this program, for clients on this machine unless a password is set; a sink of a hub: messages reach clients in one step."""
+    """A broker in this program, for clients on this machine unless a password is set; a sink of a hub:
+    messages reach clients in one step."""
 
     def __init__(self, hub: Hub, *, port: int = PLAIN_PORT, access: Access | None = None) -> None:
         """Start to serve. Raises MissingDependency, InputError where the port is taken.

@@ -4,9 +4,9 @@ A pose is a header of 20 bytes and seven numbers a bone, little-endian:
 
     "FSP1" · seq uint32 · time float64 [s] · bones uint16 · 0 uint16 · (x y z qx qy qz qw) float32 each, robot frame [m]
 
-A cloud is the same header with "FSC1" and a count uint32, then (x y z residual) float32 of each point [m]. A field, stress for instance, is
-that header with "FSV1", then the largest value float32 and the share of it at each vertex of the mesh, 0 … 255. All else is JSON that
-Unity's JsonUtility reads: objects at the top, no dictionaries, unknown numbers left out.
+A cloud is the same header with "FSC1" and a count uint32, then (x y z residual) float32 of each point [m]. A field,
+stress for instance, is that header with "FSV1", then the largest value float32 and the share of it at each vertex of the mesh,
+0 … 255. All else is JSON that Unity's JsonUtility reads: objects at the top, no dictionaries, unknown numbers left out.
 """
 
 from __future__ import annotations
@@ -275,8 +275,9 @@ def measured_bytes(seq: int, time_s: float, markers: Mapping[str, npt.ArrayLike]
 def pose_json_bytes(seq: int, time_s: float, bones: npt.NDArray[np.float32]) -> bytes:
     """Return the pose for Unity's JsonUtility, in Unity's own left-handed frame.
 
-    x changes its sign, as glTF importers for Unity do it; so do y and z of the quaternion. These are local poses of the bones under
-    the node `robot_frame` of the GLB file, or under any transform that is turned by −90° about x.
+    x changes its sign, as glTF importers for Unity do it; so do y and z of the quaternion.
+    These are local poses of the bones under the node `robot_frame` of the GLB file,
+    or under any transform that is turned by −90° about x.
     """
     return _json({"header": header(seq, time_s, "unity"), "poses": [_pose_table(row) for row in in_unity(bones)]})
 

@@ -34,8 +34,9 @@ def readings_of(source: str, channels: Sequence[str], stop: Event) -> Iterator[R
     """Yield readings until `stop` is set; lines that are none are passed over.
 
     Arguments:
-        source: a CSV file, `udp://HOST:PORT`, `mqtt://HOST/TOPIC`, or `serial:PORT?baud=115200`. What comes by UDP, MQTT or a serial line
-            is a JSON object channel → number, or numbers with commas between in the order of the channels; `time_s` is optional.
+        source: a CSV file, `udp://HOST:PORT`, `mqtt://HOST/TOPIC`, or `serial:PORT?baud=115200`. What comes by UDP,
+            MQTT or a serial line is a JSON object channel → number,
+            or numbers with commas between in the order of the channels; `time_s` is optional.
         channels: names, in the order of the values that are yielded.
         stop: ends it.
 
@@ -102,7 +103,10 @@ def _number(value: Any) -> float:
 
 
 def _grown(file: Path, channels: Sequence[str], stop: Event) -> Iterator[Reading]:
-    """Yield the rows of a CSV file: the last one there is, then those that are written to it. A file that starts anew is read anew."""
+    """Yield the rows of a CSV file: the last one there is, then those that are written to it.
+
+    A file that starts anew is read anew.
+    """
     with file.open(newline="", encoding="utf-8") as stream:
         columns = next(csv.reader(io.StringIO(stream.readline())), [])
         missing = [name for name in channels if name not in columns]

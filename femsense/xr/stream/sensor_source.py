@@ -35,7 +35,8 @@ def sensor_twin(model: ProprioceptiveModel, name: str) -> Twin:
 
 
 def frames_of_sensors(source: str, model: ProprioceptiveModel, stop: Event) -> Iterator[TwinFrame]:
-    """Yield a frame for each reading of a source (see `readings_of`); where a reading is no number, the last good pose is kept."""
+    """Yield a frame for each reading of a source (see `readings_of`); where a reading is no number,
+    the last good pose is kept."""
     live, straight = model.live(), np.linalg.inv(model.rest_bones.T_robot_bone)
     straight[:, :3, 3] = 0.0
     bones = bone_rows(skeleton_at(model.rest_bones.positions).T_robot_bone)

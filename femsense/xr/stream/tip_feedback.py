@@ -2,10 +2,11 @@
 
     b ← clip(m − p* + (1 − exp(−Δt / τ)) (p* − y)),   target of the model: p* + b
 
-with p* where the point is wanted, y where it is measured, and m where the model's inputs bring it. m − p* is the b before without what the
-model cannot do, be it too few inputs or a limit: neither winds b up (back-calculation: Åström and Hägglund 1995, section 3.5). b changes only
-while the inputs stand still where the model wants them, so that the limited rate does not either. At rest y = p*, or as near as the
-inputs allow, whatever mesh, law or contact the model lacks, as long as its slopes have the right sign and half their size.
+with p* where the point is wanted, y where it is measured, and m where the model's inputs bring it.
+m − p* is the b before without what the model cannot do, be it too few inputs or a limit: neither winds b up (back-calculation:
+Åström and Hägglund 1995, section 3.5). b changes only while the inputs stand still where the model wants them, so that the
+limited rate does not either. At rest y = p*, or as near as the inputs allow, whatever mesh, law or contact the model lacks, as
+long as its slopes have the right sign and half their size.
 """
 
 from __future__ import annotations

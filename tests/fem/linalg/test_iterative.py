@@ -1,4 +1,5 @@
-"""Conjugate gradients with two levels: the direct solver's answers, its sense of what is definite, and when they take its place."""
+"""Conjugate gradients with two levels: the direct solver's answers, its sense of what is definite,
+and when they take its place."""
 
 from __future__ import annotations
 

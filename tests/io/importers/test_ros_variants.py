@@ -1,4 +1,5 @@
-"""Bags as other programs write them: compressed files, MCAP of ROS 1 and without a profile, depth in plain PNG, infrared beside depth."""
+"""Bags as other programs write them: compressed files, MCAP of ROS 1 and without a profile, depth in plain PNG,
+infrared beside depth."""
 
 from __future__ import annotations
 

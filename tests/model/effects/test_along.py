@@ -1,4 +1,5 @@
-"""Effects along the body and of its cables' paths: axes, gradients, bodies curved at rest, coupled cables; the rig has them too."""
+"""Effects along the body and of its cables' paths: axes, gradients, bodies curved at rest, coupled cables;
+the rig has them too."""
 
 from __future__ import annotations
 

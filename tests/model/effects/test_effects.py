@@ -46,7 +46,8 @@ def robot(**options: Any) -> Robot:
 
 
 def measured(r: Robot, control: str) -> np.ndarray:
-    """Return markers of three frames as a camera half a metre above would measure them, friction, creep and softening included."""
+    """Return markers of three frames as a camera half a metre above would measure them, friction,
+    creep and softening included."""
     inputs = {"tension": [[0.5, 0.2], [1.5, 0.6], [0.7, 0.2]], "displacement": [[0.002, 0.002], [0.006, 0.001], [0.003, 0.002]]}[
         control
     ]

@@ -19,7 +19,8 @@ TRANSCRIPT = UNITY / "Tests" / "transcript.txt"
 
 
 def transcript() -> list[str]:
-    """Frames of a WebSocket in hexadecimal, their topic, and sequence, time and bones in Unity's frame; a broken pose has none."""
+    """Frames of a WebSocket in hexadecimal, their topic, and sequence, time and bones in Unity's frame;
+    a broken pose has none."""
     rng = np.random.default_rng(3)
     lines = []
     for k in range(5):
