@@ -63,11 +63,13 @@ def _print(ends: dict[str, dict[str, int]], worst: dict[str, float], longest: di
             total[status] += n
         others = ", ".join(f"{n} {status}" for status, n in sorted(counts.items()) if status != "converged")
         print(
-            f"| {kind} | {sum(counts.values())} | {counts.get('converged', 0)} | {others} | {worst[kind]:.0e} | {longest[kind]:.1f} |"
+            f"| {kind} | {sum(counts.values())} | {counts.get('converged', 0)} | {others} | {worst[kind]:.0e} | "
+            f"{longest[kind]:.1f} |"
         )
     others = ", ".join(f"{n} {status}" for status, n in sorted(total.items()) if status != "converged")
     print(
-        f"| **all** | {sum(total.values())} | {total['converged']} | {others} | {max(worst.values()):.0e} | {max(longest.values()):.1f} |"
+        f"| **all** | {sum(total.values())} | {total['converged']} | {others} | {max(worst.values()):.0e} | "
+        f"{max(longest.values()):.1f} |"
     )
 
 

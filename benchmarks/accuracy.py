@@ -40,10 +40,14 @@ def row(name: str, report: dict[str, Any], seconds: float) -> str:
     declared, forces = report["declared"], report["forces"]["error_percent"]
     worst = max(report["loads"], key=lambda load: load["error_percent"] or 0.0)
     if worst["error_percent"] is None:
-        return f"| {name} | {declared['element']} | {declared['unknowns']} | {worst['motion_mm']:.1f} mm | not known | | | {seconds:.0f} |"
+        return (
+            f"| {name} | {declared['element']} | {declared['unknowns']} | {worst['motion_mm']:.1f} mm | not known | | | "
+            f"{seconds:.0f} |"
+        )
     least = "" if report["reference"]["extrapolated"] else "≥ "
     return (
-        f"| {name} | {declared['element']}, {declared['tetrahedra']} | {declared['unknowns']} | {worst['motion_mm']:.1f} mm | {least}{worst['error_mm']:.2f} mm "
+        f"| {name} | {declared['element']}, {declared['tetrahedra']} | {declared['unknowns']} | {worst['motion_mm']:.1f} "
+        f"mm | {least}{worst['error_mm']:.2f} mm "
         f"| {least}{worst['error_percent']:.1f} % | {min(forces):+.0f} … {max(forces):+.0f} % | {seconds:.0f} |"
     )
 

@@ -176,7 +176,8 @@ def print_models(beam: Beam) -> dict[str, tuple[FittedModel, list[tuple[float, f
     ]
     print(f"\nModels (fit on 0 and 0.51 N, judged on 1.00 N; a repeat of that run: {REPEAT_MM} mm)")
     print(
-        "| model | fitted | held out | ratio | modulus | sensed at 0.510 N | at 1.001 N | further |\n|---|---|---|---|---|---|---|---|"
+        "| model | fitted | held out | ratio | modulus | sensed at 0.510 N | at 1.001 N | further "
+        "|\n|---|---|---|---|---|---|---|---|"
     )
     results: dict[str, tuple[FittedModel, list[tuple[float, float]]]] = {}
     for name, robot, terms in models:
@@ -190,7 +191,10 @@ def print_models(beam: Beam) -> dict[str, tuple[FittedModel, list[tuple[float, f
         more = "; ".join(f"{k} {shown(v)}" for k, v in table.items())
         weights = " | ".join(f"{v:.3f} ± {s:.3f} N" for v, s in forces)
         print(
-            f"| {name} | {1e3 * model.fit.rms:.2f} mm | {1e3 * model.held_rms:.2f} mm | {model.held_rms / first:.2f} | {modulus} | {weights} | {more} |",
+            (
+                f"| {name} | {1e3 * model.fit.rms:.2f} mm | {1e3 * model.held_rms:.2f} mm | {model.held_rms / first:.2f} | "
+                f"{modulus} | {weights} | {more} |"
+            ),
             flush=True,
         )
     return results
@@ -244,7 +248,10 @@ def print_cause(name: str, data: Data, model: FittedModel) -> None:
     scale, gravity = table.pop("stiffness")[0], table.pop("gravity")
     own = "; ".join(shown(v) for v in table.values())
     print(
-        f"| {name} | {1e3 * model.fit.rms:.2f} mm | {1e3 * model.held_rms:.2f} mm | {model.fit.chi2:.1f} | {shown(gravity)} | {150 * scale[0]:.0f} ± {150 * scale[1]:.0f} kPa | {own} |",
+        (
+            f"| {name} | {1e3 * model.fit.rms:.2f} mm | {1e3 * model.held_rms:.2f} mm | {model.fit.chi2:.1f} | "
+            f"{shown(gravity)} | {150 * scale[0]:.0f} ± {150 * scale[1]:.0f} kPa | {own} |"
+        ),
         flush=True,
     )
 
@@ -330,7 +337,8 @@ def print_loop(title: str, result: LoopResult, seconds: float) -> None:
     print(f"\n{title}: {result.verdict}: {result.sentence} ({seconds:.0f} s of processor time)")
     noise = ", ".join(f"{k} {1e3 * v:.3f}" for k, v in result.data.noise_components_m.items())
     print(
-        f"  noise along each axis [mm]: {noise}; held out {1e3 * result.before.validation_rms_m:.2f} -> {1e3 * result.after.validation_rms_m:.2f} mm"
+        f"  noise along each axis [mm]: {noise}; held out {1e3 * result.before.validation_rms_m:.2f} -> "
+        f"{1e3 * result.after.validation_rms_m:.2f} mm"
     )
     for effect in result.effects:
         before, after = (1e3 * rms for rms in (effect.validation_rms_before_m, effect.validation_rms_after_m))
@@ -338,7 +346,8 @@ def print_loop(title: str, result: LoopResult, seconds: float) -> None:
     for row in result.candidates[:8]:
         print(f"  tried {row.name}: {row.verdict}")
     print(
-        f"  left: {1e3 * result.left.rms_m:.2f} mm, most at {result.left.where.marker}; structure p = {result.left.structure.p_value:.3f}"
+        f"  left: {1e3 * result.left.rms_m:.2f} mm, most at {result.left.where.marker}; structure p = "
+        f"{result.left.structure.p_value:.3f}"
     )
     print(f"  next: {result.next_experiment}", flush=True)
 
@@ -368,7 +377,10 @@ def print_meshes(beam: Beam, folder: Path) -> None:
         model = fitted(beam.data, robot, [STIFF])
         scale = values(beam.data, model)["stiffness"][0][0]
         print(
-            f"| {' × '.join(map(str, cells))} | {3 * len(robot.body.mesh.nodes)} | {1e3 * model.fit.rms:.2f} mm | {1e3 * model.held_rms:.2f} mm | {150 * scale:.0f} kPa |",
+            (
+                f"| {' × '.join(map(str, cells))} | {3 * len(robot.body.mesh.nodes)} | {1e3 * model.fit.rms:.2f} mm | "
+                f"{1e3 * model.held_rms:.2f} mm | {150 * scale:.0f} kPa |"
+            ),
             flush=True,
         )
 
@@ -408,7 +420,8 @@ def print_loops(beam: Beam, folder: Path, declared_mesh: bool, cells: Sequence[i
         result = improve(robots[name], known[0], validation=known[1])
         said = ", ".join(effect.name for effect in result.effects)
         print(
-            f"{title}, marker_noise_m = {noise:.2g}: {result.verdict} ({said}), {1e3 * result.after.validation_rms_m:.2f} mm held out"
+            f"{title}, marker_noise_m = {noise:.2g}: {result.verdict} ({said}), "
+            f"{1e3 * result.after.validation_rms_m:.2f} mm held out"
         )
 
 

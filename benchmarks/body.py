@@ -91,7 +91,9 @@ def cold(data: Path) -> None:
 
             (ms, median), sofa = least_and_median_ms(solve), document["newton_steps"] * document["ms_per_step"]
             print(
-                f"{law:13} {case:13} {solve().iterations:3d} steps ({straight_steps(solve):2d} straight) {ms:6.1f} ms (median {median:5.1f})   SOFA {document['newton_steps']:3d} × {document['ms_per_step']:5.2f} = {sofa:6.1f} ms"
+                f"{law:13} {case:13} {solve().iterations:3d} steps ({straight_steps(solve):2d} straight) {ms:6.1f} ms "
+                f"(median {median:5.1f})   SOFA {document['newton_steps']:3d} × {document['ms_per_step']:5.2f} = "
+                f"{sofa:6.1f} ms"
                 f"   ratio {ms / sofa:.3f}   {verdict(ms / sofa, 0.15)}"
             )
 
@@ -235,9 +237,11 @@ def show_frames(name: str, passes: np.ndarray, worst: np.ndarray, starts: list[i
     """Print times of the frames of a path [ms], shape (passes, frames), and the worst of its errors."""
     least = passes.min(axis=0)
     print(
-        f"{name}: {least.mean():5.1f} ms a frame in the mean ({np.median(least):.1f} median, {least.max():.1f} slowest; means of the passes {', '.join(f'{m:.1f}' for m in passes.mean(axis=1))}), "
+        f"{name}: {least.mean():5.1f} ms a frame in the mean ({np.median(least):.1f} median, {least.max():.1f} slowest; "
+        f"means of the passes {', '.join(f'{m:.1f}' for m in passes.mean(axis=1))}), "
         f"{1e3 / least.mean():5.1f} Hz   {verdict(1e3 / least.mean(), wanted, most=False)}\n"
-        f"      a start in {sum(starts)} of {len(starts)} frames; motion ≤ {1e3 * worst[3]:.2f} mm, error ≤ {worst[0]:.1e} of it (reported ≤ {worst[1]:.1e}, true / reported ≤ {worst[4]:.2f}), W within {worst[2]:.1e}"
+        f"      a start in {sum(starts)} of {len(starts)} frames; motion ≤ {1e3 * worst[3]:.2f} mm, error ≤ "
+        f"{worst[0]:.1e} of it (reported ≤ {worst[1]:.1e}, true / reported ≤ {worst[4]:.2f}), W within {worst[2]:.1e}"
     )
 
 
@@ -268,7 +272,8 @@ def terms(data: Path) -> None:
         for lag in range(1, 5):
             shares = 100.0 * np.median(table[table[:, 0] == lag, 1:], axis=0)
             print(
-                f"input jitter {jitter:g} N, {lag} frames old: one {shares[0]:.2g} %, two {shares[1]:.2g} %, three {shares[2]:.2g} %, third {shares[3]:.2g} %"
+                f"input jitter {jitter:g} N, {lag} frames old: one {shares[0]:.2g} %, two {shares[1]:.2g} %, three "
+                f"{shares[2]:.2g} %, third {shares[3]:.2g} %"
             )
 
 
@@ -371,9 +376,10 @@ def growth(data: Path, levels: int) -> None:
         table = np.log(np.array(rows))
         slopes = (table[-1, 1:] - table[0, 1:]) / (table[-1, 0] - table[0, 0])
         print(
-            "exponents in unknowns: assembly {:.2f}, factor {:.2f}, solve {:.2f}, memory of the factor {:.2f}, work of the factor {:.2f}".format(
-                *slopes
-            )
+            (
+                "exponents in unknowns: assembly {:.2f}, factor {:.2f}, solve {:.2f}, memory of the factor {:.2f}, work of "
+                "the factor {:.2f}"
+            ).format(*slopes)
         )
     if len(rows) > 2:  # the smallest mesh stays in the cache
         slopes = (table[-1, 1:] - table[1, 1:]) / (table[-1, 0] - table[1, 0])
@@ -411,15 +417,18 @@ def one_level(data: Path, level: int) -> None:
     work = sum(float((np.arange(h, h - c, -1.0) ** 2).sum()) for c, h in zip(columns, heights))
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     print(
-        f"{len(mesh.tets):7d} tetrahedra, {pattern.size} unknowns: made and ordered {made:.2f} s, analysis {analysed:.2f} s, assembly {times[0]:.1f} ms, factor {times[1]:.1f} ms ({1e-6 * work / times[1]:.1f} Gflop/s),"
-        f" solve {times[2]:.2f} ms, factor {factor.bytes / 2**20:.0f} MB, peak of the process {peak:.0f} MB | {pattern.size} {times[0]} {times[1]} {times[2]} {factor.bytes} {work}"
+        f"{len(mesh.tets):7d} tetrahedra, {pattern.size} unknowns: made and ordered {made:.2f} s, analysis "
+        f"{analysed:.2f} s, assembly {times[0]:.1f} ms, factor {times[1]:.1f} ms ({1e-6 * work / times[1]:.1f} Gflop/s),"
+        f" solve {times[2]:.2f} ms, factor {factor.bytes / 2**20:.0f} MB, peak of the process {peak:.0f} MB | "
+        f"{pattern.size} {times[0]} {times[1]} {times[2]} {factor.bytes} {work}"
     )
 
 
 def iterative_growth(data: Path, levels: int) -> None:
     """The iterative solver beside the direct one, each mesh, element and solver in a process of its own."""
     print(
-        "  element tetrahedra unknowns    solver | prepared, anew, a solve (iterations) | equilibrium under weight | memory of the factor, of the process"
+        "  element tetrahedra unknowns    solver | prepared, anew, a solve (iterations) | equilibrium under weight | "
+        "memory of the factor, of the process"
     )
     for element, counts in (("tet4", levels), ("tet10", levels - 1)):
         for level in range(counts):
@@ -459,7 +468,8 @@ def one_side(data: Path, level: int, element: str) -> None:
         cold = f"{time.process_time() - began:.2f} s, {state.status} in {state.iterations} steps"
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     print(
-        f"  {element:5} {len(mesh.tets):9d} {pattern.size:9d} {os.environ['FEMSENSE_SOLVER']:>9} | analysis {first:.2f} s, then {again:.0f} ms, {solve:.1f} ms ({getattr(factor, 'iterations', 0)})"
+        f"  {element:5} {len(mesh.tets):9d} {pattern.size:9d} {os.environ['FEMSENSE_SOLVER']:>9} | analysis {first:.2f} "
+        f"s, then {again:.0f} ms, {solve:.1f} ms ({getattr(factor, 'iterations', 0)})"
         f" | {cold} | {factor.bytes / 2**20:.0f} MB, {peak:.0f} MB"
     )
 

@@ -165,7 +165,8 @@ def given_names(robot: Robot, bare: Recording, named: Recording) -> IntArray:
 def nowhere(seeds: int) -> None:
     print("\n## Markers without names, from nowhere: 8 markers, 6 frames\n")
     print(
-        "| outliers, missing a frame | runs | right | refused | rows named right | wrong | left out | outliers taken |\n|---|---|---|---|---|---|---|---|"
+        "| outliers, missing a frame | runs | right | refused | rows named right | wrong | left out | outliers taken "
+        "|\n|---|---|---|---|---|---|---|---|"
     )
     robot = lopsided()
     for outliers, missing in ((0, 0), (1, 1), (2, 2), (3, 3)):
@@ -182,7 +183,10 @@ def nowhere(seeds: int) -> None:
             rows += Counter(right=int(wrong == 0), wrong=wrong, named=((given == truth) & (truth >= 0)).sum())
             rows += Counter(out=((given < 0) & (truth >= 0)).sum(), taken=((given >= 0) & (truth < 0)).sum())
         print(
-            f"| {outliers}, {missing} | {seeds} | {rows['right']} | {rows['refused']} | {rows['named']} | {rows['wrong']} | {rows['out']} | {rows['taken']} |",
+            (
+                f"| {outliers}, {missing} | {seeds} | {rows['right']} | {rows['refused']} | {rows['named']} | "
+                f"{rows['wrong']} | {rows['out']} | {rows['taken']} |"
+            ),
             flush=True,
         )
 
@@ -200,7 +204,8 @@ def block(size: tuple[float, ...], middle: tuple[float, ...], color: tuple[float
 def clouds(seeds: int) -> None:
     print("\n## Clouds alone, from nowhere: two free frames, a table, a box and the holder in sight\n")
     print(
-        "| colour tells the robot | scenes | right | refused | wrong | turn, median, largest [°] | shift, median, largest [mm] |\n|---|---|---|---|---|---|---|"
+        "| colour tells the robot | scenes | right | refused | wrong | turn, median, largest [°] | shift, median, "
+        "largest [mm] |\n|---|---|---|---|---|---|---|"
     )
     inputs = np.array([[2.0, 0, 0, 0], [0, 0, 2.0, 0]])
     recording, states = record(inputs)
@@ -221,7 +226,10 @@ def clouds(seeds: int) -> None:
             turns, shifts = [*turns, np.degrees(turn)], [*shifts, 1e3 * shift]
         texts = [f"{np.median(v):.1f}, {np.max(v):.1f}" if v else "–" for v in (turns, shifts)]
         print(
-            f"| {'yes' if colored else 'no'} | {seeds} | {kinds['right']} | {kinds['refused']} | {kinds['wrong']} | {' | '.join(texts)} |",
+            (
+                f"| {'yes' if colored else 'no'} | {seeds} | {kinds['right']} | {kinds['refused']} | {kinds['wrong']} | "
+                f"{' | '.join(texts)} |"
+            ),
             flush=True,
         )
 
@@ -310,7 +318,8 @@ def real_tentacle(_: int) -> None:
         return
     robot, every = tentacle(cells=(12, 2, 2)), runs(every=300)
     print(
-        "| recording | rows | right | wrong | left out | refused | rms of named markers [mm], share of their spread | accused |\n|---|---|---|---|---|---|---|---|"
+        "| recording | rows | right | wrong | left out | refused | rms of named markers [mm], share of their spread | "
+        "accused |\n|---|---|---|---|---|---|---|---|"
     )
     total = Counter()
     alone = [(run.name, [run]) for run in every]
@@ -329,7 +338,8 @@ def real_tentacle(_: int) -> None:
         cells = (row["rows"], row["right"], row["wrong"], row["out"], row["refused"], f"{rms:.1f}, {share:.2f}", row["accused"])
         print(f"| {name} | {' | '.join(map(str, cells))} |", flush=True)
     print(
-        f"| all | {total['rows']} | {total['right']} | {total['wrong']} | {total['out']} | {total['refused']} | | {total['accused']} |"
+        f"| all | {total['rows']} | {total['right']} | {total['wrong']} | {total['out']} | {total['refused']} | | "
+        f"{total['accused']} |"
     )
 
 

@@ -388,7 +388,8 @@ def main() -> None:
         large_displacements()
     if arguments.only in (None, "times"):
         print(
-            "\n| ms, wall / process | free unknowns | force | force and tangent | into the matrix | factor | one solve |\n|---|---|---|---|---|---|---|"
+            "\n| ms, wall / process | free unknowns | force | force and tangent | into the matrix | factor | one solve "
+            "|\n|---|---|---|---|---|---|---|"
         )
         for quadratic in (False, True):
             for law in ("corotational", "neo_hookean"):

@@ -105,7 +105,10 @@ def main() -> None:
         seen = "yes" if found.visible[place] else "no"
         bound = found.normal_std[place]
         print(
-            f"| {where} | {seen} | {force:.3f} N | {1e3 * bound:.2f} mN | {1e3 * std:.2f} mN ({count}) | {std / bound:.2f} | {mean / force:.3f} |",
+            (
+                f"| {where} | {seen} | {force:.3f} N | {1e3 * bound:.2f} mN | {1e3 * std:.2f} mN ({count}) | "
+                f"{std / bound:.2f} | {mean / force:.3f} |"
+            ),
             flush=True,
         )
 

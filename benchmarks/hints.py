@@ -91,7 +91,8 @@ def main() -> None:
                     abs(hinted[n] - own[n]) for n in hinted.keys() & own.keys() if min(hinted[n], own[n]) < DEFAULTS.evidence
                 ]
     print(
-        f"\n{len(cases)} cases, {models} models, {len(far)} scores: they differ by {np.median(far):.2f} in the median, by {np.percentile(far, 95):.1f} in 95 of 100;"
+        f"\n{len(cases)} cases, {models} models, {len(far)} scores: they differ by {np.median(far):.2f} in the median, "
+        f"by {np.percentile(far, 95):.1f} in 95 of 100;"
     )
     print(
         f"where one of the two is below {DEFAULTS.evidence:.0f}, by {max(near):.1f} at most; searches ended too early: {missed}"

@@ -68,7 +68,8 @@ def main() -> None:
         first, second = contacts(root / "run-whole"), contacts(root / "run-killed")
         alike = first.shape == second.shape
         print(
-            f"estimate: {len(first)} and {len(second)} contacts, largest difference {np.abs(first - second).max(initial=0.0) if alike else np.nan:.2g}"
+            f"estimate: {len(first)} and {len(second)} contacts, largest difference "
+            f"{np.abs(first - second).max(initial=0.0) if alike else np.nan:.2g}"
         )
 
 

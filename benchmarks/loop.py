@@ -324,7 +324,8 @@ def power_curve(single: Sequence[dict[str, Any]]) -> None:
             inset = sum(r["label"] in answer_set(r) for r in part)
             silent = sum(not named(r) for r in part)
             print(
-                f"{low:4.2f} … {high:4.2f}   {len(part):5d}  {right:5d}  {inset:10d}  {silent:6d}  {sum(bool(named(r)) and r['label'] not in answer_set(r) for r in part):12d}"
+                f"{low:4.2f} … {high:4.2f}   {len(part):5d}  {right:5d}  {inset:10d}  {silent:6d}  "
+                f"{sum(bool(named(r)) and r['label'] not in answer_set(r) for r in part):12d}"
             )
 
 
@@ -345,7 +346,9 @@ def failures(records: Sequence[dict[str, Any]]) -> None:
                 else ""
             )
             print(
-                f"  {r['number']:3d} {r['kind']:7s} {r['robot']:6s} {r['control']:12s} {1e3 * r['white_m']:.1f} mm {r['hidden'] or r['label']} {d} -> {r['verdict']}: {names}; {1e3 * r['before_m']:.2f} -> {1e3 * r['after_m']:.2f} mm (noise {1e3 * r['floor_m']:.2f})"
+                f"  {r['number']:3d} {r['kind']:7s} {r['robot']:6s} {r['control']:12s} {1e3 * r['white_m']:.1f} mm "
+                f"{r['hidden'] or r['label']} {d} -> {r['verdict']}: {names}; {1e3 * r['before_m']:.2f} -> "
+                f"{1e3 * r['after_m']:.2f} mm (noise {1e3 * r['floor_m']:.2f})"
             )
 
 
@@ -380,7 +383,10 @@ def main() -> None:
                 with out.open("a") as file:
                     file.write(json.dumps(record, default=float) + "\n")
                 print(
-                    f"{len(records)} {record['kind']} {record['label']} {record.get('verdict', record.get('failed'))} {[e['name'] for e in record.get('effects', [])]}",
+                    (
+                        f"{len(records)} {record['kind']} {record['label']} {record.get('verdict', record.get('failed'))} "
+                        f"{[e['name'] for e in record.get('effects', [])]}"
+                    ),
                     flush=True,
                 )
     table(records)

@@ -49,7 +49,8 @@ def compared(case: Case) -> None:
     sweep = trial.groups.sweep
     own = [float((D[sweep == s] * E[sweep == s]).sum() / (E[sweep == s] ** 2).sum()) for s in np.unique(sweep)]
     print(
-        f"{case.number:4d} {case.design.name:7s}{case.control:13s} D {rms_mm(D):5.2f}  E {rms_mm(E):5.2f} mm  a {share:5.2f}  left {rms_mm(D - share * E):5.2f} mm"
+        f"{case.number:4d} {case.design.name:7s}{case.control:13s} D {rms_mm(D):5.2f}  E {rms_mm(E):5.2f} mm  a "
+        f"{share:5.2f}  left {rms_mm(D - share * E):5.2f} mm"
         f"  beyond calibration {beyond(data, D, E)} mm  sweeps {'  '.join(f'{a:5.2f}' for a in own)}",
         flush=True,
     )

@@ -38,7 +38,10 @@ def main() -> None:
         seconds, quality = time.perf_counter() - began, quality_report(filled.mesh)
         shape = f"{quality['radius_ratio']['min']:.2f} / {quality['radius_ratio']['median']:.2f}"
         print(
-            f"| {name} | {len(mesh.faces)} | {quality['tetrahedra']} | {shape} | {filled.deviation_mm:.2f} mm | {seconds:.0f} | {'; '.join(filled.done)} |",
+            (
+                f"| {name} | {len(mesh.faces)} | {quality['tetrahedra']} | {shape} | {filled.deviation_mm:.2f} mm | "
+                f"{seconds:.0f} | {'; '.join(filled.done)} |"
+            ),
             flush=True,
         )
 

@@ -173,14 +173,17 @@ def main() -> None:
         plain = fs.load_robot(given.diamond)
         robots += [plain, robot_on_mesh(plain, finer_mesh(plain.body.mesh, "tet10", 0))]
     print(
-        f"{'robot':<16} {'tets':>6} {'reached':>9} {'error':>9} {'equilibria':>10} {'time':>8} {'nearest':>8} {'violation':>10} {'elsewhere':>10} {'path':>8}"
+        f"{'robot':<16} {'tets':>6} {'reached':>9} {'error':>9} {'equilibria':>10} {'time':>8} {'nearest':>8} "
+        f"{'violation':>10} {'elsewhere':>10} {'path':>8}"
     )
     for robot in robots:
         row = measure(robot, given.targets)
         kind = "tet10" if robot.body.mesh.is_quadratic else "tet4"
         print(
-            f"{row.name[:10]:<10} {kind:<5} {len(robot.body.mesh.tets):>6} {row.reached:>4}/{row.targets:<4} {1e3 * row.error_m:>6.0e} mm"
-            f" {row.equilibria:>10.0f} {1e3 * row.seconds:>5.0f} ms {row.nearest:>4}/{row.out:<3} {row.violation:>10.0e} {1e3 * row.elsewhere_m:>7.2f} mm {row.rate_hz:>5.1f} Hz",
+            f"{row.name[:10]:<10} {kind:<5} {len(robot.body.mesh.tets):>6} {row.reached:>4}/{row.targets:<4} "
+            f"{1e3 * row.error_m:>6.0e} mm"
+            f" {row.equilibria:>10.0f} {1e3 * row.seconds:>5.0f} ms {row.nearest:>4}/{row.out:<3} {row.violation:>10.0e} "
+            f"{1e3 * row.elsewhere_m:>7.2f} mm {row.rate_hz:>5.1f} Hz",
             flush=True,
         )
 

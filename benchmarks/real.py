@@ -99,8 +99,10 @@ def arm_rows(out: Path, data: Path, ways: list[int]) -> list[Asked]:
 SETS: Mapping[str, tuple[Callable[[Path, Path, list[int]], list[Asked]], str]] = {
     "tentacle": (
         tentacle_rows,
-        "authors, mean marker error: prior 36.8 mm, fitted 15.8, a residual fitted to each pose 6.1. By hand with this model, mean marker error of single | "
-        "two tendons: prior 26.5 | 32.2, modulus 10.8 | 11.8, markers and a pose a session 7.4 | 10.2, gain and zero a session 5.9 | 9.0",
+        "authors, mean marker error: prior 36.8 mm, fitted 15.8, a residual fitted to each pose 6.1. By hand with this "
+        "model, mean marker error of single | "
+        "two tendons: prior 26.5 | 32.2, modulus 10.8 | 11.8, markers and a pose a session 7.4 | 10.2, gain and zero a "
+        "session 5.9 | 9.0",
     ),
     "trunk": (
         trunk_rows,
@@ -112,7 +114,10 @@ SETS: Mapping[str, tuple[Callable[[Path, Path, list[int]], list[Asked]], str]] =
     ),
     "arm": (
         arm_rows,
-        "linear maps leave 5.4 mm (encoders) and 36.8 mm (pressures) of the tip; see docs/real-robots.md for what stops the model",
+        (
+            "linear maps leave 5.4 mm (encoders) and 36.8 mm (pressures) of the tip; see docs/real-robots.md for what stops "
+            "the model"
+        ),
     ),
 }
 
@@ -154,7 +159,8 @@ def print_weights(out: Path, data: Path) -> None:
             seen = ", ".join(f"{m:+.2f}" for m in force.mean(axis=0))
             spread = ", ".join(f"{s:.2f}" for s in force.std(axis=0))
             print(
-                f"| {name} | {recording} | [{seen}] N | over frames [{spread}] N | stated {np.median(std, axis=0).round(2).tolist()} N | "
+                f"| {name} | {recording} | [{seen}] N | over frames [{spread}] N | stated "
+                f"{np.median(std, axis=0).round(2).tolist()} N | "
                 f"true [0, 0, {-trunk.WEIGHT_N if recording.startswith('load') else 0:.2f}] N |",
                 flush=True,
             )

@@ -176,7 +176,8 @@ def inside(folder: Path) -> None:
     winter = learn_domain(np.concatenate(trained[:2]))
     print("\nrows called inside what was learnt")
     print(
-        f"apr_5 to 48 s:        the same motion {share(domain, data.readings[same])}, two chambers emptied at 60 s {share(domain, data.readings[new])}"
+        f"apr_5 to 48 s:        the same motion {share(domain, data.readings[same])}, two chambers emptied at 60 s "
+        f"{share(domain, data.readings[new])}"
     )
     print(
         f"Jan_10-2_1 + 2:       the same motion {share(winter, trained[2])}, six chambers (apr_5) {share(winter, data.readings)}"
@@ -209,7 +210,8 @@ def actuator(file: Path | None) -> None:
     options = fs.LearnOptions(kinds=("ridge", "radial", "network"), end_to_end=True, bones=bones)
     model = fs.learn(data.select(np.arange(cut)), test=data.select(test), options=options)
     print(
-        f"{len(readings[0])} channels, six markers, {BONES} bones; {cut} states to learn, {len(test)} to test; map: {model.report['kind']}"
+        f"{len(readings[0])} channels, six markers, {BONES} bones; {cut} states to learn, {len(test)} to test; map: "
+        f"{model.report['kind']}"
     )
     for kind, row in model.report["compared"].items():
         print(f"  {kind:<8} markers {row['error_mm']:.3f} mm")

@@ -190,7 +190,8 @@ def soak(seconds: float, robots: int, viewers: int) -> None:
         process.join(20)
     slow.close()
     print(
-        f"\n{robots} robots at {RATE:.0f} Hz to {viewers} viewers for {seconds:.0f} s, beside one that does not read and one that is hostile:\n"
+        f"\n{robots} robots at {RATE:.0f} Hz to {viewers} viewers for {seconds:.0f} s, beside one that does not read and "
+        f"one that is hostile:\n"
     )
     print("| viewer | p50 [ms] | p95 | p99 | poses |\n|---|---|---|---|---|")
     print(table_row("all together", [age for ages, _ in found for age in ages]))

@@ -131,14 +131,19 @@ def _csv(file: str) -> str:
 
 def _folders() -> str:
     holds = {
-        "clouds": "the cloud of a frame, camera frame, metres, colours where the camera has them (0–1, 0–255 or 0–65535, under the usual names)",
+        "clouds": (
+            "the cloud of a frame, camera frame, metres, colours where the camera has them (0–1, 0–255 or 0–65535, under the "
+            "usual names)"
+        ),
         "depth": "a depth image of 16 bits, one unit is `depth_unit_m`; 0 where there is none",
         "color": "a colour image of 8 or 16 bits, registered to the depth image",
     }
     rows = "".join(f"| `{name}/` | {', '.join(endings)} | {holds[name]} |\n" for name, endings in FOLDERS.items())
     return (
-        "### Clouds and images\n\nA file's name is the number of its frame. With several cameras each has folders of its own: `clouds/NAME/`, `depth/NAME/`,\n"
-        f"`color/NAME/`. Notes ({', '.join(BESIDE)}) may lie beside; other files are named in a warning.\n\n| folder | endings | |\n|---|---|---|\n{rows}"
+        "### Clouds and images\n\nA file's name is the number of its frame. With several cameras each has folders of its "
+        "own: `clouds/NAME/`, `depth/NAME/`,\n"
+        f"`color/NAME/`. Notes ({', '.join(BESIDE)}) may lie beside; other files are named in a warning.\n\n| folder | "
+        f"endings | |\n|---|---|---|\n{rows}"
     )
 
 

@@ -144,5 +144,8 @@ def test_what_does_not_exist_is_found() -> None:
 
 
 def test_sentences_are_counted_without_code_tables_and_headings() -> None:
-    text = "# A heading\n\nIt is 3.5 mm: `a.b c`\nlong. Really?\n\n| a | table. Not |\n\n- one; two\n- three\n\n    x = y. z\n\n```\ncode. x\n```\n"
+    text = (
+        "# A heading\n\nIt is 3.5 mm: `a.b c`\nlong. Really?\n\n| a | table. Not |\n\n- one; two\n- three\n\n    x = y. "
+        "z\n\n```\ncode. x\n```\n"
+    )
     assert sentences_of(text) == ["It is 3.5 mm", "code long", "Really", "one", "two", "three"]

@@ -54,7 +54,10 @@ def cloud_problems(recording: Recording, *, robot: Robot | None = None) -> list[
         ]
     if distance > FAR_CLOUD:
         return [
-            f"{where}: clouds {distance:.4g} m away are not what a depth camera sees: {_likely(distance / 0.5)}; clouds are in metres"
+            (
+                f"{where}: clouds {distance:.4g} m away are not what a depth camera sees: {_likely(distance / 0.5)}; clouds "
+                f"are in metres"
+            )
         ]
     extent = max(float(np.ptp(cloud.points, axis=0).max()) for _, _, cloud in full)
     if robot is not None:

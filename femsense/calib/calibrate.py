@@ -73,7 +73,8 @@ def calibrate(robot: Robot, recording: Recording, *, frames: Sequence[int] | Non
         return _from_rest(robot, recording)
     if not len(chosen):
         raise DataError(
-            "no frame is free of undeclared contact: mark free frames with 1 in the column free of frames.csv, or declare loads.csv"
+            "no frame is free of undeclared contact: mark free frames with 1 in the column free of frames.csv, or "
+            "declare loads.csv"
         )
     allowed = None
     if has_image_markers(robot, recording):
@@ -182,7 +183,8 @@ def _pose_from_frame(robot: Robot, scene: Scene, view: int, name: str) -> FloatA
             shape = state.positions if state.converged else robot.body.mesh.nodes
             return fit_rigid(robot.markers.positions(shape)[scene.marker[rows]], scene.points[rows])
     raise DataError(
-        f"camera {name or '(only one)'} needs a frame with three markers for its pose; the most in one frame is {most}. Give T_robot_camera, or show more markers"
+        f"camera {name or '(only one)'} needs a frame with three markers for its pose; the most in one frame is {most}. "
+        f"Give T_robot_camera, or show more markers"
     )
 
 
@@ -352,7 +354,8 @@ def _declared(robot: Robot, recording: Recording, frames: IntArray) -> Calibrati
     missing = [name or "(only one)" for name, T in zip(recording.camera_names, recording.T_robot_camera) if T is None]
     if missing:
         raise DataError(
-            f"no markers, no clouds and no T_robot_camera: the pose of camera {', '.join(missing)} is not known. Record markers or clouds, or write T_robot_camera in recording.toml"
+            f"no markers, no clouds and no T_robot_camera: the pose of camera {', '.join(missing)} is not known. Record "
+            f"markers or clouds, or write T_robot_camera in recording.toml"
         )
     unknown = recording.actuation_zero == "unknown" and bool(robot.body.cables)
     if unknown and not recording.has_clouds:

@@ -101,13 +101,17 @@ def check_reading(robot: Robot, pairs: Sequence[Pairs], *, strict: bool = True) 
         plain = _rigid(one.modelled, one.measured)
         if plain < SUSPICIOUS * one.spread:
             continue
-        found = f"the markers do not fit the robot: {100 * plain / one.spread:.0f} % of their spread of {1e3 * one.spread:.3g} mm is left"
+        found = (
+            f"the markers do not fit the robot: {100 * plain / one.spread:.0f} % of their spread of {1e3 * one.spread:.3g} "
+            f"mm is left"
+        )
         scale, _ = similarity(one.modelled, one.measured)
         if max(scale, 1 / scale) > 1.5 and _rigid(one.modelled, one.measured, scale=scale) * EXPLAINED < plain:
             raise DataError(f"{found}. They are {scale:.4g} times too large: {_unit(scale)}. The files hold metres")
         if _rigid(one.modelled, one.measured, mirrored=True) * EXPLAINED < plain:
             raise DataError(
-                f"{found}. Mirrored they fit: are the axes left-handed? Camera frames are right-handed (x right, y down, z forward): change the sign of one axis"
+                f"{found}. Mirrored they fit: are the axes left-handed? Camera frames are right-handed (x right, y down, "
+                f"z forward): change the sign of one axis"
             )
         swapped = _swapped(one, plain)
         if swapped:

@@ -95,7 +95,8 @@ def find_cloud_pose(views: Sequence[View]) -> CloudPose:
     size = _size(views[0].surface)
     if not poses or poses[0].gain < LEAST:
         raise DataError(
-            "no pose was found at which the clouds of the free frames show the robot. Record markers, write T_robot_camera in recording.toml, or declare the robot's colour"
+            "no pose was found at which the clouds of the free frames show the robot. Record markers, write "
+            "T_robot_camera in recording.toml, or declare the robot's colour"
         )
     best = poses[0]
     for other in poses[1:]:
@@ -103,8 +104,10 @@ def find_cloud_pose(views: Sequence[View]) -> CloudPose:
         apart = turn > TURNED or shift > SHIFTED * size
         if apart and other.error_m < ALIKE * best.error_m:
             raise DataError(
-                f"two poses fit the clouds alike: {1e3 * best.error_m:.3g} and {1e3 * other.error_m:.3g} mm are left, turned by {np.degrees(turn):.0f}° and "
-                f"{1e3 * shift:.0f} mm apart. Has the robot a symmetry? Record markers, pull cables in free frames, or write T_robot_camera in recording.toml"
+                f"two poses fit the clouds alike: {1e3 * best.error_m:.3g} and {1e3 * other.error_m:.3g} mm are left, "
+                f"turned by {np.degrees(turn):.0f}° and "
+                f"{1e3 * shift:.0f} mm apart. Has the robot a symmetry? Record markers, pull cables in free frames, or "
+                f"write T_robot_camera in recording.toml"
             )
     return best
 

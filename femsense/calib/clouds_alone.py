@@ -80,7 +80,8 @@ def _states(robot: Robot, recording: Recording, calibration: Calibration, views:
     frames = [int(k) for k in np.flatnonzero(free) if all(recording.cloud_files[k][v] is not None for v in views)]
     if not frames:
         raise DataError(
-            "the pose of a camera without markers needs a cloud of a free frame: mark frames in which nothing touches the robot with 1 in the column free of frames.csv"
+            "the pose of a camera without markers needs a cloud of a free frame: mark frames in which nothing touches "
+            "the robot with 1 in the column free of frames.csv"
         )
     initial = None
     if recording.actuation_zero == "unknown":

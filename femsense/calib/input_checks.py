@@ -149,7 +149,8 @@ def _check_delay(motions: Motions) -> None:
     if delay:
         how = "late" if delay > 0 else "early"
         raise DataError(
-            f"the markers are {abs(delay)} frames {how}: they follow the inputs of other frames. Are markers and inputs on one clock?"
+            f"the markers are {abs(delay)} frames {how}: they follow the inputs of other frames. Are markers and inputs "
+            f"on one clock?"
         )
 
 

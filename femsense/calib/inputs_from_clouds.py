@@ -87,7 +87,8 @@ def _frames(recording: Recording) -> list[int]:
     frames = [int(k) for k in np.flatnonzero(free) if any(file is not None for file in recording.cloud_files[k])]
     if not frames:
         raise DataError(
-            "initial inputs without markers need clouds of free frames: mark frames in which nothing touches the robot with 1 in the column free of frames.csv"
+            "initial inputs without markers need clouds of free frames: mark frames in which nothing touches the robot "
+            "with 1 in the column free of frames.csv"
         )
     return [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, FRAMES).round().astype(int))]
 

@@ -234,8 +234,10 @@ def _require_one(
             ):
                 name = recording.camera_names[one.view] or "(only one)"
                 raise DataError(
-                    f"the markers of camera {name} have no names, and two poses fit them alike: {1e3 * best.error_m:.3g} and {1e3 * other_fit.error_m:.3g} mm are left, "
-                    f"and they place the markers {1e3 * away:.3g} mm apart. Name the markers, place one more where it breaks the symmetry, pull cables in free frames, or declare T_robot_camera"
+                    f"the markers of camera {name} have no names, and two poses fit them alike: {1e3 * best.error_m:.3g} "
+                    f"and {1e3 * other_fit.error_m:.3g} mm are left, "
+                    f"and they place the markers {1e3 * away:.3g} mm apart. Name the markers, place one more where it "
+                    f"breaks the symmetry, pull cables in free frames, or declare T_robot_camera"
                 )
 
 

@@ -39,12 +39,24 @@ SMALLEST_PART = 2e-3
 """Load steps smaller than this share of the load are stopped early."""
 ADVICE = {
     CONVERGED: "the unbalanced force is below its tolerance",
-    "unstable": "the forces balance, but the slightest disturbance makes the body buckle: (a) add a small force to the side to which it should go; (b) reduce the load",
+    "unstable": (
+        "the forces balance, but the slightest disturbance makes the body buckle: (a) add a small force to the side to which "
+        "it should go; (b) reduce the load"
+    ),
     "singular": "nothing holds the body: clamp more nodes (three that are not on a line at least)",
-    "stalled": "no step lowers the energy any further: (a) the load may be beyond buckling; (b) elements may be inverted; try smaller loads or a better mesh",
+    "stalled": (
+        "no step lowers the energy any further: (a) the load may be beyond buckling; (b) elements may be inverted; try "
+        "smaller loads or a better mesh"
+    ),
     "iterations": "Newton did not settle in its iterations: try smaller steps of the inputs, or start from a nearby equilibrium",
-    "cables": "the held cables and chambers contradict each other, or could not agree on which cables are slack: try other displacements",
-    "overload": "load steps became too small: (a) the body collapses or buckles under this load; (b) a cable has drawn its point to the next one; reduce the load",
+    "cables": (
+        "the held cables and chambers contradict each other, or could not agree on which cables are slack: try other "
+        "displacements"
+    ),
+    "overload": (
+        "load steps became too small: (a) the body collapses or buckles under this load; (b) a cable has drawn its point to "
+        "the next one; reduce the load"
+    ),
 }
 
 

@@ -60,7 +60,10 @@ def check_mesh(mesh: TetMesh, where: str) -> None:
     hinged = np.bincount(hinged_parts(mesh))
     if len(hinged) > 1:
         warnings.warn(
-            f"{where}: {len(hinged)} parts of {np.sort(hinged)[::-1][:6].tolist()} tetrahedra hang together by an edge or a corner alone and swing about it",
+            (
+                f"{where}: {len(hinged)} parts of {np.sort(hinged)[::-1][:6].tolist()} tetrahedra hang together by an edge "
+                f"or a corner alone and swing about it"
+            ),
             stacklevel=3,
         )
 

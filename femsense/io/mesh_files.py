@@ -182,7 +182,10 @@ def ordered_tets(points: FloatArray, tets: IntArray, where: str) -> TetMesh:
     kept, _ = distinct_cells(tets)
     if len(kept) < len(tets):
         warnings.warn(
-            f"{where}: {len(tets) - len(kept)} of {len(tets)} tetrahedra stand there twice (once for each physical group?): each is used once",
+            (
+                f"{where}: {len(tets) - len(kept)} of {len(tets)} tetrahedra stand there twice (once for each physical "
+                f"group?): each is used once"
+            ),
             stacklevel=4,
         )
     mesh = compact(points, tets[kept])

@@ -61,7 +61,10 @@ COLUMNS: dict[str, tuple[Column, ...]] = {
 }
 MEANS = {
     "frames.csv": "Required. One row a frame, in order of time.",
-    "markers.csv": "Markers as a camera sees them, camera frame. A hidden marker has no row; rows of 0, 0, 0 count as lost and are left out with a warning.",
+    "markers.csv": (
+        "Markers as a camera sees them, camera frame. A hidden marker has no row; rows of 0, 0, 0 count as lost and are left "
+        "out with a warning."
+    ),
     "rest.csv": "Markers measured with the body unloaded, camera frame.",
     "loads.csv": "Known loads: the place on the body at rest and the force, both in the robot frame.",
 }

@@ -152,7 +152,10 @@ def _empty_box(mesh: TetMesh, low: FloatArray, high: FloatArray, where: str) -> 
         "no node of the mesh is inside the box",
         where=where,
         found=f"the nearest node is number {nearest} at {_metres(mesh.nodes[nearest])}, {1e3 * distance[nearest]:.4g} mm away",
-        expected=f"a box that meets the mesh, which reaches from {_metres(mesh.nodes.min(axis=0))} to {_metres(mesh.nodes.max(axis=0))}",
+        expected=(
+            f"a box that meets the mesh, which reaches from {_metres(mesh.nodes.min(axis=0))} to "
+            f"{_metres(mesh.nodes.max(axis=0))}"
+        ),
         hint=hint,
     )
 
@@ -206,8 +209,10 @@ def _make_cable(mesh: TetMesh, table: CableTable, i: int, path: Path) -> Cable:
     outside = int((cable.path.outside > 1e-6).sum())
     if outside:
         warnings.warn(
-            f"{at_key(path, 'cables', i, 'path_m')}: cable {table.name!r} has {outside} of {len(cable.path)} points outside the mesh, "
-            f"up to {1e3 * cable.path.outside[worst]:.3g} mm; each is carried by the affine map of the tetrahedron with the nearest centre",
+            f"{at_key(path, 'cables', i, 'path_m')}: cable {table.name!r} has {outside} of {len(cable.path)} points "
+            f"outside the mesh, "
+            f"up to {1e3 * cable.path.outside[worst]:.3g} mm; each is carried by the affine map of the tetrahedron with "
+            f"the nearest centre",
             stacklevel=4,
         )
     return cable
@@ -258,7 +263,10 @@ def _far(what: str, where: str, point: Sequence[float], distance: float, limit: 
         what,
         where=where,
         found=f"{_metres(point)}, {1e3 * distance:.4g} mm outside",
-        expected=f"at most {limit:g} × the mesh's diagonal of {1e3 * diagonal:.4g} mm outside; the mesh reaches from {_metres(mesh.nodes.min(axis=0))} to {_metres(mesh.nodes.max(axis=0))}",
+        expected=(
+            f"at most {limit:g} × the mesh's diagonal of {1e3 * diagonal:.4g} mm outside; the mesh reaches from "
+            f"{_metres(mesh.nodes.min(axis=0))} to {_metres(mesh.nodes.max(axis=0))}"
+        ),
         hint=hint,
     )
 
@@ -267,17 +275,26 @@ def _warn_of_units(table: RobotTable, path: Path) -> None:
     """Warn of what can be computed but is hardly meant."""
     if table.material.young_modulus_pa < 1e3:
         warnings.warn(
-            f"{at_key(path, 'material', 'young_modulus_pa')}: {table.material.young_modulus_pa:g} Pa is softer than any silicone; is it in kPa or MPa?",
+            (
+                f"{at_key(path, 'material', 'young_modulus_pa')}: {table.material.young_modulus_pa:g} Pa is softer than any "
+                f"silicone; is it in kPa or MPa?"
+            ),
             stacklevel=4,
         )
     if table.material.density_kg_m3 < 20.0:
         warnings.warn(
-            f"{at_key(path, 'material', 'density_kg_m3')}: {table.material.density_kg_m3:g} kg/m³ is lighter than any foam; is it in g/cm³? Silicone has 1070 kg/m³",
+            (
+                f"{at_key(path, 'material', 'density_kg_m3')}: {table.material.density_kg_m3:g} kg/m³ is lighter than any "
+                f"foam; is it in g/cm³? Silicone has 1070 kg/m³"
+            ),
             stacklevel=4,
         )
     if table.gravity and np.linalg.norm(table.gravity.vector_m_s2) > 100.0:
         warnings.warn(
-            f"{at_key(path, 'gravity', 'vector_m_s2')}: {table.gravity.vector_m_s2} is more than ten times gravity; is it in mm/s²?",
+            (
+                f"{at_key(path, 'gravity', 'vector_m_s2')}: {table.gravity.vector_m_s2} is more than ten times gravity; is "
+                f"it in mm/s²?"
+            ),
             stacklevel=4,
         )
 

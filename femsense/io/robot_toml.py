@@ -59,7 +59,10 @@ def find_robot(path_or_name: str | Path) -> Path:
     if (path / "robot.toml").is_file():
         if str(path_or_name) in known and known[str(path_or_name)].resolve() != path.resolve():
             warnings.warn(
-                f"{path_or_name}: the folder {path.absolute()} is used; the robot of that name that comes along is {known[str(path_or_name)]}",
+                (
+                    f"{path_or_name}: the folder {path.absolute()} is used; the robot of that name that comes along is "
+                    f"{known[str(path_or_name)]}"
+                ),
                 stacklevel=3,
             )
         return path / "robot.toml"

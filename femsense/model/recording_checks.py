@@ -183,7 +183,10 @@ def _warn_of_inputs(robot: Robot, recording: Recording) -> None:
         highest = recording.pressures[:, j].max(initial=-np.inf)
         if highest > chamber.max_pressure * (1 + 1e-9):
             warnings.warn(
-                f"{_place(recording, 'frames.csv')}: chamber {chamber.name!r} reaches {highest:.4g} Pa, more than its max_pressure_pa of {chamber.max_pressure:.4g} Pa",
+                (
+                    f"{_place(recording, 'frames.csv')}: chamber {chamber.name!r} reaches {highest:.4g} Pa, more than its "
+                    f"max_pressure_pa of {chamber.max_pressure:.4g} Pa"
+                ),
                 stacklevel=3,
             )
     if recording.actuation != "tension":
@@ -194,17 +197,26 @@ def _warn_of_inputs(robot: Robot, recording: Recording) -> None:
             span = max(float(tension.max(initial=0.0)), 0.0) - min(float(tension.min(initial=0.0)), 0.0)
             if span > (cable.max_tension - cable.min_tension) * (1 + 1e-9):
                 warnings.warn(
-                    f"{_place(recording, 'frames.csv')}: the tensions of cable {cable.name!r} span {span:.4g} N, more than from its min_tension_n to its max_tension_n",
+                    (
+                        f"{_place(recording, 'frames.csv')}: the tensions of cable {cable.name!r} span {span:.4g} N, more "
+                        f"than from its min_tension_n to its max_tension_n"
+                    ),
                     stacklevel=3,
                 )
             continue
         if tension.max(initial=-np.inf) > cable.max_tension * (1 + 1e-9):
             warnings.warn(
-                f"{_place(recording, 'frames.csv')}: cable {cable.name!r} reaches {tension.max():.4g} N, more than its max_tension_n of {cable.max_tension:.4g} N",
+                (
+                    f"{_place(recording, 'frames.csv')}: cable {cable.name!r} reaches {tension.max():.4g} N, more than its "
+                    f"max_tension_n of {cable.max_tension:.4g} N"
+                ),
                 stacklevel=3,
             )
         if tension.min(initial=np.inf) < 0:
             warnings.warn(
-                f"{_place(recording, 'frames.csv')}: cable {cable.name!r} goes down to {tension.min():.4g} N; a cable cannot push",
+                (
+                    f"{_place(recording, 'frames.csv')}: cable {cable.name!r} goes down to {tension.min():.4g} N; a cable "
+                    f"cannot push"
+                ),
                 stacklevel=3,
             )

@@ -103,7 +103,10 @@ class Robot:
 
     def __repr__(self) -> str:
         mesh, drives = self.body.mesh, [*self.body.cable_names, *self.body.chamber_names]
-        return f"Robot({self.name}: {len(mesh.tets)} tetrahedra; {', '.join(drives) or 'no input'}; {len(self.marker_names)} markers)"
+        return (
+            f"Robot({self.name}: {len(mesh.tets)} tetrahedra; {', '.join(drives) or 'no input'}; {len(self.marker_names)} "
+            f"markers)"
+        )
 
     def with_body(self, body: BodyModel) -> Robot:
         """Return the robot with another body on the same mesh."""

@@ -49,12 +49,16 @@ class Status(StrEnum):
 _TEXTS = {
     Status.SOLVED: ("the conditions of optimality hold to the tolerance", "nothing"),
     Status.INFEASIBLE: (
-        "no point obeys all constraints: bounds that cross, measured inputs outside their bounds, or measured displacements that no"
+        "no point obeys all constraints: bounds that cross, measured inputs outside their bounds, or measured "
+        "displacements that no"
         " allowed tension and force can make",
         "check the signs and units of the cable inputs; widen the bounds of tension and force; drop the friction cone",
     ),
     Status.UNBOUNDED: (
-        "the objective falls for ever along some direction: an unknown that no row of the compliance sees and no constraint holds",
+        (
+            "the objective falls for ever along some direction: an unknown that no row of the compliance sees and no "
+            "constraint holds"
+        ),
         "use fewer contacts, add rows, or a small ridge",
     ),
     Status.NOT_CONVEX: (

@@ -247,9 +247,15 @@ def page(title: str, kind: str, chapters: Sequence[Chapter]) -> str:
             for i, (chapter, name) in enumerate(zip(chapters, names))
         )
     )
-    head = f'<meta charset="utf-8">\n<meta name="viewport" content="width=device-width, initial-scale=1">\n<title>{escape(title)}</title>\n<style>{STYLE}</style>'
+    head = (
+        f'<meta charset="utf-8">\n<meta name="viewport" content="width=device-width, '
+        f'initial-scale=1">\n<title>{escape(title)}</title>\n<style>{STYLE}</style>'
+    )
     foot = element("footer", "Lengths are 3-D distances unless the text says otherwise; ± is one standard deviation.")
-    return f'<!DOCTYPE html>\n<html lang="en">\n<head>\n{head}\n</head>\n<body>\n{element("header", top)}\n{element("main", body)}\n{foot}\n</body>\n</html>\n'
+    return (
+        f"<!DOCTYPE html>\n<html "
+        f'lang="en">\n<head>\n{head}\n</head>\n<body>\n{element("header", top)}\n{element("main", body)}\n{foot}\n</body>\n</html>\n'
+    )
 
 
 def _chapter(chapter: Chapter, name: str, *, lead: bool, alone: bool) -> Html:

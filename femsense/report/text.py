@@ -52,7 +52,8 @@ def calibration_text(calibration: Calibration) -> str:
             [
                 f"cable {name}",
                 f"{tension:.3f} N{_std(c.tension_std_n.get(name), 1.0, 'N')}, "
-                f"{1e3 * c.cable_displacement_m.get(name, float('nan')):.2f} mm{_std(c.displacement_std_m.get(name), 1e3, 'mm')} at the start",
+                f"{1e3 * c.cable_displacement_m.get(name, float('nan')):.2f} "
+                f"mm{_std(c.displacement_std_m.get(name), 1e3, 'mm')} at the start",
             ]
         )
     return "calibration\n" + columns(rows)
@@ -63,7 +64,10 @@ def _model_error(c: Calibration) -> list[list[str]]:
     if not c.rms_m > MODEL_ERRS * c.noise_m:
         return []
     own = float(np.sqrt(c.rms_m**2 - c.noise_m**2))
-    said = f"{1e3 * own:.3f} mm of it: markers repeat to {1e3 * c.noise_m:.3f} mm. The pose is no better than the model (femsense improve)"
+    said = (
+        f"{1e3 * own:.3f} mm of it: markers repeat to {1e3 * c.noise_m:.3f} mm. The pose is no better than the model "
+        f"(femsense improve)"
+    )
     return [["error of the model", said]]
 
 
@@ -107,14 +111,20 @@ def run_text(run: Run) -> str:
         rows.append(
             [
                 "residual",
-                f"{1e3 * facts['rms_before_m']:.3f} → {1e3 * facts['rms_after_m']:.3f} mm rms with the forces, median of the frames with contact",
+                (
+                    f"{1e3 * facts['rms_before_m']:.3f} → {1e3 * facts['rms_after_m']:.3f} mm rms with the forces, median of "
+                    f"the frames with contact"
+                ),
             ]
         )
     if strongest is not None:
         rows.append(
             [
                 "largest force",
-                f"{strongest.force_n:.3f} ± {strongest.std_n:.3f} N in frame {strongest.frame}, at {_millimetres(strongest.position_m)}",
+                (
+                    f"{strongest.force_n:.3f} ± {strongest.std_n:.3f} N in frame {strongest.frame}, at "
+                    f"{_millimetres(strongest.position_m)}"
+                ),
             ]
         )
     if facts["unexplained"]:
@@ -122,7 +132,10 @@ def run_text(run: Run) -> str:
         rows.append(
             [
                 "not explained",
-                f"{len(facts['unexplained'])} of {facts['frames_ok']} frames, most frame {worst['frame']}: off by {1e3 * worst['rms_after_m']:.1f} mm with the forces that were found",
+                (
+                    f"{len(facts['unexplained'])} of {facts['frames_ok']} frames, most frame {worst['frame']}: off by "
+                    f"{1e3 * worst['rms_after_m']:.1f} mm with the forces that were found"
+                ),
             ]
         )
         rows.append(

@@ -37,7 +37,10 @@ def force_text(found: ForceMap) -> str:
     """Return the map in words."""
     document = force_document(found)
     lines = [
-        f"Forces: one standard deviation of a small force at a known place, from {found.points} points a frame, at {len(found.nodes)} places.",
+        (
+            f"Forces: one standard deviation of a small force at a known place, from {found.points} points a frame, at "
+            f"{len(found.nodes)} places."
+        ),
         "",
         f"{'places':<28}{'count':>6}{'along the normal: median':>26}{'best':>10}{'worst':>10}{'along the surface':>20}",
     ]

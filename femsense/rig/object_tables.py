@@ -31,7 +31,9 @@ class ObjectTable(Schema):
 
     name: Annotated[str, Field(min_length=1, description="a name, each object its own")]
     kind: Literal["ball", "rod", "plate", "box", "mesh", "weight"] = Field(
-        description='"ball" or "plate" on a stick, "rod" that lies across, "box", "mesh", or "weight" on a stick that stands on the body'
+        description=(
+            '"ball" or "plate" on a stick, "rod" that lies across, "box", "mesh", or "weight" on a stick that stands on the body'
+        )
     )
     radius_m: Positive = Field(0.008, description="of a ball, of a rod, or of the tip of a weight's stick [m], > 0")
     length_m: Positive = Field(0.15, description="of a rod [m], > 0")

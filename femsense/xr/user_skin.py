@@ -102,7 +102,10 @@ def tie_skin(skin: UserSkin, mesh: TetMesh) -> Embedding:
         raise InputError(
             "the skin does not lie on the body",
             where="--skin",
-            found=f"half of its vertices are {1e3 * far:.3g} mm or more away; it is {_extent(skin.rest)} large, the body {_extent(mesh.nodes)}",
+            found=(
+                f"half of its vertices are {1e3 * far:.3g} mm or more away; it is {_extent(skin.rest)} large, the body "
+                f"{_extent(mesh.nodes)}"
+            ),
             expected="the same place and size at rest",
             hint="its unit, or its axes: robot frame as in robot.toml, glTF with Y up",
         )

@@ -183,7 +183,8 @@ def test_an_option_takes_several_values(words: str, spread: str) -> None:
 def test_json_is_alone_on_standard_output_whatever_libraries_print(tmp_path: Path) -> None:
     code = (
         "import ctypes, femsense.app.inspect as i, os, sys\nfrom femsense.app import cli\nreal = i.inspect_path\n"
-        "def noisy(path, **_):\n    print('python says')\n    ctypes.CDLL(None).printf(b'C says\\n')\n    os.write(1, b'the system says\\n')\n"
+        "def noisy(path, **_):\n    print('python says')\n    ctypes.CDLL(None).printf(b'C says\\n')\n    os.write(1, "
+        "b'the system says\\n')\n"
         "    return real(path, **_)\n"
         f"i.inspect_path = noisy\nsys.exit(cli.run(['inspect', {str(write_block_robot(tmp_path))!r}, '--json']))"
     )

@@ -118,7 +118,8 @@ def test_a_name_serves_as_a_robot_in_the_chain(tmp_path: Path, capfd: pytest.Cap
     script = tmp_path / "script.toml"
     script.write_text(
         'format = "femsense-script-1"\nseed = 1\n[truth]\nrefinements = 0\nsubsteps = 1\n[markers]\nstd_m = 1e-4\n'
-        '[camera]\neye_m = [0.05, -0.25, 0.25]\ntarget_m = [0.05, 0.0, 0.01]\n[[sweeps]]\nlabel = "up"\ncables = { flexor = 0.8 }\nrest = 1\nup = 1\ndown = 0\n',
+        '[camera]\neye_m = [0.05, -0.25, 0.25]\ntarget_m = [0.05, 0.0, 0.01]\n[[sweeps]]\nlabel = "up"\ncables = { '
+        "flexor = 0.8 }\nrest = 1\nup = 1\ndown = 0\n",
         encoding="utf-8",
     )
     recording, calibration, run = (str(tmp_path / name) for name in ("recording", "calibration.json", "run"))

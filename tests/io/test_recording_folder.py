@@ -68,7 +68,10 @@ def write_png(path: Path, image: np.ndarray) -> None:
 
 def write_ply(path: Path, points: np.ndarray) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    header = f"ply\nformat ascii 1.0\nelement vertex {len(points)}\nproperty double x\nproperty double y\nproperty double z\nend_header\n"
+    header = (
+        f"ply\nformat ascii 1.0\nelement vertex {len(points)}\nproperty double x\nproperty double y\nproperty double "
+        f"z\nend_header\n"
+    )
     path.write_text(header + "".join(f"{x!r} {y!r} {z!r}\n" for x, y, z in points.tolist()))
 
 
@@ -209,7 +212,10 @@ def test_a_broken_depth_image_is_found_when_its_frame_is_read(tmp_path: Path, cu
     "content",
     [
         b"",
-        b"ply\nformat binary_little_endian 1.0\nelement vertex 5\nproperty float x\nproperty float y\nproperty float z\nend_header\n\0\0",
+        (
+            b"ply\nformat binary_little_endian 1.0\nelement vertex 5\nproperty float x\nproperty float y\nproperty float "
+            b"z\nend_header\n\0\0"
+        ),
         b"junk",
     ],
 )

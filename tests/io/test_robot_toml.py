@@ -591,7 +591,10 @@ def test_the_block_of_the_helpers_is_a_sound_mesh() -> None:
 
 
 def test_nothing_heavy_is_imported() -> None:
-    code = "import sys, femsense.io.robot_toml, femsense.io.recording_folder, femsense.app.inspect; print([m for m in ('open3d', 'cv2', 'meshio', 'trimesh', 'pytetwild', 'matplotlib') if m in sys.modules])"
+    code = (
+        "import sys, femsense.io.robot_toml, femsense.io.recording_folder, femsense.app.inspect; print([m for m in "
+        "('open3d', 'cv2', 'meshio', 'trimesh', 'pytetwild', 'matplotlib') if m in sys.modules])"
+    )
     root = str(Path(femsense.__file__).parents[1])
     result = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, env={**os.environ, "PYTHONPATH": root}, check=True

@@ -379,8 +379,10 @@ def write_run_folder(
         force = scale * (0.2 + 0.5 * np.sin(0.3 * k) ** 2)
         touched = [] if lost else [0] if k < 8 else [0, 1] if k < 20 or k == 25 else []
         for c in touched:
+            size, std = force / (c + 1), "" if k in (12, 25) else 0.05 * scale
             contacts.append(
-                f"{k},{0.1 * k},{c},{0.09 - 0.04 * c},0.015,0.03,0,0,1,0.02,0,{-force / (c + 1)},{force / (c + 1)},{'' if k in (12, 25) else 0.05 * scale},cloud,{c},1e-3,1e-3,1e-3,5e-3,0.02,0.02,0.05"
+                f"{k},{0.1 * k},{c},{0.09 - 0.04 * c},0.015,0.03,0,0,1,0.02,0,{-size},{size},{std},"
+                f"cloud,{c},1e-3,1e-3,1e-3,5e-3,0.02,0.02,0.05"
             )
         lines.append(
             f'{k},{0.1 * k},"{reason if lost else "ok"}",{len(touched)},{0 if lost else 12},'

@@ -54,7 +54,10 @@ say(await page.evaluate(() => {
 await page.evaluate(() => new Promise((done) => {
   let last = performance.now();
   const { take } = femsense.shown.robots.get('bar').constructor.prototype;
-  femsense.shown.robots.get('bar').constructor.prototype.take = function (...a) { if (this.id === 'bar') last = performance.now(); return take.apply(this, a); };
+  femsense.shown.robots.get('bar').constructor.prototype.take = function (...a) {
+    if (this.id === 'bar') last = performance.now();
+    return take.apply(this, a);
+  };
   const look = () => {
     if (femsense.shown.robots.get('bar').body.isStale) { globalThis.greyAfter = performance.now() - last; return; }
     setTimeout(look, 5);
@@ -74,7 +77,11 @@ say({ watching: true });
 await stream('stale');
 await page.waitForFunction(() => globalThis.greyAfter !== undefined);
 await page.screenshot({ path: shot });
-say({ grey: await page.evaluate(() => globalThis.greyAfter), pictures: await page.evaluate(() => globalThis.pictures), badge: await page.textContent('#badge') });
+say({
+  grey: await page.evaluate(() => globalThis.greyAfter),
+  pictures: await page.evaluate(() => globalThis.pictures),
+  badge: await page.textContent('#badge'),
+});
 await stream('live');
 const fresh = await page.evaluate(() => !femsense.shown.robots.get('bar').body.isStale);
 await page.keyboard.press(' ');

@@ -216,7 +216,10 @@ const [url, shot, phone] = given;
     await page.keyboard.press('Home');
     await page.selectOption('#paint', 'stress');
     await page.waitForFunction(() => document.querySelector('#scale-top').textContent.includes('strain'), null, { timeout: 60000 });
-    const paint = () => page.evaluate(() => { const p = femsense.shown.body.painter; return { field: Math.max(...p.attributes[0].array), mode: p.mode.value }; });
+    const paint = () => page.evaluate(() => {
+      const p = femsense.shown.body.painter;
+      return { field: Math.max(...p.attributes[0].array), mode: p.mode.value };
+    });
     result.rest = await paint();
     for (let i = 0; i < 6; i++) await page.keyboard.press('ArrowRight');
     result.bent = { ...(await paint()), said: await page.textContent('#scale-top') };

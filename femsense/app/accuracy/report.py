@@ -106,7 +106,10 @@ def advice_on(report: Mapping[str, Any], options: AccuracyOptions) -> str:
     declared = next(space for space in report["spaces"] if space["declared"])
     plain = next((space for space in report["spaces"] if space["element"] == "tet10" and not space["refinements"]), None)
     if declared["force_percent"] is None and declared["motion_percent"] is None:
-        return "the declared space is the finest that is affordable here: nothing to compare it with; a coarser mesh of the same body would show its error"
+        return (
+            "the declared space is the finest that is affordable here: nothing to compare it with; a coarser mesh of the "
+            "same body would show its error"
+        )
     if declared["good_enough"]:
         return "the declared mesh is fine enough"
     if best is not None and not best["refinements"]:
@@ -118,7 +121,10 @@ def advice_on(report: Mapping[str, Any], options: AccuracyOptions) -> str:
     changes = ['element = "tet10"'] * (declared["element"] != "tet10") + [
         f"a mesh of about {wanted} tetrahedra (femsense mesh --max-tets {wanted})"
     ]
-    return f"better: {' and '.join(changes)}: about {unknowns} unknowns instead of {declared['unknowns']}, judged by errors that fall with the square of the edges"
+    return (
+        f"better: {' and '.join(changes)}: about {unknowns} unknowns instead of {declared['unknowns']}, judged by errors "
+        f"that fall with the square of the edges"
+    )
 
 
 def _lack(space: Mapping[str, Any], options: AccuracyOptions) -> float:
@@ -129,7 +135,10 @@ def _lack(space: Mapping[str, Any], options: AccuracyOptions) -> float:
 
 def _change(space: Mapping[str, Any], declared: Mapping[str, Any]) -> str:
     element = f'element = "{space["element"]}"'
-    return f"{element}: {space['unknowns']} unknowns instead of {declared['unknowns']}, {space['step_ms']:.0f} ms a Newton step instead of {declared['step_ms']:.0f} ms"
+    return (
+        f"{element}: {space['unknowns']} unknowns instead of {declared['unknowns']}, {space['step_ms']:.0f} ms a Newton step "
+        f"instead of {declared['step_ms']:.0f} ms"
+    )
 
 
 def accuracy_text(report: Mapping[str, Any]) -> str:
@@ -145,17 +154,22 @@ def accuracy_text(report: Mapping[str, Any]) -> str:
     for row in report["loads"]:
         load = f"{row['name']} {_size(row)}".strip()
         lines.append(
-            f"  {load:<28}{_mm(row['motion_mm']):>10}{_mm(row['error_mm']):>12}{_percent(row['error_percent']):>15}{_mm(row['doubt_mm']):>13}"
+            f"  "
+            f"{load:<28}{_mm(row['motion_mm']):>10}{_mm(row['error_mm']):>12}{_percent(row['error_percent']):>15}{_mm(row['doubt_mm']):>13}"
         )
     lines += _force_lines(report["forces"])
     lines += ["", f"  {'space':<24}{'tetrahedra':>10}{'unknowns':>10}{'ms a step':>11}{'motion':>9}{'force':>9}"]
     for space in report["spaces"]:
         name = f"{space_name(space['element'], space['refinements'])}{' *' if space['declared'] else ''}"
         lines.append(
-            f"  {name:<24}{space['tetrahedra']:>10}{space['unknowns']:>10}{space['step_ms']:>11.0f}{_percent(space['motion_percent']):>9}{_percent(space['force_percent']):>9}"
+            f"  {name:<24}{space['tetrahedra']:>10}{space['unknowns']:>10}{space['step_ms']:>11.0f}"
+            f"{_percent(space['motion_percent']):>9}{_percent(space['force_percent']):>9}"
         )
     lines += [
-        f"  * declared; errors are the worst of all loads and places; fine enough: {good['motion_percent']:.0f} % of motion, {good['force_percent']:.0f} % of force"
+        (
+            f"  * declared; errors are the worst of all loads and places; fine enough: {good['motion_percent']:.0f} % of "
+            f"motion, {good['force_percent']:.0f} % of force"
+        )
     ]
     if report["reference"]["left_out"]:
         lines.append(f"  left out: {'; '.join(report['reference']['left_out'])}")

@@ -66,7 +66,10 @@ def export(
     worn = None if skin is None else skin_for_run(run, skin, unit=skin_unit, budget=vertices)
     report = export_glb(run, output, bones=bones, skin=worn)
     document = {name: getattr(report, name) for name in ("bones", "vertices", "frames", "rms_m", "max_m")}
-    text = f"{report.frames} frames, {report.bones} bones, {report.vertices} vertices; {1e3 * report.rms_m:.3f} mm rms from the finite elements"
+    text = (
+        f"{report.frames} frames, {report.bones} bones, {report.vertices} vertices; {1e3 * report.rms_m:.3f} mm rms from the "
+        f"finite elements"
+    )
     return Answer({"path": str(output), **document}, f"{text}\n\nwritten: {output}")
 
 

@@ -64,7 +64,8 @@ def inspect_cloud(file: Path, report: Report, problems: list[str]) -> None:
     )
     if np.abs(cloud.points).max() > TOO_FAR:
         problems.append(
-            f"{file}: coordinates of this size look like millimetres\n  found:    up to {np.abs(cloud.points).max():.4g}\n  expected: metres"
+            f"{file}: coordinates of this size look like millimetres\n  found:    up to "
+            f"{np.abs(cloud.points).max():.4g}\n  expected: metres"
         )
 
 
@@ -198,7 +199,10 @@ def _warn_of_gaps(r: Recording, steps: FloatArray) -> None:
     if len(gaps):
         k = int(gaps[0])
         warnings.warn(
-            f"{len(gaps)} gaps in time of more than five frames, the first of {steps[k]:.3g} s before frame {r.frame_numbers[k + 1]}",
+            (
+                f"{len(gaps)} gaps in time of more than five frames, the first of {steps[k]:.3g} s before frame "
+                f"{r.frame_numbers[k + 1]}"
+            ),
             stacklevel=2,
         )
 
@@ -211,7 +215,10 @@ def _warn_of_unmatched(r: Recording, folder: Path) -> None:
             outliers = sorted(set(numbered_files(folder / kind / name, endings)) - numbers)
             if outliers:
                 warnings.warn(
-                    f"{folder / kind / name}: {len(outliers)} files whose number is not in frames.csv, the first is {outliers[0]}",
+                    (
+                        f"{folder / kind / name}: {len(outliers)} files whose number is not in frames.csv, the first is "
+                        f"{outliers[0]}"
+                    ),
                     stacklevel=2,
                 )
     if any((folder / "clouds").glob("*/*.p[lc][yd]")) and r.camera_names == ("",):

@@ -161,7 +161,10 @@ def _mesh_report(mesh: TetMesh, to_mm: float) -> Report:
 def _warn_of_quality(worst: float, name: str) -> None:
     if worst < POOR_QUALITY:
         warnings.warn(
-            f"{name}: the worst element has a radius ratio of {worst:.3g} (1 is regular): a sliver makes the model stiff and the solver slow",
+            (
+                f"{name}: the worst element has a radius ratio of {worst:.3g} (1 is regular): a sliver makes the model stiff "
+                f"and the solver slow"
+            ),
             stacklevel=2,
         )
 

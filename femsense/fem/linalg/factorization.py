@@ -209,7 +209,8 @@ def _require_memory(pattern: Pattern) -> None:
     needed, free = direct_bytes(pattern), MEMORY_SHARE * available_memory()
     if needed > free:
         raise FemsenseError(
-            f"conjugate gradients cannot solve this stiffness (not definite, or too ill-conditioned), and its factor needs {needed / 1e9:.1f} GB where {free / 1e9:.1f} GB may be used: "
+            f"conjugate gradients cannot solve this stiffness (not definite, or too ill-conditioned), and its factor "
+            f"needs {needed / 1e9:.1f} GB where {free / 1e9:.1f} GB may be used: "
             "(a) smaller loads, (b) a coarser mesh, (c) more memory"
         )
 

@@ -293,7 +293,10 @@ def _one_body(mesh: TetMesh, where: str) -> tuple[TetMesh, tuple[str, ...]]:
             where=where,
             found=f"{len(volume)} parts; all but the largest hold {100 * loose:.3g} % of the volume",
             expected="one connected body (an edge or a corner alone is a hinge)",
-            hint="a larger --max-tets or a smaller --size keeps thin bridges; bodies that only touch: let them overlap in the CAD program",
+            hint=(
+                "a larger --max-tets or a smaller --size keeps thin bridges; bodies that only touch: let them overlap in the "
+                "CAD program"
+            ),
         )
     nodes, tets = np.unique(mesh.tets[parts == main], return_inverse=True)
     kept = TetMesh(mesh.nodes[nodes], tets.reshape(-1, mesh.tets.shape[1]))

@@ -113,6 +113,7 @@ def quality_text(report: dict[str, Any]) -> str:
     for worst in report["worst"]:
         place = ", ".join(f"{value:.1f}" for value in worst["place_mm"])
         lines.append(
-            f"    {worst['element']:>6}  at [{place}] mm, radius ratio {worst['radius_ratio']:.2f}, angles {worst['dihedral_deg'][0]:.0f}° to {worst['dihedral_deg'][1]:.0f}°"
+            f"    {worst['element']:>6}  at [{place}] mm, radius ratio {worst['radius_ratio']:.2f}, angles "
+            f"{worst['dihedral_deg'][0]:.0f}° to {worst['dihedral_deg'][1]:.0f}°"
         )
     return "\n".join(lines)

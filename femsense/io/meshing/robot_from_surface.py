@@ -177,7 +177,8 @@ def _advice(quality: dict[str, Any], options: MeshOptions) -> list[str]:
     least = 1.0 if options.element == "tet10" else 2.0
     if quality["elements_through"]["fifth_percentile"] < least:
         advice.append(
-            f"thin walls have less than {least:g} elements through them: the model is too stiff there; a smaller --size, or more --max-tets"
+            f"thin walls have less than {least:g} elements through them: the model is too stiff there; a smaller --size, "
+            f"or more --max-tets"
         )
     if quality["radius_ratio"]["min"] < POOR:
         advice.append("the worst element is nearly flat: another --size or a larger --tolerance gives better ones")

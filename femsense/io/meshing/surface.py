@@ -214,7 +214,10 @@ def _closed(
     large = [(size, hole) for size, hole in zip(length, holes) if size > limit]
     if large:
         size, hole = max(large, key=lambda item: item[0])
-        found = f"{len(large)} large hole{'s' * (len(large) > 1)} of {len(holes)}; the largest has a border of {size:.4g} {unit} around {place_text(points, points[hole].mean(axis=0))}"
+        found = (
+            f"{len(large)} large hole{'s' * (len(large) > 1)} of {len(holes)}; the largest has a border of {size:.4g} {unit} "
+            f"around {place_text(points, points[hole].mean(axis=0))}"
+        )
         raise InputError(
             "the surface is open",
             where=where,
@@ -248,7 +251,10 @@ def _without_sheets(points: FloatArray, triangles: IntArray, loose: IntArray, wh
         raise InputError(
             "the surface is open",
             where=where,
-            found=f"{len(loose)} edges of one triangle that go round no hole, the first at {place_text(points, points[loose[0]].mean(axis=0))}",
+            found=(
+                f"{len(loose)} edges of one triangle that go round no hole, the first at "
+                f"{place_text(points, points[loose[0]].mean(axis=0))}"
+            ),
             expected="a closed surface",
             hint="mend it in a mesh editor",
         )

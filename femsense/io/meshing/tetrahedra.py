@@ -181,7 +181,10 @@ def _run_ftetwild(
                 where=where,
                 found=f"{len(triangles)} triangles, stopped early after {seconds:.0f} s",
                 expected="tetrahedra",
-                hint="surfaces that nearly coincide and walls thinner than the tolerance are what takes long: mend them, or femsense mesh with another --tolerance or a larger --size",
+                hint=(
+                    "surfaces that nearly coincide and walls thinner than the tolerance are what takes long: mend them, or "
+                    "femsense mesh with another --tolerance or a larger --size"
+                ),
             ) from None
         except ProgramFailed as failed:
             raise InputError(

@@ -1,9 +1,12 @@
-"""Discretisation error: how far a mesh of half the size would move the markers, in every state; where it is linear, quadratic elements.
+"""Discretisation error: how far a mesh of half the size would move the markers, in every state; where it is linear,
+quadratic elements.
 
-A residual of that shape says nothing of the robot, whatever its size: how much of it a body shows is not known (a cable that is tied to points
-sinks the deeper the finer the mesh is), but it is the same share in all sweeps, but for what directions and sweeps differ by. So it counts as
-noise, once for all sweeps together (`mesh_share` of `Thresholds`), once for each by itself (`mesh_varies`) and turned (`mesh_turns`), so that no effect is named for what a
-finer mesh would explain. A few Newton steps from the state on the declared mesh, which the finer one holds exactly, give it (a hierarchical estimate: Bank & Smith 1993).
+A residual of that shape says nothing of the robot, whatever its size:
+how much of it a body shows is not known (a cable that is tied to points sinks the deeper the finer the mesh is), but it is the
+same share in all sweeps, but for what directions and sweeps differ by. So it counts as noise, once for all sweeps together
+(`mesh_share` of `Thresholds`), once for each by itself (`mesh_varies`) and turned (`mesh_turns`), so that no effect is named for
+what a finer mesh would explain. A few Newton steps from the state on the declared mesh, which the finer one holds exactly, give
+it (a hierarchical estimate: Bank & Smith 1993).
 """
 
 from __future__ import annotations

@@ -88,8 +88,9 @@ def as_far_as_held_out_states_converge(fit: Callable[[int], FittedModel], steps:
 
 
 def matched(data: Data, fitted: FittedModel, noise: Noise, *, anew: bool = False) -> tuple[Data, FittedModel]:
-    """Return the data with the rows of clouds as a fitted model has them, and the fitted model fitted to these, time and again until neither changes much: what is
-    rounded off where the model was draws it back there. With `anew` it is asked again which rows there are."""
+    """Return the data with the rows of clouds as a fitted model has them, and the fitted model fitted to these, time and again
+    until neither changes much: what is rounded off where the model was draws it back there.
+    With `anew` it is asked again which rows there are."""
     for _ in range(data.effort.matchings):
         data = rematched(data, fitted, noise, anew=anew)
         fitted = fitted_again(data, fitted, noise, near=None if anew else fitted.fit.jets)

@@ -58,8 +58,8 @@ def fitted_at(
 
 
 def climbed(data: Data, fitted: FittedModel, start: Candidate, noise: Noise) -> list[Candidate]:
-    """Return where the best seeds come to, the best first and none of them where it starts, when each goes from neighbour to neighbour: a soft place here and a stiff one there look alike
-    when the modulus is open. Some of the states show the way."""
+    """Return where the best seeds come to, the best first and none of them where it starts, when each goes from neighbour to
+    neighbour: a soft place here and a stiff one there look alike when the modulus is open. Some of the states show the way."""
     cases = representative_cases(data, fitted, noise)
     asked, known = list[Entry](), list[Candidate]()
     answers: list[Answers] = [{} for _ in cases.data.train]

@@ -16,8 +16,8 @@ from femsense.loop.search.search_state import Progress
 
 
 def prune(data: Data, fitted: FittedModel, noise: Noise, n_effective: float, say: Progress) -> FittedModel:
-    """Return the fitted model without effects that those added later have made needless (dBIC for keeping them not above `needless`); the place of the last one,
-    which was found beside them, then moves on."""
+    """Return the fitted model without effects that those added later have made needless (dBIC for keeping them not above
+    `needless`); the place of the last one, which was found beside them, then moves on."""
     whole, added = fitted, found_in(fitted)
     for name in added[:-1] if np.isfinite(data.thresholds.needless) else []:
         others = [n for n in fitted.fit.hypothesis.names if n != name]

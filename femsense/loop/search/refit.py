@@ -54,10 +54,11 @@ def refit(
     settled: bool = False,
     begin: JointFit | None = None,
 ) -> FittedModel:
-    """Joint fit with one more effect, started where a fit to some of the states ended (`begin`), else from its linear step. Raises DataError where
-    no start helps.
+    """Joint fit with one more effect, started where a fit to some of the states ended (`begin`),
+    else from its linear step. Raises DataError where no start helps.
 
-    Where the dBIC would stay well below what is wanted (by default `Thresholds.evidence`), or below it at all if it is `settled`, the fit is stopped early on its way.
+    Where the dBIC would stay well below what is wanted (by default `Thresholds.evidence`), or below it at all if it is `settled`,
+    the fit is stopped early on its way.
     """
     null = np.array([p.null for p in candidate.parameters])
     low, high = np.array([p.low for p in candidate.parameters]), np.array([p.high for p in candidate.parameters])

@@ -125,8 +125,8 @@ def _screened(
 
 
 def spared_gain(data: Data, fitted: FittedModel, fields: Fields, noise: Noise, n_effective: float) -> float:
-    """Return what a fitted model need not gain any more before effects are tried on top of it, since the predicted gain of one of these is so much larger; nothing where all
-    states are little work."""
+    """Return what a fitted model need not gain any more before effects are tried on top of it, since the predicted gain of one of
+    these is so much larger; nothing where all states are little work."""
     if not spares(data, fitted.fit.hypothesis.robot_at(fitted.fit.coordinates)):
         return 0.0
     fit = weighed(data, fitted.fit, noise, fitted.fit.jets)

@@ -35,7 +35,11 @@ def calibration_table(shift: CalibrationShift) -> Html | None:
     return table(
         ("Quantity", "Declared", "Calibrated (before)", "With all that calibration may move", "With the effects"),
         rows,
-        caption="Camera: against where the calibration of the declared model put it (± one standard deviation). What moves back when effects are added is where they had been hiding. In the last two columns everything is free, so that values may differ from those that are returned.",
+        caption=(
+            "Camera: against where the calibration of the declared model put it (± one standard deviation). What moves back "
+            "when effects are added is where they had been hiding. In the last two columns everything is free, so that "
+            "values may differ from those that are returned."
+        ),
     )
 
 

@@ -25,12 +25,15 @@ from femsense.report.loop.what_is_left import tests_table, what_is_left
 from femsense.report.page import Chapter, Html, paragraph, section, tiles, together
 
 OLDER = (
-    "This loop.json holds no figures of the residual, of calibration, of confounding and of forces: it was written by an earlier femsense. "
+    "This loop.json holds no figures of the residual, of calibration, of confounding and of forces: it was written by an "
+    "earlier femsense. "
     "Run femsense improve again for the whole report."
 )
 CLOUDS = (
-    "There were no markers: what was fitted are clouds. Each “surface …” is a point of the body's surface; its residual is how far the "
-    "measured surface lies from the model's there, along the normal, outwards positive. Errors are root mean squares of these distances."
+    "There were no markers: what was fitted are clouds. Each “surface …” is a point of the body's surface; its residual "
+    "is how far the "
+    "measured surface lies from the model's there, along the normal, outwards positive. Errors are root mean squares of "
+    "these distances."
 )
 
 
@@ -109,7 +112,10 @@ def _summary(loop: Loop) -> Html | None:
     if share is not None:
         items.append(("Recovered", words.percent(share), "of the excess over the noise (squares)"))
     train = paragraph(
-        f"On the data that were fitted: {words.length(before.train_rms_m)} before, {words.length(after.train_rms_m)} after (rms).",
+        (
+            f"On the data that were fitted: {words.length(before.train_rms_m)} before, {words.length(after.train_rms_m)} "
+            f"after (rms)."
+        ),
         class_="soft",
     )
     known = words.known(before.train_rms_m) or words.known(after.train_rms_m)

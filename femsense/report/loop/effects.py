@@ -80,9 +80,13 @@ def ranking_table(candidates: Sequence[Candidate], ranked: Mapping[str, Ranked],
         dense=True,
     )
     text = paragraph(
-        "Δχ² is what the effect explains of the residual beyond all that calibration can absorb; ΔBIC takes off a price for each parameter and each effect tried, "
-        "and a named effect needs 10. Left-out sweeps: by how much twice the log-likelihood of sweeps that are not fitted rises, ± its standard error. “Retained” is the share of its trace "
-        "that calibration leaves. “First” is how often the effect comes first when whole sweeps are drawn anew. Values: of the final fit where named, else of the linear screening. The modulus and the input offsets are not among them: they are always fitted along.",
+        "Δχ² is what the effect explains of the residual beyond all that calibration can absorb; ΔBIC takes off a price "
+        "for each parameter and each effect tried, "
+        "and a named effect needs 10. Left-out sweeps: by how much twice the log-likelihood of sweeps that are not "
+        "fitted rises, ± its standard error. “Retained” is the share of its trace "
+        "that calibration leaves. “First” is how often the effect comes first when whole sweeps are drawn anew. Values: "
+        "of the final fit where named, else of the linear screening. The modulus and the input offsets are not among "
+        "them: they are always fitted along.",
         class_="soft",
     )
     return together(text, ranking) if ranking else None

@@ -28,7 +28,8 @@ def _loads(loads: Sequence[LoadRow]) -> Html | None:
     held = all(row.held_out for row in loads)
     medians = [_median_error(loads, name) for name in ("before_n", "after_n")]
     text = paragraph(
-        f"Sensed along the declared load, from the markers, to first order about the declared load, in {'held-out' if held else 'fitted'} frames. "
+        f"Sensed along the declared load, from the markers, to first order about the declared load, in "
+        f"{'held-out' if held else 'fitted'} frames. "
         f"Median size of the error: {medians[0]} with the declared robot, calibrated; {medians[1]} with the improved one."
     )
     numbers = table(
@@ -69,8 +70,10 @@ def _softer(compliance: Compliance) -> Html | None:
 
     middle = statistics.median(ratios)
     text = paragraph(
-        f"No load is declared in these frames. The same dent of the surface is sensed as {words.number(middle)} times the force that the declared robot senses "
-        f"(median over places and frames; {words.number(min(ratios))} to {words.number(max(ratios))}): compliance before over compliance after."
+        f"No load is declared in these frames. The same dent of the surface is sensed as {words.number(middle)} times "
+        f"the force that the declared robot senses "
+        f"(median over places and frames; {words.number(min(ratios))} to {words.number(max(ratios))}): compliance before "
+        f"over compliance after."
     )
     rows = [
         [

@@ -28,7 +28,10 @@ def held_out_errors(residuals: Residuals, table: Frames, noise_m: float | None) 
     shares = as_image(
         _distribution(before, after, noise_m),
         alt=f"Share of held-out measurements with an error below a size, before and after; medians {median[0]} and {median[1]}.",
-        caption=f"{words.counted(len(before), 'measurement')} of {words.counted(len(set(residuals.marker)), 'marker')}; median {median[0]} before, {median[1]} after; {fell}.",
+        caption=(
+            f"{words.counted(len(before), 'measurement')} of {words.counted(len(set(residuals.marker)), 'marker')}; median "
+            f"{median[0]} before, {median[1]} after; {fell}."
+        ),
     )
     dots = sweep_dots(table, noise_m) or as_image(
         _frame_dots(frames, noise_m),
@@ -136,7 +139,10 @@ def sweep_dots(frames: Frames, noise_m: float | None) -> Html | None:
     return as_image(
         figure,
         alt=f"Error of each sweep before and after; it fell in {fell} of {held} held-out sweeps.",
-        caption=f"Large dots: a sweep; small ones: its frames; held-out sweeps stand on grey. The error fell in {fell} of {words.counted(held, 'held-out sweep')}.",
+        caption=(
+            f"Large dots: a sweep; small ones: its frames; held-out sweeps stand on grey. The error fell in {fell} of "
+            f"{words.counted(held, 'held-out sweep')}."
+        ),
     )
 
 

@@ -65,8 +65,14 @@ def confounding_map(confounding: Confounding) -> Html | None:
     top = max((float(share[i, j]), names[i], names[j]) for i, j in np.argwhere(np.isfinite(share)))
     return as_image(
         _draw_map(names, share),
-        alt=f"Map of {n} effects: how much of the trace of one is collinear with another one; the most {top[0]:.0%} of {top[1]} by {top[2]}.",
-        caption="How much of the trace of the effect on the left is collinear with that of the effect below [%], with all that calibration can absorb taken off. Above 95 (bold) these data cannot distinguish the two.",
+        alt=(
+            f"Map of {n} effects: how much of the trace of one is collinear with another one; the most {top[0]:.0%} of "
+            f"{top[1]} by {top[2]}."
+        ),
+        caption=(
+            "How much of the trace of the effect on the left is collinear with that of the effect below [%], with all that "
+            "calibration can absorb taken off. Above 95 (bold) these data cannot distinguish the two."
+        ),
         wide=n > WIDE,
     )
 

@@ -37,7 +37,10 @@ def residual_against(frames: Frames, score: Score, tip: Tip) -> Html | None:
             as_image(
                 _scatter(x, y, z, by_way, score.covariate),
                 alt=f"Leading pattern of the residual against {score.covariate}{strength}, by direction.",
-                caption=f"The pattern holds {words.percent(score.share)} of the squared residual before, mean of each marker taken off; it goes best with: {score.covariate}{strength}.",
+                caption=(
+                    f"The pattern holds {words.percent(score.share)} of the squared residual before, mean of each marker "
+                    f"taken off; it goes best with: {score.covariate}{strength}."
+                ),
             )
         )
         labels = sweep_labels(frames)
@@ -152,6 +155,9 @@ def covariate_table(score: Score) -> Html | None:
     return table(
         ("Goes with", "Rank correlation before", "p (Holm)", "after"),
         rows,
-        caption="The leading pattern of the residual and what it goes with (Spearman; neighbouring frames are not independent, so p is optimistic).",
+        caption=(
+            "The leading pattern of the residual and what it goes with (Spearman; neighbouring frames are not independent, "
+            "so p is optimistic)."
+        ),
         numeric=(1, 2, 3),
     )

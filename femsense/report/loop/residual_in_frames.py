@@ -108,7 +108,8 @@ def frame_residuals_panel(pictures: Pictures, rest: DrawnSurface | None) -> Html
     length = "at true length" if frames.factor == 1 else f"drawn {frames.factor:g} times as long"
     text = paragraph(
         "Single frames of the fitted data, from little to much actuation, on the shape that the declared model has there. "
-        f"Arrows point from the model to the measurement, {length}, with one scale in all pictures; numbers are the rms of the frame."
+        f"Arrows point from the model to the measurement, {length}, with one scale in all pictures; numbers are the rms "
+        f"of the frame."
     )
     sizes = ", ".join(
         f"{title} {words.length(_rms(before))} before and {words.length(_rms(after))} after"

@@ -30,7 +30,10 @@ def power_table(loop: Loop, evidence: Evidence) -> Html | None:
     return table(
         ("Effect", "Smallest change that would have been seen"),
         rows,
-        caption="For each effect that was not found: the change from what is declared at which the data would have named it (expected ΔBIC of 10).",
+        caption=(
+            "For each effect that was not found: the change from what is declared at which the data would have named it "
+            "(expected ΔBIC of 10)."
+        ),
     )
 
 

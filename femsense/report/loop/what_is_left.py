@@ -67,7 +67,10 @@ def _yes(structure: Structure) -> str:
 def _lack(fit: LackOfFit | None) -> str:
     if fit is None:
         return "not testable: too little is repeated"
-    return f"F = {words.number(fit.f, 2)}, {_p(fit.p_value)} ({fit.df_lack}, {fit.df_pure} degrees of freedom; repeats differ by {words.length(fit.pure_error_m)})"
+    return (
+        f"F = {words.number(fit.f, 2)}, {_p(fit.p_value)} ({fit.df_lack}, {fit.df_pure} degrees of freedom; repeats differ "
+        f"by {words.length(fit.pure_error_m)})"
+    )
 
 
 MARKERS = 30
@@ -120,7 +123,10 @@ def _left_facts(left: Left, *, effects: bool) -> list[str]:
 def _structure_words(structure: Structure) -> str:
     found = structure.significant if structure.significant is not None else (structure.p_value or 0.0) <= 0.01
     state = "the residual is not mere noise" if found else "none seen beyond noise"
-    return f"{state} (correlation of neighbouring states {words.number(structure.lag_one, 2)}, smallest p = {words.number(structure.p_value, 2)})"
+    return (
+        f"{state} (correlation of neighbouring states {words.number(structure.lag_one, 2)}, smallest p = "
+        f"{words.number(structure.p_value, 2)})"
+    )
 
 
 def _marker_bars(per_marker: Mapping[str, float | None]) -> Html | None:
@@ -173,6 +179,8 @@ def force_field(field: ForceField, surface: DrawnSurface | None) -> Html | None:
     return as_image(
         figure,
         alt=f"Equivalent forces in frame {field.frame}, the largest {words.quantity(largest, 'N', 2)}.",
-        caption=f"Not evidence: the smallest forces on the surface that would bend the model to the measurement in frame {field.frame}, the one with the largest residual "
-        f"(they explain {words.percent(field.explained_share)} of it). Any residual is some field of forces; pale arrows are behind.{sum_words}",
+        caption=f"Not evidence: the smallest forces on the surface that would bend the model to the measurement in frame "
+        f"{field.frame}, the one with the largest residual "
+        f"(they explain {words.percent(field.explained_share)} of it). Any residual is some field of forces; pale arrows "
+        f"are behind.{sum_words}",
     )

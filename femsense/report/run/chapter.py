@@ -52,7 +52,10 @@ def _headline(facts: RunFacts, contacts: ContactTable | None, frames: FrameTable
     strongest = strongest_contact(contacts, frames)
     if contacts is None or strongest is None:
         return f"{base}."
-    return f"{base}; largest force {force_text(contacts.size_n[strongest], contacts.std_n[strongest])} in frame {contacts.frame[strongest]}."
+    return (
+        f"{base}; largest force {force_text(contacts.size_n[strongest], contacts.std_n[strongest])} in frame "
+        f"{contacts.frame[strongest]}."
+    )
 
 
 def _summary(facts: RunFacts, contacts: ContactTable | None, frames: FrameTable | None) -> Html:

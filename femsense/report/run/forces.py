@@ -57,7 +57,10 @@ def force_panels(contacts: ContactTable | None, frames: FrameTable | None, folde
     strongest = strongest_contact(contacts, frames) or 0
     over_time = as_image(
         _force_figure(contacts, frames, numbers, (float(times.min()), float(times.max()))),
-        alt=f"Force of {words.counted(len(numbers), 'contact')} over time; the largest {force_text(contacts.size_n[strongest], contacts.std_n[strongest])}.",
+        alt=(
+            f"Force of {words.counted(len(numbers), 'contact')} over time; the largest "
+            f"{force_text(contacts.size_n[strongest], contacts.std_n[strongest])}."
+        ),
         caption=f"Size of each force; the bands are ± 1 and ± 2 standard deviations.{rest}",
     )
     return panels(over_time, _force_on_body(contacts, frames, folder, contacts.frame[strongest]))

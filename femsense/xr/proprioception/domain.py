@@ -44,7 +44,10 @@ class Outside:
         if self.kind == "missing":
             return f"{self.channel}: no number"
         seen = "learnt" if self.kind == "range" else "expected from the other channels"
-        return f"{self.channel} = {self.value:.4g} is outside {self.low:.4g} … {self.high:.4g} ({seen}), by {self.far:.2g} times that width"
+        return (
+            f"{self.channel} = {self.value:.4g} is outside {self.low:.4g} … {self.high:.4g} ({seen}), by {self.far:.2g} "
+            f"times that width"
+        )
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -118,7 +118,8 @@ def model_inputs(model: ProprioceptiveModel, data: Labelled) -> FloatArray:
     same = (data.channels, data.marker_names) == (model.channels, model.marker_names)
     if not same:
         raise DataError(
-            f"other channels or markers: {data.channels}, {data.marker_names}; the model knows {model.channels}, {model.marker_names}"
+            f"other channels or markers: {data.channels}, {data.marker_names}; the model knows {model.channels}, "
+            f"{model.marker_names}"
         )
     if len(data) < FEWEST:
         raise DataError(f"{len(data)} rows have readings and all markers; at least {FEWEST} are needed")

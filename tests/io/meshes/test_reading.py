@@ -105,7 +105,10 @@ def test_gmsh_saves_all_with_groups_of_some(tmp_path: Path) -> None:
     elements = f"3 {len(TETS) + 1} 1 {len(TETS) + 1}\n2 1 2 1\n999 1 2 3\n"
     for tag, part in ((1, TETS[:half]), (2, TETS[half:])):
         elements += f"3 {tag} 4 {len(part)}\n" + "".join(f"1 {' '.join(map(str, tet + 1))}\n" for tet in part)
-    text = f"$MeshFormat\n4.1 0 8\n$EndMeshFormat\n$Entities\n{entities}$EndEntities\n$Nodes\n{nodes}$EndNodes\n$Elements\n{elements}$EndElements\n"
+    text = (
+        f"$MeshFormat\n4.1 0 "
+        f"8\n$EndMeshFormat\n$Entities\n{entities}$EndEntities\n$Nodes\n{nodes}$EndNodes\n$Elements\n{elements}$EndElements\n"
+    )
     (tmp_path / "a.msh").write_text(text)
     same_body(tmp_path / "a.msh")
     values = tet_values(tmp_path / "a.msh", "gmsh:physical", "here")
@@ -170,7 +173,10 @@ def test_a_vtu_of_several_pieces_is_read_whole(tmp_path: Path) -> None:
 def test_a_list_of_vtu_files(tmp_path: Path) -> None:
     for i, part in enumerate(halves()):
         (tmp_path / f"p{i}.vtu").write_text(vtu(part))
-    text = '<VTKFile type="PUnstructuredGrid"><PUnstructuredGrid><Piece Source="p0.vtu"/><Piece Source="p1.vtu"/></PUnstructuredGrid></VTKFile>'
+    text = (
+        '<VTKFile type="PUnstructuredGrid"><PUnstructuredGrid><Piece Source="p0.vtu"/><Piece '
+        'Source="p1.vtu"/></PUnstructuredGrid></VTKFile>'
+    )
     (tmp_path / "a.pvtu").write_text(text)
     same_body(tmp_path / "a.pvtu")
     (tmp_path / "p1.vtu").unlink()
@@ -214,7 +220,10 @@ def test_abaqus_elements_over_several_lines(tmp_path: Path) -> None:
 
 def test_an_instance_of_abaqus_stands_where_it_is_put(tmp_path: Path) -> None:
     part = "*Part, name=B\n*Node\n" + abaqus_nodes(NUMBERS) + abaqus_elements(NUMBERS) + "*End Part\n"
-    place = "*Assembly, name=A\n*Instance, name=B-1, part=b\n10., 0., 0.\n0., 0., 0., 0., 0., 1., 90.\n*End Instance\n*Node\n1, 0., 0., 0.\n*End Assembly\n"
+    place = (
+        "*Assembly, name=A\n*Instance, name=B-1, part=b\n10., 0., 0.\n0., 0., 0., 0., 0., 1., 90.\n*End Instance\n*Node\n1, "
+        "0., 0., 0.\n*End Assembly\n"
+    )
     (tmp_path / "a.inp").write_text(part + place)
     moved = NODES + np.array([10.0, 0.0, 0.0])
     turned = np.column_stack([-moved[:, 1], moved[:, 0], moved[:, 2]])

@@ -348,7 +348,10 @@ def test_what_takes_too_long_is_stopped() -> None:
         ("cloud.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n", "a cloud of 3 points"),
         (
             "cloud.ply",
-            b"ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\nend_header\n0 0 0\n1 0 0\n",
+            (
+                b"ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float "
+                b"z\nend_header\n0 0 0\n1 0 0\n"
+            ),
             "a cloud of 2 points",
         ),
         ("noise.stl", bytes(range(256)) * 10, "the file does not hold what it announces"),

@@ -82,7 +82,10 @@ def test_what_the_camera_measures_may_be_corrected_and_the_inverse_is_found(tmp_
 def test_parameters_have_defaults_sizes_and_scales(tmp_path):
     text = DRAUGHT.replace(
         "parameters = {",
-        'parameters = {"wind_m_s": {"low": -3, "high": 3, "size": 3}, "part": {"low": 1, "high": 9, "null": 2, "scale": "log", "unit": "s"}, ',
+        (
+            'parameters = {"wind_m_s": {"low": -3, "high": 3, "size": 3}, "part": {"low": 1, "high": 9, "null": 2, "scale": '
+            '"log", "unit": "s"}, '
+        ),
     )
     effect = load_own_effect(written(tmp_path, text))
     robot = arm((2, 1, 1))
