@@ -35,7 +35,7 @@ def found(loop, name):
 def test_friction_is_named_with_its_coefficient_and_the_held_out_error_falls():
     inputs, labels = sweeps()
     recording, _ = record(inputs, effects=[{"name": "cable_friction", "coefficient": 0.25}], labels=labels)
-    loop = improve(arm(), [recording])
+    loop = improve(arm((5, 2, 2)), [recording])
     assert loop.verdict == "effects"
     effect = found(loop, "cable_friction")
     assert effect.parameters["coefficient"].value == pytest.approx(0.25, rel=0.15)
@@ -61,7 +61,7 @@ ONE_EACH = np.concatenate([3.0 * np.outer(LEVEL, row) for row in np.eye(4)])
 @pytest.mark.parametrize("load", [0.0, 0.3])
 def test_a_modulus_is_not_told_from_a_gain_of_all_cables_where_nothing_known_pulls_besides(load: float):
     weightless, truth = (arm((4, 1, 1), gravity=(0.0, 0.0, 0.0)) for _ in range(2))
-    inputs, labels = sweeps(each=6)
+    inputs, labels = sweeps(each=4)
     tip, forces = np.array([0.1, 0.0, 0.01]), {k: np.array([0.0, 0.0, -load]) for k in range(len(inputs)) if load and k % 2}
     hidden = [{"name": "stiffness", "scale": 1.25}]
     recording, _ = record(inputs, labels=labels, truth=truth, effects=hidden, forces={k: (tip, f) for k, f in forces.items()})
@@ -141,8 +141,8 @@ def test_an_effect_whose_states_do_not_converge_again_is_taken_back():
 
 def test_a_model_that_lacks_nothing_is_told_so():
     inputs, labels = sweeps()
-    recording, _ = record(inputs, labels=labels, truth=arm(), noise=2e-4)
-    loop = improve(arm(), [recording])
+    recording, _ = record(inputs, labels=labels, truth=arm((4, 1, 1)), noise=2e-4)
+    loop = improve(arm((4, 1, 1)), [recording])
     assert loop.verdict == "none"
     assert not loop.effects
     assert loop.noise_m == pytest.approx(2e-4 * np.sqrt(3), rel=0.15)
@@ -159,8 +159,8 @@ def test_a_model_that_lacks_nothing_is_told_so():
 
 def test_a_second_round_on_the_improved_robot_finds_nothing():
     inputs, labels = sweeps()
-    recording, _ = record(inputs, effects=[{"name": "stiffness", "scale": 0.8}], labels=labels, truth=arm(), noise=2e-4)
-    first = improve(arm(), [recording])
+    recording, _ = record(inputs, effects=[{"name": "stiffness", "scale": 0.8}], labels=labels, truth=arm((4, 1, 1)), noise=2e-4)
+    first = improve(arm((4, 1, 1)), [recording])
     assert improve(first.robot, [recording]).verdict == "none"
 
 
