@@ -62,7 +62,6 @@ SEARCH = (
     Switch("sure", {"sure": INF}),
     Switch("held_chance", {"held_chance": 0.0}),
     Switch("predicts", {"predicts": 0.0}),
-    Switch("needless", {"needless": -INF}),
     Switch("swap", {"swap": INF}),
     Switch("places", {}, {"starts": 1, "rounds": 0}),
     Switch("apart", {"apart": INF}),

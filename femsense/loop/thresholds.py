@@ -45,8 +45,6 @@ class Thresholds:
 
     predicts: float = 1.0
     """Where evidence is close, so much of what left-out sweeps surely gain counts as dBIC; 0: nothing."""
-    needless: float = 0.0
-    """An effect that later ones leave so much dBIC at most is taken out; −inf: none is."""
 
     # --- places, swaps and ties --------------------------------------------------------------------------------------------------
     as_good_places: float = 0.05

@@ -1,1 +1,1 @@
-"""The search for effects: screening, refits, forward selection, acceptance, pruning, swaps."""
+"""The search for effects: screening, refits, forward selection, acceptance, swaps."""

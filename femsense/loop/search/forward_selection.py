@@ -33,31 +33,29 @@ BEHIND = "stopped early: in some of the states another one explains more by far"
 
 def select_next(
     data: Data, fitted: FittedModel, table: list[Candidate], noise: Noise, say: Progress
-) -> tuple[Refit | None, list[Refit], list[RefitRecord]]:
-    """Return the effect that comes next, or None where nothing passes; others that are as good; and what became of each candidate that was
-    refitted."""
+) -> tuple[Refit | None, list[RefitRecord]]:
+    """Return the effect that comes next, or None where nothing passes; and what became of each candidate that was refitted."""
     listed = shortlist(table, data.thresholds, data.effort, first=not found_in(fitted))
     if not listed:
-        return None, [], []
+        return None, []
     refits, records = _refitted(data, fitted, listed, noise, say)
     if not any(r.record.passes for r in refits.values()):
         refits = {i: _elsewhere(data, fitted, r, noise, say) for i, r in refits.items()}
-    passing = {i: r for i, r in refits.items() if r.record.passes}
-    if not passing:
-        return None, [], _updated(records, refits)
-    best = max(r.score for r in passing.values())
-    leading = {
-        i: r if r.record.seed_std is not None else polished(data, fitted, r, noise, say)
-        for i, r in passing.items()
-        if r.score > best - data.thresholds.evidence
-    }
+    leading = leaders(data, fitted, refits, noise, say)
+    if not leading:
+        return None, _updated(records, refits)
     # where evidence is close, what surely predicts better
     first = max(leading, key=lambda i: leading[i].score + data.thresholds.predicts * surely_predicts(leading[i]))
-    close = [r for r in leading.values() if r.score > leading[first].score - data.thresholds.evidence]
     winner = _enriched(data, fitted, leading[first], table, noise, say).saying(NAMED)
-    ties = [r for r in close if r.candidate.effect.name != winner.candidate.effect.name]
-    records = _updated(records, refits | leading | {first: winner})
-    return winner, sorted(ties, key=lambda r: -r.score), records
+    return winner, _updated(records, refits | leading | {first: winner})
+
+
+def leaders(data: Data, fitted: FittedModel, refits: Mapping[int, Refit], noise: Noise, say: Progress) -> dict[int, Refit]:
+    """Return the refits that pass and are as good as the best but for `evidence`, each with its seed improved."""
+    passing = {i: r for i, r in refits.items() if r.record.passes}
+    best = max((r.score for r in passing.values()), default=np.inf)
+    near = {i: r for i, r in passing.items() if r.score > best - data.thresholds.evidence}
+    return {i: r if r.record.seed_std is not None else polished(data, fitted, r, noise, say) for i, r in near.items()}
 
 
 def _refitted(

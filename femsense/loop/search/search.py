@@ -1,11 +1,8 @@
-"""The search for effects: screen, refit, add the best, prune, and start again from the better model until nothing passes."""
+"""The search for effects: screen, refit, add the best, ask again of what was found before, and start again from the better model until nothing passes."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-
-import numpy as np
 
 from femsense.core.errors import FemsenseError
 from femsense.io.checkpoint import Checkpoint
@@ -14,18 +11,15 @@ from femsense.loop.fit.discretisation_error import as_shown, errs_alike, with_me
 from femsense.loop.fit.fitted_model import FittedModel, weighed
 from femsense.loop.fit.marker_placement import with_turning_placements
 from femsense.loop.fit.noise_components import Noise
-from femsense.loop.result.records import NAMED, PASSES, RefitRecord
+from femsense.loop.result.records import RefitRecord
 from femsense.loop.search.acceptance import discretisation_rms, moved_by
 from femsense.loop.search.calibration import Ready, calibrated_pose, fitted_again, matched
 from femsense.loop.search.effect_fields import Fields, fields_of
 from femsense.loop.search.forward_selection import hinted, select_next
-from femsense.loop.search.input_offset import instead_of_offsets
-from femsense.loop.search.pruning import prune
-from femsense.loop.search.refit import evidence
 from femsense.loop.search.screening import Candidate, noise_of, screen_model
-from femsense.loop.search.search_state import Progress, Refit, Search, SearchProgress, at_step
+from femsense.loop.search.search_state import Progress, Search, SearchProgress, at_step
 from femsense.loop.search.subsampling import spares
-from femsense.loop.search.swaps import swapped
+from femsense.loop.search.swaps import instead_of_offsets, swapped
 from femsense.model.recording import state_key
 
 
@@ -77,7 +71,7 @@ def _take_step(course: SearchProgress, say: Progress) -> None:
             raise
         course.take_back(error)
         return
-    history, refits, ties = [*course.history[:-1], (course.history[-1][0], fitted)], course.refits, course.ties
+    history, refits = [*course.history[:-1], (course.history[-1][0], fitted)], course.refits
     course.data, course.fitted, course.noise, course.n_effective = data, fitted, noise, n_effective
     course.fields, course.table, course.history = fields, table, history
     if not found:
@@ -85,32 +79,20 @@ def _take_step(course: SearchProgress, say: Progress) -> None:
     if found >= _most_effects(data):
         course.over = True
         return
-    next_one, others, tried = select_next(data, fitted, table, noise, say)
+    next_one, tried = select_next(data, fitted, table, noise, say)
     refits = [*refits, *at_step(tried, len(history))]
-    if next_one is None and ties and np.isfinite(data.thresholds.swap):
-        instead, next_one, tried = beside_a_tie(data, fitted, ties[0], fields, noise, names, n_effective, say)
-        if next_one is not None:
-            history[-1] = (ties[0].candidate.effect.name, instead)
-            refits = [
-                *_renamed(refits, len(history) - 1, history[-1][0]),
-                *at_step(tried, len(history)),
-            ]
-            fitted, others = instead, []
     course.refits = refits
     if next_one is None:
         course.over = True
         return
     course.earlier = data
-    name, winner, course.ties = next_one.candidate.effect.name, next_one.fitted, others
+    winner = next_one.fitted
     anew = moved_by(fitted, winner) > discretisation_rms(data, fitted, whole=True) and not errs_alike(data, fitted, winner)
-    fitted = prune(data, winner, noise, n_effective, say)
-    history = [*history, (name, fitted)]
-    data = with_turning_placements(as_shown(with_mesh_errors(data, fitted, names), fitted) if anew else data, fitted)
-    found_so = history
+    history = [*history, (next_one.candidate.effect.name, winner)]
     history, refits = swapped(data, history, refits, noise, n_effective, say)
-    if history is not found_so:
-        history[-1] = (history[-1][0], prune(data, history[-1][1], noise, n_effective, say))
-    course.data, course.history, course.refits, course.fitted = data, history, refits, history[-1][1]
+    last = history[-1][1]
+    data = with_turning_placements(as_shown(with_mesh_errors(data, last, names), last) if anew else data, last)
+    course.data, course.history, course.refits, course.fitted = data, history, refits, last
 
 
 def _screened(
@@ -148,37 +130,6 @@ def scored(
         return fields, table
     fields = fields_of(data, fitted, names)
     return fields, screen_model(data, fitted.fit, noise, fields, n_effective)
-
-
-def beside_a_tie(
-    data: Data,
-    fitted: FittedModel,
-    tie: Refit,
-    fields: Fields | None,
-    noise: Noise,
-    names: Sequence[str],
-    n_effective: float,
-    say: Progress,
-) -> tuple[FittedModel, Refit | None, list[RefitRecord]]:
-    """Return the model with what was as good as the last effect in its place, and what comes next there, or None: the two together must be
-    better than the fitted model. What hides behind a wrong one of two that look alike shows beside the right one."""
-    say(f"trying {tie.candidate.effect.name} in the place of the last one, and what goes with it")
-    jets = tie.fitted.fit.jets
-    same = "clouds" not in data.measured
-    instead = fitted_again(data, tie.fitted, noise, known=jets if same else None, near=None if same else jets)
-    _, table = scored(data, instead, _fields(data, instead, fields, names), noise, names, n_effective)
-    both, _, tried = select_next(data, instead, table, noise, say)
-    if both is None or evidence(fitted.fit, both.fitted.fit) - both.candidate.cost <= data.thresholds.swap:
-        return instead, None, []
-    return instead, both, tried
-
-
-def _renamed(refits: list[RefitRecord], step: int, name: str) -> list[RefitRecord]:
-    """Return what became of candidates where another one is named at a step."""
-    return [
-        replace(r, verdict=NAMED if r.name == name else PASSES) if r.step == step and (r.passes or r.is_named) else r
-        for r in refits
-    ]
 
 
 def distinguishes_effects(data: Data) -> bool:

@@ -37,8 +37,6 @@ class SearchProgress:
     """Whether it goes on quadratic elements though linear ones are declared."""
     refits: list[RefitRecord]
     """What became of candidates that were refitted."""
-    ties: list[Refit] = field(default_factory=list)
-    """What was as good as the last effect."""
     noise: Noise | None = None
     n_effective: float = 0.0
     fields: Fields | None = None

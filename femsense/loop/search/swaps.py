@@ -1,8 +1,10 @@
-"""Ask of each effect, when another one was found, whether an alternative to it, or it itself elsewhere, is better now.
+"""What is named is asked again: of each effect, when another one was found, whether it is still needed, and whether another one, or it itself elsewhere,
+is better in its place; of the input offsets, at the end, what explains better what they took.
 
 What is named first is chosen while the others are still missing, and may have won by what it took of theirs: a tilted gravity instead
-of a payload as long as a scale of depth is missing, say, or a soft region in the wrong place as long as friction is. A step that
-swaps one is what selection and pruning alone lack.
+of a payload as long as a scale of depth is missing, say, or a soft region in the wrong place as long as friction is. The offsets are fitted along with
+everything, so that an effect competes with them only for what they leave: a camera whose distances are off, a load or a weight can look much like
+a wrong offset. So the model is fitted without, and effects are asked what they explain in that place.
 """
 
 from __future__ import annotations
@@ -14,16 +16,18 @@ import numpy as np
 
 from femsense.core.errors import FemsenseError
 from femsense.loop.data.dataset import NUISANCE, Data
+from femsense.loop.fit.cross_validation import sweeps_predicted
 from femsense.loop.fit.fitted_model import FittedModel, keeping
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.result.records import NAMED, PASSES, RefitRecord
 from femsense.loop.search.acceptance import acceptance_test, prior_cost
 from femsense.loop.search.effect_fields import fields_of
-from femsense.loop.search.forward_selection import polished, shortlist
-from femsense.loop.search.location_search import may_lie_elsewhere
-from femsense.loop.search.refit import evidence, refit
+from femsense.loop.search.forward_selection import leaders, shortlist
+from femsense.loop.search.input_offset import OFFSETS, evidence_for_offsets, offsets_are_evident
+from femsense.loop.search.location_search import closer, may_lie_elsewhere
+from femsense.loop.search.refit import FORGONE, beyond, evidence, refit
 from femsense.loop.search.screening import Candidate, screen_model
-from femsense.loop.search.search_state import Progress, Refit, at_step
+from femsense.loop.search.search_state import OffsetAlternative, Progress, Refit, at_step
 
 History = list[tuple[str, FittedModel]]
 
@@ -31,17 +35,21 @@ History = list[tuple[str, FittedModel]]
 def swapped(
     data: Data, history: History, refits: list[RefitRecord], noise: Noise, n_effective: float, say: Progress
 ) -> tuple[History, list[RefitRecord]]:
-    """Return the history with alternatives in the places of effects, but for the last one, that they beat in the whole model, and the
-    refits with what became of those that were asked."""
-    for name in [name for name, _ in history[1:-1]] if np.isfinite(data.thresholds.swap) else []:
+    """Return the history without effects, but for the last one, that are needless in the whole model, with alternatives in the places of those that
+    they beat there; and the refits with what became of those that were asked."""
+    for name in [name for name, _ in history[1:-1]]:
         fitted = history[-1][1]
+        less = _if_needless(data, fitted, name, noise, n_effective, say)
+        if less is not None:
+            history = [*history[:-1], (history[-1][0], less)]
+            continue
         alternatives = _alternatives(data, fitted, refits, name)
         if not alternatives or (alternatives == [name] and not may_lie_elsewhere(data, fitted, name, noise)):
             continue
         say(f"refitting {' or '.join(alternatives)} in the place of {name}")
         try:
             without = keeping(data, fitted, [n for n in fitted.fit.hypothesis.names if n != name], noise)
-            best, records = _best(data, fitted, without, name, alternatives, noise, n_effective, say)
+            best, records = _better(data, fitted, without, name, alternatives, noise, n_effective, say)
             if best is not None:
                 history = [*_without(data, history, without, name, noise), (best.candidate.effect.name, best.fitted)]
         except FemsenseError:
@@ -53,11 +61,34 @@ def swapped(
     return history, refits
 
 
+def _if_needless(
+    data: Data, fitted: FittedModel, name: str, noise: Noise, n_effective: float, say: Progress
+) -> FittedModel | None:
+    """Return a model without an effect that those added later have made needless (dBIC for keeping it not above 0), the place of the last one, which was
+    found beside it, moved on; else None."""
+    terms = fitted.fit.hypothesis.terms
+    count = sum(len(p) for effect, _, p in terms if effect.name == name)
+    if not count:
+        return None
+    say(f"asking whether {name} is still needed")
+    price = count * float(np.log(n_effective))
+    others = [n for n in fitted.fit.hypothesis.names if n != name]
+    try:
+        without = keeping(data, fitted, others, noise, worth=beyond(fitted.fit, FORGONE[1] * price + FORGONE[0]))
+    except FemsenseError:
+        return None
+    if evidence(without.fit, fitted.fit) > price:
+        return None
+    *_, (effect, seed, parameters) = without.fit.hypothesis.terms
+    places = effect.nearby(data.robot, seed) and len(parameters) == len(effect.parameters(data.robot, data.control))
+    return closer(data, without, noise)[0] if places else without
+
+
 def _alternatives(data: Data, fitted: FittedModel, refits: Sequence[RefitRecord], name: str) -> list[str]:
     """Return the effects that were nearly as good when one was named, the best first; the effect itself if its seed was chosen from many."""
     seeds = {effect.name: seed for effect, seed, parameters in fitted.fit.hypothesis.terms if parameters}
     named = [r for r in refits if r.name == name and r.is_named]
-    if name not in seeds or not named:
+    if name not in seeds or not named or np.isinf(data.thresholds.swap):
         return []
     own = named[-1]
     near = [
@@ -72,7 +103,7 @@ def _alternatives(data: Data, fitted: FittedModel, refits: Sequence[RefitRecord]
     return [name] * bool(seeds[name]) + others[: data.effort.alternatives]
 
 
-def _best(
+def _better(
     data: Data,
     fitted: FittedModel,
     without: FittedModel,
@@ -88,23 +119,26 @@ def _best(
     if own is None:
         return None, []
     worth = evidence(without.fit, fitted.fit) - own.cost - prior_cost(data.declared, own.effect, fitted.fit)
-    records = [RefitRecord(name, own.seed, PASSES, in_place_of=name, dbic=worth)]
-    best: Refit | None = None
     listed = [c for c in table if c.effect.name in alternatives]
-    for candidate in shortlist(listed, data.thresholds, data.effort, first=True):
+    asked = _asked(data, without, shortlist(listed, data.thresholds, data.effort, first=True), name, noise, say)
+    passing = [r for r in asked if r.record.passes]
+    records = [RefitRecord(name, own.seed, PASSES, in_place_of=name, dbic=worth), *(r.record for r in passing)]
+    best = max(passing, key=lambda r: r.score, default=None)
+    return (best if best is not None and best.score > worth + data.thresholds.swap else None), records
+
+
+def _asked(data: Data, without: FittedModel, listed: Sequence[Candidate], name: str, noise: Noise, say: Progress) -> list[Refit]:
+    """Return what becomes of candidates in the place of what a model is fitted without, those that lead with their seeds improved."""
+    asked = list[Refit]()
+    for candidate in listed:
         record = RefitRecord(candidate.effect.name, candidate.seed, in_place_of=name)
         try:
             made = refit(data, without, candidate, noise)
         except FemsenseError:
             continue
-        tried = acceptance_test(data, without, candidate, made, record, noise)
-        if not tried.record.passes:
-            continue
-        tried = polished(data, without, tried, noise, say)
-        records.append(tried.record)
-        if tried.score > (worth + data.thresholds.swap if best is None else best.score):
-            best = tried
-    return best, records
+        asked.append(acceptance_test(data, without, candidate, made, record, noise))
+    leading = leaders(data, without, dict(enumerate(asked)), noise, say)
+    return [leading.get(i, r) for i, r in enumerate(asked)]
 
 
 def _same(table: Sequence[Candidate], fitted: FittedModel, name: str) -> Candidate | None:
@@ -122,3 +156,35 @@ def _without(data: Data, history: History, without: FittedModel, name: str, nois
         known = [*NUISANCE, *left[: i + 1]]
         steps.append((other, without if i == len(left) - 1 else keeping(data, without, known, noise)))
     return steps
+
+
+def instead_of_offsets(
+    data: Data, fitted: FittedModel, names: Sequence[str], noise: Noise, n_effective: float, say: Progress
+) -> OffsetAlternative | None:
+    """Ask which effect explains what the input offsets of a model explain; None where they explain nothing.
+
+    Play of held cables does what offsets below those declared do. Of the two it is named where no offset is above: offsets err both ways.
+    """
+    without = offsets_are_evident(data, fitted, noise, n_effective)
+    if without is None or np.isinf(data.thresholds.swap):
+        return None
+    say("asking what else might be in the place of the input offsets")
+    worth = evidence_for_offsets(data, fitted, without, n_effective)
+    table = screen_model(data, without.fit, noise, fields_of(data, without, names), n_effective)
+    asked = _asked(data, without, shortlist(table, data.thresholds, data.effort, first=False), OFFSETS, noise, say)
+    best = max((r for r in asked if r.record.passes), key=lambda r: r.score, default=None)
+    if best is None:
+        return OffsetAlternative(None, "", -np.inf, [r.record for r in asked])
+    takes, ahead = _takes(data, best, fitted, without, worth)
+    records = [r.saying(NAMED).record if takes and r is best else r.record for r in asked]
+    return OffsetAlternative(best.fitted if takes else None, best.candidate.effect.name, ahead, records)
+
+
+def _takes(data: Data, best: Refit, fitted: FittedModel, without: FittedModel, worth: float) -> tuple[bool, float]:
+    """Return whether an effect takes the place of the input offsets, which are worth so much dBIC, and by how much it is ahead: where evidence is close,
+    what predicts left-out sweeps better; and what does the same with fewer numbers."""
+    assert best.record.cv_gain is not None
+    ahead, evident, least = best.score - worth, data.thresholds.evidence, data.thresholds.swap
+    predicts = best.record.cv_gain - sweeps_predicted(data.train, without.fit, fitted.fit)[0]
+    mirrors = best.candidate.effect.mirrors(OFFSETS) and best.fitted.fit.chi2 < fitted.fit.chi2 + evident
+    return ahead > least or (ahead > -evident and ahead + predicts > least) or mirrors, ahead

@@ -9,8 +9,8 @@ from arm import arm, record
 from femsense.loop.data.dataset import prepare
 from femsense.loop.fit.fitted_model import fit_model, with_nuisance
 from femsense.loop.fit.noise_components import Noise
-from femsense.loop.search.input_offset import instead_of_offsets
 from femsense.loop.search.search_state import OffsetAlternative
+from femsense.loop.search.swaps import instead_of_offsets
 from femsense.model.robot import Robot
 
 NOISE = Noise({"white": 3e-4}, "")

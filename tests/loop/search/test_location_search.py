@@ -22,7 +22,6 @@ from femsense.loop.search.acceptance import acceptance_test
 from femsense.loop.search.effect_fields import effect_fields, fields_of, part_that_tells
 from femsense.loop.search.forward_selection import has_settled, select_next
 from femsense.loop.search.location_search import climbed, closer, fitted_at, located, may_lie_elsewhere, same_place, without_term
-from femsense.loop.search.pruning import prune
 from femsense.loop.search.refit import evidence, refit, refit_from
 from femsense.loop.search.screening import Candidate, screen, screen_model
 from femsense.loop.search.search_state import Refit
@@ -115,7 +114,7 @@ def searched(
     table = screen_model(data, fitted.fit, NOISE, fields_of(data, fitted, names), COUNT)
     listed = [c for n in names for c in [c for c in table if c.effect.name == n][: each if n == "payload" else 1]]
     said = list[str]()
-    winner, _, records = select_next(data, fitted, [replace(c, score=100.0) if alike else c for c in listed], NOISE, said.append)
+    winner, records = select_next(data, fitted, [replace(c, score=100.0) if alike else c for c in listed], NOISE, said.append)
     assert winner is not None and winner.candidate.effect.name == "payload" and "refitting with payload" in said
     return [text for text in said if text.startswith("refitting")], records
 
@@ -150,7 +149,7 @@ def test_another_form_of_an_effect_is_held_against_other_effects_alone(started: 
     table = screen_model(data, fitted.fit, NOISE, fields_of(data, fitted, ["payload", "cable_gain"]), COUNT)
     one, gain = (next(c for c in table if c.effect.name == name) for name in ("payload", "cable_gain"))
     forms = [replace(one, score=100.0), replace(one, effect=replace(one.effect), score=100.0), replace(gain, score=50.0)]
-    _, _, records = select_next(data, fitted, forms, NOISE, lambda text: None)
+    _, records = select_next(data, fitted, forms, NOISE, lambda text: None)
     assert [r.name for r in records] == ["payload", "payload", "cable_gain"]
     assert "stopped early" not in records[1].verdict and records[2].verdict.startswith("stopped early")
 
@@ -275,12 +274,13 @@ def test_a_refit_with_nowhere_to_go_is_given_up_where_a_rival_explains_more(star
 @pytest.mark.parametrize("needless", [True, False])
 def test_a_place_moves_on_where_what_it_was_found_beside_is_dropped(started: tuple[Data, FittedModel], needless: bool):
     data, fitted = started
-    data = replace(data, thresholds=replace(DEFAULTS, needless=1e9 if needless else -1e9))
     gains = screen_model(data, fitted.fit, NOISE, fields_of(data, fitted, ["cable_gain"]), COUNT)
     beside = refit(data, fitted, gains[0], NOISE)
     far = max((c for c in payloads(data, beside)[:6] if off(c) > 0.012), key=off)
     both = refit(data, beside, far, NOISE)
-    left = prune(data, both, NOISE, COUNT, lambda text: None)
+    found = [("", fitted), ("cable_gain", beside), ("payload", both)]
+    dear = np.inf if needless else 1.0  # what each number of an effect costs
+    left = swapped(data, found, [], NOISE, dear, lambda text: None)[0][-1][1]
     if not needless:
         assert left is both
         return

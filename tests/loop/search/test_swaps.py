@@ -20,7 +20,7 @@ from femsense.loop.search.forward_selection import polished, richer_fit, select_
 from femsense.loop.search.location_search import closer, without_last
 from femsense.loop.search.refit import evidence, refit
 from femsense.loop.search.screening import linear_gain, screen_model
-from femsense.loop.search.search import beside_a_tie, scored, spared_gain
+from femsense.loop.search.search import scored, spared_gain
 from femsense.loop.search.search_state import Refit
 from femsense.loop.search.swaps import swapped
 from femsense.loop.thresholds import DEFAULTS, EFFORT
@@ -114,19 +114,6 @@ def test_effects_without_near_rivals_are_not_asked_again():
     assert history is before and len(refits) == 3
 
 
-def test_what_goes_with_an_effect_that_was_as_good_is_found_beside_it():
-    data, base = started()
-    wrong, _ = added(data, base, "gravity", 1)
-    table = screen_model(data, base.fit, NOISE, fields_of(data, base, ["cable_gain"]), COUNT)
-    candidate = (shortlist(table, DEFAULTS, EFFORT, first=True) or table)[0]
-    tie = Refit(candidate, refit(data, base, candidate, NOISE), 0.0, RECORD)
-    instead, both, tried = beside_a_tie(data, wrong, tie, None, NOISE, ["cable_gain", "payload"], COUNT, lambda text: None)
-    assert both is not None and both.candidate.effect.name == "payload" and tried[-1].is_named
-    assert instead.fit.hypothesis.names[-1] == "cable_gain"
-    assert both.fitted.fit.hypothesis.names[-2:] == ("cable_gain", "payload")
-    assert beside_a_tie(data, both.fitted, tie, None, NOISE, ["cable_gain", "payload"], COUNT, lambda text: None)[1] is None
-
-
 def test_what_fields_of_the_model_before_promise_is_what_its_own_do():
     data, base = started()
     names = ["cable_gain", "payload", "gravity"]
@@ -204,7 +191,7 @@ def test_a_place_is_improved_before_a_refit_is_turned_down_for_what_it_predicts(
     sure = [r.record.cv_gain / r.record.cv_std for r in (rough, there)]
     for wanted, found in ((0.5 * min(sure), True), (2.0 * max(sure), False)):
         own = replace(data, thresholds=replace(DEFAULTS, sweeps_for=wanted))
-        winner, _, records = select_next(own, base, [far], NOISE, lambda text: None)
+        winner, records = select_next(own, base, [far], NOISE, lambda text: None)
         assert (winner is not None) == found and records[0].is_named == found
 
 
