@@ -122,7 +122,7 @@ def _fitted(
     scene, fit, poses, initial, jet = _fitted_as_named(robot, recording, chosen, history)
     pairs = pairs_of(robot, scene, poses, jet.residual)
     check_reading(robot, pairs, strict=False)  # first: a mirrored body that is symmetric fits under other labels in single frames
-    better, changed = relabelled(robot, scene, pairs, root_mean_square(jet.residual) / 60.0)
+    better, changed = relabelled(robot, scene, pairs, root_mean_square(jet.residual) / 60.0, strict=strict)
     if changed:
         scene, fit, poses, initial, jet = _fitted_as_named(robot, better, chosen, history)
         pairs = pairs_of(robot, scene, poses, jet.residual)

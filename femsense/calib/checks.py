@@ -105,10 +105,11 @@ def check_reading(robot: Robot, pairs: Sequence[Pairs], *, strict: bool = True) 
             f"the markers do not fit the robot: {100 * plain / one.spread:.0f} % of their spread of {1e3 * one.spread:.3g} "
             f"mm is left"
         )
+        most_fit = float(np.median(np.linalg.norm(one.measured - one.modelled, axis=1))) < SUSPICIOUS * one.spread
         scale, _ = similarity(one.modelled, one.measured)
-        if max(scale, 1 / scale) > 1.5 and _rigid(one.modelled, one.measured, scale=scale) * EXPLAINED < plain:
+        if not most_fit and max(scale, 1 / scale) > 1.5 and _rigid(one.modelled, one.measured, scale=scale) * EXPLAINED < plain:
             raise DataError(f"{found}. They are {scale:.4g} times too large: {_unit(scale)}. The files hold metres")
-        if _rigid(one.modelled, one.measured, mirrored=True) * EXPLAINED < plain:
+        if not most_fit and _rigid(one.modelled, one.measured, mirrored=True) * EXPLAINED < plain:
             raise DataError(
                 f"{found}. Mirrored they fit: are the axes left-handed? Camera frames are right-handed (x right, y down, "
                 f"z forward): change the sign of one axis"
@@ -222,7 +223,9 @@ def true_labels(places: FloatArray, measured: FloatArray, marker: IntArray, *, n
     return best if after * EXPLAINED < before and before > 10.0 * noise else marker
 
 
-def relabelled(robot: Robot, scene: Scene, pairs: Sequence[Pairs], noise: float) -> tuple[Recording, bool]:
+def relabelled(
+    robot: Robot, scene: Scene, pairs: Sequence[Pairs], noise: float, *, strict: bool = True
+) -> tuple[Recording, bool]:
     """Return the recording with swapped labels put right and outliers left out in the scene's frames, each named in a warning.
 
     Arguments:
@@ -230,9 +233,13 @@ def relabelled(robot: Robot, scene: Scene, pairs: Sequence[Pairs], noise: float)
         scene: the markers that were fitted.
         pairs: their places, one item a camera, rows in the order of the scene's.
         noise: what the fit leaves along an axis [m].
+        strict: refuse labels that are swapped in most frames, but not in all.
 
     Returns:
         the recording, and whether anything changed.
+
+    Raises:
+        DataError: labels that seem swapped in most frames: which of them are right cannot be told.
     """
     marker, far = scene.marker.copy(), np.zeros(len(scene.marker), dtype=np.bool_)
     for view, one in enumerate(pairs):
@@ -242,7 +249,13 @@ def relabelled(robot: Robot, scene: Scene, pairs: Sequence[Pairs], noise: float)
             marker[rows[mine]] = true_labels(_all_places(robot, one, mine), one.measured[mine], one.marker[mine], noise=noise)
             far[rows[mine]] = _outliers(np.linalg.norm(one.measured[mine] - one.modelled[mine], axis=1), one.spread)
     renamed = marker != scene.marker
-    if len(np.unique(scene.frame[renamed])) > 0.5 * len(scene.frames):  # a swap in most frames is one of the whole recording
+    swapped = len(np.unique(scene.frame[renamed]))
+    if swapped > 0.5 * len(scene.frames):  # a swap in all frames is one of the whole recording
+        if strict and swapped < len(scene.frames):
+            names = " and ".join(robot.marker_names[m] for m in np.unique(scene.marker[renamed]))
+            raise DataError(
+                f"the labels of {names} seem swapped in {swapped} of {len(scene.frames)} frames. Make them the same in all frames of markers.csv"
+            )
         return scene.recording, False
     far &= ~renamed & ~_mostly(far, scene.marker)
     if not (far | renamed).any():

@@ -14,7 +14,7 @@ from femsense.fem.mesh import embed_points
 from femsense.model.recording import Recording, with_marker_table
 from femsense.model.recording_parts import RestMarkers
 from femsense.model.robot import Robot
-from femsense.model.stale_markers import without_stale_markers
+from femsense.model.stale_markers import without_far_markers, without_stale_markers
 
 SLOW = 5.0
 """Frames that are farther apart than this [s] are more likely counted in milliseconds: cameras take 5 to 90 a second."""
@@ -33,7 +33,9 @@ def check_against(robot: Robot, recording: Recording) -> Recording:
     Raises:
         InputError: other cables or chambers than the robot's, no marker in common, a known load far from the body.
     """
-    fitted = _without_strangers(robot, _with_chamber_order(robot, _with_cable_order(robot, without_stale_markers(recording))))
+    diagonal = float(np.linalg.norm(np.ptp(np.vstack([robot.body.mesh.nodes, robot.marker_points]), axis=0)))
+    measured = without_far_markers(without_stale_markers(recording), diagonal)
+    fitted = _without_strangers(robot, _with_chamber_order(robot, _with_cable_order(robot, measured)))
     _check_loads(robot, fitted)
     _check_displacements(robot, fitted)
     _warn_of_inputs(robot, fitted)

@@ -1,4 +1,4 @@
-"""Markers that a tracker lost and wrote where they were before: noise never repeats a place to the last digit."""
+"""Rows of markers that cannot be places: far from all others, or where they were before, since noise never repeats a place to the last digit."""
 
 from __future__ import annotations
 
@@ -12,8 +12,31 @@ from femsense.model.recording import Recording, with_marker_table
 
 CHANCE = 0.05
 """Rows that may repeat by chance in a recording whose copies are left out."""
+FAR = 2.0
+"""Silicone does not stretch so far that a marker is so many diagonals of the body from the others."""
 SHOWN = 6
 """Rows that a warning names."""
+
+
+def without_far_markers(recording: Recording, size: float) -> Recording:
+    """Return the recording without rows that lie more than FAR bodies from the median of their frame, and warn of them.
+
+    Where that are more than a fifth of the rows, they are something else (another unit), and all are kept.
+
+    Arguments:
+        recording: whose rows are checked; frames with fewer than four markers tell nothing.
+        size: diagonal of the body with its markers [m].
+    """
+    r = recording
+    far = np.zeros(len(r.marker_frame), dtype=np.bool_)
+    for k, v in np.unique(np.column_stack([r.marker_frame, r.marker_view]), axis=0):
+        rows = np.flatnonzero((r.marker_frame == k) & (r.marker_view == v))
+        if len(rows) >= 4:
+            far[rows] = np.linalg.norm(r.marker_xyz[rows] - np.median(r.marker_xyz[rows], axis=0), axis=1) > FAR * size
+    if not far.any() or far.mean() > 0.2:
+        return recording
+    _warn(r, far, f"more than {1e3 * FAR * size:.0f} mm from the others; outliers, left out")
+    return _kept(r, ~far)
 
 
 def without_stale_markers(recording: Recording) -> Recording:
@@ -36,17 +59,23 @@ def without_stale_markers(recording: Recording) -> Recording:
     if not copies.any() or not moving.any() or float(same[moving].mean()) ** 3 * int(follows.sum()) > CHANCE:
         return recording
     should_move = _shared(key[:, [0, 2]], moving) | _driven(r)[key[:, 0]]
+    repeats = copies & should_move & _shared(key[:, [1, 2]], moving)
+    for i in np.flatnonzero(copies & ~repeats):
+        repeats[i] = i > 0 and repeats[i - 1]  # the copy of a copy
     stale = np.zeros(len(keys), dtype=np.bool_)
-    stale[order[1:]] = copies & should_move & _shared(key[:, [1, 2]], moving)
+    stale[order[1:]] = repeats
     if not stale.any():
         return recording
-    rows = [f"{r.marker_names[m]} in frame {r.frame_numbers[f]}" for f, m, _ in keys[stale]]
+    _warn(r, stale, "to the last digit where it was in the frame before, as of a lost marker; left out")
+    return _kept(r, ~stale)
+
+
+def _warn(r: Recording, bad: BoolArray, what: str) -> None:
+    """Warn of rows that are left out."""
+    rows = [f"{r.marker_names[m]} in frame {r.frame_numbers[f]}" for f, m in zip(r.marker_frame[bad], r.marker_index[bad])]
     text = ", ".join(rows[:SHOWN]) + (f" and {len(rows) - SHOWN} more" if len(rows) > SHOWN else "")
     where = r.folder / "markers.csv" if r.folder else "markers"
-    warnings.warn(
-        f"{where}: to the last digit where it was in the frame before, as of a lost marker; left out: {text}", stacklevel=4
-    )
-    return _kept(r, ~stale)
+    warnings.warn(f"{where}: {what}: {text}", stacklevel=5)
 
 
 def _driven(r: Recording) -> BoolArray:

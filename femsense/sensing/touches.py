@@ -16,6 +16,9 @@ from femsense.sensing.types import Sensor, Touch
 PATCH = 0.525
 """Radius over which a point force is spread, in edges of elements. A linear element's shape functions are an edge wide themselves: a patch as wide
 as the edge would press on the faces beside the one that is touched."""
+DENT = 0.04
+"""Markers do not show over what area a force acts at a given place: it is spread over so much of the body's diagonal, so that a marker beside it
+does not feel a dent that is not there (the beam of the beam study: 1 mm at the marker on its upper edge)."""
 
 
 def make_touch(
@@ -39,7 +42,8 @@ def make_touch(
 def _patch(sensor: Sensor, place: FloatArray, normal: FloatArray | None) -> ContactPatch:
     body = sensor.robot.body
     edge = sensor.surface.edge * (2.0 if body.mesh.is_quadratic else 1.0)  # the surface halves those of quadratic elements
-    return patch_at(sensor.surface, body.mesh.nodes, place, PATCH * edge, body.clamped, facing=normal)
+    radius = PATCH * edge if sensor.recording.has_clouds else max(PATCH * edge, DENT * sensor.size)
+    return patch_at(sensor.surface, body.mesh.nodes, place, radius, body.clamped, facing=normal)
 
 
 def touch_normal(sensor: Sensor, touch: Touch, state: Equilibrium) -> FloatArray:

@@ -100,6 +100,22 @@ def test_an_outlier_is_named_and_left_out(robot: Robot) -> None:
     assert found.rms_m < 2e-4
 
 
+def test_a_coordinate_ten_times_too_large_is_an_outlier_and_no_unit(robot: Robot) -> None:
+    xyz = seen(robot)
+    clean = calibrate(robot, recorded(robot, xyz))
+    xyz[3, 2, 2] *= 10.0
+    with pytest.warns(UserWarning, match="from the others; outliers, left out: m2 in frame 3"):
+        found = calibrate(robot, recorded(robot, xyz))
+    np.testing.assert_allclose(found.T_robot_camera, clean.T_robot_camera, atol=2e-4)
+
+
+def test_labels_swapped_in_most_frames_are_refused(robot: Robot) -> None:
+    xyz = seen(robot)
+    xyz[:3] = xyz[:3][:, [3, 1, 2, 0, 4, 5]]
+    with pytest.raises(DataError, match=r"labels of m0 and m3 seem swapped in [23] of 5 frames|labels seem swapped: m0 and m3"):
+        calibrate(robot, recorded(robot, xyz))
+
+
 def test_a_marker_that_sits_elsewhere_in_all_frames_is_no_stray(robot: Robot, recwarn: pytest.WarningsRecorder) -> None:
     xyz = seen(robot)
     xyz[:, 2] += [0.02, -0.03, 0.01]

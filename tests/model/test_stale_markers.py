@@ -7,7 +7,7 @@ import pytest
 
 from femsense.model.recording import Recording, make_recording
 from femsense.model.recording_parts import Drives, MarkerRows, Timeline
-from femsense.model.stale_markers import without_stale_markers
+from femsense.model.stale_markers import without_far_markers, without_stale_markers
 
 F, M = 6, 4
 
@@ -41,6 +41,8 @@ def test_a_tracker_that_freezes_while_inputs_change() -> None:
         rows = left(xyz, np.arange(F))
     assert max(k for k, _ in rows) == 3
     assert len(left(xyz, np.array([0, 1, 2, 3, 3, 3]))) == F * M  # nothing should have moved
+    with pytest.warns(UserWarning, match="and 2 more"):
+        assert max(k for k, _ in left(xyz, np.array([0, 1, 2, 3, 4, 4]))) == 3  # the copy of a copy
 
 
 def test_coarse_digits_and_markers_that_never_move_are_kept() -> None:
@@ -50,3 +52,11 @@ def test_coarse_digits_and_markers_that_never_move_are_kept() -> None:
     still = noisy()
     still[:, 2] = still[0, 2]
     assert len(left(still, np.arange(F))) == F * M
+
+
+def test_one_row_far_from_the_others_is_left_out_but_not_another_unit() -> None:
+    xyz = noisy()
+    xyz[2, 3] = [0.0, 0.0, 90.0]
+    with pytest.warns(UserWarning, match="left out: d in frame 2"):
+        assert len(without_far_markers(recorded(xyz, np.zeros(F)), 10.0).marker_frame) == F * M - 1
+    assert len(without_far_markers(recorded(1e3 * xyz, np.zeros(F)), 10.0).marker_frame) == F * M
