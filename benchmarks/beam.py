@@ -513,6 +513,21 @@ def save(figure: Any, name: str) -> None:
     print(f"wrote docs/pictures/{name}.png", flush=True)
 
 
+def print_commands(folder: Path) -> None:
+    """Print what a user gets by commands alone: a modulus from the sag, then the weights untold."""
+    robot = load_robot(folder / "robot_gravity")
+    better = improve(robot, [load_recording(folder / "recordings" / "gravity_a")]).robot
+    print("| weight | said | force | status |\n|---|---|---|---|")
+    for name, weight in (("load52_a", 0.51012), ("load101_a", 1.00062)):
+        recording = load_recording(folder / "recordings" / name)
+        none = np.zeros((0, 3))
+        untold = replace(recording, load_frame=np.zeros(0, dtype=np.int64), load_points=none, load_forces=none)
+        run = estimate(better, untold, calibrate(better, untold), at=[[0.1, 0.0, 0.015]])
+        first = run.contacts[0]
+        size = f"{first.force_n:.3f} ± {first.std_n:.3f} N"
+        print(f"| {weight:.3f} N | {size} | {np.round(first.force_n_xyz, 3).tolist()} | {run.frames[0].status} |", flush=True)
+
+
 def main() -> None:
     """Print tables, pictures and loops."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -522,7 +537,11 @@ def main() -> None:
     only = parser.add_mutually_exclusive_group()
     only.add_argument("--tables", action="store_true", help="tables and pictures only")
     only.add_argument("--loops", action="store_true", help="loops only")
+    only.add_argument("--commands", action="store_true", help="what the commands say of the weights, on the declared mesh")
     given = parser.parse_args()
+    if given.commands:
+        print_commands(given.folder)
+        return
     import matplotlib
 
     matplotlib.use("Agg")

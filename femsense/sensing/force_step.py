@@ -92,9 +92,6 @@ class Linearisation:
         place = covariance[3 * m : 5 * m, 3 * m : 5 * m] * np.outer(place_std, place_std)
         places = np.array([e.T @ place[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] @ e for i, e in enumerate(self.frames)])
         scale = max(1.0, 1.483 * float(np.median(np.abs(self.residual / here.rows.std)))) ** 2
-        if not here.rows.of_clouds:
-            blocks = [scale * covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] for i in range(m)]
-            forces = np.array([without_undetermined(f, block) for f, block in zip(forces, blocks)]).reshape(m, 3)
         limit = sensor.surface.edge
         return ForceStep(
             forces,
@@ -144,23 +141,6 @@ class Linearisation:
             if settled:
                 break
         return forces, others, sizes
-
-
-def without_undetermined(force: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Return a force without what its least known directions may have by chance [N], shape (3,).
-
-    A size |f| is too large by about the variance across f: E|f|² = |f|² + tr Σ. In the principal directions of Σ each component is shrunk by
-    1 − (σ² − σ₀²) / f², at least to 0, with σ₀ the least standard deviation: the positive part of James and Stein (1961), with which the best known
-    direction stays as it is.
-
-    Arguments:
-        force: estimate [N], shape (3,).
-        covariance: of it [N²], shape (3, 3).
-    """
-    variance, axes = np.linalg.eigh(covariance)
-    along = axes.T @ force
-    kept = np.maximum(1.0 - (variance - variance[0]) / np.maximum(along**2, 1e-300), 0.0)
-    return np.asarray(axes @ (kept * along))
 
 
 def linearise(sensor: Sensor, here: Iterate) -> Linearisation:
