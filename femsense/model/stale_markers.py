@@ -1,4 +1,7 @@
-"""Rows of markers that cannot be places: far from all others, or where they were before, since noise never repeats a place to the last digit."""
+"""Rows of markers that cannot be places: far from all others, or where they were before.
+
+Noise never repeats a place to the last digit.
+"""
 
 from __future__ import annotations
 
