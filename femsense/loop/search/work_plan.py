@@ -61,14 +61,14 @@ class WorkPlan:
     def share(self) -> float:
         """Share of the work that is done; it never falls."""
         done, rest = self._done_and_rest()
-        self.furthest = max(self.furthest, done / (done + rest) if done else 0.0)
+        self.furthest = max(self.furthest, done / (done + rest) if done and self.rest else 0.0)
         return self.furthest
 
     @property
     def seconds_left(self) -> float:
-        """Seconds that the rest takes if it goes on as it did; inf at the beginning."""
+        """Seconds that the rest takes if it goes on as it did; inf as long as nothing is planned or done."""
         done, rest = self._done_and_rest()
-        return (self.clock() - self.begun) * rest / done if done else float("inf")
+        return (self.clock() - self.begun) * rest / done if done and self.rest else float("inf")
 
     def _done_and_rest(self) -> tuple[float, float]:
         own = self._own()

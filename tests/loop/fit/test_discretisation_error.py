@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from arm import arm, record, sweeps
 
+from femsense.core.work import counting
 from femsense.fem.equilibrium import solve_equilibrium
 from femsense.fem.mesh import to_linear
 from femsense.loop.data.dataset import Data, prepare
 from femsense.loop.fit.discretisation_error import (
+    as_shown,
     errs_alike,
     make_finer,
     mesh_errors,
     on_its_clamp,
     with_mesh_errors,
+    with_mesh_errors_of,
     without_mesh_error,
 )
 from femsense.loop.fit.fitted_model import FittedModel, fit_model, with_nuisance
@@ -145,3 +150,39 @@ def test_the_mesh_error_may_turn_a_little_in_all_sweeps_whatever_the_axes():
         turned = np.cross(axis, error)  # by a radian, √2 entries of one
         assert float((whiten(factor, DEFAULTS.mesh_turns * turned) ** 2).sum()) < 2.0 + 1e-6
         assert np.linalg.norm(without_mesh_error(trial, 0.1 * turned, noise)) < 0.05 * np.linalg.norm(0.1 * turned)
+
+
+def test_states_that_two_recordings_share_are_continued_on_the_finer_mesh_once():
+    robot = arm((4, 1, 1))
+    recording, _ = record(sweeps(each=1)[0], labels=sweeps(each=1)[1], truth=robot)
+    noise, data = Noise({"white": 1e-4}, ""), prepare(robot, [recording], [recording])
+    fitted = fit_model(data, Hypothesis(data.robot), Prior(np.zeros(0), np.zeros(0)), noise, np.zeros(0))
+    with counting() as work:
+        data = with_mesh_errors(data, fitted, [])
+    assert work.refined == len(np.unique(recording.inputs, axis=0))
+    np.testing.assert_allclose(data.train[0].mesh_error[:, :, 0], data.held[0].mesh_error[:, :, 0], atol=1e-9)
+
+
+def test_errors_of_some_states_serve_in_all_of_them():
+    noise, frames = Noise({"white": 1e-4}, ""), np.array([0, 1, 3, 5, 6, 7])
+    _, fitted, data = with_error_of_the_mesh(noise)
+    whole = mesh_errors(data)[0]
+    some = replace(data, train=[data.train[0].part(data.train[0].scene.frames[frames % len(data.train[0].scene.frames)])])
+    bare = replace(data, train=[replace(data.train[0], mesh_error=None, mesh_moves=None)])
+    with counting() as work:
+        handed_on = with_mesh_errors_of(bare, some, fitted)
+    assert work.refined == 0
+    np.testing.assert_allclose(mesh_errors(handed_on)[0], whole, atol=1e-9)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.02, 0.7])
+def test_the_error_of_the_mesh_counts_by_what_the_data_show_of_it_where_that_is_asked(share: float):
+    noise = Noise({"white": 1e-4}, "")
+    _, fitted, data = with_error_of_the_mesh(noise)
+    error = mesh_errors(data)[0]
+    jet = fitted.fit.jets[0]
+    shown = replace(fitted, fit=replace(fitted.fit, jets=[replace(jet, residual=share * error)]))
+    assert as_shown(data, shown) is data
+    scaled = as_shown(replace(data, mesh_as_shown=True), shown)
+    expected = share / DEFAULTS.mesh_share
+    np.testing.assert_allclose(scaled.train[0].mesh_error, expected * data.train[0].mesh_error, atol=2e-3 * np.abs(error).max())

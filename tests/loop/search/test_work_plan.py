@@ -34,18 +34,20 @@ def test_share_and_time_left_go_by_equilibria_done_and_planned() -> None:
     plan = WorkPlan(told.append, clock)
     with plan.watching():
         plan("reading")
+        count(equilibria=20)
+        assert plan.share == 0.0 and plan.seconds_left == float("inf")  # nothing is planned yet
         plan.plan([CALIBRATION, SEARCH], 10, quadratic=False)
         whole = 10 * (PASSES[CALIBRATION] + PASSES[SEARCH])
         clock.now = 8.0
-        count(equilibria=40)
-        assert plan.share == pytest.approx(40 / whole)
-        assert plan.seconds_left == pytest.approx(8.0 * (whole - 40) / 40)
+        count(equilibria=20)
+        assert plan.share == pytest.approx(40 / (20 + whole))
+        assert plan.seconds_left == pytest.approx(8.0 * (whole - 20) / 40)
         plan.next_stage()  # it took less than was expected
         assert plan.share == pytest.approx(40 / (40 + 10 * PASSES[SEARCH]))
         count(responses=20)
         assert plan.share == pytest.approx((40 + 20 * COSTS["responses"]) / (40 + 10 * PASSES[SEARCH]))
     assert told[0] == "reading"
-    assert told[1].startswith(f"reading ({40 / whole:.0%}, about ") and told[1].endswith(" s left)")
+    assert told[1].startswith(f"reading ({40 / (20 + whole):.0%}, about ") and told[1].endswith(" s left)")
 
 
 def test_more_work_than_was_expected_never_takes_the_share_back_nor_ends_it() -> None:
