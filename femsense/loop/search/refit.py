@@ -14,6 +14,7 @@ from femsense.loop.fit.fitted_model import FittedModel, fit_model, own_of
 from femsense.loop.fit.joint_fit import JointFit, Prior
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.search.screening import Candidate, jets_with
+from femsense.model.drive import has_history
 from femsense.model.effects import Effect, Entry, Parameter
 from femsense.model.effects.base import known_length
 from femsense.model.observation import Hypothesis
@@ -68,6 +69,8 @@ def refit(
     free = not candidate.effect.discrete and not directed  # for these the null is no start
     answer = 0.0 if candidate.effect.discrete else candidate.response @ (start - null)  # of what is fitted already
     worth = worth_of(fitted.fit, candidate, data.thresholds.evidence if wanted is None else wanted, settled)
+    if adds_history(fitted.fit, candidate, start):
+        worth = np.inf
 
     def started_at(share: float) -> FittedModel | None:
         part = 1.0 if share == DECLARED else share
@@ -99,6 +102,13 @@ def refit(
         if made is not None and (made.fit.fit.status == STOPPED_EARLY or made.fit.chi2 <= fitted.fit.chi2 + 1.0):
             return made
     raise DataError("no start from which the fit improves")
+
+
+def adds_history(fit: JointFit, candidate: Candidate, values: FloatArray) -> bool:
+    """Return whether a candidate with such values, shape (q,), makes states depend on those before, as none of the fit does. What it explains is then told by no
+    derivative at its null, where every segment of a cable slides: on `arm-1` of `benchmarks/distinct_states.py` friction has a predicted gain of 48 and brings 945."""
+    fitted, term = fit.hypothesis.robot_at(fit.coordinates), (candidate.effect, candidate.seed, candidate.parameters)
+    return has_history(Hypothesis(fitted, (term,)).robot_at(values)) and not has_history(fitted)
 
 
 def refit_from(data: Data, fitted: FittedModel, begin: JointFit, noise: Noise, worth: float = np.inf) -> FittedModel | None:

@@ -8,12 +8,19 @@ import numpy as np
 import pytest
 from arm import arm, record
 
+from femsense.core.least_squares import STOPPED_EARLY
 from femsense.core.work import Work, counting
 from femsense.fem.mesh import to_linear
 from femsense.loop.data.dataset import prepare
+from femsense.loop.fit.noise_components import Noise
 from femsense.loop.improve import improve
 from femsense.loop.result.loop_result import LoopResult
+from femsense.loop.search.calibration import calibrated_on, calibrated_pose, fitted_again
+from femsense.loop.search.effect_fields import fields_of
 from femsense.loop.search.element_order import linear_suffice
+from femsense.loop.search.refit import adds_history, refit
+from femsense.loop.search.screening import screen_model
+from femsense.model.effects import apply_effects
 from femsense.model.recording import Recording
 from femsense.model.remeshing import robot_on_mesh
 from femsense.model.robot import Robot
@@ -79,3 +86,21 @@ def test_the_robot_that_is_handed_back_stays_on_the_declared_mesh() -> None:
     assert "linear ones" in row.refits[0].verdict
     gain = next(e for e in loop.entries if e["name"] == "cable_gain")["scale"]["up"]
     assert gain == pytest.approx(0.8, abs=0.02)
+
+
+def test_friction_is_fitted_to_the_end_however_little_its_null_predicts() -> None:
+    """At its null every segment of a cable slides, whatever the frame before."""
+    declared = linear(arm((4, 2, 2)))
+    inputs = np.random.default_rng(4).uniform(0.0, 3.0, (FRAMES, 4))
+    truth = apply_effects(declared, [{"name": "cable_friction", "coefficient": 0.4}])
+    data = prepare(declared, [record(inputs, truth=truth)[0]], [recorded(declared, 2)])
+    noise = Noise({"white": 1e-4}, "")
+    base = calibrated_on(data, data.robot, calibrated_pose(data, data.robot, noise))
+    base = fitted_again(data, base, noise)
+    table = screen_model(data, base.fit, noise, fields_of(data, base, ["cable_friction", "cable_gain"]), 100.0)
+    one, other = (next(c for c in table if c.effect.name == name) for name in ("cable_friction", "cable_gain"))
+    assert adds_history(base.fit, one, np.full(len(one.parameters), 0.4)) and not adds_history(base.fit, other, np.array([0.8]))
+    simple = min((c for c in table if c.effect.name == "cable_friction"), key=lambda c: len(c.parameters))
+    made = refit(data, base, simple, noise, wanted=1e9)
+    assert made.fit.fit.status != STOPPED_EARLY
+    assert made.fit.coordinates[-1] == pytest.approx(0.4, abs=0.05)
