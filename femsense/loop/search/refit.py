@@ -105,8 +105,11 @@ def refit(
 
 
 def adds_history(fit: JointFit, candidate: Candidate, values: FloatArray) -> bool:
-    """Return whether a candidate with such values, shape (q,), makes states depend on those before, as none of the fit does. What it explains is then told by no
-    derivative at its null, where every segment of a cable slides: on `arm-1` of `benchmarks/distinct_states.py` friction has a predicted gain of 48 and brings 945."""
+    """Return whether a candidate with such values, shape (q,), makes states depend on those before, as none of the fit does.
+
+    What it explains is then told by no derivative at its null, where every segment of a cable slides: on `arm-1` of
+    `benchmarks/distinct_states.py` friction has a predicted gain of 48 in χ² and brings 945.
+    """
     fitted, term = fit.hypothesis.robot_at(fit.coordinates), (candidate.effect, candidate.seed, candidate.parameters)
     return has_history(Hypothesis(fitted, (term,)).robot_at(values)) and not has_history(fitted)
 
