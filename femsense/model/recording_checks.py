@@ -94,7 +94,9 @@ def _drive_order(robot: Robot, recording: Recording, kind: str, wanted: tuple[st
             where=_place(recording, "frames.csv"),
             found=", ".join(f"{kind}_{name}" for name in given) or f"no {kind} columns",
             expected=", ".join(f"{kind}_{name}" for name in wanted) or f"no {kind} columns",
-            hint=did_you_mean(extra[0], wanted) if extra else f"{idle} has a column of zeros",
+            hint=did_you_mean(extra[0], wanted)
+            if extra
+            else f"{idle} has a column of zeros; inputs that another program logged: femsense import --actuation LOG.csv",
         )
     return [given.index(name) for name in wanted]
 

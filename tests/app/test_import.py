@@ -200,3 +200,13 @@ def test_links_are_followed_and_devices_refused(table: Path, tmp_path: Path, cap
         assert run(["import", str(table), "-o", str(place), *words]) == 2
         assert "stands" in capsys.readouterr().err
     assert stat.S_ISFIFO((tmp_path / "pipe").stat().st_mode) and table.read_text() == ROWS
+
+
+def test_what_a_log_holds_is_asked_before_the_frames_are_read(
+    table: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "log.csv").write_text("time,cable_east\n100,0\n101,1\n")
+    words = ["import", str(table), "-o", str(tmp_path / "out"), "--unit", "mm", "--actuation", str(tmp_path / "log.csv")]
+    assert run(words) == 2
+    assert "--inputs tension" in capsys.readouterr().err and not list(tmp_path.glob(".part*"))
+    assert run([*words, "--inputs", "tension", "--offset", "-100"]) == 0

@@ -60,6 +60,8 @@ def write_recording(
     Raises:
         InputError: no frames, none of the pictures readable, columns whose meaning nobody said.
     """
+    if log is not None:
+        _actuation(source, list(log.columns), actuation or log.actuation)  # asked before the frames are read
     final = followed(folder)
     part = final.with_name(f"{PART_PREFIX}import-{final.name}")
     _prepare(part, identity)
