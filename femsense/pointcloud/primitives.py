@@ -14,6 +14,9 @@ from scipy.spatial import cKDTree
 
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.pointcloud.objects import euclidean_clusters
+from femsense.pointcloud.rays import Surface
+
+Fit = Callable[[FloatArray, FloatArray, FloatArray], "Shape"]
 
 FITS = 4.0
 """Median of squared whitened residuals, relative to noise alone, up to which a shape is believed."""
@@ -29,6 +32,8 @@ MOST_POINTS = 400
 """More points than this are thinned out: the shape of an object is known well enough."""
 FEWEST = 12
 """Fewer points make no shape."""
+FLAT = 0.01
+"""A surface that falls off by less than this share of the way is flat."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -36,9 +41,9 @@ class Shape:
     """A completed object."""
 
     kind: str
-    """"sphere", "cylinder", "plate" or "points"."""
+    """"sphere", "cylinder", "plate", "known" or "points"."""
     center: FloatArray
-    """Of the sphere; a point of the axis; middle of the plate [m], shape (3,)."""
+    """Of the sphere; a point of the axis; middle of the plate or of the box about the known one [m], shape (3,)."""
     axes: FloatArray
     """Rows: axis of the cylinder first; sides of the plate, then its normal, shape (3, 3)."""
     half: FloatArray
@@ -50,12 +55,31 @@ class Shape:
     points: FloatArray
     """What was seen of it [m], shape (k, 3)."""
     tree: cKDTree | None = field(default=None, repr=False)
+    behind_m: float = 0.0
+    """How far behind what was seen of it its surface may lie: the thickness of a plate whose other side touches [m]."""
+    surface: Surface | None = field(default=None, repr=False)
+    """Of a known one, where it stands."""
+
+    def towards(self, body: FloatArray) -> Shape:
+        """Return the shape with the side that faces a body; places of its surface [m], shape (k, 3). Only a plate has two sides.
+
+        A camera sees the back of a plate that is pressed on a body from the camera's side. It is no thicker than it is wide.
+        """
+        if self.kind != "plate":
+            return self
+        local = (body - self.center) @ self.axes.T
+        aside = np.linalg.norm(np.maximum(np.abs(local[:, :2]) - self.half[:2], 0.0), axis=1)
+        if local[aside <= aside.min() + self.half[:2].max(), 2].mean() >= 0.0:
+            return self
+        return replace(self, axes=self.axes * np.array([[1.0], [1.0], [-1.0]]), behind_m=2.0 * float(self.half[:2].min()))
 
     def distance(self, places: FloatArray) -> FloatArray:
         """Return the signed distance of places (k, 3) from its surface [m], > 0 outside, shape (k,)."""
         if self.kind == "points":
             assert self.tree is not None
             return np.asarray(self.tree.query(places)[0])
+        if self.surface is not None:
+            return self.surface.closest(places)[1]
         local = (places - self.center) @ self.axes.T
         if self.kind == "sphere":
             return np.asarray(np.linalg.norm(local, axis=1) - self.radius)
@@ -63,19 +87,34 @@ class Shape:
             across = np.linalg.norm(local[:, 1:], axis=1) - self.radius
             beyond = np.abs(local[:, 0]) - self.half[0]
             return np.asarray(np.where(beyond > 0, np.hypot(np.maximum(across, 0.0), np.maximum(beyond, 0.0)), across))
-        beyond = np.maximum(np.abs(local[:, :2]) - self.half[:2], 0.0)
-        return np.asarray(np.sign(local[:, 2]) * np.sqrt((beyond**2).sum(axis=1) + local[:, 2] ** 2))
+        beyond = np.linalg.norm(np.maximum(np.abs(local[:, :2]) - self.half[:2], 0.0), axis=1)
+        return np.asarray(np.where(beyond > 0.0, np.hypot(beyond, np.maximum(local[:, 2], 0.0)), local[:, 2]))
+
+    def radius_at(self, place: FloatArray, reach: float) -> float:
+        """Return the mean radius of curvature of the surface closest to a place (3,), over so much of it [m].
+
+        inf: flat or not known.
+        """
+        if self.surface is None:
+            return self.radius if self.radius > 0 else np.inf
+        foot, _, triangle, _ = self.surface.closest(place[None])
+        a, b, c = self.surface.positions[self.surface.triangles[triangle[0]]]
+        plane = np.linalg.svd(np.cross(b - a, c - a)[None])[2][1:]
+        angle = np.arange(8) * np.pi / 4
+        around = foot + reach * np.column_stack([np.cos(angle), np.sin(angle)]) @ plane
+        drop = float(self.surface.closest(around)[1].mean())
+        return (reach**2 - drop**2) / (2.0 * drop) if drop > FLAT * reach else np.inf
 
     def holds(self, points: FloatArray, std: FloatArray) -> bool:
         """Return whether points (k, 3) lie on its surface, or on that of a rod that is longer than what was seen of it."""
         if self.kind != "cylinder":
-            return self.kind == "sphere" and bool((np.abs(self.distance(points)) < 3.0 * std).mean() > 0.8)
+            return self.kind in ("sphere", "known") and bool((np.abs(self.distance(points)) < 3.0 * std).mean() > 0.8)
         longer = replace(self, half=np.array([np.inf, self.radius, self.radius]))
         return bool((np.abs(longer.distance(points)) < 3.0 * std + self.std_m).mean() > 0.8)
 
 
 def find_shapes(
-    points: FloatArray, std: FloatArray, origins: FloatArray, near: FloatArray, *, local_m: float, radius_m: float | None = None
+    points: FloatArray, std: FloatArray, origins: FloatArray, near: FloatArray, *, local_m: float, fit: Fit | None = None
 ) -> list[Shape]:
     """Return the objects among points as shapes, each fitted to what lies near a surface.
 
@@ -85,8 +124,9 @@ def find_shapes(
         origins: where its ray begins [m], shape (o, 3).
         near: distance of each from the surface that may be touched [m], shape (o,).
         local_m: how much of an object counts: points up to so far beyond its nearest one [m].
-        radius_m: known radius of the objects, if they are known balls.
+        fit: what makes a shape of points, their noise and their origins; `fit_shape` if not given.
     """
+    fit = fit or fit_shape
     result: list[Shape] = []
     left = _groups(points, std)
     while left:
@@ -95,12 +135,12 @@ def find_shapes(
         close = group[own <= own.min() + local_m]
         if len(close) < 3:
             continue
-        shape = fit_shape(points[close], std[close], origins[close], radius_m=radius_m)
+        shape = fit(points[close], std[close], origins[close])
         more = [g for g in left if shape.holds(points[g], std[g])]  # the other end of a rod that passes behind
         if more:
             left = [g for g in left if not any(g is m for m in more)]
             close = np.concatenate([close, *more])
-            shape = fit_shape(points[close], std[close], origins[close], radius_m=radius_m)
+            shape = fit(points[close], std[close], origins[close])
         result.append(shape)
     return result
 
@@ -108,7 +148,7 @@ def find_shapes(
 def fit_shape(points: FloatArray, std: FloatArray, origins: FloatArray, *, radius_m: float | None = None) -> Shape:
     """Return the simplest shape that explains points with their noise; "points" where none does.
 
-    Arguments as for `find_shapes`.
+    Arguments as for `find_shapes`; `radius_m` of a ball that is known.
     """
     ray = points - origins
     ray = ray / np.linalg.norm(ray, axis=1, keepdims=True)
@@ -128,6 +168,18 @@ def fit_shape(points: FloatArray, std: FloatArray, origins: FloatArray, *, radiu
     return min(fitting, key=lambda shape: order.index(shape.kind))
 
 
+def fit_ball(points: FloatArray, std: FloatArray, origins: FloatArray, radius_m: float) -> tuple[float, Shape | None]:
+    """Return the robust mean square of whitened residuals of a ball of known radius (1: noise alone), and the ball.
+
+    None where it does not fit.
+    """
+    ray = points - origins
+    ray = ray / np.linalg.norm(ray, axis=1, keepdims=True)
+    thin = slice(None, None, max(1, len(points) // MOST_POINTS))
+    cost, shape = _sphere(points[thin], std[thin], ray[thin], radius_m)
+    return cost, shape if cost < FITS else None
+
+
 # --- fits -------------------------------------------------------------------------------------------------------------
 
 
@@ -141,7 +193,7 @@ def _groups(points: FloatArray, std: FloatArray) -> list[IntArray]:
     return [np.flatnonzero(label == i) for i in range(int(label.max(initial=-1)) + 1)]
 
 
-def _score(residual: FloatArray) -> float:
+def typical_square(residual: FloatArray) -> float:
     """Return the robust mean square of whitened residuals: 1 for noise alone."""
     return float((1.483 * np.median(np.abs(residual))) ** 2)
 
@@ -159,12 +211,12 @@ def _sphere(points: FloatArray, std: FloatArray, ray: FloatArray, radius: float 
         return (length - size) / scale, J / scale[:, None]
 
     starts = [np.append(middle + 0.7 * r * look, np.log(r)) for r in ([radius] if radius is not None else (0.004, 0.01, 0.025))]
-    x, curve, residual = min((_least(evaluate, s[:3] if radius is not None else s) for s in starts), key=_typical)
+    x, curve, residual = min((least_squares(evaluate, s[:3] if radius is not None else s) for s in starts), key=_typical)
     size = radius if radius is not None else float(np.exp(x[3]))
     seen_from_outside = float(np.mean(np.einsum("pc,pc->p", points - x[:3], ray) < 0))
     if size > LARGEST or seen_from_outside < 0.7:
         return np.inf, None
-    return _score(residual), Shape("sphere", x[:3], np.eye(3), np.full(3, size), size, _spread(curve, 3), points)
+    return typical_square(residual), Shape("sphere", x[:3], np.eye(3), np.full(3, size), size, _spread(curve, 3), points)
 
 
 def _cylinder(points: FloatArray, std: FloatArray, ray: FloatArray) -> tuple[float, Shape | None]:
@@ -195,7 +247,7 @@ def _cylinder(points: FloatArray, std: FloatArray, ray: FloatArray) -> tuple[flo
     for frame in (main, main[[1, 2, 0]]):
         for r in (0.003, 0.01):
             start = np.array([0.7 * r * look @ frame[1], 0.7 * r * look @ frame[2], np.log(r), 0.0, 0.0])
-            tried.append((*_least(evaluator(frame), start), frame))
+            tried.append((*least_squares(evaluator(frame), start), frame))
     x, curve, residual, frame = min(tried, key=lambda t: _typical(t[:3]))
     axis, _, away = parts(x, frame)
     size = float(np.exp(x[2]))
@@ -206,17 +258,17 @@ def _cylinder(points: FloatArray, std: FloatArray, ray: FloatArray) -> tuple[flo
     axes = np.vstack([axis, np.linalg.svd(axis[None])[2][1:]])
     half = np.array([0.5 * (high - low), size, size])
     shape = Shape("cylinder", center + 0.5 * (low + high) * axis, axes, half, size, _spread(curve, 2), points)
-    return _score(residual), shape
+    return typical_square(residual), shape
 
 
-def _least(
-    evaluate: Callable[[FloatArray], tuple[FloatArray, FloatArray]], x: FloatArray
+def least_squares(
+    evaluate: Callable[[FloatArray], tuple[FloatArray, FloatArray]], x: FloatArray, *, steps: int | None = None
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return parameters, curvature and whitened residual of a robust fit (Huber, Levenberg's damping)."""
     damping = 1e-3
     residual, J = evaluate(x)
     cost = _huber(residual)
-    for _ in range(FIT_STEPS):
+    for _ in range(steps or FIT_STEPS):
         weight = np.minimum(1.0, 2.0 / np.maximum(np.abs(residual), 1e-12))
         curve = J.T @ (weight[:, None] * J)
         step = -np.linalg.solve(curve + damping * np.diag(np.diag(curve) + 1e-12), J.T @ (weight * residual))
@@ -255,7 +307,7 @@ def _plate(points: FloatArray, std: FloatArray, ray: FloatArray) -> tuple[float,
     center = middle + 0.5 * (low + high) @ axes[:2]
     half = np.append(0.5 * (high - low), 0.0)
     spread = float(np.median(std) / np.sqrt(keep.sum()))
-    return _score(residual), Shape("plate", center, np.vstack([axes[:2], normal]), half, np.inf, spread, points)
+    return typical_square(residual), Shape("plate", center, np.vstack([axes[:2], normal]), half, np.inf, spread, points)
 
 
 def _spread(curve: FloatArray, count: int) -> float:

@@ -151,7 +151,7 @@ def _moved(sensor: Sensor, here: Iterate, linear: Linearisation, step: ForceStep
     for touch, frame, way in zip(here.touches, linear.frames, step.shift):
         if way.any():
             at, radius = touch.place + way @ frame, touch.object_radius_m
-            moved = make_touch(sensor, at, source=touch.source, std_m=touch.std_m, radius=radius)
+            moved = make_touch(sensor, at, source=touch.source, std_m=touch.std_m, radius=radius, spread=touch.spread_m)
             touch = replace(moved, expected=touch.expected)
         touches.append(touch)
     forces = within_cones(sensor, tuple(touches), here.forces + (step.forces - here.forces), here.state)

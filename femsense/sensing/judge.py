@@ -11,6 +11,8 @@ from femsense.sensing.nuisance import FAR_OFF, misfit, sag_at
 from femsense.sensing.types import Fit, SensedFrame, Sensor
 
 OK = "ok"
+SURE = 16.3
+"""χ² with three degrees of freedom that noise alone gives once in 1000: a force below it is none."""
 UNSETTLED = 0.5
 """Forces that were still changing are not believed where more than this share of the residual is left, unless that is noise."""
 
@@ -37,10 +39,24 @@ def status_of(sensor: Sensor, fit: Fit, free: Fit) -> str:
     if left > limit_of(sensor, fit):
         what = "with the contacts found" if fit.touches else "and no contact explains it"
         return f"not explained: {1e3 * fit.rows.rms:.2f} mm are left, {np.sqrt(left / limit_of(sensor, fit)):.1f} times what free frames leave, {what}"
-    unsure = [i for i, f in enumerate(fit.forces) if np.linalg.norm(f) < _std_along(fit, i)]
+    unsure = [i for i, f in enumerate(fit.forces) if np.linalg.norm(f) < _std_along(fit, i) and not unspoken(fit, i)]
     if unsure and fit.touches[unsure[0]].source != "given":
         return "a contact whose force is less than its standard deviation"
     return OK
+
+
+def chi_squared(fit: Fit) -> FloatArray:
+    """Return how far each force of a fit is from none, squared, in standard deviations, shape (m,); 0 where none is known."""
+    blocks = [fit.covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] for i in range(len(fit.touches))]
+    return np.array([float(f @ np.linalg.pinv(block) @ f) for f, block in zip(fit.forces, blocks)])
+
+
+def unspoken(fit: Fit, i: int) -> bool:
+    """Return whether contact i is in the fit and not reported: an object touches there whose force may be none, beside a sure one."""
+    if fit.touches[i].source != "cloud":
+        return False
+    value = chi_squared(fit)
+    return bool(value[i] < SURE <= value.max())
 
 
 def left_over(sensor: Sensor, fit: Fit) -> float:

@@ -30,7 +30,8 @@ FAR_OFF = 9.0
 DRIVE_STD = 0.05
 """What is not known beforehand of the pull of a cable or the pressure of a chamber, relative: motor gain, and how far its ends sink into the mesh."""
 APART = 2.0
-"""The pose of the calibration knew neither modulus nor pulls: its standard deviations count so much larger where the free frames tell all of them."""
+"""The pose of the calibration knew neither modulus nor pulls: its standard deviations count so much larger where free
+frames tell them together."""
 LIKELY_GAIN = 13.5
 """Log-evidence gain that noise alone gives once in 1000 frames: χ² with three degrees at some 50 places that differ."""
 
@@ -79,7 +80,7 @@ def sag_at(sensor: Sensor, state: Equilibrium, tangent: Tangent) -> FloatArray:
     body, n = sensor.robot.body, len(state.positions)
     load = internal(body, state.positions, tangent=False).forces
     pulls = np.array([*state.tension.values(), *state.pressure.values()])
-    if len(sensor.knowledge.common_mean) == 6 * len(sensor.calibration.poses) + 1:  # no drives, or markers alone
+    if not pulls_of(sensor):
         return np.asarray(tangent.respond(load[None]))
     shares = [t / T if T > 0 else np.ones_like(t) for t, T in zip(state.segment_tensions, state.tension.values())]
     rows = pulls[:, None, None] * drive_rows(body, state.positions, shares).reshape(len(pulls), n, 3)
@@ -89,6 +90,11 @@ def sag_at(sensor: Sensor, state: Equilibrium, tangent: Tangent) -> FloatArray:
         by_length = tangent.respond_to_held()
         moves[1 + held] = (pulls[held] * np.diag(tangent.held_compliance))[:, None, None] * by_length
     return np.asarray(moves)
+
+
+def pulls_of(sensor: Sensor) -> int:
+    """Return how many pulls of cables and chambers the free frames were asked for."""
+    return len(sensor.knowledge.common_mean) - 6 * len(sensor.calibration.poses) - 1
 
 
 def nuisance_columns(knowledge: Knowledge, rows: Rows, sag: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -142,7 +148,7 @@ def learn(knowledge: Knowledge, frames: list[tuple[Rows, FloatArray]]) -> Knowle
     if not frames:
         return knowledge
     v = knowledge.common_root.shape[0] - len(frames[0][1])  # pose steps
-    wider = np.append(np.full(v, APART if len(frames[0][1]) > 1 else 1.0), np.ones(len(frames[0][1])))
+    wider = np.append(np.full(v, APART), np.ones(len(frames[0][1])))
     first = replace(knowledge, common_root=freeze(wider[:, None] * knowledge.common_root))
     for _ in range(2):  # the second time with what the first left
         frames = [(replace(rows, together=knowledge.together if rows.of_clouds else 1.0), sag) for rows, sag in frames]

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import partial
+
 import numpy as np
 import numpy.typing as npt
 
@@ -10,8 +13,10 @@ from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.fem.equilibrium import Equilibrium
 from femsense.model.contact_patch import BodySurface, closest_surface_point
+from femsense.model.recording_parts import Tool
 from femsense.model.robot import Robot
-from femsense.pointcloud.primitives import Shape, find_shapes
+from femsense.pointcloud.known_shapes import KnownShape, cylinder_shape, register
+from femsense.pointcloud.primitives import FEWEST, Shape, find_shapes, fit_ball, fit_shape
 from femsense.pointcloud.rays import Surface
 from femsense.sensing.touches import make_touch
 from femsense.sensing.types import Fit, Sensor, Touch
@@ -26,6 +31,8 @@ TILT = 1.5e-4
 """Gaps along a contact that differ by less than this are alike: a rod along a face touches anywhere on its length [m]."""
 ZONE = 0.15
 """Largest extent of a contact about its nearest point, relative to the body's diagonal."""
+CONE = float(np.sqrt(10.0 / 3.0))
+"""Radius of a cone of pressure over its root mean square radius."""
 FLOOR_STD = 0.0007
 """The surface between nodes is flat in the model: no place is known better [m]."""
 
@@ -57,9 +64,41 @@ def seen_objects(sensor: Sensor, k: int, scan: Scan | None, state: Equilibrium) 
     origins = np.array([T[:3, 3] for T in poses])[scan.others_view]
     depth = np.linalg.norm(points - origins, axis=1)
     std = np.array([float(sensor.knowledge.noises[v].std(d)) for v, d in zip(scan.others_view[near], depth[near])])
-    balls = [tool.radius for tool in sensor.recording.tools if tool.kind == "ball"]
-    only = balls[0] if len(balls) == len(sensor.recording.tools) == 1 else None
-    return find_shapes(points[near], std, origins[near], gap[near], local_m=LOCAL * sensor.size, radius_m=only)
+    tools = sensor.recording.tools
+    whole = any(tool.kind != "ball" for tool in tools)  # the more of a known object is seen, the better its pose
+    return find_shapes(
+        points[near],
+        std,
+        origins[near],
+        gap[near],
+        local_m=np.inf if whole else LOCAL * sensor.size,
+        fit=partial(fit_tool, tools) if tools else fit_shape,
+    )
+
+
+def fit_tool(tools: Sequence[Tool], points: FloatArray, std: FloatArray, origins: FloatArray) -> Shape:
+    """Return the known object that explains points with their noise, at its pose; where none does, what fits best of all shapes.
+
+    Arguments:
+        tools: what is known to touch, not empty.
+        points: of one object [m], shape (k, 3).
+        std: noise of each along its ray [m], shape (k,).
+        origins: where its ray begins [m], shape (k, 3).
+    """
+    if len(tools) == 1 and tools[0].kind == "ball":
+        return fit_shape(points, std, origins, radius_m=tools[0].radius)
+    if len(points) < FEWEST:
+        return fit_shape(points, std, origins)
+    tried = [_fit_of(tool, points, std, origins) for tool in tools]
+    good = [(cost, shape) for cost, shape in tried if shape is not None]
+    return min(good, key=lambda fit: fit[0])[1] if good else fit_shape(points, std, origins)
+
+
+def _fit_of(tool: Tool, points: FloatArray, std: FloatArray, origins: FloatArray) -> tuple[float, Shape | None]:
+    if tool.kind == "ball":
+        return fit_ball(points, std, origins, tool.radius)
+    known = cylinder_shape(tool.radius, tool.length) if tool.kind == "cylinder" else KnownShape(tool.points, tool.triangles)
+    return register(known, points, std, origins)
 
 
 def object_touches(sensor: Sensor, shapes: list[Shape], state: Equilibrium) -> list[Touch]:
@@ -69,8 +108,9 @@ def object_touches(sensor: Sensor, shapes: list[Shape], state: Equilibrium) -> l
 
 
 def _touch(sensor: Sensor, shape: Shape, state: Equilibrium) -> Touch | None:
-    triangles = sensor.surface.triangles
-    corner = shape.distance(state.positions[sensor.surface.nodes])
+    triangles, corners = sensor.surface.triangles, state.positions[sensor.surface.nodes]
+    shape = shape.towards(corners)
+    corner = shape.distance(corners)
     if corner.min() > NEAR * sensor.size:
         return None
     by_node = np.full(len(state.positions), np.inf)
@@ -80,7 +120,7 @@ def _touch(sensor: Sensor, shape: Shape, state: Equilibrium) -> Touch | None:
     places = np.einsum("wi,tic->twc", weights, state.positions[closest]).reshape(-1, 3)
     distance = shape.distance(places)
     std = float(np.hypot(shape.std_m, FLOOR_STD))
-    if distance.min() > SLACK * std + (0.0 if shape.kind != "points" else 2.0 * shape.std_m):
+    if distance.min() > SLACK * std + shape.behind_m + (0.0 if shape.kind != "points" else 2.0 * shape.std_m):
         return None
     rest = np.einsum("wi,tic->twc", weights, sensor.robot.body.mesh.nodes[closest]).reshape(-1, 3)
     best = int(np.argmin(distance))
@@ -95,12 +135,14 @@ def _touch(sensor: Sensor, shape: Shape, state: Equilibrium) -> Touch | None:
     radius = float(np.sqrt(weight @ ((rest - middle) ** 2).sum(axis=1) / weight.sum()))
     if _on_clamp(sensor, middle):
         return None
+    curvature = shape.radius_at(places[best], 0.5 * sensor.surface.edge)
     return make_touch(
         sensor,
         middle,
         source="cloud",
         std_m=float(np.hypot(std, radius)),
-        radius=shape.radius if shape.radius > 0 else np.inf,
+        radius=curvature,
+        spread=CONE * radius if shape.kind in ("plate", "known") and np.isinf(curvature) else 0.0,
     )
 
 

@@ -81,7 +81,7 @@ def make_sensor(
         Answers(),
     )
     learned = learn(knowledge, _free_rows(sensor))
-    if not pulls_are_modelled:
+    if not recording.has_clouds:
         return replace(sensor, knowledge=learned)
     sensor = _better_posed(sensor, learned)
     return replace(sensor, knowledge=learn(sensor.knowledge, _free_rows(sensor)))
@@ -94,7 +94,7 @@ def _better_posed(sensor: Sensor, learned: Knowledge) -> Sensor:
         return sensor
     poses = tuple(freeze(T) for T in moved_poses(sensor.calibration.poses, -learned.common_mean[:v], sensor.pivot))
     robot = replace(sensor.robot, body=sensor.robot.body.with_stiffness_scale(1.0 / (1.0 + learned.common_mean[v])))
-    expected = np.zeros_like(learned.common_mean)  # what was known beforehand, as it looks from there
+    expected = sensor.knowledge.common_mean.copy()  # what was known beforehand, as it looks from there
     expected[:v], expected[v] = -learned.common_mean[:v], 1.0 / (1.0 + learned.common_mean[v]) - 1.0
     return replace(
         sensor,
@@ -141,8 +141,8 @@ def _driven(robot: Robot, recording: Recording, calibration: Calibration, places
 
 
 def _marked(sensor: Sensor, k: int, state: Equilibrium) -> list[Rows]:
-    """Return the rows of the markers of a frame, if it has some and pulls are to be told beside the pose."""
-    if sensor.recording.actuation != "displacement" or not (sensor.recording.marker_frame == k).any():
+    """Return the rows of the markers of a frame, if it has some."""
+    if not (sensor.recording.marker_frame == k).any():
         return []
     try:
         return [rows_at(sensor, k, None, state)]

@@ -15,7 +15,7 @@ from femsense.fem.mesh import vertex_normals
 from femsense.pointcloud.primitives import Shape
 from femsense.pointcloud.rays import Surface
 from femsense.sensing.forces import fit_forces, no_forces
-from femsense.sensing.judge import left_over
+from femsense.sensing.judge import SURE, chi_squared, left_over, unspoken
 from femsense.sensing.nuisance import nuisance_columns, robust_std, sag_at
 from femsense.sensing.places import object_touches, said_free
 from femsense.sensing.touches import make_touch
@@ -29,8 +29,6 @@ ACROSS = 0.3
 """Size of forces along the surface that is expected of a contact whose place is searched, relative to those along the normal."""
 MOST = 4
 """Contacts a frame at most."""
-SURE = 16.3
-"""χ² with three degrees of freedom that noise alone gives once in 1000: a force below it is none."""
 ROUNDS = 2
 """How often a place is looked for again with the state that its force makes."""
 NEARBY = 0.03
@@ -209,14 +207,16 @@ def _same(sensor: Sensor, found: Sequence[Touch], touches: Sequence[Touch]) -> b
 
 
 def _significant(sensor: Sensor, k: int, scan: Scan, fit: Fit, free: Fit, before: tuple[FloatArray, ...] | None) -> Fit:
-    """Return the fit without contacts whose force may be noise, or that pull."""
+    """Return the fit without contacts whose force may be noise, or that pull.
+
+    An object that touches beside another one stays in the fit: what it may carry is part of how well the other is known.
+    """
     while fit.touches:
-        value = [
-            float(f @ np.linalg.solve(fit.covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3], f)) for i, f in enumerate(fit.forces)
-        ]
-        weakest = int(np.argmin(value))
-        if value[weakest] >= SURE:
+        value = chi_squared(fit)
+        weak = [i for i, v in enumerate(value) if v < SURE and not unspoken(fit, i)]
+        if not weak:
             return fit
+        weakest = min(weak, key=lambda i: value[i])
         kept = [t for i, t in enumerate(fit.touches) if i != weakest]
         if not kept:
             return free

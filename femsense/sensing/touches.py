@@ -29,21 +29,22 @@ def make_touch(
     std_m: float = 0.0,
     normal: FloatArray | None = None,
     radius: float = np.inf,
+    spread: float = 0.0,
 ) -> Touch:
     """Return a touch at the point of the surface at rest that is closest to a place at rest [m], shape (3,)."""
     nodes = sensor.robot.body.mesh.nodes
     at = closest_surface_point(sensor.surface, nodes, place, facing=normal)
-    patch = _patch(sensor, at, normal)
+    patch = _patch(sensor, at, normal, spread)
     outward = patch.mean(vertex_normals(nodes, sensor.surface.triangles))
     outward = outward / max(float(np.linalg.norm(outward)), 1e-12) if normal is None else normal
-    return Touch(at, outward, patch, at, std_m, source, radius)
+    return Touch(at, outward, patch, at, std_m, source, radius, spread)
 
 
-def _patch(sensor: Sensor, place: FloatArray, normal: FloatArray | None) -> ContactPatch:
+def _patch(sensor: Sensor, place: FloatArray, normal: FloatArray | None, spread: float) -> ContactPatch:
     body = sensor.robot.body
     edge = sensor.surface.edge * (2.0 if body.mesh.is_quadratic else 1.0)  # the surface halves those of quadratic elements
     radius = PATCH * edge if sensor.recording.has_clouds else max(PATCH * edge, DENT * sensor.size)
-    return patch_at(sensor.surface, body.mesh.nodes, place, radius, body.clamped, facing=normal)
+    return patch_at(sensor.surface, body.mesh.nodes, place, max(radius, spread), body.clamped, facing=normal)
 
 
 def touch_normal(sensor: Sensor, touch: Touch, state: Equilibrium) -> FloatArray:
@@ -67,7 +68,7 @@ def nodal_forces_by_shift(sensor: Sensor, touch: Touch, tangent: FloatArray, for
     n, step = len(sensor.robot.body.mesh.nodes), 0.5 * sensor.surface.edge
     if touch.std_m == 0 or not force.any():
         return np.zeros((n, 3))
-    ahead, behind = (_patch(sensor, touch.place + s * step * tangent, touch.normal) for s in (1.0, -1.0))
+    ahead, behind = (_patch(sensor, touch.place + s * step * tangent, touch.normal, touch.spread_m) for s in (1.0, -1.0))
     return np.asarray((ahead.spread(force, n) - behind.spread(force, n)) / (2.0 * step))
 
 

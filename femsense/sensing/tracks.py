@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from femsense.core.arrays import FloatArray, freeze
-from femsense.sensing.nuisance import response_std
+from femsense.sensing.judge import unspoken
+from femsense.sensing.nuisance import pulls_of, response_std
 from femsense.sensing.touches import touch_normal
 from femsense.sensing.types import ContactForce, Fit, SensedFrame, Sensor
 
@@ -20,11 +21,10 @@ def contacts_of(sensor: Sensor, k: int, fit: Fit, previous: SensedFrame | None) 
     """Return the contacts of a fit; those that begin a track have track −1."""
     number, stamp = int(sensor.recording.frame_numbers[k]), float(sensor.recording.time_s[k])
     contacts: list[ContactForce] = []
-    pulls = len(sensor.knowledge.common_mean) - 6 * len(sensor.calibration.poses) - 1  # those that the free frames were asked for
-    share = response_std(sensor.knowledge, pulls) if fit.rows.of_clouds else 0.0
+    share = response_std(sensor.knowledge, pulls_of(sensor)) if fit.rows.of_clouds else 0.0
     for i, (touch, force) in enumerate(zip(fit.touches, fit.forces)):
         size, normal = float(np.linalg.norm(force)), touch_normal(sensor, touch, fit.state)
-        if size == 0.0 and touch.source != "given":
+        if (size == 0.0 and touch.source != "given") or unspoken(fit, i):
             continue
         along = force / size if size > 0 else -normal
         own = fit.covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] + share**2 * np.outer(force, force)

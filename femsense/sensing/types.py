@@ -179,6 +179,8 @@ class Touch:
     """"cloud", "shape" or "given"."""
     object_radius_m: float = np.inf
     """Radius of curvature of what touches [m]; inf: flat or not known."""
+    spread_m: float = 0.0
+    """Radius of the zone where it touches, if that is wider than what the mesh can tell from a point [m]."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

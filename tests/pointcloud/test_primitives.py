@@ -68,3 +68,17 @@ def test_a_rod_that_passes_behind_something_is_one_object():
     shapes = find_shapes(points[apart], std[apart], origins[apart], np.abs(points[apart, 0]), local_m=0.05)
     assert len(shapes) == 1
     assert shapes[0].kind == "cylinder"
+
+
+def test_a_plate_that_is_pressed_from_the_side_of_the_camera_touches_with_its_back():
+    rng = np.random.default_rng(8)
+    points = np.column_stack([rng.uniform(-0.02, 0.02, (400, 2)), np.zeros(400)])
+    shape = fit_shape(*seen(points, np.tile([0.0, 0, 1], (400, 1)), rng))
+    below = np.column_stack([rng.uniform(-0.03, 0.03, (200, 2)), rng.uniform(-0.03, -0.004, 200)])
+    back, front = shape.towards(below), shape.towards(-below)
+    places = np.array([[0.0, 0, -0.01], [0.0, 0, -0.02], [0.1, 0, -0.01]])
+    np.testing.assert_allclose(back.distance(places[:2]), [0.01, 0.02], atol=1e-3)
+    assert back.distance(places)[2] > 0.07
+    assert back.behind_m == 2 * shape.half[:2].min()
+    assert front is shape and front.behind_m == 0.0
+    assert front.distance(places)[2] > 0.07  # beside it nothing is pressed

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import numpy as np
 import pytest
 from helpers import block_mesh
 
-from femsense.sensing.judge import least_stretch
+from femsense.fem.equilibrium import Equilibrium
+from femsense.model.contact_patch import ContactPatch
+from femsense.sensing.judge import chi_squared, least_stretch, unspoken
+from femsense.sensing.types import Fit, Rows, Touch
 
 MESH = block_mesh((2, 1, 1))
 
@@ -16,3 +21,20 @@ def test_the_stretch_under_a_contact():
     assert least_stretch(MESH, MESH.nodes * [1.0, 1.1, 0.5], carrying) == pytest.approx(0.5)
     assert least_stretch(MESH, MESH.nodes * [1.0, 1.0, -0.5], carrying) == pytest.approx(-0.5)
     assert least_stretch(MESH, MESH.nodes * [1.0, 1.0, 0.5], np.zeros(0, dtype=np.int64)) == 1.0
+
+
+def fit_of(forces: list[list[float]], sources: list[str]) -> Fit:
+    """Return a fit whose forces are known to 0.01 N along each axis."""
+    up, patch = np.array([0.0, 0.0, 1.0]), ContactPatch(np.array([0]), np.array([1.0]))
+    touches = tuple(Touch(np.zeros(3), up, patch, np.zeros(3), 1e-3, source) for source in sources)
+    none = cast(Equilibrium, None)
+    covariance = 1e-4 * np.eye(3 * len(forces))
+    return Fit(touches, none, np.array(forces), covariance, np.zeros((len(forces), 3, 3)), cast(Rows, none), 1.0)
+
+
+def test_an_object_that_touches_beside_a_sure_force_stays_in_the_fit_unspoken():
+    fit = fit_of([[0.0, 0.0, -0.2], [0.0, 0.0, -0.02]], ["cloud", "cloud"])
+    np.testing.assert_allclose(chi_squared(fit), [400.0, 4.0])
+    assert [unspoken(fit, i) for i in range(2)] == [False, True]
+    assert not unspoken(fit_of([[0.0, 0.0, -0.02], [0.0, 0.0, -0.01]], ["cloud", "cloud"]), 1)  # none is sure
+    assert not unspoken(fit_of([[0.0, 0.0, -0.2], [0.0, 0.0, -0.02]], ["cloud", "shape"]), 1)  # no object is seen there
