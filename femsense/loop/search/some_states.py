@@ -23,7 +23,8 @@ from femsense.loop.fit.noise_components import Noise
 from femsense.loop.result.records import NAMED, RefitRecord
 from femsense.loop.search.acceptance import acceptance_test
 from femsense.loop.search.calibration import START, calibrated_pose, fitted_again
-from femsense.loop.search.screening import Candidate
+from femsense.loop.search.effect_fields import fields_of
+from femsense.loop.search.screening import Candidate, screen_model
 from femsense.loop.search.search_state import Progress, Search, SearchProgress, no_equilibrium
 from femsense.model.drive import has_history
 
@@ -83,8 +84,10 @@ def in_all_states(every: Data, course: SearchProgress, search: Search, say: Prog
         refits, over = _added(data, history, name, model, search, noise, refits, say)
         if over:
             break
-    last = history[-1][1]
-    if len(history) > given:
+    last, first = history[-1][1], list[Candidate]()
+    n_effective = float(sum(t.groups.observations for t in data.train))
+    if len(history) > given:  # else it is screened anew
+        first = screen_model(data, base.fit, noise, fields_of(data, base, course.names), n_effective)
         data = with_turning_placements(data, last)
     return SearchProgress(
         data,
@@ -98,9 +101,9 @@ def in_all_states(every: Data, course: SearchProgress, search: Search, say: Prog
         course.quadratic,
         refits,
         noise=noise,
-        n_effective=search.n_effective,
-        first=search.first,
-        table=search.last,
+        n_effective=n_effective,
+        first=first,
+        table=first,
     )
 
 

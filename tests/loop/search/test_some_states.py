@@ -55,6 +55,9 @@ def test_what_is_found_in_some_states_is_fitted_and_judged_in_all() -> None:
     assert [name for name, _ in search.history[course.given :]] == ["cable_gain"]
     whole = in_all_states(every, course, search, lambda text: None)
     assert whole.found == 1 and len(whole.fitted.fit.jets[0].residual) == len(every.train[0].scene.frame)
+    assert {len(c.columns) for c in whole.first} == {
+        len(whole.base.fit.fit.residual)
+    }  # what calibration absorbs is told by all states
     named = [next(r for r in refits if r.is_named) for refits in (search.refits, whole.refits)]
     assert named[1].dchi2 > 1.2 * named[0].dchi2
     gain = whole.fitted.fit.hypothesis.entries(whole.fitted.fit.coordinates)[-1]["scale"]
