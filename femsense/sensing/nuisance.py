@@ -31,7 +31,7 @@ DRIVE_STD = 0.05
 """What is not known beforehand of the pull of a cable or the pressure of a chamber, relative: motor gain, and how far its ends sink into the mesh."""
 APART = 2.0
 """The pose of the calibration knew neither modulus nor pulls: its standard deviations count so much larger where free
-frames tell them together."""
+frames tell all of them."""
 LIKELY_GAIN = 13.5
 """Log-evidence gain that noise alone gives once in 1000 frames: χ² with three degrees at some 50 places that differ."""
 
@@ -148,7 +148,7 @@ def learn(knowledge: Knowledge, frames: list[tuple[Rows, FloatArray]]) -> Knowle
     if not frames:
         return knowledge
     v = knowledge.common_root.shape[0] - len(frames[0][1])  # pose steps
-    wider = np.append(np.full(v, APART), np.ones(len(frames[0][1])))
+    wider = np.append(np.full(v, APART if len(frames[0][1]) > 1 else 1.0), np.ones(len(frames[0][1])))
     first = replace(knowledge, common_root=freeze(wider[:, None] * knowledge.common_root))
     for _ in range(2):  # the second time with what the first left
         frames = [(replace(rows, together=knowledge.together if rows.of_clouds else 1.0), sag) for rows, sag in frames]

@@ -81,7 +81,7 @@ def make_sensor(
         Answers(),
     )
     learned = learn(knowledge, _free_rows(sensor))
-    if not recording.has_clouds:
+    if not pulls_are_modelled:
         return replace(sensor, knowledge=learned)
     sensor = _better_posed(sensor, learned)
     return replace(sensor, knowledge=learn(sensor.knowledge, _free_rows(sensor)))
@@ -141,8 +141,8 @@ def _driven(robot: Robot, recording: Recording, calibration: Calibration, places
 
 
 def _marked(sensor: Sensor, k: int, state: Equilibrium) -> list[Rows]:
-    """Return the rows of the markers of a frame, if it has some."""
-    if not (sensor.recording.marker_frame == k).any():
+    """Return the rows of the markers of a frame, if it has some and pulls are to be told beside the pose."""
+    if sensor.recording.actuation != "displacement" or not (sensor.recording.marker_frame == k).any():
         return []
     try:
         return [rows_at(sensor, k, None, state)]
