@@ -297,6 +297,11 @@ def _warn_of_units(table: RobotTable, path: Path) -> None:
             ),
             stacklevel=4,
         )
+    if table.gravity and abs(np.linalg.norm(table.gravity.vector_m_s2) - 1.0) < 0.02:
+        warnings.warn(
+            f"{at_key(path, 'gravity', 'vector_m_s2')}: {table.gravity.vector_m_s2} is 1 long; is it in g? On earth it is 9.81 m/s²",
+            stacklevel=4,
+        )
 
 
 def _metres(point: FloatArray | Sequence[float]) -> str:
