@@ -221,17 +221,6 @@ def read_table(path: Path) -> int:
     return len(np.loadtxt(path, delimiter=",", skiprows=1))
 
 
-def read_sdk_bag(path: Path) -> int:
-    """Read with Open3D's reader of RealSense files."""
-    import open3d as o3d
-
-    reader = o3d.t.io.RGBDVideoReader.create(str(path))
-    done = 0
-    while not reader.is_eof():
-        done += len(np.asarray(reader.next_frame().depth)) > 0
-    return done
-
-
 def read_av(path: Path) -> int:
     import av
 
@@ -258,7 +247,7 @@ FORMATS: dict[str, tuple[str, Callable[..., Path], Callable[[Path], int] | None,
     "mcap": ("rosbags", write_bag("mcap"), read_rosbags, {}),
     "mcap clouds": ("rosbags", write_bag("mcap", clouds=True), read_rosbags, {}),
     "mcap compressedDepth": ("rosbags", write_bag("mcap", packed=True), read_rosbags, {}),
-    "realsense bag": ("SDK 2.57", write_sdk("bag"), read_sdk_bag, {}),
+    "realsense bag": ("SDK 2.57", write_sdk("bag"), None, {}),
     "realsense db3": ("SDK 2.58+", write_sdk("db3"), None, {}),
     "kinect mkv": ("PyAV", write_mkv, read_av, {}),
     "tum": ("cv2", write_tum, read_open3d, {}),
