@@ -35,9 +35,8 @@ STEPS = 6
 ASKED = 12
 """States of a recording in which both kinds of elements are calibrated."""
 PLAINLY = 0.5
-"""Linear elements suffice where they leave less than this share of the mean square that quadratic ones leave, both calibrated.
-`benchmarks/distinct_states.py --elements`:
-0.09 and 0.11 where the truth has the declared elements, 1.1 and more where its mesh is another one."""
+"""Linear elements suffice where they leave less than this share of the mean square that quadratic ones leave, both calibrated: a tenth in the arms of
+`benchmarks/distinct_states.py --elements`, which were computed on the declared elements."""
 
 
 def seeks_with_quadratic(robot: Robot, names: Sequence[str]) -> bool:
