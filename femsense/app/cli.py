@@ -139,7 +139,7 @@ def _explained(error: Exception) -> tuple[str, int]:
         context = getattr(error, "ctx", None)
         command = context.command_path if context is not None else "femsense"
         message = " ".join(error.format_message().split()).rstrip(".")
-        return f"{message}. See: {command} --help", 2
+        return f"{message}{'' if message.endswith('?') else '.'} See: {command} --help", 2
     if isinstance(error, ImportError) and not (error.name or "").startswith("femsense"):
         return (
             f"a part of the installation does not load: {' '.join(str(error).split())}. femsense doctor says what is missing",

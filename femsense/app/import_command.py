@@ -124,7 +124,8 @@ def import_text(folder: str | Path, document: Mapping[str, Any]) -> str:
 
     notes = document.get("notes", [])
     shown = {key: value for key, value in document.items() if key not in ("notes",)}
-    lines = [f"{folder}: a recording of {document['frames']} frames", "", *section_text(shown)]
+    count = document["frames"]
+    lines = [f"{folder}: a recording of {count} {'frame' if count == 1 else 'frames'}", "", *section_text(shown)]
     lines += ["", *(f"note: {note}" for note in notes)] if notes else []
     return "\n".join(lines)
 

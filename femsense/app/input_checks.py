@@ -78,6 +78,14 @@ def warn_of_clouds(robot: Robot, recording: Recording) -> None:
         warnings.warn(f"{where}: {text}, and contacts found by clouds are doubtful", stacklevel=3)
 
 
+def warn_of_markers(robot: Robot, recording: Recording) -> None:
+    """Warn of markers of the robot that are seen in no frame."""
+    seen = {recording.marker_names[i] for i in recording.marker_index if i >= 0} - {""}
+    unseen = [name for name in robot.marker_names if name not in seen]
+    if seen and unseen:
+        warnings.warn(f"markers of the robot that are seen in no frame: {', '.join(unseen)}", stacklevel=3)
+
+
 def _marker_distance(recording: Recording, k: int, view: int) -> float | None:
     mine = (recording.marker_frame == k) & (recording.marker_view == view)
     return float(np.median(np.linalg.norm(recording.marker_xyz[mine], axis=1))) if mine.any() else None

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.io.files import write_json
+from femsense.model.robot import Robot
 
 FORMAT = "femsense-motion-1"
 FREE = ("", "*")
 """A coordinate that is written so is left free."""
+FAR = 10.0
+"""A target that is so many diagonals of the body away from it is in another unit."""
 
 
 def reach_targets(
@@ -37,6 +41,7 @@ def reach_targets(
 
     body = load_robot(robot)
     wanted = dict(_target(text) for text in targets)
+    _check_size(body, wanted)
     known = None if calibration is None else read_calibration(calibration)
     motion = reach(body, wanted, control=control, forces=[_force(text) for text in forces], calibration=known)
     unit = {name: "N" if control == "tension" else "m" for name in body.body.cable_names}
@@ -70,6 +75,21 @@ def reach_targets(
 
 def _amount(value: float, unit: str) -> str:
     return f"{1e3 * value:+.3f} mm" if unit == "m" else f"{value:.4g} {unit}"
+
+
+def _check_size(robot: Robot, wanted: Mapping[Any, FloatArray]) -> None:
+    """Raise InputError where a target is so far away that it is in another unit."""
+    low, high = robot.body.mesh.nodes.min(axis=0), robot.body.mesh.nodes.max(axis=0)
+    far = FAR * float(np.linalg.norm(high - low))
+    for name, place in wanted.items():
+        if np.nanmax(np.maximum(low - place, place - high), initial=-np.inf) > far:
+            raise InputError(
+                f"the target of {name} is farther than {FAR:.0f} times the body's size from it",
+                where="--target",
+                found=", ".join("free" if np.isnan(x) else f"{x:g}" for x in place),
+                expected=f"metres, robot frame; the body reaches from {np.round(low, 4).tolist()} to {np.round(high, 4).tolist()}",
+                hint="this looks like millimetres: divide by 1000",
+            )
 
 
 def _target(text: str) -> tuple[str | tuple[float, float, float], np.ndarray]:

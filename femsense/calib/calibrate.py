@@ -297,7 +297,7 @@ def _pose_std(T: FloatArray, covariance: FloatArray, pivot: FloatArray) -> Float
 
 def _status(fit: FitResult, own: dict[str, float | None], recording: Recording) -> str:
     if fit.status != "converged":
-        return "not settled after the last iteration: look at the history of the residual"
+        return "not settled after the last iteration: are cables or markers exchanged, or inputs in another unit? `history` has the residual"
     if recording.actuation_zero == "absolute":
         return "converged"
     weak = weak_inputs(recording, own)

@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from femsense.core.arrays import FloatArray, IntArray
+from femsense.core.errors import DataError
 from femsense.fem.compliance import tangent_at
 from femsense.fem.mesh import TetMesh
+from femsense.sensing.measurement_rows import rows_at
 from femsense.sensing.nuisance import FAR_OFF, misfit, sag_at
 from femsense.sensing.types import Fit, SensedFrame, Sensor
 
@@ -15,6 +17,10 @@ SURE = 16.3
 """χ² with three degrees of freedom that noise alone gives once in 1000: a force below it is none."""
 UNSETTLED = 0.5
 """Forces that were still changing are not believed where more than this share of the residual is left, unless that is noise."""
+
+BESIDE, NEAR = 5.0, 0.01
+"""Markers that are off by more than so many times the residual of the calibration, and this share of the body's diagonal, are not on the body.
+On a soft beam whose touch was lost they were off by 9 to 60 times; in frames with the right forces by at most 1.7 times."""
 
 SQUEEZED = 0.6
 """Elements under a contact that are shorter than this share of their length are beyond the corotational law, and mostly beyond their mesh:
@@ -38,11 +44,30 @@ def status_of(sensor: Sensor, fit: Fit, free: Fit) -> str:
     left = left_over(sensor, fit)
     if left > limit_of(sensor, fit):
         what = "with the contacts found" if fit.touches else "and no contact explains it"
-        return f"not explained: {1e3 * fit.rows.rms:.2f} mm are left, {np.sqrt(left / limit_of(sensor, fit)):.1f} times what free frames leave, {what}"
+        times = f"{np.sqrt(left / limit_of(sensor, fit)):.1f} times what free frames leave"
+        size = times if limit_of(sensor, fit) != FAR_OFF else f"{np.sqrt(left):.1f} standard deviations"
+        return f"not explained: {1e3 * fit.rows.rms:.2f} mm are left, {size}, {what}"
     unsure = [i for i, f in enumerate(fit.forces) if np.linalg.norm(f) < _std_along(fit, i) and not unspoken(fit, i)]
     if unsure and fit.touches[unsure[0]].source != "given":
         return "a contact whose force is less than its standard deviation"
     return OK
+
+
+def beside_markers(sensor: Sensor, k: int, fit: Fit) -> str:
+    """Return "ok", or in words how far the markers of frame k lie off what its cloud was taken for.
+
+    Where the body is not where the model has it, what the cloud shows of it is taken for something else, and what is left fits well.
+    """
+    try:
+        off = rows_at(sensor, k, None, fit.state).rms
+    except DataError:
+        return OK
+    if off <= max(BESIDE * sensor.calibration.rms_m, NEAR * sensor.size):
+        return OK
+    color = (
+        "" if sensor.robot.color_rgb is not None else "; without appearance.color_rgb parts of it are taken for something else"
+    )
+    return f"the markers lie {1e3 * off:.1f} mm off the body that was found in the cloud{color}"
 
 
 def chi_squared(fit: Fit) -> FloatArray:

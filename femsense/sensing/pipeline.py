@@ -25,7 +25,7 @@ from femsense.model.drive import has_history
 from femsense.model.recording import Recording
 from femsense.model.robot import Robot
 from femsense.sensing.forces import no_forces
-from femsense.sensing.judge import status_of, trusted
+from femsense.sensing.judge import OK, beside_markers, status_of, trusted
 from femsense.sensing.paper import sense_as_published
 from femsense.sensing.places import find_touches, near_places, seen_objects
 from femsense.sensing.prepare import make_sensor, scan_of
@@ -130,10 +130,11 @@ def sense_frame(sensor: Sensor, k: int, previous: SensedFrame | None) -> SensedF
     clock.lap("forces")
     contacts = contacts_of(sensor, k, fit, previous)
     number, stamp = int(sensor.recording.frame_numbers[k]), float(sensor.recording.time_s[k])
+    status = status_of(sensor, fit, free)
     report = FrameReport(
         number,
         stamp,
-        status_of(sensor, fit, free),
+        beside_markers(sensor, k, fit) if status == OK and fit.rows.of_clouds else status,
         len(contacts),
         fit.rows.count,
         free.rows.rms,

@@ -11,12 +11,16 @@ import numpy as np
 import numpy.typing as npt
 
 from femsense.core.arrays import FloatArray, IntArray
+from femsense.core.errors import InputError
 from femsense.fem.mesh import TetMesh
 from femsense.model.robot import Robot
 from femsense.xr.gltf import ExportReport, export_states
 from femsense.xr.run_contents import export_run
 from femsense.xr.usdz_export import write_usdz
 from femsense.xr.user_skin import UserSkin, export_skin
+
+ENDINGS = (".glb", ".usdz")
+"""What is written."""
 
 
 class _States(Protocol):
@@ -60,9 +64,12 @@ def export_glb(
         what was written, with the distance to the finite-element surface.
 
     Raises:
-        InputError: a folder without states, times that do not increase, or `.usdz` without the package usd-core.
+        InputError: another ending, a folder without states, times that do not increase, or `.usdz` without the package usd-core.
     """
     target = Path(path).expanduser()
+    if target.suffix.lower() not in ENDINGS:
+        hint = "--mcap and --rerun write for Foxglove and Rerun" if target.suffix.lower() in (".mcap", ".rrd") else None
+        raise InputError("the ending names no format that is written", where=target, expected=" or ".join(ENDINGS), hint=hint)
     target.parent.mkdir(parents=True, exist_ok=True)
     if target.suffix.lower() == ".usdz":
         with tempfile.TemporaryDirectory(prefix="femsense-export-") as folder:

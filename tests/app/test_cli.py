@@ -142,7 +142,7 @@ def test_version(run: Any) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["calibratte"], "No such command 'calibratte'"),
+        (["calibratte"], "No such command 'calibratte'. Did you mean 'calibrate'? See: femsense --help"),
         (["calibrate", "robot"], "Missing argument 'RECORDING'. See: femsense calibrate --help"),
         (["estimate", "a", "b"], "Missing option '-o' / '--output'. See: femsense estimate --help"),
         (["improve", "robot"], "Missing argument 'RECORDING...'. See: femsense improve --help"),
@@ -321,6 +321,8 @@ def test_calibrate_estimate_export(run: Any, robot: Path, recording: Path, tmp_p
     said = run("export", tmp_path / "run", "-o", tmp_path / "new" / "robot.glb", "--json")
     assert said.status == 0 and said.json["frames"] == 3 and (tmp_path / "new" / "robot.glb").read_bytes()[:4] == b"glTF"
     assert run("inspect", tmp_path / "run").status == 0
+    said = run("export", tmp_path / "run", "-o", tmp_path / "new" / "robot.fbx")
+    assert said.status == 2 and ".glb or .usdz" in said.err and not (tmp_path / "new" / "robot.fbx").exists()
 
 
 def test_without_a_calibration_one_is_made_and_said(run: Any, robot: Path, recording: Path, tmp_path: Path) -> None:

@@ -400,8 +400,10 @@ def test_a_recording_against_a_robot(tmp_path: Path) -> None:
     robot = write_block_robot(tmp_path / "robot")
     report = inspect_path(cloud_recording(tmp_path / "r", 1.0), robot=robot)
     assert report["problems"] == [] and any("the clouds have none" in note for note in report["warnings"])
+    assert any("seen in no frame: stalk" in note for note in report["warnings"])
     report = inspect_path(cloud_recording(tmp_path / "small", 0.01, markers=False), robot=robot)
     assert any("are they in metres?" in note for note in report["warnings"])
+    assert not any("seen in no frame" in note for note in report["warnings"])  # it has no markers at all
     report = inspect_path(robot, robot=robot)
     assert any("--robot is about recordings" in problem for problem in report["problems"])
 

@@ -235,3 +235,6 @@ def test_the_command_says_inputs_limits_and_exit_status(tmp_path: Path, capsys: 
     assert run(["reach", "four-leg", "--target", f"{name}={x + 0.3},,"]) == 1
     assert "out of reach" in capsys.readouterr().out
     assert run(["reach", "four-leg", "--target", "0.1,0.2"]) == 2
+    capsys.readouterr()
+    assert run(["reach", "four-leg", "--target", f"{name}={1e3 * x + 3},,"]) == 2
+    assert "this looks like millimetres" in capsys.readouterr().err

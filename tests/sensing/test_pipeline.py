@@ -200,3 +200,11 @@ def test_a_cloud_that_is_no_cloud_is_reported(seen, tmp_path):
 def test_the_motor_tensions_are_reported(seen):
     run = estimate(arm(), seen, calibrate(arm(), seen))
     assert run.frames[3].tension_n == pytest.approx(dict(zip(NAMES, INPUTS[3])))
+
+
+def test_a_cloud_frame_whose_markers_are_elsewhere_is_not_ok(seen):
+    """The cloud of another frame: it fits the body under the inputs, but the markers say that the body is not there."""
+    moved = seen.marker_xyz + np.where(seen.marker_frame == 1, 0.008, 0.0)[:, None] * np.array([0.0, 1.0, 0.0])
+    run = estimate(arm(), replace(seen, marker_xyz=moved), calibrate(arm(), seen))
+    assert "the markers lie" in run.frames[1].status and "mm off the body" in run.frames[1].status
+    assert [frame.status for frame in run.frames[2:]] == ["ok", "ok"]

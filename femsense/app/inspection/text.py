@@ -72,7 +72,7 @@ def _value(key: str, value: Any) -> str:
     if key.endswith("share"):
         return f"{100.0 * value:.1f} %"
     if isinstance(value, float):
-        return f"{value:.4g}"
+        return f"{value:.0f}" if 1e4 <= abs(value) < 1e7 else f"{value:.4g}"
     if isinstance(value, list):
         return ", ".join(_value("", item) for item in value)
     return str(value)

@@ -174,7 +174,7 @@ def _enriched(data: Data, fitted: FittedModel, winner: Refit, table: list[Candid
     for form in _forms(table, winner.candidate.effect.name):
         if len(form.parameters) <= len(winner.candidate.parameters):
             continue
-        say(f"trying {form.effect.name} with {len(form.parameters)} parameters")
+        say(_trying(form))
         made = richer_fit(data, fitted, winner, form, noise)
         if made is None:
             continue
@@ -199,7 +199,7 @@ def _with_more_markers(
         if max(gains) <= data.thresholds.evidence:
             break
         form = joined(winner.candidate, others[int(np.argmax(gains))])
-        say(f"trying {form.effect.name} with {len(form.parameters)} parameters")
+        say(_trying(form))
         made = richer_fit(data, fitted, winner, form, noise)
         if made is None:
             break
@@ -209,6 +209,11 @@ def _with_more_markers(
             break
         winner = more
     return winner
+
+
+def _trying(form: Candidate) -> str:
+    count = len(form.parameters)
+    return f"trying {form.effect.name} with {count} {'parameter' if count == 1 else 'parameters'}"
 
 
 def richer_fit(data: Data, fitted: FittedModel, winner: Refit, form: Candidate, noise: Noise) -> FittedModel | None:

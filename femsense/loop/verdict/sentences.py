@@ -48,6 +48,11 @@ def verdict_in_words(
     if verdict == UNEXPLAINED and not effects:
         explains = "nothing that may be handed back" if found else "no effect of the list"
         return f"A residual is left that {explains} explains: {error}{where}, {of_it}." + _mesh_in_words(budget)
+    of_it += "".join(
+        f", {1e3 * size:.2f} mm {name}"
+        for name, size in (("discretisation", mesh), ("places of markers", budget.placement_m))
+        if size > 5e-6
+    )
     what = ", ".join(f"{e.name} ({values_in_words(e.parameters)})" for e in effects)
     tail = "" if verdict == FOUND else " A residual is left that no effect explains."
     fell = f"held-out error{where} {1e3 * before.held_rms:.2f} mm before, {1e3 * after.held_rms:.2f} mm after"

@@ -38,6 +38,7 @@ def test_how_much_of_the_error_is_the_model_s_own_is_said_first() -> None:
     sentence = said("unexplained", 8.9, budget(8.8, 0.2), [stiff])
     assert "8.90 mm after, of it 8.80 mm is an error of the model, 0.20 mm noise. A residual is left" in sentence
     assert "perhaps 0.20 mm (no state repeats) noise" in said("effects", 8.9, budget(8.8, 0.2, measured=False), [stiff])
+    assert "0.20 mm noise, 0.30 mm discretisation." in said("effects", 8.9, budget(8.8, 0.2, mesh=0.3), [stiff])
     assert said("effects", 8.9, budget(8.8, 0.2, note="it is huge"), [stiff]).endswith(
         "discretisation error is not known: it is huge."
     )
