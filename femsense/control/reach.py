@@ -25,11 +25,10 @@ from femsense.calib.calibration import Calibration
 from femsense.control.goal import Goal, Target, make_goal
 from femsense.control.limits import CONTROLS, Limits, command, make_limits
 from femsense.control.motion import NEAREST, REACHED, STOPPED, Certificate, Motion, WallContact
+from femsense.control.slopes import Slopes, exact_slopes, lent_slopes, may_be_lent
 from femsense.core.arrays import FloatArray, freeze
 from femsense.core.errors import InputError
 from femsense.fem.body import BodyModel
-from femsense.fem.cables import pull_rows
-from femsense.fem.compliance import drive_rows, tangent_at
 from femsense.fem.equilibrium import Equilibrium, SolveOptions, solve_equilibrium
 from femsense.model.robot import Robot
 from femsense.qp.problem import Problem
@@ -41,11 +40,16 @@ PENALTY = 50.0
 """A limit of length that is missed by so much weighs like an error so many times as large."""
 ACTIVE = 1e-9
 """A limit holds a step back if its multiplier is larger than this, in units of the scaled problem."""
-FIRST_RADIUS, SMALLEST_STEP, NEAR = 0.3, 1e-9, 1e-5
-"""Trust region at first and the step at which a search is over, in units of the body's reach;
+FIRST_RADIUS, SHORT, SMALLEST_STEP, NEAR = 0.3, 1e-4, 1e-9, 1e-5
+"""Trust region at first, the step whose end is solved finely and that at which a search is over, in units of the body's reach;
 error from which states are solved finely [m]."""
 COARSE, FINE = 1e-9, 1e-13
 """Relative tolerance of equilibria on the way, and within a hundredth of a millimetre of the target."""
+
+KEPT = 0.1
+"""Slopes serve for another step where the last one left no more than this share of the error."""
+SURE_GAIN = 0.5
+"""Slopes that are not exact are made anew where they promise to take less than this share of the squared error."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,21 +124,36 @@ def _searched(
     """Step by step to the inputs: each step is taken if the error falls, else the trust region shrinks."""
     body, before = robot.body, state.segment_tensions
     radius, count, status, last, beyond = FIRST_RADIUS, 1, STOPPED, _Step(np.zeros(len(bounds.low)), 0.0, 0.0), ""
+    slopes, settled = lent_slopes(body, goal, state) if state.converged else None, False
     while state.converged and count < options.max_iterations:
         error, miss2 = goal.error(state.positions), float((goal.miss(state.positions) ** 2).sum())
         within = bounds.violation(_wound(body, state)) <= options.tolerance_m
-        last = _step(body, goal, bounds, state, radius, options)
-        if within and error <= options.tolerance_m:
-            status = REACHED
+        end = REACHED if within and error <= options.tolerance_m else ""
+        if slopes is None:
+            slopes, state = exact_slopes(body, goal, state)
+        if not end:
+            last = _step(body, goal, bounds, state, slopes, radius, options)
+            if not slopes.exact and (last.size < SMALLEST_STEP or last.gain <= SURE_GAIN * miss2):
+                slopes = None
+                continue
+            end = NEAREST if within and last.gain <= options.least_gain * miss2 else ""
+        if end and settled:
+            status = end
             break
-        if within and last.gain <= options.least_gain * miss2:
-            status = NEAREST
-            break
-        wanted = np.clip(_effort(state) + last.change, bounds.low, bounds.high)
-        tried = _solved(body, goal, wanted, state, before, fine=error < NEAR, tried=True)
+        fine = bool(end) or error < NEAR or last.size < SHORT
+        change = 0.0 if end else last.change
+        tried = _solved(
+            body, goal, np.clip(_effort(state) + change, bounds.low, bounds.high), state, before, fine=fine, tried=True
+        )
         count += 1
-        if tried.converged and _is_better(body, goal, bounds, tried, state):
-            state, radius, beyond = tried, 4.0 * radius, ""
+        if end:
+            state, settled = tried if tried.converged else state, True
+        elif tried.converged and _is_better(body, goal, bounds, tried, state):
+            serves = goal.error(tried.positions) <= KEPT * error
+            slopes = _learned(body, goal, slopes, state, tried) if serves else None
+            state, radius, beyond, settled = tried, 4.0 * radius, "", fine
+        elif not slopes.exact:
+            slopes = None
         elif last.size < SMALLEST_STEP:
             status = NEAREST if within and last.gain <= np.sqrt(options.least_gain) * miss2 else STOPPED
             break
@@ -158,10 +177,12 @@ class _Step:
     the largest first."""
 
 
-def _step(body: BodyModel, goal: Goal, bounds: Limits, state: Equilibrium, radius: float, options: ReachOptions) -> _Step:
+def _step(
+    body: BodyModel, goal: Goal, bounds: Limits, state: Equilibrium, slopes: Slopes, radius: float, options: ReachOptions
+) -> _Step:
     """Return the best step of the linearised problem in a trust region."""
     u, miss = _effort(state), goal.miss(state.positions)
-    J, W = _slopes(body, goal, state)
+    J, W = slopes.points, slopes.wound
     moved = np.linalg.norm(J, axis=0)
     unit = body.reach / np.maximum(moved, WEAKEST * max(float(moved.max(initial=0.0)), 1e-300))
     scaled = J * unit
@@ -191,17 +212,10 @@ def _step(body: BodyModel, goal: Goal, bounds: Limits, state: Equilibrium, radiu
     return _Step(unit * change, float(np.abs(change).max(initial=0.0)), gain, shown)
 
 
-def _slopes(body: BodyModel, goal: Goal, state: Equilibrium) -> tuple[FloatArray, FloatArray]:
-    """Return W_pa, the rows' change by unit efforts [m/N], shape (r, a + c), and W_aa, that of what the cables wind up,
-    shape (a, a + c)."""
-    tangent = tangent_at(body, state)
-    shares = [t / T if T > 0 else np.ones_like(t) for t, T in zip(state.segment_tensions, state.tension.values())]
-    forces = drive_rows(body, state.positions, shares)
-    moves = tangent.respond(forces.reshape(len(forces), -1, 3))
-    wound = pull_rows(body, state.positions) @ moves.reshape(len(forces), -1).T
-    stretch = np.array([1.0 / cable.stretch_stiffness for cable in body.cables])
-    wound[:, : len(stretch)] += np.diag(stretch)
-    return goal.rows(moves), wound
+def _learned(body: BodyModel, goal: Goal, slopes: Slopes, state: Equilibrium, tried: Equilibrium) -> Slopes:
+    """Return what the way from one state to another shows of the slopes."""
+    moved = goal.miss(state.positions) - goal.miss(tried.positions)
+    return slopes.learned(_effort(tried) - _effort(state), moved, _wound(body, tried) - _wound(body, state))
 
 
 def _effort(state: Equilibrium) -> FloatArray:
@@ -227,7 +241,7 @@ def _solved(
 ) -> Equilibrium:
     """Return the equilibrium under efforts (a + c,);
     `before` are the tensions along the cables before the robot began to move."""
-    a = len(body.cables)
+    a, lent = len(body.cables), start is not None and may_be_lent(body, start)
     return solve_equilibrium(
         body,
         tension=dict(zip(body.cable_names, effort[:a].tolist())),
@@ -235,7 +249,13 @@ def _solved(
         nodal_forces=goal.nodal_forces,
         start=start,
         bilateral=True,
-        options=SolveOptions(before=before, relative_tolerance=FINE if fine else COARSE, rough=tried),
+        options=SolveOptions(
+            before=before,
+            relative_tolerance=FINE if fine else COARSE,
+            rough=tried and not fine,
+            single=fine,
+            reuse_factor=lent,
+        ),
     )
 
 

@@ -11,7 +11,10 @@ from analytic import bar_body
 from helpers import DATA, block_mesh
 
 import femsense as fs
+from femsense.control.goal import make_goal
+from femsense.control.slopes import Slopes, exact_slopes, lent_slopes
 from femsense.core.errors import InputError
+from femsense.fem.equilibrium import SolveOptions
 from femsense.fem.mesh import embed_points
 from femsense.io.robot_toml import load_robot
 from femsense.model.effects import apply_effects
@@ -59,6 +62,45 @@ def test_what_some_inputs_reach_is_reached_and_the_inputs_do_it(control: str, se
     np.testing.assert_allclose(robot.markers.positions(again.positions)[0], wanted, atol=2e-7)
     np.testing.assert_allclose(motion.reached_m["tip"], wanted, atol=1e-10)
     assert motion.certificate.equilibrium_n < 1e-8 and motion.certificate.violation == 0.0
+
+
+def test_along_a_path_the_inputs_hold_the_body_at_each_target() -> None:
+    """Factors that are kept from one target to the next leave no state unfinished: solved anew, it is where it was said to be."""
+    robot = bar()
+    first, last = (place(robot, {"top": top, "side": side}) for top, side in ((0.2, 0.6), (0.7, 0.3)))
+    motion = None
+    for share in (0.0, 0.1, 0.2, 0.5, 1.0):
+        wanted = (1.0 - share) * first + share * last
+        motion = fs.reach(robot, {"tip": wanted}, start=motion)
+        finely = SolveOptions(relative_tolerance=1e-13)
+        there = place(robot, motion.inputs, start=motion.equilibrium, options=finely)
+        assert motion.status == "reached"
+        np.testing.assert_allclose(there, wanted, rtol=0, atol=1.2e-10)
+
+
+def test_slopes_are_those_of_the_states_near_by() -> None:
+    robot, tension = bar(), {"top": 0.4, "side": 0.3}
+    goal = make_goal(robot, {"tip": [0.0, 0.0, 0.0]}, (), ())
+    state = fs.solve_equilibrium(robot.body, tension=tension)
+    slopes, keeps = exact_slopes(robot.body, goal, state)
+    near = place(robot, {"top": 0.4 + 1e-4, "side": 0.3}) - place(robot, {"top": 0.4 - 1e-4, "side": 0.3})
+    np.testing.assert_allclose(slopes.points[:, 0], near / 2e-4, rtol=1e-4, atol=1e-8)
+    lent = lent_slopes(robot.body, goal, keeps)
+    assert slopes.exact and lent is not None and not lent.exact
+    np.testing.assert_allclose(lent.points, slopes.points)
+    assert lent_slopes(robot.body, goal, replace(state, factor=None)) is None
+
+
+def test_slopes_that_a_step_has_shown_give_that_step_and_leave_others() -> None:
+    rng = np.random.default_rng(3)
+    before = Slopes(rng.normal(size=(3, 3)), rng.normal(size=(2, 3)), exact=True)
+    change, moved, wound = rng.normal(size=3), rng.normal(size=3), rng.normal(size=2)
+    after = before.learned(change, moved, wound)
+    np.testing.assert_allclose(after.points @ change, moved, atol=1e-12)
+    np.testing.assert_allclose(after.wound @ change, wound, atol=1e-12)
+    other = np.cross([1.0, 0.0, 0.0], (before.points**2).sum(axis=0) * change)  # stands on the step, as efforts count
+    np.testing.assert_allclose(after.points @ other, before.points @ other, atol=1e-12)
+    assert not after.exact
 
 
 def test_a_direction_may_be_left_free() -> None:
