@@ -40,8 +40,8 @@ PENALTY = 50.0
 """A limit of length that is missed by so much weighs like an error so many times as large."""
 ACTIVE = 1e-9
 """A limit holds a step back if its multiplier is larger than this, in units of the scaled problem."""
-FIRST_RADIUS, SHORT, SMALLEST_STEP, NEAR = 0.3, 1e-4, 1e-9, 1e-5
-"""Trust region at first, the step whose end is solved finely and that at which a search is over, in units of the body's reach;
+FIRST_RADIUS, SMALLEST_STEP, NEAR = 0.3, 1e-9, 1e-5
+"""Trust region at first and the step at which a search is over, in units of the body's reach;
 error from which states are solved finely [m]."""
 COARSE, FINE = 1e-9, 1e-13
 """Relative tolerance of equilibria on the way, and within a hundredth of a millimetre of the target."""
@@ -140,7 +140,7 @@ def _searched(
         if end and settled:
             status = end
             break
-        fine = bool(end) or error < NEAR or last.size < SHORT
+        fine = bool(end) or error < NEAR
         change = 0.0 if end else last.change
         tried = _solved(
             body, goal, np.clip(_effort(state) + change, bounds.low, bounds.high), state, before, fine=fine, tried=True

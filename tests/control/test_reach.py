@@ -67,12 +67,10 @@ def test_what_some_inputs_reach_is_reached_and_the_inputs_do_it(control: str, se
 def test_along_a_path_the_inputs_hold_the_body_at_each_target() -> None:
     """Factors that are kept from one target to the next leave no state unfinished: solved anew, it is where it was said to be."""
     robot = bar()
-    first, last = (place(robot, {"top": top, "side": side}) for top, side in ((0.2, 0.6), (0.7, 0.3)))
-    motion = None
+    motion, finely = None, SolveOptions(relative_tolerance=1e-13)
     for share in (0.0, 0.1, 0.2, 0.5, 1.0):
-        wanted = (1.0 - share) * first + share * last
+        wanted = place(robot, {"top": 0.2 + 0.5 * share, "side": 0.6 - 0.3 * share}, options=finely)
         motion = fs.reach(robot, {"tip": wanted}, start=motion)
-        finely = SolveOptions(relative_tolerance=1e-13)
         there = place(robot, motion.inputs, start=motion.equilibrium, options=finely)
         assert motion.status == "reached"
         np.testing.assert_allclose(there, wanted, rtol=0, atol=1.2e-10)
