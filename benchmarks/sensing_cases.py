@@ -94,7 +94,7 @@ def script_of(case: Case, robot: Robot, seed: int) -> dict[str, Any]:
         ],
         "objects": objects[: len(contacts)],
         "contacts": contacts,
-        "camera": {"eye_m": eye.tolist(), "target_m": target.tolist(), "noise": NOISES[case.camera]},
+        "camera": {"eye_m": eye.tolist(), "target_m": target.tolist(), "noise": NOISES[case.camera], "declare_pose": True},
         "clouds": {"kind": "ply"},
         "markers": {"std_m": 0.3e-3},
     }

@@ -37,6 +37,7 @@ def print_rates(points: int) -> None:
 def _robot(element: str, folder: Path) -> Robot:
     document = tomllib.loads((DIAMOND / "robot.toml").read_text(encoding="utf-8"))
     document["mesh"] |= {"element": element, "file": str(DIAMOND / "diamond.vtu")}
+    document["appearance"] = {"color_rgb": [0.2, 0.4, 0.8]}  # without a colour the hidden search tells robot from ball
     folder.mkdir()
     write_toml(folder / "robot.toml", document)
     return load_robot(folder)
