@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from sensing_cases import DIAMOND
 
 from femsense import Robot, calibrate, load_recording, load_robot, simulate
 from femsense.io.clouds.cloud_files import read_cloud, write_cloud
@@ -19,6 +18,7 @@ from femsense.sensing.pipeline import sense_frame
 from femsense.sensing.prepare import make_sensor
 from femsense.sensing.types import SensedFrame
 
+DIAMOND = Path(__file__).resolve().parents[2] / "shared" / "data" / "diamond"
 FREE, TOUCHED = 3, 8
 PLACE = [0.0, -0.0429, 0.0906]
 
