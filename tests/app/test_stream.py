@@ -97,7 +97,7 @@ def test_the_command_line_lets_a_viewer_drag_and_a_viewer_of_it_too(tmp_path: Pa
                         end = min(end, time.monotonic() + 0.5)
                     viewer.send(pack([Message(f"femsense/{made.robot.name}/drag", wish)]))
                     for message in unpack(viewer.recv(5)):
-                        if not message.topic.endswith(("/pose", "/ghost", "/cloud")):
+                        if not message.topic.endswith(("/pose", "/ghost", "/cloud", "/field")):
                             heard[message.topic.rpartition("/")[2]] = json.loads(message.payload)
             assert heard["model"]["commands"] is bool(commands)
             assert [handle["name"] for handle in heard["model"]["handles"]] == list(made.robot.glued_names)

@@ -43,7 +43,7 @@ def export(
     vertices: Annotated[int, typer.Option("--vertices", min=100, help="Of --skin at most; more are decimated.")] = 100_000,
     json: Json = False,
 ) -> Answer:
-    """Write a run as a skinned, animated mesh (glTF or USDZ)."""
+    """Write a run as a skinned, animated mesh (glTF, USDZ)."""
     if mcap is not None:
         from dataclasses import asdict
 

@@ -48,7 +48,7 @@ def test_a_marker_that_slips_or_a_frame_that_is_off_is_none():
 
 @pytest.mark.parametrize("k", [2, -2])
 def test_the_loop_leaves_outliers_out_whether_they_are_fitted_or_held_out(k: int):
-    """One marker a metre away, in the first sweep or in the last one, which is held out."""
+    """One marker a decimetre away, in the first sweep or in the last one, which is held out."""
     inputs, labels = sweeps()
     plain, _ = record(inputs, effects=[{"name": "stiffness", "scale": 1.25}], labels=labels, truth=arm((8, 3, 3)))
     row = int(np.flatnonzero(plain.marker_frame == (k % len(inputs)))[3])
@@ -62,5 +62,5 @@ def test_the_loop_leaves_outliers_out_whether_they_are_fitted_or_held_out(k: int
 
 def _moved(recording: Recording, row: int) -> Recording:
     xyz = recording.marker_xyz.copy()
-    xyz[row] += [0.2, 0.3, 1.0]
+    xyz[row] += [0.02, 0.03, 0.1]
     return replace(recording, marker_xyz=xyz)
