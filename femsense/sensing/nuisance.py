@@ -155,7 +155,7 @@ def learn(knowledge: Knowledge, frames: list[tuple[Rows, FloatArray]]) -> Knowle
         grams = [_gram(knowledge, rows, sag) for rows, sag in frames]
         knowledge = _fit_common(knowledge, grams, first)
         for _ in range(2):
-            knowledge = _fit_field(knowledge, grams)
+            knowledge = _fit_field(knowledge, grams, _most(frames))
             knowledge = _fit_common(knowledge, grams, first)
         knowledge = replace(knowledge, together=_together(knowledge, frames))
     misfits = np.array([misfit(knowledge, rows, sag) for rows, sag in frames if rows.of_clouds])
@@ -241,13 +241,24 @@ def _fit_common(knowledge: Knowledge, grams: list[FloatArray], first: Knowledge)
     return replace(knowledge, common_mean=freeze(mean), common_root=freeze(root @ _root(np.linalg.inv(inner))))
 
 
-def _fit_field(knowledge: Knowledge, grams: list[FloatArray]) -> Knowledge:
-    """Return the sizes of the shared errors that are likeliest for these frames."""
+def _most(frames: list[tuple[Rows, FloatArray]]) -> tuple[float, float]:
+    """Return how large shared errors can be that no free frame contradicts: what the worst of them leaves [m], and that over the way from rest."""
+    clouds = [rows for rows, _ in frames if rows.of_clouds]
+    sizes = np.array([1.483 * np.median(np.abs(rows.residual)) for rows in clouds])
+    ways = np.array([np.sqrt(np.mean(rows.way**2)) for rows in clouds])
+    return float(sizes.max(initial=0.0)), float((sizes / np.maximum(ways, 1e-6)).max(initial=0.0))
+
+
+def _fit_field(knowledge: Knowledge, grams: list[FloatArray], most: tuple[float, float]) -> Knowledge:
+    """Return the sizes of the shared errors that are likeliest for these frames; they are no larger than what the frames leave.
+
+    Where the noise is far below the errors of the model, the field would else grow without bound: it is too smooth for them, and bends as far as it may.
+    """
     x = np.append(-knowledge.common_mean, 1.0)
     best, chosen = np.inf, knowledge
-    for bias in BIAS_STEPS:
-        for share in SHARE_STEPS:
-            tried = replace(knowledge, bias_m=float(bias), model_share=float(share))
+    for bias in (0.0, *(float(b) for b in BIAS_STEPS[1:] if b <= most[0])):
+        for share in (0.0, *(float(s) for s in SHARE_STEPS[1:] if s <= most[1])):
+            tried = replace(knowledge, bias_m=bias, model_share=share)
             parts = [_projected(tried, gram) for gram in grams]
             value = sum(float(x @ left @ x) + logdet for left, logdet in parts)
             if value < best:

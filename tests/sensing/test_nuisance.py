@@ -67,6 +67,17 @@ def test_flying_pixels_do_not_say_that_a_frame_is_not_explained():
     assert misfit(learned, replace(rows, residual=3.0 * rows.residual), SAG) > learned.misfit_limit
 
 
+def test_shared_errors_are_no_larger_than_what_free_frames_leave():
+    """Waves too short for the field of shared errors, far above the noise: it must not grow beyond them to bend after them, or a touch is no news."""
+
+    def wavy(phase: float) -> Rows:
+        rows = plate_rows(1)
+        waves = 2e-4 * np.sin(rows.place[:, 0] / 0.012 + phase) * np.sin(rows.place[:, 1] / 0.012 + phase)
+        return replace(rows, residual=waves + rows.residual / 30.0, std=rows.std / 30.0)
+
+    assert 0.0 < learn(knowledge(), [(wavy(phase), SAG) for phase in (0.0, 0.7, 1.9)]).bias_m < 2e-4
+
+
 def test_free_frames_tell_how_hard_a_cable_truly_pulls():
     moves = np.zeros((2, 4, 3))
     before = first_knowledge(knowledge().noises, knowledge().centres, 0.22, 0.03, 1e-8 * np.eye(6), drives=1)
