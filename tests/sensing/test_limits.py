@@ -13,7 +13,7 @@ from femsense.calib.calibrate import calibrate
 from femsense.core.pose import invert_pose, transform_points
 from femsense.fem.mesh import surface_triangles, triangle_normals
 from femsense.io.clouds.cloud_files import read_cloud, write_cloud
-from femsense.model.recording import Recording
+from femsense.model.recording import Recording, with_marker_table
 from femsense.pointcloud.cloud import PointCloud
 from femsense.sensing.pipeline import estimate
 from femsense.sensing.types import SensingOptions
@@ -97,6 +97,15 @@ def test_contacts_keep_their_track_and_know_how_well_they_are_placed(tmp_path):
         cloud_files=(*seen.cloud_files[:2], seen.cloud_files[3], seen.cloud_files[3]),
         inputs=np.array([*INPUTS[:2], INPUTS[3], INPUTS[3]]),
         free=np.array([True, True, False, False]),
+    )
+    early = held.marker_frame < 2  # frame 2 shows what frame 3 does: its markers would be those of another state
+    held = with_marker_table(
+        held,
+        held.marker_names,
+        held.marker_frame[early],
+        held.marker_index[early],
+        held.marker_xyz[early],
+        view=held.marker_view[early],
     )
     run = estimate(arm(), held, calibrate(arm(), seen))
     assert [c.track for c in run.contacts] == [0, 0]

@@ -50,7 +50,7 @@ def verdict_in_words(
         return f"A residual is left that {explains} explains: {error}{where}, {of_it}." + _mesh_in_words(budget)
     of_it += "".join(
         f", {1e3 * size:.2f} mm {name}"
-        for name, size in (("discretisation", mesh), ("places of markers", budget.placement_m))
+        for name, size in ((MESH.name, mesh), ("places of markers", budget.placement_m))
         if size > 5e-6
     )
     what = ", ".join(f"{e.name} ({values_in_words(e.parameters)})" for e in effects)
