@@ -31,11 +31,17 @@ REST = np.outer(np.linspace(0, 0.1, 5), [0, 0, 1.0])
 @pytest.fixture(scope="module")
 def model() -> ProprioceptiveModel:
     """Markers on a line; the readings shift each by its height times the reading, along x and y."""
-    C = np.zeros((15, 2))
-    C[0::3, 0], C[1::3, 1] = REST[:, 2], REST[:, 2]
+    return line_model(np.eye(3))
+
+
+def line_model(R: np.ndarray) -> ProprioceptiveModel:
+    """The same, all of it turned."""
+    C = np.zeros((5, 3, 2))
+    C[:, 0, 0], C[:, 1, 1] = REST[:, 2], REST[:, 2]
     domain = learn_domain(np.random.default_rng(0).uniform(-0.5, 0.5, (300, 2)))
-    network = linear_network(np.zeros(2), np.ones(2), C, REST.ravel())
-    return ProprioceptiveModel(CHANNELS, tuple("abcde"), network, (), domain, make_armature(REST, ArmatureOptions(bones=6)))
+    rest = REST @ R.T
+    network = linear_network(np.zeros(2), np.ones(2), np.einsum("ij,mjk->mik", R, C).reshape(15, 2), rest.ravel())
+    return ProprioceptiveModel(CHANNELS, tuple("abcde"), network, (), domain, make_armature(rest, ArmatureOptions(bones=6)))
 
 
 def take(source: str, count: int, send: object) -> list[Reading]:
@@ -164,6 +170,15 @@ def test_the_tube_bends_as_the_markers_do(model: ProprioceptiveModel, tmp_path: 
     np.testing.assert_allclose(ends[:2] / ends[2], [0.4, -0.2], atol=1e-3)  # on the line that the markers are on
     assert bent.status == "ok" and "bend = 9" in odd.status and "no number" in blind.status
     np.testing.assert_array_equal(blind.bones, odd.bones)
+
+
+def test_bones_of_a_lying_body_have_the_axes_of_the_robot_at_rest(tmp_path: Path) -> None:
+    R = Rotation.from_euler("yz", [90, 30], degrees=True).as_matrix()
+    file, lying = tmp_path / "sensors.csv", line_model(R)
+    file.write_text("time_s,bend,sway\n0,0.4,-0.2\n", encoding="utf-8")
+    bent = next(frames_of_sensors(str(file), lying, Event())).bones
+    axis = Rotation.from_quat(bent[-1, 3:]).as_matrix() @ R[:, 2]  # along the body at rest
+    np.testing.assert_allclose(axis, R @ (np.array([0.4, -0.2, 1.0]) / np.sqrt(1.2)), atol=1e-3)
 
 
 def test_triangles_of_the_tube_look_outward(model: ProprioceptiveModel) -> None:
