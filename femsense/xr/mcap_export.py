@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from femsense.core.arrays import FloatArray
-from femsense.core.errors import InputError
 from femsense.io.files import write_beside
 from femsense.model.recording import Recording
 from femsense.sensing.run_files import read_run
 from femsense.sensing.types import ContactForce, Run
+from femsense.xr.extras import needed
 from femsense.xr.ros_definitions import MESSAGES, definition
 from femsense.xr.run_scene import BODY, FORCE, arrow_of, body_surface, camera_pose, cloud_of, recording_of
 
@@ -52,7 +51,7 @@ def export_mcap(folder: str | Path, path: str | Path) -> McapReport:
         InputError: no run, or the package mcap-ros2-support is missing.
     """
     run = read_run(folder)
-    writer_module = _need()
+    writer_module = needed("mcap_ros2.writer", package="mcap-ros2-support", extra="mcap", doing="writing MCAP")
     pose, recording, clouds = camera_pose(folder), recording_of(run), 0
     with write_beside(path) as part, part.open("wb") as stream:
         writer = writer_module.Writer(stream)
@@ -216,16 +215,3 @@ def _towards(direction: Any, *, axis: int) -> dict[str, float]:
     second /= np.linalg.norm(second)
     columns = [first, second, np.cross(first, second)]
     return _quaternion(np.stack(columns[-axis:] + columns[:-axis] if axis else columns, axis=1))
-
-
-def _need() -> Any:
-    try:
-        return importlib.import_module("mcap_ros2.writer")
-    except ImportError as error:
-        raise InputError(
-            "writing MCAP needs a package that is not there",
-            where="mcap-ros2-support",
-            found=str(error),
-            expected="the extra [mcap]",
-            hint="pip install 'femsense[mcap]'",
-        ) from None

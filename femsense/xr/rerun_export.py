@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from femsense.core.arrays import FloatArray
-from femsense.core.errors import InputError
 from femsense.io.files import write_beside
 from femsense.sensing.run_files import read_run
 from femsense.sensing.types import ContactForce, FrameReport, Run
+from femsense.xr.extras import needed
 from femsense.xr.run_scene import BODY, FORCE, arrow_of, body_surface, camera_pose, cloud_of, recording_of
 
 UNCERTAIN = (0.9, 0.25, 0.15, 0.25)
@@ -42,7 +41,7 @@ def export_rerun(folder: str | Path, path: str | Path) -> RerunReport:
     Raises:
         InputError: no run, or the package rerun-sdk is missing.
     """
-    rr, run = _need(), read_run(folder)
+    rr, run = needed("rerun", package="rerun-sdk", extra="rerun", doing="writing .rrd"), read_run(folder)
     pose, recording, clouds = camera_pose(folder), recording_of(run), 0
     with write_beside(path) as part:
         stream = rr.RecordingStream("femsense", recording_id=str(Path(folder).resolve()))
@@ -100,16 +99,3 @@ def _log_values(rr: Any, stream: Any, report: FrameReport, contacts: list[Contac
 
 def _bytes(colors: FloatArray | None) -> Any:
     return None if colors is None else np.rint(255 * np.asarray(colors)).astype(np.uint8)
-
-
-def _need() -> Any:
-    try:
-        return importlib.import_module("rerun")
-    except ImportError as error:
-        raise InputError(
-            "writing .rrd needs a package that is not there",
-            where="rerun-sdk",
-            found=str(error),
-            expected="the extra [rerun]",
-            hint="pip install 'femsense[rerun]'",
-        ) from None

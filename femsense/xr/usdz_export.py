@@ -6,7 +6,6 @@ Reference: Pixar, Universal Scene Description, UsdSkel and UsdPreviewSurface; us
 
 from __future__ import annotations
 
-import importlib
 import re
 import tempfile
 from pathlib import Path
@@ -16,6 +15,7 @@ import numpy as np
 
 from femsense.core.errors import InputError
 from femsense.io.files import write_beside
+from femsense.xr.extras import needed
 from femsense.xr.glb_reader import AnimatedSkin, Surface, read_glb, read_surface
 from femsense.xr.gltf import T_GLTF_ROBOT, quaternions
 
@@ -37,7 +37,10 @@ def write_usdz(glb: bytes, path: str | Path) -> Path:
     Raises:
         InputError: not a mesh of femsense, or the package usd-core is missing.
     """
-    usd = {name: _need(name) for name in ("Gf", "Sdf", "Usd", "UsdGeom", "UsdShade", "UsdSkel", "UsdUtils", "Vt")}
+    usd = {
+        name: needed(f"pxr.{name}", package="usd-core", extra="usd", doing="writing .usdz")
+        for name in ("Gf", "Sdf", "Usd", "UsdGeom", "UsdShade", "UsdSkel", "UsdUtils", "Vt")
+    }
     animated, surface = read_glb(glb), read_surface(glb)
     with tempfile.TemporaryDirectory(prefix="femsense-usdz-") as folder, write_beside(path) as part:
         layer = Path(folder, "robot.usdc")
@@ -169,16 +172,3 @@ def _matrices(usd: dict[str, Any], T: Any) -> Any:
 def _identifier(name: str) -> str:
     word = re.sub(r"\W", "_", name, flags=re.ASCII)
     return word if re.match(r"[A-Za-z_]", word) else f"_{word}"
-
-
-def _need(name: str) -> Any:
-    try:
-        return importlib.import_module(f"pxr.{name}")
-    except ImportError as error:
-        raise InputError(
-            "writing .usdz needs a package that is not there",
-            where="usd-core",
-            found=str(error),
-            expected="the extra [usd]",
-            hint="pip install 'femsense[usd]'",
-        ) from None

@@ -39,7 +39,6 @@ class Streams {
   private paused = false;
   private at = 0; // time that is shown while paused [s]
   private drawn = 0;
-  private told: number | undefined; // largest value of the field that the legend names
 
   constructor(private readonly stage: Stage) {
     this.connection = new Connection(streamUrl(), (messages) => this.take(messages), (open) => this.connected(open));
@@ -149,9 +148,8 @@ class Streams {
     if (badge.textContent !== said) badge.textContent = said;
     if (!robot) return;
     element("about").textContent = robot.about();
-    const stress = element<HTMLOptionElement>("paint-stress");
-    if (stress.hidden !== !robot.model.field) stress.hidden = !robot.model.field;
-    if (robot.newest?.field?.largest !== this.told) this.legend(element<HTMLSelectElement>("paint").value as Paint);
+    element<HTMLOptionElement>("paint-stress").hidden = !robot.model.field;
+    this.legend(element<HTMLSelectElement>("paint").value as Paint);
     element("cloud").hidden = !robot.body?.hasCloud;
     element("legend").hidden = !robot.body?.hasCloud || element("cloud").getAttribute("aria-pressed") !== "true";
     if (robot.body) element("legend-scale").textContent = `${(1000 * robot.body.residualScale).toPrecision(1)} mm`;
@@ -182,7 +180,6 @@ class Streams {
 
   private legend(kind: Paint): void {
     const field = this.chosen?.newest?.field;
-    this.told = field?.largest;
     paintLegend(kind, this.chosen?.body ?? null, field ? `${amount(field.largest, field.unit)} ${field.name}` : "");
   }
 
