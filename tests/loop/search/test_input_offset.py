@@ -41,7 +41,7 @@ def test_a_zero_that_is_wrong_keeps_its_place():
     assert found is not None and found.fitted is None and found.ahead < -10.0
 
 
-@pytest.mark.parametrize(("zero", "named"), [(-1.5e-3, "cable_slack"), (1.5e-3, "")])
+@pytest.mark.parametrize(("zero", "named"), [(-1.5e-3, "cable_slack"), (-0.8e-3, "cable_slack"), (1.5e-3, "")])
 def test_play_is_named_where_held_cables_pull_less_than_declared_and_a_zero_where_they_pull_more(zero: float, named: str):
     wrong = [{"name": "cable_offset", "displacement_m": {"left": zero}}]
     found = asked(arm((4, 1, 1)), arm((4, 1, 1)), [0, 2, 1, 3], ["cable_slack"], 6e-3, effects=wrong, actuation="displacement")
