@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 from femsense.core.errors import InputError
 from femsense.xr.stream.access import Access, read_password
 from femsense.xr.stream.bridge import Bridge
-from femsense.xr.stream.hub import Hub
+from femsense.xr.stream.hub import Hub, Message
 from femsense.xr.stream.mqtt import EmbeddedBroker, MqttSink, broker_address
-from femsense.xr.stream.payloads import Twin, TwinFrame, topic
+from femsense.xr.stream.payloads import MEASURED, Twin, TwinFrame, measured_bytes, topic
 from femsense.xr.stream.publisher import Publisher, PublishOptions, play
 from femsense.xr.stream.websocket import ServerOptions, WebSocketServer
 from femsense.xr.view import PAGE, live_page_files
@@ -140,6 +140,41 @@ def let_drag(live: LiveStream, run: Path, options: DragOptions) -> DragServer:
     return server
 
 
+def measure_by_sensors(live: LiveStream, source: str, model_file: Path) -> None:
+    """Say on `measured` where sensors put the markers of the first robot that `live` plays, while they are read.
+
+    This closes the loop of a drag (see `let_drag`, which comes before).
+
+    Raises:
+        InputError: no model, no such source, or a model that knows no marker of the robot.
+    """
+    from femsense.xr.proprioception.model_file import load_model
+    from femsense.xr.stream.readings import readings_of
+    from femsense.xr.stream.sensor_source import markers_of_sensors
+
+    model, twin = load_model(model_file), live.publishers[0].twin
+    known = [handle.name for handle in twin.handles]
+    if not set(known) & set(model.marker_names):
+        raise InputError(
+            "the model knows no marker of the robot",
+            where=str(model_file),
+            found=", ".join(model.marker_names),
+            expected=f"one of the markers of {twin.name}: {', '.join(known)}",
+            hint="learn from columns that are named as the markers in robot.toml",
+        )
+    readings_of(source, model.channels, Event())  # says at once what is wrong with a source
+
+    def run() -> None:
+        for seq, (time_s, markers) in enumerate(markers_of_sensors(source, model, live.stop)):
+            message = Message(topic(twin.name, MEASURED), measured_bytes(seq, time_s, markers))
+            live.hub.publish([message])
+            live.hub.received(message, "sensors")
+
+    thread = Thread(target=run, daemon=True, name="femsense-measured")
+    live.closers.append(lambda: thread.join(2.0))
+    thread.start()
+
+
 def show_stream(
     url: str, *, port: int = 0, page: Path = PAGE, password_file: Path | None = None, authority: Path | None = None
 ) -> LiveStream:
@@ -220,6 +255,12 @@ def _play(live: LiveStream, twin: Twin, frames: Iterator[TwinFrame], options: St
     thread = Thread(target=run, daemon=True, name=f"femsense-{twin.name}")
     live.threads.append(thread)
     thread.start()
+
+
+def need_stream(runs: Sequence[Path], sensors: str | None, *, drag: bool) -> None:
+    """Raise InputError unless there are runs or sensors; both go together where sensors measure what is dragged."""
+    if not (runs and sensors is not None and drag):
+        need_one(runs, sensors)
 
 
 def need_one(runs: Sequence[Path], source: str | None) -> None:

@@ -18,7 +18,7 @@ from femsense.fem.mesh import TetMesh, surface_triangles
 from femsense.xr.glb_reader import read_glb
 from femsense.xr.gltf import ExportReport, export_states
 from femsense.xr.landmarks import landmarks_of_run, robot_table
-from femsense.xr.surface_stress import nodal_strain, stress_bytes
+from femsense.xr.surface_stress import SurfaceStress, nodal_strain, surface_stress
 from femsense.xr.user_skin import BUDGET, GLTF, UserSkin, export_skin, read_skin
 
 FORMAT = "femsense-contacts-1"
@@ -103,9 +103,8 @@ def contacts_of_run(folder: str | Path) -> dict[str, Any]:
     }
 
 
-def stress_of_run(folder: str | Path, glb: bytes) -> bytes:
-    """Return the stress at the vertices of a run's mesh (see `surface_stress.stress_bytes`);
-    strain [%] where no material is known.
+def stress_of_run(folder: str | Path, glb: bytes) -> SurfaceStress:
+    """Return the stress at the vertices of a run's mesh; strain [%] where no material is known.
 
     A vertex has the stress of the node of the body's surface that is nearest to it at rest.
     """
@@ -117,7 +116,7 @@ def stress_of_run(folder: str | Path, glb: bytes) -> bytes:
     mesh = TetMesh(rest, states["tets"])
     used = np.unique(surface_triangles(mesh))
     nearest = used[cKDTree(rest[used]).query(read_glb(glb).skin.rest)[1]]
-    return stress_bytes(nodal_strain(rest, mesh.tets, states["nodes_m"])[:, nearest], _stiffness(run) or 100.0)
+    return surface_stress(nodal_strain(rest, mesh.tets, states["nodes_m"])[:, nearest], _stiffness(run) or 100.0)
 
 
 def _stiffness(run: Path) -> float | None:

@@ -10,6 +10,7 @@ the corotational law; it is a picture, no measurement.
 from __future__ import annotations
 
 import struct
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -43,11 +44,24 @@ def nodal_strain(rest: FloatArray, tets: IntArray, nodes: npt.ArrayLike) -> Floa
     return found / np.where(touched > 0, touched, np.inf)
 
 
-def stress_bytes(strain: FloatArray, stiffness_pa: float) -> bytes:
-    """Return largest stress (float32) and shares of it, 0 … 255, frame after frame, for strains at vertices (F, V).
+@dataclass(frozen=True, eq=False, slots=True)
+class SurfaceStress:
+    """Stress at the vertices of a surface over time, as coarse as colours need it."""
+
+    largest: float
+    """[Pa]; strain [%] where no material is known."""
+    shares: npt.NDArray[np.uint8]
+    """Of the largest, 0 … 255, shape (F, V)."""
+
+    def to_bytes(self) -> bytes:
+        """Return the largest as float32, little-endian, and the shares, frame after frame."""
+        return struct.pack("<f", self.largest) + self.shares.tobytes()
+
+
+def surface_stress(strain: FloatArray, stiffness_pa: float) -> SurfaceStress:
+    """Return the stress of strains at vertices, shape (F, V).
 
     stiffness_pa: 3 μ; 100 gives strains in percent where no material is known.
     """
     largest = float(strain.max(initial=0.0))
-    shares = np.rint(255.0 * strain / max(largest, 1e-12)).astype(np.uint8)
-    return struct.pack("<f", stiffness_pa * largest) + shares.tobytes()
+    return SurfaceStress(stiffness_pa * largest, np.rint(255.0 * strain / max(largest, 1e-12)).astype(np.uint8))

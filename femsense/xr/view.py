@@ -138,7 +138,7 @@ def live_page_files(page: Path) -> dict[str, Path | bytes]:
 
 
 def _stress(run: Path, glb: Path) -> bytes:
-    return stress_of_run(run, glb.read_bytes())
+    return stress_of_run(run, glb.read_bytes()).to_bytes()
 
 
 def _json(value: dict[str, Any]) -> bytes:

@@ -8,8 +8,10 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from glb import ROOT
 from helpers import write_block_robot, write_small_recording
@@ -17,11 +19,24 @@ from small_run import make_run
 from streams import within
 from xr_bar import write_run_with_mesh
 
-from femsense.app.stream_command import StreamOptions, let_drag, need_one, show_stream, stream_document, stream_runs, stream_text
+from femsense.app.stream_command import (
+    StreamOptions,
+    let_drag,
+    measure_by_sensors,
+    need_one,
+    show_stream,
+    stream_document,
+    stream_runs,
+    stream_text,
+)
 from femsense.core.errors import InputError
 from femsense.io.recording_folder import load_recording
 from femsense.io.robot_toml import load_robot
 from femsense.sensing.run_files import run_inputs, write_run
+from femsense.xr.proprioception.domain import learn_domain
+from femsense.xr.proprioception.model import ProprioceptiveModel
+from femsense.xr.proprioception.model_file import save_model
+from femsense.xr.proprioception.network import linear_network
 from femsense.xr.stream.drag_server import DragOptions
 from femsense.xr.stream.hub import Message
 from femsense.xr.stream.websocket import pack, unpack
@@ -106,6 +121,48 @@ def test_the_command_line_lets_a_viewer_drag_and_a_viewer_of_it_too(tmp_path: Pa
                 assert {row["name"] for row in heard["command"]["inputs"]} == set(made.robot.body.cable_names)
 
 
+def test_sensors_say_where_the_dragged_marker_is(tmp_path: Path, page: Path) -> None:
+    robot = write_block_robot(tmp_path / "robot")
+    made = make_run(load_robot(robot))
+    recording = load_recording(write_small_recording(tmp_path / "recording"))
+    run = write_run(made, tmp_path / "run", inputs=run_inputs(made.robot, recording, None))
+    marker, rest = made.robot.glued_names[0], made.robot.marker_points[0]
+    network = linear_network(np.zeros(1), np.ones(1), np.array([[0.0], [0.0], [1e-3]]), rest)  # a millimetre up for each unit
+    domain = learn_domain(np.random.default_rng(0).uniform(-2.0, 2.0, (300, 1)))
+    chain = ProprioceptiveModel(("bend",), (marker,), network, (), domain, None)
+    model, strange = (
+        save_model(chain, tmp_path / "m.onnx"),
+        save_model(replace(chain, marker_names=("other",)), tmp_path / "o.onnx"),
+    )
+    readings = tmp_path / "sensors.csv"
+    readings.write_text("time_s,bend\n0,1\n", encoding="utf-8")
+    place = dict(zip("xyz", map(float, rest + 2e-3 * np.eye(3)[2])))
+    wish = json.dumps({"handle": marker, "target_m": place, "held": True, "armed": False}).encode()
+    with stream_runs([run], StreamOptions(page=page)) as live:
+        let_drag(live, run, DragOptions())
+        with pytest.raises(InputError, match="no marker of the robot"):
+            measure_by_sensors(live, str(readings), strange)
+        measure_by_sensors(live, str(readings), model)
+        told: dict[str, object] = {}
+        end = time.monotonic() + 20.0
+        with readings.open("a", encoding="utf-8") as file:
+            while time.monotonic() < end and "measured_error_m" not in told:
+                file.write(f"{time.monotonic()},1\n")
+                file.flush()
+                live.hub.received(Message(f"femsense/{made.robot.name}/drag", wish), "me")
+                time.sleep(0.05)
+                newest = live.hub.newest().get(f"femsense/{made.robot.name}/reach")
+                told = {} if newest is None else json.loads(newest.payload)
+            (said,) = json.loads(live.hub.newest()[f"femsense/{made.robot.name}/measured"].payload)["markers"]
+            assert said["name"] == marker and said["position_m"]["z"] == pytest.approx(rest[2] + 1e-3, abs=1e-7)
+            assert told["measured_error_m"] == pytest.approx(1e-3, abs=1e-6)
+            file.write("1e9,50\n")  # never learnt: says nothing
+            file.flush()
+            time.sleep(0.2)
+    (said,) = json.loads(live.hub.newest()[f"femsense/{made.robot.name}/measured"].payload)["markers"]
+    assert said["position_m"]["z"] < rest[2] + 2e-3
+
+
 @contextmanager
 def command_line(*arguments: str) -> Iterator[str]:
     """The address that a command says it serves; it ends when it is told to, without a traceback."""
@@ -130,6 +187,10 @@ def test_commands_that_name_nothing_or_too_much_are_refused(capsys: pytest.Captu
 
     assert run(["stream"]) == 2 and "one of both" in capsys.readouterr().err
     assert run(["stream", "no-such-run"]) == 2 and "no states.npz" in capsys.readouterr().err
+    assert (
+        run(["stream", "no-such-run", "--sensors", "x.csv", "--model", "m.onnx"]) == 2
+        and "one of both" in capsys.readouterr().err
+    )
     assert run(["view"]) == 2 and "nothing to show" in capsys.readouterr().err
     assert run(["view", "a-run", "--stream", "http://127.0.0.1:1"]) == 2
     with pytest.raises(InputError):

@@ -121,7 +121,9 @@ def stream(
     runs: Annotated[list[Path] | None, typer.Argument(metavar="RUN", help="Runs to play.", show_default=False)] = None,
     sensors: Annotated[
         str | None,
-        typer.Option("--sensors", metavar="SOURCE", help="A CSV file, udp://, mqtt:// or serial: instead.", show_default=False),
+        typer.Option(
+            "--sensors", metavar="SOURCE", help="CSV file, udp://, mqtt://, serial: – alone, or with --drag.", show_default=False
+        ),
     ] = None,
     model: Annotated[
         Path | None, typer.Option("--model", metavar="MODEL", help="Of femsense learn, for --sensors.", show_default=False)
@@ -153,9 +155,17 @@ def stream(
     json: Json = False,
 ) -> Answer:
     """Send bone poses and forces over MQTT and WebSocket."""
-    from femsense.app.stream_command import StreamOptions, let_drag, need_model, need_one, stream_runs, stream_sensors
+    from femsense.app.stream_command import (
+        StreamOptions,
+        let_drag,
+        measure_by_sensors,
+        need_model,
+        need_stream,
+        stream_runs,
+        stream_sensors,
+    )
 
-    need_one(runs or [], sensors)
+    need_stream(runs or [], sensors, drag=drag or commands)
     need_model(sensors, model)
     options = StreamOptions(
         host=host,
@@ -169,7 +179,7 @@ def stream(
         authority=authority,
         rate_hz=rate,
     )
-    if sensors is not None and model is not None:
+    if sensors is not None and model is not None and not runs:
         return _live(stream_sensors(sensors, model, options), browser)
     live = stream_runs(runs or [], options, loop=not once)
     if drag or commands:
@@ -177,6 +187,8 @@ def stream(
         from femsense.xr.stream.drag_server import DragOptions
 
         let_drag(live, (runs or [])[0], DragOptions(gate=GateOptions(allowed=commands)))
+        if sensors is not None and model is not None:
+            measure_by_sensors(live, sensors, model)
     return _live(live, browser)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import struct
 import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -65,7 +64,6 @@ def open_run(folder: str | Path, *, name: str | None = None, clouds: bool = True
     skin = read_glb(glb)
     skeleton = skin.skin.skeleton
     stress = stress_of_run(run, glb)
-    (largest,) = struct.unpack_from("<f", stress)
     twin = Twin(
         name=name or str(told["name"]),
         glb=glb,
@@ -74,12 +72,11 @@ def open_run(folder: str | Path, *, name: str | None = None, clouds: bool = True
         inputs=tuple(Input(**entry) for entry in told["inputs"]),
         landmarks=landmarks_of_run(run),
         duration_s=float(skin.time_s[-1]),
-        field=FieldKind(**told["field"], largest=largest),
+        field=FieldKind(**told["field"], largest=stress.largest),
     )
     frames = tuple(told["frames"])
     measured = _clouds(run, frames) if clouds else None
-    shares = np.frombuffer(stress, np.uint8, offset=4).reshape(len(frames), -1)
-    return RunStream(twin, skin, frames, measured or (None,) * len(frames), shares)
+    return RunStream(twin, skin, frames, measured or (None,) * len(frames), stress.shares)
 
 
 def frames_of(stream: RunStream, *, rate_hz: float = 60.0, loop: bool = True) -> Iterator[TwinFrame]:

@@ -48,6 +48,18 @@ def frames_of_sensors(source: str, model: ProprioceptiveModel, stop: Event) -> I
         yield TwinFrame(time_s, bones, inputs=tuple(float(v) for v in row), status=said or "ok")
 
 
+def markers_of_sensors(source: str, model: ProprioceptiveModel, stop: Event) -> Iterator[tuple[float, dict[str, FloatArray]]]:
+    """Yield the time [s] and the places of the markers [m], name → shape (3,), of each reading of a source (see `readings_of`).
+
+    Readings outside of what the model was taught are left out: their markers are guesses.
+    """
+    live = model.live()
+    for time_s, row in readings_of(source, model.channels, stop):
+        pose = live.step(row, time_s)
+        if not pose.outside:
+            yield time_s, dict(zip(model.marker_names, pose.markers))
+
+
 def tube_around(places: FloatArray, across: FloatArray) -> tuple[Skin, IntArray]:
     """Return a closed tube around a chain of bones, and its triangles, shape (t, 3).
 
