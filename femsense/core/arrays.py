@@ -22,7 +22,7 @@ def freeze(array: npt.ArrayLike, dtype: Any = np.float64) -> npt.NDArray[Any]:
     return result
 
 
-def read_only(array: FloatArray) -> FloatArray:
+def read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Return a read-only view of an array (a copy where it is not contiguous):
     kernels are compiled once more for arrays that can be written to."""
     view = np.ascontiguousarray(array).view()

@@ -81,6 +81,30 @@ def feet(corners: FloatArray, points: FloatArray, best: FloatArray) -> None:
 
 
 @njit(cache=True, nogil=True)
+def closest_of_surface(positions: FloatArray, triangles: IntArray, place: FloatArray, closest: FloatArray) -> None:
+    """Write the point (3,) of a surface, of triangles (t, 3), that is closest to a place (3,)."""
+    point, least = (place[0], place[1], place[2]), np.inf
+    for t in range(len(triangles)):
+        a, b, c = _vector(positions, triangles[t, 0]), _vector(positions, triangles[t, 1]), _vector(positions, triangles[t, 2])
+        u, v, w = _foot(a, b, c, point)
+        x, y, z = u * a[0] + v * b[0] + w * c[0], u * a[1] + v * b[1] + w * c[1], u * a[2] + v * b[2] + w * c[2]
+        distance = _length(_minus((x, y, z), point))
+        if distance < least:
+            least = distance
+            closest[0], closest[1], closest[2] = x, y, z
+
+
+@njit(cache=True, nogil=True)
+def gaps_of_faces(positions: FloatArray, faces: IntArray, place: FloatArray, gaps: FloatArray) -> None:
+    """Write how far the nearest corner of each face is from a place, less the length of its first side, shape (f,)."""
+    point = place[0], place[1], place[2]
+    for f in range(len(faces)):
+        a, b, c = _vector(positions, faces[f, 0]), _vector(positions, faces[f, 1]), _vector(positions, faces[f, 2])
+        near = min(_length(_minus(a, point)), _length(_minus(b, point)), _length(_minus(c, point)))
+        gaps[f] = near - _length(_minus(b, a))
+
+
+@njit(cache=True, nogil=True)
 def _drawn_to_face(corners: FloatArray, point: Vector, best: FloatArray) -> None:
     """Write the barycentric coordinates (4,) of the point on the faces of a tetrahedron (4, 3) that is closest to a point."""
     least = np.inf

@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from femsense.core.arrays import FloatArray, IntArray, as_points, freeze
+from femsense.core.arrays import FloatArray, IntArray, as_points, freeze, read_only
 from femsense.core.errors import InputError
 from femsense.fem.closest_point import FACES, carry, drawn_to_faces, feet, keep_deepest, may_hold
+from femsense.fem.normals import area_vectors, unit_sums
 
 EDGES = np.array([[0, 1], [1, 2], [0, 2], [0, 3], [1, 3], [2, 3]])
 FACE_EDGES = np.array([[1, 5, 4], [3, 5, 2], [0, 4, 3], [2, 1, 0]])  # middle of each side of a face: (ab, bc, ca)
@@ -189,18 +190,16 @@ def surface_triangles(mesh: TetMesh) -> IntArray:
 
 def triangle_normals(positions: FloatArray, triangles: IntArray) -> FloatArray:
     """Return area vectors (normal × area) of triangles [m²], shape (t, 3)."""
-    a, b, c = (positions[triangles[:, i]] for i in range(3))
-    return np.cross(b - a, c - a) / 2.0
+    vectors = np.empty((len(triangles), 3))
+    area_vectors(read_only(np.asarray(positions, np.float64)), read_only(np.asarray(triangles, np.int64)), vectors)
+    return vectors
 
 
 def vertex_normals(positions: FloatArray, triangles: IntArray) -> FloatArray:
     """Return unit normals at all nodes, area weighted, shape (n, 3); zero where a node is in no triangle."""
-    area = triangle_normals(positions, triangles)
-    normals = np.zeros_like(positions)
-    for i in range(3):
-        np.add.at(normals, triangles[:, i], area)
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    return np.asarray(np.divide(normals, length, out=np.zeros_like(normals), where=length > 0))
+    normals = np.empty((len(positions), 3))
+    unit_sums(read_only(np.asarray(triangles, np.int64)), triangle_normals(positions, triangles), normals)
+    return normals
 
 
 def barycentric(mesh: TetMesh, elements: IntArray, points: FloatArray) -> FloatArray:

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from femsense.core.arrays import FloatArray, IntArray
-from femsense.fem.mesh import TetMesh, closest_in_triangle, surface_triangles, triangle_normals
+from femsense.core.arrays import FloatArray, IntArray, read_only
+from femsense.fem.closest_point import closest_of_surface, gaps_of_faces
+from femsense.fem.mesh import TetMesh, surface_triangles, triangle_normals
 
 
 def _lattice(parts: int) -> FloatArray:
@@ -107,16 +108,15 @@ def patch_at(
         facing: the outward normal that was seen there, shape (3,): faces that look elsewhere do not count.
     """
     centre = closest_surface_point(surface, positions, place, facing=facing)
-    corners = positions[surface.faces[:, :3]]
-    beyond = np.linalg.norm(corners - centre, axis=2).min(axis=1) - np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1)
+    beyond = np.empty(len(surface.faces))
+    gaps_of_faces(read_only(positions), read_only(surface.faces), centre, beyond)
     faces = surface.faces[beyond <= max(radius, float(beyond.min()) + surface.edge)]
     values = _shape_values(LATTICE, faces.shape[1])  # of each point of a face, (p, 3 or 6)
     distance = np.linalg.norm(np.einsum("pa,fac->fpc", values, positions[faces]) - centre, axis=2)
     reach = max(radius, 1.01 * float(np.partition(distance, 2, axis=None)[2]))
     area = np.linalg.norm(triangle_normals(positions, faces[:, :3]), axis=1)
     pressed = area[:, None] * np.maximum(1.0 - distance / reach, 0.0)
-    share = np.zeros(len(positions))
-    np.add.at(share, faces, pressed @ values)
+    share = np.bincount(faces.ravel(), (pressed @ values).ravel(), minlength=len(positions))
     share[clamped] = 0.0
     if share.sum() <= 0.0:  # a place on the clamp: its nearest free node
         free = np.setdiff1d(surface.nodes, clamped)
@@ -134,10 +134,9 @@ def closest_surface_point(
         normals = triangle_normals(positions, triangles)
         looks = normals @ facing > 0.35 * np.linalg.norm(normals, axis=1) * np.linalg.norm(facing)
         triangles = triangles[looks] if looks.any() else triangles
-    corners = positions[triangles]
-    weights = closest_in_triangle(corners, np.broadcast_to(place, (len(corners), 3)))
-    points = np.einsum("ti,tic->tc", weights, corners)
-    return np.asarray(points[np.argmin(np.linalg.norm(points - place, axis=1))])
+    closest = np.empty(3)
+    closest_of_surface(read_only(positions), read_only(triangles), np.array(place, dtype=np.float64), closest)
+    return closest
 
 
 def _faces(triangles: IntArray, *, quadratic: bool) -> IntArray:

@@ -15,9 +15,9 @@ from femsense.core.arrays import FloatArray
 from femsense.core.errors import DataError
 from femsense.fem.compliance import Tangent, tangent_at
 from femsense.fem.equilibrium import Equilibrium
-from femsense.qp.forces import estimate_forces
-from femsense.qp.friction_cone import FrictionCone
-from femsense.qp.problem import ForceOptions
+from femsense.qp.friction_cone import pyramid_rows
+from femsense.qp.problem import Problem
+from femsense.qp.solve import solve
 from femsense.sensing.nuisance import misfit_of, nuisance_columns, robust_std, sag_at
 from femsense.sensing.touches import friction_cone, nodal_forces_by_shift, tangents_of, touch_normal
 from femsense.sensing.types import Rows, Sensor, Touch
@@ -67,6 +67,7 @@ class Linearisation:
     residual: FloatArray  # (r,), without what the free frames say
     normals: FloatArray  # outward, deformed, (m, 3)
     moves: FloatArray  # of the nodes by unit forces, (3m, n, 3)
+    sag: FloatArray  # of the nodes by the modulus and the pulls, as `sag_at` has it
 
     def cost(self, here: Iterate) -> float:
         """Return the misfit of the state, priors included."""
@@ -85,10 +86,10 @@ class Linearisation:
         place_std = np.repeat([t.std_m for t in here.touches], 2)
         free = np.repeat([t.std_m > 0 and float(np.linalg.norm(f)) > 0 for t, f in zip(here.touches, here.forces)], 2)
         wanted = np.array([e @ (t.expected - t.place) for t, e in zip(here.touches, self.frames)]).ravel()
-        R = self._reduced_rows(here, free * place_std, free * wanted)
-        held = self._held(sensor, here, R, place_std, free * wanted, trust)
-        forces, others, sizes = self._forces_and_sizes(sensor, here, R, held)
-        covariance = _posterior(R, block_diag(*_prior_roots(here.touches, self.normals, WIDER * sizes)))
+        normal = self._normal_equations(here, free * place_std, free * wanted)
+        held = self._held(sensor, here, normal, place_std, free * wanted, trust)
+        forces, others, sizes = self._forces_and_sizes(sensor, here, normal, held)
+        covariance = normal.covariance(block_diag(*_prior_roots(here.touches, self.normals, WIDER * sizes)))
         place = covariance[3 * m : 5 * m, 3 * m : 5 * m] * np.outer(place_std, place_std)
         places = np.array([e.T @ place[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] @ e for i, e in enumerate(self.frames)])
         scale = max(1.0, 1.483 * float(np.median(np.abs(self.residual / here.rows.std)))) ** 2
@@ -102,55 +103,110 @@ class Linearisation:
             sizes,
         )
 
-    def _reduced_rows(self, here: Iterate, shift_std: FloatArray, wanted: FloatArray) -> FloatArray:
-        """Return the triangle of forces, shifts, nuisance and right-hand side that says what all whitened rows say."""
-        by_shift = self.by_shift * shift_std
+    def _normal_equations(self, here: Iterate, shift_std: FloatArray, wanted: FloatArray) -> NormalEquations:
+        """Return what all whitened rows say of forces, shifts and nuisance; the latter two have their unit priors."""
         rest = self.residual + self.by_force @ here.forces.ravel() - self.by_shift @ wanted
-        A = np.hstack([self.by_force, by_shift, self.nuisance, rest[:, None]])
-        return np.asarray(np.linalg.qr(A / robust_std(here.rows, self.residual)[:, None], mode="r"))
+        A = np.hstack([self.by_force, self.by_shift * shift_std, self.nuisance, rest[:, None]])
+        A /= robust_std(here.rows, self.residual)[:, None]
+        gram, f = A.T @ A, self.by_force.shape[1]
+        others = np.append(np.zeros(f), np.ones(len(gram) - 1 - f))
+        return NormalEquations(gram[:-1, :-1] + np.diag(others), gram[:-1, -1], f)
 
     def _held(
-        self, sensor: Sensor, here: Iterate, R: FloatArray, place_std: FloatArray, wanted: FloatArray, trust: float
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return rows and values that hold forces and shifts near those that are here; none where the step is trusted."""
-        m, q, edge = len(here.touches), R.shape[1] - 1, sensor.surface.edge
+        self, sensor: Sensor, here: Iterate, normal: NormalEquations, place_std: FloatArray, wanted: FloatArray, trust: float
+    ) -> NormalEquations:
+        """Return the normal equations with forces and shifts held near those that are here; as they are where the step is trusted."""
         if trust >= 1.0:
-            return np.zeros((0, q)), np.zeros(0)
+            return normal
+        m, edge = len(here.touches), sensor.surface.edge
         prior = block_diag(*_prior_roots(here.touches, self.normals, here.sizes))
-        free_forces, _ = _solve_qp(R, prior, None, (np.zeros((0, q)), np.zeros(0)))
-        far = max(float(np.abs(free_forces).max()), 1e-6)
+        far = max(float(np.abs(normal.of_forces().forces(prior)).max()), 1e-6)
         weight = np.concatenate([np.full(3 * m, 1.0 / far), place_std / edge]) / trust
-        rows = np.diag(np.append(weight, np.zeros(q - 5 * m)))[: 5 * m]
-        return rows, np.append(here.forces.ravel() / far, -wanted / edge) / trust
+        value = np.append(here.forces.ravel() / far, -wanted / edge) / trust
+        matrix, right = normal.matrix.copy(), normal.right.copy()
+        matrix[: 5 * m, : 5 * m] += np.diag(weight**2)
+        right[: 5 * m] += weight * value
+        return NormalEquations(matrix, right, 3 * m)
 
     def _forces_and_sizes(
-        self, sensor: Sensor, here: Iterate, R: FloatArray, held: tuple[FloatArray, FloatArray]
+        self, sensor: Sensor, here: Iterate, normal: NormalEquations, held: NormalEquations
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return forces (m, 3), the other unknowns, and the size of each force that makes the rows likeliest (m,)."""
         m, sizes = len(here.touches), here.sizes
         cone = friction_cone(sensor, here.touches, self.normals)
+        sides = None if cone is None else pyramid_rows(cone, 0, 3 * m, 0)
+        free = normal.of_forces()
+        bound = free if held is normal else held.of_forces()
         for _ in range(SIZINGS):
             prior = block_diag(*_prior_roots(here.touches, self.normals, sizes))
-            covariance = _posterior(R, prior)
-            forces, others = _solve_qp(R, prior, cone, held)
-            whitened = prior @ covariance[: 3 * m, : 3 * m] @ prior.T
-            share = ((prior @ forces.ravel()) ** 2 + np.diag(whitened)).reshape(m, 3).sum(axis=1) / 3.0
+            forces = bound.forces(prior, sides)
+            whitened = prior @ np.linalg.inv(free.matrix + prior.T @ prior) @ prior.T
+            share = ((prior @ forces) ** 2 + np.diag(whitened)).reshape(m, 3).sum(axis=1) / 3.0
             new = np.clip(sizes * np.sqrt(share), 1e-6, sensor.options.force_std_n)
             settled = bool((np.abs(new - sizes) < 0.02 * new).all())
             sizes = new
             if settled:
                 break
-        return forces, others, sizes
+        return forces.reshape(m, 3), bound.others(forces), sizes
 
 
-def linearise(sensor: Sensor, here: Iterate) -> Linearisation:
-    """Return how the rows of an iterate answer to forces, to shifts of their places, and to the nuisance."""
-    tangent = tangent_at(sensor.robot.body, here.state)
+@dataclass(frozen=True, eq=False, slots=True)
+class NormalEquations:
+    """The least-squares problem of one step without the prior of its forces."""
+
+    matrix: FloatArray  # (q, q), forces first
+    right: FloatArray  # (q,)
+    force_count: int
+
+    def of_forces(self) -> ForceEquations:
+        """Return the equations of the forces, all else eliminated."""
+        f, A, b = self.force_count, self.matrix, self.right
+        eliminated = np.linalg.solve(A[f:, f:], np.column_stack([A[f:, :f], b[f:]]))
+        left = A[:f, :f] - A[:f, f:] @ eliminated[:, :f]
+        return ForceEquations(0.5 * (left + left.T), b[:f] - A[:f, f:] @ eliminated[:, f], eliminated)
+
+    def covariance(self, prior: FloatArray) -> FloatArray:
+        """Return the covariance of all unknowns; the cone, where it acts, would only make it smaller."""
+        precision, f = self.matrix.copy(), self.force_count
+        precision[:f, :f] += prior.T @ prior
+        return np.asarray(np.linalg.inv(precision))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ForceEquations:
+    """Normal equations of the forces alone."""
+
+    matrix: FloatArray  # (f, f)
+    right: FloatArray  # (f,)
+    eliminated: FloatArray  # how all else answers to the forces, and what it is without them, (q − f, f + 1)
+
+    def forces(self, prior: FloatArray, sides: FloatArray | None = None) -> FloatArray:
+        """Return the forces (f,) with their whitening prior (f, f), within a pyramid whose sides (s, f) say sides · f ≤ 0. Raises DataError."""
+        precision = self.matrix + prior.T @ prior
+        free = np.linalg.solve(precision, self.right)
+        if sides is None or (sides @ free <= 0.0).all():
+            return np.asarray(free)
+        answer = solve(Problem(P=precision, q=-self.right, G=sides, h=np.zeros(len(sides))))
+        if answer.x is None or not np.isfinite(answer.x).all():
+            raise DataError(f"the force problem has no answer: {answer.status}")
+        return answer.x
+
+    def others(self, forces: FloatArray) -> FloatArray:
+        """Return shifts and nuisance that belong to forces (f,), shape (q − f,)."""
+        return np.asarray(self.eliminated[:, -1] - self.eliminated[:, :-1] @ forces)
+
+
+def linearise(sensor: Sensor, here: Iterate, at_hand: tuple[Tangent, FloatArray] | None = None) -> Linearisation:
+    """Return how the rows of an iterate answer to forces, to shifts of their places, and to the nuisance.
+
+    `at_hand` are the tangent and `sag_at` of its state, where these are known.
+    """
+    tangent = tangent_at(sensor.robot.body, here.state) if at_hand is None else at_hand[0]
     n, m = len(here.state.positions), len(here.touches)
     basis = np.array([t.patch.spread(axis, n) for t in here.touches for axis in np.eye(3)])
     frames = np.array([tangents_of(t.normal) for t in here.touches]).reshape(m, 2, 3)
     shifts = [nodal_forces_by_shift(sensor, t, e, f) for t, es, f in zip(here.touches, frames, here.forces) for e in es]
-    sag = sag_at(sensor, here.state, tangent)
+    sag = sag_at(sensor, here.state, tangent) if at_hand is None else at_hand[1]
     moves = tangent.respond(np.concatenate([basis, np.array(shifts)]))
     answers = here.rows.functional(moves)
     columns, known = nuisance_columns(sensor.knowledge, here.rows, sag)
@@ -163,6 +219,7 @@ def linearise(sensor: Sensor, here: Iterate) -> Linearisation:
         here.rows.residual - known,
         np.array([touch_normal(sensor, t, here.state) for t in here.touches]),
         moves[: 3 * m],
+        sag,
     )
 
 
@@ -178,25 +235,3 @@ def _prior_roots(touches: Sequence[Touch], normals: FloatArray, sizes: FloatArra
         across = 1.0 if touch.source == "given" else ACROSS
         result.append(np.vstack([normal, tangents_of(normal) / across]) / size)
     return result
-
-
-def _posterior(R: FloatArray, prior: FloatArray) -> FloatArray:
-    """Return the covariance of forces, shifts and nuisance; the cone, where it acts, would only make it smaller."""
-    A, f = R[:, :-1], len(prior)
-    precision = A.T @ A + np.eye(A.shape[1])
-    precision[:f, :f] += prior.T @ prior - np.eye(f)
-    return np.asarray(np.linalg.inv(precision))
-
-
-def _solve_qp(
-    R: FloatArray, prior: FloatArray, cone: FrictionCone | None, held: tuple[FloatArray, FloatArray]
-) -> tuple[FloatArray, FloatArray]:
-    """Return forces (m, 3) within the cone and the nuisance; `held` are rows and values that hold them. Raises DataError."""
-    f = len(prior)
-    A = np.vstack([R[:, :-1], np.hstack([prior, np.zeros((f, R.shape[1] - 1 - f))]), held[0]])
-    b = np.concatenate([R[:, -1], np.zeros(f), held[1]])
-    options = ForceOptions(nuisance=A[:, f:], nuisance_std=np.ones(A.shape[1] - f), friction_cone=cone)
-    estimate = estimate_forces(A[:, :f], None, np.zeros(len(A)), b, std=1.0, options=options)
-    if not np.isfinite(estimate.forces).all():
-        raise DataError(f"the force problem has no answer: {estimate.status}")
-    return estimate.forces.reshape(-1, 3), estimate.nuisance

@@ -26,13 +26,14 @@ TRIES = 4
 """How often a step is made shorter where it leads too far: first along what the rows hardly determine."""
 
 
-def no_forces(sensor: Sensor, k: int, scan: Scan | None, state: Equilibrium) -> Fit:
-    """Return the fit of a frame without contacts."""
+def no_forces(sensor: Sensor, k: int, scan: Scan | None, state: Equilibrium, like: Fit | None = None) -> Fit:
+    """Return the fit of a frame without contacts; `like` is one of the same state to other points."""
     rows = rows_at(sensor, k, scan, state)
-    sag = sag_at(sensor, state, tangent_at(sensor.robot.body, state))
+    tangent = tangent_at(sensor.robot.body, state) if like is None or like.tangent is None else like.tangent
+    sag = sag_at(sensor, state, tangent) if like is None or like.sag is None else like.sag
     columns, known = nuisance_columns(sensor.knowledge, rows, sag)
     cost = misfit_with_lost(rows.residual - known, columns, rows)
-    return Fit((), state, np.zeros((0, 3)), np.zeros((0, 0)), np.zeros((0, 3, 3)), rows, cost)
+    return Fit((), state, np.zeros((0, 3)), np.zeros((0, 0)), np.zeros((0, 3, 3)), rows, cost, tangent=tangent, sag=sag)
 
 
 def fit_forces(
@@ -100,7 +101,7 @@ class _Frame:
         """Return the free state, or the given start where that explains the frame better. Raises DataError."""
         m, sensor = len(touches), self.sensor
         here = Iterate(tuple(touches), np.zeros((m, 3)), free.state, free.rows, np.full(m, sensor.options.force_std_n))
-        linear = linearise(sensor, here)
+        linear = linearise(sensor, here, None if free.tangent is None or free.sag is None else (free.tangent, free.sag))
         if start is None or len(start[1]) != m:
             return here, linear
         forces = within_cones(sensor, here.touches, start[1], start[0])
@@ -142,6 +143,8 @@ class _Frame:
             here.rows,
             linear.cost(replace(here, sizes=sizes)),
             converged,
+            linear.tangent,
+            linear.sag,
         )
 
 

@@ -86,7 +86,8 @@ def unspoken(fit: Fit, i: int) -> bool:
 
 def left_over(sensor: Sensor, fit: Fit) -> float:
     """Return the misfit per row that a fit leaves, about 1 where all is explained."""
-    return misfit(sensor.knowledge, fit.rows, sag_at(sensor, fit.state, tangent_at(sensor.robot.body, fit.state)))
+    sag = sag_at(sensor, fit.state, tangent_at(sensor.robot.body, fit.state)) if fit.sag is None else fit.sag
+    return misfit(sensor.knowledge, fit.rows, sag)
 
 
 def least_stretch(mesh: TetMesh, positions: FloatArray, carrying: IntArray) -> float:

@@ -54,6 +54,7 @@ def _ray_rows(sensor: Sensor, scan: Scan, state: Equilibrium) -> Rows:
         lost=len(scan.view) - len(rows.residual),
         of_clouds=True,
         together=sensor.knowledge.together,
+        operator=move,
     )
 
 

@@ -74,9 +74,9 @@ def segmented(
         if not fit.touches:
             break
         scan = _parted(sensor, every, state)
-        free = no_forces(sensor, k, scan, free.state)
+        free = no_forces(sensor, k, scan, free.state, free)
     scan = _parted(sensor, every, state)
-    return scan, no_forces(sensor, k, scan, free.state)
+    return scan, no_forces(sensor, k, scan, free.state, free)
 
 
 def _parted(sensor: Sensor, scan: Scan, state: Equilibrium) -> Scan:
@@ -122,11 +122,11 @@ def find_hidden(sensor: Sensor, fit: Fit) -> list[Touch]:
 def evidence(sensor: Sensor, fit: Fit) -> tuple[FloatArray, FloatArray]:
     """Return the gain in log evidence of one more contact at each candidate, shape (c,), and its force (c, 3) [N]."""
     body, n, rows = sensor.robot.body, len(fit.state.positions), fit.rows
-    tangent = tangent_at(body, fit.state)
+    tangent = tangent_at(body, fit.state) if fit.tangent is None else fit.tangent
     normals = vertex_normals(fit.state.positions, sensor.surface.triangles)[sensor.candidates]
     frames = np.array([np.vstack([m, np.linalg.svd(m[None])[2][1:]]) for m in normals])  # rows: normal, tangents
     answers = _answers(sensor, fit.state, tangent)
-    columns, known = nuisance_columns(sensor.knowledge, rows, sag_at(sensor, fit.state, tangent))
+    columns, known = nuisance_columns(sensor.knowledge, rows, sag_at(sensor, fit.state, tangent) if fit.sag is None else fit.sag)
     residual = rows.residual - known
     other = (
         [rows.functional(tangent.respond(np.array([t.patch.spread(a, n) for t in fit.touches for a in np.eye(3)])))]
@@ -138,7 +138,7 @@ def evidence(sensor: Sensor, fit: Fit) -> tuple[FloatArray, FloatArray]:
     thin = np.arange(0, len(std), max(1, len(std) // THIN))
     share = len(std) / len(thin)
     N, z = columns[thin] / std[thin, None], residual[thin] / std[thin]
-    W = (rows.functional(answers)[thin] / std[thin, None]).reshape(len(thin), -1, 3)
+    W = (rows.some(thin, answers) / std[thin, None]).reshape(len(thin), -1, 3)
     W = np.einsum("rcj,cij->rci", W, frames).reshape(len(thin), -1)
     inner = np.linalg.inv(N.T @ N + np.eye(N.shape[1]) / share)
     Nz, NW = N.T @ z, N.T @ W
@@ -158,14 +158,15 @@ def evidence(sensor: Sensor, fit: Fit) -> tuple[FloatArray, FloatArray]:
 
 
 def _answers(sensor: Sensor, state: Equilibrium, tangent: Tangent) -> FloatArray:
-    """Return how the nodes answer to unit forces at the candidates near a state [m/N], shape (3c, n, 3)."""
+    """Return how the nodes answer to unit forces at the candidates near a state [m/N], shape (3n, 3c)."""
     kept = sensor.answers
-    if kept.positions is None or kept.moves is None or np.abs(kept.positions - state.positions).max() > NEARBY * sensor.size:
+    if kept.positions is None or kept.columns is None or np.abs(kept.positions - state.positions).max() > NEARBY * sensor.size:
         n, c = len(state.positions), len(sensor.candidates)
         loads = np.zeros((c, 3, n, 3))
         loads[np.arange(c), :, sensor.candidates] = np.eye(3)
-        kept.positions, kept.moves = state.positions, tangent.respond(loads.reshape(-1, n, 3))
-    return kept.moves
+        moves = tangent.respond(loads.reshape(-1, n, 3))
+        kept.positions, kept.columns = state.positions, np.ascontiguousarray(moves.reshape(3 * c, -1).T)
+    return kept.columns
 
 
 # --- helpers ----------------------------------------------------------------------------------------------------------

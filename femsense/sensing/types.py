@@ -9,10 +9,12 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import scipy.sparse as sp
 
 import femsense
 from femsense.calib.calibration import Calibration
 from femsense.core.arrays import FloatArray, IntArray
+from femsense.fem.compliance import Tangent
 from femsense.fem.equilibrium import Equilibrium
 from femsense.model.camera import CameraNoise
 from femsense.model.contact_patch import BodySurface, ContactPatch
@@ -201,6 +203,10 @@ class Fit:
     """Misfit: Huber's function of the whitened residual with nuisance fitted, and the priors."""
     still: bool = True
     """Whether the forces had stopped changing."""
+    tangent: Tangent | None = None
+    """At the state, where it was made."""
+    sag: FloatArray | None = None
+    """How the nodes move with the modulus and the pulls (`sag_at`), where that was asked."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -258,6 +264,14 @@ class Rows:
     """Whether the rows are points of clouds, and not markers."""
     together: float = 1.0
     """How many rows count as one, since neighbours err together."""
+    operator: sp.csr_array | None = None
+    """What `functional` does, as a matrix, shape (r, 3n); None for markers."""
+
+    def some(self, which: IntArray, columns: FloatArray) -> FloatArray:
+        """Return the rows `which` (t,) of node displacements that stand in columns (3n, k), shape (t, k)."""
+        if self.operator is None:
+            return self.functional(columns.T.reshape(columns.shape[1], -1, 3))[which]
+        return np.asarray(self.operator[which] @ columns)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -292,8 +306,8 @@ class Answers:
 
     positions: FloatArray | None = None
     """Nodes of that state [m], shape (n, 3)."""
-    moves: FloatArray | None = None
-    """Of the surface nodes by unit forces along x, y, z at each candidate [m/N], shape (3c, n, 3)."""
+    columns: FloatArray | None = None
+    """Moves of the nodes by unit forces along x, y, z at each candidate [m/N], shape (3n, 3c)."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
