@@ -163,7 +163,7 @@ class NormalEquations:
         f, A, b = self.force_count, self.matrix, self.right
         eliminated = np.linalg.solve(A[f:, f:], np.column_stack([A[f:, :f], b[f:]]))
         left = A[:f, :f] - A[:f, f:] @ eliminated[:, :f]
-        return ForceEquations(0.5 * (left + left.T), b[:f] - A[:f, f:] @ eliminated[:, f], eliminated)
+        return ForceEquations(np.asarray(0.5 * (left + left.T)), b[:f] - A[:f, f:] @ eliminated[:, f], eliminated)
 
     def covariance(self, prior: FloatArray) -> FloatArray:
         """Return the covariance of all unknowns; the cone, where it acts, would only make it smaller."""
