@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import femsense
 from femsense.app.input_checks import warn_of_clouds
 from femsense.calib.files import read_calibration
-from femsense.core.errors import FemsenseError, InputError
+from femsense.core.errors import DataError, FemsenseError, InputError
 from femsense.core.parallel import beside
 from femsense.io.checkpoint import UNFINISHED
 from femsense.io.files import file_hash
@@ -72,6 +72,8 @@ def estimate_into(
     if given is None:
         say(f"no calibration given: calibrating first, into {Path(folder) / 'calibration.json'}")
     used = calibrate(body, frames) if given is None else given
+    if not used.settled:
+        raise DataError(f"the calibration is not to be used: {used.status}")
     began = time.perf_counter()
     run = estimate(body, frames, used, at=at, options=options, progress=progress, keep=_kept(folder, inputs))
     write_run(run, folder, inputs=inputs, seconds=time.perf_counter() - began, calibration=used)

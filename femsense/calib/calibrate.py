@@ -22,6 +22,7 @@ from femsense.calib.inputs import first_inputs, initial_state, input_bounds, inp
 from femsense.calib.inputs_from_clouds import with_initial_inputs
 from femsense.calib.joint import PLACEMENT_STD_FLOOR, fit_joint, root_mean_square
 from femsense.calib.marker_assignment import name_markers
+from femsense.calib.other_readings import check_other_readings
 from femsense.calib.rigid import fit_rigid, fit_rigid_robust
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import DataError
@@ -127,9 +128,15 @@ def _fitted(
         scene, fit, poses, initial, jet = _fitted_as_named(robot, better, chosen, history)
         pairs = pairs_of(robot, scene, poses, jet.residual)
     if strict:
-        check_inputs(robot, scene.recording, pairs)
+        check_inputs(scene.recording, pairs)
+        check_other_readings(robot, scene, pairs, initial, jet.residual, _residual_of)
     check_reading(robot, pairs, strict=strict)
     return scene, fit, poses, initial, jet
+
+
+def _residual_of(robot: Robot, recording: Recording, frames: IntArray) -> FloatArray:
+    """Return what a fit to some frames leaves [m], shape (k, 3)."""
+    return _fitted_as_named(robot, recording, frames, [])[-1].residual
 
 
 def _fitted_as_named(

@@ -48,6 +48,11 @@ class Calibration:
     """Of (rotation [rad], shift [m]) of all cameras together, shape (6 v, 6 v); not given:
     that of the first camera alone is known."""
 
+    @property
+    def settled(self) -> bool:
+        """Whether the fit came to an end; what has not settled is no calibration."""
+        return not self.status.startswith("not settled")
+
     def __repr__(self) -> str:
         fits = [(self.rms_m, "markers"), (self.normal_rms_m, "clouds")]
         said = [f"{1e3 * value:.3g} mm rms of {what}" for value, what in fits if np.isfinite(value)]

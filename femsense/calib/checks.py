@@ -69,7 +69,7 @@ def similarity(a: FloatArray, b: FloatArray, *, mirrored: bool = False) -> tuple
     return 1.0 / max(scale, 1e-12), p - scale * q @ (U * sign @ Vt).T
 
 
-def _rigid(a: FloatArray, b: FloatArray, *, mirrored: bool = False, scale: float = 1.0) -> float:
+def rigid_rms(a: FloatArray, b: FloatArray, *, mirrored: bool = False, scale: float = 1.0) -> float:
     """Return the rms [m] that the best turn and shift of b / scale leaves."""
     p, q = a - a.mean(axis=0), (b - b.mean(axis=0)) / scale * ([-1.0, 1.0, 1.0] if mirrored else [1.0, 1.0, 1.0])
     U, _, Vt = np.linalg.svd(p.T @ q)
@@ -98,7 +98,7 @@ def check_reading(robot: Robot, pairs: Sequence[Pairs], *, strict: bool = True) 
     for one in pairs:
         if len(np.unique(one.marker)) < 4 or one.spread <= 0:
             continue
-        plain = _rigid(one.modelled, one.measured)
+        plain = rigid_rms(one.modelled, one.measured)
         if plain < SUSPICIOUS * one.spread:
             continue
         found = (
@@ -107,9 +107,13 @@ def check_reading(robot: Robot, pairs: Sequence[Pairs], *, strict: bool = True) 
         )
         most_fit = float(np.median(np.linalg.norm(one.measured - one.modelled, axis=1))) < SUSPICIOUS * one.spread
         scale, _ = similarity(one.modelled, one.measured)
-        if not most_fit and max(scale, 1 / scale) > 1.5 and _rigid(one.modelled, one.measured, scale=scale) * EXPLAINED < plain:
+        if (
+            not most_fit
+            and max(scale, 1 / scale) > 1.5
+            and rigid_rms(one.modelled, one.measured, scale=scale) * EXPLAINED < plain
+        ):
             raise DataError(f"{found}. They are {scale:.4g} times too large: {_unit(scale)}. The files hold metres")
-        if not most_fit and _rigid(one.modelled, one.measured, mirrored=True) * EXPLAINED < plain:
+        if not most_fit and rigid_rms(one.modelled, one.measured, mirrored=True) * EXPLAINED < plain:
             raise DataError(
                 f"{found}. Mirrored they fit: are the axes left-handed? Camera frames are right-handed (x right, y down, "
                 f"z forward): change the sign of one axis"
@@ -145,7 +149,7 @@ def _swapped(pairs: Pairs, plain: float) -> dict[int, int]:
         best, names = (left, columns) if left < best else (best, names)
     truth = {int(a): int(b) for a, b in zip(named, named[names])}
     renamed = np.array([truth.get(int(m), int(m)) for m in pairs.marker])
-    explained = _rigid(_modelled(pairs, renamed), pairs.measured) * EXPLAINED < plain
+    explained = rigid_rms(_modelled(pairs, renamed), pairs.measured) * EXPLAINED < plain
     return {a: b for a, b in truth.items() if a != b} if explained else {}
 
 

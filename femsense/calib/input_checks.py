@@ -1,7 +1,7 @@
-"""Whether the inputs of a recording can be those that moved its markers: unit, order of the columns, delay.
+"""Whether the inputs of a recording can be in the unit that is declared: how far they move the markers.
 
 Of each marker only its motion about its mean counts, measured and modelled, so that neither pose nor placement matters.
-Another reading of the inputs counts where it takes most of the difference away.
+Another unit counts where it takes most of the difference away.
 """
 
 from __future__ import annotations
@@ -11,22 +11,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from femsense.calib.checks import EXPLAINED, SUSPICIOUS, Pairs
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import DataError
 from femsense.model.recording import Recording
-from femsense.model.robot import Robot
 
 REFUSED = 3.0
 """Motions so many times too large or small are no modulus that is off: silicones of one name differ by a factor of two."""
 WARNED = 1.5
 """Motions so many times too large or small are worth a word."""
-LATEST = 4
-"""Frames by which inputs may be late or early."""
-FEWEST = 4
-"""Fewer frames tell nothing of a delay."""
 UNITS = {
     "tension": {9.807: "kilogram-force", 4.448: "pounds", 1e-3: "millinewton", 0.00981: "gram-force"},
     "displacement": {1e-3: "millimetres", 1e-2: "centimetres", 0.0254: "inches"},
@@ -70,12 +64,11 @@ def motions_of(pairs: Pairs) -> Motions | None:
     return Motions(frames, modelled - modelled.mean(axis=0), measured - measured.mean(axis=0), pairs.spread)
 
 
-def check_inputs(robot: Robot, recording: Recording, pairs: Sequence[Pairs]) -> None:
-    """Refuse inputs in another unit, in exchanged columns, or recorded some frames off;
-    warn where motions hint at another modulus.
+def check_inputs(recording: Recording, pairs: Sequence[Pairs]) -> None:
+    """Refuse inputs in another unit; warn where motions hint at another modulus.
 
     Arguments:
-        robot, recording: as they are calibrated.
+        recording: as it is calibrated.
         pairs: the markers of each camera.
 
     Raises:
@@ -85,8 +78,6 @@ def check_inputs(robot: Robot, recording: Recording, pairs: Sequence[Pairs]) -> 
         motions = motions_of(one)
         if motions is None or _rms(motions.measured - motions.modelled) < SUSPICIOUS * motions.spread:
             continue
-        _check_order(robot, recording, motions)
-        _check_delay(motions)
         _check_scale(recording, motions)
 
 
@@ -112,50 +103,6 @@ def _units(recording: Recording, scale: float) -> str:
     names = [name for kind in kinds for known, name in UNITS[kind].items() if abs(np.log(scale / known)) < 0.4]
     held = {"tension": "newtons", "displacement": "metres", "pressure": "pascals"}[kinds[-1]] if kinds else ""
     return f"Are the inputs in {' or '.join(names)}? The files hold {held}. " if names else ""
-
-
-def _check_order(robot: Robot, recording: Recording, motions: Motions) -> None:
-    """Refuse columns that stand under each other's names: to first order each input has its own motion (least squares;
-    Kuhn 1955)."""
-    names = (*robot.body.cable_names, *robot.body.chamber_names)
-    inputs = np.hstack([recording.inputs, recording.pressures])[motions.frames]
-    inputs = inputs - inputs.mean(axis=0)
-    inputs = inputs / np.maximum(np.abs(inputs).max(axis=0), 1e-300)
-    if len(names) < 2 or len(inputs) <= len(names) or np.linalg.cond(inputs) > 20.0:
-        return
-    by_input = [np.linalg.lstsq(inputs, x, rcond=None)[0] for x in (motions.measured, motions.modelled)]
-    cost = ((by_input[0][:, None] - by_input[1][None]) ** 2).sum(axis=2)
-    columns = linear_sum_assignment(cost)[1]
-    changed = np.flatnonzero(columns != np.arange(len(names)))
-    if not len(changed):
-        return
-    if cost[changed, columns[changed]].sum() * EXPLAINED**2 < cost[changed, changed].sum():
-        text = ", ".join(f"{names[i]} moves the robot as {names[columns[i]]} should" for i in changed)
-        raise DataError(f"the columns of inputs in frames.csv seem exchanged: {text}. Exchange them, or the cables in robot.toml")
-
-
-def _check_delay(motions: Motions) -> None:
-    """Refuse inputs that are some frames late or early. Raises DataError."""
-    best, delay = np.inf, 0
-    for lag in (lag for lag in range(-LATEST, LATEST + 1) if lag):
-        shared = np.intersect1d(motions.frames, motions.frames + lag)
-        if len(shared) < max(FEWEST, len(motions.frames) // 2):
-            continue
-        measured = motions.measured[np.isin(motions.frames, shared)]
-        moved, plain = (motions.modelled[np.isin(motions.frames, k)] for k in (shared - lag, shared))
-        left, before = (_rms(_about_mean(measured - x)) for x in (moved, plain))
-        if left * EXPLAINED < before and left < best:
-            best, delay = left, lag
-    if delay:
-        how = "late" if delay > 0 else "early"
-        raise DataError(
-            f"the markers are {abs(delay)} frames {how}: they follow the inputs of other frames. Are markers and inputs "
-            f"on one clock?"
-        )
-
-
-def _about_mean(x: FloatArray) -> FloatArray:
-    return np.asarray(x - x.mean(axis=0))
 
 
 def _rms(x: FloatArray) -> float:

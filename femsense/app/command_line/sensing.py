@@ -35,10 +35,12 @@ def calibrate(
 
     check_target(output, folder=False)
     calibration = calibrate_recording(load_robot(robot), load_recording(recording))
+    if not calibration.settled:
+        text = calibration_text(calibration) + "\n\nnothing is written: this calibration is not to be used"
+        return Answer({"path": None, **calibration_document(calibration)}, text, exit_status=1)
     write_calibration(calibration, output)
     text = calibration_text(calibration) + f"\n\nwritten: {output}"
-    settled = not calibration.status.startswith("not settled")
-    return Answer({"path": str(output), **calibration_document(calibration)}, text, exit_status=0 if settled else 1)
+    return Answer({"path": str(output), **calibration_document(calibration)}, text)
 
 
 def estimate(

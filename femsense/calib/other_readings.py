@@ -1,0 +1,256 @@
+"""Whether the same files fit far better if read otherwise: inputs with another sign, order or delay, gravity another way.
+
+Each reading is first weighed with the poses free and all else held: inputs by the linear response of the markers, gravity, which
+may bend a body far, by the states of a few frames. The best is then fitted like the files themselves, and counts by what it
+leaves. No reading has parameters of its own, so that chance explains nothing.
+"""
+
+from __future__ import annotations
+
+import itertools
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from femsense.calib.checks import SUSPICIOUS, Pairs, rigid_rms
+from femsense.core.arrays import BoolArray, FloatArray, IntArray, freeze
+from femsense.core.errors import DataError
+from femsense.fem.equilibrium import SolveOptions
+from femsense.model.drive import DrivenRobot, drive_of
+from femsense.model.frame_state import solve_frame
+from femsense.model.observation import Scene
+from femsense.model.recording import Recording
+from femsense.model.robot import Robot
+
+TOLD = 1.5
+"""Another reading is worth a word where it divides the residual by this. The finger of the rig under gravity along x: 1.8."""
+REFUSED = 2.0
+"""… and the files are refused where it divides it by this. Gravity up: 2.3 on the finger, 2.4 on the arm; signs, order and
+delay of inputs: 8 and more."""
+LATEST = 4
+"""Frames by which inputs may be late or early."""
+PERMUTED = 5
+"""Of more cables than this only pairs are exchanged: all orders would be too many."""
+FEW = 3
+"""Frames by which directions of gravity are weighed."""
+
+Refit = Callable[[Robot, Recording, IntArray], FloatArray]
+"""Returns what a fit of a robot to frames of a recording leaves [m], shape (k, 3)."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Reading:
+    """Another way to read the same files."""
+
+    text: str
+    """What is wrong with the files if this reading is right."""
+    robot: Robot
+    recording: Recording
+    frames: IntArray
+    """The frames that it speaks of, shape (f,)."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Response:
+    """How markers answer to inputs and pressures, to first order."""
+
+    drivers: FloatArray
+    """As recorded, shape (F, d): inputs [N] or [m], pressures [Pa]."""
+    slope: FloatArray
+    """[m per unit of each driver], shape (d, markers, 3)."""
+
+
+def check_other_readings(
+    robot: Robot, scene: Scene, pairs: Sequence[Pairs], initial: FloatArray | None, residual: FloatArray, refit: Refit
+) -> None:
+    """Refuse files that fit far better if read otherwise; warn where they fit better.
+
+    Arguments:
+        robot: the robot.
+        scene: the markers that were fitted.
+        pairs: their places, one item a camera, rows in the order of the scene's.
+        initial: fitted initial inputs [N] or [m], shape (a,); None where they are known.
+        residual: what the fit leaves [m], shape (k, 3).
+        refit: fits another reading.
+
+    Raises:
+        DataError: says what is wrong with the files if the better reading is right.
+    """
+    if all(_rms(residual[scene.view == v]) < SUSPICIOUS * one.spread for v, one in enumerate(pairs) if len(one.marker)):
+        return
+    shares = [*_by_inputs(robot, scene, pairs, initial), *_by_gravity(robot, scene, pairs, initial)]
+    share, best = min(shares, key=lambda one: one[0], default=(1.0, None))
+    if best is None or share * TOLD > 1.0:
+        return
+    try:
+        left = _rms(refit(best.robot, best.recording, best.frames))
+    except DataError:
+        return
+    before = _rms(residual[np.isin(scene.frame, best.frames)])
+    found = f"{best.text}: the markers then fit to {1e3 * left:.3g} mm, as the files stand to {1e3 * before:.3g} mm"
+    if before > REFUSED * left:
+        raise DataError(found)
+    if before > TOLD * left:
+        warnings.warn(f"{found}. Is it so?", stacklevel=5)
+
+
+def _by_inputs(robot: Robot, scene: Scene, pairs: Sequence[Pairs], initial: FloatArray | None) -> Iterator[tuple[float, Reading]]:
+    """Yield what readings of the inputs leave to first order, as a share of what is left now."""
+    response = _response(robot, scene, initial)
+    if response is None:
+        return
+    frames, recording = scene.frames, scene.recording
+    for reading in _of_inputs(robot, recording, frames):
+        change = _drivers(reading.recording, initial, reading.frames) - response.drivers
+        shift = np.einsum("kd,dki->ki", change[scene.frame], response.slope[:, scene.marker])
+        yield _share(pairs, scene, np.isin(scene.frame, reading.frames), shift), reading
+
+
+def _by_gravity(
+    robot: Robot, scene: Scene, pairs: Sequence[Pairs], initial: FloatArray | None
+) -> Iterator[tuple[float, Reading]]:
+    """Yield what other directions of gravity leave in a few frames, as a share of what is left now."""
+    few = scene.frames[np.unique(np.linspace(0, len(scene.frames) - 1, FEW).round().astype(int))]
+    rows = np.isin(scene.frame, few)
+    now = _states(robot, scene.recording, few, initial) if rows.any() else None
+    for reading in _gravities(robot, scene.recording, scene.frames) if now is not None else ():
+        other = _states(reading.robot, reading.recording, few, initial)
+        if other is None or now is None:
+            continue
+        shift = np.zeros((len(scene.frame), 3))
+        shift[rows] = [other[f][m] - now[f][m] for f, m in zip(scene.frame[rows].tolist(), scene.marker[rows].tolist())]
+        yield _share(pairs, scene, rows, shift), reading
+
+
+def _states(robot: Robot, recording: Recording, frames: IntArray, initial: FloatArray | None) -> dict[int, FloatArray] | None:
+    """Return where the markers are in some frames [m], shape (markers, 3) each; None where a state is missing."""
+    driven, found = DrivenRobot(robot, drive_of(robot, recording, initial=initial)), dict[int, FloatArray]()
+    for k in frames.tolist():
+        state = solve_frame(driven, k, options=SolveOptions(single=True))
+        if not state.converged:
+            return None
+        found[k] = robot.markers.positions(state.positions)
+    return found
+
+
+def _signs(robot: Robot, recording: Recording, frames: IntArray) -> Iterator[Reading]:
+    names, table = _inputs(robot, recording)
+    ones = [[j] for j in range(len(names))] if len(names) > 1 else []
+    for columns in [list(range(len(names))), *ones]:
+        turned = table.copy()
+        turned[:, columns] *= -1.0
+        if columns and turned[:, columns].any():
+            text = f"the inputs of {', '.join(names[j] for j in columns)} in frames.csv seem to have the wrong sign (> 0 pulls)"
+            yield Reading(text, robot, _with_inputs(recording, turned), frames)
+
+
+def _orders(robot: Robot, recording: Recording, frames: IntArray) -> Iterator[Reading]:
+    names, table = _inputs(robot, recording)
+    a = len(robot.body.cables)
+    for first, count in ((0, a), (a, len(names) - a)):
+        for order in _permutations(count):
+            columns = np.arange(len(names))
+            columns[first : first + count] = first + np.array(order)
+            moved = [f"{names[i]} moves the robot as {names[j]} should" for i, j in enumerate(np.argsort(columns)) if i != j]
+            text = f"the columns of inputs in frames.csv seem exchanged: {', '.join(moved)}. Exchange them, or the cables in robot.toml"
+            yield Reading(text, robot, _with_inputs(recording, table[:, columns]), frames)
+
+
+def _permutations(count: int) -> Iterator[tuple[int, ...]]:
+    """Yield orders of so many columns other than their own."""
+    own = tuple(range(count))
+    if count <= PERMUTED:
+        yield from (order for order in itertools.permutations(own) if order != own)
+        return
+    for i, j in itertools.combinations(own, 2):
+        yield tuple(j if k == i else i if k == j else k for k in own)
+
+
+def _delays(robot: Robot, recording: Recording, frames: IntArray) -> Iterator[Reading]:
+    _, table = _inputs(robot, recording)
+    for lag in (lag for lag in range(-LATEST, LATEST + 1) if lag):
+        there = frames[(frames + lag >= 0) & (frames + lag < len(table))]
+        if len(there) < max(2, len(frames) // 2) or not np.ptp(table, axis=0).any():
+            continue
+        how = "early" if lag > 0 else "late"
+        text = (
+            f"the markers are {abs(lag)} frames {how}: they follow the inputs of other frames. Are markers and inputs on "
+            f"one clock?"
+        )
+        taken = np.clip(np.arange(len(table)) + lag, 0, len(table) - 1)
+        yield Reading(text, robot, _with_inputs(recording, table[taken]), there)
+
+
+def _gravities(robot: Robot, recording: Recording, frames: IntArray) -> Iterator[Reading]:
+    own, size = robot.body.gravity, float(np.linalg.norm(robot.body.gravity))
+    if recording.gravity is not None:
+        text = "gravity in frames.csv seems to have the wrong sign (an accelerometer at rest shows it upwards)"
+        yield Reading(text, robot, replace(recording, gravity=freeze(-recording.gravity)), frames)
+        return
+    for j, sign in itertools.product(range(3) if size else (), (1.0, -1.0)):
+        other = sign * size * np.eye(3)[j]
+        if float(other @ own) < 0.9 * size**2:
+            text = (
+                f"gravity seems to point along {'-' if sign < 0 else '+'}{'xyz'[j]} of the robot, not as gravity.vector_m_s2 says"
+            )
+            yield Reading(text, replace(robot, body=robot.body.with_gravity(other)), recording, frames)
+
+
+def _inputs(robot: Robot, recording: Recording) -> tuple[tuple[str, ...], FloatArray]:
+    """Return the names of cables and chambers, and what is recorded of them, shape (F, a + c)."""
+    return (*robot.body.cable_names, *robot.body.chamber_names), np.hstack([recording.inputs, recording.pressures])
+
+
+def _with_inputs(recording: Recording, table: FloatArray) -> Recording:
+    a = recording.inputs.shape[1]
+    return replace(recording, inputs=freeze(table[:, :a]), pressures=freeze(table[:, a:]))
+
+
+def _drivers(recording: Recording, initial: FloatArray | None, frames: IntArray) -> FloatArray:
+    """Return what drives the markers in each frame, shape (F, d). Cables that would push pull like none;
+    where their zero is unknown, only what changes counts."""
+    cables = recording.inputs
+    cables = np.maximum(cables, 0.0) if initial is None else cables - cables[frames].mean(axis=0)
+    return np.hstack([cables, recording.pressures])
+
+
+def _response(robot: Robot, scene: Scene, initial: FloatArray | None) -> Response | None:
+    """Return how the markers answer; None where a state is missing."""
+    recording, k = scene.recording, int(scene.frames[0])
+    _, table = _inputs(robot, recording)
+    base = table.mean(axis=0) if initial is not None else np.abs(table).mean(axis=0)
+    steps = 0.5 * np.ptp(table, axis=0)
+
+    def places(at: FloatArray) -> FloatArray | None:
+        held = _with_inputs(recording, np.broadcast_to(at, table.shape))
+        found = _states(robot, held, np.array([k]), initial)
+        return None if found is None else found[k]
+
+    rest = places(base)
+    slope = np.zeros((len(steps), len(robot.marker_names), 3))
+    for j in np.flatnonzero(steps):
+        moved = places(base + steps * (np.arange(len(steps)) == j))
+        if moved is None or rest is None:
+            return None
+        slope[j] = (moved - rest) / steps[j]
+    return Response(_drivers(recording, initial, scene.frames), slope)
+
+
+def _share(pairs: Sequence[Pairs], scene: Scene, rows: BoolArray, shift: FloatArray) -> float:
+    """Return what some rows leave where the model's markers are shifted [m], shape (k, 3), as a share of what is left now."""
+    return _left(pairs, scene.view, rows, shift) / max(_left(pairs, scene.view, rows, 0.0 * shift), 1e-300)
+
+
+def _left(pairs: Sequence[Pairs], view: IntArray, rows: BoolArray, shift: FloatArray) -> float:
+    squares = 0.0
+    for v, one in enumerate(pairs):
+        mine = rows[view == v]
+        if mine.any():
+            squares += mine.sum() * rigid_rms((one.modelled + shift[view == v])[mine], one.measured[mine]) ** 2
+    return float(np.sqrt(squares / max(rows.sum(), 1)))
+
+
+def _rms(residual: FloatArray) -> float:
+    return float(np.sqrt((residual**2).sum(axis=1).mean())) if len(residual) else 0.0

@@ -1,0 +1,85 @@
+"""Files that fit far better if read otherwise: inputs with another sign, order or delay, gravity another way."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from arm import arm, record
+
+from femsense.calib.calibrate import calibrate
+from femsense.calib.other_readings import readings
+from femsense.core.arrays import freeze
+from femsense.core.errors import DataError
+from femsense.model.recording import Recording
+
+LEVELS = np.array([(0, 0, 0, 0), (0.8, 0, 0, 0), (0.4, 0, 0, 0), (0, 0.7, 0, 0), (0, 0, 0.9, 0), (0, 0, 0, 0.5), (0, 0, 0.3, 0)])
+
+
+@cache
+def recording(actuation: str = "tension") -> Recording:
+    if actuation == "tension":
+        return record(LEVELS, noise=2e-4)[0]
+    pulls = 0.004 * LEVELS @ (np.eye(4) - np.eye(4)[[1, 0, 3, 2]])  # what one cable takes up, its opposite lets out
+    return record(pulls, noise=2e-4, zero="unknown", initial=np.full(4, 0.004), actuation="displacement")[0]
+
+
+def with_inputs(inputs: np.ndarray, plain: Recording | None = None) -> Recording:
+    return replace(plain or recording(), inputs=freeze(inputs))
+
+
+def delayed(frames: int) -> Callable[[np.ndarray], np.ndarray]:
+    return lambda inputs: inputs[np.clip(np.arange(len(inputs)) - frames, 0, None)]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "text"),
+    [
+        (lambda u: -u, "inputs of up, down, left, right in frames.csv seem to have the wrong sign"),
+        (lambda u: u[:, [2, 1, 0, 3]], "exchanged: up moves the robot as left should, left moves the robot as up should"),
+        (lambda u: np.roll(u, 1, axis=0), "1 frames early"),
+        (lambda u: np.roll(u, -1, axis=0), "1 frames late"),
+        (delayed(2), "2 frames early"),
+    ],
+)
+def test_inputs_that_fit_if_read_otherwise_are_refused(spoil: Callable[[np.ndarray], np.ndarray], text: str) -> None:
+    with pytest.raises(DataError, match=text):
+        calibrate(arm(), with_inputs(spoil(recording().inputs)))
+
+
+def test_a_delay_is_seen_with_three_free_frames_in_common() -> None:
+    free = freeze(np.arange(len(LEVELS)) < 5, np.bool_)
+    with pytest.raises(DataError, match="2 frames early"):
+        calibrate(arm(), replace(with_inputs(delayed(2)(recording().inputs)), free=free))
+
+
+def test_a_sign_shows_where_the_zero_is_unknown_too() -> None:
+    plain = recording("displacement")
+    assert calibrate(arm(), plain).rms_m < 6e-4
+    turned = plain.inputs * np.array([1.0, 1.0, -1.0, 1.0])
+    with pytest.raises(DataError, match="inputs of left in frames.csv seem to have the wrong sign"):
+        calibrate(arm(), with_inputs(turned, plain))
+
+
+def test_gravity_the_other_way_is_refused_and_another_modulus_is_no_gravity(recwarn: pytest.WarningsRecorder) -> None:
+    with pytest.raises(DataError, match="gravity seems to point along -z of the robot.*the markers then fit to"):
+        calibrate(arm(gravity=(0.0, 0.0, 9.81)), recording())
+    calibrate(arm(modulus=450e3), recording())
+    assert not [w for w in recwarn if "gravity" in str(w.message)]
+
+
+def test_an_accelerometer_of_another_sign_is_named() -> None:
+    measured = replace(recording(), gravity=freeze(np.tile([0.0, 0.0, 9.81], (len(LEVELS), 1))))
+    with pytest.raises(DataError, match=r"gravity in frames.csv seems to have the wrong sign"):
+        calibrate(arm(), measured)
+
+
+def test_many_cables_are_exchanged_by_pairs_only() -> None:
+    said = [one.text for one in readings(arm(), recording(), np.arange(len(LEVELS)))]
+    assert len(said) == len(set(said))
+    assert sum("exchanged" in text for text in said) == 23  # of four cables all orders but their own
+    assert sum("wrong sign" in text for text in said) == 5
+    assert sum("gravity" in text for text in said) == 5
