@@ -58,8 +58,16 @@ class Response:
 
     drivers: FloatArray
     """As recorded, shape (F, d): inputs [N] or [m], pressures [Pa]."""
+    base: FloatArray
+    """The drivers about which the response is taken, shape (d,)."""
+    places: FloatArray
+    """Where the markers are under them [m], shape (markers, 3)."""
     slope: FloatArray
     """[m per unit of each driver], shape (d, markers, 3)."""
+
+    def by(self, change: FloatArray, scene: Scene) -> FloatArray:
+        """Return by how much the scene's markers move [m], shape (k, 3), where drivers change, shape (F, d)."""
+        return np.asarray(np.einsum("kd,dki->ki", change[scene.frame], self.slope[:, scene.marker]))
 
 
 def check_other_readings(
@@ -96,16 +104,37 @@ def check_other_readings(
         warnings.warn(f"{found}. Is it so?", stacklevel=5)
 
 
+def readings(robot: Robot, recording: Recording, frames: IntArray) -> Iterator[Reading]:
+    """Yield other readings of a recording whose columns stand in the robot's order.
+
+    Arguments:
+        robot, recording: as they stand.
+        frames: indices of the frames that are fitted, shape (f,).
+    """
+    yield from _of_inputs(robot, recording, frames)
+    yield from _gravities(robot, recording, frames)
+
+
+def _of_inputs(robot: Robot, recording: Recording, frames: IntArray) -> Iterator[Reading]:
+    yield from _signs(robot, recording, frames)
+    yield from _orders(robot, recording, frames)
+    yield from _delays(robot, recording, frames)
+
+
 def _by_inputs(robot: Robot, scene: Scene, pairs: Sequence[Pairs], initial: FloatArray | None) -> Iterator[tuple[float, Reading]]:
     """Yield what readings of the inputs leave to first order, as a share of what is left now."""
     response = _response(robot, scene, initial)
     if response is None:
         return
     frames, recording = scene.frames, scene.recording
+    modelled = np.zeros((len(scene.frame), 3))
+    for v, one in enumerate(pairs):
+        modelled[scene.view == v] = one.modelled
     for reading in _of_inputs(robot, recording, frames):
-        change = _drivers(reading.recording, initial, reading.frames) - response.drivers
-        shift = np.einsum("kd,dki->ki", change[scene.frame], response.slope[:, scene.marker])
-        yield _share(pairs, scene, np.isin(scene.frame, reading.frames), shift), reading
+        rows, drivers = np.isin(scene.frame, reading.frames), _drivers(reading.recording, initial, reading.frames)
+        changed = modelled + response.by(drivers - response.drivers, scene)
+        anew = response.places[scene.marker] + response.by(drivers - response.base, scene)  # where a state is slack, as read now
+        yield min(_share(pairs, scene, rows, places - modelled) for places in (changed, anew)), reading
 
 
 def _by_gravity(
@@ -220,7 +249,10 @@ def _response(robot: Robot, scene: Scene, initial: FloatArray | None) -> Respons
     """Return how the markers answer; None where a state is missing."""
     recording, k = scene.recording, int(scene.frames[0])
     _, table = _inputs(robot, recording)
-    base = table.mean(axis=0) if initial is not None else np.abs(table).mean(axis=0)
+    a = recording.inputs.shape[1]
+    if initial is not None:  # all cables pull, in whichever way they are read
+        initial = np.maximum(initial, np.abs(table[:, :a] - table[scene.frames, :a].mean(axis=0)).max(axis=0))
+    base = table[scene.frames].mean(axis=0) if initial is not None else np.abs(table).mean(axis=0)
     steps = 0.5 * np.ptp(table, axis=0)
 
     def places(at: FloatArray) -> FloatArray | None:
@@ -235,7 +267,13 @@ def _response(robot: Robot, scene: Scene, initial: FloatArray | None) -> Respons
         if moved is None or rest is None:
             return None
         slope[j] = (moved - rest) / steps[j]
-    return Response(_drivers(recording, initial, scene.frames), slope)
+    if rest is None:
+        return None
+    drivers = _drivers(recording, initial, scene.frames)
+    about = base.copy()
+    if initial is not None:
+        about[:a] = 0.0  # drivers of a zero that is unknown are counted from their mean
+    return Response(drivers, about, rest, slope)
 
 
 def _share(pairs: Sequence[Pairs], scene: Scene, rows: BoolArray, shift: FloatArray) -> float:

@@ -52,7 +52,7 @@ def test_inputs_that_fit_if_read_otherwise_are_refused(spoil: Callable[[np.ndarr
 
 def test_a_delay_is_seen_with_three_free_frames_in_common() -> None:
     free = freeze(np.arange(len(LEVELS)) < 5, np.bool_)
-    with pytest.raises(DataError, match="2 frames early"):
+    with pytest.raises(DataError, match=r"2 frames early"):
         calibrate(arm(), replace(with_inputs(delayed(2)(recording().inputs)), free=free))
 
 
@@ -60,12 +60,12 @@ def test_a_sign_shows_where_the_zero_is_unknown_too() -> None:
     plain = recording("displacement")
     assert calibrate(arm(), plain).rms_m < 6e-4
     turned = plain.inputs * np.array([1.0, 1.0, -1.0, 1.0])
-    with pytest.raises(DataError, match="inputs of left in frames.csv seem to have the wrong sign"):
+    with pytest.raises(DataError, match=r"inputs of left in frames.csv seem to have the wrong sign"):
         calibrate(arm(), with_inputs(turned, plain))
 
 
 def test_gravity_the_other_way_is_refused_and_another_modulus_is_no_gravity(recwarn: pytest.WarningsRecorder) -> None:
-    with pytest.raises(DataError, match="gravity seems to point along -z of the robot.*the markers then fit to"):
+    with pytest.raises(DataError, match=r"gravity seems to point along -z of the robot.*the markers then fit to"):
         calibrate(arm(gravity=(0.0, 0.0, 9.81)), recording())
     calibrate(arm(modulus=450e3), recording())
     assert not [w for w in recwarn if "gravity" in str(w.message)]
