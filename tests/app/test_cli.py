@@ -352,6 +352,14 @@ def test_data_that_allow_no_result_are_status_1(run: Any, robot: Path, recording
     assert said.status == 1 and "no frame is free" in said.err and not (tmp_path / "c.json").exists()
 
 
+def test_a_calibration_that_has_not_settled_is_not_used(run: Any, robot: Path, recording: Path, tmp_path: Path) -> None:
+    file = tmp_path / "c.json"
+    assert run("calibrate", robot, recording, "-o", file).status == 0
+    file.write_text(file.read_text().replace('"status": "converged', '"status": "not settled'), encoding="utf-8")
+    said = run("estimate", robot, recording, "-c", file, "-o", tmp_path / "run", "--at", "0.1,0.015,0.015")
+    assert said.status == 1 and "not settled" in said.err
+
+
 def test_results_are_not_written_over_the_input(run: Any, robot: Path, recording: Path) -> None:
     before = {path: path.read_bytes() for path in (*robot.iterdir(), *recording.iterdir())}
     for output in (robot, recording):
