@@ -71,7 +71,7 @@ def estimate_into(
         return read_run(folder, robot=body)
     if given is None:
         say(f"no calibration given: calibrating first, into {Path(folder) / 'calibration.json'}")
-    used = calibrate(body, frames) if given is None else given
+    used = calibrate(body, frames, correct=bool(options and options.correct)) if given is None else given
     if not used.settled:
         raise DataError(f"the calibration is not to be used: {used.status}")
     began = time.perf_counter()
@@ -128,6 +128,7 @@ def improve_into(
     train, test = [load_recording(path) for path in recordings], [load_recording(path) for path in validation]
     own = {str(file): file_hash(Path(file)) for file in how.user_effects if Path(file).is_file()}
     inputs = loop_inputs(body, train, test, effects=effects, without=without, user_effects=own, measured=how.measured)
+    inputs["options"] |= {"correct": True} if how.correct else {}
     _require_different([*inputs["recordings"], *inputs["validation"]])
     if not again and finished(folder, inputs):
         say(f"{folder} holds this result already (--again computes it anew)")

@@ -28,6 +28,7 @@ def reach_targets(
     forces: Sequence[str] = (),
     calibration: Path | None = None,
     output: Path | None = None,
+    correct: bool = False,
 ) -> tuple[dict[str, Any], str, bool]:
     """Find the inputs for targets NAME=X,Y,Z; return the motion as plain tables and as text, and whether all is reached.
 
@@ -36,14 +37,15 @@ def reach_targets(
     """
     from femsense.calib.files import read_calibration
     from femsense.control.motion import REACHED
-    from femsense.control.reach import reach
+    from femsense.control.reach import ReachOptions, reach
     from femsense.io.robot_toml import load_robot
 
     body = load_robot(robot)
     wanted = dict(_target(text) for text in targets)
     _check_size(body, wanted)
     known = None if calibration is None else read_calibration(calibration)
-    motion = reach(body, wanted, control=control, forces=[_force(text) for text in forces], calibration=known)
+    loads = [_force(text) for text in forces]
+    motion = reach(body, wanted, control=control, forces=loads, calibration=known, options=ReachOptions(correct=correct))
     unit = {name: "N" if control == "tension" else "m" for name in body.body.cable_names}
     document = {
         "format": FORMAT,
@@ -62,6 +64,8 @@ def reach_targets(
         },
         "equilibria": motion.iterations,
     }
+    if motion.correction_std_m is not None:
+        document["correction_std_m"] = motion.correction_std_m
     if output is not None:
         write_json(output, document)
     lines = [motion.text, ""]

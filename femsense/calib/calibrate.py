@@ -33,6 +33,7 @@ from femsense.fem.equilibrium import Equilibrium, SolveOptions
 from femsense.model.camera_frame import in_robot_frame
 from femsense.model.drive import DrivenRobot, drive_of
 from femsense.model.frame_state import solve_frame
+from femsense.model.marker_correction import corrected
 from femsense.model.observation import Hypothesis, Scene, SceneJet, evaluate_scene, make_scene, rest_residual
 from femsense.model.recording import Recording
 from femsense.model.recording_checks import check_against
@@ -56,17 +57,26 @@ def usable_frames(recording: Recording) -> IntArray:
 
 
 @one_blas_thread()
-def calibrate(robot: Robot, recording: Recording, *, frames: Sequence[int] | None = None) -> Calibration:
+def calibrate(robot: Robot, recording: Recording, *, frames: Sequence[int] | None = None, correct: bool = False) -> Calibration:
     """Find the pose of each camera and, where their zero is unknown, the initial inputs of the cables.
 
     Arguments:
         robot: the robot.
         recording: markers (or a known pose) and inputs.
         frames: indices of the frames to use; by default those without undeclared contact, thinned out to MAX_FRAMES.
+        correct: use the robot's empirical correction: markers are moved by it, as the pose without it has them turned.
 
     Raises:
-        DataError: no markers and no pose, too few markers, or no equilibrium.
+        InputError: no correction, where one is asked for; DataError: no markers and no pose, too few markers, or no equilibrium.
     """
+    found = _calibrated(robot, recording, frames)
+    if not correct:
+        return found
+    moved = corrected(check_against(robot, recording), robot.require_correction(), found.poses)
+    return replace(_calibrated(robot, moved, frames), is_corrected=True)
+
+
+def _calibrated(robot: Robot, recording: Recording, frames: Sequence[int] | None) -> Calibration:
     recording = check_against(robot, recording)
     robot = robot.in_recording(recording.label)
     chosen = usable_frames(recording) if frames is None else np.asarray(frames, dtype=np.int64)

@@ -47,6 +47,8 @@ class Calibration:
     joint_covariance: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
     """Of (rotation [rad], shift [m]) of all cameras together, shape (6 v, 6 v); not given:
     that of the first camera alone is known."""
+    is_corrected: bool = False
+    """Whether the robot's empirical correction was used."""
 
     @property
     def settled(self) -> bool:

@@ -39,6 +39,7 @@ def calibration_document(calibration: Calibration) -> dict[str, Any]:
         "noise_m": c.noise_m,
         "placements_m": c.placements_m,
         "frames": c.frames,
+        "corrected": c.is_corrected,
         "cameras": [{"name": name, "T_robot_camera": T} for name, T in zip(c.camera_names, c.poses)],
     }
     checked: dict[str, Any] = plain(document)
@@ -88,6 +89,7 @@ def read_calibration(path: str | Path) -> Calibration:
             normal_rms_m=_number(document.get("normal_rms_m")),
             noise_m=_number(document.get("noise_m")),
             joint_covariance=_matrix(document.get("joint_covariance"), 6 * len(cameras)),
+            is_corrected=bool(document.get("corrected", False)),
         )
     except (TypeError, ValueError, KeyError, AttributeError) as error:
         raise InputError(

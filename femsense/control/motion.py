@@ -57,12 +57,15 @@ class Motion:
     """Equilibria that were solved."""
     equilibrium: Equilibrium
     """The state, a start for the next target."""
+    correction_std_m: float | None = None
+    """Standard deviation along each axis of what the robot's correction adds to `reached_m` [m]; None where it is not used."""
 
     @property
     def text(self) -> str:
         """The outcome in one sentence."""
         if self.status == REACHED:
-            return f"reached to {1e3 * self.error_m:.3g} mm"
+            sure = "" if self.correction_std_m is None else f"; the correction is sure to ± {1e3 * self.correction_std_m:.2g} mm"
+            return f"reached to {1e3 * self.error_m:.3g} mm{sure}"
         by = f"; stopped by {', '.join(self.limits)}" if self.limits else ""
         if self.status == NEAREST:
             reason = by or "; no input moves the points that way"

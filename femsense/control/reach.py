@@ -22,6 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from femsense.calib.calibration import Calibration
+from femsense.control.corrected import reach_corrected
 from femsense.control.goal import Goal, Target, make_goal
 from femsense.control.limits import CONTROLS, Limits, command, make_limits
 from femsense.control.motion import NEAREST, REACHED, STOPPED, Certificate, Motion, WallContact
@@ -62,6 +63,8 @@ class ReachOptions:
     """Equilibria at most."""
     least_gain: float = 1e-9
     """The search ends where the predicted gain of a step is below this share of the squared error."""
+    correct: bool = False
+    """Use the robot's empirical correction: markers are wanted where it has them."""
     damping: float = 1e-10
     """λ, in units of the largest eigenvalue of W_paᵀ W_pa; actuators that do the same share their work by it."""
 
@@ -97,19 +100,23 @@ def reach(
         the motion; a target out of reach is a status with the nearest state and what limits it, no exception.
 
     Raises:
-        InputError: an unknown marker, cable or control, or limits the wrong way round.
+        InputError: an unknown marker, cable or control, limits the wrong way round, or no correction where one is asked for.
     """
-    body, known = robot.body, options or ReachOptions()
+    known = options or ReachOptions()
     if control not in CONTROLS:
         raise InputError("unknown control", where="control", found=control, expected=" or ".join(CONTROLS))
-    goal = make_goal(robot, target, forces or (), contacts)
     bounds = make_limits(robot, control, limits or {}, calibration)
-    first = start.equilibrium if isinstance(start, Motion) else start
-    motion = _searched(robot, control, goal, bounds, _begin(body, goal, bounds, first), known, calibration)
-    if motion.status == REACHED or first is None:
-        return motion
-    again = _searched(robot, control, goal, bounds, _begin(body, goal, bounds, None), known, calibration)
-    return again if again.error_m < motion.error_m else motion
+
+    def find(aims: Target, near: Equilibrium | Motion | None) -> Motion:
+        goal = make_goal(robot, aims, forces or (), contacts)
+        first = near.equilibrium if isinstance(near, Motion) else near
+        motion = _searched(robot, control, goal, bounds, _begin(robot.body, goal, bounds, first), known, calibration)
+        if motion.status == REACHED or first is None:
+            return motion
+        again = _searched(robot, control, goal, bounds, _begin(robot.body, goal, bounds, None), known, calibration)
+        return again if again.error_m < motion.error_m else motion
+
+    return reach_corrected(robot, target, control, find, start) if known.correct else find(target, start)
 
 
 def _searched(

@@ -34,6 +34,11 @@ def robot_input(robot: Robot) -> dict[str, Any]:
     for entry in (robot.document or {}).get("effects", []):
         if "file" in entry:
             digest.update(file_hash(find_own_file(entry, robot)).encode())
+    if robot.correction is not None:
+        c = robot.correction
+        digest.update(
+            json_text(plain([c.kernel, c.length, c.ranges, c.states, c.basis, c.weights, c.covariance, c.noise])).encode()
+        )
     return {"name": robot.name, "path": None if robot.folder is None else str(robot.folder), "sha256": digest.hexdigest()}
 
 

@@ -108,6 +108,10 @@ class AppearanceTable(Schema):
     aruco_dictionary: str = Field("4X4_50", description="dictionary of the ArUco tags, as OpenCV names it without DICT_")
 
 
+class CorrectionTable(Schema):
+    file: Annotated[str, Field(min_length=1, description="the file of the correction beside robot.toml")]
+
+
 class RobotTable(Schema):
     """robot.toml, version femsense-robot-1."""
 
@@ -129,6 +133,7 @@ class RobotTable(Schema):
         description="a table [appearance] with color_rgb and aruco_dictionary",
     )
     effects: list[dict[str, Any]] = Field([], description="tables [[effects]] with a name")
+    correction: CorrectionTable | None = Field(None, description="a table [correction] with file, of femsense improve --correct")
 
 
 def robot_problems(document: dict[str, Any], path: Path) -> list[InputError]:

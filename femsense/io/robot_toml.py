@@ -6,6 +6,7 @@ import copy
 import shutil
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from femsense.core.text import did_you_mean
 from femsense.fem.body import BodyModel
 from femsense.fem.body_parts import Cable
 from femsense.fem.mesh import TetMesh
+from femsense.io.correction_file import read_correction, write_correction
 from femsense.io.files import plain, write_beside, write_toml
 from femsense.io.mesh_files import mesh_companions, write_mesh
 from femsense.io.robot_body import build_robot, nodes_within
@@ -46,8 +48,10 @@ def load_robot(path_or_name: str | Path, *, effects: bool = True) -> Robot:
     for problem in table_problems(table, path):
         raise problem
     robot = build_robot(table, document, path)
-    entries = [dict(entry) for entry in table.effects]
-    return _with_effects(robot, entries, path) if entries and effects else robot
+    if not effects:
+        return robot
+    robot = _with_effects(robot, [dict(entry) for entry in table.effects], path)
+    return robot if table.correction is None else replace(robot, correction=read_correction(path.parent / table.correction.file))
 
 
 def find_robot(path_or_name: str | Path) -> Path:
@@ -119,7 +123,7 @@ def _with_effects(robot: Robot, entries: list[dict[str, Any]], path: Path) -> Ro
 def save_robot(robot: Robot, folder: str | Path, *, effects: Sequence[Mapping[str, Any]] | None = None) -> Path:
     """Write robot.toml and a copy of the mesh file, so that the folder loads back to the same robot.
 
-    A robot that was loaded is written as it was declared; what was changed in Python since then must be said by `effects`.
+    A robot that was loaded is written as it was declared; what was changed in Python since then must be said by `effects`. Its correction goes along.
 
     Arguments:
         robot: the robot.
@@ -134,6 +138,9 @@ def save_robot(robot: Robot, folder: str | Path, *, effects: Sequence[Mapping[st
     """
     target = Path(folder)
     document = robot_document(robot, effects=effects)
+    document.pop("correction", None)
+    if robot.correction is not None:
+        document["correction"] = {"file": write_correction(robot.correction, target)}
     for entry in document.get("effects", []):
         if "file" in entry:
             entry["file"] = _copy_effect(entry, robot, target)

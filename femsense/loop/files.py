@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -43,7 +44,8 @@ def write_loop(loop: LoopResult, folder: str | Path, *, inputs: Mapping[str, Any
     check_loop_folder(folder)
     with _results_folder(folder, "loop.json") as part:
         declared = (loop.declared.document or {}).get("effects", [])
-        save_robot(loop.declared, part, effects=[*declared, *loop.entries])
+        handed_back = replace(loop.declared, correction=loop.robot.correction)
+        save_robot(handed_back, part, effects=[*declared, *loop.entries])
         write_json(part / "loop.json", {**loop.document(), "inputs": inputs or {}, "versions": versions()})
     return Path(folder)
 

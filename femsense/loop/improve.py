@@ -35,7 +35,6 @@ from femsense.loop.search.search_state import Progress, Search, SearchProgress
 from femsense.loop.search.some_states import in_all_states, some_states
 from femsense.loop.search.work_plan import ALL_STATES, CALIBRATION, SEARCH, VERDICT, WorkPlan
 from femsense.loop.thresholds import DEFAULTS, EFFORT, Effort, Thresholds
-from femsense.loop.verdict.empirical import judged_correction
 from femsense.loop.verdict.verdict import conclude
 from femsense.model.effects import EFFECTS, FORMS, Effect, find_effect, forms_by_recording, load_own_effect, try_own_effect
 from femsense.model.recording import Recording, state_key
@@ -98,14 +97,13 @@ def improve(
         data, search = _search(robot, recordings, validation, (names, forms), how, checkpoint, say)
         say.plan([VERDICT], states_of(data), quadratic=data.robot.body.mesh.is_quadratic)
         say("testing what is left")
-        result = conclude(data, search, rng)
+        result = conclude(data, search, rng, correct=how.correct)
         record = next_experiment(data, search.final, search.noise, result.confounded, result.not_testable)
         noise_is_measured = result.model_error is None or result.model_error.noise_is_measured
         if result.verdict == UNEXPLAINED or (result.confounded and not record):
             steps = next_steps(data, search.final, search.noise, noise_is_measured=noise_is_measured)
             record = "; or ".join(t for t in (*steps[:MOST_STEPS], record) if t)
-        correction = judged_correction(data, search.final) if how.correct else None
-    result = replace(result, next_experiment=record, data=replace(result.data, seed=how.seed), correction=correction)
+    result = replace(result, next_experiment=record, data=replace(result.data, seed=how.seed))
     if distinguishes_effects(data):
         return result
     only = "record another state (other inputs, load or direction of gravity): these data repeat too few states, which cannot distinguish effects"

@@ -10,8 +10,10 @@ from typing import Any
 import numpy as np
 
 from femsense.core.arrays import FloatArray, IntArray, freeze
+from femsense.core.errors import InputError
 from femsense.fem.body import BodyModel
 from femsense.fem.mesh import Embedding, embed_points, surface_triangles
+from femsense.model.marker_correction import Correction
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -98,6 +100,8 @@ class Robot:
     """Markers that colour images show, by name."""
     aruco_dictionary: str = "4X4_50"
     """Of the tags, as OpenCV names it."""
+    correction: Correction | None = None
+    """How far markers are from the model beyond all effects; used where that is asked for."""
     surface_points: int = 0
     """So many of the markers, the last ones, are points of the surface that clouds are measured at; nobody glued them on."""
 
@@ -107,6 +111,17 @@ class Robot:
             f"Robot({self.name}: {len(mesh.tets)} tetrahedra; {', '.join(drives) or 'no input'}; {len(self.marker_names)} "
             f"markers)"
         )
+
+    def require_correction(self) -> Correction:
+        """Return the correction. Raises InputError where there is none."""
+        if self.correction is None:
+            raise InputError(
+                "this robot has no correction",
+                where=self.folder or self.name,
+                expected="[correction] in robot.toml",
+                hint="femsense improve --correct learns one, and hands it back where it helps on held-out data",
+            )
+        return self.correction
 
     def with_body(self, body: BodyModel) -> Robot:
         """Return the robot with another body on the same mesh."""

@@ -76,7 +76,8 @@ def _marker_rows(sensor: Sensor, k: int, state: Equilibrium) -> Rows:
         measured - robot.marker_points[marker], axis=1
     )  # of the marker, so that a state that runs away gains nothing
     noise = sensor.options.marker_std_m or _marker_std(sensor.calibration)
-    std = np.repeat(np.hypot(noise, sensor.options.marker_model_std * way), 3)
+    beyond = np.hypot(sensor.options.marker_model_std * way, sensor.correction_std[rows])
+    std = np.repeat(np.hypot(noise, beyond), 3)
     placed = np.array([robot.marker_names[m] in sensor.calibration.placements_m for m in marker])
     # a placement that rest.csv measured moves with the pose: only the marker's motion since then is left to turn
     turned = _pose_columns(measured, sensor.pivot)

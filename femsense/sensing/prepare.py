@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -17,6 +18,7 @@ from femsense.fem.compliance import tangent_at
 from femsense.fem.equilibrium import Equilibrium
 from femsense.model.contact_patch import body_surface, flat_nodes
 from femsense.model.drive import DrivenRobot, drive_of
+from femsense.model.marker_correction import corrected
 from femsense.model.quasi_static_path import free_path
 from femsense.model.recording import Recording
 from femsense.model.recording_checks import check_against
@@ -42,7 +44,8 @@ def make_sensor(
     options: SensingOptions | None = None,
 ) -> Sensor:
     """Prepare what stays the same from frame to frame. Raises InputError where nothing says where to look for forces."""
-    recording, options = check_against(robot, recording), options or SensingOptions()
+    options = options or SensingOptions()
+    recording, correction_std = _corrected(robot, check_against(robot, recording), calibration, options)
     robot = robot.in_recording(recording.label)
     places = as_points(at if at is not None else np.zeros((0, 3)), "at")
     size = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
@@ -79,12 +82,40 @@ def make_sensor(
         size,
         knowledge,
         Answers(),
+        correction_std,
     )
     learned = learn(knowledge, _free_rows(sensor))
     if not pulls_are_modelled:
         return replace(sensor, knowledge=learned)
     sensor = _better_posed(sensor, learned)
     return replace(sensor, knowledge=learn(sensor.knowledge, _free_rows(sensor)))
+
+
+def _corrected(
+    robot: Robot, recording: Recording, calibration: Calibration, options: SensingOptions
+) -> tuple[Recording, FloatArray]:
+    """Return the recording with its markers moved by the robot's correction where that is asked for, and the correction's standard deviation [m], (K,).
+
+    Raises:
+        InputError: no correction, one for other inputs, or no markers.
+    """
+    if calibration.is_corrected != options.correct and recording.has_markers:
+        warnings.warn(
+            f"calibrated {'with' if calibration.is_corrected else 'without'} the correction, estimated"
+            f" {'with' if options.correct else 'without'} it: poses do not belong together",
+            stacklevel=4,
+        )
+    if not options.correct:
+        return recording, np.zeros(len(recording.marker_frame))
+    if recording.has_clouds or not recording.has_markers:
+        raise InputError(
+            "the correction speaks of markers; where there are clouds, forces come from these",
+            where=recording.folder,
+            expected="a recording with markers and without clouds",
+            hint="leave --correct out",
+        )
+    correction = robot.require_correction()
+    return corrected(recording, correction, calibration.poses), correction.of_rows(recording)[1]
 
 
 def _better_posed(sensor: Sensor, learned: Knowledge) -> Sensor:

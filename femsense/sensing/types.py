@@ -44,6 +44,8 @@ class SensingOptions:
     """Where there are only markers: error of the modelled motion of a point, relative to its way from rest."""
     iterations: int = 10
     """Gauss–Newton steps a frame at most."""
+    correct: bool = False
+    """Use the robot's empirical correction of its markers, with its standard deviation."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -331,3 +333,5 @@ class Sensor:
     knowledge: Knowledge
     answers: Answers
     """How the body answers to forces at the candidates, kept from frame to frame."""
+    correction_std: FloatArray
+    """Standard deviation of the correction of each marker observation along each axis [m], shape (K,); zero without one."""

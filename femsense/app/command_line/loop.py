@@ -48,6 +48,10 @@ def improve(
             help="What is used of a recording; auto: its markers, or its clouds where it has none.",
         ),
     ] = "auto",
+    correct: Annotated[
+        bool,
+        typer.Option("--correct", help="Also learn an empirical correction of what is left, judged on held-out data: no cause."),
+    ] = False,
     again: Annotated[bool, typer.Option("--again", help="Compute even where OUT holds this result already.")] = False,
     workers: Annotated[
         int | None,
@@ -102,7 +106,7 @@ def improve(
             validation=validation or [],
             effects=split_names(effects),
             without=split_names(without),
-            options=ImproveOptions(user_effects=user_effect or [], measured=measured),
+            options=ImproveOptions(user_effects=user_effect or [], measured=measured, correct=correct),
             again=again,
             say=say,
             progress=progress,

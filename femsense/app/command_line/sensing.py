@@ -11,6 +11,8 @@ import typer
 from femsense.app.command_line.answer import Answer, progress_bar, say
 from femsense.app.command_line.parameters import Json, RecordingPath, RobotPath, places
 
+USE_CORRECTION = "Use the correction that femsense improve --correct learned: of markers, never a cause."
+
 
 class SensingMethod(StrEnum):
     """How forces are found."""
@@ -23,6 +25,7 @@ def calibrate(
     robot: RobotPath,
     recording: RecordingPath,
     output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="The file to write.")] = Path("calibration.json"),
+    correct: Annotated[bool, typer.Option("--correct", help=USE_CORRECTION)] = False,
     json: Json = False,
 ) -> Answer:
     """Find the camera's pose and the cables' initial inputs."""
@@ -34,7 +37,7 @@ def calibrate(
     from femsense.report.text import calibration_text
 
     check_target(output, folder=False)
-    calibration = calibrate_recording(load_robot(robot), load_recording(recording))
+    calibration = calibrate_recording(load_robot(robot), load_recording(recording), correct=correct)
     if not calibration.settled:
         text = calibration_text(calibration) + "\n\nnothing is written: this calibration is not to be used"
         return Answer({"path": None, **calibration_document(calibration)}, text, exit_status=1)
@@ -73,6 +76,7 @@ def estimate(
     smooth: Annotated[
         float, typer.Option("--smooth", metavar="SECONDS", help="Average forces over so long; they lag by as much.")
     ] = 0.0,
+    correct: Annotated[bool, typer.Option("--correct", help=USE_CORRECTION)] = False,
     again: Annotated[bool, typer.Option("--again", help="Compute even where RUN holds this result already.")] = False,
     json: Json = False,
 ) -> Answer:
@@ -81,7 +85,7 @@ def estimate(
     from femsense.report.text import run_document, run_text
     from femsense.sensing.types import SensingOptions
 
-    options = SensingOptions(method=method.value, friction=friction, smooth_s=smooth)
+    options = SensingOptions(method=method.value, friction=friction, smooth_s=smooth, correct=correct)
     if smooth > 0:
         say(f"forces are averaged over {smooth:g} s and lag by as much")
     with progress_bar("estimate") as progress:
@@ -121,12 +125,13 @@ def reach(
     output: Annotated[
         Path | None, typer.Option("-o", "--output", metavar="FILE", help="A JSON file to write.", show_default=False)
     ] = None,
+    correct: Annotated[bool, typer.Option("--correct", help=USE_CORRECTION)] = False,
     json: Json = False,
 ) -> Answer:
     """Find the inputs that bring points of the body to places."""
     from femsense.app.reach_command import reach_targets
 
     document, text, reached = reach_targets(
-        robot, target, control=control, forces=force or [], calibration=calibration, output=output
+        robot, target, control=control, forces=force or [], calibration=calibration, output=output, correct=correct
     )
     return Answer(document, text, exit_status=0 if reached else 1)

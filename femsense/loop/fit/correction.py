@@ -19,8 +19,8 @@ from femsense.core.arrays import FloatArray, IntArray
 from femsense.loop.data.dataset import Data
 from femsense.loop.data.trial import Trial
 from femsense.loop.fit.fitted_model import FittedModel
+from femsense.model.marker_correction import KERNELS, Correction, kernel_of, recorded_inputs
 
-KERNELS = "each input by itself", "all inputs together"
 LENGTHS = 0.3, 0.6, 1.2, 2.4
 """Lengths of the kernel that are tried, in ranges of an input."""
 RATIOS = 1.0, 3.0, 10.0, 30.0, 100.0, 300.0
@@ -30,41 +30,6 @@ LIKELIER = 3.0
 itself, which carries over to inputs that were not pulled together."""
 LEAST_STATES = 6
 """Fewer states tell no function of the inputs."""
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Correction:
-    """A function of the inputs: how far each marker is from the model."""
-
-    kernel: str
-    """One of KERNELS."""
-    length: float
-    """In ranges of an input."""
-    input_names: tuple[str, ...]
-    ranges: FloatArray
-    """Of the inputs [N] or [m], shape (a,)."""
-    marker_names: tuple[str, ...]
-    states: FloatArray
-    """Inputs of the states that it was learned from, in their ranges, shape (n, a)."""
-    basis: FloatArray
-    """From the kernel to the terms, shape (n, q)."""
-    weights: FloatArray
-    """Of the terms, robot frame [m], shape (q, m, 3)."""
-    covariance: FloatArray
-    """Of the weights of one axis of a marker [m²], shape (q, q)."""
-
-    @property
-    def terms(self) -> int:
-        """Return how many terms it has."""
-        return int(self.basis.shape[1])
-
-
-def shifts_at(correction: Correction, inputs: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return by how much markers are beyond the model, robot frame [m], shape (f, m, 3), for inputs [N] or [m], shape (f, a); and one standard deviation
-    along each axis [m], shape (f,)."""
-    terms = _kernel(correction.kernel, correction.length, inputs / correction.ranges, correction.states) @ correction.basis
-    variance = np.einsum("fq,qr,fr->f", terms, correction.covariance, terms)
-    return np.einsum("fq,qmc->fmc", terms, correction.weights), np.sqrt(np.maximum(variance, 0.0))
 
 
 def learn_correction(data: Data, fitted: FittedModel) -> Correction | None:
@@ -78,7 +43,7 @@ def learn_correction(data: Data, fitted: FittedModel) -> Correction | None:
     plain = _Model(rows, np.zeros((len(number), 0)))
     best, chosen = plain.likelihood(1.0)[0], None
     for kernel, length in product(KERNELS if states.shape[1] > 1 else KERNELS[1:], LENGTHS):
-        gram = _kernel(kernel, length, states, states)
+        gram = kernel_of(kernel, length, states, states)
         values, vectors = np.linalg.eigh(gram)
         for ratio in RATIOS:
             kept = values * ratio > 1.0
@@ -93,11 +58,11 @@ def learn_correction(data: Data, fitted: FittedModel) -> Correction | None:
         return None
     kernel, length, ratio, basis, found = chosen
     weights, covariance = found.weights(ratio)
-    names = data.robot.glued_names
-    whole = np.zeros((basis.shape[1], len(names), 3))
-    whole[:, rows.markers] = weights
+    names = tuple(data.robot.glued_names[m] for m in rows.markers)
     recording = data.train[0].scene.recording
-    return Correction(kernel, length, recording.cable_names, _ranges(data), names, states, basis, whole, covariance)
+    drives = (*recording.cable_names, *recording.chamber_names)
+    noise = float(np.sqrt(found.likelihood(ratio)[1]))
+    return Correction(kernel, length, data.control, drives, _ranges(data), names, states, basis, weights, covariance, noise)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -129,13 +94,14 @@ def _rows_of(data: Data, fitted: FittedModel) -> _Rows:
 
 
 def _ranges(data: Data) -> FloatArray:
-    """Return the ranges of the inputs [N] or [m], shape (a,); of those that rest in all frames the largest of the others."""
-    return np.where(data.input_scale > 0, data.input_scale, data.input_scale.max())
+    """Return the largest value of each input where it is fitted [N], [m] or [Pa], shape (a,); of one that rests in all frames that of the largest."""
+    largest = np.max([np.abs(inputs_of(t)).max(axis=0) for t in data.train], axis=0)
+    return np.asarray(np.where(largest > 0, largest, max(largest.max(initial=0.0), 1e-12)))
 
 
 def inputs_of(trial: Trial) -> FloatArray:
-    """Return the inputs of each row of a trial [N] or [m], shape (k, a)."""
-    return trial.scene.recording.inputs[trial.scene.frame]
+    """Return the recorded inputs of each row of a trial [N], [m] or [Pa], shape (k, a)."""
+    return recorded_inputs(trial.scene.recording)[trial.scene.frame]
 
 
 class _Model:
@@ -189,16 +155,7 @@ class _Model:
         return np.asarray(weights), np.asarray(variance * largest, dtype=np.float64)
 
 
-def _kernel(kind: str, length: float, a: FloatArray, b: FloatArray) -> FloatArray:
-    """Return the kernel between inputs (n, a) and (k, a) in their ranges, shape (n, k). That of each input by itself is none at rest."""
-    own = np.exp(-0.5 * (a[:, None, :] - b[None, :, :]) ** 2 / length**2)
-    if kind == KERNELS[1]:
-        return np.asarray(own.prod(axis=2))
-    at_rest = [np.exp(-0.5 * values**2 / length**2) for values in (a, b)]
-    return np.asarray((own - at_rest[0][:, None, :] * at_rest[1][None, :, :]).sum(axis=2))
-
-
 def rows_of(correction: Correction, trial: Trial) -> tuple[FloatArray, FloatArray]:
     """Return what a correction says of the rows of a trial, robot frame [m], shape (k, 3), and its standard deviation, shape (k,)."""
-    shifts, std = shifts_at(correction, inputs_of(trial))
+    shifts, std = correction.shifts(inputs_of(trial))
     return shifts[np.arange(len(shifts)), trial.scene.marker], std

@@ -281,19 +281,9 @@ class CorrectionRecord:
     kernel: str | None = None
     length: float | None = None
     """Of the kernel, in ranges of an input."""
-    inputs: tuple[str, ...] = ()
-    """Cables."""
-    ranges: tuple[float, ...] = ()
-    """Of their inputs [N] or [m]."""
-    markers: tuple[str, ...] = ()
-    states: tuple[tuple[float, ...], ...] = ()
-    """Inputs that it was learned from, in their ranges, (n, a)."""
-    basis: tuple[tuple[float, ...], ...] = ()
-    """From the kernel to the terms, (n, q)."""
-    weights_m: tuple[tuple[tuple[float, ...], ...], ...] = ()
-    """Of the terms, robot frame [m], (q, m, 3)."""
-    covariance_m2: tuple[tuple[float, ...], ...] = ()
-    """Of the weights of one axis of a marker [m²], (q, q)."""
+    terms: int | None = None
+    noise_m: float | None = None
+    """What it leaves of a marker along each axis where it is fitted [m]."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

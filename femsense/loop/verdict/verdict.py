@@ -20,6 +20,7 @@ from femsense.loop.result.loop_result import FOUND, NONE, UNEXPLAINED, LoopResul
 from femsense.loop.result.records import Left, Structure
 from femsense.loop.search.search_state import Search
 from femsense.loop.verdict.confounding import confounded, in_words
+from femsense.loop.verdict.empirical import judged_correction
 from femsense.loop.verdict.model_error import Excess, excess_of, model_error
 from femsense.loop.verdict.report_data import gather
 from femsense.loop.verdict.residual_diagnostics import describe_left, structure_tests
@@ -49,8 +50,8 @@ SAME = 0.01, 1e-5
 """The robot that is handed back may differ from the fitted model by this share of what that leaves, or by this [m]."""
 
 
-def conclude(data: Data, search: Search, rng: np.random.Generator) -> LoopResult:
-    """Return the verdict with all that the report shows."""
+def conclude(data: Data, search: Search, rng: np.random.Generator, *, correct: bool = False) -> LoopResult:
+    """Return the verdict with all that the report shows; with an empirical correction of what is left if `correct`."""
     before, final, noise = search.before, search.final, search.noise
     std = parameter_std(data, final, noise, _seed_std(search))
     measured = repeatability(data, final, noise)
@@ -73,7 +74,8 @@ def conclude(data: Data, search: Search, rng: np.random.Generator) -> LoopResult
     unexplained = lacks or (found and not effects) or open_to_doubt or excess.is_large
     verdict = UNEXPLAINED if unexplained else FOUND if effects else NONE
     pairs = confounded(search, names, data.thresholds)
-    robot = _handed_back(data, entries)
+    correction, learned = judged_correction(data, back) if correct else (None, None)
+    robot = replace(_handed_back(data, entries), correction=learned)
     only_held = bool(surprise) and not tests.significant and not lacks
     left = _left(data, back if only_held else shown, noise, tests, excess, held=only_held)
     budget = model_error(data, excess, noise, measured)
@@ -102,6 +104,7 @@ def conclude(data: Data, search: Search, rng: np.random.Generator) -> LoopResult
         declared=data.declared,
         data=data_card(data, final, std, noise, measured.source, search.n_effective),
         model_error=budget,
+        correction=correction,
         residuals=residual_table(data, before, back),
         evidence=gather(data, before, search.base, final, back, shown, noise, search.first, search.last, tests, rng),
     )

@@ -21,6 +21,7 @@ from femsense.report.loop.residual_against import covariate_table, residual_agai
 from femsense.report.loop.residual_at_rest import mean_residual_panels
 from femsense.report.loop.residual_in_frames import frame_residuals_panel
 from femsense.report.loop.smallest_effects import power_table
+from femsense.report.loop.text import correction_text
 from femsense.report.loop.what_is_left import tests_table, what_is_left
 from femsense.report.page import Chapter, Html, paragraph, section, tiles, together
 
@@ -108,6 +109,14 @@ def _summary(loop: Loop) -> Html | None:
     if words.known(own.held_out_m):
         note = f"{kind}, held out, beyond noise and discretisation; {words.length(own.fitted_m)} where fitted"
         items.append(("Error of the model", words.length(own.held_out_m), note))
+    if loop.correction is not None and words.known(loop.correction.validation_rms_after_m):
+        items.append(
+            (
+                "With an empirical correction",
+                words.length(loop.correction.validation_rms_after_m),
+                correction_text(loop.correction),
+            )
+        )
     share = recovered(before.validation_rms_m, after.validation_rms_m, loop.noise_m)
     if share is not None:
         items.append(("Recovered", words.percent(share), "of the excess over the noise (squares)"))

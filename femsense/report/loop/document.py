@@ -171,6 +171,15 @@ class ModelError(Document):
     discretisation_note: str = ""
 
 
+class Corrected(Document):
+    """An empirical correction that was asked for."""
+
+    accepted: bool = False
+    verdict: str = ""
+    validation_rms_before_m: Number = None
+    validation_rms_after_m: Number = None
+
+
 class Loop(Document):
     """loop.json."""
 
@@ -187,6 +196,7 @@ class Loop(Document):
     detectable: dict[str, Detectable] = Field(default_factory=dict)
     left: Left = Left()
     model_error: ModelError = ModelError()
+    correction: Corrected | None = None
     data: Card = Card()
     residuals: Residuals = Residuals()
     evidence: Evidence | None = None

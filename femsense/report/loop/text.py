@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from femsense.loop.result.loop_result import NONE
-from femsense.report.loop.document import Detectable, Effect, Left, Loop, Untestable, Where
+from femsense.report.loop.document import Corrected, Detectable, Effect, Left, Loop, Untestable, Where
 from femsense.report.text import columns
 from femsense.report.words import VERDICTS
 
@@ -109,7 +109,16 @@ def _rows(loop: Loop) -> list[list[str]]:
     if own.held_out_m is not None:
         said = f"{1e3 * own.held_out_m:.3f} mm held out, beyond noise and discretisation; noise: {own.noise_source}"
         rows.append(["error of the model", said])
+    if loop.correction is not None:
+        rows.append(["with an empirical correction", correction_text(loop.correction)])
     return rows
+
+
+def correction_text(own: Corrected) -> str:
+    """Return what an empirical correction does to held-out markers, and whether it is handed back."""
+    before, after = own.validation_rms_before_m, own.validation_rms_after_m
+    sizes = "" if before is None or after is None else f"{1e3 * before:.3f} → {1e3 * after:.3f} mm rms held out; "
+    return f"{sizes}{own.verdict}; it is {'handed back, as no cause' if own.accepted else 'not handed back'}"
 
 
 def _parameter(value: Any, std: Any, unit: str | None) -> str:

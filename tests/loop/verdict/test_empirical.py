@@ -10,11 +10,11 @@ from arm import NAMES, T_ROBOT_CAMERA, arm, record
 
 from femsense.loop.data.dataset import Data, prepare
 from femsense.loop.data.trial import rms_of
-from femsense.loop.fit.correction import KERNELS, learn_correction, rows_of, shifts_at
+from femsense.loop.fit.correction import learn_correction, rows_of
 from femsense.loop.fit.fitted_model import FittedModel, fit_model, with_nuisance
 from femsense.loop.fit.noise_components import Noise
-from femsense.loop.result.tables import table_of
-from femsense.loop.verdict.empirical import correction_of, judged_correction
+from femsense.loop.verdict.empirical import judged_correction
+from femsense.model.marker_correction import SEPARATE
 from femsense.model.recording import Recording
 
 NOISE = Noise({"white": 1e-4}, "")
@@ -42,22 +42,22 @@ def single_then_both(size: float, *, held: float = 1.0) -> tuple[Data, FittedMod
 
 def test_what_single_inputs_leave_is_learned_and_carries_over_to_pairs() -> None:
     data, fitted = single_then_both(3e-4)
-    found = judged_correction(data, fitted)
-    assert found.accepted and found.kernel == KERNELS[0]
+    found, again = judged_correction(data, fitted)
+    assert found.accepted and found.kernel == SEPARATE
     assert found.validation_rms_after_m < 0.7 * found.validation_rms_before_m
-    again = correction_of(found)
-    assert table_of(found)["markers"] == list(data.robot.glued_names) and again.terms == len(found.weights_m)
+    assert again is not None and again.marker_names == data.robot.glued_names and again.terms == found.terms
     learned = learn_correction(data, fitted)
     assert learned is not None
     for a, b in zip(rows_of(learned, data.held[0]), rows_of(again, data.held[0])):
         np.testing.assert_allclose(a, b)
-    assert 0.0 < shifts_at(again, np.array([[1.0, 0.0, 0.0, 0.0]]))[1][0] < 1e-3 and again.input_names == NAMES
+    assert 0.0 < again.shifts(np.array([[1.0, 0.0, 0.0, 0.0]]))[1][0] < 1e-3 and again.input_names == NAMES
+    assert 0.5e-4 < again.noise < 2e-4 and again.control == "tension"
 
 
 def test_mere_noise_is_no_correction_and_one_that_does_not_help_is_refused() -> None:
-    assert not judged_correction(*single_then_both(0.0)).accepted
-    found = judged_correction(*single_then_both(3e-4, held=-1.0))
-    assert not found.accepted and found.validation_rms_after_m > found.validation_rms_before_m
+    assert not judged_correction(*single_then_both(0.0))[0].accepted
+    found, learned = judged_correction(*single_then_both(3e-4, held=-1.0))
+    assert not found.accepted and learned is None and found.validation_rms_after_m > found.validation_rms_before_m
     assert "not surely" in found.verdict
 
 
