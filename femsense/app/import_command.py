@@ -12,9 +12,9 @@ import femsense
 from femsense.core.errors import InputError
 from femsense.io.files import check_target, followed
 from femsense.io.importers.actuation import read_actuation_log
+from femsense.io.importers.csv_tables import header_of
 from femsense.io.importers.frames import UNITS, Options
 from femsense.io.importers.guess import open_sources, split_name
-from femsense.io.importers.plain_csv import header_of
 from femsense.io.importers.writer import RECORD, write_recording
 
 Progress = Callable[..., None]

@@ -1,7 +1,9 @@
-"""Text files of points (.xyz): x y z in a line, then perhaps a normal or a colour; blanks or commas between."""
+"""Text files of points (.xyz): x y z in a line, then perhaps a normal or a colour; blanks, commas, semicolons or tabs between, and beside
+semicolons, tabs or blanks decimal commas."""
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +13,8 @@ from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 
 SKIPPED = ("#", "//")
+DECIMAL_COMMA = re.compile(r"(?:[-+]?\d+,\d+(?:[eE][-+]?\d+)?|[-+]?\d+)")
+"""A number with a decimal comma, or a whole one."""
 
 
 def read_xyz_columns(path: str | Path) -> dict[str, npt.NDArray[np.generic]]:
@@ -25,8 +29,10 @@ def read_xyz_columns(path: str | Path) -> dict[str, npt.NDArray[np.generic]]:
     file = Path(path)
     if not file.is_file():
         raise InputError("no such file", where=file, expected="a text file of points")
-    lines = file.read_bytes().decode("utf-8-sig", "replace").replace(",", " ").replace(";", " ").splitlines()
-    rows = [(i, line.split()) for i, line in enumerate(lines, start=1) if line.strip() and not line.lstrip().startswith(SKIPPED)]
+    lines = file.read_bytes().decode("utf-8-sig", "replace").splitlines()
+    told = [(i, line) for i, line in enumerate(lines, start=1) if line.strip() and not line.lstrip().startswith(SKIPPED)]
+    comma = "." if _has_decimal_commas(told[-1][1] if told else "") else " "
+    rows = [(i, line.replace(",", comma).replace(";", " ").split()) for i, line in told]
     if rows and (len(rows[0][1]) == 1 or not _is_number(rows[0][1][0])):
         rows = rows[1:]
     if not rows:
@@ -37,6 +43,12 @@ def read_xyz_columns(path: str | Path) -> dict[str, npt.NDArray[np.generic]]:
     if table.shape[1] >= 6 and _is_color(last):
         columns |= {name: last[:, i] for i, name in enumerate(("red", "green", "blue"))}
     return columns
+
+
+def _has_decimal_commas(line: str) -> bool:
+    """Whether a line is three numbers or more with decimal commas, kept apart by semicolons, tabs or blanks."""
+    words = line.replace(";", " ").split()
+    return "," in line and "." not in line and len(words) >= 3 and all(DECIMAL_COMMA.fullmatch(word) for word in words)
 
 
 def _table(rows: list[tuple[int, list[str]]], file: Path) -> FloatArray:

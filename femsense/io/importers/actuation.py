@@ -10,9 +10,10 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
+from femsense.io.importers.csv_tables import read_numbers, time_column
 from femsense.io.importers.frames import Options
 from femsense.io.importers.journal import Journal
-from femsense.io.importers.plain_csv import named_columns, read_numbers, time_column
+from femsense.io.importers.plain_csv import input_columns, named_columns
 
 SURE = 0.6
 """A correlation below this does not tell the offset."""
@@ -62,7 +63,7 @@ def read_actuation_log(path: str | Path, options: Options) -> ActuationLog:
     clock, scale = time_column(names, file)
     time_s = table[:, clock] * scale
     mapped = named_columns(names, options.columns, ("cable_", "chamber_"))
-    direct = [(name, j, 1.0) for j, name in enumerate(names) if name.startswith(("cable_", "chamber_"))]
+    direct, actuation = input_columns(names, {})
     others = [(f"cable_{name}", j, 1.0) for j, name in enumerate(names) if j != clock and name.lower() not in ("frame", "id")]
     chosen = mapped or direct or others
     if not chosen:
@@ -74,7 +75,7 @@ def read_actuation_log(path: str | Path, options: Options) -> ActuationLog:
     if len(time_s) < 2 or (np.diff(time_s) <= 0).any():
         raise InputError("time does not increase", where=file, found=f"{len(time_s)} rows", expected="rows in order of time")
     values = np.stack([factor * table[kept, j] for _, j, factor in chosen], axis=1)
-    return ActuationLog(file, time_s, tuple(name for name, _, _ in chosen), values)
+    return ActuationLog(file, time_s, tuple(name for name, _, _ in chosen), values, None if mapped else actuation)
 
 
 def align(log: ActuationLog, journal: Journal, offset: float | None) -> tuple[ActuationLog, dict[str, Any]]:

@@ -13,11 +13,12 @@ from typing import Any
 from femsense.core.errors import InputError
 from femsense.core.text import did_you_mean
 from femsense.io.importers.c3d import open_c3d, read_c3d_header
+from femsense.io.importers.csv_tables import header_of
 from femsense.io.importers.folders import CLOUDS, PAIRS, folder_kind, open_clouds, open_redwood, open_tum
 from femsense.io.importers.frames import Options, Source
 from femsense.io.importers.kinect import open_kinect
 from femsense.io.importers.mocap_csv import is_mocap_csv, open_mocap_csv, read_export
-from femsense.io.importers.plain_csv import header_of, open_plain_csv
+from femsense.io.importers.plain_csv import open_plain_csv
 from femsense.io.importers.ros import list_ros, open_ros
 from femsense.io.importers.ros_bag import ENDINGS
 from femsense.io.importers.several import camera_names, joined

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -11,8 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from femsense.core.errors import InputError
+from femsense.io.importers.csv_tables import is_cut_off, rows_of
 from femsense.io.importers.frames import Frame, Options, Source, unit_of, upright
-from femsense.io.importers.plain_csv import rows_of
 
 HEAD = 12
 """The headers are in the first lines."""
@@ -83,11 +84,15 @@ def _frames(
     path: Path, export: Export, markers: tuple[tuple[str, tuple[int, int, int]], ...], scale: float, rate: float, up: str | None
 ) -> Iterator[Frame]:
     start: float | None = None
+    last = max(j for _, axes in export.markers for j in axes)
     for row in islice(rows_of(path), export.first, None):
         if not any(cell.strip() for cell in row):
             if export.program == "vicon" and start is not None:
                 return  # the next section begins
             continue
+        if len(row) <= last and is_cut_off(path):
+            warnings.warn(f"{path}: the last line was cut off and is left out", stacklevel=2)
+            return
         time = _cell(row, export.time) if export.time is not None else _cell(row, 0) / rate
         start = time if start is None else start
         places = [(name, np.array([_cell(row, j) for j in axes])) for name, axes in markers]
@@ -137,12 +142,12 @@ def _vicon(path: Path) -> Export:
             expected="Trajectories, rate, names, Frame,Sub Frame,X,Y,Z …, units",
         )
     names, axes, units = section[2], [cell.strip().upper() for cell in section[3]], section[4]
-    found = []
-    for j in range(2, len(axes) - 2):
-        if axes[j : j + 3] == ["X", "Y", "Z"]:
-            label = _at(names, j)
-            bare = label.rpartition(":")[2]
-            found.append(("" if bare.startswith("*") or not bare else bare, (j, j + 1, j + 2)))
+    labels = [(_at(names, j), (j, j + 1, j + 2)) for j in range(2, len(axes) - 2) if axes[j : j + 3] == ["X", "Y", "Z"]]
+    bare = [label.rpartition(":")[2] for label, _ in labels]
+    found = []  # the subject stays before the name where another has a marker of the same name
+    for (label, columns), name in zip(labels, bare):
+        nameless = name.startswith("*") or not name
+        found.append(("" if nameless else label if bare.count(name) > 1 else name, columns))
     unit = next((cell.strip() for cell in units if cell.strip()), None)
     return Export("vicon", tuple(found), unit, None, _rate(section[1][0]), (start or 0) + 5)
 

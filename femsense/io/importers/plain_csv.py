@@ -2,40 +2,27 @@
 
 from __future__ import annotations
 
-import csv
-import gzip
-import io
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 
-from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.core.text import did_you_mean
+from femsense.io.importers.csv_tables import (
+    FORCES,
+    LENGTHS,
+    PRESSURES,
+    header_of,
+    is_time,
+    number_in,
+    number_rows,
+    split_unit,
+    time_column,
+)
 from femsense.io.importers.frames import Frame, Options, Source, unit_of, upright
 
-TIMES = {
-    "time": 1.0,
-    "time_s": 1.0,
-    "t": 1.0,
-    "t_s": 1.0,
-    "seconds": 1.0,
-    "timestamp": 1.0,
-    "time (seconds)": 1.0,
-    "time_ms": 1e-3,
-    "timestamp_ms": 1e-3,
-    "time_us": 1e-6,
-    "timestamp_us": 1e-6,
-    "time_ns": 1e-9,
-    "timestamp_ns": 1e-9,
-    "secs": 1.0,
-    "sec": 1.0,
-}
-"""Names of columns of time, and seconds in one unit."""
-DECIMAL_COMMA = re.compile(r"\s*[-+]?\d*,\d+(?:[eE][-+]?\d+)?\s*")
 NO_PLACES = (
     "q",
     "quat",
@@ -56,82 +43,6 @@ NO_PLACES = (
 """Stems of columns that end in x, y, z and are no places."""
 
 
-@contextmanager
-def open_text(path: Path) -> Iterator[io.TextIOBase]:
-    """Open a text file, gzipped or not. Raises InputError where it cannot be read."""
-    try:
-        opened = gzip.open if path.suffix.lower() == ".gz" else open
-        raw = opened(path, "rb")
-    except OSError as error:
-        raise InputError("cannot be read", where=path, found=error.strerror) from None
-    with raw as stream, io.TextIOWrapper(stream, encoding="utf-8-sig", errors="replace", newline="") as text:
-        try:
-            yield text
-        except (EOFError, gzip.BadGzipFile, OSError) as error:
-            raise InputError("a broken compressed file", where=path, found=str(error), expected="a whole gzip file") from None
-
-
-def rows_of(path: Path) -> Iterator[list[str]]:
-    """Yield the rows of a CSV file as text; commas, semicolons or tabs between, and beside these two decimal commas."""
-    with open_text(path) as stream:
-        head = stream.read(4096)
-        stream.seek(0)
-        lines = head.splitlines()[:20]
-        mark = max(",;\t", key=lambda c: sum(line.count(c) for line in lines))
-        rows = csv.reader(stream, delimiter=mark)
-        yield from rows if mark == "," else ([_with_point(cell) for cell in row] for row in rows)
-
-
-def _with_point(cell: str) -> str:
-    """Return a number with a decimal comma as one with a point, anything else as it is."""
-    return cell.replace(",", ".") if DECIMAL_COMMA.fullmatch(cell) else cell
-
-
-def header_of(path: Path) -> tuple[list[str], bool]:
-    """Return the names of the columns, and whether they stand in the file; a file of bare numbers has 1, 2, …"""
-    first = next((row for row in rows_of(path) if any(cell.strip() for cell in row)), [])
-    if not first:
-        raise InputError("an empty table", where=path, found=f"{path.stat().st_size} bytes", expected="rows of numbers")
-    if all(_number(cell) is not None or not cell.strip() for cell in first):
-        return [str(i + 1) for i in range(len(first))], False
-    return [cell.strip() for cell in first], True
-
-
-def read_numbers(path: Path) -> tuple[list[str], FloatArray]:
-    """Return the names of the columns and the table, shape (rows, columns); NaN where a cell is empty. Raises InputError."""
-    names, _ = header_of(path)
-    rows = list(number_rows(path))
-    return names, np.array(rows, dtype=np.float64).reshape(-1, len(names))
-
-
-def number_rows(path: Path) -> Iterator[list[float]]:
-    """Yield the rows of numbers after the header; NaN where a cell is empty. Raises InputError with the line."""
-    names, headed = header_of(path)
-    rows = (item for item in enumerate(rows_of(path), start=1) if any(cell.strip() for cell in item[1]))
-    if headed:
-        next(rows, None)
-    for line, cells in rows:
-        values = [np.nan if not cell.strip() else _number(cell) for cell in cells[: len(names)]]
-        if len(values) < len(names) or any(value is None for value in values):
-            bad = next((cell for cell, value in zip(cells, values) if value is None), f"{len(cells)} cells")
-            raise InputError(
-                "not a row of numbers",
-                where=f"{path}, line {line}",
-                found=bad,
-                expected=f"{len(names)} numbers",
-                hint="decimal points, not commas" if "," in bad else None,
-            )
-        yield [float(value) for value in values if value is not None]
-
-
-def time_column(names: Sequence[str], path: Path) -> tuple[int, float]:
-    """Return the column of time and seconds in one unit of it. Raises InputError."""
-    for j, name in enumerate(names):
-        if name.lower() in TIMES:
-            return j, TIMES[name.lower()]
-    raise InputError("no column of time", where=path, found=", ".join(names[:12]), expected=", ".join(TIMES))
-
-
 def named_columns(names: Sequence[str], columns: Mapping[str, str], prefixes: Sequence[str]) -> list[tuple[str, int, float]]:
     """Return (name in the recording, column, factor) of the mapped columns whose new name starts with one of the prefixes."""
     found = []
@@ -145,7 +56,7 @@ def named_columns(names: Sequence[str], columns: Mapping[str, str], prefixes: Se
 def split_factor(target: str) -> tuple[str, float]:
     """Return name and factor of a target such as cable_north*4.615. Raises InputError."""
     name, star, factor = target.partition("*")
-    value = _number(factor) if star else 1.0
+    value = number_in(factor) if star else 1.0
     if value is None:
         raise InputError("not a factor", where="--map", found=target, expected="NAME=TARGET*NUMBER")
     return name.strip(), value
@@ -168,10 +79,7 @@ def open_plain_csv(path: Path, options: Options) -> Source:
     _check_map(names, options, path)
     raw = not headed and not options.columns
     triples = _raw_triples(path, names) if raw else _mapped_triples(names, options) or _named_triples(names)
-    inputs = named_columns(names, options.columns, ("cable_", "chamber_"))
-    inputs += [
-        (name, j, 1.0) for j, name in enumerate(names) if name.startswith(("cable_", "chamber_")) and name not in options.columns
-    ]
+    inputs, actuation = input_columns(names, options.columns)
     if not triples and not inputs:
         raise InputError(
             "nothing that can be taken",
@@ -182,7 +90,8 @@ def open_plain_csv(path: Path, options: Options) -> Source:
         )
     clock = _clock(path, names, headed, options)
     chosen = [j for _, axes in triples for j in axes]
-    scale = unit_of(options, None, path, _extent(path, chosen)) if triples else 1.0
+    declared = _declared_unit(names, chosen, path)
+    scale = unit_of(options, declared, path, _extent(path, chosen)) if triples else 1.0
     label = not raw
 
     def frames() -> Iterator[Frame]:
@@ -193,9 +102,9 @@ def open_plain_csv(path: Path, options: Options) -> Source:
             drive = {name: factor * row[j] for name, j, factor in inputs if np.isfinite(row[j])}
             yield Frame(time, markers=seen if label else {}, unlabelled=() if label else list(seen.values()), inputs=drive)
 
-    found = {"unit": options.unit, "up": options.up or "as in the file", "marker_columns": len(triples)}
+    found = {"unit": options.unit or declared, "up": options.up or "as in the file", "marker_columns": len(triples)}
     notes = () if label else ("the markers have no names: the column marker stays empty, calibration assigns them",)
-    return Source("csv", path, frames, found={k: v for k, v in found.items() if v}, notes=notes)
+    return Source("csv", path, frames, found={k: v for k, v in found.items() if v}, actuation=actuation, notes=notes)
 
 
 def _clock(path: Path, names: list[str], headed: bool, options: Options) -> tuple[int, float] | None:
@@ -205,7 +114,7 @@ def _clock(path: Path, names: list[str], headed: bool, options: Options) -> tupl
         return mapped[0][1], mapped[0][2]
     if not headed:
         return 1, 1.0
-    if options.rate is not None and not any(name.lower() in TIMES for name in names):
+    if options.rate is not None and not any(map(is_time, names)):
         return None
     try:
         return time_column(names, path)
@@ -218,13 +127,44 @@ def _clock(path: Path, names: list[str], headed: bool, options: Options) -> tupl
         ) from problem
 
 
+def input_columns(names: Sequence[str], mapping: Mapping[str, str]) -> tuple[list[tuple[str, int, float]], str | None]:
+    """Return (name in the recording, column, factor) of the inputs, mapped or named cable_… and chamber_…, and what cables hold.
+
+    A unit behind a name gives the factor, and says whether cables hold tensions or displacements.
+    """
+    found = named_columns(names, mapping, ("cable_", "chamber_"))
+    kinds = set[str]()
+    for j, name in enumerate(names):
+        if name in mapping or not name.startswith(("cable_", "chamber_")):
+            continue
+        bare, unit = split_unit(name)
+        sizes = PRESSURES if name.startswith("chamber_") else FORCES | LENGTHS
+        bracketed = name.endswith(("]", ")"))
+        if unit not in sizes or not (bracketed or len(unit) > 1):  # a cable may be named cable_arm_n
+            bare, unit = name, ""
+        found.append((bare, j, sizes.get(unit, 1.0)))
+        if unit and bare.startswith("cable_"):
+            kinds.add("tension" if unit in FORCES else "displacement")
+    return found, kinds.pop() if len(kinds) == 1 else None
+
+
+def _declared_unit(names: Sequence[str], columns: Sequence[int], path: Path) -> str | None:
+    """Return the unit of length that the names of places say; None where they say none. Raises InputError: several."""
+    units = {unit for unit in (split_unit(names[j])[1] for j in columns) if unit in LENGTHS}
+    if len(units) > 1:
+        raise InputError("places in several units", where=path, found=", ".join(sorted(units)), expected="one unit")
+    return units.pop() if units else None
+
+
 def _named_triples(names: Sequence[str]) -> list[tuple[str, tuple[int, int, int]]]:
     """Return markers and their columns where x, y and z differ in one letter of their names."""
     groups: dict[str, dict[str, int]] = {}
-    for j, name in enumerate(names):
-        match = re.fullmatch(r"(.+?)[ _.:/-]?([xyzXYZ])(?:_m|_mm| \(mm\)| \[m+\])?", name) or re.fullmatch(
-            r"([xyzXYZ])[_ ]?(\w+)", name
-        )
+    for j, full in enumerate(names):
+        bare, unit = split_unit(full)
+        if unit and unit not in LENGTHS:
+            continue
+        name = bare if unit else full
+        match = re.fullmatch(r"(.+?)[ _.:/-]?([xyzXYZ])", name) or re.fullmatch(r"([xyzXYZ])[_ ]?(\w+)", name)
         if match is None:
             continue
         first, second = match[1], match[2]
@@ -286,10 +226,3 @@ def _extent(path: Path, columns: Sequence[int]) -> float:
     rows = np.array([[row[j] for j in columns] for row, _ in zip(number_rows(path), range(1000))])
     values = rows[np.isfinite(rows)]
     return float(np.ptp(values)) if values.size else 0.0
-
-
-def _number(cell: str) -> float | None:
-    try:
-        return float(cell)
-    except ValueError:
-        return None

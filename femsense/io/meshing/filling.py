@@ -149,7 +149,7 @@ def _of_wanted_size(
 ) -> Filled:
     """Fill a mended surface, with longer edges until the number of tetrahedra fits, and anew where an element is flat."""
     wanted = options.most_tets or MOST_TETS
-    edge, began, thin, rough = _first_edge(surface, options), time.monotonic(), surface, 1.0
+    edge, began, thin, rough = first_edge(surface, options), time.monotonic(), surface, 1.0
     fits: Filled | None = None
     fewest: Filled | None = None
     for attempt in range(TRIES):
@@ -203,7 +203,7 @@ def _best(fits: Filled | None, fewest: Filled | None, options: MeshOptions, wher
     )
 
 
-def _first_edge(surface: ClosedSurface, options: MeshOptions) -> float:
+def first_edge(surface: ClosedSurface, options: MeshOptions) -> float:
     """Return the edge length to begin with [m]: as wanted, or such that regular tetrahedra fill the volume."""
     if options.size_mm is not None:
         return 1e-3 * options.size_mm
@@ -238,7 +238,7 @@ def _fill_once(
         seconds=seconds,
     )
     mesh, notes = _one_body(made, where)
-    deviation = _deviation(mesh, surface, crosses)
+    deviation = deviation_of(mesh, surface, crosses)
     if deviation > ASTRAY * max(tolerance, drifted + envelope):
         raise Lost(
             "a part of the body was lost: its walls are thinner than the mesh may leave the surface",
@@ -268,7 +268,7 @@ def _rougher(drifted: float, tolerance: float) -> tuple[str, ...]:
     )
 
 
-def _deviation(mesh: TetMesh, surface: ClosedSurface, crosses: bool) -> float:
+def deviation_of(mesh: TetMesh, surface: ClosedSurface, crosses: bool) -> float:
     """Return the largest distance of a point of one surface from the other [m]; where shells cross,
     of the mesh from the surface."""
     skin, numbers = np.unique(surface_triangles(mesh), return_inverse=True)

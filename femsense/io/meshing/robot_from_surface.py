@@ -22,6 +22,7 @@ from femsense.io.files import check_target, file_hash, write_json, write_text
 from femsense.io.mesh_files import SURFACE_ENDINGS, read_triangles, write_mesh
 from femsense.io.meshes.reading import read_content
 from femsense.io.meshing.cad import CAD_READ, read_cad
+from femsense.io.meshing.cad_filling import fill_cad
 from femsense.io.meshing.filling import POOR, Filled, Mesher, MeshOptions, Progress, fill
 from femsense.io.meshing.quality import quality_report, quality_text
 from femsense.io.meshing.surface import check_finite
@@ -72,7 +73,8 @@ def mesh_into(
     if not again and (known := _finished(target, inputs)):
         say(f"{target} holds this mesh already (--again fills the surface anew)")
         return known
-    filled = fill(points, triangles, options, where=str(source), progress=progress, mesher=mesher)
+    filled = fill_cad(source, points, triangles, options, progress=progress) if source.suffix.lower() in CAD_READ else None
+    filled = filled or fill(points, triangles, options, where=str(source), progress=progress, mesher=mesher)
     report = mesh_report(filled, options) | {"inputs": inputs, "femsense": femsense.__version__}
     report["robot"] = _write_robot(target, filled.mesh, options, source)
     report["mesh_sha256"] = file_hash(target / report["robot"]["mesh_file"])
