@@ -156,6 +156,8 @@ def _check_options(options: Options, inputs: str | None, zero: str | None) -> No
             raise InputError(f"not a value of {name}", where=name, found=value, expected="|".join(allowed))
     if options.every < 1:
         raise InputError("not a count of frames", where="--every", found=options.every, expected="1, 2, …")
+    if options.depth_unit is not None and not 0 < options.depth_unit < 1:
+        raise InputError("not a unit of depth", where="--depth-unit", found=options.depth_unit, expected="metres, such as 0.001")
     if options.rate is not None and options.rate <= 0:
         raise InputError("not a rate", where="--rate", found=options.rate, expected="frames a second, > 0")
 

@@ -51,6 +51,12 @@ def import_(
         list[str] | None,
         typer.Option("--shift", metavar="CAMERA=S", help="Seconds to add to a camera's times.", show_default=False),
     ] = None,
+    depth_unit: Annotated[
+        float | None,
+        typer.Option(
+            "--depth-unit", metavar="M", help="Metres in one unit of depth images, if it is another.", show_default=False
+        ),
+    ] = None,
     every: Annotated[int, typer.Option("--every", metavar="N", min=1, help="Take one of so many frames.")] = 1,
     free: Annotated[
         list[str] | None,
@@ -81,7 +87,9 @@ def import_(
     from femsense.io.importers.frames import Options
 
     shifts, spans = shifts_named(shift or []), free_named(free or [])
-    options = Options(format, tuple(topic or ()), columns_named(map_ or []), unit, up, clock, rate, base, shifts, every, spans)
+    options = Options(
+        format, tuple(topic or ()), columns_named(map_ or []), unit, depth_unit, up, clock, rate, base, shifts, every, spans
+    )
     with progress_bar("import") as progress:
         document = import_into(
             output,

@@ -25,6 +25,9 @@ MOST = 65535
 INTEL, DEC, MIPS = 84, 85, 86
 """The processors whose numbers a file holds: little-endian, VAX, big-endian."""
 
+NAMELESS = "*"
+"""Labels of tracks that nobody named begin so (Vicon Nexus)."""
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Header:
@@ -130,8 +133,10 @@ def _frames(
         for number in range(whole):
             places, missing = _points(stream.read(size), header)
             kept = {name: k for k, name in chosen if not missing[k]}
-            xyz = upright(scale * places[list(kept.values())], up)
-            yield Frame(number / header.rate, markers=dict(zip(kept, xyz)))
+            seen = dict(zip(kept, upright(scale * places[list(kept.values())], up)))
+            named = {name: place for name, place in seen.items() if not name.startswith(NAMELESS)}
+            unnamed = [place for name, place in seen.items() if name.startswith(NAMELESS)]
+            yield Frame(number / header.rate, markers=named, unlabelled=unnamed)
 
 
 def _whole_frames(path: Path, header: Header) -> int:

@@ -92,8 +92,8 @@ def is_cut_off(path: Path) -> bool:
     if path.suffix.lower() == ".gz" or not path.stat().st_size:
         return False
     with path.open("rb") as stream:
-        stream.seek(-1, 2)
-        return stream.read(1) not in (b"\n", b"\r", b"\0")
+        stream.seek(-min(path.stat().st_size, 2), 2)
+        return not stream.read().strip(b"\0").endswith((b"\n", b"\r"))
 
 
 def header_of(path: Path) -> tuple[list[str], bool]:

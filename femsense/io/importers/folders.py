@@ -15,7 +15,7 @@ from femsense.core.errors import InputError
 from femsense.io.clouds.cloud_files import CLOUD_ENDINGS, read_cloud
 from femsense.io.clouds.images import png_header, read_png
 from femsense.io.importers.array_clouds import read_array_cloud
-from femsense.io.importers.frames import Frame, Images, Lens, Options, Source, unit_of
+from femsense.io.importers.frames import FARTHEST, Frame, Images, Lens, Options, Source, unit_of
 from femsense.io.importers.pictures import decoded_image
 from femsense.pointcloud.cloud import PointCloud
 
@@ -23,8 +23,12 @@ CLOUDS = (".ply", ".pcd", ".xyz", ".npy", ".npz")
 TUM_UNIT = 1 / 5000
 """Metres in one unit of a TUM RGB-D depth image."""
 REDWOOD_UNIT = 1 / 1000
+WIDEST = 20.0
+"""Scenes of cameras are not wider [m]."""
 TUM_LENS = (525.0, 525.0, 319.5, 239.5)
 """The lens that the TUM benchmark gives for all its sequences, 640 × 480."""
+LENSES = ("camera_intrinsic.json", "intrinsic.json", "camera.json")
+"""Files of a lens as Open3D writes them."""
 PAIRS = ("associations.txt", "associated.txt", "associate.txt", "association.txt")
 """Lists of pairs as `associate.py` of TUM RGB-D prints them: time file time file, depth first or second."""
 NEAR_S = 0.02
@@ -50,12 +54,13 @@ def open_tum(folder: Path, options: Options) -> Source:
     if header is None:
         raise InputError("the first depth image is missing or none", where=folder / depth[0][1], expected="a PNG of 16 bits")
     lens, said = _folder_lens(folder, header[0], header[1])
+    unit = options.depth_unit or _depth_unit(folder) or TUM_UNIT
     notes = [f"the lens is {said}"] if said else []
     pairs = _associated(depth, color)
     lost = sum(c is None for _, _, c in pairs) if color else 0
-    found = {"depth_unit_m": TUM_UNIT, "images_without_colour": lost or None, "lens": said}
+    found = {"depth_unit_m": unit, "images_without_colour": lost or None, "lens": said}
     frames = partial(_image_frames, [(t, folder / d, folder / c if c else None) for t, d, c in pairs])
-    return Source("tum", folder, frames, found=_given(found), lens=lens, depth_unit_m=TUM_UNIT, count=len(pairs), notes=notes)
+    return Source("tum", folder, frames, found=_given(found), lens=lens, depth_unit_m=unit, count=len(pairs), notes=notes)
 
 
 def open_redwood(folder: Path, options: Options) -> Source:
@@ -67,6 +72,7 @@ def open_redwood(folder: Path, options: Options) -> Source:
     if header is None or header[2:] != (16, 0):
         raise InputError("not a depth image", where=depth[0], found=header and f"{header[2]} bits", expected="a PNG of 16 bits")
     lens, said = _folder_lens(folder, header[0], header[1])
+    unit = options.depth_unit or _depth_unit(folder) or REDWOOD_UNIT
     times = _file_times(depth)
     if times is None and options.rate is None:
         raise InputError(
@@ -76,7 +82,7 @@ def open_redwood(folder: Path, options: Options) -> Source:
     clock = times if times is not None else [i / (options.rate or 1.0) for i in range(len(depth))]
     items = [(clock[i], file, color_of.get(file)) for i, file in enumerate(depth)]
     found = {
-        "depth_unit_m": REDWOOD_UNIT,
+        "depth_unit_m": unit,
         "lens": said,
         "times": "in the names of the files" if times is not None else f"{options.rate:g} a second",
     }
@@ -87,7 +93,7 @@ def open_redwood(folder: Path, options: Options) -> Source:
         partial(_image_frames, items),
         found=_given(found),
         lens=lens,
-        depth_unit_m=REDWOOD_UNIT,
+        depth_unit_m=unit,
         count=len(items),
         notes=notes,
     )
@@ -183,7 +189,7 @@ def _associated(depth: list[tuple[float, str]], color: list[tuple[float, str]]) 
 
 def _folder_lens(folder: Path, width: int, height: int) -> tuple[Lens, str]:
     """Return the lens of a folder and where it is from."""
-    files = [folder / n for n in ("camera_intrinsic.json", "intrinsic.json", "camera.json") if (folder / n).is_file()]
+    files = [folder / n for n in LENSES if (folder / n).is_file()]
     if files:
         return _json_lens(files[0], width, height), files[0].name
     texts = [folder / n for n in ("calibration.txt", "camera.txt", "intrinsics.txt") if (folder / n).is_file()]
@@ -202,6 +208,18 @@ def _folder_lens(folder: Path, width: int, height: int) -> tuple[Lens, str]:
         found=f"images of {width} × {height}",
         expected="camera_intrinsic.json, or calibration.txt with fx fy cx cy",
     )
+
+
+def _depth_unit(folder: Path) -> float | None:
+    """Return metres in one unit of the depth images, where the lens's file has Open3D's `depth_scale` (units in a metre)."""
+    for name in LENSES:
+        if (folder / name).is_file():
+            try:
+                scale = json.loads((folder / name).read_text(encoding="utf-8-sig")).get("depth_scale")
+                return None if not scale else 1.0 / float(scale)
+            except (ValueError, TypeError, AttributeError) as error:
+                raise InputError("not a lens", where=folder / name, found=str(error), expected="depth_scale: a number") from None
+    return None
 
 
 def _json_lens(path: Path, width: int, height: int) -> Lens:
@@ -297,8 +315,13 @@ def _extent(file: Path) -> float:
 
 
 def _declared_unit(file: Path) -> str | None:
-    """Return "m" for formats whose writers use metres where the size agrees with it (PLY and PCD of cameras, within 20 m)."""
-    return "m" if file.suffix.lower() in (".ply", ".pcd") and _extent(file) < 20.0 else None
+    """Return "m" for formats whose writers use metres where size and distance agree with it (PLY and PCD of cameras)."""
+    if file.suffix.lower() not in (".ply", ".pcd"):
+        return None
+    points = read_points(file).points
+    extent = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
+    away = float(np.median(np.linalg.norm(points, axis=1))) if len(points) else 0.0
+    return "m" if extent < WIDEST and away <= FARTHEST else None
 
 
 def _given(found: dict[str, Any]) -> dict[str, Any]:

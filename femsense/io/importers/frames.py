@@ -14,6 +14,8 @@ from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
 from femsense.pointcloud.cloud import PointCloud
 
+FARTHEST = 15.0
+"""Depth cameras see no farther [m]: a scene most of which is farther away is in another unit."""
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
 """Metres in one unit."""
 MODELS = ("brown_conrady", "inverse_brown_conrady", "kannala_brandt")
@@ -122,6 +124,8 @@ class Options:
     may end in *FACTOR."""
     unit: str | None = None
     """Of lengths, a key of UNITS."""
+    depth_unit: float | None = None
+    """Metres in one unit of whole-numbered depth images, where the source says another or none."""
     up: str | None = None
     """The source's vertical axis: "x", "y" or "z"; turned to z."""
     clock: str = "auto"
@@ -161,6 +165,29 @@ def unit_of(options: Options, declared: str | None, where: str | Path | None, ex
         found=f"no unit; the positions span {extent:.4g}" if said is None else said,
         expected="--unit " + "|".join(UNITS),
         hint=f"in metres the scene would be {extent:.4g} m wide, in millimetres {1e-3 * extent:.4g} m",
+    )
+
+
+def check_reach(distances: npt.ArrayLike, where: str | Path | None) -> None:
+    """Refuse what is taken for metres, but is mostly farther away than a depth camera sees.
+
+    Arguments:
+        distances: of the points from the camera, shape (n,).
+        where: the file or topic, for the message.
+
+    Raises:
+        InputError: with the unit that would fit.
+    """
+    far = float(np.median(distances)) if np.size(distances) else 0.0
+    if far <= FARTHEST:
+        return
+    fitting = [name for name in ("cm", "mm") if UNITS[name] * far <= FARTHEST]
+    raise InputError(
+        "the scene is farther away than a depth camera sees: another unit than metres?",
+        where=where,
+        found=f"half of it beyond {far:.4g}",
+        expected=f"metres, at most {FARTHEST:g}; or --unit " + "|".join(UNITS),
+        hint=f"in millimetres that would be {1e-3 * far:.4g} m" if "mm" in fitting else None,
     )
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
-from femsense.io.importers.frames import Frame, Images, Options, Source, upright
+from femsense.io.importers.frames import DepthImage, Frame, Images, Options, Source, check_reach, upright
 from femsense.io.importers.lens import depth_points, pixel_rays, registered_color
 from femsense.io.importers.pictures import depth_of_metres
 from femsense.io.importers.ros_bag import Bag, Message, open_bag
@@ -211,7 +211,7 @@ def _frame(
     if choice.primary.kind == "depth":
         picture = partial(_images, bag, plan, message, color, rays)
     elif choice.primary.kind == "cloud":
-        picture = partial(_cloud, bag, message)
+        picture = partial(_cloud, bag, plan, message)
     named, unnamed = _markers(plan, time, message, decoded, tracks)
     inputs = _inputs(plan, time, message, decoded, tracks)
     loads = []
@@ -226,7 +226,7 @@ def _images(bag: Bag, plan: Plan, message: Message, color: Message | None, rays:
     choice = plan.choice
     where = f"{bag.path}, topic {message.topic}"
     image, encoding = _pixels(bag, message)
-    depth = depth_of_metres(image) if encoding == "32FC1" else image.astype(np.uint16)
+    depth = _in_units(plan, image, where) if encoding == "32FC1" else image.astype(np.uint16)
     depth[depth == 65535] = 0
     lens = choice.lens
     if lens is None or rays is None or depth.shape != (lens.height, lens.width):
@@ -249,14 +249,26 @@ def _images(bag: Bag, plan: Plan, message: Message, color: Message | None, rays:
     return PointCloud(points, None if pixels is None else pixels[mask] / 255.0)
 
 
+def _in_units(plan: Plan, image: Any, where: str) -> DepthImage:
+    """Return a depth image in units of FINE_UNIT from distances in floating point. Raises InputError: far beyond any camera."""
+    if plan.scale is None:
+        check_reach(image[::4, ::4][np.isfinite(image[::4, ::4]) & (image[::4, ::4] > 0)], where)
+    return depth_of_metres(image if plan.scale is None else plan.scale * image.astype(np.float64))
+
+
 def _pixels(bag: Bag, message: Message) -> tuple[Any, str]:
     where = f"{bag.path}, topic {message.topic}"
     decoded = bag.decode(message)
     return compressed_image(decoded, where) if message.type.endswith("CompressedImage") else raw_image(decoded, where)
 
 
-def _cloud(bag: Bag, message: Message) -> PointCloud:
-    return cloud_of(bag.decode(message), f"{bag.path}, topic {message.topic}")
+def _cloud(bag: Bag, plan: Plan, message: Message) -> PointCloud:
+    where = f"{bag.path}, topic {message.topic}"
+    cloud = cloud_of(bag.decode(message), where)
+    if plan.scale is not None:
+        return PointCloud(plan.scale * cloud.points, cloud.colors)
+    check_reach(np.linalg.norm(cloud.points[::16], axis=1), where)
+    return cloud
 
 
 def _markers(
@@ -269,7 +281,7 @@ def _markers(
         value = decoded if name == message.topic else tracks[name].nearest(time)
         T = plan.T_camera_markers[name]
         for label, point in [] if value is None else markers_of(value, stream.topic.type):
-            xyz = upright(T[:3, :3] @ point + T[:3, 3], plan.up)[0]
+            xyz = upright(T[:3, :3] @ (np.asarray(point) * (plan.scale or 1.0)) + T[:3, 3], plan.up)[0]
             label = plan.marker_names.get(label or name, label)
             if label:
                 named[label] = xyz

@@ -32,6 +32,8 @@ LAYOUTS: dict[str, tuple[str, int]] = {
 }
 """Encodings of sensor_msgs/Image: type of a channel and channels."""
 DEPTH = ("16UC1", "mono16", "Z16", "32FC1")
+LISTS = (6, 7, 8)
+"""Types of visualization_msgs/Marker that are many places: cubes, spheres, points."""
 POINT_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """sensor_msgs/PointField."""
 MODELS = {
@@ -110,7 +112,10 @@ def red_first(image: Pixels, encoding: str) -> npt.NDArray[np.uint8]:
 
 
 def lens_of(message: Any, where: str | Path | None) -> Lens:
-    """Return the lens of a sensor_msgs/CameraInfo of ROS 1 or 2."""
+    """Return the lens of a sensor_msgs/CameraInfo of ROS 1 or 2, for the images that its region and binning leave.
+
+    image_geometry, `PinholeCameraModel`: a region moves the centre, binning divides.
+    """
     K = np.asarray(getattr(message, "k", None) if hasattr(message, "k") else message.K, dtype=float).ravel()
     D = np.asarray(getattr(message, "d", None) if hasattr(message, "d") else message.D, dtype=float).ravel()
     name = message.distortion_model.strip().lower()
@@ -122,7 +127,11 @@ def lens_of(message: Any, where: str | Path | None) -> Lens:
     if not np.any(D != 0.0):
         model, D = "brown_conrady", np.zeros(5)
     fx, fy, cx, cy = (float(K[i]) for i in (0, 4, 2, 5))
-    return Lens(int(message.width), int(message.height), fx, fy, cx, cy, D, model or "brown_conrady")
+    width, height, roi = int(message.width), int(message.height), message.roi
+    if roi.width and roi.height:
+        width, height, cx, cy = int(roi.width), int(roi.height), cx - roi.x_offset, cy - roi.y_offset
+    across, down = max(int(message.binning_x), 1), max(int(message.binning_y), 1)
+    return Lens(width // across, height // down, fx / across, fy / down, cx / across, cy / down, D, model or "brown_conrady")
 
 
 def cloud_of(message: Any, where: str | Path | None) -> PointCloud:
@@ -176,7 +185,10 @@ def markers_of(message: Any, kind: str) -> Iterator[tuple[str, list[float]]]:
         yield from (("", place(pose.position)) for pose in message.poses)
     elif short == "MarkerArray":
         for item in message.markers:
-            if item.action == 0:
+            if item.action == 0 and item.type in LISTS:
+                T = pose_matrix(item.pose.position, item.pose.orientation)
+                yield from (("", (T[:3, :3] @ place(point) + T[:3, 3]).tolist()) for point in item.points)
+            elif item.action == 0:
                 name = f"{item.ns}_{item.id}" if item.ns and item.id else item.ns or str(item.id)
                 yield name, place(item.pose.position)
     elif short == "Markers":

@@ -9,7 +9,7 @@ import numpy as np
 
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError
-from femsense.io.importers.frames import Options
+from femsense.io.importers.frames import UNITS, Options
 from femsense.io.importers.pictures import FINE_UNIT
 from femsense.io.importers.plain_csv import split_factor
 from femsense.io.importers.ros_bag import Bag, Message
@@ -43,6 +43,8 @@ class Plan:
     notes: tuple[str, ...]
     marker_names: dict[str, str]
     """Name of a marker, or topic of one without a name → its name in the recording."""
+    scale: float | None
+    """Metres in one unit of clouds, markers and depth in floating point; None where nobody said it: metres."""
 
 
 def plan_of(bag: Bag, choice: Choice, options: Options, clock: str) -> Plan:
@@ -67,9 +69,21 @@ def plan_of(bag: Bag, choice: Choice, options: Options, clock: str) -> Plan:
     used = [s for s in choice.markers if s.topic.name in poses]
     choice = replace(choice, markers=tuple(used), loads=tuple(s for s in choice.loads if s.topic.name in points))
     renamed = {old: new.removeprefix("marker.") for old, new in options.columns.items() if new.startswith("marker.")}
-    unit = FINE_UNIT if choice.primary.encoding.startswith("32FC1") else choice.depth_unit_m
+    unit = FINE_UNIT if choice.primary.encoding.startswith("32FC1") else options.depth_unit or choice.depth_unit_m
+    scale = None if options.unit is None else UNITS[options.unit]
     return Plan(
-        choice, clock, unit, actuation, columns, points, poses, _metadata(bag, choice, clock), options.up, tuple(notes), renamed
+        choice,
+        clock,
+        unit,
+        actuation,
+        columns,
+        points,
+        poses,
+        _metadata(bag, choice, clock),
+        options.up,
+        tuple(notes),
+        renamed,
+        scale,
     )
 
 

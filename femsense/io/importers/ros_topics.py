@@ -249,7 +249,13 @@ def _lens(bag: Bag, stream: Stream) -> Lens | None:
     infos = [t for t in bag.topics if t.type.endswith("/CameraInfo") and t.count]
     topic = _nearest(stream.topic.name, infos)
     first = None if topic is None else next(bag.messages([topic.name]), None)
-    return None if first is None else lens_of(bag.decode(first), f"{bag.path}, topic {first.topic}")
+    if first is None:
+        return None
+    info = bag.decode(first)
+    frame, folder = stamp_of(info)[1], _base(stream.topic.name).rpartition("/")[0]
+    if frame and stream.frame and frame != stream.frame and not first.topic.startswith(f"{folder}/"):
+        return None  # another camera's
+    return lens_of(info, f"{bag.path}, topic {first.topic}")
 
 
 def _depth_unit(bag: Bag, stream: Stream) -> float:

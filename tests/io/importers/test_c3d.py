@@ -21,7 +21,13 @@ GENUINE = sorted((DATA / "c3d").glob("*.c3d"))
 
 
 def written(
-    path: Path, points: np.ndarray, *, rate: float = 100.0, unit: str = "mm", residuals: np.ndarray | None = None
+    path: Path,
+    points: np.ndarray,
+    *,
+    rate: float = 100.0,
+    unit: str = "mm",
+    residuals: np.ndarray | None = None,
+    labels: list[str] | None = None,
 ) -> Path:
     """Write points (frames, markers, 3) with ezc3d; NaN and residual −1 where they are missing."""
     file = ezc3d.c3d()
@@ -29,7 +35,7 @@ def written(
     data[:3] = points.transpose(2, 1, 0)
     file["parameters"]["POINT"]["RATE"]["value"] = [rate]
     file["parameters"]["POINT"]["UNITS"]["value"] = [unit]
-    file["parameters"]["POINT"]["LABELS"]["value"] = [f"M{i}" for i in range(points.shape[1])]
+    file["parameters"]["POINT"]["LABELS"]["value"] = labels or [f"M{i}" for i in range(points.shape[1])]
     file["data"]["points"] = data
     if residuals is not None:
         file["data"]["meta_points"]["residuals"] = residuals[None]
@@ -88,6 +94,13 @@ def test_metres_missing_points_and_the_vertical(tmp_path: Path) -> None:
     before = (points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
     volume = [np.einsum("ni,ni->n", np.cross(*pair), [1.0, 0, 0] * np.ones((7, 3))) for pair in (edges, before)]
     np.testing.assert_allclose(volume[0][[0, 1, 4, 5, 6]], volume[1][[0, 1, 4, 5, 6]], rtol=1e-4, atol=1e-6)
+
+
+def test_tracks_without_a_name(tmp_path: Path) -> None:
+    points = np.random.default_rng(0).normal(size=(3, 2, 3))
+    frame = next(open_source(written(tmp_path / "a.c3d", points, unit="m", labels=["tip", "*12"])).frames())
+    assert list(frame.markers) == ["tip"]
+    np.testing.assert_allclose(frame.unlabelled, points[0, 1:], rtol=1e-6)
 
 
 def test_a_unit_that_nobody_says_is_asked(tmp_path: Path) -> None:

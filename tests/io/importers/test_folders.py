@@ -233,3 +233,26 @@ def test_nothing_that_is_known(tmp_path: Path) -> None:
         open_source(tmp_path / "b.bag")
     with pytest.raises(InputError, match="no such format"):
         open_source(tmp_path / "a.oni", Options(format="rosbag"))
+
+
+def test_a_depth_scale_beside_the_lens(tmp_path: Path) -> None:
+    """Open3D's recorders write `depth_scale`, units in a metre, into the lens's file."""
+    for name, listed in (("redwood", False), ("tum", True)):
+        folder = tmp_path / name
+        (folder / "depth").mkdir(parents=True)
+        cv2.imwrite(str(folder / "depth" / "1.500.png"), depth(0))
+        if listed:
+            (folder / "depth.txt").write_text("1.5 depth/1.500.png\n")
+        lens = {"width": 64, "height": 48, "intrinsic_matrix": [60, 0, 0, 0, 61, 0, 31, 23, 1], "depth_scale": 4000.0}
+        (folder / "intrinsic.json").write_text(json.dumps(lens))
+        assert open_source(folder).depth_unit_m == 1 / 4000
+        assert open_source(folder, Options(depth_unit=0.01)).depth_unit_m == 0.01
+
+
+def test_clouds_in_centimetres_ask_for_their_unit(tmp_path: Path) -> None:
+    points = np.random.default_rng(0).uniform([-5, -5, 40], [5, 5, 50], size=(100, 3))
+    write_cloud(tmp_path / "1.5.ply", PointCloud(points))
+    with pytest.raises(InputError, match="--unit"):
+        open_source(tmp_path)
+    recording, _ = imported(tmp_path, tmp_path / "out", Options(unit="cm"))
+    np.testing.assert_allclose(read_frame_cloud(recording, 0).points, points / 100, atol=1e-6)

@@ -18,6 +18,7 @@ from rosbags.rosbag1 import Reader
 from rosbags.rosbag2 import CompressionFormat, CompressionMode
 
 from femsense.core.errors import InputError
+from femsense.io.clouds.frame_clouds import read_frame_cloud
 from femsense.io.clouds.images import read_png
 from femsense.io.importers.frames import Options
 from femsense.io.importers.guess import open_source
@@ -112,3 +113,72 @@ def test_depth_in_plain_png_beside_infrared(tmp_path: Path) -> None:
             bag.write("/camera/ir/image_raw", at, bag.image(color_of(k)[:, :, 0].astype(np.uint16), "mono16", at))
             bag.write("/camera/ir/camera_info", at, bag.info(at))
     read_right(tmp_path / "take", tmp_path)
+
+
+def test_clouds_and_depths_in_millimetres_are_asked_and_read(tmp_path: Path) -> None:
+    points = np.random.default_rng(0).uniform([-0.2, -0.2, 0.4], [0.2, 0.2, 0.6], size=(200, 3))
+    with BagWriter(tmp_path / "clouds", "mcap") as bag:
+        for k in range(FRAMES):
+            stamp = START_NS + k * STEP_NS
+            bag.write("/points", stamp, bag.cloud(1e3 * points, None, stamp))
+    with BagWriter(tmp_path / "images", "mcap") as bag:
+        for k in range(FRAMES):
+            stamp = START_NS + k * STEP_NS
+            image = depth_of(k).astype(np.float32)
+            bag.write("/cam/depth/image_raw", stamp, bag.image(image, "32FC1", stamp))
+            bag.write("/cam/depth/camera_info", stamp, bag.info(stamp))
+    for name in ("clouds", "images"):
+        with pytest.raises(InputError, match="--unit"):
+            imported(tmp_path / name, tmp_path / f"refused-{name}")
+    recording, _ = imported(tmp_path / "clouds", tmp_path / "a", Options(unit="mm"))
+    cloud = read_frame_cloud(recording, 0)
+    np.testing.assert_allclose(cloud.points, points, atol=1e-6)
+    imported(tmp_path / "images", tmp_path / "b", Options(unit="mm"))
+    wanted = 10 * depth_of(0).astype(int)
+    got = read_png(tmp_path / "b/recording/depth/000000.png")
+    kept = wanted < 65535
+    np.testing.assert_array_equal(got[kept], wanted[kept])
+    assert not got[~kept].any()
+
+
+def test_the_lens_of_another_camera_is_not_taken(tmp_path: Path) -> None:
+    for frame, taken in (("depth", False), ("color", True)):
+        with BagWriter(tmp_path / frame, "mcap") as bag:
+            bag.write("/cam/depth/image_raw", START_NS, bag.image(depth_of(0), "16UC1", START_NS, frame))
+            bag.write("/cam/color/camera_info", START_NS, bag.info(START_NS, "color"))
+        if taken:
+            assert open_source(tmp_path / frame).lens is not None
+            continue
+        with pytest.raises(InputError, match="without a lens"):
+            open_source(tmp_path / frame)
+
+
+def test_a_region_and_binning_of_the_lens(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "take", "mcap") as bag:
+        roi = bag.type("sensor_msgs/msg/RegionOfInterest")(20, 10, 96, 128, False)  # x, y, height, width
+        info = bag.info(START_NS, lens=(100.0, 102.0, 90.0, 60.0), size=(200, 150))
+        info.binning_x, info.binning_y, info.roi = 2, 2, roi
+        bag.write("/cam/depth/image_raw", START_NS, bag.image(depth_of(0), "16UC1", START_NS))
+        bag.write("/cam/depth/camera_info", START_NS, info)
+    lens = open_source(tmp_path / "take").lens
+    assert lens is not None
+    assert (lens.width, lens.height, lens.fx, lens.fy, lens.cx, lens.cy) == (64, 48, 50, 51, 35, 25)
+
+
+def test_another_unit_of_depth(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "take", "mcap") as bag:
+        write_camera(bag, FRAMES)
+    assert open_source(tmp_path / "take", Options(depth_unit=0.00025)).depth_unit_m == 0.00025
+    assert open_source(tmp_path / "take").depth_unit_m == 0.001
+
+
+def test_a_list_of_spheres_is_markers_without_names(tmp_path: Path) -> None:
+    places = np.array([[0.1, 0.2, 0.7], [0.15, 0.2, 0.75]])
+    with BagWriter(tmp_path / "take", "mcap") as bag:
+        message = bag.marker_array({"all": (0.0, 0.0, 0.5)}, START_NS)
+        message.markers[0].type = 7
+        message.markers[0].points = [bag.vector(p - [0, 0, 0.5], "Point") for p in places]
+        bag.write("/markers", START_NS, message)
+    frame = next(open_source(tmp_path / "take").frames())
+    assert not frame.markers
+    np.testing.assert_allclose(frame.unlabelled, places)

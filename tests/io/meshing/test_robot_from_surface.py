@@ -19,7 +19,9 @@ from femsense.core.errors import InputError
 from femsense.fem.chambers import chamber_volume
 from femsense.fem.equilibrium import solve_equilibrium
 from femsense.fem.mesh import TetMesh, element_volumes, surface_triangles, to_linear
+from femsense.io.mesh_files import radius_ratio
 from femsense.io.meshing import tetrahedra
+from femsense.io.meshing.cad_filling import fill_cad
 from femsense.io.meshing.filling import MeshOptions, fill
 from femsense.io.meshing.robot_from_surface import mesh_into, read_any_surface, starter_text
 from femsense.io.meshing.surface import repaired
@@ -448,3 +450,19 @@ def test_a_step_file_says_its_unit(tmp_path: Path) -> None:
     (tmp_path / "cut.step").write_bytes((tmp_path / "plate.step").read_bytes()[:2000])
     with pytest.raises(InputError, match="not readable as a CAD file"):
         read_any_surface(tmp_path / "cut.step")
+
+
+def test_a_step_file_is_filled_from_its_faces(tmp_path: Path) -> None:
+    """Also with walls of a millimetre, quickly; what asks for repairs or fewer tetrahedra goes the usual way."""
+    pytest.importorskip("gmsh")
+    write_step(tmp_path / "plate.step")
+    report = mesh_into(tmp_path / "robot", tmp_path / "plate.step", MeshOptions(), say=print)
+    assert "filled by Gmsh" in report["done"][0] and report["deviation_mm"] < report["tolerance_mm"]
+    body = load_robot(tmp_path / "robot").body
+    assert float(element_volumes(body.mesh).sum()) == pytest.approx((60 * 20 * 10 - np.pi * 16 * 10) * 1e-9, rel=0.01)
+    assert radius_ratio(body.mesh).min() > 0.1 and 300 < len(body.mesh.tets) < 2500
+    points, triangles = read_any_surface(tmp_path / "plate.step")
+    for options in (MeshOptions(unit="mm", close_holes=True), MeshOptions(unit="mm", most_tets=5)):
+        assert fill_cad(tmp_path / "plate.step", points, triangles, options) is None
+    broken = "raise SystemExit('no')"
+    assert fill_cad(tmp_path / "plate.step", points, triangles, MeshOptions(unit="mm"), program=broken) is None
