@@ -116,15 +116,14 @@ def _clock(path: Path, names: list[str], headed: bool, options: Options) -> tupl
         return 1, 1.0
     if options.rate is not None and not any(map(is_time, names)):
         return None
-    try:
-        return time_column(names, path)
-    except InputError as problem:
+    if not any(map(is_time, names)):
         raise InputError(
             "no column of time",
             where=path,
             found=", ".join(names[:12]),
             expected="a column time_s, --map COLUMN=time, or --rate HZ",
-        ) from problem
+        )
+    return time_column(names, path)
 
 
 def input_columns(names: Sequence[str], mapping: Mapping[str, str]) -> tuple[list[tuple[str, int, float]], str | None]:
