@@ -102,9 +102,12 @@ def _through(final: Path) -> Iterator[Path]:
 
 
 def followed(path: str | Path) -> Path:
-    """Return where a path leads, links followed, with its parent made."""
+    """Return where a path leads, links followed. Raises InputError: links that lead to themselves."""
     final = Path(path).absolute()
-    return final.resolve() if final.is_symlink() else final
+    try:
+        return final.resolve() if final.is_symlink() else final
+    except (OSError, RuntimeError):
+        raise _refusal(final, "links that lead to themselves") from None
 
 
 def _check_writable(final: Path) -> None:

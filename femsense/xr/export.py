@@ -13,6 +13,7 @@ import numpy.typing as npt
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import InputError
 from femsense.fem.mesh import TetMesh
+from femsense.io.files import check_target
 from femsense.model.robot import Robot
 from femsense.xr.gltf import ExportReport, export_states
 from femsense.xr.run_contents import export_run
@@ -70,6 +71,7 @@ def export_glb(
     if target.suffix.lower() not in ENDINGS:
         hint = "--mcap and --rerun write for Foxglove and Rerun" if target.suffix.lower() in (".mcap", ".rrd") else None
         raise InputError("the ending names no format that is written", where=target, expected=" or ".join(ENDINGS), hint=hint)
+    check_target(target, folder=False)
     target.parent.mkdir(parents=True, exist_ok=True)
     if target.suffix.lower() == ".usdz":
         with tempfile.TemporaryDirectory(prefix="femsense-export-") as folder:

@@ -8,7 +8,6 @@ Reference: Khronos Group, glTF 2.0 Specification, 2021.
 from __future__ import annotations
 
 import json
-import os
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ import numpy.typing as npt
 from femsense.core.arrays import FloatArray, IntArray, as_indices, as_points
 from femsense.core.errors import InputError
 from femsense.fem.mesh import TetMesh, surface_triangles, vertex_normals
+from femsense.io.files import write_beside
 from femsense.xr.skinning import Skin, as_states, fit_poses, fit_skin, rms, skin_vertices
 
 T_GLTF_ROBOT = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
@@ -118,7 +118,7 @@ def write_glb(
     texture: Texture | None = None,
     name: str = "robot",
 ) -> Path:
-    """Write a skinned mesh with one animation; beside and renamed, so that no half-written file is ever seen.
+    """Write a skinned mesh with one animation; no half-written file is ever seen (`write_beside`).
 
     Arguments:
         path: the file.
@@ -141,12 +141,8 @@ def write_glb(
     target = Path(path)
     if not target.parent.is_dir():
         raise InputError("the folder does not exist", where=target.parent, hint="make it first")
-    beside = target.with_name(f".{target.name}.{os.getpid()}.part")
-    try:
-        beside.write_bytes(data)
-        os.replace(beside, target)
-    finally:
-        beside.unlink(missing_ok=True)
+    with write_beside(target) as part:
+        part.write_bytes(data)
     return target
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from femsense.core.arrays import FloatArray
-from femsense.io.files import write_beside
+from femsense.io.files import check_target, write_beside
 from femsense.sensing.run_files import read_run
 from femsense.sensing.types import ContactForce, FrameReport, Run
 from femsense.xr.extras import needed
@@ -41,6 +41,7 @@ def export_rerun(folder: str | Path, path: str | Path) -> RerunReport:
     Raises:
         InputError: no run, or the package rerun-sdk is missing.
     """
+    check_target(path, folder=False)
     rr, run = needed("rerun", package="rerun-sdk", extra="rerun", doing="writing .rrd"), read_run(folder)
     pose, recording, clouds = camera_pose(folder), recording_of(run), 0
     with write_beside(path) as part:

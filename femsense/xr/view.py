@@ -13,6 +13,7 @@ from threading import Thread
 from typing import Any
 
 from femsense.core.errors import FemsenseError, InputError, MissingDependency
+from femsense.io.files import check_target
 from femsense.xr.run_contents import contacts_of_run, current_glb, run_folder, stress_of_run
 
 PAGE = Path(__file__).with_name("viewer") / "dist"
@@ -104,6 +105,12 @@ def write_static_page(folder: str | Path, out_dir: str | Path, *, page: Path = P
     files = page_files(page)
     run = run_folder(folder)
     out = Path(out_dir)
+    check_target(out, folder=True)
+    foreign = [name for name in files if (out / name).exists() and not (out / "contacts.json").is_file()]
+    if foreign:
+        raise InputError(
+            "something else stands there", where=out, found=", ".join(foreign), expected="a folder of its own", hint="another -o"
+        )
     out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="femsense-view-") as scratch:
         glb = current_glb(run, Path(scratch))

@@ -111,6 +111,13 @@ def test_links_are_followed(tmp_path: Path) -> None:
         assert (tmp_path / name).is_symlink() and json.loads((tmp_path / "real" / name).read_text()) == [1]
 
 
+def test_links_that_lead_to_themselves_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "a").symlink_to(tmp_path / "a")
+    for attempt in (lambda: write_json(tmp_path / "a", 1), lambda: check_target(tmp_path / "a", folder=True)):
+        with pytest.raises(InputError, match="cannot be written"):
+            attempt()
+
+
 def test_devices_are_written_through(tmp_path: Path) -> None:
     assert writes_through("/dev/null") and writes_through("/dev/stdout") and not writes_through(tmp_path / "a")
     write_json("/dev/null", [1])

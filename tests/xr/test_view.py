@@ -6,6 +6,7 @@ import json
 import os
 import re
 import struct
+import threading
 import tomllib
 import urllib.error
 import urllib.request
@@ -22,6 +23,7 @@ from xr_bar import START, bar_mesh, write_run
 
 from femsense.core.errors import InputError, MissingDependency
 from femsense.xr import run_contents, view
+from femsense.xr.export import export_glb
 from femsense.xr.surface_stress import nodal_strain
 
 
@@ -93,6 +95,31 @@ def test_static_page(run: Path, page: Path, tmp_path: Path) -> None:
     index = view.write_static_page(run, tmp_path / "out", page=page)
     assert index == tmp_path / "out" / "index.html"
     assert sorted(p.name for p in index.parent.iterdir()) == ["app.js", "contacts.json", "fields.bin", "index.html", "robot.glb"]
+
+
+def test_a_page_is_not_written_over_another(run: Path, page: Path, tmp_path: Path) -> None:
+    out = tmp_path / "mine"
+    out.mkdir()
+    (out / "index.html").write_text("mine")
+    with pytest.raises(InputError, match="something else stands there"):
+        view.write_static_page(run, out, page=page)
+    assert (out / "index.html").read_text() == "mine"
+    (out / "index.html").unlink()
+    for _ in range(2):  # its own page it writes anew
+        view.write_static_page(run, out, page=page)
+
+
+def test_a_mesh_goes_where_links_lead_and_into_pipes(run: Path, tmp_path: Path) -> None:
+    (tmp_path / "link.glb").symlink_to(tmp_path / "real.glb")
+    export_glb(run, tmp_path / "link.glb", bones=2)
+    assert (tmp_path / "link.glb").is_symlink() and (tmp_path / "real.glb").read_bytes()[:4] == b"glTF"
+    os.mkfifo(tmp_path / "pipe.glb")
+    got: list[bytes] = []
+    reader = threading.Thread(target=lambda: got.append((tmp_path / "pipe.glb").read_bytes()), daemon=True)
+    reader.start()
+    export_glb(run, tmp_path / "pipe.glb", bones=2)
+    reader.join(timeout=20)
+    assert got[0][:4] == b"glTF" and (tmp_path / "pipe.glb").is_fifo()
 
 
 # ---- what the page is told -----------------------------------------------------------------------------------------------------
