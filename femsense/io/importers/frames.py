@@ -178,7 +178,8 @@ def check_reach(distances: npt.ArrayLike, where: str | Path | None) -> None:
     Raises:
         InputError: with the unit that would fit.
     """
-    far = float(np.median(distances)) if np.size(distances) else 0.0
+    given = np.asarray(distances, dtype=np.float64)
+    far = float(np.median(given)) if given.size else 0.0
     if far <= FARTHEST:
         return
     fitting = [name for name in ("cm", "mm") if UNITS[name] * far <= FARTHEST]
