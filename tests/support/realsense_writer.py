@@ -1,9 +1,9 @@
 """Write a RealSense recording with the SDK's own recorder and a camera of its own making; run as a program.
 
-    python realsense_writer.py FILE FRAMES
+    python realsense_writer.py FILE FRAMES [inverse]
 
 FILE ends in .bag (an SDK up to 2.57) or .db3 (2.58 and later). Exit status 3:
-this SDK does not load or does not write this format.
+this SDK does not load or does not write this format. With `inverse` the depth lens has what the SDK calls inverse Brown–Conrady.
 """
 
 from __future__ import annotations
@@ -22,6 +22,8 @@ SHIFT = 0.015
 TURN = np.array([[0.6, -0.8, 0.0], [0.8, 0.6, 0.0], [0.0, 0.0, 1.0]])
 """Rotation of T_color_depth: the colour camera is rolled by 53 degrees."""
 DEPTH_LENS = (50.0, 51.0, 31.0, 23.0)
+INVERSE = [0.1, -0.05, 0.001, 0.002, 0.01]
+"""Coefficients of the depth lens, where it is asked for."""
 COLOR_LENS = (55.0, 56.0, 32.0, 24.0)
 
 
@@ -73,11 +75,16 @@ def _profile(rs: object, stream: object, form: object, lens: tuple[float, ...], 
     return video
 
 
-def main(path: str, frames: int) -> None:
+def main(path: str, frames: int, model: str = "") -> None:
     rs = _load()
     device = rs.software_device()
     depth_sensor, color_sensor = device.add_sensor("Depth"), device.add_sensor("Color")
-    depth = depth_sensor.add_video_stream(_profile(rs, rs.stream.depth, rs.format.z16, DEPTH_LENS, 0, 2))
+    video = _profile(rs, rs.stream.depth, rs.format.z16, DEPTH_LENS, 0, 2)
+    if model == "inverse":
+        lens = video.intrinsics
+        lens.model, lens.coeffs = rs.distortion.inverse_brown_conrady, INVERSE
+        video.intrinsics = lens
+    depth = depth_sensor.add_video_stream(video)
     color = color_sensor.add_video_stream(_profile(rs, rs.stream.color, rs.format.rgb8, COLOR_LENS, 1, 3))
     depth_sensor.add_read_only_option(rs.option.depth_units, DEPTH_UNIT)
     move = rs.extrinsics()
@@ -119,4 +126,4 @@ def main(path: str, frames: int) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], int(sys.argv[2]))
+    main(sys.argv[1], int(sys.argv[2]), *sys.argv[3:])

@@ -14,7 +14,7 @@ from femsense.core.errors import InputError
 from femsense.core.text import did_you_mean
 from femsense.io.importers.frames import Lens, Options
 from femsense.io.importers.ros_bag import Bag, Topic
-from femsense.io.importers.ros_messages import DEPTH, lens_of, pose_matrix, stamp_of
+from femsense.io.importers.ros_messages import DEPTH, MODELS, lens_of, pose_matrix, stamp_of
 
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 CLOUD = "sensor_msgs/msg/PointCloud2"
@@ -253,9 +253,19 @@ def _lens(bag: Bag, stream: Stream) -> Lens | None:
         return None
     info = bag.decode(first)
     frame, folder = stamp_of(info)[1], _base(stream.topic.name).rpartition("/")[0]
-    if frame and stream.frame and frame != stream.frame and not first.topic.startswith(f"{folder}/"):
+    if frame and stream.frame and frame != stream.frame and not first.topic.startswith((f"{folder}/", "/device_")):
         return None  # another camera's
-    return lens_of(info, f"{bag.path}, topic {first.topic}")
+    lens = lens_of(info, f"{bag.path}, topic {first.topic}")
+    model = _sdk_model(bag, stream.topic.name)
+    return lens if model is None or not np.any(lens.distortion != 0.0) else replace(lens, model=model)
+
+
+def _sdk_model(bag: Bag, name: str) -> str | None:
+    """Return the distortion model that a file of the RealSense SDK from 2.58 names in a text; its CameraInfo says plumb_bob to all."""
+    first = next(bag.messages([t.name for t in bag.topics if t.name == f"{name.split('/image/')[0]}/camera_info"]), None)
+    text = None if first is None else getattr(bag.decode(first), "data", None)
+    parts = dict(part.split("=", 1) for part in str(text).split(";") if "=" in part)
+    return MODELS.get(parts.get("model", "").strip().lower()) if "model" in parts else None
 
 
 def _depth_unit(bag: Bag, stream: Stream) -> float:

@@ -16,6 +16,7 @@ from femsense.io.importers.frames import Options
 from femsense.io.importers.guess import open_source
 from femsense.io.importers.writer import write_recording
 from femsense.io.recording_folder import load_recording
+from femsense.pointcloud.cloud import PointCloud
 
 FRAMES = 6
 OLD_SDK = "pyrealsense2==2.57.7.10387"
@@ -26,17 +27,20 @@ OLD_SDK = "pyrealsense2==2.57.7.10387"
 def recorded(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A file of the recorder; skipped where no SDK that writes this kind is installed."""
     pytest.importorskip("rosbags")
-    file = tmp_path_factory.mktemp("sdk") / f"take.{request.param}"
-    paths = [str(_old_sdk(request))] if request.param == "bag" else []
+    return _recorded(request, tmp_path_factory.mktemp("sdk") / f"take.{request.param}")
+
+
+def _recorded(request: pytest.FixtureRequest, file: Path, *words: str) -> Path:
+    paths = [str(_old_sdk(request))] if file.suffix == ".bag" else []
     done = subprocess.run(
-        [sys.executable, camera.__file__, str(file), str(FRAMES)],
+        [sys.executable, camera.__file__, str(file), str(FRAMES), *words],
         env={**os.environ, "PYTHONPATH": os.pathsep.join([*paths, os.environ.get("PYTHONPATH", "")])},
         capture_output=True,
         text=True,
         timeout=120,
     )
     if done.returncode == 3:
-        pytest.skip(f"no SDK that writes .{request.param}: {done.stderr.strip()[-200:]}")
+        pytest.skip(f"no SDK that writes {file.suffix}: {done.stderr.strip()[-200:]}")
     assert done.returncode == 0, done.stderr
     return file
 
@@ -104,3 +108,14 @@ def test_colours_are_those_of_the_place_that_a_depth_pixel_sees(imported: tuple[
         point = camera.TURN @ [(column - cx) / fx * z, (row - cy) / fy * z, z] + [-camera.SHIFT, 0, 0]
         u, v = round(gx * point[0] / z + dx), round(gy * point[1] / z + dy)
         np.testing.assert_array_equal(image[row, column], [4 * u, 5 * v, k])
+
+
+@pytest.mark.parametrize("ending", ["db3", "bag"])
+def test_an_inverse_lens_becomes_clouds(ending: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
+    """In .db3 a text beside the CameraInfo, which says plumb_bob to all, names the model."""
+    pytest.importorskip("rosbags")
+    source = open_source(_recorded(request, tmp_path / f"take.{ending}", "inverse"), Options())
+    assert source.lens is not None and source.lens.model == "inverse_brown_conrady"
+    np.testing.assert_allclose(source.lens.distortion[:5], camera.INVERSE, rtol=1e-6)
+    pictures = [frame.picture() for frame in source.frames() if frame.picture is not None]
+    assert len(pictures) == FRAMES and all(isinstance(picture, PointCloud) for picture in pictures)
