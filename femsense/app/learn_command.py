@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from femsense.core.errors import InputError
 from femsense.io.files import check_target
+
+if TYPE_CHECKING:
+    from femsense.xr.proprioception.labelled import Labelled
+    from femsense.xr.proprioception.model import ProprioceptiveModel
 
 Pair = tuple[Path, Path]
 
@@ -28,8 +32,8 @@ def learn_into(
     Arguments:
         files: SENSORS.csv and MARKERS.csv.
         output: the ONNX file.
-        test: two more files, of another recording: the error is stated on them.
-        adapt: a model to correct by `files`, instead of learning anew.
+        test: two more files, of another recording: the error is stated on them, that of a corrected model too.
+        adapt: a model to correct by `files`, instead of learning anew; it keeps its bones.
         end_to_end, bones, plane: as in `LearnOptions` and `ArmatureOptions`; `plane` is the normal X,Y,Z.
 
     Raises:
@@ -42,6 +46,10 @@ def learn_into(
     from femsense.xr.proprioception.learn import LearnOptions, learn
     from femsense.xr.proprioception.model_file import load_model, save_model
 
+    if adapt is not None and (end_to_end or plane is not None):
+        raise InputError(
+            "a corrected model keeps its bones", where="--adapt", found="--end-to-end or --plane", expected="neither"
+        )
     check_target(output, folder=False)
     data = read_labelled(*files)
     other = None if test is None else read_labelled(*test)
@@ -51,6 +59,9 @@ def learn_into(
         model = adapted(before, data)
         text = f"{found.text}\n\n{_adapted_text(model.report['adapted'])}"
         document = {"verdict": found.verdict, "rigid_mm": found.rigid_mm, "outside": found.channels}
+        if other is not None:
+            document["test"] = _tested(model, other)
+            text += f"\non {test[0] if test else ''}: {_each_text(document['test'])}"
     else:
         options = LearnOptions(end_to_end=end_to_end, bones=ArmatureOptions(bones=bones, plane_normal=_normal(plane)))
         model = learn(data, test=other, options=options, progress=progress)
@@ -67,6 +78,7 @@ def report_text(report: dict[str, Any]) -> str:
     lines = [
         f"{report['kind']}: {report['error_mm']:.2f} mm on {report['test_rows']} rows that were held out"
         f" (95 % interval {low:.2f} … {high:.2f}); learnt from {report['rows']}",
+        f"  of the markers: {_each_text(report['marker_error_mm'])}",
         "",
         "  map        error    held-out blocks   memory",
     ]
@@ -86,13 +98,30 @@ def report_text(report: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def _tested(model: ProprioceptiveModel, data: Labelled) -> dict[str, float]:
+    """Return the error of each marker on data that the model was not made from [mm]."""
+    from femsense.xr.proprioception.drift import model_inputs
+    from femsense.xr.proprioception.learn import marker_errors_mm
+
+    return marker_errors_mm(model.network(model_inputs(model, data)) - data.targets, model.marker_names)
+
+
+def _each_text(errors_mm: dict[str, float]) -> str:
+    return ", ".join(f"{name} {error:.2f} mm" for name, error in errors_mm.items())
+
+
 def _adapted_text(found: dict[str, Any]) -> str:
     if found["by"] == "none":
         return f"no correction helps: {found['before_mm']:.2f} mm on {found['rows']} rows"
     return (
-        f"corrected by {found['by']}: {found['before_mm']:.2f} → {found['error_mm']:.2f} mm on blocks of the {found['rows']} rows"
+        f"corrected by {_correction_text(found['by'])}: {found['before_mm']:.2f} → {found['error_mm']:.2f} mm on blocks of the {found['rows']} rows"
         " that the correction did not see"
     )
+
+
+def _correction_text(by: str) -> str:
+    words = {"base": "a rigid motion", "zeros": "other zeros of the sensors", "line": "a linear map"}
+    return " and ".join(words[part.split()[0]] for part in by.split(","))
 
 
 def _normal(text: str | None) -> tuple[float, float, float] | None:

@@ -119,9 +119,10 @@ def stream_sensors(source: str, model_file: Path, options: StreamOptions, *, nam
 
     model = load_model(model_file)
     twin = sensor_twin(model, name or model_file.stem)
-    readings_of(source, model.channels, Event())  # says at once what is wrong with a source
-    live = _serve(options, twin.name)
-    _play(live, twin, frames_of_sensors(source, model, live.stop), options, at_once=True)
+    stop = Event()
+    readings = readings_of(source, model.channels, stop)  # opened before anything is served: what is wrong is said at once
+    live = _serve(options, twin.name, stop)
+    _play(live, twin, frames_of_sensors(readings, model), options, at_once=True)
     return live
 
 
@@ -162,10 +163,10 @@ def measure_by_sensors(live: LiveStream, source: str, model_file: Path) -> None:
             expected=f"one of the markers of {twin.name}: {', '.join(known)}",
             hint="learn from columns that are named as the markers in robot.toml",
         )
-    readings_of(source, model.channels, Event())  # says at once what is wrong with a source
+    readings = readings_of(source, model.channels, live.stop)
 
     def run() -> None:
-        for seq, (time_s, markers) in enumerate(markers_of_sensors(source, model, live.stop)):
+        for seq, (time_s, markers) in enumerate(markers_of_sensors(readings, model)):
             message = Message(topic(twin.name, MEASURED), measured_bytes(seq, time_s, markers))
             live.hub.publish([message])
             live.hub.received(message, "sensors")
@@ -223,8 +224,8 @@ def _distinct(names: Sequence[str]) -> list[str]:
     return found
 
 
-def _serve(options: StreamOptions, first: str) -> LiveStream:
-    """Start the server, and a broker or a client of one where it is asked for."""
+def _serve(options: StreamOptions, first: str, stop: Event | None = None) -> LiveStream:
+    """Start the server, and a broker or a client of one where it is asked for; `stop` ends the sources."""
     password = read_password(options.password_file, os.environ.get(PASSWORD))
     access = Access(options.host, password, options.certificate, options.key)
     hub = Hub()
@@ -236,7 +237,7 @@ def _serve(options: StreamOptions, first: str) -> LiveStream:
         if options.mqtt is not None:
             MqttSink(hub, broker_address(options.mqtt, password=password, authority=options.authority), first)
         undo.pop_all()
-    return LiveStream(hub, server, broker)
+    return LiveStream(hub, server, broker, stop=stop or Event())
 
 
 def _play(live: LiveStream, twin: Twin, frames: Iterator[TwinFrame], options: StreamOptions, *, at_once: bool = False) -> None:

@@ -36,6 +36,11 @@ class BonePoses:
     def __len__(self) -> int:
         return len(self.positions)
 
+    def __repr__(self) -> str:
+        """Return how many there are and how far they reach."""
+        first, last = (", ".join(f"{1e3 * x:.1f}" for x in place) for place in self.positions[[0, -1]])
+        return f"BonePoses({len(self)} bones from ({first}) to ({last}) mm)"
+
     @property
     def T_robot_bone(self) -> FloatArray:
         """The same as matrices, shape (b, 4, 4)."""

@@ -3,8 +3,8 @@
     E = ½ (FᵀF − I),   S = λ tr(E) I + 2 μ E,   σ_vm = √(3/2) |dev S| = √6 μ |dev E|
 
 with F of each element's corners (St. Venant–Kirchhoff, Holzapfel 2000, section 6.5),
-averaged at each node over the elements around it by their volumes. At the strains of soft robots in use it follows the stress of
-the corotational law; it is a picture, no measurement.
+averaged at each corner over the elements around it by their volumes; the middle of an edge has the mean of its ends.
+At the strains of soft robots in use it follows the stress of the corotational law; it is a picture, no measurement.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from femsense.core.arrays import FloatArray, IntArray
+from femsense.fem.mesh import EDGES
 
 
 def nodal_strain(rest: FloatArray, tets: IntArray, nodes: npt.ArrayLike) -> FloatArray:
@@ -41,7 +42,11 @@ def nodal_strain(rest: FloatArray, tets: IntArray, nodes: npt.ArrayLike) -> Floa
         deviator = E - np.trace(E, axis1=1, axis2=2)[:, None, None] / 3.0 * np.eye(3)
         strain = np.sqrt(2.0 / 3.0 * (deviator**2).sum(axis=(1, 2)))
         np.add.at(row, corners.ravel(), np.repeat(volume * strain, 4))
-    return found / np.where(touched > 0, touched, np.inf)
+    found /= np.where(touched > 0, touched, np.inf)
+    if np.shape(tets)[1] > 4:
+        middles = np.asarray(tets)[:, 4:]
+        found[:, middles] = found[:, corners[:, EDGES]].mean(axis=-1)
+    return found
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -40,14 +40,26 @@ def test_learn_then_another_day(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert len(load_model(model).bone_names) == 4
     assert run(["learn", *other, "-o", str(mended), "--adapt", str(model)]) == 0
     said = capsys.readouterr().out
-    assert "base moved: " in said and "corrected by base: " in said and "written: " in said
+    assert "base moved: " in said and "corrected by a rigid motion: " in said and "written: " in said
+    assert run(["learn", *other, "-o", str(mended), "--adapt", str(model), "--test", *files, "--json"]) == 0
+    tested = json.loads(capsys.readouterr().out)["test"]
+    assert list(tested) == ["a", "b", "c"] and all(
+        9.0 < error < 11.0 for error in tested.values()
+    )  # what the first day lacks [mm]
+    assert run(["learn", *other, "-o", str(mended), "--adapt", str(model), "--plane", "0,1,0"]) == 2
+    assert "keeps its bones" in capsys.readouterr().err
     row = [0.4, 1.5]
     moved = load_model(mended).markers(row) - load_model(model).markers(row)
     np.testing.assert_allclose(moved, np.tile([0.01, 0, 0], (3, 1)), atol=5e-4)
     assert run(["learn", *files, "--test", *other, "-o", str(model)]) == 0
     said = capsys.readouterr().out
     assert "8 bones along a, b, c, in this order" in said
-    assert "40 rows that were held out" in said and "never changes: dark" in said and "light" in said
+    assert (
+        "of the markers: a " in said
+        and "40 rows that were held out" in said
+        and "never changes: dark" in said
+        and "light" in said
+    )
 
 
 def test_what_is_wrong_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

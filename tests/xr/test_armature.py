@@ -111,6 +111,7 @@ def test_flat_and_hierarchical_say_the_same() -> None:
     poses = make_armature(points).rest
     local = local_poses(poses)
     assert isinstance(local, BonePoses) and len(local) == 8
+    assert "8 bones from (" in repr(poses) and len(repr(poses)) < 80
     np.testing.assert_allclose(local.positions[1:, :2], 0.0, atol=0.02)
     assert (local.positions[1:, 2] > 0.9 * np.linalg.norm(local.positions[1:], axis=1)).all()  # each lies ahead of its parent
     np.testing.assert_allclose(flat_poses(local).T_robot_bone, poses.T_robot_bone, atol=1e-12)

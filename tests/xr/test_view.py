@@ -22,6 +22,7 @@ from helpers import write_block_robot
 from xr_bar import START, bar_mesh, write_run
 
 from femsense.core.errors import InputError, MissingDependency
+from femsense.fem.mesh import to_quadratic
 from femsense.xr import run_contents, view
 from femsense.xr.export import export_glb
 from femsense.xr.surface_stress import nodal_strain
@@ -168,8 +169,9 @@ def test_refusals_name_the_file(tmp_path: Path) -> None:
         run_contents.export_run(run, tmp_path / "x.glb")
 
 
-def test_strain_of_a_stretched_and_of_a_turned_body_is_the_textbook_s(tmp_path: Path) -> None:
-    mesh = bar_mesh((1, 1, 4))
+@pytest.mark.parametrize("quadratic", [False, True])
+def test_strain_of_a_stretched_and_of_a_turned_body_is_the_textbook_s(quadratic: bool) -> None:
+    mesh = to_quadratic(bar_mesh((1, 1, 4))) if quadratic else bar_mesh((1, 1, 4))
     stretched = mesh.nodes * [1.0, 1.0, 1.1]
     turned = mesh.nodes @ np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]) + 0.3
     strain = nodal_strain(mesh.nodes, mesh.tets, np.array([mesh.nodes, stretched, turned]))

@@ -104,7 +104,7 @@ def learn(
     report = {
         "kind": plan.kind,
         **{key: table[plan.kind][key] for key in ("error_mm", "error_ci_mm")},
-        "marker_error_mm": _by_marker(network(inputs) - test.targets, data.marker_names),
+        "marker_error_mm": marker_errors_mm(network(inputs) - test.targets, data.marker_names),
         "rows": len(work),
         "test_rows": len(test),
         "compared": table,
@@ -196,7 +196,8 @@ def _row(errors: FloatArray) -> dict[str, Any]:
     return {"error_mm": 1e3 * marker_rms(errors), "error_ci_mm": [1e3 * x for x in error_interval(errors)]}
 
 
-def _by_marker(errors: FloatArray, names: tuple[str, ...]) -> dict[str, float]:
+def marker_errors_mm(errors: FloatArray, names: tuple[str, ...]) -> dict[str, float]:
+    """Return the root mean square of each marker's distance [mm], of coordinates [m], shape (rows, 3 m)."""
     return {name: 1e3 * marker_rms(errors[:, 3 * i : 3 * i + 3]) for i, name in enumerate(names)}
 
 

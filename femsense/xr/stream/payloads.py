@@ -213,8 +213,8 @@ def field_bytes(seq: int, time_s: float, largest: float, shares: npt.NDArray[np.
 
 def header(seq: int, time_s: float, frame_id: str) -> dict[str, Any]:
     """Return a header as ROS 1 has it, and Unity's messages after it."""
-    secs = int(np.floor(time_s))
-    return {"seq": seq, "stamp": {"secs": secs, "nsecs": round(1e9 * (time_s - secs))}, "frame_id": frame_id}
+    secs, nsecs = divmod(round(1e9 * time_s), 10**9)
+    return {"seq": seq, "stamp": {"secs": secs, "nsecs": nsecs}, "frame_id": frame_id}
 
 
 def model_bytes(twin: Twin, glb_url: str) -> bytes:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import os
 import queue
 import socket
 import time
@@ -12,7 +13,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import closing, suppress
 from pathlib import Path
 from threading import Event
-from typing import Any
+from typing import TYPE_CHECKING, Any, TextIO
 from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
@@ -20,6 +21,9 @@ import numpy as np
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import InputError, MissingDependency
 from femsense.xr.stream.mqtt import MqttSource, broker_address
+
+if TYPE_CHECKING:
+    from serial import Serial
 
 LONGEST_LINE = 65_536
 POLL_S = 0.002
@@ -31,7 +35,7 @@ Reading = tuple[float, FloatArray]
 
 
 def readings_of(source: str, channels: Sequence[str], stop: Event) -> Iterator[Reading]:
-    """Yield readings until `stop` is set; lines that are none are passed over.
+    """Open a source and return what yields its readings until `stop` is set; lines that are none are passed over.
 
     Arguments:
         source: a CSV file, `udp://HOST:PORT`, `mqtt://HOST/TOPIC`, or `serial:PORT?baud=115200`. What comes by UDP,
@@ -41,7 +45,7 @@ def readings_of(source: str, channels: Sequence[str], stop: Event) -> Iterator[R
         stop: ends it.
 
     Raises:
-        InputError: no such source, a CSV file without a channel.
+        InputError: no such source, one that cannot be opened, a CSV file without a channel.
         MissingDependency: the package for it is not installed.
     """
     parts = urlsplit(source)
@@ -103,44 +107,64 @@ def _number(value: Any) -> float:
 
 
 def _grown(file: Path, channels: Sequence[str], stop: Event) -> Iterator[Reading]:
-    """Yield the rows of a CSV file: the last one there is, then those that are written to it.
+    """Open a CSV file; yield its last row, then those that are written to it.
 
-    A file that starts anew is read anew.
+    A file that starts anew, or is replaced, is read anew.
     """
-    with file.open(newline="", encoding="utf-8") as stream:
-        columns = next(csv.reader(io.StringIO(stream.readline())), [])
-        missing = [name for name in channels if name not in columns]
-        if missing:
-            raise InputError("channels are missing", where=file, found=", ".join(columns), expected=", ".join(missing))
-        newest, rest = "", ""
-        while not stop.is_set():
-            text = rest + stream.read(1 << 20)
-            *lines, rest = text.split("\n")
-            if not newest and lines:
-                lines = lines[-1:]  # what is old is not shown
-            for line in lines:
-                newest = line
-                row = dict(zip(columns, next(csv.reader([line]), [])))
-                found = _of_object(row, channels)
-                if found is not None:
-                    yield found
-            if not lines:
-                stop.wait(POLL_S)
-                if file.stat().st_size < stream.tell():
-                    stream.seek(0)
-                    stream.readline()
-                    rest = ""
+    stream = file.open(newline="", encoding="utf-8")
+    columns = next(csv.reader(io.StringIO(stream.readline())), [])
+    missing = [name for name in channels if name not in columns]
+    if missing:
+        stream.close()
+        raise InputError("channels are missing", where=file, found=", ".join(columns), expected=", ".join(missing))
+    return _rows(file, stream, columns, channels, stop)
+
+
+def _rows(file: Path, stream: TextIO, columns: list[str], channels: Sequence[str], stop: Event) -> Iterator[Reading]:
+    newest, rest = "", ""
+    while not stop.is_set():
+        text = rest + stream.read(1 << 20)
+        *lines, rest = text.split("\n")
+        if not newest and lines:
+            lines = lines[-1:]  # what is old is not shown
+        for line in lines:
+            newest = line
+            row = dict(zip(columns, next(csv.reader([line]), [])))
+            found = _of_object(row, channels)
+            if found is not None:
+                yield found
+        if not lines:
+            stop.wait(POLL_S)
+            if _began_anew(file, stream):
+                stream.close()
+                stream = file.open(newline="", encoding="utf-8")
+                stream.readline()
+                rest = ""
+    stream.close()
+
+
+def _began_anew(file: Path, stream: TextIO) -> bool:
+    """Whether a file was cut off or replaced; False while it is away."""
+    with suppress(FileNotFoundError):
+        now = file.stat()
+        return now.st_size < stream.tell() or now.st_ino != os.fstat(stream.fileno()).st_ino
+    return False
 
 
 def _datagrams(source: str, stop: Event) -> Iterator[bytes]:
     parts = urlsplit(source)
+    endpoint = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
-        endpoint = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         endpoint.bind((parts.hostname or "127.0.0.1", parts.port or 0))
     except (OSError, ValueError) as error:
+        endpoint.close()
         raise InputError(
             "the address cannot be used", where=source, found=error, expected="udp://HOST:PORT of this machine"
         ) from None
+    return _received(endpoint, stop)
+
+
+def _received(endpoint: socket.socket, stop: Event) -> Iterator[bytes]:
     with closing(endpoint):
         endpoint.settimeout(WAIT_S)
         while not stop.is_set():
@@ -163,7 +187,11 @@ def _topic(source: str, stop: Event) -> Iterator[bytes]:
             waiting.put_nowait(payload)
 
     address = broker_address(f"{parts.scheme}://{parts.netloc}")
-    with closing(MqttSource(address, lambda message: take(message.payload), topics=(name,))):
+    return _newest(MqttSource(address, lambda message: take(message.payload), topics=(name,)), waiting, stop)
+
+
+def _newest(source: MqttSource, waiting: queue.Queue[bytes], stop: Event) -> Iterator[bytes]:
+    with closing(source):
         while not stop.is_set():
             with suppress(queue.Empty):
                 yield waiting.get(timeout=WAIT_S)
@@ -182,9 +210,21 @@ def _serial(source: str, stop: Event) -> Iterator[bytes]:
         raise InputError(
             "the serial line cannot be opened", where=source, found=error, expected="serial:PORT?baud=115200"
         ) from None
+    return _lines(line, stop)
+
+
+def _lines(line: Serial, stop: Event) -> Iterator[bytes]:
+    """Yield the lines of a serial port; one that was unplugged is opened again."""
+    held = b""
     with closing(line):
-        held = b""
         while not stop.is_set():
-            held += line.read(max(1, min(line.in_waiting, LONGEST_LINE)))
+            try:
+                held += line.read(max(1, min(line.in_waiting, LONGEST_LINE)))
+            except OSError:
+                held = b""
+                line.close()
+                stop.wait(WAIT_S)
+                with suppress(OSError):
+                    line.open()
             *whole, held = held[-LONGEST_LINE:].split(b"\n")
             yield from whole

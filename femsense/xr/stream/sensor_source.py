@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from threading import Event
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
@@ -13,7 +12,7 @@ from femsense.xr.proprioception.model import ProprioceptiveModel
 from femsense.xr.skeleton import skeleton_at
 from femsense.xr.skinning import INFLUENCES, Skin
 from femsense.xr.stream.payloads import Input, Twin, TwinFrame, bone_rows
-from femsense.xr.stream.readings import readings_of
+from femsense.xr.stream.readings import Reading
 
 AROUND, BETWEEN = 20, 6
 """Vertices around the tube, and rings between neighbouring bones."""
@@ -34,13 +33,13 @@ def sensor_twin(model: ProprioceptiveModel, name: str) -> Twin:
     return Twin(name, glb, skin.skeleton.names, skin.skeleton.T_robot_bone, inputs=inputs)
 
 
-def frames_of_sensors(source: str, model: ProprioceptiveModel, stop: Event) -> Iterator[TwinFrame]:
-    """Yield a frame for each reading of a source (see `readings_of`); where a reading is no number,
+def frames_of_sensors(readings: Iterable[Reading], model: ProprioceptiveModel) -> Iterator[TwinFrame]:
+    """Yield a frame for each reading (see `readings_of`); where a reading is no number,
     the last good pose is kept."""
     live, straight = model.live(), np.linalg.inv(model.rest_bones.T_robot_bone)
     straight[:, :3, 3] = 0.0
     bones = bone_rows(skeleton_at(model.rest_bones.positions).T_robot_bone)
-    for time_s, row in readings_of(source, model.channels, stop):
+    for time_s, row in readings:
         pose = live.step(row, time_s)
         if pose.bones is not None:
             bones = bone_rows(pose.bones.T_robot_bone @ straight)  # bones that have the robot's axes at rest
@@ -48,13 +47,13 @@ def frames_of_sensors(source: str, model: ProprioceptiveModel, stop: Event) -> I
         yield TwinFrame(time_s, bones, inputs=tuple(float(v) for v in row), status=said or "ok")
 
 
-def markers_of_sensors(source: str, model: ProprioceptiveModel, stop: Event) -> Iterator[tuple[float, dict[str, FloatArray]]]:
-    """Yield the time [s] and the places of the markers [m], name → shape (3,), of each reading of a source (see `readings_of`).
+def markers_of_sensors(readings: Iterable[Reading], model: ProprioceptiveModel) -> Iterator[tuple[float, dict[str, FloatArray]]]:
+    """Yield the time [s] and the places of the markers [m], name → shape (3,), of each reading (see `readings_of`).
 
     Readings outside of what the model was taught are left out: their markers are guesses.
     """
     live = model.live()
-    for time_s, row in readings_of(source, model.channels, stop):
+    for time_s, row in readings:
         pose = live.step(row, time_s)
         if not pose.outside:
             yield time_s, dict(zip(model.marker_names, pose.markers))

@@ -63,6 +63,7 @@ def plain(value: Any) -> bool:
 
 def test_documents_say_what_is_known_and_leave_out_what_is_not() -> None:
     force = json.loads(payloads.force_bytes(9, moment(3.5, contact=True)))
+    assert payloads.header(0, 2.9999999999, "robot")["stamp"] == {"secs": 3, "nsecs": 0}
     assert force["header"] == {"seq": 9, "stamp": {"secs": 3, "nsecs": 500_000_000}, "frame_id": "robot"}
     (contact,) = force["contacts"]
     assert contact["force_n"] == {"x": 0.0, "y": 0.0, "z": -2.0} and contact["size_n"] == 2.0 and contact["std_n"] == 0.1

@@ -105,7 +105,7 @@ def test_a_file_that_grows_is_followed_from_its_end_and_again_when_it_starts_ane
     stop.set()
     (tmp_path / "other.csv").write_text("time_s,bend\n", encoding="utf-8")
     with pytest.raises(InputError, match=r"channels are missing[\s\S]*sway"):
-        next(readings_of(str(tmp_path / "other.csv"), CHANNELS, Event()))
+        readings_of(str(tmp_path / "other.csv"), CHANNELS, Event())
 
 
 def test_datagrams_are_readings() -> None:
@@ -139,10 +139,51 @@ def test_a_serial_line_is_read_line_by_line() -> None:
     assert [row.tolist() for _, row in found] == [[1, 2], [3, 4]]
 
 
+def test_a_serial_line_that_was_unplugged_comes_back(tmp_path: Path) -> None:
+    pytest.importorskip("serial")
+    pty = pytest.importorskip("pty")
+    port, stop = tmp_path / "port", Event()
+    first, theirs = pty.openpty()
+    port.symlink_to(os.ttyname(theirs))
+    readings = readings_of(f"serial:{port}", CHANNELS, stop)
+    os.write(first, b"1,2\n")
+    assert next(readings)[1].tolist() == [1, 2]
+    os.close(theirs)
+    os.close(first)
+    port.unlink()
+    second, theirs = pty.openpty()
+    port.symlink_to(os.ttyname(theirs))
+
+    def keep_sending() -> None:
+        while not stop.wait(0.05):
+            os.write(second, b"3,4\n")
+
+    Thread(target=keep_sending, daemon=True).start()
+    assert next(readings)[1].tolist() == [3, 4]
+    stop.set()
+
+
+def test_a_file_that_is_replaced_is_read_anew(tmp_path: Path) -> None:
+    file, newer = tmp_path / "sensors.csv", tmp_path / "newer.csv"
+    file.write_text("time_s,bend,sway\n0,1,2\n", encoding="utf-8")
+    stop = Event()
+    readings = readings_of(str(file), CHANNELS, stop)
+    assert next(readings)[1].tolist() == [1, 2]
+    newer.write_text("time_s,bend,sway\n" + "5,3,4\n" * 9, encoding="utf-8")
+    file.unlink()
+
+    def replace_later() -> None:
+        time.sleep(0.05)
+        newer.rename(file)
+
+    Thread(target=replace_later).start()
+    assert next(readings)[1].tolist() == [3, 4]
+
+
 @pytest.mark.parametrize("source", ["no-such.csv", "udp://127.0.0.1:99999", "mqtt://host", "serial:/dev/no-such-port", "ftp://x"])
-def test_what_is_no_source_is_refused(source: str) -> None:
+def test_what_is_no_source_is_refused_at_once(source: str) -> None:
     with pytest.raises(InputError):
-        next(readings_of(source, CHANNELS, Event()))
+        readings_of(source, CHANNELS, Event())
 
 
 def test_the_tube_bends_as_the_markers_do(model: ProprioceptiveModel, tmp_path: Path) -> None:
@@ -154,7 +195,7 @@ def test_the_tube_bends_as_the_markers_do(model: ProprioceptiveModel, tmp_path: 
     file = tmp_path / "sensors.csv"
     file.write_text("time_s,bend,sway\n0,0,0\n", encoding="utf-8")
     with file.open("a", encoding="utf-8") as stream:
-        frames = frames_of_sensors(str(file), model, Event())
+        frames = frames_of_sensors(readings_of(str(file), CHANNELS, Event()), model)
         still = next(frames)
         stream.write("1,0.4,-0.2\n")
         stream.flush()
@@ -176,7 +217,7 @@ def test_bones_of_a_lying_body_have_the_axes_of_the_robot_at_rest(tmp_path: Path
     R = Rotation.from_euler("yz", [90, 30], degrees=True).as_matrix()
     file, lying = tmp_path / "sensors.csv", line_model(R)
     file.write_text("time_s,bend,sway\n0,0.4,-0.2\n", encoding="utf-8")
-    bent = next(frames_of_sensors(str(file), lying, Event())).bones
+    bent = next(frames_of_sensors(readings_of(str(file), CHANNELS, Event()), lying)).bones
     axis = Rotation.from_quat(bent[-1, 3:]).as_matrix() @ R[:, 2]  # along the body at rest
     np.testing.assert_allclose(axis, R @ (np.array([0.4, -0.2, 1.0]) / np.sqrt(1.2)), atol=1e-3)
 
