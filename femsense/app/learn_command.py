@@ -58,10 +58,11 @@ def learn_into(
         found = drift(before, data)
         model = adapted(before, data)
         text = f"{found.text}\n\n{_adapted_text(model.report['adapted'])}"
-        document = {"verdict": found.verdict, "rigid_mm": found.rigid_mm, "outside": found.channels}
+        document: dict[str, Any] = {"verdict": found.verdict, "rigid_mm": found.rigid_mm, "outside": found.channels}
         if other is not None:
-            document["test"] = _tested(model, other)
-            text += f"\non {test[0] if test else ''}: {_each_text(document['test'])}"
+            tested = _tested(model, other)
+            document["test"] = tested
+            text += f"\non {test[0] if test else ''}: {_each_text(tested)}"
     else:
         options = LearnOptions(end_to_end=end_to_end, bones=ArmatureOptions(bones=bones, plane_normal=_normal(plane)))
         model = learn(data, test=other, options=options, progress=progress)
