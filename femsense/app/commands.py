@@ -59,6 +59,7 @@ def estimate_into(
         FemsenseError: bad input, a folder that holds something else, or data that allow no result.
     """
     from femsense.calib.calibrate import calibrate
+    from femsense.calib.given import check_given
     from femsense.sensing.pipeline import estimate
 
     check_run_folder(folder)
@@ -74,6 +75,8 @@ def estimate_into(
     used = calibrate(body, frames, correct=bool(options and options.correct)) if given is None else given
     if not used.settled:
         raise DataError(f"the calibration is not to be used: {used.status}")
+    if given is not None:
+        check_given(body, frames, given)
     began = time.perf_counter()
     run = estimate(body, frames, used, at=at, options=options, progress=progress, keep=_kept(folder, inputs))
     write_run(run, folder, inputs=inputs, seconds=time.perf_counter() - began, calibration=used)

@@ -114,11 +114,11 @@ def _as_declared(recording: Recording, views: Sequence[int]) -> Recording:
 
 
 def calibrated_start(
-    robot: Robot, recording: Recording, frames: IntArray
+    robot: Robot, recording: Recording, frames: IntArray, *, strict: bool = False
 ) -> tuple[tuple[FloatArray, ...], FloatArray | None, dict[int, Equilibrium]]:
     """Return poses, initial inputs (None where they are known) and states of frames by which further fits begin;
-    frames need markers."""
-    _, _, poses, initial, jet = _fitted(robot, recording, frames, [], strict=False)
+    frames need markers. `strict` refuses all that `calibrate` refuses (DataError)."""
+    _, _, poses, initial, jet = _fitted(robot, recording, frames, [], strict=strict)
     return tuple(poses), initial, jet.states
 
 

@@ -16,6 +16,7 @@ from scipy.optimize import linear_sum_assignment
 from femsense.core.arrays import BoolArray, FloatArray, IntArray
 from femsense.core.errors import DataError
 from femsense.model.camera_frame import in_robot_frame
+from femsense.model.marker_units import unit_hint
 from femsense.model.observation import Scene
 from femsense.model.recording import Recording, with_marker_table
 from femsense.model.robot import Robot
@@ -28,8 +29,6 @@ EXPLAINED = 4.0
 """Another reading counts where the residual falls by this factor."""
 HOPELESS = 0.5
 """A residual above this share of the markers' spread is no fit, whatever the reason."""
-UNITS = {1e3: "millimetres", 1e2: "centimetres", 39.37: "inches", 3.281: "feet", 1e6: "micrometres", 1e-3: "kilometres"}
-"""Numbers so many times too large are in this unit."""
 OUTLIER = 0.1
 """An outlier is off by this share of the markers' spread at least. No measurement set it; on a real tendon robot one marker was
 named for it, which may be the model's error."""
@@ -112,7 +111,7 @@ def check_reading(robot: Robot, pairs: Sequence[Pairs], *, strict: bool = True) 
             and max(scale, 1 / scale) > 1.5
             and rigid_rms(one.modelled, one.measured, scale=scale) * EXPLAINED < plain
         ):
-            raise DataError(f"{found}. They are {scale:.4g} times too large: {_unit(scale)}. The files hold metres")
+            raise DataError(f"{found}. They are {scale:.4g} times too large: {unit_hint(scale)} The files hold metres")
         if not most_fit and rigid_rms(one.modelled, one.measured, mirrored=True) * EXPLAINED < plain:
             raise DataError(
                 f"{found}. Mirrored they fit: are the axes left-handed? Camera frames are right-handed (x right, y down, "
@@ -123,11 +122,6 @@ def check_reading(robot: Robot, pairs: Sequence[Pairs], *, strict: bool = True) 
             raise DataError(f"{found}. The labels seem swapped: {_cycles(robot, swapped)}. Swap them in markers.csv")
         if strict and plain > HOPELESS * one.spread:
             raise DataError(f"{found}. Are these the markers of {robot.name!r}, in metres, under their names?")
-
-
-def _unit(scale: float) -> str:
-    nearest = min(UNITS, key=lambda known: abs(np.log(scale / known)))
-    return f"are they in {UNITS[nearest]}?" if abs(np.log(scale / nearest)) < 0.25 else "is the robot's mesh.unit right?"
 
 
 def _swapped(pairs: Pairs, plain: float) -> dict[int, int]:

@@ -11,6 +11,7 @@ from femsense.core.arrays import freeze
 from femsense.core.errors import InputError
 from femsense.core.text import did_you_mean
 from femsense.fem.mesh import embed_points
+from femsense.model.marker_units import check_marker_distances
 from femsense.model.recording import Recording, with_marker_table
 from femsense.model.recording_parts import RestMarkers
 from femsense.model.robot import Robot
@@ -32,10 +33,12 @@ def check_against(robot: Robot, recording: Recording) -> Recording:
 
     Raises:
         InputError: other cables or chambers than the robot's, no marker in common, a known load far from the body.
+        DataError: markers in another unit.
     """
     diagonal = float(np.linalg.norm(np.ptp(np.vstack([robot.body.mesh.nodes, robot.marker_points]), axis=0)))
     measured = without_far_markers(without_stale_markers(recording), diagonal)
     fitted = _without_strangers(robot, _with_chamber_order(robot, _with_cable_order(robot, measured)))
+    check_marker_distances(robot, fitted)
     _check_loads(robot, fitted)
     _check_displacements(robot, fitted)
     _warn_of_inputs(robot, fitted)

@@ -142,7 +142,7 @@ def test_swaps_need_a_reason() -> None:
 @pytest.mark.parametrize(
     ("name", "text"),
     [
-        ("v_inch", "39.38 times too large: are they in inches"),
+        ("v_inch", "39.27 times too large: are they in inches"),
         ("v_swapall", "swapped: mid and tip"),
         ("v_zeros_all", "left: these"),
     ],

@@ -1,0 +1,72 @@
+"""Whether a calibration that is given belongs to a recording: its free frames are calibrated once more, and compared."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+
+import numpy as np
+
+from femsense.calib.calibrate import calibrated_start
+from femsense.calib.calibration import Calibration
+from femsense.core.arrays import FloatArray, IntArray
+from femsense.core.pose import invert_pose, transform_points
+from femsense.model.recording import Recording
+from femsense.model.recording_checks import check_against
+from femsense.model.robot import Robot
+
+MOVED = 5.0
+"""A camera has moved that shows the body off by more than so many times what the calibration leaves …"""
+SHARE = 0.01
+"""… and by this share of the body's diagonal; below, forces change little."""
+FEWEST, MARKERS = 2, 4
+"""Fewer free frames, or fewer markers in them, tell nothing."""
+
+
+def check_given(robot: Robot, recording: Recording, calibration: Calibration) -> None:
+    """Refuse a recording whose own free frames cannot be calibrated, and warn of a camera that has moved since.
+
+    Recordings without free frames, or without named markers in them, are not checked.
+
+    Arguments:
+        robot: the robot.
+        recording: as loaded.
+        calibration: of another recording, or of the same.
+
+    Raises:
+        DataError: as of `calibrate`: markers or inputs that cannot be the robot's as they are written.
+    """
+    frames = _telling(recording)
+    if len(frames) < FEWEST or len(calibration.poses) != len(recording.camera_names):
+        return
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the estimate says the same
+        fitting = check_against(robot, recording)
+    free = replace(fitting, T_robot_camera=(None,) * len(recording.camera_names))
+    poses, _, _ = calibrated_start(robot.in_recording(recording.label), free, frames, strict=True)
+    for v, name in enumerate(recording.camera_names):
+        off = _apart(robot.marker_points, poses[v], calibration.poses[v])
+        size = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))
+        if off > max(MOVED * calibration.rms_m, SHARE * size):
+            camera = f"camera {name}" if name else "the camera"
+            warnings.warn(
+                f"{camera} sees the body {1e3 * off:.3g} mm from where the calibration has it: was it moved since? Calibrate this "
+                f"recording",
+                stacklevel=3,
+            )
+
+
+def _telling(recording: Recording) -> IntArray:
+    """Return the free frames in which every camera sees enough markers."""
+    if recording.free is None or recording.unnamed_frame.size:
+        return np.zeros(0, dtype=np.int64)
+    seen = np.zeros((len(recording.time_s), len(recording.camera_names)), dtype=np.int64)
+    np.add.at(seen, (recording.marker_frame, recording.marker_view), 1)
+    return np.flatnonzero(recording.free & (seen >= MARKERS).all(axis=1))
+
+
+def _apart(points: FloatArray, one: FloatArray, other: FloatArray) -> float:
+    """Return how far apart two poses of a camera (4, 4) put points that it sees, root mean square [m]; points (k, 3) are where
+    the first has them."""
+    moved = transform_points(other, transform_points(invert_pose(one), points))
+    return float(np.sqrt(((moved - points) ** 2).sum(axis=1).mean()))

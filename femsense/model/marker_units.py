@@ -1,0 +1,54 @@
+"""Whether markers are as far apart as on the robot: another unit shows before anything is fitted."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from femsense.core.errors import DataError
+from femsense.model.recording import Recording
+from femsense.model.robot import Robot
+
+UNITS = {1e3: "millimetres", 1e2: "centimetres", 39.37: "inches", 3.281: "feet", 1e6: "micrometres", 1e-3: "kilometres"}
+"""Numbers so many times too large are in this unit."""
+APART, NEAR = 2.0, 0.2
+"""Markers that are so many times as far apart as on the robot are in another unit: no silicone stretches so far, and none coils up so tightly."""
+FEWEST = 3
+"""Fewer markers in a frame tell nothing of their distances."""
+
+
+def unit_hint(scale: float) -> str:
+    """Return, as a question, in which unit numbers may be that are `scale` times too large."""
+    nearest = min(UNITS, key=lambda known: abs(np.log(scale / known)))
+    return f"are they in {UNITS[nearest]}?" if abs(np.log(scale / nearest)) < 0.25 else "is the robot's mesh.unit right?"
+
+
+def check_marker_distances(robot: Robot, recording: Recording) -> None:
+    """Refuse markers whose distances are far from those of the robot's; the median over frames counts.
+
+    Arguments:
+        robot: with its markers at rest.
+        recording: its markers' names are the robot's.
+
+    Raises:
+        DataError: says how many times they are too large, and the unit that this hints at.
+    """
+    r, number = recording, {name: i for i, name in enumerate(robot.marker_names)}
+    rest = np.array([robot.marker_points[number[name]] for name in r.marker_names]).reshape(-1, 3)
+    ratios = []
+    for k, v in np.unique(np.column_stack([r.marker_frame, r.marker_view]), axis=0):
+        rows = (r.marker_frame == k) & (r.marker_view == v)
+        own = _size(rest[r.marker_index[rows]]) if rows.sum() >= FEWEST else 0.0
+        if own > 0.0:
+            ratios.append(_size(r.marker_xyz[rows]) / own)
+    scale = float(np.median(ratios)) if ratios else 1.0
+    if NEAR < scale < APART:
+        return
+    raise DataError(
+        f"the markers do not fit the robot: by their distances they are {scale:.4g} times too large: {unit_hint(max(scale, 1e-12))} "
+        f"The files hold metres"
+    )
+
+
+def _size(points: np.ndarray) -> float:
+    """Return the median distance of points (k, 3) from their median: one that is lost does not move it."""
+    return float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)))
