@@ -23,6 +23,7 @@ from femsense.calib.inputs_from_clouds import with_initial_inputs
 from femsense.calib.joint import PLACEMENT_STD_FLOOR, fit_joint, root_mean_square
 from femsense.calib.marker_assignment import name_markers
 from femsense.calib.other_readings import check_other_readings
+from femsense.calib.pressure_zeros import find_pressure_zeros, has_unknown_zeros, weak_zeros, with_initial_pressures
 from femsense.calib.rigid import fit_rigid, fit_rigid_robust
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import DataError
@@ -94,8 +95,10 @@ def _calibrated(robot: Robot, recording: Recording, frames: Sequence[int] | None
     seen = _as_declared(recording, by_clouds)
     seen = name_markers(robot, seen, _thinned(np.intersect1d(chosen, seen.unnamed_frame)), allowed=allowed)
     if len(seen.marker_frame):
-        history: list[float] = []
-        by_markers = _result(robot, *_fitted(robot, seen, chosen, history), history)
+        by_markers = _by_markers(robot, seen, chosen)
+        robot = with_initial_pressures(robot, by_markers.chamber_pressure_pa)
+    elif has_unknown_zeros(robot, recording):
+        raise DataError('zeros of pressures need markers with names: record those, or declare actuation_zero = "absolute"')
     else:
         by_markers = _declared(robot, seen, chosen)
     if by_clouds:
@@ -105,6 +108,19 @@ def _calibrated(robot: Robot, recording: Recording, frames: Sequence[int] | None
     if by_clouds:
         return _with_std(robot, by_markers)
     return _with_clouds(robot, recording, by_markers) if len(seen.marker_frame) else by_markers
+
+
+def _by_markers(robot: Robot, recording: Recording, chosen: IntArray) -> Calibration:
+    """Return the calibration by markers, zeros of pressures included where they are unknown."""
+    history: list[float] = []
+    if not has_unknown_zeros(robot, recording):
+        return _result(robot, *_fitted(robot, recording, chosen, history), history)
+    zeros = find_pressure_zeros(robot, recording, lambda shifted: _fitted_as_named(shifted, recording, chosen, history))
+    shifted = with_initial_pressures(robot, zeros.pressure)
+    found = _result(shifted, *_fitted(shifted, recording, chosen, history), history)
+    weak = weak_zeros(recording, zeros)
+    status = f"{found.status}, but these data hardly determine the initial pressure of {weak}" if weak else found.status
+    return replace(found, chamber_pressure_pa=zeros.pressure, pressure_std_pa=zeros.std, status=status)
 
 
 def _as_declared(recording: Recording, views: Sequence[int]) -> Recording:
@@ -323,7 +339,7 @@ def _status(fit: FitResult, own: dict[str, float | None], recording: Recording) 
 
 def _from_rest(robot: Robot, recording: Recording) -> Calibration:
     """Return the calibration of a recording none of whose frames can be used: poses from the markers at rest alone."""
-    if recording.actuation_zero == "unknown" and robot.body.cables:
+    if recording.actuation_zero == "unknown" and (robot.body.cables or robot.body.chambers):
         raise DataError("initial inputs need a frame that is free of undeclared contact (column free of frames.csv)")
     number = {name: i for i, name in enumerate(robot.marker_names)}
     rest = recording.rest

@@ -50,6 +50,11 @@ class Calibration:
     is_corrected: bool = False
     """Whether the robot's empirical correction was used."""
 
+    chamber_pressure_pa: dict[str, float] = field(default_factory=dict)
+    """Initial pressure of each chamber, added to the recorded ones [Pa]; empty where their zero is known."""
+    pressure_std_pa: dict[str, float | None] = field(default_factory=dict)
+    """[Pa]; None where the data say nothing."""
+
     @property
     def settled(self) -> bool:
         """Whether the fit came to an end; what has not settled is no calibration."""

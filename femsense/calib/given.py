@@ -9,6 +9,7 @@ import numpy as np
 
 from femsense.calib.calibrate import calibrated_start
 from femsense.calib.calibration import Calibration
+from femsense.calib.pressure_zeros import with_initial_pressures
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.pose import invert_pose, transform_points
 from femsense.model.recording import Recording
@@ -43,7 +44,8 @@ def check_given(robot: Robot, recording: Recording, calibration: Calibration) ->
         warnings.simplefilter("ignore")  # the estimate says the same
         fitting = check_against(robot, recording)
     free = replace(fitting, T_robot_camera=(None,) * len(recording.camera_names))
-    poses, _, _ = calibrated_start(robot.in_recording(recording.label), free, frames, strict=True)
+    driven = with_initial_pressures(robot.in_recording(recording.label), calibration.chamber_pressure_pa)
+    poses, _, _ = calibrated_start(driven, free, frames, strict=True)
     for v, name in enumerate(recording.camera_names):
         off = _apart(robot.marker_points, poses[v], calibration.poses[v])
         size = float(np.linalg.norm(np.ptp(robot.body.mesh.nodes, axis=0)))

@@ -95,6 +95,9 @@ def make_limits(robot: Robot, control: str, limits: Mapping[str, tuple[float, fl
         i = names.index(name)
         if i < a:
             least, largest = (true_input(robot, control, i, v, calibration) for v in (least, largest))
+        elif calibration is not None:
+            zero = calibration.chamber_pressure_pa.get(name, 0.0)
+            least, largest = least + zero, largest + zero
         if i < a and control == "displacement":
             short[0][i], short[1][i] = least, largest
         else:

@@ -300,7 +300,8 @@ def _motion(
     effort, wound, miss = _effort(state), _wound(body, state), goal.miss(state.positions)
     true = effort[: len(wound)] if control == "tension" else wound
     inputs = {name: command(robot, control, i, float(true[i]), calibration) for i, name in enumerate(body.cable_names)}
-    inputs.update(state.pressure)
+    zeros = {} if calibration is None else calibration.chamber_pressure_pa
+    inputs.update({name: pressure - zeros.get(name, 0.0) for name, pressure in state.pressure.items()})
     places = goal.ties.positions(state.positions)
     share = last.gain / max(float(miss @ miss), 1e-300) if status != REACHED else 0.0
     certificate = Certificate(state.residual_n, max(share, 0.0), bounds.violation(wound) + bounds.outside(effort))

@@ -56,6 +56,8 @@ def calibration_text(calibration: Calibration) -> str:
                 f"mm{_std(c.displacement_std_m.get(name), 1e3, 'mm')} at the start",
             ]
         )
+    for name, pressure in c.chamber_pressure_pa.items():
+        rows.append([f"chamber {name}", f"{pressure:.0f} Pa{_std(c.pressure_std_pa.get(name), 1.0, 'Pa')} at the start"])
     return "calibration\n" + columns(rows)
 
 

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from femsense.calib.calibration import Calibration
 from femsense.calib.from_clouds import free_clouds, measured_noises, pose_pivot
+from femsense.calib.pressure_zeros import with_initial_pressures
 from femsense.calib.scan import REACH, Scan, parted, read_scan
 from femsense.core.arrays import FloatArray, as_points, freeze
 from femsense.core.errors import FemsenseError, InputError
@@ -58,7 +59,7 @@ def make_sensor(
             expected="clouds/, depth/, or --at X,Y,Z",
             hint="name the place at rest in metres, robot frame: --at 0.1,0,0.015",
         )
-    robot = _with_placements(robot, calibration)
+    robot = with_initial_pressures(_with_placements(robot, calibration), calibration.chamber_pressure_pa)
     noises = measured_noises(robot, recording, calibration)
     pulls_are_modelled = recording.has_clouds and recording.actuation == "displacement"
     knowledge = first_knowledge(

@@ -36,7 +36,7 @@ def test_a_recording_of_its_own_is_not_accused(recwarn: pytest.WarningsRecorder)
 
 
 def test_a_camera_that_moved_is_named() -> None:
-    moved = replace(recording(), marker_xyz=freeze(recording().marker_xyz + [0.01, 0.0, 0.0]))
+    moved = replace(recording(), marker_xyz=freeze(np.add(recording().marker_xyz, [0.01, 0.0, 0.0])))
     with pytest.warns(UserWarning, match=r"the camera sees the body 10(\.\d)? mm from where the calibration has it"):
         check_given(arm(), moved, calibration())
 
