@@ -12,6 +12,7 @@ from femsense.calib.calibration import Calibration
 from femsense.calib.pressure_zeros import with_initial_pressures
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.pose import invert_pose, transform_points
+from femsense.model.marker_correction import corrected
 from femsense.model.recording import Recording
 from femsense.model.recording_checks import check_against
 from femsense.model.robot import Robot
@@ -43,6 +44,8 @@ def check_given(robot: Robot, recording: Recording, calibration: Calibration) ->
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the estimate says the same
         fitting = check_against(robot, recording)
+    if calibration.is_corrected:
+        fitting = corrected(fitting, robot.require_correction(), calibration.poses)
     free = replace(fitting, T_robot_camera=(None,) * len(recording.camera_names))
     driven = with_initial_pressures(robot.in_recording(recording.label), calibration.chamber_pressure_pa)
     poses, _, _ = calibrated_start(driven, free, frames, strict=True)
