@@ -15,6 +15,7 @@ import numpy as np
 from femsense.calib.calibration import Calibration
 from femsense.calib.checks import check_reading, pairs_of, relabelled
 from femsense.calib.clouds_alone import placed_by_clouds, views_without_markers
+from femsense.calib.first_poses import first_poses
 from femsense.calib.from_clouds import pose_pivot, refine_poses
 from femsense.calib.from_images import has_image_markers, with_image_markers
 from femsense.calib.input_checks import check_inputs
@@ -24,16 +25,14 @@ from femsense.calib.joint import PLACEMENT_STD_FLOOR, fit_joint, root_mean_squar
 from femsense.calib.marker_assignment import name_markers
 from femsense.calib.other_readings import check_other_readings
 from femsense.calib.pressure_zeros import find_pressure_zeros, has_unknown_zeros, weak_zeros, with_initial_pressures
-from femsense.calib.rigid import fit_rigid, fit_rigid_robust
+from femsense.calib.rigid import fit_rigid
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import DataError
 from femsense.core.least_squares import FitResult, covariance_of
 from femsense.core.parallel import one_blas_thread
 from femsense.core.pose import move_pose
-from femsense.fem.equilibrium import Equilibrium, SolveOptions
+from femsense.fem.equilibrium import Equilibrium
 from femsense.model.camera_frame import in_robot_frame
-from femsense.model.drive import DrivenRobot, drive_of
-from femsense.model.frame_state import solve_frame
 from femsense.model.marker_correction import corrected
 from femsense.model.observation import Hypothesis, Scene, SceneJet, evaluate_scene, make_scene, rest_residual
 from femsense.model.recording import Recording
@@ -183,42 +182,6 @@ def _thinned(frames: IntArray) -> IntArray:
     if len(frames) <= MAX_FRAMES:
         return frames
     return np.asarray(frames[np.unique(np.linspace(0, len(frames) - 1, MAX_FRAMES).round().astype(int))])
-
-
-def first_poses(robot: Robot, scene: Scene) -> list[FloatArray]:
-    """Return a start for the pose of each camera: declared, from the markers at rest, or from those of the first frame.
-
-    Raises:
-        DataError: a camera sees fewer than three markers.
-    """
-    poses: list[FloatArray] = []
-    for v, name in enumerate(scene.recording.camera_names):
-        declared = scene.recording.T_robot_camera[v]
-        resting = scene.rest_view == v
-        if declared is not None:
-            poses.append(declared)
-        elif resting.sum() >= 3:
-            poses.append(fit_rigid_robust(robot.marker_points[scene.rest_marker[resting]], scene.rest_points[resting])[0])
-        else:
-            poses.append(_pose_from_frame(robot, scene, v, name))
-    return poses
-
-
-def _pose_from_frame(robot: Robot, scene: Scene, view: int, name: str) -> FloatArray:
-    """Fit the first frame in which a camera sees enough markers to the model of that frame."""
-    driven = DrivenRobot(robot, drive_of(robot, scene.recording, initial=first_inputs(robot, scene.recording)))
-    most = 0
-    for k in scene.frames:
-        rows = (scene.frame == k) & (scene.view == view)
-        most = max(most, int(rows.sum()))
-        if rows.sum() >= 3:
-            state = solve_frame(driven, int(k), options=SolveOptions(single=True))
-            shape = state.positions if state.converged else robot.body.mesh.nodes
-            return fit_rigid(robot.markers.positions(shape)[scene.marker[rows]], scene.points[rows])
-    raise DataError(
-        f"camera {name or '(only one)'} needs a frame with three markers for its pose; the most in one frame is {most}. "
-        f"Give T_robot_camera, or show more markers"
-    )
 
 
 def _alternate(

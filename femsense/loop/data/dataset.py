@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from femsense.calib.calibrate import calibrated_start, first_poses, usable_frames
+from femsense.calib.calibrate import calibrated_start, usable_frames
+from femsense.calib.first_poses import first_poses
 from femsense.calib.inputs import first_inputs, input_bounds
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import DataError, InputError
