@@ -37,7 +37,7 @@ def calibration_document(calibration: Calibration) -> dict[str, Any]:
             "T_robot_camera": c.pose_std,
             "cable_tension_n": c.tension_std_n,
             "cable_displacement_m": c.displacement_std_m,
-            "chamber_pressure_pa": c.pressure_std_pa,
+            **({"chamber_pressure_pa": c.pressure_std_pa} if c.pressure_std_pa else {}),
         },
         "pose_covariance": c.pose_covariance,
         "joint_covariance": c.joint_covariance,
