@@ -275,6 +275,12 @@ def held_chi2(data: Data, fitted: FittedModel, noise: Noise) -> float:
     )
 
 
+def mean_square(trials: list[Trial], residuals: list[FloatArray], noise: Noise) -> float:
+    """Return the mean square of whitened residuals; 1 is noise."""
+    rows = [whiten(noise.whitener(t.groups, t.mesh_error), r) for t, r in zip(trials, residuals)]
+    return float(np.mean(np.concatenate(rows, axis=None) ** 2)) if rows else 0.0
+
+
 def held_shift(data: Data, before: FittedModel, after: FittedModel, noise: Noise) -> float:
     """Return the whitened sum of squares of the difference between two models on held-out data."""
     return float(

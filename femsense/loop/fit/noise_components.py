@@ -17,7 +17,7 @@ that is measured five times repeats its error five times, and the term h² says 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import pairwise
 from typing import Any
@@ -50,6 +50,8 @@ class Noise:
     """Where they come from, in words."""
     surface: dict[str, float] = field(default_factory=lambda: {"white": CLOUD_START})
     """Of clouds, along the normal."""
+    assumed: float | None = None
+    """What a marker is taken to repeat to along each axis where nothing tells it [m]; None: its white part."""
 
     def components(self, groups: Groups) -> dict[str, float]:
         """Return the standard deviations that hold for rows with these groups [m]."""
@@ -58,7 +60,7 @@ class Noise:
     def joined(self, estimate: Noise, clouds: bool) -> Noise:
         """Return this noise with what was estimated of markers, or of clouds."""
         source = "; ".join(dict.fromkeys(s for s in (self.source, estimate.source) if s))
-        return Noise(self.std, source, estimate.std) if clouds else Noise(estimate.std, source, self.surface)
+        return replace(self, source=source, surface=estimate.std) if clouds else replace(self, source=source, std=estimate.std)
 
     def row_std(self, groups: Groups) -> float:
         """Return the standard deviation of a row with these groups [m]: of a coordinate of a marker, or of a cloud along the normal."""

@@ -52,7 +52,7 @@ def repeatability(data: Data, fitted: FittedModel, noise: Noise) -> Repeatabilit
     at_rest = _at_rest(trials) if axes == 3 else None
     if at_rest is not None:
         return Repeatability(at_rest, axes, True, "std_m of rest.csv")
-    white = (noise.std or noise.surface)["white"]
+    white = noise.assumed or (noise.std or noise.surface)["white"]
     return Repeatability(
         white, axes, False, "assumed from the residual: no state is reached again, and marker_noise_m is not declared"
     )

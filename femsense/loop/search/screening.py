@@ -210,8 +210,14 @@ def jets_with(fitted: FittedModel, candidate: Candidate) -> list[SceneJet]:
     ]
 
 
-def noise_of(data: Data, fitted: FittedModel, fields: Fields, before: Noise | None = None) -> tuple[Noise, float]:
-    """Estimate the noise from what the richest linear model leaves; return it with the effective number of observations."""
+def noise_of(
+    data: Data, fitted: FittedModel, fields: Fields, before: Noise | None = None, *, holds_error: bool = False
+) -> tuple[Noise, float]:
+    """Estimate the noise from what the richest linear model leaves; return it with the effective number of observations.
+
+    With `holds_error` no candidate counts as explained, and markers sit no farther from where they are declared than is known beforehand: what the
+    fitted model leaves is then noise to the fits, and `before` still tells what a marker repeats to.
+    """
     table = screen(fitted.fit, problem_of(data, fitted.fit, Noise({"white": 5e-4}, "")), fields, 100.0)
     apart, own = _apart(table, data.thresholds.apart), fitted.fit.own
     errors = [t.error_by_sweep for t in data.train]
@@ -224,7 +230,7 @@ def noise_of(data: Data, fitted: FittedModel, fields: Fields, before: Noise | No
         if error is not None:
             block[:, :, own : own + error.shape[2]] = error
         columns.append(np.concatenate([block, jet.by_effect], axis=2))
-        others = [c.raw[i] for c in (*apart, *(c for c in one_each(table) if not c.effect.places_markers))]
+        others = [] if holds_error else [c.raw[i] for c in (*apart, *(c for c in one_each(table) if not c.effect.places_markers))]
         extra.append(np.concatenate([np.zeros((*shape, 0)), *others], axis=2))
     groups = [t.groups for t in data.train]
     noise = Noise({}, "")
@@ -232,7 +238,9 @@ def noise_of(data: Data, fitted: FittedModel, fields: Fields, before: Noise | No
     for clouds in (False, True):
         which = [i for i, t in enumerate(data.train) if (t.scene.crossings is not None) == clouds]
         if which:
-            known = None if before is None else before.surface if clouds else before.std
+            known = (
+                None if before is None or (before.assumed is None and holds_error) else before.surface if clouds else before.std
+            )
             picked = (
                 [residuals[i] for i in which],
                 [columns[i] for i in which],
@@ -240,6 +248,9 @@ def noise_of(data: Data, fitted: FittedModel, fields: Fields, before: Noise | No
                 [groups[i] for i in which],
             )
             noise = noise.joined(estimate_noise(*picked, known, data.thresholds.white_share), clouds)
+    if holds_error and before is not None:
+        std = {**noise.std, "marker": min(noise.std.get("marker", 0.0), data.placement_std)} if noise.std else {}
+        noise = replace(noise, std=std, assumed=before.assumed or before.std.get("white"))
     return noise, float(sum(g.observations for g in groups))
 
 

@@ -8,7 +8,7 @@ from femsense.core.errors import FemsenseError
 from femsense.io.checkpoint import Checkpoint
 from femsense.loop.data.dataset import Data
 from femsense.loop.fit.discretisation_error import as_shown, errs_alike, with_mesh_errors
-from femsense.loop.fit.fitted_model import FittedModel, weighed
+from femsense.loop.fit.fitted_model import FittedModel, mean_square, weighed
 from femsense.loop.fit.marker_placement import with_turning_placements
 from femsense.loop.fit.noise_components import Noise
 from femsense.loop.result.records import RefitRecord
@@ -32,11 +32,11 @@ def search_begun(ready: Ready, names: Sequence[str], refits: list[RefitRecord], 
 
 def search_effects(course: SearchProgress, checkpoint: Checkpoint, say: Progress) -> tuple[Data, Search]:
     """Screen, refit and add effects until none passes; return the data as the last model has them, and the search."""
-    while not course.over:
-        checkpoint.keep(course)
-        say(f"screening effects ({course.found} found so far)")
-        _take_step(course, say)
-    checkpoint.keep(course)
+    _seek(course, checkpoint, say)
+    if _nothing_explains(course):
+        say("nothing explains what is left: asking again with weights that hold the error of the model")
+        course.begin_again(with_turning_placements(course.data, course.base))
+        _seek(course, checkpoint, say)
     data, history, noise = course.data, course.history, course.noise
     assert noise is not None
     fitted, refits, before = course.fitted, course.refits, course.before
@@ -52,6 +52,24 @@ def search_effects(course: SearchProgress, checkpoint: Checkpoint, say: Progress
     return data, found
 
 
+def _seek(course: SearchProgress, checkpoint: Checkpoint, say: Progress) -> None:
+    """Add effects until none passes."""
+    while not course.over:
+        checkpoint.keep(course)
+        say(f"screening effects ({course.found} found so far)")
+        _take_step(course, say)
+    checkpoint.keep(course)
+
+
+def _nothing_explains(course: SearchProgress) -> bool:
+    """Return whether markers are much farther from the last model than the noise of the richest linear model allows. That noise then weighs only how
+    states differ, and lets a pose and input offsets go wherever these agree."""
+    if course.holds_error or course.noise is None or "clouds" in course.data.measured:
+        return False
+    residuals = [jet.residual for jet in course.fitted.fit.jets]
+    return mean_square(course.data.train, residuals, course.noise) > course.data.thresholds.lacks
+
+
 def _most_effects(data: Data) -> int:
     return data.effort.effects if distinguishes_effects(data) else 0
 
@@ -65,7 +83,7 @@ def _take_step(course: SearchProgress, say: Progress) -> None:
         fields = None
         data, fitted = matched(data, fitted, noise)
     try:
-        fitted, noise, n_effective, fields, table = _screened(data, fitted, fields, noise, names)
+        fitted, noise, n_effective, fields, table = _screened(data, fitted, fields, noise, names, holds_error=course.holds_error)
     except FemsenseError as error:
         if not found:
             raise
@@ -96,12 +114,12 @@ def _take_step(course: SearchProgress, say: Progress) -> None:
 
 
 def _screened(
-    data: Data, fitted: FittedModel, before: Fields | None, noise: Noise | None, names: Sequence[str]
+    data: Data, fitted: FittedModel, before: Fields | None, noise: Noise | None, names: Sequence[str], *, holds_error: bool
 ) -> tuple[FittedModel, Noise, float, Fields, list[Candidate]]:
     """Return a fitted model fitted with the noise that its residual tells, that noise, the effective number of observations, and the fields and scores
     of what may come next: by the fields of the model before, as long as these predict no gain."""
     fields = _fields(data, fitted, before, names)
-    noise, n_effective = noise_of(data, fitted, fields, noise)
+    noise, n_effective = noise_of(data, fitted, fields, noise, holds_error=holds_error)
     fitted = fitted_again(data, fitted, noise, known=fitted.fit.jets, spare=spared_gain(data, fitted, fields, noise, n_effective))
     return fitted, noise, n_effective, *scored(data, fitted, fields, noise, names, n_effective)
 

@@ -13,6 +13,9 @@ from femsense.loop.result.records import RefitRecord
 from femsense.loop.search.effect_fields import Fields
 from femsense.loop.search.screening import Candidate
 
+OUTWEIGHED = "found by weights that much is left beside it: asked again with weights that hold the error of the model"
+"""The verdict on what was named before."""
+
 
 @dataclass(eq=False, slots=True)
 class SearchProgress:
@@ -44,11 +47,20 @@ class SearchProgress:
     table: list[Candidate] = field(default_factory=list)
     """The last screening."""
     over: bool = False
+    holds_error: bool = False
+    """Whether the noise holds what the model without effects leaves, since nothing explained it."""
 
     @property
     def found(self) -> int:
         """How many effects were found."""
         return len(self.history) - self.given
+
+    def begin_again(self, data: Data) -> None:
+        """Seek effects again on top of the first model, whose error the noise then holds."""
+        kept = [*self.history[: self.given - 1], (self.history[self.given - 1][0], self.base)]
+        self.refits = [replace(r, verdict=OUTWEIGHED) if r.is_named else r for r in self.refits]
+        self.data = self.earlier = data
+        self.history, self.fitted, self.fields, self.over, self.holds_error = kept, self.base, None, False, True
 
     def take_back(self, error: FemsenseError) -> None:
         """End without the last effect, whose states do not converge when they are solved again."""

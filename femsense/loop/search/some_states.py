@@ -104,6 +104,7 @@ def in_all_states(every: Data, course: SearchProgress, search: Search, say: Prog
         n_effective=n_effective,
         first=first,
         table=first,
+        holds_error=course.holds_error,
     )
 
 

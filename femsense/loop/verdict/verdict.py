@@ -13,8 +13,8 @@ from femsense.loop.data.dataset import NUISANCE, Data
 from femsense.loop.data.trial import Trial
 from femsense.loop.fit.covariance import parameter_std
 from femsense.loop.fit.discretisation_error import without_mesh_error
-from femsense.loop.fit.fitted_model import FittedModel
-from femsense.loop.fit.noise_components import Noise, whiten
+from femsense.loop.fit.fitted_model import FittedModel, mean_square
+from femsense.loop.fit.noise_components import Noise
 from femsense.loop.fit.repeatability import repeatability
 from femsense.loop.result.loop_result import FOUND, NONE, UNEXPLAINED, LoopResult
 from femsense.loop.result.records import Left, Structure
@@ -139,15 +139,15 @@ def _seed_std(search: Search) -> dict[str, FloatArray]:
 
 def lacks_much(data: Data, back: FittedModel, final: FittedModel, noise: Noise) -> bool:
     """Return whether what is handed back leaves much that the final model takes away with nuisances that are not named."""
-    train = [_mean_square(data.train, [j.residual for j in s.fit.jets], noise) for s in (back, final)]
-    held = [_mean_square(data.held, s.held_residuals, noise) for s in (back, final)]
+    train = [mean_square(data.train, [j.residual for j in s.fit.jets], noise) for s in (back, final)]
+    held = [mean_square(data.held, s.held_residuals, noise) for s in (back, final)]
     return any(own > data.thresholds.lacks * max(full, 1.0) for own, full in (train, held))
 
 
 def _surprise(data: Data, back: FittedModel, noise: Noise) -> str:
     """Return a sentence on what held-out data show of what is handed back and fitted data do not; nothing where these are as well explained."""
-    fitted = _mean_square(data.train, [j.residual for j in back.fit.jets], noise)
-    held = _mean_square(data.held, back.held_residuals, noise)
+    fitted = mean_square(data.train, [j.residual for j in back.fit.jets], noise)
+    held = mean_square(data.held, back.held_residuals, noise)
     if held <= data.thresholds.lacks * max(fitted, 1.0):
         return ""
     worst = describe_left(data.robot, data.held, _beyond_mesh(data.held, back.held_residuals, noise)).worst_frame
@@ -167,12 +167,6 @@ def _left(data: Data, fitted: FittedModel, noise: Noise, tests: Structure, exces
 
 def _beyond_mesh(trials: list[Trial], residuals: list[FloatArray], noise: Noise) -> list[FloatArray]:
     return [without_mesh_error(t, r, noise) for t, r in zip(trials, residuals)]
-
-
-def _mean_square(trials: list[Trial], residuals: list[FloatArray], noise: Noise) -> float:
-    """Return the mean square of whitened residuals; 1 is noise."""
-    rows = [whiten(noise.whitener(t.groups, t.mesh_error), r) for t, r in zip(trials, residuals)]
-    return float(np.mean(np.concatenate(rows, axis=None) ** 2)) if rows else 0.0
 
 
 def _not_handed_back(search: Search, names: list[str]) -> list[str]:
