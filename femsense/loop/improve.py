@@ -40,6 +40,8 @@ from femsense.model.effects import EFFECTS, FORMS, Effect, find_effect, forms_by
 from femsense.model.recording import Recording, state_key
 from femsense.model.robot import Robot
 
+ELSE = "record other states than these: more levels of each input, several inputs together, and the way back"
+"""What is said where nothing else is."""
 MOST_STEPS = 3
 """So many things to do next are said where an error is left."""
 
@@ -102,7 +104,7 @@ def improve(
         noise_is_measured = result.model_error is None or result.model_error.noise_is_measured
         if result.verdict == UNEXPLAINED or (result.confounded and not record):
             steps = next_steps(data, search.final, search.noise, noise_is_measured=noise_is_measured)
-            record = "; or ".join(t for t in (*steps[:MOST_STEPS], record) if t)
+            record = "; or ".join(t for t in (*steps[:MOST_STEPS], record) if t) or ELSE
     result = replace(result, next_experiment=record, data=replace(result.data, seed=how.seed))
     if distinguishes_effects(data):
         return result

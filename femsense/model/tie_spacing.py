@@ -83,11 +83,10 @@ def warn_of_tie_spacing(body: BodyModel) -> None:
 
 def tie_spacing_text(spacing: TieSpacing, count: int) -> str:
     """Return a warning for a path of `count` points that does not hold."""
-    pulled = "max_tension_n" if spacing.declared else "a tension that bends it by 57°"
+    pulled = "its max_tension_n" if spacing.declared else "what bends the body by 57°"
     return (
-        f"cable {spacing.cable!r}: between points {spacing.after} and {spacing.after + 1} of its path, "
-        f"{1e3 * spacing.gap:.3g} mm apart, the body "
-        f"buckles at {spacing.buckles_at:.3g} N, too close to {pulled} = {spacing.tension:.3g} N. If it runs in a "
-        f"channel, it wants more points: "
-        f"about {int(np.ceil(count * spacing.points_wanted))} of them (docs/bodies.md)"
+        f"cable {spacing.cable!r}: its points are too far apart. Between points {spacing.after} and {spacing.after + 1} "
+        f"({1e3 * spacing.gap:.3g} mm) the body buckles at {spacing.buckles_at:.3g} N; the cable may pull {spacing.tension:.3g} N "
+        f"({pulled}). Where it runs in a channel, give it about {int(np.ceil(count * spacing.points_wanted))} points instead of "
+        f"{count} (docs/bodies.md)"
     )

@@ -26,7 +26,7 @@ from small_run import make_run
 
 import femsense
 from femsense.app import cli
-from femsense.app.command_line.answer import Answer
+from femsense.app.command_line.answer import Answer, label_and_clock
 from femsense.app.command_line.parameters import split_names
 from femsense.app.commands import loop_page
 from femsense.core.errors import DataError, InputError
@@ -507,3 +507,11 @@ def test_the_page_of_a_loop_is_written_once_and_again_when_the_loop_is_newer(tmp
     said: list[str] = []
     assert loop_page(tmp_path, say=said.append, write=refuse) is None
     assert "nothing to show" in said[0]
+
+
+def test_how_far_the_work_is_stands_apart_from_what_is_done() -> None:
+    assert label_and_clock("refitting payload (at the tip) (40%, about 3 min left)") == (
+        "refitting payload (at the tip)",
+        "40%, about 3 min left",
+    )
+    assert label_and_clock("reading (2 files)") == ("reading (2 files)", "")

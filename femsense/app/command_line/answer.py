@@ -32,9 +32,16 @@ def progress_bar(title: str) -> Iterator[Callable[..., None] | None]:
         return
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+    from rich.table import Column
 
-    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[count]}"), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+    label = Column(ratio=1, no_wrap=True, overflow="ellipsis")  # a long one is cut, what stands beside it is not
+    columns = (
+        TextColumn("{task.description}", table_column=label),
+        BarColumn(),
+        TextColumn("{task.fields[count]}"),
+        TimeElapsedColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True), transient=True, expand=True) as bar:
         task = bar.add_task(title, total=None, count="")
 
         def advance(done: int | str, total: int | None = None) -> None:
@@ -42,13 +49,20 @@ def progress_bar(title: str) -> Iterator[Callable[..., None] | None]:
             if isinstance(done, int):
                 bar.update(task, completed=done, total=total, description=title, count=f"{done}/{total}")
                 return
+            words, clock = label_and_clock(done)
             if bar.tasks[-1].total is None:
-                bar.update(task, description=done)
+                bar.update(task, description=words, count=clock)
                 return
             bar.remove_task(task)  # an update cannot take a total away
-            task = bar.add_task(done, total=None, count="")
+            task = bar.add_task(words, total=None, count=clock)
 
         yield advance
+
+
+def label_and_clock(text: str) -> tuple[str, str]:
+    """Return what is going on, and how far that is where it ends with that in brackets: "refitting (40%, about 3 min left)"."""
+    words, opened, rest = text.rpartition(" (")
+    return (words, rest[:-1]) if opened and rest.endswith(" left)") else (text, "")
 
 
 def say(text: str) -> None:

@@ -24,7 +24,7 @@ def next_experiment(
     predicted = next_element(data, final.fit, noise, pairs, [effect.name for effect in not_testable])
     if predicted:
         said = [
-            f"{words} (would {what}: dBIC {round(before)} → {round(after)}, of {data.thresholds.evidence:.0f} that decide)"
+            f"{words} (would {what}: evidence {round(before)} → {round(after)}, where {data.thresholds.evidence:.0f} decides)"
             for words, what, before, after in predicted[:2]
         ]
         loaded = any(len(t.scene.recording.load_frame) for t in data.train)

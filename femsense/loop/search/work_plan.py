@@ -16,7 +16,7 @@ COSTS = {"equilibria": 1.0, "responses": 1.5, "refined": 12.0}
 QUADRATIC = 10.0
 """What a state on quadratic elements takes, in that of one on linear ones."""
 MORE = 0.25
-"""A stage that takes longer than was planned is expected to take this share of what it has taken besides."""
+"""A stage that has taken as long as was planned is expected to take this share of that besides; less, the longer it has taken."""
 EVERY = 5.0
 """Seconds after which it is said again how far the work is."""
 
@@ -72,7 +72,9 @@ class WorkPlan:
 
     def _done_and_rest(self) -> tuple[float, float]:
         own = self._own()
-        now = max(self.rest[0] - own, MORE * own) if self.rest else 0.0
+        now = (
+            max(self.rest[0] - own, MORE * self.rest[0] * min(1.0, (self.rest[0] / max(own, 1e-9)) ** 0.5)) if self.rest else 0.0
+        )
         return self.done + own, now + sum(self.rest[1:])
 
     def _own(self) -> float:

@@ -13,6 +13,7 @@ from femsense.fem.equilibrium import solve_equilibrium
 from femsense.fem.mesh import to_linear
 from femsense.loop.data.dataset import Data
 from femsense.loop.fit.fitted_model import FittedModel
+from femsense.loop.fit.repeatability import repeatability
 from femsense.loop.search.effect_fields import effect_fields
 from femsense.loop.search.screening import noise_of, penalty
 from femsense.model.effects import FORMS, find_effect
@@ -77,3 +78,19 @@ def test_only_the_large_fields_of_the_meshs_error_take_freedom_from_the_noise() 
     few, many = (replace(data, train=[replace(trial, mesh_error=e)]) for e in (errors[:, :, :large], errors))
     (noise, rows), (same, left) = (noise_of(d, fitted, fields) for d in (few, many))
     assert noise.std == same.std and rows == left
+
+
+def test_where_nothing_explains_what_is_left_it_is_noise_to_the_fits_and_to_nothing_else() -> None:
+    data, fitted = fitted_arm(arm((5, 2, 2)))
+    (form,) = [f for f in FORMS if f.name == "hyperelastic"][:1]
+    (seed,) = form.seeds(data.robot)
+    fields = effect_fields(fitted.fit, data.train, [(form, seed, form.parameters(data.robot, "tension"))])
+    off = fields.raw[0][:, :, 0]
+    jets = [replace(fitted.fit.jets[0], residual=fitted.fit.jets[0].residual + 2e-2 * off / np.abs(off).max())]
+    far = replace(fitted, fit=replace(fitted.fit, jets=jets))
+    noise, _ = noise_of(data, far, fields)
+    whole, _ = noise_of(data, far, fields, noise, holds_error=True)
+    size = [np.sqrt(sum(v**2 for n, v in n_.std.items() if n != "marker")) for n_ in (noise, whole)]
+    assert size[1] > 2.0 * size[0] and whole.std["marker"] <= data.placement_std
+    assert whole.assumed == noise.std["white"] and repeatability(data, far, whole).std == repeatability(data, far, noise).std
+    assert noise_of(data, far, fields, whole, holds_error=True)[0].assumed == whole.assumed
