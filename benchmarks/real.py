@@ -35,6 +35,7 @@ HEADING = (
     "fitted [mm]",
     "held out [mm]",
     "handed back: fitted, held out",
+    "with the correction, held out [mm]",
     "noise, model error [mm]",
     "CPU min",
 )
@@ -204,7 +205,7 @@ def improved(asked: Asked, minutes: float) -> dict[str, Any] | str:
     folder = asked.robot.parent / "loop"
     if not (folder / "loop.json").is_file():
         command = [sys.executable, "-m", "femsense", "improve", str(asked.robot), *map(str, asked.train), "-o", str(folder)]
-        command += ["--validation", *map(str, asked.held)] if asked.held else []
+        command += ["--correct", *(["--validation", *map(str, asked.held)] if asked.held else [])]
         began = time.perf_counter()
         try:
             done = subprocess.run(
@@ -243,6 +244,12 @@ def _value(parameter: Any) -> str:
     return str(value)
 
 
+def corrected(correction: Mapping[str, Any]) -> str:
+    """Return what an empirical correction leaves of held-out markers [mm], and whether it is handed back."""
+    after = correction.get("validation_rms_after_m")
+    return "–" if after is None else f"{1e3 * after:.1f} ({'handed back' if correction['accepted'] else 'refused'})"
+
+
 def row(asked: Asked, minutes: float, loop: bool) -> list[str]:
     """Return the cells of a row."""
     own = asked.robot.parent
@@ -256,6 +263,7 @@ def row(asked: Asked, minutes: float, loop: bool) -> list[str]:
             "",
             "",
             "",
+            "",
         ]
     document = improved(asked, minutes)
     if isinstance(document, str):
@@ -263,7 +271,7 @@ def row(asked: Asked, minutes: float, loop: bool) -> list[str]:
     before, after = document["before"], document["after"]
     back = own / "loop" / "robot.toml"
     spent = json.loads((own / "time.json").read_text())["cpu_s"] / 60 if (own / "time.json").is_file() else np.nan
-    error = document.get("model_error_m")
+    error = (document.get("model_error") or {}).get("held_out_m")
     return [
         asked.name,
         document["verdict"],
@@ -271,6 +279,7 @@ def row(asked: Asked, minutes: float, loop: bool) -> list[str]:
         f"{1e3 * before['train_rms_m']:.1f} → {1e3 * after['train_rms_m']:.1f}",
         f"{1e3 * before['validation_rms_m']:.1f} → {1e3 * after['validation_rms_m']:.1f}",
         f"{calibrated_rms(back, asked.train)}; {calibrated_rms(back, asked.held)}",
+        corrected(document.get("correction") or {}),
         f"{1e3 * document['noise_m']:.2f}, {'–' if error is None else f'{1e3 * error:.1f}'}",
         f"{spent:.1f}",
     ]

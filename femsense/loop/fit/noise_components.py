@@ -16,7 +16,7 @@ that is measured five times repeats its error five times, and the term h² says 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import pairwise
@@ -179,6 +179,7 @@ def estimate_noise(
     groups: list[Groups],
     before: dict[str, float] | None = None,
     white_share: float = DEFAULTS.white_share,
+    most: Mapping[str, float] | None = None,
 ) -> Noise:
     """Return the components of the noise by restricted maximum likelihood.
 
@@ -189,6 +190,7 @@ def estimate_noise(
         groups: of each recording.
         before: components [m] of an earlier estimate with a poorer model; the new one stays near it (a factor of two, softly), where the data leave it open.
         white_share: white noise is no less than this share of what repeats of a state scatter by.
+        most: component → what it may be at most [m].
     """
     residuals, nuisance, extra, groups = _thinned(residuals, nuisance, extra, groups)
     names = ["white", *sorted({n for g in groups for n in g.members()})]
@@ -196,8 +198,10 @@ def estimate_noise(
     basis = _richest(nuisance, extra, distinct)
     scale = float(np.sqrt(np.mean(np.concatenate([r.ravel() for r in residuals]) ** 2))) + FLOOR
     jitter = _jitter(residuals, groups) if "state" in names else 0.0
-    lowest, highest = np.log(np.maximum(1e-3 * scale, FLOOR)), np.log(3.0 * scale)
-    bounds = [(float(np.log(max(white_share * jitter, np.exp(lowest)))) if n == "white" else lowest, highest) for n in names]
+    lowest = np.log(np.maximum(1e-3 * scale, FLOOR))
+    highest = np.log([max(min(3.0 * scale, (most or {}).get(n, np.inf)), 2.0 * np.exp(lowest)) for n in names])
+    low = [float(np.log(max(white_share * jitter, np.exp(lowest)))) if n == "white" else lowest for n in names]
+    bounds = list(zip(low, highest))
     near = None if before is None else np.log([max(before.get(n, 0.0), np.exp(lowest)) for n in names])
     likelihood = Likelihood(names, residuals, basis, groups, near)
 

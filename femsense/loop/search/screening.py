@@ -210,48 +210,54 @@ def jets_with(fitted: FittedModel, candidate: Candidate) -> list[SceneJet]:
     ]
 
 
-def noise_of(
-    data: Data, fitted: FittedModel, fields: Fields, before: Noise | None = None, *, holds_error: bool = False
-) -> tuple[Noise, float]:
+def noise_of(data: Data, fitted: FittedModel, fields: Fields | None, before: Noise | None = None) -> tuple[Noise, float]:
     """Estimate the noise from what the richest linear model leaves; return it with the effective number of observations.
 
-    With `holds_error` no candidate counts as explained, and markers sit no farther from where they are declared than is known beforehand: what the
-    fitted model leaves is then noise to the fits, and `before` still tells what a marker repeats to.
+    Arguments:
+        data, fitted: whose residual tells it.
+        fields: of what the model may lack, which counts as explained. None: all that the fitted model leaves is noise to the fits, and markers sit no
+            farther from where they are declared than is known beforehand; `before` still says what a marker repeats to.
+        before: an earlier estimate.
     """
-    table = screen(fitted.fit, problem_of(data, fitted.fit, Noise({"white": 5e-4}, "")), fields, 100.0)
-    apart, own = _apart(table, data.thresholds.apart), fitted.fit.own
+    own, columns = fitted.fit.own, list[FloatArray]()
     errors = [t.error_by_sweep for t in data.train]
     widest = max(0 if e is None else e.shape[2] for e in errors)
-    columns, extra = [], []
-    for i, (error, jet, span) in enumerate(zip(errors, fitted.fit.jets, spans_of(data.train))):
-        shape = jet.residual.shape
-        block = np.zeros((*shape, own + widest))
+    for error, jet, span in zip(errors, fitted.fit.jets, spans_of(data.train)):
+        block = np.zeros((*jet.residual.shape, own + widest))
         block[:, :, span] = np.concatenate([jet.by_pose, jet.by_initial], axis=2)
         if error is not None:
             block[:, :, own : own + error.shape[2]] = error
         columns.append(np.concatenate([block, jet.by_effect], axis=2))
-        others = [] if holds_error else [c.raw[i] for c in (*apart, *(c for c in one_each(table) if not c.effect.places_markers))]
-        extra.append(np.concatenate([np.zeros((*shape, 0)), *others], axis=2))
+    extra = _explained(data, fitted, fields)
     groups = [t.groups for t in data.train]
-    noise = Noise({}, "")
+    noise = Noise(
+        {}, "", assumed=None if before is None else before.assumed or before.std.get("white") if fields is None else None
+    )
     residuals = [j.residual for j in fitted.fit.jets]
     for clouds in (False, True):
         which = [i for i, t in enumerate(data.train) if (t.scene.crossings is not None) == clouds]
         if which:
-            known = (
-                None if before is None or (before.assumed is None and holds_error) else before.surface if clouds else before.std
-            )
+            known = None if before is None or fields is None else before.surface if clouds else before.std
             picked = (
                 [residuals[i] for i in which],
                 [columns[i] for i in which],
                 [extra[i] for i in which],
                 [groups[i] for i in which],
             )
-            noise = noise.joined(estimate_noise(*picked, known, data.thresholds.white_share), clouds)
-    if holds_error and before is not None:
-        std = {**noise.std, "marker": min(noise.std.get("marker", 0.0), data.placement_std)} if noise.std else {}
-        noise = replace(noise, std=std, assumed=before.assumed or before.std.get("white"))
+            most = {"marker": data.placement_std} if fields is None and not clouds else {}
+            noise = noise.joined(estimate_noise(*picked, known, data.thresholds.white_share, most), clouds)
     return noise, float(sum(g.observations for g in groups))
+
+
+def _explained(data: Data, fitted: FittedModel, fields: Fields | None) -> list[FloatArray]:
+    """Return the columns of what a model may lack [m], (k, c, q) a trial, the likeliest first; none where nothing may be lacking."""
+    shapes = [jet.residual.shape for jet in fitted.fit.jets]
+    if fields is None:
+        return [np.zeros((*shape, 0)) for shape in shapes]
+    table = screen(fitted.fit, problem_of(data, fitted.fit, Noise({"white": 5e-4}, "")), fields, 100.0)
+    apart = _apart(table, data.thresholds.apart)
+    chosen = (*apart, *(c for c in one_each(table) if not c.effect.places_markers))
+    return [np.concatenate([np.zeros((*shape, 0)), *(c.raw[i] for c in chosen)], axis=2) for i, shape in enumerate(shapes)]
 
 
 def _apart(table: list[Candidate], times: float) -> list[Candidate]:

@@ -35,7 +35,8 @@ def search_effects(course: SearchProgress, checkpoint: Checkpoint, say: Progress
     _seek(course, checkpoint, say)
     if _nothing_explains(course):
         say("nothing explains what is left: asking again with weights that hold the error of the model")
-        course.begin_again(with_turning_placements(course.data, course.base))
+        noise = noise_of(course.data, course.fitted, None, course.noise)[0]
+        course.begin_again(with_turning_placements(course.data, course.base), noise)
         _seek(course, checkpoint, say)
     data, history, noise = course.data, course.history, course.noise
     assert noise is not None
@@ -119,7 +120,8 @@ def _screened(
     """Return a fitted model fitted with the noise that its residual tells, that noise, the effective number of observations, and the fields and scores
     of what may come next: by the fields of the model before, as long as these predict no gain."""
     fields = _fields(data, fitted, before, names)
-    noise, n_effective = noise_of(data, fitted, fields, noise, holds_error=holds_error)
+    told, n_effective = noise_of(data, fitted, fields, noise)
+    noise = noise if noise is not None and holds_error else told
     fitted = fitted_again(data, fitted, noise, known=fitted.fit.jets, spare=spared_gain(data, fitted, fields, noise, n_effective))
     return fitted, noise, n_effective, *scored(data, fitted, fields, noise, names, n_effective)
 

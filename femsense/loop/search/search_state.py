@@ -48,19 +48,20 @@ class SearchProgress:
     """The last screening."""
     over: bool = False
     holds_error: bool = False
-    """Whether the noise holds what the model without effects leaves, since nothing explained it."""
+    """Whether the noise holds what a model leaves, since nothing explained it, and stays as it is."""
 
     @property
     def found(self) -> int:
         """How many effects were found."""
         return len(self.history) - self.given
 
-    def begin_again(self, data: Data) -> None:
-        """Seek effects again on top of the first model, whose error the noise then holds."""
+    def begin_again(self, data: Data, noise: Noise) -> None:
+        """Seek effects again on top of the first model, by weights that hold what the last one leaves."""
         kept = [*self.history[: self.given - 1], (self.history[self.given - 1][0], self.base)]
         self.refits = [replace(r, verdict=OUTWEIGHED) if r.is_named else r for r in self.refits]
         self.data = self.earlier = data
-        self.history, self.fitted, self.fields, self.over, self.holds_error = kept, self.base, None, False, True
+        self.history, self.fitted, self.fields, self.noise = kept, self.base, None, noise
+        self.over, self.holds_error = False, True
 
     def take_back(self, error: FemsenseError) -> None:
         """End without the last effect, whose states do not converge when they are solved again."""

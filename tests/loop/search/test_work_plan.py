@@ -81,3 +81,14 @@ def test_it_is_said_again_only_after_some_time() -> None:
 
 def test_times_are_said_in_seconds_or_minutes() -> None:
     assert [in_words(s) for s in (0.2, 41.3, 119.0, 200.0)] == ["1 s", "41 s", "119 s", "3 min"]
+
+
+def test_a_stage_that_takes_longer_is_nearer_to_its_end_the_longer_it_takes() -> None:
+    shares = []
+    for times in (1, 4, 16):
+        plan = WorkPlan(lambda text: None, Clock())
+        with plan.watching():
+            plan.plan([SEARCH], 5, quadratic=False)
+            count(equilibria=round(times * 5 * PASSES[SEARCH]))
+            shares.append(plan.share)
+    assert shares == pytest.approx([1 / 1.25, 4 / 4.125, 16 / 16.0625])
