@@ -75,7 +75,8 @@ def conclude(data: Data, search: Search, rng: np.random.Generator, *, correct: b
     verdict = UNEXPLAINED if unexplained else FOUND if effects else NONE
     pairs = confounded(search, names, data.thresholds)
     correction, learned = judged_correction(data, back) if correct else (None, None)
-    robot = replace(_handed_back(data, entries), correction=learned)
+    robot = _handed_back(data, entries)
+    robot = robot if robot.correction is learned else replace(robot, correction=learned)
     only_held = bool(surprise) and not tests.significant and not lacks
     left = _left(data, back if only_held else shown, noise, tests, excess, held=only_held)
     budget = model_error(data, excess, noise, measured)
