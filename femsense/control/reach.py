@@ -6,9 +6,10 @@ The unknowns are the tensions of the cables and the pressures of the chambers, u
 
 (W of the exact tangent, p the wanted coordinates, s the shortening of the cables) and solves the quadratic problem
 
-    min ½ |p + W_pa du − p*|² + ½ λ |du|²   with  u_min ≤ u + du ≤ u_max,  s_min ≤ s + W_aa du ≤ s_max,
+    min ½ |p + W_pa du − p*|² + ½ duᵀ S du + ½ λ |du|²   with  u_min ≤ u + du ≤ u_max,  s_min ≤ s + W_aa du ≤ s_max,
 
 as Duriez (2013) and Coevoet et al. (2017) pose it, within a trust region that the next equilibrium widens or narrows.
+S is the second-order part, which counts where the target is out of reach (`curvature`).
 The damping λ acts on the step, not on the input, so that it moves no answer. A wanted contact force is applied to the body,
 and the place of the wall becomes one more target: both hold where the robot presses the wall with that force.
 """
@@ -23,6 +24,7 @@ import numpy.typing as npt
 
 from femsense.calib.calibration import Calibration
 from femsense.control.corrected import reach_corrected
+from femsense.control.curvature import Seen, convex, learned
 from femsense.control.goal import Goal, Target, make_goal
 from femsense.control.limits import CONTROLS, Limits, command, make_limits
 from femsense.control.motion import NEAREST, REACHED, STOPPED, Certificate, Motion, WallContact
@@ -132,14 +134,18 @@ def _searched(
     body, before = robot.body, state.segment_tensions
     radius, count, status, last, beyond = FIRST_RADIUS, 1, STOPPED, _Step(np.zeros(len(bounds.low)), 0.0, 0.0), ""
     slopes, settled = lent_slopes(body, goal, state) if state.converged else None, False
+    curvature, seen = np.zeros((len(bounds.low),) * 2), None
     while state.converged and count < options.max_iterations:
         error, miss2 = goal.error(state.positions), float((goal.miss(state.positions) ** 2).sum())
         within = bounds.violation(_wound(body, state)) <= options.tolerance_m
         end = REACHED if within and error <= options.tolerance_m else ""
         if slopes is None:
             slopes, state = exact_slopes(body, goal, state)
+            before_it, seen = seen, Seen(_effort(state), slopes.points, goal.miss(state.positions))
+            curvature = curvature if before_it is None else learned(curvature, before_it, seen)
         if not end:
-            last = _step(body, goal, bounds, state, slopes, radius, options)
+            bend = curvature if slopes.exact else 0.0 * curvature
+            last = _step(body, goal, bounds, state, slopes, radius, options, bend)
             if not slopes.exact and (last.size < SMALLEST_STEP or last.gain <= SURE_GAIN * miss2):
                 slopes = None
                 continue
@@ -185,9 +191,16 @@ class _Step:
 
 
 def _step(
-    body: BodyModel, goal: Goal, bounds: Limits, state: Equilibrium, slopes: Slopes, radius: float, options: ReachOptions
+    body: BodyModel,
+    goal: Goal,
+    bounds: Limits,
+    state: Equilibrium,
+    slopes: Slopes,
+    radius: float,
+    options: ReachOptions,
+    curvature: FloatArray,
 ) -> _Step:
-    """Return the best step of the linearised problem in a trust region."""
+    """Return the best step of the linearised problem, with what is known of its curvature, in a trust region."""
     u, miss = _effort(state), goal.miss(state.positions)
     J, W = slopes.points, slopes.wound
     moved = np.linalg.norm(J, axis=0)
@@ -196,8 +209,9 @@ def _step(
     top = max(float(np.linalg.norm(scaled, 2)) ** 2, 1e-300) if scaled.size else 1.0
     low, high = np.minimum((bounds.low - u) / unit, 0.0), np.maximum((bounds.high - u) / unit, 0.0)
     G, h, names = bounds.rows(W * unit, _wound(body, state), np.maximum(low, -radius), np.minimum(high, radius))
+    squares = convex(scaled.T @ scaled + curvature * np.outer(unit, unit))
     problem = Problem(
-        P=scaled.T @ scaled / top + options.damping * np.eye(len(u)),
+        P=squares / top + options.damping * np.eye(len(u)),
         q=-scaled.T @ miss / top,
         G=G,
         h=h,
@@ -208,13 +222,12 @@ def _step(
     if answer.x is None or answer.multipliers is None:
         return _Step(np.zeros(len(u)), 0.0, 0.0)
     change = np.asarray(answer.x)
-    left = miss - scaled @ change
     box = zip(answer.multipliers.z_box, low, high)
     active = [
         (abs(float(z)), i, "least" if z < 0 else "largest") for i, (z, a, b) in enumerate(box) if abs(a if z < 0 else b) < radius
     ]
     active += [(float(z), i, which) for z, (i, which) in zip(answer.multipliers.z, names)]
-    gain = float(miss @ miss - left @ left)
+    gain = float(2.0 * miss @ scaled @ change - change @ squares @ change)
     shown = tuple(sorted((limit for limit in active if limit[0] > ACTIVE), reverse=True))
     return _Step(unit * change, float(np.abs(change).max(initial=0.0)), gain, shown)
 

@@ -121,6 +121,13 @@ def test_what_no_input_reaches_is_answered_with_the_nearest_and_its_limits() -> 
             assert np.linalg.norm(place(robot, tension) - wanted) >= motion.error_m - 1e-9, (i, step)
 
 
+def test_a_far_target_beside_the_way_of_the_tip_ends_in_few_equilibria() -> None:
+    motion = fs.reach(limited(bar(), max_tension=3.0), {"tip": [0.0186, 0.0271, -0.0132]})
+    assert motion.status == "nearest" and motion.certificate.gradient < 1e-9
+    assert motion.iterations <= 12  # with slopes alone 28
+    assert motion.error_m == pytest.approx(0.0903, abs=1e-4)
+
+
 def test_limits_of_length_are_kept() -> None:
     robot = bar()
     name = robot.body.cable_names[0]

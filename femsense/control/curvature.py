@@ -1,0 +1,51 @@
+"""What bends of a far target's error beyond its slopes: the second-order part of the squared error, learnt from steps.
+
+Where the target is out of reach, much is missed at the nearest state, and Gauss–Newton nears it slowly: Σ r ∇²r is no longer small
+against JᵀJ. It is learnt by the secant of Dennis, Gay and Welsch (1981), as in NL2SOL.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from femsense.core.arrays import FloatArray
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Seen:
+    """A state with exact slopes."""
+
+    effort: FloatArray
+    """[N, Pa], shape (d,)."""
+    points: FloatArray
+    """J, the rows' change by unit efforts, shape (r, d)."""
+    miss: FloatArray
+    """Wanted less present coordinates [m], shape (r,)."""
+
+
+def learned(curvature: FloatArray, last: Seen, now: Seen) -> FloatArray:
+    """Return Σ r ∇²r at a state [m² per unit of effort, squared], shape (d, d), as the step to it shows.
+
+    Arguments:
+        curvature: as known before, shape (d, d).
+        last, now: where the step began and ended.
+    """
+    step = now.effort - last.effort
+    bent = -(now.points - last.points).T @ now.miss
+    turned = last.points.T @ last.miss - now.points.T @ now.miss
+    work = float(turned @ step)
+    if abs(work) <= 1e-12 * float(np.linalg.norm(turned) * np.linalg.norm(step)):
+        return curvature
+    known = float(step @ curvature @ step)
+    sized = curvature * (min(1.0, abs(float(step @ bent)) / abs(known)) if known else 1.0)
+    rest = bent - sized @ step
+    update = (np.outer(rest, turned) + np.outer(turned, rest)) / work
+    return np.asarray(sized + update - float(rest @ step) * np.outer(turned, turned) / work**2)
+
+
+def convex(matrix: FloatArray) -> FloatArray:
+    """Return a symmetric matrix without what curves downwards."""
+    values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
