@@ -8,6 +8,8 @@ import numpy.typing as npt
 from femsense.core.arrays import FloatArray
 from femsense.io.importers.frames import ColorImage, DepthImage, Lens
 
+OUTSIDE = -9.0
+"""A pixel beside every image [px]."""
 STEPS = 50
 """Fixed-point steps of the inverse; at the distortions of depth cameras ten reach single precision."""
 
@@ -64,16 +66,29 @@ def registered_color(
         color_lens: lens of the colour image.
         T_color_depth: maps depth-camera coordinates to colour-camera coordinates, shape (4, 4), translation [m].
     """
-    points, seen = depth_points(depth, rays, depth_unit_m)
+    import cv2
+
     T = np.asarray(T_color_depth, dtype=np.float64)
-    pixel = np.rint(project(points @ T[:3, :3].T + T[:3, 3], color_lens))
-    inside = (pixel >= 0).all(axis=1) & (pixel < [color_lens.width, color_lens.height]).all(axis=1)
-    column, row = pixel[inside].astype(np.int64).T
-    values = np.zeros((len(points), 3), dtype=np.uint8)
-    values[inside] = color[row, column]
-    result = np.zeros((*depth.shape, 3), dtype=np.uint8)
-    result[seen] = values
-    return result
+    z, x, y = depth * depth_unit_m, np.ascontiguousarray(rays[..., 0]), np.ascontiguousarray(rays[..., 1])
+    X, Y, Z = ((T[i, 0] * x + T[i, 1] * y + T[i, 2]) * z + T[i, 3] for i in range(3))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u, v = _bent_planes(X / Z, Y / Z, color_lens)
+    seen = (depth > 0) & (Z > 0)
+    column = np.where(seen, u * color_lens.fx + color_lens.cx, OUTSIDE).astype(np.float32)
+    row = np.where(seen, v * color_lens.fy + color_lens.cy, OUTSIDE).astype(np.float32)
+    black = (0, 0, 0)
+    found = cv2.remap(color, column, row, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=black)
+    return np.asarray(found, dtype=np.uint8)
+
+
+def _bent_planes(x: FloatArray, y: FloatArray, lens: Lens) -> tuple[FloatArray, FloatArray]:
+    """Return distorted rays (x, y, 1) of any model as x and y, of the shape that came in."""
+    if not np.any(lens.distortion != 0.0):
+        return x, y
+    if lens.model == "kannala_brandt":
+        bent = _bent_fisheye(np.stack([x, y], axis=-1), lens.distortion)
+        return bent[..., 0], bent[..., 1]
+    return _brown(x, y, lens)
 
 
 def _bent(rays: FloatArray, lens: Lens) -> FloatArray:
@@ -82,14 +97,21 @@ def _bent(rays: FloatArray, lens: Lens) -> FloatArray:
     librealsense, `rs2_project_point_to_pixel`: `inverse_brown_conrady` (and modified) takes the tangential terms at the radially
     distorted ray.
     """
+    return np.stack(_brown(rays[..., 0], rays[..., 1], lens), axis=-1)
+
+
+def _brown(x: FloatArray, y: FloatArray, lens: Lens) -> tuple[FloatArray, FloatArray]:
     k1, k2, p1, p2, k3, k4, k5, k6 = np.concatenate([lens.distortion, np.zeros(8)])[:8]
-    x, y = rays[..., 0], rays[..., 1]
     r2 = x * x + y * y
-    radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-    at = (x * radial, y * radial) if lens.model == "inverse_brown_conrady" else (x, y)
-    u = x * radial + 2 * p1 * at[0] * at[1] + p2 * (r2 + 2 * at[0] ** 2)
-    v = y * radial + 2 * p2 * at[0] * at[1] + p1 * (r2 + 2 * at[1] ** 2)
-    return np.stack([u, v], axis=-1)
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    if k4 or k5 or k6:
+        radial = radial / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    u, v = x * radial, y * radial
+    if not (p1 or p2):
+        return u, v
+    a, b = (u, v) if lens.model == "inverse_brown_conrady" else (x, y)
+    ab = a * b
+    return u + 2 * p1 * ab + p2 * (r2 + 2 * a * a), v + 2 * p2 * ab + p1 * (r2 + 2 * b * b)
 
 
 def _bent_fisheye(rays: FloatArray, coefficients: FloatArray) -> FloatArray:
