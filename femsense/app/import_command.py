@@ -115,7 +115,7 @@ def import_into(
         replace=again,
         progress=progress,
     )
-    return {**found, "notes": [*source.notes, *_thinning(found, options)], **_accepted(final, found)}
+    return {**found, "notes": [*source.notes, *_thinning(found, options), *_free(found, options)], **_accepted(final, found)}
 
 
 def import_text(folder: str | Path, document: Mapping[str, Any]) -> str:
@@ -141,6 +141,16 @@ def _thinning(found: Mapping[str, Any], options: Options) -> tuple[str, ...]:
     return (
         f"{frames} frames: calibrate, estimate and improve take time for each; if the robot moves slowly, "
         f"--every {step} keeps about {ENOUGH_FRAMES} of them{kept}",
+    )
+
+
+def _free(found: Mapping[str, Any], options: Options) -> tuple[str, ...]:
+    """Return what is said of a recording that does not tell when nothing touches the robot."""
+    if options.free:
+        return ()
+    return (
+        f"nothing says when nothing touches the robot: --free FROM:TO, seconds of {found['duration_s']:.4g}, or the column free of "
+        "frames.csv; calibrate and improve use these frames, and estimate learns from them how well camera and model agree",
     )
 
 

@@ -176,6 +176,7 @@ def test_a_recording_of_very_many_frames_is_told_how_to_take_fewer(tmp_path: Pat
     assert status == 0 and any("--every 4 keeps about 300 of them, 50 a second" in note for note in document["notes"])
     status, document = answer(capsys, *words, "--every", 4, "--again")
     assert status == 0 and document["frames"] == 300 and not any("--every" in note for note in document["notes"])
+    assert any("--free FROM:TO" in note for note in document["notes"])
 
 
 def test_inspect_knows_a_video_of_depth(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
