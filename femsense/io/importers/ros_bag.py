@@ -91,18 +91,30 @@ def open_bag(path: Path) -> Iterator[Bag]:
     """
     highlevel = need("rosbags.highlevel", "ros", "reading ROS bags")
     typesys = need("rosbags.typesys", "ros", "reading ROS bags")
-    files = _files(path)
+    files, store = _files(path), typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     try:
-        reader = highlevel.AnyReader(files, default_typestore=typesys.get_typestore(typesys.Stores.ROS2_HUMBLE))
+        reader = highlevel.AnyReader(files, default_typestore=store)
         reader.open()
     except InputError:
         raise
     except Exception as error:  # rosbags raises what zlib, sqlite, YAML and struct raise, beside its own
-        reader = _recovered(path, error)
+        reader = _without_metadata(path, highlevel, store, error) if path.is_dir() else _recovered(path, error)
     try:
         yield Bag(path, reader)
     finally:
         reader.close()
+
+
+def _without_metadata(path: Path, highlevel: Any, store: Any, error: Exception) -> Any:
+    """Return a reader of the files of a folder whose metadata.yaml is broken, with a warning. Raises InputError."""
+    files = sorted(item for item in path.iterdir() if item.suffix in ENDINGS)
+    try:
+        reader = highlevel.AnyReader(files, default_typestore=store)
+        reader.open()
+    except Exception:
+        raise _unreadable(path, error) from None
+    warnings.warn(f"{path}: metadata.yaml is broken ({_line(error)}); {len(files)} files are read by themselves", stacklevel=4)
+    return reader
 
 
 def _recovered(path: Path, error: Exception) -> RecoveredReader:

@@ -5,6 +5,8 @@ ROS 1: the records of the bag format 2.0 (http://wiki.ros.org/Bags/Format/2.0). 
 
 from __future__ import annotations
 
+import contextlib
+import io
 import struct
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
@@ -16,6 +18,9 @@ from femsense.io.importers.frames import need
 
 MESSAGE, CHUNK, CONNECTION = 2, 5, 7
 """Kinds of records of ROS 1."""
+MCAP_MAGIC, MCAP_CHUNK = b"\x89MCAP0\r\n", 6
+PIECE = 1024
+"""So many bytes at a time are decompressed of what was cut off."""
 LARGEST = 1 << 31
 """A record longer than this [bytes] is noise."""
 
@@ -109,8 +114,6 @@ def _bag_records(stream: BinaryIO) -> Iterator[Connection | tuple[int, int, byte
 
 
 def _chunk_records(data: bytes) -> Iterator[Connection | tuple[int, int, bytes]]:
-    import io
-
     stream = io.BytesIO(data)
     while (record := _bag_record(stream)) is not None:
         if (item := _bag_item(*record)) is not None:
@@ -184,19 +187,63 @@ def _mcap_records(stream: BinaryIO) -> Iterator[Connection | tuple[int, int, byt
     exceptions = need("mcap.exceptions", "ros", "recovering MCAP files")
     schemas: dict[int, Any] = {}
     try:
-        for record in reader.StreamReader(stream).records:
-            kind = type(record).__name__
-            if kind == "Schema":
-                schemas[record.id] = record
-            elif kind == "Channel" and record.schema_id in schemas:
-                schema = schemas[record.schema_id]
-                name = schema.name if schema.name.count("/") != 1 else schema.name.replace("/", "/msg/")
-                text = schema.data.decode("utf-8", "replace")
-                yield Connection(record.id, record.topic, name, text, encoding=record.message_encoding)
-            elif kind == "Message":
-                yield record.channel_id, record.log_time, record.data
+        yield from _mcap_items(reader.StreamReader(stream).records, schemas)
     except (exceptions.McapError, struct.error, ValueError, EOFError, OSError, OverflowError, MemoryError):
-        return
+        pass
     except Exception as error:  # what the decompressors raise at a break has no common base
         if type(error).__module__.split(".")[0] not in ("zstandard", "lz4", "_lz4"):
             raise
+    with contextlib.suppress(exceptions.McapError, struct.error, ValueError, EOFError):
+        rest = io.BytesIO(_last_chunk(stream))
+        yield from _mcap_items(reader.StreamReader(rest, skip_magic=True).records, schemas)
+
+
+def _mcap_items(records: Any, schemas: dict[int, Any]) -> Iterator[Connection | tuple[int, int, bytes]]:
+    for record in records:
+        kind = type(record).__name__
+        if kind == "Schema":
+            schemas[record.id] = record
+        elif kind == "Channel" and record.schema_id in schemas:
+            schema = schemas[record.schema_id]
+            name = schema.name if schema.name.count("/") != 1 else schema.name.replace("/", "/msg/")
+            text = schema.data.decode("utf-8", "replace")
+            yield Connection(record.id, record.topic, name, text, encoding=record.message_encoding)
+        elif kind == "Message":
+            yield record.channel_id, record.log_time, record.data
+
+
+def _last_chunk(stream: BinaryIO) -> bytes:
+    """Return the records in the chunk at which an MCAP file breaks off, as far as they are there; nothing where it ends otherwise.
+
+    mcap.dev/spec: a record is an opcode, a length of 8 bytes and its content; a chunk begins with two times, a size, a checksum,
+    the name of its compression and the length of its records.
+    """
+    at, end = len(MCAP_MAGIC), stream.seek(0, 2)
+    while at + 9 <= end:
+        stream.seek(at)
+        kind, length = struct.unpack("<BQ", stream.read(9))
+        if at + 9 + length > end:
+            data = stream.read() if kind == MCAP_CHUNK else b""
+            break
+        at += 9 + length
+    else:
+        return b""
+    if len(data) < 32:
+        return b""
+    (named,) = struct.unpack_from("<I", data, 28)
+    return _inflated(data[32 : 32 + named].decode("latin-1"), data[40 + named :])
+
+
+def _inflated(compression: str, data: bytes) -> bytes:
+    """Return what a part of compressed data holds, as far as it goes."""
+    out = bytearray()
+    if compression == "zstd":
+        unpack = need("zstandard", "ros", "reading compressed bags").ZstdDecompressor().decompressobj().decompress
+    elif compression == "lz4":
+        unpack = need("lz4.frame", "ros", "reading compressed bags").LZ4FrameDecompressor().decompress
+    else:
+        return data
+    with contextlib.suppress(Exception):  # at the break decompressors raise what has no common base
+        for k in range(0, len(data), PIECE):
+            out += unpack(data[k : k + PIECE])
+    return bytes(out)
