@@ -13,7 +13,7 @@ from threading import Thread
 from typing import Any
 
 from femsense.core.errors import FemsenseError, InputError, MissingDependency
-from femsense.io.files import check_target
+from femsense.io.files import check_target, followed
 from femsense.xr.run_contents import contacts_of_run, current_glb, run_folder, stress_of_run
 
 PAGE = Path(__file__).with_name("viewer") / "dist"
@@ -111,7 +111,7 @@ def write_static_page(folder: str | Path, out_dir: str | Path, *, page: Path = P
         raise InputError(
             "something else stands there", where=out, found=", ".join(foreign), expected="a folder of its own", hint="another -o"
         )
-    out.mkdir(parents=True, exist_ok=True)
+    followed(out).mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="femsense-view-") as scratch:
         glb = current_glb(run, Path(scratch))
         for name, source in files.items():

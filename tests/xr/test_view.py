@@ -106,6 +106,8 @@ def test_a_page_is_not_written_over_another(run: Path, page: Path, tmp_path: Pat
         view.write_static_page(run, out, page=page)
     assert (out / "index.html").read_text() == "mine"
     (out / "index.html").unlink()
+    (tmp_path / "link").symlink_to(tmp_path / "later")
+    assert view.write_static_page(run, tmp_path / "link", page=page).is_file() and (tmp_path / "later").is_dir()
     for _ in range(2):  # its own page it writes anew
         view.write_static_page(run, out, page=page)
 

@@ -15,7 +15,7 @@ from femsense.core.errors import InputError
 from femsense.fem.body import BodyModel, make_body
 from femsense.fem.mesh import TetMesh, element_volumes, to_quadratic
 from femsense.fem.mesh_checks import check_mesh
-from femsense.io.files import check_target, file_hash, plain, write_json, write_toml
+from femsense.io.files import check_target, file_hash, followed, plain, write_json, write_toml
 from femsense.io.mesh_files import write_mesh
 from femsense.io.meshing.channels import Channel, Subdivision, channel_path, pull_point, subdivided
 from femsense.io.meshing.line_body import Cavity, LineBody, mesh_line, place
@@ -68,7 +68,7 @@ def line_into(
     channels = channels_of(table, line, path)
     paths = subdivisions(table, line, mesh, boxes, channels, tell=tell)
     document = robot_document(table, line, boxes, channels, paths, read_toml(path))
-    target.mkdir(parents=True, exist_ok=True)
+    followed(target).mkdir(parents=True, exist_ok=True)
     write_mesh(mesh, target / MESH_FILE)
     write_toml(target / "robot.toml", document)
     load_robot(target)

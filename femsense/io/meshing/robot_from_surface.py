@@ -18,7 +18,7 @@ from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import FemsenseError, InputError
 from femsense.fem.cavities import cavity_seeds
 from femsense.fem.mesh import TetMesh
-from femsense.io.files import check_target, file_hash, write_json, write_text
+from femsense.io.files import check_target, file_hash, followed, write_json, write_text
 from femsense.io.mesh_files import SURFACE_ENDINGS, read_triangles, write_mesh
 from femsense.io.meshes.reading import read_content
 from femsense.io.meshing.cad import CAD_READ, read_cad
@@ -241,7 +241,7 @@ def _write_robot(target: Path, mesh: TetMesh, options: MeshOptions, source: Path
         write_mesh(scaled, Path(trial) / name)
         (Path(trial) / "robot.toml").write_text(text, encoding="utf-8")
         _check_loads(Path(trial), toml)
-        target.mkdir(parents=True, exist_ok=True)
+        followed(target).mkdir(parents=True, exist_ok=True)
         write_mesh(scaled, target / name)
     if is_new or text != toml.read_text(encoding="utf-8-sig"):
         write_text(toml, text)
