@@ -113,12 +113,12 @@ def align(log: ActuationLog, journal: Journal, offset: float | None) -> tuple[Ac
 
 def _offset_of_motion(log: ActuationLog, journal: Journal, times: FloatArray) -> tuple[float, float, float]:
     """Return the offset [s], its correlation, and that of the next peak."""
-    centers = np.array([entry.center or [np.nan] * 3 for entry in journal.entries()])
-    kept = np.isfinite(centers).all(axis=1)
+    places = _places(journal)
+    kept = np.isfinite(places).any(axis=1)
     if kept.sum() < 8:
         raise _unsure(log, "fewer than eight frames show the robot")
     step = max(float(np.median(np.diff(times))), (times[-1] - times[0] + np.ptp(log.time_s)) / GRID)
-    motion = _activity(times[kept], centers[kept], step)
+    motion = _activity(times[kept], places[kept], step)
     drive = _activity(log.time_s, log.values / np.maximum(np.ptp(log.values, axis=0), 1e-12), step)
     score = _correlations(motion, drive)
     best = int(np.argmax(score))
@@ -134,10 +134,29 @@ def _offset_of_motion(log: ActuationLog, journal: Journal, times: FloatArray) ->
     return float(times[kept][0] - log.time_s[0] + lag * step), float(score[best]), next_best
 
 
+def _places(journal: Journal) -> FloatArray:
+    """Return what moves, shape (frames, columns) [m], NaN where it was not seen: x, y, z of the markers that half of the frames
+    show; without such the centre of what was seen, which jumps where a marker is hidden."""
+    centers, seen = [], list[dict[str, list[float]]]()
+    for entry in journal.entries():
+        centers.append(entry.center or [np.nan] * 3)
+        seen.append({name: place for one in entry.seen.values() for name, place in one.markers.items()})
+    counts: dict[str, int] = {}
+    for markers in seen:
+        for name in markers:
+            counts[name] = counts.get(name, 0) + 1
+    often = [name for name, count in counts.items() if 2 * count >= len(seen)]
+    if not often:
+        return np.array(centers, dtype=np.float64)
+    lost = [np.nan] * 3
+    return np.array([[x for name in often for x in markers.get(name, lost)] for markers in seen], dtype=np.float64)
+
+
 def _activity(times: FloatArray, values: FloatArray, step: float) -> FloatArray:
-    """Return how fast values change, on a grid of `step` [s], each value the mean over SMOOTH_S."""
+    """Return how fast values change, on a grid of `step` [s], each value the mean over SMOOTH_S; straight over gaps (NaN)."""
     grid = np.arange(times[0], times[-1] + 0.5 * step, step)
-    even = np.stack([np.interp(grid, times, column) for column in values.T], axis=1)
+    known = [(times[np.isfinite(column)], column[np.isfinite(column)]) for column in values.T]
+    even = np.stack([np.interp(grid, when, column) for when, column in known], axis=1)
     width = max(1, min(round(SMOOTH_S / step), len(grid) // 4))
     sums = np.cumsum(np.concatenate([np.zeros((1, even.shape[1])), even]), axis=0)
     mean = (sums[width:] - sums[:-width]) / width

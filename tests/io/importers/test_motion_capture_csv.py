@@ -226,6 +226,18 @@ def test_the_offset_of_a_log_from_motion(shift: float, tmp_path: Path) -> None:
     assert np.mean(np.abs(recording.inputs[:, 0] - wanted) > 1e-6) < 0.05
 
 
+def test_markers_that_come_and_go_do_not_hide_the_motion(tmp_path: Path) -> None:
+    """Their middle jumps by decimetres then."""
+    rng, rows = np.random.default_rng(0), []
+    for t in np.arange(1, 9, 0.01):
+        gap = rng.random() < 0.2
+        rows.append(f"{t},{0.02 * drive(t)},0,1," + (",," if gap else f"{0.01 * drive(t)},0.4,1"))
+    (tmp_path / "a.csv").write_text("\n".join(["time,tip_x,tip_y,tip_z,mid_x,mid_y,mid_z", *rows]))
+    log = read_actuation_log(log_file(tmp_path / "log.csv", 3.17), Options())
+    _, found = imported(tmp_path / "a.csv", tmp_path / "out", Options(unit="m"), log=log, actuation="tension")
+    assert found["actuation_offset_s"] == pytest.approx(3.17, abs=0.03)
+
+
 def test_an_offset_that_is_given(tmp_path: Path) -> None:
     moving = moving_tip(tmp_path / "a.csv", np.arange(1, 9, 0.01).tolist())
     log = read_actuation_log(log_file(tmp_path / "log.csv", 50.0), Options())
