@@ -51,6 +51,13 @@ say(await page.evaluate(() => {
   return { vertices, arrow: arrow.getWorldPosition(at).toArray(), cone: arrow.children[3].visible, bones: Array.from(shown.bones),
     field: Array.from(skin.geometry.getAttribute('paintField').array), mode: body.painter.mode.value, scale: document.querySelector('#scale-top').textContent };
 }));
+await told();
+await page.waitForFunction(() => femsense.shown.robots.get('bar').body.isDoubtful, null, { timeout: 60000 });
+await page.waitForTimeout(300);
+say(await page.evaluate(() => ({
+  faded: femsense.shown.robots.get('bar').body.painter.faded.value,
+  parts: ['#sum', '#plot', '#forces', '#frame-facts'].map((id) => document.querySelector(id).checkVisibility()),
+})));
 await page.evaluate(() => new Promise((done) => {
   let last = performance.now();
   const { take } = femsense.shown.robots.get('bar').constructor.prototype;
@@ -128,6 +135,16 @@ def test_what_streams_is_shown_where_it_is_and_greys_when_it_stops(
         scene = said()
         check_scene(scene, run, source.last)
         assert scene["field"] == run.field[11].tolist() and scene["mode"] == 2 and scene["scale"].endswith("% strain")
+        source.last = replace(source.last, contacts=None, status="light = 9 is outside 0 … 1")
+        browser.stdin.write("go\n")
+        browser.stdin.flush()
+        odd = said()
+        assert 0 < odd["faded"] < 1 and odd["parts"] == [
+            False,
+            False,
+            False,
+            True,
+        ]  # no forces are known; why it is faded is said
         assert said()["watching"]
         source.flowing.clear()
         stale = said()

@@ -232,6 +232,19 @@ const [url, shot, phone] = given;
   if (state === 'ready') {
     await page.waitForTimeout(500);
     await page.screenshot({ path: shot });
+    const covered = () => page.evaluate(() => {               // how far corners of the space that is shown lie under panels [px]
+      const { stage, shown } = femsense, { box, camera } = stage;
+      const [dock, panel] = ['#dock', '#panel'].map((id) => document.querySelector(id).getBoundingClientRect());
+      const over = panel.width > 0.6 * innerWidth, label = shown.body.arrows.group.children[0].children.at(-1);
+      const corners = [0, 1, 2, 3, 4, 5, 6, 7].map((i) => box.min.clone().set(...['x', 'y', 'z'].map((axis, k) => box[i >> k & 1 ? 'max' : 'min'][axis])));
+      const under = corners.map((corner) => {
+        const { x, y } = corner.project(camera), across = (x + 1) / 2 * innerWidth, down = (1 - y) / 2 * innerHeight;
+        return Math.max(-across, across - (over ? innerWidth : panel.left), (over ? panel.bottom : 0) - down, down - dock.top);
+      });
+      const [end] = shown.body.arrows.ends(shown.run.frames[shown.shown].contacts);
+      return { under: Math.max(...under), beyond: box.distanceToPoint(end), off: end.distanceTo(label.getWorldPosition(end.clone())) };
+    });
+    result.covered = [await covered()];
     const clock = () => page.textContent('#clock');
     await page.keyboard.press('ArrowRight');
     result.next = await clock();
@@ -264,6 +277,7 @@ const [url, shot, phone] = given;
     await page.setViewportSize({ width: 360, height: 740 });
     await page.waitForTimeout(300);
     await page.screenshot({ path: phone });
+    result.covered.push(await covered());
     const panel = () => page.evaluate(() => {
       const panel = document.querySelector('#panel');
       return { below: panel.scrollHeight - panel.clientHeight - panel.scrollTop, said: !document.querySelector('#more').hidden };
@@ -342,6 +356,9 @@ def test_page_in_a_browser(request: pytest.FixtureRequest, run: Path, built_page
     assert bent["said"] == f"{100 * strain.max():.2f} % strain"
     (touch,) = view.contacts_of_run(run)["frames"][6]["contacts"]
     assert contact["place"][:3] == pytest.approx(in_gltf(np.array(touch["point_m"])), abs=1e-6) and contact["place"][3] > 0
+    covered: list[dict[str, float]] = seen["covered"]  # type: ignore[assignment]
+    assert len(covered) == 2 and all(one["under"] <= 0.5 and one["beyond"] == 0 for one in covered)
+    assert covered[0]["off"] < 1e-6  # what is framed is where the arrow begins
     panels: list[dict[str, Any]] = seen["panel"]  # type: ignore[assignment]
     assert all(one["said"] == (one["below"] > 6) for one in panels) and panels[2]["said"]
     for name in ("desk.png", "phone.png"):

@@ -137,7 +137,8 @@ class TwinFrame:
     time_s: float
     bones: npt.NDArray[np.float32]
     """As in `Pose`, shape (B, 7)."""
-    contacts: tuple[Contact, ...] = ()
+    contacts: tuple[Contact, ...] | None = ()
+    """None: nothing estimates forces."""
     inputs: tuple[float, ...] = ()
     """One value for each of the twin's inputs."""
     residual_m: float = float("nan")
@@ -249,14 +250,15 @@ def model_bytes(twin: Twin, glb_url: str) -> bytes:
 
 def force_bytes(seq: int, frame: TwinFrame) -> bytes:
     """Return contacts and forces of a moment, robot frame, with standard deviations."""
-    document = {
+    document: dict[str, Any] = {
         "header": header(seq, frame.time_s, "robot"),
         "frame": frame.frame,
         "status": frame.status,
         "residual_m": frame.residual_m,
         "run_s": frame.run_s,
-        "contacts": [_contact_table(contact) for contact in frame.contacts],
     }
+    if frame.contacts is not None:
+        document["contacts"] = [_contact_table(contact) for contact in frame.contacts]
     return _json(_known(document))
 
 

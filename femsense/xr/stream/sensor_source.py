@@ -44,7 +44,7 @@ def frames_of_sensors(readings: Iterable[Reading], model: ProprioceptiveModel) -
         if pose.bones is not None:
             bones = bone_rows(pose.bones.T_robot_bone @ straight)  # bones that have the robot's axes at rest
         said = "; ".join(item.text for item in pose.outside[:2])
-        yield TwinFrame(time_s, bones, inputs=tuple(float(v) for v in row), status=said or "ok")
+        yield TwinFrame(time_s, bones, contacts=None, inputs=tuple(float(v) for v in row), status=said or "ok")
 
 
 def markers_of_sensors(readings: Iterable[Reading], model: ProprioceptiveModel) -> Iterator[tuple[float, dict[str, FloatArray]]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -63,6 +64,7 @@ def plain(value: Any) -> bool:
 
 def test_documents_say_what_is_known_and_leave_out_what_is_not() -> None:
     force = json.loads(payloads.force_bytes(9, moment(3.5, contact=True)))
+    assert "contacts" not in json.loads(payloads.force_bytes(9, replace(moment(3.5), contacts=None)))
     assert payloads.header(0, 2.9999999999, "robot")["stamp"] == {"secs": 3, "nsecs": 0}
     assert force["header"] == {"seq": 9, "stamp": {"secs": 3, "nsecs": 500_000_000}, "frame_id": "robot"}
     (contact,) = force["contacts"]

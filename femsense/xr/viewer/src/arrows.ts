@@ -23,6 +23,7 @@ import { newtons, type Contact, type Vector } from "./data";
 
 const COLOR = 0xff9c33;
 const UP = new Vector3(0, 1, 0);
+const LONGEST = 0.42; // arrow, of the body's size
 const LABEL_HEIGHT = 0.046; // of the distance to the viewer
 
 export class ForceArrows {
@@ -50,7 +51,16 @@ export class ForceArrows {
       this.arrows.push(arrow);
       this.group.add(arrow.group);
     }
-    this.arrows.forEach((arrow, i) => arrow.set(placed[i], (0.42 * this.size) / this.largest));
+    this.arrows.forEach((arrow, i) => arrow.set(placed[i], (LONGEST * this.size) / this.largest));
+  }
+
+  /** Returns where arrows begin, in glTF's frame (Y up). */
+  ends(contacts: Contact[]): Vector3[] {
+    const placed = contacts.filter((c) => c.point_m && c.force_vector_n);
+    return placed.map((c) => {
+      const [x, y, z] = new Vector3(...c.point_m!).addScaledVector(new Vector3(...c.force_vector_n!), (-LONGEST * this.size) / this.largest).toArray();
+      return new Vector3(x, z, -y);
+    });
   }
 
   /** Keeps labels readable: their size follows the distance to the viewer. */

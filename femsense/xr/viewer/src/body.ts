@@ -21,7 +21,6 @@ import { ForceArrows } from "./arrows";
 import type { Contact } from "./data";
 import { Painter, type Paint } from "./paint";
 
-const STALE = new Color(0x6b727c);
 const FAR = 4; // residuals beyond so many times the scale belong to the surroundings
 
 export async function loadMesh(url: string): Promise<GLTF> {
@@ -44,8 +43,8 @@ export class Body {
   readonly residualScale: number;
   private readonly ghost = new Group();
   private readonly cloud = new Points(new BufferGeometry(), new PointsMaterial({ size: 3, sizeAttenuation: false, vertexColors: true }));
-  private readonly colors = new Map<MeshStandardMaterial, Color>();
   private stale = false;
+  private doubtful = false;
   private cloudSeen = false;
 
   constructor(readonly gltf: GLTF) {
@@ -90,13 +89,23 @@ export class Body {
   setStale(stale: boolean): void {
     if (stale === this.stale) return;
     this.stale = stale;
-    for (const [material, color] of this.colors) {
-      material.color.copy(stale ? STALE : color);
-      material.opacity = stale ? 0.5 : 1;
-      material.transparent = stale;
-      material.needsUpdate = true;
-    }
+    this.fade();
     this.arrows.setStale(stale);
+  }
+
+  /** Takes much of the body's colour away: what it shows may be wrong. */
+  setDoubtful(doubtful: boolean): void {
+    if (doubtful === this.doubtful) return;
+    this.doubtful = doubtful;
+    this.fade();
+  }
+
+  get isDoubtful(): boolean {
+    return this.doubtful;
+  }
+
+  private fade(): void {
+    this.painter.fade(this.stale ? 0.9 : this.doubtful ? 0.6 : 0);
   }
 
   get isStale(): boolean {
@@ -147,7 +156,6 @@ export class Body {
   private prepare(skin: SkinnedMesh): void {
     const material = (skin.material as MeshStandardMaterial).clone();
     skin.material = material;
-    this.colors.set(material, material.color.clone());
     this.painter.prepare(material, skin);
     const pale = new MeshBasicMaterial({ color: 0xb8c7db, transparent: true, opacity: 0.16, depthWrite: false });
     this.ghost.add(new Mesh(skin.geometry, pale));

@@ -36,6 +36,7 @@ export interface Frame {
   run_s?: number | null; // from the beginning of a run that is played over and over
   inputs: (number | null)[] | null;
   contacts: Contact[];
+  forceless?: boolean; // nothing estimates forces
 }
 
 export interface Run {
@@ -67,6 +68,11 @@ export function frameAt(frames: { time_s: number }[], time: number): number {
     else high = middle;
   }
   return high >= 0 && Math.abs(frames[high]!.time_s - time) < Math.abs(frames[low]!.time_s - time) ? high : low;
+}
+
+/** Whether what is shown may be wrong: the frame says why. */
+export function isDoubtful(frame: Frame): boolean {
+  return Boolean(frame.status) && frame.status !== "ok";
 }
 
 export function totalForce(frame: Frame): number {

@@ -4,7 +4,7 @@ import { Box3 } from "three";
 import { Body, loadMesh } from "./body";
 import { Connection, streamUrl } from "./connection";
 import { alignWith, connectTools, notice, paintChoice, paintLegend, toggle } from "./controls";
-import { amount, frameAt, type Frame } from "./data";
+import { amount, frameAt, isDoubtful, type Frame } from "./data";
 import { Dragging } from "./dragging";
 import { pack, readCloud, readField, readForces, readInputs, readModel, readPose, readReach, readStatus, type Message, type Model } from "./messages";
 import type { Field, Paint } from "./paint";
@@ -92,7 +92,7 @@ class Streams {
     const all = new Box3();
     bodies.forEach((body, i) => {
       body.group.position.x = (i - (bodies.length - 1) / 2) * width;
-      all.union(body.space().expandByScalar(0.08 * body.size).translate(body.group.position));
+      all.union(body.space().expandByScalar(0.1 * body.size).translate(body.group.position));
     });
     this.stage.fit(all);
     this.choose(this.chosen);
@@ -351,6 +351,7 @@ class Robot {
     this.shown = moment;
     this.body?.pose(moment.bones);
     this.body?.show(moment.contacts);
+    this.body?.setDoubtful(isDoubtful(moment));
     if (!this.body || moment.field === this.painted) return;
     this.painted = moment.field;
     this.body.painter.setField(moment.field);

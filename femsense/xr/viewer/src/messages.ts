@@ -109,7 +109,7 @@ export function readModel(payload: Uint8Array): Model | null {
   };
 }
 
-export function readForces(payload: Uint8Array): Pick<Frame, "frame" | "status" | "rms_after_m" | "run_s" | "contacts"> | null {
+export function readForces(payload: Uint8Array): Pick<Frame, "frame" | "status" | "rms_after_m" | "run_s" | "contacts" | "forceless"> | null {
   const told = document(payload);
   if (!told) return null;
   const frame = number(told.frame);
@@ -119,6 +119,7 @@ export function readForces(payload: Uint8Array): Pick<Frame, "frame" | "status" 
     rms_after_m: number(told.residual_m),
     run_s: number(told.run_s),
     contacts: list(told.contacts).map(contact),
+    forceless: told.contacts === undefined,
   };
 }
 

@@ -1,6 +1,6 @@
 // The panel beside the robot: contacts, what drives it, and what is known of the frame.
 
-import { amount, newtons, totalForce, totalStd, type Contact, type Frame, type Input } from "./data";
+import { amount, isDoubtful, newtons, totalForce, totalStd, type Contact, type Frame, type Input } from "./data";
 
 export function element<T extends Element = HTMLElement>(id: string): T {
   const found = document.getElementById(id);
@@ -9,6 +9,7 @@ export function element<T extends Element = HTMLElement>(id: string): T {
 }
 
 export function showFrame(frame: Frame, inputs: Input[], largest: number): void {
+  element("panel").dataset.forceless = element("dock").dataset.forceless = String(frame.forceless === true);
   element("sum").textContent = frame.contacts.length ? newtons(totalForce(frame), totalStd(frame)) : "no contact";
   element("sum-label").textContent = frame.contacts.length > 1 ? `Sum of ${frame.contacts.length}` : "Contact force";
   fill(element("contacts"), frame.contacts, (contact, row) => showContact(contact, row, largest));
@@ -19,6 +20,7 @@ export function showFrame(frame: Frame, inputs: Input[], largest: number): void 
   if (frame.frame !== null) facts.push(["Frame", String(frame.frame)]);
   if (frame.status) facts.push(["Status", frame.status]);
   if (frame.rms_after_m !== null) facts.push(["Residual, rms", `${(1e3 * frame.rms_after_m).toFixed(2)} mm`]);
+  element("frame-facts").dataset.doubtful = String(isDoubtful(frame));
   fill(element("frame-facts"), facts, ([name, value], row) => {
     part(row, "dt").textContent = name;
     part(row, "dd").textContent = value;

@@ -54,6 +54,7 @@ class Player {
     const box = this.space();
     stage.robot.add(body.group);
     body.arrows.largest = Math.max(...(run?.frames ?? []).flatMap((f) => f.contacts.map((c) => c.force_n ?? 0)), 1e-9);
+    for (const frame of run?.frames ?? []) for (const end of body.arrows.ends(frame.contacts)) box.expandByPoint(end);
     stage.fit(box);
     const landmarks = landmarksOf(this.body, run?.markers ?? [], run?.cameras ?? []);
     stage.headset.changed = (on) => {

@@ -24,6 +24,13 @@ import { RoomEnvironment } from "three/addons/environments/RoomEnvironment.js";
 import { Headset } from "./headset";
 
 const FIELD_OF_VIEW = 38; // on a screen [deg]
+const FROM = new Vector3(0.62, 0.42, 0.85).normalize(); // where the camera stands at first
+
+/** What the panels and the bar leave free at each side of the picture [px], as style.css places them. */
+function free(width: number, height: number): { left: number; right: number; top: number; bottom: number } {
+  if (width <= 820 && height > 480) return { left: 10, right: 10, top: 80 + 0.3 * height, bottom: 180 };
+  return { left: 20, right: height > 480 ? 310 : 290, top: 70, bottom: 100 };
+}
 
 export class Stage {
   readonly scene = new Scene();
@@ -94,15 +101,29 @@ export class Stage {
   lookFromStart(): void {
     this.moved = false;
     if (this.box.isEmpty()) return;
-    const size = this.box.getSize(new Vector3()).length() || 1;
     const middle = this.box.getCenter(new Vector3());
-    const narrow = Math.min(1, this.camera.aspect);
-    const distance = (0.5 * size) / Math.tan((this.camera.fov * Math.PI) / 360) / Math.max(0.45, narrow);
     this.controls.target.copy(middle);
-    this.camera.position.copy(middle).add(new Vector3(0.62, 0.42, 0.85).normalize().multiplyScalar(distance));
+    this.camera.position.copy(middle).addScaledVector(FROM, this.distance(middle));
     this.camera.updateProjectionMatrix();
     this.controls.update();
     this.touch();
+  }
+
+  /** How far away the camera sees the whole box between the panels [m]. */
+  private distance(middle: Vector3): number {
+    const { clientWidth: width, clientHeight: height } = this.canvas;
+    const { left, right, top, bottom } = free(width, height);
+    const up = Math.tan((this.camera.fov * Math.PI) / 360) * Math.max(0.2, 1 - (top + bottom) / (height || 1));
+    const aside = Math.tan((this.camera.fov * Math.PI) / 360) * this.camera.aspect * Math.max(0.2, 1 - (left + right) / (width || 1));
+    const [x, y] = [new Vector3(0, 1, 0).cross(FROM).normalize(), new Vector3()];
+    y.crossVectors(FROM, x);
+    const corner = new Vector3();
+    let distance = 0;
+    for (let i = 0; i < 8; i++) {
+      corner.set(this.box[i & 1 ? "max" : "min"].x, this.box[i & 2 ? "max" : "min"].y, this.box[i & 4 ? "max" : "min"].z).sub(middle);
+      distance = Math.max(distance, corner.dot(FROM) + Math.max(Math.abs(corner.dot(x)) / aside, Math.abs(corner.dot(y)) / up));
+    }
+    return distance || 1;
   }
 
   showGround(visible: boolean): void {
@@ -172,8 +193,8 @@ export class Stage {
     const { clientWidth: width, clientHeight: height } = this.canvas;
     if (!width || !height) return;
     this.camera.aspect = width / height;
-    if (width < 700 && height > width) this.camera.setViewOffset(width, height, 0, Math.round(-0.07 * height), width, height);
-    else this.camera.clearViewOffset(); // on a phone the panel takes the upper part
+    const { left, right, top, bottom } = free(width, height);
+    this.camera.setViewOffset(width, height, (right - left) / 2, (bottom - top) / 2, width, height);
     this.camera.updateProjectionMatrix();
     this.renderer.setSize(width, height, false);
     if (!this.moved) this.lookFromStart(); // a phone that was turned
