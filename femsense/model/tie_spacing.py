@@ -85,8 +85,8 @@ def tie_spacing_text(spacing: TieSpacing, count: int) -> str:
     """Return a warning for a path of `count` points that does not hold."""
     pulled = "its max_tension_n" if spacing.declared else "what bends the body by 57°"
     return (
-        f"cable {spacing.cable!r}: its points are too far apart. Held only there, between points {spacing.after} and {spacing.after + 1} of its path "
-        f"({1e3 * spacing.gap:.3g} mm) the body buckles at {spacing.buckles_at:.3g} N; the cable may pull {spacing.tension:.3g} N "
-        f"({pulled}). Where it runs in a channel, give it about {int(np.ceil(count * spacing.points_wanted))} points instead of "
-        f"{count} (docs/bodies.md)"
+        f"cable {spacing.cable!r}: its points are too far apart. The body is free between points {spacing.after} and "
+        f"{spacing.after + 1} of its path ({1e3 * spacing.gap:.3g} mm) and buckles there at {spacing.buckles_at:.3g} N, but the "
+        f"cable may pull {spacing.tension:.3g} N ({pulled}). Where it runs in a channel, give it about "
+        f"{int(np.ceil(count * spacing.points_wanted))} points instead of {count} (docs/bodies.md)"
     )
