@@ -139,6 +139,34 @@ def test_an_effect_whose_states_do_not_converge_again_is_taken_back():
     assert "no equilibrium in frame 3" in course.refits[0].verdict and not course.refits[0].is_named
 
 
+def test_where_nothing_explains_what_is_left_effects_are_sought_again_from_the_first_model():
+    inputs, labels = sweeps(each=1)
+    recording, _ = record(inputs, labels=labels, truth=arm((4, 1, 1)))
+    wave = 4e-3 * np.sin(1.7 * recording.marker_frame + recording.marker_index)  # no effect of the list, and no noise either
+    off = replace(recording, marker_xyz=recording.marker_xyz + wave[:, None] * np.array([0.0, 0.6, 0.8]), marker_noise_m=1e-4)
+    told: list[str] = []
+    soon = ImproveOptions(thresholds=replace(DEFAULTS, lacks=0.3))  # less than any weights leave
+    loop = improve(arm((4, 1, 1)), [off], effects=["cable_friction", "payload"], progress=told.append, options=soon)
+    assert any(text.startswith("nothing explains what is left") for text in told)
+    assert loop.verdict == "unexplained" and not [e for e in loop.effects if e.name in ("cable_friction", "payload")]
+    assert loop.noise_m < 2e-4 and loop.model_error is not None and loop.model_error.held_out_m > 1e-3
+
+
+def test_a_search_that_begins_again_keeps_what_was_tried_and_takes_other_weights():
+    inputs, labels = sweeps(each=1)
+    recording, _ = record(inputs, labels=labels, truth=arm((4, 1, 1)))
+    data = prepare(arm((4, 1, 1)), [recording], [])
+    hypothesis, prior = with_nuisance(data)
+    base = fit_model(data, hypothesis, prior, Noise({"white": 1e-4}, ""), np.zeros(len(prior.mean)))
+    named = RefitRecord("cable_friction", {}, NAMED, step=1)
+    history = [("", base), ("cable_friction", base)]
+    course = SearchProgress(data, data, base, history, 1, base, base, ["cable_friction"], False, [named], over=True)
+    weights = Noise({"white": 5e-3}, "", assumed=1e-4)
+    course.begin_again(data, weights)
+    assert not course.over and not course.found and course.noise is weights and course.holds_error
+    assert not course.refits[0].is_named and "asked again" in course.refits[0].verdict
+
+
 def test_a_model_that_lacks_nothing_is_told_so():
     inputs, labels = sweeps()
     recording, _ = record(inputs, labels=labels, truth=arm((4, 1, 1)), noise=2e-4)
