@@ -18,12 +18,14 @@ from femsense.fem.equilibrium import Equilibrium
 from femsense.sensing.force_step import ForceStep, Iterate, Linearisation, linearise, misfit_with_lost
 from femsense.sensing.measurement_rows import rows_at
 from femsense.sensing.nuisance import nuisance_columns, sag_at
-from femsense.sensing.states import ROUGH, solve_with
+from femsense.sensing.states import solve_with
 from femsense.sensing.touches import make_touch, within_cones
 from femsense.sensing.types import Fit, Sensor, Touch
 
 TRIES = 4
 """How often a step is made shorter where it leads too far: first along what the rows hardly determine."""
+SLIGHT = 1e-4
+"""Steps that lower the cost by less than this share of it are not worth their equilibrium."""
 
 
 def no_forces(sensor: Sensor, k: int, scan: Scan | None, state: Equilibrium, like: Fit | None = None) -> Fit:
@@ -64,7 +66,7 @@ def fit_forces(
     for _ in range(sensor.options.iterations):
         here = replace(here, sizes=step.sizes)
         cost = linear.cost(here)
-        if _hardly_moves(sensor, here, step):
+        if _hardly_moves(sensor, here, step) or step.gain < SLIGHT * cost:
             converged = True
             break
         better, trust = frame.descend(here, linear, step, trust)
@@ -73,7 +75,7 @@ def fit_forces(
         gain = cost - better[1].cost(better[0])
         here, linear = better
         step = linear.step(sensor, here)
-        if gain < 1e-4 * (cost - gain):
+        if gain < SLIGHT * (cost - gain):
             converged = True
             break
     return frame.fit_of(here, linear, step, converged)
@@ -105,27 +107,29 @@ class _Frame:
         if start is None or len(start[1]) != m:
             return here, linear
         forces = within_cones(sensor, here.touches, start[1], start[0])
-        return self._where_it_costs_less(replace(here, forces=forces, state=start[0]), linear.cost(here)) or (here, linear)
+        return self._where_it_costs_less(replace(here, forces=forces, state=start[0]), here, linear) or (here, linear)
 
     def descend(
         self, here: Iterate, linear: Linearisation, step: ForceStep, trust: float
     ) -> tuple[tuple[Iterate, Linearisation] | None, float]:
         """Return where a step leads that costs less, and how far the next one is trusted; None where all lead too far."""
-        cost = linear.cost(here)
         for _ in range(TRIES):
             shorter = step if trust >= 1.0 else linear.step(self.sensor, here, trust)
-            better = self._where_it_costs_less(_moved(self.sensor, here, linear, shorter), cost)
+            better = self._where_it_costs_less(_moved(self.sensor, here, linear, shorter), here, linear)
             if better is not None:
                 return better, min(4.0 * trust, 1.0)
             trust *= 0.2
         return None, trust
 
-    def _where_it_costs_less(self, there: Iterate, cost: float) -> tuple[Iterate, Linearisation] | None:
-        """Return an iterate with its equilibrium, rows and linearisation; None where it has none or costs more."""
+    def _where_it_costs_less(self, there: Iterate, here: Iterate, at: Linearisation) -> tuple[Iterate, Linearisation] | None:
+        """Return an iterate with its equilibrium, rows and linearisation; None where it has none or costs more than one that was linearised."""
+        cost = at.cost(here)
         try:
-            state = solve_with(self.sensor, self.k, there.touches, there.forces, there.state, before=self.before, tolerance=ROUGH)
+            state = solve_with(self.sensor, self.k, there.touches, there.forces, there.state, before=self.before, tried=True)
             there = replace(there, state=state, rows=rows_at(self.sensor, self.k, self.scan, state))
         except DataError:
+            return None
+        if at.cost_beside(self.sensor, there) >= cost:
             return None
         linear = linearise(self.sensor, there)
         return (there, linear) if linear.cost(there) < cost else None

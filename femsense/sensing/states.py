@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import DataError
 from femsense.fem.equilibrium import Equilibrium, SolveOptions
+from femsense.fem.newton_state import NewtonOptions
 from femsense.model.frame_state import solve_frame
 from femsense.sensing.touches import nodal_forces
 from femsense.sensing.types import Sensor, Touch
@@ -15,11 +16,13 @@ EXACT = 1e-9
 """Unbalanced force, relative to all loads, of a state that is a result."""
 ROUGH = 1e-6
 """The same of the states on the way to the forces."""
+TRIED = NewtonOptions(steps_tried=12, indefinite_tried=2)
+"""States that are tried start from what the tangent foretells: those that were taken needed ten steps at most, one of them indefinite."""
 
 
 def free_state(sensor: Sensor, k: int, start: Equilibrium | None, before: tuple[FloatArray, ...] | None) -> Equilibrium:
     """Return the state under the inputs alone. Raises DataError."""
-    return _solve(sensor, k, None, start, before, EXACT)
+    return _solve(sensor, k, None, start, before, False)
 
 
 def solve_with(
@@ -30,16 +33,16 @@ def solve_with(
     start: Equilibrium,
     *,
     before: tuple[FloatArray, ...] | None = None,
-    tolerance: float = EXACT,
+    tried: bool = False,
 ) -> Equilibrium:
     """Return the state of frame k under forces (m, 3) [N] at some places. Raises DataError.
 
     Arguments:
         start: a state near by.
         before: tensions along the cables until now (friction).
-        tolerance: unbalanced force relative to all loads.
+        tried: the state is on the way to the forces: rough, in single precision, and given up where it is far from its start.
     """
-    return _solve(sensor, k, nodal_forces(touches, forces, len(start.positions)), start, before, tolerance)
+    return _solve(sensor, k, nodal_forces(touches, forces, len(start.positions)), start, before, tried)
 
 
 def _solve(
@@ -48,9 +51,10 @@ def _solve(
     loads: FloatArray | None,
     start: Equilibrium | None,
     before: tuple[FloatArray, ...] | None,
-    tolerance: float,
+    tried: bool,
 ) -> Equilibrium:
-    options = SolveOptions(before=before, reuse_factor=start is not None, relative_tolerance=tolerance)
+    tolerance = ROUGH if tried else EXACT
+    options = SolveOptions(before=before, reuse_factor=start is not None, relative_tolerance=tolerance, rough=tried, newton=TRIED)
     state = solve_frame(sensor.driven, k, start=start, nodal_forces=loads, options=options)
     if not state.converged:
         raise DataError(f"no equilibrium: {state.status}: {state.advice}")
