@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.pointcloud.objects import euclidean_clusters
 from femsense.pointcloud.rays import Surface
+from femsense.pointcloud.round_fits import BALL, CYLINDER, SPHERE, fit_round
 
 Fit = Callable[[FloatArray, FloatArray, FloatArray], "Shape"]
 
@@ -201,17 +202,10 @@ def typical_square(residual: FloatArray) -> float:
 def _sphere(points: FloatArray, std: FloatArray, ray: FloatArray, radius: float | None) -> tuple[float, Shape | None]:
     middle, look = points.mean(axis=0), ray.mean(axis=0)
 
-    def evaluate(x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        away = points - x[:3]
-        length = np.maximum(np.linalg.norm(away, axis=1), 1e-9)
-        size = radius if radius is not None else float(np.exp(x[3]))
-        unit = away / length[:, None]
-        scale = std * np.maximum(np.abs(np.einsum("pc,pc->p", unit, ray)), 0.2)
-        J = -unit if radius is not None else np.hstack([-unit, np.full((len(unit), 1), -size)])
-        return (length - size) / scale, J / scale[:, None]
-
     starts = [np.append(middle + 0.7 * r * look, np.log(r)) for r in ([radius] if radius is not None else (0.004, 0.01, 0.025))]
-    x, curve, residual = min((least_squares(evaluate, s[:3] if radius is not None else s) for s in starts), key=_typical)
+    kind, k, known = (SPHERE, 4, 0.0) if radius is None else (BALL, 3, radius)
+    tried = [fit_round(kind, points, std, ray, start[:k], steps=FIT_STEPS, radius=known) for start in starts]
+    x, curve, residual, _ = min(tried, key=lambda fit: fit[3])
     size = radius if radius is not None else float(np.exp(x[3]))
     seen_from_outside = float(np.mean(np.einsum("pc,pc->p", points - x[:3], ray) < 0))
     if size > LARGEST or seen_from_outside < 0.7:
@@ -223,37 +217,20 @@ def _cylinder(points: FloatArray, std: FloatArray, ray: FloatArray) -> tuple[flo
     middle, look = points.mean(axis=0), ray.mean(axis=0)
     main = np.linalg.svd(points - middle, full_matrices=False)[2]
 
-    def parts(x: FloatArray, frame: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        axis = frame[0] + x[3] * frame[1] + x[4] * frame[2]
-        axis = axis / np.linalg.norm(axis)
-        away = points - middle - x[0] * frame[1] - x[1] * frame[2]
-        along = away @ axis
-        return axis, along, away - np.outer(along, axis)
-
-    def evaluator(frame: FloatArray) -> Callable[[FloatArray], tuple[FloatArray, FloatArray]]:
-        def evaluate(x: FloatArray) -> tuple[FloatArray, FloatArray]:
-            _, along, away = parts(x, frame)
-            length = np.maximum(np.linalg.norm(away, axis=1), 1e-9)
-            unit, size = away / length[:, None], float(np.exp(x[2]))
-            scale = std * np.maximum(np.abs(np.einsum("pc,pc->p", unit, ray)), 0.2)
-            across = unit @ frame[1:].T
-            tilt = -along[:, None] * across / np.sqrt(1.0 + x[3] ** 2 + x[4] ** 2)
-            J = np.hstack([-across, np.full((len(unit), 1), -size), tilt])
-            return (length - size) / scale, J / scale[:, None]
-
-        return evaluate
-
     tried = []
     for frame in (main, main[[1, 2, 0]]):
         for r in (0.003, 0.01):
             start = np.array([0.7 * r * look @ frame[1], 0.7 * r * look @ frame[2], np.log(r), 0.0, 0.0])
-            tried.append((*least_squares(evaluator(frame), start), frame))
-    x, curve, residual, frame = min(tried, key=lambda t: _typical(t[:3]))
-    axis, _, away = parts(x, frame)
+            fit = fit_round(CYLINDER, points, std, ray, start, steps=FIT_STEPS, frame=frame, middle=middle)
+            tried.append((*fit, frame))
+    x, curve, residual, _, frame = min(tried, key=lambda fit: fit[3])
+    axis = frame[0] + x[3] * frame[1] + x[4] * frame[2]
+    axis = axis / np.linalg.norm(axis)
+    center = middle + x[0] * frame[1] + x[1] * frame[2]
+    away = (points - center) - np.outer((points - center) @ axis, axis)
     size = float(np.exp(x[2]))
     if size > LARGEST or np.mean(np.einsum("pc,pc->p", away, ray) < 0) < 0.7:
         return np.inf, None
-    center = middle + x[0] * frame[1] + x[1] * frame[2]
     low, high = np.quantile((points - center) @ axis, [0.01, 0.99])
     axes = np.vstack([axis, np.linalg.svd(axis[None])[2][1:]])
     half = np.array([0.5 * (high - low), size, size])
@@ -287,10 +264,6 @@ def least_squares(
 def _huber(residual: FloatArray) -> float:
     size = np.abs(residual)
     return float(np.where(size <= 2.0, size**2, 2.0 * (2.0 * size - 2.0)).sum())
-
-
-def _typical(fit: tuple[FloatArray, FloatArray, FloatArray]) -> float:
-    return _huber(fit[2])
 
 
 def _plate(points: FloatArray, std: FloatArray, ray: FloatArray) -> tuple[float, Shape | None]:

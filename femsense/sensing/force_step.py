@@ -69,13 +69,14 @@ class Linearisation:
     normals: FloatArray  # outward, deformed, (m, 3)
     moves: FloatArray  # of the nodes by unit forces, (3m, n, 3)
     sag: FloatArray  # of the nodes by the modulus and the pulls, as `sag_at` has it
+    misfit: float  # of the rows with nuisance fitted
 
     def cost(self, here: Iterate) -> float:
         """Return the misfit of the state, priors included."""
         off = sum(float(((t.place - t.expected) ** 2).sum()) / t.std_m**2 for t in here.touches if t.std_m > 0)
         roots = _prior_roots(here.touches, self.normals, here.sizes)
         prior = sum(float(((root @ f) ** 2).sum()) for root, f in zip(roots, here.forces))
-        return misfit_with_lost(self.residual, self.nuisance, here.rows) + off + prior
+        return self.misfit + off + prior
 
     def cost_beside(self, sensor: Sensor, there: Iterate) -> float:
         """Return about what a state near by costs, before it is linearised: its rows with the nuisance of this one.
@@ -83,7 +84,7 @@ class Linearisation:
         The two differed by less than a twentieth of what the cost had changed, but for steps that were ten times too long.
         """
         columns, known = nuisance_columns(sensor.knowledge, there.rows, self.sag)
-        return replace(self, nuisance=columns, residual=there.rows.residual - known).cost(there)
+        return replace(self, misfit=misfit_with_lost(there.rows.residual - known, columns, there.rows)).cost(there)
 
     def step(self, sensor: Sensor, here: Iterate, trust: float = 1.0) -> ForceStep:
         """Return forces and shifts of the places that explain the rows best; where `trust` is below 1, near those that are here.
@@ -240,6 +241,7 @@ def linearise(sensor: Sensor, here: Iterate, at_hand: tuple[Tangent, FloatArray]
         np.array([touch_normal(sensor, t, here.state) for t in here.touches]),
         moves[: 3 * m],
         sag,
+        misfit_with_lost(here.rows.residual - known, columns, here.rows),
     )
 
 

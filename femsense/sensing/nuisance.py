@@ -210,7 +210,7 @@ def _together(knowledge: Knowledge, frames: list[tuple[Rows, FloatArray]]) -> fl
 
 def _kernel(knowledge: Knowledge, places: FloatArray) -> FloatArray:
     """Return smooth weights of each place to each centre, squares summing to 1, shape (r, p)."""
-    squared = ((places[:, None, :] - knowledge.centres[None]) ** 2).sum(axis=2)
+    squared = sum((places[:, None, i] - knowledge.centres[None, :, i]) ** 2 for i in range(3))
     weight = np.exp(-0.5 * (squared - squared.min(axis=1, keepdims=True)) / knowledge.length**2)
     return np.asarray(weight / np.sqrt((weight**2).sum(axis=1, keepdims=True)))
 

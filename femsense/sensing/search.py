@@ -138,13 +138,11 @@ def evidence(sensor: Sensor, fit: Fit) -> tuple[FloatArray, FloatArray]:
     thin = np.arange(0, len(std), max(1, len(std) // THIN))
     share = len(std) / len(thin)
     N, z = columns[thin] / std[thin, None], residual[thin] / std[thin]
-    W = (rows.some(thin, answers) / std[thin, None]).reshape(len(thin), -1, 3)
-    W = np.einsum("rcj,cij->rci", W, frames).reshape(len(thin), -1)
+    W = frames @ (rows.some(thin, answers) / std[thin, None]).T.reshape(len(frames), 3, -1)  # of each candidate, (c, 3, t)
     inner = np.linalg.inv(N.T @ N + np.eye(N.shape[1]) / share)
-    Nz, NW = N.T @ z, N.T @ W
-    g = share * (W.T @ z - NW.T @ (inner @ Nz)).reshape(-1, 3)
-    W3, NW3 = W.reshape(len(z), -1, 3), NW.reshape(len(Nz), -1, 3)
-    M = share * (np.einsum("rci,rcj->cij", W3, W3) - np.einsum("qci,qp,pcj->cij", NW3, inner, NW3, optimize=True))
+    WN = W @ N
+    g = share * (W @ z - WN @ (inner @ (N.T @ z)))
+    M = share * (W @ W.transpose(0, 2, 1) - WN @ inner @ WN.transpose(0, 2, 1))
     prior = np.diag([1.0, ACROSS**-2, ACROSS**-2]) / sensor.options.force_std_n**2
     H = M + prior
     f = np.linalg.solve(H, g[:, :, None])[:, :, 0]
@@ -253,5 +251,10 @@ def _start(previous: SensedFrame | None, touches: Sequence[Touch]) -> tuple[Equi
 
 
 def _start_of(fit: Fit, touches: Sequence[Touch]) -> tuple[Equilibrium, FloatArray] | None:
-    """Return the state and forces of a fit as a start for as many touches."""
-    return (fit.state, fit.forces) if len(fit.touches) == len(touches) and touches else None
+    """Return the state of a fit as a start for touches, with the forces (m, 3) of those that lie where it has some."""
+    if not fit.touches or not touches:
+        return None
+    away = np.array([[float(np.linalg.norm(t.place - own.place)) for own in fit.touches] for t in touches])
+    nearest = away.argmin(axis=1)
+    mutual = away.argmin(axis=0)[nearest] == np.arange(len(touches))
+    return fit.state, fit.forces[nearest] * mutual[:, None]
