@@ -90,7 +90,7 @@ def _fit(
         else:
             damping *= 10.0
     _normal(residual, slopes, False, curve, step)
-    return cost
+    return float(cost)
 
 
 @njit(cache=True, nogil=True)
@@ -150,7 +150,7 @@ def _evaluate(
                 slopes[i, 3] = -size / scale
         z = abs(residual[i])
         total += z * z if z <= CUT else CUT * (2.0 * z - CUT)
-    return total
+    return float(total)
 
 
 @njit(cache=True, nogil=True)

@@ -175,7 +175,7 @@ class NormalEquations:
     def of_forces(self) -> ForceEquations:
         """Return the equations of the forces, all else eliminated."""
         f, A, b = self.force_count, self.matrix, self.right
-        eliminated = np.linalg.solve(A[f:, f:], np.column_stack([A[f:, :f], b[f:]]))
+        eliminated = np.asarray(np.linalg.solve(A[f:, f:], np.column_stack([A[f:, :f], b[f:]])), dtype=np.float64)
         left = A[:f, :f] - A[:f, f:] @ eliminated[:, :f]
         return ForceEquations(np.asarray(0.5 * (left + left.T)), b[:f] - A[:f, f:] @ eliminated[:, f], eliminated)
 

@@ -210,7 +210,9 @@ def _together(knowledge: Knowledge, frames: list[tuple[Rows, FloatArray]]) -> fl
 
 def _kernel(knowledge: Knowledge, places: FloatArray) -> FloatArray:
     """Return smooth weights of each place to each centre, squares summing to 1, shape (r, p)."""
-    squared = sum((places[:, None, i] - knowledge.centres[None, :, i]) ** 2 for i in range(3))
+    squared = np.zeros((len(places), len(knowledge.centres)))
+    for i in range(3):
+        squared += (places[:, None, i] - knowledge.centres[None, :, i]) ** 2
     weight = np.exp(-0.5 * (squared - squared.min(axis=1, keepdims=True)) / knowledge.length**2)
     return np.asarray(weight / np.sqrt((weight**2).sum(axis=1, keepdims=True)))
 
