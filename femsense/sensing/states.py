@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from femsense.core.arrays import FloatArray
 from femsense.core.errors import DataError
 from femsense.fem.equilibrium import Equilibrium, SolveOptions
-from femsense.fem.newton_state import NewtonOptions
 from femsense.model.frame_state import solve_frame
 from femsense.sensing.touches import nodal_forces
 from femsense.sensing.types import Sensor, Touch
@@ -16,8 +15,6 @@ EXACT = 1e-9
 """Unbalanced force, relative to all loads, of a state that is a result."""
 ROUGH = 1e-6
 """The same of the states on the way to the forces."""
-TRIED = NewtonOptions(steps_tried=12, indefinite_tried=2)
-"""States that are tried start from what the tangent foretells: those that were taken needed ten steps at most, one of them indefinite."""
 
 
 def free_state(sensor: Sensor, k: int, start: Equilibrium | None, before: tuple[FloatArray, ...] | None) -> Equilibrium:
@@ -54,7 +51,7 @@ def _solve(
     tried: bool,
 ) -> Equilibrium:
     tolerance = ROUGH if tried else EXACT
-    options = SolveOptions(before=before, reuse_factor=start is not None, relative_tolerance=tolerance, rough=tried, newton=TRIED)
+    options = SolveOptions(before=before, reuse_factor=start is not None, relative_tolerance=tolerance, rough=tried)
     state = solve_frame(sensor.driven, k, start=start, nodal_forces=loads, options=options)
     if not state.converged:
         raise DataError(f"no equilibrium: {state.status}: {state.advice}")
