@@ -1,6 +1,6 @@
 """Small inputs that once went wrong: what the commands make of each now, beside what they made of it before.
 
-    python benchmarks/trials.py FOLDER [--only NAME …]
+    python benchmarks/trials.py FOLDER [--only NAME …] [--page docs/trials.md]
 
 FOLDER holds the inputs (data/trials): robots, recordings and files, each of a kind.
 Every row runs the commands a user would run, in a folder of its own, and prints their exit status, forces and what they say.
@@ -101,7 +101,7 @@ def call(arguments: Sequence[str]) -> tuple[int, str, list[str]]:
     with warnings.catch_warnings(record=True) as heard, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         warnings.simplefilter("always")
         status = cli.run(list(arguments))
-    said = [line.removeprefix("warning: ") for line in err.getvalue().splitlines() if line.strip()]
+    said = [line.removeprefix("warning: ").removeprefix("femsense: ") for line in err.getvalue().splitlines() if line.strip()]
     return status, out.getvalue(), said + [str(w.message) for w in heard]
 
 
@@ -145,11 +145,19 @@ def result_of(trial: Trial, data: Path, folder: Path) -> str:
     return f"rc 0: {forces(folder / 'run')}" + (f" ({told})" if told else "")
 
 
+def put(row: str, page: Path) -> None:
+    """Put a row in the place of that of the same input in a page."""
+    begin = row[: row.index("` |") + 3]
+    lines = [row if line.startswith(begin) else line for line in page.read_text(encoding="utf-8").splitlines()]
+    page.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("data", type=Path)
     parser.add_argument("--only", nargs="*", default=None, help="names of rows")
     parser.add_argument("--json", type=Path, help="also write the rows there")
+    parser.add_argument("--page", type=Path, help="put the rows in the place of those of the same name in this page")
     options = parser.parse_args()
     print("| input | what it is | before | now |\n|---|---|---|---|")
     rows = []
@@ -160,7 +168,10 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as folder:
             now = result_of(trial, options.data.absolute(), Path(folder)).replace("|", "/")
         rows.append({"name": trial.name, "now": now, "seconds": time.process_time() - began})
-        print(f"| `{trial.name}` | {trial.essence} | {trial.before} | {now} |", flush=True)
+        row = f"| `{trial.name}` | {trial.essence} | {trial.before} | {now} |"
+        print(row, flush=True)
+        if options.page:
+            put(row, options.page)
     if options.json:
         options.json.write_text(json.dumps(rows, indent=1))
 
