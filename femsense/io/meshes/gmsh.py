@@ -59,6 +59,8 @@ class _Stream:
 
     def rows(self, count: int, kinds: str) -> FloatArray:
         """Return `count` rows of numbers, one letter each: i (4 bytes), q (8 bytes), d (a double)."""
+        if not kinds:
+            return np.zeros((count, 0))
         if not self._binary:
             size = count * len(kinds)
             part = self._words[self._at : self._at + size]
@@ -124,7 +126,7 @@ def _parsed(data: bytes, where: str) -> MeshContent:
         return _content(*_nodes_2(open_section("Nodes")), lines, where)
     if not version.startswith("4"):
         raise InputError("a version of Gmsh's format that is not read", where=where, found=version, expected="1, 2.x, 4.0 or 4.1")
-    new = not version.startswith("4.0")
+    new = version != "4" and not version.startswith("4.0")  # Gmsh writes 4.0 as 4
     groups = _groups(open_section("Entities"), new) if b"$Entities" in data else {}
     return _content(*_nodes_4(open_section("Nodes"), new), _elements_4(open_section("Elements"), new, groups), where)
 

@@ -15,6 +15,8 @@ from femsense.io.meshes.content import MeshContent, joined
 from femsense.io.meshes.gmsh import read_gmsh
 from femsense.io.meshes.vtu import listed_files, read_own, split_pieces
 
+NASTRAN = (".bdf", ".nas", ".fem")
+
 
 def file_format(path: Path) -> str | None:
     """Return meshio's name of a mesh file's format from its content; None where only the ending says it."""
@@ -73,6 +75,11 @@ def _read(path: Path, where: str) -> MeshContent:
         folder = tempfile.TemporaryDirectory(prefix="femsense-")
         with folder:
             return joined([_through_meshio(file, kind) for file in split_pieces(path, folder)])
+    if path.suffix.lower() in NASTRAN and b"BEGIN BULK" not in (data := path.read_bytes()):
+        with tempfile.TemporaryDirectory(prefix="femsense-") as place:  # Gmsh leaves the line out, and meshio asks for it
+            whole = Path(place, path.name)
+            whole.write_bytes(b"BEGIN BULK\n" + data)
+            return _through_meshio(whole, kind)
     return _through_meshio(path, kind)
 
 

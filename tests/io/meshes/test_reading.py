@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import meshio
@@ -281,3 +283,35 @@ def test_files_that_went_wrong(name: str, low: float, high: float) -> None:
     mesh = read_tets(TRIALS / name)
     assert len(mesh.tets) == 192 and len(surface_triangles(mesh)) == 144
     np.testing.assert_allclose([mesh.nodes[:, 0].min(), mesh.nodes[:, 0].max()], [low, high])
+
+
+GMSH = """
+import gmsh, sys
+gmsh.initialize(); gmsh.option.setNumber("General.Terminal", 0)
+ends = [(3, gmsh.model.occ.addBox(x, 0, 0, 3, 1, 1)) for x in (0, 3)]
+gmsh.model.occ.fragment(ends[:1], ends[1:]); gmsh.model.occ.synchronize()
+for tag, name in ((1, "soft"), (2, "hard")):
+    gmsh.model.addPhysicalGroup(3, [tag], name=name)
+gmsh.option.setNumber("Mesh.MeshSizeMax", 2); gmsh.model.mesh.generate(3)
+for name, version, binary in (("a1", 1, 0), ("a2", 2.2, 1), ("a4", 4, 0), ("a41", 4.1, 1)):
+    gmsh.option.setNumber("Mesh.MshFileVersion", version); gmsh.option.setNumber("Mesh.Binary", binary); gmsh.write(name + ".msh")
+gmsh.option.setNumber("Mesh.Binary", 0)
+for ending in ("bdf", "inp", "vtk", "mesh"):
+    gmsh.write("a." + ending)
+gmsh.finalize()
+"""
+
+
+def test_what_gmsh_itself_writes(tmp_path: Path) -> None:
+    """Binary 4.1 with entities that are in no group, 4.0 that calls itself 4, Nastran without BEGIN BULK."""
+    pytest.importorskip("gmsh")
+    subprocess.run([sys.executable, "-c", GMSH], cwd=tmp_path, check=True, capture_output=True, timeout=120)
+    files = sorted(tmp_path.glob("a*"))
+    assert len(files) == 8
+    for file in files:
+        content = read_content(file, str(file))
+        corners = content.points[content.cells["tetra"]]
+        volume = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1])).sum() / 6
+        assert volume == pytest.approx(6.0, rel=1e-6), file.name
+    for name in ("a4.msh", "a41.msh"):
+        assert set(np.unique(tet_values(tmp_path / name, "gmsh:physical", "here"))) == {1, 2}
