@@ -63,7 +63,7 @@ def build_robot(table: RobotTable, document: dict[str, Any], path: Path) -> Robo
             expected="a positive Jacobian",
             hint='straight edges: element = "tet4", or a linear mesh',
         )
-    _warn_of_units(table, path)
+    _check_units(table, path)
     points = _marker_points(mesh, table.markers, path)
     color = table.appearance.color_rgb
     return Robot(
@@ -271,8 +271,8 @@ def _far(what: str, where: str, point: Sequence[float], distance: float, limit: 
     )
 
 
-def _warn_of_units(table: RobotTable, path: Path) -> None:
-    """Warn of what can be computed but is hardly meant."""
+def _check_units(table: RobotTable, path: Path) -> None:
+    """Warn of what can be computed but is hardly meant. Raises InputError where gravity is that of no place."""
     if table.material.young_modulus_pa < 1e3:
         warnings.warn(
             (
@@ -290,12 +290,12 @@ def _warn_of_units(table: RobotTable, path: Path) -> None:
             stacklevel=4,
         )
     if table.gravity and np.linalg.norm(table.gravity.vector_m_s2) > 100.0:
-        warnings.warn(
-            (
-                f"{at_key(path, 'gravity', 'vector_m_s2')}: {table.gravity.vector_m_s2} is more than ten times gravity; is "
-                f"it in mm/s²?"
-            ),
-            stacklevel=4,
+        raise InputError(
+            "more than ten times gravity",
+            where=at_key(path, "gravity", "vector_m_s2"),
+            found=f"{table.gravity.vector_m_s2} m/s²",
+            expected="[0.0, 0.0, -9.81], in the robot frame",
+            hint="is it in mm/s²?",
         )
     if table.gravity and abs(np.linalg.norm(table.gravity.vector_m_s2) - 1.0) < 0.02:
         warnings.warn(

@@ -15,7 +15,7 @@ from femsense.model.marker_units import check_marker_distances
 from femsense.model.recording import Recording, with_marker_table
 from femsense.model.recording_parts import RestMarkers
 from femsense.model.robot import Robot
-from femsense.model.stale_markers import without_far_markers, without_stale_markers
+from femsense.model.stale_markers import without_far_markers, without_stale_markers, without_twins
 
 SLOW = 5.0
 """Frames that are farther apart than this [s] are more likely counted in milliseconds: cameras take 5 to 90 a second."""
@@ -36,7 +36,7 @@ def check_against(robot: Robot, recording: Recording) -> Recording:
         DataError: markers in another unit.
     """
     diagonal = float(np.linalg.norm(np.ptp(np.vstack([robot.body.mesh.nodes, robot.marker_points]), axis=0)))
-    measured = without_far_markers(without_stale_markers(recording), diagonal)
+    measured = without_far_markers(without_stale_markers(without_twins(recording)), diagonal)
     fitted = _without_strangers(robot, _with_chamber_order(robot, _with_cable_order(robot, measured)))
     check_marker_distances(robot, fitted)
     _check_loads(robot, fitted)

@@ -1,4 +1,4 @@
-"""Rows of markers that cannot be places: far from all others, or where they were before.
+"""Rows of markers that cannot be places: far from all others, where they were before, or where another one is.
 
 Noise never repeats a place to the last digit.
 """
@@ -71,6 +71,23 @@ def without_stale_markers(recording: Recording) -> Recording:
         return recording
     _warn(r, stale, "to the last digit where it was in the frame before, as of a lost marker; left out")
     return _kept(r, ~stale)
+
+
+def without_twins(recording: Recording) -> Recording:
+    """Return the recording without rows of one frame that stand at the same place to the last digit, and warn of them:
+    one of their names is wrong, or none of them was seen.
+
+    Arguments:
+        recording: whose rows are checked.
+    """
+    r = recording
+    keys = np.column_stack([r.marker_frame, r.marker_view, r.marker_xyz])
+    _, group, count = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
+    twins = np.asarray(count[group.ravel()] > 1)
+    if not twins.any():
+        return recording
+    _warn(r, twins, "at the same place as another marker of the frame; left out")
+    return _kept(r, ~twins)
 
 
 def _warn(r: Recording, bad: BoolArray, what: str) -> None:

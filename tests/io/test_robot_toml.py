@@ -184,6 +184,11 @@ def test_a_modulus_in_kpa_warns(tmp_path: Path) -> None:
         load_robot(write_block_robot(tmp_path, material__young_modulus_pa=150.0))
 
 
+def test_a_gravity_in_millimetres_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"more than ten times gravity[\s\S]*is it in mm/s²"):
+        load_robot(write_block_robot(tmp_path, gravity__vector_m_s2=[0.0, 0.0, -9810.0]))
+
+
 def test_a_density_in_grams_per_cubic_centimetre_warns(tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match=r"1\.07 kg/m³ is lighter than any foam; is it in g/cm³"):
         load_robot(write_block_robot(tmp_path, material__density_kg_m3=1.07))

@@ -7,7 +7,7 @@ import pytest
 
 from femsense.model.recording import Recording, make_recording
 from femsense.model.recording_parts import Drives, MarkerRows, Timeline
-from femsense.model.stale_markers import without_far_markers, without_stale_markers
+from femsense.model.stale_markers import without_far_markers, without_stale_markers, without_twins
 
 F, M = 6, 4
 
@@ -60,3 +60,15 @@ def test_one_row_far_from_the_others_is_left_out_but_not_another_unit() -> None:
     with pytest.warns(UserWarning, match="left out: d in frame 2"):
         assert len(without_far_markers(recorded(xyz, np.zeros(F)), 10.0).marker_frame) == F * M - 1
     assert len(without_far_markers(recorded(1e3 * xyz, np.zeros(F)), 10.0).marker_frame) == F * M
+
+
+def test_two_markers_at_one_place_are_both_left_out() -> None:
+    xyz = noisy()
+    xyz[2, 3] = xyz[2, 0]
+    xyz[4, 1] = xyz[3, 2]  # of another frame
+    with pytest.warns(UserWarning, match="another marker of the frame; left out: a in frame 2, d in frame 2$"):
+        r = without_twins(recorded(xyz, np.arange(F)))
+    rows = set(zip(r.marker_frame.tolist(), r.marker_index.tolist()))
+    assert {(k, m) for k in range(F) for m in range(M)} - rows == {(2, 0), (2, 3)}
+    plain = recorded(noisy(), np.arange(F))
+    assert without_twins(plain) is plain
