@@ -198,7 +198,6 @@ def test_labels_swapped_in_all_frames_are_named_where_the_body_moves() -> None:
         calibrate(arm(), with_marker_table(recording, *table))
 
 
-@pytest.mark.parametrize(("vector", "unit"), [([0.0, 0.0, -1.0], "is it in g"), ([0.0, -9810.0, 0.0], "is it in mm/s²")])
-def test_gravity_in_another_unit_is_mentioned(tmp_path: Path, vector: list[float], unit: str) -> None:
-    with pytest.warns(UserWarning, match=unit):
-        load_robot(write_block_robot(tmp_path, gravity={"vector_m_s2": vector}))
+def test_gravity_in_another_unit_is_mentioned(tmp_path: Path) -> None:
+    with pytest.warns(UserWarning, match="is it in g"):
+        load_robot(write_block_robot(tmp_path, gravity={"vector_m_s2": [0.0, 0.0, -1.0]}))
