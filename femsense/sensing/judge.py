@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from femsense.calib.scan import Scan
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import DataError
 from femsense.fem.compliance import tangent_at
 from femsense.fem.mesh import TetMesh
-from femsense.sensing.measurement_rows import rows_at
-from femsense.sensing.nuisance import FAR_OFF, misfit, sag_at
+from femsense.sensing.measurement_rows import rows_at, seen_through
+from femsense.sensing.nuisance import FAR_OFF, misfit, nuisance_excess, sag_at
 from femsense.sensing.types import Fit, SensedFrame, Sensor
 
 OK = "ok"
@@ -30,8 +31,9 @@ under a plate on a soft dome elements fall to 0 and the force is half of the tru
 def status_of(sensor: Sensor, fit: Fit, free: Fit) -> str:
     """Return "ok", or in words why the result of a frame is not to be trusted.
 
-    Not to be trusted is a residual far above what the free frames leave, with or without contacts; a force that is less than its standard
-    deviation while the frame is not explained; forces that were still changing; and a body squeezed beyond what its model holds for.
+    Not to be trusted is a residual far above what the free frames leave, with or without contacts, or a smooth error that is; a force that is
+    less than its standard deviation while the frame is not explained; forces that were still changing; and a body squeezed beyond what its
+    model holds for.
     """
     if fit.touches and not fit.still and fit.rows.rms > UNSETTLED * free.rows.rms + 3.0 * float(np.median(free.rows.std)):
         return f"the forces have not settled: {1e3 * fit.rows.rms:.2f} mm are left of {1e3 * free.rows.rms:.2f}"
@@ -47,6 +49,12 @@ def status_of(sensor: Sensor, fit: Fit, free: Fit) -> str:
         times = f"{np.sqrt(left / limit_of(sensor, fit)):.1f} times what free frames leave"
         size = times if limit_of(sensor, fit) != FAR_OFF else f"{np.sqrt(left):.1f} standard deviations"
         return f"not explained: {1e3 * fit.rows.rms:.2f} mm are left, {size}, {what}"
+    excess = shared_errors(sensor, fit)
+    if excess > sensor.knowledge.nuisance_limit:
+        times = np.sqrt(excess / sensor.knowledge.nuisance_limit)
+        return (
+            f"not explained: a smooth error takes up what is left, {times:.1f} times as large as free frames and noise let expect"
+        )
     unsure = [i for i, f in enumerate(fit.forces) if np.linalg.norm(f) < _std_along(fit, i) and not unspoken(fit, i)]
     if unsure and fit.touches[unsure[0]].source != "given":
         return "a contact whose force is less than its standard deviation"
@@ -70,6 +78,20 @@ def beside_markers(sensor: Sensor, k: int, fit: Fit) -> str:
     return f"the markers lie {1e3 * off:.1f} mm off the body that was found in the cloud{color}"
 
 
+def behind_body(sensor: Sensor, scan: Scan, fit: Fit) -> str:
+    """Return "ok", or in words how much is seen behind the body where only the shape tells the robot's points from others.
+
+    What the state does not explain is then left out as something else, and what is kept fits well.
+    """
+    share = 0.0 if scan.segmented else seen_through(sensor, scan, fit.state)
+    if share <= sensor.knowledge.through_limit:
+        return OK
+    return (
+        f"{100 * share:.0f} % of the points lie behind the body: parts of it may have been taken for something else; "
+        "appearance.color_rgb and coloured clouds tell them apart"
+    )
+
+
 def chi_squared(fit: Fit) -> FloatArray:
     """Return how far each force of a fit is from none, squared, in standard deviations, shape (m,); 0 where none is known."""
     blocks = [fit.covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] for i in range(len(fit.touches))]
@@ -88,6 +110,13 @@ def left_over(sensor: Sensor, fit: Fit) -> float:
     """Return the misfit per row that a fit leaves, about 1 where all is explained."""
     sag = sag_at(sensor, fit.state, tangent_at(sensor.robot.body, fit.state)) if fit.sag is None else fit.sag
     return misfit(sensor.knowledge, fit.rows, sag)
+
+
+def shared_errors(sensor: Sensor, fit: Fit) -> float:
+    """Return χ² of the smooth errors that a fit needs over what is to be expected (see `nuisance_excess`)."""
+    if not fit.rows.of_clouds:
+        return 0.0
+    return nuisance_excess(sensor.knowledge, fit.rows, sag_at(sensor, fit.state, tangent_at(sensor.robot.body, fit.state)))
 
 
 def least_stretch(mesh: TetMesh, positions: FloatArray, carrying: IntArray) -> float:

@@ -8,7 +8,7 @@ import numpy as np
 
 from femsense.calib.calibration import Calibration
 from femsense.calib.checks import true_labels
-from femsense.calib.scan import REACH, Scan, ray_rows
+from femsense.calib.scan import OFF, REACH, Scan, ray_rows
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import DataError
 from femsense.fem.equilibrium import Equilibrium
@@ -20,6 +20,8 @@ FEWEST = 30
 """Fewer points of the robot than this tell nothing of its shape."""
 CATCH = 0.2
 """Where most rays miss a state that is still far off, points count by the closest face within this share of the body's diagonal."""
+BEHIND = 0.01
+"""A point lies behind the body that is farther behind its face than this share of the body's diagonal."""
 MANY = 0.7
 """Share of the points that have to be met before their rays alone are asked."""
 
@@ -45,7 +47,7 @@ def _ray_rows(sensor: Sensor, scan: Scan, state: Equilibrium) -> Rows:
     return Rows(
         functional=lambda u: np.asarray(move @ u.reshape(len(u), -1).T),
         residual=rows.residual,
-        std=rows.std,
+        std=sensor.knowledge.rough * rows.std,
         by_pose=rows.by_pose(sensor.pivot, len(poses)),
         place=rest,
         way=np.linalg.norm(rows.hits.place(state.positions) - rest, axis=1),
@@ -56,6 +58,22 @@ def _ray_rows(sensor: Sensor, scan: Scan, state: Equilibrium) -> Rows:
         together=sensor.knowledge.together,
         operator=move,
     )
+
+
+def seen_through(sensor: Sensor, scan: Scan, state: Equilibrium) -> float:
+    """Return the share of the points that lie behind the body on their ray, farther than the model or the noise may be off [1].
+
+    No camera sees through the body: where it stands elsewhere than the state has it, its points are taken for something else behind it.
+    """
+    poses = sensor.calibration.poses
+    points, origins = scan.surroundings(poses), np.array([T[:3, 3] for T in poses])[scan.others_view]
+    if not len(points):
+        return 0.0
+    hits = Surface(state.positions, sensor.surface.triangles).cast(points, origins, reach=np.inf)
+    depth = np.linalg.norm(points - origins, axis=1)[hits.index]
+    std = np.array([float(sensor.knowledge.noises[v].std(d)) for v, d in zip(scan.others_view[hits.index], depth)])
+    behind = hits.distance < -np.maximum(OFF * std * hits.cosine, BEHIND * sensor.size)
+    return float(behind.sum() / (len(scan.view) + behind.sum()))
 
 
 def _marker_rows(sensor: Sensor, k: int, state: Equilibrium) -> Rows:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import block_diag
+from scipy.stats import chi2
 
 from femsense.core.arrays import FloatArray, freeze
 from femsense.fem.assembly import internal
@@ -22,9 +24,17 @@ CELL = 0.5
 """Points within this share of the length of shared errors may err together."""
 OUTLIER = 5.0
 """Where a frame is judged, whitened residuals beyond this count as this."""
-BIAS_STEPS = np.concatenate([[0.0], 1e-5 * 2.0 ** np.arange(9)])
-SHARE_STEPS = np.concatenate([[0.0], 0.00125 * 2.0 ** np.arange(7)])
-"""Sizes of the shared errors that are tried: 0.01 … 2.6 mm, and 0.1 … 8 % of the way."""
+BIAS_STEPS = 5e-6 * 2.0 ** np.arange(10)
+SHARE_STEPS = 0.000625 * 2.0 ** np.arange(8)
+"""Sizes of the shared errors that are tried: 0.005 … 2.6 mm, and 0.06 … 8 % of the way."""
+SIZES_STD = 8.0
+"""By what factor they may be off from those that are expected beforehand."""
+FIRST_BIAS, FIRST_SHARE = 1e-4, 0.01
+"""The sizes before a free frame is seen [m], [1]."""
+ALIKE_STEPS = (0.0, 0.5, 0.8, 0.95)
+"""Shares of the variance of the shared errors that may be alike in all free frames."""
+SELDOM = 1e-3
+"""How often noise alone may say that a frame is not explained."""
 FAR_OFF = 9.0
 """Misfit per row that says that a frame is not explained where no free frame tells more: three standard deviations everywhere."""
 DRIVE_STD = 0.05
@@ -59,14 +69,15 @@ def first_knowledge(
     v = len(pose_covariance)
     root = np.diag(np.concatenate([np.zeros(v), [modulus_std], np.full(drives, DRIVE_STD)]))
     root[:v, :v] = _root(pose_covariance)
+    fields = np.repeat([FIRST_BIAS, FIRST_SHARE], len(centres))
     return Knowledge(
         noises=noises,
         centres=freeze(centres),
         length=0.7 * _spacing(centres, size),
-        bias_m=1e-4,
-        model_share=0.01,
-        common_mean=freeze(np.zeros(v + 1 + drives)),
-        common_root=freeze(root),
+        bias_m=FIRST_BIAS,
+        model_share=FIRST_SHARE,
+        mean=freeze(np.zeros(len(root) + len(fields))),
+        root=freeze(block_diag(root, np.diag(fields))),
         gain_limit=LIKELY_GAIN,
         misfit_limit=FAR_OFF,
     )
@@ -94,17 +105,21 @@ def sag_at(sensor: Sensor, state: Equilibrium, tangent: Tangent) -> FloatArray:
 
 def pulls_of(sensor: Sensor) -> int:
     """Return how many pulls of cables and chambers the free frames were asked for."""
-    return len(sensor.knowledge.common_mean) - 6 * len(sensor.calibration.poses) - 1
+    return commons(sensor.knowledge) - 6 * len(sensor.calibration.poses) - 1
+
+
+def commons(knowledge: Knowledge) -> int:
+    """Return how many numbers all frames have in common beside shared errors: pose steps, modulus and pulls."""
+    return len(knowledge.mean) - 2 * len(knowledge.centres)
 
 
 def nuisance_columns(knowledge: Knowledge, rows: Rows, sag: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the columns of unit nuisance (r, q) [m] and what the free frames say that they add to the residual (r,) [m]."""
-    common = common_columns(rows, sag)
     field = _kernel(knowledge, rows.place)
-    own = [common @ knowledge.common_root]
-    own += [knowledge.bias_m * field] if knowledge.bias_m > 0 else []
-    own += [knowledge.model_share * rows.way[:, None] * field] if knowledge.model_share > 0 else []
-    return np.hstack(own), common @ knowledge.common_mean
+    every = np.hstack([common_columns(rows, sag), field, rows.way[:, None] * field])
+    mean = knowledge.mean.copy()
+    mean[commons(knowledge) :] *= rows.of_clouds  # markers do not see what clouds have alike
+    return every @ knowledge.root, every @ mean
 
 
 def common_columns(rows: Rows, sag: FloatArray) -> FloatArray:
@@ -112,16 +127,15 @@ def common_columns(rows: Rows, sag: FloatArray) -> FloatArray:
     return np.hstack([rows.by_pose, rows.functional(sag)])
 
 
-def response_std(knowledge: Knowledge, drives: int) -> float:
-    """Return how far the model's answer to a force may be off beside its answer to gravity, relative [1].
+def response_std(knowledge: Knowledge, cameras: int) -> float:
+    """Return how far the model's answer to a force may be off beside its answer to gravity and cables, relative [1].
 
-    Cables pull as declared, but the model needs other pulls to move as the body does (mesh, law, ties): what it needs of a cable, it needs of a contact.
-    The root mean square of the pulls that the free frames ask for; 0 where they were not asked.
+    Gravity and cables pull as declared, but the model needs another modulus or other pulls to move as the body does (mesh, law, ties): what it
+    needs of them, it needs of a contact. The root mean square of the pulls that the free frames ask for, and that of the modulus beside it.
     """
-    if drives == 0:
-        return 0.0
-    variance = (knowledge.common_root[-drives:] ** 2).sum(axis=1)
-    return float(np.sqrt((knowledge.common_mean[-drives:] ** 2 + variance).mean()))
+    asked = np.arange(6 * cameras, commons(knowledge))
+    square = knowledge.mean[asked] ** 2 + (knowledge.root[asked] ** 2).sum(axis=1)
+    return float(np.sqrt(square[0] + (square[1:].mean() if len(asked) > 1 else 0.0)))
 
 
 def robust_std(rows: Rows, residual: FloatArray) -> FloatArray:
@@ -138,8 +152,8 @@ def cut_of(z: FloatArray) -> float:
 def learn(knowledge: Knowledge, frames: list[tuple[Rows, FloatArray]]) -> Knowledge:
     """Return what free frames teach.
 
-    How many neighbouring points err together; pose and modulus with the sizes of the two shared errors, by maximum likelihood over a grid; then how
-    large the misfit is that free frames leave.
+    How many neighbouring points err together and how rough they are; pose, modulus and pulls, and the shared errors: what all frames have of
+    them alike, and the sizes of both, by maximum likelihood over a grid; then how large misfit and nuisance are that free frames leave.
 
     Arguments:
         knowledge: what was known before.
@@ -147,19 +161,49 @@ def learn(knowledge: Knowledge, frames: list[tuple[Rows, FloatArray]]) -> Knowle
     """
     if not frames:
         return knowledge
-    v = knowledge.common_root.shape[0] - len(frames[0][1])  # pose steps
-    wider = np.append(np.full(v, APART if len(frames[0][1]) > 1 else 1.0), np.ones(len(frames[0][1])))
-    first = replace(knowledge, common_root=freeze(wider[:, None] * knowledge.common_root))
+    first = _Prior.of(knowledge, frames[0][1])
+    weighed = frames
     for _ in range(2):  # the second time with what the first left
-        frames = [(replace(rows, together=knowledge.together if rows.of_clouds else 1.0), sag) for rows, sag in frames]
-        grams = [_gram(knowledge, rows, sag) for rows, sag in frames]
-        knowledge = _fit_common(knowledge, grams, first)
-        for _ in range(2):
-            knowledge = _fit_field(knowledge, grams, _most(frames))
-            knowledge = _fit_common(knowledge, grams, first)
-        knowledge = replace(knowledge, together=_together(knowledge, frames))
-    misfits = np.array([misfit(knowledge, rows, sag) for rows, sag in frames if rows.of_clouds])
-    return replace(knowledge, misfit_limit=float(misfits.max() + 3.0 * max(misfits.std(), 0.05)))
+        weighed = [(_weighed(knowledge, rows), sag) for rows, sag in frames]
+        grams = [_gram(knowledge, rows, sag) for rows, sag in weighed]
+        knowledge = first.posterior(_fit_field(knowledge, grams, first), grams)
+        rough = knowledge.rough * max(1.0, _scatter(knowledge, weighed))
+        knowledge = replace(knowledge, together=_together(knowledge, weighed), rough=rough)
+    knowledge = _alike(knowledge, [_gram(knowledge, _weighed(knowledge, rows), sag) for rows, sag in frames])
+    clouds = [(_weighed(knowledge, rows), sag) for rows, sag in frames if rows.of_clouds]
+    if not clouds:
+        return knowledge
+    misfits = np.array([misfit(knowledge, rows, sag) for rows, sag in clouds])
+    excess = np.array([nuisance_excess(knowledge, rows, sag) for rows, sag in clouds])
+    through = np.array([rows.through for rows, _ in clouds])
+    return replace(
+        knowledge,
+        misfit_limit=_limit(misfits, 0.05),
+        nuisance_limit=max(1.0, _limit(excess, 0.05)),
+        through_limit=_limit(through, 0.01),
+    )
+
+
+def _limit(seen: FloatArray, least: float) -> float:
+    """Return what a value may be at most that was so large in free frames; they scatter by `least` at least."""
+    return float(seen.max() + 3.0 * max(seen.std(), least))
+
+
+def nuisance_excess(knowledge: Knowledge, rows: Rows, sag: FloatArray) -> float:
+    """Return χ² of the fitted nuisance over what noise and free frames let expect of it once in 1000 frames [1].
+
+    The nuisance is a smooth error, and may take up what touches: the rows then fit well, and only its size tells.
+    With unit prior and N = AᵀA of the whitened columns, the fitted nuisance has the covariance N (N + 1)⁻¹; its χ² is that of a gamma
+    distribution with the same mean and variance (Satterthwaite 1946).
+    """
+    columns, known = nuisance_columns(knowledge, rows, sag)
+    residual = rows.residual - known
+    fitted = misfit_of(residual, columns, rows)[1]
+    A = columns / robust_std(rows, residual)[:, None]
+    seen = np.linalg.eigvalsh(A.T @ A)
+    share = np.maximum(seen, 0.0) / (1.0 + np.maximum(seen, 0.0))
+    degrees = share.sum() ** 2 / max(float((share**2).sum()), 1e-12)
+    return float(fitted @ fitted / max(share.sum() / degrees * chi2.isf(SELDOM, degrees), 1e-12)) if degrees > 0 else 0.0
 
 
 def misfit(knowledge: Knowledge, rows: Rows, sag: FloatArray) -> float:
@@ -217,55 +261,97 @@ def _kernel(knowledge: Knowledge, places: FloatArray) -> FloatArray:
     return np.asarray(weight / np.sqrt((weight**2).sum(axis=1, keepdims=True)))
 
 
+def _weighed(knowledge: Knowledge, rows: Rows) -> Rows:
+    """Return rows as they are to be weighed: rough, and together."""
+    return replace(rows, std=knowledge.rough * rows.std, together=knowledge.together) if rows.of_clouds else rows
+
+
+def _scatter(knowledge: Knowledge, frames: list[tuple[Rows, FloatArray]]) -> float:
+    """Return how the points of the clouds scatter about what the nuisance fits, in standard deviations (median)."""
+    left = [np.abs(whitened_rest(knowledge, rows, sag)) for rows, sag in frames if rows.of_clouds]
+    return 1.483 * float(np.median(np.concatenate(left))) if left else 1.0
+
+
 def _gram(knowledge: Knowledge, rows: Rows, sag: FloatArray) -> FloatArray:
-    """Return all inner products of (field, way × field, common, residual) in whitened rows, shape (2p + c + 1,) squared."""
+    """Return all inner products of (common, field, way × field, residual) in whitened rows, shape (c + 2p + 1,) squared."""
     std = robust_std(rows, rows.residual)
     field = rows.of_clouds * _kernel(knowledge, rows.place)  # that of a marker is in its standard deviation
-    A = np.hstack([field, rows.way[:, None] * field, common_columns(rows, sag), rows.residual[:, None]]) / std[:, None]
+    A = np.hstack([common_columns(rows, sag), field, rows.way[:, None] * field, rows.residual[:, None]]) / std[:, None]
     return np.asarray(A.T @ A)
 
 
-def _projected(knowledge: Knowledge, gram: FloatArray) -> tuple[FloatArray, float]:
-    """Return the inner products of (common, residual) with the field as correlated noise, and log det of its covariance."""
-    p = 2 * len(knowledge.centres)
-    scale = np.concatenate([np.full(p // 2, knowledge.bias_m), np.full(p // 2, knowledge.model_share)])
-    core = np.eye(p) + scale[:, None] * gram[:p, :p] * scale
-    side = scale[:, None] * gram[:p, p:]
-    return gram[p:, p:] - side.T @ np.linalg.solve(core, side), float(np.linalg.slogdet(core)[1])
+def _sizes(knowledge: Knowledge) -> FloatArray:
+    """Return the size of each coefficient of the shared errors, shape (2p,)."""
+    return np.repeat([knowledge.bias_m, knowledge.model_share], len(knowledge.centres))
 
 
-def _fit_common(knowledge: Knowledge, grams: list[FloatArray], first: Knowledge) -> Knowledge:
-    """Return pose steps and modulus with their covariance, from their first prior and the free frames together."""
-    total = np.asarray(sum(_projected(knowledge, gram)[0] for gram in grams))
-    normal, right, root = total[:-1, :-1], total[:-1, -1], first.common_root
-    inner = np.eye(root.shape[1]) + root.T @ normal @ root
-    mean = first.common_mean + root @ np.linalg.solve(inner, root.T @ (right - normal @ first.common_mean))
-    return replace(knowledge, common_mean=freeze(mean), common_root=freeze(root @ _root(np.linalg.inv(inner))))
+@dataclass(frozen=True, eq=False, slots=True)
+class _Prior:
+    """What was known of poses, modulus and pulls before the free frames."""
+
+    mean: FloatArray  # (c,)
+    root: FloatArray  # (c, j)
+
+    @classmethod
+    def of(cls, knowledge: Knowledge, moves: FloatArray) -> _Prior:
+        c = commons(knowledge)
+        wider = np.ones(c)
+        wider[: c - len(moves)] = APART if len(moves) > 1 else 1.0
+        return cls(knowledge.mean[:c], wider[:, None] * knowledge.root[:c])
+
+    def evidence(self, knowledge: Knowledge, grams: list[FloatArray]) -> float:
+        """Return −2 log evidence of the free frames, up to a constant."""
+        total, logdet = self._total(knowledge, grams)
+        mean, _, inner, right = self._solved(knowledge, total)
+        left = total[-1, -1] - 2.0 * mean @ total[:-1, -1] + mean @ total[:-1, :-1] @ mean
+        return float(left - right @ np.linalg.solve(inner, right) + logdet + np.linalg.slogdet(inner)[1])
+
+    def posterior(self, knowledge: Knowledge, grams: list[FloatArray]) -> Knowledge:
+        """Return what the free frames tell of all numbers, as a new frame will have them."""
+        mean, root, inner, right = self._solved(knowledge, self._total(knowledge, grams)[0])
+        own = np.append(np.zeros(commons(knowledge)), np.sqrt(1.0 - knowledge.alike) * _sizes(knowledge))
+        covariance = root @ np.linalg.solve(inner, root.T) + np.diag(own**2)
+        return replace(knowledge, mean=freeze(mean + root @ np.linalg.solve(inner, right)), root=freeze(_root(covariance)))
+
+    def _total(self, knowledge: Knowledge, grams: list[FloatArray]) -> tuple[FloatArray, float]:
+        """Return the inner products of all frames, what each has of its own as correlated noise, and log det of its covariance."""
+        c, total, logdet = commons(knowledge), np.zeros_like(grams[0]), 0.0
+        scale = np.sqrt(1.0 - knowledge.alike) * _sizes(knowledge)
+        for gram in grams:
+            core = np.eye(len(scale)) + scale[:, None] * gram[c:-1, c:-1] * scale
+            side = scale[:, None] * gram[c:-1]
+            total += gram - side.T @ np.linalg.solve(core, side)
+            logdet += float(np.linalg.slogdet(core)[1])
+        return total, logdet
+
+    def _solved(self, knowledge: Knowledge, total: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return mean and root beforehand, and the normal equations of unit numbers: matrix and right-hand side."""
+        mean = np.append(self.mean, np.zeros(2 * len(knowledge.centres)))
+        root = block_diag(self.root, np.diag(np.sqrt(knowledge.alike) * _sizes(knowledge)))
+        inner = np.eye(root.shape[1]) + root.T @ total[:-1, :-1] @ root
+        return mean, root, inner, root.T @ (total[:-1, -1] - total[:-1, :-1] @ mean)
 
 
-def _most(frames: list[tuple[Rows, FloatArray]]) -> tuple[float, float]:
-    """Return how large shared errors can be that no free frame contradicts: what the worst of them leaves [m], and that over the way from rest."""
-    clouds = [rows for rows, _ in frames if rows.of_clouds]
-    sizes = np.array([1.483 * np.median(np.abs(rows.residual)) for rows in clouds])
-    ways = np.array([np.sqrt(np.mean(rows.way**2)) for rows in clouds])
-    return float(sizes.max(initial=0.0)), float((sizes / np.maximum(ways, 1e-6)).max(initial=0.0))
+def _fit_field(knowledge: Knowledge, grams: list[FloatArray], first: _Prior) -> Knowledge:
+    """Return the sizes of the shared errors that are likeliest for these frames."""
+    tried = [replace(knowledge, bias_m=float(b), model_share=float(s)) for b in BIAS_STEPS for s in SHARE_STEPS]
+    return min(tried, key=lambda one: first.evidence(one, grams) + _beforehand(one))
 
 
-def _fit_field(knowledge: Knowledge, grams: list[FloatArray], most: tuple[float, float]) -> Knowledge:
-    """Return the sizes of the shared errors that are likeliest for these frames; they are no larger than what the frames leave.
+def _beforehand(knowledge: Knowledge) -> float:
+    """Return −2 log of the prior of the sizes of shared errors: where frames do not tell them, they stay as they were expected."""
+    odds = np.log([knowledge.bias_m / FIRST_BIAS, knowledge.model_share / FIRST_SHARE])
+    return float(((odds / np.log(SIZES_STD)) ** 2).sum())
 
-    Where the noise is far below the errors of the model, the field would else grow without bound: it is too smooth for them, and bends as far as it may.
-    """
-    x = np.append(-knowledge.common_mean, 1.0)
-    best, chosen = np.inf, knowledge
-    for bias in (0.0, *(float(b) for b in BIAS_STEPS[1:] if b <= most[0])):
-        for share in (0.0, *(float(s) for s in SHARE_STEPS[1:] if s <= most[1])):
-            tried = replace(knowledge, bias_m=bias, model_share=share)
-            parts = [_projected(tried, gram) for gram in grams]
-            value = sum(float(x @ left @ x) + logdet for left, logdet in parts)
-            if value < best:
-                best, chosen = value, tried
-    return chosen
+
+def _alike(knowledge: Knowledge, grams: list[FloatArray]) -> Knowledge:
+    """Return what the free frames have alike of the shared errors, and how much of them, about pose, modulus and pulls as they are known."""
+    c = commons(knowledge)
+    known = _Prior(knowledge.mean[:c], np.zeros((c, 0)))
+    best = min((replace(knowledge, alike=share) for share in ALIKE_STEPS), key=lambda one: known.evidence(one, grams))
+    told = known.posterior(best, grams)
+    root = block_diag(*(_root(part @ part.T) for part in (knowledge.root[:c], told.root[c:])))
+    return replace(told, mean=freeze(np.append(knowledge.mean[:c], told.mean[c:])), root=freeze(root))
 
 
 def _spacing(points: FloatArray, size: float) -> float:

@@ -51,7 +51,7 @@ def sense_as_published(sensor: Sensor, k: int, previous: SensedFrame | None) -> 
     state = solve_with(sensor, k, touches, forces, free)
     m = len(touches)
     fit = Fit(tuple(touches), state, forces, covariance, np.zeros((m, 3, 3)), rows, 0.0)
-    contacts = contacts_of(sensor, k, fit, previous)
+    contacts = contacts_of(sensor, k, fit, free, previous)
     after = _matches(sensor, robot, state)
     number, stamp = int(sensor.recording.frame_numbers[k]), float(sensor.recording.time_s[k])
     ms = 1e3 * (time.perf_counter() - began)

@@ -25,7 +25,7 @@ from femsense.model.drive import has_history
 from femsense.model.recording import Recording
 from femsense.model.robot import Robot
 from femsense.sensing.forces import no_forces
-from femsense.sensing.judge import OK, beside_markers, status_of, trusted
+from femsense.sensing.judge import OK, behind_body, beside_markers, status_of, trusted
 from femsense.sensing.paper import sense_as_published
 from femsense.sensing.places import find_touches, near_places, seen_objects
 from femsense.sensing.prepare import make_sensor, scan_of
@@ -128,13 +128,17 @@ def sense_frame(sensor: Sensor, k: int, previous: SensedFrame | None) -> SensedF
     clock.lap("places")
     fit = explain(sensor, k, scan, shapes, touches, free, previous, before)
     clock.lap("forces")
-    contacts = contacts_of(sensor, k, fit, previous)
+    contacts = contacts_of(sensor, k, fit, alone, previous)
     number, stamp = int(sensor.recording.frame_numbers[k]), float(sensor.recording.time_s[k])
     status = status_of(sensor, fit, free)
+    if status == OK and scan is not None and not scan.segmented:
+        status = behind_body(sensor, scan, fit)
+    if status == OK and fit.rows.of_clouds:
+        status = beside_markers(sensor, k, fit)
     report = FrameReport(
         number,
         stamp,
-        beside_markers(sensor, k, fit) if status == OK and fit.rows.of_clouds else status,
+        status,
         len(contacts),
         fit.rows.count,
         free.rows.rms,

@@ -25,8 +25,8 @@ from femsense.model.recording import Recording
 from femsense.model.recording_checks import check_against
 from femsense.model.robot import Robot, spread_features
 from femsense.pointcloud.rays import Surface
-from femsense.sensing.measurement_rows import rows_at
-from femsense.sensing.nuisance import first_knowledge, learn, sag_at
+from femsense.sensing.measurement_rows import rows_at, seen_through
+from femsense.sensing.nuisance import commons, first_knowledge, learn, sag_at
 from femsense.sensing.places import check_places, near_places
 from femsense.sensing.types import Answers, Knowledge, Rows, SensingOptions, Sensor
 
@@ -122,18 +122,18 @@ def _corrected(
 def _better_posed(sensor: Sensor, learned: Knowledge) -> Sensor:
     """Return the sensor with poses and modulus as the free frames show them: rays and states near the true ones."""
     v = 6 * len(sensor.calibration.poses)
-    if not learned.common_mean.any():
+    if not learned.mean[: commons(learned)].any():
         return sensor
-    poses = tuple(freeze(T) for T in moved_poses(sensor.calibration.poses, -learned.common_mean[:v], sensor.pivot))
-    robot = replace(sensor.robot, body=sensor.robot.body.with_stiffness_scale(1.0 / (1.0 + learned.common_mean[v])))
-    expected = sensor.knowledge.common_mean.copy()  # what was known beforehand, as it looks from there
-    expected[:v], expected[v] = -learned.common_mean[:v], 1.0 / (1.0 + learned.common_mean[v]) - 1.0
+    poses = tuple(freeze(T) for T in moved_poses(sensor.calibration.poses, -learned.mean[:v], sensor.pivot))
+    robot = replace(sensor.robot, body=sensor.robot.body.with_stiffness_scale(1.0 / (1.0 + learned.mean[v])))
+    expected = sensor.knowledge.mean.copy()  # what was known beforehand, as it looks from there
+    expected[:v], expected[v] = -learned.mean[:v], 1.0 / (1.0 + learned.mean[v]) - 1.0
     return replace(
         sensor,
         robot=robot,
         driven=replace(sensor.driven, robot=robot),
         calibration=replace(sensor.calibration, poses=poses, T_robot_camera=poses[0]),
-        knowledge=replace(sensor.knowledge, common_mean=freeze(expected)),
+        knowledge=replace(sensor.knowledge, mean=freeze(expected)),
     )
 
 
@@ -192,6 +192,8 @@ def _free_rows(sensor: Sensor) -> list[tuple[Rows, FloatArray]]:
                 shape = Surface(state.positions, sensor.surface.triangles)
                 scan = parted(scan, shape, sensor.calibration.poses, sensor.knowledge.noises, reach=REACH * sensor.size)
             rows = None if scan is None else rows_at(sensor, k, scan, state)
+            if rows is not None and scan is not None and not scan.segmented:
+                rows = replace(rows, through=seen_through(sensor, scan, state))
         except FemsenseError:
             continue
         if rows is not None:

@@ -8,8 +8,10 @@ from dataclasses import replace
 import numpy as np
 
 from femsense.core.arrays import FloatArray, freeze
+from femsense.fem.equilibrium import Equilibrium
 from femsense.sensing.judge import unspoken
-from femsense.sensing.nuisance import pulls_of, response_std
+from femsense.sensing.law import law_std
+from femsense.sensing.nuisance import response_std
 from femsense.sensing.touches import touch_normal
 from femsense.sensing.types import ContactForce, Fit, SensedFrame, Sensor
 
@@ -17,17 +19,19 @@ SAME = 0.15
 """A contact nearer than this share of the body's diagonal to one of the frame before is the same one: it slid."""
 
 
-def contacts_of(sensor: Sensor, k: int, fit: Fit, previous: SensedFrame | None) -> tuple[ContactForce, ...]:
-    """Return the contacts of a fit; those that begin a track have track −1."""
+def contacts_of(sensor: Sensor, k: int, fit: Fit, free: Equilibrium, previous: SensedFrame | None) -> tuple[ContactForce, ...]:
+    """Return the contacts of a fit, `free` the state without them; those that begin a track have track −1."""
     number, stamp = int(sensor.recording.frame_numbers[k]), float(sensor.recording.time_s[k])
     contacts: list[ContactForce] = []
-    share = response_std(sensor.knowledge, pulls_of(sensor)) if fit.rows.of_clouds else 0.0
+    cloudy = fit.rows.of_clouds
+    response = response_std(sensor.knowledge, len(sensor.calibration.poses)) if cloudy else 0.0
+    shares = np.hypot(response, law_std(sensor, fit, free)) if cloudy else np.zeros(len(fit.touches))
     for i, (touch, force) in enumerate(zip(fit.touches, fit.forces)):
         size, normal = float(np.linalg.norm(force)), touch_normal(sensor, touch, fit.state)
         if (size == 0.0 and touch.source != "given") or unspoken(fit, i):
             continue
         along = force / size if size > 0 else -normal
-        own = fit.covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] + share**2 * np.outer(force, force)
+        own = fit.covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] + shares[i] ** 2 * np.outer(force, force)
         contacts.append(
             ContactForce(
                 frame=number,

@@ -266,6 +266,8 @@ class Rows:
     """Whether the rows are points of clouds, and not markers."""
     together: float = 1.0
     """How many rows count as one, since neighbours err together."""
+    through: float = 0.0
+    """Share of the points that lie behind the body on their ray (see `seen_through`)."""
     operator: sp.csr_array | None = None
     """What `functional` does, as a matrix, shape (r, 3n); None for markers."""
 
@@ -290,16 +292,25 @@ class Knowledge:
     """Size of the shared error that does not depend on motion (camera) [m]."""
     model_share: float
     """Size of the shared error relative to the way from rest (model) [1]."""
-    common_mean: FloatArray
-    """Of pose steps (6 v), modulus (1) and pulls of cables and chambers (a + c) as the free frames show them, shape (6 v + 1 + a + c,)."""
-    common_root: FloatArray
-    """Square root of their covariance, shape (6 v + 1 + a + c, j)."""
+    mean: FloatArray
+    """What free frames show of pose steps (6 v), modulus (1), pulls of cables and chambers (a + c), and of both shared errors at the
+    centres (2 p) [m], [1]: what all frames have alike; shape (6 v + 1 + a + c + 2 p,)."""
+    root: FloatArray
+    """Square root of their covariance in a new frame, shape (6 v + 1 + a + c + 2 p, j)."""
     gain_limit: float
     """Gain in log evidence from which on a contact that only the shape shows is believed: one false in 1000 free frames."""
     misfit_limit: float
     """Misfit per row above which a frame is not explained."""
+    nuisance_limit: float = np.inf
+    """χ² of the fitted nuisance over what is expected of it, above which a frame is not explained: a smooth error swallows what touches."""
+    through_limit: float = 1.0
+    """Share of the points that may lie behind the body on their ray, where colour does not tell the robot's from others."""
     together: float = 1.0
     """How many points of a cloud count as one, since neighbours err together."""
+    alike: float = 0.0
+    """Share of the variance of the shared errors that all frames have alike [1]."""
+    rough: float = 1.0
+    """How many times the noise of the camera the rows scatter: errors of the model that neighbours do not share (facets, small waves)."""
 
 
 @dataclass(eq=False, slots=True)

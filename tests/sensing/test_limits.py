@@ -10,12 +10,18 @@ import pytest
 from arm import T_ROBOT_CAMERA, arm, record
 
 from femsense.calib.calibrate import calibrate
+from femsense.calib.scan import REACH, parted
 from femsense.core.pose import invert_pose, transform_points
 from femsense.fem.mesh import surface_triangles, triangle_normals
 from femsense.io.clouds.cloud_files import read_cloud, write_cloud
 from femsense.model.recording import Recording, with_marker_table
 from femsense.pointcloud.cloud import PointCloud
+from femsense.pointcloud.rays import Surface
+from femsense.sensing.forces import no_forces
+from femsense.sensing.judge import behind_body, status_of
 from femsense.sensing.pipeline import estimate
+from femsense.sensing.prepare import make_sensor, scan_of
+from femsense.sensing.states import free_state
 from femsense.sensing.types import SensingOptions
 
 PLACE = np.array([0.085, 0.0, 0.01])
@@ -88,6 +94,36 @@ def test_a_frame_that_nothing_explains_is_not_ok(tmp_path):
     run = estimate(arm(), seen, calibrate(arm(), seen))
     assert run.frames[3].status != "ok"
     assert [frame.status for frame in run.frames[:3]] == ["ok"] * 3
+
+
+def test_no_camera_sees_through_the_body(tmp_path):
+    """Without colours, an arm that is bent away from the camera leaves points behind the state that misses its force; only these tell."""
+    seen = touched(tmp_path, np.array([0.0, 0, -0.5]), ball=False)
+    sensor = make_sensor(replace(arm(), color_rgb=None), seen, calibrate(arm(), seen))
+    kept, through = [], []
+    for k in (2, 3):
+        state = free_state(sensor, k, None, None)
+        scan = scan_of(sensor, k, state)
+        assert scan is not None and not scan.segmented
+        surface = Surface(state.positions, sensor.surface.triangles)
+        scan = parted(scan, surface, sensor.calibration.poses, sensor.knowledge.noises, reach=REACH * sensor.size)
+        fit = no_forces(sensor, k, scan, state)
+        kept.append(status_of(sensor, fit, fit))
+        through.append(behind_body(sensor, scan, fit))
+    assert kept[0] == through[0] == "ok"
+    assert "behind the body" in through[1]
+
+
+@pytest.mark.parametrize("nudge", [[0.0008, 0.0, 0.0], [0.0, 0.0006, 0.0]])
+def test_a_camera_that_was_nudged_is_not_ok(tmp_path, nudge):
+    """Pose and shared errors take up the whole shift, so that nothing is left: only their own size tells."""
+    seen = touched(tmp_path, np.zeros(3), ball=False)
+    file = seen.cloud_files[3][0]
+    assert file is not None
+    cloud = read_cloud(file)
+    write_cloud(file, PointCloud(cloud.points + np.array(nudge), cloud.colors))
+    run = estimate(arm(), seen, calibrate(arm(), seen))
+    assert [frame.status == "ok" for frame in run.frames] == [True, True, True, False]
 
 
 def test_contacts_keep_their_track_and_know_how_well_they_are_placed(tmp_path):
