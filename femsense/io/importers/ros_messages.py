@@ -29,6 +29,8 @@ LAYOUTS: dict[str, tuple[str, int]] = {
     "mono8": ("u1", 1),
     "8UC1": ("u1", 1),
     "8UC3": ("u1", 3),
+    **dict.fromkeys(("bayer_rggb8", "bayer_bggr8", "bayer_gbrg8", "bayer_grbg8"), ("u1", 1)),
+    **dict.fromkeys(("yuv422", "uyvy", "yuv422_yuy2", "yuyv"), ("u1", 2)),
 }
 """Encodings of sensor_msgs/Image: type of a channel and channels."""
 DEPTH = ("16UC1", "mono16", "Z16", "32FC1")
@@ -105,6 +107,20 @@ def compressed_image(message: Any, where: str | Path | None) -> tuple[Pixels, st
 
 def red_first(image: Pixels, encoding: str) -> npt.NDArray[np.uint8]:
     """Return a colour image as (H, W, 3), red first."""
+    import cv2
+
+    code = {
+        "bayer_rggb8": cv2.COLOR_BayerBG2RGB,  # OpenCV names a pattern by its second row
+        "bayer_bggr8": cv2.COLOR_BayerRG2RGB,
+        "bayer_gbrg8": cv2.COLOR_BayerGR2RGB,
+        "bayer_grbg8": cv2.COLOR_BayerGB2RGB,
+        "yuv422": cv2.COLOR_YUV2RGB_UYVY,
+        "uyvy": cv2.COLOR_YUV2RGB_UYVY,
+        "yuv422_yuy2": cv2.COLOR_YUV2RGB_YUY2,
+        "yuyv": cv2.COLOR_YUV2RGB_YUY2,
+    }.get(encoding)
+    if code is not None:
+        return np.asarray(cv2.cvtColor(np.ascontiguousarray(image), code), dtype=np.uint8)
     if image.ndim == 2:
         return np.repeat(image[:, :, None], 3, axis=2).astype(np.uint8)
     swapped = image[:, :, 2::-1] if encoding.startswith(("bgr", "8UC3")) else image[:, :, :3]

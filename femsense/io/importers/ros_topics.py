@@ -14,7 +14,7 @@ from femsense.core.errors import InputError
 from femsense.core.text import did_you_mean
 from femsense.io.importers.frames import Lens, Options
 from femsense.io.importers.ros_bag import Bag, Topic
-from femsense.io.importers.ros_messages import DEPTH, MODELS, lens_of, pose_matrix, stamp_of
+from femsense.io.importers.ros_messages import DEPTH, LAYOUTS, MODELS, lens_of, pose_matrix, stamp_of
 
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 CLOUD = "sensor_msgs/msg/PointCloud2"
@@ -286,6 +286,9 @@ def _with_color(bag: Bag, choice: Choice, streams: Sequence[Stream]) -> Choice:
     color = _one(bag, [s for s in same or streams if _shared(s.topic.name, depth.topic.name) == near], "colour images")
     if color is None:
         return choice
+    if color.topic.type == IMAGES[0] and color.encoding not in LAYOUTS:
+        note = f"the colours of {color.topic.name} are left out: their encoding {color.encoding!r} is not read"
+        return replace(choice, notes=(*choice.notes, note))
     lens = _lens(bag, color)
     T = _extrinsics(bag, depth, color)
     if lens is None or T is None:

@@ -44,12 +44,21 @@ def summary(source: Source, journal: Journal, counts: Mapping[str, int]) -> dict
     return {key: value for key, value in found.items() if value is not None}
 
 
-def _pictures(journal: Journal) -> dict[str, int]:
+def _pictures(journal: Journal) -> dict[str, int | None]:
     kinds = {"depth": 0, "cloud": 0, "broken": 0, "": 0}
+    empty = 0
     for entry in journal.entries():
         for seen in entry.seen.values():
             kinds[seen.picture] += 1
-    return {"depth_images": kinds["depth"], "clouds": kinds["cloud"], "broken_pictures": kinds["broken"]}
+            empty += seen.picture in ("depth", "cloud") and seen.center is None
+    if empty:
+        warnings.warn(f"{empty} of {kinds['depth'] + kinds['cloud']} pictures show nothing", stacklevel=3)
+    return {
+        "depth_images": kinds["depth"],
+        "clouds": kinds["cloud"],
+        "broken_pictures": kinds["broken"],
+        "empty_pictures": empty or None,
+    }
 
 
 def _cameras(source: Source, journal: Journal) -> list[dict[str, Any]]:

@@ -182,3 +182,47 @@ def test_a_list_of_spheres_is_markers_without_names(tmp_path: Path) -> None:
     frame = next(open_source(tmp_path / "take").frames())
     assert not frame.markers
     np.testing.assert_allclose(frame.unlabelled, places)
+
+
+def write_colors(folder: Path, pixels: np.ndarray, encoding: str) -> Path:
+    with BagWriter(folder, "mcap") as bag:
+        bag.write("/cam/depth/image_raw", START_NS, bag.image(depth_of(0), "16UC1", START_NS))
+        for name in ("depth", "color"):
+            bag.write(f"/cam/{name}/camera_info", START_NS, bag.info(START_NS))
+        bag.write("/cam/color/image_raw", START_NS, bag.image(pixels, encoding, START_NS))
+    return folder
+
+
+@pytest.mark.parametrize("encoding", ["bayer_rggb8", "bayer_bggr8", "bayer_gbrg8", "bayer_grbg8", "uyvy", "yuv422_yuy2"])
+def test_colours_as_cameras_send_them(encoding: str, tmp_path: Path) -> None:
+    shape = depth_of(0).shape
+    wanted = np.array([200, 90, 40])
+    if encoding.startswith("bayer"):
+        letters = {"r": 0, "g": 1, "b": 2}
+        tile = np.array([wanted[letters[c]] for c in encoding[6:10]], dtype=np.uint8).reshape(2, 2)
+        pixels = np.tile(tile, (shape[0] // 2, shape[1] // 2))
+    else:
+        y, cr, cb = cv2.cvtColor(wanted.astype(np.uint8).reshape(1, 1, 3), cv2.COLOR_RGB2YCrCb)[0, 0]
+        y = round(16 + 219 / 255 * int(y))
+        pair = [[cb, y], [cr, y]] if encoding == "uyvy" else [[y, cb], [y, cr]]
+        pixels = np.tile(np.array(pair, dtype=np.uint8), (shape[0], shape[1] // 2, 1))
+    imported(write_colors(tmp_path / "take", pixels, encoding), tmp_path)
+    seen = read_png(tmp_path / "recording/color/000000.png")[4:-4, 4:-4, ::-1]
+    kept = read_png(tmp_path / "recording/depth/000000.png")[4:-4, 4:-4] > 0
+    assert np.abs(np.median(seen[kept], axis=0) - wanted).max() < 25
+
+
+def test_colours_that_are_not_read_cost_themselves(tmp_path: Path) -> None:
+    source = open_source(write_colors(tmp_path / "take", np.zeros(depth_of(0).shape, np.uint8), "something"))
+    assert any("are left out: their encoding 'something'" in note for note in source.notes)
+    assert source.lens is not None
+
+
+def test_pictures_that_show_nothing_are_counted(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "take", "mcap") as bag:
+        for k in range(FRAMES):
+            stamp = START_NS + k * STEP_NS
+            bag.write("/points", stamp, bag.cloud(np.full((5, 3), np.nan if k else 0.5), None, stamp))
+    with pytest.warns(UserWarning, match="2 of 3 pictures show nothing"):
+        _, found = imported(tmp_path / "take", tmp_path)
+    assert found["empty_pictures"] == 2
