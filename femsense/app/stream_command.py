@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
     from femsense.xr.stream.drag_server import DragOptions, DragServer
 
 PASSWORD = "FEMSENSE_PASSWORD"
+PATIENCE_S = 3.0
+"""How long a connection may take before it is said that there is none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,19 +60,30 @@ class LiveStream:
     threads: list[Thread] = field(default_factory=list)
     stop: Event = field(default_factory=Event)
     closers: list[Callable[[], None]] = field(default_factory=list)
+    links: dict[str, Callable[[], str]] = field(default_factory=dict)
+    """Connections to elsewhere: what says why there is none."""
 
     @property
     def url(self) -> str:
         """Where the page is."""
         return self.server.url
 
-    def wait(self) -> None:
-        """Return when all sources have ended."""
-        for thread in self.threads:
-            while thread.is_alive():
-                thread.join(0.5)
-        while not self.threads and not self.stop.wait(0.5):
-            pass
+    @property
+    def trouble(self) -> str:
+        """Which connections there are none of, and why; empty where all is well."""
+        told = {where: why() for where, why in self.links.items()}
+        return "; ".join(f"no connection to {where} ({why}), trying again" for where, why in told.items() if why)
+
+    def wait(self, say: Callable[[str], None] | None = None) -> None:
+        """Return when all sources have ended; meanwhile say(text) what connections are lost and come back."""
+        known, patient = "", time.monotonic() + PATIENCE_S
+        while any(thread.is_alive() for thread in self.threads) or not (self.threads or self.stop.is_set()):
+            living = [thread for thread in self.threads if thread.is_alive()]
+            living[0].join(0.5) if living else self.stop.wait(0.5)
+            trouble = self.trouble
+            if say is not None and trouble != known and time.monotonic() > patient:
+                say(trouble or "connected again")
+                known = trouble
 
     def close(self) -> None:
         """End the sources, say so, and free the ports."""
@@ -188,7 +202,7 @@ def show_stream(
     except BaseException:
         bridge.close()
         raise
-    return LiveStream(hub, server, closers=[bridge.close])
+    return LiveStream(hub, server, closers=[bridge.close], links={url: lambda: bridge.trouble})
 
 
 def stream_document(live: LiveStream) -> dict[str, Any]:
@@ -234,10 +248,13 @@ def _serve(options: StreamOptions, first: str, stop: Event | None = None) -> Liv
         server = WebSocketServer(hub, files, access=access, options=ServerOptions(port=options.port))
         undo.callback(hub.close)
         broker = None if options.broker_port is None else EmbeddedBroker(hub, port=options.broker_port, access=access)
+        live = LiveStream(hub, server, broker, stop=stop or Event())
         if options.mqtt is not None:
-            MqttSink(hub, broker_address(options.mqtt, password=password, authority=options.authority), first)
+            address = broker_address(options.mqtt, password=password, authority=options.authority)
+            sink = MqttSink(hub, address, first)
+            live.links[f"{address.host}:{address.port}"] = lambda: sink.trouble
         undo.pop_all()
-    return LiveStream(hub, server, broker, stop=stop or Event())
+    return live
 
 
 def _play(live: LiveStream, twin: Twin, frames: Iterator[TwinFrame], options: StreamOptions, *, at_once: bool = False) -> None:

@@ -57,8 +57,8 @@ def data_frame_of(run: RunLike) -> Any:
 def describe_run(run: RunLike) -> str:
     """Return a run in one line."""
     ok = sum(frame.status == "ok" for frame in run.frames)
-    sizes = [contact.force_n for contact in run.contacts]
-    forces = f"{len(tracks_of(run))} contacts, up to {max(sizes):.3g} N" if sizes else "no contact"
+    sizes, count = [contact.force_n for contact in run.contacts], len(tracks_of(run))
+    forces = f"{count} contact{'s' if count > 1 else ''}, up to {max(sizes):.3g} N" if sizes else "no contact"
     return f"Run({run.robot.name}: {len(run.frames)} frames, {ok} ok; {forces})"
 
 

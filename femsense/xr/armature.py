@@ -111,6 +111,11 @@ class Armature:
     def __len__(self) -> int:
         return len(self.at)
 
+    def __repr__(self) -> str:
+        """Return how many bones lie on how long a curve through how many points."""
+        kind = ("in a plane" if self.planar else "in space") + (", inextensible" if self.inextensible else "")
+        return f"Armature({len(self)} bones on {1e3 * self.knots[-1]:.1f} mm through {len(self.knots)} points, {kind})"
+
     @property
     def names(self) -> tuple[str, ...]:
         """Name of each bone."""

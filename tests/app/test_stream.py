@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from threading import Timer
 
 import numpy as np
 import pytest
@@ -76,6 +77,19 @@ def test_a_run_that_is_played_once_ends_and_says_so(tmp_path: Path, page: Path) 
     with stream_runs([run], StreamOptions(page=page), loop=False) as live:
         live.wait()
         assert b"ended" in live.hub.newest()["femsense/bar/status"].payload and live.publishers[0].sent > 100
+
+
+def test_a_connection_that_is_missing_is_said_until_it_is_there(tmp_path: Path, page: Path) -> None:
+    run, said = write_run_with_mesh(tmp_path / "bar"), []
+    nowhere = stream_runs([run], StreamOptions(page=page, mqtt="127.0.0.1:1"), loop=False)
+    with nowhere, show_stream("http://127.0.0.1:1", page=page) as shown:
+        assert within(5.0, lambda: "Connection refused" in shown.trouble)
+        assert nowhere.trouble == "no connection to 127.0.0.1:1 (no answer), trying again"
+        Timer(4.0, shown.stop.set).start()
+        shown.wait(said.append)
+        assert len(said) == 1 and said[0].startswith("no connection to http://127.0.0.1:1 (")
+    with stream_runs([run], StreamOptions(page=page)) as live, show_stream(live.url, page=page) as shown:
+        assert within(5.0, lambda: shown.trouble == "")
 
 
 def test_a_password_travels_encrypted_or_it_is_said(tmp_path: Path, page: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,18 +2,36 @@
 
 from __future__ import annotations
 
+import json
+import re
 import struct
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from femsense.xr.stream.payloads import Contact, Input, Twin, TwinFrame
 
+DOCS = Path(__file__).resolve().parents[2] / "docs" / "streaming.md"
 PAGE = {"index.html": b"<p>page</p>", "app.js": b"1"}
 GLB = b"glTF of a robot"
+
+
+def documented(kind: str) -> Any:
+    """The example that the documentation gives of a topic."""
+    found = re.search(rf"^{kind} +(\{{.*\}})$", DOCS.read_text(encoding="utf-8"), re.MULTILINE)
+    assert found is not None, kind
+    return json.loads(found.group(1))
+
+
+def names_in(document: Any) -> Any:
+    """The names of a document and what lies under them, without values; of a list its first item."""
+    if isinstance(document, list):
+        return [names_in(one) for one in document[:1]]
+    return {name: names_in(value) for name, value in document.items()} if isinstance(document, dict) else None
 
 
 def twin(name: str = "arm", **more: Any) -> Twin:

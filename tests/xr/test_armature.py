@@ -108,7 +108,9 @@ def test_a_line_that_stretches_keeps_shares_and_an_inextensible_one_keeps_length
 
 def test_flat_and_hierarchical_say_the_same() -> None:
     points, _, _ = helix(np.linspace(0.0, 3.0, 9))
-    poses = make_armature(points).rest
+    chain = make_armature(points)
+    poses = chain.rest
+    assert repr(chain).startswith("Armature(8 bones on 161.6 mm through 9 points, in space")
     local = local_poses(poses)
     assert isinstance(local, BonePoses) and len(local) == 8
     assert "8 bones from (" in repr(poses) and len(repr(poses)) < 80

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from femsense.app.command_line.answer import Answer
+from femsense.app.command_line.answer import Answer, say
 from femsense.app.command_line.parameters import Json, RunPath
 from femsense.core.errors import InputError
 
@@ -203,7 +203,7 @@ def _live(live: LiveStream, browser: bool) -> Answer:
 
     def wait() -> None:
         with contextlib.suppress(KeyboardInterrupt), live:
-            live.wait()
+            live.wait(say)
 
     return Answer(stream_document(live), stream_text(live), then=wait)
 

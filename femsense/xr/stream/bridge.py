@@ -14,7 +14,7 @@ from urllib.parse import urlsplit
 
 from femsense.core.errors import InputError
 from femsense.xr.stream.hub import Hub, Message
-from femsense.xr.stream.mqtt import MqttSource, broker_address
+from femsense.xr.stream.mqtt import NO_ANSWER, MqttSource, broker_address
 from femsense.xr.stream.payloads import GLB, MODEL, RECEIVED, STATUS, read_document, split_topic, status_bytes, topic
 from femsense.xr.stream.websocket import pack, require_websockets, unpack
 
@@ -50,12 +50,19 @@ class Bridge:
             source = MqttSource(broker_address(url, password=password, authority=authority), self._from_broker)
             self._send: Callable[[Message], None] = source.send
             self._close: Callable[[], None] = source.close
+            self._trouble: Callable[[], str] = lambda: source.trouble
         elif scheme in ("http", "https", "ws", "wss"):
             viewer = _Viewer(self, url, password, authority)
             self._send, self._close = viewer.send, viewer.close
+            self._trouble = lambda: viewer.trouble
         else:
             raise InputError("not a stream", where="--stream", found=url, expected="http://…, ws://…, mqtt://…, or with s")
         hub.listen(self._back)
+
+    @property
+    def trouble(self) -> str:
+        """Why there is no connection; empty where there is one."""
+        return self._trouble()
 
     def close(self) -> None:
         """Leave."""
@@ -88,6 +95,7 @@ class _Viewer:
             word = base64.b64encode(f"femsense:{password}".encode()).decode()
             self._headers["Authorization"] = f"Basic {word}"
         self._connection: Connection | None = None
+        self.trouble = NO_ANSWER
         self._stop = Event()
         self._known: dict[str, str] = {}
         Thread(target=self._run, daemon=True, name="femsense-bridge").start()
@@ -109,9 +117,11 @@ class _Viewer:
 
         attempt = 0
         while not self._stop.is_set():
-            with contextlib.suppress(OSError, WebSocketException, EOFError, InputError):
+            try:
                 self._read()
-                attempt = 0
+                attempt, self.trouble = 0, NO_ANSWER
+            except (OSError, WebSocketException, EOFError, InputError) as error:
+                self.trouble = str(error) or NO_ANSWER
             self._connection = None
             self._lost()
             self._stop.wait(AGAIN_S[min(attempt, len(AGAIN_S) - 1)])
@@ -125,7 +135,7 @@ class _Viewer:
         with connect(
             address, additional_headers=self._headers, compression=None, max_size=LARGEST_MESH, open_timeout=5, proxy=None, **more
         ) as connection:
-            self._connection = connection
+            self._connection, self.trouble = connection, ""
             for frame in connection:
                 if isinstance(frame, bytes):
                     self._take(list(unpack(frame)))

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from paho.mqtt.client import Client
 
 PLAIN_PORT, TLS_PORT = 1883, 8883
+NO_ANSWER = "no answer"
 WANTED = tuple(f"{PREFIX}/+/{kind}" for kind in RECEIVED)
 """Topics that clients of a broker may send to us."""
 
@@ -65,7 +66,7 @@ class MqttSink:
     def __init__(self, hub: Hub, address: BrokerAddress, robot: str) -> None:
         """Connect in the background, for the robot whose loss the broker is to announce. Raises MissingDependency."""
         self.hub = hub
-        self._status = topic(robot, STATUS)
+        self._status, self._refusal = topic(robot, STATUS), NO_ANSWER
         self._client = make_client(address)
         self._client.will_set(self._status, status_bytes("lost"), qos=0, retain=True)
         self._client.on_connect = self._greet
@@ -75,6 +76,11 @@ class MqttSink:
         self._client.connect_async(address.host, address.port, keepalive=5)
         self._client.loop_start()
         hub.attach(self)
+
+    @property
+    def trouble(self) -> str:
+        """Why there is no connection; empty where there is one."""
+        return "" if self.connected.is_set() else self._refusal
 
     def send(self, messages: tuple[Message, ...]) -> None:
         """Hand messages to the broker if there is one; returns at once."""
@@ -90,6 +96,7 @@ class MqttSink:
 
     def _greet(self, client: Client, _data: Any, _flags: Any, reason: Any, _more: Any) -> None:
         if reason.is_failure:
+            self._refusal = str(reason)
             return
         client.subscribe([(one, 0) for one in WANTED])
         self.connected.set()
@@ -103,7 +110,7 @@ class MqttSource:
         self, address: BrokerAddress, receive: Callable[[Message], None], *, topics: Sequence[str] = (f"{PREFIX}/#",)
     ) -> None:
         """Call receive(message) in a thread of its own, for the topics that filters name. Raises MissingDependency."""
-        self._client = make_client(address)
+        self._client, self._refusal = make_client(address), NO_ANSWER
         self.connected = Event()
         self._topics = tuple(topics)
         self._client.on_connect = self._greet
@@ -113,9 +120,16 @@ class MqttSource:
         self._client.loop_start()
 
     def _greet(self, client: Client, _data: Any, _flags: Any, reason: Any, _more: Any) -> None:
-        if not reason.is_failure:
-            client.subscribe([(one, 0) for one in self._topics])
-            self.connected.set()
+        if reason.is_failure:
+            self._refusal = str(reason)
+            return
+        client.subscribe([(one, 0) for one in self._topics])
+        self.connected.set()
+
+    @property
+    def trouble(self) -> str:
+        """Why there is no connection; empty where there is one."""
+        return "" if self.connected.is_set() else self._refusal
 
     def send(self, message: Message) -> None:
         """Publish a message."""

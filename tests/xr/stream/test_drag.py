@@ -12,7 +12,7 @@ import pytest
 from analytic import bar_body
 from helpers import block_mesh
 from obedient import ObedientRobot
-from streams import within
+from streams import documented, names_in, within
 
 import femsense as fs
 from femsense.fem.mesh import embed_points, surface_triangles, to_quadratic
@@ -92,7 +92,7 @@ def served() -> Iterator[tuple[Hub, DragServer, ObedientRobot]]:
 
 def drag(hub: Hub, target: Any, *, armed: bool = True, held: bool = True, who: str = "me", handle: str = "tip") -> None:
     place = dict(zip("xyz", map(float, target)))
-    wish = {"handle": handle, "target_m": place, "held": held, "armed": armed}
+    wish = {**documented("drag"), "handle": handle, "target_m": place, "held": held, "armed": armed}
     hub.received(Message("femsense/bar/drag", json.dumps(wish).encode()), who)
 
 
@@ -118,6 +118,8 @@ def test_the_tip_of_another_mesh_arrives_and_stops_when_let_go(served: tuple[Hub
     assert away > 0.02 and missed < 0.15 * away  # its mesh has other elements, and the model is not told
     told = reach_of(hub)
     assert told["status"] == "reached" and told["error_m"] <= 1e-4
+    assert names_in({**told, "measured_error_m": 0.0}) == names_in(documented("reach"))
+    assert json.loads(hub.newest()["femsense/bar/command"].payload).keys() == documented("command").keys()
     ghost = read_pose(hub.newest()["femsense/bar/ghost"].payload)
     assert len(ghost.bones) == 4
     assert within(2.0, lambda: not there.armed)  # nobody holds on any more

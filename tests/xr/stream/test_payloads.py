@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from streams import moment, twin
+from streams import documented, moment, names_in, twin
 
 from femsense.core.errors import InputError
 from femsense.xr.stream import payloads
@@ -91,3 +91,18 @@ def test_topics_are_ours_whatever_the_robot_is_called() -> None:
 @pytest.mark.parametrize("data", [b"\xff", b"[1]", b"{", b"[" * 100_000, b"{" + b" " * (1 << 20) + b"}"])
 def test_garbage_is_no_document(data: bytes) -> None:
     assert payloads.read_document(data) is None
+
+
+def test_documents_are_those_that_the_documentation_shows() -> None:
+    vector = np.array([0.0, 0.1, 0.2])
+    known = payloads.Contact(0, vector, vector, 0.01, vector, vector, 0.004, "cloud")
+    frame = replace(moment(3.5), contacts=(known,), run_s=3.5)
+    sent = {
+        "force": payloads.force_bytes(9, frame),
+        "inputs": payloads.inputs_bytes(9, 3.5, twin().inputs, (1.5,)),
+        "pose_json": payloads.pose_json_bytes(9, 3.5, frame.bones),
+        "status": payloads.status_bytes("live"),
+        "measured": payloads.measured_bytes(9, 3.5, {"tip": vector}),
+    }
+    for kind, payload in sent.items():
+        assert names_in(json.loads(payload)) == names_in(documented(kind)), kind
