@@ -89,8 +89,10 @@ def estimate(
     count = len(recording.time_s)
     with Checkpoint(keep) as checkpoint:
         done = checkpoint.kept(Done) or Done()
+        sensor.answers.state = done.answered_at
         for k in range(len(done.reports), count):
             _sense_into(done, sense, sensor, k)
+            done.answered_at = sensor.answers.state
             if progress is not None:
                 progress(k + 1, count)
             checkpoint.keep(done, every=keep_every_s)

@@ -57,8 +57,12 @@ def seen_objects(sensor: Sensor, k: int, scan: Scan | None, state: Equilibrium) 
     points = scan.surroundings(poses)
     if len(points) < 3:
         return []
-    gap = Surface(state.positions, sensor.surface.triangles).closest(points)[1]
-    near = np.flatnonzero(gap < (NEAR + LOCAL) * sensor.size)
+    reach = (NEAR + LOCAL) * sensor.size
+    low, high = state.positions.min(axis=0) - reach, state.positions.max(axis=0) + reach
+    close = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
+    gap = np.full(len(points), np.inf)
+    gap[close] = Surface(state.positions, sensor.surface.triangles).closest(points[close])[1]
+    near = np.flatnonzero(gap < reach)
     if len(near) < 3:
         return []
     origins = np.array([T[:3, 3] for T in poses])[scan.others_view]

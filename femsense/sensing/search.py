@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -158,12 +159,14 @@ def evidence(sensor: Sensor, fit: Fit) -> tuple[FloatArray, FloatArray]:
 def _answers(sensor: Sensor, state: Equilibrium, tangent: Tangent) -> FloatArray:
     """Return how the nodes answer to unit forces at the candidates near a state [m/N], shape (3n, 3c)."""
     kept = sensor.answers
-    if kept.positions is None or kept.columns is None or np.abs(kept.positions - state.positions).max() > NEARBY * sensor.size:
+    if kept.state is None or np.abs(kept.state.positions - state.positions).max() > NEARBY * sensor.size:
+        kept.state, kept.columns = replace(state, factor=None), None
+    if kept.columns is None:
+        near = tangent if kept.state.positions is state.positions else tangent_at(sensor.robot.body, kept.state)
         n, c = len(state.positions), len(sensor.candidates)
         loads = np.zeros((c, 3, n, 3))
         loads[np.arange(c), :, sensor.candidates] = np.eye(3)
-        moves = tangent.respond(loads.reshape(-1, n, 3))
-        kept.positions, kept.columns = state.positions, np.ascontiguousarray(moves.reshape(3 * c, -1).T)
+        kept.columns = np.ascontiguousarray(near.respond(loads.reshape(-1, n, 3)).reshape(3 * c, -1).T)
     return kept.columns
 
 

@@ -238,6 +238,8 @@ class Done:
     """The last frame that gave a result to start from."""
     tracks: int = 0
     """Contacts distinguished so far."""
+    answered_at: Equilibrium | None = None
+    """The state of `Answers`."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -317,8 +319,8 @@ class Knowledge:
 class Answers:
     """How the body answers to unit forces at the candidates near one state; made anew when the body has moved far from it."""
 
-    positions: FloatArray | None = None
-    """Nodes of that state [m], shape (n, 3)."""
+    state: Equilibrium | None = None
+    """That state; an estimate that was stopped goes on with it, and makes the answers anew."""
     columns: FloatArray | None = None
     """Moves of the nodes by unit forces along x, y, z at each candidate [m/N], shape (3n, 3c)."""
 

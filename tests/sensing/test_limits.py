@@ -21,8 +21,9 @@ from femsense.sensing.forces import no_forces
 from femsense.sensing.judge import behind_body, status_of
 from femsense.sensing.pipeline import estimate
 from femsense.sensing.prepare import make_sensor, scan_of
+from femsense.sensing.search import evidence
 from femsense.sensing.states import free_state
-from femsense.sensing.types import SensingOptions
+from femsense.sensing.types import Answers, SensingOptions
 
 PLACE = np.array([0.085, 0.0, 0.01])
 INPUTS = np.array([[0.0, 0, 0, 0], [0.5, 0, 0, 0], [0.5, 0, 0.3, 0], [0.5, 0, 0.3, 0]])
@@ -147,3 +148,19 @@ def test_contacts_keep_their_track_and_know_how_well_they_are_placed(tmp_path):
     assert [c.track for c in run.contacts] == [0, 0]
     assert all(np.linalg.norm(c.position_std_m) > 1e-4 for c in run.contacts)
     assert not any(estimate(arm(), held, calibrate(arm(), seen), options=PAPER).contacts[0].position_std_m)
+
+
+def test_an_estimate_that_goes_on_searches_with_the_answers_it_had(tmp_path):
+    seen = touched(tmp_path, np.array([0.0, 0, -0.15]), ball=False)
+    sensor = make_sensor(arm(), seen, calibrate(arm(), seen))
+    state = free_state(sensor, 3, None, None)
+    fit = no_forces(sensor, 3, scan_of(sensor, 3, state), state)
+    evidence(sensor, fit)
+    wider = replace(state, positions=state.positions * [1.0, 1.05, 1.0])
+    later = replace(fit, state=wider, tangent=None)
+    gain, _ = evidence(sensor, later)  # with the answers of the first state, which is near
+    again, _ = evidence(replace(sensor, answers=Answers(sensor.answers.state)), later)
+    anew, _ = evidence(replace(sensor, answers=Answers()), later)
+    np.testing.assert_allclose(again, gain, rtol=1e-6)
+    seen_there = np.isfinite(gain)
+    assert np.abs(anew - gain)[seen_there].max() > 1e-3 * np.abs(gain[seen_there]).max()
