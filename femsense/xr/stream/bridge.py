@@ -6,7 +6,7 @@ import base64
 import contextlib
 import ssl
 import urllib.request
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from threading import Event, Thread
 from typing import TYPE_CHECKING, Any
@@ -45,9 +45,12 @@ class Bridge:
         """
         self.hub = hub
         self._stop = Event()
+        self._robots: set[str] = set()
         scheme = urlsplit(url).scheme
         if scheme in ("mqtt", "mqtts"):
-            source = MqttSource(broker_address(url, password=password, authority=authority), self._from_broker)
+            address = broker_address(url, password=password, authority=authority)
+            at = f"{address.host}:{address.port}"
+            source = MqttSource(address, self._from_broker, lost=lambda: self.lost(self._robots, at))
             self._send: Callable[[Message], None] = source.send
             self._close: Callable[[], None] = source.close
             self._trouble: Callable[[], str] = lambda: source.trouble
@@ -77,7 +80,12 @@ class Bridge:
     def _from_broker(self, message: Message) -> None:
         known = split_topic(message.topic)
         if known is not None and known[1] not in RECEIVED:
+            self._robots.add(known[0])
             self.hub.publish([message])
+
+    def lost(self, robots: Iterable[str], where: str) -> None:
+        """Say of robots that there is no connection any more."""
+        self.hub.publish([Message(topic(robot, STATUS), status_bytes("lost", where)) for robot in robots])
 
 
 class _Viewer:
@@ -123,7 +131,7 @@ class _Viewer:
             except (OSError, WebSocketException, EOFError, InputError) as error:
                 self.trouble = str(error) or NO_ANSWER
             self._connection = None
-            self._lost()
+            self._bridge.lost(list(self._known), self._at)
             self._stop.wait(AGAIN_S[min(attempt, len(AGAIN_S) - 1)])
             attempt += 1
 
@@ -159,7 +167,3 @@ class _Viewer:
             glb = answer.read(LARGEST_MESH)
         self._known[robot] = digest
         return [Message(topic(robot, GLB), glb)]
-
-    def _lost(self) -> None:
-        robots = list(self._known)
-        self._bridge.hub.publish([Message(topic(robot, STATUS), status_bytes("lost", self._at)) for robot in robots])

@@ -107,14 +107,23 @@ class MqttSource:
     """Receives from a broker what streams there."""
 
     def __init__(
-        self, address: BrokerAddress, receive: Callable[[Message], None], *, topics: Sequence[str] = (f"{PREFIX}/#",)
+        self,
+        address: BrokerAddress,
+        receive: Callable[[Message], None],
+        *,
+        topics: Sequence[str] = (f"{PREFIX}/#",),
+        lost: Callable[[], None] = lambda: None,
     ) -> None:
-        """Call receive(message) in a thread of its own, for the topics that filters name. Raises MissingDependency."""
+        """Call receive(message) in a thread of its own, for the topics that filters name, and lost() when the broker goes away.
+
+        Raises MissingDependency.
+        """
         self._client, self._refusal = make_client(address), NO_ANSWER
         self.connected = Event()
         self._topics = tuple(topics)
         self._client.on_connect = self._greet
-        self._client.on_disconnect = lambda *_: self.connected.clear()
+        self._client.on_disconnect = self._leave
+        self._lost = lost
         self._client.on_message = lambda _c, _d, got: receive(Message(got.topic, bytes(got.payload)))
         self._client.connect_async(address.host, address.port, keepalive=5)
         self._client.loop_start()
@@ -125,6 +134,10 @@ class MqttSource:
             return
         client.subscribe([(one, 0) for one in self._topics])
         self.connected.set()
+
+    def _leave(self, *_: object) -> None:
+        self.connected.clear()
+        self._lost()
 
     @property
     def trouble(self) -> str:

@@ -184,6 +184,11 @@ def test_a_bridge_brings_a_broker_to_the_page() -> None:
         assert within(5.0, lambda: "femsense/arm/glb" in here.newest() and "femsense/arm/model" in here.newest())
         publisher.publish(moment(0.0, x=0.5))
         assert within(5.0, lambda: "femsense/arm/pose" in here.newest())
+        broker.close()
+        status = {"state": "lost", "detail": f"127.0.0.1:{broker.port}"}
+        assert within(5.0, lambda: json.loads(here.newest()["femsense/arm/status"].payload) == status)
+        EmbeddedBroker(there, port=broker.port)
+        assert within(10.0, lambda: b"live" in here.newest()["femsense/arm/status"].payload)
 
 
 def test_a_bridge_brings_another_page_s_stream_comes_back_and_takes_wishes_along() -> None:

@@ -318,7 +318,7 @@ class Robot {
     const age = (now - this.arrived) / 1000;
     if (!open) return ["lost", "no connection"];
     if (this.told.state === "ended") return ["ended", "ended"];
-    if (this.told.state === "lost") return ["lost", "source lost"];
+    if (this.told.state === "lost") return ["lost", this.told.detail ? `no connection to ${this.told.detail}` : "source lost"];
     if (!Number.isFinite(age)) return ["waiting", "no pose yet"];
     if (age > STALE_S) return ["stale", `stale, ${age < 10 ? age.toFixed(1) : age.toFixed(0)} s old`];
     const span = Math.max(now - this.arrivals[0]!, 500);
