@@ -1,6 +1,6 @@
 """Robots that others built and recorded: what calibration leaves, what the loop names, and how far it is on runs that were not fitted.
 
-    python benchmarks/real.py OUT [--data FOLDER] [--only tentacle …] [--ways 1 2 …] [--minutes M] [--calibrated | --weights | --by-hand]
+    python benchmarks/real.py OUT [--data FOLDER] [--only tentacle …] [--ways 1 2 …] [--minutes M] [--calibrated | --weights | --by-hand | --fitted]
 
 Robots and recordings are made below OUT from the files of `shared/data`; nothing of these is copied. A row that stands in OUT already is
 read, not computed again, and one that takes longer than M minutes says so. `--calibrated` leaves the loop out. docs/real-robots.md tells
@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 from real import arm, tentacle, trunk
+from real.weights import fitted_by_weights
 
 from femsense import FemsenseError, calibrate, estimate, load_recording, load_robot, solve_equilibrium
 from femsense.core.pose import transform_points
@@ -188,6 +189,16 @@ def print_pairs(out: Path, data: Path) -> None:
         )
 
 
+def print_fitted(rows: list[Asked]) -> None:
+    """Print what calibration within the loop leaves by both weights (docs/closing-the-loop.md, section 4)."""
+    print(
+        "| way of asking | declared, held out [mm] | fitted; held out [mm] | modulus | by weights with the error: fitted; held out | modulus | corrected |"
+    )
+    print("|---" * 7 + "|")
+    for asked in rows:
+        print(f"| {asked.name} | " + " | ".join(fitted_by_weights(asked.robot, asked.train, asked.held)) + " |", flush=True)
+
+
 def calibrated_rms(robot: Path, recordings: list[Path]) -> str:
     """Return the rms of what calibration leaves in recordings, each with its own pose [mm]."""
     body = load_robot(robot)
@@ -296,6 +307,7 @@ def main() -> None:
     ask.add_argument("--calibrated", action="store_true")
     ask.add_argument("--weights", action="store_true", help="the force at the tip of the trunk, instead")
     ask.add_argument("--by-hand", action="store_true", help="the tentacle with the authors' pose and given moduli, instead")
+    ask.add_argument("--fitted", action="store_true", help="what calibration leaves by the loop's weights, instead")
     given = ask.parse_args()
     if given.weights:
         print_pairs(given.out / "trunk", given.data / "trunk")
@@ -304,7 +316,9 @@ def main() -> None:
     if given.by_hand:
         print_by_hand(given.out / "tentacle", given.data / "tentacle")
         return
-    for name in given.only:
+    for name in given.only if given.fitted else ():
+        print_fitted(SETS[name][0](given.out / name, given.data / name, given.ways))
+    for name in () if given.fitted else given.only:
         make, note = SETS[name]
         print(f"\n## {name}\n\n{note}\n")
         print("| " + " | ".join(HEADING) + " |\n" + "|---" * len(HEADING) + "|", flush=True)
