@@ -36,6 +36,8 @@ FORMATS: dict[str, Callable[[Path, Options], Source]] = {
     "clouds": open_clouds,
 }
 """Names of `--format`. Each importer says what it finds as a `Source`, whose frames come one after the other."""
+WHOLE_DEPTHS = ("ros", "realsense", "tum", "redwood")
+"""Formats whose depth images count a unit that may be another."""
 SIGNATURES = (
     (b"#ROSBAG V2.0", "ros"),
     (b"\x89MCAP0\r\n", "ros"),
@@ -67,6 +69,13 @@ def open_source(path: str | Path, options: Options | None = None) -> Source:
     name = said.format or guess_format(source)
     if said.base is not None and name not in ("ros", "realsense"):
         raise InputError("frames of coordinates stand in bags only", where=f"--base {said.base}", found=source)
+    if said.depth_unit is not None and name not in WHOLE_DEPTHS:
+        raise InputError(
+            "a unit of depth images is said of what has none, or one of its own",
+            where=f"--depth-unit {said.depth_unit:g}",
+            found=name or source,
+            expected=", ".join(WHOLE_DEPTHS),
+        )
     if name not in FORMATS:
         found = f"{source.suffix or 'no ending'}" if name is None else name
         packed = name is None and (source.suffix in PACKED or (source.is_dir() and any(source.glob("*.zstd"))))

@@ -247,6 +247,9 @@ def test_a_depth_scale_beside_the_lens(tmp_path: Path) -> None:
         (folder / "intrinsic.json").write_text(json.dumps(lens))
         assert open_source(folder).depth_unit_m == 1 / 4000
         assert open_source(folder, Options(depth_unit=0.01)).depth_unit_m == 0.01
+    write_cloud(tmp_path / "1.5.ply", PointCloud(np.ones((3, 3))))
+    with pytest.raises(InputError, match="--depth-unit"):
+        open_source(tmp_path / "1.5.ply", Options(depth_unit=0.01))
 
 
 def test_clouds_in_centimetres_ask_for_their_unit(tmp_path: Path) -> None:
