@@ -2,7 +2,7 @@
 
 Each reading is first weighed with the poses free and all else held: inputs by the linear response of the markers, gravity, which
 may bend a body far, by the states of a few frames. The best is then fitted like the files themselves, and counts by what it
-leaves. No reading has parameters of its own, so that chance explains nothing.
+leaves. Only another zero of the inputs has parameters of its own, and is only mentioned.
 """
 
 from __future__ import annotations
@@ -50,6 +50,8 @@ class Reading:
     recording: Recording
     frames: IntArray
     """The frames that it speaks of, shape (f,)."""
+    fitted: bool = False
+    """Whether it has parameters that were fitted: what the model lacks may pass for them, so that files are never refused for it."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -98,7 +100,7 @@ def check_other_readings(
         return
     before = _rms(residual[np.isin(scene.frame, best.frames)])
     found = f"{best.text}: the markers then fit to {1e3 * left:.3g} mm, as the files stand to {1e3 * before:.3g} mm"
-    if before > REFUSED * left:
+    if before > REFUSED * left and not best.fitted:
         raise DataError(found)
     if before > TOLD * left:
         warnings.warn(f"{found}. Is it so?", stacklevel=5)
@@ -135,6 +137,33 @@ def _by_inputs(robot: Robot, scene: Scene, pairs: Sequence[Pairs], initial: Floa
         changed = modelled + response.by(drivers - response.drivers, scene)
         anew = response.places[scene.marker] + response.by(drivers - response.base, scene)  # where a state is slack, as read now
         yield min(_share(pairs, scene, rows, places - modelled) for places in (changed, anew)), reading
+    if initial is None and robot.body.cables:
+        yield _by_zero(robot, scene, pairs, response, modelled)
+
+
+def _by_zero(
+    robot: Robot, scene: Scene, pairs: Sequence[Pairs], response: Response, modelled: FloatArray
+) -> tuple[float, Reading]:
+    """Return what inputs of cables leave that count from another zero, to first order, as a share of what is left now."""
+    measured, recording, a = np.zeros_like(modelled), scene.recording, len(robot.body.cables)
+    columns = [response.slope[:a, scene.marker].transpose(1, 2, 0)]
+    for v, one in enumerate(pairs):
+        measured[scene.view == v] = one.measured
+        mine = (scene.view == v)[:, None, None]
+        arm = modelled - modelled.mean(axis=0)
+        turned = np.stack([np.cross(axis, arm) for axis in np.eye(3)], axis=2)
+        columns += [mine * turned, mine * np.broadcast_to(np.eye(3), (len(arm), 3, 3))]
+    J = np.concatenate(columns, axis=2).reshape(measured.size, -1)
+    size = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
+    zero = (np.linalg.lstsq(J / size, (measured - modelled).ravel(), rcond=1e-3)[0] / size)[:a]
+    unit, scale = ("N", 1.0) if recording.actuation == "tension" else ("mm", 1e3)
+    values = ", ".join(f"{name} {scale * z:+.2g} {unit}" for name, z in zip(robot.body.cable_names, zero))
+    text = f'the inputs in frames.csv seem to count from another zero ({values}). actuation_zero = "unknown" finds it'
+    shifted = replace(recording, inputs=freeze(recording.inputs + zero))
+    change = np.zeros_like(response.drivers)
+    change[:, :a] = zero
+    share = _share(pairs, scene, np.ones(len(modelled), dtype=np.bool_), response.by(change, scene))
+    return share, Reading(text, robot, shifted, scene.frames, fitted=True)
 
 
 def _by_gravity(

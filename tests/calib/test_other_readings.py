@@ -77,6 +77,11 @@ def test_an_accelerometer_of_another_sign_is_named() -> None:
         calibrate(arm(), measured)
 
 
+def test_another_zero_is_mentioned_with_its_size() -> None:
+    with pytest.warns(UserWarning, match=r'count from another zero \(.*up -(0\.[89]|1)\S* N.*"unknown" finds it.*then fit to'):
+        calibrate(arm(), with_inputs(np.add(recording().inputs, [1.0, 0.0, 0.0, 0.0])))
+
+
 def test_many_cables_are_exchanged_by_pairs_only() -> None:
     said = [one.text for one in readings(arm(), recording(), np.arange(len(LEVELS)))]
     assert len(said) == len(set(said))
