@@ -53,7 +53,6 @@ class ForceStep:
     place_covariance: FloatArray  # (m, 3, 3) [m²]
     force_std: FloatArray  # (m,) [N]
     sizes: FloatArray  # (m,) [N]
-    gain: float  # by how much the cost is expected to fall
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -102,9 +101,6 @@ class Linearisation:
         covariance = normal.covariance(block_diag(*_prior_roots(here.touches, self.normals, WIDER * sizes)))
         place = covariance[3 * m : 5 * m, 3 * m : 5 * m] * np.outer(place_std, place_std)
         places = np.array([e.T @ place[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] @ e for i, e in enumerate(self.frames)])
-        was = np.concatenate([here.forces.ravel(), -wanted * free / np.where(free, place_std, 1.0)])
-        prior = block_diag(*_prior_roots(here.touches, self.normals, sizes))
-        gain = normal.cost(was, prior) - normal.cost(np.concatenate([forces.ravel(), others[: 2 * m]]), prior)
         scale = max(1.0, 1.483 * float(np.median(np.abs(self.residual / here.rows.std)))) ** 2
         limit = sensor.surface.edge
         return ForceStep(
@@ -114,7 +110,6 @@ class Linearisation:
             scale * places.reshape(m, 3, 3),
             np.sqrt(scale * np.diag(covariance)[: 3 * m].reshape(m, 3).mean(axis=1)),
             sizes,
-            gain,
         )
 
     def _normal_equations(self, here: Iterate, shift_std: FloatArray, wanted: FloatArray) -> NormalEquations:
@@ -178,13 +173,6 @@ class NormalEquations:
         eliminated = np.asarray(np.linalg.solve(A[f:, f:], np.column_stack([A[f:, :f], b[f:]])), dtype=np.float64)
         left = A[:f, :f] - A[:f, f:] @ eliminated[:, :f]
         return ForceEquations(np.asarray(0.5 * (left + left.T)), b[:f] - A[:f, f:] @ eliminated[:, f], eliminated)
-
-    def cost(self, known: FloatArray, prior: FloatArray) -> float:
-        """Return the cost, but for what is the same everywhere, with the first unknowns (k,) known, the others at their best."""
-        k, f, A = len(known), self.force_count, self.matrix
-        rest = self.right[k:] - A[k:, :k] @ known
-        own = known @ A[:k, :k] @ known - 2.0 * self.right[:k] @ known + ((prior @ known[:f]) ** 2).sum()
-        return float(own - rest @ np.linalg.solve(A[k:, k:], rest))
 
     def covariance(self, prior: FloatArray) -> FloatArray:
         """Return the covariance of all unknowns; the cone, where it acts, would only make it smaller."""

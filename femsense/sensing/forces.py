@@ -25,7 +25,7 @@ from femsense.sensing.types import Fit, Sensor, Touch
 TRIES = 4
 """How often a step is made shorter where it leads too far: first along what the rows hardly determine."""
 SLIGHT = 1e-4
-"""Steps that lower the cost by less than this share of it are not worth their equilibrium."""
+"""A step that lowered the cost by less than this share of it is the last one."""
 
 
 def no_forces(sensor: Sensor, k: int, scan: Scan | None, state: Equilibrium, like: Fit | None = None) -> Fit:
@@ -66,7 +66,7 @@ def fit_forces(
     for _ in range(sensor.options.iterations):
         here = replace(here, sizes=step.sizes)
         cost = linear.cost(here)
-        if _hardly_moves(sensor, here, step) or step.gain < SLIGHT * cost:
+        if _hardly_moves(sensor, here, step):
             converged = True
             break
         better, trust = frame.descend(here, linear, step, trust)

@@ -254,10 +254,5 @@ def _start(previous: SensedFrame | None, touches: Sequence[Touch]) -> tuple[Equi
 
 
 def _start_of(fit: Fit, touches: Sequence[Touch]) -> tuple[Equilibrium, FloatArray] | None:
-    """Return the state of a fit as a start for touches, with the forces (m, 3) of those that lie where it has some."""
-    if not fit.touches or not touches:
-        return None
-    away = np.array([[float(np.linalg.norm(t.place - own.place)) for own in fit.touches] for t in touches])
-    nearest = away.argmin(axis=1)
-    mutual = away.argmin(axis=0)[nearest] == np.arange(len(touches))
-    return fit.state, fit.forces[nearest] * mutual[:, None]
+    """Return the state and forces of a fit as a start for as many touches."""
+    return (fit.state, fit.forces) if len(fit.touches) == len(touches) and touches else None

@@ -32,20 +32,3 @@ def test_forces_with_all_else_eliminated_are_those_of_the_whole_problem(pull: fl
     np.testing.assert_allclose(reduced.others(forces), whole.nuisance, rtol=1e-6, atol=1e-9)
     if pull < 0:
         np.testing.assert_allclose(equations.covariance(prior)[: 3 * m, : 3 * m], whole.covariance, rtol=1e-6)
-
-
-def test_the_cost_of_some_unknowns_is_that_with_all_others_at_their_best() -> None:
-    rng = np.random.default_rng(4)
-    rows, measured, prior = rng.normal(size=(30, 8)), rng.normal(size=30), np.diag([2.0, 3.0, 4.0])
-    units = np.append(np.zeros(3), np.ones(5))
-    equations = NormalEquations(rows.T @ rows + np.diag(units), rows.T @ measured, 3)
-
-    def whole(x: np.ndarray) -> float:
-        return float(((rows @ x - measured) ** 2).sum() + ((prior @ x[:3]) ** 2).sum() + (x[3:] ** 2).sum())
-
-    forces = equations.of_forces().forces(prior)
-    best = np.append(forces, equations.of_forces().others(forces))
-    known = best[:5] + np.array([0.1, 0.0, -0.1, 0.2, 0.0])
-    rest = np.linalg.solve(rows[:, 5:].T @ rows[:, 5:] + np.eye(3), rows[:, 5:].T @ (measured - rows[:, :5] @ known))
-    difference = equations.cost(known, prior) - equations.cost(best[:5], prior)
-    assert difference == pytest.approx(whole(np.append(known, rest)) - whole(best))
