@@ -35,8 +35,8 @@ def search_effects(course: SearchProgress, checkpoint: Checkpoint, say: Progress
     _seek(course, checkpoint, say)
     if _nothing_explains(course):
         say("nothing explains what is left: asking again with weights that hold the error of the model")
-        noise = noise_of(course.data, course.fitted, None, course.noise)[0]
-        course.begin_again(with_turning_placements(course.data, course.base), noise)
+        weights = noise_of(course.data, course.fitted, None, course.noise)[0]
+        course.begin_again(with_turning_placements(course.data, course.base), weights)
         _seek(course, checkpoint, say)
     data, history, noise = course.data, course.history, course.noise
     assert noise is not None
