@@ -88,7 +88,7 @@ def behind_body(sensor: Sensor, scan: Scan, fit: Fit) -> str:
         return OK
     return (
         f"{100 * share:.0f} % of the points lie behind the body: parts of it may have been taken for something else; "
-        "appearance.color_rgb and coloured clouds tell them apart"
+        "appearance.color_rgb and coloured clouds distinguish them"
     )
 
 

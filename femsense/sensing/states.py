@@ -37,7 +37,7 @@ def solve_with(
     Arguments:
         start: a state near by.
         before: tensions along the cables until now (friction).
-        tried: the state is on the way to the forces: rough, in single precision, and given up where it is far from its start.
+        tried: the state is on the way to the forces: rough, in single precision, and stopped where it is far from its start.
     """
     return _solve(sensor, k, nodal_forces(touches, forces, len(start.positions)), start, before, tried)
 

@@ -176,7 +176,7 @@ def test_inputs_move_the_body_neither_too_far_nor_beyond_their_limit(tmp_path: P
 
 
 def test_a_body_without_an_equilibrium_is_said(tmp_path: Path) -> None:
-    robot = block(tmp_path, gravity__vector_m_s2=[0.0, 0.0, -98100.0])
+    robot = block(tmp_path, gravity__vector_m_s2=[0.0, 0.0, -98.1], material__young_modulus_pa=20.0)
     with pytest.raises(DataError, match="no equilibrium under its own weight"):
         assess_accuracy(robot)
 
