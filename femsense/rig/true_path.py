@@ -27,6 +27,8 @@ SETTLED = 1e-8
 SETTLED_HELD = 1e-6
 """The same where cables are held: their tensions come from the balance of the body, to its tolerance [N]."""
 PASSES = 200
+SHORTEST = 0.05
+"""Least share of a step towards the contact forces that a state asks for."""
 SOFT = 1e-5
 """Shares of the moduli rest when a pass moves them by less than this."""
 SLOW = 0.9
@@ -213,6 +215,7 @@ class TruePath:
         """Move on to a load: the state, the tensions along the cables and the contact forces agree at the end."""
         whole = self.body if self.plan.gravity is None else self.body.with_gravity(load.gravity)
         passes, far = [self._motors(load)], FAR
+        pressed = FixedPoint(self._contact_forces(load))
         for _ in range(PASSES):
             ahead = creep_ahead(passes, far)
             motors = passes[-1] if ahead is None else ahead
@@ -220,7 +223,7 @@ class TruePath:
             along, _ = self._along(motors)
             shares = self._shares()
             body = whole if shares is None else whole.with_stiffness_scale(shares)
-            forces = load.forces + self._contact_forces(load)
+            forces = load.forces + pressed.value
             self.state = self._solve(body, load, motors, along, forces, frame)
             soft = self._shares()
             same = soft is None or shares is None or bool(np.abs(soft - shares).max() < SOFT)
@@ -230,6 +233,7 @@ class TruePath:
                 self.grips = self._along(self._motors(load))[1]
                 return
             passes.append(self._motors(load))
+            pressed.step(self._contact_forces(load))
         raise DataError(f"the truth of frame {frame} does not settle: friction and contact keep moving; use more substeps")
 
     def _shares(self) -> FloatArray | None:
@@ -288,6 +292,25 @@ class TruePath:
 
     def _contact_forces(self, load: _Load) -> FloatArray:
         return self.presses.total(load.contact, self.state.positions)
+
+
+class FixedPoint:
+    """Seeks x = g(x): the step towards g(x) is as long as the last two say (vector Aitken; Irons & Tuck 1969), and never longer than whole."""
+
+    def __init__(self, value: FloatArray) -> None:
+        self.value = value
+        self._missed: FloatArray | None = None
+        self._share = 1.0
+
+    def step(self, wanted: FloatArray) -> None:
+        """Move on, with g of the value at hand."""
+        missed = wanted - self.value
+        if self._missed is not None:
+            change = missed - self._missed
+            square = float((change**2).sum())
+            ahead = -self._share * float((self._missed * change).sum()) / square if square > 0.0 else 1.0
+            self._share = float(np.clip(ahead, SHORTEST, 1.0))
+        self.value, self._missed = self.value + self._share * missed, missed
 
 
 def creep_ahead(passes: list[FloatArray], far: float) -> FloatArray | None:

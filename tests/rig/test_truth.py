@@ -230,6 +230,18 @@ def test_a_contact_presses_with_its_force_into_the_surface(robot: Robot) -> None
     assert np.abs(free[7].state.positions - frames[7].state.positions).max() > 1e-4
 
 
+def test_a_force_that_turns_with_a_floppy_body_settles(tmp_path: Path) -> None:
+    floppy = load_robot(write_block_robot(tmp_path / "floppy", cells=(12, 2, 2), material__young_modulus_pa=1e5))
+    press = {"sweep": "b", "point_m": [0.095, 0.01, 0.03], "force_n": [0.0, 1.5, 3.0]}
+    script = changed(BARE, {"contacts": [press], "loads": [], "sweeps__1__cables": {"top": 1e-3}})
+    plan = plan_script(check_script(script), floppy)
+    contact = true_path(floppy, plan)[-1].contacts[0]
+    assert (
+        np.linalg.norm(contact.force) == pytest.approx(3.0, rel=1e-9) and contact.normal[2] < 0.8
+    )  # turned by more than a third of a right angle
+    np.testing.assert_allclose(contact.force / 3.0, -contact.normal, atol=1e-7)
+
+
 def test_a_contact_patch_is_small_and_on_one_side(robot: Robot) -> None:
     mesh = true_robot(robot, TruthTable.model_validate({"refinements": 2, "element": "tet4"}), []).body.mesh
     patch = contact_patch(mesh, [0.07, 0.015, 0.03], 0.008)
