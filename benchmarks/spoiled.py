@@ -1,12 +1,13 @@
 """Recordings spoiled on purpose: what calibrate and estimate make of each kind of wrong input, on robots that come along.
 
-    python benchmarks/spoiled.py [--robot finger four-leg …] [--only KIND …] [--seed N] [--given]
+    python benchmarks/spoiled.py [--robot finger four-leg …] [--only KIND …] [--seed N] [--given] [--out FOLDER] [--minutes N]
 
 The clean recording comes from the virtual rig: a finer mesh, neo-Hookean, markers with 0.2 mm of noise,
 a force in the last sweep. Each kind of error is then written into its files. A row is *told* where a command ends with status 1
 or 2; *right* where each force is within 20 % or two standard deviations, and these are at most twice those of the clean
 recording; *wrong* elsewhere, *SILENT* where then nothing is said either. *left a file* where a refused calibration leaves one.
-With --given the clean recording is calibrated, and only what is estimated is spoiled. Prints a table, and the count of each.
+With --given the clean recording is calibrated, and only what is estimated is spoiled. Rows that stand in FOLDER/rows.jsonl already are
+not measured again, and no row is begun after N minutes, so that it may be run in parts. Prints a table, and the count of each.
 """
 
 from __future__ import annotations
@@ -15,9 +16,12 @@ import argparse
 import contextlib
 import csv
 import io
+import json
 import shutil
 import tempfile
+import time
 import warnings
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -391,6 +395,67 @@ def try_kind(trial: Trial, spoil: Spoil, work: Path) -> tuple[str, str, list[str
     return outcome, text, said, widest
 
 
+@dataclass
+class Rows:
+    """What is measured already, a line of JSON each."""
+
+    path: Path
+
+    def __post_init__(self) -> None:
+        lines = self.path.read_text(encoding="utf-8").splitlines() if self.path.is_file() else []
+        self.done = {tuple(row["key"]): row for row in map(json.loads, lines)}
+
+    def add(self, key: tuple[str, ...], outcome: str, force: str, said: list[str], widest: float) -> None:
+        row = {"key": key, "outcome": outcome, "force": force, "said": said, "widest": widest}
+        self.done[key] = row
+        with self.path.open("a", encoding="utf-8") as stream:
+            stream.write(json.dumps(row) + "\n")
+
+    def show(self, key: tuple[str, ...]) -> None:
+        row = self.done[key]
+        print(f"| {key[0]} | {key[1]} | {row['outcome']} | {row['force']} | {' / '.join(row['said'])} |", flush=True)
+
+
+def kinds_of(name: str, actuation: str, only: list[str] | None) -> list[str]:
+    """Return the kinds that can befall a robot, the clean recording first."""
+    kinds = [kind for kind in KINDS if only is None or kind in ("clean", *only)]
+    chambers, pulled = name == "pneu-finger", name != "pneu-finger" and actuation == "tension"
+    return [kind for kind in kinds if (chambers or kind not in ONLY_CHAMBERS) and (pulled or kind not in ONLY_TENSION)]
+
+
+def trial_of(name: str, folder: Path, options: argparse.Namespace) -> Trial:
+    """Return the clean recording of a robot, simulated where the folder has none, and its calibration where one is to be given."""
+    clean = folder / f"{name}-{options.actuation}-{options.seed}"
+    if not (clean / "recording.toml").is_file():
+        simulate(load_robot(name), script_of(name, options.actuation, options.seed), clean)
+    source = Path(__file__).parents[1] / "meshes" / name
+    trial = Trial(clean, source, pressed_at(name)[0], options.seed, None)
+    if options.given:
+        trial.given = clean.with_suffix(".json")
+        if not trial.given.is_file():
+            call(["calibrate", str(source), str(clean), "-o", str(trial.given)])
+    return trial
+
+
+def measure(name: str, folder: Path, rows: Rows, options: argparse.Namespace, until: float) -> None:
+    """Measure the rows of a robot that are not there yet, and print all."""
+    trial = trial_of(name, folder, options)
+    for kind in kinds_of(name, options.actuation, options.only):
+        key = (name, kind, options.actuation, str(options.seed), "given" if options.given else "")
+        if key not in rows.done:
+            if time.monotonic() > until:
+                continue
+            try:
+                with tempfile.TemporaryDirectory() as work:
+                    outcome, force, said, widest = try_kind(trial, KINDS[kind], Path(work))
+                    told = [" ".join(s.replace(f"{work}/", "").split())[:160] for s in dict.fromkeys(said)]
+            except LookupError:
+                continue
+            rows.add(key, outcome, force, told[:2], widest)
+        trial.widest = 2.0 * rows.done[key]["widest"] if kind == "clean" else trial.widest
+        rows.show(key)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--robot", nargs="*", default=["finger", "arm", "pneu-finger"])
@@ -398,36 +463,19 @@ def main() -> None:
     parser.add_argument("--only", nargs="*", help="kinds")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--given", action="store_true", help="calibrate the clean recording")
+    parser.add_argument("--out", type=Path, help="keep recordings and rows here")
+    parser.add_argument("--minutes", type=float, default=np.inf, help="begin no row after so long")
     options = parser.parse_args()
-    counts: dict[str, int] = {}
-    print("| robot | kind | outcome | force, true 0.15 N | said |\n|---|---|---|---|---|")
-    for name in options.robot:
-        with tempfile.TemporaryDirectory() as folder:
-            clean = simulate(load_robot(name), script_of(name, options.actuation, options.seed), Path(folder) / "clean")
-            source = Path(__file__).parents[1] / "meshes" / name
-            trial = Trial(clean, source, pressed_at(name)[0], options.seed, None)
-            if options.given:
-                trial.given = Path(folder) / "clean.json"
-                call(["calibrate", str(source), str(clean), "-o", str(trial.given)])
-            for kind, spoil in KINDS.items():
-                if options.only is not None and kind not in ("clean", *options.only):
-                    continue
-                if kind in ONLY_CHAMBERS and name != "pneu-finger":
-                    continue
-                if kind in ONLY_TENSION and (name == "pneu-finger" or options.actuation != "tension"):
-                    continue
-                work = Path(folder) / "work"
-                shutil.rmtree(work, ignore_errors=True)
-                work.mkdir()
-                try:
-                    outcome, force, said, widest = try_kind(trial, spoil, work)
-                except LookupError:
-                    continue
-                trial.widest = 2.0 * widest if kind == "clean" else trial.widest
-                told = " / ".join(" ".join(s.replace(f"{work}/", "").split())[:160] for s in said[:2])
-                counts[outcome] = counts.get(outcome, 0) + 1
-                print(f"| {name} | {kind} | {outcome} | {force} | {told} |", flush=True)
-    print("\n" + ", ".join(f"{k}: {v}" for k, v in sorted(counts.items())))
+    until = time.monotonic() + 60.0 * options.minutes
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = options.out or Path(temporary)
+        folder.mkdir(parents=True, exist_ok=True)
+        rows = Rows(folder / "rows.jsonl")
+        print("| robot | kind | outcome | force, true 0.15 N | said |\n|---|---|---|---|---|")
+        for name in options.robot:
+            measure(name, folder, rows, options, until)
+        counts = Counter(row["outcome"] for row in rows.done.values())
+        print("\n" + ", ".join(f"{k}: {v}" for k, v in sorted(counts.items())))
 
 
 if __name__ == "__main__":

@@ -26,6 +26,7 @@ from femsense.calib.marker_assignment import name_markers
 from femsense.calib.other_readings import check_other_readings
 from femsense.calib.pressure_zeros import find_pressure_zeros, has_unknown_zeros, weak_zeros, with_initial_pressures
 from femsense.calib.rigid import fit_rigid
+from femsense.calib.single_inputs import check_single_inputs
 from femsense.calib.still_camera import check_camera_still
 from femsense.core.arrays import FloatArray, IntArray
 from femsense.core.errors import DataError
@@ -155,7 +156,9 @@ def _fitted(
         pairs = pairs_of(robot, scene, poses, jet.residual)
     if strict:
         check_inputs(scene.recording, pairs)
-        check_other_readings(robot, scene, pairs, initial, jet.residual, _residual_of)
+        said = check_other_readings(robot, scene, pairs, initial, jet.residual, _residual_of)
+        if initial is None and not said:
+            check_single_inputs(robot, scene, poses, jet.residual, jet.states, _residual_of)
         check_camera_still(robot, scene.recording, pairs)
     check_reading(robot, pairs, strict=strict)
     return scene, fit, poses, initial, jet

@@ -74,8 +74,8 @@ class Response:
 
 def check_other_readings(
     robot: Robot, scene: Scene, pairs: Sequence[Pairs], initial: FloatArray | None, residual: FloatArray, refit: Refit
-) -> None:
-    """Refuse files that fit far better if read otherwise; warn where they fit better.
+) -> bool:
+    """Refuse files that fit far better if read otherwise; warn where they fit better. Return whether a warning was given.
 
     Arguments:
         robot: the robot.
@@ -89,21 +89,22 @@ def check_other_readings(
         DataError: says what is wrong with the files if the better reading is right.
     """
     if all(_rms(residual[scene.view == v]) < SUSPICIOUS * one.spread for v, one in enumerate(pairs) if len(one.marker)):
-        return
+        return False
     shares = [*_by_inputs(robot, scene, pairs, initial), *_by_gravity(robot, scene, pairs, initial)]
     share, best = min(shares, key=lambda one: one[0], default=(1.0, None))
     if best is None or share * TOLD > 1.0:
-        return
+        return False
     try:
         left = _rms(refit(best.robot, best.recording, best.frames))
     except DataError:
-        return
+        return False
     before = _rms(residual[np.isin(scene.frame, best.frames)])
     found = f"{best.text}: the markers then fit to {1e3 * left:.3g} mm, as the files stand to {1e3 * before:.3g} mm"
     if before > REFUSED * left and not best.fitted:
         raise DataError(found)
     if before > TOLD * left:
         warnings.warn(f"{found}. Is it so?", stacklevel=5)
+    return before > TOLD * left
 
 
 def readings(robot: Robot, recording: Recording, frames: IntArray) -> Iterator[Reading]:
