@@ -3,7 +3,7 @@ wrong labels, a real tentacle.
 
     python benchmarks/calibration.py [PART …] [--seeds N]
 
-Parts: bound, nowhere, clouds, labels, tentacle, rate; all where none is named.
+Parts: bound, nowhere, clouds, labels, single, tentacle, rate; all where none is named.
 Recordings come from a finer mesh with another law than the one that calibrates. Prints every figure of docs/calibration.md.
 """
 
@@ -28,9 +28,11 @@ from arm import NAMES, T_ROBOT_CAMERA, arm, record  # noqa: E402
 from tentacle import FOLDER, Run, recording_of, runs, tentacle  # noqa: E402
 
 from femsense import DataError, Drives, Recording, Robot, Timeline, calibrate  # noqa: E402
+from femsense.calib.calibrate import calibrated_start  # noqa: E402
 from femsense.calib.cloud_pose_search import View, difference, find_cloud_pose  # noqa: E402
 from femsense.calib.inputs import first_inputs  # noqa: E402
 from femsense.calib.marker_assignment import name_markers  # noqa: E402
+from femsense.calib.single_inputs import single_inputs  # noqa: E402
 from femsense.core.arrays import FloatArray, IntArray  # noqa: E402
 from femsense.core.pose import invert_pose, make_pose, rotation_from_vector, transform_points  # noqa: E402
 from femsense.fem.mesh import surface_triangles  # noqa: E402
@@ -302,6 +304,43 @@ def _spoiled(recording: Recording, kind: str, rng: np.random.Generator) -> Recor
     return with_marker_table(recording, recording.marker_names, recording.marker_frame, index, xyz)
 
 
+# One cable's input
+
+
+LEVELS = np.array([(0, 0, 0, 0), (0.8, 0, 0, 0), (0.4, 0, 0, 0), (0, 0.7, 0, 0), (0, 0, 0.9, 0), (0, 0, 0, 0.5), (0, 0, 0.3, 0)])
+
+
+def single(seeds: int) -> None:
+    print("\n## The input of one cable is off: 12 markers, 7 frames\n")
+    print("| what is wrong | runs | said | offset, median [N] | gain, median | left [mm] |\n|---|---|---|---|---|---|")
+    for kind, gain, offset, modulus in (
+        ("nothing", 1.0, 0.0, 300e3),
+        ("the modulus of the robot, by half", 1.0, 0.0, 450e3),
+        ("an offset of a quarter of the range", 1.0, 0.2, 300e3),
+        ("an offset of half the range", 1.0, 0.4, 300e3),
+        ("a gain of 0.8", 1.25, 0.0, 300e3),
+    ):
+        rows = [_one_single(arm(modulus=modulus), seed, gain, offset) for seed in range(seeds)]
+        said, add, times, left = (np.array(column) for column in zip(*rows))
+        print(
+            f"| {kind} | {seeds} | {said.sum():.0f} | {np.median(add):.3f} | {np.median(times):.3f} | {1e3 * np.median(left):.2f} |",
+            flush=True,
+        )
+
+
+def _one_single(robot: Robot, seed: int, gain: float, offset: float) -> tuple[bool, float, float, float]:
+    recording = record(LEVELS, noise=2e-4, seed=seed)[0]
+    inputs = recording.inputs * [gain, 1.0, 1.0, 1.0] + np.array([offset, 0.0, 0.0, 0.0])
+    spoiled = replace(recording, inputs=inputs)
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always")
+        found = calibrate(robot, spoiled)
+    frames = np.arange(len(LEVELS))
+    poses, _, states = calibrated_start(robot, spoiled, frames)
+    own = single_inputs(robot, make_scene(robot, spoiled, frames), poses, states)[0]
+    return any("alone seems off" in str(w.message) for w in heard), own.offset, own.gain, found.rms_m
+
+
 # The real tentacle
 
 
@@ -410,7 +449,15 @@ def _seen(robot: Robot) -> tuple[Recording, FloatArray]:
     return with_marker_table(plain, robot.marker_names, np.zeros(count, np.int64), np.arange(count), seen), seen
 
 
-PARTS = {"bound": bound, "nowhere": nowhere, "clouds": clouds, "labels": labels, "tentacle": real_tentacle, "rate": rate}
+PARTS = {
+    "bound": bound,
+    "nowhere": nowhere,
+    "clouds": clouds,
+    "labels": labels,
+    "single": single,
+    "tentacle": real_tentacle,
+    "rate": rate,
+}
 
 
 def main() -> None:

@@ -55,6 +55,13 @@ def test_intervals_hold_a_gain_beside_an_offset() -> None:
     assert abs(right.offset + 0.12) < 0.02 + 3.0 * right.offset_std
 
 
+def test_a_modulus_is_no_gain_of_one_cable() -> None:
+    robot, frames = arm(modulus=450e3), np.arange(len(LEVELS))
+    poses, _, states = calibrated_start(robot, recording(), frames)
+    found = single_inputs(robot, make_scene(robot, recording(), frames), poses, states)
+    assert max(abs(one.gain - 1.0) for one in found) < 0.1  # 0.5 where the gain in common is not fitted
+
+
 def test_what_is_off_is_read_otherwise_and_the_rest_as_it_stands() -> None:
     one = SingleInput(1, 0.5, 0.1, 2.0, 0.1, 0.3)
     assert one.read(np.ones((2, 3))).tolist() == [[1.0, 2.5, 1.0]] * 2
