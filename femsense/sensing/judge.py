@@ -46,19 +46,23 @@ def status_of(sensor: Sensor, fit: Fit, free: Fit) -> str:
     left = left_over(sensor, fit)
     if left > limit_of(sensor, fit):
         what = "with the contacts found" if fit.touches else "and no contact explains it"
-        times = f"{np.sqrt(left / limit_of(sensor, fit)):.1f} times what free frames leave"
+        times = f"{exceeding(left / limit_of(sensor, fit))} free frames let expect"
         size = times if limit_of(sensor, fit) != FAR_OFF else f"{np.sqrt(left):.1f} standard deviations"
         return f"not explained: {1e3 * fit.rows.rms:.2f} mm are left, {size}, {what}"
     excess = shared_errors(sensor, fit)
     if excess > sensor.knowledge.nuisance_limit:
-        times = np.sqrt(excess / sensor.knowledge.nuisance_limit)
-        return (
-            f"not explained: a smooth error takes up what is left, {times:.1f} times as large as free frames and noise let expect"
-        )
+        more = exceeding(excess / sensor.knowledge.nuisance_limit)
+        return f"not explained: a smooth error takes up what is left, {more} free frames and noise let expect"
     unsure = [i for i, f in enumerate(fit.forces) if np.linalg.norm(f) < _std_along(fit, i) and not unspoken(fit, i)]
     if unsure and fit.touches[unsure[0]].source != "given":
         return "a contact whose force is less than its standard deviation"
     return OK
+
+
+def exceeding(square: float) -> str:
+    """Return in words how far something is above a limit whose square it has so many times (> 1): a tenth more is not "1.1 times" that, and less not 1.0."""
+    times = float(np.sqrt(square))
+    return f"{times:.1f} times what" if times >= 2.0 else f"{max(round(100.0 * (times - 1.0)), 1)} % more than"
 
 
 def beside_markers(sensor: Sensor, k: int, fit: Fit) -> str:

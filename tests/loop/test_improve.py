@@ -50,6 +50,7 @@ def test_a_wrong_modulus_is_named_stiffness_and_nothing_else():
     assert [e.name for e in loop.effects] == ["stiffness"]
     assert "do not tell" not in loop.sentence  # weight tells it from a gain of all cables
     assert found(loop, "stiffness").parameters["scale"].value == pytest.approx(1.25, rel=0.06)
+    assert [e["name"] for e in loop.entries] == ["stiffness", *loop.fitted_along] and "cable_offset" in loop.fitted_along
     assert loop.robot.body.material.young_modulus[0] == pytest.approx(1.25 * 300e3, rel=0.06)
 
 

@@ -21,3 +21,10 @@ def test_a_loop_says_how_large_the_error_of_the_model_is() -> None:
     text = loop_text(Loop.model_validate({"verdict": "unexplained", "model_error": parts}))
     assert "12.100 mm held out, beyond noise and discretisation; noise: marker_noise_m of recording.toml" in text
     assert "error of the model" not in loop_text(Loop(verdict="none"))
+
+
+def test_what_was_fitted_along_and_is_handed_back_is_said_with_its_values() -> None:
+    along = {"cable_offset": {"offset_n": {"value": {"m1": 0.21}, "std": {"m1": 0.08}, "unit": "N"}}}
+    text = loop_text(Loop.model_validate({"verdict": "effects", "fitted_along": along}))
+    title, values = text.split("cable_offset (fitted along, part of the improved robot, not named)")
+    assert "verdict: effects" in title and "0.21" in values and "0.08" in values

@@ -18,7 +18,7 @@ from femsense.model.recording import Recording, with_marker_table
 from femsense.pointcloud.cloud import PointCloud
 from femsense.pointcloud.rays import Surface
 from femsense.sensing.forces import no_forces
-from femsense.sensing.judge import behind_body, status_of
+from femsense.sensing.judge import behind_body, exceeding, status_of
 from femsense.sensing.pipeline import estimate
 from femsense.sensing.prepare import make_sensor, scan_of
 from femsense.sensing.search import evidence
@@ -95,6 +95,11 @@ def test_a_frame_that_nothing_explains_is_not_ok(tmp_path):
     run = estimate(arm(), seen, calibrate(arm(), seen))
     assert run.frames[3].status != "ok"
     assert [frame.status for frame in run.frames[:3]] == ["ok"] * 3
+
+
+def test_what_is_beyond_a_limit_is_never_said_to_be_once_as_large():
+    assert [exceeding(times**2) for times in (1.0001, 1.04, 1.7)] == ["1 % more than", "4 % more than", "70 % more than"]
+    assert exceeding(2.34**2) == "2.3 times what"
 
 
 def test_no_camera_sees_through_the_body(tmp_path):

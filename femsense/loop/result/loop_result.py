@@ -21,6 +21,7 @@ from femsense.loop.result.records import (
     Residuals,
     TriedEffect,
     Untestable,
+    Value,
 )
 from femsense.loop.result.tables import AS_EMPTY, LEFT_OUT, table_of
 from femsense.model.effects import Entry
@@ -68,6 +69,9 @@ class LoopResult:
     data: DataCard
     model_error: ModelError | None = field(default=None, metadata=AS_EMPTY)
     """What is left that is no noise."""
+    fitted_along: Mapping[str, Mapping[str, Value]] = field(default_factory=dict)
+    """What the improved robot has beside `effects`, since these were fitted with it (the modulus, input offsets) → its values. It is not named: no value
+    of it is surely away from what is declared, or held-out data do not need it."""
     correction: CorrectionRecord | None = field(default=None, metadata=LEFT_OUT)
     """An empirical correction of what is left, where one was asked for."""
     residuals: Residuals | None = field(default=None, metadata=AS_EMPTY)

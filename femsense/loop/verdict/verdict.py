@@ -42,6 +42,7 @@ from femsense.loop.verdict.summary import (
     residual_table,
     tried_effects,
     untestable,
+    values_of,
 )
 from femsense.model.effects import Entry, apply_effects
 from femsense.model.robot import Robot
@@ -105,6 +106,7 @@ def conclude(data: Data, search: Search, rng: np.random.Generator, *, correct: b
         declared=data.declared,
         data=data_card(data, final, std, noise, measured.source, search.n_effective),
         model_error=budget,
+        fitted_along={e["name"]: values_of(std, back, e["name"]) for e in entries if e["name"] not in names},
         correction=correction,
         residuals=residual_table(data, before, back),
         evidence=gather(data, before, search.base, final, back, shown, noise, search.first, search.last, tests, rng),

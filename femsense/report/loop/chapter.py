@@ -12,7 +12,7 @@ from femsense.report.drawing import skin
 from femsense.report.loop.calibration_moves import calibration_table
 from femsense.report.loop.data_card import data_card
 from femsense.report.loop.document import Loop
-from femsense.report.loop.effects import effects_table, ranking_table, refits_table
+from femsense.report.loop.effects import along_table, effects_table, ranking_table, refits_table
 from femsense.report.loop.evidence import Evidence
 from femsense.report.loop.forces import forces_part
 from femsense.report.loop.held_out import held_out_errors
@@ -70,6 +70,7 @@ def loop_chapter(file: Path, title: str) -> Chapter:
         section(
             "4. Effects",
             effects_table(loop.effects),
+            along_table(loop.fitted_along),
             ranking_table(loop.candidates, evidence.ranking, loop.effects),
             refits_table(loop.candidates),
         ),

@@ -189,6 +189,7 @@ class Loop(Document):
     before: Errors = Errors()
     after: Errors = Errors()
     effects: list[Effect] = Field(default_factory=list)
+    fitted_along: dict[str, dict[str, Parameter]] = Field(default_factory=dict)
     candidates: list[Candidate] = Field(default_factory=list)
     confounded: list[Confounded] = Field(default_factory=list)
     next_experiment: str = ""

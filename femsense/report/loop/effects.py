@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from femsense.loop.result.records import NAMED, PASSES
 from femsense.model.effects import EFFECTS
 from femsense.report import words
-from femsense.report.loop.document import Candidate, Effect
+from femsense.report.loop.document import Candidate, Effect, Parameter
 from femsense.report.loop.evidence import Estimate, Ranked
 from femsense.report.page import Cell, Html, code, element, paragraph, table, together
 
@@ -53,6 +53,18 @@ def effects_table(effects: Sequence[Effect]) -> Html | None:
         caption="Effects in the order in which they were added, with the parameters of the final fit.",
         numeric=(3, 4),
     )
+
+
+def along_table(fitted_along: Mapping[str, Mapping[str, Parameter]]) -> Html | None:
+    """Return what the improved robot has beside the effects that are named, since these were fitted with it; None where that is nothing."""
+    rows = [
+        [code(name), code(f"{key} {part}".strip()), words.parameter(value, std, parameter.unit)]
+        for name, parameters in fitted_along.items()
+        for key, parameter in parameters.items()
+        for part, value, std in words.entries(parameter.value, parameter.std)
+    ]
+    caption = "Fitted along, and part of the improved robot too: what is named was fitted with it, but it is not named itself."
+    return table(("Fitted along", "Parameter", "Value ± std"), rows, caption=caption) if rows else None
 
 
 def ranking_table(candidates: Sequence[Candidate], ranked: Mapping[str, Ranked], effects: Sequence[Effect]) -> Html | None:

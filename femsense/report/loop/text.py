@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from femsense.loop.result.loop_result import NONE
-from femsense.report.loop.document import Corrected, Detectable, Effect, Left, Loop, Untestable, Where
+from femsense.report.loop.document import Corrected, Detectable, Effect, Left, Loop, Parameter, Untestable, Where
 from femsense.report.text import columns
 from femsense.report.words import VERDICTS
 
@@ -21,6 +21,8 @@ def loop_text(loop: Loop) -> str:
     lines.append(columns(_rows(loop)))
     for effect in loop.effects:
         lines += ["", effect_text(effect)]
+    for name, parameters in loop.fitted_along.items():
+        lines += ["", f"{name} (fitted along, part of the improved robot, not named)", _values(parameters)]
     for title, said in (
         ("cannot be distinguished", ", ".join(" / ".join(pair) for pair in _open_pairs(loop))),
         ("not testable", ", ".join(map(_untestable, loop.not_testable))),
@@ -35,7 +37,7 @@ def loop_text(loop: Loop) -> str:
 
 def effect_text(effect: Effect) -> str:
     """Return an effect that was found: its name, parameters with one standard deviation, and what it changed."""
-    rows = [[key, _parameter(entry.value, entry.std, entry.unit)] for key, entry in effect.parameters.items()]
+    rows = _value_rows(effect.parameters)
     before, after = effect.validation_rms_before_m, effect.validation_rms_after_m
     if before is not None and after is not None:
         rows.append(["residual on held-out data", f"{1e3 * before:.3f} → {1e3 * after:.3f} mm rms"])
@@ -43,6 +45,14 @@ def effect_text(effect: Effect) -> str:
 
 
 # --- helpers ----------------------------------------------------------------------------------------------------------
+
+
+def _values(parameters: Mapping[str, Parameter]) -> str:
+    return columns(_value_rows(parameters))
+
+
+def _value_rows(parameters: Mapping[str, Parameter]) -> list[list[str]]:
+    return [[key, _parameter(entry.value, entry.std, entry.unit)] for key, entry in parameters.items()]
 
 
 def _open_pairs(loop: Loop) -> list[list[str]]:
