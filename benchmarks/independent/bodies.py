@@ -175,6 +175,52 @@ def pad(rng: np.random.Generator) -> Body:
     return Body("pad", points, tets, truth, 60e3, 0.45, 1070.0, fixed, [], 0.0, (1.0e-3, 3e-3), -0.004, 4e-3, color, touchable)
 
 
+def slab(rng: np.random.Generator) -> Body:
+    """A plate 110 × 64 × 13 mm clamped along one edge, with two cables near its upper face; truth: 27-node bricks."""
+    points, tets = _kuhn(np.linspace(0, 0.11, 15), np.linspace(-0.032, 0.032, 9), np.linspace(-0.0065, 0.0065, 3))
+    truth = skfem.MeshHex.init_tensor(np.linspace(0, 0.11, 13), np.linspace(-0.032, 0.032, 8), np.linspace(-0.0065, 0.0065, 4))
+    tendons = [
+        Tendon(name, np.array([[x, y, 0.004] for x in (0.1, 0.07, 0.035)]), np.array([-0.02, y, 0.004]))
+        for name, y in (("left", 0.018), ("right", -0.018))
+    ]
+    fixed = np.array([[-0.001, -0.05, -0.02], [1e-4, 0.05, 0.02]])
+    touchable = np.array([[0.05, -0.028, -1], [0.105, 0.028, 1]])
+    color = (0.30, 0.30, 0.75)
+    return Body(
+        "slab", points, tets, truth, 700e3, 0.46, 1050.0, fixed, tendons, 1.5, (1.5e-3, 5e-3), -0.07, 2.0e-3, color, touchable
+    )
+
+
+def post(rng: np.random.Generator) -> Body:
+    """A round post 28 × 85 mm that stands, with three cables; truth: P2 on facets of its own, which cut the round otherwise."""
+    points, tets = _post(5, 14)
+    fine, cells = _post(6, 15)
+    fine[:, 0] *= -1
+    truth = _other(fine, cells, rng, share=0.0)
+    tendons = []
+    for name, angle in (("a", 0.4), ("b", 0.4 + 2 * np.pi / 3), ("c", 0.4 + 4 * np.pi / 3)):
+        x, y = 0.009 * np.cos(angle), 0.009 * np.sin(angle)
+        tendons.append(Tendon(name, np.array([[x, y, z] for z in (0.082, 0.055, 0.025)]), np.array([x, y, -0.01])))
+    fixed = np.array([[-0.02, -0.02, -0.001], [0.02, 0.02, 1e-4]])
+    touchable = np.array([[-1, -1, 0.035], [1, 1, 0.08]])
+    color = (0.80, 0.45, 0.15)
+    return Body(
+        "post", points, tets, truth, 180e3, 0.44, 1100.0, fixed, tendons, 1.0, (1.5e-3, 4e-3), -0.02, 2.5e-3, color, touchable
+    )
+
+
+def _post(across: int, up: int) -> tuple[Array, Array]:
+    """A round post of so many nodes across and along."""
+    axis = np.linspace(-1, 1, across)
+    points, tets = _kuhn(axis, axis, np.linspace(0, 0.085, up))
+    u, v, w = points.T
+    round_ = 0.9
+    x = u * (1 - round_ + round_ * np.sqrt(1 - v**2 / 2))
+    y = v * (1 - round_ + round_ * np.sqrt(1 - u**2 / 2))
+    points = np.column_stack([0.014 * x, 0.014 * y, w])
+    return points, _upright(points, tets)
+
+
 def _surface(points: Array, tets: Array) -> tuple[Array, Array]:
     faces = np.concatenate([tets[:, k] for k in ([1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1])])
     _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
@@ -195,8 +241,8 @@ def _pulled_in(surface: tuple[Array, Array], point: Array, depth: float) -> Arra
     return inside[int(np.argmin(distance))].astype(float)
 
 
-def write_robot(folder: Path, body: Body, markers: dict[str, Array]) -> None:
-    """robot.toml and its mesh, by the contract."""
+def write_robot(folder: Path, body: Body, markers: dict[str, Array], *, colors: bool = True) -> None:
+    """robot.toml and its mesh, by the contract; without `colors` it does not say how the robot looks."""
     folder.mkdir(parents=True, exist_ok=True)
     meshio.write(folder / f"{body.name}.vtu", meshio.Mesh(body.points * 1e3, [("tetra", body.tets)]))
     lines = [
@@ -228,7 +274,8 @@ def write_robot(folder: Path, body: Body, markers: dict[str, Array]) -> None:
         lines += ["max_tension_n = 20.0"]
     for name, place in markers.items():
         lines += ["", "[[markers]]", f'name = "{name}"', f"position_m = {listed(place)}"]
-    lines += ["", "[features]", "count = 51", "", "[appearance]", f"color_rgb = {list(body.color)}", ""]
+    lines += ["", "[features]", "count = 51", ""]
+    lines += ["[appearance]", f"color_rgb = {list(body.color)}", ""] if colors else []
     (folder / "robot.toml").write_text("\n".join(lines), encoding="utf-8")
 
 

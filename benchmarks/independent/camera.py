@@ -118,31 +118,29 @@ def paint(shot: Shot, robot_color: Array, object_color: Array, camera: Camera, r
     return np.asarray((255 * shade).clip(0, 255), np.uint8)
 
 
-def write_cloud(path: Path, z: Array, color: NDArray[np.uint8], keep: NDArray[np.bool_]) -> None:
+def write_cloud(path: Path, z: Array, color: NDArray[np.uint8] | None, keep: NDArray[np.bool_]) -> None:
     """A binary PLY in the camera frame."""
     chosen = keep & (z > 0)
     points = directions()[chosen] * z[chosen, None]
-    rows = np.empty(len(points), [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")])
-    for k, name in enumerate(("x", "y", "z")):
+    own = ("red", "green", "blue") if color is not None else ()
+    rows = np.empty(len(points), [*((n, "<f4") for n in "xyz"), *((n, "u1") for n in own)])
+    for k, name in enumerate("xyz"):
         rows[name] = points[:, k]
-    for k, name in enumerate(("red", "green", "blue")):
+    for k, name in enumerate(own):
         rows[name] = color[chosen, k]
     head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
-    head += (
-        [f"property float {n}" for n in "xyz"] + [f"property uchar {n}" for n in ("red", "green", "blue")] + ["end_header", ""]
-    )
+    head += [f"property float {n}" for n in "xyz"] + [f"property uchar {n}" for n in own] + ["end_header", ""]
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes("\n".join(head).encode() + rows.tobytes())
 
 
-def write_images(folder: Path, frame: int, z: Array, color: NDArray[np.uint8], unit: float) -> None:
-    """A depth image of 16 bits and a colour image of 8 bits."""
+def write_images(folder: Path, frame: int, z: Array, color: NDArray[np.uint8] | None, unit: float) -> None:
+    """A depth image of 16 bits and a colour image of 8 bits, if there are colours."""
     import cv2
 
-    for name, image in (
-        ("depth", np.round(z / unit).clip(0, 65535).astype(np.uint16).reshape(HEIGHT, WIDTH)),
-        ("color", color.reshape(HEIGHT, WIDTH, 3)[:, :, ::-1]),
-    ):
+    images = {"depth": np.round(z / unit).clip(0, 65535).astype(np.uint16).reshape(HEIGHT, WIDTH)}
+    images |= {} if color is None else {"color": color.reshape(HEIGHT, WIDTH, 3)[:, :, ::-1]}
+    for name, image in images.items():
         path = folder / name / f"{frame:06d}.png"
         path.parent.mkdir(parents=True, exist_ok=True)
         if not cv2.imwrite(str(path), np.ascontiguousarray(image)):

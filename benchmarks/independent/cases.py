@@ -19,6 +19,8 @@ class Touch:
     """How far it slides over its frames [m]."""
     first: int = 0
     """Its first frame, counted from the first touched one."""
+    scale: float = 1.0
+    """How many times larger the object is than those that are drawn."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,10 @@ class Case:
     """The touching ball is declared in [[tools]]."""
     hard: bool = False
     """Three times the dropouts, more flying pixels."""
+    colors: bool = True
+    """Whether the camera has colours."""
+    calm: int = 0
+    """So many frames in place of the touched ones, in which the objects hover beside the robot and the inputs swing."""
 
 
 FREE, TOUCHED, AFTER = 6, 10, 2
@@ -60,4 +66,11 @@ CASES = (
     Case("pad-normal", "pad", (Touch(),)),
     Case("pad-plate", "pad", (Touch("plate"),), camera="tof", images=True, declared_noise=True),
     Case("pad-slide", "pad", (Touch(tangent=0.3, slide_m=0.012),), camera="stereo", distance_m=0.5, hard=True),
+    Case("slab-gray", "slab", (Touch(scale=1.5),), camera="tof", distance_m=0.45, images=True, colors=False),
+    Case("slab-rod", "slab", (Touch("rod"),), "displacement", "tof", 0.3, declared_noise=True),
+    Case("post-two", "post", (Touch(scale=0.6), Touch(first=4)), "displacement", "stereo", 0.3),
+    Case("post-plate", "post", (Touch("plate", scale=1.4),), "tension", "stereo", 0.4, images=True, colors=False),
+    Case("bar-calm", "bar", (Touch(),), calm=200),
+    Case("arm-calm", "arm", (Touch("rod"),), "displacement", "tof", 0.5, images=True, calm=200),
+    Case("post-calm", "post", (Touch("plate"),), "tension", "stereo", 0.35, hard=True, calm=200),
 )

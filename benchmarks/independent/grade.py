@@ -171,8 +171,9 @@ def run(folder: Path, *, at: bool = False, timeout: float = 900.0) -> str:
         if done.returncode:
             return f"{words[0]} ended with {done.returncode}: {(done.stdout + done.stderr).strip()[-160:]!r}"
     pose = np.asarray(json.loads(Path(calibration).read_text(encoding="utf-8"))["T_robot_camera"])
-    true = np.asarray(json.loads((folder / "truth.json").read_text(encoding="utf-8"))["T_robot_camera"])
-    points = [p["point"] for p in json.loads((folder / "truth.json").read_text(encoding="utf-8"))["contacts"]]
+    truth = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
+    true = np.asarray(truth["T_robot_camera"])
+    points = [p["point"] for p in truth["contacts"]] or list(truth["markers_m"].values())
     off = np.linalg.norm(_moved(pose, true, np.asarray(points)), axis=1).mean()
     return f"pose {1e3 * off:.2f} mm off, {time.perf_counter() - begin:.0f} s"
 

@@ -47,7 +47,7 @@ def make(case: Case, folder: Path, seed: int, *, diamond: Path | None = None, pl
     problem = Problem(solid, [Cable(t.name, solid.rows(t.path), t.pull) for t in body.tendons])
     camera = _camera(case, body, rng)
     markers = _markers(body, skin, rng)
-    write_robot(folder / "robot", body, markers)
+    write_robot(folder / "robot", body, markers, colors=case.colors)
     take = Take()
     zero = rng.uniform(0.1, 0.35, len(body.tendons)) * body.tension * (case.zero == "unknown")
     for tension in _free_inputs(case, body, zero, rng):
@@ -71,8 +71,8 @@ def make(case: Case, folder: Path, seed: int, *, diamond: Path | None = None, pl
         "frames": len(take.states),
         "certificate": {
             "worst_residual_n": max(s.residual_n for s in take.states),
-            "worst_energy_slope": max(abs(c["energy_slope"]) for c in take.certificates),
-            "least_energy_curvature_j": min(c["energy_curvature_j"] for c in take.certificates),
+            "worst_energy_slope": max((abs(c["energy_slope"]) for c in take.certificates), default=0.0),
+            "least_energy_curvature_j": min((c["energy_curvature_j"] for c in take.certificates), default=0.0),
         },
         "markers_m": {k: listed(v) for k, v in markers.items()},
         "made_in_s": round(time.perf_counter() - begin, 1),
@@ -90,8 +90,8 @@ def _needed(folder: Path | None) -> Path:
 def _camera(case: Case, body: Body, rng: np.random.Generator) -> Camera:
     low, high = body.points.min(axis=0), body.points.max(axis=0)
     target = (low + high) / 2 + rng.normal(scale=0.004, size=3)
-    elevation = rng.uniform(0.6, 1.0) if case.robot in ("pad", "diamond") else rng.uniform(0.25, 0.75)
-    azimuth = rng.uniform(-np.pi, np.pi) if case.robot != "bar" else rng.choice([-1, 1]) * rng.uniform(0.9, 2.1)
+    elevation = rng.uniform(0.6, 1.0) if case.robot in ("pad", "diamond", "slab") else rng.uniform(0.25, 0.75)
+    azimuth = rng.uniform(-np.pi, np.pi) if case.robot not in ("bar", "slab") else rng.choice([-1, 1]) * rng.uniform(0.9, 2.1)
     pose = look_at(target, case.distance_m * rng.uniform(0.95, 1.05), azimuth, elevation, rng.normal(scale=0.1))
     amount = (0.002, 0.0) if case.camera == "stereo" else (0.0003, 0.0008)
     return Camera(case.camera, pose, amount, 0.3 if case.hard else 0.1, 0.5 if case.hard else 0.2)
@@ -127,11 +127,12 @@ def _touch(
     largest = [_largest(problem, skin, calm, one) for one in placed]
     base, cord = calm.tension, problem.shortening(calm.x)
     hop = rng.uniform(0.3, 0.7, len(base)) * body.tension if case.jump else np.zeros(len(base))
-    for k in range(TOUCHED + AFTER):
+    swing = 5.0 if case.calm else 1.0
+    for k in range(case.calm or TOUCHED + AFTER):
         before = take.states[-1]
-        drift = 0.08 * body.tension * np.sin(0.5 * k + np.arange(len(base)))
+        drift = 0.08 * swing * body.tension * np.sin(0.5 * k + np.arange(len(base)))
         tension = np.maximum(base + drift + hop * (k in (0, 1, 2, 6, 7)), 0.0)
-        shortening = cord + 4e-4 * np.sin(0.5 * k + np.arange(len(base))) + 0.002 * (hop > 0) * (k in (0, 1, 2, 6, 7))
+        shortening = cord + 4e-4 * swing * np.sin(0.5 * k + np.arange(len(base))) + 0.002 * (hop > 0) * (k in (0, 1, 2, 6, 7))
         total = np.zeros_like(before.x)
         for number, (one, most) in enumerate(zip(placed, largest)):
             level = _level(case, k, one)
@@ -146,7 +147,7 @@ def _touch(
 
 def _level(case: Case, k: int, one: Placed) -> float:
     last = TOUCHED
-    if k < one.touch.first or k >= last:
+    if case.calm or k < one.touch.first or k >= last:
         return 0.0
     if case.jump:
         return (1.0, 1.0, 0.6, 0.6, 1.0, 0.3, 1.0, 1.0, 0.5, 0.8)[k]
@@ -190,10 +191,10 @@ def _film(
         for number, one in enumerate(placed if frame >= FREE else []):
             mine = [c["patch"] for c in here if c["contact"] == number]
             spread = mine[0] if mine else one.patch(skin, float((frame - FREE) >= TOUCHED))
-            objects += one.objects(spread, state.x, 0.0 if mine else AWAY_M)
+            objects += one.objects(spread, state.x, 0.0 if mine else _away(case, frame))
         shot = shoot(camera, (np.asarray(skin.rows @ state.x), skin.tri), objects, table(body.ground))
         z = measure(camera, shot, rng)
-        picture = paint(shot, np.array(body.color), color, camera, rng)
+        picture = paint(shot, np.array(body.color), color, camera, rng) if case.colors else None
         if case.images:
             write_images(folder, frame, z, picture, 1e-4)
         else:
@@ -217,6 +218,11 @@ def _film(
             "hidden": one.touch.hidden,
             "patch_radius_m": one.radius,
         }
+
+
+def _away(case: Case, frame: int) -> float:
+    """How far an object that does not touch is from the robot [m]."""
+    return AWAY_M * (0.1 + 0.9 * abs(np.sin(0.13 * frame))) if case.calm else AWAY_M
 
 
 def _certify(

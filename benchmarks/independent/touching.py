@@ -160,6 +160,7 @@ def _candidate(body: Body, skin: Skin, touch: Touch, size: Array, rng: np.random
     ]
     if body.name == "pad" and touch.kind == "plate":
         radius = rng.uniform(0.009, 0.012)
+    radius *= touch.scale
     spread = {"ball": body.patch, "rod": 0.6 * body.patch, "plate": min(0.005, 0.9 * radius)}[touch.kind]
     return Placed(
         touch, shape(touch.kind, radius), place, along, spread, 3.0 if touch.kind == "rod" else 1.0, rng.uniform(*body.yields)

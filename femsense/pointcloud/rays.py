@@ -76,6 +76,10 @@ class Surface:
         looking = np.einsum("rc,rc->r", hits.normal, ray) < -GRAZING
         return _select(hits, (gap <= reach) & looking)
 
+    def gap(self, points: FloatArray) -> FloatArray:
+        """Return how far points (k, 3) lie from the surface, inside or outside [m], shape (k,)."""
+        return np.asarray(self._scene.compute_distance(_tensor(points)).numpy(), dtype=np.float64)
+
     def closest(self, points: FloatArray) -> tuple[FloatArray, FloatArray, IntArray, FloatArray]:
         """Return the closest points (k, 3) [m], signed distances (k,) > 0 outside [m],
         their triangles (k,) and barycentric weights (k, 3)."""

@@ -28,8 +28,6 @@ WIDER = 2.0
 """The size of the forces is itself uncertain: standard deviations are those of a prior so much wider than the likeliest."""
 SIZINGS = 8
 """How often the size of the forces is estimated anew in one linear problem."""
-LOST = 9.0
-"""What a point counts that finds no surface in one state and one in another."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -83,10 +81,12 @@ class Linearisation:
         The two differed by less than a twentieth of what the cost had changed, but for steps that were ten times too long.
         """
         columns, known = nuisance_columns(sensor.knowledge, there.rows, self.sag)
-        return replace(self, misfit=misfit_with_lost(there.rows.residual - known, columns, there.rows)).cost(there)
+        return replace(self, misfit=misfit_of(there.rows.residual - known, columns, there.rows)[0]).cost(there)
 
-    def step(self, sensor: Sensor, here: Iterate, trust: float = 1.0) -> ForceStep:
+    def step(self, sensor: Sensor, here: Iterate, trust: float = 1.0, *, firm: bool = False) -> ForceStep:
         """Return forces and shifts of the places that explain the rows best; where `trust` is below 1, near those that are here.
+
+        `firm` as for `robust_std`.
 
         Three components of one force are seldom all determined: a beam hardly yields along its axis. They share a Gaussian prior whose size the
         data choose (MacKay 1992), so that what the data do not see shrinks and does not inflate the force. Raises DataError.
@@ -95,7 +95,7 @@ class Linearisation:
         place_std = np.repeat([t.std_m for t in here.touches], 2)
         free = np.repeat([t.std_m > 0 and float(np.linalg.norm(f)) > 0 for t, f in zip(here.touches, here.forces)], 2)
         wanted = np.array([e @ (t.expected - t.place) for t, e in zip(here.touches, self.frames)]).ravel()
-        normal = self._normal_equations(here, free * place_std, free * wanted)
+        normal = self._normal_equations(here, free * place_std, free * wanted, firm)
         held = self._held(sensor, here, normal, place_std, free * wanted, trust)
         forces, others, sizes = self._forces_and_sizes(sensor, here, normal, held)
         covariance = normal.covariance(block_diag(*_prior_roots(here.touches, self.normals, WIDER * sizes)))
@@ -112,11 +112,11 @@ class Linearisation:
             sizes,
         )
 
-    def _normal_equations(self, here: Iterate, shift_std: FloatArray, wanted: FloatArray) -> NormalEquations:
+    def _normal_equations(self, here: Iterate, shift_std: FloatArray, wanted: FloatArray, firm: bool) -> NormalEquations:
         """Return what all whitened rows say of forces, shifts and nuisance; the latter two have their unit priors."""
         rest = self.residual + self.by_force @ here.forces.ravel() - self.by_shift @ wanted
         A = np.hstack([self.by_force, self.by_shift * shift_std, self.nuisance, rest[:, None]])
-        A /= robust_std(here.rows, self.residual)[:, None]
+        A /= robust_std(here.rows, self.residual, firm=firm)[:, None]
         gram, f = A.T @ A, self.by_force.shape[1]
         others = np.append(np.zeros(f), np.ones(len(gram) - 1 - f))
         return NormalEquations(gram[:-1, :-1] + np.diag(others), gram[:-1, -1], f)
@@ -229,13 +229,8 @@ def linearise(sensor: Sensor, here: Iterate, at_hand: tuple[Tangent, FloatArray]
         np.array([touch_normal(sensor, t, here.state) for t in here.touches]),
         moves[: 3 * m],
         sag,
-        misfit_with_lost(here.rows.residual - known, columns, here.rows),
+        misfit_of(here.rows.residual - known, columns, here.rows)[0],
     )
-
-
-def misfit_with_lost(residual: FloatArray, nuisance: FloatArray, rows: Rows) -> float:
-    """Return the misfit of rows with nuisance fitted, points without a surface counted in."""
-    return misfit_of(residual, nuisance, rows)[0] + LOST * rows.lost / rows.together
 
 
 def _prior_roots(touches: Sequence[Touch], normals: FloatArray, sizes: FloatArray) -> list[FloatArray]:

@@ -15,9 +15,9 @@ from femsense.core.arrays import FloatArray, freeze
 from femsense.core.errors import DataError
 from femsense.fem.compliance import tangent_at
 from femsense.fem.equilibrium import Equilibrium
-from femsense.sensing.force_step import ForceStep, Iterate, Linearisation, linearise, misfit_with_lost
+from femsense.sensing.force_step import ForceStep, Iterate, Linearisation, linearise
 from femsense.sensing.measurement_rows import rows_at
-from femsense.sensing.nuisance import nuisance_columns, sag_at
+from femsense.sensing.nuisance import misfit_of, nuisance_columns, sag_at
 from femsense.sensing.states import solve_with
 from femsense.sensing.touches import make_touch, within_cones
 from femsense.sensing.types import Fit, Sensor, Touch
@@ -34,7 +34,7 @@ def no_forces(sensor: Sensor, k: int, scan: Scan | None, state: Equilibrium, lik
     tangent = tangent_at(sensor.robot.body, state) if like is None or like.tangent is None else like.tangent
     sag = sag_at(sensor, state, tangent) if like is None or like.sag is None else like.sag
     columns, known = nuisance_columns(sensor.knowledge, rows, sag)
-    cost = misfit_with_lost(rows.residual - known, columns, rows)
+    cost = misfit_of(rows.residual - known, columns, rows)[0]
     return Fit((), state, np.zeros((0, 3)), np.zeros((0, 0)), np.zeros((0, 3, 3)), rows, cost, tangent=tangent, sag=sag)
 
 
@@ -61,23 +61,8 @@ def fit_forces(
     """
     frame = _Frame(sensor, k, scan, before)
     here, linear = frame.best_start(touches, free, start)
-    step = linear.step(sensor, here)
-    converged, trust = False, 1.0
-    for _ in range(sensor.options.iterations):
-        here = replace(here, sizes=step.sizes)
-        cost = linear.cost(here)
-        if _hardly_moves(sensor, here, step):
-            converged = True
-            break
-        better, trust = frame.descend(here, linear, step, trust)
-        if better is None:
-            break
-        gain = cost - better[1].cost(better[0])
-        here, linear = better
-        step = linear.step(sensor, here)
-        if gain < SLIGHT * (cost - gain):
-            converged = True
-            break
+    for firm in (False, True) if here.rows.of_clouds else (False,):
+        here, linear, step, converged = frame.settle(here, linear, firm)
     return frame.fit_of(here, linear, step, converged)
 
 
@@ -109,12 +94,30 @@ class _Frame:
         forces = within_cones(sensor, here.touches, start[1], start[0])
         return self._where_it_costs_less(replace(here, forces=forces, state=start[0]), here, linear) or (here, linear)
 
+    def settle(self, here: Iterate, linear: Linearisation, firm: bool) -> tuple[Iterate, Linearisation, ForceStep, bool]:
+        """Return where steps lead that lower the cost, the step from there, and whether they had become small (`firm`: see `robust_std`)."""
+        step, trust = linear.step(self.sensor, here, firm=firm), 1.0
+        for _ in range(self.sensor.options.iterations):
+            here = replace(here, sizes=step.sizes)
+            cost = linear.cost(here)
+            if _hardly_moves(self.sensor, here, step):
+                return here, linear, step, True
+            better, trust = self.descend(here, linear, step, trust, firm)
+            if better is None:
+                break
+            gain = cost - better[1].cost(better[0])
+            here, linear = better
+            step = linear.step(self.sensor, here, firm=firm)
+            if gain < SLIGHT * (cost - gain):
+                return here, linear, step, True
+        return here, linear, step, False
+
     def descend(
-        self, here: Iterate, linear: Linearisation, step: ForceStep, trust: float
+        self, here: Iterate, linear: Linearisation, step: ForceStep, trust: float, firm: bool
     ) -> tuple[tuple[Iterate, Linearisation] | None, float]:
         """Return where a step leads that costs less, and how far the next one is trusted; None where all lead too far."""
         for _ in range(TRIES):
-            shorter = step if trust >= 1.0 else linear.step(self.sensor, here, trust)
+            shorter = step if trust >= 1.0 else linear.step(self.sensor, here, trust, firm=firm)
             better = self._where_it_costs_less(_moved(self.sensor, here, linear, shorter), here, linear)
             if better is not None:
                 return better, min(4.0 * trust, 1.0)

@@ -44,6 +44,7 @@ def _ray_rows(sensor: Sensor, scan: Scan, state: Equilibrium) -> Rows:
     nodes = sensor.robot.body.mesh.nodes
     move = rows.operator(len(nodes))
     rest = rows.hits.place(nodes)
+    missed = np.setdiff1d(np.arange(len(scan.view)), rows.hits.index, assume_unique=True)
     return Rows(
         functional=lambda u: np.asarray(move @ u.reshape(len(u), -1).T),
         residual=rows.residual,
@@ -53,7 +54,7 @@ def _ray_rows(sensor: Sensor, scan: Scan, state: Equilibrium) -> Rows:
         way=np.linalg.norm(rows.hits.place(state.positions) - rest, axis=1),
         count=len(rows.residual),
         rms=float(np.sqrt((rows.residual**2).mean())),
-        lost=len(scan.view) - len(rows.residual),
+        missed=surface.gap(scan.points(poses)[missed]) / (sensor.knowledge.rough * scan.ray_std(noises)[missed]),
         of_clouds=True,
         together=sensor.knowledge.together,
         operator=move,

@@ -23,7 +23,7 @@ HUBER = 2.5
 CELL = 0.5
 """Points within this share of the length of shared errors may err together."""
 OUTLIER = 5.0
-"""Where a frame is judged, whitened residuals beyond this count as this."""
+"""Where states are compared and a frame is judged, whitened residuals of points beyond this count as this."""
 BIAS_STEPS = 5e-6 * 2.0 ** np.arange(10)
 SHARE_STEPS = 0.000625 * 2.0 ** np.arange(8)
 """Sizes of the shared errors that are tried: 0.005 … 2.6 mm, and 0.06 … 8 % of the way."""
@@ -138,10 +138,16 @@ def response_std(knowledge: Knowledge, cameras: int) -> float:
     return float(np.sqrt(square[0] + (square[1:].mean() if len(asked) > 1 else 0.0)))
 
 
-def robust_std(rows: Rows, residual: FloatArray) -> FloatArray:
-    """Return standard deviations that are larger where residuals stand out (Huber), and for rows that err together [m], shape (r,)."""
-    std = rows.std * np.sqrt(rows.together)
-    return np.asarray(std * np.sqrt(np.maximum(np.abs(residual / rows.std) / cut_of(residual / rows.std), 1.0)))
+def robust_std(rows: Rows, residual: FloatArray, *, firm: bool = False) -> FloatArray:
+    """Return standard deviations that are larger where residuals stand out (Huber), and for rows that err together [m], shape (r,).
+
+    `firm`: outliers tell nothing, and theirs are infinite. That is for states near the answer (MM-estimate, Yohai 1987): those that mix
+    two depths lie all on one side, and many small pulls move a small contact.
+    """
+    std, z = rows.std * np.sqrt(rows.together), np.abs(residual / rows.std)
+    cut = cut_of(z)
+    wider = np.sqrt(np.maximum(z / cut, 1.0))
+    return np.asarray(std * np.where(firm & rows.of_clouds & (z > OUTLIER / HUBER * cut), np.inf, wider))
 
 
 def cut_of(z: FloatArray) -> float:
@@ -228,13 +234,18 @@ def huber(z: FloatArray, cut: float) -> FloatArray:
 
 
 def misfit_of(residual: FloatArray, columns: FloatArray, rows: Rows) -> tuple[float, FloatArray]:
-    """Return Huber's function of the whitened residual with unit nuisance fitted, summed, and the nuisance."""
+    """Return Huber's function of the whitened residual with unit nuisance fitted, summed, and the nuisance.
+
+    A point of a cloud costs no more than an outlier, wherever it lies; one whose ray meets nothing costs by its distance from the surface.
+    """
     std = robust_std(rows, residual)
     A = columns / std[:, None]
     fitted = np.linalg.solve(A.T @ A + np.eye(columns.shape[1]), A.T @ (residual / std))
     z = np.abs(residual - columns @ fitted) / rows.std
     cut = cut_of(residual / rows.std)
-    return float(huber(z, cut).sum() / rows.together + fitted @ fitted), np.asarray(fitted, dtype=np.float64)
+    far = OUTLIER / HUBER * cut if rows.of_clouds else np.inf
+    total = huber(np.minimum(z, far), cut).sum() + huber(np.minimum(rows.missed, far), cut).sum()
+    return float(total / rows.together + fitted @ fitted), np.asarray(fitted, dtype=np.float64)
 
 
 # --- helpers ----------------------------------------------------------------------------------------------------------

@@ -184,8 +184,10 @@ def _with_objects(
 ) -> Fit:
     """Return the fit with what objects touch, their places found again in the state that the forces make."""
     fit = free
-    if previous is not None and previous.touches:  # what held in the frame before is a start
-        again = _try(sensor, k, scan, previous.touches, free, (previous.state, previous.forces), before)
+    held = () if previous is None else tuple(t for t in previous.touches if shapes or t.source == "shape")
+    if previous is not None and held:  # what held in the frame before is a start; an object that is gone touches no more
+        start = (previous.state, previous.forces) if len(held) == len(previous.touches) else None
+        again = _try(sensor, k, scan, held, free, start, before)
         fit = fit if again is None or left_over(sensor, again) > sensor.knowledge.misfit_limit else _better(fit, again)
     for _ in range(ROUNDS if shapes else 0):
         found = object_touches(sensor, shapes, fit.state)

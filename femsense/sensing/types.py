@@ -262,8 +262,8 @@ class Rows:
     """Points or markers."""
     rms: float
     """[m]."""
-    lost: int = 0
-    """Points of the scan that found no surface."""
+    missed: FloatArray = field(default_factory=lambda: np.zeros(0))
+    """How far points of the scan whose rays meet nothing, or graze it, lie from the surface, in standard deviations, shape (q,)."""
     of_clouds: bool = False
     """Whether the rows are points of clouds, and not markers."""
     together: float = 1.0

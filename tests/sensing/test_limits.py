@@ -155,6 +155,25 @@ def test_contacts_keep_their_track_and_know_how_well_they_are_placed(tmp_path):
     assert not any(estimate(arm(), held, calibrate(arm(), seen), options=PAPER).contacts[0].position_std_m)
 
 
+def test_an_object_that_is_gone_touches_no_more(tmp_path):
+    """In the last frame nothing is seen of the ball, and the force stays: only the shape betrays it then."""
+    for name in ("seen", "gone"):
+        (tmp_path / name).mkdir()
+    seen, gone = (touched(tmp_path / name, np.array([0.0, 0, -0.15]), ball=name == "seen") for name in ("seen", "gone"))
+    held = replace(
+        seen,
+        cloud_files=(*seen.cloud_files[:2], seen.cloud_files[3], gone.cloud_files[3]),
+        inputs=np.array([*INPUTS[:2], INPUTS[3], INPUTS[3]]),
+        free=np.array([True, True, False, False]),
+    )
+    early = held.marker_frame < 2
+    columns = (held.marker_frame, held.marker_index, held.marker_xyz)
+    held = with_marker_table(held, held.marker_names, *(c[early] for c in columns), view=held.marker_view[early])
+    run = estimate(arm(), held, calibrate(arm(), seen))
+    assert [(c.frame, c.source) for c in run.contacts] == [(2, "cloud"), (3, "shape")]
+    assert run.contacts[1].force_n == pytest.approx(0.15, rel=0.2)
+
+
 def test_an_estimate_that_goes_on_searches_with_the_answers_it_had(tmp_path):
     seen = touched(tmp_path, np.array([0.0, 0, -0.15]), ball=False)
     sensor = make_sensor(arm(), seen, calibrate(arm(), seen))

@@ -18,7 +18,16 @@ from femsense.model.camera import CameraNoise
 from femsense.model.effects import apply_effects
 from femsense.model.recording import Recording
 from femsense.pointcloud.cloud import PointCloud
-from femsense.sensing.nuisance import first_knowledge, learn, misfit, nuisance_columns, nuisance_excess, response_std
+from femsense.sensing.nuisance import (
+    first_knowledge,
+    learn,
+    misfit,
+    misfit_of,
+    nuisance_columns,
+    nuisance_excess,
+    response_std,
+    robust_std,
+)
 from femsense.sensing.pipeline import estimate
 from femsense.sensing.prepare import make_sensor
 from femsense.sensing.types import Knowledge, Rows
@@ -52,6 +61,34 @@ def plate_rows(window: int, seed: int = 0) -> Rows:
         rms=STD,
         of_clouds=True,
     )
+
+
+def with_far_points(far: float) -> Rows:
+    """Return rows of which every fiftieth lies so many standard deviations off, to one side."""
+    rows = plate_rows(1)
+    residual = rows.residual.copy()
+    residual[::50] = far * STD
+    return replace(rows, residual=residual)
+
+
+def test_an_outlier_costs_the_same_wherever_it_lies_and_where_its_ray_meets_nothing():
+    near, far = (with_far_points(z) for z in (6.0, 25.0))
+    none = np.zeros((len(near.residual), 0))
+    cost = misfit_of(near.residual, none, near)[0]
+    assert misfit_of(far.residual, none, far)[0] == pytest.approx(cost)
+    keep = np.arange(len(far.residual)) % 50 != 0
+    missed = replace(far, residual=far.residual[keep], std=far.std[keep], missed=np.full((~keep).sum(), 25.0))
+    assert misfit_of(missed.residual, none[keep], missed)[0] == pytest.approx(cost, rel=0.01)
+    grazing = replace(missed, missed=np.full((~keep).sum(), 1.0))
+    assert misfit_of(grazing.residual, none[keep], grazing)[0] < 0.9 * cost
+
+
+def test_outliers_tell_nothing_near_the_answer_but_pull_before():
+    rows = with_far_points(8.0)
+    assert np.isinf(robust_std(rows, rows.residual, firm=True)[::50]).all()
+    assert np.isfinite(robust_std(rows, rows.residual)).all()
+    markers = replace(rows, of_clouds=False)
+    assert np.isfinite(robust_std(markers, rows.residual, firm=True)).all()
 
 
 @pytest.mark.parametrize("window", [1, 2])

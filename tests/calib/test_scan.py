@@ -1,0 +1,51 @@
+"""What a scan takes for the robot."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from arm import T_ROBOT_CAMERA, arm, record
+
+from femsense.calib.scan import Scan, read_scan
+from femsense.core.arrays import FloatArray
+from femsense.core.pose import invert_pose, transform_points
+from femsense.io.clouds.cloud_files import write_cloud
+from femsense.pointcloud.cloud import PointCloud
+
+BLUE, GRAY, TINTED = [0.2, 0.4, 0.8], [0.12, 0.12, 0.13], [0.05, 0.09, 0.19]
+
+
+def square(low: float, high: float, z: float) -> FloatArray:
+    """Return points on a square millimetre grid from low to high along the arm, at a height [m]."""
+    x, y = np.meshgrid(np.arange(low, high, 1e-3), np.arange(-0.01, 0.01, 1e-3))
+    return np.column_stack([x.ravel(), y.ravel(), np.full(x.size, z)])
+
+
+def scanned(folder: Path, points: FloatArray, colors: FloatArray) -> Scan:
+    """Return the scan of one cloud, given in the robot frame."""
+    robot = arm()
+    cloud = PointCloud(transform_points(invert_pose(T_ROBOT_CAMERA), points), colors)
+    write_cloud(folder / "0.ply", cloud)
+    recording, _ = record(np.zeros((1, 4)), noise=0.0)
+    recording = replace(recording, cloud_files=((folder / "0.ply",),), color_files=((None,),))
+    scan = read_scan(robot, recording, 0, (T_ROBOT_CAMERA,), robot.body.mesh.nodes)
+    assert scan is not None
+    return scan
+
+
+@pytest.mark.parametrize("shadow", [False, True])
+def test_a_dark_point_is_of_the_robot_where_those_around_it_are(tmp_path, shadow):
+    """Dark gray has any hue by noise: every tenth point of a dark plate has the robot's. A shadow on the robot stays the robot."""
+    arm_points, plate = square(0.0, 0.06, 0.01), square(0.07, 0.1, 0.013)
+    colors = np.vstack([np.tile(BLUE, (len(arm_points), 1)), np.tile(GRAY, (len(plate), 1))])
+    inner = np.flatnonzero(np.abs(plate[:, 1]) < 0.007)[4::11]
+    colors[len(arm_points) + inner] = TINTED
+    if shadow:
+        colors[: len(arm_points)][arm_points[:, 0] < 0.02] = TINTED
+    scan = scanned(tmp_path, np.vstack([arm_points, plate]), colors)
+    assert scan.segmented
+    assert len(scan.view) == len(arm_points)
+    assert scan.points((T_ROBOT_CAMERA,))[:, 2].max() < 0.011
