@@ -78,7 +78,7 @@ def test_an_outlier_costs_the_same_wherever_it_lies_and_where_its_ray_meets_noth
     assert misfit_of(far.residual, none, far)[0] == pytest.approx(cost)
     keep = np.arange(len(far.residual)) % 50 != 0
     missed = replace(far, residual=far.residual[keep], std=far.std[keep], missed=np.full((~keep).sum(), 25.0))
-    assert misfit_of(missed.residual, none[keep], missed)[0] == pytest.approx(cost, rel=0.01)
+    assert misfit_of(missed.residual, none[keep], missed)[0] == pytest.approx(cost, rel=0.02)
     grazing = replace(missed, missed=np.full((~keep).sum(), 1.0))
     assert misfit_of(grazing.residual, none[keep], grazing)[0] < 0.9 * cost
 
