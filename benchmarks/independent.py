@@ -24,7 +24,13 @@ def main() -> int:
     ask = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     ask.add_argument("out", nargs="?", type=Path)
     ask.add_argument("--seed", type=int, default=1)
-    ask.add_argument("--case", action="append", default=[], metavar="NAME", help="one of the cases; may be repeated; else all but the calm ones")
+    ask.add_argument(
+        "--case",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="one of the cases; may be repeated; else all but the calm ones",
+    )
     ask.add_argument("--diamond", type=Path, default=DIAMOND, help="folder with diamond.vtu")
     ask.add_argument("--plain", action="store_true", help="declare neither noise nor tools in recording.toml")
     ask.add_argument("--run", action="store_true", help="run femsense on each case and grade it")
