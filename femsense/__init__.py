@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     from femsense.calib.calibration import Calibration
     from femsense.calib.files import read_calibration, write_calibration
     from femsense.control.motion import Motion, WallContact
-    from femsense.control.reach import ReachOptions, reach
+    from femsense.control.reach import reach
+    from femsense.control.search import ReachOptions
     from femsense.core.errors import DataError, FemsenseError, InputError, MissingDependency
     from femsense.fem.blocks import block_mesh
     from femsense.fem.body import BodyModel, make_body, tie_cable
@@ -161,10 +162,8 @@ _HOMES = {
         "Motion",
         "WallContact",
     ),
-    "control.reach": (
-        "ReachOptions",
-        "reach",
-    ),
+    "control.reach": ("reach",),
+    "control.search": ("ReachOptions",),
     "core.errors": (
         "DataError",
         "FemsenseError",

@@ -37,7 +37,8 @@ def reach_targets(
     """
     from femsense.calib.files import read_calibration
     from femsense.control.motion import REACHED
-    from femsense.control.reach import ReachOptions, reach
+    from femsense.control.reach import reach
+    from femsense.control.search import ReachOptions
     from femsense.io.robot_toml import load_robot
 
     body = load_robot(robot)

@@ -69,6 +69,8 @@ class Limits:
 
 def make_limits(robot: Robot, control: str, limits: Mapping[str, tuple[float, float]], calibration: Calibration | None) -> Limits:
     """Return the limits of the inputs: those of the robot, narrowed by given ones. Raises InputError."""
+    if control not in CONTROLS:
+        raise InputError("unknown control", where="control", found=control, expected=" or ".join(CONTROLS))
     body = robot.body
     low = np.array([*(c.min_tension for c in body.cables), *(0.0 for _ in body.chambers)])
     high = np.array([*(c.max_tension for c in body.cables), *(c.max_pressure for c in body.chambers)])

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from femsense.core.arrays import FloatArray
 from femsense.fem.equilibrium import Equilibrium
 
-REACHED, NEAREST, STOPPED = "reached", "nearest", "stopped"
+REACHED, NEAREST, STOPPED, CONVERGING = "reached", "nearest", "stopped", "converging"
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +49,8 @@ class Motion:
     error_m: float
     """Largest distance of a point from its target, along the directions that are wanted [m]."""
     status: str
-    """"reached"; "nearest": the limits allow no better; "stopped": no equilibrium, or steps ran out on the way."""
+    """"reached"; "nearest": the limits allow no better; "stopped": no equilibrium, or steps ran out on the way;
+    "converging": more steps come nearer (`Follower`)."""
     limits: tuple[str, ...]
     """The limits that stop it, in words, those that cost most first."""
     certificate: Certificate
@@ -67,6 +68,8 @@ class Motion:
             sure = "" if self.correction_std_m is None else f"; the correction is sure to ± {1e3 * self.correction_std_m:.2g} mm"
             return f"reached to {1e3 * self.error_m:.3g} mm{sure}"
         by = f"; stopped by {', '.join(self.limits)}" if self.limits else ""
+        if self.status == CONVERGING:
+            return f"converging: {1e3 * self.error_m:.3g} mm off by now{by}"
         if self.status == NEAREST:
             reason = by or "; no input moves the points that way"
             return f"out of reach: the nearest is {1e3 * self.error_m:.3g} mm off{reason}"

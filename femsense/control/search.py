@@ -1,0 +1,272 @@
+"""The search for inputs, one equilibrium at a time (`reach` says what is solved in each round)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from femsense.control.curvature import Seen, convex, learned
+from femsense.control.goal import Goal
+from femsense.control.limits import Limits
+from femsense.control.motion import NEAREST, REACHED, STOPPED
+from femsense.control.slopes import Slopes, exact_slopes, lent_slopes, may_be_lent
+from femsense.core.arrays import FloatArray
+from femsense.fem.body import BodyModel
+from femsense.fem.equilibrium import Equilibrium, SolveOptions, solve_equilibrium
+from femsense.qp.problem import Problem
+from femsense.qp.solve import solve
+
+WEAKEST = 1e-3
+"""An actuator that moves the points less than this share of the strongest is not pulled harder for it."""
+PENALTY = 50.0
+"""A limit of length that is missed by so much weighs like an error so many times as large."""
+ACTIVE = 1e-9
+"""A limit holds a step back if its multiplier is larger than this, in units of the scaled problem."""
+FIRST_RADIUS, SMALLEST_STEP, NEAR = 0.3, 1e-9, 1e-5
+"""Trust region at first and the step at which a search is over, in units of the body's reach;
+error from which states are solved finely [m]."""
+COARSE, FINE = 1e-9, 1e-13
+"""Relative tolerance of equilibria on the way, and within a hundredth of a millimetre of the target."""
+
+KEPT = 0.1
+"""Slopes serve for another step where the last one left no more than this share of the error."""
+SURE_GAIN = 0.5
+"""Slopes that are not exact are made anew where they promise to take less than this share of the squared error."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReachOptions:
+    """When a search for inputs ends."""
+
+    tolerance_m: float = 1e-10
+    """A target is reached that is missed by less than this [m]."""
+    max_iterations: int = 60
+    """Equilibria at most."""
+    least_gain: float = 1e-9
+    """The search ends where the predicted gain of a step is below this share of the squared error."""
+    correct: bool = False
+    """Use the robot's empirical correction: markers are wanted where it has them."""
+    damping: float = 1e-10
+    """λ, in units of the largest eigenvalue of W_paᵀ W_pa; actuators that do the same share their work by it."""
+
+
+class Search:
+    """Goes step by step to inputs: each step is taken if the error falls, else the trust region shrinks."""
+
+    def __init__(self, body: BodyModel, goal: Goal, bounds: Limits, start: Equilibrium | None, options: ReachOptions) -> None:
+        """Begin at an equilibrium, within the limits of efforts; without one at rest."""
+        self.body, self.goal, self.bounds, self.options = body, goal, bounds, options
+        self.state = _begin(body, goal, bounds, start)
+        self.before = self.state.segment_tensions
+        self.count = 1
+        """Equilibria that were solved for this goal."""
+        self.status = "" if self.state.converged else STOPPED
+        """How it ended; empty while it goes on."""
+        self.last, self.beyond = Step(np.zeros(len(bounds.low)), 0.0, 0.0), ""
+        self._radius, self._settled = FIRST_RADIUS, False
+        self._slopes = lent_slopes(body, goal, self.state) if self.state.converged else None
+        self._curvature: FloatArray = np.zeros((len(bounds.low),) * 2)
+        self._seen: tuple[Seen, FloatArray] | None = None  # and the positions there
+
+    def serves(self, goal: Goal) -> bool:
+        """Return whether a goal wants the same coordinates of the same points, though elsewhere."""
+        return self.goal.names == goal.names and np.array_equal(self.goal.directions, goal.directions)
+
+    def aim(self, goal: Goal) -> None:
+        """Go on from here to where the same points are wanted now. What was learnt on the way stays."""
+        moved = float(np.abs(goal.wanted - self.goal.wanted).max(initial=0.0))
+        self.goal, self.count, self._settled = goal, 0, False
+        self.before, self.status, self.beyond = self.state.segment_tensions, "" if self.state.converged else STOPPED, ""
+        self._radius = min(max(self._radius, 2.0 * moved / self.body.reach), FIRST_RADIUS)
+        if self._seen is not None:
+            seen, positions = self._seen
+            self._seen = replace(seen, miss=goal.miss(positions)), positions
+
+    def advance(self) -> None:
+        """Solve one more equilibrium, or find that this is the end."""
+        if self.status or self.count >= self.options.max_iterations:
+            self.status = self.status or STOPPED
+            return
+        error = self.goal.error(self.state.positions)
+        within = self.bounds.violation(wound_up(self.body, self.state)) <= self.options.tolerance_m
+        end = REACHED if within and error <= self.options.tolerance_m else ""
+        slopes, end = self._plan(end, within)
+        if end and self._settled:
+            self.status = end
+            return
+        fine = bool(end) or error < NEAR
+        change = 0.0 if end else self.last.change
+        effort = np.clip(efforts_of(self.state) + change, self.bounds.low, self.bounds.high)
+        tried = _solved(self.body, self.goal, effort, self.state, self.before, fine=fine, tried=True)
+        self.count += 1
+        if end:
+            self.state, self._settled = tried if tried.converged else self.state, True
+        elif tried.converged and _is_better(self.body, self.goal, self.bounds, tried, self.state):
+            serves = self.goal.error(tried.positions) <= KEPT * error
+            self._slopes = _learned(self.body, self.goal, slopes, self.state, tried) if serves else None
+            self.state, self._radius, self.beyond, self._settled = tried, 4.0 * self._radius, "", fine
+        elif not slopes.exact:
+            self._slopes = None
+        else:
+            self._fall_back(tried, within)
+
+    def _plan(self, end: str, within: bool) -> tuple[Slopes, str]:
+        """Return the slopes that serve here, and how the search ends if it does; the step stands in `last`."""
+        miss2 = float((self.goal.miss(self.state.positions) ** 2).sum())
+        if self._slopes is not None and not end:
+            self._step(self._slopes)
+            if not self._slopes.exact and (self.last.size < SMALLEST_STEP or self.last.gain <= SURE_GAIN * miss2):
+                self._slopes = None
+        if self._slopes is None:
+            self._slopes = self._exact()
+            if not end:
+                self._step(self._slopes)
+        if not end and within and self.last.gain <= self.options.least_gain * miss2:
+            end = NEAREST
+        return self._slopes, end
+
+    def _exact(self) -> Slopes:
+        """Return the slopes at this state; what they show of the curvature is learnt."""
+        slopes, self.state = exact_slopes(self.body, self.goal, self.state)
+        seen = Seen(efforts_of(self.state), slopes.points, self.goal.miss(self.state.positions))
+        if self._seen is not None:
+            self._curvature = learned(self._curvature, self._seen[0], seen)
+        self._seen = seen, self.state.positions
+        return slopes
+
+    def _step(self, slopes: Slopes) -> None:
+        bend = self._curvature if slopes.exact else 0.0 * self._curvature
+        self.last = _best_step(self.body, self.goal, self.bounds, self.state, slopes, self._radius, self.options, bend)
+
+    def _fall_back(self, tried: Equilibrium, within: bool) -> None:
+        """Shrink the trust region after a step that led nowhere, or end where none is left."""
+        if self.last.size >= SMALLEST_STEP:
+            self._radius = 0.25 * min(self._radius, self.last.size)
+            self.beyond = "" if tried.converged else tried.status
+            return
+        miss2 = float((self.goal.miss(self.state.positions) ** 2).sum())
+        small = self.last.gain <= np.sqrt(self.options.least_gain) * miss2
+        self.status = NEAREST if within and small else STOPPED
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Step:
+    """The answer of one quadratic problem."""
+
+    change: FloatArray
+    """Of the efforts [N, Pa], shape (a + c,)."""
+    size: float
+    """Largest change, in units of what would move the points by the body's reach [1]."""
+    gain: float
+    """By how much the squared error falls to first order [m²]."""
+    active: tuple[tuple[float, int, str], ...] = ()
+    """Limits that hold it back: (multiplier, index of the effort, "least", "largest", "shortest" or "longest"),
+    the largest first."""
+
+
+def _best_step(
+    body: BodyModel,
+    goal: Goal,
+    bounds: Limits,
+    state: Equilibrium,
+    slopes: Slopes,
+    radius: float,
+    options: ReachOptions,
+    curvature: FloatArray,
+) -> Step:
+    """Return the best step of the linearised problem, with what is known of its curvature, in a trust region."""
+    u, miss = efforts_of(state), goal.miss(state.positions)
+    J, W = slopes.points, slopes.wound
+    moved = np.linalg.norm(J, axis=0)
+    unit = body.reach / np.maximum(moved, WEAKEST * max(float(moved.max(initial=0.0)), 1e-300))
+    scaled = J * unit
+    top = max(float(np.linalg.norm(scaled, 2)) ** 2, 1e-300) if scaled.size else 1.0
+    low, high = np.minimum((bounds.low - u) / unit, 0.0), np.maximum((bounds.high - u) / unit, 0.0)
+    G, h, names = bounds.rows(W * unit, wound_up(body, state), np.maximum(low, -radius), np.minimum(high, radius))
+    squares = convex(scaled.T @ scaled + curvature * np.outer(unit, unit))
+    problem = Problem(
+        P=squares / top + options.damping * np.eye(len(u)),
+        q=-scaled.T @ miss / top,
+        G=G,
+        h=h,
+        lb=np.maximum(low, -radius),
+        ub=np.minimum(high, radius),
+    )
+    answer = solve(problem)
+    if answer.x is None or answer.multipliers is None:
+        return Step(np.zeros(len(u)), 0.0, 0.0)
+    change = np.asarray(answer.x)
+    box = zip(answer.multipliers.z_box, low, high)
+    active = [
+        (abs(float(z)), i, "least" if z < 0 else "largest") for i, (z, a, b) in enumerate(box) if abs(a if z < 0 else b) < radius
+    ]
+    active += [(float(z), i, which) for z, (i, which) in zip(answer.multipliers.z, names)]
+    gain = float(2.0 * miss @ scaled @ change - change @ squares @ change)
+    shown = tuple(sorted((limit for limit in active if limit[0] > ACTIVE), reverse=True))
+    return Step(unit * change, float(np.abs(change).max(initial=0.0)), gain, shown)
+
+
+def _learned(body: BodyModel, goal: Goal, slopes: Slopes, state: Equilibrium, tried: Equilibrium) -> Slopes:
+    """Return what the way from one state to another shows of the slopes."""
+    moved = goal.miss(state.positions) - goal.miss(tried.positions)
+    return slopes.learned(efforts_of(tried) - efforts_of(state), moved, wound_up(body, tried) - wound_up(body, state))
+
+
+def efforts_of(state: Equilibrium) -> FloatArray:
+    """Return tensions [N], then pressures [Pa], shape (a + c,)."""
+    return np.array([*state.tension.values(), *state.pressure.values()])
+
+
+def wound_up(body: BodyModel, state: Equilibrium) -> FloatArray:
+    """Return what each motor has wound up [m], shape (a,): the cable's shortening and its stretch."""
+    stretch = [state.tension[cable.name] / cable.stretch_stiffness for cable in body.cables]
+    return np.asarray(np.array(list(state.shortening.values())) + np.array(stretch))
+
+
+def _solved(
+    body: BodyModel,
+    goal: Goal,
+    effort: FloatArray,
+    start: Equilibrium | None,
+    before: tuple[FloatArray, ...] | None,
+    *,
+    fine: bool = False,
+    tried: bool = False,
+) -> Equilibrium:
+    """Return the equilibrium under efforts (a + c,);
+    `before` are the tensions along the cables before the robot began to move."""
+    a, lent = len(body.cables), start is not None and may_be_lent(body, start)
+    return solve_equilibrium(
+        body,
+        tension=dict(zip(body.cable_names, effort[:a].tolist())),
+        pressure=dict(zip(body.chamber_names, effort[a:].tolist())),
+        nodal_forces=goal.nodal_forces,
+        start=start,
+        bilateral=True,
+        options=SolveOptions(
+            before=before,
+            relative_tolerance=FINE if fine else COARSE,
+            rough=tried and not fine,
+            single=fine,
+            reuse_factor=lent,
+        ),
+    )
+
+
+def _begin(body: BodyModel, goal: Goal, bounds: Limits, start: Equilibrium | None) -> Equilibrium:
+    """Return the state to begin with, within the limits of efforts."""
+    effort = np.zeros(len(bounds.low)) if start is None else efforts_of(start)
+    before = None if start is None else start.segment_tensions
+    return _solved(body, goal, np.clip(effort, bounds.low, bounds.high), start, before)
+
+
+def _is_better(body: BodyModel, goal: Goal, bounds: Limits, tried: Equilibrium, state: Equilibrium) -> bool:
+    """Return whether a state is nearer, limits of length that are violated included (an exact penalty: the more is missed,
+    the more they count)."""
+    weight = PENALTY * float(np.linalg.norm(goal.miss(state.positions)))
+
+    def merit(one: Equilibrium) -> float:
+        return float((goal.miss(one.positions) ** 2).sum()) + weight * bounds.violation(wound_up(body, one))
+
+    return merit(tried) < merit(state)
